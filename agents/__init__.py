@@ -1,0 +1,1 @@
+"""Decisions: policies that see an observation and nothing else."""

@@ -1,0 +1,1 @@
+"""The bus: keys, messages and the exchange. Zenoh lives in `session` and nowhere else."""

@@ -1,0 +1,1 @@
+"""The PettingZoo environment over the kernel."""

@@ -1,0 +1,106 @@
+"""Work in the cell: places, what an arm must physically do, and the jobs that ask for it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import networkx as nx
+
+Kind = Literal["pick_place", "hold", "press", "sort"]
+KINDS: tuple[str, ...] = get_args(Kind)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """A pose in the cell at which a hand works; also the name of the station that one arm at a time may use."""
+
+    name: str
+    position_m: tuple[float, float, float]
+    """Tool point in the world, m."""
+    tool_deg: tuple[float, float, float] = (180.0, 0.0, 0.0)
+    """Roll, pitch, yaw of the tool frame about the fixed world axes, deg; its z axis points out of the hand.
+    (180, 0, 0) points down, (0, 90, 0) along world x."""
+    retreat_m: float = 0.08
+    """How far the hand backs off along its own z axis before it travels."""
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise ValueError("Place.name must not be empty.")
+        if self.retreat_m < 0:
+            raise ValueError(f"Place.retreat_m must be >= 0 (got {self.retreat_m}).")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Work:
+    """What the hand must do once: the content of a job that a motion is planned for."""
+
+    kind: Kind
+    places: tuple[Place, ...]
+    """pick_place, sort: from, to. hold, press: the one place."""
+    payload_kg: float = 0.0
+    """Carried from grasp to release; a hold grasps at its place and releases there."""
+    dwell_s: float = 0.5
+    """pick_place, sort: closing or opening the hand. hold, press: how long one repetition lasts."""
+    force_n: float = 0.0
+    """press: contact force along the tool's z axis, N."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ValueError(f"Work.kind '{self.kind}' is unknown. Allowed: {', '.join(KINDS)}.")
+        wanted = 2 if self.kind in ("pick_place", "sort") else 1
+        if len(self.places) != wanted:
+            raise ValueError(f"A {self.kind} needs {wanted} place(s), got {len(self.places)}.")
+        for name in ("payload_kg", "force_n"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"Work.{name} must be >= 0 (got {getattr(self, name)}).")
+        if self.dwell_s <= 0:
+            raise ValueError(f"Work.dwell_s must be > 0 (got {self.dwell_s}).")
+        if self.force_n and self.kind != "press":
+            raise ValueError(f"Only a press has a contact force; this is a {self.kind} with {self.force_n} N.")
+
+    def stations(self) -> tuple[str, ...]:
+        """Names of the stations it occupies."""
+        return tuple(dict.fromkeys(place.name for place in self.places))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """A piece of work that arrives, is worth something, and must be repeated so many times."""
+
+    name: str
+    work: Work
+    repetitions: int
+    release_s: float
+    due_s: float
+    """Soft: being later is tardiness, not failure."""
+    value: float
+    after: tuple[str, ...] = ()
+    """Names of the jobs that must be finished first."""
+
+    def __post_init__(self) -> None:
+        if self.repetitions < 1:
+            raise ValueError(f"Job '{self.name}': repetitions must be >= 1 (got {self.repetitions}).")
+        if self.release_s < 0 or self.due_s < self.release_s:
+            raise ValueError(f"Job '{self.name}': needs 0 <= release_s <= due_s (got {self.release_s}, {self.due_s}).")
+
+
+def precedence(jobs: Sequence[Job]) -> nx.DiGraph:
+    """Which job waits for which, as a graph of names with edges from earlier to later.
+
+    Raises:
+        ValueError: a name occurs twice, a predecessor does not exist, or the jobs wait for each other in a ring.
+    """
+    graph = nx.DiGraph()
+    for job in jobs:
+        if job.name in graph:
+            raise ValueError(f"Two jobs are called '{job.name}'.")
+        graph.add_node(job.name)
+    for job in jobs:
+        for name in job.after:
+            if name not in graph:
+                raise ValueError(f"Job '{job.name}' waits for '{name}', which does not exist.")
+            graph.add_edge(name, job.name)
+    if not nx.is_directed_acyclic_graph(graph):
+        ring = " → ".join(edge[0] for edge in nx.find_cycle(graph))
+        raise ValueError(f"Jobs wait for each other in a ring: {ring}.")
+    return graph

@@ -1,0 +1,118 @@
+"""The motor law: from joint torque and speed to current, and from current to heat.
+
+Laws and symbols: i = (tau/eta + tau_f) / (N·Kt·(1 + a_kt (Th − 25))), tau_f = tau_c·tanh(qd/v0) + b·qd,
+copper loss K_cu (1 + a_cu (Tw − 25)) i², friction heat tau_f·qd. Numbers: `fleet/data/gen3_thermal.json`.
+"""
+
+import json
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from importlib import resources
+from typing import Any
+
+import numpy as np
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Motors:
+    """Parameters of the seven joint motors; every array [..., joint], leading axes for several arms."""
+
+    torque_per_amp: Array
+    """N·Kt at the reference temperature, N·m/A at the joint."""
+    eta: Array
+    """Gear efficiency."""
+    coulomb_nm: Array
+    viscous_nms_per_rad: Array
+    copper_w_per_a2: Array
+    """Copper loss per squared current at the reference temperature."""
+    idle_w: Array
+    """Heat of the powered drive at rest, into the housing."""
+    current_max_a: Array
+    sensor_noise_k: Array
+    """Standard deviation of the motor temperature reading."""
+    alpha_cu_per_k: float
+    alpha_kt_per_k: float
+    reference_c: float
+    v0_rad_s: float
+    """Speed over which Coulomb friction builds up."""
+
+    def __post_init__(self) -> None:
+        for name in ("torque_per_amp", "eta", "copper_w_per_a2", "current_max_a"):
+            if np.any(getattr(self, name) <= 0):
+                raise ValueError(f"Motors.{name} must be > 0 (got {getattr(self, name)}).")
+
+
+@cache
+def thermal_data() -> dict[str, Any]:
+    """The project's data file of identified Gen3 parameters, with its source."""
+    text = resources.files("fleet").joinpath("data/gen3_thermal.json").read_text(encoding="utf-8")
+    return json.loads(text)
+
+
+def gen3_motors(*, wear: float = 0.0) -> Motors:
+    """Motors of a nominal Gen3 whose joint friction has grown by the share `wear`."""
+    data = thermal_data()
+
+    def per_joint(name: str) -> Array:
+        return np.array(data[name], dtype=float)
+
+    return Motors(
+        torque_per_amp=data["gear_ratio"] * per_joint("kt_nm_per_a"),
+        eta=per_joint("eta"),
+        coulomb_nm=per_joint("coulomb_nm") * (1.0 + wear),
+        viscous_nms_per_rad=per_joint("viscous_nms_per_rad") * (1.0 + wear),
+        copper_w_per_a2=per_joint("copper_w_per_a2"),
+        idle_w=per_joint("idle_w"),
+        current_max_a=per_joint("current_max_a"),
+        sensor_noise_k=per_joint("sensor_noise_k"),
+        alpha_cu_per_k=data["alpha_cu_per_k"],
+        alpha_kt_per_k=data["alpha_kt_per_k"],
+        reference_c=data["reference_c"],
+        v0_rad_s=data["v0_rad_s"],
+    )
+
+
+def stack_motors(motors: list[Motors]) -> Motors:
+    """Motors of several arms as one, arrays [arm, joint]. The scalar constants must agree."""
+    first = motors[0]
+    arrays = {
+        f.name: np.stack([getattr(m, f.name) for m in motors])
+        for f in fields(Motors)
+        if isinstance(getattr(first, f.name), np.ndarray)
+    }
+    return replace(first, **arrays)
+
+
+def friction_torque(qd: Array, motors: Motors) -> Array:
+    """Friction that the motor must overcome, N·m, [..., joint]."""
+    return motors.coulomb_nm * np.tanh(qd / motors.v0_rad_s) + motors.viscous_nms_per_rad * qd
+
+
+def friction_heat(qd: Array, motors: Motors) -> Array:
+    """Friction power, W, [..., joint]; never negative."""
+    return friction_torque(qd, motors) * qd
+
+
+def reference_current(tau: Array, qd: Array, motors: Motors) -> Array:
+    """Motor current if the magnets were at the reference temperature, A, [..., joint].
+
+    The temperature enters as a factor, `magnet_factor`, so heat of a planned motion is computed once.
+    """
+    return (tau / motors.eta + friction_torque(qd, motors)) / motors.torque_per_amp
+
+
+def magnet_factor(housing_c: Array, motors: Motors) -> Array:
+    """Torque constant at a housing temperature over that at the reference temperature, [..., joint]."""
+    return 1.0 + motors.alpha_kt_per_k * (housing_c - motors.reference_c)
+
+
+def current(tau: Array, qd: Array, housing_c: Array, motors: Motors) -> Array:
+    """Motor current, A, [..., joint], for joint torque `tau` N·m, speed `qd` rad/s, housing temperature °C."""
+    return reference_current(tau, qd, motors) / magnet_factor(housing_c, motors)
+
+
+def copper_loss(current_sq: Array, winding_c: Array, motors: Motors) -> Array:
+    """Heat in the winding, W, [..., joint], for a (mean) squared current A² and a winding temperature °C."""
+    return motors.copper_w_per_a2 * (1.0 + motors.alpha_cu_per_k * (winding_c - motors.reference_c)) * current_sq

@@ -1,0 +1,1 @@
+"""One engine: kernel, plants and planner. MuJoCo lives here and nowhere else."""

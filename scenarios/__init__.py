@@ -1,0 +1,1 @@
+"""What to try: scenarios, and the composition root that builds and runs them."""

@@ -1,0 +1,1 @@
+"""One robot's heat: the LSTM variational autoencoder that scores planned motion."""
