@@ -39,9 +39,12 @@ class Motors:
     """Speed over which Coulomb friction builds up."""
 
     def __post_init__(self) -> None:
-        for name in ("torque_per_amp", "eta", "copper_w_per_a2", "current_max_a"):
-            if np.any(getattr(self, name) <= 0):
+        for name in ("torque_per_amp", "eta", "copper_w_per_a2", "current_max_a", "v0_rad_s"):
+            if not np.all(np.greater(getattr(self, name), 0)):
                 raise ValueError(f"Motors.{name} must be > 0 (got {getattr(self, name)}).")
+        for name in ("coulomb_nm", "viscous_nms_per_rad", "idle_w", "sensor_noise_k"):
+            if not np.all(np.greater_equal(getattr(self, name), 0)):
+                raise ValueError(f"Motors.{name} must be >= 0 (got {getattr(self, name)}).")
 
 
 @cache
@@ -75,13 +78,21 @@ def gen3_motors(*, wear: float = 0.0) -> Motors:
 
 
 def stack_motors(motors: list[Motors]) -> Motors:
-    """Motors of several arms as one, arrays [arm, joint]. The scalar constants must agree."""
+    """Motors of several arms as one, arrays [arm, joint].
+
+    Raises:
+        ValueError: no motors, or the scalar constants of two arms differ.
+    """
+    if not motors:
+        raise ValueError("stack_motors needs the motors of at least one arm.")
     first = motors[0]
-    arrays = {
-        f.name: np.stack([getattr(m, f.name) for m in motors])
-        for f in fields(Motors)
-        if isinstance(getattr(first, f.name), np.ndarray)
-    }
+    arrays = {}
+    for name in (f.name for f in fields(Motors)):
+        values = [getattr(m, name) for m in motors]
+        if isinstance(values[0], np.ndarray):
+            arrays[name] = np.stack(values)
+        elif any(value != values[0] for value in values):
+            raise ValueError(f"Motors.{name} is one number for all stacked arms (got {values}).")
     return replace(first, **arrays)
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import networkx as nx
 import numpy as np
 
-from fleet.motor import Motors, thermal_data
+from fleet.motor import Motors, copper_loss, magnet_factor, thermal_data
 from fleet.robot import JOINTS, Cooling
 
 Array = np.ndarray
@@ -43,6 +43,11 @@ class ThermalSpread:
     housing_ambient: float = 0.0
     capacity: float = 0.0
     idle: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not value >= 0:
+                raise ValueError(f"ThermalSpread.{name} must be >= 0 (got {value}).")
 
     @classmethod
     def gen3(cls, scale: float = 1.0) -> "ThermalSpread":
@@ -171,22 +176,37 @@ def thermal_model(network: nx.Graph) -> ThermalModel:
     """Matrices of a network made by `gen3_network` (or of the same nodes with other numbers).
 
     Raises:
-        ValueError: a node or capacity is missing, or a value is not > 0.
+        ValueError: a node, capacity or conductance is missing or out of range, a node is not a Gen3's, or a node
+            has no path to ambient.
     """
     names = [winding(j) for j in range(JOINTS)] + [housing(j) for j in range(JOINTS)]
-    missing = [name for name in [*names, "ambient"] if name not in network]
-    if missing:
-        raise ValueError(f"The thermal network lacks the nodes {', '.join(missing)}.")
+    _check(network, names)
     capacity = np.array([network.nodes[name]["capacity_j_per_k"] for name in names], dtype=float)
     conductance = nx.to_numpy_array(network, nodelist=[*names, "ambient"], weight="conductance_w_per_k")
-    if np.any(capacity <= 0) or np.any(conductance < 0):
-        raise ValueError("Capacities must be > 0 and conductances >= 0 in a thermal network.")
     laplacian = np.diag(conductance[:NODES].sum(axis=1)) - conductance[:NODES, :NODES]
     root = np.sqrt(capacity)
     rates, modes = np.linalg.eigh(laplacian / np.outer(root, root))
-    if rates[0] <= 0:
-        raise ValueError("Some node of the thermal network has no path to ambient: its heat could not leave.")
     return ThermalModel(capacity, laplacian, conductance[:NODES, NODES], rates, modes)
+
+
+def _check(network: nx.Graph, names: list[str]) -> None:
+    expected = {*names, "ambient"}
+    if missing := sorted(expected - set(network)):
+        raise ValueError(f"The thermal network lacks the nodes {', '.join(missing)}.")
+    if unknown := sorted(set(network) - expected):
+        raise ValueError(f"The thermal network has nodes that no Gen3 has: {', '.join(unknown)}.")
+    for name in names:
+        capacity = network.nodes[name].get("capacity_j_per_k")
+        if capacity is None or not 0 < capacity < np.inf:
+            raise ValueError(f"Node '{name}' needs a capacity_j_per_k > 0 (got {capacity}).")
+    for one, other, conductance in network.edges(data="conductance_w_per_k"):
+        if conductance is None or not 0 <= conductance < np.inf:
+            raise ValueError(f"Edge '{one}' - '{other}' needs a conductance_w_per_k >= 0 (got {conductance}).")
+    # By reachability: the smallest rate of a cut-off node is rounding noise of either sign, not zero.
+    open_edges = [(a, b) for a, b, conductance in network.edges(data="conductance_w_per_k") if conductance > 0]
+    cooled = nx.node_connected_component(nx.Graph([("ambient", "ambient"), *open_edges]), "ambient")
+    if trapped := [name for name in names if name not in cooled]:
+        raise ValueError(f"No path to ambient, heat could not leave: {', '.join(trapped)}.")
 
 
 def stack_models(models: list[ThermalModel]) -> ThermalModel:
@@ -199,3 +219,69 @@ def stack_models(models: list[ThermalModel]) -> ThermalModel:
 def node_heat(winding_w: Array, housing_w: Array) -> Array:
     """Heat per node, W, [..., node], from heat into windings and into housings, each [..., joint]."""
     return np.concatenate([winding_w, housing_w], axis=-1)
+
+
+def drive_heat(temp_c: Array, current_sq: Array, friction_w: Array, motors: Motors) -> Array:
+    """Heat per node of a powered arm at its temperatures, W, [..., node].
+
+    Args:
+        temp_c: °C, [..., node].
+        current_sq: Mean squared current at the magnets' reference temperature, A², [..., joint].
+        friction_w: Mean friction heat, W, [..., joint].
+    """
+    warm_sq = current_sq / magnet_factor(temp_c[..., HOUSING], motors) ** 2
+    return node_heat(copper_loss(warm_sq, temp_c[..., WINDING], motors), motors.idle_w + friction_w)
+
+
+NEWTON_STEPS = 100
+
+
+def settled(
+    model: ThermalModel, current_sq: Array, friction_w: Array, motors: Motors, ambient_c: float
+) -> Array | None:
+    """Temperatures at which one arm settles under a constant drive, °C, [node]; None when it never does.
+
+    Copper loss grows with the winding's temperature and the current with the magnets', so beyond some load no
+    temperature balances the heat. The cold arm is below every balance, heat grows with every temperature and ever
+    faster, so Newton's steps climb to the lowest balance as long as the inverse Jacobian has no negative entry
+    (Ortega & Rheinboldt, Iterative Solution of Nonlinear Equations, theorem 13.3.4); where it has one, there is none.
+
+    Args:
+        current_sq: Mean squared current at the magnets' reference temperature, A², [joint].
+        friction_w: Mean friction heat, W, [joint].
+    """
+    temp_c = np.full(NODES, float(ambient_c))
+    for _ in range(NEWTON_STEPS):
+        excess = drive_heat(temp_c, current_sq, friction_w, motors)
+        excess += model.to_ambient * ambient_c - model.laplacian @ temp_c
+        inverse = _inverse_or_none(model.laplacian - _heat_slope(temp_c, current_sq, motors))
+        if inverse is None:
+            return None
+        step = inverse @ excess
+        temp_c = temp_c + step
+        if np.any(magnet_factor(temp_c[HOUSING], motors) <= 0):
+            return None
+        if np.max(np.abs(step)) < 1e-9:
+            return temp_c
+    return None
+
+
+def _heat_slope(temp_c: Array, current_sq: Array, motors: Motors) -> Array:
+    """Derivative of `drive_heat` by the temperatures, W/K, [node, node]."""
+    factor = magnet_factor(temp_c[HOUSING], motors)
+    warm_sq = current_sq / factor**2
+    slope = np.zeros((NODES, NODES))
+    rows = np.arange(JOINTS)
+    slope[rows, rows] = motors.copper_w_per_a2 * motors.alpha_cu_per_k * warm_sq
+    loss_w = copper_loss(warm_sq, temp_c[WINDING], motors)
+    slope[rows, rows + JOINTS] = -2.0 * motors.alpha_kt_per_k / factor * loss_w
+    return slope
+
+
+def _inverse_or_none(jacobian: Array) -> Array | None:
+    """Inverse of a matrix with off-diagonal entries <= 0, None unless it is non-negative (an M-matrix)."""
+    try:
+        inverse = np.linalg.inv(jacobian)
+    except np.linalg.LinAlgError:  # Singular: exactly at the fold.
+        return None
+    return inverse if inverse.min() >= -1e-9 * np.abs(inverse).max() else None
