@@ -1,0 +1,128 @@
+"""A twin in a folder: `weights.safetensors` and `twin.json`, readable without running anybody's code."""
+
+import os
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from fleet.errors import CheckpointError
+from fleet.robot import JOINTS
+from twin.model import JointVae, TwinConfig
+from twin.score import JointFit, Twin
+from twin.window import Scaler
+
+FORMAT = 1
+WEIGHTS = "weights.safetensors"
+CARD = "twin.json"
+
+
+class _Head(msgspec.Struct):
+    """What must be known before the rest can be read."""
+
+    format: int
+
+
+class _Card(msgspec.Struct, forbid_unknown_fields=True):
+    """The content of `twin.json`."""
+
+    format: int
+    version: str
+    arm: str
+    data_hash: str
+    seed: str
+    config: TwinConfig
+    turn_q: list[float]
+    mean: list[list[float]]
+    std: list[list[float]]
+    still: list[bool]
+    fits: list[JointFit]
+
+
+def save(twin: Twin, folder: Path) -> None:
+    """Write the twin into a folder, made if need be. Files appear whole or not at all."""
+    folder.mkdir(parents=True, exist_ok=True)
+    card = _Card(
+        format=FORMAT,
+        version=twin.version,
+        arm=twin.arm,
+        data_hash=twin.data_hash,
+        seed=twin.seed,
+        config=twin.config,
+        turn_q=twin.scaler.turn_q.tolist(),
+        mean=twin.scaler.mean.tolist(),
+        std=twin.scaler.std.tolist(),
+        still=twin.scaler.still.tolist(),
+        fits=list(twin.fits),
+    )
+    unfinished = folder / f".{WEIGHTS}.{os.getpid()}"
+    save_file(twin.tensors(), unfinished)
+    unfinished.replace(folder / WEIGHTS)
+    unfinished = folder / f".{CARD}.{os.getpid()}"
+    unfinished.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=2))
+    unfinished.replace(folder / CARD)
+
+
+def load(folder: Path, *, joints: int = JOINTS) -> Twin:
+    """The twin that `save` wrote, with the same scores to the last bit.
+
+    Raises:
+        CheckpointError: a file is missing or damaged, of another format, for another number of joints, lacks
+            tensors, or is not what was saved.
+    """
+    card = _read_card(folder / CARD)
+    if len(card.turn_q) != joints:
+        raise CheckpointError(f"{folder / CARD}: the twin has {len(card.turn_q)} joints, the arm has {joints}.")
+    scaler = Scaler(np.array(card.turn_q), np.array(card.mean), np.array(card.std), np.array(card.still))
+    shapes = {scaler.mean.shape, scaler.std.shape, (len(scaler.still), 3), (len(card.fits), 3)}
+    if shapes != {(joints, 3)}:
+        raise CheckpointError(f"{folder / CARD}: mean, std, still and fits must each have {joints} joints.")
+    nets = _read_nets(folder / WEIGHTS, card.config, joints)
+    twin = Twin(card.config, scaler, nets, arm=card.arm, data_hash=card.data_hash, seed=card.seed, fits=card.fits)
+    if twin.version != card.version:
+        raise CheckpointError(
+            f"{folder}: the content has changed since it was saved (says version {card.version}, is {twin.version})."
+        )
+    return twin
+
+
+def _read_card(path: Path) -> _Card:
+    try:
+        text = path.read_bytes()
+    except FileNotFoundError:
+        raise CheckpointError(f"No twin in {path.parent}: {path.name} is missing.") from None
+    try:
+        head = msgspec.json.decode(text, type=_Head)
+        if head.format != FORMAT:
+            raise CheckpointError(f"{path}: format {head.format} is not the one read here, {FORMAT}.")
+        return msgspec.json.decode(text, type=_Card)
+    except msgspec.DecodeError as error:  # not JSON, or (ValidationError) JSON of another shape
+        raise CheckpointError(f"{path}: {error}") from error
+
+
+def _read_nets(path: Path, config: TwinConfig, joints: int) -> list[JointVae]:
+    if not path.exists():
+        raise CheckpointError(f"No twin in {path.parent}: {path.name} is missing.")
+    try:
+        tensors = load_file(path)
+    except SafetensorError as error:
+        raise CheckpointError(f"{path}: damaged ({error}).") from error
+    with torch.random.fork_rng(devices=[]):
+        nets = [JointVae(config) for _ in range(joints)]
+    wanted = {
+        f"joint_{j + 1}.{name}": tensor for j, net in enumerate(nets) for name, tensor in net.state_dict().items()
+    }
+    missing, unknown = sorted(wanted.keys() - tensors.keys()), sorted(tensors.keys() - wanted.keys())
+    if missing or unknown:
+        raise CheckpointError(f"{path}: missing tensors {missing[:3]}, unknown tensors {unknown[:3]}.")
+    for name, tensor in wanted.items():
+        if tensors[name].shape != tensor.shape or tensors[name].dtype != tensor.dtype:
+            raise CheckpointError(
+                f"{path}: tensor {name} is {tensors[name].dtype} {tuple(tensors[name].shape)}, "
+                f"the configuration needs {tensor.dtype} {tuple(tensor.shape)}."
+            )
+        tensor.copy_(tensors[name])
+    return nets

@@ -1,0 +1,123 @@
+"""The network of one joint: an LSTM encoder to a Gaussian latent, and an LSTM decoder back to the window."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from fleet.motion import CHANNELS, RATE_HZ
+
+LOGVAR_RANGE = (-8.0, 4.0)
+"""Clamp of the posterior's log variance: neither a delta nor wider than the prior can use."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwinConfig:
+    """What a twin looks at, how large it is and how it is trained."""
+
+    latent: int = 2
+    hidden: int = 32
+    layers: int = 1
+    window: int = 50
+    """Samples per window."""
+    rate_hz: float = 12.5
+    """Samples per second inside a window."""
+    record_hz: float = RATE_HZ
+    """Samples per second of the training records; plans always come at fleet.motion.RATE_HZ."""
+    stride: int = 10
+    """Samples from one training window to the next."""
+    score_stride: int = 50
+    """Samples from one scored window to the next; the last is flush with the end, so all time is covered."""
+    max_windows: int = 2500
+    """Training uses at most so many windows, drawn evenly from all."""
+    beta: float = 1.0
+    """Weight of the KL term."""
+    epochs: int = 60
+    batch: int = 128
+    learning_rate: float = 3e-3
+    """Peak of the one-cycle schedule."""
+    clip: float = 1.0
+    """Largest gradient norm."""
+    restarts: int = 2
+    """Trainings per joint from other weights; the best ELBO stays. A small latent has local minima."""
+    noise: tuple[float, float, float] = (0.001, 0.005, 0.1)
+    """Sensor noise added to the training windows, standard deviation in rad, rad/s, N·m: plans are smooth and
+    measured motion is not, and a twin of either must not call the other new."""
+    allow_collapse: bool = False
+    """Keep a twin whose latent says nothing, as a baseline, instead of raising CollapsedPosterior."""
+
+    def __post_init__(self) -> None:
+        whole = ("latent", "hidden", "layers", "stride", "score_stride", "max_windows", "epochs", "batch", "restarts")
+        for name in whole:
+            if getattr(self, name) < 1:
+                raise ValueError(f"TwinConfig.{name} must be >= 1 (got {getattr(self, name)}).")
+        for name in ("rate_hz", "record_hz", "learning_rate", "clip"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"TwinConfig.{name} must be > 0 (got {getattr(self, name)}).")
+        if self.window < 2:
+            raise ValueError(f"TwinConfig.window must be >= 2 samples (got {self.window}).")
+        if max(self.stride, self.score_stride) > self.window:
+            raise ValueError(
+                f"TwinConfig.stride and score_stride must be <= window = {self.window}, or samples between windows "
+                f"are never seen (got {self.stride}, {self.score_stride})."
+            )
+        if not self.beta >= 0:
+            raise ValueError(f"TwinConfig.beta must be >= 0 (got {self.beta}).")
+        if len(self.noise) != len(CHANNELS) or not all(std >= 0 for std in self.noise):
+            raise ValueError(f"TwinConfig.noise must be three standard deviations >= 0 (got {self.noise}).")
+
+    @classmethod
+    def quick(cls) -> "TwinConfig":
+        """For small budgets: about a seventh of the default's training steps."""
+        return cls(max_windows=768, epochs=60, restarts=1)
+
+
+class JointVae(nn.Module):
+    """Encoder and decoder of one joint's windows [batch, time, channel], in z-scores."""
+
+    def __init__(self, config: TwinConfig) -> None:
+        super().__init__()
+        channels, hidden, layers = len(CHANNELS), config.hidden, config.layers
+        self.encoder = nn.LSTM(channels, hidden, layers, batch_first=True)
+        self.summary = nn.Linear(hidden, hidden)
+        self.mu = nn.Linear(hidden, config.latent)
+        self.logvar = nn.Linear(hidden, config.latent)
+        self.expand = nn.Linear(config.latent, hidden)
+        self.decoder = nn.LSTM(hidden, hidden, layers, batch_first=True)
+        self.out = nn.Linear(hidden, channels)
+
+    def encode(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Posterior mean and log variance, each [batch, latent]."""
+        _, (last, _) = self.encoder(x)
+        seen = torch.tanh(self.summary(last[-1]))
+        return self.mu(seen), self.logvar(seen).clamp(*LOGVAR_RANGE)
+
+    def decode(self, z: Tensor, steps: int) -> Tensor:
+        """The window that a latent [batch, latent] stands for, [batch, time, channel]."""
+        told = torch.tanh(self.expand(z))[:, None].expand(-1, steps, -1)
+        return self.out(self.decoder(told)[0])
+
+    def forward(self, x: Tensor, eps: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Reconstruction from z = mu + eps·sigma with mean and log variance; eps = 0 decodes the mean."""
+        mu, logvar = self.encode(x)
+        return self.decode(mu + eps * torch.exp(0.5 * logvar), x.shape[1]), mu, logvar
+
+
+def build(config: TwinConfig, seed: int) -> JointVae:
+    """A network with random weights of this seed; torch's global random state stays as it was."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return JointVae(config)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """One torch thread inside: these networks gain nothing from more, and sums keep their order."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
