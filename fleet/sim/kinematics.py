@@ -1,0 +1,210 @@
+"""Inverse kinematics of the Gen3: closed-form elbow postures as seeds, polished on the exact model."""
+
+from dataclasses import dataclass
+from itertools import product
+
+import mink
+import numpy as np
+
+from fleet.robot import GEN3, JOINTS
+from fleet.sim.models import ArmModel
+
+Array = np.ndarray
+
+SHOULDER_M = 0.28481
+"""Height of joint 2 over the base plate."""
+UPPER_ARM_M = 0.42076
+"""Joint 2 to joint 4."""
+FOREARM_M = 0.31436
+"""Joint 4 to joint 6."""
+HAND_M = 0.167455
+"""Joint 6 to the flange."""
+REACH_M = UPPER_ARM_M + FOREARM_M + HAND_M
+"""Shoulder to flange, outstretched: 0.902 m in Kinova's user guide."""
+ELBOW_ANGLES_DEG = (0.0, 60.0, -60.0, 120.0, -120.0, 180.0)
+"""Turns of the elbow about the line from shoulder to wrist, in the order in which they are tried; 0 is
+furthest out along the base axis."""
+
+POSITION_TOLERANCE_M = 1e-3
+ANGLE_TOLERANCE_RAD = np.deg2rad(0.5)
+# Solved tighter than promised, so that the promise survives rounding to float32.
+_SOLVED_M = 1e-5
+_SOLVED_RAD = 1e-5
+_STEPS = 40
+_SEED_SLACK_M = 0.015  # The seeds neglect the 12 mm by which upper arm and forearm are offset.
+_SEED_SLACK_RAD = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Where the tool should be, in the world."""
+
+    position_m: Array
+    """[3]."""
+    rotation: Array
+    """Tool frame to world, [3, 3]."""
+
+    def backed_off(self, distance_m: float) -> "Pose":
+        """The pose moved back along its own z axis."""
+        return Pose(self.position_m - distance_m * self.rotation[:, 2], self.rotation)
+
+
+class Unreachable(Exception):
+    """No joint positions put the tool at the pose; the message is the reason, with its numbers."""
+
+
+class InverseKinematics:
+    """Joint positions that put one arm's tool at a pose.
+
+    The seven joints leave one freedom, the elbow's turn about the line shoulder–wrist. Without the 12 mm offset of
+    its links the arm has a closed form for each turn; mink takes it from there to the exact model.
+    """
+
+    def __init__(self, arm: ArmModel) -> None:
+        self._arm = arm
+        self._base = arm.robot.mount.rotation()
+        self._origin = np.asarray(arm.robot.mount.position_m)
+        self._configuration = mink.Configuration(arm.model)
+        self._tool = mink.FrameTask(
+            f"{arm.robot.name}/tool", "site", position_cost=1.0, orientation_cost=0.3, lm_damping=1e-6
+        )
+        self._posture = mink.PostureTask(arm.model, cost=1e-3)
+        self._limit = mink.ConfigurationLimit(arm.model)
+
+    def shoulder_distance_m(self, pose: Pose) -> float:
+        """From joint 2 to the tool point."""
+        return float(np.linalg.norm(self._in_base(pose).position_m - (0.0, 0.0, SHOULDER_M)))
+
+    def solve(self, pose: Pose, elbow_deg: float, near: Array) -> Array:
+        """Joint positions with the elbow turned so far, as close to `near` as its turns allow, rad, [joint].
+
+        Raises:
+            Unreachable: too far, too near, beyond a joint stop, or not converged.
+        """
+        seed = nearest_turn(self._seed(pose, elbow_deg, near), near)
+        q = self._polish(pose, seed)
+        return nearest_turn(q, near)
+
+    def error(self, pose: Pose, q: Array) -> tuple[float, float]:
+        """Distance, m, and angle, rad, between the tool at q and the pose."""
+        position, turn = self._arm.tool_pose(q)
+        return float(np.linalg.norm(position - pose.position_m)), angle_between(turn, pose.rotation)
+
+    def _in_base(self, pose: Pose) -> Pose:
+        return Pose(self._base.T @ (pose.position_m - self._origin), self._base.T @ pose.rotation)
+
+    def _seed(self, pose: Pose, elbow_deg: float, near: Array) -> Array:
+        target = self._in_base(pose)
+        wrist = target.position_m - HAND_M * target.rotation[:, 2] - (0.0, 0.0, SHOULDER_M)
+        _check_distance(self.shoulder_distance_m(pose), float(np.linalg.norm(wrist)))
+        elbow = _elbow(wrist, elbow_deg, near)
+        candidates = [
+            nearest_turn(_angles(elbow, wrist, target.rotation, flips), near) for flips in product((1, -1), repeat=3)
+        ]
+        seed = min(candidates, key=lambda q: float(np.max(np.abs(q - near) / GEN3.velocity)))
+        low, high = self._arm.position_range.T
+        beyond = np.maximum(low - seed, seed - high)
+        worst = int(np.argmax(beyond))
+        if beyond[worst] > _SEED_SLACK_RAD:
+            raise Unreachable(
+                f"joint limit: joint_{worst + 1} would have to be at {seed[worst]:.2f} rad, "
+                f"allowed {low[worst]:.2f} to {high[worst]:.2f}"
+            )
+        return np.clip(seed, low, high)
+
+    def _polish(self, pose: Pose, seed: Array) -> Array:
+        configuration = self._configuration
+        configuration.update(seed)
+        self._posture.set_target(seed)
+        self._tool.set_target(
+            mink.SE3.from_rotation_and_translation(mink.SO3.from_matrix(pose.rotation), pose.position_m)
+        )
+        for step in range(_STEPS):
+            distance, angle = self.error(pose, configuration.q)
+            if distance < _SOLVED_M and angle < _SOLVED_RAD:
+                return configuration.q.copy()
+            # The posture keeps the free elbow in place at first; at the end it would only bias the tool.
+            tasks = [self._tool, self._posture] if step < _STEPS // 2 else [self._tool]
+            try:
+                velocity = mink.solve_ik(
+                    configuration, tasks, dt=1.0, solver="daqp", damping=1e-9, limits=[self._limit]
+                )
+            except mink.NoSolutionFound as error:
+                raise Unreachable(f"no IK solution: {error}") from error
+            configuration.integrate_inplace(velocity, 1.0)
+        distance, angle = self.error(pose, configuration.q)
+        if distance < POSITION_TOLERANCE_M / 2 and angle < ANGLE_TOLERANCE_RAD / 2:
+            return configuration.q.copy()
+        raise Unreachable(
+            f"no IK solution: stopped {distance * 1e3:.1f} mm and {np.rad2deg(angle):.1f} deg "
+            f"from the pose after {_STEPS} steps"
+        )
+
+
+def nearest_turn(q: Array, near: Array) -> Array:
+    """The same positions with whole turns of the continuous joints (1, 3, 5, 7) taken off towards `near`."""
+    turned = q.copy()
+    turned[::2] -= 2 * np.pi * np.round((q[::2] - near[::2]) / (2 * np.pi))
+    return turned
+
+
+def angle_between(a: Array, b: Array) -> float:
+    """Angle of the turn from one frame to the other, rad, exact for small ones too."""
+    return float(2 * np.arcsin(min(1.0, np.linalg.norm(a - b) / np.sqrt(8.0))))
+
+
+def _check_distance(tool_m: float, wrist_m: float) -> None:
+    if tool_m > REACH_M + _SEED_SLACK_M or wrist_m > UPPER_ARM_M + FOREARM_M + _SEED_SLACK_M:
+        turned = "" if tool_m > REACH_M else f"; with this tool direction the wrist would be {wrist_m:.3f} m away"
+        raise Unreachable(f"reach: {tool_m:.3f} m from the shoulder, the arm has {REACH_M:.3f} m{turned}")
+
+
+def _elbow(wrist: Array, elbow_deg: float, near: Array) -> Array:
+    """Shoulder to elbow in the base frame, [3], with the elbow turned from its place furthest along z."""
+    distance = float(np.linalg.norm(wrist))
+    axis = wrist / distance if distance > 1e-9 else np.array([0.0, 0.0, 1.0])
+    along = (UPPER_ARM_M**2 - FOREARM_M**2 + distance**2) / (2 * max(distance, 1e-9))
+    along = float(np.clip(along, -UPPER_ARM_M, UPPER_ARM_M))
+    up = np.array([0.0, 0.0, 1.0]) - axis[2] * axis
+    if np.linalg.norm(up) < 1e-6:  # The wrist is on the base axis: no elbow is furthest out.
+        up = np.array([-np.cos(near[0]), np.sin(near[0]), 0.0])
+    up /= np.linalg.norm(up)
+    turn = np.deg2rad(elbow_deg)
+    side = np.cos(turn) * up + np.sin(turn) * np.cross(axis, up)
+    return along * axis + np.sqrt(UPPER_ARM_M**2 - along**2) * side
+
+
+def _angles(elbow: Array, wrist: Array, turn: Array, flips: tuple[int, ...]) -> Array:
+    """Joint positions of the arm without offsets, [joint].
+
+    Its tool frame is Rz(−q1) Ry(q2) Rz(−q3) Ry(q4) Rz(−q5) Ry(q6) Rz(−q7) in the base frame, with every link
+    along z of its own frame; `flips` are the signs of q2, q4 and q6.
+    """
+    upper = elbow / np.linalg.norm(elbow)
+    lower = (wrist - elbow) / np.linalg.norm(wrist - elbow)
+    q = np.empty(JOINTS)
+    q[0], q[1] = _point(upper, flips[0])
+    frame = _rz(-q[0]) @ _ry(q[1])
+    q[2], q[3] = _point(frame.T @ lower, flips[1])
+    frame = frame @ _rz(-q[2]) @ _ry(q[3])
+    hand = frame.T @ turn
+    q[4], q[5] = _point(hand[:, 2], flips[2])
+    last = (_rz(-q[4]) @ _ry(q[5])).T @ hand
+    q[6] = -np.arctan2(last[1, 0], last[0, 0])
+    return q
+
+
+def _point(direction: Array, sign: int) -> tuple[float, float]:
+    """Angles (a, b) with Rz(−a) Ry(b) z = direction and b of the given sign."""
+    x, y, z = direction
+    return -float(np.arctan2(sign * y, sign * x)), sign * float(np.arctan2(np.hypot(x, y), z))
+
+
+def _rz(angle: float) -> Array:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _ry(angle: float) -> Array:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
