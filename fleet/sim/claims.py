@@ -1,0 +1,99 @@
+"""Who may claim what, and who gets it: slots, legal actions, and one winner per job and station."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleet.sim.state import DONE, IDLE, WAITING, WORKING, State, World
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Claims:
+    """Outcome of one round of claims."""
+
+    won: Array
+    """Index of the job each arm was awarded, int [env, arm], −1 for none."""
+    lost: Array
+    """A legal claim that somebody else won, bool [env, arm]."""
+    illegal: Array
+    """An action outside the mask, bool [env, arm]."""
+    wanted: Array
+    """The job each arm legally claimed, int [env, arm], −1 for none."""
+
+
+def slots(world: World, state: State) -> Array:
+    """Jobs on offer, oldest in the queue first, int [env, slot], −1 for an empty slot.
+
+    A job is on offer once it is released, all jobs it waits for are done, and nobody works on it. A job that a
+    fault sent back queues again at the end, so it does not block the others.
+    """
+    jobs = world.jobs
+    time_s = (state.tick * world.dt_s)[:, None]
+    done = np.concatenate([state.status == DONE, np.ones((world.envs, 1), dtype=bool)], axis=1)  # column −1: no job
+    ready = np.take_along_axis(done[:, None, :], jobs.after, axis=2).all(axis=-1)
+    offered = jobs.exists & (state.status == WAITING) & (jobs.release_s <= time_s) & ready
+    key = np.where(offered, state.queued_s, np.inf)
+    order = np.argsort(key, axis=1, kind="stable")[:, : world.slots]
+    found = np.where(np.take_along_axis(offered, order, axis=1), order, -1)
+    if found.shape[1] < world.slots:
+        found = np.pad(found, ((0, 0), (0, world.slots - found.shape[1])), constant_values=-1)
+    return found
+
+
+def occupied(world: World, state: State) -> Array:
+    """Which stations have an arm at work, bool [env, station + 1]; the last column is a dummy, always free."""
+    taken = np.zeros((world.envs, len(world.stations) + 1), dtype=bool)
+    env, arm = np.nonzero(state.mode == WORKING)
+    at = world.jobs.stations[env, state.job[env, arm]]  # [row, n], −1 points at the dummy
+    taken[env[:, None], at] = True
+    taken[:, -1] = False
+    return taken
+
+
+def legal(world: World, state: State, on_offer: Array) -> Array:
+    """Legal actions, bool [env, arm, slot + 1]; action 0, wait or go on, always is."""
+    envs, arms = state.mode.shape
+    env = np.arange(envs)[:, None]
+    filled = on_offer >= 0
+    busy = occupied(world, state)[env[..., None], world.jobs.stations[env, on_offer]].any(axis=-1)  # [env, slot]
+    can = np.take_along_axis(world.offers.plan, on_offer[:, None, :], axis=2) >= 0  # [env, arm, slot]
+    free = (state.mode == IDLE)[..., None]
+    mask = np.ones((envs, arms, world.slots + 1), dtype=bool)
+    mask[..., 1:] = free & (filled & ~busy)[:, None, :] & can
+    return mask
+
+
+def resolve(world: World, state: State, on_offer: Array, mask: Array, actions: Array, scores: Array) -> Claims:
+    """Award every claimed job to one arm: the lower shared score wins, then the lower index.
+
+    Args:
+        on_offer: [env, slot] of `slots`.
+        mask: [env, arm, slot + 1] of `legal`.
+        actions: int [env, arm]; anything outside the mask counts as illegal and as a wait.
+        scores: Shared difficulty, [env, arm, slot]; NaN loses against any number.
+    """
+    envs, arms = actions.shape
+    env, arm = np.arange(envs)[:, None], np.arange(arms)[None, :]
+    inside = (actions >= 0) & (actions <= world.slots)
+    chosen = np.where(inside, actions, 0)
+    allowed = inside & mask[env, arm, chosen]
+    slot = np.where(allowed & (chosen > 0), chosen - 1, -1)
+    wanted = np.where(slot >= 0, on_offer[env, slot], -1)
+    score = np.where(slot >= 0, scores[env, arm, slot], np.inf)
+    order = np.argsort(np.where(np.isnan(score), np.inf, score), axis=1, kind="stable")
+    taken = np.zeros((envs, world.jobs.exists.shape[1] + 1), dtype=bool)
+    busy = occupied(world, state)
+    won = np.full_like(wanted, -1)
+    rows = np.arange(envs)
+    for rank in range(arms):
+        who = order[:, rank]
+        job = wanted[rows, who]
+        at = world.jobs.stations[rows, job]
+        gets = (job >= 0) & ~taken[rows, job] & ~busy[rows[:, None], at].any(axis=1)
+        won[rows[gets], who[gets]] = job[gets]
+        taken[rows[gets], job[gets]] = True
+        busy[rows[gets][:, None], at[gets]] = True
+        busy[:, -1] = False
+    return Claims(won=won, lost=(wanted >= 0) & (won < 0), illegal=~allowed, wanted=wanted)

@@ -1,0 +1,182 @@
+"""From nouns to arrays: the plan table, the offers of every arm for every job, and the world of a shift."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleet.difficulty import Difficulty, DifficultyModel
+from fleet.job import Job, Work, precedence
+from fleet.motion import Drive, Plan, drive
+from fleet.motor import Motors, stack_motors
+from fleet.robot import GEN3, Robot, ThermalLimits
+from fleet.sim.state import JobTable, Offers, PlanTable, World
+from fleet.thermal import ThermalModel, settled, stack_models
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """One arm with everything that is its own."""
+
+    robot: Robot
+    motors: Motors
+    """[joint]."""
+    thermal: ThermalModel
+    rest_tau: Array
+    """Torque that holds the home posture, N·m, [joint]."""
+    model: DifficultyModel
+    """Its twin, or what stands in for it."""
+    plans: Mapping[Work, tuple[Plan, ...]]
+    """Variants per work it can do; a work it cannot do is missing."""
+
+    def rest_drive(self) -> Drive:
+        """Mean heat drive of standing at home, each [joint]."""
+        still = np.stack([self.robot.home_q(), np.zeros_like(self.rest_tau), self.rest_tau])[None]
+        return drive(still, self.motors)
+
+
+def warm_start(arm: Arm, ambient_c: float) -> Array:
+    """Temperatures of an arm that has stood powered at home for hours, °C, [node].
+
+    Raises:
+        ValueError: standing at home alone overheats it.
+    """
+    rest = arm.rest_drive()
+    temp = settled(arm.thermal, rest.current_sq, rest.friction_w, arm.motors, ambient_c)
+    if temp is None:
+        raise ValueError(f"Arm '{arm.robot.name}' never settles while standing at home in air of {ambient_c:g} °C.")
+    return temp
+
+
+def best_offer(arm: Arm, job: Job) -> tuple[Plan, Difficulty | None] | None:
+    """The variant of a job that the arm's twin finds easiest (without a score: the first), or None if it cannot."""
+    variants = arm.plans.get(job.work)
+    if not variants:
+        return None
+    scored = [(plan, arm.model.score(plan, job.repetitions)) for plan in variants]
+    return min(scored, key=lambda pair: pair[1].total if pair[1] is not None else 0.0)
+
+
+def build_world(
+    arms: Sequence[Arm],
+    shifts: Sequence[Sequence[Job]],
+    *,
+    limits: ThermalLimits,
+    dt_s: float,
+    ticks: int,
+    slots: int,
+    ambient_c: Array,
+    start_warm: bool,
+) -> tuple[World, tuple[Plan, ...]]:
+    """The world of one or more parallel shifts, and the plans behind the rows of its plan table.
+
+    Args:
+        shifts: The jobs of each env.
+        ambient_c: Air at each arm during each tick, [tick, arm].
+        start_warm: Arms begin at their idle equilibrium rather than at ambient.
+    """
+    motors = stack_motors([arm.motors for arm in arms])
+    thermal = stack_models([arm.thermal for arm in arms])
+    phi, gamma = thermal.step_matrices(dt_s)
+    plans, offers = _offers(arms, shifts)
+    rest = [arm.rest_drive() for arm in arms]
+    start = np.repeat(ambient_c[0][:, None], thermal.capacity.shape[-1], axis=1)
+    if start_warm:
+        start = np.stack([warm_start(a, c) for a, c in zip(arms, ambient_c[0].tolist(), strict=True)])
+    stations = tuple(dict.fromkeys(name for jobs in shifts for job in jobs for name in job.work.stations()))
+    world = World(
+        arms=tuple(arm.robot.name for arm in arms),
+        stations=stations,
+        dt_s=dt_s,
+        ticks=ticks,
+        slots=slots,
+        ambient_c=ambient_c,
+        thermal=thermal,
+        motors=motors,
+        limits=limits,
+        torque_warning=np.array(GEN3.torque_warning),
+        rest=Drive(np.stack([d.current_sq for d in rest]), np.stack([d.friction_w for d in rest])),
+        plans=_plan_table(plans, {arm.robot.name: arm.motors for arm in arms}),
+        jobs=_job_table(shifts, stations),
+        offers=offers,
+        start_c=start,
+        phi=phi,
+        gamma=gamma,
+    )
+    return world, plans
+
+
+def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]]) -> tuple[tuple[Plan, ...], Offers]:
+    shape = (len(shifts), len(arms), max(1, *(len(jobs) for jobs in shifts)))
+    plan, total, risk = np.full(shape, -1), np.full(shape, np.nan), np.full(shape, np.nan)
+    rows: dict[int, int] = {}
+    plans: list[Plan] = []
+    known: dict[tuple[int, Work, int], tuple[Plan, Difficulty | None] | None] = {}
+    for e, jobs in enumerate(shifts):
+        for j, job in enumerate(jobs):
+            for a, arm in enumerate(arms):
+                key = (a, job.work, job.repetitions)
+                if key not in known:
+                    known[key] = best_offer(arm, job)
+                offer = known[key]
+                if offer is None:
+                    continue
+                best, score = offer
+                if id(best) not in rows:
+                    rows[id(best)] = len(plans)
+                    plans.append(best)
+                plan[e, a, j] = rows[id(best)]
+                if score is not None:
+                    total[e, a, j] = score.total
+                    risk[e, a, j] = np.nan if score.p_saturation is None else score.p_saturation
+    return tuple(plans), Offers(plan=plan, difficulty=total, p_saturation=risk)
+
+
+def _plan_table(plans: Sequence[Plan], motors: Mapping[str, Motors]) -> PlanTable:
+    if not plans:
+        joints = len(GEN3.velocity)
+        empty = np.zeros((1, 3, joints))
+        return PlanTable(np.zeros((1, 3)), empty, empty, np.zeros((1, joints)))
+    drives = [[drive(phase.profile, motors[plan.arm]) for phase in plan.phases] for plan in plans]
+    peaks = [np.abs(np.concatenate([p.profile[:, 2] for p in plan.phases])).max(axis=0) for plan in plans]
+    return PlanTable(
+        times_s=np.array([[phase.duration_s for phase in plan.phases] for plan in plans]),
+        current_sq=np.array([[d.current_sq for d in row] for row in drives]),
+        friction_w=np.array([[d.friction_w for d in row] for row in drives]),
+        peak_tau=np.array(peaks, dtype=float),
+    )
+
+
+def _job_table(shifts: Sequence[Sequence[Job]], stations: Sequence[str]) -> JobTable:
+    most = max(1, *(len(jobs) for jobs in shifts))
+    waits = max((len(job.after) for jobs in shifts for job in jobs), default=0) or 1
+    places = max((len(job.work.stations()) for jobs in shifts for job in jobs), default=0) or 1
+    station = {name: i for i, name in enumerate(stations)}
+
+    def padded(value: float, dtype: type = float) -> Array:
+        return np.full((len(shifts), most), value, dtype=dtype)
+
+    table = JobTable(
+        names=tuple(tuple(job.name for job in jobs) for jobs in shifts),
+        exists=padded(False, bool),
+        release_s=padded(np.inf),
+        due_s=padded(np.inf),
+        value=padded(0.0),
+        payload_kg=padded(0.0),
+        repetitions=padded(1, int),
+        after=np.full((len(shifts), most, waits), -1),
+        stations=np.full((len(shifts), most, places), -1),
+    )
+    for e, jobs in enumerate(shifts):
+        precedence(jobs)
+        index = {job.name: j for j, job in enumerate(jobs)}
+        for j, job in enumerate(jobs):
+            table.exists[e, j] = True
+            table.release_s[e, j], table.due_s[e, j], table.value[e, j] = job.release_s, job.due_s, job.value
+            table.payload_kg[e, j], table.repetitions[e, j] = job.work.payload_kg, job.repetitions
+            table.after[e, j, : len(job.after)] = [index[name] for name in job.after]
+            names = job.work.stations()
+            table.stations[e, j, : len(names)] = [station[name] for name in names]
+    return table
