@@ -1,0 +1,102 @@
+"""Names on the wire: every key is built and parsed here, and nowhere else.
+
+`thermofleet/v1/{fleet}/…` with `arm/{arm}/{topic}`, `auction/{auctioneer}/{topic}` and `jobs/submit`. Names of fleets,
+arms and auctioneers are percent-encoded to one chunk, so no name can smuggle a wildcard, a `/` or an `@` into a key
+(a chunk that begins with `@` is matched by no wildcard, and its history is silently lost).
+"""
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+from urllib.parse import quote, unquote
+
+Role = Literal["arm", "auction", "jobs"]
+ArmTopic = Literal["alive", "state", "info", "difficulty", "event", "quote", "award"]
+AuctionTopic = Literal["announce", "result"]
+
+PREFIX = "thermofleet/v1"
+TOPICS: dict[Role, tuple[str, ...]] = {
+    "arm": get_args(ArmTopic),
+    "auction": get_args(AuctionTopic),
+    "jobs": ("submit",),
+}
+_ROLES: dict[str, Role] = {str(role): role for role in TOPICS}
+
+
+@dataclass(frozen=True)
+class Key:
+    """A concrete key, taken apart."""
+
+    fleet: str
+    role: Role
+    name: str
+    """Of the arm or the auctioneer; "" for jobs."""
+    topic: str
+
+    def __str__(self) -> str:
+        """The key as it goes over the wire.
+
+        Raises:
+            ValueError: a name is empty or no valid Unicode, or the topic does not belong to the role.
+        """
+        if self.role not in TOPICS:
+            raise ValueError(f"Unknown role '{self.role}' of a key. Allowed: {', '.join(TOPICS)}.")
+        if self.topic not in TOPICS[self.role]:
+            raise ValueError(f"Unknown topic '{self.topic}' of '{self.role}'. Allowed: {', '.join(TOPICS[self.role])}.")
+        start = f"{PREFIX}/{_chunk(self.fleet)}/{self.role}"
+        if self.role != "jobs":
+            return f"{start}/{_chunk(self.name)}/{self.topic}"
+        if self.name:
+            raise ValueError(f"The keys under jobs belong to nobody (got the name {self.name!r}).")
+        return f"{start}/{self.topic}"
+
+
+def of_arm(fleet: str, arm: str, topic: ArmTopic) -> str:
+    """Key of what one arm says: `thermofleet/v1/{fleet}/arm/{arm}/{topic}`."""
+    return str(Key(fleet, "arm", arm, topic))
+
+
+def of_every_arm(fleet: str, topic: ArmTopic) -> str:
+    """Key expression that matches the topic of every arm of one fleet; for subscribers and queries, never for a put."""
+    return of_arm(fleet, "x", topic).replace("/arm/x/", "/arm/*/")
+
+
+def of_auction(fleet: str, auctioneer: str, topic: AuctionTopic) -> str:
+    """Key of what one auctioneer says: `thermofleet/v1/{fleet}/auction/{auctioneer}/{topic}`."""
+    return str(Key(fleet, "auction", auctioneer, topic))
+
+
+def job_submission(fleet: str) -> str:
+    """Key at which outsiders hand in jobs: `thermofleet/v1/{fleet}/jobs/submit`."""
+    return str(Key(fleet, "jobs", "", "submit"))
+
+
+def parse(key: str) -> Key:
+    """The concrete key taken apart, the inverse of `str`.
+
+    Raises:
+        ValueError: not a key of this version, or not written as `str(Key(...))` would write it (wildcards, for one).
+    """
+    parts = key.split("/")
+    named = len(parts) == 6
+    if "/".join(parts[:2]) != PREFIX or not (named or len(parts) == 5):
+        raise ValueError(f"'{key}' is no key of this bus: expected {PREFIX}/{{fleet}}/{{arm|auction|jobs}}/….")
+    role = _ROLES.get(parts[3])
+    if role is None or named == (role == "jobs"):
+        raise ValueError(f"'{key}' has no such place: expected arm/{{arm}}/…, auction/{{auctioneer}}/… or jobs/submit.")
+    try:
+        names = [unquote(part, errors="strict") for part in (parts[2], parts[4] if named else "")]
+    except UnicodeDecodeError as error:
+        raise ValueError(f"'{key}' holds a percent escape that is no UTF-8.") from error
+    parsed = Key(names[0], role, names[1], parts[-1])
+    if str(parsed) != key:
+        raise ValueError(f"'{key}' is not written as one concrete key should be: expected '{parsed}'.")
+    return parsed
+
+
+def _chunk(name: str) -> str:
+    if not name:
+        raise ValueError("A name in a key must not be empty.")
+    try:
+        return quote(name, safe="")
+    except UnicodeEncodeError as error:
+        raise ValueError(f"The name {name!r} is no valid Unicode text.") from error
