@@ -36,8 +36,8 @@ class _Card(msgspec.Struct, forbid_unknown_fields=True):
     seed: str
     config: TwinConfig
     turn_q: list[float]
-    mean: list[list[float]]
-    std: list[list[float]]
+    mean: list[tuple[float, float, float]]
+    std: list[tuple[float, float, float]]
     still: list[bool]
     fits: list[JointFit]
 
@@ -77,8 +77,7 @@ def load(folder: Path, *, joints: int = JOINTS) -> Twin:
     if len(card.turn_q) != joints:
         raise CheckpointError(f"{folder / CARD}: the twin has {len(card.turn_q)} joints, the arm has {joints}.")
     scaler = Scaler(np.array(card.turn_q), np.array(card.mean), np.array(card.std), np.array(card.still))
-    shapes = {scaler.mean.shape, scaler.std.shape, (len(scaler.still), 3), (len(card.fits), 3)}
-    if shapes != {(joints, 3)}:
+    if {len(part) for part in (scaler.mean, scaler.std, scaler.still, card.fits)} != {joints}:
         raise CheckpointError(f"{folder / CARD}: mean, std, still and fits must each have {joints} joints.")
     nets = _read_nets(folder / WEIGHTS, card.config, joints)
     twin = Twin(card.config, scaler, nets, arm=card.arm, data_hash=card.data_hash, seed=card.seed, fits=card.fits)

@@ -1,6 +1,7 @@
 """Training the twin of one arm from motion that stayed cool."""
 
 import hashlib
+import math
 from collections.abc import Callable, Sequence
 
 import msgspec
@@ -27,6 +28,16 @@ class CollapsedPosterior(FleetError):
         super().__init__(
             f"The twin of '{arm}' learned nothing of joint {joint + 1}: KL {kl_nats:.2f} nat, {active} active latent "
             "unit(s). Lower beta, train longer (epochs, max_windows), or set allow_collapse to keep it as a baseline."
+        )
+        self.joint = joint
+
+
+class Diverged(FleetError):
+    """No training of a joint ended with finite weights."""
+
+    def __init__(self, arm: str, joint: int) -> None:
+        super().__init__(
+            f"The training of joint {joint + 1} of '{arm}' ended without finite weights. Lower learning_rate or clip."
         )
         self.joint = joint
 
@@ -73,6 +84,7 @@ def train(
     Raises:
         ValueError: no records, or one that is misshapen or not finite.
         CollapsedPosterior: a joint that did move in training has no latent to speak of.
+        Diverged: the optimiser lost its way on some joint.
     """
     windows = windows_of(
         records, from_hz=config.record_hz, rate_hz=config.rate_hz, window=config.window, stride=config.stride
@@ -94,6 +106,9 @@ def train(
                 own = _child(seed, joint, restart)
                 net = fit_joint(x, noise[joint], config, own, progress=report)
                 candidates.append((_assess(net, x, config, own, restart), net))
+            candidates = [(fit, net) for fit, net in candidates if math.isfinite(fit.elbo)]
+            if not candidates:
+                raise Diverged(arm, joint)
             fit, net = max(candidates, key=lambda pair: pair[0].elbo)
             if collapsed(fit.kl, fit.active_units) and not (config.allow_collapse or scaler.still[joint]):
                 raise CollapsedPosterior(arm, joint, fit.kl, fit.active_units)

@@ -1,0 +1,140 @@
+import gc
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fleet.difficulty import DifficultyModel
+from fleet.motion import Phase
+from twin.window import cut, resample
+
+
+def test_the_twin_is_a_difficulty_model(twin, plan):
+    model: DifficultyModel = twin
+    difficulty = model.score(plan, 10)
+    assert difficulty is not None
+    assert difficulty.per_joint.shape == (7,)
+    assert 0 <= difficulty.total < 7
+    assert np.all(difficulty.per_joint >= 0)
+
+
+def test_a_score_repeats_even_in_another_batch_or_process(twin, plan, make_plan, motion, rng):
+    others = [make_plan(*(motion(rng, s) for s in (2.0, 6.0, 2.0))) for _ in range(9)]
+    first = twin.score(plan, 3).per_joint
+    fresh = pickle.loads(pickle.dumps(twin))
+    fresh.phase_errors([*others, plan])
+    np.testing.assert_array_equal(first, twin.score(plan, 3).per_joint)
+    np.testing.assert_allclose(first, fresh.score(plan, 3).per_joint, rtol=1e-6)
+
+
+@pytest.mark.parametrize("joint", [1, 3, 5])
+def test_more_torque_than_known_raises_the_score_of_that_joint_alone(twin, plan, joint):
+    def heavier(phase: Phase) -> Phase:
+        profile = phase.profile.copy()
+        profile[:, 2, joint] *= 3
+        return Phase(profile, phase.payload_kg)
+
+    known = twin.score(plan, 10).per_joint
+    loaded_plan = replace(plan, **{name: heavier(getattr(plan, name)) for name in ("approach", "cycle", "retreat")})
+    rise = twin.score(loaded_plan, 10).per_joint - known
+    assert rise[joint] > 0.05
+    assert np.all(np.abs(np.delete(rise, joint)) < 1e-6)
+    assert twin.shares(loaded_plan, 10)[joint, 2] > twin.shares(plan, 10)[joint, 2]
+
+
+def test_errors_far_beyond_training_stay_below_one(twin, plan):
+    far = replace(plan, cycle=Phase(plan.cycle.profile * 1000, plan.cycle.payload_kg))
+    d = twin.score(far, 10).per_joint
+    assert np.all(d < 1)
+    assert d.sum() < 7
+
+
+def test_many_repetitions_approach_the_cycle_alone(twin, plan):
+    cycle = twin.phase_errors([plan])[0, 1]
+    gaps = [np.abs(twin.job_errors(plan, n) - cycle).max() for n in (1, 10, 100, 10_000)]
+    assert gaps == sorted(gaps, reverse=True)
+    assert gaps[-1] < 1e-3
+
+
+def test_the_job_error_is_the_mean_over_its_time(twin, plan):
+    per_phase = twin.phase_errors([plan])[0]
+    times = np.array([3.0, 4 * 10.0, 2.5])
+    want = (times[:, None, None] * per_phase).sum(0) / times.sum()
+    np.testing.assert_allclose(twin.job_errors(plan, 4), want)
+
+
+def test_the_phase_error_is_the_plain_mean_of_the_reconstruction_error(twin, make_plan, motion, rng):
+    plan = make_plan(motion(rng, 4.0), motion(rng, 8.0), motion(rng, 4.0))
+    windows = cut(resample(plan.cycle.profile, 50.0, 12.5), 50, 50)
+    away = np.abs(windows - twin.reconstruct(windows)) / twin.scaler.std
+    np.testing.assert_allclose(twin.phase_errors([plan])[0, 1], away.mean(axis=(0, 1)), rtol=1e-4)
+
+
+def test_shares_sum_to_one(twin, plan):
+    shares = twin.shares(plan, 2)
+    assert shares.shape == (7, 3)
+    assert np.all(shares >= 0)
+    assert shares.sum() == pytest.approx(1.0)
+
+
+def test_an_empty_phase_weighs_nothing(twin, plan):
+    nothing = Phase(np.zeros((0, 3, 7), np.float32), np.zeros(0, np.float32))
+    still = replace(plan, approach=nothing, retreat=nothing)
+    np.testing.assert_allclose(twin.job_errors(still, 1), twin.phase_errors([plan])[0, 1], rtol=1e-6)
+    with pytest.raises(ValueError, match="no motion"):
+        twin.score(replace(still, cycle=nothing), 1)
+
+
+def test_plans_are_remembered_only_while_they_live(twin, make_plan, motion, rng):
+    fresh = pickle.loads(pickle.dumps(twin))
+    plan = make_plan(*(motion(rng, 2.0) for _ in range(3)))
+    fresh.score(plan, 1)
+    assert len(fresh._known) == 1
+    del plan
+    gc.collect()
+    assert len(fresh._known) == 0
+
+
+def test_plans_in_one_call_keep_their_order(twin, make_plan, motion, rng):
+    plans = [make_plan(*(motion(rng, s) for s in (1.0, 5.0, 1.5))) for _ in range(4)]
+    together = twin.phase_errors([*plans, plans[0]])
+    fresh = pickle.loads(pickle.dumps(twin))
+    alone = np.stack([fresh.phase_errors([plan])[0] for plan in [*plans, plans[0]]])
+    assert together.shape == (5, 3, 7, 3)
+    np.testing.assert_allclose(together, alone, rtol=1e-6)
+    assert twin.phase_errors([]).shape == (0, 3, 7, 3)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_plan_that_is_not_finite_is_refused(twin, plan, value):
+    plan.cycle.profile[3, 1, 2] = value
+    with pytest.raises(ValueError, match="Cycle of arm 'arm' is not finite: qd of joint 3 at sample 3"):
+        twin.score(plan, 1)
+
+
+def test_a_job_without_repetitions_is_refused(twin, plan):
+    with pytest.raises(ValueError, match="at least one repetition"):
+        twin.score(plan, 0)
+
+
+def test_a_plan_of_another_arm_is_refused(twin, plan):
+    short = replace(plan, cycle=Phase(plan.cycle.profile[:, :, :6], plan.cycle.payload_kg))
+    with pytest.raises(ValueError, match="has 7 joints, the plan 6"):
+        twin.score(short, 1)
+
+
+def test_known_motion_fills_the_latent_like_the_prior(twin, records):
+    windows = np.concatenate([cut(resample(record, 50.0, 12.5), 50, 50) for record in records])
+    z = twin.latent(windows)
+    assert z.shape == (len(windows), 7, 2)
+    active = z.var(axis=0) > 0.01
+    assert active.any(axis=1).all()
+    assert np.abs(z.mean(axis=0)).max() < 0.6
+    assert z.std(axis=0).max() < 1.5
+
+
+@pytest.mark.parametrize("bad", [np.zeros((2, 40, 7, 3)), np.full((2, 50, 7, 3), np.nan)])
+def test_windows_that_do_not_fit_are_refused(twin, bad):
+    with pytest.raises(ValueError, match="Windows must be"):
+        twin.latent(bad)

@@ -1,0 +1,127 @@
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
+
+import numpy as np
+import pytest
+import torch
+
+from fleet.errors import FleetError
+from twin.loss import negative_elbo
+from twin.model import TwinConfig, build
+from twin.train import CollapsedPosterior, Diverged, hash_records, seed_text, train, training_key
+
+SEED = np.random.SeedSequence(11)
+
+
+@pytest.fixture(scope="module")
+def tiny() -> TwinConfig:
+    return TwinConfig(hidden=8, max_windows=64, epochs=3, batch=32, restarts=2, allow_collapse=True)
+
+
+def test_the_loss_falls_on_one_batch():
+    net = build(TwinConfig(hidden=16), seed=0)
+    draw = torch.Generator().manual_seed(0)
+    time = torch.arange(50) / 12.5
+    phase = 6.28 * torch.rand(32, 1, 1, generator=draw)
+    x = 2 * torch.sin(time[None, :, None] + phase + torch.tensor([0.0, 1.57, 0.5]))
+    optimizer = torch.optim.Adam(net.parameters(), lr=1e-2)
+    losses = []
+    for _ in range(120):
+        optimizer.zero_grad()
+        loss = negative_elbo(x, *net(x, torch.randn(32, 2, generator=draw)), beta=1.0)
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.6 * losses[0]
+
+
+def test_the_twin_knows_its_training_better_than_their_mean(twin):
+    for fit in twin.fits:
+        assert fit.mean_squared_error < 0.75
+        assert fit.kl > 0.5
+        assert fit.active_units >= 1
+
+
+def test_the_same_seed_gives_the_same_weights(records, tiny):
+    first = train(records, tiny, SEED, arm="a")
+    again = train(records, tiny, SEED, arm="a")
+    other = train(records, tiny, np.random.SeedSequence(12), arm="a")
+    assert first.version == again.version != other.version
+    for name, tensor in first.tensors().items():
+        assert torch.equal(tensor, again.tensors()[name])
+
+
+def test_training_leaves_global_random_states_and_threads_alone(records, tiny):
+    before, threads = torch.random.get_rng_state(), torch.get_num_threads()
+    train(records, tiny, SEED, arm="a")
+    assert torch.equal(before, torch.random.get_rng_state())
+    assert torch.get_num_threads() == threads
+
+
+def test_another_process_trains_the_same_twin(records, tiny):
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        there = pool.submit(train, records[:8], tiny, SEED, arm="a").result(timeout=60)
+    assert there.version == train(records[:8], tiny, SEED, arm="a").version
+
+
+def test_the_best_restart_stays(records, tiny):
+    both = train(records, tiny, SEED, arm="a")
+    first = train(records, replace(tiny, restarts=1), SEED, arm="a")
+    assert all(b.elbo >= f.elbo for b, f in zip(both.fits, first.fits, strict=True))
+    assert any(b.restart == 1 for b in both.fits)
+
+
+def test_progress_rises_to_one(records, tiny):
+    told: list[float] = []
+    train(records[:4], tiny, SEED, arm="a", progress=told.append)
+    assert told == sorted(told)
+    assert told[-1] == pytest.approx(1.0)
+    assert len(told) == 7 * 2 * 3
+
+
+def test_a_collapsed_posterior_is_an_error_with_advice(records, small):
+    drowned = replace(small, beta=1000.0, epochs=8, max_windows=128)
+    with pytest.raises(CollapsedPosterior, match="Lower beta") as caught:
+        train(records, drowned, SEED, arm="arm_3")
+    assert isinstance(caught.value, FleetError)
+    assert "arm_3" in str(caught.value)
+    kept = train(records, replace(drowned, allow_collapse=True), SEED, arm="arm_3")
+    assert max(fit.kl for fit in kept.fits) < 0.5
+
+
+def test_a_joint_that_stood_still_may_have_nothing_to_say(records, small):
+    held = [record.copy() for record in records]
+    for record in held:
+        record[:, :, 4:] = record[0, :, 4:] = 0.5
+    twin = train(held, replace(small, epochs=25, noise=(0.0, 0.0, 0.0)), SEED, arm="a")
+    assert twin.scaler.still.tolist() == [False] * 4 + [True] * 3
+
+
+def test_diverged_training_is_an_error(records, tiny):
+    with pytest.raises(Diverged, match="Lower learning_rate"):
+        train(records, replace(tiny, learning_rate=1e30, clip=1e30, epochs=5), SEED, arm="a")
+
+
+def test_the_key_changes_with_data_configuration_and_seed(records, tiny):
+    key = training_key(records, tiny, SEED)
+    assert key == training_key([record.copy() for record in records], tiny, np.random.SeedSequence(11))
+    changed = [records[0] + 1e-6, *records[1:]]
+    others = [
+        training_key(changed, tiny, SEED),
+        training_key(records[1:], tiny, SEED),
+        training_key(records, replace(tiny, beta=2.0), SEED),
+        training_key(records, tiny, np.random.SeedSequence(12)),
+        training_key(records, tiny, np.random.SeedSequence(11, spawn_key=(1,))),
+    ]
+    assert len({key, *others}) == 6
+
+
+def test_the_data_is_named_by_its_content_unless_told(records, tiny):
+    one = replace(tiny, epochs=1, restarts=1)
+    assert train(records[:2], one, SEED, arm="a").data_hash == hash_records(records[:2])
+    assert train(records[:2], one, SEED, arm="a", data_hash="lot 7").data_hash == "lot 7"
+
+
+def test_a_seed_reads_as_entropy_and_spawn_key():
+    assert seed_text(np.random.SeedSequence(5, spawn_key=(1, 2))) == "5/1.2"
