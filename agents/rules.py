@@ -1,0 +1,130 @@
+"""Dispatching rules: the ladder's lowest rungs, each with one idea.
+
+All of them keep the fleet busy: an arm that may work does. They differ in who takes which job.
+"""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from agents.policy import WAIT, Policy, legal_slots
+from fleet.env.observation import Observation
+from fleet.errors import nearest
+
+
+class RandomLegal:
+    """Every free arm claims a random legal job."""
+
+    def __init__(self) -> None:
+        self._rng = np.random.default_rng(0)
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Begin a shift."""
+        self._rng = rng
+
+    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+        """A uniform choice among the legal claims of each arm; WAIT only where there is none."""
+        return {arm: self._choose(obs) for arm, obs in observations.items()}
+
+    def _choose(self, observation: Observation) -> int:
+        choices = legal_slots(observation)
+        return int(self._rng.choice(choices)) + 1 if choices else WAIT
+
+
+class RoundRobin:
+    """The oldest job goes to the next arm in turn that is free and able."""
+
+    def __init__(self) -> None:
+        self._turn = 0
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Begin a shift: the first arm's turn."""
+        self._turn = 0
+
+    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+        """Walk the queue from the oldest job, handing each to the next able arm."""
+        arms = list(observations)
+        actions = dict.fromkeys(arms, WAIT)
+        for slot in _slots(observations):
+            for step in range(len(arms)):
+                arm = arms[(self._turn + step) % len(arms)]
+                if actions[arm] == WAIT and observations[arm].action_mask[slot + 1]:
+                    actions[arm] = slot + 1
+                    self._turn = (self._turn + step + 1) % len(arms)
+                    break
+        return actions
+
+
+class CoolestFirst:
+    """The oldest job goes to the free arm with most headroom."""
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Nothing to begin."""
+
+    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+        """Walk the queue from the oldest job, handing each to the coolest able arm."""
+        coolest = sorted(observations, key=lambda arm: -float(observations[arm].headroom_k))
+        actions = dict.fromkeys(observations, WAIT)
+        for slot in _slots(observations):
+            for arm in coolest:
+                if actions[arm] == WAIT and observations[arm].action_mask[slot + 1]:
+                    actions[arm] = slot + 1
+                    break
+        return actions
+
+
+class LeastDifficulty:
+    """The pair of free arm and offered job with the lowest shared difficulty first.
+
+    An arm leaves a job to a peer that is free and told a lower difficulty, and takes the easiest of the rest. Each
+    arm decides from its own observation alone, so it works as well on every arm by itself.
+    """
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Nothing to begin."""
+
+    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+        """Each arm's claim from its own observation."""
+        return {arm: self._choose(obs) for arm, obs in observations.items()}
+
+    def _choose(self, observation: Observation) -> int:
+        open_slots = legal_slots(observation)
+        if not open_slots:
+            return WAIT
+        own = np.where(observation.known > 0, observation.difficulty, np.inf)
+        free = (observation.peer_heard > 0) & (observation.peer_working == 0) & (observation.peer_faulted == 0)
+        told = np.where((observation.peer_known > 0) & free[:, None], observation.peer_difficulty, np.inf)
+        # Greedy matching of everyone free, as this arm sees it: the easiest pair first, then the next.
+        costs = np.vstack([own, told])[:, open_slots]
+        while np.isfinite(costs).any():
+            who, column = np.unravel_index(int(np.argmin(costs)), costs.shape)
+            if who == 0:
+                return open_slots[int(column)] + 1
+            costs[who, :] = np.inf
+            costs[:, column] = np.inf
+        return WAIT if np.isfinite(own[open_slots]).any() else open_slots[0] + 1
+
+
+def _slots(observations: Mapping[str, Observation]) -> range:
+    first = next(iter(observations.values()))
+    return range(len(first.offered))
+
+
+RULES: dict[str, Callable[[], Policy]] = {
+    "random": RandomLegal,
+    "round_robin": RoundRobin,
+    "coolest_first": CoolestFirst,
+    "least_difficulty": LeastDifficulty,
+}
+"""Policies by the name under which `--policy` knows them."""
+
+
+def make_policy(name: str) -> Policy:
+    """A fresh policy by name.
+
+    Raises:
+        ValueError: no such policy; names the nearest one.
+    """
+    if name not in RULES:
+        raise ValueError(f"No policy '{name}'{nearest(name, RULES)}")
+    return RULES[name]()
