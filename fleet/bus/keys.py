@@ -88,8 +88,12 @@ def parse(key: str) -> Key:
     except UnicodeDecodeError as error:
         raise ValueError(f"'{key}' holds a percent escape that is no UTF-8.") from error
     parsed = Key(names[0], role, names[1], parts[-1])
-    if str(parsed) != key:
-        raise ValueError(f"'{key}' is not written as one concrete key should be: expected '{parsed}'.")
+    try:
+        written = str(parsed)
+    except ValueError as error:
+        raise ValueError(f"'{key}' is no key of this bus: {error}") from error
+    if written != key:
+        raise ValueError(f"'{key}' is not written as one concrete key should be: expected '{written}'.")
     return parsed
 
 

@@ -1,0 +1,44 @@
+"""Words to say, for every test of an exchange."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from fleet.bus.exchange import Heard, Words
+
+
+def random_words(rng: np.random.Generator, arms: int, time_s: float, slots: int = 4) -> Words:
+    """Words with awkward floats, unknown scores, empty slots, and jobs that come and go between ticks."""
+    jobs = [f"job {number}" for number in rng.choice(8, size=slots, replace=False)]
+    for slot in np.flatnonzero(rng.random(slots) < 0.25):
+        jobs[slot] = ""
+    difficulty, p_saturation = rng.random((2, arms, slots)) * 10.0 ** rng.integers(-300, 1, (2, arms, slots))
+    difficulty[rng.random((arms, slots)) < 0.3] = np.nan
+    p_saturation[rng.random((arms, slots)) < 0.3] = np.nan
+    return Words(
+        time_s=time_s,
+        mode=rng.integers(0, 3, arms),
+        temp_c=rng.normal(40.0, 10.0, (arms, 7)),
+        headroom_k=rng.normal(10.0, 20.0, arms),
+        jobs=tuple(jobs),
+        difficulty=difficulty,
+        p_saturation=p_saturation,
+        twin=tuple(f"twin-{number}" for number in rng.integers(0, 2, arms)),
+    )
+
+
+def assert_equal(one: Heard, other: Heard) -> None:
+    """The same arrays to the last bit; NaN equals NaN."""
+    for name in ("mode", "headroom_k", "difficulty", "p_saturation", "age_s"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name, strict=True)
+
+
+@pytest.fixture
+def make_words() -> Callable[..., Words]:
+    return random_words
+
+
+@pytest.fixture
+def assert_same() -> Callable[[Heard, Heard], None]:
+    return assert_equal

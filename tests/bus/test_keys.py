@@ -1,0 +1,106 @@
+"""Keys: what is built is parsed back, and no name can leave its chunk."""
+
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet.bus import keys
+from fleet.bus.keys import TOPICS, Key
+
+names = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=30)
+wild = st.sampled_from(
+    ["*", "**", "@", "@v1", "a/b", "/", "a b", "$*", "?", "#", "%", "%2F", "ä", "机", ".", "..", "x//y"]
+)
+concrete = st.one_of(
+    st.sampled_from([(role, topic) for role, topics in TOPICS.items() for topic in topics]).flatmap(
+        lambda place: st.builds(
+            Key,
+            fleet=names | wild,
+            role=st.just(place[0]),
+            name=st.just("") if place[0] == "jobs" else names | wild,
+            topic=st.just(place[1]),
+        )
+    )
+)
+
+
+@given(concrete)
+def test_a_parsed_key_is_the_key_that_was_built(key):
+    assert keys.parse(str(key)) == key
+
+
+@given(concrete)
+def test_every_chunk_is_legal_and_visible_to_wildcards(key):
+    chunks = str(key).split("/")
+    assert all(chunks)
+    assert not any(chunk.startswith("@") for chunk in chunks)
+    assert not set("*$?#@ ") & set(str(key))
+    assert str(key).isascii()
+
+
+@given(concrete, concrete)
+def test_different_names_have_different_keys(one, other):
+    assert (str(one) == str(other)) == (one == other)
+
+
+@pytest.mark.parametrize(
+    ("built", "written"),
+    [
+        (keys.of_arm("f", "arm_0", "state"), "thermofleet/v1/f/arm/arm_0/state"),
+        (keys.of_arm("hall 2", "a/b", "alive"), "thermofleet/v1/hall%202/arm/a%2Fb/alive"),
+        (keys.of_every_arm("x", "difficulty"), "thermofleet/v1/x/arm/*/difficulty"),
+        (keys.of_auction("f", "@boss", "announce"), "thermofleet/v1/f/auction/%40boss/announce"),
+        (keys.job_submission("f"), "thermofleet/v1/f/jobs/submit"),
+    ],
+)
+def test_keys_are_written_as_the_design_says(built, written):
+    assert built == written
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "thermofleet/v1",
+        "thermofleet/v2/f/arm/a/state",
+        "other/v1/f/arm/a/state",
+        "thermofleet/v1/f/arm/*/state",
+        "thermofleet/v1/**",
+        "thermofleet/v1/f/arm//state",
+        "thermofleet/v1//arm/a/state",
+        "thermofleet/v1/f/arm/a/state/x",
+        "thermofleet/v1/f/arm/a/announce",
+        "thermofleet/v1/f/auction/a/state",
+        "thermofleet/v1/f/jobs/a/submit",
+        "thermofleet/v1/f/arm/state",
+        "thermofleet/v1/f/robot/a/state",
+        "thermofleet/v1/f/arm/a%zz/state",
+        "thermofleet/v1/f/arm/%ff/state",
+        "thermofleet/v1/f/arm/a b/state",
+        "thermofleet/v1/f/arm/%61/state",
+        "thermofleet/v1/f/arm/a%2f/state",
+        "thermofleet/v1/@f/arm/a/state",
+    ],
+)
+def test_what_is_no_concrete_key_is_refused(text):
+    with pytest.raises(ValueError, match=re.escape(f"'{text}'")):
+        keys.parse(text)
+
+
+@given(st.text(max_size=60))
+def test_any_text_is_parsed_or_refused(text):
+    try:
+        key = keys.parse(text)
+    except ValueError:
+        return
+    assert str(key) == text
+
+
+@pytest.mark.parametrize("name", ["", "\ud800"])
+def test_names_that_cannot_be_written_are_refused(name):
+    with pytest.raises(ValueError, match="name"):
+        keys.of_arm("f", name, "state")
+    with pytest.raises(ValueError, match="name"):
+        keys.of_auction(name, "a", "result")
