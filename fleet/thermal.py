@@ -217,8 +217,8 @@ def stack_models(models: list[ThermalModel]) -> ThermalModel:
 
 
 def node_heat(winding_w: Array, housing_w: Array) -> Array:
-    """Heat per node, W, [..., node], from heat into windings and into housings, each [..., joint]."""
-    return np.concatenate([winding_w, housing_w], axis=-1)
+    """Heat per node, W, [..., node], from heat into windings and into housings, each [..., joint] or broadcast."""
+    return np.concatenate(np.broadcast_arrays(winding_w, housing_w), axis=-1)
 
 
 def drive_heat(temp_c: Array, current_sq: Array, friction_w: Array, motors: Motors) -> Array:

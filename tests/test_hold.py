@@ -1,0 +1,215 @@
+"""How long an arm may hold: the published table, an independent solver, and what a person may type wrongly."""
+
+import json
+import math
+from io import StringIO
+
+import numpy as np
+import pytest
+import typer
+from rich.console import Console
+from scipy.integrate import solve_ivp
+from typer.testing import CliRunner
+
+from fleet.motor import gen3_motors, reference_current
+from fleet.robot import JOINTS, POSTURES
+from fleet.thermal import NODES, drive_heat, gen3_network, thermal_model
+from scenarios.hold import LIMITS_C, HoldError, as_json, as_table, courses, hold, hold_command
+
+J2, J4 = 1, 3
+
+app = typer.Typer()
+app.command("hold")(hold_command)
+app.callback()(lambda: None)  # Two levels, as in the real command line.
+
+
+def run(*arguments: str):
+    return CliRunner().invoke(app, ["hold", *arguments])
+
+
+# Scenario check of the identification at 25 °C: torque of joints 2 and 4, current of joint 2, minutes to 60 and 75 °C
+# from cold and from idle-warm.
+PUBLISHED = [
+    ("outstretched", 0.0, 23.5, 7.1, 2.30, None, None, None, None),
+    ("outstretched", 1.1, 33.2, 12.3, 3.25, 100.0, None, 71.0, None),
+    ("outstretched", 2.0, 41.2, 16.6, 4.03, 33.0, 88.0, 16.0, 68.0),
+    ("outstretched", 3.0, 50.1, 21.3, 4.89, 12.6, 30.0, 5.0, 18.0),
+    ("outstretched", 4.0, 58.9, 26.0, 5.76, 5.5, 12.7, 2.7, 6.5),
+    ("raised", 4.0, 51.0, 22.5, 4.99, 11.4, 27.0, 4.5, 16.0),
+    ("raised", 3.0, 43.3, 18.4, 4.24, 26.0, 63.0, 11.0, 46.0),
+    ("home", 4.0, 26.7, 18.1, 2.60, None, None, None, None),
+    ("home", 0.0, 8.7, 4.5, 0.85, None, None, None, None),
+]
+
+
+@pytest.mark.parametrize(("posture", "kg", "tau2", "tau4", "amps2", "cold60", "cold75", "warm60", "warm75"), PUBLISHED)
+def test_published_table(posture, kg, tau2, tau4, amps2, cold60, cold75, warm60, warm75):
+    result = hold(kg, posture, 25.0)
+    assert result.cold.torque_nm[J2] == pytest.approx(tau2, abs=0.1)
+    assert result.cold.torque_nm[J4] == pytest.approx(tau4, abs=0.1)
+    assert result.cold.current_a[J2] == pytest.approx(amps2, abs=0.015)
+    found = (result.cold.t60_min, result.cold.t75_min, result.idle_warm.t60_min, result.idle_warm.t75_min)
+    for times, published in zip(found, (cold60, cold75, warm60, warm75), strict=True):
+        if published is None:
+            assert times[J2] is None
+        else:
+            assert times[J2] == pytest.approx(published, rel=0.03)
+
+
+def test_the_rated_continuous_payload_settles_at_63():
+    # Kinova rates 1.1 kg at full reach as continuous, 4 kg in the mid-range.
+    assert hold(1.1, "outstretched").cold.steady_c[J2] == pytest.approx(63.0, abs=1.5)
+    assert hold(4.0, "home").cold.steady_c[J2] == pytest.approx(52.0, abs=1.5)
+    assert hold(0.0, "outstretched").cold.steady_c[J2] == pytest.approx(48.0, abs=1.5)
+
+
+def test_both_starts_settle_at_the_same_temperature():
+    result = hold(2.0, "raised", 30.0)
+    assert result.cold.steady_c == result.idle_warm.steady_c
+
+
+@pytest.mark.parametrize(("posture", "kg", "start"), [("outstretched", 4.0, "idle_warm"), ("raised", 3.0, "cold")])
+def test_times_agree_with_a_general_ode_solver_to_half_a_percent(posture, kg, start):
+    result = hold(kg, posture, 25.0)
+    model, motors, rest = thermal_model(gen3_network()), gen3_motors(), np.zeros(JOINTS)
+    current_sq = reference_current(np.array(result.cold.torque_nm), rest, motors) ** 2
+    idle = np.concatenate([rest, motors.idle_w])
+    start_c = np.full(NODES, 25.0)
+    if start == "idle_warm":
+        start_c = 25.0 + np.linalg.solve(model.laplacian, idle)
+
+    def slope(_: float, temp_c: np.ndarray) -> np.ndarray:
+        flow = model.to_ambient * 25.0 - model.laplacian @ temp_c
+        return (flow + drive_heat(temp_c, current_sq, rest, motors)) / model.capacity
+
+    def warns(_: float, temp_c: np.ndarray) -> float:
+        return temp_c[J2] - LIMITS_C[0]
+
+    def faults(_: float, temp_c: np.ndarray) -> float:
+        return temp_c[J2] - LIMITS_C[1]
+
+    solved = solve_ivp(slope, (0.0, 7200.0), start_c, events=[warns, faults], rtol=1e-9, atol=1e-9, method="LSODA")
+    course = getattr(result, start)
+    assert course.t60_min[J2] == pytest.approx(solved.t_events[0][0] / 60.0, rel=0.005)
+    assert course.t75_min[J2] == pytest.approx(solved.t_events[1][0] / 60.0, rel=0.005)
+
+
+def test_more_payload_is_never_slower_to_warn():
+    times = [hold(kg, "outstretched").cold.t60_min[J2] for kg in (0.8, 1.0, 1.2, 2.0, 4.0, 6.0, 8.0)]
+    minutes = [math.inf if t is None else t for t in times]
+    assert minutes == sorted(minutes, reverse=True)
+    assert minutes[0] == math.inf
+    assert minutes[-1] < 2.0
+
+
+def test_a_limit_is_passed_exactly_when_the_arm_settles_above_it():
+    for kg in (0.6, 0.8, 0.85, 0.9, 1.0, 1.8):
+        result = hold(kg, "outstretched")
+        for course in (result.cold, result.idle_warm):
+            for limit_c, times in zip(LIMITS_C, (course.t60_min, course.t75_min), strict=True):
+                for steady_c, minutes in zip(course.steady_c, times, strict=True):
+                    assert steady_c is not None
+                    assert (minutes is not None) == (steady_c > limit_c)
+
+
+def test_runaway_has_no_settling_temperature_but_has_times():
+    result = hold(7.0, "outstretched")
+    assert result.cold.steady_c == (None,) * JOINTS
+    assert result.cold.t75_min[J2] is not None
+    assert "never settles" in result.note
+    assert "torque warning of 56.7" in result.note
+
+
+def test_a_start_above_the_limit_passes_at_once():
+    hot, _ = courses(np.zeros(JOINTS), 60.0, thermal_model(gen3_network()), gen3_motors())
+    assert hot.t60_min == (0.0,) * JOINTS
+
+
+def test_better_cooling_buys_time_and_a_tool_costs_it():
+    base = hold(3.0).cold.t75_min[J2]
+    forced = hold(3.0, cooling="forced_air").cold.t75_min[J2]
+    tool = hold(2.0, tool_kg=1.0).cold
+    assert base is not None
+    assert forced is None or forced > base
+    assert tool.torque_nm == hold(3.0).cold.torque_nm  # Both are point masses at the flange.
+
+
+def test_a_posture_in_degrees_is_the_posture_by_name():
+    assert hold(3.0, "0,90,0,0,0,0,0").cold.torque_nm == pytest.approx(
+        hold(3.0, "outstretched").cold.torque_nm, abs=1e-3
+    )
+
+
+def test_json_has_lists_of_seven_and_nulls():
+    printed = run("--payload", "3", "--posture", "outstretched", "--ambient", "25", "--json")
+    assert printed.exit_code == 0
+    data = json.loads(printed.stdout)
+    assert (data["payload"], data["posture"], data["ambient_c"]) == (3.0, "outstretched", 25.0)
+    assert "55 °C" in data["note"]
+    assert "extrapolates" in data["note"]
+    for start in ("cold", "idle_warm"):
+        assert set(data[start]) == {"t60_min", "t75_min", "steady_c", "torque_nm", "current_a"}
+        assert all(len(values) == JOINTS for values in data[start].values())
+        assert data[start]["t60_min"][0] is None
+        assert data[start]["t75_min"][J2] > data[start]["t60_min"][J2] > 0
+    assert data == as_json(hold(3.0, "outstretched", 25.0))
+
+
+def test_table_names_every_joint_and_says_where_it_extrapolates():
+    printed = run("--payload", "4")
+    assert printed.exit_code == 0
+    assert all(f" {j} " in printed.stdout for j in range(1, JOINTS + 1))
+    text = " ".join(printed.stdout.split())
+    assert "Above 55 °C the model extrapolates" in text
+    assert "5.5 | 2.7" in text
+    assert "12.7 | 6.5" in text
+
+
+def test_table_fits_a_terminal():
+    console = Console(width=80, file=StringIO())
+    with console.capture() as printed:
+        console.print(as_table(hold(4.0, "0,90,0,0,0,0,0")))
+    assert max(len(line) for line in printed.get().splitlines()) <= 80
+    assert "…" not in printed.get()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--payload", "-1"], "0 kg or more (got -1.0)"),
+        (["--payload", "nan"], "0 kg or more (got nan)"),
+        (["--payload", "inf"], "0 kg or more (got inf)"),
+        (["--tool-kg", "-0.1"], "tool mass"),
+        (["--ambient", "nan"], "-40 … 60 °C (got nan)"),
+        (["--ambient", "300"], "-40 … 60 °C (got 300.0)"),
+        (["--posture", "outstreched"], "did you mean 'outstretched'?"),
+        (["--posture", ""], "Allowed: home"),
+        (["--posture", "1,2,3"], "7 comma-separated angles"),
+        (["--posture", "0,nan,0,0,0,0,0"], "7 comma-separated angles"),
+        (["--posture", "0,130,0,0,0,0,0"], "Joint 2 turns from"),
+        (["--payload", "14"], "at most 104 N·m"),
+        (["--cooling", "forced"], "did you mean 'forced_air'?"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_exit_code_2(arguments, says):
+    answer = run(*arguments)
+    assert answer.exit_code == 2
+    assert answer.stdout == ""
+    assert says in answer.stderr
+    assert answer.stderr.count("\n") == 1
+
+
+def test_a_word_for_a_number_is_refused():
+    answer = run("--payload", "heavy")
+    assert answer.exit_code == 2
+    assert "payload" in answer.stderr
+
+
+def test_every_named_posture_can_be_held():
+    for name in POSTURES:
+        assert hold(1.0, name).cold.steady_c[0] is not None
+
+
+def test_the_library_raises_its_own_error():
+    with pytest.raises(HoldError, match="No posture 'flat'"):
+        hold(1.0, "flat")

@@ -1,0 +1,437 @@
+"""The thermal network against closed forms, independent solvers, published figures and its own properties."""
+
+# MuJoCo is compiled and ships no type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from itertools import pairwise
+
+import mujoco
+import networkx as nx
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+
+from fleet.motor import Motors, gen3_motors, reference_current
+from fleet.robot import JOINTS, Cooling
+from fleet.thermal import (
+    AMBIENT_FACTOR,
+    HOUSING,
+    NODES,
+    WINDING,
+    ThermalModel,
+    ThermalSpread,
+    advance,
+    drive_heat,
+    gen3_network,
+    housing,
+    node_heat,
+    settled,
+    spread_motors,
+    stack_models,
+    thermal_model,
+    winding,
+)
+
+MODEL = thermal_model(gen3_network())
+MOTORS = gen3_motors()
+REST = np.zeros(JOINTS)
+J2, J4 = 1, 3
+
+heats = arrays(float, NODES, elements=st.floats(0.0, 60.0))
+states = arrays(float, NODES, elements=st.floats(10.0, 90.0))
+lengths = st.floats(0.01, 5000.0)
+
+
+def holding(tau2_nm: float, tau4_nm: float, tau6_nm: float = 1.0) -> np.ndarray:
+    """Squared reference current of a hold with these torques of joints 2, 4 and 6, A², [joint]."""
+    return reference_current(np.array([0, tau2_nm, 0, tau4_nm, 0, tau6_nm, 0]), REST, MOTORS) ** 2
+
+
+def idle_warm(ambient_c: float) -> np.ndarray:
+    """Where a powered arm without load settles, °C, [node]."""
+    return MODEL.steady(node_heat(REST, MOTORS.idle_w), ambient_c)
+
+
+def history(
+    current_sq: np.ndarray,
+    start_c: np.ndarray,
+    *,
+    minutes: float,
+    dt_s: float,
+    ambient_c: float = 25.0,
+    model: ThermalModel = MODEL,
+    motors: Motors = MOTORS,
+) -> np.ndarray:
+    """Temperatures at 0, dt, 2·dt, …, °C, [time, node], with the heat refreshed once per step."""
+    phi, gamma = model.step_matrices(dt_s)
+    rows = [start_c]
+    for _ in range(round(60.0 * minutes / dt_s)):
+        heat = drive_heat(rows[-1], current_sq, REST, motors)
+        rows.append(advance(rows[-1], heat, ambient_c, phi, gamma, model.to_ambient))
+    return np.array(rows)
+
+
+def crossing_min(temp_c: np.ndarray, limit_c: float, dt_s: float) -> float | None:
+    """Minutes until a rising history [time] passes a limit; None when it does not."""
+    above = np.flatnonzero(temp_c >= limit_c)
+    return None if above.size == 0 else float(above[0] * dt_s / 60.0)
+
+
+# Published behaviour -------------------------------------------------------------------------------------------------
+
+# Scenario check of the identification (MuJoCo gravity torques, 25 °C): torques of joints 2 and 4, minutes to 60 and
+# 75 °C from cold and from idle-warm, temperature after 30 min and after 3 h of holding from cold.
+HOLDS = {
+    "outstretched 0 kg": (23.5, 7.1, None, None, None, None, 38.5, 48.0),
+    "outstretched 1.1 kg": (33.2, 12.3, 100.0, None, 71.0, None, 47.9, 63.0),
+    "outstretched 2 kg": (41.2, 16.6, 33.0, 88.0, 16.0, 68.0, 58.8, 81.0),
+    "outstretched 3 kg": (50.1, 21.3, 12.6, 30.0, 5.0, 18.0, 75.1, 112.0),
+    "outstretched 4 kg": (58.9, 26.0, 5.5, 12.7, 2.7, 6.5, 97.5, 164.0),
+    "raised 4 kg": (51.0, 22.5, 11.4, 27.0, 4.5, 16.0, 77.0, 116.0),
+    "raised 3 kg": (43.3, 18.4, 26.0, 63.0, 11.0, 46.0, 62.0, 87.0),
+    "home 4 kg": (26.7, 18.1, None, None, None, None, 41.0, 52.0),
+}
+
+
+@pytest.mark.parametrize("name", HOLDS)
+def test_holds_heat_joint_2_as_published(name):
+    tau2, tau4, cold60, cold75, warm60, warm75, after_30_min, after_3_h = HOLDS[name]
+    dt_s = 2.0
+    cold = history(holding(tau2, tau4), np.full(NODES, 25.0), minutes=180, dt_s=dt_s)[:, J2]
+    warm = history(holding(tau2, tau4), idle_warm(25.0), minutes=180, dt_s=dt_s)[:, J2]
+    for temp_c, limit_c, published in (
+        (cold, 60.0, cold60),
+        (cold, 75.0, cold75),
+        (warm, 60.0, warm60),
+        (warm, 75.0, warm75),
+    ):
+        found = crossing_min(temp_c, limit_c, dt_s)
+        assert found is None if published is None else found == pytest.approx(published, rel=0.03, abs=0.05)
+    assert cold[round(30 * 60 / dt_s)] == pytest.approx(after_30_min, abs=0.4)
+    assert cold[-1] == pytest.approx(after_3_h, abs=0.7)
+
+
+def test_idle_arm_settles_where_the_logged_one_does():
+    published = [35.3, 32.6, 32.8, 34.3, 39.8, 41.5, 42.1]
+    np.testing.assert_allclose(idle_warm(22.0)[WINDING], published, atol=0.3)
+
+
+def test_published_settling_temperature_of_the_rated_continuous_payload():
+    # 1.1 kg at full reach is what Kinova rates for continuous use; it passes the warning, never the fault.
+    end = settled(MODEL, holding(33.2, 12.3), REST, MOTORS, 25.0)
+    assert end is not None
+    assert end[J2] == pytest.approx(63.0, abs=1.5)
+
+
+# The step ------------------------------------------------------------------------------------------------------------
+
+
+@settings(deadline=None)
+@given(states, heats, lengths, lengths)
+def test_two_steps_equal_one_long_step(start_c, heat_w, a_s, b_s):
+    twice = MODEL.step(MODEL.step(start_c, heat_w, 22.0, a_s), heat_w, 22.0, b_s)
+    np.testing.assert_allclose(twice, MODEL.step(start_c, heat_w, 22.0, a_s + b_s), atol=1e-9)
+
+
+@settings(deadline=None)
+@given(states, heats, heats, lengths)
+def test_more_loss_is_never_cooler(start_c, heat_w, more_w, dt_s):
+    cooler = MODEL.step(start_c, heat_w, 22.0, dt_s)
+    assert np.all(MODEL.step(start_c, heat_w + more_w, 22.0, dt_s) >= cooler - 1e-9)
+
+
+@settings(deadline=None)
+@given(states, heats, arrays(float, NODES, elements=st.floats(0.0, 20.0)), lengths)
+def test_a_hotter_start_is_never_cooler_later(start_c, heat_w, hotter_k, dt_s):
+    cooler = MODEL.step(start_c, heat_w, 22.0, dt_s)
+    assert np.all(MODEL.step(start_c + hotter_k, heat_w, 22.0, dt_s) >= cooler - 1e-9)
+
+
+@settings(deadline=None)
+@given(states, st.floats(-20.0, 40.0), lengths)
+def test_without_heat_everything_stays_between_its_extremes(start_c, ambient_c, dt_s):
+    end = MODEL.step(start_c, np.zeros(NODES), ambient_c, dt_s)
+    assert end.min() >= min(start_c.min(), ambient_c) - 1e-9
+    assert end.max() <= max(start_c.max(), ambient_c) + 1e-9
+
+
+@settings(deadline=None)
+@given(states, heats, st.floats(0.1, 5000.0))
+def test_a_step_is_the_matrix_exponential(start_c, heat_w, dt_s):
+    flow = -MODEL.laplacian / MODEL.capacity[:, None]
+    load = (heat_w + MODEL.to_ambient * 22.0) / MODEL.capacity
+    augmented = np.zeros((NODES + 1, NODES + 1))
+    augmented[:NODES, :NODES], augmented[:NODES, NODES] = flow, load
+    expected = (expm(augmented * dt_s) @ np.append(start_c, 1.0))[:NODES]
+    np.testing.assert_allclose(MODEL.step(start_c, heat_w, 22.0, dt_s), expected, atol=1e-7)
+
+
+def test_zero_time_changes_nothing():
+    start_c = np.linspace(20.0, 60.0, NODES)
+    np.testing.assert_allclose(MODEL.step(start_c, np.ones(NODES), 22.0, 0.0), start_c, atol=1e-12)
+
+
+def test_steps_of_tiny_length_keep_their_precision():
+    heat_w = np.full(NODES, 10.0)
+    rise = MODEL.step(np.full(NODES, 22.0), heat_w, 22.0, 1e-6) - 22.0
+    np.testing.assert_allclose(rise, heat_w / MODEL.capacity * 1e-6, rtol=1e-4)
+
+
+def test_heat_in_is_heat_stored_plus_heat_to_ambient():
+    # Sum of C·T' over the nodes: heat flows between nodes cancel, only ambient takes any away.
+    start_c, heat_w, dt_s = np.linspace(25.0, 55.0, NODES), np.linspace(1.0, 14.0, NODES), 900.0
+    fine_s = np.linspace(0.0, dt_s, 2001)
+    path = np.array([MODEL.step(start_c, heat_w, 22.0, t) for t in fine_s])
+    to_ambient_j = np.trapezoid((path - 22.0) @ MODEL.to_ambient, fine_s)
+    stored_j = MODEL.capacity @ (path[-1] - start_c)
+    assert stored_j + to_ambient_j == pytest.approx(heat_w.sum() * dt_s, rel=1e-6)
+
+
+# Settled temperatures ------------------------------------------------------------------------------------------------
+
+
+def kirchhoff(graph: nx.Graph, heat_w: dict[str, float], ambient_c: float) -> dict[str, float]:
+    """Node temperatures by writing down one heat balance per node, least squares over all of them."""
+    names = [name for name in graph if name != "ambient"]
+    rows, right = [], []
+    for name in names:
+        row, known = dict.fromkeys(names, 0.0), heat_w.get(name, 0.0)
+        for other, edge in graph[name].items():
+            row[name] += edge["conductance_w_per_k"]
+            if other == "ambient":
+                known += edge["conductance_w_per_k"] * ambient_c
+            else:
+                row[other] -= edge["conductance_w_per_k"]
+        rows.append([row[n] for n in names])
+        right.append(known)
+    return dict(zip(names, np.linalg.lstsq(np.array(rows), np.array(right))[0], strict=True))
+
+
+def test_steady_state_balances_the_heat_of_every_node():
+    graph = gen3_network()
+    winding_w, housing_w = np.arange(1.0, 8.0), np.arange(7.0, 0.0, -1.0)
+    named = {winding(j): winding_w[j] for j in range(JOINTS)} | {housing(j): housing_w[j] for j in range(JOINTS)}
+    expected = kirchhoff(graph, named, 22.0)
+    found = MODEL.steady(node_heat(winding_w, housing_w), 22.0)
+    np.testing.assert_allclose(found[WINDING], [expected[winding(j)] for j in range(JOINTS)], rtol=1e-10)
+    np.testing.assert_allclose(found[HOUSING], [expected[housing(j)] for j in range(JOINTS)], rtol=1e-10)
+
+
+def test_one_joint_alone_is_two_resistors_in_series():
+    graph = gen3_network()
+    for j in range(JOINTS - 1):
+        graph.remove_edge(housing(j), housing(j + 1))
+    heat_w = node_heat(np.full(JOINTS, 10.0), np.full(JOINTS, 3.0))
+    found = thermal_model(graph).steady(heat_w, 22.0)
+    assert found[J2] == pytest.approx(22.0 + 13 * 3.25 + 10 * 2.5)
+    assert found[J2 + JOINTS] == pytest.approx(22.0 + 13 * 3.25)
+
+
+def test_a_long_step_ends_in_the_steady_state():
+    heat_w = np.linspace(1.0, 10.0, NODES)
+    np.testing.assert_allclose(
+        MODEL.step(np.full(NODES, 22.0), heat_w, 22.0, 1e6), MODEL.steady(heat_w, 22.0), rtol=1e-12
+    )
+
+
+@pytest.mark.parametrize("tau2_nm", [0.0, 23.5, 41.2, 58.9])
+def test_settled_is_where_a_long_hold_ends(tau2_nm):
+    end = settled(MODEL, holding(tau2_nm, 15.0), REST, MOTORS, 25.0)
+    assert end is not None
+    run = history(holding(tau2_nm, 15.0), np.full(NODES, 25.0), minutes=60 * 24, dt_s=20.0)
+    np.testing.assert_allclose(end, run[-1], atol=1e-3)
+
+
+def test_beyond_some_load_nothing_settles():
+    def joint_2(tau2_nm: float) -> float | None:
+        end = settled(MODEL, holding(tau2_nm, 0.0), REST, MOTORS, 25.0)
+        return None if end is None else float(end[J2])
+
+    fold_nm = next(tau for tau in np.arange(50.0, 100.0, 0.1) if joint_2(tau) is None)
+    assert 58.9 < fold_nm < 75.0
+    assert all(joint_2(tau) is None for tau in np.arange(fold_nm, 104.0, 5.0))
+    run = history(holding(fold_nm, 0.0), np.full(NODES, 25.0), minutes=60 * 48, dt_s=20.0)[:, J2]
+    assert run[-1] - run[-180] > 1.0  # Still rising, by more than a kelvin in an hour, after two days.
+
+
+# Second methods and step size ----------------------------------------------------------------------------------------
+
+
+def test_a_hold_agrees_with_a_general_ode_solver():
+    current_sq = holding(50.1, 21.3)
+
+    def slope(_: float, temp_c: np.ndarray) -> np.ndarray:
+        joints = range(JOINTS)
+        out = np.zeros(NODES)
+        for j in joints:
+            tw, th = temp_c[j], temp_c[JOINTS + j]
+            amps_sq = current_sq[j] / (1 - 0.0011 * (th - 25)) ** 2
+            r_wh, r_ha, c_w, c_h, k = (2.5, 3.25, 66.0, 760.0, 0.41) if j < 4 else (5.9, 5.8, 58.0, 380.0, 0.34)
+            flow = (tw - th) / r_wh
+            near = sum(0.03 * (temp_c[JOINTS + n] - th) for n in (j - 1, j + 1) if n in joints)
+            idle = (4.2, 3.2, 3.3, 3.7, 3.2, 3.4, 3.5)[j]
+            out[j] = (k * (1 + 0.00393 * (tw - 25)) * amps_sq - flow) / c_w
+            out[JOINTS + j] = (flow - (th - 25) / r_ha + near + idle) / c_h
+        return out
+
+    start_c = np.full(NODES, 25.0)
+    solved = solve_ivp(slope, (0.0, 1800.0), start_c, rtol=1e-9, atol=1e-9, method="LSODA").y[:, -1]
+    fine = history(current_sq, start_c, minutes=30, dt_s=0.5)[-1]
+    np.testing.assert_allclose(fine, solved, atol=0.01)
+
+
+def test_refreshing_heat_every_10_s_costs_less_than_a_twentieth_kelvin():
+    start_c = np.full(NODES, 25.0)
+    fine = history(holding(50.1, 21.3), start_c, minutes=30, dt_s=0.1)
+    error = {}
+    for dt_s in (10.0, 5.0):
+        coarse = history(holding(50.1, 21.3), start_c, minutes=30, dt_s=dt_s)
+        error[dt_s] = np.max(np.abs(coarse - fine[:: round(dt_s / 0.1)]))
+    assert error[10.0] <= 0.05
+    assert error[5.0] == pytest.approx(error[10.0] / 2, rel=0.1)  # First order in the step.
+
+
+def test_one_winding_heats_as_in_mujoco():
+    # Same copper, same holding current: a locked MuJoCo motor, its voltage set so that the torque stays, against a
+    # network whose housings are tied to ambient.
+    ambient_c, amps, minutes, dt_s = 35.0, 4.5, 10, 0.05
+    kt = 0.11
+    plant = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option timestep="{dt_s}"/><worldbody><body>
+        <joint name="j" type="hinge" axis="0 0 1" limited="true" range="-0.001 0.001"/><geom size="0.1" mass="1000"/>
+        </body></worldbody><actuator><dcmotor joint="j" motorconst="{kt}" resistance="0.41"
+        thermal="2.5 66 0 0.00393 25 {ambient_c}"/></actuator></mujoco>"""
+    )
+    data = mujoco.MjData(plant)
+    data.ctrl[0] = amps * 0.41
+    for _ in range(round(60 * minutes / dt_s)):
+        mujoco.mj_step(plant, data)
+        data.ctrl[0] *= amps * kt / data.actuator_force[0]
+    graph = gen3_network()
+    for j in range(JOINTS):
+        graph.edges[housing(j), "ambient"]["conductance_w_per_k"] = 1e9
+    model = thermal_model(graph)
+    # The magnets of MuJoCo's motor keep their strength, so ours get the current that the warm ones need.
+    current_sq = np.full(JOINTS, (amps * (1 - 0.0011 * (ambient_c - 25.0))) ** 2)
+    ours = history(current_sq, np.full(NODES, ambient_c), minutes=minutes, dt_s=0.5, ambient_c=ambient_c, model=model)
+    assert data.act[0] > 20.0
+    assert ours[-1, J2] - ambient_c == pytest.approx(data.act[0], abs=0.01)
+
+
+# Cooling, spread, several arms ---------------------------------------------------------------------------------------
+
+
+def test_better_cooling_is_cooler():
+    order: list[Cooling] = ["vacuum", "still_air", "forced_air", "liquid", "immersion"]
+    assert set(order) == set(AMBIENT_FACTOR)
+    heat_w = node_heat(np.full(JOINTS, 8.0), MOTORS.idle_w)
+    ends = [thermal_model(gen3_network(cooling=name)).steady(heat_w, 25.0) for name in order]
+    assert all(np.all(worse > better) for worse, better in pairwise(ends))
+
+
+def test_dust_is_hotter_and_no_cooling_at_all_is_refused():
+    heat_w = node_heat(REST, MOTORS.idle_w)
+    assert np.all(thermal_model(gen3_network(cooling_factor=0.7)).steady(heat_w, 25.0) > MODEL.steady(heat_w, 25.0))
+    with pytest.raises(ValueError, match="No path to ambient"):
+        thermal_model(gen3_network(cooling_factor=0.0))
+    with pytest.raises(ValueError, match="Unknown cooling 'wind'"):
+        gen3_network(cooling="wind")  # pyright: ignore[reportArgumentType]
+
+
+def spread_arm(seed: int) -> tuple[ThermalModel, Motors]:
+    """One arm that differs from the nominal one."""
+    rng = np.random.default_rng(seed)
+    network = gen3_network(spread=ThermalSpread.gen3(), rng=rng)
+    return thermal_model(network), spread_motors(MOTORS, ThermalSpread.gen3(), rng)
+
+
+def test_the_same_seed_makes_the_same_arm():
+    (one, one_motors), (same, same_motors), (other, other_motors) = (spread_arm(seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one.laplacian, same.laplacian)
+    np.testing.assert_array_equal(one.capacity, same.capacity)
+    np.testing.assert_array_equal(one_motors.copper_w_per_a2, same_motors.copper_w_per_a2)
+    assert not np.allclose(one.laplacian, other.laplacian)
+    assert not np.allclose(one_motors.idle_w, other_motors.idle_w)
+
+
+def test_spread_has_the_width_it_says():
+    width = ThermalSpread(housing_ambient=0.2, capacity=0.1, winding_housing=0.15)
+    rng = np.random.default_rng(3)
+    models = [thermal_model(gen3_network(spread=width, rng=rng)) for _ in range(300)]
+    to_air = np.log([m.to_ambient[HOUSING] / MODEL.to_ambient[HOUSING] for m in models])
+    capacity = np.log([m.capacity / MODEL.capacity for m in models])
+    assert to_air.std() == pytest.approx(0.2, rel=0.1)
+    assert capacity.std() == pytest.approx(0.1, rel=0.1)
+    assert to_air.mean() == pytest.approx(0.0, abs=0.02)
+
+
+def test_no_spread_is_the_nominal_arm_and_spread_needs_a_seed():
+    none = gen3_network(spread=ThermalSpread(), rng=np.random.default_rng(0))
+    np.testing.assert_allclose(thermal_model(none).laplacian, MODEL.laplacian)
+    with pytest.raises(ValueError, match="rng"):
+        gen3_network(spread=ThermalSpread.gen3())
+    with pytest.raises(ValueError, match=r"ThermalSpread\.copper"):
+        ThermalSpread(copper=-0.1)
+
+
+def test_several_arms_step_as_each_alone():
+    models = [spread_arm(seed)[0] for seed in range(3)]
+    start_c = np.linspace(20.0, 70.0, 3 * NODES).reshape(3, NODES)
+    heat_w = np.linspace(0.0, 20.0, 3 * NODES).reshape(3, NODES)
+    ambient_c, dt_s = np.array([20.0, 25.0, 30.0]), np.array([1.0, 60.0, 3600.0])
+    stacked = stack_models(models)
+    together = stacked.step(start_c, heat_w, ambient_c, dt_s)
+    steady = stacked.steady(heat_w, ambient_c)
+    for k, model in enumerate(models):
+        alone = model.step(start_c[k], heat_w[k], ambient_c[k], dt_s[k])
+        np.testing.assert_allclose(together[k], alone, rtol=1e-12)
+        np.testing.assert_allclose(steady[k], model.steady(heat_w[k], ambient_c[k]), rtol=1e-12)
+
+
+# Networks that cannot be ---------------------------------------------------------------------------------------------
+
+
+def test_a_node_without_a_path_to_ambient_is_refused():
+    graph = gen3_network()
+    graph.remove_edge(housing(2), "ambient")
+    thermal_model(graph)  # Its neighbours still carry its heat away.
+    graph.remove_edge(housing(1), housing(2))
+    graph.remove_edge(housing(2), housing(3))
+    with pytest.raises(ValueError, match="No path to ambient, heat could not leave: winding_3, housing_3"):
+        thermal_model(graph)
+
+
+def test_missing_or_foreign_parts_are_named():
+    graph = gen3_network()
+    graph.add_node("gripper", capacity_j_per_k=100.0)
+    with pytest.raises(ValueError, match="gripper"):
+        thermal_model(graph)
+    graph = gen3_network()
+    graph.remove_node(winding(4))
+    with pytest.raises(ValueError, match="lacks the nodes winding_5"):
+        thermal_model(graph)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf"), None])
+def test_impossible_capacities_are_named(value):
+    graph = gen3_network()
+    graph.nodes[housing(0)]["capacity_j_per_k"] = value
+    with pytest.raises(ValueError, match="'housing_1' needs a capacity_j_per_k"):
+        thermal_model(graph)
+
+
+@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf"), None])
+def test_impossible_conductances_are_named(value):
+    graph = gen3_network()
+    graph.edges[winding(0), housing(0)]["conductance_w_per_k"] = value
+    with pytest.raises(ValueError, match="needs a conductance_w_per_k"):
+        thermal_model(graph)
+
+
+def test_powered_off_arm_cools_to_the_room():
+    end = MODEL.step(np.full(NODES, 70.0), np.zeros(NODES), 22.0, 6 * 3600.0)
+    np.testing.assert_allclose(end, 22.0, atol=0.05)
