@@ -21,7 +21,7 @@ HAND_M = 0.167455
 """Joint 6 to the flange."""
 REACH_M = UPPER_ARM_M + FOREARM_M + HAND_M
 """Shoulder to flange, outstretched: 0.902 m in Kinova's user guide."""
-ELBOW_ANGLES_DEG = (0.0, 60.0, -60.0, 120.0, -120.0, 180.0)
+ELBOW_ANGLES_DEG = (0.0, 60.0, -60.0, 120.0, -120.0, 180.0, 30.0, -30.0, 90.0, -90.0, 150.0, -150.0)
 """Turns of the elbow about the line from shoulder to wrist, in the order in which they are tried; 0 is
 furthest out along the base axis."""
 
@@ -31,8 +31,14 @@ ANGLE_TOLERANCE_RAD = np.deg2rad(0.5)
 _SOLVED_M = 1e-5
 _SOLVED_RAD = 1e-5
 _STEPS = 40
+_STEP_RAD = 0.3
+_SEEDS = 3
 _SEED_SLACK_M = 0.015  # The seeds neglect the 12 mm by which upper arm and forearm are offset.
 _SEED_SLACK_RAD = 0.1
+_WRIST_M = UPPER_ARM_M + FOREARM_M
+_FULL = 0.985  # Share of the reach beyond which a miss is a matter of reach.
+_AT_STOP_RAD = 0.01
+_BENT = 0.998  # Share of the reach up to which a seed stretches the arm.
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,9 +87,14 @@ class InverseKinematics:
         Raises:
             Unreachable: too far, too near, beyond a joint stop, or not converged.
         """
-        seed = nearest_turn(self._seed(pose, elbow_deg, near), near)
-        q = self._polish(pose, seed)
-        return nearest_turn(q, near)
+        failure: Unreachable | None = None
+        for seed in self._seeds(pose, elbow_deg, near):
+            try:
+                return nearest_turn(self._polish(pose, seed), near)
+            except Unreachable as error:
+                failure = failure or error
+        assert failure is not None
+        raise failure
 
     def error(self, pose: Pose, q: Array) -> tuple[float, float]:
         """Distance, m, and angle, rad, between the tool at q and the pose."""
@@ -93,24 +104,30 @@ class InverseKinematics:
     def _in_base(self, pose: Pose) -> Pose:
         return Pose(self._base.T @ (pose.position_m - self._origin), self._base.T @ pose.rotation)
 
-    def _seed(self, pose: Pose, elbow_deg: float, near: Array) -> Array:
+    def _seeds(self, pose: Pose, elbow_deg: float, near: Array) -> list[Array]:
+        """Joint positions close to the pose, at least one; the quickest to reach from `near` first."""
         target = self._in_base(pose)
-        wrist = target.position_m - HAND_M * target.rotation[:, 2] - (0.0, 0.0, SHOULDER_M)
-        _check_distance(self.shoulder_distance_m(pose), float(np.linalg.norm(wrist)))
+        wrist = self._wrist(target)
+        tool_m, wrist_m = self._distances(pose)
+        if tool_m > REACH_M + _SEED_SLACK_M or wrist_m > _WRIST_M + _SEED_SLACK_M:
+            raise Unreachable(_out_of_reach(tool_m, wrist_m))
+        # A straight arm is singular: it would never find out how to bend.
+        wrist *= min(1.0, _BENT * _WRIST_M / max(wrist_m, 1e-9))
         elbow = _elbow(wrist, elbow_deg, near)
-        candidates = [
+        seeds = [
             nearest_turn(_angles(elbow, wrist, target.rotation, flips), near) for flips in product((1, -1), repeat=3)
         ]
-        seed = min(candidates, key=lambda q: float(np.max(np.abs(q - near) / GEN3.velocity)))
+        seeds.sort(key=lambda q: float(np.max(np.abs(q - near) / GEN3.velocity)))
         low, high = self._arm.position_range.T
-        beyond = np.maximum(low - seed, seed - high)
+        # Joint stops are symmetric, so the flips share one verdict.
+        beyond = np.maximum(low - seeds[0], seeds[0] - high)
         worst = int(np.argmax(beyond))
         if beyond[worst] > _SEED_SLACK_RAD:
             raise Unreachable(
-                f"joint limit: joint_{worst + 1} would have to be at {seed[worst]:.2f} rad, "
+                f"joint limit: joint_{worst + 1} would have to be at {seeds[0][worst]:.2f} rad, "
                 f"allowed {low[worst]:.2f} to {high[worst]:.2f}"
             )
-        return np.clip(seed, low, high)
+        return [np.clip(seed, low, high) for seed in seeds[:_SEEDS]]
 
     def _polish(self, pose: Pose, seed: Array) -> Array:
         configuration = self._configuration
@@ -131,14 +148,35 @@ class InverseKinematics:
                 )
             except mink.NoSolutionFound as error:
                 raise Unreachable(f"no IK solution: {error}") from error
-            configuration.integrate_inplace(velocity, 1.0)
+            # A full step from far away, or near a singularity, would leave the region where it means something.
+            configuration.integrate_inplace(velocity * min(1.0, _STEP_RAD / max(np.max(np.abs(velocity)), 1e-12)), 1.0)
         distance, angle = self.error(pose, configuration.q)
         if distance < POSITION_TOLERANCE_M / 2 and angle < ANGLE_TOLERANCE_RAD / 2:
             return configuration.q.copy()
         raise Unreachable(
-            f"no IK solution: stopped {distance * 1e3:.1f} mm and {np.rad2deg(angle):.1f} deg "
-            f"from the pose after {_STEPS} steps"
+            self._why_short(pose, configuration.q, f"{distance * 1e3:.0f} mm and {np.rad2deg(angle):.1f} deg")
         )
+
+    def _why_short(self, pose: Pose, q: Array, short: str) -> str:
+        """The reason why the iteration came to rest at q, away from the pose."""
+        low, high = self._arm.position_range.T
+        at_stop = np.minimum(q - low, high - q) < _AT_STOP_RAD
+        if at_stop.any():
+            joint = int(np.argmax(at_stop))
+            return f"joint limit: with joint_{joint + 1} at its stop, {q[joint]:.2f} rad, the tool is {short} off"
+        tool_m, wrist_m = self._distances(pose)
+        if tool_m > _FULL * REACH_M or wrist_m > _FULL * _WRIST_M:
+            return _out_of_reach(tool_m, wrist_m)
+        return f"no IK solution: the tool is {short} off after {_STEPS} steps"
+
+    def _distances(self, pose: Pose) -> tuple[float, float]:
+        """From joint 2 to the tool point and to joint 6, m."""
+        wrist_m = float(np.linalg.norm(self._wrist(self._in_base(pose))))
+        return self.shoulder_distance_m(pose), wrist_m
+
+    def _wrist(self, in_base: Pose) -> Array:
+        """Joint 2 to joint 6 in the base frame, m, [3]."""
+        return in_base.position_m - HAND_M * in_base.rotation[:, 2] - (0.0, 0.0, SHOULDER_M)
 
 
 def nearest_turn(q: Array, near: Array) -> Array:
@@ -153,10 +191,11 @@ def angle_between(a: Array, b: Array) -> float:
     return float(2 * np.arcsin(min(1.0, np.linalg.norm(a - b) / np.sqrt(8.0))))
 
 
-def _check_distance(tool_m: float, wrist_m: float) -> None:
-    if tool_m > REACH_M + _SEED_SLACK_M or wrist_m > UPPER_ARM_M + FOREARM_M + _SEED_SLACK_M:
-        turned = "" if tool_m > REACH_M else f"; with this tool direction the wrist would be {wrist_m:.3f} m away"
-        raise Unreachable(f"reach: {tool_m:.3f} m from the shoulder, the arm has {REACH_M:.3f} m{turned}")
+def _out_of_reach(tool_m: float, wrist_m: float) -> str:
+    reason = f"reach: {tool_m:.3f} m from the shoulder, the arm has {REACH_M:.3f} m"
+    if tool_m > REACH_M:
+        return reason
+    return f"{reason}; with this tool direction its wrist would be {wrist_m:.3f} m away, at most {_WRIST_M:.3f} m"
 
 
 def _elbow(wrist: Array, elbow_deg: float, near: Array) -> Array:

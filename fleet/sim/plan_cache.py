@@ -53,7 +53,7 @@ class PlanCache:
         """What was stored, made out to this arm and work; None if nothing was, or if the file is broken."""
         path = self._path(key)
         try:
-            with np.load(path, allow_pickle=False) as stored:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
                 if "infeasible" in stored:
                     place, reason = stored["infeasible"].tolist()
                     return InfeasibleJob(arm, place, reason)

@@ -166,12 +166,12 @@ class Planner:
         """The sample that breaks a limit most, and which; None if none does. All [time, joint]."""
         if len(q) == 0:
             return None
-        low, high = self._arm.position_range.T
+        stops = self._arm.position_range[:, 1]  # symmetric
         for name, unit, value, limit in (
             ("torque", "N·m", np.abs(tau), np.array(GEN3.torque_clip)),
             ("velocity", "rad/s", np.abs(qd), np.array(GEN3.velocity)),
             ("acceleration", "rad/s²", np.abs(qdd), np.array(GEN3.acceleration)),
-            ("joint limit", "rad", np.maximum(q, -q), np.maximum(high, -low)),
+            ("joint limit", "rad", np.abs(q), stops),
         ):
             share = value / limit
             sample, joint = (int(i) for i in np.unravel_index(np.argmax(share), share.shape))
