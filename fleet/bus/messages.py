@@ -81,7 +81,7 @@ class Info(msgspec.Struct, frozen=True):
 
 
 Message = State | DifficultyWord | Info
-Kind = TypeVar("Kind", State, DifficultyWord, Info)
+Kind = TypeVar("Kind", bound=Message)
 
 _ENCODER = msgspec.json.Encoder()
 

@@ -52,7 +52,7 @@ def loopback(endpoint: str) -> str:
     match = _ENDPOINT.fullmatch(endpoint)
     if match is None or not 0 <= int(match["port"]) <= 65535:
         raise BusError(
-            f"'{endpoint}' is no endpoint of this bus: expected tcp/<address>:<port>, as tcp/127.0.0.1:7447."
+            f"'{endpoint}' is no endpoint of this bus. Expected tcp/<address>:<port>, as tcp/127.0.0.1:7447."
         )
     host = match["v6"] or match["host"]
     if host == "localhost":

@@ -13,7 +13,7 @@ import math
 import time
 import weakref
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from queue import Empty, SimpleQueue
 from typing import Any, Generic, Self, TypeVar
 
@@ -34,8 +34,9 @@ HEARTBEAT_S = 0.25
 SILENT_AFTER = 3
 """Ticks that a peer may miss in a row before nobody waits for it until it is heard again."""
 _LOOK_AGAIN_S = 0.002
-_BACKLOG = 64
-"""Samples per arm that one session keeps between two ticks; more than a fleet that behaves ever needs."""
+_BACKLOG = 1024
+"""Samples that one session keeps until they are read, for each topic; the oldest go first. A fleet that behaves needs
+a few per arm, the rest is patience with strangers."""
 
 _OPEN_TIMEOUT_S = 20.0
 
@@ -70,7 +71,7 @@ class _Client:
         self._arm = arms[index]
         self._index = index
         self._reader = reader
-        self._limit = _BACKLOG * len(arms)
+        self._limit = max(_BACKLOG, 16 * len(arms))
         self._inbox: SimpleQueue[zenoh.Sample] = SimpleQueue()
         self.present: set[int] = set()
         """Arms whose liveliness token this arm sees."""
@@ -373,12 +374,14 @@ class ZenohExchange:
 
 
 def _hearer(inbox: "SimpleQueue[zenoh.Sample]", limit: int) -> Any:
-    """Puts samples into the inbox straight from the receiving thread, and drops them while it is full."""
+    """Puts samples into the inbox straight from the receiving thread, in place of the oldest ones when it is full."""
     put, size = inbox.put, inbox.qsize
 
     def hear(sample: zenoh.Sample) -> None:
-        if size() < limit:
-            put(sample)
+        put(sample)
+        if size() > limit:
+            with suppress(Empty):  # whoever reads may have been quicker
+                inbox.get_nowait()
 
     return zenoh.handlers.Callback(hear, indirect=False)
 

@@ -1,0 +1,155 @@
+"""The exchange over Zenoh on bad links: every arm's link goes through a gate that the test can shut or cut."""
+
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+
+import numpy as np
+import pytest
+
+from fleet.bus.router import Router
+from fleet.bus.session import SILENT_AFTER, ZenohExchange
+
+ARMS = ("arm_0", "arm_1", "arm_2")
+PATIENT_S = 30.0
+SHORT_S = 0.1
+
+
+class Gate:
+    """A TCP relay to a router. Links are numbered as they connect: the exchange connects its arms in order."""
+
+    def __init__(self, endpoint: str) -> None:
+        host, port = endpoint.removeprefix("tcp/").split(":")
+        self._target = (host, int(port))
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.endpoint = f"tcp/127.0.0.1:{self._server.getsockname()[1]}"
+        self.says: list[threading.Event] = []
+        """Per link: set while what the arm says may pass; what waits passes later."""
+        self._sockets: list[tuple[socket.socket, socket.socket]] = []
+        self._threads = [threading.Thread(target=self._accept, daemon=True)]
+        self._threads[0].start()
+
+    def _accept(self) -> None:
+        with suppress(OSError):
+            while True:
+                arm, _ = self._server.accept()
+                router = socket.create_connection(self._target)
+                open_gate = threading.Event()
+                open_gate.set()
+                self.says.append(open_gate)
+                self._sockets.append((arm, router))
+                always = threading.Event()
+                always.set()
+                for source, sink, gate in ((arm, router, open_gate), (router, arm, always)):
+                    self._threads.append(threading.Thread(target=self._pump, args=(source, sink, gate), daemon=True))
+                    self._threads[-1].start()
+
+    @staticmethod
+    def _pump(source: socket.socket, sink: socket.socket, gate: threading.Event) -> None:
+        with suppress(OSError):
+            while data := source.recv(65536):
+                gate.wait(PATIENT_S)
+                sink.sendall(data)
+        for end in (source, sink):
+            with suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+
+    def cut(self, link: int) -> None:
+        for end in self._sockets[link]:
+            with suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        with suppress(OSError):
+            self._server.shutdown(socket.SHUT_RDWR)
+        self._server.close()
+        for gate in self.says:
+            gate.set()
+        for link in range(len(self._sockets)):
+            self.cut(link)
+        for thread in self._threads:
+            thread.join(PATIENT_S)
+        for pair in self._sockets:
+            for end in pair:
+                end.close()
+
+
+@pytest.fixture
+def gate() -> Iterator[Gate]:
+    with Router() as router:
+        relay = Gate(router.endpoint)
+        yield relay
+        relay.close()
+
+
+def until_all_is_heard(bus: ZenohExchange, make_words, time_s: float) -> tuple[int, np.ndarray]:
+    """Share until nothing is old any more; ticks that took, and the ages of the last but one."""
+    rng = np.random.default_rng(9)
+    age_s = np.zeros((3, 3))
+    end_s = time.monotonic() + PATIENT_S
+    tick = 0
+    while time.monotonic() < end_s:
+        heard = bus.share(make_words(rng, 3, time_s + 10.0 * tick))
+        if not heard.age_s.any():
+            return tick, age_s
+        tick, age_s = tick + 1, heard.age_s
+    raise AssertionError(f"Not heard again within {PATIENT_S} s: ages {age_s}")
+
+
+def test_a_word_that_does_not_come_leaves_the_last_one_with_its_age(gate, make_words, caplog):
+    rng = np.random.default_rng(0)
+    with ZenohExchange(ARMS, "f", gate.endpoint, timeout_s=SHORT_S) as bus:
+        _, _ = until_all_is_heard(bus, make_words, 0.0)
+        first = make_words(rng, 3, 1e6)
+        before = bus.share(first)
+        assert not before.age_s.any()
+        late = bus.late
+        gate.says[1].clear()
+        heard = bus.share(make_words(rng, 3, 1e6 + 10.0))
+        unheard = np.array([[0, 10, 0], [0, 0, 0], [0, 10, 0]], dtype=float)
+        np.testing.assert_array_equal(heard.age_s, unheard)
+        np.testing.assert_array_equal(heard.headroom_k[[0, 2], 1], first.headroom_k[1])
+        assert bus.late == late + 2
+        assert "arm_1 by arm_0, arm_1 by arm_2" in caplog.text
+        gate.says[1].set()
+        until_all_is_heard(bus, make_words, 1e6 + 20.0)
+
+
+def test_nobody_waits_for_ever_for_an_arm_that_is_silent(gate, make_words):
+    """A patience of 0.1 s is spent at most `SILENT_AFTER` times, however many ticks the arm says nothing."""
+    rng = np.random.default_rng(0)
+    with ZenohExchange(ARMS, "f", gate.endpoint, timeout_s=SHORT_S) as bus:
+        until_all_is_heard(bus, make_words, 0.0)
+        gate.says[1].clear()
+        waits = 0
+        for tick in range(20):
+            start_s = time.perf_counter()
+            age_s = bus.share(make_words(rng, 3, 1e6 + 10.0 * tick)).age_s
+            waits += time.perf_counter() - start_s >= SHORT_S
+        assert age_s[0, 1] >= 200.0
+        assert age_s[0, 2] == 0.0 or waits > SILENT_AFTER
+        assert waits >= SILENT_AFTER
+        assert waits < 15
+        gate.says[1].set()
+        until_all_is_heard(bus, make_words, 2e6)
+
+
+def test_an_arm_whose_link_was_cut_comes_back(gate, make_words):
+    """Its token goes with the link, so nobody waits the patience of 30 s for it."""
+    with ZenohExchange(ARMS, "f", gate.endpoint, timeout_s=PATIENT_S) as bus:
+        until_all_is_heard(bus, make_words, 0.0)
+        start_s = time.monotonic()
+        gate.cut(1)
+        rng = np.random.default_rng(0)
+        missed = 0
+        for tick in range(100_000):
+            age_s = bus.share(make_words(rng, 3, 1e6 + 10.0 * tick)).age_s
+            missed += bool(age_s.any())
+            if missed and not age_s.any():
+                break
+        assert missed
+        assert not age_s.any()
+        assert time.monotonic() - start_s < PATIENT_S
+        assert bus.malformed == 0
