@@ -36,6 +36,8 @@ class Gate:
             while True:
                 arm, _ = self._server.accept()
                 router = socket.create_connection(self._target)
+                for end in (arm, router):
+                    end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 open_gate = threading.Event()
                 open_gate.set()
                 self.says.append(open_gate)
@@ -101,7 +103,7 @@ def until_all_is_heard(bus: ZenohExchange, make_words, time_s: float) -> tuple[i
 def test_a_word_that_does_not_come_leaves_the_last_one_with_its_age(gate, make_words, caplog):
     rng = np.random.default_rng(0)
     with ZenohExchange(ARMS, "f", gate.endpoint, timeout_s=SHORT_S) as bus:
-        _, _ = until_all_is_heard(bus, make_words, 0.0)
+        until_all_is_heard(bus, make_words, 0.0)
         first = make_words(rng, 3, 1e6)
         before = bus.share(first)
         assert not before.age_s.any()
@@ -118,20 +120,22 @@ def test_a_word_that_does_not_come_leaves_the_last_one_with_its_age(gate, make_w
 
 
 def test_nobody_waits_for_ever_for_an_arm_that_is_silent(gate, make_words):
-    """A patience of 0.1 s is spent at most `SILENT_AFTER` times, however many ticks the arm says nothing."""
+    """The patience is spent `SILENT_AFTER` times, however many ticks the arm says nothing."""
     rng = np.random.default_rng(0)
-    with ZenohExchange(ARMS, "f", gate.endpoint, timeout_s=SHORT_S) as bus:
+    patience_s = 0.3
+    with ZenohExchange(ARMS, "f", gate.endpoint, timeout_s=patience_s) as bus:
         until_all_is_heard(bus, make_words, 0.0)
+        bus.share(make_words(rng, 3, 1e6))
         gate.says[1].clear()
         waits = 0
-        for tick in range(20):
+        age_s = np.zeros((3, 3))
+        for tick in range(1, 41):
             start_s = time.perf_counter()
             age_s = bus.share(make_words(rng, 3, 1e6 + 10.0 * tick)).age_s
-            waits += time.perf_counter() - start_s >= SHORT_S
-        assert age_s[0, 1] >= 200.0
-        assert age_s[0, 2] == 0.0 or waits > SILENT_AFTER
-        assert waits >= SILENT_AFTER
-        assert waits < 15
+            waits += time.perf_counter() - start_s >= patience_s
+        assert age_s[0, 1] == age_s[2, 1] == 400.0
+        # Room for a machine that stalls now and then; without a limit it were 40.
+        assert SILENT_AFTER <= waits <= 20
         gate.says[1].set()
         until_all_is_heard(bus, make_words, 2e6)
 
@@ -144,6 +148,7 @@ def test_an_arm_whose_link_was_cut_comes_back(gate, make_words):
         gate.cut(1)
         rng = np.random.default_rng(0)
         missed = 0
+        age_s = np.zeros((3, 3))
         for tick in range(100_000):
             age_s = bus.share(make_words(rng, 3, 1e6 + 10.0 * tick)).age_s
             missed += bool(age_s.any())

@@ -1,0 +1,165 @@
+"""What a tick costs: `share` over Zenoh and in memory, beside bare Zenoh doing the same deliveries.
+
+    python benchmarks/bench_exchange.py [--arms 4 16 64] [--ticks 200]
+
+Bare Zenoh: as many client sessions on the same kind of router, each puts two payloads of the same sizes per tick and
+counts what its peers put, without reading it. Ping-pong: one put to a peer and its callback's put back, halved. All
+run in one process on loopback, taking turns, so that a busy machine slows them alike.
+"""
+
+import argparse
+import statistics
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+
+import numpy as np
+import zenoh
+
+from fleet.bus.exchange import Words
+from fleet.bus.memory import MemoryExchange
+from fleet.bus.messages import encode
+from fleet.bus.router import Router, open_client
+from fleet.bus.session import ZenohExchange
+from fleet.bus.wording import spoken
+
+SLOTS = 8
+WARM_UP = 5
+TIMEOUT_S = 30.0
+
+
+def words_at(tick: int, arms: int, rng: np.random.Generator) -> Words:
+    """Words of the size a scenario has: seven joints, eight slots, one score in five not known."""
+    difficulty, p_saturation = rng.random((2, arms, SLOTS))
+    difficulty[rng.random((arms, SLOTS)) < 0.2] = np.nan
+    return Words(
+        time_s=10.0 * tick,
+        mode=rng.integers(0, 3, arms),
+        temp_c=rng.normal(40.0, 10.0, (arms, 7)),
+        headroom_k=rng.normal(20.0, 5.0, arms),
+        jobs=tuple(f"job_{tick + slot}" for slot in range(SLOTS)),
+        difficulty=difficulty,
+        p_saturation=p_saturation,
+        twin=("lstm-1",) * arms,
+    )
+
+
+class Bare:
+    """Zenoh alone: put, and count in callbacks until all has come."""
+
+    def __init__(self, arms: int, resources: ExitStack) -> None:
+        endpoint = resources.enter_context(Router()).endpoint
+        self._expected = 2 * arms * (arms - 1)
+        self._came = 0
+        self._lock = threading.Lock()
+        self._done = threading.Event()
+        sessions = [open_client(endpoint, timeout_s=TIMEOUT_S) for _ in range(arms)]
+        for session in sessions:
+            resources.callback(session.close)
+        remote = zenoh.Locality.REMOTE
+        count = zenoh.handlers.Callback(self._count, indirect=False)
+        for session in sessions:
+            session.declare_subscriber("bare/*/*", count, allowed_origin=remote)
+        self._publishers = [
+            [session.declare_publisher(f"bare/{i}/{topic}", allowed_destination=remote) for topic in ("a", "b")]
+            for i, session in enumerate(sessions)
+        ]
+        for session in sessions:
+            await_router(session)
+
+    def _count(self, sample: zenoh.Sample) -> None:
+        with self._lock:
+            self._came += 1
+            if self._came == self._expected:
+                self._done.set()
+
+    def tick(self, payloads: list[tuple[bytes, bytes]]) -> None:
+        self._came = 0
+        self._done.clear()
+        for publishers, pair in zip(self._publishers, payloads, strict=True):
+            for publisher, payload in zip(publishers, pair, strict=True):
+                publisher.put(payload)
+        assert self._done.wait(TIMEOUT_S), f"bare Zenoh lost {self._expected - self._came} deliveries"
+
+
+class PingPong:
+    """One client puts, another one's callback puts back."""
+
+    def __init__(self, resources: ExitStack) -> None:
+        endpoint = resources.enter_context(Router()).endpoint
+        near, far = (open_client(endpoint, timeout_s=TIMEOUT_S) for _ in range(2))
+        resources.callback(near.close)
+        resources.callback(far.close)
+        self._back = threading.Event()
+        self._ping = near.declare_publisher("ping")
+        pong = far.declare_publisher("pong")
+
+        def put_back(sample: zenoh.Sample) -> None:
+            pong.put(sample.payload)
+
+        far.declare_subscriber("ping", zenoh.handlers.Callback(put_back, indirect=False))
+        near.declare_subscriber("pong", zenoh.handlers.Callback(lambda _: self._back.set(), indirect=False))
+        await_router(far)
+        await_router(near)
+
+    def one_way_s(self) -> float:
+        self._back.clear()
+        start_s = time.perf_counter()
+        self._ping.put(b"x" * 256)
+        assert self._back.wait(TIMEOUT_S)
+        return (time.perf_counter() - start_s) / 2
+
+
+def await_router(session: zenoh.Session) -> None:
+    """Return when the router has taken what the session declared: it answers in order."""
+    assert list(session.get("@/*/router", timeout=TIMEOUT_S))
+
+
+def timed(call: Callable[[], object]) -> float:
+    """How long a call takes, s."""
+    start_s = time.perf_counter()
+    call()
+    return time.perf_counter() - start_s
+
+
+def measure(arms: int, ticks: int) -> str:
+    """One row of the table."""
+    rng = np.random.default_rng(0)
+    names = tuple(f"arm_{i}" for i in range(arms))
+    zenoh_s, memory_s, bare_s = [], [], []
+    with ExitStack() as resources:
+        bus = resources.enter_context(ZenohExchange(names, "bench", timeout_s=TIMEOUT_S))
+        memory = resources.enter_context(MemoryExchange(names))
+        bare = Bare(arms, resources)
+        for tick in range(ticks + WARM_UP):
+            words = words_at(tick, arms, rng)
+            payloads = [(encode(state), encode(word)) for state, word in spoken(words, names, tick)]
+            zenoh_s.append(timed(lambda words=words: bus.share(words)))
+            memory_s.append(timed(lambda words=words: memory.share(words)))
+            bare_s.append(timed(lambda payloads=payloads: bare.tick(payloads)))
+        lost = bus.late
+    times = [sorted(1e3 * s for s in column[WARM_UP:]) for column in (zenoh_s, bare_s, memory_s)]
+    cells = "".join(f"{statistics.median(column):>9.3f}{column[int(0.95 * len(column))]:>9.3f}" for column in times)
+    ratio = statistics.median(times[0]) / statistics.median(times[1])
+    return f"{arms:>5}{2 * arms * (arms - 1):>12}{cells}{ratio:>8.2f}{lost:>6}"
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--arms", type=int, nargs="+", default=[4, 16, 64])
+    parser.add_argument("--ticks", type=int, default=200, help="for 4 arms; fewer for more (default 200)")
+    options = parser.parse_args()
+    with ExitStack() as resources:
+        ping = PingPong(resources)
+        one_way = statistics.median(ping.one_way_s() for _ in range(500))
+    print(f"bare Zenoh put → callback through the router, one way, median: {1e3 * one_way:.3f} ms\n")
+    print("ms per tick          share over Zenoh        bare Zenoh     share in memory   Zenoh/")
+    print(" arms  deliveries   median      p95   median      p95   median      p95    bare  late")
+    for arms in options.arms:
+        print(measure(arms, max(20, options.ticks * 4 // arms)), flush=True)
+
+
+if __name__ == "__main__":
+    main()
