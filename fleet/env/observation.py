@@ -154,7 +154,7 @@ class Layout:
             )
         lead = vector.shape[:-1]
         named: dict[str, Any] = {
-            name: vector[..., span].reshape(*lead, *shape) for name, (span, shape) in self._spans.items()
+            name: vector[..., span].reshape((*lead, *shape)) for name, (span, shape) in self._spans.items()
         }
         return Observation(**named, action_mask=action_mask)
 

@@ -1,0 +1,252 @@
+"""The composition root: from a scenario to arms with plans and twins, and to the environment they live in."""
+
+import logging
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from fleet.bus.exchange import Exchange
+from fleet.bus.memory import MemoryExchange
+from fleet.difficulty import Blind, DifficultyModel
+from fleet.env.allocation_v0 import AllocationEnv, Episode, parallel_env
+from fleet.errors import FleetError, InfeasibleJob, ScenarioError, nearest
+from fleet.job import Work
+from fleet.motion import Plan
+from fleet.motor import Motors, gen3_motors, thermal_data
+from fleet.robot import Robot
+from fleet.sim.models import ArmModel
+from fleet.sim.oracle import Oracle
+from fleet.sim.planner import Planner
+from fleet.sim.plants import ProfilePlant
+from fleet.sim.world import Arm, build_world, warm_start
+from fleet.thermal import ThermalModel, ThermalSpread, gen3_network, spread_motors, thermal_model
+from scenarios.jobs import all_works, draw_jobs, rehearsal_works
+from scenarios.load import load, override
+from scenarios.scenario import Scenario
+
+log = logging.getLogger(__name__)
+
+DifficultyName = Literal["twin", "blind", "oracle"]
+PlantName = Literal["profile", "mujoco"]
+BusName = Literal["zenoh", "memory"]
+
+Progress = Callable[[str, float], None]
+"""Told what is going on and the share of it that is done, 0 to 1."""
+
+
+def quiet(stage: str, share: float) -> None:
+    """A `Progress` that says nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fleet:
+    """A scenario's arms, ready to work: planned, and with twins that know their cool motion."""
+
+    scenario: Scenario
+    arms: tuple[Arm, ...]
+    infeasible: tuple[InfeasibleJob, ...]
+    """What single arms cannot do, with the reasons."""
+
+
+def cache_folder() -> Path:
+    """Where plans and twins are kept: $THERMOFLEET_CACHE, else thermofleet in $XDG_CACHE_HOME or ~/.cache."""
+    own = os.environ.get("THERMOFLEET_CACHE")
+    if own:
+        return Path(own)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "thermofleet"
+
+
+def choose(kind: str, name: str, allowed: Any) -> None:
+    """Refuse a name that a Literal type does not have.
+
+    Raises:
+        ScenarioError: names the nearest one.
+    """
+    if name not in get_args(allowed):
+        raise ScenarioError(f"No {kind} '{name}'{nearest(name, get_args(allowed))}")
+
+
+def prepare(
+    scenario: Scenario,
+    *,
+    difficulty: DifficultyName = "twin",
+    cache: Path | None = None,
+    progress: Progress = quiet,
+) -> Fleet:
+    """Plan every work for every arm, and give each arm its difficulty model. Cached on content.
+
+    Raises:
+        ScenarioError: some work can be done by no arm.
+    """
+    choose("difficulty", difficulty, DifficultyName)
+    folder = cache or cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FleetError(f"Cannot keep plans and twins in '{folder}': {error.strerror}.") from error
+    bodies = [_body(scenario, i) for i in range(len(scenario.arms))]
+    wanted = rehearsal_works(scenario) if difficulty == "twin" else all_works(scenario)
+    plans: list[dict[Work, tuple[Plan, ...]]] = []
+    refused: list[InfeasibleJob] = []
+    for i, (robot, _, _) in enumerate(bodies):
+        possible, impossible = _plan(
+            robot, wanted, scenario, folder, lambda s, i=i: progress("planning", (i + s) / len(bodies))
+        )
+        plans.append(possible)
+        refused += impossible
+    _check_feasible(scenario, plans, refused)
+    models: list[DifficultyModel]
+    if difficulty == "twin":
+        from scenarios.rehearse import twins  # loads torch
+
+        models = list(twins(scenario, bodies, plans, folder, progress))
+    else:
+        models = [Blind() for _ in bodies]
+    arms = []
+    for (robot, motors, thermal), model, possible in zip(bodies, models, plans, strict=True):
+        rest_tau = ArmModel(robot).gravity_torque(robot.home_q())
+        own = {work: possible[work] for work in all_works(scenario) if work in possible}
+        arm = Arm(robot=robot, motors=motors, thermal=thermal, rest_tau=rest_tau, model=model, plans=own)
+        arms.append(_with_oracle(scenario, arm) if difficulty == "oracle" else arm)
+    return Fleet(scenario, tuple(arms), tuple(refused))
+
+
+def _body(scenario: Scenario, index: int) -> tuple[Robot, Motors, ThermalModel]:
+    """One arm's robot, motors and thermal model: its own, and the same for every seed of a run."""
+    spec = scenario.arms[index]
+    rng = np.random.default_rng(np.random.SeedSequence([scenario.spread.seed, index]))
+    spread = ThermalSpread.gen3(scenario.spread.scale)
+    motors = spread_motors(gen3_motors(wear=spec.wear), spread, rng)
+    network = gen3_network(cooling=spec.cooling, cooling_factor=spec.cooling_factor, spread=spread, rng=rng)
+    return spec.robot(), motors, thermal_model(network)
+
+
+def _plan(
+    robot: Robot, wanted: tuple[Work, ...], scenario: Scenario, folder: Path, progress: Callable[[float], None]
+) -> tuple[dict[Work, tuple[Plan, ...]], list[InfeasibleJob]]:
+    planner = Planner(
+        robot, elbows=scenario.planning.elbows, speeds=scenario.planning.speeds, cache_dir=folder / "plans"
+    )
+    possible: dict[Work, tuple[Plan, ...]] = {}
+    refused: list[InfeasibleJob] = []
+    for i, work in enumerate(wanted):
+        progress(i / len(wanted))
+        try:
+            possible[work] = planner.plan(work)
+        except InfeasibleJob as error:
+            refused.append(error)
+            log.info("%s", error)
+    return possible, refused
+
+
+def _check_feasible(
+    scenario: Scenario, plans: list[dict[Work, tuple[Plan, ...]]], refused: list[InfeasibleJob]
+) -> None:
+    for i, stream in enumerate(scenario.jobs):
+        for work in all_works(scenario):
+            own = work.kind == stream.kind and tuple(p.name for p in work.places) == stream.places
+            if own and not any(work in possible for possible in plans):
+                places = {place.name for place in work.places}
+                reasons = " ".join(dict.fromkeys(str(e) for e in refused if e.place in places))
+                raise ScenarioError(
+                    f"{scenario.name}: jobs[{i}] '{stream.name}' with {work.payload_kg:g} kg can be done by no arm. "
+                    + reasons
+                )
+
+
+def _with_oracle(scenario: Scenario, arm: Arm) -> Arm:
+    air = float(np.mean(scenario.ambient.at(np.linspace(0, scenario.horizon_s, 100)))) + arm.robot.ambient_offset_k
+    model = Oracle(arm.motors, arm.thermal, warm_start(arm, air), air, scenario.limits.warning_c)
+    return replace(arm, model=model)
+
+
+@dataclass(frozen=True, eq=False)
+class ShiftFactory:
+    """Makes the episode of a seed for one fleet."""
+
+    fleet: Fleet
+    plant: PlantName = "profile"
+
+    def __call__(self, seed: np.random.SeedSequence) -> Episode:
+        """Draw the jobs and lay out the world; the same seed gives the same episode."""
+        scenario, arms = self.fleet.scenario, self.fleet.arms
+        # Children by hand: SeedSequence.spawn would count, and give others the second time.
+        jobs_seed, sensor_seed = (
+            np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, i)) for i in range(2)
+        )
+        jobs = draw_jobs(scenario, jobs_seed)
+        times = (np.arange(scenario.ticks) + 0.5) * scenario.decision_interval_s
+        ambient = scenario.ambient.at(times)[:, None] + air_offsets(scenario)
+        world, plans = build_world(
+            arms,
+            [jobs],
+            limits=scenario.limits,
+            dt_s=scenario.decision_interval_s,
+            ticks=scenario.ticks,
+            slots=scenario.slots,
+            ambient_c=ambient,
+            start_warm=scenario.start == "idle_warm",
+        )
+        home = np.stack([arm.robot.home_q() for arm in arms])
+        plant = ProfilePlant(plans, home, np.stack([arm.rest_tau for arm in arms]))
+        rng = np.random.default_rng(sensor_seed)
+        return Episode(world=world, plant=plant, twins=tuple(arm.model.version for arm in arms), rng=rng)
+
+
+def air_offsets(scenario: Scenario) -> np.ndarray:
+    """Air at each arm over the air of the cell, K, [arm]: the scenario's own, and what the place adds by chance."""
+    sd = scenario.spread.scale * thermal_data()["spread"]["ambient_k"]
+    rng = np.random.default_rng(np.random.SeedSequence([scenario.spread.seed, len(scenario.arms), 1]))
+    drawn = sd * rng.standard_normal(len(scenario.arms))
+    return drawn + np.array([arm.ambient_offset_k for arm in scenario.arms])
+
+
+def open_exchange(bus: BusName, arms: tuple[str, ...], fleet: str) -> Exchange:
+    """The exchange by name; over Zenoh with an in-process router."""
+    choose("bus", bus, BusName)
+    if bus == "memory":
+        return MemoryExchange(arms)
+    from fleet.bus.session import ZenohExchange
+
+    return ZenohExchange(arms, fleet)
+
+
+def make_env(
+    scenario: str | Path | Scenario,
+    *,
+    difficulty: DifficultyName = "twin",
+    plant: PlantName = "profile",
+    bus: BusName = "memory",
+    cache: Path | None = None,
+    env_options: Mapping[str, Any] | None = None,
+    progress: Progress = quiet,
+    **overrides: Any,
+) -> AllocationEnv:
+    """The PettingZoo `ParallelEnv` of a scenario.
+
+    Args:
+        scenario: A library name, a .toml file, or a `Scenario`.
+        difficulty: What scores the plans: the arms' twins (trained or taken from the cache), `blind` or `oracle`.
+        plant: What moves the arms.
+        bus: What carries the words between arms.
+        cache: Folder of plans and twins.
+        env_options: Further options of `fleet.env.allocation_v0.AllocationEnv`.
+        overrides: Top-level fields of the scenario to change, for example `horizon_s=600`.
+    """
+    base = scenario if isinstance(scenario, Scenario) else load(scenario)
+    chosen = override(base, **overrides) if overrides else base
+    fleet = prepare(chosen, difficulty=difficulty, cache=cache, progress=progress)
+    return env_of(fleet, plant=plant, bus=bus, **(env_options or {}))
+
+
+def env_of(fleet: Fleet, *, plant: PlantName = "profile", bus: BusName = "memory", **options: Any) -> AllocationEnv:
+    """The `ParallelEnv` of a fleet that is ready; options as in `AllocationEnv`."""
+    choose("plant", plant, PlantName)
+    names = tuple(arm.robot.name for arm in fleet.arms)
+    exchange = open_exchange(bus, names, fleet.scenario.name)
+    return parallel_env(ShiftFactory(fleet, plant), exchange=exchange, weights=fleet.scenario.reward, **options)

@@ -1,0 +1,240 @@
+"""What a scenario file may say: the schema, and the one home of every default that is not a noun's own."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from fleet.arrivals import Arrivals, Batch, Poisson, Trace
+from fleet.env.reward import RewardWeights
+from fleet.job import Kind, Place
+from fleet.robot import Cooling, Mount, Robot, ThermalLimits
+
+
+def _positive(owner: str, **values: float) -> None:
+    for name, value in values.items():
+        if not 0 < value < np.inf:
+            raise ValueError(f"{owner}.{name} must be > 0 (got {value})")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmSpec:
+    """One arm as a scenario names it; see `fleet.robot.Robot` and `Mount` for the meaning."""
+
+    name: str
+    position_m: tuple[float, float, float] = Mount.position_m
+    tilt_deg: tuple[float, float, float] = Mount.tilt_deg
+    home: str = Robot.home
+    tool_kg: float = Robot.tool_kg
+    cooling: Cooling = Robot.cooling
+    cooling_factor: float = Robot.cooling_factor
+    ambient_offset_k: float = Robot.ambient_offset_k
+    wear: float = Robot.wear
+
+    def __post_init__(self) -> None:
+        self.robot()
+
+    def robot(self) -> Robot:
+        """The noun."""
+        return Robot(
+            name=self.name,
+            mount=Mount(position_m=self.position_m, tilt_deg=self.tilt_deg),
+            home=self.home,
+            tool_kg=self.tool_kg,
+            cooling=self.cooling,
+            cooling_factor=self.cooling_factor,
+            ambient_offset_k=self.ambient_offset_k,
+            wear=self.wear,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArrivalSpec:
+    """When jobs of a stream arrive."""
+
+    kind: Literal["poisson", "batch", "trace"]
+    every_s: float | None = None
+    """poisson: mean gap. batch: gap between batches, none for a single one."""
+    count: int | None = None
+    """batch: jobs per batch."""
+    start_s: float = 0.0
+    stop_s: float | None = None
+    """poisson: no arrivals after this."""
+    times_s: tuple[float, ...] | None = None
+    """trace: the arrival times."""
+    file: str | None = None
+    """trace: a text file beside the scenario, one arrival time in seconds per line."""
+
+    def __post_init__(self) -> None:
+        allowed = {
+            "poisson": {"every_s", "stop_s"},
+            "batch": {"every_s", "count"},
+            "trace": {"times_s", "file"},
+        }[self.kind]
+        for name in ("every_s", "count", "stop_s", "times_s", "file"):
+            if getattr(self, name) is not None and name not in allowed:
+                raise ValueError(f"arrivals of kind '{self.kind}' take no '{name}'; they take {_list(allowed)}")
+        missing = {"poisson": self.every_s, "batch": self.count}.get(self.kind, 0)
+        if missing is None:
+            raise ValueError(
+                f"arrivals of kind '{self.kind}' need '{'every_s' if self.kind == 'poisson' else 'count'}'"
+            )
+        if self.kind == "trace" and (self.times_s is None) == (self.file is None):
+            raise ValueError("arrivals of kind 'trace' need either 'times_s' or 'file'")
+        if self.file is None:
+            self.arrivals()
+
+    def arrivals(self, from_file: tuple[float, ...] = ()) -> Arrivals:
+        """The noun; `from_file` are the times of a trace kept in a file."""
+        if self.kind == "poisson":
+            assert self.every_s is not None
+            stop_s = np.inf if self.stop_s is None else self.stop_s
+            return Poisson(every_s=self.every_s, start_s=self.start_s, stop_s=stop_s)
+        if self.kind == "batch":
+            assert self.count is not None
+            return Batch(count=self.count, start_s=self.start_s, every_s=self.every_s)
+        return Trace(times_s=tuple(t + self.start_s for t in (self.times_s or from_file)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class JobStream:
+    """A kind of job that keeps arriving; one payload and one number of repetitions is drawn for each job."""
+
+    name: str
+    kind: Kind
+    places: tuple[str, ...]
+    """Names of places: from, to for pick_place and sort; one for hold and press."""
+    arrivals: ArrivalSpec
+    payload_kg: tuple[float, ...] = (0.0,)
+    repetitions: tuple[int, int] = (1, 1)
+    """Fewest and most."""
+    dwell_s: float = 0.5
+    """See `fleet.job.Work`: of a hold or press, how long one repetition lasts."""
+    force_n: float = 0.0
+    value: float = 1.0
+    due_s: float = 1800.0
+    """Due so long after release."""
+    after: tuple[str, ...] = ()
+    """Streams whose job of the same number must be finished first."""
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise ValueError("JobStream.name must not be empty")
+        if not self.payload_kg or min(self.payload_kg) < 0:
+            raise ValueError(f"JobStream.payload_kg must be some masses >= 0 (got {list(self.payload_kg)})")
+        low, high = self.repetitions
+        if not 1 <= low <= high:
+            raise ValueError(
+                f"JobStream.repetitions must be [fewest, most] with 1 <= fewest <= most (got {low}, {high})"
+            )
+        _positive("JobStream", dwell_s=self.dwell_s, due_s=self.due_s)
+        if self.value < 0 or self.force_n < 0:
+            raise ValueError(f"JobStream.value and force_n must be >= 0 (got {self.value}, {self.force_n})")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ambient:
+    """Air temperature of the cell over the shift."""
+
+    points: tuple[tuple[float, float], ...] = ((0.0, 25.0),)
+    """(time s, °C), straight lines between, constant outside."""
+
+    def __post_init__(self) -> None:
+        times = [t for t, _ in self.points]
+        if not times or times != sorted(times):
+            raise ValueError("Ambient.points must be at least one [time_s, temperature_c], in order of time")
+        if not all(-40 <= c <= 60 for _, c in self.points):
+            raise ValueError(f"Ambient.points must lie between -40 and 60 °C (got {[c for _, c in self.points]})")
+
+    def at(self, time_s: np.ndarray) -> np.ndarray:
+        """°C, same shape as the times."""
+        times, temps = zip(*self.points, strict=True)
+        return np.interp(time_s, times, temps)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Planning:
+    """How many ways each arm plans for a work."""
+
+    elbows: int = 3
+    speeds: tuple[float, ...] = (1.0, 0.6)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwinSpec:
+    """How the arms' twins come to know what is normal."""
+
+    size: Literal["quick", "full"] = "full"
+    """quick trains on fewer windows for fewer epochs."""
+    cool_c: float = 40.0
+    """A rehearsed motion is cool if no motor passes this within the horizon."""
+    horizon_s: float = 1800.0
+    ambient_c: float = 22.0
+    """Air during the rehearsal, which starts cold."""
+    payload_kg: tuple[float, ...] = (0.0, 0.5, 1.0)
+    """Light payloads with which every motion of the scenario is rehearsed besides its own."""
+
+    def __post_init__(self) -> None:
+        _positive("TwinSpec", horizon_s=self.horizon_s)
+        if self.cool_c <= self.ambient_c:
+            raise ValueError(f"TwinSpec.cool_c must be above ambient_c (got {self.cool_c}, {self.ambient_c})")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spread:
+    """How far the arms of this fleet differ from the nominal Gen3; the fleet is the same for every seed of a run."""
+
+    scale: float = 1.0
+    """Times the log-normal standard deviations of `fleet.thermal.ThermalSpread.gen3`; 0 makes all arms alike."""
+    seed: int = 0
+    """Which fleet."""
+
+    def __post_init__(self) -> None:
+        if self.scale < 0 or self.seed < 0:
+            raise ValueError(f"Spread.scale and seed must be >= 0 (got {self.scale}, {self.seed})")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenario:
+    """One shift of one fleet in one cell."""
+
+    name: str
+    description: str
+    horizon_s: float
+    arms: tuple[ArmSpec, ...]
+    places: tuple[Place, ...]
+    jobs: tuple[JobStream, ...]
+    decision_interval_s: float = 10.0
+    slots: int = 8
+    start: Literal["idle_warm", "cold"] = "idle_warm"
+    telemetry_interval_s: float = 1.0
+    ambient: Ambient = field(default_factory=Ambient)
+    limits: ThermalLimits = field(default_factory=ThermalLimits)
+    reward: RewardWeights = field(default_factory=RewardWeights)
+    planning: Planning = field(default_factory=Planning)
+    twin: TwinSpec = field(default_factory=TwinSpec)
+    spread: Spread = field(default_factory=Spread)
+
+    def __post_init__(self) -> None:
+        _positive(
+            "Scenario",
+            horizon_s=self.horizon_s,
+            decision_interval_s=self.decision_interval_s,
+            telemetry_interval_s=self.telemetry_interval_s,
+        )
+        if self.telemetry_interval_s > self.decision_interval_s:
+            raise ValueError(
+                "Scenario.telemetry_interval_s must not exceed decision_interval_s "
+                f"(got {self.telemetry_interval_s}, {self.decision_interval_s})"
+            )
+        if self.slots < 1:
+            raise ValueError(f"Scenario.slots must be >= 1 (got {self.slots})")
+
+    @property
+    def ticks(self) -> int:
+        """Decision intervals in the shift."""
+        return max(1, round(self.horizon_s / self.decision_interval_s))
+
+
+def _list(names: set[str]) -> str:
+    return ", ".join(sorted(names))
