@@ -12,6 +12,7 @@ import logging
 import math
 import time
 import weakref
+from collections import deque
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from queue import Empty, SimpleQueue
@@ -64,6 +65,38 @@ class _Memory(Generic[Content]):
         return True
 
 
+class _Inbox:
+    """Samples on their way from Zenoh's receiving threads to the one that reads; full, it lets go of the oldest.
+
+    The reader is woken once, when as many have come as it waits for: a wake for each would cost more than reading it.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._samples: deque[zenoh.Sample] = deque(maxlen=limit)
+        self._limit = limit
+        self._wanted = math.inf
+        self._enough: SimpleQueue[None] = SimpleQueue()
+
+    def hear(self, sample: zenoh.Sample) -> None:
+        """Take a sample; called by receiving threads."""
+        self._samples.append(sample)
+        if len(self._samples) >= self._wanted:
+            self._wanted = math.inf
+            self._enough.put(None)
+
+    def wait(self, count: int, deadline_s: float) -> None:
+        """Return when `count` samples are there, when time is up, or now and then earlier."""
+        self._wanted = min(count, self._limit)
+        if len(self._samples) < self._wanted:
+            with suppress(Empty):
+                self._enough.get(timeout=max(0.0, deadline_s - time.monotonic()))
+        self._wanted = math.inf
+
+    def take(self) -> list[zenoh.Sample]:
+        """All that is there, oldest first."""
+        return [self._samples.popleft() for _ in range(len(self._samples))]
+
+
 class _Client:
     """One arm on the bus: its session, what it says with, and what it has heard."""
 
@@ -72,7 +105,7 @@ class _Client:
         self._index = index
         self._reader = reader
         self._limit = max(_BACKLOG, 16 * len(arms))
-        self._inbox: SimpleQueue[zenoh.Sample] = SimpleQueue()
+        self._inbox = _Inbox(self._limit)
         self.present: set[int] = set()
         """Arms whose liveliness token this arm sees."""
         self.conditions = _Memory[Condition](len(arms))
@@ -86,7 +119,8 @@ class _Client:
             zenoh.handlers.RingChannel(self._limit),
             allowed_origin=zenoh.Locality.REMOTE,
         )
-        hear = _hearer(self._inbox, self._limit)
+        # On the receiving thread itself: a thread of Python's between would only hand on.
+        hear: Any = zenoh.handlers.Callback(self._inbox.hear, indirect=False)
         self._difficulties = advanced.declare_advanced_subscriber(
             session,
             keys.of_every_arm(fleet, "difficulty"),
@@ -128,58 +162,51 @@ class _Client:
 
     def await_peers(self, arms: int, deadline_s: float) -> bool:
         """Whether every arm's token was seen before the deadline."""
-        while len(self.present) < arms:
-            if not self._hear_next(deadline_s, tick=-1, now_s=-math.inf):
-                return False
-        return True
+        in_time = True
+        while len(self.present) < arms and in_time:
+            in_time = time.monotonic() < deadline_s
+            self._inbox.wait(arms - len(self.present), deadline_s)
+            self.drain(tick=-1, now_s=-math.inf)
+        return len(self.present) == arms
 
     def drain(self, tick: int, now_s: float) -> None:
         """Read all that has come, without waiting."""
-        while not self._inbox.empty() and self._hear_next(0.0, tick, now_s):
-            pass
-        self._drain_ring(tick, now_s)
+        for sample in self._inbox.take():
+            self._take(sample, tick, now_s)
+        for _ in range(self._limit):
+            sample = self._ring.try_recv()
+            if sample is None:
+                break
+            self._take(sample, tick, now_s)
 
     def listen(self, tick: int, now_s: float, deadline_s: float) -> list[int]:
         """Wait for the words of this tick; returns the peers that were not heard, for whatever reason."""
-        peers = [sender for sender in range(len(self.misses)) if sender != self._index]
-        ticks = self.scores.ticks
-        missing = {sender for sender in peers if ticks[sender] < tick and self._expected(sender)}
-        while missing and self._hear_next(deadline_s, tick, now_s):
-            missing = {sender for sender in missing if ticks[sender] < tick and self._expected(sender)}
-        self._drain_ring(tick, now_s)
-        ticks = self.conditions.ticks
-        # Not reached in the common case: a state travels ahead of its difficulty.
-        while any(ticks[sender] < tick and self._expected(sender) for sender in peers):
-            rest_s = deadline_s - time.monotonic()
-            if rest_s <= 0:
-                break
-            self._hear_next(time.monotonic() + min(rest_s, _LOOK_AGAIN_S), tick, now_s)
-            self._drain_ring(tick, now_s)
-        unheard = [s for s in peers if min(self.scores.ticks[s], self.conditions.ticks[s]) < tick]
-        for sender in peers:
-            self.misses[sender] = self.misses[sender] + 1 if sender in unheard else 0
+        in_time = True
+        while in_time and (missing := self._missing(self.scores.ticks, tick)):
+            in_time = time.monotonic() < deadline_s
+            self._inbox.wait(len(missing), deadline_s)
+            self.drain(tick, now_s)
+        # As a rule not reached: a state travels ahead of its difficulty.
+        while in_time and self._missing(self.conditions.ticks, tick):
+            in_time = time.monotonic() < deadline_s
+            self._inbox.wait(1, min(deadline_s, time.monotonic() + _LOOK_AGAIN_S))
+            self.drain(tick, now_s)
+        unheard = []
+        for sender, heard in enumerate(map(min, self.scores.ticks, self.conditions.ticks)):
+            self.misses[sender] = self.misses[sender] + 1 if heard < tick else 0
+            if heard < tick:
+                unheard.append(sender)
         return unheard
+
+    def _missing(self, ticks: list[int], tick: int) -> list[int]:
+        """Peers whose word of this tick is still awaited."""
+        return [sender for sender, heard in enumerate(ticks) if heard < tick and self._expected(sender)]
 
     def _expected(self, sender: int) -> bool:
         return sender in self.present and self.misses[sender] < SILENT_AFTER
 
-    def _hear_next(self, deadline_s: float, tick: int, now_s: float) -> bool:
-        """Read the next difficulty or token; False when none came before the deadline."""
-        try:
-            sample = self._inbox.get(timeout=max(0.0, deadline_s - time.monotonic()))
-        except Empty:
-            return False
-        self._take(sample, tick, now_s)
-        return True
-
-    def _drain_ring(self, tick: int, now_s: float) -> None:
-        for _ in range(self._limit):
-            sample = self._ring.try_recv()
-            if sample is None:
-                return
-            self._take(sample, tick, now_s)
-
     def _take(self, sample: zenoh.Sample, tick: int, now_s: float) -> None:
+        """Read a sample and keep what is new."""
         key = str(sample.key_expr)
         place = self._reader.places.get(key)
         if place is None:
@@ -196,13 +223,11 @@ class _Client:
         if said_tick > tick or word.time_s > now_s or (said_tick == tick and word.time_s != now_s):
             reason = f"speaks of tick {said_tick} at {word.time_s} s, but it is tick {tick} at {now_s} s"
             self._reader.refuse(key, reason)
-            return
-        newer = (
+        elif (
             self.conditions.keep(sender, said_tick, word)
             if isinstance(word, Condition)
             else self.scores.keep(sender, said_tick, word)
-        )
-        if newer:
+        ):
             # A silent peer that is heard again gets one more chance to be in time.
             self.misses[sender] = min(self.misses[sender], SILENT_AFTER - 1)
 
@@ -371,19 +396,6 @@ class ZenohExchange:
             more = f" and {len(fresh) - 8} more" if len(fresh) > 8 else ""
             _LOG.warning("Not heard at %s s (and not before heard again): %s%s.", self._now_s, named, more)
         self._unheard = unheard
-
-
-def _hearer(inbox: "SimpleQueue[zenoh.Sample]", limit: int) -> Any:
-    """Puts samples into the inbox straight from the receiving thread, in place of the oldest ones when it is full."""
-    put, size = inbox.put, inbox.qsize
-
-    def hear(sample: zenoh.Sample) -> None:
-        put(sample)
-        if size() > limit:
-            with suppress(Empty):  # whoever reads may have been quicker
-                inbox.get_nowait()
-
-    return zenoh.handlers.Callback(hear, indirect=False)
 
 
 def _remembering_publisher(

@@ -6,7 +6,9 @@ import queue
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -141,13 +143,34 @@ def test_a_flood_passes_and_leaves_no_trace(make_words, assert_same):
     pytest.fail("The flood never ended.")
 
 
+def sample(number: int) -> Any:
+    """Something to keep in an inbox, which never looks inside."""
+    return number
+
+
 def test_an_inbox_that_is_full_lets_go_of_the_oldest():
-    inbox = queue.SimpleQueue()
-    hear = session._hearer(inbox, 4)
+    inbox = session._Inbox(4)
     for number in range(10):
-        hear(number)
-    assert [inbox.get_nowait() for _ in range(4)] == [6, 7, 8, 9]
-    assert inbox.empty()
+        inbox.hear(sample(number))
+    assert inbox.take() == [6, 7, 8, 9]
+    assert inbox.take() == []
+
+
+def test_an_inbox_wakes_its_reader_when_enough_has_come():
+    inbox = session._Inbox(100)
+    inbox.hear(sample(0))
+    talker = threading.Thread(target=lambda: [inbox.hear(sample(number)) for number in range(1, 50)])
+    talker.start()
+    end_s = time.monotonic() + PATIENT_S
+    samples = []
+    while len(samples) < 50 and time.monotonic() < end_s:
+        inbox.wait(50 - len(samples), end_s)
+        samples += inbox.take()
+    talker.join()
+    assert samples == list(range(50))
+    assert time.monotonic() < end_s
+    inbox.wait(1, time.monotonic() + 0.01)
+    assert inbox.take() == []
 
 
 def test_a_late_joiner_gets_the_last_word_and_who_said_it(make_words):
