@@ -30,7 +30,7 @@ from fleet.errors import BusError
 
 _LOG = logging.getLogger(__name__)
 
-HEARTBEAT_S = 0.25
+HEARTBEAT_S = 1.0
 """How soon after the last word its number is repeated, so that a lost last word is noticed."""
 SILENT_AFTER = 3
 """Ticks that a peer may miss in a row before nobody waits for it until it is heard again."""
