@@ -56,7 +56,11 @@ class Itinerary:
 
 
 def itinerary(work: Work) -> Itinerary:
-    """Stops and legs of a work. The payload hangs from the end of the grasp to the end of the release."""
+    """Stops and legs of a work. The payload hangs from the end of the grasp to the end of the release.
+
+    A sort goes straight from place to place. A hold grasps in the approach and lets go in the retreat; a press has
+    its payload, if any, for as long as it presses.
+    """
     first = Stop(work.places[0], backed_off=False)
     above = Stop(work.places[0], backed_off=True)
     if work.kind == "pick_place":

@@ -84,6 +84,7 @@ class ArmModel:
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_ACTUATION
         self.data = mujoco.MjData(self.model)
         self._tool = self.model.site(f"{robot.name}/tool").id
+        self._elbow = self.model.body(f"{robot.name}/forearm").id
         self._payload = self.model.body(f"{robot.name}/payload").id
         self.position_range: Array = np.where(
             self.model.jnt_limited[:, None].astype(bool), self.model.jnt_range, (-np.inf, np.inf)
@@ -95,6 +96,12 @@ class ArmModel:
         self.data.qpos[:] = q
         mujoco.mj_kinematics(self.model, self.data)
         return self.data.site_xpos[self._tool].copy(), self.data.site_xmat[self._tool].reshape(3, 3).copy()
+
+    def elbow_position(self, q: Array) -> Array:
+        """Where joint 4 is in the world, m, [3]."""
+        self.data.qpos[:] = q
+        mujoco.mj_kinematics(self.model, self.data)
+        return self.data.xpos[self._elbow].copy()
 
     def gravity_torque(self, q: Array, payload_kg: float = 0.0) -> Array:
         """Torque that holds the arm still at q with a point mass at the flange, N·m, [joint]."""

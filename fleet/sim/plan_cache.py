@@ -15,6 +15,8 @@ from fleet.errors import InfeasibleJob
 from fleet.job import Work
 from fleet.motion import RATE_HZ, Phase, Plan
 from fleet.robot import GEN3, Robot
+from fleet.sim.itinerary import GRASP_S
+from fleet.sim.kinematics import ELBOW_ANGLES_DEG
 from fleet.sim.models import GRAVITY_M_S2, gen3_xml
 
 Array = np.ndarray
@@ -44,6 +46,8 @@ class PlanCache:
             "home": robot.home_q().tolist(),
             "tool_kg": robot.tool_kg,
             "work": asdict(work),
+            "grasp_s": GRASP_S,
+            "elbow_angles_deg": ELBOW_ANGLES_DEG,
             "elbows": elbows,
             "speeds": speeds,
         }

@@ -19,8 +19,8 @@ from fleet.sim.trajectory import joined, line, move, rest
 Array = np.ndarray
 log = logging.getLogger(__name__)
 
-SAME_ELBOW_RAD = 0.2
-"""Postures closer than this in every joint at every stop are one variant."""
+SAME_ELBOW_M = 0.05
+"""Postures whose elbows are closer than this at every stop load the joints alike: one variant."""
 CLEARANCE_STEP_RAD = 0.1
 _LIMIT_TOLERANCE = 1e-6
 
@@ -86,7 +86,7 @@ class Planner:
                 break
             try:
                 stops = self._stops(route, elbow_deg)
-                if any(_same(stops, other) for other, _ in found):
+                if any(self._same_elbow(stops, other) for other, _ in found):
                     continue
                 self._check_clearance(route, stops)
             except _Failure as failure:
@@ -125,6 +125,12 @@ class Planner:
             except Unreachable as error:
                 raise _Failure(stop.place, str(error), stage=len(solved)) from error
         return solved
+
+    def _same_elbow(self, stops: dict[Stop, Array], other: dict[Stop, Array]) -> bool:
+        return all(
+            np.linalg.norm(self._arm.elbow_position(q) - self._arm.elbow_position(other[stop])) < SAME_ELBOW_M
+            for stop, q in stops.items()
+        )
 
     def _check_clearance(self, route: Itinerary, stops: dict[Stop, Array]) -> None:
         for stop, parent in route.tree().items():
@@ -210,7 +216,3 @@ def _with_start(route: Itinerary) -> list[tuple[Leg, ...]]:
 def _pose(stop: Stop) -> Pose:
     pose = Pose(np.array(stop.place.position_m), rotation(stop.place.tool_deg))
     return pose.backed_off(stop.place.retreat_m) if stop.backed_off else pose
-
-
-def _same(stops: dict[Stop, Array], other: dict[Stop, Array]) -> bool:
-    return all(np.max(np.abs(q - other[stop])) < SAME_ELBOW_RAD for stop, q in stops.items())

@@ -133,6 +133,20 @@ def test_payload_may_change_from_sample_to_sample():
     np.testing.assert_allclose(tau[0], tau[2])
     np.testing.assert_allclose(np.abs(tau[1, 1] - tau[0, 1]), 3.0 * 9.81 * 0.902, atol=0.05)
     np.testing.assert_array_equal(FLOOR.gravity_torque(q[0]), tau[0])
+    FLOOR.gravity_torque(q[0], 5.0)
+    assert FLOOR.model.body_mass.sum() == pytest.approx(8.188, abs=1e-3)
+
+
+def test_joints_carry_their_rotors_and_no_friction():
+    """Gear ratio 100, rotors of 0.40e-4 and 0.22e-4 kg·m²; friction is the motor law's business."""
+    np.testing.assert_allclose(FLOOR.model.dof_armature, [100**2 * 0.40e-4] * 4 + [100**2 * 0.22e-4] * 3)
+    assert not FLOOR.model.dof_damping.any()
+    assert not FLOOR.model.dof_frictionloss.any()
+
+
+def test_the_elbow_of_an_upright_arm_is_705_mm_over_the_base():
+    """0.28481 m to joint 2 and 0.42076 m to joint 4 (URDF)."""
+    assert FLOOR.elbow_position(np.zeros(7))[2] == pytest.approx(0.70557, abs=1e-4)
 
 
 def test_a_cell_holds_all_arms_stations_and_servos():

@@ -4,6 +4,7 @@ import logging
 import re
 import warnings
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from fleet.job import KINDS, Place, Work
 from fleet.motion import RATE_HZ, Plan
 from fleet.robot import GEN3, POSTURES, Mount, Robot, rotation
 from fleet.sim.clearance import Clearance
-from fleet.sim.kinematics import InverseKinematics, Pose, Unreachable, angle_between
+from fleet.sim.kinematics import InverseKinematics, Pose, Unreachable, angle_between, nearest_turn
 from fleet.sim.models import ArmModel
 from fleet.sim.planner import Planner
 
@@ -180,8 +181,14 @@ def test_variants_are_numbered_from_the_quickest_and_differ():
     assert [(plan.elbow, plan.speed) for plan in plans] == [(e, s) for e in range(3) for s in (1.0, 0.6)]
     fastest = [plan.duration_s(1) for plan in plans[::2]]
     assert fastest == sorted(fastest)
-    elbows = [plan.cycle.profile[0, 0] for plan in plans[::2]]
-    assert all(np.abs(a - b).max() > 0.2 for a, b in zip(elbows, elbows[1:], strict=False))
+    elbows = [ARMS["floor"].elbow_position(plan.cycle.profile[0, 0].astype(float)) for plan in plans[::2]]
+    assert all(np.linalg.norm(a - b) > 0.05 for a, b in combinations(elbows, 2))
+
+
+def test_an_outstretched_arm_has_one_elbow():
+    far_out = Place(name="far out", position_m=(0.902, 0.0, 0.285), tool_deg=(0.0, 90.0, 0.0), retreat_m=0.0)
+    plans = Planner(ROBOTS["floor"], speeds=(1.0,)).plan(work("hold", places=(far_out,), payload_kg=1.0))
+    assert [plan.elbow for plan in plans] == [0]
 
 
 def assert_same(plans: tuple[Plan, ...], others: tuple[Plan, ...]) -> None:
@@ -275,15 +282,44 @@ def test_inverse_kinematics_finds_poses_that_exist(q, elbow_deg):
     robot = ROBOTS["wall"]
     inverse = InverseKinematics(ARMS["wall"])
     pose = Pose(*ARMS["wall"].tool_pose(q))
+    found, reason = None, ""
     try:
         found = inverse.solve(pose, elbow_deg, robot.home_q())
-    except Unreachable as reason:
+    except Unreachable as error:
+        reason = str(error)
+    if found is None:
         # Some elbow turns need a joint beyond its stop, and none is left to an outstretched arm.
-        assert "joint limit" in str(reason) or (abs(q[3]) < 0.2 and "reach" in str(reason))
+        assert reason.startswith("joint limit") or (abs(q[3]) < 0.2 and reason.startswith("reach"))
         return
     distance_m, angle_rad = inverse.error(pose, found)
     assert distance_m < 1e-3
     assert np.rad2deg(angle_rad) < 0.5
+
+
+@pytest.mark.parametrize(
+    "beyond",
+    [
+        (0.0, 2.25, 3.14, -1.87, 0.0, 0.96, 1.57),
+        (0.0, 0.40, 3.14, -2.62, 0.0, 0.96, 1.57),
+        (0.0, 0.40, 3.14, -2.09, 0.0, 2.14, 1.57),
+    ],
+)
+def test_inverse_kinematics_stays_within_the_stops(beyond):
+    """Poses that an arm without stops would take with joint 2, 4 or 6 a little beyond them."""
+    arm, q = ARMS["floor"], np.array(beyond)
+    try:
+        found = InverseKinematics(arm).solve(Pose(*arm.tool_pose(q)), 0.0, q)
+    except Unreachable as error:
+        found = np.zeros(7) if "at its stop" in str(error) else np.full(7, np.nan)
+    assert (np.abs(found) <= arm.position_range[:, 1] + 1e-9).all()
+
+
+@given(q=st.tuples(*[st.floats(-20.0, 20.0)] * 7).map(np.array), near=st.tuples(*[st.floats(-9.0, 9.0)] * 7))
+def test_the_nearest_turn_is_within_half_a_turn(q, near):
+    turned = nearest_turn(q, np.array(near))
+    assert np.abs(turned - near)[::2].max() <= np.pi + 1e-9
+    np.testing.assert_array_equal(turned[1::2], q[1::2])
+    np.testing.assert_allclose(np.cos(turned), np.cos(q), atol=1e-9)
 
 
 def test_named_postures_are_clear_and_a_folded_arm_is_not():
