@@ -76,16 +76,16 @@ class MemoryExchange:
         check(words, self.arms)
         if words.time_s < self._now_s:
             self._forget()
-        self._now_s = words.time_s
+        self._now_s = now_s = float(words.time_s)
         spoken = self._speak(words)
         self._on_the_way.append(spoken)
         # A hair of slack: 0.1 + 0.2 must not come a tick after 0.3.
-        while self._on_the_way and self._on_the_way[0].due_s <= words.time_s + 1e-9 * max(1.0, abs(words.time_s)):
+        while self._on_the_way and self._on_the_way[0].due_s <= now_s + 1e-9 * max(1.0, abs(now_s)):
             self._hear(self._on_the_way.popleft())
         for arm, (condition, scores) in enumerate(zip(spoken.conditions, spoken.scores, strict=True)):
             self._conditions[arm][arm] = condition
             self._scores[arm][arm] = scores
-        return assemble(words.time_s, words.jobs, self._conditions, self._scores)
+        return assemble(now_s, words.jobs, self._conditions, self._scores)
 
     def close(self) -> None:
         """Let go of everything; twice is fine."""
@@ -108,16 +108,17 @@ class MemoryExchange:
     def _speak(self, words: Words) -> _Spoken:
         # Copies: the caller may fill the same arrays again at the next tick.
         difficulty, p_saturation = np.array(words.difficulty, dtype=float), np.array(words.p_saturation, dtype=float)
+        time_s = float(words.time_s)
         conditions = [
-            Condition(words.time_s, mode, headroom)
+            Condition(time_s, mode, headroom)
             for mode, headroom in zip(words.mode.tolist(), words.headroom_k.tolist(), strict=True)
         ]
-        scores = [Scores(words.time_s, words.jobs, d, p) for d, p in zip(difficulty, p_saturation, strict=True)]
+        scores = [Scores(time_s, words.jobs, d, p) for d, p in zip(difficulty, p_saturation, strict=True)]
         reaches = self._hears
         if self._loss:
             assert self._rng is not None
             reaches = reaches & (self._rng.random(reaches.shape) >= self._loss)
-        return _Spoken(words.time_s + self._delay_s, conditions, scores, reaches)
+        return _Spoken(time_s + self._delay_s, conditions, scores, reaches)
 
     def _hear(self, spoken: _Spoken) -> None:
         came = int(spoken.reaches.sum())

@@ -108,6 +108,8 @@ class _Client:
         self._inbox = _Inbox(self._limit)
         self.present: set[int] = set()
         """Arms whose liveliness token this arm sees."""
+        self._awaited: set[int] = set()
+        """Those of them that were there when the tick began, and have not been away since."""
         self.conditions = _Memory[Condition](len(arms))
         self.scores = _Memory[Scores](len(arms))
         self.misses = [0] * len(arms)
@@ -140,6 +142,11 @@ class _Client:
         self._info = _remembering_publisher(session, keys.of_arm(fleet, self._arm, "info"), Info)
         self._said_info: Info | None = None
         self._token = session.liveliness().declare_token(keys.of_arm(fleet, self._arm, "alive"))
+
+    def begin(self, tick: int, now_s: float) -> None:
+        """Read what came since `tick`, the last one, and settle whom to wait for: words on a broken link never come."""
+        self.drain(tick, now_s)
+        self._awaited = {sender for sender in self.present if self.misses[sender] < SILENT_AFTER}
 
     def say(self, state: State, difficulty: DifficultyWord) -> None:
         """Publish the words of one tick, and who says them when that has changed."""
@@ -200,10 +207,7 @@ class _Client:
 
     def _missing(self, ticks: list[int], tick: int) -> list[int]:
         """Peers whose word of this tick is still awaited."""
-        return [sender for sender, heard in enumerate(ticks) if heard < tick and self._expected(sender)]
-
-    def _expected(self, sender: int) -> bool:
-        return sender in self.present and self.misses[sender] < SILENT_AFTER
+        return [sender for sender, heard in enumerate(ticks) if heard < tick and sender in self._awaited]
 
     def _take(self, sample: zenoh.Sample, tick: int, now_s: float) -> None:
         """Read a sample and keep what is new."""
@@ -214,7 +218,11 @@ class _Client:
             return
         topic, sender = place
         if topic == "alive":
-            (self.present.add if sample.kind == zenoh.SampleKind.PUT else self.present.discard)(sender)
+            if sample.kind == zenoh.SampleKind.PUT:
+                self.present.add(sender)
+            else:
+                self.present.discard(sender)
+                self._awaited.discard(sender)
             return
         read = self._reader.read(topic, sender, sample.payload.to_bytes(), str(sample.encoding))
         if read is None:
@@ -320,12 +328,12 @@ class ZenohExchange:
         check(words, self.arms)
         self.open()
         for client in self._clients:
-            client.drain(self._tick, self._now_s)
+            client.begin(self._tick, self._now_s)
         if words.time_s < self._now_s:
             for client in self._clients:
                 client.forget(self._tick)
         self._tick += 1
-        self._now_s = words.time_s
+        self._now_s = float(words.time_s)
         self._reader.forget()
         try:
             for client, (state, difficulty) in zip(self._clients, spoken(words, self.arms, self._tick), strict=True):
@@ -337,12 +345,12 @@ class ZenohExchange:
         unheard = {
             (receiver, sender)
             for receiver, client in enumerate(self._clients)
-            for sender in client.listen(self._tick, words.time_s, deadline_s)
+            for sender in client.listen(self._tick, self._now_s, deadline_s)
         }
         self._count(unheard)
         self.malformed = self._reader.malformed
         return assemble(
-            words.time_s,
+            self._now_s,
             words.jobs,
             [client.conditions.words for client in self._clients],
             [client.scores.words for client in self._clients],

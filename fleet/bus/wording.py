@@ -59,11 +59,13 @@ class Reader:
         }
         """Topic and index of the arm for every key that is listened to."""
         self._arms = arms
+        self._complained: set[str] = set()
         self._read: dict[tuple[Topic, int, bytes, str], tuple[int, Condition | Scores] | None] = {}
 
     def forget(self) -> None:
         """A new tick: nothing that was read before will come again."""
         self._read.clear()
+        self._complained.clear()
 
     def read(
         self, topic: Topic, sender: int, payload: bytes, said_encoding: str
@@ -75,7 +77,7 @@ class Reader:
                 self._read[said] = _content(topic, self._arms[sender], payload, said_encoding)
             except MalformedMessage as error:
                 self._read[said] = None
-                _LOG.warning("Left out: %s", error)
+                self._complain(f"{topic} {sender}", str(error))
         word = self._read[said]
         if word is None:
             self.malformed += 1
@@ -84,7 +86,7 @@ class Reader:
     def refuse(self, key: str, reason: str) -> None:
         """Count and log a word that was read, but cannot be."""
         self.malformed += 1
-        _LOG.warning("Left out under %s: %s.", key, reason)
+        self._complain(key, f"under '{key}': {reason}.")
 
     def strange(self, key: str) -> None:
         """Judge a key under which no arm of this exchange speaks: another arm of the fleet may, a wildcard may not."""
@@ -92,7 +94,13 @@ class Reader:
             keys.parse(key)
         except ValueError as error:
             self.malformed += 1
-            _LOG.warning("Left out: %s", error)
+            self._complain(key, str(error))
+
+    def _complain(self, place: str, reason: str) -> None:
+        """Log the first complaint of a tick about a place: whoever floods the bus shall not flood the log."""
+        if place not in self._complained:
+            self._complained.add(place)
+            _LOG.warning("Left out: %s", reason)
 
 
 def _content(topic: Topic, arm: str, payload: bytes, said_encoding: str) -> tuple[int, Condition | Scores]:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import pytest
 import zenoh
 
 from fleet.bus import keys, session
+from fleet.bus.exchange import Exchange
 from fleet.bus.memory import MemoryExchange
 from fleet.bus.messages import DifficultyWord, Info, State, decode, encode, encoding
 from fleet.bus.router import Router, open_client
@@ -41,6 +43,18 @@ def test_a_new_episode_knows_nothing_of_the_last_but_what_is_said_anew(make_word
         for time_s in (0.0, 10.0, 20.0, 0.0, 10.0, 0.0):
             words = make_words(rng, 3, time_s)
             assert_same(bus.share(words), memory.share(words))
+
+
+@pytest.mark.parametrize("make", [lambda: MemoryExchange(ARMS), lambda: ZenohExchange(ARMS, "f")])
+def test_an_exchange_is_an_exchange(make: Callable[[], Exchange], make_words):
+    """The contract that the environment relies on, for both."""
+    with make() as exchange:
+        heard = exchange.share(make_words(np.random.default_rng(0), 3, 0.0))
+        assert exchange.arms == ARMS
+        assert (exchange.delivered, exchange.malformed, exchange.late) == (6, 0, 0)
+        assert heard.mode.dtype.kind == "i"
+        assert heard.difficulty.dtype == heard.p_saturation.dtype == heard.age_s.dtype == np.float64
+    exchange.close()
 
 
 def test_one_arm_alone_needs_nobody(make_words):
