@@ -27,6 +27,9 @@ class InfeasibleJob(FleetError):
         self.place = place
         self.reason = reason
 
+    def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
+        return type(self), (self.arm, self.place, self.reason)
+
 
 class BusError(FleetError):
     """The bus could not be opened, or a word on it could not be delivered in time."""

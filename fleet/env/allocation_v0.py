@@ -120,6 +120,11 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
             raise RuntimeError("There is no state yet: call reset() first.")
         return self._state
 
+    @property
+    def messages(self) -> int:
+        """Words that reached a peer so far."""
+        return self._exchange.delivered
+
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """Space of an agent's observation; the same object on every call."""
         return self.observation_spaces[agent]

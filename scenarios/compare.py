@@ -1,0 +1,153 @@
+"""Several policies on the same seeds: the seed is the unit of replication, differences are paired."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from joblib import Parallel, delayed
+from rich.table import Table
+from scipy.stats import bootstrap, trim_mean
+
+from agents.rules import make_policy
+from fleet.errors import FleetError
+from fleet.metrics import Metrics
+from scenarios.build import DifficultyName, Fleet, Progress, prepare, quiet
+from scenarios.run import RunSpec, run
+from scenarios.scenario import Scenario
+
+Array = np.ndarray
+
+RESAMPLES = 2000
+FIGURES: dict[str, Callable[[Metrics], float]] = {
+    "value": lambda m: m.value,
+    "finished": lambda m: m.finished,
+    "on_time": lambda m: m.on_time,
+    "faults": lambda m: m.faults,
+    "above_warning_min": lambda m: m.above_warning_min,
+    "peak_c": lambda m: max(m.peak_c.values()),
+    "availability": lambda m: m.availability,
+}
+"""What is compared, by name."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure of one policy over the seeds."""
+
+    mean: float
+    iqm: float
+    """Interquartile mean (Agarwal et al., NeurIPS 2021)."""
+    low: float
+    high: float
+    """95 % bootstrap interval of the mean."""
+    difference: float
+    """Mean paired difference to the baseline."""
+    difference_low: float
+    difference_high: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Policies on the same seeds."""
+
+    scenario: str
+    seeds: tuple[int, ...]
+    baseline: str
+    figures: dict[str, dict[str, Figure]]
+    """[policy][figure]."""
+
+
+def compare(
+    scenario: Scenario,
+    policies: Sequence[str],
+    *,
+    seeds: Sequence[int],
+    baseline: str,
+    difficulty: DifficultyName = "twin",
+    cache_dir: Path | None = None,
+    progress: Progress = quiet,
+) -> Comparison:
+    """Run every policy on every seed (in memory, profile plant), on all cores; the result does not depend on how many.
+
+    Raises:
+        FleetError: unknown policy, or a baseline that is not among the policies.
+    """
+    try:
+        for policy in policies:
+            make_policy(policy)
+    except ValueError as error:
+        raise FleetError(str(error)) from error
+    if baseline not in policies:
+        raise FleetError(f"The baseline '{baseline}' is not among the policies compared: {', '.join(policies)}.")
+    prepare(scenario, difficulty=difficulty, cache=cache_dir, progress=progress)  # into the cache, for all workers
+    cells = [(policy, seed) for policy in policies for seed in seeds]
+    metrics: list[Metrics] = []
+    with Parallel(n_jobs=-1, return_as="generator") as pool:
+        for done in pool(delayed(_cell)(scenario, difficulty, cache_dir, *cell) for cell in cells):
+            assert done is not None
+            metrics.append(done)
+            progress("comparing", len(metrics) / len(cells))
+    by_policy = {p: [m for (q, _), m in zip(cells, metrics, strict=True) if q == p] for p in policies}
+    rng = np.random.default_rng(np.random.SeedSequence(0))
+    figures = {
+        p: {name: _figure(of, rows, by_policy[baseline], rng) for name, of in FIGURES.items()}
+        for p, rows in by_policy.items()
+    }
+    return Comparison(scenario.name, tuple(seeds), baseline, figures)
+
+
+@cache
+def _fleet(scenario: Scenario, difficulty: DifficultyName, cache_dir: Path | None) -> Fleet:
+    return prepare(scenario, difficulty=difficulty, cache=cache_dir)
+
+
+def _cell(scenario: Scenario, difficulty: DifficultyName, cache_dir: Path | None, policy: str, seed: int) -> Metrics:
+    fleet = _fleet(scenario, difficulty, cache_dir)
+    return run(fleet, RunSpec(policy=policy, seed=seed, bus="memory", difficulty=difficulty), record=False).metrics
+
+
+def _figure(
+    of: Callable[[Metrics], float], rows: Sequence[Metrics], base: Sequence[Metrics], rng: np.random.Generator
+) -> Figure:
+    values = np.array([of(m) for m in rows], dtype=float)
+    paired = values - np.array([of(m) for m in base], dtype=float)
+    low, high = interval(values, rng)
+    d_low, d_high = interval(paired, rng)
+    return Figure(
+        mean=float(values.mean()),
+        iqm=float(trim_mean(values, 0.25)),
+        low=low,
+        high=high,
+        difference=float(paired.mean()),
+        difference_low=d_low,
+        difference_high=d_high,
+    )
+
+
+def interval(values: Array, rng: np.random.Generator) -> tuple[float, float]:
+    """95 % percentile bootstrap interval of the mean over seeds, [seed]."""
+    if np.ptp(values) == 0:
+        return float(values[0]), float(values[0])
+    found = bootstrap((values,), np.mean, n_resamples=RESAMPLES, method="percentile", rng=rng, vectorized=True)
+    return float(found.confidence_interval.low), float(found.confidence_interval.high)
+
+
+def comparison_table(result: Comparison) -> Table:
+    """Mean with its interval per policy and figure; a star where the paired difference excludes zero."""
+    seeds = len(result.seeds)
+    title = f"{result.scenario}, {seeds} seeds: mean [95 % interval], * differs from {result.baseline} (paired)"
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    table.add_column("policy")
+    for name in FIGURES:
+        table.add_column(name, justify="right")
+    for policy, figures in result.figures.items():
+        cells = []
+        for name in FIGURES:
+            f = figures[name]
+            star = "*" if f.difference_low > 0 or f.difference_high < 0 else " "
+            digits = 3 if name == "availability" else 1
+            cells.append(f"{f.mean:.{digits}f} [{f.low:.{digits}f}, {f.high:.{digits}f}]{star}")
+        table.add_row(policy, *cells)
+    return table

@@ -1,0 +1,121 @@
+"""A run folder: run.json, telemetry.parquet, events.parquet, report.html. Whole, or not there."""
+
+import json
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from fleet.errors import FleetError
+from fleet.events import Event
+from fleet.robot import JOINTS
+from fleet.sim.state import MODES
+from fleet.telemetry import Telemetry
+from scenarios.report import report_html
+from scenarios.run import RunResult, summary
+
+FILES = ("run.json", "telemetry.parquet", "events.parquet", "report.html")
+
+
+@contextmanager
+def new_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
+    """A temporary folder that becomes `out` when the block ends well, and vanishes when it does not.
+
+    Raises:
+        FleetError: `out` cannot be written, or holds something that is not ours to replace.
+    """
+    check_free(out, overwrite=overwrite)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+    except OSError as error:
+        raise FleetError(f"Cannot write to '{out}': {error.strerror}.") from error
+    try:
+        yield work
+        old = None
+        if out.exists():
+            old = Path(tempfile.mkdtemp(prefix=f".{out.name}.old.", dir=out.parent))
+            out.rename(old / out.name)
+        work.chmod(0o755)
+        work.rename(out)
+        if old is not None:
+            shutil.rmtree(old)
+    except OSError as error:
+        raise FleetError(f"Cannot write to '{out}': {error.strerror}.") from error
+    finally:
+        if work.exists():
+            shutil.rmtree(work)
+
+
+def check_free(out: Path, *, overwrite: bool) -> None:
+    """Refuse a place that is taken by anything but an earlier run that may be replaced."""
+    if not out.exists():
+        return
+    if not out.is_dir():
+        raise FleetError(f"Cannot write to '{out}': it is a file; --out needs a folder.")
+    strangers = sorted(p.name for p in out.iterdir() if p.name not in FILES)
+    if strangers:
+        raise FleetError(f"'{out}' holds other things ('{strangers[0]}'); --out needs a new folder or an earlier run.")
+    status = _status(out)
+    if status == "finished" and not overwrite:
+        raise FleetError(f"'{out}' holds a finished run; give another --out, or --overwrite to replace it.")
+
+
+def _status(out: Path) -> str | None:
+    try:
+        return json.loads((out / "run.json").read_text(encoding="utf-8")).get("status")
+    except (OSError, ValueError, AttributeError):
+        return None
+
+
+def write(result: RunResult, folder: Path) -> None:
+    """Lay down the files of a run in an existing folder."""
+    run = summary(result)
+    arms = [arm.name for arm in result.scenario.arms]
+    (folder / "run.json").write_text(json.dumps(run, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    pq.write_table(event_table(result.events), folder / "events.parquet")
+    if result.telemetry is None:
+        return
+    pq.write_table(telemetry_table(result.telemetry, arms), folder / "telemetry.parquet")
+    limits = result.scenario.limits
+    html = report_html(run, result.telemetry, result.events, arms, warning_c=limits.warning_c, error_c=limits.error_c)
+    (folder / "report.html").write_text(html, encoding="utf-8")
+
+
+def telemetry_table(telemetry: Telemetry, arms: list[str]) -> pa.Table:
+    """One row per arm and moment: time_s, arm, mode, then q, qd, tau, current_a and temp_c of joints 1..7."""
+    samples, count = telemetry.mode.shape
+    columns: dict[str, Any] = {
+        "time_s": np.repeat(telemetry.time_s, count),
+        "arm": pa.array(arms * samples).dictionary_encode(),
+        "mode": pa.DictionaryArray.from_arrays(pa.array(telemetry.mode.ravel(), pa.int8()), pa.array(MODES)),
+    }
+    for name in ("q", "qd", "tau", "current_a", "temp_c"):
+        values = getattr(telemetry, name).reshape(samples * count, JOINTS).astype(np.float32)
+        for joint in range(JOINTS):
+            columns[f"{name}_{joint + 1}"] = values[:, joint]
+    return pa.table(columns)
+
+
+def event_table(events: tuple[Event, ...]) -> pa.Table:
+    """One row per event, the fields of `Event` but for the env."""
+    rows: list[Mapping[str, Any]] = [{k: v for k, v in asdict(e).items() if k != "env"} for e in events]
+    schema = pa.schema(
+        [
+            ("time_s", pa.float64()),
+            ("kind", pa.string()),
+            ("arm", pa.string()),
+            ("job", pa.string()),
+            ("joint", pa.int8()),
+            ("value", pa.float64()),
+            ("reason", pa.string()),
+        ]
+    )
+    return pa.Table.from_pylist(rows, schema=schema)
