@@ -1,0 +1,434 @@
+"""What a shift looked like, as one Plotly figure: who did what above, how warm every motor was below.
+
+A figure is a plain dict in Plotly's schema: building Plotly's own objects takes longer than the rest of a report.
+"""
+
+import base64
+import html
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fleet.events import Event
+from fleet.robot import JOINTS
+from fleet.schedule import Assignment, Schedule
+from fleet.telemetry import Telemetry
+
+Array = np.ndarray
+Trace = dict[str, Any]
+
+POINTS_PER_TRACE = 2000
+POINTS_IN_ALL = 250_000
+"""Above this a browser grows slow; large fleets get fewer points per trace."""
+FEWEST_POINTS = 200
+
+STREAM_COLOURS = ("#4477aa", "#ddaa33", "#228833", "#aa4499", "#66ccee", "#997755", "#999933", "#555566")
+JOINT_COLOURS = ("#332288", "#cc6677", "#117733", "#88ccee", "#aa4499", "#999933", "#44aa99")
+FAULT, WARNING, INK, FAINT = "#cc2222", "#e08a00", "#222222", "#e6e6e6"
+
+MARGIN = {"l": 90, "r": 84, "t": 64, "b": 52}
+BAR = 0.62
+"""Height of a bar, in rows."""
+HATCH = {"fillmode": "overlay", "fgcolor": "white", "fgopacity": 1.0, "size": 7, "solidity": 0.35}
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Vertical layout in pixels from the top of the plotting area."""
+
+    arms: int
+
+    @property
+    def gantt(self) -> float:
+        return max(90.0, self.arms * (40.0 if self.arms <= 8 else 26.0))
+
+    @property
+    def gap(self) -> float:
+        """Between the two blocks: an axis, a title and a legend."""
+        return 130.0
+
+    @property
+    def lane(self) -> float:
+        return 130.0 if self.arms <= 8 else 90.0
+
+    @property
+    def between(self) -> float:
+        return 14.0
+
+    @property
+    def total(self) -> float:
+        return self.gantt + self.gap + self.arms * self.lane + (self.arms - 1) * self.between
+
+    def lane_top(self, a: int) -> float:
+        return self.gantt + self.gap + a * (self.lane + self.between)
+
+    def share(self, from_top_px: float) -> float:
+        """Paper coordinate: 1 at the top, 0 at the bottom."""
+        return 1.0 - from_top_px / self.total
+
+    def domain(self, top: float, height: float) -> list[float]:
+        return [max(0.0, self.share(top + height)), self.share(top)]
+
+
+def figure(
+    plan: Schedule,
+    telemetry: Telemetry,
+    events: Sequence[Event],
+    arms: Sequence[str],
+    *,
+    warning_c: float,
+    error_c: float,
+) -> dict[str, Any]:
+    """The figure: `data` and `layout` in Plotly's schema.
+
+    Args:
+        telemetry: Temperatures [sample, arm, joint], arms in the order of `arms`; may be empty.
+    """
+    unit, unit_s = time_unit(plan.horizon_s)
+    rows = _Rows(len(arms))
+    data = [
+        *_work_bars(plan, arms, unit_s),
+        *_outage_bars(plan, arms, unit_s),
+        *_marks(events, arms, unit_s),
+        *_temperatures(telemetry, arms, unit, unit_s),
+    ]
+    return {
+        "data": data,
+        "layout": _layout(plan, telemetry, arms, rows, unit, unit_s, warning_c=warning_c, error_c=error_c),
+    }
+
+
+def time_unit(horizon_s: float) -> tuple[str, float]:
+    """Unit in which a shift is best read, and its length in s: minutes up to three hours, else hours."""
+    return ("min", 60.0) if horizon_s <= 3 * 3600 else ("h", 3600.0)
+
+
+def stream_of(job: str) -> str:
+    """Name of the stream that a job came from: what stands before its last dash."""
+    return job.rpartition("-")[0] or job
+
+
+def decimate(value: Array, limit: int) -> Array:
+    """Which samples to draw so that a line of many looks the same: lowest and highest of each bin.
+
+    Args:
+        value: [sample].
+        limit: Most samples to keep, at least 4.
+
+    Returns:
+        Indices in order, with the first, the last and both extremes among them, int [kept <= limit].
+    """
+    if limit < 4:
+        raise ValueError(f"limit must be >= 4 (got {limit}).")
+    if len(value) <= limit:
+        return np.arange(len(value))
+    edges = np.linspace(0, len(value), (limit - 2) // 2 + 1).astype(int)
+    keep = [0, len(value) - 1]
+    for low, high in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        piece = value[low:high]
+        keep += [low + int(piece.argmin()), low + int(piece.argmax())]
+    return np.unique(keep)
+
+
+def plain(text: str) -> str:
+    """Text that Plotly shows as it is, though it reads a little HTML."""
+    return html.escape(text, quote=False)
+
+
+def clock(time_s: float) -> str:
+    """A time of the shift as h:mm:ss."""
+    seconds = round(time_s)
+    return f"{seconds // 3600}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
+
+
+def _packed(values: Any) -> dict[str, str]:
+    """Numbers as Plotly reads them packed: a third of their length in decimals."""
+    raw = np.ascontiguousarray(values, dtype="<f4").tobytes()
+    return {"dtype": "f4", "bdata": base64.b64encode(raw).decode("ascii")}
+
+
+def _work_bars(plan: Schedule, arms: Sequence[str], unit_s: float) -> list[Trace]:
+    streams = sorted({stream_of(a.job) for a in plan.assignments})
+    traces = []
+    for i, stream in enumerate(streams):
+        own = [a for a in plan.assignments if stream_of(a.job) == stream]
+        colour = STREAM_COLOURS[i % len(STREAM_COLOURS)]
+        traces.append(
+            _bars(
+                plain(stream),
+                [(arms.index(a.arm), a.start_s, a.end_s, _told(a)) for a in own],
+                unit_s,
+                color=colour,
+                opacity=[1.0 if a.outcome == "finished" else 0.55 for a in own],
+                line={
+                    "color": [INK if a.late_s else "white" for a in own],
+                    "width": [1.6 if a.late_s else 0.6 for a in own],
+                },
+                pattern=HATCH | {"shape": ["/" if a.outcome == "returned" else "" for a in own]},
+            )
+        )
+    keys = (
+        ("late", any(a.late_s for a in plan.assignments), {"color": "white", "line": {"color": INK, "width": 1.6}}),
+        (
+            "returned",
+            any(a.outcome == "returned" for a in plan.assignments),
+            {"color": "#888888", "pattern": HATCH | {"shape": "/"}},
+        ),
+        ("still running", any(a.outcome == "running" for a in plan.assignments), {"color": "#888888", "opacity": 0.55}),
+    )
+    return traces + [
+        {
+            "type": "bar",
+            "orientation": "h",
+            "name": name,
+            "x": [None],
+            "y": [None],
+            "marker": marker,
+            "legend": "legend",
+        }
+        for name, used, marker in keys
+        if used
+    ]
+
+
+def _bars(name: str, spans: Sequence[tuple[int, float, float, str]], unit_s: float, **marker: Any) -> Trace:
+    """Horizontal bars from (row, start_s, end_s, hover text)."""
+    return {
+        "type": "bar",
+        "orientation": "h",
+        "name": name,
+        "y": [row for row, *_ in spans],
+        "base": [round(start / unit_s, 5) for _, start, _, _ in spans],
+        "x": [round((end - start) / unit_s, 5) for _, start, end, _ in spans],
+        "width": BAR,
+        "marker": marker,
+        "customdata": [text for *_, text in spans],
+        "hovertemplate": "%{customdata}<extra></extra>",
+        "legend": "legend",
+    }
+
+
+def _told(a: Assignment) -> str:
+    """Hover text of one assignment."""
+    if a.outcome == "finished":
+        end = "on time" if not a.late_s else f"late by {clock(a.late_s)}"
+        end = f"finished at {clock(a.finished_s or 0.0)}, {end}"
+    elif a.outcome == "returned":
+        kept = "" if a.cycles_kept is None else f", {a.cycles_kept} cycles kept"
+        end = f"returned to the queue after a fault{kept}"
+    else:
+        end = "still running at the end"
+    score = f"<br>difficulty {a.difficulty:.3g}" if np.isfinite(a.difficulty) else ""
+    return f"<b>{plain(a.job)}</b> on {plain(a.arm)}<br>{clock(a.start_s)} – {clock(a.end_s)}<br>{end}{score}"
+
+
+def _outage_bars(plan: Schedule, arms: Sequence[str], unit_s: float) -> list[Trace]:
+    if not plan.outages:
+        return []
+    spans = []
+    for o in plan.outages:
+        end = "recovered" if o.recovered else "not recovered"
+        text = f"<b>{plain(o.arm)} lost</b><br>{clock(o.start_s)} – {clock(o.end_s)}, {end}<br>{plain(o.reason)}"
+        spans.append((arms.index(o.arm), o.start_s, o.end_s, text))
+    return [_bars("out after a fault", spans, unit_s, color=FAULT, opacity=0.8, line={"width": 0})]
+
+
+def _marks(events: Sequence[Event], arms: Sequence[str], unit_s: float) -> list[Trace]:
+    """Faults and warnings, above the bars of their arm."""
+    looks = (("fault", "x", FAULT), ("warning", "triangle-up", WARNING))
+    traces = []
+    for kind, symbol, colour in looks:
+        own = [e for e in events if e.kind == kind and e.arm in arms]
+        if own:
+            traces.append(
+                {
+                    "type": "scatter",
+                    "mode": "markers",
+                    "name": kind,
+                    "x": [round(e.time_s / unit_s, 5) for e in own],
+                    "y": [arms.index(e.arm) - 0.42 for e in own],
+                    "marker": {"symbol": symbol, "color": colour, "size": 9, "line": {"color": "white", "width": 1}},
+                    "customdata": [_said(e) for e in own],
+                    "hovertemplate": "%{customdata}<extra></extra>",
+                    "legend": "legend",
+                }
+            )
+    return traces
+
+
+def _said(e: Event) -> str:
+    """Hover text of one event."""
+    job = f"<br>{plain(e.job)}" if e.job else ""
+    return f"<b>{e.kind}</b> of {plain(e.arm)} at {clock(e.time_s)}<br>{plain(e.reason)}{job}"
+
+
+def _temperatures(telemetry: Telemetry, arms: Sequence[str], unit: str, unit_s: float) -> list[Trace]:
+    points = int(np.clip(POINTS_IN_ALL // max(1, JOINTS * len(arms)), FEWEST_POINTS, POINTS_PER_TRACE))
+    traces = []
+    for a, arm in enumerate(arms):
+        for j in range(JOINTS):
+            value = telemetry.temp_c[:, a, j]
+            kept = decimate(value, points)
+            traces.append(
+                {
+                    "type": "scatter",
+                    "mode": "lines",
+                    "name": f"joint {j + 1}",
+                    "legendgroup": f"joint {j + 1}",
+                    "legend": "legend2",
+                    "showlegend": a == 0,
+                    "x": _packed(telemetry.time_s[kept] / unit_s),
+                    "y": _packed(value[kept]),
+                    "xaxis": "x2",
+                    "yaxis": f"y{a + 2}",
+                    "line": {"color": JOINT_COLOURS[j], "width": 1.3},
+                    "hovertemplate": (
+                        f"{plain(arm)} joint {j + 1}<br>%{{y:.1f}} °C at %{{x:.2f}} {unit}<extra></extra>"
+                    ),
+                }
+            )
+    return traces
+
+
+def _layout(
+    plan: Schedule,
+    telemetry: Telemetry,
+    arms: Sequence[str],
+    rows: _Rows,
+    unit: str,
+    unit_s: float,
+    *,
+    warning_c: float,
+    error_c: float,
+) -> dict[str, Any]:
+    end = max(plan.horizon_s / unit_s, 1e-3)
+    axis = {"showgrid": True, "gridcolor": FAINT, "zeroline": False, "linecolor": "#bbbbbb", "ticks": "outside"}
+    time = axis | {"range": [0, end], "title": {"text": f"time ({unit})", "standoff": 6}, "domain": [0, 1]}
+    known = telemetry.temp_c[np.isfinite(telemetry.temp_c)]
+    low = float(known.min(initial=warning_c - 20.0))
+    high = float(known.max(initial=error_c))
+    room = 0.06 * (high - low)
+    lanes = {
+        f"yaxis{a + 2}": axis
+        | {
+            "domain": rows.domain(rows.lane_top(a), rows.lane),
+            "anchor": "x2",
+            "range": [low - room, high + room],
+            "title": {"text": f"<b>{plain(arm)}</b><br>°C", "standoff": 8},
+            "nticks": 6,
+            **({"matches": "y2"} if a else {}),
+        }
+        for a, arm in enumerate(arms)
+    }
+    return {
+        "template": "none",
+        "height": round(rows.total + MARGIN["t"] + MARGIN["b"]),
+        "margin": MARGIN,
+        "font": {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 12, "color": INK},
+        "paper_bgcolor": "white",
+        "plot_bgcolor": "white",
+        "barmode": "overlay",
+        "hovermode": "closest",
+        "dragmode": "zoom",
+        "hoverlabel": {"align": "left", "bgcolor": "white", "bordercolor": "#bbbbbb", "font": {"color": INK}},
+        "xaxis": time | {"anchor": "y"},
+        "xaxis2": time | {"anchor": f"y{len(arms) + 1}", "matches": "x"},
+        "yaxis": axis
+        | {
+            "domain": rows.domain(0.0, rows.gantt),
+            "range": [len(arms) - 0.4, -0.65],
+            "tickvals": list(range(len(arms))),
+            "ticktext": [plain(arm) for arm in arms],
+            "showgrid": False,
+            "fixedrange": True,
+            "automargin": True,
+        },
+        **lanes,
+        "legend": _legend(rows.share(0.0), rows) | {"itemclick": "toggle"},
+        "legend2": _legend(rows.share(rows.lane_top(0)), rows) | {"itemdoubleclick": "toggleothers"},
+        "annotations": [
+            _title("Who did what", rows.share(-34.0)),
+            _title("Motor temperatures", rows.share(rows.lane_top(0) - 34.0)),
+            *_limit_labels(len(arms), warning_c, error_c),
+        ],
+        "shapes": _shapes(plan, arms, unit_s, warning_c, error_c),
+    }
+
+
+def _legend(top: float, rows: _Rows) -> dict[str, Any]:
+    """One line above the block that begins at `top`."""
+    return {
+        "orientation": "h",
+        "x": 0,
+        "xanchor": "left",
+        "y": top + 6.0 / rows.total,
+        "yanchor": "bottom",
+        "bgcolor": "rgba(255,255,255,0)",
+        "tracegroupgap": 0,
+    }
+
+
+def _title(text: str, y: float) -> dict[str, Any]:
+    return {
+        "text": f"<b>{text}</b>",
+        "x": 0,
+        "xref": "paper",
+        "xanchor": "left",
+        "y": y,
+        "yref": "paper",
+        "yanchor": "bottom",
+        "showarrow": False,
+        "font": {"size": 15},
+    }
+
+
+def _limit_labels(arms: int, warning_c: float, error_c: float) -> list[dict[str, Any]]:
+    labels = (("error", error_c, FAULT, "bottom"), ("warning", warning_c, WARNING, "top"))
+    return [
+        {
+            "text": f"{word} {limit:g} °C",
+            "x": 1,
+            "xref": "paper",
+            "xanchor": "left",
+            "xshift": 4,
+            "y": limit,
+            "yref": f"y{a + 2}",
+            "yanchor": anchor,
+            "yshift": -5 if anchor == "bottom" else 5,
+            "showarrow": False,
+            "font": {"size": 10, "color": colour},
+        }
+        for a in range(arms)
+        for word, limit, colour, anchor in labels
+    ]
+
+
+def _shapes(
+    plan: Schedule, arms: Sequence[str], unit_s: float, warning_c: float, error_c: float
+) -> list[dict[str, Any]]:
+    """Limits as lines across the lanes, faults as vertical lines and outages as shade in the lane of their arm."""
+    limits = [
+        {
+            "type": "line",
+            "xref": "paper",
+            "x0": 0,
+            "x1": 1,
+            "yref": f"y{a + 2}",
+            "y0": limit,
+            "y1": limit,
+            "line": {"color": colour, "width": 1, "dash": dash},
+        }
+        for a in range(len(arms))
+        for limit, colour, dash in ((warning_c, WARNING, "dash"), (error_c, FAULT, "solid"))
+    ]
+    outages = []
+    for o in plan.outages:
+        lane = {"xref": "x2", "yref": f"y{arms.index(o.arm) + 2} domain", "y0": 0, "y1": 1}
+        start, end = round(o.start_s / unit_s, 5), round(o.end_s / unit_s, 5)
+        outages += [
+            lane | {"type": "rect", "x0": start, "x1": end, "fillcolor": FAULT, "opacity": 0.10, "line": {"width": 0}},
+            lane | {"type": "line", "x0": start, "x1": start, "line": {"color": FAULT, "width": 1.5}},
+        ]
+    return limits + outages

@@ -1,0 +1,260 @@
+"""The report: one file that shows what happened, fetches nothing, and cannot be broken by a name."""
+
+import base64
+import copy
+import json
+import re
+from html.parser import HTMLParser
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from plotly.offline import get_plotlyjs
+
+from fleet.events import Event
+from fleet.schedule import schedule
+from fleet.telemetry import Telemetry
+from scenarios.figure import decimate, figure, stream_of
+from scenarios.report import ROWS, report_html
+
+ARMS = ("arm_0", "arm_1")
+HOSTILE = '</script><img src="https://evil.example/x"><b>-001'
+
+RUN: dict[str, Any] = {
+    "format": 1,
+    "status": "finished",
+    "scenario": {"name": "two_arms", "description": "Two arms at work.", "horizon_s": 7200.0},
+    "policy": "coolest_first",
+    "seed": 3,
+    "plant": "profile",
+    "bus": "memory",
+    "difficulty": "blind",
+    "twins": {"arm_0": "blind", "arm_1": "blind"},
+    "versions": {"thermofleet": "0.1.0"},
+    "metrics": {"jobs": 4, "finished": 2, "value": 3.5, "faults": 1, "peak_c": {"arm_0": 76.5, "arm_1": 41.0}},
+}
+
+EVENTS = (
+    Event(time_s=0.0, kind="award", arm="arm_0", job="hold-001", value=0.4),
+    Event(time_s=0.0, kind="award", arm="arm_1", job=HOSTILE),
+    Event(time_s=0.0, kind="lost", arm="arm_1", job="hold-001", reason="another arm claimed it"),
+    Event(time_s=300.0, kind="finish", arm="arm_1", job=HOSTILE, value=12.0),
+    Event(time_s=310.0, kind="home", arm="arm_1", job=HOSTILE),
+    Event(time_s=600.0, kind="warning", arm="arm_0", job="hold-001", joint=2, reason="motor 2 passed 60 °C"),
+    Event(time_s=1200.0, kind="fault", arm="arm_0", job="hold-001", joint=2, reason="motor 2 passed 75 °C"),
+    Event(time_s=1200.0, kind="return", arm="arm_0", job="hold-001", value=3.0, reason="3 of 9 cycles kept"),
+    Event(time_s=3000.0, kind="recover", arm="arm_0", reason="cool again"),
+    Event(time_s=7000.0, kind="award", arm="arm_1", job="hold-001"),
+)
+
+
+def telemetry(samples: int = 7200, arms: int = 2) -> Telemetry:
+    """Temperatures that wander; everything else is still."""
+    rng = np.random.default_rng(0)
+    joints = np.zeros((samples, arms, 7))
+    temp_c = 40.0 + np.cumsum(rng.normal(0, 0.05, joints.shape), axis=0)
+    return Telemetry(
+        time_s=np.arange(1.0, samples + 1),
+        mode=np.zeros((samples, arms), dtype=int),
+        q=joints,
+        qd=joints,
+        tau=joints,
+        current_a=joints,
+        temp_c=temp_c,
+    )
+
+
+def page(
+    run: dict[str, Any] = RUN,
+    events: tuple[Event, ...] = EVENTS,
+    arms: tuple[str, ...] = ARMS,
+    readings: Telemetry | None = None,
+) -> str:
+    readings = telemetry(arms=len(arms)) if readings is None else readings
+    return report_html(run, readings, events, arms, warning_c=60.0, error_c=75.0)
+
+
+def drawn(text: str) -> dict[str, Any]:
+    """The figure as the browser would read it from the page."""
+    start = text.index("const drawn=") + len("const drawn=")
+    return json.JSONDecoder().raw_decode(text[start:])[0]
+
+
+def own(text: str) -> str:
+    """The page without Plotly's own code, which must be in it once."""
+    assert text.count(get_plotlyjs()) == 1
+    return text.replace(get_plotlyjs(), "")
+
+
+class Elements(HTMLParser):
+    """Every element of a page with its attributes, and the text outside scripts."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.words = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data: str) -> None:
+        self.words += data
+
+
+def test_nothing_is_fetched_and_nothing_is_offered_to_a_server() -> None:
+    text = page()
+    elements = Elements(own(text))
+    for tag, attributes in elements.tags:
+        assert tag not in ("link", "iframe", "img", "object")
+        assert not {"src", "href", "srcset", "action"} & set(attributes)
+    assert "@import" not in text.replace(get_plotlyjs(), "")
+    (policy,) = [a["content"] for _, a in elements.tags if a.get("http-equiv") == "Content-Security-Policy"]
+    assert policy is not None
+    assert "default-src 'none'" in policy
+    assert "http" not in policy
+    assert '"showSendToCloud":false' in text
+    assert '"plotlyServerURL":""' in text
+
+
+def test_same_input_same_bytes_in_any_order_of_the_log() -> None:
+    assert page() == page(copy.deepcopy(RUN), EVENTS[::-1])
+
+
+def test_plotly_accepts_the_figure() -> None:
+    go.Figure(drawn(page()))  # raises on any property or value that Plotly does not know
+
+
+@pytest.mark.parametrize("count", [1, 5, 16])
+def test_every_arm_has_a_row_and_a_lane_of_seven_motors(count: int) -> None:
+    arms = tuple(f"arm_{i}" for i in range(count))
+    shown = drawn(page(events=(), arms=arms, readings=telemetry(50, count)))
+    assert tuple(shown["layout"]["yaxis"]["ticktext"]) == arms
+    for a, arm in enumerate(arms):
+        assert arm in shown["layout"][f"yaxis{a + 2}"]["title"]["text"]
+        lane = [t for t in shown["data"] if t.get("yaxis") == f"y{a + 2}"]
+        assert [t["legendgroup"] for t in lane] == [f"joint {j}" for j in range(1, 8)]
+    domains = [shown["layout"][f"yaxis{i if i > 1 else ''}"]["domain"] for i in range(1, count + 2)]
+    assert all(0 <= low < high <= 1 for low, high in domains)
+    assert all(upper[0] > lower[1] for upper, lower in pairwise(domains))
+    go.Figure(shown)
+
+
+def test_the_legend_names_each_joint_once() -> None:
+    shown = [t["name"] for t in drawn(page())["data"] if t.get("legend") == "legend2" and t["showlegend"]]
+    assert shown == [f"joint {j}" for j in range(1, 8)]
+
+
+def test_every_fault_is_marked_in_gantt_lane_and_table() -> None:
+    text = page()
+    shown = drawn(text)
+    (marks,) = [t for t in shown["data"] if t.get("name") == "fault"]
+    assert marks["x"] == [20.0]  # 1200 s in minutes
+    assert "motor 2 passed 75" in marks["customdata"][0]
+    lines = [s for s in shown["layout"]["shapes"] if s.get("xref") == "x2" and s["type"] == "line"]
+    assert [(s["x0"], s["x1"], s["yref"]) for s in lines] == [(20.0, 20.0, "y2 domain")]
+    (block,) = [t for t in shown["data"] if t.get("name") == "out after a fault"]
+    assert (block["base"], block["x"], block["y"]) == ([20.0], [30.0], [0])
+    assert own(text).count('<tr class="fault">') == 1
+
+
+def test_the_gantt_shows_each_assignment_where_and_how_it_went() -> None:
+    bars = {t["name"]: t for t in drawn(page())["data"] if t["type"] == "bar" and t["x"] != [None]}
+    hold = bars["hold"]
+    assert (hold["y"], hold["base"]) == ([0, 1], [0.0, round(7000 / 60, 5)])
+    assert hold["marker"]["pattern"]["shape"] == ["/", ""]
+    assert "returned to the queue after a fault, 3 cycles kept" in hold["customdata"][0]
+    assert "still running" in hold["customdata"][1]
+    (other,) = [t for name, t in bars.items() if name not in ("hold", "out after a fault")]
+    assert "late by 0:00:12" in other["customdata"][0]
+
+
+def test_a_hostile_name_stays_text() -> None:
+    run = copy.deepcopy(RUN)
+    run["scenario"]["name"] = run["scenario"]["description"] = run["policy"] = HOSTILE
+    lost = Event(time_s=5.0, kind="lost", arm="arm_1", job=HOSTILE, reason=HOSTILE)
+    text = own(page(run, (*EVENTS, lost)))
+    elements = Elements(text)
+    assert not [tag for tag, _ in elements.tags if tag in ("img", "b")]
+    assert elements.words.count(HOSTILE) >= 4  # title, heading, description, table
+    assert text.count("<script>") == text.count("</script>") == 2
+    bars = [t for t in drawn(text)["data"] if t["type"] == "bar"]
+    assert not any("<img" in t["name"] or "<img" in "".join(t.get("customdata", [])) for t in bars)
+
+
+def test_an_interrupted_run_says_so_and_ends_where_it_stopped() -> None:
+    events = tuple(e for e in EVENTS if e.time_s < 5000)
+    text = page({**RUN, "status": "interrupted"}, events, readings=telemetry(5400))
+    assert "Interrupted after 1 h 30 min" in Elements(own(text)).words
+    assert drawn(text)["layout"]["xaxis"]["range"] == [0, 90.0]
+    assert "Interrupted" not in own(page())
+
+
+def test_a_run_without_figures_readings_or_events_still_has_a_report() -> None:
+    run = {"status": "interrupted", "metrics": {"value": None, "availability": float("nan"), "peak_c": {}}}
+    text = page(run, (), readings=telemetry(0))
+    assert "unnamed scenario" in text
+    assert "No fault" in text
+    go.Figure(drawn(text))
+
+
+def test_figures_at_the_head_come_from_the_metrics() -> None:
+    words = re.sub(r"\s+", " ", Elements(own(page())).words)
+    for shown in ("jobs finished2 of 4", "value3.5", "faults1", "hottest motor76.5 °C arm_0"):
+        assert shown in words
+    assert "tardiness" not in words
+
+
+def test_a_long_log_is_cut_from_the_least_serious_end_and_says_by_how_much() -> None:
+    lost = tuple(Event(time_s=float(t), kind="lost", arm="arm_1", job="hold-001") for t in range(1000))
+    text = own(page(events=(*lost, *EVENTS)))
+    assert text.count('<tr class="') == ROWS
+    assert text.count('<tr class="fault">') == text.count('<tr class="warning">') == 1
+    assert f"{ROWS} of 1005 are listed; left out: {1005 - ROWS} × claim lost" in text
+    assert 'class="award"' not in text
+
+
+def test_telemetry_of_another_fleet_is_refused() -> None:
+    with pytest.raises(ValueError, match="telemetry is of 2 arms, the fleet has 3"):
+        page(arms=("a", "b", "c"), events=(), readings=telemetry(10, 2))
+
+
+@given(
+    arrays(np.float64, st.integers(1, 400), elements=st.floats(-50, 150)),
+    st.integers(4, 60),
+)
+def test_decimation_keeps_both_extremes_the_ends_and_the_limit(value: np.ndarray, limit: int) -> None:
+    kept = decimate(value, limit)
+    assert len(kept) <= max(limit, 0)
+    assert (np.diff(kept) > 0).all()
+    assert (kept[0], kept[-1]) == (0, len(value) - 1)
+    assert (value[kept].min(), value[kept].max()) == (value.min(), value.max())
+
+
+def test_a_short_spike_of_a_long_shift_is_drawn() -> None:
+    readings = telemetry(28_800, 1)
+    readings.temp_c[12_345, 0, 1] = 99.0
+    shown = figure(schedule((), ("a",), 28_800.0), readings, (), ("a",), warning_c=60.0, error_c=75.0)
+    (lane,) = [t for t in shown["data"] if t["name"] == "joint 2"]
+    x, y = (np.frombuffer(base64.b64decode(lane[axis]["bdata"]), dtype="<f4") for axis in "xy")
+    assert len(x) == len(y) <= 2000
+    assert y.max() == 99.0
+    assert x[y.argmax()] == pytest.approx(readings.time_s[12_345] / 3600)
+
+
+def test_a_large_fleet_gets_fewer_points_per_motor() -> None:
+    arms = tuple(f"arm_{i}" for i in range(64))
+    shown = figure(schedule((), arms, 7200.0), telemetry(7200, 64), (), arms, warning_c=60.0, error_c=75.0)
+    points = [len(base64.b64decode(t["x"]["bdata"])) // 4 for t in shown["data"] if t["type"] == "scatter"]
+    assert len(points) == 64 * 7
+    assert sum(points) <= 250_000
+
+
+@pytest.mark.parametrize(("job", "stream"), [("sort_parts-001", "sort_parts"), ("a-b-2", "a-b"), ("lonely", "lonely")])
+def test_the_stream_of_a_job_stands_before_its_last_dash(job: str, stream: str) -> None:
+    assert stream_of(job) == stream
