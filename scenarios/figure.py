@@ -28,9 +28,14 @@ STREAM_COLOURS = ("#4477aa", "#ddaa33", "#228833", "#aa4499", "#66ccee", "#99775
 JOINT_COLOURS = ("#332288", "#cc6677", "#117733", "#88ccee", "#aa4499", "#999933", "#44aa99")
 FAULT, WARNING, INK, FAINT = "#cc2222", "#e08a00", "#222222", "#e6e6e6"
 
-MARGIN = {"l": 90, "r": 84, "t": 64, "b": 52}
+MARGIN = {"l": 90, "r": 84, "b": 52}
+NARROW_PX = 860
+"""Width of the plotting area on a small laptop, for which room is left where a legend must wrap."""
+LEGEND_ROW_PX = 20.0
 BAR = 0.62
 """Height of a bar, in rows."""
+NAME = 20.0
+"""Height of the name of an arm above its lane, px."""
 HATCH = {"fillmode": "overlay", "fgcolor": "white", "fgopacity": 1.0, "size": 7, "solidity": 0.35}
 
 
@@ -47,15 +52,15 @@ class _Rows:
     @property
     def gap(self) -> float:
         """Between the two blocks: an axis, a title and a legend."""
-        return 130.0
+        return 150.0
 
     @property
     def lane(self) -> float:
-        return 130.0 if self.arms <= 8 else 90.0
+        return 120.0 if self.arms <= 8 else 84.0
 
     @property
     def between(self) -> float:
-        return 14.0
+        return 28.0
 
     @property
     def total(self) -> float:
@@ -96,7 +101,9 @@ def figure(
     ]
     return {
         "data": data,
-        "layout": _layout(plan, telemetry, arms, rows, unit, unit_s, warning_c=warning_c, error_c=error_c),
+        "layout": _layout(
+            plan, telemetry, arms, rows, _legend_height(data), unit, unit_s, warning_c=warning_c, error_c=error_c
+        ),
     }
 
 
@@ -297,6 +304,7 @@ def _layout(
     telemetry: Telemetry,
     arms: Sequence[str],
     rows: _Rows,
+    legend_px: float,
     unit: str,
     unit_s: float,
     *,
@@ -316,16 +324,17 @@ def _layout(
             "domain": rows.domain(rows.lane_top(a), rows.lane),
             "anchor": "x2",
             "range": [low - room, high + room],
-            "title": {"text": f"<b>{plain(arm)}</b><br>°C", "standoff": 8},
+            "title": {"text": "°C", "standoff": 8},
             "nticks": 6,
             **({"matches": "y2"} if a else {}),
         }
-        for a, arm in enumerate(arms)
+        for a in range(len(arms))
     }
     return {
         "template": "none",
-        "height": round(rows.total + MARGIN["t"] + MARGIN["b"]),
-        "margin": MARGIN,
+        "height": round(rows.total + legend_px + 44.0 + MARGIN["b"]),
+        "margin": MARGIN | {"t": round(legend_px + 44.0)},
+        "modebar": {"orientation": "v"},
         "font": {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 12, "color": INK},
         "paper_bgcolor": "white",
         "plot_bgcolor": "white",
@@ -347,14 +356,24 @@ def _layout(
         },
         **lanes,
         "legend": _legend(rows.share(0.0), rows) | {"itemclick": "toggle"},
-        "legend2": _legend(rows.share(rows.lane_top(0)), rows) | {"itemdoubleclick": "toggleothers"},
+        "legend2": _legend(rows.share(rows.lane_top(0) - NAME), rows) | {"itemdoubleclick": "toggleothers"},
         "annotations": [
-            _title("Who did what", rows.share(-34.0)),
-            _title("Motor temperatures", rows.share(rows.lane_top(0) - 34.0)),
+            _title("Who did what", rows.share(-legend_px - 14.0)),
+            _title("Motor temperatures", rows.share(rows.lane_top(0) - NAME - 34.0)),
+            *(_title(plain(arm), rows.share(rows.lane_top(a) - 2.0), size=12) for a, arm in enumerate(arms)),
             *_limit_labels(len(arms), warning_c, error_c),
         ],
         "shapes": _shapes(plan, arms, unit_s, warning_c, error_c),
     }
+
+
+def _legend_height(data: Sequence[Trace]) -> float:
+    """Room for the legend of the work, px: on a narrow page it takes several lines, with columns of equal width."""
+    wide = [45.0 + 6.5 * len(trace["name"]) for trace in data if trace["legend"] == "legend"]
+    if sum(wide) <= NARROW_PX:
+        return LEGEND_ROW_PX
+    per_row = max(1, int(NARROW_PX // max(wide)))
+    return LEGEND_ROW_PX * -(-len(wide) // per_row)
 
 
 def _legend(top: float, rows: _Rows) -> dict[str, Any]:
@@ -370,7 +389,7 @@ def _legend(top: float, rows: _Rows) -> dict[str, Any]:
     }
 
 
-def _title(text: str, y: float) -> dict[str, Any]:
+def _title(text: str, y: float, *, size: int = 15) -> dict[str, Any]:
     return {
         "text": f"<b>{text}</b>",
         "x": 0,
@@ -380,7 +399,7 @@ def _title(text: str, y: float) -> dict[str, Any]:
         "yref": "paper",
         "yanchor": "bottom",
         "showarrow": False,
-        "font": {"size": 15},
+        "font": {"size": size},
     }
 
 

@@ -38,7 +38,7 @@ body { margin: 0 auto; max-width: 1320px; padding: 20px 28px 48px; color: #222; 
   font: 14px/1.45 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
 h1 { font-size: 22px; margin: 0 0 2px; overflow-wrap: anywhere; }
 h2 { font-size: 15px; margin: 28px 0 8px; }
-p { margin: 2px 0; max-width: 90ch; }
+p { margin: 2px 0; max-width: 90ch; overflow-wrap: anywhere; }
 .faint { color: #666; }
 .status { display: inline-block; margin: 8px 0 0; padding: 2px 10px; border-radius: 4px; font-weight: 600; }
 .finished { background: #e8f3ea; color: #1c6b32; }
@@ -53,7 +53,7 @@ p { margin: 2px 0; max-width: 90ch; }
 table { border-collapse: collapse; font-size: 13px; width: 100%; }
 th, td { text-align: left; padding: 3px 12px 3px 0; border-bottom: 1px solid #eee; vertical-align: top;
   overflow-wrap: anywhere; }
-th { color: #666; font-weight: 600; position: sticky; top: 0; background: #fff; }
+th { color: #666; font-weight: 600; }
 td.time { font-variant-numeric: tabular-nums; white-space: nowrap; }
 #lost:not(:checked) ~ table tr.lost { display: none; }
 tr.fault td { color: #b51d1d; font-weight: 600; }
@@ -236,7 +236,7 @@ def _origin(run: Mapping[str, Any]) -> str:
     for key, value in (rest | scenario).items():
         parts = value.items() if isinstance(value, Mapping) else [("", value)]
         rows += [(f"{key} {part}".strip(), inner) for part, inner in parts]
-    cells = "".join(f"<tr><td>{_text(key.replace('_', ' '))}</td><td>{_text(_said(v))}</td></tr>" for key, v in rows)
+    cells = "".join(f"<tr><td>{_text(key)}</td><td>{_text(_said(v))}</td></tr>" for key, v in rows)
     return f"<details><summary>How this run was made, and all its figures</summary><table>{cells}</table></details>"
 
 

@@ -135,8 +135,9 @@ def test_every_arm_has_a_row_and_a_lane_of_seven_motors(count: int) -> None:
     arms = tuple(f"arm_{i}" for i in range(count))
     shown = drawn(page(events=(), arms=arms, readings=telemetry(50, count)))
     assert tuple(shown["layout"]["yaxis"]["ticktext"]) == arms
+    names = [note["text"] for note in shown["layout"]["annotations"]]
     for a, arm in enumerate(arms):
-        assert arm in shown["layout"][f"yaxis{a + 2}"]["title"]["text"]
+        assert f"<b>{arm}</b>" in names
         lane = [t for t in shown["data"] if t.get("yaxis") == f"y{a + 2}"]
         assert [t["legendgroup"] for t in lane] == [f"joint {j}" for j in range(1, 8)]
     domains = [shown["layout"][f"yaxis{i if i > 1 else ''}"]["domain"] for i in range(1, count + 2)]
