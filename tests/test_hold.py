@@ -68,8 +68,11 @@ def test_both_starts_settle_at_the_same_temperature():
     assert result.cold.steady_c == result.idle_warm.steady_c
 
 
-@pytest.mark.parametrize(("posture", "kg", "start"), [("outstretched", 4.0, "idle_warm"), ("raised", 3.0, "cold")])
-def test_times_agree_with_a_general_ode_solver_to_half_a_percent(posture, kg, start):
+@pytest.mark.parametrize(
+    ("posture", "kg", "start"),
+    [("outstretched", 4.0, "idle_warm"), ("raised", 3.0, "cold"), ("outstretched", 9.0, "idle_warm")],
+)
+def test_times_agree_with_a_general_ode_solver_to_a_thousandth(posture, kg, start):
     result = hold(kg, posture, 25.0)
     model, motors, rest = thermal_model(gen3_network()), gen3_motors(), np.zeros(JOINTS)
     current_sq = reference_current(np.array(result.cold.torque_nm), rest, motors) ** 2
@@ -88,10 +91,11 @@ def test_times_agree_with_a_general_ode_solver_to_half_a_percent(posture, kg, st
     def faults(_: float, temp_c: np.ndarray) -> float:
         return temp_c[J2] - LIMITS_C[1]
 
-    solved = solve_ivp(slope, (0.0, 7200.0), start_c, events=[warns, faults], rtol=1e-9, atol=1e-9, method="LSODA")
     course = getattr(result, start)
-    assert course.t60_min[J2] == pytest.approx(solved.t_events[0][0] / 60.0, rel=0.005)
-    assert course.t75_min[J2] == pytest.approx(solved.t_events[1][0] / 60.0, rel=0.005)
+    span_s = (0.0, 1.05 * 60.0 * course.t75_min[J2])  # No longer: a runaway ends in finite time.
+    solved = solve_ivp(slope, span_s, start_c, events=[warns, faults], rtol=1e-9, atol=1e-9, method="LSODA")
+    assert course.t60_min[J2] == pytest.approx(solved.t_events[0][0] / 60.0, rel=0.001)
+    assert course.t75_min[J2] == pytest.approx(solved.t_events[1][0] / 60.0, rel=0.001)
 
 
 def test_more_payload_is_never_slower_to_warn():
@@ -118,6 +122,13 @@ def test_runaway_has_no_settling_temperature_but_has_times():
     assert result.cold.t75_min[J2] is not None
     assert "never settles" in result.note
     assert "torque warning of 56.7" in result.note
+
+
+def test_nothing_is_said_of_the_time_after_a_motor_burnt():
+    # Joint 2 melts within minutes here; what its heat would do to joint 1 half an hour later is no prediction.
+    result = hold(7.0, "raised", 60.0)
+    assert result.idle_warm.t75_min[J2] is not None
+    assert result.idle_warm.t75_min[0] is None
 
 
 def test_a_start_above_the_limit_passes_at_once():

@@ -258,6 +258,32 @@ def test_beyond_some_load_nothing_settles():
     assert run[-1] - run[-180] > 1.0  # Still rising, by more than a kelvin in an hour, after two days.
 
 
+@settings(deadline=None)
+@given(arrays(float, JOINTS, elements=st.floats(0.0, 110.0)), st.floats(-40.0, 60.0))
+def test_settled_is_a_balance_above_the_room_or_nothing(tau_nm, ambient_c):
+    # Newton's method without care would also find balances far below absolute zero, or the unstable ones.
+    current_sq = reference_current(tau_nm, REST, MOTORS) ** 2
+    end = settled(MODEL, current_sq, REST, MOTORS, ambient_c)
+    if end is not None:
+        assert np.all(end >= ambient_c)
+        heat_w = drive_heat(end, current_sq, REST, MOTORS)
+        np.testing.assert_allclose(MODEL.steady(heat_w, ambient_c), end, atol=1e-6)
+        hotter_w = drive_heat(end + 0.1, current_sq, REST, MOTORS)
+        assert hotter_w.sum() - heat_w.sum() < 0.1 * MODEL.to_ambient.sum()  # Stable: a push away dies out.
+
+
+def test_a_hopeless_load_on_a_wrist_settles_nowhere():
+    current_sq = reference_current(np.array([0, 0, 0, 0, 0, 0, 96.2]), REST, MOTORS) ** 2
+    assert settled(MODEL, current_sq, REST, MOTORS, 25.0) is None
+
+
+def test_friction_and_idle_heat_enter_the_housings():
+    friction_w = np.arange(7.0)
+    end = settled(MODEL, REST, friction_w, MOTORS, 22.0)
+    assert end is not None
+    np.testing.assert_allclose(end, MODEL.steady(node_heat(REST, MOTORS.idle_w + friction_w), 22.0))
+
+
 # Second methods and step size ----------------------------------------------------------------------------------------
 
 
