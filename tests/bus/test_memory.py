@@ -149,6 +149,14 @@ def test_what_was_said_does_not_change_with_the_callers_arrays(make_words):
     assert heard.difficulty[0, 0, 0] == 9.0
 
 
+def test_a_delay_is_not_a_tick_longer_for_a_rounding(make_words):
+    """0.1 + 0.2 > 0.3 in binary."""
+    exchange = MemoryExchange(ARMS, delay_s=0.2)
+    rng = np.random.default_rng(0)
+    exchange.share(make_words(rng, 4, 0.1))
+    assert np.isfinite(exchange.share(make_words(rng, 4, 0.3)).age_s).all()
+
+
 def test_one_arm_alone_knows_itself(make_words):
     heard = MemoryExchange(["solo"]).share(make_words(np.random.default_rng(0), 1, 0.0))
     assert heard.difficulty.shape == (1, 1, 4)

@@ -85,7 +85,7 @@ def test_an_arm_is_on_the_bus_once():
 
 
 def state_json(**changes) -> bytes:
-    fields = json.loads(encode(State("arm_0", 1, 10.0, "idle", (20.0,), 40.0)))
+    fields = json.loads(encode(State("arm_0", 0, 0.0, "idle", (20.0,), 40.0)))
     return json.dumps(fields | changes).encode()
 
 

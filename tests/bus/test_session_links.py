@@ -123,6 +123,32 @@ def test_a_word_that_does_not_come_leaves_the_last_one_with_its_age(gate, make_w
         until_all_is_heard(bus, make_words, 1e6 + 20.0)
 
 
+def test_in_a_new_episode_nothing_is_known_of_an_arm_that_is_silent(gate, make_words):
+    rng = np.random.default_rng(0)
+    with ZenohExchange(ARMS, "f", gate.endpoint, timeout_s=SHORT_S) as bus:
+        until_all_is_heard(bus, make_words, 1e6)
+        gate.says[1].clear()
+        heard = bus.share(make_words(rng, 3, 0.0))
+        assert np.isinf(heard.age_s[[0, 2], 1]).all()
+        assert np.isnan(heard.headroom_k[[0, 2], 1]).all()
+        # Its words of the new episode count when they come, those of the last do not.
+        gate.says[1].set()
+        until_all_is_heard(bus, make_words, 10.0)
+
+
+def test_a_link_that_breaks_while_it_is_waited_for_ends_the_wait(gate, make_words):
+    with ZenohExchange(ARMS, "f", gate.endpoint, timeout_s=PATIENT_S) as bus:
+        until_all_is_heard(bus, make_words, 0.0)
+        gate.says[1].clear()
+        gate.refuse()
+        breaks = threading.Timer(0.2, gate.cut, args=(1,))
+        breaks.start()
+        start_s = time.monotonic()
+        bus.share(make_words(np.random.default_rng(0), 3, 1e6))
+        assert time.monotonic() - start_s < PATIENT_S
+        breaks.join()
+
+
 def test_nobody_waits_for_ever_for_an_arm_that_is_silent(gate, make_words):
     """The patience is spent `SILENT_AFTER` times, however many ticks the arm says nothing."""
     rng = np.random.default_rng(0)
