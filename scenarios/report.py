@@ -12,7 +12,8 @@ from plotly.offline import get_plotlyjs
 from fleet.events import Event
 from fleet.schedule import schedule
 from fleet.telemetry import Telemetry
-from scenarios.figure import clock, figure
+from scenarios.figure import figure
+from scenarios.gantt import clock
 
 ROWS = 300
 """Most rows of the event table."""
