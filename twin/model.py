@@ -31,7 +31,7 @@ class TwinConfig:
     score_stride: int = 50
     """Samples from one scored window to the next; the last is flush with the end, so all time is covered."""
     max_windows: int = 2500
-    """Training uses at most so many windows, drawn evenly from all."""
+    """Training uses at most so many windows, drawn at random from all."""
     beta: float = 1.0
     """Weight of the KL term."""
     epochs: int = 60

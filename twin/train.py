@@ -77,7 +77,8 @@ def train(
     by side in processes of their own.
 
     Args:
-        records: Profiles [time, 3, joint] at `config.record_hz`.
+        records: Profiles [time, 3, joint] at `config.record_hz`. Those of a plan's phases, one by one, are cut and
+            padded as they will be when scored. Light, cool work makes the sharpest twin: what was trained on is known.
         data_hash: Name of the data in the checkpoint; by default the hash of the records.
         progress: Told the share done, 0 to 1, after every epoch.
 
@@ -90,7 +91,8 @@ def train(
         records, from_hz=config.record_hz, rate_hz=config.rate_hz, window=config.window, stride=config.stride
     )
     if len(windows) > config.max_windows:
-        windows = windows[np.linspace(0, len(windows) - 1, config.max_windows).round().astype(int)]
+        rng = np.random.default_rng(_child(seed, windows.shape[2], 0))
+        windows = windows[np.sort(rng.choice(len(windows), config.max_windows, replace=False))]
     scaler = Scaler.fit(windows)
     z = torch.from_numpy(scaler.to_z(windows))
     noise = torch.from_numpy((np.array(config.noise) / scaler.std).astype(np.float32))  # [joint, channel]

@@ -72,6 +72,17 @@ def test_the_best_restart_stays(records, tiny):
     assert any(b.restart == 1 for b in both.fits)
 
 
+def test_more_windows_than_wanted_are_drawn_without_bias(records, tiny):
+    rising = [record + np.float32(i) for i, record in enumerate(records)]
+    means = [
+        train(rising, replace(tiny, epochs=1, restarts=1), np.random.SeedSequence(s), arm="a").scaler.mean[1, 0]
+        for s in range(6)
+    ]
+    of_64 = np.std(np.arange(60)) / np.sqrt(64)
+    assert np.std(means) > 0.2 * of_64
+    np.testing.assert_allclose(np.mean(means), np.mean(rising, axis=(0, 1))[0, 1], atol=4 * of_64 / np.sqrt(6))
+
+
 def test_progress_rises_to_one(records, tiny):
     told: list[float] = []
     train(records[:4], tiny, SEED, arm="a", progress=told.append)
