@@ -37,8 +37,10 @@ class Difficulty:
 class DifficultyModel(Protocol):
     """Says how hard a plan is for one arm, without moving it."""
 
-    version: str
-    """What produced the score, for the digital thread."""
+    @property
+    def version(self) -> str:
+        """What produced the score, for the digital thread."""
+        ...
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty | None:
         """Difficulty of doing the plan so many times; None when the model has no opinion."""

@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -100,13 +100,13 @@ def prepare(
         plans.append(possible)
         refused += impossible
     _check_feasible(scenario, plans, refused)
-    models: list[DifficultyModel]
+    models: Sequence[DifficultyModel]
     if difficulty == "twin":
         from scenarios.rehearse import twins  # loads torch
 
-        models = list(twins(scenario, bodies, plans, folder, progress))
+        models = twins(scenario, bodies, plans, folder, progress)
     else:
-        models = [Blind() for _ in bodies]
+        models = [Blind()] * len(bodies)
     arms = []
     for (robot, motors, thermal), model, possible in zip(bodies, models, plans, strict=True):
         rest_tau = ArmModel(robot).gravity_torque(robot.home_q())

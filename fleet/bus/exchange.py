@@ -7,7 +7,7 @@ same arrays. A new episode begins where the time of the words goes back: what wa
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -82,7 +82,7 @@ class Exchange(Protocol):
 
     def __enter__(self) -> Self: ...
 
-    def __exit__(self, *exc: object) -> None: ...
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: Any, /) -> None: ...
 
 
 @dataclass(frozen=True, eq=False)

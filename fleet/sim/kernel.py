@@ -107,7 +107,7 @@ def step(
     heating = warm(world, state, heat_w)
     cut_s = faults.cut(world, state, heating)
     faults.account(world, state, heating, log)
-    state.busy_s[:] += path.spans_s[..., :3].sum(axis=-1)
+    state.busy_s[:] += np.minimum(path.spans_s[..., :3].sum(axis=-1), cut_s)
     state.temp_c[:] = heating.end_c
     _finish(world, state, path, cut_s, log)
     faults.fault(world, state, heating, cut_s, path.starts_s[..., 1], world.plans.times_s[path.plan, 1], log)
