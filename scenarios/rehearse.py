@@ -25,13 +25,13 @@ Array = np.ndarray
 log = logging.getLogger(__name__)
 
 STANDING_S = 12.0
-"""Of a cycle, at most so long goes into the record: a hold of a minute shows nothing new after that."""
+"""Of a phase, at most so long goes into the record: a hold of a minute shows nothing new after that."""
 
 
 def cool_records(
     plans: Mapping[Work, tuple[Plan, ...]], motors: Motors, thermal: ThermalModel, scenario: Scenario
 ) -> list[Array]:
-    """Profiles [time, 3, joint] of the plans that stay cool when repeated over the whole horizon from a cold start.
+    """Phases [time, 3, joint] of the plans that stay cool when repeated over the whole horizon from a cold start.
 
     Chosen by the horizon, never by the temperature at the moment: a heavy job too begins cool.
     """
@@ -46,10 +46,12 @@ def cool_records(
         ambient_c=spec.ambient_c,
     ).max(axis=1, initial=-np.inf)
     most = int(STANDING_S * RATE_HZ)
+    # Phase by phase, so that training windows are cut and padded as those of a plan that is scored.
     return [
-        np.concatenate([plan.approach.profile, plan.cycle.profile[:most], plan.retreat.profile])
+        phase.profile[:most]
         for plan, peak in zip(every, highest, strict=True)
         if peak <= spec.cool_c
+        for phase in plan.phases
     ]
 
 

@@ -85,8 +85,13 @@ class Twin:
         """How many joints it scores."""
         return self.scaler.joints
 
-    @cached_property
+    @property
     def version(self) -> str:
+        """Short name of this twin by its content: configuration, scaler, weights and data."""
+        return self._content_hash
+
+    @cached_property
+    def _content_hash(self) -> str:
         """Short hash of everything that a score depends on, and of where it came from."""
         digest = hashlib.sha256()
         digest.update(msgspec.json.encode([self.config, self.arm, self.data_hash, self.seed, self.fits]))
