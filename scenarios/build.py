@@ -18,7 +18,9 @@ from fleet.job import Work
 from fleet.motion import Plan
 from fleet.motor import Motors, gen3_motors, thermal_data
 from fleet.robot import Robot
+from fleet.sim.kernel import Plant
 from fleet.sim.models import ArmModel
+from fleet.sim.mujoco_plant import MujocoPlant
 from fleet.sim.oracle import Oracle
 from fleet.sim.planner import Planner
 from fleet.sim.plants import ProfilePlant
@@ -192,8 +194,12 @@ class ShiftFactory:
             ambient_c=ambient,
             start_warm=scenario.start == "idle_warm",
         )
-        home = np.stack([arm.robot.home_q() for arm in arms])
-        plant = ProfilePlant(plans, home, np.stack([arm.rest_tau for arm in arms]))
+        robots, rest_tau = [arm.robot for arm in arms], np.stack([arm.rest_tau for arm in arms])
+        plant: Plant
+        if self.plant == "mujoco":
+            plant = MujocoPlant(robots, plans, rest_tau, scenario.places)
+        else:
+            plant = ProfilePlant(plans, np.stack([robot.home_q() for robot in robots]), rest_tau)
         rng = np.random.default_rng(sensor_seed)
         return Episode(world=world, plant=plant, twins=tuple(arm.model.version for arm in arms), rng=rng)
 

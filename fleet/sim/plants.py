@@ -67,21 +67,27 @@ class ProfilePlant:
         return out
 
 
-def sample(plan: Plan, time_s: Array, repetitions: int) -> Array:
-    """Planned [time, channel, joint] at moments since leaving home, s, of a job of so many cycles."""
+def row(plan: Plan, time_s: Array, repetitions: int) -> Array:
+    """Which sample of the plan's phases, one after the other, is due at moments since leaving home, s.
+
+    The cycle counts as often as it is repeated; before and after the job it is the first and the last sample.
+    """
     lengths = [len(phase.profile) for phase in plan.phases]
     index = np.floor(np.asarray(time_s) * RATE_HZ + 1e-6).astype(int)
     total = lengths[0] + repetitions * lengths[1] + lengths[2]
     index = np.clip(index, 0, total - 1)
     into = index - lengths[0]
     after = into - repetitions * lengths[1]
-    joined = np.concatenate([phase.profile for phase in plan.phases])
-    where = np.where(
+    return np.where(
         into < 0,
         index,
         np.where(after < 0, lengths[0] + into % max(lengths[1], 1), lengths[0] + lengths[1] + after),
     )
-    return joined[where]
+
+
+def sample(plan: Plan, time_s: Array, repetitions: int) -> Array:
+    """Planned [time, channel, joint] at moments since leaving home, s, of a job of so many cycles."""
+    return np.concatenate([phase.profile for phase in plan.phases])[row(plan, time_s, repetitions)]
 
 
 def read(world: World, step: Step, offsets_s: Array, motion: Array, rng: np.random.Generator) -> Telemetry:
