@@ -21,7 +21,7 @@ from fleet.env.reward import TERMS, RewardWeights, terms
 from fleet.events import Event
 from fleet.sim import claims
 from fleet.sim.kernel import Plant, Step, step
-from fleet.sim.state import DONE, State, World, initial
+from fleet.sim.state import DONE, MODES, State, World, initial
 from fleet.thermal import WINDING
 
 Array = np.ndarray
@@ -170,14 +170,16 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
             )
         chosen = np.array([[_integer(arm, actions.get(arm, 0)) for arm in self.possible_agents]])
         log = self.events if self._keep_events else None
-        done = step(self.world, before, chosen, self._shared_scores()[None], self._episode.plant, log)
+        done = step(self.world, before, chosen, self._shared_scores()[None], self._episode.plant, log, self._board)
         if self._watch is not None:
             self._watch(done)
         self._state = done.state
         self._perceive()
         parts = {name: float(value[0]) for name, value in terms(self.world, before, done.state, self._weights).items()}
         reward = sum(parts.values())
-        finished = bool((done.state.status[0] == DONE)[self.world.jobs.exists[0]].all())
+        jobs = self.world.jobs.exists[0]
+        # A shift without any job is stood through to its end.
+        finished = bool(jobs.any() and (done.state.status[0][jobs] == DONE).all())
         last_tick = min(self.world.ticks, self._max_cycles or self.world.ticks)
         over = not finished and bool(done.state.tick[0] >= last_tick)
         arms = list(self.agents)
@@ -194,11 +196,11 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
 
     def state(self) -> Array:
         """What all arms know together: their vectors one after the other, float32."""
-        return self._vectors[0].reshape(-1).copy()
+        return self._perceived()[0].reshape(-1).copy()
 
     def knowledge(self) -> dict[str, Observation]:
         """The present observation of every arm by name, as policies read it."""
-        vectors, masks = self._vectors[0], self._mask[0].astype(np.int8)
+        vectors, masks = (values.copy() for values in self._perceived())
         return {arm: self.layout.read(vectors[a], masks[a]) for a, arm in enumerate(self.possible_agents)}
 
     def render(self) -> str | None:
@@ -211,7 +213,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
             job = state.job[0, a]
             name = world.jobs.names[0][job] if job >= 0 else "-"
             temps = " ".join(f"{t:5.1f}" for t in state.temp_c[0, a, WINDING])
-            rows.append(f"{arm:>10}  {('idle', 'working', 'faulted')[state.mode[0, a]]:<8} {name:<20} {temps}")
+            rows.append(f"{arm:>10}  {MODES[state.mode[0, a]]:<8} {name:<20} {temps}")
         return "\n".join(rows)
 
     def close(self) -> None:
@@ -221,13 +223,13 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
     def _perceive(self) -> None:
         """Read the sensors, tell the peers, hear them, and lay it all out."""
         world, state = self.world, self.truth
-        self._on_offer = claims.slots(world, state)
-        self._mask = claims.legal(world, state, self._on_offer)
+        self._board = claims.board(world, state)
+        on_offer, mask = self._board.on_offer, self._board.mask
         true_c = state.temp_c[..., WINDING]
         measured = true_c + world.motors.sensor_noise_k * self._episode.rng.standard_normal(true_c.shape)
-        words = say(world, state, self._on_offer, measured, self._episode.twins)
+        words = say(world, state, on_offer, measured, self._episode.twins)
         self._heard: Heard = self._exchange.share(words)
-        observation = observe(world, state, self._on_offer, self._mask, measured, self._heard)
+        observation = observe(world, state, on_offer, mask, measured, self._heard)
         self._vectors = self.layout.pack(observation)
 
     def _shared_scores(self) -> Array:
@@ -235,8 +237,14 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         arm = np.arange(len(self.possible_agents))
         return self._heard.difficulty[arm, arm]
 
+    def _perceived(self) -> tuple[Array, Array]:
+        """Vectors float32 [arm, size] and masks int8 [arm, slot + 1] of this moment."""
+        if self._state is None:
+            raise RuntimeError("Nobody knows anything yet: call reset() first.")
+        return self._vectors[0], self._board.mask[0].astype(np.int8)
+
     def _observations(self) -> dict[str, dict[str, Array]]:
-        vectors, masks = self._vectors[0], self._mask[0].astype(np.int8)
+        vectors, masks = self._perceived()
         return {
             arm: {"observation": vectors[a].copy(), "action_mask": masks[a].copy()}
             for a, arm in enumerate(self.possible_agents)

@@ -6,13 +6,14 @@ what they said. Nothing of the simulator's truth is in here.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, Literal
 
 import numpy as np
 
 from fleet.bus.exchange import Heard, Words
 from fleet.robot import JOINTS
+from fleet.sim.claims import per_slot
 from fleet.sim.state import FAULTED, IDLE, WORKING, State, World
 
 Array = np.ndarray
@@ -173,22 +174,21 @@ def say(world: World, state: State, on_offer: Array, measured_c: Array, twins: t
         temp_c=measured_c[0],
         headroom_k=world.limits.warning_c - measured_c[0].max(axis=-1),
         jobs=tuple(names[j] if j >= 0 else "" for j in on_offer[0].tolist()),
-        difficulty=per_slot(world.offers.difficulty, on_offer)[0],
-        p_saturation=per_slot(world.offers.p_saturation, on_offer)[0],
+        difficulty=scored(world.offers.difficulty, on_offer)[0],
+        p_saturation=scored(world.offers.p_saturation, on_offer)[0],
         twin=twins,
     )
 
 
-def per_slot(values: Array, on_offer: Array) -> Array:
-    """[env, arm, slot] of something known per [env, arm, job]; NaN in empty slots."""
-    picked = np.take_along_axis(values, on_offer[:, None, :], axis=2)
-    return np.where((on_offer >= 0)[:, None, :], picked, np.nan)
+def scored(values: Array, on_offer: Array) -> Array:
+    """[env, arm, slot] of a score per [env, arm, job]; NaN in empty slots."""
+    return np.where((on_offer >= 0)[:, None, :], per_slot(values, on_offer), np.nan)
 
 
 def remaining_s(world: World, state: State, on_offer: Array) -> Array:
     """How long each arm would take for what is left of each job on offer, s, [env, arm, slot]; 0 where it cannot."""
     env = np.arange(world.envs)[:, None]
-    plan = np.take_along_axis(world.offers.plan, on_offer[:, None, :], axis=2)
+    plan = per_slot(world.offers.plan, on_offer)
     times = world.plans.times_s[plan]
     cycles = (world.jobs.repetitions - state.cycles)[env, on_offer][:, None, :]
     total = times[..., 0] + cycles * times[..., 1] + times[..., 2]
@@ -213,11 +213,11 @@ def observe(
         picked = np.where(filled, values[env, on_offer], 0.0)
         return np.broadcast_to(picked[:, None, :], (envs, arms, world.slots))
 
-    own = per_slot(world.offers.difficulty, on_offer)
-    risk = per_slot(world.offers.p_saturation, on_offer)
+    own = scored(world.offers.difficulty, on_offer)
+    risk = scored(world.offers.p_saturation, on_offer)
     duration = remaining_s(world, state, on_offer)
     peer = {name: _others(values) for name, values in told.items() if name != "p_saturation"}
-    total = world.plans.times_s[np.take_along_axis(world.offers.plan, state.job[..., None], axis=2)[..., 0]]
+    total = world.plans.times_s[world.offers.plan[env, np.arange(arms), state.job]]
     left = total[..., 0] + state.todo * total[..., 1] + total[..., 2] - state.progress_s
     never = np.isinf(peer["age_s"])
     return Observation(
@@ -254,5 +254,10 @@ def observe(
 def _others(values: Array) -> Array:
     """[env, receiver, peer, ...] of [env, receiver, sender, ...]: the senders other than the receiver, in order."""
     arms = values.shape[1]
-    sender = np.array([[s for s in range(arms) if s != r] for r in range(arms)], dtype=int).reshape(arms, arms - 1)
-    return values[:, np.arange(arms)[:, None], sender]
+    return values[:, np.arange(arms)[:, None], _peers(arms)]
+
+
+@cache
+def _peers(arms: int) -> Array:
+    """Indices of the peers of each arm, int [arm, peer]."""
+    return np.array([[s for s in range(arms) if s != r] for r in range(arms)], dtype=int).reshape(arms, arms - 1)

@@ -23,6 +23,28 @@ class Claims:
     """The job each arm legally claimed, int [env, arm], −1 for none."""
 
 
+@dataclass(frozen=True, eq=False)
+class Board:
+    """What hangs out to be claimed at the beginning of a step."""
+
+    on_offer: Array
+    """Of `slots`, int [env, slot]."""
+    mask: Array
+    """Of `legal`, bool [env, arm, slot + 1]."""
+
+
+def board(world: World, state: State) -> Board:
+    """The jobs on offer, and who may claim them."""
+    on_offer = slots(world, state)
+    return Board(on_offer, legal(world, state, on_offer))
+
+
+def per_slot(values: Array, on_offer: Array) -> Array:
+    """[env, arm, slot] of something known per [env, arm, job]; empty slots hold that of some job."""
+    envs, arms = values.shape[:2]
+    return values[np.arange(envs)[:, None, None], np.arange(arms)[:, None], on_offer[:, None, :]]
+
+
 def slots(world: World, state: State) -> Array:
     """Jobs on offer, oldest in the queue first, int [env, slot], −1 for an empty slot.
 
@@ -31,12 +53,14 @@ def slots(world: World, state: State) -> Array:
     """
     jobs = world.jobs
     time_s = (state.tick * world.dt_s)[:, None]
-    done = np.concatenate([state.status == DONE, np.ones((world.envs, 1), dtype=bool)], axis=1)  # column −1: no job
-    ready = np.take_along_axis(done[:, None, :], jobs.after, axis=2).all(axis=-1)
+    done = np.ones((world.envs, state.status.shape[1] + 1), dtype=bool)  # column −1: no job
+    done[:, :-1] = state.status == DONE
+    env = np.arange(world.envs)[:, None]
+    ready = done[env[..., None], jobs.after].all(axis=-1)
     offered = jobs.exists & (state.status == WAITING) & (jobs.release_s <= time_s) & ready
     key = np.where(offered, state.queued_s, np.inf)
     order = np.argsort(key, axis=1, kind="stable")[:, : world.slots]
-    found = np.where(np.take_along_axis(offered, order, axis=1), order, -1)
+    found = np.where(offered[env, order], order, -1)
     if found.shape[1] < world.slots:
         found = np.pad(found, ((0, 0), (0, world.slots - found.shape[1])), constant_values=-1)
     return found
@@ -58,19 +82,18 @@ def legal(world: World, state: State, on_offer: Array) -> Array:
     env = np.arange(envs)[:, None]
     filled = on_offer >= 0
     busy = occupied(world, state)[env[..., None], world.jobs.stations[env, on_offer]].any(axis=-1)  # [env, slot]
-    can = np.take_along_axis(world.offers.plan, on_offer[:, None, :], axis=2) >= 0  # [env, arm, slot]
+    can = per_slot(world.offers.plan, on_offer) >= 0  # [env, arm, slot]
     free = (state.mode == IDLE)[..., None]
     mask = np.ones((envs, arms, world.slots + 1), dtype=bool)
     mask[..., 1:] = free & (filled & ~busy)[:, None, :] & can
     return mask
 
 
-def resolve(world: World, state: State, on_offer: Array, mask: Array, actions: Array, scores: Array) -> Claims:
+def resolve(world: World, state: State, board: Board, actions: Array, scores: Array) -> Claims:
     """Award every claimed job to one arm: the lower shared score wins, then the lower index.
 
     Args:
-        on_offer: [env, slot] of `slots`.
-        mask: [env, arm, slot + 1] of `legal`.
+        board: Of the same state.
         actions: int [env, arm]; anything outside the mask counts as illegal and as a wait.
         scores: Shared difficulty, [env, arm, slot]; NaN loses against any number.
     """
@@ -78,9 +101,9 @@ def resolve(world: World, state: State, on_offer: Array, mask: Array, actions: A
     env, arm = np.arange(envs)[:, None], np.arange(arms)[None, :]
     inside = (actions >= 0) & (actions <= world.slots)
     chosen = np.where(inside, actions, 0)
-    allowed = inside & mask[env, arm, chosen]
+    allowed = inside & board.mask[env, arm, chosen]
     slot = np.where(allowed & (chosen > 0), chosen - 1, -1)
-    wanted = np.where(slot >= 0, on_offer[env, slot], -1)
+    wanted = np.where(slot >= 0, board.on_offer[env, slot], -1)
     score = np.where(slot >= 0, scores[env, arm, slot], np.inf)
     order = np.argsort(np.where(np.isnan(score), np.inf, score), axis=1, kind="stable")
     taken = np.zeros((envs, world.jobs.exists.shape[1] + 1), dtype=bool)

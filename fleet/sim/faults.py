@@ -1,39 +1,70 @@
 """Limits of heat: the exact moments of warnings, faults and recoveries, and what follows from them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from fleet.events import Event, EventKind
 from fleet.sim.state import FAULTED, IDLE, RUNNING, WAITING, State, World
-from fleet.thermal import HOUSING, WINDING, ThermalModel, node_heat
+from fleet.thermal import WINDING, ThermalModel, node_heat
 
 Array = np.ndarray
 
-BISECTIONS = 40
-"""Halvings of a step to find a crossing: 10 s · 2⁻⁴⁰ ≈ 10 ps."""
+BISECTIONS = 30
+"""Halvings of a step to find a crossing: 10 s · 2⁻³⁰ ≈ 10 ns."""
+
+
+@dataclass(frozen=True, eq=False)
+class Leg:
+    """A stretch of a step in which the heat of one arm is constant; times are seconds into the step."""
+
+    model: ThermalModel
+    temp_c: Array
+    """At its beginning, [node]."""
+    heat_w: Array
+    """[node]."""
+    ambient_c: float
+    begin_s: float
+    end_s: float
+
+    def at(self, time_s: float) -> Array:
+        """Temperatures at a moment of the leg, °C, [node]."""
+        return self.model.step(self.temp_c, self.heat_w, self.ambient_c, time_s - self.begin_s)
+
+    def crossing_s(self, limit_c: float) -> float:
+        """When the hottest winding passes a limit in the direction it is going; its end if it does not."""
+        rising = hottest(self.temp_c) < limit_c
+        low, high = self.begin_s, self.end_s
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            above = hottest(self.at(middle)) >= limit_c
+            low, high = (low, middle) if above == rising else (middle, high)
+        return high
 
 
 @dataclass(frozen=True, eq=False)
 class Heating:
-    """One thermal step of every arm under constant heat."""
+    """One thermal step of every arm: constant heat, and after a fault the brakes."""
 
     start_c: Array
     """[env, arm, node]."""
     heat_w: Array
-    """[env, arm, node]."""
+    """Until the fault, [env, arm, node]."""
     ambient_c: Array
     """[env, arm]."""
     end_c: Array
-    """[env, arm, node]; rows of arms that fault are rewritten with the brakes on since then."""
+    """[env, arm, node]."""
+    cut_s: Array
+    """Seconds each arm moved before a fault stopped it, [env, arm]; the whole interval if none did."""
 
-    def crossing_s(self, world: World, e: int, a: int, limit_c: float) -> float:
-        """When the hottest motor of one arm passes a limit within the step, s."""
-        model = arm_model(world, a)
-        return crossing_s(
-            model, self.start_c[e, a], self.heat_w[e, a], float(self.ambient_c[e, a]), limit_c, world.dt_s
-        )
+    def legs(self, world: World, e: int, a: int) -> tuple[Leg, ...]:
+        """The step of one arm: one leg, or one until the fault and one after it."""
+        model, ambient_c, at = arm_model(world, a), float(self.ambient_c[e, a]), float(self.cut_s[e, a])
+        moving = Leg(model, self.start_c[e, a], self.heat_w[e, a], ambient_c, 0.0, at)
+        if at == world.dt_s:
+            return (moving,)
+        return moving, Leg(model, moving.at(at), braked_heat(world, a), ambient_c, at, world.dt_s)
 
 
 def arm_model(world: World, arm: int) -> ThermalModel:
@@ -42,22 +73,10 @@ def arm_model(world: World, arm: int) -> ThermalModel:
     return ThermalModel(m.capacity[arm], m.laplacian[arm], m.to_ambient[arm], m.rates[arm], m.modes[arm])
 
 
-def crossing_s(
-    model: ThermalModel, temp_c: Array, heat_w: Array, ambient_c: float, limit_c: float, dt_s: float
-) -> float:
-    """When, within `dt_s`, the hottest winding of one arm passes a limit in the direction it is going, s.
-
-    Args:
-        model: One arm, no leading axes.
-        temp_c, heat_w: [node].
-    """
-    rising = temp_c[WINDING].max() < limit_c
-    low, high = 0.0, dt_s
-    for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        above = model.step(temp_c, heat_w, ambient_c, middle)[WINDING].max() >= limit_c
-        low, high = (low, middle) if above == rising else (middle, high)
-    return high
+def braked_heat(world: World, arm: int) -> Array:
+    """Heat of an arm that stands faulted on its brakes, W, [node]: none if the drives are off."""
+    idle_w = world.motors.idle_w[arm]
+    return node_heat(np.zeros_like(idle_w), np.zeros_like(idle_w) if world.limits.power_off_on_fault else idle_w)
 
 
 def hottest(temp_c: Array) -> Array:
@@ -79,49 +98,57 @@ def event(
     )
 
 
-def cut(world: World, state: State, heating: Heating) -> Array:
-    """Seconds of the step each arm gets to move before a fault stops it, [env, arm]; the whole step if none does.
-
-    Rewrites the end temperatures of the arms that fault: no motion, and no idle heat if the drives go off.
-    """
-    cut_s = np.full(state.mode.shape, world.dt_s)
+def brake(world: World, state: State, heating: Heating) -> Heating:
+    """The same step with the brakes on, and the drives off if they go off, in arms that pass the error limit."""
+    cut_s, end_c = heating.cut_s.copy(), heating.end_c.copy()
     too_hot = (hottest(heating.end_c) >= world.limits.error_c) & (state.mode != FAULTED)
     for e, a in np.argwhere(too_hot).tolist():
-        at = heating.crossing_s(world, e, a, world.limits.error_c)
-        model, ambient_c = arm_model(world, a), float(heating.ambient_c[e, a])
-        there = model.step(heating.start_c[e, a], heating.heat_w[e, a], ambient_c, at)
-        idle_w = np.zeros(there[HOUSING].shape) if world.limits.power_off_on_fault else world.motors.idle_w[a]
-        braked = node_heat(np.zeros_like(idle_w), idle_w)
-        heating.end_c[e, a] = model.step(there, braked, ambient_c, world.dt_s - at)
-        state.energy_j[e, a] += (braked - heating.heat_w[e, a]).sum() * (world.dt_s - at)
-        cut_s[e, a] = at
-    return cut_s
+        (moving,) = heating.legs(world, e, a)
+        hot_from_the_start = hottest(moving.temp_c) >= world.limits.error_c
+        cut_s[e, a] = 0.0 if hot_from_the_start else moving.crossing_s(world.limits.error_c)
+    heating = replace(heating, cut_s=cut_s, end_c=end_c)
+    for e, a in np.argwhere(cut_s < world.dt_s).tolist():
+        end_c[e, a] = heating.legs(world, e, a)[-1].at(world.dt_s)
+    return heating
 
 
 def account(world: World, state: State, heating: Heating, log: list[Event] | None) -> None:
     """Peaks, time above the warning limit, lost time, energy, and the warnings themselves."""
-    limit = world.limits.warning_c
+    limit, dt_s = world.limits.warning_c, world.dt_s
     first, last = hottest(heating.start_c), hottest(heating.end_c)
-    above_s = np.where((first >= limit) & (last >= limit), world.dt_s, 0.0)
-    for e, a in np.argwhere((first >= limit) != (last >= limit)).tolist():
-        at = heating.crossing_s(world, e, a, limit)
-        above_s[e, a] = at if first[e, a] >= limit else world.dt_s - at
-        if log is not None and last[e, a] >= limit:
-            k = int(heating.end_c[e, a, WINDING].argmax())
-            text = f"motor {k + 1} passed {limit:g} °C"
-            job = int(state.job[e, a])
-            log.append(event(world, state, e, a, at, "warning", job, joint=k + 1, value=limit, reason=text))
-    state.above_warning_s[:] += above_s
+    above_s = np.where((first >= limit) & (last >= limit), dt_s, 0.0)
+    state.energy_j[:] += heating.heat_w.sum(axis=-1) * heating.cut_s
     state.peak_c[:] = np.maximum(state.peak_c, last)
-    state.lost_s[:] += np.where(state.mode == FAULTED, world.dt_s, 0.0)
-    state.energy_j[:] += heating.heat_w.sum(axis=-1) * world.dt_s
+    state.lost_s[:] += np.where(state.mode == FAULTED, dt_s, 0.0)
+    for e, a in np.argwhere(((first >= limit) != (last >= limit)) | (heating.cut_s < dt_s)).tolist():
+        legs = heating.legs(world, e, a)
+        above_s[e, a] = 0.0
+        for leg in legs:
+            begins, ends = bool(hottest(leg.temp_c) >= limit), bool(hottest(leg.at(leg.end_s)) >= limit)
+            if begins == ends:
+                above_s[e, a] += begins * (leg.end_s - leg.begin_s)
+                continue
+            at = leg.crossing_s(limit)
+            above_s[e, a] += at - leg.begin_s if begins else leg.end_s - at
+            if log is not None and ends:
+                log.append(_passed(world, state, e, a, leg, at, "warning", limit))
+        if len(legs) == 2:
+            braked = legs[1]
+            state.energy_j[e, a] += braked.heat_w.sum() * (braked.end_s - braked.begin_s)
+            state.peak_c[e, a] = max(state.peak_c[e, a], float(hottest(braked.temp_c)))
+    state.above_warning_s[:] += above_s
+
+
+def _passed(world: World, state: State, e: int, a: int, leg: Leg, at: float, kind: EventKind, limit_c: float) -> Event:
+    k = int(leg.at(at)[WINDING].argmax())
+    text = f"motor {k + 1} passed {limit_c:g} °C"
+    return event(world, state, e, a, at, kind, int(state.job[e, a]), joint=k + 1, value=limit_c, reason=text)
 
 
 def fault(
     world: World,
     state: State,
     heating: Heating,
-    cut_s: Array,
     cycle_starts_s: Array,
     cycle_s: Array,
     log: list[Event] | None,
@@ -129,24 +156,18 @@ def fault(
     """Arms cut short fault: their job goes back to the queue with the cycles done kept, and they are lost.
 
     Args:
-        cut_s: Of `cut`, [env, arm].
         cycle_starts_s: Time since leaving home at which the first cycle began, [env, arm].
         cycle_s: Length of one cycle, [env, arm].
     """
-    limit = world.limits.error_c
-    for e, a in np.argwhere(cut_s < world.dt_s).tolist():
-        at, j = float(cut_s[e, a]), int(state.job[e, a])
+    for e, a in np.argwhere(heating.cut_s < world.dt_s).tolist():
+        at, j = float(heating.cut_s[e, a]), int(state.job[e, a])
         if log is not None:
-            ambient_c = float(heating.ambient_c[e, a])
-            there = arm_model(world, a).step(heating.start_c[e, a], heating.heat_w[e, a], ambient_c, at)
-            k = int(there[WINDING].argmax())
-            text = f"motor {k + 1} passed {limit:g} °C"
-            log.append(event(world, state, e, a, at, "fault", j, joint=k + 1, value=limit, reason=text))
+            moving = heating.legs(world, e, a)[0]
+            log.append(_passed(world, state, e, a, moving, at, "fault", world.limits.error_c))
         if j >= 0 and state.status[e, j] == RUNNING:
             cycles = (state.progress_s[e, a] - cycle_starts_s[e, a]) // cycle_s[e, a]
             _return_job(world, state, e, a, j, int(np.clip(cycles, 0, state.todo[e, a])), at, log)
         state.faults[e, a] += 1
-        state.peak_c[e, a] = max(state.peak_c[e, a], limit)
         state.lost_s[e, a] += world.dt_s - at
         state.mode[e, a], state.job[e, a], state.progress_s[e, a], state.todo[e, a] = FAULTED, -1, 0.0, 0
 
@@ -169,8 +190,8 @@ def recover(world: World, state: State, heating: Heating, log: list[Event] | Non
     limit = world.limits.restart_c
     waiting = faulted & np.isinf(state.clear_at_s) & (hottest(heating.end_c) < limit)
     for e, a in np.argwhere(waiting).tolist():
-        below = hottest(heating.start_c[e, a]) < limit
-        at = 0.0 if below else heating.crossing_s(world, e, a, limit)
+        cooling = heating.legs(world, e, a)[-1]
+        at = cooling.begin_s if hottest(cooling.temp_c) < limit else cooling.crossing_s(limit)
         state.clear_at_s[e, a] = state.tick[e] * world.dt_s + at + world.limits.clear_s
     end_s = ((state.tick + 1) * world.dt_s)[:, None]
     for e, a in np.argwhere(faulted & (state.clear_at_s <= end_s)).tolist():

@@ -13,11 +13,15 @@ import numpy as np
 from fleet.events import Event
 from fleet.motion import Drive
 from fleet.sim import claims, faults
+from fleet.sim.claims import Board
 from fleet.sim.faults import Heating, event
 from fleet.sim.state import DONE, FAULTED, IDLE, RUNNING, WORKING, State, World
 from fleet.thermal import HOUSING, drive_heat
 
 Array = np.ndarray
+
+ROUNDING_S = 1e-9
+"""Sums of phases may be this much off; a whole step must not be lost to it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +50,11 @@ class Step:
     """At its beginning, with the awards made."""
     path: Timeline
     heating: Heating
-    cut_s: Array
-    """Seconds each arm moved before a fault stopped it, [env, arm]; the whole interval if none did."""
+
+    @property
+    def cut_s(self) -> Array:
+        """Seconds each arm moved before a fault stopped it, [env, arm]; the whole interval if none did."""
+        return self.heating.cut_s
 
 
 class Plant(Protocol):
@@ -72,15 +79,19 @@ def timeline(world: World, state: State) -> Timeline:
     spans = np.where(working[..., None], spans, 0.0)
     rest = np.where(state.mode == FAULTED, 0.0, world.dt_s - spans.sum(axis=-1))
     running = working & (state.status[env, state.job] == RUNNING)
-    done = np.maximum(ends[..., 1] - state.progress_s, 0.0)
-    home = np.maximum(ends[..., 2] - state.progress_s, 0.0)
+    done, home = np.moveaxis(_within(ends[..., 1:] - begin, world.dt_s), -1, 0)
     return Timeline(
         spans_s=np.concatenate([spans, rest[..., None]], axis=-1),
         plan=plan,
         starts_s=starts,
-        done_s=np.where(running & (done <= world.dt_s), done, np.inf),
-        home_s=np.where(working & (home <= world.dt_s), home, np.inf),
+        done_s=np.where(running, done, np.inf),
+        home_s=np.where(working, home, np.inf),
     )
+
+
+def _within(time_s: Array, dt_s: float) -> Array:
+    """Moments of a step, inf where later; what rounding puts a hair behind its end counts as its end."""
+    return np.where(time_s <= dt_s + ROUNDING_S, np.clip(time_s, 0.0, dt_s), np.inf)
 
 
 def step(
@@ -90,6 +101,7 @@ def step(
     scores: Array,
     plant: Plant,
     log: list[Event] | None = None,
+    board: Board | None = None,
 ) -> Step:
     """One decision interval: the state after it, and how it went.
 
@@ -97,24 +109,22 @@ def step(
         actions: 0 waits or goes on, k claims slot k, int [env, arm].
         scores: Shared difficulty by which two claims for one job are settled, [env, arm, slot].
         log: Takes an `Event` for everything that happens, if given.
+        board: `claims.board(world, before)`, if it is at hand.
     """
     state = before.copy()
-    on_offer = claims.slots(world, state)
-    mask = claims.legal(world, state, on_offer)
-    _award(world, state, claims.resolve(world, state, on_offer, mask, actions, scores), log)
+    _award(world, state, claims.resolve(world, state, board or claims.board(world, state), actions, scores), log)
     path, began = timeline(world, state), state.copy()
     heat_w = heat_of(world, state, plant.drive(world, state, path))
-    heating = warm(world, state, heat_w)
-    cut_s = faults.cut(world, state, heating)
+    heating = faults.brake(world, state, warm(world, state, heat_w))
     faults.account(world, state, heating, log)
-    state.busy_s[:] += np.minimum(path.spans_s[..., :3].sum(axis=-1), cut_s)
+    state.busy_s[:] += np.minimum(path.spans_s[..., :3].sum(axis=-1), heating.cut_s)
     state.temp_c[:] = heating.end_c
-    _finish(world, state, path, cut_s, log)
-    faults.fault(world, state, heating, cut_s, path.starts_s[..., 1], world.plans.times_s[path.plan, 1], log)
+    _finish(world, state, path, heating.cut_s, log)
+    faults.fault(world, state, heating, path.starts_s[..., 1], world.plans.times_s[path.plan, 1], log)
     faults.recover(world, state, heating, log)
     _log_releases(world, state, log)
     state.tick[:] += 1
-    return Step(state=state, began=began, path=path, heating=heating, cut_s=cut_s)
+    return Step(state=state, began=began, path=path, heating=heating)
 
 
 def warm(world: World, state: State, heat_w: Array) -> Heating:
@@ -123,7 +133,8 @@ def warm(world: World, state: State, heat_w: Array) -> Heating:
     load = heat_w + world.thermal.to_ambient * ambient_c[..., None]
     # einsum, not matmul: a row's result must not depend on how many rows there are.
     end_c = np.einsum("aij,eaj->eai", world.phi, state.temp_c) + np.einsum("aij,eaj->eai", world.gamma, load)
-    return Heating(start_c=state.temp_c.copy(), heat_w=heat_w, ambient_c=ambient_c, end_c=end_c)
+    whole = np.full(state.mode.shape, world.dt_s)
+    return Heating(start_c=state.temp_c.copy(), heat_w=heat_w, ambient_c=ambient_c, end_c=end_c, cut_s=whole)
 
 
 def heat_of(world: World, state: State, drive: Drive) -> Array:

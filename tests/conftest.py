@@ -1,0 +1,183 @@
+"""Small worlds in which every figure is known beforehand: constant torques, whole seconds, no MuJoCo and no twin."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from fleet.difficulty import Difficulty, DifficultyModel
+from fleet.env.allocation_v0 import Episode
+from fleet.job import Job, Place, Work
+from fleet.motion import RATE_HZ, Phase, Plan
+from fleet.motor import Motors, gen3_motors
+from fleet.robot import JOINTS, Robot, ThermalLimits
+from fleet.sim.plants import ProfilePlant
+from fleet.sim.state import World
+from fleet.sim.world import Arm, build_world
+from fleet.thermal import ThermalModel, gen3_network, thermal_model
+
+LIGHT, WARM, HOT = 0.0, 4.0, 8.0
+"""Payloads, kg: cool for ever; past 60 °C within the hour; past 75 °C within minutes."""
+
+
+def torque(payload_kg: float) -> np.ndarray:
+    """Joint 2 bears the arm and the payload at 1 m; the others a little, N·m, [joint]."""
+    return np.array([5.0, 15.0 + 9.81 * payload_kg, 4.0, 8.0, 2.0, 2.0, 1.0])
+
+
+def phase(seconds: float, tau: np.ndarray, qd: float = 0.0) -> Phase:
+    """The same torque and speed throughout."""
+    samples = round(seconds * RATE_HZ)
+    profile = np.zeros((samples, 3, JOINTS), np.float32)
+    profile[:, 1], profile[:, 2] = qd, tau
+    return Phase(profile, np.zeros(samples, np.float32))
+
+
+def work(place: str = "bench", payload_kg: float = LIGHT, to: str | None = None) -> Work:
+    """A hold at one place, or a pick and place between two."""
+    places = tuple(Place(name=name, position_m=(0.5, 0.0, 0.2)) for name in (place, to) if name)
+    return Work(kind="hold" if to is None else "pick_place", places=places, payload_kg=payload_kg)
+
+
+@dataclass(frozen=True)
+class ByPayload:
+    """Finds a work as hard as its payload, each arm in its own measure."""
+
+    measure: float
+    version: str = "by payload"
+
+    def score(self, plan: Plan, repetitions: int) -> Difficulty:
+        d = 1.0 - np.exp(-self.measure * (1.0 + plan.work.payload_kg) / 10.0)
+        return Difficulty(np.full(JOINTS, d), p_saturation=float(d))
+
+
+@dataclass(frozen=True)
+class Times:
+    """Seconds of the phases of every plan of an arm."""
+
+    approach: float = 3.0
+    cycle: float = 10.0
+    retreat: float = 2.0
+
+
+def arm(
+    index: int,
+    works: Sequence[Work],
+    *,
+    times: Times | None = None,
+    model: DifficultyModel | None = None,
+    motors: Motors | None = None,
+    thermal: ThermalModel | None = None,
+    qd: float = 0.0,
+) -> Arm:
+    """An arm that can do the works, nominal unless told otherwise."""
+    times = times or Times()
+    name = f"arm_{index}"
+    plans = {}
+    for each in works:
+        tau = torque(each.payload_kg)
+        parts = [phase(times.approach, tau), phase(times.cycle, tau, qd), phase(times.retreat, tau)]
+        plans[each] = (Plan(name, each, 0, 1.0, *parts),)
+    return Arm(
+        robot=Robot(name=name),
+        motors=motors or gen3_motors(),
+        thermal=thermal or thermal_model(gen3_network()),
+        rest_tau=torque(0.0) / 3.0,
+        model=model or ByPayload(1.0 + 0.1 * index),
+        plans=plans,
+    )
+
+
+def job(name: str, content: Work | None = None, **changes) -> Job:
+    """Three cycles, there from the beginning."""
+    base = Job(name=name, work=content or work(), repetitions=3, release_s=0.0, due_s=600.0, value=1.0)
+    return replace(base, **changes)
+
+
+def shop(
+    shifts: Sequence[Sequence[Job]],
+    *,
+    arms: int | Sequence[Arm] = 2,
+    limits: ThermalLimits | None = None,
+    dt_s: float = 10.0,
+    ticks: int = 60,
+    slots: int = 4,
+    ambient_c: float = 25.0,
+    start_warm: bool = False,
+) -> tuple[World, ProfilePlant]:
+    """A world in which every arm can do every job (unless arms are given), and the plant that moves it."""
+    if isinstance(arms, int):
+        works = tuple(dict.fromkeys(j.work for jobs in shifts for j in jobs))
+        arms = [arm(i, works) for i in range(arms)]
+    world, plans = build_world(
+        arms,
+        shifts,
+        limits=limits or ThermalLimits(),
+        dt_s=dt_s,
+        ticks=ticks,
+        slots=slots,
+        ambient_c=np.full((ticks, len(arms)), ambient_c),
+        start_warm=start_warm,
+    )
+    rest_q = np.stack([a.robot.home_q() for a in arms])
+    return world, ProfilePlant(plans, rest_q, np.stack([a.rest_tau for a in arms]))
+
+
+@dataclass(frozen=True)
+class Shifts:
+    """Makes random small shifts for an environment: mixed payloads, shared stations, precedence, heat."""
+
+    arms: int = 3
+    jobs: int = 8
+    ticks: int = 40
+    slots: int = 4
+    ambient_c: float = 30.0
+    limits: ThermalLimits = field(default_factory=ThermalLimits)
+
+    def __call__(self, seed: np.random.SeedSequence) -> Episode:
+        draw, sensor = (
+            np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, i))) for i in (0, 1)
+        )
+        works = [work(place, payload) for place in ("bench", "press", "rack") for payload in (LIGHT, WARM, HOT)]
+        arms = [arm(i, works, times=Times(cycle=10.0 + 2.0 * i)) for i in range(self.arms)]
+        jobs = []
+        for i in range(self.jobs):
+            before = (f"job_{i - 2}",) if i > 1 and draw.random() < 0.3 else ()
+            release_s = float(draw.uniform(0, 0.5 * self.ticks * 10.0))
+            jobs.append(
+                job(
+                    f"job_{i}",
+                    works[int(draw.integers(len(works)))],
+                    repetitions=int(draw.integers(1, 6)),
+                    release_s=release_s,
+                    due_s=release_s + 100.0,
+                    value=float(draw.integers(1, 5)),
+                    after=before,
+                )
+            )
+        world, plant = shop(
+            [jobs], arms=arms, limits=self.limits, ticks=self.ticks, slots=self.slots, ambient_c=self.ambient_c
+        )
+        return Episode(world=world, plant=plant, twins=("by payload",) * self.arms, rng=sensor)
+
+
+@pytest.fixture(scope="session")
+def small() -> SimpleNamespace:
+    """The makers of small worlds."""
+    return SimpleNamespace(
+        arm=arm,
+        job=job,
+        shop=shop,
+        work=work,
+        torque=torque,
+        phase=phase,
+        Times=Times,
+        ByPayload=ByPayload,
+        Shifts=Shifts,
+        LIGHT=LIGHT,
+        WARM=WARM,
+        HOT=HOT,
+        PATH=__file__,
+    )
