@@ -123,9 +123,9 @@ class MujocoPlant:
         """
         if int(step.began.tick[0]) != self._tick:
             raise ValueError(f"MujocoPlant can read tick {self._tick} only (got {int(step.began.tick[0])}).")
-        cut_s = np.where(step.began.mode[0] == FAULTED, 0.0, step.cut_s[0])
-        braked = (offsets_s[:, None] >= cut_s) & (cut_s < world.dt_s)  # [sample, arm]
-        moments = self._sample_of(np.minimum(offsets_s[:, None], np.where(cut_s > 0, cut_s, np.inf)))
+        faulted, cut_s = step.began.mode[0] == FAULTED, step.cut_s[0]
+        braked = faulted | ((offsets_s[:, None] >= cut_s) & (cut_s < world.dt_s))  # [sample, arm]
+        moments = self._sample_of(np.minimum(offsets_s[:, None], np.where(faulted, np.inf, cut_s)))
         motion = self._motion[moments, np.arange(len(cut_s))]
         motion[braked, 1:] = 0.0
         return read(world, step, offsets_s, motion, rng)

@@ -26,7 +26,8 @@ class ProfilePlant:
     def __init__(self, plans: Sequence[Plan], rest_q: Array, rest_tau: Array) -> None:
         self._plans = tuple(plans)
         self._rest = np.stack([rest_q, np.zeros_like(rest_q), rest_tau], axis=1)  # [arm, channel, joint]
-        self._last = self._rest.copy()
+        self._stood = self._rest.copy()
+        """Where the brakes stopped it last."""
 
     def drive(self, world: World, state: State, timeline: Timeline) -> Drive:
         """Mean heat drive over the step, each [env, arm, joint]: phases weighted by their time in it."""
@@ -51,20 +52,21 @@ class ProfilePlant:
 
     def _motion(self, world: World, step: Step, a: int, offsets_s: Array) -> Array:
         """[sample, channel, joint] of one arm."""
-        began = step.began
-        out = np.broadcast_to(self._rest[a], (len(offsets_s), *self._rest[a].shape)).copy()
-        if began.mode[0, a] == FAULTED:
-            out[:] = self._last[a]
-        elif began.mode[0, a] == WORKING:
+        mode, cut_s = step.began.mode[0, a], step.cut_s[0, a]
+        if mode == FAULTED:
+            return np.broadcast_to(self._stood[a], (len(offsets_s), *self._stood[a].shape))
+        moments = np.append(offsets_s, cut_s)
+        out = np.broadcast_to(self._rest[a], (len(moments), *self._rest[a].shape)).copy()
+        if mode == WORKING:
             plan = self._plans[step.path.plan[0, a]]
-            moving = offsets_s < min(step.path.home_s[0, a], step.cut_s[0, a])
-            at = began.progress_s[0, a] + np.minimum(offsets_s, step.cut_s[0, a])
-            sampled = sample(plan, at, int(began.todo[0, a]))
-            braked = offsets_s >= step.cut_s[0, a]
-            out[moving | braked] = sampled[moving | braked]
-            out[braked, 1:] = 0.0
-        self._last[a] = out[-1]
-        return out
+            away = moments < step.path.home_s[0, a]
+            progress_s = step.began.progress_s[0, a] + moments[away]
+            out[away] = sample(plan, progress_s, int(step.began.todo[0, a]))
+        if cut_s < world.dt_s:
+            out[-1, 1:] = 0.0
+            self._stood[a] = out[-1]
+            out[moments >= cut_s] = out[-1]
+        return out[:-1]
 
 
 def row(plan: Plan, time_s: Array, repetitions: int) -> Array:

@@ -203,6 +203,9 @@ def test_arms_follow_their_plan_and_need_its_torque(kind, arm):
     motion = np.stack([np.concatenate([getattr(p, n)[:, arm] for p in parts]) for n in ("q", "qd", "tau")], axis=1)
     planned = sample(plan, np.arange(1, count + 1) / RATE_HZ, repetitions)
     error = motion[:count] - planned
+    told, _ = recorded(world, plants["profile"], offsets, first=(1, 0) if arm == 0 else (0, 1))
+    np.testing.assert_array_equal(np.concatenate([p.q[:, arm] for p in told])[:count], planned[:, 0])
+    np.testing.assert_array_equal(np.concatenate([p.tau[:, arm] for p in told])[:count], planned[:, 2])
     rms = np.sqrt((error**2).mean(axis=0))
     assert rms[0].max() < 1e-4
     assert rms[1].max() < 0.01
@@ -265,6 +268,23 @@ def test_torque_is_what_changes_the_momentum(plan, clips):
     assert np.any(np.isclose(np.abs(read.tau[:, 0]), limit)) == clips
 
 
+def test_torque_goes_straight_but_jumps_with_the_load():
+    """At rest with no stiffness to speak of, ctrl · kp − kp · q is the torque alone."""
+    home = still(np.zeros(7), np.zeros(7), 3)
+    motion = home.motion.copy()
+    motion[2:, 2] = 6.0  # from sample 2 on
+    kp, kv = np.full(7, 1000.0), np.full(7, 10.0)
+    straight = control([replace(home, motion=motion)], 3, kp, kv) * kp
+    np.testing.assert_allclose(straight[:, 0], [0, 0, 0, 0, 2, 4, 6, 6, 6], atol=1e-12)
+    jumps = [0, 0, 0, 0, 0, 0, 6, 6, 6]
+    payload_kg, force_n = np.array([0.0, 0.0, 1.0, 1.0]), np.zeros((4, 3))
+    grasped = control([replace(home, motion=motion, payload_kg=payload_kg)], 3, kp, kv) * kp
+    np.testing.assert_allclose(grasped[:, 0], jumps, atol=1e-12)
+    force_n[2:, 1] = -3.0
+    pressed = control([replace(home, motion=motion, force_n=force_n)], 3, kp, kv) * kp
+    np.testing.assert_allclose(pressed[:, 0], jumps, atol=1e-12)
+
+
 # Both plants
 
 
@@ -301,31 +321,34 @@ def test_motor_temperatures_of_both_plants_agree_after_two_hours():
         np.testing.assert_allclose(one.temp_c, other.temp_c, atol=0.5)
 
 
-HOT = ThermalLimits(error_c=27.0, warning_c=26.5, restart_c=26.0, clear_s=5.0)
-"""An arm with 3 kg passes this from 25 °C within a minute, and is back soon."""
+HOT = ThermalLimits(error_c=26.0, warning_c=25.8, restart_c=25.6, clear_s=5.0)
+"""A working arm passes this from 25 °C within a minute, and is back soon."""
 
 
+@pytest.mark.parametrize("kind", ["hold", "pick_place"])
 @pytest.mark.parametrize("name", ["profile", "mujoco"])
-def test_a_fault_cuts_the_tick_and_the_brakes_hold_until_somebody_clears_it(name):
-    world, plants = shift(job("hold", repetitions=20), ticks=90, limits=HOT)
-    plant = plants[name]
+def test_a_fault_cuts_the_tick_and_the_brakes_hold_until_somebody_clears_it(name, kind):
+    world, plants = shift(job(kind, repetitions=60), ticks=90, limits=HOT)
     offsets = np.arange(1, 501) / RATE_HZ
-    parts, steps = recorded(world, plant, offsets)
-    cut = next(i for i, done in enumerate(steps) if done.cut_s[0, 0] < world.dt_s)
-    recovered = next(i for i in range(cut + 1, len(steps)) if steps[i].state.mode[0, 0] == IDLE)
-    assert recovered > cut + 2
-    braked = offsets >= steps[cut].cut_s[0, 0]
-    assert 0 < braked.sum() < len(offsets)
-    stood = parts[cut].q[braked, 0]
-    np.testing.assert_array_equal(stood, np.tile(stood[0], (len(stood), 1)))
-    assert np.abs(parts[cut].tau[~braked, 0]).min(axis=0).max() > 1.0
-    for part, rows in [(parts[cut], braked), *((parts[i], slice(None)) for i in range(cut + 1, recovered + 1))]:
-        assert np.all(part.mode[rows, 0] == FAULTED)
-        for quiet in (part.qd, part.tau, part.current_a):
-            assert np.all(quiet[rows, 0] == 0.0)
-        np.testing.assert_allclose(part.q[rows, 0], np.broadcast_to(stood[0], part.q[rows, 0].shape), atol=2e-3)
-    assert np.linalg.norm(stood[0] - ROBOTS[0].home_q()) > 0.1
-    np.testing.assert_allclose(parts[recovered + 1].q[0, 0], ROBOTS[0].home_q(), atol=1e-3)
+    parts, steps = recorded(world, plants[name], offsets)
+    cuts = [i for i, done in enumerate(steps) if done.cut_s[0, 0] < world.dt_s]
+    assert len(cuts) >= 2
+    for cut in cuts[:-1]:
+        recovered = next(i for i in range(cut + 1, len(steps)) if steps[i].state.mode[0, 0] == IDLE)
+        assert recovered > cut + 2
+        braked = offsets >= steps[cut].cut_s[0, 0]
+        assert 0 < braked.sum() < len(offsets)
+        stood = parts[cut].q[braked, 0]
+        np.testing.assert_array_equal(stood, np.tile(stood[0], (len(stood), 1)))
+        last = parts[cut].q[~braked, 0][-1]
+        np.testing.assert_allclose(stood[0], last, atol=1.4 / RATE_HZ)
+        for part, rows in [(parts[cut], braked), *((parts[i], slice(None)) for i in range(cut + 1, recovered + 1))]:
+            assert np.all(part.mode[rows, 0] == FAULTED)
+            for quiet in (part.qd, part.tau, part.current_a):
+                assert np.all(quiet[rows, 0] == 0.0)
+            np.testing.assert_allclose(part.q[rows, 0], np.tile(stood[0], (len(part.q[rows]), 1)), atol=1e-5)
+        assert np.linalg.norm(stood[0] - ROBOTS[0].home_q()) > 0.1
+        np.testing.assert_allclose(parts[recovered + 1].q[0, 0], ROBOTS[0].home_q(), atol=1e-3)
 
 
 def test_only_faulted_arms_heat_nothing():
@@ -364,7 +387,7 @@ def test_looking_at_the_sensors_changes_nothing():
 
 
 def test_tick_zero_starts_afresh():
-    world, plants = shift(job("sort"), job("press"), ticks=4)
+    world, plants = shift(job("sort", repetitions=90), job("hold"), ticks=4)
     first, second = (work_through(world, plants["mujoco"])[-1].temp_c for _ in range(2))
     np.testing.assert_array_equal(first, second)
 
