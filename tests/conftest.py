@@ -92,7 +92,7 @@ def arm(
 
 def job(name: str, content: Work | None = None, **changes) -> Job:
     """Three cycles, there from the beginning."""
-    base = Job(name=name, work=content or work(), repetitions=3, release_s=0.0, due_s=600.0, value=1.0)
+    base = Job(name=name, work=content or work(), repetitions=3, release_s=0.0, due_s=1e4, value=1.0)
     return replace(base, **changes)
 
 

@@ -16,7 +16,7 @@ from fleet.thermal import WINDING, ThermalModel, advance, drive_heat
 Array = np.ndarray
 
 STEP_S = 10.0
-"""Heat is refreshed this often."""
+"""Heat is refreshed at least this often."""
 
 
 def peaks(
@@ -37,16 +37,17 @@ def peaks(
     load = [drive(plan.cycle.profile, motors) for plan in plans]
     current_sq = np.array([d.current_sq for d in load])
     friction_w = np.array([d.friction_w for d in load])
-    phi, gamma = thermal.step_matrices(STEP_S)
+    duration = np.asarray(duration_s, dtype=float)
+    steps = np.ceil(duration / STEP_S)
+    # Equal steps that end when the work does: a job of 12 s must not heat for 20.
+    phi, gamma = thermal.step_matrices(duration / np.maximum(steps, 1))
     temp = np.tile(start_c, (len(plans), 1))
     highest = temp[:, WINDING].copy()
-    left_s = np.array(duration_s, dtype=float)
-    for _ in range(int(np.ceil(left_s.max(initial=0.0) / STEP_S))):
+    for step in range(int(steps.max(initial=0.0))):
         heat = drive_heat(temp, current_sq, friction_w, motors)
         temp = advance(temp, heat, np.full(len(plans), ambient_c), phi, gamma, thermal.to_ambient)
-        going = (left_s > 0)[:, None]
+        going = (step < steps)[:, None]
         highest = np.where(going, np.maximum(highest, temp[:, WINDING]), highest)
-        left_s -= STEP_S
     return highest
 
 
