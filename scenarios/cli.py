@@ -1,8 +1,11 @@
 """The command line: `thermofleet run`, `list`, `show`, `compare`, `hold` and `demo`."""
 
+import errno
 import json
 import logging
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,9 +14,12 @@ from typing import Annotated, Any
 import msgspec
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.logging import RichHandler
+from rich.progress import BarColumn, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as Progressbar
 from rich.table import Table
 
+from agents.rules import RULES, make_policy
 from fleet.errors import FleetError
 from fleet.metrics import Metrics
 from scenarios.hold import hold_command
@@ -30,22 +36,46 @@ out_console = Console()
 err_console = Console(stderr=True)
 
 ScenarioArg = Annotated[str, typer.Argument(help="A library name (see `thermofleet list`) or a .toml file.")]
-PolicyOption = Annotated[str, typer.Option(help="random, round_robin, coolest_first or least_difficulty.")]
-SeedOption = Annotated[int, typer.Option(min=0, help="Draws the jobs, the noise and the policy's chance.")]
+PolicyOption = Annotated[str, typer.Option(help=f"{', '.join(RULES)}.")]
+SeedOption = Annotated[int, typer.Option(help="Draws the jobs, the noise and the policy's chance; 0 or more.")]
 PlantOption = Annotated[str, typer.Option(help="profile (planned heat) or mujoco (closed loop in one scene).")]
 BusOption = Annotated[str, typer.Option(help="zenoh (in-process router) or memory.")]
 DifficultyOption = Annotated[str, typer.Option(help="What scores the plans: twin, blind or oracle.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print figures as JSON.")]
+Progress = Callable[[str, float], None]
+
+USAGE, INTERRUPTED = 2, 130
+"""Exit codes: something the user can mend; Ctrl-C."""
+_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS)
+
+
+class Interrupted(FleetError):
+    """Ctrl-C before there was anything to keep; names the stage."""
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Entry point: errors that the user can mend are one sentence and exit code 2."""
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
+    """Entry point: errors that the user can mend are one sentence and exit code 2; Ctrl-C is 130."""
+    told = RichHandler(console=err_console, show_time=False, show_path=False, rich_tracebacks=False)
+    logging.basicConfig(level=logging.WARNING, format="%(name)s: %(message)s", handlers=[told])
     try:
-        app(args=list(argv) if argv is not None else None)
+        code = app(args=list(argv) if argv is not None else None, prog_name="thermofleet", standalone_mode=False)
+    except Interrupted as interrupted:
+        _say(str(interrupted))
+        sys.exit(INTERRUPTED)
     except FleetError as error:
-        err_console.print(f"Error: {error}", markup=False, highlight=False, soft_wrap=True)
-        sys.exit(2)
+        _say(f"Error: {error}")
+        sys.exit(USAGE)
+    except typer.TyperException as error:
+        message = error.format_message()
+        if message:  # none where the help was shown instead
+            _say(f"Error: {message.rstrip('.')}{'' if message.endswith('?') else '.'} See thermofleet --help.")
+        sys.exit(USAGE)
+    except OSError as error:
+        if error.errno not in _DISK:
+            raise
+        _say(f"Error: '{error.filename or 'disk'}': {error.strerror}.")
+        sys.exit(USAGE)
+    sys.exit(code or 0)
 
 
 @app.command("run")
@@ -59,30 +89,30 @@ def run_command(
     plant: PlantOption = "profile",
     bus: BusOption = "zenoh",
     difficulty: DifficultyOption = "twin",
-    overwrite: Annotated[bool, typer.Option(help="Replace a finished run in --out.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a finished run in --out.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Work one shift of a scenario and record it."""
     from scenarios.folder import check_free
 
     chosen = load(scenario)
+    spec = _spec(policy, seed, plant, bus, difficulty)
     where = out or Path("runs") / f"{chosen.name}-{policy}-{seed}"
     check_free(where, overwrite=overwrite)
-    spec = _spec(policy, seed, plant, bus, difficulty)
     with progress_bar() as progress:
         result = _run_into(chosen, spec, where, overwrite, progress)
     if as_json:
         typer.echo(json.dumps({"out": str(where), **_figures(result)}, indent=1))
     else:
         out_console.print(table_of({policy: result.metrics}, f"{chosen.name}, seed {seed}"))
-        out_console.print(f"Recorded in {where}; open {where / 'report.html'} in a browser.", soft_wrap=True)
+        if result.finished:
+            _tell(f"Recorded in {where}; open {where / 'report.html'} in a browser.")
     if not result.finished:
-        err_console.print(
-            f"Interrupted at {result.time_s:.0f} s of {chosen.horizon_s:.0f} s: what happened until then is kept in "
-            f"{where} (status 'interrupted'). The same command runs the shift anew from the cached plans and twins.",
-            soft_wrap=True,
+        _say(
+            f"Interrupted after {result.time_s:g} s of {chosen.horizon_s:g} s: the shift until then is kept in {where} "
+            "(status 'interrupted'). The same command works the whole shift from the plans and twins already made."
         )
-        raise typer.Exit(130)
+        raise typer.Exit(INTERRUPTED)
 
 
 @app.command("list")
@@ -118,10 +148,8 @@ def show_command(scenario: ScenarioArg, as_json: JsonOption = False) -> None:
 @app.command("compare")
 def compare_command(
     scenario: ScenarioArg,
-    policies: Annotated[
-        str, typer.Option(help="Comma-separated.")
-    ] = "random,round_robin,coolest_first,least_difficulty",
-    seeds: Annotated[int, typer.Option(min=2, help="How many, from 0.")] = 10,
+    policies: Annotated[str, typer.Option(help="Comma-separated.")] = ",".join(RULES),
+    seeds: Annotated[int, typer.Option(help="How many, from 0; 2 or more.")] = 10,
     baseline: Annotated[str, typer.Option(help="Paired differences are against this policy.")] = "round_robin",
     difficulty: DifficultyOption = "twin",
     as_json: JsonOption = False,
@@ -130,6 +158,8 @@ def compare_command(
     from scenarios.compare import compare, comparison_table
 
     chosen = load(scenario)
+    if seeds < 2:
+        raise FleetError(f"--seeds must be 2 or more, so that there is something to compare (got {seeds}).")
     names = [name.strip() for name in policies.split(",")]
     with progress_bar() as progress:
         how: Any = difficulty  # checked when the fleet is prepared
@@ -153,20 +183,16 @@ def demo_command(
             spec = _spec(policy, seed, "profile", "zenoh", "twin")
             result = _run_into(chosen, spec, out / policy, True, progress)
             if not result.finished:
-                err_console.print(f"Interrupted; finished recordings are in {out}.")
-                raise typer.Exit(130)
+                raise Interrupted(f"Interrupted while working; recordings are in {out}.")
             results[policy] = result.metrics
     out_console.print(table_of(results, f"{chosen.name}, seed {seed}: {chosen.description}"))
-    out_console.print(
-        f"Open {out / 'least_difficulty' / 'report.html'} in a browser to see what happened.", soft_wrap=True
-    )
+    _tell(f"Open {out / 'least_difficulty' / 'report.html'} in a browser to see what happened.")
 
 
 app.command("hold")(hold_command)
 
 
 def _spec(policy: str, seed: int, plant: str, bus: str, difficulty: str) -> Any:
-    from agents.rules import make_policy
     from scenarios.build import BusName, DifficultyName, PlantName, choose
     from scenarios.run import RunSpec
 
@@ -174,6 +200,8 @@ def _spec(policy: str, seed: int, plant: str, bus: str, difficulty: str) -> Any:
         make_policy(policy)
     except ValueError as error:
         raise FleetError(str(error)) from error
+    if seed < 0:
+        raise FleetError(f"--seed must be 0 or more (got {seed}).")
     choose("plant", plant, PlantName)
     choose("bus", bus, BusName)
     choose("difficulty", difficulty, DifficultyName)
@@ -181,17 +209,38 @@ def _spec(policy: str, seed: int, plant: str, bus: str, difficulty: str) -> Any:
     return RunSpec(policy=policy, seed=seed, **fields)
 
 
-def _run_into(scenario: Scenario, spec: Any, out: Path, overwrite: bool, progress: Callable[[str, float], None]) -> Any:
+def _run_into(scenario: Scenario, spec: Any, out: Path, overwrite: bool, progress: Progress) -> Any:
     from scenarios.build import prepare
     from scenarios.folder import new_folder, write
     from scenarios.run import run
 
     with new_folder(out, overwrite=overwrite) as folder:
         fleet = prepare(scenario, difficulty=spec.difficulty, progress=progress)
-        result = run(fleet, spec, progress=progress)
-        progress("writing", 0.0)
-        write(result, folder)
+        with stop_on_interrupt() as stopped:
+            result = run(fleet, spec, progress=progress, stopped=stopped)
+            progress("writing", 0.0)
+            write(result, folder)
     return result
+
+
+@contextmanager
+def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
+    """Ctrl-C turns the given function true, so that a shift ends between two steps; a second Ctrl-C breaks it off."""
+    pressed = threading.Event()
+
+    def note(_signal: int, _frame: object) -> None:
+        if pressed.is_set():
+            raise KeyboardInterrupt
+        pressed.set()
+
+    if threading.current_thread() is not threading.main_thread():  # only that one may handle signals
+        yield pressed.is_set
+        return
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield pressed.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _figures(result: Any) -> dict[str, Any]:
@@ -202,16 +251,44 @@ def _figures(result: Any) -> dict[str, Any]:
 
 
 @contextmanager
-def progress_bar() -> Iterator[Callable[[str, float], None]]:
-    """A bar on standard error that names the stage."""
-    columns = (SpinnerColumn(), TextColumn("{task.description:<10}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=err_console, transient=True) as bar:
+def progress_bar() -> Iterator[Progress]:
+    """A bar on standard error that names the stage.
+
+    Raises:
+        Interrupted: Ctrl-C in a stage that keeps nothing but what is in the cache.
+    """
+    from scenarios.build import cache_folder
+
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description:<9}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+    )
+    with Progressbar(*columns, console=err_console, transient=True, disable=not err_console.is_terminal) as bar:
         task = bar.add_task("starting", total=1.0)
 
         def tell(stage: str, share: float) -> None:
             bar.update(task, description=stage, completed=share)
 
-        yield tell
+        try:
+            yield tell
+        except KeyboardInterrupt:
+            raise Interrupted(
+                f"Interrupted while {bar.tasks[0].description}: nothing was written. Plans and twins already made are "
+                f"kept in {cache_folder()}, and the same command goes on from there."
+            ) from None
+
+
+def _say(sentence: str) -> None:
+    """One line on standard error, not wrapped, so that paths can be copied."""
+    err_console.print(sentence, markup=False, highlight=False, soft_wrap=True)
+
+
+def _tell(sentence: str) -> None:
+    """One line on standard output."""
+    out_console.print(sentence, markup=False, highlight=False, soft_wrap=True)
 
 
 def table_of(results: dict[str, Metrics], title: str) -> Table:

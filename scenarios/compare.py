@@ -67,24 +67,31 @@ def compare(
     baseline: str,
     difficulty: DifficultyName = "twin",
     cache_dir: Path | None = None,
+    workers: int = -1,
     progress: Progress = quiet,
 ) -> Comparison:
-    """Run every policy on every seed (in memory, profile plant), on all cores; the result does not depend on how many.
+    """Run every policy on every seed, in memory and on the profile plant.
+
+    Args:
+        workers: Processes, -1 for one per core; the result does not depend on it.
 
     Raises:
-        FleetError: unknown policy, or a baseline that is not among the policies.
+        FleetError: unknown policy, one named twice, or a baseline that is not among the policies.
     """
     try:
         for policy in policies:
             make_policy(policy)
     except ValueError as error:
         raise FleetError(str(error)) from error
+    for i, policy in enumerate(policies):
+        if policy in policies[:i]:
+            raise FleetError(f"The policy '{policy}' is named twice; every policy is compared once.")
     if baseline not in policies:
         raise FleetError(f"The baseline '{baseline}' is not among the policies compared: {', '.join(policies)}.")
     prepare(scenario, difficulty=difficulty, cache=cache_dir, progress=progress)  # into the cache, for all workers
     cells = [(policy, seed) for policy in policies for seed in seeds]
     metrics: list[Metrics] = []
-    with Parallel(n_jobs=-1, return_as="generator") as pool:
+    with Parallel(n_jobs=workers, return_as="generator") as pool:
         for done in pool(delayed(_cell)(scenario, difficulty, cache_dir, *cell) for cell in cells):
             assert done is not None
             metrics.append(done)
@@ -135,19 +142,25 @@ def interval(values: Array, rng: np.random.Generator) -> tuple[float, float]:
 
 
 def comparison_table(result: Comparison) -> Table:
-    """Mean with its interval per policy and figure; a star where the paired difference excludes zero."""
-    seeds = len(result.seeds)
-    title = f"{result.scenario}, {seeds} seeds: mean [95 % interval], * differs from {result.baseline} (paired)"
-    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
-    table.add_column("policy")
-    for name in FIGURES:
+    """A block per figure: mean and paired difference, each with its interval; narrow enough for 80 columns."""
+    title = (
+        f"{result.scenario}, {len(result.seeds)} seeds: mean, paired difference to {result.baseline}, "
+        "95 % intervals; * excludes 0"
+    )
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False, header_style="bold")
+    table.add_column("", overflow="fold")
+    for name in ("mean", "interval", "difference", "interval", ""):
         table.add_column(name, justify="right")
-    for policy, figures in result.figures.items():
-        cells = []
-        for name in FIGURES:
+    for name in FIGURES:
+        table.add_row(f"[bold]{name}[/bold]")
+        digits = 3 if name == "availability" else 1
+        for policy, figures in result.figures.items():
             f = figures[name]
-            star = "*" if f.difference_low > 0 or f.difference_high < 0 else " "
-            digits = 3 if name == "availability" else 1
-            cells.append(f"{f.mean:.{digits}f} [{f.low:.{digits}f}, {f.high:.{digits}f}]{star}")
-        table.add_row(policy, *cells)
+            mean = (f"{f.mean:.{digits}f}", f"{f.low:.{digits}f} … {f.high:.{digits}f}")
+            if policy == result.baseline:
+                table.add_row(f"  {policy}", *mean)
+                continue
+            between = f"{f.difference_low:+.{digits}f} … {f.difference_high:+.{digits}f}"
+            star = "*" if f.difference_low > 0 or f.difference_high < 0 else ""
+            table.add_row(f"  {policy}", *mean, f"{f.difference:+.{digits}f}", between, star)
     return table

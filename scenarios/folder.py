@@ -1,10 +1,11 @@
 """A run folder: run.json, telemetry.parquet, events.parquet, report.html. Whole, or not there."""
 
 import json
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -32,61 +33,94 @@ def new_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
         FleetError: `out` cannot be written, or holds something that is not ours to replace.
     """
     check_free(out, overwrite=overwrite)
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
-    except OSError as error:
-        raise FleetError(f"Cannot write to '{out}': {error.strerror}.") from error
+    place = Path(os.path.abspath(out))
+    made = [parent for parent in place.parents if not parent.exists()]
+    with _or_say(out):
+        place.parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=f".{place.name}.", dir=place.parent))
     try:
         yield work
-        old = None
-        if out.exists():
-            old = Path(tempfile.mkdtemp(prefix=f".{out.name}.old.", dir=out.parent))
-            out.rename(old / out.name)
-        work.chmod(0o755)
-        work.rename(out)
-        if old is not None:
-            shutil.rmtree(old)
-    except OSError as error:
-        raise FleetError(f"Cannot write to '{out}': {error.strerror}.") from error
+        with _or_say(out):
+            work.chmod(0o755)
+            _swap(work, place)
     finally:
         if work.exists():
             shutil.rmtree(work)
+            for parent in made:
+                with suppress(OSError):  # somebody else has put something there in the meantime
+                    parent.rmdir()
+
+
+def _swap(work: Path, place: Path) -> None:
+    """Let `work` take the place of what was there."""
+    if not place.exists():
+        work.rename(place)
+        return
+    old = Path(tempfile.mkdtemp(prefix=f".{place.name}.old.", dir=place.parent))
+    place.rename(old / place.name)
+    work.rename(place)
+    shutil.rmtree(old)
+
+
+@contextmanager
+def _or_say(out: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise FleetError(f"Cannot write to '{out}': {error.strerror or error}.") from error
 
 
 def check_free(out: Path, *, overwrite: bool) -> None:
-    """Refuse a place that is taken by anything but an earlier run that may be replaced."""
-    if not out.exists():
-        return
-    if not out.is_dir():
-        raise FleetError(f"Cannot write to '{out}': it is a file; --out needs a folder.")
-    strangers = sorted(p.name for p in out.iterdir() if p.name not in FILES)
+    """Refuse a place that is taken by anything but an earlier run that may be replaced.
+
+    Raises:
+        FleetError: what is there, and what would be allowed.
+    """
+    with _or_say(out):
+        for parent in out.parents:
+            if parent.exists() and not parent.is_dir():
+                raise FleetError(f"Cannot write to '{out}': '{parent}' is a file, not a folder.")
+        if not out.exists():
+            return
+        if not out.is_dir():
+            raise FleetError(f"Cannot write to '{out}': it is a file; --out needs a folder.")
+        held = sorted(p.name for p in out.iterdir())
+    status = _status(out)
+    strangers = [name for name in held if name not in FILES] if status else held
     if strangers:
         raise FleetError(f"'{out}' holds other things ('{strangers[0]}'); --out needs a new folder or an earlier run.")
-    status = _status(out)
     if status == "finished" and not overwrite:
         raise FleetError(f"'{out}' holds a finished run; give another --out, or --overwrite to replace it.")
 
 
 def _status(out: Path) -> str | None:
+    """What run.json says; None where there is none, or not ours."""
     try:
-        return json.loads((out / "run.json").read_text(encoding="utf-8")).get("status")
-    except (OSError, ValueError, AttributeError):
+        status = json.loads((out / "run.json").read_text(encoding="utf-8"))["status"]
+    except (OSError, ValueError, KeyError, TypeError):
         return None
+    return status if status in ("finished", "interrupted") else None
 
 
 def write(result: RunResult, folder: Path) -> None:
-    """Lay down the files of a run in an existing folder."""
+    """Lay down the files of a run in an existing folder.
+
+    Raises:
+        FleetError: the disk refuses.
+    """
     run = summary(result)
     arms = [arm.name for arm in result.scenario.arms]
-    (folder / "run.json").write_text(json.dumps(run, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    pq.write_table(event_table(result.events), folder / "events.parquet")
-    if result.telemetry is None:
-        return
-    pq.write_table(telemetry_table(result.telemetry, arms), folder / "telemetry.parquet")
-    limits = result.scenario.limits
-    html = report_html(run, result.telemetry, result.events, arms, warning_c=limits.warning_c, error_c=limits.error_c)
-    (folder / "report.html").write_text(html, encoding="utf-8")
+    with _or_say(folder):
+        (folder / "run.json").write_text(json.dumps(run, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        pq.write_table(event_table(result.events), folder / "events.parquet")
+        if result.telemetry is None:
+            return
+        pq.write_table(telemetry_table(result.telemetry, arms), folder / "telemetry.parquet")
+        limits = result.scenario.limits
+        html = report_html(
+            run, result.telemetry, result.events, arms, warning_c=limits.warning_c, error_c=limits.error_c
+        )
+        (folder / "report.html").write_text(html, encoding="utf-8")
 
 
 def telemetry_table(telemetry: Telemetry, arms: list[str]) -> pa.Table:

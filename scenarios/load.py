@@ -4,17 +4,19 @@ import dataclasses
 import tomllib
 from collections.abc import Mapping
 from importlib import resources
-from itertools import combinations
-from math import dist
+from itertools import combinations, pairwise
+from math import dist, isfinite
 from pathlib import Path
-from types import UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, get_args, get_origin, get_type_hints
 
 import msgspec
 
 from fleet.errors import ScenarioError, nearest
-from scenarios.scenario import Scenario
+from scenarios.complaint import check_finite, complaint, plain_kind
+from scenarios.scenario import JobStream, Scenario
 
+MOST_JOBS = 100_000
+"""More than anybody would wait for; a mistyped gap gives billions."""
 APART_M = 0.2
 """Two bases closer than this would stand in one place: a Gen3 base is 0.09 m wide and needs its first joint free."""
 
@@ -33,27 +35,30 @@ def load(name_or_path: str | Path) -> Scenario:
     """
     known = library()
     path = known.get(str(name_or_path), Path(name_or_path))
-    if not path.is_file():
-        if path.suffix == ".toml":
-            raise ScenarioError(f"There is no scenario file '{path}'.")
-        raise ScenarioError(f"No scenario '{name_or_path}'{nearest(str(name_or_path), known)}")
     try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+        raw = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError) as error:
+        if path.suffix == ".toml":
+            raise ScenarioError(f"There is no scenario file '{path}'.") from error
+        raise ScenarioError(f"No scenario '{name_or_path}'{nearest(str(name_or_path), known)}") from error
+    except OSError as error:
+        raise ScenarioError(f"Cannot read '{path}': {error.strerror}.") from error
     except tomllib.TOMLDecodeError as error:
         raise ScenarioError(f"{path.name}: not valid TOML: {error}.") from error
     except UnicodeDecodeError as error:
         raise ScenarioError(f"{path.name}: not a UTF-8 text file.") from error
-    raw = {"name": path.stem, **raw}
-    return checked(raw, path)
+    return checked({"name": path.stem, **raw}, path)
 
 
 def checked(raw: Mapping[str, Any], path: Path) -> Scenario:
     """The scenario of a parsed file; `path` names it in errors and locates what it refers to."""
     _known_keys(raw, Scenario, path.name, "")
+    check_finite(raw, path.name)
+    raw = {"arms": (), "places": (), "jobs": (), **raw}  # so that having none and not naming any is said alike
     try:
         scenario = msgspec.convert(raw, Scenario, strict=True)
     except msgspec.ValidationError as error:
-        raise ScenarioError(f"{path.name}: {_place(str(error))}.") from error
+        raise ScenarioError(f"{path.name}: {complaint(error, raw, Scenario)}") from error
     _check(scenario, path)
     return _with_traces(scenario, path)
 
@@ -64,14 +69,17 @@ def override(scenario: Scenario, **changes: Any) -> Scenario:
     Raises:
         ScenarioError: no such field, or a value it cannot take.
     """
-    raw = msgspec.to_builtins(scenario)
-    return checked({**raw, **msgspec.to_builtins(changes)}, Path(f"{scenario.name} with overrides"))
+    where = f"{scenario.name} with overrides"
+    try:
+        plain = msgspec.to_builtins(changes)
+    except TypeError as error:
+        raise ScenarioError(f"{where}: {error}.") from error
+    return checked({**msgspec.to_builtins(scenario), **plain}, Path(where))
 
 
 def _known_keys(raw: Any, kind: Any, file: str, place: str) -> None:
     """Refuse keys that the dataclass `kind` does not have, all the way down."""
-    if get_origin(kind) in (Union, UnionType):
-        kind = next((arg for arg in get_args(kind) if dataclasses.is_dataclass(arg)), kind)
+    kind = plain_kind(kind)
     if get_origin(kind) is tuple and isinstance(raw, list):
         for i, item in enumerate(raw):
             _known_keys(item, get_args(kind)[0], file, f"{place}[{i}]")
@@ -84,14 +92,6 @@ def _known_keys(raw: Any, kind: Any, file: str, place: str) -> None:
             where = f"{file}: {place}" if place else file
             raise ScenarioError(f"{where}: unknown key '{key}'{nearest(key, allowed)}")
         _known_keys(value, hints[key], file, f"{place}.{key}" if place else key)
-
-
-def _place(message: str) -> str:
-    """msgspec's message with the place first and in our words: `arms[0].tool_kg: Expected ...`."""
-    text, _, where = message.partition(" - at `$")
-    where = where.strip("`").lstrip(".")
-    text = text.rstrip(".")
-    return f"{where}: {text}" if where else text
 
 
 def _check(scenario: Scenario, path: Path) -> None:
@@ -128,9 +128,17 @@ def _check(scenario: Scenario, path: Path) -> None:
             )
         for name in stream.after:
             if name not in streams[:i]:
-                raise ScenarioError(
-                    f"{file}: jobs[{i}].after: '{name}' is no stream above this one{nearest(name, streams[:i])}"
-                )
+                above = nearest(name, streams[:i]) if i else "; there is none."
+                raise ScenarioError(f"{file}: jobs[{i}].after: '{name}' is no stream above this one{above}")
+    total = sum(_expected_jobs(stream, scenario.horizon_s) for stream in scenario.jobs)
+    if total > MOST_JOBS:
+        raise ScenarioError(f"{file}: jobs: about {total:.3g} jobs would arrive in a shift; allowed are {MOST_JOBS}.")
+
+
+def _expected_jobs(stream: JobStream, horizon_s: float) -> float:
+    spec = stream.arrivals
+    gap_s = spec.every_s or horizon_s
+    return horizon_s / gap_s * (spec.count or 1) if spec.kind != "trace" else len(spec.times_s or ())
 
 
 def _with_traces(scenario: Scenario, path: Path) -> Scenario:
@@ -149,8 +157,12 @@ def _with_traces(scenario: Scenario, path: Path) -> Scenario:
 def _trace(where: Path, place: str) -> tuple[float, ...]:
     try:
         lines = where.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError as error:
+        raise ScenarioError(f"{place}: there is no file '{where}'.") from error
     except OSError as error:
         raise ScenarioError(f"{place}: cannot read '{where}': {error.strerror}.") from error
+    except UnicodeDecodeError as error:
+        raise ScenarioError(f"{place}: '{where.name}' is not a UTF-8 text file.") from error
     times: list[float] = []
     for number, line in enumerate(lines, start=1):
         if not line.strip() or line.lstrip().startswith("#"):
@@ -159,6 +171,9 @@ def _trace(where: Path, place: str) -> tuple[float, ...]:
             times.append(float(line))
         except ValueError as error:
             raise ScenarioError(f"{place}: line {number} of '{where.name}' is no time in seconds: {line!r}.") from error
-    if times != sorted(times) or any(t < 0 for t in times):
-        raise ScenarioError(f"{place}: the times in '{where.name}' must be >= 0 and in order.")
+    if not times:
+        raise ScenarioError(f"{place}: '{where.name}' holds no time; one arrival time in seconds per line is needed.")
+    for before, time in pairwise([0.0, *times]):
+        if not (isfinite(time) and before <= time):
+            raise ScenarioError(f"{place}: the times in '{where.name}' must be >= 0 and in order ({time} s is not).")
     return tuple(times)

@@ -62,7 +62,7 @@ def run(
     stopped: Callable[[], bool] = lambda: False,
     record: bool = True,
 ) -> RunResult:
-    """Work the shift. Ctrl-C, or `stopped` turning true, ends it early with what there is.
+    """Work the shift; `stopped` turning true ends it early, between two steps, with what there is.
 
     Args:
         record: Keep telemetry; sweeps do without.
@@ -82,8 +82,6 @@ def run(
             reward += next(iter(rewards.values()))
             progress("working", float(env.truth.tick[0] / env.world.ticks))
         finished = not env.agents
-    except KeyboardInterrupt:
-        finished = False
     finally:
         env.close()
     state, world = env.truth, env.world

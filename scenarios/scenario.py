@@ -10,6 +10,13 @@ from fleet.env.reward import RewardWeights
 from fleet.job import Kind, Place
 from fleet.robot import Cooling, Mount, Robot, ThermalLimits
 
+LONGEST_DWELL_S = 3600.0
+"""Of one repetition: every motion is kept sample by sample."""
+MOST_REPETITIONS = 100_000
+MOST_SAMPLES = 1_000_000
+"""Telemetry samples of an arm in a shift: eleven days at one a second."""
+MOST_SLOTS = 256
+
 
 def _positive(owner: str, **values: float) -> None:
     for name, value in values.items():
@@ -73,7 +80,9 @@ class ArrivalSpec:
         }[self.kind]
         for name in ("every_s", "count", "stop_s", "times_s", "file"):
             if getattr(self, name) is not None and name not in allowed:
-                raise ValueError(f"arrivals of kind '{self.kind}' take no '{name}'; they take {_list(allowed)}")
+                raise ValueError(
+                    f"arrivals of kind '{self.kind}' take no '{name}'; they take {_list(allowed | {'start_s'})}"
+                )
         missing = {"poisson": self.every_s, "batch": self.count}.get(self.kind, 0)
         if missing is None:
             raise ValueError(
@@ -123,11 +132,16 @@ class JobStream:
         if not self.payload_kg or min(self.payload_kg) < 0:
             raise ValueError(f"JobStream.payload_kg must be some masses >= 0 (got {list(self.payload_kg)})")
         low, high = self.repetitions
-        if not 1 <= low <= high:
+        if not 1 <= low <= high <= MOST_REPETITIONS:
             raise ValueError(
-                f"JobStream.repetitions must be [fewest, most] with 1 <= fewest <= most (got {low}, {high})"
+                f"JobStream.repetitions must be [fewest, most] with 1 <= fewest <= most <= {MOST_REPETITIONS} "
+                f"(got {low}, {high})"
             )
         _positive("JobStream", dwell_s=self.dwell_s, due_s=self.due_s)
+        if self.dwell_s > LONGEST_DWELL_S:
+            raise ValueError(
+                f"JobStream.dwell_s must be at most {LONGEST_DWELL_S:g} s (got {self.dwell_s}); more by repetitions"
+            )
         if self.value < 0 or self.force_n < 0:
             raise ValueError(f"JobStream.value and force_n must be >= 0 (got {self.value}, {self.force_n})")
 
@@ -158,6 +172,13 @@ class Planning:
 
     elbows: int = 3
     speeds: tuple[float, ...] = (1.0, 0.6)
+    """Shares of the arm's speed limits."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.elbows <= 12:
+            raise ValueError(f"Planning.elbows must lie between 1 and 12 (got {self.elbows})")
+        if not self.speeds or not all(0.05 <= speed <= 1 for speed in self.speeds):
+            raise ValueError(f"Planning.speeds must be some shares between 0.05 and 1 (got {list(self.speeds)})")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,6 +199,8 @@ class TwinSpec:
         _positive("TwinSpec", horizon_s=self.horizon_s)
         if self.cool_c <= self.ambient_c:
             raise ValueError(f"TwinSpec.cool_c must be above ambient_c (got {self.cool_c}, {self.ambient_c})")
+        if min(self.payload_kg, default=0.0) < 0:
+            raise ValueError(f"TwinSpec.payload_kg must be masses >= 0 (got {list(self.payload_kg)})")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,8 +250,17 @@ class Scenario:
                 "Scenario.telemetry_interval_s must not exceed decision_interval_s "
                 f"(got {self.telemetry_interval_s}, {self.decision_interval_s})"
             )
-        if self.slots < 1:
-            raise ValueError(f"Scenario.slots must be >= 1 (got {self.slots})")
+        if not 1 <= self.slots <= MOST_SLOTS:
+            raise ValueError(f"Scenario.slots must lie between 1 and {MOST_SLOTS} (got {self.slots})")
+        if self.horizon_s / self.telemetry_interval_s > MOST_SAMPLES:
+            raise ValueError(
+                f"Scenario.horizon_s must be at most {MOST_SAMPLES} times telemetry_interval_s "
+                f"(got {self.horizon_s}, {self.telemetry_interval_s})"
+            )
+        if not self.name.strip() or self.name[0] == "." or any(c in "/\\" or not c.isprintable() for c in self.name):
+            raise ValueError(
+                f"Scenario.name must be non-empty, begin with no dot and hold no slash (got '{self.name}')"
+            )
 
     @property
     def ticks(self) -> int:

@@ -1,5 +1,6 @@
 """A scenario in words and tables."""
 
+from collections.abc import Callable
 from itertools import groupby
 
 import numpy as np
@@ -8,7 +9,7 @@ from rich.text import Text
 
 from scenarios.build import Progress, ShiftFactory, prepare, quiet
 from scenarios.load_factor import LoadFactor, load_factor
-from scenarios.scenario import Scenario
+from scenarios.scenario import ArmSpec, JobStream, Scenario
 
 SEEDS = 5
 """Shifts over which the load factor is averaged."""
@@ -31,7 +32,8 @@ def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | Tex
         f"{arm}: {', '.join(sorted({e.place for e in es}))}" for arm, es in groupby(fleet.infeasible, lambda e: e.arm)
     ]
     tail = Text("Out of reach: " + "; ".join(refused) if refused else "Every arm reaches every place.")
-    return [Text(head), _arms(scenario), _jobs(scenario), tail]
+    gap = Text("")
+    return [Text(head), gap, _arms(scenario), gap, _jobs(scenario), gap, tail]
 
 
 def _regime(factors: list[LoadFactor]) -> str:
@@ -40,33 +42,64 @@ def _regime(factors: list[LoadFactor]) -> str:
 
 
 def _arms(scenario: Scenario) -> Table:
-    table = _table("arm", "position, m", "tilt, deg", "home", "cooling", "air, K", "wear")
+    """One row per arm; what is usual for all of them is left out."""
+    usual = ArmSpec(name="usual")
+    columns: list[tuple[str, Callable[[ArmSpec], str]]] = [
+        ("home", lambda a: a.home),
+        ("tool, kg", lambda a: f"{a.tool_kg:g}"),
+        ("cooling", lambda a: a.cooling if a.cooling_factor == 1 else f"{a.cooling} × {a.cooling_factor:g}"),
+        ("air, K", lambda a: f"{a.ambient_offset_k:+g}"),
+        ("wear", lambda a: f"{a.wear:g}"),
+    ]
+    told = [(name, text) for name, text in columns if any(text(a) != text(usual) for a in scenario.arms)]
+    table = _table("arms", "position, m", "tilt, deg", *(name for name, _ in told))
     for a in scenario.arms:
         where = ", ".join(f"{v:g}" for v in a.position_m)
         tilt = ", ".join(f"{v:g}" for v in a.tilt_deg)
-        cooling = a.cooling if a.cooling_factor == 1 else f"{a.cooling} × {a.cooling_factor:g}"
-        table.add_row(a.name, where, tilt, a.home, cooling, f"{a.ambient_offset_k:+g}", f"{a.wear:g}")
+        table.add_row(a.name, where, tilt, *(text(a) for _, text in told))
     return table
 
 
 def _jobs(scenario: Scenario) -> Table:
-    table = _table("jobs", "kind", "places", "payload, kg", "repetitions", "value", "due, min", "arrivals")
+    """One row per stream, in words, so that it fits any terminal."""
+    table = _table("jobs", "")
     for s in scenario.jobs:
-        spec = s.arrivals
-        when = {
-            "poisson": f"Poisson, every {spec.every_s} s",
-            "batch": f"{spec.count} at {spec.start_s:g} s" + (f", every {spec.every_s:g} s" if spec.every_s else ""),
-            "trace": f"trace of {len(spec.times_s or ())}",
-        }[spec.kind]
-        loads = ", ".join(f"{p:g}" for p in s.payload_kg)
-        low, high = s.repetitions
-        reps = f"{low}" if low == high else f"{low}–{high}"
-        table.add_row(s.name, s.kind, " → ".join(s.places), loads, reps, f"{s.value:g}", f"{s.due_s / 60:g}", when)
+        table.add_row(s.name, f"{_work(s)}\nworth {s.value:g}, due after {s.due_s / 60:g} min; {_arrivals(s)}")
     return table
 
 
+def _work(stream: JobStream) -> str:
+    loads = " or ".join(f"{p:g}" for p in stream.payload_kg)
+    low, high = stream.repetitions
+    times = f"{low}" if low == high else f"{low}–{high}"
+    where = " → ".join(stream.places)
+    match stream.kind:
+        case "hold":
+            return f"hold {loads} kg at {where}, {times} × {stream.dwell_s:g} s"
+        case "press":
+            held = f" and {loads} kg" if any(stream.payload_kg) else ""
+            return f"press {where} with {stream.force_n:g} N{held}, {times} × {stream.dwell_s:g} s"
+        case "pick_place" | "sort":
+            return f"{stream.kind} {where}, {loads} kg, {times} times"
+
+
+def _arrivals(stream: JobStream) -> str:
+    spec = stream.arrivals
+    after = f", after {', '.join(stream.after)}" if stream.after else ""
+    match spec.kind:
+        case "poisson":
+            first = f" from {spec.start_s:g} s" if spec.start_s else ""
+            last = f" until {spec.stop_s:g} s" if spec.stop_s is not None else ""
+            return f"Poisson, one every {spec.every_s:g} s{first}{last}{after}"
+        case "batch":
+            again = f", again every {spec.every_s:g} s" if spec.every_s else ""
+            return f"{spec.count} at {spec.start_s:g} s{again}{after}"
+        case "trace":
+            return f"a trace of {len(spec.times_s or ())}{after}"
+
+
 def _table(*columns: str) -> Table:
-    table = Table(box=None, pad_edge=False)
+    table = Table(box=None, pad_edge=False, header_style="bold")
     for column in columns:
-        table.add_column(column)
+        table.add_column(column, overflow="fold")
     return table
