@@ -148,7 +148,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         self.events = []
         self._perceive()
         zero = dict.fromkeys(TERMS, 0.0)
-        return self._observations(), {arm: self._info(a, zero) for a, arm in enumerate(self.agents)}
+        return self._observations(), {arm: self._info(a, zero) for a, arm in enumerate(self.world.arms)}
 
     def step(
         self, actions: dict[str, int]
@@ -168,7 +168,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
             raise ValueError(
                 f"No agent '{sorted(unknown)[0]}' in this fleet. Agents: {', '.join(self.possible_agents)}."
             )
-        chosen = np.array([[_integer(arm, actions.get(arm, 0)) for arm in self.possible_agents]])
+        chosen = np.array([[_integer(arm, actions.get(arm, 0)) for arm in self.world.arms]])
         log = self.events if self._keep_events else None
         done = step(self.world, before, chosen, self._shared_scores()[None], self._episode.plant, log, self._board)
         if self._watch is not None:
@@ -182,7 +182,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         finished = bool(jobs.any() and (done.state.status[0][jobs] == DONE).all())
         last_tick = min(self.world.ticks, self._max_cycles or self.world.ticks)
         over = not finished and bool(done.state.tick[0] >= last_tick)
-        arms = list(self.agents)
+        arms = self.world.arms
         infos = {arm: self._info(a, parts) for a, arm in enumerate(arms)}
         if finished or over:
             self.agents = []
@@ -201,7 +201,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
     def knowledge(self) -> dict[str, Observation]:
         """The present observation of every arm by name, as policies read it."""
         vectors, masks = (values.copy() for values in self._perceived())
-        return {arm: self.layout.read(vectors[a], masks[a]) for a, arm in enumerate(self.possible_agents)}
+        return {arm: self.layout.read(vectors[a], masks[a]) for a, arm in enumerate(self.world.arms)}
 
     def render(self) -> str | None:
         """The fleet as a table of text in mode "ansi"."""
@@ -234,7 +234,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
 
     def _shared_scores(self) -> Array:
         """Difficulty by which claims are settled, [arm, slot]: each arm's own word, as it told it."""
-        arm = np.arange(len(self.possible_agents))
+        arm = np.arange(len(self.world.arms))
         return self._heard.difficulty[arm, arm]
 
     def _perceived(self) -> tuple[Array, Array]:
@@ -247,7 +247,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         vectors, masks = self._perceived()
         return {
             arm: {"observation": vectors[a].copy(), "action_mask": masks[a].copy()}
-            for a, arm in enumerate(self.possible_agents)
+            for a, arm in enumerate(self.world.arms)
         }
 
     def _info(self, a: int, parts: dict[str, float]) -> dict[str, float]:
