@@ -1,6 +1,7 @@
 """When jobs arrive: a Poisson stream, batches, or a trace."""
 
 from dataclasses import dataclass
+from math import inf
 
 import numpy as np
 
@@ -11,12 +12,12 @@ class Poisson:
 
     every_s: float
     start_s: float = 0.0
-    stop_s: float = float("inf")
+    stop_s: float = inf
 
     def __post_init__(self) -> None:
-        if self.every_s <= 0:
-            raise ValueError(f"Poisson.every_s must be > 0 (got {self.every_s}).")
-        if not 0 <= self.start_s <= self.stop_s:
+        if not 0 < self.every_s < inf:
+            raise ValueError(f"Poisson.every_s must be > 0 and finite (got {self.every_s}).")
+        if not (0 <= self.start_s <= self.stop_s and self.start_s < inf):
             raise ValueError(f"Poisson needs 0 <= start_s <= stop_s (got {self.start_s}, {self.stop_s}).")
 
 
@@ -31,10 +32,10 @@ class Batch:
     def __post_init__(self) -> None:
         if self.count < 1:
             raise ValueError(f"Batch.count must be >= 1 (got {self.count}).")
-        if self.start_s < 0:
-            raise ValueError(f"Batch.start_s must be >= 0 (got {self.start_s}).")
-        if self.every_s is not None and self.every_s <= 0:
-            raise ValueError(f"Batch.every_s must be > 0 (got {self.every_s}).")
+        if not 0 <= self.start_s < inf:
+            raise ValueError(f"Batch.start_s must be >= 0 and finite (got {self.start_s}).")
+        if self.every_s is not None and not 0 < self.every_s < inf:
+            raise ValueError(f"Batch.every_s must be > 0 and finite (got {self.every_s}).")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,8 +45,8 @@ class Trace:
     times_s: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        if any(t < 0 for t in self.times_s) or list(self.times_s) != sorted(self.times_s):
-            raise ValueError("Trace.times_s must be >= 0 and in order.")
+        if not all(0 <= t < inf for t in self.times_s) or list(self.times_s) != sorted(self.times_s):
+            raise ValueError(f"Trace.times_s must be >= 0, finite and in order (got {self.times_s}).")
 
 
 Arrivals = Poisson | Batch | Trace
@@ -55,9 +56,9 @@ def release_times(arrivals: Arrivals, horizon_s: float, rng: np.random.Generator
     """Arrival times before the horizon, s, [job], in order."""
     match arrivals:
         case Poisson():
-            stop = min(arrivals.stop_s, horizon_s)
+            stop = max(min(arrivals.stop_s, horizon_s), arrivals.start_s)
             # Conditioned on their number, the arrivals of a Poisson process are uniform order statistics.
-            count = rng.poisson(max(stop - arrivals.start_s, 0.0) / arrivals.every_s)
+            count = rng.poisson((stop - arrivals.start_s) / arrivals.every_s)
             return np.sort(rng.uniform(arrivals.start_s, stop, size=count))
         case Batch():
             starts = [arrivals.start_s]

@@ -49,6 +49,8 @@ def gini(shares: np.ndarray) -> float:
     Source: mean absolute difference over twice the mean (Sen, On Economic Inequality, 1973).
     """
     shares = np.asarray(shares, dtype=float)
+    if not shares.size:
+        raise ValueError("The Gini coefficient needs at least one share.")
     if np.any(shares < 0):
         raise ValueError(f"Shares must be >= 0 (got {shares}).")
     mean = shares.mean()

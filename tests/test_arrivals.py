@@ -1,0 +1,95 @@
+"""Arrivals against the theory of Poisson streams, and batches and traces told by hand."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from fleet.arrivals import Batch, Poisson, Trace, release_times
+
+HORIZON_S = 8 * 3600.0
+
+
+def rng(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence(seed))
+
+
+def test_poisson_counts_have_the_mean_and_the_spread_of_theory() -> None:
+    stream, shifts = Poisson(every_s=600.0), 4000
+    counts = np.array([len(release_times(stream, HORIZON_S, rng(s))) for s in range(shifts)])
+    mean = HORIZON_S / 600.0
+    # The mean of n counts has the deviation √(μ/n); their variance, μ √(2/n + 1/(μ n)). Four deviations each.
+    assert counts.mean() == pytest.approx(mean, abs=4 * np.sqrt(mean / shifts))
+    assert counts.var() == pytest.approx(mean, abs=4 * mean * np.sqrt(2 / shifts + 1 / (mean * shifts)))
+
+
+def test_poisson_gaps_are_exponential_and_times_uniform() -> None:
+    times = release_times(Poisson(every_s=10.0), 1e6, rng(5))
+    gaps = np.diff(times, prepend=0.0)
+    assert stats.kstest(gaps, "expon", args=(0, 10.0)).pvalue > 0.01
+    assert stats.kstest(times, "uniform", args=(0, 1e6)).pvalue > 0.01
+
+
+@given(
+    every_s=st.floats(1.0, 1e4),
+    start_s=st.floats(0.0, 5e4),
+    length_s=st.floats(0.0, 5e4),
+    horizon_s=st.floats(0.0, 5e4),
+    seed=st.integers(0, 9),
+)
+def test_poisson_arrivals_are_in_order_and_inside(every_s, start_s, length_s, horizon_s, seed) -> None:
+    stream = Poisson(every_s=every_s, start_s=start_s, stop_s=start_s + length_s)
+    times = release_times(stream, horizon_s, rng(seed))
+    assert (np.diff(times) >= 0).all()
+    assert ((times >= start_s) & (times <= min(start_s + length_s, horizon_s))).all()
+    np.testing.assert_array_equal(times, release_times(stream, horizon_s, rng(seed)))
+
+
+@pytest.mark.parametrize(
+    ("stream", "expected"),
+    [
+        (Batch(count=3), [0.0, 0.0, 0.0]),
+        (Batch(count=2, start_s=10.0, every_s=40.0), [10.0, 10.0, 50.0, 50.0, 90.0, 90.0]),
+        (Batch(count=1, start_s=100.0), []),
+        (Batch(count=1, start_s=99.0), [99.0]),
+        (Batch(count=1, start_s=200.0, every_s=5.0), []),
+        (Trace(times_s=(0.0, 3.0, 3.0, 99.5, 100.0, 250.0)), [0.0, 3.0, 3.0, 99.5]),
+        (Trace(times_s=()), []),
+        (Poisson(every_s=5.0, start_s=100.0), []),
+        (Poisson(every_s=5.0, start_s=300.0), []),
+    ],
+)
+def test_arrivals_stop_before_the_horizon(stream, expected) -> None:
+    assert release_times(stream, 100.0, rng()).tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: Poisson(every_s=0.0), r"Poisson.every_s must be > 0 and finite \(got 0.0\)"),
+        (lambda: Poisson(every_s=1.0, start_s=5.0, stop_s=4.0), "0 <= start_s <= stop_s"),
+        (lambda: Poisson(every_s=1.0, start_s=-1.0), "0 <= start_s <= stop_s"),
+        (lambda: Batch(count=0), r"Batch.count must be >= 1 \(got 0\)"),
+        (lambda: Batch(count=1, start_s=-1.0), "Batch.start_s must be >= 0"),
+        (lambda: Batch(count=1, every_s=0.0), "Batch.every_s must be > 0"),
+        (lambda: Trace(times_s=(3.0, 2.0)), "in order"),
+        (lambda: Trace(times_s=(-1.0,)), "in order"),
+    ],
+)
+def test_streams_that_cannot_be_are_refused(make, says) -> None:
+    with pytest.raises(ValueError, match=says):
+        make()
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_numbers_that_are_none_are_refused(bad) -> None:
+    for make in (
+        lambda: Poisson(every_s=bad),
+        lambda: Poisson(every_s=1.0, start_s=bad),
+        lambda: Batch(count=1, start_s=bad),
+        lambda: Batch(count=1, every_s=bad),
+        lambda: Trace(times_s=(bad,)),
+    ):
+        with pytest.raises(ValueError, match=r"must be|needs"):
+            make()
