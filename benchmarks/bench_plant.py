@@ -1,0 +1,96 @@
+"""What the closed loop costs: simulated steps per second of the MuJoCo plant, beside bare `mj_step` of its scene.
+
+    python benchmarks/bench_plant.py
+
+The plant is driven through ticks of the quickstart scenario in which its arms are at work: references, control, payload
+switches, simulation and heat. Bare is MuJoCo's own loop (`mj_step(model, data, nstep)`) over the same model and as
+many steps, with the arms held at home; contacts, of which there are none, are off in both. The two take turns, on one
+core; speeds are medians.
+"""
+
+# MuJoCo is compiled and ships no type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+import os
+
+os.environ["OMP_NUM_THREADS"] = "1"
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from agents.rules import make_policy
+from fleet.sim.kernel import Step
+from fleet.sim.mujoco_plant import MujocoPlant
+from scenarios.build import ShiftFactory, env_of, prepare
+from scenarios.load import load
+
+TICKS = 20
+RUNS = 9
+
+
+def at_work(factory: ShiftFactory) -> list[Step]:
+    """The first steps of a shift, as the profile plant works it."""
+    steps: list[Step] = []
+    policy = make_policy("round_robin")
+    policy.reset(np.random.default_rng(0))
+    env = env_of(factory.fleet, watch=steps.append, max_cycles=TICKS)
+    env.reset(seed=0)
+    while env.agents:
+        env.step(policy.act(env.knowledge()))
+    env.close()
+    return steps
+
+
+def seconds(call: Callable[[], object]) -> float:
+    """CPU time of a call, s."""
+    start_s = time.process_time()
+    call()
+    return time.process_time() - start_s
+
+
+def measure(arms: int) -> str:
+    """One row of the table."""
+    base = load("quickstart")
+    # Everything is there from the start, so that the arms work.
+    jobs = tuple(
+        replace(s, arrivals=replace(s.arrivals, kind="batch", every_s=None, count=4), repetitions=(40, 40))
+        for s in base.jobs
+    )
+    fleet = prepare(replace(base, arms=base.arms[:arms], jobs=jobs, horizon_s=TICKS * 10.0), difficulty="blind")
+    steps = at_work(ShiftFactory(fleet))
+    episode = ShiftFactory(fleet, "mujoco")(np.random.SeedSequence(0))
+    plant, world = episode.plant, episode.world
+    assert isinstance(plant, MujocoPlant)
+    held, count = mujoco.MjData(plant.model), round(TICKS * world.dt_s / plant.model.opt.timestep)
+    held.qpos[:] = held.ctrl[:] = np.concatenate([arm.robot.home_q() for arm in fleet.arms])
+
+    def driven() -> None:
+        for done in steps:
+            plant.drive(world, done.began, done.path)
+
+    speeds = [
+        (count / seconds(lambda: mujoco.mj_step(plant.model, held, count)), count / seconds(driven))
+        for _ in range(RUNS)
+    ]
+    bare, ours = (statistics.median(column) for column in zip(*speeds, strict=True))
+    ratio = statistics.median(b / a for a, b in speeds)
+    busy = np.mean([done.began.mode[0] == 1 for done in steps])
+    real_time = ours * plant.model.opt.timestep
+    return f"{arms:>5}{busy:>8.0%}{bare:>16,.0f}{ours:>16,.0f}{ratio:>9.2f}{real_time:>13,.0f} x"
+
+
+def main() -> None:
+    """Print the table."""
+    print(f"{RUNS} runs of {TICKS} ticks; median steps/s of CPU time")
+    print(f"{'arms':>5}{'busy':>8}{'bare mj_step/s':>16}{'plant steps/s':>16}{'ratio':>9}{'real time':>15}")
+    for arms in (2, 4):
+        print(measure(arms), flush=True)
+
+
+if __name__ == "__main__":
+    main()
