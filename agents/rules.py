@@ -74,10 +74,10 @@ class CoolestFirst:
 
 
 class LeastDifficulty:
-    """The pair of free arm and offered job with the lowest shared difficulty first.
+    """The oldest job goes to the free arm that told the lowest difficulty for it.
 
-    An arm leaves a job to a peer that is free and told a lower difficulty, and takes the easiest of the rest. Each
-    arm decides from its own observation alone, so it works as well on every arm by itself.
+    Each arm walks the queue by itself, from its own scores and what its peers told it, so the rule needs nobody in
+    the middle. An arm that knows no difficulty for a job stands behind those that do.
     """
 
     def reset(self, rng: np.random.Generator) -> None:
@@ -88,21 +88,15 @@ class LeastDifficulty:
         return {arm: self._choose(obs) for arm, obs in observations.items()}
 
     def _choose(self, observation: Observation) -> int:
-        open_slots = legal_slots(observation)
-        if not open_slots:
-            return WAIT
-        own = np.where(observation.known > 0, observation.difficulty, np.inf)
         free = (observation.peer_heard > 0) & (observation.peer_working == 0) & (observation.peer_faulted == 0)
         told = np.where((observation.peer_known > 0) & free[:, None], observation.peer_difficulty, np.inf)
-        # Greedy matching of everyone free, as this arm sees it: the easiest pair first, then the next.
-        costs = np.vstack([own, told])[:, open_slots]
-        while np.isfinite(costs).any():
-            who, column = np.unravel_index(int(np.argmin(costs)), costs.shape)
-            if who == 0:
-                return open_slots[int(column)] + 1
-            costs[who, :] = np.inf
-            costs[:, column] = np.inf
-        return WAIT if np.isfinite(own[open_slots]).any() else open_slots[0] + 1
+        own = np.where(observation.known > 0, observation.difficulty, np.inf)
+        for slot in legal_slots(observation):
+            rival = int(np.argmin(told[:, slot])) if len(told) else -1
+            if rival < 0 or own[slot] <= told[rival, slot]:
+                return slot + 1
+            told[rival, :] = np.inf  # That peer takes this job, so it takes no other.
+        return WAIT
 
 
 def _slots(observations: Mapping[str, Observation]) -> range:
