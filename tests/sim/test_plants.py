@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet.difficulty import Blind
+from fleet.errors import FleetError
 from fleet.job import Job, Place, Work
 from fleet.motion import RATE_HZ, Phase, Plan
 from fleet.motor import gen3_motors
@@ -415,6 +416,15 @@ def test_only_the_last_tick_can_be_read():
     step(world, done.state, np.zeros((1, 2), int), np.zeros((1, 2, 8)), plants["mujoco"])
     with pytest.raises(ValueError, match=r"tick 1 only \(got 0\)"):
         plants["mujoco"].readings(world, done, np.array([1.0]), np.random.default_rng(0))
+
+
+def test_a_simulation_that_diverges_is_an_error(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warning into a file.
+    plan = PLANS[0][WORKS["press"]][0]
+    world, _ = shift(job("press"), robots=ROBOTS[:1])
+    plant = MujocoPlant(ROBOTS[:1], [replace(plan, work=replace(plan.work, force_n=1e12))], np.zeros((1, 7)))
+    with pytest.raises(FleetError, match="diverged in tick 0"):
+        step(world, initial(world), np.ones((1, 1), int), np.zeros((1, 1, 8)), plant)
 
 
 def test_a_step_must_be_whole_samples():
