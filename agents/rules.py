@@ -76,8 +76,9 @@ class CoolestFirst:
 class LeastDifficulty:
     """The oldest job goes to the free arm that told the lowest difficulty for it.
 
-    Each arm walks the queue by itself, from its own scores and what its peers told it, so the rule needs nobody in
-    the middle. An arm that knows no difficulty for a job stands behind those that do.
+    Each arm walks the queue by itself, from its own scores, what its peers told it and its place in the fleet, which
+    settles ties; so the rule needs nobody in the middle. An arm that knows no difficulty for a job stands behind those
+    that do.
     """
 
     def reset(self, rng: np.random.Generator) -> None:
@@ -85,17 +86,26 @@ class LeastDifficulty:
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
         """Each arm's claim from its own observation."""
-        return {arm: self._choose(obs) for arm, obs in observations.items()}
+        return {arm: self._choose(obs, place) for place, (arm, obs) in enumerate(observations.items())}
 
-    def _choose(self, observation: Observation) -> int:
+    def _choose(self, observation: Observation, place: int) -> int:
+        mine = legal_slots(observation)
+        if not mine:
+            return WAIT
         free = (observation.peer_heard > 0) & (observation.peer_working == 0) & (observation.peer_faulted == 0)
         told = np.where((observation.peer_known > 0) & free[:, None], observation.peer_difficulty, np.inf)
-        own = np.where(observation.known > 0, observation.difficulty, np.inf)
-        for slot in legal_slots(observation):
-            rival = int(np.argmin(told[:, slot])) if len(told) else -1
-            if rival < 0 or own[slot] <= told[rival, slot]:
+        own = np.where((observation.known > 0) & (observation.action_mask[1:] > 0), observation.difficulty, np.inf)
+        me = min(place, len(told))
+        costs = np.insert(told, me, own, axis=0)
+        for slot in np.flatnonzero(observation.offered).tolist():
+            if slot not in mine and observation.feasible[slot]:
+                continue  # It waits for a station: nobody may claim it.
+            best = int(np.argmin(costs[:, slot]))
+            known = bool(np.isfinite(costs[best, slot]))
+            if slot in mine and (best == me or not known):
                 return slot + 1
-            told[rival, :] = np.inf  # That peer takes this job, so it takes no other.
+            if known:
+                costs[best, :] = np.inf  # That peer takes this job, so it takes no other.
         return WAIT
 
 

@@ -1,0 +1,215 @@
+"""The dispatching rules: each does what its name says, and none ever claims what it may not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from agents.policy import WAIT, legal_slots
+from agents.rules import RULES, LeastDifficulty, RandomLegal, make_policy
+from fleet.env.allocation_v0 import parallel_env
+from fleet.env.observation import Layout, Observation
+
+
+def rng(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def fleet(
+    difficulty: list[list[float]],
+    *,
+    mask: list[list[int]] | None = None,
+    feasible: list[list[int]] | None = None,
+    headroom_k: list[float] | None = None,
+    free: list[int] | None = None,
+) -> dict[str, Observation]:
+    """What arms know that find the slots so difficult, [arm][slot] (NaN unknown), and told each other all of it."""
+    d = np.array(difficulty, dtype=float)
+    arms, slots = d.shape
+    layout = Layout(arms, slots)
+    able = np.ones((arms, slots)) if feasible is None else np.array(feasible)
+    legal = able if mask is None else np.array(mask)
+    idle = np.ones(arms) if free is None else np.array(free)
+    legal = legal * idle[:, None]
+    known = ~np.isnan(d) & (able > 0)
+    values = np.where(known, d, 0.0)
+    out = {}
+    for me in range(arms):
+        peers = [p for p in range(arms) if p != me]
+        blank = layout.read(np.zeros(layout.size, np.float32), np.append(1, legal[me]).astype(np.int8))
+        out[f"arm_{me}"] = replace(
+            blank,
+            idle=idle[me],
+            offered=np.ones(slots),
+            feasible=able[me],
+            known=known[me].astype(float),
+            difficulty=values[me],
+            headroom_k=np.float32(0.0 if headroom_k is None else headroom_k[me]),
+            peer_heard=np.ones(arms - 1),
+            peer_working=1.0 - idle[peers],
+            peer_known=known[peers].astype(float),
+            peer_difficulty=values[peers],
+        )
+    return out
+
+
+def act(name: str, *rounds: dict[str, Observation], seed: int = 0) -> list[list[int]]:
+    policy = make_policy(name)
+    policy.reset(rng(seed))
+    return [list(policy.act(seen).values()) for seen in rounds]
+
+
+@pytest.mark.parametrize("name", RULES)
+@pytest.mark.parametrize("arms", [1, 3])
+def test_every_rule_is_legal_all_shift_and_gets_work_done(small, name, arms) -> None:
+    env = parallel_env(small.Shifts(arms=arms, jobs=12, ticks=120, ambient_c=38.0))
+    policy = make_policy(name)
+    for seed in range(3):
+        env.reset(seed=seed)
+        policy.reset(rng(seed))
+        while env.agents:
+            actions = policy.act(env.knowledge())
+            assert list(actions) == env.possible_agents
+            assert all(type(action) is int for action in actions.values())
+            env.step(actions)
+        assert env.truth.illegal.sum() == 0
+        assert (env.truth.status == 2).sum() > 3
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_every_rule_waits_where_nothing_is_legal(name) -> None:
+    assert act(name, fleet([[1.0, 2.0], [2.0, 1.0]], mask=[[0, 0], [0, 0]])) == [[WAIT, WAIT]]
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_every_rule_lets_a_single_free_arm_work(name) -> None:
+    seen = fleet([[0.1] * 3, [6.0, 5.0, np.nan], [0.1] * 3], free=[0, 1, 0])
+    ((first, second, third),) = act(name, seen)
+    assert (first, third) == (WAIT, WAIT)
+    assert second != WAIT
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_every_rule_repeats_by_seed(small, name) -> None:
+    env = parallel_env(small.Shifts(jobs=12))
+    traces = []
+    for _ in range(2):
+        policy = make_policy(name)
+        policy.reset(rng(5))
+        env.reset(seed=5)
+        traces.append([])
+        while env.agents:
+            traces[-1].append(policy.act(env.knowledge()))
+            env.step(traces[-1][-1])
+    assert traces[0] == traces[1]
+
+
+def test_an_unknown_rule_names_the_nearest() -> None:
+    with pytest.raises(ValueError, match="No policy 'coolest'; did you mean 'coolest_first'"):
+        make_policy("coolest")
+
+
+# round_robin
+
+
+def test_round_robin_rotates() -> None:
+    one_job = fleet([[1.0]] * 3)
+    assert act("round_robin", *[one_job] * 4) == [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 0]]
+    # Two jobs, oldest first: arms 0 and 1, then 2 and 0.
+    assert act("round_robin", *[fleet([[1.0, 1.0]] * 3)] * 2) == [[1, 2, 0], [2, 0, 1]]
+
+
+def test_round_robin_passes_over_whom_it_cannot_ask() -> None:
+    busy = fleet([[1.0]] * 3, free=[0, 1, 1])
+    unable = fleet([[1.0]] * 3, feasible=[[1], [1], [0]])
+    assert act("round_robin", busy, unable, fleet([[1.0]] * 3)) == [[0, 1, 0], [1, 0, 0], [0, 1, 0]]
+
+
+# coolest_first
+
+
+def test_coolest_first_gives_the_oldest_job_to_the_most_headroom() -> None:
+    seen = fleet([[1.0, 1.0]] * 3, headroom_k=[10.0, 30.0, 20.0])
+    assert act("coolest_first", seen) == [[0, 1, 2]]
+    assert act("coolest_first", fleet([[1.0, 1.0]] * 3, headroom_k=[10.0, 30.0, 20.0], free=[1, 0, 1])) == [[2, 0, 1]]
+    assert act("coolest_first", fleet([[1.0]] * 2, headroom_k=[-5.0, -9.0])) == [[1, 0]]
+
+
+# random
+
+
+def test_random_is_uniform_over_what_is_legal() -> None:
+    seen = fleet([[1.0] * 5], mask=[[1, 0, 1, 1, 0]])
+    policy = RandomLegal()
+    policy.reset(rng(3))
+    counts = np.bincount([policy.act(seen)["arm_0"] for _ in range(3000)], minlength=6)
+    assert counts[[0, 2, 5]].tolist() == [0, 0, 0]
+    assert stats.chisquare(counts[[1, 3, 4]]).pvalue > 0.01
+
+
+# least_difficulty
+
+
+def test_least_difficulty_gives_the_oldest_job_to_the_arm_that_finds_it_easiest() -> None:
+    assert act("least_difficulty", fleet([[2.0, 3.0], [1.0, 0.5]])) == [[2, 1]]
+    assert act("least_difficulty", fleet([[2.0, 0.1], [4.0, 3.0]])) == [[1, 2]]
+    assert act("least_difficulty", fleet([[2.0], [1.9], [2.1]])) == [[0, 1, 0]]
+
+
+def test_least_difficulty_leaves_nothing_to_a_peer_that_is_at_work() -> None:
+    assert act("least_difficulty", fleet([[2.0], [1.0]], free=[1, 0])) == [[1, 0]]
+
+
+def test_least_difficulty_reckons_with_what_only_a_peer_can_do() -> None:
+    # Arm 1 takes the older job, which only it can do, so the other is for arm 0 although arm 1 finds it easier.
+    assert act("least_difficulty", fleet([[np.nan, 2.0], [0.5, 1.0]], feasible=[[0, 1], [1, 1]])) == [[2, 1]]
+
+
+def test_least_difficulty_does_not_wait_for_a_station() -> None:
+    # The older job is easiest for arm 0, but its station is busy.
+    assert act("least_difficulty", fleet([[0.1, 2.0], [0.2, 3.0]], mask=[[0, 1], [0, 1]])) == [[2, 0]]
+
+
+def test_least_difficulty_settles_ties_by_the_place_in_the_fleet() -> None:
+    assert act("least_difficulty", fleet([[1.0, 1.0, 1.0]] * 3)) == [[1, 2, 3]]
+
+
+def test_least_difficulty_asks_those_who_know_first() -> None:
+    assert act("least_difficulty", fleet([[np.nan, 2.0], [3.0, 1.0]])) == [[2, 1]]
+    assert act("least_difficulty", fleet([[np.nan, 2.0]])) == [[1]]
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.data())
+def test_least_difficulty_agrees_with_one_who_sees_everything(data) -> None:
+    """So no two arms ever claim the same job."""
+    arms, slots = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 5))
+    rows = st.lists(st.sampled_from([0.5, 1.0, 1.0, 2.0, 3.5, 6.0]), min_size=slots, max_size=slots)
+    bits = st.lists(st.integers(0, 1), min_size=slots, max_size=slots)
+    d = np.array(data.draw(st.lists(rows, min_size=arms, max_size=arms)))
+    able = np.array(data.draw(st.lists(bits, min_size=arms, max_size=arms)))
+    free = np.array(data.draw(st.lists(st.integers(0, 1), min_size=arms, max_size=arms)))
+    expected = [0] * arms
+    for slot in range(slots):
+        asked = [(d[a, slot], a) for a in range(arms) if able[a, slot] and free[a] and not expected[a]]
+        if asked:
+            expected[min(asked)[1]] = slot + 1
+    seen = fleet(d.tolist(), feasible=able.tolist(), free=free.tolist())
+    assert act("least_difficulty", seen) == [expected]
+
+
+def test_two_arms_never_claim_the_same_job_in_a_shift(small) -> None:
+    env = parallel_env(small.Shifts(arms=2, jobs=20, ticks=150), keep_events=True)
+    policy = LeastDifficulty()
+    for seed in range(3):
+        env.reset(seed=seed)
+        while env.agents:
+            seen = env.knowledge()
+            actions = policy.act(seen)
+            claims = [action for action in actions.values() if action]
+            assert len(claims) == len(set(claims))
+            assert all(action == WAIT or action - 1 in legal_slots(seen[arm]) for arm, action in actions.items())
+            env.step(actions)
