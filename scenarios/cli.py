@@ -5,6 +5,7 @@ import json
 import logging
 import signal
 import sys
+import textwrap
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -106,7 +107,7 @@ def run_command(
     else:
         out_console.print(table_of({policy: result.metrics}, f"{chosen.name}, seed {seed}"))
         if result.finished:
-            _tell(f"Recorded in {where}; open {where / 'report.html'} in a browser.")
+            _say(f"Recorded in {where}; open {where / 'report.html'} in a browser.", out_console)
     if not result.finished:
         _say(
             f"Interrupted after {result.time_s:g} s of {chosen.horizon_s:g} s: the shift until then is kept in {where} "
@@ -186,7 +187,7 @@ def demo_command(
                 raise Interrupted(f"Interrupted while working; recordings are in {out}.")
             results[policy] = result.metrics
     out_console.print(table_of(results, f"{chosen.name}, seed {seed}: {chosen.description}"))
-    _tell(f"Open {out / 'least_difficulty' / 'report.html'} in a browser to see what happened.")
+    _say(f"Open {out / 'least_difficulty' / 'report.html'} in a browser to see what happened.", out_console)
 
 
 app.command("hold")(hold_command)
@@ -281,14 +282,11 @@ def progress_bar() -> Iterator[Progress]:
             ) from None
 
 
-def _say(sentence: str) -> None:
-    """One line on standard error, not wrapped, so that paths can be copied."""
-    err_console.print(sentence, markup=False, highlight=False, soft_wrap=True)
-
-
-def _tell(sentence: str) -> None:
-    """One line on standard output."""
-    out_console.print(sentence, markup=False, highlight=False, soft_wrap=True)
+def _say(sentence: str, console: Console = err_console) -> None:
+    """A sentence on standard error; on a terminal wrapped between words, but never within one, which may be a path."""
+    if console.is_terminal:
+        sentence = textwrap.fill(sentence, console.width, break_long_words=False, break_on_hyphens=False)
+    console.print(sentence, markup=False, highlight=False, soft_wrap=True)
 
 
 def table_of(results: dict[str, Metrics], title: str) -> Table:

@@ -1,0 +1,92 @@
+"""A small cell whose plans are made once for all tests here, and the command line called in place."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from scenarios.cli import main
+
+SMALL = """
+description = "Two arms hold and sort for three minutes."
+horizon_s = 180
+
+[[arms]]
+name = "left"
+position_m = [-0.45, 0.0, 0.0]
+
+[[arms]]
+name = "right"
+position_m = [0.45, 0.0, 0.0]
+tilt_deg = [0, 0, 180]
+
+[[places]]
+name = "bench"
+position_m = [0.0, 0.2, 0.25]
+
+[[places]]
+name = "shelf"
+position_m = [0.0, -0.2, 0.25]
+
+[[jobs]]
+name = "hold"
+kind = "hold"
+places = ["bench"]
+payload_kg = [2.0]
+repetitions = [1, 2]
+dwell_s = 10
+arrivals = { kind = "batch", count = 2 }
+
+[[jobs]]
+name = "sort"
+kind = "sort"
+places = ["shelf", "bench"]
+payload_kg = [0.2, 0.5]
+repetitions = [1, 3]
+arrivals = { kind = "poisson", every_s = 30 }
+
+[planning]
+elbows = 1
+speeds = [1.0]
+"""
+
+
+@dataclass(frozen=True)
+class Said:
+    """What one call of the command line said."""
+
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture(scope="session")
+def plans(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The cache that all tests of a run share; never the user's."""
+    return tmp_path_factory.getbasetemp() / "cache"
+
+
+@pytest.fixture
+def small_toml(tmp_path: Path) -> Path:
+    """The small scenario as a file."""
+    path = tmp_path / "heat.toml"
+    path.write_text(SMALL, encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def thermofleet(
+    plans: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., Said]:
+    """The command line: `thermofleet("run", path, "--seed", 3)`."""
+    monkeypatch.setenv("THERMOFLEET_CACHE", str(plans))
+
+    def call(*args: object) -> Said:
+        with pytest.raises(SystemExit) as left:
+            main([str(arg) for arg in args])
+        said = capsys.readouterr()
+        assert isinstance(left.value.code, int)
+        return Said(left.value.code, said.out, said.err)
+
+    return call
