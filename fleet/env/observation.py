@@ -219,7 +219,7 @@ def observe(
     peer = {name: _others(values) for name, values in told.items() if name != "p_saturation"}
     total = world.plans.times_s[world.offers.plan[env, np.arange(arms), state.job]]
     left = total[..., 0] + state.todo * total[..., 1] + total[..., 2] - state.progress_s
-    never = np.isinf(peer["age_s"])
+    never, known, peer_known = np.isinf(peer["age_s"]), ~np.isnan(own), ~np.isnan(peer["difficulty"])
     return Observation(
         clock=np.broadcast_to(time_s / world.horizon_s, (envs, arms)),
         idle=state.mode == IDLE,
@@ -231,9 +231,9 @@ def observe(
         headroom_k=world.limits.warning_c - measured_c.max(axis=-1),
         offered=slot(np.ones_like(world.jobs.value)),
         feasible=duration > 0,
-        known=~np.isnan(own),
-        difficulty=np.nan_to_num(own, nan=0.0),
-        p_saturation=np.nan_to_num(risk, nan=0.5),
+        known=known,
+        difficulty=np.where(known, own, 0.0),
+        p_saturation=np.where(np.isnan(risk), 0.5, risk),
         duration_s=duration,
         slack_s=np.where(filled[:, None, :], slot(world.jobs.due_s) - time_s[..., None] - duration, 0.0),
         age_s=np.where(filled[:, None, :], time_s[..., None] - slot(state.queued_s), 0.0),
@@ -244,9 +244,9 @@ def observe(
         peer_age_s=np.where(never, LONG_S, peer["age_s"]),
         peer_working=~never & (peer["mode"] == WORKING),
         peer_faulted=~never & (peer["mode"] == FAULTED),
-        peer_headroom_k=np.nan_to_num(peer["headroom_k"], nan=0.0),
-        peer_known=~np.isnan(peer["difficulty"]),
-        peer_difficulty=np.nan_to_num(peer["difficulty"], nan=0.0),
+        peer_headroom_k=np.where(np.isnan(peer["headroom_k"]), 0.0, peer["headroom_k"]),
+        peer_known=peer_known,
+        peer_difficulty=np.where(peer_known, peer["difficulty"], 0.0),
         action_mask=mask.astype(np.int8),
     )
 

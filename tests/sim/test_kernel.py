@@ -77,12 +77,16 @@ def test_a_job_is_finished_and_its_arm_home_at_the_planned_moment(
 ) -> None:
     spans = small.Times(approach / 50, cycle / 50, retreat / 50)
     content = small.work()
-    jobs = [small.job("a", content, repetitions=repetitions)]
+    jobs = [small.job("a", content, repetitions=repetitions, due_s=150.0)]
     world, plant = small.shop([jobs], arms=[small.arm(0, [content], times=spans)], ticks=40)
     log: list[Event] = []
-    play(world, plant, [[0]] * award_tick + [[1]], log)
+    last = play(world, plant, [[0]] * award_tick + [[1]], log)[-1].state
     done = award_tick * DT_S + (approach + repetitions * cycle) / 50
     assert times(log, "finish") == pytest.approx([done] if done <= world.horizon_s else [])
+    assert last.finished_s[0, 0] == pytest.approx(done if done <= world.horizon_s else np.nan, nan_ok=True)
+    assert [e.value for e in log if e.kind == "finish"] == pytest.approx(
+        [max(0.0, done - 150.0)] * len(times(log, "finish"))
+    )
     home = done + retreat / 50
     assert times(log, "home") == pytest.approx([home] if home <= world.horizon_s else [])
 
@@ -185,15 +189,17 @@ def test_an_idle_warm_fleet_stays_as_it_is(small) -> None:
     assert play(world, plant, [])[-1].state.temp_c == pytest.approx(initial(world).temp_c, abs=1e-6)
 
 
-def test_energy_is_the_heat_put_in(small) -> None:
+@pytest.mark.parametrize("power_off", [True, False])
+def test_energy_is_the_heat_put_in(small, power_off) -> None:
     content = small.work(payload_kg=small.HOT)
-    world, plant = small.shop([[small.job("a", content, repetitions=60)]], ticks=200)
+    limits = ThermalLimits(power_off_on_fault=power_off)
+    world, plant = small.shop([[small.job("a", content, repetitions=60)]], ticks=120, limits=limits)
     steps = play(world, plant, [[1, 0]])
     assert steps[-1].state.faults[0, 0] == 1
     capacity, to_air = world.thermal.capacity, world.thermal.to_ambient
     for a in range(2):
         stored = ((steps[-1].state.temp_c - initial(world).temp_c)[0, a] * capacity[a]).sum()
-        # What left to the air: the integral of each leg is (Γ-free) closed form by the balance of that leg.
+        # What left to the air, by Gauss-Legendre quadrature of each leg.
         left = 0.0
         for s in steps:
             for leg in s.heating.legs(world, 0, a):
