@@ -1,0 +1,96 @@
+"""Comparisons: paired by seed, the same on any number of cores, intervals that cover."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from fleet.errors import FleetError
+from scenarios.compare import FIGURES, Comparison, compare, comparison_table, interval
+from scenarios.load import load
+from scenarios.scenario import Scenario
+
+POLICIES = ("random", "round_robin")
+
+
+@pytest.fixture
+def scenario(small_toml: Path) -> Scenario:
+    return load(small_toml)
+
+
+def compared(scenario: Scenario, plans: Path, workers: int, **changes) -> Comparison:
+    how = {"policies": POLICIES, "seeds": range(3), "baseline": "round_robin"} | changes
+    return compare(scenario, difficulty="blind", cache_dir=plans, workers=workers, **how)
+
+
+def test_the_result_does_not_depend_on_the_number_of_workers(scenario, plans):
+    assert compared(scenario, plans, workers=1) == compared(scenario, plans, workers=2)
+
+
+def test_a_policy_differs_from_itself_by_nothing(scenario, plans):
+    result = compared(scenario, plans, workers=1)
+    for figure in result.figures["round_robin"].values():
+        assert (figure.difference, figure.difference_low, figure.difference_high) == (0.0, 0.0, 0.0)
+
+
+def test_figures_are_means_over_seeds_with_intervals_around_them(scenario, plans):
+    result = compared(scenario, plans, workers=1)
+    assert result.seeds == (0, 1, 2)
+    assert set(result.figures) == set(POLICIES)
+    for figures in result.figures.values():
+        assert set(figures) == set(FIGURES)
+        for figure in figures.values():
+            assert figure.low <= figure.mean <= figure.high
+            assert figure.difference_low <= figure.difference <= figure.difference_high
+    random, base = result.figures["random"]["peak_c"], result.figures["round_robin"]["peak_c"]
+    assert random.difference == pytest.approx(random.mean - base.mean)
+
+
+def test_the_bootstrap_interval_covers_the_true_mean_as_it_should():
+    """Percentile bootstrap of 30 normal values covers a little less than 95 % (Efron & Tibshirani, ch. 13)."""
+    rng = np.random.default_rng(0)
+    hits = 0
+    for _ in range(200):
+        low, high = interval(rng.normal(3.0, 2.0, size=30), rng)
+        hits += low <= 3.0 <= high
+    assert 0.88 <= hits / 200 <= 0.98
+
+
+def test_the_width_of_the_interval_is_that_of_the_normal_law():
+    values = np.random.default_rng(1).normal(0.0, 1.0, size=400)
+    low, high = interval(values, np.random.default_rng(2))
+    assert high - low == pytest.approx(2 * 1.96 * values.std() / np.sqrt(400), rel=0.1)
+
+
+def test_equal_values_have_an_interval_of_no_width():
+    assert interval(np.full(5, 4.0), np.random.default_rng(0)) == (4.0, 4.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"policies": ("rnd", "round_robin")}, "No policy 'rnd'; did you mean 'random'?"),
+        ({"policies": ("random", "random")}, "The policy 'random' is named twice"),
+        ({"baseline": "coolest_first"}, "The baseline 'coolest_first' is not among the policies compared: random, "),
+    ],
+)
+def test_a_comparison_that_makes_no_sense_is_told(scenario, plans, changes, sentence):
+    with pytest.raises(FleetError) as error:
+        compared(scenario, plans, workers=1, **changes)
+    assert sentence in str(error.value)
+
+
+def test_the_table_fits_eighty_columns_without_losing_a_word(scenario, plans):
+    result = compared(scenario, plans, workers=1)
+    page = io.StringIO()
+    Console(file=page, width=80).print(comparison_table(result))
+    text = page.getvalue()
+    assert "…  " not in text
+    assert max(len(line.rstrip()) for line in text.splitlines()) <= 80
+    for name in (*FIGURES, *POLICIES):
+        assert name in text
+    figure = result.figures["random"]["peak_c"]
+    assert f"{figure.mean:.1f}" in text
+    assert f"{figure.difference_low:+.1f} … {figure.difference_high:+.1f}" in text
