@@ -104,13 +104,14 @@ def resolve(world: World, state: State, board: Board, actions: Array, scores: Ar
     allowed = inside & board.mask[env, arm, chosen]
     slot = np.where(allowed & (chosen > 0), chosen - 1, -1)
     wanted = np.where(slot >= 0, board.on_offer[env, slot], -1)
-    score = np.where(slot >= 0, scores[env, arm, slot], np.inf)
-    order = np.argsort(np.where(np.isnan(score), np.inf, score), axis=1, kind="stable")
+    claimed, score = slot >= 0, scores[env, arm, slot]
+    score = np.where(score < np.inf, score, np.finfo(float).max)
+    order = np.argsort(np.where(claimed, score, np.inf), axis=1, kind="stable")  # who claims nothing comes last
     taken = np.zeros((envs, world.jobs.exists.shape[1] + 1), dtype=bool)
     busy = occupied(world, state)
     won = np.full_like(wanted, -1)
     rows = np.arange(envs)
-    for rank in range(arms):
+    for rank in range(int(claimed.sum(axis=1).max(initial=0))):
         who = order[:, rank]
         job = wanted[rows, who]
         at = world.jobs.stations[rows, job]

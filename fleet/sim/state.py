@@ -3,7 +3,7 @@
 Every array of the state has a leading env axis [env, ...]; a single shift is env = 1.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -157,7 +157,7 @@ class State:
 
     def copy(self) -> Self:
         """The same state in arrays of its own."""
-        return replace(self, **{f.name: getattr(self, f.name).copy() for f in fields(self)})
+        return type(self)(**{name: values.copy() for name, values in vars(self).items()})
 
 
 def initial(world: World) -> State:
