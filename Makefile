@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 OUT ?= out
+GOAL := $(or $(firstword $(MAKECMDGOALS)),demo)
 
 .PHONY: demo test test-slow lint bench clean install
 
@@ -26,17 +27,21 @@ bench: $(STAMP)
 
 install: $(STAMP)
 
+# A broken environment is taken away again, so that the next call begins anew. The constraints also hold for what
+# builds the package.
 $(STAMP): pyproject.toml constraints.txt
-	@command -v $(PYTHON) >/dev/null 2>&1 || { \
-	  echo "thermofleet needs Python 3.11 or newer, and there is no '$(PYTHON)' here. Install it, or name one: make $(MAKECMDGOALS) PYTHON=/path/to/python3.11"; exit 1; }
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
-	  echo "thermofleet needs Python 3.11 or newer; '$(PYTHON)' is $$($(PYTHON) --version 2>&1). Name another: make $(MAKECMDGOALS) PYTHON=/path/to/python3.11"; exit 1; }
-	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { \
-	  echo "Could not make a virtual environment with '$(PYTHON) -m venv'. On Debian and Ubuntu: apt install python3-venv"; exit 1; }
-	@echo "Installing thermofleet into $(VENV) (once; log in $(VENV)/install.log) …"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]' >$(VENV)/install.log 2>&1 || { \
+	@command -v "$(PYTHON)" >/dev/null 2>&1 || { \
+	  echo "thermofleet needs Python 3.11 or newer, and there is no '$(PYTHON)' here. Install it, or name one: make $(GOAL) PYTHON=/path/to/python3.11"; exit 1; }
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
+	  echo "thermofleet needs Python 3.11 or newer, and '$(PYTHON)' is $$("$(PYTHON)" --version 2>&1 | head -1). Name another: make $(GOAL) PYTHON=/path/to/python3.11"; exit 1; }
+	@test -x $(BIN)/python || "$(PYTHON)" -m venv $(VENV) >/dev/null 2>&1 || { \
+	  rm -rf $(VENV); \
+	  echo "'$(PYTHON) -m venv $(VENV)' could not make an environment. On Debian and Ubuntu the package python3-venv is missing then: apt install python3-venv"; exit 1; }
+	@echo "Installing thermofleet into $(VENV) (once, a few minutes; log in $(VENV)/install.log) …"
+	@PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]' >$(VENV)/install.log 2>&1 || { \
 	  echo "The packages could not be installed. The usual reason is no network: they are fetched once, later runs need none."; \
-	  echo "What pip said:"; grep -E '^ERROR' $(VENV)/install.log | head -3; echo "All of it: $(VENV)/install.log"; exit 1; }
+	  grep -m1 -E '^ERROR' $(VENV)/install.log | sed 's/^ERROR:/pip said:/'; \
+	  echo "All that pip said is in $(VENV)/install.log; 'make $(GOAL)' tries again."; exit 1; }
 	@touch $(STAMP)
 
 clean:

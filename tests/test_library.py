@@ -1,0 +1,57 @@
+"""Every scenario of the library, found by looking: it loads, it can be done, it runs under every rule."""
+
+from pathlib import Path
+
+import pytest
+
+from agents.rules import RULES
+from fleet.robot import JOINTS
+from scenarios.build import Fleet, prepare
+from scenarios.folder import telemetry_table
+from scenarios.jobs import all_works
+from scenarios.load import library, load
+from scenarios.run import RunSpec, run
+
+ROOT = Path(__file__).parents[1]
+FILES = sorted((ROOT / "scenarios" / "library").glob("*.toml"))
+TICKS = 20
+
+
+@pytest.fixture(scope="module", params=FILES, ids=lambda path: path.stem)
+def fleet(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Fleet:
+    """The fleet of a scenario, planned once."""
+    cache = tmp_path_factory.getbasetemp() / "cache"
+    return prepare(load(request.param), difficulty="blind", cache=cache)
+
+
+def test_the_library_lists_every_file():
+    assert set(library()) == {path.stem for path in FILES}
+    assert len(FILES) >= 3
+
+
+def test_every_work_can_be_done_by_two_arms_or_more(fleet):
+    """Otherwise there would be nothing to allocate."""
+    able = {work: [arm.robot.name for arm in fleet.arms if work in arm.plans] for work in all_works(fleet.scenario)}
+    lonely = {f"{w.kind} at {w.places[0].name}, {w.payload_kg} kg": who for w, who in able.items() if len(who) < 2}
+    assert lonely == {}
+
+
+def test_a_scenario_says_what_it_is(fleet):
+    assert fleet.scenario.description.endswith(".")
+    assert len(fleet.scenario.arms) >= 2
+
+
+@pytest.mark.parametrize("policy", RULES)
+def test_every_rule_works_its_first_minutes(fleet, policy):
+    asked = iter(range(TICKS + 1))
+    spec = RunSpec(policy=policy, seed=1, bus="memory", difficulty="blind")
+    result = run(fleet, spec, stopped=lambda: next(asked) >= TICKS)
+    assert result.time_s == TICKS * fleet.scenario.decision_interval_s
+    assert result.metrics.illegal_actions == 0
+    assert result.telemetry is not None
+    arms = [arm.name for arm in fleet.scenario.arms]
+    table = telemetry_table(result.telemetry, arms)
+    joints = [f"{name}_{j + 1}" for name in ("q", "qd", "tau", "current_a", "temp_c") for j in range(JOINTS)]
+    assert table.column_names == ["time_s", "arm", "mode", *joints]
+    assert table.num_rows == len(arms) * round(result.time_s / fleet.scenario.telemetry_interval_s)
+    assert 0 < min(result.metrics.peak_c.values()) < 75

@@ -1,0 +1,94 @@
+"""`make` on a machine that lacks something says so in a sentence; the repository's own environment is not touched."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
+
+
+def make(goal: str, venv: Path, python: object) -> subprocess.CompletedProcess[str]:
+    """`make goal` with its environment in `venv`."""
+    command = ["make", "-C", str(ROOT), "--no-print-directory", goal, f"VENV={venv}", f"PYTHON={python}"]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+def script(path: Path, body: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"#!/bin/sh\n{body}\n", encoding="utf-8")
+    path.chmod(0o755)
+    return path
+
+
+PIP_FAILS = """\
+echo 'WARNING: Retrying after connection broken'
+echo 'ERROR: Could not find a version that satisfies the requirement daqp' >&2
+echo 'ERROR: No matching distribution found for daqp' >&2
+exit 1"""
+
+
+@pytest.fixture
+def stub(tmp_path: Path) -> Path:
+    """A python that makes environments whose pip finds no network."""
+    broken = script(tmp_path / "pip_fails", PIP_FAILS)
+    body = f'case "$1 $2" in "-m venv") mkdir -p "$3/bin"; cp "{broken}" "$3/bin/python";; esac'
+    return script(tmp_path / "python3", body)
+
+
+@pytest.mark.parametrize("goal", ["test", "demo"])
+def test_no_python_at_all(tmp_path, goal):
+    said = make(goal, tmp_path / "venv", "missing-python")
+    assert said.returncode != 0
+    assert said.stdout == (
+        "thermofleet needs Python 3.11 or newer, and there is no 'missing-python' here. Install it, or name one: "
+        f"make {goal} PYTHON=/path/to/python3.11\n"
+    )
+    assert not (tmp_path / "venv").exists()
+
+
+def test_a_python_that_is_too_old(tmp_path):
+    old = script(tmp_path / "python3.8", 'case "$1" in -c) exit 1;; --version) echo Python 3.8.10;; esac')
+    said = make("test", tmp_path / "venv", old)
+    assert said.returncode != 0
+    assert said.stdout == (
+        f"thermofleet needs Python 3.11 or newer, and '{old}' is Python 3.8.10. Name another: "
+        "make test PYTHON=/path/to/python3.11\n"
+    )
+    assert not (tmp_path / "venv").exists()
+
+
+def test_a_python_without_venv(tmp_path):
+    body = 'case "$1 $2" in "-m venv") mkdir -p "$3/bin"; touch "$3/bin/python"; echo Traceback >&2; exit 1;; esac'
+    said = make("test", tmp_path / "venv", script(tmp_path / "python3", body))
+    assert said.returncode != 0
+    assert "could not make an environment. On Debian and Ubuntu the package python3-venv is missing" in said.stdout
+    assert "Traceback" not in said.stdout + said.stderr
+    assert not (tmp_path / "venv").exists()
+
+
+def test_no_network(tmp_path, stub):
+    venv = tmp_path / "venv"
+    said = make("test", venv, stub)
+    assert said.returncode != 0
+    assert said.stdout.splitlines()[1:] == [
+        "The packages could not be installed. The usual reason is no network: they are fetched once, later runs need "
+        "none.",
+        "pip said: Could not find a version that satisfies the requirement daqp",
+        f"All that pip said is in {venv}/install.log; 'make test' tries again.",
+    ]
+    assert not (venv / ".installed").exists()
+    assert "Retrying" in (venv / "install.log").read_text(encoding="utf-8")
+
+
+def test_the_next_call_tries_again_and_then_not_any_more(tmp_path, stub):
+    venv = tmp_path / "venv"
+    make("install", venv, stub)
+    script(venv / "bin" / "python", "exit 0")
+    assert make("install", venv, stub).returncode == 0
+    assert (venv / ".installed").exists()
+    script(venv / "bin" / "python", "exit 1")
+    assert make("install", venv, stub).returncode == 0

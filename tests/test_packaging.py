@@ -1,0 +1,153 @@
+"""The distribution: its names, its pins, and a wheel that works where the source is not."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tomllib
+import venv
+from importlib import import_module
+from importlib.metadata import packages_distributions, version
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("fleet", "agents", "twin", "scenarios")
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_the_four_names_are_this_project_and_nobody_elses(name):
+    """Another distribution, openai-agents, owns the name `agents` too: both cannot live in one environment."""
+    assert set(packages_distributions()[name]) == {"thermofleet"}
+    assert Path(str(import_module(name).__file__)).parent == ROOT / name
+
+
+def test_the_version_is_that_of_the_project():
+    assert version("thermofleet") == PROJECT["version"]
+
+
+def pins() -> dict[str, str]:
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").split()
+    return dict(line.split("==") for line in lines)
+
+
+@pytest.mark.parametrize("requirement", [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["dev"]])
+def test_every_direct_dependency_is_pinned_within_its_range(requirement):
+    found = re.fullmatch(r"([\w-]+)>=([\d.]+)(?:,<(\d+))?", requirement)
+    assert found is not None
+    name, low, high = found.groups()
+    pinned = [int(part) for part in pins()[name].split(".")]
+    assert pinned >= [int(part) for part in low.split(".")]
+    assert high is None or pinned[0] < int(high)
+
+
+def test_nothing_is_pinned_that_is_not_asked_for():
+    asked = [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["dev"]]
+    assert set(pins()) == {re.split("[><=]", requirement)[0] for requirement in asked}
+
+
+def written_by_hand() -> list[Path]:
+    """Text files of the repository."""
+    here = [ROOT / ".ci" / "run", *ROOT.glob("*.*"), ROOT / "Makefile", ROOT / ".gitignore"]
+    folders = (*PACKAGES, "tests", "benchmarks", "examples", "docs")
+    inside = [path for folder in folders for path in (ROOT / folder).rglob("*")]
+    kinds = (".py", ".toml", ".md", ".txt", ".json", ".xml", "")
+    return [path for path in (*here, *inside) if path.is_file() and path.suffix in kinds]
+
+
+def test_no_package_registry_and_no_path_of_a_machine_is_named():
+    named = re.compile("|".join(["py" + r"pi\.", "python" + r"hosted\.", "/wo" + "rk/", "/ro" + "ot/", "/ho" + "me/"]))
+    found = [str(path.relative_to(ROOT)) for path in written_by_hand() if named.search(path.read_text("utf-8"))]
+    assert found == []
+
+
+@pytest.fixture(scope="module")
+def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An environment with the wheel alone; the libraries of the running one are visible through a .pth file."""
+    base = tmp_path_factory.mktemp("wheel")
+    source = base / "source"
+    source.mkdir()
+    for name in PACKAGES:
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source / name)
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", "--no-input"]
+    alone = ["--no-deps", "--no-index"]
+    build = [*pip, "wheel", *alone, "--no-build-isolation", "--wheel-dir", str(base / "dist"), str(source)]
+    subprocess.run(build, check=True, cwd=base, timeout=120, capture_output=True)
+    (wheel,) = (base / "dist").glob("*.whl")
+    home = base / "venv"
+    venv.create(home, symlinks=True)
+    python = home / "bin" / "python"
+    install = [*pip, "--python", str(python), "install", *alone, str(wheel)]
+    subprocess.run(install, check=True, cwd=base, timeout=120, capture_output=True)
+    own = Path(
+        subprocess.check_output([python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"]).decode()
+    )
+    libraries = {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
+    # Lines of a .pth file only lengthen the path: the editable install's own .pth file in there is not read.
+    (Path(str(own).strip()) / "libraries.pth").write_text("\n".join(sorted(libraries)), encoding="utf-8")
+    return home
+
+
+def there(home: Path, *command: str) -> str:
+    """Run a command of the other environment, away from the source."""
+    cache = home.parents[1] / "cache"
+    env = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "COV"))}
+    env["THERMOFLEET_CACHE"] = str(cache)
+    ran = subprocess.run(
+        [str(home / "bin" / command[0]), *command[1:]],
+        cwd=home,
+        env=env,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout
+
+
+def test_the_wheel_is_what_is_imported_there(elsewhere):
+    program = "import fleet, agents, twin, scenarios; print(*[p.__file__ for p in (fleet, agents, twin, scenarios)])"
+    files = there(elsewhere, "python", "-c", program).split()
+    assert all(Path(file).is_relative_to(elsewhere) for file in files)
+    assert not any(Path(file).is_relative_to(ROOT) for file in files)
+
+
+def test_the_wheel_brings_its_data(elsewhere):
+    program = """
+from importlib.resources import files
+for package, path in (("fleet", "sim/assets/gen3.xml"), ("fleet", "data/gen3_thermal.json")):
+    assert files(package).joinpath(path).is_file(), path
+print(*sorted(f.name for f in files("scenarios").joinpath("library").iterdir() if f.name.endswith(".toml")))
+"""
+    library = sorted(path.name for path in (ROOT / "scenarios" / "library").glob("*.toml"))
+    assert there(elsewhere, "python", "-c", program).split() == library
+
+
+def test_the_command_works_there(elsewhere):
+    assert "quickstart" in there(elsewhere, "thermofleet", "list")
+    told = json.loads(there(elsewhere, "thermofleet", "hold", "--payload", "3", "--json"))
+    # facts of the arm: outstretched with 3 kg, joint 2 passes 60 °C after 12.6 min and 75 °C after 30
+    assert told["cold"]["t60_min"][1] == pytest.approx(12.6, abs=0.5)
+    assert told["cold"]["t75_min"][1] == pytest.approx(30.0, abs=1.5)
+
+
+def test_an_episode_runs_there(elsewhere):
+    program = """
+from scenarios.build import make_env
+env = make_env("quickstart", difficulty="blind", horizon_s=120)
+env.reset(seed=0)
+steps = 0
+while env.agents:
+    env.step({arm: 0 for arm in env.agents})
+    steps += 1
+print(steps)
+"""
+    assert int(there(elsewhere, "python", "-c", program)) == 12
