@@ -22,7 +22,8 @@ def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | Tex
     factors = [load_factor(factory(np.random.SeedSequence(seed)).world) for seed in range(SEEDS)]
     thermal = float(np.mean([f.thermal for f in factors]))
     time = float(np.mean([f.time for f in factors]))
-    air = ", ".join(f"{c:g} °C at {t / 3600:g} h" for t, c in scenario.ambient.points)
+    told = [f"{c:g} °C at {t / 3600:g} h" for t, c in scenario.ambient.points]
+    air = ", ".join(told) if len(told) > 1 else f"{scenario.ambient.at(np.zeros(1))[0]:g} °C"
     head = (
         f"{scenario.name}: {scenario.description}\n{scenario.horizon_s / 3600:g} h, a decision every "
         f"{scenario.decision_interval_s:g} s, {scenario.slots} slots, air {air}\n"
