@@ -65,6 +65,7 @@ def test_warning_and_fault_come_when_a_fine_integration_says(small, payload_kg) 
         t, hot = fine(world, s.heating.start_c[0, 0], s.heating.heat_w[0, 0], 25.0, DT_S)
         assert found.time_s % DT_S == pytest.approx(t[np.argmax(hot >= limit_c)], abs=0.05)
         assert (found.joint, found.value, found.job) == (2, limit_c, "a")
+    assert s.state.peak_c[0, 0] == pytest.approx(75.0, abs=1e-6)  # the hottest it got was at the fault
 
 
 def test_a_falling_warning_ends_the_time_above_it_to_the_moment(small) -> None:

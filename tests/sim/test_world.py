@@ -56,6 +56,20 @@ def test_without_a_score_it_offers_the_first_and_says_nothing(small) -> None:
         assert (world.offers.plan == 0).all()
 
 
+def test_more_of_the_same_work_is_scored_for_itself(small) -> None:
+    class ByLength:
+        version = "by length"
+
+        def score(self, plan: Plan, repetitions: int) -> Difficulty:
+            return Difficulty(np.full(7, repetitions / 100.0))
+
+    content = small.work()
+    jobs = [small.job("a", content, repetitions=5), small.job("b", content, repetitions=9)]
+    world, _ = small.shop([jobs], arms=[small.arm(0, [content], model=ByLength())])
+    assert world.offers.difficulty[0, 0] == pytest.approx([0.35, 0.63])
+    assert world.offers.plan[0, 0].tolist() == [0, 0]
+
+
 def test_a_work_nobody_planned_is_no_offer(small) -> None:
     arm = small.arm(0, [small.work("rack")])
     assert best_offer(arm, small.job("a")) is None
