@@ -171,6 +171,18 @@ def test_it_ends_when_all_work_is_done(make, small) -> None:
     assert env.world.jobs.due_s[0, 0] < env.world.horizon_s
 
 
+def test_work_done_in_the_last_step_is_done_and_not_cut_short(make) -> None:
+    def last(max_cycles: int | None = None) -> tuple[int, bool, bool]:
+        env = make({"arms": 2, "jobs": 1, "ticks": 400, "ambient_c": 20.0}, max_cycles=max_cycles)
+        env.reset(seed=2)
+        trace = go_on(env, np.random.default_rng(2))
+        return len(trace), trace[-1][2]["arm_0"], trace[-1][3]["arm_0"]
+
+    steps, *_ = last()
+    assert last() == last(steps) == (steps, True, False)
+    assert last(steps - 1) == (steps - 1, False, True)
+
+
 def test_a_shift_without_jobs_is_stood_through(make) -> None:
     env = make({"jobs": 0, "ticks": 9})
     env.reset(seed=0)
