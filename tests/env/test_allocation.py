@@ -14,7 +14,7 @@ from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 
 from fleet.bus.session import ZenohExchange
 from fleet.env import allocation_v0
-from fleet.env.allocation_v0 import AllocationEnv, parallel_env
+from fleet.env.allocation_v0 import AllocationEnv, Episode, parallel_env
 from fleet.robot import ThermalLimits
 from fleet.sim.state import FAULTED
 
@@ -126,6 +126,17 @@ def test_legal_claims_are_awarded_or_lost_and_illegal_ones_only_counted(make) ->
             seen["lost"] += award == -1
             seen["illegal"] += not legal
     assert min(seen.values()) > 0
+
+
+@pytest.mark.parametrize("winner", [0, 1, 2])
+def test_of_two_claims_that_of_the_lower_shared_difficulty_wins(small, winner) -> None:
+    content = small.work()
+    arms = [small.arm(i, [content], model=small.ByPayload(1.0 if i == winner else 2.0)) for i in range(3)]
+    world, plant = small.shop([[small.job("a", content)]], arms=arms)
+    env = parallel_env(lambda seed: Episode(world, plant, ("by payload",) * 3, np.random.default_rng(seed)))
+    env.reset(seed=0)
+    env.step(dict.fromkeys(env.possible_agents, 1))
+    assert env.truth.last_award[0].tolist() == [1 if i == winner else -1 for i in range(3)]
 
 
 def test_a_wait_differs_in_nothing_from_an_illegal_action(make) -> None:
@@ -327,6 +338,9 @@ def test_nothing_that_is_handed_out_is_the_env_s_own(make) -> None:
         for seen in env.knowledge().values():
             seen.temp_c[:] = 0.0
             seen.action_mask[:] = 0
+        assert plain(env.state()) == plain(untouched.state())
+        for arm, seen in untouched.knowledge().items():
+            assert plain(vars(env.knowledge()[arm])) == plain(vars(seen))
         env.agents.reverse()
         handed, kept = env.step(wild(env, rng)), untouched.step(wild(untouched, other))
 
