@@ -74,11 +74,12 @@ class CoolestFirst:
 
 
 class LeastDifficulty:
-    """The oldest job goes to the free arm that told the lowest difficulty for it.
+    """The pair of free arm and job with the least difficulty first, reckoned against what the fleet finds on average.
 
-    Each arm walks the queue by itself, from its own scores, what its peers told it and its place in the fleet, which
-    settles ties; so the rule needs nobody in the middle. An arm that knows no difficulty for a job stands behind those
-    that do.
+    Some work is new to every twin and would be left by all if plain difficulties were compared across jobs; what one
+    arm finds harder than the others is what the choice can change. Each arm works this out by itself, from its own
+    scores, what its peers told it and its place in the fleet, which settles ties; so the rule needs nobody in the
+    middle. Where nobody has a score, the oldest job is claimed.
     """
 
     def reset(self, rng: np.random.Generator) -> None:
@@ -92,21 +93,27 @@ class LeastDifficulty:
         mine = legal_slots(observation)
         if not mine:
             return WAIT
+        own = np.where(observation.known > 0, observation.difficulty, np.nan)
+        peers = np.where(observation.peer_known > 0, observation.peer_difficulty, np.nan)
+        told = np.insert(peers.astype(float), place, own, axis=0)  # [arm, slot], the fleet's order
+        told[np.ix_(range(len(told)), _closed(observation, mine))] = np.nan
+        known = ~np.isnan(told)
+        average = np.where(known, told, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
         free = (observation.peer_heard > 0) & (observation.peer_working == 0) & (observation.peer_faulted == 0)
-        told = np.where((observation.peer_known > 0) & free[:, None], observation.peer_difficulty, np.inf)
-        own = np.where((observation.known > 0) & (observation.action_mask[1:] > 0), observation.difficulty, np.inf)
-        me = min(place, len(told))
-        costs = np.insert(told, me, own, axis=0)
-        for slot in np.flatnonzero(observation.offered).tolist():
-            if slot not in mine and observation.feasible[slot]:
-                continue  # It waits for a station: nobody may claim it.
-            best = int(np.argmin(costs[:, slot]))
-            known = bool(np.isfinite(costs[best, slot]))
-            if slot in mine and (best == me or not known):
-                return slot + 1
-            if known:
-                costs[best, :] = np.inf  # That peer takes this job, so it takes no other.
-        return WAIT
+        costs = np.where(known & np.insert(free, place, True)[:, None], told - average, np.inf).round(9)
+        while np.isfinite(costs).any():
+            slot, arm = np.unravel_index(int(np.argmin(costs.T)), costs.T.shape)  # ties: oldest job, first arm
+            if arm == place:
+                return int(slot) + 1
+            costs[arm, :] = np.inf
+            costs[:, slot] = np.inf
+        return mine[0] + 1 if np.isnan(own[mine]).all() else WAIT
+
+
+def _closed(observation: Observation, mine: list[int]) -> list[int]:
+    """Slots that nobody may claim now: empty, or this arm could do the job but its station is busy."""
+    offered = observation.offered > 0
+    return [s for s in range(len(offered)) if not offered[s] or (s not in mine and observation.feasible[s] > 0)]
 
 
 def _slots(observations: Mapping[str, Observation]) -> range:

@@ -1,6 +1,7 @@
 """The dispatching rules: each does what its name says, and none ever claims what it may not."""
 
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -153,19 +154,19 @@ def test_random_is_uniform_over_what_is_legal() -> None:
 # least_difficulty
 
 
-def test_least_difficulty_gives_the_oldest_job_to_the_arm_that_finds_it_easiest() -> None:
-    assert act("least_difficulty", fleet([[2.0, 3.0], [1.0, 0.5]])) == [[2, 1]]
-    assert act("least_difficulty", fleet([[2.0, 0.1], [4.0, 3.0]])) == [[1, 2]]
+def test_least_difficulty_takes_the_pair_with_most_advantage_first() -> None:
+    # Arm 1 finds both easier, but slot 2 by more; against the average that is -1.25, its slot 1 -0.5.
+    assert act("least_difficulty", fleet([[2.0, 3.0], [1.0, 0.5]])) == [[1, 2]]
     assert act("least_difficulty", fleet([[2.0], [1.9], [2.1]])) == [[0, 1, 0]]
+
+
+def test_least_difficulty_does_not_starve_work_that_is_new_to_everybody() -> None:
+    # The older job is hard for both alike; a single free arm still takes it where the other is no better for it.
+    assert act("least_difficulty", fleet([[5.0, 1.0], [5.0, 0.5]], free=[1, 0])) == [[1, 0]]
 
 
 def test_least_difficulty_leaves_nothing_to_a_peer_that_is_at_work() -> None:
     assert act("least_difficulty", fleet([[2.0], [1.0]], free=[1, 0])) == [[1, 0]]
-
-
-def test_least_difficulty_reckons_with_what_only_a_peer_can_do() -> None:
-    # Arm 1 takes the older job, which only it can do, so the other is for arm 0 although arm 1 finds it easier.
-    assert act("least_difficulty", fleet([[np.nan, 2.0], [0.5, 1.0]], feasible=[[0, 1], [1, 1]])) == [[2, 1]]
 
 
 def test_least_difficulty_does_not_wait_for_a_station() -> None:
@@ -173,30 +174,35 @@ def test_least_difficulty_does_not_wait_for_a_station() -> None:
     assert act("least_difficulty", fleet([[0.1, 2.0], [0.2, 3.0]], mask=[[0, 1], [0, 1]])) == [[2, 0]]
 
 
-def test_least_difficulty_settles_ties_by_the_place_in_the_fleet() -> None:
+def test_least_difficulty_settles_ties_by_age_and_place_in_the_fleet() -> None:
     assert act("least_difficulty", fleet([[1.0, 1.0, 1.0]] * 3)) == [[1, 2, 3]]
 
 
-def test_least_difficulty_asks_those_who_know_first() -> None:
-    assert act("least_difficulty", fleet([[np.nan, 2.0], [3.0, 1.0]])) == [[2, 1]]
-    assert act("least_difficulty", fleet([[np.nan, 2.0]])) == [[1]]
+def test_least_difficulty_without_any_score_claims_the_oldest() -> None:
+    assert act("least_difficulty", fleet([[np.nan, np.nan]])) == [[1]]
 
 
 @settings(max_examples=300, deadline=None)
 @given(st.data())
 def test_least_difficulty_agrees_with_one_who_sees_everything(data) -> None:
-    """So no two arms ever claim the same job."""
+    """Greedy matching in exact fractions; so no two arms ever claim the same job."""
     arms, slots = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 5))
     rows = st.lists(st.sampled_from([0.5, 1.0, 1.0, 2.0, 3.5, 6.0]), min_size=slots, max_size=slots)
     bits = st.lists(st.integers(0, 1), min_size=slots, max_size=slots)
     d = np.array(data.draw(st.lists(rows, min_size=arms, max_size=arms)))
     able = np.array(data.draw(st.lists(bits, min_size=arms, max_size=arms)))
     free = np.array(data.draw(st.lists(st.integers(0, 1), min_size=arms, max_size=arms)))
-    expected = [0] * arms
+    pairs = []
     for slot in range(slots):
-        asked = [(d[a, slot], a) for a in range(arms) if able[a, slot] and free[a] and not expected[a]]
-        if asked:
-            expected[min(asked)[1]] = slot + 1
+        told = [Fraction(d[a, slot]) for a in range(arms) if able[a, slot]]
+        pairs += [
+            (Fraction(d[a, slot]) - sum(told) / len(told), slot, a) for a in range(arms) if able[a, slot] and free[a]
+        ]
+    expected, given_away = [0] * arms, set()
+    for _, slot, arm in sorted(pairs):
+        if not expected[arm] and slot not in given_away:
+            expected[arm] = slot + 1
+            given_away.add(slot)
     seen = fleet(d.tolist(), feasible=able.tolist(), free=free.tolist())
     assert act("least_difficulty", seen) == [expected]
 
