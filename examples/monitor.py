@@ -1,43 +1,56 @@
 """Watch a fleet from another process, with nothing but `eclipse-zenoh` and `json`.
 
-In one terminal:  thermofleet run quickstart --listen 7447 --overwrite
-In another:       python examples/monitor.py 7447
+In one terminal:  python examples/monitor.py 7447
+In another:       thermofleet run quickstart --listen 7447 --overwrite
 """
 
 import json
+import queue
 import sys
-import time
 
 import zenoh
 
+KEYS = "thermofleet/v1/*/arm/*/{}"
+WAIT_S = 60.0
+"""For the fleet to come."""
+QUIET_S = 5.0
+"""Without a word for so long, it has gone."""
 
-def main(port, limit_s=60.0):
-    """Print what arms say of themselves, once per ten words and arm; stop when the fleet is gone."""
-    config = {"mode": "client", "connect": {"endpoints": [f"tcp/127.0.0.1:{port}"], "timeout_ms": 10000}}
-    config["scouting"] = {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
-    heard = 0
+
+def main(port):
+    """Print, every ten minutes of the shift, how each arm says it is; return how many words were heard."""
+    config = {
+        "mode": "client",
+        "connect": {"endpoints": [f"tcp/127.0.0.1:{port}"], "timeout_ms": int(1000 * WAIT_S)},
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+    }
+    inbox = queue.SimpleQueue()
+    heard, shown = 0, {}
     with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
-        words = session.declare_subscriber("thermofleet/v1/*/arm/*/state", zenoh.handlers.RingChannel(256))
-        difficulty = session.declare_subscriber("thermofleet/v1/*/arm/*/difficulty", zenoh.handlers.RingChannel(256))
-        quiet_since = time.monotonic()
-        end = quiet_since + limit_s
-        while time.monotonic() < end and time.monotonic() - quiet_since < 5.0:
-            sample = words.try_recv()
-            if sample is None:
-                time.sleep(0.01)
-                continue
-            quiet_since = time.monotonic()
+        session.declare_subscriber(KEYS.format("state"), inbox.put)
+        session.declare_subscriber(KEYS.format("difficulty"), inbox.put)
+        while True:
+            try:
+                sample = inbox.get(timeout=QUIET_S if heard else WAIT_S)
+            except queue.Empty:
+                break
             heard += 1
             word = json.loads(sample.payload.to_bytes())
-            if heard % 40 < 4:
-                hottest = max(word["temp_c"])
-                print(f"{word['time_s']:7.0f} s  {word['arm']:<12} {word['mode']:<8} hottest motor {hottest:5.1f} °C")
-            scores = difficulty.try_recv()
-            if scores is not None and heard % 40 == 5:
-                said = json.loads(scores.payload.to_bytes())
-                print(f"           {said['arm']} finds", dict(zip(said["jobs"], said["difficulty"], strict=True)))
+            kind = str(sample.key_expr).rsplit("/", 1)[1]
+            if word["time_s"] >= shown.get((word["arm"], kind), 0.0):
+                shown[word["arm"], kind] = word["time_s"] + 600.0
+                print(f"{word['time_s']:7.0f} s  {word['arm']:<12} {describe(kind, word)}", flush=True)
     print(f"heard {heard} words")
     return heard
+
+
+def describe(kind, word):
+    """One word in a line."""
+    if kind == "state":
+        return f"{word['mode']:<8} hottest motor {max(word['temp_c']):5.1f} °C"
+    scores = zip(word["jobs"], word["difficulty"], strict=True)
+    told = ", ".join(f"{job} {d:.2f}" for job, d in scores if d is not None)
+    return f"finds {told}" if told else "finds nothing on offer"
 
 
 if __name__ == "__main__":

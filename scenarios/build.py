@@ -212,14 +212,14 @@ def air_offsets(scenario: Scenario) -> np.ndarray:
     return drawn + np.array([arm.ambient_offset_k for arm in scenario.arms])
 
 
-def open_exchange(bus: BusName, arms: tuple[str, ...], fleet: str) -> Exchange:
-    """The exchange by name; over Zenoh with an in-process router."""
+def open_exchange(bus: BusName, arms: tuple[str, ...], fleet: str, port: int = 0) -> Exchange:
+    """The exchange by name; over Zenoh with an in-process router on a loopback port (0: a free one)."""
     choose("bus", bus, BusName)
     if bus == "memory":
         return MemoryExchange(arms)
     from fleet.bus.session import ZenohExchange
 
-    return ZenohExchange(arms, fleet)
+    return ZenohExchange(arms, fleet, port=port)
 
 
 def make_env(
@@ -250,9 +250,11 @@ def make_env(
     return env_of(fleet, plant=plant, bus=bus, **(env_options or {}))
 
 
-def env_of(fleet: Fleet, *, plant: PlantName = "profile", bus: BusName = "memory", **options: Any) -> AllocationEnv:
-    """The `ParallelEnv` of a fleet that is ready; options as in `AllocationEnv`."""
+def env_of(
+    fleet: Fleet, *, plant: PlantName = "profile", bus: BusName = "memory", port: int = 0, **options: Any
+) -> AllocationEnv:
+    """The `ParallelEnv` of a fleet that is ready; `port` as in `open_exchange`, options as in `AllocationEnv`."""
     choose("plant", plant, PlantName)
     names = tuple(arm.robot.name for arm in fleet.arms)
-    exchange = open_exchange(bus, names, fleet.scenario.name)
+    exchange = open_exchange(bus, names, fleet.scenario.name, port)
     return parallel_env(ShiftFactory(fleet, plant), exchange=exchange, weights=fleet.scenario.reward, **options)

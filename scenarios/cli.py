@@ -91,6 +91,9 @@ def run_command(
     bus: BusOption = "zenoh",
     difficulty: DifficultyOption = "twin",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a finished run in --out.")] = False,
+    listen: Annotated[
+        int, typer.Option(help="Loopback port of the fleet's Zenoh router, for others to watch; 0 is any free one.")
+    ] = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Work one shift of a scenario and record it."""
@@ -98,14 +101,17 @@ def run_command(
 
     chosen = load(scenario)
     spec = _spec(policy, seed, plant, bus, difficulty)
+    if not 0 <= listen <= 65535 or (listen and bus == "memory"):
+        raise FleetError(f"--listen needs a port from 1 to 65535 and --bus zenoh (got {listen}, {bus}).")
     where = out or Path("runs") / f"{chosen.name}-{policy}-{seed}"
     check_free(where, overwrite=overwrite)
     with progress_bar() as progress:
-        result = _run_into(chosen, spec, where, overwrite, progress)
+        result = _run_into(chosen, spec, where, overwrite, progress, listen)
     if as_json:
         typer.echo(json.dumps({"out": str(where), **_figures(result)}, indent=1))
     else:
-        out_console.print(table_of({policy: result.metrics}, f"{chosen.name}, seed {seed}"))
+        _say(f"{chosen.name}, seed {seed}", out_console)
+        out_console.print(table_of({policy: result.metrics}))
         if result.finished:
             _say(f"Recorded in {where}; open {where / 'report.html'} in a browser.", out_console)
     if not result.finished:
@@ -186,7 +192,8 @@ def demo_command(
             if not result.finished:
                 raise Interrupted(f"Interrupted while working; recordings are in {out}.")
             results[policy] = result.metrics
-    out_console.print(table_of(results, f"{chosen.name}, seed {seed}: {chosen.description}"))
+    _say(f"{chosen.name}, seed {seed}: {chosen.description}", out_console)
+    out_console.print(table_of(results))
     _say(f"Open {out / 'least_difficulty' / 'report.html'} in a browser to see what happened.", out_console)
 
 
@@ -210,7 +217,7 @@ def _spec(policy: str, seed: int, plant: str, bus: str, difficulty: str) -> Any:
     return RunSpec(policy=policy, seed=seed, **fields)
 
 
-def _run_into(scenario: Scenario, spec: Any, out: Path, overwrite: bool, progress: Progress) -> Any:
+def _run_into(scenario: Scenario, spec: Any, out: Path, overwrite: bool, progress: Progress, port: int = 0) -> Any:
     from scenarios.build import prepare
     from scenarios.folder import new_folder, write
     from scenarios.run import run
@@ -218,7 +225,7 @@ def _run_into(scenario: Scenario, spec: Any, out: Path, overwrite: bool, progres
     with new_folder(out, overwrite=overwrite) as folder:
         fleet = prepare(scenario, difficulty=spec.difficulty, progress=progress)
         with stop_on_interrupt() as stopped:
-            result = run(fleet, spec, progress=progress, stopped=stopped)
+            result = run(fleet, spec, progress=progress, stopped=stopped, port=port)
             progress("writing", 0.0)
             write(result, folder)
     return result
@@ -289,9 +296,9 @@ def _say(sentence: str, console: Console = err_console) -> None:
     console.print(sentence, markup=False, highlight=False, soft_wrap=True)
 
 
-def table_of(results: dict[str, Metrics], title: str) -> Table:
+def table_of(results: dict[str, Metrics]) -> Table:
     """Key figures, one column per policy."""
-    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("")
     for name in results:
         table.add_column(name, justify="right")

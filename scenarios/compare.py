@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 from joblib import Parallel, delayed
+from rich.console import Group
 from rich.table import Table
+from rich.text import Text
 from scipy.stats import bootstrap, trim_mean
 
 from agents.rules import make_policy
@@ -141,13 +143,13 @@ def interval(values: Array, rng: np.random.Generator) -> tuple[float, float]:
     return float(found.confidence_interval.low), float(found.confidence_interval.high)
 
 
-def comparison_table(result: Comparison) -> Table:
+def comparison_table(result: Comparison) -> Group:
     """A block per figure: mean and paired difference, each with its interval; narrow enough for 80 columns."""
     title = (
         f"{result.scenario}, {len(result.seeds)} seeds: mean, paired difference to {result.baseline}, "
         "95 % intervals; * excludes 0"
     )
-    table = Table(title=title, title_justify="left", box=None, pad_edge=False, header_style="bold")
+    table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("", overflow="fold")
     for name in ("mean", "interval", "difference", "interval", ""):
         table.add_column(name, justify="right")
@@ -163,4 +165,4 @@ def comparison_table(result: Comparison) -> Table:
             between = f"{f.difference_low:+.{digits}f} … {f.difference_high:+.{digits}f}"
             star = "*" if f.difference_low > 0 or f.difference_high < 0 else ""
             table.add_row(f"  {policy}", *mean, f"{f.difference:+.{digits}f}", between, star)
-    return table
+    return Group(Text(title), table)
