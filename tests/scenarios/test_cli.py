@@ -299,6 +299,24 @@ def test_compare_prints_a_table_or_json(thermofleet, small_toml, monkeypatch):
     assert "above_warning_min" in thermofleet(*some).out
 
 
+def test_the_demo_sets_two_policies_side_by_side(thermofleet, tmp_path, monkeypatch, plans):
+    from scenarios.build import prepare
+
+    def without_twins(scenario, *, difficulty, progress):
+        return prepare(scenario, difficulty="blind", cache=plans, progress=progress)
+
+    monkeypatch.setattr("scenarios.build.prepare", without_twins)
+    said = thermofleet("demo", "--out", tmp_path / "demo")
+    assert said.code == 0
+    head = said.out.splitlines()[1].split()
+    assert head == ["round_robin", "least_difficulty"]
+    for policy in head:
+        told = run_json(tmp_path / "demo" / policy)
+        assert (told["policy"], told["status"], told["scenario"]["name"]) == (policy, "finished", "quickstart")
+        assert f"{told['metrics']['energy_wh']:.0f}" in said.out
+    assert str(tmp_path / "demo" / "least_difficulty" / "report.html") in said.out
+
+
 def test_help_names_every_command_and_every_policy(thermofleet):
     said = thermofleet("--help")
     assert said.code == 0
