@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 OUT ?= out
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 GOAL := $(or $(firstword $(MAKECMDGOALS)),demo)
 
 .PHONY: demo test test-slow lint bench clean install
@@ -27,8 +28,8 @@ bench: $(STAMP)
 
 install: $(STAMP)
 
-# A broken environment is taken away again, so that the next call begins anew. The constraints also hold for what
-# builds the package.
+# A broken environment is taken away again, so that the next call begins anew. setuptools comes first, so that the
+# pinned one builds the package.
 $(STAMP): pyproject.toml constraints.txt
 	@command -v "$(PYTHON)" >/dev/null 2>&1 || { \
 	  echo "thermofleet needs Python 3.11 or newer, and there is no '$(PYTHON)' here. Install it, or name one: make $(GOAL) PYTHON=/path/to/python3.11"; exit 1; }
@@ -38,9 +39,9 @@ $(STAMP): pyproject.toml constraints.txt
 	  rm -rf $(VENV); \
 	  echo "'$(PYTHON) -m venv $(VENV)' could not make an environment. On Debian and Ubuntu the package python3-venv is missing then: apt install python3-venv"; exit 1; }
 	@echo "Installing thermofleet into $(VENV) (once, a few minutes; log in $(VENV)/install.log) …"
-	@PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]' >$(VENV)/install.log 2>&1 || { \
+	@{ $(PIP) setuptools && $(PIP) --no-build-isolation -e '.[dev]'; } >$(VENV)/install.log 2>&1 || { \
 	  echo "The packages could not be installed. The usual reason is no network: they are fetched once, later runs need none."; \
-	  grep -m1 -E '^ERROR' $(VENV)/install.log | sed 's/^ERROR:/pip said:/'; \
+	  grep -m1 -oE 'ERROR: .*' $(VENV)/install.log | sed 's/^ERROR:/pip said:/'; \
 	  echo "All that pip said is in $(VENV)/install.log; 'make $(GOAL)' tries again."; exit 1; }
 	@touch $(STAMP)
 

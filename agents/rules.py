@@ -79,7 +79,7 @@ class LeastDifficulty:
     Some work is new to every twin and would be left by all if plain difficulties were compared across jobs; what one
     arm finds harder than the others is what the choice can change. Each arm works this out by itself, from its own
     scores, what its peers told it and its place in the fleet, which settles ties; so the rule needs nobody in the
-    middle. Where nobody has a score, the oldest job is claimed.
+    middle. Where nobody has a score, free arms take the oldest jobs in the fleet's order.
     """
 
     def reset(self, rng: np.random.Generator) -> None:
@@ -107,7 +107,10 @@ class LeastDifficulty:
                 return int(slot) + 1
             costs[arm, :] = np.inf
             costs[:, slot] = np.inf
-        return mine[0] + 1 if np.isnan(own[mine]).all() else WAIT
+        if not np.isnan(own[mine]).all():
+            return WAIT
+        before = int(free[:place].sum())  # free arms with the first word
+        return mine[min(before, len(mine) - 1)] + 1
 
 
 def _closed(observation: Observation, mine: list[int]) -> list[int]:

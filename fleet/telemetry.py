@@ -2,10 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Literal, get_args
 
 import numpy as np
 
 Array = np.ndarray
+
+Mode = Literal["idle", "working", "faulted"]
+MODES: tuple[Mode, ...] = get_args(Mode)
+"""Index = the number that stands for the mode in arrays."""
+IDLE, WORKING, FAULTED = range(len(MODES))
 
 
 @dataclass(frozen=True, eq=False)
@@ -15,7 +21,7 @@ class Telemetry:
     time_s: Array
     """[sample]."""
     mode: Array
-    """0 idle, 1 working, 2 faulted, int [sample, arm]."""
+    """Index into `MODES`, int [sample, arm]."""
     q: Array
     """rad, [sample, arm, joint]."""
     qd: Array

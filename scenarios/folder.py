@@ -17,8 +17,7 @@ import pyarrow.parquet as pq
 from fleet.errors import FleetError
 from fleet.events import Event
 from fleet.robot import JOINTS
-from fleet.sim.state import MODES
-from fleet.telemetry import Telemetry
+from fleet.telemetry import MODES, Telemetry
 from scenarios.report import report_html
 from scenarios.run import RunResult, summary
 

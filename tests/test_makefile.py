@@ -26,7 +26,7 @@ def script(path: Path, body: str) -> Path:
 
 PIP_FAILS = """\
 echo 'WARNING: Retrying after connection broken'
-echo 'ERROR: Could not find a version that satisfies the requirement daqp' >&2
+echo '  ERROR: Could not find a version that satisfies the requirement daqp' >&2
 echo 'ERROR: No matching distribution found for daqp' >&2
 exit 1"""
 

@@ -11,7 +11,7 @@ from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 
-from fleet.bus.messages import MODES
+from fleet.telemetry import MODES
 
 Array = np.ndarray
 

@@ -6,15 +6,12 @@ version may add some; a change that a reader of today could misread takes a new 
 """
 
 from math import isfinite
-from typing import Annotated, Literal, TypeVar, get_args
+from typing import Annotated, TypeVar
 
 import msgspec
 
 from fleet.errors import BusError
-
-Mode = Literal["idle", "working", "faulted"]
-MODES: tuple[Mode, ...] = get_args(Mode)
-"""Index = the integer that stands for the mode in arrays."""
+from fleet.telemetry import Mode
 
 VERSION = 1
 Name = Annotated[str, msgspec.Meta(min_length=1)]

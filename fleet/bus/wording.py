@@ -6,7 +6,8 @@ from typing import Literal
 
 from fleet.bus import keys
 from fleet.bus.exchange import Array, Condition, Scores, Words
-from fleet.bus.messages import MODES, DifficultyWord, MalformedMessage, State, decode, encoding
+from fleet.bus.messages import DifficultyWord, MalformedMessage, State, decode, encoding
+from fleet.telemetry import MODES
 
 _LOG = logging.getLogger(__name__)
 

@@ -21,7 +21,8 @@ from fleet.env.reward import TERMS, RewardWeights, terms
 from fleet.events import Event
 from fleet.sim import claims
 from fleet.sim.kernel import Plant, Step, step
-from fleet.sim.state import DONE, MODES, State, World, initial
+from fleet.sim.state import DONE, State, World, initial
+from fleet.telemetry import MODES
 from fleet.thermal import WINDING
 
 Array = np.ndarray

@@ -14,7 +14,8 @@ import numpy as np
 from fleet.bus.exchange import Heard, Words
 from fleet.robot import JOINTS
 from fleet.sim.claims import per_slot
-from fleet.sim.state import FAULTED, IDLE, WORKING, State, World
+from fleet.sim.state import State, World
+from fleet.telemetry import FAULTED, IDLE, WORKING
 
 Array = np.ndarray
 Axis = Literal["joint", "slot", "peer"]

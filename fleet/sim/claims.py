@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet.sim.state import DONE, IDLE, WAITING, WORKING, State, World
+from fleet.sim.state import DONE, WAITING, State, World
+from fleet.telemetry import IDLE, WORKING
 
 Array = np.ndarray
 

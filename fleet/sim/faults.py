@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from fleet.events import Event, EventKind
-from fleet.sim.state import FAULTED, IDLE, RUNNING, WAITING, State, World
+from fleet.sim.state import RUNNING, WAITING, State, World
+from fleet.telemetry import FAULTED, IDLE
 from fleet.thermal import WINDING, ThermalModel, node_heat
 
 Array = np.ndarray

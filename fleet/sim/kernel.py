@@ -15,7 +15,8 @@ from fleet.motion import Drive
 from fleet.sim import claims, faults
 from fleet.sim.claims import Board
 from fleet.sim.faults import Heating, event
-from fleet.sim.state import DONE, FAULTED, IDLE, RUNNING, WORKING, State, World
+from fleet.sim.state import DONE, RUNNING, State, World
+from fleet.telemetry import FAULTED, IDLE, WORKING, Telemetry
 from fleet.thermal import HOUSING, drive_heat
 
 Array = np.ndarray
@@ -62,6 +63,10 @@ class Plant(Protocol):
 
     def drive(self, world: World, state: State, timeline: Timeline) -> Drive:
         """Mean heat drive over the step, each [env, arm, joint]."""
+        ...
+
+    def readings(self, world: World, step: "Step", offsets_s: Array, rng: np.random.Generator) -> Telemetry:
+        """What the sensors of env 0 said at moments of the step just driven, s into it, [sample], in (0, dt_s]."""
         ...
 
 

@@ -19,8 +19,8 @@ from fleet.sim.kernel import Step, Timeline
 from fleet.sim.models import build_cell
 from fleet.sim.plants import read
 from fleet.sim.reference import Reference, control, reference, still
-from fleet.sim.state import FAULTED, WORKING, State, World
-from fleet.telemetry import Telemetry
+from fleet.sim.state import State, World
+from fleet.telemetry import FAULTED, WORKING, Telemetry
 
 Array = np.ndarray
 

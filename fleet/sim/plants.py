@@ -7,8 +7,8 @@ import numpy as np
 from fleet.motion import RATE_HZ, Drive, Plan
 from fleet.motor import current
 from fleet.sim.kernel import Step, Timeline
-from fleet.sim.state import FAULTED, WORKING, State, World
-from fleet.telemetry import Telemetry
+from fleet.sim.state import State, World
+from fleet.telemetry import FAULTED, WORKING, Telemetry
 from fleet.thermal import HOUSING, WINDING
 
 Array = np.ndarray

@@ -11,13 +11,10 @@ import numpy as np
 from fleet.motion import Drive
 from fleet.motor import Motors
 from fleet.robot import ThermalLimits
+from fleet.telemetry import IDLE
 from fleet.thermal import NODES, ThermalModel
 
 Array = np.ndarray
-
-IDLE, WORKING, FAULTED = 0, 1, 2
-MODES = ("idle", "working", "faulted")
-"""Names of the modes of an arm, by number."""
 
 WAITING, RUNNING, DONE = 0, 1, 2
 """Status of a job."""

@@ -178,8 +178,9 @@ def test_least_difficulty_settles_ties_by_age_and_place_in_the_fleet() -> None:
     assert act("least_difficulty", fleet([[1.0, 1.0, 1.0]] * 3)) == [[1, 2, 3]]
 
 
-def test_least_difficulty_without_any_score_claims_the_oldest() -> None:
+def test_least_difficulty_without_any_score_hands_out_the_oldest_in_order() -> None:
     assert act("least_difficulty", fleet([[np.nan, np.nan]])) == [[1]]
+    assert act("least_difficulty", fleet([[np.nan, np.nan]] * 2)) == [[1, 2]]
 
 
 @settings(max_examples=300, deadline=None)

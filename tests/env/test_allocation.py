@@ -16,7 +16,7 @@ from fleet.bus.session import ZenohExchange
 from fleet.env import allocation_v0
 from fleet.env.allocation_v0 import AllocationEnv, Episode, parallel_env
 from fleet.robot import ThermalLimits
-from fleet.sim.state import FAULTED
+from fleet.telemetry import FAULTED
 
 Trace = list[tuple[Any, ...]]
 

@@ -13,7 +13,8 @@ from fleet.env.allocation_v0 import parallel_env
 from fleet.env.observation import FIELDS, LONG_S, Layout, Observation, observe, remaining_s, say
 from fleet.sim.claims import board
 from fleet.sim.kernel import step
-from fleet.sim.state import FAULTED, IDLE, WORKING, initial
+from fleet.sim.state import initial
+from fleet.telemetry import FAULTED, IDLE, WORKING
 
 
 def heard(arms: int, slots: int, **told: np.ndarray) -> Heard:

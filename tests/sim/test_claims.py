@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from fleet.sim.claims import board, resolve
 from fleet.sim.kernel import step
-from fleet.sim.state import IDLE, WORKING, initial
+from fleet.sim.state import initial
+from fleet.telemetry import IDLE, WORKING
 
 
 def shop_of(small, places, arms=3, slots=4, **more):

@@ -13,7 +13,8 @@ from fleet.robot import ThermalLimits
 from fleet.sim.claims import board
 from fleet.sim.faults import hottest
 from fleet.sim.kernel import Step, step
-from fleet.sim.state import DONE, FAULTED, IDLE, WAITING, World, initial
+from fleet.sim.state import DONE, WAITING, World, initial
+from fleet.telemetry import FAULTED, IDLE
 from fleet.thermal import WINDING
 
 DT_S = 10.0

@@ -13,7 +13,8 @@ from fleet.motor import gen3_motors, thermal_data
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.sim.claims import board
 from fleet.sim.kernel import Step, step
-from fleet.sim.state import DONE, FAULTED, IDLE, RUNNING, WAITING, WORKING, State, initial
+from fleet.sim.state import DONE, RUNNING, WAITING, State, initial
+from fleet.telemetry import FAULTED, IDLE, WORKING
 from fleet.thermal import WINDING, gen3_network, thermal_model
 
 DT_S = 10.0

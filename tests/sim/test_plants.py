@@ -20,8 +20,9 @@ from fleet.sim.mujoco_plant import STRIDE, TIMESTEP_S, MujocoPlant, load_hands
 from fleet.sim.planner import Planner
 from fleet.sim.plants import ProfilePlant, row, sample
 from fleet.sim.reference import control, reference, still
-from fleet.sim.state import FAULTED, IDLE, WORKING, initial
+from fleet.sim.state import initial
 from fleet.sim.world import Arm, build_world
+from fleet.telemetry import FAULTED, IDLE, WORKING
 from fleet.thermal import gen3_network, thermal_model
 from scenarios.build import make_env
 from scenarios.scenario import ArmSpec, ArrivalSpec, JobStream, Planning, Scenario
