@@ -156,7 +156,8 @@ def show_command(scenario: ScenarioArg, as_json: JsonOption = False) -> None:
 def compare_command(
     scenario: ScenarioArg,
     policies: Annotated[str, typer.Option(help="Comma-separated.")] = ",".join(RULES),
-    seeds: Annotated[int, typer.Option(help="How many, from 0; 2 or more.")] = 10,
+    seeds: Annotated[int, typer.Option(help="How many; 2 or more.")] = 10,
+    first_seed: Annotated[int, typer.Option(help="The first of them; hold some out when you tune.")] = 0,
     baseline: Annotated[str, typer.Option(help="Paired differences are against this policy.")] = "round_robin",
     difficulty: DifficultyOption = "twin",
     as_json: JsonOption = False,
@@ -167,10 +168,13 @@ def compare_command(
     chosen = load(scenario)
     if seeds < 2:
         raise FleetError(f"--seeds must be 2 or more, so that there is something to compare (got {seeds}).")
+    if first_seed < 0:
+        raise FleetError(f"--first-seed must be 0 or more (got {first_seed}).")
+    chosen_seeds = range(first_seed, first_seed + seeds)
     names = [name.strip() for name in policies.split(",")]
     with progress_bar() as progress:
         how: Any = difficulty  # checked when the fleet is prepared
-        result = compare(chosen, names, seeds=range(seeds), baseline=baseline, difficulty=how, progress=progress)
+        result = compare(chosen, names, seeds=chosen_seeds, baseline=baseline, difficulty=how, progress=progress)
     if as_json:
         typer.echo(msgspec.json.format(msgspec.json.encode(result), indent=1).decode())
     else:

@@ -146,8 +146,8 @@ def interval(values: Array, rng: np.random.Generator) -> tuple[float, float]:
 def comparison_table(result: Comparison) -> Group:
     """A block per figure: mean and paired difference, each with its interval; narrow enough for 80 columns."""
     title = (
-        f"{result.scenario}, {len(result.seeds)} seeds: mean, paired difference to {result.baseline}, "
-        "95 % intervals; * excludes 0"
+        f"{result.scenario}, seeds {result.seeds[0]} to {result.seeds[-1]}: mean, paired difference to "
+        f"{result.baseline}, 95 % intervals; * excludes 0"
     )
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("", overflow="fold")
