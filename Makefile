@@ -41,7 +41,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "Installing thermofleet into $(VENV) (once, a few minutes; log in $(VENV)/install.log) …"
 	@{ $(PIP) setuptools && $(PIP) --no-build-isolation -e '.[dev]'; } >$(VENV)/install.log 2>&1 || { \
 	  echo "The packages could not be installed. The usual reason is no network: they are fetched once, later runs need none."; \
-	  grep -oE 'ERROR: .*' $(VENV)/install.log | grep -v 'conflicting dependencies' | sed 's/^ERROR:/pip said:/;q'; \
+	  grep -oE 'ERROR: .*' $(VENV)/install.log | grep -vE 'conflicting dependencies|ResolutionImpossible' | sed 's/^ERROR:/pip said:/;q'; \
 	  echo "All that pip said is in $(VENV)/install.log; 'make $(GOAL)' tries again."; exit 1; }
 	@touch $(STAMP)
 
