@@ -1,11 +1,17 @@
 """How much heat a shift asks of its fleet: the regime a scenario is in.
 
-Thermal load factor: offered heat over the heat the fleet can carry at the warning limit, under the best assignment.
 Doing job j on arm a for t_aj seconds would lift some motor's settled temperature over its idle one; the share of the
-room up to the warning limit that the hottest motor uses, times t_aj, is the arm time h_aj the job takes thermally. The
-factor λ is the least for which all jobs can be shared out (in parts) with no arm above λ times the shift:
-min λ, Σ_a x_aj = 1, Σ_j h_aj x_aj ≤ λ·T, x ≥ 0, a linear program. Below 0.6 a shift is relaxed; at 0.8–1.1 policies
-differ; above 1.2 no policy keeps the fleet below the limit. With t_aj in place of h_aj it is the load in time.
+room up to the warning limit that the hottest motor uses, times t_aj, is the arm time h_aj the job takes thermally.
+Three loads follow, each over the shift of length T, 1 being what the fleet can just carry:
+
+- time: the least λ for which all jobs can be shared out (in parts) with no arm busy for longer than λ·T,
+  min λ, Σ_a x_aj = 1, Σ_j t_aj x_aj ≤ λ·T, x ≥ 0, a linear program;
+- thermal, the thermal load factor: the same with h_aj, among the assignments that the arms have time for
+  (Σ_j t_aj x_aj ≤ T, or the time load's λ·T where that is more): what the best assignment asks;
+- blind: the hottest arm's share when every job goes in equal parts to all arms that can do it: what not knowing asks.
+
+Above 1.2 for the best assignment no policy keeps the fleet below the limit; below 0.6 for the blind one nobody needs to
+know; in between the choice of arm decides.
 """
 
 from dataclasses import dataclass
@@ -21,9 +27,10 @@ Array = np.ndarray
 
 @dataclass(frozen=True)
 class LoadFactor:
-    """Load of env 0 of a world: 1 is what the best assignment can just carry."""
+    """Loads of env 0 of a world: 1 is what the fleet can just carry."""
 
     thermal: float
+    blind: float
     time: float
 
     @property
@@ -31,21 +38,23 @@ class LoadFactor:
         """In a word."""
         if max(self.thermal, self.time) > 1.2:
             return "hopeless"
-        return "relaxed" if self.thermal < 0.6 else "heat decides"
+        return "relaxed" if self.blind < 0.6 else "heat decides"
 
 
 def load_factor(world: World) -> LoadFactor:
-    """Thermal and time load of the jobs of env 0."""
+    """Thermal, blind and time load of the jobs of env 0."""
     jobs = np.flatnonzero(world.jobs.exists[0] & (world.offers.plan[0] >= 0).any(axis=0))
     plan = world.offers.plan[0][:, jobs]
-    times = world.plans.times_s[plan]
-    time_s = times[..., 0] + world.jobs.repetitions[0, jobs] * times[..., 1] + times[..., 2]
-    share = _heat_share(world, plan)
     possible = plan >= 0
-    return LoadFactor(
-        thermal=_best_split(np.where(possible, share * time_s, np.inf), world.horizon_s),
-        time=_best_split(np.where(possible, time_s, np.inf), world.horizon_s),
-    )
+    if not possible.any():
+        return LoadFactor(0.0, 0.0, 0.0)
+    times = world.plans.times_s[plan]
+    length_s = times[..., 0] + world.jobs.repetitions[0, jobs] * times[..., 1] + times[..., 2]
+    busy = np.where(possible, length_s, 0.0) / world.horizon_s
+    heat = _heat_share(world, plan) * busy
+    time = _least(busy, possible)
+    blind = (heat * possible / possible.sum(axis=0)).sum(axis=1).max()
+    return LoadFactor(thermal=_least(heat, possible, busy, max(1.0, time)), blind=float(blind), time=time)
 
 
 def _heat_share(world: World, plan: Array) -> Array:
@@ -54,7 +63,7 @@ def _heat_share(world: World, plan: Array) -> Array:
     at_limit = np.full(world.start_c.shape, limit)
     air = world.ambient_c.mean(axis=0)
     rest = _settled(world, at_limit, world.rest.current_sq, world.rest.friction_w, air)
-    room = np.maximum(limit - rest, 0.1)
+    room = np.maximum(limit - rest, 1.0)  # an arm that idles at the limit has none left
     out = np.empty(plan.shape)
     for j in range(plan.shape[1]):
         rows = np.maximum(plan[:, j], 0)
@@ -69,23 +78,33 @@ def _settled(world: World, temp_c: Array, current_sq: Array, friction_w: Array, 
     return world.thermal.steady(drive_heat(temp_c, current_sq, friction_w, world.motors), air_c)[..., WINDING]
 
 
-def _best_split(hours: Array, horizon_s: float) -> float:
-    """Least largest load of an arm over the horizon when every job is shared out, [arm, job]; inf is impossible."""
-    arms, jobs = hours.shape
-    if jobs == 0:
-        return 0.0
-    possible = np.isfinite(hours)
-    cost = np.zeros(arms * jobs + 1)
-    cost[-1] = 1.0
+def _least(load: Array, possible: Array, busy: Array | None = None, most: float = np.inf) -> float:
+    """Least largest load of an arm when every job is shared out, [arm, job], while no arm's `busy` passes `most`."""
+    arms, jobs = load.shape
+    cost = np.append(np.zeros(arms * jobs), 1.0)
     whole = np.hstack([np.tile(np.eye(jobs), arms), np.zeros((jobs, 1))])
-    load = np.zeros((arms, arms * jobs + 1))
-    for a in range(arms):
-        load[a, a * jobs : (a + 1) * jobs] = np.where(possible[a], hours[a], 0.0) / horizon_s
-        load[a, -1] = -1.0
+    per_arm = [np.hstack([_block(load), np.full((arms, 1), -1.0)])]
+    bound = [np.zeros(arms)]
+    if busy is not None:
+        per_arm.append(np.hstack([_block(busy), np.zeros((arms, 1))]))
+        bound.append(np.full(arms, most * (1.0 + 1e-9)))
     upper = np.append(np.where(possible.ravel(), 1.0, 0.0), np.inf)
     found = linprog(
-        cost, load, np.zeros(arms), whole, np.ones(jobs), bounds=np.column_stack([np.zeros(len(cost)), upper])
+        cost,
+        np.vstack(per_arm),
+        np.concatenate(bound),
+        whole,
+        np.ones(jobs),
+        bounds=np.column_stack([np.zeros(len(cost)), upper]),
     )
     if not found.success:
         raise ValueError(f"The load of the shift could not be computed: {found.message}")
     return float(found.x[-1])
+
+
+def _block(values: Array) -> Array:
+    """[arm, arm · job] with row a holding the values of arm a in its own columns, for [arm, job]."""
+    arms, jobs = values.shape
+    out = np.zeros((arms, arms, jobs))
+    out[np.arange(arms), np.arange(arms)] = values
+    return out.reshape(arms, arms * jobs)

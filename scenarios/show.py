@@ -21,13 +21,15 @@ def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | Tex
     factory = ShiftFactory(fleet)
     factors = [load_factor(factory(np.random.SeedSequence(seed)).world) for seed in range(SEEDS)]
     thermal = float(np.mean([f.thermal for f in factors]))
+    blind = float(np.mean([f.blind for f in factors]))
     time = float(np.mean([f.time for f in factors]))
     told = [f"{c:g} °C at {t / 3600:g} h" for t, c in scenario.ambient.points]
     air = ", ".join(told) if len(told) > 1 else f"{scenario.ambient.at(np.zeros(1))[0]:g} °C"
     head = (
         f"{scenario.name}: {scenario.description}\n{scenario.horizon_s / 3600:g} h, a decision every "
         f"{scenario.decision_interval_s:g} s, {scenario.slots} slots, air {air}\n"
-        f"thermal load factor {thermal:.2f}, time load {time:.2f} (mean of {SEEDS} seeds): {_regime(factors)}"
+        f"thermal load factor {thermal:.2f} under the best assignment, {blind:.2f} under a blind one, "
+        f"time load {time:.2f} (mean of {SEEDS} seeds): {_regime(factors)}"
     )
     refused = [
         f"{arm}: {', '.join(sorted({e.place for e in es}))}" for arm, es in groupby(fleet.infeasible, lambda e: e.arm)

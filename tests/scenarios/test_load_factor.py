@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleet.thermal import WINDING, drive_heat
+from fleet.thermal import WINDING, drive_heat, gen3_network, thermal_model
 from scenarios.load_factor import LoadFactor, load_factor
 
 TICKS = 60
@@ -90,7 +90,7 @@ def test_doubling_the_jobs_doubles_the_load_and_no_job_is_none(small):
     arms = equal_arms(small, 2, content)
     jobs = [small.job(f"job_{i}", content) for i in range(4)]
     assert load_of(small, jobs, arms).thermal == pytest.approx(2 * load_of(small, jobs[:2], arms).thermal)
-    assert load_of(small, [], arms) == LoadFactor(thermal=0.0, time=0.0)
+    assert load_of(small, [], arms) == LoadFactor(thermal=0.0, blind=0.0, time=0.0)
 
 
 def test_heavier_is_never_cooler(small):
@@ -102,9 +102,31 @@ def test_heavier_is_never_cooler(small):
     assert loads[0] < loads[2]
 
 
+def test_the_best_assignment_is_one_that_the_arms_have_time_for(small):
+    """Arm 1 heats more; alone, arm 0 would take both jobs, but it has time for one only."""
+    content = small.work(payload_kg=small.WARM)
+    cycles = int((HORIZON_S - 5.0) / 10.0)
+    whole = replace(small.job("a", content), repetitions=cycles)
+    poor = thermal_model(gen3_network(cooling_factor=0.8))
+    arms = [small.arm(0, [content]), small.arm(1, [content], thermal=poor)]
+    both = load_of(small, [whole, replace(whole, name="b")], arms)
+    length = (5.0 + 10.0 * cycles) / HORIZON_S
+    assert both.time == pytest.approx(length)
+    alone = [load_of(small, [whole], [arm]).thermal for arm in (small.arm(0, [content]), arms[1])]
+    left = 2 - 1 / length  # jobs' worth of work that does not fit on arm 0
+    assert alone[1] * left > alone[0] / length  # so arm 1 is the one that decides
+    assert both.thermal == pytest.approx(alone[1] * left)
+    assert both.blind == pytest.approx(max(alone))
+
+
 @pytest.mark.parametrize(
-    ("thermal", "time", "word"),
-    [(0.3, 0.9, "relaxed"), (0.9, 0.9, "heat decides"), (1.3, 0.5, "hopeless"), (0.1, 1.3, "hopeless")],
+    ("thermal", "blind", "time", "word"),
+    [
+        (0.3, 0.5, 0.9, "relaxed"),
+        (0.3, 0.8, 0.9, "heat decides"),
+        (1.3, 1.5, 0.5, "hopeless"),
+        (0.1, 0.1, 1.3, "hopeless"),
+    ],
 )
-def test_the_regime_in_a_word(thermal, time, word):
-    assert LoadFactor(thermal=thermal, time=time).regime == word
+def test_the_regime_in_a_word(thermal, blind, time, word):
+    assert LoadFactor(thermal=thermal, blind=blind, time=time).regime == word
