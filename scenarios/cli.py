@@ -184,7 +184,7 @@ def compare_command(
 @app.command("demo")
 def demo_command(
     out: Annotated[Path, typer.Option(help="Folder for the two recordings.")] = Path("out/demo"),
-    seed: SeedOption = 0,
+    seed: SeedOption = 1,
 ) -> None:
     """The quickstart shift under two policies, side by side."""
     chosen = load("quickstart")
