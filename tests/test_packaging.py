@@ -36,7 +36,10 @@ def pins() -> dict[str, str]:
     return dict(line.split("==") for line in lines)
 
 
-@pytest.mark.parametrize("requirement", [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["dev"]])
+EXTRAS = [requirement for extra in PROJECT["optional-dependencies"].values() for requirement in extra]
+
+
+@pytest.mark.parametrize("requirement", [*PROJECT["dependencies"], *EXTRAS])
 def test_every_direct_dependency_is_pinned_within_its_range(requirement):
     found = re.fullmatch(r"([\w-]+)>=([\d.]+)(?:,<(\d+))?", requirement)
     assert found is not None
@@ -47,7 +50,7 @@ def test_every_direct_dependency_is_pinned_within_its_range(requirement):
 
 
 def test_nothing_is_pinned_that_is_not_asked_for():
-    asked = [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["dev"]]
+    asked = [*PROJECT["dependencies"], *EXTRAS]
     assert set(pins()) == {re.split("[><=]", requirement)[0] for requirement in asked}
 
 

@@ -12,17 +12,16 @@ import logging
 import math
 import time
 import weakref
-from collections import deque
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
-from queue import Empty, SimpleQueue
-from typing import Any, Generic, Self, TypeVar
+from contextlib import ExitStack
+from typing import Any, Self
 
 import zenoh
 from zenoh import ext as advanced
 
 from fleet.bus import keys
 from fleet.bus.exchange import Condition, Heard, Scores, Words, assemble, check, checked_arms
+from fleet.bus.inbox import Inbox, LastWords
 from fleet.bus.messages import DifficultyWord, Info, State, encode, encoding
 from fleet.bus.router import Router, loopback, open_client
 from fleet.bus.wording import Reader, condition_of, scores_of, spoken
@@ -41,61 +40,6 @@ a few per arm, the rest is patience with strangers."""
 
 _OPEN_TIMEOUT_S = 20.0
 
-Content = TypeVar("Content", Condition, Scores)
-
-
-class _Memory(Generic[Content]):
-    """The last words of one topic that one arm received, per sender."""
-
-    def __init__(self, arms: int) -> None:
-        self.ticks = [-1] * arms
-        self.words: list[Content | None] = [None] * arms
-
-    def forget(self, tick: int) -> None:
-        """Know nothing, and keep nothing that was said at `tick` or before."""
-        self.ticks = [tick] * len(self.ticks)
-        self.words = [None] * len(self.words)
-
-    def keep(self, sender: int, tick: int, word: Content) -> bool:
-        """Whether the word is newer than what was known of the sender."""
-        if tick <= self.ticks[sender]:
-            return False
-        self.ticks[sender] = tick
-        self.words[sender] = word
-        return True
-
-
-class _Inbox:
-    """Samples on their way from Zenoh's receiving threads to the one that reads; full, it lets go of the oldest.
-
-    The reader is woken once, when as many have come as it waits for: a wake for each would cost more than reading it.
-    """
-
-    def __init__(self, limit: int) -> None:
-        self._samples: deque[zenoh.Sample] = deque(maxlen=limit)
-        self._limit = limit
-        self._wanted = math.inf
-        self._enough: SimpleQueue[None] = SimpleQueue()
-
-    def hear(self, sample: zenoh.Sample) -> None:
-        """Take a sample; called by receiving threads."""
-        self._samples.append(sample)
-        if len(self._samples) >= self._wanted:
-            self._wanted = math.inf
-            self._enough.put(None)
-
-    def wait(self, count: int, deadline_s: float) -> None:
-        """Return when `count` samples are there, when time is up, or now and then earlier."""
-        self._wanted = min(count, self._limit)
-        if len(self._samples) < self._wanted:
-            with suppress(Empty):
-                self._enough.get(timeout=max(0.0, deadline_s - time.monotonic()))
-        self._wanted = math.inf
-
-    def take(self) -> list[zenoh.Sample]:
-        """All that is there, oldest first."""
-        return [self._samples.popleft() for _ in range(len(self._samples))]
-
 
 class _Client:
     """One arm on the bus: its session, what it says with, and what it has heard."""
@@ -105,13 +49,13 @@ class _Client:
         self._index = index
         self._reader = reader
         self._limit = max(_BACKLOG, 16 * len(arms))
-        self._inbox = _Inbox(self._limit)
+        self._inbox = Inbox(self._limit)
         self.present: set[int] = set()
         """Arms whose liveliness token this arm sees."""
         self._awaited: set[int] = set()
         """Those of them that were there when the tick began, and have not been away since."""
-        self.conditions = _Memory[Condition](len(arms))
-        self.scores = _Memory[Scores](len(arms))
+        self.conditions = LastWords[Condition](len(arms))
+        self.scores = LastWords[Scores](len(arms))
         self.misses = [0] * len(arms)
         """Ticks in a row in which a peer was not heard."""
 

@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 import zenoh
 
-from fleet.bus import keys, session
+from fleet.bus import keys
 from fleet.bus.exchange import Exchange
+from fleet.bus.inbox import Inbox
 from fleet.bus.memory import MemoryExchange
 from fleet.bus.messages import DifficultyWord, Info, State, decode, encode, encoding
 from fleet.bus.router import Router, open_client
@@ -163,7 +164,7 @@ def sample(number: int) -> Any:
 
 
 def test_an_inbox_that_is_full_lets_go_of_the_oldest():
-    inbox = session._Inbox(4)
+    inbox = Inbox(4)
     for number in range(10):
         inbox.hear(sample(number))
     assert inbox.take() == [6, 7, 8, 9]
@@ -171,7 +172,7 @@ def test_an_inbox_that_is_full_lets_go_of_the_oldest():
 
 
 def test_an_inbox_wakes_its_reader_when_enough_has_come():
-    inbox = session._Inbox(100)
+    inbox = Inbox(100)
     inbox.hear(sample(0))
     talker = threading.Thread(target=lambda: [inbox.hear(sample(number)) for number in range(1, 50)])
     talker.start()
