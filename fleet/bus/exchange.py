@@ -1,7 +1,7 @@
 """The exchange: what every arm says at a tick, and what every arm then knows of every other.
 
 Two of them exist: `MemoryExchange` without a bus, and `ZenohExchange` over one. At zero delay and no loss they give the
-same arrays. A new episode begins where the time of the words goes back: what was heard before is then forgotten.
+same arrays. `begin` starts a new episode: what was heard before is forgotten.
 """
 
 import math
@@ -67,11 +67,16 @@ class Exchange(Protocol):
     late: int
     """Words that did not reach a peer in the tick they were due, over all ticks."""
 
+    def begin(self, rng: np.random.Generator | None = None) -> None:
+        """A new episode: forget what was heard; chance, where there is any, comes from `rng` from now on."""
+        ...
+
     def share(self, words: Words) -> Heard:
         """Say the words of one tick, and return what every arm knows thereafter.
 
         Raises:
-            ValueError: the words do not fit the arms, or hold numbers that cannot be said.
+            ValueError: the words do not fit the arms, hold numbers that cannot be said, or are of a time before the
+                last ones (`begin` first).
             BusError: the bus could not be opened, or is closed.
         """
         ...
@@ -190,6 +195,12 @@ def check(words: Words, arms: tuple[str, ...]) -> None:
             raise ValueError(f"Words.{name} must be finite, or NaN where not known (got {getattr(words, name)}).")
     if not np.isin(words.mode, range(len(MODES))).all():
         raise ValueError(f"Words.mode must be one of 0..{len(MODES) - 1} (got {words.mode}).")
+
+
+def check_order(time_s: float, last_s: float) -> None:
+    """Refuse words of a time before the last ones."""
+    if time_s < last_s:
+        raise ValueError(f"Words of {time_s:g} s come after those of {last_s:g} s: begin() starts a new episode.")
 
 
 def _interned(known: Sequence[Sequence[Word | None]]) -> tuple[Array, list[Word]]:

@@ -8,7 +8,7 @@ from typing import Self
 import networkx as nx
 import numpy as np
 
-from fleet.bus.exchange import Array, Condition, Heard, Scores, Words, assemble, check, checked_arms
+from fleet.bus.exchange import Array, Condition, Heard, Scores, Words, assemble, check, check_order, checked_arms
 from fleet.errors import BusError, nearest
 
 
@@ -64,6 +64,12 @@ class MemoryExchange:
         self._closed = False
         self._forget()
 
+    def begin(self, rng: np.random.Generator | None = None) -> None:
+        """A new episode: forget what was heard and what is on its way; losses are drawn from `rng` from now on."""
+        self._forget()
+        if rng is not None:
+            self._rng = rng
+
     def share(self, words: Words) -> Heard:
         """Say the words of one tick, and return what every arm knows thereafter.
 
@@ -74,8 +80,7 @@ class MemoryExchange:
         if self._closed:
             raise BusError("This exchange is closed.")
         check(words, self.arms)
-        if words.time_s < self._now_s:
-            self._forget()
+        check_order(words.time_s, self._now_s)
         self._now_s = now_s = float(words.time_s)
         spoken = self._speak(words)
         self._on_the_way.append(spoken)

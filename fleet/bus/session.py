@@ -16,11 +16,12 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Any, Self
 
+import numpy as np
 import zenoh
 from zenoh import ext as advanced
 
 from fleet.bus import keys
-from fleet.bus.exchange import Condition, Heard, Scores, Words, assemble, check, checked_arms
+from fleet.bus.exchange import Condition, Heard, Scores, Words, assemble, check, check_order, checked_arms
 from fleet.bus.inbox import Inbox, LastWords
 from fleet.bus.messages import DifficultyWord, Info, State, encode, encoding
 from fleet.bus.router import Router, loopback, open_client
@@ -269,6 +270,13 @@ class ZenohExchange:
             raise
         return self
 
+    def begin(self, rng: np.random.Generator | None = None) -> None:
+        """A new episode: forget what was heard. The bus draws no chance, so `rng` is not used."""
+        for client in self._clients:
+            client.begin(self._tick, self._now_s)  # what waits to be read is of the last episode
+            client.forget(self._tick)
+        self._now_s = -math.inf
+
     def share(self, words: Words) -> Heard:
         """Say the words of one tick, and return what every arm knows thereafter.
 
@@ -280,12 +288,10 @@ class ZenohExchange:
             BusError: the bus could not be opened, was lost, or is closed.
         """
         check(words, self.arms)
+        check_order(words.time_s, self._now_s)
         self.open()
         for client in self._clients:
             client.begin(self._tick, self._now_s)
-        if words.time_s < self._now_s:
-            for client in self._clients:
-                client.forget(self._tick)
         self._tick += 1
         self._now_s = float(words.time_s)
         self._reader.forget()

@@ -89,6 +89,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         self.possible_agents = list(world.arms)
         self.agents: list[str] = []
         self._exchange = exchange or MemoryExchange(world.arms)
+        self._spoken_before = 0
         self.layout = Layout(len(world.arms), world.slots)
         low, high = self.layout.bounds
         self.observation_spaces = {
@@ -123,8 +124,8 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
 
     @property
     def messages(self) -> int:
-        """Words that reached a peer so far."""
-        return self._exchange.delivered
+        """Words that reached a peer in this episode."""
+        return self._exchange.delivered - self._spoken_before
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """Space of an agent's observation; the same object on every call."""
@@ -144,6 +145,8 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         else:
             entropy = self._seeds.spawn(1)[0]
         self._episode = self._make_episode(entropy)
+        self._exchange.begin(self._episode.rng.spawn(1)[0])
+        self._spoken_before = self._exchange.delivered
         self._state = initial(self.world)
         self.agents = list(self.possible_agents)
         self.events = []

@@ -134,8 +134,21 @@ def test_a_new_episode_knows_nothing_of_the_last(make_words):
     rng = np.random.default_rng(0)
     heard = [exchange.share(make_words(rng, 4, 10.0 * tick)) for tick in range(3)][-1]
     assert np.isfinite(heard.age_s).all()
+    exchange.begin()
     heard = exchange.share(make_words(rng, 4, 0.0))
     np.testing.assert_array_equal(np.isinf(heard.age_s), ~np.eye(4, dtype=bool))
+
+
+def test_a_new_episode_may_bring_its_own_chance(make_words, assert_same):
+    exchange = MemoryExchange(ARMS, loss=0.5, rng=np.random.default_rng(0))
+
+    def episode() -> list[Heard]:
+        exchange.begin(np.random.default_rng(3))
+        rng = np.random.default_rng(1)
+        return [exchange.share(make_words(rng, 4, 10.0 * tick)) for tick in range(10)]
+
+    for one, other in zip(episode(), episode(), strict=True):
+        assert_same(one, other)
 
 
 def test_what_was_said_does_not_change_with_the_callers_arrays(make_words):

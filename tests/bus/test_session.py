@@ -42,6 +42,9 @@ def test_a_new_episode_knows_nothing_of_the_last_but_what_is_said_anew(make_word
     rng = np.random.default_rng(1)
     with ZenohExchange(ARMS, "again", timeout_s=PATIENT_S) as bus, MemoryExchange(ARMS) as memory:
         for time_s in (0.0, 10.0, 20.0, 0.0, 10.0, 0.0):
+            if time_s == 0.0:
+                bus.begin()
+                memory.begin()
             words = make_words(rng, 3, time_s)
             assert_same(bus.share(words), memory.share(words))
 
@@ -50,7 +53,10 @@ def test_a_new_episode_knows_nothing_of_the_last_but_what_is_said_anew(make_word
 def test_an_exchange_is_an_exchange(make: Callable[[], Exchange], make_words):
     """The contract that the environment relies on, for both."""
     with make() as exchange:
+        exchange.begin(np.random.default_rng(0))
         heard = exchange.share(make_words(np.random.default_rng(0), 3, 0.0))
+        with pytest.raises(ValueError, match=r"-1 s come after those of 0 s: begin\(\)"):
+            exchange.share(make_words(np.random.default_rng(0), 3, -1.0))
         assert exchange.arms == ARMS
         assert (exchange.delivered, exchange.malformed, exchange.late) == (6, 0, 0)
         assert heard.mode.dtype.kind == "i"

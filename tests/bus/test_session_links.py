@@ -128,6 +128,7 @@ def test_in_a_new_episode_nothing_is_known_of_an_arm_that_is_silent(gate, make_w
     with ZenohExchange(ARMS, "f", gate.endpoint, timeout_s=SHORT_S) as bus:
         until_all_is_heard(bus, make_words, 1e6)
         gate.says[1].clear()
+        bus.begin()
         heard = bus.share(make_words(rng, 3, 0.0))
         assert np.isinf(heard.age_s[[0, 2], 1]).all()
         assert np.isnan(heard.headroom_k[[0, 2], 1]).all()

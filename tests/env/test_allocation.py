@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 
+from fleet.bus.memory import MemoryExchange
 from fleet.bus.session import ZenohExchange
 from fleet.env import allocation_v0
 from fleet.env.allocation_v0 import AllocationEnv, Episode, parallel_env
@@ -370,3 +371,24 @@ def test_watcher_and_event_log_see_every_step(make) -> None:
     kinds = [e.kind for e in env.events]
     assert kinds.count("finish") == trace[-1][4]["arm_0"]["jobs_done"]
     assert {"award", "release", "finish", "home"} <= set(kinds)
+
+
+def test_an_episode_with_losses_and_delay_repeats_by_seed(small):
+    """Also when the same env has run another one in between."""
+    make = small.Shifts(arms=3, jobs=6, ticks=30)
+    names = make(np.random.SeedSequence(0)).world.arms
+    exchange = MemoryExchange(names, loss=0.4, delay_s=20.0, rng=np.random.default_rng(9))
+    env = parallel_env(make, exchange=exchange)
+
+    def trace(seed: int) -> list[np.ndarray]:
+        env.reset(seed=seed)
+        out = [env.state()]
+        while env.agents:
+            env.step(dict.fromkeys(env.agents, 0))
+            out.append(env.state())
+        return out
+
+    first, messages = trace(4), env.messages
+    trace(5)
+    np.testing.assert_array_equal(trace(4), first)
+    assert env.messages == messages
