@@ -11,8 +11,8 @@ import sys
 import zenoh
 
 KEYS = "thermofleet/v1/*/arm/*/{}"
-WAIT_S = 60.0
-"""For the fleet to come."""
+WAIT_S = 600.0
+"""For the fleet to come: at first it trains its twins."""
 QUIET_S = 5.0
 """Without a word for so long, it has gone."""
 
@@ -21,12 +21,21 @@ def main(port):
     """Print, every ten minutes of the shift, how each arm says it is; return how many words were heard."""
     config = {
         "mode": "client",
-        "connect": {"endpoints": [f"tcp/127.0.0.1:{port}"], "timeout_ms": int(1000 * WAIT_S)},
+        "connect": {
+            "endpoints": [f"tcp/127.0.0.1:{port}"],
+            "timeout_ms": int(1000 * WAIT_S),
+            "retry": {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 1},
+        },
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
     }
     inbox = queue.SimpleQueue()
     heard, shown = 0, {}
-    with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
+    print(f"waiting for a fleet at port {port}", flush=True)
+    try:
+        opened = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+    except zenoh.ZError:
+        sys.exit(f"No fleet listened at port {port} within {WAIT_S:.0f} s; start one with --listen {port}.")
+    with opened as session:
         session.declare_subscriber(KEYS.format("state"), inbox.put)
         session.declare_subscriber(KEYS.format("difficulty"), inbox.put)
         while True:

@@ -212,14 +212,14 @@ def air_offsets(scenario: Scenario) -> np.ndarray:
     return drawn + np.array([arm.ambient_offset_k for arm in scenario.arms])
 
 
-def open_exchange(bus: BusName, arms: tuple[str, ...], fleet: str, port: int = 0) -> Exchange:
-    """The exchange by name; over Zenoh with an in-process router on a loopback port (0: a free one)."""
+def open_exchange(bus: BusName, arms: tuple[str, ...], fleet: str, endpoint: str | None = None) -> Exchange:
+    """The exchange by name; over Zenoh by the router at a loopback endpoint, or by an in-process one of its own."""
     choose("bus", bus, BusName)
     if bus == "memory":
         return MemoryExchange(arms)
     from fleet.bus.session import ZenohExchange
 
-    return ZenohExchange(arms, fleet, port=port)
+    return ZenohExchange(arms, fleet, endpoint)
 
 
 def make_env(
@@ -251,10 +251,10 @@ def make_env(
 
 
 def env_of(
-    fleet: Fleet, *, plant: PlantName = "profile", bus: BusName = "memory", port: int = 0, **options: Any
+    fleet: Fleet, *, plant: PlantName = "profile", bus: BusName = "memory", endpoint: str | None = None, **options: Any
 ) -> AllocationEnv:
-    """The `ParallelEnv` of a fleet that is ready; `port` as in `open_exchange`, options as in `AllocationEnv`."""
+    """The `ParallelEnv` of a fleet that is ready; `endpoint` as in `open_exchange`, options as in `AllocationEnv`."""
     choose("plant", plant, PlantName)
     names = tuple(arm.robot.name for arm in fleet.arms)
-    exchange = open_exchange(bus, names, fleet.scenario.name, port)
+    exchange = open_exchange(bus, names, fleet.scenario.name, endpoint)
     return parallel_env(ShiftFactory(fleet, plant), exchange=exchange, weights=fleet.scenario.reward, **options)

@@ -105,8 +105,8 @@ def run_command(
         raise FleetError(f"--listen needs a port from 1 to 65535 and --bus zenoh (got {listen}, {bus}).")
     where = out or Path("runs") / f"{chosen.name}-{policy}-{seed}"
     check_free(where, overwrite=overwrite)
-    with progress_bar() as progress:
-        result = _run_into(chosen, spec, where, overwrite, progress, listen)
+    with router_at(listen) as endpoint, progress_bar() as progress:
+        result = _run_into(chosen, spec, where, overwrite, progress, endpoint)
     if as_json:
         typer.echo(json.dumps({"out": str(where), **_figures(result)}, indent=1))
     else:
@@ -221,7 +221,9 @@ def _spec(policy: str, seed: int, plant: str, bus: str, difficulty: str) -> Any:
     return RunSpec(policy=policy, seed=seed, **fields)
 
 
-def _run_into(scenario: Scenario, spec: Any, out: Path, overwrite: bool, progress: Progress, port: int = 0) -> Any:
+def _run_into(
+    scenario: Scenario, spec: Any, out: Path, overwrite: bool, progress: Progress, endpoint: str | None = None
+) -> Any:
     from scenarios.build import prepare
     from scenarios.folder import new_folder, write
     from scenarios.run import run
@@ -229,10 +231,22 @@ def _run_into(scenario: Scenario, spec: Any, out: Path, overwrite: bool, progres
     with new_folder(out, overwrite=overwrite) as folder:
         fleet = prepare(scenario, difficulty=spec.difficulty, progress=progress)
         with stop_on_interrupt() as stopped:
-            result = run(fleet, spec, progress=progress, stopped=stopped, port=port)
+            result = run(fleet, spec, progress=progress, stopped=stopped, endpoint=endpoint)
             progress("writing", 0.0)
             write(result, folder)
     return result
+
+
+@contextmanager
+def router_at(port: int) -> Iterator[str | None]:
+    """The endpoint of a router on a loopback port, open before the fleet comes, so that its first words are heard."""
+    if not port:
+        yield None
+        return
+    from fleet.bus.router import Router
+
+    with Router(port) as router:
+        yield router.endpoint
 
 
 @contextmanager

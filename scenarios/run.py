@@ -61,19 +61,19 @@ def run(
     progress: Progress = quiet,
     stopped: Callable[[], bool] = lambda: False,
     record: bool = True,
-    port: int = 0,
+    endpoint: str | None = None,
 ) -> RunResult:
     """Work the shift; `stopped` turning true ends it early, between two steps, with what there is.
 
     Args:
         record: Keep telemetry; sweeps do without.
-        port: Loopback port of the fleet's router, for others to listen on; 0 takes a free one.
+        endpoint: Of a Zenoh router on loopback that others listen on too; by default the fleet has its own.
     """
     policy = make_policy(spec.policy)
     policy_seed, reading_seed = np.random.SeedSequence([spec.seed, 1]).spawn(2)
     policy.reset(np.random.default_rng(policy_seed))
     recorder = _Recorder(fleet.scenario, np.random.default_rng(reading_seed)) if record else None
-    env = env_of(fleet, plant=spec.plant, bus=spec.bus, port=port, keep_events=True, watch=recorder)
+    env = env_of(fleet, plant=spec.plant, bus=spec.bus, endpoint=endpoint, keep_events=True, watch=recorder)
     finished, reward = False, 0.0
     try:
         if recorder is not None:

@@ -191,21 +191,12 @@ class ZenohExchange:
     Nothing is opened before the first `share` or the `with` block. One thread at a time may use an exchange.
     """
 
-    def __init__(
-        self,
-        arms: Sequence[str],
-        fleet: str,
-        endpoint: str | None = None,
-        *,
-        port: int = 0,
-        timeout_s: float = 2.0,
-    ) -> None:
+    def __init__(self, arms: Sequence[str], fleet: str, endpoint: str | None = None, *, timeout_s: float = 2.0) -> None:
         """Prepare an exchange between `arms`.
 
         Args:
             fleet: Name of the fleet, part of every key.
-            endpoint: Of a router on loopback, as `tcp/127.0.0.1:7447`; None for a router of its own.
-            port: Of its own router on 127.0.0.1; 0 takes a free one.
+            endpoint: Of a router on loopback, as `tcp/127.0.0.1:7447`; None for a router of its own on a free port.
             timeout_s: How long `share` waits for words that do not come.
 
         Raises:
@@ -219,7 +210,6 @@ class ZenohExchange:
         self.late = 0
         self._fleet = fleet
         self._endpoint = None if endpoint is None else loopback(endpoint)
-        self._port = port
         self._timeout_s = timeout_s
         self._reader = Reader(fleet, self.arms)
         self._clients: list[_Client] = []
@@ -248,7 +238,7 @@ class ZenohExchange:
             return self
         try:
             if self._endpoint is None:
-                self._endpoint = self._resources.enter_context(Router(self._port)).endpoint
+                self._endpoint = self._resources.enter_context(Router()).endpoint
             sessions: list[zenoh.Session] = []
             for _ in self.arms:
                 sessions.append(open_client(self._endpoint, timeout_s=self._timeout_s))
