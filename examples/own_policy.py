@@ -1,35 +1,50 @@
-"""An own policy on the environment: leave a job alone when it would leave too little headroom.
+"""An own policy: least difficulty, but an arm with little headroom rests.
 
-Run: python examples/own_policy.py
+Compare it with the rules that come along:
+    thermofleet compare active_waiting --policies round_robin,least_difficulty,examples/own_policy.py:Careful
+Or work one shift by hand, as below:
+    python examples/own_policy.py
 """
 
-import numpy as np
+from agents.policy import WAIT
+from agents.rules import LeastDifficulty
 
-import scenarios
-from agents.policy import WAIT, legal_slots
+HEADROOM_K = 3.0
 
 
-def careful(observation):
-    """The easiest legal job, but nothing for an arm with less than 10 K of headroom."""
-    slots = legal_slots(observation)
-    if not slots or observation.headroom_k < 10:
-        return WAIT
-    return slots[int(np.argmin(observation.difficulty[slots]))] + 1
+class Careful:
+    """What least_difficulty says, unless the hottest motor is close to its warning limit."""
+
+    def __init__(self):
+        self._rule = LeastDifficulty()
+
+    def reset(self, rng):
+        """Begin a shift; `rng` is the only source of chance a policy should use."""
+        self._rule.reset(rng)
+
+    def act(self, observations):
+        """One action per arm: WAIT, or k for the job in slot k; see fleet/env/observation.py for what an arm knows."""
+        wanted = self._rule.act(observations)
+        return {arm: WAIT if seen.headroom_k < HEADROOM_K else wanted[arm] for arm, seen in observations.items()}
 
 
 def main(horizon_s=7200, difficulty="twin"):
+    """One shift of quickstart under each of the two."""
+    import numpy as np
+
+    import scenarios
+
     env = scenarios.make_env("quickstart", horizon_s=horizon_s, difficulty=difficulty)
-    env.reset(seed=0)
-    total = 0.0
-    while env.agents:
-        knowledge = env.knowledge()  # by name; the same numbers as the observation vectors
-        _, rewards, _, _, infos = env.step({arm: careful(knowledge[arm]) for arm in env.agents})
-        total += rewards["arm_0"]
-    print(f"reward {total:.1f}, jobs done {infos['arm_0']['jobs_done']:.0f}")
-    for arm, info in infos.items():
-        print(f"{arm}: peak {info['peak_c']:.1f} °C, faults {info['faults']:.0f}")
+    for policy in (LeastDifficulty(), Careful()):
+        policy.reset(np.random.default_rng(0))
+        env.reset(seed=0)
+        reward, infos = 0.0, {}
+        while env.agents:
+            _, rewards, _, _, infos = env.step(policy.act(env.knowledge()))
+            reward += rewards["arm_0"]  # all arms share one reward
+        peaks = ", ".join(f"{arm} {info['peak_c']:.1f} °C" for arm, info in infos.items())
+        print(f"{type(policy).__name__}: reward {reward:.1f}, jobs {infos['arm_0']['jobs_done']:.0f}, peaks {peaks}")
     env.close()
-    return total
 
 
 if __name__ == "__main__":

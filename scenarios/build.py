@@ -26,7 +26,7 @@ from fleet.sim.planner import Planner
 from fleet.sim.plants import ProfilePlant
 from fleet.sim.world import Arm, build_world, warm_start
 from fleet.thermal import ThermalModel, ThermalSpread, gen3_network, spread_motors, thermal_model
-from scenarios.jobs import all_works, draw_jobs, rehearsal_works
+from scenarios.jobs import all_works, draw_jobs, rehearsal_works, works_of
 from scenarios.load import load, override
 from scenarios.scenario import Scenario
 
@@ -146,19 +146,25 @@ def _plan(
     return possible, refused
 
 
+TOLD = 4
+"""Of how many arms a sentence gives the reason."""
+
+
 def _check_feasible(
-    scenario: Scenario, plans: list[dict[Work, tuple[Plan, ...]]], refused: list[InfeasibleJob]
+    scenario: Scenario, plans: Sequence[Mapping[Work, tuple[Plan, ...]]], refused: Sequence[InfeasibleJob]
 ) -> None:
     for i, stream in enumerate(scenario.jobs):
-        for work in all_works(scenario):
-            own = work.kind == stream.kind and tuple(p.name for p in work.places) == stream.places
-            if own and not any(work in possible for possible in plans):
-                places = {place.name for place in work.places}
-                reasons = " ".join(dict.fromkeys(str(e) for e in refused if e.place in places))
-                raise ScenarioError(
-                    f"{scenario.name}: jobs[{i}] '{stream.name}' with {work.payload_kg:g} kg can be done by no arm. "
-                    + reasons
-                )
+        for work in works_of(scenario, stream):
+            if any(work in possible for possible in plans):
+                continue
+            reasons = list(
+                dict.fromkeys(f"{e.arm} at '{e.place}': {e.reason}" for e in refused if e.place in stream.places)
+            )
+            more = f"; and {len(reasons) - TOLD} more" if len(reasons) > TOLD else ""
+            raise ScenarioError(
+                f"{scenario.name}.toml: jobs[{i}].places: no arm can do '{stream.name}' with {work.payload_kg:g} kg "
+                f"({'; '.join(reasons[:TOLD])}{more}); move the places or an arm, or make the load lighter."
+            )
 
 
 def _with_oracle(scenario: Scenario, arm: Arm) -> Arm:

@@ -20,11 +20,12 @@ from rich.progress import BarColumn, SpinnerColumn, TaskProgressColumn, TextColu
 from rich.progress import Progress as Progressbar
 from rich.table import Table
 
-from agents.rules import RULES, make_policy
+from agents.rules import RULES
 from fleet.errors import FleetError
 from fleet.metrics import Metrics
 from scenarios.hold import hold_command
 from scenarios.load import library, load
+from scenarios.policies import label, policy_of
 from scenarios.scenario import Scenario
 
 app = typer.Typer(
@@ -37,7 +38,7 @@ out_console = Console()
 err_console = Console(stderr=True)
 
 ScenarioArg = Annotated[str, typer.Argument(help="A library name (see `thermofleet list`) or a .toml file.")]
-PolicyOption = Annotated[str, typer.Option(help=f"{', '.join(RULES)}.")]
+PolicyOption = Annotated[str, typer.Option(help=f"{', '.join(RULES)}, or an own FILE.py:CLASS.")]
 SeedOption = Annotated[int, typer.Option(help="Draws the jobs, the noise and the policy's chance; 0 or more.")]
 PlantOption = Annotated[str, typer.Option(help="profile (planned heat) or mujoco (closed loop in one scene).")]
 BusOption = Annotated[str, typer.Option(help="zenoh (in-process router) or memory.")]
@@ -45,6 +46,11 @@ DifficultyOption = Annotated[str, typer.Option(help="What scores the plans: twin
 JsonOption = Annotated[bool, typer.Option("--json", help="Print figures as JSON.")]
 Progress = Callable[[str, float], None]
 
+LONG_STAGES = {
+    "training": "Training the twins that are not in the cache: a minute or two for a fleet of four …",
+    "comparing": "Comparing the policies …",
+}
+"""What is said of a stage that takes long where there is no terminal to draw a bar on."""
 USAGE, INTERRUPTED = 2, 130
 """Exit codes: something the user can mend; Ctrl-C."""
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS)
@@ -103,7 +109,7 @@ def run_command(
     spec = _spec(policy, seed, plant, bus, difficulty)
     if not 0 <= listen <= 65535 or (listen and bus == "memory"):
         raise FleetError(f"--listen needs a port from 1 to 65535 and --bus zenoh (got {listen}, {bus}).")
-    where = out or Path("runs") / f"{chosen.name}-{policy}-{seed}"
+    where = out or Path("runs") / f"{chosen.name}-{label(policy)}-{seed}"
     check_free(where, overwrite=overwrite)
     with router_at(listen) as endpoint, progress_bar() as progress:
         result = _run_into(chosen, spec, where, overwrite, progress, endpoint)
@@ -111,7 +117,7 @@ def run_command(
         typer.echo(json.dumps({"out": str(where), **_figures(result)}, indent=1))
     else:
         _say(f"{chosen.name}, seed {seed}", out_console)
-        out_console.print(table_of({policy: result.metrics}))
+        out_console.print(table_of({label(policy): result.metrics}))
         if result.finished:
             _say(f"Recorded in {where}; open {where / 'report.html'} in a browser.", out_console)
     if not result.finished:
@@ -155,7 +161,7 @@ def show_command(scenario: ScenarioArg, as_json: JsonOption = False) -> None:
 @app.command("compare")
 def compare_command(
     scenario: ScenarioArg,
-    policies: Annotated[str, typer.Option(help="Comma-separated.")] = ",".join(RULES),
+    policies: Annotated[str, typer.Option(help="Comma-separated; an own one as FILE.py:CLASS.")] = ",".join(RULES),
     seeds: Annotated[int, typer.Option(help="How many; 2 or more.")] = 10,
     first_seed: Annotated[int, typer.Option(help="The first of them; hold some out when you tune.")] = 0,
     baseline: Annotated[str, typer.Option(help="Paired differences are against this policy.")] = "round_robin",
@@ -208,10 +214,7 @@ def _spec(policy: str, seed: int, plant: str, bus: str, difficulty: str) -> Any:
     from scenarios.build import BusName, DifficultyName, PlantName, choose
     from scenarios.run import RunSpec
 
-    try:
-        make_policy(policy)
-    except ValueError as error:
-        raise FleetError(str(error)) from error
+    policy_of(policy)
     if seed < 0:
         raise FleetError(f"--seed must be 0 or more (got {seed}).")
     choose("plant", plant, PlantName)
@@ -296,6 +299,10 @@ def progress_bar() -> Iterator[Progress]:
         task = bar.add_task("starting", total=1.0)
 
         def tell(stage: str, share: float) -> None:
+            if not err_console.is_terminal and stage != bar.tasks[0].description and share < 1.0:
+                said = LONG_STAGES.get(stage)
+                if said:
+                    _say(said)
             bar.update(task, description=stage, completed=share)
 
         try:
@@ -330,8 +337,8 @@ def table_of(results: dict[str, Metrics]) -> Table:
         ("availability", lambda m: f"{m.availability:.1%}"),
         ("energy, Wh", lambda m: f"{m.energy_wh:.0f}"),
     ]
-    for label, text in rows:
-        table.add_row(label, *(text(m) for m in results.values()))
+    for what, text in rows:
+        table.add_row(what, *(text(m) for m in results.values()))
     for arm in next(iter(results.values())).peak_c:
         table.add_row(f"peak {arm}, °C", *(f"{m.peak_c[arm]:.1f}" for m in results.values()))
     return table

@@ -12,10 +12,10 @@ from rich.table import Table
 from rich.text import Text
 from scipy.stats import bootstrap, trim_mean
 
-from agents.rules import make_policy
 from fleet.errors import FleetError
 from fleet.metrics import Metrics
 from scenarios.build import DifficultyName, Fleet, Progress, prepare, quiet
+from scenarios.policies import label, policy_of
 from scenarios.run import RunSpec, run
 from scenarios.scenario import Scenario
 
@@ -80,11 +80,8 @@ def compare(
     Raises:
         FleetError: unknown policy, one named twice, or a baseline that is not among the policies.
     """
-    try:
-        for policy in policies:
-            make_policy(policy)
-    except ValueError as error:
-        raise FleetError(str(error)) from error
+    for policy in policies:
+        policy_of(policy)
     for i, policy in enumerate(policies):
         if policy in policies[:i]:
             raise FleetError(f"The policy '{policy}' is named twice; every policy is compared once.")
@@ -160,9 +157,9 @@ def comparison_table(result: Comparison) -> Group:
             f = figures[name]
             mean = (f"{f.mean:.{digits}f}", f"{f.low:.{digits}f} … {f.high:.{digits}f}")
             if policy == result.baseline:
-                table.add_row(f"  {policy}", *mean)
+                table.add_row(f"  {label(policy)}", *mean)
                 continue
             between = f"{f.difference_low:+.{digits}f} … {f.difference_high:+.{digits}f}"
             star = "*" if f.difference_low > 0 or f.difference_high < 0 else ""
-            table.add_row(f"  {policy}", *mean, f"{f.difference:+.{digits}f}", between, star)
+            table.add_row(f"  {label(policy)}", *mean, f"{f.difference:+.{digits}f}", between, star)
     return Group(Text(title), table)

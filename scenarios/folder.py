@@ -122,19 +122,29 @@ def write(result: RunResult, folder: Path) -> None:
         (folder / "report.html").write_text(html, encoding="utf-8")
 
 
+UNITS = {"q": "rad", "qd": "rad/s", "tau": "N·m", "current_a": "A", "temp_c": "°C"}
+"""Of the readings of each joint, also in the metadata of the columns."""
+
+
 def telemetry_table(telemetry: Telemetry, arms: list[str]) -> pa.Table:
-    """One row per arm and moment: time_s, arm, mode, then q, qd, tau, current_a and temp_c of joints 1..7."""
+    """One row per arm and moment: time_s, arm, mode, then the readings of `UNITS` for joints 1..7."""
     samples, count = telemetry.mode.shape
     columns: dict[str, Any] = {
         "time_s": np.repeat(telemetry.time_s, count),
         "arm": pa.array(arms * samples).dictionary_encode(),
         "mode": pa.DictionaryArray.from_arrays(pa.array(telemetry.mode.ravel(), pa.int8()), pa.array(MODES)),
     }
-    for name in ("q", "qd", "tau", "current_a", "temp_c"):
+    units: dict[str, str] = {"time_s": "s"}
+    for name, unit in UNITS.items():
         values = getattr(telemetry, name).reshape(samples * count, JOINTS).astype(np.float32)
         for joint in range(JOINTS):
             columns[f"{name}_{joint + 1}"] = values[:, joint]
-    return pa.table(columns)
+            units[f"{name}_{joint + 1}"] = unit
+    table = pa.table(columns)
+    described = [
+        field.with_metadata({"unit": units[field.name]}) if field.name in units else field for field in table.schema
+    ]
+    return table.cast(pa.schema(described))
 
 
 def event_table(events: tuple[Event, ...]) -> pa.Table:

@@ -20,7 +20,7 @@ HATCH = {"fillmode": "overlay", "fgcolor": "white", "fgopacity": 1.0, "size": 7,
 
 def gantt(plan: Schedule, events: Sequence[Event], arms: Sequence[str], unit_s: float) -> list[Trace]:
     """All traces; the row of an arm is its index, times are in units of `unit_s`."""
-    return [*_work_bars(plan, arms, unit_s), *_outage_bars(plan, arms, unit_s), *_marks(events, arms, unit_s)]
+    return [*_work_bars(plan, events, arms, unit_s), *_outage_bars(plan, arms, unit_s), *_marks(events, arms, unit_s)]
 
 
 def stream_of(job: str) -> str:
@@ -39,11 +39,14 @@ def clock(time_s: float) -> str:
     return f"{seconds // 3600}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
 
 
-def _work_bars(plan: Schedule, arms: Sequence[str], unit_s: float) -> list[Trace]:
-    streams = sorted({stream_of(a.job) for a in plan.assignments})
+def _work_bars(plan: Schedule, events: Sequence[Event], arms: Sequence[str], unit_s: float) -> list[Trace]:
+    # Also of jobs that nobody took: so a stream keeps its colour from one policy's report to the next.
+    streams = sorted({stream_of(event.job) for event in events if event.job})
     traces = []
     for i, stream in enumerate(streams):
         own = [a for a in plan.assignments if stream_of(a.job) == stream]
+        if not own:
+            continue
         colour = STREAM_COLOURS[i % len(STREAM_COLOURS)]
         traces.append(
             _bars(

@@ -10,13 +10,13 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from agents.rules import make_policy
 from fleet.events import Event
 from fleet.metrics import Metrics
 from fleet.sim.kernel import Step
 from fleet.telemetry import Telemetry, join
 from scenarios.build import BusName, DifficultyName, Fleet, PlantName, Progress, env_of, quiet
 from scenarios.outcome import metrics_of
+from scenarios.policies import policy_of
 from scenarios.scenario import Scenario
 
 RUN_FORMAT = 1
@@ -69,7 +69,7 @@ def run(
         record: Keep telemetry; sweeps do without.
         endpoint: Of a Zenoh router on loopback that others listen on too; by default the fleet has its own.
     """
-    policy = make_policy(spec.policy)
+    policy = policy_of(spec.policy)
     policy_seed, reading_seed = np.random.SeedSequence([spec.seed, 1]).spawn(2)
     policy.reset(np.random.default_rng(policy_seed))
     recorder = _Recorder(fleet.scenario, np.random.default_rng(reading_seed)) if record else None

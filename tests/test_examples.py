@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -9,6 +10,8 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+
+from scenarios.cli import main
 
 ROOT = Path(__file__).parents[1]
 
@@ -30,7 +33,17 @@ def own_cache(tmp_path, monkeypatch) -> None:
 def test_own_policy_finishes_a_shift(capsys) -> None:
     example("own_policy").main(horizon_s=1800, difficulty="oracle")
     told = capsys.readouterr().out
-    assert all(f"arm_{i}: peak" in told for i in range(4))
+    for name in ("LeastDifficulty", "Careful"):
+        assert re.search(rf"{name}: reward -?[\d.]+, jobs \d+, peaks arm_0 [\d.]+ °C", told)
+
+
+def test_own_policy_is_compared_beside_the_rules(capsys) -> None:
+    own = f"{ROOT / 'examples' / 'own_policy.py'}:Careful"
+    command = ["compare", "quickstart", "--policies", f"least_difficulty,{own}", "--baseline", "least_difficulty"]
+    with pytest.raises(SystemExit) as left:
+        main([*command, "--seeds", "2", "--difficulty", "oracle"])
+    assert left.value.code == 0
+    assert "Careful" in capsys.readouterr().out
 
 
 def test_monitor_hears_every_arm_from_another_process(tmp_path) -> None:

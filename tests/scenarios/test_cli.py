@@ -110,7 +110,7 @@ def test_ctrl_c_while_working_keeps_what_was_done_and_the_same_command_replaces_
 ):
     out = tmp_path / "run"
     with monkeypatch.context() as patched:
-        patched.setattr("scenarios.run.make_policy", lambda name: PressingCtrlC(step=4, times=1))
+        patched.setattr("scenarios.run.policy_of", lambda name: PressingCtrlC(step=4, times=1))
         said = thermofleet("run", small_toml, *QUICK, "--out", out)
     assert said.code == 130
     assert "Interrupted after 40 s of 180 s: the shift until then is kept in " in said.err
@@ -123,7 +123,7 @@ def test_ctrl_c_while_working_keeps_what_was_done_and_the_same_command_replaces_
 
 
 def test_a_second_ctrl_c_leaves_nothing(thermofleet, small_toml, tmp_path, monkeypatch):
-    monkeypatch.setattr("scenarios.run.make_policy", lambda name: PressingCtrlC(step=4, times=2))
+    monkeypatch.setattr("scenarios.run.policy_of", lambda name: PressingCtrlC(step=4, times=2))
     said = thermofleet("run", small_toml, *QUICK, "--out", tmp_path / "run")
     assert said.code == 130
     assert "Interrupted while working: nothing was written." in said.err
@@ -172,7 +172,7 @@ def test_a_killed_run_leaves_only_a_folder_with_a_dot(small_toml, tmp_path, plan
             def reset(self, rng): pass
             def act(self, observations): os.kill(os.getpid(), signal.SIGKILL)
 
-        scenarios.run.make_policy = lambda name: Killed()
+        scenarios.run.policy_of = lambda name: Killed()
         main(sys.argv[1:])
     """)
     where = tmp_path / "runs"
@@ -205,8 +205,18 @@ BAD_INPUT: list[tuple[str, Callable[[str], str] | None, list[str], str]] = [
         "the cell has no arm",
     ),
     ("no trace", lambda t: t.replace('"batch", count = 2', '"trace", file = "t.txt"'), [], "there is no file '"),
-    ("unreachable", unreachable, [], "heat: jobs[0] 'hold' with 2 kg can be done by no arm."),
-    ("too heavy", too_heavy, [], "heat: jobs[0] 'hold' with 40 kg can be done by no arm."),
+    (
+        "unreachable",
+        unreachable,
+        [],
+        "jobs[0].places: no arm can do 'hold' with 2 kg (left at 'bench': reach:",
+    ),
+    (
+        "too heavy",
+        too_heavy,
+        [],
+        "jobs[0].places: no arm can do 'hold' with 40 kg (left at 'bench': torque:",
+    ),
     ("policy", None, ["--policy", "raundom"], "No policy 'raundom'; did you mean 'random'? Allowed: "),
     ("plant", None, ["--plant", "mojoco"], "No plant 'mojoco'; did you mean 'mujoco'? Allowed: mujoco, profile."),
     ("bus", None, ["--bus", "zeno"], "No bus 'zeno'; did you mean 'zenoh'? Allowed: memory, zenoh."),

@@ -1,0 +1,53 @@
+"""Policies by name: the rules that come along, or an own class as `FILE.py:CLASS` or `MODULE:CLASS`."""
+
+import importlib
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+from agents.policy import Policy
+from agents.rules import RULES, make_policy
+from fleet.errors import FleetError, nearest
+
+
+def policy_of(name: str) -> Policy:
+    """A fresh policy.
+
+    Raises:
+        FleetError: no such rule, file, module or class, or one that is no policy.
+    """
+    if ":" not in name:
+        try:
+            return make_policy(name)
+        except ValueError as error:
+            raise FleetError(f"{error} Or give an own one as FILE.py:CLASS.") from error
+    where, _, kind = name.rpartition(":")
+    module = _module(where, name)
+    found = getattr(module, kind, None)
+    if not isinstance(found, type):
+        classes = [key for key, value in vars(module).items() if isinstance(value, type)]
+        raise FleetError(f"No class '{kind}' in '{where}'{nearest(kind, classes)}")
+    if not callable(getattr(found, "reset", None)) or not callable(getattr(found, "act", None)):
+        raise FleetError(f"'{name}' is no policy: it needs the methods reset(rng) and act(observations).")
+    return found()
+
+
+def label(name: str) -> str:
+    """How a table calls a policy: the rule, or the class."""
+    return name.rpartition(":")[2]
+
+
+def _module(where: str, name: str) -> ModuleType:
+    if not where.endswith(".py"):
+        try:
+            return importlib.import_module(where)
+        except ImportError as error:
+            rules = ", ".join(RULES)
+            raise FleetError(f"Policy '{name}': cannot import '{where}' ({error}). Rules: {rules}.") from error
+    path = Path(where)
+    spec = importlib.util.spec_from_file_location(f"own_policy_{path.stem}", path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise FleetError(f"Policy '{name}': there is no file '{where}'.")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
