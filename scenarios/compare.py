@@ -14,7 +14,7 @@ from scipy.stats import bootstrap, trim_mean
 
 from fleet.errors import FleetError
 from fleet.metrics import Metrics
-from scenarios.build import DifficultyName, Fleet, Progress, prepare, quiet
+from scenarios.build import DifficultyName, Fleet, Progress, cache_folder, prepare, quiet
 from scenarios.policies import label, policy_of
 from scenarios.run import RunSpec, run
 from scenarios.scenario import Scenario
@@ -87,11 +87,12 @@ def compare(
             raise FleetError(f"The policy '{policy}' is named twice; every policy is compared once.")
     if baseline not in policies:
         raise FleetError(f"The baseline '{baseline}' is not among the policies compared: {', '.join(policies)}.")
-    prepare(scenario, difficulty=difficulty, cache=cache_dir, progress=progress)  # into the cache, for all workers
+    folder = cache_dir or cache_folder()  # named here: a worker may have been started under another one
+    prepare(scenario, difficulty=difficulty, cache=folder, progress=progress)  # into the cache, for all workers
     cells = [(policy, seed) for policy in policies for seed in seeds]
     metrics: list[Metrics] = []
     with Parallel(n_jobs=workers, return_as="generator") as pool:
-        for done in pool(delayed(_cell)(scenario, difficulty, cache_dir, *cell) for cell in cells):
+        for done in pool(delayed(_cell)(scenario, difficulty, folder, *cell) for cell in cells):
             assert done is not None
             metrics.append(done)
             progress("comparing", len(metrics) / len(cells))
@@ -105,11 +106,11 @@ def compare(
 
 
 @cache
-def _fleet(scenario: Scenario, difficulty: DifficultyName, cache_dir: Path | None) -> Fleet:
+def _fleet(scenario: Scenario, difficulty: DifficultyName, cache_dir: Path) -> Fleet:
     return prepare(scenario, difficulty=difficulty, cache=cache_dir)
 
 
-def _cell(scenario: Scenario, difficulty: DifficultyName, cache_dir: Path | None, policy: str, seed: int) -> Metrics:
+def _cell(scenario: Scenario, difficulty: DifficultyName, cache_dir: Path, policy: str, seed: int) -> Metrics:
     fleet = _fleet(scenario, difficulty, cache_dir)
     return run(fleet, RunSpec(policy=policy, seed=seed, bus="memory", difficulty=difficulty), record=False).metrics
 
