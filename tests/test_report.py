@@ -129,7 +129,9 @@ def test_same_input_same_bytes_in_any_order_of_the_log() -> None:
 
 
 def test_plotly_accepts_the_figure() -> None:
-    go.Figure(drawn(page()))  # raises on any property or value that Plotly does not know
+    shown = drawn(page())
+    known = go.Figure(shown)  # raises on any property or value that Plotly does not know
+    assert len(known.data) == len(shown["data"])
 
 
 @pytest.mark.parametrize("count", [1, 5, 16])
