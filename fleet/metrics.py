@@ -1,6 +1,6 @@
 """What a shift came to, in the figures of the field."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -57,6 +57,3 @@ def gini(shares: np.ndarray) -> float:
     if mean == 0:
         return 0.0
     return float(np.abs(shares[:, None] - shares[None, :]).mean() / (2 * mean))
-
-
-NAMES = tuple(f.name for f in fields(Metrics))

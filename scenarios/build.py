@@ -92,7 +92,8 @@ def prepare(
     except OSError as error:
         raise FleetError(f"Cannot keep plans and twins in '{folder}': {error.strerror}.") from error
     bodies = [_body(scenario, i) for i in range(len(scenario.arms))]
-    wanted = rehearsal_works(scenario) if difficulty == "twin" else all_works(scenario)
+    asked = all_works(scenario)
+    wanted = rehearsal_works(scenario) if difficulty == "twin" else asked
     plans: list[dict[Work, tuple[Plan, ...]]] = []
     refused: list[InfeasibleJob] = []
     for i, (robot, _, _) in enumerate(bodies):
@@ -112,7 +113,7 @@ def prepare(
     arms = []
     for (robot, motors, thermal), model, possible in zip(bodies, models, plans, strict=True):
         rest_tau = ArmModel(robot).gravity_torque(robot.home_q())
-        own = {work: possible[work] for work in all_works(scenario) if work in possible}
+        own = {work: possible[work] for work in asked if work in possible}
         arm = Arm(robot=robot, motors=motors, thermal=thermal, rest_tau=rest_tau, model=model, plans=own)
         arms.append(_with_oracle(scenario, arm) if difficulty == "oracle" else arm)
     return Fleet(scenario, tuple(arms), tuple(refused))

@@ -112,7 +112,7 @@ def run_command(
     where = out or Path("runs") / f"{chosen.name}-{label(policy)}-{seed}"
     check_free(where, overwrite=overwrite)
     with router_at(listen) as endpoint, progress_bar() as progress:
-        result = _run_into(chosen, spec, where, overwrite, progress, endpoint)
+        _, result = _run_into(chosen, spec, where, overwrite, progress, endpoint=endpoint)
     if as_json:
         typer.echo(json.dumps({"out": str(where), **_figures(result)}, indent=1))
     else:
@@ -195,10 +195,11 @@ def demo_command(
     """The quickstart shift under two policies, side by side."""
     chosen = load("quickstart")
     results: dict[str, Metrics] = {}
+    fleet = None
     with progress_bar() as progress:
         for policy in ("round_robin", "least_difficulty"):
             spec = _spec(policy, seed, "profile", "zenoh", "twin")
-            result = _run_into(chosen, spec, out / policy, True, progress)
+            fleet, result = _run_into(chosen, spec, out / policy, True, progress, fleet=fleet)
             if not result.finished:
                 raise Interrupted(f"Interrupted while working; recordings are in {out}.")
             results[policy] = result.metrics
@@ -225,19 +226,27 @@ def _spec(policy: str, seed: int, plant: str, bus: str, difficulty: str) -> Any:
 
 
 def _run_into(
-    scenario: Scenario, spec: Any, out: Path, overwrite: bool, progress: Progress, endpoint: str | None = None
-) -> Any:
+    scenario: Scenario,
+    spec: Any,
+    out: Path,
+    overwrite: bool,
+    progress: Progress,
+    *,
+    endpoint: str | None = None,
+    fleet: Any = None,
+) -> tuple[Any, Any]:
+    """The fleet, made ready unless it is given, and the result of its shift, written to `out`."""
     from scenarios.build import prepare
     from scenarios.folder import new_folder, write
     from scenarios.run import run
 
     with new_folder(out, overwrite=overwrite) as folder:
-        fleet = prepare(scenario, difficulty=spec.difficulty, progress=progress)
+        fleet = fleet or prepare(scenario, difficulty=spec.difficulty, progress=progress)
         with stop_on_interrupt() as stopped:
             result = run(fleet, spec, progress=progress, stopped=stopped, endpoint=endpoint)
             progress("writing", 0.0)
             write(result, folder)
-    return result
+    return fleet, result
 
 
 @contextmanager
