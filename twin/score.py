@@ -148,12 +148,51 @@ class Twin:
         empty = np.zeros((0, len(PHASES), self.joints, len(CHANNELS)))
         return np.stack([self._known[plan] for plan in plans]) if len(plans) else empty
 
-    def latent(self, windows: Array) -> Array:
-        """Posterior means of windows [batch, time, joint, channel] in SI units, [batch, joint, latent]."""
+    def plans_errors(self, plans: Sequence[Plan], repetitions: Sequence[int]) -> Array:
+        """`job_errors` of many jobs, new plans in one pass, [plan, joint, channel]."""
+        self.phase_errors(plans)
+        errors = [self.job_errors(plan, times) for plan, times in zip(plans, repetitions, strict=True)]
+        return np.stack(errors) if errors else np.zeros((0, self.joints, len(CHANNELS)))
+
+    def profile_errors(self, profile: Array, rate_hz: float) -> Array:
+        """Time mean of |x − x̂| over a recorded stretch [time, 3, joint], as over a phase of a plan, [joint, channel].
+
+        Raises:
+            ValueError: no samples, or a profile that is misshapen, not finite or of another number of joints.
+        """
+        if len(profile) == 0:
+            raise ValueError("A stretch without samples has no error.")
+        return self._stretch_errors([("The stretch", profile)], rate_hz)[0]
+
+    def window_errors(self, windows: Array) -> Array:
+        """Time mean of |x − x̂| of windows [batch, time, joint, channel] in SI units, [batch, joint, channel]."""
         z = self._z_of(windows)
+        return np.abs(z - self._decoded(z)).mean(axis=1, dtype=float)
+
+    def posterior(self, windows: Array) -> tuple[Array, Array]:
+        """Mean and standard deviation of the latent of windows in SI units, each [batch, net, latent]."""
+        z = self._z_of(windows)
+        mu, sigma = [], []
         with one_thread(), torch.inference_mode():
-            means = [net.encode(torch.from_numpy(z[:, :, j]))[0].numpy() for j, net in enumerate(self.nets)]
-        return np.stack(means, axis=1)
+            for j, net in enumerate(self.nets):
+                mean, logvar = net.encode(torch.from_numpy(np.ascontiguousarray(z[:, :, j])))
+                mu.append(mean.numpy())
+                sigma.append(torch.exp(0.5 * logvar).numpy())
+        return np.stack(mu, axis=1), np.stack(sigma, axis=1)
+
+    def latent(self, windows: Array) -> Array:
+        """Posterior means of windows [batch, time, joint, channel] in SI units, [batch, net, latent]."""
+        return self.posterior(windows)[0]
+
+    def decode(self, latent: Array) -> Array:
+        """The windows that latents [batch, net, latent] stand for, SI units, [batch, time, joint, channel]."""
+        wanted = (len(self.nets), self.config.latent)
+        if latent.ndim != 3 or latent.shape[1:] != wanted:
+            raise ValueError(f"Latents must be [batch, {wanted[0]}, {wanted[1]}] (got {latent.shape}).")
+        told = torch.from_numpy(np.ascontiguousarray(latent, dtype=np.float32))
+        with one_thread(), torch.inference_mode():
+            made = [net.decode(told[:, j], self.config.window).numpy() for j, net in enumerate(self.nets)]
+        return self.scaler.to_si(np.stack(made, axis=2))
 
     def reconstruct(self, windows: Array) -> Array:
         """What the twin makes of windows, SI units, [batch, time, joint, channel]; angles near the training data."""
@@ -181,19 +220,28 @@ class Twin:
 
     def _errors(self, plans: Sequence[Plan]) -> Array:
         """[plan, phase, joint, channel] of plans not seen before."""
+        stretches = [
+            (f"{name.capitalize()} of arm '{plan.arm}'", phase.profile)
+            for plan in plans
+            for name, phase in zip(PHASES, plan.phases, strict=True)
+        ]
+        return self._stretch_errors(stretches, RATE_HZ).reshape(len(plans), len(PHASES), self.joints, len(CHANNELS))
+
+    def _stretch_errors(self, stretches: Sequence[tuple[str, Array]], rate_hz: float) -> Array:
+        """Time mean of |x − x̂| over each named profile [time, 3, joint], [stretch, joint, channel]; empty: zeros."""
         c = self.config
         parts, weights, owners = [], [], []
-        for i, (plan, p) in enumerate((plan, p) for plan in plans for p in range(len(PHASES))):
-            profile = check_profile(plan.phases[p].profile, f"{PHASES[p].capitalize()} of arm '{plan.arm}'")
+        for i, (name, stretch) in enumerate(stretches):
+            profile = check_profile(stretch, name)
             if profile.shape[-1] != self.joints:
-                raise ValueError(f"The twin of '{self.arm}' has {self.joints} joints, the plan {profile.shape[-1]}.")
-            samples = resample(profile, RATE_HZ, c.rate_hz)
+                raise ValueError(f"The twin of '{self.arm}' has {self.joints} joints, {name} {profile.shape[-1]}.")
+            samples = resample(profile, rate_hz, c.rate_hz)
             parts.append(cut(samples, c.window, c.score_stride))
             weights.append(cover(len(samples), c.window, c.score_stride))
             owners.append(np.full(len(parts[-1]), i))
         z = self.scaler.to_z(np.concatenate(parts))
         error = np.abs(z - self._decoded(z))
         of_window = np.einsum("bt,btjc->bjc", np.concatenate(weights), error)
-        of_phase = np.zeros((len(parts), self.joints, len(CHANNELS)))
-        np.add.at(of_phase, np.concatenate(owners), of_window)
-        return of_phase.reshape(len(plans), len(PHASES), self.joints, len(CHANNELS))
+        of_stretch = np.zeros((len(parts), self.joints, len(CHANNELS)))
+        np.add.at(of_stretch, np.concatenate(owners), of_window)
+        return of_stretch

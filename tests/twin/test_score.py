@@ -120,7 +120,7 @@ def test_a_job_without_repetitions_is_refused(twin, plan):
 
 def test_a_plan_of_another_arm_is_refused(twin, plan):
     short = replace(plan, cycle=Phase(plan.cycle.profile[:, :, :6], plan.cycle.payload_kg))
-    with pytest.raises(ValueError, match="has 7 joints, the plan 6"):
+    with pytest.raises(ValueError, match="has 7 joints, Cycle of arm 'arm' 6"):
         twin.score(short, 1)
 
 
@@ -138,3 +138,36 @@ def test_known_motion_fills_the_latent_like_the_prior(twin, records):
 def test_windows_that_do_not_fit_are_refused(twin, bad):
     with pytest.raises(ValueError, match="Windows must be"):
         twin.latent(bad)
+
+
+def test_a_recorded_stretch_scores_like_a_phase_of_a_plan_at_any_rate(twin, plan):
+    cycle = plan.cycle.profile
+    np.testing.assert_allclose(twin.profile_errors(cycle, 50.0), twin.phase_errors([plan])[0, 1], rtol=1e-6)
+    held = np.repeat(cycle, 2, axis=0)
+    np.testing.assert_allclose(twin.profile_errors(held, 100.0), twin.profile_errors(cycle, 50.0), rtol=1e-4)
+    with pytest.raises(ValueError, match="without samples"):
+        twin.profile_errors(cycle[:0], 50.0)
+
+
+def test_many_jobs_score_as_each_alone(twin, make_plan, motion, rng):
+    plans = [make_plan(*(motion(rng, s) for s in (1.0, 5.0, 1.5))) for _ in range(3)]
+    together = twin.plans_errors(plans, [1, 5, 9])
+    for plan, n, errors in zip(plans, [1, 5, 9], together, strict=True):
+        np.testing.assert_array_equal(errors, twin.job_errors(plan, n))
+    assert twin.plans_errors([], []).shape == (0, 7, 3)
+
+
+def test_window_errors_are_the_mean_distance_to_the_reconstruction(twin, plan):
+    windows = cut(resample(plan.cycle.profile, 50.0, 12.5), 50, 25)
+    away = np.abs(windows - twin.reconstruct(windows)) / twin.scaler.std
+    np.testing.assert_allclose(twin.window_errors(windows), away.mean(axis=1), rtol=1e-4)
+
+
+def test_decoding_the_posterior_mean_is_the_reconstruction(twin, plan):
+    windows = cut(resample(plan.cycle.profile, 50.0, 12.5), 50, 25)
+    mu, sigma = twin.posterior(windows)
+    assert mu.shape == sigma.shape == (len(windows), 7, 2)
+    assert np.all((sigma > 0) & (sigma < 1.5))
+    np.testing.assert_allclose(twin.decode(mu), twin.reconstruct(windows), rtol=1e-5, atol=1e-5)
+    with pytest.raises(ValueError, match=r"Latents must be \[batch, 7, 2\]"):
+        twin.decode(mu[:, :, :1])
