@@ -1,0 +1,87 @@
+"""What a model says of a plan: how its probability depends on temperature."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet.difficulty import Difficulty, Risk, stack_risks
+
+CURVE = np.array([[-4.0, 0.05], [0.0, 0.2], [0.0, 0.4], [3.0, 1.0]])
+
+risks = st.builds(
+    lambda seed, pieces, curved: Risk(
+        np.random.default_rng(seed).normal(-3.0, 2.0, pieces),
+        np.random.default_rng(seed).exponential(0.05, (pieces, 7)),
+        CURVE[: 2 + seed % 3] if curved else None,
+    ),
+    st.integers(0, 10_000),
+    st.integers(1, 4),
+    st.booleans(),
+)
+temps = st.integers(0, 10_000).map(lambda seed: np.random.default_rng(seed).uniform(10.0, 80.0, 7))
+
+
+def test_the_worst_piece_decides_through_the_logistic_function() -> None:
+    weight = np.zeros((2, 7))
+    weight[0, 1], weight[1, 3] = 0.2, 0.1
+    risk = Risk(np.array([-10.0, -5.0]), weight)
+    temp_c = np.full(7, 30.0)
+    # Pieces −10 + 0.2 · 30 = −4 and −5 + 0.1 · 30 = −2.
+    assert risk.at(temp_c) == pytest.approx(1 / (1 + np.exp(2.0)))
+    temp_c[1] = 50.0
+    assert risk.at(temp_c) == pytest.approx(0.5)  # the first piece is now at 0
+
+
+@given(risk=risks, temp_c=temps, joint=st.integers(0, 6), more_k=st.floats(0.0, 50.0))
+def test_warmer_is_never_less_risky_where_no_weight_is_negative(risk, temp_c, joint, more_k) -> None:
+    warmer = temp_c.copy()
+    warmer[joint] += more_k
+    assert 0.0 <= risk.at(temp_c) <= risk.at(warmer) <= 1.0
+
+
+@given(score=st.floats(-10, 10))
+def test_a_curve_reads_as_numpy_interpolates(score) -> None:
+    risk = Risk(np.array([score]), np.zeros((1, 7)), CURVE)
+    if score == 0.0:
+        assert risk.at(np.zeros(7)) == 0.4  # at a jump: its upper end
+    else:
+        assert risk.at(np.zeros(7)) == pytest.approx(np.interp(score, *CURVE.T))
+
+
+@given(several=st.lists(risks, min_size=1, max_size=5), temp_c=temps)
+def test_stacked_risks_say_what_each_said(several, temp_c) -> None:
+    stack = stack_risks(several)
+    assert stack.at(temp_c) == pytest.approx([float(r.at(temp_c)) for r in several])
+    order = np.arange(len(several))[::-1]
+    assert stack[order].at(np.tile(temp_c, (len(several), 1))) == pytest.approx(stack.at(temp_c)[::-1])
+
+
+@given(risk=risks, temp_c=st.lists(temps, min_size=1, max_size=4))
+def test_one_risk_serves_many_temperatures(risk, temp_c) -> None:
+    assert risk.at(np.array([temp_c])).tolist() == [[pytest.approx(float(risk.at(t))) for t in temp_c]]
+
+
+@pytest.mark.parametrize(
+    ("offset", "weight", "curve", "says"),
+    [
+        (np.zeros(0), np.zeros((0, 7)), None, "at least one piece"),
+        (np.zeros(2), np.zeros((3, 7)), None, "at least one piece"),
+        (np.array([np.nan]), np.zeros((1, 7)), None, "must not be NaN"),
+        (np.zeros(1), np.full((1, 7), np.inf), None, "must be finite"),
+        (np.zeros(1), np.zeros((1, 7)), np.zeros((4, 3)), "knot, 2"),
+    ],
+)
+def test_a_risk_that_makes_no_sense_is_refused(offset, weight, curve, says) -> None:
+    with pytest.raises(ValueError, match=says):
+        Risk(offset, weight, curve)
+
+
+def test_a_probability_has_one_home() -> None:
+    risk = Risk(np.array([-1.0]), np.full((1, 7), 0.01))
+    d = np.full(7, 0.1)
+    assert Difficulty(d, risk=risk).p_at(np.full(7, 20.0)) == float(risk.at(np.full(7, 20.0)))
+    assert Difficulty(d, 0.3).p_at(np.full(7, 20.0)) == 0.3
+    assert Difficulty(d).p_at(np.full(7, 20.0)) is None
+    with pytest.raises(ValueError, match="not both"):
+        Difficulty(d, 0.3, risk)
