@@ -14,7 +14,7 @@ import numpy as np
 from fleet.bus.exchange import Heard, Words
 from fleet.robot import JOINTS
 from fleet.sim.claims import per_slot
-from fleet.sim.state import State, World
+from fleet.sim.state import Offers, State, World
 from fleet.telemetry import FAULTED, IDLE, WORKING
 
 Array = np.ndarray
@@ -49,7 +49,7 @@ FIELDS: tuple[Field, ...] = (
     Field("feasible", ("slot",), "1", 0, 1, "1 when this arm could do it at all"),
     Field("known", ("slot",), "1", 0, 1, "1 when this arm has a difficulty for it"),
     Field("difficulty", ("slot",), "1", 0, JOINTS, "own thermal difficulty d of its best plan, 0 where not known"),
-    Field("p_saturation", ("slot",), "1", 0, 1, "probability to pass the warning limit, 0.5 where not known"),
+    Field("p_saturation", ("slot",), "1", 0, 1, "probability to pass the warning limit from now, 0.5 if not known"),
     Field("duration_s", ("slot",), "s", 0, LONG_S, "how long this arm would take for what is left of it"),
     Field("slack_s", ("slot",), "s", -LONG_S, LONG_S, "due date minus now minus duration"),
     Field("age_s", ("slot",), "s", 0, LONG_S, "time since it was released or came back"),
@@ -176,7 +176,7 @@ def say(world: World, state: State, on_offer: Array, measured_c: Array, twins: t
         headroom_k=world.limits.warning_c - measured_c[0].max(axis=-1),
         jobs=tuple(names[j] if j >= 0 else "" for j in on_offer[0].tolist()),
         difficulty=scored(world.offers.difficulty, on_offer)[0],
-        p_saturation=scored(world.offers.p_saturation, on_offer)[0],
+        p_saturation=saturation(world.offers, on_offer, measured_c)[0],
         twin=twins,
     )
 
@@ -184,6 +184,22 @@ def say(world: World, state: State, on_offer: Array, measured_c: Array, twins: t
 def scored(values: Array, on_offer: Array) -> Array:
     """[env, arm, slot] of a score per [env, arm, job]; NaN in empty slots."""
     return np.where((on_offer >= 0)[:, None, :], per_slot(values, on_offer), np.nan)
+
+
+def saturation(offers: Offers, on_offer: Array, measured_c: Array) -> Array:
+    """Probability of each arm, as warm as it measures, to pass the warning limit in each job on offer.
+
+    It is that of the whole job, also where a fault sent the job back with cycles done: then it errs to the safe side.
+
+    Returns:
+        [env, arm, slot]; NaN in empty slots and where the arm cannot say.
+    """
+    p = scored(offers.p_saturation, on_offer)
+    if offers.risks is not None:
+        row = np.where((on_offer >= 0)[:, None, :], per_slot(offers.risk, on_offer), -1)
+        env, arm, slot = np.nonzero(row >= 0)
+        p[env, arm, slot] = offers.risks[row[env, arm, slot]].at(measured_c[env, arm])
+    return p
 
 
 def remaining_s(world: World, state: State, on_offer: Array) -> Array:
@@ -215,7 +231,7 @@ def observe(
         return np.broadcast_to(picked[:, None, :], (envs, arms, world.slots))
 
     own = scored(world.offers.difficulty, on_offer)
-    risk = scored(world.offers.p_saturation, on_offer)
+    risk = saturation(world.offers, on_offer, measured_c)
     duration = remaining_s(world, state, on_offer)
     peer = {name: _others(values) for name, values in told.items() if name != "p_saturation"}
     total = world.plans.times_s[world.offers.plan[env, np.arange(arms), state.job]]

@@ -8,6 +8,7 @@ from typing import Self
 
 import numpy as np
 
+from fleet.difficulty import Risk
 from fleet.motion import Drive
 from fleet.motor import Motors
 from fleet.robot import ThermalLimits
@@ -63,7 +64,11 @@ class Offers:
     difficulty: Array
     """d, [env, arm, job]; NaN where there is no score."""
     p_saturation: Array
-    """[env, arm, job]; NaN where unknown."""
+    """Of models that take the start for granted, [env, arm, job]; NaN where unknown."""
+    risk: Array
+    """Row of `risks`, for the whole job, int [env, arm, job]; −1 where the model has none."""
+    risks: Risk | None
+    """[risk, ...]; None where no model of the fleet has any."""
 
 
 @dataclass(frozen=True, eq=False)

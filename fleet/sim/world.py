@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet.difficulty import Difficulty, DifficultyModel
+from fleet.difficulty import Difficulty, DifficultyModel, Risk, stack_risks
 from fleet.job import Job, Work, precedence
 from fleet.motion import Drive, Plan, drive
 from fleet.motor import Motors, stack_motors
@@ -110,9 +110,11 @@ def build_world(
 
 def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]]) -> tuple[tuple[Plan, ...], Offers]:
     shape = (len(shifts), len(arms), max(1, *(len(jobs) for jobs in shifts)))
-    plan, total, risk = np.full(shape, -1), np.full(shape, np.nan), np.full(shape, np.nan)
+    plan, total, p_saturation = np.full(shape, -1), np.full(shape, np.nan), np.full(shape, np.nan)
+    risk = np.full(shape, -1)
     rows: dict[int, int] = {}
     plans: list[Plan] = []
+    risks: dict[int, tuple[int, Risk]] = {}
     known: dict[tuple[int, Work, int], tuple[Plan, Difficulty | None] | None] = {}
     for e, jobs in enumerate(shifts):
         for j, job in enumerate(jobs):
@@ -130,8 +132,11 @@ def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]]) -> tuple[tuple
                 plan[e, a, j] = rows[id(best)]
                 if score is not None:
                     total[e, a, j] = score.total
-                    risk[e, a, j] = np.nan if score.p_saturation is None else score.p_saturation
-    return tuple(plans), Offers(plan=plan, difficulty=total, p_saturation=risk)
+                    p_saturation[e, a, j] = np.nan if score.p_saturation is None else score.p_saturation
+                    if score.risk is not None:
+                        risk[e, a, j] = risks.setdefault(id(score.risk), (len(risks), score.risk))[0]
+    stack = stack_risks([r for _, r in risks.values()]) if risks else None
+    return tuple(plans), Offers(plan=plan, difficulty=total, p_saturation=p_saturation, risk=risk, risks=stack)
 
 
 def _plan_table(plans: Sequence[Plan], motors: Mapping[str, Motors]) -> PlanTable:

@@ -9,8 +9,10 @@ from hypothesis import strategies as st
 
 from fleet.bus.exchange import UNHEARD, Heard
 from fleet.bus.memory import MemoryExchange
+from fleet.difficulty import Difficulty, Risk
 from fleet.env.allocation_v0 import parallel_env
-from fleet.env.observation import FIELDS, LONG_S, Layout, Observation, observe, remaining_s, say
+from fleet.env.observation import FIELDS, LONG_S, Layout, Observation, observe, remaining_s, saturation, say
+from fleet.motion import Plan
 from fleet.sim.claims import board
 from fleet.sim.kernel import step
 from fleet.sim.state import initial
@@ -172,6 +174,47 @@ def test_an_arm_says_what_it_measures_and_thinks(small) -> None:
     np.testing.assert_array_equal(words.difficulty[:, 0], world.offers.difficulty[0, :, 0])
     assert np.isnan(words.difficulty[:, 1:]).all()
     assert np.isnan(words.p_saturation[:, 1:]).all()
+
+
+class SecondJointDecides:
+    """P passes one half where joint 2 is at 50 °C less half a kelvin for every repetition."""
+
+    version = "second joint decides"
+
+    def score(self, plan: Plan, repetitions: int) -> Difficulty:
+        risk = Risk(np.array([0.2 * (0.5 * repetitions - 50.0)]), 0.2 * np.eye(7)[1:2])
+        return Difficulty(np.full(7, 0.1), risk=risk)
+
+
+def test_the_probability_is_that_of_the_temperatures_now(small) -> None:
+    bench, rack = small.work("bench"), small.work("rack")
+    arms = [small.arm(0, [bench]), small.arm(1, [bench, rack], model=SecondJointDecides())]
+    jobs = [
+        [small.job("a", bench, repetitions=4), small.job("b", rack, repetitions=8)],
+        [small.job("a", bench, repetitions=20)],
+    ]
+    world, _ = small.shop(jobs, arms=arms, slots=3)
+    state, on_offer = initial(world), np.array([[1, 0, -1], [0, -1, -1]])
+    measured = np.full((2, 2, 7), 25.0)
+    measured[0, 1, 1], measured[1, 1, 1] = 46.0, 35.0
+    p = saturation(world.offers, on_offer, measured)
+    # Joint 2 at 46 and 35 °C; one half at 46 (8 repetitions), 48 (4) and 40 (20).
+    assert p[0, 1] == pytest.approx([0.5, 1 / (1 + np.exp(0.4)), np.nan], nan_ok=True)
+    assert p[1, 1] == pytest.approx([1 / (1 + np.exp(1.0)), np.nan, np.nan], nan_ok=True)
+    # The other arm's model takes the start for granted, and cannot do the second job.
+    fixed = arms[0].model.score(arms[0].plans[bench][0], 4)
+    assert p[0, 0] == pytest.approx([np.nan, fixed.p_saturation, np.nan], nan_ok=True)
+    assert (saturation(world.offers, on_offer, measured + 1.0)[:, 1] >= p[:, 1])[~np.isnan(p[:, 1])].all()
+
+    seen = observe(world, state, on_offer, np.ones((2, 2, 4), bool), measured, vars(both_heard(2, 3)))
+    np.testing.assert_array_equal(seen.p_saturation, np.where(np.isnan(p), 0.5, p))
+    words = say(world, state, on_offer, measured, ("x", "y"))
+    np.testing.assert_array_equal(words.p_saturation, p[0])
+
+
+def both_heard(arms: int, slots: int) -> Heard:
+    """What `heard` makes, for two envs."""
+    return Heard(**{name: np.stack([values] * 2) for name, values in vars(heard(arms, slots)).items()})
 
 
 def test_what_peers_told_is_what_they_know_themselves(small) -> None:

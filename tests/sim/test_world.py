@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleet.difficulty import Blind, Difficulty
+from fleet.difficulty import Blind, Difficulty, Risk
 from fleet.motion import Plan
 from fleet.motor import gen3_motors
 from fleet.sim.state import initial
@@ -122,3 +122,23 @@ def test_an_arm_that_overheats_standing_at_home_is_refused(small) -> None:
     arm = replace(small.arm(0, [small.work()]), rest_tau=np.full(7, 500.0))
     with pytest.raises(ValueError, match="Arm 'arm_0' never settles while standing at home in air of 25 °C"):
         small.shop([[small.job("a")]], arms=[arm], start_warm=True)
+
+
+def test_risks_are_tabled_once_and_found_by_their_row(small) -> None:
+    class ByLength:
+        version = "by length"
+
+        def score(self, plan: Plan, repetitions: int) -> Difficulty:
+            return Difficulty(
+                np.zeros(7), risk=Risk(np.full(repetitions, -1.0 * repetitions), np.zeros((repetitions, 7)))
+            )
+
+    content = small.work()
+    jobs = [small.job("a", content, repetitions=2), small.job("b", content, repetitions=3), small.job("c", content)]
+    arms = [small.arm(0, [content], model=ByLength()), small.arm(1, [content])]
+    offers = small.shop([jobs, jobs[:1]], arms=arms)[0].offers
+    assert offers.risk.tolist() == [[[0, 1, 1], [-1, -1, -1]], [[0, -1, -1], [-1, -1, -1]]]
+    assert offers.risks is not None
+    assert offers.risks.offset.tolist() == [[-2.0, -2.0, -np.inf], [-3.0] * 3]
+    assert np.isnan(offers.p_saturation[:, 0]).all()
+    assert small.shop([jobs], arms=[arms[1]])[0].offers.risks is None
