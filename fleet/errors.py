@@ -39,6 +39,25 @@ class CheckpointError(FleetError):
     """A stored twin does not fit what is asked of it; names what differs."""
 
 
+class LogError(FleetError):
+    """A log file cannot be used as it is.
+
+    Attributes:
+        file: The file, as it was given.
+        line: Line of a text file, or row of a table, from 1; None where the whole file is meant.
+        reason: What is wrong, and what would be right.
+    """
+
+    def __init__(self, file: str, line: int | None, reason: str) -> None:
+        super().__init__(f"{file}: {reason}" if line is None else f"{file}, line {line}: {reason}")
+        self.file = file
+        self.line = line
+        self.reason = reason
+
+    def __reduce__(self) -> tuple[type, tuple[str, int | None, str]]:
+        return type(self), (self.file, self.line, self.reason)
+
+
 def nearest(name: str, allowed: Iterable[str]) -> str:
     """The end of an error sentence: the allowed names, and the nearest one if there is one.
 
