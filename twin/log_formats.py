@@ -1,0 +1,131 @@
+"""The two CSV formats of logs: the columns each must have, their units, and the way to SI."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleet.robot import JOINTS
+from twin.log_table import Damage, Table, beyond
+from twin.recording import CHANNELS
+
+Array = np.ndarray
+
+TEMP_RANGE_C = (-40.0, 200.0)
+"""What a motor's temperature sensor can say; outside, it is broken or counts kelvin."""
+LIMITED = (1, 3, 5)
+"""Joints with end stops, index 0..6, none of which reaches half a turn."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Format:
+    """How a CSV names its columns, and what they count in."""
+
+    name: str
+    time: str
+    """Column of the time, s."""
+    groups: tuple[str, ...]
+    """Start of the column names of each of `CHANNELS`."""
+    factors: tuple[float, ...]
+    """What each group is multiplied by to be in SI with our signs."""
+    turns: bool
+    """Whether angles count from 0° to 360°, so that a little below zero reads 359.9°."""
+    first_joint: int
+    required: int
+    """So many of the groups must be there; of the others, all joints or none."""
+
+    def columns(self, group: str, joints: int = JOINTS) -> list[str]:
+        """Column names of a group, joint by joint."""
+        return [f"{group}_{self.first_joint + j}" for j in range(joints)]
+
+
+GEN3 = Format(
+    name="Gen3 log",
+    time="Time (s)",
+    groups=("Pos", "Velocity", "Torque", "Current", "Temp"),
+    # The drive reports the torque that the joint feels: against gravity_torque of the model its slope is −1 over the
+    # 34 logs (docs/logs.md), while the current has the sign of the torque that the motor makes.
+    factors=(np.pi / 180, np.pi / 180, -1.0, 1.0, 1.0),
+    turns=True,
+    first_joint=0,
+    required=5,
+)
+PLAIN = Format(
+    name="plain log",
+    time="time_s",
+    groups=CHANNELS,
+    factors=(1.0,) * len(CHANNELS),
+    turns=False,
+    first_joint=1,
+    required=3,
+)
+
+
+def format_of(names: Sequence[str]) -> Format:
+    """The format whose column of time is there.
+
+    Raises:
+        ValueError: neither is.
+    """
+    for known in (GEN3, PLAIN):
+        if known.time in names:
+            return known
+    hint = " Columns are separated by commas, numbers have a decimal point." if any(";" in n for n in names) else ""
+    raise ValueError(
+        f"is no log: its first line begins with '{','.join(names)[:40]}', where a Gen3 log has '{GEN3.time}' "
+        f"and a plain one '{PLAIN.time}'.{hint}"
+    )
+
+
+def check_columns(known: Format, names: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The groups that are there, and the columns that belong to none.
+
+    Raises:
+        ValueError: which columns are missing, or that the arm has another number of joints.
+    """
+    counts = {group: _count(known, group, names) for group in known.groups}
+    groups = [g for i, g in enumerate(known.groups) if i < known.required or counts[g]]
+    joints = {counts[g] for g in groups}
+    if len(joints) == 1 and joints not in ({JOINTS}, {0}):
+        raise ValueError(
+            f"is of an arm with {joints.pop()} joints; a Gen3 has {JOINTS}, and only its logs can be read."
+        )
+    wanted = [column for g in groups for column in known.columns(g)]
+    missing = [column for column in wanted if column not in names]
+    if missing:
+        raise ValueError(f"misses the column{'s' * (len(missing) > 1)} {', '.join(missing)} of a {known.name}.")
+    return groups, [name for name in names if name not in wanted and name != known.time]
+
+
+def _count(known: Format, group: str, names: Sequence[str]) -> int:
+    """How many joints a group has columns for, without a gap; 0 when one is left out."""
+    found = sum(name.rpartition("_")[0] == group and name.rpartition("_")[2].isdigit() for name in names)
+    return found if set(known.columns(group, found)) <= set(names) else 0
+
+
+def channels(known: Format, groups: Sequence[str], table: Table) -> dict[str, Array]:
+    """The groups of a table in SI with our signs, each [row, joint]; a Gen3's angles within half a turn of zero."""
+    found: dict[str, Array] = {}
+    for channel, group, factor in zip(CHANNELS, known.groups, known.factors, strict=True):
+        if group in groups:
+            found[channel] = table.values[:, [table.names.index(column) for column in known.columns(group)]] * factor
+    if known.turns:
+        found["q"] = (found["q"] + np.pi) % (2 * np.pi) - np.pi
+    return found
+
+
+def unbelievable(known: Format, found: dict[str, Array], where: Array) -> list[Damage]:
+    """Rows whose numbers no Gen3 can have said, which mostly means another unit.
+
+    Args:
+        found: Channels in SI, [row, joint].
+        where: Line of each row, [row].
+    """
+    damage: list[Damage] = []
+    if not known.turns:
+        # Past half a turn a joint has passed its end stop; the others may turn on.
+        q = np.where(np.isin(np.arange(JOINTS), LIMITED), found["q"], 0.0)
+        damage += beyond(q, where, (-np.pi, np.pi), "joint {joint} at {value:.5g} is beyond its stops; q is in rad")
+    if "temp_c" in found:
+        damage += beyond(found["temp_c"], where, TEMP_RANGE_C, "motor {joint} at {value:.5g} is no °C of a motor")
+    return damage

@@ -1,0 +1,65 @@
+"""The lines of a log file, plain or gzip, and what is broken before any number is read."""
+
+import gzip
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from fleet.errors import LogError
+
+_GZIP = b"\x1f\x8b"
+_CHUNK = 1024
+"""Bytes of a gzip stream at a time; what is lost before a damaged place is at most what one chunk holds."""
+
+
+@dataclass(frozen=True)
+class Lines:
+    """A text file, line by line, the first one being line 1."""
+
+    lines: tuple[bytes, ...]
+    """Without their ends."""
+    cut: str | None
+    """Why the last line may be half a line; None when it has its end."""
+    broken: str | None
+    """What is wrong with the compression; None when nothing is."""
+
+
+def read_lines(path: Path) -> Lines:
+    """All lines of a file; compression is told by the content, not by the name.
+
+    Raises:
+        LogError: it cannot be opened, is empty, or ends in .gz and is no gzip file.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise LogError(str(path), None, f"cannot be read: {error.strerror or error}.") from error
+    if not data:
+        raise LogError(str(path), None, "is empty.")
+    broken = None
+    if data.startswith(_GZIP):
+        data, broken = _decompress(data)
+    elif path.suffix == ".gz":
+        raise LogError(str(path), None, "ends in .gz but holds no gzip data; was it unpacked or downloaded as a page?")
+    if not data.strip():
+        raise LogError(str(path), None, f"holds no text ({broken})." if broken else "is empty.")
+    whole, end, rest = data.rpartition(b"\n")
+    if not rest.strip():
+        return Lines(tuple(whole.split(b"\n")), None, broken)
+    cut = "the file ends in the middle of this line" if not broken else "the gzip data end in the middle of this line"
+    return Lines((*whole.split(b"\n"), rest) if end else (rest,), cut, broken)
+
+
+def _decompress(data: bytes) -> tuple[bytes, str | None]:
+    """What a gzip file holds up to its first damage, and the damage."""
+    try:
+        return gzip.decompress(data), None
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        reason = "cut off" if isinstance(error, EOFError) else f"damaged: {error}"
+    stream, parts = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16), list[bytes]()
+    try:
+        for first in range(0, len(data), _CHUNK):
+            parts.append(stream.decompress(data[first : first + _CHUNK]))
+    except zlib.error:
+        pass  # already told by `reason`
+    return b"".join(parts), f"the gzip data are {reason}"
