@@ -1,0 +1,145 @@
+"""Measures by hand, tables by permutation, words by the numbers."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from fleet.errors import FleetError
+from scenarios.detection import Detection, alarms, detection
+from scenarios.quality import MEASURES, QUESTIONS, Jobs, beaten, judge, spread, table, text
+from twin.rivals import Scores
+
+REFERENCE = np.arange(19.0)
+
+
+def test_measures_by_hand():
+    peak_c = np.array([30.0, 40.0, 50.0, 60.0, 70.0])
+    score = np.array([2.0, 1.0, 19.0, 18.0, 20.0])
+    found = detection(score, peak_c, reference=REFERENCE, novel=np.array([0.0, 18.0, 18.5, 40.0]))
+    assert found.auroc == pytest.approx(5 / 6)  # of six pairs critical-other only (18, 19) is the wrong way round
+    assert found.auprc == pytest.approx(0.5 * 1 + 0.5 * 2 / 3)  # precision 1 at the first, 2/3 at the second
+    # ranks 2 1 4 3 5 against 1 2 3 4 5: 1 − 6·(1 + 1 + 1 + 1)/(5·24)
+    assert found.spearman == pytest.approx(0.8)
+    assert found.caught == 0.5  # 18 ties with a reference, 20 is beyond all
+    assert found.false_novel == 0.5
+
+
+def test_an_alarm_is_as_rare_as_promised():
+    rng = np.random.default_rng(0)
+    rates = [alarms(rng.normal(size=400), rng.normal(size=59), 0.05).mean() for _ in range(400)]
+    assert np.mean(rates) == pytest.approx(3 / 60, abs=0.006)
+    assert not alarms(np.array([18.0]), REFERENCE)[0]
+    assert alarms(np.array([18.001]), REFERENCE)[0]
+
+
+@pytest.mark.parametrize("peak_c", [np.full(4, 80.0), np.full(4, 20.0)])
+def test_without_both_kinds_there_is_no_quality(peak_c):
+    with pytest.raises(FleetError, match="some of both kinds"):
+        detection(np.arange(4.0), peak_c, reference=REFERENCE, novel=REFERENCE)
+
+
+def test_what_cannot_be_measured_says_so():
+    peak_c = np.array([30.0, 70.0])
+    with pytest.raises(FleetError, match=r"at least 19 held-out cool jobs \(got 5\)"):
+        detection(np.arange(2.0), peak_c, reference=np.arange(5.0), novel=REFERENCE)
+    with pytest.raises(ValueError, match="finite"):
+        detection(np.array([0.0, np.nan]), peak_c, reference=REFERENCE, novel=REFERENCE)
+    with pytest.raises(ValueError, match="alike"):
+        detection(np.arange(3.0), peak_c, reference=REFERENCE, novel=REFERENCE)
+    with pytest.raises(ValueError, match="a repetition and a peak per plan"):
+        Jobs((), (1,), np.zeros((0, 7)))
+
+
+@dataclass(frozen=True)
+class ByRepetitions:
+    """Stands for a scorer; the repetitions of a job tell it everything."""
+
+    name: str
+    joint_2: np.ndarray
+
+    def scores(self, plans, repetitions):
+        at = np.array(repetitions)
+        per_joint = np.zeros((len(at), 7))
+        per_joint[:, 1] = self.joint_2[at]
+        return Scores(per_joint, -per_joint.sum(axis=1))
+
+
+def jobs_of(make_plan, numbers, peak_2):
+    peak_c = np.full((len(numbers), 7), 25.0)
+    peak_c[:, 1] = peak_2
+    return Jobs((make_plan,) * len(numbers), tuple(numbers), peak_c)
+
+
+@pytest.fixture
+def parts(small):
+    plan = small.arm(0, [small.work()]).plans[small.work()][0]
+    numbers = np.arange(20, 60)
+    return {
+        "test": jobs_of(plan, numbers, numbers + 20.0),
+        "reference": jobs_of(plan, np.arange(20), 25.0),
+        "novel": jobs_of(plan, np.arange(10), 25.0),
+    }
+
+
+def test_each_question_asks_its_own_score(parts):
+    found = judge([ByRepetitions("rises", np.arange(60.0))], **parts)
+    assert found["rises", "any joint, total"].auroc == 0.0  # its total falls
+    assert found["rises", "any joint, joint 2"].auroc == 1.0
+    assert found["rises", "joint 2, joint 2"] == Detection(
+        auroc=1.0, auprc=1.0, spearman=1.0, caught=1.0, false_novel=0.0
+    )
+    with pytest.raises(ValueError, match="names of their own"):
+        judge([ByRepetitions("a", np.arange(60.0))] * 2, **parts)
+
+
+def test_the_order_of_jobs_does_not_matter(parts):
+    rng = np.random.default_rng(4)
+    scorer = ByRepetitions("noisy", np.arange(60.0) + rng.normal(0, 10, 60))
+
+    def shuffled(jobs):
+        order = rng.permutation(len(jobs.plans))
+        return Jobs(jobs.plans, tuple(np.array(jobs.repetitions)[order].tolist()), jobs.peak_c[order])
+
+    moved = judge([scorer], **{name: shuffled(jobs) for name, jobs in parts.items()})
+    first = judge([scorer], **parts)
+    for key, found in first.items():
+        for measure in MEASURES:
+            assert getattr(moved[key], measure) == pytest.approx(getattr(found, measure))
+
+
+def some(**values):
+    return Detection(**({"auroc": 0.9, "auprc": 0.8, "spearman": 0.7, "caught": 0.5, "false_novel": 0.5} | values))
+
+
+def by_seed(seeds):
+    """Judged of each seed from {scorer: Detection}; the same for each question."""
+    return [{(name, question): found for question in QUESTIONS for name, found in seed.items()} for seed in seeds]
+
+
+def test_the_words_follow_the_numbers():
+    quality = table(
+        by_seed(
+            [
+                {"VAE": some(auroc=0.90), "better": some(auroc=0.98), "mixed": some(auroc=0.95, spearman=0.6)},
+                {"VAE": some(auroc=0.92), "better": some(auroc=0.99), "mixed": some(auroc=0.91, spearman=0.6)},
+            ]
+        )
+    )
+    said = beaten(quality, "VAE", ("mixed", "better"))
+    assert len(said) == len(QUESTIONS)
+    assert all("better beats VAE under all 2 seeds" in sentence for sentence in said)
+    assert "AUROC .985 ± .007 against .910 ± .014 (+0.075, at least +0.070)" in said[0]
+    assert "AUPRC" not in said[0]
+
+
+def test_a_table_has_a_row_per_scorer_and_question_in_order():
+    quality = table(by_seed([{"b": some(), "a": some(auroc=1.0)}]))
+    assert [(row.question, row.scorer) for row in quality.rows] == [(q, s) for q in QUESTIONS for s in ("b", "a")]
+    assert quality.row("a", QUESTIONS[1]).values("auroc").tolist() == [1.0]
+    assert "| a | 1.000 | .800 | .700 | .500 | .500 |" in text(quality)
+    assert spread(np.array([-0.5])) == "-.500"
+    with pytest.raises(ValueError, match="No scorer 'c'"):
+        quality.row("c", QUESTIONS[0])
+    with pytest.raises(ValueError, match="same scorers under each"):
+        table([*by_seed([{"b": some()}]), *by_seed([{"a": some()}])])
