@@ -58,7 +58,7 @@ def detection(
     return Detection(
         auroc=float(roc_auc_score(critical, score)),
         auprc=float(average_precision_score(critical, score)),
-        spearman=float(spearmanr(score, peak_c)[0]),
+        spearman=float(np.asarray(spearmanr(score, peak_c))[0]),
         caught=float(alarms(score[critical], reference, rate).mean()),
         false_novel=float(alarms(novel, reference, rate).mean()) if len(novel) else float("nan"),
     )
