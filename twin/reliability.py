@@ -42,7 +42,7 @@ def reliability(p: Array, event: Array, *, bins: int = BINS, confidence: float =
     p, event = _checked(p, event)
     if bins < 1:
         raise ValueError(f"A reliability table needs at least one bin (got {bins}).")
-    edges = np.quantile(p, np.linspace(0.0, 1.0, bins + 1))
+    edges = np.percentile(p, np.linspace(0.0, 1.0, bins + 1) * 100)  # rounds as scikit-learn does
     of_job = np.searchsorted(edges[1:-1], p)
     count = np.bincount(of_job, minlength=bins)
     filled = count > 0
