@@ -1,6 +1,6 @@
 """What the sensors of one arm said over some time: the plain value between a log file and whatever learns from it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -69,6 +69,12 @@ class Recording:
     def duration_s(self) -> float:
         """From the first to the last sample, s; zero when there is none."""
         return float(self.time_s[-1] - self.time_s[0]) if len(self.time_s) else 0.0
+
+    def part(self, rows: slice | Array) -> "Recording":
+        """Some of its samples, in their order: a slice, a mask or indices."""
+        own = {channel: getattr(self, channel) for channel in CHANNELS}
+        kept = {channel: None if values is None else values[rows] for channel, values in own.items()}
+        return replace(self, time_s=self.time_s[rows], **kept)
 
 
 def of_telemetry(telemetry: Telemetry, arms: tuple[str, ...]) -> list[Recording]:

@@ -1,0 +1,132 @@
+"""Which parts of an arm's recordings may teach its twin what is normal: chosen by what came of them, not by how warm
+the motors were at the time. A heavy job too begins cool."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from fleet.errors import FleetError
+from twin.recording import Recording
+from twin.stretches import GAP_S, Stretch, stretches
+
+Array = np.ndarray
+
+TREND_S = 60.0
+"""Over the last so many seconds of a recording one sees where its temperatures are going."""
+
+
+class NothingCool(FleetError):
+    """No part of the recordings stayed cool, so a twin would have nothing to learn from."""
+
+
+def cool_stretches(
+    recordings: Sequence[Recording],
+    rate_hz: float,
+    *,
+    cool_c: float | Sequence[float] | Array,
+    horizon_s: float,
+    joints: Sequence[int] | None = None,
+    least_s: float = 0.0,
+    gap_s: float = GAP_S,
+) -> list[Stretch]:
+    """The stretches after whose every moment no motor reaches `cool_c` within the horizon.
+
+    Where a recording ends before the horizon does, its last temperatures are taken to go on as straight as they went
+    in the last minute: a motor that warms towards a limit cools more and more, so this errs on the safe side.
+
+    Args:
+        cool_c: °C, for all joints or per joint. Idle wrists of a Gen3 sit at 40 to 43 °C, so one limit for all that
+            tells a loaded joint 2 from a resting one leaves nothing; give theirs apart, or the joints that count.
+        horizon_s: How far a moment's work shows in the temperatures; inf is the rest of the
+            recording, whatever would have come after it.
+        joints: Index 0..6 of the motors that count; None is all.
+        least_s: Shorter stretches are left out.
+
+    Raises:
+        NothingCool: there is no such stretch; tells which motors are warm.
+        ValueError: no recordings, one without temperatures, or limits of another number of joints.
+    """
+    if not recordings:
+        raise ValueError("There are no recordings to choose from.")
+    found: list[Stretch] = []
+    for recording in recordings:
+        limit_c = _limits(recording, cool_c, joints)
+        cool = cool_moments(recording, limit_c, horizon_s)
+        for piece in _runs(cool):
+            part = recording.part(piece)
+            found += [s for s in stretches(part, rate_hz, gap_s=gap_s) if len(s.time_s) >= least_s * rate_hz]
+    if not found:
+        raise NothingCool(_advice(recordings, cool_c, joints, horizon_s))
+    return found
+
+
+def cool_moments(recording: Recording, limit_c: Array, horizon_s: float) -> Array:
+    """Whether no motor reaches its limit from a moment on until the horizon, bool [time].
+
+    Args:
+        limit_c: °C, [joint]; inf for motors that do not count.
+
+    Raises:
+        ValueError: a recording without temperatures, or a horizon below zero.
+    """
+    if recording.temp_c is None:
+        raise ValueError(f"Recording '{recording.name}' has no motor temperatures, so nobody knows when it was cool.")
+    if not horizon_s >= 0:
+        raise ValueError(f"horizon_s must be >= 0 (got {horizon_s}).")
+    time_s = recording.time_s
+    hot_s = time_s[(recording.temp_c >= limit_c).any(axis=1)]
+    next_hot_s = np.append(hot_s, np.inf)[np.searchsorted(hot_s, time_s)]
+    if len(time_s) and np.isfinite(horizon_s):
+        next_hot_s = np.minimum(next_hot_s, _hot_after_end(recording, limit_c))
+    return (next_hot_s > time_s + horizon_s) if np.isfinite(horizon_s) else next_hot_s == np.inf
+
+
+def _hot_after_end(recording: Recording, limit_c: Array) -> float:
+    """When a motor would reach its limit, if temperatures went on as in the last minute; inf if never."""
+    assert recording.temp_c is not None
+    time_s, temp_c = recording.time_s, recording.temp_c
+    last = time_s >= time_s[-1] - TREND_S
+    if last.sum() < 2:
+        return float("inf")
+    since_s = time_s[last] - time_s[last].mean()
+    slope = since_s @ (temp_c[last] - temp_c[last].mean(axis=0)) / (since_s @ since_s)  # K/s, [joint]
+    with np.errstate(divide="ignore"):
+        wait_s = np.where(slope > 0, (limit_c - temp_c[-1]) / np.where(slope > 0, slope, 1.0), np.inf)
+    return float(time_s[-1] + np.maximum(wait_s, 0.0).min())
+
+
+def _limits(recording: Recording, cool_c: float | Sequence[float] | Array, joints: Sequence[int] | None) -> Array:
+    limit_c = np.asarray(cool_c, dtype=float)
+    if limit_c.ndim > 1 or limit_c.size not in (1, recording.joints):
+        raise ValueError(f"cool_c must be one limit or {recording.joints}, one per joint (got {limit_c.size}).")
+    limit_c = np.broadcast_to(limit_c, (recording.joints,)).copy()
+    if joints is not None:
+        strangers = [j for j in joints if not 0 <= j < recording.joints]
+        if strangers or not joints:
+            raise ValueError(f"joints must be some of 0 … {recording.joints - 1} (got {tuple(joints)}).")
+        limit_c[[j for j in range(recording.joints) if j not in joints]] = np.inf
+    return limit_c
+
+
+def _runs(mask: Array) -> list[slice]:
+    """Where a mask is true without a break."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
+    return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _advice(
+    recordings: Sequence[Recording],
+    cool_c: float | Sequence[float] | Array,
+    joints: Sequence[int] | None,
+    horizon_s: float,
+) -> str:
+    coolest = np.min([r.temp_c.min(axis=0) for r in recordings if r.temp_c is not None and len(r.time_s)], axis=0)
+    limit_c = _limits(recordings[0], cool_c, joints)
+    always = [f"{j + 1} ({coolest[j]:.1f} °C)" for j in np.flatnonzero(coolest >= limit_c)]
+    least = f"Of all samples the coolest of joint {', '.join(always)} is over its limit. " if always else ""
+    return (
+        f"No moment of {len(recordings)} recording(s) is followed by {horizon_s:g} s in which all motors that count "
+        f"stay below {np.unique(limit_c[np.isfinite(limit_c)]).round(1).tolist()} °C. {least}Raise cool_c (idle wrists "
+        "of a Gen3 sit at 40 to 43 °C: limits may differ by joint), count fewer joints, shorten horizon_s, or record "
+        "light work."
+    )
