@@ -88,6 +88,16 @@ def rotation(roll_pitch_yaw_deg: tuple[float, float, float]) -> np.ndarray:
     return about_z @ about_y @ about_x
 
 
+def angles_deg(turned: np.ndarray) -> tuple[float, float, float]:
+    """Roll, pitch, yaw of a rotation [3, 3], deg: the inverse of `rotation`. With the pitch at ±90°, yaw is 0."""
+    pitch = np.arctan2(-turned[2, 0], np.hypot(turned[0, 0], turned[1, 0]))
+    if abs(np.cos(pitch)) < 1e-6:
+        roll, yaw = np.arctan2(-turned[1, 2], turned[1, 1]), 0.0
+    else:
+        roll, yaw = np.arctan2(turned[2, 1], turned[2, 2]), np.arctan2(turned[1, 0], turned[0, 0])
+    return float(np.rad2deg(roll)), float(np.rad2deg(pitch)), float(np.rad2deg(yaw))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Mount:
     """Where an arm's base stands in the cell, and how it is turned."""

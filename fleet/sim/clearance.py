@@ -12,6 +12,8 @@ Array = np.ndarray
 
 ALLOWED_DEPTH_M = 0.005
 """Primitives are a little larger than the real shells here and there."""
+CLEARANCE_STEP_RAD = 0.1
+"""Postures of a way are looked at so far apart."""
 _FLOOR_LINKS = ("half_arm_1", "half_arm_2", "forearm", "wrist_1", "wrist_2", "bracelet")
 _BASE_LINKS = ("forearm", "wrist_1", "wrist_2", "bracelet")
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.difficulty import Difficulty, difficulty_of_error
-from fleet.motion import Plan, drive
+from fleet.motion import Drive, Plan, drive
 from fleet.motor import Motors
-from fleet.thermal import WINDING, ThermalModel, advance, drive_heat
+from fleet.thermal import NODES, WINDING, ThermalModel, advance, drive_heat
 
 Array = np.ndarray
 
@@ -35,20 +35,52 @@ def peaks(
         start_c: Temperatures at the beginning, [node].
     """
     load = [drive(plan.cycle.profile, motors) for plan in plans]
-    current_sq = np.array([d.current_sq for d in load])
-    friction_w = np.array([d.friction_w for d in load])
+    return warmed(load, duration_s, motors=motors, thermal=thermal, start_c=start_c, ambient_c=ambient_c).highest_c
+
+
+@dataclass(frozen=True, eq=False)
+class Warmed:
+    """What a stretch of time made of an arm's temperatures."""
+
+    end_c: Array
+    """°C, [case, node]."""
+    highest_c: Array
+    """Of each winding, beginning and end included, °C, [case, joint]."""
+
+
+def warmed(
+    load: Sequence[Drive],
+    duration_s: Sequence[float] | Array,
+    *,
+    motors: Motors,
+    thermal: ThermalModel,
+    start_c: Array,
+    ambient_c: Array | float,
+) -> Warmed:
+    """Temperatures of one powered arm after each load has lasted so long.
+
+    Args:
+        load: What drives the heat, [case].
+        duration_s: >= 0, [case].
+        start_c: Temperatures at the beginning, [node] or [case, node].
+        ambient_c: Air, one for all or [case].
+    """
+    count = len(load)
+    current_sq = np.array([d.current_sq for d in load]).reshape(count, -1)
+    friction_w = np.array([d.friction_w for d in load]).reshape(count, -1)
     duration = np.asarray(duration_s, dtype=float)
     steps = np.ceil(duration / STEP_S)
     # Equal steps that end when the work does: a job of 12 s must not heat for 20.
     phi, gamma = thermal.step_matrices(duration / np.maximum(steps, 1))
-    temp = np.tile(start_c, (len(plans), 1))
+    ambient = np.broadcast_to(np.asarray(ambient_c, dtype=float), (count,))
+    temp = np.broadcast_to(np.asarray(start_c, dtype=float), (count, NODES)).copy()
     highest = temp[:, WINDING].copy()
     for step in range(int(steps.max(initial=0.0))):
         heat = drive_heat(temp, current_sq, friction_w, motors)
-        temp = advance(temp, heat, np.full(len(plans), ambient_c), phi, gamma, thermal.to_ambient)
         going = (step < steps)[:, None]
-        highest = np.where(going, np.maximum(highest, temp[:, WINDING]), highest)
-    return highest
+        temp = np.where(going, advance(temp, heat, ambient, phi, gamma, thermal.to_ambient), temp)
+        highest = np.maximum(highest, temp[:, WINDING])
+    return Warmed(temp, highest)
 
 
 @dataclass(frozen=True, eq=False)

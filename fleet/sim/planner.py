@@ -8,10 +8,11 @@ import numpy as np
 from fleet.errors import InfeasibleJob
 from fleet.job import Place, Work
 from fleet.motion import Phase, Plan
-from fleet.robot import GEN3, Robot, rotation
-from fleet.sim.clearance import Clearance
+from fleet.robot import Robot, rotation
+from fleet.sim.clearance import CLEARANCE_STEP_RAD, Clearance
 from fleet.sim.itinerary import Itinerary, Leg, Stop, itinerary
 from fleet.sim.kinematics import ELBOW_ANGLES_DEG, InverseKinematics, Pose, Unreachable
+from fleet.sim.limits import broken_limit
 from fleet.sim.models import ArmModel
 from fleet.sim.plan_cache import PlanCache
 from fleet.sim.trajectory import joined, line, move, rest
@@ -21,8 +22,6 @@ log = logging.getLogger(__name__)
 
 SAME_ELBOW_M = 0.05
 """Postures whose elbows are closer than this at every stop load the joints alike: one variant."""
-CLEARANCE_STEP_RAD = 0.1
-_LIMIT_TOLERANCE = 1e-6
 
 
 class Planner:
@@ -158,7 +157,7 @@ class Planner:
             push = work.force_n * rotation(work.places[0].tool_deg)[:, 2]
             force = np.where(presses[:, None], -push, 0.0)
         tau = self._arm.inverse_dynamics(motion.q, motion.qd, motion.qdd, payload_kg, force)
-        broken = self._broken_limit(motion.q, motion.qd, motion.qdd, tau)
+        broken = broken_limit(motion.q, motion.qd, motion.qdd, tau, self._arm.position_range)
         if broken:
             sample, reason = broken
             leg = legs[of_leg[sample]]
@@ -167,26 +166,6 @@ class Planner:
             raise _Failure(place, reason + load, stage=_LIMIT_STAGE)
         profile = np.stack([motion.q, motion.qd, tau], axis=1)
         return Phase(profile.astype(np.float32), payload_kg.astype(np.float32))
-
-    def _broken_limit(self, q: Array, qd: Array, qdd: Array, tau: Array) -> tuple[int, str] | None:
-        """The sample that breaks a limit most, and which; None if none does. All [time, joint]."""
-        if len(q) == 0:
-            return None
-        stops = self._arm.position_range[:, 1]  # symmetric
-        for name, unit, value, limit in (
-            ("torque", "N·m", np.abs(tau), np.array(GEN3.torque_clip)),
-            ("velocity", "rad/s", np.abs(qd), np.array(GEN3.velocity)),
-            ("acceleration", "rad/s²", np.abs(qdd), np.array(GEN3.acceleration)),
-            ("joint limit", "rad", np.abs(q), stops),
-        ):
-            share = value / limit
-            sample, joint = (int(i) for i in np.unravel_index(np.argmax(share), share.shape))
-            if share[sample, joint] > 1.0 + _LIMIT_TOLERANCE:
-                return sample, (
-                    f"{name}: joint_{joint + 1} needs {value[sample, joint]:.1f} {unit}, "
-                    f"allowed {limit[joint]:.1f} {unit},"
-                )
-        return None
 
 
 _CLEARANCE_STAGE = 100
