@@ -12,7 +12,7 @@ import numpy as np
 from fleet.errors import FleetError
 from fleet.motion import Plan
 from fleet.motor import Motors, gen3_motors
-from fleet.robot import Robot, ThermalLimits
+from fleet.robot import JOINTS, Robot, ThermalLimits
 from fleet.sim.exercise import light_jobs, random_jobs
 from fleet.sim.oracle import peaks
 from fleet.thermal import NODES, ThermalModel, ThermalSpread, gen3_network, spread_motors, thermal_model
@@ -175,5 +175,5 @@ class _Subject:
 
 def _gathered(jobs: Sequence[tuple[Plan, Array]] | Iterator[tuple[Plan, Array]]) -> Sample:
     kept = list(jobs)
-    highest = np.array([peak for _, peak in kept]).reshape(len(kept), -1)
+    highest = np.array([peak for _, peak in kept]).reshape(len(kept), JOINTS)
     return Sample(tuple(plan for plan, _ in kept), highest)

@@ -66,8 +66,8 @@ def warmed(
         ambient_c: Air, one for all or [case].
     """
     count = len(load)
-    current_sq = np.array([d.current_sq for d in load]).reshape(count, -1)
-    friction_w = np.array([d.friction_w for d in load]).reshape(count, -1)
+    current_sq = np.array([d.current_sq for d in load]).reshape(count, len(motors.idle_w))
+    friction_w = np.array([d.friction_w for d in load]).reshape(count, len(motors.idle_w))
     duration = np.asarray(duration_s, dtype=float)
     steps = np.ceil(duration / STEP_S)
     # Equal steps that end when the work does: a job of 12 s must not heat for 20.
