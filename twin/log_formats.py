@@ -83,9 +83,9 @@ def check_columns(known: Format, names: Sequence[str]) -> tuple[list[str], list[
     Raises:
         ValueError: which columns are missing, or that the arm has another number of joints.
     """
-    counts = {group: _count(known, group, names) for group in known.groups}
+    counts = {group: sum(_is_of(group, name) for name in names) for group in known.groups}
     groups = [g for i, g in enumerate(known.groups) if i < known.required or counts[g]]
-    joints = {counts[g] for g in groups}
+    joints = {counts[g] if set(known.columns(g, counts[g])) <= set(names) else 0 for g in groups}
     if len(joints) == 1 and joints not in ({JOINTS}, {0}):
         raise ValueError(
             f"is of an arm with {joints.pop()} joints; a Gen3 has {JOINTS}, and only its logs can be read."
@@ -97,10 +97,9 @@ def check_columns(known: Format, names: Sequence[str]) -> tuple[list[str], list[
     return groups, [name for name in names if name not in wanted and name != known.time]
 
 
-def _count(known: Format, group: str, names: Sequence[str]) -> int:
-    """How many joints a group has columns for, without a gap; 0 when one is left out."""
-    found = sum(name.rpartition("_")[0] == group and name.rpartition("_")[2].isdigit() for name in names)
-    return found if set(known.columns(group, found)) <= set(names) else 0
+def _is_of(group: str, name: str) -> bool:
+    start, _, joint = name.rpartition("_")
+    return start == group and joint.isdigit()
 
 
 def channels(known: Format, groups: Sequence[str], table: Table) -> dict[str, Array]:

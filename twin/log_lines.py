@@ -2,14 +2,15 @@
 
 import gzip
 import zlib
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from fleet.errors import LogError
 
 _GZIP = b"\x1f\x8b"
-_CHUNK = 1024
-"""Bytes of a gzip stream at a time; what is lost before a damaged place is at most what one chunk holds."""
+_CHUNK = 65536
+"""Bytes of a damaged gzip file at a time."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +57,20 @@ def _decompress(data: bytes) -> tuple[bytes, str | None]:
         return gzip.decompress(data), None
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         reason = "cut off" if isinstance(error, EOFError) else f"damaged: {error}"
+    return _until_damage(data), f"the gzip data are {reason}"
+
+
+def _until_damage(data: bytes) -> bytes:
+    """All that comes out of a gzip file before its first damaged byte."""
     stream, parts = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16), list[bytes]()
-    try:
-        for first in range(0, len(data), _CHUNK):
+    for first in range(0, len(data), _CHUNK):
+        before = stream.copy()
+        try:
             parts.append(stream.decompress(data[first : first + _CHUNK]))
-    except zlib.error:
-        pass  # already told by `reason`
-    return b"".join(parts), f"the gzip data are {reason}"
+        except zlib.error:
+            # A chunk that fails gives nothing, not even what precedes the damage: once more, byte by byte.
+            with suppress(zlib.error):
+                for i in range(first, first + _CHUNK):
+                    parts.append(before.decompress(data[i : i + 1]))
+            break
+    return b"".join(parts)

@@ -137,11 +137,12 @@ def _misfit(time_s: Array, row: int) -> str:
 
 
 def _longest_increasing(values: Array) -> Array:
-    """Mask of a longest strictly increasing subsequence (patience sorting)."""
+    """Mask of a longest strictly increasing subsequence (patience sorting); of two that fit, the first stays."""
     tops: list[float] = []
     at: list[int] = []
     previous = np.full(len(values), -1)
-    for i, value in enumerate(values.tolist()):
+    # Of equally long ones this finds the last, so it runs from the end.
+    for i, value in enumerate((-values[::-1]).tolist()):
         pile = bisect_left(tops, value)
         previous[i] = at[pile - 1] if pile else -1
         tops[pile : pile + 1], at[pile : pile + 1] = [value], [i]
@@ -150,7 +151,7 @@ def _longest_increasing(values: Array) -> Array:
     while i >= 0:
         keep[i] = True
         i = previous[i]
-    return keep
+    return keep[::-1]
 
 
 def beyond(values: Array, where: Array, bounds: tuple[float, float], words: str) -> list[Damage]:

@@ -1,0 +1,286 @@
+"""Three formats say the same motion; what is wrong with a file is told with its line, and the rest read on demand."""
+
+import gzip
+import logging
+import zlib
+from collections.abc import Callable, Iterable
+from itertools import combinations, pairwise
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet.errors import LogError
+from fleet.telemetry import Telemetry
+from scenarios.folder import telemetry_table
+from twin.log_table import backwards
+from twin.logs import read, read_folder
+from twin.recording import CHANNELS
+
+GEN3 = ["Time (s)", *(f"{g}_{j}" for g in ("Pos", "Temp", "Torque", "Current", "Velocity") for j in range(7))]
+PLAIN = ["time_s", *(f"{c}_{j}" for c in CHANNELS for j in range(1, 8))]
+TIME_S = (0.0, 0.5, 1.1, 1.5)
+
+
+def gen3_row(time_s: float) -> list[str]:
+    """Joint k (1..7) at k degrees below zero, 20 + k °C, k N·m on the joint, −k A, k °/s."""
+    k = np.arange(1, 8)
+    numbers = [time_s, *(360.0 - k), *(20.0 + k), *(1.0 * k), *(-1.0 * k), *(1.0 * k)]
+    return [repr(float(n)) for n in numbers]
+
+
+def plain_row(time_s: float) -> list[str]:
+    """The same in SI with our signs."""
+    k = np.arange(1, 8)
+    numbers = [time_s, *np.deg2rad(-k), *np.deg2rad(k), *(-1.0 * k), *(-1.0 * k), *(20.0 + k)]
+    return [repr(float(n)) for n in numbers]
+
+
+def text(header: list[str], rows: Iterable[list[str]], end: str = "\r\n") -> str:
+    return "".join(",".join(row) + end for row in (header, *rows))
+
+
+@pytest.fixture
+def gen3(tmp_path: Path) -> Callable[..., Path]:
+    """Writes a Gen3 log in which single cells are other than they should be."""
+
+    def write(cells: dict[tuple[int, str], str] | None = None, name: str = "log.csv", count: int = 4) -> Path:
+        rows = [gen3_row(TIME_S[i] if i < 4 else i) for i in range(count)]
+        for (line, column), cell in (cells or {}).items():
+            rows[line - 2][GEN3.index(column)] = cell
+        path = tmp_path / name
+        path.write_bytes(text(GEN3, rows).encode())
+        return path
+
+    return write
+
+
+def refused(path: Path, match: str, line: int | None) -> LogError:
+    with pytest.raises(LogError, match=match) as caught:
+        read(path)
+    assert (caught.value.file, caught.value.line) == (str(path), line)
+    return caught.value
+
+
+def test_all_formats_say_the_same_in_si(tmp_path: Path, gen3: Callable[..., Path]):
+    plain = tmp_path / "plain.csv"
+    plain.write_text(text(PLAIN, map(plain_row, TIME_S), "\n"))
+    packed = tmp_path / "packed.csv.gz"
+    packed.write_bytes(gzip.compress(gen3().read_bytes()))
+    k = np.tile(np.arange(1.0, 8.0), (4, 1))
+    for path, name in ((gen3(), "log"), (plain, "plain"), (packed, "packed")):
+        (recording,) = read(path)
+        assert (recording.name, recording.dropped) == (name, ())
+        np.testing.assert_allclose(recording.time_s, TIME_S)
+        expected = {"q": np.deg2rad(-k), "qd": np.deg2rad(k), "tau": -k, "current_a": -k, "temp_c": 20 + k}
+        for channel, values in expected.items():
+            np.testing.assert_allclose(getattr(recording, channel), values, atol=1e-12)
+
+
+def test_a_run_gives_a_recording_per_arm(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    numbers = {c: rng.uniform(20, 30, (5, 2, 7)) if c == "temp_c" else rng.uniform(-2, 2, (5, 2, 7)) for c in CHANNELS}
+    telemetry = Telemetry(time_s=np.arange(5.0), mode=np.zeros((5, 2), dtype=int), **numbers)
+    pq.write_table(telemetry_table(telemetry, ["left", "right"]), tmp_path / "telemetry.parquet")
+    pq.write_table(pa.table({"kind": ["fault"]}), tmp_path / "events.parquet")
+    for recordings in (read(tmp_path / "telemetry.parquet"), read_folder(tmp_path)):
+        assert [r.name for r in recordings] == ["telemetry/left", "telemetry/right"]
+        for channel in CHANNELS:
+            np.testing.assert_allclose(getattr(recordings[1], channel), numbers[channel][:, 1].astype(np.float32))
+
+
+def test_columns_may_come_in_any_order_and_currents_and_temperatures_may_lack(tmp_path: Path):
+    order = np.random.default_rng(0).permutation(22)
+    rows = [[row[i] for i in order] for row in map(plain_row, TIME_S)]
+    path = tmp_path / "short.csv"
+    path.write_text("\ufeff" + text([f'"{PLAIN[i]}"' for i in order], rows, "\n"), encoding="utf-8")
+    (recording,) = read(path)
+    np.testing.assert_allclose(recording.tau[0], -np.arange(1.0, 8.0))
+    assert recording.current_a is recording.temp_c is None
+
+
+@pytest.mark.parametrize(
+    ("cells", "line", "match"),
+    [
+        ({(3, "Pos_1"): "abc"}, 3, "field 3, 'abc', is not a number"),
+        ({(4, "Temp_0"): ""}, 4, "field 9, '', is not a number"),
+        ({(4, "Temp_0"): "nan"}, 4, "field 9 is nan"),
+        ({(2, "Torque_6"): "inf"}, 2, "field 22 is inf"),
+        ({(3, "Velocity_6"): "1.0,2.0"}, 3, "37 fields where the header has 36"),
+        ({(4, "Time (s)"): "0.2"}, 4, "time runs backwards: 0.2 s beside 0.5 s"),
+        ({(4, "Time (s)"): "0.5"}, 4, "time repeats: 0.5 s"),
+        ({(3, "Time (s)"): "900"}, 3, "time jumps ahead: 900 s"),
+        ({(5, "Temp_2"): "310.2"}, 5, "motor 3 at 310.2 is no °C"),
+    ],
+)
+def test_a_damaged_line_is_named_and_the_rest_read_on_demand(gen3, cells, line, match, caplog):
+    path = gen3(cells)
+    assert 'read with damaged="skip"' in str(refused(path, match, line))
+    with caplog.at_level(logging.WARNING):
+        (recording,) = read(path, damaged="skip")
+    keep = [i for i in range(4) if i != line - 2]
+    np.testing.assert_allclose(recording.time_s, np.array(TIME_S)[keep])
+    assert len(recording.dropped) == 1
+    assert recording.dropped[0].startswith(f"line {line}: ")
+    assert recording.dropped[0] in caplog.text
+
+
+def test_an_end_in_the_middle_of_a_line_is_no_whole_line(gen3):
+    whole = gen3().read_bytes()
+    path = gen3()
+    for kept in range(whole.rindex(b"\r\n", 0, -2) + 5, len(whole) - 1, 40):
+        path.write_bytes(whole[:kept])
+        refused(path, "ends in the middle of this line", 5)
+        (recording,) = read(path, damaged="skip")
+        assert recording.time_s.tolist() == list(TIME_S[:3])
+
+
+def test_many_damaged_lines_are_told_shortly(gen3):
+    cells = {(line, "Pos_0"): "x" for line in (*range(5, 15), 20)}
+    path = gen3(cells, count=30)
+    assert "and 10 more places" in str(refused(path, "field 2, 'x'", 5))
+    (recording,) = read(path, damaged="skip")
+    assert [sentence.partition(":")[0] for sentence in recording.dropped] == ["lines 5 to 14", "line 20"]
+    assert len(recording.time_s) == 19
+    every_other = gen3({(line, "Pos_0"): "x" for line in range(5, 105, 2)}, count=110)
+    assert read(every_other, damaged="skip")[0].dropped[-1] == "and 30 more places like these"
+
+
+def test_a_clock_set_anew_is_two_recordings(tmp_path: Path):
+    path = tmp_path / "twice.csv"
+    path.write_text(text(GEN3, [gen3_row(t) for t in (*range(10), *range(8))]))
+    for damaged in ("refuse", "skip"):
+        with pytest.raises(LogError, match=r"anew at line 12 .9 s, then 0 s.: these are several recordings"):
+            read(path, damaged=damaged)
+
+
+@given(st.lists(st.integers(0, 30), min_size=1, max_size=10))
+def test_as_many_samples_stay_as_can(times):
+    # Second method: the longest strictly increasing subsequence by trying all of them.
+    best = max(
+        count
+        for count in range(1, len(times) + 1)
+        for chosen in combinations(times, count)
+        if all(a < b for a, b in pairwise(chosen))
+    )
+    try:
+        left_out = [damage.line for damage in backwards(np.array(times, float), np.arange(len(times)))]
+    except ValueError:
+        assert len(times) - best > 3
+        return
+    kept = np.delete(np.array(times), left_out)
+    assert (np.diff(kept) > 0).all()
+    assert len(kept) == best
+
+
+@pytest.mark.parametrize(
+    ("content", "line", "match"),
+    [
+        (b"", None, "is empty"),
+        (b"\r\n \n", None, "is empty"),
+        (text(GEN3, []).encode(), None, "holds no good line"),
+        (b"a,b\r\n1,2\r\n", 1, "begins with 'a,b', where a Gen3 log has 'Time .s.' and a plain one 'time_s'"),
+        (text(GEN3, []).replace(",", ";").encode(), 1, "separated by commas"),
+        (text(GEN3[:-2], []).encode(), 1, "misses the columns Velocity_5, Velocity_6 of a Gen3 log"),
+        (text(GEN3[:-1], []).encode(), 1, "misses the column Velocity_6 of a Gen3 log"),
+        (text([n for n in GEN3 if not n.endswith("_6")], []).encode(), 1, "an arm with 6 joints; a Gen3 has 7"),
+        (text([n for n in PLAIN if n != "temp_c_3"], []).encode(), 1, "misses the column temp_c_3 of a plain log"),
+        (text([*PLAIN[:15], *(f"torque_{j}" for j in range(1, 8))], []).encode(), 1, "misses the columns tau_1, tau_2"),
+        (text([*GEN3, "Pos_0"], []).encode(), 1, "names the column 'Pos_0' twice"),
+        (text(GEN3, map(gen3_row, TIME_S)).encode("utf-16"), 1, "is not text in UTF-8"),
+        (text(PLAIN, [["0", *["89.5"] * 7, *["0"] * 28]]).encode(), 2, "joint 2 at 89.5 is beyond its stops; q is in"),
+    ],
+)
+def test_a_file_that_is_no_log_says_why(tmp_path: Path, content: bytes, line: int | None, match: str):
+    path = tmp_path / "bad.csv"
+    path.write_bytes(content)
+    refused(path, match, line)
+
+
+def test_strange_columns_are_left_out_on_demand(tmp_path: Path):
+    path = tmp_path / "more.csv"
+    path.write_text(text([*GEN3, "Note"], [[*gen3_row(t), "1"] for t in TIME_S]))
+    refused(path, "columns Note are none of a Gen3 log", None)
+    (recording,) = read(path, damaged="skip")
+    assert "Note" in recording.dropped[0]
+    np.testing.assert_allclose(recording.time_s, TIME_S)
+
+
+def test_a_broken_gzip_gives_what_it_holds_on_demand(tmp_path: Path, gen3):
+    whole = gen3(count=200).read_bytes()
+    packed = gzip.compress(whole, compresslevel=0)
+    path = tmp_path / "half.csv.gz"
+    path.write_bytes(packed[: len(packed) // 2])
+    refused(path, "gzip data are cut off", None)
+    (recording,) = read(path, damaged="skip")
+    assert 80 <= len(recording.time_s) <= 100
+    np.testing.assert_array_equal(recording.temp_c, read(gen3(count=200))[0].part(slice(len(recording.time_s))).temp_c)
+    assert "cut off" in recording.dropped[0]
+    assert "in the middle of this line" in recording.dropped[1]
+    path.write_bytes(packed[:-8] + b"\0" * 8)
+    refused(path, "gzip data are damaged: CRC", None)
+    assert len(read(path, damaged="skip")[0].time_s) == 200
+    path.write_bytes(b"<html>")
+    refused(path, "holds no gzip data", None)
+    path.write_bytes(zlib.compress(b"", wbits=31))
+    refused(path, "is empty", None)
+
+
+def test_a_line_in_another_encoding_is_a_damaged_line(gen3):
+    path = gen3()
+    path.write_bytes(path.read_bytes().replace(b"1.1,", b"1\xb71,"))
+    refused(path, "not text in UTF-8", 4)
+    assert read(path, damaged="skip")[0].time_s.tolist() == [0.0, 0.5, 1.5]
+
+
+def test_a_table_that_is_no_telemetry_says_why(tmp_path: Path):
+    path = tmp_path / "telemetry.parquet"
+    path.write_bytes(b"PAR1 and no more")
+    refused(path, "is no whole parquet file", None)
+    columns = {"time_s": [0.0, 1.0, 2.0], **{name: [0.5] * 3 for name in PLAIN[1:]}}
+    pq.write_table(pa.table(columns), path)
+    refused(path, "misses the column arm", None)
+    pq.write_table(pa.table({"arm": ["a"] * 3, **columns, "q_3": ["x"] * 3}), path)
+    refused(path, "column q_3 holds string, no numbers", None)
+    pq.write_table(pa.table({"arm": ["a"] * 3, **{k: v for k, v in columns.items() if k != "q_3"}}), path)
+    refused(path, "misses the column q_3", None)
+    pq.write_table(pa.table({"arm": ["a"] * 3, **columns, "tau_2": [0.0, None, 0.0]}), path)
+    refused(path, "tau_2 is missing or not a finite number", 2)
+    assert read(path, damaged="skip")[0].time_s.tolist() == [0.0, 2.0]
+    with pytest.raises(LogError, match="cannot be read: No such file"):
+        read(tmp_path / "none.csv")
+    with pytest.raises(LogError, match="is a folder"):
+        read(tmp_path)
+
+
+def test_a_folder_is_read_whole_or_says_what_is_left_out(tmp_path: Path, gen3, caplog):
+    with pytest.raises(LogError, match=r"holds no log; a log ends in .csv.gz, .csv, .parquet"):
+        read_folder(tmp_path)
+    gen3(name="b.csv")
+    gen3(name="a.csv")
+    (tmp_path / "notes.txt").write_text("kept apart")
+    assert [r.name for r in read_folder(tmp_path)] == ["a", "b"]
+    (tmp_path / "c.csv").write_text("no log\n")
+    with pytest.raises(LogError, match=r"c\.csv, line 1: is no log"):
+        read_folder(tmp_path)
+    with caplog.at_level(logging.WARNING):
+        assert [r.name for r in read_folder(tmp_path, damaged="skip")] == ["a", "b"]
+    assert "left out" in caplog.text
+    assert "c.csv" in caplog.text
+    (tmp_path / "a.csv.gz").write_bytes(gzip.compress((tmp_path / "a.csv").read_bytes()))
+    with pytest.raises(LogError, match=r"'a.csv' and 'a.csv.gz' are one log"):
+        read_folder(tmp_path)
+    with pytest.raises(LogError, match="no such folder"):
+        read_folder(tmp_path / "none")
+    with pytest.raises(LogError, match="is no folder"):
+        read_folder(tmp_path / "a.csv")
+
+
+def test_a_folder_without_one_good_log_is_an_error(tmp_path: Path):
+    (tmp_path / "c.csv").write_text("no log\n")
+    with pytest.raises(LogError, match="none of its 1 logs can be read"):
+        read_folder(tmp_path, damaged="skip")
