@@ -22,7 +22,7 @@ AMBIENT_C = (19.0, 27.0)
 DURATION_S = (180.0, 2700.0)
 EARLIER_S = (300.0, 3600.0)
 """How long the job before lasted, where there was one."""
-REST_S = (0.0, 1200.0)
+REST_S = (0.0, 1800.0)
 """Rest, powered, between the job before and this one."""
 COOLING_STEP_S = 300.0
 """An arm above the limit rests on in such steps until it is below."""
