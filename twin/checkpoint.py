@@ -11,13 +11,16 @@ from safetensors.torch import load_file, save_file
 
 from fleet.errors import CheckpointError
 from fleet.robot import JOINTS
-from twin.model import JointVae, TwinConfig
-from twin.score import JointFit, Twin
+from twin.measures import PARTS, Calibration, Features
+from twin.model import LstmVae, TwinConfig, build
+from twin.score import Fit, Twin, net_names
 from twin.window import Scaler
 
-FORMAT = 1
+FORMAT = 2
 WEIGHTS = "weights.safetensors"
 CARD = "twin.json"
+REFERENCE = "calibration.reference"
+"""Tensor with the features of held-out cool jobs, float64 [job, joint, part]; absent without a calibration."""
 
 
 class _Head(msgspec.Struct):
@@ -39,7 +42,8 @@ class _Card(msgspec.Struct, forbid_unknown_fields=True):
     mean: list[tuple[float, float, float]]
     std: list[tuple[float, float, float]]
     still: list[bool]
-    fits: list[JointFit]
+    fits: list[Fit]
+    calibrated: bool
 
 
 def save(twin: Twin, folder: Path) -> None:
@@ -57,9 +61,13 @@ def save(twin: Twin, folder: Path) -> None:
         std=twin.scaler.std.tolist(),
         still=twin.scaler.still.tolist(),
         fits=list(twin.fits),
+        calibrated=twin.calibration is not None,
     )
     unfinished = folder / f".{WEIGHTS}.{os.getpid()}"
-    save_file(twin.tensors(), unfinished)
+    tensors = twin.tensors()
+    if twin.calibration is not None:
+        tensors[REFERENCE] = torch.from_numpy(np.array(twin.calibration.reference.packed, dtype=float))
+    save_file(tensors, unfinished)
     unfinished.replace(folder / WEIGHTS)
     unfinished = folder / f".{CARD}.{os.getpid()}"
     unfinished.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=2))
@@ -77,10 +85,23 @@ def load(folder: Path, *, joints: int = JOINTS) -> Twin:
     if len(card.turn_q) != joints:
         raise CheckpointError(f"{folder / CARD}: the twin has {len(card.turn_q)} joints, the arm has {joints}.")
     scaler = Scaler(np.array(card.turn_q), np.array(card.mean), np.array(card.std), np.array(card.still))
-    if {len(part) for part in (scaler.mean, scaler.std, scaler.still, card.fits)} != {joints}:
-        raise CheckpointError(f"{folder / CARD}: mean, std, still and fits must each have {joints} joints.")
-    nets = _read_nets(folder / WEIGHTS, card.config, joints)
-    twin = Twin(card.config, scaler, nets, arm=card.arm, data_hash=card.data_hash, seed=card.seed, fits=card.fits)
+    if {len(part) for part in (scaler.mean, scaler.std, scaler.still)} != {joints}:
+        raise CheckpointError(f"{folder / CARD}: mean, std and still must each have {joints} joints.")
+    networks = card.config.networks(joints)
+    if len(card.fits) != networks:
+        raise CheckpointError(f"{folder / CARD}: fits must have {networks} entries, one per network.")
+    tensors = _read_tensors(folder / WEIGHTS)
+    calibration = _calibration(folder / WEIGHTS, tensors, joints) if card.calibrated else None
+    twin = Twin(
+        card.config,
+        scaler,
+        _nets(folder / WEIGHTS, tensors, card.config, joints),
+        arm=card.arm,
+        data_hash=card.data_hash,
+        seed=card.seed,
+        fits=card.fits,
+        calibration=calibration,
+    )
     if twin.version != card.version:
         raise CheckpointError(
             f"{folder}: the content has changed since it was saved (says version {card.version}, is {twin.version})."
@@ -102,18 +123,35 @@ def _read_card(path: Path) -> _Card:
         raise CheckpointError(f"{path}: {error}") from error
 
 
-def _read_nets(path: Path, config: TwinConfig, joints: int) -> list[JointVae]:
+def _read_tensors(path: Path) -> dict[str, torch.Tensor]:
     if not path.exists():
         raise CheckpointError(f"No twin in {path.parent}: {path.name} is missing.")
     try:
-        tensors = load_file(path)
+        return load_file(path)
     except SafetensorError as error:
         raise CheckpointError(f"{path}: damaged ({error}).") from error
-    with torch.random.fork_rng(devices=[]):
-        nets = [JointVae(config) for _ in range(joints)]
-    wanted = {
-        f"joint_{j + 1}.{name}": tensor for j, net in enumerate(nets) for name, tensor in net.state_dict().items()
-    }
+
+
+def _calibration(path: Path, tensors: dict[str, torch.Tensor], joints: int) -> Calibration:
+    """The calibration, taken out of the tensors."""
+    reference = tensors.pop(REFERENCE, None)
+    if reference is None:
+        raise CheckpointError(f"{path}: missing tensors ['{REFERENCE}'].")
+    if reference.dtype != torch.float64 or reference.ndim != 3 or tuple(reference.shape[1:]) != (joints, PARTS):
+        raise CheckpointError(
+            f"{path}: tensor {REFERENCE} is {reference.dtype} {tuple(reference.shape)}, "
+            f"it must be {torch.float64} (jobs, {joints}, {PARTS})."
+        )
+    try:
+        return Calibration(Features(reference.numpy()))
+    except ValueError as error:
+        raise CheckpointError(f"{path}: {error}") from error
+
+
+def _nets(path: Path, tensors: dict[str, torch.Tensor], config: TwinConfig, joints: int) -> list[LstmVae]:
+    channels = config.channels(joints)
+    nets = {name: build(config, seed=0, channels=channels) for name in net_names(config, joints)}
+    wanted = {f"{owner}.{name}": tensor for owner, net in nets.items() for name, tensor in net.state_dict().items()}
     missing, unknown = sorted(wanted.keys() - tensors.keys()), sorted(tensors.keys() - wanted.keys())
     if missing or unknown:
         raise CheckpointError(f"{path}: missing tensors {missing[:3]}, unknown tensors {unknown[:3]}.")
@@ -124,4 +162,4 @@ def _read_nets(path: Path, config: TwinConfig, joints: int) -> list[JointVae]:
                 f"the configuration needs {tensor.dtype} {tuple(tensor.shape)}."
             )
         tensor.copy_(tensors[name])
-    return nets
+    return list(nets.values())

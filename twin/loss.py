@@ -20,13 +20,14 @@ def reconstruction(x: Tensor, x_hat: Tensor) -> Tensor:
 
 
 def kl(mu: Tensor, logvar: Tensor) -> Tensor:
-    """KL(N(mu, e^logvar) ‖ N(0, 1)) summed over the latent, nats, [batch]."""
+    """KL(N(mu, e^logvar) ‖ N(0, 1)) summed over the latent, nats, [batch]; infinite for the point of an autoencoder."""
     return 0.5 * (mu.square() + logvar.exp() - 1.0 - logvar).sum(1)
 
 
 def negative_elbo(x: Tensor, x_hat: Tensor, mu: Tensor, logvar: Tensor, beta: float) -> Tensor:
-    """Mean over the batch of reconstruction + β·KL, scalar."""
-    return (reconstruction(x, x_hat) + beta * kl(mu, logvar)).mean()
+    """Mean over the batch of reconstruction + β·KL, scalar; β = 0 leaves the KL out, as an autoencoder needs it."""
+    error = reconstruction(x, x_hat)
+    return (error + beta * kl(mu, logvar)).mean() if beta else error.mean()
 
 
 def active_units(mu: Tensor) -> int:
@@ -34,6 +35,6 @@ def active_units(mu: Tensor) -> int:
     return int((torch.var(mu, dim=0, correction=0) > ACTIVE_VARIANCE).sum())
 
 
-def collapsed(kl_nats: float, active: int) -> bool:
-    """Whether the decoder has learned to do without the latent."""
-    return kl_nats < LEAST_KL_NATS or active == 0
+def collapsed(kl_nats: float | None, active: int) -> bool:
+    """Whether the decoder has learned to do without the latent; an autoencoder has no KL (None) to tell it by."""
+    return active == 0 or (kl_nats is not None and kl_nats < LEAST_KL_NATS)

@@ -1,13 +1,19 @@
-"""The network of one joint: an LSTM encoder to a Gaussian latent, and an LSTM decoder back to the window."""
+"""The network: an LSTM encoder of a window to a Gaussian latent, and an LSTM decoder from there back to the window."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
 
 from fleet.motion import CHANNELS, RATE_HZ
+
+Scope = Literal["joint", "arm"]
+"""One network per joint, of 3 channels; or one for the whole arm, of 3 channels times its joints."""
+Kind = Literal["vae", "ae"]
+"""Variational; or a plain autoencoder: no KL, no noise on the latent, no posterior."""
 
 LOGVAR_RANGE = (-8.0, 4.0)
 """Clamp of the posterior's log variance: neither a delta nor wider than the prior can use."""
@@ -17,7 +23,10 @@ LOGVAR_RANGE = (-8.0, 4.0)
 class TwinConfig:
     """What a twin looks at, how large it is and how it is trained."""
 
+    scope: Scope = "joint"
+    kind: Kind = "vae"
     latent: int = 2
+    """Size of the latent of each network."""
     hidden: int = 32
     layers: int = 1
     window: int = 50
@@ -49,6 +58,9 @@ class TwinConfig:
     """Keep a twin whose latent says nothing, as a baseline, instead of raising CollapsedPosterior."""
 
     def __post_init__(self) -> None:
+        for name, allowed in (("scope", get_args(Scope)), ("kind", get_args(Kind))):
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"TwinConfig.{name} must be one of {allowed} (got {getattr(self, name)!r}).")
         whole = ("latent", "hidden", "layers", "stride", "score_stride", "max_windows", "epochs", "batch", "restarts")
         for name in whole:
             if getattr(self, name) < 1:
@@ -73,26 +85,42 @@ class TwinConfig:
         """For small budgets: about a seventh of the default's training steps."""
         return cls(max_windows=768, epochs=60, restarts=1)
 
+    @classmethod
+    def whole_arm(cls) -> "TwinConfig":
+        """One network for all joints: it also knows which postures and loads go together, and trains faster."""
+        return cls(scope="arm", hidden=64, latent=8)
 
-class JointVae(nn.Module):
-    """Encoder and decoder of one joint's windows [batch, time, channel], in z-scores."""
+    def networks(self, joints: int) -> int:
+        """How many networks an arm with so many joints has."""
+        return 1 if self.scope == "arm" else joints
 
-    def __init__(self, config: TwinConfig) -> None:
+    def channels(self, joints: int) -> int:
+        """How many channels each of its networks reads."""
+        return len(CHANNELS) * joints // self.networks(joints)
+
+
+class LstmVae(nn.Module):
+    """Encoder and decoder of windows [batch, time, channel], in z-scores."""
+
+    def __init__(self, config: TwinConfig, channels: int) -> None:
         super().__init__()
-        channels, hidden, layers = len(CHANNELS), config.hidden, config.layers
+        hidden, layers = config.hidden, config.layers
         self.encoder = nn.LSTM(channels, hidden, layers, batch_first=True)
         self.summary = nn.Linear(hidden, hidden)
         self.mu = nn.Linear(hidden, config.latent)
-        self.logvar = nn.Linear(hidden, config.latent)
+        self.logvar = nn.Linear(hidden, config.latent) if config.kind == "vae" else None
         self.expand = nn.Linear(config.latent, hidden)
         self.decoder = nn.LSTM(hidden, hidden, layers, batch_first=True)
         self.out = nn.Linear(hidden, channels)
 
     def encode(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Posterior mean and log variance, each [batch, latent]."""
+        """Posterior mean and log variance, each [batch, latent]; that of an autoencoder is -inf: it is certain."""
         _, (last, _) = self.encoder(x)
         seen = torch.tanh(self.summary(last[-1]))
-        return self.mu(seen), self.logvar(seen).clamp(*LOGVAR_RANGE)
+        mu = self.mu(seen)
+        if self.logvar is None:
+            return mu, torch.full_like(mu, -torch.inf)
+        return mu, self.logvar(seen).clamp(*LOGVAR_RANGE)
 
     def decode(self, z: Tensor, steps: int) -> Tensor:
         """The window that a latent [batch, latent] stands for, [batch, time, channel]."""
@@ -105,11 +133,11 @@ class JointVae(nn.Module):
         return self.decode(mu + eps * torch.exp(0.5 * logvar), x.shape[1]), mu, logvar
 
 
-def build(config: TwinConfig, seed: int) -> JointVae:
+def build(config: TwinConfig, seed: int, *, channels: int = len(CHANNELS)) -> LstmVae:
     """A network with random weights of this seed; torch's global random state stays as it was."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return JointVae(config)
+        return LstmVae(config, channels)
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 import hashlib
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 
 import msgspec
 import numpy as np
@@ -10,9 +11,10 @@ import torch
 from torch import Tensor
 
 from fleet.errors import FleetError
+from twin.forward import split
 from twin.loss import active_units, collapsed, kl, negative_elbo, reconstruction
-from twin.model import JointVae, TwinConfig, build, one_thread
-from twin.score import JointFit, Twin
+from twin.model import LstmVae, TwinConfig, build, one_thread
+from twin.score import Fit, Twin, net_names
 from twin.window import Scaler, windows_of
 
 Array = np.ndarray
@@ -22,24 +24,34 @@ RECIPE = 1
 
 
 class CollapsedPosterior(FleetError):
-    """The latent of a joint carries nothing: the decoder answers every window with the same motion."""
+    """The latent of a network carries nothing: the decoder answers every window with the same motion.
 
-    def __init__(self, arm: str, joint: int, kl_nats: float, active: int) -> None:
+    Attributes:
+        net: Which network, `joint_2` or `arm`.
+    """
+
+    def __init__(self, arm: str, net: str, kl_nats: float, active: int) -> None:
         super().__init__(
-            f"The twin of '{arm}' learned nothing of joint {joint + 1}: KL {kl_nats:.2f} nat, {active} active latent "
+            f"The twin of '{arm}' learned nothing of {_spoken(net)}: KL {kl_nats:.2f} nat, {active} active latent "
             "unit(s). Lower beta, train longer (epochs, max_windows), or set allow_collapse to keep it as a baseline."
         )
-        self.joint = joint
+        self.arm, self.net, self.kl_nats, self.active = arm, net, kl_nats, active
+
+    def __reduce__(self) -> tuple[type, tuple[str, str, float, int]]:
+        return type(self), (self.arm, self.net, self.kl_nats, self.active)
 
 
 class Diverged(FleetError):
-    """No training of a joint ended with finite weights."""
+    """No training of a network ended with finite weights."""
 
-    def __init__(self, arm: str, joint: int) -> None:
+    def __init__(self, arm: str, net: str) -> None:
         super().__init__(
-            f"The training of joint {joint + 1} of '{arm}' ended without finite weights. Lower learning_rate or clip."
+            f"The training of {_spoken(net)} of '{arm}' ended without finite weights. Lower learning_rate or clip."
         )
-        self.joint = joint
+        self.arm, self.net = arm, net
+
+    def __reduce__(self) -> tuple[type, tuple[str, str]]:
+        return type(self), (self.arm, self.net)
 
 
 def hash_records(records: Sequence[Array]) -> str:
@@ -84,8 +96,8 @@ def train(
 
     Raises:
         ValueError: no records, or one that is misshapen or not finite.
-        CollapsedPosterior: a joint that did move in training has no latent to speak of.
-        Diverged: the optimiser lost its way on some joint.
+        CollapsedPosterior: a network whose joints did move in training has no latent to speak of.
+        Diverged: the optimiser lost its way on some network.
     """
     windows = windows_of(
         records, from_hz=config.record_hz, rate_hz=config.rate_hz, window=config.window, stride=config.stride
@@ -94,80 +106,112 @@ def train(
         rng = np.random.default_rng(_child(seed, windows.shape[2], 0))
         windows = windows[np.sort(rng.choice(len(windows), config.max_windows, replace=False))]
     scaler = Scaler.fit(windows)
-    z = torch.from_numpy(scaler.to_z(windows))
-    noise = torch.from_numpy((np.array(config.noise) / scaler.std).astype(np.float32))  # [joint, channel]
+    names = net_names(config, scaler.joints)
+    noise = (np.array(config.noise) / scaler.std).astype(np.float32).reshape(len(names), -1)  # [net, channel]
+    still = [bool(part.all()) for part in np.split(scaler.still, len(names))]
     nets, fits = [], []
-    runs = scaler.joints * config.restarts
     with one_thread():
-        for joint in range(scaler.joints):
-            x = z[:, :, joint].contiguous()
-            candidates: list[tuple[JointFit, JointVae]] = []
-            for restart in range(config.restarts):
-                done = joint * config.restarts + restart
-                report = None if progress is None else _part_of(progress, done, runs)
-                own = _child(seed, joint, restart)
-                net = fit_joint(x, noise[joint], config, own, progress=report)
-                candidates.append((_assess(net, x, config, own, restart), net))
-            candidates = [(fit, net) for fit, net in candidates if math.isfinite(fit.elbo)]
-            if not candidates:
-                raise Diverged(arm, joint)
-            fit, net = max(candidates, key=lambda pair: pair[0].elbo)
-            if collapsed(fit.kl, fit.active_units) and not (config.allow_collapse or scaler.still[joint]):
-                raise CollapsedPosterior(arm, joint, fit.kl, fit.active_units)
+        for n, (name, x) in enumerate(zip(names, split(scaler.to_z(windows), len(names)), strict=True)):
+            report = None if progress is None else _part_of(progress, n, len(names))
+            seeds = [_child(seed, n, restart) for restart in range(config.restarts)]
+            best = _best_of(torch.from_numpy(x), torch.from_numpy(noise[n]), config, seeds, report)
+            if best is None:
+                raise Diverged(arm, name)
+            fit, net = best
+            kl_nats = fit.kl if config.kind == "vae" else None
+            if collapsed(kl_nats, fit.active_units) and not (config.allow_collapse or still[n]):
+                raise CollapsedPosterior(arm, name, fit.kl, fit.active_units)
             nets.append(net)
             fits.append(fit)
     data = hash_records(records) if data_hash is None else data_hash
     return Twin(config, scaler, nets, arm=arm, data_hash=data, seed=seed_text(seed), fits=fits)
 
 
-def fit_joint(
+def _best_of(
+    x: Tensor, noise: Tensor, config: TwinConfig, seeds: Sequence[int], progress: Callable[[float], None] | None
+) -> tuple[Fit, LstmVae] | None:
+    """The restart of the best ELBO on the training windows; None if none stayed finite."""
+    candidates = []
+    for restart, own in enumerate(seeds):
+        run = fit_net(
+            x, noise, config, own, progress=None if progress is None else _part_of(progress, restart, len(seeds))
+        )
+        candidates.append((_assess(run, x, config, own, restart), run.net))
+    elbos = tuple(fit.elbo if math.isfinite(fit.elbo) else None for fit, _ in candidates)
+    finite = [(fit, net) for fit, net in candidates if math.isfinite(fit.elbo)]
+    if not finite:
+        return None
+    fit, net = max(finite, key=lambda pair: pair[0].elbo)
+    return replace(fit, restart_elbos=elbos), net
+
+
+@dataclass
+class Run:
+    """One training of one network, and how it went."""
+
+    net: LstmVae
+    elbo_by_epoch: list[float] = field(default_factory=list)
+    kl_by_epoch: list[float] = field(default_factory=list)
+
+
+def fit_net(
     x: Tensor,
     noise: Tensor,
     config: TwinConfig,
     seed: int,
     *,
     progress: Callable[[float], None] | None = None,
-) -> JointVae:
-    """One training of one joint's network.
+) -> Run:
+    """One training of one network.
 
     Args:
         x: Windows in z-scores, [batch, time, channel].
         noise: Standard deviation added to each channel, in z-scores, [channel].
     """
-    net = build(config, seed)
-    draw = torch.Generator().manual_seed(seed)
+    run = Run(build(config, seed, channels=x.shape[-1]))
+    net, draw = run.net, torch.Generator().manual_seed(seed)
+    beta = config.beta if config.kind == "vae" else 0.0
     optimizer = torch.optim.Adam(net.parameters(), lr=config.learning_rate, fused=True)
     steps = config.epochs * -(-len(x) // config.batch)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.learning_rate, total_steps=max(steps, 2))
     for epoch in range(config.epochs):
+        sums = torch.zeros(2)
         for index in torch.randperm(len(x), generator=draw).split(config.batch):
             batch = x[index]
             batch = batch + noise * torch.randn(batch.shape, generator=draw)
             eps = torch.randn(len(index), config.latent, generator=draw)
             optimizer.zero_grad()
             x_hat, mu, logvar = net(batch, eps)
-            negative_elbo(batch, x_hat, mu, logvar, config.beta).backward()
+            loss = negative_elbo(batch, x_hat, mu, logvar, beta)
+            loss.backward()
             torch.nn.utils.clip_grad_norm_(net.parameters(), config.clip)
             optimizer.step()
             schedule.step()
+            nats = kl(mu.detach(), logvar.detach()).mean() if config.kind == "vae" else torch.zeros(())
+            sums += len(index) * torch.stack([-loss.detach(), nats])
+        elbo, nats = (sums / len(x)).tolist()
+        run.elbo_by_epoch.append(elbo)
+        run.kl_by_epoch.append(nats)
         if progress is not None:
             progress((epoch + 1) / config.epochs)
-    return net
+    return run
 
 
-def _assess(net: JointVae, x: Tensor, config: TwinConfig, seed: int, restart: int) -> JointFit:
+def _assess(run: Run, x: Tensor, config: TwinConfig, seed: int, restart: int) -> Fit:
     """Quality on the training windows, with one draw of the latent per window for the ELBO."""
     draw = torch.Generator().manual_seed(seed)
     with torch.inference_mode():
-        x_hat, mu, logvar = net(x, torch.randn(len(x), config.latent, generator=draw))
-        mean_hat = net.decode(mu, x.shape[1])
-        nats = kl(mu, logvar).mean()
-        return JointFit(
-            elbo=float(-(reconstruction(x, x_hat).mean() + nats)),
-            kl=float(nats),
+        x_hat, mu, logvar = run.net(x, torch.randn(len(x), config.latent, generator=draw))
+        mean_hat = run.net.decode(mu, x.shape[1])
+        nats = float(kl(mu, logvar).mean()) if config.kind == "vae" else 0.0
+        return Fit(
+            elbo=-float(reconstruction(x, x_hat).mean()) - nats,
+            kl=nats,
             active_units=active_units(mu),
             mean_squared_error=float((x - mean_hat).square().mean()),
             restart=restart,
+            elbo_by_epoch=tuple(run.elbo_by_epoch),
+            kl_by_epoch=tuple(run.kl_by_epoch),
         )
 
 
@@ -179,3 +223,7 @@ def _child(seed: np.random.SeedSequence, joint: int, restart: int) -> int:
 
 def _part_of(progress: Callable[[float], None], done: int, runs: int) -> Callable[[float], None]:
     return lambda share: progress((done + share) / runs)
+
+
+def _spoken(net: str) -> str:
+    return "the whole arm" if net == "arm" else net.replace("_", " ")

@@ -64,7 +64,7 @@ def test_a_file_cut_short_is_named(folder, name):
 
 def test_another_format_is_refused(folder):
     edit(folder, lambda card: card.update(format=99, surprise=1))
-    with pytest.raises(CheckpointError, match="format 99 is not the one read here, 1"):
+    with pytest.raises(CheckpointError, match="format 99 is not the one read here, 2"):
         load(folder)
 
 

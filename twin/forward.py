@@ -1,0 +1,61 @@
+"""The networks of a twin as functions of arrays in z-scores: to the latent, back from it, and both."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fleet.motion import CHANNELS
+from twin.model import LstmVae, one_thread
+
+Array = np.ndarray
+
+_CHUNK = 512
+"""Windows per pass: keeps the activations in cache."""
+
+
+class Networks:
+    """Trained networks side by side: each reads its share of an arm's channels; nothing is drawn at random."""
+
+    def __init__(self, nets: Sequence[LstmVae]) -> None:
+        self.nets = tuple(net.eval().requires_grad_(False) for net in nets)
+
+    def posterior(self, z: Array) -> tuple[Array, Array]:
+        """Mean and standard deviation of the latent of windows [batch, time, joint, channel], [batch, net, latent]."""
+        mu, sigma = [], []
+        with one_thread(), torch.inference_mode():
+            for net, x in zip(self.nets, self._split(z), strict=True):
+                parts = [net.encode(part) for part in x.split(_CHUNK)]
+                mu.append(torch.cat([mean for mean, _ in parts]).numpy())
+                sigma.append(torch.exp(0.5 * torch.cat([logvar for _, logvar in parts])).numpy())
+        return np.stack(mu, axis=1), np.stack(sigma, axis=1)
+
+    def decode(self, latent: Array, steps: int) -> Array:
+        """Windows that latents [batch, net, latent] stand for, float32 [batch, time, joint, channel]."""
+        told = torch.from_numpy(np.array(latent, dtype=np.float32))
+        with one_thread(), torch.inference_mode():
+            made = [
+                torch.cat([net.decode(part, steps) for part in told[:, n].split(_CHUNK)]).numpy()
+                for n, net in enumerate(self.nets)
+            ]
+        return _join(made)
+
+    def reconstruct(self, z: Array) -> Array:
+        """Windows [batch, time, joint, channel] decoded from the mean of their posterior, float32."""
+        return self.decode(self.posterior(z)[0], z.shape[1])
+
+    def _split(self, z: Array) -> list[Tensor]:
+        """The windows as each network reads them, [batch, time, channel of the network]."""
+        return [torch.from_numpy(x) for x in split(z, len(self.nets))]
+
+
+def split(z: Array, networks: int) -> list[Array]:
+    """Windows [batch, time, joint, channel] as each of one or all joints' networks reads them."""
+    apart = z.reshape(*z.shape[:2], networks, -1)
+    return [np.ascontiguousarray(apart[:, :, n]) for n in range(networks)]
+
+
+def _join(made: Sequence[Array]) -> Array:
+    whole = np.stack(made, axis=2)
+    return whole.reshape(*whole.shape[:2], -1, len(CHANNELS))
