@@ -15,12 +15,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.errors import LogError
+from fleet.robot import Robot
+from fleet.sim.models import ArmModel
 from fleet.telemetry import Telemetry
 from scenarios.folder import telemetry_table
 from twin.log_table import backwards
 from twin.logs import read, read_folder
 from twin.recording import CHANNELS
 
+LOGS = Path(__file__).parents[2] / "../shared/data/gen3_logs"
 GEN3 = ["Time (s)", *(f"{g}_{j}" for g in ("Pos", "Temp", "Torque", "Current", "Velocity") for j in range(7))]
 PLAIN = ["time_s", *(f"{c}_{j}" for c in CHANNELS for j in range(1, 8))]
 TIME_S = (0.0, 0.5, 1.1, 1.5)
@@ -284,3 +287,37 @@ def test_a_folder_without_one_good_log_is_an_error(tmp_path: Path):
     (tmp_path / "c.csv").write_text("no log\n")
     with pytest.raises(LogError, match="none of its 1 logs can be read"):
         read_folder(tmp_path, damaged="skip")
+
+
+needs_logs = pytest.mark.skipif(not LOGS.is_dir(), reason="the Gen3 logs are not beside this checkout")
+
+
+@needs_logs
+def test_signs_of_a_real_arm_are_those_of_the_model():
+    # Joint 2 held outstretched with a gripper of 0.75 kg: MuJoCo's gravity torque is the second method.
+    (log,) = read(next(LOGS.glob("0_KinovaLog_joint_1.csv*")))
+    some = log.part(slice(None, None, 40))
+    model = ArmModel(Robot(name="logged"))
+    gravity = np.array([model.gravity_torque(q, 0.75) for q in some.q])
+    for joint in (1, 3, 5):
+        assert np.polyfit(gravity[:, joint], some.tau[:, joint], 1)[0] == pytest.approx(1.0, abs=0.2)
+        assert np.corrcoef(some.current_a[:, joint], some.tau[:, joint])[0, 1] > 0.9
+    # A circle is slow enough for two samples a second: there the velocities are those of the positions.
+    (circle,) = read(next(LOGS.glob("1_KinovaLog_circle.csv*")))
+    np.testing.assert_allclose(
+        np.polyfit(np.gradient(circle.q[:, 1], circle.time_s), circle.qd[:, 1], 1)[0], 1, atol=0.1
+    )
+
+
+@needs_logs
+def test_a_real_log_cut_anywhere_keeps_its_whole_lines(tmp_path: Path):
+    packed = next(LOGS.glob("0_KinovaLog_120_20_weight_API.csv.gz")).read_bytes()
+    (whole,) = read(next(LOGS.glob("0_KinovaLog_120_20_weight_API.csv.gz")))
+    path = tmp_path / "cut.csv.gz"
+    for kept in np.random.default_rng(0).integers(2000, len(packed), 8):
+        path.write_bytes(packed[:kept])
+        with pytest.raises(LogError, match="cut off"):
+            read(path)
+        (rest,) = read(path, damaged="skip")
+        for channel in CHANNELS:
+            np.testing.assert_array_equal(getattr(rest, channel), getattr(whole, channel)[: len(rest.time_s)])
