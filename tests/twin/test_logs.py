@@ -6,6 +6,8 @@ import zlib
 from collections.abc import Callable, Iterable
 from itertools import combinations, pairwise
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -287,6 +289,24 @@ def test_a_folder_without_one_good_log_is_an_error(tmp_path: Path):
     (tmp_path / "c.csv").write_text("no log\n")
     with pytest.raises(LogError, match="none of its 1 logs can be read"):
         read_folder(tmp_path, damaged="skip")
+
+
+def test_the_recorder_in_the_documentation_writes_a_gen3_log(tmp_path: Path):
+    page = (Path(__file__).parents[2] / "docs/logs.md").read_text(encoding="utf-8")
+    code = next(block for block in page.split("```python")[1:] if "def record" in block).partition("```")[0]
+    space: dict[str, Any] = {}
+    exec(code, space)
+    k = iter(range(1, 8))
+    actuators = [
+        SimpleNamespace(position=360.0 - i, temperature_motor=20.0 + i, torque=i, current_motor=-i, velocity=i)
+        for i in k
+    ]
+    arm = SimpleNamespace(RefreshFeedback=lambda: SimpleNamespace(actuators=actuators))
+    space["record"](arm, tmp_path / "own.csv", duration_s=0.01, rate_hz=1e6)
+    (own,) = read(tmp_path / "own.csv")
+    np.testing.assert_allclose(own.q[0], np.deg2rad(-np.arange(1.0, 8.0)))
+    np.testing.assert_allclose(own.tau[0], -np.arange(1.0, 8.0))
+    np.testing.assert_allclose(own.temp_c[-1], 20 + np.arange(1.0, 8.0))
 
 
 needs_logs = pytest.mark.skipif(not LOGS.is_dir(), reason="the Gen3 logs are not beside this checkout")
