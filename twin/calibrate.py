@@ -22,7 +22,7 @@ LEAST_JOBS = 30
 LEAST_OF_EACH = 5
 """Jobs that passed the limit, and jobs that did not: fewer cannot be cross-validated."""
 FOLDS = 5
-STRENGTHS = tuple(float(c) for c in np.logspace(-2, 3, 11))
+STRENGTHS = tuple(float(c) for c in np.logspace(-2, 2, 9))
 """Candidates for the inverse of the regularisation."""
 
 
@@ -202,7 +202,7 @@ def logistic(
 
     bounds = [(0.0 if r else None, None) for r in rising] + [(None, None)]
     first = np.zeros(z.shape[1] + 1) if start is None else start
-    options = {"maxiter": 5000, "ftol": 1e-12, "gtol": 1e-7}
+    options = {"maxiter": 5000, "ftol": 1e-10, "gtol": 1e-6}
     found = minimize(cost, first, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
     return found[:-1], float(found[-1])
 
