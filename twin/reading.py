@@ -7,11 +7,10 @@ import numpy as np
 
 from fleet.motion import RATE_HZ, Plan
 from twin.model import TwinConfig
+from twin.score import PHASES
 from twin.window import check_profile, cover, cut, resample
 
 Array = np.ndarray
-
-PHASES = ("approach", "cycle", "retreat")
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +28,13 @@ class Reading:
 
     def mean(self, values: Array) -> Array:
         """Time mean over each job of what was found at each sample, [batch, time, ...] to [job, ...]."""
-        of_window = np.einsum("bt,bt...->b...", self.weight, values)
+        return self._sum(np.einsum("bt,bt...->b...", self.weight, values))
+
+    def mean_of_windows(self, values: Array) -> Array:
+        """Time mean over each job of what was found of each window, [batch, ...] to [job, ...]."""
+        return self._sum(np.einsum("b,b...->b...", self.weight.sum(axis=1), values))
+
+    def _sum(self, of_window: Array) -> Array:
         total = np.zeros((self.jobs, *of_window.shape[1:]))
         np.add.at(total, self.job, of_window)
         return total
