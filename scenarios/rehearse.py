@@ -95,6 +95,16 @@ def _train(records: list[Array], config: TwinConfig, seed: np.random.SeedSequenc
     save(train(records, config, seed, arm=arm), home)
 
 
+def trained(records: list[Array], config: TwinConfig, seed: np.random.SeedSequence, *, arm: str, folder: Path) -> Twin:
+    """The twin of these records: from the folder while all it depends on is unchanged, else trained and kept there."""
+    home = folder / "twins" / training_key(records, config, seed)
+    kept = _stored(home)
+    if kept is None:
+        _train(records, config, seed, arm, home)
+        kept = load(home)
+    return kept
+
+
 def _stored(home: Path) -> Twin | None:
     if not home.is_dir():
         return None

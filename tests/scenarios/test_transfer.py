@@ -1,0 +1,107 @@
+"""Regressors against least squares, aggregation against the mean by hand, few labels against many."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fleet.errors import FleetError
+from scenarios.contest import jobs_of
+from scenarios.rehearse import trained
+from scenarios.study import make_study
+from scenarios.transfer import INPUTS, REGRESSORS, compare, fit, job_inputs, moments, over_time, text, transfer
+from twin.model import TwinConfig
+from twin.reading import read_jobs
+from twin.rivals import untrained
+
+TINY = replace(untrained(TwinConfig()), hidden=4, max_windows=64)
+
+
+@pytest.fixture(scope="module")
+def tiny():
+    return lambda seed: make_study(seed, train=6, reference=2, test=44, novel=0)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(3)
+
+
+def test_what_depends_linearly_is_learned_exactly(rng):
+    x = rng.normal(size=(60, 4))
+    y = 30.0 + x @ np.array([1.0, -2.0, 0.5, 0.0])
+    said = fit("ridge", x[:40], y[:40], seed=0)(x[40:])
+    solved, *_ = np.linalg.lstsq(np.c_[np.ones(40), x[:40]], y[:40], rcond=None)
+    np.testing.assert_allclose(said, np.c_[np.ones(20), x[40:]] @ solved, atol=0.02)
+    np.testing.assert_allclose(said, y[40:], atol=0.02)
+
+
+def test_the_small_network_learns_what_ridge_cannot(rng):
+    x = rng.uniform(-1, 1, (400, 1))
+    y = 40.0 + 10.0 * x[:, 0] ** 2
+    errors = {name: np.std(fit(name, x[:200], y[:200], seed=1)(x[200:]) - y[200:]) for name in REGRESSORS}
+    assert errors["MLP"] < 0.3 * errors["ridge"]
+    repeated = fit("MLP", x[:50], y[:50], seed=2)(x), fit("MLP", x[:50], y[:50], seed=2)(x)
+    np.testing.assert_array_equal(*repeated)
+
+
+def test_more_labels_help_and_an_input_that_knows_beats_noise(rng):
+    x = rng.normal(size=(120, 6))
+    rise_k = 20.0 + 5.0 * x[:, 0] + rng.normal(0, 0.5, 120)
+    rows = compare({"knows": x, "noise": rng.normal(size=(120, 6))}, rise_k, rng, labels=(6, 40), draws=4)
+    by = {(row.inputs, row.regressor, row.labels): row for row in rows}
+    assert len(by) == 2 * len(REGRESSORS) * 2
+    assert np.mean(by["knows", "ridge", 40].rmse_k) < np.mean(by["knows", "ridge", 6].rmse_k)
+    assert np.mean(by["knows", "ridge", 40].r2) > 0.97
+    assert np.mean(by["noise", "ridge", 40].r2) < 0.1
+    assert all(len(row.r2) == len(row.rmse_k) == 4 for row in rows)
+    with pytest.raises(FleetError, match="61 labels need 122 jobs"):
+        compare({"knows": x}, rise_k, rng, labels=(61,))
+    with pytest.raises(ValueError, match="No regressor 'forest'"):
+        fit("forest", x, rise_k, 0)
+
+
+def test_aggregation_by_hand(small):
+    work = small.work()
+    plan = small.arm(0, [work], times=small.Times(approach=4.0, cycle=8.0, retreat=4.0)).plans[work][0]
+    reading = read_jobs([plan, plan], [1, 3], TINY)  # windows of 4 s: 1 + 2 + 1
+    found = over_time(reading, np.array([0.0, 1.0, 3.0, 4.0] * 2)[:, None])
+    np.testing.assert_allclose(found[0], [2.0, np.sqrt((4 + 1 + 1 + 4) / 4)])
+    np.testing.assert_allclose(found[1], [(0 + 3 * 1 + 3 * 3 + 4) / 8, np.sqrt((4 + 3 * 1 + 3 * 1 + 4) / 8)])
+
+
+def test_moments_by_hand():
+    windows = np.zeros((1, 2, 1, 3))
+    windows[0, :, 0, 2] = [1.0, 7.0]
+    np.testing.assert_allclose(moments(windows)[0, 0], [0, 0, 4.0, 0, 0, 3.0, 0, 0, 5.0])
+
+
+def test_transfer_runs_from_study_to_table_and_repeats(tiny, tmp_path):
+    seeds = [np.random.SeedSequence(1), np.random.SeedSequence(2)]
+    first = transfer(seeds, config=TINY, folder=tmp_path, make=tiny, labels=(8,), draws=2)
+    again = transfer(seeds[:1], config=TINY, folder=tmp_path, make=tiny, labels=(8,), draws=2)
+    assert [row.rmse_k[:2] for row in first] == [row.rmse_k for row in again]
+    assert [(row.inputs, row.regressor) for row in first] == [(i, r) for i in INPUTS for r in REGRESSORS]
+    assert all(len(row.r2) == 4 for row in first)
+    assert text(first).count("\n") == 2 + len(first)
+    with pytest.raises(ValueError, match="at least one seed"):
+        transfer([], config=TINY, folder=tmp_path, make=tiny)
+
+
+def test_inputs_follow_their_jobs(tiny, tmp_path):
+    study = tiny(np.random.SeedSequence(1))
+    twin = trained(study.train.records(), TINY, np.random.SeedSequence(1), arm="arm", folder=tmp_path)
+    jobs = jobs_of(study.test, study.horizon_s)
+    order = np.random.default_rng(0).permutation(len(jobs.plans))
+    moved = replace(
+        jobs,
+        plans=tuple(jobs.plans[i] for i in order),
+        repetitions=tuple(jobs.repetitions[i] for i in order),
+        peak_c=jobs.peak_c[order],
+    )
+    first, again = job_inputs(twin, jobs), job_inputs(twin, moved)
+    assert first["latent"].shape == (44, 7 * 2 * 2)
+    assert first["raw"].shape == (44, 7 * 9 * 2)
+    assert first["both"].shape == (44, 7 * 22)
+    for name, values in first.items():
+        np.testing.assert_allclose(values[order], again[name], rtol=1e-4, atol=1e-5)
