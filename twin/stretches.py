@@ -93,26 +93,26 @@ def on_clock(time_s: Array, values: Array, rate_hz: float) -> tuple[Array, Array
     samples = since_s[-1] * rate_hz + _SAME_RATE * len(time_s)
     if rate_hz * np.median(np.diff(time_s)) >= 1 - _SAME_RATE:
         at_s = np.minimum(np.arange(int(samples) + 1) / rate_hz, since_s[-1])
-        return time_s[0] + at_s, _line(since_s, values, at_s)
+        return time_s[0] + at_s, line_at(since_s, values, at_s)
     edges_s = np.minimum(np.arange(int(samples) + 1) / rate_hz, since_s[-1])
-    at_edges = _integral(since_s, values, edges_s)
+    at_edges = integral_at(since_s, values, edges_s)
     means = np.diff(at_edges, axis=0) / _down(np.diff(edges_s), values)
     return time_s[0] + (edges_s[1:] + edges_s[:-1]) / 2.0, means
 
 
-def _line(time_s: Array, values: Array, at_s: Array) -> Array:
+def line_at(time_s: Array, values: Array, at_s: Array) -> Array:
     """Straight lines between readings, at some moments."""
     before = np.clip(np.searchsorted(time_s, at_s, side="right") - 1, 0, len(time_s) - 2)
     share = _down((at_s - time_s[before]) / (time_s[before + 1] - time_s[before]), values)
     return (1 - share) * values[before] + share * values[before + 1]
 
 
-def _integral(time_s: Array, values: Array, at_s: Array) -> Array:
+def integral_at(time_s: Array, values: Array, at_s: Array) -> Array:
     """Integral of the straight lines between readings, from the first of them to some moments."""
     areas = (values[1:] + values[:-1]) / 2.0 * _down(np.diff(time_s), values)
     to_reading = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(areas, axis=0)])
     before = np.clip(np.searchsorted(time_s, at_s, side="right") - 1, 0, len(time_s) - 2)
-    rest = (values[before] + _line(time_s, values, at_s)) / 2.0 * _down(at_s - time_s[before], values)
+    rest = (values[before] + line_at(time_s, values, at_s)) / 2.0 * _down(at_s - time_s[before], values)
     return to_reading[before] + rest
 
 
