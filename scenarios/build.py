@@ -91,13 +91,13 @@ def prepare(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise FleetError(f"Cannot keep plans and twins in '{folder}': {error.strerror}.") from error
-    bodies = [_body(scenario, i) for i in range(len(scenario.arms))]
+    bodies = [body_of(scenario, i) for i in range(len(scenario.arms))]
     asked = all_works(scenario)
     wanted = rehearsal_works(scenario) if difficulty == "twin" else asked
     plans: list[dict[Work, tuple[Plan, ...]]] = []
     refused: list[InfeasibleJob] = []
     for i, (robot, _, _) in enumerate(bodies):
-        possible, impossible = _plan(
+        possible, impossible = plan_works(
             robot, wanted, scenario, folder, lambda s, i=i: progress("planning", (i + s) / len(bodies))
         )
         plans.append(possible)
@@ -119,7 +119,7 @@ def prepare(
     return Fleet(scenario, tuple(arms), tuple(refused))
 
 
-def _body(scenario: Scenario, index: int) -> tuple[Robot, Motors, ThermalModel]:
+def body_of(scenario: Scenario, index: int) -> tuple[Robot, Motors, ThermalModel]:
     """One arm's robot, motors and thermal model: its own, and the same for every seed of a run."""
     spec = scenario.arms[index]
     rng = np.random.default_rng(np.random.SeedSequence([scenario.spread.seed, index]))
@@ -129,9 +129,10 @@ def _body(scenario: Scenario, index: int) -> tuple[Robot, Motors, ThermalModel]:
     return spec.robot(), motors, thermal_model(network)
 
 
-def _plan(
+def plan_works(
     robot: Robot, wanted: tuple[Work, ...], scenario: Scenario, folder: Path, progress: Callable[[float], None]
 ) -> tuple[dict[Work, tuple[Plan, ...]], list[InfeasibleJob]]:
+    """What one arm can do of what is wanted, with its plans (cached in `folder`), and what it cannot."""
     planner = Planner(
         robot, elbows=scenario.planning.elbows, speeds=scenario.planning.speeds, cache_dir=folder / "plans"
     )

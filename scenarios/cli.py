@@ -1,11 +1,10 @@
-"""The command line: `thermofleet run`, `list`, `show`, `compare`, `hold` and `demo`."""
+"""The command line: `thermofleet run`, `list`, `show`, `compare`, `hold`, `demo`, and `twin` with its own commands."""
 
 import errno
 import json
 import logging
 import signal
 import sys
-import textwrap
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -14,10 +13,7 @@ from typing import Annotated, Any
 
 import msgspec
 import typer
-from rich.console import Console
 from rich.logging import RichHandler
-from rich.progress import BarColumn, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
-from rich.progress import Progress as Progressbar
 from rich.table import Table
 
 from agents.rules import RULES
@@ -27,6 +23,8 @@ from scenarios.hold import hold_command
 from scenarios.load import library, load
 from scenarios.policies import label, policy_of
 from scenarios.scenario import Scenario
+from scenarios.terminal import Interrupted, Progress, err_console, out_console, progress_bar, say
+from scenarios.twin_cli import twin_app
 
 app = typer.Typer(
     help="Robot fleets that know how hard a job is on their motors, tell each other, and share the work.",
@@ -34,9 +32,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-out_console = Console()
-err_console = Console(stderr=True)
-
 ScenarioArg = Annotated[str, typer.Argument(help="A library name (see `thermofleet list`) or a .toml file.")]
 PolicyOption = Annotated[str, typer.Option(help=f"{', '.join(RULES)}, or an own FILE.py:CLASS.")]
 SeedOption = Annotated[int, typer.Option(help="Draws the jobs, the noise and the policy's chance; 0 or more.")]
@@ -44,20 +39,10 @@ PlantOption = Annotated[str, typer.Option(help="profile (planned heat) or mujoco
 BusOption = Annotated[str, typer.Option(help="zenoh (in-process router) or memory.")]
 DifficultyOption = Annotated[str, typer.Option(help="What scores the plans: twin, blind or oracle.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print figures as JSON.")]
-Progress = Callable[[str, float], None]
 
-LONG_STAGES = {
-    "training": "Training the twins that are not in the cache: a minute or two for a fleet of four …",
-    "comparing": "Comparing the policies …",
-}
-"""What is said of a stage that takes long where there is no terminal to draw a bar on."""
 USAGE, INTERRUPTED = 2, 130
 """Exit codes: something the user can mend; Ctrl-C."""
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS)
-
-
-class Interrupted(FleetError):
-    """Ctrl-C before there was anything to keep; names the stage."""
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -67,20 +52,20 @@ def main(argv: Sequence[str] | None = None) -> None:
     try:
         code = app(args=list(argv) if argv is not None else None, prog_name="thermofleet", standalone_mode=False)
     except Interrupted as interrupted:
-        _say(str(interrupted))
+        say(str(interrupted))
         sys.exit(INTERRUPTED)
     except FleetError as error:
-        _say(f"Error: {error}")
+        say(f"Error: {error}")
         sys.exit(USAGE)
     except typer.TyperException as error:
         message = error.format_message()
         if message:  # none where the help was shown instead
-            _say(f"Error: {message.rstrip('.')}{'' if message.endswith('?') else '.'} See thermofleet --help.")
+            say(f"Error: {message.rstrip('.')}{'' if message.endswith('?') else '.'} See thermofleet --help.")
         sys.exit(USAGE)
     except OSError as error:
         if error.errno not in _DISK:
             raise
-        _say(f"Error: '{error.filename or 'disk'}': {error.strerror}.")
+        say(f"Error: '{error.filename or 'disk'}': {error.strerror}.")
         sys.exit(USAGE)
     sys.exit(code or 0)
 
@@ -116,12 +101,12 @@ def run_command(
     if as_json:
         typer.echo(json.dumps({"out": str(where), **_figures(result)}, indent=1))
     else:
-        _say(f"{chosen.name}, seed {seed}", out_console)
+        say(f"{chosen.name}, seed {seed}", out_console)
         out_console.print(table_of({label(policy): result.metrics}))
         if result.finished:
-            _say(f"Recorded in {where}; open {where / 'report.html'} in a browser.", out_console)
+            say(f"Recorded in {where}; open {where / 'report.html'} in a browser.", out_console)
     if not result.finished:
-        _say(
+        say(
             f"Interrupted after {result.time_s:g} s of {chosen.horizon_s:g} s: the shift until then is kept in {where} "
             "(status 'interrupted'). The same command works the whole shift from the plans and twins already made."
         )
@@ -203,12 +188,13 @@ def demo_command(
             if not result.finished:
                 raise Interrupted(f"Interrupted while working; recordings are in {out}.")
             results[policy] = result.metrics
-    _say(f"{chosen.name}, seed {seed}: {chosen.description}", out_console)
+    say(f"{chosen.name}, seed {seed}: {chosen.description}", out_console)
     out_console.print(table_of(results))
-    _say(f"Open {out / 'least_difficulty' / 'report.html'} in a browser to see what happened.", out_console)
+    say(f"Open {out / 'least_difficulty' / 'report.html'} in a browser to see what happened.", out_console)
 
 
 app.command("hold")(hold_command)
+app.add_typer(twin_app, name="twin")
 
 
 def _spec(policy: str, seed: int, plant: str, bus: str, difficulty: str) -> Any:
@@ -286,48 +272,6 @@ def _figures(result: Any) -> dict[str, Any]:
 
     whole = summary(result)
     return {key: whole[key] for key in ("status", "policy", "seed", "plant", "bus", "difficulty", "metrics")}
-
-
-@contextmanager
-def progress_bar() -> Iterator[Progress]:
-    """A bar on standard error that names the stage.
-
-    Raises:
-        Interrupted: Ctrl-C in a stage that keeps nothing but what is in the cache.
-    """
-    from scenarios.build import cache_folder
-
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description:<9}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeElapsedColumn(),
-    )
-    with Progressbar(*columns, console=err_console, transient=True, disable=not err_console.is_terminal) as bar:
-        task = bar.add_task("starting", total=1.0)
-
-        def tell(stage: str, share: float) -> None:
-            if not err_console.is_terminal and stage != bar.tasks[0].description and share < 1.0:
-                said = LONG_STAGES.get(stage)
-                if said:
-                    _say(said)
-            bar.update(task, description=stage, completed=share)
-
-        try:
-            yield tell
-        except KeyboardInterrupt:
-            raise Interrupted(
-                f"Interrupted while {bar.tasks[0].description}: nothing was written. Plans and twins already made are "
-                f"kept in {cache_folder()}, and the same command goes on from there."
-            ) from None
-
-
-def _say(sentence: str, console: Console = err_console) -> None:
-    """A sentence on standard error; on a terminal wrapped between words, but never within one, which may be a path."""
-    if console.is_terminal:
-        sentence = textwrap.fill(sentence, console.width, break_long_words=False, break_on_hyphens=False)
-    console.print(sentence, markup=False, highlight=False, soft_wrap=True)
 
 
 def table_of(results: dict[str, Metrics]) -> Table:

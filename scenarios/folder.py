@@ -1,4 +1,4 @@
-"""A run folder: run.json, telemetry.parquet, events.parquet, report.html. Whole, or not there."""
+"""Folders of results, whole or not there; and what lies in the folder of a run."""
 
 import json
 import os
@@ -6,7 +6,8 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +25,29 @@ from scenarios.run import RunResult, summary
 FILES = ("run.json", "telemetry.parquet", "events.parquet", "report.html")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Kind:
+    """How a folder of results is known again, so that only its like is replaced."""
+
+    what: str
+    """In words, after "a finished"."""
+    card: str
+    """A JSON file with a field `status`: finished or interrupted."""
+    holds: tuple[str, ...]
+    """Patterns of all that may lie in it."""
+
+
+RUN = Kind(what="run", card="run.json", holds=FILES)
+
+
 @contextmanager
-def new_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
+def new_folder(out: Path, *, overwrite: bool = False, kind: Kind = RUN) -> Iterator[Path]:
     """A temporary folder that becomes `out` when the block ends well, and vanishes when it does not.
 
     Raises:
         FleetError: `out` cannot be written, or holds something that is not ours to replace.
     """
-    check_free(out, overwrite=overwrite)
+    check_free(out, overwrite=overwrite, kind=kind)
     place = Path(os.path.abspath(out))
     made = [parent for parent in place.parents if not parent.exists()]
     with _or_say(out):
@@ -69,8 +85,8 @@ def _or_say(out: Path) -> Iterator[None]:
         raise FleetError(f"Cannot write to '{out}': {error.strerror or error}.") from error
 
 
-def check_free(out: Path, *, overwrite: bool) -> None:
-    """Refuse a place that is taken by anything but an earlier run that may be replaced.
+def check_free(out: Path, *, overwrite: bool, kind: Kind = RUN) -> None:
+    """Refuse a place that is taken by anything but an earlier result of this kind that may be replaced.
 
     Raises:
         FleetError: what is there, and what would be allowed.
@@ -84,18 +100,20 @@ def check_free(out: Path, *, overwrite: bool) -> None:
         if not out.is_dir():
             raise FleetError(f"Cannot write to '{out}': it is a file; --out needs a folder.")
         held = sorted(p.name for p in out.iterdir())
-    status = _status(out)
-    strangers = [name for name in held if name not in FILES] if status else held
+    status = _status(out / kind.card)
+    strangers = [name for name in held if not status or not any(fnmatchcase(name, known) for known in kind.holds)]
     if strangers:
-        raise FleetError(f"'{out}' holds other things ('{strangers[0]}'); --out needs a new folder or an earlier run.")
+        raise FleetError(
+            f"'{out}' holds other things ('{strangers[0]}'); --out needs a new folder or an earlier {kind.what}."
+        )
     if status == "finished" and not overwrite:
-        raise FleetError(f"'{out}' holds a finished run; give another --out, or --overwrite to replace it.")
+        raise FleetError(f"'{out}' holds a finished {kind.what}; give another --out, or --overwrite to replace it.")
 
 
-def _status(out: Path) -> str | None:
-    """What run.json says; None where there is none, or not ours."""
+def _status(card: Path) -> str | None:
+    """What run.json, or its like, says; None where there is none, or not ours."""
     try:
-        status = json.loads((out / "run.json").read_text(encoding="utf-8"))["status"]
+        status = json.loads(card.read_text(encoding="utf-8"))["status"]
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return status if status in ("finished", "interrupted") else None

@@ -1,0 +1,222 @@
+"""`thermofleet twin …`: train the twin of an arm, score with it, export it, and report what it is worth."""
+
+import json
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from fleet.errors import FleetError, LogError, nearest
+from scenarios.load import load
+from scenarios.terminal import out_console, progress_bar, say
+
+twin_app = typer.Typer(
+    help="The digital twin of an arm: an LSTM variational autoencoder of its cool motion, and what it tells.",
+    no_args_is_help=True,
+)
+
+ScenarioArg = Annotated[
+    str | None, typer.Argument(help="A library name (see `thermofleet list`) or a .toml file; or use --log.")
+]
+LogOption = Annotated[
+    Path | None, typer.Option("--log", help="A log of a real arm, or a folder of logs: .csv, .csv.gz, .parquet.")
+]
+DamagedOption = Annotated[
+    bool, typer.Option("--skip-damaged", help="Leave out lines of a log that cannot be used, instead of stopping.")
+]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result in --out.")]
+ArmOption = Annotated[str | None, typer.Option(help="Only this arm; without it, every arm of the scenario.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print figures as JSON.")]
+TwinsArg = Annotated[Path, typer.Argument(help="A folder that `thermofleet twin train` wrote.")]
+WhichOption = Annotated[str | None, typer.Option("--arm", help="Whose twin, where the folder holds several.")]
+
+
+@twin_app.command("train")
+def train_command(
+    scenario: ScenarioArg = None,
+    log: LogOption = None,
+    out: Annotated[Path, typer.Option(help="Folder for the twins.")] = Path("runs/twins"),
+    arm: ArmOption = None,
+    size: Annotated[str | None, typer.Option(help="quick or full; default what the scenario says.")] = None,
+    scope: Annotated[str | None, typer.Option(help="joint (a network per joint) or arm (one of 21 channels).")] = None,
+    kind: Annotated[str | None, typer.Option(help="vae or ae (a plain autoencoder, as a baseline).")] = None,
+    latent: Annotated[int | None, typer.Option(help="Units of the latent.")] = None,
+    hidden: Annotated[int | None, typer.Option(help="Units of each LSTM.")] = None,
+    layers: Annotated[int | None, typer.Option(help="Layers of each LSTM.")] = None,
+    window: Annotated[int | None, typer.Option(help="Samples per window.")] = None,
+    rate_hz: Annotated[float | None, typer.Option("--rate", help="Samples per second inside a window.")] = None,
+    epochs: Annotated[int | None, typer.Option(help="Passes over the training windows.")] = None,
+    restarts: Annotated[int | None, typer.Option(help="Trainings per network; the best ELBO stays.")] = None,
+    beta: Annotated[float | None, typer.Option(help="Weight of the KL term.")] = None,
+    max_windows: Annotated[int | None, typer.Option(help="Training uses at most so many windows.")] = None,
+    cool: Annotated[float, typer.Option(help="--log: what stays below is normal, °C.")] = 40.0,
+    allow_collapse: Annotated[
+        bool, typer.Option("--allow-collapse", help="Keep a twin whose latent says nothing, as a baseline.")
+    ] = False,
+    seed: Annotated[int, typer.Option(help="Of weights and training; 0 or more.")] = 0,
+    skip_damaged: DamagedOption = False,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Train the twins of a scenario's arms, or of the arm whose logs are given.
+
+    A full twin of seven joints takes about four minutes on one core, a quick one half a minute; arms are trained
+    side by side.
+    """
+    chosen = one_source(scenario, log)
+    if seed < 0:
+        raise FleetError(f"--seed must be 0 or more (got {seed}).")
+    if size not in (None, "quick", "full"):
+        raise FleetError(f"No size '{size}'{nearest(size or '', ('quick', 'full'))}")
+    if log is not None and arm is not None:
+        raise FleetError("--arm chooses among a scenario's arms; a log has one arm, so leave it out with --log.")
+    fields = {
+        "scope": scope,
+        "kind": kind,
+        "latent": latent,
+        "hidden": hidden,
+        "layers": layers,
+        "window": window,
+        "rate_hz": rate_hz,
+        "epochs": epochs,
+        "restarts": restarts,
+        "beta": beta,
+        "max_windows": max_windows,
+        "allow_collapse": allow_collapse or None,
+    }
+    given = {name: value for name, value in fields.items() if value is not None}
+    from scenarios.folder import check_free, new_folder
+    from scenarios.twin_training import TWINS, arm_index, save_twins, train_arms, train_log
+
+    check_free(out, overwrite=overwrite, kind=TWINS)
+    with in_options(), progress_bar() as progress, new_folder(out, overwrite=overwrite, kind=TWINS) as folder:
+        if log is not None:
+            config = config_of("quick" if size is None else size, given, of_log=True)
+            twins = [train_log(recordings_of(log, skip_damaged), config, seed, cool_c=cool, progress=progress)]
+            source = f"log {log}"
+        else:
+            of_scenario = load(str(chosen))
+            config = config_of(size or of_scenario.twin.size, given)
+            arms = range(len(of_scenario.arms)) if arm is None else [arm_index(of_scenario, arm)]
+            twins = train_arms(of_scenario, list(arms), config, seed, progress)
+            source = f"scenario {of_scenario.name}"
+        card = save_twins(twins, folder, source)
+    if as_json:
+        typer.echo(json.dumps({"out": str(out), **card}, indent=1))
+        return
+    for twin in card["twins"]:
+        out_console.print(quality_table(twin))
+    say(f"Written to {out}; score with: thermofleet twin score {out}", out_console)
+
+
+@twin_app.command("score")
+def score_command(
+    twins: TwinsArg,
+    scenario: Annotated[str | None, typer.Argument(help="Score this scenario's jobs; or use --log.")] = None,
+    log: LogOption = None,
+    arm: WhichOption = None,
+    format_: Annotated[str, typer.Option("--format", help="table, csv or json.")] = "table",
+    skip_damaged: DamagedOption = False,
+) -> None:
+    """Score every job of a scenario, or a log window by window; every line can be traced to the twin's version."""
+    one_source(scenario, log)
+    if format_ not in ("table", "csv", "json"):
+        raise FleetError(f"No format '{format_}'{nearest(format_, ('table', 'csv', 'json'))}")
+    from scenarios.twin_scores import job_rows, render, window_rows
+    from scenarios.twin_training import open_twin
+
+    if log is not None:
+        twin = open_twin(twins, arm)
+        rows = [row for recording in recordings_of(log, skip_damaged) for row in window_rows(twin, recording)]
+    else:
+        chosen = load(str(scenario))
+        twin = open_twin(twins, arm)
+        with progress_bar() as progress:
+            rows = job_rows(twin, chosen, progress)
+    shown = render(rows, format_, caption=f"twin of {twin.arm}, version {twin.version}, data {twin.data_hash}")
+    if isinstance(shown, str):
+        typer.echo(shown, nl=False)
+    else:
+        out_console.print(shown)
+
+
+@contextmanager
+def in_options() -> Iterator[None]:
+    """What a collapse says one may change, as options."""
+    from twin.train import CollapsedPosterior
+
+    try:
+        yield
+    except CollapsedPosterior as error:
+        names = r"\b(epochs|max_windows|allow_collapse|beta)\b"
+        raise FleetError(re.sub(names, lambda n: f"--{n[1].replace('_', '-')}", str(error))) from error
+
+
+def one_source(scenario: str | None, log: Path | None) -> str | None:
+    """The scenario, or None where it is a log; exactly one of the two must be given."""
+    if (scenario is None) == (log is None):
+        told = "neither" if scenario is None else "both"
+        raise FleetError(f"Give either a scenario or --log FILE_OR_FOLDER (got {told}).")
+    return scenario
+
+
+def recordings_of(log: Path, skip_damaged: bool) -> list[Any]:
+    """The recordings of a log file, or of all logs of a folder.
+
+    Raises:
+        FleetError: names file and line, and how to go on without it.
+    """
+    from twin.logs import read, read_folder
+
+    damaged = "skip" if skip_damaged else "refuse"
+    try:
+        return read_folder(log, damaged=damaged) if log.is_dir() else read(log, damaged=damaged)
+    except LogError as error:
+        raise FleetError(str(error).replace('damaged="skip"', "--skip-damaged")) from error
+
+
+def config_of(size: str, given: dict[str, Any], *, of_log: bool = False) -> Any:
+    """The configuration of a size with what was given on the command line.
+
+    Raises:
+        FleetError: an option that cannot be, in its own name.
+    """
+    from dataclasses import replace
+
+    from scenarios.twin_training import log_config
+    from twin.model import TwinConfig
+
+    base = TwinConfig.quick() if size == "quick" else TwinConfig()
+    try:
+        config = replace(log_config(base) if of_log else base, **given)
+    except ValueError as error:
+        option = re.sub(r"TwinConfig\.(\w+)", lambda found: f"--{found[1].replace('_', '-')}", str(error), count=1)
+        raise FleetError(option.replace("--rate-hz", "--rate")) from error
+    return config
+
+
+def quality_table(twin: dict[str, Any]) -> Table:
+    """How well each network of a twin knows its data, with what names it."""
+    table = Table(
+        title=f"Twin of {twin['arm']}: version {twin['version']}",
+        caption=f"data {twin['data_hash']}, seed {twin['seed']}, calibrated on {twin['calibrated_on']} held-out jobs",
+        caption_justify="left",
+        box=None,
+        pad_edge=False,
+        title_justify="left",
+    )
+    for head in ("network", "ELBO, nat", "KL, nat", "active units", "MSE, σ²"):
+        table.add_column(head, justify="left" if head == "network" else "right")
+    for fit in twin["networks"]:
+        table.add_row(
+            fit["name"].replace("_", " "),
+            f"{fit['elbo']:.1f}",
+            f"{fit['kl']:.2f}",
+            str(fit["active_units"]),
+            f"{fit['mean_squared_error']:.3f}",
+        )
+    return table

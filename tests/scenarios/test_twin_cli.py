@@ -1,0 +1,178 @@
+"""`thermofleet twin`, called as a person calls it: trained on a scenario and on a log, scored, told what is wrong."""
+
+import csv
+import io
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from scenarios.cli import main
+
+TINY = ("--hidden", 8, "--epochs", 10, "--max-windows", 150, "--restarts", 1, "--allow-collapse")
+RATE_HZ = 2.0
+
+
+def log_csv(seconds: float, *, celsius: float, load: float = 1.0, seed: int = 0) -> str:
+    """A plain log: seven joints swinging at 2 Hz, joint 2 at one temperature, all others cool."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(0.0, seconds, 1 / RATE_HZ)
+    omega = rng.uniform(0.1, 0.6, 7)
+    q = 0.5 * np.sin(np.outer(time_s, omega) + rng.uniform(0, 6, 7))
+    qd = 0.5 * omega * np.cos(np.outer(time_s, omega))
+    tau = load * 10 * np.cos(q) + rng.normal(0, 0.2, q.shape)
+    temp_c = np.full(q.shape, 30.0)
+    temp_c[:, 1] = celsius
+    head = ["time_s", *(f"{name}_{j}" for name in ("q", "qd", "tau", "temp_c") for j in range(1, 8))]
+    rows = np.hstack([time_s[:, None], q, qd, tau, temp_c])
+    return "\n".join([",".join(head), *(",".join(f"{v:.6f}" for v in row) for row in rows)]) + "\n"
+
+
+@pytest.fixture(scope="session")
+def logs(tmp_path_factory):
+    """A folder of one cool log, and a hot log beside it."""
+    where = tmp_path_factory.mktemp("logs")
+    (where / "cool").mkdir()
+    (where / "cool" / "monday.csv").write_text(log_csv(400, celsius=31.0), encoding="utf-8")
+    (where / "hot.csv").write_text(log_csv(100, celsius=55.0, load=3.0), encoding="utf-8")
+    return where
+
+
+@pytest.fixture(scope="session")
+def trained(logs, tmp_path_factory):
+    """The folder that training on the cool log gives."""
+    out = tmp_path_factory.mktemp("trained") / "twins"
+    arguments = ["twin", "train", "--log", logs / "cool", *TINY, "--out", out]
+    with pytest.raises(SystemExit) as left:
+        main([str(argument) for argument in arguments])
+    assert left.value.code == 0
+    return out
+
+
+@pytest.fixture
+def twins(trained, tmp_path):
+    """A copy of one's own."""
+    return shutil.copytree(trained, tmp_path / "twins")
+
+
+def test_a_log_becomes_a_twin_that_finds_threefold_torque_harder(thermofleet, twins, logs):
+    card = json.loads((twins / "twins.json").read_text(encoding="utf-8"))
+    assert card["status"] == "finished"
+    mean_d, mean_load = {}, {}
+    for name in ("cool/monday.csv", "hot.csv"):
+        said = thermofleet("twin", "score", twins, "--log", logs / name, "--format", "csv")
+        assert said.code == 0
+        rows = list(csv.DictReader(io.StringIO(said.out)))
+        assert len(rows) == int((400 if "cool" in name else 100) * RATE_HZ) // 50
+        assert {row["twin"] for row in rows} == {card["twins"][0]["version"]}
+        mean_d[name] = np.mean([float(row["d_2"]) for row in rows])
+        for row in rows:
+            assert float(row["d"]) == pytest.approx(sum(float(row[f"d_{j}"]) for j in range(1, 8)), rel=1e-4)
+        mean_load[name] = np.mean([float(row["load"]) for row in rows])
+    assert mean_d["hot.csv"] > mean_d["cool/monday.csv"]
+    assert mean_load["hot.csv"] > 2 * mean_load["cool/monday.csv"]
+
+
+def test_training_again_gives_the_same_twin_and_tells_its_quality(thermofleet, logs, twins, tmp_path):
+    said = thermofleet("twin", "train", "--log", logs / "cool", *TINY, "--out", tmp_path / "again", "--json")
+    told = json.loads(said.out)
+    first = json.loads((twins / "twins.json").read_text(encoding="utf-8"))
+    assert told["twins"] == first["twins"]
+    assert [fit["name"] for fit in told["twins"][0]["networks"]] == [f"joint_{j}" for j in range(1, 8)]
+    assert all(fit["mean_squared_error"] > 0 for fit in told["twins"][0]["networks"])
+
+
+def test_scores_as_a_table_name_the_twin(thermofleet, twins, logs):
+    said = thermofleet("twin", "score", twins, "--log", logs / "hot.csv")
+    version = json.loads((twins / "twins.json").read_text(encoding="utf-8"))["twins"][0]["version"]
+    assert f"version {version}" in " ".join(said.out.split())
+
+
+def test_a_finished_training_is_kept_until_told_otherwise(thermofleet, logs, twins):
+    before = (twins / "twins.json").read_bytes()
+    again = ("twin", "train", "--log", logs / "cool", *TINY, "--out", twins, "--seed", 1)
+    assert thermofleet(*again).code == 2
+    assert (twins / "twins.json").read_bytes() == before
+    assert thermofleet(*again, "--overwrite").code == 0
+    assert (twins / "twins.json").read_bytes() != before
+
+
+def test_the_twin_of_one_arm_of_a_scenario_scores_its_jobs(thermofleet, small_toml, tmp_path):
+    out = tmp_path / "twins"
+    said = thermofleet("twin", "train", small_toml, "--arm", "right", *TINY, "--out", out)
+    assert said.code == 0
+    assert [home.name for home in out.glob("*.twin")] == ["right.twin"]
+    said = thermofleet("twin", "score", out, small_toml, "--format", "json")
+    rows = json.loads(said.out)["rows"]
+    assert {row["job"] for row in rows} == {"hold bench", "sort shelf → bench"}
+    assert all(0 <= row["d"] < 7 and row["why"] for row in rows)
+    calibrated_on = json.loads((out / "twins.json").read_text(encoding="utf-8"))["twins"][0]["calibrated_on"]
+    assert all((row["p_value"] is None) == (calibrated_on == 0) for row in rows)
+    hold = max(row["d_2"] for row in rows if row["job"] == "hold bench")
+    assert hold > min(row["d_2"] for row in rows if row["job"] != "hold bench")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["train"], "Give either a scenario or --log FILE_OR_FOLDER (got neither)."),
+        (["train", "quickstart", "--log", "x.csv"], "Give either a scenario or --log FILE_OR_FOLDER (got both)."),
+        (["train", "quickstart", "--arm", "arm_9"], "No arm 'arm_9' in quickstart; did you mean 'arm_"),
+        (["train", "quickstart", "--latent", "0"], "--latent must be >= 1 (got 0)."),
+        (["train", "quickstart", "--rate", "-1"], "--rate must be > 0 (got -1.0)."),
+        (["train", "quickstart", "--size", "ful"], "No size 'ful'; did you mean 'full'?"),
+        (["train", "quickstart", "--seed", "-1"], "--seed must be 0 or more (got -1)."),
+        (["train", "--log", "HERE/nowhere.csv"], "nowhere.csv"),
+        (["train", "--log", "HERE"], "holds no log; a log ends in"),
+        (["train", "--log", "HERE/damaged.csv"], "damaged.csv, line 3: "),
+        (["score", "HERE/nowhere", "quickstart"], "nowhere'; make one with: thermofleet twin train"),
+        (["score", "HERE", "quickstart"], "holds no twin"),
+        (["score", "HERE"], "Give either a scenario or --log"),
+        (["score", "HERE", "quickstart", "--format", "cvs"], "No format 'cvs'; did you mean 'csv'?"),
+    ],
+)
+def test_bad_input_is_told_in_one_sentence_and_nothing_is_written(thermofleet, tmp_path, arguments, sentence):
+    if "damaged" in str(arguments):
+        lines = log_csv(20, celsius=30).splitlines()
+        (tmp_path / "damaged.csv").write_text("\n".join([*lines[:2], "1,2,oops", *lines[3:]]) + "\n", encoding="utf-8")
+    before = sorted(p.name for p in tmp_path.iterdir())
+    arguments = [str(argument).replace("HERE", str(tmp_path)) for argument in arguments]
+    out = ("--out", tmp_path / "out") if arguments[0] == "train" else ()
+    said = thermofleet("twin", *arguments, *out)
+    assert said.code == 2
+    assert said.err.startswith("Error: ")
+    assert sentence in said.err
+    assert said.err.count("\n") == 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == before
+
+
+def test_a_damaged_log_can_be_read_without_its_bad_lines(thermofleet, twins, tmp_path):
+    lines = log_csv(60, celsius=30).splitlines()
+    damaged = tmp_path / "damaged.csv"
+    damaged.write_text("\n".join([*lines[:2], "1,2,oops", *lines[3:]]) + "\n", encoding="utf-8")
+    refused = thermofleet("twin", "score", twins, "--log", damaged, "--format", "csv")
+    assert "--skip-damaged" in refused.err
+    said = thermofleet("twin", "score", twins, "--log", damaged, "--format", "csv", "--skip-damaged")
+    assert said.code == 0
+    assert len(said.out.splitlines()) == 1 + 2  # the head and two windows of 25 s
+
+
+def test_a_log_of_a_hot_arm_teaches_nothing(thermofleet, logs, tmp_path):
+    said = thermofleet("twin", "train", "--log", logs / "hot.csv", *TINY, "--out", tmp_path / "twins")
+    assert said.code == 2
+    assert "No moment of 1 recording(s) is followed by" in said.err
+
+
+def test_a_collapse_is_told_with_the_options_that_mend_it(thermofleet, logs, tmp_path):
+    some = ("--hidden", 4, "--epochs", 1, "--max-windows", 64, "--restarts", 1, "--beta", 1000)
+    said = thermofleet("twin", "train", "--log", logs / "cool", *some, "--out", tmp_path / "twins")
+    assert said.code == 2
+    assert "--epochs, --max-windows" in said.err
+    assert not (tmp_path / "twins").exists()
+
+
+def test_twin_help_does_not_wait_for_the_learning_library(thermofleet):
+    said = thermofleet("twin", "--help")
+    assert said.code == 0
+    assert all(command in said.out for command in ("train", "score"))
