@@ -73,6 +73,18 @@ def test_pca_of_k_dimensions_leaves_nothing_of_a_k_dimensional_motion(make_plan)
     assert pca(cool, 8).scores(plans, [1, 2, 3]).per_joint.min() > 1e-3
 
 
+def test_pca_is_the_singular_value_decomposition(cool, make_plan, motion):
+    profile = motion(np.random.default_rng(8), 1.6)  # one window of 20 samples at 12.5 Hz, alone in its plan
+    none = np.zeros((0, 3, 7), np.float32)
+    plan = make_plan(none, profile, none)
+    known_windows = cool.z[:, :, 1].astype(float).reshape(len(cool.z), -1)
+    mean = known_windows.mean(axis=0)
+    leading = np.linalg.svd(known_windows - mean)[2][:3]
+    asked = cool.scaler.to_z(read_jobs([plan], [1], CONFIG).windows)[0, :, 1].astype(float).ravel()
+    error = np.abs(asked - mean - (asked - mean) @ leading.T @ leading).reshape(20, 3).sum(axis=1).mean()
+    assert pca(cool, 3).scores([plan], [1]).per_joint[0, 1] == pytest.approx(1 - np.exp(-error), rel=1e-6)
+
+
 def test_mahalanobis_is_the_closed_form():
     rng = np.random.default_rng(1)
     x = rng.normal(size=(80, 4)) @ rng.normal(size=(4, 4))
