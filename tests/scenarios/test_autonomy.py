@@ -1,0 +1,82 @@
+"""The same data gives the same twin; the prior's own statistics; shares by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scenarios.autonomy import GENERATED, OWN, PRIOR, autonomy, prior_records, proposed, remaining
+from scenarios.detection import Detection
+from scenarios.quality import QUESTIONS, table
+from scenarios.rehearse import trained
+from scenarios.study import make_study
+from twin.model import TwinConfig
+from twin.rivals import untrained
+
+TINY = replace(untrained(TwinConfig()), hidden=4, max_windows=64)
+SEED = np.random.SeedSequence(1)
+
+
+@pytest.fixture(scope="module")
+def study():
+    return make_study(SEED, train=8, reference=20, test=30, novel=4)
+
+
+def test_a_twin_that_is_given_its_own_data_again_is_the_same_twin(study, tmp_path):
+    result = autonomy(
+        [SEED],
+        config=TINY,
+        folder=tmp_path,
+        make=lambda _: study,
+        propose=lambda study, twin, count, seed: study.train.plans,
+    )
+    for question in QUESTIONS:
+        assert result.row(OWN, question).seeds == result.row(GENERATED, question).seeds
+        assert result.row(PRIOR, question).seeds != result.row(OWN, question).seeds
+        for share in remaining(result, question).values():
+            np.testing.assert_allclose(share, 1.0)
+
+
+def test_what_is_proposed_is_told_how_much_and_by_which_seed(study, tmp_path):
+    told = []
+
+    def propose(study, twin, count, seed):
+        told.append((count, seed))
+        return study.train.plans[:count]
+
+    for _ in range(2):
+        autonomy([SEED], config=TINY, folder=tmp_path, make=lambda _: study, propose=propose, count=3)
+    assert told[0] == told[1]
+    assert told[0][0] == 3
+    with pytest.raises(ValueError, match="at least one generated job"):
+        autonomy([SEED], config=TINY, folder=tmp_path, make=lambda _: study, count=0)
+
+
+def test_prior_samples_are_windows_of_the_twin_in_si_units(study, tmp_path):
+    twin = trained(study.train.records(), TINY, SEED, arm="arm", folder=tmp_path)
+    drawn = prior_records(twin, 40, np.random.default_rng(0))
+    assert len(drawn) == 40
+    assert drawn[0].shape == (TINY.window, 3, 7)
+    latent = np.random.default_rng(0).standard_normal((40, 7, 2)).astype(np.float32)
+    np.testing.assert_array_equal(drawn[5][:, 2, 1], twin.decode(latent)[5, :, 1, 2])
+
+
+def some(auroc, auprc, spearman):
+    return Detection(auroc=auroc, auprc=auprc, spearman=spearman, caught=0.0, false_novel=0.0)
+
+
+def test_what_remains_by_hand():
+    real, again = some(0.9, 0.8, 0.5), some(0.7, 0.4, 0.5)
+    quality = table([{(name, q): found for q in QUESTIONS for name, found in ((OWN, real), (GENERATED, again))}])
+    assert {name: share[0] for name, share in remaining(quality, QUESTIONS[0]).items()} == pytest.approx(
+        {"auroc": 0.5, "auprc": 0.5, "spearman": 1.0}
+    )
+
+
+@pytest.mark.slow
+def test_a_trained_twin_proposes_motion_to_learn_from(tmp_path):
+    study = make_study(SEED, train=40, reference=0, test=0, novel=0)
+    twin = trained(study.train.records(), TwinConfig.quick(), SEED, arm="arm", folder=tmp_path)
+    plans = proposed(study, twin, 3, 1)
+    assert len(plans) == 3
+    assert all(plan.arm == study.robot.name for plan in plans)
