@@ -50,7 +50,9 @@ class TwinConfig:
     clip: float = 1.0
     """Largest gradient norm."""
     restarts: int = 2
-    """Trainings per joint from other weights; the best ELBO stays. A small latent has local minima."""
+    """Trainings per network from other weights: a small latent has local minima."""
+    trial: float = 0.4
+    """Share of the epochs that every restart gets; then only the one of the best ELBO goes on. See `twin.train`."""
     noise: tuple[float, float, float] = (0.001, 0.005, 0.1)
     """Sensor noise added to the training windows, standard deviation in rad, rad/s, N·m: plans are smooth and
     measured motion is not, and a twin of either must not call the other new."""
@@ -68,6 +70,8 @@ class TwinConfig:
         for name in ("rate_hz", "record_hz", "learning_rate", "clip"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"TwinConfig.{name} must be > 0 (got {getattr(self, name)}).")
+        if not 0 < self.trial <= 1:
+            raise ValueError(f"TwinConfig.trial must be in (0, 1] (got {self.trial}).")
         if self.window < 2:
             raise ValueError(f"TwinConfig.window must be >= 2 samples (got {self.window}).")
         if max(self.stride, self.score_stride) > self.window:

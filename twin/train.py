@@ -3,7 +3,6 @@
 import hashlib
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
 
 import msgspec
 import numpy as np
@@ -12,14 +11,14 @@ from torch import Tensor
 
 from fleet.errors import FleetError
 from twin.forward import split
-from twin.loss import active_units, collapsed, kl, negative_elbo, reconstruction
+from twin.loss import active_units, collapsed, kl, negative_elbo
 from twin.model import LstmVae, TwinConfig, build, one_thread
 from twin.score import Fit, Twin, net_names
 from twin.window import Scaler, windows_of
 
 Array = np.ndarray
 
-RECIPE = 1
+RECIPE = 2
 """Raised whenever the same records, configuration and seed would give other weights."""
 
 
@@ -130,86 +129,92 @@ def train(
 def _best_of(
     x: Tensor, noise: Tensor, config: TwinConfig, seeds: Sequence[int], progress: Callable[[float], None] | None
 ) -> tuple[Fit, LstmVae] | None:
-    """The restart of the best ELBO on the training windows; None if none stayed finite."""
-    candidates = []
-    for restart, own in enumerate(seeds):
-        run = fit_net(
-            x, noise, config, own, progress=None if progress is None else _part_of(progress, restart, len(seeds))
-        )
-        candidates.append((_assess(run, x, config, own, restart), run.net))
-    elbos = tuple(fit.elbo if math.isfinite(fit.elbo) else None for fit, _ in candidates)
-    finite = [(fit, net) for fit, net in candidates if math.isfinite(fit.elbo)]
-    if not finite:
-        return None
-    fit, net = max(finite, key=lambda pair: pair[0].elbo)
-    return replace(fit, restart_elbos=elbos), net
+    """The restart that was ahead after the trial, trained to the end; the next one if it diverges, None if all do."""
+    runs = [Run(x, noise, config, seed) for seed in seeds]
+    trial = max(1, round(config.trial * config.epochs)) if len(runs) > 1 else 0
+    total = trial * len(runs) + config.epochs - trial
+    for n, run in enumerate(runs):
+        run.train(trial, None if progress is None else _part_of(progress, n * trial, total))
+    elbos = [_elbo(run, seed) for run, seed in zip(runs, seeds, strict=True)]
+    told = tuple(elbo if math.isfinite(elbo) else None for elbo in elbos) if trial else ()
+    order = sorted(range(len(runs)), key=lambda n: -elbos[n] if math.isfinite(elbos[n]) else math.inf)
+    for place, n in enumerate(order):
+        last = progress if place == 0 else None
+        runs[n].train(config.epochs, None if last is None else _part_of(last, trial * (len(runs) - 1), total))
+        if math.isfinite(_elbo(runs[n], seeds[n])):
+            return _assess(runs[n], seeds[n], n, told), runs[n].net
+    return None
 
 
-@dataclass
 class Run:
-    """One training of one network, and how it went."""
+    """One training of one network, which can stop after some epochs and go on."""
 
-    net: LstmVae
-    elbo_by_epoch: list[float] = field(default_factory=list)
-    kl_by_epoch: list[float] = field(default_factory=list)
+    def __init__(self, x: Tensor, noise: Tensor, config: TwinConfig, seed: int) -> None:
+        """
+        Args:
+            x: Windows in z-scores, [batch, time, channel].
+            noise: Standard deviation added to each channel, in z-scores, [channel].
+        """
+        self.x, self.noise, self.config = x, noise, config
+        self.net = build(config, seed, channels=x.shape[-1])
+        self.elbo_by_epoch: list[float] = []
+        self.kl_by_epoch: list[float] = []
+        self._draw = torch.Generator().manual_seed(seed)
+        self._optimizer = torch.optim.Adam(self.net.parameters(), lr=config.learning_rate, fused=True)
+        steps = config.epochs * -(-len(x) // config.batch)
+        self._schedule = torch.optim.lr_scheduler.OneCycleLR(
+            self._optimizer, config.learning_rate, total_steps=max(steps, 2)
+        )
 
+    def train(self, until: int, progress: Callable[[float], None] | None = None) -> None:
+        """Go on until so many epochs are done; `progress` is told how many there are, after each."""
+        while len(self.elbo_by_epoch) < until:
+            sums = torch.zeros(2)
+            for index in torch.randperm(len(self.x), generator=self._draw).split(self.config.batch):
+                sums += len(index) * self._step(self.x[index])
+            elbo, nats = (sums / len(self.x)).tolist()
+            self.elbo_by_epoch.append(elbo)
+            self.kl_by_epoch.append(nats)
+            if progress is not None:
+                progress(len(self.elbo_by_epoch))
 
-def fit_net(
-    x: Tensor,
-    noise: Tensor,
-    config: TwinConfig,
-    seed: int,
-    *,
-    progress: Callable[[float], None] | None = None,
-) -> Run:
-    """One training of one network.
-
-    Args:
-        x: Windows in z-scores, [batch, time, channel].
-        noise: Standard deviation added to each channel, in z-scores, [channel].
-    """
-    run = Run(build(config, seed, channels=x.shape[-1]))
-    net, draw = run.net, torch.Generator().manual_seed(seed)
-    beta = config.beta if config.kind == "vae" else 0.0
-    optimizer = torch.optim.Adam(net.parameters(), lr=config.learning_rate, fused=True)
-    steps = config.epochs * -(-len(x) // config.batch)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.learning_rate, total_steps=max(steps, 2))
-    for epoch in range(config.epochs):
-        sums = torch.zeros(2)
-        for index in torch.randperm(len(x), generator=draw).split(config.batch):
-            batch = x[index]
-            batch = batch + noise * torch.randn(batch.shape, generator=draw)
-            eps = torch.randn(len(index), config.latent, generator=draw)
-            optimizer.zero_grad()
-            x_hat, mu, logvar = net(batch, eps)
-            loss = negative_elbo(batch, x_hat, mu, logvar, beta)
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(net.parameters(), config.clip)
-            optimizer.step()
-            schedule.step()
-            nats = kl(mu.detach(), logvar.detach()).mean() if config.kind == "vae" else torch.zeros(())
-            sums += len(index) * torch.stack([-loss.detach(), nats])
-        elbo, nats = (sums / len(x)).tolist()
-        run.elbo_by_epoch.append(elbo)
-        run.kl_by_epoch.append(nats)
-        if progress is not None:
-            progress((epoch + 1) / config.epochs)
-    return run
+    def _step(self, batch: Tensor) -> Tensor:
+        """One step of the optimiser; ELBO and KL of the batch, nats per window."""
+        config, net, draw = self.config, self.net, self._draw
+        variational = config.kind == "vae"
+        batch = batch + self.noise * torch.randn(batch.shape, generator=draw)
+        eps = torch.randn(len(batch), config.latent, generator=draw)
+        self._optimizer.zero_grad()
+        x_hat, mu, logvar = net(batch, eps)
+        loss = negative_elbo(batch, x_hat, mu, logvar, config.beta if variational else 0.0)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(net.parameters(), config.clip)
+        self._optimizer.step()
+        self._schedule.step()
+        nats = kl(mu.detach(), logvar.detach()).mean() if variational else torch.zeros(())
+        return torch.stack([-loss.detach(), nats])
 
 
-def _assess(run: Run, x: Tensor, config: TwinConfig, seed: int, restart: int) -> Fit:
-    """Quality on the training windows, with one draw of the latent per window for the ELBO."""
+def _elbo(run: Run, seed: int) -> float:
+    """Nats per window on the training windows, with one draw of the latent for each."""
     draw = torch.Generator().manual_seed(seed)
     with torch.inference_mode():
-        x_hat, mu, logvar = run.net(x, torch.randn(len(x), config.latent, generator=draw))
-        mean_hat = run.net.decode(mu, x.shape[1])
-        nats = float(kl(mu, logvar).mean()) if config.kind == "vae" else 0.0
+        x_hat, mu, logvar = run.net(run.x, torch.randn(len(run.x), run.config.latent, generator=draw))
+        return -float(negative_elbo(run.x, x_hat, mu, logvar, 1.0 if run.config.kind == "vae" else 0.0))
+
+
+def _assess(run: Run, seed: int, restart: int, restart_elbos: tuple[float | None, ...]) -> Fit:
+    """Quality on the training windows."""
+    with torch.inference_mode():
+        mu, logvar = run.net.encode(run.x)
+        mean_hat = run.net.decode(mu, run.x.shape[1])
         return Fit(
-            elbo=-float(reconstruction(x, x_hat).mean()) - nats,
-            kl=nats,
+            elbo=_elbo(run, seed),
+            kl=float(kl(mu, logvar).mean()) if run.config.kind == "vae" else 0.0,
             active_units=active_units(mu),
-            mean_squared_error=float((x - mean_hat).square().mean()),
+            mean_squared_error=float((run.x - mean_hat).square().mean()),
             restart=restart,
+            restart_elbos=restart_elbos,
             elbo_by_epoch=tuple(run.elbo_by_epoch),
             kl_by_epoch=tuple(run.kl_by_epoch),
         )

@@ -47,6 +47,9 @@ def test_one_thread_gives_the_threads_back_even_after_an_error():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
+        ({"scope": "leg"}, r"scope must be one of \('joint', 'arm'\)"),
+        ({"kind": "gan"}, "kind must be one of"),
+        ({"trial": 0.0}, r"trial must be in \(0, 1\]"),
         ({"latent": 0}, "latent must be >= 1"),
         ({"rate_hz": 0.0}, "rate_hz must be > 0"),
         ({"learning_rate": float("nan")}, "learning_rate must be > 0"),
@@ -65,3 +68,19 @@ def test_a_configuration_that_cannot_be_is_refused(change, words):
 def test_quick_trains_less():
     quick, full = TwinConfig.quick(), TwinConfig()
     assert quick.max_windows * quick.epochs * quick.restarts < full.max_windows * full.epochs * full.restarts / 4
+
+
+def test_an_autoencoder_is_certain_whatever_the_noise():
+    net = build(TwinConfig(kind="ae"), seed=0)
+    x = torch.randn(4, 50, 3, generator=torch.Generator().manual_seed(1))
+    quiet, mu, logvar = net(x, torch.zeros(4, 2))
+    loud, _, _ = net(x, torch.full((4, 2), 1e6))
+    assert torch.equal(quiet, loud)
+    assert torch.equal(logvar.exp(), torch.zeros_like(mu))
+
+
+@pytest.mark.parametrize(("scope", "networks", "channels"), [("joint", 7, 3), ("arm", 1, 21)])
+def test_a_scope_says_how_many_networks_read_how_much(scope, networks, channels):
+    config = TwinConfig(scope=scope)
+    assert (config.networks(7), config.channels(7)) == (networks, channels)
+    assert TwinConfig.whole_arm().networks(7) == 1

@@ -1,3 +1,4 @@
+import pickle
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
@@ -65,11 +66,25 @@ def test_another_process_trains_the_same_twin(records, tiny):
     assert there.version == train(records[:8], tiny, SEED, arm="a").version
 
 
-def test_the_best_restart_stays(records, tiny):
-    both = train(records, tiny, SEED, arm="a")
-    first = train(records, replace(tiny, restarts=1), SEED, arm="a")
+def test_the_restart_that_is_ahead_after_the_trial_is_trained_to_the_end(records, tiny):
+    config = replace(tiny, epochs=5, trial=0.4, restarts=3)
+    twin = train(records[:8], config, SEED, arm="a")
+    assert {len(fit.elbo_by_epoch) for fit in twin.fits} == {5}
+    assert any(fit.restart > 0 for fit in twin.fits)
+    for fit in twin.fits:
+        assert len(fit.restart_elbos) == 3
+        assert fit.restart == np.argmax(fit.restart_elbos)
+    alone = train(records[:8], replace(config, restarts=1), SEED, arm="a").fits
+    for joint, fit in enumerate(twin.fits):
+        assert (fit.elbo_by_epoch == alone[joint].elbo_by_epoch) == (fit.restart == 0)
+
+
+def test_a_whole_trial_keeps_the_best_of_full_trainings(records, tiny):
+    config = replace(tiny, trial=1.0)
+    both = train(records[:8], config, SEED, arm="a")
+    first = train(records[:8], replace(config, restarts=1), SEED, arm="a")
     assert all(b.elbo >= f.elbo for b, f in zip(both.fits, first.fits, strict=True))
-    assert any(b.restart == 1 for b in both.fits)
+    assert any(b.elbo > f.elbo for b, f in zip(both.fits, first.fits, strict=True))
 
 
 def test_more_windows_than_wanted_are_drawn_without_bias(records, tiny):
@@ -88,7 +103,7 @@ def test_progress_rises_to_one(records, tiny):
     train(records[:4], tiny, SEED, arm="a", progress=told.append)
     assert told == sorted(told)
     assert told[-1] == pytest.approx(1.0)
-    assert len(told) == 7 * 2 * 3
+    assert len(told) == 7 * (1 + 3)  # one epoch of trial for the restart that stays behind
 
 
 def test_a_collapsed_posterior_is_an_error_with_advice(records, small):
@@ -136,3 +151,59 @@ def test_the_data_is_named_by_its_content_unless_told(records, tiny):
 
 def test_a_seed_reads_as_entropy_and_spawn_key():
     assert seed_text(np.random.SeedSequence(5, spawn_key=(1, 2))) == "5/1.2"
+
+
+def test_one_network_can_know_the_whole_arm(records, small):
+    config = replace(small, scope="arm", latent=8, hidden=32)
+    twin = train(records, config, SEED, arm="a")
+    assert len(twin.nets) == len(twin.fits) == 1
+    assert {name.split(".")[0] for name in twin.tensors()} == {"arm"}
+    assert twin.fits[0].mean_squared_error < 0.9
+    assert twin.fits[0].kl > 0.5
+    assert len(twin.fits[0].kl_by_epoch) == config.epochs
+
+
+def test_an_autoencoder_has_no_posterior_and_is_watched_by_its_units(records, small):
+    twin = train(records, replace(small, kind="ae"), SEED, arm="a")
+    assert not any("logvar" in name for name in twin.tensors())
+    for fit in twin.fits:
+        assert fit.kl == 0.0
+        assert fit.active_units >= 1
+        np.testing.assert_allclose(fit.elbo, -0.5 * 150 * fit.mean_squared_error, rtol=1e-4)
+
+
+def test_an_autoencoder_that_learned_nothing_is_collapsed(records, small):
+    still = replace(small, kind="ae", learning_rate=1e-9, epochs=1)
+    with pytest.raises(CollapsedPosterior, match="0 active latent unit"):
+        train(
+            [record * np.float32(0.0) + record[:1] * np.float32(i % 2) for i, record in enumerate(records[:6])],
+            replace(still, noise=(0.0, 0.0, 0.0), latent=1),
+            SEED,
+            arm="a",
+        )
+
+
+def test_errors_of_training_travel_between_processes():
+    for error in (CollapsedPosterior("arm_1", "joint_2", 0.1, 0), Diverged("arm_1", "arm")):
+        back = pickle.loads(pickle.dumps(error))
+        assert (type(back), str(back)) == (type(error), str(error))
+    assert "joint 2" in str(CollapsedPosterior("arm_1", "joint_2", 0.1, 0))
+    assert "the whole arm" in str(Diverged("arm_1", "arm"))
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        ([], "at least one record"),
+        ([np.full((100, 3, 7), np.nan)], "Record 0 is not finite"),
+        ([np.zeros((100, 3, 7)), np.zeros((100, 3, 6))], "same number of joints"),
+    ],
+)
+def test_records_that_cannot_teach_are_refused(tiny, bad, words):
+    with pytest.raises(ValueError, match=words):
+        train(bad, tiny, SEED, arm="a")
+
+
+def test_a_record_shorter_than_a_window_teaches_what_it_shows(motion, tiny, rng):
+    twin = train([motion(rng, 1.0) for _ in range(40)], tiny, SEED, arm="a")
+    assert np.isfinite([fit.elbo for fit in twin.fits]).all()
