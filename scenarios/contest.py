@@ -140,17 +140,34 @@ def contest(
     folder: Path,
     make: Make = make_study,
     bring: Bring | None = None,
+    networks: Sequence[str] | None = None,
 ) -> Judged:
-    """Everybody's quality under one seed: a study and trainings of its own; trained twins are kept in the folder."""
+    """Everybody's quality under one seed: a study and trainings of its own; trained twins are kept in the folder.
+
+    Args:
+        networks: Which of the `variants` take part, the VAE among them; all by default.
+
+    Raises:
+        ValueError: an unknown network, or no VAE.
+        FleetError: no test job is critical, or all are.
+    """
+    chosen = _chosen(config, networks)
     study = make(seed)
     test, reference, novel = (jobs_of(part, study.horizon_s) for part in (study.test, study.reference, study.novel))
     records = study.train.records()
     twins = {
-        name: trained(records, variant, seed, arm=study.robot.name, folder=folder)
-        for name, variant in variants(config).items()
+        name: trained(records, variant, seed, arm=study.robot.name, folder=folder) for name, variant in chosen.items()
     }
     scorers = [*readings(twins, reference), *rivals(study, config, seed), *(bring(study) if bring else ())]
     return judge(scorers, test=test, reference=reference, novel=novel, limit_c=study.warning_c)
+
+
+def _chosen(config: TwinConfig, networks: Sequence[str] | None) -> dict[str, TwinConfig]:
+    every = variants(config)
+    names = list(every) if networks is None else networks
+    if VAE not in names or not set(names) <= set(every):
+        raise ValueError(f"A contest is of the '{VAE}' and any of {', '.join(every)} (got {', '.join(names)}).")
+    return {name: variant for name, variant in every.items() if name in names}
 
 
 def quality(
@@ -160,15 +177,12 @@ def quality(
     folder: Path,
     make: Make = make_study,
     bring: Bring | None = None,
+    networks: Sequence[str] | None = None,
     processes: int = 1,
 ) -> QualityTable:
-    """The contest under every seed, side by side in so many processes.
-
-    Raises:
-        ValueError: no seeds.
-        FleetError: under some seed no test job is critical, or all are.
-    """
-    under = (delayed(contest)(seed, config=config, folder=folder, make=make, bring=bring) for seed in seeds)
+    """The contest under every seed, side by side in so many processes; raises as `contest`, and without seeds."""
+    alike = {"config": config, "folder": folder, "make": make, "bring": bring, "networks": networks}
+    under = (delayed(contest)(seed, **alike) for seed in seeds)
     per_seed: list[Judged] = []
     with Parallel(n_jobs=processes, return_as="generator") as pool:
         for done in pool(under):

@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenarios.contest import RIVALS, VAE, TwinScorer, difficulty, jobs_of, quality, readings, variants
+from scenarios.contest import RIVALS, VAE, TwinScorer, contest, difficulty, jobs_of, quality, readings, variants
 from scenarios.quality import MEASURES, QUESTIONS, beaten
 from scenarios.rehearse import trained
 from scenarios.study import make_study
 from twin.model import TwinConfig
 from twin.rivals import Modelled, Scores, untrained
 
+SEED = np.random.SeedSequence(1)
 TINY = replace(untrained(TwinConfig()), hidden=4, max_windows=64)
 
 
@@ -21,13 +22,13 @@ def tiny(seed):
 
 @pytest.fixture(scope="module")
 def study():
-    return tiny(np.random.SeedSequence(1))
+    return tiny(SEED)
 
 
 @pytest.fixture(scope="module")
 def twin(study, tmp_path_factory):
     folder = tmp_path_factory.mktemp("twins")
-    return trained(study.train.records(), TINY, np.random.SeedSequence(1), arm="arm", folder=folder)
+    return trained(study.train.records(), TINY, SEED, arm="arm", folder=folder)
 
 
 def test_jobs_fill_the_horizon(study):
@@ -76,7 +77,7 @@ class ByTemperature:
 
 
 def test_everybody_takes_part_and_the_truth_wins(study, tmp_path):
-    seeds = [np.random.SeedSequence(1)]
+    seeds = [SEED]
     result = quality(
         seeds, config=TINY, folder=tmp_path, make=lambda _: study, bring=lambda study: [ByTemperature(study)]
     )
@@ -91,3 +92,13 @@ def test_everybody_takes_part_and_the_truth_wins(study, tmp_path):
         best = result.row("rc", question)
         assert [best.values(m)[0] for m in ("auroc", "auprc", "spearman")] == pytest.approx([1.0, 1.0, 1.0])
     assert any("rc beats VAE" in said for said in beaten(result, VAE, ("rc",)))
+
+
+def test_fewer_networks_may_take_part_but_not_without_the_twin(study, tmp_path):
+    few = contest(SEED, config=TINY, folder=tmp_path, make=lambda _: study, networks=(VAE, "AE"))
+    names = {scorer for scorer, _ in few}
+    assert {VAE, "AE", "kNN-5"} <= names
+    assert not {"VAE z=8", "collapsed VAE"} & names
+    for networks in (("AE",), (VAE, "GAN")):
+        with pytest.raises(ValueError, match="A contest is of the 'VAE' and any of"):
+            contest(SEED, config=TINY, folder=tmp_path, make=lambda _: study, networks=networks)
