@@ -90,11 +90,11 @@ def check_columns(known: Format, names: Sequence[str]) -> tuple[list[str], list[
         raise ValueError(
             f"is of an arm with {joints.pop()} joints; a Gen3 has {JOINTS}, and only its logs can be read."
         )
-    wanted = [column for g in groups for column in known.columns(g)]
+    wanted = [known.time, *(column for g in groups for column in known.columns(g))]
     missing = [column for column in wanted if column not in names]
     if missing:
         raise ValueError(f"misses the column{'s' * (len(missing) > 1)} {', '.join(missing)} of a {known.name}.")
-    return groups, [name for name in names if name not in wanted and name != known.time]
+    return groups, [name for name in names if name not in wanted]
 
 
 def _is_of(group: str, name: str) -> bool:

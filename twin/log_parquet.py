@@ -25,11 +25,17 @@ def read_arms(path: Path) -> dict[str, Table]:
         table = pq.read_table(path)
     except (OSError, pa.ArrowInvalid) as error:
         raise LogError(str(path), None, f"is no whole parquet file ({str(error).splitlines()[0]}).") from error
-    if ARM not in table.column_names:
-        raise LogError(str(path), None, f"misses the column {ARM} of a telemetry.parquet.")
+    if ARM not in table.column_names or len(table.column_names) == 1:
+        missing = "time_s" if ARM in table.column_names else ARM
+        raise LogError(str(path), None, f"misses the column {missing} of a telemetry.parquet.")
+    if not table.num_rows:
+        raise LogError(str(path), None, "holds no rows.")
     names = tuple(name for name in table.column_names if name not in (ARM, MODE))
     values = np.column_stack([_numbers(path, name, table[name]) for name in names])
     arms = np.array(table[ARM].cast(pa.string()).to_pylist(), dtype=object)
+    nameless = [row for row, arm in enumerate(arms.tolist()) if arm is None]
+    if nameless:
+        raise LogError(str(path), nameless[0] + 1, "names no arm.")
     return {str(arm): _of_rows(names, values, np.flatnonzero(arms == arm)) for arm in dict.fromkeys(arms.tolist())}
 
 

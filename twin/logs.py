@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -32,7 +32,10 @@ def read(path: str | Path, *, damaged: Damaged = "refuse") -> list[Recording]:
 
     Raises:
         LogError: file, line and reason.
+        ValueError: `damaged` is neither.
     """
+    if damaged not in get_args(Damaged):
+        raise ValueError(f"damaged must be one of {', '.join(get_args(Damaged))} (got {damaged!r}).")
     path = Path(path)
     name = _name(path)
     if path.is_dir():
@@ -59,7 +62,7 @@ def read_folder(path: str | Path, *, damaged: Damaged = "refuse") -> list[Record
     path = Path(path)
     if not path.is_dir():
         raise LogError(str(path), None, "is no folder." if path.exists() else "there is no such folder.")
-    files = sorted(f for f in path.iterdir() if f.name.endswith(SUFFIXES) and f.name not in NOT_LOGS)
+    files = sorted(f for f in path.iterdir() if f.name.lower().endswith(SUFFIXES) and f.name not in NOT_LOGS)
     if not files:
         raise LogError(str(path), None, f"holds no log; a log ends in {', '.join(SUFFIXES)}.")
     by_name = {_name(f): f for f in files}
@@ -80,7 +83,7 @@ def read_folder(path: str | Path, *, damaged: Damaged = "refuse") -> list[Record
 
 
 def _name(path: Path) -> str:
-    return next((path.name.removesuffix(s) for s in SUFFIXES if path.name.endswith(s)), path.name)
+    return next((path.name[: -len(s)] for s in SUFFIXES if path.name.lower().endswith(s)), path.name)
 
 
 def _recording(
@@ -90,7 +93,7 @@ def _recording(
     try:
         groups, strangers = check_columns(known, table.names)
     except ValueError as error:
-        raise LogError(str(path), 1 if known is not PLAIN or path.suffix != ".parquet" else None, str(error)) from error
+        raise LogError(str(path), None if path.suffix == ".parquet" else 1, str(error)) from error
     found = channels(known, groups, table)
     damage = [*table.damage, *unbelievable(known, found, table.where)]
     good = ~np.isin(table.where, [d.line for d in damage])

@@ -256,6 +256,16 @@ def test_a_table_that_is_no_telemetry_says_why(tmp_path: Path):
     pq.write_table(pa.table({"arm": ["a"] * 3, **columns, "tau_2": [0.0, None, 0.0]}), path)
     refused(path, "tau_2 is missing or not a finite number", 2)
     assert read(path, damaged="skip")[0].time_s.tolist() == [0.0, 2.0]
+    pq.write_table(pa.table({"arm": ["a"], **{k: v[:1] for k, v in columns.items() if k != "time_s"}}), path)
+    refused(path, "misses the column time_s", None)
+    pq.write_table(pa.table({"arm": ["a"]}), path)
+    refused(path, "misses the column time_s", None)
+    pq.write_table(pa.table({"arm": ["a", None, "a"], **columns}), path)
+    refused(path, "names no arm", 2)
+    pq.write_table(pa.table({"arm": pa.array([], pa.string()), "time_s": pa.array([], pa.float64())}), path)
+    refused(path, "holds no rows", None)
+    with pytest.raises(ValueError, match="one of refuse, skip"):
+        read(path, damaged="ignore")  # pyright: ignore[reportArgumentType]
     with pytest.raises(LogError, match="cannot be read: No such file"):
         read(tmp_path / "none.csv")
     with pytest.raises(LogError, match="is a folder"):
