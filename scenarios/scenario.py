@@ -16,6 +16,7 @@ MOST_REPETITIONS = 100_000
 MOST_SAMPLES = 1_000_000
 """Telemetry samples of an arm in a shift: eleven days at one a second."""
 MOST_SLOTS = 256
+MOST_EXPLORATION = 10_000
 
 
 def _positive(owner: str, **values: float) -> None:
@@ -194,6 +195,8 @@ class TwinSpec:
     """Air during the rehearsal, which starts cold."""
     payload_kg: tuple[float, ...] = (0.0, 0.5, 1.0)
     """Light payloads with which every motion of the scenario is rehearsed besides its own."""
+    exploration: int = 64
+    """Light motions of other kinds, folded, elbow out, fast wrist, turned base, that are rehearsed as well; 0: none."""
 
     def __post_init__(self) -> None:
         _positive("TwinSpec", horizon_s=self.horizon_s)
@@ -201,6 +204,8 @@ class TwinSpec:
             raise ValueError(f"TwinSpec.cool_c must be above ambient_c (got {self.cool_c}, {self.ambient_c})")
         if min(self.payload_kg, default=0.0) < 0:
             raise ValueError(f"TwinSpec.payload_kg must be masses >= 0 (got {list(self.payload_kg)})")
+        if not 0 <= self.exploration <= MOST_EXPLORATION:
+            raise ValueError(f"TwinSpec.exploration must lie between 0 and {MOST_EXPLORATION} (got {self.exploration})")
 
 
 @dataclass(frozen=True, kw_only=True)

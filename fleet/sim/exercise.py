@@ -24,6 +24,8 @@ from fleet.sim.trajectory import Motion, joined, line, move, rest
 Array = np.ndarray
 log = logging.getLogger(__name__)
 
+EXERCISE_VERSION = 1
+"""Raised whenever the same draw would give another motion."""
 MOST_DRAWS = 50
 """Per wanted job; where more fail, the arm hardly has room to move."""
 
@@ -33,6 +35,8 @@ NATURAL_MIX = (0.4, 0.3, 0.3)
 
 REACH = (0.6, 0.6)
 """Beta distribution of the reach, 0 near, 1 nearly outstretched: cells are laid out for either, less often between."""
+FOLDED = np.array([0.0, -0.35, np.pi, -2.35, 0.0, -0.87, 1.57])
+"""Near Kinova's `retract`, far enough from the stop of joint 4 to move."""
 _SCATTER = np.array([1.2, 0.25, 0.3, 0.3, 0.4, 0.6, 0.8])
 
 
@@ -77,7 +81,7 @@ def exercise(
         raise ValueError(f"The payload of an exercise must be >= 0 (got {payload_kg}).")
     places = _places(arm, stops, name)
     work = _work(places, payload_kg, dwell)
-    _check_clearance(arm, stops, places)
+    _check_way(arm, stops, places)
     phases = [_phase(arm, legs, places) for legs in _legs(arm.robot.home_q(), stops, dwell, payload_kg, speed)]
     return Plan(arm.robot.name, work, 0, speed, *phases)
 
@@ -172,7 +176,7 @@ def _around(rng: np.random.Generator, posture: Array, width: Sequence[float], co
 
 
 def _folded(rng: np.random.Generator) -> Array:
-    return _around(rng, np.array(POSTURES["retract"]), (0.8, 0.25, 0.3, 0.15, 0.8, 0.5, 1.5))
+    return _around(rng, FOLDED, (0.8, 0.25, 0.3, 0.15, 0.8, 0.5, 1.5))
 
 
 def _elbow_out(rng: np.random.Generator) -> Array:
@@ -222,8 +226,15 @@ def _work(places: tuple[Place, ...], payload_kg: float, dwell: Array) -> Work:
     return Work(kind=kind, places=ends, payload_kg=float(payload_kg), dwell_s=float(dwell.max()))
 
 
-def _check_clearance(arm: ArmModel, stops: Array, places: tuple[Place, ...]) -> None:
+def _check_way(arm: ArmModel, stops: Array, places: tuple[Place, ...]) -> None:
+    # Straight lines between postures within the joint stops keep within them.
     clearance = Clearance(arm)
+    low, high = arm.position_range.T
+    for i, stop in enumerate(stops):
+        if ((stop < low) | (stop > high)).any():
+            joint = int(np.argmax(np.maximum(low - stop, stop - high)))
+            reason = f"joint limit: joint_{joint + 1} would stand at {stop[joint]:.2f} rad"
+            raise InfeasibleJob(arm.robot.name, places[i].name, reason)
     before = arm.robot.home_q()
     for i, stop in enumerate((*stops, stops[0])):
         if hit := clearance.first_hit(line(before, stop, CLEARANCE_STEP_RAD)[1:]):

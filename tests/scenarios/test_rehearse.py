@@ -10,18 +10,21 @@ from scipy.integrate import solve_ivp
 from fleet.errors import FleetError
 from fleet.motion import drive
 from fleet.motor import gen3_motors
-from fleet.robot import JOINTS, Robot
+from fleet.robot import JOINTS, Mount, Robot
+from fleet.sim.models import ArmModel
 from fleet.thermal import NODES, WINDING, drive_heat, gen3_network, thermal_model
 from scenarios import rehearse
 from scenarios.load import library, load
 from twin.model import TwinConfig
+from twin.train import train
 
 TINY = TwinConfig(max_windows=64, epochs=2, restarts=1, hidden=4, allow_collapse=True)
 
 
 @pytest.fixture
 def scenario():
-    return load(library()["quickstart"])
+    quickstart = load(library()["quickstart"])
+    return replace(quickstart, twin=replace(quickstart.twin, exploration=3))
 
 
 @pytest.fixture
@@ -99,3 +102,52 @@ def test_a_spoilt_checkpoint_is_trained_anew_with_a_word(plans, scenario, tmp_pa
         (anew,) = rehearse.twins(scenario, bodies(1), [plans], tmp_path, lambda *tell: None)
     assert "training anew" in caplog.text
     assert anew.version == twin.version
+
+
+def test_an_arm_explores_with_light_motion_that_stays_cool_on_its_own_mount(scenario):
+    """Second method: the torque at the first sample is the arm's own gravity torque, wherever it hangs."""
+    ceiling = Robot(name="arm_1", mount=Mount(position_m=(0.0, 0.0, 1.2), tilt_deg=(180.0, 0.0, 0.0)))
+    (_, motors, thermal), _ = bodies(2)
+    explored = rehearse.explored_records(scenario, 1, (ceiling, motors, thermal))
+    assert len(explored) == 3 * scenario.twin.exploration
+    arm = ArmModel(ceiling)
+    for approach in explored[::3]:
+        q, _, tau = approach[0]
+        assert tau == pytest.approx(arm.gravity_torque(q), abs=8.0)  # the rest accelerates the rotors
+    assert max(np.abs(record[:, 2, 1]).max() for record in explored) < 25.0  # light: no outstretched load
+
+
+def test_exploration_that_gets_hot_is_left_out(scenario):
+    (body,) = bodies(1)
+    strict = replace(scenario, twin=replace(scenario.twin, cool_c=22.5))
+    assert rehearse.explored_records(strict, 0, body) == []
+
+
+def test_an_arm_that_does_not_explore_learns_from_its_work_alone(plans, scenario, tmp_path, tiny):
+    none = replace(scenario, twin=replace(scenario.twin, exploration=0))
+    (body,) = bodies(1)
+    assert rehearse.explored_records(none, 0, body) == []
+    (twin,) = rehearse.twins(none, [body], [plans], tmp_path, lambda *tell: None)
+    (explorer,) = rehearse.twins(scenario, [body], [plans], tmp_path, lambda *tell: None)
+    own = rehearse.cool_records(plans, *body[1:], none)
+    seed = np.random.SeedSequence([none.spread.seed, 0])
+    assert twin.data_hash == train(own, TINY, seed, arm="arm_0").data_hash
+    both = [*own, *rehearse.explored_records(scenario, 0, body)]
+    assert explorer.data_hash == train(both, TINY, seed, arm="arm_0").data_hash
+
+
+def test_every_arm_explores_in_its_own_way_and_the_same_every_time(scenario):
+    first, other = bodies(2)
+    one = rehearse.explored_records(scenario, 0, first)
+    again = rehearse.explored_records(scenario, 0, first)
+    assert all(np.array_equal(a, b) for a, b in zip(one, again, strict=True))
+    elsewhere = rehearse.explored_records(scenario, 1, other)
+    assert not np.array_equal(one[0][-1], elsewhere[0][-1])
+
+
+def test_other_motors_are_another_twin_since_other_exploration_stays_cool(plans, scenario, tmp_path, tiny):
+    (body,) = bodies(1)
+    rehearse.twins(scenario, [body], [plans], tmp_path, lambda *tell: None)
+    warmer = (body[0], replace(body[1], idle_w=body[1].idle_w * 1.001), body[2])
+    rehearse.twins(scenario, [warmer], [plans], tmp_path, lambda *tell: None)
+    assert len(list((tmp_path / "twins").iterdir())) == 2
