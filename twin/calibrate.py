@@ -13,7 +13,7 @@ from sklearn.model_selection import StratifiedKFold
 from fleet.errors import FleetError
 from fleet.motion import Plan
 from twin.measures import Features
-from twin.saturation import METHODS, ONE_SIDED, Evidence, Method, SaturationModel, evidence_of, log_duration
+from twin.saturation import METHODS, ONE_SIDED, Evidence, Method, SaturationModel, evidence_of, warmed, within
 from twin.score import Twin
 
 Array = np.ndarray
@@ -99,7 +99,7 @@ class Experience:
 
 
 def fit_saturation(
-    past: Experience, *, evidence: Evidence = "load", method: Method = "logistic", horizon_s: float | None = None
+    past: Experience, *, evidence: Evidence = "excess", method: Method = "logistic", horizon_s: float | None = None
 ) -> SaturationModel:
     """The probability of saturation as the arm's past jobs teach it. Deterministic.
 
@@ -107,7 +107,8 @@ def fit_saturation(
     and one-sided evidence cannot make a job safer: their slopes are kept >= 0, which few jobs alone would not show.
 
     Args:
-        evidence: What is read of the twin's errors; see `twin.saturation.evidence_of`.
+        evidence: What is read of the twin's errors; see `twin.saturation.evidence_of`. The default had the least
+            cross-validated loss in `scenarios.saturation_study`, `errors` the most.
         method: `isotonic` puts a monotone curve, fitted on cross-validated scores, in the place of the logistic
             function: for many jobs, a few hundred at least.
         horizon_s: `passed` tells of so long after the start; None: of the whole job.
@@ -120,9 +121,11 @@ def fit_saturation(
         raise ValueError(f"No method '{method}'. Allowed: {', '.join(METHODS)}.")
     read = evidence_of(past.features, evidence)
     check(past)
+    heating_s = within(past.duration_s, horizon_s)
     columns = read.reshape(len(past), -1)
-    x = np.column_stack([columns, log_duration(past.duration_s, horizon_s), past.temp_c])
-    rising = np.arange(x.shape[1]) >= (0 if evidence in ONE_SIDED else columns.shape[1])
+    count = columns.shape[1]
+    x = np.column_stack([columns, columns * warmed(heating_s)[:, None], np.log(heating_s), past.temp_c])
+    rising = np.arange(x.shape[1]) >= (0 if evidence in ONE_SIDED else 2 * count)
     mean, std = x.mean(axis=0), x.std(axis=0)
     std = np.where(std > 1e-9 * np.maximum(np.abs(mean), 1e-9), std, np.inf)  # what never varied teaches nothing
     z = (x - mean) / std
@@ -135,9 +138,10 @@ def fit_saturation(
         method=method,
         horizon_s=horizon_s,
         offset=float(offset - slope @ mean),
-        of_evidence=tuple(tuple(row.tolist()) for row in slope[: columns.shape[1]].reshape(read.shape[1:])),
-        of_log_duration=float(slope[columns.shape[1]]),
-        of_temp=tuple(slope[columns.shape[1] + 1 :].tolist()),
+        at_once=_rows(slope[:count], past),
+        later=_rows(slope[count : 2 * count], past),
+        of_log_duration=float(slope[2 * count]),
+        of_temp=tuple(slope[2 * count + 1 :].tolist()),
         curve=None if method == "logistic" else monotone_curve(held_out, past.passed),
         data_hash=past.data_hash,
         jobs=len(past),
@@ -145,6 +149,11 @@ def fit_saturation(
         strength=strength,
         log_loss=float(nats(held_out, past.passed).mean()),
     )
+
+
+def _rows(slope: Array, past: Experience) -> tuple[tuple[float, ...], ...]:
+    """[joint][column] of the slopes of one block of evidence."""
+    return tuple(tuple(row.tolist()) for row in slope.reshape(past.temp_c.shape[1], -1))
 
 
 def check(past: Experience) -> None:

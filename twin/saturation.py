@@ -23,6 +23,7 @@ Array = np.ndarray
 
 Evidence = Literal["errors", "load", "excess"]
 Method = Literal["logistic", "isotonic"]
+EVIDENCE: tuple[Evidence, ...] = get_args(Evidence)
 METHODS: tuple[Method, ...] = get_args(Method)
 
 _COLUMNS: Mapping[str, Callable[[Features], Array]] = {
@@ -32,6 +33,10 @@ _COLUMNS: Mapping[str, Callable[[Features], Array]] = {
 }
 ONE_SIDED: tuple[Evidence, ...] = ("load", "excess")
 """Evidence that counts only more load than known: more of it never makes a job safer."""
+
+
+WARMING_S = 1500.0
+"""How fast load becomes heat: between the modes of a Gen3's windings (150 to 290 s) and housings (1700 to 2700 s)."""
 
 
 def evidence_of(features: Features, evidence: Evidence) -> Array:
@@ -46,7 +51,10 @@ def evidence_of(features: Features, evidence: Evidence) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class SaturationModel:
-    """P = link(offset + evidence · of_evidence + ln(duration) · of_log_duration + temp_c · of_temp)."""
+    """P = link(offset + evidence · (at_once + warmed · later) + ln(duration) · of_log_duration + temp_c · of_temp).
+
+    warmed = 1 − exp(−duration / WARMING_S): what the load of a joint comes to by the end of the job.
+    """
 
     twin: str
     """Version of the twin that it reads."""
@@ -55,8 +63,10 @@ class SaturationModel:
     horizon_s: float | None
     """Only what happens so soon counts; None for the whole job."""
     offset: float
-    of_evidence: tuple[tuple[float, ...], ...]
-    """[joint][column]."""
+    at_once: tuple[tuple[float, ...], ...]
+    """Of the evidence in however short a job, [joint][column]."""
+    later: tuple[tuple[float, ...], ...]
+    """Of the evidence, in addition, in an endless job, [joint][column]."""
     of_log_duration: float
     """>= 0, of ln(duration in s)."""
     of_temp: tuple[float, ...]
@@ -80,12 +90,13 @@ class SaturationModel:
                 f"SaturationModel needs evidence of {', '.join(_COLUMNS)} and method of {', '.join(METHODS)} "
                 f"(got {self.evidence}, {self.method})."
             )
-        if len(self.of_evidence) != len(self.of_temp) or not self.of_temp:
+        joints = [len(self.at_once), len(self.later), len(self.of_temp)]
+        if len(set(joints)) != 1 or not self.of_temp:
             raise ValueError(
-                "SaturationModel.of_evidence and of_temp must have one entry per joint "
-                f"(got {len(self.of_evidence)} and {len(self.of_temp)})."
+                f"SaturationModel.at_once, later and of_temp must have one entry per joint (got {joints})."
             )
-        numbers = [self.offset, self.of_log_duration, *self.of_temp, *(w for row in self.of_evidence for w in row)]
+        slopes = [w for row in self.at_once + self.later for w in row]
+        numbers = [self.offset, self.of_log_duration, *self.of_temp, *slopes]
         if not np.isfinite(numbers).all() or min(self.of_log_duration, *self.of_temp) < 0:
             raise ValueError("SaturationModel needs finite numbers, and no slope of temperature or duration below 0.")
 
@@ -126,19 +137,30 @@ class SaturationModel:
 
     def _base(self, features: Features, duration_s: Array | float) -> Array:
         """The score at 0 °C, [...]."""
-        found, wanted = evidence_of(features, self.evidence), np.shape(self.of_evidence)
+        found, wanted = evidence_of(features, self.evidence), np.shape(self.at_once)
         if found.shape[-2:] != wanted:
             raise ValueError(f"This model reads {wanted} numbers [joint, column] of a job (got {found.shape[-2:]}).")
-        log_s = log_duration(duration_s, self.horizon_s)
-        return self.offset + np.einsum("...jc,jc->...", found, self.of_evidence) + self.of_log_duration * log_s
+        heating_s = within(duration_s, self.horizon_s)
+        slope = np.array(self.at_once) + warmed(heating_s)[..., None, None] * np.array(self.later)
+        return self.offset + (found * slope).sum(axis=(-2, -1)) + self.of_log_duration * np.log(heating_s)
 
 
-def log_duration(duration_s: Array | float, horizon_s: float | None) -> Array:
-    """ln of how long jobs heat within the horizon, in s, [...]."""
+def warmed(duration_s: Array) -> Array:
+    """Share of its final heat that a load reaches in so long, [0, 1)."""
+    return -np.expm1(-duration_s / WARMING_S)
+
+
+def within(duration_s: Array | float, horizon_s: float | None) -> Array:
+    """How long jobs heat within the horizon, s, [...].
+
+    Raises:
+        ValueError: a duration that is not > 0.
+    """
     duration = np.asarray(duration_s, dtype=float)
-    if not ((duration > 0) & np.isfinite(duration)).all():
-        raise ValueError(f"A job lasts > 0 s (got {duration[~((duration > 0) & np.isfinite(duration))][:3]}).")
-    return np.log(duration if horizon_s is None else np.minimum(duration, horizon_s))
+    right = (duration > 0) & np.isfinite(duration)
+    if not right.all():
+        raise ValueError(f"A job lasts > 0 s (got {duration[~right][:3]}).")
+    return duration if horizon_s is None else np.minimum(duration, horizon_s)
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,8 @@ MODEL = SaturationModel(
     method="logistic",
     horizon_s=None,
     offset=-10.0,
-    of_evidence=((0.0,), (2.0,), (0.0,), (1.0,), (0.0,), (0.0,), (0.0,)),
+    at_once=((0.0,), (1.5,), (0.0,), (1.0,), (0.0,), (0.0,), (0.0,)),
+    later=((0.0,), (1.0,), (0.0,), (0.0,), (0.0,), (0.0,), (0.0,)),
     of_log_duration=0.5,
     of_temp=(0.0, 0.1, 0.0, 0.05, 0.0, 0.0, 0.0),
     curve=None,
@@ -41,10 +42,12 @@ def features(**load: float) -> Features:
 
 def test_a_probability_by_hand() -> None:
     temp_c = np.array([99.0, 40.0, 99.0, 20.0, 99.0, 99.0, 99.0])
-    # −10 + 2 · 1.5 + 1 · 0.5 + 0.5 · ln(e⁴) + 0.1 · 40 + 0.05 · 20 = 0.5
-    risk = MODEL.risk(features(joint_2=1.5, joint_4=0.5), np.exp(4.0))
-    assert risk.at(temp_c) == pytest.approx(1 / (1 + np.exp(-0.5)))
-    assert MODEL.score(features(joint_2=1.5, joint_4=0.5), np.exp(4.0), temp_c) == pytest.approx(0.5)
+    # Half warmed: −10 + (1.5 + 0.5) · 1.5 + 1 · 0.5 + 0.1 · 40 + 0.05 · 20 + 0.5 · ln t
+    half_s = 1500.0 * np.log(2.0)
+    expected = -1.5 + 0.5 * np.log(half_s)
+    risk = MODEL.risk(features(joint_2=1.5, joint_4=0.5), half_s)
+    assert risk.at(temp_c) == pytest.approx(1 / (1 + np.exp(-expected)))
+    assert MODEL.score(features(joint_2=1.5, joint_4=0.5), half_s, temp_c) == pytest.approx(expected)
 
 
 def test_what_comes_after_the_horizon_does_not_count() -> None:
@@ -137,7 +140,7 @@ def test_a_model_of_other_data_or_another_twin_is_refused_by_name(tmp_path: Path
     save_saturation(replace(MODEL, twin=twin.version), tmp_path)
     with pytest.raises(CheckpointError, match="data_hash is d, wanted other"):
         load_calibrated(twin, tmp_path, data_hash="other")
-    few = replace(MODEL, twin=twin.version, of_temp=(0.1,), of_evidence=((1.0,),))
+    few = replace(MODEL, twin=twin.version, of_temp=(0.1,), at_once=((1.0,),), later=((1.0,),))
     save_saturation(few, tmp_path)
     with pytest.raises(CheckpointError, match="joints is 1, wanted 7"):
         load_calibrated(twin, tmp_path)
