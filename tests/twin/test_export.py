@@ -1,0 +1,61 @@
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from twin.export import MODEL, ExportError, export_onnx
+from twin.train import train
+
+onnxruntime = pytest.importorskip("onnxruntime")
+
+
+def windows(rng, motion, count, seconds=4.0):
+    made = np.stack([motion(rng, seconds)[::4] for _ in range(count)]).transpose(0, 1, 3, 2).astype(float)
+    made[::2, :, ::2, 0] += 4 * np.pi * np.sign(made[::2, :1, ::2, 0])  # other turns of the continuous joints
+    return made
+
+
+def session(path):
+    return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+
+
+def assert_parity(twin, path, x):
+    reconstruction, errors, mu = session(path).run(None, {"windows": x})
+    np.testing.assert_allclose((reconstruction - twin.reconstruct(x)) / twin.scaler.std, 0, atol=1e-5)
+    np.testing.assert_allclose(errors, twin.window_errors(x), atol=1e-5)
+    np.testing.assert_allclose(mu, twin.latent(x), atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def exported(twin, tmp_path_factory):
+    return export_onnx(twin, tmp_path_factory.mktemp("out") / "arm_0")
+
+
+@pytest.mark.parametrize("count", [1, 2, 9])
+def test_onnxruntime_says_what_the_twin_says(twin, exported, rng, motion, count):
+    assert_parity(twin, exported, windows(rng, motion, count))
+
+
+def test_the_file_says_whose_it_is(twin, exported):
+    said = session(exported).get_modelmeta().custom_metadata_map
+    assert said["twin_version"] == twin.version
+    assert said["arm"] == "arm_0"
+    assert said["data_hash"] == twin.data_hash
+    assert (said["channels"], said["rate_hz"], said["window"]) == ("q,qd,tau", "12.5", "50")
+    assert [path.name for path in exported.parent.iterdir()] == [MODEL]
+
+
+@pytest.mark.parametrize("change", [{"scope": "arm", "latent": 3}, {"kind": "ae"}, {"layers": 2}])
+def test_every_kind_of_twin_can_be_exported(records, small, rng, motion, tmp_path, change):
+    config = replace(small, **change, hidden=8, epochs=1, max_windows=64, allow_collapse=True)
+    twin = train(records[:6], config, np.random.SeedSequence(2), arm="b")
+    path = export_onnx(twin, tmp_path / "b.onnx")
+    assert path == tmp_path / "b.onnx"
+    assert_parity(twin, path, windows(rng, motion, 3))
+
+
+def test_without_onnx_the_error_names_the_extra(twin, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(ExportError, match=r"thermofleet\[onnx\]"):
+        export_onnx(twin, tmp_path)
