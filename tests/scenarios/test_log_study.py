@@ -103,7 +103,7 @@ def test_a_real_arm_is_reconstructed_worse_when_hot(seed: int):
     result = hot_and_cool(log_study(read_folder(LOGS), seed))
     print(f"\nseed {seed}: {result}")
     assert result.hot_windows == 526
-    # Measured: 2.0 to 2.7 for the usual window, 1.34 to 1.38 for the mean, which taught motions in few cool files raise.
+    # Measured: 2.0 to 2.7 for the usual window, 1.34 to 1.38 for the mean, which taught motions in cool files raise.
     assert result.median_ratio >= 1.7
     assert result.ratio >= 1.2
     assert result.hot_difficulty > 1.5 * result.cool_difficulty
