@@ -18,8 +18,9 @@ from twin.measures import Calibration, Features
 from twin.model import TwinConfig
 from twin.nominal import torque_over_continuous, torque_over_known
 from twin.novelty import isolation_forest, mahalanobis, nearest_neighbours
+from twin.rc import RcTwin
 from twin.reading import check_jobs
-from twin.rivals import Scorer, Scores, collapsed, known, pca, untrained
+from twin.rivals import Modelled, Scorer, Scores, collapsed, known, pca, untrained
 from twin.score import Twin
 
 Array = np.ndarray
@@ -37,9 +38,10 @@ RIVALS = (
     "isolation forest",
     "RMS torque / known",
     "RMS torque / continuous",
-    "rc",
+    "rc, nominal",
+    "rc, identified",
 )
-"""What is not the twin; `rc` takes part where somebody brings it."""
+"""What is not the twin; `rc, identified` takes part where somebody brings it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +113,7 @@ def readings(twins: dict[str, Twin], reference: Jobs) -> list[Scorer]:
 
 
 def rivals(study: Study, config: TwinConfig, seed: np.random.SeedSequence) -> list[Scorer]:
-    """Everything that needs no network; torque over nominal knows a nominal Gen3, not this arm."""
+    """Everything that needs no network; torque over continuous and rc know a nominal Gen3, not this arm."""
     records = study.train.records()
     cool = known(records, replace(config, max_windows=TwinConfig().max_windows), seed)
     nominal = torque_over_continuous(
@@ -125,11 +127,12 @@ def rivals(study: Study, config: TwinConfig, seed: np.random.SeedSequence) -> li
         isolation_forest(cool, seed),
         torque_over_known(records),
         nominal,
+        Modelled("rc, nominal", RcTwin.nominal(study.robot.name, ambient_c=study.ambient_c), worst=True),
     ]
 
 
 Bring = Callable[[Study], Sequence[Scorer]]
-"""Further scorers of a study, `rc` for one."""
+"""Further scorers of a study, as `rc, identified` for one whose logs were read."""
 Make = Callable[[np.random.SeedSequence], Study]
 
 

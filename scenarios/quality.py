@@ -137,12 +137,13 @@ def beaten(quality: QualityTable, subject: str, rivals: Sequence[str]) -> tuple[
     """Where a rival beats the subject, a sentence per question and rival, the largest lead in AUROC first.
 
     A rival beats it in a measure if it is ahead under every seed; with three seeds chance alone does so in one of
-    eight, so the lead and its spread stand in the sentence.
+    eight, so the lead and its spread stand in the sentence. Rivals who did not take part are passed over.
     """
+    present = {row.scorer for row in quality.rows}
     sentences = []
     for question in QUESTIONS:
         own = quality.row(subject, question)
-        rows = [quality.row(rival, question) for rival in rivals]
+        rows = [quality.row(rival, question) for rival in rivals if rival in present]
         rows.sort(key=lambda row: -float((row.values("auroc") - own.values("auroc")).mean()))
         sentences += [said for row in rows if (said := _lead(row, own))]
     return tuple(sentences)

@@ -146,6 +146,8 @@ class Modelled:
 
     name: str
     model: DifficultyModel
+    worst: bool = False
+    """The total is the worst joint, in place of the sum over joints."""
 
     def scores(self, plans: Sequence[Plan], repetitions: Sequence[int]) -> Scores:
         """Score of each job, a plan done so many times; also raises where the model has no opinion."""
@@ -154,7 +156,7 @@ class Modelled:
         if None in said:
             raise ValueError(f"'{self.name}' has no opinion on job {said.index(None)}.")
         per_joint = np.stack([each.per_joint for each in said if each is not None])
-        return Scores(per_joint, per_joint.sum(axis=1))
+        return Scores(per_joint, per_joint.max(axis=1) if self.worst else per_joint.sum(axis=1))
 
 
 def collapsed(config: TwinConfig) -> TwinConfig:

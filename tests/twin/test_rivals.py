@@ -208,6 +208,9 @@ def test_a_difficulty_model_scores_like_the_rest(twin, jobs):
     scores = Modelled("VAE", twin).scores(jobs, [1, 2, 3, 4])
     errors = twin.plans_errors(jobs, [1, 2, 3, 4]).sum(axis=-1)
     np.testing.assert_allclose(scores.per_joint, difficulty_of_error(errors))
+    np.testing.assert_allclose(scores.total, scores.per_joint.sum(axis=1))
+    worst = Modelled("VAE", twin, worst=True).scores(jobs, [1, 2, 3, 4])
+    np.testing.assert_array_equal(worst.total, scores.per_joint.max(axis=1))
     with pytest.raises(ValueError, match="'silent' has no opinion on job 2"):
         Modelled("silent", Silent()).scores(jobs, [1, 1, 2, 1])
 
