@@ -1,16 +1,18 @@
 """How far P(saturation) and its alarm can be trusted: fitted on labelled past jobs of a studied arm, judged on others.
 
-`python -m scenarios.saturation_study 1 2 3` prints the figures of these seeds.
+`python -m scenarios.saturation_study FOLDER 1 2 3` prints the figures of these seeds; trained twins stay in the folder.
 """
 
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from sklearn.metrics import roc_auc_score
 
 from scenarios.past_jobs import PastJobs, past_jobs
+from scenarios.rehearse import trained
 from scenarios.study import Study, make_study
 from twin.alarm import ConformalAlarm
 from twin.calibrate import Experience, fit_saturation
@@ -19,7 +21,7 @@ from twin.model import TwinConfig
 from twin.reliability import Reliability, brier, reliability
 from twin.saturation import EVIDENCE, METHODS, Evidence, Method
 from twin.score import Twin
-from twin.train import train
+from twin.train import seed_text
 
 Array = np.ndarray
 
@@ -74,8 +76,9 @@ class Alarmed:
 class Trust:
     """What one twin's probabilities and alarms are worth."""
 
-    seed: int
+    seed: str
     exploration: int
+    """Light motions among the twin's training jobs."""
     share_passed: float
     """Of the held-out jobs."""
     stated: tuple[Stated, ...]
@@ -83,9 +86,11 @@ class Trust:
 
 
 def saturation_study(
-    seeds: Sequence[int],
+    seeds: Sequence[np.random.SeedSequence],
     *,
-    config: TwinConfig | None = None,
+    config: TwinConfig,
+    folder: Path,
+    make: Callable[..., Study] = make_study,
     explorations: Sequence[int] = (0, EXPLORATION),
     labelled: int = LABELLED,
     watched: int = WATCHED,
@@ -93,30 +98,30 @@ def saturation_study(
     novel: int = NOVEL,
     progress: Callable[[str], None] = lambda stage: None,
 ) -> list[Trust]:
-    """Both questions for arms, jobs and twins of several seeds, each with and without exploration."""
+    """Both questions for arms, jobs and twins of several seeds, each with and without exploration.
+
+    Args:
+        folder: Where trained twins are kept.
+        make: Makes the study of a seed, as `make_study`.
+    """
     found = []
     for seed in seeds:
         for exploration in explorations:
-            progress(f"seed {seed}, exploration {exploration}")
-            study = make_study(
-                np.random.SeedSequence(seed),
-                reference=0,
-                test=labelled + watched + held_out,
-                novel=novel,
-                exploration=exploration,
-            )
-            twin = train(
-                study.train.records(),
-                config or TwinConfig.quick(),
-                np.random.SeedSequence([seed, 1]),
-                arm=study.robot.name,
-            )
+            progress(f"seed {seed_text(seed)}, exploration {exploration}")
+            study = make(seed, test=labelled + watched + held_out, novel=novel, exploration=exploration)
+            twin = trained(study.train.records(), config, seed, arm=study.robot.name, folder=folder)
             found.append(trust(study, twin, seed=seed, exploration=exploration, labelled=labelled, watched=watched))
     return found
 
 
 def trust(
-    study: Study, twin: Twin, *, seed: int, exploration: int, labelled: int = LABELLED, watched: int = WATCHED
+    study: Study,
+    twin: Twin,
+    *,
+    seed: np.random.SeedSequence,
+    exploration: int,
+    labelled: int = LABELLED,
+    watched: int = WATCHED,
 ) -> Trust:
     """What the probabilities and alarms of a twin are worth; of the test jobs the first two kinds are set aside.
 
@@ -131,14 +136,17 @@ def trust(
     if natural <= labelled + watched:
         raise ValueError(f"This takes more than {labelled} + {watched} test jobs (got {natural}).")
     # In one call, so that novel motions too begin as warm as natural work before them leaves the arm.
-    jobs = past_jobs(study, (*study.test.plans, *study.novel.plans), np.random.default_rng([seed, 7]))
+    begun, split = (
+        np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 7, i))) for i in (0, 1)
+    )
+    jobs = past_jobs(study, (*study.test.plans, *study.novel.plans), begun)
     past = seen(twin, jobs)
-    order = np.random.default_rng([seed, 8]).permutation(natural)
+    order = split.permutation(natural)
     learned, setting, rest = (past.part(rows) for rows in np.split(order, (labelled, labelled + watched)))
     novel = past.part(np.arange(natural, len(past)))
     kinds: list[tuple[Evidence, Method]] = [(evidence, method) for evidence in EVIDENCE for method in METHODS]
     return Trust(
-        seed=seed,
+        seed=seed_text(seed),
         exploration=exploration,
         share_passed=float(rest.passed.mean()),
         stated=tuple(_stated(learned, rest, evidence, method) for evidence, method in kinds),
@@ -195,7 +203,8 @@ def lines(found: Sequence[Trust]) -> list[str]:
     for exploration in dict.fromkeys(each.exploration for each in found):
         some = [each for each in found if each.exploration == exploration]
         passed = ", ".join(f"{each.share_passed:.0%}" for each in some)
-        said.append(f"exploration {exploration}, seeds {[each.seed for each in some]}, passed the limit: {passed}")
+        seeds = ", ".join(each.seed for each in some)
+        said.append(f"exploration {exploration}, seeds {seeds}, passed the limit: {passed}")
         said.append(f"  {'P(saturation)':20} AUROC         Brier         ECE")
         for row in zip(*(each.stated for each in some), strict=True):
             figures = [[s.auroc for s in row], [s.brier for s in row], [s.table.error for s in row]]
@@ -212,9 +221,14 @@ def _figure(values: Sequence[float]) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Print the figures of the seeds given."""
-    seeds = [int(word) for word in (sys.argv[1:] if argv is None else argv)] or [1, 2, 3]
-    found = saturation_study(seeds, progress=lambda stage: print(stage, file=sys.stderr, flush=True))
+    """Print the figures of the seeds given after the folder."""
+    folder, *numbers = sys.argv[1:] if argv is None else argv
+    found = saturation_study(
+        [np.random.SeedSequence(int(number)) for number in numbers],
+        config=TwinConfig.quick(),
+        folder=Path(folder),
+        progress=lambda stage: print(stage, file=sys.stderr, flush=True),
+    )
     print("\n".join(lines(found)))
 
 
