@@ -10,7 +10,9 @@ from joblib import Parallel, delayed
 from fleet.difficulty import difficulty_of_error
 from fleet.motion import CHANNELS, Plan
 from fleet.motor import gen3_motors
-from fleet.thermal import gen3_network, thermal_model
+from fleet.robot import JOINTS
+from fleet.sim.oracle import Oracle
+from fleet.thermal import gen3_network, node_heat, thermal_model
 from scenarios.quality import Jobs, Judged, QualityTable, judge, table
 from scenarios.rehearse import trained
 from scenarios.study import Sample, Study, make_study
@@ -18,7 +20,6 @@ from twin.measures import Calibration, Features
 from twin.model import TwinConfig
 from twin.nominal import torque_over_continuous, torque_over_known
 from twin.novelty import isolation_forest, mahalanobis, nearest_neighbours
-from twin.rc import RcTwin
 from twin.reading import check_jobs
 from twin.rivals import Modelled, Scorer, Scores, collapsed, known, pca, untrained
 from twin.score import Twin
@@ -113,11 +114,17 @@ def readings(twins: dict[str, Twin], reference: Jobs) -> list[Scorer]:
 
 
 def rivals(study: Study, config: TwinConfig, seed: np.random.SeedSequence) -> list[Scorer]:
-    """Everything that needs no network; torque over continuous and rc know a nominal Gen3, not this arm."""
+    """Everything that needs no network; torque over continuous and rc know a nominal Gen3, not the true arm."""
     records = study.train.records()
     cool = known(records, replace(config, max_windows=TwinConfig().max_windows), seed)
-    nominal = torque_over_continuous(
-        gen3_motors(), thermal_model(gen3_network()), limit_c=study.warning_c, ambient_c=study.ambient_c
+    motors, thermal = gen3_motors(), thermal_model(gen3_network())
+    rc = Oracle(
+        motors=motors,
+        thermal=thermal,
+        start_c=thermal.steady(node_heat(np.zeros(JOINTS), motors.idle_w), study.ambient_c),
+        ambient_c=study.ambient_c,
+        warning_c=study.warning_c,
+        version="rc, nominal",
     )
     return [
         pca(cool, 2),
@@ -126,8 +133,8 @@ def rivals(study: Study, config: TwinConfig, seed: np.random.SeedSequence) -> li
         mahalanobis(cool),
         isolation_forest(cool, seed),
         torque_over_known(records),
-        nominal,
-        Modelled("rc, nominal", RcTwin.nominal(study.robot.name, ambient_c=study.ambient_c), worst=True),
+        torque_over_continuous(motors, thermal, limit_c=study.warning_c, ambient_c=study.ambient_c),
+        Modelled(rc.version, rc, worst=True),
     ]
 
 
