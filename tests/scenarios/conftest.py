@@ -3,10 +3,21 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from fleet.motor import gen3_motors
+from fleet.robot import Robot
+from fleet.sim.exercise import random_jobs
+from fleet.sim.oracle import peaks
+from fleet.thermal import NODES, ThermalSpread, gen3_network, spread_motors, thermal_model
 from scenarios.cli import main
+from scenarios.perform import alone
+from scenarios.records import records
+from twin.model import TwinConfig
+from twin.train import train
 
 SMALL = """
 description = "Two arms hold and sort for three minutes."
@@ -65,6 +76,23 @@ class Said:
 def plans(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The cache that all tests of a run share; never the user's."""
     return tmp_path_factory.getbasetemp() / "cache"
+
+
+@pytest.fixture(scope="session")
+def subject() -> SimpleNamespace:
+    """An arm with heat of its own, light jobs that it knows to stay cool, and a small twin trained on them."""
+    draw = np.random.default_rng(np.random.SeedSequence(8))
+    robot, spread = Robot(name="arm", tool_kg=0.9), ThermalSpread.gen3(0.5)
+    motors = spread_motors(gen3_motors(), spread, draw)
+    thermal = thermal_model(gen3_network(spread=spread, rng=draw))
+    drawn = random_jobs(robot, 40, draw, payload_kg=(0.0, 1.5))
+    half_hours = [1800.0] * len(drawn)
+    cold_c = np.full(NODES, 23.0)
+    peak_c = peaks(drawn, half_hours, motors=motors, thermal=thermal, start_c=cold_c, ambient_c=23.0).max(axis=1)
+    jobs = tuple(job for job, highest in zip(drawn, peak_c, strict=True) if highest < 40.0)
+    config = TwinConfig(hidden=16, max_windows=384, epochs=40, batch=64, restarts=1)
+    twin = train(records(jobs), config, np.random.SeedSequence(3), arm=robot.name)
+    return SimpleNamespace(arm=alone(robot, motors, thermal), jobs=jobs, twin=twin)
 
 
 @pytest.fixture

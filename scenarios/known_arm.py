@@ -1,0 +1,87 @@
+"""One arm of a scenario with its twin and the cool motion it knows: what generation and recovery begin from."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fleet.errors import FleetError, nearest
+from fleet.motion import Plan
+from fleet.sim.oracle import peaks
+from fleet.sim.world import Arm
+from fleet.thermal import NODES
+from scenarios.build import Progress, body_of, cache_folder, plan_works, prepare, quiet
+from scenarios.generate import Verification
+from scenarios.jobs import rehearsal_works
+from scenarios.perform import alone
+from scenarios.scenario import Scenario
+from twin.score import Twin
+
+
+@dataclass(frozen=True, eq=False)
+class KnownArm:
+    """An arm, its twin, and its motions that stay cool over the whole horizon of a rehearsal."""
+
+    arm: Arm
+    twin: Twin
+    sources: tuple[Plan, ...]
+    verification: Verification
+    """By a nominal Gen3's heat, in the rehearsal's air, for its horizon and limit."""
+
+
+def known_arm(
+    scenario: Scenario,
+    name: str | None = None,
+    *,
+    twin: Twin | None = None,
+    cache: Path | None = None,
+    progress: Progress = quiet,
+) -> KnownArm:
+    """An arm of a scenario by name; without one, the first.
+
+    Args:
+        twin: Its twin; by default the scenario's own, trained or from the cache.
+
+    Raises:
+        FleetError: no such arm, a twin of another arm, or no motion of this arm stays cool.
+    """
+    names = [spec.name for spec in scenario.arms]
+    name = names[0] if name is None else name
+    if name not in names:
+        raise FleetError(f"No arm '{name}' in {scenario.name}{nearest(name, names)}")
+    index = names.index(name)
+    if twin is None:
+        made = prepare(scenario, cache=cache, progress=progress).arms[index].model
+        assert isinstance(made, Twin)
+        twin = made
+    elif twin.arm != name:
+        raise FleetError(f"This is the twin of arm '{twin.arm}', not of '{name}'; give the one that belongs to it.")
+    robot, motors, thermal = body_of(scenario, index)
+    possible, _ = plan_works(
+        robot, rehearsal_works(scenario), scenario, cache or cache_folder(), lambda share: progress("planning", share)
+    )
+    spec = scenario.twin
+    verification = Verification.nominal(robot, spec.ambient_c, cool_c=spec.cool_c, horizon_s=spec.horizon_s)
+    arm = alone(robot, motors, thermal)
+    return KnownArm(
+        arm, twin, _cool(arm, [plan for ways in possible.values() for plan in ways], verification), verification
+    )
+
+
+def _cool(arm: Arm, plans: list[Plan], asked: Verification) -> tuple[Plan, ...]:
+    """What the arm has found to stay cool, by its true motors: it has done it."""
+    highest = peaks(
+        plans,
+        [asked.horizon_s] * len(plans),
+        motors=arm.motors,
+        thermal=arm.thermal,
+        start_c=np.full(NODES, asked.ambient_c),
+        ambient_c=asked.ambient_c,
+    ).max(axis=1, initial=-np.inf)
+    cool = tuple(plan for plan, peak in zip(plans, highest, strict=True) if peak <= asked.cool_c)
+    if not cool:
+        raise FleetError(
+            f"Arm '{arm.robot.name}' has no motion that stays below {asked.cool_c:g} °C for {asked.horizon_s:g} s, so "
+            "there is nothing to begin from. Raise twin.cool_c, or give twin.payload_kg lighter loads."
+        )
+    return cool

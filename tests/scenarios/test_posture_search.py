@@ -1,0 +1,64 @@
+"""The parts of the search, each against the true law: heat while holding, the hidden housings, and the ranking."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import spearmanr
+
+from fleet.motor import gen3_motors, reference_current
+from fleet.sim.models import ArmModel
+from fleet.thermal import HOUSING, WINDING, advance, drive_heat, gen3_network, settled, thermal_model
+from scenarios.posture_search import Nearby, course, holding, housing_estimate
+
+MOTORS, THERMAL = gen3_motors(), thermal_model(gen3_network())
+Q = np.deg2rad([0.0, 60.0, 180.0, -60.0, 0.0, 55.0, 90.0])
+
+
+def test_a_long_hold_ends_where_it_settles():
+    tau = np.array([0.0, -30.0, 0.0, 15.0, 0.0, 5.0, 0.0])
+    temps = course(np.full(14, 23.0), tau, MOTORS, THERMAL, 23.0, 40 * 3600.0)
+    end_c = settled(THERMAL, reference_current(tau, np.zeros(7), MOTORS) ** 2, np.zeros(7), MOTORS, 23.0)
+    assert end_c is not None
+    np.testing.assert_allclose(temps[-1], end_c[WINDING], atol=0.05)
+    np.testing.assert_array_equal(temps[0], np.full(7, 23.0))
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.floats(600.0, 2400.0), st.floats(15.0, 45.0))
+def test_hidden_housings_follow_from_windings_after_some_minutes(seconds, load_nm):
+    """The estimate takes all of the winding's heat to flow on; some still warms it, so true housings are warmer."""
+    tau = np.array([1.0, -load_nm, 1.0, 0.4 * load_nm, 0.5, 4.0, 0.0])
+    temp_c = np.full(14, 23.0)
+    phi, gamma = THERMAL.step_matrices(1.0)
+    current_sq = reference_current(tau, np.zeros(7), MOTORS) ** 2
+    for _ in range(int(seconds)):
+        heat_w = drive_heat(temp_c, current_sq, np.zeros(7), MOTORS)
+        temp_c = advance(temp_c, heat_w, 23.0, phi, gamma, THERMAL.to_ambient)
+    guess_c = housing_estimate(temp_c[WINDING], tau, MOTORS, THERMAL, 23.0)
+    np.testing.assert_array_equal(guess_c[WINDING], temp_c[WINDING])
+    np.testing.assert_allclose(guess_c[HOUSING], temp_c[HOUSING], atol=2.5)
+    assert np.all(guess_c[HOUSING] <= temp_c[HOUSING] + 1e-9)
+
+
+def test_the_hottest_motors_torque_error_ranks_postures_as_their_heat_does(subject):
+    rng = np.random.default_rng(0)
+    model = ArmModel(subject.arm.robot)
+    near = Q + rng.uniform(-0.6, 0.6, (60, 7))
+    error = holding(subject.twin, model, near, 3.0).one_sided[:, 1]
+    start_c = np.full(14, 50.0)
+    arm = subject.arm
+    end_c = [course(start_c, model.gravity_torque(q, 3.0), arm.motors, arm.thermal, 23.0, 600.0)[-1, 1] for q in near]
+    assert spearmanr(error, end_c).statistic > 0.9
+
+
+def test_more_payload_is_never_easier_for_the_shoulder(subject):
+    model = ArmModel(subject.arm.robot)
+    loads = [float(holding(subject.twin, model, Q[None], kg).one_sided[0, 1]) for kg in (1.0, 2.0, 3.0, 4.0)]
+    assert np.all(np.diff(loads) > 0)
+
+
+@pytest.mark.parametrize("changes", [{"joint_rad": 0.0}, {"tool_m": -1.0}, {"candidates": 0}, {"speed": 1.5}])
+def test_nearby_is_somewhere(changes):
+    with pytest.raises(ValueError, match=rf"Nearby.{next(iter(changes))} must be"):
+        Nearby(**changes)

@@ -1,0 +1,77 @@
+"""Posture recovery in the simulator: what the hottest motor does with and without, and when there is nothing to do."""
+
+import numpy as np
+import pytest
+
+from fleet.sim.models import ArmModel
+from scenarios.generate import Verification
+from scenarios.posture_search import Nearby, RecoveryError
+from scenarios.recover import recover, warmed
+
+HOLDS = {
+    "reaching": ((0.0, 60.0, 180.0, -30.0, 0.0, 55.0, 90.0), 3.0, 57.0),
+    "forward": ((20.0, 60.0, 180.0, -90.0, 0.0, 55.0, 90.0), 3.0, 50.0),
+    "turned": ((-90.0, 70.0, 170.0, -50.0, 10.0, 40.0, 0.0), 2.5, 55.0),
+}
+
+
+@pytest.fixture(scope="module")
+def asked(subject):
+    return Verification.nominal(subject.arm.robot, 23.0)
+
+
+@pytest.mark.parametrize("name", HOLDS)
+def test_the_hottest_motor_cools_and_is_cooler_than_without(subject, asked, name):
+    degrees, payload_kg, until_c = HOLDS[name]
+    q = np.deg2rad(degrees)
+    start_c = warmed(subject.arm, q, payload_kg, ambient_c=23.0, until_c=until_c)
+    hold = {"start_c": start_c, "verification": asked, "hold_s": 150.0, "nearby": Nearby(candidates=200)}
+    found = recover(subject.twin, subject.arm, q, payload_kg, seed=len(name), **hold)
+    hot = found.hottest
+    assert hot == 1
+    assert found.with_c[0, hot] == pytest.approx(until_c, abs=1.0)
+    assert found.with_c[-1, hot] < found.with_c[0, hot]
+    assert np.all(found.with_c[5:, hot] < found.without_c[5:, hot])
+    assert found.without_c[-1, hot] > found.without_c[0, hot]
+    assert found.cooled_k > 0
+    assert found.spared_k > 3.0
+    # Nearby, and held there with less torque: that is why.
+    assert found.difficulty_after[hot] < found.difficulty_before[hot]
+    assert np.abs(found.moved_rad).max() <= 0.6 + 1e-9
+    model = ArmModel(subject.arm.robot)
+    away = model.tool_pose(found.q_after)[0] - model.tool_pose(found.q_before)[0]
+    assert np.linalg.norm(away) == pytest.approx(found.tool_m)
+    assert found.tool_m <= 0.3
+    before, after = (np.abs(model.gravity_torque(p, payload_kg)[hot]) for p in (found.q_before, found.q_after))
+    assert after < before
+    assert found.error_rad < 1e-3
+
+
+def test_nothing_better_near_is_said(subject, asked):
+    q = np.deg2rad(HOLDS["reaching"][0])
+    start_c = warmed(subject.arm, q, 3.0, ambient_c=23.0, until_c=50.0)
+    with pytest.raises(RecoveryError, match=r"No better posture near: of \d+ within 0.01 rad per joint") as said:
+        recover(subject.twin, subject.arm, q, 3.0, start_c=start_c, verification=asked, nearby=Nearby(joint_rad=0.01))
+    assert "would not cool" in str(said.value)
+    assert "put the payload down" in str(said.value)
+
+
+def test_a_light_hold_does_not_get_warm(subject):
+    with pytest.raises(RecoveryError, match=r"does not get warm: holding 0.5 kg there for 30 min"):
+        warmed(subject.arm, np.zeros(7), 0.5, ambient_c=23.0, until_c=55.0, most_s=1800.0)
+
+
+@pytest.mark.parametrize(
+    ("q", "payload_kg", "said"),
+    [
+        (np.zeros(7), 5.0, r"rated for a payload of 0 … 4.5 kg \(got 5\)"),
+        (np.zeros(7), -1.0, r"rated for a payload"),
+        (np.zeros(7), np.nan, r"rated for a payload"),
+        (np.full(7, 2.5), 1.0, r"Joint 2 turns from -2.24 to 2.24 rad.*at 2.50"),
+        (np.zeros(6), 1.0, r"7 finite joint angles"),
+        (np.array([0, 2.2, np.pi, 0, 0, 0, 0]), 1.0, r"cannot hold 1 kg there: collision"),
+    ],
+)
+def test_a_hold_that_cannot_be_is_refused(subject, asked, q, payload_kg, said):
+    with pytest.raises(RecoveryError, match=said):
+        recover(subject.twin, subject.arm, q, payload_kg, start_c=np.full(14, 50.0), verification=asked)
