@@ -21,7 +21,6 @@ from twin.model import TwinConfig
 from twin.reliability import Reliability, brier, reliability
 from twin.saturation import EVIDENCE, METHODS, Evidence, Method
 from twin.score import Twin
-from twin.train import seed_text
 
 Array = np.ndarray
 
@@ -76,7 +75,7 @@ class Alarmed:
 class Trust:
     """What one twin's probabilities and alarms are worth."""
 
-    seed: str
+    seed: int
     exploration: int
     """Light motions among the twin's training jobs."""
     share_passed: float
@@ -86,7 +85,7 @@ class Trust:
 
 
 def saturation_study(
-    seeds: Sequence[np.random.SeedSequence],
+    seeds: Sequence[int],
     *,
     config: TwinConfig,
     folder: Path,
@@ -107,9 +106,10 @@ def saturation_study(
     found = []
     for seed in seeds:
         for exploration in explorations:
-            progress(f"seed {seed_text(seed)}, exploration {exploration}")
-            study = make(seed, test=labelled + watched + held_out, novel=novel, exploration=exploration)
-            twin = trained(study.train.records(), config, seed, arm=study.robot.name, folder=folder)
+            progress(f"seed {seed}, exploration {exploration}")
+            entropy = np.random.SeedSequence(seed)
+            study = make(entropy, test=labelled + watched + held_out, novel=novel, exploration=exploration)
+            twin = trained(study.train.records(), config, entropy, arm=study.robot.name, folder=folder)
             found.append(trust(study, twin, seed=seed, exploration=exploration, labelled=labelled, watched=watched))
     return found
 
@@ -118,7 +118,7 @@ def trust(
     study: Study,
     twin: Twin,
     *,
-    seed: np.random.SeedSequence,
+    seed: int,
     exploration: int,
     labelled: int = LABELLED,
     watched: int = WATCHED,
@@ -136,9 +136,7 @@ def trust(
     if natural <= labelled + watched:
         raise ValueError(f"This takes more than {labelled} + {watched} test jobs (got {natural}).")
     # In one call, so that novel motions too begin as warm as natural work before them leaves the arm.
-    begun, split = (
-        np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 7, i))) for i in (0, 1)
-    )
+    begun, split = np.random.default_rng([seed, 7]), np.random.default_rng([seed, 8])
     jobs = past_jobs(study, (*study.test.plans, *study.novel.plans), begun)
     past = seen(twin, jobs)
     order = split.permutation(natural)
@@ -146,7 +144,7 @@ def trust(
     novel = past.part(np.arange(natural, len(past)))
     kinds: list[tuple[Evidence, Method]] = [(evidence, method) for evidence in EVIDENCE for method in METHODS]
     return Trust(
-        seed=seed_text(seed),
+        seed=seed,
         exploration=exploration,
         share_passed=float(rest.passed.mean()),
         stated=tuple(_stated(learned, rest, evidence, method) for evidence, method in kinds),
@@ -203,7 +201,7 @@ def lines(found: Sequence[Trust]) -> list[str]:
     for exploration in dict.fromkeys(each.exploration for each in found):
         some = [each for each in found if each.exploration == exploration]
         passed = ", ".join(f"{each.share_passed:.0%}" for each in some)
-        seeds = ", ".join(each.seed for each in some)
+        seeds = ", ".join(str(each.seed) for each in some)
         said.append(f"exploration {exploration}, seeds {seeds}, passed the limit: {passed}")
         said.append(f"  {'P(saturation)':20} AUROC         Brier         ECE")
         for row in zip(*(each.stated for each in some), strict=True):
@@ -224,7 +222,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Print the figures of the seeds given after the folder."""
     folder, *numbers = sys.argv[1:] if argv is None else argv
     found = saturation_study(
-        [np.random.SeedSequence(int(number)) for number in numbers],
+        [int(number) for number in numbers],
         config=TwinConfig.quick(),
         folder=Path(folder),
         progress=lambda stage: print(stage, file=sys.stderr, flush=True),
