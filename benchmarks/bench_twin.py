@@ -1,0 +1,192 @@
+"""What a twin costs: a training step, the training of seven joints, and scoring, beside plain `nn.LSTM` and the floor.
+
+    python benchmarks/bench_twin.py [--full]
+
+CPU time on one core, medians; ours and the others take turns. Plain is `nn.LSTM` autoencoding with nothing around it:
+encoder, linear layers, decoder, loss and backward, or the forward pass alone. The floor is the matrix multiplications
+of the same passes alone, as `torch.mm` of their shapes. Training is projected from its steps; --full does it, on random
+smooth motion. A job of the target has four windows; that of a real plan is the median of the quickstart's.
+"""
+
+import os
+
+os.environ["OMP_NUM_THREADS"] = "1"
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fleet.motion import RATE_HZ
+from twin.export import export_onnx
+from twin.forward import Networks
+from twin.model import LstmVae, TwinConfig, build
+from twin.score import Fit, Twin
+from twin.train import Run, train
+from twin.window import Scaler
+
+JOINTS = 7
+RUNS = 15
+
+
+def seconds(call: Callable[[], object]) -> float:
+    """CPU time of a call, s."""
+    start_s = time.process_time()
+    call()
+    return time.process_time() - start_s
+
+
+def in_turns(calls: dict[str, Callable[[], object]], runs: int) -> dict[str, float]:
+    """Median CPU time of each call, s, after one that does not count."""
+    for call in calls.values():
+        call()
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(runs):
+        for name, call in calls.items():
+            times[name].append(seconds(call))
+    return {name: statistics.median(column) for name, column in times.items()}
+
+
+def plain_forward(net: LstmVae, x: Tensor) -> Tensor:
+    """The same layers in the plainest words."""
+    _, (last, _) = net.encoder(x)
+    latent = net.mu(torch.tanh(net.summary(last[-1])))
+    told = torch.tanh(net.expand(latent))[:, None].expand(-1, x.shape[1], -1)
+    return net.out(net.decoder(told)[0])
+
+
+def plain_step(net: LstmVae, x: Tensor, optimizer: torch.optim.Optimizer) -> None:
+    """Forward, squared error, backward, Adam."""
+    optimizer.zero_grad()
+    (plain_forward(net, x) - x).square().sum().backward()
+    optimizer.step()
+
+
+def floor(config: TwinConfig, batch: int, passes: int, nets: int) -> Callable[[], None]:
+    """The recurrent multiplications of encoder and decoder, one time step after another, so many times over."""
+    hidden, weight = torch.randn(batch, config.hidden), torch.randn(config.hidden, 4 * config.hidden)
+    out = torch.empty(batch, 4 * config.hidden)
+
+    def multiply() -> None:
+        for _ in range(2 * config.window * passes * nets):
+            torch.mm(hidden, weight, out=out)
+
+    return multiply
+
+
+def smooth(rng: np.random.Generator, length_s: float) -> np.ndarray:
+    """A profile [time, 3, joint] of sums of sines."""
+    time_s = np.arange(int(length_s * RATE_HZ)) / RATE_HZ
+    omega, shift = 2 * np.pi * rng.uniform(0.05, 0.25, (3, 1, JOINTS)), rng.uniform(0, 6.28, (3, 1, JOINTS))
+    angle = omega * time_s[:, None] + shift
+    q, qd, qdd = np.sin(angle).sum(0), (omega * np.cos(angle)).sum(0), -(omega**2 * np.sin(angle)).sum(0)
+    return np.stack([q, qd, 10 * np.sin(q) + qdd], axis=1).astype(np.float32)
+
+
+def untrained(config: TwinConfig) -> Twin:
+    """Random weights cost as much as good ones."""
+    scaler = Scaler(np.zeros(JOINTS), np.zeros((JOINTS, 3)), np.ones((JOINTS, 3)), np.zeros(JOINTS, dtype=bool))
+    count, channels = config.networks(JOINTS), config.channels(JOINTS)
+    nets = [build(config, seed, channels=channels) for seed in range(count)]
+    fit = Fit(elbo=0.0, kl=1.0, active_units=1, mean_squared_error=1.0, restart=0)
+    return Twin(config, scaler, nets, arm="bench", data_hash="", seed="0", fits=[fit] * count)
+
+
+def training(config: TwinConfig, name: str) -> None:
+    """A step beside plain, and what it makes of a whole training."""
+    channels, nets = config.channels(JOINTS), config.networks(JOINTS)
+    x = torch.randn(config.batch, config.window, channels)
+    run = Run(x, torch.zeros(channels), TwinConfig(**{**vars(config), "epochs": 10_000}), seed=0)
+    net = build(config, 0, channels=channels)
+    optimizer = torch.optim.Adam(net.parameters(), lr=1e-3, fused=True)
+    epochs = iter(range(1, 10_000))
+    took = in_turns(
+        {
+            "ours": lambda: run.train(next(epochs)),
+            "plain": lambda: plain_step(net, x, optimizer),
+            "floor": floor(config, config.batch, 3, 1),
+        },
+        RUNS,
+    )
+    steps = nets * -(-config.max_windows // config.batch)
+    trial = round(config.trial * config.epochs) if config.restarts > 1 else 0
+    whole_s = took["ours"] * steps * (config.epochs + trial * (config.restarts - 1))
+    print(
+        f"{name:<26}{1e3 * took['ours']:>9.1f}{1e3 * took['plain']:>9.1f}{1e3 * took['floor']:>9.1f}"
+        f"{took['ours'] / took['plain']:>8.2f}   all joints, restarts included: {whole_s:.0f} s"
+    )
+
+
+def scoring(config: TwinConfig, name: str, windows: int, runs: int) -> None:
+    """Reconstruction beside plain forward passes, the floor and ONNX Runtime."""
+    twin = untrained(config)
+    z = np.random.default_rng(0).standard_normal((windows, config.window, JOINTS, 3)).astype(np.float32)
+    networks = Networks(twin.nets)
+    parts = [
+        torch.from_numpy(np.ascontiguousarray(x))
+        for x in np.moveaxis(z.reshape(*z.shape[:2], len(twin.nets), -1), 2, 0)
+    ]
+
+    def plain() -> None:
+        with torch.inference_mode():
+            for net, x in zip(twin.nets, parts, strict=True):
+                plain_forward(net, x)
+
+    calls: dict[str, Callable[[], object]] = {
+        "features": lambda: twin.window_features(z),
+        "ours": lambda: networks.reconstruct(z),
+        "plain": plain,
+        "floor": floor(config, windows, 1, len(twin.nets)),
+    }
+    took = in_turns({**calls, **_onnx(twin, z)}, runs)
+    cells = "".join(f"{1e3 * took[key]:>11.2f}" if key in took else f"{'-':>11}" for key in (*calls, "onnx"))
+    print(f"{name:<34}{cells}{took['ours'] / took['plain']:>8.2f}")
+
+
+def _onnx(twin: Twin, z: np.ndarray) -> dict[str, Callable[[], object]]:
+    """The exported twin, if ONNX Runtime is there."""
+    try:
+        import onnxruntime
+    except ImportError:
+        return {}
+    import tempfile
+    from pathlib import Path
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    with tempfile.TemporaryDirectory() as folder:
+        file = export_onnx(twin, Path(folder))
+        session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
+    feed = {"windows": z.astype(float)}
+    return {"onnx": lambda: session.run(["errors"], feed)}
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--full", action="store_true", help="train seven joints at the default configuration")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    default, arm = TwinConfig(), TwinConfig.whole_arm()
+    print(f"{'training step, batch 128':<26}{'ours ms':>9}{'plain':>9}{'floor':>9}{'ratio':>8}")
+    training(default, "one joint of seven")
+    training(arm, "whole arm")
+    columns = ("features", "networks", "plain", "floor", "onnx")
+    print(f"\n{'scoring, 7 joints, ms':<34}" + "".join(f"{name:>11}" for name in columns) + f"{'ratio':>8}")
+    scoring(default, "1 job of 4 windows", 4, 200)
+    scoring(default, "1 real plan, 9 windows", 9, 100)
+    scoring(default, "1 000 jobs of 4 windows", 4000, 3)
+    scoring(arm, "whole arm, 1 000 jobs of 4 windows", 4000, 3)
+    if arguments.full:
+        rng = np.random.default_rng(0)
+        records = [smooth(rng, 12.0) for _ in range(250)]
+        took_s = seconds(lambda: train(records, default, np.random.SeedSequence(0), arm="bench"))
+        print(f"\nseven joints, default configuration, {default.restarts} restarts: {took_s:.0f} s on one core")
+
+
+if __name__ == "__main__":
+    main()

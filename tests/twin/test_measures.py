@@ -1,0 +1,214 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from fleet.errors import CheckpointError
+from fleet.motion import Phase
+from twin.checkpoint import CARD, load, save
+from twin.measures import Calibration, Features, measures_of, score_of
+from twin.window import cut, resample
+
+errors = st.floats(0.0, 20.0)
+
+
+def packed(count, rng):
+    return Features(rng.gamma(3.0, 0.2, (count, 7, 5)))
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    return Calibration(packed(200, np.random.default_rng(0)))
+
+
+@pytest.fixture(scope="module")
+def jobs(make_plan, motion):
+    rng = np.random.default_rng(4)
+    return [(make_plan(*(motion(rng, s) for s in (2.0, 6.0, 2.0))), 1 + i) for i in range(12)]
+
+
+@pytest.fixture(scope="module")
+def known(twin, jobs):
+    return twin.calibrated(jobs)
+
+
+def heavier(plan, joint, factor):
+    def load_of(phase):
+        profile = phase.profile.copy()
+        profile[:, 2, joint] *= factor
+        return Phase(profile, phase.payload_kg)
+
+    return replace(plan, **{name: load_of(getattr(plan, name)) for name in ("approach", "cycle", "retreat")})
+
+
+@given(arrays(float, (4, 7, 5), elements=errors))
+def test_difficulty_is_one_minus_exp_of_the_summed_error(values):
+    features = Features(values)
+    want = 1 - np.exp(-values[..., :3].sum(axis=-1))
+    np.testing.assert_allclose(features.difficulty, np.minimum(want, 1 - 1e-13), atol=1e-12)
+    assert np.all(features.difficulty < 1)
+    np.testing.assert_allclose(features.load, 1 - np.exp(-values[..., 3]), atol=1e-12)
+
+
+def test_calibrated_difficulty_is_zero_at_the_median_half_at_the_95th_percentile_and_rises_to_one(calibration):
+    usual = calibration.reference.errors.sum(axis=-1)
+    for level, want in ((0.0, 0.0), (50.0, 0.0), (95.0, 0.5), (100.0, None)):
+        values = np.zeros((7, 5))
+        values[:, 0] = np.percentile(usual, level, axis=0)
+        got = calibration.difficulty(Features(values))
+        if want is None:
+            assert np.all(got > 0.5)
+        else:
+            np.testing.assert_allclose(got, want, atol=1e-12)
+    far = np.zeros((7, 5))
+    far[:, 2] = 20.0
+    assert np.all(calibration.difficulty(Features(far)) > 0.99)
+
+
+def test_joints_that_never_differ_have_a_least_spread():
+    calibration = Calibration(Features(np.full((5, 7, 5), 0.2)))
+    np.testing.assert_allclose(calibration.spread, 0.01)
+    assert np.all(np.isfinite(calibration.difficulty(Features(np.full((7, 5), 0.3)))))
+
+
+@given(st.integers(2, 60), st.integers(0, 2**32 - 1))
+def test_the_p_value_counts_cool_jobs_that_score_as_high(count, seed):
+    rng = np.random.default_rng(seed)
+    calibration, new = Calibration(packed(count, rng)), packed(6, rng)
+    reference = score_of(calibration.reference, "sum")
+    for s, p in zip(score_of(new, "sum"), calibration.p_value(new, "sum"), strict=True):
+        assert p == (1 + sum(r >= s for r in reference)) / (count + 1)
+
+
+def test_cool_jobs_raise_false_alarms_as_often_as_asked():
+    """Split conformal: over many calibrations, P(p ≤ α) ≤ α for exchangeable jobs."""
+    rng = np.random.default_rng(2)
+    alarms = np.concatenate([Calibration(packed(39, rng)).p_value(packed(20, rng), "load") for _ in range(300)])
+    for alpha in (0.05, 0.1, 0.25):
+        assert np.mean(alarms <= alpha) == pytest.approx(alpha, abs=0.012)
+
+
+@pytest.mark.parametrize("name", ["sum", "max", "load", "load_max", "excess", "calibrated_sum", "calibrated_max"])
+def test_more_error_never_scores_lower(calibration, rng, name):
+    less = packed(50, rng)
+    more = Features(less.packed + rng.gamma(1.0, 0.3, less.packed.shape))
+    assert np.all(score_of(more, name, calibration) >= score_of(less, name, calibration))
+    assert score_of(less, name, calibration).shape == (50,)
+
+
+def test_a_score_may_be_one_joint_and_must_exist(calibration, rng):
+    features = packed(3, rng)
+    np.testing.assert_array_equal(score_of(features, "joint_2"), features.difficulty[:, 1])
+    with pytest.raises(ValueError, match="No score 'joint_8'; did you mean 'joint_"):
+        score_of(features, "joint_8")
+    with pytest.raises(ValueError, match=r"needs a twin with a calibration: Twin\.calibrated"):
+        score_of(features, "calibrated_sum")
+
+
+@pytest.mark.parametrize("shape", [(1, 7, 5), (7, 5)])
+def test_a_calibration_needs_some_jobs(shape):
+    with pytest.raises(ValueError, match="two or more held-out cool jobs"):
+        Calibration(Features(np.zeros(shape)))
+    with pytest.raises(ValueError, match="must be"):
+        Features(np.zeros((7, 3)))
+
+
+@pytest.mark.parametrize(
+    ("channel", "one_sided", "word"),
+    [(0, 0.0, "a new place"), (1, 0.0, "a new speed"), (2, 1.0, "more load"), (2, 0.1, "another load")],
+)
+def test_the_reason_is_named_in_words(calibration, channel, one_sided, word):
+    values = np.zeros((7, 5))
+    values[:, :3] = calibration.usual
+    values[3, channel] += 2.0
+    values[3, 3] = one_sided * values[3, 2]
+    measures = measures_of(Features(values), calibration, score="sum", version="v")
+    assert measures.why() == f"joint 4: {word} (100 %)"
+    assert measures.shares.sum() == pytest.approx(1.0)
+
+
+def test_nothing_beyond_the_usual_says_so(calibration):
+    values = np.zeros((7, 5))
+    measures = measures_of(Features(values), calibration, score="sum", version="v")
+    assert measures.why() == "nothing beyond the usual"
+    assert measures.shares.sum() == 0
+    assert measures.p_value == 1.0
+
+
+def test_one_sided_torque_counts_only_more_load_than_the_twin_makes_of_it(twin, jobs, known):
+    """Second way: from the reconstruction in SI units."""
+    windows = cut(resample(heavier(jobs[0][0], 1, 2.0).cycle.profile, 50.0, 12.5), 50, 25)
+    tau, tau_hat = windows[..., 2], twin.reconstruct(windows)[..., 2]
+    features = twin.window_features(windows)
+    more = np.maximum(np.abs(tau) - np.abs(tau_hat), 0) / twin.scaler.std[:, 2]
+    np.testing.assert_allclose(features.one_sided, more.mean(axis=1), rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(
+        features.excess_sq, np.maximum(tau**2 - tau_hat**2, 0).mean(axis=1), rtol=1e-3, atol=1e-4
+    )
+    assert np.all(features.one_sided <= features.errors[..., 2] + 1e-6)
+
+
+def test_a_heavier_job_is_told_from_cool_ones_and_why(known, jobs):
+    cool = known.measures([plan for plan, _ in jobs], [times for _, times in jobs])
+    hot = known.measure(heavier(jobs[0][0], 1, 10.0), 5)
+    assert np.median(cool.calibrated) < 0.05
+    assert hot.calibrated[1] > 0.9
+    assert hot.calibrated[1] > cool.calibrated[:, 1].max()
+    assert hot.load[1] > cool.load[:, 1].max()
+    assert hot.p_value == pytest.approx(1 / 13)
+    assert hot.why(1).startswith("joint 2: more load")
+    assert hot.version == known.version
+
+
+def test_measures_of_many_jobs_are_those_of_each(known, jobs):
+    together = known.measures([plan for plan, _ in jobs], [times for _, times in jobs], score="max")
+    for i, (plan, times) in enumerate(jobs):
+        one, own = together.of_job(i), known.measure(plan, times, score="max")
+        np.testing.assert_array_equal(one.difficulty, own.difficulty)
+        np.testing.assert_array_equal(own.difficulty, known.score(plan, times).per_joint)
+        assert (one.p_value, one.why()) == (own.p_value, own.why())
+    with pytest.raises(ValueError, match="one job"):
+        together.why()
+    with pytest.raises(ValueError, match="one job"):
+        own.of_job(0)
+
+
+def test_without_a_calibration_there_is_no_opinion_on_what_is_usual(twin, jobs):
+    measures = twin.measure(*jobs[0])
+    assert measures.calibrated is None
+    assert measures.p_value is None
+    np.testing.assert_allclose(measures.shares, twin.shares(*jobs[0]))
+    assert measures.total == pytest.approx(twin.score(*jobs[0]).total)
+
+
+def test_a_recorded_stretch_has_measures_too(known, jobs):
+    plan = jobs[0][0]
+    features = known.profile_features(plan.cycle.profile, 50.0)
+    measures = known.measures_of(features, score="joint_2")
+    np.testing.assert_allclose(features.errors, known.phase_errors([plan])[0, 1], rtol=1e-6)
+    assert measures.calibrated.shape == (7,)
+    assert 0 < measures.p_value <= 1
+
+
+def test_a_calibration_is_kept_in_the_checkpoint_and_in_the_version(twin, known, jobs, tmp_path):
+    save(known, tmp_path / "a")
+    back = load(tmp_path / "a")
+    assert back.version == known.version != twin.version
+    assert (back.measure(*jobs[1]).p_value, back.arm) == (known.measure(*jobs[1]).p_value, known.arm)
+    np.testing.assert_array_equal(back.calibration.reference.packed, known.calibration.reference.packed)
+    save(twin, tmp_path / "b")
+    assert load(tmp_path / "b").calibration is None
+
+
+def test_a_checkpoint_with_and_without_calibration_cannot_be_mixed(twin, known, tmp_path):
+    for model, claims, words in ((twin, True, "missing tensors .'calibration"), (known, False, "unknown tensors")):
+        folder = tmp_path / str(claims)
+        save(model, folder)
+        card = json.loads((folder / CARD).read_text())
+        (folder / CARD).write_text(json.dumps({**card, "calibrated": claims}))
+        with pytest.raises(CheckpointError, match=words):
+            load(folder)
