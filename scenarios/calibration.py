@@ -1,0 +1,139 @@
+"""The past jobs that calibrate a scenario's twins: rehearsed in simulation, labelled by what they did to the motors.
+
+An arm that has worked for weeks has such jobs in its records. One that has not rehearses: its own work and a natural
+mix up to heavy payloads, for times and from temperatures of all kinds, critical ones among them.
+"""
+
+import hashlib
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from fleet.errors import CheckpointError
+from fleet.job import Work
+from fleet.motion import Plan
+from fleet.motor import Motors
+from fleet.robot import Robot
+from fleet.sim.exercise import EXERCISE_VERSION, random_jobs
+from fleet.thermal import ThermalModel
+from scenarios.past_jobs import past_jobs
+from scenarios.saturation_study import LABELLED, seen
+from scenarios.scenario import Scenario
+from scenarios.study import Sample, Study
+from twin.calibrate import Experience, NotEnoughExperience, fit_saturation
+from twin.saturation import CalibratedTwin
+from twin.saturation_file import load_calibrated, save_saturation
+from twin.score import Twin
+
+log = logging.getLogger(__name__)
+
+RECIPE = 1
+"""Raised whenever the same twin and scenario would rehearse other jobs or fit another model."""
+OWN = 0.5
+"""Share of the rehearsed jobs that are the scenario's own work; the others come from the natural mix."""
+
+Body = tuple[Robot, Motors, ThermalModel]
+
+
+def calibrated_twins(
+    scenario: Scenario,
+    bodies: Sequence[Body],
+    plans: Sequence[Mapping[Work, tuple[Plan, ...]]],
+    twins: Sequence[Twin],
+    folder: Path,
+    *,
+    jobs: int = LABELLED,
+) -> list[CalibratedTwin]:
+    """Every arm's twin with the probability of saturation that its rehearsal taught; from the folder where possible.
+
+    Raises:
+        NotEnoughExperience: an arm's rehearsal says too little of what leads to saturation; names the arm.
+    """
+    found = []
+    for index, (body, own, twin) in enumerate(zip(bodies, plans, twins, strict=True)):
+        home = folder / "saturation" / _key(scenario, body, own, twin, jobs)
+        found.append(_stored(twin, home) or _fitted(scenario, index, body, own, twin, home, jobs))
+    return found
+
+
+def rehearse_saturation(
+    scenario: Scenario,
+    index: int,
+    body: Body,
+    plans: Mapping[Work, tuple[Plan, ...]],
+    twin: Twin,
+    *,
+    jobs: int = LABELLED,
+) -> Experience:
+    """Past jobs of the arm of this index as its twin saw them; the same for every seed of a run.
+
+    Args:
+        plans: What it can do of the scenario's work, `jobs` drawn from all variants.
+    """
+    robot, motors, thermal = body
+    rng = np.random.default_rng(np.random.SeedSequence([scenario.spread.seed, index], spawn_key=(2,)))
+    every = [plan for variants in plans.values() for plan in variants]
+    count = round(OWN * jobs) if every else 0
+    own = [every[i] for i in rng.integers(max(len(every), 1), size=count)]
+    mixed = (*own, *random_jobs(robot, jobs - count, rng))
+    none = Sample((), np.empty((0, motors.idle_w.size)))
+    spec = scenario.twin
+    arm = Study(
+        robot=robot,
+        motors=motors,
+        thermal=thermal,
+        ambient_c=spec.ambient_c,
+        horizon_s=spec.horizon_s,
+        cool_c=spec.cool_c,
+        warning_c=scenario.limits.warning_c,
+        train=none,
+        reference=none,
+        test=none,
+        novel=none,
+    )
+    return seen(twin, past_jobs(arm, mixed, rng))
+
+
+def _fitted(
+    scenario: Scenario,
+    index: int,
+    body: Body,
+    plans: Mapping[Work, tuple[Plan, ...]],
+    twin: Twin,
+    home: Path,
+    jobs: int,
+) -> CalibratedTwin:
+    past = rehearse_saturation(scenario, index, body, plans, twin, jobs=jobs)
+    try:
+        model = fit_saturation(past)
+    except NotEnoughExperience as error:
+        raise NotEnoughExperience(f"{scenario.name}: arm '{body[0].name}': {error}") from error
+    save_saturation(model, home)
+    return CalibratedTwin(twin, model)
+
+
+def _stored(twin: Twin, home: Path) -> CalibratedTwin | None:
+    if not home.is_dir():
+        return None
+    try:
+        return load_calibrated(twin, home)
+    except CheckpointError as error:
+        log.warning("The stored saturation model cannot be used (%s); fitting anew.", error)
+        return None
+
+
+def _key(scenario: Scenario, body: Body, plans: Mapping[Work, tuple[Plan, ...]], twin: Twin, jobs: int) -> str:
+    """Equal keys mean equal models: by the twin, the arm's body, its plans, and what is rehearsed."""
+    robot, motors, thermal = body
+    parts = [RECIPE, EXERCISE_VERSION, jobs, twin.version, scenario.spread.seed, scenario.limits.warning_c, robot]
+    digest = hashlib.sha256(msgspec.json.encode(parts))
+    for value in (*vars(motors).values(), *vars(thermal).values()):
+        digest.update(np.asarray(value, dtype=float).tobytes())
+    for variants in plans.values():
+        for phase in (phase for plan in variants for phase in plan.phases):
+            digest.update(f"{phase.profile.shape}".encode())
+            digest.update(np.ascontiguousarray(phase.profile).tobytes())
+    return digest.hexdigest()[:32]

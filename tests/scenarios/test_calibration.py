@@ -1,0 +1,69 @@
+"""The rehearsal that calibrates a scenario's twins: enough of both outcomes, kept, and the same in every run."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleet.motion import drive
+from fleet.robot import ThermalLimits
+from scenarios.build import body_of
+from scenarios.calibration import calibrated_twins, rehearse_saturation
+from scenarios.load import load
+from twin.calibrate import NotEnoughExperience
+from twin.measures import Features
+
+
+@dataclass(frozen=True)
+class Seer:
+    """Stands in for a twin: reports the squared current of each joint."""
+
+    motors: object
+    version: str = "seer"
+    joints: int = 7
+
+    def features(self, plans, repetitions) -> Features:
+        heat = np.array([drive(plan.cycle.profile, self.motors).current_sq for plan in plans])
+        return Features(np.repeat(heat[..., None], 5, axis=-1))
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return load("quickstart")
+
+
+def test_a_rehearsal_holds_both_outcomes_and_repeats(scenario) -> None:
+    body = body_of(scenario, 0)
+    past = rehearse_saturation(scenario, 0, body, {}, Seer(body[1]), jobs=60)
+    assert 5 <= past.passed.sum() <= 40
+    assert len(past) == 60
+    assert past.temp_c.min() > 15.0
+    assert past.temp_c.max() < 60.5
+    assert rehearse_saturation(scenario, 0, body, {}, Seer(body[1]), jobs=60).data_hash == past.data_hash
+    assert rehearse_saturation(scenario, 1, body, {}, Seer(body[1]), jobs=60).data_hash != past.data_hash
+
+
+def test_a_calibrated_twin_is_kept_for_the_same_arm_only(scenario, tmp_path: Path, caplog) -> None:
+    body = body_of(scenario, 0)
+    first = calibrated_twins(scenario, [body], [{}], [Seer(body[1])], tmp_path, jobs=60)
+    (home,) = (tmp_path / "saturation").iterdir()
+    (home / "saturation.json").touch()
+    stamp = (home / "saturation.json").stat().st_mtime_ns
+    again = calibrated_twins(scenario, [body], [{}], [Seer(body[1])], tmp_path, jobs=60)
+    assert again[0].saturation == first[0].saturation
+    assert (home / "saturation.json").stat().st_mtime_ns == stamp
+    other = body_of(scenario, 1)
+    calibrated_twins(scenario, [other], [{}], [Seer(other[1])], tmp_path, jobs=60)
+    assert len(list((tmp_path / "saturation").iterdir())) == 2
+    (home / "saturation.json").write_text("{")
+    mended = calibrated_twins(scenario, [body], [{}], [Seer(body[1])], tmp_path, jobs=60)
+    assert mended[0].saturation == first[0].saturation
+    assert "fitting anew" in caplog.text
+
+
+def test_an_arm_that_nothing_heats_is_named(scenario, tmp_path: Path) -> None:
+    body = body_of(scenario, 0)
+    lax = replace(scenario, limits=ThermalLimits(warning_c=500.0, error_c=600.0))
+    with pytest.raises(NotEnoughExperience, match=rf"quickstart: arm '{body[0].name}': In 0 of 40 past jobs"):
+        calibrated_twins(lax, [body], [{}], [Seer(body[1])], tmp_path, jobs=40)
