@@ -35,6 +35,10 @@ class BusError(FleetError):
     """The bus could not be opened, or a word on it could not be delivered in time."""
 
 
+class IdentificationError(FleetError):
+    """Recordings cannot tell an arm's thermal parameters; says what to record."""
+
+
 class CheckpointError(FleetError):
     """A stored twin does not fit what is asked of it; names what differs."""
 

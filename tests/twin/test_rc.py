@@ -1,0 +1,257 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fleet.motion import RATE_HZ, drive
+from fleet.motor import friction_heat, reference_current
+from fleet.robot import JOINTS
+from fleet.sim.oracle import peaks, warmed
+from fleet.thermal import HOUSING, NODES, WINDING, ThermalSpread, drive_heat, gen3_network, settled, spread_motors
+from twin.calibrate import NotEnoughExperience
+from twin.forecast import continued_peaks, planned_peaks
+from twin.heat_log import heat_logs
+from twin.identified import nominal_body
+from twin.identify import identify
+from twin.observer import observe
+from twin.rc import RcTwin
+from twin.rc_checkpoint import load_twin, save
+from twin.rc_risk import fit_head
+from twin.recording import Recording
+from twin.reliability import brier, calibration_error
+from twin.thermal_values import Body
+
+AIR_C = 22.0
+FULL_REACH_NM = np.array([0.0, 50.1, 0.0, 21.3, 0.0, 1.0, 0.0])
+"""3 kg held outstretched (gravity torques of the Gen3 model)."""
+
+
+def hold(tau, seconds: float = 4.0):
+    """Profile of a posture held, [time, 3, joint]."""
+    samples = round(seconds * RATE_HZ)
+    return np.stack([np.zeros((samples, JOINTS)), np.zeros((samples, JOINTS)), np.tile(tau, (samples, 1))], axis=1)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(5)
+
+
+@pytest.fixture
+def holds(make_plan):
+    """Plan that holds joint torques."""
+
+    def make(tau, seconds: float = 4.0):
+        short = hold(tau, 0.5)
+        return make_plan(*(p.astype(np.float32) for p in (short, hold(tau, seconds), short)))
+
+    return make
+
+
+def test_three_kilograms_outstretched_pass_the_limit_when_the_project_says(holds):
+    # 12.6 min from a cold arm in 25 °C, DESIGN §3.
+    twin = RcTwin.nominal(ambient_c=25.0)
+    time_s, temp_c = twin.predict(holds(FULL_REACH_NM), 450, np.full(JOINTS, 25.0))
+    assert time_s[-1] == pytest.approx(1801.0)
+    passed_s = np.interp(60.0, temp_c[:, 1], time_s)
+    assert passed_s / 60.0 == pytest.approx(12.6, abs=0.2)
+
+
+def test_peaks_are_those_of_the_simulator_with_the_same_parameters(holds, rng):
+    twin = RcTwin.nominal()
+    plans = [holds(scale * FULL_REACH_NM) for scale in (0.3, 0.7, 1.1)]
+    repetitions = [20, 100, 300]
+    start = np.full(NODES, 30.0)
+    mine = twin.peaks(plans, repetitions, start_c=start)
+    lasts = [plan.duration_s(n) for plan, n in zip(plans, repetitions, strict=True)]
+    theirs = peaks(plans, lasts, motors=twin.motors, thermal=twin.thermal, start_c=start, ambient_c=AIR_C)
+    np.testing.assert_allclose(mine, theirs, atol=0.05)  # steps of unequal length
+
+
+def test_a_job_in_phases_ends_where_its_mean_ends(holds):
+    twin = RcTwin.nominal()
+    plan = holds(FULL_REACH_NM)
+    _, temp_c = twin.predict(plan, 50, np.full(JOINTS, 30.0))
+    peak = twin.peaks([plan], [50], start_c=np.full(NODES, 30.0))[0]
+    np.testing.assert_allclose(temp_c.max(axis=0), peak, atol=0.02)
+
+
+def test_difficulty_grows_with_load_and_repetitions_and_is_none_at_rest(holds):
+    twin = RcTwin.nominal()
+    rest = twin.score(holds(np.zeros(JOINTS)), 100)
+    np.testing.assert_allclose(rest.per_joint, 0.0, atol=1e-9)
+    d = [twin.score(holds(s * FULL_REACH_NM), n).per_joint[1] for s, n in ((0.5, 100), (1.0, 100), (1.0, 1000))]
+    assert 0 < d[0] < d[1] < d[2] < 1
+    # The limit is reached where the rise fills the room: d = 1 − 1/e.
+    idle = twin.idle_c[1]
+    at_limit = replace(twin, warning_c=float(twin.peaks([holds(FULL_REACH_NM)], [100], start_c=twin.idle_c)[0, 1]))
+    assert at_limit.warning_c > idle
+    assert at_limit.score(holds(FULL_REACH_NM), 100).per_joint[1] == pytest.approx(1 - np.exp(-1))
+
+
+def test_pieces_are_the_step_by_step_prediction(holds, rng):
+    twin = RcTwin.nominal()
+    plan, times = holds(FULL_REACH_NM), 200
+    (found,) = twin.pieces([plan], [times])
+    for temp_c in (np.full(JOINTS, 25.0), rng.uniform(25, 45, JOINTS)):
+        scaled = found.offset + found.weight @ temp_c
+        # Where joint 2 stands at the end, undone by the scale that the limit gives away.
+        higher = replace(twin, warning_c=twin.warning_c + 1.0).pieces([plan], [times])[0]
+        scale = 1.0 / (found.offset - higher.offset)
+        by_pieces = (scaled * scale + twin.warning_c).reshape(-1, JOINTS)
+        load, duration = twin._load([plan], [times])
+        course = twin.course(load, duration, twin.likely_start(temp_c))[:, 0, WINDING]
+        np.testing.assert_allclose(by_pieces[0], temp_c, atol=1e-9)
+        np.testing.assert_allclose(by_pieces[-1], course[-1], rtol=0.02)  # magnets frozen halfway
+
+
+def test_risk_rises_with_every_temperature_and_needs_past_jobs(holds, rng):
+    twin = RcTwin.nominal()
+    plan = holds(FULL_REACH_NM)
+    with pytest.raises(ValueError, match="no P"):
+        twin.risk(plan, 100)
+    assert twin.score(plan, 100).risk is None
+    taught = twin.with_head(fit_head(rng.normal(0, 1, 100), rng.random(100) < 0.5))
+    assert taught.version != twin.version
+    plans = [holds(s * FULL_REACH_NM) for s in rng.uniform(0.2, 1.4, 60)]
+    temps = rng.uniform(25, 50, (60, JOINTS))
+    repeats = [100] * 60
+    passed = np.array([twin.pieces([p], [100])[0].margin(t) for p, t in zip(plans, temps, strict=True)]) > 0
+    taught = twin.learned(plans, repeats, temp_c=temps, passed=passed)
+    risk = taught.score(plan, 100).risk
+    assert risk is not None
+    p = [risk.at(np.full(JOINTS, t)) for t in (20.0, 40.0, 55.0, 70.0)]
+    assert p[0] < p[1] < p[2] < p[3]
+    with pytest.raises(NotEnoughExperience, match="needs 30 past jobs"):
+        twin.learned(plans[:10], repeats[:10], temp_c=temps[:10], passed=passed[:10])
+    with pytest.raises(NotEnoughExperience, match="0 passing"):
+        twin.learned(plans, repeats, temp_c=temps, passed=np.zeros(60, dtype=bool))
+
+
+def test_bad_plans_are_refused(holds, make_plan):
+    twin, empty = RcTwin.nominal(), np.zeros((0, 3, JOINTS), np.float32)
+    with pytest.raises(ValueError, match="at least one repetition"):
+        twin.score(holds(FULL_REACH_NM), 0)
+    with pytest.raises(ValueError, match="no motion"):
+        twin.score(make_plan(empty, empty, empty), 1)
+    six = np.zeros((50, 3, 6), np.float32)
+    with pytest.raises(ValueError, match="7 joints"):
+        twin.score(make_plan(six, six, six), 1)
+    with pytest.raises(ValueError, match="start_c"):
+        twin.predict(holds(FULL_REACH_NM), 1, np.zeros(3))
+
+
+def working(twin: RcTwin, minutes: float, rng: np.random.Generator) -> tuple[Recording, np.ndarray]:
+    """A log at 1 Hz of a hold and a rest from warm housings, and the true node temperatures."""
+    count = round(60 * minutes)
+    on = (np.arange(count + 1) < count // 2).astype(float)[:, None]
+    tau, still = on * FULL_REACH_NM, np.zeros((count + 1, JOINTS))
+    start = np.append(np.full(JOINTS, 35.0), np.full(JOINTS, 31.0))
+    phi, gamma = twin.thermal.step_matrices(1.0)
+    temp, amps = [start], []
+    for k in range(count):
+        square = reference_current(tau[k], still[k], twin.motors) ** 2
+        heat = drive_heat(temp[-1], square, friction_heat(still[k], twin.motors), twin.motors)
+        temp.append(phi @ temp[-1] + gamma @ (heat + twin.thermal.to_ambient * AIR_C))
+    for k in range(count + 1):
+        factor = 1.0 + twin.motors.alpha_kt_per_k * (temp[k][HOUSING] - twin.motors.reference_c)
+        amps.append(reference_current(tau[k], still[k], twin.motors) / factor)
+    temps = np.array(temp)
+    seen = temps[:, WINDING] + twin.motors.sensor_noise_k * rng.standard_normal((count + 1, JOINTS))
+    arrays = {"q": still, "qd": still, "tau": tau, "current_a": np.array(amps), "temp_c": seen}
+    return Recording(name="work", time_s=np.arange(count + 1.0), **arrays), temps
+
+
+def test_the_observer_finds_the_housings_and_says_how_well(rng):
+    twin = RcTwin.nominal()
+    recording, truth = working(twin, 40.0, rng)
+    seen = observe(twin, recording)
+    error = np.abs(seen.temp_c[:, HOUSING] - truth[seen.time_s.astype(int), HOUSING])
+    assert (error[0] > 3.5).all()
+    assert error[-1].max() < 1.0
+    assert (seen.sd_k[-1, HOUSING] < 0.4 * seen.sd_k[0, HOUSING]).all()
+    assert (error[-1] < 3.0 * seen.sd_k[-1, HOUSING]).all()
+    np.testing.assert_array_equal(seen.at(1e9), seen.temp_c[-1])
+    with pytest.raises(ValueError, match="log begins"):
+        seen.at(-1.0)
+
+
+def test_forecasts_know_the_coming_load_or_take_the_last_one_for_granted(rng):
+    twin = RcTwin.nominal()
+    recording, truth = working(twin, 40.0, rng)
+    (log,) = heat_logs(recording, twin.motors, "torque")
+    states = truth[log.time_s.astype(int)]
+    planned = planned_peaks(twin, log, states, 300.0)
+    continued = continued_peaks(twin, log, states, 300.0, past_s=30.0)
+    assert np.isnan(planned[-1]).all()
+    assert np.isnan(continued[0]).all()
+    for k in (30, 100, 125, 180):
+        coming = truth[int(log.time_s[k]) + 1 : int(log.time_s[k]) + 301, WINDING].max(axis=0)
+        np.testing.assert_allclose(planned[k], coming, atol=0.15)
+    # Just before the hold ends, a load that goes on is hotter than what comes; in the middle it is the same.
+    assert continued[115, 1] > planned[115, 1] + 0.5
+    np.testing.assert_allclose(continued[60], planned[60], atol=0.15)
+
+
+def own_arm(seed: int) -> tuple[RcTwin, Body]:
+    rng, spread = np.random.default_rng(seed), ThermalSpread.gen3()
+    body = nominal_body()
+    return RcTwin.nominal(), Body(spread_motors(body.motors, spread, rng), gen3_network(spread=spread, rng=rng))
+
+
+def test_an_identified_arm_predicts_its_own_heat_better_than_the_nominal_one(holds, rng, tmp_path):
+    nominal, body = own_arm(11)
+    true = RcTwin(arm="own", body=body, ambient_c=AIR_C, base="true")
+    recordings = [replace(working(true, 40.0, rng)[0], name=f"{i}") for i in range(2)]
+    got = identify(recordings, ambient_sd_k=0.0, step_s=20.0)
+    plans = [holds(s * FULL_REACH_NM) for s in (0.5, 0.8, 1.1)]
+    start = np.full(NODES, 30.0)
+    wanted = true.peaks(plans, [200] * 3, start_c=start)[:, 1]
+    error = [
+        np.abs(twin.peaks(plans, [200] * 3, start_c=start)[:, 1] - wanted).max() for twin in (nominal, RcTwin.of(got))
+    ]
+    assert error[1] < min(0.5 * error[0], 0.5)
+    save(got, tmp_path, saturation=fit_head(rng.normal(0, 1, 60), rng.random(60) < 0.5))
+    back = load_twin(tmp_path)
+    assert back.head is not None
+    np.testing.assert_array_equal(
+        back.peaks(plans, [200] * 3, start_c=start), RcTwin.of(got).peaks(plans, [200] * 3, start_c=start)
+    )
+
+
+def test_probability_from_past_jobs_of_an_arm_unlike_the_nominal_one(holds):
+    # Jobs of random loads and lengths from random starts; labels by the simulator's law with the arm's own numbers.
+    nominal, body = own_arm(2)
+    rng = np.random.default_rng(0)
+    count, taught = 700, 200
+    scale = rng.uniform(0.2, 1.3, count)
+    tau = scale[:, None] * FULL_REACH_NM * rng.uniform(0.5, 1.5, (count, JOINTS))
+    plans = [holds(row, 0.2) for row in tau]
+    repetitions = rng.integers(300, 12000, count)
+    winding = rng.uniform(22, 50, (count, 1)) + rng.normal(0, 2, (count, JOINTS))
+    start = np.concatenate([winding, winding - rng.uniform(0, 5, (count, JOINTS))], axis=1)
+    loads = [drive(plan.cycle.profile, body.motors) for plan in plans]
+    lasts = np.array([plan.duration_s(int(n)) for plan, n in zip(plans, repetitions, strict=True)])
+    air = np.full(count, 24.0)
+    true = warmed(loads, lasts, motors=body.motors, thermal=body.thermal(), start_c=start, ambient_c=air)
+    passed = true.highest_c.max(axis=1) >= 60.0
+    twin = nominal.learned(plans[:taught], repetitions[:taught], temp_c=winding[:taught], passed=passed[:taught])
+    assert twin.head is not None
+    p = np.array(
+        [
+            float(twin.head.risk(of_job).at(t))
+            for of_job, t in zip(twin.pieces(plans[taught:], repetitions[taught:]), winding[taught:], strict=True)
+        ]
+    )
+    assert 0.1 < passed.mean() < 0.9
+    assert brier(p, passed[taught:]) <= 0.045
+    assert calibration_error(p, passed[taught:]) <= 0.04
+
+
+def test_the_warm_end_is_where_newton_says_it_settles(holds):
+    twin = RcTwin.nominal()
+    plan = holds(0.5 * FULL_REACH_NM)
+    load = drive(plan.cycle.profile, twin.motors)
+    end = settled(twin.thermal, load.current_sq, load.friction_w, twin.motors, AIR_C)
+    _, temp_c = twin.predict(plan, 15000, np.full(JOINTS, 30.0))
+    np.testing.assert_allclose(temp_c[-1], end[WINDING], atol=0.05)
