@@ -32,11 +32,14 @@ def test_a_round_trip_keeps_every_bit_of_the_score(twin, folder, plan):
     np.testing.assert_array_equal(back.score(plan, 5).per_joint, twin.score(plan, 5).per_joint)
 
 
-def test_two_layers_and_a_wider_latent_come_back(records, small, tmp_path):
-    config = replace(small, layers=2, latent=3, epochs=1, allow_collapse=True)
+@pytest.mark.parametrize("change", [{"layers": 2, "latent": 3}, {"scope": "arm"}, {"kind": "ae"}])
+def test_every_kind_of_twin_comes_back(records, small, tmp_path, plan, change):
+    config = replace(small, **change, epochs=1, allow_collapse=True)
     other = train(records[:3], config, np.random.SeedSequence(0), arm="b")
     save(other, tmp_path)
-    assert load(tmp_path).version == other.version
+    back = load(tmp_path)
+    assert back.version == other.version
+    np.testing.assert_array_equal(back.score(plan, 2).per_joint, other.score(plan, 2).per_joint)
 
 
 def test_saving_leaves_two_files_and_loading_no_trace_in_the_random_state(twin, folder):
@@ -106,6 +109,9 @@ def test_a_changed_weight_is_noticed(folder):
         (lambda card: card["config"].update(hidden=8), "the configuration needs"),
         (lambda card: card["config"].update(hidden=-8), "hidden must be >= 1"),
         (lambda card: card["std"].pop(), "must each have 7 joints"),
+        (lambda card: card["fits"].pop(), "fits must have 7 entries, one per network"),
+        (lambda card: card["config"].update(scope="arm"), "fits must have 1 entries"),
+        (lambda card: card["config"].update(kind="ae"), "unknown tensors"),
         (lambda card: card["std"][0].pop(), "Expected `array` of length 3"),
         (lambda card: card.pop("seed"), "seed"),
         (lambda card: card.update(more=1), "more"),

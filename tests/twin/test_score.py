@@ -7,6 +7,8 @@ import pytest
 
 from fleet.difficulty import DifficultyModel
 from fleet.motion import Phase
+from twin.measures import Features
+from twin.score import Twin
 from twin.window import cut, resample
 
 
@@ -171,3 +173,26 @@ def test_decoding_the_posterior_mean_is_the_reconstruction(twin, plan):
     np.testing.assert_allclose(twin.decode(mu), twin.reconstruct(windows), rtol=1e-5, atol=1e-5)
     with pytest.raises(ValueError, match=r"Latents must be \[batch, 7, 2\]"):
         twin.decode(mu[:, :, :1])
+
+
+def test_every_plan_needs_its_repetitions(twin, plan):
+    with pytest.raises(ValueError, match="Every plan needs its repetitions"):
+        twin.features([plan], [1, 2])
+
+
+def test_a_twin_needs_its_networks(twin):
+    with pytest.raises(ValueError, match=r"scope 'arm' for 7 joints needs 1 network"):
+        Twin(
+            replace(twin.config, scope="arm"),
+            twin.scaler,
+            twin.nets,
+            arm="a",
+            data_hash="",
+            seed="0",
+            fits=twin.fits,
+        )
+
+
+def test_a_calibration_of_another_arm_is_refused(twin):
+    with pytest.raises(ValueError, match="calibration is for 6 joints, the twin has 7"):
+        twin.calibrated_by(Features(np.zeros((4, 6, 5))))
