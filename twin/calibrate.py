@@ -107,8 +107,8 @@ def fit_saturation(
     and one-sided evidence cannot make a job safer: their slopes are kept >= 0, which few jobs alone would not show.
 
     Args:
-        evidence: What is read of the twin's errors; see `twin.saturation.evidence_of`. The default had the least
-            cross-validated loss in `scenarios.saturation_study`, `errors` the most.
+        evidence: What is read of the twin's errors; see `twin.saturation.evidence_of`. The default has the least
+            Brier score in `scenarios.saturation_study`, `errors` the largest.
         method: `isotonic` puts a monotone curve, fitted on cross-validated scores, in the place of the logistic
             function: for many jobs, a few hundred at least.
         horizon_s: `passed` tells of so long after the start; None: of the whole job.
@@ -119,29 +119,26 @@ def fit_saturation(
     """
     if method not in METHODS:
         raise ValueError(f"No method '{method}'. Allowed: {', '.join(METHODS)}.")
-    read = evidence_of(past.features, evidence)
     check(past)
-    heating_s = within(past.duration_s, horizon_s)
-    columns = read.reshape(len(past), -1)
-    count = columns.shape[1]
-    x = np.column_stack([columns, columns * warmed(heating_s)[:, None], np.log(heating_s), past.temp_c])
-    rising = np.arange(x.shape[1]) >= (0 if evidence in ONE_SIDED else 2 * count)
+    x, rising = _design(past, evidence, horizon_s)
     mean, std = x.mean(axis=0), x.std(axis=0)
     std = np.where(std > 1e-9 * np.maximum(np.abs(mean), 1e-9), std, np.inf)  # what never varied teaches nothing
     z = (x - mean) / std
     strength, held_out = choose_strength(z, past.passed, rising)
     slope, offset = logistic(z, past.passed, rising, strength)
     slope = slope / std
+    joints = past.temp_c.shape[1]
+    at_once, later = (tuple(map(_floats, block)) for block in np.split(slope[: -joints - 1].reshape(2 * joints, -1), 2))
     return SaturationModel(
         twin=past.twin,
         evidence=evidence,
         method=method,
         horizon_s=horizon_s,
         offset=float(offset - slope @ mean),
-        at_once=_rows(slope[:count], past),
-        later=_rows(slope[count : 2 * count], past),
-        of_log_duration=float(slope[2 * count]),
-        of_temp=tuple(slope[2 * count + 1 :].tolist()),
+        at_once=at_once,
+        later=later,
+        of_log_duration=float(slope[-joints - 1]),
+        of_temp=_floats(slope[-joints:]),
         curve=None if method == "logistic" else monotone_curve(held_out, past.passed),
         data_hash=past.data_hash,
         jobs=len(past),
@@ -151,9 +148,17 @@ def fit_saturation(
     )
 
 
-def _rows(slope: Array, past: Experience) -> tuple[tuple[float, ...], ...]:
-    """[joint][column] of the slopes of one block of evidence."""
-    return tuple(tuple(row.tolist()) for row in slope.reshape(past.temp_c.shape[1], -1))
+def _design(past: Experience, evidence: Evidence, horizon_s: float | None) -> tuple[Array, Array]:
+    """Columns [job, column] and which of them must not make a job safer, bool [column]: the evidence, the evidence
+    times how far it has warmed, ln(duration), temperatures."""
+    read = evidence_of(past.features, evidence).reshape(len(past), -1)
+    heating_s = within(past.duration_s, horizon_s)
+    x = np.column_stack([read, read * warmed(heating_s)[:, None], np.log(heating_s), past.temp_c])
+    return x, np.arange(x.shape[1]) >= (0 if evidence in ONE_SIDED else 2 * read.shape[1])
+
+
+def _floats(values: Array) -> tuple[float, ...]:
+    return tuple(values.tolist())
 
 
 def check(past: Experience) -> None:
