@@ -51,21 +51,23 @@ def epoch_study(
     epochs: Sequence[int] = EPOCHS,
     seeds: Sequence[int] = (0, 1, 2, 3, 4),
     config: TwinConfig | None = None,
+    records: int = RECORDS,
     workers: int = -1,
     progress: Callable[[str, float], None] = lambda stage, share: None,
 ) -> EpochStudy:
     """Train a twin anew for every number of epochs and seed; each seed draws the jobs of its record.
 
     Args:
-        jobs: Profiles [time, 3, joint] of the phases of each job, all cool; at least twice `RECORDS` of them.
+        jobs: Profiles [time, 3, joint] of the phases of each job, all cool; at least twice `records` of them.
+        records: Jobs that make up a record.
         config: What is trained; by default one restart, as the paper knows none. A collapse is kept as a result.
         workers: Processes, -1 for one per core; the result does not depend on it.
 
     Raises:
         ValueError: too few jobs, or no epochs or seeds.
     """
-    if len(jobs) < 2 * RECORDS:
-        raise ValueError(f"The epoch table needs {2 * RECORDS} cool jobs or more (got {len(jobs)}).")
+    if records < 1 or len(jobs) < 2 * records:
+        raise ValueError(f"The epoch table needs {2 * max(records, 1)} cool jobs or more (got {len(jobs)}).")
     if not epochs or not seeds or min(epochs) < 1:
         raise ValueError(f"The epoch table needs seeds, and epochs >= 1 (got {seeds!r}, {epochs!r}).")
     base = replace(config or TwinConfig(restarts=1), allow_collapse=True)
@@ -73,7 +75,7 @@ def epoch_study(
     cells = []
     # Longest first, so that no core ends with a long training alone.
     order = sorted(range(len(tasks)), key=lambda i: -tasks[i][1])
-    work = (delayed(_cell)(jobs, replace(base, epochs=tasks[i][1]), tasks[i][0]) for i in order)
+    work = (delayed(_cell)(jobs, replace(base, epochs=tasks[i][1]), tasks[i][0], records) for i in order)
     total, done = sum(count for _, count in tasks), 0
     with Parallel(n_jobs=min(len(tasks), _cores()) if workers < 0 else workers, return_as="generator") as pool:
         for i, cell in zip(order, pool(work), strict=True):
@@ -87,16 +89,16 @@ def epoch_study(
     return EpochStudy(tuple(epochs), tuple(seeds), windows, known, held)
 
 
-def _cell(jobs: Sequence[Sequence[Array]], config: TwinConfig, seed: int) -> tuple[Array, Array, int]:
+def _cell(jobs: Sequence[Sequence[Array]], config: TwinConfig, seed: int, records: int) -> tuple[Array, Array, int]:
     """Errors on the training record and on other jobs, [joint, channel], and the windows trained on."""
     rng = np.random.default_rng(np.random.SeedSequence([seed, 1]))
     chosen = rng.permutation(len(jobs))
-    records = [phase for i in chosen[:RECORDS] for phase in jobs[i] if len(phase)]
-    others = [phase for i in chosen[RECORDS : 5 * RECORDS] for phase in jobs[i] if len(phase)]
-    twin = train(records, config, np.random.SeedSequence(seed), arm="epochs")
+    taught = [phase for i in chosen[:records] for phase in jobs[i] if len(phase)]
+    others = [phase for i in chosen[records : 5 * records] for phase in jobs[i] if len(phase)]
+    twin = train(taught, config, np.random.SeedSequence(seed), arm="epochs")
     seen, new = (
         windows_of(part, from_hz=config.record_hz, rate_hz=config.rate_hz, window=config.window, stride=config.stride)
-        for part in (records, others)
+        for part in (taught, others)
     )
     return twin.window_errors(seen).mean(axis=0), twin.window_errors(new).mean(axis=0), len(seen)
 

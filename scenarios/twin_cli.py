@@ -156,6 +156,60 @@ def in_options() -> Iterator[None]:
         raise FleetError(re.sub(names, lambda n: f"--{n[1].replace('_', '-')}", str(error))) from error
 
 
+@twin_app.command("report")
+def report_command(
+    scenario: ScenarioArg = None,
+    log: LogOption = None,
+    out: Annotated[Path, typer.Option(help="Folder for report.html, report.json and the pictures.")] = Path(
+        "runs/twin_report"
+    ),
+    arm: Annotated[str | None, typer.Option(help="Which arm of the scenario; default the first.")] = None,
+    seeds: Annotated[int, typer.Option(help="How many; figures with a spread are repeated under each.")] = 3,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer jobs, smaller trainings.")] = False,
+    skip_damaged: DamagedOption = False,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """The paper's pictures and tables as one HTML page that opens offline, with PNGs and report.json.
+
+    From a scenario: one arm's study of 1 200 test jobs, two hours or more on two cores with three seeds; --quick
+    takes 200 jobs and about twenty minutes. From logs: ten minutes per seed for some hours of logs. The folder holds
+    some MB. Twins are kept in the cache, so the same command goes on where it was interrupted. A section that cannot
+    be computed says why in the page, and the command leaves with code 1.
+    """
+    chosen = one_source(scenario, log)
+    if seeds < 1:
+        raise FleetError(f"--seeds must be 1 or more (got {seeds}).")
+    if log is not None and arm is not None:
+        raise FleetError("--arm chooses among a scenario's arms; a log has one arm, so leave it out with --log.")
+    from scenarios.folder import check_free, new_folder
+    from scenarios.twin_lab import QUICK, Size
+    from scenarios.twin_report import REPORT, report_logs, report_scenario, write
+    from scenarios.twin_training import arm_index
+
+    check_free(out, overwrite=overwrite, kind=REPORT)
+    command = f"thermofleet twin report {f'--log {log.name}' if log else chosen} --seeds {seeds}{' --quick' * quick}"
+    with progress_bar() as progress, new_folder(out, overwrite=overwrite, kind=REPORT) as folder:
+        told: dict[str, Any] = {"seeds": range(seeds), "command": command, "progress": progress}
+        if log is not None:
+            sections = report_logs(recordings_of(log, skip_damaged), quick=quick, **told)
+            title = f"What a twin makes of the logs in {log.name}"
+        else:
+            of_scenario = load(str(chosen))
+            index = 0 if arm is None else arm_index(of_scenario, arm)
+            sections = report_scenario(of_scenario, index, size=QUICK if quick else Size(), **told)
+            title = f"The twin of {of_scenario.arms[index].name} in {of_scenario.name}"
+        card = write(sections, folder, title=title, lead=("Every section says what was found and how.",))
+    if as_json:
+        typer.echo((out / "report.json").read_text(encoding="utf-8"), nl=False)
+    else:
+        say(f"Open {out / 'report.html'} in a browser.", out_console)
+    if card["failed"]:
+        reasons = "; ".join(f"{key}: {why}" for key, why in card["failed"].items())
+        say(f"{len(card['failed'])} of {len(sections)} sections could not be computed ({reasons})")
+        raise typer.Exit(1)
+
+
 def one_source(scenario: str | None, log: Path | None) -> str | None:
     """The scenario, or None where it is a log; exactly one of the two must be given."""
     if (scenario is None) == (log is None):

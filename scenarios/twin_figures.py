@@ -158,8 +158,8 @@ def latent_scatter_figure(mu: Array, temp_c: Array, *, limit_c: float, joint: in
     return figure
 
 
-def difficulty_figure(groups: dict[str, Array], *, title: str, score: str = "d") -> Figure:
-    """Difficulty of jobs by kind: per joint at the left, the sum over the joints at the right.
+def difficulty_figure(groups: dict[str, Array], *, title: str, unit: str = "jobs") -> Figure:
+    """Difficulty of jobs, or of windows, by kind: per joint at the left, the sum over the joints at the right.
 
     Args:
         groups: [job, joint] by name, from normal to critical; at most three.
@@ -171,7 +171,7 @@ def difficulty_figure(groups: dict[str, Array], *, title: str, score: str = "d")
     for g, ((name, values), colour) in enumerate(zip(groups.items(), colours, strict=True)):
         at = np.arange(joints) + 1 + (g - (len(groups) - 1) / 2) * room
         boxes(left, list(values.T), at, colour, 0.85 * room)
-        left.plot([], [], color=colour, linewidth=7, label=f"{name} ({len(values)} jobs)")
+        left.plot([], [], color=colour, linewidth=7, label=f"{name} ({len(values)} {unit})")
     total = {name: values.sum(axis=1) for name, values in groups.items()}
     every = np.concatenate(list(total.values()))
     edges = np.linspace(every.min(), every.max() + 1e-9, 28)
@@ -179,8 +179,8 @@ def difficulty_figure(groups: dict[str, Array], *, title: str, score: str = "d")
         right.hist(values, edges, density=True, color=colour, alpha=0.25)
         right.hist(values, edges, density=True, histtype="step", color=colour, linewidth=1.8)
     left.set_xticks(np.arange(joints) + 1)
-    named(left, x="joint", y=f"{score} of the joint", title="box: quartiles, whiskers: 5 % and 95 %")
-    named(right, x=f"{score}, sum over the joints", y="share of jobs (density)", title="sum over the joints")
+    named(left, x="joint", y="d of the joint", title="box: quartiles, whiskers: 5 % and 95 %")
+    named(right, x="d, sum over the joints", y=f"share of {unit} (density)", title="sum over the joints")
     legend_below(figure, left)
     return figure
 

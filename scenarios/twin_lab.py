@@ -1,0 +1,144 @@
+"""What the chapters of a twin report work on: one arm's study under several seeds, and its twins, made when needed."""
+
+import os
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from pathlib import Path
+
+import numpy as np
+
+from fleet.robot import Robot
+from scenarios.build import Progress, quiet
+from scenarios.contest import Make, jobs_of
+from scenarios.epochs import EPOCHS
+from scenarios.quality import CARRIER, Jobs
+from scenarios.rehearse import trained
+from scenarios.study import Sample, Study, make_study
+from twin.model import TwinConfig
+from twin.reading import read_jobs
+from twin.score import Twin
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Size:
+    """How much a report computes."""
+
+    train: int = 200
+    reference: int = 200
+    test: int = 1200
+    novel: int = 300
+    past: int = 200
+    """Labelled past jobs of the probability of saturation."""
+    epochs: tuple[int, ...] = EPOCHS
+    epoch_seeds: int = 5
+    generated: int = 20
+    """Motions per strength of the perturbation."""
+    own: int = 150
+    """Generated jobs from which a twin learns again."""
+    config: TwinConfig = field(default_factory=TwinConfig)
+
+
+QUICK = Size(
+    train=60,
+    reference=60,
+    test=200,
+    novel=60,
+    epochs=(20, 60, 240),
+    epoch_seeds=2,
+    generated=6,
+    own=40,
+    config=TwinConfig.quick(),
+)
+
+
+class Lab:
+    """Studies and twins of one arm, each made once.
+
+    Attributes:
+        robot: The arm that is studied.
+        seeds: What every figure with a spread is repeated under.
+        size: How much is computed.
+        folder: Where trained twins are kept.
+    """
+
+    def __init__(
+        self, robot: Robot, seeds: tuple[int, ...], size: Size, folder: Path, progress: Progress = quiet
+    ) -> None:
+        self.robot, self.seeds, self.size, self.folder, self.progress = robot, seeds, size, folder, progress
+
+    @property
+    def sequences(self) -> list[np.random.SeedSequence]:
+        """The seeds as numpy knows them."""
+        return [np.random.SeedSequence(seed) for seed in self.seeds]
+
+    @property
+    def make(self) -> Make:
+        """The study of a seed, in this report's size."""
+        size = self.size
+        return partial(
+            make_study,
+            robot=self.robot,
+            train=size.train,
+            reference=size.reference,
+            test=size.test,
+            novel=size.novel,
+        )
+
+    @property
+    def processes(self) -> int:
+        """So many seeds side by side."""
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return max(1, min(cores, len(self.seeds)))
+
+    @cached_property
+    def study(self) -> Study:
+        """That of the first seed, from which the pictures are."""
+        self.progress("drawing jobs", 0.0)
+        return self.make(self.sequences[0])
+
+    @cached_property
+    def twin(self) -> Twin:
+        """Trained on the first study's cool jobs, calibrated on its held-out ones."""
+        self.progress("training", 0.0)
+        records = self.study.train.records()
+        twin = trained(records, self.size.config, self.sequences[0], arm=self.robot.name, folder=self.folder)
+        held_out = self.jobs(self.study.reference)
+        return twin.calibrated(list(zip(held_out.plans, held_out.repetitions, strict=True)))
+
+    def jobs(self, sample: Sample) -> Jobs:
+        """A sample as jobs that fill the horizon."""
+        return jobs_of(sample, self.study.horizon_s)
+
+    @cached_property
+    def windows(self) -> tuple[Array, Array]:
+        """Windows of test jobs [window, time, joint, channel], and the peak of joint 2 in the job of each, °C."""
+        index = np.flatnonzero(self.study.test.passes(self.study.warning_c) | ~self.warm)[:MOST_JOBS]
+        jobs = self.jobs(self.study.test)
+        reading = read_jobs([jobs.plans[i] for i in index], [jobs.repetitions[i] for i in index], self.twin.config)
+        return reading.windows, jobs.peak_c[index][reading.job, CARRIER]
+
+    @property
+    def warm(self) -> Array:
+        """Test jobs that are neither cool nor critical, bool [job]."""
+        return self.study.test.passes(self.study.cool_c) & ~self.study.critical
+
+    @cached_property
+    def difficulty(self) -> Array:
+        """d_k of the test jobs, [job, joint]."""
+        jobs = self.jobs(self.study.test)
+        return self.twin.measures(jobs.plans, jobs.repetitions).difficulty
+
+    @cached_property
+    def examples(self) -> tuple[int, int]:
+        """A normal and a critical test job whose difficulty of joint 2 is that of the middle one of its kind."""
+        d = self.difficulty[:, CARRIER]
+        return tuple(  # pyright: ignore[reportReturnType]
+            int(index[np.argsort(d[index])[len(index) // 2]])
+            for index in (np.flatnonzero(~self.warm & ~self.study.critical), np.flatnonzero(self.study.critical))
+        )
+
+
+MOST_JOBS = 240
+"""Whose windows are shown in a latent map."""

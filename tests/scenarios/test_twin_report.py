@@ -1,0 +1,149 @@
+"""The page of a twin report: whole, offline, honest about what is missing; and the folder it lies in."""
+
+import base64
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from fleet.errors import FleetError
+from scenarios.epochs import epoch_study
+from scenarios.twin_page import PNG_HEAD, Picture, Section, Table, page, spread
+from scenarios.twin_report import claims, computed, provenance, write
+from scenarios.twin_style import png, sheet
+from twin.model import TwinConfig
+
+
+def picture(name="dots", alt="Three dots."):
+    figure, ((axes,),) = sheet(width=2, height=2)
+    axes.plot([1, 2, 3])
+    return Picture(name=name, png=png(figure), alt=alt)
+
+
+@pytest.fixture(scope="module")
+def section():
+    return Section(
+        key="dots",
+        title="Dots & <lines>",
+        sentences=("Three dots were found.",),
+        how="by looking",
+        pictures=(picture(),),
+        tables=(Table(head=("what", "σ"), rows=(("a <b>", "1.0"),)),),
+        numbers={"dots": np.arange(3), "none": float("nan"), "one": np.float64(1.5)},
+    )
+
+
+class Seen(HTMLParser):
+    """What stands in a page."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.images, self.sections, self.words, self.outside = [], [], "", []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        given = dict(attrs)
+        if tag == "img":
+            self.images.append(given)
+        if tag == "section":
+            self.sections.append(given["id"])
+        self.outside += [v for k, v in attrs if k in ("src", "href") and not v.startswith(("data:", "#"))]
+
+    def handle_data(self, data):
+        self.words += data
+
+
+def test_a_page_holds_every_section_and_picture_inside_itself(section):
+    other = replace(section, key="more", title="More")
+    seen = Seen(page("Title & more", ["Lead."], [section, other]))
+    assert seen.sections == ["dots", "more"]
+    assert seen.outside == []
+    assert [image["alt"] for image in seen.images] == ["Three dots.", "Three dots."]
+    data = base64.b64decode(seen.images[0]["src"].removeprefix("data:image/png;base64,"))
+    assert data == section.pictures[0].png
+    assert data.startswith(PNG_HEAD)
+    for words in ("Title & more", "Dots & <lines>", "Three dots were found.", "by looking", "a <b>", "All 2 sections"):
+        assert words in seen.words
+
+
+def test_what_failed_is_said_on_top_and_in_its_place(section):
+    text = page("Title", [], [section, Section(key="hard", title="Hard", failed="no job is critical.")])
+    seen = Seen(text)
+    assert "1 of 2 sections could not be computed: Hard." in seen.words
+    assert "Not computed: no job is critical." in seen.words
+
+
+def test_a_chapter_that_fails_leaves_its_reason_and_the_others(section):
+    def fails(_):
+        raise FleetError("nothing is hot")
+
+    found = computed([("a", "First", fails), ("dots", "Dots", lambda _: section)], None)
+    assert [s.failed for s in found] == ["nothing is hot", None]
+    assert "First" in claims(found).sentences[-1]
+
+
+def test_the_folder_holds_page_pictures_and_numbers(section, tmp_path):
+    thread = provenance({"twin": "abc123"}, (0, 1), "thermofleet twin report x")
+    card = write([section, thread], tmp_path, title="Title")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["dots.png", "report.html", "report.json"]
+    told = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
+    assert told["sections"]["dots"]["numbers"] == {"dots": [0, 1, 2], "none": None, "one": 1.5}
+    assert told["failed"] == card["failed"] == {}
+    assert told["sections"]["provenance"]["numbers"]["twin"] == "abc123"
+    assert told["sections"]["provenance"]["numbers"]["command"] == "thermofleet twin report x"
+    assert re.search(r"abc123", (tmp_path / "report.html").read_text(encoding="utf-8"))
+
+
+def test_what_is_no_picture_or_no_table_is_refused():
+    with pytest.raises(ValueError, match="must be a PNG"):
+        Picture(name="x", png=b"GIF89a", alt="x")
+    with pytest.raises(ValueError, match="needs an alt text"):
+        replace(picture(), alt="")
+    with pytest.raises(ValueError, match="Every row needs 2 cells"):
+        Table(head=("a", "b"), rows=(("1",),))
+
+
+def test_spread_is_the_sample_deviation():
+    values = [0.1, 0.2, 0.6]
+    assert spread(values) == f"{np.mean(values):.3f} ± {np.std(values, ddof=1):.3f}"
+    assert spread([0.5]) == "0.500"
+    assert spread([float("nan")]) == "–"
+
+
+@pytest.fixture(scope="module")
+def waves():
+    rng = np.random.default_rng(2)
+    time_s = np.arange(0, 8, 1 / 50)
+    jobs = []
+    for _ in range(6):
+        q = np.sin(np.outer(time_s, rng.uniform(0.5, 2.0, 2)) + rng.uniform(0, 6, 2))
+        jobs.append([np.stack([q, np.gradient(q, 1 / 50, axis=0), 10 * q], axis=1).astype(np.float32)])
+    return jobs
+
+
+SHORT = {"epochs": (2, 60), "seeds": (0, 1), "config": TwinConfig(hidden=8, restarts=1, batch=32), "records": 2}
+
+
+def test_more_epochs_know_the_record_better(waves):
+    found = epoch_study(waves, **SHORT, workers=1)
+    assert found.known.shape == found.held_out.shape == (2, 2, 2, 3)  # seed, epochs, joint, channel
+    known, _ = found.table()
+    assert (known[:, 1].mean(axis=-1) < known[:, 0].mean(axis=-1)).all()
+    np.testing.assert_array_equal(found.rising(0)[0], (np.diff(found.known[:, :, 0], axis=1) > 0).mean(axis=(0, 1)))
+
+
+@pytest.mark.slow
+def test_workers_do_not_change_the_epoch_table(waves):
+    one, two = (epoch_study(waves, **SHORT, workers=n) for n in (1, 2))
+    np.testing.assert_array_equal(one.known, two.known)
+    np.testing.assert_array_equal(one.held_out, two.held_out)
+
+
+def test_too_few_jobs_or_no_epochs_are_refused(waves):
+    with pytest.raises(ValueError, match="needs 10 cool jobs or more"):
+        epoch_study(waves)
+    with pytest.raises(ValueError, match="needs seeds, and epochs"):
+        epoch_study(waves, epochs=(), records=2)
