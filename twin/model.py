@@ -51,7 +51,7 @@ class TwinConfig:
     """Largest gradient norm."""
     restarts: int = 2
     """Trainings per network from other weights: a small latent has local minima."""
-    trial: float = 0.5
+    trial: float = 0.6
     """Share of the epochs that every restart gets; then only the one of the best ELBO goes on. See `twin.train`."""
     noise: tuple[float, float, float] = (0.001, 0.005, 0.1)
     """Sensor noise added to the training windows, standard deviation in rad, rad/s, N·m: plans are smooth and
