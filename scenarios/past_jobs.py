@@ -25,7 +25,8 @@ EARLIER_S = (300.0, 3600.0)
 REST_S = (0.0, 1800.0)
 """Rest, powered, between the job before and this one."""
 COOLING_STEP_S = 300.0
-"""An arm above the limit rests on in such steps until it is below."""
+COOLING_STEPS = 12
+"""An arm above the limit rests on in such steps until it is below, an hour at most."""
 BEFORE = {"cold": 0.15, "idle": 0.25, "work": 0.6}
 """Share of the jobs that begin switched on just now, long idle, and after a job and a rest."""
 
@@ -101,9 +102,14 @@ def _start(study: Study, plans: Sequence[Plan], ambient: Array, rng: np.random.G
     after = _worked(study, earlier, times, warm_up, ambient).end_c
     after = _rested(study, after, rng.uniform(*REST_S, count), ambient)
     start = np.select([(before == "cold")[:, None], (before == "idle")[:, None]], [cold, long_idle], after)
-    while (hot := start[:, WINDING].max(axis=1, initial=-np.inf) >= study.warning_c).any():
-        start = _rested(study, start, hot * COOLING_STEP_S, ambient)
-    return start
+    for _ in range(COOLING_STEPS):
+        start = _rested(study, start, _hot(study, start) * COOLING_STEP_S, ambient)
+    # What idles above the limit, in warm air and with a badly cooled wrist, has to be switched off to go on.
+    return np.where(_hot(study, start)[:, None], cold, start)
+
+
+def _hot(study: Study, temp: Array) -> Array:
+    return temp[:, WINDING].max(axis=1, initial=-np.inf) >= study.warning_c
 
 
 def _worked(study: Study, plans: Sequence[Plan], times: Array, start: Array, ambient: Array) -> Warmed:

@@ -24,8 +24,8 @@ GRIPPER_KG = 0.925
 """Robotiq 2F-85 with its coupling."""
 SUBJECT = Robot(name="arm", tool_kg=GRIPPER_KG)
 """On the floor, as most arms stand."""
-_BATCH = 100
-_MOST_BATCHES = 100
+_BATCH = 25
+_MOST_BATCHES = 400
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,5 +1,8 @@
 """Exercises: real plans in joint space, within limits, and the draws that twins are judged and explored with."""
 
+# MuJoCo is compiled and ships no type stubs.
+# pyright: reportAttributeAccessIssue=false
+
 import mujoco
 import numpy as np
 import pytest

@@ -1,0 +1,174 @@
+"""The study: labels from an independent integration, samples that share nothing, and past jobs with a history."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from fleet.errors import FleetError
+from fleet.motion import drive
+from fleet.robot import JOINTS
+from fleet.thermal import NODES, WINDING, ThermalSpread, drive_heat
+from scenarios.past_jobs import past_jobs
+from scenarios.study import Study, make_study
+
+SEED = np.random.SeedSequence(11)
+SIZES: dict[str, Any] = {"train": 12, "reference": 10, "test": 60, "novel": 12}
+
+
+@pytest.fixture(scope="module")
+def study() -> Study:
+    return make_study(SEED, **SIZES)
+
+
+@pytest.fixture(scope="module")
+def past(study):
+    return past_jobs(study, study.test.plans, np.random.default_rng(3))
+
+
+def integrated(study: Study, stretches: Sequence, start_c: np.ndarray, ambient_c: float):
+    """Second method: scipy's Runge-Kutta through stretches of (profile, duration); node temperatures and peaks."""
+    temp, highest = start_c, start_c[WINDING]
+    for profile, duration_s in stretches:
+        load = drive(profile, study.motors)
+
+        def slope(_t, temp, load=load):
+            heat = drive_heat(temp, load.current_sq, load.friction_w, study.motors)
+            return (heat + study.thermal.to_ambient * ambient_c - study.thermal.laplacian @ temp) / (
+                study.thermal.capacity
+            )
+
+        run = solve_ivp(slope, (0.0, duration_s), temp, rtol=1e-7, atol=1e-7, max_step=60.0)
+        temp, highest = run.y[:, -1], np.maximum(highest, run.y[WINDING].max(axis=1))
+    return temp, highest
+
+
+def profiles(plans):
+    return {plan.cycle.profile.tobytes() for plan in plans}
+
+
+def test_samples_have_their_sizes_and_share_no_job(study):
+    samples = (study.train, study.reference, study.test, study.novel)
+    assert [len(sample) for sample in samples] == list(SIZES.values())
+    assert all(sample.peak_c.shape == (len(sample), JOINTS) for sample in samples)
+    every = [profiles(sample.plans) for sample in samples]
+    assert len(set.union(*every)) == sum(SIZES.values())
+
+
+def test_labels_are_those_of_an_independent_integration(study):
+    cold = np.full(NODES, study.ambient_c)
+    for i in range(0, len(study.test), 12):
+        profile = study.test.plans[i].cycle.profile
+        _, highest = integrated(study, [(profile, study.horizon_s)], cold, study.ambient_c)
+        assert study.test.peak_c[i] == pytest.approx(highest, abs=0.1)
+
+
+def test_what_is_learned_from_stays_cool_and_the_test_does_not(study):
+    assert study.train.peak_c.max() <= study.cool_c
+    assert study.reference.peak_c.max() <= study.cool_c
+    assert not study.novel.passes(study.cool_c).any()
+    assert 0 < study.critical.sum() < len(study.test)
+    assert np.array_equal(study.critical, (study.test.peak_c >= 60.0).any(axis=1))
+
+
+def test_the_same_seed_makes_the_same_study_and_another_another(study):
+    again = make_study(SEED, **SIZES)
+    assert np.array_equal(again.test.peak_c, study.test.peak_c)
+    assert profiles(again.train.plans) == profiles(study.train.plans)
+    other = make_study(np.random.SeedSequence(12), train=1, reference=0, test=1, novel=0)
+    assert not profiles(other.test.plans) & profiles(study.test.plans)
+    assert not np.allclose(other.motors.idle_w, study.motors.idle_w)
+
+
+def test_exploration_takes_the_place_of_work_and_leaves_the_rest_as_it_is(study):
+    explored = make_study(SEED, **SIZES, exploration=5)
+    assert len(explored.train) == SIZES["train"]
+    assert len(profiles(explored.train.plans) & profiles(study.train.plans)) == SIZES["train"] - 5
+    assert not profiles(explored.train.plans) & profiles(study.novel.plans)
+    assert max(plan.work.payload_kg for plan in explored.train.plans[-5:]) <= 0.5
+    for name in ("reference", "test", "novel"):
+        assert profiles(getattr(explored, name).plans) == profiles(getattr(study, name).plans)
+
+
+def test_no_spread_is_the_nominal_arm():
+    from fleet.motor import gen3_motors
+
+    nominal = make_study(SEED, train=0, reference=0, test=1, novel=0, spread=ThermalSpread())
+    assert np.array_equal(nominal.motors.idle_w, gen3_motors().idle_w)
+    assert nominal.train.peak_c.shape == (0, JOINTS)
+    assert nominal.train.records() == []
+
+
+def test_records_are_phases_and_show_a_long_hold_in_part(study):
+    records = study.train.records()
+    assert len(records) == 3 * SIZES["train"]
+    assert max(len(record) for record in records) <= 12.0 * 50
+    assert max(plan.cycle.duration_s for plan in study.train.plans) > 12.0
+
+
+@pytest.mark.parametrize("wrong", [{"test": -1}, {"exploration": 13}, {"exploration": -1}])
+def test_impossible_sizes_are_refused(wrong: dict[str, Any]):
+    with pytest.raises(ValueError, match="exploration <= train"):
+        make_study(SEED, **(SIZES | wrong))
+
+
+def test_an_arm_without_cool_motion_is_told_so(monkeypatch):
+    monkeypatch.setattr("scenarios.study._MOST_BATCHES", 1)
+    with pytest.raises(FleetError, match=r"none stays below 23.1 °C for 1800 s from 23 °C; raise cool_c"):
+        make_study(SEED, **SIZES, cool_c=23.1)
+
+
+def test_past_jobs_last_from_three_to_forty_five_minutes_and_begin_below_the_limit(past):
+    assert past.duration_s.min() > 120.0
+    assert past.duration_s.max() < 2800.0
+    assert past.start_c[:, WINDING].max() < 60.0
+    cycles = np.array([plan.duration_s(int(n)) for plan, n in zip(past.plans, past.repetitions, strict=True)])
+    assert np.array_equal(past.duration_s, cycles)
+    assert 0.1 < past.passed.mean() < 0.5
+    assert (past.ambient_c >= 19.0).all()
+    assert (past.ambient_c <= 27.0).all()
+
+
+def test_peaks_of_past_jobs_are_those_of_an_independent_integration(study, past):
+    for i in range(0, len(past), 15):
+        plan = past.plans[i]
+        stretches = [
+            (plan.approach.profile, plan.approach.duration_s),
+            (plan.cycle.profile, plan.cycle.duration_s * int(past.repetitions[i])),
+            (plan.retreat.profile, plan.retreat.duration_s),
+        ]
+        _, highest = integrated(study, stretches, past.start_c[i], float(past.ambient_c[i]))
+        assert past.peak_c[i] == pytest.approx(highest, abs=0.15)
+
+
+def test_past_jobs_begin_cold_idle_or_warm_from_work(study, past):
+    rise = past.start_c - past.ambient_c[:, None]
+    cold = np.all(rise == 0, axis=1)
+    assert 0.03 < cold.mean() < 0.35
+    # Long idle, no joint of the base turns above 15 K; after work joint 2 often is.
+    assert (rise[:, 1] > 15.0).mean() > 0.2
+
+
+def test_sensors_say_the_start_with_their_own_noise(study, past):
+    noise = past.measured_c - past.start_c[:, WINDING]
+    expected = study.motors.sensor_noise_k
+    assert noise.std(axis=0) == pytest.approx(expected, rel=0.35)
+
+
+def test_an_arm_that_idles_above_the_limit_begins_below_it_all_the_same(study):
+    hot = replace(study, motors=replace(study.motors, idle_w=3.0 * study.motors.idle_w))
+    past = past_jobs(hot, hot.test.plans[:8], np.random.default_rng(3))
+    assert past.start_c[:, WINDING].max() < 60.0
+
+
+def test_past_jobs_repeat_and_none_are_none(study, past):
+    again = past_jobs(study, study.test.plans, np.random.default_rng(3))
+    assert np.array_equal(again.peak_c, past.peak_c)
+    assert np.array_equal(again.measured_c, past.measured_c)
+    nothing = past_jobs(study, [], np.random.default_rng(3))
+    assert len(nothing) == 0
+    assert nothing.passed.shape == (0,)
+    assert nothing.start_c.shape == (0, NODES)
