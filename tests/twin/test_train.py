@@ -17,7 +17,7 @@ SEED = np.random.SeedSequence(11)
 
 @pytest.fixture(scope="module")
 def tiny() -> TwinConfig:
-    return TwinConfig(hidden=8, max_windows=64, epochs=3, batch=32, restarts=2, allow_collapse=True)
+    return TwinConfig(hidden=8, max_windows=64, epochs=3, batch=32, restarts=2, trial=0.4, allow_collapse=True)
 
 
 def test_the_loss_falls_on_one_batch():
