@@ -81,6 +81,25 @@ def test_the_gradient_is_that_of_finite_differences(rng):
         assert by_jacobian[k] == pytest.approx(by_difference, rel=1e-4, abs=1e-3), problem.layout.names[k]
 
 
+def test_the_information_is_that_left_when_the_hidden_starts_are_fitted_too(rng):
+    # Second method: parameters and start together, the start's share then taken out (Schur complement).
+    problem = problem_of([logged(prior_draw(rng), rng, 6.0)[0]], free=("copper_w_per_a2", "housing_j_per_k"))
+    x = problem.layout.mean
+    (hidden,) = problem._hidden(x)
+    size = len(x)
+
+    def rows(both):
+        (at,) = problem._hidden(both[:size])
+        return np.append(at.wanted - at.matrix @ both[size:], (both[:size] - problem.layout.mean) / problem.layout.sd)
+
+    middle, nudge = np.append(x, hidden.found), 1e-4 * np.eye(size + len(hidden.found))
+    slope = np.array([(rows(middle + e) - rows(middle - e)) / 2e-4 for e in nudge]).T
+    whole = slope.T @ slope
+    left = whole[:size, :size] - whole[:size, size:] @ np.linalg.solve(whole[size:, size:], whole[size:, :size])
+    jacobian = problem.jacobian(x)
+    np.testing.assert_allclose(jacobian.T @ jacobian, left, rtol=1e-3, atol=1e-3 * np.abs(left).max())
+
+
 def test_the_course_in_modes_is_that_of_a_fine_euler_step(rng):
     body = prior_draw(rng)
     model, dt_s = body.thermal(), np.array([10.0, 3.0, 25.0])
