@@ -2,6 +2,7 @@
 
 import numpy as np
 from scipy.spatial import KDTree
+from sklearn.metrics import roc_auc_score
 
 from fleet.errors import FleetError
 from fleet.motion import CHANNELS, RATE_HZ, Plan
@@ -58,6 +59,7 @@ def _motion(plan: Plan) -> Array:
 
 def latent_chapter(lab: Lab) -> Section:
     """The latent plane of joint 2."""
+    _ = lab.examples  # says what is missing
     windows, temp_c = lab.windows
     mu, sigma = (part[:, min(CARRIER, part.shape[1] - 1)] for part in lab.twin.posterior(windows))
     if mu.shape[1] < 2:
@@ -150,8 +152,10 @@ def difficulty_chapter(lab: Lab) -> Section:
         raise FleetError("The test jobs lack a kind (cool, between or critical), so there is nothing to compare.")
     medians = {name: np.median(values, axis=0) for name, values in groups.items()}
     cool, hot = medians[next(iter(medians))], medians[list(medians)[-1]]
-    best = int(np.argmax(hot - cool))
-    drawn = difficulty_figure(groups, title=f"Joint {best + 1} tells critical jobs best; the sum over joints blurs it")
+    found = [float(roc_auc_score(critical, d[:, j])) for j in range(d.shape[1])]
+    best, of_sum = int(np.argmax(found)), float(roc_auc_score(critical, d.sum(axis=1)))
+    title = f"Joint {best + 1} tells critical jobs best (AUROC {found[best]:.2f}); the sum gets {of_sum:.2f}"
+    drawn = difficulty_figure(groups, title=title)
     rows = tuple((name, *(f"{v:.2f}" for v in m), f"{m.sum():.2f}") for name, m in medians.items())
     return Section(
         key="difficulty",

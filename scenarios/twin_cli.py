@@ -10,29 +10,27 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from fleet.errors import FleetError, LogError, nearest
+from fleet.errors import FleetError, nearest
 from scenarios.load import load
 from scenarios.terminal import out_console, progress_bar, say
+from scenarios.twin_commands import export_command, generate_command, identify_command, recover_command
+from scenarios.twin_options import (
+    ArmOption,
+    DamagedOption,
+    JsonOption,
+    LogOption,
+    OverwriteOption,
+    ScenarioArg,
+    TwinsArg,
+    WhichOption,
+    one_source,
+    recordings_of,
+)
 
 twin_app = typer.Typer(
     help="The digital twin of an arm: an LSTM variational autoencoder of its cool motion, and what it tells.",
     no_args_is_help=True,
 )
-
-ScenarioArg = Annotated[
-    str | None, typer.Argument(help="A library name (see `thermofleet list`) or a .toml file; or use --log.")
-]
-LogOption = Annotated[
-    Path | None, typer.Option("--log", help="A log of a real arm, or a folder of logs: .csv, .csv.gz, .parquet.")
-]
-DamagedOption = Annotated[
-    bool, typer.Option("--skip-damaged", help="Leave out lines of a log that cannot be used, instead of stopping.")
-]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result in --out.")]
-ArmOption = Annotated[str | None, typer.Option(help="Only this arm; without it, every arm of the scenario.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print figures as JSON.")]
-TwinsArg = Annotated[Path, typer.Argument(help="A folder that `thermofleet twin train` wrote.")]
-WhichOption = Annotated[str | None, typer.Option("--arm", help="Whose twin, where the folder holds several.")]
 
 
 @twin_app.command("train")
@@ -144,6 +142,12 @@ def score_command(
         out_console.print(shown)
 
 
+twin_app.command("identify")(identify_command)
+twin_app.command("generate")(generate_command)
+twin_app.command("recover")(recover_command)
+twin_app.command("export")(export_command)
+
+
 @contextmanager
 def in_options() -> Iterator[None]:
     """What a collapse says one may change, as options."""
@@ -208,29 +212,6 @@ def report_command(
         reasons = "; ".join(f"{key}: {why}" for key, why in card["failed"].items())
         say(f"{len(card['failed'])} of {len(sections)} sections could not be computed ({reasons})")
         raise typer.Exit(1)
-
-
-def one_source(scenario: str | None, log: Path | None) -> str | None:
-    """The scenario, or None where it is a log; exactly one of the two must be given."""
-    if (scenario is None) == (log is None):
-        told = "neither" if scenario is None else "both"
-        raise FleetError(f"Give either a scenario or --log FILE_OR_FOLDER (got {told}).")
-    return scenario
-
-
-def recordings_of(log: Path, skip_damaged: bool) -> list[Any]:
-    """The recordings of a log file, or of all logs of a folder.
-
-    Raises:
-        FleetError: names file and line, and how to go on without it.
-    """
-    from twin.logs import read, read_folder
-
-    damaged = "skip" if skip_damaged else "refuse"
-    try:
-        return read_folder(log, damaged=damaged) if log.is_dir() else read(log, damaged=damaged)
-    except LogError as error:
-        raise FleetError(str(error).replace('damaged="skip"', "--skip-damaged")) from error
 
 
 def config_of(size: str, given: dict[str, Any], *, of_log: bool = False) -> Any:

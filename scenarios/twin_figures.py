@@ -105,8 +105,9 @@ def latent_map_figure(normal: tuple[Array, Array], critical: tuple[Array, Array]
     """
     figure, ((left, right),) = sheet(1, 2, width=10, height=4.8, title=title, sharex=True, sharey=True)
     both = np.concatenate([normal[0][:, :2], critical[0][:, :2]])
+    wide = np.concatenate([normal[1][:, :2], critical[1][:, :2]])
     low, high = np.percentile(both, [0.5, 99.5], axis=0)
-    room = 0.12 * np.maximum(high - low, 0.5)
+    room = 0.12 * np.maximum(high - low, 0.5) + 1.5 * np.median(wide, axis=0)
     x, y = (np.linspace(low[k] - room[k], high[k] + room[k], 140) for k in range(2))
     for (mu, sigma), colour, name in ((normal, NORMAL, "normal"), (critical, CRITICAL, "critical")):
         height = density(mu[:, :2], sigma[:, :2], x, y)
@@ -123,7 +124,7 @@ def latent_map_figure(normal: tuple[Array, Array], critical: tuple[Array, Array]
 
 
 def _ellipse(mu: Array, sigma: Array, colour: str) -> Ellipse:
-    return Ellipse((mu[0], mu[1]), 2 * sigma[0], 2 * sigma[1], edgecolor=colour, facecolor=colour, alpha=0.22)
+    return Ellipse((mu[0], mu[1]), 2 * sigma[0], 2 * sigma[1], edgecolor=colour, fill=False, alpha=0.6)
 
 
 def _some(mu: Array, sigma: Array, most: int) -> list[tuple[Array, Array]]:
@@ -148,7 +149,7 @@ def latent_scatter_figure(mu: Array, temp_c: Array, *, limit_c: float, joint: in
     ):
         index = np.flatnonzero(chosen)
         index = rng.permutation(index)[:MOST_POINTS]
-        left.scatter(*mu[index, :2].T, s=14, color=colour, marker=mark, alpha=0.55, linewidths=0, label=name)
+        left.scatter(*mu[index, :2].T, s=18, color=colour, marker=mark, alpha=0.7, linewidths=0, label=name)
     index = rng.permutation(len(mu))[: 2 * MOST_POINTS]
     dots = right.scatter(*mu[index, :2].T, s=14, c=temp_c[index], cmap="viridis", linewidths=0, alpha=0.85)
     figure.colorbar(dots, ax=right, label="temperature (°C)")

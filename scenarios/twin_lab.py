@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fleet.errors import FleetError
 from fleet.robot import Robot
 from scenarios.build import Progress, quiet
 from scenarios.contest import Make, jobs_of
@@ -132,7 +133,17 @@ class Lab:
 
     @cached_property
     def examples(self) -> tuple[int, int]:
-        """A normal and a critical test job whose difficulty of joint 2 is that of the middle one of its kind."""
+        """A normal and a critical test job whose difficulty of joint 2 is that of the middle one of its kind.
+
+        Raises:
+            FleetError: the test jobs lack a kind.
+        """
+        kinds = self.study.critical, ~self.warm & ~self.study.critical
+        if not all(kind.any() for kind in kinds):
+            raise FleetError(
+                f"Of {len(self.study.test)} test jobs {kinds[0].sum()} are critical and {kinds[1].sum()} cool: without "
+                "some of both there is nothing to compare. Take another arm, or leave out --quick."
+            )
         d = self.difficulty[:, CARRIER]
         return tuple(  # pyright: ignore[reportReturnType]
             int(index[np.argsort(d[index])[len(index) // 2]])

@@ -9,8 +9,9 @@ from sklearn.metrics import roc_curve
 from fleet.motion import CHANNELS
 from scenarios.build import Progress, quiet
 from scenarios.epochs import EPOCHS, epoch_study
-from scenarios.log_study import HOT_C, JOINT, HotAndCool, LogStudy, hot_and_cool, log_study
-from scenarios.twin_charts import pairs_figure, roc_figure
+from scenarios.log_rc import log_rc
+from scenarios.log_study import AHEAD_S, HOT_C, JOINT, HotAndCool, LogStudy, hot_and_cool, log_study
+from scenarios.twin_charts import pairs_figure, ranking_figure, roc_figure
 from scenarios.twin_figures import (
     data_figure,
     difficulty_figure,
@@ -56,7 +57,8 @@ class Logbook:
 
     @property
     def first(self) -> LogStudy:
-        """The study from which the pictures are."""
+        """The study from which the pictures are; it has hot and cool windows, or `compared` raises."""
+        _ = self.compared
         return self.studies[0]
 
     def example(self, hot: bool) -> int:
@@ -68,7 +70,6 @@ class Logbook:
 
 def log_data_chapter(book: Logbook) -> Section:
     """A cool and a hot window as recorded."""
-    found = book.compared[0]  # first, since it says what is missing where all windows are hot or none
     study, cool, hot = book.first, book.example(False), book.example(True)
     words = [f"{study.file[i]}, {study.start_s[i] / 60:.1f} min, {study.temp_c[i, JOINT]:.1f} °C" for i in (cool, hot)]
     drawn = data_figure(
@@ -87,8 +88,8 @@ def log_data_chapter(book: Logbook) -> Section:
         numbers={
             "cool": words[0],
             "hot": words[1],
-            "cool_windows": found.cool_windows,
-            "hot_windows": found.hot_windows,
+            "cool_windows": book.compared[0].cool_windows,
+            "hot_windows": book.compared[0].hot_windows,
         },
     )
 
@@ -211,7 +212,7 @@ def _words(key: str) -> str:
 
 def log_epochs_chapter(book: Logbook) -> Section:
     """Reconstruction error against epochs on recorded motion."""
-    windows, study = book.first.windows, book.first
+    windows, study = book.studies[0].windows, book.studies[0]
     cool = np.unique(study.file[~study.hot])
     jobs = [[w.transpose(0, 2, 1)] for name in cool for w in windows[(study.file == name) & ~study.hot][:40:4]]
     config = TwinConfig(
@@ -235,4 +236,37 @@ def log_epochs_chapter(book: Logbook) -> Section:
         pictures=(Picture(name="epochs", png=png(drawn), alt="Error against epochs, recorded windows."),),
         tables=(Table(head=("mean |error|, σ", *(f"{n} epochs" for n in found.epochs)), rows=rows),),
         numbers={"epochs": list(found.epochs), "known": known.tolist(), "held_out": held_out.tolist()},
+    )
+
+
+def log_rc_chapter(book: Logbook) -> Section:
+    """Whether a motor passes 40 °C soon: the twin's difficulty against temperature and an identified network."""
+    book.progress("identifying", 0.0)
+    found = log_rc(book.first, book.recordings)
+    rows = tuple(
+        (name, f"{found.below.auroc[name]:.3f}", f"{found.below.auprc[name]:.3f}", f"{found.every.auroc[name]:.3f}")
+        for name in found.below.auroc
+    )
+    best = max(found.below.auroc, key=lambda name: found.below.auroc[name])
+    d = found.below.auroc["d"]
+    said = (
+        f"Of {found.below.windows} held-out windows still below {HOT_C:g} °C, {found.below.passing} (in "
+        f"{found.below.files_passing} files) pass it within {AHEAD_S / 60:g} minutes. d alone ranks them with AUROC "
+        f"{d:.3f}; the best is {best} with {found.below.auroc[best]:.3f} (target .95)."
+    )
+    values = {name: {"AUROC": np.array([auroc])} for name, auroc in found.below.auroc.items()}
+    drawn = ranking_figure(
+        values, ours=["d"], title=f"Passes {HOT_C:g} °C within five minutes? Heat has a memory", targets={"AUROC": 0.95}
+    )
+    rms = [value for each in found.identified.rms_k.values() for value in each]
+    fit = f"The network explains its own files to {np.median(rms):.2f} K (median over files and joints)."
+    return Section(
+        key="rc",
+        title="With temperature and a thermal network",
+        sentences=(said, fit),
+        how="A thermal network identified from the twin's training files alone (rc), and a nominal one, started at the "
+        "measured temperatures of each window; first seed. Windows of one file are much alike, so files count.",
+        pictures=(Picture(name="rc", png=png(drawn), alt=said),),
+        tables=(Table(head=("ranked by", "AUROC, still below", "AUPRC, still below", "AUROC, all"), rows=rows),),
+        numbers={"below": vars(found.below), "every": vars(found.every), "rc": found.identified.version},
     )

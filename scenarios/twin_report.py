@@ -92,6 +92,7 @@ def report_logs(
         ("latent", "Latent map", log.log_latent_chapter),
         ("reconstruction", "Reconstruction of a cool and of a hot record", log.log_reconstruction_chapter),
         ("difficulty", "Error and difficulty, hot against cool", log.log_difficulty_chapter),
+        ("rc", "With temperature and a thermal network", log.log_rc_chapter),
         ("epochs", "Reconstruction error against epochs", log.log_epochs_chapter),
     ]
     found = computed(chapters, book, progress)

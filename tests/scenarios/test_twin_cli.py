@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from scenarios.cli import main
+from scenarios.twin_page import Section
+from twin.model import TwinConfig
 
 TINY = ("--hidden", 8, "--epochs", 10, "--max-windows", 150, "--restarts", 1, "--allow-collapse")
 RATE_HZ = 2.0
@@ -129,6 +131,15 @@ def test_the_twin_of_one_arm_of_a_scenario_scores_its_jobs(thermofleet, small_to
         (["score", "HERE", "quickstart"], "holds no twin"),
         (["score", "HERE"], "Give either a scenario or --log"),
         (["score", "HERE", "quickstart", "--format", "cvs"], "No format 'cvs'; did you mean 'csv'?"),
+        (["report", "quickstart", "--seeds", "0"], "--seeds must be 1 or more (got 0)."),
+        (["report", "quickstart", "--arm", "arm_9"], "No arm 'arm_9' in quickstart"),
+        (["report", "--log", "HERE"], "holds no log; a log ends in"),
+        (["identify", "--log", "HERE/nowhere"], "nowhere"),
+        (["generate", "quickstart", "--count", "0"], "--count must be 1 or more"),
+        (["generate", "quickstart", "--twins", "HERE"], "holds no twin"),
+        (["generate", "quickstart", "--format", "npz"], "No format 'npz'."),
+        (["recover", "quickstart", "--posture", "raisd"], "a name; did you mean 'raised'?"),
+        (["recover", "quickstart", "--hold", "0"], "--hold must be > 0 (got 0)."),
     ],
 )
 def test_bad_input_is_told_in_one_sentence_and_nothing_is_written(thermofleet, tmp_path, arguments, sentence):
@@ -137,7 +148,7 @@ def test_bad_input_is_told_in_one_sentence_and_nothing_is_written(thermofleet, t
         (tmp_path / "damaged.csv").write_text("\n".join([*lines[:2], "1,2,oops", *lines[3:]]) + "\n", encoding="utf-8")
     before = sorted(p.name for p in tmp_path.iterdir())
     arguments = [str(argument).replace("HERE", str(tmp_path)) for argument in arguments]
-    out = ("--out", tmp_path / "out") if arguments[0] == "train" else ()
+    out = () if arguments[0] == "score" else ("--out", tmp_path / "out")
     said = thermofleet("twin", *arguments, *out)
     assert said.code == 2
     assert said.err.startswith("Error: ")
@@ -171,7 +182,36 @@ def test_a_collapse_is_told_with_the_options_that_mend_it(thermofleet, logs, tmp
     assert not (tmp_path / "twins").exists()
 
 
+def test_an_exported_twin_ends_in_onnx(thermofleet, twins, tmp_path):
+    assert "--out must name a file that ends in .onnx" in thermofleet("twin", "export", twins, "--out", tmp_path).err
+    pytest.importorskip("onnx")
+    out = tmp_path / "twin.onnx"
+    version = json.loads((twins / "twins.json").read_text(encoding="utf-8"))["twins"][0]["version"]
+    assert version in thermofleet("twin", "export", twins, "--out", out).out
+    assert version.encode() in out.read_bytes()
+
+
+def test_a_report_of_logs_that_stay_cool_says_what_is_missing_and_leaves_with_code_one(
+    thermofleet, logs, tmp_path, monkeypatch
+):
+    small = TwinConfig(rate_hz=2.0, record_hz=2.0, hidden=8, epochs=3, restarts=1, max_windows=64, allow_collapse=True)
+    monkeypatch.setattr("scenarios.log_study.CONFIG", small)
+    monkeypatch.setattr("scenarios.twin_logbook.log_epochs_chapter", lambda book: Section(key="epochs", title="Epochs"))
+    some = tmp_path / "logs"
+    some.mkdir()
+    for day in ("monday", "tuesday", "friday"):
+        (some / f"{day}.csv").write_text(log_csv(60, celsius=31.0, seed=len(day)), encoding="utf-8")
+    out = tmp_path / "report"
+    said = thermofleet("twin", "report", "--log", some, "--seeds", 1, "--out", out)
+    assert said.code == 1
+    assert "test windows are hot" in said.err
+    told = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    assert "difficulty" in told["failed"]
+    assert "epochs" not in told["failed"]
+    assert (out / "report.html").read_text(encoding="utf-8").count("Not computed: ") == len(told["failed"])
+
+
 def test_twin_help_does_not_wait_for_the_learning_library(thermofleet):
     said = thermofleet("twin", "--help")
     assert said.code == 0
-    assert all(command in said.out for command in ("train", "score"))
+    assert all(c in said.out for c in ("train", "score", "report", "identify", "generate", "recover", "export"))

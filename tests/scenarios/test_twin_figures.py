@@ -80,7 +80,7 @@ def test_the_latent_map_draws_an_ellipse_of_one_sigma_per_posterior():
     figure = latent_map_figure((mu, sigma), (mu[:4] + 2, sigma[:4]), joint=1, title="finding")
     ellipses = figure.axes[1].patches
     assert len(ellipses) == 13
-    assert sum(to_rgb(e.get_facecolor()) == to_rgb(NORMAL) for e in ellipses) == 9
+    assert sum(to_rgb(e.get_edgecolor()) == to_rgb(NORMAL) for e in ellipses) == 9
     np.testing.assert_allclose(ellipses[0].get_center(), mu[0])
     assert ellipses[0].get_width() == pytest.approx(2 * sigma[0, 0])
     assert "joint 2" in figure.axes[0].get_xlabel()
