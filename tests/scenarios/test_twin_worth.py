@@ -1,0 +1,132 @@
+"""Chapters on a twin's worth say what the figures say: told apart with results made up by hand."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from scenarios import twin_worth as worth
+from scenarios.autonomy import GENERATED, OWN, PRIOR
+from scenarios.coverage import Coverage
+from scenarios.detection import Detection
+from scenarios.quality import QUESTIONS, QualityTable, Row
+from scenarios.saturation_study import Alarmed, Stated, Trust
+from scenarios.transfer import TransferRow
+from scenarios.twin_lab import QUICK
+from scenarios.twin_page import page
+from scenarios.twin_report import plain
+from twin.reliability import reliability
+
+
+@pytest.fixture
+def lab(tmp_path):
+    seeds = (0, 1)
+    return SimpleNamespace(
+        seeds=seeds,
+        sequences=[np.random.SeedSequence(seed) for seed in seeds],
+        size=QUICK,
+        folder=tmp_path,
+        processes=1,
+        progress=lambda stage, share: None,
+        make=lambda seed, **sizes: SimpleNamespace(
+            robot=SimpleNamespace(name="arm"), train=SimpleNamespace(records=list)
+        ),
+    )
+
+
+def detected(value: float) -> Detection:
+    return Detection(auroc=value, auprc=value - 0.1, spearman=value - 0.2, caught=0.9, false_novel=0.5)
+
+
+def table_of(values: dict[str, float]) -> QualityTable:
+    return QualityTable(
+        rows=tuple(
+            Row(scorer=name, question=question, seeds=(detected(v), detected(v + 0.01)))
+            for question in QUESTIONS
+            for name, v in values.items()
+        )
+    )
+
+
+def whole(section):
+    """The section as page and as JSON, both of which must be possible."""
+    assert section.failed is None
+    assert section.pictures
+    json.dumps(plain(dict(section.numbers)), allow_nan=False)
+    return page("t", [], [section])
+
+
+def test_a_rival_that_wins_is_named_and_a_missed_target_too(lab, monkeypatch):
+    monkeypatch.setattr(worth, "quality", lambda seeds, **how: table_of({"VAE": 0.9, "kNN-5": 0.95, "PCA-2": 0.7}))
+    section = worth.quality_chapter(lab)
+    text = " ".join(section.sentences)
+    assert "kNN-5 beats VAE under all 2 seeds" in text
+    assert "PCA-2 beats" not in text
+    assert "AUROC 0.905 ± 0.007 (target 0.93: not reached)" in text
+    assert "Spearman 0.705 ± 0.007 (target 0.75: not reached)" in text
+    assert [t.rows[1][1] for t in section.tables] == ["0.955 ± 0.007"] * 3
+    assert "kNN-5" in whole(section)
+
+
+def test_where_none_wins_it_says_so(lab, monkeypatch):
+    monkeypatch.setattr(worth, "quality", lambda seeds, **how: table_of({"VAE": 0.95, "PCA-2": 0.7}))
+    section = worth.quality_chapter(lab)
+    assert "No rival beats the VAE" in " ".join(section.sentences)
+    assert "AUROC 0.955 ± 0.007 (target 0.93: reached)" in section.sentences[0]
+
+
+def test_saturation_names_the_head_with_the_least_brier(lab, monkeypatch):
+    rng = np.random.default_rng(3)
+    p = rng.uniform(size=300)
+    passed = rng.uniform(size=300) < p
+
+    def told(study, twin, *, seed, exploration):
+        stated = [
+            Stated(evidence=e, method="logistic", auroc=0.9, brier=b, table=reliability(p, passed), p=p, passed=passed)
+            for e, b in (("load", 0.07), ("errors", 0.04))
+        ]
+        alarm = Alarmed(score="sum", false_alarms=0.05, expected=(0.02, 0.08), false_novel=0.7, caught=0.2)
+        return Trust(seed=seed, exploration=exploration, share_passed=0.5, stated=tuple(stated), alarms=(alarm,))
+
+    monkeypatch.setattr(worth, "trust", told)
+    monkeypatch.setattr(worth, "trained", lambda *some, **more: None)
+    section = worth.saturation_chapter(lab)
+    assert "The best head (errors, logistic)" in section.sentences[0]
+    assert section.tables[1].rows == (("sum", "0.050 ± 0.000", "0.700 ± 0.000", "0.200 ± 0.000"),)
+    whole(section)
+
+
+def test_coverage_says_from_what_to_what(lab, monkeypatch):
+    before = Detection(auroc=0.9, auprc=0.8, spearman=0.7, caught=0.9, false_novel=0.8)
+    after = Detection(auroc=0.9, auprc=0.8, spearman=0.7, caught=0.9, false_novel=0.1)
+    found = Coverage(exploration=24, train=60, without={"sum": (before, before)}, explored={"sum": (after, after)})
+    monkeypatch.setattr(worth, "coverage", lambda seeds, **how: found)
+    section = worth.coverage_chapter(lab)
+    assert "from 80% to 10%" in section.sentences[0]
+    whole(section)
+
+
+def test_autonomy_counts_what_remains_above_chance(lab, monkeypatch):
+    found = table_of({OWN: 0.9, GENERATED: 0.7, PRIOR: 0.6})
+    monkeypatch.setattr(worth.again, "autonomy", lambda seeds, **how: found)
+    section = worth.autonomy_chapter(lab)
+    remaining = section.numbers["remaining"]["auroc"]
+    np.testing.assert_allclose(remaining, [0.2 / 0.4, 0.21 / 0.41])
+    assert "51% of the AUROC above chance" in section.sentences[0]
+    whole(section)
+
+
+@pytest.mark.parametrize(
+    ("latent", "said"), [((5.0, 4.0), "Raw features beat latent ones"), ((2.0, 4.0), "with 10 labels (ridge)")]
+)
+def test_transfer_says_with_how_many_labels_the_latent_helps(lab, monkeypatch, latent, said):
+    rows = [
+        TransferRow(inputs=name, regressor="ridge", labels=n, rmse_k=(e, e + 0.2), r2=(0.5, 0.6))
+        for name, errors in (("latent", latent), ("raw", (3.0, 2.0)))
+        for n, e in zip((10, 50), errors, strict=True)
+    ]
+    monkeypatch.setattr(worth, "transfer", lambda seeds, **how: rows)
+    section = worth.transfer_chapter(lab)
+    assert said in section.sentences[0]
+    whole(section)
