@@ -199,7 +199,7 @@ def epochs_chapter(lab: Lab) -> Section:
         np.array(study.epochs),
         known,
         held_out,
-        title=f"More epochs help the record trained on, {hardest} least",
+        title=f"From {first} to {last} epochs {hardest} gains least, torque falls to {fall[TAU]:.0%}",
     )
     return Section(
         key="epochs",

@@ -100,9 +100,7 @@ def log_latent_chapter(book: Logbook) -> Section:
     kinds = [rng.permutation(np.flatnonzero(study.hot == hot))[:MOST_WINDOWS] for hot in (False, True)]
     parts = [study.twin.posterior(study.windows[index]) for index in kinds]
     cool, hot = ((mu[:, JOINT], sigma[:, JOINT]) for mu, sigma in parts)
-    maps = latent_map_figure(
-        cool, hot, joint=JOINT, title="Latent map of recorded windows: hot ones do not stand apart"
-    )
+    maps = latent_map_figure(cool, hot, joint=JOINT, title="Latent map of recorded windows: hot against cool")
     temp_c = study.temp_c[np.concatenate(kinds), JOINT]
     mu = np.concatenate([cool[0], hot[0]])
     dots = latent_scatter_figure(mu, temp_c, limit_c=HOT_C, joint=JOINT, title="Posterior means by motor temperature")
@@ -256,7 +254,7 @@ def log_rc_chapter(book: Logbook) -> Section:
     )
     values = {name: {"AUROC": np.array([auroc])} for name, auroc in found.below.auroc.items()}
     drawn = ranking_figure(
-        values, ours=["d"], title=f"Passes {HOT_C:g} °C within five minutes? Heat has a memory", targets={"AUROC": 0.95}
+        values, ours=["d"], title=f"Passes {HOT_C:g} °C within five minutes? Best: {best}", targets={"AUROC": 0.95}
     )
     rms = [value for each in found.identified.rms_k.values() for value in each]
     fit = f"The network explains its own files to {np.median(rms):.2f} K (median over files and joints)."

@@ -25,18 +25,19 @@ Chapter = Callable[[Any], Section]
 
 CLAIMS = (
     "The paper (E. Guiffo Kaigom, arXiv 2509.12740) claims that an LSTM variational autoencoder, trained without "
-    "labels "
-    "on motion that stays cool, reconstructs critical motion worse, that the error in [0, 1) per joint and summed is a "
-    "measure of thermal difficulty, and that the latent gives new uncritical motion.",
+    "labels on motion that stays cool, reconstructs critical motion worse, that the error in [0, 1) per joint and "
+    "summed is a measure of thermal difficulty, and that the latent gives new uncritical motion.",
     "The score looks at motion and torque alone. It cannot know the motors' temperatures at the start, how long a job "
     "will last, or the heat hidden in the housings; P(saturation) takes the first two in and a thermal network all "
     "three.",
     "What is light but new looks hard to every detector of novelty. A high d means: outside experience or more load "
     "than known; the channel shares say which. Only load heats.",
-    "In the simulation the truth is a thermal network whose absolute scale is known to ± 25 % and which extrapolates "
-    "above 55 °C; figures from it compare methods, they do not promise degrees of a real arm.",
 )
 """What may and may not be concluded, whatever the figures say."""
+SIMULATED = (
+    "In the simulation the truth is a thermal network whose absolute scale is known to ± 25 % and which extrapolates "
+    "above 55 °C; figures from it compare methods, they do not promise degrees of a real arm."
+)
 
 
 def report_scenario(
@@ -71,7 +72,7 @@ def report_scenario(
     found = computed(chapters, lab, progress)
     source = {"scenario": scenario.name, "arm": lab.robot.name, "quick": lab.size == QUICK}
     twins = {} if "twin" not in vars(lab) else {"twin": lab.twin.version, "data": lab.twin.data_hash}
-    return [*found, claims(found), provenance(source | twins, seeds, command)]
+    return [*found, claims(found, simulated=True), provenance(source | twins, seeds, command)]
 
 
 def report_logs(
@@ -114,11 +115,12 @@ def computed(chapters: Sequence[tuple[str, str, Chapter]], subject: Any, progres
     return sections
 
 
-def claims(sections: Sequence[Section]) -> Section:
+def claims(sections: Sequence[Section], *, simulated: bool = False) -> Section:
     """What the paper claims, what was measured, and what cannot be claimed."""
     missing = [section.title for section in sections if section.failed]
     told = (f"Not measured in this report: {'; '.join(missing)}.",) if missing else ()
-    return Section(key="claims", title="What may be concluded", sentences=(*CLAIMS, *told))
+    sentences = (*CLAIMS, *((SIMULATED,) if simulated else ()), *told)
+    return Section(key="claims", title="What may be concluded", sentences=sentences)
 
 
 def provenance(source: dict[str, Any], seeds: Sequence[int], command: str) -> Section:
