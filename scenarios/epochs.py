@@ -3,12 +3,11 @@
 The paper's table (E. Guiffo Kaigom, arXiv 2509.12740): errors fall with epochs, not always, and velocity is hardest.
 """
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from joblib import Parallel, delayed
+from joblib import Parallel, cpu_count, delayed
 
 from twin.model import TwinConfig
 from twin.train import train
@@ -77,7 +76,7 @@ def epoch_study(
     order = sorted(range(len(tasks)), key=lambda i: -tasks[i][1])
     work = (delayed(_cell)(jobs, replace(base, epochs=tasks[i][1]), tasks[i][0], records) for i in order)
     total, done = sum(count for _, count in tasks), 0
-    with Parallel(n_jobs=min(len(tasks), _cores()) if workers < 0 else workers, return_as="generator") as pool:
+    with Parallel(n_jobs=min(len(tasks), cpu_count()) if workers < 0 else workers, return_as="generator") as pool:
         for i, cell in zip(order, pool(work), strict=True):
             cells.append((i, cell))
             done += tasks[i][1]
@@ -101,7 +100,3 @@ def _cell(jobs: Sequence[Sequence[Array]], config: TwinConfig, seed: int, record
         for part in (taught, others)
     )
     return twin.window_errors(seen).mean(axis=0), twin.window_errors(new).mean(axis=0), len(seen)
-
-
-def _cores() -> int:
-    return max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)

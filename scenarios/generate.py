@@ -20,9 +20,9 @@ from fleet.robot import Robot
 from fleet.sim.clearance import Clearance
 from fleet.sim.limits import broken_limit
 from fleet.sim.models import ArmModel
-from fleet.sim.oracle import peaks
 from fleet.sim.world import Arm
 from fleet.thermal import NODES, ThermalModel, gen3_network, thermal_model
+from scenarios.cool import cold_peaks
 from scenarios.perform import perform
 from twin.generate import Variation, check_source, vary
 from twin.score import Twin
@@ -225,8 +225,7 @@ def planned(made: Variation, source: Plan, model: ArmModel) -> Plan:
 
 def peak_of(plan: Plan, motors: Motors, thermal: ThermalModel, ambient_c: float, horizon_s: float) -> Array:
     """Hottest winding temperatures when a plan's cycle repeats over the horizon from a cold start, °C, [joint]."""
-    cold_c = np.full(NODES, ambient_c)
-    return peaks([plan], [horizon_s], motors=motors, thermal=thermal, start_c=cold_c, ambient_c=ambient_c)[0]
+    return cold_peaks([plan], motors, thermal, ambient_c=ambient_c, horizon_s=horizon_s)[0]
 
 
 def _postures(plan: Plan) -> Array:

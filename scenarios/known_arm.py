@@ -3,14 +3,11 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from fleet.errors import FleetError, nearest
 from fleet.motion import Plan
-from fleet.sim.oracle import peaks
 from fleet.sim.world import Arm
-from fleet.thermal import NODES
 from scenarios.build import Progress, body_of, cache_folder, plan_works, prepare, quiet
+from scenarios.cool import some_cool_plans
 from scenarios.generate import Verification
 from scenarios.jobs import rehearsal_works
 from scenarios.perform import alone
@@ -56,32 +53,12 @@ def known_arm(
         twin = made
     elif twin.arm != name:
         raise FleetError(f"This is the twin of arm '{twin.arm}', not of '{name}'; give the one that belongs to it.")
-    robot, motors, thermal = body_of(scenario, index)
+    body = body_of(scenario, index)
+    robot, motors, thermal = body
     possible, _ = plan_works(
         robot, rehearsal_works(scenario), scenario, cache or cache_folder(), lambda share: progress("planning", share)
     )
+    sources = some_cool_plans([plan for ways in possible.values() for plan in ways], body, scenario)
     spec = scenario.twin
     verification = Verification.nominal(robot, spec.ambient_c, cool_c=spec.cool_c, horizon_s=spec.horizon_s)
-    arm = alone(robot, motors, thermal)
-    return KnownArm(
-        arm, twin, _cool(arm, [plan for ways in possible.values() for plan in ways], verification), verification
-    )
-
-
-def _cool(arm: Arm, plans: list[Plan], asked: Verification) -> tuple[Plan, ...]:
-    """What the arm has found to stay cool, by its true motors: it has done it."""
-    highest = peaks(
-        plans,
-        [asked.horizon_s] * len(plans),
-        motors=arm.motors,
-        thermal=arm.thermal,
-        start_c=np.full(NODES, asked.ambient_c),
-        ambient_c=asked.ambient_c,
-    ).max(axis=1, initial=-np.inf)
-    cool = tuple(plan for plan, peak in zip(plans, highest, strict=True) if peak <= asked.cool_c)
-    if not cool:
-        raise FleetError(
-            f"Arm '{arm.robot.name}' has no motion that stays below {asked.cool_c:g} °C for {asked.horizon_s:g} s, so "
-            "there is nothing to begin from. Raise twin.cool_c, or give twin.payload_kg lighter loads."
-        )
-    return cool
+    return KnownArm(alone(robot, motors, thermal), twin, sources, verification)

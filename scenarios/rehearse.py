@@ -6,23 +6,19 @@ whatever is new for a danger. `scenarios/coverage.py` measures what that is wort
 
 import hashlib
 import logging
-import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 import msgspec
 import numpy as np
-from joblib import Parallel, delayed
+from joblib import Parallel, cpu_count, delayed
 
-from fleet.errors import CheckpointError, FleetError
+from fleet.errors import CheckpointError
 from fleet.job import Work
 from fleet.motion import Plan
-from fleet.motor import Motors
-from fleet.robot import Robot
 from fleet.sim.exercise import EXERCISE_VERSION, light_jobs
-from fleet.sim.oracle import peaks
-from fleet.thermal import NODES, ThermalModel
+from scenarios.cool import Body, cool_plans, some_cool_plans
 from scenarios.records import records
 from scenarios.scenario import Scenario, TwinSpec
 from twin.checkpoint import load, save
@@ -33,17 +29,17 @@ from twin.train import train, training_key
 Array = np.ndarray
 log = logging.getLogger(__name__)
 
-Body = tuple[Robot, Motors, ThermalModel]
+REHEARSAL_VERSION = 2
+"""Raised whenever the same arm would be taught another thing, or told another thing is usual."""
 
 
-def cool_records(
-    plans: Mapping[Work, tuple[Plan, ...]], motors: Motors, thermal: ThermalModel, scenario: Scenario
-) -> list[Array]:
+def cool_records(plans: Mapping[Work, tuple[Plan, ...]], body: Body, scenario: Scenario) -> list[Array]:
     """Phases [time, 3, joint] of the plans that stay cool when repeated over the whole horizon from a cold start.
 
-    Chosen by the horizon, never by the temperature at the moment: a heavy job too begins cool.
+    Raises:
+        FleetError: none does.
     """
-    return records(_cool([plan for variants in plans.values() for plan in variants], motors, thermal, scenario.twin))
+    return records(some_cool_plans([plan for variants in plans.values() for plan in variants], body, scenario))
 
 
 def explored_records(scenario: Scenario, index: int, body: Body) -> list[Array]:
@@ -51,26 +47,41 @@ def explored_records(scenario: Scenario, index: int, body: Body) -> list[Array]:
 
     They are the same for every seed of a run.
     """
-    robot, motors, thermal = body
-    rng = np.random.default_rng(np.random.SeedSequence([scenario.spread.seed, index], spawn_key=(EXPLORATION,)))
-    light = light_jobs(robot, scenario.twin.exploration, rng)
-    return records(_cool(light, motors, thermal, scenario.twin))
+    return records(_explored(scenario, index, body, EXPLORATION))
 
 
-EXPLORATION = 1
-"""Keeps these draws apart from others of the same arm."""
+def taught(
+    own: Sequence[Array],
+    config: TwinConfig,
+    seed: np.random.SeedSequence,
+    *,
+    scenario: Scenario,
+    index: int,
+    body: Body,
+    progress: Callable[[float], None] | None = None,
+) -> Twin:
+    """The twin of an arm: trained on its own cool motion and its exploration, and told what is usual by more of that.
+
+    Args:
+        own: As `cool_records` gives it.
+        index: Which arm of the scenario it is.
+        progress: Told the share of the training that is done.
+    """
+    learned = [*own, *explored_records(scenario, index, body)]
+    twin = train(learned, config, seed, arm=body[0].name, progress=progress)
+    held_out = _explored(scenario, index, body, HELD_OUT)
+    return twin.calibrated([(plan, 1) for plan in held_out]) if len(held_out) >= FEWEST_HELD_OUT else twin
 
 
-def _cool(plans: Sequence[Plan], motors: Motors, thermal: ThermalModel, spec: TwinSpec) -> Iterable[Plan]:
-    highest = peaks(
-        plans,
-        [spec.horizon_s] * len(plans),
-        motors=motors,
-        thermal=thermal,
-        start_c=np.full(NODES, spec.ambient_c),
-        ambient_c=spec.ambient_c,
-    ).max(axis=1, initial=-np.inf)
-    return (plan for plan, peak in zip(plans, highest, strict=True) if peak <= spec.cool_c)
+EXPLORATION, HELD_OUT = 1, 2
+"""Keep these draws apart from others of the same arm."""
+FEWEST_HELD_OUT = 8
+"""With fewer held-out motions a twin stays without a calibration."""
+
+
+def _explored(scenario: Scenario, index: int, body: Body, draw: int) -> tuple[Plan, ...]:
+    rng = np.random.default_rng(np.random.SeedSequence([scenario.spread.seed, index], spawn_key=(draw,)))
+    return cool_plans(light_jobs(body[0], scenario.twin.exploration, rng), body, scenario.twin)
 
 
 def twins(
@@ -86,24 +97,15 @@ def twins(
         FleetError: an arm has no motion that stays cool, so it cannot know what is normal.
     """
     config = TwinConfig.quick() if scenario.twin.size == "quick" else TwinConfig()
-    own = []
-    for (robot, motors, thermal), possible in zip(bodies, plans, strict=True):
-        cool = cool_records(possible, motors, thermal, scenario)
-        if not cool:
-            raise FleetError(
-                f"{scenario.name}: arm '{robot.name}' has no motion that stays below {scenario.twin.cool_c:g} °C for "
-                f"{scenario.twin.horizon_s:g} s, so its twin has nothing to learn from. Raise twin.cool_c, or give "
-                "twin.payload_kg lighter loads."
-            )
-        own.append(cool)
-    seeds = [np.random.SeedSequence([scenario.spread.seed, i]) for i in range(len(bodies))]
+    own = [cool_records(possible, body, scenario) for body, possible in zip(bodies, plans, strict=True)]
+    seeds = [arm_seed(scenario.spread.seed, i) for i in range(len(bodies))]
     keys = [training_key(r, config, s) for r, s in zip(own, seeds, strict=True)]
     homes = [folder / "twins" / _key(k, scenario.twin, body) for k, body in zip(keys, bodies, strict=True)]
     missing = [i for i, home in enumerate(homes) if _stored(home) is None]
     progress("training", 1.0 - len(missing) / len(bodies))
     if missing:
         jobs = (delayed(_rehearse)(own[i], config, seeds[i], homes[i], scenario, i, bodies[i]) for i in missing)
-        with Parallel(n_jobs=min(len(missing), _cores()), return_as="generator_unordered") as pool:
+        with Parallel(n_jobs=min(len(missing), cpu_count()), return_as="generator_unordered") as pool:
             for done, _ in enumerate(pool(jobs), start=1):
                 progress("training", 1.0 - (len(missing) - done) / len(bodies))
     return [load(home) for home in homes]
@@ -118,7 +120,12 @@ def _rehearse(
     index: int,
     body: Body,
 ) -> None:
-    _train([*own, *explored_records(scenario, index, body)], config, seed, body[0].name, home)
+    save(taught(own, config, seed, scenario=scenario, index=index, body=body), home)
+
+
+def arm_seed(seed: int, index: int) -> np.random.SeedSequence:
+    """Of the training of an arm, by its place in the scenario; who else is trained does not matter."""
+    return np.random.SeedSequence([seed, index])
 
 
 def _key(own: str, spec: TwinSpec, body: Body) -> str:
@@ -126,14 +133,12 @@ def _key(own: str, spec: TwinSpec, body: Body) -> str:
     if not spec.exploration:
         return own
     robot, motors, thermal = body
-    digest = hashlib.sha256(msgspec.json.encode([own, EXERCISE_VERSION, asdict(spec), asdict(robot)]))
+    digest = hashlib.sha256(
+        msgspec.json.encode([own, REHEARSAL_VERSION, EXERCISE_VERSION, asdict(spec), asdict(robot)])
+    )
     for value in (*vars(motors).values(), *vars(thermal).values()):
         digest.update(np.asarray(value, dtype=float).tobytes())
     return digest.hexdigest()[: len(own)]
-
-
-def _train(learned: list[Array], config: TwinConfig, seed: np.random.SeedSequence, arm: str, home: Path) -> None:
-    save(train(learned, config, seed, arm=arm), home)
 
 
 def trained(records: list[Array], config: TwinConfig, seed: np.random.SeedSequence, *, arm: str, folder: Path) -> Twin:
@@ -141,7 +146,7 @@ def trained(records: list[Array], config: TwinConfig, seed: np.random.SeedSequen
     home = folder / "twins" / training_key(records, config, seed)
     kept = _stored(home)
     if kept is None:
-        _train(records, config, seed, arm, home)
+        save(train(records, config, seed, arm=arm), home)
         kept = load(home)
     return kept
 
@@ -154,7 +159,3 @@ def _stored(home: Path) -> Twin | None:
     except CheckpointError as error:
         log.warning("The stored twin cannot be used (%s); training anew.", error)
         return None
-
-
-def _cores() -> int:
-    return max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)

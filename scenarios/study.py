@@ -14,8 +14,8 @@ from fleet.motion import Plan
 from fleet.motor import Motors, gen3_motors
 from fleet.robot import JOINTS, Robot, ThermalLimits
 from fleet.sim.exercise import light_jobs, random_jobs
-from fleet.sim.oracle import peaks
-from fleet.thermal import NODES, ThermalModel, ThermalSpread, gen3_network, spread_motors, thermal_model
+from fleet.thermal import ThermalModel, ThermalSpread, gen3_network, spread_motors, thermal_model
+from scenarios.cool import cold_peaks
 from scenarios.records import records
 
 Array = np.ndarray
@@ -141,14 +141,7 @@ class _Subject:
 
     def judged(self, plans: Sequence[Plan]) -> Sample:
         """The plans with their peaks."""
-        highest = peaks(
-            plans,
-            [self.horizon_s] * len(plans),
-            motors=self.motors,
-            thermal=self.thermal,
-            start_c=np.full(NODES, self.ambient_c),
-            ambient_c=self.ambient_c,
-        )
+        highest = cold_peaks(plans, self.motors, self.thermal, ambient_c=self.ambient_c, horizon_s=self.horizon_s)
         return Sample(tuple(plans), highest)
 
     def cool_jobs(

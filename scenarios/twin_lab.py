@@ -1,11 +1,11 @@
 """What the chapters of a twin report work on: one arm's study under several seeds, and its twins, made when needed."""
 
-import os
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
+from joblib import cpu_count
 
 from fleet.errors import FleetError
 from fleet.robot import Robot
@@ -90,8 +90,7 @@ class Lab:
     @property
     def processes(self) -> int:
         """So many seeds side by side."""
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        return max(1, min(cores, len(self.seeds)))
+        return max(1, min(cpu_count(), len(self.seeds)))
 
     @cached_property
     def study(self) -> Study:

@@ -1,8 +1,7 @@
 """Twins trained on request: of a scenario's arms or of a real arm's logs, kept in one folder and found there again."""
 
 import json
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -10,16 +9,13 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-from joblib import Parallel, delayed
+from joblib import Parallel, cpu_count, delayed
 
 from fleet.errors import CheckpointError, FleetError, nearest
-from fleet.motion import Plan
-from fleet.sim.oracle import peaks
-from fleet.thermal import NODES
 from scenarios.build import Progress, body_of, cache_folder, plan_works, quiet
 from scenarios.folder import Kind
 from scenarios.jobs import rehearsal_works
-from scenarios.records import records
+from scenarios.rehearse import arm_seed, cool_records, taught
 from scenarios.scenario import Scenario
 from twin.checkpoint import CARD as TWIN_CARD
 from twin.checkpoint import load, save
@@ -48,80 +44,38 @@ def arm_index(scenario: Scenario, name: str) -> int:
     return names.index(name)
 
 
-HELD_OUT = 0.2
-"""Share of an arm's cool plans that its twin is not trained on, but takes what is usual from."""
-FEWEST_HELD_OUT = 8
-"""With fewer, nothing is held out and the twin stays without a calibration."""
-
-
 def train_arms(
-    scenario: Scenario, arms: Sequence[int], config: TwinConfig, seed: int, progress: Progress = quiet
+    scenario: Scenario, arms: Sequence[int], config: TwinConfig, seed: int | None = None, progress: Progress = quiet
 ) -> list[Twin]:
-    """The twins of some arms of a scenario, each trained on its own rehearsal, side by side.
+    """The twins of some arms of a scenario, side by side, each taught what the fleet's twin of that arm is taught.
+
+    With the scenario's own configuration and seed they are the twins with which its fleet works.
 
     Args:
         arms: Which, by their place in the scenario; the twin of an arm does not depend on who is trained with it.
+        seed: Of weights and training; by default the scenario's own.
 
     Raises:
         FleetError: an arm has no motion that stays cool, or the latent of a joint collapsed.
     """
-    seeds = [np.random.SeedSequence([seed, index]) for index in arms]
-    prepared = []
-    for done, (index, own) in enumerate(zip(arms, seeds, strict=True)):
+    bodies = [body_of(scenario, index) for index in arms]
+    lessons = []
+    for done, (index, body) in enumerate(zip(arms, bodies, strict=True)):
         share = lambda s, done=done: progress("planning", (done + s) / len(arms))  # noqa: E731
-        prepared.append(_cool_plans(scenario, index, own, share))
-    names = [scenario.arms[index].name for index in arms]
+        possible, _ = plan_works(body[0], rehearsal_works(scenario), scenario, cache_folder(), share)
+        own = cool_records(possible, body, scenario)
+        lessons.append((own, config, arm_seed(scenario.spread.seed if seed is None else seed, index)))
+    places = [{"scenario": scenario, "index": index, "body": body} for index, body in zip(arms, bodies, strict=True)]
     progress("training", 0.0)
     if len(arms) == 1:  # in this process, so that the bar moves within the training
-        told = lambda share: progress("training", share)  # noqa: E731
-        return [_calibrated(prepared[0], config, seeds[0], names[0], told)]
-    work = (delayed(_calibrated)(cool, config, s, n) for cool, s, n in zip(prepared, seeds, names, strict=True))
+        return [taught(*lessons[0], **places[0], progress=lambda share: progress("training", share))]
+    work = (delayed(taught)(*lesson, **place) for lesson, place in zip(lessons, places, strict=True))
     twins = []
-    with Parallel(n_jobs=min(len(arms), _cores()), return_as="generator") as pool:
+    with Parallel(n_jobs=min(len(arms), cpu_count()), return_as="generator") as pool:
         for twin in pool(work):
             twins.append(twin)
             progress("training", len(twins) / len(arms))
     return twins
-
-
-def _cool_plans(
-    scenario: Scenario, index: int, seed: np.random.SeedSequence, progress: Callable[[float], None]
-) -> tuple[list[Plan], list[Plan]]:
-    """An arm's rehearsed plans that stay cool: to learn from, and held out for what is usual."""
-    robot, motors, thermal = body_of(scenario, index)
-    possible, _ = plan_works(robot, rehearsal_works(scenario), scenario, cache_folder(), progress)
-    every = [plan for variants in possible.values() for plan in variants]
-    spec = scenario.twin
-    highest = peaks(
-        every,
-        [spec.horizon_s] * len(every),
-        motors=motors,
-        thermal=thermal,
-        start_c=np.full(NODES, spec.ambient_c),
-        ambient_c=spec.ambient_c,
-    ).max(axis=1, initial=-np.inf)
-    cool = [plan for plan, peak in zip(every, highest, strict=True) if peak <= spec.cool_c]
-    if not cool:
-        raise FleetError(
-            f"{scenario.name}: arm '{robot.name}' has no motion that stays below {spec.cool_c:g} °C for "
-            f"{spec.horizon_s:g} s, so its twin has nothing to learn from. Raise twin.cool_c, or give "
-            "twin.payload_kg lighter loads."
-        )
-    held_out = int(HELD_OUT * len(cool)) if HELD_OUT * len(cool) >= FEWEST_HELD_OUT else 0
-    order = np.random.default_rng(seed).permutation(len(cool))
-    return [cool[i] for i in sorted(order[held_out:])], [cool[i] for i in sorted(order[:held_out])]
-
-
-def _calibrated(
-    cool: tuple[list[Plan], list[Plan]],
-    config: TwinConfig,
-    seed: np.random.SeedSequence,
-    arm: str,
-    progress: Callable[[float], None] | None = None,
-) -> Twin:
-    known, held_out = cool
-    twin = train(records(known), config, seed, arm=arm, progress=progress)
-    return twin.calibrated([(plan, 1) for plan in held_out]) if held_out else twin
 
 
 LOG_RATE_HZ = 2.0
@@ -233,7 +187,3 @@ def open_twin(folder: Path, arm: str | None = None) -> Twin:
 
 def _home(arm: str) -> str:
     return f"{quote(arm, safe='')}.twin"
-
-
-def _cores() -> int:
-    return max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)

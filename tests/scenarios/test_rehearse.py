@@ -5,16 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from fleet.errors import FleetError
-from fleet.motion import drive
 from fleet.motor import gen3_motors
-from fleet.robot import JOINTS, Mount, Robot
+from fleet.robot import Mount, Robot
+from fleet.sim.exercise import light_jobs
 from fleet.sim.models import ArmModel
-from fleet.thermal import NODES, WINDING, drive_heat, gen3_network, thermal_model
+from fleet.thermal import gen3_network, thermal_model
 from scenarios import rehearse
 from scenarios.load import library, load
+from scenarios.records import records
 from twin.model import TwinConfig
 from twin.train import train
 
@@ -43,27 +43,6 @@ def bodies(count):
     return [(Robot(name=f"arm_{i}"), gen3_motors(), thermal_model(gen3_network())) for i in range(count)]
 
 
-def test_what_gets_hot_within_the_horizon_is_left_out_although_it_begins_cool(plans, scenario):
-    """Second method: integrate each plan's heat over the horizon."""
-    _, motors, thermal = bodies(1)[0]
-    spec = scenario.twin
-    cool = 0
-    for variants in plans.values():
-        load_ = drive(variants[0].cycle.profile, motors)
-
-        def slope(_t, temp, load_=load_):
-            heat = drive_heat(temp, load_.current_sq, load_.friction_w, motors)
-            return (heat + thermal.to_ambient * spec.ambient_c - thermal.laplacian @ temp) / thermal.capacity
-
-        run = solve_ivp(slope, (0.0, spec.horizon_s), np.full(NODES, spec.ambient_c), rtol=1e-8, atol=1e-8)
-        assert run.y[WINDING, 0].max() < spec.cool_c  # every one of them begins cool
-        cool += run.y[WINDING].max() <= spec.cool_c
-    assert 0 < cool < len(plans)
-    records = rehearse.cool_records(plans, motors, thermal, scenario)
-    assert len(records) == 3 * cool  # approach, cycle, retreat
-    assert all(record.shape[1:] == (3, JOINTS) for record in records)
-
-
 def test_a_fleet_that_gets_hot_at_everything_is_told_what_to_change(plans, scenario, tmp_path):
     strict = replace(scenario, twin=replace(scenario.twin, cool_c=22.5))
     with pytest.raises(FleetError, match=r"arm 'arm_0' has no motion that stays below 22.5 °C .* Raise twin.cool_c"):
@@ -71,6 +50,7 @@ def test_a_fleet_that_gets_hot_at_everything_is_told_what_to_change(plans, scena
 
 
 def test_twins_are_trained_once_and_then_taken_from_the_cache(plans, scenario, tmp_path, tiny, monkeypatch):
+    monkeypatch.setattr(rehearse, "cpu_count", lambda: 1)
     told = []
     first = rehearse.twins(scenario, bodies(2), [plans, plans], tmp_path, lambda *tell: told.append(tell))
     assert told[-1] == ("training", 1.0)
@@ -89,7 +69,7 @@ def test_twins_are_trained_once_and_then_taken_from_the_cache(plans, scenario, t
 
 def test_twins_do_not_depend_on_how_many_work(plans, scenario, tmp_path, tiny, monkeypatch):
     both = rehearse.twins(scenario, bodies(2), [plans, plans], tmp_path / "two", lambda *tell: None)
-    monkeypatch.setattr(rehearse, "_cores", lambda: 1)
+    monkeypatch.setattr(rehearse, "cpu_count", lambda: 1)
     alone = rehearse.twins(scenario, bodies(2), [plans, plans], tmp_path / "one", lambda *tell: None)
     assert [t.version for t in both] == [t.version for t in alone]
 
@@ -129,7 +109,7 @@ def test_an_arm_that_does_not_explore_learns_from_its_work_alone(plans, scenario
     assert rehearse.explored_records(none, 0, body) == []
     (twin,) = rehearse.twins(none, [body], [plans], tmp_path, lambda *tell: None)
     (explorer,) = rehearse.twins(scenario, [body], [plans], tmp_path, lambda *tell: None)
-    own = rehearse.cool_records(plans, *body[1:], none)
+    own = rehearse.cool_records(plans, body, none)
     seed = np.random.SeedSequence([none.spread.seed, 0])
     assert twin.data_hash == train(own, TINY, seed, arm="arm_0").data_hash
     both = [*own, *rehearse.explored_records(scenario, 0, body)]
@@ -151,3 +131,25 @@ def test_other_motors_are_another_twin_since_other_exploration_stays_cool(plans,
     warmer = (body[0], replace(body[1], idle_w=body[1].idle_w * 1.001), body[2])
     rehearse.twins(scenario, [warmer], [plans], tmp_path, lambda *tell: None)
     assert len(list((tmp_path / "twins").iterdir())) == 2
+
+
+def test_a_twin_is_told_what_is_usual_by_cool_motion_that_it_was_not_trained_on(scenario, monkeypatch):
+    """Second method: train on what was handed to the training, and calibrate by hand with what was not."""
+    explores = replace(scenario, twin=replace(scenario.twin, exploration=9))
+    (body,) = bodies(1)
+    drawn = []
+    monkeypatch.setattr(rehearse, "light_jobs", lambda *some: drawn.append(light_jobs(*some)) or drawn[-1])
+    seed = rehearse.arm_seed(0, 0)
+    twin = rehearse.taught([], TINY, seed, scenario=explores, index=0, body=body)
+    learned, held_out = drawn
+    assert not {plan.cycle.profile.tobytes() for plan in learned} & {plan.cycle.profile.tobytes() for plan in held_out}
+    untold = train(records(learned), TINY, seed, arm="arm_0")
+    assert untold.calibration is None
+    assert twin.version == untold.calibrated([(plan, 1) for plan in held_out]).version
+
+
+def test_too_few_held_out_motions_leave_a_twin_uncalibrated(scenario):
+    (body,) = bodies(1)
+    twin = rehearse.taught([], TINY, rehearse.arm_seed(0, 0), scenario=scenario, index=0, body=body)
+    assert scenario.twin.exploration == 3
+    assert twin.calibration is None

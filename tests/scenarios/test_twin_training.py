@@ -1,0 +1,50 @@
+"""Twins trained by hand: the very ones with which a fleet works, whoever is trained beside them."""
+
+from dataclasses import replace
+
+import pytest
+
+from scenarios.build import prepare
+from scenarios.load import load, override
+from scenarios.scenario import Scenario
+from scenarios.twin_training import quality, train_arms
+from twin.model import TwinConfig
+from twin.score import Twin
+
+TINY = TwinConfig(max_windows=64, epochs=2, restarts=1, hidden=4, allow_collapse=True)
+
+
+@pytest.fixture
+def scenario(small_toml, plans, monkeypatch) -> Scenario:
+    monkeypatch.setenv("THERMOFLEET_CACHE", str(plans))
+    return override(load(small_toml), twin={"size": "quick", "exploration": 9}, spread={"seed": 4})
+
+
+@pytest.fixture
+def fleet(scenario, monkeypatch, tmp_path_factory, plans) -> list[Twin]:
+    """The twins with which the scenario's fleet works."""
+    monkeypatch.setattr(TwinConfig, "quick", classmethod(lambda cls: TINY))
+    monkeypatch.setattr("scenarios.rehearse.cpu_count", lambda: 1)
+    models = [arm.model for arm in prepare(scenario, cache=plans).arms]
+    return [model for model in models if isinstance(model, Twin)]
+
+
+def test_a_twin_trained_by_hand_is_that_of_the_fleet(scenario, fleet):
+    told = []
+    (right,) = train_arms(scenario, [1], TINY, progress=lambda *tell: told.append(tell))
+    assert right.arm == "right"
+    assert [twin.version for twin in fleet][1] == right.version
+    assert (right.data_hash, right.seed) == (fleet[1].data_hash, fleet[1].seed)
+    assert quality(right)["calibrated_on"] == 9
+    assert [stage for stage, _ in told] == sorted(stage for stage, _ in told)
+    assert told[-1] == ("training", 1.0)
+
+
+def test_who_is_trained_beside_it_does_not_matter_and_another_seed_does(scenario, fleet, monkeypatch):
+    monkeypatch.setattr("scenarios.twin_training.cpu_count", lambda: 1)
+    assert [twin.version for twin in train_arms(scenario, [0, 1], TINY)] == [twin.version for twin in fleet]
+    (other,) = train_arms(scenario, [0], TINY, seed=5)
+    assert other.data_hash == fleet[0].data_hash
+    assert other.version != fleet[0].version
+    (same,) = train_arms(replace(scenario, name="renamed"), [0], TINY, seed=scenario.spread.seed)
+    assert same.version == fleet[0].version
