@@ -6,11 +6,12 @@ from pathlib import Path
 from fleet.errors import FleetError, nearest
 from fleet.motion import Plan
 from fleet.sim.world import Arm
-from scenarios.build import Progress, body_of, cache_folder, plan_works, prepare, quiet
+from scenarios.build import Progress, body_of, cache_folder, plan_works, quiet
 from scenarios.cool import some_cool_plans
 from scenarios.generate import Verification
 from scenarios.jobs import rehearsal_works
 from scenarios.perform import alone
+from scenarios.rehearse import twins
 from scenarios.scenario import Scenario
 from twin.score import Twin
 
@@ -37,7 +38,7 @@ def known_arm(
     """An arm of a scenario by name; without one, the first.
 
     Args:
-        twin: Its twin; by default the scenario's own, trained or from the cache.
+        twin: Its twin; by default that with which the arm works in the scenario's fleet, trained or from the cache.
 
     Raises:
         FleetError: no such arm, a twin of another arm, or no motion of this arm stays cool.
@@ -47,17 +48,15 @@ def known_arm(
     if name not in names:
         raise FleetError(f"No arm '{name}' in {scenario.name}{nearest(name, names)}")
     index = names.index(name)
-    if twin is None:
-        made = prepare(scenario, cache=cache, progress=progress).arms[index].model
-        assert isinstance(made, Twin)
-        twin = made
-    elif twin.arm != name:
+    if twin is not None and twin.arm != name:
         raise FleetError(f"This is the twin of arm '{twin.arm}', not of '{name}'; give the one that belongs to it.")
-    body = body_of(scenario, index)
+    body, folder = body_of(scenario, index), cache or cache_folder()
     robot, motors, thermal = body
     possible, _ = plan_works(
-        robot, rehearsal_works(scenario), scenario, cache or cache_folder(), lambda share: progress("planning", share)
+        robot, rehearsal_works(scenario), scenario, folder, lambda share: progress("planning", share)
     )
+    if twin is None:
+        (twin,) = twins(scenario, [body], [possible], folder, progress, arms=[index])
     sources = some_cool_plans([plan for ways in possible.values() for plan in ways], body, scenario)
     spec = scenario.twin
     verification = Verification.nominal(robot, spec.ambient_c, cool_c=spec.cool_c, horizon_s=spec.horizon_s)

@@ -90,21 +90,27 @@ def twins(
     plans: Sequence[Mapping[Work, tuple[Plan, ...]]],
     folder: Path,
     progress: Callable[[str, float], None],
+    *,
+    arms: Sequence[int] | None = None,
 ) -> list[Twin]:
     """The twin of every arm: from the cache while its inputs are unchanged, else trained, arms side by side.
+
+    Args:
+        arms: Whose these bodies and plans are, by place in the scenario; by default all of it, in order.
 
     Raises:
         FleetError: an arm has no motion that stays cool, so it cannot know what is normal.
     """
     config = TwinConfig.quick() if scenario.twin.size == "quick" else TwinConfig()
     own = [cool_records(possible, body, scenario) for body, possible in zip(bodies, plans, strict=True)]
-    seeds = [arm_seed(scenario.spread.seed, i) for i in range(len(bodies))]
+    places = range(len(bodies)) if arms is None else arms
+    seeds = [arm_seed(scenario.spread.seed, index) for index in places]
     keys = [training_key(r, config, s) for r, s in zip(own, seeds, strict=True)]
     homes = [folder / "twins" / _key(k, scenario.twin, body) for k, body in zip(keys, bodies, strict=True)]
     missing = [i for i, home in enumerate(homes) if _stored(home) is None]
     progress("training", 1.0 - len(missing) / len(bodies))
     if missing:
-        jobs = (delayed(_rehearse)(own[i], config, seeds[i], homes[i], scenario, i, bodies[i]) for i in missing)
+        jobs = (delayed(_rehearse)(own[i], config, seeds[i], homes[i], scenario, places[i], bodies[i]) for i in missing)
         with Parallel(n_jobs=min(len(missing), cpu_count()), return_as="generator_unordered") as pool:
             for done, _ in enumerate(pool(jobs), start=1):
                 progress("training", 1.0 - (len(missing) - done) / len(bodies))

@@ -4,8 +4,11 @@ from dataclasses import replace
 
 import pytest
 
-from scenarios.build import prepare
+from scenarios.build import body_of, plan_works, quiet
+from scenarios.jobs import rehearsal_works
+from scenarios.known_arm import known_arm
 from scenarios.load import load, override
+from scenarios.rehearse import twins
 from scenarios.scenario import Scenario
 from scenarios.twin_training import quality, train_arms
 from twin.model import TwinConfig
@@ -21,12 +24,14 @@ def scenario(small_toml, plans, monkeypatch) -> Scenario:
 
 
 @pytest.fixture
-def fleet(scenario, monkeypatch, tmp_path_factory, plans) -> list[Twin]:
+def fleet(scenario, monkeypatch, plans) -> list[Twin]:
     """The twins with which the scenario's fleet works."""
     monkeypatch.setattr(TwinConfig, "quick", classmethod(lambda cls: TINY))
     monkeypatch.setattr("scenarios.rehearse.cpu_count", lambda: 1)
-    models = [arm.model for arm in prepare(scenario, cache=plans).arms]
-    return [model for model in models if isinstance(model, Twin)]
+    bodies = [body_of(scenario, index) for index in range(2)]
+    works = rehearsal_works(scenario)
+    planned = [plan_works(body[0], works, scenario, plans, lambda share: None)[0] for body in bodies]
+    return twins(scenario, bodies, planned, plans, quiet)
 
 
 def test_a_twin_trained_by_hand_is_that_of_the_fleet(scenario, fleet):
@@ -48,3 +53,7 @@ def test_who_is_trained_beside_it_does_not_matter_and_another_seed_does(scenario
     assert other.version != fleet[0].version
     (same,) = train_arms(replace(scenario, name="renamed"), [0], TINY, seed=scenario.spread.seed)
     assert same.version == fleet[0].version
+
+
+def test_an_arm_that_generates_and_recovers_knows_itself_by_the_twin_of_the_fleet(scenario, fleet, plans):
+    assert known_arm(scenario, "right", cache=plans).twin.version == fleet[1].version
