@@ -1,0 +1,119 @@
+"""What exploration is worth: rates counted by hand on a few jobs, whose scores are their payloads."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fleet.motor import gen3_motors
+from fleet.robot import JOINTS, Robot
+from fleet.thermal import gen3_network, thermal_model
+from scenarios import coverage as module
+from scenarios.coverage import READ, coverage
+from scenarios.study import Sample, Study
+from twin.measures import Features
+from twin.model import TwinConfig
+
+SEEDS = [np.random.SeedSequence(seed) for seed in (5, 6)]
+HORIZON_S = 95.0
+NEW_KG = (5.0, 5.0, 0.2, 0.2)
+TEST = {3.0: 70.0, 1.0: 65.0, 0.5: 50.0, 2.0: 30.0}
+"""Payload and true peak: of the two critical jobs one stands out of the reference, and a cool one does."""
+
+
+class ByExcess:
+    """Stands for a twin: the excess of joint 2 is the payload, its errors fall with it.
+
+    What it explored makes it find motion with more than 4 kg usual.
+    """
+
+    def __init__(self, explored: bool) -> None:
+        self.explored = explored
+
+    def features(self, plans, repetitions) -> Features:
+        for plan, times in zip(plans, repetitions, strict=True):
+            assert (times - 1) * plan.cycle.duration_s < HORIZON_S <= times * plan.cycle.duration_s
+        payloads = np.array([plan.work.payload_kg for plan in plans])
+        packed = np.zeros((len(plans), JOINTS, 5))
+        packed[:, 1, 4] = np.where(self.explored & (payloads > 4.0), 0.1, payloads)
+        packed[:, 1, :4] = 1.0 - payloads[:, None] / 10.0
+        return Features(packed)
+
+
+@pytest.fixture
+def make(small):
+    """Makes a study in which an explored training job is one with 9 kg."""
+
+    def sample(payloads_kg, peaks_c) -> Sample:
+        works = [small.work(f"place_{i}", payload_kg=float(kg)) for i, kg in enumerate(payloads_kg)]
+        plans = tuple(variants[0] for variants in small.arm(0, works).plans.values())
+        return Sample(plans, np.repeat(np.array(peaks_c, dtype=float)[:, None], JOINTS, axis=1))
+
+    def made(_seed, *, train: int, exploration: int) -> Study:
+        learned = [1.0] * (train - exploration) + [9.0] * exploration
+        return Study(
+            robot=Robot(name="arm"),
+            motors=gen3_motors(),
+            thermal=thermal_model(gen3_network()),
+            ambient_c=23.0,
+            horizon_s=HORIZON_S,
+            cool_c=40.0,
+            warning_c=60.0,
+            train=sample(learned, [30.0] * train),
+            reference=sample(np.arange(19) / 10, [30.0] * 19),
+            test=sample(TEST, list(TEST.values())),
+            novel=sample(NEW_KG, [30.0] * len(NEW_KG)),
+        )
+
+    return made
+
+
+@pytest.fixture
+def trainings(monkeypatch) -> list[dict[str, Any]]:
+    """What each twin was trained on."""
+    seen = []
+
+    def train(records, config, seed, *, arm, folder):
+        # Joint 2 of the small arms bears 15 N·m and the payload at one metre.
+        payloads = [(float(np.abs(record[:, 2, 1]).max()) - 15.0) / 9.81 for record in records[1::3]]
+        explored = sum(kg > 5.0 for kg in payloads)
+        seen.append({"explored": explored, "work": len(payloads) - explored, "seed": seed, "config": config})
+        return ByExcess(explored > 0)
+
+    monkeypatch.setattr(module, "trained", train)
+    return seen
+
+
+def test_rates_are_those_counted_by_hand(make, trainings):
+    found = coverage(SEEDS, config=TwinConfig(), folder=Path("none"), exploration=3, train=8, make=make)
+    assert (found.exploration, found.train) == (3, 8)
+    assert set(found.without) == set(found.explored) == set(READ)
+    for seed in range(len(SEEDS)):
+        without, explored = found.without["excess"][seed], found.explored["excess"][seed]
+        # Ranked 3 kg (critical), 2, 1 (critical), 0.5: three of four pairs are in order.
+        assert without.auroc == 0.75
+        assert without.auprc == pytest.approx(0.5 * 1 + 0.5 * 2 / 3)
+        assert without.spearman == pytest.approx(1 - 6 * (0 + 1 + 1 + 4) / 60)  # ranks 4 2 1 3 and 4 3 2 1
+        # At 5 % of 19 references only what is above all of them, 1.8 kg, raises an alarm.
+        assert without.caught == 0.5
+        assert without.false_novel == 0.5
+        assert explored == replace(without, false_novel=0.0)
+        # Its errors fall with the payload: no test job stands out, and only one pair is in order.
+        falling = found.without["joint_2"][seed]
+        assert (falling.auroc, falling.caught, falling.false_novel) == (0.25, 0.0, 0.0)
+
+
+def test_both_twins_get_as_many_jobs_and_the_same_seed(make, trainings):
+    config = TwinConfig.quick()
+    coverage(SEEDS, config=config, folder=Path("none"), exploration=3, train=8, make=make)
+    assert [(t["work"], t["explored"]) for t in trainings] == [(8, 0), (5, 3)] * 2
+    assert [t["seed"] for t in trainings] == [SEEDS[0], SEEDS[0], SEEDS[1], SEEDS[1]]
+    assert all(t["config"] == config for t in trainings)
+
+
+@pytest.mark.parametrize(("seeds", "exploration"), [([], 3), (SEEDS, 0), (SEEDS, 9)])
+def test_no_seed_and_no_or_too_much_exploration_are_refused(make, seeds, exploration):
+    with pytest.raises(ValueError, match="a seed and 0 < exploration <= train"):
+        coverage(seeds, config=TwinConfig(), folder=Path("none"), exploration=exploration, train=8, make=make)
