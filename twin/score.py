@@ -20,8 +20,8 @@ from twin.window import Scaler, check_profile, cover, cut, resample
 Array = np.ndarray
 
 PHASES = ("approach", "cycle", "retreat")
-_CHUNK = 512
-"""Plans per pass: bounds the memory for their windows."""
+_CHUNK = 128
+"""Plans per pass: bounds the memory for their windows and keeps it in cache."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +49,8 @@ class Fit:
 class Twin:
     """A trained twin; implements `fleet.difficulty.DifficultyModel`.
 
-    The score repeats: it decodes the posterior mean and draws nothing.
+    The score repeats: it decodes the posterior mean and draws nothing. Only the last digits (1e-6) depend on how many
+    plans are scored in one call.
 
     Attributes:
         arm: Name of the arm it belongs to.

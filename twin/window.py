@@ -33,18 +33,26 @@ def resample(profile: Array, from_hz: float, to_hz: float) -> Array:
         float64 [time, channel, joint] with continuous joints unwrapped; the last sample may stand for a shorter time.
     """
     samples = np.array(profile, dtype=float)
-    continuous = [j for j in CONTINUOUS if j < samples.shape[-1]]
-    samples[:, Q, continuous] = np.unwrap(samples[:, Q, continuous], axis=0)
+    _unwrap(samples[:, Q])
     if len(samples) == 0 or from_hz == to_hz:
         return samples
     length = len(samples)
     count = int(np.ceil(length * to_hz / from_hz - 1e-9))
     edges = np.minimum(np.arange(count + 1) * (from_hz / to_hz), length)
-    integral = np.concatenate([np.zeros((1, *samples.shape[1:])), np.cumsum(samples, axis=0)])
+    integral = np.zeros((length + 1, *samples.shape[1:]))
+    np.cumsum(samples, axis=0, out=integral[1:])
     whole = np.minimum(edges.astype(int), length - 1)
     part = (edges - whole)[:, None, None]
     at_edges = integral[whole] + part * samples[whole]
     return np.diff(at_edges, axis=0) / np.diff(edges)[:, None, None]
+
+
+def _unwrap(q: Array) -> None:
+    """Take the jumps of whole turns out of the continuous joints' angles [time, joint], in place."""
+    continuous = [j for j in CONTINUOUS if j < q.shape[1]]
+    turns = np.round(np.diff(q[:, continuous], axis=0) / (2 * np.pi))
+    if turns.any():
+        q[1:, continuous] -= 2 * np.pi * np.cumsum(turns, axis=0)
 
 
 def starts(length: int, window: int, stride: int) -> Array:
@@ -134,7 +142,10 @@ class Scaler:
 
     def to_z(self, windows: Array) -> Array:
         """Windows [batch, time, joint, channel] in training standard deviations, float32."""
-        return ((_nearest_turn(windows, self.turn_q) - self.mean) / self.std).astype(np.float32)
+        z = _nearest_turn(windows, self.turn_q)
+        z -= self.mean
+        z /= self.std
+        return z.astype(np.float32)
 
     def to_si(self, z: Array) -> Array:
         """Back to rad, rad/s, N·m, [batch, time, joint, channel]; angles near the training data."""
