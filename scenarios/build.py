@@ -103,17 +103,19 @@ def prepare(
         plans.append(possible)
         refused += impossible
     _check_feasible(scenario, plans, refused)
+    work = [{w: possible[w] for w in asked if w in possible} for possible in plans]
     models: Sequence[DifficultyModel]
     if difficulty == "twin":
-        from scenarios.rehearse import twins  # loads torch
+        from scenarios.calibration import calibrated_twins  # both load torch
+        from scenarios.rehearse import twins
 
-        models = twins(scenario, bodies, plans, folder, progress)
+        known = twins(scenario, bodies, plans, folder, progress)
+        models = calibrated_twins(scenario, bodies, work, known, folder, progress)
     else:
         models = [Blind()] * len(bodies)
     arms = []
-    for (robot, motors, thermal), model, possible in zip(bodies, models, plans, strict=True):
+    for (robot, motors, thermal), model, own in zip(bodies, models, work, strict=True):
         rest_tau = ArmModel(robot).gravity_torque(robot.home_q())
-        own = {work: possible[work] for work in asked if work in possible}
         arm = Arm(robot=robot, motors=motors, thermal=thermal, rest_tau=rest_tau, model=model, plans=own)
         arms.append(_with_oracle(scenario, arm) if difficulty == "oracle" else arm)
     return Fleet(scenario, tuple(arms), tuple(refused))

@@ -1,16 +1,17 @@
 """The past jobs that calibrate a scenario's twins: rehearsed in simulation, labelled by what they did to the motors.
 
-An arm that has worked for weeks has such jobs in its records. One that has not rehearses: its own work and a natural
-mix up to heavy payloads, for times and from temperatures of all kinds, critical ones among them.
+An arm that has worked for weeks has such jobs in its records. One that has not rehearses: its own work and random work
+with heavy payloads, for times and from temperatures of all kinds, critical ones among them.
 """
 
 import hashlib
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import msgspec
 import numpy as np
+from joblib import Parallel, cpu_count, delayed
 
 from fleet.errors import CheckpointError
 from fleet.job import Work
@@ -20,7 +21,7 @@ from fleet.robot import Robot
 from fleet.sim.exercise import EXERCISE_VERSION, random_jobs
 from fleet.thermal import ThermalModel
 from scenarios.past_jobs import past_jobs
-from scenarios.saturation_study import LABELLED, seen
+from scenarios.saturation_study import seen
 from scenarios.scenario import Scenario
 from scenarios.study import Sample, Study
 from twin.calibrate import Experience, NotEnoughExperience, fit_saturation
@@ -32,8 +33,12 @@ log = logging.getLogger(__name__)
 
 RECIPE = 1
 """Raised whenever the same twin and scenario would rehearse other jobs or fit another model."""
+REHEARSED = 300
+"""Past jobs of each arm: also one that hardly anything heats then has some in which a motor passed the limit."""
 OWN = 0.5
-"""Share of the rehearsed jobs that are the scenario's own work; the others come from the natural mix."""
+"""Share of the rehearsed jobs that are the scenario's own work."""
+HEAVY_KG = (2.0, 4.0)
+"""Payloads of the other jobs: lighter ones say little of what leads to saturation."""
 
 Body = tuple[Robot, Motors, ThermalModel]
 
@@ -44,19 +49,29 @@ def calibrated_twins(
     plans: Sequence[Mapping[Work, tuple[Plan, ...]]],
     twins: Sequence[Twin],
     folder: Path,
+    progress: Callable[[str, float], None],
     *,
-    jobs: int = LABELLED,
-) -> list[CalibratedTwin]:
+    jobs: int = REHEARSED,
+) -> list[CalibratedTwin | Twin]:
     """Every arm's twin with the probability of saturation that its rehearsal taught; from the folder where possible.
 
-    Raises:
-        NotEnoughExperience: an arm's rehearsal says too little of what leads to saturation; names the arm.
+    An arm whose rehearsal says too little of what leads to saturation keeps its twin as it is, which has no such
+    probability; a warning says why.
     """
-    found = []
-    for index, (body, own, twin) in enumerate(zip(bodies, plans, twins, strict=True)):
-        home = folder / "saturation" / _key(scenario, body, own, twin, jobs)
-        found.append(_stored(twin, home) or _fitted(scenario, index, body, own, twin, home, jobs))
-    return found
+    homes = [
+        folder / "saturation" / _key(scenario, body, own, twin, jobs)
+        for body, own, twin in zip(bodies, plans, twins, strict=True)
+    ]
+    missing = [i for i, (twin, home) in enumerate(zip(twins, homes, strict=True)) if _stored(twin, home) is None]
+    progress("calibrating", 1.0 - len(missing) / len(bodies))
+    if missing:
+        tasks = (delayed(_fit)(scenario, i, bodies[i], plans[i], twins[i], homes[i], jobs) for i in missing)
+        with Parallel(n_jobs=min(len(missing), cpu_count()), return_as="generator_unordered") as pool:
+            for done, why_not in enumerate(pool(tasks), start=1):
+                progress("calibrating", 1.0 - (len(missing) - done) / len(bodies))
+                if why_not:
+                    log.warning("%s", why_not)
+    return [_stored(twin, home) or twin for twin, home in zip(twins, homes, strict=True)]
 
 
 def rehearse_saturation(
@@ -66,19 +81,19 @@ def rehearse_saturation(
     plans: Mapping[Work, tuple[Plan, ...]],
     twin: Twin,
     *,
-    jobs: int = LABELLED,
+    jobs: int = REHEARSED,
 ) -> Experience:
     """Past jobs of the arm of this index as its twin saw them; the same for every seed of a run.
 
     Args:
-        plans: What it can do of the scenario's work, `jobs` drawn from all variants.
+        plans: How it would do the scenario's work; `OWN` of the jobs are drawn from all variants.
     """
     robot, motors, thermal = body
     rng = np.random.default_rng(np.random.SeedSequence([scenario.spread.seed, index], spawn_key=(2,)))
     every = [plan for variants in plans.values() for plan in variants]
     count = round(OWN * jobs) if every else 0
     own = [every[i] for i in rng.integers(max(len(every), 1), size=count)]
-    mixed = (*own, *random_jobs(robot, jobs - count, rng))
+    mixed = (*own, *random_jobs(robot, jobs - count, rng, payload_kg=HEAVY_KG))
     none = Sample((), np.empty((0, motors.idle_w.size)))
     spec = scenario.twin
     arm = Study(
@@ -97,7 +112,7 @@ def rehearse_saturation(
     return seen(twin, past_jobs(arm, mixed, rng))
 
 
-def _fitted(
+def _fit(
     scenario: Scenario,
     index: int,
     body: Body,
@@ -105,14 +120,14 @@ def _fitted(
     twin: Twin,
     home: Path,
     jobs: int,
-) -> CalibratedTwin:
-    past = rehearse_saturation(scenario, index, body, plans, twin, jobs=jobs)
+) -> str | None:
+    """Fit and keep the model of one arm; why that cannot be, if it cannot."""
     try:
-        model = fit_saturation(past)
+        model = fit_saturation(rehearse_saturation(scenario, index, body, plans, twin, jobs=jobs))
     except NotEnoughExperience as error:
-        raise NotEnoughExperience(f"{scenario.name}: arm '{body[0].name}': {error}") from error
+        return f"{scenario.name}: arm '{body[0].name}' cannot say how probable saturation is. {error}"
     save_saturation(model, home)
-    return CalibratedTwin(twin, model)
+    return None
 
 
 def _stored(twin: Twin, home: Path) -> CalibratedTwin | None:

@@ -17,9 +17,10 @@ from fleet.telemetry import Telemetry, join
 from scenarios.build import BusName, DifficultyName, Fleet, PlantName, Progress, env_of, quiet
 from scenarios.outcome import metrics_of
 from scenarios.policies import policy_of
+from scenarios.provenance import provenance
 from scenarios.scenario import Scenario
 
-RUN_FORMAT = 1
+RUN_FORMAT = 2
 """Raised when run.json or the columns of the recordings change."""
 _LIBRARIES = ("thermofleet", "numpy", "mujoco", "torch", "pettingzoo", "eclipse-zenoh", "pyarrow")
 
@@ -45,8 +46,8 @@ class RunResult:
     telemetry: Telemetry | None
     """None if the shift was interrupted before its first step."""
     events: tuple[Event, ...]
-    twins: dict[str, str]
-    """Version of each arm's difficulty model."""
+    twins: dict[str, dict[str, Any]]
+    """`provenance` of each arm's difficulty model."""
     finished: bool
     """False if interrupted."""
     time_s: float
@@ -94,7 +95,7 @@ def run(
         metrics=metrics_of(world, state, events, env.messages),
         telemetry=join(recorder.parts) if recorder is not None and recorder.parts else None,
         events=events,
-        twins=dict(zip(world.arms, env.episode.twins, strict=True)),
+        twins={arm.robot.name: provenance(arm.model) for arm in fleet.arms},
         finished=finished,
         time_s=float(state.tick[0] * world.dt_s),
         total_reward=reward,

@@ -8,10 +8,9 @@ import pytest
 
 from fleet.motion import drive
 from fleet.robot import ThermalLimits
-from scenarios.build import body_of
+from scenarios.build import body_of, quiet
 from scenarios.calibration import calibrated_twins, rehearse_saturation
 from scenarios.load import load
-from twin.calibrate import NotEnoughExperience
 from twin.measures import Features
 
 
@@ -46,24 +45,26 @@ def test_a_rehearsal_holds_both_outcomes_and_repeats(scenario) -> None:
 
 def test_a_calibrated_twin_is_kept_for_the_same_arm_only(scenario, tmp_path: Path, caplog) -> None:
     body = body_of(scenario, 0)
-    first = calibrated_twins(scenario, [body], [{}], [Seer(body[1])], tmp_path, jobs=60)
+    first = calibrated_twins(scenario, [body], [{}], [Seer(body[1])], tmp_path, quiet, jobs=60)
     (home,) = (tmp_path / "saturation").iterdir()
     (home / "saturation.json").touch()
     stamp = (home / "saturation.json").stat().st_mtime_ns
-    again = calibrated_twins(scenario, [body], [{}], [Seer(body[1])], tmp_path, jobs=60)
+    again = calibrated_twins(scenario, [body], [{}], [Seer(body[1])], tmp_path, quiet, jobs=60)
     assert again[0].saturation == first[0].saturation
     assert (home / "saturation.json").stat().st_mtime_ns == stamp
     other = body_of(scenario, 1)
-    calibrated_twins(scenario, [other], [{}], [Seer(other[1])], tmp_path, jobs=60)
+    calibrated_twins(scenario, [other], [{}], [Seer(other[1])], tmp_path, quiet, jobs=60)
     assert len(list((tmp_path / "saturation").iterdir())) == 2
     (home / "saturation.json").write_text("{")
-    mended = calibrated_twins(scenario, [body], [{}], [Seer(body[1])], tmp_path, jobs=60)
+    mended = calibrated_twins(scenario, [body], [{}], [Seer(body[1])], tmp_path, quiet, jobs=60)
     assert mended[0].saturation == first[0].saturation
     assert "fitting anew" in caplog.text
 
 
-def test_an_arm_that_nothing_heats_is_named(scenario, tmp_path: Path) -> None:
-    body = body_of(scenario, 0)
+def test_an_arm_that_nothing_heats_keeps_its_twin_and_says_why(scenario, tmp_path: Path, caplog) -> None:
+    body, twin = body_of(scenario, 0), Seer(body_of(scenario, 0)[1])
     lax = replace(scenario, limits=ThermalLimits(warning_c=500.0, error_c=600.0))
-    with pytest.raises(NotEnoughExperience, match=rf"quickstart: arm '{body[0].name}': In 0 of 40 past jobs"):
-        calibrated_twins(lax, [body], [{}], [Seer(body[1])], tmp_path, jobs=40)
+    assert calibrated_twins(lax, [body], [{}], [twin], tmp_path, quiet, jobs=40) == [twin]
+    assert f"quickstart: arm '{body[0].name}' cannot say" in caplog.text
+    assert "In 0 of 40 past jobs" in caplog.text
+    assert not (tmp_path / "saturation").exists()

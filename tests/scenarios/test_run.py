@@ -132,7 +132,7 @@ def test_the_summary_says_how_the_run_was_made_and_holds_no_clock_time(fleet):
     assert told["difficulty"] == "blind"
     assert told["scenario_hash"] == scenario_hash(fleet.scenario)
     assert {"thermofleet", "mujoco", "python"} <= set(told["versions"])
-    assert set(told["twins"]) == {"left", "right"}
+    assert told["twins"] == {"left": {"version": "blind"}, "right": {"version": "blind"}}
     assert json.loads(json.dumps(told, allow_nan=False))["metrics"] == told["metrics"]
 
 
