@@ -10,16 +10,17 @@ from joblib import Parallel, delayed
 from fleet.difficulty import difficulty_of_error
 from fleet.motion import CHANNELS, Plan
 from fleet.motor import gen3_motors
-from fleet.robot import JOINTS
-from fleet.sim.oracle import Oracle
-from fleet.thermal import gen3_network, node_heat, thermal_model
+from fleet.thermal import gen3_network, thermal_model
+from scenarios.own_logs import AIR_SD_K, own_logs
 from scenarios.quality import Jobs, Judged, QualityTable, judge, table
 from scenarios.rehearse import trained
 from scenarios.study import Sample, Study, make_study
+from twin.identify import identify
 from twin.measures import Calibration, Features
 from twin.model import TwinConfig
 from twin.nominal import torque_over_continuous, torque_over_known
 from twin.novelty import isolation_forest, mahalanobis, nearest_neighbours
+from twin.rc import RcTwin
 from twin.reading import check_jobs
 from twin.rivals import Modelled, Scorer, Scores, collapsed, known, pca, untrained
 from twin.score import Twin
@@ -39,10 +40,14 @@ RIVALS = (
     "isolation forest",
     "RMS torque / known",
     "RMS torque / continuous",
-    "rc, nominal",
-    "rc, identified",
+    "rc nominal",
+    "rc identified",
 )
-"""What is not the twin; `rc, identified` takes part where somebody brings it."""
+"""What is not the twin."""
+TOLD_OF_HEAT = ("RMS torque / continuous", "rc nominal", "rc identified")
+"""Who was given motor data and the thermal law; all others saw nothing but cool motion."""
+LOGS = 6
+"""Training jobs that the arm does for half an hour each, logged with its temperatures, for identification."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,19 +118,11 @@ def readings(twins: dict[str, Twin], reference: Jobs) -> list[Scorer]:
     return ways
 
 
-def rivals(study: Study, config: TwinConfig, seed: np.random.SeedSequence) -> list[Scorer]:
-    """Everything that needs no network; torque over continuous and rc know a nominal Gen3, not the true arm."""
+def rivals(study: Study, config: TwinConfig, seed: np.random.SeedSequence, logs: int = LOGS) -> list[Scorer]:
+    """Everything that needs no network; what is told of heat knows a nominal Gen3 or the arm's logs, not its truth."""
     records = study.train.records()
     cool = known(records, replace(config, max_windows=TwinConfig().max_windows), seed)
     motors, thermal = gen3_motors(), thermal_model(gen3_network())
-    rc = Oracle(
-        motors=motors,
-        thermal=thermal,
-        start_c=thermal.steady(node_heat(np.zeros(JOINTS), motors.idle_w), study.ambient_c),
-        ambient_c=study.ambient_c,
-        warning_c=study.warning_c,
-        version="rc, nominal",
-    )
     return [
         pca(cool, 2),
         pca(cool, 8),
@@ -134,12 +131,21 @@ def rivals(study: Study, config: TwinConfig, seed: np.random.SeedSequence) -> li
         isolation_forest(cool, seed),
         torque_over_known(records),
         torque_over_continuous(motors, thermal, limit_c=study.warning_c, ambient_c=study.ambient_c),
-        Modelled(rc.version, rc, worst=True),
+        _physical("rc nominal", RcTwin.nominal(study.robot.name, ambient_c=study.ambient_c), study),
+        _physical("rc identified", identified(study, seed, logs), study),
     ]
 
 
-Bring = Callable[[Study], Sequence[Scorer]]
-"""Further scorers of a study, as `rc, identified` for one whose logs were read."""
+def identified(study: Study, seed: np.random.SeedSequence, logs: int = LOGS) -> RcTwin:
+    """The arm as logs of its cool training jobs tell it; it has seen no job that overheats, as the others have not."""
+    told = own_logs(study, study.train.plans[:logs], np.random.default_rng(seed))
+    return RcTwin.of(identify(told, arm=study.robot.name, ambient_c=study.ambient_c, ambient_sd_k=AIR_SD_K))
+
+
+def _physical(name: str, rc: RcTwin, study: Study) -> Modelled:
+    return Modelled(name, replace(rc, warning_c=study.warning_c), worst=True)
+
+
 Make = Callable[[np.random.SeedSequence], Study]
 
 
@@ -149,30 +155,36 @@ def contest(
     config: TwinConfig,
     folder: Path,
     make: Make = make_study,
-    bring: Bring | None = None,
     networks: Sequence[str] | None = None,
+    logs: int = LOGS,
 ) -> Judged:
     """Everybody's quality under one seed: a study and trainings of its own; trained twins are kept in the folder.
 
     Args:
         networks: Which of the `variants` take part, the VAE among them; all by default.
+        logs: Training jobs that are logged to identify the arm.
 
     Raises:
         ValueError: an unknown network, or no VAE.
         FleetError: no test job is critical, or all are.
     """
-    chosen = _chosen(config, networks)
+    configs = chosen(config, networks)
     study = make(seed)
     test, reference, novel = (jobs_of(part, study.horizon_s) for part in (study.test, study.reference, study.novel))
     records = study.train.records()
     twins = {
-        name: trained(records, variant, seed, arm=study.robot.name, folder=folder) for name, variant in chosen.items()
+        name: trained(records, variant, seed, arm=study.robot.name, folder=folder) for name, variant in configs.items()
     }
-    scorers = [*readings(twins, reference), *rivals(study, config, seed), *(bring(study) if bring else ())]
+    scorers = [*readings(twins, reference), *rivals(study, config, seed, logs)]
     return judge(scorers, test=test, reference=reference, novel=novel, limit_c=study.warning_c)
 
 
-def _chosen(config: TwinConfig, networks: Sequence[str] | None) -> dict[str, TwinConfig]:
+def chosen(config: TwinConfig, networks: Sequence[str] | None) -> dict[str, TwinConfig]:
+    """Those of the `variants` that are named, or all.
+
+    Raises:
+        ValueError: an unknown network, or no VAE.
+    """
     every = variants(config)
     names = list(every) if networks is None else networks
     if VAE not in names or not set(names) <= set(every):
@@ -186,16 +198,16 @@ def quality(
     config: TwinConfig,
     folder: Path,
     make: Make = make_study,
-    bring: Bring | None = None,
     networks: Sequence[str] | None = None,
+    logs: int = LOGS,
     processes: int = 1,
 ) -> QualityTable:
     """The contest under every seed, side by side in so many processes; raises as `contest`, and without seeds."""
-    alike = {"config": config, "folder": folder, "make": make, "bring": bring, "networks": networks}
+    alike = {"config": config, "folder": folder, "make": make, "networks": networks, "logs": logs}
     under = (delayed(contest)(seed, **alike) for seed in seeds)
     per_seed: list[Judged] = []
     with Parallel(n_jobs=processes, return_as="generator") as pool:
         for done in pool(under):
             assert done is not None
             per_seed.append(done)
-    return table(per_seed)
+    return table(per_seed, told_of_heat=TOLD_OF_HEAT)

@@ -29,6 +29,7 @@ LABELS = {
     "caught": "TPR at 5 %",
     "false_novel": "FPR novel",
 }
+HEAT, MOTION = "heat", "motion"
 MEASURES = tuple(field.name for field in fields(Detection))
 
 Judged = dict[tuple[str, str], Detection]
@@ -72,6 +73,12 @@ class QualityTable:
     """Rows in the order in which the scorers were given, question by question."""
 
     rows: tuple[Row, ...]
+    told_of_heat: tuple[str, ...] = ()
+    """Scorers that were given motor data and the thermal law; the others know motion alone."""
+
+    def knows(self, scorer: str) -> str:
+        """What a scorer was told: heat or motion."""
+        return HEAT if scorer in self.told_of_heat else MOTION
 
     def row(self, scorer: str, question: str) -> Row:
         """The row of a scorer.
@@ -107,8 +114,11 @@ def judge(scorers: Sequence[Scorer], *, test: Jobs, reference: Jobs, novel: Jobs
     return found
 
 
-def table(per_seed: Sequence[Judged]) -> QualityTable:
+def table(per_seed: Sequence[Judged], told_of_heat: Sequence[str] = ()) -> QualityTable:
     """What was found under several seeds, side by side.
+
+    Args:
+        told_of_heat: Names of scorers that know more than motion, as `QualityTable.told_of_heat`.
 
     Raises:
         ValueError: no seed, or seeds with other scorers.
@@ -121,7 +131,8 @@ def table(per_seed: Sequence[Judged]) -> QualityTable:
             Row(scorer=scorer, question=question, seeds=tuple(each[scorer, question] for each in per_seed))
             for question in QUESTIONS
             for scorer in scorers
-        )
+        ),
+        told_of_heat=tuple(told_of_heat),
     )
 
 
@@ -133,34 +144,59 @@ def _truth(peak_c: Array, question: str) -> Array:
     return peak_c.max(axis=1) if question.startswith("any") else peak_c[:, CARRIER]
 
 
-def beaten(quality: QualityTable, subject: str, rivals: Sequence[str]) -> tuple[str, ...]:
-    """Where a rival beats the subject, a sentence per question and rival, the largest lead in AUROC first.
+def verdicts(quality: QualityTable, subject: str, rivals: Sequence[str]) -> tuple[str, ...]:
+    """Who beats the subject, who ties with it and whom it beats: a sentence per question and kind of knowledge.
 
-    A rival beats it in a measure if it is ahead under every seed; with three seeds chance alone does so in one of
-    eight, so the lead and its spread stand in the sentence. Rivals who did not take part are passed over.
+    One is ahead of the other in a measure if it is under every seed; between equals chance alone does so in one of
+    four times with three seeds. Whatever changes sides from seed to seed is a tie. Rivals who did not take part are
+    passed over.
     """
-    present = {row.scorer for row in quality.rows}
-    sentences = []
-    for question in QUESTIONS:
-        own = quality.row(subject, question)
-        rows = [quality.row(rival, question) for rival in rivals if rival in present]
-        rows.sort(key=lambda row: -float((row.values("auroc") - own.values("auroc")).mean()))
-        sentences += [said for row in rows if (said := _lead(row, own))]
-    return tuple(sentences)
-
-
-def _lead(row: Row, own: Row) -> str | None:
-    leads = []
-    for measure in RANKING:
-        ahead = row.values(measure) - own.values(measure)
-        if np.all(ahead > 0):
-            figures = f"{spread(row.values(measure))} against {spread(own.values(measure))}"
-            leads.append(f"{LABELS[measure]} {figures} (+{ahead.mean():.3f}, at least +{ahead.min():.3f})")
-    if not leads:
-        return None
-    return (
-        f"{WORDS[own.question]}, {row.scorer} beats {own.scorer} under all {len(own.seeds)} seeds: {'; '.join(leads)}."
+    present = [rival for rival in rivals if any(row.scorer == rival for row in quality.rows)]
+    groups = [(kind, [rival for rival in present if quality.knows(rival) == kind]) for kind in (MOTION, HEAT)]
+    return tuple(
+        _verdict(quality, question, subject, kind, some) for question in QUESTIONS for kind, some in groups if some
     )
+
+
+def _verdict(quality: QualityTable, question: str, subject: str, kind: str, rivals: Sequence[str]) -> str:
+    own = quality.row(subject, question)
+    rows = sorted((quality.row(rival, question) for rival in rivals), key=lambda row: -_mean_lead(row, own, "auroc"))
+    said: dict[str, list[str]] = {"is beaten by": [], "is partly beaten by": [], "ties with": [], "beats": []}
+    for row in rows:
+        leads = {m: _mean_lead(row, own, m) for m in RANKING if _sides(row, own, m)}
+        if not leads:
+            said["ties with"].append(row.scorer)
+        elif max(leads.values()) < 0:
+            said["beats"].append(row.scorer)
+        else:
+            way = "is beaten by" if min(leads.values()) > 0 else "is partly beaten by"
+            said[way].append(f"{row.scorer} ({_leads(leads)})")
+    told = "know motion alone" if kind == MOTION else "were told of motors and heat"
+    found = ". It ".join(f"{way} {_listed(names)}" for way, names in said.items() if names)
+    return f"{WORDS[question]}? Among those that {told}, {subject} {found}."
+
+
+def _leads(leads: dict[str, float]) -> str:
+    """What the one has more than the other, and then what less: `AUROC +.020, but Spearman −.100`."""
+    more, less = (
+        ", ".join(f"{LABELS[m]} {sign}{_short(abs(lead))}" for m, lead in leads.items() if (lead > 0) == (sign == "+"))
+        for sign in ("+", "−")
+    )
+    return f"{more}, but {less}" if less else more
+
+
+def _mean_lead(row: Row, own: Row, measure: str) -> float:
+    return float((row.values(measure) - own.values(measure)).mean())
+
+
+def _sides(row: Row, own: Row, measure: str) -> bool:
+    """Whether the same one is ahead under every seed, by what the table shows."""
+    ahead = np.round(row.values(measure) - own.values(measure), 3)
+    return bool(np.all(ahead > 0) or np.all(ahead < 0))
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + f" and {names[-1]}"
 
 
 def spread(values: Array) -> str:
@@ -177,10 +213,11 @@ def text(quality: QualityTable) -> str:
     """The table as Markdown, a part per question."""
     lines = []
     for question in QUESTIONS:
-        lines += [f"**{WORDS[question]}**", "", "| score | " + " | ".join(LABELS[m] for m in MEASURES) + " |"]
-        lines.append("|---" * (1 + len(MEASURES)) + "|")
+        lines += [f"**{WORDS[question]}**", "", "| score | knows | " + " | ".join(LABELS[m] for m in MEASURES) + " |"]
+        lines.append("|---" * (2 + len(MEASURES)) + "|")
         for row in quality.rows:
             if row.question == question:
-                lines.append(f"| {row.scorer} | " + " | ".join(spread(row.values(m)) for m in MEASURES) + " |")
+                told = (row.scorer, quality.knows(row.scorer), *(spread(row.values(m)) for m in MEASURES))
+                lines.append("| " + " | ".join(told) + " |")
         lines.append("")
     return "\n".join(lines)

@@ -7,7 +7,7 @@ import numpy as np
 from scenarios import autonomy as again
 from scenarios.contest import RIVALS, VAE, quality
 from scenarios.coverage import coverage
-from scenarios.quality import LABELS, MEASURES, QUESTIONS, WORDS, QualityTable, beaten
+from scenarios.quality import LABELS, MEASURES, QUESTIONS, WORDS, QualityTable, verdicts
 from scenarios.rehearse import trained
 from scenarios.saturation_study import LABELLED, WATCHED, Trust, trust
 from scenarios.transfer import transfer
@@ -38,10 +38,9 @@ def quality_chapter(lab: Lab) -> Section:
         f"{'reached' if d_2.values(m).mean() >= TARGETS[LABELS[m]] else 'not reached'})"
         for m in SHOWN
     ]
-    lost = beaten(found, VAE, [name for name in RIVALS if (name, question) in _keys(found)])
     sentences = (
         f"d of joint 2 under {len(lab.seeds)} seeds: {'; '.join(met)}.",
-        *(lost or ("No rival beats the VAE under every seed in any of the three measures.",)),
+        *verdicts(found, VAE, RIVALS),
         "The label follows from the mean squared torque and the temperature at the start, so a torque rule is hard to "
         "beat by construction; the question is how near a score comes that was told nothing of heat.",
     )
@@ -60,17 +59,13 @@ def quality_chapter(lab: Lab) -> Section:
     )
 
 
-def _keys(found: QualityTable) -> set[tuple[str, str]]:
-    return {(row.scorer, row.question) for row in found.rows}
-
-
 def quality_table(found: QualityTable, question: str) -> Table:
     """One question's rows, every measure as mean ± standard deviation."""
     return Table(
         caption=WORDS[question],
-        head=("score", *(LABELS[m] for m in MEASURES)),
+        head=("score", "knows", *(LABELS[m] for m in MEASURES)),
         rows=tuple(
-            (row.scorer, *(spread(row.values(m).tolist()) for m in MEASURES))
+            (row.scorer, found.knows(row.scorer), *(spread(row.values(m).tolist()) for m in MEASURES))
             for row in found.rows
             if row.question == question
         ),

@@ -1,13 +1,13 @@
 """Measures by hand, tables by permutation, words by the numbers."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 from fleet.errors import FleetError
 from scenarios.detection import Detection, alarms, detection
-from scenarios.quality import MEASURES, QUESTIONS, Jobs, beaten, judge, spread, table, text
+from scenarios.quality import MEASURES, QUESTIONS, Jobs, judge, spread, table, text, verdicts
 from twin.rivals import Scores
 
 REFERENCE = np.arange(19.0)
@@ -101,7 +101,8 @@ def test_the_order_of_jobs_does_not_matter(parts):
         order = rng.permutation(len(jobs.plans))
         return Jobs(jobs.plans, tuple(np.array(jobs.repetitions)[order].tolist()), jobs.peak_c[order])
 
-    moved = judge([scorer], **{name: shuffled(jobs) for name, jobs in parts.items()})
+    test, reference, novel = (shuffled(parts[name]) for name in ("test", "reference", "novel"))
+    moved = judge([scorer], test=test, reference=reference, novel=novel)
     first = judge([scorer], **parts)
     for key, found in first.items():
         for measure in MEASURES:
@@ -121,23 +122,45 @@ def test_the_words_follow_the_numbers():
     quality = table(
         by_seed(
             [
-                {"VAE": some(auroc=0.90), "better": some(auroc=0.98), "mixed": some(auroc=0.95, spearman=0.6)},
-                {"VAE": some(auroc=0.92), "better": some(auroc=0.99), "mixed": some(auroc=0.91, spearman=0.6)},
+                {
+                    "VAE": some(auroc=0.90),
+                    "mixed": some(auroc=0.91, spearman=0.6),
+                    "better": some(auroc=0.98),
+                    "turns": some(auroc=0.95),
+                    "worse": some(auprc=0.7),
+                    "as the table shows it": some(auroc=0.90001),
+                    "rc": some(auroc=0.99),
+                },
+                {
+                    "VAE": some(auroc=0.92),
+                    "mixed": some(auroc=0.93, spearman=0.6),
+                    "better": some(auroc=0.99),
+                    "turns": some(auroc=0.91),
+                    "worse": some(auroc=0.92, auprc=0.6),
+                    "as the table shows it": some(auroc=0.92001),
+                    "rc": some(auroc=0.99),
+                },
             ]
-        )
+        ),
+        told_of_heat=("rc",),
     )
-    said = beaten(quality, "VAE", ("mixed", "better", "absent"))
-    assert len(said) == len(QUESTIONS)
-    assert all("better beats VAE under all 2 seeds" in sentence for sentence in said)
-    assert "AUROC .985 ± .007 against .910 ± .014 (+0.075, at least +0.070)" in said[0]
-    assert "AUPRC" not in said[0]
+    everybody = ("mixed", "better", "turns", "worse", "as the table shows it", "absent", "rc")
+    said = verdicts(quality, "VAE", everybody)
+    assert len(said) == 2 * len(QUESTIONS)
+    assert said[4] == (
+        "Does joint 2 overheat, asked of its own score? Among those that know motion alone, VAE is beaten by better "
+        "(AUROC +.075). It is partly beaten by mixed (AUROC +.010, but Spearman −.100). It ties with turns and as the "
+        "table shows it. It beats worse."
+    )
+    assert said[5].endswith("Among those that were told of motors and heat, VAE is beaten by rc (AUROC +.080).")
 
 
 def test_a_table_has_a_row_per_scorer_and_question_in_order():
     quality = table(by_seed([{"b": some(), "a": some(auroc=1.0)}]))
     assert [(row.question, row.scorer) for row in quality.rows] == [(q, s) for q in QUESTIONS for s in ("b", "a")]
     assert quality.row("a", QUESTIONS[1]).values("auroc").tolist() == [1.0]
-    assert "| a | 1.000 | .800 | .700 | .500 | .500 |" in text(quality)
+    assert "| a | motion | 1.000 | .800 | .700 | .500 | .500 |" in text(quality)
+    assert "| a | heat | 1.000 |" in text(replace(quality, told_of_heat=("a",)))
     assert spread(np.array([-0.5])) == "-.500"
     with pytest.raises(ValueError, match="No scorer 'c'"):
         quality.row("c", QUESTIONS[0])
