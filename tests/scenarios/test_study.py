@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 from fleet.errors import FleetError
 from fleet.motion import drive
 from fleet.robot import JOINTS
+from fleet.sim.models import ArmModel
 from fleet.thermal import NODES, WINDING, ThermalSpread, drive_heat
 from scenarios.past_jobs import past_jobs
 from scenarios.study import Study, make_study
@@ -93,6 +94,11 @@ def test_exploration_takes_the_place_of_work_and_leaves_the_rest_as_it_is(study)
         assert profiles(getattr(explored, name).plans) == profiles(getattr(study, name).plans)
 
 
+def test_held_out_jobs_do_not_depend_on_how_many_are_learned_from(study):
+    alone = make_study(SEED, train=0, reference=SIZES["reference"], test=0, novel=0)
+    assert profiles(alone.reference.plans) == profiles(study.reference.plans)
+
+
 def test_no_spread_is_the_nominal_arm():
     from fleet.motor import gen3_motors
 
@@ -145,11 +151,18 @@ def test_peaks_of_past_jobs_are_those_of_an_independent_integration(study, past)
 
 
 def test_past_jobs_begin_cold_idle_or_warm_from_work(study, past):
+    """Second method: what standing at home for hours comes to, integrated; only work before makes joint 2 warmer."""
     rise = past.start_c - past.ambient_c[:, None]
     cold = np.all(rise == 0, axis=1)
     assert 0.03 < cold.mean() < 0.35
-    # Long idle, no joint of the base turns above 15 K; after work joint 2 often is.
-    assert (rise[:, 1] > 15.0).mean() > 0.2
+    standing = np.zeros((2, 3, JOINTS), np.float32)
+    standing[:, 0] = study.robot.home_q()
+    standing[:, 2] = ArmModel(study.robot).gravity_torque(study.robot.home_q())
+    switched_on = np.full(NODES, study.ambient_c)
+    idle_c, _ = integrated(study, [(standing, 4 * 3600.0)], switched_on, study.ambient_c)
+    idle = idle_c - study.ambient_c
+    assert (np.abs(rise - idle).max(axis=1) < 1.5).mean() > 0.1
+    assert (rise[:, 1] > idle[1] + 2.0).mean() > 0.15
 
 
 def test_sensors_say_the_start_with_their_own_noise(study, past):
