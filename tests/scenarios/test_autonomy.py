@@ -22,11 +22,17 @@ def study():
     return make_study(SEED, train=8, reference=20, test=30, novel=4)
 
 
-def test_a_twin_that_is_given_its_own_data_again_is_the_same_twin(study, tmp_path):
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Twins of all tests here; each is trained once."""
+    return tmp_path_factory.mktemp("twins")
+
+
+def test_a_twin_that_is_given_its_own_data_again_is_the_same_twin(study, folder):
     result = autonomy(
         [SEED],
         config=TINY,
-        folder=tmp_path,
+        folder=folder,
         make=lambda _: study,
         propose=lambda study, twin, count, seed: study.train.plans,
     )
@@ -37,7 +43,7 @@ def test_a_twin_that_is_given_its_own_data_again_is_the_same_twin(study, tmp_pat
             np.testing.assert_allclose(share, 1.0)
 
 
-def test_what_is_proposed_is_told_how_much_and_by_which_seed(study, tmp_path):
+def test_what_is_proposed_is_told_how_much_and_by_which_seed(study, folder):
     told = []
 
     def propose(study, twin, count, seed):
@@ -45,15 +51,15 @@ def test_what_is_proposed_is_told_how_much_and_by_which_seed(study, tmp_path):
         return study.train.plans[:count]
 
     for _ in range(2):
-        autonomy([SEED], config=TINY, folder=tmp_path, make=lambda _: study, propose=propose, count=3)
+        autonomy([SEED], config=TINY, folder=folder, make=lambda _: study, propose=propose, count=3)
     assert told[0] == told[1]
     assert told[0][0] == 3
     with pytest.raises(ValueError, match="at least one generated job"):
-        autonomy([SEED], config=TINY, folder=tmp_path, make=lambda _: study, count=0)
+        autonomy([SEED], config=TINY, folder=folder, make=lambda _: study, count=0)
 
 
-def test_prior_samples_are_windows_of_the_twin_in_si_units(study, tmp_path):
-    twin = trained(study.train.records(), TINY, SEED, arm="arm", folder=tmp_path)
+def test_prior_samples_are_windows_of_the_twin_in_si_units(study, folder):
+    twin = trained(study.train.records(), TINY, SEED, arm="arm", folder=folder)
     drawn = prior_records(twin, 40, np.random.default_rng(0))
     assert len(drawn) == 40
     assert drawn[0].shape == (TINY.window, 3, 7)
