@@ -1,10 +1,11 @@
 """Posture recovery: a warm arm that holds a payload moves to a nearby posture which its twin finds easier.
 
 What is proposed comes from `scenarios.posture_search`; here it is performed in MuJoCo, beside the same hold without
-recovery, from the same temperatures.
+recovery, from the same temperatures. Both begin with watching the motors for `Nearby.watch_s`.
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from fleet.sim.models import ArmModel
 from fleet.sim.world import Arm
 from fleet.thermal import NODES, WINDING, advance, drive_heat
 from scenarios.generate import Verification
-from scenarios.perform import perform
+from scenarios.perform import Performance, perform
 from scenarios.posture_search import Nearby, RecoveryError, Search, holding
 from twin.score import Twin
 
@@ -59,7 +60,7 @@ class Recovery:
     without_c: Array
     """True winding temperatures of going on, °C, [time, joint]."""
     with_c: Array
-    """The same with the recovery at time zero, °C, [time, joint]."""
+    """The same with the recovery, which the arm leaves for after watching, °C, [time, joint]."""
     error_rad: float
     """Farthest that a joint was from its plan while the recovery was performed."""
 
@@ -101,23 +102,27 @@ def recover(
         hold_s: How long it has still to hold.
 
     Raises:
-        RecoveryError: the payload or the posture is out of range, the hold itself cannot be done, or nothing near is
-            better; says which.
+        RecoveryError: the payload, the posture or the time is out of range, the hold itself cannot be done, or
+            nothing near is better; says which.
     """
     near = nearby or Nearby()
     model = ArmModel(arm.robot)
     check_hold(model, q, payload_kg)
+    if not hold_s > near.watch_s:
+        raise RecoveryError(
+            f"The arm watches its motors for {near.watch_s:g} s before it goes, so it must have longer to hold than "
+            f"that (got {hold_s:g} s)."
+        )
     stay = _exercise(model, [q], [hold_s], payload_kg, near.speed)
-    search = Search(twin, model, verification, near, np.asarray(q, dtype=float), payload_kg, start_c[WINDING], hold_s)
-    found = search.best(np.random.default_rng(np.random.SeedSequence(seed)))
-    runs = [
-        perform(arm, p, start_c=start_c, ambient_c=verification.ambient_c, tick_s=TICK_S) for p in (stay, found.plan)
-    ]
+    on = partial(perform, arm, start_c=start_c, ambient_c=verification.ambient_c, tick_s=TICK_S)
     time_s = np.arange(0.0, hold_s + 1e-9, TICK_S)
-    without_c, with_c = (
-        np.stack([np.interp(time_s + p.approach.duration_s, run.time_s, t) for t in run.temp_c.T], axis=1)
-        for p, run in zip((stay, found.plan), runs, strict=True)
+    stayed = on(stay)
+    before_c, now_c = _held(stayed, np.array([0.0, near.watch_s]))
+    search = Search(
+        twin, model, verification, near, np.asarray(q, dtype=float), payload_kg, before_c, now_c, hold_s - near.watch_s
     )
+    found = search.best(np.random.default_rng(np.random.SeedSequence(seed)))
+    recovered = on(found.plan)
     return Recovery(
         arm=arm.robot.name,
         twin_version=twin.version,
@@ -132,10 +137,16 @@ def recover(
         passed_over=found.passed_over,
         best_error=found.best_error,
         time_s=time_s,
-        without_c=without_c,
-        with_c=with_c,
-        error_rad=runs[1].error_rad,
+        without_c=_held(stayed, time_s),
+        with_c=_held(recovered, time_s),
+        error_rad=recovered.error_rad,
     )
+
+
+def _held(run: Performance, time_s: Array) -> Array:
+    """Winding temperatures at times since the arm began to hold, °C, [time, joint]."""
+    since_s = run.time_s - run.plan.approach.duration_s
+    return np.stack([np.interp(time_s, since_s, temp_c) for temp_c in run.temp_c.T], axis=1)
 
 
 def check_hold(model: ArmModel, q: Array, payload_kg: float) -> None:
