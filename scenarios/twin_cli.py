@@ -55,7 +55,9 @@ def train_command(
     allow_collapse: Annotated[
         bool, typer.Option("--allow-collapse", help="Keep a twin whose latent says nothing, as a baseline.")
     ] = False,
-    seed: Annotated[int, typer.Option(help="Of weights and training; 0 or more.")] = 0,
+    seed: Annotated[
+        int | None, typer.Option(help="Of weights and training; 0 or more. By default the scenario's, for logs 0.")
+    ] = None,
     skip_damaged: DamagedOption = False,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
@@ -66,7 +68,7 @@ def train_command(
     side by side.
     """
     chosen = one_source(scenario, log)
-    if seed < 0:
+    if seed is not None and seed < 0:
         raise FleetError(f"--seed must be 0 or more (got {seed}).")
     if size not in (None, "quick", "full"):
         raise FleetError(f"No size '{size}'{nearest(size or '', ('quick', 'full'))}")
@@ -94,7 +96,7 @@ def train_command(
     with in_options(), progress_bar() as progress, new_folder(out, overwrite=overwrite, kind=TWINS) as folder:
         if log is not None:
             config = config_of("quick" if size is None else size, given, of_log=True)
-            twins = [train_log(recordings_of(log, skip_damaged), config, seed, cool_c=cool, progress=progress)]
+            twins = [train_log(recordings_of(log, skip_damaged), config, seed or 0, cool_c=cool, progress=progress)]
             source = f"log {log}"
         else:
             of_scenario = load(str(chosen))

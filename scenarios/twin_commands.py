@@ -1,6 +1,7 @@
 """`thermofleet twin identify`, `generate`, `recover` and `export`: what a twin is good for besides its scores."""
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -92,8 +93,7 @@ def generate_command(
     with progress_bar() as progress:
         known = known_arm(chosen, arm, twin=twin_of(twins, arm or chosen.arms[0].name), progress=progress)
         some = {"s": strength, "count": count, "seed": seed, "verification": known.verification}
-        told = lambda share: progress("generating", share)  # noqa: E731
-        made = generate(known.twin, known.arm, known.sources, **some, progress=told)
+        made = generate(known.twin, known.arm, known.sources, **some, progress=partial(progress, "generating"))
     how: Any = format_
     save_generated(made, out, format=how, overwrite=overwrite)
     if as_json:
@@ -124,13 +124,18 @@ def recover_command(
     check_choices(seed, format_)
     if not hold_s > 0:
         raise FleetError(f"--hold must be > 0 (got {hold_s:g}).")
+    from fleet.sim.models import ArmModel
     from scenarios.folder import check_free
     from scenarios.known_arm import known_arm
     from scenarios.motion_files import RECOVERY, recovery_summary, save_recovery
-    from scenarios.recover import recover, warmed
+    from scenarios.recover import check_hold, recover, warmed
 
     chosen, q = load(scenario), posture_q(posture)
     check_free(out, overwrite=overwrite, kind=RECOVERY)
+    for spec in chosen.arms:
+        if arm in (None, spec.name):  # all that can be refused is refused before the training
+            check_hold(ArmModel(spec.robot()), q, payload)
+            break
     with progress_bar() as progress:
         known = known_arm(chosen, arm, twin=twin_of(twins, arm or chosen.arms[0].name), progress=progress)
         progress("recovering", 0.0)
