@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from sklearn.metrics import average_precision_score, roc_auc_score
@@ -9,6 +10,7 @@ from sklearn.metrics import average_precision_score, roc_auc_score
 from fleet.difficulty import difficulty_of_error
 from fleet.errors import FleetError
 from fleet.motion import CHANNELS
+from scenarios.rehearse import trained
 from twin.cool import cool_stretches
 from twin.model import TwinConfig
 from twin.recording import Recording
@@ -100,8 +102,12 @@ def log_study(
     *,
     config: TwinConfig = CONFIG,
     progress: Callable[[float], None] | None = None,
+    folder: Path | None = None,
 ) -> LogStudy:
     """A twin of `TRAIN_SHARE` of the cool files, drawn by the seed, and what it makes of the windows of all others.
+
+    Args:
+        folder: Where the trained twin is kept, and found again.
 
     Raises:
         FleetError: too few files are cool, or none is left to test on.
@@ -119,7 +125,11 @@ def log_study(
     taught = [r for r in recordings if r.name in names]
     normal = cool_stretches(taught, config.rate_hz, cool_c=HOT_C, horizon_s=np.inf, joints=(JOINT,))
     records = [stretch.profile for stretch in normal]
-    twin = train(records, config, np.random.SeedSequence(seed), arm="logged", progress=progress)
+    own = np.random.SeedSequence(seed)
+    if folder is None:
+        twin = train(records, config, own, arm="logged", progress=progress)
+    else:
+        twin = trained(records, config, own, arm="logged", folder=folder)
     rest = [r for r in recordings if r.name not in names]
     parts = [
         _windows(r, s, config) for r in rest for s in stretches(r, config.rate_hz) if len(s.time_s) >= config.window

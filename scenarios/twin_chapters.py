@@ -47,7 +47,12 @@ def data_chapter(lab: Lab) -> Section:
         f"its kind; planned motion at {RATE_HZ:g} Hz, torque from inverse dynamics. Normal: no motor passes "
         f"{lab.study.cool_c:g} °C within the horizon; critical: one passes {lab.study.warning_c:g} °C.",
         pictures=(Picture(name="data", png=png(drawn), alt=f"Position, velocity and torque over time. {found}"),),
-        numbers={"rms_torque_nm": load, "peak_c": peaks},
+        numbers={
+            "rms_torque_nm": load,
+            "peak_c": peaks,
+            "twin": lab.twin.version,
+            "data": lab.twin.data_hash,
+        },
     )
 
 
@@ -170,7 +175,14 @@ def difficulty_chapter(lab: Lab) -> Section:
         f"{len(d)} held-out jobs repeated for {study.horizon_s / 60:g} min.",
         pictures=(Picture(name="difficulty", png=png(drawn), alt="Boxes of d per joint and histograms of the sum."),),
         tables=(Table(head=("median d", *(f"joint {j + 1}" for j in range(d.shape[1])), "of sum"), rows=rows),),
-        numbers={name: m.tolist() for name, m in medians.items()},
+        numbers={
+            "median": {name: m.tolist() for name, m in medians.items()},
+            "joint": best + 1,
+            "cool": float(cool[best]),
+            "critical": float(hot[best]),
+            "auroc": found,
+            "auroc_of_sum": of_sum,
+        },
     )
 
 
@@ -178,7 +190,7 @@ def epochs_chapter(lab: Lab) -> Section:
     """Reconstruction error against epochs."""
     jobs = [[phase.profile for phase in plan.phases] for plan in lab.study.train.plans]
     seeds = tuple(range(lab.size.epoch_seeds))
-    study = epoch_study(jobs, epochs=lab.size.epochs, seeds=seeds, progress=lab.progress)
+    study = epoch_study(jobs, epochs=lab.size.epochs, seeds=seeds, workers=1, progress=lab.progress)
     known, held_out = study.table(CARRIER)
     rising = study.rising(CARRIER)
     fall = known[:, -1].mean(axis=0) / known[:, 0].mean(axis=0)
@@ -206,7 +218,8 @@ def epochs_chapter(lab: Lab) -> Section:
         title="Reconstruction error against epochs",
         sentences=sentences,
         how=f"Joint {CARRIER + 1}. A separate training for each number of epochs and each of {len(seeds)} seeds, one "
-        f"restart, on a record of 5 cool jobs (about {study.windows} windows); held out are 20 other cool jobs. "
+        "restart, the one-cycle schedule stretched over just these epochs, on a record of 5 cool jobs (about "
+        f"{study.windows} windows); held out are 20 other cool jobs. "
         "Mean and standard deviation over the seeds, in standard deviations of the training data.",
         pictures=(Picture(name="epochs", png=png(drawn), alt="Error against epochs. " + " ".join(sentences)),),
         tables=(Table(head=("mean |error|, σ", *(f"{n} epochs" for n in study.epochs)), rows=rows),),

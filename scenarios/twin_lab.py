@@ -1,20 +1,23 @@
 """What the chapters of a twin report work on: one arm's study under several seeds, and its twins, made when needed."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from joblib import cpu_count
+from joblib import Parallel, cpu_count, delayed
 
 from fleet.errors import FleetError
 from fleet.robot import Robot
 from scenarios.build import Progress, quiet
-from scenarios.contest import Make, jobs_of
+from scenarios.contest import VAE, Make, chosen, jobs_of
 from scenarios.epochs import EPOCHS
 from scenarios.quality import CARRIER, Jobs
 from scenarios.rehearse import trained
 from scenarios.study import Sample, Study, make_study
+from scenarios.transfer import LABELS
 from twin.model import TwinConfig
 from twin.reading import read_jobs
 from twin.score import Twin
@@ -31,14 +34,23 @@ class Size:
     test: int = 1200
     novel: int = 300
     past: int = 200
-    """Labelled past jobs of the probability of saturation."""
+    """Labelled past jobs from which the probability of saturation is learned; as many again set its alarm."""
     epochs: tuple[int, ...] = EPOCHS
     epoch_seeds: int = 5
     generated: int = 20
     """Motions per strength of the perturbation."""
     own: int = 150
     """Generated jobs from which a twin learns again."""
+    labels: tuple[int, ...] = LABELS
+    """How many labelled jobs the regressor of the transfer gets."""
+    networks: tuple[str, ...] | None = None
+    """Which of `contest.variants` take part in the contest; all by default."""
     config: TwinConfig = field(default_factory=TwinConfig)
+
+    @property
+    def explored(self) -> int:
+        """Light motions among the training jobs of a twin that explores."""
+        return self.train * 2 // 5
 
 
 QUICK = Size(
@@ -46,16 +58,19 @@ QUICK = Size(
     reference=60,
     test=200,
     novel=60,
-    epochs=(20, 60, 240),
+    past=100,
+    epochs=(20, 40, 60),
     epoch_seeds=2,
     generated=6,
     own=40,
+    labels=(10, 50, 100),
+    networks=(VAE, "AE", "untrained VAE"),
     config=TwinConfig.quick(),
 )
 
 
 class Lab:
-    """Studies and twins of one arm, each made once.
+    """Studies and twins of one arm, each made once. What travels to another process is what it was made from.
 
     Attributes:
         robot: The arm that is studied.
@@ -68,6 +83,9 @@ class Lab:
         self, robot: Robot, seeds: tuple[int, ...], size: Size, folder: Path, progress: Progress = quiet
     ) -> None:
         self.robot, self.seeds, self.size, self.folder, self.progress = robot, seeds, size, folder, progress
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Lab, (self.robot, self.seeds, self.size, self.folder)
 
     @property
     def sequences(self) -> list[np.random.SeedSequence]:
@@ -87,10 +105,19 @@ class Lab:
             novel=size.novel,
         )
 
-    @property
-    def processes(self) -> int:
-        """So many seeds side by side."""
-        return max(1, min(cpu_count(), len(self.seeds)))
+    def teach(self, networks: Sequence[str] = (VAE,), *, explored: bool = False) -> None:
+        """Train every twin that is not kept yet, all seeds side by side, so that no chapter waits for another.
+
+        Args:
+            networks: Of the contest.
+            explored: Also the twin of every seed that has explored.
+        """
+        tasks = [(seed, name, 0) for name in networks for seed in self.seeds]
+        tasks += [(seed, VAE, self.size.explored) for seed in self.seeds if explored]
+        self.progress("training", 0.0)
+        with Parallel(n_jobs=max(1, min(cpu_count(), len(tasks))), return_as="generator_unordered") as pool:
+            for done, _ in enumerate(pool(delayed(_teach)(self, *task) for task in tasks), start=1):
+                self.progress("training", done / len(tasks))
 
     @cached_property
     def study(self) -> Study:
@@ -152,3 +179,11 @@ class Lab:
 
 MOST_JOBS = 240
 """Whose windows are shown in a latent map."""
+
+
+def _teach(lab: Lab, seed: int, network: str, exploration: int) -> None:
+    sequence = np.random.SeedSequence(seed)
+    # The other samples decide nothing about the training.
+    study = lab.make(sequence, exploration=exploration, reference=0, test=0, novel=0)  # pyright: ignore[reportCallIssue]
+    config = chosen(lab.size.config, (VAE, network))[network]
+    trained(study.train.records(), config, sequence, arm=study.robot.name, folder=lab.folder)

@@ -1,13 +1,14 @@
 """What a report shows of a real arm's logs: the paper's claim on files that the twin has never seen."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from sklearn.metrics import roc_curve
 
 from fleet.motion import CHANNELS
-from scenarios.build import Progress, quiet
+from scenarios.build import Progress, cache_folder, quiet
 from scenarios.epochs import EPOCHS, epoch_study
 from scenarios.log_rc import log_rc
 from scenarios.log_study import AHEAD_S, HOT_C, JOINT, HotAndCool, LogStudy, hot_and_cool, log_study
@@ -40,6 +41,8 @@ class Logbook:
     config: TwinConfig
     progress: Progress = quiet
     epochs: tuple[int, ...] = EPOCHS
+    folder: Path = field(default_factory=cache_folder)
+    """Where trained twins are kept."""
 
     @cached_property
     def studies(self) -> list[LogStudy]:
@@ -47,7 +50,7 @@ class Logbook:
         found = []
         for done, seed in enumerate(self.seeds):
             told = lambda share, done=done: self.progress("training", (done + share) / len(self.seeds))  # noqa: E731
-            found.append(log_study(self.recordings, seed, config=self.config, progress=told))
+            found.append(log_study(self.recordings, seed, config=self.config, progress=told, folder=self.folder))
         return found
 
     @cached_property
@@ -88,6 +91,7 @@ def log_data_chapter(book: Logbook) -> Section:
         numbers={
             "cool": words[0],
             "hot": words[1],
+            "twins": ", ".join(each.twin.version for each in book.studies),
             "cool_windows": book.compared[0].cool_windows,
             "hot_windows": book.compared[0].hot_windows,
         },

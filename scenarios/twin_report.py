@@ -2,42 +2,27 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from joblib import cpu_count
 
-from fleet.errors import FleetError
 from scenarios.build import Progress, cache_folder, quiet
+from scenarios.contest import VAE, variants
 from scenarios.folder import Kind
 from scenarios.scenario import Scenario
+from scenarios.twin_claims import claims
 from scenarios.twin_lab import QUICK, Lab, Size
 from scenarios.twin_page import Section, Table, page
+from scenarios.twin_sections import Entry, Shelf, basis, computed, plain
 from twin.recording import Recording
 
 CARD = "report.json"
 PAGE = "report.html"
 REPORT = Kind(what="twin report", card=CARD, holds=(CARD, PAGE, "*.png"))
-
-Chapter = Callable[[Any], Section]
-
-CLAIMS = (
-    "The paper (E. Guiffo Kaigom, arXiv 2509.12740) claims that an LSTM variational autoencoder, trained without "
-    "labels on motion that stays cool, reconstructs critical motion worse, that the error in [0, 1) per joint and "
-    "summed is a measure of thermal difficulty, and that the latent gives new uncritical motion.",
-    "The score looks at motion and torque alone. It cannot know the motors' temperatures at the start, how long a job "
-    "will last, or the heat hidden in the housings; P(saturation) takes the first two in and a thermal network all "
-    "three.",
-    "What is light but new looks hard to every detector of novelty. A high d means: outside experience or more load "
-    "than known; the channel shares say which. Only load heats.",
-)
-"""What may and may not be concluded, whatever the figures say."""
-SIMULATED = (
-    "In the simulation the truth is a thermal network whose absolute scale is known to ± 25 % and which extrapolates "
-    "above 55 °C; figures from it compare methods, they do not promise degrees of a real arm."
-)
 
 
 def report_scenario(
@@ -49,30 +34,61 @@ def report_scenario(
     command: str = "",
     progress: Progress = quiet,
 ) -> list[Section]:
-    """All chapters for one arm of a scenario: its body, mount and tool, with the natural mix of work of a study."""
+    """All chapters for one arm of a scenario: its body, mount and tool, with the natural mix of work of a study.
+
+    Finished sections are kept in the cache as soon as they are there.
+    """
     from scenarios import twin_chapters as own
+    from scenarios import twin_heat as heat
     from scenarios import twin_motion as motion
     from scenarios import twin_worth as worth
 
     lab = Lab(scenario.arms[arm].robot(), tuple(seeds), size or Size(), cache_folder(), progress)
-    chapters: list[tuple[str, str, Chapter]] = [
-        ("data", "Training and anomalous data", own.data_chapter),
-        ("latent", "Latent map", own.latent_chapter),
-        ("reconstruction", "Reconstruction of a normal and of a hot record", own.reconstruction_chapter),
-        ("difficulty", "Thermal difficulty of critical and non-critical jobs", own.difficulty_chapter),
-        ("epochs", "Reconstruction error against epochs", own.epochs_chapter),
-        ("generation", "Generated motions", motion.generation_chapter),
-        ("recovery", "Posture recovery", motion.recovery_chapter),
-        ("quality", "Quality of the difficulty, against its rivals", worth.quality_chapter),
-        ("saturation", "Probability of saturation, and its alarm", worth.saturation_chapter),
-        ("coverage", "What exploration is worth", worth.coverage_chapter),
-        ("autonomy", "A twin taught by its own motion alone", worth.autonomy_chapter),
-        ("transfer", "Latent features for a small regressor", worth.transfer_chapter),
+    first: Any = {"group": "first", "load": 0.3}
+    chapters = [
+        Entry(key="data", title="Training and anomalous data", chapter=own.data_chapter, **first),
+        Entry(key="latent", title="Latent map", chapter=own.latent_chapter, **first),
+        Entry(
+            key="reconstruction",
+            title="Reconstruction of a normal and of a hot record",
+            chapter=own.reconstruction_chapter,
+            **first,
+        ),
+        Entry(
+            key="difficulty",
+            title="Thermal difficulty of critical and non-critical jobs",
+            chapter=own.difficulty_chapter,
+            **first,
+        ),
+        Entry(key="epochs", title="Reconstruction error against epochs", chapter=own.epochs_chapter, load=2),
+        Entry(key="generation", title="Generated motions", chapter=motion.generation_chapter, load=2),
+        Entry(key="recovery", title="Posture recovery", chapter=motion.recovery_chapter, load=1),
+        Entry(
+            key="quality", title="Quality of the difficulty, against its rivals", chapter=worth.quality_chapter, load=4
+        ),
+        Entry(
+            key="saturation",
+            title="Probability of saturation, and its alarm",
+            chapter=heat.saturation_chapter,
+            load=3,
+        ),
+        Entry(key="identification", title="The arm's own thermal network", chapter=heat.identification_chapter),
+        Entry(key="coverage", title="What exploration is worth", chapter=worth.coverage_chapter, load=2),
+        Entry(key="autonomy", title="A twin taught by its own motion alone", chapter=worth.autonomy_chapter, load=6),
+        Entry(key="transfer", title="Latent features for a small regressor", chapter=worth.transfer_chapter, load=2),
     ]
-    found = computed(chapters, lab, progress)
+    shelf = Shelf(lab.folder, basis(lab.robot, lab.seeds, lab.size))
+    missing = {entry.key for entry in chapters if shelf.read(entry.key) is None}
+    if missing:
+        lab.teach(
+            (lab.size.networks or tuple(variants(lab.size.config))) if "quality" in missing else (VAE,),
+            explored=bool(missing & {"saturation", "coverage"}),
+        )
+    found = computed(chapters, lab, shelf=shelf, processes=cpu_count(), progress=progress)
     source = {"scenario": scenario.name, "arm": lab.robot.name, "quick": lab.size == QUICK}
-    twins = {} if "twin" not in vars(lab) else {"twin": lab.twin.version, "data": lab.twin.data_hash}
-    return [*found, claims(found, simulated=True), provenance(source | twins, seeds, command)]
+    told = next((section.numbers for section in found if section.key == "data"), {})
+    twins = {name: told[name] for name in ("twin", "data") if name in told}
+    return [claims(found, simulated=True), *found, provenance(source | twins, seeds, command)]
 
 
 def report_logs(
@@ -83,44 +99,38 @@ def report_logs(
     command: str = "",
     progress: Progress = quiet,
 ) -> list[Section]:
-    """All chapters that recorded motion allows."""
+    """All chapters that recorded motion allows; finished sections are kept in the cache."""
     from scenarios import twin_logbook as log
     from scenarios.log_study import CONFIG
 
-    book = log.Logbook(tuple(recordings), tuple(seeds), CONFIG, progress, QUICK.epochs if quick else Size().epochs)
-    chapters: list[tuple[str, str, Chapter]] = [
-        ("data", "Training and anomalous data", log.log_data_chapter),
-        ("latent", "Latent map", log.log_latent_chapter),
-        ("reconstruction", "Reconstruction of a cool and of a hot record", log.log_reconstruction_chapter),
-        ("difficulty", "Error and difficulty, hot against cool", log.log_difficulty_chapter),
-        ("rc", "With temperature and a thermal network", log.log_rc_chapter),
-        ("epochs", "Reconstruction error against epochs", log.log_epochs_chapter),
+    epochs = QUICK.epochs if quick else Size().epochs
+    book = log.Logbook(tuple(recordings), tuple(seeds), CONFIG, progress, epochs, cache_folder())
+    all_in_one: Any = {"group": "logs"}
+    chapters = [
+        Entry(key="data", title="Training and anomalous data", chapter=log.log_data_chapter, **all_in_one),
+        Entry(key="latent", title="Latent map", chapter=log.log_latent_chapter, **all_in_one),
+        Entry(
+            key="reconstruction",
+            title="Reconstruction of a cool and of a hot record",
+            chapter=log.log_reconstruction_chapter,
+            **all_in_one,
+        ),
+        Entry(
+            key="difficulty",
+            title="Error and difficulty, hot against cool",
+            chapter=log.log_difficulty_chapter,
+            **all_in_one,
+        ),
+        Entry(key="rc", title="With temperature and a thermal network", chapter=log.log_rc_chapter, **all_in_one),
+        Entry(key="epochs", title="Reconstruction error against epochs", chapter=log.log_epochs_chapter, **all_in_one),
     ]
-    found = computed(chapters, book, progress)
-    source: dict[str, Any] = {"logs": len(recordings), "data": recordings_hash(recordings), "quick": quick}
-    if "studies" in vars(book):
-        source["twins"] = ", ".join(study.twin.version for study in book.studies)
-    return [*found, claims(found), provenance(source, seeds, command)]
-
-
-def computed(chapters: Sequence[tuple[str, str, Chapter]], subject: Any, progress: Progress = quiet) -> list[Section]:
-    """Every chapter's section; one that cannot be computed is a section that says why."""
-    sections = []
-    for key, title, chapter in chapters:
-        progress(title.lower(), 0.0)
-        try:
-            sections.append(chapter(subject))
-        except (FleetError, ValueError) as error:
-            sections.append(Section(key=key, title=title, failed=f"{error}"))
-    return sections
-
-
-def claims(sections: Sequence[Section], *, simulated: bool = False) -> Section:
-    """What the paper claims, what was measured, and what cannot be claimed."""
-    missing = [section.title for section in sections if section.failed]
-    told = (f"Not measured in this report: {'; '.join(missing)}.",) if missing else ()
-    sentences = (*CLAIMS, *((SIMULATED,) if simulated else ()), *told)
-    return Section(key="claims", title="What may be concluded", sentences=sentences)
+    data = recordings_hash(recordings)
+    shelf = Shelf(book.folder, basis("logs", data, tuple(seeds), CONFIG, epochs))
+    found = computed(chapters, book, shelf=shelf, progress=progress)
+    source: dict[str, Any] = {"logs": len(recordings), "data": data, "quick": quick}
+    told = next((section.numbers for section in found if section.key == "data"), {})
+    source |= {"twins": told["twins"]} if "twins" in told else {}
+    return [claims(found), *found, provenance(source, seeds, command)]
 
 
 def provenance(source: dict[str, Any], seeds: Sequence[int], command: str) -> Section:
@@ -169,14 +179,3 @@ def write(sections: Sequence[Section], folder: Path, *, title: str, lead: Sequen
     text = json.dumps(plain(card), indent=1, allow_nan=False) + "\n"
     (folder / CARD).write_text(text, encoding="utf-8")
     return card
-
-
-def plain(value: Any) -> Any:
-    """The same with what JSON lacks left out: NaN becomes null, numpy's numbers and arrays those of Python."""
-    if isinstance(value, dict):
-        return {str(key): plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(inner) for inner in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
-    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -1,4 +1,4 @@
-"""What the twin is worth, chapter by chapter: against its rivals, as a probability, as an alarm, as a teacher."""
+"""What the twin is worth, chapter by chapter: against its rivals, after exploration, as a teacher, as an input."""
 
 from typing import Any
 
@@ -8,10 +8,8 @@ from scenarios import autonomy as again
 from scenarios.contest import RIVALS, VAE, quality
 from scenarios.coverage import coverage
 from scenarios.quality import LABELS, MEASURES, QUESTIONS, WORDS, QualityTable, verdicts
-from scenarios.rehearse import trained
-from scenarios.saturation_study import LABELLED, WATCHED, Trust, trust
 from scenarios.transfer import transfer
-from scenarios.twin_charts import curves_figure, pairs_figure, ranking_figure, reliability_figure
+from scenarios.twin_charts import curves_figure, pairs_figure, ranking_figure
 from scenarios.twin_lab import Lab
 from scenarios.twin_page import Picture, Section, Table, spread
 from scenarios.twin_style import png
@@ -26,7 +24,7 @@ TARGETS = {"AUROC": 0.93, "AUPRC": 0.80, "Spearman": 0.75}
 def quality_chapter(lab: Lab) -> Section:
     """The quality table: every scorer on the same held-out jobs."""
     lab.progress("quality", 0.0)
-    found = quality(lab.sequences, config=lab.size.config, folder=lab.folder, make=lab.make, processes=lab.processes)
+    found = quality(lab.sequences, config=lab.size.config, folder=lab.folder, make=lab.make, networks=lab.size.networks)
     question = QUESTIONS[-1]
     values = {row.scorer: {LABELS[m]: row.values(m) for m in SHOWN} for row in found.rows if row.question == question}
     ours = tuple(name for name in values if name.startswith(VAE))
@@ -82,84 +80,6 @@ def quality_numbers(found: QualityTable) -> dict[str, Any]:
     }
 
 
-def saturation_chapter(lab: Lab) -> Section:
-    """P(saturation) and its alarm."""
-    found: list[Trust] = []
-    count = max(lab.size.test, LABELLED + WATCHED + 200)
-    explored = lab.size.train * 2 // 5
-    for done, (seed, sequence) in enumerate(zip(lab.seeds, lab.sequences, strict=True)):
-        lab.progress("saturation", done / len(lab.seeds))
-        study = lab.make(sequence, test=count, exploration=explored)  # pyright: ignore[reportCallIssue]
-        twin = trained(study.train.records(), lab.size.config, sequence, arm=study.robot.name, folder=lab.folder)
-        found.append(trust(study, twin, seed=seed, exploration=explored))
-    ways = [f"{s.evidence}, {s.method}" for s in found[0].stated]
-    curves = {
-        way: (found[0].stated[i].table.mean_p, found[0].stated[i].table.share, found[0].stated[i].table.count)
-        for i, way in enumerate(ways)
-        if found[0].stated[i].method == "logistic"
-    }
-    rows = tuple(
-        (
-            way,
-            spread([t.stated[i].auroc for t in found]),
-            spread([t.stated[i].brier for t in found]),
-            spread([t.stated[i].table.error for t in found]),
-        )
-        for i, way in enumerate(ways)
-    )
-    alarms = tuple(
-        (
-            alarm.score,
-            spread([t.alarms[i].false_alarms for t in found]),
-            spread([t.alarms[i].false_novel for t in found]),
-            spread([t.alarms[i].caught for t in found]),
-        )
-        for i, alarm in enumerate(found[0].alarms)
-    )
-    best = int(np.argmin([np.mean([t.stated[i].brier for t in found]) for i in range(len(ways))]))
-    brier, error = ([get(t.stated[best]) for t in found] for get in (lambda s: s.brier, lambda s: s.table.error))
-    sentence = (
-        f"The best head ({ways[best]}) reaches AUROC {rows[best][1]} (target .97), Brier {spread(brier)} (target .05) "
-        f"and ECE {spread(error)} (target .05) from {LABELLED} labelled past jobs."
-    )
-    drawn = reliability_figure(curves, title="P(saturation): what was said against what happened (first seed)")
-    return Section(
-        key="saturation",
-        title="Probability of saturation, and its alarm",
-        sentences=(
-            sentence,
-            "The alarm's false alarms are bounded for jobs exchangeable with those it was set on, and only for those; "
-            "under novel motions the bound is void, and the column says what happened.",
-        ),
-        how=f"Past jobs with start temperatures from real histories; the arm's own gains are unknown to the twin. "
-        f"{LABELLED} jobs teach, {WATCHED} more set the alarm at 5 %, the rest are judged; {explored} of "
-        f"{lab.size.train} training jobs are light exploration.",
-        pictures=(Picture(name="reliability", png=png(drawn), alt="Reliability diagram. " + sentence),),
-        tables=(
-            Table(head=("evidence, method", "AUROC", "Brier", "ECE"), rows=rows, caption="P(saturation)"),
-            Table(head=("alarm on", "false alarms", "on novel motions", "critical caught"), rows=alarms),
-        ),
-        numbers={
-            "stated": {
-                way: {
-                    "auroc": [t.stated[i].auroc for t in found],
-                    "brier": [t.stated[i].brier for t in found],
-                    "ece": [t.stated[i].table.error for t in found],
-                }
-                for i, way in enumerate(ways)
-            },
-            "alarms": {
-                alarm.score: {
-                    "false_alarms": [t.alarms[i].false_alarms for t in found],
-                    "false_novel": [t.alarms[i].false_novel for t in found],
-                    "caught": [t.alarms[i].caught for t in found],
-                }
-                for i, alarm in enumerate(found[0].alarms)
-            },
-        },
-    )
-
-
 def coverage_chapter(lab: Lab) -> Section:
     """What light exploration in the rehearsal is worth."""
     lab.progress("coverage", 0.0)
@@ -168,7 +88,7 @@ def coverage_chapter(lab: Lab) -> Section:
         lab.sequences,
         config=size.config,
         folder=lab.folder,
-        exploration=size.train * 2 // 5,
+        exploration=size.explored,
         train=size.train,
         make=lab.make,
     )
@@ -213,7 +133,6 @@ def autonomy_chapter(lab: Lab) -> Section:
         folder=lab.folder,
         make=lab.make,
         count=lab.size.own,
-        processes=lab.processes,
     )
     question = QUESTIONS[1]
     kept = again.remaining(found, question)
@@ -235,7 +154,7 @@ def autonomy_chapter(lab: Lab) -> Section:
 def transfer_chapter(lab: Lab) -> Section:
     """Latent features as input of a small regressor."""
     lab.progress("transfer", 0.0)
-    found = transfer(lab.sequences, config=lab.size.config, folder=lab.folder, make=lab.make, processes=lab.processes)
+    found = transfer(lab.sequences, config=lab.size.config, folder=lab.folder, make=lab.make, labels=lab.size.labels)
     regressors = list(dict.fromkeys(row.regressor for row in found))
     inputs = list(dict.fromkeys(row.inputs for row in found))
     labels = sorted({row.labels for row in found})

@@ -5,14 +5,17 @@ import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
+from operator import itemgetter
 
 import numpy as np
 import pytest
 
 from fleet.errors import FleetError
 from scenarios.epochs import epoch_study
+from scenarios.twin_claims import ahead, claims
 from scenarios.twin_page import PNG_HEAD, Picture, Section, Table, page, spread
-from scenarios.twin_report import claims, computed, provenance, write
+from scenarios.twin_report import provenance, write
+from scenarios.twin_sections import Entry, Shelf, basis, computed
 from scenarios.twin_style import png, sheet
 from twin.model import TwinConfig
 
@@ -80,9 +83,82 @@ def test_a_chapter_that_fails_leaves_its_reason_and_the_others(section):
     def fails(_):
         raise FleetError("nothing is hot")
 
-    found = computed([("a", "First", fails), ("dots", "Dots", lambda _: section)], None)
+    found = computed([entry("a", fails), entry("dots", lambda _: section)], None)
     assert [s.failed for s in found] == ["nothing is hot", None]
-    assert "First" in claims(found).sentences[-1]
+    assert "Chapter a" in claims(found).sentences[-1]
+
+
+def entry(key, chapter, **more):
+    return Entry(key=key, title=f"Chapter {key}", chapter=chapter, **more)
+
+
+def test_a_finished_section_is_kept_though_a_later_one_breaks(section, tmp_path):
+    def breaks(_):
+        raise KeyboardInterrupt
+
+    shelf = Shelf(tmp_path, basis("inputs", 1))
+    chapters = [entry("dots", lambda _: section, load=2), entry("late", breaks)]
+    with pytest.raises(KeyboardInterrupt):
+        computed(chapters, None, shelf=shelf)
+    kept = shelf.read("dots")
+    assert kept == replace(section, numbers={"dots": [0, 1, 2], "none": None, "one": 1.5})
+
+    def never(_):
+        raise AssertionError("was kept")
+
+    assert computed([entry("dots", never)], None, shelf=shelf) == [kept]
+    assert Shelf(tmp_path, basis("inputs", 2)).read("dots") is None
+
+
+def test_what_failed_or_is_damaged_is_computed_anew(section, tmp_path):
+    def fails(_):
+        raise FleetError("not yet")
+
+    shelf = Shelf(tmp_path, "b")
+    assert computed([entry("dots", fails)], None, shelf=shelf)[0].failed == "not yet"
+    assert shelf.read("dots") is None
+    shelf.keep(section)
+    (kept,) = (tmp_path / "sections").iterdir()
+    kept.write_bytes(kept.read_bytes()[:-20])
+    assert computed([entry("dots", lambda _: section)], None, shelf=shelf) == [section]
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_sections_come_in_order_whatever_is_computed_first_or_beside(processes, tmp_path):
+    how = {"a": {}, "b": {"group": "g"}, "c": {"group": "g", "load": 9}}
+    chapters = [entry(key, itemgetter(key), **more) for key, more in how.items()]
+    sections = {key: Section(key=key, title=key) for key in how}
+    shelf = Shelf(tmp_path, "basis")
+    found = computed(chapters, sections, shelf=shelf, processes=processes)
+    assert found == list(sections.values())
+    assert [shelf.read(key) for key in how] == found
+
+
+def quality_of(**auroc):
+    return {"joint 2, joint 2": {name: {"auroc": values} for name, values in auroc.items()}}
+
+
+def test_a_baseline_is_named_only_if_it_is_ahead_in_every_seed():
+    rivals = {"kNN-5": [0.95, 0.95], "PCA-2": [0.99, 0.80], "rc nominal": [0.99, 0.98]}
+    (said,) = ahead(quality_of(VAE=[0.9, 0.92], **rivals))
+    assert "kNN-5 (0.950 ± 0.000), which know motion alone" in said
+    assert "rc nominal (0.985 ± 0.007), which were told of heat" in said
+    assert "PCA-2" not in said
+    (said,) = ahead(quality_of(VAE=[0.9, 0.92], **{"PCA-2": [0.99, 0.80]}))
+    assert said.startswith("No rival")
+    assert ahead({}) == ()
+
+
+def test_claims_are_judged_by_the_figures():
+    def row(cooled_k):
+        made = claims([Section(key="recovery", title="R", numbers={"cooled_k": cooled_k})], simulated=True)
+        return made.tables[0].rows[0]
+
+    assert row(2.5)[1:] == ("+2.5 K in ten minutes", "yes")
+    assert row(-1.0)[1:] == ("-1.0 K in ten minutes", "no")
+    hot = {"below": {"auroc": {"d": 0.6, "rc": 0.96}}}
+    found = claims([Section(key="rc", title="rc", numbers=hot)])
+    assert found.tables[0].rows[0][1:] == ("0.960 (rc); d alone 0.600", "yes")
 
 
 def test_the_folder_holds_page_pictures_and_numbers(section, tmp_path):

@@ -6,16 +6,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from fleet.thermal import gen3_network, thermal_model
+from scenarios import twin_heat as heat
 from scenarios import twin_worth as worth
 from scenarios.autonomy import GENERATED, OWN, PRIOR
 from scenarios.coverage import Coverage
 from scenarios.detection import Detection
 from scenarios.quality import QUESTIONS, QualityTable, Row
+from scenarios.rc_study import RcTrust
 from scenarios.saturation_study import Alarmed, Stated, Trust
 from scenarios.transfer import TransferRow
 from scenarios.twin_lab import QUICK
 from scenarios.twin_page import page
-from scenarios.twin_report import plain
+from scenarios.twin_sections import plain
 from twin.reliability import reliability
 
 
@@ -27,7 +30,6 @@ def lab(tmp_path):
         sequences=[np.random.SeedSequence(seed) for seed in seeds],
         size=QUICK,
         folder=tmp_path,
-        processes=1,
         progress=lambda stage, share: None,
         make=lambda seed, **sizes: SimpleNamespace(
             robot=SimpleNamespace(name="arm"), train=SimpleNamespace(records=list)
@@ -81,7 +83,7 @@ def test_saturation_names_the_head_with_the_least_brier(lab, monkeypatch):
     p = rng.uniform(size=300)
     passed = rng.uniform(size=300) < p
 
-    def told(study, twin, *, seed, exploration):
+    def told(study, twin, *, seed, exploration, **parts):
         stated = [
             Stated(evidence=e, method="logistic", auroc=0.9, brier=b, table=reliability(p, passed), p=p, passed=passed)
             for e, b in (("load", 0.07), ("errors", 0.04))
@@ -89,12 +91,40 @@ def test_saturation_names_the_head_with_the_least_brier(lab, monkeypatch):
         alarm = Alarmed(score="sum", false_alarms=0.05, expected=(0.02, 0.08), false_novel=0.7, caught=0.2)
         return Trust(seed=seed, exploration=exploration, share_passed=0.5, stated=tuple(stated), alarms=(alarm,))
 
-    monkeypatch.setattr(worth, "trust", told)
-    monkeypatch.setattr(worth, "trained", lambda *some, **more: None)
-    section = worth.saturation_chapter(lab)
-    assert "The best head (errors, logistic)" in section.sentences[0]
+    def physical(study, *, seed, **parts):
+        alike = {"seed": seed, "share_passed": 0.5, "auroc": 0.99, "table": reliability(p, passed)}
+        return (
+            RcTrust(name="nominal", brier=0.03, peak_error_k=4.0, **alike),
+            RcTrust(name="identified", brier=0.02, peak_error_k=1.0, **alike),
+        )
+
+    monkeypatch.setattr(heat, "trust", told)
+    monkeypatch.setattr(heat, "rc_trust", physical)
+    monkeypatch.setattr(heat, "trained", lambda *some, **more: None)
+    section = heat.saturation_chapter(lab)
+    assert "The best head of the learned twin (errors, logistic)" in section.sentences[0]
+    assert (
+        "AUROC 0.900 ± 0.000 (target 0.97: not reached), Brier 0.040 ± 0.000 (target 0.05: reached)"
+        in (section.sentences[0])
+    )
+    assert "1.0 ± 0.0 K instead of 4.0 ± 0.0 K: it pays in degrees rather than in ranking." in section.sentences[2]
     assert section.tables[1].rows == (("sum", "0.050 ± 0.000", "0.700 ± 0.000", "0.200 ± 0.000"),)
+    assert [row[0] for row in section.tables[0].rows] == [
+        "load, logistic",
+        "errors, logistic",
+        "rc nominal",
+        "rc identified",
+    ]
     whole(section)
+
+
+def test_the_truth_of_a_thermal_model_is_the_network_it_was_made_from():
+    network = gen3_network()
+    again = heat.network_of(thermal_model(network))
+    before, after = (
+        {frozenset(ends): g for *ends, g in graph.edges(data="conductance_w_per_k")} for graph in (network, again)
+    )
+    assert after == pytest.approx(before)
 
 
 def test_coverage_says_from_what_to_what(lab, monkeypatch):
