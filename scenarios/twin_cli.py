@@ -62,11 +62,7 @@ def train_command(
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Train the twins of a scenario's arms, or of the arm whose logs are given.
-
-    A full twin of seven joints takes about four minutes on one core, a quick one half a minute; arms are trained
-    side by side.
-    """
+    """Train the twins of a scenario's arms, or of the arm whose logs are given; arms are trained side by side."""
     chosen = one_source(scenario, log)
     if seed is not None and seed < 0:
         raise FleetError(f"--seed must be 0 or more (got {seed}).")
@@ -178,10 +174,10 @@ def report_command(
 ) -> None:
     """The paper's pictures and tables as one HTML page that opens offline, with PNGs and report.json.
 
-    From a scenario: one arm's study of 1 200 test jobs, two hours or more on two cores with three seeds; --quick
-    takes 200 jobs and about twenty minutes. From logs: ten minutes per seed for some hours of logs. The folder holds
-    some MB. Twins are kept in the cache, so the same command goes on where it was interrupted. A section that cannot
-    be computed says why in the page, and the command leaves with code 1.
+    From a scenario: one arm's study of 1 200 test jobs with every rival trained anew under each seed, which takes
+    hours; --quick takes 200 jobs, small trainings and fewer rivals. The folder holds some MB. Twins and finished
+    sections are kept in the cache, so the same command goes on where it was interrupted. A section that cannot be
+    computed says why in the page, and the command leaves with code 1.
     """
     chosen = one_source(scenario, log)
     if seeds < 1:

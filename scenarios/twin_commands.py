@@ -34,10 +34,7 @@ def identify_command(
     skip_damaged: DamagedOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """The arm's thermal network from its own logs: values with 95 % intervals, and what stays unexplained.
-
-    Takes about a minute per hour of logs.
-    """
+    """The arm's thermal network from its own logs: values with 95 % intervals, and what stays unexplained."""
     from twin.identify import identify
     from twin.rc_checkpoint import save
 

@@ -114,10 +114,10 @@ class Lab:
         """
         tasks = [(seed, name, 0) for name in networks for seed in self.seeds]
         tasks += [(seed, VAE, self.size.explored) for seed in self.seeds if explored]
-        self.progress("training", 0.0)
+        self.progress("teaching", 0.0)
         with Parallel(n_jobs=max(1, min(cpu_count(), len(tasks))), return_as="generator_unordered") as pool:
             for done, _ in enumerate(pool(delayed(_teach)(self, *task) for task in tasks), start=1):
-                self.progress("training", done / len(tasks))
+                self.progress("teaching", done / len(tasks))
 
     @cached_property
     def study(self) -> Study:

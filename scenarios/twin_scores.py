@@ -21,6 +21,8 @@ from twin.stretches import Stretch, stretches
 
 Array = np.ndarray
 Row = dict[str, Any]
+TRACE = ("twin", "data")
+"""What leads from a score to the twin's version, and from there to the hash of its training data."""
 
 
 def job_rows(twin: Twin, scenario: Scenario, progress: Progress = quiet) -> list[Row]:
@@ -59,6 +61,7 @@ def _job_row(twin: Twin, plan: Plan, repetitions: int) -> Row:
         "p_value": None if measures.p_value is None else float(measures.p_value),
         "why": measures.why(),
         "twin": twin.version,
+        "data": twin.data_hash,
     }
 
 
@@ -100,6 +103,7 @@ def _stretch_rows(twin: Twin, stretch: Stretch) -> list[Row]:
                 "hottest_c": None if stretch.temp_c is None else float(stretch.temp_c[i : i + c.window].max()),
                 "why": one.why(),
                 "twin": twin.version,
+                "data": twin.data_hash,
             }
         )
     return rows
@@ -118,10 +122,10 @@ def render(rows: Sequence[Row], how: str, *, caption: str) -> str | Table:
         return held.getvalue()
     table = Table(box=None, pad_edge=False, caption=caption, caption_justify="left")
     for head in heads:
-        if head != "twin":  # said once, below
+        if head not in TRACE:  # said once, below
             table.add_column(head, justify="right" if rows and isinstance(rows[0][head], int | float) else "left")
     for row in rows:
-        table.add_row(*(_cell(value) for head, value in row.items() if head != "twin"))
+        table.add_row(*(_cell(value) for head, value in row.items() if head not in TRACE))
     return table
 
 

@@ -68,6 +68,7 @@ def test_a_log_becomes_a_twin_that_finds_threefold_torque_harder(thermofleet, tw
         rows = list(csv.DictReader(io.StringIO(said.out)))
         assert len(rows) == int((400 if "cool" in name else 100) * RATE_HZ) // 50
         assert {row["twin"] for row in rows} == {card["twins"][0]["version"]}
+        assert {row["data"] for row in rows} == {card["twins"][0]["data_hash"]}
         mean_d[name] = np.mean([float(row["d_2"]) for row in rows])
         for row in rows:
             assert float(row["d"]) == pytest.approx(sum(float(row[f"d_{j}"]) for j in range(1, 8)), rel=1e-4)
