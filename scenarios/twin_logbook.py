@@ -265,10 +265,20 @@ def log_rc_chapter(book: Logbook) -> Section:
     return Section(
         key="rc",
         title="With temperature and a thermal network",
-        sentences=(said, fit),
+        sentences=(said, *_together(found.below.auroc), fit),
         how="A thermal network identified from the twin's training files alone (rc), and a nominal one, started at the "
         "measured temperatures of each window; first seed. Windows of one file are much alike, so files count.",
         pictures=(Picture(name="rc", png=png(drawn), alt=said),),
         tables=(Table(head=("ranked by", "AUROC, still below", "AUPRC, still below", "AUROC, all"), rows=rows),),
         numbers={"below": vars(found.below), "every": vars(found.every), "rc": found.identified.version},
     )
+
+
+def _together(auroc: dict[str, float]) -> tuple[str, ...]:
+    """Whether d is worth adding to temperature and network, and whether identification is worth its logs."""
+    rc, nominal = (auroc[f"{name}, load continued"] for name in ("rc", "nominal rc"))
+    said = [f"With the load going on, the identified network ranks with {rc:.3f}, the nominal one with {nominal:.3f}."]
+    if "all" in auroc:
+        verdict = "do not add it" if auroc["all"] <= rc else "it adds something"
+        said.append(f"d together with temperature and network gets {auroc['all']:.3f}: {verdict}.")
+    return tuple(said)
