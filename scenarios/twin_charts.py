@@ -40,7 +40,7 @@ def ranking_figure(
         targets: A dashed line per measure, where one was set.
     """
     measures = list(next(iter(values.values())))
-    order = sorted(values, key=lambda name: float(np.mean(values[name][measures[0]])))
+    order = ranked(values)
     height = 1.7 + 0.3 * len(order)
     figure, (row,) = sheet(1, len(measures), width=11, height=height, title=title, sharey=True)
     at = np.arange(len(order))
@@ -65,6 +65,11 @@ def ranking_figure(
         row[0].plot([], [], color=CRITICAL, linestyle="--", label="target")
     legend_below(figure, row[0])
     return figure
+
+
+def ranked(values: Mapping[str, Mapping[str, Array]]) -> list[str]:
+    """Methods from worst to best by the mean of the first measure; who shows the same there, by the next."""
+    return sorted(values, key=lambda name: [round(float(np.mean(seeds)), 3) for seeds in values[name].values()])
 
 
 def reliability_figure(tables: Mapping[str, tuple[Array, Array, Array]], *, title: str) -> Figure:

@@ -11,7 +11,7 @@ from scenarios.contest import LOGS
 from scenarios.own_logs import AIR_SD_K, own_logs
 from scenarios.rc_study import RcTrust, rc_trust
 from scenarios.rehearse import trained
-from scenarios.saturation_study import Trust, trust
+from scenarios.saturation_study import LABELLED, Trust, trust
 from scenarios.twin_charts import reliability_figure
 from scenarios.twin_lab import Lab
 from scenarios.twin_page import Picture, Section, Table, spread
@@ -62,7 +62,7 @@ def saturation_chapter(lab: Lab) -> Section:
     best = min(learned, key=lambda way: float(np.mean(numbers[way]["brier"])))
     sentences = (
         f"The best head of the learned twin ({best}): {_against(numbers[best], TARGETS)}, from {lab.size.past} "
-        "labelled past jobs.",
+        f"labelled past jobs{'' if lab.size.past == LABELLED else f' (the targets were set for {LABELLED})'}.",
         f"The identified network (rc identified): {_against(numbers['rc identified'], RC_TARGETS)}.",
         _worth_of_identification(numbers, peak),
         "The alarm's false alarms are bounded for jobs exchangeable with those it was set on, and only for those; "

@@ -9,7 +9,7 @@ from scenarios.contest import RIVALS, VAE, quality
 from scenarios.coverage import coverage
 from scenarios.quality import LABELS, MEASURES, QUESTIONS, WORDS, QualityTable, verdicts
 from scenarios.transfer import transfer
-from scenarios.twin_charts import curves_figure, pairs_figure, ranking_figure
+from scenarios.twin_charts import curves_figure, pairs_figure, ranked, ranking_figure
 from scenarios.twin_lab import Lab
 from scenarios.twin_page import Picture, Section, Table, spread
 from scenarios.twin_style import png
@@ -28,7 +28,7 @@ def quality_chapter(lab: Lab) -> Section:
     question = QUESTIONS[-1]
     values = {row.scorer: {LABELS[m]: row.values(m) for m in SHOWN} for row in found.rows if row.question == question}
     ours = tuple(name for name in values if name.startswith(VAE))
-    first = max(values, key=lambda name: float(values[name][LABELS["auroc"]].mean()))
+    first = ranked(values)[-1]
     drawn = ranking_figure(values, ours=ours, title=f"{WORDS[question]}: {first} does it best", targets=TARGETS)
     d_2 = found.row(VAE, question)
     met = [

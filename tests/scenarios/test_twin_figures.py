@@ -13,6 +13,7 @@ from scenarios.twin_charts import (
     curves_figure,
     motions_figure,
     pairs_figure,
+    ranked,
     ranking_figure,
     reliability_figure,
     roc_figure,
@@ -126,6 +127,15 @@ def test_a_ranking_puts_the_best_on_top_and_every_seed_as_a_dot():
     assert [same_color(bar.get_facecolor()[:3], NORMAL) for bar in axes.patches] == [False, False, True]
     assert axes.patches[2].get_width() == pytest.approx(0.905)
     assert any(list(line.get_xdata()) == [0.9, 0.91] for line in axes.get_lines())
+
+
+def test_who_ties_in_the_first_measure_is_ranked_by_the_next():
+    values = {
+        "a": {"AUROC": np.array([0.9999, 1.0]), "Spearman": np.array([0.8, 0.8])},
+        "b": {"AUROC": np.array([0.9998, 1.0]), "Spearman": np.array([0.9, 0.9])},
+        "c": {"AUROC": np.array([0.98, 0.98]), "Spearman": np.array([1.0, 1.0])},
+    }
+    assert ranked(values) == ["c", "a", "b"]
 
 
 def test_reliability_has_the_diagonal_and_the_counts():
