@@ -80,14 +80,17 @@ def reliability_figure(tables: Mapping[str, tuple[Array, Array, Array]], *, titl
     """
     figure, ((left, right),) = sheet(1, 2, width=10, height=4.6, title=title, widths=(1.25, 1))
     left.plot([0, 1], [0, 1], color="#999999", linestyle="--", linewidth=1, label="perfect")
-    room = 0.08 / max(len(tables), 1)
+    room, edges = 0.08 / max(len(tables), 1), np.linspace(0.0, 1.0, 11)
     for i, (name, (said, seen, count)) in enumerate(tables.items()):
         left.plot(said, seen, color=LINES[i % 6], marker=MARKS[i % 6], markersize=5, label=name)
-        right.bar(said + (i - (len(tables) - 1) / 2) * room, count, width=room, color=LINES[i % 6], alpha=0.8)
+        # Bins of equal mass all have the same count; tenths show how sure a method is.
+        jobs, _ = np.histogram(said, edges, weights=count)
+        at = edges[:-1] + 0.05 + (i - (len(tables) - 1) / 2) * room
+        right.bar(at, jobs, width=room, color=LINES[i % 6], alpha=0.8)
     left.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
     named(left, x="predicted probability", y="share that really passed the limit", title="reliability")
     named(right, x="predicted probability", y="jobs", title="how many jobs were told so")
-    right.set_xlim(-0.06, 1.06)
+    right.set_xlim(-0.02, 1.02)
     legend_below(figure, left)
     return figure
 
