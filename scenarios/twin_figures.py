@@ -45,9 +45,22 @@ def data_figure(normal: Array, hot: Array, rate_hz: float, *, joint: int, title:
             lines[0].set_label("other joints")
             axes.plot(time_s, record[:, channel, joint], color=colour, linewidth=2.0, label=f"joint {joint + 1}")
             named(axes, y="" if column else CHANNEL_LABELS[channel], title="" if channel else name)
+            widened(axes, LEAST_SPAN[channel])
         named(grid[2][column], x="time (s)")
     legend_of_both(figure, grid[0][0], grid[0][1], joint)
     return figure
+
+
+LEAST_SPAN = (0.1, 0.1, 2.0)
+"""Of an axis of q (rad), qd (rad/s), tau (N·m): less is noise of a joint that holds still."""
+
+
+def widened(axes: Axes, least: float) -> None:
+    """Let the y axis span so much at least, around its middle."""
+    low, high = axes.get_ylim()
+    if high - low < least:
+        middle = (low + high) / 2
+        axes.set_ylim(middle - least / 2, middle + least / 2)
 
 
 def legend_of_both(figure: Figure, left: Axes, right: Axes, joint: int) -> None:
@@ -79,6 +92,7 @@ def reconstruction_figure(
             axes.plot(time_s, seen[:, channel], color=colour, linewidth=2.0, label=f"joint {joint + 1}")
             axes.plot(time_s, made[:, channel], color=INK, linewidth=1.3, linestyle="--", label="reconstruction")
             named(axes, y="" if column else CHANNEL_LABELS[channel], title="" if channel else name)
+            widened(axes, LEAST_SPAN[channel])
         named(grid[2][column], x="time (s)")
     legend_of_both(figure, grid[0][0], grid[0][1], joint)
     return figure

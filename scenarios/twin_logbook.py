@@ -12,6 +12,7 @@ from scenarios.build import Progress, cache_folder, quiet
 from scenarios.epochs import EPOCHS, epoch_study
 from scenarios.log_rc import log_rc
 from scenarios.log_study import AHEAD_S, HOT_C, JOINT, HotAndCool, LogStudy, hot_and_cool, log_study
+from scenarios.twin_chapters import active_units
 from scenarios.twin_charts import pairs_figure, ranking_figure, roc_figure
 from scenarios.twin_figures import (
     data_figure,
@@ -113,7 +114,7 @@ def log_latent_chapter(book: Logbook) -> Section:
     return Section(
         key="latent",
         title="Latent map",
-        sentences=(said,),
+        sentences=(said, active_units(mu)),
         how=f"Posterior of held-out windows under the network of joint 2, at most {MOST_WINDOWS} of each kind.",
         pictures=(
             Picture(name="latent_map", png=png(maps), alt="Density of cool and hot windows. " + said),

@@ -60,6 +60,12 @@ def test_records_stand_channel_by_channel_with_their_joint_in_its_colour():
     assert legend_of(figure) == ["joint 2, normal", "joint 2, critical", "other joints"]
 
 
+def test_the_noise_of_a_still_joint_does_not_fill_its_axis():
+    still = np.full((20, 3, 7), 1e-7) * np.arange(20)[:, None, None]
+    low, high = data_figure(still, still, 10.0, joint=1, title="finding").axes[2].get_ylim()
+    assert high - low == pytest.approx(0.1)
+
+
 def test_a_reconstruction_is_drawn_against_what_was_seen():
     seen = RECORD[:, :, 0]
     figure = reconstruction_figure(seen, seen + 1, seen, seen - 2, 10.0, joint=3, title="finding")

@@ -12,6 +12,7 @@ import pytest
 
 from fleet.errors import FleetError
 from scenarios.epochs import epoch_study
+from scenarios.twin_chapters import active_units
 from scenarios.twin_claims import ahead, claims
 from scenarios.twin_page import PNG_HEAD, Picture, Section, Table, page, spread
 from scenarios.twin_report import provenance, write
@@ -223,3 +224,8 @@ def test_too_few_jobs_or_no_epochs_are_refused(waves):
         epoch_study(waves)
     with pytest.raises(ValueError, match="needs seeds, and epochs"):
         epoch_study(waves, epochs=(), records=2)
+
+
+def test_a_unit_that_stays_at_zero_is_not_active():
+    mu = np.stack([np.linspace(-1, 1, 50), np.linspace(-0.01, 0.01, 50)], axis=1)
+    assert active_units(mu).startswith("1 of 2 units")
