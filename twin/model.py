@@ -39,7 +39,7 @@ class TwinConfig:
     """Samples from one training window to the next."""
     score_stride: int = 50
     """Samples from one scored window to the next; the last is flush with the end, so all time is covered."""
-    max_windows: int = 2500
+    max_windows: int = 2000
     """Training uses at most so many windows, drawn at random from all."""
     beta: float = 1.0
     """Weight of the KL term."""
@@ -86,7 +86,7 @@ class TwinConfig:
 
     @classmethod
     def quick(cls) -> "TwinConfig":
-        """For small budgets: about a seventh of the default's training steps."""
+        """For small budgets: about a quarter of the default's training steps."""
         return cls(max_windows=768, epochs=60, restarts=1)
 
     @classmethod
