@@ -17,7 +17,7 @@ Progress = Callable[[str, float], None]
 """Told what is going on and the share of it that is done, 0 to 1."""
 
 LONG_STAGES = {
-    "training": "Training the twins that are not in the cache: a minute or two for a fleet of four …",
+    "training": "Training the twins that are not in the cache: two or three minutes for a fleet of four …",
     "comparing": "Comparing the policies …",
 }
 """What is said of a stage that takes long where there is no terminal to draw a bar on."""
