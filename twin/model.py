@@ -39,8 +39,8 @@ class TwinConfig:
     """Samples from one training window to the next."""
     score_stride: int = 50
     """Samples from one scored window to the next; the last is flush with the end, so all time is covered."""
-    max_windows: int = 2000
-    """Training uses at most so many windows, drawn at random from all."""
+    max_windows: int = 1792
+    """Training uses at most so many windows, drawn at random from all; 14 batches."""
     beta: float = 1.0
     """Weight of the KL term."""
     epochs: int = 60
