@@ -21,8 +21,12 @@ from twin.stretches import Stretch, stretches
 
 Array = np.ndarray
 Row = dict[str, Any]
+LOADED = 2
+"""The joint that carries most of a standing arm's load: a table shows its d, which ranks best."""
 TRACE = ("twin", "data")
 """What leads from a score to the twin's version, and from there to the hash of its training data."""
+LEFT_OUT = (*TRACE, "log", "elbow", "end_s", *(f"d_{joint}" for joint in range(1, 8) if joint != LOADED))
+"""Columns that a table has no room for in 80 characters; CSV and JSON hold them all."""
 
 
 def job_rows(twin: Twin, scenario: Scenario, progress: Progress = quiet) -> list[Row]:
@@ -120,13 +124,18 @@ def render(rows: Sequence[Row], how: str, *, caption: str) -> str | Table:
         writer.writeheader()
         writer.writerows({key: _flat(value) for key, value in row.items()} for row in rows)
         return held.getvalue()
+    caption = f"{caption}; --format csv or json for every joint"
     table = Table(box=None, pad_edge=False, caption=caption, caption_justify="left")
-    for head in heads:
-        if head not in TRACE:  # said once, below
-            table.add_column(head, justify="right" if rows and isinstance(rows[0][head], int | float) else "left")
+    for head in (head for head in heads if head not in LEFT_OUT):
+        words = isinstance(rows[0][head], str)
+        table.add_column(SHORT.get(head, head), justify="left" if words else "right", no_wrap=not words)
     for row in rows:
-        table.add_row(*(_cell(value) for head, value in row.items() if head not in TRACE))
+        table.add_row(*(_cell(value) for head, value in row.items() if head not in LEFT_OUT))
     return table
+
+
+SHORT = {"payload_kg": "kg", "repetitions": "times", "p_value": "p", "hottest_c": "°C"}
+"""Of heads, in a table."""
 
 
 def _flat(value: Any) -> Any:
@@ -136,4 +145,4 @@ def _flat(value: Any) -> Any:
 def _cell(value: Any) -> str:
     if value is None:
         return "–"
-    return f"{value:.3f}" if isinstance(value, float) else str(value)
+    return f"{value:.2f}" if isinstance(value, float) else str(value)

@@ -90,6 +90,7 @@ def test_scores_as_a_table_name_the_twin(thermofleet, twins, logs):
     said = thermofleet("twin", "score", twins, "--log", logs / "hot.csv")
     version = json.loads((twins / "twins.json").read_text(encoding="utf-8"))["twins"][0]["version"]
     assert f"version {version}" in " ".join(said.out.split())
+    assert "…" not in said.out  # everything fits into 80 columns
 
 
 def test_a_finished_training_is_kept_until_told_otherwise(thermofleet, logs, twins):
