@@ -16,10 +16,8 @@ from joblib import Parallel, cpu_count, delayed
 from fleet.errors import CheckpointError
 from fleet.job import Work
 from fleet.motion import Plan
-from fleet.motor import Motors
-from fleet.robot import Robot
 from fleet.sim.exercise import EXERCISE_VERSION, random_jobs
-from fleet.thermal import ThermalModel
+from scenarios.cool import Body
 from scenarios.past_jobs import past_jobs
 from scenarios.saturation_study import seen
 from scenarios.scenario import Scenario
@@ -39,8 +37,6 @@ OWN = 0.5
 """Share of the rehearsed jobs that are the scenario's own work."""
 HEAVY_KG = (2.0, 4.0)
 """Payloads of the other jobs: lighter ones say little of what leads to saturation."""
-
-Body = tuple[Robot, Motors, ThermalModel]
 
 
 def calibrated_twins(
@@ -62,7 +58,8 @@ def calibrated_twins(
         folder / "saturation" / _key(scenario, body, own, twin, jobs)
         for body, own, twin in zip(bodies, plans, twins, strict=True)
     ]
-    missing = [i for i, (twin, home) in enumerate(zip(twins, homes, strict=True)) if _stored(twin, home) is None]
+    kept = [_stored(twin, home) for twin, home in zip(twins, homes, strict=True)]
+    missing = [i for i, model in enumerate(kept) if model is None]
     progress("calibrating", 1.0 - len(missing) / len(bodies))
     if missing:
         tasks = (delayed(_fit)(scenario, i, bodies[i], plans[i], twins[i], homes[i], jobs) for i in missing)
@@ -71,7 +68,9 @@ def calibrated_twins(
                 progress("calibrating", 1.0 - (len(missing) - done) / len(bodies))
                 if why_not:
                     log.warning("%s", why_not)
-    return [_stored(twin, home) or twin for twin, home in zip(twins, homes, strict=True)]
+        for i in missing:
+            kept[i] = _stored(twins[i], homes[i])
+    return [model or twin for model, twin in zip(kept, twins, strict=True)]
 
 
 def rehearse_saturation(

@@ -7,6 +7,7 @@ from scipy.stats import spearmanr
 from sklearn.metrics import average_precision_score, roc_auc_score
 
 from fleet.errors import FleetError
+from twin.conformal import p_value
 
 Array = np.ndarray
 
@@ -76,6 +77,4 @@ def alarms(score: Array, reference: Array, rate: float = ALARM_RATE) -> Array:
     least = int(np.ceil(1 / rate - 1e-9)) - 1
     if len(reference) < least:
         raise FleetError(f"Alarms at {rate:.0%} need at least {least} held-out cool jobs (got {len(reference)}).")
-    ordered = np.sort(reference)
-    as_high = len(ordered) - np.searchsorted(ordered, score, side="left")
-    return (1 + as_high) <= rate * (1 + len(ordered)) + 1e-9
+    return p_value(np.sort(reference), score) <= rate + 1e-9

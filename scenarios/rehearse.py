@@ -107,14 +107,15 @@ def twins(
     seeds = [arm_seed(scenario.spread.seed, index) for index in places]
     keys = [training_key(r, config, s) for r, s in zip(own, seeds, strict=True)]
     homes = [folder / "twins" / _key(k, scenario.twin, body) for k, body in zip(keys, bodies, strict=True)]
-    missing = [i for i, home in enumerate(homes) if _stored(home) is None]
+    kept = [_stored(home) for home in homes]
+    missing = [i for i, twin in enumerate(kept) if twin is None]
     progress("training", 1.0 - len(missing) / len(bodies))
     if missing:
         jobs = (delayed(_rehearse)(own[i], config, seeds[i], homes[i], scenario, places[i], bodies[i]) for i in missing)
         with Parallel(n_jobs=min(len(missing), cpu_count()), return_as="generator_unordered") as pool:
             for done, _ in enumerate(pool(jobs), start=1):
                 progress("training", 1.0 - (len(missing) - done) / len(bodies))
-    return [load(home) for home in homes]
+    return [twin or load(home) for twin, home in zip(kept, homes, strict=True)]
 
 
 def _rehearse(

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.stats import beta
 
 from fleet.errors import FleetError
+from twin.conformal import p_value
 
 Array = np.ndarray
 
@@ -64,8 +65,7 @@ class ConformalAlarm:
 
     def p_value(self, score: Array) -> Array:
         """Share of jobs that went well among which such a score would be seen, (0, 1]; the alarm is p <= alpha."""
-        below = np.searchsorted(self.scores, np.asarray(score, dtype=float), side="left")
-        return (1.0 + len(self.scores) - below) / (len(self.scores) + 1.0)
+        return p_value(np.array(self.scores), np.asarray(score, dtype=float))
 
     def spread(self, confidence: float = 0.9) -> tuple[float, float]:
         """Between which rates of false alarms this one calibration puts the alarm, for scores without ties.

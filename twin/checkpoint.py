@@ -11,6 +11,7 @@ from safetensors.torch import load_file, save_file
 
 from fleet.errors import CheckpointError
 from fleet.robot import JOINTS
+from twin.card import check_version, read_card, write_card
 from twin.measures import PARTS, Calibration, Features
 from twin.model import LstmVae, TwinConfig, build
 from twin.score import Fit, Twin, net_names
@@ -21,12 +22,6 @@ WEIGHTS = "weights.safetensors"
 CARD = "twin.json"
 REFERENCE = "calibration.reference"
 """Tensor with the features of held-out cool jobs, float64 [job, joint, part]; absent without a calibration."""
-
-
-class _Head(msgspec.Struct):
-    """What must be known before the rest can be read."""
-
-    format: int
 
 
 class _Card(msgspec.Struct, forbid_unknown_fields=True):
@@ -69,9 +64,7 @@ def save(twin: Twin, folder: Path) -> None:
         tensors[REFERENCE] = torch.from_numpy(np.array(twin.calibration.reference.packed, dtype=float))
     save_file(tensors, unfinished)
     unfinished.replace(folder / WEIGHTS)
-    unfinished = folder / f".{CARD}.{os.getpid()}"
-    unfinished.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=2))
-    unfinished.replace(folder / CARD)
+    write_card(card, folder / CARD)
 
 
 def load(folder: Path, *, joints: int = JOINTS) -> Twin:
@@ -81,7 +74,7 @@ def load(folder: Path, *, joints: int = JOINTS) -> Twin:
         CheckpointError: a file is missing or damaged, of another format, for another number of joints, lacks
             tensors, or is not what was saved.
     """
-    card = _read_card(folder / CARD)
+    card = read_card(folder / CARD, _Card, format_=FORMAT, what="twin")
     if len(card.turn_q) != joints:
         raise CheckpointError(f"{folder / CARD}: the twin has {len(card.turn_q)} joints, the arm has {joints}.")
     scaler = Scaler(np.array(card.turn_q), np.array(card.mean), np.array(card.std), np.array(card.still))
@@ -102,25 +95,8 @@ def load(folder: Path, *, joints: int = JOINTS) -> Twin:
         fits=card.fits,
         calibration=calibration,
     )
-    if twin.version != card.version:
-        raise CheckpointError(
-            f"{folder}: the content has changed since it was saved (says version {card.version}, is {twin.version})."
-        )
+    check_version(folder, card.version, twin.version)
     return twin
-
-
-def _read_card(path: Path) -> _Card:
-    try:
-        text = path.read_bytes()
-    except FileNotFoundError:
-        raise CheckpointError(f"No twin in {path.parent}: {path.name} is missing.") from None
-    try:
-        head = msgspec.json.decode(text, type=_Head)
-        if head.format != FORMAT:
-            raise CheckpointError(f"{path}: format {head.format} is not the one read here, {FORMAT}.")
-        return msgspec.json.decode(text, type=_Card)
-    except msgspec.DecodeError as error:  # not JSON, or (ValidationError) JSON of another shape
-        raise CheckpointError(f"{path}: {error}") from error
 
 
 def _read_tensors(path: Path) -> dict[str, torch.Tensor]:

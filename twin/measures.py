@@ -13,6 +13,7 @@ import numpy as np
 from fleet.difficulty import difficulty_of_error
 from fleet.errors import nearest
 from fleet.motion import CHANNELS
+from twin.conformal import p_value
 
 Array = np.ndarray
 
@@ -110,9 +111,8 @@ class Calibration:
         (split conformal; Vovk, Gammerman & Shafer, Algorithmic Learning in a Random World, 2005, prop. 2.8; one-class:
         Bates et al., Annals of Statistics 51, 2023). It says nothing of motions that are new and light.
         """
-        known, asked = self._sorted(score), score_of(features, score, self)
-        at_least = len(known) - np.searchsorted(known, asked - TIE * np.abs(asked), side="left")
-        return (1.0 + at_least) / (len(known) + 1.0)
+        asked = score_of(features, score, self)
+        return p_value(self._sorted(score), asked - TIE * np.abs(asked))
 
     def _sorted(self, score: str) -> Array:
         return np.sort(score_of(self.reference, score, self))

@@ -1,6 +1,5 @@
 """An identified arm in one file, `rc.json`: readable numbers with their intervals, and what they came from."""
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from fleet.errors import CheckpointError
 from fleet.motor import Motors
 from fleet.robot import JOINTS
 from fleet.thermal import thermal_model
+from twin.card import check_version, read_card, write_card
 from twin.heat_log import Source
 from twin.identified import Identified, Parameter
 from twin.rc import RcTwin
@@ -20,12 +20,6 @@ from twin.thermal_values import Body
 
 FORMAT = 1
 CARD = "rc.json"
-
-
-class _Head(msgspec.Struct):
-    """What must be known before the rest can be read."""
-
-    format: int
 
 
 class _Card(msgspec.Struct, forbid_unknown_fields=True):
@@ -73,9 +67,7 @@ def save(identified: Identified, folder: Path, *, saturation: MarginHead | None 
         conductance_w_per_k=list(network.edges(data="conductance_w_per_k")),
         saturation=saturation,
     )
-    unfinished = folder / f".{CARD}.{os.getpid()}"
-    unfinished.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=2))
-    unfinished.replace(folder / CARD)
+    write_card(card, folder / CARD)
 
 
 def load(folder: Path) -> Identified:
@@ -100,17 +92,7 @@ def load_twin(folder: Path) -> RcTwin:
 
 
 def _read(path: Path) -> _Card:
-    try:
-        text = path.read_bytes()
-    except FileNotFoundError:
-        raise CheckpointError(f"No identified arm in {path.parent}: {path.name} is missing.") from None
-    try:
-        head = msgspec.json.decode(text, type=_Head)
-        if head.format != FORMAT:
-            raise CheckpointError(f"{path}: format {head.format} is not the one read here, {FORMAT}.")
-        return msgspec.json.decode(text, type=_Card)
-    except msgspec.DecodeError as error:  # not JSON, or (ValidationError) JSON of another shape
-        raise CheckpointError(f"{path}: {error}") from error
+    return read_card(path, _Card, format_=FORMAT, what="identified arm")
 
 
 def _identified(card: _Card, path: Path) -> Identified:
@@ -141,8 +123,5 @@ def _identified(card: _Card, path: Path) -> Identified:
         seconds=card.seconds,
         data_hash=card.data_hash,
     )
-    if found.version != card.version:
-        raise CheckpointError(
-            f"{path}: the content has changed since it was saved (says version {card.version}, is {found.version})."
-        )
+    check_version(path, card.version, found.version)
     return found

@@ -1,22 +1,16 @@
 """A saturation model in a file beside its twin: `saturation.json`, plain numbers."""
 
-import os
 from pathlib import Path
 
 import msgspec
 
 from fleet.errors import CheckpointError
+from twin.card import check_version, read_card, write_card
 from twin.saturation import CalibratedTwin, SaturationModel
 from twin.score import Twin
 
 FORMAT = 1
 FILE = "saturation.json"
-
-
-class _Head(msgspec.Struct):
-    """What must be known before the rest can be read."""
-
-    format: int
 
 
 class _Card(msgspec.Struct, forbid_unknown_fields=True):
@@ -31,9 +25,7 @@ def save_saturation(model: SaturationModel, folder: Path) -> None:
     """Write the model into the folder of its twin, made if need be. The file appears whole or not at all."""
     folder.mkdir(parents=True, exist_ok=True)
     card = _Card(FORMAT, model.version, model)
-    unfinished = folder / f".{FILE}.{os.getpid()}"
-    unfinished.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=2))
-    unfinished.replace(folder / FILE)
+    write_card(card, folder / FILE)
 
 
 def load_saturation(folder: Path) -> SaturationModel:
@@ -43,22 +35,8 @@ def load_saturation(folder: Path) -> SaturationModel:
         CheckpointError: the file is missing or damaged, of another format, or not what was saved.
     """
     path = folder / FILE
-    try:
-        text = path.read_bytes()
-    except FileNotFoundError:
-        raise CheckpointError(f"No saturation model in {folder}: {FILE} is missing.") from None
-    try:
-        head = msgspec.json.decode(text, type=_Head)
-        if head.format != FORMAT:
-            raise CheckpointError(f"{path}: format {head.format} is not the one read here, {FORMAT}.")
-        card = msgspec.json.decode(text, type=_Card)
-    except msgspec.DecodeError as error:  # not JSON, or (ValidationError) JSON of another shape
-        raise CheckpointError(f"{path}: {error}") from error
-    if card.model.version != card.version:
-        raise CheckpointError(
-            f"{path}: the content has changed since it was saved (says version {card.version}, is "
-            f"{card.model.version})."
-        )
+    card = read_card(path, _Card, format_=FORMAT, what="saturation model")
+    check_version(path, card.version, card.model.version)
     return card.model
 
 
