@@ -31,6 +31,7 @@ NOUNS = {name for name in MODULES if name.count(".") == 1 and name.startswith("f
     "fleet.sim",
     "fleet.env",
     "fleet.bus",
+    "fleet.live",
 }
 
 
@@ -64,6 +65,8 @@ def allowed(importer: str, imported: str) -> bool:
         return below(imported, "fleet.env", "fleet.sim", "fleet.bus.exchange", "fleet.bus.memory") or imported in NOUNS
     if below(importer, "fleet.sim"):
         return below(imported, "fleet.sim") or imported in NOUNS
+    if below(importer, "fleet.live"):
+        return below(imported, "fleet.live", "fleet.bus", "fleet.sim") or imported in NOUNS
     if below(importer, "fleet.bus"):
         return below(imported, "fleet.bus") or imported in NOUNS
     if importer.removeprefix("fleet.") in LAWS:
@@ -76,7 +79,7 @@ def library_allowed(importer: str, library: str) -> bool:
     if library in SIM_LIBRARIES:
         return below(importer, "fleet.sim")
     if library == "zenoh":
-        return importer in ("fleet.bus.session", "fleet.bus.router")
+        return importer in ("fleet.bus.session", "fleet.bus.router", "fleet.bus.link")
     if library == "torch":
         return below(importer, "twin", "agents.learned")
     return True

@@ -1,24 +1,28 @@
 """Names on the wire: every key is built and parsed here, and nowhere else.
 
-`thermofleet/v1/{fleet}/…` with `arm/{arm}/{topic}`, `auction/{auctioneer}/{topic}` and `jobs/submit`. Names of fleets,
-arms and auctioneers are percent-encoded to one chunk, so no name can smuggle a wildcard, a `/` or an `@` into a key
-(a chunk that begins with `@` is matched by no wildcard, and its history is silently lost).
+`thermofleet/v1/{fleet}/…` with `arm/{arm}/{topic}`, `auction/{auctioneer}/{topic}`, `jobs/{topic}` and `clock/now`.
+Names of fleets, arms and auctioneers are percent-encoded to one chunk, so no name can smuggle a wildcard, a `/` or an
+`@` into a key (a chunk that begins with `@` is matched by no wildcard, and its history is silently lost).
 """
 
 from dataclasses import dataclass
 from typing import Literal, get_args
 from urllib.parse import quote, unquote
 
-Role = Literal["arm", "auction", "jobs"]
+Role = Literal["arm", "auction", "jobs", "clock"]
 ArmTopic = Literal["alive", "state", "info", "difficulty", "event", "quote", "award"]
-AuctionTopic = Literal["announce", "result"]
+AuctionTopic = Literal["alive", "announce", "result", "lease", "report"]
+JobsTopic = Literal["submit", "status"]
 
 PREFIX = "thermofleet/v1"
 TOPICS: dict[Role, tuple[str, ...]] = {
     "arm": get_args(ArmTopic),
     "auction": get_args(AuctionTopic),
-    "jobs": ("submit",),
+    "jobs": get_args(JobsTopic),
+    "clock": ("now",),
 }
+NAMELESS: tuple[Role, ...] = ("jobs", "clock")
+"""Roles whose keys belong to nobody."""
 _ROLES: dict[str, Role] = {str(role): role for role in TOPICS}
 
 
@@ -29,7 +33,7 @@ class Key:
     fleet: str
     role: Role
     name: str
-    """Of the arm or the auctioneer; "" for jobs."""
+    """Of the arm or the auctioneer; "" for jobs and clock."""
     topic: str
 
     def __str__(self) -> str:
@@ -43,10 +47,10 @@ class Key:
         if self.topic not in TOPICS[self.role]:
             raise ValueError(f"Unknown topic '{self.topic}' of '{self.role}'. Allowed: {', '.join(TOPICS[self.role])}.")
         start = f"{PREFIX}/{_chunk(self.fleet)}/{self.role}"
-        if self.role != "jobs":
+        if self.role not in NAMELESS:
             return f"{start}/{_chunk(self.name)}/{self.topic}"
         if self.name:
-            raise ValueError(f"The keys under jobs belong to nobody (got the name {self.name!r}).")
+            raise ValueError(f"The keys under {self.role} belong to nobody (got the name {self.name!r}).")
         return f"{start}/{self.topic}"
 
 
@@ -65,9 +69,19 @@ def of_auction(fleet: str, auctioneer: str, topic: AuctionTopic) -> str:
     return str(Key(fleet, "auction", auctioneer, topic))
 
 
-def job_submission(fleet: str) -> str:
-    """Key at which outsiders hand in jobs: `thermofleet/v1/{fleet}/jobs/submit`."""
-    return str(Key(fleet, "jobs", "", "submit"))
+def of_every_auction(fleet: str, topic: AuctionTopic) -> str:
+    """Key expression that matches the topic of every auctioneer of one fleet; never for a put."""
+    return of_auction(fleet, "x", topic).replace("/auction/x/", "/auction/*/")
+
+
+def of_jobs(fleet: str, topic: JobsTopic) -> str:
+    """Key at which outsiders hand in jobs, or ask what became of them: `thermofleet/v1/{fleet}/jobs/{topic}`."""
+    return str(Key(fleet, "jobs", "", topic))
+
+
+def of_clock(fleet: str) -> str:
+    """Key at which the fleet's time is asked for: `thermofleet/v1/{fleet}/clock/now`."""
+    return str(Key(fleet, "clock", "", "now"))
 
 
 def parse(key: str) -> Key:
@@ -79,10 +93,12 @@ def parse(key: str) -> Key:
     parts = key.split("/")
     named = len(parts) == 6
     if "/".join(parts[:2]) != PREFIX or not (named or len(parts) == 5):
-        raise ValueError(f"'{key}' is no key of this bus: expected {PREFIX}/{{fleet}}/{{arm|auction|jobs}}/….")
+        raise ValueError(f"'{key}' is no key of this bus: expected {PREFIX}/{{fleet}}/{{{'|'.join(TOPICS)}}}/….")
     role = _ROLES.get(parts[3])
-    if role is None or named == (role == "jobs"):
-        raise ValueError(f"'{key}' has no such place: expected arm/{{arm}}/…, auction/{{auctioneer}}/… or jobs/submit.")
+    if role is None or named == (role in NAMELESS):
+        raise ValueError(
+            f"'{key}' has no such place: expected arm/{{arm}}/…, auction/{{auctioneer}}/…, jobs/… or clock/now."
+        )
     try:
         names = [unquote(part, errors="strict") for part in (parts[2], parts[4] if named else "")]
     except UnicodeDecodeError as error:

@@ -22,8 +22,8 @@ class MalformedMessage(BusError, ValueError):
     """A word that is not what its key and schema promise; says what is wrong with it."""
 
 
-class State(msgspec.Struct, frozen=True):
-    """How an arm is: telemetry, the newest one counts."""
+class State(msgspec.Struct, frozen=True, omit_defaults=True):
+    """How an arm is: telemetry, the newest one counts. What is measured besides is left out where nobody measures."""
 
     arm: Name
     tick: Tick
@@ -34,11 +34,25 @@ class State(msgspec.Struct, frozen=True):
     """Measured motor temperatures, [joint]."""
     headroom_k: float
     """Warning limit minus hottest motor."""
+    job: str = ""
+    """The job in hand; "" for none."""
+    q: tuple[float, ...] = ()
+    """rad, [joint]."""
+    qd: tuple[float, ...] = ()
+    """rad/s, [joint]."""
+    tau: tuple[float, ...] = ()
+    """N·m at the joint output, [joint]."""
+    current_a: tuple[float, ...] = ()
+    """[joint]."""
 
     def __post_init__(self) -> None:
-        _finite("State", "time_s", (self.time_s,))
-        _finite("State", "temp_c", self.temp_c)
-        _finite("State", "headroom_k", (self.headroom_k,))
+        for name in ("time_s", "headroom_k"):
+            finite("State", name, (getattr(self, name),))
+        for name in ("temp_c", "q", "qd", "tau", "current_a"):
+            values = getattr(self, name)
+            finite("State", name, values)
+            if values and len(values) != len(self.temp_c):
+                raise ValueError(f"State.{name} needs one value per joint ({len(self.temp_c)}, got {len(values)}).")
 
 
 class DifficultyWord(msgspec.Struct, frozen=True):
@@ -57,13 +71,13 @@ class DifficultyWord(msgspec.Struct, frozen=True):
     """Probability that a motor passes the warning limit, [job]; None where not known."""
 
     def __post_init__(self) -> None:
-        _finite("DifficultyWord", "time_s", (self.time_s,))
+        finite("DifficultyWord", "time_s", (self.time_s,))
         for name, values in (("difficulty", self.difficulty), ("p_saturation", self.p_saturation)):
             if len(values) != len(self.jobs):
                 raise ValueError(
                     f"DifficultyWord.{name} needs one value per job ({len(self.jobs)}, got {len(values)})."
                 )
-            _finite("DifficultyWord", name, values)
+            finite("DifficultyWord", name, values)
         if len(set(self.jobs)) != len(self.jobs):
             raise ValueError(f"DifficultyWord.jobs names a job twice (got {self.jobs}).")
 
@@ -77,25 +91,36 @@ class Info(msgspec.Struct, frozen=True):
     """Version of its twin."""
 
 
-Message = State | DifficultyWord | Info
-Kind = TypeVar("Kind", bound=Message)
+Kind = TypeVar("Kind", bound=msgspec.Struct)
 
 _ENCODER = msgspec.json.Encoder()
 
 
-def schema(kind: type[Message]) -> str:
+def schema(kind: type[msgspec.Struct]) -> str:
     """Name and version of a message's schema, for example `thermofleet.State.v1`."""
     return f"thermofleet.{kind.__name__}.v{VERSION}"
 
 
-def encoding(kind: type[Message]) -> str:
+def encoding(kind: type[msgspec.Struct]) -> str:
     """The encoding that travels with every message, for example `application/json;thermofleet.State.v1`."""
     return f"application/json;{schema(kind)}"
 
 
-def encode(message: Message) -> bytes:
+def encode(message: msgspec.Struct) -> bytes:
     """The message as JSON; floats come back exactly."""
     return _ENCODER.encode(message)
+
+
+def read(kind: type[Kind], payload: bytes) -> Kind:
+    """The message of this kind that the payload is.
+
+    Raises:
+        MalformedMessage: not JSON, not of this kind, or not finite.
+    """
+    try:
+        return msgspec.json.decode(payload, type=kind)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise MalformedMessage(f"Not a {schema(kind)}: {error}") from error
 
 
 def decode(kind: type[Kind], payload: bytes, *, arm: str) -> Kind:
@@ -108,15 +133,30 @@ def decode(kind: type[Kind], payload: bytes, *, arm: str) -> Kind:
         MalformedMessage: not JSON, not of this kind, not finite, or not by this arm.
     """
     try:
-        message = msgspec.json.decode(payload, type=kind)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise MalformedMessage(f"Not a {schema(kind)} by '{arm}': {error}") from error
-    if message.arm != arm:
-        raise MalformedMessage(f"A {schema(kind)} under the key of '{arm}' claims to be by '{message.arm}'.")
+        message = read(kind, payload)
+    except MalformedMessage as error:
+        raise MalformedMessage(f"By '{arm}': {error}") from error
+    return spoken_by(message, arm, "arm")
+
+
+def spoken_by(message: Kind, name: str, role: str) -> Kind:
+    """The message, if the arm or auctioneer that it names in its field `role` is the one whose key it came under.
+
+    Raises:
+        MalformedMessage: it speaks for another.
+    """
+    claimed = getattr(message, role)
+    if claimed != name:
+        raise MalformedMessage(f"A {schema(type(message))} under the key of '{name}' claims to be by '{claimed}'.")
     return message
 
 
-def _finite(kind: str, name: str, values: tuple[float | None, ...]) -> None:
+def finite(kind: str, name: str, values: tuple[float | None, ...]) -> None:
+    """Refuse NaN and infinity in a field.
+
+    Raises:
+        ValueError: names the field.
+    """
     for value in values:
         if value is not None and not isfinite(value):
             raise ValueError(f"{kind}.{name} must be finite (got {value}).")

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.bus import keys
-from fleet.bus.keys import TOPICS, Key
+from fleet.bus.keys import NAMELESS, TOPICS, Key
 
 names = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=30)
 wild = st.sampled_from(
@@ -19,7 +19,7 @@ concrete = st.one_of(
             Key,
             fleet=names | wild,
             role=st.just(place[0]),
-            name=st.just("") if place[0] == "jobs" else names | wild,
+            name=st.just("") if place[0] in NAMELESS else names | wild,
             topic=st.just(place[1]),
         )
     )
@@ -52,7 +52,9 @@ def test_different_names_have_different_keys(one, other):
         (keys.of_arm("hall 2", "a/b", "alive"), "thermofleet/v1/hall%202/arm/a%2Fb/alive"),
         (keys.of_every_arm("x", "difficulty"), "thermofleet/v1/x/arm/*/difficulty"),
         (keys.of_auction("f", "@boss", "announce"), "thermofleet/v1/f/auction/%40boss/announce"),
-        (keys.job_submission("f"), "thermofleet/v1/f/jobs/submit"),
+        (keys.of_jobs("f", "submit"), "thermofleet/v1/f/jobs/submit"),
+        (keys.of_clock("f"), "thermofleet/v1/f/clock/now"),
+        (keys.of_every_auction("f", "result"), "thermofleet/v1/f/auction/*/result"),
     ],
 )
 def test_keys_are_written_as_the_design_says(built, written):

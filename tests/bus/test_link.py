@@ -1,0 +1,162 @@
+"""A line to the bus over a real router: what is said arrives, what is asked is answered, and rubbish harms nobody."""
+
+import json
+import time
+from contextlib import ExitStack
+
+import pytest
+
+from fleet.bus import keys
+from fleet.bus.link import Link, Refused
+from fleet.bus.messages import encoding
+from fleet.bus.router import Router
+from fleet.bus.trade import Admission, ArmEvent, Clock, ClockRequest, JobWord, Submission, Submitted
+from fleet.errors import BusError
+
+PATIENCE_S = 10.0
+
+
+@pytest.fixture
+def bus():
+    """A router, and what makes lines to it."""
+    with ExitStack() as stack:
+        router = stack.enter_context(Router())
+        yield lambda **options: stack.enter_context(Link(router.endpoint, "f", **options))
+
+
+def serve(condition, *links):
+    """Serve all links until the condition holds."""
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline_s, "waited in vain"
+        for link in links:
+            link.serve(time.monotonic() + 0.02)
+
+
+def raw(link):
+    """The session beneath, to speak rubbish with."""
+    return link._session
+
+
+def test_an_answer_reaches_the_one_who_asked(bus):
+    asker, teller = bus(), bus()
+    teller.answer(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=12.5, speed=60.0))
+    got = []
+    asker.ask(keys.of_clock("f"), ClockRequest(), Clock, got.append, timeout_s=5.0)
+    serve(lambda: got, asker, teller)
+    assert list(got[0].words.values()) == [Clock(time_s=12.5, speed=60.0)]
+    assert not got[0].refused
+    assert got[0].took_s < PATIENCE_S
+
+
+def test_a_question_to_nobody_is_over_at_once(bus):
+    asker = bus()
+    answers = asker.ask_and_wait(keys.of_clock("f"), ClockRequest(), Clock, timeout_s=30.0)
+    assert not answers.words
+    assert answers.took_s < PATIENCE_S
+
+
+def test_a_refusal_is_told_in_words(bus):
+    asker, teller = bus(), bus()
+
+    def refuse(_):
+        raise Refused("No clock here.")
+
+    teller.answer(keys.of_clock("f"), ClockRequest, refuse)
+    got = []
+    asker.ask(keys.of_clock("f"), ClockRequest(), Clock, got.append, timeout_s=5.0)
+    serve(lambda: got, asker, teller)
+    assert list(got[0].refused.values()) == ["No clock here."]
+
+
+def test_two_that_ask_each_other_do_not_block(bus):
+    one, other = bus(), bus()
+    job = JobWord(name="j", kind="hold", places=("rack",))
+    got = []
+
+    def answered(jobs):
+        other.ask(keys.of_clock("f"), ClockRequest(), Clock, got.append, timeout_s=5.0)
+        return Submitted(auctioneer="a", jobs=tuple(Admission(j.name, True) for j in jobs.jobs))
+
+    other.answer(keys.of_jobs("f", "submit"), Submission, answered)
+    one.answer(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=1.0, speed=1.0))
+    one.ask(keys.of_jobs("f", "submit"), Submission((job,)), Submitted, got.append, timeout_s=5.0)
+    serve(lambda: len(got) == 2, one, other)
+    assert all(len(answers.words) == 1 for answers in got)
+
+
+@pytest.mark.parametrize(
+    ("payload", "said", "complaint"),
+    [
+        (b"{", encoding(ClockRequest), "Not a thermofleet.ClockRequest.v1"),
+        (b"\xff\xfe", encoding(ClockRequest), "Not a thermofleet.ClockRequest.v1"),
+        (b"{}", "application/json;thermofleet.ClockRequest.v9", "encoded as"),
+        (b"{}", "text/plain", "encoded as"),
+    ],
+)
+def test_a_malformed_question_is_answered_with_what_is_wrong(bus, payload, said, complaint):
+    asker, teller = bus(), bus()
+    teller.answer(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=1.0, speed=1.0))
+    replies = []
+    raw(asker).get(keys.of_clock("f"), replies.append, payload=payload, encoding=said, timeout=5.0)
+    serve(lambda: replies, teller)
+    assert complaint in replies[0].err.payload.to_string()
+    assert teller.malformed == 1
+
+
+def test_a_late_joiner_hears_the_last_words(bus):
+    arm = bus()
+    say = arm.publisher(keys.of_arm("f", "arm_0", "event"), ArmEvent, remember=8)
+    for number in range(3):
+        say(ArmEvent(arm="arm_0", number=number, time_s=1.0, kind="finish"))
+    late, heard = bus(), []
+    late.listen(
+        keys.of_every_arm("f", "event"), ArmEvent, lambda arm, word: heard.append((arm, word.number)), remembered=8
+    )
+    serve(lambda: len(heard) == 3, late)
+    assert heard == [("arm_0", 0), ("arm_0", 1), ("arm_0", 2)]
+
+
+def test_words_that_speak_for_another_are_left_out(bus):
+    listener, stranger, heard = bus(), bus(), []
+    listener.listen(keys.of_every_arm("f", "event"), ArmEvent, lambda arm, word: heard.append(arm))
+    lie = ArmEvent(arm="arm_1", number=0, time_s=1.0, kind="finish")
+    truth = ArmEvent(arm="arm_2", number=0, time_s=1.0, kind="finish")
+    stranger.say(keys.of_arm("f", "arm_0", "event"), lie)
+    raw(stranger).put("thermofleet/v1/f/arm/*/event", json.dumps({"arm": "arm_0"}), encoding=encoding(ArmEvent))
+    stranger.say(keys.of_arm("f", "arm_2", "event"), truth)
+    serve(lambda: heard, listener)
+    assert heard == ["arm_2"]
+    assert listener.malformed == 2
+
+
+def test_who_comes_and_goes_is_seen(bus):
+    watcher, seen = bus(), []
+    watcher.watch(keys.of_every_arm("f", "alive"), lambda arm, there: seen.append((arm, there)))
+    arm = bus()
+    arm.alive(keys.of_arm("f", "arm_0", "alive"))
+    serve(lambda: ("arm_0", True) in seen, watcher)
+    arm.close()
+    serve(lambda: ("arm_0", False) in seen, watcher)
+
+
+def test_what_nobody_handles_pushes_out_the_oldest(bus):
+    listener, sender, heard = bus(backlog=10), bus(), []
+    listener.listen(keys.of_every_arm("f", "event"), ArmEvent, lambda arm, word: heard.append(word.number))
+    for number in range(50):
+        sender.say(keys.of_arm("f", "a", "event"), ArmEvent(arm="a", number=number, time_s=0.0, kind="finish"))
+    sender.say(keys.of_arm("f", "a", "event"), ArmEvent(arm="a", number=50, time_s=0.0, kind="finish"))
+    deadline_s = time.monotonic() + PATIENCE_S
+    while listener.overrun < 41 and time.monotonic() < deadline_s:
+        with listener._came:
+            listener._came.wait(0.05)
+    listener.serve()
+    assert heard == list(range(41, 51))
+    assert listener.overrun == 41
+
+
+def test_a_closed_line_says_so(bus):
+    link = bus()
+    link.close()
+    with pytest.raises(BusError, match="not open"):
+        link.say(keys.of_arm("f", "a", "event"), ArmEvent(arm="a", number=0, time_s=0.0, kind="finish"))
