@@ -15,6 +15,8 @@ AuctionTopic = Literal["alive", "announce", "result", "lease", "report"]
 JobsTopic = Literal["submit", "status"]
 
 PREFIX = "thermofleet/v1"
+STATES = f"{PREFIX}/*/arm/*/state"
+"""Key expression that matches the telemetry of every arm of every fleet; for rules, never for a put."""
 TOPICS: dict[Role, tuple[str, ...]] = {
     "arm": get_args(ArmTopic),
     "auction": get_args(AuctionTopic),
@@ -46,9 +48,9 @@ class Key:
             raise ValueError(f"Unknown role '{self.role}' of a key. Allowed: {', '.join(TOPICS)}.")
         if self.topic not in TOPICS[self.role]:
             raise ValueError(f"Unknown topic '{self.topic}' of '{self.role}'. Allowed: {', '.join(TOPICS[self.role])}.")
-        start = f"{PREFIX}/{_chunk(self.fleet)}/{self.role}"
+        start = f"{PREFIX}/{chunk(self.fleet)}/{self.role}"
         if self.role not in NAMELESS:
-            return f"{start}/{_chunk(self.name)}/{self.topic}"
+            return f"{start}/{chunk(self.name)}/{self.topic}"
         if self.name:
             raise ValueError(f"The keys under {self.role} belong to nobody (got the name {self.name!r}).")
         return f"{start}/{self.topic}"
@@ -84,6 +86,25 @@ def of_clock(fleet: str) -> str:
     return str(Key(fleet, "clock", "", "now"))
 
 
+def all_of_fleet(fleet: str) -> str:
+    """Key expression that matches all that is said in one fleet; for subscribers and rules, never for a put."""
+    return f"{PREFIX}/{chunk(fleet)}/**"
+
+
+def all_of(fleet: str, role: Role, name: str = "") -> str:
+    """Key expression that matches all that one arm or auctioneer may say, or all of a role without names."""
+    start = f"{PREFIX}/{chunk(fleet)}/{role}"
+    return f"{start}/**" if role in NAMELESS else f"{start}/{chunk(name)}/**"
+
+
+def caches_of(expression: str) -> str:
+    """Key expression of what advanced publishers and subscribers say to each other under the keys of another one.
+
+    `**` matches no chunk that begins with `@`, so it does not cover these.
+    """
+    return f"{expression}/@adv/**"
+
+
 def parse(key: str) -> Key:
     """The concrete key taken apart, the inverse of `str`.
 
@@ -113,7 +134,12 @@ def parse(key: str) -> Key:
     return parsed
 
 
-def _chunk(name: str) -> str:
+def chunk(name: str) -> str:
+    """The name as one chunk of a key.
+
+    Raises:
+        ValueError: empty, or no valid Unicode.
+    """
     if not name:
         raise ValueError("A name in a key must not be empty.")
     try:

@@ -3,6 +3,7 @@
 import re
 
 import pytest
+import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -43,6 +44,19 @@ def test_every_chunk_is_legal_and_visible_to_wildcards(key):
 @given(concrete, concrete)
 def test_different_names_have_different_keys(one, other):
     assert (str(one) == str(other)) == (one == other)
+
+
+@given(concrete, concrete)
+def test_all_of_one_is_what_it_says_and_no_word_of_another(one, other):
+    """Zenoh itself is asked what the key expressions include."""
+    own = zenoh.KeyExpr(keys.all_of(one.fleet, one.role, one.name))
+    assert own.includes(str(one))
+    assert own.includes(str(other)) == ((one.fleet, one.role, one.name) == (other.fleet, other.role, other.name))
+    assert zenoh.KeyExpr(keys.all_of_fleet(one.fleet)).includes(str(other)) == (one.fleet == other.fleet)
+    assert zenoh.KeyExpr(keys.STATES).includes(str(one)) == ((one.role, one.topic) == ("arm", "state"))
+    cache = f"{one}/@adv/pub/1/2"
+    assert not own.includes(cache)
+    assert zenoh.KeyExpr(keys.caches_of(str(own))).includes(cache)
 
 
 @pytest.mark.parametrize(
