@@ -62,6 +62,14 @@ class LogError(FleetError):
         return type(self), (self.file, self.line, self.reason)
 
 
+class JournalError(FleetError):
+    """A journal cannot be used as it is: damaged, in use by another, or not writable; names the file."""
+
+
+class JournalFull(JournalError):
+    """There is no room for a record; the journal is as it was before."""
+
+
 def nearest(name: str, allowed: Iterable[str]) -> str:
     """The end of an error sentence: the allowed names, and the nearest one if there is one.
 

@@ -1,0 +1,71 @@
+"""The fleet's time: monotone whatever it is corrected by, and right within half a round trip."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet.live.clock import SLEW, FleetClock
+
+speed = st.floats(0.1, 1000.0)
+moment = st.floats(0.0, 1e6)
+span = st.floats(0.0, 1e4)
+corrections = st.lists(st.tuples(span, st.floats(0.0, 5.0), st.floats(0.0, 1e7)), max_size=8)
+
+
+def test_a_minute_at_sixtyfold_speed_is_an_hour():
+    clock = FleetClock(60.0, real_s=1000.0, zero_s=7.0)
+    assert clock.now_s(1000.0) == 7.0
+    assert clock.now_s(1060.0) == 7.0 + 3600.0
+    assert clock.now_s(900.0) == 7.0
+
+
+@given(speed, moment, corrections, st.lists(span, min_size=2, max_size=20))
+def test_it_never_goes_backwards_and_its_rate_is_bounded(speed, start, corrections, spans):
+    clock, real_s = FleetClock(speed, start), start
+    before = clock.now_s(real_s)
+    said_first = before
+    for wait, trip, said in corrections:
+        asked, real_s = real_s + wait, real_s + wait + trip
+        shown = clock.now_s(real_s)
+        assert shown >= before
+        clock = clock.corrected(asked, real_s, said)
+        assert clock.now_s(real_s) == shown  # the correction itself is no jump
+        before = shown
+    for step in spans:
+        later = clock.now_s(real_s + step)
+        passed = speed * ((real_s + step) - real_s)
+        rounding = 1e-9 * (1.0 + abs(later))
+        assert before + (1 - SLEW) * passed - rounding <= later <= before + (1 + SLEW) * passed + rounding
+        before, real_s = later, real_s + step
+    assert before >= said_first
+
+
+@given(speed, span, st.floats(0.0, 5.0), st.floats(0.0, 1.0), st.floats(-100.0, 100.0))
+def test_after_a_correction_it_is_right_within_half_a_round_trip(speed, asked, trip, share, ahead):
+    """The other clock answers at any moment between question and answer; the truth is `speed · real`."""
+    clock = FleetClock(speed, 0.0, speed * 100.0 + speed * ahead)  # the truth is speed · (real + 100)
+    answered = asked + trip
+    said = speed * (asked + share * trip + 100.0)
+    settled = answered + (abs(ahead) + trip) / SLEW + 1.0
+    off = clock.corrected(asked, answered, said).now_s(settled) - speed * (settled + 100.0)
+    assert abs(off) <= speed * trip / 2 + 1e-6 * speed
+    at_once = clock.set_by(asked, answered, said).now_s(answered) - speed * (answered + 100.0)
+    assert abs(at_once) <= speed * trip / 2 + 1e-6 * speed
+
+
+def test_what_is_owed_is_made_up_for_at_a_tenth_of_the_speed():
+    clock = FleetClock(2.0, 0.0, 0.0).corrected(0.0, 0.0, 4.0)
+    assert clock.now_s(10.0) == pytest.approx(20.0 + 2.0)
+    assert clock.now_s(20.0) == pytest.approx(40.0 + 4.0)
+    assert clock.now_s(30.0) == pytest.approx(60.0 + 4.0)
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_speed_must_be_a_positive_number(speed):
+    with pytest.raises(ValueError, match=r"FleetClock\.speed"):
+        FleetClock(speed)
+
+
+def test_an_answer_before_its_question_is_refused():
+    with pytest.raises(ValueError, match="after its question"):
+        FleetClock(1.0).corrected(2.0, 1.0, 0.0)

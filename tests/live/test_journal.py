@@ -1,0 +1,237 @@
+"""A journal gives back what was written, and refuses to guess."""
+
+import errno
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet.errors import FleetError, JournalError, JournalFull
+from fleet.live.journal import Journal
+
+ROOT = Path(__file__).parents[2]
+
+
+class Said(msgspec.Struct, frozen=True, tag="said"):
+    text: str
+
+
+class Counted(msgspec.Struct, frozen=True, tag="counted"):
+    number: int
+    share: float = 0.0
+
+
+KIND = Said | Counted
+record = st.builds(Said, st.text()) | st.builds(
+    Counted, st.integers(-(2**60), 2**60), st.floats(allow_nan=False, allow_infinity=False)
+)
+
+
+def written(path, *batches, **options):
+    """The journal's file with these batches, and its bytes."""
+    with Journal(path, KIND, **options) as journal:
+        for batch in batches:
+            journal.append(*batch)
+    return path.read_bytes()
+
+
+def read(path):
+    with Journal(path, KIND) as journal:
+        return list(journal.replay())
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.lists(record, max_size=4), max_size=6), st.lists(record, max_size=3))
+def test_what_is_written_comes_back_in_order(tmp_path_factory, batches, later):
+    path = tmp_path_factory.mktemp("journal") / "deep" / "arm.jsonl"
+    quick = {"sync": lambda file: None}
+    written(path, *batches, **quick)
+    written(path, later, **quick)
+    assert read(path) == [each for batch in [*batches, later] for each in batch]
+
+
+def test_every_line_is_json_for_anybody(tmp_path):
+    lines = written(tmp_path / "j", [Said("a\nb"), Counted(1)], [Said("ä")]).splitlines()
+    assert [msgspec.json.decode(line)["records"] for line in lines] == [
+        [{"type": "said", "text": "a\nb"}, {"type": "counted", "number": 1, "share": 0.0}],
+        [{"type": "said", "text": "ä"}],
+    ]
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_a_torn_last_line_is_taken_away_and_said(tmp_path_factory, data):
+    path = tmp_path_factory.mktemp("journal") / "j"
+    first = len(written(path, [Said("kept")]))
+    whole = written(path, [Said("torn"), Counted(7)])
+    cut = data.draw(st.integers(first + 1, len(whole) - 1))
+    path.write_bytes(whole[:cut])
+    with Journal(path, KIND) as journal:
+        assert journal.torn == cut - first
+        assert list(journal.replay()) == [Said("kept")]
+        journal.append(Said("after"))
+    assert path.read_bytes()[:first] == whole[:first]
+    assert read(path) == [Said("kept"), Said("after")]
+
+
+def test_a_torn_line_is_logged(tmp_path, caplog):
+    path = tmp_path / "j"
+    path.write_bytes(written(path, [Said("a")]) + b'{"crc":"')
+    read(path)
+    assert "torn (8 bytes)" in caplog.text
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.data())
+def test_damage_is_refused_with_file_and_line(tmp_path_factory, data):
+    path = tmp_path_factory.mktemp("journal") / "j"
+    whole = written(path, [Said("one")], [Said("two"), Counted(2)], [Said("three")])
+    where = data.draw(st.integers(0, len(whole) - 2))
+    byte = data.draw(st.integers(0, 255).filter(lambda b: b != whole[where]))
+    path.write_bytes(whole[:where] + bytes([byte]) + whole[where + 1 :])
+    line = whole[:where].count(b"\n") + 1
+    with pytest.raises(JournalError, match=rf"{path}, line {line}: damaged"):
+        read(path)
+
+
+def test_a_line_that_is_missing_from_the_middle_of_another_is_damage(tmp_path):
+    path = tmp_path / "j"
+    lines = written(path, [Said("one")], [Said("two")]).splitlines(keepends=True)
+    path.write_bytes(lines[0] + lines[1][:9] + b"\n" + lines[1])
+    with pytest.raises(JournalError, match="line 2: damaged"):
+        read(path)
+
+
+def test_records_of_another_version_are_refused_with_their_line(tmp_path):
+    path = tmp_path / "j"
+    written(path, [Said("one")], [Counted(2)])
+    with pytest.raises(JournalError, match="line 2: no record of this version"), Journal(path, Said):
+        pass
+
+
+def test_two_at_one_journal_are_refused_and_the_next_is_not(tmp_path):
+    path = tmp_path / "j"
+    program = f"""
+from pathlib import Path
+from fleet.live.journal import Journal
+from msgspec import Struct
+from fleet.errors import JournalError
+try:
+    Journal(Path({str(path)!r}), Struct).open()
+except JournalError as error:
+    print(error)
+"""
+    ask = [sys.executable, "-c", program]
+    with Journal(path, KIND):
+        with pytest.raises(JournalError, match="in use by another"):
+            Journal(path, KIND).open()
+        said = subprocess.run(ask, capture_output=True, text=True, check=True, timeout=60, cwd=ROOT)
+        assert "in use by another process" in said.stdout
+    assert subprocess.run(ask, capture_output=True, text=True, check=True, timeout=60, cwd=ROOT).stdout == ""
+
+
+def test_nothing_is_told_before_it_is_on_disk(tmp_path):
+    """The last fsync of an append comes after its last byte."""
+    sizes = []
+    with Journal(tmp_path / "j", KIND, sync=lambda file: sizes.append(os.fstat(file).st_size)) as journal:
+        del sizes[:]
+        journal.append(Said("a"), Said("b"))
+        assert sizes == [journal.path.stat().st_size]
+
+
+class ShortOfRoom:
+    """An `os.write` that takes a few bytes more, and then finds the disk full."""
+
+    def __init__(self, room):
+        self.room, self.write = room, os.write
+
+    def __call__(self, file, data):
+        if not self.room:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        taken = self.write(file, bytes(data[: self.room]))
+        self.room -= taken
+        return taken
+
+
+@pytest.mark.parametrize("room", [0, 1, 20])
+def test_a_full_disk_leaves_the_file_whole(tmp_path, monkeypatch, room):
+    path = tmp_path / "j"
+    before = written(path, [Said("kept")])
+    with Journal(path, KIND) as journal:
+        with monkeypatch.context() as full:
+            full.setattr(os, "write", ShortOfRoom(room))
+            with pytest.raises(JournalFull, match="has no room for more: No space left") as raised:
+                journal.append(Said("too much"))
+        assert isinstance(raised.value, FleetError)
+        assert path.read_bytes() == before
+        journal.append(Said("room again"))
+        assert list(journal.replay()) == [Said("kept"), Said("room again")]
+
+
+def test_a_real_limit_of_the_file_size_leaves_the_file_whole(tmp_path):
+    """The kernel's own refusal: RLIMIT_FSIZE cuts a write short, then refuses the rest."""
+    program = f"""
+import resource, sys
+from pathlib import Path
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from test_journal import KIND, Said
+from fleet.errors import JournalFull
+from fleet.live.journal import Journal
+with Journal(Path({str(tmp_path / "j")!r}), KIND) as journal:
+    journal.append(Said("kept"))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (journal.path.stat().st_size + 10,) * 2)
+    try:
+        journal.append(Said("x" * 100))
+    except JournalFull as full:
+        print("full")
+    print(list(journal.replay()), journal.path.read_bytes().count(b"xx"))
+"""
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
+    assert said.stdout.splitlines() == ["full", "[Said(text='kept')] 0"]
+
+
+def test_after_a_failed_sync_nothing_more_is_promised(tmp_path):
+    path = tmp_path / "j"
+    before = written(path, [Said("kept")])
+
+    def fail(file):
+        raise OSError(errno.EIO, "Input/output error")
+
+    with Journal(path, KIND, sync=fail) as journal:
+        for said in ("cannot be written: Input/output error", "must be opened anew"):
+            with pytest.raises(JournalError, match=said):
+                journal.append(Said("lost"))
+    assert path.read_bytes() == before
+
+
+def test_a_rewritten_journal_holds_only_what_it_was_given(tmp_path, monkeypatch):
+    path = tmp_path / "j"
+    written(path, *[[Counted(n)] for n in range(50)])
+    with Journal(path, KIND) as journal:
+        journal.rewrite(Counted(49))
+        journal.append(Said("next"))
+        assert list(journal.replay()) == [Counted(49), Said("next")]
+        with monkeypatch.context() as full:
+            full.setattr(os, "write", ShortOfRoom(5))
+            with pytest.raises(JournalFull):
+                journal.rewrite(Said("too much"))
+        journal.append(Said("still"))
+    assert read(path) == [Counted(49), Said("next"), Said("still")]
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["j", "j.lock"]
+
+
+def test_a_closed_journal_says_so(tmp_path):
+    journal = Journal(tmp_path / "j", KIND)
+    with pytest.raises(JournalError, match="not open"):
+        journal.append(Said("a"))
+
+
+def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(JournalError, match="cannot be opened"):
+        Journal(tmp_path / "file" / "j", KIND).open()
