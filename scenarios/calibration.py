@@ -29,8 +29,10 @@ from twin.score import Twin
 
 log = logging.getLogger(__name__)
 
-RECIPE = 1
+RECIPE = 2
 """Raised whenever the same twin and scenario would rehearse other jobs or fit another model."""
+PAST = 4
+"""Keeps this draw apart from those of `scenarios.rehearse` for the same arm."""
 REHEARSED = 300
 """Past jobs of each arm: also one that hardly anything heats then has some in which a motor passed the limit."""
 OWN = 0.5
@@ -88,7 +90,7 @@ def rehearse_saturation(
         plans: How it would do the scenario's work; `OWN` of the jobs are drawn from all variants.
     """
     robot, motors, thermal = body
-    rng = np.random.default_rng(np.random.SeedSequence([scenario.spread.seed, index], spawn_key=(2,)))
+    rng = np.random.default_rng(np.random.SeedSequence([scenario.spread.seed, index], spawn_key=(PAST,)))
     every = [plan for variants in plans.values() for plan in variants]
     count = round(OWN * jobs) if every else 0
     own = [every[i] for i in rng.integers(max(len(every), 1), size=count)]

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from fleet.errors import FleetError, nearest
+from fleet.errors import FleetError
 from fleet.motion import Plan
 from fleet.sim.world import Arm
 from scenarios.build import Progress, body_of, cache_folder, plan_works, quiet
@@ -43,11 +43,8 @@ def known_arm(
     Raises:
         FleetError: no such arm, a twin of another arm, or no motion of this arm stays cool.
     """
-    names = [spec.name for spec in scenario.arms]
-    name = names[0] if name is None else name
-    if name not in names:
-        raise FleetError(f"No arm '{name}' in {scenario.name}{nearest(name, names)}")
-    index = names.index(name)
+    name = scenario.arms[0].name if name is None else name
+    index = scenario.index_of(name)
     if twin is not None and twin.arm != name:
         raise FleetError(f"This is the twin of arm '{twin.arm}', not of '{name}'; give the one that belongs to it.")
     body, folder = body_of(scenario, index), cache or cache_folder()

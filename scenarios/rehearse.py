@@ -29,17 +29,17 @@ from twin.train import train, training_key
 Array = np.ndarray
 log = logging.getLogger(__name__)
 
-REHEARSAL_VERSION = 2
+REHEARSAL_VERSION = 3
 """Raised whenever the same arm would be taught another thing, or told another thing is usual."""
 
 
-def cool_records(plans: Mapping[Work, tuple[Plan, ...]], body: Body, scenario: Scenario) -> list[Array]:
-    """Phases [time, 3, joint] of the plans that stay cool when repeated over the whole horizon from a cold start.
+def cool_motion(plans: Mapping[Work, tuple[Plan, ...]], body: Body, scenario: Scenario) -> tuple[Plan, ...]:
+    """The plans that stay cool when repeated over the whole horizon from a cold start.
 
     Raises:
         FleetError: none does.
     """
-    return records(some_cool_plans([plan for variants in plans.values() for plan in variants], body, scenario))
+    return some_cool_plans([plan for variants in plans.values() for plan in variants], body, scenario)
 
 
 def explored_records(scenario: Scenario, index: int, body: Body) -> list[Array]:
@@ -51,7 +51,7 @@ def explored_records(scenario: Scenario, index: int, body: Body) -> list[Array]:
 
 
 def taught(
-    own: Sequence[Array],
+    own: Sequence[Plan],
     config: TwinConfig,
     seed: np.random.SeedSequence,
     *,
@@ -60,28 +60,39 @@ def taught(
     body: Body,
     progress: Callable[[float], None] | None = None,
 ) -> Twin:
-    """The twin of an arm: trained on its own cool motion and its exploration, and told what is usual by more of that.
+    """The twin of an arm: trained on its own cool motion and its exploration, and told what is usual.
+
+    Usual is fresh exploration, on which it was not trained, and as much of its own work, on which it was: that comes
+    again as it is, and measured against slow exploration alone a fifth of fast cool work would count as unusual.
 
     Args:
-        own: As `cool_records` gives it.
+        own: As `cool_motion` gives it.
         index: Which arm of the scenario it is.
         progress: Told the share of the training that is done.
     """
-    learned = [*own, *explored_records(scenario, index, body)]
+    learned = [*records(own), *explored_records(scenario, index, body)]
     twin = train(learned, config, seed, arm=body[0].name, progress=progress)
-    held_out = _explored(scenario, index, body, HELD_OUT)
-    return twin.calibrated([(plan, 1) for plan in held_out]) if len(held_out) >= FEWEST_HELD_OUT else twin
+    fresh = _explored(scenario, index, body, HELD_OUT)
+    if len(fresh) < FEWEST_HELD_OUT:
+        return twin
+    rng = np.random.default_rng(_draw_seed(scenario, index, USUAL))
+    chosen = rng.choice(len(own), size=min(len(own), len(fresh)), replace=False)
+    return twin.calibrated([(plan, 1) for plan in (*fresh, *(own[i] for i in chosen))])
 
 
-EXPLORATION, HELD_OUT = 1, 2
+EXPLORATION, HELD_OUT, USUAL = 1, 2, 3
 """Keep these draws apart from others of the same arm."""
 FEWEST_HELD_OUT = 8
 """With fewer held-out motions a twin stays without a calibration."""
 
 
 def _explored(scenario: Scenario, index: int, body: Body, draw: int) -> tuple[Plan, ...]:
-    rng = np.random.default_rng(np.random.SeedSequence([scenario.spread.seed, index], spawn_key=(draw,)))
+    rng = np.random.default_rng(_draw_seed(scenario, index, draw))
     return cool_plans(light_jobs(body[0], scenario.twin.exploration, rng), body, scenario.twin)
+
+
+def _draw_seed(scenario: Scenario, index: int, draw: int) -> np.random.SeedSequence:
+    return np.random.SeedSequence([scenario.spread.seed, index], spawn_key=(draw,))
 
 
 def twins(
@@ -102,10 +113,10 @@ def twins(
         FleetError: an arm has no motion that stays cool, so it cannot know what is normal.
     """
     config = TwinConfig.quick() if scenario.twin.size == "quick" else TwinConfig()
-    own = [cool_records(possible, body, scenario) for body, possible in zip(bodies, plans, strict=True)]
+    own = [cool_motion(possible, body, scenario) for body, possible in zip(bodies, plans, strict=True)]
     places = range(len(bodies)) if arms is None else arms
     seeds = [arm_seed(scenario.spread.seed, index) for index in places]
-    keys = [training_key(r, config, s) for r, s in zip(own, seeds, strict=True)]
+    keys = [training_key(records(o), config, s) for o, s in zip(own, seeds, strict=True)]
     homes = [folder / "twins" / _key(k, scenario.twin, body) for k, body in zip(keys, bodies, strict=True)]
     kept = [_stored(home) for home in homes]
     missing = [i for i, twin in enumerate(kept) if twin is None]
@@ -119,7 +130,7 @@ def twins(
 
 
 def _rehearse(
-    own: list[Array],
+    own: Sequence[Plan],
     config: TwinConfig,
     seed: np.random.SeedSequence,
     home: Path,

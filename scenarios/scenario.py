@@ -7,6 +7,7 @@ import numpy as np
 
 from fleet.arrivals import Arrivals, Batch, Poisson, Trace
 from fleet.env.reward import RewardWeights
+from fleet.errors import FleetError, nearest
 from fleet.job import Kind, Place
 from fleet.robot import Cooling, Mount, Robot, ThermalLimits
 
@@ -271,6 +272,17 @@ class Scenario:
     def ticks(self) -> int:
         """Decision intervals in the shift."""
         return max(1, round(self.horizon_s / self.decision_interval_s))
+
+    def index_of(self, arm: str) -> int:
+        """Where an arm stands in `arms`.
+
+        Raises:
+            FleetError: there is no such arm; names those there are.
+        """
+        names = [spec.name for spec in self.arms]
+        if arm not in names:
+            raise FleetError(f"No arm '{arm}' in {self.name}{nearest(arm, names)}")
+        return names.index(arm)
 
 
 def _list(names: set[str]) -> str:

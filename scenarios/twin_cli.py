@@ -86,7 +86,7 @@ def train_command(
     }
     given = {name: value for name, value in fields.items() if value is not None}
     from scenarios.folder import check_free, new_folder
-    from scenarios.twin_training import TWINS, arm_index, save_twins, train_arms, train_log
+    from scenarios.twin_training import TWINS, save_twins, train_arms, train_log
 
     check_free(out, overwrite=overwrite, kind=TWINS)
     with in_options(), progress_bar() as progress, new_folder(out, overwrite=overwrite, kind=TWINS) as folder:
@@ -97,7 +97,7 @@ def train_command(
         else:
             of_scenario = load(str(chosen))
             config = config_of(size or of_scenario.twin.size, given)
-            arms = range(len(of_scenario.arms)) if arm is None else [arm_index(of_scenario, arm)]
+            arms = range(len(of_scenario.arms)) if arm is None else [of_scenario.index_of(arm)]
             twins = train_arms(of_scenario, list(arms), config, seed, progress)
             source = f"scenario {of_scenario.name}"
         card = save_twins(twins, folder, source)
@@ -187,7 +187,6 @@ def report_command(
     from scenarios.folder import check_free, new_folder
     from scenarios.twin_lab import QUICK, Size
     from scenarios.twin_report import REPORT, report_logs, report_scenario, write
-    from scenarios.twin_training import arm_index
 
     check_free(out, overwrite=overwrite, kind=REPORT)
     command = f"thermofleet twin report {f'--log {log.name}' if log else chosen} --seeds {seeds}{' --quick' * quick}"
@@ -198,7 +197,7 @@ def report_command(
             title = f"What a twin makes of the logs in {log.name}"
         else:
             of_scenario = load(str(chosen))
-            index = 0 if arm is None else arm_index(of_scenario, arm)
+            index = 0 if arm is None else of_scenario.index_of(arm)
             sections = report_scenario(of_scenario, index, size=QUICK if quick else Size(), **told)
             title = f"The twin of {of_scenario.arms[index].name} in {of_scenario.name}"
         card = write(sections, folder, title=title, lead=("Every section says what was found and how.",))

@@ -14,7 +14,6 @@ from fleet.motion import Plan
 from scenarios.build import Progress, body_of, cache_folder, plan_works, quiet
 from scenarios.jobs import all_works
 from scenarios.scenario import Scenario
-from scenarios.twin_training import arm_index
 from twin.recording import Recording
 from twin.score import Twin
 from twin.stretches import Stretch, stretches
@@ -35,7 +34,7 @@ def job_rows(twin: Twin, scenario: Scenario, progress: Progress = quiet) -> list
     Raises:
         FleetError: the scenario has no arm of the twin's name.
     """
-    robot, _, _ = body_of(scenario, arm_index(scenario, twin.arm))
+    robot, _, _ = body_of(scenario, scenario.index_of(twin.arm))
     plans, _ = plan_works(
         robot, all_works(scenario), scenario, cache_folder(), lambda share: progress("planning", share)
     )

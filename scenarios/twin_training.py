@@ -15,7 +15,7 @@ from fleet.errors import CheckpointError, FleetError, nearest
 from scenarios.build import Progress, body_of, cache_folder, plan_works, quiet
 from scenarios.folder import Kind
 from scenarios.jobs import rehearsal_works
-from scenarios.rehearse import arm_seed, cool_records, taught
+from scenarios.rehearse import arm_seed, cool_motion, taught
 from scenarios.scenario import Scenario
 from twin.checkpoint import CARD as TWIN_CARD
 from twin.checkpoint import load, save
@@ -30,18 +30,6 @@ Array = np.ndarray
 CARD = "twins.json"
 TWINS = Kind(what="training", card=CARD, holds=(CARD, "*.twin"))
 """A folder of twins: one folder `ARM.twin` each, and the card with their quality."""
-
-
-def arm_index(scenario: Scenario, name: str) -> int:
-    """Where an arm stands in its scenario.
-
-    Raises:
-        FleetError: it has no such arm; names those it has.
-    """
-    names = [arm.name for arm in scenario.arms]
-    if name not in names:
-        raise FleetError(f"No arm '{name}' in {scenario.name}{nearest(name, names)}")
-    return names.index(name)
 
 
 def train_arms(
@@ -61,9 +49,12 @@ def train_arms(
     bodies = [body_of(scenario, index) for index in arms]
     lessons = []
     for done, (index, body) in enumerate(zip(arms, bodies, strict=True)):
-        share = lambda s, done=done: progress("planning", (done + s) / len(arms))  # noqa: E731
+
+        def share(s: float, done: int = done) -> None:
+            progress("planning", (done + s) / len(arms))
+
         possible, _ = plan_works(body[0], rehearsal_works(scenario), scenario, cache_folder(), share)
-        own = cool_records(possible, body, scenario)
+        own = cool_motion(possible, body, scenario)
         lessons.append((own, config, arm_seed(scenario.spread.seed if seed is None else seed, index)))
     places = [{"scenario": scenario, "index": index, "body": body} for index, body in zip(arms, bodies, strict=True)]
     progress("training", 0.0)

@@ -109,7 +109,7 @@ def test_an_arm_that_does_not_explore_learns_from_its_work_alone(plans, scenario
     assert rehearse.explored_records(none, 0, body) == []
     (twin,) = rehearse.twins(none, [body], [plans], tmp_path, lambda *tell: None)
     (explorer,) = rehearse.twins(scenario, [body], [plans], tmp_path, lambda *tell: None)
-    own = rehearse.cool_records(plans, body, none)
+    own = records(rehearse.cool_motion(plans, body, none))
     seed = np.random.SeedSequence([none.spread.seed, 0])
     assert twin.data_hash == train(own, TINY, seed, arm="arm_0").data_hash
     both = [*own, *rehearse.explored_records(scenario, 0, body)]
@@ -133,19 +133,34 @@ def test_other_motors_are_another_twin_since_other_exploration_stays_cool(plans,
     assert len(list((tmp_path / "twins").iterdir())) == 2
 
 
-def test_a_twin_is_told_what_is_usual_by_cool_motion_that_it_was_not_trained_on(scenario, monkeypatch):
-    """Second method: train on what was handed to the training, and calibrate by hand with what was not."""
+def test_a_twin_is_told_what_is_usual_by_fresh_motion_and_as_much_of_its_own(plans, scenario, monkeypatch):
+    """Second method: train on what was handed to the training, and calibrate by hand."""
     explores = replace(scenario, twin=replace(scenario.twin, exploration=9))
     (body,) = bodies(1)
     drawn = []
     monkeypatch.setattr(rehearse, "light_jobs", lambda *some: drawn.append(light_jobs(*some)) or drawn[-1])
     seed = rehearse.arm_seed(0, 0)
-    twin = rehearse.taught([], TINY, seed, scenario=explores, index=0, body=body)
+    own = [plan for variants in plans.values() for plan in variants]
+    assert 0 < len(own) < 9  # all of it is chosen
+    twin = rehearse.taught(own, TINY, seed, scenario=explores, index=0, body=body)
     learned, held_out = drawn
     assert not {plan.cycle.profile.tobytes() for plan in learned} & {plan.cycle.profile.tobytes() for plan in held_out}
-    untold = train(records(learned), TINY, seed, arm="arm_0")
+    untold = train([*records(own), *records(learned)], TINY, seed, arm="arm_0")
     assert untold.calibration is None
-    assert twin.version == untold.calibrated([(plan, 1) for plan in held_out]).version
+    told = twin.calibration.reference.packed
+    assert len(told) == len(held_out) + len(own)
+    by_hand = untold.features([*held_out, *own], [1] * len(told)).packed
+    assert np.allclose(np.sort(told, axis=0), np.sort(by_hand, axis=0), rtol=1e-4, atol=1e-5)
+
+
+def test_of_much_own_work_only_as_much_is_usual_as_there_is_fresh_motion(plans, scenario):
+    explores = replace(scenario, twin=replace(scenario.twin, exploration=9))
+    (body,) = bodies(1)
+    own = [plan for variants in plans.values() for plan in variants] * 8
+    twin = rehearse.taught(own, TINY, rehearse.arm_seed(0, 0), scenario=explores, index=0, body=body)
+    fresh = len(rehearse._explored(explores, 0, body, rehearse.HELD_OUT))
+    assert len(own) > fresh
+    assert len(twin.calibration.reference.packed) == 2 * fresh
 
 
 def test_too_few_held_out_motions_leave_a_twin_uncalibrated(scenario):

@@ -41,7 +41,7 @@ def test_a_twin_trained_by_hand_is_that_of_the_fleet(scenario, fleet):
     assert right.arm == "right"
     assert [twin.version for twin in fleet][1] == right.version
     assert (right.data_hash, right.seed) == (fleet[1].data_hash, fleet[1].seed)
-    assert quality(right)["calibrated_on"] == 9
+    assert 9 < quality(right)["calibrated_on"] <= 18  # nine fresh motions, and at most as much of its own work
     assert [stage for stage, _ in told] == sorted(stage for stage, _ in told)
     assert told[-1] == ("training", 1.0)
 
