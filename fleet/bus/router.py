@@ -1,6 +1,7 @@
 """The router of a fleet, and the transport settings that every session on the bus shares.
 
-Loopback only: nothing on this bus proves who it is, so nothing outside this machine may reach it.
+Without TLS nothing on this bus proves who it is, so nothing outside this machine may reach it: loopback only. With TLS
+both ends of every line prove who they are, and the router keeps the rules of its roster.
 """
 
 import ipaddress
@@ -8,10 +9,15 @@ import json
 import logging
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Self
 
 import zenoh
 
+from fleet.bus import keys
+from fleet.bus.keyring import read_roster
+from fleet.bus.roster import access_control
+from fleet.bus.security import Tls, why_not
 from fleet.errors import BusError
 
 _LOG = logging.getLogger(__name__)
@@ -19,28 +25,63 @@ _LOG = logging.getLogger(__name__)
 LEASE_MS = 2000
 """After this long without a sign of life a session counts as gone."""
 _ATTEMPTS = 3
-_ENDPOINT = re.compile(r"tcp/(?:\[(?P<v6>[0-9A-Fa-f:.]+)\]|(?P<host>[^:\[\]/?#]+)):(?P<port>\d{1,5})")
+_ENDPOINT = re.compile(r"(?P<how>tcp|tls)/(?:\[(?P<v6>[0-9A-Fa-f:.]+)\]|(?P<host>[^:\[\]/?#]+)):(?P<port>\d{1,5})")
+_ANY_ADDRESS = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}
+"""Addresses that mean every one of this machine, and how this machine itself reaches them."""
 
-_TRANSPORT: Mapping[str, Any] = {
+_SCOUTING: Mapping[str, Any] = {
     # A router would otherwise wait half a second for others to be found.
-    "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-    "transport": {
-        "shared_memory": {"enabled": False},
-        "link": {
-            "tx": {
-                "lease": LEASE_MS,
-                "queue": {
-                    "size": {"data": 16},
-                    # Microseconds. A burst of a whole fleet on a busy machine is no reason to drop; a stuck peer is.
-                    "congestion_control": {
-                        "drop": {"wait_before_drop": 20_000},
-                        "block": {"wait_before_close": 1_000_000},
-                    },
-                },
-            }
-        },
+    "delay": 0,
+    "multicast": {"enabled": False},
+    "gossip": {"enabled": False},
+}
+_SENDING: Mapping[str, Any] = {
+    "lease": LEASE_MS,
+    "queue": {
+        "size": {"data": 16},
+        # Microseconds. A burst of a whole fleet on a busy machine is no reason to drop; a stuck peer is.
+        "congestion_control": {"drop": {"wait_before_drop": 20_000}, "block": {"wait_before_close": 1_000_000}},
     },
 }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """What a router lets through of what each session sends; the rest is dropped without a word."""
+
+    message_bytes: int = 65_536
+    """Largest payload with its attachment, of a word, a question or an answer."""
+    state_hz: float | None = None
+    """Telemetry words a second, real time, of each session; None for any number. A steady stream needs a limit of
+    twice its rate: what counts is the gap between two words, which varies."""
+
+    def __post_init__(self) -> None:
+        if self.message_bytes < 1:
+            raise ValueError(f"Limits.message_bytes must be >= 1 (got {self.message_bytes}).")
+        if self.state_hz is not None and not 0 < self.state_hz < 1e6:
+            raise ValueError(f"Limits.state_hz must be > 0, or None (got {self.state_hz}).")
+
+    def settings(self) -> dict[str, Any]:
+        """In the words of Zenoh's configuration."""
+        size = {
+            "flows": ["ingress"],
+            "messages": ["put", "delete", "query", "reply"],
+            "key_exprs": ["**", keys.caches_of("**")],
+            "size_limit": self.message_bytes,
+        }
+        if self.state_hz is None:
+            return {"low_pass_filter": [size]}
+        rate = {
+            "flows": ["ingress"],
+            "messages": ["put", "delete"],
+            "rules": [{"key_expr": keys.STATES, "freq": self.state_hz}],
+        }
+        return {"low_pass_filter": [size], "downsampling": [rate]}
+
+    @property
+    def assembled_bytes(self) -> int:
+        """Of a message in pieces, what the router keeps in memory at most before it judges the whole."""
+        return 2 * self.message_bytes + 65_536
 
 
 def loopback(endpoint: str) -> str:
@@ -50,7 +91,7 @@ def loopback(endpoint: str) -> str:
         BusError: anything else, with the reason.
     """
     match = _ENDPOINT.fullmatch(endpoint)
-    if match is None or not 0 <= int(match["port"]) <= 65535:
+    if match is None or match["how"] != "tcp" or not 0 <= int(match["port"]) <= 65535:
         raise BusError(
             f"'{endpoint}' is no endpoint of this bus. Expected tcp/<address>:<port>, as tcp/127.0.0.1:7447."
         )
@@ -65,27 +106,56 @@ def loopback(endpoint: str) -> str:
         ) from error
     if not address.is_loopback:
         raise BusError(
-            f"Endpoint '{endpoint}' is not on loopback. The bus has no authentication, so whoever reaches it could "
-            "speak for any arm; it stays on 127.0.0.1, [::1] or localhost."
+            f"Endpoint '{endpoint}' is not on loopback. Without TLS the bus has no authentication, so whoever reaches "
+            "it could speak for any arm; it stays on 127.0.0.1, [::1] or localhost. With the certificates of "
+            "thermofleet keys, tls/ may lead elsewhere."
         )
     return endpoint
 
 
-def open_client(endpoint: str, *, timeout_s: float) -> zenoh.Session:
-    """A client session on the router at `endpoint`.
+def reachable(endpoint: str, tls: Tls | None = None) -> str:
+    """The endpoint, when a session may connect to it: on loopback without TLS, anywhere with it.
 
     Raises:
-        BusError: the endpoint is not on loopback, or no router answered within `timeout_s`.
+        BusError: anything else, with the reason.
+    """
+    match = _ENDPOINT.fullmatch(endpoint)
+    if tls is None and match is not None and match["how"] == "tls":
+        raise BusError(f"Endpoint '{endpoint}' needs a certificate: the folder and the name of a participant.")
+    if tls is None:
+        return loopback(endpoint)
+    if match is None or match["how"] != "tls" or not 0 < int(match["port"]) <= 65535:
+        raise BusError(
+            f"'{endpoint}' is no endpoint to show the certificate of '{tls.name}' at. Expected tls/<address>:<port>, "
+            "as tls/127.0.0.1:7447."
+        )
+    return endpoint
+
+
+def open_client(endpoint: str, *, timeout_s: float, tls: Tls | None = None) -> zenoh.Session:
+    """A client session on the router at `endpoint`.
+
+    Args:
+        tls: Who connects, for an endpoint that begins with `tls/`.
+
+    Raises:
+        BusError: the endpoint is not on loopback and has no TLS, the certificate is not good, or no router answered
+            within `timeout_s`.
     """
     connect = {
-        "endpoints": [loopback(endpoint)],
+        "endpoints": [reachable(endpoint, tls)],
         "timeout_ms": max(1, round(1000 * timeout_s)),
         "retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
     }
+    link = {"tx": _SENDING}
+    if tls is not None:
+        tls.check(serves=False)
+        link["tls"] = tls.link(serves=False)
     try:
-        return zenoh.open(_config({"mode": "client", "connect": connect}))
+        return zenoh.open(_config({"mode": "client", "connect": connect}, link))
     except zenoh.ZError as error:
-        raise BusError(f"No router answered at {endpoint} within {timeout_s} s ({_first(error)}).") from error
+        reason = why_not(*_address(endpoint), tls) or _first(error)
+        raise BusError(f"No router answered at {endpoint} within {timeout_s} s ({reason}).") from error
 
 
 class Router:
@@ -94,15 +164,30 @@ class Router:
     `with Router() as router:` listens on a free port of 127.0.0.1 until the end of the block.
     """
 
-    def __init__(self, port: int = 0) -> None:
+    def __init__(
+        self, port: int = 0, *, host: str = "127.0.0.1", tls: Tls | None = None, limits: Limits | None = None
+    ) -> None:
         """Prepare a router.
 
         Args:
-            port: TCP port on 127.0.0.1; 0 lets the system choose a free one.
+            port: TCP port; 0 lets the system choose a free one.
+            host: Address to listen on; without TLS one of loopback.
+            tls: The router's own certificate; the folder's roster gives the rules. None for plain TCP.
+
+        Raises:
+            BusError: plain TCP beyond loopback.
         """
         if not 0 <= port <= 65535:
             raise ValueError(f"A port is 0..65535 (got {port}).")
+        self._host = f"[{host}]" if ":" in host and not host.startswith("[") else host
         self._port = port
+        self._tls = tls
+        self._limits = limits or Limits()
+        self._listen = f"{'tcp' if tls is None else 'tls'}/{self._host}:{port}"
+        if tls is None:
+            loopback(self._listen)
+        elif _ENDPOINT.fullmatch(self._listen) is None:
+            raise BusError(f"'{host}' is no address to listen on, as 127.0.0.1 or 0.0.0.0.")
         self._session: zenoh.Session | None = None
         self._endpoint: str | None = None
 
@@ -121,28 +206,27 @@ class Router:
         """Listen.
 
         Raises:
-            BusError: the port is taken, or the system gives none.
+            BusError: the port is taken, the system gives none, or the router's certificate is not good.
         """
         if self._session is not None:
             return self
-        config = {
-            "mode": "router",
-            "listen": {"endpoints": [f"tcp/127.0.0.1:{self._port}"]},
-            # The router's own description is the one place that tells which port the system chose.
-            "adminspace": {"enabled": True, "permissions": {"read": True, "write": False}},
-        }
+        config = self._settings()
         problem = BusError("The router did not open.")
         # Only a port that the system chooses can be free at the second attempt.
         for attempt in range(1, 1 + (1 if self._port else _ATTEMPTS)):
             try:
-                session = zenoh.open(_config(config))
+                session = zenoh.open(config)
             except zenoh.ZError as error:
-                where = f"port {self._port} of 127.0.0.1; is it in use?" if self._port else "a free port of 127.0.0.1."
+                where = (
+                    f"port {self._port} of {self._host}; is it in use?"
+                    if self._port
+                    else f"a free port of {self._host}."
+                )
                 problem = BusError(f"The router could not listen on {where} ({_first(error)})")
                 problem.__cause__ = error
                 continue
             try:
-                self._endpoint = _where(session)
+                self._endpoint = self._where(session)
             except BusError as error:
                 problem = error
                 session.close()
@@ -172,19 +256,43 @@ class Router:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
+    def _settings(self) -> zenoh.Config:
+        own = {
+            "mode": "router",
+            "listen": {"endpoints": [self._listen]},
+            # The router's own description is the one place that tells which port the system chose.
+            "adminspace": {"enabled": True, "permissions": {"read": True, "write": False}},
+            **self._limits.settings(),
+        }
+        link = {"tx": _SENDING, "rx": {"max_message_size": self._limits.assembled_bytes}}
+        if self._tls is not None:
+            self._tls.check(serves=True)
+            link["tls"] = self._tls.link(serves=True)
+            own["access_control"] = access_control(read_roster(self._tls.folder))
+        return _config(own, link)
 
-def _config(own: Mapping[str, Any]) -> zenoh.Config:
-    return zenoh.Config.from_json5(json.dumps({**_TRANSPORT, **own}))
-
-
-def _where(session: zenoh.Session) -> str:
-    """The endpoint that a router session listens on, from its own description."""
-    for reply in session.get(f"@/{session.zid()}/router", timeout=5.0):
-        if reply.ok is not None:
+    def _where(self, session: zenoh.Session) -> str:
+        """The endpoint that a router session listens on, from its own description."""
+        for reply in session.get(f"@/{session.zid()}/router", timeout=5.0):
+            if reply.ok is None:
+                continue
             locators = json.loads(reply.ok.payload.to_bytes())["locators"]
-            if len(locators) == 1:
-                return loopback(locators[0])
-    raise BusError("The router opened, but does not tell on which port it listens.")
+            ports = {locator.rsplit(":", 1)[1] for locator in locators}
+            if len(ports) == 1:
+                host = _ANY_ADDRESS.get(self._host.strip("[]"), self._host)
+                return f"{self._listen[:3]}/{host}:{ports.pop()}"
+        raise BusError("The router opened, but does not tell on which port it listens.")
+
+
+def _config(own: Mapping[str, Any], link: Mapping[str, Any]) -> zenoh.Config:
+    transport = {"shared_memory": {"enabled": False}, "link": link}
+    return zenoh.Config.from_json5(json.dumps({"scouting": _SCOUTING, "transport": transport, **own}))
+
+
+def _address(endpoint: str) -> tuple[str, int]:
+    """Host and port of an endpoint that was found good."""
+    host, port = endpoint[len("tcp/") :].rsplit(":", 1)
+    return host.strip("[]"), int(port)
 
 
 def _first(error: zenoh.ZError) -> str:

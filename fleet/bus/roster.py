@@ -1,0 +1,171 @@
+"""Who takes part in a fleet, and what each may do on its bus: the rules that a router with TLS keeps.
+
+Everybody in the roster hears all that is said in its own fleet, and may ask what was said before. Beyond that, a
+participant says, answers and asks what its role needs, and everything else is denied.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import msgspec
+
+from fleet.bus import keys
+from fleet.errors import BusError, nearest
+
+Role = Literal["router", "arm", "auctioneer", "submitter", "monitor", "recorder"]
+ROLES: tuple[str, ...] = get_args(Role)
+LONGEST_COMMON_NAME = 64
+"""Characters (X.520, ub-common-name)."""
+_TAKEN = ("ca",)
+"""File names that are not a participant's."""
+
+_SAY = ("put", "delete", "liveliness_token", "declare_queryable", "reply")
+_LISTEN = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query")
+_HEAR = ("put", "delete", "liveliness_token", "declare_subscriber", "declare_queryable", "query", "reply")
+
+
+class Participant(msgspec.Struct, frozen=True):
+    """One that may connect."""
+
+    name: str
+    """Of an arm or an auctioneer: the name in its keys."""
+    role: Role
+
+    def __post_init__(self) -> None:
+        if self.file in _TAKEN:
+            raise ValueError(f"No participant may be named '{self.name}': its files are those of something else.")
+        if len(self.common_name) > LONGEST_COMMON_NAME:
+            raise ValueError(
+                f"The name '{self.name}' is too long for a certificate: '{self.common_name}' has "
+                f"{len(self.common_name)} characters, and {LONGEST_COMMON_NAME} are allowed."
+            )
+
+    @property
+    def file(self) -> str:
+        """Name of its files, without the ending; no name can leave the folder."""
+        return keys.chunk(self.name)
+
+    @property
+    def common_name(self) -> str:
+        """Who it is, in its certificate: `arm:arm_0`. The rules know a participant by this and by nothing else."""
+        return f"{self.role}:{self.file}"
+
+
+class Roster(msgspec.Struct, frozen=True):
+    """The participants of one fleet."""
+
+    fleet: str
+    participants: tuple[Participant, ...]
+
+    def __post_init__(self) -> None:
+        keys.chunk(self.fleet)
+        files = [participant.file.casefold() for participant in self.participants]
+        for participant in self.participants:
+            if files.count(participant.file.casefold()) > 1:
+                raise ValueError(f"The name '{participant.name}' is taken; participants need names that differ.")
+
+    def named(self, name: str) -> Participant:
+        """The participant of a name.
+
+        Raises:
+            BusError: there is none.
+        """
+        for participant in self.participants:
+            if participant.name == name:
+                return participant
+        known = nearest(name, [participant.name for participant in self.participants])
+        raise BusError(f"No '{name}' takes part in the fleet '{self.fleet}'{known}")
+
+    def of_role(self, role: Role) -> tuple[str, ...]:
+        """Names of the participants of one role."""
+        return tuple(participant.name for participant in self.participants if participant.role == role)
+
+
+def of_arms(fleet: str, arms: Iterable[str], extra: Sequence[Participant] = ()) -> Roster:
+    """The roster of a fleet with these arms: one of every other role, named like it, and the extra ones.
+
+    Raises:
+        ValueError: a name twice, empty, or too long.
+    """
+    others = tuple(Participant(role, role) for role in get_args(Role) if role != "arm")
+    return Roster(fleet, (*others, *(Participant(arm, "arm") for arm in arms), *extra))
+
+
+@dataclass(frozen=True)
+class Rights:
+    """What one participant may do, as key expressions."""
+
+    says: tuple[str, ...] = ()
+    """Publishes, shows tokens, declares queryables and answers under these."""
+    asks: tuple[str, ...] = ()
+    """Sends queries to these."""
+
+
+def rights(fleet: str, participant: Participant) -> Rights:
+    """What a participant may do beyond listening."""
+    time, status = keys.of_clock(fleet), keys.of_jobs(fleet, "status")
+    quotes, awards = keys.of_every_arm(fleet, "quote"), keys.of_every_arm(fleet, "award")
+    if participant.role == "arm":
+        lease, report = keys.of_every_auction(fleet, "lease"), keys.of_every_auction(fleet, "report")
+        return Rights(says=(keys.all_of(fleet, "arm", participant.name),), asks=(lease, report, time))
+    if participant.role == "auctioneer":
+        own = keys.all_of(fleet, "auction", participant.name)
+        return Rights(
+            says=(own, keys.all_of(fleet, "jobs"), keys.all_of(fleet, "clock")), asks=(quotes, awards, time, status)
+        )
+    if participant.role == "submitter":
+        return Rights(asks=(keys.of_jobs(fleet, "submit"), status, quotes, time))
+    if participant.role in ("monitor", "recorder"):
+        return Rights(asks=(status, time))
+    return Rights()
+
+
+def access_control(roster: Roster) -> dict[str, Any]:
+    """The rules of a roster in the words of Zenoh's configuration; whatever they do not allow is denied.
+
+    ingress is what a participant sends to the router, egress what the router hands to it. A rule allows a message when
+    a key expression of the rule includes the whole key expression of the message: `arm/*/state` is in no arm's rule.
+    """
+    fleet = roster.fleet
+    everything = _with_caches([keys.all_of_fleet(fleet)])
+    rules = [
+        _rule("listen", "ingress", _LISTEN, everything),
+        _rule("hear", "egress", _HEAR, everything),
+        _rule("recall", "ingress", ("query",), [keys.caches_of(keys.all_of_fleet(fleet))]),
+    ]
+    subjects, policies = [], []
+    for participant in roster.participants:
+        if participant.role == "router":
+            continue
+        who, may = participant.common_name, rights(fleet, participant)
+        own = []
+        if may.says:
+            own.append(_rule(f"{who} says", "ingress", _SAY, _with_caches(may.says)))
+        if may.asks:
+            own.append(_rule(f"{who} asks", "ingress", ("query",), may.asks))
+        rules += own
+        subjects.append({"id": who, "cert_common_names": [who]})
+        policies.append({"subjects": [who], "rules": ["listen", "hear", "recall", *(rule["id"] for rule in own)]})
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": subjects,
+        "policies": policies,
+    }
+
+
+def _with_caches(expressions: Iterable[str]) -> list[str]:
+    """What advanced publishers and subscribers need beside the keys themselves."""
+    return [found for expression in expressions for found in (expression, keys.caches_of(expression))]
+
+
+def _rule(name: str, flow: str, messages: Sequence[str], expressions: Sequence[str]) -> dict[str, Any]:
+    return {
+        "id": name,
+        "permission": "allow",
+        "flows": [flow],
+        "messages": list(messages),
+        "key_exprs": list(expressions),
+    }

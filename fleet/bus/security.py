@@ -1,0 +1,120 @@
+"""Mutual TLS: with which certificate one end of a line shows who it is, and why a line did not come about.
+
+A line is encrypted and both ends have proved who they are: the router by a certificate that names its host, every
+other by one that names it (`arm:arm_0`). What each may do then is in `fleet.bus.roster`.
+"""
+
+import logging
+import os
+import socket
+import ssl
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+from fleet.bus.keys import chunk
+from fleet.errors import BusError
+
+_LOG = logging.getLogger(__name__)
+
+REMIND = timedelta(days=14)
+"""A certificate that ends sooner is worth a warning."""
+_PROBE_S = 1.0
+
+
+@dataclass(frozen=True)
+class Tls:
+    """Who an end of a line is: a participant, and the folder with its certificate, its key and `ca.pem`."""
+
+    folder: Path
+    name: str
+
+    def check(self, *, serves: bool) -> None:
+        """Refuse to begin a line that could not come about.
+
+        Args:
+            serves: Whether this end listens, as the router does.
+
+        Raises:
+            BusError: a file is missing, damaged, expired or of another authority, or the key lies open.
+        """
+        # Not at the top: whoever has no TLS shall not wait for the library.
+        from fleet.bus.certificates import check, common_name, told
+
+        certificate = check(self.folder, self._file)
+        who = common_name(certificate)
+        if who.startswith("router:") != serves:
+            needs = "a router needs that of a router" if serves else "only the router may use it"
+            raise BusError(f"'{self.folder / self._file}.pem' is the certificate of '{who}'; {needs}.")
+        self._check_secret()
+        left = certificate.not_valid_after_utc - datetime.now(UTC)
+        if left < REMIND:
+            _LOG.warning("The certificate of '%s' ends on %s.", who, told(certificate.not_valid_after_utc))
+
+    def link(self, *, serves: bool) -> dict[str, Any]:
+        """Zenoh's settings for the lines of this end."""
+        end = "listen" if serves else "connect"
+        return {
+            "root_ca_certificate": str(self._path("ca.pem")),
+            f"{end}_certificate": str(self._path(f"{self._file}.pem")),
+            f"{end}_private_key": str(self._path(f"{self._file}.key")),
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+            # A line does not outlive the certificate it was opened with.
+            "close_link_on_expiration": True,
+        }
+
+    def context(self) -> ssl.SSLContext:
+        """The same end for Python's own TLS."""
+        context = ssl.create_default_context(cafile=self._path("ca.pem"))
+        context.load_cert_chain(self._path(f"{self._file}.pem"), self._path(f"{self._file}.key"))
+        return context
+
+    @property
+    def _file(self) -> str:
+        return chunk(self.name)
+
+    def _path(self, file: str) -> Path:
+        return Path(os.path.abspath(self.folder)) / file
+
+    def _check_secret(self) -> None:
+        path = self._path(f"{self._file}.key")
+        if os.name == "posix" and path.stat().st_mode & 0o077:
+            raise BusError(f"Others on this machine may read the private key '{path}': chmod 600 it.")
+
+
+def why_not(host: str, port: int, tls: Tls | None) -> str:
+    """Why no line to a router comes about, as far as a handshake with it tells; "" where it tells nothing."""
+    try:
+        with socket.create_connection((host, port), timeout=_PROBE_S) as line:
+            return _speaks_tls(line) if tls is None else _handshake(line, host, tls)
+    except OSError as error:
+        return error.strerror or str(error)
+
+
+def _speaks_tls(line: socket.socket) -> str:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
+    with suppress(OSError), context.wrap_socket(line):
+        return "what listens there speaks TLS: a certificate and an endpoint that begins with tls/ are needed"
+    return ""
+
+
+def _handshake(line: socket.socket, host: str, tls: Tls) -> str:
+    try:
+        with tls.context().wrap_socket(line, server_hostname=host) as secure:
+            # In TLS 1.3 the other end judges our certificate after our half is done: its verdict is the first we read.
+            secure.recv(1)
+    except ssl.SSLCertVerificationError as error:
+        return f"the certificate of what listens there is refused: {error.verify_message}"
+    except TimeoutError:
+        return ""
+    except ssl.SSLError as error:
+        reason = (error.reason or str(error)).lower().replace("_", " ")
+        if "alert" in reason:
+            return f"the router refuses the certificate of '{tls.name}': {reason.partition('alert ')[2]}"
+        return f"what listens there speaks no TLS ({reason})"
+    return ""
