@@ -147,7 +147,10 @@ class Quote(msgspec.Struct, frozen=True):
 
 
 class Award(msgspec.Struct, frozen=True):
-    """To `arm/{arm}/award`: this job is yours. The same award again gets the same answer and changes nothing."""
+    """To `arm/{arm}/award`: this job is yours. The same award again gets the same answer and changes nothing.
+
+    A refusal is final: neither this award nor another for that job on the same quote will be taken later.
+    """
 
     award: Name
     """Unique per job and auction."""
@@ -216,6 +219,9 @@ class Report(msgspec.Struct, frozen=True):
     time_s: float
     """When it was finished or given back."""
     reason: str = ""
+    unsure: bool = False
+    """With `returned`: the arm crashed after it was given leave to finish, so nobody knows whether the last cycle was
+    done. The job is reported unfinished rather than given to another, who might do that cycle a second time."""
 
     def __post_init__(self) -> None:
         finite("Report", "time_s", (self.time_s,))
@@ -287,7 +293,7 @@ class ArmEvent(msgspec.Struct, frozen=True, omit_defaults=True):
 
     arm: Name
     number: Count
-    """Counts the events of this arm, also over restarts."""
+    """Counts the events of this arm; never the same again, and with a leap after a restart."""
     time_s: float
     kind: Name
     job: str = ""
