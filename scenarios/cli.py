@@ -19,9 +19,12 @@ from rich.table import Table
 from agents.rules import RULES
 from fleet.errors import FleetError
 from fleet.metrics import Metrics
+from scenarios.contract_cli import contract_command
 from scenarios.hold import hold_command
+from scenarios.keys_cli import keys_command
 from scenarios.load import library, load
 from scenarios.policies import label, policy_of
+from scenarios.router_cli import router_command
 from scenarios.scenario import Scenario
 from scenarios.terminal import Interrupted, Progress, err_console, out_console, progress_bar, say
 from scenarios.twin_cli import twin_app
@@ -194,6 +197,9 @@ def demo_command(
 
 
 app.command("hold")(hold_command)
+app.command("keys")(keys_command)
+app.command("router")(router_command)
+app.command("contract")(contract_command)
 app.add_typer(twin_app, name="twin")
 
 

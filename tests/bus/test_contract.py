@@ -1,0 +1,197 @@
+"""The documents of the bus say what the structs say: checked with a validator that is not ours."""
+
+import copy
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from jsonschema import Draft202012Validator
+from typer.testing import CliRunner
+
+from fleet.bus import keys, messages, trade
+from fleet.bus.asyncapi import asyncapi
+from fleet.bus.contract import CHANNELS, WORDS, descriptions, schema_document
+from fleet.bus.messages import MalformedMessage
+from fleet.bus.specimens import SPECIMENS
+from fleet.bus.trade import JobWord
+from scenarios.cli import app
+from scenarios.contract_cli import documents
+from scenarios.contract_page import filled
+
+ROOT = Path(__file__).parents[2]
+DOCUMENT = schema_document()
+VALIDATORS = {
+    word: Draft202012Validator({"$ref": f"#/$defs/{word.__name__}", "$defs": DOCUMENT["$defs"]}) for word in WORDS
+}
+NAMED = [pytest.param(word, id=word.__name__) for word in WORDS]
+JUNK = st.sampled_from([None, True, -1, 0, 2.5, "", "x", [], [0.5], [""], {}, 10**9, "idle"])
+
+
+def example(word):
+    """The specimen of a word as plain JSON values."""
+    return json.loads(messages.encode(SPECIMENS[word]))
+
+
+def refused(word, value) -> str:
+    """Why the struct refuses a value: "" if it does not, "schema" for its types, "rule" for what it says beyond."""
+    try:
+        messages.read(word, json.dumps(value).encode())
+    except MalformedMessage as error:
+        by_rule = isinstance(error.__cause__, BaseException) and isinstance(error.__cause__.__cause__, ValueError)
+        return "rule" if by_rule else "schema"
+    return ""
+
+
+def places(value, path=()):
+    """Paths to every field and item of a JSON value."""
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for name, part in items:
+        yield (*path, name)
+        yield from places(part, (*path, name))
+
+
+def test_every_key_of_the_bus_is_in_the_contract():
+    topics = {(role, topic) for role, all_topics in keys.TOPICS.items() for topic in all_topics}
+    assert {(channel.role, channel.topic) for channel in CHANNELS} == topics
+    assert len(CHANNELS) == len(topics)
+
+
+@pytest.mark.parametrize("channel", CHANNELS, ids=lambda channel: channel.name)
+def test_an_address_filled_in_is_a_key(channel):
+    key = channel.address.format(fleet="f", arm="a", auctioneer="a")
+    parsed = keys.parse(key)
+    assert (parsed.role, parsed.topic) == (channel.role, channel.topic)
+
+
+def test_every_word_has_an_example():
+    assert set(SPECIMENS) == set(WORDS)
+
+
+def test_the_schemas_are_schemas():
+    Draft202012Validator.check_schema(DOCUMENT)
+
+
+@pytest.mark.parametrize("word", NAMED)
+def test_an_example_is_accepted_by_struct_and_schema(word):
+    for value in (example(word), {**example(word), "from a later version": 1}):
+        VALIDATORS[word].validate(value)
+        assert refused(word, value) == ""
+    assert messages.read(word, messages.encode(SPECIMENS[word])) == SPECIMENS[word]
+
+
+@pytest.mark.parametrize("word", NAMED)
+@given(data=st.data())
+def test_struct_and_schema_refuse_the_same(word, data):
+    value = copy.deepcopy(example(word))
+    changes = data.draw(st.integers(1, 2))
+    for _ in range(changes):
+        all_places = list(places(value))
+        if not all_places:
+            break
+        *path, last = data.draw(st.sampled_from(all_places))
+        where = value
+        for name in path:
+            where = where[name]
+        if data.draw(st.booleans()):
+            where[last] = copy.deepcopy(data.draw(JUNK))
+        else:
+            del where[last]
+    why = refused(word, value)
+    if why != "rule":
+        assert VALIDATORS[word].is_valid(value) == (why == ""), (why, value)
+    elif changes == 1:  # two could break a rule and the schema
+        assert VALIDATORS[word].is_valid(value)
+
+
+@pytest.mark.parametrize(
+    ("word", "change"),
+    [
+        (messages.State, {"q": [0.0]}),
+        (messages.DifficultyWord, {"difficulty": [0.1]}),
+        (messages.DifficultyWord, {"jobs": ["twice", "twice"]}),
+        (JobWord, {"places": ["one"]}),
+        (JobWord, {"kind": "hold"}),
+        (JobWord, {"release_s": 10.0, "due_s": 9.0}),
+    ],
+)
+def test_what_only_the_structs_refuse(word, change):
+    whole = example(trade.Submission)["jobs"][0] if word is JobWord else example(word)
+    value = {**whole, **change}
+    assert Draft202012Validator({"$ref": f"#/$defs/{word.__name__}", "$defs": DOCUMENT["$defs"]}).is_valid(value)
+    assert refused(word, value) == "rule"
+
+
+@pytest.mark.parametrize("word", NAMED)
+def test_every_required_field_is_required_by_both(word):
+    for name in DOCUMENT["$defs"][word.__name__].get("required", ()):
+        value = {field: part for field, part in example(word).items() if field != name}
+        assert not VALIDATORS[word].is_valid(value)
+        assert refused(word, value) == "schema"
+
+
+def test_a_whole_number_written_with_a_point_is_the_one_known_difference():
+    """JSON schema takes 3.0 for an integer, the structs do not; docs/bus.md says so."""
+    value = {**example(messages.State), "tick": 3.0}
+    assert VALIDATORS[messages.State].is_valid(value)
+    assert refused(messages.State, value) == "schema"
+    assert "`3`, not `3.0`" in (ROOT / "docs" / "bus.md").read_text(encoding="utf-8")
+
+
+def test_fields_are_described_by_the_text_under_them():
+    assert descriptions(messages.State)["tau"] == "N·m at the joint output, [joint]."
+    assert descriptions(JobWord)["payload_kg"].startswith("Carried from grasp to release")
+    assert descriptions(JobWord)["release_s"] == "Not before this."
+
+
+def test_asyncapi_has_every_key_and_no_loose_end():
+    document = asyncapi()
+    assert [channel["address"] for channel in document["channels"].values()] == [c.address for c in CHANNELS]
+
+    def references(value):
+        if isinstance(value, dict):
+            if isinstance(value.get("$ref"), str):
+                yield value["$ref"]
+            for part in value.values():
+                yield from references(part)
+        elif isinstance(value, list):
+            for part in value:
+                yield from references(part)
+
+    for reference in set(references(document)):
+        where = document
+        for name in reference.removeprefix("#/").split("/"):
+            where = where[name]
+    for message in document["components"]["messages"].values():
+        schema = {"$ref": message["payload"]["$ref"], "components": document["components"]}
+        Draft202012Validator(schema).validate(message["examples"][0]["payload"])
+
+
+def test_no_binding_is_claimed_that_asyncapi_does_not_know():
+    assert '"bindings"' not in json.dumps(asyncapi())
+
+
+def test_the_committed_documents_are_current():
+    done = CliRunner().invoke(app, ["contract", "--check", "--out", str(ROOT / "docs" / "contract")])
+    assert done.exit_code == 0, done.exception
+    assert set(documents(ROOT / "docs" / "contract")) == {
+        ROOT / "docs" / "contract" / "schemas.json",
+        ROOT / "docs" / "contract" / "asyncapi.json",
+        ROOT / "docs" / "bus.md",
+    }
+
+
+def test_stale_documents_are_named_and_made_anew(tmp_path):
+    out = tmp_path / "contract"
+    told = CliRunner().invoke(app, ["contract", "--check", "--out", str(out)])
+    assert "schemas.json" in str(told.exception)
+    assert not out.exists()
+    (tmp_path / "bus.md").write_text("a\n<!-- made by thermofleet contract: ways -->\nold\n<!-- end -->\nz\n")
+    assert CliRunner().invoke(app, ["contract", "--out", str(out)]).exit_code == 0
+    page = (tmp_path / "bus.md").read_text()
+    assert "old" not in page
+    assert page.startswith("a\n")
+    assert page.endswith("<!-- end -->\nz\n")
+    assert filled(page) == page
+    assert CliRunner().invoke(app, ["contract", "--check", "--out", str(out)]).exit_code == 0
