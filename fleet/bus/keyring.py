@@ -15,10 +15,8 @@ from pathlib import Path
 import msgspec
 
 from fleet.bus.certificates import CA, HERE, issue, new_authority, read, write_whole
-from fleet.bus.roster import Participant, Roster
+from fleet.bus.roster import ROSTER, Participant, Roster, read_roster
 from fleet.errors import BusError
-
-ROSTER = "roster.json"
 
 
 def make(
@@ -74,23 +72,6 @@ def add(
     ends = issue(folder, participant, days=days, hosts=hosts)
     _write_roster(folder, fuller)
     return ends
-
-
-def read_roster(folder: Path) -> Roster:
-    """The roster of a folder of keys.
-
-    Raises:
-        BusError: there is none, or it is damaged.
-    """
-    path = folder / ROSTER
-    try:
-        return msgspec.json.decode(path.read_bytes(), type=Roster)
-    except FileNotFoundError as error:
-        raise BusError(f"There is no '{path}': it is no folder of keys. thermofleet keys makes one.") from error
-    except OSError as error:
-        raise BusError(f"Cannot read '{path}': {error.strerror}.") from error
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise BusError(f"'{path}' is no roster: {error}.") from error
 
 
 def ends_of(folder: Path, roster: Roster) -> dict[str, datetime]:

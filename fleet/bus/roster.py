@@ -6,6 +6,7 @@ participant says, answers and asks what its role needs, and everything else is d
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import msgspec
@@ -17,6 +18,8 @@ Role = Literal["router", "arm", "auctioneer", "submitter", "monitor", "recorder"
 ROLES: tuple[str, ...] = get_args(Role)
 LONGEST_COMMON_NAME = 64
 """Characters (X.520, ub-common-name)."""
+ROSTER = "roster.json"
+"""File name of the roster in a folder of keys."""
 _TAKEN = ("ca",)
 """File names that are not a participant's."""
 
@@ -90,6 +93,23 @@ def of_arms(fleet: str, arms: Iterable[str], extra: Sequence[Participant] = ()) 
     """
     others = tuple(Participant(role, role) for role in get_args(Role) if role != "arm")
     return Roster(fleet, (*others, *(Participant(arm, "arm") for arm in arms), *extra))
+
+
+def read_roster(folder: Path) -> Roster:
+    """The roster of a folder of keys.
+
+    Raises:
+        BusError: there is none, or it is damaged.
+    """
+    path = folder / ROSTER
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=Roster)
+    except FileNotFoundError as error:
+        raise BusError(f"There is no '{path}': it is no folder of keys. thermofleet keys makes one.") from error
+    except OSError as error:
+        raise BusError(f"Cannot read '{path}': {error.strerror}.") from error
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise BusError(f"'{path}' is no roster: {error}.") from error
 
 
 @dataclass(frozen=True)

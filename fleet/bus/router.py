@@ -15,8 +15,7 @@ from typing import Any, Self
 import zenoh
 
 from fleet.bus import keys
-from fleet.bus.keyring import read_roster
-from fleet.bus.roster import access_control
+from fleet.bus.roster import access_control, read_roster
 from fleet.bus.security import Tls, why_not
 from fleet.errors import BusError
 

@@ -1,0 +1,115 @@
+"""`thermofleet keys`: a certificate authority for a fleet, and one certificate for each that takes part."""
+
+import json
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, get_args
+
+import typer
+from rich.table import Table
+
+from fleet.bus.roster import ROLES, Participant, Role, Roster, of_arms, read_roster, rights
+from fleet.errors import FleetError, nearest
+from scenarios.load import load
+from scenarios.terminal import out_console, say
+
+DAYS = 365
+
+
+def keys_command(
+    folder: Annotated[Path, typer.Argument(help="Folder of the keys of one fleet.", metavar="DIR")],
+    scenario: Annotated[
+        str | None, typer.Argument(help="Make new keys for the arms of this scenario; without it, show what is there.")
+    ] = None,
+    extra: Annotated[
+        list[str] | None, typer.Option(help=f"NAME:ROLE, one more participant; roles: {', '.join(ROLES)}.")
+    ] = None,
+    add: Annotated[
+        list[str] | None, typer.Option(help="NAME:ROLE, a certificate by the authority that is there already.")
+    ] = None,
+    days: Annotated[int, typer.Option(help="How long the participants' certificates last.")] = DAYS,
+    host: Annotated[
+        list[str] | None, typer.Option(help="Name or address of the router beyond localhost, 127.0.0.1 and ::1.")
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace what is there; with --add a certificate, else all of them.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print what is there as JSON.")] = False,
+) -> None:
+    """Keys and certificates for mutual TLS: make them, add to them, show them."""
+    from fleet.bus.certificates import HERE
+    from fleet.bus.keyring import add as add_to
+    from fleet.bus.keyring import ends_of, make
+
+    if add and (scenario or extra):
+        raise FleetError("--add goes with the keys that are there; leave SCENARIO and --extra out.")
+    if extra and not scenario:
+        raise FleetError("--extra goes with a new set of keys, so SCENARIO is needed; --add adds to an old one.")
+    if scenario:
+        chosen = load(scenario)
+        more = [participant_of(text) for text in extra or ()]
+        roster = _roster(chosen.name, [arm.name for arm in chosen.arms], more)
+        make(folder, roster, days=days, hosts=host or HERE, overwrite=overwrite)
+    for text in add or ():
+        add_to(folder, participant_of(text), days=days, hosts=host or HERE, overwrite=overwrite)
+    roster = read_roster(folder)
+    ends = ends_of(folder, roster)
+    if as_json:
+        typer.echo(json.dumps(_plain(roster, ends), indent=1))
+        return
+    out_console.print(_table(roster, ends))
+    if scenario or add:
+        say(f"Keys of the fleet '{roster.fleet}' are in {folder}. Keep {folder / 'ca.key'} where no participant runs.")
+
+
+def participant_of(text: str) -> Participant:
+    """The participant of `NAME:ROLE`; a name may hold colons.
+
+    Raises:
+        FleetError: not of this form, no such role, or a name that cannot be.
+    """
+    name, colon, role = text.rpartition(":")
+    if not colon or not name:
+        raise FleetError(f"'{text}' is not NAME:ROLE, as gateway:submitter.")
+    for known in get_args(Role):
+        if role == known:
+            try:
+                return Participant(name, known)
+            except ValueError as error:
+                raise FleetError(str(error)) from error
+    raise FleetError(f"'{text}': no role '{role}'{nearest(role, ROLES)}")
+
+
+def _roster(fleet: str, arms: list[str], extra: list[Participant]) -> Roster:
+    try:
+        return of_arms(fleet, arms, extra)
+    except ValueError as error:
+        raise FleetError(str(error)) from error
+
+
+def _table(roster: Roster, ends: dict[str, datetime]) -> Table:
+    from fleet.bus.certificates import CA, told
+
+    table = Table(box=None, pad_edge=False)
+    for column in ("participant", "role", "certificate ends"):
+        table.add_column(column)
+    now = datetime.now(UTC)
+    rows = [("(authority)", "", ends[CA]), *((one.name, one.role, ends[one.name]) for one in roster.participants)]
+    for name, role, end in rows:
+        table.add_row(name, role, f"{told(end)}{', expired' if end < now else ''}")
+    return table
+
+
+def _plain(roster: Roster, ends: dict[str, datetime]) -> dict[str, object]:
+    from fleet.bus.certificates import CA
+
+    def row(one: Participant) -> dict[str, object]:
+        who = {"name": one.name, "role": one.role, "common_name": one.common_name, "ends": ends[one.name].isoformat()}
+        return {**who, **asdict(rights(roster.fleet, one))}
+
+    return {
+        "fleet": roster.fleet,
+        "authority_ends": ends[CA].isoformat(),
+        "participants": [row(one) for one in roster.participants],
+    }
