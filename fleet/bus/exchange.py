@@ -208,7 +208,12 @@ def _interned(known: Sequence[Sequence[Word | None]]) -> tuple[Array, list[Word]
     place: dict[int, int] = {id(None): -1}
     different: list[Word] = []
     rows: list[list[int]] = []
+    last: object = None
     for row in known:
+        if row is last:  # what all know alike is looked at once
+            rows.append(rows[-1])
+            continue
+        last = row
         rows.append([])
         for word in row:
             index = place.get(id(word))

@@ -33,6 +33,10 @@ class LastWords(Generic[Content]):
         self.words[sender] = word
         return True
 
+    def of(self, tick: int) -> list[Content | None]:
+        """Those words that were said at a tick, [sender]."""
+        return [word if said == tick else None for said, word in zip(self.ticks, self.words, strict=True)]
+
 
 class Inbox(Generic[Item]):
     """Samples on their way from receiving threads to the one that reads; full, it lets go of the oldest.

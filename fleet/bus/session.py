@@ -21,6 +21,8 @@ import zenoh
 from zenoh import ext as advanced
 
 from fleet.bus import keys
+from fleet.bus.channel import PERFECT, Channel
+from fleet.bus.delivery import Delivery
 from fleet.bus.exchange import Condition, Heard, Scores, Words, assemble, check, check_order, checked_arms
 from fleet.bus.inbox import Inbox, LastWords
 from fleet.bus.messages import DifficultyWord, Info, State, encode, encoding
@@ -189,9 +191,20 @@ class ZenohExchange:
     """Hands words over through Zenoh: a router, and one client session per arm, all in this process.
 
     Nothing is opened before the first `share` or the `with` block. One thread at a time may use an exchange.
+
+    A channel that is not perfect works at the receivers: the bus carries every word to every arm, and each holds back
+    what the channel delays and drops what it loses, so that the fleet knows the same as with a `MemoryExchange`.
     """
 
-    def __init__(self, arms: Sequence[str], fleet: str, endpoint: str | None = None, *, timeout_s: float = 2.0) -> None:
+    def __init__(
+        self,
+        arms: Sequence[str],
+        fleet: str,
+        endpoint: str | None = None,
+        *,
+        channel: Channel = PERFECT,
+        timeout_s: float = 2.0,
+    ) -> None:
         """Prepare an exchange between `arms`.
 
         Args:
@@ -201,6 +214,7 @@ class ZenohExchange:
 
         Raises:
             BusError: the endpoint is not on loopback.
+            ValueError: the channel speaks of an arm that is not there.
         """
         self.arms = checked_arms(arms)
         if not 0 < timeout_s < math.inf:
@@ -212,6 +226,7 @@ class ZenohExchange:
         self._endpoint = None if endpoint is None else loopback(endpoint)
         self._timeout_s = timeout_s
         self._reader = Reader(fleet, self.arms)
+        self._delivery = None if channel.perfect else Delivery(self.arms, channel)
         self._clients: list[_Client] = []
         self._tick = -1
         self._now_s = -math.inf
@@ -261,7 +276,9 @@ class ZenohExchange:
         return self
 
     def begin(self, rng: np.random.Generator | None = None) -> None:
-        """A new episode: forget what was heard. The bus draws no chance, so `rng` is not used."""
+        """A new episode: forget what was heard; chance, where the channel has any, comes from `rng` from now on."""
+        if self._delivery is not None:
+            self._delivery.begin(rng)
         for client in self._clients:
             client.begin(self._tick, self._now_s)  # what waits to be read is of the last episode
             client.forget(self._tick)
@@ -274,7 +291,8 @@ class ZenohExchange:
         time leaves the last one known, with its age, and is counted in `late`.
 
         Raises:
-            ValueError: the words do not fit the arms, or hold numbers that cannot be said.
+            ValueError: the words do not fit the arms, or hold numbers that cannot be said; or the channel draws by
+                chance, and there is no rng.
             BusError: the bus could not be opened, was lost, or is closed.
         """
         check(words, self.arms)
@@ -299,12 +317,16 @@ class ZenohExchange:
         }
         self._count(unheard)
         self.malformed = self._reader.malformed
-        return assemble(
-            self._now_s,
-            words.jobs,
-            [client.conditions.words for client in self._clients],
-            [client.scores.words for client in self._clients],
-        )
+        if self._delivery is None:
+            conditions = [client.conditions.words for client in self._clients]
+            scores = [client.scores.words for client in self._clients]
+            return assemble(self._now_s, words.jobs, conditions, scores)
+        # A word that the bus itself brings a tick late is lost: the channel asks for the words of this tick.
+        conditions = [client.conditions.of(self._tick) for client in self._clients]
+        scores = [client.scores.of(self._tick) for client in self._clients]
+        self._delivery.carry(self._now_s, conditions, scores)
+        self.delivered, self.late = self._delivery.delivered, self._delivery.late
+        return assemble(self._now_s, words.jobs, self._delivery.conditions, self._delivery.scores)
 
     def close(self) -> None:
         """Disconnect every arm and stop the router; twice is fine.

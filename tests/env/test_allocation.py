@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 
+from fleet.bus.channel import Channel
 from fleet.bus.memory import MemoryExchange
 from fleet.bus.session import ZenohExchange
 from fleet.env import allocation_v0
@@ -377,7 +378,7 @@ def test_an_episode_with_losses_and_delay_repeats_by_seed(small):
     """Also when the same env has run another one in between."""
     make = small.Shifts(arms=3, jobs=6, ticks=30)
     names = make(np.random.SeedSequence(0)).world.arms
-    exchange = MemoryExchange(names, loss=0.4, delay_s=20.0, rng=np.random.default_rng(9))
+    exchange = MemoryExchange(names, Channel(loss=0.4, delay_s=20.0))
     env = parallel_env(make, exchange=exchange)
 
     def trace(seed: int) -> list[np.ndarray]:

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet.bus.exchange import UNHEARD, Heard
+from fleet.bus.channel import Channel
 from fleet.bus.memory import MemoryExchange
 from fleet.difficulty import Difficulty, Risk
 from fleet.env.allocation_v0 import parallel_env
@@ -237,7 +238,7 @@ def test_what_peers_told_is_what_they_know_themselves(small) -> None:
 
 
 def test_a_word_that_takes_its_time_is_as_old_as_it_took(small) -> None:
-    exchange = MemoryExchange(("arm_0", "arm_1"), delay_s=20.0)
+    exchange = MemoryExchange(("arm_0", "arm_1"), Channel(delay_s=20.0))
     env = parallel_env(small.Shifts(arms=2), exchange=exchange)
     env.reset(seed=1)
     ages = []

@@ -1,0 +1,175 @@
+"""What lies between arms that talk: who can hear whom, how long a word takes, which words are lost, when links are cut.
+
+A channel is a plain value. `fleet.bus.delivery` does to words what it says, the same in memory and over Zenoh.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from itertools import combinations
+from typing import Any, Literal, get_args
+
+import networkx as nx
+import numpy as np
+
+from fleet.errors import nearest
+
+Array = np.ndarray
+
+TopologyName = Literal["complete", "star", "ring", "line", "random_geometric"]
+TOPOLOGIES: tuple[TopologyName, ...] = get_args(TopologyName)
+
+
+@dataclass(frozen=True)
+class Partition:
+    """A time in which arms hear only those of their own group."""
+
+    from_s: float
+    to_s: float
+    """The first moment after it."""
+    groups: tuple[tuple[str, ...], ...]
+    """Names of arms; those that no group names are one more group together."""
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.from_s) and self.from_s < self.to_s):
+            raise ValueError(f"A partition must end after it begins (got from {self.from_s} s to {self.to_s} s).")
+        if not self.groups or not all(self.groups):
+            raise ValueError(f"A partition needs groups of at least one arm each (got {self.groups}).")
+        named = [arm for group in self.groups for arm in group]
+        for arm in named:
+            if named.count(arm) > 1:
+                raise ValueError(f"A partition names '{arm}' twice; every arm is in one group.")
+
+    def cuts(self, arms: Sequence[str]) -> Array:
+        """Which links it cuts, bool, [receiver, sender].
+
+        Raises:
+            ValueError: a group names an arm that is not there.
+        """
+        group = np.full(len(arms), -1)
+        for number, members in enumerate(self.groups):
+            for arm in members:
+                if arm not in arms:
+                    raise ValueError(f"No arm '{arm}' to be in a group of a partition{nearest(arm, arms)}")
+                group[list(arms).index(arm)] = number
+        return group[:, None] != group[None, :]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Channel:
+    """How words travel. The default is perfect: every arm hears every other at once."""
+
+    topology: TopologyName | nx.Graph = "complete"
+    """Who can hear whom; words are not passed on. A star has the first arm in the middle, ring and line have the arms
+    in the fleet's order. Of a networkx graph of names of arms, an edge lets both ends hear each other, a directed one
+    its head hear its tail, and an arm that is no node is alone."""
+    radius: float = 0.5
+    """Of `random_geometric`: arms lie at random in the unit square, and hear those that are not farther away."""
+    topology_seed: int = 0
+    """Of `random_geometric`: draws where the arms lie."""
+    delay_s: float = 0.0
+    """How long every word takes at least, simulation seconds."""
+    jitter_s: float = 0.0
+    """How much longer it may take: each word on each link draws its own, uniform from 0 to this."""
+    loss: float = 0.0
+    """Probability that a word is lost on a link; each draws for itself."""
+    partitions: tuple[Partition, ...] = ()
+    """A word that is under way on a link while a partition cuts it is lost."""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.topology, str) and self.topology not in TOPOLOGIES:
+            raise ValueError(f"No topology '{self.topology}'{nearest(self.topology, TOPOLOGIES)}")
+        if not 0 <= self.radius < math.inf:
+            raise ValueError(f"radius must be finite and >= 0 (got {self.radius}).")
+        if self.topology_seed < 0:
+            raise ValueError(f"topology_seed must be >= 0 (got {self.topology_seed}).")
+        for name in ("delay_s", "jitter_s"):
+            value = getattr(self, name)
+            if not 0 <= value < math.inf:
+                raise ValueError(f"{name} must be finite and >= 0 (got {value}).")
+        if not 0 <= self.loss <= 1:
+            raise ValueError(f"loss must be a probability, from 0 to 1 (got {self.loss}).")
+        object.__setattr__(self, "partitions", tuple(self.partitions))
+
+    @property
+    def perfect(self) -> bool:
+        """Whether every arm hears every other at once, always."""
+        return self.topology == "complete" and not (self.delay_s or self.by_chance or self.partitions)
+
+    @property
+    def by_chance(self) -> bool:
+        """Whether what becomes of a word is drawn."""
+        return bool(self.loss or self.jitter_s)
+
+    def graph(self, arms: Sequence[str]) -> nx.Graph:
+        """Who can hear whom, as a graph over the names of the arms.
+
+        Raises:
+            ValueError: a node is no arm.
+        """
+        if not isinstance(self.topology, str):
+            for node in self.topology:
+                if node not in arms:
+                    raise ValueError(f"No arm '{node}' to be a node of the graph{nearest(str(node), arms)}")
+            return self.topology
+        graph = nx.Graph()
+        graph.add_nodes_from(arms)
+        match self.topology:
+            case "complete":
+                graph.add_edges_from(combinations(arms, 2))
+            case "star":
+                graph.add_edges_from((arms[0], arm) for arm in arms[1:])
+            case "ring" | "line":
+                nx.add_path(graph, arms)
+                if self.topology == "ring":
+                    graph.add_edge(arms[-1], arms[0])
+            case "random_geometric":
+                places = np.random.default_rng(self.topology_seed).random((len(arms), 2))
+                near = zip(arms, places.tolist(), strict=True)
+                pairs = combinations(near, 2)
+                graph.add_edges_from((a, b) for (a, p), (b, q) in pairs if math.dist(p, q) <= self.radius)
+        graph.remove_edges_from(list(nx.selfloop_edges(graph)))
+        return graph
+
+    def hears(self, arms: Sequence[str]) -> Array:
+        """Who can hear whom, bool, [receiver, sender], never of oneself; raises as `graph`."""
+        graph = self.graph(arms)
+        place = {arm: index for index, arm in enumerate(arms)}
+        found = np.zeros((len(arms), len(arms)), dtype=bool)
+        for tail, head in graph.edges():
+            found[place[head], place[tail]] = True
+            if not graph.is_directed():
+                found[place[tail], place[head]] = True
+        np.fill_diagonal(found, False)
+        return found
+
+    def check(self, arms: Sequence[str]) -> None:
+        """Refuse a channel that speaks of arms that are not there.
+
+        Raises:
+            ValueError: names the arm, and those that are there.
+        """
+        self.graph(arms)
+        for partition in self.partitions:
+            partition.cuts(arms)
+
+    def described(self) -> dict[str, Any]:
+        """The channel in plain values, for a recording."""
+        topology: Any = self.topology if isinstance(self.topology, str) else _edges(self.topology)
+        drawn = {"radius": self.radius, "topology_seed": self.topology_seed}
+        return {
+            "topology": topology,
+            **(drawn if topology == "random_geometric" else {}),
+            "delay_s": self.delay_s,
+            "jitter_s": self.jitter_s,
+            "loss": self.loss,
+            "partitions": [asdict(partition) for partition in self.partitions],
+        }
+
+
+def _edges(graph: nx.Graph) -> dict[str, Any]:
+    return {"directed": graph.is_directed(), "edges": sorted([str(tail), str(head)] for tail, head in graph.edges())}
+
+
+PERFECT = Channel()
+"""Every arm hears every other at once."""

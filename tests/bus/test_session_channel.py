@@ -1,0 +1,56 @@
+"""Over Zenoh and in memory the fleet knows the same, whatever the channel does to its words."""
+
+import networkx as nx
+import numpy as np
+import pytest
+
+from agents.rules import make_policy
+from fleet.bus.channel import Channel, Partition
+from fleet.bus.memory import MemoryExchange
+from fleet.bus.session import ZenohExchange
+from fleet.env.allocation_v0 import parallel_env
+
+ARMS = ("arm_0", "arm_1", "arm_2", "arm_3")
+PATIENT_S = 30.0
+CHANNELS = {
+    "perfect": Channel(),
+    "ring": Channel(
+        topology="ring",
+        delay_s=10.0,
+        jitter_s=15.0,
+        loss=0.2,
+        partitions=(Partition(60.0, 120.0, (("arm_0", "arm_1"), ("arm_2", "arm_3"))),),
+    ),
+    "directed": Channel(topology=nx.DiGraph([("arm_0", "arm_1"), ("arm_1", "arm_2")]), loss=0.5),
+    "silent": Channel(loss=1.0),
+}
+
+
+@pytest.mark.parametrize("channel", CHANNELS.values(), ids=CHANNELS)
+def test_the_bus_and_the_memory_know_the_same_under_a_channel(make_words, assert_same, channel):
+    rng = np.random.default_rng(0)
+    with ZenohExchange(ARMS, "same", channel=channel, timeout_s=PATIENT_S) as bus:
+        memory = MemoryExchange(ARMS, channel)
+        for episode in range(2):
+            for exchange in (bus, memory):
+                exchange.begin(np.random.default_rng(episode))
+            for tick in range(15):
+                words = make_words(rng, 4, 10.0 * tick, slots=3 + tick % 3)
+                assert_same(bus.share(words), memory.share(words))
+        assert (bus.delivered, bus.late, bus.malformed) == (memory.delivered, memory.late, 0)
+
+
+@pytest.mark.parametrize("channel", CHANNELS.values(), ids=CHANNELS)
+def test_the_same_seed_gives_the_same_awards_over_either(small, channel):
+    def shift(exchange: ZenohExchange | MemoryExchange) -> tuple[list[str], int]:
+        env = parallel_env(small.Shifts(arms=4, jobs=20, ticks=60), exchange=exchange, keep_events=True)
+        policy = make_policy("least_difficulty")
+        env.reset(seed=3)
+        while env.agents:
+            env.step(policy.act(env.knowledge()))
+        return [repr(event) for event in env.events], env.messages
+
+    with ZenohExchange(ARMS, "trace", channel=channel, timeout_s=PATIENT_S) as bus:
+        over_zenoh = shift(bus)
+    assert over_zenoh == shift(MemoryExchange(ARMS, channel))
+    assert sum("award" in event for event in over_zenoh[0]) > 5
