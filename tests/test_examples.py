@@ -6,10 +6,35 @@ import re
 import socket
 import subprocess
 import sys
+import time
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+
+from fleet.bus import keys
+from fleet.bus.link import Link
+from fleet.bus.messages import State
+from fleet.bus.router import Router
+from fleet.bus.trade import (
+    Ack,
+    Award,
+    Clock,
+    ClockRequest,
+    Hold,
+    JobWord,
+    Lease,
+    LeaseRequest,
+    Offer,
+    Quote,
+    QuoteRequest,
+    Receipt,
+    Report,
+    Result,
+    Status,
+    StatusRequest,
+)
 
 ROOT = Path(__file__).parents[1]
 COMMAND = [sys.executable, "-c", "from scenarios.cli import main; main()"]
@@ -62,3 +87,208 @@ def test_monitor_hears_every_arm_from_another_process(tmp_path) -> None:
     assert monitor.returncode == 0
     assert all(f"arm_{i}" in told for i in range(4))
     assert "hottest motor" in told
+
+
+PATIENCE_S = 20.0
+JOB = JobWord(name="crate 1", kind="hold", places=("rack",), repetitions=3, payload_kg=1.0)
+
+
+@contextmanager
+def running(name, *arguments):
+    """An example in a process of its own, from when it says that it is ready."""
+    command = [sys.executable, "-u", str(ROOT / "examples" / f"{name}.py"), *map(str, arguments)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        line = process.stdout.readline()
+        assert line.startswith("ready"), line + process.stdout.read()
+        yield process
+    finally:
+        process.kill()
+        process.communicate(timeout=PATIENCE_S)
+
+
+@pytest.fixture
+def bus():
+    """The port of a router, and what makes lines to it."""
+    with ExitStack() as stack:
+        router = stack.enter_context(Router())
+        port = int(router.endpoint.rsplit(":", 1)[1])
+        yield port, lambda: stack.enter_context(Link(router.endpoint, "f"))
+
+
+def serve(condition, *links):
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline_s, "waited in vain"
+        for link in links:
+            link.serve(time.monotonic() + 0.02)
+
+
+def only(answers):
+    """The one answer to a question."""
+    assert not answers.refused
+    (word,) = answers.words.values()
+    return word
+
+
+def test_own_arm_keeps_the_rules_towards_a_strict_auctioneer(bus):
+    port, link = bus
+    auctioneer, leave, asked, reports, states = link(), [], [], [], []
+
+    def lease(request):
+        asked.append(request)
+        held = tuple(hold.award for hold in request.holds)
+        return Lease(auctioneer="a", lease_s=6.0, granted=held, lost=(), leave=held if leave else ())
+
+    def report(word):
+        reports.append(word)
+        return Receipt(auctioneer="a", award=word.award)
+
+    auctioneer.answer(keys.of_auction("f", "a", "lease"), LeaseRequest, lease)
+    auctioneer.answer(keys.of_auction("f", "a", "report"), Report, report)
+    auctioneer.answer(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=5000.0, speed=60.0))
+    auctioneer.listen(keys.of_every_arm("f", "state"), State, lambda _, word: states.append(word))
+    told = []
+    auctioneer.watch(keys.of_every_arm("f", "alive"), lambda arm, there: told.append((arm, there)))
+    command = [sys.executable, "-u", str(ROOT / "examples" / "own_arm.py"), str(port), "f", "arm 1/b"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        serve(lambda: ("arm 1/b", True) in told and states, auctioneer)
+        assert states[0].time_s >= 5000.0
+
+        def question(key, word, kind):
+            return only(auctioneer.ask_and_wait(keys.of_arm("f", "arm 1/b", key), word, kind, timeout_s=PATIENCE_S))
+
+        dry = question("quote", QuoteRequest(auction="r", jobs=(JOB,), dry_run=True), Quote)
+        assert dry.quote == ""
+        quote = question("quote", QuoteRequest(auction="r", jobs=(JOB,)), Quote)
+        assert quote.offers[0].feasible
+        award = Award(award="r-crate", auction="r", auctioneer="a", quote=quote.quote, job=JOB)
+        first, again = (question("award", award, Ack) for _ in range(2))
+        assert first == again
+        assert first.accepted
+        second = Award(award="r-other", auction="r", auctioneer="a", quote=quote.quote, job=JOB)
+        assert not question("award", second, Ack).accepted
+        unheard = Award(award="r-unheard", auction="r", auctioneer="a", quote="never made", job=JOB)
+        assert not question("award", unheard, Ack).accepted
+
+        serve(lambda: any(hold.phase == "finishing" for request in asked for hold in request.holds), auctioneer)
+        asked.clear()
+        serve(lambda: asked, auctioneer)  # it waits at its last cycle until it may begin it
+        assert asked[0].holds[0].cycles == JOB.repetitions - 1
+        assert not reports
+        leave.append(True)
+        serve(lambda: reports, auctioneer)
+        assert (reports[0].outcome, reports[0].cycles, reports[0].job) == ("finished", 3, "crate 1")
+    finally:
+        process.kill()
+        process.communicate(timeout=PATIENCE_S)
+    serve(lambda: ("arm 1/b", False) in told, auctioneer)
+    assert auctioneer.malformed == 0
+
+
+def test_own_allocator_keeps_the_rules_towards_a_strict_arm(bus):
+    port, link = bus
+    arm, awards, results = link(), [], []
+    leases, receipts = [], []
+
+    def offer(job):
+        return Offer(job=job.name, feasible=True, d=0.5)
+
+    def quote(request):
+        return Quote(
+            arm="x", auction=request.auction, quote=f"x-{request.auction}", valid_s=3.0, twin="t", time_s=1.0,
+            mode="idle", headroom_k=20.0, capacity=0 if awards else 1, offers=tuple(map(offer, request.jobs)),
+        )  # fmt: skip
+
+    def take(award):
+        awards.append(award)
+        return Ack(arm="x", award=award.award, accepted=True)
+
+    arm.answer(keys.of_arm("f", "x", "quote"), QuoteRequest, quote)
+    arm.answer(keys.of_arm("f", "x", "award"), Award, take)
+    arm.listen(keys.of_every_auction("f", "result"), Result, lambda _, word: results.append(word.status.state))
+    with running("own_allocator", port, "f"):
+        command = [sys.executable, str(ROOT / "examples" / "submit_jobs.py"), str(port), "f"]
+        outsider = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        try:
+            serve(lambda: awards, arm)
+
+            def hold(phase, cycles):
+                holds = (Hold(award=awards[0].award, job=awards[0].job.name, cycles=cycles, phase=phase),)
+                key = keys.of_auction("f", "own", "lease")
+                request = LeaseRequest(arm="x", holds=holds)
+                arm.ask(key, request, Lease, lambda answers: leases.append(only(answers)), timeout_s=PATIENCE_S)
+                serve(lambda: leases, arm)
+                return leases.pop()
+
+            assert awards[0].award not in hold("working", 0).leave
+            assert awards[0].award in hold("finishing", 0).leave
+            word = Report(
+                arm="x", award=awards[0].award, job=awards[0].job.name, outcome="finished", cycles=1, time_s=3.0
+            )
+            for _ in range(2):
+                key = keys.of_auction("f", "own", "report")
+                arm.ask(key, word, Receipt, lambda answers: receipts.append(only(answers)), timeout_s=PATIENCE_S)
+            serve(lambda: len(receipts) == 2 and "finished" in results, arm)
+            assert receipts[0] == receipts[1]
+            assert awards[0].award in hold("working", 0).lost
+            status = only(arm.ask_and_wait(keys.of_jobs("f", "status"), StatusRequest(), Status, timeout_s=PATIENCE_S))
+            assert {word.job: word.state for word in status.jobs}[awards[0].job.name] == "finished"
+        finally:
+            outsider.kill()
+            outsider.communicate(timeout=PATIENCE_S)
+    assert arm.malformed == 0
+
+
+@pytest.mark.parametrize("kinds", [("own_arm", "quote"), ("own_arm", "award"), ("own_allocator", "lease")])
+@pytest.mark.parametrize(
+    ("payload", "said"),
+    [(b"{", None), (b"[]", None), (b"{}", None), (b"\xff", None), (b"{}", "text/plain"), (b'{"jobs": 3}', None)],
+)
+def test_an_example_survives_rubbish_and_says_what_is_wrong(rubbish_at, kinds, payload, said):
+    assert "Not a good" in rubbish_at(*kinds, payload, said)
+
+
+@pytest.fixture(scope="module")
+def rubbish_at():
+    """Asks an example at a key for an answer to rubbish; each runs once for all questions."""
+    words = {"quote": "QuoteRequest", "award": "Award", "lease": "LeaseRequest"}
+    with ExitStack() as stack:
+        router = stack.enter_context(Router())
+        port = int(router.endpoint.rsplit(":", 1)[1])
+        line = stack.enter_context(Link(router.endpoint, "f"))
+        stack.enter_context(running("own_arm", port, "f", "x"))
+        stack.enter_context(running("own_allocator", port, "f"))
+
+        def ask(example, topic, payload, said):
+            key = keys.of_arm("f", "x", topic) if example == "own_arm" else keys.of_auction("f", "own", topic)
+            encoding = said or f"application/json;thermofleet.{words[topic]}.v1"
+            (reply,) = list(line._session.get(key, payload=payload, encoding=encoding, timeout=PATIENCE_S))
+            return reply.err.payload.to_string()
+
+        yield ask
+
+
+def test_the_examples_make_a_fleet_of_their_own(bus):
+    port, link = bus
+    watcher, heard = link(), []
+    watcher.listen(keys.of_every_auction("f", "result"), Result, lambda _, word: heard.append(word.status))
+    watcher.listen(keys.of_every_arm("f", "state"), State, lambda _, word: None)
+    with running("own_arm", port, "f", "a"), running("own_arm", port, "f", "b"), running("own_allocator", port, "f"):
+        command = [sys.executable, str(ROOT / "examples" / "submit_jobs.py"), str(port), "f"]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert "3 of 3 jobs finished" in done.stdout
+        serve(lambda: sum(status.state == "finished" for status in heard) >= 3, watcher)
+    finished = [status.job for status in heard if status.state == "finished"]
+    assert sorted(finished) == ["outside 1", "outside 2", "outside 3"]
+    assert finished.index("outside 1") < finished.index("outside 3")
+    assert watcher.malformed == 0
+
+
+def test_every_example_for_outsiders_imports_nothing_of_ours():
+    for name in ("monitor", "submit_jobs", "own_arm", "own_allocator"):
+        source = (ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8")
+        imported = set(re.findall(r"^(?:import|from) (\w+)", source, re.MULTILINE))
+        assert imported - set(sys.stdlib_module_names) == {"zenoh"}
