@@ -9,6 +9,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from fleet.bus.channel import PERFECT, Channel
 from fleet.bus.exchange import Exchange
 from fleet.bus.memory import MemoryExchange
 from fleet.difficulty import Blind, DifficultyModel
@@ -222,14 +223,23 @@ def air_offsets(scenario: Scenario) -> np.ndarray:
     return drawn + np.array([arm.ambient_offset_k for arm in scenario.arms])
 
 
-def open_exchange(bus: BusName, arms: tuple[str, ...], fleet: str, endpoint: str | None = None) -> Exchange:
-    """The exchange by name; over Zenoh by the router at a loopback endpoint, or by an in-process one of its own."""
-    choose("bus", bus, BusName)
-    if bus == "memory":
-        return MemoryExchange(arms)
-    from fleet.bus.session import ZenohExchange
+def open_exchange(
+    bus: BusName, arms: tuple[str, ...], fleet: str, endpoint: str | None = None, channel: Channel = PERFECT
+) -> Exchange:
+    """The exchange by name; over Zenoh by the router at a loopback endpoint, or by an in-process one of its own.
 
-    return ZenohExchange(arms, fleet, endpoint)
+    Raises:
+        FleetError: no such bus, or a channel that speaks of other arms.
+    """
+    choose("bus", bus, BusName)
+    try:
+        if bus == "memory":
+            return MemoryExchange(arms, channel)
+        from fleet.bus.session import ZenohExchange
+
+        return ZenohExchange(arms, fleet, endpoint, channel=channel)
+    except ValueError as error:
+        raise FleetError(str(error)) from error
 
 
 def make_env(
@@ -238,6 +248,7 @@ def make_env(
     difficulty: DifficultyName = "twin",
     plant: PlantName = "profile",
     bus: BusName = "memory",
+    channel: Channel = PERFECT,
     cache: Path | None = None,
     env_options: Mapping[str, Any] | None = None,
     progress: Progress = quiet,
@@ -250,6 +261,7 @@ def make_env(
         difficulty: What scores the plans: the arms' twins (trained or taken from the cache), `blind` or `oracle`.
         plant: What moves the arms.
         bus: What carries the words between arms.
+        channel: What becomes of words on the way: topology, delay, loss, partitions.
         cache: Folder of plans and twins.
         env_options: Further options of `fleet.env.allocation_v0.AllocationEnv`.
         overrides: Top-level fields of the scenario to change, for example `horizon_s=600`.
@@ -257,14 +269,20 @@ def make_env(
     base = scenario if isinstance(scenario, Scenario) else load(scenario)
     chosen = override(base, **overrides) if overrides else base
     fleet = prepare(chosen, difficulty=difficulty, cache=cache, progress=progress)
-    return env_of(fleet, plant=plant, bus=bus, **(env_options or {}))
+    return env_of(fleet, plant=plant, bus=bus, channel=channel, **(env_options or {}))
 
 
 def env_of(
-    fleet: Fleet, *, plant: PlantName = "profile", bus: BusName = "memory", endpoint: str | None = None, **options: Any
+    fleet: Fleet,
+    *,
+    plant: PlantName = "profile",
+    bus: BusName = "memory",
+    endpoint: str | None = None,
+    channel: Channel = PERFECT,
+    **options: Any,
 ) -> AllocationEnv:
-    """The `ParallelEnv` of a fleet that is ready; `endpoint` as in `open_exchange`, options as in `AllocationEnv`."""
+    """The `ParallelEnv` of a fleet that is ready; arguments as in `open_exchange`, options as in `AllocationEnv`."""
     choose("plant", plant, PlantName)
     names = tuple(arm.robot.name for arm in fleet.arms)
-    exchange = open_exchange(bus, names, fleet.scenario.name, endpoint)
+    exchange = open_exchange(bus, names, fleet.scenario.name, endpoint, channel)
     return parallel_env(ShiftFactory(fleet, plant), exchange=exchange, weights=fleet.scenario.reward, **options)

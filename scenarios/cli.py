@@ -17,8 +17,10 @@ from rich.logging import RichHandler
 from rich.table import Table
 
 from agents.rules import RULES
+from fleet.bus.channel import PERFECT, Channel
 from fleet.errors import FleetError
 from fleet.metrics import Metrics
+from scenarios.channel_options import ChannelMaker, with_channel
 from scenarios.contract_cli import contract_command
 from scenarios.hold import hold_command
 from scenarios.keys_cli import keys_command
@@ -74,6 +76,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 @app.command("run")
+@with_channel
 def run_command(
     scenario: ScenarioArg,
     policy: PolicyOption = "least_difficulty",
@@ -89,12 +92,14 @@ def run_command(
         int, typer.Option(help="Loopback port of the fleet's Zenoh router, for others to watch; 0 is any free one.")
     ] = 0,
     as_json: JsonOption = False,
+    *,
+    channel: ChannelMaker,
 ) -> None:
     """Work one shift of a scenario and record it."""
     from scenarios.folder import check_free
 
     chosen = load(scenario)
-    spec = _spec(policy, seed, plant, bus, difficulty)
+    spec = _spec(policy, seed, plant, bus, difficulty, channel(chosen))
     if not 0 <= listen <= 65535 or (listen and bus == "memory"):
         raise FleetError(f"--listen needs a port from 1 to 65535 and --bus zenoh (got {listen}, {bus}).")
     where = out or Path("runs") / f"{chosen.name}-{label(policy)}-{seed}"
@@ -147,6 +152,7 @@ def show_command(scenario: ScenarioArg, as_json: JsonOption = False) -> None:
 
 
 @app.command("compare")
+@with_channel
 def compare_command(
     scenario: ScenarioArg,
     policies: Annotated[str, typer.Option(help="Comma-separated; an own one as FILE.py:CLASS.")] = ",".join(RULES),
@@ -155,6 +161,8 @@ def compare_command(
     baseline: Annotated[str, typer.Option(help="Paired differences are against this policy.")] = "round_robin",
     difficulty: DifficultyOption = "twin",
     as_json: JsonOption = False,
+    *,
+    channel: ChannelMaker,
 ) -> None:
     """Several policies on the same seeds, with intervals."""
     from scenarios.compare import compare, comparison_table
@@ -164,11 +172,20 @@ def compare_command(
         raise FleetError(f"--seeds must be 2 or more, so that there is something to compare (got {seeds}).")
     if first_seed < 0:
         raise FleetError(f"--first-seed must be 0 or more (got {first_seed}).")
+    between = channel(chosen)
     chosen_seeds = range(first_seed, first_seed + seeds)
     names = [name.strip() for name in policies.split(",")]
     with progress_bar() as progress:
         how: Any = difficulty  # checked when the fleet is prepared
-        result = compare(chosen, names, seeds=chosen_seeds, baseline=baseline, difficulty=how, progress=progress)
+        result = compare(
+            chosen,
+            names,
+            seeds=chosen_seeds,
+            baseline=baseline,
+            difficulty=how,
+            channel=between,
+            progress=progress,
+        )
     if as_json:
         typer.echo(msgspec.json.format(msgspec.json.encode(result), indent=1).decode())
     else:
@@ -203,7 +220,7 @@ app.command("contract")(contract_command)
 app.add_typer(twin_app, name="twin")
 
 
-def _spec(policy: str, seed: int, plant: str, bus: str, difficulty: str) -> Any:
+def _spec(policy: str, seed: int, plant: str, bus: str, difficulty: str, channel: Channel = PERFECT) -> Any:
     from scenarios.build import BusName, DifficultyName, PlantName, choose
     from scenarios.run import RunSpec
 
@@ -213,7 +230,7 @@ def _spec(policy: str, seed: int, plant: str, bus: str, difficulty: str) -> Any:
     choose("plant", plant, PlantName)
     choose("bus", bus, BusName)
     choose("difficulty", difficulty, DifficultyName)
-    fields: dict[str, Any] = {"plant": plant, "bus": bus, "difficulty": difficulty}
+    fields: dict[str, Any] = {"plant": plant, "bus": bus, "difficulty": difficulty, "channel": channel}
     return RunSpec(policy=policy, seed=seed, **fields)
 
 

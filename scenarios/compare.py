@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
@@ -12,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 from scipy.stats import bootstrap, trim_mean
 
+from fleet.bus.channel import PERFECT, Channel
 from fleet.errors import FleetError
 from fleet.metrics import Metrics
 from scenarios.build import DifficultyName, Fleet, Progress, cache_folder, prepare, quiet
@@ -59,6 +61,9 @@ class Comparison:
     baseline: str
     figures: dict[str, dict[str, Figure]]
     """[policy][figure]."""
+    channel: dict[str, Any]
+    """`Channel.described` of what lay between the arms."""
+    channel_text: str
 
 
 def compare(
@@ -68,6 +73,7 @@ def compare(
     seeds: Sequence[int],
     baseline: str,
     difficulty: DifficultyName = "twin",
+    channel: Channel = PERFECT,
     cache_dir: Path | None = None,
     workers: int = -1,
     progress: Progress = quiet,
@@ -75,6 +81,7 @@ def compare(
     """Run every policy on every seed, in memory and on the profile plant.
 
     Args:
+        channel: What becomes of the arms' words on the way, the same for every policy.
         workers: Processes, -1 for one per core; the result does not depend on it.
 
     Raises:
@@ -92,7 +99,7 @@ def compare(
     cells = [(policy, seed) for policy in policies for seed in seeds]
     metrics: list[Metrics] = []
     with Parallel(n_jobs=workers, return_as="generator") as pool:
-        for done in pool(delayed(_cell)(scenario, difficulty, folder, *cell) for cell in cells):
+        for done in pool(delayed(_cell)(scenario, difficulty, channel, folder, *cell) for cell in cells):
             assert done is not None
             metrics.append(done)
             progress("comparing", len(metrics) / len(cells))
@@ -102,7 +109,7 @@ def compare(
         p: {name: _figure(of, rows, by_policy[baseline], rng) for name, of in FIGURES.items()}
         for p, rows in by_policy.items()
     }
-    return Comparison(scenario.name, tuple(seeds), baseline, figures)
+    return Comparison(scenario.name, tuple(seeds), baseline, figures, channel.described(), channel.text)
 
 
 @cache
@@ -110,9 +117,12 @@ def _fleet(scenario: Scenario, difficulty: DifficultyName, cache_dir: Path) -> F
     return prepare(scenario, difficulty=difficulty, cache=cache_dir)
 
 
-def _cell(scenario: Scenario, difficulty: DifficultyName, cache_dir: Path, policy: str, seed: int) -> Metrics:
+def _cell(
+    scenario: Scenario, difficulty: DifficultyName, channel: Channel, cache_dir: Path, policy: str, seed: int
+) -> Metrics:
     fleet = _fleet(scenario, difficulty, cache_dir)
-    return run(fleet, RunSpec(policy=policy, seed=seed, bus="memory", difficulty=difficulty), record=False).metrics
+    spec = RunSpec(policy=policy, seed=seed, bus="memory", difficulty=difficulty, channel=channel)
+    return run(fleet, spec, record=False).metrics
 
 
 def _figure(
@@ -147,6 +157,8 @@ def comparison_table(result: Comparison) -> Group:
         f"{result.scenario}, seeds {result.seeds[0]} to {result.seeds[-1]}: mean, paired difference to "
         f"{result.baseline}, 95 % intervals; * excludes 0"
     )
+    if result.channel != PERFECT.described():
+        title += f"\nWords travel: {result.channel_text}."
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("", overflow="fold")
     for name in ("mean", "interval", "difference", "interval", ""):

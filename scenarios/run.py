@@ -3,13 +3,14 @@
 import hashlib
 import platform
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from typing import Any
 
 import msgspec
 import numpy as np
 
+from fleet.bus.channel import PERFECT, Channel
 from fleet.events import Event
 from fleet.metrics import Metrics
 from fleet.sim.kernel import Step
@@ -20,7 +21,7 @@ from scenarios.policies import policy_of
 from scenarios.provenance import provenance
 from scenarios.scenario import Scenario
 
-RUN_FORMAT = 2
+RUN_FORMAT = 3
 """Raised when run.json or the columns of the recordings change."""
 _LIBRARIES = ("thermofleet", "numpy", "mujoco", "torch", "pettingzoo", "eclipse-zenoh", "pyarrow")
 
@@ -34,6 +35,8 @@ class RunSpec:
     plant: PlantName = "profile"
     bus: BusName = "zenoh"
     difficulty: DifficultyName = "twin"
+    channel: Channel = PERFECT
+    """What becomes of the arms' words on the way."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +77,15 @@ def run(
     policy_seed, reading_seed = np.random.SeedSequence([spec.seed, 1]).spawn(2)
     policy.reset(np.random.default_rng(policy_seed))
     recorder = _Recorder(fleet.scenario, np.random.default_rng(reading_seed)) if record else None
-    env = env_of(fleet, plant=spec.plant, bus=spec.bus, endpoint=endpoint, keep_events=True, watch=recorder)
+    env = env_of(
+        fleet,
+        plant=spec.plant,
+        bus=spec.bus,
+        endpoint=endpoint,
+        channel=spec.channel,
+        keep_events=True,
+        watch=recorder,
+    )
     finished, reward = False, 0.0
     try:
         if recorder is not None:
@@ -130,7 +141,8 @@ def summary(result: RunResult) -> dict[str, Any]:
         "time_s": result.time_s,
         "scenario": msgspec.to_builtins(result.scenario),
         "scenario_hash": scenario_hash(result.scenario),
-        **asdict(result.spec),
+        **asdict(replace(result.spec, channel=PERFECT)),
+        "channel": result.spec.channel.described(),
         "twins": result.twins,
         "versions": {"python": platform.python_version()} | {name: version(name) for name in _LIBRARIES},
         "reward": result.total_reward,

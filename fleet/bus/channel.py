@@ -153,6 +153,20 @@ class Channel:
         for partition in self.partitions:
             partition.cuts(arms)
 
+    @property
+    def text(self) -> str:
+        """The channel in a few words, as `ring, 30 to 35 s late, 20 % lost`."""
+        named = self.topology if isinstance(self.topology, str) else "own graph"
+        parts = [f"{named} of radius {self.radius:g}" if named == "random_geometric" else named]
+        if self.jitter_s:
+            parts.append(f"{self.delay_s:g} to {self.delay_s + self.jitter_s:g} s late")
+        elif self.delay_s:
+            parts.append(f"{self.delay_s:g} s late")
+        if self.loss:
+            parts.append(f"{100 * self.loss:g} % lost")
+        parts += [f"cut from {cut.from_s:g} to {cut.to_s:g} s" for cut in self.partitions]
+        return ", ".join(parts)
+
     def described(self) -> dict[str, Any]:
         """The channel in plain values, for a recording."""
         topology: Any = self.topology if isinstance(self.topology, str) else _edges(self.topology)
