@@ -1,0 +1,235 @@
+"""What an auctioneer knows about its jobs: a state that follows from journal records and from nothing else.
+
+Whatever happens to a job is a record: it is written to the journal first and applied here after that, so a replay of
+the journal gives the same ledger again, with the same numbers on its results. What cannot be known after a crash, how
+long an arm still holds its lease, is not in here: whoever replays lets every open award count as leased from then.
+"""
+
+from bisect import insort
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+
+from fleet.bus.trade import Admission, JobState, JobStatus, JobWord
+from fleet.live.admission import MOST_JOBS, admit
+from fleet.live.records import Accepted, Awarded, Began, Closed, Ended, Heard, Leave, Record, Silent, Ticked
+
+REMEMBERED = 64
+"""Last changes, for those who may have missed them when the auctioneer was gone."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """A job's state has changed."""
+
+    number: int
+    """Counts all changes, from 0, also over restarts."""
+    time_s: float
+    status: JobStatus
+    auction: str = ""
+    d: float | None = None
+    p_saturation: float | None = None
+
+
+@dataclass
+class Entry:
+    """One job and where it stands."""
+
+    word: JobWord
+    by: str
+    state: JobState = "waiting"
+    award: str = ""
+    """The open one, or the last one."""
+    cycles: int = 0
+    finished_s: float | None = None
+    reason: str = ""
+
+
+@dataclass
+class Promise:
+    """One award and what became of it."""
+
+    made: Awarded
+    leave: bool = False
+    silent: bool = False
+    outcome: str = ""
+
+
+@dataclass
+class Ledger:
+    """Jobs and awards. Only `apply` changes it."""
+
+    places: frozenset[str] | None = None
+    """Places of the cell; None: any name goes."""
+    most: int = MOST_JOBS
+    jobs: dict[str, Entry] = field(default_factory=dict)
+    awards: dict[str, Promise] = field(default_factory=dict)
+    time_s: float = 0.0
+    """Latest of all records."""
+    number: int = 0
+    """Of the next change."""
+    ended: bool = False
+    recent: deque[Change] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    open: dict[str, Promise] = field(default_factory=dict)
+    """Awards that an arm may still hold, by name."""
+    _waiting: list[str] = field(default_factory=list)
+    """Jobs that nobody holds, in the order of their release, then of their names."""
+
+    # What is asked
+
+    def admit(self, words: Sequence[JobWord]) -> tuple[Admission, ...]:
+        """What becomes of jobs that are handed in together; nothing is changed yet."""
+        if self.ended:
+            return tuple(Admission(word.name, False, "The shift is over, no more jobs are taken.") for word in words)
+        there = {name: entry.word for name, entry in self.jobs.items()}
+        return admit(words, there, places=self.places, most=self.most)
+
+    def ready(self, time_s: float, most: int) -> list[JobWord]:
+        """The first jobs that an arm may begin now: released, after their predecessors, at free stations."""
+        if self.ended:
+            return []
+        taken = self.taken()
+        found = (
+            word
+            for name in self._waiting
+            for word in [self.jobs[name].word]
+            if word.release_s <= time_s
+            and not taken & frozenset(word.places)
+            and all(self.jobs[before].state == "finished" for before in word.after)
+        )
+        return list(islice(found, most))
+
+    def taken(self) -> frozenset[str]:
+        """Stations at which an arm may be at work. One that went silent in its last cycle does not bar its station."""
+        return frozenset(
+            place
+            for promise in self.open.values()
+            if not promise.silent
+            for place in self.jobs[promise.made.job].word.places
+        )
+
+    def unsettled(self) -> list[str]:
+        """Names of the jobs that are neither finished nor given up."""
+        return [name for name, entry in self.jobs.items() if entry.state not in ("finished", "unfinished")]
+
+    def status(self, names: Iterable[str] = ()) -> list[JobStatus]:
+        """Where jobs stand, all of them if none is named; names that nobody knows are left out."""
+        wanted = dict.fromkeys(names) or self.jobs
+        return [self._status(self.jobs[name]) for name in wanted if name in self.jobs]
+
+    # What happens
+
+    def apply(self, record: Record) -> list[Change]:
+        """Let a record that is in the journal take effect; returns whose state has changed."""
+        match record:
+            case Accepted():
+                touched = self._accept(record)
+            case Awarded():
+                entry = self.jobs[record.job]
+                self.awards[record.award] = self.open[record.award] = Promise(record)
+                entry.state, entry.award, entry.reason = "awarded", record.award, ""
+                self._waiting.remove(record.job)
+                touched = [entry]
+            case Leave():
+                touched = [self._of(record.award)]
+                self.awards[record.award].leave = True
+                touched[0].state = "finishing"
+            case Silent():
+                touched = [self._of(record.award)]
+                self.awards[record.award].silent = True
+                arm = self.awards[record.award].made.arm
+                touched[0].state = "unfinished"
+                touched[0].reason = f"'{arm}' was about to finish it and has not been heard of since."
+            case Heard():
+                touched = [self._of(record.award)]
+                self.awards[record.award].silent = False
+                touched[0].state, touched[0].reason = "finishing", ""
+            case Closed():
+                touched = self._close(record)
+            case Ended():
+                self.ended = True
+                touched = [self.jobs[name] for name in self.unsettled()]
+                for entry in touched:
+                    entry.reason = entry.reason or "The shift ended before it was done."
+                    entry.state = "unfinished"
+            case Began() | Ticked():
+                touched = []
+        self.time_s = max(self.time_s, record.time_s)
+        return [self._change(entry, record.time_s) for entry in touched]
+
+    # Inside
+
+    def _accept(self, record: Accepted) -> list[Entry]:
+        fresh = [Entry(word, record.by) for word in record.jobs if word.name not in self.jobs]
+        self.jobs |= {entry.word.name: entry for entry in fresh}
+        self._waiting = sorted([*self._waiting, *(e.word.name for e in fresh)], key=self._release)
+        return fresh
+
+    def _close(self, record: Closed) -> list[Entry]:
+        promise = self.awards[record.award]
+        promise.silent, promise.outcome = False, record.outcome
+        self.open.pop(record.award, None)
+        entry = self.jobs[promise.made.job]
+        if entry.state == "finished":
+            return []
+        entry.cycles = max(entry.cycles, min(record.cycles, entry.word.repetitions))
+        if record.outcome == "finished":
+            self.open.pop(entry.award, None)  # done is done, whoever else was given it meanwhile
+            if entry.word.name in self._waiting:
+                self._waiting.remove(entry.word.name)
+            entry.state, entry.award, entry.reason, entry.finished_s = "finished", record.award, "", record.time_s
+        elif entry.award != record.award:
+            return []  # another one holds it now
+        elif record.unsure or self.ended:
+            entry.state = "unfinished"
+            entry.reason = record.reason or "Nobody knows whether its last cycle was done."
+        else:
+            entry.state, entry.reason = "waiting", record.reason
+            # Somebody has to do at least the last cycle of it.
+            entry.cycles = min(entry.cycles, entry.word.repetitions - 1)
+            if entry.word.name not in self._waiting:
+                insort(self._waiting, entry.word.name, key=self._release)
+        return [entry]
+
+    def _release(self, name: str) -> tuple[float, str]:
+        return self.jobs[name].word.release_s, name
+
+    def _of(self, award: str) -> Entry:
+        return self.jobs[self.awards[award].made.job]
+
+    def _status(self, entry: Entry) -> JobStatus:
+        held = entry.state in ("awarded", "finishing", "finished") or (
+            entry.state == "unfinished" and entry.award in self.open
+        )
+        return JobStatus(
+            job=entry.word.name,
+            state=entry.state,
+            arm=self.awards[entry.award].made.arm if held else "",
+            award=entry.award if held else "",
+            cycles=entry.cycles,
+            finished_s=entry.finished_s,
+            reason=entry.reason,
+        )
+
+    def _change(self, entry: Entry, time_s: float) -> Change:
+        made = self.awards[entry.award].made if entry.award else None
+        change = Change(
+            number=self.number,
+            time_s=time_s,
+            status=self._status(entry),
+            auction="" if made is None else made.auction,
+            d=None if made is None else made.d,
+            p_saturation=None if made is None else made.p_saturation,
+        )
+        self.number += 1
+        self.recent.append(change)
+        return change
+
+
+def replayed(records: Iterable[Record], places: frozenset[str] | None = None, most: int = MOST_JOBS) -> Ledger:
+    """The ledger that a journal tells of."""
+    ledger = Ledger(places, most)
+    for record in records:
+        ledger.apply(record)
+    return ledger

@@ -1,0 +1,213 @@
+"""What is admitted, what is ready, and that the journal alone makes the same ledger again."""
+
+import graphlib
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet.bus.trade import JobWord
+from fleet.live.admission import admit
+from fleet.live.ledger import Ledger, replayed
+from fleet.live.records import Accepted, Awarded, Closed, Ended, Heard, Leave, Silent, Ticked
+
+
+def word(name: str, *after: str, place: str = "rack", **changes) -> JobWord:
+    return JobWord(name=name, kind="hold", places=(place,), after=after, **{"repetitions": 4, **changes})
+
+
+def ledger(*words: JobWord) -> Ledger:
+    return replayed([Accepted(words, "test", 0.0)])
+
+
+def award(job: str, number: int = 0, arm: str = "arm_0", cycles: int = 0) -> Awarded:
+    return Awarded(f"{number}:{job}", f"round {number}", job, arm, "quote", cycles, 1.0, d=0.5, p_saturation=0.1)
+
+
+def names(words) -> list[str]:
+    return [w.name for w in words]
+
+
+# admission
+
+
+def test_the_same_job_again_is_taken_and_another_of_its_name_is_not():
+    there = {"a": word("a")}
+    same, other, twice, third = admit([word("a"), word("a", value=2.0), word("b"), word("b", value=9.0)], there)
+    assert same.accepted
+    assert twice.accepted
+    assert not other.accepted
+    assert not third.accepted
+    assert other.reason == "Another job is called 'a' already; one name is one job."
+
+
+def test_jobs_handed_in_together_may_wait_for_each_other_in_any_order():
+    assert all(a.accepted for a in admit([word("c", "b"), word("b", "a"), word("a")], {}))
+
+
+def test_who_waits_for_what_will_never_be_is_refused_with_the_reason():
+    words = [word("a", "nobody"), word("b", "a"), word("c", "d"), word("d", "c"), word("e", "e"), word("f")]
+    a, b, c, d, e, f = admit(words, {})
+    assert a.reason == "It waits for 'nobody', which is not there or was not taken."
+    assert b.reason == "It waits for 'a', which is not taken either."
+    assert c.reason == "Jobs wait for each other in a ring: c → d → c."
+    assert d.reason == "Jobs wait for each other in a ring: d → c → d."
+    assert e.reason == "Jobs wait for each other in a ring: e → e."
+    assert f.accepted
+
+
+def test_an_unknown_place_is_refused_and_takes_its_followers_with_it():
+    first, second = admit([word("a", place="moon"), word("b", "a")], {}, places=frozenset({"rack", "bin"}))
+    assert first.reason == "No place 'moon' in this cell. Places: bin, rack."
+    assert second.reason == "It waits for 'a', which is not there or was not taken."
+
+
+def test_no_more_jobs_than_there_is_room_for():
+    admissions = admit([word("b"), word("c"), word("a")], {"a": word("a")}, most=2)
+    assert [a.accepted for a in admissions] == [True, False, True]
+    assert admissions[1].reason == "There are 2 jobs already, and more are not taken."
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.dictionaries(st.sampled_from("abcdef"), st.sets(st.sampled_from("abcdefg"), max_size=2), min_size=1))
+def test_what_is_admitted_can_be_ordered_and_what_is_not_could_not(graph):
+    """Against the standard library's topological sorter."""
+    admissions = admit([word(name, *sorted(after)) for name, after in graph.items()], {})
+    taken = {a.job for a in admissions if a.accepted}
+    order = tuple(graphlib.TopologicalSorter({name: graph[name] for name in taken}).static_order())
+    assert set(order) == taken
+    for left in set(graph) - taken:  # nobody could be added to the order alone
+        assert not graph[left] <= taken
+
+
+# readiness
+
+
+def test_ready_is_released_after_its_predecessors_and_at_a_free_station():
+    book = ledger(
+        word("late", release_s=9.0, place="a"),
+        word("first", place="b"),
+        word("next", "first", place="c"),
+        word("also at b", place="b"),
+    )
+    assert names(book.ready(0.0, 9)) == ["also at b", "first"]
+    book.apply(award("first"))
+    assert names(book.ready(9.0, 9)) == ["late"]
+    book.apply(Closed("0:first", "finished", 4, 5.0))
+    assert names(book.ready(9.0, 9)) == ["also at b", "next", "late"]
+    assert names(book.ready(9.0, 1)) == ["also at b"]
+
+
+def test_the_oldest_are_offered_first():
+    book = ledger(word("b", release_s=1.0, place="x"), word("a", release_s=2.0), word("c", place="y"))
+    assert names(book.ready(5.0, 2)) == ["c", "b"]
+    book.apply(award("c"))
+    book.apply(Closed("0:c", "returned", 1, 5.0, "too hot"))
+    assert names(book.ready(5.0, 2)) == ["c", "b"]
+
+
+# a job's life
+
+
+def test_a_job_goes_from_waiting_to_finished():
+    book = ledger(word("a"))
+    said = [
+        change.status
+        for record in (award("a"), Leave("0:a", 2.0), Closed("0:a", "finished", 4, 3.0))
+        for change in book.apply(record)
+    ]
+    assert [s.state for s in said] == ["awarded", "finishing", "finished"]
+    assert (said[-1].arm, said[-1].finished_s, said[-1].cycles) == ("arm_0", 3.0, 4)
+    assert not book.open
+    assert book.unsettled() == []
+
+
+def test_cycles_done_are_kept_but_the_last_one_is_never_taken_for_granted():
+    book = ledger(word("a"))
+    book.apply(award("a"))
+    book.apply(Closed("0:a", "returned", 99, 3.0))
+    assert book.status(["a"])[0].cycles == 3
+    book.apply(award("a", 1, cycles=3))
+    book.apply(Closed("1:a", "dropped", 0, 4.0))
+    assert book.status(["a"])[0].cycles == 3
+
+
+def test_silence_after_leave_is_unfinished_until_heard_of():
+    book = ledger(word("a"))
+    for record in (award("a"), Leave("0:a", 2.0), Silent("0:a", 8.0)):
+        book.apply(record)
+    (status,) = book.status()
+    assert (status.state, status.arm) == ("unfinished", "arm_0")
+    assert "0:a" in book.open
+    assert book.ready(99.0, 9) == []
+    assert book.taken() == frozenset()
+    book.apply(Heard("0:a", 9.0))
+    assert book.status()[0].state == "finishing"
+    book.apply(Closed("0:a", "finished", 4, 9.5))
+    assert book.status()[0].state == "finished"
+
+
+def test_who_is_unsure_of_the_last_cycle_leaves_the_job_unfinished_for_good():
+    book = ledger(word("a"))
+    for record in (award("a"), Leave("0:a", 2.0), Closed("0:a", "returned", 3, 8.0, "crashed", unsure=True)):
+        book.apply(record)
+    assert book.status()[0].state == "unfinished"
+    assert book.ready(99.0, 9) == []
+
+
+def test_done_is_done_and_takes_the_job_from_whoever_was_given_it_meanwhile():
+    book = ledger(word("a"))
+    for record in (award("a"), Closed("0:a", "dropped", 1, 5.0), award("a", 1, "arm_1", 1)):
+        book.apply(record)
+    book.apply(Closed("0:a", "finished", 4, 6.0))
+    assert (book.status()[0].state, book.status()[0].arm) == ("finished", "arm_0")
+    assert not book.open
+    assert book.apply(Closed("1:a", "finished", 4, 7.0)) == []
+    assert book.status()[0].finished_s == 6.0
+
+
+def test_the_end_of_the_shift_leaves_nothing_open_to_offer():
+    book = ledger(word("a"), word("b", place="bin"), word("c", place="belt"))
+    book.apply(award("a"))
+    book.apply(award("b"))
+    book.apply(Closed("0:b", "finished", 4, 5.0))
+    book.apply(Ended(7200.0))
+    assert {s.job: s.state for s in book.status()} == {"a": "unfinished", "b": "finished", "c": "unfinished"}
+    assert book.ready(9999.0, 9) == []
+    assert "shift is over" in book.admit([word("d")])[0].reason
+    book.apply(Closed("0:a", "finished", 4, 7201.0))
+    assert book.status(["a", "nobody"])[0].state == "finished"
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 9)), max_size=25))
+def test_the_journal_alone_makes_the_same_ledger_again(steps):
+    """Any life of three jobs: replayed in one go it gives the same states, and the same numbers on its changes."""
+    book = Ledger()
+    written, said = [], []
+
+    def happen(record):
+        written.append(record)
+        said.extend(book.apply(record))
+
+    happen(Accepted((word("a"), word("b", "a", place="bin"), word("c", place="belt")), "test", 0.0))
+    for time_s, (job, choice) in enumerate(steps, start=1):
+        entry = book.jobs[job]
+        if entry.state == "waiting":
+            if job in names(book.ready(float(time_s), 9)):
+                happen(award(job, time_s))
+        elif entry.award in book.open:
+            promise = book.awards[entry.award]
+            may = [Closed(entry.award, "finished", 4, time_s), Closed(entry.award, "returned", choice, time_s)]
+            if promise.silent:
+                may.append(Heard(entry.award, time_s))
+            elif promise.leave:
+                may.append(Silent(entry.award, time_s))
+            else:
+                may += [Leave(entry.award, time_s), Closed(entry.award, "dropped", 0, time_s)]
+            happen(may[choice % len(may)])
+        else:
+            happen(Ticked(float(time_s)))
+    again = replayed(written)
+    assert again == book
+    assert [change.number for change in said] == list(range(len(said)))
+    assert again.number == len(said)
