@@ -51,7 +51,9 @@ def issue(
     """Write `NAME.pem` and `NAME.key` for a participant, signed by the authority in the folder.
 
     Args:
-        hosts: Names and addresses under which the router is reached; other roles have none.
+        hosts: Names and addresses under which the router is reached, beside those of this machine; other roles have
+            none.
+        now: From when the days count.
 
     Returns:
         When the certificate ends: after `days`, or with the authority if that is sooner.
@@ -63,7 +65,7 @@ def issue(
         raise BusError(f"A certificate lasts 1 to {LONGEST_DAYS} days (got {days}).")
     now = now or datetime.now(UTC)
     authority = read(folder, CA)
-    check_dates(authority, CA, now)
+    check_dates(authority, CA, datetime.now(UTC))
     signer = _read_key(folder, CA)
     if signer.public_key() != authority.public_key():
         raise BusError(f"'{folder / 'ca.key'}' is not the key of '{folder / 'ca.pem'}'.")

@@ -104,17 +104,19 @@ def _speaks_tls(line: socket.socket) -> str:
 
 
 def _handshake(line: socket.socket, host: str, tls: Tls) -> str:
+    shaken = False
     try:
         with tls.context().wrap_socket(line, server_hostname=host) as secure:
+            shaken = True
             # In TLS 1.3 the other end judges our certificate after our half is done: its verdict is the first we read.
             secure.recv(1)
     except ssl.SSLCertVerificationError as error:
         return f"the certificate of what listens there is refused: {error.verify_message}"
-    except TimeoutError:
-        return ""
     except ssl.SSLError as error:
         reason = (error.reason or str(error)).lower().replace("_", " ")
         if "alert" in reason:
             return f"the router refuses the certificate of '{tls.name}': {reason.partition('alert ')[2]}"
-        return f"what listens there speaks no TLS ({reason})"
+        return f"what listens there speaks no TLS: {reason}"
+    except TimeoutError:
+        return "" if shaken else "what listens there speaks no TLS: it does not answer"
     return ""

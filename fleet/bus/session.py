@@ -14,6 +14,7 @@ import time
 import weakref
 from collections.abc import Sequence
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -26,7 +27,8 @@ from fleet.bus.delivery import Delivery
 from fleet.bus.exchange import Condition, Heard, Scores, Words, assemble, check, check_order, checked_arms
 from fleet.bus.inbox import Inbox, LastWords
 from fleet.bus.messages import DifficultyWord, Info, State, encode, encoding
-from fleet.bus.router import Router, loopback, open_client
+from fleet.bus.router import Router, open_client, reachable
+from fleet.bus.security import Tls
 from fleet.bus.wording import Reader, condition_of, scores_of, spoken
 from fleet.errors import BusError
 
@@ -203,6 +205,7 @@ class ZenohExchange:
         endpoint: str | None = None,
         *,
         channel: Channel = PERFECT,
+        tls: Path | None = None,
         timeout_s: float = 2.0,
     ) -> None:
         """Prepare an exchange between `arms`.
@@ -210,6 +213,8 @@ class ZenohExchange:
         Args:
             fleet: Name of the fleet, part of every key.
             endpoint: Of a router on loopback, as `tcp/127.0.0.1:7447`; None for a router of its own on a free port.
+            tls: Folder with a certificate of every arm (and of `router`, for a router of its own); the endpoint then
+                begins with `tls/`, and may be anywhere.
             timeout_s: How long `share` waits for words that do not come.
 
         Raises:
@@ -223,7 +228,9 @@ class ZenohExchange:
         self.malformed = 0
         self.late = 0
         self._fleet = fleet
-        self._endpoint = None if endpoint is None else loopback(endpoint)
+        self._tls = {arm: None if tls is None else Tls(tls, arm) for arm in self.arms}
+        self._own_tls = None if tls is None else Tls(tls, "router")
+        self._endpoint = None if endpoint is None else reachable(endpoint, self._tls[self.arms[0]])
         self._timeout_s = timeout_s
         self._reader = Reader(fleet, self.arms)
         self._delivery = None if channel.perfect else Delivery(self.arms, channel)
@@ -253,10 +260,10 @@ class ZenohExchange:
             return self
         try:
             if self._endpoint is None:
-                self._endpoint = self._resources.enter_context(Router()).endpoint
+                self._endpoint = self._resources.enter_context(Router(tls=self._own_tls)).endpoint
             sessions: list[zenoh.Session] = []
-            for _ in self.arms:
-                sessions.append(open_client(self._endpoint, timeout_s=self._timeout_s))
+            for arm in self.arms:
+                sessions.append(open_client(self._endpoint, timeout_s=self._timeout_s, tls=self._tls[arm]))
                 self._resources.callback(sessions[-1].close)
             self._refuse_namesakes(sessions[0])
             self._clients = [

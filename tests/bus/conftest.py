@@ -1,9 +1,11 @@
 """Words to say, for every test of an exchange."""
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import pytest
+import zenoh
 
 from fleet.bus.exchange import Heard, Words
 
@@ -42,3 +44,20 @@ def make_words() -> Callable[..., Words]:
 @pytest.fixture
 def assert_same() -> Callable[[Heard, Heard], None]:
     return assert_equal
+
+
+def stranger(endpoint: str, tls: Mapping[str, object] | None = None, mode: str = "client") -> zenoh.Session:
+    """A session as somebody opens it who has none of our checks."""
+    config = {
+        "mode": mode,
+        "connect": {"endpoints": [endpoint], "timeout_ms": 300, "exit_on_failure": True},
+        "listen": {"endpoints": []},
+        "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "transport": {"link": {"tls": tls or {}}},
+    }
+    return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+
+
+@pytest.fixture
+def open_stranger() -> Callable[..., zenoh.Session]:
+    return stranger

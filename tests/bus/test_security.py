@@ -1,0 +1,388 @@
+"""A router with TLS lets nobody in whom it does not know, and nobody do what is not theirs.
+
+Everything here runs against a real router over loopback. That something was blocked is seen by a receiver that gets
+what the same session rightly said afterwards: lines keep their order. That the receiver would have seen it is shown on
+an open router, where every trespass gets through.
+"""
+
+import queue
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+from zenoh import ext
+
+from fleet.bus import keys
+from fleet.bus.certificates import issue
+from fleet.bus.keyring import add, make
+from fleet.bus.memory import MemoryExchange
+from fleet.bus.roster import Participant, of_arms
+from fleet.bus.router import Router, open_client
+from fleet.bus.security import Tls
+from fleet.bus.session import ZenohExchange
+
+ARMS = ("arm_0", "arm_1", "arm 2/*@")
+PATIENT_S = 20.0
+HERE = "thermofleet/v1/f"
+Connect = Callable[[str], zenoh.Session]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The keys of the fleet f."""
+    place = tmp_path_factory.mktemp("keys") / "f"
+    make(place, of_arms("f", ARMS), days=30)
+    return place
+
+
+@pytest.fixture(scope="module")
+def guarded(folder: Path) -> Iterator[Router]:
+    with Router(tls=Tls(folder, "router")) as router:
+        yield router
+
+
+@pytest.fixture(scope="module")
+def open_router() -> Iterator[Router]:
+    with Router() as router:
+        yield router
+
+
+@pytest.fixture(params=["guarded", "open"])
+def side(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture
+def router(side: str, guarded: Router, open_router: Router) -> Router:
+    return guarded if side == "guarded" else open_router
+
+
+@pytest.fixture
+def connect(router: Router, side: str, folder: Path) -> Iterator[Connect]:
+    """Sessions of participants by name, on the guarded and on the open router."""
+    with ExitStack() as stack:
+
+        def session(name: str) -> zenoh.Session:
+            tls = Tls(folder, name) if side == "guarded" else None
+            return stack.enter_context(open_client(router.endpoint, timeout_s=PATIENT_S, tls=tls))
+
+        yield session
+
+
+def inside(router: Router) -> zenoh.Session:
+    """The router's own session, which hears all that it lets in, whatever the key."""
+    assert router._session is not None
+    return router._session
+
+
+def settled(session: zenoh.Session) -> None:
+    """Wait until the router has taken all that the session said or declared: it answers in order."""
+    assert list(session.liveliness().get(f"{HERE}/arm/*/alive", timeout=PATIENT_S)) is not None
+
+
+def ask(session: zenoh.Session, key: str) -> list[str]:
+    """The answers to a question to all, sorted."""
+    replies = session.get(
+        key,
+        payload=b"?",
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,
+        timeout=PATIENT_S,
+    )
+    return sorted(reply.ok.payload.to_string() for reply in replies if reply.ok)
+
+
+def answer(session: zenoh.Session, key: str, *replies: tuple[str, str]) -> tuple[zenoh.Queryable, list[str]]:
+    """A queryable, and the questions that reach it."""
+    asked: list[str] = []
+
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            asked.append(str(query.key_expr))
+            for under, text in replies:
+                query.reply(under, text)
+
+    return session.declare_queryable(key, reply), asked
+
+
+OF_OTHERS = [
+    keys.of_arm("f", "arm_0", "state"),
+    keys.of_arm("f", "arm_0", "difficulty"),
+    keys.of_arm("f", ARMS[2], "event"),
+    keys.of_every_arm("f", "state"),
+    f"{HERE}/arm/**",
+    f"{HERE}/**",
+    "**",
+    f"{HERE}/arm/arm_1*/state".replace("1*", "1$*"),
+    keys.of_arm("g", "arm_1", "state"),
+    keys.of_auction("f", "auctioneer", "announce"),
+    keys.of_jobs("f", "submit"),
+    keys.of_clock("f"),
+    f"{HERE}/arm/arm_0/difficulty/@adv/pub/1/2",
+    f"{HERE}/arm/arm_10/state",
+    "somewhere/else",
+]
+
+
+@pytest.mark.parametrize("key", OF_OTHERS)
+@pytest.mark.parametrize("what", ["put", "delete"])
+def test_an_arm_says_nothing_under_the_key_of_another(router, side, connect, key, what):
+    heard: queue.Queue[str] = queue.Queue()
+    ears = [
+        inside(router).declare_subscriber(where, lambda sample: heard.put(str(sample.key_expr)))
+        for where in ("**", "**/@adv/**")
+    ]
+    arm = connect("arm_1")
+    getattr(arm, what)(key, *([b"not mine"] if what == "put" else []))
+    arm.put(keys.of_arm("f", "arm_1", "state"), b"mine")
+    first = heard.get(timeout=PATIENT_S)
+    assert first == (keys.of_arm("f", "arm_1", "state") if side == "guarded" else key)
+    for ear in ears:
+        ear.undeclare()
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "own"),
+    [
+        ("monitor", keys.of_arm("f", "arm_0", "state"), None),
+        ("recorder", keys.of_arm("f", "arm_0", "state"), None),
+        ("submitter", keys.of_jobs("f", "submit"), None),
+        ("auctioneer", keys.of_arm("f", "arm_0", "state"), keys.of_auction("f", "auctioneer", "result")),
+        ("auctioneer", keys.of_auction("f", "other", "result"), keys.of_jobs("f", "status")),
+    ],
+)
+def test_every_role_says_what_is_its_own_and_nothing_else(router, side, connect, name, key, own):
+    heard: queue.Queue[str] = queue.Queue()
+    ear = inside(router).declare_subscriber("**", lambda sample: heard.put(str(sample.key_expr)))
+    session = connect(name)
+    session.put(key, b"not mine")
+    if own is not None:
+        session.put(own, b"mine")
+    settled(session)
+    inside(router).put("the/end", b"")
+    got = [heard.get(timeout=PATIENT_S)]
+    while got[-1] != "the/end":
+        got.append(heard.get(timeout=PATIENT_S))
+    ear.undeclare()
+    assert got[:-1] == [found for found in ([] if side == "guarded" else [key]) + [own] if found]
+
+
+FAKES = [
+    keys.of_arm("f", "arm_0", "quote"),
+    keys.of_every_arm("f", "quote"),
+    f"{HERE}/**",
+    "**",
+]
+
+
+@pytest.mark.parametrize("fake", FAKES)
+def test_nobody_answers_in_the_place_of_an_arm(side, connect, fake):
+    arm, rogue, auctioneer = connect("arm_0"), connect("arm_1"), connect("auctioneer")
+    mine, own = keys.of_arm("f", "arm_0", "quote"), keys.of_arm("f", "arm_1", "quote")
+    kept = [answer(arm, mine, (mine, "arm_0")), answer(rogue, fake, (mine, "fake")), answer(rogue, own, (own, "arm_1"))]
+    settled(arm)
+    settled(rogue)
+    said = ask(auctioneer, keys.of_every_arm("f", "quote"))
+    assert [text for text in said if text != "fake"] == ["arm_0", "arm_1"]
+    assert ("fake" in said) == (side == "open")
+    # A question to every arm reaches this session, by its own right; one to that arm alone does not.
+    kept[1][1].clear()
+    assert [text for text in ask(auctioneer, mine) if text != "fake"] == ["arm_0"]
+    assert bool(kept[1][1]) == (side == "open")
+
+
+def test_an_answer_under_the_key_of_another_does_not_arrive(side, connect):
+    rogue, auctioneer = connect("arm_1"), connect("auctioneer")
+    own, other = keys.of_arm("f", "arm_1", "quote"), keys.of_arm("f", "arm_0", "quote")
+    kept = answer(rogue, own, (other, "fake"), (own, "true"))
+    settled(rogue)
+    assert ask(auctioneer, keys.of_every_arm("f", "quote")) == (["true"] if side == "guarded" else ["fake", "true"])
+    assert kept[1] == [keys.of_every_arm("f", "quote")]
+
+
+@pytest.mark.parametrize("fake", [keys.of_arm("f", "arm_0", "alive"), keys.of_auction("f", "auctioneer", "alive")])
+def test_nobody_pretends_that_another_is_there(side, connect, fake):
+    seen: queue.Queue[str] = queue.Queue()
+    monitor, rogue = connect("monitor"), connect("arm_1")
+    watch = monitor.liveliness().declare_subscriber(
+        f"{HERE}/*/*/alive", lambda sample: seen.put(str(sample.key_expr)), history=True
+    )
+    own = keys.of_arm("f", "arm_1", "alive")
+    tokens = [rogue.liveliness().declare_token(key) for key in (fake, own)]
+    assert seen.get(timeout=PATIENT_S) == (own if side == "guarded" else fake)
+    settled(rogue)
+    replies = connect("recorder").liveliness().get(f"{HERE}/*/*/alive", timeout=PATIENT_S)
+    assert {str(reply.ok.key_expr) for reply in replies if reply.ok} == ({own} if side == "guarded" else {own, fake})
+    for token in tokens:
+        token.undeclare()
+    watch.undeclare()
+
+
+ASKERS = {
+    keys.of_arm("f", "arm_0", "quote"): {"auctioneer", "submitter"},
+    keys.of_arm("f", "arm_0", "award"): {"auctioneer"},
+    keys.of_auction("f", "auctioneer", "lease"): {"arm_0", "arm_1"},
+    keys.of_auction("f", "auctioneer", "report"): {"arm_0", "arm_1"},
+    keys.of_jobs("f", "submit"): {"submitter"},
+    keys.of_jobs("f", "status"): {"submitter", "monitor", "recorder", "auctioneer"},
+    keys.of_clock("f"): {"arm_0", "arm_1", "submitter", "monitor", "recorder", "auctioneer"},
+}
+
+
+@pytest.mark.parametrize("key", ASKERS)
+def test_each_asks_what_its_role_needs(side, connect, key):
+    answerer = connect("arm_0" if "/arm/" in key else "auctioneer")
+    kept, asked = answer(answerer, key, (key, "answer"))
+    settled(answerer)
+    wild = key.replace("arm_0", "*").replace("/auctioneer/", "/*/")
+    everybody = ("arm_0", "arm_1", "submitter", "monitor", "recorder", "auctioneer")
+    answered = {name: [ask(connect(name), question) for question in {key, wild}] for name in everybody}
+    for name, said in answered.items():
+        may = side == "open" or name in ASKERS[key]
+        assert all(texts == (["answer"] if may else []) for texts in said), name
+    assert len(asked) == sum(len(texts) for said in answered.values() for texts in said)
+    kept.undeclare()
+
+
+def test_a_reason_to_refuse_reaches_whoever_asks_that_arm_alone(side, connect):
+    """Zenoh sends an error under the key of the question: under a wildcard it would be in no arm's own rule."""
+    arm, auctioneer = connect("arm_0"), connect("auctioneer")
+    key = keys.of_arm("f", "arm_0", "award")
+
+    def refuse(query: zenoh.Query) -> None:
+        with query:
+            query.reply_err(b"too warm")
+
+    kept = arm.declare_queryable(key, refuse)
+    settled(arm)
+
+    def reasons(where: str) -> list[str]:
+        return [reply.err.payload.to_string() for reply in auctioneer.get(where, timeout=PATIENT_S) if reply.err]
+
+    assert reasons(key) == ["too warm"]
+    assert reasons(keys.of_every_arm("f", "award")) == ([] if side == "guarded" else ["too warm"])
+    kept.undeclare()
+
+
+def test_a_late_joiner_gets_the_last_words_and_gaps_are_noticed(connect):
+    """Caches and their detection live under `@adv`, which needs rules of its own."""
+    monitor, heard = connect("monitor"), queue.Queue()
+
+    def publisher(name: str) -> ext.AdvancedPublisher:
+        return ext.declare_advanced_publisher(
+            connect(name),
+            keys.of_arm("f", name, "difficulty"),
+            cache=ext.CacheConfig(max_samples=2),
+            sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.2),
+            publisher_detection=True,
+        )
+
+    early = publisher("arm_0")
+    for text in ("a", "b", "c"):
+        early.put(text)
+    subscriber = ext.declare_advanced_subscriber(
+        monitor,
+        keys.of_every_arm("f", "difficulty"),
+        lambda sample: heard.put(sample.payload.to_string()),
+        history=ext.HistoryConfig(detect_late_publishers=True, max_samples=2),
+        recovery=ext.RecoveryConfig(heartbeat=True),
+    )
+    assert [heard.get(timeout=PATIENT_S) for _ in range(2)] == ["b", "c"]
+    early.put("d")
+    assert heard.get(timeout=PATIENT_S) == "d"
+    late = publisher("arm_1")
+    late.put("e")
+    assert heard.get(timeout=PATIENT_S) == "e"
+    for entity in (subscriber, early, late):
+        entity.undeclare()
+
+
+def test_a_whole_exchange_is_the_same_with_every_rule_on(guarded, folder, make_words, assert_same):
+    rng = np.random.default_rng(0)
+    with (
+        ZenohExchange(ARMS, "f", guarded.endpoint, tls=folder, timeout_s=PATIENT_S) as bus,
+        ZenohExchange(ARMS, "f", tls=folder, timeout_s=PATIENT_S) as own,
+        MemoryExchange(ARMS) as memory,
+    ):
+        for tick in range(10):
+            words = make_words(rng, 3, 10.0 * tick, slots=3 + tick % 3)
+            known = memory.share(words)
+            assert_same(bus.share(words), known)
+            assert_same(own.share(words), known)
+        assert (bus.late, bus.malformed, own.late, own.malformed) == (0, 0, 0, 0)
+        assert (own.endpoint or "").startswith("tls/127.0.0.1:")
+
+
+@pytest.mark.parametrize("mode", ["client", "peer", "router"])
+def test_a_certificate_gives_no_more_rights_in_another_mode(open_stranger, guarded, folder, mode):
+    heard: queue.Queue[str] = queue.Queue()
+    with (
+        open_client(guarded.endpoint, timeout_s=PATIENT_S, tls=Tls(folder, "monitor")) as monitor,
+        open_stranger(guarded.endpoint, Tls(folder, "arm_1").link(serves=False), mode) as rogue,
+    ):
+        ears = [
+            session.declare_subscriber(f"{HERE}/**", lambda sample: heard.put(str(sample.key_expr)))
+            for session in (monitor, inside(guarded))
+        ]
+        got: list[str] = []
+        end_s = time.monotonic() + PATIENT_S
+        # A peer or a router sends nothing before it has learnt who listens.
+        while len(got) < 2 and time.monotonic() < end_s:
+            rogue.put(keys.of_arm("f", "arm_0", "state"), b"not mine")
+            rogue.put(keys.of_arm("f", "arm_1", "state"), b"mine")
+            with suppress(queue.Empty):
+                got.append(heard.get(timeout=0.1))
+        assert got == [keys.of_arm("f", "arm_1", "state")] * 2
+        for ear in ears:
+            ear.undeclare()
+
+
+def test_somebody_whom_the_authority_knows_and_the_roster_does_not_may_do_nothing(guarded, folder, tmp_path):
+    """Such as one that was added after the router started."""
+    stranger = tmp_path / "copy"
+    stranger.mkdir()
+    for name in ("ca.pem", "ca.key"):
+        (stranger / name).write_bytes((folder / name).read_bytes())
+    issue(stranger, Participant("arm_9", "arm"), days=1)
+    heard: queue.Queue[str] = queue.Queue()
+    ear = inside(guarded).declare_subscriber("**", lambda sample: heard.put(str(sample.key_expr)))
+    with (
+        open_client(guarded.endpoint, timeout_s=PATIENT_S, tls=Tls(stranger, "arm_9")) as rogue,
+        open_client(guarded.endpoint, timeout_s=PATIENT_S, tls=Tls(folder, "arm_0")) as arm,
+    ):
+        deaf: list[zenoh.Sample] = []
+        subscriber = rogue.declare_subscriber(f"{HERE}/**", deaf.append, allowed_origin=zenoh.Locality.REMOTE)
+        rogue.put(keys.of_arm("f", "arm_9", "state"), b"not in the roster")
+        assert list(rogue.get(f"{HERE}/**", timeout=PATIENT_S)) == []
+        arm.put(keys.of_arm("f", "arm_0", "state"), b"mine")
+        assert heard.get(timeout=PATIENT_S) == keys.of_arm("f", "arm_0", "state")
+        assert list(rogue.get(f"{HERE}/**", timeout=PATIENT_S)) == []
+        assert deaf == []
+        subscriber.undeclare()
+    ear.undeclare()
+
+
+def test_the_router_tells_a_guest_nothing_of_itself(side, connect):
+    assert bool(ask(connect("monitor"), "@/*/router")) == (side == "open")
+
+
+def test_one_that_is_added_may_speak_when_the_router_starts_again(tmp_path):
+    place = tmp_path / "k"
+    make(place, of_arms("f", ["arm_0"]), days=30)
+    new, key = Participant("arm_7", "arm"), keys.of_arm("f", "arm_7", "state")
+    add(place, new, days=30)
+    heard: queue.Queue[str] = queue.Queue()
+    for _ in range(2):  # the second time with a new certificate of the same authority
+        with (
+            Router(tls=Tls(place, "router")) as router,
+            open_client(router.endpoint, timeout_s=PATIENT_S, tls=Tls(place, "arm_7")) as arm,
+        ):
+            ear = inside(router).declare_subscriber("**", lambda sample: heard.put(str(sample.key_expr)))
+            arm.put(key, b"mine")
+            assert heard.get(timeout=PATIENT_S) == key
+            ear.undeclare()
+        add(place, new, days=60, overwrite=True)

@@ -1,0 +1,173 @@
+"""Lines with TLS: who gets one, who gets none and why, and when it ends. All against a real router over loopback."""
+
+import json
+import queue
+import socket
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from fleet.bus import keys
+from fleet.bus.certificates import issue
+from fleet.bus.keyring import make
+from fleet.bus.roster import Participant, of_arms
+from fleet.bus.router import Router, open_client
+from fleet.bus.security import Tls
+from fleet.errors import BusError
+
+ARMS = ("arm_0", "arm_1")
+PATIENT_S = 20.0
+SHORT_S = 0.3
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The keys of the fleet f."""
+    place = tmp_path_factory.mktemp("keys") / "f"
+    make(place, of_arms("f", ARMS), days=30)
+    return place
+
+
+@pytest.fixture(scope="module")
+def guarded(folder: Path) -> Iterator[Router]:
+    with Router(tls=Tls(folder, "router")) as router:
+        yield router
+
+
+@pytest.fixture(scope="module")
+def open_router() -> Iterator[Router]:
+    with Router() as router:
+        yield router
+
+
+def rogue_folder(place: Path, true: Path, how: str) -> Path:
+    """Keys that the router must refuse, though their owner knows the true authority's certificate."""
+    make(place, of_arms("f", ARMS), days=30)
+    if how == "wrong authority":
+        (place / "ca.pem").write_bytes((true / "ca.pem").read_bytes())
+        return place
+    for name in ("ca.pem", "ca.key"):
+        (place / name).write_bytes((true / name).read_bytes())
+    role = Participant("arm_0", "router" if how == "wrong end" else "arm")
+    ago = timedelta(days=2) if how == "expired" else timedelta(days=-2) if how == "not yet" else timedelta()
+    issue(place, role, days=1, now=datetime.now(UTC) - ago)
+    return place
+
+
+REFUSALS = {
+    "wrong authority": "arm_0.pem' is not signed by the certificate authority",
+    "expired": "'arm_0.pem' expired on 20",
+    "not yet": "'arm_0.pem' is valid only from 20",
+    "wrong end": "arm_0.pem' is the certificate of 'router:arm_0'; only the router",
+}
+
+
+@pytest.mark.parametrize("how", REFUSALS)
+def test_a_certificate_that_is_not_good_is_refused_at_both_ends(open_stranger, guarded, folder, tmp_path, how):
+    tls = Tls(rogue_folder(tmp_path / "k", folder, how), "arm_0")
+    with pytest.raises(BusError, match=REFUSALS[how]):
+        open_client(guarded.endpoint, timeout_s=PATIENT_S, tls=tls)
+    with pytest.raises(zenoh.ZError), open_stranger(guarded.endpoint, tls.link(serves=False)):
+        pass
+
+
+def test_nobody_gets_in_without_a_certificate(open_stranger, guarded, folder):
+    ca = {"root_ca_certificate": str(folder / "ca.pem")}
+    with pytest.raises(zenoh.ZError), open_stranger(guarded.endpoint, ca):
+        pass
+    with pytest.raises(BusError, match="needs a certificate"):
+        open_client(guarded.endpoint, timeout_s=PATIENT_S)
+    with pytest.raises(BusError, match=r"There is no '.*nobody\.pem'"):
+        open_client(guarded.endpoint, timeout_s=PATIENT_S, tls=Tls(folder, "nobody"))
+
+
+def test_plain_tcp_and_tls_do_not_meet(guarded, open_router, folder):
+    plain = guarded.endpoint.replace("tls/", "tcp/")
+    with pytest.raises(BusError, match=r"No router answered .*speaks TLS"):
+        open_client(plain, timeout_s=SHORT_S)
+    secure = open_router.endpoint.replace("tcp/", "tls/")
+    with pytest.raises(BusError, match=r"No router answered .*speaks no TLS"):
+        open_client(secure, timeout_s=SHORT_S, tls=Tls(folder, "arm_0"))
+    with pytest.raises(BusError, match="Expected tls/"):
+        open_client(open_router.endpoint, timeout_s=SHORT_S, tls=Tls(folder, "arm_0"))
+
+
+def test_keys_of_another_fleet_open_no_line_and_the_reason_is_told(guarded, tmp_path):
+    make(tmp_path / "other", of_arms("f", ARMS), days=30)
+    with pytest.raises(BusError, match=r"the certificate of what listens there is refused: .*issuer"):
+        open_client(guarded.endpoint, timeout_s=SHORT_S, tls=Tls(tmp_path / "other", "arm_0"))
+
+
+def test_the_verdict_of_the_router_is_told(guarded, folder, tmp_path):
+    """An authority of the same name whose router is trusted, and whose arms the router does not trust."""
+    place = rogue_folder(tmp_path / "k", folder, "wrong authority")
+    mixed = tmp_path / "mixed.pem"
+    make(tmp_path / "rogue", of_arms("f", ARMS), days=30)
+    for name in ("arm_0.pem", "arm_0.key"):
+        (place / name).write_bytes((tmp_path / "rogue" / name).read_bytes())
+    mixed.write_bytes((tmp_path / "rogue" / "ca.pem").read_bytes() + (folder / "ca.pem").read_bytes())
+    (place / "ca.pem").write_bytes(mixed.read_bytes())
+    with pytest.raises(BusError, match="the router refuses the certificate of 'arm_0': "):
+        open_client(guarded.endpoint, timeout_s=SHORT_S, tls=Tls(place, "arm_0"))
+
+
+def test_no_participant_can_play_the_router(folder):
+    with pytest.raises(BusError, match="certificate of 'arm:arm_0'; a router needs that of a router"):
+        Router(tls=Tls(folder, "arm_0")).open()
+    own = Tls(folder, "arm_0").link(serves=False)
+    tls = {key.replace("connect_", "listen_"): value for key, value in own.items()}
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    listening = {"mode": "router", "listen": {"endpoints": [f"tls/127.0.0.1:{port}"]}}
+    quiet = {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}}
+    config = {**listening, "scouting": quiet, "transport": {"link": {"tls": tls}}}
+    with (
+        zenoh.open(zenoh.Config.from_json5(json.dumps(config))),
+        pytest.raises(BusError, match="the certificate of what listens there is refused"),
+    ):
+        open_client(f"tls/127.0.0.1:{port}", timeout_s=SHORT_S, tls=Tls(folder, "arm_1"))
+
+
+def test_a_line_ends_with_its_certificate(folder, guarded, tmp_path):
+    place = rogue_folder(tmp_path / "k", folder, "good")
+    soon = datetime.now(UTC) + timedelta(seconds=2.0)
+    issue(place, Participant("arm_0", "arm"), days=1, now=soon - timedelta(days=1))
+    seen: queue.Queue[zenoh.Sample] = queue.Queue()
+    with open_client(guarded.endpoint, timeout_s=PATIENT_S, tls=Tls(folder, "monitor")) as monitor:
+        key = keys.of_arm("f", "arm_0", "alive")
+        watch = monitor.liveliness().declare_subscriber(key, seen.put, history=True)
+        with open_client(guarded.endpoint, timeout_s=PATIENT_S, tls=Tls(place, "arm_0")) as arm:
+            token = arm.liveliness().declare_token(key)
+            assert seen.get(timeout=PATIENT_S).kind == zenoh.SampleKind.PUT
+            gone = seen.get(timeout=PATIENT_S)
+            while gone.kind == zenoh.SampleKind.PUT:  # a client may get a token twice
+                gone = seen.get(timeout=PATIENT_S)
+            assert datetime.now(UTC) >= soon - timedelta(seconds=1)
+            token.undeclare()
+        watch.undeclare()
+
+
+def test_a_key_that_others_may_read_is_not_used(folder, tmp_path, guarded):
+    place = rogue_folder(tmp_path / "k", folder, "good")
+    (place / "arm_0.key").chmod(0o640)
+    with pytest.raises(BusError, match="Others on this machine may read"):
+        open_client(guarded.endpoint, timeout_s=PATIENT_S, tls=Tls(place, "arm_0"))
+
+
+def test_a_certificate_that_ends_soon_is_said(guarded, folder, tmp_path, caplog):
+    place = rogue_folder(tmp_path / "k", folder, "good")
+    open_client(guarded.endpoint, timeout_s=PATIENT_S, tls=Tls(place, "arm_0")).close()
+    assert "The certificate of 'arm:arm_0' ends on 20" in caplog.text
+
+
+def test_a_router_with_tls_may_listen_elsewhere_and_without_it_not(folder):
+    with Router(host="0.0.0.0", tls=Tls(folder, "router")) as router:
+        assert router.endpoint.startswith("tls/127.0.0.1:")
+        open_client(router.endpoint, timeout_s=PATIENT_S, tls=Tls(folder, "arm_0")).close()
+    with pytest.raises(BusError, match="Without TLS the bus has no authentication"):
+        Router(host="0.0.0.0")
+    with pytest.raises(BusError, match="no address to listen on"):
+        Router(host="a b/c", tls=Tls(folder, "router"))
