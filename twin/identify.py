@@ -20,7 +20,7 @@ from twin.heat_log import STEP_S, HeatLog, heat_logs, source_of
 from twin.identified import AMBIENT_C, Identified, Parameter, nominal_body
 from twin.recording import CHANNELS, Recording
 from twin.thermal_fit import Noise, Problem, noise_of
-from twin.thermal_values import THERMAL, Body, Layout
+from twin.thermal_values import PRIOR_SD, Body, Layout
 
 Array = np.ndarray
 
@@ -42,7 +42,7 @@ def identify(
     nominal: Body | None = None,
     ambient_c: float = AMBIENT_C,
     ambient_sd_k: float | None = None,
-    free: Sequence[str] = THERMAL,
+    free: Sequence[str] = tuple(PRIOR_SD),
     step_s: float = STEP_S,
 ) -> Identified:
     """The arm's parameters, most probable given its recordings and the prior.
@@ -52,7 +52,7 @@ def identify(
         ambient_c: Air around the arm.
         ambient_sd_k: How well the air during one recording is known; 0 is exactly, the default is that of rooms.
             What differs from recording to recording is then put down to the air, not to the arm.
-        free: Names of `twin.thermal_values.PRIOR_SD`.
+        free: Names of `twin.thermal_values.PRIOR_SD`; the others are held at the nominal arm's.
 
     Raises:
         IdentificationError: the recordings cannot tell: none, other joints, no temperatures, too short, nothing that

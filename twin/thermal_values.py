@@ -36,7 +36,8 @@ the absolute scale; the names are those of that file.
 """
 
 THERMAL = tuple(name for name in PRIOR_SD if name not in ("coulomb_nm", "viscous_nms_per_rad"))
-"""What is free unless friction is asked for: friction watts give the absolute scale when they are held."""
+"""What is free when an arm's friction is known. Held friction watts set the absolute scale of all heat, so an error of
+theirs, or of the speed between slow samples, comes back in every parameter, and no interval shows it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +89,7 @@ class Body:
 class Layout:
     """Free parameters of one arm as a vector of logarithms, with their Gaussian prior around a nominal arm."""
 
-    def __init__(self, nominal: Body, free: Sequence[str] = THERMAL) -> None:
+    def __init__(self, nominal: Body, free: Sequence[str] = tuple(PRIOR_SD)) -> None:
         """Raises ValueError for a name that is none of `PRIOR_SD` or given twice, and for a nominal value of zero."""
         if not free or set(free) - set(PRIOR_SD) or len(set(free)) != len(free):
             raise ValueError(f"Free parameters must be some of {', '.join(PRIOR_SD)}, each once (got {tuple(free)}).")

@@ -11,10 +11,11 @@ from fleet.errors import FleetError
 from fleet.thermal import WINDING
 from scenarios.log_rc import log_rc
 from scenarios.log_study import CONFIG, LogStudy, log_study
-from scenarios.own_logs import own_logs
+from scenarios.own_logs import AIR_SD_K, own_logs
 from scenarios.rc_study import lines, rc_trust
 from scenarios.study import Study, make_study
-from twin.identified import nominal_body
+from scenarios.twin_heat import network_of
+from twin.identified import Body, nominal_body
 from twin.identify import identify
 from twin.logs import read_folder
 from twin.rc import RcTwin
@@ -27,6 +28,20 @@ LOGS = Path(__file__).parents[2] / "../shared/data/gen3_logs"
 @pytest.fixture(scope="module")
 def study() -> Study:
     return make_study(np.random.SeedSequence(5), train=0, reference=0, test=160, novel=0)
+
+
+@pytest.mark.slow
+def test_intervals_hold_the_truth_on_brisk_work_logged_at_2_hz():
+    inside = []
+    for seed in (1, 2, 3):
+        brisk = make_study(np.random.SeedSequence(seed), train=6, reference=0, test=0, novel=0)
+        logs = own_logs(brisk, brisk.train.plans, np.random.default_rng(seed))
+        found = identify(logs, ambient_c=brisk.ambient_c, ambient_sd_k=AIR_SD_K)
+        truth = Body(brisk.motors, network_of(brisk.thermal))
+        for p in found.parameters:
+            true = float(truth.value(p.name)[0 if p.joint is None else p.joint - 1])
+            inside.append(p.low <= true <= p.high)
+    assert np.mean(inside) >= 0.8  # 171 values, three arms whose errors are not independent
 
 
 def test_own_logs_are_what_the_arm_itself_would_replay(study: Study):
