@@ -23,9 +23,9 @@ ROSTER = "roster.json"
 _TAKEN = ("ca",)
 """File names that are not a participant's."""
 
-_SAY = ("put", "delete", "liveliness_token", "declare_queryable", "reply")
+_SAY = ("put", "liveliness_token", "declare_queryable", "reply")
 _LISTEN = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query")
-_HEAR = ("put", "delete", "liveliness_token", "declare_subscriber", "declare_queryable", "query", "reply")
+_HEAR = ("put", "liveliness_token", "declare_subscriber", "declare_queryable", "query", "reply")
 
 
 class Participant(msgspec.Struct, frozen=True):
@@ -117,7 +117,7 @@ class Rights:
     """What one participant may do, as key expressions."""
 
     says: tuple[str, ...] = ()
-    """Publishes, shows tokens, declares queryables and answers under these."""
+    """Publishes (but deletes nothing), shows tokens, declares queryables and answers under these."""
     asks: tuple[str, ...] = ()
     """Sends queries to these."""
 
