@@ -276,9 +276,11 @@ def test_a_late_joiner_gets_the_last_words_and_gaps_are_noticed(connect):
     """Caches and their detection live under `@adv`, which needs rules of its own."""
     monitor, heard = connect("monitor"), queue.Queue()
 
+    arms = {name: connect(name) for name in ("arm_0", "arm_1")}
+
     def publisher(name: str) -> ext.AdvancedPublisher:
         return ext.declare_advanced_publisher(
-            connect(name),
+            arms[name],
             keys.of_arm("f", name, "difficulty"),
             cache=ext.CacheConfig(max_samples=2),
             sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.2),
@@ -288,6 +290,7 @@ def test_a_late_joiner_gets_the_last_words_and_gaps_are_noticed(connect):
     early = publisher("arm_0")
     for text in ("a", "b", "c"):
         early.put(text)
+    settled(arms["arm_0"])
     subscriber = ext.declare_advanced_subscriber(
         monitor,
         keys.of_every_arm("f", "difficulty"),
