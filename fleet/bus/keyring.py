@@ -114,11 +114,12 @@ def _swap(work: Path, place: Path) -> None:
         return
     aside = Path(tempfile.mkdtemp(prefix=f".{place.name}.old.", dir=place.parent))
     old = aside / place.name
-    place.rename(old)
     try:
+        place.rename(old)
         work.rename(place)
     except OSError:
-        old.rename(place)
+        if old.exists():
+            old.rename(place)
         aside.rmdir()
         raise
     shutil.rmtree(aside, ignore_errors=True)

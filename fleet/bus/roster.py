@@ -36,7 +36,7 @@ class Participant(msgspec.Struct, frozen=True):
     role: Role
 
     def __post_init__(self) -> None:
-        if self.file in _TAKEN:
+        if self.file.casefold() in _TAKEN:
             raise ValueError(f"No participant may be named '{self.name}': its files are those of something else.")
         if len(self.common_name) > LONGEST_COMMON_NAME:
             raise ValueError(
@@ -64,8 +64,8 @@ class Roster(msgspec.Struct, frozen=True):
     def __post_init__(self) -> None:
         keys.chunk(self.fleet)
         files = [participant.file.casefold() for participant in self.participants]
-        for participant in self.participants:
-            if files.count(participant.file.casefold()) > 1:
+        for i, participant in enumerate(self.participants):
+            if files[i] in files[:i]:
                 raise ValueError(f"The name '{participant.name}' is taken; participants need names that differ.")
 
     def named(self, name: str) -> Participant:

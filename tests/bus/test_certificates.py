@@ -1,0 +1,298 @@
+"""Certificates and the folder of keys: what OpenSSL says of them, and that nothing is ever half there."""
+
+import os
+import re
+import shutil
+import stat
+import subprocess
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet.bus import certificates
+from fleet.bus.certificates import LONGEST_DAYS, check, issue, new_authority, read
+from fleet.bus.keyring import add, ends_of, make
+from fleet.bus.roster import ROSTER, Participant, Roster, of_arms, read_roster
+from fleet.errors import BusError
+
+ARMS = ("arm_0", "arm 2/*@")
+needs_openssl = pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("keys") / "f"
+    make(place, of_arms("f", ARMS), days=30, hosts=["fleet.example", "192.0.2.7"])
+    return place
+
+
+def openssl(*words: object) -> str:
+    done = subprocess.run(["openssl", *map(str, words)], capture_output=True, text=True, timeout=20, check=False)
+    return done.stdout + done.stderr
+
+
+def text_of(path: Path) -> str:
+    return re.sub(r"\s+", " ", openssl("x509", "-in", path, "-noout", "-text", "-nameopt", "RFC2253,utf8"))
+
+
+@needs_openssl
+@pytest.mark.parametrize(
+    "file", ["router", "auctioneer", "submitter", "monitor", "recorder", "arm_0", "arm%202%2F%2A%40"]
+)
+def test_openssl_finds_each_certificate_good_for_its_own_end_alone(folder, file):
+    """The second method: another implementation of X.509 reads and judges what ours has written."""
+    path = folder / f"{file}.pem"
+    own, other = ("sslserver", "sslclient") if file == "router" else ("sslclient", "sslserver")
+    verify = ("verify", "-x509_strict", "-CAfile", folder / "ca.pem", "-purpose")
+    assert openssl(*verify, own, path) == f"{path}: OK\n"
+    assert "unsuitable certificate purpose" in openssl(*verify, other, path)
+    text = text_of(path)
+    role = "arm" if file.startswith("arm") else file
+    assert f"Subject: CN={role}:{file},O=thermofleet" in text
+    assert "Issuer: CN=f certificate authority,O=thermofleet" in text
+    assert "ASN1 OID: prime256v1" in text
+    assert "Signature Algorithm: ecdsa-with-SHA256" in text
+    assert "X509v3 Basic Constraints: critical CA:FALSE" in text
+    assert "X509v3 Key Usage: critical Digital Signature X509v3" in text
+    names = "DNS:localhost, IP Address:127.0.0.1, IP Address:0:0:0:0:0:0:0:1, DNS:fleet.example, IP Address:192.0.2.7"
+    assert (f"Subject Alternative Name: {names} " in text) == (file == "router")
+    assert ("Subject Alternative Name" in text) == (file == "router")
+    key = folder / f"{file}.key"
+    assert openssl("pkey", "-in", key, "-pubout") == openssl("x509", "-in", path, "-noout", "-pubkey")
+
+
+@needs_openssl
+def test_openssl_finds_an_authority_that_signs_certificates_and_no_other_authority(folder):
+    text = text_of(folder / "ca.pem")
+    assert "X509v3 Basic Constraints: critical CA:TRUE, pathlen:0" in text
+    assert "X509v3 Key Usage: critical Certificate Sign, CRL Sign" in text
+
+
+@needs_openssl
+def test_openssl_agrees_about_dates_and_authorities(folder, tmp_path):
+    place = tmp_path / "other"
+    make(place, of_arms("f", ["arm_0"]), days=30)
+    verify = ("verify", "-x509_strict", "-CAfile", place / "ca.pem")
+    assert "error" in openssl(*verify, folder / "arm_0.pem")
+    issue(place, Participant("arm_0", "arm"), days=1, now=datetime.now(UTC) - timedelta(days=3))
+    assert "certificate has expired" in openssl(*verify, place / "arm_0.pem")
+    with pytest.raises(BusError, match=r"'arm_0\.pem' expired on \d{4}-\d\d-\d\d \d\d:\d\d UTC"):
+        check(place, "arm_0")
+    shutil.copy(folder / "arm_0.pem", place / "arm_0.pem")
+    with pytest.raises(BusError, match=r"arm_0\.key' is not the key of"):
+        check(place, "arm_0")
+    shutil.copy(folder / "arm_0.key", place / "arm_0.key")
+    with pytest.raises(BusError, match="not signed by the certificate authority"):
+        check(place, "arm_0")
+
+
+@pytest.mark.parametrize("days", [1, 30, LONGEST_DAYS])
+def test_a_certificate_lasts_as_long_as_was_said_and_no_longer_than_its_authority(tmp_path, days):
+    now = datetime.now(UTC).replace(microsecond=0)
+    new_authority(tmp_path, "f", now=now - timedelta(days=1))
+    ends = issue(tmp_path, Participant("a", "arm"), days=days, now=now)
+    assert read(tmp_path, "a").not_valid_after_utc == ends
+    assert ends - now == timedelta(days=min(days, LONGEST_DAYS - 1))
+    check(tmp_path, "a", now=ends)
+    with pytest.raises(BusError, match=f"expired on {ends:%Y-%m-%d %H:%M} UTC"):
+        check(tmp_path, "a", now=ends + timedelta(seconds=1))
+    check(tmp_path, "a", now=now - timedelta(minutes=5))
+    with pytest.raises(BusError, match="is valid only from"):
+        check(tmp_path, "a", now=now - timedelta(minutes=6))
+
+
+@pytest.mark.parametrize("days", [0, -1, LONGEST_DAYS + 1])
+def test_days_that_cannot_be_are_refused(tmp_path, days):
+    with pytest.raises(BusError, match=f"lasts 1 to {LONGEST_DAYS} days"):
+        make(tmp_path / "k", of_arms("f", ["a"]), days=days)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_only_the_owner_reads_what_is_secret(folder):
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in folder.iterdir()}
+    assert {name for name, mode in modes.items() if mode == 0o600} == {n for n in modes if n.endswith(".key")}
+    assert all(mode in (0o600, 0o644) for mode in modes.values())
+
+
+def test_everybody_has_a_pair_and_the_roster_names_them(folder):
+    roster = read_roster(folder)
+    assert roster == of_arms("f", ARMS)
+    files = {participant.file for participant in roster.participants} | {"ca"}
+    assert {p.name for p in folder.iterdir()} == {f"{f}.{end}" for f in files for end in ("pem", "key")} | {ROSTER}
+    assert set(ends_of(folder, roster)) == {*ARMS, "ca", "router", "auctioneer", "submitter", "monitor", "recorder"}
+    for participant in roster.participants:
+        assert certificates.common_name(check(folder, participant.file)) == participant.common_name
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_keys_are_replaced_only_when_that_was_said(tmp_path):
+    place = tmp_path / "k"
+    make(place, of_arms("f", ["a"]), days=3)
+    before = contents(place)
+    with pytest.raises(BusError, match="holds the keys of a fleet"):
+        make(place, of_arms("f", ["a"]), days=3)
+    assert contents(place) == before
+    make(place, of_arms("g", ["b"]), days=3, overwrite=True)
+    assert read_roster(place).fleet == "g"
+    assert not set(contents(place).values()) & set(before.values())
+    assert list(tmp_path.iterdir()) == [place]
+
+
+@pytest.mark.parametrize("what", ["notes.txt", "arm_0.pem"])
+def test_a_folder_with_something_else_is_left_alone(tmp_path, what):
+    place = tmp_path / "k"
+    place.mkdir()
+    (place / what).write_text("mine")
+    for overwrite in (False, True):
+        with pytest.raises(BusError, match="holds something else"):
+            make(place, of_arms("f", ["a"]), days=3, overwrite=overwrite)
+    assert contents(place) == {what: b"mine"}
+
+
+@pytest.mark.parametrize("at", ["os.replace", "os.fsync", "pathlib.Path.rename"])
+@pytest.mark.parametrize("nth", [0, 3, 7])
+def test_what_breaks_off_leaves_what_was_there_and_nothing_half(tmp_path, monkeypatch, at, nth):
+    place = tmp_path / "k"
+    make(place, of_arms("f", ["a"]), days=3)
+    before = contents(place)
+    real = {"os.replace": os.replace, "os.fsync": os.fsync, "pathlib.Path.rename": Path.rename}[at]
+    calls = []
+
+    def breaks(*args):
+        calls.append(args)
+        if len(calls) == 1 + (nth if at != "pathlib.Path.rename" else min(nth, 1)):
+            raise OSError(28, "No space left on device")
+        return real(*args)
+
+    monkeypatch.setattr(at, breaks)
+    with pytest.raises(BusError, match="No space left"):
+        make(place, of_arms("f", ["a", "b"]), days=3, overwrite=True)
+    monkeypatch.undo()
+    assert contents(place) == before
+    assert list(tmp_path.iterdir()) == [place]
+
+
+@pytest.mark.parametrize("nth", range(3))
+def test_adding_that_breaks_off_leaves_a_folder_that_can_be_added_to(tmp_path, monkeypatch, nth):
+    place = tmp_path / "k"
+    make(place, of_arms("f", ["a"]), days=3)
+    real, calls = os.replace, []
+
+    def breaks(*args):
+        calls.append(args)
+        if len(calls) == 1 + nth:
+            raise OSError(28, "No space left on device")
+        real(*args)
+
+    monkeypatch.setattr(os, "replace", breaks)
+    with pytest.raises(BusError, match="No space left"):
+        add(place, Participant("b", "arm"), days=3)
+    monkeypatch.undo()
+    assert read_roster(place) == of_arms("f", ["a"])
+    assert not [name for name in contents(place) if name.endswith(".tmp")]
+    add(place, Participant("b", "arm"), days=3)
+    check(place, "b")
+    assert read_roster(place).named("b") == Participant("b", "arm")
+
+
+def test_one_is_added_by_the_same_authority_once(tmp_path):
+    place = tmp_path / "k"
+    make(place, of_arms("f", ["a"]), days=3)
+    before = contents(place)
+    add(place, Participant("gateway", "submitter"), days=3)
+    check(place, "gateway")
+    after = contents(place)
+    assert {name for name in after if after[name] != before.get(name)} == {"gateway.pem", "gateway.key", ROSTER}
+    with pytest.raises(BusError, match="'gateway' has a certificate"):
+        add(place, Participant("gateway", "submitter"), days=3)
+    with pytest.raises(BusError, match=r"of the role submitter in .* not monitor"):
+        add(place, Participant("gateway", "monitor"), days=3, overwrite=True)
+    with pytest.raises(BusError, match="'GATEWAY' is taken"):
+        add(place, Participant("GATEWAY", "monitor"), days=3)
+    add(place, Participant("gateway", "submitter"), days=3, overwrite=True)
+    assert contents(place)["gateway.pem"] != after["gateway.pem"]
+    check(place, "gateway")
+
+
+def test_without_the_key_of_the_authority_nobody_is_added(tmp_path):
+    place = tmp_path / "k"
+    make(place, of_arms("f", ["a"]), days=3)
+    (place / "ca.key").unlink()
+    with pytest.raises(BusError, match=r"There is no '.*ca\.key'"):
+        add(place, Participant("b", "arm"), days=3)
+    assert read_roster(place) == of_arms("f", ["a"])
+
+
+def test_an_expired_authority_signs_nothing_and_vouches_for_nobody(tmp_path):
+    new_authority(tmp_path, "f", now=datetime.now(UTC) - timedelta(days=LONGEST_DAYS + 1))
+    with pytest.raises(BusError, match=r"'ca\.pem' expired on"):
+        issue(tmp_path, Participant("a", "arm"), days=1)
+
+
+@pytest.mark.parametrize(
+    ("damage", "complaint"),
+    [
+        ({"a.pem": b"-----BEGIN"}, r"a\.pem' is no certificate"),
+        ({"a.key": b""}, r"a\.key' is no private key"),
+        ({"ca.pem": b"\xff"}, r"ca\.pem' is no certificate"),
+        ({"a.pem": None}, r"There is no '.*a\.pem'; thermofleet keys"),
+        ({ROSTER: b"{"}, "is no roster"),
+        ({ROSTER: b'{"fleet":"f","participants":[{"name":"a","role":"king"}]}'}, "is no roster: .*king"),
+        ({ROSTER: b'{"fleet":"","participants":[]}'}, "is no roster: .*empty"),
+        ({ROSTER: None}, "no folder of keys"),
+    ],
+)
+def test_what_is_damaged_is_named(tmp_path, damage, complaint):
+    place = tmp_path / "k"
+    make(place, of_arms("f", ["a"]), days=3)
+    for name, content in damage.items():
+        (place / name).unlink()
+        if content is not None:
+            (place / name).write_bytes(content)
+    with pytest.raises(BusError, match=complaint):
+        read_roster(place) and check(place, "a")
+
+
+def test_hosts_that_cannot_be_are_refused(tmp_path):
+    with pytest.raises(BusError, match="no host name"):
+        make(tmp_path / "k", of_arms("f", ["a"]), days=3, hosts=["münchen.example"])
+    assert list(tmp_path.iterdir()) == []
+
+
+names = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=20)
+
+
+@given(st.lists(names, max_size=6), names)
+def test_files_stay_in_the_folder_and_differ(arms, fleet):
+    try:
+        roster = of_arms(fleet, arms)
+    except ValueError:
+        return
+    files = [participant.file for participant in roster.participants]
+    assert len({file.casefold() for file in [*files, "ca"]}) == len(files) + 1
+    assert not [file for file in files if "/" in file or "\\" in file or "\0" in file]
+    assert len({participant.common_name for participant in roster.participants}) == len(files)
+    assert all(participant.common_name.isascii() for participant in roster.participants)
+
+
+@pytest.mark.parametrize(
+    ("arms", "complaint"),
+    [
+        (["a", "A"], "taken"),
+        (["router"], "taken"),
+        (["ca"], "may be named"),
+        (["x" * 61], "64 are allowed"),
+        ([""], "empty"),
+    ],
+)
+def test_names_that_cannot_be_are_refused(arms, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        of_arms("f", arms)
+    assert Roster("f", (Participant("x" * 60, "arm"),))
