@@ -33,7 +33,8 @@ def router_command(
     ] = STATE_HZ,
 ) -> None:
     """Run the router of a fleet until Ctrl-C or SIGTERM; its endpoint is printed when it listens."""
-    from fleet.bus.router import Limits, Router
+    from fleet.bus.limits import Limits
+    from fleet.bus.router import Router
     from fleet.bus.security import Tls
 
     if not 0 <= port <= 65535:
