@@ -17,9 +17,9 @@ import zenoh
 MOST = 100
 """Jobs in one word; the bus takes up to 256 and 64 KiB."""
 JOBS = [
-    {"name": "outside 1", "kind": "hold", "places": ["rack"], "payload_kg": 1.0, "dwell_s": 5.0},
-    {"name": "outside 2", "kind": "hold", "places": ["rack"], "payload_kg": 0.5, "dwell_s": 5.0, "repetitions": 2},
-    {"name": "outside 3", "kind": "hold", "places": ["rack"], "after": ["outside 1"], "dwell_s": 2.0},
+    {"name": "outside 1", "kind": "hold", "places": ["fixture"], "payload_kg": 1.0, "dwell_s": 5.0},
+    {"name": "outside 2", "kind": "hold", "places": ["fixture"], "payload_kg": 0.5, "dwell_s": 5.0, "repetitions": 2},
+    {"name": "outside 3", "kind": "hold", "places": ["fixture"], "after": ["outside 1"], "dwell_s": 2.0},
 ]
 
 

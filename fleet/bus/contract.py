@@ -72,6 +72,16 @@ class Channel:
         return tuple(word for word in (self.word, self.answer) if word is not None)
 
 
+@dataclass(frozen=True)
+class Published:
+    """One key at which words are published."""
+
+    role: Role
+    topic: str
+    word: Word
+    kept: int
+
+
 CHANNELS: tuple[Channel, ...] = (
     Channel("arm", "alive", "token"),
     Channel("arm", "state", "dropped", messages.State),
@@ -89,6 +99,12 @@ CHANNELS: tuple[Channel, ...] = (
     Channel("jobs", "status", "answered", trade.StatusRequest, trade.Status, by="auctioneer"),
     Channel("clock", "now", "answered", trade.ClockRequest, trade.Clock, by="auctioneer"),
 )
+PUBLISHED: tuple[Published, ...] = tuple(
+    Published(channel.role, channel.topic, channel.word, channel.kept)
+    for channel in CHANNELS
+    if channel.way in ("dropped", "remembered") and channel.word is not None
+)
+"""What can be listened to."""
 WORDS: tuple[Word, ...] = tuple(dict.fromkeys(word for channel in CHANNELS for word in channel.words))
 """Every word that travels by itself, in the order of the keys."""
 

@@ -1,0 +1,90 @@
+// Watch a fleet from Node (18 or newer), with no package at all, through `thermofleet gateway`.
+//
+//     node examples/monitor.mjs http://127.0.0.1:8080/v1 [seconds]
+//
+// Reads the stream of server-sent events and prints a table every second. When the stream breaks it comes back and says
+// the last number it has seen, so no event is missed. A token, if the gateway wants one: THERMOFLEET_TOKEN.
+
+const [base = "http://127.0.0.1:8080/v1", seconds = "0"] = process.argv.slice(2);
+const arms = new Map(); // name -> what is known of it
+const jobs = new Map(); // name -> state
+let last = ""; // number of the last word
+
+const headers = () => ({
+  Accept: "text/event-stream",
+  ...(last && { "Last-Event-ID": last }),
+  ...(process.env.THERMOFLEET_TOKEN && { Authorization: `Bearer ${process.env.THERMOFLEET_TOKEN}` }),
+});
+
+function arm(name) {
+  if (!arms.has(name)) arms.set(name, {});
+  return arms.get(name);
+}
+
+// One word of the stream: {name, word}, the word as docs/bus.md has it.
+function heard(topic, { name, word }) {
+  if (topic === "state") {
+    const hottest = Math.max(...word.temp_c);
+    Object.assign(arm(name), {
+      mode: word.mode,
+      "hottest °C": hottest.toFixed(1),
+      joint: word.temp_c.indexOf(hottest) + 1,
+      headroom: word.headroom_k.toFixed(1),
+      job: word.job ?? "", // left out when there is none
+    });
+  } else if (topic === "difficulty") {
+    const scores = word.jobs.map((job, i) => [job, word.difficulty[i]]).filter(([, d]) => d !== null);
+    arm(name).difficulty = scores.map(([job, d]) => `${job} ${d.toFixed(2)}`).join(", ");
+  } else if (topic === "presence" && word.role === "arm") {
+    arm(word.name).token = word.there ? "yes" : "no";
+  } else if (topic === "result") {
+    jobs.set(word.status.job, word.status.state);
+  } else if (topic === "event") {
+    console.log(`${word.time_s.toFixed(0)} s  ${name}: ${word.kind} ${word.job ?? ""} ${word.reason ?? ""}`);
+  }
+}
+
+// Blocks end with an empty line; lines are "field: value", and a line that begins with ":" is a sign of life.
+function take(block) {
+  const fields = {};
+  for (const line of block.split("\n")) {
+    const at = line.indexOf(":");
+    if (at > 0) fields[line.slice(0, at)] = line.slice(at + 1).replace(/^ /, "");
+  }
+  if (fields.id) last = fields.id;
+  if (fields.event === "gap") console.log("some events are missing: we were away for too long");
+  else if (fields.data) heard(fields.event, JSON.parse(fields.data));
+}
+
+async function read(signal) {
+  const response = await fetch(`${base}/events`, { headers: headers(), signal });
+  if (!response.ok) throw new Error((await response.json()).detail);
+  const text = response.body.pipeThrough(new TextDecoderStream());
+  let rest = "";
+  for await (const part of text) {
+    const blocks = (rest + part).split("\n\n");
+    rest = blocks.pop();
+    blocks.forEach(take);
+  }
+}
+
+function show() {
+  const counts = {};
+  for (const state of jobs.values()) counts[state] = (counts[state] ?? 0) + 1;
+  console.table(Object.fromEntries([...arms].sort()));
+  console.log("jobs:", counts);
+}
+
+const end = new AbortController();
+const pace = setInterval(show, 1000);
+if (Number(seconds)) setTimeout(() => end.abort(), 1000 * Number(seconds));
+while (!end.signal.aborted) {
+  try {
+    await read(end.signal);
+  } catch (error) {
+    if (!end.signal.aborted) console.error(`${error.message}; trying again`);
+  }
+  if (!end.signal.aborted) await new Promise((again) => setTimeout(again, 1000));
+}
+clearInterval(pace);
+show();

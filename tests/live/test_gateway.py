@@ -1,0 +1,438 @@
+"""The bus over HTTP with real sockets: what is said comes out, what is asked goes in, and nobody slows the others."""
+
+import asyncio
+import http.client
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+
+from fleet.bus import keys
+from fleet.bus.link import Link, Refused
+from fleet.bus.messages import DifficultyWord, State
+from fleet.bus.router import Router
+from fleet.bus.trade import (
+    Admission,
+    ArmEvent,
+    JobStatus,
+    Offer,
+    Quote,
+    QuoteRequest,
+    Status,
+    StatusRequest,
+    Submission,
+    Submitted,
+)
+from fleet.errors import FleetError
+from fleet.live.gateway import Gateway
+from scenarios.gateway_app import MOST_BYTES, Readers, application
+from scenarios.live_gateway import check, listening, server_of
+
+ROOT = Path(__file__).parents[2]
+PATIENCE_S = 20.0
+CRATE_JSON = {"name": "crate 1", "kind": "hold", "places": ["rack"]}
+
+
+class StandIn:
+    """A fleet of one arm `a/1` and an auctioneer, on a thread of its own."""
+
+    def __init__(self, endpoint):
+        self.link, self.stop, self.asked = Link(endpoint, "f"), threading.Event(), []
+        self.thread = threading.Thread(target=self.serve)
+
+    def __enter__(self):
+        link = self.link.open()
+        link.answer(keys.of_arm("f", "a/1", "quote"), QuoteRequest, self.quote)
+        link.alive(keys.of_arm("f", "a/1", "alive"))
+        self.event = link.publisher(keys.of_arm("f", "a/1", "event"), ArmEvent, remember=8)
+        link.answer(keys.of_jobs("f", "submit"), Submission, self.submit)
+        link.answer(keys.of_jobs("f", "status"), StatusRequest, self.status)
+        self.thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self.stop.set()
+        self.thread.join()
+        self.link.close()
+
+    def serve(self):
+        while not self.stop.is_set():
+            self.link.serve(time.monotonic() + 0.05)
+
+    def quote(self, request):
+        assert request.dry_run
+        offers = tuple(Offer(job=job.name, feasible=True, d=0.25) for job in request.jobs)
+        return Quote("a/1", request.auction, "", 3.0, "t", 1.0, "idle", 20.0, 1, offers)
+
+    def submit(self, word):
+        if word.by == "disk full":
+            raise Refused("The journal has no room.")
+        self.asked.append(word)
+        return Submitted("au", tuple(Admission(job.name, True) for job in word.jobs))
+
+    def status(self, word):
+        return Status("au", 9.0, (JobStatus("crate 1", "waiting"),))
+
+    def state(self, tick, arm="a/1"):
+        word = State(arm=arm, tick=tick, time_s=float(tick), mode="idle", temp_c=(30.0, 41.5), headroom_k=18.5)
+        self.link.say(keys.of_arm("f", arm, "state"), word)
+
+    def difficulty(self):
+        word = DifficultyWord("a/1", 1, 1.0, "t", ("crate 1",), (0.5,), (None,))
+        self.link.say(keys.of_arm("f", "a/1", "difficulty"), word)
+
+    def happens(self, number, reason=""):
+        self.event(ArmEvent(arm="a/1", number=number, time_s=1.0, kind="warning", joint=2, reason=reason))
+
+
+class Served:
+    """A gateway in this process, on a free port."""
+
+    def __init__(self, endpoint, **options):
+        self.endpoint, self.options, self.readers = endpoint, options, Readers()
+        self.started = threading.Event()
+        self.thread = threading.Thread(target=lambda: asyncio.run(self.run()))
+
+    async def run(self):
+        stuck_s = self.options.get("stuck_s", 10.0)
+        with listening("127.0.0.1", 0, stuck_s) as bound, Link(self.endpoint, "f") as link:
+            async with Gateway(link, self.readers.tell) as self.gateway:
+                self.server = server_of(application(self.gateway, self.readers, **self.options), self.readers)
+                self.port = bound.getsockname()[1]
+                self.started.set()
+                await self.server.serve(sockets=[bound])
+
+    def __enter__(self):
+        self.thread.start()
+        assert self.started.wait(PATIENCE_S)
+        return self
+
+    def __exit__(self, *_):
+        self.server.should_exit = True
+        self.thread.join(PATIENCE_S)
+        assert not self.thread.is_alive()
+
+    def ask(self, method, path, body=None, headers=()):
+        """Status, content type and JSON of an answer."""
+        line = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
+        try:
+            sent = json.dumps(body) if isinstance(body, dict | list) else body
+            line.request(method, path, sent, {"Content-Type": "application/json", **dict(headers)})
+            answer = line.getresponse()
+            return answer.status, answer.headers.get_content_type(), json.loads(answer.read() or b"null")
+        finally:
+            line.close()
+
+    @contextmanager
+    def stream(self, headers=(), receive_bytes=None):
+        """The lines of a stream of events, as a file."""
+        with socket.socket() as line:
+            if receive_bytes:
+                line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_bytes)
+            line.settimeout(PATIENCE_S)
+            line.connect(("127.0.0.1", self.port))
+            head = "".join(f"{name}: {value}\r\n" for name, value in dict(headers).items())
+            line.sendall(f"GET /v1/events HTTP/1.1\r\nHost: localhost:{self.port}\r\n{head}\r\n".encode())
+            with line.makefile("r", encoding="utf-8", newline="\n") as file:
+                yield line, file
+
+
+def events(file, enough):
+    """Events of a stream by id, topic and data, until there are enough."""
+    found, now = [], {}
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not enough(found):
+        assert time.monotonic() < deadline_s, found
+        text = file.readline()
+        assert text, f"the stream ended after {found}"
+        name, colon, value = text.rstrip("\n").partition(": ")
+        if colon and name in ("id", "event", "data"):
+            now[name] = value
+        elif text == "\n" and "event" in now:
+            found.append((now.get("id"), now["event"], json.loads(now["data"])))
+            now = {}
+    return found
+
+
+def of(topic, found):
+    return [data for _, name, data in found if name == topic]
+
+
+def numbers_of(found):
+    """What the arm numbered its events with."""
+    return [data["word"]["number"] for data in of("event", found)]
+
+
+@pytest.fixture(scope="module")
+def router():
+    with Router() as opened:
+        yield opened.endpoint
+
+
+@pytest.fixture(scope="module")
+def arm(router):
+    with StandIn(router) as standing:
+        yield standing
+
+
+@pytest.fixture(scope="module")
+def gateway(router, arm):
+    with Served(router) as served:
+        yield served
+
+
+def until(condition, make=lambda: None):
+    """The first true value of a condition that other threads bring about."""
+    deadline_s = time.monotonic() + PATIENCE_S
+    pause = threading.Event()
+    while not (value := condition()):
+        assert time.monotonic() < deadline_s, "waited in vain"
+        make()
+        pause.wait(0.02)
+    return value
+
+
+def test_the_fleet_is_told_with_ages(gateway, arm):
+    def fleet():
+        _, kind, told = gateway.ask("GET", "/v1/fleet")
+        assert kind == "application/json"
+        return told if told["arms"] and told["arms"][0]["present"] and told["jobs"] else None
+
+    told = until(fleet, lambda: arm.state(3))
+    assert told["fleet"] == "f"
+    (seen,) = told["arms"]
+    assert (seen["arm"], seen["hottest_c"], seen["joint"], seen["headroom_k"]) == ("a/1", 41.5, 2, 18.5)
+    assert 0 <= seen["state_age_s"] < 3.0
+    assert told["counts"] == {"waiting": 1}
+
+
+def test_jobs_go_in_and_answers_come_out(gateway, arm):
+    status, _, told = gateway.ask("POST", "/v1/jobs", {"jobs": [CRATE_JSON], "by": "me"})
+    assert (status, told["jobs"][0]["accepted"]) == (200, True)
+    assert arm.asked[-1].jobs[0].name == "crate 1"
+    status, _, told = gateway.ask("GET", "/v1/jobs?job=crate%201")
+    assert (status, told["jobs"][0]["state"]) == (200, "waiting")
+    status, _, told = gateway.ask("POST", "/v1/ask", {"jobs": [CRATE_JSON]})
+    assert (status, told["quotes"][0]["offers"][0]["d"]) == (200, 0.25)
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "body", "headers", "status", "says"),
+    [
+        ("POST", "/v1/jobs", "{", {}, 422, "Not a thermofleet.Submission"),
+        ("POST", "/v1/jobs", {"jobs": []}, {}, 422, "length >= 1"),
+        ("POST", "/v1/jobs", {"jobs": [{**CRATE_JSON, "places": ["a", "b"]}]}, {}, 422, "place"),
+        ("POST", "/v1/jobs", b"\xff", {}, 422, "Not a"),
+        ("POST", "/v1/jobs", {"jobs": [CRATE_JSON]}, {"Content-Type": "text/plain"}, 415, "application/json"),
+        ("POST", "/v1/jobs", {"jobs": [CRATE_JSON], "by": "disk full"}, {}, 503, "no room"),
+        ("POST", "/v1/ask", {"jobs": []}, {}, 422, "length >= 1"),
+        ("POST", "/v1/jobs", b" " * (MOST_BYTES + 1), {}, 413, "at most"),
+        ("GET", "/v1/nothing", None, {}, 404, "Not Found"),
+        ("DELETE", "/v1/jobs", None, {}, 405, "Not Allowed"),
+        ("GET", "/v1/fleet", None, {"Host": "evil.example"}, 421, "evil.example"),
+        ("GET", "/v1/fleet", None, {"Host": "evil.example:80"}, 421, "evil.example"),
+    ],
+)
+def test_what_is_wrong_is_told_as_a_problem(gateway, method, path, body, headers, status, says):
+    got, kind, told = gateway.ask(method, path, body, headers)
+    assert (got, kind) == (status, "application/problem+json")
+    assert told["status"] == status
+    assert says in told["detail"]
+
+
+def test_a_body_of_unknown_length_is_cut_off_too(gateway):
+    line = http.client.HTTPConnection("127.0.0.1", gateway.port, timeout=PATIENCE_S)
+    parts = (b" " * 10_000 for _ in range(7))
+    line.request("POST", "/v1/jobs", parts, {"Content-Type": "application/json"}, encode_chunked=True)
+    assert line.getresponse().status == 413
+    line.close()
+
+
+def test_a_body_that_does_not_come_is_not_waited_for(router):
+    with Served(router, body_s=0.2) as served, socket.create_connection(("127.0.0.1", served.port)) as line:
+        line.settimeout(PATIENCE_S)
+        head = (
+            "POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n{"
+        )
+        line.sendall(head.encode())
+        assert b" 408 " in line.recv(1000)
+
+
+def test_without_an_auctioneer_the_gateway_says_so():
+    with Router() as empty, Served(empty.endpoint) as served:
+        status, _, told = served.ask("POST", "/v1/jobs", {"jobs": [CRATE_JSON]})
+        assert (status, told["detail"]) == (503, "There is no auctioneer in this fleet.")
+        status, _, told = served.ask("GET", "/v1/fleet")
+        assert (status, told["arms"]) == (200, [])
+
+
+def test_only_who_shows_the_token_gets_in(router):
+    token = "sixteen-or-more-characters"
+    with Served(router, token=token) as served:
+        for wrong in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": f"Basic {token}"},
+                      {"Authorization": f"Bearer {token}x"}, {"Authorization": f"Bearer {token[:-1]}"}):  # fmt: skip
+            status, kind, _ = served.ask("GET", "/v1/fleet", headers=wrong)
+            assert (status, kind) == (401, "application/problem+json")
+        with served.stream() as (_, file):
+            assert " 401 " in file.readline()
+        status, _, _ = served.ask("GET", "/v1/fleet", headers={"Authorization": f"bearer {token}", "Host": "any"})
+        assert status == 200
+
+
+@pytest.mark.parametrize(
+    ("host", "port", "token", "says"),
+    [
+        ("0.0.0.0", 8080, "", "THERMOFLEET_TOKEN"),
+        ("192.0.2.1", 8080, "", "not this machine alone"),
+        ("0.0.0.0", 8080, "short", "16"),
+        ("127.0.0.1", 99999, "", "--port"),
+        ("localhost", 8080, "", "IP address"),
+    ],
+)
+def test_strangers_are_let_in_only_with_a_token(host, port, token, says):
+    with pytest.raises(FleetError, match=re.escape(says)):
+        check(host, port, token)
+
+
+def test_with_a_token_any_address_goes_and_the_log_warns(caplog):
+    check("0.0.0.0", 8080, "sixteen-or-more-characters")
+    assert "not encrypted" in caplog.text
+
+
+def test_no_other_origin_is_ever_allowed(gateway):
+    line = http.client.HTTPConnection("127.0.0.1", gateway.port, timeout=PATIENCE_S)
+    line.request("GET", "/v1/fleet", headers={"Origin": "http://evil.example"})
+    assert not [name for name in line.getresponse().headers if name.lower().startswith("access-control")]
+    line.close()
+
+
+def test_the_stream_tells_all_that_is_said(gateway, arm):
+    with gateway.stream() as (_, file):
+        arm.state(1)
+        arm.difficulty()
+        arm.happens(0)
+        found = events(file, lambda found: {"state", "difficulty", "event"} <= {name for _, name, _ in found})
+    assert of("presence", found)[0]["word"] == {"role": "arm", "name": "a/1", "there": True}
+    assert of("state", found)[0]["name"] == "a/1"
+    assert of("state", found)[0]["word"]["temp_c"] == [30.0, 41.5]
+    assert of("event", found)[0]["word"]["kind"] == "warning"
+    numbers = [int(number.partition("-")[2]) for number, _, _ in found]
+    assert numbers == sorted(set(numbers))
+
+
+def test_who_comes_back_misses_no_event(gateway, arm):
+    with gateway.stream() as (_, file):
+        arm.happens(100)
+        last = events(file, lambda found: 100 in numbers_of(found))[-1][0]
+    for number in range(101, 104):
+        arm.happens(number)
+    with gateway.stream({"Last-Event-ID": last}) as (_, file):
+        found = events(file, lambda found: len(of("event", found)) == 3)
+    assert numbers_of(found) == [101, 102, 103]
+    assert not of("gap", found)
+    with gateway.stream({"Last-Event-ID": "otherlife-99999999"}) as (_, file):  # before a restart: all again
+        assert events(file, lambda found: set(numbers_of(found)) >= {100, 101, 102, 103})
+
+
+def test_a_silent_stream_shows_signs_of_life():
+    with Router() as empty, Served(empty.endpoint, heartbeat_s=0.05) as served, served.stream() as (_, file):
+        assert any(": still here" in file.readline() for _ in range(30))
+
+
+def test_a_stuck_reader_is_dropped_and_slows_nobody(router, arm):
+    big = "x" * 4000
+    with Served(router, stuck_s=0.5) as served, served.stream(receive_bytes=4096) as _, served.stream() as (
+        _,
+        file,
+    ):  # fmt: skip
+        until(lambda: len(served.readers.there) == 2)
+        slowest_s = 0.0
+        for number in range(600):  # far more than socket buffers hold
+            said_s = time.monotonic()
+            arm.happens(number, big)
+            if number % 100 == 99:
+                events(
+                    file,
+                    lambda found, n=number: n in numbers_of(found),
+                )
+                slowest_s = max(slowest_s, time.monotonic() - said_s)
+        assert slowest_s < 5.0
+        until(lambda: len(served.readers.there) == 1)  # the stuck one is gone, the other still reads
+        arm.happens(600)
+        assert events(file, lambda found: 600 in numbers_of(found))
+        until(lambda: len(served.server.server_state.connections) == 1)  # and so is its connection
+
+
+def test_a_reader_that_vanishes_is_forgotten(gateway, arm):
+    for _ in range(3):
+        with gateway.stream() as (_, file):
+            file.readline()
+            until(lambda: gateway.readers.there)
+        until(lambda: not gateway.readers.there, lambda: arm.state(1))
+
+
+def test_there_are_only_so_many_readers(gateway):
+    with ExitStack() as stack:
+        for _ in range(64):
+            stack.enter_context(gateway.stream())
+        until(lambda: len(gateway.readers.there) == 64)
+        assert gateway.ask("GET", "/v1/events")[0] == 503
+        assert gateway.ask("GET", "/v1/fleet")[0] == 200
+
+
+@contextmanager
+def process(endpoint, *options):
+    """The command in a process of its own, from when it says that it is ready, and its address."""
+    command = [sys.executable, "-u", "-c", "from scenarios.cli import main; main()", "gateway", "--fleet", "f"]
+    started = subprocess.Popen(
+        [*command, "--endpoint", endpoint, "--port", "0", *options],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        line = started.stdout.readline()
+        assert line.startswith("ready gateway http://127.0.0.1:"), line + started.stderr.read()
+        yield started, line.split()[2]
+    finally:
+        started.kill()
+        started.communicate(timeout=PATIENCE_S)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_the_command_ends_in_order_even_while_somebody_reads(router, number, code):
+    with process(router) as (started, address):
+        port = int(address.split(":")[2].split("/")[0])
+        line = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
+        line.request("GET", "/v1/events")
+        assert line.getresponse().status == 200
+        started.send_signal(number)
+        assert started.wait(PATIENCE_S) == code
+        line.close()
+        assert "Traceback" not in started.stderr.read()
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no Node")
+def test_the_monitor_in_javascript_shows_the_fleet(router, arm):
+    with process(router) as (_, address):
+        arm.state(1)
+        arm.difficulty()
+        arm.happens(7)
+        command = ["node", str(ROOT / "examples" / "monitor.mjs"), address, "3"]
+        node = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | {"NO_COLOR": "1"})
+        until(lambda: node.poll() is not None, lambda: arm.state(1))
+        told, _ = node.communicate(timeout=PATIENCE_S)
+    assert node.returncode == 0
+    assert re.search(r"a/1 .*idle.*41\.5.*2 .*18\.5", told)
+    assert "warning" in told
+    assert "crate 1 0.50" in told
