@@ -7,7 +7,7 @@ long an arm still holds its lease, is not in here: whoever replays lets every op
 
 from bisect import insort
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -85,8 +85,8 @@ class Ledger:
         there = {name: entry.word for name, entry in self.jobs.items()}
         return admit(words, there, places=self.places, most=self.most)
 
-    def ready(self, time_s: float, most: int) -> list[JobWord]:
-        """The first jobs that an arm may begin now: released, after their predecessors, at free stations."""
+    def ready(self, time_s: float, most: int, *, but: Container[str] = ()) -> list[JobWord]:
+        """The first jobs, `but` for some, that may begin now: released, after their predecessors, at free stations."""
         if self.ended:
             return []
         taken = self.taken()
@@ -95,6 +95,7 @@ class Ledger:
             for name in self._waiting
             for word in [self.jobs[name].word]
             if word.release_s <= time_s
+            and name not in but
             and not taken & frozenset(word.places)
             and all(self.jobs[before].state == "finished" for before in word.after)
         )
