@@ -248,10 +248,10 @@ class ModelFleet:
         if isinstance(said, Submitted):
             self.accepted |= {word.name: word for word in words}
 
-    def step(self, dt_s: float) -> None:
-        """Time goes on, everybody does what is due."""
+    def step(self, dt_s: float, but: str = "") -> None:
+        """Time goes on; the auctioneer sees who is there, and does what is due."""
         self.true_s += dt_s
-        self.auctioneer.seen(frozenset(name for name, arm in self.arms.items() if arm.up))
+        self.auctioneer.seen(frozenset(name for name, arm in self.arms.items() if arm.up and name != but))
         self.attempt(lambda: self.auctioneer.tick(self.real_s, self.true_s))
 
     def arm_turn(self, name: str) -> None:
@@ -312,7 +312,7 @@ class ModelFleet:
             for _ in range(4):
                 self.wires = [wire for wire in self.wires if not but or but not in (wire.to, speaker(wire))]
                 self.deliver_all()
-            self.step(dt_s)
+            self.step(dt_s, but)
 
     def calm(self) -> bool:
         """Nothing is in anybody's hands."""

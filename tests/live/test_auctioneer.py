@@ -131,6 +131,18 @@ def test_a_report_on_the_award_of_another_is_refused(fleet_of):
     assert fleet.auctioneer.status()[0].state == "awarded"
 
 
+def test_the_same_report_again_changes_nothing(fleet_of):
+    fleet = fleet_of(1)
+    bid(fleet, hold("a"))
+    fleet.deliver_all()
+    fleet.arms["arm_0"].give_back(fleet.true_s)
+    (report,) = fleet.arms["arm_0"].reports.values()
+    first = fleet.auctioneer.reported(report, fleet.real_s, fleet.true_s)
+    written = len(fleet.journal)
+    assert fleet.auctioneer.reported(report, fleet.real_s, fleet.true_s) == first
+    assert len(fleet.journal) == written
+
+
 def test_a_report_on_an_award_that_nobody_made_changes_nothing(fleet_of):
     fleet = fleet_of(1)
     fleet.submit(hold("a"))
