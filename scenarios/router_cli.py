@@ -1,10 +1,10 @@
 """`thermofleet router`: the router of a fleet as a process of its own."""
 
 import signal
-from collections.abc import Iterator
+import socket
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Annotated
 
 import typer
@@ -46,21 +46,35 @@ def router_command(
     limits = Limits(state_hz=state_hz or None)
     with stop_asked() as asked, Router(port, host=host, tls=Tls(tls, name) if tls else None, limits=limits) as router:
         typer.echo(router.endpoint)  # flushed: a supervisor reads this line
-        if asked.get() == signal.SIGINT:
+        if asked() == signal.SIGINT:
             raise Interrupted("The router was interrupted; whoever was connected tries again by itself.")
 
 
 @contextmanager
-def stop_asked() -> Iterator["SimpleQueue[int]"]:
-    """A queue that gets the number of the signal that asks for an end: Ctrl-C or SIGTERM."""
-    asked: SimpleQueue[int] = SimpleQueue()  # the one thing that a signal handler may safely put into
+def stop_asked() -> Iterator[Callable[[], int]]:
+    """A function that waits until Ctrl-C or SIGTERM asks for an end, and returns the number of the signal.
+
+    Zenoh has threads of its own, and a signal that one of them takes wakes no lock or queue that the main thread waits
+    on: seen in every second try. A socket that the signal itself writes into always does.
+    """
     numbers = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda which, _frame: asked.put(which)) for number in numbers]
-    try:
-        yield asked
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
+    woken, waker = socket.socketpair()
+    with woken, waker:
+        waker.setblocking(False)
+        before_fd = signal.set_wakeup_fd(waker.fileno())
+        before = [signal.signal(number, lambda *_: None) for number in numbers]
+
+        def wait() -> int:
+            while (number := woken.recv(1)[0]) not in numbers:
+                pass
+            return number
+
+        try:
+            yield wait
+        finally:
+            for number, handler in zip(numbers, before, strict=True):
+                signal.signal(number, handler)
+            signal.set_wakeup_fd(before_fd)
 
 
 def _check_roster(folder: Path | None, scenario: str) -> None:

@@ -1,0 +1,165 @@
+"""`thermofleet keys` and `thermofleet router`, called as a person and as a supervisor call them."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from fleet.bus import keys
+from fleet.bus.router import open_client
+from fleet.bus.security import Tls
+from scenarios.cli import main
+
+ROOT = Path(__file__).parents[2]
+PATIENT_S = 20.0
+
+
+def call(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
+    """Exit code, and what was said on both outputs."""
+    with pytest.raises(SystemExit) as left:
+        main([str(word) for word in words])
+    said = capsys.readouterr()
+    assert isinstance(left.value.code, int)
+    return left.value.code, said.out, said.err
+
+
+@contextmanager
+def started(*words: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """The router as a process, and the line that it prints when it listens."""
+    command = [sys.executable, "-c", "from scenarios.cli import main; main()", "router", *map(str, words)]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            yield process, process.stdout.readline().strip()
+        finally:
+            process.kill()
+
+
+@pytest.fixture
+def folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+    place = tmp_path / "keys"
+    assert call(capsys, "keys", place, "quickstart", "--extra", "gateway:submitter")[0] == 0
+    return place
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_a_router_says_where_it_listens_and_ends_when_asked(number, code):
+    with started("--port", 0) as (process, endpoint):
+        assert endpoint.startswith("tcp/127.0.0.1:")
+        with open_client(endpoint, timeout_s=PATIENT_S):
+            process.send_signal(number)
+            out, err = process.communicate(timeout=PATIENT_S)
+        assert process.returncode == code
+        assert out == ""
+        assert ("The router was interrupted" in err) == (code == 130)
+        assert "Traceback" not in err
+
+
+def test_a_router_with_tls_knows_the_fleet_and_thins_its_telemetry(folder):
+    with started("--port", 0, "--tls", folder, "--scenario", "quickstart", "--state-hz", 5) as (process, endpoint):
+        assert endpoint.startswith("tls/127.0.0.1:")
+        with (
+            open_client(endpoint, timeout_s=PATIENT_S, tls=Tls(folder, "arm_0")) as arm,
+            open_client(endpoint, timeout_s=PATIENT_S, tls=Tls(folder, "monitor")) as monitor,
+        ):
+            heard: list[str] = []
+            listener = monitor.declare_subscriber(
+                "thermofleet/v1/quickstart/**", lambda s: heard.append(str(s.key_expr))
+            )
+            cache = keys.caches_of("thermofleet/v1/quickstart/arm/nobody")
+            assert list(monitor.get(cache, timeout=PATIENT_S)) == []
+            for _ in range(100):
+                arm.put(keys.of_arm("quickstart", "arm_0", "state"), b"")
+                arm.put(keys.of_arm("quickstart", "arm_1", "event"), b"not mine")
+            for session in (arm, monitor):
+                assert list(session.get(cache, timeout=PATIENT_S)) == []
+            assert 1 <= heard.count(keys.of_arm("quickstart", "arm_0", "state")) < 50
+            assert keys.of_arm("quickstart", "arm_1", "event") not in heard
+            listener.undeclare()
+        process.terminate()
+        assert process.wait(PATIENT_S) == 0
+
+
+def test_a_port_in_use_is_one_sentence(capsys):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        code, out, err = call(capsys, "router", "--port", port)
+    assert (code, out) == (2, "")
+    assert f"could not listen on port {port} of 127.0.0.1; is it in use?" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("--host", "0.0.0.0"), "Without TLS the bus has no authentication"),
+        (("--host", "192.0.2.1"), "is not on loopback"),
+        (("--port", "70000"), "--port must be 0 to 65535"),
+        (("--state-hz", "-1"), "--state-hz must be 0 or more"),
+        (("--scenario", "quickstart"), "--scenario goes with --tls"),
+        (("--tls", "{keys}", "--scenario", "heat_wave"), "are of the fleet 'quickstart', not of 'heat_wave'"),
+        (("--tls", "{keys}/none"), "There is no '"),
+        (("--tls", "{keys}", "--name", "arm_0"), "a router needs that of a router"),
+    ],
+)
+def test_what_a_router_cannot_do_is_one_sentence(capsys, folder, words, complaint):
+    code, out, err = call(capsys, "router", *(word.format(keys=folder) for word in words))
+    assert (code, out) == (2, "")
+    assert complaint in " ".join(err.split())
+    assert "Traceback" not in err
+
+
+def test_an_arm_without_a_certificate_is_named_before_the_router_starts(capsys, folder):
+    told = json.loads((folder / "roster.json").read_text())
+    told["participants"] = [one for one in told["participants"] if one["name"] != "arm_1"]
+    (folder / "roster.json").write_text(json.dumps(told))
+    code, _, err = call(capsys, "router", "--tls", folder, "--scenario", "quickstart")
+    assert code == 2
+    assert "--add arm_1:arm makes one" in " ".join(err.split())
+
+
+def test_keys_are_made_shown_and_added_to(capsys, folder):
+    code, out, err = call(capsys, "keys", folder, "--json")
+    assert (code, err) == (0, "")
+    told = json.loads(out)
+    assert told["fleet"] == "quickstart"
+    roles = {one["name"]: one["role"] for one in told["participants"]}
+    assert roles == {
+        **{role: role for role in ("router", "auctioneer", "submitter", "monitor", "recorder")},
+        **{f"arm_{i}": "arm" for i in range(4)},
+        "gateway": "submitter",
+    }
+    assert call(capsys, "keys", folder, "--add", "a:b:monitor", "--days", 5)[0] == 0
+    code, out, _ = call(capsys, "keys", folder)
+    assert "a:b" in out
+    assert "expired" not in out
+    assert "(authority)" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("quickstart",), "holds the keys of a fleet"),
+        (("--add", "gateway:submitter"), "has a certificate"),
+        (("--add", "x:king"), "no role 'king'. Allowed: arm"),
+        (("--add", "x:submiter"), "did you mean 'submitter'?"),
+        (("--add", "x"), "is not NAME:ROLE"),
+        (("--add", "ca:monitor"), "may be named 'ca'"),
+        (("--add", "y:arm", "--days", "0"), "lasts 1 to 3650 days"),
+        (("--extra", "y:arm"), "SCENARIO is needed"),
+        (("quickstart", "--add", "y:arm"), "leave SCENARIO and --extra out"),
+        (("quickstart", "--extra", "arm_0:arm", "--overwrite"), "'arm_0' is taken"),
+        (("nowhere",), "No scenario 'nowhere'"),
+    ],
+)
+def test_keys_that_cannot_be_made_are_one_sentence(capsys, folder, words, complaint):
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    code, out, err = call(capsys, "keys", folder, *words)
+    assert (code, out) == (2, "")
+    assert complaint in " ".join(err.split())
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
