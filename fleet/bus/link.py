@@ -33,8 +33,10 @@ Heard = TypeVar("Heard", bound=msgspec.Struct)
 
 BACKLOG = 4096
 """What waits to be handled, at most; the oldest goes first. A fleet that behaves needs a few per participant."""
-REMEMBERED = 64
-"""Last words of a remembering publisher that a late joiner gets."""
+REMEMBERED = 1024
+"""Words that a publisher of telemetry or events keeps for those who come later or come back: at ten a second a router
+may be away for a minute and a half. A listener that wants them all asks for as many: after a break it gets so many of
+the last ones and no others."""
 HEARTBEAT_S = 0.5
 
 
@@ -68,6 +70,7 @@ class Link:
     Attributes:
         fleet: Name of the fleet, part of every key.
         malformed: Messages that were not what they should be.
+        complaints: What was wrong with the last of them.
         overrun: Messages that were lost because nobody served for too long.
     """
 
@@ -75,6 +78,7 @@ class Link:
         """Prepare a line to the router at `endpoint`, which has `timeout_s` to answer."""
         self.fleet = fleet
         self.malformed = 0
+        self.complaints: deque[str] = deque(maxlen=8)
         self.overrun = 0
         self._endpoint, self._timeout_s = endpoint, timeout_s
         self._waiting: deque[Callable[[], None]] = deque()
@@ -357,6 +361,7 @@ class Link:
     def _complain(self, reason: str) -> None:
         """Log the first few and then fewer and fewer: whoever floods the bus shall not flood the log."""
         self.malformed += 1
+        self.complaints.append(reason)
         if self.malformed & (self.malformed - 1) == 0:  # 1, 2, 4, 8, …
             _LOG.warning("Left out (%d so far): %s", self.malformed, reason)
 

@@ -33,6 +33,15 @@ def serve(condition, *links):
             link.serve(time.monotonic() + 0.02)
 
 
+def meet(*links):
+    """What each has declared is known to all: a token is declared last, and seen after the rest."""
+    seen = [set() for _ in links]
+    for number, (link, names) in enumerate(zip(links, seen, strict=True)):
+        link.alive(keys.of_arm("f", f"guest_{number}", "alive"))
+        link.watch(keys.of_every_arm("f", "alive"), lambda arm, _, names=names: names.add(arm))
+    serve(lambda: all(len(names) >= len(links) for names in seen), *links)
+
+
 def raw(link):
     """The session beneath, to speak rubbish with."""
     return link._session
@@ -41,6 +50,7 @@ def raw(link):
 def test_an_answer_reaches_the_one_who_asked(bus):
     asker, teller = bus(), bus()
     teller.answer(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=12.5, speed=60.0))
+    meet(asker, teller)
     got = []
     asker.ask(keys.of_clock("f"), ClockRequest(), Clock, got.append, timeout_s=5.0)
     serve(lambda: got, asker, teller)
@@ -63,6 +73,7 @@ def test_a_refusal_is_told_in_words(bus):
         raise Refused("No clock here.")
 
     teller.answer(keys.of_clock("f"), ClockRequest, refuse)
+    meet(asker, teller)
     got = []
     asker.ask(keys.of_clock("f"), ClockRequest(), Clock, got.append, timeout_s=5.0)
     serve(lambda: got, asker, teller)
@@ -80,6 +91,7 @@ def test_two_that_ask_each_other_do_not_block(bus):
 
     other.answer(keys.of_jobs("f", "submit"), Submission, answered)
     one.answer(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=1.0, speed=1.0))
+    meet(one, other)
     one.ask(keys.of_jobs("f", "submit"), Submission((job,)), Submitted, got.append, timeout_s=5.0)
     serve(lambda: len(got) == 2, one, other)
     assert all(len(answers.words) == 1 for answers in got)
@@ -97,6 +109,7 @@ def test_two_that_ask_each_other_do_not_block(bus):
 def test_a_malformed_question_is_answered_with_what_is_wrong(bus, payload, said, complaint):
     asker, teller = bus(), bus()
     teller.answer(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=1.0, speed=1.0))
+    meet(asker, teller)
     replies = []
     raw(asker).get(keys.of_clock("f"), replies.append, payload=payload, encoding=said, timeout=5.0)
     serve(lambda: replies, teller)
@@ -120,6 +133,7 @@ def test_a_late_joiner_hears_the_last_words(bus):
 def test_words_that_speak_for_another_are_left_out(bus):
     listener, stranger, heard = bus(), bus(), []
     listener.listen(keys.of_every_arm("f", "event"), ArmEvent, lambda arm, word: heard.append(arm))
+    meet(listener, stranger)
     lie = ArmEvent(arm="arm_1", number=0, time_s=1.0, kind="finish")
     truth = ArmEvent(arm="arm_2", number=0, time_s=1.0, kind="finish")
     stranger.say(keys.of_arm("f", "arm_0", "event"), lie)
@@ -143,6 +157,7 @@ def test_who_comes_and_goes_is_seen(bus):
 def test_what_nobody_handles_pushes_out_the_oldest(bus):
     listener, sender, heard = bus(backlog=10), bus(), []
     listener.listen(keys.of_every_arm("f", "event"), ArmEvent, lambda arm, word: heard.append(word.number))
+    meet(listener, sender)
     for number in range(50):
         sender.say(keys.of_arm("f", "a", "event"), ArmEvent(arm="a", number=number, time_s=0.0, kind="finish"))
     sender.say(keys.of_arm("f", "a", "event"), ArmEvent(arm="a", number=50, time_s=0.0, kind="finish"))
