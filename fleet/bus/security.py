@@ -51,7 +51,8 @@ class Tls:
         self._check_secret()
         left = certificate.not_valid_after_utc - datetime.now(UTC)
         if left < REMIND:
-            _LOG.warning("The certificate of '%s' ends on %s.", who, told(certificate.not_valid_after_utc))
+            ends = told(certificate.not_valid_after_utc)
+            _LOG.warning("The certificate of '%s' ends on %s; thermofleet keys --add renews it.", who, ends)
 
     def link(self, *, serves: bool) -> dict[str, Any]:
         """Zenoh's settings for the lines of this end."""

@@ -1,0 +1,139 @@
+"""What TLS, rules and limits cost: a round trip through the router and the opening of a line, beside bare Zenoh.
+
+    python benchmarks/bench_tls.py [--rounds 2000] [--opens 40]
+
+Three routers in one process on loopback: bare Zenoh, ours with plain TCP (size and rate limits), ours with mutual TLS
+(limits, and the rules of a fleet of 16 arms). A round trip is a put of 256 bytes from one client through the router to
+another, whose callback puts it back; `open` is `zenoh.open` of a client with all checks of its certificate. The three
+take turns, so that a busy machine slows them alike.
+"""
+
+import argparse
+import json
+import queue
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+import zenoh
+
+from fleet.bus import keys
+from fleet.bus.keyring import make
+from fleet.bus.limits import Limits
+from fleet.bus.roster import of_arms
+from fleet.bus.router import Router, open_client
+from fleet.bus.security import Tls
+
+ARMS = [f"arm_{i}" for i in range(16)]
+PATIENT_S = 20.0
+WARM_UP = 50
+PAYLOAD = b"x" * 256
+QUIET = {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}}
+
+
+class PingPong:
+    """Two arms that throw a word to and fro under their own keys."""
+
+    def __init__(self, open_arm: Callable[[str], zenoh.Session], stack: ExitStack) -> None:
+        one, other = (stack.enter_context(open_arm(name)) for name in ARMS[:2])
+        there, back = (keys.of_arm("bench", name, "event") for name in ARMS[:2])
+        self._came: queue.SimpleQueue[None] = queue.SimpleQueue()
+        answer = other.declare_publisher(back)
+        self._ask = one.declare_publisher(there)
+        heard = zenoh.handlers.Callback(lambda sample: answer.put(sample.payload), indirect=False)
+        ended = zenoh.handlers.Callback(lambda _: self._came.put(None), indirect=False)
+        self._kept = (other.declare_subscriber(there, heard), one.declare_subscriber(back, ended))
+        for session in (one, other):  # answered in order: what was declared is known to the router
+            list(session.get(keys.caches_of("thermofleet/v1/bench/arm/nobody"), timeout=PATIENT_S))
+
+    def round_s(self) -> float:
+        """Seconds of one round trip."""
+        began_s = time.perf_counter()
+        self._ask.put(PAYLOAD)
+        self._came.get(timeout=PATIENT_S)
+        return time.perf_counter() - began_s
+
+
+def bare_router(stack: ExitStack) -> str:
+    """A router with nothing of ours; its endpoint."""
+    config = {
+        "mode": "router",
+        "listen": {"endpoints": ["tcp/127.0.0.1:0"]},
+        "scouting": QUIET,
+        "adminspace": {"enabled": True},
+        "transport": {"shared_memory": {"enabled": False}},
+    }
+    session = stack.enter_context(zenoh.open(zenoh.Config.from_json5(json.dumps(config))))
+    (reply,) = list(session.get(f"@/{session.zid()}/router", timeout=PATIENT_S))
+    assert reply.ok is not None
+    return json.loads(reply.ok.payload.to_bytes())["locators"][0]
+
+
+def bare_client(endpoint: str) -> zenoh.Session:
+    """A client with nothing of ours."""
+    config = {
+        "mode": "client",
+        "connect": {"endpoints": [endpoint]},
+        "scouting": QUIET,
+        "transport": {"shared_memory": {"enabled": False}},
+    }
+    return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+
+
+def opened_s(open_arm: Callable[[str], zenoh.Session]) -> float:
+    """Seconds that opening one line takes."""
+    began_s = time.perf_counter()
+    with open_arm(ARMS[2]):
+        return time.perf_counter() - began_s
+
+
+def row(name: str, rounds: list[float], opens: list[float]) -> str:
+    """Median and 99th percentile of both, in µs and ms."""
+
+    def at(values: list[float], share: float) -> float:
+        return sorted(values)[min(len(values) - 1, int(share * len(values)))]
+
+    cells = [f"{1e6 * at(rounds, share):>10.0f}" for share in (0.5, 0.99)]
+    cells += [f"{1e3 * at(opens, share):>10.2f}" for share in (0.5, 0.99)]
+    return f"{name:<34}{''.join(cells)}"
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=2000)
+    parser.add_argument("--opens", type=int, default=40)
+    options = parser.parse_args()
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "keys"
+        make(folder, of_arms("bench", ARMS), days=30)
+        limits = Limits(state_hz=100.0)
+        bare = bare_router(stack)
+        plain = stack.enter_context(Router(limits=limits)).endpoint
+        secure = stack.enter_context(Router(tls=Tls(folder, "router"), limits=limits)).endpoint
+        sides: dict[str, Callable[[str], zenoh.Session]] = {
+            "bare Zenoh, TCP": lambda _: bare_client(bare),
+            "ours, TCP, limits": lambda _: open_client(plain, timeout_s=PATIENT_S),
+            "ours, mutual TLS, limits, rules": lambda arm: open_client(
+                secure, timeout_s=PATIENT_S, tls=Tls(folder, arm)
+            ),
+        }
+        pairs = {name: PingPong(open_arm, stack) for name, open_arm in sides.items()}
+        rounds: dict[str, list[float]] = {name: [] for name in sides}
+        opens: dict[str, list[float]] = {name: [] for name in sides}
+        for _ in range(options.rounds + WARM_UP):
+            for name, pair in pairs.items():
+                rounds[name].append(pair.round_s())
+        for _ in range(options.opens):
+            for name, open_arm in sides.items():
+                opens[name].append(opened_s(open_arm))
+        print(f"{'':<34}  round trip, µs       open, ms")
+        print(f"{'':<34}{'p50':>10}{'p99':>10}{'p50':>10}{'p99':>10}")
+        for name in sides:
+            print(row(name, rounds[name][WARM_UP:], opens[name]))
+
+
+if __name__ == "__main__":
+    main()
