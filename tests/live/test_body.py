@@ -1,0 +1,254 @@
+"""The live body is the arm of a shift: the same heat, the same moments; and it does no cycle that it may not do."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet.env.allocation_v0 import Episode, parallel_env
+from fleet.live.body import SimulatedBody
+from fleet.robot import ThermalLimits
+from fleet.telemetry import FAULTED
+from fleet.thermal import WINDING
+
+DT_S = 10.0
+LIMITS = ThermalLimits()
+
+
+def body_of(arm, *, dt_s=DT_S, limits=LIMITS, air_c=lambda time_s: 25.0, warm=False, seed=0):
+    return SimulatedBody(arm, limits, air_c, dt_s=dt_s, rng=np.random.default_rng(seed), warm=warm)
+
+
+def one_job(small, *, repetitions=3, payload=None, times=None):
+    """An arm, a job of three cycles of 10 s after 3 s of approach, 2 s of retreat, and its plan."""
+    content = small.work(payload_kg=small.LIGHT if payload is None else payload)
+    arm = small.arm(0, [content], times=times)
+    return arm, small.job("a", content, repetitions=repetitions), arm.plans[content][0]
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.data())
+def test_it_lives_through_the_same_shift_as_the_simulator(small, data):
+    """One arm, the same jobs in the same order: temperatures at every tick and every event agree."""
+    draw = data.draw
+    loads = [small.LIGHT, small.WARM, small.HOT]
+    works = [small.work(f"p{i}", load) for i, load in enumerate(loads)]
+    spans = small.Times(*(draw(st.integers(1, 900)) / 50 for _ in range(3)))
+    arm = small.arm(0, works, times=spans)
+    jobs = [
+        small.job(
+            f"j{i}",
+            works[draw(st.integers(0, 2))],
+            repetitions=draw(st.integers(1, 40)),
+            release_s=float(draw(st.integers(0, 600))),
+            due_s=2000.0,
+        )
+        for i in range(draw(st.integers(1, 5)))
+    ]
+    limits = ThermalLimits(warning_c=35.0, error_c=40.0, restart_c=34.0)  # faults within a short shift
+    world, plant = small.shop([jobs], arms=[arm], limits=limits, dt_s=DT_S, ticks=200, slots=8)
+    air = 25.0 + 3.0 * np.sin(np.arange(200) / 30.0)[:, None]
+    world = replace(world, ambient_c=air)
+    shift = parallel_env(
+        lambda seed: Episode(world=world, plant=plant, twins=("t",), rng=np.random.default_rng(0)), keep_events=True
+    )
+    body = body_of(arm, limits=limits, air_c=lambda time_s: float(air[int(time_s / DT_S), 0]))
+    shift.reset(seed=0)
+    waiting = {job.name: job.release_s for job in jobs}
+    done, by_name, lived = dict.fromkeys(waiting, 0), {job.name: job for job in jobs}, []
+    for tick in range(world.ticks):
+        legal = shift.knowledge()["arm_0"].action_mask
+        shift.step({"arm_0": 1 if legal[1] else 0})
+        order = sorted(waiting, key=lambda n: (waiting[n], list(by_name).index(n)))
+        ready = [n for n in order if waiting[n] <= tick * DT_S]
+        if body.free and ready:
+            job = by_name[ready[0]]
+            del waiting[job.name]
+            body.begin(job, arm.plans[job.work][0], done[job.name])
+            body.permit(job.repetitions)
+        for each in body.advance((tick + 1) * DT_S):
+            lived.append(each)
+            if each.kind == "return":
+                waiting[each.job], done[each.job] = each.time_s, int(each.value)
+        np.testing.assert_allclose(body.truth.temp_c[0, 0], shift.truth.temp_c[0, 0], rtol=0, atol=1e-6)
+        assert body.truth.mode[0, 0] == shift.truth.mode[0, 0]
+        if not shift.agents:
+            break
+    told = ("finish", "home", "warning", "fault", "return", "recover")
+    expected = sorted((e.kind, e.job, round(e.time_s, 6)) for e in shift.events if e.kind in told)
+    assert sorted((e.kind, e.job, round(e.time_s, 6)) for e in lived if e.kind in told) == expected
+    assert {n: c for n, c in done.items() if n in waiting} == {
+        n: int(shift.truth.cycles[0, j]) for j, n in enumerate(world.jobs.names[0]) if n in waiting
+    }
+
+
+def test_a_job_ends_at_its_planned_moment_whatever_the_step(small):
+    arm, job, plan = one_job(small)
+    for dt_s in (0.1, 0.7, 6.0):
+        body = body_of(arm, dt_s=dt_s)
+        body.begin(job, plan, 1)
+        assert body.last_in_s() == pytest.approx(3.0 + 10.0)
+        assert body.free_in_s() == pytest.approx(3.0 + 20.0 + 2.0)
+        body.permit(3)
+        events = body.advance(60.0)
+        assert [(e.kind, e.job) for e in events if e.kind in ("finish", "home")] == [("finish", "a"), ("home", "a")]
+        assert [e.time_s for e in events if e.kind in ("finish", "home")] == pytest.approx([23.0, 25.0])
+        assert body.free
+
+
+def test_without_leave_it_stops_before_the_last_cycle_and_comes_home(small):
+    arm, job, plan = one_job(small)
+    body = body_of(arm, dt_s=1.0)
+    body.begin(job, plan, 0)
+    body.permit(2)
+    events = body.advance(24.0)
+    assert body.cycles == 2
+    assert body.last_in_s() == pytest.approx(1.0 + 3.0)  # on its way home, and back again
+    events += body.advance(100.0)
+    assert [e.kind for e in events] == ["home"]
+    assert events[0].time_s == pytest.approx(25.0)
+    assert (body.job, body.cycles, body.free) == ("a", 2, False)
+    body.permit(3)
+    events = body.advance(200.0)
+    assert [(e.kind, e.time_s) for e in events] == [("finish", pytest.approx(113.0)), ("home", pytest.approx(115.0))]
+    assert body.free
+
+
+def test_leave_in_time_makes_it_one_stint(small):
+    arm, job, plan = one_job(small)
+    body = body_of(arm, dt_s=1.0)
+    body.begin(job, plan, 0)
+    body.permit(2)
+    body.advance(22.0)
+    assert body.last_in_s() == pytest.approx(1.0)
+    body.permit(3)
+    assert [e.time_s for e in body.advance(60.0) if e.kind == "finish"] == pytest.approx([33.0])
+
+
+@pytest.mark.parametrize(
+    ("when", "cycles", "home_s"), [(2.0, 0, 5.0), (3.5, 1, 15.0), (13.0, 1, 15.0), (14.0, 2, 25.0)]
+)
+def test_paused_it_ends_the_cycle_it_began_and_goes_home(small, when, cycles, home_s):
+    arm, job, plan = one_job(small)
+    body = body_of(arm, dt_s=0.5)
+    body.begin(job, plan, 0)
+    body.permit(3)
+    body.advance(when)
+    body.permit(body.cycles)
+    events = body.advance(50.0)
+    assert [(e.kind, e.time_s) for e in events] == [("home", pytest.approx(home_s))]
+    assert (body.job, body.cycles) == ("a", cycles)
+
+
+def test_a_pause_that_is_over_before_it_takes_effect_is_none(small):
+    arm, job, plan = one_job(small)
+    body = body_of(arm, dt_s=0.5)
+    body.begin(job, plan, 0)
+    body.permit(3)
+    body.advance(9.0)
+    body.permit(0)
+    body.advance(11.0)
+    body.permit(3)
+    assert [e.time_s for e in body.advance(60.0) if e.kind == "finish"] == pytest.approx([33.0])
+
+
+def test_nothing_moves_before_it_may(small):
+    arm, job, plan = one_job(small, repetitions=1)
+    body = body_of(arm)
+    body.begin(job, plan, 0)
+    assert body.advance(300.0) == []
+    assert (body.job, body.cycles, body.free) == ("a", 0, False)
+    assert body.last_in_s() == pytest.approx(3.0)
+
+
+def test_what_it_lets_go_of_is_forgotten_when_it_is_home(small):
+    arm, job, plan = one_job(small)
+    body = body_of(arm, dt_s=1.0)
+    body.begin(job, plan, 0)
+    body.permit(3)
+    body.advance(8.0)
+    body.let_go()
+    assert (body.job, body.free) == ("", False)
+    assert [(e.kind, e.time_s) for e in body.advance(30.0)] == [("home", pytest.approx(15.0))]
+    assert body.free
+    body.begin(job, plan, 0)
+    body.let_go()
+    assert body.free
+
+
+def test_letting_go_in_the_last_cycle_finishes_nothing(small):
+    arm, job, plan = one_job(small)
+    body = body_of(arm, dt_s=1.0)
+    body.begin(job, plan, 2)
+    body.permit(3)
+    body.advance(8.0)
+    body.let_go()
+    assert [e.kind for e in body.advance(60.0)] == ["home"]
+
+
+def test_a_fault_gives_the_job_back_with_its_cycles_and_the_arm_recovers(small):
+    arm, job, plan = one_job(small, repetitions=5000, payload=small.HOT)
+    limits = ThermalLimits(warning_c=60.0, error_c=75.0, restart_c=50.0)
+    body = body_of(arm, limits=limits)
+    body.begin(job, plan, 7)
+    body.permit(5000)
+    events = body.advance(4 * 3600.0)
+    kinds = [e.kind for e in events]
+    assert kinds[:4] == ["torque_warning", "warning", "fault", "return"]
+    fault, returned = events[2], events[3]
+    assert returned.time_s == fault.time_s
+    assert returned.value == 7 + (fault.time_s - 3.0) // 10.0
+    assert kinds[4:] == ["recover"]
+    assert body.free
+    assert body.job == ""
+    peak = body.truth.peak_c[0, 0]
+    assert 75.0 <= peak < 76.0
+
+
+def test_a_faulted_body_is_not_free_and_says_when_not(small):
+    arm, job, plan = one_job(small, repetitions=5000, payload=small.HOT)
+    body = body_of(arm)
+    body.begin(job, plan, 0)
+    body.permit(5000)
+    while body.truth.mode[0, 0] != FAULTED:
+        body.advance(body.time_s + DT_S)
+    assert not body.free
+    assert body.free_in_s() == np.inf
+    assert body.last_in_s() == np.inf
+    assert body.read().mode == "faulted"
+    assert set(body.read().current_a) == {0.0}
+    with pytest.raises(ValueError, match="cannot begin"):
+        body.begin(job, plan, 0)
+
+
+def test_what_it_reads_is_what_it_does(small):
+    arm, job, plan = one_job(small, payload=small.WARM)
+    body = body_of(arm, dt_s=1.0, warm=True)
+    rest = body.read()
+    assert rest.mode == "idle"
+    np.testing.assert_allclose(rest.q, arm.robot.home_q())
+    np.testing.assert_allclose(rest.tau, arm.rest_tau)
+    noise_k = arm.motors.sensor_noise_k
+    assert (np.abs(np.array(rest.temp_c) - body.truth.temp_c[0, 0, WINDING]) < 6 * noise_k).all()
+    body.begin(job, plan, 0)
+    body.permit(3)
+    body.advance(5.0)
+    working = body.read()
+    assert working.mode == "working"
+    np.testing.assert_allclose(working.tau, small.torque(small.WARM), rtol=1e-6)
+    assert working.current_a[1] > rest.current_a[1] if rest.current_a else working.current_a[1] > 0
+
+
+def test_its_time_can_be_set_and_it_catches_up_in_bounded_steps(small):
+    arm, job, plan = one_job(small)
+    body = body_of(arm, dt_s=1.0)
+    body.advance(10.0)
+    body.set_time(5000.0)
+    assert body.time_s == pytest.approx(5000.0)
+    body.begin(job, plan, 0)
+    body.permit(3)
+    assert [e.time_s for e in body.advance(5060.0) if e.kind == "finish"] == pytest.approx([5033.0])
+    body.advance(1e6)
+    assert body.time_s == pytest.approx(5060.0 + 2000.0)
