@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from agents.consensus import Consensus
+from agents.hearsay import Trust, advantage
 from agents.policy import WAIT, Policy, legal_slots
 from fleet.env.observation import Observation
 from fleet.errors import nearest
@@ -79,8 +81,12 @@ class LeastDifficulty:
     Some work is new to every twin and would be left by all if plain difficulties were compared across jobs; what one
     arm finds harder than the others is what the choice can change. Each arm works this out by itself, from its own
     scores, what its peers told it and its place in the fleet, which settles ties; so the rule needs nobody in the
-    middle. Where nobody has a score, free arms take the oldest jobs in the fleet's order.
+    middle. Where nobody has a score, free arms take the oldest jobs in the fleet's order. What a peer told a while ago
+    counts for less, and a peer not heard for long is not left anything, as `agents.hearsay` has it.
     """
+
+    def __init__(self, trust: Trust | None = None) -> None:
+        self._trust = trust or Trust()
 
     def reset(self, rng: np.random.Generator) -> None:
         """Nothing to begin."""
@@ -93,30 +99,26 @@ class LeastDifficulty:
         mine = legal_slots(observation)
         if not mine:
             return WAIT
-        own = np.where(observation.known > 0, observation.difficulty, np.nan)
-        peers = np.where(observation.peer_known > 0, observation.peer_difficulty, np.nan)
-        told = np.insert(peers.astype(float), place, own, axis=0)  # [arm, slot], the fleet's order
-        told[np.ix_(range(len(told)), _closed(observation, mine))] = np.nan
-        known = ~np.isnan(told)
-        average = np.where(known, told, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-        free = (observation.peer_heard > 0) & (observation.peer_working == 0) & (observation.peer_faulted == 0)
-        costs = np.where(known & np.insert(free, place, True)[:, None], told - average, np.inf).round(9)
+        harder = advantage(observation, place, _open(observation, mine), self._trust)
+        free = self._trust.free(observation)
+        able = ~np.isnan(harder) & np.insert(free, place, True)[:, None]
+        costs = np.where(able, harder, np.inf).round(9)
         while np.isfinite(costs).any():
             slot, arm = np.unravel_index(int(np.argmin(costs.T)), costs.T.shape)  # ties: oldest job, first arm
             if arm == place:
                 return int(slot) + 1
             costs[arm, :] = np.inf
             costs[:, slot] = np.inf
-        if not np.isnan(own[mine]).all():
+        if observation.known[mine].any():
             return WAIT
         before = int(free[:place].sum())  # free arms with the first word
         return mine[min(before, len(mine) - 1)] + 1
 
 
-def _closed(observation: Observation, mine: list[int]) -> list[int]:
-    """Slots that nobody may claim now: empty, or this arm could do the job but its station is busy."""
-    offered = observation.offered > 0
-    return [s for s in range(len(offered)) if not offered[s] or (s not in mine and observation.feasible[s] > 0)]
+def _open(observation: Observation, mine: list[int]) -> np.ndarray:
+    """Slots that somebody may claim now, bool, [slot]: not empty, and not one that only its busy station closes."""
+    may = np.isin(np.arange(len(observation.offered)), mine)
+    return (observation.offered > 0) & (may | (observation.feasible == 0))
 
 
 def _slots(observations: Mapping[str, Observation]) -> range:
@@ -129,6 +131,7 @@ RULES: dict[str, Callable[[], Policy]] = {
     "round_robin": RoundRobin,
     "coolest_first": CoolestFirst,
     "least_difficulty": LeastDifficulty,
+    "consensus": Consensus,
 }
 """Policies by the name under which `--policy` knows them."""
 

@@ -12,7 +12,7 @@ from scipy import stats
 from agents.policy import WAIT, legal_slots
 from agents.rules import RULES, LeastDifficulty, RandomLegal, make_policy
 from fleet.env.allocation_v0 import parallel_env
-from fleet.env.observation import Layout, Observation
+from fleet.env.observation import LONG_S, Layout, Observation
 
 
 def rng(seed: int = 0) -> np.random.Generator:
@@ -183,9 +183,10 @@ def test_least_difficulty_without_any_score_hands_out_the_oldest_in_order() -> N
     assert act("least_difficulty", fleet([[np.nan, np.nan]] * 2)) == [[1, 2]]
 
 
+@pytest.mark.parametrize("name", ["least_difficulty", "consensus"])
 @settings(max_examples=300, deadline=None)
 @given(st.data())
-def test_least_difficulty_agrees_with_one_who_sees_everything(data) -> None:
+def test_by_advantage_agrees_with_one_who_sees_everything(name, data) -> None:
     """Greedy matching in exact fractions; so no two arms ever claim the same job."""
     arms, slots = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 5))
     rows = st.lists(st.sampled_from([0.5, 1.0, 1.0, 2.0, 3.5, 6.0]), min_size=slots, max_size=slots)
@@ -205,7 +206,7 @@ def test_least_difficulty_agrees_with_one_who_sees_everything(data) -> None:
             expected[arm] = slot + 1
             given_away.add(slot)
     seen = fleet(d.tolist(), feasible=able.tolist(), free=free.tolist())
-    assert act("least_difficulty", seen) == [expected]
+    assert act(name, seen) == [expected]
 
 
 def test_two_arms_never_claim_the_same_job_in_a_shift(small) -> None:
@@ -220,3 +221,53 @@ def test_two_arms_never_claim_the_same_job_in_a_shift(small) -> None:
             assert len(claims) == len(set(claims))
             assert all(action == WAIT or action - 1 in legal_slots(seen[arm]) for arm, action in actions.items())
             env.step(actions)
+
+
+# consensus
+
+
+def cut(seen: dict[str, Observation], links: list[tuple[int, int]]) -> dict[str, Observation]:
+    """The same, where only these pairs of arms ever heard each other."""
+    out = {}
+    for me, (arm, obs) in enumerate(seen.items()):
+        peers = [p for p in range(len(seen)) if p != me]
+        heard = np.array([float((me, p) in links or (p, me) in links) for p in peers])
+        known = obs.peer_known * heard[:, None]
+        out[arm] = replace(
+            obs,
+            peer_heard=heard,
+            peer_known=known,
+            peer_difficulty=obs.peer_difficulty * known,
+            peer_age_s=np.where(heard > 0, obs.peer_age_s, LONG_S),
+        )
+    return out
+
+
+def test_consensus_agrees_through_those_between_and_least_difficulty_cannot() -> None:
+    """On a line 0 – 1 – 2, the two ends want the same job and do not hear each other; the middle is at work."""
+    line = cut(fleet([[1.0, 1.5], [6.0, 6.0], [1.0, 1.2]], free=[1, 0, 1]), [(0, 1), (1, 2)])
+    assert act("least_difficulty", line) == [[1, 0, 1]]
+    assert act("consensus", line) == [[1, 0, 2]]
+
+
+def test_consensus_lets_every_arm_bid_for_itself_where_words_are_late() -> None:
+    late = {arm: replace(o, peer_age_s=np.full(2, 10.0)) for arm, o in fleet([[1.0, 2.0]] * 3).items()}
+    assert act("consensus", late) == [[1, 1, 1]]
+
+
+def test_consensus_without_any_score_hands_out_the_oldest_in_order() -> None:
+    assert act("consensus", fleet([[np.nan, np.nan]] * 2)) == [[1, 2]]
+    # A job without a score comes after all that have one.
+    assert act("consensus", fleet([[np.nan, 5.0], [np.nan, 0.0]], free=[1, 0])) == [[2, 0]]
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.data())
+def test_consensus_gives_no_job_twice_on_any_connected_graph(data) -> None:
+    arms, slots = data.draw(st.integers(2, 5)), data.draw(st.integers(1, 4))
+    scores = st.lists(st.sampled_from([0.0, 1.0, 2.0, np.nan]), min_size=slots, max_size=slots)
+    d = data.draw(st.lists(scores, min_size=arms, max_size=arms))
+    links = [(a, data.draw(st.integers(0, a - 1))) for a in range(1, arms)]
+    (actions,) = act("consensus", cut(fleet(d), links))
+    claims = [action for action in actions if action]
+    assert len(claims) == len(set(claims)) == min(arms, slots)

@@ -1,0 +1,116 @@
+"""Old words count for less: exactly nothing changes at age 0, and nothing old wins or loses a job for long."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from agents.hearsay import Trust, advantage
+from agents.policy import Policy
+from agents.rules import LeastDifficulty
+from fleet.env.allocation_v0 import parallel_env
+from fleet.env.observation import LONG_S, Layout, Observation
+
+
+def heard(own: list[float], peers: list[list[float]], ages_s: list[float]) -> Observation:
+    """What the first arm knows that finds the slots so difficult, and was told so much, so long ago; NaN not told."""
+    told = np.array(peers, dtype=float).reshape(len(ages_s), len(own))
+    slots = len(own)
+    layout = Layout(1 + len(ages_s), slots)
+    known = ~np.isnan(told)
+    return replace(
+        layout.read(np.zeros(layout.size, np.float32), np.ones(slots + 1, np.int8)),
+        idle=1.0,
+        offered=np.ones(slots),
+        feasible=np.ones(slots),
+        known=(~np.isnan(own)).astype(float),
+        difficulty=np.nan_to_num(np.array(own)),
+        peer_heard=np.array([float(age < LONG_S) for age in ages_s]),
+        peer_age_s=np.array(ages_s, dtype=np.float32),
+        peer_working=np.zeros(len(ages_s)),
+        peer_faulted=np.zeros(len(ages_s)),
+        peer_known=known.astype(float),
+        peer_difficulty=np.where(known, told, 0.0),
+    )
+
+
+def choice(policy: Policy, observation: Observation) -> int:
+    """The first arm's claim."""
+    return policy.act({"arm_0": observation})["arm_0"]
+
+
+def test_a_word_counts_for_one_part_in_e_after_the_time_in_which_it_fades():
+    seen = heard([0.0], [[0.0]] * 3, [0.0, 30.0, 60.0])
+    np.testing.assert_allclose(Trust(fading_s=30.0).weights(seen), [1.0, 1 / math.e, 1 / math.e**2])
+
+
+def test_advantage_is_against_the_average_by_weight_and_fades_with_it():
+    """Own 1, a peer 4 told an e-folding ago: the average is (1 + 4/e) / (1 + 1/e)."""
+    found = advantage(heard([1.0], [[4.0]], [60.0]), 0, np.array([True]), Trust(fading_s=60.0))
+    average = (1 + 4 / math.e) / (1 + 1 / math.e)
+    np.testing.assert_allclose(found[:, 0], [1.0 - average, (4.0 - average) / math.e])
+
+
+@given(
+    st.lists(st.floats(0, 7) | st.just(np.nan), min_size=4, max_size=4),
+    st.floats(1, 1e6),
+)
+def test_at_age_zero_every_trust_is_the_same_to_the_last_bit(told, fading_s):
+    seen = heard(told[:2], [told[2:]], [0.0])
+    slots = np.array([True, True])
+    plain = np.array(told).reshape(2, 2)
+    known = ~np.isnan(plain)
+    average = np.where(known, plain, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    np.testing.assert_array_equal(advantage(seen, 0, slots, Trust(fading_s=fading_s)), plain - average)
+
+
+@given(st.floats(0, 7), st.floats(0, 7), st.floats(0, 1e4), st.floats(0, 1e4))
+def test_an_old_word_is_nearer_to_nothing(own, told, age_s, more_s):
+    at = [
+        abs(advantage(heard([own], [[told]], [age]), 0, np.array([True]), Trust())) for age in (age_s, age_s + more_s)
+    ]
+    assert (at[1] <= at[0] + 1e-9).all()
+
+
+def test_a_job_is_left_to_a_better_peer_only_as_long_as_it_may_be_free():
+    policy = LeastDifficulty(Trust(fading_s=60.0, expiry_s=45.0))
+    assert choice(policy, heard([2.0], [[1.0]], [0.0])) == 0
+    assert choice(policy, heard([2.0], [[1.0]], [40.0])) == 0
+    assert choice(policy, heard([2.0], [[1.0]], [45.0])) == 1
+
+
+@pytest.mark.parametrize("state", ["peer_working", "peer_faulted"])
+def test_nothing_is_left_to_a_peer_that_is_not_free(state):
+    assert choice(LeastDifficulty(), replace(heard([2.0], [[1.0]], [0.0]), **{state: np.ones(1)})) == 1
+
+
+def test_a_peer_with_an_old_claim_gives_way_to_one_with_a_fresh_one():
+    """Two jobs; the peer told that it finds the second easier by 2, ages ago, this arm by 1 now."""
+    policy = LeastDifficulty(Trust(fading_s=10.0, expiry_s=1e9))
+    assert choice(policy, heard([1.0, 1.0], [[4.0, 1.0]], [0.0])) == 1
+    assert choice(policy, heard([3.0, 2.0], [[3.0, 1.8]], [0.0])) == 1
+    # Now its claim on the second counts for e^-8: this arm takes what it finds easiest against the average.
+    assert choice(policy, heard([3.0, 1.9], [[2.9, 2.0]], [80.0])) == 2
+
+
+def test_a_shift_with_fresh_words_does_not_depend_on_trust(small):
+    def trace(policy: Policy) -> list[dict[str, int]]:
+        env = parallel_env(small.Shifts(arms=3, jobs=15, ticks=80))
+        env.reset(seed=2)
+        said = []
+        while env.agents:
+            said.append(policy.act(env.knowledge()))
+            env.step(said[-1])
+        return said
+
+    assert trace(LeastDifficulty()) == trace(LeastDifficulty(Trust(fading_s=0.1, expiry_s=0.1)))
+    assert trace(LeastDifficulty()) == trace(LeastDifficulty(Trust(fading_s=1e12, expiry_s=math.inf)))
+
+
+@pytest.mark.parametrize("changes", [{"fading_s": 0.0}, {"expiry_s": -1.0}, {"fading_s": math.nan}])
+def test_trust_that_cannot_be_is_refused(changes):
+    with pytest.raises(ValueError, match=f"Trust.{next(iter(changes))} must be > 0"):
+        Trust(**changes)
