@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from queue import Empty, SimpleQueue
 
+from fleet.live.supervisor import end_with_supervisor
 from scenarios.terminal import Interrupted
 
 
@@ -43,6 +44,7 @@ class Stop:
 @contextmanager
 def until_stopped() -> Iterator[Stop]:
     """Ctrl-C and SIGTERM ask for an end instead of breaking off; in the main thread only."""
+    end_with_supervisor()
     stop = Stop()
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = [signal.signal(number, lambda which, _frame: stop.note(which)) for number in numbers]
