@@ -55,15 +55,9 @@ class Arm:
             put = self.ask(topic, kind)
             self.session.declare_queryable(f"{self.mine}/{topic}", put, complete=True)
         alive = self.session.liveliness().declare_token(f"{self.mine}/alive")
-        info = ext.declare_advanced_publisher(  # remembered: those who come later hear it too
-            self.session,
-            f"{self.mine}/info",
-            encoding=encoding("Info"),
-            cache=ext.CacheConfig(1),
-            publisher_detection=True,
-            sample_miss_detection=ext.MissDetectionConfig(sporadic_heartbeat=0.5),
-        )
+        info = self.remembering("info", "Info", 1)
         info.put(json.dumps({"arm": self.name, "joints": 1, "twin": "mock"}))
+        self.difficulty = self.remembering("difficulty", "DifficultyWord", 4)
         print(f"ready {self.name}", flush=True)
         tick_s = asked_s = time.monotonic()
         end_s = tick_s + seconds
@@ -78,6 +72,17 @@ class Arm:
                     asked_s = time.monotonic()
                     self.renew()
         alive.undeclare()
+
+    def remembering(self, topic, kind, kept):
+        """A publisher whose last words also reach those who come later."""
+        return ext.declare_advanced_publisher(
+            self.session,
+            f"{self.mine}/{topic}",
+            encoding=encoding(kind),
+            cache=ext.CacheConfig(kept),
+            publisher_detection=True,
+            sample_miss_detection=ext.MissDetectionConfig(sporadic_heartbeat=0.5),
+        )
 
     def ask(self, topic, kind):
         """What Zenoh calls with a question: only a hand-over, the answer is made on our own thread."""
@@ -104,6 +109,7 @@ class Arm:
         if name:
             now = time.monotonic()
             self.quotes = {old: made_s for old, made_s in self.quotes.items() if now < made_s + VALID_S} | {name: now}
+            self.say_difficulty(offers)
         return {
             "arm": self.name,
             "auction": word["auction"],
@@ -219,6 +225,19 @@ class Arm:
 
         key = f"{self.root}/auction/{quote(auctioneer, safe='')}/{topic}"
         self.session.get(key, came, payload=json.dumps(word), encoding=encoding(kind), timeout=1.0)
+
+    def say_difficulty(self, offers):
+        """What the jobs on offer would be like, for everybody to know."""
+        word = {
+            "arm": self.name,
+            "tick": self.tick,
+            "time_s": self.now_s(),
+            "twin": "mock",
+            "jobs": [offer["job"] for offer in offers],
+            "difficulty": [offer.get("d") for offer in offers],
+            "p_saturation": [None for _ in offers],
+        }
+        self.difficulty.put(json.dumps(word))
 
     def say_state(self):
         """Telemetry: the newest counts, so it may be dropped."""

@@ -16,6 +16,8 @@ import zenoh
 
 MOST = 100
 """Jobs in one word; the bus takes up to 256 and 64 KiB."""
+WAIT_S = 10.0
+"""For an auctioneer to come."""
 JOBS = [
     {"name": "outside 1", "kind": "hold", "places": ["fixture"], "payload_kg": 1.0, "dwell_s": 5.0},
     {"name": "outside 2", "kind": "hold", "places": ["fixture"], "payload_kg": 0.5, "dwell_s": 5.0, "repetitions": 2},
@@ -87,6 +89,13 @@ def main(port, fleet, jobs, seconds=600.0):
     }
     root = f"thermofleet/v1/{quote(fleet, safe='')}"
     with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
+        tokens = queue.SimpleQueue()  # an auctioneer shows its token once it can answer
+        watcher = session.liveliness().declare_subscriber(f"{root}/auction/*/alive", tokens.put, history=True)
+        try:
+            tokens.get(timeout=WAIT_S)
+        except queue.Empty:
+            sys.exit(f"No auctioneer came to the fleet '{fleet}' at port {port} within {WAIT_S:.0f} s.")
+        watcher.undeclare()
         taken = submit(session, root, jobs)
         if not taken:
             sys.exit(f"Nobody took a job in the fleet '{fleet}' at port {port}.")

@@ -15,7 +15,7 @@ import pytest
 
 from fleet.bus import keys
 from fleet.bus.link import Link
-from fleet.bus.messages import State
+from fleet.bus.messages import DifficultyWord, State
 from fleet.bus.router import Router
 from fleet.bus.trade import (
     Ack,
@@ -148,7 +148,8 @@ def test_own_arm_keeps_the_rules_towards_a_strict_auctioneer(bus):
     auctioneer.answer(keys.of_auction("f", "a", "report"), Report, report)
     auctioneer.answer(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=5000.0, speed=60.0))
     auctioneer.listen(keys.of_every_arm("f", "state"), State, lambda _, word: states.append(word))
-    told = []
+    scores, told = [], []
+    auctioneer.listen(keys.of_every_arm("f", "difficulty"), DifficultyWord, lambda _, word: scores.append(word))
     auctioneer.watch(keys.of_every_arm("f", "alive"), lambda arm, there: told.append((arm, there)))
     command = [sys.executable, "-u", str(ROOT / "examples" / "own_arm.py"), str(port), "f", "arm 1/b"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
@@ -163,6 +164,8 @@ def test_own_arm_keeps_the_rules_towards_a_strict_auctioneer(bus):
         assert dry.quote == ""
         quote = question("quote", QuoteRequest(auction="r", jobs=(JOB,)), Quote)
         assert quote.offers[0].feasible
+        serve(lambda: scores, auctioneer)
+        assert scores[0].difficulty == (quote.offers[0].d,)
         award = Award(award="r-crate", auction="r", auctioneer="a", quote=quote.quote, job=JOB)
         first, again = (question("award", award, Ack) for _ in range(2))
         assert first == again

@@ -1,0 +1,281 @@
+"""What an onlooker knows of a fleet, and how it is shown: present is token and fresh state, and no name is too many."""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from io import StringIO
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from fleet.bus import keys
+from fleet.bus.link import Link
+from fleet.bus.messages import DifficultyWord, State
+from fleet.bus.router import Router
+from fleet.bus.trade import ArmEvent, JobStatus, Result, Status
+from fleet.live import overview as overview_module
+from fleet.live.onlooker import Onlooker
+from fleet.live.overview import FRESH_S, ArmNow, FleetNow, Overview
+from fleet.live.stream import MOST_WAITING, NEWEST_WINS, Feed, Letterbox
+from scenarios.watch_screen import age, clock, line, scores, screen
+
+PATIENCE_S = 20.0
+
+
+def state(arm="a", time_s=1.0, **change):
+    words = {"tick": 1, "mode": "idle", "temp_c": (30.0, 52.5, 40.0), "headroom_k": 7.5, **change}
+    return State(arm=arm, time_s=time_s, **words)
+
+
+def result(number, job="j", to="awarded"):
+    return Result(auctioneer="au", number=number, time_s=1.0, status=JobStatus(job, to))
+
+
+@given(token=st.booleans(), age_s=st.floats(0.0, 10.0), spoke=st.booleans())
+def test_present_is_token_and_fresh_state(token, age_s, spoke):
+    seen = Overview("f")
+    seen.token("arm", "a", token)
+    if spoke:
+        seen.hear("a", state(), 100.0)
+    (arm,) = seen.now(100.0 + age_s).arms
+    assert arm.present == (token and spoke and (100.0 + age_s) - 100.0 <= FRESH_S)
+    assert arm.state_age_s == (pytest.approx(age_s, abs=1e-9) if spoke else None)
+
+
+def test_the_hottest_motor_is_named_by_its_joint():
+    seen = Overview("f")
+    seen.hear("a", state(), 0.0)
+    (arm,) = seen.now(0.0).arms
+    assert (arm.hottest_c, arm.joint) == (52.5, 2)
+
+
+def test_news_is_told_once():
+    seen = Overview("f")
+    assert [seen.token("arm", "a", there) for there in (True, True, False, False, True)] == [
+        True,
+        False,
+        True,
+        False,
+        True,
+    ]
+
+
+def test_an_older_result_changes_nothing():
+    seen = Overview("f")
+    for word in (result(2, to="finished"), result(1, to="awarded")):
+        seen.hear("au", word, 0.0)
+    assert seen.now(0.0).counts == {"finished": 1}
+
+
+def test_the_auctioneers_answer_fills_in_what_was_not_heard():
+    seen = Overview("f")
+    seen.told(Status("au", 1.0, (JobStatus("x", "waiting"), JobStatus("y", "finished"))), 0.0)
+    assert seen.now(4.0).counts == {"waiting": 1, "finished": 1}
+    assert seen.now(4.0).auctioneers[0].heard_age_s == 4.0
+
+
+def test_invented_names_push_out_the_oldest(monkeypatch):
+    monkeypatch.setattr(overview_module, "MOST_ARMS", 3)
+    monkeypatch.setattr(overview_module, "MOST_JOBS", 3)
+    seen = Overview("f")
+    for number in range(10):
+        seen.hear(f"a{number}", state(f"a{number}"), 0.0)
+        seen.hear("au", result(number, f"j{number}"), 0.0)
+    now = seen.now(0.0)
+    assert [arm.arm for arm in now.arms] == ["a7", "a8", "a9"]
+    assert [job.job for job in now.jobs] == ["j7", "j8", "j9"]
+    assert len(seen._numbers) <= 6
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(["state", "difficulty", "event", "result"]), st.sampled_from("ab")), max_size=60
+    ),
+    st.integers(0, 60),
+)
+def test_a_reader_gets_every_event_once_and_the_newest_state(said, after):
+    """Taken in two helpings or one, in order: the letter box and the feed tell the same."""
+    feed, box, got = Feed(), Letterbox(), []
+    for count, (topic, name) in enumerate(said):
+        box.put(feed.add(topic, name, str(count)))
+        if count == after:
+            got += box.take()
+    got += box.take()
+    numbers = [entry.number for entry in got]
+    assert numbers == sorted(set(numbers))
+    events = [number for number, (topic, _) in enumerate(said, 1) if topic not in NEWEST_WINS]
+    assert [entry.number for entry in got if entry.topic not in NEWEST_WINS] == events
+    last = {where: number for number, where in enumerate(said, 1) if where[0] in NEWEST_WINS}
+    assert {(entry.topic, entry.name): entry.number for entry in got if entry.topic in NEWEST_WINS} == last
+    missed, gap = feed.since(0)
+    assert not gap
+    assert {entry.number for entry in missed} == {*events, *last.values()}
+
+
+def test_a_full_letter_box_says_so_and_holds_nothing():
+    feed, box = Feed(), Letterbox()
+    for _ in range(MOST_WAITING + 1):
+        box.put(feed.add("event", "a", "{}"))
+    assert box.full
+    assert box.take() == []
+
+
+def test_telemetry_never_fills_a_letter_box():
+    feed, box = Feed(), Letterbox()
+    for number in range(10 * MOST_WAITING):
+        box.put(feed.add("state", f"arm {number % 5}", "{}"))
+    assert not box.full
+    assert len(box.take()) == 5
+
+
+def test_what_is_forgotten_leaves_a_gap():
+    feed = Feed()
+    for _ in range(1100):
+        feed.add("event", "a", "{}")
+    assert feed.since(10)[1]
+    assert not feed.since(1000)[1]
+    assert len(feed.since(1000)[0]) == 100
+
+
+def shown(now, width=80, height=24, events=()):
+    console = Console(file=StringIO(), width=width, height=height, force_terminal=False)
+    console.print(screen(now, list(events), height))
+    return console.file.getvalue()
+
+
+def fleet_of(arms):
+    return FleetNow("f", tuple(arms), (), {"waiting": 2, "finished": 1}, ())
+
+
+def arm_now(name="a", **change):
+    known = {
+        "token": True, "present": True, "mode": "working", "time_s": 3661.0, "hottest_c": 52.5, "joint": 2,
+        "headroom_k": 7.5, "job": "crate 1", "difficulty": {"x": 0.5, "y": None, "z": 0.25}, "state_age_s": 0.1,
+    }  # fmt: skip
+    return ArmNow(arm=name, **{**known, **change})
+
+
+def test_the_screen_says_what_is_known():
+    told = shown(fleet_of([arm_now()]), width=120, events=["a came"])
+    assert re.search(r"a +working +52\.5 J2 +7\.5 +crate 1 +z 0\.25, x 0\.50, y — +0\.1 s +— +yes", told)
+    assert "1:01:01" in told
+    assert "1 of 1 arms present" in told
+    assert "jobs: 2 waiting, 1 finished" in told
+    assert "a came" in told
+
+
+@given(arms=st.integers(0, 40), width=st.integers(60, 200), height=st.integers(8, 50), events=st.integers(0, 20))
+def test_the_screen_fits(arms, width, height, events):
+    names = [arm_now(f"arm_{number}", headroom_k=float(number), job="j" * 60) for number in range(arms)]
+    told = shown(fleet_of(names), width, height, ["an event " * 20] * events).splitlines()
+    assert len(told) <= max(height, 4 + min(events, 6) + 2)
+    assert max(map(len, told)) <= width
+
+
+def test_where_there_is_no_room_the_arms_in_need_stay():
+    names = [arm_now(f"arm_{number}", headroom_k=float(number)) for number in range(30)]
+    told = shown(fleet_of(names), height=12)
+    assert "arm_0 " in told
+    assert "arm_29" not in told
+    assert "more with more headroom" in told
+
+
+def test_nobody_is_shown_as_nobody():
+    told = shown(FleetNow("f", (), (), {}, ()))
+    assert "no auctioneer" in told
+    assert "jobs: none" in told
+
+
+def test_ages_and_times_are_short():
+    assert [age(value) for value in (None, -0.1, 0.04, 9.94, 12.4, 130.0)] == [
+        "—",
+        "0.0 s",
+        "0.0 s",
+        "9.9 s",
+        "12 s",
+        "2 min",
+    ]
+    assert [clock(value) for value in (0.0, 59.9, 3600.0, 86461.0)] == ["0:00:00", "0:00:59", "1:00:00", "24:01:01"]
+    assert scores(SimpleNamespace(difficulty={})) == ""
+    assert "headroom 7.5 K  does crate 1" in line(arm_now())
+    assert "no token" in line(arm_now(token=False))
+
+
+@pytest.fixture
+def fleet():
+    """A fleet of one arm that says its words whenever it is asked to."""
+    with Router() as router, Link(router.endpoint, "f") as link:
+        link.alive(keys.of_arm("f", "a", "alive"))
+        event = link.publisher(keys.of_arm("f", "a", "event"), ArmEvent, remember=8)
+
+        def say():
+            link.say(keys.of_arm("f", "a", "state"), state(headroom_k=7.5))
+            link.say(keys.of_arm("f", "a", "difficulty"), DifficultyWord("a", 1, 1.0, "t", ("j",), (0.5,), (None,)))
+
+        yield SimpleNamespace(endpoint=router.endpoint, say=say, link=link, event=event)
+
+
+def test_an_onlooker_hears_a_whole_fleet(fleet):
+    heard, came = [], []
+    fleet.event(ArmEvent(arm="a", number=0, time_s=1.0, kind="warning", joint=2))
+    with Link(fleet.endpoint, "f") as link:
+        onlooker = Onlooker(link, heard=lambda *said: heard.append(said[:2]), came=lambda *who: came.append(who))
+        deadline_s = time.monotonic() + PATIENCE_S
+        while len({topic for topic, _ in heard}) < 3 and time.monotonic() < deadline_s:
+            fleet.say()
+            onlooker.serve(time.monotonic() + 0.05)
+        (arm,) = onlooker.overview.now(time.monotonic()).arms
+    assert {topic for topic, _ in heard} == {"state", "difficulty", "event"}  # the event was said before
+    assert came == [("arm", "a", True)]
+    assert arm.present
+    assert arm.event == "warning joint 2"
+
+
+def command(*arguments):
+    return [sys.executable, "-u", "-c", "from scenarios.cli import main; main()", "watch", *arguments]
+
+
+def test_without_a_terminal_lines_are_printed_until_told_to_stop(fleet):
+    for number, code in ((signal.SIGTERM, 0), (signal.SIGINT, 130)):
+        process = subprocess.Popen(
+            command("--endpoint", fleet.endpoint), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        )
+        try:
+            assert process.stdout.readline() == "a came\n"
+            fleet.say()
+            while "52.5 °C J2" not in (told := process.stdout.readline()):
+                assert told
+            assert "finds j 0.50" in told
+            process.send_signal(number)
+            assert process.wait(PATIENCE_S) == code
+        finally:
+            process.kill()
+            process.communicate(timeout=PATIENCE_S)
+
+
+def test_a_snapshot_is_json(fleet):
+    done = subprocess.run(
+        command("--endpoint", fleet.endpoint, "--json"), capture_output=True, text=True, timeout=60, check=True
+    )
+    told = json.loads(done.stdout)
+    assert told["fleet"] == "f"
+    assert [(arm["arm"], arm["token"], arm["present"]) for arm in told["arms"]] == [("a", True, False)]
+
+
+@pytest.mark.parametrize("fleets", [(), ("f", "g")])
+def test_which_fleet_is_meant_must_be_clear(fleets):
+    with Router() as router:
+        links = [Link(router.endpoint, name).open() for name in fleets]
+        for link in links:
+            link.alive(keys.of_arm(link.fleet, "a", "alive"))
+        done = subprocess.run(command("--endpoint", router.endpoint), capture_output=True, text=True, timeout=60)
+        for link in links:
+            link.close()
+    assert done.returncode == 2
+    assert ("Several fleets" if fleets else "Nobody is at") in done.stderr.replace("\n", " ")
