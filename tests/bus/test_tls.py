@@ -2,6 +2,7 @@
 
 import json
 import queue
+import re
 import socket
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
@@ -171,3 +172,13 @@ def test_a_router_with_tls_may_listen_elsewhere_and_without_it_not(folder):
         Router(host="0.0.0.0")
     with pytest.raises(BusError, match="no address to listen on"):
         Router(host="a b/c", tls=Tls(folder, "router"))
+
+
+def test_the_documented_configuration_opens_a_line(guarded, folder):
+    """For clients without our code: taken from the page as it stands."""
+    page = (Path(__file__).parents[2] / "docs" / "security.md").read_text(encoding="utf-8")
+    (block,) = re.findall("```json\n(.*?)```", page, flags=re.DOTALL)
+    config = block.replace("ENDPOINT", guarded.endpoint).replace("DIR", str(folder)).replace("NAME", "monitor")
+    with zenoh.open(zenoh.Config.from_json5(config)) as client:
+        assert len(client.info.routers_zid()) == 1
+        assert list(client.get(keys.caches_of("thermofleet/v1/f/arm/nobody"), timeout=PATIENT_S)) == []
