@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 from fleet.bus.trade import JobWord, Offer, Quote
 
@@ -22,9 +23,12 @@ class Bidding:
 
     def offer(self, arm: str, job: str) -> Offer | None:
         """What an arm bid for a job; None if it did not, or cannot do it."""
-        quote = self.quotes.get(arm)
-        offers = () if quote is None else quote.offers
-        return next((offer for offer in offers if offer.job == job and offer.feasible), None)
+        return self._offers.get((arm, job))
+
+    @cached_property
+    def _offers(self) -> dict[tuple[str, str], Offer]:
+        pairs = ((arm, offer) for arm, quote in self.quotes.items() for offer in quote.offers if offer.feasible)
+        return {(arm, offer.job): offer for arm, offer in pairs}
 
 
 Allocate = Callable[[Bidding], Mapping[str, str]]

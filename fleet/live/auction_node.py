@@ -1,0 +1,262 @@
+"""The auctioneer on the bus: it hears who is there, asks, awards, and keeps the fleet's time. One thread drives it."""
+
+import logging
+import math
+import secrets
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+import msgspec
+
+from fleet.bus import keys
+from fleet.bus.link import REMEMBERED, Answers, Link, Refused
+from fleet.bus.messages import State
+from fleet.bus.trade import (
+    MOST_JOBS,
+    Ack,
+    Announce,
+    Clock,
+    ClockRequest,
+    JobStatus,
+    LeaseRequest,
+    Quote,
+    QuoteRequest,
+    Report,
+    Result,
+    Status,
+    StatusRequest,
+    Submission,
+    Submitted,
+)
+from fleet.errors import BusError, JournalFull
+from fleet.live.auctioneer import SCAN_S, Auctioneer, Give, Objection
+from fleet.live.bidding import Allocate
+from fleet.live.clock import FleetClock
+from fleet.live.journal import Journal
+from fleet.live.ledger import replayed
+from fleet.live.records import Began, Record, Ticked
+from fleet.live.timing import Timing
+
+_LOG = logging.getLogger(__name__)
+
+Word = TypeVar("Word", bound=msgspec.Struct)
+
+FRESH_S = 3.0
+"""An arm is there when its token is and its last state is no older than this, real seconds."""
+TICK_S = 2.0
+"""Real seconds between two records of the fleet's time."""
+
+
+class AuctionNode:
+    """The one auctioneer of a fleet.
+
+    Attributes:
+        auctioneer: Its state machine.
+        journal: Where its promises are.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        name: str,
+        journal: Journal[Record],
+        *,
+        allocate: Allocate,
+        speed: float,
+        places: frozenset[str] | None = None,
+        timing: Timing | None = None,
+    ) -> None:
+        """Take up the auction where the journal, which is open, leaves it.
+
+        Args:
+            link: Open line to the bus.
+            speed: Fleet seconds per real second.
+            places: Names of the cell's places; None: jobs may name any.
+
+        Raises:
+            BusError: the fleet has an auctioneer already.
+            JournalError: the journal is damaged, or has no room.
+        """
+        self._link, self._name, self.journal = link, name, journal
+        self._timing = timing or Timing()
+        self._refuse_a_second()
+        ledger = replayed(journal.replay(), places)
+        real_s = time.monotonic()
+        # It may have told the time until just before its next record of it, and never tells an earlier one.
+        zero_s = ledger.time_s + TICK_S * speed if ledger.time_s else 0.0
+        self._clock = FleetClock(speed, real_s, zero_s)
+        journal.append(Began(name, zero_s))
+        self.auctioneer = Auctioneer(
+            name,
+            ledger,
+            allocate=allocate,
+            keep=journal.append,
+            life=secrets.token_hex(4),
+            real_s=real_s,
+            timing=self._timing,
+        )
+        self._tokens: set[str] = set()
+        self._heard_s: dict[str, float] = {}
+        self._ticked_s = real_s
+        self._declare()
+
+    @property
+    def time_s(self) -> float:
+        """The fleet's time."""
+        return self._clock.now_s(time.monotonic())
+
+    @property
+    def present(self) -> frozenset[str]:
+        """Arms that are there."""
+        real_s = time.monotonic()
+        return frozenset(arm for arm in self._tokens if real_s - self._heard_s.get(arm, -math.inf) < FRESH_S)
+
+    def serve(self, until_s: float) -> None:
+        """Handle what comes and do what is due, until `time.monotonic()` is `until_s` or a little earlier.
+
+        Raises:
+            JournalError: the journal cannot be relied on any more.
+        """
+        self._link.serve(min(until_s, time.monotonic() + SCAN_S))
+        real_s, time_s = self._now()
+        self.auctioneer.seen(self.present)
+        self.auctioneer.tick(real_s, time_s)
+        if real_s >= self._ticked_s + TICK_S:
+            self._ticked_s = real_s
+            self._note_time(time_s)
+        self._send()
+
+    def submit(self, word: Submission) -> Submitted:
+        """Take jobs.
+
+        Raises:
+            JournalFull: nothing is taken.
+        """
+        answer = self.auctioneer.submitted(word, *self._now())
+        self._send()
+        return answer
+
+    def end(self) -> None:
+        """The shift is over.
+
+        Raises:
+            JournalFull: nobody was told.
+        """
+        self.auctioneer.end(self.time_s)
+        self._send()
+
+    # Inside
+
+    def _now(self) -> tuple[float, float]:
+        real_s = time.monotonic()
+        return real_s, self._clock.now_s(real_s)
+
+    def _refuse_a_second(self) -> None:
+        """Two that take the same jobs would have them done twice."""
+        fleet = self._link.fleet
+        nobody = StatusRequest(("?",))
+        answers = self._link.ask_and_wait(keys.of_jobs(fleet, "status"), nobody, Status, timeout_s=2.0)
+        for status in answers.words.values():
+            raise BusError(f"Fleet '{fleet}' has an auctioneer already: '{status.auctioneer}'. A fleet has one.")
+        if answers.refused:
+            raise BusError(f"Fleet '{fleet}' has an auctioneer already, which does not answer. Stop it first.")
+
+    def _declare(self) -> None:
+        link, fleet, name = self._link, self._link.fleet, self._name
+        self._announce = link.publisher(keys.of_auction(fleet, name, "announce"), Announce, remember=REMEMBERED)
+        self._result = link.publisher(keys.of_auction(fleet, name, "result"), Result, remember=REMEMBERED)
+        auctioneer = self.auctioneer
+        link.answer(keys.of_jobs(fleet, "submit"), Submission, self._checked(auctioneer.submitted))
+        link.answer(keys.of_jobs(fleet, "status"), StatusRequest, self._status)
+        link.answer(keys.of_auction(fleet, name, "lease"), LeaseRequest, self._checked(auctioneer.leased))
+        link.answer(keys.of_auction(fleet, name, "report"), Report, self._checked(auctioneer.reported))
+        link.answer(keys.of_clock(fleet), ClockRequest, lambda _: Clock(self.time_s, self._clock.speed))
+        link.listen(keys.of_every_arm(fleet, "state"), State, self._state)
+        link.watch(keys.of_every_arm(fleet, "alive"), self._token)
+        link.alive(keys.of_auction(fleet, name, "alive"))
+
+    def _checked(self, handle: Callable[[Word, float, float], msgspec.Struct]) -> Callable[[Word], msgspec.Struct]:
+        """The handler with the time, whose objections go back to the one who asked."""
+
+        def answer(word: Word) -> msgspec.Struct:
+            try:
+                return handle(word, *self._now())
+            except (Objection, JournalFull) as error:
+                _LOG.warning("Refused: %s", error)
+                raise Refused(str(error)) from error
+            finally:
+                self._send()
+
+        return answer
+
+    def _status(self, word: StatusRequest) -> Status:
+        return Status(self._name, self.time_s, _first(self.auctioneer.status(word.jobs)))
+
+    def _state(self, arm: str, _state: State) -> None:
+        self._heard_s[arm] = time.monotonic()
+
+    def _token(self, arm: str, there: bool) -> None:
+        if there:
+            self._tokens.add(arm)
+        else:
+            self._tokens.discard(arm)
+            self._heard_s.pop(arm, None)
+
+    def _note_time(self, time_s: float) -> None:
+        try:
+            self.journal.append(Ticked(time_s))
+        except JournalFull as error:
+            _LOG.error("The fleet's time is not noted: %s", error)
+
+    # What goes out
+
+    def _send(self) -> None:
+        out = self.auctioneer.out
+        while out:
+            match out.popleft():
+                case QuoteRequest() as request:
+                    self._ask(request)
+                case Give(arm, award):
+                    key = keys.of_arm(self._link.fleet, arm, "award")
+                    self._link.ask(key, award, Ack, self._acknowledged, timeout_s=self._timing.ack_s)
+                case Announce() as announce:
+                    self._announce(announce)
+                case Result() as result:
+                    self._result(result)
+
+    def _ask(self, request: QuoteRequest) -> None:
+        read: set[str] = set()
+
+        def came(answers: Answers[Quote]) -> None:
+            for key in answers.words.keys() - read:
+                read.add(key)
+                self.auctioneer.quoted(answers.words[key], *self._now())
+            self._send()
+
+        def over(answers: Answers[Quote]) -> None:
+            came(answers)
+            for reason in filter(None, answers.refused.values()):
+                _LOG.warning("No quote: %s", reason)
+            self.auctioneer.all_quoted(request.auction, *self._now())
+            self._send()
+
+        key = keys.of_every_arm(self._link.fleet, "quote")
+        self._link.ask(key, request, Quote, over, timeout_s=self._timing.window_s, each=came)
+
+    def _acknowledged(self, answers: Answers[Ack]) -> None:
+        for ack in answers.words.values():
+            try:
+                self.auctioneer.acknowledged(ack, *self._now())
+            except JournalFull as error:  # it is sent again, and answered again
+                _LOG.error("The answer of '%s' is not noted: %s", ack.arm, error)
+        for reason in filter(None, answers.refused.values()):
+            _LOG.warning("No answer to an award: %s", reason)
+        self._send()
+
+
+def _first(statuses: tuple[JobStatus, ...]) -> tuple[JobStatus, ...]:
+    """As many as one word may hold; those that may still change come first."""
+    if len(statuses) <= MOST_JOBS:
+        return statuses
+    return tuple(sorted(statuses, key=lambda said: said.state in ("finished", "unfinished")))[:MOST_JOBS]

@@ -1,0 +1,14 @@
+"""The commands of a live fleet, each a module of its own."""
+
+import typer
+
+from scenarios.live_ask import ask_command
+from scenarios.live_auction import auction_command
+from scenarios.live_submit import submit_command
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the command line."""
+    app.command("auction")(auction_command)
+    app.command("submit")(submit_command)
+    app.command("ask")(ask_command)
