@@ -1,387 +1,378 @@
-"""The auctioneer: asks for quotes, awards jobs, renews leases and takes reports, so that no job is done twice.
+"""The body of an arm: what moves and gets warm when the arm works.
 
-A state machine without a clock and without I/O. Real seconds (`real_s`, monotonic) and the fleet's time (`time_s`) come
-as arguments; records go to `keep`, which returns once they are on disk; what is to be said or asked lies in `out`.
-The rule is in the head of `fleet.bus.trade`; this side of it:
-
-- an award is on disk before it is sent, and from then on counts as leased for `Timing.hold_s`, whether there is an
-  answer or not; every renewal counts anew from the moment it is answered;
-- a job is offered again only when its lease is over here, or the arm has refused it or given it back;
-- leave to finish is on disk before it is given, and bars the job for everybody else for good;
-- after a crash every open award counts as leased from the restart.
+`SimulatedBody` steps the one engine of the shift, `fleet.sim.kernel`, in a world of one arm and the one job in hand. A
+job is done in stints: the arm leaves home, does the cycles that it may do, and comes home again; what it may do can
+grow while it is at it, so a job that is let through to its end is one stint, as in a shift.
 """
 
-import logging
-import math
-from collections import deque
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal, Protocol
 
-from fleet.bus.trade import (
-    Ack,
-    Announce,
-    Award,
-    Hold,
-    JobStatus,
-    Lease,
-    LeaseRequest,
-    Quote,
-    QuoteRequest,
-    Receipt,
-    Report,
-    Result,
-    Submission,
-    Submitted,
+import numpy as np
+
+from fleet.difficulty import Blind
+from fleet.events import Event
+from fleet.job import Job
+from fleet.motion import Plan
+from fleet.robot import ThermalLimits
+from fleet.sim.kernel import ROUNDING_S, Step, step
+from fleet.sim.plants import ProfilePlant
+from fleet.sim.state import DONE, State, World, initial
+from fleet.sim.world import Arm, build_world
+from fleet.telemetry import FAULTED, MODES, WORKING, Mode
+from fleet.thermal import WINDING
+
+Array = np.ndarray
+
+MOST_STEPS = 2000
+"""Of one call: a body that has fallen far behind catches up little by little."""
+_TOLD = ("torque_warning", "home", "warning", "fault", "recover")
+"""Events of the kernel that are true of a live arm as they are."""
+_KEPT = (
+    "tick",
+    "temp_c",
+    "mode",
+    "clear_at_s",
+    "faults",
+    "peak_c",
+    "above_warning_s",
+    "busy_s",
+    "lost_s",
+    "energy_j",
 )
-from fleet.errors import FleetError, JournalFull
-from fleet.live.bidding import Allocate, Bidding, Round, nobody_can, sound
-from fleet.live.ledger import Change, Ledger
-from fleet.live.records import Accepted, Awarded, Closed, Ended, Heard, Leave, Record, Silent
-from fleet.live.timing import Timing
-
-_LOG = logging.getLogger(__name__)
-
-SCAN_S = 0.05
-"""Real seconds between two looks for jobs that have become ready."""
-
-
-class Objection(FleetError):
-    """What was said cannot be; the one who said it is told this sentence."""
+"""What of a state goes on when the job changes."""
 
 
 @dataclass(frozen=True)
-class Give:
-    """Send this award to its arm."""
+class Reading:
+    """What the sensors of one arm say."""
 
-    arm: str
-    award: Award
+    mode: Mode
+    temp_c: tuple[float, ...]
+    """Motor temperatures, [joint]."""
+    q: tuple[float, ...] = ()
+    """rad, [joint]; empty where not known, as the others below."""
+    qd: tuple[float, ...] = ()
+    """rad/s."""
+    tau: tuple[float, ...] = ()
+    """N·m."""
+    current_a: tuple[float, ...] = ()
 
 
-Out = QuoteRequest | Give | Announce | Result
+class Body(Protocol):
+    """Does what it may of the job in hand as time goes on."""
+
+    @property
+    def time_s(self) -> float:
+        """The fleet's time until which it has lived."""
+        ...
+
+    @property
+    def job(self) -> str:
+        """Name of the job in hand; "" for none."""
+        ...
+
+    @property
+    def free(self) -> bool:
+        """Whether it stands at home, whole, with nothing in hand."""
+        ...
+
+    @property
+    def cycles(self) -> int:
+        """Done of the job in hand, those of others included."""
+        ...
+
+    def last_in_s(self) -> float:
+        """Seconds until the last cycle of the job in hand could begin; inf for none."""
+        ...
+
+    def free_in_s(self) -> float:
+        """Seconds until it could be free, if it may do all of the job in hand; inf while it is faulted."""
+        ...
+
+    def begin(self, job: Job, plan: Plan, cycles: int) -> None:
+        """Take a job in hand of which `cycles` are done; it must be free. Nothing moves before `permit`."""
+        ...
+
+    def permit(self, cycles: int) -> None:
+        """So many cycles of the job in hand may be begun, those done included; one that was begun is ended."""
+        ...
+
+    def let_go(self) -> None:
+        """Go home after the cycle that was begun, and forget the job."""
+        ...
+
+    def advance(self, until_s: float) -> list[Event]:
+        """Live up to a time, or as far as it gets, and tell what happened; `finish` and `return` end the job."""
+        ...
+
+    def set_time(self, time_s: float) -> None:
+        """From now on the fleet's time is another."""
+        ...
+
+    def read(self) -> Reading:
+        """What its sensors say now."""
+        ...
 
 
 @dataclass(eq=False)
-class _Sent:
-    """An award without an answer."""
+class _Task:
+    """The job in hand."""
 
-    give: Give
-    at_s: float
-    attempts: int = 1
+    job: Job
+    plan: Plan
+    before: int
+    """Cycles done before the present stint."""
+    may: int
+    """Cycles that may be begun in all."""
+    dropped: bool = False
+    """Finished or let go of: only the way home is left."""
 
 
-class Auctioneer:
-    """One auctioneer in one life.
+class SimulatedBody:
+    """One arm of the simulator in real time.
 
-    Attributes:
-        ledger: What it knows of its jobs.
-        out: What it wants said and asked, oldest first; whoever drives it takes it out.
-        cycles: Last heard progress of the awards that are open.
+    Args:
+        arm: Its truth: motors, heat, posture at rest. Its plans and its model are not looked at.
+        air_c: Air at the arm, °C, at a time of the fleet.
+        dt_s: Length of a step, fleet seconds.
+        time_s: The fleet's time at its birth.
+        warm: Whether it has stood powered at home for hours, or is as cold as the air.
     """
 
     def __init__(
         self,
-        name: str,
-        ledger: Ledger,
+        arm: Arm,
+        limits: ThermalLimits,
+        air_c: Callable[[float], float],
         *,
-        allocate: Allocate,
-        keep: Callable[..., None],
-        life: str,
-        real_s: float,
-        timing: Timing | None = None,
+        dt_s: float,
+        rng: np.random.Generator,
+        time_s: float = 0.0,
+        warm: bool = True,
     ) -> None:
-        """Begin, or go on where the ledger stands.
+        if not dt_s > 0:
+            raise ValueError(f"SimulatedBody.dt_s must be > 0 (got {dt_s}).")
+        self._arm, self._limits, self._air_c, self._dt_s, self._rng = arm, limits, air_c, dt_s, rng
+        self._began_s = time_s
+        self._task: _Task | None = None
+        self._world, self._plant = self._laid_out(None, warm=warm)
+        self._state = initial(self._world)
+        self._last: tuple[World, Step] | None = None
+
+    # What it is
+
+    @property
+    def time_s(self) -> float:
+        """The fleet's time until which it has lived."""
+        return self._began_s + float(self._state.tick[0]) * self._dt_s
+
+    @property
+    def job(self) -> str:
+        """Name of the job in hand; "" for none."""
+        return "" if self._task is None or self._task.dropped else self._task.job.name
+
+    @property
+    def free(self) -> bool:
+        """Whether it stands at home, whole, with nothing in hand."""
+        return self._task is None and self._state.mode[0, 0] not in (WORKING, FAULTED)
+
+    @property
+    def cycles(self) -> int:
+        """Done of the job in hand, those of others included."""
+        assert self._task is not None, "no job in hand"
+        return self._task.before + self._begun(done=True)
+
+    @property
+    def truth(self) -> State:
+        """The simulator's state, for tests and nobody else."""
+        return self._state
+
+    def last_in_s(self) -> float:
+        """Seconds until the last cycle of the job in hand could begin; inf for none."""
+        task = self._task
+        if task is None or task.dropped or self._faulted:
+            return np.inf
+        last = task.job.repetitions - 1
+        if self._in_stint:
+            approach_s, cycle_s, _ = self._times_s
+            return max(0.0, approach_s + (last - task.before) * cycle_s - self._progress_s)
+        return self._home_in_s + task.plan.approach.duration_s + (last - self.cycles) * task.plan.cycle.duration_s
+
+    def free_in_s(self) -> float:
+        """Seconds until it could be free, if it may do all of the job in hand; inf while it is faulted."""
+        if self._faulted:
+            return np.inf
+        last_in_s = self.last_in_s()
+        if self._task is None or not np.isfinite(last_in_s):
+            return self._home_in_s
+        return last_in_s + self._task.plan.cycle.duration_s + self._task.plan.retreat.duration_s
+
+    def read(self) -> Reading:
+        """What its sensors say now."""
+        if self._last is None:
+            still = np.zeros_like(self._arm.rest_tau)
+            noise = self._world.motors.sensor_noise_k[0] * self._rng.standard_normal(still.shape)
+            values = [self._state.temp_c[0, 0, WINDING] + noise, self._arm.robot.home_q(), still, self._arm.rest_tau]
+            return Reading("idle", *(tuple(v.tolist()) for v in values))
+        said = self._plant.readings(*self._last, np.array([self._dt_s]), self._rng)
+        values = (said.temp_c, said.q, said.qd, said.tau, said.current_a)
+        return Reading(MODES[self._state.mode[0, 0]], *(tuple(value[0, 0].tolist()) for value in values))
+
+    # What it does
+
+    def begin(self, job: Job, plan: Plan, cycles: int) -> None:
+        """Take a job in hand of which `cycles` are done; it must be free. Nothing moves before `permit`."""
+        if not self.free:
+            raise ValueError(f"Arm '{self._arm.robot.name}' has '{self.job}' in hand and cannot begin '{job.name}'.")
+        if not 0 <= cycles < job.repetitions:
+            raise ValueError(f"Of {job.repetitions} cycles of '{job.name}' {cycles} are done: there must be some left.")
+        self._task = _Task(job, plan, cycles, may=cycles)
+        self._world, self._plant = self._laid_out(self._task)
+        self._state = self._carried(self._world)
+
+    def permit(self, cycles: int) -> None:
+        """So many cycles of the job in hand may be begun, those done included; one that was begun is ended."""
+        if self._task is not None and not self._task.dropped:
+            self._task.may = min(cycles, self._task.job.repetitions)
+
+    def let_go(self) -> None:
+        """Go home after the cycle that was begun, and forget the job."""
+        if self._task is not None:
+            self._task.may, self._task.dropped = 0, True
+            if not self._working:
+                self._task = None
+
+    def set_time(self, time_s: float) -> None:
+        """From now on the fleet's time is another."""
+        self._began_s += time_s - self.time_s
+
+    def advance(self, until_s: float) -> list[Event]:
+        """Live up to a time, or as far as it gets, and tell what happened; `finish` and `return` end the job."""
+        events: list[Event] = []
+        steps = int((until_s - self.time_s) / self._dt_s + 1e-6)
+        for _ in range(min(max(steps, 0), MOST_STEPS)):
+            events += self._step()
+        return events
+
+    # One step
+
+    def _step(self) -> list[Event]:
+        task, log, shift_s = self._task, list[Event](), self._began_s
+        air = np.array([[self._air_c(self.time_s + 0.5 * self._dt_s)]])
+        self._world = replace(self._world, ambient_c=air)
+        goes = task is not None and self._set_out(task)
+        done = step(self._world, self._state, np.array([[int(goes)]]), np.zeros((1, 1, 1)), self._plant, log)
+        self._last, self._state = (self._world, done), done.state
+        events = [replace(e, time_s=e.time_s + shift_s) for e in log if e.kind in _TOLD]
+        return events if task is None else events + self._told(task, int(done.began.todo[0, 0]), log, shift_s)
+
+    def _set_out(self, task: _Task) -> bool:
+        """Let the coming step know what may be done; whether the arm leaves home in it."""
+        state = self._state
+        if self._faulted:
+            return False
+        if not self._working:
+            if task.may <= task.before:
+                return False
+            table = replace(self._world.jobs, repetitions=np.array([[task.may - task.before]]))
+            self._world = replace(self._world, jobs=table)
+            self._state = self._carried(self._world)
+            return True
+        if self._in_stint:
+            self._state = replace(state, todo=np.array([[max(task.may - task.before, self._begun())]]))
+        return False
+
+    def _told(self, task: _Task, done: int, log: list[Event], shift_s: float) -> list[Event]:
+        """What a step means for the job in hand; forgets it where it ended.
 
         Args:
-            keep: Writes records; returns when they are on disk, or raises `JournalError` and has written none.
-            life: Part of the names of auctions and awards; never the same again for this name.
+            done: Cycles of the stint, if it ended.
         """
-        self.name, self.ledger = name, ledger
-        self.out: deque[Out] = deque(self._result(change) for change in ledger.recent)
-        self.cycles: dict[str, int] = {}
-        self._allocate, self._keep, self._life = allocate, keep, life
-        self._timing = timing or Timing()
-        self._until_s = dict.fromkeys(ledger.open, real_s + self._timing.hold_s)
-        self._unanswered: dict[str, _Sent] = {}
-        self._round: Round | None = None
-        self._rounds = 0
-        self._present: frozenset[str] = frozenset()
-        self._later_s: dict[str, float] = {}
-        self._notes: dict[str, str] = {}
-        self._scan_s = -math.inf
-        self._pause_s = self._timing.pause_s[0]
+        told: list[Event] = []
+        for each in log:
+            at_s = each.time_s + shift_s
+            if each.kind == "finish":
+                task.before += done
+                if task.before == task.job.repetitions and not task.dropped:
+                    late_s = max(0.0, at_s - task.job.due_s)
+                    text = f"late by {late_s:.0f} s" if late_s else "on time"
+                    told.append(self._event(task, at_s, "finish", late_s, text))
+                    task.dropped = True
+            elif each.kind == "home":
+                if task.dropped:
+                    self._task = None
+            elif each.kind == "fault":
+                kept = next((int(e.value) for e in log if e.kind == "return"), 0)
+                if not task.dropped:
+                    cycles = task.before + kept
+                    text = f"{cycles} of {task.job.repetitions} cycles kept"
+                    told.append(self._event(task, at_s, "return", float(cycles), text))
+                self._task = None
+        return told
 
-    # What comes from outside
+    def _event(self, task: _Task, at_s: float, kind: Literal["finish", "return"], value: float, reason: str) -> Event:
+        name = self._arm.robot.name
+        return Event(time_s=at_s, kind=kind, arm=name, job=task.job.name, value=value, reason=reason)
 
-    def submitted(self, word: Submission, real_s: float, time_s: float) -> Submitted:
-        """Take jobs; every accepted one is on disk when this returns."""
-        admissions = self.ledger.admit(word.jobs)
-        taken = {job.name: job for job, said in zip(word.jobs, admissions, strict=True) if said.accepted}
-        fresh = tuple(job for name, job in taken.items() if name not in self.ledger.jobs)
-        if fresh:
-            self._happen(Accepted(fresh, word.by, time_s))
-            self._hurry()
-        return Submitted(self.name, admissions)
+    # The simulator's arrays of one arm
 
-    def leased(self, word: LeaseRequest, real_s: float, time_s: float) -> Lease:
-        """Renew leases, and give leave to finish to those who ask for it."""
-        self._expire(real_s, time_s)
-        mine = {hold.award: hold for hold in word.holds if self._is_held(hold, word.arm)}
-        for award, hold in mine.items():
-            self._unanswered.pop(award, None)
-            self.cycles[award] = max(hold.cycles, self.cycles.get(award, 0))
-            self._until_s[award] = real_s + self._timing.hold_s
-        self._note_leave(mine, time_s)
-        return Lease(
-            auctioneer=self.name,
-            lease_s=self._timing.lease_s,
-            granted=tuple(mine),
-            lost=tuple(hold.award for hold in word.holds if hold.award not in mine),
-            leave=tuple(award for award in mine if self.ledger.open[award].leave),
+    def _laid_out(self, task: _Task | None, *, warm: bool = False) -> tuple[World, ProfilePlant]:
+        plans = {} if task is None else {task.job.work: (task.plan,)}
+        jobs = [] if task is None else [replace(task.job, release_s=0.0, due_s=np.inf, after=())]
+        world, rows = build_world(
+            [replace(self._arm, model=Blind(), plans=plans)],
+            [jobs],
+            limits=self._limits,
+            dt_s=self._dt_s,
+            ticks=1,
+            slots=1,
+            ambient_c=np.array([[self._air_c(self._began_s)]]),
+            start_warm=warm,
         )
+        return world, ProfilePlant(rows, self._arm.robot.home_q()[None], self._arm.rest_tau[None])
 
-    def reported(self, word: Report, real_s: float, time_s: float) -> Receipt:
-        """Note how an award ended; the same report again changes nothing.
+    def _carried(self, world: World) -> State:
+        """The state at home before a stint, with all that is true of the arm as it was."""
+        return replace(initial(world), **{name: getattr(self._state, name).copy() for name in _KEPT})
 
-        Raises:
-            Objection: the award is another arm's, or for another job.
-        """
-        promise = self.ledger.awards.get(word.award)
-        if promise is None:
-            # Of a life whose journal is gone: nothing is known of it, and the arm shall not repeat it for ever.
-            _LOG.warning("'%s' reports on an award that is not known here: %s.", word.arm, word.award)
-            return Receipt(self.name, word.award)
-        if (promise.made.arm, promise.made.job) != (word.arm, word.job):
-            raise Objection(
-                f"Award '{word.award}' is of '{promise.made.job}' to '{promise.made.arm}', not of '{word.job}' to "
-                f"'{word.arm}'."
-            )
-        if promise.outcome not in ("finished", "returned"):
-            if word.outcome == "finished" and not promise.leave:
-                _LOG.error("'%s' finished '%s' without leave.", word.arm, word.job)
-            done_s = min(word.time_s, time_s)
-            self._happen(Closed(word.award, word.outcome, word.cycles, done_s, word.reason, word.unsure))
-            self._forget(word.award)
-            if word.outcome == "finished":
-                self._hurry()
-            else:
-                self._pause(real_s, (word.job,))
-        return Receipt(self.name, word.award)
+    @property
+    def _faulted(self) -> bool:
+        return bool(self._state.mode[0, 0] == FAULTED)
 
-    def quoted(self, quote: Quote, real_s: float, time_s: float) -> None:
-        """A bid has come; the round closes with the last one that is waited for."""
-        open_round = self._round
-        if open_round is not None and quote.auction == open_round.auction:
-            open_round.quotes[quote.arm] = quote
-            if open_round.complete(self._present):
-                self._close_round(open_round, real_s, time_s)
+    @property
+    def _working(self) -> bool:
+        return bool(self._state.mode[0, 0] == WORKING)
 
-    def all_quoted(self, auction: str, real_s: float, time_s: float) -> None:
-        """No more bids will come."""
-        if self._round is not None and self._round.auction == auction:
-            self._close_round(self._round, real_s, time_s)
+    @property
+    def _in_stint(self) -> bool:
+        """Whether it is away, and not yet on its way home."""
+        return self._working and bool(self._state.status[0, 0] != DONE)
 
-    def acknowledged(self, ack: Ack, real_s: float, time_s: float) -> None:
-        """An arm has answered an award."""
-        sent = self._unanswered.get(ack.award)
-        if sent is None or sent.give.arm != ack.arm:
-            return
-        if not ack.accepted:
-            self._happen(Closed(ack.award, "refused", 0, time_s, f"'{ack.arm}' refused it: {ack.reason}"))
-            self._forget(ack.award)
-            self._pause(real_s, (sent.give.award.job.name,))
-        self._unanswered.pop(ack.award, None)
+    @property
+    def _progress_s(self) -> float:
+        return float(self._state.progress_s[0, 0])
 
-    def seen(self, present: frozenset[str]) -> None:
-        """These arms are there."""
-        if present - self._present:
-            self._hurry()
-        self._present = present
+    @property
+    def _times_s(self) -> tuple[float, float, float]:
+        """Of approach, cycle and retreat."""
+        approach, cycle, retreat = self._world.plans.times_s[0].tolist()
+        return approach, cycle, retreat
 
-    def tick(self, real_s: float, time_s: float) -> None:
-        """Do what is due."""
-        self._expire(real_s, time_s)
-        self._send_again(real_s)
-        if self._round is None:
-            if real_s >= self._scan_s:
-                self._scan_s = real_s + SCAN_S
-                self._open_round(real_s, time_s)
-        elif real_s >= self._round.until_s or self._round.complete(self._present):
-            self._close_round(self._round, real_s, time_s)
+    def _begun(self, *, done: bool = False) -> int:
+        """Cycles of this stint that were begun, or with `done` those that are over."""
+        if not self._in_stint:
+            return 0
+        approach_s, cycle_s, _ = self._times_s
+        count = (self._progress_s - approach_s) / cycle_s
+        whole = np.floor(count + ROUNDING_S) if done else np.ceil(count - ROUNDING_S)
+        return int(np.clip(whole, 0, self._state.todo[0, 0]))
 
-    def end(self, time_s: float) -> None:
-        """The shift is over: nothing more is offered, and what is not done is reported unfinished."""
-        if not self.ledger.ended:
-            self._round = None
-            self._happen(Ended(time_s))
-
-    def status(self, names: Iterable[str] = ()) -> tuple[JobStatus, ...]:
-        """Where jobs stand, with what was last heard."""
-        return tuple(
-            JobStatus(
-                job=said.job,
-                state=said.state,
-                arm=said.arm,
-                award=said.award,
-                cycles=max(said.cycles, self.cycles.get(said.award, 0)),
-                finished_s=said.finished_s,
-                reason=said.reason or (self._notes.get(said.job, "") if said.state == "waiting" else ""),
-            )
-            for said in self.ledger.status(names)
-        )
-
-    # Leases
-
-    def _is_held(self, hold: Hold, arm: str) -> bool:
-        promise = self.ledger.open.get(hold.award)
-        if promise is None or (promise.made.arm, promise.made.job) != (arm, hold.job):
-            return False
-        return promise.leave or not self.ledger.ended
-
-    def _note_leave(self, mine: dict[str, Hold], time_s: float) -> None:
-        records: list[Record] = []
-        for award, hold in mine.items():
-            promise = self.ledger.open[award]
-            if hold.phase == "finishing" and not promise.leave:
-                records.append(Leave(award, time_s))
-            elif promise.silent and not self.ledger.ended:
-                records.append(Heard(award, time_s))
-        try:
-            self._happen(*records)
-        except JournalFull as error:
-            _LOG.error("No leave to finish is given: %s", error)
-
-    def _expire(self, real_s: float, time_s: float) -> None:
-        """Take back what is leased no longer; what had leave to finish stays with its arm."""
-        for award in [award for award, until_s in self._until_s.items() if real_s >= until_s]:
-            promise = self.ledger.open[award]
-            did = "answer the award" if award in self._unanswered else "renew its lease"
-            why = f"'{promise.made.arm}' did not {did}."
-            try:
-                if not promise.leave:
-                    self._happen(Closed(award, "dropped", self.cycles.get(award, 0), time_s, why))
-                    self._forget(award)
-                    self._hurry()
-                elif not promise.silent and not self.ledger.ended:
-                    self._happen(Silent(award, time_s))
-                    self._until_s[award] = math.inf
-            except JournalFull as error:
-                _LOG.error("'%s' stays with '%s': %s", promise.made.job, promise.made.arm, error)
-                return
-
-    def _forget(self, award: str) -> None:
-        """Keep nothing of awards that are closed: this one, and one that it has overtaken."""
-        for table in (self._until_s, self._unanswered, self.cycles):
-            for closed in [name for name in table if name == award or name not in self.ledger.open]:
-                del table[closed]
-
-    # Rounds
-
-    def _hurry(self) -> None:
-        """Something has changed: whatever was offered in vain may find its arm now."""
-        self._later_s.clear()
-        self._scan_s = -math.inf
-        self._pause_s = self._timing.pause_s[0]
-
-    def _pause(self, real_s: float, jobs: Iterable[str]) -> None:
-        """Offer these jobs again only after a while, longer each time in a row."""
-        self._later_s |= dict.fromkeys(jobs, real_s + self._pause_s)
-        self._pause_s = min(2 * self._pause_s, self._timing.pause_s[1])
-
-    def _open_round(self, real_s: float, time_s: float) -> None:
-        busy = {sent.give.arm for sent in self._unanswered.values()}
-        bidders = self._present - busy
-        recent = any(real_s < sent.at_s + self._timing.window_s for sent in self._unanswered.values())
-        if not bidders or recent:
-            return
-        later = {job for job, at_s in self._later_s.items() if at_s > real_s}
-        jobs = tuple(self.ledger.ready(time_s, self._timing.most_offered, but=later))
-        if not jobs:
-            return
-        self._rounds += 1
-        auction = f"{self.name}-{self._life}-{self._rounds}"
-        self._round = Round(auction, jobs, bidders, real_s + self._timing.window_s)
-        self.out.append(Announce(self.name, auction, time_s, tuple(word.name for word in jobs)))
-        self.out.append(QuoteRequest(auction, jobs))
-
-    def _close_round(self, closing: Round, real_s: float, time_s: float) -> None:
-        self._round = None
-        taken = self.ledger.taken()
-        jobs = tuple(
-            word
-            for word in closing.jobs
-            if self.ledger.jobs[word.name].state == "waiting" and not taken & frozenset(word.places)
-        )
-        heard = {arm: quote for arm, quote in closing.quotes.items() if arm in closing.asked & self._present}
-        self._notes |= nobody_can(Bidding(closing.auction, time_s, jobs, heard))
-        room = {arm: quote for arm, quote in heard.items() if quote.capacity}
-        bidding = Bidding(closing.auction, time_s, jobs, room)
-        allocation = sound(bidding, self._allocate(bidding)) if room and jobs else {}
-        try:
-            self._award(bidding, allocation, real_s, time_s)
-        except JournalFull as error:
-            _LOG.error("Nothing is awarded: %s", error)
-            allocation = {}
-        if allocation:
-            self._scan_s, self._pause_s = -math.inf, self._timing.pause_s[0]
-        else:
-            if not room:  # whatever else might be offered: nobody takes more
-                self._scan_s = real_s + self._pause_s
-            self._pause(real_s, (word.name for word in closing.jobs))
-
-    def _award(self, bidding: Bidding, allocation: dict[str, str], real_s: float, time_s: float) -> None:
-        records: list[Awarded] = []
-        for job, arm in allocation.items():
-            offer = bidding.offer(arm, job)
-            assert offer is not None  # `sound` has seen to it
-            records.append(
-                Awarded(
-                    award=f"{bidding.auction}:{job}",
-                    auction=bidding.auction,
-                    job=job,
-                    arm=arm,
-                    quote=bidding.quotes[arm].quote,
-                    cycles=self.ledger.jobs[job].cycles,
-                    time_s=time_s,
-                    d=offer.d,
-                    p_saturation=offer.p_saturation,
-                )
-            )
-        self._happen(*records)
-        for made in records:
-            self._notes.pop(made.job, None)
-            word = self.ledger.jobs[made.job].word
-            award = Award(made.award, made.auction, self.name, made.quote, word, made.cycles, self._timing.lease_s)
-            give = Give(made.arm, award)
-            self._unanswered[made.award] = _Sent(give, real_s)
-            self._until_s[made.award] = real_s + self._timing.hold_s
-            self.out.append(give)
-
-    def _send_again(self, real_s: float) -> None:
-        for sent in self._unanswered.values():
-            if real_s >= sent.at_s + self._timing.ack_s and sent.attempts < self._timing.attempts:
-                sent.at_s, sent.attempts = real_s, sent.attempts + 1
-                self.out.append(sent.give)
-
-    # Records
-
-    def _happen(self, *records: Record) -> None:
-        """Records first, then their effect.
-
-        Raises:
-            JournalError: nothing was written, and nothing has happened.
-        """
-        if records:
-            self._keep(*records)
-            for record in records:
-                self.out.extend(self._result(change) for change in self.ledger.apply(record))
-
-    def _result(self, change: Change) -> Result:
-        return Result(
-            auctioneer=self.name,
-            number=change.number,
-            time_s=change.time_s,
-            status=change.status,
-            auction=change.auction,
-            d=change.d,
-            p_saturation=change.p_saturation,
-        )
+    @property
+    def _home_in_s(self) -> float:
+        """Seconds until it is home if it begins no further cycle than it set out to do."""
+        if not self._working:
+            return 0.0
+        approach_s, cycle_s, retreat_s = self._times_s
+        return max(0.0, approach_s + float(self._state.todo[0, 0]) * cycle_s + retreat_s - self._progress_s)
