@@ -1,0 +1,270 @@
+"""The auctioneer over a real router: jobs are taken, awarded and finished, and go on after it was gone."""
+
+import errno
+import os
+import threading
+import time
+from contextlib import ExitStack
+from itertools import count
+
+import pytest
+
+from fleet.bus import keys
+from fleet.bus.link import Link
+from fleet.bus.messages import State
+from fleet.bus.router import Router
+from fleet.bus.trade import (
+    Ack,
+    Announce,
+    Award,
+    Clock,
+    ClockRequest,
+    Hold,
+    JobWord,
+    Lease,
+    LeaseRequest,
+    Offer,
+    Quote,
+    QuoteRequest,
+    Receipt,
+    Report,
+    Result,
+    Status,
+    StatusRequest,
+    Submission,
+    Submitted,
+)
+from fleet.errors import BusError, JournalFull
+from fleet.live.auction_node import AuctionNode
+from fleet.live.journal import Journal
+from fleet.live.records import Record
+
+PATIENCE_S = 15.0
+
+
+def cheapest(bidding):
+    """One job per arm, the first ones first."""
+    free = sorted(bidding.quotes)
+    return dict(zip((word.name for word in bidding.jobs), free, strict=False))
+
+
+class Arm:
+    """The least that an arm must say: it takes one job at a time and finishes it as soon as it has leave."""
+
+    def __init__(self, link, name):
+        self.link, self.name = link, name
+        self.done, self.awards = [], []
+        self._numbers = count()
+        self._hold, self._answers, self._said_s, self._asked = None, {}, 0.0, False
+        fleet = link.fleet
+        link.answer(keys.of_arm(fleet, name, "quote"), QuoteRequest, self.quote)
+        link.answer(keys.of_arm(fleet, name, "award"), Award, self.take)
+        link.alive(keys.of_arm(fleet, name, "alive"))
+
+    def quote(self, request):
+        offers = tuple(Offer(word.name, True, finish_in_s=1.0) for word in request.jobs)
+        quote = f"{self.name}-{next(self._numbers)}"
+        room = int(self._hold is None)
+        return Quote(self.name, request.auction, quote, 5.0, "none", 0.0, "idle", 20.0, room, offers)
+
+    def take(self, award):
+        self.awards.append(award)
+        if award.award not in self._answers:
+            self._answers[award.award] = Ack(self.name, award.award, self._hold is None)
+            self._hold = self._hold or award
+        return self._answers[award.award]
+
+    def turn(self):
+        self.link.serve(time.monotonic() + 0.005)
+        if time.monotonic() > self._said_s + 0.1:
+            self._said_s = time.monotonic()
+            self.link.say(keys.of_arm(self.link.fleet, self.name, "state"), self.state())
+            if self._hold is not None and not self._asked:
+                self._asked = True
+                hold = Hold(self._hold.award, self._hold.job.name, 0, "finishing")
+                key = keys.of_auction(self.link.fleet, self._hold.auctioneer, "lease")
+                self.link.ask(key, LeaseRequest(self.name, (hold,)), Lease, self.leased, timeout_s=1.0)
+
+    def state(self):
+        return State(self.name, next(self._numbers), 0.0, "idle", (30.0,), 30.0)
+
+    def leased(self, answers):
+        self._asked = False
+        for lease in answers.words.values():
+            if self._hold is not None and self._hold.award in lease.leave:
+                award, self._asked = self._hold, True
+                self.done.append(award.job.name)
+                report = Report(self.name, award.award, award.job.name, "finished", 1, 0.0)
+                key = keys.of_auction(self.link.fleet, award.auctioneer, "report")
+                self.link.ask(key, report, Receipt, self.receipted, timeout_s=1.0)
+
+    def receipted(self, answers):
+        assert answers.words
+        self._hold, self._asked = None, False
+
+
+class Bus:
+    """A router, and participants that are served in turn."""
+
+    def __init__(self, stack, folder):
+        self.stack, self.folder = stack, folder
+        self.endpoint = stack.enter_context(Router()).endpoint
+        self.arms, self.nodes, self.links = [], [], []
+
+    def link(self):
+        link = Link(self.endpoint, "f")
+        self.stack.enter_context(link)
+        self.links.append(link)
+        return link
+
+    def arm(self, name):
+        self.arms.append(Arm(self.stack.enter_context(Link(self.endpoint, "f")), name))
+        return self.arms[-1]
+
+    def auctioneer(self, name="auctioneer", sync=None, **options):
+        """A node with a life of its own, that `kill` may end."""
+        extra = {} if sync is None else {"sync": sync}
+        with ExitStack() as life:
+            link = life.enter_context(Link(self.endpoint, "f"))
+            book = life.enter_context(Journal[Record](self.folder / name, Record, **extra))
+            node = AuctionNode(link, name, book, **{"allocate": cheapest, "speed": 60.0, **options})
+            node.life = self.stack.enter_context(life.pop_all())
+        self.nodes.append(node)
+        return node
+
+    def kill(self, node):
+        self.nodes.remove(node)
+        node.life.close()
+
+    def until(self, condition):
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not condition():
+            assert time.monotonic() < deadline_s, "waited in vain"
+            for node in self.nodes:
+                node.serve(time.monotonic() + 0.005)
+            for arm in self.arms:
+                arm.turn()
+            for link in self.links:
+                link.serve(time.monotonic() + 0.001)
+
+    def ask(self, key, word, kind):
+        """What is answered to a question of an outsider."""
+        got = []
+        self.link().ask(key, word, kind, got.append, timeout_s=5.0)
+        self.until(lambda: got)
+        return got[0]
+
+
+@pytest.fixture
+def bus(tmp_path):
+    with ExitStack() as stack:
+        yield Bus(stack, tmp_path)
+
+
+def jobs(*names, place="rack", **changes):
+    return tuple(JobWord(name=name, kind="hold", places=(place,), **changes) for name in names)
+
+
+def states(node):
+    return [said.state for said in node.auctioneer.status()]
+
+
+def test_jobs_are_taken_awarded_and_finished(bus):
+    node = bus.auctioneer(places=frozenset({"rack", "bin"}))
+    bus.arm("arm_0")
+    bus.arm("arm_1")
+    word = Submission((*jobs("a"), *jobs("b", place="bin"), *jobs("c", place="moon")), "test")
+    answers = bus.ask(keys.of_jobs("f", "submit"), word, Submitted)
+    (answer,) = answers.words.values()
+    assert [said.accepted for said in answer.jobs] == [True, True, False]
+    bus.until(lambda: states(node) == ["finished", "finished"])
+    assert sorted(job for arm in bus.arms for job in arm.done) == ["a", "b"]
+    (status,) = bus.ask(keys.of_jobs("f", "status"), StatusRequest(("b", "nobody")), Status).words.values()
+    assert [said.state for said in status.jobs] == ["finished"]
+
+
+def test_who_comes_late_hears_the_last_results(bus):
+    node = bus.auctioneer()
+    bus.arm("arm_0")
+    node.submit(Submission(jobs("a")))
+    bus.until(lambda: states(node) == ["finished"])
+    results, rounds = [], []
+    late = bus.link()
+    late.listen(keys.of_every_auction("f", "result"), Result, lambda _, word: results.append(word), remembered=64)
+    late.listen(keys.of_every_auction("f", "announce"), Announce, lambda _, word: rounds.append(word), remembered=64)
+    bus.until(lambda: len(results) == 4 and rounds)
+    assert [result.status.state for result in results] == ["waiting", "awarded", "finishing", "finished"]
+    assert [result.number for result in results] == [0, 1, 2, 3]
+    assert rounds[0].jobs == ("a",)
+
+
+def test_nothing_is_lost_while_the_auctioneer_is_gone(bus):
+    first = bus.auctioneer()
+    first.submit(Submission(jobs("a", "b")))
+    arm = bus.arm("arm_0")
+    bus.until(lambda: "awarded" in states(first))
+    time_s = first.time_s
+    bus.kill(first)
+    second = bus.auctioneer()
+    assert second.time_s >= time_s
+    bus.until(lambda: states(second) == ["finished", "finished"])
+    assert sorted(arm.done) == ["a", "b"]
+    assert len({award.award for award in arm.awards}) == 2
+
+
+def test_a_fleet_has_one_auctioneer(bus):
+    node = bus.auctioneer("one")
+    # While the second one asks, the first is not served, as if it stood still.
+    with pytest.raises(BusError, match="has an auctioneer already, which does not answer"):
+        bus.auctioneer("two")
+    stop = threading.Event()
+
+    def serve():
+        while not stop.is_set():
+            node.serve(time.monotonic() + 0.05)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        with pytest.raises(BusError, match="has an auctioneer already: 'one'"):
+            bus.auctioneer("two")
+    finally:
+        stop.set()
+        thread.join(PATIENCE_S)
+    bus.kill(node)
+    assert states(bus.auctioneer("two")) == []
+
+
+def test_the_fleets_time_runs_at_its_speed(bus):
+    bus.auctioneer(speed=1000.0)
+    (one,) = bus.ask(keys.of_clock("f"), ClockRequest(), Clock).words.values()
+    (two,) = bus.ask(keys.of_clock("f"), ClockRequest(), Clock).words.values()
+    assert one.speed == 1000.0
+    assert 0.0 <= one.time_s < two.time_s
+
+
+def test_an_arm_with_a_token_that_says_nothing_is_not_there(bus):
+    node = bus.auctioneer()
+    mute = bus.link()
+    mute.alive(keys.of_arm("f", "mute", "alive"))
+    bus.arm("arm_0")
+    bus.until(lambda: node.present == {"arm_0"} and "mute" in node._tokens)
+
+
+def test_a_full_disk_is_a_refusal_and_no_end(bus):
+    full = []
+
+    def sync(file):
+        if full:
+            raise OSError(full.pop(), "No space left on device")
+        os.fsync(file)
+
+    node = bus.auctioneer(sync=sync)
+    full.append(errno.ENOSPC)
+    answers = bus.ask(keys.of_jobs("f", "submit"), Submission(jobs("a")), Submitted)
+    assert "has no room for more" in next(iter(answers.refused.values()))
+    full.append(errno.ENOSPC)
+    with pytest.raises(JournalFull):
+        node.submit(Submission(jobs("a")))
+    assert bus.ask(keys.of_jobs("f", "submit"), Submission(jobs("a")), Submitted).words
+    assert states(node) == ["waiting"]
