@@ -24,8 +24,7 @@ from scenarios.channel_options import ChannelMaker, with_channel
 from scenarios.contract_cli import contract_command
 from scenarios.hold import hold_command
 from scenarios.keys_cli import keys_command
-from scenarios.live_gateway import gateway_command
-from scenarios.live_watch import watch_command
+from scenarios.live_cli import register as register_live
 from scenarios.load import library, load
 from scenarios.policies import label, policy_of
 from scenarios.router_cli import router_command
@@ -219,8 +218,7 @@ app.command("hold")(hold_command)
 app.command("keys")(keys_command)
 app.command("router")(router_command)
 app.command("contract")(contract_command)
-app.command("gateway")(gateway_command)
-app.command("watch")(watch_command)
+register_live(app)
 app.add_typer(twin_app, name="twin")
 
 

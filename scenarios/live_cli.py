@@ -4,7 +4,10 @@ import typer
 
 from scenarios.live_ask import ask_command
 from scenarios.live_auction import auction_command
+from scenarios.live_doctor import doctor_command
+from scenarios.live_gateway import gateway_command
 from scenarios.live_submit import submit_command
+from scenarios.live_watch import watch_command
 
 
 def register(app: typer.Typer) -> None:
@@ -12,3 +15,6 @@ def register(app: typer.Typer) -> None:
     app.command("auction")(auction_command)
     app.command("submit")(submit_command)
     app.command("ask")(ask_command)
+    app.command("watch")(watch_command)
+    app.command("doctor")(doctor_command)
+    app.command("gateway")(gateway_command)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fleet.errors import FleetError
+from scenarios.live_options import ENDPOINT, EndpointOption, FleetOption, the_fleet
 from scenarios.terminal import Interrupted
 
 if TYPE_CHECKING:
@@ -27,8 +28,8 @@ _LOG = logging.getLogger(__name__)
 
 
 def gateway_command(
-    endpoint: Annotated[str, typer.Option(envvar="THERMOFLEET_ENDPOINT")] = "tcp/127.0.0.1:7447",
-    fleet: Annotated[str, typer.Option(help="Name of the fleet: the scenario's name.")] = "quickstart",
+    endpoint: EndpointOption = ENDPOINT,
+    fleet: FleetOption = "",
     port: Annotated[int, typer.Option(help="TCP port of the gateway; 0 is any free one.")] = 8080,
     host: Annotated[str, typer.Option(help="Address to listen on; beyond loopback only with a token.")] = "127.0.0.1",
     token: Annotated[
@@ -43,7 +44,7 @@ def gateway_command(
         raise FleetError(f"The gateway needs the extra: pip install 'thermofleet[gateway]' ({error.name}).") from error
     del starlette, uvicorn
     check(host, port, token)
-    if asyncio.run(serve(endpoint, fleet, host, port, token)) == signal.SIGINT:
+    if asyncio.run(serve(endpoint, the_fleet(fleet, endpoint), host, port, token)) == signal.SIGINT:
         raise Interrupted("The gateway was interrupted.")
 
 

@@ -35,6 +35,7 @@ from fleet.live.bidding import Allocate
 from fleet.live.clock import FleetClock
 from fleet.live.journal import Journal
 from fleet.live.ledger import replayed
+from fleet.live.overview import FRESH_S
 from fleet.live.records import Began, Record, Ticked
 from fleet.live.timing import Timing
 
@@ -42,8 +43,6 @@ _LOG = logging.getLogger(__name__)
 
 Word = TypeVar("Word", bound=msgspec.Struct)
 
-FRESH_S = 3.0
-"""An arm is there when its token is and its last state is no older than this, real seconds."""
 TICK_S = 2.0
 """Real seconds between two records of the fleet's time."""
 

@@ -16,7 +16,7 @@ from fleet.bus.trade import Announce, ArmEvent, JobStatus, Result, Status
 from fleet.telemetry import Mode
 
 FRESH_S = 3.0
-"""Real seconds; an arm whose state is older does not count as present, whatever its token says."""
+"""Real seconds: an arm is present when its token is there and its last state is no older than this."""
 MOST_ARMS, MOST_JOBS = 1024, 4096
 
 Role = Literal["arm", "auction"]

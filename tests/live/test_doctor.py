@@ -1,0 +1,217 @@
+"""The doctor finds each illness by its signs, and calls a healthy fleet healthy."""
+
+import json
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import ExitStack, contextmanager
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet.bus import keys
+from fleet.bus.link import Link
+from fleet.bus.messages import State
+from fleet.bus.router import Router
+from fleet.bus.trade import Clock, ClockRequest
+from fleet.live.diagnosis import OFFSET_S, Sounding, diagnosed
+from fleet.live.overview import FRESH_S, ArmNow, AuctioneerNow, FleetNow
+
+PATIENCE_S = 30.0
+ASKED = Sounding(asked_s=100.0, answered_s=100.01, time_s=5000.0, speed=60.0)
+"""The fleet's time is 5000 s at the real second 100.005."""
+
+ALONE = (AuctioneerNow("au", True, 0.1),)
+
+
+def arm(**change):
+    known = {"arm": "a", "token": True, "present": True, "mode": "idle", "time_s": 5060.0, "state_age_s": 0.5}
+    return ArmNow(**{**known, **change})
+
+
+def fleet(*arms, auctioneers=ALONE, counts=None):
+    return FleetNow("f", arms, auctioneers, counts or {}, ())
+
+
+def faults(now, *soundings, **more):
+    found = diagnosed(now, 101.505, soundings or [ASKED], **more)
+    return [finding.what for finding in found.findings if finding.level == "fault"], found
+
+
+def test_a_healthy_fleet_is_called_healthy():
+    told, found = faults(fleet(arm()))
+    assert told == []
+    assert found.healthy
+    assert found.round_trip_s == pytest.approx(0.01)
+    assert found.time_s == pytest.approx(5000.0 + 60.0 * 1.5)
+    assert found.offsets_s["a"] == pytest.approx(0.0, abs=1e-9)  # 5060 s at the real second 101.005, as it should be
+
+
+@pytest.mark.parametrize(
+    ("now", "says"),
+    [
+        (fleet(), "No arm is present"),
+        (fleet(arm(), arm(arm="b", present=False, state_age_s=FRESH_S + 1.0, time_s=4850.0)), "b is stale"),
+        (
+            fleet(arm(), arm(arm="b", present=False, state_age_s=None, time_s=None)),
+            "b shows its token but says no state",
+        ),
+        (fleet(arm(), arm(arm="b", present=False, token=False)), "b says its state but shows no token"),
+        (fleet(arm(), arm(arm="b", time_s=5060.0 + 60.0 * 3)), "3.0 s ahead"),
+        (fleet(arm(), arm(arm="b", time_s=5060.0 - 60.0 * 3)), "3.0 s behind"),
+    ],
+)
+def test_each_illness_of_an_arm_is_named_alone(now, says):
+    told, found = faults(now)
+    assert len(told) == 1
+    assert says in told[0]
+    assert not found.healthy
+
+
+@pytest.mark.parametrize(
+    ("sounding", "auctioneers", "says"),
+    [
+        (Sounding(1.0, 1.1), (), "No auctioneer"),
+        (Sounding(1.0, 1.1), (AuctioneerNow("au", True),), "does it hang"),
+        (ASKED, (AuctioneerNow("x", True), AuctioneerNow("y", True)), "2 auctioneers"),
+    ],
+)
+def test_each_illness_of_an_auctioneer_is_named(sounding, auctioneers, says):
+    told, _ = faults(fleet(arm(), auctioneers=auctioneers), sounding)
+    assert len(told) == 1
+    assert says in told[0]
+
+
+def test_malformed_words_are_a_fault_with_their_reason():
+    told, _ = faults(fleet(arm()), malformed=3, complaints=("under 'k': not JSON",))
+    assert told == ["3 malformed word(s), the last: under 'k': not JSON"]
+
+
+def test_what_somebody_should_look_at_is_no_fault():
+    hot = arm(mode="faulted", hottest_c=76.0, joint=2)
+    told, found = faults(fleet(hot, counts={"unfinished": 1}), Sounding(100.0, 100.4, 5000.0, 60.0), overrun=5)
+    assert told == []
+    warned = " ".join(finding.what for finding in found.findings)
+    for word in ("joint 2 is at 76.0", "400 ms", "5 word(s)", "1 job(s) are unfinished"):
+        assert word in warned
+
+
+@given(
+    delay_s=st.lists(st.tuples(st.floats(0, 0.4), st.floats(0, 0.4)), min_size=1, max_size=5),
+    speed=st.floats(0.5, 200.0),
+    ahead_s=st.floats(-5.0, 5.0),
+)
+def test_the_offset_of_a_clock_is_known_to_half_a_round_trip(delay_s, speed, ahead_s):
+    """Cristian's bound, whatever the way there and the way back take."""
+    soundings = [
+        Sounding(100.0 + k, 100.0 + k + there + back, speed * (100.0 + k + there), speed)
+        for k, (there, back) in enumerate(delay_s)
+    ]
+    seen = arm(time_s=speed * (106.0 + ahead_s), state_age_s=0.5)
+    found = diagnosed(fleet(seen), 106.5, soundings)
+    best_s = min(there + back for there, back in delay_s)
+    assert abs(found.offsets_s["a"] - ahead_s) <= best_s / 2 + 1e-6
+    if abs(ahead_s) > OFFSET_S + 0.41:
+        assert not found.healthy
+
+
+@contextmanager
+def participants(endpoint, *, states=True, clocks=1):
+    """One arm and so many auctioneers, on a thread of their own."""
+    stop = threading.Event()
+    with ExitStack() as stack:
+        arm_link = stack.enter_context(Link(endpoint, "f"))
+        arm_link.alive(keys.of_arm("f", "a", "alive"))
+        lines = [stack.enter_context(Link(endpoint, "f")) for _ in range(clocks)]
+        began_s = time.monotonic()
+
+        def now_s():
+            return 10.0 * (time.monotonic() - began_s)
+
+        for number, line in enumerate(lines):
+            line.alive(keys.of_auction("f", f"au{number}", "alive"))
+            line.answer(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=now_s(), speed=10.0))
+
+        def live():
+            while not stop.is_set():
+                if states:
+                    arm_link.say(keys.of_arm("f", "a", "state"), State("a", 1, now_s(), "idle", (30.0,), 30.0))
+                for line in (arm_link, *lines):
+                    line.serve(time.monotonic() + 0.03)
+
+        thread = threading.Thread(target=live)
+        thread.start()
+        try:
+            yield arm_link
+        finally:
+            stop.set()
+            thread.join(PATIENCE_S)
+
+
+def doctor(endpoint, *options):
+    command = [sys.executable, "-c", "from scenarios.cli import main; main()", "doctor", "--endpoint", endpoint]
+    done = subprocess.run(
+        [*command, "--seconds", "1", *options], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+    return done.returncode, " ".join((done.stdout + done.stderr).split())
+
+
+def test_a_healthy_fleet_gives_exit_code_0():
+    with Router() as router, participants(router.endpoint):
+        code, told = doctor(router.endpoint)
+        assert (code, "The fleet is well." in told) == (0, True), told
+        code, told = doctor(router.endpoint, "--json")
+    found = json.loads(told)
+    assert (code, found["healthy"], found["findings"]) == (0, True, [])
+    assert abs(found["offsets_s"]["a"]) < 1.0
+
+
+def test_a_sick_fleet_gives_exit_code_1_and_all_reasons():
+    with Router() as router, participants(router.endpoint, states=False, clocks=2) as line:
+        stop = threading.Event()
+
+        def babble():
+            while not stop.wait(0.1):
+                line._session.put(keys.of_arm("f", "a", "state"), b"rubbish")
+
+        thread = threading.Thread(target=babble)
+        thread.start()
+        code, told = doctor(router.endpoint)
+        stop.set()
+        thread.join(PATIENCE_S)
+    assert code == 1
+    for says in ("a shows its token but says no state", "2 auctioneers", "No arm is present", "malformed word"):
+        assert says in told
+
+
+def test_nobody_at_the_router_is_not_healthy():
+    with Router() as router:
+        code, told = doctor(router.endpoint)
+    assert code == 1
+    assert "answers. Nobody is there" in told
+
+
+def test_a_router_that_is_not_there_gives_exit_code_2_and_says_how_to_start_one():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    code, told = doctor(f"tcp/127.0.0.1:{port}")
+    assert code == 2
+    assert f"thermofleet router --port {port}" in told
+
+
+def test_something_else_at_the_port_is_recognised():
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        code, told = doctor(f"tcp/127.0.0.1:{other.getsockname()[1]}")
+    assert code == 2
+    assert "does not speak as our router does" in told
+
+
+@pytest.mark.parametrize("wrong", [["--endpoint", "http://x"], ["--seconds", "0"]])
+def test_what_cannot_be_asked_gives_exit_code_2(wrong):
+    code, told = doctor("tcp/127.0.0.1:1", *wrong)
+    assert code == 2
+    assert "Error:" in told
