@@ -33,6 +33,11 @@ _SCOUTING: Mapping[str, Any] = {
     "multicast": {"enabled": False},
     "gossip": {"enabled": False},
 }
+_ACCEPTING: Mapping[str, Any] = {
+    # Lines that were begun and never opened keep new ones out when there are too many of them (by default 100, 10 s).
+    "accept_pending": 1000,
+    "accept_timeout": 3000,
+}
 _SENDING: Mapping[str, Any] = {
     "lease": LEASE_MS,
     "queue": {
@@ -244,7 +249,7 @@ class Router:
 
 
 def _config(own: Mapping[str, Any], link: Mapping[str, Any]) -> zenoh.Config:
-    transport = {"shared_memory": {"enabled": False}, "link": link}
+    transport = {"shared_memory": {"enabled": False}, "unicast": _ACCEPTING, "link": link}
     return zenoh.Config.from_json5(json.dumps({"scouting": _SCOUTING, "transport": transport, **own}))
 
 

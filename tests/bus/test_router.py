@@ -1,10 +1,13 @@
 """The router: a free port of this machine, and nothing else."""
 
 import socket
+from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 
-from fleet.bus.router import Router, loopback, open_client
+from fleet.bus.router import Router, loopback, open_client, reachable
+from fleet.bus.security import Tls
 from fleet.errors import BusError
 
 
@@ -38,6 +41,16 @@ def test_a_port_is_free_again_after_close():
         _ = router.endpoint
     with Router(port) as again:
         assert again.endpoint == f"tcp/127.0.0.1:{port}"
+
+
+def test_lines_that_nobody_opens_keep_nobody_out():
+    """Zenoh's own limit of 100 would make the next one wait ten seconds."""
+    with ExitStack() as stack:
+        router = stack.enter_context(Router())
+        host, port = router.endpoint.removeprefix("tcp/").split(":")
+        for _ in range(150):
+            stack.enter_context(socket.create_connection((host, int(port)), timeout=10))
+        open_client(router.endpoint, timeout_s=2.5).close()
 
 
 def test_no_router_is_said_within_the_time_given():
@@ -74,6 +87,31 @@ def test_loopback_is_allowed(endpoint):
 def test_every_other_endpoint_is_refused_with_the_reason(endpoint, reason):
     with pytest.raises(BusError, match=reason):
         loopback(endpoint)
+
+
+TLS = Tls(Path("keys"), "arm_0")
+
+
+@pytest.mark.parametrize("endpoint", ["tls/127.0.0.1:7447", "tls/router.example:7447", "tls/[2001:db8::1]:80"])
+def test_with_a_certificate_an_endpoint_may_be_anywhere(endpoint):
+    assert reachable(endpoint, TLS) == endpoint
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "tls", "reason"),
+    [
+        ("tls/127.0.0.1:7447", None, "needs a certificate"),
+        ("tcp/10.0.0.1:7447", None, "Without TLS the bus has no authentication"),
+        ("tcp/127.0.0.1:7447", TLS, "no endpoint to show the certificate of 'arm_0' at"),
+        ("tls/127.0.0.1:0", TLS, "Expected tls/"),
+        ("quic/127.0.0.1:7447", TLS, "Expected tls/"),
+        ("tls/127.0.0.1:7447#enable_mtls=false", TLS, "Expected tls/"),
+        ("", TLS, "Expected tls/"),
+    ],
+)
+def test_an_endpoint_and_a_certificate_belong_together(endpoint, tls, reason):
+    with pytest.raises(BusError, match=reason):
+        reachable(endpoint, tls)
 
 
 @pytest.mark.parametrize("port", [-1, 65536])

@@ -4,6 +4,7 @@ import json
 import queue
 import re
 import socket
+import time
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -172,6 +173,20 @@ def test_a_router_with_tls_may_listen_elsewhere_and_without_it_not(folder):
         Router(host="0.0.0.0")
     with pytest.raises(BusError, match="no address to listen on"):
         Router(host="a b/c", tls=Tls(folder, "router"))
+
+
+def test_rubbish_at_the_door_harms_no_line_that_is_open_and_delays_new_ones_alone(guarded, folder):
+    """Zenoh waits 0.1 s after every handshake that fails."""
+    host, port = guarded.endpoint.removeprefix("tls/").split(":")
+    cache = keys.caches_of("thermofleet/v1/f/arm/nobody")
+    with open_client(guarded.endpoint, timeout_s=PATIENT_S, tls=Tls(folder, "arm_0")) as arm:
+        for number in range(10):
+            with socket.create_connection((host, int(port)), timeout=PATIENT_S) as line:
+                line.sendall(bytes(range(number, 200)))
+        began_s = time.monotonic()
+        assert list(arm.get(cache, timeout=PATIENT_S)) == []
+        assert time.monotonic() - began_s < 0.9, "an open line does not wait for those at the door"
+        open_client(guarded.endpoint, timeout_s=PATIENT_S, tls=Tls(folder, "arm_1")).close()
 
 
 def test_the_documented_configuration_opens_a_line(guarded, folder):
