@@ -17,8 +17,8 @@ from fleet.errors import FleetError
 
 _LOG = logging.getLogger(__name__)
 
-READY = "ready"
-"""The first word of the line with which a participant says that it is there."""
+READY = "ready "
+"""So begins the line with which a participant says that it is there."""
 SUPERVISED = "THERMOFLEET_SUPERVISOR"
 """In the environment of what is supervised: the process of the supervisor."""
 
@@ -46,6 +46,8 @@ class Part:
     argv: tuple[str, ...]
     essential: bool = False
     """Its good end is the end of the fleet."""
+    ready: str = READY
+    """How the line begins with which it says that it is there."""
     env: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -95,14 +97,22 @@ class Supervisor:
             self._launch(running)
         except OSError as error:
             raise FleetError(f"'{part.name}' cannot be started: {error.strerror or error}.") from error
-        if ready_s is None:
-            return
+        if ready_s is not None:
+            self.await_ready(part.name, ready_s)
+
+    def await_ready(self, name: str, ready_s: float, stopped: Callable[[], bool] = lambda: False) -> None:
+        """Wait until a part that was started says that it is ready, or until told to stop.
+
+        Raises:
+            FleetError: it ended, or was not ready in time; what it said last is told.
+        """
+        running = self._parts[name]
         deadline_s = time.monotonic() + ready_s
-        while not running.ready.wait(0.05):
+        while not running.ready.wait(0.05) and not stopped():
             if running.process is not None and running.process.poll() is not None:
-                raise FleetError(f"'{part.name}' ended at once: {self.last_words(part.name)}")
+                raise FleetError(f"'{name}' ended at once: {self.last_words(name)}")
             if time.monotonic() > deadline_s:
-                raise FleetError(f"'{part.name}' was not ready within {ready_s:g} s: {self.last_words(part.name)}")
+                raise FleetError(f"'{name}' was not ready within {ready_s:g} s: {self.last_words(name)}")
 
     def ready(self, name: str) -> bool:
         """Whether a part has said so since its last start."""
@@ -192,7 +202,7 @@ class Supervisor:
             for line in said:
                 log.write(line)
                 log.flush()
-                if line.split(" ", 1)[0].strip() == READY:
+                if line.startswith(running.part.ready):
                     running.ready.set()
         process.wait()
         self._ended.put(running.part.name)

@@ -14,7 +14,7 @@ from fleet.errors import FleetError
 from fleet.live.supervisor import Backoff, Part, Supervisor
 
 PATIENCE_S = 20.0
-STAY = "import signal; print('ready', flush=True); signal.pause()"
+STAY = "import signal; print('ready x', flush=True); signal.pause()"
 STUBBORN = f"import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); {STAY}; signal.pause()"
 LOYAL = f"from fleet.live.supervisor import end_with_supervisor; end_with_supervisor(); {STAY}"
 
@@ -59,7 +59,7 @@ def test_a_process_that_is_killed_comes_again(tmp_path):
         second = supervisor.pid("a")
         assert second not in (None, first)
     assert gone(second)
-    assert supervisor.log("a").read_text() == "ready\nready\n"
+    assert supervisor.log("a").read_text() == "ready x\nready x\n"
 
 
 def test_one_that_always_fails_is_not_started_all_the_time(tmp_path):

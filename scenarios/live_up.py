@@ -1,0 +1,135 @@
+"""`thermofleet up`: a whole fleet as processes of its own, supervised: router, arms, auctioneer, recorder."""
+
+import socket
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from agents.auction import ASSIGNMENTS
+from agents.cost import COSTS
+from fleet.errors import FleetError
+from fleet.live.supervisor import Part, Supervisor
+from scenarios.load import load
+from scenarios.terminal import out_console, progress_bar, say
+
+START_S = 60.0
+"""Real seconds that a participant has to say that it is ready: an arm loads its twin."""
+PROGRAM = (sys.executable, "-c", "from scenarios.cli import main; main()")
+
+
+def parts_of(
+    scenario: str,
+    names: tuple[str, ...],
+    *,
+    port: int,
+    fleet: str,
+    folder: Path,
+    speed: float,
+    rule: str,
+    assignment: str,
+    difficulty: str,
+    jobs: str,
+    seed: int,
+) -> tuple[Part, list[Part], Part, Part]:
+    """Router, arms, recorder and auctioneer of a fleet, as `Supervisor` starts them.
+
+    Args:
+        scenario: A library name or a file.
+        names: Of the arms.
+        folder: Holds journals, recording and logs.
+    """
+    endpoint = f"tcp/127.0.0.1:{port}"
+    common = ("--endpoint", endpoint)
+    of_fleet = (*common, "--fleet", fleet, "--speed", f"{speed:g}", "--journal", str(folder / "journals"))
+    router = Part(name="router", argv=(*PROGRAM, "router", "--port", str(port)), ready=endpoint)
+    arms = [
+        Part(
+            name=f"arm-{name}",
+            argv=(*PROGRAM, "arm", scenario, name, *of_fleet, "--difficulty", difficulty, "--seed", str(seed)),
+        )
+        for name in names
+    ]
+    record = Part(name="record", argv=(*PROGRAM, "record", fleet, *common, "--out", str(folder / "recording")))
+    how = ("--rule", rule, "--assignment", assignment, "--jobs", jobs, "--seed", str(seed))
+    auction = Part(name="auction", argv=(*PROGRAM, "auction", scenario, *of_fleet, *how), essential=jobs == "scenario")
+    return router, arms, record, auction
+
+
+def up_command(
+    scenario: Annotated[str, typer.Argument(help="A library name (see `thermofleet list`) or a .toml file.")],
+    speed: Annotated[float, typer.Option(help="Fleet seconds per real second.")] = 60.0,
+    rule: Annotated[str, typer.Option(help=f"What a job costs an arm: {', '.join(COSTS)}.")] = "thermal",
+    assignment: Annotated[str, typer.Option(help=f"Who gets what: {', '.join(ASSIGNMENTS)}.")] = "matching",
+    difficulty: Annotated[str, typer.Option(help="What scores the plans: twin or blind.")] = "twin",
+    jobs: Annotated[
+        str, typer.Option(help="scenario: its own stream, until it is done; none: what others submit, until Ctrl-C.")
+    ] = "scenario",
+    seed: Annotated[int, typer.Option(help="Draws the scenario's jobs and the sensors' noise; 0 or more.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for journals, recording and logs; default runs/live-FLEET.")
+    ] = None,
+    port: Annotated[int, typer.Option(help="Loopback port of the router; 0 is any free one.")] = 0,
+    fleet: Annotated[str, typer.Option(help="Name of the fleet; default: the scenario's name.")] = "",
+) -> None:
+    """Start a whole fleet, each participant a process of its own, and keep it running until its work is done.
+
+    What ends is started again with back-off; Ctrl-C ends all in order. The same command with the same --out goes on
+    where the journals stop.
+    """
+    from scenarios.build import prepare
+    from scenarios.live_allocation import allocation
+    from scenarios.stopping import until_stopped
+
+    chosen = load(scenario)
+    if not 0 < speed < float("inf") or seed < 0 or not 0 <= port <= 65535:
+        raise FleetError(f"--speed must be > 0, --seed >= 0, --port 0 to 65535 (got {speed:g}, {seed}, {port}).")
+    if difficulty not in ("twin", "blind") or jobs not in ("scenario", "none"):
+        raise FleetError(f"--difficulty is twin or blind, --jobs scenario or none (got {difficulty}, {jobs}).")
+    allocation(rule, assignment, chosen.limits.warning_c)
+    fleet = fleet or chosen.name
+    folder = out or Path("runs") / f"live-{fleet}"
+    with progress_bar() as progress:  # once, so that no arm has to plan or train by itself
+        prepare(chosen, difficulty="twin" if difficulty == "twin" else "blind", progress=progress)
+    router, arms, record, auction = parts_of(
+        scenario,
+        tuple(arm.name for arm in chosen.arms),
+        port=port or free_port(),
+        fleet=fleet,
+        folder=folder,
+        speed=speed,
+        rule=rule,
+        assignment=assignment,
+        difficulty=difficulty,
+        jobs=jobs,
+        seed=seed,
+    )
+    with until_stopped() as stop, Supervisor(folder / "logs") as supervisor:
+        supervisor.start(router, ready_s=START_S)
+        for part in (record, *arms):
+            supervisor.start(part)
+        for part in (record, *arms):
+            supervisor.await_ready(part.name, START_S, stop.is_set)
+        supervisor.start(auction)
+        supervisor.await_ready(auction.name, START_S, stop.is_set)
+        say(
+            f"{fleet} is up: {len(arms)} arms at {router.ready}, {speed:g} times as fast as real time; logs in "
+            f"{supervisor.folder}. Look: thermofleet watch --endpoint {router.ready}",
+            out_console,
+        )
+        ended = supervisor.run(stop.is_set)
+        if ended:
+            say(supervisor.log(ended).read_text(encoding="utf-8").strip().rpartition(f"ready {ended}")[2], out_console)
+        again = {name: count for name, count in supervisor.restarts().items() if count}
+    if again:
+        say("Started again: " + ", ".join(f"{name} {count} time(s)" for name, count in again.items()), out_console)
+    say(f"Recorded in {folder / 'recording'}.", out_console)
+    stop.leave(f"The fleet was stopped; journals, recording and logs are in {folder}, and the same command goes on.")
+
+
+def free_port() -> int:
+    """A port of 127.0.0.1 that nobody listens on now: the router needs the same one when it is started again."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
