@@ -144,18 +144,22 @@ class Supervisor:
         Returns "" if it was told to stop.
         """
         while not stopped():
-            now_s = time.monotonic()
-            for running in self._parts.values():
-                if running.process is None and not running.over and running.due_s <= now_s:
-                    self._launch(running)
-                    running.restarts += 1
-            try:
-                name = self._ended.get(timeout=look_s)
-            except Empty:
-                continue
-            if self._note_end(self._parts[name]):
-                return name
+            if ended := self.look(look_s):
+                return ended
         return ""
+
+    def look(self, wait_s: float = 0.0) -> str:
+        """Start what is due, and wait so long for an end; the name of an essential part that has ended well, or ""."""
+        now_s = time.monotonic()
+        for running in self._parts.values():
+            if running.process is None and not running.over and running.due_s <= now_s:
+                self._launch(running)
+                running.restarts += 1
+        try:
+            name = self._ended.get(timeout=wait_s) if wait_s else self._ended.get_nowait()
+        except Empty:
+            return ""
+        return name if self._note_end(self._parts[name]) else ""
 
     def stop(self) -> None:
         """End all, the last started first: SIGTERM, and SIGKILL for what does not heed it."""
