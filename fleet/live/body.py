@@ -25,7 +25,7 @@ from fleet.thermal import WINDING
 
 Array = np.ndarray
 
-MOST_STEPS = 2000
+MOST_STEPS = 200
 """Of one call: a body that has fallen far behind catches up little by little."""
 _TOLD = ("torque_warning", "home", "warning", "fault", "recover")
 """Events of the kernel that are true of a live arm as they are."""

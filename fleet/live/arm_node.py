@@ -1,0 +1,395 @@
+"""An arm on the bus: it lives with the fleet's time, says how it is, offers, takes work, and keeps its promises.
+
+One thread drives it. What could keep it from its state words is cut into pieces: a motion that was never planned takes
+some 50 ms; an answer plans for at most `PLANNING_S`, says how the arm is between two plans, and offers what is left as
+`not planned yet`; the rest is planned one motion a turn, so that the next question finds it.
+"""
+
+import logging
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from fleet.bus import keys
+from fleet.bus.link import REMEMBERED, Answers, Link, Refused
+from fleet.bus.messages import DifficultyWord, Info, State
+from fleet.bus.trade import (
+    Ack,
+    ArmEvent,
+    Award,
+    Clock,
+    ClockRequest,
+    JobWord,
+    Lease,
+    LeaseRequest,
+    Offer,
+    Quote,
+    QuoteRequest,
+    Receipt,
+    Report,
+)
+from fleet.errors import BusError
+from fleet.events import Event
+from fleet.live.body import Body, Reading
+from fleet.live.clock import FleetClock
+from fleet.live.contractor import Contractor
+from fleet.live.estimate import Estimator
+from fleet.live.promises import Held
+
+_LOG = logging.getLogger(__name__)
+
+PLANNING_S = 0.3
+"""Real seconds that one answer may spend on planning."""
+MOST_PLANNED = 256
+"""Motions that wait to be planned."""
+ANSWER_S = 1.0
+"""Real seconds that an auctioneer has to answer."""
+CLOCK_S = (1.0, 30.0)
+"""Real seconds between two questions for the time: until the first answer, and after it."""
+TOLD_S = 10.0
+"""Real seconds between two complaints about the same."""
+EVENTS_OF_A_LIFE = 1_000_000_000
+"""The number of an event is that of the boot times this, and a count."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Nature:
+    """What kind of arm it is."""
+
+    warning_c: float
+    """Motor temperature at which it takes no more work."""
+    rate_hz: float = 10.0
+    """State words per real second."""
+    life: int = 1
+    """Number of its boot."""
+    air_c: Callable[[float], float] = lambda time_s: 25.0
+    """Air of the cell at a time of the fleet, as a thermometer on the wall tells it."""
+    works: bool = True
+    """Whether it takes jobs at all."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.rate_hz <= 1000:
+            raise ValueError(f"Nature.rate_hz must be > 0 and <= 1000 (got {self.rate_hz:g}).")
+
+
+class ArmNode:
+    """One arm of a fleet.
+
+    Attributes:
+        clock: The fleet's time as the arm keeps it.
+        behind_s: Fleet seconds by which the body was last behind that time.
+        contractor: What the arm has promised.
+    """
+
+    def __init__(
+        self, link: Link, body: Body, contractor: Contractor, estimator: Estimator, clock: FleetClock, nature: Nature
+    ) -> None:
+        """Take part: `link` is open."""
+        self.clock, self.contractor, self.behind_s = clock, contractor, 0.0
+        self._link, self._body, self._estimator, self._nature = link, body, estimator, nature
+        self._name = contractor.arm
+        self._at_work = ""
+        """Award that the body is at."""
+        self._unplanned: deque[JobWord] = deque(maxlen=MOST_PLANNED)
+        self._reading = body.read()
+        self._tick = self._events = 0
+        self._said_s = self._clock_asked_s = -math.inf
+        self._complained_s: dict[str, float] = {}
+        self._clock_known = False
+        self._declare()
+
+    def serve(self, until_s: float) -> None:
+        """Live until `time.monotonic()` is `until_s`, or a little less."""
+        due_s = self._said_s + 1.0 / self._nature.rate_hz
+        if self._unplanned:
+            due_s = -math.inf
+        self._link.serve(min(until_s, due_s))
+        self._turn()
+        if self._unplanned:
+            self._estimator.prepare(self._unplanned.popleft())
+
+    # What it hears
+
+    def _declare(self) -> None:
+        link, fleet, name = self._link, self._link.fleet, self._name
+        self._say_state = link.publisher(keys.of_arm(fleet, name, "state"), State)
+        self._say_difficulty = link.publisher(keys.of_arm(fleet, name, "difficulty"), DifficultyWord, remember=1)
+        self._say_event = link.publisher(keys.of_arm(fleet, name, "event"), ArmEvent, remember=REMEMBERED)
+        info = link.publisher(keys.of_arm(fleet, name, "info"), Info, remember=1)
+        info(Info(name, len(self._reading.temp_c), self._estimator.model.version))
+        link.answer(keys.of_arm(fleet, name, "quote"), QuoteRequest, self._quote)
+        link.answer(keys.of_arm(fleet, name, "award"), Award, self._award)
+        link.alive(keys.of_arm(fleet, name, "alive"))
+        self._turn()
+
+    def _quote(self, request: QuoteRequest) -> Quote:
+        words = {word.name: word for word in request.jobs}
+        if len(words) != len(request.jobs):
+            raise Refused("A job is named twice in this question.")
+        self._plan_what_is_new(request.jobs)
+        real_s = time.monotonic()
+        temp_c = np.array(self._reading.temp_c)
+        offers = self._estimator.offers(
+            request.jobs, temp_c, self._nature.air_c(self.clock.now_s(real_s)), self._busy_s()
+        )
+        name = ""
+        if not request.dry_run:
+            can = {offer.job: (words[offer.job], offer.feasible) for offer in offers}
+            name = self.contractor.quoted(can, real_s)
+            self._tell_difficulty(offers, real_s)
+        faulted = self._reading.mode == "faulted"
+        return Quote(
+            arm=self._name,
+            auction=request.auction,
+            quote=name,
+            valid_s=self.contractor.terms.valid_s,
+            twin=self._estimator.model.version,
+            time_s=self.clock.now_s(real_s),
+            mode=self._reading.mode,
+            headroom_k=self._headroom_k,
+            capacity=self.contractor.spare if self._nature.works and not faulted else 0,
+            offers=offers,
+        )
+
+    def _plan_what_is_new(self, words: tuple[JobWord, ...]) -> None:
+        """Plan within the time for it, and leave the rest for later."""
+        until_s = time.monotonic() + PLANNING_S
+        for word in words:
+            if self._estimator.ready(word):
+                continue
+            if time.monotonic() < until_s:
+                self._estimator.prepare(word)
+                self._turn()
+            else:
+                self._unplanned.append(word)
+
+    def _tell_difficulty(self, offers: tuple[Offer, ...], real_s: float) -> None:
+        self._say_difficulty(
+            DifficultyWord(
+                arm=self._name,
+                tick=self._tick,
+                time_s=self.clock.now_s(real_s),
+                twin=self._estimator.model.version,
+                jobs=tuple(offer.job for offer in offers),
+                difficulty=tuple(offer.d for offer in offers),
+                p_saturation=tuple(offer.p_saturation for offer in offers),
+            )
+        )
+
+    def _award(self, award: Award) -> Ack:
+        before = len(self.contractor.held)
+        ack = self.contractor.awarded(award, time.monotonic(), self._unfit())
+        if ack.accepted and len(self.contractor.held) > before:
+            way = self._estimator.way(award.job)
+            score = None if way is None or way.difficulty is None else way.difficulty.total
+            self._tell(Event(time_s=self._body.time_s, kind="award", job=award.job.name), score)
+        return ack
+
+    def _unfit(self) -> str:
+        """Why it takes no work just now."""
+        if not self._nature.works:
+            return "I take no jobs"
+        if self._reading.mode == "faulted":
+            return "I am faulted"
+        if self._headroom_k <= 0:
+            return f"I am too hot: a motor is {-self._headroom_k:.1f} K above the warning limit"
+        return ""
+
+    # What it does by itself
+
+    def _turn(self) -> None:
+        real_s = time.monotonic()
+        self.contractor.catch_up()
+        self._live(real_s)
+        self.contractor.give_up(self._body.time_s, real_s)
+        for auctioneer, request in self.contractor.lease_requests(real_s):
+            self._ask_lease(auctioneer, request, real_s)
+        for auctioneer, report in self.contractor.reports(real_s):
+            self._report(auctioneer, report)
+        self._ask_clock(real_s)
+        if real_s >= self._said_s + 1.0 / self._nature.rate_hz:
+            self._say(real_s)
+
+    def _live(self, real_s: float) -> None:
+        """Let the body live up to now, within what it may do."""
+        now_s, first = self.clock.now_s(real_s), next(iter(self.contractor.held), None)
+        self._hand_over(first)
+        if first is not None and not first.leave and first.until_s < real_s:
+            # What it did while it had a lease is its own, also if this process was held up since.
+            before_s = math.nextafter(first.until_s, -math.inf)
+            self._advance(self.clock.now_s(before_s), first, before_s, real_s)
+            first = next(iter(self.contractor.held), None)
+        self._advance(now_s, first, real_s, real_s)
+        self.behind_s = now_s - self._body.time_s
+        if self.behind_s > 2.0 * self.clock.speed:
+            self._complain("behind", f"is {self.behind_s:.1f} s of the fleet's time behind.")
+
+    def _hand_over(self, first: Held | None) -> None:
+        """Have the body let go of what is no longer the arm's own, and take up what comes next."""
+        name = "" if first is None else first.award.award
+        if self._at_work not in ("", name):
+            self._body.let_go()
+            self._at_work = ""
+        if first is None or not self._body.free:
+            return
+        job, way = self._estimator.job(first.award.job), self._estimator.way(first.award.job)
+        assert job is not None, "an award for what cannot be is refused"
+        assert way is not None, "an award for what cannot be is refused"
+        self._body.begin(job, way.plan, first.cycles)
+        self._at_work = name
+
+    def _advance(self, until_s: float, first: Held | None, permit_s: float, real_s: float) -> None:
+        if first is not None and self._at_work == first.award.award:
+            may = self.contractor.may(permit_s)
+            if self._awaits_leave(first, real_s):
+                may = first.cycles  # at home: to leave it and come back for the last cycle would be a waste
+            self._body.permit(may)
+        for event in self._body.advance(until_s):
+            self._lived(event, real_s)
+        if self._reading.mode == "faulted" and self.contractor.held:
+            self.contractor.returned(self._body.time_s, real_s, "the arm is faulted")
+            self._at_work = ""
+        first = next(iter(self.contractor.held), None)
+        if first is not None:
+            at_it = self._at_work == first.award.award and self._body.job
+            cycles = self._body.cycles if at_it else first.cycles
+            self.contractor.worked(cycles, self._last_in_s(first) / self.clock.speed)
+
+    def _awaits_leave(self, first: Held, real_s: float) -> bool:
+        """Whether the arm stands at home, the last cycle is near, and leave for it may come any moment."""
+        near = first.last_in_s <= self.contractor.terms.ahead_s and not first.leave
+        return near and self._reading.mode != "working" and real_s < first.until_s
+
+    def _last_in_s(self, first: Held) -> float:
+        """Fleet seconds until the last cycle of the first job could begin."""
+        if self._at_work == first.award.award:
+            return self._body.last_in_s()
+        way = self._estimator.way(first.award.job)
+        if way is None:
+            return math.inf
+        left = first.award.job.repetitions - 1 - first.cycles
+        return self._body.free_in_s() + way.plan.approach.duration_s + left * way.plan.cycle.duration_s
+
+    def _lived(self, event: Event, real_s: float) -> None:
+        """Draw the consequences of what happened to the body, and tell."""
+        if event.kind == "finish":
+            self._at_work = ""
+            self.contractor.finished(event.time_s, real_s)
+        elif event.kind == "return":
+            self._at_work = ""
+            self.contractor.worked(int(event.value), math.inf)
+            self.contractor.returned(event.time_s, real_s, f"the arm faulted; {event.reason}")
+        self._tell(event)
+
+    def _busy_s(self) -> float:
+        """Until the arm has done all that it has in hand, fleet seconds."""
+        busy_s = self._body.free_in_s()
+        for held in self.contractor.held:
+            way = self._estimator.way(held.award.job)
+            if held.award.award != self._at_work and way is not None:
+                busy_s += way.plan.duration_s(held.award.job.repetitions - held.cycles)
+        return busy_s
+
+    @property
+    def _headroom_k(self) -> float:
+        return self._nature.warning_c - max(self._reading.temp_c)
+
+    # What it says and asks
+
+    def _say(self, real_s: float) -> None:
+        self._said_s = real_s
+        self._reading = reading = self._body.read()
+        self._tick += 1
+        first = next(iter(self.contractor.held), None)
+        self._say_state(_state(self._name, self._tick, self._body.time_s, reading, self._headroom_k, first))
+
+    def _tell(self, event: Event, value: float | None = None) -> None:
+        self._events += 1
+        if value is None and math.isfinite(event.value):
+            value = event.value
+        self._say_event(
+            ArmEvent(
+                arm=self._name,
+                number=self._nature.life * EVENTS_OF_A_LIFE + self._events,
+                time_s=event.time_s,
+                kind=event.kind,
+                job=event.job,
+                joint=event.joint,
+                value=value,
+                reason=event.reason,
+            )
+        )
+
+    def _ask_lease(self, auctioneer: str, request: LeaseRequest, asked_s: float) -> None:
+        def done(answers: Answers[Lease]) -> None:
+            for lease in answers.words.values():
+                self.contractor.leased(lease, asked_s)
+
+        key = keys.of_auction(self._link.fleet, auctioneer, "lease")
+        self._safely(partial(self._link.ask, key, request, Lease, done, timeout_s=ANSWER_S))
+
+    def _report(self, auctioneer: str, report: Report) -> None:
+        def done(answers: Answers[Receipt]) -> None:
+            for receipt in answers.words.values():
+                self.contractor.receipted(receipt)
+
+        key = keys.of_auction(self._link.fleet, auctioneer, "report")
+        self._safely(partial(self._link.ask, key, report, Receipt, done, timeout_s=ANSWER_S))
+
+    def _ask_clock(self, asked_s: float) -> None:
+        def done(answers: Answers[Clock]) -> None:
+            for said in answers.words.values():
+                self._set_clock(said, asked_s, time.monotonic())
+                return
+
+        if asked_s >= self._clock_asked_s + CLOCK_S[self._clock_known]:
+            self._clock_asked_s = asked_s
+            key = keys.of_clock(self._link.fleet)
+            self._safely(partial(self._link.ask, key, ClockRequest(), Clock, done, timeout_s=ANSWER_S))
+
+    def _set_clock(self, said: Clock, asked_s: float, answered_s: float) -> None:
+        """Take the fleet's time: at once the first time, little by little after that."""
+        clock = self.clock
+        if said.speed != clock.speed:
+            self._complain("speed", f"goes at the fleet's speed of {said.speed:g}, not at {clock.speed:g}.")
+            clock = FleetClock(said.speed, answered_s, clock.now_s(answered_s))
+        if self._clock_known:
+            self.clock = clock.corrected(asked_s, answered_s, said.time_s)
+            return
+        self._clock_known = True
+        self.clock = clock.set_by(asked_s, answered_s, said.time_s)
+        self._body.set_time(self.clock.now_s(answered_s))
+
+    def _safely(self, ask: Callable[[], None]) -> None:
+        """Ask; what cannot be asked now is asked again in its time."""
+        try:
+            ask()
+        except BusError as error:
+            self._complain("bus", str(error))
+
+    def _complain(self, what: str, sentence: str) -> None:
+        now_s = time.monotonic()
+        if now_s >= self._complained_s.get(what, -math.inf) + TOLD_S:
+            self._complained_s[what] = now_s
+            _LOG.warning("Arm '%s' %s", self._name, sentence)
+
+
+def _state(name: str, tick: int, time_s: float, reading: Reading, headroom_k: float, first: Held | None) -> State:
+    return State(
+        arm=name,
+        tick=tick,
+        time_s=time_s,
+        mode=reading.mode,
+        temp_c=reading.temp_c,
+        headroom_k=headroom_k,
+        job="" if first is None else first.award.job.name,
+        q=reading.q,
+        qd=reading.qd,
+        tau=reading.tau,
+        current_a=reading.current_a,
+    )
