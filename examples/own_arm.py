@@ -19,6 +19,7 @@ from zenoh import ext
 
 STATE_S, CYCLE_S, VALID_S = 0.1, 0.1, 3.0
 LIMIT_C, AMBIENT_C = 60.0, 25.0
+DRIFT = 0.01  # clocks may go at rates that differ by so much: our count of a lease must end first
 
 
 class Arm:
@@ -157,7 +158,7 @@ class Arm:
                     "cycles": award.get("cycles", 0),
                     "wanted": award["job"].get("repetitions", 1),
                     "auctioneer": award["auctioneer"],
-                    "until_s": quoted_s + lease_s,
+                    "until_s": quoted_s + (1 - DRIFT) * lease_s,
                     "leave": False,
                     "ready_s": time.monotonic() + CYCLE_S,
                 }
@@ -203,12 +204,16 @@ class Arm:
             self.send(hold["auctioneer"], "lease", "LeaseRequest", request, lambda lease: self.leased(lease, asked_s))
 
     def leased(self, lease, asked_s):
-        """The lease is counted from the moment we asked."""
-        if self.hold and self.hold["award"] in lease["lost"]:
+        """The lease is counted from the moment we asked. Leave to finish, once given, is not taken back."""
+        hold = self.hold
+        if hold is None:
+            return
+        if hold["award"] in lease.get("leave", ()):
+            hold["leave"] = True
+        if hold["award"] in lease["granted"]:
+            hold["until_s"] = asked_s + (1 - DRIFT) * lease["lease_s"]
+        elif hold["award"] in lease["lost"] and not hold["leave"]:
             self.hold = None
-        elif self.hold and self.hold["award"] in lease["granted"]:
-            self.hold["until_s"] = asked_s + lease["lease_s"]
-            self.hold["leave"] = self.hold["award"] in lease.get("leave", ())
 
     def receipt(self, word):
         """The auctioneer has it on disk."""

@@ -19,7 +19,9 @@ def filled(page: str) -> str:
     Raises:
         FleetError: a part is asked for that is not made here.
     """
-    parts = {"keys": key_table, "ways": way_table, "words": word_tables}
+    from scenarios.contract_numbers import limit_table, time_table
+
+    parts = {"keys": key_table, "ways": way_table, "words": word_tables, "times": time_table, "limits": limit_table}
 
     def part(match: re.Match[str]) -> str:
         if match["name"] not in parts:
@@ -41,12 +43,12 @@ def key_table() -> str:
         )
         for channel in CHANNELS
     ]
-    return _table(("key", "said or answered by", "to", "way", "word"), rows)
+    return table(("key", "said or answered by", "to", "way", "word"), rows)
 
 
 def way_table() -> str:
     """What the ways of saying mean."""
-    return _table(("way", "meaning"), list(WAYS.items()))
+    return table(("way", "meaning"), list(WAYS.items()))
 
 
 def word_tables() -> str:
@@ -72,7 +74,7 @@ def _word(name: str, part: Mapping[str, Any], where: str, word: type | None) -> 
             )
             for field, kind in part["properties"].items()
         ]
-        said.append(_table(("field", "type", "if left out", "meaning"), rows))
+        said.append(table(("field", "type", "if left out", "meaning"), rows))
     else:
         said.append("No fields: the payload is `{}`.")
     if word is not None:
@@ -122,6 +124,7 @@ def _default(kind: Mapping[str, Any]) -> str:
     return f"`{json.dumps(kind['default'])}`" if "default" in kind else ""
 
 
-def _table(head: tuple[str, ...], rows: list[Any]) -> str:
+def table(head: tuple[str, ...], rows: list[Any]) -> str:
+    """A table in Markdown."""
     lines = [head, tuple("---" for _ in head), *rows]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)

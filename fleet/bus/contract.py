@@ -91,7 +91,7 @@ CHANNELS: tuple[Channel, ...] = (
     Channel("arm", "quote", "answered", trade.QuoteRequest, trade.Quote, to="auctioneer, or anybody for a dry run"),
     Channel("arm", "award", "answered", trade.Award, trade.Ack, to="auctioneer"),
     Channel("auction", "alive", "token", by="auctioneer"),
-    Channel("auction", "announce", "dropped", trade.Announce, by="auctioneer"),
+    Channel("auction", "announce", "remembered", trade.Announce, by="auctioneer", kept=REMEMBERED),
     Channel("auction", "result", "remembered", trade.Result, by="auctioneer", kept=REMEMBERED),
     Channel("auction", "lease", "answered", trade.LeaseRequest, trade.Lease, by="auctioneer", to="arm"),
     Channel("auction", "report", "answered", trade.Report, trade.Receipt, by="auctioneer", to="arm"),
