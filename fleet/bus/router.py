@@ -15,7 +15,7 @@ import zenoh
 
 from fleet.bus.limits import Limits
 from fleet.bus.roster import access_control, read_roster
-from fleet.bus.security import Tls, why_not
+from fleet.bus.security import Tls, identified, why_not
 from fleet.errors import BusError
 
 _LOG = logging.getLogger(__name__)
@@ -85,7 +85,7 @@ def reachable(endpoint: str, tls: Tls | None = None) -> str:
     """
     match = _ENDPOINT.fullmatch(endpoint)
     if tls is None and match is not None and match["how"] == "tls":
-        raise BusError(f"Endpoint '{endpoint}' needs a certificate: the folder and the name of a participant.")
+        raise BusError(f"Endpoint '{endpoint}' needs a certificate: say whose, as {endpoint}#FOLDER/NAME.")
     if tls is None:
         return loopback(endpoint)
     if match is None or match["how"] != "tls" or not 0 < int(match["port"]) <= 65535:
@@ -100,12 +100,15 @@ def open_client(endpoint: str, *, timeout_s: float, tls: Tls | None = None) -> z
     """A client session on the router at `endpoint`.
 
     Args:
-        tls: Who connects, for an endpoint that begins with `tls/`.
+        endpoint: As `tcp/127.0.0.1:7447`, or with who connects as `tls/127.0.0.1:7447#FOLDER/NAME`.
+        tls: Who connects, for an endpoint that begins with `tls/` and does not say so itself.
 
     Raises:
         BusError: the endpoint is not on loopback and has no TLS, the certificate is not good, or no router answered
             within `timeout_s`.
     """
+    if tls is None:
+        endpoint, tls = identified(endpoint)
     connect = {
         "endpoints": [reachable(endpoint, tls)],
         "timeout_ms": max(1, round(1000 * timeout_s)),

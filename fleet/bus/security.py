@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 from fleet.bus.keys import chunk
 from fleet.errors import BusError
@@ -67,6 +68,10 @@ class Tls:
             "close_link_on_expiration": True,
         }
 
+    def endpoint(self, address: str) -> str:
+        """An address `tls/HOST:PORT` together with who connects there, the inverse of `identified`."""
+        return f"{address}#{self.folder / self._file}"
+
     def context(self) -> ssl.SSLContext:
         """The same end for Python's own TLS."""
         context = ssl.create_default_context(cafile=self._path("ca.pem"))
@@ -84,6 +89,17 @@ class Tls:
         path = self._path(f"{self._file}.key")
         if os.name == "posix" and path.stat().st_mode & 0o077:
             raise BusError(f"Others on this machine may read the private key '{path}': chmod 600 it.")
+
+
+def identified(endpoint: str) -> tuple[str, Tls | None]:
+    """An endpoint that says who connects, `tls/HOST:PORT#FOLDER/NAME`, taken apart; None where it does not say.
+
+    NAME is the participant's file without its ending, so that every name can be written.
+    """
+    address, mark, who = endpoint.partition("#")
+    if not (mark and who and address.startswith("tls/")):
+        return endpoint, None
+    return address, Tls(Path(who).parent, unquote(Path(who).name))
 
 
 def why_not(host: str, port: int, tls: Tls | None) -> str:

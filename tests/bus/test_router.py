@@ -5,9 +5,11 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from fleet.bus.router import Router, loopback, open_client, reachable
-from fleet.bus.security import Tls
+from fleet.bus.security import Tls, identified
 from fleet.errors import BusError
 
 
@@ -112,6 +114,19 @@ def test_with_a_certificate_an_endpoint_may_be_anywhere(endpoint):
 def test_an_endpoint_and_a_certificate_belong_together(endpoint, tls, reason):
     with pytest.raises(BusError, match=reason):
         reachable(endpoint, tls)
+
+
+@given(
+    st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=20), st.sampled_from(["keys", "/a b/c#d"])
+)
+def test_an_endpoint_may_say_who_connects(name, folder):
+    tls = Tls(Path(folder), name)
+    assert identified(tls.endpoint("tls/127.0.0.1:7447")) == ("tls/127.0.0.1:7447", tls)
+
+
+@pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:7447#keys/arm_0", "tls/127.0.0.1:7447", "tls/127.0.0.1:7447#", ""])
+def test_an_endpoint_that_says_nobody_is_left_as_it_is(endpoint):
+    assert identified(endpoint) == (endpoint, None)
 
 
 @pytest.mark.parametrize("port", [-1, 65536])

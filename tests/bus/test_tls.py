@@ -14,10 +14,13 @@ import zenoh
 
 from fleet.bus import keys
 from fleet.bus.certificates import issue
+from fleet.bus.discover import fleets_at
 from fleet.bus.keyring import make
+from fleet.bus.link import Link
 from fleet.bus.roster import Participant, of_arms
 from fleet.bus.router import Router, open_client
 from fleet.bus.security import Tls
+from fleet.bus.trade import Clock, ClockRequest
 from fleet.errors import BusError
 
 ARMS = ("arm_0", "arm_1")
@@ -74,6 +77,16 @@ def test_a_certificate_that_is_not_good_is_refused_at_both_ends(open_stranger, g
         open_client(guarded.endpoint, timeout_s=PATIENT_S, tls=tls)
     with pytest.raises(zenoh.ZError), open_stranger(guarded.endpoint, tls.link(serves=False)):
         pass
+
+
+def test_an_endpoint_that_says_who_connects_is_enough_for_every_command(guarded, folder):
+    endpoint = Tls(folder, "monitor").endpoint(guarded.endpoint)
+    with Link(endpoint, "f") as link:
+        link.say(keys.of_arm("f", "monitor", "event"), ClockRequest())  # not its own key: dropped
+        assert not link.ask_and_wait(keys.of_clock("f"), ClockRequest(), Clock, timeout_s=PATIENT_S).words
+    assert fleets_at(endpoint) == ("f",)
+    with pytest.raises(BusError, match="say whose, as tls/"):
+        open_client(guarded.endpoint, timeout_s=PATIENT_S)
 
 
 def test_nobody_gets_in_without_a_certificate(open_stranger, guarded, folder):
