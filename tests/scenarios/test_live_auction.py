@@ -1,0 +1,270 @@
+"""`thermofleet auction`, `submit` and `ask`, called as a person calls them, and what they are made of."""
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleet.bus import keys
+from fleet.bus.link import Link
+from fleet.bus.router import Router
+from fleet.bus.trade import JobWord, Offer, Quote, QuoteRequest
+from fleet.errors import FleetError
+from fleet.job import Job, Place, Work
+from fleet.live.bidding import Bidding
+from scenarios.build import make_env
+from scenarios.cli import main
+from scenarios.live_allocation import allocation, bids_of
+from scenarios.live_auction import own_jobs, word_of
+from scenarios.live_submit import read_jobs
+from scenarios.load import load
+
+ROOT = Path(__file__).parents[2]
+PATIENT_S = 20.0
+HOLD = {"name": "a", "kind": "hold", "places": ["rack"], "repetitions": 2}
+
+
+def call(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
+    """Exit code, and what was said on both outputs."""
+    with pytest.raises(SystemExit) as left:
+        main([str(word) for word in words])
+    said = capsys.readouterr()
+    assert isinstance(left.value.code, int)
+    return left.value.code, said.out, said.err
+
+
+# jobs from a file
+
+
+def test_jobs_come_one_a_line_or_as_a_list(tmp_path):
+    other = {**HOLD, "name": "b"}
+    lines, listed = tmp_path / "jobs.jsonl", tmp_path / "jobs.json"
+    lines.write_text(f"{json.dumps(HOLD)}\n\n{json.dumps(other)}\n", encoding="utf-8")
+    listed.write_text(json.dumps([HOLD, other], indent=1), encoding="utf-8")
+    assert [word.name for word in read_jobs(str(lines))] == ["a", "b"]
+    assert read_jobs(str(lines)) == read_jobs(str(listed))
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        (f"{json.dumps(HOLD)}\n{{}}", "line 2: Object missing required field `name`."),
+        (json.dumps(HOLD | {"repetitions": 0}), "line 1: Expected `int` >= 1 (at repetitions)."),
+        (json.dumps([HOLD, HOLD | {"kind": "dance"}]), "Invalid enum value 'dance' (at [1].kind)."),
+        (json.dumps(HOLD | {"places": ["a", "b"]}), "line 1: A hold needs 1 place(s), got 2."),
+        ("{", "line 1: Input data was truncated."),
+        ("\n", "there are no jobs in it."),
+        ("[]", "there are no jobs in it."),
+        ("\xff", "line 1: "),
+    ],
+)
+def test_what_is_no_job_is_told_by_its_line(tmp_path, text, complaint):
+    file = tmp_path / "jobs"
+    file.write_bytes(text.encode("latin-1"))
+    with pytest.raises(FleetError) as refusal:
+        read_jobs(str(file))
+    assert str(refusal.value).startswith(f"{file}")
+    assert complaint in str(refusal.value)
+
+
+def test_a_missing_file_is_one_sentence(capsys):
+    code, _, err = call(capsys, "submit", "no-such-file", "--fleet", "f")
+    assert code == 2
+    assert "Cannot read 'no-such-file': No such file or directory." in err
+
+
+# the scenario's own stream
+
+
+def test_the_stream_is_the_one_of_a_run(small_toml, plans):
+    """Against the world that a run lays out for the same seed."""
+    scenario = load(small_toml)
+    env = make_env(scenario, difficulty="blind", cache=plans)
+    for seed in (0, 3):
+        env.reset(seed=seed)
+        table, drawn = env.world.jobs, own_jobs(scenario, seed)
+        assert {word.name for _, word in drawn} == set(table.names[0])
+        for name, release_s, repetitions in zip(table.names[0], table.release_s[0], table.repetitions[0], strict=True):
+            (word,) = (word for _, word in drawn if word.name == name)
+            assert (word.release_s, word.repetitions) == (release_s, repetitions)
+
+
+def test_a_job_is_handed_in_after_what_it_waits_for(small_toml):
+    drawn = own_jobs(load(small_toml), 0)
+    assert [at_s for at_s, _ in drawn] == sorted(at_s for at_s, _ in drawn)
+    seen: set[str] = set()
+    for at_s, word in drawn:
+        assert at_s >= word.release_s
+        assert set(word.after) <= seen
+        seen.add(word.name)
+
+
+def test_a_job_travels_whole():
+    place = Place(name="rack", position_m=(0.0, 0.0, 0.0))
+    work = Work(kind="press", places=(place,), force_n=30.0, dwell_s=20.0)
+    job = Job(name="p", work=work, repetitions=6, release_s=1.0, due_s=9.0, value=3.0, after=("q",))
+    assert word_of(job) == JobWord("p", "press", ("rack",), 6, 0.0, 20.0, 30.0, 1.0, 9.0, 3.0, ("q",))
+
+
+# costs
+
+
+def quote(arm: str, *offers: Offer) -> Quote:
+    return Quote(arm, "r", "q", 5.0, "t", 0.0, "idle", 20.0, 1, offers)
+
+
+def test_quotes_become_arrays():
+    jobs = (JobWord("a", "hold", ("x",), due_s=150.0, value=2.0), JobWord("b", "hold", ("y",)))
+    quotes = {
+        "one": quote("one", Offer("a", True, "", None, 1.5, 0.25, 55.0, 60.0, 100.0), Offer("b", False, "reach")),
+        "two": quote("two", Offer("b", True)),
+    }
+    bids = bids_of(Bidding("r", 100.0, jobs, quotes), ("one", "two"), 60.0)
+    nan = np.nan
+    np.testing.assert_array_equal(bids.feasible, [[True, False], [False, True]])
+    np.testing.assert_array_equal(bids.difficulty, [[1.5, nan], [nan, nan]])
+    np.testing.assert_array_equal(bids.p_saturation, [[0.25, nan], [nan, nan]])
+    np.testing.assert_array_equal(bids.peak_headroom_k, [[5.0, nan], [nan, nan]])
+    np.testing.assert_array_equal(bids.finish_s, [[100.0, nan], [nan, nan]])
+    np.testing.assert_array_equal(bids.tardiness_s, [[50.0, nan], [nan, nan]])
+    np.testing.assert_array_equal(bids.value, [2.0, 1.0])
+
+
+@pytest.mark.parametrize("assignment", ["ssi", "matching"])
+def test_the_arm_that_would_get_hot_does_not_get_the_job(assignment):
+    jobs = (JobWord("a", "hold", ("x",)),)
+    quotes = {
+        "hot": quote("hot", Offer("a", True, d=1.0, p_saturation=0.9, finish_in_s=10.0)),
+        "cool": quote("cool", Offer("a", True, d=1.1, p_saturation=0.0, finish_in_s=20.0)),
+    }
+    bidding = Bidding("r", 0.0, jobs, quotes)
+    assert allocation("thermal", assignment, 60.0)(bidding) == {"a": "cool"}
+    assert allocation("quickest", assignment, 60.0)(bidding) == {"a": "hot"}
+
+
+def test_an_unknown_rule_is_one_sentence(capsys):
+    code, _, err = call(capsys, "auction", "quickstart", "--rule", "thermo")
+    assert code == 2
+    assert "No rule 'thermo'; did you mean 'thermal'?" in err
+
+
+# the commands
+
+
+@contextmanager
+def auctioneer(endpoint: str, folder: Path, *words: object) -> Iterator[subprocess.Popen[str]]:
+    """The command as a process that has said that it is ready."""
+    program = [sys.executable, "-c", "from scenarios.cli import main; main()", "auction"]
+    options = ["--endpoint", endpoint, "--journal", folder, *words]
+    command = [*program, *map(str, options)]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            said = process.stdout.readline()
+            assert said == f"ready auctioneer {endpoint} {process.pid}\n"
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.fixture
+def endpoint() -> Iterator[str]:
+    with Router() as router:
+        yield router.endpoint
+
+
+def test_jobs_handed_in_are_kept_over_a_kill(endpoint, tmp_path, capsys):
+    file = tmp_path / "jobs.jsonl"
+    file.write_text("\n".join(json.dumps(HOLD | {"name": n, "places": [p]}) for n, p in (("a", "belt"), ("b", "moon"))))
+    at = ("--endpoint", endpoint, "--fleet", "quickstart")
+    with auctioneer(endpoint, tmp_path, "quickstart", "--jobs", "none") as process:
+        code, out, _ = call(capsys, "submit", file, *at)
+        assert code == 1
+        assert out.startswith("a: accepted\nb: refused: No place 'moon' in this cell. Places: ")
+        code, _, err = call(capsys, "auction", "quickstart", "--endpoint", endpoint, "--journal", tmp_path / "other")
+        assert code == 2
+        assert "Fleet 'quickstart' has an auctioneer already: 'auctioneer'." in err
+        process.send_signal(signal.SIGKILL)
+        process.wait(PATIENT_S)
+    with auctioneer(endpoint, tmp_path, "quickstart", "--jobs", "none") as process:
+        file.write_text(json.dumps(HOLD | {"places": ["belt"]}))
+        assert call(capsys, "submit", file, *at)[:2] == (0, "a: accepted\n")
+        process.send_signal(signal.SIGTERM)
+        out, err = process.communicate(timeout=PATIENT_S)
+        assert process.returncode == 0
+        assert "0 of 1 jobs finished" in out
+        assert "Going on from" in err
+
+
+def test_a_shift_that_ends_tells_what_is_undone(endpoint, tmp_path):
+    short = tmp_path / "short.toml"
+    text = (ROOT / "scenarios" / "library" / "quickstart.toml").read_text(encoding="utf-8")
+    short.write_text(text.replace("horizon_s = 7200", "horizon_s = 600"), encoding="utf-8")
+    with auctioneer(endpoint, tmp_path / "journal", short, "--speed", "1000") as process:
+        out, _ = process.communicate(timeout=PATIENT_S)
+    assert process.returncode == 0
+    assert "unfinished, The shift ended before it was done." in out
+
+
+def test_nobody_to_hand_in_to_is_one_sentence(endpoint, tmp_path, capsys):
+    file = tmp_path / "jobs"
+    file.write_text(json.dumps(HOLD))
+    code, _, err = call(capsys, "submit", file, "--endpoint", endpoint, "--fleet", "f")
+    assert code == 2
+    assert "No auctioneer of fleet 'f' answered" in err
+
+
+@contextmanager
+def arm(endpoint: str) -> Iterator[list[QuoteRequest]]:
+    """An arm that only quotes; gives what it was asked."""
+    asked: list[QuoteRequest] = []
+    stop = threading.Event()
+
+    def answer(request: QuoteRequest) -> Quote:
+        asked.append(request)
+        offers = (Offer(request.jobs[0].name, True, "", (0.5,) * 7, 3.5, 0.125, 52.34, 100.0, 160.0),)
+        return Quote("arm_0", request.auction, "", 5.0, "t", 0.0, "idle", 20.0, 1, offers)
+
+    with Link(endpoint, "f") as link:
+        link.answer(keys.of_arm("f", "arm_0", "quote"), QuoteRequest, answer)
+
+        def serve() -> None:
+            while not stop.is_set():
+                link.serve(time.monotonic() + 0.05)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            yield asked
+        finally:
+            stop.set()
+            thread.join(PATIENT_S)
+
+
+def test_ask_shows_what_a_job_would_cost_whom(endpoint, capsys):
+    job = ("--kind", "hold", "--place", "rack", "--payload", "2")
+    with arm(endpoint) as asked:
+        code, out, _ = call(capsys, "ask", *job, "--endpoint", endpoint, "--fleet", "f")
+        assert code == 0
+        assert "hold  arm_0  3.50     0.12     52.3      100        160" in out
+        code, out, _ = call(capsys, "ask", *job, "--endpoint", endpoint, "--fleet", "f", "--json")
+        assert json.loads(out)[0]["offers"][0]["d"] == 3.5
+    assert [request.dry_run for request in asked] == [True, True]
+    assert asked[0].jobs[0].payload_kg == 2.0
+
+
+def test_ask_says_what_is_missing(endpoint, capsys):
+    at = ("--endpoint", endpoint, "--fleet", "f")
+    assert "either a FILE of jobs or one job" in call(capsys, "ask", *at)[2]
+    assert "No such job: Invalid enum value 'dance' (at kind)." in call(capsys, "ask", "--kind", "dance", *at)[2]
+    code, _, err = call(capsys, "ask", "--kind", "hold", "--place", "rack", *at)
+    assert code == 2
+    assert "No arm of fleet 'f' answered" in err
