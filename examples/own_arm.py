@@ -58,7 +58,7 @@ class Arm:
         alive = self.session.liveliness().declare_token(f"{self.mine}/alive")
         info = self.remembering("info", "Info", 1)
         info.put(json.dumps({"arm": self.name, "joints": 1, "twin": "mock"}))
-        self.difficulty = self.remembering("difficulty", "DifficultyWord", 4)
+        self.difficulty = self.remembering("difficulty", "DifficultyWord", 1)
         print(f"ready {self.name}", flush=True)
         tick_s = asked_s = time.monotonic()
         end_s = tick_s + seconds

@@ -290,6 +290,47 @@ def test_the_examples_make_a_fleet_of_their_own(bus):
     assert watcher.malformed == 0
 
 
+def test_own_arm_and_the_submitter_work_with_the_real_auctioneer(bus, tmp_path):
+    """The auctioneer of `thermofleet auction`, an arm and a submitter that know it from docs/bus.md alone."""
+    port, link = bus
+    watcher, heard = link(), []
+    watcher.listen(
+        keys.of_every_auction("f", "result"), Result, lambda _, word: heard.append(word.status), remembered=64
+    )
+    options = [
+        "--jobs",
+        "none",
+        "--fleet",
+        "f",
+        "--endpoint",
+        f"tcp/127.0.0.1:{port}",
+        "--journal",
+        str(tmp_path / "j"),
+    ]
+    auction = subprocess.Popen(
+        [*COMMAND, "auction", "quickstart", *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        assert auction.stdout.readline().startswith("ready")
+        with running("own_arm", port, "f", "a"), running("own_arm", port, "f", "b"):
+            command = [sys.executable, str(ROOT / "examples" / "submit_jobs.py"), str(port), "f"]
+            done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+            assert done.returncode == 0, done.stdout + done.stderr
+        auction.terminate()
+        told = auction.communicate(timeout=PATIENCE_S)[1]
+        assert auction.returncode == 0
+        assert "Left out" not in told  # nothing that the examples said was malformed
+        serve(lambda: sum(status.state == "finished" for status in heard) == 3, watcher)
+        assert sorted(status.job for status in heard if status.state == "finished") == [
+            "outside 1",
+            "outside 2",
+            "outside 3",
+        ]
+    finally:
+        auction.kill()
+        auction.communicate(timeout=PATIENCE_S)
+
+
 def test_every_example_for_outsiders_imports_nothing_of_ours():
     for name in ("monitor", "submit_jobs", "own_arm", "own_allocator"):
         source = (ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8")

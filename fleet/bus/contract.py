@@ -86,7 +86,7 @@ CHANNELS: tuple[Channel, ...] = (
     Channel("arm", "alive", "token"),
     Channel("arm", "state", "dropped", messages.State),
     Channel("arm", "info", "remembered", messages.Info, kept=1),
-    Channel("arm", "difficulty", "remembered", messages.DifficultyWord, kept=4),
+    Channel("arm", "difficulty", "remembered", messages.DifficultyWord, kept=1),
     Channel("arm", "event", "remembered", trade.ArmEvent, kept=REMEMBERED),
     Channel("arm", "quote", "answered", trade.QuoteRequest, trade.Quote, to="auctioneer, or anybody for a dry run"),
     Channel("arm", "award", "answered", trade.Award, trade.Ack, to="auctioneer"),

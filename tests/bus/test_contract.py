@@ -1,7 +1,9 @@
 """The documents of the bus say what the structs say: checked with a validator that is not ours."""
 
+import ast
 import copy
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -13,6 +15,7 @@ from typer.testing import CliRunner
 from fleet.bus import keys, messages, trade
 from fleet.bus.asyncapi import asyncapi
 from fleet.bus.contract import CHANNELS, WORDS, descriptions, schema_document
+from fleet.bus.link import REMEMBERED
 from fleet.bus.messages import MalformedMessage
 from fleet.bus.specimens import SPECIMENS
 from fleet.bus.trade import JobWord
@@ -166,6 +169,29 @@ def test_asyncapi_has_every_key_and_no_loose_end():
     for message in document["components"]["messages"].values():
         schema = {"$ref": message["payload"]["$ref"], "components": document["components"]}
         Draft202012Validator(schema).validate(message["examples"][0]["payload"])
+
+
+@pytest.mark.parametrize(("node", "role"), [("arm_node", "arm"), ("auction_node", "auction")])
+def test_the_participants_publish_and_answer_as_the_contract_says(node, role):
+    """Read from their source: `link.publisher(keys.of_…(…, "topic"), Kind, remember=…)` and `link.answer(…)`."""
+    source = (ROOT / "fleet" / "live" / f"{node}.py").read_text(encoding="utf-8")
+    found = {}
+    for call in ast.walk(ast.parse(source)):
+        if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) and len(call.args) > 1):
+            continue
+        if call.func.attr in ("publisher", "answer") and isinstance(call.args[0], ast.Call):
+            key = ast.unparse(call.args[0])
+            topic = re.search(r"'(\w+)'\)$", key)
+            where = (key.split("of_")[1].split("(")[0], topic[1] if topic else "now")
+            remember = next((ast.unparse(k.value) for k in call.keywords if k.arg == "remember"), "0")
+            kept = REMEMBERED if remember == "REMEMBERED" else int(remember)
+            found[where] = (ast.unparse(call.args[1]), kept)
+    said = {
+        (channel.role, channel.topic): (channel.word.__name__, channel.kept)
+        for channel in CHANNELS
+        if channel.word is not None and channel.by == {"arm": "arm", "auction": "auctioneer"}[role]
+    }
+    assert found == said
 
 
 def test_no_binding_is_claimed_that_asyncapi_does_not_know():
