@@ -9,6 +9,7 @@ import typer
 
 from agents.auction import ASSIGNMENTS
 from agents.cost import COSTS
+from fleet.bus.security import Tls
 from fleet.errors import FleetError
 from fleet.live.supervisor import Part, Supervisor
 from scenarios.load import load
@@ -32,6 +33,7 @@ def parts_of(
     difficulty: str,
     jobs: str,
     seed: int,
+    tls: Path | None = None,
 ) -> tuple[Part, list[Part], Part, Part]:
     """Router, arms, recorder and auctioneer of a fleet, as `Supervisor` starts them.
 
@@ -39,21 +41,26 @@ def parts_of(
         scenario: A library name or a file.
         names: Of the arms.
         folder: Holds journals, recording and logs.
+        tls: Folder with a certificate of everybody; None for plain TCP.
     """
-    endpoint = f"tcp/127.0.0.1:{port}"
-    common = ("--endpoint", endpoint)
-    of_fleet = (*common, "--fleet", fleet, "--speed", f"{speed:g}", "--journal", str(folder / "journals"))
-    router = Part(name="router", argv=(*PROGRAM, "router", "--port", str(port)), ready=endpoint)
+    address = f"{'tls' if tls else 'tcp'}/127.0.0.1:{port}"
+    secure = () if tls is None else ("--tls", str(tls), "--scenario", scenario)
+
+    def reach(name: str) -> tuple[str, str]:
+        return "--endpoint", address if tls is None else Tls(tls, name).endpoint(address)
+
+    of_fleet = ("--fleet", fleet, "--speed", f"{speed:g}", "--journal", str(folder / "journals"))
+    router = Part(name="router", argv=(*PROGRAM, "router", "--port", str(port), *secure), ready=address)
+    scored = ("--difficulty", difficulty, "--seed", str(seed))
     arms = [
-        Part(
-            name=f"arm-{name}",
-            argv=(*PROGRAM, "arm", scenario, name, *of_fleet, "--difficulty", difficulty, "--seed", str(seed)),
-        )
+        Part(name=f"arm-{name}", argv=(*PROGRAM, "arm", scenario, name, *reach(name), *of_fleet, *scored))
         for name in names
     ]
-    record = Part(name="record", argv=(*PROGRAM, "record", fleet, *common, "--out", str(folder / "recording")))
+    kept = (*reach("recorder"), "--out", str(folder / "recording"))
+    record = Part(name="record", argv=(*PROGRAM, "record", fleet, *kept))
     how = ("--rule", rule, "--assignment", assignment, "--jobs", jobs, "--seed", str(seed))
-    auction = Part(name="auction", argv=(*PROGRAM, "auction", scenario, *of_fleet, *how), essential=jobs == "scenario")
+    at = (*reach("auctioneer"), *of_fleet)
+    auction = Part(name="auction", argv=(*PROGRAM, "auction", scenario, *at, *how), essential=jobs == "scenario")
     return router, arms, record, auction
 
 
@@ -72,6 +79,9 @@ def up_command(
     ] = None,
     port: Annotated[int, typer.Option(help="Loopback port of the router; 0 is any free one.")] = 0,
     fleet: Annotated[str, typer.Option(help="Name of the fleet; default: the scenario's name.")] = "",
+    tls: Annotated[
+        Path | None, typer.Option(help="Folder that thermofleet keys made for this scenario: mutual TLS and its rules.")
+    ] = None,
 ) -> None:
     """Start a whole fleet, each participant a process of its own, and keep it running until its work is done.
 
@@ -89,6 +99,8 @@ def up_command(
         raise FleetError(f"--difficulty is twin or blind, --jobs scenario or none (got {difficulty}, {jobs}).")
     allocation(rule, assignment, chosen.limits.warning_c)
     fleet = fleet or chosen.name
+    if tls is not None and fleet != chosen.name:
+        raise FleetError(f"The keys of --tls are for the fleet of their scenario; leave --fleet out (got '{fleet}').")
     folder = out or Path("runs") / f"live-{fleet}"
     with progress_bar() as progress:  # once, so that no arm has to plan or train by itself
         prepare(chosen, difficulty="twin" if difficulty == "twin" else "blind", progress=progress)
@@ -104,7 +116,9 @@ def up_command(
         difficulty=difficulty,
         jobs=jobs,
         seed=seed,
+        tls=tls,
     )
+    look = Tls(tls, "monitor").endpoint(router.ready) if tls else router.ready
     with until_stopped() as stop, Supervisor(folder / "logs") as supervisor:
         supervisor.start(router, ready_s=START_S)
         for part in (record, *arms):
@@ -115,7 +129,7 @@ def up_command(
         supervisor.await_ready(auction.name, START_S, stop.is_set)
         say(
             f"{fleet} is up: {len(arms)} arms at {router.ready}, {speed:g} times as fast as real time; logs in "
-            f"{supervisor.folder}. Look: thermofleet watch --endpoint {router.ready}",
+            f"{supervisor.folder}. Look: thermofleet watch --endpoint {look}",
             out_console,
         )
         ended = supervisor.run(stop.is_set)

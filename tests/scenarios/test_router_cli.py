@@ -13,8 +13,9 @@ import pytest
 
 from fleet.bus import keys
 from fleet.bus.router import open_client
-from fleet.bus.security import Tls
+from fleet.bus.security import Tls, identified
 from scenarios.cli import main
+from scenarios.live_up import parts_of
 
 ROOT = Path(__file__).parents[2]
 PATIENT_S = 20.0
@@ -139,6 +140,20 @@ def test_keys_are_made_shown_and_added_to(capsys, folder):
     assert "a:b" in out
     assert "expired" not in out
     assert "(authority)" in out
+
+
+def test_up_gives_every_process_its_own_certificate(folder):
+    options = {"port": 7447, "fleet": "quickstart", "folder": Path("run"), "speed": 60.0, "seed": 0, "jobs": "none"}
+    chosen = {"rule": "thermal", "assignment": "matching", "difficulty": "blind"}
+    router, arms, record, auction = parts_of("quickstart", ("arm_0", "arm_1"), tls=folder, **options, **chosen)
+    assert router.argv[router.argv.index("--tls") + 1] == str(folder)
+    assert router.ready == "tls/127.0.0.1:7447"
+    who = [identified(part.argv[part.argv.index("--endpoint") + 1]) for part in (*arms, record, auction)]
+    names = ("arm_0", "arm_1", "recorder", "auctioneer")
+    assert who == [(router.ready, Tls(folder, name)) for name in names]
+    for tls in who:
+        assert tls[1] is not None
+        tls[1].check(serves=False)
 
 
 @pytest.mark.parametrize(
