@@ -190,6 +190,8 @@ class Auctioneer:
             self._forget(ack.award)
             self._pause(real_s, (sent.give.award.job.name,))
         self._unanswered.pop(ack.award, None)
+        if not self._unanswered:
+            self._scan_s = -math.inf  # the next round waits for nobody
 
     def seen(self, present: frozenset[str]) -> None:
         """These arms are there."""

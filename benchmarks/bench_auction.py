@@ -1,0 +1,275 @@
+"""What an auction costs: 50 jobs on offer to 8 arms, until all 8 awards of a batch are acknowledged.
+
+    python benchmarks/bench_auction.py [--arms 8] [--jobs 50] [--batches 100] [--rule thermal] [--assignment matching]
+
+Router, auctioneer and every arm are processes of their own on loopback. Ours: JSON words that are checked on both
+ends, costs, matching, and a journal that is on disk before an award is sent. Arms here have nothing to work out: they
+quote constants, and take every award. Bare: in the same processes, a query to all arms and one to each, with payloads
+of the same sizes, half of it before and half after ours. Then the journal alone.
+"""
+
+import argparse
+import multiprocessing
+import os
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from itertools import count
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import zenoh
+
+from fleet.bus import keys
+from fleet.bus.link import Link
+from fleet.bus.messages import State, encode
+from fleet.bus.router import Router, open_client
+from fleet.bus.trade import Ack, Award, JobWord, Offer, Quote, QuoteRequest, Submission
+from fleet.live.auction_node import AuctionNode
+from fleet.live.journal import Journal
+from fleet.live.records import Awarded, Record
+from fleet.live.timing import Timing
+
+FLEET = "bench"
+PATIENCE_S = 20.0
+START_S = 60.0
+STATE_S = 0.1
+JOINTS = 7
+
+
+def route(port: Any, stop: Any) -> None:
+    """The router's process."""
+    with Router() as router:
+        port.put(router.endpoint)
+        stop.wait()
+
+
+def offer(word: JobWord, number: int) -> Offer:
+    """What an arm says of a job: figures of the usual length, other ones for every arm."""
+    d = tuple(0.123456789 * (1 + joint + number) for joint in range(JOINTS))
+    return Offer(word.name, True, "", d, sum(d), 0.0123456789 * number, 51.23456789, 123.456789, 234.56789)
+
+
+def arm(endpoint: str, number: int, quote_size: int, ready: Any, stop: Any) -> None:
+    """An arm's process: quotes and takes, tells its state ten times a second, and answers bare queries."""
+    name, numbers, said_s = f"arm_{number}", count(), 0.0
+    with Link(endpoint, FLEET, timeout_s=PATIENCE_S) as link, open_client(endpoint, timeout_s=PATIENCE_S) as bare:
+
+        def quote(request: QuoteRequest) -> Quote:
+            offers = tuple(offer(word, number) for word in request.jobs)
+            return Quote(name, request.auction, f"{name}-{next(numbers)}", 5.0, "t", 0.0, "idle", 20.0, 1, offers)
+
+        link.answer(keys.of_arm(FLEET, name, "quote"), QuoteRequest, quote)
+        link.answer(keys.of_arm(FLEET, name, "award"), Award, lambda word: Ack(name, word.award, True))
+        link.alive(keys.of_arm(FLEET, name, "alive"))
+        sizes = {"quote": quote_size, "award": len(encode(Ack(name, "x" * 32, True)))}
+        queryables = [constant(bare, f"bare/{number}/{topic}", b"x" * size) for topic, size in sizes.items()]
+        ready.release()
+        while not stop.is_set():
+            link.serve(time.monotonic() + STATE_S / 2)
+            if time.monotonic() >= said_s + STATE_S:
+                said_s = time.monotonic()
+                link.say(
+                    keys.of_arm(FLEET, name, "state"), State(name, next(numbers), 0.0, "idle", (30.0,) * JOINTS, 30.0)
+                )
+        del queryables
+
+
+def constant(session: zenoh.Session, key: str, answer: bytes) -> zenoh.Queryable[None]:
+    """Answers the same to everything, on the receiving thread."""
+
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            query.reply(key, answer)
+
+    handler: Any = zenoh.handlers.Callback(reply, indirect=False)
+    return session.declare_queryable(key, handler, complete=True)
+
+
+@contextmanager
+def processes(arms: int, quote_size: int) -> Iterator[str]:
+    """Router and arms; gives the endpoint."""
+    spawn = multiprocessing.get_context("spawn")
+    stop, port, ready = spawn.Event(), spawn.Queue(), spawn.Semaphore(0)
+    router = spawn.Process(target=route, args=(port, stop))
+    router.start()
+    endpoint = port.get(timeout=START_S)
+    children = [spawn.Process(target=arm, args=(endpoint, i, quote_size, ready, stop)) for i in range(arms)]
+    try:
+        for child in children:
+            child.start()
+        for _ in children:
+            assert ready.acquire(timeout=START_S), "an arm did not come up"
+        yield endpoint
+    finally:
+        stop.set()
+        for child in (*children, router):
+            child.join(PATIENCE_S)
+
+
+class Stopwatch:
+    """Times every batch of a node, from its question for quotes to the last answer to its awards."""
+
+    def __init__(self, link: Link, node: AuctionNode) -> None:
+        self.batches_s: list[tuple[int, float]] = []
+        """Awards in a batch, and how long it took."""
+        self._asked_s, self._open, self._sent = 0.0, 0, 0
+        ask, acknowledged = link.ask, node.auctioneer.acknowledged
+
+        def asked(key: str, word: Any, *rest: Any, **more: Any) -> None:
+            if isinstance(word, QuoteRequest):
+                self._asked_s, self._open, self._sent = time.perf_counter(), 0, 0
+            elif isinstance(word, Award):
+                self._open, self._sent = self._open + 1, self._sent + 1
+            ask(key, word, *rest, **more)
+
+        def answered(*told: Any) -> None:
+            acknowledged(*told)
+            self._open -= 1
+            if not self._open:
+                self.batches_s.append((self._sent, time.perf_counter() - self._asked_s))
+
+        link.ask, node.auctioneer.acknowledged = asked, answered
+
+
+def words(jobs: int) -> list[JobWord]:
+    """Jobs at stations of their own, so that every batch is full."""
+    return [
+        JobWord(
+            name=f"load_tray-{i:04d}", kind="hold", places=(f"tray_{i}",), repetitions=30, payload_kg=1.5, due_s=900.0
+        )
+        for i in range(jobs)
+    ]
+
+
+def ours(endpoint: str, folder: Path, options: argparse.Namespace) -> tuple[list[tuple[int, float]], float]:
+    """Batches of an auctioneer, and the awards per second over all of them."""
+    from scenarios.live_allocation import allocation  # loads SciPy, which an arm's process does not need
+
+    timing = Timing(lease_s=120.0, most_offered=options.jobs)
+    # There are always so many on offer, to the last batch.
+    work = words(options.arms * options.batches + options.jobs)
+    allocate = allocation(options.rule, options.assignment, 60.0)
+    with Link(endpoint, FLEET) as link, Journal[Record](folder / "bench.journal", Record) as book:
+        node = AuctionNode(link, "auctioneer", book, allocate=allocate, speed=1.0, timing=timing)
+        deadline_s = time.monotonic() + PATIENCE_S
+        while len(node.present) < options.arms and time.monotonic() < deadline_s:
+            node.serve(deadline_s)
+        watch = Stopwatch(link, node)
+        for i in range(0, len(work), 200):
+            node.submit(Submission(tuple(work[i : i + 200])))
+        begun_s, deadline_s = time.perf_counter(), time.monotonic() + 30.0
+        while len(watch.batches_s) < options.batches and time.monotonic() < deadline_s:
+            node.serve(deadline_s)
+        took_s = time.perf_counter() - begun_s
+    return watch.batches_s, sum(sent for sent, _ in watch.batches_s) / took_s
+
+
+def bare_batch(session: zenoh.Session, arms: int, request: bytes, award: bytes) -> float:
+    """A query to all, then one to each, s."""
+    begun_s = time.perf_counter()
+    gather(session, ["bare/*/quote"], request, arms)
+    gather(session, [f"bare/{i}/award" for i in range(arms)], award, arms)
+    return time.perf_counter() - begun_s
+
+
+def gather(session: zenoh.Session, asked: list[str], payload: bytes, answers: int) -> None:
+    """Ask under each key; wait until all of it is over, and see that everybody has answered."""
+    left, came, done = count(len(asked) - 1, -1), count(1), Event()
+    last = [0]
+
+    def reply(one: zenoh.Reply) -> None:
+        if one.ok is not None:
+            last[0] = next(came)
+
+    def over() -> None:
+        if next(left) == 0:
+            done.set()
+
+    for key in asked:
+        handler: Any = zenoh.handlers.Callback(reply, drop=over, indirect=False)
+        session.get(
+            key,
+            handler,
+            payload=payload,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=PATIENCE_S,
+        )
+    assert done.wait(PATIENCE_S)
+    assert last[0] == answers, f"{last[0]} of {answers} answered"
+
+
+def journal_s(folder: Path, arms: int, times: int, sync: Callable[[int], None]) -> list[float]:
+    """How long it takes to write the awards of a batch, s each."""
+    out = []
+    with Journal[Record](folder / f"alone-{sync.__name__}.journal", Record, sync=sync) as book:
+        for batch in range(times):
+            made = [
+                Awarded(f"auctioneer-0a1b2c3d-{batch}:job-{i}", "a" * 24, f"job-{i}", f"arm_{i}", "q" * 16, 0, 1.0, 2.0)
+                for i in range(arms)
+            ]
+            begun_s = time.perf_counter()
+            book.append(*made)
+            out.append(time.perf_counter() - begun_s)
+    return out
+
+
+def unsynced(_file: int) -> None:
+    """Leaves it to the system when to write."""
+
+
+def row(what: str, seconds: list[float]) -> str:
+    """Median and 95th percentile in ms."""
+    ordered = sorted(1e3 * s for s in seconds)
+    return f"{what:<44}{statistics.median(ordered):>9.2f}{ordered[int(0.95 * len(ordered))]:>9.2f}{len(ordered):>7}"
+
+
+def main() -> None:
+    """Print the table; exit code 1 where a target is missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--arms", type=int, default=8)
+    parser.add_argument("--jobs", type=int, default=50, help="on offer at a time")
+    parser.add_argument("--batches", type=int, default=100)
+    parser.add_argument("--rule", default="thermal")
+    parser.add_argument("--assignment", default="matching")
+    options = parser.parse_args()
+    sample = words(options.jobs)
+    request = encode(QuoteRequest("auctioneer-0a1b2c3d-1", tuple(sample)))
+    quote = encode(
+        Quote("arm_0", "a" * 22, "q" * 12, 5.0, "t", 0.0, "idle", 20.0, 1, tuple(offer(w, 1) for w in sample))
+    )
+    award = encode(Award("a" * 36, "a" * 24, "auctioneer", "q" * 16, sample[0]))
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=os.getcwd())))
+        endpoint = stack.enter_context(processes(options.arms, len(quote)))
+        with open_client(endpoint, timeout_s=PATIENCE_S) as session:
+            half = max(1, options.batches // 2)
+            bare = [bare_batch(session, options.arms, request, award) for _ in range(half)]
+            batches, per_s = ours(endpoint, folder, options)
+            bare += [bare_batch(session, options.arms, request, award) for _ in range(half)]
+        synced = journal_s(folder, options.arms, options.batches, os.fsync)
+        loose = journal_s(folder, options.arms, options.batches, unsynced)
+    times = [s for _, s in batches]
+    print(
+        f"{options.arms} arms, {options.jobs} jobs on offer, {options.rule} / {options.assignment}; "
+        f"request {len(request)} B, quote {len(quote)} B"
+    )
+    print(f"{'':<44}{'p50 ms':>9}{'p95 ms':>9}{'times':>7}")
+    print(row(f"a batch: quotes, {options.arms} awards, all answers", times))
+    print(row("bare Zenoh: the same queries", bare))
+    print(row("journal: the awards of a batch, fsync", synced))
+    print(row("journal: the same without fsync", loose))
+    print(
+        f"awards per second: {per_s:.0f}; full batches: {sum(n == options.arms for n, _ in batches)} of {len(batches)}"
+    )
+    p95_ms = 1e3 * sorted(times)[int(0.95 * len(times))]
+    sys.exit(0 if p95_ms <= 50.0 and per_s >= 100.0 else 1)
+
+
+if __name__ == "__main__":
+    main()
