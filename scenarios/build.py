@@ -86,13 +86,48 @@ def prepare(
     Raises:
         ScenarioError: some work can be done by no arm.
     """
+    arms, refused = _arms(scenario, range(len(scenario.arms)), difficulty, cache, progress, every_work=True)
+    return Fleet(scenario, tuple(arms), tuple(refused))
+
+
+def prepare_arm(
+    scenario: Scenario,
+    name: str,
+    *,
+    difficulty: DifficultyName = "twin",
+    cache: Path | None = None,
+    progress: Progress = quiet,
+) -> Arm:
+    """The same of one arm alone: word for word the arm that it is in the scenario's fleet.
+
+    Raises:
+        FleetError: the scenario has no such arm.
+    """
+    (arm,), _ = _arms(scenario, [scenario.index_of(name)], difficulty, cache, progress, every_work=False)
+    return arm
+
+
+def _arms(
+    scenario: Scenario,
+    places: Sequence[int],
+    difficulty: DifficultyName,
+    cache: Path | None,
+    progress: Progress,
+    *,
+    every_work: bool,
+) -> tuple[list[Arm], list[InfeasibleJob]]:
+    """The arms at these places of the scenario, and what each cannot do.
+
+    Args:
+        every_work: Refuse a scenario in which some work can be done by none of them.
+    """
     choose("difficulty", difficulty, DifficultyName)
     folder = cache or cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise FleetError(f"Cannot keep plans and twins in '{folder}': {error.strerror}.") from error
-    bodies = [body_of(scenario, i) for i in range(len(scenario.arms))]
+    bodies = [body_of(scenario, i) for i in places]
     asked = all_works(scenario)
     wanted = rehearsal_works(scenario) if difficulty == "twin" else asked
     plans: list[dict[Work, tuple[Plan, ...]]] = []
@@ -103,15 +138,16 @@ def prepare(
         )
         plans.append(possible)
         refused += impossible
-    _check_feasible(scenario, plans, refused)
+    if every_work:
+        _check_feasible(scenario, plans, refused)
     work = [{w: possible[w] for w in asked if w in possible} for possible in plans]
     models: Sequence[DifficultyModel]
     if difficulty == "twin":
         from scenarios.calibration import calibrated_twins  # both load torch
         from scenarios.rehearse import twins
 
-        known = twins(scenario, bodies, plans, folder, progress)
-        models = calibrated_twins(scenario, bodies, work, known, folder, progress)
+        known = twins(scenario, bodies, plans, folder, progress, arms=places)
+        models = calibrated_twins(scenario, bodies, work, known, folder, progress, arms=places)
     else:
         models = [Blind()] * len(bodies)
     arms = []
@@ -119,7 +155,7 @@ def prepare(
         rest_tau = ArmModel(robot).gravity_torque(robot.home_q())
         arm = Arm(robot=robot, motors=motors, thermal=thermal, rest_tau=rest_tau, model=model, plans=own)
         arms.append(_with_oracle(scenario, arm) if difficulty == "oracle" else arm)
-    return Fleet(scenario, tuple(arms), tuple(refused))
+    return arms, refused
 
 
 def body_of(scenario: Scenario, index: int) -> tuple[Robot, Motors, ThermalModel]:
@@ -136,9 +172,7 @@ def plan_works(
     robot: Robot, wanted: tuple[Work, ...], scenario: Scenario, folder: Path, progress: Callable[[float], None]
 ) -> tuple[dict[Work, tuple[Plan, ...]], list[InfeasibleJob]]:
     """What one arm can do of what is wanted, with its plans (cached in `folder`), and what it cannot."""
-    planner = Planner(
-        robot, elbows=scenario.planning.elbows, speeds=scenario.planning.speeds, cache_dir=folder / "plans"
-    )
+    planner = planner_of(robot, scenario, folder)
     possible: dict[Work, tuple[Plan, ...]] = {}
     refused: list[InfeasibleJob] = []
     for i, work in enumerate(wanted):
@@ -149,6 +183,12 @@ def plan_works(
             refused.append(error)
             log.info("%s", error)
     return possible, refused
+
+
+def planner_of(robot: Robot, scenario: Scenario, folder: Path) -> Planner:
+    """What plans for one arm as the scenario wants it, with its plans cached in `folder`."""
+    spec = scenario.planning
+    return Planner(robot, elbows=spec.elbows, speeds=spec.speeds, cache_dir=folder / "plans")
 
 
 TOLD = 4

@@ -50,12 +50,17 @@ def calibrated_twins(
     progress: Callable[[str, float], None],
     *,
     jobs: int = REHEARSED,
+    arms: Sequence[int] | None = None,
 ) -> list[CalibratedTwin | Twin]:
     """Every arm's twin with the probability of saturation that its rehearsal taught; from the folder where possible.
 
     An arm whose rehearsal says too little of what leads to saturation keeps its twin as it is, which has no such
     probability; a warning says why.
+
+    Args:
+        arms: Whose these bodies, plans and twins are, by place in the scenario; by default all of it, in order.
     """
+    places = range(len(bodies)) if arms is None else arms
     homes = [
         folder / "saturation" / _key(scenario, body, own, twin, jobs)
         for body, own, twin in zip(bodies, plans, twins, strict=True)
@@ -64,7 +69,7 @@ def calibrated_twins(
     missing = [i for i, model in enumerate(kept) if model is None]
     progress("calibrating", 1.0 - len(missing) / len(bodies))
     if missing:
-        tasks = (delayed(_fit)(scenario, i, bodies[i], plans[i], twins[i], homes[i], jobs) for i in missing)
+        tasks = (delayed(_fit)(scenario, places[i], bodies[i], plans[i], twins[i], homes[i], jobs) for i in missing)
         with Parallel(n_jobs=min(len(missing), cpu_count()), return_as="generator_unordered") as pool:
             for done, why_not in enumerate(pool(tasks), start=1):
                 progress("calibrating", 1.0 - (len(missing) - done) / len(bodies))

@@ -2,6 +2,7 @@
 
 import typer
 
+from scenarios.live_arm import arm_command
 from scenarios.live_ask import ask_command
 from scenarios.live_auction import auction_command
 from scenarios.live_doctor import doctor_command
@@ -12,6 +13,7 @@ from scenarios.live_watch import watch_command
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the command line."""
+    app.command("arm")(arm_command)
     app.command("auction")(auction_command)
     app.command("submit")(submit_command)
     app.command("ask")(ask_command)

@@ -15,13 +15,14 @@ from fleet.difficulty import Blind
 from fleet.events import Event
 from fleet.job import Job
 from fleet.motion import Plan
+from fleet.motor import current
 from fleet.robot import ThermalLimits
 from fleet.sim.kernel import ROUNDING_S, Step, step
 from fleet.sim.plants import ProfilePlant
 from fleet.sim.state import DONE, State, World, initial
 from fleet.sim.world import Arm, build_world
 from fleet.telemetry import FAULTED, MODES, WORKING, Mode
-from fleet.thermal import WINDING
+from fleet.thermal import HOUSING, WINDING
 
 Array = np.ndarray
 
@@ -213,8 +214,9 @@ class SimulatedBody:
         """What its sensors say now."""
         if self._last is None:
             still = np.zeros_like(self._arm.rest_tau)
-            noise = self._world.motors.sensor_noise_k[0] * self._rng.standard_normal(still.shape)
-            values = [self._state.temp_c[0, 0, WINDING] + noise, self._arm.robot.home_q(), still, self._arm.rest_tau]
+            temp_c, motors, tau = self._state.temp_c[0, 0], self._arm.motors, self._arm.rest_tau
+            noisy_c = temp_c[WINDING] + motors.sensor_noise_k * self._rng.standard_normal(still.shape)
+            values = (noisy_c, self._arm.robot.home_q(), still, tau, current(tau, still, temp_c[HOUSING], motors))
             return Reading("idle", *(tuple(v.tolist()) for v in values))
         said = self._plant.readings(*self._last, np.array([self._dt_s]), self._rng)
         values = (said.temp_c, said.q, said.qd, said.tau, said.current_a)

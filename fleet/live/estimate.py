@@ -4,7 +4,7 @@ All of it is what the arm knows: its planned motion, its difficulty model, measu
 network of its make (`NominalHeat`); the truth of its body is not among it.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -104,10 +104,15 @@ class Estimator:
         self._variants: dict[Work, tuple[Plan, ...] | str] = {}
         self._ways: dict[tuple[Work, int], Way] = {}
 
+    def know(self, works: Iterable[Work]) -> None:
+        """Plan some works beforehand."""
+        for work in works:
+            self._variants[work] = self._planned(work)
+
     def ready(self, word: JobWord) -> bool:
-        """Whether an offer for the job takes no planning."""
+        """Whether an offer for the job takes neither planning nor scoring."""
         work = self._work(word)
-        return isinstance(work, str) or work in self._variants
+        return isinstance(work, str) or self._known(work, word.repetitions)
 
     def prepare(self, word: JobWord) -> None:
         """Plan the job and score it, which may take long; cannot fail."""
@@ -159,7 +164,10 @@ class Estimator:
         work = self._work(word)
         if isinstance(work, str):
             return work
-        return self._way(work, word.repetitions) if work in self._variants else NOT_YET
+        return self._way(work, word.repetitions) if self._known(work, word.repetitions) else NOT_YET
+
+    def _known(self, work: Work, repetitions: int) -> bool:
+        return (work, repetitions) in self._ways or isinstance(self._variants.get(work), str)
 
     def _work(self, word: JobWord) -> Work | str:
         """The work, or why there is none."""
@@ -178,24 +186,29 @@ class Estimator:
             return str(error)
 
     def _way(self, work: Work, repetitions: int) -> Way | str:
+        known = self._ways.get((work, repetitions))
+        if known is not None:
+            return known
         variants = self._variants.pop(work, None)
         if variants is None:
-            try:
-                variants = self._plan(work)
-            except InfeasibleJob as infeasible:
-                variants = f"at '{infeasible.place}': {infeasible.reason}"
+            variants = self._planned(work)
         self._variants[work] = variants  # the last used comes last
         if len(self._variants) > MOST_WORKS:
             del self._variants[next(iter(self._variants))]
         if isinstance(variants, str):
             return variants
-        key = (work, repetitions)
-        if key not in self._ways:
-            if len(self._ways) >= MOST_SCORES:
-                del self._ways[next(iter(self._ways))]
-            scored = [Way(plan, self.model.score(plan, repetitions)) for plan in variants]
-            self._ways[key] = min(scored, key=lambda way: way.difficulty.total if way.difficulty else 0.0)
-        return self._ways[key]
+        if len(self._ways) >= MOST_SCORES:
+            del self._ways[next(iter(self._ways))]
+        scored = [Way(plan, self.model.score(plan, repetitions)) for plan in variants]
+        best = min(scored, key=lambda way: way.difficulty.total if way.difficulty else 0.0)
+        self._ways[work, repetitions] = best
+        return best
+
+    def _planned(self, work: Work) -> tuple[Plan, ...] | str:
+        try:
+            return self._plan(work)
+        except InfeasibleJob as infeasible:
+            return f"at '{infeasible.place}': {infeasible.reason}"
 
 
 def _offer(word: JobWord, way: Way, temp_c: Array, peak_c: float, busy_s: float) -> Offer:

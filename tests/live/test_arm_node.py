@@ -1,0 +1,290 @@
+"""An arm on a real bus: it says how it is, offers, works with leave, reports, and goes on after a crash."""
+
+import time
+from contextlib import ExitStack
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from fleet.bus import keys
+from fleet.bus.link import Link
+from fleet.bus.messages import DifficultyWord, Info, State
+from fleet.bus.router import Router
+from fleet.bus.trade import (
+    Ack,
+    ArmEvent,
+    Award,
+    Clock,
+    ClockRequest,
+    JobWord,
+    Lease,
+    LeaseRequest,
+    Quote,
+    QuoteRequest,
+    Receipt,
+    Report,
+)
+from fleet.errors import InfeasibleJob
+from fleet.job import Place
+from fleet.live.arm_node import PLANNING_S, ArmNode, Nature
+from fleet.live.body import SimulatedBody
+from fleet.live.clock import FleetClock
+from fleet.live.contractor import Contractor, Terms
+from fleet.live.estimate import NOT_YET, Estimator, NominalHeat
+from fleet.live.journal import Journal
+from fleet.live.log_body import LogBody, Readings
+from fleet.live.promises import Promise, recall, restarted, retold
+from fleet.robot import ThermalLimits
+
+PATIENCE_S = 15.0
+SPEED = 60.0
+JOB = JobWord(name="j", kind="hold", places=("bench",), repetitions=3)
+PLACES = {name: Place(name=name, position_m=(0.5, 0.0, 0.2)) for name in ("bench", "rack")}
+
+
+class Auctioneer:
+    """What answers an arm: leases for all, leave when asked, receipts; and what it was told."""
+
+    def __init__(self, link):
+        self.link, self.grants, self.leases, self.reports, self.words = link, True, [], [], []
+        link.answer(keys.of_auction("f", "x", "lease"), LeaseRequest, self.lease)
+        link.answer(keys.of_auction("f", "x", "report"), Report, self.report)
+
+    def lease(self, request):
+        self.leases.append(request)
+        names = tuple(h.award for h in request.holds) if self.grants else ()
+        leave = tuple(h.award for h in request.holds if self.grants and h.phase == "finishing")
+        return Lease("x", 2.0, names, (), leave)
+
+    def report(self, report):
+        self.reports.append(report)
+        return Receipt("x", report.award)
+
+
+@pytest.fixture
+def bus(tmp_path, small):
+    """A router; makers of arms and lines; and what serves them all until something is true."""
+    with ExitStack() as stack:
+        router = stack.enter_context(Router())
+        nodes, links = [], []
+
+        def link():
+            links.append(stack.enter_context(Link(router.endpoint, "f")))
+            return links[-1]
+
+        def arm(plan=None, body=None, folder=tmp_path, speed=SPEED, clock_s=100.0, **nature):
+            content = small.work("bench")
+            own = small.arm(0, [content])
+            book = stack.enter_context(Journal(folder / "arm_0.jsonl", Promise))
+            memory = restarted(recall(book.replay()), "arm_0", 0.0)
+            book.rewrite(*retold(memory))
+            body = body or SimulatedBody(
+                own, ThermalLimits(), lambda _: 25.0, dt_s=speed / 20, rng=np.random.default_rng(0), time_s=clock_s
+            )
+            line = stack.enter_context(Link(router.endpoint, "f"))
+            contractor = Contractor("arm_0", book.append, memory, nonce=str(memory.boot), terms=Terms(valid_s=3.0))
+            estimator = Estimator(own.model, plan or (lambda work: own.plans[content]), PLACES, NominalHeat())
+            clock = FleetClock(speed, time.monotonic(), clock_s)
+            nature = Nature(**{"warning_c": 60.0, "rate_hz": 20.0, "life": memory.boot, **nature})
+            node = ArmNode(line, body, contractor, estimator, clock, nature)
+            nodes.append(node)
+            return SimpleNamespace(node=node, link=line, book=book, body=body)
+
+        def serve(condition):
+            deadline_s = time.monotonic() + PATIENCE_S
+            while not condition():
+                assert time.monotonic() < deadline_s, "waited in vain"
+                for node in nodes:
+                    node.serve(time.monotonic() + 0.005)
+                for each in links:
+                    each.serve(time.monotonic() + 0.001)
+
+        def ask(line, topic, word, kind):
+            got = []
+            line.ask(keys.of_arm("f", "arm_0", topic), word, kind, got.append, timeout_s=5.0)
+            serve(lambda: got)
+            assert not got[0].refused, got[0].refused
+            return next(iter(got[0].words.values()))
+
+        def crash(one):
+            nodes.remove(one.node)
+            one.link.close()
+            one.book.close()
+
+        yield SimpleNamespace(link=link, arm=arm, serve=serve, ask=ask, crash=crash, small=small)
+
+
+def request(*jobs, dry_run=False):
+    return QuoteRequest("r", jobs or (JOB,), dry_run=dry_run)
+
+
+def award(quote, job=JOB, name="w"):
+    return Award(award=name, auction="r", auctioneer="x", quote=quote, job=job, lease_s=2.0)
+
+
+def test_it_says_what_it_is_and_how_it_is(bus):
+    watcher, heard = bus.link(), {}
+    for topic, kind, remembered in (("state", State, 0), ("info", Info, 1)):
+        watcher.listen(
+            keys.of_every_arm("f", topic),
+            kind,
+            lambda arm, word, t=topic: heard.update({t: word}),
+            remembered=remembered,
+        )
+    there = []
+    watcher.watch(keys.of_every_arm("f", "alive"), lambda name, is_there: there.append((name, is_there)))
+    bus.arm()
+    bus.serve(lambda: {"state", "info"} <= heard.keys() and there)
+    assert there[0] == ("arm_0", True)
+    assert heard["info"] == Info("arm_0", 7, "by payload")
+    state = heard["state"]
+    assert (state.mode, state.job, len(state.q), len(state.current_a)) == ("idle", "", 7, 7)
+    assert state.headroom_k == pytest.approx(60.0 - max(state.temp_c))
+    assert state.time_s >= 100.0
+
+
+def test_a_job_goes_from_quote_to_receipt(bus):
+    auctioneer, events, words = Auctioneer(bus.link()), [], []
+    line = bus.link()
+    line.listen(keys.of_every_arm("f", "event"), ArmEvent, lambda _, e: events.append(e), remembered=64)
+    line.listen(keys.of_every_arm("f", "difficulty"), DifficultyWord, lambda _, w: words.append(w), remembered=1)
+    arm = bus.arm()
+    quote = bus.ask(line, "quote", request(), Quote)
+    assert (quote.capacity, quote.valid_s, quote.twin) == (1, 3.0, "by payload")
+    (offer,) = quote.offers
+    assert offer.duration_s == pytest.approx(35.0)
+    assert bus.ask(line, "award", award(quote.quote), Ack).accepted
+    bus.serve(lambda: auctioneer.reports)
+    (report,) = auctioneer.reports
+    assert (report.outcome, report.cycles, report.job) == ("finished", 3, "j")
+    assert report.time_s == pytest.approx(next(e.time_s for e in events if e.kind == "award") + 33.0, abs=1e-6)
+    assert any(h.phase == "finishing" for leased in auctioneer.leases for h in leased.holds)
+    bus.serve(lambda: [e.kind for e in events] == ["award", "finish", "home"])
+    assert [e.number - events[0].number for e in events] == [0, 1, 2]
+    assert words[-1].jobs == ("j",)
+    bus.serve(lambda: not recall(arm.book.replay()).reports)
+    assert bus.ask(line, "quote", request(), Quote).capacity == 1
+
+
+def test_a_dry_run_changes_nothing(bus):
+    words, line = [], bus.link()
+    line.listen(keys.of_every_arm("f", "difficulty"), DifficultyWord, lambda _, w: words.append(w), remembered=1)
+    arm = bus.arm()
+    before = list(arm.book.replay())
+    quote = bus.ask(line, "quote", request(dry_run=True), Quote)
+    assert quote.quote == ""
+    assert quote.offers[0].feasible
+    bus.ask(line, "quote", request(), Quote)
+    bus.serve(lambda: words)
+    assert len(words) == 1
+    assert list(arm.book.replay()) == before
+
+
+def test_without_leave_nothing_is_finished_and_without_a_lease_nothing_goes_on(bus):
+    auctioneer, line = Auctioneer(bus.link()), bus.link()
+    auctioneer.grants = False
+    arm = bus.arm()
+    quote = bus.ask(line, "quote", request(), Quote)
+    assert bus.ask(line, "award", award(quote.quote), Ack).accepted
+    bus.serve(lambda: time.monotonic() > arm.node.contractor.held[0].until_s + 0.3)
+    assert arm.node.contractor.held[0].cycles < 3
+    assert arm.body.read().mode == "idle"
+    auctioneer.grants = True
+    bus.serve(lambda: auctioneer.reports)
+    assert auctioneer.reports[0].outcome == "finished"
+
+
+def test_after_a_crash_the_job_is_given_back_and_the_arm_works_again(bus):
+    auctioneer, line = Auctioneer(bus.link()), bus.link()
+    arm = bus.arm()
+    quote = bus.ask(line, "quote", request(), Quote)
+    assert bus.ask(line, "award", award(quote.quote), Ack).accepted
+    bus.crash(arm)
+    bus.arm()
+    bus.serve(lambda: auctioneer.reports)
+    assert (auctioneer.reports[0].outcome, auctioneer.reports[0].award) == ("returned", "w")
+    assert bus.ask(line, "award", award(quote.quote), Ack).accepted  # the same answer, and no second life for it
+    again = bus.ask(line, "quote", request(), Quote)
+    assert again.quote != quote.quote
+    assert bus.ask(line, "award", award(again.quote, name="w2"), Ack).accepted
+    bus.serve(lambda: any(r.outcome == "finished" for r in auctioneer.reports))
+    assert [(r.award, r.outcome) for r in auctioneer.reports] == [("w", "returned"), ("w2", "finished")]
+
+
+def test_an_arm_that_is_hot_offers_but_takes_nothing(bus):
+    line = bus.link()
+    bus.arm(warning_c=20.0)
+    quote = bus.ask(line, "quote", request(), Quote)
+    assert quote.headroom_k < 0
+    ack = bus.ask(line, "award", award(quote.quote), Ack)
+    assert not ack.accepted
+    assert "too hot" in ack.reason
+
+
+def test_the_time_is_the_auctioneers_from_the_first_word_on(bus):
+    line = bus.link()
+    start_s = time.monotonic()
+    line.answer(keys.of_clock("f"), ClockRequest, lambda _: Clock(5000.0 + 30.0 * (time.monotonic() - start_s), 30.0))
+    arm = bus.arm()
+    bus.serve(lambda: arm.node.clock.speed == 30.0)
+    off_s = arm.node.clock.now_s(time.monotonic()) - 5000.0 - 30.0 * (time.monotonic() - start_s)
+    assert abs(off_s) < 30.0 * 0.5
+    bus.serve(lambda: arm.body.time_s > 5000.0)
+
+
+def test_planning_never_keeps_an_arm_from_its_words_for_longer_than_one_plan(bus):
+    """Twenty motions of 50 ms each: the answer comes within its time, states go on, and the rest is planned after."""
+    planned = []
+    own = bus.small.arm(0, [bus.small.work("bench")])
+
+    def slowly(work):
+        end_s = time.monotonic() + 0.05
+        while time.monotonic() < end_s:
+            pass
+        planned.append(work)
+        if work.payload_kg > 18:
+            raise InfeasibleJob("arm_0", "bench", "torque")
+        return next(iter(own.plans.values()))
+
+    line, came = bus.link(), []
+    line.listen(keys.of_every_arm("f", "state"), State, lambda _, state: came.append(time.monotonic()))
+    bus.arm(plan=slowly, speed=1.0)
+    bus.serve(lambda: len(came) > 3)
+    jobs = tuple(JobWord(name=f"j{i}", kind="hold", places=("bench",), payload_kg=float(i)) for i in range(20))
+    del came[:]
+    began_s = time.monotonic()
+    quote = bus.ask(line, "quote", request(*jobs), Quote)
+    assert time.monotonic() - began_s < PLANNING_S + 0.4
+    late = [o.job for o in quote.offers if o.reason == NOT_YET]
+    assert 0 < len(late) < 20
+    bus.serve(lambda: len(planned) == 20)
+    bus.serve(lambda: came and came[-1] > time.monotonic() - 0.05)
+    quote = bus.ask(line, "quote", request(*jobs), Quote)
+    assert [o.feasible for o in quote.offers] == [True] * 19 + [False]
+
+
+def test_a_log_lives_as_an_arm_and_takes_no_work(bus):
+    time_s = np.linspace(0.0, 20.0, 201)
+    ramp = np.tile(time_s[:, None], (1, 7))
+    readings = Readings(
+        time_s=time_s + 77.0, temp_c=30.0 + ramp, q=0.1 * ramp, qd=np.full_like(ramp, 0.1), tau=ramp, current_a=-ramp
+    )
+
+    def refuse(work):
+        raise InfeasibleJob("arm_0", work.places[0].name, "it replays a log")
+
+    line, states = bus.link(), []
+    line.listen(keys.of_every_arm("f", "state"), State, lambda _, state: states.append(state))
+    bus.arm(plan=refuse, body=LogBody(readings, time_s=100.0), speed=20.0, works=False)
+    bus.serve(lambda: states and states[-1].time_s > 125.0)
+    for state in states:
+        into_s = min(np.floor((state.time_s - 100.0) * 10 + 1e-6) / 10, 20.0)
+        assert state.temp_c == pytest.approx((30.0 + into_s,) * 7)
+        assert state.current_a == pytest.approx((-into_s,) * 7)
+        assert state.mode == ("idle" if into_s == 20.0 else "working")
+    assert states[-1].qd == (0.0,) * 7
+    quote = bus.ask(line, "quote", request(), Quote)
+    assert (quote.capacity, quote.offers[0].feasible) == (0, False)
+    assert "replays a log" in quote.offers[0].reason
+    assert not bus.ask(line, "award", award(quote.quote), Ack).accepted
