@@ -24,8 +24,10 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-TURN_S, FAREWELL_S = 0.1, 1.0
-"""Real seconds: between two looks at what else is to be done; to say the last words and hear late ones."""
+TURN_S = 0.1
+"""Real seconds between two looks at what else is to be done."""
+FAREWELL_S = (1.0, 10.0)
+"""Real seconds to say the last words; and at most, to hear of jobs that are in their last cycle."""
 
 
 def auction_command(
@@ -102,9 +104,9 @@ def work(node: "AuctionNode", own: "Sequence[tuple[float, JobWord]]", horizon_s:
             if over:
                 node.end()
             break
-    farewell_s = time.monotonic() + FAREWELL_S
-    while time.monotonic() < farewell_s and not stop.is_set():
-        node.serve(farewell_s)
+    first_s, last_s = (time.monotonic() + farewell_s for farewell_s in FAREWELL_S)
+    while not stop.is_set() and time.monotonic() < (last_s if node.auctioneer.finishing() else first_s):
+        node.serve(time.monotonic() + TURN_S)
 
 
 def own_jobs(scenario: Scenario, seed: int) -> "list[tuple[float, JobWord]]":

@@ -216,6 +216,10 @@ class Auctioneer:
             self._round = None
             self._happen(Ended(time_s))
 
+    def finishing(self) -> bool:
+        """Whether an arm that is there may be in the last cycle of a job."""
+        return any(promise.leave and promise.made.arm in self._present for promise in self.ledger.open.values())
+
     def status(self, names: Iterable[str] = ()) -> tuple[JobStatus, ...]:
         """Where jobs stand, with what was last heard."""
         return tuple(
