@@ -86,7 +86,7 @@ class MadeArm:
     plan: Callable[[Work], tuple[Plan, ...]]
     """Variants of a work; raises InfeasibleJob."""
     body: "Callable[[float, float], Body]"
-    """Its body by the fleet's time at its birth and the longest step, s."""
+    """Its body by the fleet's time at its birth and the length of its steps, s."""
     works: tuple[Work, ...] = ()
     """Whose plans are at hand."""
     takes_work: bool = True
@@ -123,7 +123,8 @@ def simulated(
             arm,
             scenario.limits,
             lambda at_s: float(scenario.ambient.at(np.array(at_s))) + offset_k,
-            dt_s=min(dt_s, scenario.decision_interval_s),
+            dt_s=dt_s,
+            longest_s=scenario.decision_interval_s,
             rng=np.random.default_rng(np.random.SeedSequence([seed, index])),
             time_s=time_s,
             warm=scenario.start == "idle_warm",

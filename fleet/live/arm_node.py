@@ -358,6 +358,7 @@ class ArmNode:
         if said.speed != clock.speed:
             self._complain("speed", f"goes at the fleet's speed of {said.speed:g}, not at {clock.speed:g}.")
             clock = FleetClock(said.speed, answered_s, clock.now_s(answered_s))
+            self._body.set_pace(said.speed / self._nature.rate_hz)
         if self._clock_known:
             self.clock = clock.corrected(asked_s, answered_s, said.time_s)
             return

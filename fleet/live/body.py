@@ -112,6 +112,10 @@ class Body(Protocol):
         """From now on the fleet's time is another."""
         ...
 
+    def set_pace(self, dt_s: float) -> None:
+        """From now on it is looked at every so many fleet seconds."""
+        ...
+
     def read(self) -> Reading:
         """What its sensors say now."""
         ...
@@ -138,6 +142,7 @@ class SimulatedBody:
         arm: Its truth: motors, heat, posture at rest. Its plans and its model are not looked at.
         air_c: Air at the arm, °C, at a time of the fleet.
         dt_s: Length of a step, fleet seconds.
+        longest_s: No step is longer, whatever the pace.
         time_s: The fleet's time at its birth.
         warm: Whether it has stood powered at home for hours, or is as cold as the air.
     """
@@ -150,12 +155,14 @@ class SimulatedBody:
         *,
         dt_s: float,
         rng: np.random.Generator,
+        longest_s: float = np.inf,
         time_s: float = 0.0,
         warm: bool = True,
     ) -> None:
-        if not dt_s > 0:
-            raise ValueError(f"SimulatedBody.dt_s must be > 0 (got {dt_s}).")
-        self._arm, self._limits, self._air_c, self._dt_s, self._rng = arm, limits, air_c, dt_s, rng
+        if not (dt_s > 0 and longest_s > 0):
+            raise ValueError(f"SimulatedBody.dt_s and longest_s must be > 0 (got {dt_s}, {longest_s}).")
+        self._arm, self._limits, self._air_c, self._rng = arm, limits, air_c, rng
+        self._dt_s, self._longest_s = min(dt_s, longest_s), longest_s
         self._began_s = time_s
         self._task: _Task | None = None
         self._world, self._plant = self._laid_out(None, warm=warm)
@@ -218,7 +225,8 @@ class SimulatedBody:
             noisy_c = temp_c[WINDING] + motors.sensor_noise_k * self._rng.standard_normal(still.shape)
             values = (noisy_c, self._arm.robot.home_q(), still, tau, current(tau, still, temp_c[HOUSING], motors))
             return Reading("idle", *(tuple(v.tolist()) for v in values))
-        said = self._plant.readings(*self._last, np.array([self._dt_s]), self._rng)
+        world, step_made = self._last
+        said = self._plant.readings(world, step_made, np.array([world.dt_s]), self._rng)
         values = (said.temp_c, said.q, said.qd, said.tau, said.current_a)
         return Reading(MODES[self._state.mode[0, 0]], *(tuple(value[0, 0].tolist()) for value in values))
 
@@ -249,6 +257,17 @@ class SimulatedBody:
     def set_time(self, time_s: float) -> None:
         """From now on the fleet's time is another."""
         self._began_s += time_s - self.time_s
+
+    def set_pace(self, dt_s: float) -> None:
+        """From now on it is looked at every so many fleet seconds: that is how long a step lasts."""
+        time_s, ticks, dt_s = self.time_s, float(self._state.tick[0]), min(dt_s, self._longest_s)
+        phi, gamma = self._world.thermal.step_matrices(dt_s)
+        # The simulator counts its time in ticks of the new length.
+        clear_at_s = self._state.clear_at_s + ticks * (dt_s - self._dt_s)
+        self._world = replace(self._world, dt_s=dt_s, phi=phi, gamma=gamma)
+        self._state = replace(self._state, clear_at_s=clear_at_s)
+        self._dt_s = dt_s
+        self.set_time(time_s)
 
     def advance(self, until_s: float) -> list[Event]:
         """Live up to a time, or as far as it gets, and tell what happened; `finish` and `return` end the job."""

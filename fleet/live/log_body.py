@@ -82,6 +82,9 @@ class LogBody:
         self._began_s += time_s - self._now_s
         self._now_s = time_s
 
+    def set_pace(self, dt_s: float) -> None:
+        """Whoever looks sees the last sample."""
+
     def read(self) -> Reading:
         """The last sample that was taken by now."""
         log, row = self._log, self._row

@@ -254,3 +254,38 @@ def test_its_time_can_be_set_and_it_catches_up_in_bounded_steps(small):
     assert [e.time_s for e in body.advance(5060.0) if e.kind == "finish"] == pytest.approx([5033.0])
     body.advance(1e6)
     assert body.time_s == pytest.approx(5060.0 + MOST_STEPS)
+
+
+def test_a_change_of_pace_changes_nothing_else(small):
+    """A faulted arm cools, recovers and works at the same moments, whatever the steps; heat is exact at rest."""
+    arm, job, plan = one_job(small, repetitions=5000, payload=small.HOT)
+    bodies = [body_of(arm, dt_s=5.0), body_of(arm, dt_s=5.0)]
+    for body in bodies:
+        body.begin(job, plan, 0)
+        body.permit(5000)
+        while body.truth.mode[0, 0] != FAULTED:
+            body.advance(body.time_s + 5.0)
+    steady, changed = bodies
+    changed.set_pace(2.5)
+    assert changed.time_s == pytest.approx(steady.time_s)
+    until_s = steady.time_s + 2 * 3600.0
+    events = [[], []]
+    for told, body in zip(events, bodies, strict=True):
+        while body.time_s < until_s - 1e-6:
+            told += body.advance(until_s)
+    (one,), (other,) = events
+    assert one.kind == other.kind == "recover"
+    assert one.time_s == pytest.approx(other.time_s, abs=1e-3)
+    np.testing.assert_allclose(steady.truth.temp_c, changed.truth.temp_c, atol=0.01)
+
+
+def test_no_step_is_longer_than_it_may_be(small):
+    arm, _, _ = one_job(small)
+    body = SimulatedBody(
+        arm, LIMITS, lambda time_s: 25.0, dt_s=60.0, longest_s=10.0, rng=np.random.default_rng(0), warm=False
+    )
+    body.advance(10.0)
+    assert body.time_s == 10.0
+    body.set_pace(100.0)
+    body.advance(20.0)
+    assert body.time_s == 20.0
