@@ -2,6 +2,8 @@
 
 In one terminal:  python examples/monitor.py 7447
 In another:       thermofleet run quickstart --listen 7447 --overwrite
+
+A fleet of processes (thermofleet router, auction, arm) also says what happens to its arms and its jobs.
 """
 
 import json
@@ -10,7 +12,7 @@ import sys
 
 import zenoh
 
-KEYS = "thermofleet/v1/*/arm/*/{}"
+ARMS, AUCTIONS = "thermofleet/v1/*/arm/*/{}", "thermofleet/v1/*/auction/*/{}"
 WAIT_S = 600.0
 """For the fleet to come: at first it trains its twins."""
 QUIET_S = 5.0
@@ -36,8 +38,9 @@ def main(port):
     except zenoh.ZError:
         sys.exit(f"No fleet listened at port {port} within {WAIT_S:.0f} s; start one with --listen {port}.")
     with opened as session:
-        session.declare_subscriber(KEYS.format("state"), inbox.put)
-        session.declare_subscriber(KEYS.format("difficulty"), inbox.put)
+        for topic in ("state", "difficulty", "event"):
+            session.declare_subscriber(ARMS.format(topic), inbox.put)
+        session.declare_subscriber(AUCTIONS.format("result"), inbox.put)
         while True:
             try:
                 sample = inbox.get(timeout=QUIET_S if heard else WAIT_S)
@@ -46,9 +49,10 @@ def main(port):
             heard += 1
             word = json.loads(sample.payload.to_bytes())
             kind = str(sample.key_expr).rsplit("/", 1)[1]
-            if word["time_s"] >= shown.get((word["arm"], kind), 0.0):
-                shown[word["arm"], kind] = word["time_s"] + 600.0
-                print(f"{word['time_s']:7.0f} s  {word['arm']:<12} {describe(kind, word)}", flush=True)
+            who = word.get("arm") or word["auctioneer"]
+            if kind in ("event", "result") or word["time_s"] >= shown.get((who, kind), 0.0):
+                shown[who, kind] = word["time_s"] + 600.0
+                print(f"{word['time_s']:7.0f} s  {who:<12} {describe(kind, word)}", flush=True)
     print(f"heard {heard} words")
     return heard
 
@@ -57,6 +61,11 @@ def describe(kind, word):
     """One word in a line."""
     if kind == "state":
         return f"{word['mode']:<8} hottest motor {max(word['temp_c']):5.1f} °C"
+    if kind == "event":
+        return f"{word['kind']} {word.get('job', '')} {word.get('reason', '')}".rstrip()
+    if kind == "result":
+        job = word["status"]
+        return f"{job['job']} is {job['state']} {job.get('arm', '')} {job.get('reason', '')}".rstrip()
     scores = zip(word["jobs"], word["difficulty"], strict=True)
     told = ", ".join(f"{job} {d:.2f}" for job, d in scores if d is not None)
     return f"finds {told}" if told else "finds nothing on offer"

@@ -278,12 +278,22 @@ def test_the_examples_make_a_fleet_of_their_own(bus):
     watcher, heard = link(), []
     watcher.listen(keys.of_every_auction("f", "result"), Result, lambda _, word: heard.append(word.status))
     watcher.listen(keys.of_every_arm("f", "state"), State, lambda _, word: None)
+    monitor = subprocess.Popen(
+        [sys.executable, "-u", str(ROOT / "examples" / "monitor.py"), str(port)], stdout=subprocess.PIPE, text=True
+    )
+    assert monitor.stdout.readline().startswith("waiting")
     with running("own_arm", port, "f", "a"), running("own_arm", port, "f", "b"), running("own_allocator", port, "f"):
         command = [sys.executable, str(ROOT / "examples" / "submit_jobs.py"), str(port), "f"]
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
         assert done.returncode == 0, done.stdout + done.stderr
         assert "3 of 3 jobs finished" in done.stdout
         serve(lambda: sum(status.state == "finished" for status in heard) >= 3, watcher)
+    try:
+        told, _ = monitor.communicate(timeout=PATIENCE_S)
+    finally:
+        monitor.kill()
+    assert re.search(r"own +outside 1 is finished [ab]\n", told)
+    assert re.search(r" [ab] +finds outside 1 0\.10", told)
     finished = [status.job for status in heard if status.state == "finished"]
     assert sorted(finished) == ["outside 1", "outside 2", "outside 3"]
     assert finished.index("outside 1") < finished.index("outside 3")
