@@ -134,7 +134,7 @@ def up_command(
         )
         ended = supervisor.run(stop.is_set)
         if ended:
-            say(supervisor.log(ended).read_text(encoding="utf-8").strip().rpartition(f"ready {ended}")[2], out_console)
+            say(supervisor.since_ready(ended), out_console)
         again = {name: count for name, count in supervisor.restarts().items() if count}
     if again:
         say("Started again: " + ", ".join(f"{name} {count} time(s)" for name, count in again.items()), out_console)

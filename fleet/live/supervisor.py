@@ -138,6 +138,12 @@ class Supervisor:
         )
         return lines[-1] if lines else f"it said nothing (see {self.log(name)})."
 
+    def since_ready(self, name: str) -> str:
+        """What a part has said since it last was ready; all of it, if it never was."""
+        lines = self.log(name).read_text(encoding="utf-8", errors="replace").splitlines()
+        last = max((i for i, line in enumerate(lines) if line.startswith(self._parts[name].part.ready)), default=-1)
+        return "\n".join(lines[last + 1 :])
+
     def run(self, stopped: Callable[[], bool], *, look_s: float = 0.2) -> str:
         """Keep all running until told to stop, or until an essential part has ended well; returns the name of that one.
 

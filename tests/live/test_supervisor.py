@@ -77,7 +77,8 @@ def test_the_good_end_of_an_essential_part_is_the_end(tmp_path):
         supervisor.start(part("done", "print('finished')", essential=True))
         assert supervisor.run(until(lambda: False)) == "done"
     assert gone(stays)
-    assert supervisor.last_words("done") == "finished"
+    assert supervisor.last_words("done") == supervisor.since_ready("done") == "finished"
+    assert supervisor.since_ready("stays") == ""
 
 
 def test_what_does_not_heed_or_stands_still_is_ended_all_the_same(tmp_path):
