@@ -252,7 +252,8 @@ class JobStatus(msgspec.Struct, frozen=True):
 
 
 class StatusRequest(msgspec.Struct, frozen=True):
-    """To `jobs/status`: where do these jobs stand? All of them if none is named."""
+    """To `jobs/status`: where do these jobs stand? All of them if none is named; of more than 256, all that one answer
+    holds, those that may still change come first."""
 
     jobs: tuple[str, ...] = ()
 
