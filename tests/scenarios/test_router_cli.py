@@ -1,6 +1,8 @@
 """`thermofleet keys` and `thermofleet router`, called as a person and as a supervisor call them."""
 
 import json
+import os
+import re
 import signal
 import socket
 import subprocess
@@ -9,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 
 from fleet.bus import keys
@@ -178,3 +181,29 @@ def test_keys_that_cannot_be_made_are_one_sentence(capsys, folder, words, compla
     assert (code, out) == (2, "")
     assert complaint in " ".join(err.split())
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+@pytest.mark.slow
+def test_a_whole_fleet_works_with_every_rule_on(capsys, small_toml, plans, tmp_path):
+    """Processes of their own for router, arms, auctioneer and recorder: what they need of each other is allowed."""
+    place, out = tmp_path / "keys", tmp_path / "live"
+    assert call(capsys, "keys", place, small_toml)[0] == 0
+    words = ("up", small_toml, "--tls", place, "--speed", 20, "--difficulty", "blind", "--out", out)
+    done = subprocess.run(
+        [sys.executable, "-c", "from scenarios.cli import main; main()", *map(str, words)],
+        cwd=ROOT,
+        env={**os.environ, "THERMOFLEET_CACHE": str(plans)},
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    results = [row for path in (out / "recording").glob("results-*") for row in pq.read_table(path).to_pylist()]
+    finished = {row["job"] for row in results if row["state"] == "finished"}
+    assert re.search(rf"{len(finished)} of \d+ jobs finished", done.stdout)
+    assert len(finished) >= 4
+    assert {row["arm"] for row in results if row["state"] == "finished"} == {"left", "right"}
+    logs = {path.name: path.read_text(encoding="utf-8") for path in (out / "logs").iterdir()}
+    assert logs["router.log"].startswith("tls/")
+    assert not [name for name, said in logs.items() if "Traceback" in said or "No router answered" in said]
