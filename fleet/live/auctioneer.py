@@ -123,8 +123,10 @@ class Auctioneer:
         return Submitted(self.name, admissions)
 
     def leased(self, word: LeaseRequest, real_s: float, time_s: float) -> Lease:
-        """Renew leases, and give leave to finish to those who ask for it."""
-        self._expire(real_s, time_s)
+        """Renew leases, and give leave to finish to those who ask for it.
+
+        An arm that asks after its lease, but before its job was taken back, keeps it: nobody else can have it.
+        """
         mine = {hold.award: hold for hold in word.holds if self._is_held(hold, word.arm)}
         for award, hold in mine.items():
             self._unanswered.pop(award, None)

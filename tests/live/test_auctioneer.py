@@ -160,6 +160,19 @@ def test_a_lease_of_another_arm_is_lost(fleet_of):
     assert (lease.granted, lease.lost, lease.leave) == ((), (award.award,), ())
 
 
+def test_who_asks_late_keeps_a_job_that_was_not_taken_back(fleet_of, live):
+    fleet = fleet_of(1)
+    bid(fleet, hold("a"))
+    fleet.deliver_all()
+    fleet.true_s += 10 * live.TIMING.lease_s  # as if the auctioneer had stood still
+    (award,) = fleet.arms["arm_0"].holds
+    request = fleet.arms["arm_0"].request()
+    assert fleet.auctioneer.leased(request, fleet.real_s, fleet.true_s).granted == (award,)
+    fleet.true_s += 2 * live.TIMING.lease_s
+    fleet.auctioneer.tick(fleet.real_s, fleet.true_s)
+    assert fleet.auctioneer.leased(request, fleet.real_s, fleet.true_s).lost == (award,)
+
+
 def test_what_no_arm_can_do_says_why(fleet_of):
     fleet = fleet_of(1)
     fleet.submit(hold("a"))
