@@ -79,7 +79,10 @@ def library_allowed(importer: str, library: str) -> bool:
     if library in SIM_LIBRARIES:
         return below(importer, "fleet.sim")
     if library == "zenoh":
-        return importer in ("fleet.bus.session", "fleet.bus.router", "fleet.bus.link")
+        # ros2: other keys, bytes and attachments than ours, which `Link` knows nothing of.
+        return importer in ("fleet.bus.session", "fleet.bus.router", "fleet.bus.link", "fleet.bus.ros2")
+    if library == "rosbags":
+        return importer == "fleet.bus.ros2_cdr"
     if library == "torch":
         return below(importer, "twin", "agents.learned")
     return True
@@ -124,7 +127,13 @@ def test_the_wrong_way_is_seen(importer, imported):
 
 @pytest.mark.parametrize(
     ("importer", "library"),
-    [("scenarios.build", "mujoco"), ("fleet.bus.memory", "zenoh"), ("agents.rules", "torch"), ("fleet.env.x", "mink")],
+    [
+        ("scenarios.build", "mujoco"),
+        ("fleet.bus.memory", "zenoh"),
+        ("agents.rules", "torch"),
+        ("fleet.env.x", "mink"),
+        ("fleet.bus.ros2", "rosbags"),
+    ],
 )
 def test_a_library_out_of_its_place_is_seen(importer, library):
     assert not library_allowed(importer, library)
