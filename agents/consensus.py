@@ -18,7 +18,7 @@ import networkx as nx
 import numpy as np
 
 from agents.hearsay import Trust, advantage
-from agents.policy import WAIT, legal_slots
+from agents.policy import WAIT
 from fleet.env.observation import Observation
 from fleet.robot import JOINTS
 
@@ -138,6 +138,8 @@ class Consensus:
         """Each arm's claim after as many rounds as it takes."""
         seen = list(observations.values())
         cost = np.array([self._bids(obs, place) for place, obs in enumerate(seen)])
+        if not np.isfinite(cost).any():
+            return dict.fromkeys(observations, WAIT)
         online = [(obs.peer_heard > 0) & (obs.peer_age_s <= 0) for obs in seen]
         hears = np.array([np.insert(row, place, False) for place, row in enumerate(online)], dtype=bool)
         claims = agree(cost, hears).claims.tolist()
@@ -145,6 +147,8 @@ class Consensus:
 
     def _bids(self, observation: Observation, place: int) -> Array:
         """What each slot would cost this arm, inf where it may not claim it, [slot]."""
-        legal = np.isin(np.arange(len(observation.offered)), legal_slots(observation))
+        legal = observation.action_mask[1:] > 0
+        if not legal.any():
+            return np.full(len(legal), np.inf)
         harder = advantage(observation, place, legal, self._trust)[place]
         return np.where(legal, np.where(np.isnan(harder), _UNKNOWN, harder), np.inf).round(9)
