@@ -1,7 +1,7 @@
 """The exchange: what every arm says at a tick, and what every arm then knows of every other.
 
-Two of them exist: `MemoryExchange` without a bus, and `ZenohExchange` over one. At zero delay and no loss they give the
-same arrays. `begin` starts a new episode: what was heard before is forgotten.
+Two of them exist: `MemoryExchange` without a bus, and `ZenohExchange` over one. On the same channel and with the same
+chance they give the same arrays. `begin` starts a new episode: what was heard before is forgotten.
 """
 
 import math
