@@ -7,7 +7,7 @@ OUT ?= out
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 GOAL := $(or $(firstword $(MAKECMDGOALS)),demo)
 
-.PHONY: demo test test-slow lint bench clean install
+.PHONY: demo test test-slow lint bench chaos clean install
 
 demo: $(STAMP)
 	@$(BIN)/thermofleet demo --out $(OUT)/demo
@@ -22,6 +22,9 @@ lint: $(STAMP)
 	@$(BIN)/ruff format --check .
 	@$(BIN)/ruff check .
 	@$(BIN)/pyright
+
+chaos: $(STAMP)
+	@$(BIN)/python benchmarks/chaos.py
 
 bench: $(STAMP)
 	@for b in benchmarks/bench_*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done

@@ -49,6 +49,7 @@ from fleet.bus.trade import (
 from fleet.live.journal import Journal
 from fleet.live.promises import Closed, Promise
 from fleet.live.supervisor import Backoff, Supervisor
+from scenarios.build import prepare
 from scenarios.live_up import free_port, parts_of
 from scenarios.load import load
 
@@ -423,6 +424,7 @@ def main() -> None:
     if unknown := [name for name in chosen if name not in FAULTS]:
         parser.error(f"no fault '{unknown[0]}'; there are {', '.join(FAULTS)}")
     logging.basicConfig(level=logging.ERROR)
+    prepare(load(SCENARIO), difficulty="blind")  # once, so that no arm has to plan while it is struck
     columns = ("fault", "jobs", "finished", "unfinished", "lost", "twice", "died", "detected s", "recovered s", "all s")
     widths = (18, 5, 9, 11, 5, 6, 5, 11, 12, 7)
     print("".join(f"{name:>{width}}" for name, width in zip(columns, widths, strict=True)), flush=True)
