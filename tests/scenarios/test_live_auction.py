@@ -6,9 +6,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,10 +17,22 @@ import pytest
 from fleet.bus import keys
 from fleet.bus.link import Link
 from fleet.bus.router import Router
-from fleet.bus.trade import JobWord, Offer, Quote, QuoteRequest
+from fleet.bus.trade import (
+    Admission,
+    JobStatus,
+    JobWord,
+    Offer,
+    Quote,
+    QuoteRequest,
+    Status,
+    StatusRequest,
+    Submission,
+    Submitted,
+)
 from fleet.errors import FleetError
 from fleet.job import Job, Place, Work
 from fleet.live.bidding import Bidding
+from scenarios import live_auction
 from scenarios.build import make_env
 from scenarios.cli import main
 from scenarios.live_allocation import allocation, bids_of
@@ -105,6 +118,37 @@ def test_a_job_is_handed_in_after_what_it_waits_for(small_toml):
         assert at_s >= word.release_s
         assert set(word.after) <= seen
         seen.add(word.name)
+
+
+class Stage:
+    """Stands in for a node: an hour passes with every turn, and a job is done in the turn after it was handed in."""
+
+    def __init__(self) -> None:
+        self.time_s, self.handed_in, self.open, self.ended = 0.0, [], [], False
+        self.auctioneer = SimpleNamespace(ledger=SimpleNamespace(unsettled=lambda: self.open), finishing=lambda: False)
+
+    def serve(self, _until_s: float) -> None:
+        self.time_s += 3600.0
+        self.open = []
+
+    def submit(self, word: Submission) -> Submitted:
+        self.handed_in.append((self.time_s, [job.name for job in word.jobs]))
+        self.open = list(word.jobs)
+        return Submitted("auctioneer", tuple(Admission(job.name, True) for job in word.jobs))
+
+    def end(self) -> None:
+        self.ended = True
+
+
+@pytest.mark.parametrize(("horizon_s", "ended"), [(1e6, False), (7200.0, True)])
+def test_a_stream_is_handed_in_as_time_goes_on_until_all_is_done_or_the_shift_is_over(monkeypatch, horizon_s, ended):
+    monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
+    stage, never = Stage(), SimpleNamespace(is_set=lambda: False)
+    names = {"a": 0.0, "b": 3700.0, "c": 7000.0, "d": 10000.0}
+    live_auction.work(stage, [(at_s, JobWord(n, "hold", ("x",))) for n, at_s in names.items()], horizon_s, never)
+    all_of_it = [(3600.0, ["a"]), (7200.0, ["b", "c"]), (10800.0, ["d"])]
+    assert stage.handed_in == (all_of_it[:2] if ended else all_of_it)
+    assert stage.ended is ended
 
 
 def test_a_job_travels_whole():
@@ -223,18 +267,11 @@ def test_nobody_to_hand_in_to_is_one_sentence(endpoint, tmp_path, capsys):
 
 
 @contextmanager
-def arm(endpoint: str) -> Iterator[list[QuoteRequest]]:
-    """An arm that only quotes; gives what it was asked."""
-    asked: list[QuoteRequest] = []
+def served(endpoint: str, declare: Callable[[Link], None]) -> Iterator[None]:
+    """A participant of fleet f on a thread of its own."""
     stop = threading.Event()
-
-    def answer(request: QuoteRequest) -> Quote:
-        asked.append(request)
-        offers = (Offer(request.jobs[0].name, True, "", (0.5,) * 7, 3.5, 0.125, 52.34, 100.0, 160.0),)
-        return Quote("arm_0", request.auction, "", 5.0, "t", 0.0, "idle", 20.0, 1, offers)
-
     with Link(endpoint, "f") as link:
-        link.answer(keys.of_arm("f", "arm_0", "quote"), QuoteRequest, answer)
+        declare(link)
 
         def serve() -> None:
             while not stop.is_set():
@@ -243,10 +280,40 @@ def arm(endpoint: str) -> Iterator[list[QuoteRequest]]:
         thread = threading.Thread(target=serve)
         thread.start()
         try:
-            yield asked
+            yield
         finally:
             stop.set()
             thread.join(PATIENT_S)
+
+
+@contextmanager
+def arm(endpoint: str) -> Iterator[list[QuoteRequest]]:
+    """An arm that only quotes; gives what it was asked."""
+    asked: list[QuoteRequest] = []
+
+    def answer(request: QuoteRequest) -> Quote:
+        asked.append(request)
+        offers = (Offer(request.jobs[0].name, True, "", (0.5,) * 7, 3.5, 0.125, 52.34, 100.0, 160.0),)
+        return Quote("arm_0", request.auction, "", 5.0, "t", 0.0, "idle", 20.0, 1, offers)
+
+    with served(endpoint, lambda link: link.answer(keys.of_arm("f", "arm_0", "quote"), QuoteRequest, answer)):
+        yield asked
+
+
+@pytest.mark.parametrize(("end", "code"), [("finished", 0), ("unfinished", 1)])
+def test_jobs_can_be_followed_to_their_end(endpoint, tmp_path, capsys, end, code):
+    states = iter([JobStatus("a", "waiting"), JobStatus("a", "awarded", "arm_0"), JobStatus("a", end, "arm_0")])
+
+    def declare(link: Link) -> None:
+        taken = Submitted("auctioneer", (Admission("a", True),))
+        link.answer(keys.of_jobs("f", "submit"), Submission, lambda _: taken)
+        link.answer(keys.of_jobs("f", "status"), StatusRequest, lambda _: Status("auctioneer", 0.0, (next(states),)))
+
+    file = tmp_path / "jobs"
+    file.write_text(json.dumps(HOLD))
+    with served(endpoint, declare):
+        said = call(capsys, "submit", file, "--wait", "--endpoint", endpoint, "--fleet", "f")
+    assert said[:2] == (code, f"a: accepted\na: waiting\na: awarded by arm_0\na: {end} by arm_0\n")
 
 
 def test_ask_shows_what_a_job_would_cost_whom(endpoint, capsys):
