@@ -98,17 +98,15 @@ class ArmNode:
         self._unplanned: deque[JobWord] = deque(maxlen=MOST_PLANNED)
         self._reading = body.read()
         self._tick = self._events = 0
-        self._said_s = self._clock_asked_s = -math.inf
+        self._due_s = self._clock_asked_s = -math.inf
+        """Real seconds at which the next state word is due, and the time was asked for last."""
         self._complained_s: dict[str, float] = {}
         self._clock_known = False
         self._declare()
 
     def serve(self, until_s: float) -> None:
         """Live until `time.monotonic()` is `until_s`, or a little less."""
-        due_s = self._said_s + 1.0 / self._nature.rate_hz
-        if self._unplanned:
-            due_s = -math.inf
-        self._link.serve(min(until_s, due_s))
+        self._link.serve(-math.inf if self._unplanned else min(until_s, self._due_s))
         self._turn()
         if self._unplanned:
             self._estimator.prepare(self._unplanned.popleft())
@@ -120,8 +118,8 @@ class ArmNode:
         self._say_state = link.publisher(keys.of_arm(fleet, name, "state"), State)
         self._say_difficulty = link.publisher(keys.of_arm(fleet, name, "difficulty"), DifficultyWord, remember=1)
         self._say_event = link.publisher(keys.of_arm(fleet, name, "event"), ArmEvent, remember=REMEMBERED)
-        info = link.publisher(keys.of_arm(fleet, name, "info"), Info, remember=1)
-        info(Info(name, len(self._reading.temp_c), self._estimator.model.version))
+        self._say_info = link.publisher(keys.of_arm(fleet, name, "info"), Info, remember=1)  # kept: it remembers
+        self._say_info(Info(name, len(self._reading.temp_c), self._estimator.model.version))
         link.answer(keys.of_arm(fleet, name, "quote"), QuoteRequest, self._quote)
         link.answer(keys.of_arm(fleet, name, "award"), Award, self._award)
         link.alive(keys.of_arm(fleet, name, "alive"))
@@ -212,8 +210,10 @@ class ArmNode:
         for auctioneer, report in self.contractor.reports(real_s):
             self._report(auctioneer, report)
         self._ask_clock(real_s)
-        if real_s >= self._said_s + 1.0 / self._nature.rate_hz:
-            self._say(real_s)
+        if real_s >= self._due_s:
+            # At its rate on average; what was missed is not made up for.
+            self._due_s = max(self._due_s, real_s - 1.0 / self._nature.rate_hz) + 1.0 / self._nature.rate_hz
+            self._say()
 
     def _live(self, real_s: float) -> None:
         """Let the body live up to now, within what it may do."""
@@ -301,8 +301,7 @@ class ArmNode:
 
     # What it says and asks
 
-    def _say(self, real_s: float) -> None:
-        self._said_s = real_s
+    def _say(self) -> None:
         self._reading = reading = self._body.read()
         self._tick += 1
         first = next(iter(self.contractor.held), None)

@@ -148,6 +148,14 @@ def test_it_says_what_it_is_and_how_it_is(bus):
     assert state.time_s >= 100.0
 
 
+def test_who_comes_late_still_learns_what_it_is(bus):
+    bus.arm()
+    late, heard = bus.link(), []
+    late.listen(keys.of_every_arm("f", "info"), Info, lambda _, word: heard.append(word), remembered=1)
+    bus.serve(lambda: heard)
+    assert heard == [Info("arm_0", 7, "by payload")]
+
+
 def test_a_job_goes_from_quote_to_receipt(bus):
     auctioneer, events, words = Auctioneer(bus.link()), [], []
     line = bus.link()

@@ -1,0 +1,203 @@
+"""`thermofleet arm`: the same arm as in a run, as a process of its own; and a log that lives as one."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleet.bus import keys
+from fleet.bus.link import Link
+from fleet.bus.messages import Info, State
+from fleet.bus.router import Router
+from fleet.bus.trade import JobWord, Quote, QuoteRequest
+from fleet.errors import FleetError, LogError
+from scenarios.build import prepare, prepare_arm, quiet
+from scenarios.live_arm import replayed, simulated
+from scenarios.load import load
+from twin.logs import read
+from twin.recording import CHANNELS
+
+LOGS = Path(__file__).parents[2] / "../shared/data/gen3_logs"
+PATIENCE_S = 60.0
+TIME_S = np.arange(0.0, 4.0, 0.1)
+
+
+@pytest.fixture
+def log(tmp_path):
+    """A plain log in which every channel of joint k rises by k a second from its own start."""
+    starts = dict(zip(CHANNELS, (0.0, 1.0, 2.0, 3.0, 30.0), strict=True))
+    rise = TIME_S[:, None] * np.arange(1, 8) / 100
+    columns = np.hstack([TIME_S[:, None] + 50.0, *(start + rise for start in starts.values())])
+    header = ",".join(["time_s", *(f"{channel}_{k}" for channel in CHANNELS for k in range(1, 8))])
+    path = tmp_path / "real.csv"
+    np.savetxt(path, columns, delimiter=",", header=header, comments="", fmt="%.12g")
+    return path
+
+
+class Process:
+    """`thermofleet arm …` until the end of the block."""
+
+    def __init__(self, *args, cache, cwd):
+        program = "import sys; from scenarios.cli import main; main(sys.argv[1:])"
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", program, "arm", *map(str, args)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=cwd,
+            env={**os.environ, "THERMOFLEET_CACHE": str(cache), "OMP_NUM_THREADS": "1"},
+        )
+        self.killer = threading.Timer(PATIENCE_S, self.process.kill)
+        self.killer.start()
+        self.ready = self.process.stdout.readline()
+
+    def end(self, number):
+        self.process.send_signal(number)
+        _, said = self.process.communicate(timeout=PATIENCE_S)
+        return self.process.returncode, said
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exc):
+        self.killer.cancel()
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.communicate()
+
+
+def heard_from(link, fleet, enough):
+    """State words and the info of an arm, once there are enough."""
+    states, infos = [], []
+    link.listen(keys.of_every_arm(fleet, "state"), State, lambda _, word: states.append(word))
+    link.listen(keys.of_every_arm(fleet, "info"), Info, lambda _, word: infos.append(word), remembered=1)
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not (infos and enough(states)):
+        assert time.monotonic() < deadline_s, "waited in vain"
+        link.serve(time.monotonic() + 0.1)
+    return states, infos[-1]
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (["ghost"], "No arm 'ghost'"),
+        (["left", "--source", "log"], "log with a FILE"),
+        (["left", "some.csv"], "log with a FILE"),
+        (["left", "--source", "video"], "--source must be"),
+        (["left", "--difficulty", "oracle"], "twin or blind"),
+        (["left", "--speed", "0"], "--speed must be > 0"),
+        (["left", "--rate-hz", "1000"], "--rate-hz"),
+        (["left", "--capacity", "0"], "--capacity"),
+        (["left", "--seed", "-1"], "--seed"),
+        (["left", "none.csv", "--source", "log"], "none.csv"),
+        (["left", "--difficulty", "blind", "--endpoint", "tcp/127.0.0.1:1"], "No router answered"),
+    ],
+)
+def test_what_cannot_be_is_one_sentence(thermofleet, small_toml, tmp_path, monkeypatch, options, complaint):
+    monkeypatch.chdir(tmp_path)
+    said = thermofleet("arm", small_toml, *options)
+    assert said.code == 2
+    assert complaint in said.err.replace("\n", " ")
+
+
+def test_one_arm_alone_is_the_arm_of_the_fleet(small_toml, plans):
+    scenario = load(small_toml)
+    fleet = prepare(scenario, difficulty="blind", cache=plans)
+    alone, same = prepare_arm(scenario, "right", difficulty="blind", cache=plans), fleet.arms[1]
+    assert alone.robot == same.robot
+    for name in ("motors", "thermal"):
+        for one, other in zip(vars(getattr(alone, name)).values(), vars(getattr(same, name)).values(), strict=True):
+            np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(alone.rest_tau, same.rest_tau)
+    assert alone.plans.keys() == same.plans.keys()
+    for work, variants in alone.plans.items():
+        for one, other in zip(variants, same.plans[work], strict=True):
+            np.testing.assert_array_equal(one.cycle.profile, other.cycle.profile)
+
+
+@pytest.mark.slow
+def test_one_arm_alone_has_the_twin_that_it_has_in_the_fleet(small_toml, tmp_path):
+    text = small_toml.read_text(encoding="utf-8") + '\n[twin]\nsize = "quick"\nexploration = 0\n'
+    small_toml.write_text(text, encoding="utf-8")
+    scenario = load(small_toml)
+    alone = prepare_arm(scenario, "right", cache=tmp_path / "one")
+    assert alone.model.version == prepare(scenario, cache=tmp_path / "all").arms[1].model.version
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_an_arm_lives_as_a_process_and_ends_when_told(small_toml, plans, tmp_path, number, code):
+    with Router() as router, Link(router.endpoint, "heat") as link:
+        options = ["--endpoint", router.endpoint, "--difficulty", "blind", "--rate-hz", 20]
+        with Process(small_toml, "left", *options, cache=plans, cwd=tmp_path) as arm:
+            assert arm.ready.split() == ["ready", "left", router.endpoint, str(arm.process.pid)]
+            states, info = heard_from(link, "heat", lambda states: len(states) > 5)
+            assert "torch" not in Path(f"/proc/{arm.process.pid}/maps").read_text()
+            returned, said = arm.end(number)
+    assert returned == code, said
+    assert (info.twin, states[-1].mode) == ("blind", "idle")
+    assert (tmp_path / "runs/live-heat/left.journal").is_file()
+    if number == signal.SIGINT:
+        assert "the same command goes on" in said.replace("\n", " ")
+
+
+def test_a_log_lives_as_an_arm(small_toml, plans, log, tmp_path):
+    with Router() as router, Link(router.endpoint, "heat") as link:
+        options = ["--source", "log", "--endpoint", router.endpoint, "--speed", 4, "--rate-hz", 20]
+        with Process(small_toml, "museum", log, *options, cache=plans, cwd=tmp_path) as arm:
+            assert arm.ready.startswith("ready museum")
+            states, info = heard_from(link, "heat", lambda states: states and states[-1].mode == "idle")
+            job = JobWord(name="j", kind="hold", places=("bench",))
+            answers = link.ask_and_wait(
+                keys.of_every_arm("heat", "quote"), QuoteRequest("q", (job,), dry_run=True), Quote, timeout_s=10.0
+            )
+            assert arm.end(signal.SIGTERM)[0] == 0
+    assert info.twin == "log real.csv"
+    (quote,) = answers.words.values()
+    assert "replays the log 'real.csv'" in quote.offers[0].reason
+    rise = np.arange(1, 8) / 100
+    for state in states:
+        into_s = (state.temp_c[0] - 30.0) * 100  # what the first joint says of the time, the others must say too
+        np.testing.assert_allclose(state.temp_c, 30.0 + into_s * rise, atol=1e-9)
+        np.testing.assert_allclose(state.q, into_s * rise, atol=1e-9)
+        np.testing.assert_allclose(state.tau, 2.0 + into_s * rise, atol=1e-9)
+        np.testing.assert_allclose(state.current_a, 3.0 + into_s * rise, atol=1e-9)
+    seen = [round((state.temp_c[0] - 30.0) * 100, 6) for state in states]
+    assert seen == sorted(seen)
+    assert seen[-1] == pytest.approx(TIME_S[-1])
+    began_s = states[0].time_s - seen[0]
+    for state, into_s in zip(states, seen, strict=True):
+        if state.mode == "working":
+            assert state.time_s - began_s == pytest.approx(into_s, abs=0.1 + 1e-6)
+
+
+def test_a_log_without_temperatures_or_of_others_is_refused(log, tmp_path):
+    bare = tmp_path / "bare.csv"
+    lines = log.read_text().splitlines()
+    bare.write_text("\n".join(",".join(line.split(",")[:22]) for line in lines))
+    with pytest.raises(LogError, match="no motor temperatures"):
+        replayed("arm", bare)
+
+
+def test_a_name_that_the_scenario_does_not_have_is_refused(small_toml, plans):
+    with pytest.raises(FleetError, match="No arm 'museum'"):
+        simulated(load(small_toml), "museum", "blind", 0, quiet, plans)
+
+
+@pytest.mark.skipif(not LOGS.is_dir(), reason="the real logs are not here")
+def test_a_real_arm_is_replayed_as_it_was_logged():
+    file = sorted(LOGS.glob("*.csv.gz"))[0]
+    (recording,) = read(file, damaged="skip")
+    body = replayed("kinova", file).body(1000.0, 0.1)
+    for row in np.linspace(0, len(recording.time_s) - 2, 50).astype(int).tolist():
+        body.advance(1000.0 + recording.time_s[row] - recording.time_s[0] + 1e-6)
+        reading = body.read()
+        np.testing.assert_array_equal(reading.temp_c, recording.temp_c[row])
+        np.testing.assert_array_equal(reading.q, recording.q[row])
+        np.testing.assert_array_equal(reading.current_a, recording.current_a[row])
