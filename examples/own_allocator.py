@@ -98,6 +98,7 @@ class Allocator:
 
     def auction(self):
         """One round: ask all arms, give each waiting job to the arm that finds it easiest."""
+        taken = {place for job in self.jobs.values() if self.in_hand(job) for place in job["places"]}
         finished = {name for name, status in self.status.items() if status["state"] == "finished"}
         waiting = [
             job
@@ -116,10 +117,15 @@ class Allocator:
         for index, job in enumerate(waiting):
             offers = {arm: quote["offers"][index] for arm, quote in quotes.items() if free[arm] > 0}
             easy = [(o.get("d") or 0.0, arm) for arm, o in offers.items() if o["feasible"]]
-            if easy:
+            if easy and taken.isdisjoint(job["places"]):  # a station serves one arm at a time
                 _, arm = min(easy)
                 free[arm] -= 1
+                taken.update(job["places"])
                 self.award(job, arm, name, quotes[arm]["quote"])
+
+    def in_hand(self, job):
+        """Whether an arm has it."""
+        return self.status[job["name"]]["state"] in ("awarded", "finishing")
 
     def award(self, job, arm, auction, quote_name):
         """Give a job to an arm, and ask again if there is no answer: the same award is taken once.
@@ -235,7 +241,11 @@ def main(port, fleet, seconds=float("inf")):
         "connect": {"endpoints": [f"tcp/127.0.0.1:{port}"], "timeout_ms": 10_000},
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
     }
-    with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
+    try:
+        session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+    except zenoh.ZError:
+        sys.exit(f"No router answered at port {port}.")
+    with session:  # one that is not closed keeps the process from ending
         Allocator(session, fleet).run(seconds)
 
 

@@ -281,7 +281,11 @@ def connect(port):
 
 def main(port, fleet, name, seconds=float("inf")):
     """Be an arm until Ctrl-C, or for so many seconds."""
-    with connect(port) as session:  # a session that is not closed keeps the process from ending
+    try:
+        session = connect(port)
+    except zenoh.ZError:
+        sys.exit(f"No router answered at port {port}.")
+    with session:  # one that is not closed keeps the process from ending
         Arm(session, fleet, name).run(seconds)
 
 

@@ -88,7 +88,11 @@ def main(port, fleet, jobs, seconds=600.0):
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
     }
     root = f"thermofleet/v1/{quote(fleet, safe='')}"
-    with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
+    try:
+        opened = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+    except zenoh.ZError:
+        sys.exit(f"No router answered at port {port}.")
+    with opened as session:
         tokens = queue.SimpleQueue()  # an auctioneer shows its token once it can answer
         watcher = session.liveliness().declare_subscriber(f"{root}/auction/*/alive", tokens.put, history=True)
         try:
