@@ -11,9 +11,10 @@ import time
 import weakref
 from collections import deque
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
-from threading import Condition
+from queue import Empty, SimpleQueue
+from threading import Lock
 from typing import Any, Generic, Protocol, Self, TypeVar
 
 import msgspec
@@ -81,9 +82,9 @@ class Link:
         self.complaints: deque[str] = deque(maxlen=8)
         self.overrun = 0
         self._endpoint, self._timeout_s = endpoint, timeout_s
-        self._waiting: deque[Callable[[], None]] = deque()
+        self._waiting: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._backlog = backlog
-        self._came = Condition()
+        self._overrunning = Lock()
         self._session: zenoh.Session | None = None
         self._resources = ExitStack()
         # A process that ends without closing its session would hang.
@@ -108,8 +109,7 @@ class Link:
         except zenoh.ZError as error:
             raise BusError(f"The line to {self._endpoint} did not close in order: {error}") from error
         finally:
-            with self._came:
-                self._waiting.clear()
+            self._waiting = SimpleQueue()
 
     def __enter__(self) -> Self:
         return self.open()
@@ -124,30 +124,31 @@ class Link:
 
         Returns at the first pause after something was handled, or when time is up.
         """
-        handled = 0
-        with self._came:
-            if not self._waiting:
-                self._came.wait_for(lambda: bool(self._waiting), max(0.0, until_s - time.monotonic()))
-            limit = len(self._waiting)
-        while handled < limit:
-            with self._came:
-                if not self._waiting:
-                    break
-                handle = self._waiting.popleft()
+        wait_s = until_s - time.monotonic()
+        try:
+            handle = self._waiting.get(timeout=wait_s) if wait_s > 0 else self._waiting.get_nowait()
+        except Empty:
+            return 0
+        handle()
+        handled = 1
+        for _ in range(self._waiting.qsize()):
+            try:
+                handle = self._waiting.get_nowait()
+            except Empty:  # the oldest went to make room
+                break
             handle()
             handled += 1
         return handled
 
     def post(self, handle: Callable[[], None]) -> None:
         """Have something handled by `serve`; any thread may call this."""
-        with self._came:
-            if len(self._waiting) >= self._backlog:
-                self._waiting.popleft()
+        if self._waiting.qsize() >= self._backlog:
+            with self._overrunning, suppress(Empty):
+                self._waiting.get_nowait()
                 self.overrun += 1
                 if self.overrun == 1 or self.overrun % 1000 == 0:
                     _LOG.warning("%d message(s) lost: they came faster than they were handled.", self.overrun)
-            self._waiting.append(handle)
-            self._came.notify()
+        self._waiting.put(handle)
 
     # Saying
 

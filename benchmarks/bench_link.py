@@ -1,0 +1,111 @@
+"""How soon a difficulty that one process says is used by another, beside bare Zenoh in the same run.
+
+    python benchmarks/bench_link.py [--words 1500] [--rate 100]
+
+A speaker and a listener, each a process of its own, meet at a router in a third. The speaker takes turns: a word by
+`Link` (checked, remembered for late joiners, JSON) and the same bytes by a bare Zenoh publisher into a bare callback.
+Both carry the monotonic clock, which processes of one machine share; a word counts as used when the listener's handler
+has it as a checked message. Microseconds; the target is the ratio.
+"""
+
+import argparse
+import json
+import multiprocessing
+import statistics
+import time
+from multiprocessing.connection import Connection
+
+from fleet.bus import keys
+from fleet.bus.link import Link
+from fleet.bus.messages import DifficultyWord, encode
+from fleet.bus.router import Router, open_client
+
+FLEET = "bench"
+SLOTS = 8
+TARGET = 1.5
+PATIENCE_S = 30.0
+
+
+def word(tick: int) -> DifficultyWord:
+    """What an arm says of eight jobs, at this moment."""
+    jobs = tuple(f"hold_at_fixture-{slot:03d}" for slot in range(SLOTS))
+    scores = tuple(0.1 * slot + 2.0 for slot in range(SLOTS))
+    return DifficultyWord("arm_0", tick, time.monotonic(), "0123456789abcdef", jobs, scores, scores)
+
+
+def listen(endpoint: str, words: int, pipe: Connection) -> None:
+    """Take both kinds and send back how old each was, s."""
+    ours: list[float] = []
+    bare: list[float] = []
+    with Link(endpoint, FLEET) as link, open_client(endpoint, timeout_s=10.0) as session:
+        link.listen(
+            keys.of_every_arm(FLEET, "difficulty"),
+            DifficultyWord,
+            lambda _, said: ours.append(time.monotonic() - said.time_s),
+            remembered=1,
+        )
+
+        def took(sample: object) -> None:
+            bare.append(time.monotonic() - json.loads(sample.payload.to_bytes())["time_s"])  # type: ignore[attr-defined]
+
+        subscriber = session.declare_subscriber("bare/difficulty", took)
+        link.alive(keys.of_arm(FLEET, "listener", "alive"))
+        pipe.send("ready")
+        deadline_s = time.monotonic() + PATIENCE_S
+        while len(ours) < words and time.monotonic() < deadline_s:
+            link.serve(time.monotonic() + 0.5)
+        pipe.send((ours, bare))
+        subscriber.undeclare()
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--words", type=int, default=1500)
+    parser.add_argument("--rate", type=float, default=100.0, help="words of each kind a second")
+    arguments = parser.parse_args()
+    spawn = multiprocessing.get_context("spawn")
+    router_end, router_other = spawn.Pipe()
+    router = spawn.Process(target=_route, args=(router_other,), daemon=True)
+    router.start()
+    endpoint = router_end.recv()
+    here, there = spawn.Pipe()
+    listener = spawn.Process(target=listen, args=(endpoint, arguments.words, there), daemon=True)
+    listener.start()
+    assert here.recv() == "ready"
+    with Link(endpoint, FLEET) as link, open_client(endpoint, timeout_s=10.0) as session:
+        say = link.publisher(keys.of_arm(FLEET, "arm_0", "difficulty"), DifficultyWord, remember=1)
+        put = session.declare_publisher("bare/difficulty")
+        seen: list[str] = []
+        link.watch(keys.of_every_arm(FLEET, "alive"), lambda arm, _: seen.append(arm))
+        due_s = time.monotonic() + 0.5
+        link.serve(due_s)
+        for tick in range(arguments.words):
+            for speak in (lambda tick=tick: say(word(tick)), lambda tick=tick: put.put(encode(word(tick)))):
+                due_s += 0.5 / arguments.rate
+                while time.monotonic() < due_s:
+                    link.serve(due_s)
+                speak()
+        ours, bare = here.recv()
+    router_end.send("end")
+    print(f"{'one way, us':<26}{'words':>7}{'p50':>8}{'p99':>9}")
+    rows = {"bare put → callback": bare, "ours, said → used": ours}
+    quantiles: dict[str, list[float]] = {}
+    for name, ages in rows.items():
+        cuts = statistics.quantiles(ages, n=100)
+        quantiles[name] = [1e6 * cuts[49], 1e6 * cuts[98]]
+        print(f"{name:<26}{len(ages):>7}{quantiles[name][0]:>8.0f}{quantiles[name][1]:>9.0f}")
+    (bare_50, bare_99), (ours_50, ours_99) = quantiles.values()
+    print(f"{'ratio (target ≤ ' + str(TARGET) + ')':<33}{ours_50 / bare_50:>8.2f}{ours_99 / bare_99:>9.2f}")
+    listener.join(PATIENCE_S)
+    router.join(PATIENCE_S)
+
+
+def _route(pipe: Connection) -> None:
+    with Router() as router:
+        pipe.send(router.endpoint)
+        pipe.recv()
+
+
+if __name__ == "__main__":
+    main()
