@@ -11,6 +11,7 @@ from scenarios.live_record import record_command, replay_command
 from scenarios.live_submit import submit_command
 from scenarios.live_up import up_command
 from scenarios.live_watch import watch_command
+from scenarios.ros2_cli import ros2_app
 
 
 def register(app: typer.Typer) -> None:
@@ -25,3 +26,4 @@ def register(app: typer.Typer) -> None:
     app.command("gateway")(gateway_command)
     app.command("record")(record_command)
     app.command("replay")(replay_command)
+    app.add_typer(ros2_app, name="ros2")
