@@ -326,7 +326,10 @@ class Contractor:
     def _phase(self, held: Held) -> Phase:
         if held is not next(iter(self._held.values())):
             return "queued"
-        return "finishing" if held.leave or held.last_in_s <= self.terms.ahead_s else "working"
+        # A job of one cycle begins only with leave, however far the way to its place is.
+        only_last = held.cycles >= held.award.job.repetitions - 1
+        near = held.last_in_s <= self.terms.ahead_s
+        return "finishing" if held.leave or only_last or near else "working"
 
     def _hold(self, held: Held) -> Hold:
         """What is told of a job in hand: no more cycles than are on disk."""

@@ -356,6 +356,19 @@ def test_a_first_start_is_the_first_boot():
     assert retold(restarted(recall([Booted(4)]), "a", 0.0)) == (Booted(5),)
 
 
+@pytest.mark.parametrize(
+    ("repetitions", "done", "phase"), [(1, 0, "finishing"), (3, 2, "finishing"), (3, 1, "working")]
+)
+def test_an_arm_that_has_only_the_last_cycle_left_asks_for_leave_from_afar(repetitions, done, phase):
+    """It may not set out without: waiting until the last cycle is near, it would wait for ever."""
+    contractor, _ = shop()
+    job = replace(JOB, repetitions=repetitions)
+    contractor.awarded(award_on(quoted(contractor, job), job), 0.0)
+    contractor.worked(done, last_in_s=100.0)
+    ((_, request),) = contractor.lease_requests(3.0)
+    assert request.holds[0].phase == phase
+
+
 @pytest.mark.parametrize("name", ["capacity", "valid_s", "quotes", "patience_s", "ahead_s"])
 def test_terms_must_be_positive(name):
     with pytest.raises(ValueError, match=rf"Terms\.{name}"):
