@@ -30,8 +30,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-TURN_S, CLOCK_S = 0.25, 2.0
-"""Real seconds: between two looks at whether to stop; that the auctioneer has to tell the time at the start."""
+TURN_S, CLOCK_S, FAREWELL_S = 0.25, 2.0, 1.0
+"""Real seconds: between two looks at whether to stop; that the auctioneer has to tell the time at the start; to give
+back what is in hand at the end."""
 
 
 def arm_command(
@@ -74,6 +75,7 @@ def arm_command(
         typer.echo(f"ready {name} {endpoint} {os.getpid()}")
         while not stop.is_set():
             node.serve(time.monotonic() + TURN_S)
+        node.retire(time.monotonic() + FAREWELL_S)
         stop.leave(f"Interrupted; the journal is {book.path}, and the same command goes on.")
 
 

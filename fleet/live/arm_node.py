@@ -10,7 +10,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -35,7 +35,7 @@ from fleet.bus.trade import (
 )
 from fleet.errors import BusError
 from fleet.events import Event
-from fleet.live.body import Body, Reading
+from fleet.live.body import Body
 from fleet.live.clock import FleetClock
 from fleet.live.contractor import Contractor
 from fleet.live.estimate import Estimator
@@ -51,6 +51,8 @@ ANSWER_S = 1.0
 """Real seconds that an auctioneer has to answer."""
 CLOCK_S = (1.0, 30.0)
 """Real seconds between two questions for the time: until the first answer, and after it."""
+RETRY_S = 1.0
+"""Real seconds between two attempts to write what there was no room for."""
 TOLD_S = 10.0
 """Real seconds between two complaints about the same."""
 EVENTS_OF_A_LIFE = 1_000_000_000
@@ -100,6 +102,7 @@ class ArmNode:
         self._tick = self._events = 0
         self._due_s = self._clock_asked_s = -math.inf
         """Real seconds at which the next state word is due, and the time was asked for last."""
+        self._retry_s = -math.inf
         self._complained_s: dict[str, float] = {}
         self._clock_known = False
         self._declare()
@@ -110,6 +113,13 @@ class ArmNode:
         self._turn()
         if self._unplanned:
             self._estimator.prepare(self._unplanned.popleft())
+
+    def retire(self, until_s: float) -> None:
+        """Give back what is in hand, and say so until there are receipts or `time.monotonic()` is `until_s`."""
+        self._nature = replace(self._nature, works=False)
+        self.contractor.returned(self._body.time_s, time.monotonic(), "the arm was stopped")
+        while self.contractor.owes and time.monotonic() < until_s:
+            self.serve(until_s)
 
     # What it hears
 
@@ -140,7 +150,6 @@ class ArmNode:
             can = {offer.job: (words[offer.job], offer.feasible) for offer in offers}
             name = self.contractor.quoted(can, real_s)
             self._tell_difficulty(offers, real_s)
-        faulted = self._reading.mode == "faulted"
         return Quote(
             arm=self._name,
             auction=request.auction,
@@ -150,7 +159,7 @@ class ArmNode:
             time_s=self.clock.now_s(real_s),
             mode=self._reading.mode,
             headroom_k=self._headroom_k,
-            capacity=self.contractor.spare if self._nature.works and not faulted else 0,
+            capacity=0 if self._unfit() else self.contractor.spare,
             offers=offers,
         )
 
@@ -202,7 +211,9 @@ class ArmNode:
 
     def _turn(self) -> None:
         real_s = time.monotonic()
-        self.contractor.catch_up()
+        if real_s >= self._retry_s:
+            self._retry_s = real_s + RETRY_S
+            self.contractor.catch_up()
         self._live(real_s)
         self.contractor.give_up(self._body.time_s, real_s)
         for auctioneer, request in self.contractor.lease_requests(real_s):
@@ -238,8 +249,7 @@ class ArmNode:
         if first is None or not self._body.free:
             return
         job, way = self._estimator.job(first.award.job), self._estimator.way(first.award.job)
-        assert job is not None, "an award for what cannot be is refused"
-        assert way is not None, "an award for what cannot be is refused"
+        assert job is not None and way is not None, "an award for what cannot be is refused"  # noqa: PT018
         self._body.begin(job, way.plan, first.cycles)
         self._at_work = name
 
@@ -304,13 +314,24 @@ class ArmNode:
     def _say(self) -> None:
         self._reading = reading = self._body.read()
         self._tick += 1
-        first = next(iter(self.contractor.held), None)
-        self._say_state(_state(self._name, self._tick, self._body.time_s, reading, self._headroom_k, first))
+        state = State(
+            arm=self._name,
+            tick=self._tick,
+            time_s=self._body.time_s,
+            mode=reading.mode,
+            temp_c=reading.temp_c,
+            headroom_k=self._headroom_k,
+            job=next((held.award.job.name for held in self.contractor.held), ""),
+            q=reading.q,
+            qd=reading.qd,
+            tau=reading.tau,
+            current_a=reading.current_a,
+        )
+        self._say_state(state)
 
     def _tell(self, event: Event, value: float | None = None) -> None:
         self._events += 1
-        if value is None and math.isfinite(event.value):
-            value = event.value
+        value = event.value if value is None and math.isfinite(event.value) else value
         self._say_event(
             ArmEvent(
                 arm=self._name,
@@ -377,19 +398,3 @@ class ArmNode:
         if now_s >= self._complained_s.get(what, -math.inf) + TOLD_S:
             self._complained_s[what] = now_s
             _LOG.warning("Arm '%s' %s", self._name, sentence)
-
-
-def _state(name: str, tick: int, time_s: float, reading: Reading, headroom_k: float, first: Held | None) -> State:
-    return State(
-        arm=name,
-        tick=tick,
-        time_s=time_s,
-        mode=reading.mode,
-        temp_c=reading.temp_c,
-        headroom_k=headroom_k,
-        job="" if first is None else first.award.job.name,
-        q=reading.q,
-        qd=reading.qd,
-        tau=reading.tau,
-        current_a=reading.current_a,
-    )

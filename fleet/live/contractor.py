@@ -355,6 +355,11 @@ class Contractor:
                 due.append((pending.auctioneer, pending.report))
         return due
 
+    @property
+    def owes(self) -> bool:
+        """Whether a report has no receipt yet."""
+        return bool(self._reports)
+
     def receipted(self, receipt: Receipt) -> None:
         """The auctioneer has a report."""
         pending = self._reports.get(receipt.award)

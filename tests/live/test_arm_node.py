@@ -39,6 +39,7 @@ from fleet.live.promises import Promise, recall, restarted, retold
 from fleet.robot import ThermalLimits
 
 PATIENCE_S = 15.0
+LIMITS = ThermalLimits()
 SPEED = 60.0
 JOB = JobWord(name="j", kind="hold", places=("bench",), repetitions=3)
 PLACES = {name: Place(name=name, position_m=(0.5, 0.0, 0.2)) for name in ("bench", "rack")}
@@ -74,14 +75,14 @@ def bus(tmp_path, small):
             links.append(stack.enter_context(Link(router.endpoint, "f")))
             return links[-1]
 
-        def arm(plan=None, body=None, folder=tmp_path, speed=SPEED, clock_s=100.0, **nature):
+        def arm(plan=None, body=None, speed=SPEED, clock_s=100.0, limits=LIMITS, warm=True, **nature):
             content = small.work("bench")
             own = small.arm(0, [content])
-            book = stack.enter_context(Journal(folder / "arm_0.jsonl", Promise))
+            book = stack.enter_context(Journal(tmp_path / "arm_0.jsonl", Promise))
             memory = restarted(recall(book.replay()), "arm_0", 0.0)
             book.rewrite(*retold(memory))
             body = body or SimulatedBody(
-                own, ThermalLimits(), lambda _: 25.0, dt_s=speed / 20, rng=np.random.default_rng(0), time_s=clock_s
+                own, limits, lambda _: 25.0, dt_s=speed / 20, rng=np.random.default_rng(0), time_s=clock_s, warm=warm
             )
             line = stack.enter_context(Link(router.endpoint, "f"))
             contractor = Contractor("arm_0", book.append, memory, nonce=str(memory.boot), terms=Terms(valid_s=3.0))
@@ -223,6 +224,40 @@ def test_after_a_crash_the_job_is_given_back_and_the_arm_works_again(bus):
     assert bus.ask(line, "award", award(again.quote, name="w2"), Ack).accepted
     bus.serve(lambda: any(r.outcome == "finished" for r in auctioneer.reports))
     assert [(r.award, r.outcome) for r in auctioneer.reports] == [("w", "returned"), ("w2", "finished")]
+
+
+def test_an_arm_that_is_stopped_gives_back_its_job_and_is_sure(bus):
+    auctioneer, line = Auctioneer(bus.link()), bus.link()
+    arm = bus.arm(speed=1.0)
+    quote = bus.ask(line, "quote", request(), Quote)
+    assert bus.ask(line, "award", award(quote.quote), Ack).accepted
+    arm.node.retire(time.monotonic())
+    bus.serve(lambda: auctioneer.reports)
+    (report,) = auctioneer.reports
+    assert (report.outcome, report.unsure, report.reason) == ("returned", False, "the arm was stopped")
+    bus.serve(lambda: not arm.node.contractor.owes)
+    again = bus.ask(line, "quote", request(), Quote)
+    assert again.capacity == 0
+    assert not bus.ask(line, "award", award(again.quote, name="w2"), Ack).accepted
+
+
+def test_an_arm_that_faults_gives_back_its_job_with_the_cycles(bus):
+    auctioneer, line, events = Auctioneer(bus.link()), bus.link(), []
+    line.listen(keys.of_every_arm("f", "event"), ArmEvent, lambda _, e: events.append(e), remembered=64)
+    limits = ThermalLimits(warning_c=33.0, error_c=34.0, restart_c=30.0)
+    bus.arm(limits=limits, warning_c=1000.0, speed=600.0, warm=False)
+    long = JobWord(name="j", kind="hold", places=("bench",), repetitions=5000)
+    quote = bus.ask(line, "quote", request(long), Quote)
+    assert bus.ask(line, "award", award(quote.quote, long), Ack).accepted
+    bus.serve(lambda: auctioneer.reports)
+    (report,) = auctioneer.reports
+    fault = next(e for e in events if e.kind == "fault")
+    began_s = next(e for e in events if e.kind == "award").time_s
+    assert (report.outcome, report.time_s) == ("returned", fault.time_s)
+    assert report.cycles > 3
+    assert report.cycles == (fault.time_s - began_s - 3.0) // 10.0
+    assert "faulted" in report.reason
+    assert bus.ask(line, "quote", request(), Quote).capacity == 0
 
 
 def test_an_arm_that_is_hot_offers_but_takes_nothing(bus):
