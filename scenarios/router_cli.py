@@ -1,9 +1,5 @@
 """`thermofleet router`: the router of a fleet as a process of its own."""
 
-import signal
-import socket
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +7,7 @@ import typer
 
 from fleet.errors import FleetError
 from scenarios.load import load
-from scenarios.terminal import Interrupted
+from scenarios.stopping import until_stopped
 
 PORT = 7447
 STATE_HZ = 100.0
@@ -44,37 +40,10 @@ def router_command(
     if scenario is not None:
         _check_roster(tls, scenario)
     limits = Limits(state_hz=state_hz or None)
-    with stop_asked() as asked, Router(port, host=host, tls=Tls(tls, name) if tls else None, limits=limits) as router:
+    with until_stopped() as stop, Router(port, host=host, tls=Tls(tls, name) if tls else None, limits=limits) as router:
         typer.echo(router.endpoint)  # flushed: a supervisor reads this line
-        if asked() == signal.SIGINT:
-            raise Interrupted("The router was interrupted; whoever was connected tries again by itself.")
-
-
-@contextmanager
-def stop_asked() -> Iterator[Callable[[], int]]:
-    """A function that waits until Ctrl-C or SIGTERM asks for an end, and returns the number of the signal.
-
-    Zenoh has threads of its own, and a signal that one of them takes wakes no lock or queue that the main thread waits
-    on: seen in every second try. A socket that the signal itself writes into always does.
-    """
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    woken, waker = socket.socketpair()
-    with woken, waker:
-        waker.setblocking(False)
-        before_fd = signal.set_wakeup_fd(waker.fileno())
-        before = [signal.signal(number, lambda *_: None) for number in numbers]
-
-        def wait() -> int:
-            while (number := woken.recv(1)[0]) not in numbers:
-                pass
-            return number
-
-        try:
-            yield wait
-        finally:
-            for number, handler in zip(numbers, before, strict=True):
-                signal.signal(number, handler)
-            signal.set_wakeup_fd(before_fd)
+        stop.wait()
+        stop.leave("The router was interrupted; whoever was connected tries again by itself.")
 
 
 def _check_roster(folder: Path | None, scenario: str) -> None:

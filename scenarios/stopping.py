@@ -1,31 +1,40 @@
 """Ends of participants that run until they are told to stop: Ctrl-C or SIGTERM."""
 
+import select
 import signal
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
-from queue import Empty, SimpleQueue
 
 from fleet.live.supervisor import end_with_supervisor
 from scenarios.terminal import Interrupted
 
+NUMBERS = (signal.SIGINT, signal.SIGTERM)
+
 
 class Stop:
-    """What was asked: an end, and by which signal."""
+    """What was asked: an end, and by which signal.
 
-    def __init__(self) -> None:
-        self._asked: SimpleQueue[int] = SimpleQueue()  # the one thing that a signal handler may safely put into
+    Zenoh has threads of its own, and a signal that one of them takes wakes no lock or queue that the main thread waits
+    on: seen in every second try. A socket that the signal itself writes into always does.
+    """
+
+    def __init__(self, woken: socket.socket) -> None:
+        self._woken = woken
+        self._number = 0
 
     def is_set(self) -> bool:
         """Whether an end was asked for."""
-        return not self._asked.empty()
+        return self.wait(0.0)
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait until an end is asked for; whether it was."""
-        try:
-            self._asked.put(self._asked.get(timeout=timeout_s))
-        except Empty:
-            return False
-        return True
+        while not self._number and self._woken.fileno() >= 0:  # it is closed after the block
+            ready, _, _ = select.select([self._woken], [], [], timeout_s)
+            if not ready:
+                return False
+            self._number = next((number for number in self._woken.recv(64) if number in NUMBERS), 0)
+        return self._number > 0
 
     def leave(self, sentence: str) -> None:
         """After everything is in order: the sentence and exit code 130 for Ctrl-C, nothing for SIGTERM.
@@ -33,23 +42,24 @@ class Stop:
         Raises:
             Interrupted: it was Ctrl-C.
         """
-        if self.is_set() and self._asked.get() == signal.SIGINT:
+        if self.is_set() and self._number == signal.SIGINT:
             raise Interrupted(sentence)
-
-    def note(self, number: int) -> None:
-        """Ask for an end, as the signal of this number."""
-        self._asked.put(number)
 
 
 @contextmanager
 def until_stopped() -> Iterator[Stop]:
     """Ctrl-C and SIGTERM ask for an end instead of breaking off; in the main thread only."""
     end_with_supervisor()
-    stop = Stop()
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda which, _frame: stop.note(which)) for number in numbers]
-    try:
-        yield stop
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
+    woken, waker = socket.socketpair()
+    with woken, waker:
+        waker.setblocking(False)
+        before_fd = signal.set_wakeup_fd(waker.fileno(), warn_on_full_buffer=False)
+        before = [signal.signal(number, lambda *_: None) for number in NUMBERS]
+        stop = Stop(woken)
+        try:
+            yield stop
+        finally:
+            stop.is_set()
+            for number, handler in zip(NUMBERS, before, strict=True):
+                signal.signal(number, handler)
+            signal.set_wakeup_fd(before_fd)
