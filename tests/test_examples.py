@@ -341,6 +341,29 @@ def test_own_arm_and_the_submitter_work_with_the_real_auctioneer(bus, tmp_path):
         auction.communicate(timeout=PATIENCE_S)
 
 
+@pytest.mark.slow
+def test_own_allocator_has_real_arms_do_the_jobs(bus, tmp_path):
+    """`thermofleet arm`, which plans and simulates, under an allocator that knows it from docs/bus.md alone."""
+    port, link = bus
+    watcher, heard = link(), []
+    watcher.listen(keys.of_every_auction("f", "result"), Result, lambda _, word: heard.append(word.status))
+    watcher.listen(keys.of_every_arm("f", "state"), State, lambda _, word: None)
+    with running("own_allocator", port, "f") as allocator, ExitStack() as stack:
+        for name in ("arm_0", "arm_1"):
+            options = ["--difficulty", "blind", "--fleet", "f", "--endpoint", f"tcp/127.0.0.1:{port}"]
+            command = [*COMMAND, "arm", "quickstart", name, *options, "--journal", str(tmp_path / name)]
+            arm = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+            stack.callback(arm.communicate)
+            stack.callback(arm.kill)
+            assert arm.stdout.readline().startswith("ready")
+        command = [sys.executable, "-u", str(ROOT / "examples" / "submit_jobs.py"), str(port), "f"]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=150, check=False)
+        assert "3 of 3 jobs finished" in done.stdout, done.stdout + done.stderr
+        assert allocator.poll() is None
+    serve(lambda: sum(status.state == "finished" for status in heard) == 3, watcher)
+    assert watcher.malformed == 0
+
+
 def test_every_example_for_outsiders_imports_nothing_of_ours():
     for name in ("monitor", "submit_jobs", "own_arm", "own_allocator"):
         source = (ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8")
