@@ -15,7 +15,7 @@ from urllib.parse import quote
 import zenoh
 
 MOST = 100
-"""Jobs in one word; the bus takes up to 256 and 64 KiB."""
+"""Jobs in one word; the bus takes up to 128 and 64 KiB."""
 WAIT_S = 10.0
 """For an auctioneer to come."""
 JOBS = [

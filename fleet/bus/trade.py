@@ -25,7 +25,7 @@ Count = Annotated[int, msgspec.Meta(ge=0)]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
-MOST_JOBS = 256
+MOST_JOBS = 128
 """In one word: more are several words, so that none grows beyond what the router lets through."""
 
 
@@ -252,7 +252,7 @@ class JobStatus(msgspec.Struct, frozen=True):
 
 
 class StatusRequest(msgspec.Struct, frozen=True):
-    """To `jobs/status`: where do these jobs stand? All of them if none is named; of more than 256, all that one answer
+    """To `jobs/status`: where do these jobs stand? All of them if none is named; of more than 128, all that one answer
     holds, those that may still change come first."""
 
     jobs: tuple[str, ...] = ()
