@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 ANSWER_S, ATTEMPTS = 5.0, 3
 """Real seconds to wait for an answer, and how often to ask: the same job twice is one job."""
+AT_ONCE = 64
+"""Jobs in one word: a router may drop words of more than 64 KiB."""
 LOOK_S = 0.5
 """Real seconds between two looks at how jobs stand."""
 PATIENCE_S = 30.0
@@ -91,10 +93,21 @@ def plain(error: Exception) -> str:
 
 def parts(words: "Sequence[JobWord]") -> "Iterator[tuple[JobWord, ...]]":
     """The jobs in as many words as they need."""
-    from fleet.bus.trade import MOST_JOBS
+    ordered = in_order(words)
+    for start in range(0, len(ordered), AT_ONCE):
+        yield tuple(ordered[start : start + AT_ONCE])
 
-    for start in range(0, len(words), MOST_JOBS):
-        yield tuple(words[start : start + MOST_JOBS])
+
+def in_order(words: "Sequence[JobWord]") -> "Sequence[JobWord]":
+    """The jobs, every one after those that it waits for; as they are where they wait for each other in a ring."""
+    from graphlib import CycleError, TopologicalSorter
+
+    try:
+        order = list(TopologicalSorter({word.name: word.after for word in words}).static_order())
+    except CycleError:
+        return words  # the auctioneer says which
+    place = {name: i for i, name in enumerate(order)}
+    return sorted(words, key=lambda word: place[word.name])
 
 
 def submitted(link: "Link", words: "tuple[JobWord, ...]", by: str) -> "tuple[Admission, ...]":
@@ -141,12 +154,12 @@ def follow(link: "Link", names: "Sequence[str]", stop: "Stop") -> "list[str]":
 def stand(link: "Link", names: "Sequence[str]") -> "list[JobStatus]":
     """Where jobs stand; nothing where nobody answers."""
     from fleet.bus import keys
-    from fleet.bus.trade import MOST_JOBS, Status, StatusRequest
+    from fleet.bus.trade import Status, StatusRequest
 
     key = keys.of_jobs(link.fleet, "status")
     out: list[JobStatus] = []
-    for start in range(0, len(names), MOST_JOBS):
-        request = StatusRequest(tuple(names[start : start + MOST_JOBS]))
+    for start in range(0, len(names), AT_ONCE):
+        request = StatusRequest(tuple(names[start : start + AT_ONCE]))
         words: dict[str, Status] = link.ask_and_wait(key, request, Status, timeout_s=ANSWER_S).words
         out += [status for answer in words.values() for status in answer.jobs]
     return out

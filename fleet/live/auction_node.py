@@ -5,13 +5,14 @@ import math
 import secrets
 import time
 from collections.abc import Callable
+from itertools import accumulate
 from typing import TypeVar
 
 import msgspec
 
 from fleet.bus import keys
 from fleet.bus.link import REMEMBERED, Answers, Link, Refused
-from fleet.bus.messages import State
+from fleet.bus.messages import State, encode
 from fleet.bus.trade import (
     MOST_JOBS,
     Ack,
@@ -43,6 +44,8 @@ _LOG = logging.getLogger(__name__)
 
 Word = TypeVar("Word", bound=msgspec.Struct)
 
+MOST_BYTES = 60_000
+"""Of the jobs in one answer: a router may drop larger words."""
 TICK_S = 2.0
 """Real seconds between two records of the fleet's time."""
 
@@ -256,6 +259,7 @@ class AuctionNode:
 
 def _first(statuses: tuple[JobStatus, ...]) -> tuple[JobStatus, ...]:
     """As many as one word may hold; those that may still change come first."""
-    if len(statuses) <= MOST_JOBS:
-        return statuses
-    return tuple(sorted(statuses, key=lambda said: said.state in ("finished", "unfinished")))[:MOST_JOBS]
+    if len(statuses) > MOST_JOBS:
+        statuses = tuple(sorted(statuses, key=lambda said: said.state in ("finished", "unfinished")))[:MOST_JOBS]
+    room = accumulate(len(encode(said)) + 1 for said in statuses)
+    return tuple(said for said, used in zip(statuses, room, strict=True) if used <= MOST_BYTES)

@@ -34,7 +34,7 @@ from fleet.bus.trade import (
     Submitted,
 )
 from fleet.errors import FleetError, JournalFull
-from fleet.live.bidding import Allocate, Bidding, Round, nobody_can, sound
+from fleet.live.bidding import MOST_TOLD, Allocate, Bidding, Round, nobody_can, sound
 from fleet.live.ledger import Change, Ledger
 from fleet.live.records import Accepted, Awarded, Closed, Ended, Heard, Leave, Record, Silent
 from fleet.live.timing import Timing
@@ -161,7 +161,8 @@ class Auctioneer:
             if word.outcome == "finished" and not promise.leave:
                 _LOG.error("'%s' finished '%s' without leave.", word.arm, word.job)
             done_s = min(word.time_s, time_s)
-            self._happen(Closed(word.award, word.outcome, word.cycles, done_s, word.reason, word.unsure))
+            why = word.reason[:MOST_TOLD]
+            self._happen(Closed(word.award, word.outcome, word.cycles, done_s, why, word.unsure))
             self._forget(word.award)
             if word.outcome == "finished":
                 self._hurry()
@@ -188,7 +189,8 @@ class Auctioneer:
         if sent is None or sent.give.arm != ack.arm:
             return
         if not ack.accepted:
-            self._happen(Closed(ack.award, "refused", 0, time_s, f"'{ack.arm}' refused it: {ack.reason}"))
+            why = f"'{ack.arm}' refused it: {ack.reason}"[:MOST_TOLD]
+            self._happen(Closed(ack.award, "refused", 0, time_s, why))
             self._forget(ack.award)
             self._pause(real_s, (sent.give.award.job.name,))
         self._unanswered.pop(ack.award, None)

@@ -9,6 +9,9 @@ from fleet.bus.trade import JobWord, Offer, Quote
 
 _LOG = logging.getLogger(__name__)
 
+MOST_TOLD = 500
+"""Characters of a reason that are passed on; a word must not grow with the number of arms."""
+
 
 @dataclass(frozen=True, eq=False)
 class Bidding:
@@ -60,7 +63,7 @@ def nobody_can(bidding: Bidding) -> dict[str, str]:
             if not offer.feasible:
                 reasons.setdefault(offer.job, {})[arm] = offer.reason or "infeasible"
     return {
-        job: "No arm can do it: " + "; ".join(f"{arm}: {reason}" for arm, reason in said.items()) + "."
+        job: f"No arm can do it: {'; '.join(f'{arm}: {reason}' for arm, reason in said.items())}."[:MOST_TOLD]
         for job, said in reasons.items()
         if len(said) == len(bidding.quotes)
     }

@@ -11,7 +11,7 @@ import pytest
 
 from fleet.bus import keys
 from fleet.bus.link import Link
-from fleet.bus.messages import State
+from fleet.bus.messages import State, encode
 from fleet.bus.router import Router
 from fleet.bus.trade import (
     Ack,
@@ -20,6 +20,7 @@ from fleet.bus.trade import (
     Clock,
     ClockRequest,
     Hold,
+    JobStatus,
     JobWord,
     Lease,
     LeaseRequest,
@@ -35,7 +36,7 @@ from fleet.bus.trade import (
     Submitted,
 )
 from fleet.errors import BusError, JournalFull
-from fleet.live.auction_node import AuctionNode
+from fleet.live.auction_node import AuctionNode, _first
 from fleet.live.journal import Journal
 from fleet.live.records import Record
 
@@ -268,3 +269,14 @@ def test_a_full_disk_is_a_refusal_and_no_end(bus):
         node.submit(Submission(jobs("a")))
     assert bus.ask(keys.of_jobs("f", "submit"), Submission(jobs("a")), Submitted).words
     assert states(node) == ["waiting"]
+
+
+def test_a_status_of_very_many_jobs_fits_into_a_word_and_tells_the_open_ones_first(bus):
+    node = bus.auctioneer()
+    long = "x" * 100
+    node.submit(Submission(jobs(*(f"{long}{i}" for i in range(1500)))))
+    (status,) = bus.ask(keys.of_jobs("f", "status"), StatusRequest(), Status).words.values()
+    assert 100 < len(status.jobs) <= 256
+    assert len(encode(status)) < 65_536
+    first = JobStatus("done", "finished")
+    assert _first((first, *status.jobs * 2))[0].state == "waiting"

@@ -37,7 +37,7 @@ from scenarios.build import make_env
 from scenarios.cli import main
 from scenarios.live_allocation import allocation, bids_of
 from scenarios.live_auction import own_jobs, word_of
-from scenarios.live_submit import read_jobs
+from scenarios.live_submit import parts, read_jobs
 from scenarios.load import load
 
 ROOT = Path(__file__).parents[2]
@@ -86,6 +86,15 @@ def test_what_is_no_job_is_told_by_its_line(tmp_path, text, complaint):
         read_jobs(str(file))
     assert str(refusal.value).startswith(f"{file}")
     assert complaint in str(refusal.value)
+
+
+def test_jobs_in_several_words_come_after_those_they_wait_for():
+    words = [JobWord(f"j{i:03d}", "hold", ("x",), after=(f"j{i + 1:03d}",) if i < 199 else ()) for i in range(200)]
+    handed_in = list(parts(words))
+    assert [len(part) for part in handed_in] == [64, 64, 64, 8]
+    assert [word.name for part in handed_in for word in part] == [word.name for word in reversed(words)]
+    ring = [JobWord("a", "hold", ("x",), after=("b",)), JobWord("b", "hold", ("x",), after=("a",))]
+    assert list(parts(ring)) == [tuple(ring)]
 
 
 def test_a_missing_file_is_one_sentence(capsys):
