@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fleet.bus import messages
-from fleet.bus.contract import CHANNELS, WAYS, Channel, schemas
+from fleet.bus.contract import CHANNELS, WAYS, schemas
 from fleet.bus.specimens import SPECIMENS
 from fleet.errors import FleetError
 
@@ -83,12 +83,11 @@ def _word(name: str, part: Mapping[str, Any], where: str, word: type | None) -> 
 
 
 def _where(name: str) -> str:
-    def at(channel: Channel) -> str:
-        return (
-            f"`{channel.role}/…/{channel.topic}`" if "{arm" in channel.address else f"`{channel.role}/{channel.topic}`"
-        )
-
-    return "".join(f"Key {at(channel)}. " for channel in CHANNELS if name in [word.__name__ for word in channel.words])
+    return "".join(
+        f"Key `…/{channel.address.split('/{fleet}/')[1]}`. "
+        for channel in CHANNELS
+        if name in [word.__name__ for word in channel.words]
+    )
 
 
 def _type(kind: Mapping[str, Any]) -> str:
