@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from fleet.difficulty import Difficulty, DifficultyModel
 from fleet.env.allocation_v0 import Episode
@@ -17,6 +18,9 @@ from fleet.sim.plants import ProfilePlant
 from fleet.sim.state import World
 from fleet.sim.world import Arm, build_world
 from fleet.thermal import ThermalModel, gen3_network, thermal_model
+
+settings.register_profile("thermofleet", deadline=None)  # a busy machine is no reason to fail
+settings.load_profile("thermofleet")
 
 LIGHT, WARM, HOT = 0.0, 4.0, 8.0
 """Payloads, kg: cool for ever; past 60 °C within the hour; past 75 °C within minutes."""
