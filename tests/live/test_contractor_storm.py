@@ -396,7 +396,7 @@ def test_a_long_gale_does_no_harm(seed):
     storm.open_shop(tuple(chance.uniform(0.9951, 1.0049) for _ in range(3)), [1, 2, 3])
     storm.gale(seed, 4000)
     storm.teardown()
-    assert sum(storm.last_cycles.values()) > 10  # there was work
+    assert sum(storm.last_cycles.values()) > 5  # there was work
 
 
 def test_a_calm_shop_finishes_every_job_in_good_time():
