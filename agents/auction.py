@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from fleet.errors import nearest
 
@@ -121,6 +120,8 @@ def _by_name(lot: Lot) -> Lot:
 
 def _matched(lot: Lot) -> Assignment:
     """The cheapest of the largest matchings, stations aside. (Kuhn 1955; Crouse 2016 for rectangular matrices.)"""
+    from scipy.optimize import linear_sum_assignment  # a second to load, and only the auctioneer needs it
+
     rows = [a for a, room in enumerate(lot.capacity) for _ in range(min(room, len(lot.jobs)))]
     cost = lot.cost[rows]
     may = np.isfinite(cost)

@@ -16,7 +16,6 @@ from rich.table import Table
 from fleet.errors import FleetError, nearest
 from fleet.motor import Motors, current, gen3_motors, reference_current, thermal_data
 from fleet.robot import GEN3, JOINTS, POSTURES, Cooling, Robot, ThermalLimits
-from fleet.sim.models import ArmModel
 from fleet.thermal import (
     HOUSING,
     NODES,
@@ -98,6 +97,8 @@ def hold(
     Raises:
         HoldError: an argument is out of range, or the hold needs more torque than a motor has.
     """
+    from fleet.sim.models import ArmModel  # loads MuJoCo
+
     for name, value in (("payload", payload_kg), ("tool mass", tool_kg)):
         if not 0 <= value < np.inf:
             raise HoldError(f"The {name} must be a mass of 0 kg or more (got {value}).")
