@@ -84,7 +84,7 @@ class Published:
 
 CHANNELS: tuple[Channel, ...] = (
     Channel("arm", "alive", "token"),
-    Channel("arm", "state", "dropped", messages.State),
+    Channel("arm", "state", "remembered", messages.State, kept=REMEMBERED),
     Channel("arm", "info", "remembered", messages.Info, kept=1),
     Channel("arm", "difficulty", "remembered", messages.DifficultyWord, kept=1),
     Channel("arm", "event", "remembered", trade.ArmEvent, kept=REMEMBERED),

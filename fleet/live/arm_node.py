@@ -125,7 +125,7 @@ class ArmNode:
 
     def _declare(self) -> None:
         link, fleet, name = self._link, self._link.fleet, self._name
-        self._say_state = link.publisher(keys.of_arm(fleet, name, "state"), State)
+        self._say_state = link.publisher(keys.of_arm(fleet, name, "state"), State, remember=REMEMBERED)
         self._say_difficulty = link.publisher(keys.of_arm(fleet, name, "difficulty"), DifficultyWord, remember=1)
         self._say_event = link.publisher(keys.of_arm(fleet, name, "event"), ArmEvent, remember=REMEMBERED)
         self._say_info = link.publisher(keys.of_arm(fleet, name, "info"), Info, remember=1)  # kept: it remembers
