@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet.bus.exchange import UNHEARD, Heard
 from fleet.bus.channel import Channel
+from fleet.bus.exchange import UNHEARD, Heard
 from fleet.bus.memory import MemoryExchange
 from fleet.difficulty import Difficulty, Risk
 from fleet.env.allocation_v0 import parallel_env
