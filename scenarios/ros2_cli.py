@@ -2,6 +2,7 @@
 
 import os
 import time
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -117,11 +118,8 @@ def node_at(router: str, name: str, domain: int) -> "Node":
     Raises:
         FleetError: the extra is not there, or the domain is none.
     """
-    try:
-        import rosbags
-    except ImportError as error:
-        raise FleetError("ROS 2 needs the extra: pip install 'thermofleet[ros2]' (rosbags is missing).") from error
-    del rosbags
+    if find_spec("rosbags") is None:
+        raise FleetError("ROS 2 needs the extra: pip install 'thermofleet[ros2]' (rosbags is missing).")
     from fleet.bus.ros2 import Node
     from fleet.bus.ros2_names import DOMAINS
 
