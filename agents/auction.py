@@ -6,6 +6,7 @@ serves one job at a time, so jobs that share one are not awarded together.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib import import_module
 
 import numpy as np
 
@@ -102,6 +103,8 @@ def assignment_by_name(name: str) -> AssignmentRule:
     """
     if name not in ASSIGNMENTS:
         raise ValueError(f"No assignment '{name}'{nearest(name, ASSIGNMENTS)}")
+    if name == "matching":  # loaded now rather than in the first round
+        import_module("scipy.optimize")
     return ASSIGNMENTS[name]
 
 
@@ -120,7 +123,7 @@ def _by_name(lot: Lot) -> Lot:
 
 def _matched(lot: Lot) -> Assignment:
     """The cheapest of the largest matchings, stations aside. (Kuhn 1955; Crouse 2016 for rectangular matrices.)"""
-    from scipy.optimize import linear_sum_assignment  # a second to load, and only the auctioneer needs it
+    from scipy.optimize import linear_sum_assignment  # some time to load, and only the auctioneer needs it
 
     rows = [a for a, room in enumerate(lot.capacity) for _ in range(min(room, len(lot.jobs)))]
     cost = lot.cost[rows]
