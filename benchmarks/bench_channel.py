@@ -3,10 +3,11 @@
     python benchmarks/bench_channel.py [SCENARIO] [--seeds 5] [--first-seed 100] [--policies least_difficulty,consensus]
 
 Means over the seeds, and in brackets the mean paired difference to the same policy and seed on a perfect channel, *
-where its 95 % bootstrap interval excludes zero. `heard`: words that came, of all pairs of arms. `lost`: claims that
-somebody else won. Policies that ask no peer (round_robin) are the same on every channel. In memory, on the profile
-plant, with the arms' twins, on all cores. As it is: 130 shifts, some eight minutes of processor time, half of that on
-two free cores (and a few minutes for the twins where they are not in the cache yet); `heat_wave` takes three times that.
+where its 95 % bootstrap interval excludes zero (with a handful of seeds these intervals are too narrow). `heard`: words
+that came, of all pairs of arms. `lost`: claims whose job or station somebody else won. Policies that ask no peer
+(round_robin) are the same on every channel. In memory, on the profile plant, with the arms' twins, on all cores. As it
+is: 130 shifts, some eight minutes of processor time, half of that on two free cores (and a few minutes for the twins
+where they are not in the cache yet); `heat_wave` takes three times that.
 """
 
 import argparse
