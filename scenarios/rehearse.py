@@ -103,28 +103,38 @@ def twins(
     progress: Callable[[str, float], None],
     *,
     arms: Sequence[int] | None = None,
+    config: TwinConfig | None = None,
+    seed: int | None = None,
 ) -> list[Twin]:
     """The twin of every arm: from the cache while its inputs are unchanged, else trained, arms side by side.
 
     Args:
         arms: Whose these bodies and plans are, by place in the scenario; by default all of it, in order.
+        config: By default of the size that the scenario says, as its fleet works with.
+        seed: Of weights and training; by default the scenario's own. What an arm is taught does not depend on it.
 
     Raises:
         FleetError: an arm has no motion that stays cool, so it cannot know what is normal.
     """
-    config = TwinConfig.quick() if scenario.twin.size == "quick" else TwinConfig()
+    if config is None:
+        config = TwinConfig.quick() if scenario.twin.size == "quick" else TwinConfig()
     own = [cool_motion(possible, body, scenario) for body, possible in zip(bodies, plans, strict=True)]
     places = range(len(bodies)) if arms is None else arms
-    seeds = [arm_seed(scenario.spread.seed, index) for index in places]
+    seeds = [arm_seed(scenario.spread.seed if seed is None else seed, index) for index in places]
     keys = [training_key(records(o), config, s) for o, s in zip(own, seeds, strict=True)]
-    homes = [folder / "twins" / _key(k, scenario.twin, body) for k, body in zip(keys, bodies, strict=True)]
+    drawn = scenario.spread.seed if seed not in (None, scenario.spread.seed) else None
+    homes = [folder / "twins" / _key(k, scenario.twin, body, drawn) for k, body in zip(keys, bodies, strict=True)]
     kept = [_stored(home) for home in homes]
     missing = [i for i, twin in enumerate(kept) if twin is None]
     progress("training", 1.0 - len(missing) / len(bodies))
-    if missing:
-        jobs = (delayed(_rehearse)(own[i], config, seeds[i], homes[i], scenario, places[i], bodies[i]) for i in missing)
+    jobs = ((own[i], config, seeds[i], homes[i], scenario, places[i], bodies[i]) for i in missing)
+    if len(missing) == 1:  # in this process, so that progress is told within the training
+        before = 1.0 - 1.0 / len(bodies)
+        _rehearse(*next(jobs), lambda share: progress("training", before + share / len(bodies)))
+        progress("training", 1.0)
+    elif missing:
         with Parallel(n_jobs=min(len(missing), cpu_count()), return_as="generator_unordered") as pool:
-            for done, _ in enumerate(pool(jobs), start=1):
+            for done, _ in enumerate(pool(delayed(_rehearse)(*job) for job in jobs), start=1):
                 progress("training", 1.0 - (len(missing) - done) / len(bodies))
     return [twin or load(home) for twin, home in zip(kept, homes, strict=True)]
 
@@ -137,8 +147,9 @@ def _rehearse(
     scenario: Scenario,
     index: int,
     body: Body,
+    progress: Callable[[float], None] | None = None,
 ) -> None:
-    save(taught(own, config, seed, scenario=scenario, index=index, body=body), home)
+    save(taught(own, config, seed, scenario=scenario, index=index, body=body, progress=progress), home)
 
 
 def arm_seed(seed: int, index: int) -> np.random.SeedSequence:
@@ -146,14 +157,17 @@ def arm_seed(seed: int, index: int) -> np.random.SeedSequence:
     return np.random.SeedSequence([seed, index])
 
 
-def _key(own: str, spec: TwinSpec, body: Body) -> str:
-    """Key of a twin by that of its own motion and by what decides on its exploration, which is not drawn for it."""
+def _key(own: str, spec: TwinSpec, body: Body, drawn: int | None = None) -> str:
+    """Key of a twin by that of its own motion and by what decides on its exploration, which is not drawn for it.
+
+    Args:
+        drawn: Seed of the exploration where the key of the own motion names another one.
+    """
     if not spec.exploration:
         return own
     robot, motors, thermal = body
-    digest = hashlib.sha256(
-        msgspec.json.encode([own, REHEARSAL_VERSION, EXERCISE_VERSION, asdict(spec), asdict(robot)])
-    )
+    of = [own, REHEARSAL_VERSION, EXERCISE_VERSION, asdict(spec), asdict(robot)]
+    digest = hashlib.sha256(msgspec.json.encode(of if drawn is None else [*of, drawn]))
     for value in (*vars(motors).values(), *vars(thermal).values()):
         digest.update(np.asarray(value, dtype=float).tobytes())
     return digest.hexdigest()[: len(own)]

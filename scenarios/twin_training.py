@@ -9,13 +9,12 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-from joblib import Parallel, cpu_count, delayed
 
 from fleet.errors import CheckpointError, FleetError, nearest
 from scenarios.build import Progress, body_of, cache_folder, plan_works, quiet
 from scenarios.folder import Kind
 from scenarios.jobs import rehearsal_works
-from scenarios.rehearse import arm_seed, cool_motion, taught
+from scenarios.rehearse import twins
 from scenarios.scenario import Scenario
 from twin.checkpoint import CARD as TWIN_CARD
 from twin.checkpoint import load, save
@@ -37,7 +36,8 @@ def train_arms(
 ) -> list[Twin]:
     """The twins of some arms of a scenario, side by side, each taught what the fleet's twin of that arm is taught.
 
-    With the scenario's own configuration and seed they are the twins with which its fleet works.
+    With the scenario's own configuration and seed they are the twins with which its fleet works. All are taken from
+    the cache while their inputs are unchanged, and else trained and kept there.
 
     Args:
         arms: Which, by their place in the scenario; the twin of an arm does not depend on who is trained with it.
@@ -47,26 +47,14 @@ def train_arms(
         FleetError: an arm has no motion that stays cool, or the latent of a joint collapsed.
     """
     bodies = [body_of(scenario, index) for index in arms]
-    lessons = []
-    for done, (index, body) in enumerate(zip(arms, bodies, strict=True)):
+    plans = []
+    for done, body in enumerate(bodies):
 
         def share(s: float, done: int = done) -> None:
             progress("planning", (done + s) / len(arms))
 
-        possible, _ = plan_works(body[0], rehearsal_works(scenario), scenario, cache_folder(), share)
-        own = cool_motion(possible, body, scenario)
-        lessons.append((own, config, arm_seed(scenario.spread.seed if seed is None else seed, index)))
-    places = [{"scenario": scenario, "index": index, "body": body} for index, body in zip(arms, bodies, strict=True)]
-    progress("training", 0.0)
-    if len(arms) == 1:  # in this process, so that the bar moves within the training
-        return [taught(*lessons[0], **places[0], progress=lambda share: progress("training", share))]
-    work = (delayed(taught)(*lesson, **place) for lesson, place in zip(lessons, places, strict=True))
-    twins = []
-    with Parallel(n_jobs=min(len(arms), cpu_count()), return_as="generator") as pool:
-        for twin in pool(work):
-            twins.append(twin)
-            progress("training", len(twins) / len(arms))
-    return twins
+        plans.append(plan_works(body[0], rehearsal_works(scenario), scenario, cache_folder(), share)[0])
+    return twins(scenario, bodies, plans, cache_folder(), progress, arms=arms, config=config, seed=seed)
 
 
 LOG_RATE_HZ = 2.0

@@ -9,7 +9,7 @@ from scenarios.build import body_of, plan_works, quiet
 from scenarios.jobs import rehearsal_works
 from scenarios.known_arm import known_arm
 from scenarios.load import load, override
-from scenarios.rehearse import twins
+from scenarios.rehearse import taught, twins
 from scenarios.scenario import Scenario
 from scenarios.twin_training import quality, train_arms
 from twin.model import TwinConfig
@@ -35,7 +35,9 @@ def fleet(scenario, monkeypatch, plans) -> list[Twin]:
     return twins(scenario, bodies, planned, plans, quiet)
 
 
-def test_a_twin_trained_by_hand_is_that_of_the_fleet(scenario, fleet):
+def test_a_twin_trained_by_hand_is_that_of_the_fleet(scenario, fleet, plans, tmp_path, monkeypatch):
+    shutil.copytree(plans / "plans", tmp_path / "plans")  # and no twins: it is trained anew
+    monkeypatch.setenv("THERMOFLEET_CACHE", str(tmp_path))
     told = []
     (right,) = train_arms(scenario, [1], TINY, progress=lambda *tell: told.append(tell))
     assert right.arm == "right"
@@ -46,8 +48,40 @@ def test_a_twin_trained_by_hand_is_that_of_the_fleet(scenario, fleet):
     assert told[-1] == ("training", 1.0)
 
 
-def test_who_is_trained_beside_it_does_not_matter_and_another_seed_does(scenario, fleet, monkeypatch):
-    monkeypatch.setattr("scenarios.twin_training.cpu_count", lambda: 1)
+def test_the_twins_of_the_fleet_are_not_trained_again(scenario, fleet, monkeypatch):
+    def never(*_args, **_more):
+        raise AssertionError("trained again")
+
+    monkeypatch.setattr("scenarios.rehearse.taught", never)
+    kept = train_arms(scenario, [0, 1], TINY)
+    assert [quality(twin) for twin in kept] == [quality(twin) for twin in fleet]
+    with pytest.raises(AssertionError, match="trained again"):
+        train_arms(scenario, [1], replace(TINY, epochs=3))
+
+
+def test_what_is_trained_by_hand_is_kept_by_its_seed_and_that_of_its_exploration(scenario, fleet, monkeypatch):
+    (first,) = train_arms(scenario, [1], TINY, seed=6)
+    trained = []
+
+    def counted(*args, **more):
+        trained.append(more["index"])
+        return taught(*args, **more)
+
+    monkeypatch.setattr("scenarios.rehearse.taught", counted)
+    (again,) = train_arms(scenario, [1], TINY, seed=6)
+    assert (again.version, trained) == (first.version, [])
+    # Arms of one body and one plan, but other exploration: weights of seed 6 are not those of scenario 6.
+    even = override(scenario, spread={"seed": 4, "scale": 0.0})
+    (of_hand,) = train_arms(even, [1], TINY, seed=6)
+    (of_fleet,) = train_arms(override(even, spread={"seed": 6, "scale": 0.0}), [1], TINY)
+    assert trained == [1, 1]
+    assert of_hand.seed == of_fleet.seed
+    assert of_hand.data_hash != of_fleet.data_hash
+
+
+def test_who_is_trained_beside_it_does_not_matter_and_another_seed_does(scenario, fleet, tmp_path, monkeypatch, plans):
+    shutil.copytree(plans / "plans", tmp_path / "plans")  # and no twins: all are trained anew
+    monkeypatch.setenv("THERMOFLEET_CACHE", str(tmp_path))
     assert [twin.version for twin in train_arms(scenario, [0, 1], TINY)] == [twin.version for twin in fleet]
     (other,) = train_arms(scenario, [0], TINY, seed=5)
     assert other.data_hash == fleet[0].data_hash
