@@ -148,11 +148,16 @@ twin_app.command("export")(export_command)
 
 @contextmanager
 def in_options() -> Iterator[None]:
-    """What a collapse says one may change, as options."""
+    """What a collapse or a log that teaches nothing says one may change, as options."""
+    from twin.cool import NothingCool, TooShort
     from twin.train import CollapsedPosterior
 
     try:
         yield
+    except TooShort as error:
+        raise FleetError(f"{error.fact} Log for longer, or take a smaller --window.") from error
+    except NothingCool as error:
+        raise FleetError(f"{error.fact} Raise --cool, or log lighter work.") from error
     except CollapsedPosterior as error:
         names = r"\b(epochs|max_windows|allow_collapse|beta)\b"
         raise FleetError(re.sub(names, lambda n: f"--{n[1].replace('_', '-')}", str(error))) from error
@@ -223,6 +228,9 @@ def config_of(size: str, given: dict[str, Any], *, of_log: bool = False) -> Any:
     from twin.model import TwinConfig
 
     base = TwinConfig.quick() if size == "quick" else TwinConfig()
+    # Windows smaller than the usual step between them would leave out what lies between.
+    window = max(1, given.get("window", base.window))
+    base = replace(base, stride=min(base.stride, window), score_stride=min(base.score_stride, window))
     try:
         config = replace(log_config(base) if of_log else base, **given)
     except ValueError as error:

@@ -16,7 +16,22 @@ TREND_S = 60.0
 
 
 class NothingCool(FleetError):
-    """No part of the recordings stayed cool, so a twin would have nothing to learn from."""
+    """No part of the recordings stayed cool, so a twin would have nothing to learn from.
+
+    Attributes:
+        fact: What was found, without the advice that follows it.
+    """
+
+    def __init__(self, fact: str, advice: str) -> None:
+        super().__init__(f"{fact} {advice}")
+        self.fact, self.advice = fact, advice
+
+    def __reduce__(self) -> tuple[type, tuple[str, str]]:
+        return type(self), (self.fact, self.advice)
+
+
+class TooShort(NothingCool):
+    """What stayed cool is shorter than what a twin looks at."""
 
 
 def cool_stretches(
@@ -40,24 +55,29 @@ def cool_stretches(
         horizon_s: How far a moment's work shows in the temperatures; inf is the rest of the
             recording, whatever would have come after it.
         joints: Index 0..6 of the motors that count; None is all.
-        least_s: Shorter stretches are left out.
+        least_s: Shorter stretches are left out; where a twin is to learn from them, its window.
 
     Raises:
+        TooShort: there are such stretches, all shorter than `least_s`.
         NothingCool: there is no such stretch; tells which motors are warm.
         ValueError: no recordings, one without temperatures, or limits of another number of joints.
     """
     if not recordings:
         raise ValueError("There are no recordings to choose from.")
     found: list[Stretch] = []
+    whole = True
     for recording in recordings:
         limit_c = _limits(recording, cool_c, joints)
         cool = cool_moments(recording, limit_c, horizon_s)
+        whole &= bool(cool.all())
         for piece in _runs(cool):
-            part = recording.part(piece)
-            found += [s for s in stretches(part, rate_hz, gap_s=gap_s) if len(s.time_s) >= least_s * rate_hz]
+            found += stretches(recording.part(piece), rate_hz, gap_s=gap_s)
     if not found:
-        raise NothingCool(_advice(recordings, cool_c, joints, horizon_s))
-    return found
+        raise _nothing_cool(recordings, cool_c, joints, horizon_s)
+    long = [s for s in found if len(s.time_s) >= least_s * rate_hz]
+    if not long:
+        raise _too_short(max(len(s.time_s) for s in found) / rate_hz, least_s, whole=whole)
+    return long
 
 
 def cool_moments(recording: Recording, limit_c: Array, horizon_s: float) -> Array:
@@ -114,19 +134,37 @@ def _runs(mask: Array) -> list[slice]:
     return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
-def _advice(
+def _nothing_cool(
     recordings: Sequence[Recording],
     cool_c: float | Sequence[float] | Array,
     joints: Sequence[int] | None,
     horizon_s: float,
-) -> str:
+) -> NothingCool:
     coolest = np.min([r.temp_c.min(axis=0) for r in recordings if r.temp_c is not None and len(r.time_s)], axis=0)
     limit_c = _limits(recordings[0], cool_c, joints)
+    counted = np.flatnonzero(np.isfinite(limit_c))
+    names = ", ".join(str(j + 1) for j in counted)
+    some = f"motor {names} never" if len(counted) == 1 else f"none of motors {names}"
+    who = "no motor" if len(counted) == len(limit_c) else some
+    least_c, most_c = limit_c[counted].min(), limit_c[counted].max()
+    limit = f"{least_c:g} °C" if least_c == most_c else f"its {least_c:g} to {most_c:g} °C"
+    until = f"{horizon_s:g} s" if np.isfinite(horizon_s) else "a rest of the recording"
     always = [f"{j + 1} ({coolest[j]:.1f} °C)" for j in np.flatnonzero(coolest >= limit_c)]
-    least = f"Of all samples the coolest of joint {', '.join(always)} is over its limit. " if always else ""
-    return (
-        f"No moment of {len(recordings)} recording(s) is followed by {horizon_s:g} s in which all motors that count "
-        f"stay below {np.unique(limit_c[np.isfinite(limit_c)]).round(1).tolist()} °C. {least}Raise cool_c (idle wrists "
-        "of a Gen3 sit at 40 to 43 °C: limits may differ by joint), count fewer joints, shorten horizon_s, or record "
-        "light work."
+    least = f" Of all samples the coolest of joint {', '.join(always)} is over its limit." if always else ""
+    return NothingCool(
+        f"No moment of {_counted(len(recordings))} is followed by {until} in which {who} reaches {limit}.{least}",
+        "Raise cool_c (idle wrists of a Gen3 sit at 40 to 43 °C: limits may differ by joint), count fewer joints, "
+        "shorten horizon_s, or record light work.",
     )
+
+
+def _too_short(longest_s: float, least_s: float, *, whole: bool) -> TooShort:
+    what = "What was recorded" if whole else "What stays cool"
+    return TooShort(
+        f"{what} is shorter than one window: {least_s:.4g} s are needed, the longest stretch has {longest_s:.4g} s.",
+        "Record for longer, or look at less at a time (least_s).",
+    )
+
+
+def _counted(recordings: int) -> str:
+    return "one recording" if recordings == 1 else f"{recordings} recordings"

@@ -173,7 +173,23 @@ def test_a_damaged_log_can_be_read_without_its_bad_lines(thermofleet, twins, tmp
 def test_a_log_of_a_hot_arm_teaches_nothing(thermofleet, logs, tmp_path):
     said = thermofleet("twin", "train", "--log", logs / "hot.csv", *TINY, "--out", tmp_path / "twins")
     assert said.code == 2
-    assert "No moment of 1 recording(s) is followed by" in said.err
+    assert said.err == (
+        "Error: No moment of one recording is followed by a rest of the recording in which none of motors 1, 2, 3, 4 "
+        "reaches 40 °C. Of all samples the coolest of joint 2 (55.0 °C) is over its limit. "
+        "Raise --cool, or log lighter work.\n"
+    )
+
+
+def test_a_log_shorter_than_a_window_is_told_so(thermofleet, tmp_path):
+    (tmp_path / "short.csv").write_text(log_csv(20, celsius=30.0), encoding="utf-8")
+    train = ("twin", "train", "--log", tmp_path / "short.csv", *TINY, "--out", tmp_path / "twins")
+    said = thermofleet(*train)
+    assert said.code == 2
+    assert said.err == (
+        "Error: What was recorded is shorter than one window: 25 s are needed, the longest stretch has 20 s. Log for "
+        "longer, or take a smaller --window.\n"
+    )
+    assert thermofleet(*train, "--window", 20).code == 0
 
 
 def test_a_collapse_is_told_with_the_options_that_mend_it(thermofleet, logs, tmp_path):

@@ -1,9 +1,11 @@
 """Cool is what stays cool: the horizon decides, not the moment."""
 
+import pickle
+
 import numpy as np
 import pytest
 
-from twin.cool import NothingCool, cool_moments, cool_stretches
+from twin.cool import NothingCool, TooShort, cool_moments, cool_stretches
 from twin.recording import Recording
 
 JOINTS = 7
@@ -68,10 +70,29 @@ def test_stretches_come_from_the_cool_parts_alone():
 
 
 def test_all_critical_says_what_to_do():
-    with pytest.raises(NothingCool, match=r"1 recording.*60 s.*\[40.0\].*joint 2 \(50.0 °C\).*Raise cool_c"):
-        cool_stretches([warmed(np.full(100, 50.0))], 1.0, cool_c=40.0, horizon_s=60.0)
+    hot = [warmed(np.full(100, 50.0))]
+    words = r"one recording .* 60 s in which no motor reaches 40 °C\..*joint 2 \(50.0 °C\).*Raise cool_c"
+    with pytest.raises(NothingCool, match=words):
+        cool_stretches(hot, 1.0, cool_c=40.0, horizon_s=60.0)
+    words = (
+        r"^No moment of 2 recordings .* by a rest of the recording in which none of motors 2, 3 reaches its 40 to 45 °C"
+    )
+    with pytest.raises(NothingCool, match=words) as refused:
+        cool_stretches(hot * 2, 1.0, cool_c=[40, 40, 45, 40, 40, 40, 40], horizon_s=np.inf, joints=[1, 2])
+    assert refused.value.fact.endswith("joint 2 (50.0 °C) is over its limit.")
+    again = pickle.loads(pickle.dumps(refused.value))  # it may come out of another process
+    assert (str(again), again.fact) == (str(refused.value), refused.value.fact)
     with pytest.raises(ValueError, match="no recordings"):
         cool_stretches([], 1.0, cool_c=40.0, horizon_s=60.0)
+
+
+def test_too_short_is_not_told_as_too_hot():
+    with pytest.raises(TooShort, match=r"^What was recorded is shorter .* 25 s are needed, the longest .* has 10 s\."):
+        cool_stretches([warmed(np.full(10, 30.0))] * 2, 1.0, cool_c=40.0, horizon_s=60.0, least_s=25.0)
+    temp_c = np.full(100, 35.0)
+    temp_c[12::13] = 50.0
+    with pytest.raises(TooShort, match=r"^What stays cool is shorter .* 25 s are needed, the longest .* has 12 s\."):
+        cool_stretches([warmed(temp_c)], 1.0, cool_c=40.0, horizon_s=0.0, least_s=25.0)
 
 
 def test_bad_arguments_are_named():
