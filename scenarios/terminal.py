@@ -17,10 +17,14 @@ Progress = Callable[[str, float], None]
 """Told what is going on and the share of it that is done, 0 to 1."""
 
 LONG_STAGES = {
-    "training": "Training the twins that are not in the cache: two or three minutes for a fleet of four …",
+    "training": "Training the twins that are not in the cache: up to a minute per arm and core, at full size some minutes …",
+    "learning the log": "Training the twin of the log: up to a minute, at full size some minutes …",
+    "teaching": "Training the networks that the report compares and the cache lacks: the longest part …",
     "comparing": "Comparing the policies …",
 }
 """What is said of a stage that takes long where there is no terminal to draw a bar on."""
+COUNTED = "computing "
+"""Begins the name of a stage that counts what there is to do; where there is no bar, each is said as it is."""
 
 
 class Interrupted(FleetError):
@@ -28,8 +32,11 @@ class Interrupted(FleetError):
 
 
 @contextmanager
-def progress_bar() -> Iterator[Progress]:
-    """A bar on standard error that names the stage.
+def progress_bar(*, kept: str = "Plans and twins already made are") -> Iterator[Progress]:
+    """A bar on standard error that names the stage; where there is no terminal, a line for each that takes long.
+
+    Args:
+        kept: What is found in the cache after an interruption, as the beginning of a sentence; empty for nothing.
 
     Raises:
         Interrupted: Ctrl-C in a stage that keeps nothing but what is in the cache.
@@ -47,19 +54,18 @@ def progress_bar() -> Iterator[Progress]:
         task = bar.add_task("starting", total=1.0)
 
         def tell(stage: str, share: float) -> None:
-            if not err_console.is_terminal and stage != bar.tasks[0].description and share < 1.0:
-                said = LONG_STAGES.get(stage)
-                if said:
-                    say(said)
+            if not err_console.is_terminal and stage != bar.tasks[0].description:
+                if stage.startswith(COUNTED):
+                    say(f"{stage[0].upper()}{stage[1:]}")
+                elif share < 1.0 and stage in LONG_STAGES:
+                    say(LONG_STAGES[stage])
             bar.update(task, description=stage, completed=share)
 
         try:
             yield tell
         except KeyboardInterrupt:
-            raise Interrupted(
-                f"Interrupted while {bar.tasks[0].description}: nothing was written. Plans and twins already made are "
-                f"kept in {cache_folder()}, and the same command goes on from there."
-            ) from None
+            again = f" {kept} kept in {cache_folder()}, and the same command goes on from there." if kept else ""
+            raise Interrupted(f"Interrupted while {bar.tasks[0].description}: nothing was written.{again}") from None
 
 
 def say(sentence: str, console: Console = err_console) -> None:

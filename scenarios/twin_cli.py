@@ -51,7 +51,9 @@ def train_command(
     restarts: Annotated[int | None, typer.Option(help="Trainings per network; the best ELBO stays.")] = None,
     beta: Annotated[float | None, typer.Option(help="Weight of the KL term.")] = None,
     max_windows: Annotated[int | None, typer.Option(help="Training uses at most so many windows.")] = None,
-    cool: Annotated[float, typer.Option(help="--log: what stays below is normal, °C.")] = 40.0,
+    cool: Annotated[
+        float, typer.Option(help="--log: what motors 1 to 4 stay below is normal, °C; wrists do not count.")
+    ] = 40.0,
     allow_collapse: Annotated[
         bool, typer.Option("--allow-collapse", help="Keep a twin whose latent says nothing, as a baseline.")
     ] = False,
@@ -89,7 +91,9 @@ def train_command(
     from scenarios.twin_training import TWINS, save_twins, train_arms, train_log
 
     check_free(out, overwrite=overwrite, kind=TWINS)
-    with in_options(), progress_bar() as progress, new_folder(out, overwrite=overwrite, kind=TWINS) as folder:
+    # What is learned of a log is kept in --out alone.
+    bar = progress_bar() if log is None else progress_bar(kept="")
+    with in_options(), bar as progress, new_folder(out, overwrite=overwrite, kind=TWINS) as folder:
         if log is not None:
             config = config_of("quick" if size is None else size, given, of_log=True)
             twins = [train_log(recordings_of(log, skip_damaged), config, seed or 0, cool_c=cool, progress=progress)]
@@ -172,7 +176,9 @@ def report_command(
     ),
     arm: Annotated[str | None, typer.Option(help="Which arm of the scenario; default the first.")] = None,
     seeds: Annotated[int, typer.Option(help="How many; figures with a spread are repeated under each.")] = 3,
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer jobs, smaller trainings.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Fewer jobs, smaller trainings: some 20 min on two cores.")
+    ] = False,
     skip_damaged: DamagedOption = False,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
@@ -195,7 +201,8 @@ def report_command(
 
     check_free(out, overwrite=overwrite, kind=REPORT)
     command = f"thermofleet twin report {f'--log {log.name}' if log else chosen} --seeds {seeds}{' --quick' * quick}"
-    with progress_bar() as progress, new_folder(out, overwrite=overwrite, kind=REPORT) as folder:
+    bar = progress_bar(kept="Twins and sections already made are")
+    with bar as progress, new_folder(out, overwrite=overwrite, kind=REPORT) as folder:
         told: dict[str, Any] = {"seeds": range(seeds), "command": command, "progress": progress}
         if log is not None:
             sections = report_logs(recordings_of(log, skip_damaged), quick=quick, **told)

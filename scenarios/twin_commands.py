@@ -39,7 +39,7 @@ def identify_command(
     from twin.rc_checkpoint import save
 
     recordings = recordings_of(log, skip_damaged)
-    with progress_bar() as progress:
+    with progress_bar(kept="") as progress:
         progress("identifying", 0.0)
         found = identify(recordings, arm=arm, ambient_c=ambient)
     if out is not None:

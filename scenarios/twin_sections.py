@@ -22,6 +22,7 @@ import scenarios
 import twin
 from fleet.errors import FleetError
 from scenarios.build import Progress, quiet
+from scenarios.terminal import COUNTED
 from scenarios.twin_page import Section
 
 log = logging.getLogger(__name__)
@@ -111,6 +112,7 @@ def computed(
     Args:
         subject: What the chapters work on; pickled where there are several processes.
         shelf: Where finished sections are kept, and found again.
+        progress: Told of each section as it begins; where they are computed side by side, as it ends.
     """
     found = {entry.key: section for entry in entries if shelf and (section := shelf.read(entry.key))}
     groups: dict[str, list[Entry]] = {}
@@ -124,14 +126,15 @@ def computed(
         with Parallel(n_jobs=min(processes, len(ordered)), return_as="generator_unordered") as pool:
             for sections in pool(delayed(_group)(group, subject, shelf) for group in ordered):
                 assert sections is not None
-                found |= {section.key: section for section in sections}
-                done = sum(entry.load for group in ordered for entry in group if entry.key in found)
-                progress("sections", done / total)
+                for section in sections:
+                    found[section.key] = section
+                    done += next(entry.load for entry in entries if entry.key == section.key)
+                    progress(f"{COUNTED}sections, {len(found)} of {len(entries)} done: {section.title}", done / total)
     else:
-        for group in ordered:
-            progress(group[0].title.lower(), done / total)
-            found |= {section.key: section for section in _group(group, subject, shelf)}
-            done += sum(entry.load for entry in group)
+        for entry in (entry for group in ordered for entry in group):
+            progress(f"{COUNTED}section {len(found) + 1} of {len(entries)}: {entry.title}", done / total)
+            found[entry.key] = _section(entry, subject, shelf)
+            done += entry.load
     return [found[entry.key] for entry in entries]
 
 

@@ -87,14 +87,14 @@ def train_log(
     config = replace(config, record_hz=config.rate_hz)
     least_s = config.window / config.rate_hz
     cool = cool_stretches(recordings, config.rate_hz, cool_c=cool_c, horizon_s=np.inf, joints=LOADED, least_s=least_s)
-    progress("training", 0.0)
+    progress("learning the log", 0.0)
     own = np.random.SeedSequence([seed, 0])
     return train(
         [stretch.profile for stretch in cool],
         config,
         own,
         arm=names[0],
-        progress=lambda share: progress("training", share),
+        progress=lambda share: progress("learning the log", share),
     )
 
 

@@ -86,6 +86,19 @@ def test_training_again_gives_the_same_twin_and_tells_its_quality(thermofleet, l
     assert all(fit["mean_squared_error"] > 0 for fit in told["twins"][0]["networks"])
 
 
+def test_ctrl_c_while_learning_a_log_promises_nothing(thermofleet, logs, tmp_path, monkeypatch):
+    def interrupted(*_args, **_more):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("scenarios.twin_training.train", interrupted)
+    said = thermofleet("twin", "train", "--log", logs / "cool", *TINY, "--out", tmp_path / "twins")
+    assert said.code == 130
+    first, *_, last = said.err.splitlines()
+    assert first.startswith("Training the twin of the log: ")
+    assert last == "Interrupted while learning the log: nothing was written."
+    assert not (tmp_path / "twins").exists()
+
+
 def test_scores_as_a_table_name_the_twin(thermofleet, twins, logs):
     said = thermofleet("twin", "score", twins, "--log", logs / "hot.csv")
     version = json.loads((twins / "twins.json").read_text(encoding="utf-8"))["twins"][0]["version"]

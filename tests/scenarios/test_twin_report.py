@@ -130,8 +130,14 @@ def test_sections_come_in_order_whatever_is_computed_first_or_beside(processes, 
     chapters = [entry(key, itemgetter(key), **more) for key, more in how.items()]
     sections = {key: Section(key=key, title=key) for key in how}
     shelf = Shelf(tmp_path, "basis")
-    found = computed(chapters, sections, shelf=shelf, processes=processes)
+    told = []
+    found = computed(chapters, sections, shelf=shelf, processes=processes, progress=lambda *tell: told.append(tell))
     assert found == list(sections.values())
+    stages = [stage for stage, _ in told if stage.startswith("computing ")]
+    # Titles of sections are their keys here, those of chapters are not.
+    assert sorted(stage[-1] for stage in stages) == ["a", "b", "c"]
+    count = [f"section {n} of 3: Chapter " if processes == 1 else f"sections, {n} of 3 done: " for n in (1, 2, 3)]
+    assert [stage[:-1] for stage in stages] == [f"computing {words}" for words in count]
     assert [shelf.read(key) for key in how] == found
 
 
