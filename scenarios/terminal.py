@@ -17,7 +17,7 @@ Progress = Callable[[str, float], None]
 """Told what is going on and the share of it that is done, 0 to 1."""
 
 LONG_STAGES = {
-    "training": "Training the twins that are not in the cache: up to a minute per arm and core, at full size some minutes …",
+    "training": "Training the twins that are not in the cache: a minute at most per arm and core, full ones minutes …",
     "learning the log": "Training the twin of the log: up to a minute, at full size some minutes …",
     "teaching": "Training the networks that the report compares and the cache lacks: the longest part …",
     "comparing": "Comparing the policies …",
