@@ -181,7 +181,7 @@ def told(damage: Sequence[Damage]) -> tuple[str, ...]:
         sentences.append(f"{lines}: {some[0].reason}")
     if len(sentences) > TOLD_LINES:
         more = len(sentences) - TOLD_LINES
-        sentences[TOLD_LINES:] = [f"and {more} more places like these"]
+        sentences[TOLD_LINES:] = [f"and {more} more damaged place{'s' * (more > 1)}"]
     return tuple(sentences)
 
 

@@ -121,7 +121,7 @@ def _refuse(path: Path, broken: Sequence[str], damage: Sequence[Damage]) -> None
     others = len(broken) + len(damage) - 1
     if others < 0:
         return
-    more = f", and {others} more place{'s' * (others > 1)} like this" if others else ""
+    more = f", and {others} more damaged place{'s' * (others > 1)}" if others else ""
     ask = f'{more}. The good rest can be read with damaged="skip".'
     if broken:
         raise LogError(str(path), None, f"{broken[0]}{ask}")

@@ -147,12 +147,12 @@ def test_an_end_in_the_middle_of_a_line_is_no_whole_line(gen3):
 def test_many_damaged_lines_are_told_shortly(gen3):
     cells = {(line, "Pos_0"): "x" for line in (*range(5, 15), 20)}
     path = gen3(cells, count=30)
-    assert "and 10 more places" in str(refused(path, "field 2, 'x'", 5))
+    assert "and 10 more damaged places. The good rest" in str(refused(path, "field 2, 'x'", 5))
     (recording,) = read(path, damaged="skip")
     assert [sentence.partition(":")[0] for sentence in recording.dropped] == ["lines 5 to 14", "line 20"]
     assert len(recording.time_s) == 19
     every_other = gen3({(line, "Pos_0"): "x" for line in range(5, 105, 2)}, count=110)
-    assert read(every_other, damaged="skip")[0].dropped[-1] == "and 30 more places like these"
+    assert read(every_other, damaged="skip")[0].dropped[-1] == "and 30 more damaged places"
 
 
 def test_a_clock_set_anew_is_two_recordings(tmp_path: Path):
