@@ -14,6 +14,7 @@ from fleet.robot import POSTURES
 from scenarios.load import load
 from scenarios.terminal import out_console, progress_bar, say
 from scenarios.twin_options import DamagedOption, JsonOption, OverwriteOption, TwinsArg, WhichOption, recordings_of
+from twin.identified import AMBIENT_C
 
 FORMATS = ("parquet", "csv")
 
@@ -30,28 +31,42 @@ def identify_command(
     log: Annotated[Path, typer.Option("--log", help="A log with motor temperatures, or a folder of logs of one arm.")],
     out: Annotated[Path | None, typer.Option(help="Folder for rc.json, to be predicted with.")] = None,
     arm: Annotated[str, typer.Option(help="The arm's name.")] = "arm",
-    ambient: Annotated[float, typer.Option(help="Air around the arm, °C.")] = 22.0,
+    ambient: Annotated[
+        float | None, typer.Option(help=f"Air around the arm, °C; {AMBIENT_C:g} is assumed unless you say.")
+    ] = None,
     skip_damaged: DamagedOption = False,
+    overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """The arm's thermal network from its own logs: values with 95 % intervals, and what stays unexplained."""
-    from twin.identify import identify
-    from twin.rc_checkpoint import save
+    """The arm's thermal network from its own logs: values with 95 % intervals, and what stays unexplained.
 
+    A day of logs takes half a minute to a minute.
+    """
+    from twin.identify import identify
+    from twin.rc_checkpoint import CARD, save
+
+    if out is not None and out.exists():
+        if not out.is_dir():
+            raise FleetError(f"Cannot write to '{out}': it is a file; --out needs a folder.")
+        if (out / CARD).exists() and not overwrite:
+            raise FleetError(f"'{out}' holds an identified arm; give another --out, or --overwrite to replace it.")
+    air_c = AMBIENT_C if ambient is None else ambient
     recordings = recordings_of(log, skip_damaged)
     with progress_bar(kept="") as progress:
         progress("identifying", 0.0)
-        found = identify(recordings, arm=arm, ambient_c=ambient)
+        found = identify(recordings, arm=arm, ambient_c=air_c)
     if out is not None:
         save(found, out)
     if as_json:
         parameters = [{**vars(p), "informed": p.informed} for p in found.parameters]
-        told = {"arm": arm, "version": found.version, "data_hash": found.data_hash, "rms_k": found.rms_k}
+        told: dict[str, Any] = {"arm": arm, "version": found.version, "data_hash": found.data_hash}
+        told |= {"out": None if out is None else str(out), "ambient_c": air_c, "rms_k": found.rms_k}
         typer.echo(json.dumps({**told, "parameters": parameters}, indent=1))
         return
-    table = Table(box=None, pad_edge=False, caption=f"version {found.version}, data {found.data_hash}")
-    for head in ("parameter", "joint", "value", "95 % from", "to", "prior", "told by the logs"):
-        table.add_column(head, justify="left" if head == "parameter" else "right")
+    caption = f"version {found.version}, data {found.data_hash}; told: whether the logs say more than the prior"
+    table = Table(box=None, pad_edge=False, caption=caption, caption_justify="left")
+    for head in ("parameter", "joint", "value", "95 % from", "to", "prior", "told"):
+        table.add_column(head, justify="left" if head == "parameter" else "right", no_wrap=head == "parameter")
     for p in found.parameters:
         numbers = (f"{v:.4g}" for v in (p.value, p.low, p.high, p.prior))
         table.add_row(p.name, "–" if p.joint is None else str(p.joint), *numbers, "yes" if p.informed else "no")
@@ -60,6 +75,9 @@ def identify_command(
     middle = sorted(worst.values())[len(worst) // 2]
     left = f"median {middle:.2f} K, most {max(worst.values()):.2f} K"
     say(f"Unexplained at the worst joint of a recording: {left}.", out_console)
+    mend = "" if ambient is not None else "; if yours was another, give it with --ambient"
+    say(f"Air of {air_c:g} °C was taken as given{mend}.", out_console)
+    say("Nothing was written; --out FOLDER keeps it." if out is None else f"Written to {out}.", out_console)
 
 
 def generate_command(
@@ -76,7 +94,10 @@ def generate_command(
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """New motion near what an arm knows: inside its limits, predicted to stay cool, performed in the simulator."""
+    """New motion near what an arm knows: inside its limits, predicted to stay cool, performed in the simulator.
+
+    Takes some 20 s once the arm's twin is in the cache.
+    """
     check_choices(seed, format_)
     if count < 1 or not strength >= 0:
         raise FleetError(f"--count must be 1 or more and --s 0 or more (got {count}, {strength:g}).")
@@ -117,7 +138,10 @@ def recover_command(
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """A nearby posture in which a warm arm holds its payload with less load, performed with and without."""
+    """A nearby posture in which a warm arm holds its payload with less load, performed with and without.
+
+    Takes some 20 s once the arm's twin is in the cache.
+    """
     check_choices(seed, format_)
     if not hold_s > 0:
         raise FleetError(f"--hold must be > 0 (got {hold_s:g}).")
@@ -157,10 +181,13 @@ def export_command(
     twins: TwinsArg,
     out: Annotated[Path, typer.Option(help="A file that ends in .onnx.")] = Path("twin.onnx"),
     arm: WhichOption = None,
+    overwrite: OverwriteOption = False,
 ) -> None:
-    """The twin as ONNX, to be scored without Python; needs the extra onnx."""
+    """The twin as ONNX, to be scored without Python; needs the extra onnx, which `make` installs."""
     if out.suffix != ".onnx":
         raise FleetError(f"--out must name a file that ends in .onnx (got '{out}').")
+    if out.exists() and not overwrite:
+        raise FleetError(f"'{out}' is there already; give another --out, or --overwrite to replace it.")
     from scenarios.twin_training import open_twin
     from twin.export import export_onnx
 

@@ -16,8 +16,8 @@ TINY = ("--hidden", 8, "--epochs", 10, "--max-windows", 150, "--restarts", 1, "-
 RATE_HZ = 2.0
 
 
-def log_csv(seconds: float, *, celsius: float, load: float = 1.0, seed: int = 0) -> str:
-    """A plain log: seven joints swinging at 2 Hz, joint 2 at one temperature, all others cool."""
+def log_csv(seconds: float, *, celsius: float, load: float = 1.0, seed: int = 0, warms_k: float = 0.0) -> str:
+    """A plain log: seven joints swinging at 2 Hz, joint 2 at one temperature or warming, all others cool."""
     rng = np.random.default_rng(seed)
     time_s = np.arange(0.0, seconds, 1 / RATE_HZ)
     omega = rng.uniform(0.1, 0.6, 7)
@@ -25,7 +25,7 @@ def log_csv(seconds: float, *, celsius: float, load: float = 1.0, seed: int = 0)
     qd = 0.5 * omega * np.cos(np.outer(time_s, omega))
     tau = load * 10 * np.cos(q) + rng.normal(0, 0.2, q.shape)
     temp_c = np.full(q.shape, 30.0)
-    temp_c[:, 1] = celsius
+    temp_c[:, 1] = celsius + warms_k * (1 - np.exp(-time_s / 300))
     head = ["time_s", *(f"{name}_{j}" for name in ("q", "qd", "tau", "temp_c") for j in range(1, 8))]
     rows = np.hstack([time_s[:, None], q, qd, tau, temp_c])
     return "\n".join([",".join(head), *(",".join(f"{v:.6f}" for v in row) for row in rows)]) + "\n"
@@ -220,6 +220,30 @@ def test_an_exported_twin_ends_in_onnx(thermofleet, twins, tmp_path):
     version = json.loads((twins / "twins.json").read_text(encoding="utf-8"))["twins"][0]["version"]
     assert version in thermofleet("twin", "export", twins, "--out", out).out
     assert version.encode() in out.read_bytes()
+    again = thermofleet("twin", "export", twins, "--out", out)
+    assert (again.code, "twin.onnx' is there already; give another --out" in again.err) == (2, True)
+    assert thermofleet("twin", "export", twins, "--out", out, "--overwrite").code == 0
+
+
+def test_an_identified_arm_is_told_whole_with_its_air_and_its_place_and_is_not_replaced(thermofleet, tmp_path):
+    (tmp_path / "monday.csv").write_text(log_csv(400, celsius=31.0, warms_k=5.0), encoding="utf-8")
+    identify = ("twin", "identify", "--log", tmp_path / "monday.csv", "--out", tmp_path / "rc")
+    said = thermofleet(*identify)
+    assert said.code == 0
+    assert "…" not in said.out  # also the longest name fits into 80 columns
+    assert "winding_housing_k_per_w" in said.out
+    assert (
+        f"Air of 22 °C was taken as given; if yours was another, give it with --ambient.\nWritten to {tmp_path / 'rc'}"
+        in (said.out)
+    )
+    before = (tmp_path / "rc" / "rc.json").read_bytes()
+    again = thermofleet(*identify, "--ambient", 25)
+    assert again.code == 2
+    assert "holds an identified arm; give another --out, or --overwrite to replace it." in again.err
+    assert (tmp_path / "rc" / "rc.json").read_bytes() == before
+    replaced = thermofleet(*identify, "--ambient", 25, "--overwrite")
+    assert "Air of 25 °C was taken as given.\n" in replaced.out
+    assert json.loads((tmp_path / "rc" / "rc.json").read_text(encoding="utf-8"))["ambient_c"] == 25.0
 
 
 def test_a_report_of_logs_that_stay_cool_says_what_is_missing_and_leaves_with_code_one(
