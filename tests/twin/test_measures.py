@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from fleet.errors import CheckpointError
 from fleet.motion import Phase
 from twin.checkpoint import CARD, load, save
-from twin.measures import Calibration, Features, measures_of, score_of
+from twin.measures import TIE, Calibration, Features, measures_of, score_of
 from twin.window import cut, resample
 
 errors = st.floats(0.0, 20.0)
@@ -82,7 +82,7 @@ def test_the_p_value_counts_cool_jobs_that_score_as_high(count, seed):
     new = Features(np.concatenate([packed(6, rng).packed, calibration.reference.packed[:2]]))  # the last two are ties
     reference = score_of(calibration.reference, "sum")
     for s, p in zip(score_of(new, "sum"), calibration.p_value(new, "sum"), strict=True):
-        assert p == (1 + sum(r >= s for r in reference)) / (count + 1)
+        assert p == (1 + sum(r >= s - TIE * abs(s) for r in reference)) / (count + 1)  # what is nearly as high counts
 
 
 def test_cool_jobs_raise_false_alarms_as_often_as_asked():
