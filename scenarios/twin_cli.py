@@ -64,7 +64,11 @@ def train_command(
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Train the twins of a scenario's arms, or of the arm whose logs are given; arms are trained side by side."""
+    """Train the twins of a scenario's arms, or of the arm whose logs are given; arms are trained side by side.
+
+    Quick takes up to a minute per arm and core, full some four minutes; what is in the cache, as the fleet's own twins after a
+    run of the scenario, takes seconds. Of logs nothing is kept but what is written to --out.
+    """
     chosen = one_source(scenario, log)
     if seed is not None and seed < 0:
         raise FleetError(f"--seed must be 0 or more (got {seed}).")
@@ -122,7 +126,10 @@ def score_command(
     format_: Annotated[str, typer.Option("--format", help="table, csv or json.")] = "table",
     skip_damaged: DamagedOption = False,
 ) -> None:
-    """Score every job of a scenario, or a log window by window; every line can be traced to the twin's version."""
+    """Score every job of a scenario, or a log window by window; every line can be traced to the twin's version.
+
+    Takes seconds, and half a minute where the jobs have to be planned first.
+    """
     one_source(scenario, log)
     if format_ not in ("table", "csv", "json"):
         raise FleetError(f"No format '{format_}'{nearest(format_, ('table', 'csv', 'json'))}")
