@@ -66,8 +66,8 @@ def train_command(
 ) -> None:
     """Train the twins of a scenario's arms, or of the arm whose logs are given; arms are trained side by side.
 
-    Quick takes up to a minute per arm and core, full some four minutes; what is in the cache, as the fleet's own twins after a
-    run of the scenario, takes seconds. Of logs nothing is kept but what is written to --out.
+    Quick takes up to a minute per arm and core, full some four minutes; what is in the cache, as the fleet's own
+    twins after a run of the scenario, takes seconds. Of logs nothing is kept but what is written to --out.
     """
     chosen = one_source(scenario, log)
     if seed is not None and seed < 0:
