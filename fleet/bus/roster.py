@@ -47,7 +47,7 @@ class Participant(msgspec.Struct, frozen=True):
     @property
     def file(self) -> str:
         """Name of its files, without the ending; no name can leave the folder."""
-        return keys.chunk(self.name)
+        return file_of(self.name)
 
     @property
     def common_name(self) -> str:
@@ -110,6 +110,14 @@ def read_roster(folder: Path) -> Roster:
         raise BusError(f"Cannot read '{path}': {error.strerror}.") from error
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise BusError(f"'{path}' is no roster: {error}.") from error
+
+
+def file_of(name: str) -> str:
+    """What the files of a participant are called, without their ending: its name as in keys, but never hidden, and
+    never `.` or `..`; `urllib.parse.unquote` is the inverse.
+    """
+    written = keys.chunk(name)
+    return f"%2E{written[1:]}" if written.startswith(".") else written
 
 
 @dataclass(frozen=True)

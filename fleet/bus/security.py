@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-from fleet.bus.keys import chunk
+from fleet.bus.roster import file_of
 from fleet.errors import BusError
 
 _LOG = logging.getLogger(__name__)
@@ -80,7 +80,7 @@ class Tls:
 
     @property
     def _file(self) -> str:
-        return chunk(self.name)
+        return file_of(self.name)
 
     def _path(self, file: str) -> Path:
         return Path(os.path.abspath(self.folder)) / file

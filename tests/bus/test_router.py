@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fleet.bus.router import Router, loopback, open_client, reachable
@@ -119,6 +119,8 @@ def test_an_endpoint_and_a_certificate_belong_together(endpoint, tls, reason):
 @given(
     st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=20), st.sampled_from(["keys", "/a b/c#d"])
 )
+@example(".", "keys")
+@example("..", "keys")
 def test_an_endpoint_may_say_who_connects(name, folder):
     tls = Tls(Path(folder), name)
     assert identified(tls.endpoint("tls/127.0.0.1:7447")) == ("tls/127.0.0.1:7447", tls)
