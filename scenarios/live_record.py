@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from fleet.errors import FleetError
+from scenarios.live_options import ENDPOINT, EndpointOption
 from scenarios.terminal import out_console, say
 
 if TYPE_CHECKING:
@@ -42,15 +43,10 @@ def record(link: "Link", folder: Path, *, rotate_s: float, stopped: Callable[[],
     return recorder
 
 
-EndpointOption = Annotated[
-    str, typer.Option(envvar="THERMOFLEET_ENDPOINT", help="Of the fleet's router.", metavar="tcp/127.0.0.1:PORT")
-]
-
-
 def record_command(
     fleet: Annotated[str, typer.Argument(help="Name of the fleet, as a rule that of its scenario.")],
     out: Annotated[Path, typer.Option(help="Folder of the recording; one that was broken off goes on.")],
-    endpoint: EndpointOption = "tcp/127.0.0.1:7447",
+    endpoint: EndpointOption = ENDPOINT,
     rotate: Annotated[float, typer.Option(help="Real seconds after which a part is written.")] = 60.0,
 ) -> None:
     """Write what the arms and the auctioneer say to Parquet, in parts that can be read while it goes on."""
@@ -70,7 +66,7 @@ def record_command(
 
 def replay_command(
     path: Annotated[Path, typer.Argument(help="Folder of a run or of a recording.")],
-    endpoint: EndpointOption = "tcp/127.0.0.1:7447",
+    endpoint: EndpointOption = ENDPOINT,
     fleet: Annotated[str | None, typer.Option(help="Under which name; default that of the recording.")] = None,
     speed: Annotated[float, typer.Option(help="Recorded seconds per real second.")] = 1.0,
 ) -> None:
