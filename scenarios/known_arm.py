@@ -7,11 +7,10 @@ from fleet.errors import FleetError
 from fleet.motion import Plan
 from fleet.sim.world import Arm
 from scenarios.build import Progress, body_of, cache_folder, plan_works, quiet
-from scenarios.cool import some_cool_plans
 from scenarios.generate import Verification
 from scenarios.jobs import rehearsal_works
 from scenarios.perform import alone
-from scenarios.rehearse import twins
+from scenarios.rehearse import cool_motion, twins
 from scenarios.scenario import Scenario
 from twin.score import Twin
 
@@ -54,7 +53,7 @@ def known_arm(
     )
     if twin is None:
         (twin,) = twins(scenario, [body], [possible], folder, progress, arms=[index])
-    sources = some_cool_plans([plan for ways in possible.values() for plan in ways], body, scenario)
+    sources = cool_motion(possible, body, scenario)
     spec = scenario.twin
     verification = Verification.nominal(robot, spec.ambient_c, cool_c=spec.cool_c, horizon_s=spec.horizon_s)
     return KnownArm(alone(robot, motors, thermal), twin, sources, verification)
