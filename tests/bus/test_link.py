@@ -153,6 +153,7 @@ def test_who_comes_and_goes_is_seen(bus):
     serve(lambda: ("arm_0", True) in seen, watcher)
     arm.close()
     serve(lambda: ("arm_0", False) in seen, watcher)
+    assert seen.index(("arm_0", True)) < seen.index(("arm_0", False))
 
 
 def test_what_nobody_handles_pushes_out_the_oldest(bus):
