@@ -407,7 +407,10 @@ def _outcome(fleet: Fleet, taken: set[str]) -> Outcome:
 
 def _every_key(fleet: str, arms: tuple[str, ...]) -> list[keys.Key]:
     named = [keys.Key(fleet, "arm", arm, topic) for arm in (*arms, "nobody") for topic in keys.TOPICS["arm"]]
-    auction = [keys.Key(fleet, "auction", "auctioneer", topic) for topic in keys.TOPICS["auction"]]
+    auction = [
+        keys.Key(fleet, "auction", "auctioneer", topic, arms[0] if topic in keys.ASKED else "")
+        for topic in keys.TOPICS["auction"]
+    ]
     rest = [keys.Key(fleet, role, "", topic) for role in keys.NAMELESS for topic in keys.TOPICS[role]]
     return [*named, *auction, *rest]
 

@@ -37,8 +37,8 @@ class Allocator:
             f"{self.root}/jobs/submit": ("Submission", "Submitted", self.submit),
             f"{self.root}/jobs/status": ("StatusRequest", "Status", self.tell),
             f"{self.root}/clock/now": ("ClockRequest", "Clock", lambda _: {"time_s": self.now_s(), "speed": 1.0}),
-            f"{self.mine}/lease": ("LeaseRequest", "Lease", self.lease),
-            f"{self.mine}/report": ("Report", "Receipt", self.report),
+            f"{self.mine}/lease/*": ("LeaseRequest", "Lease", self.lease),
+            f"{self.mine}/report/*": ("Report", "Receipt", self.report),
         }
         for key, (asked, said, make) in places.items():
             self.session.declare_queryable(key, self.hand_over(key, asked, said, make), complete=True)
@@ -60,14 +60,20 @@ class Allocator:
 
         def answer(query):
             with query:
+                asker = str(query.key_expr).rsplit("/", 1)[1]
+                mine, kind = key.replace("*", asker), said
+                if "*" in mine:  # asked under a wildcard: by whom?
+                    return
                 try:
                     if str(query.encoding) != encoding(asked):
                         raise ValueError(f"encoded as {query.encoding}, not as {encoding(asked)}")
-                    word = make(json.loads(query.payload.to_bytes()))
+                    word = json.loads(query.payload.to_bytes())
+                    if mine != key and word["arm"] != unquote(asker):
+                        raise ValueError(f"{unquote(asker)} speaks for {word['arm']}")
+                    word = make(word)
                 except (ValueError, KeyError, TypeError, AttributeError) as error:
-                    query.reply_err(f"Not a good {asked}: {error!r}".encode())
-                else:
-                    query.reply(key, json.dumps(word), encoding=encoding(said))
+                    word, kind = {"reason": f"Not a good {asked}: {error!r}"}, "Refusal"
+                query.reply(mine, json.dumps(word), encoding=encoding(kind))
 
         return lambda query: self.inbox.put(lambda: answer(query))
 
@@ -223,7 +229,7 @@ class Allocator:
         )
         answers = {}
         for reply in replies:
-            if reply.ok is not None:
+            if reply.ok is not None and str(reply.ok.encoding) != encoding("Refusal"):
                 arm = unquote(str(reply.ok.key_expr).split("/")[4])
                 answers[arm] = json.loads(reply.ok.payload.to_bytes())
         return answers

@@ -41,7 +41,7 @@ class Arm:
         for reply in self.session.get(
             f"{self.root}/clock/now", payload="{}", encoding=encoding("ClockRequest"), timeout=1.0
         ):
-            if reply.ok is not None:
+            if reply.ok is not None and str(reply.ok.encoding) == encoding("Clock"):
                 clock = json.loads(reply.ok.payload.to_bytes())
                 return clock["time_s"] - clock["speed"] * time.monotonic(), clock["speed"]
         return -time.monotonic(), 1.0
@@ -97,11 +97,10 @@ class Arm:
                     raise ValueError(f"encoded as {query.encoding}, not as {encoding(kind)}")
                 word = json.loads(query.payload.to_bytes())
                 said = self.make_quote(word) if topic == "quote" else self.take(word)
-            except (ValueError, KeyError, TypeError, AttributeError) as error:
-                query.reply_err(f"Not a good {kind}: {error!r}".encode())
-            else:
                 reply = {"quote": "Quote", "award": "Ack"}[topic]
-                query.reply(f"{self.mine}/{topic}", json.dumps(said), encoding=encoding(reply))
+            except (ValueError, KeyError, TypeError, AttributeError) as error:
+                said, reply = {"reason": f"Not a good {kind}: {error!r}"}, "Refusal"
+            query.reply(f"{self.mine}/{topic}", json.dumps(said), encoding=encoding(reply))
 
     def make_quote(self, word):
         """What each job would cost; a dry run leaves no trace."""
@@ -224,11 +223,12 @@ class Arm:
         """Ask the auctioneer something without waiting; no answer is no answer."""
 
         def came(reply):
-            if reply.ok is not None:
+            if reply.ok is not None and str(reply.ok.encoding) != encoding("Refusal"):
                 answer = json.loads(reply.ok.payload.to_bytes())
                 self.inbox.put(lambda: done(answer))
 
-        key = f"{self.root}/auction/{quote(auctioneer, safe='')}/{topic}"
+        me = quote(self.name, safe="")  # who asks is part of the key
+        key = f"{self.root}/auction/{quote(auctioneer, safe='')}/{topic}/{me}"
         self.session.get(key, came, payload=json.dumps(word), encoding=encoding(kind), timeout=1.0)
 
     def say_difficulty(self, offers):

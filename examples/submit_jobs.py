@@ -73,8 +73,10 @@ def ask(session, key, kind, word):
     )
     answers = []
     for reply in replies:
-        if reply.ok is None:
-            print(f"refused: {reply.err.payload.to_bytes().decode()}", flush=True)
+        if reply.ok is None:  # Zenoh's own: nobody answered in time
+            print(f"no answer: {reply.err.payload.to_bytes().decode()}", flush=True)
+        elif str(reply.ok.encoding) == "application/json;thermofleet.Refusal.v1":
+            print(f"refused: {json.loads(reply.ok.payload.to_bytes())['reason']}", flush=True)
         else:
             answers.append(json.loads(reply.ok.payload.to_bytes()))
     return answers

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fleet.bus import messages
-from fleet.bus.contract import CHANNELS, WAYS, schemas
+from fleet.bus.contract import CHANNELS, WAYS, Channel, Word, schemas
 from fleet.bus.specimens import SPECIMENS
 from fleet.errors import FleetError
 
@@ -39,11 +39,16 @@ def key_table() -> str:
             channel.by,
             channel.to,
             channel.way + (f" ({channel.kept})" if channel.kept else ""),
-            " → ".join(f"[{word.__name__}](#{word.__name__.lower()})" for word in channel.words) or "no payload",
+            " → ".join(f"[{word.__name__}](#{word.__name__.lower()})" for word in _said(channel)) or "no payload",
         )
         for channel in CHANNELS
     ]
     return table(("key", "said or answered by", "to", "way", "word"), rows)
+
+
+def _said(channel: Channel) -> list[Word]:
+    """The words of a key, without the refusal that may come instead of any answer."""
+    return [word for word in (channel.word, channel.answer) if word is not None]
 
 
 def way_table() -> str:
@@ -86,7 +91,7 @@ def _where(name: str) -> str:
     return "".join(
         f"Key `…/{channel.address.split('/{fleet}/')[1]}`. "
         for channel in CHANNELS
-        if name in [word.__name__ for word in channel.words]
+        if name in [word.__name__ for word in _said(channel)]
     )
 
 

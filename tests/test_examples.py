@@ -1,6 +1,7 @@
 """The examples run as their first lines say, and see what the fleet does."""
 
 import importlib.util
+import json
 import os
 import re
 import socket
@@ -144,8 +145,8 @@ def test_own_arm_keeps_the_rules_towards_a_strict_auctioneer(bus):
         reports.append(word)
         return Receipt(auctioneer="a", award=word.award)
 
-    auctioneer.answer(keys.of_auction("f", "a", "lease"), LeaseRequest, lease)
-    auctioneer.answer(keys.of_auction("f", "a", "report"), Report, report)
+    auctioneer.answer(keys.asked_by_every_arm("f", "a", "lease"), LeaseRequest, lease)
+    auctioneer.answer(keys.asked_by_every_arm("f", "a", "report"), Report, report)
     auctioneer.answer(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=5000.0, speed=60.0))
     auctioneer.listen(keys.of_every_arm("f", "state"), State, lambda _, word: states.append(word))
     scores, told = [], []
@@ -219,7 +220,7 @@ def test_own_allocator_keeps_the_rules_towards_a_strict_arm(bus):
 
             def hold(phase, cycles):
                 holds = (Hold(award=awards[0].award, job=awards[0].job.name, cycles=cycles, phase=phase),)
-                key = keys.of_auction("f", "own", "lease")
+                key = keys.asked_by("f", "own", "lease", "x")
                 request = LeaseRequest(arm="x", holds=holds)
                 arm.ask(key, request, Lease, lambda answers: leases.append(only(answers)), timeout_s=PATIENCE_S)
                 serve(lambda: leases, arm)
@@ -231,7 +232,7 @@ def test_own_allocator_keeps_the_rules_towards_a_strict_arm(bus):
                 arm="x", award=awards[0].award, job=awards[0].job.name, outcome="finished", cycles=1, time_s=3.0
             )
             for _ in range(2):
-                key = keys.of_auction("f", "own", "report")
+                key = keys.asked_by("f", "own", "report", "x")
                 arm.ask(key, word, Receipt, lambda answers: receipts.append(only(answers)), timeout_s=PATIENCE_S)
             serve(lambda: len(receipts) == 2 and "finished" in results, arm)
             assert receipts[0] == receipts[1]
@@ -265,10 +266,11 @@ def rubbish_at():
         stack.enter_context(running("own_allocator", port, "f"))
 
         def ask(example, topic, payload, said):
-            key = keys.of_arm("f", "x", topic) if example == "own_arm" else keys.of_auction("f", "own", topic)
+            key = keys.of_arm("f", "x", topic) if example == "own_arm" else keys.asked_by("f", "own", topic, "x")
             encoding = said or f"application/json;thermofleet.{words[topic]}.v1"
             (reply,) = list(line._session.get(key, payload=payload, encoding=encoding, timeout=PATIENCE_S))
-            return reply.err.payload.to_string()
+            assert str(reply.ok.encoding) == "application/json;thermofleet.Refusal.v1"
+            return json.loads(reply.ok.payload.to_string())["reason"]
 
         yield ask
 

@@ -73,7 +73,10 @@ def _operations(channel: Channel) -> dict[str, Any]:
     }
     if channel.answer is None:
         return {f"say_{channel.name}": operation}
-    reply = {"channel": {"$ref": f"#/channels/{channel.name}"}, "messages": [_in(channel, channel.answer)]}
+    reply = {
+        "channel": {"$ref": f"#/channels/{channel.name}"},
+        "messages": [_in(channel, word) for word in channel.words[1:]],
+    }
     return {f"ask_{channel.name}": {**operation, "reply": reply}}
 
 

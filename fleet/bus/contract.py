@@ -26,7 +26,7 @@ WAYS: Mapping[Way, str] = {
     "token": "a liveliness token, no payload",
     "dropped": "published, dropped under congestion",
     "remembered": "published, dropped under congestion; the last ones are kept for those who come later",
-    "answered": "a queryable (complete): the question is in the query's payload, the answer in the reply",
+    "answered": "a queryable (complete): the question is in the query's payload, the answer or a Refusal in the reply",
 }
 ADDRESS: Mapping[Role, str] = {
     "arm": f"{keys.PREFIX}/{{fleet}}/arm/{{arm}}",
@@ -64,12 +64,13 @@ class Channel:
     @property
     def address(self) -> str:
         """The key with its parameters in braces."""
-        return f"{ADDRESS[self.role]}/{self.topic}"
+        return f"{ADDRESS[self.role]}/{self.topic}{'/{arm}' if self.topic in keys.ASKED else ''}"
 
     @property
     def words(self) -> tuple[Word, ...]:
-        """What travels there: nothing, a word, or a question and its answer."""
-        return tuple(word for word in (self.word, self.answer) if word is not None)
+        """What travels there: nothing, a word, or a question, its answer and what may come instead."""
+        instead = None if self.answer is None else messages.Refusal
+        return tuple(word for word in (self.word, self.answer, instead) if word is not None)
 
 
 @dataclass(frozen=True)

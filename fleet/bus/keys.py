@@ -1,6 +1,8 @@
 """Names on the wire: every key is built and parsed here, and nowhere else.
 
 `thermofleet/v1/{fleet}/…` with `arm/{arm}/{topic}`, `auction/{auctioneer}/{topic}`, `jobs/{topic}` and `clock/now`.
+What an arm asks an auctioneer as itself it asks under `auction/{auctioneer}/{topic}/{arm}`: the rules of a router see
+keys and nothing else, so who asks must be part of the key.
 Names of fleets, arms and auctioneers are percent-encoded to one chunk, so no name can smuggle a wildcard, a `/` or an
 `@` into a key (a chunk that begins with `@` is matched by no wildcard, and its history is silently lost).
 """
@@ -11,7 +13,8 @@ from urllib.parse import quote, unquote
 
 Role = Literal["arm", "auction", "jobs", "clock"]
 ArmTopic = Literal["alive", "state", "info", "difficulty", "event", "quote", "award"]
-AuctionTopic = Literal["alive", "announce", "result", "lease", "report"]
+AuctionTopic = Literal["alive", "announce", "result"]
+AskedTopic = Literal["lease", "report"]
 JobsTopic = Literal["submit", "status"]
 
 PREFIX = "thermofleet/v1"
@@ -19,12 +22,14 @@ STATES = f"{PREFIX}/*/arm/*/state"
 """Key expression that matches the telemetry of every arm of every fleet; for rules, never for a put."""
 TOPICS: dict[Role, tuple[str, ...]] = {
     "arm": get_args(ArmTopic),
-    "auction": get_args(AuctionTopic),
+    "auction": get_args(AuctionTopic) + get_args(AskedTopic),
     "jobs": get_args(JobsTopic),
     "clock": ("now",),
 }
 NAMELESS: tuple[Role, ...] = ("jobs", "clock")
 """Roles whose keys belong to nobody."""
+ASKED: tuple[str, ...] = get_args(AskedTopic)
+"""Topics of an auctioneer whose keys end in the name of the arm that asks."""
 _ROLES: dict[str, Role] = {str(role): role for role in TOPICS}
 
 
@@ -37,18 +42,24 @@ class Key:
     name: str
     """Of the arm or the auctioneer; "" for jobs and clock."""
     topic: str
+    asker: str = ""
+    """The arm that asks, for the topics in `ASKED`; "" for all others."""
 
     def __str__(self) -> str:
         """The key as it goes over the wire.
 
         Raises:
-            ValueError: a name is empty or no valid Unicode, or the topic does not belong to the role.
+            ValueError: a name is empty or no valid Unicode, or what is given does not belong together.
         """
         if self.role not in TOPICS:
             raise ValueError(f"Unknown role '{self.role}' of a key. Allowed: {', '.join(TOPICS)}.")
         if self.topic not in TOPICS[self.role]:
             raise ValueError(f"Unknown topic '{self.topic}' of '{self.role}'. Allowed: {', '.join(TOPICS[self.role])}.")
         start = f"{PREFIX}/{chunk(self.fleet)}/{self.role}"
+        if self.topic in ASKED:
+            return f"{start}/{chunk(self.name)}/{self.topic}/{chunk(self.asker)}"
+        if self.asker:
+            raise ValueError(f"Nobody's name ends the keys of '{self.topic}' (got {self.asker!r}).")
         if self.role not in NAMELESS:
             return f"{start}/{chunk(self.name)}/{self.topic}"
         if self.name:
@@ -74,6 +85,36 @@ def of_auction(fleet: str, auctioneer: str, topic: AuctionTopic) -> str:
 def of_every_auction(fleet: str, topic: AuctionTopic) -> str:
     """Key expression that matches the topic of every auctioneer of one fleet; never for a put."""
     return of_auction(fleet, "x", topic).replace("/auction/x/", "/auction/*/")
+
+
+def asked_by(fleet: str, auctioneer: str, topic: AskedTopic, arm: str) -> str:
+    """Key at which one arm asks one auctioneer: `thermofleet/v1/{fleet}/auction/{auctioneer}/{topic}/{arm}`."""
+    return str(Key(fleet, "auction", auctioneer, topic, arm))
+
+
+def asked_by_every_arm(fleet: str, auctioneer: str, topic: AskedTopic) -> str:
+    """Key expression under which one auctioneer answers all arms; never for an answer itself (see `answered`)."""
+    return asked_by(fleet, auctioneer, topic, "x").removesuffix("x") + "*"
+
+
+def asked_of_every_auction(fleet: str, topic: AskedTopic, arm: str) -> str:
+    """Key expression that matches what one arm may ask any auctioneer; for rules."""
+    return asked_by(fleet, "x", topic, arm).replace("/auction/x/", "/auction/*/")
+
+
+def answered(expression: str, asked: str) -> str:
+    """The concrete key under which one who answers under an expression answers what was asked under `asked`.
+
+    Where the expression ends in `*`, the place of the asker, that is who asked; of all others it is itself.
+
+    Raises:
+        ValueError: what was asked names no asker.
+    """
+    if not expression.endswith("/*"):
+        return expression
+    key = expression.removesuffix("*") + asked.rsplit("/", 1)[1]
+    parse(key)
+    return key
 
 
 def of_jobs(fleet: str, topic: JobsTopic) -> str:
@@ -112,7 +153,8 @@ def parse(key: str) -> Key:
         ValueError: not a key of this version, or not written as `str(Key(...))` would write it (wildcards, for one).
     """
     parts = key.split("/")
-    named = len(parts) == 6
+    asked = len(parts) == 7 and parts[5] in ASKED
+    named = len(parts) == 6 or asked
     if "/".join(parts[:2]) != PREFIX or not (named or len(parts) == 5):
         raise ValueError(f"'{key}' is no key of this bus: expected {PREFIX}/{{fleet}}/{{{'|'.join(TOPICS)}}}/….")
     role = _ROLES.get(parts[3])
@@ -121,10 +163,11 @@ def parse(key: str) -> Key:
             f"'{key}' has no such place: expected arm/{{arm}}/…, auction/{{auctioneer}}/…, jobs/… or clock/now."
         )
     try:
-        names = [unquote(part, errors="strict") for part in (parts[2], parts[4] if named else "")]
+        chunks = (parts[2], parts[4] if named else "", parts[6] if asked else "")
+        names = [unquote(part, errors="strict") for part in chunks]
     except UnicodeDecodeError as error:
         raise ValueError(f"'{key}' holds a percent escape that is no UTF-8.") from error
-    parsed = Key(names[0], role, names[1], parts[-1])
+    parsed = Key(names[0], role, names[1], parts[5] if named else parts[4], names[2])
     try:
         written = str(parsed)
     except ValueError as error:

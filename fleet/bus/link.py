@@ -22,7 +22,7 @@ import zenoh
 from zenoh import ext as advanced
 
 from fleet.bus import keys
-from fleet.bus.messages import MalformedMessage, encode, encoding, read, spoken_by
+from fleet.bus.messages import MalformedMessage, Refusal, encode, encoding, read, read_as, spoken_by
 from fleet.bus.router import open_client
 from fleet.errors import BusError
 
@@ -31,6 +31,7 @@ _LOG = logging.getLogger(__name__)
 Asked = TypeVar("Asked", bound=msgspec.Struct)
 Said = TypeVar("Said", bound=msgspec.Struct)
 Heard = TypeVar("Heard", bound=msgspec.Struct)
+Word = TypeVar("Word")
 
 BACKLOG = 4096
 """What waits to be handled, at most; the oldest goes first. A fleet that behaves needs a few per participant."""
@@ -50,9 +51,9 @@ class Answers(Generic[Said]):
     """What came back to a question, so far; complete when the handler gets it."""
 
     words: dict[str, Said] = field(default_factory=dict)
-    """By the key of who answered."""
+    """By the key of who answered; a second answer under the same key has its number behind it, as `KEY (2)`."""
     refused: dict[str, str] = field(default_factory=dict)
-    """Why not, by the key of who refused; "" for one who did not answer in time."""
+    """Why not, by the key of who refused; "" for one who did not answer in time, whose key is not known."""
     took_s: float = math.nan
     """Real seconds until it was complete."""
 
@@ -242,7 +243,11 @@ class Link:
     # Answering and listening
 
     def answer(self, key: str, kind: type[Asked], handle: Callable[[Asked], msgspec.Struct]) -> None:
-        """Answer what is asked under a concrete key; `handle` may raise `Refused`."""
+        """Answer what is asked under a concrete key; `handle` may raise `Refused`.
+
+        Where the key ends in `*`, the place of the asker (`keys.asked_by_every_arm`), answers go under the key that
+        was asked. A question that speaks for another arm than that key names is malformed.
+        """
         queryable = self._open().declare_queryable(
             key, _direct(lambda query: self.post(lambda: self._reply(key, query, kind, handle))), complete=True
         )
@@ -310,7 +315,7 @@ class Link:
             return
         try:
             speaker = keys.parse(str(sample.key_expr))
-            message = _checked(kind, str(sample.encoding), sample.payload.to_bytes())
+            message = read_as(kind, str(sample.encoding), sample.payload.to_bytes())
             message = _by(message, speaker)
         except (ValueError, MalformedMessage) as error:
             self._complain(f"under '{sample.key_expr}': {error}")
@@ -327,16 +332,18 @@ class Link:
         if reply.ok is None:
             error = reply.err
             said = "" if error is None else error.payload.to_bytes().decode(errors="replace")
-            answers.refused[f"?{len(answers.refused)}"] = "" if said == "Timeout" else said
+            _add(answers.refused, "?", "" if said == "Timeout" else said)
             return
-        key = str(reply.ok.key_expr)
+        key, said, payload = str(reply.ok.key_expr), str(reply.ok.encoding), reply.ok.payload.to_bytes()
         try:
-            message = _checked(kind, str(reply.ok.encoding), reply.ok.payload.to_bytes())
-            answers.words[key] = _by(message, keys.parse(key))
+            speaker = keys.parse(key)
+            if said == encoding(Refusal):
+                _add(answers.refused, key, read(Refusal, payload).reason)
+            else:
+                _add(answers.words, key, _by(read_as(kind, said, payload), speaker))
         except (ValueError, MalformedMessage) as error:
-            answers.refused[key] = str(error)
+            _add(answers.refused, key, str(error))
             self._complain(f"answer under '{key}': {error}")
-            return
         if each is not None:
             each(answers)
 
@@ -345,19 +352,23 @@ class Link:
     ) -> None:
         with query:
             try:
-                payload = query.payload
-                said = "" if query.encoding is None else str(query.encoding)
-                question = _checked(kind, said, b"" if payload is None else payload.to_bytes())
-            except MalformedMessage as error:
-                self._complain(f"question under '{key}': {error}")
-                query.reply_err(str(error).encode())
+                mine = keys.answered(key, str(query.key_expr))
+            except ValueError as error:  # there is no key to answer under
+                self._complain(f"question under '{query.key_expr}': {error}")
                 return
             try:
+                payload = query.payload
+                said = "" if query.encoding is None else str(query.encoding)
+                question = read_as(kind, said, b"" if payload is None else payload.to_bytes())
+                if asker := keys.parse(mine).asker:
+                    question = spoken_by(question, asker, "arm")
                 answer = handle(question)
+            except MalformedMessage as error:
+                self._complain(f"question under '{mine}': {error}")
+                answer = Refusal(str(error))
             except Refused as refusal:
-                query.reply_err(str(refusal).encode())
-            else:
-                query.reply(key, encode(answer), encoding=encoding(type(answer)))
+                answer = Refusal(str(refusal))
+            query.reply(mine, encode(answer), encoding=encoding(type(answer)))
 
     def _complain(self, reason: str) -> None:
         """Log the first few and then fewer and fewer: whoever floods the bus shall not flood the log."""
@@ -367,23 +378,21 @@ class Link:
             _LOG.warning("Left out (%d so far): %s", self.malformed, reason)
 
 
-def _checked(kind: type[Heard], said_encoding: str, payload: bytes) -> Heard:
-    """The message of a kind.
-
-    Raises:
-        MalformedMessage: encoded otherwise, or not of this kind.
-    """
-    if said_encoding != encoding(kind):
-        raise MalformedMessage(f"It is encoded as '{said_encoding}', not as '{encoding(kind)}'.")
-    return read(kind, payload)
-
-
 def _by(message: Heard, speaker: keys.Key) -> Heard:
     """The message, if it speaks for nobody but the speaker."""
     for field_name, role in (("arm", "arm"), ("auctioneer", "auction")):
         if speaker.role == role and hasattr(message, field_name):
             return spoken_by(message, speaker.name, field_name)
     return message
+
+
+def _add(table: dict[str, Word], key: str, word: Word) -> None:
+    """Put a word into a table without pushing another out: several may answer under one key, as two auctioneers."""
+    name, number = key, 1
+    while name in table:
+        number += 1
+        name = f"{key} ({number})"
+    table[name] = word
 
 
 def _direct(handle: Callable[[Any], None]) -> Any:

@@ -91,6 +91,17 @@ class Info(msgspec.Struct, frozen=True):
     """Version of its twin."""
 
 
+class Refusal(msgspec.Struct, frozen=True):
+    """Instead of any other answer, under the key of who refuses: why there is none.
+
+    An answer like others. An error of Zenoh's travels under the key of the question: asked under a wildcard, that is
+    nobody's own key, and a router that keeps rules drops it.
+    """
+
+    reason: str
+    """A sentence."""
+
+
 Kind = TypeVar("Kind", bound=msgspec.Struct)
 
 _ENCODER = msgspec.json.Encoder()
@@ -121,6 +132,17 @@ def read(kind: type[Kind], payload: bytes) -> Kind:
         return msgspec.json.decode(payload, type=kind)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise MalformedMessage(f"Not a {schema(kind)}: {error}") from error
+
+
+def read_as(kind: type[Kind], said_encoding: str, payload: bytes) -> Kind:
+    """The message of this kind, which its encoding says that the payload is.
+
+    Raises:
+        MalformedMessage: encoded otherwise, or not of this kind.
+    """
+    if said_encoding != encoding(kind):
+        raise MalformedMessage(f"It is encoded as '{said_encoding}', not as '{encoding(kind)}'.")
+    return read(kind, payload)
 
 
 def decode(kind: type[Kind], payload: bytes, *, arm: str) -> Kind:

@@ -135,7 +135,8 @@ def rights(fleet: str, participant: Participant) -> Rights:
     time, status = keys.of_clock(fleet), keys.of_jobs(fleet, "status")
     quotes, awards = keys.of_every_arm(fleet, "quote"), keys.of_every_arm(fleet, "award")
     if participant.role == "arm":
-        lease, report = keys.of_every_auction(fleet, "lease"), keys.of_every_auction(fleet, "report")
+        # The key names the asker: whoever may ask under it is that arm.
+        lease, report = (keys.asked_of_every_auction(fleet, topic, participant.name) for topic in ("lease", "report"))
         return Rights(says=(keys.all_of(fleet, "arm", participant.name),), asks=(lease, report, time))
     if participant.role == "auctioneer":
         own = keys.all_of(fleet, "auction", participant.name)

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import msgspec
 
-from fleet.bus.messages import DifficultyWord, Info, State
+from fleet.bus.messages import DifficultyWord, Info, Refusal, State
 from fleet.bus.trade import (
     Ack,
     Admission,
@@ -95,6 +95,7 @@ _ALL: tuple[msgspec.Struct, ...] = (
     Lease(auctioneer=_AUCTIONEER, lease_s=6.0, granted=(_AWARD,), lost=(), leave=(_AWARD,)),
     Report(arm=_ARM, award=_AWARD, job="crate_1", outcome="finished", cycles=20, time_s=842.5),
     Receipt(auctioneer=_AUCTIONEER, award=_AWARD),
+    Refusal(reason="Award 'auctioneer-17-crate_1' is of 'crate_1' to 'arm_1', not of 'crate_1' to 'arm_0'."),
     Submission(jobs=(CRATE,), by="shop floor"),
     Submitted(auctioneer=_AUCTIONEER, jobs=(Admission(job="crate_1", accepted=True),)),
     StatusRequest(jobs=("crate_1",)),

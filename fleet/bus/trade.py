@@ -187,7 +187,7 @@ class Hold(msgspec.Struct, frozen=True):
 
 
 class LeaseRequest(msgspec.Struct, frozen=True):
-    """To `auction/{auctioneer}/lease`: these are the jobs I hold; may I go on?"""
+    """To `auction/{auctioneer}/lease/{arm}`: these are the jobs I hold; may I go on?"""
 
     arm: Name
     holds: Annotated[tuple[Hold, ...], msgspec.Meta(max_length=MOST_JOBS)]
@@ -208,7 +208,7 @@ class Lease(msgspec.Struct, frozen=True):
 
 
 class Report(msgspec.Struct, frozen=True):
-    """To `auction/{auctioneer}/report`: what became of an award. Said again until there is a `Receipt`."""
+    """To `auction/{auctioneer}/report/{arm}`: what became of an award. Said again until there is a `Receipt`."""
 
     arm: Name
     award: Name

@@ -350,7 +350,7 @@ class ArmNode:
             for lease in answers.words.values():
                 self.contractor.leased(lease, asked_s)
 
-        key = keys.of_auction(self._link.fleet, auctioneer, "lease")
+        key = keys.asked_by(self._link.fleet, auctioneer, "lease", self._name)
         self._safely(partial(self._link.ask, key, request, Lease, done, timeout_s=ANSWER_S))
 
     def _report(self, auctioneer: str, report: Report) -> None:
@@ -358,7 +358,7 @@ class ArmNode:
             for receipt in answers.words.values():
                 self.contractor.receipted(receipt)
 
-        key = keys.of_auction(self._link.fleet, auctioneer, "report")
+        key = keys.asked_by(self._link.fleet, auctioneer, "report", self._name)
         self._safely(partial(self._link.ask, key, report, Receipt, done, timeout_s=ANSWER_S))
 
     def _ask_clock(self, asked_s: float) -> None:

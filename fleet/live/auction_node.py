@@ -171,8 +171,8 @@ class AuctionNode:
         auctioneer = self.auctioneer
         link.answer(keys.of_jobs(fleet, "submit"), Submission, self._checked(auctioneer.submitted))
         link.answer(keys.of_jobs(fleet, "status"), StatusRequest, self._status)
-        link.answer(keys.of_auction(fleet, name, "lease"), LeaseRequest, self._checked(auctioneer.leased))
-        link.answer(keys.of_auction(fleet, name, "report"), Report, self._checked(auctioneer.reported))
+        link.answer(keys.asked_by_every_arm(fleet, name, "lease"), LeaseRequest, self._checked(auctioneer.leased))
+        link.answer(keys.asked_by_every_arm(fleet, name, "report"), Report, self._checked(auctioneer.reported))
         link.answer(keys.of_clock(fleet), ClockRequest, lambda _: Clock(self.time_s, self._clock.speed))
         link.listen(keys.of_every_arm(fleet, "state"), State, self._state)
         link.watch(keys.of_every_arm(fleet, "alive"), self._token)

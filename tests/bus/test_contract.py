@@ -182,7 +182,8 @@ def test_the_participants_publish_and_answer_as_the_contract_says(node, role):
         if call.func.attr in ("publisher", "answer") and isinstance(call.args[0], ast.Call):
             key = ast.unparse(call.args[0])
             topic = re.search(r"'(\w+)'\)$", key)
-            where = (key.split("of_")[1].split("(")[0], topic[1] if topic else "now")
+            place = {"asked_by_every_arm": "auction"}.get(key.split(".")[1].split("(")[0]) or key.split("of_")[1]
+            where = (place.split("(")[0], topic[1] if topic else "now")
             remember = next((ast.unparse(k.value) for k in call.keywords if k.arg == "remember"), "0")
             kept = REMEMBERED if remember == "REMEMBERED" else int(remember)
             found[where] = (ast.unparse(call.args[1]), kept)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.bus import keys
-from fleet.bus.keys import NAMELESS, TOPICS, Key
+from fleet.bus.keys import ASKED, NAMELESS, TOPICS, Key
 
 names = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=30)
 wild = st.sampled_from(
@@ -22,6 +22,7 @@ concrete = st.one_of(
             role=st.just(place[0]),
             name=st.just("") if place[0] in NAMELESS else names | wild,
             topic=st.just(place[1]),
+            asker=names | wild if place[1] in ASKED else st.just(""),
         )
     )
 )
@@ -69,6 +70,9 @@ def test_all_of_one_is_what_it_says_and_no_word_of_another(one, other):
         (keys.of_jobs("f", "submit"), "thermofleet/v1/f/jobs/submit"),
         (keys.of_clock("f"), "thermofleet/v1/f/clock/now"),
         (keys.of_every_auction("f", "result"), "thermofleet/v1/f/auction/*/result"),
+        (keys.asked_by("f", "a", "lease", "arm 1/b"), "thermofleet/v1/f/auction/a/lease/arm%201%2Fb"),
+        (keys.asked_by_every_arm("f", "x", "report"), "thermofleet/v1/f/auction/x/report/*"),
+        (keys.asked_of_every_auction("f", "report", "x"), "thermofleet/v1/f/auction/*/report/x"),
     ],
 )
 def test_keys_are_written_as_the_design_says(built, written):
@@ -89,6 +93,14 @@ def test_keys_are_written_as_the_design_says(built, written):
         "thermofleet/v1/f/arm/a/state/x",
         "thermofleet/v1/f/arm/a/announce",
         "thermofleet/v1/f/auction/a/state",
+        "thermofleet/v1/f/auction/a/lease",
+        "thermofleet/v1/f/auction/a/lease/",
+        "thermofleet/v1/f/auction/a/lease/*",
+        "thermofleet/v1/f/auction/a/lease/%61",
+        "thermofleet/v1/f/auction/a/lease/x/y",
+        "thermofleet/v1/f/auction/a/result/x",
+        "thermofleet/v1/f/arm/a/lease/x",
+        "thermofleet/v1/f/jobs/a/lease/x",
         "thermofleet/v1/f/jobs/a/submit",
         "thermofleet/v1/f/arm/state",
         "thermofleet/v1/f/robot/a/state",
@@ -103,6 +115,30 @@ def test_keys_are_written_as_the_design_says(built, written):
 def test_what_is_no_concrete_key_is_refused(text):
     with pytest.raises(ValueError, match=re.escape(f"'{text}'")):
         keys.parse(text)
+
+
+@given(concrete.filter(lambda key: key.asker))
+def test_an_answer_goes_under_the_key_of_the_one_who_asked(key):
+    everybody = keys.asked_by_every_arm(key.fleet, key.name, key.topic)
+    assert zenoh.KeyExpr(everybody).includes(str(key))
+    assert keys.answered(everybody, str(key)) == str(key)
+    assert keys.answered(everybody, keys.asked_of_every_auction(key.fleet, key.topic, key.asker)) == str(key)
+    assert keys.answered("any/concrete/key", str(key)) == "any/concrete/key"
+
+
+@pytest.mark.parametrize(
+    "asked", ["auction/a/lease/*", "auction/a/lease/%61", "auction/a/**", "**", "auction/a/lease/$*"]
+)
+def test_who_asks_as_nobody_is_not_answered(asked):
+    with pytest.raises(ValueError, match=r"no key of this bus|not written|no such place"):
+        keys.answered(keys.asked_by_every_arm("f", "a", "lease"), f"thermofleet/v1/f/{asked}")
+
+
+def test_only_what_an_arm_asks_an_auctioneer_ends_in_a_name():
+    with pytest.raises(ValueError, match=r"Nobody's name ends the keys of 'result' \(got 'x'\)"):
+        str(Key("f", "auction", "a", "result", "x"))
+    with pytest.raises(ValueError, match="must not be empty"):
+        str(Key("f", "auction", "a", "lease"))
 
 
 @given(st.text(max_size=60))

@@ -9,7 +9,7 @@ import pytest
 
 from fleet.bus import keys
 from fleet.bus.link import Link, Refused
-from fleet.bus.messages import encoding
+from fleet.bus.messages import Refusal, encoding
 from fleet.bus.router import Router
 from fleet.bus.trade import Admission, ArmEvent, Clock, ClockRequest, JobWord, Submission, Submitted
 from fleet.errors import BusError
@@ -78,7 +78,7 @@ def test_a_refusal_is_told_in_words(bus):
     got = []
     asker.ask(keys.of_clock("f"), ClockRequest(), Clock, got.append, timeout_s=5.0)
     serve(lambda: got, asker, teller)
-    assert list(got[0].refused.values()) == ["No clock here."]
+    assert got[0].refused == {keys.of_clock("f"): "No clock here."}
 
 
 def test_two_that_ask_each_other_do_not_block(bus):
@@ -114,7 +114,8 @@ def test_a_malformed_question_is_answered_with_what_is_wrong(bus, payload, said,
     replies = []
     raw(asker).get(keys.of_clock("f"), replies.append, payload=payload, encoding=said, timeout=5.0)
     serve(lambda: replies, teller)
-    assert complaint in replies[0].err.payload.to_string()
+    assert str(replies[0].ok.encoding) == encoding(Refusal)
+    assert complaint in json.loads(replies[0].ok.payload.to_bytes())["reason"]
     assert teller.malformed == 1
 
 

@@ -10,17 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.bus import keys
-from fleet.bus.keys import NAMELESS, TOPICS
+from fleet.bus.keys import ASKED, NAMELESS, TOPICS
 from fleet.bus.roster import ROLES, Participant, access_control, of_arms, rights
 from fleet.errors import BusError
 
 DOCS = (Path(__file__).parents[2] / "docs" / "security.md").read_text(encoding="utf-8")
 ARMS = ("arm_0", "arm_1", "arm 2/*@", "arm_10")
 EVERY_KEY = [
-    str(keys.Key("f", role, name, topic))
+    str(keys.Key("f", role, name, topic, asker))
     for role, topics in TOPICS.items()
     for topic in topics
     for name in ([""] if role in NAMELESS else ["auctioneer", "other"] if role == "auction" else ARMS)
+    for asker in (ARMS if topic in ASKED else [""])
 ]
 
 
@@ -62,6 +63,17 @@ def test_every_key_has_the_speakers_that_it_should_have(message):
         assert may == (participant.name == owner), (participant, key)
         cache = f"{key}/@adv/pub/1/2"
         assert allowed(rules, participant.common_name, "ingress", message, cache) == may, (participant, cache)
+
+
+def test_what_ends_in_the_name_of_an_arm_is_asked_by_that_arm_alone():
+    rules = access_control(of_arms("f", ARMS))
+    asked = [key for key in EVERY_KEY if keys.parse(key).asker]
+    assert len(asked) == 2 * 2 * len(ARMS)
+    for key, participant in product(asked, of_arms("f", ARMS).participants):
+        may = allowed(rules, participant.common_name, "ingress", "query", key)
+        assert may == (participant.name == keys.parse(key).asker), (participant, key)
+        for wild in (f"{key.rpartition('/')[0]}/*", key.rpartition("/")[0] + "/**", keys.all_of_fleet("f"), "**"):
+            assert not allowed(rules, participant.common_name, "ingress", "query", wild), (participant, wild)
 
 
 def test_nobody_deletes_and_everybody_but_the_router_hears_its_own_fleet_alone():

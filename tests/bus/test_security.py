@@ -7,6 +7,7 @@ an open router, where every trespass gets through.
 
 import itertools
 import queue
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
@@ -20,11 +21,14 @@ from zenoh import ext
 from fleet.bus import keys
 from fleet.bus.certificates import issue
 from fleet.bus.keyring import add, make
+from fleet.bus.link import Answers, Link, Refused
 from fleet.bus.memory import MemoryExchange
+from fleet.bus.messages import encode, encoding
 from fleet.bus.roster import Participant, of_arms
 from fleet.bus.router import Router, open_client
 from fleet.bus.security import Tls
 from fleet.bus.session import ZenohExchange
+from fleet.bus.trade import Clock, ClockRequest, Hold, Lease, LeaseRequest, Receipt, Report
 
 ARMS = ("arm_0", "arm_1", "arm 2/*@")
 PATIENT_S = 20.0
@@ -232,8 +236,8 @@ def test_nobody_pretends_that_another_is_there(side, connect, fake):
 ASKERS = {
     keys.of_arm("f", "arm_0", "quote"): {"auctioneer", "submitter"},
     keys.of_arm("f", "arm_0", "award"): {"auctioneer"},
-    keys.of_auction("f", "auctioneer", "lease"): {"arm_0", "arm_1"},
-    keys.of_auction("f", "auctioneer", "report"): {"arm_0", "arm_1"},
+    keys.asked_by("f", "auctioneer", "lease", "arm_0"): {"arm_0"},
+    keys.asked_by("f", "auctioneer", "report", "arm_1"): {"arm_1"},
     keys.of_jobs("f", "submit"): {"submitter"},
     keys.of_jobs("f", "status"): {"submitter", "monitor", "recorder", "auctioneer"},
     keys.of_clock("f"): {"arm_0", "arm_1", "submitter", "monitor", "recorder", "auctioneer"},
@@ -245,7 +249,7 @@ def test_each_asks_what_its_role_needs(side, connect, key):
     answerer = connect("arm_0" if "/arm/" in key else "auctioneer")
     kept, asked = answer(answerer, key, (key, "answer"))
     settled(answerer)
-    wild = key.replace("arm_0", "*").replace("/auctioneer/", "/*/")
+    wild = key.replace("/arm/arm_0/", "/arm/*/").replace("/auctioneer/", "/*/")
     everybody = ("arm_0", "arm_1", "submitter", "monitor", "recorder", "auctioneer")
     answered = {name: [ask(connect(name), question) for question in {key, wild}] for name in everybody}
     for name, said in answered.items():
@@ -255,10 +259,10 @@ def test_each_asks_what_its_role_needs(side, connect, key):
     kept.undeclare()
 
 
-def test_a_reason_to_refuse_reaches_whoever_asks_that_arm_alone(side, connect):
-    """Zenoh sends an error under the key of the question: under a wildcard it would be in no arm's own rule."""
+def test_an_error_of_zenohs_is_lost_under_a_wildcard_and_a_refusal_is_not(router, side, connect, folder):
+    """An error travels under the key of the question: a wildcard is in no arm's own rule, so the router drops it."""
     arm, auctioneer = connect("arm_0"), connect("auctioneer")
-    key = keys.of_arm("f", "arm_0", "award")
+    key, everywhere = keys.of_arm("f", "arm_0", "award"), keys.of_every_arm("f", "award")
 
     def refuse(query: zenoh.Query) -> None:
         with query:
@@ -271,8 +275,85 @@ def test_a_reason_to_refuse_reaches_whoever_asks_that_arm_alone(side, connect):
         return [reply.err.payload.to_string() for reply in auctioneer.get(where, timeout=PATIENT_S) if reply.err]
 
     assert reasons(key) == ["too warm"]
-    assert reasons(keys.of_every_arm("f", "award")) == ([] if side == "guarded" else ["too warm"])
+    assert reasons(everywhere) == ([] if side == "guarded" else ["too warm"])
     kept.undeclare()
+
+    def too_warm(_: ClockRequest) -> Clock:
+        raise Refused("too warm")
+
+    endpoint = Tls(folder, "arm_0").endpoint(router.endpoint) if side == "guarded" else router.endpoint
+    asker = Tls(folder, "auctioneer").endpoint(router.endpoint) if side == "guarded" else router.endpoint
+    with Link(endpoint, "f") as answers, Link(asker, "f") as asks:
+        answers.answer(key, ClockRequest, too_warm)
+        settled(raw(answers))
+        for where in (key, everywhere):
+            got: list[Answers[Clock]] = []
+            asks.ask(where, ClockRequest(), Clock, got.append, timeout_s=PATIENT_S)
+            serve(lambda got=got: bool(got), answers, asks)
+            assert got[0].refused == {key: "too warm"}
+
+
+def raw(link: Link) -> zenoh.Session:
+    """The session beneath."""
+    assert link._session is not None
+    return link._session
+
+
+def serve(condition: Callable[[], bool], *links: Link) -> None:
+    """Serve all until the condition holds."""
+    deadline_s = time.monotonic() + PATIENT_S
+    while not condition():
+        assert time.monotonic() < deadline_s, "waited in vain"
+        for link in links:
+            link.serve(time.monotonic() + 0.02)
+
+
+@pytest.mark.parametrize("topic", keys.ASKED)
+def test_an_arm_neither_renews_nor_reports_for_another(router, side, connect, folder, topic):
+    """Neither under its own key with the other's name in the word, nor under the other's; for itself it does."""
+    words = {
+        "lease": lambda arm: LeaseRequest(arm, (Hold("w", "j", 0, "working"),)),
+        "report": lambda arm: Report(arm, "w", "j", "finished", 1, 0.0),
+    }
+    taken: list[str] = []
+
+    def take(word: LeaseRequest | Report) -> Lease | Receipt:
+        taken.append(word.arm)
+        return Lease("auctioneer", 6.0, ("w",), ()) if isinstance(word, LeaseRequest) else Receipt("auctioneer", "w")
+
+    endpoint = Tls(folder, "auctioneer").endpoint(router.endpoint) if side == "guarded" else router.endpoint
+    with Link(endpoint, "f") as auctioneer:
+        auctioneer.answer(keys.asked_by_every_arm("f", "auctioneer", topic), type(words[topic]("x")), take)
+        settled(raw(auctioneer))
+        rogue = connect("arm_1")
+
+        def ask_under(key: str, arm: str) -> list[str]:
+            """The answers that the certificate of arm_1 gets under a key for a word of `arm`."""
+            over, got = threading.Event(), []
+            word = words[topic](arm)
+            handler = zenoh.handlers.Callback(got.append, drop=over.set, indirect=False)
+            rogue.get(
+                key, handler, payload=encode(word), encoding=encoding(type(word)), target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE, timeout=PATIENT_S,
+            )  # fmt: skip
+            serve(over.is_set, auctioneer)
+            return [str(reply.ok.encoding).split(".")[1] for reply in got]
+
+        def ask_as(asker: str, arm: str) -> list[str]:
+            one, every = keys.asked_by("f", "auctioneer", topic, asker), keys.asked_of_every_auction("f", topic, asker)
+            return ask_under(one, arm) + ask_under(every, arm)
+
+        answer = {"lease": "Lease", "report": "Receipt"}[topic]
+        assert ask_as("arm_1", "arm_0") == ["Refusal"] * 2
+        assert taken == []
+        assert auctioneer.malformed == 2
+        assert "under the key of 'arm_1' claims to be by 'arm_0'" in auctioneer.complaints[-1]
+        assert ask_as("arm_0", "arm_0") == ([] if side == "guarded" else [answer] * 2)
+        assert ask_as("arm_1", "arm_1") == [answer] * 2
+        assert taken == ([] if side == "guarded" else ["arm_0"] * 2) + ["arm_1"] * 2
+        for nobody in (keys.asked_by_every_arm("f", "auctioneer", topic), keys.all_of("f", "auction", "auctioneer")):
+            assert ask_under(nobody, "arm_0") == []
+        assert len(taken) == (2 if side == "guarded" else 4)
 
 
 def test_a_late_joiner_gets_the_last_words_and_gaps_are_noticed(connect):

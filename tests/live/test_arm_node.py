@@ -50,8 +50,8 @@ class Auctioneer:
 
     def __init__(self, link):
         self.link, self.grants, self.leases, self.reports, self.words = link, True, [], [], []
-        link.answer(keys.of_auction("f", "x", "lease"), LeaseRequest, self.lease)
-        link.answer(keys.of_auction("f", "x", "report"), Report, self.report)
+        link.answer(keys.asked_by_every_arm("f", "x", "lease"), LeaseRequest, self.lease)
+        link.answer(keys.asked_by_every_arm("f", "x", "report"), Report, self.report)
 
     def lease(self, request):
         self.leases.append(request)

@@ -83,7 +83,7 @@ class Arm:
             if self._hold is not None and not self._asked:
                 self._asked = True
                 hold = Hold(self._hold.award, self._hold.job.name, 0, "finishing")
-                key = keys.of_auction(self.link.fleet, self._hold.auctioneer, "lease")
+                key = keys.asked_by(self.link.fleet, self._hold.auctioneer, "lease", self.name)
                 self.link.ask(key, LeaseRequest(self.name, (hold,)), Lease, self.leased, timeout_s=1.0)
 
     def state(self):
@@ -96,7 +96,7 @@ class Arm:
                 award, self._asked = self._hold, True
                 self.done.append(award.job.name)
                 report = Report(self.name, award.award, award.job.name, "finished", 1, 0.0)
-                key = keys.of_auction(self.link.fleet, award.auctioneer, "report")
+                key = keys.asked_by(self.link.fleet, award.auctioneer, "report", self.name)
                 self.link.ask(key, report, Receipt, self.receipted, timeout_s=1.0)
 
     def receipted(self, answers):
