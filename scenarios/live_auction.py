@@ -91,7 +91,7 @@ def work(node: "AuctionNode", own: "Sequence[tuple[float, JobWord]]", horizon_s:
     while not stop.is_set():
         node.serve(time.monotonic() + TURN_S)
         due = tuple(word for at_s, word in left if at_s <= node.time_s)
-        if due:
+        if due and not node.rivals:
             try:
                 for said in node.submit(Submission(due, "scenario")).jobs:
                     if not said.accepted:

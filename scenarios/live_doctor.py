@@ -13,7 +13,8 @@ from scenarios.live_options import ENDPOINT, EndpointOption, FleetOption
 from scenarios.terminal import out_console, say
 
 if TYPE_CHECKING:
-    from fleet.bus.link import Answers, Link
+    from fleet.bus.answers import Answers
+    from fleet.bus.link import Link
     from fleet.bus.trade import Clock
     from fleet.live.diagnosis import Diagnosis
     from fleet.live.overview import FleetNow
@@ -28,6 +29,9 @@ def doctor_command(
     endpoint: EndpointOption = ENDPOINT,
     fleet: FleetOption = "",
     seconds: Annotated[float, typer.Option(help="How long to listen, real time.")] = 3.0,
+    auctioneer: Annotated[
+        bool, typer.Option(help="Whether the fleet should have one; none where arms only show themselves.")
+    ] = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print what was found as JSON.")] = False,
 ) -> None:
     """Say whether a fleet is well: exit code 0 healthy, 1 not, 2 out of reach."""
@@ -45,7 +49,7 @@ def doctor_command(
             if there else "Nobody is there: no arm and no auctioneer shows a token."
         ))  # fmt: skip
         raise typer.Exit(ILL)
-    now, found = examine(endpoint, fleet or there[0], seconds)
+    now, found = examine(endpoint, fleet or there[0], seconds, auctioneer=auctioneer)
     if as_json:
         told = {"healthy": found.healthy, **msgspec.to_builtins(found)}
         typer.echo(msgspec.json.format(msgspec.json.encode(told)).decode())
@@ -54,8 +58,11 @@ def doctor_command(
     raise typer.Exit(0 if found.healthy else ILL)
 
 
-def examine(endpoint: str, fleet: str, seconds: float) -> "tuple[FleetNow, Diagnosis]":
+def examine(endpoint: str, fleet: str, seconds: float, *, auctioneer: bool = True) -> "tuple[FleetNow, Diagnosis]":
     """A fleet after it was listened to for so many real seconds.
+
+    Args:
+        auctioneer: Whether it should have one.
 
     Raises:
         BusError: no router answered.
@@ -90,7 +97,7 @@ def examine(endpoint: str, fleet: str, seconds: float) -> "tuple[FleetNow, Diagn
         now_s = time.monotonic()
         now = onlooker.overview.now(now_s)
         problems = {"malformed": link.malformed, "complaints": tuple(link.complaints), "overrun": link.overrun}
-    return now, diagnosed(now, now_s, soundings, **problems)
+    return now, diagnosed(now, now_s, soundings, auctioneer=auctioneer, **problems)
 
 
 def show(endpoint: str, now: "FleetNow", found: "Diagnosis") -> None:

@@ -12,17 +12,17 @@ import weakref
 from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
 from threading import Lock
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 import msgspec
 import zenoh
 from zenoh import ext as advanced
 
 from fleet.bus import keys
-from fleet.bus.messages import MalformedMessage, Refusal, encode, encoding, read, read_as, spoken_by
+from fleet.bus.answers import Answers, by
+from fleet.bus.messages import MalformedMessage, Refusal, encode, encoding, read_as, spoken_by
 from fleet.bus.router import open_client
 from fleet.errors import BusError
 
@@ -31,7 +31,6 @@ _LOG = logging.getLogger(__name__)
 Asked = TypeVar("Asked", bound=msgspec.Struct)
 Said = TypeVar("Said", bound=msgspec.Struct)
 Heard = TypeVar("Heard", bound=msgspec.Struct)
-Word = TypeVar("Word")
 
 BACKLOG = 4096
 """What waits to be handled, at most; the oldest goes first. A fleet that behaves needs a few per participant."""
@@ -44,18 +43,6 @@ HEARTBEAT_S = 0.5
 
 class Refused(Exception):
     """Raised by a handler of questions: the asker gets this sentence instead of an answer."""
-
-
-@dataclass(eq=False)
-class Answers(Generic[Said]):
-    """What came back to a question, so far; complete when the handler gets it."""
-
-    words: dict[str, Said] = field(default_factory=dict)
-    """By the key of who answered; a second answer under the same key has its number behind it, as `KEY (2)`."""
-    refused: dict[str, str] = field(default_factory=dict)
-    """Why not, by the key of who refused; "" for one who did not answer in time, whose key is not known."""
-    took_s: float = math.nan
-    """Real seconds until it was complete."""
 
 
 class Publisher(Protocol):
@@ -295,6 +282,14 @@ class Link:
         subscriber = self._open().liveliness().declare_subscriber(expression, _direct(came), history=True)
         self._resources.callback(lambda: subscriber)
 
+    def there(self, expression: str, *, timeout_s: float) -> frozenset[str]:
+        """Names in the keys of the liveliness tokens that are shown now; waits for the router's answer."""
+        names: set[str] = set()
+        for reply in self._open().liveliness().get(expression, timeout=timeout_s):
+            if reply.ok is not None:
+                self._token(str(reply.ok.key_expr), True, lambda name, _: names.add(name))
+        return frozenset(names)
+
     # Inside
 
     def _open(self) -> zenoh.Session:
@@ -316,7 +311,7 @@ class Link:
         try:
             speaker = keys.parse(str(sample.key_expr))
             message = read_as(kind, str(sample.encoding), sample.payload.to_bytes())
-            message = _by(message, speaker)
+            message = by(message, speaker)
         except (ValueError, MalformedMessage) as error:
             self._complain(f"under '{sample.key_expr}': {error}")
         else:
@@ -330,19 +325,12 @@ class Link:
         each: Callable[[Answers[Said]], None] | None,
     ) -> None:
         if reply.ok is None:
-            error = reply.err
-            said = "" if error is None else error.payload.to_bytes().decode(errors="replace")
-            _add(answers.refused, "?", "" if said == "Timeout" else said)
+            answers.miss("" if reply.err is None else reply.err.payload.to_bytes().decode(errors="replace"))
             return
-        key, said, payload = str(reply.ok.key_expr), str(reply.ok.encoding), reply.ok.payload.to_bytes()
+        key = str(reply.ok.key_expr)
         try:
-            speaker = keys.parse(key)
-            if said == encoding(Refusal):
-                _add(answers.refused, key, read(Refusal, payload).reason)
-            else:
-                _add(answers.words, key, _by(read_as(kind, said, payload), speaker))
-        except (ValueError, MalformedMessage) as error:
-            _add(answers.refused, key, str(error))
+            answers.take(key, str(reply.ok.encoding), reply.ok.payload.to_bytes(), kind)
+        except MalformedMessage as error:
             self._complain(f"answer under '{key}': {error}")
         if each is not None:
             each(answers)
@@ -376,23 +364,6 @@ class Link:
         self.complaints.append(reason)
         if self.malformed & (self.malformed - 1) == 0:  # 1, 2, 4, 8, …
             _LOG.warning("Left out (%d so far): %s", self.malformed, reason)
-
-
-def _by(message: Heard, speaker: keys.Key) -> Heard:
-    """The message, if it speaks for nobody but the speaker."""
-    for field_name, role in (("arm", "arm"), ("auctioneer", "auction")):
-        if speaker.role == role and hasattr(message, field_name):
-            return spoken_by(message, speaker.name, field_name)
-    return message
-
-
-def _add(table: dict[str, Word], key: str, word: Word) -> None:
-    """Put a word into a table without pushing another out: several may answer under one key, as two auctioneers."""
-    name, number = key, 1
-    while name in table:
-        number += 1
-        name = f"{key} ({number})"
-    table[name] = word
 
 
 def _direct(handle: Callable[[Any], None]) -> Any:

@@ -16,7 +16,8 @@ from functools import partial
 import numpy as np
 
 from fleet.bus import keys
-from fleet.bus.link import REMEMBERED, Answers, Link, Refused
+from fleet.bus.answers import Answers
+from fleet.bus.link import REMEMBERED, Link, Refused
 from fleet.bus.messages import DifficultyWord, Info, State
 from fleet.bus.trade import (
     Ack,
@@ -394,7 +395,6 @@ class ArmNode:
             self._complain("bus", str(error))
 
     def _complain(self, what: str, sentence: str) -> None:
-        now_s = time.monotonic()
-        if now_s >= self._complained_s.get(what, -math.inf) + TOLD_S:
+        if (now_s := time.monotonic()) >= self._complained_s.get(what, -math.inf) + TOLD_S:
             self._complained_s[what] = now_s
             _LOG.warning("Arm '%s' %s", self._name, sentence)

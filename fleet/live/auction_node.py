@@ -11,8 +11,10 @@ from typing import TypeVar
 import msgspec
 
 from fleet.bus import keys
-from fleet.bus.link import REMEMBERED, Answers, Link, Refused
+from fleet.bus.answers import Answers
+from fleet.bus.link import REMEMBERED, Link, Refused
 from fleet.bus.messages import State, encode
+from fleet.bus.router import LEASE_MS
 from fleet.bus.trade import (
     MOST_JOBS,
     Ack,
@@ -56,6 +58,8 @@ class AuctionNode:
     Attributes:
         auctioneer: Its state machine.
         journal: Where its promises are.
+        rivals: Other auctioneers that are in the fleet, against the rule. While there are any, it takes and awards no
+            jobs: they might be done twice, or two arms sent to one station. What arms have in hand goes on.
     """
 
     def __init__(
@@ -98,6 +102,7 @@ class AuctionNode:
             real_s=real_s,
             timing=self._timing,
         )
+        self.rivals: set[str] = set()
         self._tokens: set[str] = set()
         self._heard_s: dict[str, float] = {}
         self._ticked_s = real_s
@@ -122,7 +127,7 @@ class AuctionNode:
         """
         self._link.serve(min(until_s, time.monotonic() + SCAN_S))
         real_s, time_s = self._now()
-        self.auctioneer.seen(self.present)
+        self.auctioneer.seen(frozenset() if self.rivals else self.present)
         self.auctioneer.tick(real_s, time_s)
         if real_s >= self._ticked_s + TICK_S:
             self._ticked_s = real_s
@@ -134,8 +139,9 @@ class AuctionNode:
 
         Raises:
             JournalFull: nothing is taken.
+            Objection: nothing is taken, as there is another auctioneer.
         """
-        answer = self.auctioneer.submitted(word, *self._now())
+        answer = self._submitted(word, *self._now())
         self._send()
         return answer
 
@@ -155,8 +161,19 @@ class AuctionNode:
         return real_s, self._clock.now_s(real_s)
 
     def _refuse_a_second(self) -> None:
-        """Two that take the same jobs would have them done twice."""
+        """Two that take the same jobs would have them done twice.
+
+        One that hangs still shows its token, and one that is about to show it answers already.
+        """
         fleet = self._link.fleet
+        there = self._link.there(keys.of_every_auction(fleet, "alive"), timeout_s=2.0)
+        if self._name in there:
+            raise BusError(
+                f"Fleet '{fleet}' has an auctioneer '{self._name}' already: its token is there. Stop that one first; "
+                f"if it has just died, its token goes within {LEASE_MS / 1000:g} s."
+            )
+        if there:
+            raise BusError(f"Fleet '{fleet}' has an auctioneer already: '{', '.join(sorted(there))}'. A fleet has one.")
         nobody = StatusRequest(("?",))
         answers = self._link.ask_and_wait(keys.of_jobs(fleet, "status"), nobody, Status, timeout_s=2.0)
         for status in answers.words.values():
@@ -169,13 +186,14 @@ class AuctionNode:
         self._announce = link.publisher(keys.of_auction(fleet, name, "announce"), Announce, remember=REMEMBERED)
         self._result = link.publisher(keys.of_auction(fleet, name, "result"), Result, remember=REMEMBERED)
         auctioneer = self.auctioneer
-        link.answer(keys.of_jobs(fleet, "submit"), Submission, self._checked(auctioneer.submitted))
+        link.answer(keys.of_jobs(fleet, "submit"), Submission, self._checked(self._submitted))
         link.answer(keys.of_jobs(fleet, "status"), StatusRequest, self._status)
         link.answer(keys.asked_by_every_arm(fleet, name, "lease"), LeaseRequest, self._checked(auctioneer.leased))
         link.answer(keys.asked_by_every_arm(fleet, name, "report"), Report, self._checked(auctioneer.reported))
         link.answer(keys.of_clock(fleet), ClockRequest, lambda _: Clock(self.time_s, self._clock.speed))
         link.listen(keys.of_every_arm(fleet, "state"), State, self._state)
         link.watch(keys.of_every_arm(fleet, "alive"), self._token)
+        link.watch(keys.of_every_auction(fleet, "alive"), self._rival)
         link.alive(keys.of_auction(fleet, name, "alive"))
 
     def _checked(self, handle: Callable[[Word, float, float], msgspec.Struct]) -> Callable[[Word], msgspec.Struct]:
@@ -191,6 +209,25 @@ class AuctionNode:
                 self._send()
 
         return answer
+
+    def _submitted(self, word: Submission, real_s: float, time_s: float) -> Submitted:
+        if self.rivals:
+            raise Objection(f"{self._two()}: no jobs are taken until one is stopped.")
+        return self.auctioneer.submitted(word, real_s, time_s)
+
+    def _rival(self, name: str, there: bool) -> None:
+        if name == self._name or there == (name in self.rivals):
+            return
+        (self.rivals.add if there else self.rivals.discard)(name)
+        if self.rivals:
+            _LOG.error("%s: no jobs are taken or awarded until one is stopped.", self._two())
+        else:
+            _LOG.warning("Auctioneer '%s' is gone; jobs are taken and awarded again.", name)
+
+    def _two(self) -> str:
+        return (
+            f"Fleet '{self._link.fleet}' has more than one auctioneer ({', '.join(sorted({self._name, *self.rivals}))})"
+        )
 
     def _status(self, word: StatusRequest) -> Status:
         return Status(self._name, self.time_s, _first(self.auctioneer.status(word.jobs)))

@@ -7,6 +7,7 @@ grow while it is at it, so a job that is let through to its end is one stint, as
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from math import ceil, floor
 from typing import Literal, Protocol
 
 import numpy as np
@@ -281,8 +282,9 @@ class SimulatedBody:
 
     def _step(self) -> list[Event]:
         task, log, shift_s = self._task, list[Event](), self._began_s
-        air = np.array([[self._air_c(self.time_s + 0.5 * self._dt_s)]])
-        self._world = replace(self._world, ambient_c=air)
+        air_c = self._air_c(self.time_s + 0.5 * self._dt_s)
+        if air_c != self._world.ambient_c[0, 0]:
+            self._world = replace(self._world, ambient_c=np.array([[air_c]]))
         goes = task is not None and self._set_out(task)
         done = step(self._world, self._state, np.array([[int(goes)]]), np.zeros((1, 1, 1)), self._plant, log)
         self._last, self._state = (self._world, done), done.state
@@ -302,7 +304,9 @@ class SimulatedBody:
             self._state = self._carried(self._world)
             return True
         if self._in_stint:
-            self._state = replace(state, todo=np.array([[max(task.may - task.before, self._begun())]]))
+            todo = max(task.may - task.before, self._begun())
+            if todo != state.todo[0, 0]:
+                self._state = replace(state, todo=np.array([[todo]]))
         return False
 
     def _told(self, task: _Task, done: int, log: list[Event], shift_s: float) -> list[Event]:
@@ -387,8 +391,8 @@ class SimulatedBody:
             return 0
         approach_s, cycle_s, _ = self._times_s
         count = (self._progress_s - approach_s) / cycle_s
-        whole = np.floor(count + ROUNDING_S) if done else np.ceil(count - ROUNDING_S)
-        return int(np.clip(whole, 0, self._state.todo[0, 0]))
+        whole = floor(count + ROUNDING_S) if done else ceil(count - ROUNDING_S)
+        return min(max(whole, 0), int(self._state.todo[0, 0]))
 
     @property
     def _home_in_s(self) -> float:

@@ -62,6 +62,7 @@ def diagnosed(
     malformed: int = 0,
     complaints: Sequence[str] = (),
     overrun: int = 0,
+    auctioneer: bool = True,
 ) -> Diagnosis:
     """What is wrong with a fleet that was listened to for a while.
 
@@ -69,12 +70,13 @@ def diagnosed(
         now: The fleet at the real second `now_s`.
         complaints: What was wrong with malformed words.
         overrun: Words lost because they came faster than we listened.
+        auctioneer: Whether the fleet should have one.
     """
     trips_s = [sounding.answered_s - sounding.asked_s for sounding in soundings]
     clock = best_clock(soundings)
     offsets_s = {arm.arm: offset_s(arm, now_s, clock) for arm in now.arms if arm.time_s is not None} if clock else {}
     findings = [
-        *about_auctioneers(now, soundings),
+        *about_auctioneers(now, soundings, auctioneer),
         *(finding for arm in now.arms for finding in about_arm(arm, offsets_s.get(arm.arm))),
     ]
     if not any(arm.present for arm in now.arms):
@@ -97,16 +99,26 @@ def diagnosed(
     )
 
 
-def about_auctioneers(now: FleetNow, soundings: Sequence[Sounding]) -> list[Finding]:
-    """Whether one, and only one, takes jobs and tells the time."""
+def about_auctioneers(now: FleetNow, soundings: Sequence[Sounding], wanted: bool = True) -> list[Finding]:
+    """Whether one, and only one, takes jobs and tells the time; or none, where none is wanted."""
     there = [seen.auctioneer for seen in now.auctioneers if seen.token]
     if len(there) > 1:
-        return [Finding("fault", f"{len(there)} auctioneers are there ({', '.join(there)}): a fleet has one.")]
+        told = f"{len(there)} auctioneers are there ({', '.join(there)}): a fleet has one; stop all but one."
+        return [Finding("fault", told)]
+    if not wanted:
+        told = f"Auctioneer {', '.join(there)} is there, though the fleet should have none."
+        return [Finding("warning", told)] if there else []
     if any(sounding.time_s is not None for sounding in soundings):
         return []
     if there:
         return [Finding("fault", f"Auctioneer {', '.join(there)} shows its token but does not answer: does it hang?")]
-    return [Finding("fault", "No auctioneer: nobody takes jobs, and every arm keeps its own time.")]
+    return [
+        Finding(
+            "fault",
+            "No auctioneer shows a token or answers: nobody hands out jobs, and every arm keeps its own time. "
+            "If this fleet has none by intention, say --no-auctioneer.",
+        )
+    ]
 
 
 def about_arm(arm: ArmNow, offset_s: float | None) -> list[Finding]:

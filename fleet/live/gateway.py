@@ -10,7 +10,8 @@ from typing import Self, TypeVar
 import msgspec
 
 from fleet.bus import keys
-from fleet.bus.link import Answers, Link
+from fleet.bus.answers import Answers
+from fleet.bus.link import Link
 from fleet.bus.messages import encode
 from fleet.bus.trade import Quote, QuoteRequest, Status, StatusRequest, Submission, Submitted
 from fleet.errors import BusError

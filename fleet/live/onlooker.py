@@ -7,8 +7,9 @@ from collections.abc import Callable
 import msgspec
 
 from fleet.bus import keys
+from fleet.bus.answers import Answers
 from fleet.bus.contract import PUBLISHED
-from fleet.bus.link import Answers, Link
+from fleet.bus.link import Link
 from fleet.bus.trade import Status, StatusRequest
 from fleet.errors import BusError
 from fleet.live.overview import Overview, Role

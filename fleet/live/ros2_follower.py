@@ -9,7 +9,8 @@ import time
 from collections.abc import Mapping
 
 from fleet.bus import keys
-from fleet.bus.link import Answers, Link, Refused
+from fleet.bus.answers import Answers
+from fleet.bus.link import Link, Refused
 from fleet.bus.messages import Info, MalformedMessage, State
 from fleet.bus.ros2 import Node
 from fleet.bus.ros2_cdr import DIAGNOSTICS, JOINT_STATE, read_diagnostics, read_joints, type_hash

@@ -19,9 +19,10 @@ import zenoh
 from zenoh import ext
 
 from fleet.bus import keys
+from fleet.bus.answers import Answers
 from fleet.bus.certificates import issue
 from fleet.bus.keyring import add, make
-from fleet.bus.link import Answers, Link, Refused
+from fleet.bus.link import Link, Refused
 from fleet.bus.memory import MemoryExchange
 from fleet.bus.messages import encode, encoding
 from fleet.bus.roster import Participant, of_arms

@@ -5,6 +5,7 @@ import os
 import threading
 import time
 from contextlib import ExitStack
+from functools import partial
 from itertools import count
 
 import pytest
@@ -37,7 +38,9 @@ from fleet.bus.trade import (
 )
 from fleet.errors import BusError, JournalFull
 from fleet.live.auction_node import AuctionNode, _first
+from fleet.live.auctioneer import Objection
 from fleet.live.journal import Journal
+from fleet.live.onlooker import Onlooker
 from fleet.live.records import Record
 
 PATIENCE_S = 15.0
@@ -122,12 +125,12 @@ class Bus:
         self.arms.append(Arm(self.stack.enter_context(Link(self.endpoint, "f")), name))
         return self.arms[-1]
 
-    def auctioneer(self, name="auctioneer", sync=None, **options):
+    def auctioneer(self, name="auctioneer", sync=None, folder="", **options):
         """A node with a life of its own, that `kill` may end."""
         extra = {} if sync is None else {"sync": sync}
         with ExitStack() as life:
             link = life.enter_context(Link(self.endpoint, "f"))
-            book = life.enter_context(Journal[Record](self.folder / name, Record, **extra))
+            book = life.enter_context(Journal[Record](self.folder / folder / name, Record, **extra))
             node = AuctionNode(link, name, book, **{"allocate": cheapest, "speed": 60.0, **options})
             node.life = self.stack.enter_context(life.pop_all())
         self.nodes.append(node)
@@ -215,14 +218,26 @@ def test_nothing_is_lost_while_the_auctioneer_is_gone(bus):
 
 def test_a_fleet_has_one_auctioneer(bus):
     node = bus.auctioneer("one")
-    # While the second one asks, the first is not served, as if it stood still.
+    # While the second one asks, the first is not served, as if it stood still: its token tells.
+    with pytest.raises(BusError, match=r"has an auctioneer already: 'one'. A fleet has one"):
+        bus.auctioneer("two")
+    with pytest.raises(BusError, match=r"has an auctioneer 'one' already: its token is there. Stop that one first"):
+        bus.auctioneer("one", folder="elsewhere")
+    bus.kill(node)
+    assert states(bus.auctioneer("one")) == []
+
+
+def test_one_that_answers_and_shows_no_token_yet_is_an_auctioneer_too(bus):
+    early = bus.link()
+    early.answer(keys.of_jobs("f", "status"), StatusRequest, lambda _: Status("one", 0.0, ()))
+    early.watch(keys.of_every_arm("f", "alive"), lambda *_: None)
     with pytest.raises(BusError, match="has an auctioneer already, which does not answer"):
         bus.auctioneer("two")
     stop = threading.Event()
 
     def serve():
         while not stop.is_set():
-            node.serve(time.monotonic() + 0.05)
+            early.serve(time.monotonic() + 0.05)
 
     thread = threading.Thread(target=serve)
     thread.start()
@@ -232,8 +247,54 @@ def test_a_fleet_has_one_auctioneer(bus):
     finally:
         stop.set()
         thread.join(PATIENCE_S)
-    bus.kill(node)
-    assert states(bus.auctioneer("two")) == []
+
+
+def test_two_auctioneers_are_both_seen_and_do_nothing_together(bus, monkeypatch):
+    """Two may come together after a cut: neither saw the other when it began."""
+    monkeypatch.setattr(AuctionNode, "_refuse_a_second", lambda self: None)
+    one, two = bus.auctioneer("one"), bus.auctioneer("two")
+    arm = bus.arm("arm_0")
+    bus.until(lambda: one.rivals == {"two"} and two.rivals == {"one"} and one.present == {"arm_0"})
+    answers = bus.ask(keys.of_jobs("f", "submit"), Submission(jobs("a")), Submitted)
+    assert not answers.words
+    assert (
+        sorted(answers.refused.values())
+        == ["Fleet 'f' has more than one auctioneer (one, two): no jobs are taken until one is stopped."] * 2
+    )
+    with pytest.raises(Objection, match="more than one auctioneer"):
+        one.submit(Submission(jobs("a")))
+    status = bus.ask(keys.of_jobs("f", "status"), StatusRequest(), Status)
+    assert sorted(word.auctioneer for word in status.words.values()) == ["one", "two"]
+    assert len(bus.ask(keys.of_clock("f"), ClockRequest(), Clock).words) == 2
+    bus.kill(two)
+    bus.until(lambda: not one.rivals)
+    one.submit(Submission(jobs("a")))
+    bus.until(lambda: states(one) == ["finished"])
+    assert arm.done == ["a"]
+
+
+def test_what_was_taken_before_a_second_auctioneer_came_is_awarded_by_nobody_meanwhile(bus, monkeypatch):
+    monkeypatch.setattr(AuctionNode, "_refuse_a_second", lambda self: None)
+    one = bus.auctioneer("one")
+    one.submit(Submission(jobs("a")))
+    two = bus.auctioneer("two")
+    bus.until(lambda: one.rivals == {"two"})
+    arm = bus.arm("arm_0")
+    bus.until(lambda: one.present == {"arm_0"})
+    seen = bus.link()
+    onlooker = Onlooker(seen)
+    bus.until(
+        lambda: {said.auctioneer for said in onlooker.overview.now(0.0).auctioneers if said.token} == {"one", "two"}
+    )
+    bus.until(partial(later, time.monotonic() + 0.5))
+    assert states(one) == ["waiting"]
+    assert not arm.awards
+    bus.kill(two)
+    bus.until(lambda: states(one) == ["finished"])
+
+
+def later(at_s):
+    return time.monotonic() > at_s
 
 
 def test_the_fleets_time_runs_at_its_speed(bus):

@@ -85,6 +85,20 @@ def test_each_illness_of_an_auctioneer_is_named(sounding, auctioneers, says):
     assert says in told[0]
 
 
+def test_a_fleet_without_an_auctioneer_by_intention_is_healthy():
+    silence = Sounding(100.0, 100.1)
+    assert faults(fleet(arm(), auctioneers=()), silence)[0] == [
+        "No auctioneer shows a token or answers: nobody hands out jobs, and every arm keeps its own time. "
+        "If this fleet has none by intention, say --no-auctioneer."
+    ]
+    told, found = faults(fleet(arm(), auctioneers=()), silence, auctioneer=False)
+    assert (told, found.findings, found.time_s) == ([], (), None)
+    told, found = faults(fleet(arm()), auctioneer=False)
+    assert told == []
+    assert "au is there, though" in found.findings[0].what
+    assert "2 auctioneers" in faults(fleet(arm(), auctioneers=(*ALONE, *ALONE)), auctioneer=False)[0][0]
+
+
 def test_malformed_words_are_a_fault_with_their_reason():
     told, _ = faults(fleet(arm()), malformed=3, complaints=("under 'k': not JSON",))
     assert told == ["3 malformed word(s), the last: under 'k': not JSON"]
@@ -185,6 +199,14 @@ def test_a_sick_fleet_gives_exit_code_1_and_all_reasons():
     assert code == 1
     for says in ("a shows its token but says no state", "2 auctioneers", "No arm is present", "malformed word"):
         assert says in told
+
+
+def test_the_doctor_is_told_that_no_auctioneer_is_meant():
+    with Router() as router, participants(router.endpoint, clocks=0):
+        code, told = doctor(router.endpoint)
+        assert (code, "say --no-auctioneer" in told) == (1, True)
+        code, told = doctor(router.endpoint, "--no-auctioneer")
+    assert (code, "The fleet is well." in told, "time nobody tells it" in told) == (0, True, True), told
 
 
 def test_nobody_at_the_router_is_not_healthy():
