@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from fleet.env.lettering import width
+from fleet.env.lettering import fitted, width
 from fleet.env.scene import Cell
 from fleet.robot import JOINTS
 
@@ -28,9 +28,10 @@ MOST_APART = 12
 
 @dataclass(frozen=True)
 class Label:
-    """A name, the left end of its middle line, and where a line from its station ends if it stands apart."""
+    """A name, whose station it is, the left end of its middle line, and the end of a line to it if it stands apart."""
 
     text: str
+    station: int
     at: Pixel
     tail: Pixel | None
 
@@ -180,18 +181,23 @@ def _apart(
     clear_ring = np.array([2 * reach + 4, 2 * reach + below + 2])
     for i in range(MOVES):
         at += 0.08 * (1 - i / MOVES) * (home - at)
-        at += _push(at + text, fixed, clear_station, 0.4)
-        at += _push(at, at, clear_ring, 0.5)
+        at += _push(at + text, fixed, clear_station, 0.4, 4)
+        at += _push(at, at, clear_ring, 0.5, 2)
         at = np.clip(at, low, high)
     return tuple((int(x), int(y)) for x, y in np.rint(at))
 
 
-def _push(at: Array, others: Array, clear: Array, share: float) -> Array:
-    """Moves [point, 2] away from others within the ellipse `clear`, by a share of what they are too near."""
+def _push(at: Array, others: Array, clear: Array, share: float, corners: int) -> Array:
+    """Moves [point, 2] away from others by a share of what they are too near.
+
+    Args:
+        clear: Half width and height of the room around a point.
+        corners: 2 for an ellipse; the more, the nearer the room is to a rectangle.
+    """
     if not len(others):
         return np.zeros_like(at)
     gap = at[:, None] - others[None]  # [point, other, 2]
-    near = np.linalg.norm(gap / clear, axis=-1, keepdims=True)
+    near = np.linalg.norm(gap / clear, ord=corners, axis=-1, keepdims=True)
     inside = (near < 1.0) & (near > 0.0)
     away = gap / np.maximum(near, 1e-6) * (1.0 - near)
     return share * np.where(inside, np.clip(away, -clear, clear), 0.0).sum(axis=1)
@@ -211,7 +217,7 @@ def _labelled(
     line = text // 2 + 1
     taken: list[Box] = [(x - reach, y - reach, x + reach, y + reach + below) for x, y in rings]
     taken += [(x - station, y - station, x + station, y + station) for x, y in stations]
-    names = [name for name, _ in cell.stations]
+    names = [fitted(name, text, floor[2] - floor[0]) for name, _ in cell.stations]
     left, labels = list(range(len(names))), []
     # First those that can stand at their stations; in a large cell no others, since the lines would be a tangle.
     for apart in (False, True) if len(names) <= MOST_APART else (False,):
@@ -220,7 +226,7 @@ def _labelled(
             for x, y, tail in _around(stations[i], long, station, line, apart):
                 box = (x - 1, y - line, x + long + 1, y + line)
                 if _within(box, floor) and not any(_meet(box, other) for other in taken):
-                    labels.append(Label(names[i], (x, y), tail))
+                    labels.append(Label(names[i], i, (x, y), tail))
                     taken.append(box)
                     left.remove(i)
                     break

@@ -73,15 +73,12 @@ def _background(cell: Cell, size: Pixel, warning_c: float, error_c: float) -> Im
     draw = ImageDraw.Draw(image)
     draw.rectangle(plan.floor, fill=GROUND)
     _draw_legend(image, draw, cell, plan, warning_c, error_c)
-    where = _station_pixels(cell, plan)
     for label in plan.labels:
         if label.tail is not None:
-            draw.line((where[label.text], label.tail), "#9a9a9a", 1)
+            draw.line((plan.stations[label.station], label.tail), "#9a9a9a", 1)
     for x, y in plan.stations:
         half = plan.station
         draw.rectangle((x - half, y - half, x + half, y + half), fill=PAPER, outline=FAINT)
-    for label in plan.labels:
-        write(image, label.at, label.text, FAINT, plan.text, anchor="lm")
     for base, ring in zip(plan.bases, plan.rings, strict=True):
         if np.hypot(base[0] - ring[0], base[1] - ring[1]) > 0.5 * plan.reach:
             draw.line((base, ring), LINE, 1)
@@ -133,8 +130,8 @@ def _draw_legend(
 
 
 def _draw_work(image: Image.Image, draw: ImageDraw.ImageDraw, scene: Scene, plan: FloorPlan) -> None:
-    """Lines from the arms to the stations they occupy."""
-    where = _station_pixels(scene.cell, plan)
+    """Lines from the arms to the stations they occupy, and the names of all stations over them."""
+    where = {name: at for (name, _), at in zip(scene.cell.stations, plan.stations, strict=True)}
     thick = max(2, round((3 if len(scene.cell.arms) <= 16 else 2) * plan.scale))
     for a, names in enumerate(scene.at):
         ends = [where[name] for name in names if name in where]
@@ -144,10 +141,8 @@ def _draw_work(image: Image.Image, draw: ImageDraw.ImageDraw, scene: Scene, plan
         for x, y in ends:
             half = plan.station
             draw.rectangle((x - half, y - half, x + half, y + half), fill=WORK, outline=INK)
-
-
-def _station_pixels(cell: Cell, plan: FloorPlan) -> dict[str, Pixel]:
-    return {name: at for (name, _), at in zip(cell.stations, plan.stations, strict=True)}
+    for label in plan.labels:
+        write(image, label.at, label.text, FAINT, plan.text, anchor="lm", halo=GROUND)
 
 
 def _draw_arm(image: Image.Image, scene: Scene, plan: FloorPlan, a: int, colours: Array) -> None:
