@@ -18,6 +18,7 @@ from fleet.job import Job
 from fleet.motion import Plan
 from fleet.motor import current
 from fleet.robot import ThermalLimits
+from fleet.sim.claims import Board
 from fleet.sim.kernel import ROUNDING_S, Step, step
 from fleet.sim.plants import ProfilePlant
 from fleet.sim.state import DONE, State, World, initial
@@ -29,20 +30,11 @@ Array = np.ndarray
 
 MOST_STEPS = 200
 """Of one call: a body that has fallen far behind catches up little by little."""
+NOTHING_ON_OFFER = Board(on_offer=np.array([[-1]]), mask=np.array([[[True, False]]]))
+"""To one arm that claims nothing: what hangs out need not be looked up."""
 _TOLD = ("torque_warning", "home", "warning", "fault", "recover")
 """Events of the kernel that are true of a live arm as they are."""
-_KEPT = (
-    "tick",
-    "temp_c",
-    "mode",
-    "clear_at_s",
-    "faults",
-    "peak_c",
-    "above_warning_s",
-    "busy_s",
-    "lost_s",
-    "energy_j",
-)
+_KEPT = ("tick", "temp_c", "mode", "clear_at_s", "faults", "peak_c", "above_warning_s", "busy_s", "lost_s", "energy_j")
 """What of a state goes on when the job changes."""
 
 
@@ -286,7 +278,8 @@ class SimulatedBody:
         if air_c != self._world.ambient_c[0, 0]:
             self._world = replace(self._world, ambient_c=np.array([[air_c]]))
         goes = task is not None and self._set_out(task)
-        done = step(self._world, self._state, np.array([[int(goes)]]), np.zeros((1, 1, 1)), self._plant, log)
+        board = None if goes else NOTHING_ON_OFFER
+        done = step(self._world, self._state, np.array([[int(goes)]]), np.zeros((1, 1, 1)), self._plant, log, board)
         self._last, self._state = (self._world, done), done.state
         events = [replace(e, time_s=e.time_s + shift_s) for e in log if e.kind in _TOLD]
         return events if task is None else events + self._told(task, int(done.began.todo[0, 0]), log, shift_s)
