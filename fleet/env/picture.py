@@ -115,7 +115,8 @@ def _draw_legend(
     for temp_c in marks[:4]:
         x = legend_x(plan, temp_c, warning_c, error_c)
         bold = temp_c >= warning_c
-        draw.line((x, middle - half - 1, x, middle + half + 3), INK, 1)
+        for begin, end in ((middle - half - 3, middle - half - 1), (middle + half + 1, middle + half + 3)):
+            draw.line((x, begin, x, end), INK, 1)
         write(image, (x, middle + half + 4), f"{temp_c:g} °C", INK, plan.text, bold=bold, anchor="ma")
     x, y = right + 2 * plan.text, middle
     for kind in (kind for kind in ICONS if kind in cell.kinds):
