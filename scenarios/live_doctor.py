@@ -69,6 +69,7 @@ def examine(endpoint: str, fleet: str, seconds: float, *, auctioneer: bool = Tru
     """
     from fleet.bus import keys
     from fleet.bus.link import Link
+    from fleet.bus.security import identified
     from fleet.bus.trade import Clock, ClockRequest
     from fleet.live.diagnosis import Sounding, diagnosed
     from fleet.live.onlooker import Onlooker
@@ -97,7 +98,8 @@ def examine(endpoint: str, fleet: str, seconds: float, *, auctioneer: bool = Tru
         now_s = time.monotonic()
         now = onlooker.overview.now(now_s)
         problems = {"malformed": link.malformed, "complaints": tuple(link.complaints), "overrun": link.overrun}
-    return now, diagnosed(now, now_s, soundings, auctioneer=auctioneer, **problems)
+    secure = identified(endpoint)[1] is not None
+    return now, diagnosed(now, now_s, soundings, auctioneer=auctioneer, secure=secure, **problems)
 
 
 def show(endpoint: str, now: "FleetNow", found: "Diagnosis") -> None:
@@ -124,14 +126,17 @@ def show(endpoint: str, now: "FleetNow", found: "Diagnosis") -> None:
 
 
 def why_unreachable(endpoint: str) -> str:
-    """What a plain connection to the endpoint tells; "" for an endpoint that is none."""
-    match = re.fullmatch(r"(?:tcp|tls)/\[?([^\]/]+?)\]?:(\d{1,5})", endpoint)
+    """What a plain connection to the endpoint tells; "" for one with TLS, or that is none: the error says it all."""
+    match = re.fullmatch(r"tcp/\[?([^\]/]+?)\]?:(\d{1,5})", endpoint)
     if match is None or int(match[2]) > 65535:
         return ""
+    from fleet.bus.security import why_not
+
     host, port = match[1], int(match[2])
     try:
         with socket.create_connection((host, port), timeout=ANSWER_S):
-            return f"Something listens at port {port}, but it does not speak as our router does; does it want TLS?"
+            known = why_not(host, port, None)  # which the error tells
+            return "" if known else f"Something listens at port {port}, but it does not speak as our router does."
     except ConnectionRefusedError:
         return f"Nothing listens at port {port} of {host}; start it with: thermofleet router --port {port}"
     except OSError as error:

@@ -23,6 +23,8 @@ from zenoh import ext as advanced
 from fleet.bus import keys
 from fleet.bus.answers import Answers, by
 from fleet.bus.messages import MalformedMessage, Refusal, encode, encoding, read_as, spoken_by
+from fleet.bus.permission import participant_at, rights_by_role
+from fleet.bus.roster import Participant
 from fleet.bus.router import open_client
 from fleet.errors import BusError
 
@@ -74,6 +76,7 @@ class Link:
         self._backlog = backlog
         self._overrunning = Lock()
         self._session: zenoh.Session | None = None
+        self._who: Participant | None = None
         self._resources = ExitStack()
         # A process that ends without closing its session would hang.
         self._at_exit = weakref.finalize(self, self._resources.close)
@@ -87,6 +90,7 @@ class Link:
         if self._session is None:
             self._session = open_client(self._endpoint, timeout_s=self._timeout_s)
             self._resources.callback(self._session.close)
+            self._who = participant_at(self._endpoint)
         return self
 
     def close(self) -> None:
@@ -190,7 +194,11 @@ class Link:
             kind: What the answers should be; an answer that speaks for another than its key says is malformed.
             timeout_s: Real seconds. One that stands still costs this long, unless `each` shows that enough is there.
             each: Called after every answer with all that are there.
+
+        Raises:
+            BusError: the line is not open, or with this certificate that may not be asked: a router would drop it.
         """
+        self._check_may_ask(key)
         answers: Answers[Said] = Answers()
         asked_s = time.monotonic()
 
@@ -291,6 +299,19 @@ class Link:
         return frozenset(names)
 
     # Inside
+
+    def _check_may_ask(self, key: str) -> None:
+        if self._who is None:
+            return
+        asked = zenoh.KeyExpr(key)
+        may = {
+            role: any(zenoh.KeyExpr(allowed).includes(asked) for allowed in one.asks)
+            for role, one in rights_by_role(self.fleet, self._who.name).items()
+        }
+        if not may[self._who.role]:
+            others = " or ".join(role for role in may if may[role])
+            needed = f"; that takes the certificate of one in the role {others}" if others else ""
+            raise BusError(f"'{self._who.common_name}' may not ask '{key}'{needed}.")
 
     def _open(self) -> zenoh.Session:
         if self._session is None:

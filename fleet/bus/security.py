@@ -23,6 +23,8 @@ _LOG = logging.getLogger(__name__)
 REMIND = timedelta(days=14)
 """A certificate that ends sooner is worth a warning."""
 _PROBE_S = 1.0
+_STRANGERS = (18, 19, 20, 21)
+"""What OpenSSL says (X509_V_ERR_…) of a certificate whose authority it does not know."""
 
 
 @dataclass(frozen=True)
@@ -44,11 +46,11 @@ class Tls:
         # Not at the top: whoever has no TLS shall not wait for the library.
         from fleet.bus.certificates import check, common_name, told
 
-        certificate = check(self.folder, self._file)
+        certificate = check(self.folder, self.file)
         who = common_name(certificate)
         if who.startswith("router:") != serves:
             needs = "a router needs that of a router" if serves else "only the router may use it"
-            raise BusError(f"'{self.folder / self._file}.pem' is the certificate of '{who}'; {needs}.")
+            raise BusError(f"'{self.folder / self.file}.pem' is the certificate of '{who}'; {needs}.")
         self._check_secret()
         left = certificate.not_valid_after_utc - datetime.now(UTC)
         if left < REMIND:
@@ -60,8 +62,8 @@ class Tls:
         end = "listen" if serves else "connect"
         return {
             "root_ca_certificate": str(self._path("ca.pem")),
-            f"{end}_certificate": str(self._path(f"{self._file}.pem")),
-            f"{end}_private_key": str(self._path(f"{self._file}.key")),
+            f"{end}_certificate": str(self._path(f"{self.file}.pem")),
+            f"{end}_private_key": str(self._path(f"{self.file}.key")),
             "enable_mtls": True,
             "verify_name_on_connect": True,
             # A line does not outlive the certificate it was opened with.
@@ -70,23 +72,24 @@ class Tls:
 
     def endpoint(self, address: str) -> str:
         """An address `tls/HOST:PORT` together with who connects there, the inverse of `identified`."""
-        return f"{address}#{self.folder / self._file}"
+        return f"{address}#{self.folder / self.file}"
 
     def context(self) -> ssl.SSLContext:
         """The same end for Python's own TLS."""
         context = ssl.create_default_context(cafile=self._path("ca.pem"))
-        context.load_cert_chain(self._path(f"{self._file}.pem"), self._path(f"{self._file}.key"))
+        context.load_cert_chain(self._path(f"{self.file}.pem"), self._path(f"{self.file}.key"))
         return context
 
     @property
-    def _file(self) -> str:
+    def file(self) -> str:
+        """Name of its files, without the ending."""
         return file_of(self.name)
 
     def _path(self, file: str) -> Path:
         return Path(os.path.abspath(self.folder)) / file
 
     def _check_secret(self) -> None:
-        path = self._path(f"{self._file}.key")
+        path = self._path(f"{self.file}.key")
         if os.name == "posix" and path.stat().st_mode & 0o077:
             raise BusError(f"Others on this machine may read the private key '{path}': chmod 600 it.")
 
@@ -128,7 +131,8 @@ def _handshake(line: socket.socket, host: str, tls: Tls) -> str:
             # In TLS 1.3 the other end judges our certificate after our half is done: its verdict is the first we read.
             secure.recv(1)
     except ssl.SSLCertVerificationError as error:
-        return f"the certificate of what listens there is refused: {error.verify_message}"
+        doubt = f"; are the keys in '{tls.folder}' those of another fleet?" if error.verify_code in _STRANGERS else ""
+        return f"the certificate of what listens there is refused: {error.verify_message}{doubt}"
     except ssl.SSLError as error:
         reason = (error.reason or str(error)).lower().replace("_", " ")
         if "alert" in reason:

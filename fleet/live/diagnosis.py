@@ -63,6 +63,7 @@ def diagnosed(
     complaints: Sequence[str] = (),
     overrun: int = 0,
     auctioneer: bool = True,
+    secure: bool = False,
 ) -> Diagnosis:
     """What is wrong with a fleet that was listened to for a while.
 
@@ -71,6 +72,7 @@ def diagnosed(
         complaints: What was wrong with malformed words.
         overrun: Words lost because they came faster than we listened.
         auctioneer: Whether the fleet should have one.
+        secure: Whether it was listened to with a certificate: one that the router does not know hears nothing.
     """
     trips_s = [sounding.answered_s - sounding.asked_s for sounding in soundings]
     clock = best_clock(soundings)
@@ -80,7 +82,9 @@ def diagnosed(
         *(finding for arm in now.arms for finding in about_arm(arm, offsets_s.get(arm.arm))),
     ]
     if not any(arm.present for arm in now.arms):
-        findings.append(Finding("fault", "No arm is present: none shows both a token and a fresh state."))
+        deaf = secure and not any(arm.token for arm in now.arms)
+        hint = " Or the router does not know this certificate: it reads its roster when it starts." if deaf else ""
+        findings.append(Finding("fault", f"No arm is present: none shows both a token and a fresh state.{hint}"))
     if trips_s and median(trips_s) > SLOW_S:
         findings.append(Finding("warning", f"The router is slow: a round trip takes {1000 * median(trips_s):.0f} ms."))
     if malformed:

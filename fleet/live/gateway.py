@@ -85,7 +85,11 @@ class Gateway:
         return await self._one(keys.of_jobs(self._link.fleet, "status"), word, Status)
 
     async def quotes(self, word: QuoteRequest) -> Quotes:
-        """Ask every arm what jobs would cost."""
+        """Ask every arm what jobs would cost.
+
+        Raises:
+            Silence: with its certificate the gateway may not ask.
+        """
         answers = await self._ask(keys.of_every_arm(self._link.fleet, "quote"), word, Quote, QUOTE_S)
         return Quotes(tuple(answers.words.values()), tuple(answers.refused.values()))
 
@@ -98,13 +102,16 @@ class Gateway:
         raise Silence("There is no auctioneer in this fleet.")
 
     async def _ask(self, key: str, word: msgspec.Struct, kind: type[Said], timeout_s: float) -> Answers[Said]:
-        def ask(done: Callable[[Answers[Said]], None]) -> None:
+        def ask(done: Callable[[Answers[Said] | BusError], None]) -> None:
             try:
                 self._link.ask(key, word, kind, done, timeout_s=timeout_s)
             except BusError as error:
-                done(Answers(refused={key: str(error)}))
+                done(error)
 
-        return await self._on_bus(ask)
+        answers = await self._on_bus(ask)
+        if isinstance(answers, BusError):
+            raise Silence(str(answers)) from answers
+        return answers
 
     async def _on_bus(self, question: Callable[[Callable[[Result], None]], None]) -> Result:
         """What a question on the bus thread is answered with."""

@@ -1,0 +1,209 @@
+"""Who looks at a fleet over TLS sees it with a certificate, and is told in a sentence what is wrong with another."""
+
+import http.client
+import json
+import subprocess
+import sys
+import threading
+import time
+from contextlib import ExitStack, contextmanager
+from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
+
+import pytest
+from typer.testing import CliRunner
+
+from fleet.bus import keys
+from fleet.bus.certificates import issue
+from fleet.bus.keyring import make
+from fleet.bus.link import Link
+from fleet.bus.messages import State
+from fleet.bus.roster import Participant, of_arms
+from fleet.bus.router import Router
+from fleet.bus.security import Tls
+from fleet.bus.trade import (
+    Admission,
+    Clock,
+    ClockRequest,
+    JobStatus,
+    Offer,
+    Quote,
+    QuoteRequest,
+    Status,
+    StatusRequest,
+    Submission,
+    Submitted,
+)
+from fleet.errors import BusError
+from scenarios.cli import app
+
+PATIENCE_S = 30.0
+ARM = "arm 1/b"
+EXTRA = Participant("gateway", "submitter")
+COMMANDS = {
+    "watch": ["watch", "--json"],
+    "doctor": ["doctor", "--seconds", "1"],
+    "gateway": ["gateway", "--port", "0"],
+}
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory):
+    """A router with TLS, one arm and an auctioneer, each with its own certificate, on a thread of their own."""
+    place, stop = tmp_path_factory.mktemp("keys") / "f", threading.Event()
+    make(place, of_arms("f", [ARM], [EXTRA]), days=30)
+    with ExitStack() as stack:
+        router = stack.enter_context(Router(tls=Tls(place, "router")))
+
+        def line(name):
+            return stack.enter_context(Link(Tls(place, name).endpoint(router.endpoint), "f"))
+
+        arm, auctioneer, began_s = line(ARM), line("auctioneer"), time.monotonic()
+
+        def quote(request):
+            offers = tuple(Offer(job=job.name, feasible=True, d=0.25) for job in request.jobs)
+            return Quote(ARM, request.auction, "", 3.0, "t", 1.0, "idle", 20.0, 1, offers)
+
+        def now_s():
+            return time.monotonic() - began_s
+
+        arm.answer(keys.of_arm("f", ARM, "quote"), QuoteRequest, quote)
+        arm.alive(keys.of_arm("f", ARM, "alive"))
+        auctioneer.answer(keys.of_clock("f"), ClockRequest, lambda _: Clock(now_s(), 1.0))
+        status = Status("auctioneer", 1.0, (JobStatus("j", "waiting"),))
+        auctioneer.answer(keys.of_jobs("f", "status"), StatusRequest, lambda _: status)
+        taken = Submitted("auctioneer", (Admission("crate", True),))
+        auctioneer.answer(keys.of_jobs("f", "submit"), Submission, lambda _: taken)
+        auctioneer.alive(keys.of_auction("f", "auctioneer", "alive"))
+
+        def live():
+            while not stop.is_set():
+                arm.say(keys.of_arm("f", ARM, "state"), State(ARM, 1, now_s(), "idle", (30.0,), 30.0))
+                for each in (arm, auctioneer):
+                    each.serve(time.monotonic() + 0.02)
+
+        thread = threading.Thread(target=live)
+        thread.start()
+        yield SimpleNamespace(endpoint=router.endpoint, keys=place)
+        stop.set()
+        thread.join(PATIENCE_S)
+
+
+def run(command, endpoint):
+    return CliRunner().invoke(app, [*COMMANDS[command], "--endpoint", endpoint])
+
+
+def test_a_monitor_watches(fleet):
+    done = run("watch", Tls(fleet.keys, "monitor").endpoint(fleet.endpoint))
+    assert done.exit_code == 0, done.exception
+    now = json.loads(done.stdout)
+    assert [(arm["arm"], arm["present"]) for arm in now["arms"]] == [(ARM, True)]
+    assert (now["auctioneers"][0]["auctioneer"], now["counts"]) == ("auctioneer", {"waiting": 1})
+
+
+def test_the_doctor_finds_a_fleet_with_rules_well(fleet):
+    done = run("doctor", Tls(fleet.keys, "monitor").endpoint(fleet.endpoint))
+    assert (done.exit_code, "The fleet is well." in done.stdout) == (0, True), done.stdout
+
+
+@contextmanager
+def gateway(fleet, name):
+    """The address of a gateway with the certificate of this one."""
+    command = [sys.executable, "-c", "from scenarios.cli import main; main()", *COMMANDS["gateway"]]
+    started = subprocess.Popen(
+        [*command, "--endpoint", Tls(fleet.keys, name).endpoint(fleet.endpoint)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        ready = started.stdout.readline()
+        assert ready.startswith("ready gateway http://127.0.0.1:"), ready + started.stderr.read()
+        yield int(ready.split(":")[2].split("/")[0])
+    finally:
+        started.kill()
+        started.communicate(timeout=PATIENCE_S)
+
+
+def asked(port, method, path, body=None):
+    line = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
+    try:
+        line.request(method, path, json.dumps(body), {"Content-Type": "application/json"})
+        answer = line.getresponse()
+        return answer.status, json.loads(answer.read())
+    finally:
+        line.close()
+
+
+JOBS = {"jobs": [{"name": "crate", "kind": "hold", "places": ["rack"]}]}
+
+
+def test_the_gateway_hands_in_with_the_certificate_of_a_submitter(fleet):
+    with gateway(fleet, "gateway") as port:
+        code, told = asked(port, "POST", "/v1/jobs", JOBS)
+        assert (code, told["jobs"][0]["accepted"]) == (200, True), told
+        code, told = asked(port, "POST", "/v1/ask", JOBS)
+        assert (code, [quote["arm"] for quote in told["quotes"]]) == (200, [ARM]), told
+        code, told = asked(port, "GET", "/v1/fleet")
+        assert (code, [arm["arm"] for arm in told["arms"]]) == (200, [ARM])
+
+
+def test_the_gateway_says_that_a_monitor_may_only_look(fleet):
+    with gateway(fleet, "monitor") as port:
+        assert asked(port, "GET", "/v1/jobs?job=j")[0] == 200
+        for path in ("/v1/jobs", "/v1/ask"):
+            code, told = asked(port, "POST", path, JOBS)
+            assert code == 503
+            assert "'monitor:monitor' may not ask" in told["detail"]
+            assert "takes the certificate of one in the role" in told["detail"]
+
+
+def of_another_authority(place, true):
+    make(place, of_arms("f", [ARM]), days=30)
+
+
+def expired(place, true):
+    of_another_authority(place, true)
+    for name in ("ca.pem", "ca.key"):
+        (place / name).write_bytes((true / name).read_bytes())
+    issue(place, Participant("monitor", "monitor"), days=1, now=datetime.now(UTC) - timedelta(days=2))
+
+
+WRONG = {
+    "none": r"^Endpoint '\S+' needs a certificate: say whose, as tls/\S+#FOLDER/NAME\.$",
+    "plain": r"^No router answered at tcp/\S+ within 5\.0 s \(what listens there speaks TLS: .* are needed\)\.$",
+    "missing": r"^There is no '\S+/nobody\.pem'; thermofleet keys makes it\.$",
+    "wrong role": r"^'\S+/router\.pem' is the certificate of 'router:router'; only the router may use it\.$",
+    "another authority": r"^No router answered .* is refused: .*; are the keys in '\S+' those of another fleet\?\)\.$",
+    "expired": r"^The certificate 'monitor\.pem' expired on 20.* UTC; issue a new one with thermofleet keys\.$",
+}
+
+
+SLOW = ("plain", "another authority")
+"""Tried until the time for it is over: with one command each."""
+
+
+@pytest.mark.parametrize(
+    ("command", "how"),
+    [(command, how) for command in COMMANDS for how in WRONG if how not in SLOW or command == "doctor"],
+)
+def test_what_is_wrong_is_said_in_one_sentence(fleet, tmp_path, command, how):
+    here = tmp_path / "k"
+    if how in ("another authority", "expired"):
+        (expired if how == "expired" else of_another_authority)(here, fleet.keys)
+    endpoint = {
+        "none": fleet.endpoint,
+        "plain": fleet.endpoint.replace("tls/", "tcp/"),
+        "missing": f"{fleet.endpoint}#{fleet.keys}/nobody",
+        "wrong role": f"{fleet.endpoint}#{fleet.keys}/router",
+    }.get(how, f"{fleet.endpoint}#{here}/monitor")
+    done = run(command, endpoint)
+    assert isinstance(done.exception, BusError)
+    with pytest.raises(BusError, match=WRONG[how]):
+        raise done.exception
+
+
+def test_the_doctor_thinks_of_a_certificate_that_the_router_does_not_know(fleet, tmp_path):
+    expired(tmp_path / "k", fleet.keys)
+    issue(tmp_path / "k", Participant("spy", "monitor"), days=20)
+    done = run("doctor", f"{fleet.endpoint}#{tmp_path}/k/spy")
+    assert done.exit_code == 1
+    assert "the router does not know this certificate" in " ".join(done.stdout.split())
