@@ -35,8 +35,8 @@ from fleet.bus.trade import (
 )
 from fleet.errors import FleetError, JournalFull
 from fleet.live.bidding import MOST_TOLD, Allocate, Bidding, Round, nobody_can, sound
-from fleet.live.ledger import Change, Ledger
-from fleet.live.records import Accepted, Awarded, Closed, Ended, Heard, Leave, Record, Silent
+from fleet.live.ledger import Ledger
+from fleet.live.records import Accepted, Awarded, Change, Closed, Ended, Heard, Leave, Record, Silent
 from fleet.live.timing import Timing
 
 _LOG = logging.getLogger(__name__)

@@ -93,6 +93,11 @@ class Journal(Generic[Record]):
     def __exit__(self, *exc: object) -> None:
         self.close()
 
+    @property
+    def size(self) -> int:
+        """Of the file, bytes."""
+        return self._end
+
     def replay(self) -> Iterator[Record]:
         """All records, oldest first.
 
@@ -126,7 +131,7 @@ class Journal(Generic[Record]):
 
         Raises:
             JournalFull: there is no room; the file is as it was.
-            JournalError: the disk failed; the file is as it was.
+            JournalError: the disk failed; the file is as it was, or it is the new one and must be opened anew.
         """
         draft = self.path.with_name(f"{self.path.name}.new")
         line = self._line(records) if records else b""
@@ -137,14 +142,19 @@ class Journal(Generic[Record]):
             self._write(file, line)
             self._sync(file)
             os.replace(draft, self.path)
-            self._sync_folder()
         except OSError as error:
             if file >= 0:
                 os.close(file)
             draft.unlink(missing_ok=True)
             raise self._failed(error) from error
+        # From here on the old file has no name, and what would be written there were lost.
         os.close(self._file)
         self._file, self._end, self._broken = file, len(line), ""
+        try:
+            self._sync_folder()
+        except OSError as error:
+            self._broken = f"{self._failed(error)} Nothing more is written until it is opened anew."
+            raise JournalError(self._broken) from error
 
     # Inside
 

@@ -8,52 +8,30 @@ long an arm still holds its lease, is not in here: whoever replays lets every op
 from bisect import insort
 from collections import deque
 from collections.abc import Container, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 
-from fleet.bus.trade import Admission, JobState, JobStatus, JobWord
+from fleet.bus.trade import Admission, JobStatus, JobWord
 from fleet.live.admission import MOST_JOBS, admit
-from fleet.live.records import Accepted, Awarded, Began, Closed, Ended, Heard, Leave, Record, Silent, Ticked
+from fleet.live.records import (
+    Accepted,
+    Awarded,
+    Began,
+    Change,
+    Closed,
+    Ended,
+    Entry,
+    Heard,
+    Leave,
+    Promise,
+    Record,
+    Silent,
+    Standing,
+    Ticked,
+)
 
 REMEMBERED = 64
 """Last changes, for those who may have missed them when the auctioneer was gone."""
-
-
-@dataclass(frozen=True)
-class Change:
-    """A job's state has changed."""
-
-    number: int
-    """Counts all changes, from 0, also over restarts."""
-    time_s: float
-    status: JobStatus
-    auction: str = ""
-    d: float | None = None
-    p_saturation: float | None = None
-
-
-@dataclass
-class Entry:
-    """One job and where it stands."""
-
-    word: JobWord
-    by: str
-    state: JobState = "waiting"
-    award: str = ""
-    """The open one, or the last one."""
-    cycles: int = 0
-    finished_s: float | None = None
-    reason: str = ""
-
-
-@dataclass
-class Promise:
-    """One award and what became of it."""
-
-    made: Awarded
-    leave: bool = False
-    silent: bool = False
-    outcome: str = ""
 
 
 @dataclass
@@ -119,6 +97,27 @@ class Ledger:
         wanted = dict.fromkeys(names) or self.jobs
         return [self._status(self.jobs[name]) for name in wanted if name in self.jobs]
 
+    def standing(self) -> Standing:
+        """The one record from which the same ledger follows as from all that were applied.
+
+        Of an award that was refused, and of those for a finished job but the one that finished it, nothing is kept:
+        whatever may still be said of them changes nothing.
+        """
+        kept = [
+            promise
+            for name, promise in self.awards.items()
+            if name in self.open or self._of(name).award == name or self._may_count(promise)
+        ]
+        return Standing(
+            time_s=self.time_s,
+            number=self.number,
+            ended=self.ended,
+            jobs=tuple(map(replace, self.jobs.values())),
+            awards=tuple(map(replace, kept)),
+            open=tuple(self.open),
+            recent=tuple(self.recent),
+        )
+
     # What happens
 
     def apply(self, record: Record) -> list[Change]:
@@ -154,6 +153,10 @@ class Ledger:
                 for entry in touched:
                     entry.reason = entry.reason or "The shift ended before it was done."
                     entry.state = "unfinished"
+                self._waiting = []
+            case Standing():
+                self._stand(record)
+                touched = []
             case Began() | Ticked():
                 touched = []
         self.time_s = max(self.time_s, record.time_s)
@@ -192,6 +195,18 @@ class Ledger:
             if entry.word.name not in self._waiting:
                 insort(self._waiting, entry.word.name, key=self._release)
         return [entry]
+
+    def _stand(self, record: Standing) -> None:
+        self.number, self.ended = record.number, record.ended
+        self.jobs = {entry.word.name: replace(entry) for entry in record.jobs}
+        self.awards = {promise.made.award: replace(promise) for promise in record.awards}
+        self.open = {name: self.awards[name] for name in record.open}
+        self.recent = deque(record.recent, maxlen=REMEMBERED)
+        self._waiting = sorted((n for n, entry in self.jobs.items() if entry.state == "waiting"), key=self._release)
+
+    def _may_count(self, promise: Promise) -> bool:
+        """Whether a report on an award that nobody holds any more could change where its job stands."""
+        return promise.outcome != "refused" and self.jobs[promise.made.job].state != "finished"
 
     def _release(self, name: str) -> tuple[float, str]:
         return self.jobs[name].word.release_s, name

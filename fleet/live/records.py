@@ -1,10 +1,11 @@
-"""What happened to the jobs of an auctioneer: the records of its journal."""
+"""What happened to the jobs of an auctioneer: the records of its journal, and where all of them leave the jobs."""
 
+from dataclasses import dataclass
 from typing import Literal
 
 import msgspec
 
-from fleet.bus.trade import JobWord
+from fleet.bus.trade import JobState, JobStatus, JobWord
 
 
 class Began(msgspec.Struct, frozen=True, tag=True):
@@ -84,5 +85,57 @@ class Ended(msgspec.Struct, frozen=True, tag=True):
     time_s: float
 
 
-Record = Began | Ticked | Accepted | Awarded | Leave | Silent | Heard | Closed | Ended
+@dataclass(frozen=True)
+class Change:
+    """A job's state has changed."""
+
+    number: int
+    """Counts all changes, from 0, also over restarts."""
+    time_s: float
+    status: JobStatus
+    auction: str = ""
+    d: float | None = None
+    p_saturation: float | None = None
+
+
+@dataclass
+class Entry:
+    """One job and where it stands."""
+
+    word: JobWord
+    by: str
+    state: JobState = "waiting"
+    award: str = ""
+    """The open one, or the last one."""
+    cycles: int = 0
+    finished_s: float | None = None
+    reason: str = ""
+
+
+@dataclass
+class Promise:
+    """One award and what became of it."""
+
+    made: Awarded
+    leave: bool = False
+    silent: bool = False
+    outcome: str = ""
+
+
+class Standing(msgspec.Struct, frozen=True, tag=True):
+    """Where all the records so far have led: a journal may begin with it instead of them."""
+
+    time_s: float
+    number: int
+    """Of the next change."""
+    ended: bool
+    jobs: tuple[Entry, ...]
+    awards: tuple[Promise, ...]
+    """Of which something may yet be heard that counts."""
+    open: tuple[str, ...]
+    """Awards that an arm may still hold, by name."""
+    recent: tuple[Change, ...]
+
+
+Record = Began | Ticked | Accepted | Awarded | Leave | Silent | Heard | Closed | Ended | Standing
 """Each has `time_s`, the fleet's time when it was written."""

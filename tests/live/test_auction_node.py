@@ -37,6 +37,7 @@ from fleet.bus.trade import (
     Submitted,
 )
 from fleet.errors import BusError, JournalFull
+from fleet.live import auction_node
 from fleet.live.auction_node import AuctionNode, _first
 from fleet.live.auctioneer import Objection
 from fleet.live.journal import Journal
@@ -330,6 +331,42 @@ def test_a_full_disk_is_a_refusal_and_no_end(bus):
         node.submit(Submission(jobs("a")))
     assert bus.ask(keys.of_jobs("f", "submit"), Submission(jobs("a")), Submitted).words
     assert states(node) == ["waiting"]
+
+
+def test_a_journal_is_shortened_at_the_start_and_when_it_has_grown(bus, monkeypatch):
+    first = bus.auctioneer()
+    bus.arm("arm_0")
+    bus.ask(keys.of_jobs("f", "submit"), Submission(jobs("a"), "test"), Submitted)
+    bus.until(lambda: states(first) == ["finished"])
+    bus.kill(first)
+    again = bus.auctioneer()
+    assert [type(record).__name__ for record in again.journal.replay()] == ["Standing", "Began"]
+    assert states(again) == ["finished"]
+    monkeypatch.setattr(auction_node, "TICK_S", 0.01)
+    monkeypatch.setattr(auction_node, "LEAST_LONG_BYTES", 1)
+    before = again.journal.size
+    bus.kill(again)
+    third = bus.auctioneer()
+    sizes = []
+    bus.until(lambda: sizes.append(third.journal.size) or (len(sizes) > 1 and sizes[-1] < sizes[-2]))
+    assert max(sizes) < 5 * before
+    assert states(third) == ["finished"]
+
+
+def test_a_journal_that_cannot_be_shortened_is_gone_on_with(bus, monkeypatch, caplog):
+    first = bus.auctioneer()
+    bus.ask(keys.of_jobs("f", "submit"), Submission(jobs("a"), "test"), Submitted)
+    bus.kill(first)
+    with monkeypatch.context() as full:
+        full.setattr(Journal, "rewrite", refuse)
+        again = bus.auctioneer()
+    assert "stays as long as it is: no room" in caplog.text
+    assert [type(record).__name__ for record in again.journal.replay()] == ["Standing", "Began", "Accepted", "Began"]
+    assert states(again) == ["waiting"]
+
+
+def refuse(*_records):
+    raise JournalFull("no room")
 
 
 def test_a_status_of_very_many_jobs_fits_into_a_word_and_tells_the_open_ones_first(bus):

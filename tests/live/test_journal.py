@@ -225,6 +225,109 @@ def test_a_rewritten_journal_holds_only_what_it_was_given(tmp_path, monkeypatch)
     assert sorted(each.name for each in tmp_path.iterdir()) == ["j", "j.lock"]
 
 
+class Crash(BaseException):
+    """The process is gone, or the power."""
+
+
+class Disk:
+    """Counts what is done to files, ends all at one moment, and knows what was brought to the disk by then."""
+
+    def __init__(self, moment):
+        self.left, self.synced = moment, {}
+        self.open, self.write, self.replace = os.open, os.write, os.replace
+
+    def _tick(self):
+        if not self.left:
+            raise Crash
+        self.left -= 1
+
+    def opens(self, *args):
+        self._tick()
+        return self.open(*args)
+
+    def writes(self, file, data):
+        """Half of it, so that every line is written in many pieces."""
+        self._tick()
+        return self.write(file, bytes(data[: (len(data) + 1) // 2]))
+
+    def replaces(self, *args):
+        self._tick()
+        return self.replace(*args)
+
+    def syncs(self, file):
+        self._tick()
+        self.synced[os.fstat(file).st_ino] = os.fstat(file).st_size
+
+    def lose_power(self, folder):
+        """Whatever was not brought to the disk is not there."""
+        for path in folder.iterdir():
+            if path.name in ("j", "j.new"):
+                os.truncate(path, self.synced.get(path.stat().st_ino, 0))
+
+
+@pytest.mark.parametrize("power", [False, True], ids=["killed", "without power"])
+def test_a_crash_at_any_moment_of_a_rewrite_leaves_the_old_records_or_the_new(tmp_path, monkeypatch, power):
+    old, new, later = [Said("one"), Counted(2)], [Counted(1)], Said("later")
+    seen = set()
+    for moment in range(60):
+        path = tmp_path / str(moment) / "j"
+        written(path, old)
+        disk, stage = Disk(moment), 0
+        disk.synced[path.stat().st_ino] = path.stat().st_size
+        journal = Journal(path, KIND, sync=disk.syncs).open()
+        with monkeypatch.context() as patched:
+            patched.setattr(os, "open", disk.opens)
+            patched.setattr(os, "write", disk.writes)
+            patched.setattr(os, "replace", disk.replaces)
+            try:
+                journal.rewrite(*new)
+                stage = 1
+                journal.append(later)
+                stage = 2
+            except Crash:
+                pass
+        journal.close()
+        if power:
+            disk.lose_power(path.parent)
+        allowed = {0: [old, new], 1: [new, [*new, later]], 2: [[*new, later]]}[stage]
+        found = read(path)
+        assert found in allowed, f"crash at {moment}"
+        seen.add(tuple(found))
+        with Journal(path, KIND) as journal:  # whatever the crash left behind, it can be done again
+            journal.rewrite(*new)
+        assert read(path) == new
+        if stage == 2:
+            break
+    assert stage == 2
+    assert seen == {tuple(old), tuple(new), (*new, later)}
+
+
+def test_when_nobody_knows_which_file_has_the_name_nothing_more_is_promised(tmp_path):
+    """The folder cannot be brought to the disk after the new file took the name of the old one."""
+    path = tmp_path / "j"
+    written(path, [Said("old")])
+
+    def fail(file):
+        if os.path.isdir(f"/proc/self/fd/{file}"):
+            raise OSError(errno.EIO, "Input/output error")
+
+    with Journal(path, KIND, sync=fail) as journal:
+        with pytest.raises(JournalError, match="Nothing more is written until"):
+            journal.rewrite(Said("new"))
+        with pytest.raises(JournalError, match="until it is opened anew"):
+            journal.append(Said("lost"))
+    assert read(path) == [Said("new")]
+
+
+def test_a_journal_knows_its_size(tmp_path):
+    with Journal(tmp_path / "j", KIND) as journal:
+        assert journal.size == 0
+        journal.append(Said("a"), Counted(1))
+        assert journal.size == journal.path.stat().st_size
+        journal.rewrite(Said("b"))
+        assert journal.size == journal.path.stat().st_size
+
+
 def test_a_closed_journal_says_so(tmp_path):
     journal = Journal(tmp_path / "j", KIND)
     with pytest.raises(JournalError, match="not open"):

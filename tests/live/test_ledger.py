@@ -1,14 +1,16 @@
 """What is admitted, what is ready, and that the journal alone makes the same ledger again."""
 
 import graphlib
+from dataclasses import replace
 
+import msgspec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet.bus.trade import JobWord
 from fleet.live.admission import admit
 from fleet.live.ledger import Ledger, replayed
-from fleet.live.records import Accepted, Awarded, Closed, Ended, Heard, Leave, Silent, Ticked
+from fleet.live.records import Accepted, Awarded, Closed, Ended, Heard, Leave, Record, Silent, Ticked
 
 
 def word(name: str, *after: str, place: str = "rack", **changes) -> JobWord:
@@ -178,36 +180,108 @@ def test_the_end_of_the_shift_leaves_nothing_open_to_offer():
     assert book.status(["a", "nobody"])[0].state == "finished"
 
 
+steps = st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 9)), max_size=25)
+
+
+def begun() -> Ledger:
+    return replayed([Accepted((word("a"), word("b", "a", place="bin"), word("c", place="belt")), "test", 0.0)])
+
+
+def next_record(book: Ledger, job: str, choice: int, time_s: int):
+    """Something that may happen to a job now."""
+    entry = book.jobs[job]
+    if entry.state == "waiting" and job in names(book.ready(float(time_s), 9)):
+        return award(job, time_s)
+    if entry.award not in book.open:
+        return Ticked(float(time_s))
+    promise = book.awards[entry.award]
+    may = [Closed(entry.award, "finished", 4, time_s), Closed(entry.award, "returned", choice, time_s)]
+    if promise.silent:
+        may.append(Heard(entry.award, time_s))
+    elif promise.leave:
+        may.append(Silent(entry.award, time_s))
+    else:
+        may += [Leave(entry.award, time_s), Closed(entry.award, "dropped", 0, time_s)]
+        may += [Closed(entry.award, "refused", 0, time_s, "not now")]
+    return may[choice % len(may)]
+
+
 @settings(max_examples=200, deadline=None)
-@given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 9)), max_size=25))
+@given(steps)
 def test_the_journal_alone_makes_the_same_ledger_again(steps):
     """Any life of three jobs: replayed in one go it gives the same states, and the same numbers on its changes."""
-    book = Ledger()
-    written, said = [], []
-
-    def happen(record):
-        written.append(record)
-        said.extend(book.apply(record))
-
-    happen(Accepted((word("a"), word("b", "a", place="bin"), word("c", place="belt")), "test", 0.0))
+    book, written, said = begun(), [Accepted(tuple(e.word for e in begun().jobs.values()), "test", 0.0)], []
     for time_s, (job, choice) in enumerate(steps, start=1):
-        entry = book.jobs[job]
-        if entry.state == "waiting":
-            if job in names(book.ready(float(time_s), 9)):
-                happen(award(job, time_s))
-        elif entry.award in book.open:
-            promise = book.awards[entry.award]
-            may = [Closed(entry.award, "finished", 4, time_s), Closed(entry.award, "returned", choice, time_s)]
-            if promise.silent:
-                may.append(Heard(entry.award, time_s))
-            elif promise.leave:
-                may.append(Silent(entry.award, time_s))
-            else:
-                may += [Leave(entry.award, time_s), Closed(entry.award, "dropped", 0, time_s)]
-            happen(may[choice % len(may)])
-        else:
-            happen(Ticked(float(time_s)))
+        written.append(next_record(book, job, choice, time_s))
+        said.extend(book.apply(written[-1]))
     again = replayed(written)
     assert again == book
-    assert [change.number for change in said] == list(range(len(said)))
-    assert again.number == len(said)
+    assert [change.number for change in said] == list(range(3, 3 + len(said)))
+    assert again.number == 3 + len(said)
+
+
+@settings(max_examples=300, deadline=None)
+@given(steps, steps, st.booleans())
+def test_where_records_have_led_can_stand_for_them(steps, later, ends):
+    """Through JSON and back it is the same ledger, whatever happens after it, but for awards that nobody needs."""
+    book = begun()
+    for time_s, (job, choice) in enumerate(steps, start=1):
+        book.apply(next_record(book, job, choice, time_s))
+    if ends:
+        book.apply(Ended(50.0))
+    record = msgspec.json.decode(msgspec.json.encode(book.standing()), type=Record)
+    short = replayed([record])
+    for time_s, (job, choice) in enumerate(later, start=100):
+        happens = next_record(book, job, choice, time_s)
+        assert short.apply(happens) == book.apply(happens)
+    needed = {name: promise for name, promise in book.awards.items() if name in short.awards}
+    assert replace(short, awards={}) == replace(book, awards={})
+    assert short.awards == needed
+    assert list(short.jobs) == list(book.jobs)
+    assert book.open.keys() | {e.award for e in book.jobs.values() if e.award} <= needed.keys()
+
+
+@settings(max_examples=300, deadline=None)
+@given(steps, st.data())
+def test_a_late_report_changes_as_much_after_the_journal_was_shortened(steps, data):
+    """Of any award there ever was: one that is not known any more would have changed nothing."""
+    book = begun()
+    for time_s, (job, choice) in enumerate(steps, start=1):
+        book.apply(next_record(book, job, choice, time_s))
+    reported = [name for name, promise in book.awards.items() if promise.outcome != "refused"]
+    if not reported:
+        return
+    short, name = replayed([book.standing()]), data.draw(st.sampled_from(reported))
+    late = Closed(name, data.draw(st.sampled_from(["finished", "returned"])), 2, 100.0)
+    before = book.status()
+    changes = book.apply(late)
+    if name in short.awards:
+        assert short.apply(late) == changes
+    else:
+        assert changes == []
+        assert book.status() == before
+
+
+def test_a_ledger_and_what_stands_for_it_share_nothing():
+    book = ledger(word("a"))
+    book.apply(award("a"))
+    record = book.standing()
+    short = replayed([record])
+    book.apply(Leave("0:a", 2.0))
+    assert not record.awards[0].leave
+    assert short.status()[0].state == "awarded"
+    short.apply(Closed("0:a", "finished", 4, 3.0))
+    assert record.jobs[0].state == "awarded"
+
+
+def test_what_stands_for_a_week_is_short():
+    """302 400 ticks and 3000 awards on 300 jobs: only the jobs remain."""
+    book = ledger(*(word(f"job {i}", place=f"p{i}") for i in range(300)))
+    for i in range(3000):
+        job = f"job {i % 300}"
+        book.apply(award(job, i))
+        book.apply(Closed(f"{i}:{job}", "refused" if i < 2700 else "finished", 4, float(i)))
+        for _ in range(100):
+            book.apply(Ticked(float(i)))
+    assert len(book.awards) == 3000
+    assert len(book.standing().awards) == 300
