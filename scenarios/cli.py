@@ -1,4 +1,4 @@
-"""The command line: `thermofleet run`, `list`, `show`, `compare`, `hold`, `demo`, and `twin` with its own commands."""
+"""The command line: `thermofleet run`, `list`, `show`, `compare`, `animate`, `demo`, and what has a file of its own."""
 
 import errno
 import json
@@ -20,6 +20,7 @@ from agents.rules import RULES
 from fleet.bus.channel import PERFECT, Channel
 from fleet.errors import FleetError
 from fleet.metrics import Metrics
+from scenarios.animate import animate_command
 from scenarios.channel_options import ChannelMaker, with_channel
 from scenarios.contract_cli import contract_command
 from scenarios.hold import hold_command
@@ -214,6 +215,7 @@ def demo_command(
     say(f"Open {out / 'least_difficulty' / 'report.html'} in a browser to see what happened.", out_console)
 
 
+app.command("animate")(animate_command)
 app.command("hold")(hold_command)
 app.command("keys")(keys_command)
 app.command("router")(router_command)
