@@ -7,7 +7,11 @@ OUT ?= out
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 GOAL := $(or $(firstword $(MAKECMDGOALS)),demo)
 
-.PHONY: demo test test-slow lint bench chaos clean install
+# Each trainer has an environment of its own: what they want of one another's packages does not agree.
+ADAPTERS := $(sort $(basename $(notdir $(wildcard constraints/*.txt))))
+ADAPTER_TESTS := $(ADAPTERS:%=test-adapter-%)
+
+.PHONY: demo test test-slow test-adapter test-adapters $(ADAPTER_TESTS) lint bench chaos clean install
 
 demo: $(STAMP)
 	@$(BIN)/thermofleet demo --out $(OUT)/demo
@@ -17,6 +21,18 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	@$(BIN)/python -m pytest -m slow
+
+ifneq ($(filter $(ADAPTER),$(ADAPTERS)),)
+test-adapter: test-adapter-$(ADAPTER)
+else
+test-adapter:
+	@echo "Name a trainer: make test-adapter ADAPTER=NAME. There are: $(ADAPTERS)."; exit 1
+endif
+
+test-adapters: $(ADAPTER_TESTS)
+
+$(ADAPTER_TESTS): test-adapter-%: .venv-adapters/%/.installed
+	@.venv-adapters/$*/bin/python -m pytest -m adapter tests/adapters/test_$*.py
 
 lint: $(STAMP)
 	@$(BIN)/ruff format --check .
@@ -48,6 +64,18 @@ $(STAMP): pyproject.toml constraints.txt
 	  echo "All that pip said is in $(VENV)/install.log; 'make $(GOAL)' tries again."; exit 1; }
 	@touch $(STAMP)
 
+# A trainer's own pins come before the shared ones. Its packages are put in as pinned, whatever they say of one another.
+$(ADAPTERS:%=.venv-adapters/%/.installed): .venv-adapters/%/.installed: constraints/%.txt constraints.txt pyproject.toml | $(STAMP)
+	@echo "Installing $* into .venv-adapters/$* (once, a few minutes; log in .venv-adapters/$*/install.log) …"
+	@test -x .venv-adapters/$*/bin/python || $(BIN)/python -m venv .venv-adapters/$*
+	@awk -F== '!seen[$$1]++' constraints/$*.txt constraints.txt >.venv-adapters/$*/pins.txt
+	@pip=".venv-adapters/$*/bin/python -m pip --disable-pip-version-check install --quiet"; \
+	{ $$pip -c .venv-adapters/$*/pins.txt setuptools && \
+	  $$pip -c .venv-adapters/$*/pins.txt --no-build-isolation -e . pytest hypothesis && \
+	  $$pip --no-deps -r constraints/$*.txt; } >.venv-adapters/$*/install.log 2>&1 || { \
+	  echo "$* could not be installed; all that pip said is in .venv-adapters/$*/install.log."; exit 1; }
+	@touch $@
+
 clean:
-	rm -rf $(VENV) $(OUT) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .venv-adapters $(OUT) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -17,6 +17,7 @@ NOUNS_OF_LAWS = ("robot", "job", "errors")
 """Nouns without which no law could be written down: how many joints, what work, which errors."""
 
 SIM_LIBRARIES = ("mujoco", "mink", "ruckig")
+TRAINERS = ("agilerl", "benchmarl", "ray", "sb3_contrib", "stable_baselines3", "tianshou")
 HEAVY = ("torch", "mujoco", "zenoh")
 
 
@@ -83,6 +84,8 @@ def library_allowed(importer: str, library: str) -> bool:
         return importer in ("fleet.bus.session", "fleet.bus.router", "fleet.bus.link", "fleet.bus.ros2")
     if library == "rosbags":
         return importer == "fleet.bus.ros2_cdr"
+    if library in TRAINERS:
+        return below(importer, "fleet.env.adapters")
     if library == "torch":
         return below(importer, "twin", "agents.learned")
     return True
@@ -133,6 +136,8 @@ def test_the_wrong_way_is_seen(importer, imported):
         ("agents.rules", "torch"),
         ("fleet.env.x", "mink"),
         ("fleet.bus.ros2", "rosbags"),
+        ("fleet.env.allocation_v0", "ray"),
+        ("agents.learned.train", "stable_baselines3"),
     ],
 )
 def test_a_library_out_of_its_place_is_seen(importer, library):
@@ -176,6 +181,13 @@ def loaded_by(*modules: str) -> set[str]:
 )
 def test_what_is_light_loads_no_heavy_library(modules):
     assert loaded_by(*modules) & set(HEAVY) == set()
+
+
+def test_nobody_imports_an_adapter_but_its_user():
+    adapters = [
+        (name_of(path), name) for path in SOURCES for name in imports(path) if below(name, "fleet.env.adapters")
+    ]
+    assert [pair for pair in adapters if not below(pair[0], "fleet.env.adapters")] == []
 
 
 def test_every_package_is_walked():

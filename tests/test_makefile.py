@@ -92,3 +92,12 @@ def test_the_next_call_tries_again_and_then_not_any_more(tmp_path, stub):
     assert (venv / ".installed").exists()
     script(venv / "bin" / "python", "exit 1")
     assert make("install", venv, stub).returncode == 0
+
+
+@pytest.mark.parametrize("adapter", ["", "nobody"])
+def test_a_trainer_that_is_not_there(adapter):
+    command = ["make", "-C", str(ROOT), "--no-print-directory", "test-adapter", f"ADAPTER={adapter}"]
+    said = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert said.returncode != 0
+    trainers = " ".join(sorted(path.stem for path in (ROOT / "constraints").glob("*.txt")))
+    assert said.stdout == f"Name a trainer: make test-adapter ADAPTER=NAME. There are: {trainers}.\n"

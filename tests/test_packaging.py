@@ -31,32 +31,64 @@ def test_the_version_is_that_of_the_project():
     assert version("thermofleet") == PROJECT["version"]
 
 
-def pins() -> dict[str, str]:
-    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").split()
+def pinned_in(file: str) -> dict[str, str]:
+    lines = (ROOT / file).read_text(encoding="utf-8").split()
     return dict(line.split("==") for line in lines)
 
 
-EXTRAS = [requirement for extra in PROJECT["optional-dependencies"].values() for requirement in extra]
+TRAINERS = sorted(path.stem for path in (ROOT / "constraints").glob("*.txt"))
+"""Trainers of reinforcement learning, each with an environment and pins of its own."""
+EXTRAS = PROJECT["optional-dependencies"]
+SHARED = [*PROJECT["dependencies"], *(each for extra in EXTRAS if extra not in TRAINERS for each in EXTRAS[extra])]
 
 
-@pytest.mark.parametrize("requirement", [*PROJECT["dependencies"], *EXTRAS])
-def test_every_direct_dependency_is_pinned_within_its_range(requirement):
-    found = re.fullmatch(r"([\w-]+)>=([\d.]+)(?:,<(\d+))?", requirement)
+@pytest.mark.parametrize(
+    ("requirement", "file"),
+    [
+        *((requirement, "constraints.txt") for requirement in SHARED),
+        *((each, f"constraints/{extra}.txt") for extra in EXTRAS if extra in TRAINERS for each in EXTRAS[extra]),
+    ],
+)
+def test_every_direct_dependency_is_pinned_within_its_range(requirement, file):
+    found = re.fullmatch(r"([\w-]+)(?:\[\w+\])?>=([\d.]+)(?:,<(\d+))?", requirement)
     assert found is not None
     name, low, high = found.groups()
-    pinned = [int(part) for part in pins()[name].split(".")]
+    pinned = [int(part) for part in pinned_in(file)[name].split(".")]
     assert pinned >= [int(part) for part in low.split(".")]
     assert high is None or pinned[0] < int(high)
 
 
 def test_nothing_is_pinned_that_is_not_asked_for():
-    asked = [*PROJECT["dependencies"], *EXTRAS]
-    assert set(pins()) == {re.split("[><=]", requirement)[0] for requirement in asked}
+    assert set(pinned_in("constraints.txt")) == {re.split("[><=]", requirement)[0] for requirement in SHARED}
+
+
+OTHERWISE = {"rllib": {"gymnasium"}}
+"""What a trainer wants in another version than everybody else."""
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
+def test_a_trainer_pins_what_it_brings_and_what_it_wants_otherwise(trainer):
+    shared, own = pinned_in("constraints.txt"), pinned_in(f"constraints/{trainer}.txt")
+    assert {name for name in own if name in shared} == OTHERWISE.get(trainer, set())
+    assert all(own[name] != shared[name] for name in OTHERWISE.get(trainer, ()))
+
+
+def test_every_trainer_has_an_adapter_and_a_test():
+    assert TRAINERS
+    for trainer in TRAINERS:
+        assert (ROOT / "fleet" / "env" / "adapters" / f"{trainer}.py").exists()
+        assert (ROOT / "tests" / "adapters" / f"test_{trainer}.py").exists()
 
 
 def written_by_hand() -> list[Path]:
     """Text files of the repository."""
-    here = [ROOT / ".ci" / "run", *ROOT.glob("*.*"), ROOT / "Makefile", ROOT / ".gitignore"]
+    here = [
+        ROOT / ".ci" / "run",
+        *ROOT.glob("*.*"),
+        *ROOT.glob("constraints/*"),
+        ROOT / "Makefile",
+        ROOT / ".gitignore",
+    ]
     folders = (*PACKAGES, "tests", "benchmarks", "examples", "docs")
     inside = [path for folder in folders for path in (ROOT / folder).rglob("*")]
     kinds = (".py", ".toml", ".md", ".txt", ".json", ".xml", "")

@@ -1,0 +1,116 @@
+"""BenchMARL takes the environment: MAPPO and QMIX, a few iterations."""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytestmark = [
+    pytest.mark.adapter,
+    pytest.mark.filterwarnings("ignore:PettingZoo in TorchRL is tested using"),
+    pytest.mark.filterwarnings("ignore:max_n_frames and max_n_iters have both been set"),
+    pytest.mark.filterwarnings("ignore:size_average and reduce args will be deprecated"),
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
+]
+
+Parameters = dict[str, np.ndarray]
+
+
+def parameters(module) -> Parameters:
+    return {name: value.detach().numpy().copy() for name, value in module.named_parameters()}
+
+
+def trained(workshop, seed: int, algorithm: str = "Mappo") -> tuple[Parameters, Parameters]:
+    """The policy's parameters before and after two iterations."""
+    import benchmarl.algorithms
+    from benchmarl.experiment import Experiment, ExperimentConfig
+    from benchmarl.models.mlp import MlpConfig
+
+    from fleet.env.adapters.benchmarl import AllocationTask
+
+    config = ExperimentConfig.get_from_yaml()
+    config.loggers, config.create_json, config.render = [], False, False
+    config.max_n_iters, config.lr = 2, 1e-3
+    config.on_policy_collected_frames_per_batch = config.off_policy_collected_frames_per_batch = 60
+    config.on_policy_n_envs_per_worker = config.off_policy_n_envs_per_worker = 2
+    config.on_policy_minibatch_size, config.on_policy_n_minibatch_iters = 30, 2
+    config.off_policy_train_batch_size, config.off_policy_n_optimizer_steps = 30, 4
+    config.evaluation_interval, config.evaluation_episodes = 60, 1
+    with tempfile.TemporaryDirectory() as folder:
+        config.save_folder = folder
+        experiment = Experiment(
+            task=AllocationTask("small", workshop, max_steps=400),
+            algorithm_config=getattr(benchmarl.algorithms, f"{algorithm}Config").get_from_yaml(),
+            model_config=MlpConfig.get_from_yaml(),
+            seed=seed,
+            config=config,
+        )
+        before = parameters(experiment.policy)
+        experiment.run()
+        after = parameters(experiment.policy)
+        assert (Path(folder) / experiment.name / "config.pkl").exists()
+    return before, after
+
+
+@pytest.fixture(scope="module", params=["Mappo", "Qmix"])
+def session(request, small_workshop):
+    """A training, what it left, and what reached the environments."""
+    workshop = small_workshop()
+    return workshop.log, *trained(workshop, 0, request.param)
+
+
+def test_it_trains_and_sends_no_illegal_action(session) -> None:
+    log, before, after = session
+    assert log.steps >= 120
+    assert log.claims > 50
+    assert log.illegal == 0
+    assert all(np.isfinite(value).all() for value in after.values())
+    assert all((before[name] != after[name]).any() for name in before)
+    assert log.orders == {("arm_0", "arm_1", "arm_2")}
+
+
+def test_a_seed_repeats_the_training_and_another_does_not(small_workshop) -> None:
+    (before, after), again, other = (trained(small_workshop(), seed) for seed in (0, 0, 1))
+    for name in before:
+        np.testing.assert_array_equal(again[1][name], after[name])
+    assert any((other[1][name] != after[name]).any() for name in before)
+
+
+def test_the_hash_seed_changes_nothing(elsewhere) -> None:
+    assert elsewhere(__file__, 1) == elsewhere(__file__, 2)
+
+
+@pytest.mark.parametrize("shift", [{"ticks": 6}, {"jobs": 1, "ticks": 400, "ambient_c": 20.0}], ids=["cut", "finished"])
+def test_a_rollout_is_the_episode_of_the_environment(small_workshop, shift) -> None:
+    """The second way: the same claims given to the environment itself."""
+    import torch
+
+    from fleet.env.adapters.benchmarl import AllocationTask
+
+    workshop = small_workshop(**shift)
+    torch.manual_seed(0)
+    task = AllocationTask("small", workshop, max_steps=400)
+    env = task.get_env_fun(1, False, 5, "cpu")()
+    env.set_seed(5)
+    rollout = env.rollout(task.max_steps(env))
+    plain = workshop()
+    plain.reset(seed=5)
+    plain.reset()  # a rollout begins with a reset of its own
+    finished = "jobs" in shift
+    for t, row in enumerate(rollout):
+        claims = dict(zip(plain.possible_agents, row["arm", "action"].tolist(), strict=True))
+        seen, rewards, terminated, truncated, infos = plain.step(claims)
+        after = row["next"]
+        for i, arm in enumerate(plain.possible_agents):
+            np.testing.assert_array_equal(after["arm", "observation", "observation"][i], seen[arm]["observation"])
+            assert after["arm", "reward"][i].item() == pytest.approx(rewards[arm], rel=1e-6)
+            assert after["arm", "info", "illegal"][i].item() == infos[arm]["illegal"] == 0
+            if plain.agents:
+                np.testing.assert_array_equal(after["arm", "action_mask"][i], seen[arm]["action_mask"] == 1)
+        np.testing.assert_array_equal(after["state"], plain.state())
+        last = t == len(rollout) - 1
+        assert (after["terminated"].item(), after["truncated"].item()) == (last and finished, last and not finished)
+        assert (terminated["arm_0"], truncated["arm_0"]) == (last and finished, last and not finished)
+    assert plain.agents == []
+    env.close()

@@ -1,0 +1,128 @@
+"""Tianshou takes the environment: masked DQN, one network for all arms, a few updates."""
+
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.adapter
+
+Parameters = dict[str, np.ndarray]
+
+
+def parameters(module) -> Parameters:
+    return {name: value.detach().numpy().copy() for name, value in module.state_dict().items()}
+
+
+def trained(workshop, seed: int) -> tuple[Parameters, Parameters]:
+    """The network's parameters before and after a training of two epochs."""
+    import torch
+    from tianshou.algorithm import DQN
+    from tianshou.algorithm.modelfree.dqn import DiscreteQLearningPolicy
+    from tianshou.algorithm.multiagent.marl import MultiAgentOffPolicyAlgorithm
+    from tianshou.algorithm.optim import AdamOptimizerFactory
+    from tianshou.data import Collector, VectorReplayBuffer
+    from tianshou.env import DummyVectorEnv
+    from tianshou.trainer import OffPolicyTrainerParams
+    from tianshou.utils.net.common import Net
+
+    from fleet.env.adapters.tianshou import TianshouEnv
+
+    torch.manual_seed(seed)
+    np.random.seed(seed)  # noqa: NPY002  # Tianshou explores and samples by the global one
+    env = TianshouEnv(workshop())
+    arms = len(env.agents)
+    net = Net(
+        state_shape=env.observation_space["observation"].shape, action_shape=env.action_space.n, hidden_sizes=(32,)
+    )
+    before = parameters(net)
+    policy = DiscreteQLearningPolicy(model=net, action_space=env.action_space, eps_training=0.5, eps_inference=0.5)
+    optim = AdamOptimizerFactory(lr=1e-3)
+    dqn = DQN(policy=policy, optim=optim, n_step_return_horizon=arms, target_update_freq=5)
+    team = MultiAgentOffPolicyAlgorithm(algorithms=[dqn] * arms, env=env)
+    envs = DummyVectorEnv([lambda: TianshouEnv(workshop()) for _ in range(2)])
+    envs.seed(seed)
+    collector = Collector(team, envs, VectorReplayBuffer(2000, 2), exploration_noise=True)
+    collector.reset()
+    team.run_training(
+        OffPolicyTrainerParams(
+            training_collector=collector,
+            max_epochs=2,
+            epoch_num_steps=180,
+            collection_step_num_env_steps=60,
+            update_step_num_gradient_steps_per_sample=0.1,
+            batch_size=32,
+            multi_agent_return_reduction=lambda rewards: rewards.mean(axis=1),
+            verbose=False,
+            show_progress=False,
+        )
+    )
+    return before, parameters(net)
+
+
+@pytest.fixture(scope="module")
+def session(small_workshop):
+    """A training, what it left, and what reached the environments."""
+    workshop = small_workshop()
+    return workshop.log, *trained(workshop, seed=0)
+
+
+def test_it_trains_and_sends_no_illegal_action(session) -> None:
+    log, before, after = session
+    assert log.steps >= 100
+    assert log.claims > 50
+    assert log.illegal == 0
+    assert all(np.isfinite(value).all() for value in after.values())
+    assert all((before[name] != after[name]).any() for name in before)
+    assert log.orders == {("arm_0", "arm_1", "arm_2")}
+
+
+def test_a_seed_repeats_the_training_and_another_does_not(session, small_workshop) -> None:
+    _, before, after = session
+    again, other = trained(small_workshop(), seed=0), trained(small_workshop(), seed=1)
+    for name in before:
+        np.testing.assert_array_equal(again[1][name], after[name])
+    assert any((other[1][name] != after[name]).any() for name in before)
+
+
+def test_the_hash_seed_changes_nothing(elsewhere) -> None:
+    assert elsewhere(__file__, 1) == elsewhere(__file__, 2)
+
+
+@pytest.mark.parametrize("shift", [{"ticks": 6}, {"jobs": 1, "ticks": 400, "ambient_c": 20.0}], ids=["cut", "finished"])
+def test_turns_are_the_steps_of_the_environment(small_workshop, shift) -> None:
+    """The second way: the same claims given to the environment itself, all arms at once."""
+    from fleet.env.adapters.tianshou import TianshouEnv
+
+    workshop = small_workshop(**shift)
+    env, plain = TianshouEnv(workshop()), workshop()
+    seen, _ = env.reset(seed=3)
+    there, _ = plain.reset(seed=3)
+    rng, over = np.random.default_rng(3), False
+    while not over:
+        claims = {}
+        for arm in plain.possible_agents:
+            assert not over
+            assert seen["agent_id"] == arm
+            np.testing.assert_array_equal(seen["obs"], there[arm]["observation"])
+            np.testing.assert_array_equal(seen["mask"], there[arm]["action_mask"] == 1)
+            claims[arm] = int(rng.choice(np.flatnonzero(seen["mask"])))
+            seen, rewards, terminated, truncated, _ = env.step(claims[arm])
+            over = terminated or truncated
+            if arm != "arm_2":
+                assert not rewards.any()
+        there, rewards_there, terminated_there, truncated_there, _ = plain.step(claims)
+        np.testing.assert_allclose(rewards, list(rewards_there.values()), rtol=1e-6)
+        assert (terminated, truncated) == (terminated_there["arm_0"], truncated_there["arm_0"])
+    np.testing.assert_array_equal(seen["obs"], there["arm_0"]["observation"])
+    assert (terminated, truncated) == (("jobs" in shift), ("jobs" not in shift))
+
+
+def test_rewards_of_a_turn_are_not_written_on(small_workshop) -> None:
+    from fleet.env.adapters.tianshou import TianshouEnv
+
+    env = TianshouEnv(small_workshop()())
+    env.reset(seed=0)
+    _, first, *_ = env.step(0)
+    kept = first.copy()
+    for _ in range(20):
+        env.step(0)
+    np.testing.assert_array_equal(first, kept)
