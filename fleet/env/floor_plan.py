@@ -142,12 +142,17 @@ def _reach(cell: Cell, floor: Box, below: int, scale: float) -> int:
 
 
 def _rooms(rings: tuple[Pixel, ...], floor: Box, reach: int, below: int, text: int) -> tuple[int, ...]:
-    """Width that the text below each ring may take without touching its neighbour's or the edge."""
+    """Width that the text below each ring may take without touching the edge, another ring or the text of one."""
     rooms = []
     for i, (x, y) in enumerate(rings):
-        beside = [abs(x - u) - 4 for j, (u, v) in enumerate(rings) if j != i and abs(y - v) < below]
-        edge = 2 * min(x - floor[0], floor[2] - x) - 4
-        rooms.append(max(2 * reach, min([2 * reach + 5 * text, edge, *beside])))
+        room = min(2 * reach + 5 * text, 2 * min(x - floor[0], floor[2] - x) - 4)
+        for u, v in (*rings[:i], *rings[i + 1 :]):
+            off = max(y + reach - v, v - (y + reach + below), 0)  # from the text to the middle of the other ring
+            if off < reach:
+                room = min(room, 2 * (abs(x - u) - math.isqrt(reach**2 - off**2)) - 4)
+            if abs(y - v) < below:
+                room = min(room, abs(x - u) - 4)
+        rooms.append(max(2 * text, room))
     return tuple(rooms)
 
 

@@ -47,6 +47,8 @@ def picture(scene: Scene, size: Pixel = NORMAL) -> Array:
     colours = heat_colour(scene.temp_c, scene.warning_c, scene.error_c)
     for a in range(len(scene.cell.arms)):
         _draw_arm(image, scene, plan, a, colours[a])
+    for a in range(len(scene.cell.arms)):
+        _name_arm(image, scene, plan, a)
     _draw_header(image, draw, scene, plan)
     draw_queue(image, draw, scene, plan)
     return np.array(image)
@@ -169,7 +171,6 @@ def _draw_arm(image: Image.Image, scene: Scene, plan: FloorPlan, a: int, colours
         _paste(image, _cross(max(3, round(0.8 * inner)), max(2, inner // 5)), (x, y), FAULT)
     elif letters >= 9:
         write(image, (x, y), f"{max(temps):.0f}", INK, letters, bold=True, anchor="mm")
-    _name_arm(image, scene, plan, a)
 
 
 def _name_arm(image: Image.Image, scene: Scene, plan: FloorPlan, a: int) -> None:

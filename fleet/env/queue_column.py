@@ -22,11 +22,12 @@ def draw_queue(image: Image.Image, draw: ImageDraw.ImageDraw, scene: Scene, plan
     y += round(1.7 * text)
     if not scene.offers:
         write(image, (x, y), "nothing on offer", FAINT, text, anchor="la")
+        y += line
     each = 3 * line + text // 2
     shown = max(0, min(len(scene.offers), (bottom - 2 * line - y) // each))
     for offer in scene.offers[:shown]:
         write(image, (x, y), fitted(offer.job, text, room), INK, text, anchor="la")
-        mass = f"{offer.payload_kg:g} kg"
+        mass = f"{offer.payload_kg:g} kg" if offer.payload_kg else "no payload"
         write(image, (x, y + line), mass, FAINT, text, anchor="la")
         late = offer.due_in_s < 0
         words = fitted(due(offer.due_in_s), text, room - width(mass, text) - text // 2, bold=late)

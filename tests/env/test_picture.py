@@ -255,6 +255,23 @@ def test_arms_at_one_place_do_not_cover_each_other(arms, size) -> None:
     assert gaps.min() >= 2 * (plan.ring + plan.motor)
 
 
+@pytest.mark.parametrize("size", [(960, 640), (480, 320)])
+@pytest.mark.parametrize("arms", [2, 4, 6])
+def test_what_an_arm_does_is_not_written_over_another_arm(arms, size) -> None:
+    cell = replace(row(arms), mounts_m=((0.0, 0.0, 0.0),) * arms)
+    plan = floor_plan(cell, size)
+    idle = picture(scene(cell), size)
+    for a in range(arms):
+        job = ["" for _ in range(arms)]
+        job[a] = "hold_at_the_fixture_in_the_middle-001"
+        busy = picture(scene(cell, job=tuple(job)), size)
+        assert (busy != idle).any()
+        for other in range(arms):
+            for x, y in plan.motors(other) if other != a else ():
+                near = (slice(y - plan.motor, y + plan.motor + 1), slice(x - plan.motor, x + plan.motor + 1))
+                assert (busy[near] == idle[near]).all()
+
+
 @settings(max_examples=40)
 @given(cells(), sizes)
 def test_names_of_stations_cover_no_arm_and_no_other_name(cell, size) -> None:
