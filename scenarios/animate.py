@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,7 +19,6 @@ from scenarios.terminal import Progress, out_console, progress_bar, say
 if TYPE_CHECKING:
     from fleet.env.allocation_v0 import AllocationEnv
     from fleet.env.floor_plan import Pixel
-    from fleet.sim.state import State
     from scenarios.scenario import Scenario
 
 SIZE = "960x640"
@@ -106,24 +106,25 @@ def _frames(
     title = f"{scenario.name} · {label(policy)} · seed {seed}"
     env = env_of(fleet)
     try:
-        for state in _shift(env, policy, seed):
-            ticks = int(state.tick[0])
-            progress("working", ticks / env.world.ticks)
-            if env.agents and ticks % stride:
+        for decisions in _shift(env, policy, seed):
+            progress("working", decisions / scenario.ticks)
+            if env.agents and decisions % stride:
                 continue
-            scene = scene_of(env.world, state, cell, title=title)
+            scene = scene_of(env.world, env.truth, cell, title=title)
             palette = palette or Palette(scene, size)
             yield palette.indexed(picture(scene, size))
     finally:
         env.close()
 
 
-def _shift(env: "AllocationEnv", policy: str, seed: int) -> "Iterator[State]":
-    """The truth after the reset and after every step of the shift that `thermofleet run` works with this seed."""
+def _shift(env: "AllocationEnv", policy: str, seed: int) -> Iterator[int]:
+    """Work the shift that `thermofleet run` works with this seed; decisions made, after the reset and every step."""
     chosen = policy_of(policy)
     chosen.reset(np.random.default_rng(np.random.SeedSequence([seed, 1]).spawn(2)[0]))
     env.reset(seed=seed)
-    yield env.truth
-    while env.agents:
+    yield 0
+    for decisions in count(1):
+        if not env.agents:
+            return
         env.step(chosen.act(env.knowledge()))
-        yield env.truth
+        yield decisions
