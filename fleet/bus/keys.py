@@ -8,6 +8,7 @@ Names of fleets, arms and auctioneers are percent-encoded to one chunk, so no na
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal, get_args
 from urllib.parse import quote, unquote
 
@@ -28,6 +29,8 @@ TOPICS: dict[Role, tuple[str, ...]] = {
 }
 NAMELESS: tuple[Role, ...] = ("jobs", "clock")
 """Roles whose keys belong to nobody."""
+MOST_KNOWN, LONGEST_KNOWN = 4096, 256
+"""Keys that need not be taken apart again, and characters of the longest of them."""
 ASKED: tuple[str, ...] = get_args(AskedTopic)
 """Topics of an auctioneer whose keys end in the name of the arm that asks."""
 _ROLES: dict[str, Role] = {str(role): role for role in TOPICS}
@@ -152,6 +155,11 @@ def parse(key: str) -> Key:
     Raises:
         ValueError: not a key of this version, or not written as `str(Key(...))` would write it (wildcards, for one).
     """
+    # The same few keys come with every message; what is longer than any of ours is not worth the room.
+    return _known(key) if len(key) <= LONGEST_KNOWN else _parse(key)
+
+
+def _parse(key: str) -> Key:
     parts = key.split("/")
     asked = len(parts) == 7 and parts[5] in ASKED
     named = len(parts) == 6 or asked
@@ -175,6 +183,9 @@ def parse(key: str) -> Key:
     if written != key:
         raise ValueError(f"'{key}' is not written as one concrete key should be: expected '{written}'.")
     return parsed
+
+
+_known = lru_cache(MOST_KNOWN)(_parse)
 
 
 def chunk(name: str) -> str:

@@ -5,6 +5,7 @@ would turn them into `null` in silence), a score that is not known is `null`. Un
 version may add some; a change that a reader of today could misread takes a new version in the schema name.
 """
 
+from functools import cache
 from math import isfinite
 from typing import Annotated, TypeVar
 
@@ -112,6 +113,7 @@ def schema(kind: type[msgspec.Struct]) -> str:
     return f"thermofleet.{kind.__name__}.v{VERSION}"
 
 
+@cache
 def encoding(kind: type[msgspec.Struct]) -> str:
     """The encoding that travels with every message, for example `application/json;thermofleet.State.v1`."""
     return f"application/json;{schema(kind)}"

@@ -156,3 +156,16 @@ def test_names_that_cannot_be_written_are_refused(name):
         keys.of_arm("f", name, "state")
     with pytest.raises(ValueError, match="name"):
         keys.of_auction(name, "a", "result")
+
+
+def test_a_key_that_was_read_before_is_not_taken_apart_again_unless_it_is_very_long():
+    short, long = (keys.of_arm("f", name, "state") for name in ("arm_0", "a" * 300))
+    assert keys.parse(short) is keys.parse(short)
+    assert keys.parse(long) == keys.parse(long)
+    assert keys.parse(long) is not keys.parse(long)
+
+
+def test_many_keys_fill_no_memory():
+    for i in range(2 * keys.MOST_KNOWN):
+        keys.parse(keys.of_arm("f", f"arm_{i}", "state"))
+    assert keys._known.cache_info().currsize == keys.MOST_KNOWN
