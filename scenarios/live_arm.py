@@ -110,7 +110,7 @@ def simulated(
     how: Any = difficulty
     arm = prepare_arm(scenario, name, difficulty=how, cache=cache, progress=progress)
     index = scenario.index_of(name)
-    offset_k = float(air_offsets(scenario)[index])
+    air_c, offset_k = air_of(scenario), float(air_offsets(scenario)[index])
     planners: list[Any] = []
 
     def plan(work: Work) -> tuple[Plan, ...]:
@@ -124,7 +124,7 @@ def simulated(
         return SimulatedBody(
             arm,
             scenario.limits,
-            lambda at_s: float(scenario.ambient.at(np.array(at_s))) + offset_k,
+            lambda at_s: air_c(at_s) + offset_k,
             dt_s=dt_s,
             longest_s=scenario.decision_interval_s,
             rng=np.random.default_rng(np.random.SeedSequence([seed, index])),
@@ -133,6 +133,16 @@ def simulated(
         )
 
     return MadeArm(name=name, model=arm.model, plan=plan, body=body, works=tuple(arm.plans))
+
+
+def air_of(scenario: Scenario) -> Callable[[float], float]:
+    """Air of the cell at a time of the fleet, °C: asked ten times a second, so what never changes is not worked out."""
+    import numpy as np
+
+    if len({temp_c for _, temp_c in scenario.ambient.points}) == 1:
+        steady_c = float(scenario.ambient.points[0][1])
+        return lambda at_s: steady_c
+    return lambda at_s: float(scenario.ambient.at(np.array(at_s)))
 
 
 def replayed(name: str, file: Path) -> MadeArm:
@@ -185,8 +195,6 @@ def node_of(
     Args:
         nonce: Never the same for two lives; drawn unless given.
     """
-    import numpy as np
-
     from fleet.live.arm_node import ArmNode, Nature
     from fleet.live.contractor import Contractor, Terms
     from fleet.live.estimate import Estimator, NominalHeat
@@ -203,7 +211,7 @@ def node_of(
         warning_c=scenario.limits.warning_c,
         rate_hz=rate_hz,
         life=memory.boot,
-        air_c=lambda at_s: float(scenario.ambient.at(np.array(at_s))),
+        air_c=air_of(scenario),
         works=made.takes_work,
     )
     body = made.body(clock.now_s(time.monotonic()), clock.speed / rate_hz)

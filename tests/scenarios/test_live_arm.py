@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +19,9 @@ from fleet.bus.router import Router
 from fleet.bus.trade import JobWord, Quote, QuoteRequest
 from fleet.errors import FleetError, LogError
 from scenarios.build import prepare, prepare_arm, quiet
-from scenarios.live_arm import replayed, simulated
+from scenarios.live_arm import air_of, replayed, simulated
 from scenarios.load import load
+from scenarios.scenario import Ambient
 from twin.logs import read
 from twin.recording import CHANNELS
 
@@ -201,3 +203,10 @@ def test_a_real_arm_is_replayed_as_it_was_logged():
         np.testing.assert_array_equal(reading.temp_c, recording.temp_c[row])
         np.testing.assert_array_equal(reading.q, recording.q[row])
         np.testing.assert_array_equal(reading.current_a, recording.current_a[row])
+
+
+@pytest.mark.parametrize("points", [((0.0, 28.0),), ((0.0, 28.0), (600.0, 28.0)), ((0.0, 20.0), (600.0, 40.0))])
+def test_the_air_is_that_of_the_scenario_at_any_time(points):
+    scenario = replace(load("quickstart"), ambient=Ambient(points=points))
+    for time_s in (-1.0, 0.0, 150.0, 600.0, 1e6):
+        assert air_of(scenario)(time_s) == np.interp(time_s, *zip(*points, strict=True))
