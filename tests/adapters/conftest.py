@@ -116,7 +116,7 @@ def elsewhere(small) -> Callable[[str, int], str]:
         ran = subprocess.run(
             [sys.executable, "-c", ELSEWHERE, small.PATH, __file__, file],
             env=os.environ | {"PYTHONHASHSEED": str(hash_seed), "PYTHONPATH": ":".join(p for p in sys.path if p)},
-            capture_output=True, text=True, timeout=240, check=False,
+            capture_output=True, text=True, timeout=600, check=False,
         )  # fmt: skip
         told = [line for line in ran.stdout.splitlines() if line.startswith("trained ")]
         assert len(told) == 1, ran.stderr[-2000:]

@@ -1,0 +1,123 @@
+"""AgileRL takes the environment: IPPO and MADDPG by its own training loops, a few updates."""
+
+import random
+
+import numpy as np
+import pytest
+
+pytestmark = [pytest.mark.adapter, pytest.mark.filterwarnings("default")]
+
+Parameters = dict[str, np.ndarray]
+
+
+def parameters(agent) -> Parameters:
+    networks = agent.actors.items()
+    return {
+        f"{group}.{name}": value.detach().numpy().copy()
+        for group, net in networks
+        for name, value in net.named_parameters()
+    }
+
+
+def trained(workshop, seed: int, algorithm: str = "IPPO", masks: str = "list") -> tuple[Parameters, Parameters]:
+    """The actors' parameters before and after a training."""
+    import torch
+    from agilerl import algorithms
+    from agilerl.components.replay_buffer import ReplayBuffer
+    from agilerl.training.train_multi_agent_off_policy import train_multi_agent_off_policy
+    from agilerl.training.train_multi_agent_on_policy import train_multi_agent_on_policy
+
+    from fleet.env.adapters.agilerl import AgileRLEnv
+
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002  # AgileRL shuffles by the global one
+    torch.manual_seed(seed)
+    env = AgileRLEnv(workshop(), masks=masks)
+    env.reset(seed=seed)
+    arms = env.possible_agents
+    spaces = [env.observation_space(arm) for arm in arms], [env.action_space(arm) for arm in arms]
+    options = {"learn_step": 30, "batch_size": 16, "net_config": {"latent_dim": 16}}
+    common = {"max_steps": 120, "evo_steps": 60, "eval_steps": 15, "verbose": False}
+    if algorithm == "IPPO":
+        agent = algorithms.IPPO(*spaces, agent_ids=arms, lr=1e-3, **options)
+        before = parameters(agent)
+        train_multi_agent_on_policy(env, "small", algorithm, [agent], **common)
+    else:
+        agent = getattr(algorithms, algorithm)(*spaces, agent_ids=arms, **options)
+        before = parameters(agent)
+        train_multi_agent_off_policy(env, "small", algorithm, [agent], ReplayBuffer(1000), **common)
+    return before, parameters(agent)
+
+
+@pytest.fixture(scope="module", params=[("IPPO", "list"), ("MADDPG", "list"), ("MATD3", "array")], ids="-".join)
+def session(request, small_workshop):
+    """A training, what it left, and what reached the environments."""
+    workshop = small_workshop()
+    return workshop.log, *trained(workshop, 0, *request.param)
+
+
+def test_it_trains_and_sends_no_illegal_action(session) -> None:
+    log, before, after = session
+    assert log.steps >= 120
+    assert log.claims > 50
+    assert log.illegal == 0
+    assert all(np.isfinite(value).all() for value in after.values())
+    assert sum((before[name] != after[name]).any() for name in before) > len(before) / 2
+    assert log.orders == {("arm_0", "arm_1", "arm_2")}
+
+
+def test_a_seed_repeats_the_training_and_another_does_not(small_workshop) -> None:
+    (before, after), again, other = (trained(small_workshop(), seed) for seed in (0, 0, 1))
+    for name in before:
+        np.testing.assert_array_equal(again[1][name], after[name])
+    assert any((other[1][name] != after[name]).any() for name in before)
+
+
+def test_the_hash_seed_changes_nothing(elsewhere) -> None:
+    assert elsewhere(__file__, 1) == elsewhere(__file__, 2)
+
+
+@pytest.mark.parametrize("masks", ["list", "array"])
+@pytest.mark.parametrize("shift", [{"ticks": 6}, {"jobs": 1, "ticks": 400, "ambient_c": 20.0}], ids=["cut", "finished"])
+def test_it_is_the_environment_with_the_mask_elsewhere(small_workshop, shift, masks) -> None:
+    from fleet.env.adapters.agilerl import AgileRLEnv
+
+    env, plain = AgileRLEnv(small_workshop(**shift)(), masks=masks), small_workshop(**shift)()
+    (seen, infos), (there, infos_there) = env.reset(seed=3), plain.reset(seed=3)
+    rng, ends = np.random.default_rng(3), None
+    while True:
+        for arm in plain.possible_agents:
+            assert env.observation_space(arm) is env.observation_space(arm)
+            assert env.observation_space(arm).contains(seen[arm])
+            np.testing.assert_array_equal(seen[arm], there[arm]["observation"])
+            assert isinstance(infos[arm]["action_mask"], list if masks == "list" else np.ndarray)
+            np.testing.assert_array_equal(infos[arm].pop("action_mask"), there[arm]["action_mask"])
+            assert infos[arm] == infos_there[arm]
+        if not env.agents:
+            break
+        claims = {arm: int(rng.choice(np.flatnonzero(each["action_mask"]))) for arm, each in there.items()}
+        seen, rewards, *ends, infos = env.step(claims)
+        there, rewards_there, *ends_there, infos_there = plain.step(claims)
+        assert (rewards, ends) == (rewards_there, ends_there)
+    assert [set(end.values()) for end in ends] == [{"jobs" in shift}, {"jobs" not in shift}]
+
+
+def test_a_reset_brings_the_infos_of_the_end_up_to_date(small_workshop) -> None:
+    """AgileRL's own loop acts by them in the new episode."""
+    from fleet.env.adapters.agilerl import AgileRLEnv
+
+    env = AgileRLEnv(small_workshop(ticks=3)(), masks="list")
+    env.reset(seed=1)
+    kept = [env.step(dict.fromkeys(env.possible_agents, 0))[-1] for _ in range(3)]
+    before = [repr(infos) for infos in kept]
+    _, fresh = env.reset(seed=2)
+    assert kept[2] == fresh
+    assert repr(fresh) != before[2]
+    assert [repr(infos) for infos in kept[:2]] == before[:2]
+
+
+def test_another_kind_of_mask_is_refused(small_workshop) -> None:
+    from fleet.env.adapters.agilerl import AgileRLEnv
+
+    with pytest.raises(ValueError, match=r"masks must be 'list' \(for IPPO\) or 'array'"):
+        AgileRLEnv(small_workshop()(), masks="tuple")
