@@ -66,8 +66,9 @@ class Palette:
     """Colours for every picture of a cell: what is common exactly, the rest as near as `COLOURS` allow."""
 
     def __init__(self, scene: Scene, size: Pixel) -> None:
-        seen = np.concatenate([picture(each, size).reshape(-1, 3) for each in _specimens(scene)])
-        colours, counts = np.unique(seen, axis=0, return_counts=True)
+        seen = np.concatenate([_numbered(picture(each, size)).ravel() for each in _specimens(scene)])
+        numbers, counts = np.unique(seen, return_counts=True)
+        colours = np.stack([numbers >> 16, numbers >> 8 & 255, numbers & 255], axis=1).astype(np.uint8)
         exact = colours[np.argsort(-counts, kind="stable")[:FREQUENT]]
         spread = Image.fromarray(colours[None]).quantize(COLOURS - len(exact), method=Quantize.MEDIANCUT)
         rest = np.array(spread.getpalette(), dtype=np.uint8).reshape(-1, 3)
@@ -85,9 +86,15 @@ class Palette:
         return image
 
 
-def _cell_of(colour: Array) -> Array:
+def _numbered(colours: Array) -> Array:
+    """One number per colour [..., 3], so that finding the different ones is fast."""
+    wide = colours.astype(np.int32)
+    return wide[..., 0] << 16 | wide[..., 1] << 8 | wide[..., 2]
+
+
+def _cell_of(colours: Array) -> Array:
     """Which of the cells of `BITS` per channel colours [..., 3] lie in."""
-    high = (colour >> (8 - BITS)).astype(np.int32)
+    high = (colours >> (8 - BITS)).astype(np.int32)
     return (high[..., 0] << 2 * BITS) | (high[..., 1] << BITS) | high[..., 2]
 
 
