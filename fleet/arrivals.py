@@ -1,6 +1,6 @@
 """When jobs arrive: a Poisson stream, batches, or a trace."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 
 import numpy as np
@@ -68,3 +68,10 @@ def release_times(arrivals: Arrivals, horizon_s: float, rng: np.random.Generator
         case Trace():
             times = np.array(arrivals.times_s, dtype=float)
     return times[times < horizon_s]
+
+
+def oftener(arrivals: Arrivals, factor: float) -> Arrivals:
+    """The same so many times as often; single batches and traces stay as they are."""
+    if isinstance(arrivals, Trace) or arrivals.every_s is None:
+        return arrivals
+    return replace(arrivals, every_s=arrivals.every_s / factor)

@@ -1,7 +1,6 @@
 """The composition root: from a scenario to arms with plans and twins, and to the environment they live in."""
 
 import logging
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,10 +11,12 @@ import numpy as np
 from fleet.bus.channel import PERFECT, Channel
 from fleet.bus.exchange import Exchange
 from fleet.bus.memory import MemoryExchange
+from fleet.cache import cache_folder
 from fleet.difficulty import Blind, DifficultyModel
-from fleet.env.allocation_v0 import AllocationEnv, Episode, parallel_env
+from fleet.env.allocation_v0 import AllocationEnv, MaskPlace, parallel_env
+from fleet.env.episode import Episode
 from fleet.errors import FleetError, InfeasibleJob, ScenarioError, nearest
-from fleet.job import Work
+from fleet.job import Job, Work
 from fleet.motion import Plan
 from fleet.motor import Motors, gen3_motors, thermal_data
 from fleet.robot import Robot
@@ -25,8 +26,10 @@ from fleet.sim.mujoco_plant import MujocoPlant
 from fleet.sim.oracle import Oracle
 from fleet.sim.planner import Planner
 from fleet.sim.plants import ProfilePlant
+from fleet.sim.state import World
 from fleet.sim.world import Arm, build_world, warm_start
 from fleet.thermal import ThermalModel, ThermalSpread, gen3_network, spread_motors, thermal_model
+from scenarios.cell import cell_of
 from scenarios.jobs import all_works, draw_jobs, rehearsal_works, works_of
 from scenarios.load import load, override
 from scenarios.scenario import Scenario
@@ -53,15 +56,6 @@ class Fleet:
     arms: tuple[Arm, ...]
     infeasible: tuple[InfeasibleJob, ...]
     """What single arms cannot do, with the reasons."""
-
-
-def cache_folder() -> Path:
-    """Where plans and twins are kept: $THERMOFLEET_CACHE, else thermofleet in $XDG_CACHE_HOME or ~/.cache."""
-    own = os.environ.get("THERMOFLEET_CACHE")
-    if own:
-        return Path(own)
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "thermofleet"
 
 
 def choose(kind: str, name: str, allowed: Any) -> None:
@@ -218,6 +212,29 @@ def _with_oracle(scenario: Scenario, arm: Arm) -> Arm:
     return replace(arm, model=model)
 
 
+def children(seed: np.random.SeedSequence) -> tuple[np.random.SeedSequence, np.random.SeedSequence]:
+    """Of the seed of a shift: for its jobs, and for its sensors."""
+    # By hand: SeedSequence.spawn would count, and give others the second time.
+    jobs, sensors = (np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, i)) for i in range(2))
+    return jobs, sensors
+
+
+def world_of(fleet: Fleet, jobs: Sequence[Job]) -> tuple[World, tuple[Plan, ...]]:
+    """The world of a shift with these jobs, and the plans behind the rows of its plan table."""
+    scenario = fleet.scenario
+    times = (np.arange(scenario.ticks) + 0.5) * scenario.decision_interval_s
+    return build_world(
+        fleet.arms,
+        [jobs],
+        limits=scenario.limits,
+        dt_s=scenario.decision_interval_s,
+        ticks=scenario.ticks,
+        slots=scenario.slots,
+        ambient_c=scenario.ambient.at(times)[:, None] + air_offsets(scenario),
+        start_warm=scenario.start == "idle_warm",
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class ShiftFactory:
     """Makes the episode of a seed for one fleet."""
@@ -228,31 +245,16 @@ class ShiftFactory:
     def __call__(self, seed: np.random.SeedSequence) -> Episode:
         """Draw the jobs and lay out the world; the same seed gives the same episode."""
         scenario, arms = self.fleet.scenario, self.fleet.arms
-        # Children by hand: SeedSequence.spawn would count, and give others the second time.
-        jobs_seed, sensor_seed = (
-            np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, i)) for i in range(2)
-        )
-        jobs = draw_jobs(scenario, jobs_seed)
-        times = (np.arange(scenario.ticks) + 0.5) * scenario.decision_interval_s
-        ambient = scenario.ambient.at(times)[:, None] + air_offsets(scenario)
-        world, plans = build_world(
-            arms,
-            [jobs],
-            limits=scenario.limits,
-            dt_s=scenario.decision_interval_s,
-            ticks=scenario.ticks,
-            slots=scenario.slots,
-            ambient_c=ambient,
-            start_warm=scenario.start == "idle_warm",
-        )
+        jobs_seed, sensor_seed = children(seed)
+        world, plans = world_of(self.fleet, draw_jobs(scenario, jobs_seed))
         robots, rest_tau = [arm.robot for arm in arms], np.stack([arm.rest_tau for arm in arms])
         plant: Plant
         if self.plant == "mujoco":
             plant = MujocoPlant(robots, plans, rest_tau, scenario.places)
         else:
             plant = ProfilePlant(plans, np.stack([robot.home_q() for robot in robots]), rest_tau)
-        rng = np.random.default_rng(sensor_seed)
-        return Episode(world=world, plant=plant, twins=tuple(arm.model.version for arm in arms), rng=rng)
+        twins = tuple(arm.model.version for arm in arms)
+        return Episode(world=world, plant=plant, twins=twins, sensors=sensor_seed)
 
 
 def air_offsets(scenario: Scenario) -> np.ndarray:
@@ -290,7 +292,9 @@ def make_env(
     bus: BusName = "memory",
     channel: Channel = PERFECT,
     cache: Path | None = None,
-    env_options: Mapping[str, Any] | None = None,
+    max_cycles: int | None = None,
+    render_mode: str | None = None,
+    mask_in: MaskPlace = "obs",
     progress: Progress = quiet,
     **overrides: Any,
 ) -> AllocationEnv:
@@ -303,13 +307,14 @@ def make_env(
         bus: What carries the words between arms.
         channel: What becomes of words on the way: topology, delay, loss, partitions.
         cache: Folder of plans and twins.
-        env_options: Further options of `fleet.env.allocation_v0.AllocationEnv`.
+        max_cycles, render_mode, mask_in: As in `fleet.env.allocation_v0.AllocationEnv`.
         overrides: Top-level fields of the scenario to change, for example `horizon_s=600`.
     """
     base = scenario if isinstance(scenario, Scenario) else load(scenario)
     chosen = override(base, **overrides) if overrides else base
     fleet = prepare(chosen, difficulty=difficulty, cache=cache, progress=progress)
-    return env_of(fleet, plant=plant, bus=bus, channel=channel, **(env_options or {}))
+    options = {"max_cycles": max_cycles, "render_mode": render_mode, "mask_in": mask_in}
+    return env_of(fleet, plant=plant, bus=bus, channel=channel, **options)
 
 
 def env_of(
@@ -325,4 +330,5 @@ def env_of(
     choose("plant", plant, PlantName)
     names = tuple(arm.robot.name for arm in fleet.arms)
     exchange = open_exchange(bus, names, fleet.scenario.name, endpoint, channel)
-    return parallel_env(ShiftFactory(fleet, plant), exchange=exchange, weights=fleet.scenario.reward, **options)
+    options = {"weights": fleet.scenario.reward, "cell": cell_of(fleet.scenario), **options}
+    return parallel_env(ShiftFactory(fleet, plant), exchange=exchange, **options)

@@ -1,13 +1,16 @@
 """The jobs of a shift: what a scenario's streams ask for, drawn for one seed."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
-from fleet.arrivals import release_times
+from fleet.arrivals import oftener, release_times
 from fleet.job import Job, Work
 from scenarios.scenario import JobStream, Scenario
+
+Array = np.ndarray
 
 
 def works_of(scenario: Scenario, stream: JobStream, payload_kg: Sequence[float] | None = None) -> tuple[Work, ...]:
@@ -30,30 +33,105 @@ def all_works(scenario: Scenario) -> tuple[Work, ...]:
     return tuple(dict.fromkeys(work for stream in scenario.jobs for work in works_of(scenario, stream)))
 
 
+@dataclass(frozen=True, eq=False)
+class DrawnJobs:
+    """The jobs of one shift as arrays [job], in order of release, and of their names where they come together."""
+
+    stream: Array
+    """Index into the scenario's streams."""
+    number: Array
+    """Of the job in its stream, from 0."""
+    payload: Array
+    """Index into the stream's payloads."""
+    repetitions: Array
+    release_s: Array
+    after: Array
+    """Indices of the jobs that must be done first, int [job, n], −1 for none."""
+
+
+class JobSource:
+    """Draws the jobs of a scenario's shifts."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        self._arrivals = [stream.arrivals.arrivals() for stream in scenario.jobs]
+        self._ranges = [
+            (np.array([0, stream.repetitions[0]]), np.array([len(stream.payload_kg), stream.repetitions[1] + 1]))
+            for stream in scenario.jobs
+        ]
+        self._index = {stream.name: i for i, stream in enumerate(scenario.jobs)}
+        self._waits = max((len(stream.after) for stream in scenario.jobs), default=0) or 1
+        self._rank: Array = np.zeros((len(scenario.jobs), 0), dtype=int)
+
+    def draw(self, seed: np.random.SeedSequence, often: float = 1.0) -> DrawnJobs:
+        """The jobs of one shift; each stream has a random row of its own, so none disturbs another.
+
+        Args:
+            often: They come so many times as often.
+        """
+        streams = self.scenario.jobs
+        horizon_s = self.scenario.ticks * self.scenario.decision_interval_s
+        times: list[Array] = []
+        choices: list[Array] = []
+        arriving = self._arrivals if often == 1.0 else [oftener(each, often) for each in self._arrivals]
+        for arrivals, (low, high), child in zip(arriving, self._ranges, seed.spawn(len(self._ranges)), strict=True):
+            rng = np.random.default_rng(child)
+            times.append(release_times(arrivals, horizon_s, rng))
+            choices.append(rng.integers(low, high, size=(len(times[-1]), 2)))
+        counts = [len(each) for each in times]
+        release_s = np.concatenate([np.zeros(0), *times])
+        chosen = np.concatenate([np.zeros((0, 2), dtype=int), *choices])
+        payload, repetitions = np.moveaxis(chosen, -1, 0)
+        stream = np.repeat(np.arange(len(counts)), counts)
+        first = np.cumsum([0, *counts])
+        number = np.arange(len(stream)) - first[stream]
+        order = np.lexsort((self._ranks(max(counts, default=0))[stream, number], release_s))
+        after = np.full((len(stream), self._waits), -1)
+        if any(spec.after for spec in streams):
+            place = np.empty(len(order), dtype=int)
+            place[order] = np.arange(len(order))
+            for i, spec in enumerate(streams):
+                for n, other in enumerate(spec.after):
+                    o = self._index[other]
+                    both = min(counts[i], counts[o])
+                    after[first[i] : first[i] + both, n] = place[first[o] : first[o] + both]
+        return DrawnJobs(
+            stream=stream[order],
+            number=number[order],
+            payload=payload[order],
+            repetitions=repetitions[order],
+            release_s=release_s[order],
+            after=after[order],
+        )
+
+    def _ranks(self, most: int) -> Array:
+        """Place of each job's name among all names, [stream, number], for so many jobs a stream at least."""
+        if self._rank.shape[1] < most:
+            most = max(most, 2 * self._rank.shape[1])
+            names = np.array([[_name(stream.name, n) for n in range(most)] for stream in self.scenario.jobs])
+            self._rank = np.argsort(np.argsort(names, axis=None)).reshape(names.shape)
+        return self._rank
+
+
 def draw_jobs(scenario: Scenario, seed: np.random.SeedSequence) -> tuple[Job, ...]:
-    """The jobs of one shift in order of release; each stream has a random row of its own, so none disturbs another."""
-    horizon_s = scenario.ticks * scenario.decision_interval_s
-    jobs: list[Job] = []
-    counts: dict[str, int] = {}
-    for stream, child in zip(scenario.jobs, seed.spawn(len(scenario.jobs)), strict=True):
-        rng = np.random.default_rng(child)
-        times = release_times(stream.arrivals.arrivals(), horizon_s, rng)
-        choices = works_of(scenario, stream)
-        low, high = stream.repetitions
-        counts[stream.name] = len(times)
-        for number, release_s in enumerate(times.tolist()):
-            jobs.append(
-                Job(
-                    name=_name(stream.name, number),
-                    work=choices[int(rng.integers(len(choices)))],
-                    repetitions=int(rng.integers(low, high + 1)),
-                    release_s=release_s,
-                    due_s=release_s + stream.due_s,
-                    value=stream.value,
-                    after=tuple(_name(other, number) for other in stream.after if number < counts[other]),
-                )
-            )
-    return tuple(sorted(jobs, key=lambda job: (job.release_s, job.name)))
+    """The jobs of one shift in order of release."""
+    drawn = JobSource(scenario).draw(seed)
+    streams = scenario.jobs
+    works = [works_of(scenario, stream) for stream in streams]
+    rows = zip(drawn.stream.tolist(), drawn.number.tolist(), strict=True)
+    names = [_name(streams[i].name, number) for i, number in rows]
+    return tuple(
+        Job(
+            name=names[j],
+            work=works[i][drawn.payload[j]],
+            repetitions=int(drawn.repetitions[j]),
+            release_s=float(drawn.release_s[j]),
+            due_s=float(drawn.release_s[j]) + streams[i].due_s,
+            value=streams[i].value,
+            after=tuple(names[k] for k in drawn.after[j].tolist() if k >= 0),
+        )
+        for j, i in enumerate(drawn.stream.tolist())
+    )
 
 
 def _name(stream: str, number: int) -> str:

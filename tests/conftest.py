@@ -141,9 +141,8 @@ class Shifts:
     limits: ThermalLimits = field(default_factory=ThermalLimits)
 
     def __call__(self, seed: np.random.SeedSequence) -> Episode:
-        draw, sensor = (
-            np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, i))) for i in (0, 1)
-        )
+        jobs_seed, sensors = (np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, i)) for i in (0, 1))
+        draw = np.random.default_rng(jobs_seed)
         works = [work(place, payload) for place in ("bench", "press", "rack") for payload in (LIGHT, WARM, HOT)]
         arms = [arm(i, works, times=Times(cycle=10.0 + 2.0 * i)) for i in range(self.arms)]
         jobs = []
@@ -164,7 +163,7 @@ class Shifts:
         world, plant = shop(
             [jobs], arms=arms, limits=self.limits, ticks=self.ticks, slots=self.slots, ambient_c=self.ambient_c
         )
-        return Episode(world=world, plant=plant, twins=("by payload",) * self.arms, rng=sensor)
+        return Episode(world=world, plant=plant, twins=("by payload",) * self.arms, sensors=sensors)
 
 
 @pytest.fixture(scope="session")

@@ -33,6 +33,11 @@ class MemoryExchange:
         self._now_s = -float("inf")
         self._closed = False
 
+    @property
+    def perfect(self) -> bool:
+        """Whether every arm hears every other at once, always."""
+        return self._delivery is None
+
     def begin(self, rng: np.random.Generator | None = None) -> None:
         """A new episode: forget what was heard and what is on its way; chance comes from `rng` from now on."""
         self._now_s = -float("inf")

@@ -6,48 +6,65 @@ claims the job in slot k. Two claims for one job or station: the lower shared di
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import parallel_to_aec, wrappers
 
-from fleet.bus.exchange import Exchange, Heard
+from fleet.bus.exchange import Exchange
 from fleet.bus.memory import MemoryExchange
-from fleet.env.observation import Layout, Observation, observe, say
-from fleet.env.reward import TERMS, RewardWeights, terms
+from fleet.env.episode import Episode as Episode
+from fleet.env.episode import EpisodeFactory as EpisodeFactory
+from fleet.env.observation import Layout, Observation
+from fleet.env.picture import draw
+from fleet.env.plain import PlainShift
+from fleet.env.reward import TERMS, RewardWeights
+from fleet.env.scene import Cell
+from fleet.env.spaces import arm_spaces
+from fleet.env.window import Window
 from fleet.events import Event
-from fleet.sim import claims
-from fleet.sim.kernel import Plant, Step, step
-from fleet.sim.state import DONE, State, World, initial
+from fleet.sim.kernel import Step
+from fleet.sim.plants import ProfilePlant
+from fleet.sim.state import State, World
 from fleet.telemetry import MODES
 from fleet.thermal import WINDING
 
 Array = np.ndarray
 
 VERSION = "allocation_v0"
+MaskPlace = Literal["obs", "info", "both"]
+RENDER_MODES = ("ansi", "rgb_array", "human")
+_LARGEST = 2**62
+FRAMES_PER_S = 10
+"""Of a rendered episode, in decision intervals per second."""
 
 
-@dataclass(frozen=True, eq=False)
-class Episode:
-    """One shift, ready to run."""
+class Shift(Protocol):
+    """One episode that is being stepped: `fleet.env.plain.PlainShift` or `fleet.env.compiled.CompiledShift`."""
 
-    world: World
-    plant: Plant
-    twins: tuple[str, ...]
-    """Version of each arm's difficulty model."""
-    rng: np.random.Generator
-    """For sensor noise."""
-
-
-EpisodeFactory = Callable[[np.random.SeedSequence], Episode]
-"""Makes the episode of a seed; the fleet must be the same for every seed."""
+    @property
+    def state(self) -> State: ...
+    @property
+    def vectors(self) -> Array: ...
+    @property
+    def mask(self) -> Array: ...
+    @property
+    def messages(self) -> int: ...
+    @property
+    def counts(self) -> tuple[Array, Array, Array, Array, int]: ...
+    @property
+    def tick(self) -> int: ...
+    def step(self, actions: Array, /) -> tuple[Array, bool]: ...
 
 
 class AllocationEnv(ParallelEnv[str, Any, Any]):
     """The environment itself; `parallel_env` is its public door.
+
+    Arms that follow their plans and hear each other at once are stepped by the compiled engine of the batch,
+    `fleet.env.vector`; with an event log, a watcher, another plant or another exchange the plain kernel steps them, to
+    the same end.
 
     Args:
         make_episode: Makes the shift of a seed.
@@ -56,10 +73,19 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         max_cycles: Ends the episode earlier than the shift's horizon, in decision intervals.
         keep_events: Collect an event log in `events`.
         watch: Called with every `Step` of the kernel, for recording.
-        render_mode: "ansi" for a table of the fleet as text, or None.
+        render_mode: "rgb_array" for a picture from above, "human" for a window that shows it, "ansi" for a table of
+            the fleet as text, or None.
+        cell: Where arms and stations stand, for pictures; arms in a row if not given.
+        mask_in: Where the mask of legal actions is: in the observation, in the info, or both. In the info alone, the
+            observation is the vector by itself.
     """
 
-    metadata = {"name": VERSION, "render_modes": ["ansi"], "is_parallelizable": True}  # noqa: RUF012  # PettingZoo's
+    metadata = {  # noqa: RUF012  # PettingZoo's
+        "name": VERSION,
+        "render_modes": list(RENDER_MODES),
+        "render_fps": FRAMES_PER_S,
+        "is_parallelizable": True,
+    }
 
     def __init__(
         self,
@@ -71,11 +97,16 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         keep_events: bool = False,
         watch: Callable[[Step], None] | None = None,
         render_mode: str | None = None,
+        cell: Cell | None = None,
+        mask_in: MaskPlace = "obs",
     ) -> None:
-        if render_mode not in (None, "ansi"):
-            raise ValueError(f"render_mode must be None or 'ansi' (got {render_mode!r}).")
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            allowed = ", ".join(map(repr, RENDER_MODES))
+            raise ValueError(f"render_mode must be None or one of {allowed} (got {render_mode!r}).")
         if max_cycles is not None and max_cycles < 1:
             raise ValueError(f"max_cycles must be >= 1 (got {max_cycles}).")
+        if mask_in not in get_args(MaskPlace):
+            raise ValueError(f"mask_in must be one of {', '.join(get_args(MaskPlace))} (got {mask_in!r}).")
         self.render_mode = render_mode
         self.events: list[Event] = []
         self._make_episode = make_episode
@@ -83,27 +114,26 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         self._max_cycles = max_cycles
         self._keep_events = keep_events
         self._watch = watch
+        self._cell, self._window = cell, Window() if render_mode == "human" else None
+        self._mask_in = mask_in
         self._seeds = np.random.SeedSequence()
         self._episode = make_episode(np.random.SeedSequence(0))
         world = self._episode.world
         self.possible_agents = list(world.arms)
         self.agents: list[str] = []
         self._exchange = exchange or MemoryExchange(world.arms)
-        self._spoken_before = 0
         self.layout = Layout(len(world.arms), world.slots)
-        low, high = self.layout.bounds
-        self.observation_spaces = {
-            arm: spaces.Dict(
-                {
-                    "observation": spaces.Box(low, high, dtype=np.float32),
-                    "action_mask": spaces.Box(0, 1, (world.slots + 1,), dtype=np.int8),
-                }
-            )
-            for arm in world.arms
+        per_arm = [arm_spaces(self.layout) for _ in world.arms]
+        self.observation_spaces: dict[str, spaces.Space[Any]] = {
+            arm: own["observation"] if mask_in == "info" else own
+            for arm, (own, _) in zip(world.arms, per_arm, strict=True)
         }
-        self.action_spaces = {arm: spaces.Discrete(world.slots + 1) for arm in world.arms}
+        self.action_spaces: dict[str, spaces.Space[Any]] = {
+            arm: own for arm, (_, own) in zip(world.arms, per_arm, strict=True)
+        }
+        low, high = self.layout.bounds
         self.state_space = spaces.Box(np.tile(low, len(world.arms)), np.tile(high, len(world.arms)), dtype=np.float32)
-        self._state: State | None = None
+        self._shift: Shift | None = None
 
     @property
     def world(self) -> World:
@@ -118,26 +148,24 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
     @property
     def truth(self) -> State:
         """The simulator's state (not for policies)."""
-        if self._state is None:
-            raise RuntimeError("There is no state yet: call reset() first.")
-        return self._state
+        return self._begun("looking at its state").state
 
     @property
     def messages(self) -> int:
         """Words that reached a peer in this episode."""
-        return self._exchange.delivered - self._spoken_before
+        return self._begun("counting messages").messages
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """Space of an agent's observation; the same object on every call."""
-        return self.observation_spaces[agent]
+        return self.observation_spaces[self._known(agent)]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
         """Space of an agent's action; the same object on every call."""
-        return self.action_spaces[agent]
+        return self.action_spaces[self._known(agent)]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, dict[str, Array]], dict[str, dict[str, float]]]:
+    ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
         """Begin a new shift: observations and infos by agent. Without a seed, the next one of the last seed's row."""
         if seed is not None:
             self._seeds = np.random.SeedSequence(seed)
@@ -145,54 +173,43 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         else:
             entropy = self._seeds.spawn(1)[0]
         self._episode = self._make_episode(entropy)
-        self._exchange.begin(self._episode.rng.spawn(1)[0])
-        self._spoken_before = self._exchange.delivered
-        self._state = initial(self.world)
         self.agents = list(self.possible_agents)
         self.events = []
-        self._perceive()
-        zero = dict.fromkeys(TERMS, 0.0)
-        return self._observations(), {arm: self._info(a, zero) for a, arm in enumerate(self.world.arms)}
+        self._shift = self._laid_out()
+        observations, masks = self._observations()
+        return observations, self._infos(np.zeros(len(TERMS)), masks)
 
     def step(
-        self, actions: dict[str, int]
-    ) -> tuple[
-        dict[str, dict[str, Array]],
-        dict[str, float],
-        dict[str, bool],
-        dict[str, bool],
-        dict[str, dict[str, float]],
-    ]:
-        """One decision interval; a missing or illegal action is a wait."""
-        before = self.truth
+        self, actions: dict[str, Any]
+    ) -> tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+        """One decision interval; a missing or illegal action is a wait.
+
+        Raises:
+            RuntimeError: before reset, or after the end.
+            ValueError: an action that is no integer, or of an agent that is not there.
+        """
+        shift = self._begun("step()")
         if not self.agents:
             raise RuntimeError("The episode is over: call reset() before step().")
-        unknown = set(actions) - set(self.possible_agents)
-        if unknown:
-            raise ValueError(
-                f"No agent '{sorted(unknown)[0]}' in this fleet. Agents: {', '.join(self.possible_agents)}."
-            )
-        chosen = np.array([[_integer(arm, actions.get(arm, 0)) for arm in self.world.arms]])
-        log = self.events if self._keep_events else None
-        done = step(self.world, before, chosen, self._shared_scores()[None], self._episode.plant, log, self._board)
-        if self._watch is not None:
-            self._watch(done)
-        self._state = done.state
-        self._perceive()
-        parts = {name: float(value[0]) for name, value in terms(self.world, before, done.state, self._weights).items()}
-        reward = sum(parts.values())
-        jobs = self.world.jobs.exists[0]
-        # A shift without any job is stood through to its end.
-        finished = bool(jobs.any() and (done.state.status[0][jobs] == DONE).all())
+        arms = self.possible_agents
+        chosen = np.zeros(len(arms), dtype=np.int64)
+        found = 0
+        for a, arm in enumerate(arms):
+            if arm in actions:
+                chosen[a] = _integer(arm, actions[arm])
+                found += 1
+        if found < len(actions):
+            self._known(next(iter(sorted(set(actions) - set(arms), key=str))))
+        parts, finished = shift.step(chosen)
         last_tick = min(self.world.ticks, self._max_cycles or self.world.ticks)
-        over = not finished and bool(done.state.tick[0] >= last_tick)
-        arms = self.world.arms
-        infos = {arm: self._info(a, parts) for a, arm in enumerate(arms)}
+        over = not finished and shift.tick >= last_tick
+        observations, masks = self._observations()
+        infos = self._infos(parts, masks)
         if finished or over:
             self.agents = []
         return (
-            self._observations(),
-            dict.fromkeys(arms, reward),
+            observations,
+            dict.fromkeys(arms, float(parts.sum())),
             dict.fromkeys(arms, finished),
             dict.fromkeys(arms, over),
             infos,
@@ -200,73 +217,99 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
 
     def state(self) -> Array:
         """What all arms know together: their vectors one after the other, float32."""
-        return self._perceived()[0].reshape(-1).copy()
+        return self._begun("state()").vectors.reshape(-1).copy()
 
     def knowledge(self) -> dict[str, Observation]:
         """The present observation of every arm by name, as policies read it."""
-        vectors, masks = (values.copy() for values in self._perceived())
-        return {arm: self.layout.read(vectors[a], masks[a]) for a, arm in enumerate(self.world.arms)}
+        shift = self._begun("knowledge()")
+        vectors, masks = shift.vectors.copy(), shift.mask.copy()
+        return {arm: self.layout.read(vectors[a], masks[a]) for a, arm in enumerate(self.possible_agents)}
 
-    def render(self) -> str | None:
-        """The fleet as a table of text in mode "ansi"."""
+    def render(self) -> Array | str | None:
+        """The fleet as a picture, uint8 [height, width, 3], in mode "rgb_array", as a table of text in mode "ansi", or
+        shown in a window in mode "human" (which returns nothing, as does no mode)."""
         if self.render_mode is None:
             return None
-        state, world = self.truth, self.world
-        rows = [f"t = {state.tick[0] * world.dt_s:7.0f} s"]
-        for a, arm in enumerate(world.arms):
-            job = state.job[0, a]
-            name = world.jobs.names[0][job] if job >= 0 else "-"
-            temps = " ".join(f"{t:5.1f}" for t in state.temp_c[0, a, WINDING])
-            rows.append(f"{arm:>10}  {MODES[state.mode[0, a]]:<8} {name:<20} {temps}")
-        return "\n".join(rows)
+        shift, world = self._begun("render()"), self.world
+        if self.render_mode == "ansi":
+            return _table(world, shift.state)
+        frame = draw(world, shift.state, self._cell)
+        if self._window is None:
+            return frame
+        self._window.show(frame)
+        return None
 
     def close(self) -> None:
-        """Close the exchange."""
+        """Close the exchange, and the window if there is one."""
         self._exchange.close()
+        if self._window is not None:
+            self._window.close()
 
-    def _perceive(self) -> None:
-        """Read the sensors, tell the peers, hear them, and lay it all out."""
-        world, state = self.world, self.truth
-        self._board = claims.board(world, state)
-        on_offer, mask = self._board.on_offer, self._board.mask
-        true_c = state.temp_c[..., WINDING]
-        measured = true_c + world.motors.sensor_noise_k * self._episode.rng.standard_normal(true_c.shape)
-        words = say(world, state, on_offer, measured, self._episode.twins)
-        self._heard: Heard = self._exchange.share(words)
-        observation = observe(world, state, on_offer, mask, measured, self._heard)
-        self._vectors = self.layout.pack(observation)
+    def _laid_out(self) -> Shift:
+        """The new episode, ready to be stepped."""
+        exchange = self._exchange
+        at_once = isinstance(exchange, MemoryExchange) and exchange.perfect
+        plain = self._keep_events or self._watch is not None
+        if plain or not at_once or not isinstance(self._episode.plant, ProfilePlant):
+            log = self.events if self._keep_events else None
+            return PlainShift(self._episode, exchange, self._weights, log, self._watch)
+        from fleet.env.compiled import CompiledShift  # loads numba, which a live arm has no use for
 
-    def _shared_scores(self) -> Array:
-        """Difficulty by which claims are settled, [arm, slot]: each arm's own word, as it told it."""
-        arm = np.arange(len(self.world.arms))
-        return self._heard.difficulty[arm, arm]
+        return CompiledShift(self._episode, self._weights)
 
-    def _perceived(self) -> tuple[Array, Array]:
-        """Vectors float32 [arm, size] and masks int8 [arm, slot + 1] of this moment."""
-        if self._state is None:
-            raise RuntimeError("Nobody knows anything yet: call reset() first.")
-        return self._vectors[0], self._board.mask[0].astype(np.int8)
+    def _begun(self, what: str) -> Shift:
+        if self._shift is None:
+            raise RuntimeError(f"No episode has begun: call reset() before {what}.")
+        return self._shift
 
-    def _observations(self) -> dict[str, dict[str, Array]]:
-        vectors, masks = self._perceived()
-        return {
-            arm: {"observation": vectors[a].copy(), "action_mask": masks[a].copy()}
-            for a, arm in enumerate(self.world.arms)
-        }
+    def _known(self, agent: str) -> str:
+        if agent not in self.possible_agents:
+            raise ValueError(f"No agent '{agent}' in this fleet. Agents: {', '.join(self.possible_agents)}.")
+        return agent
 
-    def _info(self, a: int, parts: dict[str, float]) -> dict[str, float]:
-        state = self.truth
-        info = {
-            "faults": float(state.faults[0, a]),
-            "illegal": float(state.illegal[0, a]),
-            "peak_c": float(state.peak_c[0, a]),
-            "above_warning_s": float(state.above_warning_s[0, a]),
-            "jobs_done": float((state.status[0] == DONE).sum()),
-        }
-        return info | {f"reward_{name}": value for name, value in parts.items()}
+    def _observations(self) -> tuple[dict[str, Any], Array]:
+        """Observations by agent, and the masks [arm, slot + 1]; all in arrays of their own."""
+        shift = self._begun("observing")
+        vectors, masks = shift.vectors.copy(), shift.mask.copy()
+        arms = self.possible_agents
+        if self._mask_in == "info":
+            return {arm: vectors[a] for a, arm in enumerate(arms)}, masks
+        return {arm: {"observation": vectors[a], "action_mask": masks[a]} for a, arm in enumerate(arms)}, masks
+
+    def _infos(self, parts: Array, masks: Array) -> dict[str, dict[str, Any]]:
+        *per_arm, done = self._begun("infos").counts
+        named = {f"reward_{name}": part for name, part in zip(TERMS, parts.tolist(), strict=True)}
+        infos: dict[str, dict[str, Any]] = {}
+        for arm, faults, illegal, peak_c, above_s in zip(
+            self.possible_agents, *(values.tolist() for values in per_arm), strict=True
+        ):
+            infos[arm] = {
+                "faults": float(faults),
+                "illegal": float(illegal),
+                "peak_c": peak_c,
+                "above_warning_s": above_s,
+                "jobs_done": float(done),
+                **named,
+            }
+        if self._mask_in != "obs":
+            for a, info in enumerate(infos.values()):
+                info["action_mask"] = masks[a].copy()
+        return infos
+
+
+def _table(world: World, state: State) -> str:
+    rows = [f"t = {state.tick[0] * world.dt_s:7.0f} s"]
+    for a, arm in enumerate(world.arms):
+        job = state.job[0, a]
+        name = world.jobs.names[0][job] if job >= 0 else "-"
+        temps = " ".join(f"{t:5.1f}" for t in state.temp_c[0, a, WINDING])
+        rows.append(f"{arm:>10}  {MODES[state.mode[0, a]]:<8} {name:<20} {temps}")
+    return "\n".join(rows)
 
 
 def _integer(arm: str, action: Any) -> int:
+    if type(action) is int and abs(action) <= _LARGEST:
+        return action
     value = np.asarray(action)
     if value.size != 1 or not np.issubdtype(value.dtype, np.integer):
         raise ValueError(f"The action of '{arm}' must be one integer (got {action!r}).")

@@ -124,6 +124,11 @@ class Layout:
             begin = end
         return spans
 
+    @property
+    def starts(self) -> tuple[int, ...]:
+        """Where each of `FIELDS` begins."""
+        return tuple(self._spans[field.name][0].start for field in FIELDS)
+
     @cached_property
     def size(self) -> int:
         """Length of the vector."""

@@ -26,6 +26,8 @@ class RewardWeights:
 
 
 TERMS = tuple(f.name for f in fields(RewardWeights))
+_UNITS = np.array([1.0, 1.0, 60.0, 1.0, 3600.0])
+"""Of the weights: minutes and watt hours where the simulator counts s and J."""
 
 
 def terms(world: World, before: State, after: State, weights: RewardWeights) -> dict[str, Array]:
@@ -35,11 +37,25 @@ def terms(world: World, before: State, after: State, weights: RewardWeights) -> 
     finished_s = np.where(fresh, after.finished_s, 0.0)
     due_s = np.where(fresh, world.jobs.due_s, 0.0)
     late_min = np.maximum(finished_s - due_s, 0.0) / 60.0
-    raw = {
-        "finished_value": value.sum(axis=1),
-        "tardiness": (value * late_min).sum(axis=1),
-        "above_warning": (after.above_warning_s - before.above_warning_s).sum(axis=1) / 60.0,
-        "faults": (after.faults - before.faults).sum(axis=1).astype(float),
-        "energy": (after.energy_j - before.energy_j).sum(axis=1) / 3600.0,
-    }
-    return {name: getattr(weights, name) * raw[name] for name in TERMS}
+    raw = np.stack(
+        [
+            value.sum(axis=1),
+            (value * late_min).sum(axis=1),
+            (after.above_warning_s - before.above_warning_s).sum(axis=1),
+            (after.faults - before.faults).sum(axis=1),
+            (after.energy_j - before.energy_j).sum(axis=1),
+        ],
+        axis=1,
+    )
+    scaled = scale(raw, np.array([getattr(weights, name) for name in TERMS]))
+    return dict(zip(TERMS, scaled.T, strict=True))
+
+
+def scale(raw: Array, weights: Array) -> Array:
+    """What the terms are worth, [env, term].
+
+    Args:
+        raw: Finished value, that value times its minutes of tardiness, s above warning, faults, J, [env, term].
+        weights: Of the terms, [term].
+    """
+    return raw / _UNITS * weights

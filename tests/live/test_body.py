@@ -52,7 +52,8 @@ def test_it_lives_through_the_same_shift_as_the_simulator(small, data):
     air = 25.0 + 3.0 * np.sin(np.arange(200) / 30.0)[:, None]
     world = replace(world, ambient_c=air)
     shift = parallel_env(
-        lambda seed: Episode(world=world, plant=plant, twins=("t",), rng=np.random.default_rng(0)), keep_events=True
+        lambda seed: Episode(world=world, plant=plant, twins=("t",), sensors=np.random.SeedSequence(0)),
+        keep_events=True,
     )
     body = body_of(arm, limits=limits, air_c=lambda time_s: float(air[int(time_s / DT_S), 0]))
     shift.reset(seed=0)

@@ -1,0 +1,201 @@
+"""Many shifts side by side in arrays, stepped by the compiled kernel: behind the batch and the single env alike."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleet.env.fields import look, turn
+from fleet.env.observation import Layout
+from fleet.env.reward import TERMS, RewardWeights, scale
+from fleet.sim.state import WAITING, State
+from fleet.sim.tables import Drawn, Offer, Rows, Tables, state_of
+from fleet.telemetry import IDLE
+from fleet.thermal import NODES, WINDING
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Shift:
+    """What was drawn for one shift; arrays [job], in the order of release."""
+
+    lot: int
+    """Which fleet of the tables."""
+    air_k: float
+    """By how much its air is warmer than the lot's."""
+    kind: Array
+    release_s: Array
+    due_s: Array
+    repetitions: Array
+    after: Array
+    """int [job, n], −1 for none."""
+    key: int
+    """Of the sensor noise, 64 bits; see `fleet.sim.noise`."""
+
+
+class Engine:
+    """Steps shifts in place; `begin` puts a new shift into a row.
+
+    Args:
+        tables: What does not change.
+        envs: Number of rows.
+        layout: Of the observation.
+        weights: Of the reward terms.
+        jobs: For how many jobs a shift there is room from the beginning; room is made for more.
+    """
+
+    def __init__(self, tables: Tables, envs: int, layout: Layout, weights: RewardWeights, *, jobs: int = 1) -> None:
+        arms, slots = layout.arms, layout.slots
+        self.tables, self.layout = tables, layout
+        self._weights = np.array([getattr(weights, name) for name in TERMS])
+        self._offer = Offer(np.full((envs, slots), -1), np.zeros((envs, arms, slots + 1), np.int8), np.zeros(envs, int))
+        self._all = np.arange(envs)
+        self._raw = np.zeros((envs, len(TERMS)))
+        self._start = np.array(layout.starts)
+        self._low, self._high = layout.bounds
+        self._drawn = _no_jobs(envs, jobs, 1)
+        self._rows = _no_rows(envs, arms, jobs)
+
+    @property
+    def envs(self) -> int:
+        """Number of rows."""
+        return len(self._all)
+
+    @property
+    def mask(self) -> Array:
+        """Legal actions now, int8 [env, arm, slot + 1]; a view that the next step overwrites."""
+        return self._offer.mask
+
+    @property
+    def rows(self) -> Rows:
+        """The state itself, to be looked at only."""
+        return self._rows
+
+    @property
+    def drawn(self) -> Drawn:
+        """The shifts themselves, to be looked at only."""
+        return self._drawn
+
+    def state(self, env: int = 0) -> State:
+        """The state of one env, [1, ...], in arrays of its own."""
+        return state_of(self._rows, env, env + 1)
+
+    def state_of_all(self) -> State:
+        """The state of all envs, in arrays of its own."""
+        return state_of(self._rows, 0, self.envs)
+
+    @property
+    def open(self) -> Array:
+        """Jobs not done, int [env]."""
+        return self._offer.open
+
+    def begin(self, env: int, shift: Shift) -> None:
+        """Put a new shift into a row; `observe` then tells what its arms know."""
+        count = len(shift.kind)
+        waits = shift.after.shape[1] if count else 1
+        if count > self._drawn.kind.shape[1] or waits > self._drawn.after.shape[2]:
+            self._make_room(count, waits)
+        d, s = self._drawn, self._rows
+        d.lot[env], d.air_k[env], d.key[env], d.jobs[env] = shift.lot, shift.air_k, shift.key, count
+        d.kind[env, :count], d.repetitions[env, :count] = shift.kind, shift.repetitions
+        d.release_s[env, :count], d.due_s[env, :count] = shift.release_s, shift.due_s
+        d.after[env] = -1
+        d.after[env, :count, : shift.after.shape[1]] = shift.after
+        for name in _ZERO:
+            getattr(s, name)[env] = 0
+        s.mode[env], s.job[env], s.clear_at_s[env] = IDLE, -1, np.inf
+        s.temp_c[env] = self.tables.start_c[shift.lot] + shift.air_k
+        s.peak_c[env] = s.temp_c[env][:, WINDING].max(axis=-1)
+        s.status[env], s.finished_s[env] = WAITING, np.nan
+        s.queued_s[env] = d.release_s[env]
+        self._offer.open[env] = count
+
+    def observe(self, envs: Array, out: Array) -> None:
+        """What the arms of some envs know at the beginning of a shift, into float32 [env, arm, size]."""
+        look(
+            self.tables, self._drawn, self._rows, self._offer, envs, self._start, self._low, self._high, out,
+        )  # fmt: skip
+
+    def step(self, actions: Array, out: Array) -> tuple[Array, Array]:
+        """One decision interval of every env.
+
+        Args:
+            actions: int64 [env, arm]; anything outside the mask is a wait, and counted.
+            out: Takes what the arms know thereafter, float32 [env, arm, size].
+
+        Returns:
+            Weighted reward terms [env, term], and which envs have done all their jobs, bool [env].
+        """
+        turn(
+            self.tables, self._drawn, self._rows, self._offer, actions, self._raw, self._all,
+            self._start, self._low, self._high, out,
+        )  # fmt: skip
+        return scale(self._raw, self._weights), (self._offer.open == 0) & (self._drawn.jobs > 0)
+
+    def _make_room(self, jobs: int, waits: int) -> None:
+        """For more jobs a shift, a tenth more than asked for, keeping what is there."""
+        jobs = max(self._drawn.kind.shape[1], jobs + jobs // 10)
+        waits = max(self._drawn.after.shape[2], waits)
+        envs, arms = self._rows.mode.shape
+        drawn, rows = _no_jobs(envs, jobs, waits), _no_rows(envs, arms, jobs)
+        for new, old in zip((*drawn, *rows), (*self._drawn, *self._rows), strict=True):
+            new[tuple(slice(0, n) for n in old.shape)] = old
+        self._drawn, self._rows = drawn, rows
+
+
+_ZERO = (
+    "tick", "progress_s", "todo", "last_award", "faults", "illegal", "above_warning_s", "busy_s", "lost_s",
+    "energy_j", "cycles", "returns",
+)  # fmt: skip
+"""What is zero at the beginning of a shift."""
+
+
+def _no_jobs(envs: int, jobs: int, waits: int) -> Drawn:
+    return Drawn(
+        lot=np.zeros(envs, int),
+        air_k=np.zeros(envs),
+        key=np.zeros(envs, np.uint64),
+        jobs=np.zeros(envs, int),
+        kind=np.zeros((envs, jobs), int),
+        release_s=np.full((envs, jobs), np.inf),
+        due_s=np.full((envs, jobs), np.inf),
+        repetitions=np.ones((envs, jobs), int),
+        after=np.full((envs, jobs, waits), -1),
+    )
+
+
+def _no_rows(envs: int, arms: int, jobs: int) -> Rows:
+    per_arm = {
+        name: np.zeros((envs, arms))
+        for name in ("progress_s", "clear_at_s", "peak_c", "above_warning_s", "busy_s", "lost_s", "energy_j")
+    }
+    counts = {name: np.zeros((envs, arms), int) for name in ("mode", "job", "todo", "last_award", "faults", "illegal")}
+    return Rows(
+        tick=np.zeros(envs, int),
+        temp_c=np.zeros((envs, arms, NODES)),
+        **per_arm,
+        **counts,
+        status=np.zeros((envs, jobs), int),
+        queued_s=np.zeros((envs, jobs)),
+        cycles=np.zeros((envs, jobs), int),
+        returns=np.zeros((envs, jobs), int),
+        finished_s=np.zeros((envs, jobs)),
+    )
+
+
+def shifts_of(drawn: Drawn, keys: Sequence[int]) -> list[Shift]:
+    """The shifts of a world as `tables_of` gives it, with the keys of their sensor noise."""
+    return [
+        Shift(
+            lot=int(drawn.lot[e]),
+            air_k=float(drawn.air_k[e]),
+            kind=drawn.kind[e, :count],
+            release_s=drawn.release_s[e, :count],
+            due_s=drawn.due_s[e, :count],
+            repetitions=drawn.repetitions[e, :count],
+            after=drawn.after[e, :count],
+            key=key,
+        )
+        for e, (count, key) in enumerate(zip(drawn.jobs.tolist(), keys, strict=True))
+    ]

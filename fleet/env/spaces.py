@@ -1,0 +1,18 @@
+"""Spaces of one arm, for the single environment and the batch."""
+
+import numpy as np
+from gymnasium import spaces
+
+from fleet.env.observation import Layout
+
+
+def arm_spaces(layout: Layout) -> tuple[spaces.Dict, spaces.Discrete]:
+    """What one arm observes, and what it may answer."""
+    low, high = layout.bounds
+    observation = spaces.Dict(
+        {
+            "observation": spaces.Box(low, high, dtype=np.float32),
+            "action_mask": spaces.Box(0, 1, (layout.slots + 1,), dtype=np.int8),
+        }
+    )
+    return observation, spaces.Discrete(layout.slots + 1)

@@ -1,0 +1,303 @@
+"""One step of many shifts, compiled: what `fleet.sim.kernel` does, env by env and arm by arm, without an event log.
+
+For the plant that follows the plan. `fleet.sim.kernel` is the plain form, and says what is done and why; a test holds
+the two together. A row's result does not depend on how many rows there are.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from fleet.robot import JOINTS
+from fleet.sim.boiling import above_s, braked_heat, crossing_s, hottest, into_modes
+from fleet.sim.jit import inner
+from fleet.sim.kernel import ROUNDING_S
+from fleet.sim.state import DONE, RUNNING, WAITING
+from fleet.sim.tables import Drawn, Offer, Rows, Tables
+from fleet.telemetry import FAULTED, IDLE, WORKING
+from fleet.thermal import NODES
+
+Array = np.ndarray
+
+LARGEST = float(np.finfo(float).max)
+TERMS = 5
+"""Reward terms, in the order of `fleet.env.reward.RewardWeights`: value, tardiness, above warning, faults, energy."""
+
+
+@inner
+def hang_out(t: Tables, d: Drawn, s: Rows, o: Offer, rows: Array) -> None:
+    """The jobs on offer in some envs, oldest in the queue first, and who may claim them.
+
+    Args:
+        rows: Which envs, int [row].
+    """
+    lots, kinds, count, release_s, after = d.lot, d.kind, d.jobs, d.release_s, d.after
+    tick, modes, in_hand, status, queued_s = s.tick, s.mode, s.job, s.status, s.queued_s
+    on_offer, mask = o.on_offer, o.mask
+    stations, plan = t.stations, t.plan
+    arms, slots, waits, places = modes.shape[1], on_offer.shape[1], after.shape[2], stations.shape[2]
+    busy, key = np.empty(t.station_count + 1, np.bool_), np.empty(slots)
+    for e in rows:
+        lot, now_s = lots[e], tick[e] * t.dt_s
+        found = 0
+        for j in range(count[e]):
+            if status[e, j] != WAITING or release_s[e, j] > now_s:
+                continue
+            queued = queued_s[e, j]
+            if found == slots and queued >= key[slots - 1]:
+                continue
+            ready = True
+            for n in range(waits):
+                before = after[e, j, n]
+                if before >= 0 and status[e, before] != DONE:
+                    ready = False
+                    break
+            if not ready:
+                continue
+            place = found if found < slots else slots - 1
+            while place > 0 and key[place - 1] > queued:
+                key[place] = key[place - 1]
+                on_offer[e, place] = on_offer[e, place - 1]
+                place -= 1
+            key[place] = queued
+            on_offer[e, place] = j
+            found = min(found + 1, slots)
+        occupied(lot, e, modes, in_hand, kinds, stations, busy)
+        for a in range(arms):
+            mask[e, a, 0] = 1
+        for k in range(slots):
+            if k >= found:
+                on_offer[e, k] = -1
+                for a in range(arms):
+                    mask[e, a, k + 1] = 0
+                continue
+            kind, free = kinds[e, on_offer[e, k]], True
+            for n in range(places):
+                station = stations[lot, kind, n]
+                if station >= 0 and busy[station]:
+                    free = False
+            for a in range(arms):
+                mask[e, a, k + 1] = free and modes[e, a] == IDLE and plan[lot, a, kind] >= 0
+
+
+@inner
+def occupied(lot: Any, e: int, modes: Array, in_hand: Array, kinds: Array, stations: Array, busy: Array) -> None:
+    """Which stations of an env have an arm at work, bool [station + 1]."""
+    busy[:] = False
+    for a in range(modes.shape[1]):
+        if modes[e, a] == WORKING:
+            for n in range(stations.shape[2]):
+                station = stations[lot, kinds[e, in_hand[e, a]], n]
+                if station >= 0:
+                    busy[station] = True
+
+
+@inner
+def award(t: Tables, d: Drawn, s: Rows, o: Offer, actions: Array) -> None:
+    """Every claimed job to one arm: the lower difficulty wins, then the lower index.
+
+    Args:
+        actions: int [env, arm].
+    """
+    lots, kinds, repetitions = d.lot, d.kind, d.repetitions
+    modes, in_hand, status, last, illegal = s.mode, s.job, s.status, s.last_award, s.illegal
+    progress_s, todo, cycles = s.progress_s, s.todo, s.cycles
+    on_offer, mask, stations, difficulty = o.on_offer, o.mask, t.stations, t.difficulty
+    (envs, arms), slots, places = modes.shape, on_offer.shape[1], stations.shape[2]
+    busy, key, order = np.empty(t.station_count + 1, np.bool_), np.empty(arms), np.empty(arms, np.int64)
+    for e in range(envs):
+        lot, claims = lots[e], 0
+        for a in range(arms):
+            action = actions[e, a]
+            last[e, a] = 0
+            if action == 0:
+                continue
+            if action < 0 or action > slots or mask[e, a, action] == 0:
+                illegal[e, a] += 1
+                continue
+            score = difficulty[lot, a, kinds[e, on_offer[e, action - 1]]]
+            if not score < np.inf:
+                score = LARGEST
+            place = claims
+            while place > 0 and key[place - 1] > score:
+                key[place], order[place] = key[place - 1], order[place - 1]
+                place -= 1
+            key[place], order[place] = score, a
+            claims += 1
+        if claims == 0:
+            continue
+        occupied(lot, e, modes, in_hand, kinds, stations, busy)
+        for rank in range(claims):
+            a = order[rank]
+            j = on_offer[e, actions[e, a] - 1]
+            kind, free = kinds[e, j], status[e, j] == WAITING
+            for n in range(places):
+                station = stations[lot, kind, n]
+                if station >= 0 and busy[station]:
+                    free = False
+            if not free:
+                last[e, a] = -1
+                continue
+            for n in range(places):
+                station = stations[lot, kind, n]
+                if station >= 0:
+                    busy[station] = True
+            last[e, a], status[e, j] = 1, RUNNING
+            modes[e, a], in_hand[e, a], progress_s[e, a] = WORKING, j, 0.0
+            todo[e, a] = repetitions[e, j] - cycles[e, j]
+
+
+@inner
+def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array) -> None:
+    """Every arm through one step: motion, heat, limits, the end of its job.
+
+    Args:
+        raw: Takes the reward terms, not weighted, [env, term].
+    """
+    # The arrays by names of their own: a field of a tuple is counted at every use.
+    lots, airs_k, kinds, repetitions, due_s = d.lot, d.air_k, d.kind, d.repetitions, d.due_s
+    ticks, temp_c, modes, in_hand, progress_s, todo = s.tick, s.temp_c, s.mode, s.job, s.progress_s, s.todo
+    clear_at_s, faults, peak_c, above_warning_s = s.clear_at_s, s.faults, s.peak_c, s.above_warning_s
+    busy_s, lost_s, energy_j, status, queued_s = s.busy_s, s.lost_s, s.energy_j, s.status, s.queued_s
+    cycles, returns, finished_s, left = s.cycles, s.returns, s.finished_s, o.open
+    ambient_c, phi, gamma, to_ambient = t.ambient_c, t.phi, t.gamma, t.to_ambient
+    copper, idle_w, rest_sq, rest_friction_w = t.copper, t.idle_w, t.rest_sq, t.rest_friction_w
+    times_s, current_sq, friction_w, plans, values = t.times_s, t.current_sq, t.friction_w, t.plan, t.value
+    dt_s, alpha_kt, alpha_cu, reference_c = t.dt_s, t.alpha_kt, t.alpha_cu, t.reference_c
+    warning_c, error_c = t.warning_c, t.error_c
+    heat, load, end = np.empty(NODES), np.empty(NODES), np.empty(NODES)
+    envs, arms = modes.shape
+    for e in range(envs):
+        lot, tick = lots[e], ticks[e]
+        now_s, moment = tick * dt_s, min(tick, t.ticks - 1)
+        value = late = above_s = count = energy = 0.0
+        for a in range(arms):
+            mode, j = modes[e, a], in_hand[e, a]
+            plan, spent_s, done_s, home_s = 0, 0.0, np.inf, np.inf
+            first_s = cycle_s = share_0 = share_1 = share_2 = 0.0
+            if mode == WORKING:
+                plan = plans[lot, a, kinds[e, j]]
+                begin_s = progress_s[e, a]
+                until_s = begin_s + dt_s
+                first_s, cycle_s = times_s[plan, 0], times_s[plan, 1]
+                last_s = first_s + cycle_s * todo[e, a]
+                back_s = last_s + times_s[plan, 2]
+                span_0 = max(min(until_s, first_s) - begin_s, 0.0)
+                span_1 = max(min(until_s, last_s) - max(begin_s, first_s), 0.0)
+                span_2 = max(min(until_s, back_s) - max(begin_s, last_s), 0.0)
+                spent_s = span_0 + span_1 + span_2
+                share_0, share_1, share_2 = span_0 / dt_s, span_1 / dt_s, span_2 / dt_s
+                if status[e, j] == RUNNING and last_s - begin_s <= dt_s + ROUNDING_S:
+                    done_s = min(max(last_s - begin_s, 0.0), dt_s)
+                if back_s - begin_s <= dt_s + ROUNDING_S:
+                    home_s = min(max(back_s - begin_s, 0.0), dt_s)
+            rest = 0.0 if mode == FAULTED else (dt_s - spent_s) / dt_s
+            powered = 0.0 if t.power_off and mode == FAULTED else 1.0
+            air_c = ambient_c[lot, moment, a] + airs_k[e]
+            for k in range(JOINTS):
+                amps_sq = share_0 * current_sq[plan, 0, k] + share_1 * current_sq[plan, 1, k]
+                amps_sq += share_2 * current_sq[plan, 2, k] + rest * rest_sq[lot, a, k]
+                rubbed_w = share_0 * friction_w[plan, 0, k] + share_1 * friction_w[plan, 1, k]
+                rubbed_w += share_2 * friction_w[plan, 2, k] + rest * rest_friction_w[lot, a, k]
+                factor = 1.0 + alpha_kt * (temp_c[e, a, JOINTS + k] - reference_c)
+                warmer = 1.0 + alpha_cu * (temp_c[e, a, k] - reference_c)
+                heat[k] = copper[lot, a, k] * warmer * (amps_sq / (factor * factor))
+                heat[JOINTS + k] = rubbed_w + powered * idle_w[lot, a, k]
+            heat_w = 0.0
+            for n in range(NODES):
+                heat_w += heat[n]
+                load[n] = heat[n] + to_ambient[lot, a, n] * air_c
+                end[n] = 0.0
+            for n in range(NODES):
+                from_c, into_w = temp_c[e, a, n], load[n]
+                for m in range(NODES):
+                    end[m] += phi[lot, a, n, m] * from_c + gamma[lot, a, n, m] * into_w
+            first_c, last_c = temp_c[e, a, 0], end[0]
+            for k in range(1, JOINTS):
+                first_c, last_c = max(first_c, temp_c[e, a, k]), max(last_c, end[k])
+            cut_s, here_s, here_j, top_c, cool_s = dt_s, 0.0, heat_w * dt_s, last_c, np.inf
+            if mode != FAULTED and last_c < error_c and (first_c >= warning_c) == (last_c >= warning_c):
+                here_s = dt_s if first_c >= warning_c else 0.0
+            else:
+                cut_s, here_s, here_j, top_c, cool_s = boil(t, lot, a, mode, temp_c[e, a], heat, heat_w, air_c, end)
+            energy_j[e, a] += here_j
+            above_warning_s[e, a] += here_s
+            peak_c[e, a] = max(peak_c[e, a], top_c)
+            busy_s[e, a] += min(spent_s, cut_s)
+            above_s += here_s
+            energy += here_j
+            for n in range(NODES):
+                temp_c[e, a, n] = end[n]
+            if mode == WORKING:
+                if done_s <= cut_s:
+                    status[e, j], cycles[e, j], finished_s[e, j] = DONE, repetitions[e, j], now_s + done_s
+                    left[e] -= 1
+                    worth = values[lot, kinds[e, j]]
+                    value += worth
+                    late += worth * (max(finished_s[e, j] - due_s[e, j], 0.0) / 60.0)
+                progress_s[e, a] += cut_s
+                if home_s <= cut_s:
+                    modes[e, a], in_hand[e, a], progress_s[e, a], todo[e, a] = IDLE, -1, 0.0, 0
+            if mode == FAULTED:
+                lost_s[e, a] += dt_s
+            if cut_s < dt_s:
+                j = in_hand[e, a]
+                if j >= 0 and status[e, j] == RUNNING:
+                    kept = int((progress_s[e, a] - first_s) // cycle_s)
+                    cycles[e, j] += min(max(kept, 0), todo[e, a])
+                    status[e, j], queued_s[e, j] = WAITING, now_s + cut_s
+                    returns[e, j] += 1
+                count += 1.0
+                faults[e, a] += 1
+                lost_s[e, a] += dt_s - cut_s
+                modes[e, a], in_hand[e, a], progress_s[e, a], todo[e, a] = FAULTED, -1, 0.0, 0
+            if modes[e, a] == FAULTED:
+                if clear_at_s[e, a] == np.inf and cool_s < np.inf:
+                    clear_at_s[e, a] = now_s + cool_s + t.clear_s
+                if clear_at_s[e, a] <= (tick + 1) * dt_s:
+                    lost_s[e, a] -= dt_s - (clear_at_s[e, a] - now_s)
+                    modes[e, a], clear_at_s[e, a] = IDLE, np.inf
+        raw[e, 0], raw[e, 1], raw[e, 2], raw[e, 3], raw[e, 4] = value, late, above_s, count, energy
+        ticks[e] += 1
+
+
+@inner
+def boil(
+    t: Tables, lot: int, a: int, mode: int, begin: Array, heat: Array, heat_w: float, air_c: float, end: Array
+) -> tuple[float, float, float, float, float]:
+    """The rare step of an arm that passes a limit or is faulted; `end` becomes what it really ends at.
+
+    Returns:
+        Seconds until a fault stops it (the whole step if none does), seconds above the warning limit, energy in J,
+        the hottest that counts, and the moment from which every motor is below the restart limit (inf if none).
+    """
+    dt_s, now, modal = t.dt_s, np.empty(NODES), np.empty((2, NODES))
+    into_modes(t, lot, a, begin, heat, air_c, modal)
+    faulted, cut_s = mode == FAULTED, dt_s
+    if not faulted and hottest(end) >= t.error_c:
+        cut_s = 0.0
+        if hottest(begin) < t.error_c:
+            cut_s = crossing_s(t, lot, a, modal, dt_s, t.error_c, True, now)
+    last_c = hottest(end)
+    if cut_s == dt_s:
+        above = above_s(t, lot, a, modal, begin, dt_s, now)
+        cool_s = np.inf
+        if faulted and last_c < t.restart_c:
+            cool_s = 0.0
+            if hottest(begin) >= t.restart_c:
+                cool_s = crossing_s(t, lot, a, modal, dt_s, t.restart_c, False, now)
+        return dt_s, above, heat_w * dt_s, last_c, cool_s
+    above = above_s(t, lot, a, modal, begin, cut_s, now)
+    stopped, brakes = now.copy(), np.empty(NODES)
+    braked_heat(t, lot, a, brakes)
+    into_modes(t, lot, a, stopped, brakes, air_c, modal)
+    left_s, peak = dt_s - cut_s, hottest(stopped)
+    above += above_s(t, lot, a, modal, stopped, left_s, now)
+    end[:] = now
+    peak = max(peak, hottest(end))
+    cool_s = np.inf
+    if hottest(end) < t.restart_c:
+        cool_s = cut_s
+        if peak >= t.restart_c:
+            cool_s = cut_s + crossing_s(t, lot, a, modal, left_s, t.restart_c, False, now)
+    return cut_s, above, heat_w * cut_s + brakes.sum() * left_s, peak, cool_s

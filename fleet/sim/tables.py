@@ -1,0 +1,293 @@
+"""The arrays that the compiled kernel reads and writes, by name.
+
+A *lot* is one fleet as it is built: envs of one lot have the same arms. A *kind* is one sort of job: its work and how
+often it is repeated. Every array lies in one piece and belongs to the tuple alone, so that one compilation fits all.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from fleet.difficulty import Risk
+from fleet.robot import JOINTS
+from fleet.sim.state import State, World
+
+Array = np.ndarray
+
+
+class Tables(NamedTuple):
+    """All that does not change from shift to shift; see `World` for the meaning."""
+
+    dt_s: float
+    ticks: int
+    warning_c: float
+    error_c: float
+    restart_c: float
+    clear_s: float
+    power_off: bool
+    alpha_cu: float
+    alpha_kt: float
+    reference_c: float
+    ambient_c: Array
+    """[lot, tick, arm]."""
+    phi: Array
+    """Transposed, [lot, arm, from node, to node], as gamma."""
+    gamma: Array
+    to_ambient: Array
+    """[lot, arm, node]."""
+    root: Array
+    """Square root of the capacities, [lot, arm, node]."""
+    rates: Array
+    """[lot, arm, mode]."""
+    modes: Array
+    """[lot, arm, node, mode]."""
+    copper: Array
+    """[lot, arm, joint], as the following."""
+    idle_w: Array
+    noise_k: Array
+    rest_sq: Array
+    rest_friction_w: Array
+    start_c: Array
+    """[lot, arm, node]."""
+    times_s: Array
+    """[plan, phase]."""
+    current_sq: Array
+    """[plan, phase, joint]."""
+    friction_w: Array
+    plan: Array
+    """Row of the plan tables, −1 for none, int [lot, arm, kind]."""
+    difficulty: Array
+    """[lot, arm, kind], NaN where not known."""
+    p_saturation: Array
+    risk: Array
+    """Row of the risk tables, −1 for none, int [lot, arm, kind]."""
+    offset: Array
+    """[risk, piece]."""
+    weight: Array
+    """[risk, piece, joint]."""
+    curve: Array
+    """[risk, knot, 2]; no knot at all where no risk has any."""
+    stations: Array
+    """int [lot, kind, n], −1 for none."""
+    station_count: int
+    payload_kg: Array
+    """[lot, kind]."""
+    value: Array
+    """[lot, kind]."""
+
+
+class Drawn(NamedTuple):
+    """What was drawn for the shift of each env."""
+
+    lot: Array
+    """int [env]."""
+    air_k: Array
+    """By how much its air is warmer than the lot's, [env]."""
+    key: Array
+    """Of its sensor noise, uint64 [env]."""
+    jobs: Array
+    """Jobs of the shift, int [env]; they are the first of their row."""
+    kind: Array
+    """int [env, job]."""
+    release_s: Array
+    due_s: Array
+    repetitions: Array
+    """int [env, job]."""
+    after: Array
+    """int [env, job, n], −1 for none."""
+
+
+class Rows(NamedTuple):
+    """The arrays of a `State`, in its order, to be written in place."""
+
+    tick: Array
+    temp_c: Array
+    mode: Array
+    job: Array
+    progress_s: Array
+    todo: Array
+    clear_at_s: Array
+    last_award: Array
+    faults: Array
+    illegal: Array
+    peak_c: Array
+    above_warning_s: Array
+    busy_s: Array
+    lost_s: Array
+    energy_j: Array
+    status: Array
+    queued_s: Array
+    cycles: Array
+    returns: Array
+    finished_s: Array
+
+
+class Offer(NamedTuple):
+    """What hangs out to be claimed; see `claims.Board`."""
+
+    on_offer: Array
+    """int [env, slot]."""
+    mask: Array
+    """int8 [env, arm, slot + 1]."""
+    open: Array
+    """Jobs not done, int [env]."""
+
+
+def rows_of(state: State) -> Rows:
+    """The arrays of a state themselves."""
+    return Rows(**vars(state))
+
+
+def state_of(rows: Rows, first: int, last: int) -> State:
+    """A state of some envs, in arrays of its own."""
+    return State(**{name: values[first:last].copy() for name, values in rows._asdict().items()})
+
+
+def tables_of(world: World) -> tuple[Tables, Drawn]:
+    """A world as tables: each env is a lot of its own, and each job a kind."""
+    envs, jobs = world.envs, world.jobs
+    count = jobs.exists.sum(axis=1)
+    if not np.array_equal(jobs.exists, np.arange(jobs.exists.shape[1]) < count[:, None]):
+        raise ValueError("The jobs of an env must be the first of its row.")
+
+    def lots(values: Array) -> Array:
+        return np.repeat(values[None], envs, axis=0)
+
+    limits, motors, offers = world.limits, world.motors, world.offers
+    offset, weight, curve = risk_tables(offers.risks)
+    tables = Tables(
+        dt_s=float(world.dt_s),
+        ticks=int(world.ticks),
+        warning_c=float(limits.warning_c),
+        error_c=float(limits.error_c),
+        restart_c=float(limits.restart_c),
+        clear_s=float(limits.clear_s),
+        power_off=bool(limits.power_off_on_fault),
+        alpha_cu=float(motors.alpha_cu_per_k),
+        alpha_kt=float(motors.alpha_kt_per_k),
+        reference_c=float(motors.reference_c),
+        ambient_c=lots(world.ambient_c),
+        phi=lots(world.phi.swapaxes(-1, -2)),
+        gamma=lots(world.gamma.swapaxes(-1, -2)),
+        to_ambient=lots(world.thermal.to_ambient),
+        root=lots(np.sqrt(world.thermal.capacity)),
+        rates=lots(world.thermal.rates),
+        modes=lots(world.thermal.modes),
+        copper=lots(motors.copper_w_per_a2),
+        idle_w=lots(motors.idle_w),
+        noise_k=lots(motors.sensor_noise_k),
+        rest_sq=lots(world.rest.current_sq),
+        rest_friction_w=lots(world.rest.friction_w),
+        start_c=lots(world.start_c),
+        times_s=world.plans.times_s,
+        current_sq=world.plans.current_sq,
+        friction_w=world.plans.friction_w,
+        plan=offers.plan,
+        difficulty=offers.difficulty,
+        p_saturation=offers.p_saturation,
+        risk=offers.risk,
+        offset=offset,
+        weight=weight,
+        curve=curve,
+        stations=jobs.stations,
+        station_count=len(world.stations),
+        payload_kg=jobs.payload_kg,
+        value=jobs.value,
+    )
+    drawn = Drawn(
+        lot=np.arange(envs),
+        air_k=np.zeros(envs),
+        key=np.zeros(envs, np.uint64),
+        jobs=count,
+        kind=np.repeat(np.arange(jobs.exists.shape[1])[None], envs, axis=0),
+        release_s=jobs.release_s,
+        due_s=jobs.due_s,
+        repetitions=jobs.repetitions,
+        after=jobs.after,
+    )
+    return owned(tables), owned(drawn)
+
+
+def risk_tables(risks: Risk | None) -> tuple[Array, Array, Array]:
+    """Offset, weight and curve of stacked risks, with empty axes for what is not there."""
+    if risks is None:
+        return np.empty((0, 1)), np.empty((0, 1, JOINTS)), np.empty((0, 0, 2))
+    curve = np.empty((len(risks.offset), 0, 2)) if risks.curve is None else risks.curve
+    return risks.offset, risks.weight, curve
+
+
+Arrays = TypeVar("Arrays", Tables, Drawn)
+
+
+def owned(arrays: Arrays) -> Arrays:
+    """The same with every array in one piece, writeable and its own."""
+    return arrays._replace(
+        **{name: np.array(v, order="C") for name, v in arrays._asdict().items() if isinstance(v, np.ndarray)}
+    )
+
+
+def stacked(fleets: Sequence[Tables]) -> Tables:
+    """The tables of several fleets as lots of one.
+
+    Raises:
+        ValueError: they differ in what they share: the length of a step or a shift, limits, arms, or kinds of jobs.
+    """
+    first = fleets[0]
+    for other in fleets[1:]:
+        for name in _SHARED:
+            if getattr(other, name) != getattr(first, name):
+                raise ValueError(
+                    f"Fleets of one batch must agree in {name} ({getattr(first, name)}, {getattr(other, name)})."
+                )
+        for name in ("ambient_c", "plan"):
+            if getattr(other, name).shape != getattr(first, name).shape:
+                raise ValueError(f"Fleets of one batch must have as many arms and kinds of jobs as the first ({name}).")
+    rows = np.cumsum([0, *(len(each.times_s) for each in fleets)])
+    risks = np.cumsum([0, *(len(each.offset) for each in fleets)])
+    pieces = max(each.offset.shape[1] for each in fleets)
+    knots = max(each.curve.shape[1] for each in fleets)
+    places = max(each.stations.shape[2] for each in fleets)
+
+    def shifted(name: str, by: Array) -> Array:
+        each = [getattr(t, name) for t in fleets]
+        return np.concatenate([np.where(v >= 0, v + n, -1) for v, n in zip(each, by, strict=False)])
+
+    joined = {name: np.concatenate([getattr(each, name) for each in fleets]) for name in _JOINED}
+    return owned(
+        first._replace(
+            **joined,
+            plan=shifted("plan", rows),
+            risk=shifted("risk", risks),
+            offset=np.concatenate([_padded(t.offset, 1, pieces, -np.inf) for t in fleets]),
+            weight=np.concatenate([_padded(t.weight, 1, pieces, 0.0) for t in fleets]),
+            curve=np.concatenate([_longer(t.curve, knots) for t in fleets]),
+            stations=np.concatenate([_padded(t.stations, 2, places, -1) for t in fleets]),
+            station_count=max(each.station_count for each in fleets),
+        )
+    )
+
+
+_SHARED = ("dt_s", "ticks", "warning_c", "error_c", "restart_c", "clear_s", "power_off", "alpha_cu", "alpha_kt",
+           "reference_c")  # fmt: skip
+_JOINED = ("ambient_c", "phi", "gamma", "to_ambient", "root", "rates", "modes", "copper", "idle_w", "noise_k",
+           "rest_sq", "rest_friction_w", "start_c", "times_s", "current_sq", "friction_w", "difficulty",
+           "p_saturation", "payload_kg", "value")  # fmt: skip
+
+
+def _padded(values: Array, axis: int, size: int, fill: float) -> Array:
+    width = [(0, 0)] * values.ndim
+    width[axis] = (0, size - values.shape[axis])
+    return np.pad(values, width, constant_values=fill)
+
+
+def _longer(curve: Array, knots: int) -> Array:
+    """Curves [risk, knot, 2] with more knots: constant beyond the last; NaN where there is none at all."""
+    more = knots - curve.shape[1]
+    if not more or not len(curve):
+        return np.zeros((len(curve), knots, 2)) if not len(curve) else curve
+    if not curve.shape[1]:
+        return np.full((len(curve), knots, 2), np.nan)
+    beyond = np.repeat(curve[:, -1:], more, axis=1)
+    beyond[..., 0] = np.where(np.isnan(curve[:, :1, 0]), np.nan, np.inf)
+    return np.concatenate([curve, beyond], axis=1)

@@ -1,0 +1,156 @@
+"""Scenarios for the batched environment: fleets planned and scored once, shifts drawn as arrays."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fleet.env.engine import Shift
+from fleet.env.vector import BatchEnv, Library
+from fleet.errors import ScenarioError
+from fleet.job import Job
+from fleet.sim.noise import key_of
+from fleet.sim.tables import stacked, tables_of
+from scenarios.build import DifficultyName, Fleet, Progress, children, prepare, quiet, world_of
+from scenarios.jobs import JobSource, works_of
+from scenarios.load import load, override
+from scenarios.scenario import Scenario
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Randomisation:
+    """How far the shifts of a batch differ beyond their jobs; each shift draws for itself."""
+
+    ambient_k: tuple[float, float] = (0.0, 0.0)
+    """The air of the cell is warmer by something between these, K."""
+    arrivals: tuple[float, float] = (1.0, 1.0)
+    """Jobs of a stream come so many times as often; a trace stays as it is."""
+    variants: Sequence[Mapping[str, Any]] = ()
+    """Fleets to choose from besides the scenario's own, as overrides of its top-level fields: `arms` with other
+    mounts, wear or cooling, `spread` with another seed. Each is planned and scored once."""
+
+    def __post_init__(self) -> None:
+        for name in ("ambient_k", "arrivals"):
+            low, high = getattr(self, name)
+            if not low <= high:
+                raise ValueError(f"Randomisation.{name} needs low <= high (got {low}, {high}).")
+        if self.arrivals[0] <= 0:
+            raise ValueError(f"Randomisation.arrivals must be > 0 (got {self.arrivals}).")
+
+
+def make_batch(
+    scenario: str | Path | Scenario,
+    num_envs: int,
+    seed: int | Sequence[int] | None = None,
+    *,
+    difficulty: DifficultyName = "twin",
+    randomise: Randomisation | None = None,
+    cache: Path | None = None,
+    max_cycles: int | None = None,
+    autoreset: bool = True,
+    progress: Progress = quiet,
+    **overrides: Any,
+) -> BatchEnv:
+    """The batched environment of a scenario: `num_envs` shifts side by side in one process and one thread.
+
+    Args:
+        scenario, difficulty, cache, overrides: As in `make_env`.
+        seed: Env e begins the shift of `seed + e` (or of `seed[e]`): that of `make_env(…).reset(seed=…)`.
+        randomise: Beyond what a scenario draws: air, arrivals, fleets.
+        max_cycles, autoreset: As in `fleet.env.vector.BatchEnv`.
+
+    Raises:
+        ScenarioError: a variant that is no fleet of the same arms and jobs.
+    """
+    base = scenario if isinstance(scenario, Scenario) else load(scenario)
+    chosen = override(base, **overrides) if overrides else base
+    randomise = randomise or Randomisation()
+    specs = [chosen, *(override(chosen, **variant) for variant in randomise.variants)]
+    fleets = [
+        prepare(
+            spec, difficulty=difficulty, cache=cache, progress=lambda what, s, i=i: progress(what, (i + s) / len(specs))
+        )
+        for i, spec in enumerate(specs)
+    ]
+    library = library_of(fleets, randomise)
+    return BatchEnv(library, num_envs, seed=seed, weights=chosen.reward, max_cycles=max_cycles, autoreset=autoreset)
+
+
+def library_of(fleets: Sequence[Fleet], randomise: Randomisation | None = None) -> Library:
+    """What the shifts of one fleet, or of several with the same arms and jobs, are drawn from.
+
+    Raises:
+        ScenarioError: they are not of the same arms and jobs.
+    """
+    scenario = fleets[0].scenario
+    tables = []
+    for fleet in fleets:
+        other = fleet.scenario
+        for what, one, two in (
+            ("slots", scenario.slots, other.slots),
+            ("jobs", scenario.jobs, other.jobs),
+            ("names of arms", [arm.name for arm in scenario.arms], [arm.name for arm in other.arms]),
+        ):
+            if one != two:
+                raise ScenarioError(f"{other.name}: a variant must keep the {what} of its scenario.")
+        world, _ = world_of(fleet, _kinds(other))
+        tables.append(tables_of(world)[0])
+    try:
+        table = stacked(tables)
+    except ValueError as error:
+        raise ScenarioError(str(error)) from error
+    names = tuple(arm.name for arm in scenario.arms)
+    return Library(names, scenario.slots, table, _Draw(scenario, len(fleets), randomise or Randomisation()))
+
+
+def _kinds(scenario: Scenario) -> list[Job]:
+    """One job of every kind that a scenario's streams can ask for: each work, each number of repetitions."""
+    return [
+        Job(name=f"{stream.name}/{p}/{repetitions}", work=work, repetitions=repetitions, release_s=0.0, due_s=0.0,
+            value=stream.value)
+        for stream in scenario.jobs
+        for p, work in enumerate(works_of(scenario, stream))
+        for repetitions in range(stream.repetitions[0], stream.repetitions[1] + 1)
+    ]  # fmt: skip
+
+
+class _Draw:
+    """Draws the shift of a seed: the same jobs as `ShiftFactory` makes of it, as arrays."""
+
+    def __init__(self, scenario: Scenario, lots: int, randomise: Randomisation) -> None:
+        self._lots, self._randomise = lots, randomise
+        self._wild = lots > 1 or randomise != Randomisation()
+        self._source = JobSource(scenario)
+        streams = scenario.jobs
+        self._lowest = np.array([stream.repetitions[0] for stream in streams])
+        self._counts = np.array([stream.repetitions[1] - stream.repetitions[0] + 1 for stream in streams])
+        works = np.array([len(stream.payload_kg) for stream in streams])
+        self._first = np.cumsum([0, *(works * self._counts)])[:-1]
+        self._due_s = np.array([stream.due_s for stream in streams], dtype=float)
+
+    def __call__(self, seed: np.random.SeedSequence) -> Shift:
+        jobs_seed, sensor_seed = children(seed)
+        lot, air_k, often = self._varied(seed) if self._wild else (0, 0.0, 1.0)
+        drawn = self._source.draw(jobs_seed, often)
+        stream = drawn.stream
+        more = drawn.repetitions - self._lowest[stream]
+        return Shift(
+            lot=lot,
+            air_k=air_k,
+            kind=self._first[stream] + drawn.payload * self._counts[stream] + more,
+            release_s=drawn.release_s,
+            due_s=drawn.release_s + self._due_s[stream],
+            repetitions=drawn.repetitions,
+            after=drawn.after,
+            key=key_of(sensor_seed),
+        )
+
+    def _varied(self, seed: np.random.SeedSequence) -> tuple[int, float, float]:
+        """Fleet, warmer air in K, and how many times as often jobs come."""
+        rng = np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 2)))
+        air_k, often = rng.uniform(*self._randomise.ambient_k), rng.uniform(*self._randomise.arrivals)
+        return int(rng.integers(self._lots)), float(air_k), float(often)
