@@ -8,11 +8,15 @@ run in one process on loopback, taking turns, so that a busy machine slows them 
 """
 
 import argparse
+import multiprocessing
+import os
 import statistics
 import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from multiprocessing.connection import Connection
+from pathlib import Path
 
 import numpy as np
 import zenoh
@@ -21,7 +25,7 @@ from fleet.bus.exchange import Words
 from fleet.bus.memory import MemoryExchange
 from fleet.bus.messages import encode
 from fleet.bus.router import Router, open_client
-from fleet.bus.session import ZenohExchange
+from fleet.bus.session import MOST_SEATS, ZenohExchange
 from fleet.bus.wording import spoken
 
 SLOTS = 8
@@ -50,20 +54,21 @@ class Bare:
 
     def __init__(self, arms: int, resources: ExitStack) -> None:
         endpoint = resources.enter_context(Router()).endpoint
-        self._expected = 2 * arms * (arms - 1)
+        seats = min(arms, MOST_SEATS)
+        self._expected = messages(arms)
         self._came = 0
         self._lock = threading.Lock()
         self._done = threading.Event()
-        sessions = [open_client(endpoint, timeout_s=TIMEOUT_S) for _ in range(arms)]
+        sessions = [open_client(endpoint, timeout_s=TIMEOUT_S) for _ in range(seats)]
         for session in sessions:
             resources.callback(session.close)
-        remote = zenoh.Locality.REMOTE
+        remote = zenoh.Locality.REMOTE if seats == arms else zenoh.Locality.ANY
         count = zenoh.handlers.Callback(self._count, indirect=False)
         for session in sessions:
             session.declare_subscriber("bare/*/*", count, allowed_origin=remote)
         self._publishers = [
-            [session.declare_publisher(f"bare/{i}/{topic}", allowed_destination=remote) for topic in ("a", "b")]
-            for i, session in enumerate(sessions)
+            [sessions[i % seats].declare_publisher(f"bare/{i}/{topic}", allowed_destination=remote) for topic in "ab"]
+            for i in range(arms)
         ]
         for session in sessions:
             await_router(session)
@@ -111,6 +116,11 @@ class PingPong:
         return (time.perf_counter() - start_s) / 2
 
 
+def messages(arms: int) -> int:
+    """Messages that arrive in a tick: two words of every arm, at every session but their own unless arms share it."""
+    return 2 * arms * (arms - 1 if arms <= MOST_SEATS else MOST_SEATS)
+
+
 def await_router(session: zenoh.Session) -> None:
     """Return when the router has taken what the session declared: it answers in order."""
     assert list(session.get("@/*/router", timeout=TIMEOUT_S))
@@ -142,7 +152,43 @@ def measure(arms: int, ticks: int) -> str:
     times = [sorted(1e3 * s for s in column[WARM_UP:]) for column in (zenoh_s, bare_s, memory_s)]
     cells = "".join(f"{statistics.median(column):>9.3f}{column[int(0.95 * len(column))]:>9.3f}" for column in times)
     ratio = statistics.median(times[0]) / statistics.median(times[1])
-    return f"{arms:>5}{2 * arms * (arms - 1):>12}{cells}{ratio:>8.2f}{lost:>6}"
+    return f"{arms:>5}{messages(arms):>12}{cells}{ratio:>8.2f}{lost:>6}"
+
+
+def start(arms: int, pipe: Connection) -> None:
+    """In a process of its own: seconds until the exchange is open and until all have heard all, and MB for it."""
+    rng = np.random.default_rng(0)
+    words = words_at(0, arms, rng)
+    with Router() as router, open_client(router.endpoint, timeout_s=TIMEOUT_S):  # what Zenoh itself takes once
+        before_mb, begun_s = resident_mb(), time.perf_counter()
+        with ZenohExchange(tuple(f"arm_{i}" for i in range(arms)), "start", timeout_s=TIMEOUT_S) as bus:
+            open_s = time.perf_counter() - begun_s
+            bus.share(words)
+            heard_s, late = time.perf_counter() - begun_s, bus.late
+            pipe.send((open_s, heard_s, resident_mb() - before_mb, late))
+
+
+def resident_mb() -> float:
+    """Resident set of this process, MB."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def started(arms: int, times: int) -> str:
+    """One line on how an exchange of so many arms starts, the median of some starts."""
+    spawn = multiprocessing.get_context("spawn")
+    found = []
+    for _ in range(times):
+        here, there = spawn.Pipe()
+        process = spawn.Process(target=start, args=(arms, there))
+        process.start()
+        found.append(here.recv())
+        process.join(TIMEOUT_S)
+    open_s, heard_s, mb, late = (statistics.median(column) for column in zip(*found, strict=True))
+    told = {True: "met", False: "missed"}
+    return (
+        f"{arms} arms from nothing: open after {open_s:.2f} s, all have heard all after {heard_s:.2f} s, {mb:.0f} MB, "
+        f"{late:.0f} late (targets: <= 1 s {told[heard_s <= 1]}, <= 120 MB {told[mb <= 120]})"
+    )
 
 
 def main() -> None:
@@ -150,11 +196,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--arms", type=int, nargs="+", default=[4, 16, 64])
     parser.add_argument("--ticks", type=int, default=200, help="for 4 arms; fewer for more (default 200)")
+    parser.add_argument("--start", type=int, default=256, help="arms of the fleet whose start is timed")
     options = parser.parse_args()
     with ExitStack() as resources:
         ping = PingPong(resources)
         one_way = statistics.median(ping.one_way_s() for _ in range(500))
     print(f"bare Zenoh put → callback through the router, one way, median: {1e3 * one_way:.3f} ms\n")
+    print(started(options.start, 5) + "\n")
     print("ms per tick          share over Zenoh        bare Zenoh     share in memory   Zenoh/")
     print(" arms  deliveries   median      p95   median      p95   median      p95    bare  late")
     for arms in options.arms:

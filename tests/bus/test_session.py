@@ -21,7 +21,7 @@ from fleet.bus.inbox import Inbox
 from fleet.bus.memory import MemoryExchange
 from fleet.bus.messages import DifficultyWord, Info, State, decode, encode, encoding
 from fleet.bus.router import Router, open_client
-from fleet.bus.session import ZenohExchange
+from fleet.bus.session import MOST_SEATS, ZenohExchange
 from fleet.errors import BusError
 
 ARMS = ("arm_0", "arm_1", "arm 2/*@")
@@ -29,13 +29,50 @@ ROOT = Path(__file__).parents[2]
 PATIENT_S = 30.0
 
 
-def test_the_bus_and_the_memory_know_the_same(make_words, assert_same):
+@pytest.mark.parametrize("sessions", [1, 2, 8])
+def test_the_bus_and_the_memory_know_the_same(make_words, assert_same, sessions):
     rng = np.random.default_rng(0)
-    with ZenohExchange(ARMS, "same", timeout_s=PATIENT_S) as bus, MemoryExchange(ARMS) as memory:
+    with ZenohExchange(ARMS, "same", timeout_s=PATIENT_S, sessions=sessions) as bus, MemoryExchange(ARMS) as memory:
         for tick in range(20):
             words = make_words(rng, 3, 10.0 * tick, slots=3 + tick % 3)
             assert_same(bus.share(words), memory.share(words))
         assert (bus.delivered, bus.late, bus.malformed) == (memory.delivered, 0, 0) == (120, 0, 0)
+
+
+def test_a_large_fleet_shares_few_sessions_and_knows_the_same(make_words, assert_same):
+    arms = tuple(f"arm_{i}" for i in range(40))
+    rng = np.random.default_rng(2)
+    with ZenohExchange(arms, "large", timeout_s=PATIENT_S) as bus, MemoryExchange(arms) as memory:
+        with open_client(bus.endpoint, timeout_s=5.0) as session:  # everything that is said goes over the router, too
+            heard = [
+                session.declare_subscriber(keys.of_every_arm("large", "difficulty"), zenoh.handlers.FifoChannel(99))
+            ]
+            assert list(session.get("@/*/router", timeout=5.0))
+            for tick in range(3):
+                words = make_words(rng, 40, 10.0 * tick)
+                assert_same(bus.share(words), memory.share(words))
+            said = [heard[0].recv() for _ in range(2 * 40)]
+        assert len({str(sample.key_expr) for sample in said}) == 40
+        assert (bus.delivered, bus.late, bus.malformed) == (3 * 40 * 39, 0, 0)
+        assert len(bus._seats) == MOST_SEATS
+
+
+def test_arms_that_share_a_session_are_waited_for_alike(make_words, caplog):
+    """One whose words do not come is missed by all others, and by nobody twice."""
+    rng = np.random.default_rng(3)
+    with ZenohExchange(ARMS, "miss", timeout_s=0.2, sessions=2) as bus:
+        bus.share(make_words(rng, 3, 0.0))
+        voice = bus._seats[1]._voices[0]  # of the second arm, alone at its seat
+        voice.say = lambda state, difficulty: None
+        heard = bus.share(make_words(rng, 3, 10.0))
+        assert heard.age_s[:, 1].tolist() == [10.0, 0.0, 10.0]
+        assert bus.late == 2
+    with ZenohExchange(ARMS, "miss", timeout_s=0.2, sessions=1) as bus:
+        bus.share(make_words(rng, 3, 0.0))
+        bus._seats[0]._voices[1].say = lambda state, difficulty: None
+        heard = bus.share(make_words(rng, 3, 10.0))
+        assert heard.age_s[[0, 2], 1].tolist() == [10.0, 10.0]
+        assert bus.late == 2
 
 
 def test_a_new_episode_knows_nothing_of_the_last_but_what_is_said_anew(make_words, assert_same):
@@ -251,7 +288,7 @@ def test_a_process_ends_however_it_leaves_the_exchange(ending):
     program = f"""
 import numpy as np
 from fleet.bus.exchange import Words
-from fleet.bus.session import ZenohExchange
+from fleet.bus.session import MOST_SEATS, ZenohExchange
 bus = ZenohExchange(["a", "b"], "f", timeout_s=30.0)
 one = np.ones((2, 1))
 heard = bus.share(Words(0.0, np.zeros(2, int), one, one[:, 0], ("j",), one, one, ("", "")))

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from fleet.bus.router import Router
-from fleet.bus.session import SILENT_AFTER, ZenohExchange
+from fleet.bus.seat import SILENT_AFTER
+from fleet.bus.session import ZenohExchange
 
 ARMS = ("arm_0", "arm_1", "arm_2")
 PATIENT_S = 30.0
