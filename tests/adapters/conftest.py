@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,6 +13,8 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
 from fleet.env.allocation_v0 import parallel_env
+
+PAGE = Path(__file__).parents[2] / "docs" / "trainers.md"
 
 ELSEWHERE = """
 import hashlib, importlib.util, sys
@@ -90,7 +93,7 @@ class Workshop:
         """What reached its environments."""
         return LOGS[self.name]
 
-    def __call__(self) -> Watched:
+    def __call__(self, *_: Any, **__: Any) -> Watched:
         return Watched(parallel_env(self.shifts), self.name)
 
 
@@ -123,3 +126,20 @@ def elsewhere(small) -> Callable[[str, int], str]:
         return told[0]
 
     return train
+
+
+@pytest.fixture
+def example(small_workshop, monkeypatch, tmp_path) -> Callable[[str], dict[str, Any]]:
+    """Runs a trainer's example of docs/trainers.md on a small shift; gives its variables, and the `log`."""
+
+    def run(trainer: str) -> dict[str, Any]:
+        _, _, section = PAGE.read_text(encoding="utf-8").partition(f"## {trainer}\n")
+        code = section.split("```python\n")[1].split("```")[0]
+        workshop = small_workshop()
+        monkeypatch.setattr("scenarios.make_env", workshop, raising=False)
+        monkeypatch.chdir(tmp_path)
+        told: dict[str, Any] = {}
+        exec(code, told)
+        return told | {"log": workshop.log}
+
+    return run

@@ -121,3 +121,10 @@ def test_another_kind_of_mask_is_refused(small_workshop) -> None:
 
     with pytest.raises(ValueError, match=r"masks must be 'list' \(for IPPO\) or 'array'"):
         AgileRLEnv(small_workshop()(), masks="tuple")
+
+
+def test_the_example_of_the_page_runs(example) -> None:
+    told = example("AgileRL")
+    assert set(told["actions"]) == {"arm_0", "arm_1", "arm_2"}
+    for arm, claim in told["actions"].items():
+        assert told["infos"][arm]["action_mask"][int(claim[0])] == 1

@@ -114,3 +114,9 @@ def test_a_rollout_is_the_episode_of_the_environment(small_workshop, shift) -> N
         assert (terminated["arm_0"], truncated["arm_0"]) == (last and finished, last and not finished)
     assert plain.agents == []
     env.close()
+
+
+def test_the_example_of_the_page_runs(example) -> None:
+    log = example("BenchMARL")["log"]
+    assert log.steps == 600
+    assert log.illegal == 0

@@ -127,3 +127,10 @@ def test_the_last_observation_comes_with_the_end(small_workshop) -> None:
     assert (terminated, truncated, env.agents) == ({"__all__": False}, {"__all__": True}, [])
     assert env.render() is None
     env.close()
+
+
+def test_the_example_of_the_page_runs(example) -> None:
+    told = example("RLlib")
+    assert told["log"].steps >= 600
+    assert told["log"].illegal == 0
+    told["algo"].stop()

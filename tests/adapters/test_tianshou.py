@@ -126,3 +126,8 @@ def test_rewards_of_a_turn_are_not_written_on(small_workshop) -> None:
     for _ in range(20):
         env.step(0)
     np.testing.assert_array_equal(first, kept)
+
+
+def test_the_example_of_the_page_runs(example) -> None:
+    seen = example("Tianshou")["seen"]
+    assert (seen["agent_id"], seen["mask"][0]) == ("arm_0", True)
