@@ -40,7 +40,7 @@ lint: $(STAMP)
 	@$(BIN)/pyright
 
 chaos: $(STAMP)
-	@$(BIN)/python benchmarks/chaos.py
+	@$(BIN)/python benchmarks/chaos
 
 bench: $(STAMP)
 	@for b in benchmarks/bench_*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done

@@ -1,12 +1,14 @@
-"""A short part of the campaign of benchmarks/chaos.py: real processes, real signals, and every job done once."""
+"""A short part of the campaign of benchmarks/chaos: real processes, real signals, and every job done once."""
 
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-CAMPAIGN = Path(__file__).parents[2] / "benchmarks" / "chaos.py"
+CAMPAIGN = Path(__file__).parents[2] / "benchmarks" / "chaos"
 
 
 def strike(*faults, jobs):
@@ -26,7 +28,23 @@ def test_a_fleet_survives_the_death_of_its_auctioneer():
     assert row[1:3] == ["8", "8"]  # all of them, and none twice, says the exit code
 
 
+def test_a_fleet_with_certificates_lets_no_trespasser_in():
+    told = strike("trespass", jobs=12)
+    assert told.returncode == 0, told.stdout + told.stderr
+    tried, opened = map(int, re.search(r"(\d+) ways in tried, (\d+) open", told.stdout).groups())
+    assert tried >= 30
+    assert opened == 0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("cc") is None, reason="a clock that jumps needs a C compiler")
+def test_a_jump_of_the_wall_clock_harms_nothing():
+    told = strike("clock-jump", jobs=12)
+    assert told.returncode == 0, told.stdout + told.stderr
+
+
 @pytest.mark.slow
 def test_a_fleet_survives_every_fault():
-    told = strike("kill-arm", "stop-arm", "kill-router", "stuck-subscriber", "full-disk", "rubbish", jobs=24)
+    processes = ("kill-arm", "stop-arm", "kill-router", "stuck-subscriber", "full-disk", "partition")
+    told = strike(*processes, "rubbish", "replayed-awards", jobs=24)
     assert told.returncode == 0, told.stdout + told.stderr

@@ -1,5 +1,8 @@
 """The fleet's time: monotone whatever it is corrected by, and right within half a round trip."""
 
+import ast
+from pathlib import Path
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -9,6 +12,7 @@ from fleet.live.clock import SLEW, FleetClock
 speed = st.floats(0.1, 1000.0)
 moment = st.floats(0.0, 1e6)
 span = st.floats(0.0, 1e4)
+ROOT = Path(__file__).parents[2]
 corrections = st.lists(st.tuples(span, st.floats(0.0, 5.0), st.floats(0.0, 1e7)), max_size=8)
 
 
@@ -69,3 +73,22 @@ def test_a_speed_must_be_a_positive_number(speed):
 def test_an_answer_before_its_question_is_refused():
     with pytest.raises(ValueError, match="after its question"):
         FleetClock(1.0).corrected(2.0, 1.0, 0.0)
+
+
+WALL = {("time", "time"), ("time", "time_ns"), ("datetime", "now"), ("datetime", "utcnow"), ("date", "today")}
+OF_THE_DAY = {"certificates.py": "validity", "security.py": "validity", "ros2.py": "stamps of ROS messages"}
+
+
+@pytest.mark.parametrize(
+    "path",
+    [*(ROOT / "fleet" / "live").glob("*.py"), *(ROOT / "fleet" / "bus").glob("*.py")],
+    ids=lambda path: path.name,
+)
+def test_no_participant_goes_by_the_wall_clock(path):
+    """A jump of it then harms nothing; benchmarks/chaos shows it on a fleet of processes."""
+    read = {
+        (node.value.id, node.attr)
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)
+    }
+    assert not read & WALL or path.name in OF_THE_DAY

@@ -1,0 +1,93 @@
+"""Faults against a whole fleet, each participant a process: what is lost or done twice, and how soon it recovers.
+
+    python benchmarks/chaos [--only NAME,NAME] [--jobs 24] [--speed 120] [--keep DIR]
+
+For every fault a fleet of four arms is started anew (router, auctioneer, recorder, arms, on loopback; `trespass` with
+TLS), gets jobs, and while they are worked on the fault strikes. Then all jobs must come to an end: finished once, or
+reported unfinished. Whether a job was done twice is read from the journals of the arms, not asked of the auctioneer.
+Detected: real seconds until the bus shows that something is wrong (a token gone, a state older than 3 s). Recovered:
+until everybody is there and speaks again and the auctioneer answers; it counts the fault itself, where that takes time.
+Exit code 1 if a job is lost or done twice, a process has died that nobody killed, somebody did what it may not, or a
+clock was thrown off. Bounded: at most `PATIENCE_S` for each part of a fault.
+"""
+
+import argparse
+import logging
+import math
+import sys
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+
+from campaign import SCENARIO, campaign
+from partition import partition
+from processes import full_disk, kill_arm, kill_auctioneer, kill_router, stop_arm, stuck_subscriber
+from rubbish import replayed_awards, rubbish
+from struck import Fault
+from trespass import trespass
+from wall_clock import clock_jump
+
+from scenarios.build import prepare
+from scenarios.load import load
+
+FAULTS = {
+    "kill-arm": Fault(kill_arm),
+    "stop-arm": Fault(stop_arm),
+    "kill-auctioneer": Fault(kill_auctioneer),
+    "kill-router": Fault(kill_router),
+    "stuck-subscriber": Fault(stuck_subscriber),
+    "full-disk": Fault(full_disk),
+    "rubbish": Fault(rubbish),
+    "replayed-awards": Fault(replayed_awards),
+    "trespass": Fault(trespass, tls=True),
+    "partition": Fault(partition, line=True),
+    "clock-jump": Fault(clock_jump, clocks=True),
+}
+
+
+def main() -> None:
+    """Strike with every fault and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default=",".join(FAULTS), help="some faults, comma-separated")
+    parser.add_argument("--jobs", type=int, default=24)
+    parser.add_argument("--speed", type=float, default=120.0, help="fleet seconds per real second")
+    parser.add_argument("--keep", type=Path, help="folder in which journals, logs and recordings stay")
+    arguments = parser.parse_args()
+    chosen = arguments.only.split(",")
+    if unknown := [name for name in chosen if name not in FAULTS]:
+        parser.error(f"no fault '{unknown[0]}'; there are {', '.join(FAULTS)}")
+    logging.basicConfig(level=logging.ERROR)
+    prepare(load(SCENARIO), difficulty="blind")  # once, so that no arm has to plan while it is struck
+    columns = ("fault", "jobs", "finished", "unfinished", "lost", "twice", "died", "detected s", "recovered s", "all s")
+    widths = (18, 5, 9, 11, 5, 6, 5, 11, 12, 7)
+    print("".join(f"{name:>{width}}" for name, width in zip(columns, widths, strict=True)), flush=True)
+    good = True
+    for name in chosen:
+        with ExitStack() as stack:
+            folder = arguments.keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            found = campaign(FAULTS[name], folder / name, jobs=arguments.jobs, speed=arguments.speed)
+        good = good and found.good
+        numbers = (
+            len(found.lost),
+            len(found.twice),
+            len(found.died),
+            found.detected_s,
+            found.recovered_s,
+            found.took_s,
+        )
+        cells = (name, arguments.jobs, found.finished, found.unfinished, *numbers)
+        print("".join(f"{_text(cell):>{width}}" for cell, width in zip(cells, widths, strict=True)), flush=True)
+        for what in ("lost", "twice", "died", "wrong", "notes"):
+            if names := getattr(found, what):
+                print(f"    {what}: {', '.join(names)}", flush=True)
+    sys.exit(0 if good else 1)
+
+
+def _text(value: object) -> str:
+    if isinstance(value, float):
+        return "-" if math.isnan(value) else "never" if math.isinf(value) else f"{value:.1f}"
+    return str(value)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,94 @@
+"""A stranger on plain TCP that says what nobody should: rubbish on every key, and awards that were made before."""
+
+import json
+import math
+import random
+
+import msgspec
+from struck import Fleet
+
+from fleet.bus import keys
+from fleet.bus.messages import State, encode, encoding
+from fleet.bus.trade import Award, LeaseRequest, QuoteRequest, Report, Submission
+
+RUBBISH = 100_000
+
+
+def rubbish(fleet: Fleet) -> float:
+    """100 000 malformed, oversized and adversarial messages, on every key there is."""
+    rng = random.Random(0)
+    of_fleet, session = fleet.link.fleet, fleet.session
+    said = [str(key) for key in _every_key(of_fleet, fleet.arms)]
+    kinds = [encoding(kind) for kind in (State, Award, QuoteRequest, LeaseRequest, Report, Submission)]
+    bodies = [
+        b"",
+        b"{",
+        b"null",
+        b"[]",
+        b"\xff\xfe\x00",
+        b'{"arm":"arm_0"}',
+        b'{"arm":1e999}',
+        b"{" * 2000,
+        b'{"arm":"arm_0","tick":-1}',
+        b'"' + b"x" * 9000 + b'"',
+        b"[" * 30000,
+        b"x" * 70_000,
+        json.dumps(
+            {
+                "arm": "arm_0",
+                "tick": 10**18,
+                "time_s": 1e300,
+                "mode": "idle",
+                "temp_c": [1e308] * 7,
+                "headroom_k": -1e308,
+            }
+        ).encode(),
+    ]
+    for number in range(RUBBISH):
+        key, body, kind = rng.choice(said), rng.choice(bodies), rng.choice(kinds)
+        if number % 50 == 0:
+            session.get(key, lambda _reply: None, payload=body, encoding=kind, timeout=1.0)
+        else:
+            session.put(key, body, encoding=kind)
+        if number % 500 == 0:
+            fleet.supervisor.look()
+            fleet.link.serve()
+    return math.nan
+
+
+def replayed_awards(fleet: Fleet) -> float:
+    """Awards that were made before are sent again, by somebody else."""
+    arm = fleet.arms[0]
+    for award in awards_of(fleet, arm) * 50:
+        fleet.session.get(
+            keys.of_arm(fleet.link.fleet, arm, "award"),
+            lambda _reply: None,
+            payload=encode(award),
+            encoding=encoding(Award),
+            timeout=2.0,
+        )
+        fleet.supervisor.look()
+        fleet.link.serve()
+    return math.nan
+
+
+def awards_of(fleet: Fleet, arm: str) -> list[Award]:
+    """What an arm has been awarded so far, by its journal."""
+    path = fleet.folder / "journals" / f"{arm}.journal"
+    lines = [json.loads(line)["records"] for line in path.read_bytes().splitlines() if line.endswith(b"}")]
+    return [
+        msgspec.convert(record["award"], Award)
+        for records in lines
+        for record in records
+        if record["type"] == "accepted"
+    ]
+
+
+def _every_key(fleet: str, arms: tuple[str, ...]) -> list[keys.Key]:
+    named = [keys.Key(fleet, "arm", arm, topic) for arm in (*arms, "nobody") for topic in keys.TOPICS["arm"]]
+    auction = [
+        keys.Key(fleet, "auction", "auctioneer", topic, arms[0] if topic in keys.ASKED else "")
+        for topic in keys.TOPICS["auction"]
+    ]
+    rest = [keys.Key(fleet, role, "", topic) for role in keys.NAMELESS for topic in keys.TOPICS[role]]
+    return [*named, *auction, *rest]
