@@ -4,7 +4,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
@@ -13,18 +13,13 @@ from fleet.bus.exchange import Exchange
 from fleet.bus.memory import MemoryExchange
 from fleet.cache import cache_folder
 from fleet.difficulty import Blind, DifficultyModel
-from fleet.env.allocation_v0 import AllocationEnv, MaskPlace, parallel_env
-from fleet.env.episode import Episode
 from fleet.errors import FleetError, InfeasibleJob, ScenarioError, nearest
 from fleet.job import Job, Work
 from fleet.motion import Plan
 from fleet.motor import Motors, gen3_motors, thermal_data
 from fleet.robot import Robot
 from fleet.sim.kernel import Plant
-from fleet.sim.models import ArmModel
-from fleet.sim.mujoco_plant import MujocoPlant
-from fleet.sim.oracle import Oracle
-from fleet.sim.planner import Planner
+from fleet.sim.known_plans import KnownPlans, rest_torque
 from fleet.sim.plants import ProfilePlant
 from fleet.sim.state import World
 from fleet.sim.world import Arm, build_world, warm_start
@@ -33,6 +28,10 @@ from scenarios.cell import cell_of
 from scenarios.jobs import all_works, draw_jobs, rehearsal_works, works_of
 from scenarios.load import load, override
 from scenarios.scenario import Scenario
+
+if TYPE_CHECKING:  # an arm alone needs neither an environment nor the physics
+    from fleet.env.allocation_v0 import AllocationEnv, MaskPlace
+    from fleet.env.episode import Episode
 
 log = logging.getLogger(__name__)
 
@@ -146,7 +145,7 @@ def _arms(
         models = [Blind()] * len(bodies)
     arms = []
     for (robot, motors, thermal), model, own in zip(bodies, models, work, strict=True):
-        rest_tau = ArmModel(robot).gravity_torque(robot.home_q())
+        rest_tau = rest_torque(robot, folder / "plans")
         arm = Arm(robot=robot, motors=motors, thermal=thermal, rest_tau=rest_tau, model=model, plans=own)
         arms.append(_with_oracle(scenario, arm) if difficulty == "oracle" else arm)
     return arms, refused
@@ -179,10 +178,10 @@ def plan_works(
     return possible, refused
 
 
-def planner_of(robot: Robot, scenario: Scenario, folder: Path) -> Planner:
+def planner_of(robot: Robot, scenario: Scenario, folder: Path) -> KnownPlans:
     """What plans for one arm as the scenario wants it, with its plans cached in `folder`."""
     spec = scenario.planning
-    return Planner(robot, elbows=spec.elbows, speeds=spec.speeds, cache_dir=folder / "plans")
+    return KnownPlans(robot, elbows=spec.elbows, speeds=spec.speeds, cache_dir=folder / "plans")
 
 
 TOLD = 4
@@ -207,6 +206,8 @@ def _check_feasible(
 
 
 def _with_oracle(scenario: Scenario, arm: Arm) -> Arm:
+    from fleet.sim.oracle import Oracle
+
     air = float(np.mean(scenario.ambient.at(np.linspace(0, scenario.horizon_s, 100)))) + arm.robot.ambient_offset_k
     model = Oracle(arm.motors, arm.thermal, warm_start(arm, air), air, scenario.limits.warning_c)
     return replace(arm, model=model)
@@ -242,14 +243,18 @@ class ShiftFactory:
     fleet: Fleet
     plant: PlantName = "profile"
 
-    def __call__(self, seed: np.random.SeedSequence) -> Episode:
+    def __call__(self, seed: np.random.SeedSequence) -> "Episode":
         """Draw the jobs and lay out the world; the same seed gives the same episode."""
+        from fleet.env.episode import Episode
+
         scenario, arms = self.fleet.scenario, self.fleet.arms
         jobs_seed, sensor_seed = children(seed)
         world, plans = world_of(self.fleet, draw_jobs(scenario, jobs_seed))
         robots, rest_tau = [arm.robot for arm in arms], np.stack([arm.rest_tau for arm in arms])
         plant: Plant
         if self.plant == "mujoco":
+            from fleet.sim.mujoco_plant import MujocoPlant
+
             plant = MujocoPlant(robots, plans, rest_tau, scenario.places)
         else:
             plant = ProfilePlant(plans, np.stack([robot.home_q() for robot in robots]), rest_tau)
@@ -294,10 +299,10 @@ def make_env(
     cache: Path | None = None,
     max_cycles: int | None = None,
     render_mode: str | None = None,
-    mask_in: MaskPlace = "obs",
+    mask_in: "MaskPlace" = "obs",
     progress: Progress = quiet,
     **overrides: Any,
-) -> AllocationEnv:
+) -> "AllocationEnv":
     """The PettingZoo `ParallelEnv` of a scenario.
 
     Args:
@@ -325,8 +330,10 @@ def env_of(
     endpoint: str | None = None,
     channel: Channel = PERFECT,
     **options: Any,
-) -> AllocationEnv:
+) -> "AllocationEnv":
     """The `ParallelEnv` of a fleet that is ready; arguments as in `open_exchange`, options as in `AllocationEnv`."""
+    from fleet.env.allocation_v0 import parallel_env
+
     choose("plant", plant, PlantName)
     names = tuple(arm.robot.name for arm in fleet.arms)
     exchange = open_exchange(bus, names, fleet.scenario.name, endpoint, channel)

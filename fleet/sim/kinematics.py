@@ -21,9 +21,6 @@ HAND_M = 0.167455
 """Joint 6 to the flange."""
 REACH_M = UPPER_ARM_M + FOREARM_M + HAND_M
 """Shoulder to flange, outstretched: 0.902 m in Kinova's user guide."""
-ELBOW_ANGLES_DEG = (0.0, 60.0, -60.0, 120.0, -120.0, 180.0, 30.0, -30.0, 90.0, -90.0, 150.0, -150.0)
-"""Turns of the elbow about the line from shoulder to wrist, in the order in which they are tried; 0 is
-furthest out along the base axis."""
 
 POSITION_TOLERANCE_M = 1e-3
 ANGLE_TOLERANCE_RAD = np.deg2rad(0.5)

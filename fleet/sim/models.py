@@ -4,7 +4,6 @@
 # pyright: reportAttributeAccessIssue=false
 
 from collections.abc import Sequence
-from importlib import resources
 from itertools import combinations
 
 import mujoco
@@ -12,18 +11,13 @@ import numpy as np
 
 from fleet.job import Place
 from fleet.robot import GEN3, JOINTS, Robot, rotation
+from fleet.sim.description import GRAVITY_M_S2, gen3_xml
 from fleet.sim.meshes import use_meshes
 
 Array = np.ndarray
 
-GRAVITY_M_S2 = 9.81
 SAME_PLACE_M = 0.01
 """Bases closer than this stand in one place."""
-
-
-def gen3_xml() -> bytes:
-    """The project's MJCF of one Gen3."""
-    return resources.files("fleet").joinpath("sim/assets/gen3.xml").read_bytes()
 
 
 def build_cell(

@@ -15,9 +15,8 @@ from fleet.errors import InfeasibleJob
 from fleet.job import Work
 from fleet.motion import RATE_HZ, Phase, Plan
 from fleet.robot import GEN3, Robot
+from fleet.sim.description import ELBOW_ANGLES_DEG, GRAVITY_M_S2, gen3_xml
 from fleet.sim.itinerary import GRASP_S
-from fleet.sim.kinematics import ELBOW_ANGLES_DEG
-from fleet.sim.models import GRAVITY_M_S2, gen3_xml
 
 Array = np.ndarray
 log = logging.getLogger(__name__)
@@ -38,20 +37,42 @@ class PlanCache:
         """Hash of everything that shapes a plan; the arm's name and its heat do not."""
         content = {
             "planner": PLANNER_VERSION,
-            "model": self._model_hash,
-            "gravity": GRAVITY_M_S2,
             "rate_hz": RATE_HZ,
             "limits": asdict(GEN3),
-            "mount": asdict(robot.mount),
-            "home": robot.home_q().tolist(),
-            "tool_kg": robot.tool_kg,
+            **self._arm(robot),
             "work": asdict(work),
             "grasp_s": GRASP_S,
             "elbow_angles_deg": ELBOW_ANGLES_DEG,
             "elbows": elbows,
             "speeds": speeds,
         }
-        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32]
+        return _hash(content)
+
+    def rest_key(self, robot: Robot) -> str:
+        """Hash of everything that shapes the torque which holds an arm at home."""
+        return _hash({"what": "torque at home", **self._arm(robot)})
+
+    def load_rest(self, key: str) -> Array | None:
+        """The torque that holds the arm at home as it was stored, N·m, [joint]; None if it was not."""
+        try:
+            with self._path(key).open("rb") as file, np.load(file, allow_pickle=False) as stored:
+                return stored["rest_tau"]
+        except _BROKEN_FILE:
+            return None
+
+    def store_rest(self, key: str, rest_tau: Array) -> None:
+        """Keep it."""
+        self._write(key, rest_tau=rest_tau)
+
+    def _arm(self, robot: Robot) -> dict[str, object]:
+        """What shapes the torques of an arm."""
+        return {
+            "model": self._model_hash,
+            "gravity": GRAVITY_M_S2,
+            "mount": asdict(robot.mount),
+            "home": robot.home_q().tolist(),
+            "tool_kg": robot.tool_kg,
+        }
 
     def load(self, key: str, arm: str, work: Work) -> tuple[Plan, ...] | InfeasibleJob | None:
         """What was stored, made out to this arm and work; None if nothing was, or if the file is broken."""
@@ -98,6 +119,10 @@ class PlanCache:
         except BaseException:
             Path(temporary).unlink(missing_ok=True)
             raise
+
+
+def _hash(content: dict[str, object]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32]
 
 
 def _unpack(

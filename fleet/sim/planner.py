@@ -10,8 +10,9 @@ from fleet.job import Place, Work
 from fleet.motion import Phase, Plan
 from fleet.robot import Robot, rotation
 from fleet.sim.clearance import CLEARANCE_STEP_RAD, Clearance
+from fleet.sim.description import ELBOW_ANGLES_DEG
 from fleet.sim.itinerary import Itinerary, Leg, Stop, itinerary
-from fleet.sim.kinematics import ELBOW_ANGLES_DEG, InverseKinematics, Pose, Unreachable
+from fleet.sim.kinematics import InverseKinematics, Pose, Unreachable
 from fleet.sim.limits import broken_limit
 from fleet.sim.models import ArmModel
 from fleet.sim.plan_cache import PlanCache

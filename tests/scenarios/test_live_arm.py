@@ -18,6 +18,8 @@ from fleet.bus.messages import Info, State
 from fleet.bus.router import Router
 from fleet.bus.trade import JobWord, Quote, QuoteRequest
 from fleet.errors import FleetError, LogError
+from fleet.sim.known_plans import rest_torque
+from fleet.sim.models import ArmModel
 from scenarios.build import prepare, prepare_arm, quiet
 from scenarios.live_arm import air_of, replayed, simulated
 from scenarios.load import load
@@ -210,3 +212,31 @@ def test_the_air_is_that_of_the_scenario_at_any_time(points):
     scenario = replace(load("quickstart"), ambient=Ambient(points=points))
     for time_s in (-1.0, 0.0, 150.0, 600.0, 1e6):
         assert air_of(scenario)(time_s) == np.interp(time_s, *zip(*points, strict=True))
+
+
+def test_a_blind_arm_whose_plans_are_known_loads_no_physics(tmp_path):
+    """64 of them on one machine would each take 50 MB more."""
+    prepare(load("quickstart"), difficulty="blind", cache=tmp_path)
+    program = f"""
+import sys
+from pathlib import Path
+from scenarios.build import quiet
+from scenarios.live_arm import simulated
+from scenarios.load import load
+made = simulated(load("quickstart"), "arm_0", "blind", 0, quiet, Path({str(tmp_path)!r}))
+made.body(0.0, 0.1).advance(1.0)
+print(*sys.modules)
+"""
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
+    heavy = {"mujoco", "mink", "ruckig", "scipy", "torch", "pettingzoo", "gymnasium", "numba", "pyarrow", "plotly"}
+    assert set(said.stdout.split()) & heavy == set()
+
+
+def test_what_an_arm_needs_to_stand_at_home_is_the_same_from_the_cache(tmp_path):
+    fresh, kept = (prepare_arm(load("quickstart"), "arm_2", difficulty="blind", cache=tmp_path) for _ in range(2))
+    assert fresh.rest_tau.tolist() == kept.rest_tau.tolist()
+    assert fresh.rest_tau.tolist() == ArmModel(fresh.robot).gravity_torque(fresh.robot.home_q()).tolist()
+    tilted = replace(fresh.robot, mount=replace(fresh.robot.mount, tilt_deg=(30.0, 0.0, 0.0)))
+    heavier = replace(fresh.robot, tool_kg=fresh.robot.tool_kg + 1.0)
+    for other in (tilted, heavier):
+        assert rest_torque(other, tmp_path / "plans").tolist() != fresh.rest_tau.tolist()

@@ -14,8 +14,9 @@ from fleet.job import Job, Place, Work
 from fleet.motion import RATE_HZ, Phase, Plan
 from fleet.motor import gen3_motors
 from fleet.robot import GEN3, Mount, Robot, ThermalLimits
+from fleet.sim.description import gen3_xml
 from fleet.sim.kernel import step
-from fleet.sim.models import ArmModel, build_cell, gen3_xml
+from fleet.sim.models import ArmModel, build_cell
 from fleet.sim.mujoco_plant import STRIDE, TIMESTEP_S, MujocoPlant, load_hands
 from fleet.sim.planner import Planner
 from fleet.sim.plants import ProfilePlant, row, sample
