@@ -1,0 +1,247 @@
+"""What an arm's process costs: 64 of them at work, ten state words a second each, beside a bare Zenoh publisher.
+
+    python benchmarks/bench_fleet.py [--arms 64] [--seconds 20] [--rate 10] [--speed 1]
+
+Every arm is `thermofleet arm`, a process of its own, blind, in a cell of its own; all meet at one router. This process
+deals: it gives each arm one long pick-and-place job and renews its lease, so the body moves and gets warm. It also
+listens: every word is checked, and the ticks that came are counted against those that were said. Beside them in the
+same run: one process that puts as many bytes as often, by Zenoh alone.
+
+Processor time is that of the kernel's books over the window (/proc/PID/stat, user and system, all threads). PSS counts
+a page that n processes share 1/n to each, so the sum over the arms is what they really take.
+"""
+
+import argparse
+import os
+import signal
+import statistics
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from contextlib import ExitStack
+from itertools import pairwise
+from pathlib import Path
+
+from fleet.bus import keys
+from fleet.bus.link import Answers, Link
+from fleet.bus.messages import State, encode
+from fleet.bus.trade import (
+    Ack,
+    Award,
+    Clock,
+    ClockRequest,
+    JobWord,
+    Lease,
+    LeaseRequest,
+    Quote,
+    QuoteRequest,
+    Receipt,
+    Report,
+)
+from fleet.live.supervisor import Part, Supervisor
+from scenarios.build import prepare
+from scenarios.live_up import PROGRAM, free_port
+from scenarios.load import load
+
+FLEET, DEALER = "bench", "dealer"
+TARGET = 0.04
+"""Of a core, each arm."""
+START_S, SETTLE_S, FAREWELL_S = 300.0, 5.0, 10.0
+LEASE_S = 6.0
+JOINTS = 7
+CELL = """
+description = "One arm and its tray."
+horizon_s = 3600
+[[arms]]
+name = "{arm}"
+[[places]]
+name = "tray"
+position_m = [0.45, 0.2, 0.15]
+[[places]]
+name = "belt"
+position_m = [0.45, -0.2, 0.15]
+[[jobs]]
+name = "load"
+kind = "pick_place"
+places = ["belt", "tray"]
+payload_kg = [0.5]
+arrivals = {{ kind = "batch", count = 1 }}
+"""
+BARE = """
+import sys, threading, zenoh
+endpoint, size, rate = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
+config = '{"mode": "client", "connect": {"endpoints": ["%s"]}, "scouting": {"multicast": {"enabled": false}}}'
+with zenoh.open(zenoh.Config.from_json5(config % endpoint)) as session:
+    publisher = session.declare_publisher("bare/state")
+    print("ready", flush=True)
+    payload, pause = b"x" * size, threading.Event()
+    while True:
+        pause.wait(1 / rate)
+        publisher.put(payload)
+"""
+
+
+class Dealer:
+    """Gives every arm one job and lets it go on with it; counts what the arms say."""
+
+    def __init__(self, link: Link, speed: float) -> None:
+        self.ticks: dict[str, list[int]] = defaultdict(list)
+        """Of the state words that came, by arm."""
+        self.working: set[str] = set()
+        """Arms whose last word says so."""
+        self.refused: list[str] = []
+        self._link, self._speed, self._began_s = link, speed, time.monotonic()
+        link.listen(keys.of_every_arm(FLEET, "state"), State, self._heard)
+        link.answer(keys.asked_by_every_arm(FLEET, DEALER, "lease"), LeaseRequest, self._lease)
+        link.answer(keys.asked_by_every_arm(FLEET, DEALER, "report"), Report, lambda word: Receipt(DEALER, word.award))
+        link.answer(keys.of_clock(FLEET), ClockRequest, lambda _: Clock(self._now_s(), speed))
+
+    def deal(self, arm: str) -> None:
+        """Ask an arm for a quote and award it its job."""
+        job = JobWord(f"load-{arm}", "pick_place", ("belt", "tray"), 100_000, 0.5)
+
+        def quoted(answers: Answers[Quote]) -> None:
+            self.refused += answers.refused.values()
+            for quote in answers.words.values():
+                award = Award(f"a-{arm}", f"q-{arm}", DEALER, quote.quote, job, 0, LEASE_S)
+                self._link.ask(keys.of_arm(FLEET, arm, "award"), award, Ack, told, timeout_s=START_S)
+
+        def told(answers: Answers[Ack]) -> None:
+            self.refused += [ack.reason for ack in answers.words.values() if not ack.accepted]
+
+        request = QuoteRequest(f"q-{arm}", (job,))
+        self._link.ask(keys.of_arm(FLEET, arm, "quote"), request, Quote, quoted, timeout_s=START_S)
+
+    def serve(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
+        """Deal and listen for so long, or until something has come true."""
+        end_s = time.monotonic() + seconds
+        while time.monotonic() < end_s and not until():
+            self._link.serve(min(end_s, time.monotonic() + 0.2))
+
+    def _heard(self, arm: str, word: State) -> None:
+        self.ticks[arm].append(word.tick)
+        (self.working.add if word.mode == "working" else self.working.discard)(arm)
+
+    def _lease(self, word: LeaseRequest) -> Lease:
+        return Lease(DEALER, LEASE_S, tuple(hold.award for hold in word.holds), ())
+
+    def _now_s(self) -> float:
+        return self._speed * (time.monotonic() - self._began_s)
+
+
+def cpu_s(pid: int) -> float:
+    """User and system time of a process so far, s."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def memory_mb(pid: int) -> tuple[float, float, int]:
+    """Resident set and proportional set of a process, MB, and how many threads it has."""
+    status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+    shares = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    pss_kb = next(int(line.split()[1]) for line in shares if line.startswith("Pss:"))
+    return int(status["VmRSS"].split()[0]) / 1024, pss_kb / 1024, int(status["Threads"])
+
+
+def arms_of(folder: Path, names: list[str], endpoint: str, options: argparse.Namespace) -> list[Part]:
+    """The arms' processes; their common plans are made beforehand, as `thermofleet up` does."""
+    cells = [folder / f"{name}.toml" for name in names]
+    for name, cell in zip(names, cells, strict=True):
+        cell.write_text(CELL.format(arm=name), encoding="utf-8")
+    prepare(load(cells[0]), difficulty="blind")
+    how = ("--difficulty", "blind", "--speed", f"{options.speed:g}", "--rate-hz", f"{options.rate:g}")
+    where = ("--endpoint", endpoint, "--fleet", FLEET, "--journal", str(folder / "journals"))
+    return [
+        Part(name=name, argv=(*PROGRAM, "arm", str(cell), name, *where, *how))
+        for name, cell in zip(names, cells, strict=True)
+    ]
+
+
+def end(supervisor: Supervisor, dealer: Dealer, names: list[str]) -> None:
+    """Ask all arms to go, and take their last reports."""
+    pids = [pid for name in names if (pid := supervisor.pid(name)) is not None]
+    for pid in pids:
+        os.kill(pid, signal.SIGTERM)
+    dealer.serve(FAREWELL_S, lambda: not any(supervisor.pid(name) for name in names))
+
+
+def row(what: str, values: list[float], form: str = "{:.2f}") -> str:
+    """Median, 95th percentile and most."""
+    ordered = sorted(values)
+    cells = (statistics.median(ordered), ordered[int(0.95 * (len(ordered) - 1))], ordered[-1])
+    return f"{what:<36}" + "".join(f"{form.format(cell):>10}" for cell in cells)
+
+
+def main() -> None:
+    """Print the table, and whether the targets are met."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--arms", type=int, default=64)
+    parser.add_argument("--seconds", type=float, default=20.0, help="window, after all are there and at work")
+    parser.add_argument("--rate", type=float, default=10.0, help="state words of each a second")
+    parser.add_argument("--speed", type=float, default=1.0, help="fleet seconds per real second")
+    options = parser.parse_args()
+    names = [f"arm_{i:02d}" for i in range(options.arms)]
+    size = len(encode(State("arm_00", 1000, 123.456789, "working", *[(12.345678901234567,) * JOINTS] * 1, 12.3456789)))
+    size += 4 * JOINTS * 20  # joint positions, speeds, torques and currents, as a simulated arm tells them
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        supervisor = stack.enter_context(Supervisor(folder / "logs"))
+        port = free_port()
+        endpoint = f"tcp/127.0.0.1:{port}"
+        supervisor.start(Part(name="router", argv=(*PROGRAM, "router", "--port", str(port)), ready=endpoint))
+        supervisor.await_ready("router", START_S)
+        bare = (sys.executable, "-c", BARE, endpoint, str(size), str(options.rate))
+        supervisor.start(Part(name="bare", argv=bare, ready="ready"), ready_s=START_S)
+        dealer = Dealer(stack.enter_context(Link(endpoint, FLEET)), options.speed)
+        parts = arms_of(folder, names, endpoint, options)
+        began_s = time.monotonic()
+        for part in parts:
+            supervisor.start(part)
+        dealer.serve(START_S, lambda: all(supervisor.ready(n) for n in names) or not all(map(supervisor.pid, names)))
+        for name in names:
+            supervisor.await_ready(name, 0.0)
+        started_s = time.monotonic() - began_s
+        for name in names:
+            dealer.deal(name)
+        dealer.serve(START_S, lambda: len(dealer.working) == len(names) or bool(dealer.refused))
+        assert not dealer.refused, dealer.refused[0]
+        assert len(dealer.working) == len(names), f"{len(dealer.working)} of {len(names)} arms are at work"
+        dealer.serve(SETTLE_S)
+        pids = {name: supervisor.pid(name) or 0 for name in (*names, "bare", "router")} | {"this": os.getpid()}
+        before = {name: cpu_s(pid) for name, pid in pids.items()}
+        dealer.ticks.clear()
+        begun_s = time.monotonic()
+        dealer.serve(options.seconds)
+        took_s = time.monotonic() - begun_s
+        share = {name: (cpu_s(pid) - before[name]) / took_s for name, pid in pids.items()}
+        ticks = {name: list(dealer.ticks[name]) for name in names}
+        memory = {name: memory_mb(pid) for name, pid in pids.items()}
+        still = len(dealer.working)
+        end(supervisor, dealer, names)
+    came = sum(map(len, ticks.values()))
+    said = sum(of[-1] - of[0] + 1 for of in ticks.values() if of)
+    orderly = all(b > a for of in ticks.values() for a, b in pairwise(of))
+    told_hz = [(of[-1] - of[0]) / took_s for of in ticks.values()]
+    arms = [100 * share[name] for name in names]
+    print(f"{len(names)} arms, {os.cpu_count()} cores, {options.rate:g} Hz, speed {options.speed:g}, {took_s:.1f} s;")
+    print(f"all ready {started_s:.1f} s after the first was started; {still} at work at the end\n")
+    print(f"{'each arm':<36}{'median':>10}{'p95':>10}{'most':>10}")
+    print(row("processor, % of a core", arms))
+    print(row("RSS, MB", [memory[name][0] for name in names], "{:.1f}"))
+    print(row("PSS, MB", [memory[name][1] for name in names], "{:.1f}"))
+    print(row("threads", [float(memory[name][2]) for name in names], "{:.0f}"))
+    print(row("words a second", told_hz))
+    print(f"\n{'beside them':<36}{'% of core':>10}{'RSS MB':>10}{'PSS MB':>10}")
+    for what, name in (("bare publisher", "bare"), ("router", "router"), ("dealer and listener", "this")):
+        print(f"{what:<36}{100 * share[name]:>10.2f}{memory[name][0]:>10.1f}{memory[name][1]:>10.1f}")
+    print(f"\nall arms: {sum(arms) / 100:.2f} cores, {sum(memory[name][1] for name in names):.0f} MB (PSS)")
+    print(f"delivered: {came} of {said} ({came / max(said, 1):.2%}){'' if orderly else ', out of order'}")
+    told = {True: "met", False: "missed"}
+    everything = came == said and len([of for of in ticks.values() if of]) == len(names)
+    print(f"targets: 100 % delivered: {told[everything]}; <= 4 % of a core each: {told[max(arms) <= 100 * TARGET]}")
+
+
+if __name__ == "__main__":
+    main()
