@@ -32,7 +32,10 @@ class Allocator:
         self.rounds = self.results = 0
 
     def run(self, seconds):
-        """Allocate for so long."""
+        """Allocate for so long, unless somebody else does."""
+        for reply in self.session.liveliness().get(f"{self.root}/auction/*/alive", timeout=1.0):
+            if reply.ok is not None:
+                sys.exit(f"{reply.ok.key_expr} is there: a fleet has one auctioneer.")
         places = {
             f"{self.root}/jobs/submit": ("Submission", "Submitted", self.submit),
             f"{self.root}/jobs/status": ("StatusRequest", "Status", self.tell),
