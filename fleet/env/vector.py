@@ -105,11 +105,10 @@ class BatchEnv:
         chosen = self._rows_of(rows)
         if not self._begun and len(chosen) < self.num_envs:
             raise RuntimeError("Nothing was begun yet: call reset() for all envs before reset(rows=…).")
-        if rows is None:
-            self._vectors = self._no_vectors()
-        else:
-            self._vectors = self._vectors.copy()
+        self._vectors = self._no_vectors()
         self._begin(chosen)
+        if len(chosen) < self.num_envs:
+            self._engine.observe(np.setdiff1d(np.arange(self.num_envs), chosen), self._vectors)
         self._begun = True
         raw = np.zeros((self.num_envs, len(TERMS)))
         return self._obs(), self._info(raw, np.zeros(0, dtype=int), None)
@@ -151,7 +150,9 @@ class BatchEnv:
     def knowledge(self) -> Observation:
         """What the arms know now by name, leading axes [env, arm], as policies read it."""
         self._check_begun("knowledge")
-        return self.layout.read(self._vectors.copy(), self._engine.mask.copy())
+        vectors = self._no_vectors()  # what was handed out may have been written into
+        self._engine.observe(np.arange(self.num_envs), vectors)
+        return self.layout.read(vectors, self._engine.mask.copy())
 
     def close(self) -> None:
         """Nothing is held open."""
