@@ -25,7 +25,7 @@ from fleet.bus.exchange import Words
 from fleet.bus.memory import MemoryExchange
 from fleet.bus.messages import encode
 from fleet.bus.router import Router, open_client
-from fleet.bus.session import MOST_SEATS, ZenohExchange
+from fleet.bus.session import ZenohExchange, seats_of
 from fleet.bus.wording import spoken
 
 SLOTS = 8
@@ -54,7 +54,7 @@ class Bare:
 
     def __init__(self, arms: int, resources: ExitStack) -> None:
         endpoint = resources.enter_context(Router()).endpoint
-        seats = min(arms, MOST_SEATS)
+        seats = seats_of(arms)
         self._expected = messages(arms)
         self._came = 0
         self._lock = threading.Lock()
@@ -118,7 +118,8 @@ class PingPong:
 
 def messages(arms: int) -> int:
     """Messages that arrive in a tick: two words of every arm, at every session but their own unless arms share it."""
-    return 2 * arms * (arms - 1 if arms <= MOST_SEATS else MOST_SEATS)
+    seats = seats_of(arms)
+    return 2 * arms * (arms - 1 if seats == arms else seats)
 
 
 def await_router(session: zenoh.Session) -> None:

@@ -1,7 +1,7 @@
 """The exchange over Zenoh: every arm knows of its peers only what came over the bus.
 
-Up to `MOST_SEATS` arms each have a client session of their own (`fleet.bus.seat`); more of them share so many. What n
-sessions hear of n arms grows with n², and with it the time to find each other and the memory.
+A few arms each have a client session of their own (`fleet.bus.seat`), many share some: what n sessions hear of n arms
+grows with n², and with it the time to find each other and the memory.
 
 A tick is two words per arm: `state` (telemetry: dropped under congestion, read through a ring) and `difficulty` (an
 advanced publisher with cache and recovery, so that a gap is filled and a late joiner gets the last word). Both travel
@@ -35,11 +35,16 @@ from fleet.errors import BusError
 
 _LOG = logging.getLogger(__name__)
 
-MOST_SEATS = 8
-"""Sessions of one exchange, unless every arm has to show a certificate of its own."""
+MOST_SEATS, SHARED_SEATS = 8, 4
+"""So many arms have a session each; more of them share so many sessions."""
 MOST_NAMED = 8
 """Arms that a complaint names."""
 _OPEN_TIMEOUT_S = 20.0
+
+
+def seats_of(arms: int) -> int:
+    """Sessions on which so many arms meet, unless each has to show a certificate of its own."""
+    return arms if arms <= MOST_SEATS else SHARED_SEATS
 
 
 class ZenohExchange:
@@ -60,7 +65,7 @@ class ZenohExchange:
         channel: Channel = PERFECT,
         tls: Path | None = None,
         timeout_s: float = 2.0,
-        sessions: int = MOST_SEATS,
+        sessions: int | None = None,
     ) -> None:
         """Prepare an exchange between `arms`.
 
@@ -70,7 +75,7 @@ class ZenohExchange:
             tls: Folder with a certificate of every arm (and of `router`, for a router of its own); the endpoint then
                 begins with `tls/`, and may be anywhere.
             timeout_s: How long `share` waits for words that do not come.
-            sessions: Most that the arms share; with `tls` every arm has its own.
+            sessions: That the arms share, at most; None for `seats_of` them. With `tls` every arm has its own.
 
         Raises:
             BusError: the endpoint is not on loopback.
@@ -82,9 +87,10 @@ class ZenohExchange:
         self.delivered = 0
         self.malformed = 0
         self.late = 0
-        if sessions < 1:
+        if sessions is not None and sessions < 1:
             raise ValueError(f"sessions must be >= 1 (got {sessions}).")
-        self._seated = len(self.arms) if tls is not None else min(sessions, len(self.arms))
+        arms_in_all = len(self.arms)
+        self._seated = arms_in_all if tls is not None else min(sessions or seats_of(arms_in_all), arms_in_all)
         self._fleet = fleet
         self._tls = {arm: None if tls is None else Tls(tls, arm) for arm in self.arms}
         self._own_tls = None if tls is None else Tls(tls, "router")

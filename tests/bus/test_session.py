@@ -21,7 +21,7 @@ from fleet.bus.inbox import Inbox
 from fleet.bus.memory import MemoryExchange
 from fleet.bus.messages import DifficultyWord, Info, State, decode, encode, encoding
 from fleet.bus.router import Router, open_client
-from fleet.bus.session import MOST_SEATS, ZenohExchange
+from fleet.bus.session import MOST_SEATS, SHARED_SEATS, ZenohExchange
 from fleet.errors import BusError
 
 ARMS = ("arm_0", "arm_1", "arm 2/*@")
@@ -54,6 +54,8 @@ def test_a_large_fleet_shares_few_sessions_and_knows_the_same(make_words, assert
             said = [heard[0].recv() for _ in range(2 * 40)]
         assert len({str(sample.key_expr) for sample in said}) == 40
         assert (bus.delivered, bus.late, bus.malformed) == (3 * 40 * 39, 0, 0)
+        assert len(bus._seats) == SHARED_SEATS
+    with ZenohExchange(arms[:MOST_SEATS], "small", timeout_s=PATIENT_S) as bus:
         assert len(bus._seats) == MOST_SEATS
 
 
@@ -288,7 +290,7 @@ def test_a_process_ends_however_it_leaves_the_exchange(ending):
     program = f"""
 import numpy as np
 from fleet.bus.exchange import Words
-from fleet.bus.session import MOST_SEATS, ZenohExchange
+from fleet.bus.session import ZenohExchange
 bus = ZenohExchange(["a", "b"], "f", timeout_s=30.0)
 one = np.ones((2, 1))
 heard = bus.share(Words(0.0, np.zeros(2, int), one, one[:, 0], ("j",), one, one, ("", "")))
