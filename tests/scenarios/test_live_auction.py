@@ -134,7 +134,12 @@ class Stage:
 
     def __init__(self) -> None:
         self.time_s, self.handed_in, self.open, self.ended = 0.0, [], [], False
+        self.alone_s = 0.0
         self.auctioneer = SimpleNamespace(ledger=SimpleNamespace(unsettled=lambda: self.open), finishing=lambda: False)
+
+    @property
+    def rivals(self) -> set[str]:
+        return {"other"} if self.time_s < self.alone_s else set()
 
     def serve(self, _until_s: float) -> None:
         self.time_s += 3600.0
@@ -158,6 +163,14 @@ def test_a_stream_is_handed_in_as_time_goes_on_until_all_is_done_or_the_shift_is
     all_of_it = [(3600.0, ["a"]), (7200.0, ["b", "c"]), (10800.0, ["d"])]
     assert stage.handed_in == (all_of_it[:2] if ended else all_of_it)
     assert stage.ended is ended
+
+
+def test_nothing_is_handed_in_while_there_is_another_auctioneer(monkeypatch):
+    monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
+    stage, never = Stage(), SimpleNamespace(is_set=lambda: False)
+    stage.alone_s = 7200.0
+    live_auction.work(stage, [(0.0, JobWord("a", "hold", ("x",)))], 1e6, never)
+    assert stage.handed_in == [(7200.0, ["a"])]
 
 
 def test_a_job_travels_whole():
@@ -243,6 +256,10 @@ def test_jobs_handed_in_are_kept_over_a_kill(endpoint, tmp_path, capsys):
         assert code == 1
         assert out.startswith("a: accepted\nb: refused: No place 'moon' in this cell. Places: ")
         code, _, err = call(capsys, "auction", "quickstart", "--endpoint", endpoint, "--journal", tmp_path / "other")
+        assert code == 2
+        assert "Fleet 'quickstart' has an auctioneer 'auctioneer' already: its token is there." in err
+        other = ("--name", "other", "--journal", tmp_path / "other")
+        code, _, err = call(capsys, "auction", "quickstart", "--endpoint", endpoint, *other)
         assert code == 2
         assert "Fleet 'quickstart' has an auctioneer already: 'auctioneer'." in err
         process.send_signal(signal.SIGKILL)
