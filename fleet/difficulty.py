@@ -6,6 +6,7 @@ over the channels (E. Guiffo Kaigom, arXiv 2509.12740; the reading in which d_k 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -111,7 +112,7 @@ class Difficulty:
         if self.p_saturation is not None and self.risk is not None:
             raise ValueError("A Difficulty has p_saturation or risk, not both: risk.at(temp_c) is the probability.")
 
-    @property
+    @cached_property
     def total(self) -> float:
         """d = Σ_k d_k, in [0, joints)."""
         return float(np.sum(self.per_joint))

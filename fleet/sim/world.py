@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -31,6 +32,39 @@ class Arm:
     plans: Mapping[Work, tuple[Plan, ...]]
     """Variants per work it can do; a work it cannot do is missing."""
 
+    @cached_property
+    def _offered(self) -> dict[tuple[Work, int], tuple[Plan, Difficulty | None] | None]:
+        return {}
+
+    @cached_property
+    def warm_c(self) -> dict[float, Array]:
+        """Settled temperatures by the air they settled in, as `warm_start` finds them."""
+        return {}
+
+    @cached_property
+    def _driven(self) -> dict[int, tuple[Plan, Array, Array, Array]]:
+        return {}
+
+    def offer(self, work: Work, repetitions: int) -> tuple[Plan, Difficulty | None] | None:
+        """As `best_offer`, asked of its twin once: shift after shift wants the same."""
+        key = (work, repetitions)
+        if key not in self._offered:
+            variants = self.plans.get(work, ())
+            scored = [(plan, self.model.score(plan, repetitions)) for plan in variants]
+            self._offered[key] = min(
+                scored, key=lambda pair: pair[1].total if pair[1] is not None else 0.0, default=None
+            )
+        return self._offered[key]
+
+    def driven(self, plan: Plan) -> tuple[Array, Array, Array]:
+        """Of one of its plans: mean squared current and friction heat, [phase, joint], and largest torques, [joint]."""
+        if id(plan) not in self._driven:  # with the plan itself, so that its id stays its own
+            drives = [drive(phase.profile, self.motors) for phase in plan.phases]
+            peak = np.abs(np.concatenate([phase.profile[:, 2] for phase in plan.phases])).max(axis=0)
+            current_sq, friction_w = (np.array([getattr(d, n) for d in drives]) for n in ("current_sq", "friction_w"))
+            self._driven[id(plan)] = (plan, current_sq, friction_w, peak)
+        return self._driven[id(plan)][1:]
+
     def rest_drive(self) -> Drive:
         """Mean heat drive of standing at home, each [joint]."""
         still = np.stack([self.robot.home_q(), np.zeros_like(self.rest_tau), self.rest_tau])[None]
@@ -43,20 +77,19 @@ def warm_start(arm: Arm, ambient_c: float) -> Array:
     Raises:
         ValueError: standing at home alone overheats it.
     """
-    rest = arm.rest_drive()
-    temp = settled(arm.thermal, rest.current_sq, rest.friction_w, arm.motors, ambient_c)
-    if temp is None:
+    known = arm.warm_c.get(ambient_c)
+    if known is None:
+        rest = arm.rest_drive()
+        known = settled(arm.thermal, rest.current_sq, rest.friction_w, arm.motors, ambient_c)
+    if known is None:
         raise ValueError(f"Arm '{arm.robot.name}' never settles while standing at home in air of {ambient_c:g} °C.")
-    return temp
+    arm.warm_c[ambient_c] = known
+    return known.copy()
 
 
 def best_offer(arm: Arm, job: Job) -> tuple[Plan, Difficulty | None] | None:
     """The variant of a job that the arm's twin finds easiest (without a score: the first), or None if it cannot."""
-    variants = arm.plans.get(job.work)
-    if not variants:
-        return None
-    scored = [(plan, arm.model.score(plan, job.repetitions)) for plan in variants]
-    return min(scored, key=lambda pair: pair[1].total if pair[1] is not None else 0.0)
+    return arm.offer(job.work, job.repetitions)
 
 
 def build_world(
@@ -77,11 +110,8 @@ def build_world(
         ambient_c: Air at each arm during each tick, [tick, arm].
         start_warm: Arms begin at their idle equilibrium rather than at ambient.
     """
-    motors = stack_motors([arm.motors for arm in arms])
-    thermal = stack_models([arm.thermal for arm in arms])
-    phi, gamma = thermal.step_matrices(dt_s)
+    motors, thermal, rest, phi, gamma = _laws(tuple(arms), dt_s)
     plans, offers = _offers(arms, shifts)
-    rest = [arm.rest_drive() for arm in arms]
     start = np.repeat(ambient_c[0][:, None], thermal.capacity.shape[-1], axis=1)
     if start_warm:
         start = np.stack([warm_start(a, c) for a, c in zip(arms, ambient_c[0].tolist(), strict=True)])
@@ -97,8 +127,8 @@ def build_world(
         motors=motors,
         limits=limits,
         torque_warning=np.array(GEN3.torque_warning),
-        rest=Drive(np.stack([d.current_sq for d in rest]), np.stack([d.friction_w for d in rest])),
-        plans=_plan_table(plans, {arm.robot.name: arm.motors for arm in arms}),
+        rest=rest,
+        plans=_plan_table(plans, {arm.robot.name: arm for arm in arms}),
         jobs=_job_table(shifts, stations),
         offers=offers,
         start_c=start,
@@ -108,6 +138,14 @@ def build_world(
     return world, plans
 
 
+@lru_cache(maxsize=8)
+def _laws(arms: tuple[Arm, ...], dt_s: float) -> tuple[Motors, ThermalModel, Drive, Array, Array]:
+    """Motors, thermal models and rest of a fleet, [arm, ...], and the matrices of a step: the same in every shift."""
+    thermal, drives = stack_models([arm.thermal for arm in arms]), [arm.rest_drive() for arm in arms]
+    rest = Drive(np.stack([d.current_sq for d in drives]), np.stack([d.friction_w for d in drives]))
+    return stack_motors([arm.motors for arm in arms]), thermal, rest, *thermal.step_matrices(dt_s)
+
+
 def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]]) -> tuple[tuple[Plan, ...], Offers]:
     shape = (len(shifts), len(arms), max(1, *(len(jobs) for jobs in shifts)))
     plan, total, p_saturation = np.full(shape, -1), np.full(shape, np.nan), np.full(shape, np.nan)
@@ -115,14 +153,10 @@ def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]]) -> tuple[tuple
     rows: dict[int, int] = {}
     plans: list[Plan] = []
     risks: dict[int, tuple[int, Risk]] = {}
-    known: dict[tuple[int, Work, int], tuple[Plan, Difficulty | None] | None] = {}
     for e, jobs in enumerate(shifts):
         for j, job in enumerate(jobs):
             for a, arm in enumerate(arms):
-                key = (a, job.work, job.repetitions)
-                if key not in known:
-                    known[key] = best_offer(arm, job)
-                offer = known[key]
+                offer = best_offer(arm, job)
                 if offer is None:
                     continue
                 best, score = offer
@@ -139,18 +173,17 @@ def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]]) -> tuple[tuple
     return tuple(plans), Offers(plan=plan, difficulty=total, p_saturation=p_saturation, risk=risk, risks=stack)
 
 
-def _plan_table(plans: Sequence[Plan], motors: Mapping[str, Motors]) -> PlanTable:
+def _plan_table(plans: Sequence[Plan], arms: Mapping[str, Arm]) -> PlanTable:
     if not plans:
         joints = len(GEN3.velocity)
         empty = np.zeros((1, 3, joints))
         return PlanTable(np.zeros((1, 3)), empty, empty, np.zeros((1, joints)))
-    drives = [[drive(phase.profile, motors[plan.arm]) for phase in plan.phases] for plan in plans]
-    peaks = [np.abs(np.concatenate([p.profile[:, 2] for p in plan.phases])).max(axis=0) for plan in plans]
+    driven = [arms[plan.arm].driven(plan) for plan in plans]
     return PlanTable(
         times_s=np.array([[phase.duration_s for phase in plan.phases] for plan in plans]),
-        current_sq=np.array([[d.current_sq for d in row] for row in drives]),
-        friction_w=np.array([[d.friction_w for d in row] for row in drives]),
-        peak_tau=np.array(peaks, dtype=float),
+        current_sq=np.array([current_sq for current_sq, _, _ in driven]),
+        friction_w=np.array([friction_w for _, friction_w, _ in driven]),
+        peak_tau=np.array([peak for _, _, peak in driven], dtype=float),
     )
 
 
