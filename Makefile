@@ -8,10 +8,12 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c const
 GOAL := $(or $(firstword $(MAKECMDGOALS)),demo)
 
 # Each trainer has an environment of its own: what they want of one another's packages does not agree.
-ADAPTERS := $(sort $(basename $(notdir $(wildcard constraints/*.txt))))
+# The peers that benchmarks/env.py is measured beside are no trainer, but live there too.
+PINNED := $(sort $(basename $(notdir $(wildcard constraints/*.txt))))
+ADAPTERS := $(filter-out bench,$(PINNED))
 ADAPTER_TESTS := $(ADAPTERS:%=test-adapter-%)
 
-.PHONY: demo test test-slow test-adapter test-adapters $(ADAPTER_TESTS) lint bench chaos clean install
+.PHONY: demo test test-slow test-adapter test-adapters $(ADAPTER_TESTS) lint bench bench-env chaos clean install
 
 demo: $(STAMP)
 	@$(BIN)/thermofleet demo --out $(OUT)/demo
@@ -45,6 +47,9 @@ chaos: $(STAMP)
 bench: $(STAMP)
 	@for b in benchmarks/bench_*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done
 
+bench-env: .venv-adapters/bench/.installed
+	@.venv-adapters/bench/bin/python benchmarks/env.py
+
 install: $(STAMP)
 
 # A broken environment is taken away again, so that the next call begins anew. setuptools comes first, so that the
@@ -65,7 +70,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $(STAMP)
 
 # A trainer's own pins come before the shared ones. Its packages are put in as pinned, whatever they say of one another.
-$(ADAPTERS:%=.venv-adapters/%/.installed): .venv-adapters/%/.installed: constraints/%.txt constraints.txt pyproject.toml | $(STAMP)
+$(PINNED:%=.venv-adapters/%/.installed): .venv-adapters/%/.installed: constraints/%.txt constraints.txt pyproject.toml | $(STAMP)
 	@echo "Installing $* into .venv-adapters/$* (once, a few minutes; log in .venv-adapters/$*/install.log) …"
 	@test -x .venv-adapters/$*/bin/python || $(BIN)/python -m venv .venv-adapters/$*
 	@awk -F== '!seen[$$1]++' constraints/$*.txt constraints.txt >.venv-adapters/$*/pins.txt
