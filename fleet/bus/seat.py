@@ -41,7 +41,6 @@ class Seat:
     ) -> None:
         """Declare all that these arms say and hear."""
         self.seated = tuple(seated)
-        self._arms = arms
         self._reader = reader
         # An arm alone knows its own words without the bus.
         origin = zenoh.Locality.REMOTE if len(self.seated) == 1 else zenoh.Locality.ANY

@@ -37,7 +37,7 @@ from fleet.bus.trade import (
 from fleet.errors import BusError
 from fleet.events import Event
 from fleet.live.body import Body
-from fleet.live.clock import FleetClock
+from fleet.live.clock import FleetClock, next_due_s
 from fleet.live.contractor import Contractor
 from fleet.live.estimate import Estimator
 from fleet.live.promises import Held
@@ -223,8 +223,7 @@ class ArmNode:
             self._report(auctioneer, report)
         self._ask_clock(real_s)
         if real_s >= self._due_s:
-            # At its rate on average; what was missed is not made up for.
-            self._due_s = max(self._due_s, real_s - 1.0 / self._nature.rate_hz) + 1.0 / self._nature.rate_hz
+            self._due_s = next_due_s(self._due_s, real_s, 1.0 / self._nature.rate_hz)
             self._say()
 
     def _live(self, real_s: float) -> None:
@@ -295,6 +294,7 @@ class ArmNode:
             self._at_work = ""
             self.contractor.worked(int(event.value), math.inf)
             self.contractor.returned(event.time_s, real_s, f"the arm faulted; {event.reason}")
+            self._reading = self._body.read()  # what it offers from now on knows of the fault
         self._tell(event)
 
     def _busy_s(self) -> float:

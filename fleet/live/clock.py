@@ -63,3 +63,12 @@ class FleetClock:
         if answered_s < asked_s:
             raise ValueError(f"An answer comes after its question (got {asked_s} and {answered_s}).")
         return time_s + 0.5 * self.speed * (answered_s - asked_s)
+
+
+def next_due_s(due_s: float, now_s: float, period_s: float) -> float:
+    """When to do again what is done every `period_s`, was due at `due_s` and is done now.
+
+    At its rate on average, but never sooner than after half a period: what was missed is not made up for, and a router
+    that limits a rate by the gap between two words drops the second of two at once.
+    """
+    return max(due_s + period_s, now_s + 0.5 * period_s)

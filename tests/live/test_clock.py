@@ -1,13 +1,14 @@
 """The fleet's time: monotone whatever it is corrected by, and right within half a round trip."""
 
 import ast
+import math
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.live.clock import SLEW, FleetClock
+from fleet.live.clock import SLEW, FleetClock, next_due_s
 
 speed = st.floats(0.1, 1000.0)
 moment = st.floats(0.0, 1e6)
@@ -92,3 +93,21 @@ def test_no_participant_goes_by_the_wall_clock(path):
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)
     }
     assert not read & WALL or path.name in OF_THE_DAY
+
+
+@given(st.lists(st.floats(0.0, 5.0), min_size=1, max_size=40))
+def test_what_is_due_again_and_again_keeps_its_rate_and_never_comes_twice_at_once(delays_s):
+    """Done late by some delay each time: never closer than half a period, never ahead of its rate."""
+    period_s, due_s, last_s = 0.1, 0.0, -math.inf
+    for number, delay_s in enumerate(delays_s):
+        now_s = max(due_s, last_s) + delay_s
+        assert now_s - last_s >= 0.5 * period_s - 1e-9
+        assert now_s >= number * period_s - 1e-9
+        due_s, last_s = next_due_s(due_s, now_s, period_s), now_s
+
+
+def test_small_delays_do_not_add_up():
+    due_s = 0.0
+    for _ in range(100):
+        due_s = next_due_s(due_s, due_s + 0.04, 0.1)
+    assert due_s == pytest.approx(10.0)
