@@ -49,7 +49,13 @@ class Engine:
         arms, slots = layout.arms, layout.slots
         self.tables, self.layout = tables, layout
         self._weights = np.array([getattr(weights, name) for name in TERMS])
-        self._offer = Offer(np.full((envs, slots), -1), np.zeros((envs, arms, slots + 1), np.int8), np.zeros(envs, int))
+        self._offer = Offer(
+            on_offer=np.full((envs, slots), -1),
+            mask=np.zeros((envs, arms, slots + 1), np.int8),
+            open=np.zeros(envs, int),
+            queue=np.zeros((envs, jobs), np.int32),
+            head=np.zeros(envs, int),
+        )
         self._all = np.arange(envs)
         self._raw = np.zeros((envs, len(TERMS)))
         self._start = np.array(layout.starts)
@@ -109,7 +115,8 @@ class Engine:
         s.peak_c[env] = s.temp_c[env][:, WINDING].max(axis=-1)
         s.status[env], s.finished_s[env] = WAITING, np.nan
         s.queued_s[env] = d.release_s[env]
-        self._offer.open[env] = count
+        self._offer.open[env], self._offer.head[env] = count, 0
+        self._offer.queue[env, :count] = np.argsort(shift.release_s, kind="stable")
 
     def observe(self, envs: Array, out: Array) -> None:
         """What the arms of some envs know at the beginning of a shift, into float32 [env, arm, size]."""
@@ -139,8 +146,10 @@ class Engine:
         waits = max(self._drawn.after.shape[2], waits)
         envs, arms = self._rows.mode.shape
         drawn, rows = _no_jobs(envs, jobs, waits), _no_rows(envs, arms, jobs)
-        for new, old in zip((*drawn, *rows), (*self._drawn, *self._rows), strict=True):
+        queue = np.zeros((envs, jobs), np.int32)
+        for new, old in zip((*drawn, *rows, queue), (*self._drawn, *self._rows, self._offer.queue), strict=True):
             new[tuple(slice(0, n) for n in old.shape)] = old
+        self._offer = self._offer._replace(queue=queue)
         self._drawn, self._rows = drawn, rows
 
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from fleet.env.observation import FIELDS, LONG_S
 from fleet.robot import JOINTS
-from fleet.sim.jit import entry, inner
+from fleet.sim.boiling import hottest
+from fleet.sim.jit import entry, inner, natural
 from fleet.sim.noise import FIRST, GOLDEN, LEVELS, QUANTILES, SECOND
 from fleet.sim.rows import award, hang_out, live
 from fleet.sim.tables import Drawn, Offer, Rows, Tables
@@ -22,15 +23,13 @@ Array = np.ndarray
 _PLACE = {field.name: place for place, field in enumerate(FIELDS)}
 CLOCK, MODE, BUSY, LAST_AWARD = (_PLACE[name] for name in ("clock", "idle", "busy_s", "last_award"))
 TEMP, HEADROOM = _PLACE["temp_c"], _PLACE["headroom_k"]
-OFFERED, FEASIBLE, KNOWN = (_PLACE[name] for name in ("offered", "feasible", "known"))
-DIFFICULTY, P_SATURATION = _PLACE["difficulty"], _PLACE["p_saturation"]
-DURATION, SLACK, AGE = (_PLACE[name] for name in ("duration_s", "slack_s", "age_s"))
-PAYLOAD, VALUE, RETURNS = (_PLACE[name] for name in ("payload_kg", "value", "returns"))
-PEER_HEARD, PEER_AGE = _PLACE["peer_heard"], _PLACE["peer_age_s"]
-PEER_WORKING, PEER_FAULTED = _PLACE["peer_working"], _PLACE["peer_faulted"]
-PEER_HEADROOM = _PLACE["peer_headroom_k"]
-PEER_KNOWN, PEER_DIFFICULTY = _PLACE["peer_known"], _PLACE["peer_difficulty"]
+OFFERED, PEER_HEARD = _PLACE["offered"], _PLACE["peer_heard"]
 assert [_PLACE[name] - MODE for name in ("idle", "working", "faulted")] == [IDLE, WORKING, FAULTED]
+assert [field.name for field in FIELDS[OFFERED:]] == [
+    "offered", "feasible", "known", "difficulty", "p_saturation", "duration_s", "slack_s", "age_s", "payload_kg",
+    "value", "returns", "peer_heard", "peer_age_s", "peer_working", "peer_faulted", "peer_headroom_k", "peer_known",
+    "peer_difficulty",
+]  # fmt: skip
 
 
 _GOLDEN, _FIRST, _SECOND = np.uint64(GOLDEN), np.uint64(FIRST), np.uint64(SECOND)
@@ -89,95 +88,103 @@ def perceive(
     lots, kinds, keys, repetitions, due_s = d.lot, d.kind, d.key, d.repetitions, d.due_s
     ticks, temp_c, modes, in_hand, progress_s, todo = s.tick, s.temp_c, s.mode, s.job, s.progress_s, s.todo
     last, queued_s, cycles, returns, on_offer = s.last_award, s.queued_s, s.cycles, s.returns, o.on_offer
-    noise_k, plans, times_s, difficulties = t.noise_k, t.plan, t.times_s, t.difficulty
-    payload_kg, values, risks, p_saturation = t.payload_kg, t.value, t.risk, t.p_saturation
+    noise_k, words, payload_kg, values, risks = t.noise_k, t.word, t.payload_kg, t.value, t.risk
     offset, weight, curve = t.offset, t.weight, t.curve
-    arms, slots = modes.shape[1], on_offer.shape[1]
-    measured, headroom, scored = np.empty(JOINTS), np.empty(arms), np.empty((arms, slots), np.float32)
-    known = np.empty((arms, slots), np.float32)
+    arms, slots = natural(modes.shape[1]), natural(on_offer.shape[1])
+    measured, headroom = np.empty(JOINTS), np.empty(arms, np.float32)
+    scored, known = np.empty(arms * slots, np.float32), np.empty(arms * slots, np.float32)
+    left, slack_s = np.empty(slots), np.empty(slots)
+    shared = np.zeros((5, slots), np.float32)  # of every slot what all arms see alike
     c_clock, c_mode, c_busy, c_last = start[CLOCK], start[MODE], start[BUSY], start[LAST_AWARD]
-    c_temp, c_headroom, c_offered, c_feasible = start[TEMP], start[HEADROOM], start[OFFERED], start[FEASIBLE]
-    c_known, c_difficulty, c_p, c_duration = start[KNOWN], start[DIFFICULTY], start[P_SATURATION], start[DURATION]
-    c_slack, c_age, c_payload, c_value = start[SLACK], start[AGE], start[PAYLOAD], start[VALUE]
-    c_returns, c_heard, c_working, c_faulted = (
-        start[RETURNS],
-        start[PEER_HEARD],
-        start[PEER_WORKING],
-        start[PEER_FAULTED],
+    c_temp, c_headroom = natural(start[TEMP]), natural(start[HEADROOM])
+    c_slots, c_peers = natural(start[OFFERED]), natural(start[PEER_HEARD])
+    c_offered, c_feasible, c_known, c_difficulty, c_p, c_duration, c_slack, c_age, c_payload, c_value, c_returns = (
+        c_slots, c_slots + slots, c_slots + 2 * slots, c_slots + 3 * slots, c_slots + 4 * slots, c_slots + 5 * slots,
+        c_slots + 6 * slots, c_slots + 7 * slots, c_slots + 8 * slots, c_slots + 9 * slots, c_slots + 10 * slots,
+    )  # fmt: skip
+    peers = arms - 1
+    c_heard_age, c_working, c_faulted, c_room = (
+        c_peers + peers,
+        c_peers + 2 * peers,
+        c_peers + 3 * peers,
+        c_peers + 4 * peers,
     )
-    c_heard_age, c_peer_headroom, c_peer_known, c_told = (
-        start[PEER_AGE],
-        start[PEER_HEADROOM],
-        start[PEER_KNOWN],
-        start[PEER_DIFFICULTY],
-    )
+    c_peer_known, c_told = c_peers + 5 * peers, c_peers + 5 * peers + peers * slots
     low_c, high_c, low_k, high_k = low[c_temp], high[c_temp], low[c_headroom], high[c_headroom]
-    for e in rows:
-        lot, now_s, count = lots[e], ticks[e] * t.dt_s, ticks[e] * arms * JOINTS
+    most_kg, most_value, most_returns = high[c_payload], high[c_value], high[c_returns]
+    for row in rows:
+        e = natural(row)
+        lot, now_s, count = natural(lots[e]), ticks[e] * t.dt_s, ticks[e] * arms * JOINTS
+        clock = now_s / (t.ticks * t.dt_s)
+        found = 0
+        while found < slots and on_offer[e, found] >= 0:
+            j = natural(on_offer[e, found])
+            kind = natural(kinds[e, j])
+            left[found], slack_s[found] = repetitions[e, j] - cycles[e, j], due_s[e, j] - now_s
+            shared[0, found] = 1.0
+            shared[1, found] = min(max(now_s - queued_s[e, j], 0.0), LONG_S)
+            shared[2, found] = min(payload_kg[lot, kind], most_kg)
+            shared[3, found] = min(max(values[lot, kind], 0.0), most_value)
+            shared[4, found] = min(returns[e, j], most_returns)
+            found += 1
+        for m in range(5):
+            for k in range(found, slots):
+                shared[m, k] = 0.0
         for a in range(arms):
             mode = modes[e, a]
-            out[e, a, c_clock] = now_s / (t.ticks * t.dt_s)
+            out[e, a, c_clock] = clock
             for m in range(3):
                 out[e, a, c_mode + m] = m == mode
-            out[e, a, c_busy] = 0.0
+            busy_s = 0.0
             if mode == WORKING:
-                plan = plans[lot, a, kinds[e, in_hand[e, a]]]
-                whole_s = times_s[plan, 0] + todo[e, a] * times_s[plan, 1] + times_s[plan, 2]
-                out[e, a, c_busy] = min(max(whole_s - progress_s[e, a], 0.0), LONG_S)
+                kind = natural(kinds[e, natural(in_hand[e, a])])
+                busy_s = words[lot, a, kind, 0] + todo[e, a] * words[lot, a, kind, 1] - progress_s[e, a]
+            out[e, a, c_busy] = min(max(busy_s, 0.0), LONG_S)
             out[e, a, c_last] = last[e, a]
-            top_c = -np.inf
             for k in range(JOINTS):
-                count += 1
-                measured[k] = temp_c[e, a, k] + noise_k[lot, a, k] * noise(keys[e], count)
+                measured[k] = temp_c[e, a, k] + noise_k[lot, a, k] * noise(keys[e], count + k + 1)
                 out[e, a, c_temp + k] = min(max(measured[k], low_c), high_c)
-                top_c = max(top_c, measured[k])
-            headroom[a] = t.warning_c - top_c
-            out[e, a, c_headroom] = min(max(headroom[a], low_k), high_k)
+            count += JOINTS
+            headroom[a] = min(max(t.warning_c - hottest(measured), low_k), high_k)
+            out[e, a, c_headroom] = headroom[a]
             for k in range(slots):
-                j = on_offer[e, k]
-                scored[a, k], known[a, k] = 0.0, 0.0
-                if j < 0:
-                    for c in (c_offered, c_feasible, c_known, c_difficulty, c_duration, c_slack):
-                        out[e, a, c + k] = 0.0
-                    for c in (c_age, c_payload, c_value, c_returns):
-                        out[e, a, c + k] = 0.0
-                    out[e, a, c_p + k] = 0.5
-                    continue
-                kind = kinds[e, j]
-                out[e, a, c_offered + k] = 1.0
-                out[e, a, c_age + k] = min(max(now_s - queued_s[e, j], 0.0), LONG_S)
-                out[e, a, c_payload + k] = min(payload_kg[lot, kind], high[c_payload])
-                out[e, a, c_value + k] = min(max(values[lot, kind], 0.0), high[c_value])
-                out[e, a, c_returns + k] = min(returns[e, j], high[c_returns])
-                plan, duration_s = plans[lot, a, kind], 0.0
-                if plan >= 0:
-                    left = repetitions[e, j] - cycles[e, j]
-                    duration_s = times_s[plan, 0] + left * times_s[plan, 1] + times_s[plan, 2]
+                out[e, a, c_offered + k] = shared[0, k]
+                out[e, a, c_age + k] = shared[1, k]
+                out[e, a, c_payload + k] = shared[2, k]
+                out[e, a, c_value + k] = shared[3, k]
+                out[e, a, c_returns + k] = shared[4, k]
+            for k in range(found):
+                kind = natural(kinds[e, natural(on_offer[e, k])])
+                duration_s = words[lot, a, kind, 0] + left[k] * words[lot, a, kind, 1]
                 out[e, a, c_feasible + k] = duration_s > 0
                 out[e, a, c_duration + k] = min(duration_s, LONG_S)
-                out[e, a, c_slack + k] = min(max(due_s[e, j] - now_s - duration_s, -LONG_S), LONG_S)
-                difficulty = difficulties[lot, a, kind]
-                if not math.isnan(difficulty):
-                    scored[a, k], known[a, k] = difficulty, 1.0
-                out[e, a, c_known + k] = known[a, k]
-                out[e, a, c_difficulty + k] = scored[a, k]
-                risk = risks[lot, a, kind]
-                p = p_saturation[lot, a, kind] if risk < 0 else at_risk(offset, weight, curve, risk, measured)
-                out[e, a, c_p + k] = 0.5 if math.isnan(p) else p
+                out[e, a, c_slack + k] = min(max(slack_s[k] - duration_s, -LONG_S), LONG_S)
+                known[a * slots + k], scored[a * slots + k] = words[lot, a, kind, 2], words[lot, a, kind, 3]
+                p, risk = words[lot, a, kind, 4], risks[lot, a, kind]
+                if risk >= 0:
+                    p = at_risk(offset, weight, curve, natural(risk), measured)
+                out[e, a, c_p + k] = p
+            for k in range(found, slots):
+                out[e, a, c_feasible + k] = out[e, a, c_duration + k] = out[e, a, c_slack + k] = 0.0
+                out[e, a, c_p + k] = 0.5
+                known[a * slots + k] = scored[a * slots + k] = 0.0
+            for k in range(slots):
+                out[e, a, c_known + k], out[e, a, c_difficulty + k] = known[a * slots + k], scored[a * slots + k]
         for a in range(arms):
             peer = 0
             for b in range(arms):
-                if b == a:
-                    continue
-                out[e, a, c_heard + peer], out[e, a, c_heard_age + peer] = 1.0, 0.0
-                out[e, a, c_working + peer] = modes[e, b] == WORKING
-                out[e, a, c_faulted + peer] = modes[e, b] == FAULTED
-                out[e, a, c_peer_headroom + peer] = min(max(headroom[b], low_k), high_k)
-                first_known, first_told = c_peer_known + peer * slots, c_told + peer * slots
-                for k in range(slots):
-                    out[e, a, first_known + k] = known[b, k]
-                    out[e, a, first_told + k] = scored[b, k]
-                peer += 1
+                if b != a:
+                    out[e, a, c_peers + peer], out[e, a, c_heard_age + peer] = 1.0, 0.0
+                    out[e, a, c_working + peer] = modes[e, b] == WORKING
+                    out[e, a, c_faulted + peer] = modes[e, b] == FAULTED
+                    out[e, a, c_room + peer] = headroom[b]
+                    peer += 1
+            before, behind = a * slots, (arms - 1 - a) * slots
+            for i in range(before):
+                out[e, a, c_peer_known + i], out[e, a, c_told + i] = known[i], scored[i]
+            for i in range(behind):
+                out[e, a, c_peer_known + before + i] = known[before + slots + i]
+                out[e, a, c_told + before + i] = scored[before + slots + i]
 
 
 @entry

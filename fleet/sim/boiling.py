@@ -20,20 +20,20 @@ Array = np.ndarray
 @inner
 def hottest(temp_c: Array) -> float:
     """Of the motors, [node]."""
-    top = temp_c[0]
-    for j in range(1, JOINTS):
-        top = max(top, temp_c[j])
-    return top
+    return max(
+        max(max(temp_c[0], temp_c[1]), max(temp_c[2], temp_c[3])),
+        max(max(temp_c[4], temp_c[5]), temp_c[6]),
+    )
 
 
 @inner
-def into_modes(t: Tables, lot: int, a: int, temp_c: Array, heat_w: Array, ambient_c: float, modal: Array) -> None:
-    """y and z of a stretch that begins at these temperatures, [2, mode]."""
+def into_modes(t: Tables, lot: int, a: int, temp_c: Array, load_w: Array, modal: Array) -> None:
+    """y and z of a stretch that begins at these temperatures, [2, mode]; the load is heat and what the air gives."""
     modal[:] = 0.0
     for n in range(NODES):
         root = t.root[lot, a, n]
         warm = root * temp_c[n]
-        load = (heat_w[n] + t.to_ambient[lot, a, n] * ambient_c) / root
+        load = load_w[n] / root
         for m in range(NODES):
             modal[0, m] += t.modes[lot, a, n, m] * warm
             modal[1, m] += t.modes[lot, a, n, m] * load
@@ -69,12 +69,16 @@ def crossing_s(
 
 
 @inner
-def braked_heat(t: Tables, lot: int, a: int, out: Array) -> None:
-    """Heat of an arm on its brakes, W, [node]."""
-    out[:] = 0.0
+def braked_load(t: Tables, lot: int, a: int, air_c: float, out: Array) -> float:
+    """Load of an arm on its brakes, W, [node]; returns the heat in it."""
+    heat_w = 0.0
+    for n in range(NODES):
+        out[n] = t.to_ambient[lot, a, n] * air_c
     if not t.power_off:
         for j in range(JOINTS):
-            out[JOINTS + j] = t.idle_w[lot, a, j]
+            out[JOINTS + j] += t.idle_w[lot, a, j]
+            heat_w += t.idle_w[lot, a, j]
+    return heat_w
 
 
 @inner

@@ -29,6 +29,12 @@ def inner(function: Function) -> Function:
     return cast(Function, njit(function, error_model="numpy"))
 
 
+@inner
+def natural(index: Any) -> Any:
+    """The same index, of which the compiler then knows that it is not negative: it need not count from the end."""
+    return index & 0x7FFFFFFF
+
+
 def entry(function: Function) -> Function:
     """Compile a function that Python calls, and keep its code in the user's cache folder, by all it is made of."""
     digest = hashlib.sha256(numba.__version__.encode())

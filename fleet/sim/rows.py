@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from fleet.robot import JOINTS
-from fleet.sim.boiling import above_s, braked_heat, crossing_s, hottest, into_modes
-from fleet.sim.jit import inner
+from fleet.sim.boiling import above_s, braked_load, crossing_s, hottest, into_modes
+from fleet.sim.jit import inner, natural
 from fleet.sim.kernel import ROUNDING_S
 from fleet.sim.state import DONE, RUNNING, WAITING
-from fleet.sim.tables import Drawn, Offer, Rows, Tables
+from fleet.sim.tables import LANES, WIDE, Drawn, Offer, Rows, Tables
 from fleet.telemetry import FAULTED, IDLE, WORKING
 from fleet.thermal import NODES
 
@@ -32,52 +32,42 @@ def hang_out(t: Tables, d: Drawn, s: Rows, o: Offer, rows: Array) -> None:
         rows: Which envs, int [row].
     """
     lots, kinds, count, release_s, after = d.lot, d.kind, d.jobs, d.release_s, d.after
-    tick, modes, in_hand, status, queued_s = s.tick, s.mode, s.job, s.status, s.queued_s
-    on_offer, mask = o.on_offer, o.mask
+    tick, modes, in_hand, status = s.tick, s.mode, s.job, s.status
+    on_offer, mask, queue, head = o.on_offer, o.mask, o.queue, o.head
     stations, plan = t.stations, t.plan
-    arms, slots, waits, places = modes.shape[1], on_offer.shape[1], after.shape[2], stations.shape[2]
-    busy, key = np.empty(t.station_count + 1, np.bool_), np.empty(slots)
-    for e in rows:
-        lot, now_s = lots[e], tick[e] * t.dt_s
-        found = 0
-        for j in range(count[e]):
-            if status[e, j] != WAITING or release_s[e, j] > now_s:
-                continue
-            queued = queued_s[e, j]
-            if found == slots and queued >= key[slots - 1]:
-                continue
+    arms, slots = natural(modes.shape[1]), natural(on_offer.shape[1])
+    waits, places = natural(after.shape[2]), natural(stations.shape[2])
+    busy, can = np.empty(t.station_count + 1, np.bool_), np.empty(arms, np.bool_)
+    for row in rows:
+        e = natural(row)
+        lot, now_s, found = natural(lots[e]), tick[e] * t.dt_s, 0
+        for place in range(natural(head[e]), count[e]):
+            j = natural(queue[e, place])
+            if found == slots or release_s[e, j] > now_s:
+                break
             ready = True
             for n in range(waits):
                 before = after[e, j, n]
                 if before >= 0 and status[e, before] != DONE:
                     ready = False
-                    break
-            if not ready:
-                continue
-            place = found if found < slots else slots - 1
-            while place > 0 and key[place - 1] > queued:
-                key[place] = key[place - 1]
-                on_offer[e, place] = on_offer[e, place - 1]
-                place -= 1
-            key[place] = queued
-            on_offer[e, place] = j
-            found = min(found + 1, slots)
+            if ready:
+                on_offer[e, found] = j
+                found += 1
         occupied(lot, e, modes, in_hand, kinds, stations, busy)
         for a in range(arms):
-            mask[e, a, 0] = 1
-        for k in range(slots):
-            if k >= found:
-                on_offer[e, k] = -1
-                for a in range(arms):
-                    mask[e, a, k + 1] = 0
-                continue
-            kind, free = kinds[e, on_offer[e, k]], True
+            mask[e, a, 0], can[a] = 1, modes[e, a] == IDLE
+        for k in range(found):
+            kind, free = natural(kinds[e, on_offer[e, k]]), True
             for n in range(places):
                 station = stations[lot, kind, n]
                 if station >= 0 and busy[station]:
                     free = False
             for a in range(arms):
-                mask[e, a, k + 1] = free and modes[e, a] == IDLE and plan[lot, a, kind] >= 0
+                mask[e, a, k + 1] = free and can[a] and plan[lot, a, kind] >= 0
+        for k in range(found, slots):
+            on_offer[e, k] = -1
+            for a in range(arms):
+                mask[e, a, k + 1] = 0
 
 
 @inner
@@ -102,7 +92,7 @@ def award(t: Tables, d: Drawn, s: Rows, o: Offer, actions: Array) -> None:
     lots, kinds, repetitions = d.lot, d.kind, d.repetitions
     modes, in_hand, status, last, illegal = s.mode, s.job, s.status, s.last_award, s.illegal
     progress_s, todo, cycles = s.progress_s, s.todo, s.cycles
-    on_offer, mask, stations, difficulty = o.on_offer, o.mask, t.stations, t.difficulty
+    on_offer, mask, queue, head, stations, difficulty = o.on_offer, o.mask, o.queue, o.head, t.stations, t.difficulty
     (envs, arms), slots, places = modes.shape, on_offer.shape[1], stations.shape[2]
     busy, key, order = np.empty(t.station_count + 1, np.bool_), np.empty(arms), np.empty(arms, np.int64)
     for e in range(envs):
@@ -142,9 +132,41 @@ def award(t: Tables, d: Drawn, s: Rows, o: Offer, actions: Array) -> None:
                 station = stations[lot, kind, n]
                 if station >= 0:
                     busy[station] = True
+            take_out(queue, head, e, j)
             last[e, a], status[e, j] = 1, RUNNING
             modes[e, a], in_hand[e, a], progress_s[e, a] = WORKING, j, 0.0
             todo[e, a] = repetitions[e, j] - cycles[e, j]
+
+
+@inner
+def take_out(queue: Array, head: Array, e: int, j: int) -> None:
+    """A job leaves the queue: those before it move up."""
+    place = head[e]
+    ahead = queue[e, place]
+    while ahead != j:
+        place += 1
+        ahead, queue[e, place] = queue[e, place], ahead
+    head[e] += 1
+
+
+@inner
+def put_back(d: Drawn, s: Rows, o: Offer, e: int, j: int, until_s: float) -> None:
+    """A job comes back into the queue, behind all that were released or came back before it.
+
+    Args:
+        until_s: End of the step: what is released later comes later.
+    """
+    queue, queued_s = o.queue, s.queued_s
+    since_s, place = queued_s[e, j], o.head[e] - 1
+    o.head[e] = place
+    while place + 1 < d.jobs[e]:
+        ahead = queue[e, place + 1]
+        came_s = queued_s[e, ahead]
+        if d.release_s[e, ahead] > until_s or came_s > since_s or (came_s == since_s and ahead > j):
+            break
+        queue[e, place] = ahead
+        place += 1
+    queue[e, place] = j
 
 
 @inner
@@ -160,15 +182,16 @@ def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array) -> None:
     clear_at_s, faults, peak_c, above_warning_s = s.clear_at_s, s.faults, s.peak_c, s.above_warning_s
     busy_s, lost_s, energy_j, status, queued_s = s.busy_s, s.lost_s, s.energy_j, s.status, s.queued_s
     cycles, returns, finished_s, left = s.cycles, s.returns, s.finished_s, o.open
-    ambient_c, phi, gamma, to_ambient = t.ambient_c, t.phi, t.gamma, t.to_ambient
+    ambient_c, steps, to_ambient = t.ambient_c, t.step, t.to_ambient
     copper, idle_w, rest_sq, rest_friction_w = t.copper, t.idle_w, t.rest_sq, t.rest_friction_w
     times_s, current_sq, friction_w, plans, values = t.times_s, t.current_sq, t.friction_w, t.plan, t.value
     dt_s, alpha_kt, alpha_cu, reference_c = t.dt_s, t.alpha_kt, t.alpha_cu, t.reference_c
     warning_c, error_c = t.warning_c, t.error_c
-    heat, load, end = np.empty(NODES), np.empty(NODES), np.empty(NODES)
+    motor_w, friction, fold = np.empty(LANES), np.empty(LANES), np.empty(4)
+    begin, end = np.zeros(2 * NODES + LANES), np.empty(WIDE)  # the temperatures, the loads, and what pads them
     envs, arms = modes.shape
     for e in range(envs):
-        lot, tick = lots[e], ticks[e]
+        lot, tick = natural(lots[e]), natural(ticks[e])
         now_s, moment = tick * dt_s, min(tick, t.ticks - 1)
         value = late = above_s = count = energy = 0.0
         for a in range(arms):
@@ -176,7 +199,7 @@ def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array) -> None:
             plan, spent_s, done_s, home_s = 0, 0.0, np.inf, np.inf
             first_s = cycle_s = share_0 = share_1 = share_2 = 0.0
             if mode == WORKING:
-                plan = plans[lot, a, kinds[e, j]]
+                plan = natural(plans[lot, a, natural(kinds[e, j])])
                 begin_s = progress_s[e, a]
                 until_s = begin_s + dt_s
                 first_s, cycle_s = times_s[plan, 0], times_s[plan, 1]
@@ -194,32 +217,34 @@ def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array) -> None:
             rest = 0.0 if mode == FAULTED else (dt_s - spent_s) / dt_s
             powered = 0.0 if t.power_off and mode == FAULTED else 1.0
             air_c = ambient_c[lot, moment, a] + airs_k[e]
-            for k in range(JOINTS):
+            for n in range(NODES):
+                begin[n] = temp_c[e, a, n]
+            for k in range(LANES):
                 amps_sq = share_0 * current_sq[plan, 0, k] + share_1 * current_sq[plan, 1, k]
                 amps_sq += share_2 * current_sq[plan, 2, k] + rest * rest_sq[lot, a, k]
                 rubbed_w = share_0 * friction_w[plan, 0, k] + share_1 * friction_w[plan, 1, k]
                 rubbed_w += share_2 * friction_w[plan, 2, k] + rest * rest_friction_w[lot, a, k]
-                factor = 1.0 + alpha_kt * (temp_c[e, a, JOINTS + k] - reference_c)
-                warmer = 1.0 + alpha_cu * (temp_c[e, a, k] - reference_c)
-                heat[k] = copper[lot, a, k] * warmer * (amps_sq / (factor * factor))
-                heat[JOINTS + k] = rubbed_w + powered * idle_w[lot, a, k]
-            heat_w = 0.0
-            for n in range(NODES):
-                heat_w += heat[n]
-                load[n] = heat[n] + to_ambient[lot, a, n] * air_c
-                end[n] = 0.0
-            for n in range(NODES):
-                from_c, into_w = temp_c[e, a, n], load[n]
-                for m in range(NODES):
-                    end[m] += phi[lot, a, n, m] * from_c + gamma[lot, a, n, m] * into_w
-            first_c, last_c = temp_c[e, a, 0], end[0]
-            for k in range(1, JOINTS):
-                first_c, last_c = max(first_c, temp_c[e, a, k]), max(last_c, end[k])
+                factor = 1.0 + alpha_kt * (begin[JOINTS + k] - reference_c)
+                warmer = 1.0 + alpha_cu * (begin[k] - reference_c)
+                motor_w[k] = copper[lot, a, k] * warmer * (amps_sq / (factor * factor))
+                friction[k] = rubbed_w + powered * idle_w[lot, a, k]
+            for k in range(4):
+                fold[k] = (motor_w[k] + friction[k]) + (motor_w[4 + k] + friction[4 + k])
+            heat_w = (fold[0] + fold[1]) + (fold[2] + fold[3])
+            for k in range(JOINTS):
+                begin[NODES + k] = motor_w[k] + to_ambient[lot, a, k] * air_c
+                begin[NODES + JOINTS + k] = friction[k] + to_ambient[lot, a, JOINTS + k] * air_c
+            for m in range(WIDE):
+                into = 0.0
+                for n in range(2 * NODES):
+                    into += steps[lot, a, n, m] * begin[n]
+                end[m] = into
+            first_c, last_c = hottest(begin), hottest(end)
             cut_s, here_s, here_j, top_c, cool_s = dt_s, 0.0, heat_w * dt_s, last_c, np.inf
             if mode != FAULTED and last_c < error_c and (first_c >= warning_c) == (last_c >= warning_c):
                 here_s = dt_s if first_c >= warning_c else 0.0
             else:
-                cut_s, here_s, here_j, top_c, cool_s = boil(t, lot, a, mode, temp_c[e, a], heat, heat_w, air_c, end)
+                cut_s, here_s, here_j, top_c, cool_s = boil(t, lot, a, mode, begin, heat_w, air_c, end)
             energy_j[e, a] += here_j
             above_warning_s[e, a] += here_s
             peak_c[e, a] = max(peak_c[e, a], top_c)
@@ -247,6 +272,7 @@ def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array) -> None:
                     cycles[e, j] += min(max(kept, 0), todo[e, a])
                     status[e, j], queued_s[e, j] = WAITING, now_s + cut_s
                     returns[e, j] += 1
+                    put_back(d, s, o, e, j, now_s + dt_s)
                 count += 1.0
                 faults[e, a] += 1
                 lost_s[e, a] += dt_s - cut_s
@@ -263,16 +289,19 @@ def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array) -> None:
 
 @inner
 def boil(
-    t: Tables, lot: int, a: int, mode: int, begin: Array, heat: Array, heat_w: float, air_c: float, end: Array
+    t: Tables, lot: int, a: int, mode: int, begin: Array, heat_w: float, air_c: float, end: Array
 ) -> tuple[float, float, float, float, float]:
     """The rare step of an arm that passes a limit or is faulted; `end` becomes what it really ends at.
+
+    Args:
+        begin: Temperatures, then loads (heat and what the air gives), [from].
 
     Returns:
         Seconds until a fault stops it (the whole step if none does), seconds above the warning limit, energy in J,
         the hottest that counts, and the moment from which every motor is below the restart limit (inf if none).
     """
     dt_s, now, modal = t.dt_s, np.empty(NODES), np.empty((2, NODES))
-    into_modes(t, lot, a, begin, heat, air_c, modal)
+    into_modes(t, lot, a, begin, begin[NODES:], modal)
     faulted, cut_s = mode == FAULTED, dt_s
     if not faulted and hottest(end) >= t.error_c:
         cut_s = 0.0
@@ -289,15 +318,15 @@ def boil(
         return dt_s, above, heat_w * dt_s, last_c, cool_s
     above = above_s(t, lot, a, modal, begin, cut_s, now)
     stopped, brakes = now.copy(), np.empty(NODES)
-    braked_heat(t, lot, a, brakes)
-    into_modes(t, lot, a, stopped, brakes, air_c, modal)
+    brakes_w = braked_load(t, lot, a, air_c, brakes)
+    into_modes(t, lot, a, stopped, brakes, modal)
     left_s, peak = dt_s - cut_s, hottest(stopped)
     above += above_s(t, lot, a, modal, stopped, left_s, now)
-    end[:] = now
+    end[:NODES] = now
     peak = max(peak, hottest(end))
     cool_s = np.inf
     if hottest(end) < t.restart_c:
         cool_s = cut_s
         if peak >= t.restart_c:
             cool_s = cut_s + crossing_s(t, lot, a, modal, left_s, t.restart_c, False, now)
-    return cut_s, above, heat_w * cut_s + brakes.sum() * left_s, peak, cool_s
+    return cut_s, above, heat_w * cut_s + brakes_w * left_s, peak, cool_s

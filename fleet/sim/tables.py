@@ -15,6 +15,9 @@ from fleet.sim.state import State, World
 
 Array = np.ndarray
 
+LANES, WIDE = 8, 16
+"""Joints and nodes are padded to so many, which a processor takes at once."""
+
 
 class Tables(NamedTuple):
     """All that does not change from shift to shift; see `World` for the meaning."""
@@ -31,9 +34,9 @@ class Tables(NamedTuple):
     reference_c: float
     ambient_c: Array
     """[lot, tick, arm]."""
-    phi: Array
-    """Transposed, [lot, arm, from node, to node], as gamma."""
-    gamma: Array
+    step: Array
+    """One step of the heat, [lot, arm, from, to node]: from the temperatures (the transposed phi), then from the loads
+    (gamma); its rows padded with zeros to `WIDE`."""
     to_ambient: Array
     """[lot, arm, node]."""
     root: Array
@@ -42,10 +45,11 @@ class Tables(NamedTuple):
     """[lot, arm, mode]."""
     modes: Array
     """[lot, arm, node, mode]."""
-    copper: Array
-    """[lot, arm, joint], as the following."""
-    idle_w: Array
     noise_k: Array
+    """[lot, arm, joint]."""
+    copper: Array
+    """[lot, arm, joint padded to `LANES`], as the following."""
+    idle_w: Array
     rest_sq: Array
     rest_friction_w: Array
     start_c: Array
@@ -53,13 +57,15 @@ class Tables(NamedTuple):
     times_s: Array
     """[plan, phase]."""
     current_sq: Array
-    """[plan, phase, joint]."""
+    """[plan, phase, joint padded to `LANES`]."""
     friction_w: Array
     plan: Array
     """Row of the plan tables, −1 for none, int [lot, arm, kind]."""
     difficulty: Array
     """[lot, arm, kind], NaN where not known."""
-    p_saturation: Array
+    word: Array
+    """What an arm says of a kind of job, [lot, arm, kind, 5]: seconds on the way there and back, seconds a cycle (zero
+    of what it cannot do), 1 if it knows a difficulty, the difficulty or 0, and P(saturation) or 0.5."""
     risk: Array
     """Row of the risk tables, −1 for none, int [lot, arm, kind]."""
     offset: Array
@@ -132,6 +138,10 @@ class Offer(NamedTuple):
     """int8 [env, arm, slot + 1]."""
     open: Array
     """Jobs not done, int [env]."""
+    queue: Array
+    """Jobs that wait, released or not, by the time they came, int32 [env, job]; they fill a row up to its last job."""
+    head: Array
+    """Where in its row the queue begins, int [env]."""
 
 
 def rows_of(state: State) -> Rows:
@@ -168,24 +178,23 @@ def tables_of(world: World) -> tuple[Tables, Drawn]:
         alpha_kt=float(motors.alpha_kt_per_k),
         reference_c=float(motors.reference_c),
         ambient_c=lots(world.ambient_c),
-        phi=lots(world.phi.swapaxes(-1, -2)),
-        gamma=lots(world.gamma.swapaxes(-1, -2)),
+        step=lots(_padded(np.concatenate([world.phi, world.gamma], axis=-1).swapaxes(-1, -2), 2, WIDE, 0.0)),
         to_ambient=lots(world.thermal.to_ambient),
         root=lots(np.sqrt(world.thermal.capacity)),
         rates=lots(world.thermal.rates),
         modes=lots(world.thermal.modes),
-        copper=lots(motors.copper_w_per_a2),
-        idle_w=lots(motors.idle_w),
+        copper=lots(_padded(motors.copper_w_per_a2, -1, LANES, 0.0)),
+        idle_w=lots(_padded(motors.idle_w, -1, LANES, 0.0)),
         noise_k=lots(motors.sensor_noise_k),
-        rest_sq=lots(world.rest.current_sq),
-        rest_friction_w=lots(world.rest.friction_w),
+        rest_sq=lots(_padded(world.rest.current_sq, -1, LANES, 0.0)),
+        rest_friction_w=lots(_padded(world.rest.friction_w, -1, LANES, 0.0)),
         start_c=lots(world.start_c),
         times_s=world.plans.times_s,
-        current_sq=world.plans.current_sq,
-        friction_w=world.plans.friction_w,
+        current_sq=_padded(world.plans.current_sq, -1, LANES, 0.0),
+        friction_w=_padded(world.plans.friction_w, -1, LANES, 0.0),
         plan=offers.plan,
         difficulty=offers.difficulty,
-        p_saturation=offers.p_saturation,
+        word=_words(world),
         risk=offers.risk,
         offset=offset,
         weight=weight,
@@ -207,6 +216,22 @@ def tables_of(world: World) -> tuple[Tables, Drawn]:
         after=jobs.after,
     )
     return owned(tables), owned(drawn)
+
+
+def _words(world: World) -> Array:
+    offers, can = world.offers, world.offers.plan >= 0
+    times_s = np.where(can[..., None], world.plans.times_s[offers.plan], 0.0)
+    known, p_known = ~np.isnan(offers.difficulty), ~np.isnan(offers.p_saturation)
+    return np.stack(
+        [
+            times_s[..., 0] + times_s[..., 2],
+            times_s[..., 1],
+            known,
+            np.where(known, offers.difficulty, 0.0),
+            np.where(p_known, offers.p_saturation, 0.5),
+        ],
+        axis=-1,
+    )
 
 
 def risk_tables(risks: Risk | None) -> tuple[Array, Array, Array]:
@@ -270,9 +295,9 @@ def stacked(fleets: Sequence[Tables]) -> Tables:
 
 _SHARED = ("dt_s", "ticks", "warning_c", "error_c", "restart_c", "clear_s", "power_off", "alpha_cu", "alpha_kt",
            "reference_c")  # fmt: skip
-_JOINED = ("ambient_c", "phi", "gamma", "to_ambient", "root", "rates", "modes", "copper", "idle_w", "noise_k",
+_JOINED = ("ambient_c", "step", "to_ambient", "root", "rates", "modes", "copper", "idle_w", "noise_k",
            "rest_sq", "rest_friction_w", "start_c", "times_s", "current_sq", "friction_w", "difficulty",
-           "p_saturation", "payload_kg", "value")  # fmt: skip
+           "word", "payload_kg", "value")  # fmt: skip
 
 
 def _padded(values: Array, axis: int, size: int, fill: float) -> Array:
