@@ -10,12 +10,16 @@ from hypothesis import settings
 
 from fleet.difficulty import Difficulty, DifficultyModel
 from fleet.env.allocation_v0 import Episode
+from fleet.env.engine import Shift
+from fleet.env.vector import Library
 from fleet.job import Job, Place, Work
 from fleet.motion import RATE_HZ, Phase, Plan
 from fleet.motor import Motors, gen3_motors
 from fleet.robot import JOINTS, Robot, ThermalLimits
+from fleet.sim.noise import key_of
 from fleet.sim.plants import ProfilePlant
 from fleet.sim.state import World
+from fleet.sim.tables import tables_of
 from fleet.sim.world import Arm, build_world
 from fleet.thermal import ThermalModel, gen3_network, thermal_model
 
@@ -129,6 +133,9 @@ def shop(
     return world, ProfilePlant(plans, rest_q, np.stack([a.rest_tau for a in arms]))
 
 
+WORKS = tuple(work(place, payload) for place in ("bench", "press", "rack") for payload in (LIGHT, WARM, HOT))
+
+
 @dataclass(frozen=True)
 class Shifts:
     """Makes random small shifts for an environment: mixed payloads, shared stations, precedence, heat."""
@@ -141,10 +148,15 @@ class Shifts:
     limits: ThermalLimits = field(default_factory=ThermalLimits)
 
     def __call__(self, seed: np.random.SeedSequence) -> Episode:
+        """The episode of a seed."""
+        jobs, sensors = self.drawn(seed)
+        world, plant = self.shop(jobs)
+        return Episode(world=world, plant=plant, twins=("by payload",) * self.arms, sensors=sensors)
+
+    def drawn(self, seed: np.random.SeedSequence) -> tuple[list[Job], np.random.SeedSequence]:
+        """The jobs of a seed, and that of its sensors."""
         jobs_seed, sensors = (np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, i)) for i in (0, 1))
         draw = np.random.default_rng(jobs_seed)
-        works = [work(place, payload) for place in ("bench", "press", "rack") for payload in (LIGHT, WARM, HOT)]
-        arms = [arm(i, works, times=Times(cycle=10.0 + 2.0 * i)) for i in range(self.arms)]
         jobs = []
         for i in range(self.jobs):
             before = (f"job_{i - 2}",) if i > 1 and draw.random() < 0.3 else ()
@@ -152,7 +164,7 @@ class Shifts:
             jobs.append(
                 job(
                     f"job_{i}",
-                    works[int(draw.integers(len(works)))],
+                    WORKS[int(draw.integers(len(WORKS)))],
                     repetitions=int(draw.integers(1, 6)),
                     release_s=release_s,
                     due_s=release_s + 100.0,
@@ -160,10 +172,42 @@ class Shifts:
                     after=before,
                 )
             )
-        world, plant = shop(
-            [jobs], arms=arms, limits=self.limits, ticks=self.ticks, slots=self.slots, ambient_c=self.ambient_c
+        return jobs, sensors
+
+    def shop(self, jobs: Sequence[Job]) -> tuple[World, ProfilePlant]:
+        """A world with these jobs."""
+        arms = [arm(i, WORKS, times=Times(cycle=10.0 + 2.0 * i)) for i in range(self.arms)]
+        return shop([jobs], arms=arms, limits=self.limits, ticks=self.ticks, slots=self.slots, ambient_c=self.ambient_c)
+
+    def library(self) -> Library:
+        """The same shifts for a batch."""
+        world, _ = self.shop([job(str(k), work, repetitions=n, value=v) for k, (work, n, v) in enumerate(KINDS)])
+        return Library(world.arms, self.slots, tables_of(world)[0], AsArrays(self))
+
+
+KINDS = tuple((each, n, float(v)) for each in WORKS for n in range(1, 6) for v in range(1, 5))
+"""Every work, number of repetitions and value that `Shifts` draws."""
+
+
+@dataclass(frozen=True)
+class AsArrays:
+    """Draws what `Shifts` draws, for a batch."""
+
+    shifts: Shifts
+
+    def __call__(self, seed: np.random.SeedSequence) -> Shift:
+        jobs, sensors = self.shifts.drawn(seed)
+        index = {each.name: j for j, each in enumerate(jobs)}
+        return Shift(
+            lot=0,
+            air_k=0.0,
+            kind=np.array([KINDS.index((each.work, each.repetitions, each.value)) for each in jobs], dtype=int),
+            release_s=np.array([each.release_s for each in jobs]),
+            due_s=np.array([each.due_s for each in jobs]),
+            repetitions=np.array([each.repetitions for each in jobs], dtype=int),
+            after=np.array([[index[name] for name in each.after] or [-1] for each in jobs], dtype=int).reshape(-1, 1),
+            key=key_of(sensors),
         )
-        return Episode(world=world, plant=plant, twins=("by payload",) * self.arms, sensors=sensors)
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,187 @@
+"""How environments are played through, and what they gave is compared."""
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fleet.env.allocation_v0 import AllocationEnv, parallel_env
+from fleet.env.vector import BatchEnv
+from scenarios.load import checked
+from scenarios.scenario import Scenario
+
+Trace = list[tuple[Any, ...]]
+
+
+def wild(env: AllocationEnv, rng: np.random.Generator) -> dict[str, int]:
+    """Mostly legal actions, some not."""
+    actions = {}
+    for arm, seen in env.knowledge().items():
+        legal = np.flatnonzero(seen.action_mask)
+        actions[arm] = int(rng.choice(legal)) if rng.random() < 0.9 else int(rng.integers(env.world.slots + 1))
+    return actions
+
+
+def go_on(env: AllocationEnv, rng: np.random.Generator, steps: int = 10_000) -> Trace:
+    """Everything the env gives until the end of the episode, or for so many steps."""
+    trace: Trace = []
+    while env.agents and len(trace) < steps:
+        trace.append(env.step(wild(env, rng)))
+    return trace
+
+
+def chosen(mask: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """Mostly legal actions, some not, [...], of a mask [..., slot + 1]; by numbers from 0 to 1, [..., 2]."""
+    slots = mask.shape[-1]
+    rank = np.floor(numbers[..., 0] * mask.sum(axis=-1)).astype(int)
+    legal = np.argmax(np.cumsum(mask, axis=-1) > rank[..., None], axis=-1)
+    return np.where(numbers[..., 1] < 0.9, legal, np.floor(numbers[..., 0] * slots).astype(int))
+
+
+def plain(trace: Any) -> Any:
+    """The same in lists and numbers, so that two can be compared with ==."""
+    if isinstance(trace, dict):
+        return {key: plain(value) for key, value in trace.items()}
+    if isinstance(trace, list | tuple):
+        return [plain(value) for value in trace]
+    return trace.tolist() if isinstance(trace, np.ndarray) else trace
+
+
+def rows(given: Any, which: Any) -> dict[str, Any]:
+    """Some rows of what a batch gave at a step or a reset, by name; `which` are env numbers."""
+    obs, info = given[0], given[-1]
+    which = np.atleast_1d(np.asarray(which, dtype=int))
+    out = {name: values[which] for name, values in obs.items()}
+    out |= {name: values[which] for name, values in zip(RETURNED, given[1:-1], strict=False)}
+    out |= {name: values[which] for name, values in info.items() if not name.startswith("final_")}
+    ended = info["final_envs"].tolist()
+    out["ended"] = np.array([e in ended for e in which.tolist()])
+    place = [ended.index(e) for e in which.tolist() if e in ended]
+    return out | {f"final_{name}": values[place] for name, values in info["final_obs"].items()}
+
+
+def single(env: AllocationEnv, given: Any) -> dict[str, Any]:
+    """What a single env gave at a step or a reset, as the only row of a batch."""
+    arms = env.possible_agents
+    seen, infos = given[0], given[-1]
+    out = {name: np.stack([seen[arm][name] for arm in arms])[None] for name in ("observation", "action_mask")}
+    for name, each in zip(RETURNED, given[1:-1], strict=False):
+        assert len(set(each.values())) == 1  # all arms alike
+        out[name] = np.array([each[arms[0]]])
+    for name in infos[arms[0]]:
+        per_arm = np.array([infos[arm][name] for arm in arms])
+        out[name] = per_arm[None] if name in PER_ARM else per_arm[:1]
+    return out
+
+
+def same(one: dict[str, Any], other: dict[str, Any]) -> None:
+    """To the last bit."""
+    assert list(one) == list(other)
+    for name, values in one.items():
+        np.testing.assert_array_equal(values, other[name], err_msg=name)
+
+
+RETURNED = ("reward", "terminated", "truncated")
+PER_ARM = ("faults", "illegal", "peak_c", "above_warning_s")
+
+
+def digest(*given: Any) -> str:
+    """A hash of everything in dictionaries, tuples and arrays, in the order it comes in."""
+    told = hashlib.sha256()
+
+    def tell(value: Any) -> None:
+        if isinstance(value, dict):
+            for key, each in value.items():
+                told.update(str(key).encode())
+                tell(each)
+        elif isinstance(value, list | tuple):
+            for each in value:
+                tell(each)
+        else:
+            array = np.asarray(value)
+            told.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
+
+    tell(given)
+    return told.hexdigest()
+
+
+@pytest.fixture(scope="session")
+def play() -> SimpleNamespace:
+    """How environments are played through, and what they gave is compared."""
+    return SimpleNamespace(
+        wild=wild, go_on=go_on, chosen=chosen, plain=plain, rows=rows, same=same, single=single, digest=digest,
+        PATH=__file__,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def make(small) -> Callable[..., AllocationEnv]:
+    """Makes a small environment; `shift` are the options of its shifts."""
+
+    def make_env(shift: dict[str, Any] | None = None, **options: Any) -> AllocationEnv:
+        return parallel_env(small.Shifts(**(shift or {})), **options)
+
+    return make_env
+
+
+@pytest.fixture
+def batch(small) -> Callable[..., BatchEnv]:
+    """Makes a small batch; `shift` are the options of its shifts."""
+
+    def make_batch(num_envs: int, shift: dict[str, Any] | None = None, **options: Any) -> BatchEnv:
+        return BatchEnv(small.Shifts(**(shift or {})).library(), num_envs, **options)
+
+    return make_batch
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of plans, which all tests of a run share; never the user's."""
+    return tmp_path_factory.getbasetemp() / "cache"
+
+
+@pytest.fixture(scope="session")
+def cell() -> Scenario:
+    """A cell of three arms, planned in a second, hot enough to fault."""
+    return checked(CELL, Path("cell.toml"))
+
+
+CELL: dict[str, Any] = {
+    "name": "cell",
+    "description": "Three arms, one of which cannot hold.",
+    "horizon_s": 600.0,
+    "slots": 4,
+    "ambient": {"points": [[0.0, 30.0], [600.0, 32.0]]},
+    "limits": {"warning_c": 34.5, "error_c": 35.0, "restart_c": 34.0, "clear_s": 15.0},
+    "start": "cold",
+    "arms": [
+        {"name": "left", "position_m": [-0.45, 0.0, 0.0]},
+        {"name": "right", "position_m": [0.45, 0.0, 0.0], "tilt_deg": [0.0, 0.0, 180.0], "wear": 0.3},
+        {"name": "far", "position_m": [0.0, 0.9, 0.55], "tilt_deg": [90.0, 0.0, 0.0]},
+    ],
+    "places": [
+        {"name": "bench", "position_m": [0.0, 0.2, 0.25]},
+        {"name": "shelf", "position_m": [0.0, -0.2, 0.25]},
+        {"name": "rack", "position_m": [0.0, 0.0, 0.3]},
+    ],
+    "jobs": [
+        {
+            "name": "hold", "kind": "hold", "places": ["bench"], "payload_kg": [3.0, 4.0], "repetitions": [2, 4],
+            "dwell_s": 15.0, "arrivals": {"kind": "poisson", "every_s": 60.0, "stop_s": 240.0}, "value": 3.0,
+            "due_s": 120.0,
+        },
+        {
+            "name": "sort", "kind": "sort", "places": ["shelf", "rack"], "payload_kg": [0.2, 0.5],
+            "repetitions": [1, 3], "arrivals": {"kind": "poisson", "every_s": 40.0, "stop_s": 200.0}, "due_s": 100.0,
+        },
+        {
+            "name": "check", "kind": "press", "places": ["rack"], "force_n": 20.0, "dwell_s": 4.0,
+            "arrivals": {"kind": "batch", "count": 3, "start_s": 60.0}, "after": ["sort"], "value": 2.0,
+        },
+    ],
+    "planning": {"elbows": 1, "speeds": [1.0]},
+}  # fmt: skip

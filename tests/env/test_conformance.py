@@ -1,0 +1,246 @@
+"""The environment's contract: PettingZoo's own checks, and what they leave open."""
+
+import warnings
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.spaces import Dict
+from pettingzoo.test import (
+    api_test,
+    max_cycles_test,
+    parallel_api_test,
+    parallel_seed_test,
+    render_test,
+    seed_test,
+    state_test,
+)
+
+from fleet.env import allocation_v0
+from fleet.env.reward import TERMS
+
+HOT = {"arms": 3, "ambient_c": 38.0}
+
+
+@pytest.fixture
+def quiet() -> Iterator[None]:
+    """Without what PettingZoo's tests say of every environment of this layout."""
+    with warnings.catch_warnings():
+        # A dictionary of vector and mask is the layout the field agrees on; api_test says so of every such env.
+        warnings.filterwarnings("ignore", message="Observation space for each agent probably should be")
+        warnings.filterwarnings("ignore", message="Observation is not a NumPy array")
+        # Its wrapper of parallel envs has these properties, and reading them warns.
+        warnings.filterwarnings("ignore", message="The `(observation|action)_spaces` dictionary is deprecated")
+        yield
+
+
+@pytest.fixture
+def module(small) -> SimpleNamespace:
+    """The environment of small shifts with the doors of a PettingZoo module."""
+    shifts = small.Shifts()
+    return SimpleNamespace(
+        env=lambda **options: allocation_v0.env(shifts, **options),
+        raw_env=lambda **options: allocation_v0.raw_env(shifts, **options),
+        parallel_env=lambda **options: allocation_v0.parallel_env(shifts, **options),
+    )
+
+
+# PettingZoo's checks
+
+
+@pytest.mark.parametrize("arms", [1, 2, 4])
+def test_it_is_a_parallel_env(make, arms) -> None:
+    parallel_api_test(make({"arms": arms}), num_cycles=200)
+
+
+@pytest.mark.parametrize("door", ["env", "raw_env"])
+def test_it_is_an_aec_env(module, quiet, door) -> None:
+    env = getattr(module, door)()
+    api_test(env, num_cycles=120)
+    assert env.metadata["name"] == "allocation_v0"
+
+
+@pytest.mark.parametrize("keep_events", [False, True])
+def test_the_same_seed_gives_the_same_episode_to_pettingzoo(module, keep_events) -> None:
+    parallel_seed_test(lambda: module.parallel_env(keep_events=keep_events), num_cycles=100)
+    seed_test(lambda: module.env(keep_events=keep_events), num_cycles=100)
+
+
+def test_max_cycles_are_those_pettingzoo_asks_for(module) -> None:
+    max_cycles_test(module)
+
+
+def test_it_renders_as_pettingzoo_asks(module, monkeypatch) -> None:
+    monkeypatch.setattr("matplotlib.get_backend", lambda: "agg")  # no window pops up
+    render_test(module.env, {"ansi": lambda text: text.startswith("t = ")})
+
+
+def test_its_state_is_as_pettingzoo_asks(module, quiet) -> None:
+    state_test(module.env(), module.parallel_env(), num_cycles=50)
+
+
+# What they leave open: every step of whole episodes
+
+
+@pytest.mark.parametrize("options", [{}, {"keep_events": True}, {"mask_in": "both"}, {"mask_in": "info"}])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_all_that_a_parallel_env_gives_is_in_its_spaces(make, play, seed, options) -> None:
+    env = make(HOT, **options)
+    observations, infos = env.reset(seed=seed)
+    rng, keys, ended = np.random.default_rng(seed), list(infos["arm_0"]), []
+    while True:
+        assert list(observations) == list(infos) == env.possible_agents
+        for arm, seen in observations.items():
+            fits(env.observation_space(arm), seen)
+            masks = [each["action_mask"] for each in (seen, infos[arm]) if "action_mask" in each]
+            assert len(masks) == (2 if options.get("mask_in") == "both" else 1)
+            for mask in masks:
+                assert mask.dtype == np.int8
+                assert mask[0] == 1
+                np.testing.assert_array_equal(mask, env.knowledge()[arm].action_mask)
+        assert env.state_space.contains(env.state())
+        for info in infos.values():
+            assert list(info) == keys
+            numbers = [value for name, value in info.items() if name != "action_mask"]
+            assert all(type(value) is float and np.isfinite(value) for value in numbers)
+        if not env.agents:
+            break
+        observations, rewards, terminated, truncated, infos = env.step(play.wild(env, rng))
+        for given in (rewards, terminated, truncated):
+            assert list(given) == env.possible_agents
+            assert len(set(given.values())) == 1
+        assert [type(given["arm_0"]) for given in (rewards, terminated, truncated)] == [float, bool, bool]
+        assert rewards["arm_1"] == pytest.approx(sum(infos["arm_1"][f"reward_{name}"] for name in TERMS), abs=1e-12)
+        ended.append(terminated["arm_0"] + truncated["arm_0"])
+    assert ended == [0] * (len(ended) - 1) + [1]
+
+
+def test_all_that_an_aec_env_gives_is_in_its_spaces(module) -> None:
+    env = module.env()
+    for seed in range(3):
+        env.reset(seed=seed)
+        rng, keys, turns, ends = np.random.default_rng(seed), None, 0, set()
+        for arm in env.agent_iter():
+            seen, reward, terminated, truncated, info = env.last()
+            fits(env.observation_space(arm), seen)
+            assert np.isfinite(reward)
+            keys = keys or list(info)
+            assert list(info) == keys
+            if terminated or truncated:
+                ends.add((terminated, truncated))
+                env.step(None)
+                continue
+            assert arm == env.possible_agents[turns % env.max_num_agents]
+            turns += 1
+            env.step(int(rng.choice(np.flatnonzero(seen["action_mask"]))))
+        assert len(ends) == 1
+        assert turns % env.max_num_agents == 0
+
+
+def test_all_that_a_batch_gives_is_in_its_spaces(batch, play) -> None:
+    env, rng = batch(9, HOT, seed=0), np.random.default_rng(0)
+    given = env.reset()
+    keys = list(given[1])
+    for _ in range(100):
+        obs, info = given[0], given[-1]
+        for each in (obs, info["final_obs"]):
+            for arms in zip(each["observation"], each["action_mask"], strict=True):
+                for vector, mask in zip(*arms, strict=True):
+                    fits(env.single_observation_space, {"observation": vector, "action_mask": mask})
+        assert list(info) == keys
+        assert {name: (v.dtype.kind, v.shape) for name, v in info.items() if not name.startswith("final")} == {
+            **{name: ("i", (9, 3)) for name in ("faults", "illegal")},
+            **{name: ("f", (9, 3)) for name in ("peak_c", "above_warning_s")},
+            "jobs_done": ("i", (9,)),
+            **{f"reward_{name}": ("f", (9,)) for name in TERMS},
+        }
+        actions = play.chosen(obs["action_mask"], rng.random((9, 3, 2)))
+        given = env.step(actions)
+        _, reward, terminated, truncated, info = given
+        assert [(v.dtype, v.shape) for v in given[1:4]] == [(float, (9,)), (bool, (9,)), (bool, (9,))]
+        np.testing.assert_allclose(reward, sum(info[f"reward_{name}"] for name in TERMS), atol=1e-12)
+        assert not (terminated & truncated).any()
+        np.testing.assert_array_equal(np.flatnonzero(terminated | truncated), info["final_envs"])
+
+
+def fits(space: Any, seen: Any) -> None:
+    """In its space and a number throughout."""
+    assert space.contains(seen)
+    assert np.isfinite(seen["observation"] if isinstance(space, Dict) else seen).all()
+
+
+# Objects
+
+
+def test_spaces_are_the_same_objects_at_every_call(make) -> None:
+    env = make()
+    for arm in env.possible_agents:
+        assert env.observation_space(arm) is env.observation_space(arm) is env.observation_spaces[arm]
+        assert env.action_space(arm) is env.action_space(arm) is env.action_spaces[arm]
+    before = [*env.observation_spaces.values(), *env.action_spaces.values(), env.state_space]
+    env.reset(seed=0)
+    env.step({})
+    after = [*env.observation_spaces.values(), *env.action_spaces.values(), env.state_space]
+    assert all(one is other for one, other in zip(before, after, strict=True))
+    assert len(set(map(id, before))) == len(before)  # so that seeding one agent's space seeds no other
+
+
+def test_wrappers_find_what_they_look_for(make) -> None:
+    env = make(render_mode="ansi")
+    assert env.unwrapped.render_mode == "ansi"
+    assert env.metadata["is_parallelizable"]
+    assert set(env.metadata["render_modes"]) == {"ansi", "rgb_array", "human"}
+    assert (env.max_num_agents, env.num_agents) == (3, 0)
+    env.reset(seed=0)
+    assert env.num_agents == 3
+
+
+@pytest.mark.parametrize("keep_events", [False, True])
+def test_nothing_that_is_handed_out_is_the_env_s_own(make, play, keep_events) -> None:
+    options = {"keep_events": keep_events, "mask_in": "both"}
+    env, untouched = make(**options), make(**options)
+    rng, other = np.random.default_rng(2), np.random.default_rng(2)
+    handed, kept = env.reset(seed=2), untouched.reset(seed=2)
+    for _ in range(15):
+        assert play.plain(handed) == play.plain(kept)
+        for arm in env.possible_agents:
+            handed[0][arm]["observation"][:] = -1.0
+            handed[0][arm]["action_mask"][:] = 0
+            handed[-1][arm]["action_mask"][:] = 0
+            handed[-1][arm]["peak_c"] = -1.0
+        for part in handed:
+            part["__all__"] = part.pop("arm_0")  # as RLlib does
+        env.state()[:] = 0.0
+        for seen in env.knowledge().values():
+            seen.temp_c[:] = 0.0
+            seen.action_mask[:] = 0
+        assert play.plain(env.state()) == play.plain(untouched.state())
+        for arm, seen in untouched.knowledge().items():
+            assert play.plain(vars(env.knowledge()[arm])) == play.plain(vars(seen))
+        env.agents.reverse()
+        handed, kept = env.step(play.wild(env, rng)), untouched.step(play.wild(untouched, other))
+
+
+def test_nothing_that_a_batch_hands_out_is_its_own(batch, play) -> None:
+    env, untouched = (batch(6, {"jobs": 4, "ticks": 12}, seed=3) for _ in range(2))
+    rng, handed, kept = np.random.default_rng(2), env.reset(), untouched.reset()
+    for step in range(30):
+        play.same(play.rows(handed, range(6)), play.rows(kept, range(6)))
+        actions = play.chosen(kept[0]["action_mask"], rng.random((6, 3, 2)))
+        for part in (handed[0], handed[-1], handed[-1]["final_obs"]):
+            for name in list(part):
+                if isinstance(part[name], np.ndarray):
+                    part[name][...] = 1
+                part[f"{name} of mine"] = None
+        for values in (*handed[1:-1], *vars(env.state).values(), *vars(env.knowledge()).values()):
+            values[...] = 1
+        play.same(vars(env.knowledge()), vars(untouched.knowledge()))
+        play.same(vars(env.state), vars(untouched.state))
+        if step % 7 == 3:
+            some = {"rows": [1, 4]}
+            handed, kept = env.reset(**some), untouched.reset(**some)
+            play.same(play.rows(handed, range(6)), play.rows(kept, range(6)))
+            actions = np.where(np.isin(np.arange(6), [1, 4])[:, None], 0, actions)
+        handed, kept = env.step(actions), untouched.step(actions)

@@ -1,0 +1,203 @@
+"""The batch: a row is the single environment, bit for bit, whatever the company it is in."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet.env.vector import BatchEnv, Library
+
+SHIFT: dict[str, Any] = {"arms": 3, "jobs": 4, "ticks": 22, "ambient_c": 20.0}
+"""Some of these shifts end with the work, some at the horizon, at different times."""
+STEPS = 110
+SEED = 100
+
+
+def numbers(env: int, steps: int = STEPS, arms: int = 3) -> np.ndarray:
+    """What decides the actions of one env at every step, [step, arm, 2]."""
+    return np.random.default_rng(1000 + env).random((steps, arms, 2))
+
+
+def played(env: BatchEnv, play, who: list[int], steps: int = STEPS) -> list[dict[str, Any]]:
+    """All that rows gave from reset on, whose actions are those of the envs `who`."""
+    all_numbers = np.stack([numbers(e, steps) for e in who], axis=1)
+    given = env.reset()
+    trace = [play.rows(given, range(env.num_envs))]
+    for each in all_numbers:
+        given = env.step(play.chosen(given[0]["action_mask"], each))
+        trace.append(play.rows(given, range(env.num_envs)))
+    return trace
+
+
+def row(step: dict[str, Any], e: int) -> dict[str, Any]:
+    """One row of what `played` tells of a step."""
+    place = int(np.count_nonzero(step["ended"][:e]))
+    ended = bool(step["ended"][e])
+    return {n: v[place : place + ended] if n.startswith("final_") else v[e : e + 1] for n, v in step.items()}
+
+
+@pytest.fixture(scope="module")
+def library(small) -> Library:
+    """Of these shifts."""
+    return small.Shifts(**SHIFT).library()
+
+
+@pytest.fixture(scope="module")
+def many(library, play) -> list[dict[str, Any]]:
+    """What 64 envs gave."""
+    return played(BatchEnv(library, 64, seed=SEED), play, list(range(64)))
+
+
+# Alone or in company
+
+
+def test_shifts_of_these_tests_end_in_both_ways_and_at_different_times(many) -> None:
+    terminated = np.array([step["terminated"] for step in many[1:]])
+    truncated = np.array([step["truncated"] for step in many[1:]])
+    assert min(terminated.sum(), truncated.sum()) > 20
+    assert not (terminated & truncated).any()
+    assert len(set((terminated | truncated).argmax(axis=0).tolist())) > 5
+    assert (terminated | truncated).sum(axis=0).min() >= 3  # each env is in its fourth shift at least
+
+
+@pytest.mark.parametrize("who", [[0], [1], [40], [63], [5, 6, 7, 8, 9, 10, 11], [63, 2, 31, 0, 17, 30, 44]])
+def test_a_row_is_the_same_in_whatever_company_and_order(many, batch, play, who) -> None:
+    trace = played(batch(len(who), SHIFT, seed=[SEED + e for e in who]), play, who)
+    for one, all_rows in zip(trace, many, strict=True):
+        for place, e in enumerate(who):
+            play.same(row(one, place), row(all_rows, e))
+
+
+@pytest.mark.parametrize("keep_events", [False, True], ids=["compiled", "plain"])
+@pytest.mark.parametrize("e", [0, 1, 5, 40])
+def test_a_row_is_the_single_env_through_all_its_resets(many, make, play, e, keep_events) -> None:
+    env = make(SHIFT, keep_events=keep_events)
+    exact = not keep_events  # the plain kernel sums in another order
+    equal(play, play.single(env, env.reset(seed=SEED + e)), row(many[0], e), exact)
+    for step, each in zip(many[1:], numbers(e), strict=True):
+        mask = np.stack([seen.action_mask for seen in env.knowledge().values()])
+        actions = dict(zip(env.possible_agents, play.chosen(mask, each).tolist(), strict=True))
+        found, expected = play.single(env, env.step(actions)), row(step, e)
+        assert expected["ended"][0] == (not env.agents)
+        if not env.agents:
+            last = {name: found[name] for name in ("observation", "action_mask")}
+            equal(play, last, {name: expected[f"final_{name}"] for name in last}, exact)
+            first = play.single(env, env.reset())
+            found |= {name: first[name] for name in last}
+        equal(play, found, expected, exact)
+
+
+def equal(play, found: dict[str, Any], expected: dict[str, Any], exact: bool) -> None:
+    expected = {name: expected[name] for name in found}
+    if exact:
+        play.same(found, expected)
+        return
+    for name, values in found.items():
+        np.testing.assert_allclose(values, expected[name], rtol=1e-6, atol=1e-5, err_msg=name)
+
+
+def test_one_seed_counts_up_and_a_list_is_taken_as_it_is(batch, play) -> None:
+    up, listed = batch(5, SHIFT, seed=7).reset(), batch(5, SHIFT, seed=[7, 8, 9, 10, 11]).reset()
+    play.same(up[0], listed[0])
+    again = batch(5, SHIFT, seed=1)
+    again.reset()
+    again.step(np.zeros((5, 3), int))
+    for seed in (7, np.int64(7), np.arange(7, 12)):
+        play.same(again.reset(seed=seed)[0], up[0])
+    alike = batch(3, SHIFT, seed=[4, 4, 4]).reset()[0]
+    assert (alike["observation"] == alike["observation"][:1]).all()
+
+
+# Resets
+
+
+def test_the_first_of_the_new_shift_is_what_a_reset_gives(batch, play) -> None:
+    """With and without going on by itself: the same shifts, one step later or not."""
+    by_itself, by_hand = batch(16, SHIFT, seed=3), batch(16, SHIFT, seed=3, autoreset=False)
+    one, other = by_itself.reset(), by_hand.reset()
+    play.same(one[0], other[0])
+    ends, rng = 0, np.random.default_rng(0)
+    for _ in range(STEPS):
+        actions = play.chosen(one[0]["action_mask"], rng.random((16, 3, 2)))
+        one, other = by_itself.step(actions), by_hand.step(actions)
+        for a, b in zip(one[1:4], other[1:4], strict=True):
+            np.testing.assert_array_equal(a, b)
+        over = other[2] | other[3]
+        np.testing.assert_array_equal(np.flatnonzero(over), other[4]["final_envs"])
+        np.testing.assert_array_equal(one[4]["final_envs"], other[4]["final_envs"])
+        play.same(one[4]["final_obs"], {name: values[over] for name, values in other[0].items()})
+        for name in ("faults", "peak_c", "jobs_done", "reward_energy"):  # of the step made, not of the shift begun
+            np.testing.assert_array_equal(one[4][name], other[4][name])
+        assert len(other[4]["final_obs"]["observation"]) == 0
+        if over.any():
+            ends += 1
+            fresh, _ = by_hand.reset(rows=over if ends % 2 else np.flatnonzero(over))
+            play.same(one[0], fresh)
+        else:
+            play.same(one[0], other[0])
+        play.same(vars(by_itself.knowledge()), vars(by_hand.knowledge()))
+        play.same(vars(by_itself.state), vars(by_hand.state))
+    assert ends > 10
+
+
+@settings(max_examples=20)
+@given(chosen=st.sets(st.integers(0, 5)), as_mask=st.booleans(), at=st.integers(0, 30))
+def test_resetting_some_rows_leaves_the_others_as_they_are(library, play, chosen, as_mask, at) -> None:
+    one, other, rng = BatchEnv(library, 6, seed=1), BatchEnv(library, 6, seed=1), np.random.default_rng(at)
+    here, there = one.reset(), other.reset()
+    for _ in range(at):
+        actions = play.chosen(here[0]["action_mask"], rng.random((6, 3, 2)))
+        here, there = one.step(actions), other.step(actions)
+    rest = [e for e in range(6) if e not in chosen]
+    rows = np.isin(np.arange(6), list(chosen)) if as_mask else sorted(chosen)
+    obs, _ = one.reset(rows=rows)
+    for _ in range(20):
+        play.same({n: v[rest] for n, v in obs.items()}, {n: v[rest] for n, v in there[0].items()})
+        actions = play.chosen(there[0]["action_mask"], rng.random((6, 3, 2)))
+        here, there = one.step(actions), other.step(actions)
+        obs = here[0]
+        play.same(play.rows(here, rest), play.rows(there, rest))
+
+
+def test_a_reset_begins_anew_and_leaves_nothing_of_before(batch, play) -> None:
+    used, fresh = batch(8, SHIFT, seed=5), batch(8, SHIFT, seed=5)
+    one, rng = used.reset(), np.random.default_rng(0)
+    for _ in range(37):
+        one = used.step(play.chosen(one[0]["action_mask"], rng.random((8, 3, 2))))
+    one, other = used.reset(seed=21), fresh.reset(seed=21)
+    for _ in range(40):
+        play.same(play.rows(one, range(8)), play.rows(other, range(8)))
+        actions = play.chosen(one[0]["action_mask"], rng.random((8, 3, 2)))
+        one, other = used.step(actions), fresh.step(actions)
+
+
+def test_room_for_more_jobs_is_made_without_a_trace(small, library, play) -> None:
+    """A row with many jobs makes room in all; those of few jobs never need it."""
+    few, lots = library.draw, small.Shifts(**{**SHIFT, "jobs": 23}).library().draw
+    mixing = replace(library, draw=lambda seed: (lots if seed.entropy == 2 else few)(seed))
+    mixed, alone = BatchEnv(mixing, 3, seed=0), BatchEnv(library, 2, seed=0)
+    one, other, rng = mixed.reset(), alone.reset(), np.random.default_rng(0)
+    for _ in range(12):
+        play.same(play.rows(one, range(2)), play.rows(other, range(2)))
+        actions = play.chosen(one[0]["action_mask"], rng.random((3, 3, 2)))
+        one, other = mixed.step(actions), alone.step(actions[:2])
+    assert mixed.state.status.shape[1] >= 23 > alone.state.status.shape[1]
+
+
+def test_max_cycles_end_a_shift_earlier(batch) -> None:
+    env = batch(3, SHIFT, seed=0, max_cycles=5)
+    env.reset()
+    ends = [env.step(np.zeros((3, 3), int))[3].tolist() for _ in range(11)]
+    assert [all(end) for end in ends] == [False] * 4 + [True] + [False] * 4 + [True, False]
+
+
+def test_the_knowledge_of_a_batch_is_that_of_its_rows(batch, make, play) -> None:
+    env, one = batch(3, SHIFT, seed=8), make(SHIFT)
+    env.reset()
+    one.reset(seed=9)
+    known = vars(env.knowledge())
+    for a, seen in enumerate(one.knowledge().values()):
+        play.same({name: values[1, a] for name, values in known.items()}, vars(seen))
