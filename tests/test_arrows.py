@@ -18,6 +18,7 @@ NOUNS_OF_LAWS = ("robot", "job", "errors")
 
 SIM_LIBRARIES = ("mujoco", "mink", "ruckig")
 TRAINERS = ("agilerl", "benchmarl", "ray", "sb3_contrib", "stable_baselines3", "tianshou")
+TENSORS = ("torch", "torchrl", "tensordict")
 HEAVY = ("torch", "mujoco", "zenoh")
 
 
@@ -92,8 +93,10 @@ def library_allowed(importer: str, library: str) -> bool:
         return importer == "fleet.bus.ros2_cdr"
     if library in TRAINERS:
         return below(importer, "fleet.env.adapters")
-    if library == "torch":
-        return below(importer, "twin", "agents.learned", "fleet.env.adapters")
+    if library in TENSORS:
+        return below(importer, "agents.learned", "fleet.env.adapters") or (
+            library == "torch" and below(importer, "twin")
+        )
     return True
 
 
@@ -144,6 +147,8 @@ def test_the_wrong_way_is_seen(importer, imported):
         ("fleet.bus.ros2", "rosbags"),
         ("fleet.env.allocation_v0", "ray"),
         ("agents.learned.train", "stable_baselines3"),
+        ("fleet.env.vector", "torch"),
+        ("twin.train", "torchrl"),
     ],
 )
 def test_a_library_out_of_its_place_is_seen(importer, library):

@@ -62,7 +62,7 @@ def test_nothing_is_pinned_that_is_not_asked_for():
     assert set(pinned_in("constraints.txt")) == {re.split("[><=]", requirement)[0] for requirement in SHARED}
 
 
-OTHERWISE = {"rllib": {"gymnasium"}}
+OTHERWISE = {"agilerl": {"tensordict"}, "benchmarl": {"tensordict", "torchrl"}, "rllib": {"gymnasium"}}
 """What it wants in another version than everybody else."""
 
 

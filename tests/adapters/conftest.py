@@ -13,6 +13,7 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
 from fleet.env.allocation_v0 import parallel_env
+from fleet.env.vector import BatchEnv
 
 PAGE = Path(__file__).parents[2] / "docs" / "trainers.md"
 
@@ -112,6 +113,20 @@ def small_workshop(small) -> Callable[..., Workshop]:
 
 
 @pytest.fixture(scope="session")
+def small_batch(small) -> Callable[..., BatchEnv]:
+    """Makes batches of the same shifts, as `make_batch` does: scenario (any), number of envs, seed."""
+
+    def make(
+        scenario: str = "", num_envs: int = 4, seed: int | None = None, *, autoreset: bool = True, **shift: Any
+    ) -> BatchEnv:
+        known = {key: value for key, value in shift.items() if key not in ("difficulty", "horizon_s")}
+        shifts = small.Shifts(**({"arms": 3, "jobs": 8, "ticks": 15} | known))
+        return BatchEnv(shifts.library(), num_envs, seed=seed, autoreset=autoreset)
+
+    return make
+
+
+@pytest.fixture(scope="session")
 def elsewhere(small) -> Callable[[str, int], str]:
     """Trains with the `trained` of a test file in a process with this hash seed; gives the digest."""
 
@@ -129,7 +144,7 @@ def elsewhere(small) -> Callable[[str, int], str]:
 
 
 @pytest.fixture
-def example(small_workshop, monkeypatch, tmp_path) -> Callable[[str], dict[str, Any]]:
+def example(small_workshop, small_batch, monkeypatch, tmp_path) -> Callable[[str], dict[str, Any]]:
     """Runs a trainer's example of docs/trainers.md on a small shift; gives its variables, and the `log`."""
 
     def run(trainer: str) -> dict[str, Any]:
@@ -137,6 +152,7 @@ def example(small_workshop, monkeypatch, tmp_path) -> Callable[[str], dict[str, 
         code = section.split("```python\n")[1].split("```")[0]
         workshop = small_workshop()
         monkeypatch.setattr("scenarios.make_env", workshop, raising=False)
+        monkeypatch.setattr("scenarios.make_batch", small_batch, raising=False)
         monkeypatch.chdir(tmp_path)
         told: dict[str, Any] = {}
         exec(code, told)

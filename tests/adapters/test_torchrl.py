@@ -1,0 +1,246 @@
+"""TorchRL takes the batch: specs, masks, seeds, resets and ends, against the batch itself."""
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.envs import RewardSum, TransformedEnv, check_env_specs
+from torchrl.modules import MaskedCategorical
+
+from fleet.env.adapters.torchrl import TorchRLEnv
+from fleet.env.reward import TERMS
+from fleet.env.vector import BatchEnv
+
+ARMS, SLOTS, TICKS = 3, 4, 15
+
+
+@pytest.fixture(scope="module")
+def make(small_batch):
+    """Makes environments of small shifts: `make(envs, seed, state=…, infos=…, jobs=…)`."""
+
+    def make(envs: int = 5, seed: int | None = 3, *, state: bool = False, infos: bool = False, **shift) -> TorchRLEnv:
+        return TorchRLEnv(batch(envs, **shift), seed=seed, state=state, infos=infos)
+
+    def batch(envs: int, *, autoreset: bool = False, **shift) -> BatchEnv:
+        return small_batch(num_envs=envs, autoreset=autoreset, **shift)
+
+    make.batch = batch
+    return make
+
+
+BRIEF = {"jobs": 1, "ambient_c": 20.0, "ticks": 30}
+"""Shifts of one job: every row finishes it, each at another time."""
+
+
+def rolled(env: TorchRLEnv, steps: int, seed: int = 0) -> TensorDict:
+    torch.manual_seed(seed)
+    return env.rollout(steps, break_when_any_done=False)
+
+
+def same(one: TensorDict, two: TensorDict) -> bool:
+    return bool((one == two).all())
+
+
+@pytest.mark.parametrize("switches", [{}, {"state": True}, {"infos": True}, {"state": True, "infos": True}], ids=str)
+@pytest.mark.parametrize("envs", [1, 4])
+def test_torchrl_finds_the_specs_kept(make, envs, switches) -> None:
+    check_env_specs(make(envs, **switches))
+    check_env_specs(make(envs, **switches), break_when_any_done=False)
+
+
+def test_what_it_tells_lies_in_its_specs(make) -> None:
+    env = make(4, state=True, infos=True)
+    frames = rolled(env, 40)
+    for at in range(40):
+        assert env.observation_spec.is_in(frames[:, at].select(*env.observation_spec.keys(True, True)))
+        assert env.observation_spec.is_in(frames["next"][:, at].select(*env.observation_spec.keys(True, True)))
+
+
+@pytest.mark.parametrize("shift", [{}, BRIEF], ids=["cut", "brief"])
+def test_a_rollout_is_the_batch_stepped_by_hand(make, shift) -> None:
+    """The second way: a batch that begins new shifts by itself, given the same claims."""
+    frames = rolled(make(6, seed=11, state=True, infos=True, **shift), 70)
+    batch = make.batch(6, autoreset=True, **shift)
+    obs, _ = batch.reset(seed=11)
+    ends = 0
+    for at in range(70):
+        now, after = frames[:, at], frames["next"][:, at]
+        np.testing.assert_array_equal(now["arms", "observation"], obs["observation"])
+        np.testing.assert_array_equal(now["arms", "action_mask"], obs["action_mask"] == 1)
+        np.testing.assert_array_equal(now["state"], obs["observation"].reshape(6, -1))
+        obs, reward, terminated, truncated, info = batch.step(now["arms", "action"].numpy())
+        last = {key: value.copy() for key, value in obs.items()}
+        for key, value in info["final_obs"].items():
+            last[key][info["final_envs"]] = value
+        np.testing.assert_array_equal(after["arms", "observation"], last["observation"])
+        np.testing.assert_array_equal(after["arms", "action_mask"], last["action_mask"] == 1)
+        np.testing.assert_array_equal(after["arms", "reward"], np.float32(reward)[:, None, None].repeat(ARMS, axis=1))
+        np.testing.assert_array_equal(after["terminated"][:, 0], terminated)
+        np.testing.assert_array_equal(after["truncated"][:, 0], truncated)
+        np.testing.assert_array_equal(after["done"][:, 0], terminated | truncated)
+        ends += int(after["done"].sum())
+    assert ends >= 6
+    assert bool(frames["next", "terminated"].any()) == (shift is BRIEF)
+    assert bool(frames["next", "truncated"].any()) == (shift is not BRIEF)
+
+
+def test_infos_are_those_of_the_batch(make) -> None:
+    frames = rolled(make(4, seed=2, infos=True, jobs=60, ticks=60), 55)
+    batch = make.batch(4, jobs=60, ticks=60)
+    batch.reset(seed=2)
+    for at in range(55):
+        *_, info = batch.step(frames["arms", "action"][:, at].numpy())
+        told, team = frames["next", "arms", "info"][:, at], frames["next", "info"][:, at]
+        for name in ("faults", "illegal", "peak_c", "above_warning_s"):
+            np.testing.assert_array_equal(told[name][..., 0], np.float32(info[name]))
+        np.testing.assert_array_equal(team["jobs_done"][:, 0], info["jobs_done"])
+    terms = sum(frames["next", "info", f"reward_{term}"] for term in TERMS)
+    np.testing.assert_allclose(terms, frames["next", "arms", "reward"][:, :, 0], rtol=1e-5, atol=1e-5)
+    assert frames["next", "info", "jobs_done"].max() > 0
+    assert frames["next", "arms", "info", "above_warning_s"].max() > 0
+
+
+def test_random_rollouts_send_no_illegal_action(make) -> None:
+    frames = rolled(make(16, infos=True), 60)
+    chosen = frames["arms", "action_mask"].gather(-1, frames["arms", "action"][..., None])
+    assert chosen.all()
+    assert (frames["arms", "action"] > 0).sum() > 100
+    assert frames["next", "arms", "info", "illegal"].max() == 0
+
+
+def test_what_is_sent_against_the_mask_waits_and_is_counted(make) -> None:
+    env = make(2, infos=True)
+    seen = env.reset()
+    seen["arms", "action_mask"][..., 1:] = True
+    seen["arms", "action"] = torch.full((2, ARMS), SLOTS)  # no slot but the first two can hold a job so early
+    assert (env.step(seen)["next", "arms", "info", "illegal"] == 1).all()
+
+
+def test_every_legal_action_is_drawn_as_often(make) -> None:
+    torch.manual_seed(0)
+    env = make(1)
+    env.reset()
+    mask = torch.tensor([[[True, False, True, True, False], [True] * 5, [True] + [False] * 4]])
+    env._mask = mask
+    drawn = torch.stack([env.rand_action()["arms", "action"][0] for _ in range(4000)])
+    counts = np.stack([np.bincount(drawn[:, arm], minlength=5) for arm in range(ARMS)])
+    shares = (mask[0] / mask[0].sum(-1, keepdim=True)).numpy()
+    spread = np.sqrt(4000 * shares * (1 - shares))  # binomial
+    assert (np.abs(counts - 4000 * shares) <= 4.0 * spread).all()
+
+
+def test_a_seed_repeats_the_shifts_and_another_does_not(make) -> None:
+    first = rolled(make(4, seed=0), 40)
+    assert same(first, rolled(make(4, seed=0), 40))
+    assert not same(first, rolled(make(4, seed=1), 40))
+    env = make(4, seed=5)
+    rolled(env, 7)
+    assert env.set_seed(0) != 0
+    assert same(first, rolled(env, 40))
+    assert not same(first, rolled(env, 40))  # the next shifts, not the same again
+    assert env.set_seed(0, static_seed=True) == 0
+    assert same(first, rolled(env, 40))
+
+
+def test_a_row_is_the_shift_of_its_own_seed(make) -> None:
+    there, alone = make(4, seed=20).reset(), make(1, seed=22).reset()
+    assert same(there[2:3], alone)
+    assert not same(there[1:2], alone)
+
+
+def test_without_a_seed_the_batch_keeps_its_own_and_none_is_another_each_time(make) -> None:
+    unseeded = TorchRLEnv(make.batch(2, seed=9)).reset()
+    assert same(unseeded, make(2, seed=9).reset())
+    env = make(2)
+    env.set_seed(None)
+    one = env.reset()
+    env.set_seed(None)
+    assert not same(one, env.reset())
+
+
+def test_a_partial_reset_leaves_the_others_alone(make) -> None:
+    env = make(3)
+    seen = env.reset()
+    for _ in range(4):
+        seen = env.step_mdp(env.step(env.rand_action(seen)))
+    before = seen.clone()
+    seen["_reset"] = torch.tensor([[False], [True], [False]])
+    after = env.reset(seen)
+    assert same(after[0].exclude("_reset", "arms"), before[0].exclude("_reset", "arms"))
+    for key in ("observation", "action_mask"):
+        assert (after["arms", key][[0, 2]] == before["arms", key][[0, 2]]).all()
+    clock = after["arms", "observation"][:, 0, 0] * TICKS
+    np.testing.assert_allclose(clock, [4, 0, 4], atol=1e-5)
+
+
+def test_a_rollout_until_all_are_done_waits_for_the_last(make) -> None:
+    env = make(8, infos=True, **BRIEF)
+    torch.manual_seed(0)
+    frames = env.rollout(100, break_when_any_done=False, break_when_all_done=True)
+    done = frames["next", "done"][..., 0]
+    assert done[:, -1].all()
+    assert not done[:, -2].all()
+    ended = done.int().argmax(dim=1)
+    assert len(set(ended.tolist())) > 1
+    for row, at in enumerate(ended.tolist()):
+        for later in range(at, frames.shape[1]):
+            assert same(frames["next"][row, later], frames["next"][row, at])
+    assert not env.rollout(3)["next", "done"].any()
+
+
+def test_only_what_is_done_may_be_left_out_of_a_step(make) -> None:
+    env = make(2)
+    seen = env.rand_action(env.reset())
+    seen["_step"] = torch.tensor([[True], [False]])
+    with pytest.raises(ValueError, match="only leave out envs that are done"):
+        env.step(seen)
+
+
+def test_a_step_after_the_end_says_what_to_call(make) -> None:
+    env = make(2)
+    last = env.rollout(TICKS)[:, -1]
+    assert last["next", "truncated"].all()
+    with pytest.raises(RuntimeError, match="call reset"):
+        env.step(env.rand_action(env.step_mdp(last)))
+
+
+def test_a_batch_that_resets_by_itself_is_refused(make) -> None:
+    with pytest.raises(ValueError, match="autoreset=False"):
+        TorchRLEnv(make.batch(2, autoreset=True))
+
+
+def masked(frames: TensorDict) -> TensorDict:
+    logits = torch.zeros(frames["arms", "action_mask"].shape)
+    frames["arms", "action"] = MaskedCategorical(logits=logits, mask=frames["arms", "action_mask"]).sample()
+    return frames
+
+
+def test_a_collector_with_a_masked_policy_sends_no_illegal_action(make) -> None:
+    torch.manual_seed(0)
+    returns = RewardSum(in_keys=[("arms", "reward")], out_keys=[("arms", "episode_reward")])
+    env = TransformedEnv(make(8, infos=True), returns)
+    collector = Collector(env, masked, frames_per_batch=8 * TICKS, total_frames=8 * TICKS * 3)
+    batches = [frames.clone() for frames in collector]
+    collector.shutdown()
+    for frames in batches:
+        assert frames["next", "truncated"].sum() == 8
+        assert frames["next", "arms", "info", "illegal"].max() == 0
+        total = frames["next", "arms", "reward"].sum(dim=1)
+        torch.testing.assert_close(frames["next", "arms", "episode_reward"][:, -1], total)
+    assert not same(batches[0], batches[1])
+
+
+def test_it_is_said_which_arms_are_in_the_group(make) -> None:
+    assert make().group_map == {"arms": ["arm_0", "arm_1", "arm_2"]}
+
+
+def test_it_closes_once(make) -> None:
+    env = make()
+    env.close()
+    assert env.is_closed
+
+
+def test_the_example_of_the_page_runs(example) -> None:
+    frames = example("TorchRL")["frames"]
+    assert frames["arms", "action_mask"].gather(-1, frames["arms", "action"][..., None]).all()
