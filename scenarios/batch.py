@@ -11,10 +11,10 @@ from fleet.env.engine import Shift
 from fleet.env.vector import BatchEnv, Library
 from fleet.errors import ScenarioError
 from fleet.job import Job
-from fleet.sim.noise import key_of
 from fleet.sim.tables import stacked, tables_of
-from scenarios.build import DifficultyName, Fleet, Progress, children, prepare, quiet, world_of
-from scenarios.jobs import JobSource, works_of
+from scenarios.build import DifficultyName, Fleet, Progress, prepare, quiet, world_of
+from scenarios.draw import QuickSource, children_of
+from scenarios.jobs import works_of
 from scenarios.load import load, override
 from scenarios.scenario import Scenario
 
@@ -118,13 +118,17 @@ def _kinds(scenario: Scenario) -> list[Job]:
     ]  # fmt: skip
 
 
+_SENSORS = np.array([[1]])
+"""The second child of a shift's seed is its sensors'; see `scenarios.build.children`."""
+
+
 class _Draw:
     """Draws the shift of a seed: the same jobs as `ShiftFactory` makes of it, as arrays."""
 
     def __init__(self, scenario: Scenario, lots: int, randomise: Randomisation) -> None:
         self._lots, self._randomise = lots, randomise
         self._wild = lots > 1 or randomise != Randomisation()
-        self._source = JobSource(scenario)
+        self._source = QuickSource(scenario)
         streams = scenario.jobs
         self._lowest = np.array([stream.repetitions[0] for stream in streams])
         self._counts = np.array([stream.repetitions[1] - stream.repetitions[0] + 1 for stream in streams])
@@ -133,20 +137,18 @@ class _Draw:
         self._due_s = np.array([stream.due_s for stream in streams], dtype=float)
 
     def __call__(self, seed: np.random.SeedSequence) -> Shift:
-        jobs_seed, sensor_seed = children(seed)
         lot, air_k, often = self._varied(seed) if self._wild else (0, 0.0, 1.0)
-        drawn = self._source.draw(jobs_seed, often)
+        drawn = self._source.draw(seed, often)
         stream = drawn.stream
-        more = drawn.repetitions - self._lowest[stream]
         return Shift(
             lot=lot,
             air_k=air_k,
-            kind=self._first[stream] + drawn.payload * self._counts[stream] + more,
+            kind=self._first[stream] + drawn.payload * self._counts[stream] + drawn.more,
             release_s=drawn.release_s,
             due_s=drawn.release_s + self._due_s[stream],
-            repetitions=drawn.repetitions,
+            repetitions=self._lowest[stream] + drawn.more,
             after=drawn.after,
-            key=key_of(sensor_seed),
+            key=children_of(seed, _SENSORS)[0][0],
         )
 
     def _varied(self, seed: np.random.SeedSequence) -> tuple[int, float, float]:

@@ -85,7 +85,7 @@ class JobSource:
         stream = np.repeat(np.arange(len(counts)), counts)
         first = np.cumsum([0, *counts])
         number = np.arange(len(stream)) - first[stream]
-        order = np.lexsort((self._ranks(max(counts, default=0))[stream, number], release_s))
+        order = np.lexsort((self.ranks(max(counts, default=0))[stream, number], release_s))
         after = np.full((len(stream), self._waits), -1)
         if any(spec.after for spec in streams):
             place = np.empty(len(order), dtype=int)
@@ -104,7 +104,7 @@ class JobSource:
             after=after[order],
         )
 
-    def _ranks(self, most: int) -> Array:
+    def ranks(self, most: int) -> Array:
         """Place of each job's name among all names, [stream, number], for so many jobs a stream at least."""
         if self._rank.shape[1] < most:
             most = max(most, 2 * self._rank.shape[1])
