@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,8 @@ class Randomisation:
             low, high = getattr(self, name)
             if not low <= high:
                 raise ValueError(f"Randomisation.{name} needs low <= high (got {low}, {high}).")
+            if not (isfinite(low) and isfinite(high)):
+                raise ValueError(f"Randomisation.{name} must be finite (got {low}, {high}).")
         if self.arrivals[0] <= 0:
             raise ValueError(f"Randomisation.arrivals must be > 0 (got {self.arrivals}).")
 

@@ -5,7 +5,7 @@ whole episode. Every decision interval each answers Discrete(slots + 1): 0 waits
 claims the job in slot k. Two claims for one job or station: the lower shared difficulty wins, then the lower index.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
@@ -15,6 +15,7 @@ from pettingzoo.utils import parallel_to_aec, wrappers
 
 from fleet.bus.exchange import Exchange
 from fleet.bus.memory import MemoryExchange
+from fleet.env.arguments import at_least_one, seed_of
 from fleet.env.episode import Episode as Episode
 from fleet.env.episode import EpisodeFactory as EpisodeFactory
 from fleet.env.observation import Layout, Observation
@@ -103,15 +104,13 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         if render_mode is not None and render_mode not in RENDER_MODES:
             allowed = ", ".join(map(repr, RENDER_MODES))
             raise ValueError(f"render_mode must be None or one of {allowed} (got {render_mode!r}).")
-        if max_cycles is not None and max_cycles < 1:
-            raise ValueError(f"max_cycles must be >= 1 (got {max_cycles}).")
         if mask_in not in get_args(MaskPlace):
             raise ValueError(f"mask_in must be one of {', '.join(get_args(MaskPlace))} (got {mask_in!r}).")
         self.render_mode = render_mode
         self.events: list[Event] = []
         self._make_episode = make_episode
         self._weights = weights or RewardWeights()
-        self._max_cycles = max_cycles
+        self._max_cycles = None if max_cycles is None else at_least_one("max_cycles", max_cycles)
         self._keep_events = keep_events
         self._watch = watch
         self._cell, self._window = cell, Window() if render_mode == "human" else None
@@ -166,10 +165,13 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-        """Begin a new shift: observations and infos by agent. Without a seed, the next one of the last seed's row."""
+        """Begin a new shift: observations and infos by agent. Without a seed, the next one of the last seed's row.
+
+        Raises:
+            ValueError: a seed that is no integer >= 0.
+        """
         if seed is not None:
-            self._seeds = np.random.SeedSequence(seed)
-            entropy = np.random.SeedSequence(seed)
+            self._seeds, entropy = seed_of(seed), seed_of(seed)
         else:
             entropy = self._seeds.spawn(1)[0]
         self._episode = self._make_episode(entropy)
@@ -186,11 +188,13 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
 
         Raises:
             RuntimeError: before reset, or after the end.
-            ValueError: an action that is no integer, or of an agent that is not there.
+            ValueError: no dictionary, an action that is no integer, or one of an agent that is not there.
         """
         shift = self._begun("step()")
         if not self.agents:
             raise RuntimeError("The episode is over: call reset() before step().")
+        if not isinstance(actions, Mapping):
+            raise ValueError(f"step() takes a dictionary of agents and their actions (got {actions!r}).")
         arms = self.possible_agents
         chosen = np.zeros(len(arms), dtype=np.int64)
         found = 0

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from fleet.env.arguments import at_least_one, seeds_of
 from fleet.env.engine import Engine, Shift
 from fleet.env.observation import Layout, Observation
 from fleet.env.reward import TERMS, RewardWeights
@@ -57,11 +58,9 @@ class BatchEnv:
         max_cycles: int | None = None,
         autoreset: bool = True,
     ) -> None:
-        if num_envs < 1:
-            raise ValueError(f"num_envs must be >= 1 (got {num_envs}).")
-        if max_cycles is not None and max_cycles < 1:
-            raise ValueError(f"max_cycles must be >= 1 (got {max_cycles}).")
-        self.num_envs = num_envs
+        self.num_envs = num_envs = at_least_one("num_envs", num_envs)
+        ticks = library.tables.ticks
+        self._last_tick = ticks if max_cycles is None else min(ticks, at_least_one("max_cycles", max_cycles))
         self.agents = library.arms
         """Names of the arms, in the order of the arm axis."""
         self.layout = Layout(len(library.arms), library.slots)
@@ -70,8 +69,7 @@ class BatchEnv:
         self.autoreset = autoreset
         self._library = library
         self._engine = Engine(library.tables, num_envs, self.layout, weights or RewardWeights())
-        self._last_tick = min(library.tables.ticks, max_cycles or library.tables.ticks)
-        self._seeds = self._seeds_of(seed)
+        self._seeds = seeds_of(seed, num_envs)
         self._fresh = np.ones(num_envs, dtype=bool)
         """Rows whose next shift is that of their seed itself."""
         self._over = np.ones(num_envs, dtype=bool)
@@ -80,7 +78,7 @@ class BatchEnv:
     @property
     def state(self) -> State:
         """The simulator's truth of all envs, in arrays of its own (not for policies)."""
-        self._check_begun("state")
+        self._check_begun("looking at its state")
         return self._engine.state_of_all()
 
     def reset(
@@ -101,7 +99,7 @@ class BatchEnv:
         if seed is not None:
             if rows is not None:
                 raise ValueError("reset(seed=…) seeds all envs: give seed or rows, not both.")
-            self._seeds, self._fresh = self._seeds_of(seed), np.ones(self.num_envs, dtype=bool)
+            self._seeds, self._fresh = seeds_of(seed, self.num_envs), np.ones(self.num_envs, dtype=bool)
         chosen = self._rows_of(rows)
         if not self._begun and len(chosen) < self.num_envs:
             raise RuntimeError("Nothing was begun yet: call reset() for all envs before reset(rows=…).")
@@ -129,7 +127,7 @@ class BatchEnv:
             RuntimeError: before reset, or of an env whose shift is over.
             ValueError: actions of another type or shape.
         """
-        self._check_begun("step")
+        self._check_begun("step()")
         if not self.autoreset and self._over.any():
             which = np.flatnonzero(self._over)
             raise RuntimeError(
@@ -149,7 +147,7 @@ class BatchEnv:
 
     def knowledge(self) -> Observation:
         """What the arms know now by name, leading axes [env, arm], as policies read it."""
-        self._check_begun("knowledge")
+        self._check_begun("knowledge()")
         vectors = self._no_vectors()  # what was handed out may have been written into
         self._engine.observe(np.arange(self.num_envs), vectors)
         return self.layout.read(vectors, self._engine.mask.copy())
@@ -192,21 +190,18 @@ class BatchEnv:
         return np.empty((self.num_envs, self.layout.arms, self.layout.size), np.float32)
 
     def _checked(self, actions: Any) -> Array:
-        values, shape = np.asarray(actions), (self.num_envs, self.layout.arms)
+        shape = (self.num_envs, self.layout.arms)
+        try:
+            values = np.asarray(actions)
+        except ValueError as error:
+            raise ValueError(
+                f"actions must be integers [env, arm] of shape {shape} (got rows of unlike length)."
+            ) from error
         if values.shape != shape or values.dtype.kind not in "iu":
             raise ValueError(
                 f"actions must be integers [env, arm] of shape {shape} (got {values.dtype} of shape {values.shape})."
             )
         return np.ascontiguousarray(values, dtype=np.int64)
-
-    def _seeds_of(self, seed: int | Sequence[int] | None) -> list[np.random.SeedSequence]:
-        if seed is None:
-            return np.random.SeedSequence().spawn(self.num_envs)
-        if isinstance(seed, int | np.integer):
-            return [np.random.SeedSequence(int(seed) + e) for e in range(self.num_envs)]
-        if len(seed) != self.num_envs:
-            raise ValueError(f"seed must be one integer or one for each of {self.num_envs} envs (got {len(seed)}).")
-        return [np.random.SeedSequence(int(each)) for each in seed]
 
     def _rows_of(self, rows: Array | Sequence[int] | None) -> Array:
         if rows is None:

@@ -1,0 +1,256 @@
+"""What a caller may do wrong: one sentence each that says what was given, what is allowed, and what to call."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fleet.env import allocation_v0
+from fleet.errors import ScenarioError
+from scenarios import make_batch, make_env
+from scenarios.batch import Randomisation
+
+NO_SEEDS = (-1, 1.5, "a", True, [1, 2], np.array([1, 2]), np.array(3.0))
+
+
+# The single environment
+
+
+def test_actions_may_be_numpy_integers(make, play) -> None:
+    env, other = make(), make()
+    env.reset(seed=1)
+    other.reset(seed=1)
+    arrays = {"arm_0": np.array(1), "arm_1": np.int64(2), "arm_2": np.array([0], dtype=np.uint8)}
+    assert play.plain(env.step(arrays)) == play.plain(other.step({"arm_0": 1, "arm_1": 2, "arm_2": 0}))
+
+
+@pytest.mark.parametrize("action", [1.0, np.array(0.0), "1", None, True, np.array([0, 1]), 2**70, [], {}])
+def test_an_action_that_is_no_integer_is_refused_and_changes_nothing(make, play, action) -> None:
+    env, other = make(), make()
+    env.reset(seed=1)
+    other.reset(seed=1)
+    with pytest.raises(ValueError, match="The action of 'arm_1' must be one integer"):
+        env.step({"arm_0": 1, "arm_1": action})
+    assert play.plain(env.step({"arm_0": 1})) == play.plain(other.step({"arm_0": 1}))
+
+
+@pytest.mark.parametrize("actions", [None, 1, [1, 0, 0], np.zeros(3, int), "arm_0"])
+def test_actions_that_are_no_dictionary_are_refused(make, actions) -> None:
+    env = make()
+    env.reset(seed=1)
+    with pytest.raises(ValueError, match=r"step\(\) takes a dictionary of agents and their actions \(got "):
+        env.step(actions)
+
+
+@pytest.mark.parametrize("name", ["arm_9", 0, None])
+def test_an_agent_that_is_not_there_is_named_with_those_that_are(make, name) -> None:
+    env = make()
+    env.reset(seed=0)
+    for call in (lambda: env.step({name: 0}), lambda: env.observation_space(name), lambda: env.action_space(name)):
+        with pytest.raises(ValueError, match=rf"No agent '{name}' in this fleet\. Agents: arm_0, arm_1, arm_2\."):
+            call()
+
+
+def test_before_a_reset_and_after_the_end_it_says_what_to_call(make, play) -> None:
+    env = make(render_mode="ansi")
+    calls = (lambda: env.step({}), env.state, env.knowledge, env.render, lambda: env.truth, lambda: env.messages)
+    for call in calls:
+        with pytest.raises(RuntimeError, match=r"No episode has begun: call reset\(\) before .+\."):
+            call()
+    env.reset(seed=0)
+    play.go_on(env, np.random.default_rng(0))
+    with pytest.raises(RuntimeError, match=r"The episode is over: call reset\(\) before step\(\)\."):
+        env.step({})
+    env.state()
+    env.render()
+
+
+@pytest.mark.parametrize("seed", NO_SEEDS)
+def test_a_seed_that_is_none_is_refused(make, seed) -> None:
+    with pytest.raises(ValueError, match=r"seed must be an integer >= 0 \(got "):
+        make().reset(seed=seed)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"render_mode": "tv"}, r"render_mode must be None or one of 'ansi', 'rgb_array', 'human' \(got 'tv'\)\."),
+        ({"mask_in": "none"}, r"mask_in must be one of obs, info, both \(got 'none'\)\."),
+        ({"max_cycles": 0}, r"max_cycles must be an integer >= 1 \(got 0\)\."),
+        ({"max_cycles": 2.5}, r"max_cycles must be an integer >= 1 \(got 2\.5\)\."),
+    ],
+)
+def test_an_option_that_there_is_not_is_refused(make, options, said) -> None:
+    with pytest.raises(ValueError, match=said):
+        make(**options)
+
+
+def test_the_turn_by_turn_env_says_it_too(small) -> None:
+    env = allocation_v0.env(small.Shifts())
+    with pytest.raises(AssertionError, match=r"reset\(\) needs to be called before step"):
+        env.step(1)
+    env.reset(seed=0)
+    env.step(1.5)
+    env.step(0)
+    with pytest.raises(ValueError, match=r"The action of 'arm_0' must be one integer \(got 1\.5\)"):
+        env.step(0)  # all have answered
+
+
+# The batch
+
+
+@pytest.mark.parametrize(
+    "actions",
+    [
+        None, 0, "x", {"arm_0": 1}, np.zeros((2, 3)), np.zeros((2, 3), bool), np.zeros((3, 2), int), np.zeros(6, int),
+        np.zeros((2, 3, 1), int), [[0, 0, 0], [0, 0]], [[0, 0, 0], [0, 0, 2**70]], [[0, 0, None]] * 2,
+    ],
+)  # fmt: skip
+def test_actions_of_another_type_or_shape_are_refused_and_change_nothing(batch, play, actions) -> None:
+    env, other = batch(2, seed=0), batch(2, seed=0)
+    env.reset()
+    other.reset()
+    with pytest.raises(ValueError, match=r"actions must be integers \[env, arm\] of shape \(2, 3\) \(got "):
+        env.step(actions)
+    nobody = np.zeros((2, 3), int)
+    play.same(play.rows(env.step(nobody), range(2)), play.rows(other.step(nobody), range(2)))
+
+
+@pytest.mark.parametrize("kind", [np.int8, np.uint8, np.int32, np.uint64])
+def test_actions_may_be_of_any_integer_type_and_order(batch, play, kind) -> None:
+    env, other = batch(2, seed=0), batch(2, seed=0)
+    env.reset()
+    other.reset()
+    actions = np.array([[1, 2, 0], [0, 3, 100]])
+    given = [
+        env.step(np.asfortranarray(actions.astype(kind))),
+        other.step(actions.tolist()),
+    ]
+    play.same(play.rows(given[0], range(2)), play.rows(given[1], range(2)))
+
+
+def test_a_batch_says_what_to_call_before_a_reset_and_after_an_end(batch) -> None:
+    env = batch(2, {"ticks": 3}, seed=0, autoreset=False)
+    nobody = np.zeros((2, 3), int)
+    for call in (lambda: env.step(nobody), env.knowledge, lambda: env.state):
+        with pytest.raises(RuntimeError, match=r"Nothing was begun yet: call reset\(\) before "):
+            call()
+    with pytest.raises(RuntimeError, match=r"call reset\(\) for all envs before reset\(rows=…\)"):
+        env.reset(rows=[0])
+    env.reset()
+    for _ in range(3):
+        env.step(nobody)
+    over = r"The shift of 2 env\(s\) is over \(first: env 0\): call reset\(rows=…\) before step\(\)\."
+    with pytest.raises(RuntimeError, match=over):
+        env.step(nobody)
+    env.reset(rows=[0])
+    with pytest.raises(RuntimeError, match=r"The shift of 1 env\(s\) is over \(first: env 1\)"):
+        env.step(nobody)
+    env.reset(rows=[1])
+    env.step(nobody)
+
+
+@pytest.mark.parametrize(
+    "seed", [*(each for each in NO_SEEDS if np.ndim(each) == 0), [1], [1, 2, 3], [1, -2], [1, "x"]]
+)
+def test_seeds_that_do_not_fit_are_refused(batch, seed) -> None:
+    said = r"seed must be (an integer >= 0|one integer or one for each of 2 envs) \(got "
+    with pytest.raises(ValueError, match=said):
+        batch(2, seed=seed)
+    env = batch(2)
+    with pytest.raises(ValueError, match=said):
+        env.reset(seed=seed)
+
+
+@pytest.mark.parametrize("rows", [[2], [-1], [0, 1, 2]])
+def test_rows_out_of_range_are_refused(batch, rows) -> None:
+    env = batch(2, seed=0)
+    env.reset()
+    with pytest.raises(ValueError, match=r"rows must be from 0 to 1 \(got "):
+        env.reset(rows=rows)
+
+
+@pytest.mark.parametrize("rows", [1, "x", [[0]], [0.5], np.array([True]), {0}])
+def test_rows_of_another_shape_are_refused(batch, rows) -> None:
+    env = batch(2, seed=0)
+    env.reset()
+    with pytest.raises(ValueError, match=r"rows must be int \[n\] or bool \[2\] \(got "):
+        env.reset(rows=rows)
+
+
+def test_seed_and_rows_do_not_go_together(batch) -> None:
+    with pytest.raises(ValueError, match="give seed or rows, not both"):
+        batch(2).reset(seed=0, rows=[0])
+
+
+@pytest.mark.parametrize("count", [0, -3, 2.5, "x", None, True])
+def test_a_batch_needs_an_env_and_a_step(batch, count) -> None:
+    with pytest.raises(ValueError, match=r"num_envs must be an integer >= 1 \(got "):
+        batch(count)
+    if count is not None:
+        with pytest.raises(ValueError, match=r"max_cycles must be an integer >= 1 \(got "):
+            batch(2, max_cycles=count)
+
+
+# Scenarios
+
+
+def beyond(cell) -> dict[str, Any]:
+    """The cell with its shelf where no arm reaches."""
+    places = [{"name": p.name, "position_m": list(p.position_m)} for p in cell.places]
+    places[1]["position_m"] = [9.0, 0.0, 0.2]
+    return {"places": places}
+
+
+def test_jobs_that_no_arm_can_do_are_refused_with_what_to_change(cell, folder) -> None:
+    said = r"jobs\[1\]\.places: no arm can do 'sort' with 0\.2 kg \(left at 'shelf': .+\); move the places or an arm"
+    for make in (make_env, lambda scenario, **options: make_batch(scenario, 2, **options)):
+        with pytest.raises(ScenarioError, match=said):
+            make(cell, difficulty="blind", cache=folder, **beyond(cell))
+
+
+def test_a_scenario_or_a_field_that_there_is_not_is_refused(cell, folder) -> None:
+    for make in (make_env, lambda scenario, **options: make_batch(scenario, 2, **options)):
+        with pytest.raises(ScenarioError, match="No scenario 'quickstrat'; did you mean 'quickstart'"):
+            make("quickstrat")
+        with pytest.raises(ScenarioError, match=r"There is no scenario file '.*none\.toml'"):
+            make(Path("none.toml"))
+        with pytest.raises(ScenarioError, match=r"unknown key 'horizon'; did you mean 'horizon_s'"):
+            make(cell, difficulty="blind", cache=folder, horizon=60)
+        with pytest.raises(ScenarioError, match="No difficulty 'twins'; did you mean 'twin'"):
+            make(cell, difficulty="twins", cache=folder)
+
+
+def test_a_variant_of_another_fleet_is_refused(cell, folder) -> None:
+    arms = [{"name": a.name, "position_m": list(a.position_m), "tilt_deg": list(a.tilt_deg)} for a in cell.arms]
+    other = [dict(arms[0], name="west"), *arms[1:]]
+    stream = {"name": "x", "kind": "hold", "places": ["bench"], "arrivals": {"kind": "batch", "count": 1}}
+    refused = {
+        "the names of arms": [{"arms": arms[::-1]}, {"arms": other}, {"arms": arms[:2]}],
+        "the jobs": [{"jobs": [stream]}],
+        "the slots": [{"slots": 3}],
+        "dt_s": [{"decision_interval_s": 20.0}],
+        "ticks": [{"horizon_s": 300.0}],
+        "error_c": [{"limits": {"warning_c": 34.5, "error_c": 36.0, "restart_c": 34.0, "clear_s": 15.0}}],
+    }
+    for what, variants in refused.items():
+        for variant in variants:
+            randomise = Randomisation(variants=[variant])
+            with pytest.raises(ScenarioError, match=what):
+                make_batch(cell, 2, difficulty="blind", cache=folder, randomise=randomise)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"ambient_k": (2.0, 1.0)}, r"Randomisation\.ambient_k needs low <= high \(got 2\.0, 1\.0\)"),
+        ({"arrivals": (2.0, 1.0)}, r"Randomisation\.arrivals needs low <= high"),
+        ({"arrivals": (0.0, 1.0)}, r"Randomisation\.arrivals must be > 0"),
+        ({"ambient_k": (0.0, float("inf"))}, r"Randomisation\.ambient_k must be finite"),
+        ({"arrivals": (float("nan"), 1.0)}, r"Randomisation\.arrivals needs low <= high"),
+    ],
+)
+def test_a_range_that_is_none_is_refused(options, said) -> None:
+    with pytest.raises(ValueError, match=said):
+        Randomisation(**options)
