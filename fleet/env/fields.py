@@ -15,7 +15,7 @@ from fleet.sim.boiling import hottest
 from fleet.sim.jit import entry, inner, natural
 from fleet.sim.noise import FIRST, GOLDEN, LEVELS, QUANTILES, SECOND
 from fleet.sim.rows import award, hang_out, live
-from fleet.sim.tables import Drawn, Offer, Rows, Tables
+from fleet.sim.tables import LANES, Drawn, Offer, Rows, Tables
 from fleet.telemetry import FAULTED, IDLE, WORKING
 
 Array = np.ndarray
@@ -91,11 +91,12 @@ def perceive(
     noise_k, words, payload_kg, values, risks = t.noise_k, t.word, t.payload_kg, t.value, t.risk
     offset, weight, curve = t.offset, t.weight, t.curve
     arms, slots = natural(modes.shape[1]), natural(on_offer.shape[1])
-    measured, headroom = np.empty(JOINTS), np.empty(arms, np.float32)
-    scored, known = np.empty(arms * slots, np.float32), np.empty(arms * slots, np.float32)
+    measured, headroom = np.empty(LANES), np.empty(arms, np.float32)
+    said = np.empty((2, arms * slots), np.float32)  # whether an arm knows a difficulty for a slot, and which
     left, slack_s = np.empty(slots), np.empty(slots)
-    shared = np.zeros((5, slots), np.float32)  # of every slot what all arms see alike
-    c_clock, c_mode, c_busy, c_last = start[CLOCK], start[MODE], start[BUSY], start[LAST_AWARD]
+    shared = np.zeros(5 * slots, np.float32)  # what all arms see alike of the slots, field by field
+    c_clock, c_mode = natural(start[CLOCK]), natural(start[MODE])
+    c_busy, c_last = natural(start[BUSY]), natural(start[LAST_AWARD])
     c_temp, c_headroom = natural(start[TEMP]), natural(start[HEADROOM])
     c_slots, c_peers = natural(start[OFFERED]), natural(start[PEER_HEARD])
     c_offered, c_feasible, c_known, c_difficulty, c_p, c_duration, c_slack, c_age, c_payload, c_value, c_returns = (
@@ -114,22 +115,23 @@ def perceive(
     most_kg, most_value, most_returns = high[c_payload], high[c_value], high[c_returns]
     for row in rows:
         e = natural(row)
-        lot, now_s, count = natural(lots[e]), ticks[e] * t.dt_s, ticks[e] * arms * JOINTS
+        lot, now_s, key = natural(lots[e]), ticks[e] * t.dt_s, keys[e]
+        count = natural(ticks[e]) * arms * JOINTS
         clock = now_s / (t.ticks * t.dt_s)
         found = 0
         while found < slots and on_offer[e, found] >= 0:
             j = natural(on_offer[e, found])
             kind = natural(kinds[e, j])
             left[found], slack_s[found] = repetitions[e, j] - cycles[e, j], due_s[e, j] - now_s
-            shared[0, found] = 1.0
-            shared[1, found] = min(max(now_s - queued_s[e, j], 0.0), LONG_S)
-            shared[2, found] = min(payload_kg[lot, kind], most_kg)
-            shared[3, found] = min(max(values[lot, kind], 0.0), most_value)
-            shared[4, found] = min(returns[e, j], most_returns)
+            shared[found] = 1.0
+            shared[slots + found] = min(max(now_s - queued_s[e, j], 0.0), LONG_S)
+            shared[2 * slots + found] = min(payload_kg[lot, kind], most_kg)
+            shared[3 * slots + found] = min(max(values[lot, kind], 0.0), most_value)
+            shared[4 * slots + found] = min(returns[e, j], most_returns)
             found += 1
         for m in range(5):
             for k in range(found, slots):
-                shared[m, k] = 0.0
+                shared[m * slots + k] = 0.0
         for a in range(arms):
             mode = modes[e, a]
             out[e, a, c_clock] = clock
@@ -141,25 +143,24 @@ def perceive(
                 busy_s = words[lot, a, kind, 0] + todo[e, a] * words[lot, a, kind, 1] - progress_s[e, a]
             out[e, a, c_busy] = min(max(busy_s, 0.0), LONG_S)
             out[e, a, c_last] = last[e, a]
+            for k in range(LANES):
+                measured[k] = temp_c[e, a, k] + noise_k[lot, a, k] * noise(key, count + k + 1)
             for k in range(JOINTS):
-                measured[k] = temp_c[e, a, k] + noise_k[lot, a, k] * noise(keys[e], count + k + 1)
                 out[e, a, c_temp + k] = min(max(measured[k], low_c), high_c)
             count += JOINTS
             headroom[a] = min(max(t.warning_c - hottest(measured), low_k), high_k)
             out[e, a, c_headroom] = headroom[a]
             for k in range(slots):
-                out[e, a, c_offered + k] = shared[0, k]
-                out[e, a, c_age + k] = shared[1, k]
-                out[e, a, c_payload + k] = shared[2, k]
-                out[e, a, c_value + k] = shared[3, k]
-                out[e, a, c_returns + k] = shared[4, k]
+                out[e, a, c_offered + k] = shared[k]
+            for i in range(4 * slots):
+                out[e, a, c_age + i] = shared[slots + i]
             for k in range(found):
                 kind = natural(kinds[e, natural(on_offer[e, k])])
                 duration_s = words[lot, a, kind, 0] + left[k] * words[lot, a, kind, 1]
                 out[e, a, c_feasible + k] = duration_s > 0
                 out[e, a, c_duration + k] = min(duration_s, LONG_S)
                 out[e, a, c_slack + k] = min(max(slack_s[k] - duration_s, -LONG_S), LONG_S)
-                known[a * slots + k], scored[a * slots + k] = words[lot, a, kind, 2], words[lot, a, kind, 3]
+                said[0, a * slots + k], said[1, a * slots + k] = words[lot, a, kind, 2], words[lot, a, kind, 3]
                 p, risk = words[lot, a, kind, 4], risks[lot, a, kind]
                 if risk >= 0:
                     p = at_risk(offset, weight, curve, natural(risk), measured)
@@ -167,9 +168,11 @@ def perceive(
             for k in range(found, slots):
                 out[e, a, c_feasible + k] = out[e, a, c_duration + k] = out[e, a, c_slack + k] = 0.0
                 out[e, a, c_p + k] = 0.5
-                known[a * slots + k] = scored[a * slots + k] = 0.0
+                said[0, a * slots + k] = said[1, a * slots + k] = 0.0
             for k in range(slots):
-                out[e, a, c_known + k], out[e, a, c_difficulty + k] = known[a * slots + k], scored[a * slots + k]
+                out[e, a, c_known + k] = said[0, a * slots + k]
+            for k in range(slots):
+                out[e, a, c_difficulty + k] = said[1, a * slots + k]
         for a in range(arms):
             peer = 0
             for b in range(arms):
@@ -180,11 +183,12 @@ def perceive(
                     out[e, a, c_room + peer] = headroom[b]
                     peer += 1
             before, behind = a * slots, (arms - 1 - a) * slots
-            for i in range(before):
-                out[e, a, c_peer_known + i], out[e, a, c_told + i] = known[i], scored[i]
-            for i in range(behind):
-                out[e, a, c_peer_known + before + i] = known[before + slots + i]
-                out[e, a, c_told + before + i] = scored[before + slots + i]
+            for m in range(2):
+                place = c_told if m else c_peer_known
+                for i in range(before):
+                    out[e, a, place + i] = said[m, i]
+                for i in range(behind):
+                    out[e, a, place + before + i] = said[m, before + slots + i]
 
 
 @entry

@@ -76,8 +76,8 @@ def braked_load(t: Tables, lot: int, a: int, air_c: float, out: Array) -> float:
         out[n] = t.to_ambient[lot, a, n] * air_c
     if not t.power_off:
         for j in range(JOINTS):
-            out[JOINTS + j] += t.idle_w[lot, a, j]
-            heat_w += t.idle_w[lot, a, j]
+            out[JOINTS + j] += t.motor[lot, a, 1, j]
+            heat_w += t.motor[lot, a, 1, j]
     return heat_w
 
 

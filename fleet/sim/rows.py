@@ -183,11 +183,10 @@ def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array) -> None:
     busy_s, lost_s, energy_j, status, queued_s = s.busy_s, s.lost_s, s.energy_j, s.status, s.queued_s
     cycles, returns, finished_s, left = s.cycles, s.returns, s.finished_s, o.open
     ambient_c, steps, to_ambient = t.ambient_c, t.step, t.to_ambient
-    copper, idle_w, rest_sq, rest_friction_w = t.copper, t.idle_w, t.rest_sq, t.rest_friction_w
-    times_s, current_sq, friction_w, plans, values = t.times_s, t.current_sq, t.friction_w, t.plan, t.value
+    motor, drive, times_s, plans, values = t.motor, t.drive, t.times_s, t.plan, t.value
     dt_s, alpha_kt, alpha_cu, reference_c = t.dt_s, t.alpha_kt, t.alpha_cu, t.reference_c
     warning_c, error_c = t.warning_c, t.error_c
-    motor_w, friction, fold = np.empty(LANES), np.empty(LANES), np.empty(4)
+    power, fold = np.empty((2, LANES)), np.empty(4)  # W of windings, of friction and electronics
     begin, end = np.zeros(2 * NODES + LANES), np.empty(WIDE)  # the temperatures, the loads, and what pads them
     envs, arms = modes.shape
     for e in range(envs):
@@ -220,20 +219,21 @@ def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array) -> None:
             for n in range(NODES):
                 begin[n] = temp_c[e, a, n]
             for k in range(LANES):
-                amps_sq = share_0 * current_sq[plan, 0, k] + share_1 * current_sq[plan, 1, k]
-                amps_sq += share_2 * current_sq[plan, 2, k] + rest * rest_sq[lot, a, k]
-                rubbed_w = share_0 * friction_w[plan, 0, k] + share_1 * friction_w[plan, 1, k]
-                rubbed_w += share_2 * friction_w[plan, 2, k] + rest * rest_friction_w[lot, a, k]
+                amps_sq = share_0 * drive[plan, 0, 0, k] + share_1 * drive[plan, 1, 0, k]
+                amps_sq += share_2 * drive[plan, 2, 0, k] + rest * motor[lot, a, 2, k]
                 factor = 1.0 + alpha_kt * (begin[JOINTS + k] - reference_c)
                 warmer = 1.0 + alpha_cu * (begin[k] - reference_c)
-                motor_w[k] = copper[lot, a, k] * warmer * (amps_sq / (factor * factor))
-                friction[k] = rubbed_w + powered * idle_w[lot, a, k]
+                power[0, k] = motor[lot, a, 0, k] * warmer * (amps_sq / (factor * factor))
+            for k in range(LANES):
+                rubbed_w = share_0 * drive[plan, 0, 1, k] + share_1 * drive[plan, 1, 1, k]
+                rubbed_w += share_2 * drive[plan, 2, 1, k] + rest * motor[lot, a, 3, k]
+                power[1, k] = rubbed_w + powered * motor[lot, a, 1, k]
             for k in range(4):
-                fold[k] = (motor_w[k] + friction[k]) + (motor_w[4 + k] + friction[4 + k])
+                fold[k] = (power[0, k] + power[1, k]) + (power[0, 4 + k] + power[1, 4 + k])
             heat_w = (fold[0] + fold[1]) + (fold[2] + fold[3])
             for k in range(JOINTS):
-                begin[NODES + k] = motor_w[k] + to_ambient[lot, a, k] * air_c
-                begin[NODES + JOINTS + k] = friction[k] + to_ambient[lot, a, JOINTS + k] * air_c
+                begin[NODES + k] = power[0, k] + to_ambient[lot, a, k] * air_c
+                begin[NODES + JOINTS + k] = power[1, k] + to_ambient[lot, a, JOINTS + k] * air_c
             for m in range(WIDE):
                 into = 0.0
                 for n in range(2 * NODES):

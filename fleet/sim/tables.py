@@ -46,19 +46,16 @@ class Tables(NamedTuple):
     modes: Array
     """[lot, arm, node, mode]."""
     noise_k: Array
-    """[lot, arm, joint]."""
-    copper: Array
-    """[lot, arm, joint padded to `LANES`], as the following."""
-    idle_w: Array
-    rest_sq: Array
-    rest_friction_w: Array
+    """[lot, arm, joint padded to `LANES`]."""
+    motor: Array
+    """Of each joint its copper loss in W/A², idle heat in W, and squared current and friction heat at rest, [lot, arm,
+    4, joint padded to `LANES`]."""
     start_c: Array
     """[lot, arm, node]."""
     times_s: Array
     """[plan, phase]."""
-    current_sq: Array
-    """[plan, phase, joint padded to `LANES`]."""
-    friction_w: Array
+    drive: Array
+    """Mean squared current and mean friction heat, [plan, phase, 2, joint padded to `LANES`]."""
     plan: Array
     """Row of the plan tables, −1 for none, int [lot, arm, kind]."""
     difficulty: Array
@@ -183,15 +180,11 @@ def tables_of(world: World) -> tuple[Tables, Drawn]:
         root=lots(np.sqrt(world.thermal.capacity)),
         rates=lots(world.thermal.rates),
         modes=lots(world.thermal.modes),
-        copper=lots(_padded(motors.copper_w_per_a2, -1, LANES, 0.0)),
-        idle_w=lots(_padded(motors.idle_w, -1, LANES, 0.0)),
-        noise_k=lots(motors.sensor_noise_k),
-        rest_sq=lots(_padded(world.rest.current_sq, -1, LANES, 0.0)),
-        rest_friction_w=lots(_padded(world.rest.friction_w, -1, LANES, 0.0)),
+        motor=lots(_laned(motors.copper_w_per_a2, motors.idle_w, world.rest.current_sq, world.rest.friction_w)),
+        noise_k=lots(_padded(motors.sensor_noise_k, -1, LANES, 0.0)),
         start_c=lots(world.start_c),
         times_s=world.plans.times_s,
-        current_sq=_padded(world.plans.current_sq, -1, LANES, 0.0),
-        friction_w=_padded(world.plans.friction_w, -1, LANES, 0.0),
+        drive=_laned(world.plans.current_sq, world.plans.friction_w),
         plan=offers.plan,
         difficulty=offers.difficulty,
         word=_words(world),
@@ -216,6 +209,11 @@ def tables_of(world: World) -> tuple[Tables, Drawn]:
         after=jobs.after,
     )
     return owned(tables), owned(drawn)
+
+
+def _laned(*values: Array) -> Array:
+    """Values [..., joint] side by side, [..., value, joint padded to `LANES`]."""
+    return _padded(np.stack(values, axis=-2), -1, LANES, 0.0)
 
 
 def _words(world: World) -> Array:
@@ -295,8 +293,8 @@ def stacked(fleets: Sequence[Tables]) -> Tables:
 
 _SHARED = ("dt_s", "ticks", "warning_c", "error_c", "restart_c", "clear_s", "power_off", "alpha_cu", "alpha_kt",
            "reference_c")  # fmt: skip
-_JOINED = ("ambient_c", "step", "to_ambient", "root", "rates", "modes", "copper", "idle_w", "noise_k",
-           "rest_sq", "rest_friction_w", "start_c", "times_s", "current_sq", "friction_w", "difficulty",
+_JOINED = ("ambient_c", "step", "to_ambient", "root", "rates", "modes", "motor", "noise_k",
+           "start_c", "times_s", "drive", "difficulty",
            "word", "payload_kg", "value")  # fmt: skip
 
 
