@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fleet.difficulty import Difficulty, Risk
 from fleet.env.allocation_v0 import AllocationEnv, parallel_env
 from fleet.env.vector import BatchEnv
+from fleet.robot import JOINTS
 from scenarios.load import checked
 from scenarios.scenario import Scenario
 
@@ -109,12 +111,27 @@ def digest(*given: Any) -> str:
     return told.hexdigest()
 
 
+class Learned:
+    """Knows how the risk depends on the temperatures: by a logistic of one or two pieces, or by a curve."""
+
+    version = "learned"
+
+    def __init__(self, pieces: int, *, curve: bool) -> None:
+        self._pieces, self._curve = pieces, curve
+
+    def score(self, plan, repetitions: int) -> Difficulty:
+        slope = np.linspace(0.01, 0.05, self._pieces)[:, None] * np.arange(1, JOINTS + 1)
+        curve = np.array([[-3.0, 0.1], [0.0, 0.4], [0.0, 0.5], [4.0, 0.9]]) if self._curve else None
+        risk = Risk(-np.linspace(4.0, 7.0, self._pieces) - plan.work.payload_kg, slope, curve)
+        return Difficulty(np.full(JOINTS, 0.1 + 0.05 * plan.work.payload_kg), risk=risk)
+
+
 @pytest.fixture(scope="session")
 def play() -> SimpleNamespace:
     """How environments are played through, and what they gave is compared."""
     return SimpleNamespace(
         wild=wild, go_on=go_on, chosen=chosen, plain=plain, rows=rows, same=same, single=single, digest=digest,
-        PATH=__file__,
+        Learned=Learned, PATH=__file__,
     )  # fmt: skip
 
 

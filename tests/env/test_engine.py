@@ -6,30 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet.bus.memory import MemoryExchange
-from fleet.difficulty import Difficulty, Risk
 from fleet.env.compiled import CompiledShift
 from fleet.env.episode import Episode
 from fleet.env.plain import PlainShift
 from fleet.env.reward import RewardWeights
-from fleet.robot import JOINTS, ThermalLimits
+from fleet.robot import ThermalLimits
 from fleet.sim.noise import LEVELS, key_of, standard_normal
 
 STEPS = 60
-
-
-class Learned:
-    """Knows how the risk depends on the temperatures: by a logistic of one or two pieces, or by a curve."""
-
-    version = "learned"
-
-    def __init__(self, pieces: int, *, curve: bool) -> None:
-        self._pieces, self._curve = pieces, curve
-
-    def score(self, plan, repetitions: int) -> Difficulty:
-        slope = np.linspace(0.01, 0.05, self._pieces)[:, None] * np.arange(1, JOINTS + 1)
-        curve = np.array([[-3.0, 0.1], [0.0, 0.4], [0.0, 0.5], [4.0, 0.9]]) if self._curve else None
-        risk = Risk(-np.linspace(4.0, 7.0, self._pieces) - plan.work.payload_kg, slope, curve)
-        return Difficulty(np.full(JOINTS, 0.1 + 0.05 * plan.work.payload_kg), risk=risk)
 
 
 def both(small, episode, seed: int):
@@ -95,11 +79,11 @@ def test_the_shifts_of_that_comparison_are_hot_enough_to_fault_and_recover(small
 
 
 @pytest.mark.parametrize(("pieces", "curve"), [(1, False), (3, False), (2, True)])
-def test_risks_are_the_same(small, pieces, curve) -> None:
+def test_risks_are_the_same(small, play, pieces, curve) -> None:
     content = [small.work(place, payload) for place in ("a", "b") for payload in (small.LIGHT, small.HOT)]
     arms = [
-        small.arm(0, content, model=Learned(pieces, curve=curve)),
-        small.arm(1, content[:2], model=Learned(1, curve=False)),
+        small.arm(0, content, model=play.Learned(pieces, curve=curve)),
+        small.arm(1, content[:2], model=play.Learned(1, curve=False)),
         small.arm(2, content),
     ]
     jobs = [small.job(f"j{i}", content[i % 4], release_s=50.0 * (i % 3)) for i in range(6)]

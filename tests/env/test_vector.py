@@ -201,3 +201,14 @@ def test_the_knowledge_of_a_batch_is_that_of_its_rows(batch, make, play) -> None
     known = vars(env.knowledge())
     for a, seen in enumerate(one.knowledge().values()):
         play.same({name: values[1, a] for name, values in known.items()}, vars(seen))
+
+
+def test_staggered_envs_end_their_first_shifts_one_after_the_other(small) -> None:
+    make = small.Shifts(jobs=30, ticks=20)
+    env = BatchEnv(make.library(), 5, seed=0, stagger=True)
+    env.reset()
+    waits = np.zeros((5, make.arms), dtype=int)
+    ends = [np.flatnonzero(env.step(waits)[3]).tolist() for _ in range(24)]
+    assert {tick + 1: which for tick, which in enumerate(ends) if which} == {
+        4: [0], 8: [1], 12: [2], 16: [3], 20: [4], 24: [0],
+    }  # fmt: skip

@@ -1,0 +1,128 @@
+"""One truth: a recorded run, replayed action by action through every door, is the same shift."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fleet.env.vector import BatchEnv
+from fleet.robot import ThermalLimits
+from fleet.sim.claims import slots
+from fleet.sim.state import DONE, State
+from fleet.thermal import WINDING
+from scenarios.batch import library_of
+from scenarios.build import Fleet, env_of, prepare
+from scenarios.policies import policy_of
+from scenarios.run import RunResult, RunSpec, run
+
+SEED = 2
+
+
+@pytest.fixture(scope="module", params=["blind", "oracle"])
+def fleet(request, cell, folder) -> Fleet:
+    """The cell, ready."""
+    return prepare(cell, difficulty=request.param, cache=folder)
+
+
+@pytest.fixture(scope="module", params=["random", "round_robin"])
+def recorded(request, fleet) -> RunResult:
+    """A run as `thermofleet run` records it."""
+    return run(fleet, RunSpec(policy=request.param, seed=SEED, bus="memory"))
+
+
+def actions_of(result: RunResult, on_offer: list[str], arms: list[str], now_s: float) -> dict[str, int]:
+    """What the arms did at a moment, from the record alone: claims won and lost, by what hung out then."""
+    told = [e for e in result.events if e.time_s == now_s and e.kind in ("award", "lost")]
+    return {arm: next((on_offer.index(e.job) + 1 for e in told if e.arm == arm), 0) for arm in arms}
+
+
+def offered(env: Any) -> list[str]:
+    """Names of the jobs in the slots of a single env, by the plain rule."""
+    names = env.world.jobs.names[0]
+    return [names[j] if j >= 0 else "" for j in slots(env.world, env.truth)[0].tolist()]
+
+
+def close(found: State, expected: State, jobs: int) -> None:
+    """Of one env: temperatures, completions, faults and all the rest."""
+    for name, values in vars(expected).items():
+        own = getattr(found, name)
+        own = own[:, :jobs] if name in ("status", "queued_s", "cycles", "returns", "finished_s") else own
+        np.testing.assert_allclose(
+            own, values[:, :jobs] if own.shape != values.shape else values, rtol=1e-9, atol=1e-9, err_msg=name
+        )
+
+
+def test_a_recorded_run_replayed_through_every_door_is_the_same_shift(fleet, recorded) -> None:
+    plain, compiled = env_of(fleet, keep_events=True), env_of(fleet)
+    batch = BatchEnv(library_of([fleet]), 3, seed=[SEED - 1, SEED, SEED + 1], weights=fleet.scenario.reward)
+    plain.reset(seed=SEED)
+    compiled.reset(seed=SEED)
+    obs, _ = batch.reset()
+    rewards, arms, terms = np.zeros(3), plain.possible_agents, {}
+    jobs = len(plain.world.jobs.names[0])
+    while plain.agents:
+        names = offered(plain)
+        actions = actions_of(recorded, names, arms, float(plain.truth.tick[0] * plain.world.dt_s))
+        close(compiled.truth, plain.truth, jobs)
+        close(State(**{n: v[1:2] for n, v in vars(batch.state).items()}), plain.truth, jobs)
+        for a, arm in enumerate(arms):
+            np.testing.assert_allclose(obs["observation"][1, a], plain.state().reshape(3, -1)[a], rtol=1e-6, atol=1e-5)
+            np.testing.assert_array_equal(obs["action_mask"][1, a], plain.knowledge()[arm].action_mask)
+        together = np.zeros((3, 3), int)
+        together[1] = list(actions.values())
+        one, other, many = plain.step(actions), compiled.step(actions), batch.step(together)
+        obs = many[0]
+        assert one[2] == other[2] == dict.fromkeys(arms, bool(many[2][1]))
+        assert one[3] == other[3] == dict.fromkeys(arms, bool(many[3][1]))
+        rewards += [one[1]["left"], other[1]["left"], many[1][1]]
+        np.testing.assert_allclose(rewards, rewards[0], rtol=1e-9, atol=1e-9)
+        for name, value in one[4]["left"].items():
+            if name.startswith("reward_"):
+                found = [value, other[4]["left"][name], many[4][name][1]]
+                np.testing.assert_allclose(found, value, rtol=1e-9, atol=1e-9)
+                terms[name] = terms.get(name, 0.0) + value
+    # And all of them are what was recorded.
+    happened = [(e.time_s, e.kind, e.arm, e.job) for e in sorted(plain.events, key=lambda e: e.time_s)]
+    assert happened == [(e.time_s, e.kind, e.arm, e.job) for e in recorded.events]
+    np.testing.assert_allclose(rewards, recorded.total_reward, rtol=1e-9)
+    finished = {e.job: e.time_s for e in recorded.events if e.kind == "finish"}
+    truth, world = compiled.truth, compiled.world
+    found = {n: truth.finished_s[0, j] for j, n in enumerate(world.jobs.names[0]) if truth.status[0, j] == DONE}
+    assert found == pytest.approx(finished, rel=1e-9)
+    assert truth.faults.sum() == sum(e.kind == "fault" for e in recorded.events) == recorded.metrics.faults > 0
+    assert dict(zip(arms, truth.peak_c[0].tolist(), strict=True)) == pytest.approx(recorded.metrics.peak_c, rel=1e-9)
+    measured = recorded.telemetry.temp_c[-1]
+    np.testing.assert_allclose(measured, truth.temp_c[0, :, WINDING], atol=6 * plain.world.motors.sensor_noise_k.max())
+    assert terms["reward_finished_value"] == pytest.approx(recorded.metrics.value, rel=1e-9)
+
+
+def test_the_bus_and_the_watcher_change_nothing(fleet, recorded) -> None:
+    over_zenoh = run(fleet, RunSpec(policy=recorded.spec.policy, seed=SEED, bus="zenoh"), record=False)
+    assert list(map(repr, over_zenoh.events)) == list(map(repr, recorded.events))  # NaN is what it is, too
+    assert over_zenoh.total_reward == recorded.total_reward
+
+
+def test_the_simulated_arms_come_to_the_same_in_half_an_hour(cell, folder) -> None:
+    """All arms in MuJoCo, told to do what those of the profile plant did."""
+    streams = tuple(replace(s, arrivals=replace(s.arrivals, stop_s=None)) for s in cell.jobs[:2])
+    longer = replace(cell, horizon_s=1800.0, jobs=streams, limits=ThermalLimits())
+    fleet = prepare(longer, difficulty="blind", cache=folder)
+    profile, simulated = env_of(fleet), env_of(fleet, plant="mujoco")
+    policy = policy_of("least_difficulty")
+    policy.reset(np.random.default_rng(0))
+    profile.reset(seed=0)
+    simulated.reset(seed=0)
+    apart_k = 0.0
+    while profile.agents:
+        actions = policy.act(profile.knowledge())
+        one, other = profile.step(actions), simulated.step(actions)
+        assert one[2:4] == other[2:4]
+        apart_k = max(apart_k, float(np.abs(profile.truth.temp_c - simulated.truth.temp_c).max()))
+        np.testing.assert_array_equal(profile.truth.status, simulated.truth.status)
+    assert apart_k <= 0.5
+    assert profile.truth.tick[0] == 180
+    np.testing.assert_allclose(profile.truth.finished_s, simulated.truth.finished_s, atol=1e-9)
+    assert (profile.truth.status == DONE).sum() > 20
+    assert profile.truth.peak_c.max() > 40.0
+    simulated.close()

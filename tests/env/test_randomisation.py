@@ -1,0 +1,188 @@
+"""Scenarios in a batch: the shifts of `make_env`, and how far they are let vary."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet.env.engine import shifts_of
+from fleet.env.vector import BatchEnv, Library
+from fleet.sim.tables import stacked, tables_of
+from scenarios import make_batch, make_env
+from scenarios.batch import Randomisation, library_of
+from scenarios.build import Fleet, prepare
+from scenarios.jobs import draw_jobs
+
+SEED = 30
+
+
+@pytest.fixture(scope="module")
+def fleet(cell, folder) -> Fleet:
+    """The cell, ready."""
+    return prepare(cell, difficulty="blind", cache=folder)
+
+
+def actions_of(play, mask: np.ndarray, step: int) -> np.ndarray:
+    """For every row alike, whatever rows there are."""
+    return play.chosen(mask, np.random.default_rng(step).random((1, 3, 2)))
+
+
+# As it is
+
+
+@pytest.mark.parametrize("difficulty", ["blind", "oracle"])
+@pytest.mark.parametrize("e", [0, 4])
+def test_a_row_is_the_env_of_the_scenario_with_that_seed(cell, folder, play, e, difficulty) -> None:
+    options: dict[str, Any] = {"difficulty": difficulty, "cache": folder}
+    batch, env = make_batch(cell, 6, SEED, **options), make_env(cell, **options)
+    obs, _ = batch.reset()
+    seen = play.single(env, env.reset(seed=SEED + e))
+    ends, faults = [], 0
+    for step in range(140):
+        play.same({n: v[e : e + 1] for n, v in obs.items()}, {n: seen[n] for n in obs})
+        actions = actions_of(play, obs["action_mask"], step)
+        given = batch.step(actions)
+        obs = given[0]
+        seen = play.single(env, env.step(dict(zip(env.possible_agents, actions[e].tolist(), strict=True))))
+        expected = play.rows(given, e)
+        play.same({n: v for n, v in seen.items() if n not in obs}, {n: expected[n] for n in seen if n not in obs})
+        faults += int(seen["faults"].sum())
+        if not env.agents:
+            ends.append(bool(seen["terminated"]))
+            play.same({n: expected[f"final_{n}"] for n in obs}, {n: seen[n] for n in obs})
+            seen = play.single(env, env.reset())
+    assert len(ends) >= 2
+    assert faults > 0
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 2**63))
+def test_a_shift_as_arrays_has_the_jobs_of_the_scenario(fleet, seed) -> None:
+    library, entropy = library_of([fleet]), np.random.SeedSequence(seed)
+    jobs, shift = draw_jobs(fleet.scenario, np.random.SeedSequence(seed, spawn_key=(0,))), library.draw(entropy)
+    place = {job.name: j for j, job in enumerate(jobs)}
+    tables = library.tables
+    assert shift.repetitions.tolist() == [job.repetitions for job in jobs]
+    assert shift.release_s.tolist() == [job.release_s for job in jobs]
+    assert shift.due_s.tolist() == [job.due_s for job in jobs]
+    assert [{j for j in row if j >= 0} for row in shift.after.tolist()] == [
+        {place[name] for name in job.after} for job in jobs
+    ]
+    assert tables.payload_kg[0, shift.kind].tolist() == [job.work.payload_kg for job in jobs]
+    assert tables.value[0, shift.kind].tolist() == [job.value for job in jobs]
+    again = library.draw(entropy)
+    assert all(np.array_equal(value, getattr(again, name)) for name, value in vars(shift).items())
+
+
+# Varied
+
+
+def test_no_variation_is_that_of_none(fleet) -> None:
+    plain, zero = library_of([fleet]), library_of([fleet], Randomisation(ambient_k=(0.0, 0.0), arrivals=(1.0, 1.0)))
+    for seed in range(5):
+        one, other = (lib.draw(np.random.SeedSequence(seed)) for lib in (plain, zero))
+        assert all(np.array_equal(value, getattr(other, name)) for name, value in vars(one).items())
+
+
+def test_what_varies_stays_within_its_bounds_and_reaches_all_of_them(fleet) -> None:
+    randomise = Randomisation(ambient_k=(-2.0, 6.0), arrivals=(0.5, 2.0))
+    library = library_of([fleet] * 3, randomise)
+    shifts = [library.draw(np.random.SeedSequence(seed)) for seed in range(300)]
+    air = np.array([shift.air_k for shift in shifts])
+    assert -2.0 <= air.min() < -1.8
+    assert 5.8 < air.max() <= 6.0
+    assert air.mean() == pytest.approx(2.0, abs=4 * 8.0 / np.sqrt(12 * 300))
+    lots = np.bincount([shift.lot for shift in shifts], minlength=3)
+    assert len(lots) == 3
+    assert np.abs(lots - 100).max() < 4 * np.sqrt(300 * 2 / 9)
+    # 240 s at one in 60 s and 200 s at one in 40 s are 9 jobs, on the mean 1.25 times as often, and 3 at once.
+    often = Randomisation(arrivals=(3.0, 3.0))
+    for chosen, expected in ((Randomisation(), 12.0), (randomise, 3 + 9 * 1.25), (often, 3 + 9 * 3.0)):
+        counts = [len(library_of([fleet], chosen).draw(np.random.SeedSequence(s)).kind) for s in range(200)]
+        assert np.mean(counts) == pytest.approx(expected, abs=4 * np.std(counts) / np.sqrt(200))
+
+
+def test_a_variation_is_of_its_seed_and_leaves_the_noise_alone(fleet, play) -> None:
+    randomise = Randomisation(ambient_k=(0.0, 5.0), arrivals=(0.8, 1.2))
+    library = library_of([fleet], randomise)
+    for seed in range(4):
+        plain, one, again = (lib.draw(np.random.SeedSequence(seed)) for lib in (library_of([fleet]), library, library))
+        assert all(np.array_equal(value, getattr(again, name)) for name, value in vars(one).items())
+        assert (one.key, plain.air_k) == (plain.key, 0.0)
+        assert one.air_k > 0.0
+    three, seven = BatchEnv(library, 3, seed=4), BatchEnv(library, 7, seed=2)
+    rows = three.reset()[0], seven.reset()[0]
+    play.same(rows[0], {name: values[2:5] for name, values in rows[1].items()})
+
+
+def test_warmer_air_is_felt_by_every_motor(cell, folder) -> None:
+    options: dict[str, Any] = {"difficulty": "blind", "cache": folder, "limits": {}}
+    cool = make_batch(cell, 5, 0, **options)
+    warm = make_batch(cell, 5, 0, randomise=Randomisation(ambient_k=(3.0, 3.0)), **options)
+    nobody = np.zeros((5, 3), int)
+    for batch in (cool, warm):
+        batch.reset()
+    np.testing.assert_allclose(warm.state.temp_c - cool.state.temp_c, 3.0)
+    for batch in (cool, warm):
+        for _ in range(15):
+            batch.step(nobody)
+    warmer = warm.state.temp_c - cool.state.temp_c
+    assert warmer.min() > 3.0 - 1e-9
+    assert 3.0 + 1e-6 < warmer.max() < 3.1  # the losses of a warmer motor are a little higher
+
+
+def test_a_variant_is_its_fleet(cell, folder, play) -> None:
+    """Rows of a batch of two fleets, each beside the batch of that fleet alone."""
+    options: dict[str, Any] = {"difficulty": "oracle", "cache": folder}
+    variant = {"spread": {"scale": 2.0, "seed": 9}}
+    both = make_batch(cell, 12, SEED, randomise=Randomisation(variants=[variant]), **options)
+    alone = [make_batch(cell, 12, SEED, **options, **each) for each in ({}, variant)]
+    obs, given = both.reset()[0], [env.reset()[0] for env in alone]
+    lot = (obs["observation"] == given[1]["observation"]).all(axis=(1, 2)).astype(int)
+    for step in range(70):
+        is_one = [(obs["observation"] == each["observation"]).all(axis=(1, 2)) for each in given]
+        assert np.choose(lot, is_one).all()
+        assert not (is_one[0] & is_one[1]).any()
+        for each, env in enumerate(alone):
+            np.testing.assert_array_equal(env.state.temp_c[lot == each], both.state.temp_c[lot == each])
+        actions = actions_of(play, obs["action_mask"], step)
+        (obs, _, terminated, truncated, _), given = both.step(actions), [env.step(actions)[0] for env in alone]
+        if (terminated | truncated).any():  # the next shift of a row may be of the other fleet
+            break
+    assert step > 10
+    assert 0 < lot.sum() < 12
+
+
+def test_fleets_of_unlike_risks_in_one_table_are_each_its_own(small, play) -> None:
+    """Without risks, with one piece, with three and a curve; of one station and of two."""
+    models = [
+        [small.ByPayload(1.0 + 0.1 * i) for i in range(3)],
+        [play.Learned(1, curve=False) for _ in range(3)],
+        [play.Learned(3, curve=True), small.ByPayload(1.0), play.Learned(2, curve=False)],
+    ]
+    works = [small.work("bench", small.HOT), small.work("rack", 1.0, to="bench"), small.work("rack")]
+    flat = [small.work("bench", small.HOT), small.work("rack", 1.0), small.work("rack")]
+    tables, shifts = [], []
+    for lot, own in enumerate(models):
+        content = flat if lot == 1 else works
+        arms = [small.arm(i, content, model=model, times=small.Times(cycle=8.0 + lot)) for i, model in enumerate(own)]
+        jobs = [small.job(f"j{j}", content[j % 3], release_s=30.0 * (j // 2), repetitions=2 + j % 2) for j in range(9)]
+        world, _ = small.shop([jobs], arms=arms, ticks=40, ambient_c=30.0 + lot)
+        own_tables, drawn = tables_of(world)
+        tables.append(own_tables)
+        shifts += shifts_of(drawn, [77])
+    assert len({table.offset.shape for table in tables}) == 3
+    assert len({table.stations.shape for table in tables}) == 2
+    names, together = ("arm_0", "arm_1", "arm_2"), stacked(tables)
+    for lot, own_tables in enumerate(tables):
+        in_all = replace(shifts[lot], lot=lot)
+        alone = BatchEnv(Library(names, 4, own_tables, lambda _, lot=lot: shifts[lot]), 1, seed=0)
+        among = BatchEnv(Library(names, 4, together, lambda _, shift=in_all: shift), 1, seed=0)
+        one, other = alone.reset(), among.reset()
+        for step in range(40):
+            play.same(play.rows(one, 0), play.rows(other, 0))
+            actions = actions_of(play, one[0]["action_mask"], step)
+            one, other = alone.step(actions), among.step(actions)
