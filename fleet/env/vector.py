@@ -14,6 +14,7 @@ from fleet.env.arguments import at_least_one, seeds_of
 from fleet.env.engine import Engine, Shift
 from fleet.env.observation import Layout, Observation
 from fleet.env.reward import TERMS, RewardWeights
+from fleet.env.shelf import Shelf
 from fleet.env.spaces import arm_spaces
 from fleet.sim.state import State
 from fleet.sim.tables import Tables
@@ -67,6 +68,7 @@ class BatchEnv:
         self.single_observation_space, self.single_action_space = arm_spaces(self.layout)
         """Of one arm."""
         self.autoreset = autoreset
+        self._shelf = Shelf((num_envs, len(library.arms), self.layout.size), np.float32)
         self._library = library
         self._engine = Engine(library.tables, num_envs, self.layout, weights or RewardWeights())
         self._seeds = seeds_of(seed, num_envs)
@@ -187,7 +189,8 @@ class BatchEnv:
         }
 
     def _no_vectors(self) -> Array:
-        return np.empty((self.num_envs, self.layout.arms, self.layout.size), np.float32)
+        """For vectors to be written to: of earlier steps, if nobody has them any more."""
+        return self._shelf.take()
 
     def _checked(self, actions: Any) -> Array:
         shape = (self.num_envs, self.layout.arms)
