@@ -1,4 +1,4 @@
-"""`thermofleet contract`: write down what is said on the bus, for those who write their own participants."""
+"""`thermofleet contract`: write down what is said on the bus and seen in the environment, for those who join in."""
 
 import json
 from pathlib import Path
@@ -9,7 +9,8 @@ import typer
 from fleet.errors import FleetError
 from scenarios.terminal import out_console, say
 
-PAGE = "bus.md"
+PAGES = ("bus.md", "env.md")
+"""Their tables are filled in."""
 
 
 def contract_command(
@@ -18,7 +19,7 @@ def contract_command(
         bool, typer.Option("--check", help="Write nothing; say whether the documents are current.")
     ] = False,
 ) -> None:
-    """JSON schemas and an AsyncAPI 3 document of every word on the bus; fills the tables of bus.md beside --out."""
+    """JSON schemas and an AsyncAPI 3 document of every word on the bus; fills the tables of bus.md and env.md."""
     made = documents(out)
     stale = [path for path, text in made.items() if not path.is_file() or path.read_text(encoding="utf-8") != text]
     if check:
@@ -35,7 +36,7 @@ def contract_command(
 
 
 def documents(out: Path) -> dict[Path, str]:
-    """Text of every document by its path; of the page too, where there is one in the folder above."""
+    """Text of every document by its path; of the pages too, where they are in the folder above."""
     from fleet.bus.asyncapi import asyncapi
     from fleet.bus.contract import schema_document
     from scenarios.contract_page import filled
@@ -44,9 +45,9 @@ def documents(out: Path) -> dict[Path, str]:
         out / "schemas.json": _json(schema_document()),
         out / "asyncapi.json": _json(asyncapi()),
     }
-    page = out.parent / PAGE
-    if page.is_file():
-        made[page] = filled(page.read_text(encoding="utf-8"))
+    for page in (out.parent / name for name in PAGES):
+        if page.is_file():
+            made[page] = filled(page.read_text(encoding="utf-8"))
     return made
 
 

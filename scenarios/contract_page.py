@@ -1,4 +1,4 @@
-"""Tables of the contract for docs/bus.md, from the same source as the schemas."""
+"""Tables for docs/bus.md and docs/env.md, from the same source as the schemas and the environment."""
 
 import json
 import re
@@ -21,7 +21,15 @@ def filled(page: str) -> str:
     """
     from scenarios.contract_numbers import limit_table, time_table
 
-    parts = {"keys": key_table, "ways": way_table, "words": word_tables, "times": time_table, "limits": limit_table}
+    parts = {
+        "keys": key_table,
+        "ways": way_table,
+        "words": word_tables,
+        "times": time_table,
+        "limits": limit_table,
+        "observation": observation_table,
+        "rewards": reward_table,
+    }
 
     def part(match: re.Match[str]) -> str:
         if match["name"] not in parts:
@@ -62,6 +70,20 @@ def word_tables() -> str:
     words = {word.__name__: word for word in SPECIMENS}
     order = [*words, *(name for name in parts if name not in words)]
     return "\n\n".join(_word(name, parts[name], _where(name), words.get(name)) for name in order if name in parts)
+
+
+def observation_table() -> str:
+    """What an arm knows, field by field."""
+    from scenarios.env_tables import field_rows
+
+    return table(("field", "of 4 arms, 8 slots", "shape", "unit", "range", "meaning"), field_rows())
+
+
+def reward_table() -> str:
+    """What the reward is made of."""
+    from scenarios.env_tables import reward_rows
+
+    return table(("info", "weight", "what for"), reward_rows())
 
 
 def _word(name: str, part: Mapping[str, Any], where: str, word: type | None) -> str:

@@ -1,0 +1,82 @@
+"""docs/env.md says what the environment does: its tables are made of it, and its example runs."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from fleet.env.observation import FIELDS, Layout
+from fleet.env.reward import TERMS, RewardWeights
+from scenarios import make_batch, make_env
+from scenarios.cli import app
+from scenarios.contract_page import filled
+from scenarios.load import override
+
+PAGE = Path(__file__).parents[2] / "docs" / "env.md"
+TEXT = PAGE.read_text(encoding="utf-8")
+
+
+def test_its_tables_are_current() -> None:
+    assert filled(TEXT) == TEXT, "write it anew with: thermofleet contract"
+
+
+def test_the_command_says_when_a_table_is_not_current(tmp_path) -> None:
+    page, call = tmp_path / "env.md", CliRunner().invoke
+    page.write_text(TEXT.replace("| `clock` | 0 |", "| `clock` | 7 |"), encoding="utf-8")
+    out = ["contract", "--out", str(tmp_path / "contract")]
+    assert "env.md" in str(call(app, [*out, "--check"]).exception)
+    assert call(app, out).exit_code == 0
+    assert page.read_text(encoding="utf-8") == TEXT
+    assert call(app, [*out, "--check"]).exit_code == 0
+
+
+def test_every_field_lies_where_the_table_says() -> None:
+    layout = Layout(4, 8)
+    rows = dict(re.findall(r"^\| `(\w+)` \| ([\d–]+) \| [^|]+ \| [^|]+ \| [^|]+ …", TEXT, re.MULTILINE))
+    assert list(rows) == [field.name for field in FIELDS]
+    ends = [int(place.split("–")[-1]) for place in rows.values()]
+    assert [int(place.split("–")[0]) for place in rows.values()] == [0, *(end + 1 for end in ends[:-1])]
+    assert ends[-1] == layout.size - 1 == 164
+
+
+@pytest.mark.parametrize(("n", "slots"), [(1, 1), (4, 8), (7, 3)])
+def test_the_size_is_what_the_page_says(n, slots) -> None:
+    a, b, c, d = map(int, re.findall(r"size = (\d+) \+ (\d+) K \+ \(n − 1\)\((\d+) \+ (\d+) K\)", TEXT)[0])
+    assert Layout(n, slots).size == a + b * slots + (n - 1) * (c + d * slots)
+
+
+def test_every_info_is_told_of(make, batch) -> None:
+    infos = make().reset(seed=0)[1]["arm_0"]
+    told = set(re.findall(r"`(?:info\[\")?(\w+)(?:\"\])?`", TEXT))
+    assert {name for name in (*infos, *batch(1).reset()[1]) if name not in told} == set()
+    weights = RewardWeights()
+    for name in TERMS:
+        weight = f"{getattr(weights, name):g}".replace("-", "−")
+        assert f"| `reward_{name}` | {weight} |" in TEXT
+
+
+def test_its_example_runs(monkeypatch, cell, folder) -> None:
+    """On a cell that is planned in a moment."""
+
+    def small(given: dict[str, Any]) -> dict[str, Any]:
+        fields = {name: given.pop(name) for name in ("horizon_s",) if name in given}
+        return {"scenario": override(cell, **fields), "cache": folder, **given}
+
+    def env(scenario: str, **given: Any) -> Any:
+        assert scenario == "quickstart"
+        return make_env(**small(given))
+
+    def batch(scenario: str, num_envs: int, **given: Any) -> Any:
+        assert scenario == "quickstart"
+        return make_batch(**small(given), num_envs=num_envs)
+
+    monkeypatch.setattr("scenarios.make_env", env, raising=False)
+    monkeypatch.setattr("scenarios.make_batch", batch, raising=False)
+    monkeypatch.setattr("scenarios.registration.make_env", env)
+    told: dict[str, Any] = {}
+    exec(TEXT.split("```python\n")[1].split("```")[0], told)
+    assert told["env"].agents == []
+    assert told["by_name"].possible_agents == list(told["batch"].agents)
+    assert told["reward"].shape == (32,)
