@@ -57,7 +57,7 @@ class Engine:
             head=np.zeros(envs, int),
         )
         self._all = np.arange(envs)
-        self._raw = np.zeros((envs, len(TERMS)))
+        self._raw = np.zeros((len(TERMS), envs))
         self._start = np.array(layout.starts)
         self._low, self._high = layout.bounds
         self._drawn = _no_jobs(envs, jobs, 1)
@@ -138,7 +138,7 @@ class Engine:
             self.tables, self._drawn, self._rows, self._offer, actions, self._raw, self._all,
             self._start, self._low, self._high, out,
         )  # fmt: skip
-        return scale(self._raw, self._weights), (self._offer.open == 0) & (self._drawn.jobs > 0)
+        return scale(self._raw.T, self._weights), (self._offer.open == 0) & (self._drawn.jobs > 0)
 
     def _make_room(self, jobs: int, waits: int) -> None:
         """For more jobs a shift, a tenth more than asked for, keeping what is there."""

@@ -233,7 +233,7 @@ def turn(
 
     Args:
         actions: int64 [env, arm].
-        raw: Takes the reward terms, not weighted, [env, term].
+        raw: Takes the reward terms, not weighted, [term, env].
         rows: All envs, int [env].
         start, low, high, out: As in `look`.
     """

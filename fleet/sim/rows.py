@@ -174,7 +174,7 @@ def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array) -> None:
     """Every arm through one step: motion, heat, limits, the end of its job.
 
     Args:
-        raw: Takes the reward terms, not weighted, [env, term].
+        raw: Takes the reward terms, not weighted, [term, env].
     """
     # The arrays by names of their own: a field of a tuple is counted at every use.
     lots, airs_k, kinds, repetitions, due_s = d.lot, d.air_k, d.kind, d.repetitions, d.due_s
@@ -283,7 +283,7 @@ def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array) -> None:
                 if clear_at_s[e, a] <= (tick + 1) * dt_s:
                     lost_s[e, a] -= dt_s - (clear_at_s[e, a] - now_s)
                     modes[e, a], clear_at_s[e, a] = IDLE, np.inf
-        raw[e, 0], raw[e, 1], raw[e, 2], raw[e, 3], raw[e, 4] = value, late, above_s, count, energy
+        raw[0, e], raw[1, e], raw[2, e], raw[3, e], raw[4, e] = value, late, above_s, count, energy
         ticks[e] += 1
 
 
