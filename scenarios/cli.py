@@ -31,6 +31,7 @@ from scenarios.policies import label, policy_of
 from scenarios.router_cli import router_command
 from scenarios.scenario import Scenario
 from scenarios.terminal import Interrupted, Progress, err_console, out_console, progress_bar, say
+from scenarios.train_cli import train_command
 from scenarios.twin_cli import twin_app
 
 app = typer.Typer(
@@ -216,6 +217,7 @@ def demo_command(
 
 
 app.command("animate")(animate_command)
+app.command("train")(train_command)
 app.command("hold")(hold_command)
 app.command("keys")(keys_command)
 app.command("router")(router_command)

@@ -15,23 +15,23 @@ from scipy.stats import bootstrap, trim_mean
 
 from fleet.bus.channel import PERFECT, Channel
 from fleet.errors import FleetError
-from fleet.metrics import Metrics
 from scenarios.build import DifficultyName, Fleet, Progress, cache_folder, prepare, quiet
 from scenarios.policies import label, policy_of
-from scenarios.run import RunSpec, run
+from scenarios.run import RunResult, RunSpec, run
 from scenarios.scenario import Scenario
 
 Array = np.ndarray
 
 RESAMPLES = 2000
-FIGURES: dict[str, Callable[[Metrics], float]] = {
-    "value": lambda m: m.value,
-    "finished": lambda m: m.finished,
-    "on_time": lambda m: m.on_time,
-    "faults": lambda m: m.faults,
-    "above_warning_min": lambda m: m.above_warning_min,
-    "peak_c": lambda m: max(m.peak_c.values()),
-    "availability": lambda m: m.availability,
+FIGURES: dict[str, Callable[[RunResult], float]] = {
+    "reward": lambda r: r.total_reward,
+    "value": lambda r: r.metrics.value,
+    "finished": lambda r: r.metrics.finished,
+    "on_time": lambda r: r.metrics.on_time,
+    "faults": lambda r: r.metrics.faults,
+    "above_warning_min": lambda r: r.metrics.above_warning_min,
+    "peak_c": lambda r: max(r.metrics.peak_c.values()),
+    "availability": lambda r: r.metrics.availability,
 }
 """What is compared, by name."""
 
@@ -97,17 +97,16 @@ def compare(
     folder = cache_dir or cache_folder()  # named here: a worker may have been started under another one
     prepare(scenario, difficulty=difficulty, cache=folder, progress=progress)  # into the cache, for all workers
     cells = [(policy, seed) for policy in policies for seed in seeds]
-    metrics: list[Metrics] = []
+    found: list[dict[str, float]] = []
     with Parallel(n_jobs=workers, return_as="generator") as pool:
         for done in pool(delayed(_cell)(scenario, difficulty, channel, folder, *cell) for cell in cells):
             assert done is not None
-            metrics.append(done)
-            progress("comparing", len(metrics) / len(cells))
-    by_policy = {p: [m for (q, _), m in zip(cells, metrics, strict=True) if q == p] for p in policies}
+            found.append(done)
+            progress("comparing", len(found) / len(cells))
+    by_policy = {p: [m for (q, _), m in zip(cells, found, strict=True) if q == p] for p in policies}
     rng = np.random.default_rng(np.random.SeedSequence(0))
     figures = {
-        p: {name: _figure(of, rows, by_policy[baseline], rng) for name, of in FIGURES.items()}
-        for p, rows in by_policy.items()
+        p: {name: _figure(name, rows, by_policy[baseline], rng) for name in FIGURES} for p, rows in by_policy.items()
     }
     return Comparison(scenario.name, tuple(seeds), baseline, figures, channel.described(), channel.text)
 
@@ -119,17 +118,19 @@ def _fleet(scenario: Scenario, difficulty: DifficultyName, cache_dir: Path) -> F
 
 def _cell(
     scenario: Scenario, difficulty: DifficultyName, channel: Channel, cache_dir: Path, policy: str, seed: int
-) -> Metrics:
+) -> dict[str, float]:
+    """The figures of one policy on one seed."""
     fleet = _fleet(scenario, difficulty, cache_dir)
     spec = RunSpec(policy=policy, seed=seed, bus="memory", difficulty=difficulty, channel=channel)
-    return run(fleet, spec, record=False).metrics
+    result = run(fleet, spec, record=False)
+    return {name: float(of(result)) for name, of in FIGURES.items()}
 
 
 def _figure(
-    of: Callable[[Metrics], float], rows: Sequence[Metrics], base: Sequence[Metrics], rng: np.random.Generator
+    name: str, rows: Sequence[dict[str, float]], base: Sequence[dict[str, float]], rng: np.random.Generator
 ) -> Figure:
-    values = np.array([of(m) for m in rows], dtype=float)
-    paired = values - np.array([of(m) for m in base], dtype=float)
+    values = np.array([each[name] for each in rows])
+    paired = values - np.array([each[name] for each in base])
     low, high = interval(values, rng)
     d_low, d_high = interval(paired, rng)
     return Figure(

@@ -1,7 +1,9 @@
-"""Policies by name: the rules that come along, or an own class as `FILE.py:CLASS` or `MODULE:CLASS`."""
+"""Policies by name: the rules that come along, an own class as `FILE.py:CLASS` or `MODULE:CLASS`, or the folder of a
+trained one."""
 
 import importlib
 import importlib.util
+import os
 from pathlib import Path
 from types import ModuleType
 
@@ -14,13 +16,17 @@ def policy_of(name: str) -> Policy:
     """A fresh policy.
 
     Raises:
-        FleetError: no such rule, file, module or class, or one that is no policy.
+        FleetError: no such rule, file, module, class or folder, or one that is no policy.
     """
+    if Path(name).is_dir():
+        from agents.learned.policy import load_policy  # loads torch
+
+        return load_policy(Path(name))
     if ":" not in name:
         try:
             return make_policy(name)
         except ValueError as error:
-            raise FleetError(f"{error} Or give an own one as FILE.py:CLASS.") from error
+            raise FleetError(f"{error} Or give an own one as FILE.py:CLASS, or the folder of a trained one.") from error
     where, _, kind = name.rpartition(":")
     module = _module(where, name)
     found = getattr(module, kind, None)
@@ -33,7 +39,9 @@ def policy_of(name: str) -> Policy:
 
 
 def label(name: str) -> str:
-    """How a table calls a policy: the rule, or the class."""
+    """How a table calls a policy: the rule, the class, or the last folder."""
+    if Path(name).is_dir():
+        return Path(os.path.abspath(name)).name
     return name.rpartition(":")[2]
 
 

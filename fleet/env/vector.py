@@ -47,6 +47,8 @@ class BatchEnv:
         weights: Of the reward terms.
         max_cycles: Ends a shift earlier than its horizon, in decision intervals.
         autoreset: Begin a new shift by itself; otherwise `reset(rows=…)` must, before the next step.
+        stagger: Cut the first shift of env e after (e + 1) / num_envs of its length, so that from then on the envs are
+            spread over the hours of a shift, as a learner wants them that sees a few hours at a time.
     """
 
     def __init__(
@@ -58,10 +60,15 @@ class BatchEnv:
         weights: RewardWeights | None = None,
         max_cycles: int | None = None,
         autoreset: bool = True,
+        stagger: bool = False,
     ) -> None:
         self.num_envs = num_envs = at_least_one("num_envs", num_envs)
         ticks = library.tables.ticks
-        self._last_tick = ticks if max_cycles is None else min(ticks, at_least_one("max_cycles", max_cycles))
+        self._whole = ticks if max_cycles is None else min(ticks, at_least_one("max_cycles", max_cycles))
+        """Decision intervals of a shift that is not cut."""
+        share = (np.arange(num_envs) + 1) / num_envs if stagger else np.ones(num_envs)
+        self._last_tick = np.ceil(self._whole * share).astype(int)
+        """Of the present shift of each env."""
         self.agents = library.arms
         """Names of the arms, in the order of the arm axis."""
         self.layout = Layout(len(library.arms), library.slots)
@@ -141,6 +148,7 @@ class BatchEnv:
         truncated = ~finished & (self._engine.rows.tick >= self._last_tick)
         self._vectors, self._over = vectors, finished | truncated
         ended = np.flatnonzero(self._over)
+        self._last_tick[ended] = self._whole
         last = self._obs(ended) if len(ended) and self.autoreset else None
         info = self._info(terms, ended, last)
         if last is not None:

@@ -1,0 +1,108 @@
+"""The shared network: one actor for every arm of every fleet, and the critics that train it.
+
+Deep sets (Zaheer et al., NeurIPS 2017): slots and peers enter by the same small networks and are pooled, so the
+logits move with the slots, and neither the order of peers nor their number matters.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from agents.learned.features import OWN, PAIR, PEER, SLOT, sets_of
+from fleet.env.observation import Layout
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkSize:
+    """Widths of the hidden layers."""
+
+    arm: int = 48
+    slot: int = 48
+    pair: int = 16
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if value < 1:
+                raise ValueError(f"NetworkSize.{name} must be >= 1 (got {value}).")
+
+
+class Actor(nn.Module):
+    """What an arm would rather do: logits over wait and the slots."""
+
+    def __init__(self, size: NetworkSize | None = None) -> None:
+        super().__init__()
+        size = size or NetworkSize()
+        self.own = _mlp([OWN, size.arm, size.arm])
+        self.pair = _mlp([PAIR + PEER + SLOT, size.pair, size.pair])
+        self.slot = _mlp([SLOT + 2 * size.pair + size.arm, size.slot, size.slot])
+        self.claim = _mlp([2 * size.slot + size.arm, size.slot, 1], last=False)
+        self.wait = _mlp([size.slot + size.arm, size.slot, 1], last=False)
+        self._pair = size.pair
+
+    def forward(self, layout: Layout, vectors: Tensor) -> Tensor:
+        """Logits before the mask, [row, slot + 1], of vectors [row, size]."""
+        own_in, slot_in, peer_in, pair_in = sets_of(layout, vectors)
+        slots, peers = slot_in.shape[-2], peer_in.shape[-2]
+        own = self.own(own_in)
+        if peers:
+            said = torch.cat(
+                [
+                    pair_in,
+                    peer_in[..., :, None, :].expand(*pair_in.shape[:-1], PEER),
+                    slot_in[..., None, :, :].expand(*pair_in.shape[:-1], SLOT),
+                ],
+                dim=-1,
+            )
+            heard = self.pair(said)
+            crowd = torch.cat([heard.mean(dim=-3), heard.amax(dim=-3)], dim=-1)
+        else:
+            crowd = slot_in.new_zeros(*slot_in.shape[:-1], 2 * self._pair)
+        mine = own[..., None, :].expand(*slot_in.shape[:-1], own.shape[-1])
+        slot = self.slot(torch.cat([slot_in, crowd, mine], dim=-1))
+        offered = slot_in[..., :1]
+        queue = (offered * slot).sum(dim=-2) / offered.sum(dim=-2).clamp(min=1.0)
+        waiting = queue[..., None, :].expand(*queue.shape[:-1], slots, queue.shape[-1])
+        claim = self.claim(torch.cat([slot, waiting, mine], dim=-1))[..., 0]
+        return torch.cat([self.wait(torch.cat([queue, own], dim=-1)), claim], dim=-1)
+
+
+class Critic(nn.Module):
+    """What a fleet's state is worth: of all arms together (MAPPO), or as each sees it (IPPO)."""
+
+    def __init__(self, size: NetworkSize | None = None, *, central: bool = True) -> None:
+        super().__init__()
+        size = size or NetworkSize()
+        self.central = central
+        self.own = _mlp([OWN, size.arm, size.arm])
+        self.slot = _mlp([SLOT, size.pair, size.pair])
+        self.worth = _mlp([2 * size.arm + 2 * size.pair, size.arm, 1], last=False)
+
+    def forward(self, layout: Layout, vectors: Tensor) -> Tensor:
+        """Values [..., arm] of vectors [..., arm, size]; a central critic gives all arms the same."""
+        sets = sets_of(layout, vectors)
+        own = self.own(sets.own)
+        offered = sets.slot[..., :1]
+        slot = offered * self.slot(sets.slot)
+        queue = torch.cat([slot.sum(dim=-2) / 8.0, slot.amax(dim=-2)], dim=-1)
+        if not self.central:
+            return self.worth(torch.cat([own, torch.zeros_like(own), queue], dim=-1))[..., 0]
+        state = torch.cat([own.mean(dim=-2), own.amax(dim=-2), queue.mean(dim=-2)], dim=-1)
+        return self.worth(state).expand(*vectors.shape[:-1])
+
+
+def masked(logits: Tensor, mask: Tensor) -> Tensor:
+    """Logits with those of illegal actions at the lowest finite value, so that their probability is zero."""
+    return logits.masked_fill(~mask.bool(), torch.finfo(logits.dtype).min)
+
+
+def _mlp(widths: Sequence[int], *, last: bool = True) -> nn.Sequential:
+    """Linear layers with SiLU between them, and after the last one if `last`."""
+    layers: list[nn.Module] = []
+    for i, (before, after) in enumerate(pairwise(widths)):
+        layers.append(nn.Linear(before, after))
+        if last or i < len(widths) - 2:
+            layers.append(nn.SiLU())
+    return nn.Sequential(*layers)

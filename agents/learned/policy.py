@@ -1,0 +1,86 @@
+"""A trained policy: the shared actor as a `Policy`, and how it is kept (safetensors and JSON)."""
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from agents.learned.network import Actor, NetworkSize, masked
+from fleet.env.observation import Layout, Observation
+from fleet.errors import CheckpointError
+
+FORMAT = 1
+WEIGHTS, CARD = "policy.safetensors", "policy.json"
+
+
+class LearnedPolicy:
+    """Every arm claims what the actor rates highest.
+
+    Args:
+        actor: Trained, for a fleet of any size.
+    """
+
+    def __init__(self, actor: Actor) -> None:
+        self._actor = actor.eval()
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Nothing to begin: it draws nothing."""
+
+    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+        """The best rated action of every arm; WAIT where there is no choice."""
+        actions = dict.fromkeys(observations, 0)
+        choosing = [arm for arm, seen in observations.items() if seen.action_mask[1:].any()]
+        if not choosing:
+            return actions
+        first = observations[choosing[0]]
+        layout = Layout(len(first.peer_heard) + 1, len(first.offered))
+        vectors = torch.from_numpy(np.stack([layout.pack(observations[arm]) for arm in choosing]))
+        mask = torch.from_numpy(np.stack([observations[arm].action_mask for arm in choosing]))
+        with torch.inference_mode():
+            best = masked(self._actor(layout, vectors), mask).argmax(dim=-1)
+        return actions | dict(zip(choosing, best.tolist(), strict=True))
+
+
+def save_policy(actor: Actor, size: NetworkSize, folder: Path, **told: Any) -> None:
+    """Write an actor into a folder, made if need be; files appear whole or not at all.
+
+    Args:
+        told: What the card shall say besides: scenario, algorithm, steps.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    draft = folder / f".{WEIGHTS}.{os.getpid()}"
+    save_file({name: value.contiguous() for name, value in actor.state_dict().items()}, draft)
+    draft.replace(folder / WEIGHTS)
+    draft = folder / f".{CARD}.{os.getpid()}"
+    draft.write_text(json.dumps({"format": FORMAT, "size": asdict(size), **told}, indent=1) + "\n", encoding="utf-8")
+    draft.replace(folder / CARD)
+
+
+def load_policy(folder: Path) -> LearnedPolicy:
+    """The policy that `save_policy` wrote.
+
+    Raises:
+        CheckpointError: a file is missing, damaged or of another format.
+    """
+    try:
+        card = json.loads((folder / CARD).read_text(encoding="utf-8"))
+        if card["format"] != FORMAT:
+            raise CheckpointError(f"{folder / CARD}: format {card['format']} is not {FORMAT}: train it again.")
+        size = NetworkSize(**card["size"])
+    except FileNotFoundError as error:
+        raise CheckpointError(f"There is no trained policy in '{folder}': no {CARD}.") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise CheckpointError(f"{folder / CARD}: not the card of a policy ({error}).") from error
+    actor = Actor(size)
+    try:
+        actor.load_state_dict(load_file(folder / WEIGHTS))
+    except (OSError, SafetensorError, RuntimeError) as error:
+        raise CheckpointError(f"{folder / WEIGHTS}: {error}") from error
+    return LearnedPolicy(actor)

@@ -1,0 +1,189 @@
+"""The learned policy: what it must not depend on, that it learns, and that it is kept."""
+
+import json
+from itertools import islice
+
+import numpy as np
+import pytest
+import torch
+
+from agents.learned.features import sets_of
+from agents.learned.network import Actor, Critic, NetworkSize, masked
+from agents.learned.policy import CARD, WEIGHTS, LearnedPolicy, load_policy, save_policy
+from agents.learned.ppo import PpoConfig, Trainer
+from fleet.env.adapters.torchrl import TorchRLEnv
+from fleet.env.engine import Shift, shifts_of
+from fleet.env.observation import FIELDS, Layout, Observation
+from fleet.env.vector import BatchEnv, Library
+from fleet.errors import CheckpointError
+from fleet.sim.noise import key_of
+from fleet.sim.tables import tables_of
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def random_observation(layout: Layout, rng: np.random.Generator, rows: int) -> np.ndarray:
+    low, high = layout.bounds
+    values = rng.uniform(np.maximum(low, -300.0), np.minimum(high, 300.0), (rows, layout.size))
+    parts = layout.read(values, values[:, :0])
+    for field in FIELDS:
+        if field.unit == "1" and (field.low, field.high) == (0, 1):
+            part = getattr(parts, field.name)
+            part[...] = np.round(part)
+    return values.astype(np.float32)
+
+
+def reordered(layout: Layout, vectors: np.ndarray, slots: np.ndarray, peers: np.ndarray) -> np.ndarray:
+    """The same knowledge with slots and peers in another order."""
+    seen = layout.read(vectors.copy(), vectors[:, :0])
+    named = {}
+    for field in FIELDS:
+        part = getattr(seen, field.name)
+        for axis, order in (("slot", slots), ("peer", peers)):
+            if axis in field.axes:
+                part = np.take(part, order, axis=1 + field.axes.index(axis))
+        named[field.name] = part
+    return layout.pack(Observation(**named, action_mask=vectors[:, :0]))
+
+
+@pytest.mark.parametrize(("arms", "slots"), [(1, 1), (2, 3), (4, 8), (9, 5)])
+def test_logits_move_with_the_slots_and_do_not_know_the_order_of_peers(arms, slots) -> None:
+    rng, layout = np.random.default_rng(arms), Layout(arms, slots)
+    torch.manual_seed(0)
+    actor, critic = Actor().double(), Critic().double()
+    vectors = random_observation(layout, rng, 6)
+    slot_order, peer_order = rng.permutation(slots), rng.permutation(arms - 1)
+    other = reordered(layout, vectors, slot_order, peer_order)
+    one, two = (actor(layout, torch.from_numpy(v).double()) for v in (vectors, other))
+    torch.testing.assert_close(two[:, 0], one[:, 0])
+    torch.testing.assert_close(two[:, 1:], one[:, 1:][:, slot_order.copy()])
+    assert slots == 1 or one[:, 1:].std() > 0
+    fleet = torch.from_numpy(vectors).double()[None]
+    torch.testing.assert_close(critic(layout, fleet.flip(1)), critic(layout, fleet).flip(1))
+
+
+def test_no_feature_is_wild() -> None:
+    layout = Layout(4, 8)
+    low, high = layout.bounds
+    for vectors in (low, high, random_observation(layout, np.random.default_rng(0), 200)):
+        for part in sets_of(layout, torch.from_numpy(np.atleast_2d(vectors))):
+            assert torch.isfinite(part).all()
+
+
+def test_what_is_illegal_has_no_probability() -> None:
+    mask = torch.tensor([[1, 0, 1], [1, 0, 0]])
+    chance = torch.softmax(masked(torch.tensor([[0.0, 9.0, 1.0], [0.0, 9.0, 1.0]]), mask), dim=-1)
+    assert chance[:, 1].tolist() == [0.0, 0.0]
+    assert chance[1].tolist() == [1.0, 0.0, 0.0]
+
+
+def lopsided(small) -> Library:
+    """A fleet of two: one arm finishes a job in no time, the other takes most of the shift; both find it as hard."""
+    content = [small.work(place) for place in ("a", "b", "c", "d")]
+    same = small.ByPayload(1.0)
+    quick, slow = small.Times(1.0, 2.0, 1.0), small.Times(100.0, 100.0, 100.0)
+    arms = [small.arm(0, content, times=quick, model=same), small.arm(1, content, times=slow, model=same)]
+    jobs = [small.job(f"j{i:02d}", content[i % 4], repetitions=1, release_s=20.0 * (i // 2)) for i in range(24)]
+    world, _ = small.shop([jobs], arms=arms, ticks=30, slots=4)
+    tables, drawn = tables_of(world)
+
+    def draw(seed: np.random.SeedSequence) -> Shift:
+        (shift,) = shifts_of(drawn, [key_of(seed)])
+        return shift
+
+    return Library(world.arms, world.slots, tables, draw)
+
+
+def trainer(small, **changes) -> Trainer:
+    library = lopsided(small)
+
+    def make_env(envs: int, seed: int) -> TorchRLEnv:
+        return TorchRLEnv(BatchEnv(library, envs, seed=seed, autoreset=False))
+
+    return Trainer(make_env, Layout(2, 4), PpoConfig(**{"envs": 8, "steps": 30, "minibatch": 128, **changes}))
+
+
+def weights(of: Trainer) -> dict[str, torch.Tensor]:
+    return {name: value.clone() for name, value in of.actor.state_dict().items()}
+
+
+@pytest.mark.parametrize("algorithm", ["mappo", "ippo"])
+def test_it_learns_to_leave_work_to_the_quick_arm(small, algorithm) -> None:
+    learner = trainer(small, algorithm=algorithm, learning_rate=3e-3)
+    rewards = [told.reward for told in islice(learner.iterate(), 25)]
+    assert np.mean(rewards[-3:]) > 1.15 * np.mean(rewards[:3])
+
+
+def test_the_same_seed_learns_the_same_and_another_does_not(small) -> None:
+    runs = [trainer(small, seed=seed) for seed in (1, 1, 2)]
+    for each in runs:
+        list(islice(each.iterate(), 2))
+    one, again, other = (weights(each) for each in runs)
+    assert all(torch.equal(one[name], again[name]) for name in one)
+    assert not all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_a_training_goes_on_where_it_was(small) -> None:
+    first = trainer(small)
+    list(islice(first.iterate(), 2))
+    later = trainer(small)
+    later.resume(first.state())
+    assert later.done == 2
+    assert all(torch.equal(weights(first)[name], value) for name, value in weights(later).items())
+    assert next(later.iterate()).number == 3
+
+
+def test_a_policy_is_kept_whole(tmp_path) -> None:
+    torch.manual_seed(3)
+    size, layout = NetworkSize(arm=8, slot=8, pair=4), Layout(3, 5)
+    actor = Actor(size)
+    save_policy(actor, size, tmp_path / "p", scenario="x")
+    vectors = random_observation(layout, np.random.default_rng(1), 3)
+    mask = np.ones((3, 6), np.int8)
+    mask[1, 1:] = 0
+    seen = {f"arm_{a}": layout.read(vectors[a], mask[a]) for a in range(3)}
+    kept, fresh = load_policy(tmp_path / "p"), LearnedPolicy(actor)
+    kept.reset(np.random.default_rng(0))
+    assert kept.act(seen) == fresh.act(seen)
+    assert kept.act(seen)["arm_1"] == 0
+    with torch.inference_mode():
+        best = masked(actor(layout, torch.from_numpy(vectors)), torch.from_numpy(mask)).argmax(dim=-1).tolist()
+    assert list(kept.act(seen).values()) == best
+    assert json.loads((tmp_path / "p" / CARD).read_text())["scenario"] == "x"
+
+
+def test_what_is_no_policy_is_said(tmp_path) -> None:
+    with pytest.raises(CheckpointError, match="There is no trained policy in"):
+        load_policy(tmp_path)
+    size = NetworkSize(arm=8, slot=8, pair=4)
+    save_policy(Actor(size), size, tmp_path)
+    (tmp_path / WEIGHTS).write_bytes(b"rubbish")
+    with pytest.raises(CheckpointError, match=WEIGHTS):
+        load_policy(tmp_path)
+    save_policy(Actor(), size, tmp_path)
+    with pytest.raises(CheckpointError, match="size mismatch"):
+        load_policy(tmp_path)
+    for text, reason in (("{", "not the card"), ('{"format": 9, "size": {}}', "format 9 is not 1"), ("[]", "not the")):
+        (tmp_path / CARD).write_text(text)
+        with pytest.raises(CheckpointError, match=reason):
+            load_policy(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"algorithm": "dqn"}, "algorithm must be one of mappo, ippo"),
+        ({"envs": 0}, "envs must be >= 1"),
+        ({"learning_rate": 0.0}, "learning_rate must be > 0"),
+        ({"gamma": 1.5}, r"gamma must be in \(0, 1\]"),
+    ],
+)
+def test_a_wrong_configuration_is_refused(changes, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        PpoConfig(**changes)

@@ -1,0 +1,76 @@
+"""`thermofleet train`: the folder it leaves, going on, and what it refuses."""
+
+import json
+
+import pytest
+
+from agents.learned.policy import load_policy
+from agents.learned.ppo import PpoConfig
+from fleet.errors import FleetError
+from scenarios.cli import main
+from scenarios.load import load, override
+from scenarios.policies import label, policy_of
+from scenarios.train import CURVE, LOG, STATE, VALIDATION_SEED, TrainingPlan, train
+
+SMALL = {"horizon_s": 300.0}
+
+
+def small_config(**changes) -> PpoConfig:
+    return PpoConfig(**{"envs": 4, "steps": 16, "epochs": 1, **changes})
+
+
+def trained(out, cache, *, iterations: int = 2, resume: bool = False, **changes):
+    told: list[str] = []
+    plan = TrainingPlan(minutes=5.0, iterations=iterations, validate_every=1, validation_envs=2)
+    scenario = override(load("quickstart"), **SMALL)
+    done = train(
+        scenario, small_config(**changes), out, plan, difficulty="blind", resume=resume, cache=cache, tell=told.append
+    )
+    return done, told
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+def test_a_training_leaves_a_policy_its_log_and_its_curves(tmp_path, cache) -> None:
+    out = tmp_path / "learned"
+    done, told = trained(out, cache)
+    assert (done.iterations, done.env_steps, done.interrupted) == (2, 2 * 4 * 16, False)
+    assert len(told) == 2
+    rows = [json.loads(line) for line in (out / LOG).read_text().splitlines()]
+    judged = [row["validation_reward"] for row in rows if "validation_reward" in row]
+    assert done.best == max(judged)
+    assert [row["number"] for row in rows if "number" in row] == [1, 2]
+    assert (out / CURVE).read_bytes().startswith(b"\x89PNG")
+    assert type(policy_of(str(out))) is type(load_policy(out))
+    assert label(str(out)) == "learned"
+    with pytest.raises(FleetError, match="holds a training already: give --resume"):
+        trained(out, cache)
+    done, _ = trained(out, cache, iterations=3, resume=True)
+    assert done.iterations == 3
+    assert done.best >= max(judged)
+    with pytest.raises(FleetError, match="was of another config"):
+        trained(out, cache, iterations=4, resume=True, gamma=0.9)
+    (out / STATE).write_bytes(b"rubbish")
+    with pytest.raises(FleetError, match="no training to go on from"):
+        trained(out, cache, iterations=4, resume=True)
+
+
+def test_validation_seeds_are_nobody_elses() -> None:
+    assert VALIDATION_SEED > 1_000_000
+
+
+def test_what_cannot_be_is_refused(tmp_path, capsys) -> None:
+    for words, reason in (
+        (["--algo", "dqn"], "algorithm must be one of mappo, ippo"),
+        (["--minutes", "0"], "minutes must be > 0"),
+        (["--envs", "0"], "envs must be >= 1"),
+        (["--threads", "0"], "--threads must be 1 or more"),
+        (["--resume"], "holds no training to resume"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            main(["train", "quickstart", "--out", str(tmp_path / "none"), "--difficulty", "blind", *words])
+        assert stop.value.code == 2
+        assert reason in " ".join(capsys.readouterr().err.split())
