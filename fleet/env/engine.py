@@ -142,7 +142,8 @@ class Engine:
 
     def _make_room(self, jobs: int, waits: int) -> None:
         """For more jobs a shift, a tenth more than asked for, keeping what is there."""
-        jobs = max(self._drawn.kind.shape[1], jobs + jobs // 10)
+        have = self._drawn.kind.shape[1]
+        jobs = jobs + jobs // 10 if jobs > have else have
         waits = max(self._drawn.after.shape[2], waits)
         envs, arms = self._rows.mode.shape
         drawn, rows = _no_jobs(envs, jobs, waits), _no_rows(envs, arms, jobs)

@@ -1,0 +1,224 @@
+"""What holds in every shift, of whatever fleet: nothing is lost, done twice, or in two places."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from hypothesis import event, given, settings
+from hypothesis import strategies as st
+
+from fleet.env.allocation_v0 import AllocationEnv, Episode, parallel_env
+from fleet.job import Job
+from fleet.robot import ThermalLimits
+from fleet.sim.claims import slots
+from fleet.sim.state import DONE, RUNNING, WAITING, State
+from fleet.telemetry import FAULTED, IDLE, WORKING
+
+TICKS, DT_S = 45, 10.0
+PLACES = ("bench", "press", "rack")
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A scenario as it is drawn."""
+
+    works: tuple[tuple[str, str | None, float], ...]
+    """From, to (None for a hold), and kg."""
+    able: tuple[frozenset[int], ...]
+    """Which works each arm can do."""
+    jobs: tuple[tuple[int, int, float, frozenset[int]], ...]
+    """Work, repetitions, release and what comes before."""
+    slots: int
+    error_c: float
+    ambient_c: float
+    start_warm: bool
+    power_off: bool
+    seed: int
+
+
+@st.composite
+def drafts(draw: Any) -> Draft:
+    """Small scenarios; every work can be done by some arm."""
+    payload = st.sampled_from([8.0, 4.0, 0.0])
+    pair = st.tuples(st.sampled_from(PLACES), st.none() | st.sampled_from(PLACES), payload)
+    works = draw(st.lists(pair.filter(lambda w: w[0] != w[1]), min_size=1, max_size=4, unique=True))
+    arms = draw(st.integers(1, 4))
+    numbers = st.frozensets(st.integers(0, len(works) - 1))
+    able = [draw(numbers) for _ in range(arms)]
+    able[0] |= set(range(len(works))) - frozenset().union(*able)
+    jobs = []
+    for j in range(draw(st.integers(0, 10))):
+        before = draw(st.frozensets(st.integers(0, j - 1), max_size=2)) if j else frozenset[int]()
+        release = draw(st.floats(0.0, TICKS * DT_S, allow_nan=False))
+        jobs.append((draw(st.integers(0, len(works) - 1)), draw(st.integers(1, 5)), release, before))
+    return Draft(
+        works=tuple(works),
+        able=tuple(able),
+        jobs=tuple(jobs),
+        slots=draw(st.integers(1, 5)),
+        error_c=draw(st.sampled_from([44.0, 50.0, 75.0])),
+        ambient_c=draw(st.sampled_from([38.0, 25.0, -10.0])),
+        start_warm=draw(st.booleans()),
+        power_off=draw(st.booleans()),
+        seed=draw(st.integers(0, 2**32)),
+    )
+
+
+def laid_out(small, draft: Draft, **options: Any) -> AllocationEnv:
+    """The environment of a draft."""
+    works = [small.work(place, kg, to=to) for place, to, kg in draft.works]
+    arms = [
+        small.arm(i, [works[w] for w in sorted(able)], times=small.Times(3.0 + i, 7.0 + 2 * i, 2.0))
+        for i, able in enumerate(draft.able)
+    ]
+    jobs: list[Job] = [
+        small.job(
+            f"j{j}",
+            works[w],
+            repetitions=n,
+            release_s=s,
+            due_s=s + 60.0,
+            value=1.0 + j,
+            after=tuple(f"j{k}" for k in sorted(before)),
+        )
+        for j, (w, n, s, before) in enumerate(draft.jobs)
+    ]
+    e = draft.error_c
+    limits = ThermalLimits(
+        warning_c=e - 4, error_c=e, restart_c=e - 6, clear_s=25.0, power_off_on_fault=draft.power_off
+    )
+    world, plant = small.shop(
+        [jobs], arms=arms, limits=limits, ticks=TICKS, slots=draft.slots, ambient_c=draft.ambient_c, dt_s=DT_S,
+        start_warm=draft.start_warm,
+    )  # fmt: skip
+    return parallel_env(lambda seed: Episode(world, plant, ("t",) * len(arms), seed), **options)
+
+
+@settings(max_examples=100)
+@given(draft=drafts())
+def test_every_shift_keeps_its_books(small, play, draft) -> None:
+    env, rng = laid_out(small, draft), np.random.default_rng(draft.seed)
+    seen, infos = env.reset(seed=draft.seed)
+    before, value = env.truth, 0.0
+    looks_right(env, seen)
+    while env.agents:
+        claims_only_what_hangs_out(env)
+        seen, rewards, terminated, truncated, infos = env.step(play.wild(env, rng))
+        now = env.truth
+        is_sound(env, now)
+        goes_forward(env, before, now)
+        looks_right(env, seen)
+        assert np.isfinite(list(rewards.values())).all()
+        value += infos["arm_0"]["reward_finished_value"]
+        before = now
+    jobs = env.world.jobs
+    done = before.status[0][jobs.exists[0]] == DONE
+    assert terminated["arm_0"] == (len(done) > 0 and bool(done.all()))
+    assert truncated["arm_0"] == (not terminated["arm_0"])
+    assert infos["arm_0"]["jobs_done"] == done.sum()
+    assert value == np.float64(jobs.value[0][jobs.exists[0]][done].sum())
+    event(
+        f"faults: {min(int(before.faults.sum()), 2)}, done: {'all' if done.all() else 'some' if done.any() else 'none'}"
+    )
+
+
+def is_sound(env: AllocationEnv, now: State) -> None:
+    """One moment by itself."""
+    world, jobs, exists = env.world, env.world.jobs, env.world.jobs.exists[0]
+    mode, job, status = now.mode[0], now.job[0], now.status[0]
+    elapsed_s = now.tick[0] * world.dt_s
+    assert np.isfinite(now.temp_c).all()
+    assert (now.temp_c > world.ambient_c.min() - 1e-6).all()
+    # Never two arms on one job or at one station, and none on a job that waits.
+    working = np.flatnonzero(mode == WORKING)
+    in_hand = job[working]
+    assert len(set(in_hand.tolist())) == len(in_hand)
+    assert (job[mode != WORKING] == -1).all()
+    assert (status[in_hand] != WAITING).all()
+    assert set(np.flatnonzero(status == RUNNING).tolist()) <= set(in_hand.tolist())
+    places = [s for j in in_hand.tolist() for s in set(jobs.stations[0, j].tolist()) if s >= 0]
+    assert len(set(places)) == len(places)
+    # Cycles and completions.
+    cycles, asked = now.cycles[0][exists], jobs.repetitions[0][exists]
+    done = status[exists] == DONE
+    assert (cycles >= 0).all()
+    assert (cycles <= asked).all()
+    assert (cycles[done] == asked[done]).all()
+    finished_s = now.finished_s[0][exists]
+    assert (np.isnan(finished_s) == ~done).all()
+    assert (finished_s[done] >= jobs.release_s[0][exists][done]).all()
+    assert (finished_s[done] <= elapsed_s + 1e-9).all()
+    for j in np.flatnonzero(exists & (status != WAITING)).tolist():
+        for first in jobs.after[0, j][jobs.after[0, j] >= 0].tolist():
+            assert status[first] == DONE
+            assert not now.finished_s[0, j] < now.finished_s[0, first]
+    # Time and heat are accounted for.
+    assert (now.busy_s + now.lost_s <= elapsed_s + 1e-6).all()
+    assert (now.above_warning_s <= elapsed_s + 1e-6).all()
+    assert (now.lost_s[now.faults == 0] == 0).all()
+    assert (now.peak_c[0] >= now.temp_c[0, :, :7].max(axis=1) - 1e-9).all()
+    assert (
+        now.peak_c <= max(world.limits.error_c, float(world.start_c[:, :7].max()), world.ambient_c.max()) + 1e-6
+    ).all()
+    assert now.returns.sum() <= now.faults.sum()
+    assert (now.faults[0][mode == FAULTED] > 0).all()
+
+
+def goes_forward(env: AllocationEnv, before: State, now: State) -> None:
+    """From one moment to the next nothing is taken back."""
+    assert now.tick[0] == before.tick[0] + 1
+    for name in ("faults", "illegal", "peak_c", "above_warning_s", "busy_s", "lost_s", "energy_j", "cycles", "returns"):
+        assert (getattr(now, name) >= getattr(before, name) - 1e-9).all(), name
+    was = before.status[0] == DONE
+    assert (now.status[0][was] == DONE).all()
+    np.testing.assert_array_equal(now.finished_s[0][was], before.finished_s[0][was])
+    # Two arms do not work on one job in one step: who has it lets go only by the end or by a fault.
+    for a in np.flatnonzero(before.mode[0] == WORKING).tolist():
+        j = before.job[0, a]
+        others = np.delete(now.job[0], a)
+        assert j not in others.tolist() or now.faults[0, a] > before.faults[0, a]
+
+
+def looks_right(env: AllocationEnv, seen: dict[str, Any]) -> None:
+    """The masks follow from the rules, and the observation says the same."""
+    world, now, known = env.world, env.truth, env.knowledge()
+    on_offer = slots(world, now)[0]
+    taken = {s for j in now.job[0][now.mode[0] == WORKING].tolist() for s in world.jobs.stations[0, j].tolist()} - {-1}
+    for a, arm in enumerate(env.possible_agents):
+        own, mask = known[arm], seen[arm]["action_mask"]
+        assert env.observation_space(arm).contains(seen[arm])
+        assert mask[0] == 1
+        for k, j in enumerate(on_offer.tolist()):
+            able = j >= 0 and world.offers.plan[0, a, j] >= 0
+            free = j >= 0 and not taken & set(world.jobs.stations[0, j].tolist())
+            assert mask[k + 1] == (able and free and now.mode[0, a] == IDLE)
+            assert own.offered[k] == (j >= 0)
+            assert own.feasible[k] == able
+            assert own.known[k] == able
+        assert [own.idle, own.working, own.faulted] == [now.mode[0, a] == m for m in (IDLE, WORKING, FAULTED)]
+        filled = own.offered == 1
+        assert (np.diff(filled.astype(int)) <= 0).all()  # slots fill from the front
+        assert (np.diff(own.age_s[filled]) <= 1e-3).all()  # the oldest first
+        assert own.last_award == now.last_award[0, a]
+        assert (own.busy_s > 0) == (now.mode[0, a] == WORKING)
+
+
+def claims_only_what_hangs_out(env: AllocationEnv) -> None:
+    """What is offered is released, waits, and has all it waits for done."""
+    world, now = env.world, env.truth
+    for j in slots(world, now)[0].tolist():
+        if j >= 0:
+            assert now.status[0, j] == WAITING
+            assert world.jobs.release_s[0, j] <= now.tick[0] * world.dt_s
+            assert (now.status[0][world.jobs.after[0, j][world.jobs.after[0, j] >= 0]] == DONE).all()
+
+
+def test_a_shift_of_many_jobs_that_wait_for_two_is_as_large_as_it_is(small) -> None:
+    """Room for what is waited for is made without room for more jobs: pictures and tables go by the world's."""
+    many = tuple((0, 1, 0.0, frozenset(range(j - 2, j)) if j > 2 else frozenset[int]()) for j in range(12))
+    draft = Draft((("bench", None, 0.0),), (frozenset({0}),), many, 3, 75.0, 25.0, False, False, 0)
+    env = laid_out(small, draft, render_mode="ansi")
+    env.reset(seed=0)
+    assert env.truth.status.shape == env.world.jobs.exists.shape == (1, 12)
+    env.step({"arm_0": 1})
+    assert "working" in str(env.render())
