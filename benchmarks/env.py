@@ -1,0 +1,195 @@
+"""Env steps per CPU-second, ours and the peers', on one core in one thread.
+
+    make bench-env                          # installs the peers and runs this with them
+    .venv/bin/python benchmarks/env.py      # ours, and whatever of the peers is there
+
+Every row is a program of its own, pinned to one core, and the median of three windows of a whole shift each (720
+steps), so beginning the next shift is in the figure. Actions are random among the legal ones, and choosing them is in
+the figure too: `fleet.env.chance.random_legal` for the batch, the same by hand for the single environment. Growth and
+memory take quickstart's cell, its four arms as often as wanted and its jobs as much oftener, with 8 slots.
+"""
+
+import os
+import sys
+
+os.environ["OMP_NUM_THREADS"] = "1"
+
+import statistics
+import subprocess
+import time
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from fleet.env.chance import random_legal
+from fleet.env.vector import BatchEnv, Library
+from scenarios.batch import Randomisation, library_of
+from scenarios.build import env_of, prepare
+from scenarios.load import load
+
+WINDOWS, SHIFT = 3, 720
+PEERS = Path(__file__).parent / "peers.py"
+
+
+def median_rate(window: Callable[[], int]) -> float:
+    """Steps per CPU-second, median of the windows, after one that does not count."""
+    found = []
+    for _ in range(WINDOWS + 1):
+        begin = time.process_time()
+        steps = window()
+        found.append(steps / (time.process_time() - begin))
+    return statistics.median(found[1:])
+
+
+def single(difficulty: str) -> float:
+    """The `ParallelEnv`, dicts in and out."""
+    env = env_of(prepare(load("quickstart"), difficulty=difficulty))
+    rng, seen = np.random.default_rng(0), {}
+
+    def window() -> int:
+        nonlocal seen
+        steps = 2 * SHIFT
+        for _ in range(steps):
+            if not env.agents:
+                seen, _ = env.reset()
+            actions = {}
+            for arm, share in zip(env.agents, rng.random(len(env.agents)).tolist(), strict=True):
+                legal = seen[arm]["action_mask"].nonzero()[0]
+                actions[arm] = int(legal[int(share * len(legal))])
+            seen, *_ = env.step(actions)
+        return steps
+
+    seen, _ = env.reset(seed=0)
+    for _ in range(10):  # a twin is asked once for every job there can be
+        env.reset()
+    return median_rate(window)
+
+
+def library(difficulty: str, arms: int = 4) -> Library:
+    """Quickstart with its four arms, or with them several times over and as many more jobs."""
+    times = arms // 4
+    fleet = [prepare(load("quickstart"), difficulty=difficulty)]
+    one = library_of(fleet, Randomisation(arrivals=(times, times)))
+    second = ("step", "to_ambient", "root", "rates", "modes", "motor", "noise_k", "start_c", "plan", "difficulty",
+              "word", "risk")  # fmt: skip
+    tables = one.tables._replace(
+        ambient_c=np.tile(one.tables.ambient_c, (1, 1, times)),
+        **{name: np.concatenate([getattr(one.tables, name)] * times, axis=1) for name in second},
+    )
+    return Library(tuple(f"arm_{a}" for a in range(arms)), one.slots, tables, one.draw)
+
+
+def batch(difficulty: str, envs: int, arms: int = 4) -> float:
+    """The batch: env steps per CPU-second."""
+    env, rng = BatchEnv(library(difficulty, arms), envs, seed=0), np.random.default_rng(0)
+    seen, _ = env.reset()
+
+    def window() -> int:
+        nonlocal seen
+        for _ in range(SHIFT):
+            seen, *_ = env.step(random_legal(seen["action_mask"], rng))
+        return envs * SHIFT
+
+    return median_rate(window)
+
+
+def torchrl(envs: int) -> float:
+    """TorchRL's rollout of the native env, with its random policy."""
+    import torch
+
+    from fleet.env.adapters.torchrl import TorchRLEnv
+
+    torch.set_num_threads(1)
+    env = TorchRLEnv(BatchEnv(library("blind"), envs, seed=0, autoreset=False), seed=0)
+    begin, length = env.reset(), 90
+
+    def window() -> int:
+        nonlocal begin
+        for _ in range(SHIFT // length):
+            frames = env.rollout(length, break_when_any_done=False, auto_reset=False, tensordict=begin)
+            begin = env.step_mdp(frames[:, -1])
+        return envs * SHIFT
+
+    return median_rate(window)
+
+
+def resident_mb() -> float:
+    """Memory of this process, MB."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def memory(envs: int, arms: int) -> float:
+    """MB that so many envs add to a process that has one."""
+    shared, rng = library("blind", arms), np.random.default_rng(0)
+
+    def run(count: int) -> BatchEnv:
+        env = BatchEnv(shared, count, seed=0)
+        seen, _ = env.reset()
+        for _ in range(SHIFT + 10):
+            seen, *_ = env.step(random_legal(seen["action_mask"], rng))
+        return env
+
+    run(1)
+    before = resident_mb()
+    many = run(envs)
+    after = resident_mb()
+    assert many.num_envs == envs
+    return after - before
+
+
+ROWS = {
+    "single": lambda difficulty: single(difficulty),
+    "batch": lambda difficulty, envs, arms="4": batch(difficulty, int(envs), int(arms)),
+    "torchrl": lambda envs: torchrl(int(envs)),
+    "memory": lambda envs, arms: memory(int(envs), int(arms)),
+}
+
+
+def measured(*command: str) -> float | None:
+    """What a program of its own found; None, and why, where it could not."""
+    done = subprocess.run([sys.executable, *command], capture_output=True, text=True, timeout=600, check=False)
+    if done.returncode:
+        print(f"  {' '.join(command[1:])} failed: {done.stderr.strip().splitlines()[-1:]}", flush=True)
+        return None
+    return float(done.stdout.split()[-1])
+
+
+def line(what: str, value: float | None, target: float | None = None, unit: str = "") -> None:
+    """One row of the table."""
+    aim = "" if target is None else f"{target:>12,.0f}"
+    print(f"{what:<52}{'-' if value is None else f'{value:,.0f}':>12}{aim:>12} {unit}", flush=True)
+
+
+def main() -> None:
+    """The table."""
+    here = str(Path(__file__))
+    print(f"{'env steps per CPU-second, one core':<52}{'measured':>12}{'target':>12}")
+    for difficulty in ("blind", "twin"):
+        line(f"single ParallelEnv, {difficulty}", measured(here, "single", difficulty), 12_000)
+        line(f"batch of 32, {difficulty}", measured(here, "batch", difficulty, "32"), 250_000)
+        line(f"batch of 1024, {difficulty}", measured(here, "batch", difficulty, "1024"), 800_000)
+    if find_spec("torchrl") is None:
+        print("TorchRL is not installed: pip install 'thermofleet[learn]' -c constraints.txt")
+    else:
+        line("TorchRL rollout of 1024, blind", measured(here, "torchrl", "1024"), 300_000)
+    for name, module, envs in (("mpe", "mpe2", (1,)), ("rware", "rware", (1,)), ("vmas", "vmas", (1, 32, 1024))):
+        if find_spec(module) is None:
+            print(f"{name} is not installed: make bench-env installs it into .venv-adapters/bench and runs this there")
+            continue
+        for count in envs:
+            line(f"{name}, {count}", measured(str(PEERS), name, str(count)))
+    for arms in (4, 8, 16, 64):
+        found = measured(here, "batch", "blind", "64", str(arms))
+        cost_ns = None if found is None else 1e9 / (found * arms)
+        line(f"batch of 64 with {arms} arms: ns per arm step", cost_ns, unit="ns")
+    line("memory of 1024 envs with 8 arms", measured(here, "memory", "1024", "8"), 200, "MB")
+
+
+if __name__ == "__main__":
+    if len(sys.argv) > 1:
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+        print(ROWS[sys.argv[1]](*sys.argv[2:]))
+    else:
+        main()
