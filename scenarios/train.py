@@ -4,6 +4,7 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -103,7 +104,9 @@ def train(
 
     def look(told: Iteration) -> None:
         nonlocal best
-        reward = float(returns(judge, greedy(trainer), seeds).mean())
+        rng = np.random.default_rng(np.random.SeedSequence([VALIDATION_SEED, told.number]))
+        act = partial(trainer.act, rng=rng)
+        reward = float(returns(judge, lambda obs: act(obs["observation"], obs["action_mask"]), seeds).mean())
         if reward > best:
             best = reward
             more = {"algorithm": config.algorithm, "iterations": told.number, "env_steps": told.env_steps}
@@ -130,11 +133,6 @@ def train(
         look(told)
     draw_curves(out)
     return Trained(trainer.done, trainer.env_steps, best, time.monotonic() - began_s, interrupted)
-
-
-def greedy(trainer: Trainer) -> Callable[[Obs], Array]:
-    """What the actor rates highest, as actions int [env, arm]."""
-    return lambda obs: trainer.greedy(obs["observation"], obs["action_mask"])
 
 
 def returns(env: BatchEnv, act: Callable[[Obs], Array], seeds: Sequence[int]) -> Array:

@@ -21,7 +21,10 @@ WEIGHTS, CARD = "policy.safetensors", "policy.json"
 
 
 class LearnedPolicy:
-    """Every arm claims what the actor rates highest.
+    """Every arm draws from what the actor finds likely, as it did in training.
+
+    The likeliest action alone would not do: arms that see the same would all claim the same job, and an arm that
+    waits now and then would wait for ever.
 
     Args:
         actor: Trained, for a fleet of any size.
@@ -29,12 +32,14 @@ class LearnedPolicy:
 
     def __init__(self, actor: Actor) -> None:
         self._actor = actor.eval()
+        self._rng = np.random.default_rng(0)
 
     def reset(self, rng: np.random.Generator) -> None:
-        """Nothing to begin: it draws nothing."""
+        """Begin a shift."""
+        self._rng = rng
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
-        """The best rated action of every arm; WAIT where there is no choice."""
+        """An action of every arm; WAIT where there is no choice."""
         actions = dict.fromkeys(observations, 0)
         choosing = [arm for arm, seen in observations.items() if seen.action_mask[1:].any()]
         if not choosing:
@@ -44,8 +49,13 @@ class LearnedPolicy:
         vectors = torch.from_numpy(np.stack([layout.pack(observations[arm]) for arm in choosing]))
         mask = torch.from_numpy(np.stack([observations[arm].action_mask for arm in choosing]))
         with torch.inference_mode():
-            best = masked(self._actor(layout, vectors), mask).argmax(dim=-1)
-        return actions | dict(zip(choosing, best.tolist(), strict=True))
+            logits = masked(self._actor(layout, vectors), mask).numpy()
+        return actions | dict(zip(choosing, draw(logits, self._rng).tolist(), strict=True))
+
+
+def draw(logits: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A draw from softmax(logits), int [...], of logits [..., action] (Gumbel's trick)."""
+    return (logits + rng.gumbel(size=logits.shape)).argmax(axis=-1)
 
 
 def save_policy(actor: Actor, size: NetworkSize, folder: Path, **told: Any) -> None:

@@ -25,6 +25,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
 from agents.learned.network import Actor, Critic, NetworkSize, masked
+from agents.learned.policy import draw
 from fleet.env.observation import Layout
 from fleet.errors import CheckpointError
 
@@ -233,12 +234,12 @@ class Trainer:
         advantage, target = (torch.cat([each[i] for each in found], dim=-1) for i in range(2))
         return advantage, target
 
-    def greedy(self, vectors: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """What the actor rates highest now, int [...], of vectors float32 [..., size] and masks."""
+    def act(self, vectors: np.ndarray, mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Draws of the actor as it is now, int [...], at vectors float32 [..., size] and masks."""
         legal = torch.from_numpy(mask)
         with torch.inference_mode():
             logits = Chooser(self.actor, self.layout)(torch.from_numpy(vectors), legal)
-            return masked(logits, legal).argmax(dim=-1).numpy()
+            return draw(masked(logits, legal).numpy(), rng)
 
     def save(self, path: Path, **told: float) -> None:
         """Write all that goes on when training is resumed, and some numbers; the file appears whole or not at all."""
