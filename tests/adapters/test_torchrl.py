@@ -117,6 +117,14 @@ def test_what_is_sent_against_the_mask_waits_and_is_counted(make) -> None:
     assert (env.step(seen)["next", "arms", "info", "illegal"] == 1).all()
 
 
+def test_a_rollout_into_old_frames_is_a_rollout(make) -> None:
+    frames = rolled(make(4, seed=0), 20)
+    old = rolled(make(4, seed=1), 20)
+    torch.manual_seed(0)
+    assert same(make(4, seed=0).rollout(20, break_when_any_done=False, out=old), frames)
+    assert same(old, frames)
+
+
 def test_every_legal_action_is_drawn_as_often(make) -> None:
     torch.manual_seed(0)
     env = make(1)
@@ -216,18 +224,21 @@ def masked(frames: TensorDict) -> TensorDict:
     return frames
 
 
-def test_a_collector_with_a_masked_policy_sends_no_illegal_action(make) -> None:
+@pytest.mark.parametrize("compact", [False, True])
+def test_a_collector_with_a_masked_policy_sends_no_illegal_action(make, compact) -> None:
     torch.manual_seed(0)
     returns = RewardSum(in_keys=[("arms", "reward")], out_keys=[("arms", "episode_reward")])
     env = TransformedEnv(make(8, infos=True), returns)
-    collector = Collector(env, masked, frames_per_batch=8 * TICKS, total_frames=8 * TICKS * 3)
+    collector = Collector(env, masked, frames_per_batch=8 * TICKS, total_frames=8 * TICKS * 3, compact_obs=compact)
     batches = [frames.clone() for frames in collector]
     collector.shutdown()
     for frames in batches:
         assert frames["next", "truncated"].sum() == 8
-        assert frames["next", "arms", "info", "illegal"].max() == 0
-        total = frames["next", "arms", "reward"].sum(dim=1)
-        torch.testing.assert_close(frames["next", "arms", "episode_reward"][:, -1], total)
+        assert frames["arms", "action_mask"].gather(-1, frames["arms", "action"][..., None]).all()
+        assert frames["arms", "info", "illegal"].max() == 0
+        if not compact:  # it leaves out of "next" what the next frame has
+            total = frames["next", "arms", "reward"].sum(dim=1)
+            torch.testing.assert_close(frames["next", "arms", "episode_reward"][:, -1], total)
     assert not same(batches[0], batches[1])
 
 
