@@ -47,6 +47,7 @@ chaos: $(STAMP)
 bench: $(STAMP)
 	@for b in benchmarks/bench_*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done
 
+.venv-adapters/bench/.installed: EXTRA := [learn]
 bench-env: .venv-adapters/bench/.installed
 	@.venv-adapters/bench/bin/python benchmarks/env.py
 
@@ -76,7 +77,7 @@ $(PINNED:%=.venv-adapters/%/.installed): .venv-adapters/%/.installed: constraint
 	@awk -F== '!seen[$$1]++' constraints/$*.txt constraints.txt >.venv-adapters/$*/pins.txt
 	@pip=".venv-adapters/$*/bin/python -m pip --disable-pip-version-check install --quiet"; \
 	{ $$pip -c .venv-adapters/$*/pins.txt setuptools && \
-	  $$pip -c .venv-adapters/$*/pins.txt --no-build-isolation -e . pytest hypothesis && \
+	  $$pip -c .venv-adapters/$*/pins.txt --no-build-isolation -e '.$(EXTRA)' pytest hypothesis && \
 	  $$pip --no-deps -r constraints/$*.txt; } >.venv-adapters/$*/install.log 2>&1 || { \
 	  echo "$* could not be installed; all that pip said is in .venv-adapters/$*/install.log."; exit 1; }
 	@touch $@
