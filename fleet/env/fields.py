@@ -32,6 +32,8 @@ assert [field.name for field in FIELDS[OFFERED:]] == [
 ]  # fmt: skip
 
 
+BLOCK = 128
+"""Envs that go through a whole step together, few enough to stay in the cache."""
 _GOLDEN, _FIRST, _SECOND = np.uint64(GOLDEN), np.uint64(FIRST), np.uint64(SECOND)
 _30, _27, _31, _32, _LEVELS = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(32), np.uint64(LEVELS - 1)
 
@@ -237,7 +239,9 @@ def turn(
         rows: All envs, int [env].
         start, low, high, out: As in `look`.
     """
-    award(t, d, s, o, actions)
-    live(t, d, s, o, raw)
-    hang_out(t, d, s, o, rows)
-    perceive(t, d, s, o, rows, start, low, high, out)
+    for first in range(0, len(rows), BLOCK):
+        some = rows[first : first + BLOCK]
+        award(t, d, s, o, actions, some)
+        live(t, d, s, o, raw, some)
+        hang_out(t, d, s, o, some)
+        perceive(t, d, s, o, some, start, low, high, out)

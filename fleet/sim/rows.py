@@ -83,20 +83,22 @@ def occupied(lot: Any, e: int, modes: Array, in_hand: Array, kinds: Array, stati
 
 
 @inner
-def award(t: Tables, d: Drawn, s: Rows, o: Offer, actions: Array) -> None:
+def award(t: Tables, d: Drawn, s: Rows, o: Offer, actions: Array, rows: Array) -> None:
     """Every claimed job to one arm: the lower difficulty wins, then the lower index.
 
     Args:
         actions: int [env, arm].
+        rows: Which envs, int [row].
     """
     lots, kinds, repetitions = d.lot, d.kind, d.repetitions
     modes, in_hand, status, last, illegal = s.mode, s.job, s.status, s.last_award, s.illegal
     progress_s, todo, cycles = s.progress_s, s.todo, s.cycles
     on_offer, mask, queue, head, stations, difficulty = o.on_offer, o.mask, o.queue, o.head, t.stations, t.difficulty
-    (envs, arms), slots, places = modes.shape, on_offer.shape[1], stations.shape[2]
+    arms, slots, places = modes.shape[1], on_offer.shape[1], stations.shape[2]
     busy, key, order = np.empty(t.station_count + 1, np.bool_), np.empty(arms), np.empty(arms, np.int64)
-    for e in range(envs):
-        lot, claims = lots[e], 0
+    for row in rows:
+        e = natural(row)
+        lot, claims = natural(lots[e]), 0
         for a in range(arms):
             action = actions[e, a]
             last[e, a] = 0
@@ -119,7 +121,7 @@ def award(t: Tables, d: Drawn, s: Rows, o: Offer, actions: Array) -> None:
         occupied(lot, e, modes, in_hand, kinds, stations, busy)
         for rank in range(claims):
             a = order[rank]
-            j = on_offer[e, actions[e, a] - 1]
+            j = natural(on_offer[e, actions[e, a] - 1])
             kind, free = kinds[e, j], status[e, j] == WAITING
             for n in range(places):
                 station = stations[lot, kind, n]
@@ -170,11 +172,12 @@ def put_back(d: Drawn, s: Rows, o: Offer, e: int, j: int, until_s: float) -> Non
 
 
 @inner
-def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array) -> None:
+def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array, rows: Array) -> None:
     """Every arm through one step: motion, heat, limits, the end of its job.
 
     Args:
         raw: Takes the reward terms, not weighted, [term, env].
+        rows: Which envs, int [row].
     """
     # The arrays by names of their own: a field of a tuple is counted at every use.
     lots, airs_k, kinds, repetitions, due_s = d.lot, d.air_k, d.kind, d.repetitions, d.due_s
@@ -188,8 +191,9 @@ def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array) -> None:
     warning_c, error_c = t.warning_c, t.error_c
     power, fold = np.empty((2, LANES)), np.empty(4)  # W of windings, of friction and electronics
     begin, end = np.zeros(2 * NODES + LANES), np.empty(WIDE)  # the temperatures, the loads, and what pads them
-    envs, arms = modes.shape
-    for e in range(envs):
+    arms = modes.shape[1]
+    for row in rows:
+        e = natural(row)
         lot, tick = natural(lots[e]), natural(ticks[e])
         now_s, moment = tick * dt_s, min(tick, t.ticks - 1)
         value = late = above_s = count = energy = 0.0
