@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from fleet.env.arguments import at_least_one, seeds_of
+from fleet.env.chance import random_legal as random_legal
 from fleet.env.engine import Engine, Shift
 from fleet.env.observation import Layout, Observation
 from fleet.env.reward import TERMS, RewardWeights
