@@ -3,6 +3,7 @@
 import logging
 import os
 import secrets
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fleet.errors import FleetError, InfeasibleJob
+from fleet.errors import BusError, FleetError, InfeasibleJob
 from fleet.job import Work
 from fleet.motion import Plan
 from scenarios.live_options import ENDPOINT, EndpointOption
@@ -33,6 +34,8 @@ log = logging.getLogger(__name__)
 TURN_S, CLOCK_S, FAREWELL_S = 0.25, 2.0, 1.0
 """Real seconds: between two looks at whether to stop; that the auctioneer has to tell the time at the start; to give
 back what is in hand at the end."""
+NAMESAKE_S = 4.0
+"""Real seconds that the token of one that has just died may still be there: its session's lease, and some more."""
 
 
 def arm_command(
@@ -71,6 +74,7 @@ def arm_command(
         Link(endpoint, fleet) as link,
         Journal[Promise](folder / f"{name}.journal", Promise) as book,
     ):
+        refuse_namesake(link, name)
         node = node_of(link, book, made, chosen, speed=speed, rate_hz=rate_hz, capacity=capacity)
         typer.echo(f"ready {name} {endpoint} {os.getpid()}")
         while not stop.is_set():
@@ -177,6 +181,33 @@ def replayed(name: str, file: Path) -> MadeArm:
 
     model, body = Blind(version=f"log {file.name}"), lambda time_s, dt_s: LogBody(readings, time_s=time_s)
     return MadeArm(name=name, model=model, plan=refuse, body=body, takes_work=False)
+
+
+def refuse_namesake(link: "Link", name: str, *, patience_s: float = NAMESAKE_S) -> None:
+    """Wait until no arm of that name is there: two would speak, and take work, with one voice.
+
+    Raises:
+        BusError: one is there still.
+    """
+    from fleet.bus import keys
+
+    gone = threading.Event()
+
+    def heard(_: str, there: bool) -> None:
+        (gone.clear if there else gone.set)()
+
+    key = keys.of_arm(link.fleet, name, "alive")
+    if not link.there(key, timeout_s=patience_s):
+        return
+    link.watch(key, heard)
+    deadline_s = time.monotonic() + patience_s
+    while not gone.is_set() and time.monotonic() < deadline_s:
+        link.serve(deadline_s)
+    if not gone.is_set():
+        raise BusError(
+            f"Fleet '{link.fleet}' has an arm '{name}' already: its token is there. Stop that one first, or give this "
+            "one another name."
+        )
 
 
 def node_of(

@@ -17,11 +17,11 @@ from fleet.bus.link import Link
 from fleet.bus.messages import Info, State
 from fleet.bus.router import Router
 from fleet.bus.trade import JobWord, Quote, QuoteRequest
-from fleet.errors import FleetError, LogError
+from fleet.errors import BusError, FleetError, LogError
 from fleet.sim.known_plans import rest_torque
 from fleet.sim.models import ArmModel
 from scenarios.build import prepare, prepare_arm, quiet
-from scenarios.live_arm import air_of, replayed, simulated
+from scenarios.live_arm import air_of, refuse_namesake, replayed, simulated
 from scenarios.load import load
 from scenarios.scenario import Ambient
 from twin.logs import read
@@ -179,6 +179,26 @@ def test_a_log_lives_as_an_arm(small_toml, plans, log, tmp_path):
     for state, into_s in zip(states, seen, strict=True):
         if state.mode == "working":
             assert state.time_s - began_s == pytest.approx(into_s, abs=0.1 + 1e-6)
+
+
+def test_no_second_arm_lives_under_a_name():
+    with Router(0) as router, Link(router.endpoint, "f") as first, Link(router.endpoint, "f") as second:
+        first.alive(keys.of_arm("f", "a", "alive"))
+        refuse_namesake(second, "b", patience_s=PATIENCE_S)
+        with pytest.raises(BusError, match="has an arm 'a' already"):
+            refuse_namesake(second, "a", patience_s=0.3)
+
+
+def test_an_arm_waits_for_the_token_of_its_last_life_to_go():
+    with Router(0) as router, Link(router.endpoint, "f") as second:
+        with Link(router.endpoint, "f") as first:
+            first.alive(keys.of_arm("f", "a", "alive"))
+            assert second.there(keys.of_arm("f", "a", "alive"), timeout_s=PATIENCE_S)
+            leaves = threading.Timer(0.3, first.close)
+            leaves.start()
+            refuse_namesake(second, "a", patience_s=PATIENCE_S)
+            leaves.join()
+        assert not second.there(keys.of_arm("f", "a", "alive"), timeout_s=PATIENCE_S)
 
 
 def test_a_log_without_temperatures_or_of_others_is_refused(log, tmp_path):
