@@ -10,6 +10,7 @@ import typer
 
 from fleet.errors import BusError, FleetError
 from scenarios.live_options import ENDPOINT, EndpointOption, FleetOption
+from scenarios.load import load
 from scenarios.terminal import out_console, say
 
 if TYPE_CHECKING:
@@ -32,6 +33,9 @@ def doctor_command(
     auctioneer: Annotated[
         bool, typer.Option(help="Whether the fleet should have one; none where arms only show themselves.")
     ] = True,
+    scenario: Annotated[
+        str, typer.Option(help="Every arm of this scenario should be there; without it, only who is there is known.")
+    ] = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print what was found as JSON.")] = False,
 ) -> None:
     """Say whether a fleet is well: exit code 0 healthy, 1 not, 2 out of reach."""
@@ -39,6 +43,7 @@ def doctor_command(
 
     if not 0 < seconds <= 600:
         raise FleetError(f"--seconds must be more than 0 and at most 600 (got {seconds:g}).")
+    expected = tuple(arm.name for arm in load(scenario).arms) if scenario else ()
     try:
         there = fleets_at(endpoint)
     except BusError as error:
@@ -49,20 +54,25 @@ def doctor_command(
             if there else "Nobody is there: no arm and no auctioneer shows a token."
         ))  # fmt: skip
         raise typer.Exit(ILL)
-    now, found = examine(endpoint, fleet or there[0], seconds, auctioneer=auctioneer)
+    now, found = examine(endpoint, fleet or there[0], seconds, auctioneer=auctioneer, expected=expected)
     if as_json:
         told = {"healthy": found.healthy, **msgspec.to_builtins(found)}
         typer.echo(msgspec.json.format(msgspec.json.encode(told)).decode())
     else:
         show(endpoint, now, found)
+        if there and fleet and fleet not in there:
+            say(f"Fleets at {endpoint}: {', '.join(there)}.", out_console)
     raise typer.Exit(0 if found.healthy else ILL)
 
 
-def examine(endpoint: str, fleet: str, seconds: float, *, auctioneer: bool = True) -> "tuple[FleetNow, Diagnosis]":
+def examine(
+    endpoint: str, fleet: str, seconds: float, *, auctioneer: bool = True, expected: tuple[str, ...] = ()
+) -> "tuple[FleetNow, Diagnosis]":
     """A fleet after it was listened to for so many real seconds.
 
     Args:
         auctioneer: Whether it should have one.
+        expected: Arms that should be there.
 
     Raises:
         BusError: no router answered.
@@ -99,7 +109,7 @@ def examine(endpoint: str, fleet: str, seconds: float, *, auctioneer: bool = Tru
         now = onlooker.overview.now(now_s)
         problems = {"malformed": link.malformed, "complaints": tuple(link.complaints), "overrun": link.overrun}
     secure = identified(endpoint)[1] is not None
-    return now, diagnosed(now, now_s, soundings, auctioneer=auctioneer, secure=secure, **problems)
+    return now, diagnosed(now, now_s, soundings, auctioneer=auctioneer, secure=secure, expected=expected, **problems)
 
 
 def show(endpoint: str, now: "FleetNow", found: "Diagnosis") -> None:

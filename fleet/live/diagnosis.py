@@ -64,6 +64,7 @@ def diagnosed(
     overrun: int = 0,
     auctioneer: bool = True,
     secure: bool = False,
+    expected: Sequence[str] = (),
 ) -> Diagnosis:
     """What is wrong with a fleet that was listened to for a while.
 
@@ -73,6 +74,7 @@ def diagnosed(
         overrun: Words lost because they came faster than we listened.
         auctioneer: Whether the fleet should have one.
         secure: Whether it was listened to with a certificate: one that the router does not know hears nothing.
+        expected: Arms that should be there: one that went before anybody listened leaves no trace.
     """
     trips_s = [sounding.answered_s - sounding.asked_s for sounding in soundings]
     clock = best_clock(soundings)
@@ -81,6 +83,8 @@ def diagnosed(
         *about_auctioneers(now, soundings, auctioneer),
         *(finding for arm in now.arms for finding in about_arm(arm, offsets_s.get(arm.arm))),
     ]
+    if missing := [name for name in expected if name not in {arm.arm for arm in now.arms if arm.token}]:
+        findings.append(Finding("fault", f"Not there: {', '.join(missing)}."))
     if not any(arm.present for arm in now.arms):
         deaf = secure and not any(arm.token for arm in now.arms)
         hint = " Or the router does not know this certificate: it reads its roster when it starts." if deaf else ""
@@ -88,7 +92,8 @@ def diagnosed(
     if trips_s and median(trips_s) > SLOW_S:
         findings.append(Finding("warning", f"The router is slow: a round trip takes {1000 * median(trips_s):.0f} ms."))
     if malformed:
-        findings.append(Finding("fault", f"{malformed} malformed word(s), the last: {'; '.join(complaints)}"))
+        told = "; ".join(dict.fromkeys(complaints))  # a flood says the same again and again
+        findings.append(Finding("fault", f"{malformed} malformed word(s), the last: {told}"))
     if overrun:
         findings.append(Finding("warning", f"{overrun} word(s) came faster than they were listened to."))
     if unfinished := now.counts.get("unfinished", 0):

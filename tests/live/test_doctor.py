@@ -104,6 +104,18 @@ def test_malformed_words_are_a_fault_with_their_reason():
     assert told == ["3 malformed word(s), the last: under 'k': not JSON"]
 
 
+def test_what_is_wrong_again_and_again_is_said_once():
+    told, _ = faults(fleet(arm()), malformed=3, complaints=["no JSON.", "no State.", "no JSON."])
+    assert told == ["3 malformed word(s), the last: no JSON.; no State."]
+
+
+def test_an_arm_that_went_before_anybody_listened_is_missed_only_by_name():
+    assert faults(fleet(arm()))[0] == []
+    assert faults(fleet(arm()), expected=("a", "b", "c"))[0] == ["Not there: b, c."]
+    left = arm(arm="b", token=False, present=False, state_age_s=None, time_s=None)
+    assert faults(fleet(arm(), left), expected=("a", "b"))[0] == ["Not there: b."]
+
+
 def test_what_somebody_should_look_at_is_no_fault():
     hot = arm(mode="faulted", hottest_c=76.0, joint=2)
     told, found = faults(fleet(hot, counts={"unfinished": 1}), Sounding(100.0, 100.4, 5000.0, 60.0), overrun=5)
