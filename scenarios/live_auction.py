@@ -73,6 +73,8 @@ def auction_command(
         typer.echo(f"ready {name} {endpoint} {os.getpid()}")
         if node.auctioneer.ledger.jobs:
             log.warning("Going on from %s: %s", book.path, told(node).partition("\n")[0])
+        if node.auctioneer.ledger.ended:
+            log.warning("That shift is over; another --journal (of thermofleet up: --out) begins a new one.")
         if own:
             work(node, own, chosen.horizon_s, stop)
         else:
@@ -87,7 +89,7 @@ def work(node: "AuctionNode", own: "Sequence[tuple[float, JobWord]]", horizon_s:
     from fleet.bus.trade import Submission
     from fleet.errors import JournalFull
 
-    left = list(own)
+    left = [] if node.auctioneer.ledger.ended else list(own)
     while not stop.is_set():
         node.serve(time.monotonic() + TURN_S)
         due = tuple(word for at_s, word in left if at_s <= node.time_s)
@@ -99,7 +101,7 @@ def work(node: "AuctionNode", own: "Sequence[tuple[float, JobWord]]", horizon_s:
                 del left[: len(due)]
             except JournalFull as error:
                 log.error("The scenario's jobs have to wait: %s", error)
-        over = node.time_s >= horizon_s
+        over = node.time_s >= horizon_s and not node.auctioneer.ledger.ended
         if over or not (left or node.auctioneer.ledger.unsettled()):
             if over:
                 node.end()

@@ -166,6 +166,6 @@ def stand(link: "Link", names: "Sequence[str]") -> "list[JobStatus]":
 
 
 def _line(status: "JobStatus") -> str:
-    at = f" by {status.arm}" if status.arm else ""
+    at = f" {'to' if status.state == 'awarded' else 'by'} {status.arm}" if status.arm else ""
     when = f" at {status.finished_s:.0f} s" if status.finished_s is not None else ""
     return f"{status.job}: {status.state}{at}{when}{f': {status.reason}' if status.reason else ''}"

@@ -81,7 +81,7 @@ def tell(news: "deque[str]", topic: str, name: str, word: msgspec.Struct) -> Non
         news.append(f"{clock(word.time_s)}  {name}: {described(word)}")
     elif isinstance(word, Result):
         job = word.status
-        by = f" by {job.arm}" if job.arm else ""
+        by = f" {'to' if job.state == 'awarded' else 'by'} {job.arm}" if job.arm else ""
         why = f": {job.reason}" if job.reason else ""
         news.append(f"{clock(word.time_s)}  job {job.job}: {job.state}{by}{why}")
 

@@ -135,7 +135,8 @@ class Stage:
     def __init__(self) -> None:
         self.time_s, self.handed_in, self.open, self.ended = 0.0, [], [], False
         self.alone_s = 0.0
-        self.auctioneer = SimpleNamespace(ledger=SimpleNamespace(unsettled=lambda: self.open), finishing=lambda: False)
+        ledger = SimpleNamespace(unsettled=lambda: self.open, ended=False)
+        self.auctioneer = SimpleNamespace(ledger=ledger, finishing=lambda: False)
 
     @property
     def rivals(self) -> set[str]:
@@ -163,6 +164,14 @@ def test_a_stream_is_handed_in_as_time_goes_on_until_all_is_done_or_the_shift_is
     all_of_it = [(3600.0, ["a"]), (7200.0, ["b", "c"]), (10800.0, ["d"])]
     assert stage.handed_in == (all_of_it[:2] if ended else all_of_it)
     assert stage.ended is ended
+
+
+def test_nothing_of_a_shift_that_is_over_is_handed_in_again(monkeypatch):
+    monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
+    stage, never = Stage(), SimpleNamespace(is_set=lambda: False)
+    stage.auctioneer.ledger.ended = True
+    live_auction.work(stage, [(0.0, JobWord("a", "hold", ("x",)))], 1.0, never)
+    assert stage.handed_in == []
 
 
 def test_nothing_is_handed_in_while_there_is_another_auctioneer(monkeypatch):
@@ -339,7 +348,7 @@ def test_jobs_can_be_followed_to_their_end(endpoint, tmp_path, capsys, end, code
     file.write_text(json.dumps(HOLD))
     with served(endpoint, declare):
         said = call(capsys, "submit", file, "--wait", "--endpoint", endpoint, "--fleet", "f")
-    assert said[:2] == (code, f"a: accepted\na: waiting\na: awarded by arm_0\na: {end} by arm_0\n")
+    assert said[:2] == (code, f"a: accepted\na: waiting\na: awarded to arm_0\na: {end} by arm_0\n")
 
 
 def test_ask_shows_what_a_job_would_cost_whom(endpoint, capsys):
