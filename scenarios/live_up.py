@@ -13,10 +13,12 @@ from fleet.bus.security import Tls
 from fleet.errors import FleetError
 from fleet.live.supervisor import Part, Supervisor
 from scenarios.load import load
-from scenarios.terminal import out_console, progress_bar, say
+from scenarios.terminal import err_console, out_console, progress_bar, say
 
 START_S = 60.0
 """Real seconds that a participant has to say that it is ready: an arm loads its twin."""
+PORT = 7447
+"""Where every command looks for the router unless it is told."""
 PROGRAM = (sys.executable, "-c", "from scenarios.cli import main; main()")
 
 
@@ -77,7 +79,9 @@ def up_command(
     out: Annotated[
         Path | None, typer.Option(help="Folder for journals, recording and logs; default runs/live-FLEET.")
     ] = None,
-    port: Annotated[int, typer.Option(help="Loopback port of the router; 0 is any free one.")] = 0,
+    port: Annotated[
+        int | None, typer.Option(help="Loopback port of the router; 0 is any free one. Default: 7447, or any if taken.")
+    ] = None,
     fleet: Annotated[str, typer.Option(help="Name of the fleet; default: the scenario's name.")] = "",
     tls: Annotated[
         Path | None, typer.Option(help="Folder that thermofleet keys made for this scenario: mutual TLS and its rules.")
@@ -93,8 +97,8 @@ def up_command(
     from scenarios.stopping import until_stopped
 
     chosen = load(scenario)
-    if not 0 < speed < float("inf") or seed < 0 or not 0 <= port <= 65535:
-        raise FleetError(f"--speed must be > 0, --seed >= 0, --port 0 to 65535 (got {speed:g}, {seed}, {port}).")
+    if not 0 < speed < float("inf") or seed < 0 or not 0 <= (port or 0) <= 65535:
+        raise FleetError(f"--speed must be > 0, --seed >= 0, --port 0 to 65535 (got {speed:g}, {seed}, {port or 0}).")
     if difficulty not in ("twin", "blind") or jobs not in ("scenario", "none"):
         raise FleetError(f"--difficulty is twin or blind, --jobs scenario or none (got {difficulty}, {jobs}).")
     allocation(rule, assignment, chosen.limits.warning_c)
@@ -107,7 +111,7 @@ def up_command(
     router, arms, record, auction = parts_of(
         scenario,
         tuple(arm.name for arm in chosen.arms),
-        port=port or free_port(),
+        port=port or free_port(PORT if port is None else 0),
         fleet=fleet,
         folder=folder,
         speed=speed,
@@ -119,6 +123,7 @@ def up_command(
         tls=tls,
     )
     look = Tls(tls, "monitor").endpoint(router.ready) if tls else router.ready
+    say(f"Starting the router, the recorder, {len(arms)} arms and the auctioneer …", err_console)
     with until_stopped() as stop, Supervisor(folder / "logs") as supervisor:
         supervisor.start(router, ready_s=START_S)
         for part in (record, *arms):
@@ -134,7 +139,10 @@ def up_command(
         )
         ended = supervisor.run(stop.is_set)
         if ended:
-            say(supervisor.since_ready(ended), out_console)
+            for line in supervisor.since_ready(ended).splitlines():
+                say(line, out_console)
+        else:
+            say("Stopping; every participant ends in order …", err_console)
         again = {name: count for name, count in supervisor.restarts().items() if count}
     if again:
         say("Started again: " + ", ".join(f"{name} {count} time(s)" for name, count in again.items()), out_console)
@@ -142,8 +150,16 @@ def up_command(
     stop.leave(f"The fleet was stopped; journals, recording and logs are in {folder}, and the same command goes on.")
 
 
-def free_port() -> int:
-    """A port of 127.0.0.1 that nobody listens on now: the router needs the same one when it is started again."""
+def free_port(wanted: int = 0) -> int:
+    """A port of 127.0.0.1 that nobody listens on now: the router needs the same one when it is started again.
+
+    Args:
+        wanted: Taken if it is free; 0 for any.
+    """
     with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as routers do: one that has just ended is free
+        try:
+            probe.bind(("127.0.0.1", wanted))
+        except OSError:
+            probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]

@@ -18,7 +18,7 @@ from fleet.bus import keys
 from fleet.bus.router import open_client
 from fleet.bus.security import Tls, identified
 from scenarios.cli import main
-from scenarios.live_up import parts_of
+from scenarios.live_up import free_port, parts_of
 
 ROOT = Path(__file__).parents[2]
 PATIENT_S = 20.0
@@ -207,3 +207,12 @@ def test_a_whole_fleet_works_with_every_rule_on(capsys, small_toml, plans, tmp_p
     logs = {path.name: path.read_text(encoding="utf-8") for path in (out / "logs").iterdir()}
     assert logs["router.log"].startswith("tls/")
     assert not [name for name, said in logs.items() if "Traceback" in said or "No router answered" in said]
+
+
+def test_the_port_that_everybody_knows_is_taken_where_it_is_free():
+    with socket.socket() as held:
+        held.bind(("127.0.0.1", 0))
+        held.listen()
+        taken = held.getsockname()[1]
+        assert free_port(taken) not in (0, taken)
+    assert free_port(taken) == taken
