@@ -51,7 +51,7 @@ def follow(session, root, names, seconds):
                 for status in words:
                     if status["job"] in names - ended.keys() and status["state"] in ("finished", "unfinished"):
                         ended[status["job"]] = status["state"]
-                        print(f"{status['job']}: {status['state']} {status.get('arm', '')}", flush=True)
+                        print(" ".join([f"{status['job']}: {status['state']}", *said(status)]), flush=True)
                 if names <= ended.keys():
                     break
                 words = [json.loads(results.get(timeout=2.0).payload.to_bytes())["status"]]
@@ -59,6 +59,11 @@ def follow(session, root, names, seconds):
             continue
     subscriber.undeclare()
     return ended
+
+
+def said(status):
+    """What else a status tells: the arm, and why."""
+    return filter(None, (status.get("arm"), status.get("reason")))
 
 
 def ask(session, key, kind, word):

@@ -78,6 +78,8 @@ def replay_command(
     if not speed > 0:
         raise FleetError(f"--speed must be > 0 (got {speed:g}).")
     told = Replay.of(path)
+    if not len(told):
+        raise FleetError(f"'{path}' holds no words yet; a recording is written every --rotate seconds and at its end.")
     with until_stopped() as stop, Link(endpoint, fleet or told.fleet) as link:
         typer.echo(f"ready replay {endpoint}")
         words = told.play(link, speed=speed, stopped=stop.is_set)
