@@ -31,7 +31,9 @@ MOST_PIXELS = 600_000_000
 
 def animate_command(
     scenario: Annotated[str, typer.Argument(help="A library name (see `thermofleet list`) or a .toml file.")],
-    policy: Annotated[str, typer.Option(help=f"{', '.join(RULES)}, or an own FILE.py:CLASS.")] = "least_difficulty",
+    policy: Annotated[
+        str, typer.Option(help=f"{', '.join(RULES)}, an own FILE.py:CLASS, or a folder of train.")
+    ] = "least_difficulty",
     seed: Annotated[int, typer.Option(help="As in `thermofleet run`: the same shift.")] = 0,
     out: Annotated[Path | None, typer.Option(help="The file; default runs/SCENARIO-POLICY-SEED.gif.")] = None,
     every: Annotated[

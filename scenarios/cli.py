@@ -41,7 +41,7 @@ app = typer.Typer(
     add_completion=False,
 )
 ScenarioArg = Annotated[str, typer.Argument(help="A library name (see `thermofleet list`) or a .toml file.")]
-PolicyOption = Annotated[str, typer.Option(help=f"{', '.join(RULES)}, or an own FILE.py:CLASS.")]
+PolicyOption = Annotated[str, typer.Option(help=f"{', '.join(RULES)}, an own FILE.py:CLASS, or a folder of train.")]
 SeedOption = Annotated[int, typer.Option(help="Draws the jobs, the noise and the policy's chance; 0 or more.")]
 PlantOption = Annotated[str, typer.Option(help="profile (planned heat) or mujoco (closed loop in one scene).")]
 BusOption = Annotated[str, typer.Option(help="zenoh (in-process router) or memory.")]
@@ -158,10 +158,18 @@ def show_command(scenario: ScenarioArg, as_json: JsonOption = False) -> None:
 @with_channel
 def compare_command(
     scenario: ScenarioArg,
-    policies: Annotated[str, typer.Option(help="Comma-separated; an own one as FILE.py:CLASS.")] = ",".join(RULES),
+    policies: Annotated[
+        str, typer.Option(help="Comma-separated; an own one as FILE.py:CLASS, a trained one as its folder.")
+    ] = ",".join(RULES),
     seeds: Annotated[int, typer.Option(help="How many; 2 or more.")] = 10,
     first_seed: Annotated[int, typer.Option(help="The first of them; hold some out when you tune.")] = 0,
-    baseline: Annotated[str, typer.Option(help="Paired differences are against this policy.")] = "round_robin",
+    baseline: Annotated[
+        str | None,
+        typer.Option(
+            help="Paired differences are against this policy; default round_robin, or else the first.",
+            show_default=False,
+        ),
+    ] = None,
     difficulty: DifficultyOption = "twin",
     as_json: JsonOption = False,
     *,
@@ -184,7 +192,7 @@ def compare_command(
             chosen,
             names,
             seeds=chosen_seeds,
-            baseline=baseline,
+            baseline=baseline or ("round_robin" if "round_robin" in names else names[0]),
             difficulty=how,
             channel=between,
             progress=progress,

@@ -309,6 +309,13 @@ def test_compare_prints_a_table_or_json(thermofleet, small_toml, monkeypatch):
     assert "above_warning_min" in thermofleet(*some).out
 
 
+def test_without_round_robin_the_first_policy_is_the_baseline(thermofleet, small_toml, monkeypatch):
+    monkeypatch.setenv("LOKY_MAX_CPU_COUNT", "1")
+    some = ("compare", small_toml, "--seeds", 2, "--difficulty", "blind", "--json", "--policies")
+    for policies, baseline in (("random,coolest_first", "random"), ("random,round_robin", "round_robin")):
+        assert json.loads(thermofleet(*some, policies).out)["baseline"] == baseline
+
+
 def test_the_demo_sets_two_policies_side_by_side(thermofleet, tmp_path, monkeypatch, plans):
     from scenarios.build import prepare
 
