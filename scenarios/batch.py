@@ -13,10 +13,10 @@ from fleet.env.vector import BatchEnv, Library
 from fleet.errors import ScenarioError
 from fleet.job import Job
 from fleet.sim.tables import stacked, tables_of
-from scenarios.build import DifficultyName, Fleet, Progress, prepare, quiet, world_of
+from scenarios.build import DifficultyName, Fleet, Progress, chosen_of, prepare, quiet, world_of
 from scenarios.draw import QuickSource, children_of
 from scenarios.jobs import works_of
-from scenarios.load import load, override
+from scenarios.load import override
 from scenarios.scenario import Scenario
 
 Array = np.ndarray
@@ -36,13 +36,20 @@ class Randomisation:
 
     def __post_init__(self) -> None:
         for name in ("ambient_k", "arrivals"):
-            low, high = getattr(self, name)
+            try:
+                low, high = getattr(self, name)
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"Randomisation.{name} must be (low, high) (got {getattr(self, name)}).") from error
             if not low <= high:
                 raise ValueError(f"Randomisation.{name} needs low <= high (got {low}, {high}).")
             if not (isfinite(low) and isfinite(high)):
                 raise ValueError(f"Randomisation.{name} must be finite (got {low}, {high}).")
         if self.arrivals[0] <= 0:
             raise ValueError(f"Randomisation.arrivals must be > 0 (got {self.arrivals}).")
+
+
+_SINGLE = frozenset({"plant", "bus", "channel", "render_mode", "mask_in"})
+"""What the single env takes beside the overrides, and a batch does not."""
 
 
 def make_batch(
@@ -67,10 +74,13 @@ def make_batch(
         max_cycles, autoreset: As in `fleet.env.vector.BatchEnv`.
 
     Raises:
-        ScenarioError: a variant that is no fleet of the same arms and jobs.
+        ScenarioError: a variant that is no fleet of the same arms and jobs, or an option that only `make_env` has.
     """
-    base = scenario if isinstance(scenario, Scenario) else load(scenario)
-    chosen = override(base, **overrides) if overrides else base
+    if single := sorted(_SINGLE & set(overrides)):
+        raise ScenarioError(f"make_batch() takes no {single[0]}; only make_env() does.")
+    if not isinstance(randomise, Randomisation | None):
+        raise ScenarioError(f"randomise must be a scenarios.batch.Randomisation (got {randomise!r}).")
+    chosen = chosen_of(scenario, overrides, make_batch)
     randomise = randomise or Randomisation()
     specs = [chosen, *(override(chosen, **variant) for variant in randomise.variants)]
     fleets = [

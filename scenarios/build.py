@@ -3,6 +3,8 @@
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from dataclasses import fields as dataclass_fields
+from inspect import Parameter, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -289,6 +291,22 @@ def open_exchange(
         raise FleetError(str(error)) from error
 
 
+def chosen_of(scenario: str | Path | Scenario, overrides: Mapping[str, Any], door: Callable[..., Any]) -> Scenario:
+    """The scenario with its overrides; a name that is neither a field nor an option of the door is refused.
+
+    Raises:
+        ScenarioError: names the nearest of both.
+    """
+    chosen = scenario if isinstance(scenario, Scenario) else load(scenario)
+    fields = [field.name for field in dataclass_fields(Scenario)]
+    options = [name for name, taken in signature(door).parameters.items() if taken.kind is Parameter.KEYWORD_ONLY]
+    for name in overrides:
+        if name not in fields:
+            allowed = nearest(name, [*fields, *options])
+            raise ScenarioError(f"{chosen.name} with overrides: unknown key '{name}'{allowed}")
+    return override(chosen, **overrides) if overrides else chosen
+
+
 def make_env(
     scenario: str | Path | Scenario,
     *,
@@ -315,8 +333,9 @@ def make_env(
         max_cycles, render_mode, mask_in: As in `fleet.env.allocation_v0.AllocationEnv`.
         overrides: Top-level fields of the scenario to change, for example `horizon_s=600`.
     """
-    base = scenario if isinstance(scenario, Scenario) else load(scenario)
-    chosen = override(base, **overrides) if overrides else base
+    if not isinstance(channel, Channel):
+        raise ScenarioError(f"channel must be a fleet.bus.channel.Channel (got {channel!r}).")
+    chosen = chosen_of(scenario, overrides, make_env)
     fleet = prepare(chosen, difficulty=difficulty, cache=cache, progress=progress)
     options = {"max_cycles": max_cycles, "render_mode": render_mode, "mask_in": mask_in}
     return env_of(fleet, plant=plant, bus=bus, channel=channel, **options)

@@ -222,6 +222,25 @@ def test_a_scenario_or_a_field_that_there_is_not_is_refused(cell, folder) -> Non
             make(cell, difficulty="twins", cache=folder)
 
 
+def test_a_name_that_is_neither_field_nor_option_is_told_the_nearest_of_both(cell, folder) -> None:
+    with pytest.raises(ScenarioError, match="unknown key 'render_mod'; did you mean 'render_mode'"):
+        make_env(cell, difficulty="blind", cache=folder, render_mod="ansi")
+    with pytest.raises(ScenarioError, match="unknown key 'randomize'; did you mean 'randomise'"):
+        make_batch(cell, 2, difficulty="blind", cache=folder, randomize=None)
+    single = {"plant": "mujoco", "bus": "zenoh", "channel": None, "render_mode": "ansi", "mask_in": "info"}
+    for name, value in single.items():
+        with pytest.raises(ScenarioError, match=rf"make_batch\(\) takes no {name}; only make_env\(\) does\."):
+            make_batch(cell, 2, difficulty="blind", cache=folder, **{name: value})
+
+
+def test_an_option_of_another_type_is_refused_with_the_type_it_takes(cell, folder) -> None:
+    wrong: Any = 0.3
+    with pytest.raises(ScenarioError, match=r"channel must be a fleet\.bus\.channel\.Channel \(got 0\.3\)"):
+        make_env(cell, difficulty="blind", cache=folder, channel=wrong)
+    with pytest.raises(ScenarioError, match=r"randomise must be a scenarios\.batch\.Randomisation \(got 0\.3\)"):
+        make_batch(cell, 2, difficulty="blind", cache=folder, randomise=wrong)
+
+
 def test_a_variant_of_another_fleet_is_refused(cell, folder) -> None:
     arms = [{"name": a.name, "position_m": list(a.position_m), "tilt_deg": list(a.tilt_deg)} for a in cell.arms]
     other = [dict(arms[0], name="west"), *arms[1:]]
@@ -248,6 +267,8 @@ def test_a_variant_of_another_fleet_is_refused(cell, folder) -> None:
         ({"arrivals": (2.0, 1.0)}, r"Randomisation\.arrivals needs low <= high"),
         ({"arrivals": (0.0, 1.0)}, r"Randomisation\.arrivals must be > 0"),
         ({"ambient_k": (0.0, float("inf"))}, r"Randomisation\.ambient_k must be finite"),
+        ({"ambient_k": 3.0}, r"Randomisation\.ambient_k must be \(low, high\) \(got 3\.0\)"),
+        ({"arrivals": (1.0, 2.0, 3.0)}, r"Randomisation\.arrivals must be \(low, high\)"),
         ({"arrivals": (float("nan"), 1.0)}, r"Randomisation\.arrivals needs low <= high"),
     ],
 )
