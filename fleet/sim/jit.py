@@ -5,7 +5,9 @@ and to the same result.
 """
 
 import hashlib
+import logging
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -13,6 +15,8 @@ import numba
 from numba import config, njit
 
 from fleet.cache import users_folder
+
+log = logging.getLogger(__name__)
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -35,13 +39,22 @@ def natural(index: Any) -> Any:
     return index & 0x7FFFFFFF
 
 
+@cache
+def _announce(folder: Path) -> None:
+    """Say once that the first step takes long: a warning, for that is shown where nobody set up logging."""
+    log.warning("The first step compiles the engine: some 20 s of one core, once, kept in %s.", folder)
+
+
 def entry(function: Function) -> Function:
     """Compile a function that Python calls, and keep its code in the user's cache folder, by all it is made of."""
     digest = hashlib.sha256(numba.__version__.encode())
     for name in _SOURCES:
         digest.update((_HERE / name).read_bytes())
+    folder = users_folder() / "compiled" / digest.hexdigest()[:16]
     options: Any = config  # numba sets them by name
-    before, options.CACHE_DIR = options.CACHE_DIR, str(users_folder() / "compiled" / digest.hexdigest()[:16])
+    if not (folder.exists() or options.DISABLE_JIT):
+        _announce(folder)
+    before, options.CACHE_DIR = options.CACHE_DIR, str(folder)
     try:
         return cast(Function, njit(function, error_model="numpy", cache=True, nogil=True))
     finally:
