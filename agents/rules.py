@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from agents.consensus import Consensus
+from agents.dispatch import Wspt, WsptCool
 from agents.hearsay import Trust, advantage
 from agents.policy import WAIT, Policy, legal_slots
 from fleet.env.observation import Observation
@@ -132,6 +133,8 @@ RULES: dict[str, Callable[[], Policy]] = {
     "coolest_first": CoolestFirst,
     "least_difficulty": LeastDifficulty,
     "consensus": Consensus,
+    "wspt": Wspt,
+    "wspt_cool": WsptCool,
 }
 """Policies by the name under which `--policy` knows them."""
 

@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -10,13 +10,16 @@ from typing import Any
 
 import numpy as np
 
+from agents.learned.imitation import imitate
 from agents.learned.policy import CARD, save_policy
 from agents.learned.ppo import Iteration, PpoConfig, Trainer
+from agents.policy import Policy
 from fleet.env.adapters.torchrl import TorchRLEnv
 from fleet.env.vector import BatchEnv, Obs
 from fleet.errors import FleetError
 from scenarios.batch import library_of
 from scenarios.build import DifficultyName, Progress, prepare, quiet
+from scenarios.policies import policy_of
 from scenarios.run import scenario_hash
 from scenarios.scenario import Scenario
 
@@ -95,6 +98,10 @@ def train(
     judge = BatchEnv(library, plan.validation_envs, weights=scenario.reward)
     trainer = Trainer(make_env, judge.layout, config)
     best = -np.inf
+    rng = np.random.default_rng(np.random.SeedSequence([config.seed, 4]))
+    if not resume and config.warm_start:
+        teacher = BatchEnv(library, 16, seed=int(rng.integers(2**31)), weights=scenario.reward, stagger=True)
+        imitate(trainer.actor, judge.layout, _shown(teacher, config.warm_start, progress), rng)
     if resume:
         best = trainer.load(out / STATE)["best"]
     out.mkdir(parents=True, exist_ok=True)
@@ -133,6 +140,36 @@ def train(
         look(told)
     draw_curves(out)
     return Trained(trainer.done, trainer.env_steps, best, time.monotonic() - began_s, interrupted)
+
+
+IMITATED = 60
+"""Batches of decisions of a rule that the actor is shown for a warm start."""
+DECISIONS = 128
+"""In each, of every env."""
+
+
+def _shown(env: BatchEnv, rule: str, progress: Progress) -> Iterator[tuple[Array, Array, Array]]:
+    """What a rule does in a batch: vectors, masks and actions, [row, …], rows of all arms at all moments."""
+    policies = [policy_of(rule) for _ in range(env.num_envs)]
+    for policy, child in zip(policies, np.random.SeedSequence(0).spawn(env.num_envs), strict=True):
+        policy.reset(np.random.default_rng(child))
+    obs, _ = env.reset()
+    for number in range(IMITATED):
+        progress(f"imitating {rule}", number / IMITATED)
+        rows: list[tuple[Array, Array, Array]] = []
+        for _ in range(DECISIONS):
+            actions = np.array([_asked(env, obs, policy, e) for e, policy in enumerate(policies)])
+            rows.append((obs["observation"], obs["action_mask"], actions))
+            obs, *_ = env.step(actions)
+        vectors, masks, actions = (np.concatenate(part) for part in zip(*rows, strict=True))
+        yield vectors.reshape(-1, vectors.shape[-1]), masks.reshape(-1, masks.shape[-1]), actions.reshape(-1)
+
+
+def _asked(env: BatchEnv, obs: Obs, policy: Policy, e: int) -> list[int]:
+    """What a policy does in one env, int [arm]."""
+    vectors, masks, read = obs["observation"][e], obs["action_mask"][e], env.layout.read
+    actions = policy.act({arm: read(vectors[a], masks[a]) for a, arm in enumerate(env.agents)})
+    return [actions[arm] for arm in env.agents]
 
 
 def returns(env: BatchEnv, act: Callable[[Obs], Array], seeds: Sequence[int]) -> Array:

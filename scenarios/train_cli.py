@@ -8,6 +8,7 @@ import typer
 
 from fleet.errors import FleetError
 from scenarios.load import load
+from scenarios.policies import policy_of
 from scenarios.terminal import out_console, progress_bar, say
 
 
@@ -18,6 +19,9 @@ def train_command(
     ] = "mappo",
     minutes: Annotated[float, typer.Option(help="How long; the twins' training before it not counted.")] = 30.0,
     iterations: Annotated[int | None, typer.Option(help="End earlier, after so many iterations in all.")] = None,
+    warm_start: Annotated[
+        str, typer.Option(help="Rule that the network imitates first, for example wspt; none if not given.")
+    ] = "",
     envs: Annotated[int, typer.Option(help="Shifts side by side.")] = 64,
     seed: Annotated[int, typer.Option(help="Of the shifts, the network's start and the order of learning.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Folder; default runs/SCENARIO-ALGO-SEED.")] = None,
@@ -32,6 +36,8 @@ def train_command(
     chosen = load(scenario)
     if threads < 1 or seed < 0:
         raise FleetError(f"--threads must be 1 or more and --seed 0 or more (got {threads}, {seed}).")
+    if warm_start:
+        policy_of(warm_start)
     where = out or Path("runs") / f"{chosen.name}-{algo}-{seed}"
     if find_spec("torchrl") is None:
         raise FleetError("Training needs TorchRL: pip install 'thermofleet[learn]' -c constraints.txt.")
@@ -41,7 +47,7 @@ def train_command(
     use_threads(threads)
     named: Any = algo
     try:
-        config = PpoConfig(algorithm=named, envs=envs, seed=seed)
+        config = PpoConfig(algorithm=named, envs=envs, seed=seed, warm_start=warm_start)
     except ValueError as error:
         raise FleetError(str(error)) from error
     plan = TrainingPlan(minutes=minutes, iterations=iterations)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from fleet.env.observation import Layout
 
-OWN, SLOT, PEER, PAIR = 14, 11, 5, 3
+OWN, SLOT, PEER, PAIR = 14, 12, 5, 3
 """Features of an arm itself, of a slot, of a peer, and of a peer's word on a slot."""
 
 
@@ -48,6 +48,7 @@ def sets_of(layout: Layout, vectors: Tensor) -> Sets:
             o.payload_kg / 4.0,
             o.value / 4.0,
             o.returns,
+            o.value / (o.duration_s / 60.0).clamp(min=0.5),
         ],
         dim=-1,
     )

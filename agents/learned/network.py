@@ -14,6 +14,9 @@ from torch import Tensor, nn
 from agents.learned.features import OWN, PAIR, PEER, SLOT, sets_of
 from fleet.env.observation import Layout
 
+RARELY = -3.0
+"""Logit by which a fresh actor rather claims than waits: it begins as a rule that keeps the fleet busy."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkSize:
@@ -41,6 +44,7 @@ class Actor(nn.Module):
         self.claim = _mlp([2 * size.slot + size.arm, size.slot, 1], last=False)
         self.wait = _mlp([size.slot + size.arm, size.slot, 1], last=False)
         self._pair = size.pair
+        nn.init.constant_(last_bias(self.wait), RARELY)
 
     def forward(self, layout: Layout, vectors: Tensor) -> Tensor:
         """Logits before the mask, [row, slot + 1], of vectors [row, size]."""
@@ -96,6 +100,12 @@ class Critic(nn.Module):
 def masked(logits: Tensor, mask: Tensor) -> Tensor:
     """Logits with those of illegal actions at the lowest finite value, so that their probability is zero."""
     return logits.masked_fill(~mask.bool(), torch.finfo(logits.dtype).min)
+
+
+def last_bias(layers: nn.Sequential) -> Tensor:
+    """The bias of the last linear layer."""
+    linear = [layer for layer in layers if isinstance(layer, nn.Linear)][-1]
+    return linear.bias
 
 
 def _mlp(widths: Sequence[int], *, last: bool = True) -> nn.Sequential:

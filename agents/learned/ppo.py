@@ -48,14 +48,17 @@ class PpoConfig:
     """Over the choices; the critic sees every moment once."""
     minibatch: int = 512
     """Choices of arms in a step of the actor."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 3e-4
     gamma: float = 0.99
-    lmbda: float = 0.95
+    lmbda: float = 0.98
+    """Near 1: the value of the job in hand is not in the observation, so it is the reward itself that must arrive."""
     clip: float = 0.2
-    entropy: float = 0.005
+    entropy: float = 0.002
     """Weight of the entropy bonus."""
     max_gradient: float = 0.5
     reward_scale: float = 0.1
+    warm_start: str = ""
+    """Rule that the actor imitates first; empty for none."""
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from agents.learned.features import sets_of
+from agents.learned.imitation import imitate
 from agents.learned.network import Actor, Critic, NetworkSize, masked
 from agents.learned.policy import CARD, WEIGHTS, LearnedPolicy, draw, load_policy, save_policy
 from agents.learned.ppo import PpoConfig, Trainer
@@ -89,13 +90,15 @@ def test_draws_are_those_of_the_softmax() -> None:
     np.testing.assert_allclose(np.bincount(drawn, minlength=4) / 20_000, [0.5, 0.3, 0.2, 0.0], atol=0.012)
 
 
-def lopsided(small) -> Library:
-    """A fleet of two: one arm finishes a job in no time, the other takes most of the shift; both find it as hard."""
+def unequal(small) -> Library:
+    """Two arms and more jobs than they can do: every fourth is worth ten of the others."""
     content = [small.work(place) for place in ("a", "b", "c", "d")]
     same = small.ByPayload(1.0)
-    quick, slow = small.Times(1.0, 2.0, 1.0), small.Times(100.0, 100.0, 100.0)
-    arms = [small.arm(0, content, times=quick, model=same), small.arm(1, content, times=slow, model=same)]
-    jobs = [small.job(f"j{i:02d}", content[i % 4], repetitions=1, release_s=20.0 * (i // 2)) for i in range(24)]
+    arms = [small.arm(i, content, times=small.Times(1.0, 25.0, 1.0), model=same) for i in range(2)]
+    jobs = [
+        small.job(f"j{i:02d}", content[i % 4], repetitions=1, release_s=10.0 * i, value=1.0 if i % 4 == 1 else 0.1)
+        for i in range(40)
+    ]
     world, _ = small.shop([jobs], arms=arms, ticks=30, slots=4)
     tables, drawn = tables_of(world)
 
@@ -107,7 +110,7 @@ def lopsided(small) -> Library:
 
 
 def trainer(small, **changes) -> Trainer:
-    library = lopsided(small)
+    library = unequal(small)
 
     def make_env(envs: int, seed: int) -> TorchRLEnv:
         return TorchRLEnv(BatchEnv(library, envs, seed=seed, autoreset=False))
@@ -120,10 +123,10 @@ def weights(of: Trainer) -> dict[str, torch.Tensor]:
 
 
 @pytest.mark.parametrize("algorithm", ["mappo", "ippo"])
-def test_it_learns_to_leave_work_to_the_quick_arm(small, algorithm) -> None:
+def test_it_learns_what_is_worth_more(small, algorithm) -> None:
     learner = trainer(small, algorithm=algorithm, learning_rate=3e-3)
     rewards = [told.reward for told in islice(learner.iterate(), 25)]
-    assert np.mean(rewards[-3:]) > 1.15 * np.mean(rewards[:3])
+    assert np.mean(rewards[-3:]) > 1.1 * np.mean(rewards[:3])
 
 
 def test_the_same_seed_learns_the_same_and_another_does_not(small) -> None:
@@ -191,3 +194,23 @@ def test_what_is_no_policy_is_said(tmp_path) -> None:
 def test_a_wrong_configuration_is_refused(changes, message) -> None:
     with pytest.raises(ValueError, match=message):
         PpoConfig(**changes)
+
+
+def test_a_warm_start_learns_the_rule_it_is_shown() -> None:
+    rng, layout = np.random.default_rng(0), Layout(3, 4)
+
+    def shown(rows: int):
+        vectors = random_observation(layout, rng, rows)
+        mask = np.ones((rows, 5), np.int8)
+        mask[::7, 1:] = 0  # no choice: not to be learned from
+        payload = layout.read(vectors, mask).payload_kg
+        return vectors, mask, np.where(mask[:, 1], payload.argmax(axis=-1) + 1, 0)
+
+    torch.manual_seed(0)
+    actor = Actor()
+    told = imitate(actor, layout, [shown(600) for _ in range(12)], np.random.default_rng(1))
+    assert told[-1] < 0.5 * told[0]
+    vectors, mask, actions = shown(400)
+    with torch.inference_mode():
+        best = masked(actor(layout, torch.from_numpy(vectors)), torch.from_numpy(mask)).argmax(dim=-1).numpy()
+    assert (best == actions)[mask[:, 1] > 0].mean() > 0.8
