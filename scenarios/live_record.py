@@ -1,7 +1,10 @@
 """`thermofleet record` and `thermofleet replay`: the bus to Parquet, and Parquet to the bus."""
 
+import fcntl
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -28,19 +31,43 @@ def record(link: "Link", folder: Path, *, rotate_s: float, stopped: Callable[[],
     from fleet.bus.trade import ArmEvent, Result
     from scenarios.bus_recording import Recorder
 
-    recorder = Recorder.open(folder, link.fleet)
-    link.listen(keys.of_every_arm(link.fleet, "state"), State, recorder.state, remembered=REMEMBERED)
-    link.listen(keys.of_every_arm(link.fleet, "event"), ArmEvent, recorder.event, remembered=REMEMBERED)
-    link.listen(keys.of_every_auction(link.fleet, "result"), Result, recorder.result, remembered=REMEMBERED)
-    due_s = time.monotonic() + rotate_s
-    while not stopped():
-        link.serve(min(due_s, time.monotonic() + LOOK_S))
-        if time.monotonic() >= due_s:
-            recorder.write()
-            due_s = time.monotonic() + rotate_s
-    link.serve()
-    recorder.write(status="finished")
+    with alone(folder):
+        recorder = Recorder.open(folder, link.fleet)
+        link.listen(keys.of_every_arm(link.fleet, "state"), State, recorder.state, remembered=REMEMBERED)
+        link.listen(keys.of_every_arm(link.fleet, "event"), ArmEvent, recorder.event, remembered=REMEMBERED)
+        link.listen(keys.of_every_auction(link.fleet, "result"), Result, recorder.result, remembered=REMEMBERED)
+        due_s = time.monotonic() + rotate_s
+        while not stopped():
+            link.serve(min(due_s, time.monotonic() + LOOK_S))
+            if time.monotonic() >= due_s:
+                recorder.write()
+                due_s = time.monotonic() + rotate_s
+        link.serve()
+        recorder.write(status="finished")
     return recorder
+
+
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Nobody else records in the folder, made if it is missing, until the end of the block or of the process.
+
+    Raises:
+        FleetError: somebody does, or there can be no such folder.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)  # locked itself: it needs no file more
+    except OSError as error:
+        raise FleetError(f"Cannot write to '{folder}': {error.strerror}.") from error
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            told = f"Another process records in '{folder}'; two would write over each other's parts."
+            raise FleetError(told) from error
+        yield
+    finally:
+        os.close(handle)
 
 
 def record_command(

@@ -18,7 +18,7 @@ from fleet.bus.trade import ArmEvent, JobStatus, Result
 from fleet.errors import FleetError
 from scenarios.bus_recording import CARD, Recorder, part_files, read_card, read_parts, states
 from scenarios.bus_replay import Replay
-from scenarios.live_record import record
+from scenarios.live_record import alone, record
 
 PATIENCE_S = 20.0
 
@@ -213,3 +213,11 @@ def test_a_replay_says_the_same_again_and_refuses_to_speak_for_those_who_are_the
             told.play(other, speed=100.0, stopped=lambda: False)
     for kind in ("telemetry", "events", "results"):
         assert read_parts(tmp_path / "second", kind).equals(read_parts(tmp_path / "first", kind)), kind
+
+
+def test_two_do_not_record_in_one_folder(tmp_path):
+    rec = tmp_path / "rec"
+    with alone(rec), pytest.raises(FleetError, match="Another process records"), alone(rec):
+        pass
+    with alone(rec):  # the first has ended
+        pass
