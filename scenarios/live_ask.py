@@ -33,7 +33,10 @@ def ask_command(
     endpoint: EndpointOption = ENDPOINT,
     fleet: FleetOption = "",
 ) -> None:
-    """Ask every arm what jobs would cost it: difficulty, risk, peak temperature, finish, or why it cannot."""
+    """Ask every arm what jobs would cost it: difficulty, risk, peak temperature, finish, or why it cannot.
+
+    A job takes as long as it is with the ways there and home; it is done when its last cycle is, after what is in hand.
+    """
     from fleet.bus import keys
     from fleet.bus.link import Link
     from fleet.bus.trade import MOST_JOBS, Quote, QuoteRequest
