@@ -59,7 +59,7 @@ def make_batch(
     *,
     difficulty: DifficultyName = "twin",
     randomise: Randomisation | None = None,
-    cache: Path | None = None,
+    cache: str | Path | None = None,
     max_cycles: int | None = None,
     autoreset: bool = True,
     progress: Progress = quiet,

@@ -66,14 +66,14 @@ def choose(kind: str, name: str, allowed: Any) -> None:
         ScenarioError: names the nearest one.
     """
     if name not in get_args(allowed):
-        raise ScenarioError(f"No {kind} '{name}'{nearest(name, get_args(allowed))}")
+        raise ScenarioError(f"No {kind} '{name}'{nearest(str(name), get_args(allowed))}")
 
 
 def prepare(
     scenario: Scenario,
     *,
     difficulty: DifficultyName = "twin",
-    cache: Path | None = None,
+    cache: str | Path | None = None,
     progress: Progress = quiet,
 ) -> Fleet:
     """Plan every work for every arm, and give each arm its difficulty model. Cached on content.
@@ -90,7 +90,7 @@ def prepare_arm(
     name: str,
     *,
     difficulty: DifficultyName = "twin",
-    cache: Path | None = None,
+    cache: str | Path | None = None,
     progress: Progress = quiet,
 ) -> Arm:
     """The same of one arm alone: word for word the arm that it is in the scenario's fleet.
@@ -106,7 +106,7 @@ def _arms(
     scenario: Scenario,
     places: Sequence[int],
     difficulty: DifficultyName,
-    cache: Path | None,
+    cache: str | Path | None,
     progress: Progress,
     *,
     every_work: bool,
@@ -117,7 +117,7 @@ def _arms(
         every_work: Refuse a scenario in which some work can be done by none of them.
     """
     choose("difficulty", difficulty, DifficultyName)
-    folder = cache or cache_folder()
+    folder = Path(cache) if cache else cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -297,10 +297,14 @@ def chosen_of(scenario: str | Path | Scenario, overrides: Mapping[str, Any], doo
     Raises:
         ScenarioError: names the nearest of both.
     """
+    if not isinstance(scenario, str | Path | Scenario):
+        raise ScenarioError(f"scenario must be a library name, a .toml file or a Scenario (got {scenario!r}).")
     chosen = scenario if isinstance(scenario, Scenario) else load(scenario)
     fields = [field.name for field in dataclass_fields(Scenario)]
     options = [name for name, taken in signature(door).parameters.items() if taken.kind is Parameter.KEYWORD_ONLY]
     for name in overrides:
+        if name == "seed":
+            raise ScenarioError("make_env() takes no seed: give it to reset(seed=…).")
         if name not in fields:
             allowed = nearest(name, [*fields, *options])
             raise ScenarioError(f"{chosen.name} with overrides: unknown key '{name}'{allowed}")
@@ -314,7 +318,7 @@ def make_env(
     plant: PlantName = "profile",
     bus: BusName = "memory",
     channel: Channel = PERFECT,
-    cache: Path | None = None,
+    cache: str | Path | None = None,
     max_cycles: int | None = None,
     render_mode: str | None = None,
     mask_in: "MaskPlace" = "obs",

@@ -233,10 +233,26 @@ def test_a_name_that_is_neither_field_nor_option_is_told_the_nearest_of_both(cel
             make_batch(cell, 2, difficulty="blind", cache=folder, **{name: value})
 
 
+def test_a_seed_is_told_where_it_belongs(cell, folder) -> None:
+    with pytest.raises(ScenarioError, match=r"make_env\(\) takes no seed: give it to reset\(seed=…\)"):
+        make_env(cell, difficulty="blind", cache=folder, seed=3)
+
+
+def test_a_cache_folder_may_be_a_text(cell, folder) -> None:
+    make_env(cell, difficulty="blind", cache=str(folder)).reset(seed=0)
+    make_batch(cell, 1, difficulty="blind", cache=str(folder)).reset()
+
+
 def test_an_option_of_another_type_is_refused_with_the_type_it_takes(cell, folder) -> None:
     wrong: Any = 0.3
+    none: Any = None
     with pytest.raises(ScenarioError, match=r"channel must be a fleet\.bus\.channel\.Channel \(got 0\.3\)"):
         make_env(cell, difficulty="blind", cache=folder, channel=wrong)
+    with pytest.raises(ScenarioError, match="No difficulty 'None'"):
+        make_env(cell, difficulty=none, cache=folder)
+    for make in (make_env, lambda scenario: make_batch(scenario, 2)):
+        with pytest.raises(ScenarioError, match=r"scenario must be a library name, .+ \(got 0\.3\)"):
+            make(wrong)
     with pytest.raises(ScenarioError, match=r"randomise must be a scenarios\.batch\.Randomisation \(got 0\.3\)"):
         make_batch(cell, 2, difficulty="blind", cache=folder, randomise=wrong)
 
