@@ -218,9 +218,10 @@ def _check_folder(out: Path, card: dict[str, Any], *, resume: bool) -> None:
         raise FleetError(f"'{out}' holds no training to resume.") from None
     if not (out / STATE).is_file():
         raise FleetError(f"The training in '{out}' ended before its first checkpoint: begin anew in another --out.")
-    for name, value in json.loads(json.dumps(card)).items():
-        if before.get(name) != value:
-            raise FleetError(f"The training in '{out}' was of another {name} ({before.get(name)}, now {value}).")
+    was, now = (each | each.get("config", {}) | {"config": None} for each in (before, json.loads(json.dumps(card))))
+    for name, value in now.items():
+        if was.get(name) != value:
+            raise FleetError(f"The training in '{out}' was of another {name} ({was.get(name)}, now {value}).")
 
 
 def _append(path: Path, row: dict[str, Any]) -> None:

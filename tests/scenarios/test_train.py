@@ -51,7 +51,7 @@ def test_a_training_leaves_a_policy_its_log_and_its_curves(tmp_path, cache) -> N
     done, _ = trained(out, cache, iterations=3, resume=True)
     assert done.iterations == 3
     assert done.best >= max(judged)
-    with pytest.raises(FleetError, match="was of another config"):
+    with pytest.raises(FleetError, match=r"was of another gamma \(0\.99, now 0\.9\)"):
         trained(out, cache, iterations=4, resume=True, gamma=0.9)
     (out / STATE).write_bytes(b"rubbish")
     with pytest.raises(FleetError, match="no training to go on from"):
