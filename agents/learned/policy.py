@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 
 from agents.learned.network import Actor, NetworkSize, masked
 from fleet.env.observation import Layout, Observation
@@ -66,7 +66,8 @@ def save_policy(actor: Actor, size: NetworkSize, folder: Path, **told: Any) -> N
     """
     folder.mkdir(parents=True, exist_ok=True)
     draft = folder / f".{WEIGHTS}.{os.getpid()}"
-    save_file({name: value.contiguous() for name, value in actor.state_dict().items()}, draft)
+    # Not save_file, which hides its file from the group and others.
+    draft.write_bytes(save({name: value.contiguous() for name, value in actor.state_dict().items()}))
     draft.replace(folder / WEIGHTS)
     draft = folder / f".{CARD}.{os.getpid()}"
     draft.write_text(json.dumps({"format": FORMAT, "size": asdict(size), **told}, indent=1) + "\n", encoding="utf-8")

@@ -163,6 +163,7 @@ def test_a_policy_is_kept_whole(tmp_path) -> None:
     assert [kept.act(seen) for _ in range(20)] == [fresh.act(seen) for _ in range(20)]
     assert kept.act(seen)["arm_1"] == 0
     assert json.loads((tmp_path / "p" / CARD).read_text())["scenario"] == "x"
+    assert len({path.stat().st_mode for path in (tmp_path / "p").iterdir()}) == 1  # who may read one may read all
 
 
 def test_what_is_no_policy_is_said(tmp_path) -> None:
