@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fleet.env.fields import BLOCK
 from fleet.env.vector import BatchEnv, Library
 
 SHIFT: dict[str, Any] = {"arms": 3, "jobs": 4, "ticks": 22, "ambient_c": 20.0}
@@ -69,6 +70,14 @@ def test_a_row_is_the_same_in_whatever_company_and_order(many, batch, play, who)
     for one, all_rows in zip(trace, many, strict=True):
         for place, e in enumerate(who):
             play.same(row(one, place), row(all_rows, e))
+
+
+def test_a_row_of_a_thousand_is_the_row_alone(library, play) -> None:
+    """Also on either side of what the engine takes at a time."""
+    thousand = played(BatchEnv(library, 1024, seed=SEED), play, list(range(1024)), steps=50)
+    for e in (0, BLOCK - 1, BLOCK, 1023):
+        for one, all_rows in zip(played(BatchEnv(library, 1, seed=SEED + e), play, [e], 50), thousand, strict=True):
+            play.same(row(one, 0), row(all_rows, e))
 
 
 @pytest.mark.parametrize("keep_events", [False, True], ids=["compiled", "plain"])
