@@ -87,13 +87,18 @@ def train(
         FleetError: the folder holds a training and is not to be resumed, or the other way round, or one of another
             scenario or configuration.
     """
-    card = {"scenario": scenario.name, "scenario_hash": scenario_hash(scenario), "config": asdict(config)}
+    card = {
+        "scenario": scenario.name,
+        "scenario_hash": scenario_hash(scenario),
+        "difficulty": difficulty,
+        "config": asdict(config),
+    }
     _check_folder(out, card, resume=resume)
     fleet = prepare(scenario, difficulty=difficulty, cache=cache, progress=progress)
     library = library_of([fleet])
 
     def make_env(envs: int, seed: int) -> TorchRLEnv:
-        return TorchRLEnv(BatchEnv(library, envs, seed=seed, weights=scenario.reward, autoreset=False))
+        return TorchRLEnv(BatchEnv(library, envs, seed=seed, weights=scenario.reward, autoreset=False, stagger=True))
 
     judge = BatchEnv(library, plan.validation_envs, weights=scenario.reward)
     trainer = Trainer(make_env, judge.layout, config)
@@ -104,6 +109,8 @@ def train(
         imitate(trainer.actor, judge.layout, _shown(teacher, config.warm_start, progress), rng)
     if resume:
         best = trainer.load(out / STATE)["best"]
+        if plan.iterations is not None and trainer.done >= plan.iterations:
+            raise FleetError(f"The training in '{out}' has {trainer.done} iterations: --iterations must be more.")
     out.mkdir(parents=True, exist_ok=True)
     (out / "training.json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
     began_s, interrupted = time.monotonic(), False
@@ -122,7 +129,7 @@ def train(
         _append(out / LOG, {"iteration": told.number, "validation_reward": reward})
         tell(f"Iteration {told.number}: {reward:.1f} a shift on the validation seeds, {best:.1f} the best so far.")
 
-    told = None
+    told, looked = None, 0
     try:
         for told in trainer.iterate():
             _append(out / LOG, asdict(told))
@@ -131,13 +138,15 @@ def train(
             progress(f"iteration {told.number}, best {best:.1f}", min(share, 1.0))
             if told.number % plan.validate_every == 0 or share >= 1.0:
                 look(told)
+                looked = told.number
             if share >= 1.0:
                 break
     except KeyboardInterrupt:
         interrupted = True
         if told is None:
             raise
-        look(told)
+        if looked < told.number:
+            look(told)
     draw_curves(out)
     return Trained(trainer.done, trainer.env_steps, best, time.monotonic() - began_s, interrupted)
 

@@ -16,7 +16,8 @@ from agents.learned.network import Actor, NetworkSize, masked
 from fleet.env.observation import Layout, Observation
 from fleet.errors import CheckpointError
 
-FORMAT = 1
+FORMAT = 2
+"""Raised when the network or what it is fed changes."""
 WEIGHTS, CARD = "policy.safetensors", "policy.json"
 
 

@@ -66,13 +66,13 @@ class PpoConfig:
             raise ValueError(f"algorithm must be one of {', '.join(get_args(Algorithm))} (got {self.algorithm!r}).")
         for name in ("envs", "steps", "epochs", "minibatch"):
             if getattr(self, name) < 1:
-                raise ValueError(f"PpoConfig.{name} must be >= 1 (got {getattr(self, name)}).")
+                raise ValueError(f"{name} must be >= 1 (got {getattr(self, name)}).")
         for name in ("learning_rate", "clip", "max_gradient", "reward_scale"):
             if not getattr(self, name) > 0:
-                raise ValueError(f"PpoConfig.{name} must be > 0 (got {getattr(self, name)}).")
+                raise ValueError(f"{name} must be > 0 (got {getattr(self, name)}).")
         for name in ("gamma", "lmbda"):
             if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"PpoConfig.{name} must be in (0, 1] (got {getattr(self, name)}).")
+                raise ValueError(f"{name} must be in (0, 1] (got {getattr(self, name)}).")
 
 
 @dataclass(frozen=True)

@@ -430,7 +430,7 @@ def test_the_monitor_in_javascript_shows_the_fleet(router, arm):
         arm.happens(7)
         command = ["node", str(ROOT / "examples" / "monitor.mjs"), address, "3"]
         node = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | {"NO_COLOR": "1"})
-        until(lambda: node.poll() is not None, lambda: arm.state(1))
+        until(lambda: node.poll() is not None, lambda: (arm.state(1), arm.difficulty()))
         told, _ = node.communicate(timeout=PATIENCE_S)
     assert node.returncode == 0
     assert re.search(r"a/1 .*idle.*41\.5.*2 .*18\.5", told)
