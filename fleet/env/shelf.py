@@ -9,9 +9,16 @@ import numpy as np
 
 Array = np.ndarray
 
-_ALONE = 3
-"""References to an array that only the shelf knows, as seen from inside its search: the shelf's, the name's, the
-call's. Whoever looks at an array, or at a part of it, holds one more."""
+
+def _references(arrays: list[Array], place: int) -> int:
+    """References to an array of a list, as this function sees them."""
+    array = arrays[place]
+    return sys.getrefcount(array)
+
+
+_ALONE = _references([np.empty(0)], 0)
+"""Of an array that only the list knows: measured, for interpreters count differently. Whoever looks at an array, or at
+a part of it, holds one more."""
 
 
 class Shelf:
@@ -27,9 +34,9 @@ class Shelf:
 
     def take(self) -> Array:
         """An array that nobody else has."""
-        for array in self._arrays:
-            if sys.getrefcount(array) == _ALONE:
-                return array
+        for place in range(len(self._arrays)):
+            if _references(self._arrays, place) == _ALONE:
+                return self._arrays[place]
         array = np.empty(self._shape, self._dtype)
         if len(self._arrays) < self._keep:
             self._arrays.append(array)
