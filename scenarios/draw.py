@@ -181,9 +181,25 @@ class QuickSource:
         self._keys = np.array([[0, i] for i in range(len(streams))], dtype=int).reshape(-1, 2)
         """A shift's first child is its jobs', and the children of that are the streams'."""
         self._generator = np.random.Generator(np.random.PCG64(0))
+        self._alike = True
+        """Whether this NumPy draws as the one this was written for."""
+        self._alike = all(self._agrees(np.random.SeedSequence(seed)) for seed in range(2))
+
+    def _agrees(self, seed: np.random.SeedSequence) -> bool:
+        one, other = self.draw(seed), self._slow(seed, 1.0)
+        return all(np.array_equal(value, getattr(other, name)) for name, value in vars(one).items())
+
+    def _slow(self, seed: np.random.SeedSequence, often: float) -> QuickJobs:
+        """With NumPy's own generators."""
+        slow = self._source.draw(np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 0)), often)
+        return QuickJobs(
+            slow.stream, slow.payload, slow.repetitions - self._lowest[slow.stream], slow.release_s, slow.after
+        )
 
     def draw(self, seed: np.random.SeedSequence, often: float = 1.0) -> QuickJobs:
         """The jobs of the shift of a seed: those that `JobSource` draws from its first child."""
+        if not self._alike:
+            return self._slow(seed, often)
         states = children_of(seed, self._keys)
         generator, bits = self._generator, self._generator.bit_generator
         arriving = self._arrivals if often == 1.0 else [oftener(each, often) for each in self._arrivals]
@@ -213,12 +229,7 @@ class QuickSource:
         done = lay_out(
             counts, words, begins, times_s, window_s, self._spans, rank, self._after, release_s, stream, chosen, after
         )
-        if done:
-            return QuickJobs(stream, chosen[:, 0], chosen[:, 1], release_s, after)
-        slow = self._source.draw(np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 0)), often)
-        return QuickJobs(
-            slow.stream, slow.payload, slow.repetitions - self._lowest[slow.stream], slow.release_s, slow.after
-        )
+        return QuickJobs(stream, chosen[:, 0], chosen[:, 1], release_s, after) if done else self._slow(seed, often)
 
 
 def children_of(seed: np.random.SeedSequence, keys: Array) -> list[list[int]]:

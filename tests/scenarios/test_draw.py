@@ -64,3 +64,12 @@ def test_a_shift_without_jobs_is_drawn() -> None:
     never = ArrivalSpec(kind="trace", times_s=())
     empty = replace(scenario, jobs=tuple(replace(stream, arrivals=never) for stream in scenario.jobs))
     assert len(QuickSource(empty).draw(np.random.SeedSequence(1)).stream) == 0
+
+
+def test_another_numpy_is_noticed_and_done_without(monkeypatch) -> None:
+    scenario, seed = load("quickstart"), np.random.SeedSequence(5)
+    expected = QuickSource(scenario).draw(seed)
+    monkeypatch.setattr("scenarios.draw.pcg64", lambda *words: pcg64(*words[::-1]))  # draws other numbers
+    found = QuickSource(scenario).draw(seed)
+    for name, value in vars(expected).items():
+        np.testing.assert_array_equal(getattr(found, name), value)
