@@ -12,6 +12,7 @@ from fleet.env.engine import Shift
 from fleet.env.vector import BatchEnv, Library
 from fleet.errors import ScenarioError
 from fleet.job import Job
+from fleet.seeds import child
 from fleet.sim.tables import stacked, tables_of
 from scenarios.build import DifficultyName, Fleet, Progress, chosen_of, prepare, quiet, world_of
 from scenarios.draw import QuickSource, children_of
@@ -166,6 +167,6 @@ class _Draw:
 
     def _varied(self, seed: np.random.SeedSequence) -> tuple[int, float, float]:
         """Fleet, warmer air in K, and how many times as often jobs come."""
-        rng = np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 2)))
+        rng = np.random.default_rng(child(seed, 2))
         air_k, often = rng.uniform(*self._randomise.ambient_k), rng.uniform(*self._randomise.arrivals)
         return int(rng.integers(self._lots)), float(air_k), float(often)

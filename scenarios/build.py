@@ -20,6 +20,7 @@ from fleet.job import Job, Work
 from fleet.motion import Plan
 from fleet.motor import Motors, gen3_motors, thermal_data
 from fleet.robot import Robot
+from fleet.seeds import child
 from fleet.sim.kernel import Plant
 from fleet.sim.known_plans import KnownPlans, rest_torque
 from fleet.sim.plants import ProfilePlant
@@ -217,9 +218,7 @@ def _with_oracle(scenario: Scenario, arm: Arm) -> Arm:
 
 def children(seed: np.random.SeedSequence) -> tuple[np.random.SeedSequence, np.random.SeedSequence]:
     """Of the seed of a shift: for its jobs, and for its sensors."""
-    # By hand: SeedSequence.spawn would count, and give others the second time.
-    jobs, sensors = (np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, i)) for i in range(2))
-    return jobs, sensors
+    return child(seed, 0), child(seed, 1)
 
 
 def world_of(fleet: Fleet, jobs: Sequence[Job]) -> tuple[World, tuple[Plan, ...]]:

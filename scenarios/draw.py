@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from fleet.arrivals import Poisson, oftener, release_times
+from fleet.seeds import child
 from fleet.sim.jit import entry
 from scenarios.jobs import JobSource
 from scenarios.scenario import Scenario
@@ -191,7 +192,7 @@ class QuickSource:
 
     def _slow(self, seed: np.random.SeedSequence, often: float) -> QuickJobs:
         """With NumPy's own generators."""
-        slow = self._source.draw(np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 0)), often)
+        slow = self._source.draw(child(seed, 0), often)
         return QuickJobs(
             slow.stream, slow.payload, slow.repetitions - self._lowest[slow.stream], slow.release_s, slow.after
         )

@@ -13,6 +13,7 @@ from fleet.errors import FleetError
 from fleet.motion import Plan
 from fleet.motor import Motors, gen3_motors
 from fleet.robot import JOINTS, Robot, ThermalLimits
+from fleet.seeds import child
 from fleet.sim.exercise import light_jobs, random_jobs
 from fleet.thermal import ThermalModel, ThermalSpread, gen3_network, spread_motors, thermal_model
 from scenarios.cool import cold_peaks
@@ -118,11 +119,8 @@ def make_study(
 
 
 def _children(seed: np.random.SeedSequence, count: int) -> list[np.random.Generator]:
-    """Independent generators. `SeedSequence.spawn` would count its calls, and the second study would differ."""
-    return [
-        np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, i)))
-        for i in range(count)
-    ]
+    """Independent generators."""
+    return [np.random.default_rng(child(seed, i)) for i in range(count)]
 
 
 def _body(robot: Robot, spread: ThermalSpread, rng: np.random.Generator) -> tuple[Motors, ThermalModel]:

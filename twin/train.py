@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from fleet.errors import FleetError
+from fleet.seeds import child
 from twin.forward import split
 from twin.loss import active_units, collapsed, kl, negative_elbo
 from twin.model import LstmVae, TwinConfig, build, one_thread
@@ -227,9 +228,8 @@ def _assess(run: Run, seed: int, restart: int, restart_elbos: tuple[float | None
 
 
 def _child(seed: np.random.SeedSequence, joint: int, restart: int) -> int:
-    """A seed for torch. `SeedSequence.spawn` would count its calls, and the second training would differ."""
-    own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, joint, restart))
-    return int(own.generate_state(1, np.uint64)[0] >> np.uint64(1))
+    """A seed for torch."""
+    return int(child(seed, joint, restart).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
 def _part_of(progress: Callable[[float], None], done: int, runs: int) -> Callable[[float], None]:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fleet.seeds import child
 from fleet.sim.kernel import Plant
 from fleet.sim.state import World
 
@@ -23,7 +24,7 @@ class Episode:
     @property
     def chance(self) -> np.random.SeedSequence:
         """Of what becomes of words on their way."""
-        return np.random.SeedSequence(self.sensors.entropy, spawn_key=(*self.sensors.spawn_key, 0))
+        return child(self.sensors, 0)
 
 
 EpisodeFactory = Callable[[np.random.SeedSequence], Episode]
