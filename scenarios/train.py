@@ -14,6 +14,7 @@ from agents.learned.imitation import imitate
 from agents.learned.policy import CARD, save_policy
 from agents.learned.ppo import Iteration, PpoConfig, Trainer
 from agents.policy import Policy
+from fleet.drafts import drafted
 from fleet.env.adapters.torchrl import TorchRLEnv
 from fleet.env.vector import BatchEnv, Obs
 from fleet.errors import FleetError
@@ -210,9 +211,8 @@ def draw_curves(folder: Path) -> None:
     bottom.legend(frameon=False)
     for axes in (top, bottom):
         axes.grid(alpha=0.3)
-    draft = folder / f".{CURVE}"
-    figure.savefig(draft, dpi=120, format="png")
-    draft.replace(folder / CURVE)
+    with drafted(folder / CURVE) as draft:
+        figure.savefig(draft, dpi=120, format="png")
 
 
 def _check_folder(out: Path, card: dict[str, Any], *, resume: bool) -> None:

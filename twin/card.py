@@ -1,11 +1,11 @@
 """The readable part of what is kept: one JSON card of a known format, written whole and refused by name."""
 
-import os
 from pathlib import Path
 from typing import TypeVar
 
 import msgspec
 
+from fleet.drafts import drafted
 from fleet.errors import CheckpointError
 
 Card = TypeVar("Card")
@@ -19,9 +19,8 @@ class _Head(msgspec.Struct):
 
 def write_card(card: msgspec.Struct, path: Path) -> None:
     """Write a card into an existing folder. It appears whole or not at all."""
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
-    unfinished.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=2))
-    unfinished.replace(path)
+    with drafted(path) as draft:
+        draft.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=2))
 
 
 def read_card(path: Path, kind: type[Card], *, format_: int, what: str) -> Card:

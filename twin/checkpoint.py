@@ -1,6 +1,5 @@
 """A twin in a folder: `weights.safetensors` and `twin.json`, readable without running anybody's code."""
 
-import os
 from pathlib import Path
 
 import msgspec
@@ -9,6 +8,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
+from fleet.drafts import drafted
 from fleet.errors import CheckpointError
 from fleet.robot import JOINTS
 from twin.card import check_version, read_card, write_card
@@ -58,12 +58,11 @@ def save(twin: Twin, folder: Path) -> None:
         fits=list(twin.fits),
         calibrated=twin.calibration is not None,
     )
-    unfinished = folder / f".{WEIGHTS}.{os.getpid()}"
     tensors = twin.tensors()
     if twin.calibration is not None:
         tensors[REFERENCE] = torch.from_numpy(np.array(twin.calibration.reference.packed, dtype=float))
-    save_file(tensors, unfinished)
-    unfinished.replace(folder / WEIGHTS)
+    with drafted(folder / WEIGHTS) as draft:
+        save_file(tensors, draft)
     write_card(card, folder / CARD)
 
 

@@ -1,7 +1,6 @@
 """A trained policy: the shared actor as a `Policy`, and how it is kept (safetensors and JSON)."""
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -13,6 +12,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 
 from agents.learned.network import Actor, NetworkSize, masked
+from fleet.drafts import drafted
 from fleet.env.observation import Layout, Observation
 from fleet.errors import CheckpointError
 
@@ -66,13 +66,12 @@ def save_policy(actor: Actor, size: NetworkSize, folder: Path, **told: Any) -> N
         told: What the card shall say besides: scenario, algorithm, steps.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    draft = folder / f".{WEIGHTS}.{os.getpid()}"
-    # Not save_file, which hides its file from the group and others.
-    draft.write_bytes(save({name: value.contiguous() for name, value in actor.state_dict().items()}))
-    draft.replace(folder / WEIGHTS)
-    draft = folder / f".{CARD}.{os.getpid()}"
-    draft.write_text(json.dumps({"format": FORMAT, "size": asdict(size), **told}, indent=1) + "\n", encoding="utf-8")
-    draft.replace(folder / CARD)
+    with drafted(folder / WEIGHTS) as draft:
+        # Not save_file, which hides its file from the group and others.
+        draft.write_bytes(save({name: value.contiguous() for name, value in actor.state_dict().items()}))
+    card = {"format": FORMAT, "size": asdict(size), **told}
+    with drafted(folder / CARD) as draft:
+        draft.write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
 
 
 def load_policy(folder: Path) -> LearnedPolicy:

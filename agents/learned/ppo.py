@@ -5,7 +5,6 @@ whole fleet (MAPPO, Yu et al., NeurIPS 2022) or of each arm by itself (IPPO, de 
 moments at which an arm has a choice train the actor: an arm at work can only go on.
 """
 
-import os
 import pickle
 import zipfile
 from collections.abc import Callable, Iterator
@@ -26,6 +25,7 @@ from torchrl.objectives.value.functional import vec_generalized_advantage_estima
 
 from agents.learned.network import Actor, Critic, NetworkSize, masked
 from agents.learned.policy import draw
+from fleet.drafts import drafted
 from fleet.env.observation import Layout
 from fleet.errors import CheckpointError
 
@@ -227,15 +227,9 @@ class Trainer:
         following = torch.cat([values[:, 1:], last], dim=1)  # what comes after an end does not count
         done = seen["next", "done"].expand(*values.shape)
         reward = seen["next", "arms", "reward"][..., 0] * self.config.reward_scale
-        found = [
-            vec_generalized_advantage_estimate(
-                self.config.gamma, self.config.lmbda,
-                *(part[..., a, None].contiguous() for part in (values, following, reward, done, done)),
-            )
-            for a in range(values.shape[-1])
-        ]  # fmt: skip
-        advantage, target = (torch.cat([each[i] for each in found], dim=-1) for i in range(2))
-        return advantage, target
+        return vec_generalized_advantage_estimate(
+            self.config.gamma, self.config.lmbda, values, following, reward, done, done
+        )
 
     def act(self, vectors: np.ndarray, mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Draws of the actor as it is now, int [...], at vectors float32 [..., size] and masks."""
@@ -246,9 +240,8 @@ class Trainer:
 
     def save(self, path: Path, **told: float) -> None:
         """Write all that goes on when training is resumed, and some numbers; the file appears whole or not at all."""
-        draft = path.with_name(f".{path.name}.{os.getpid()}")
-        torch.save({"trainer": self.state(), **told}, draft)
-        draft.replace(path)
+        with drafted(path) as draft:
+            torch.save({"trainer": self.state(), **told}, draft)
 
     def load(self, path: Path) -> dict[str, Any]:
         """Go on from what `save` wrote; returns the numbers.
