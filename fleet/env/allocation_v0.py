@@ -19,7 +19,6 @@ from fleet.env.arguments import at_least_one, seed_of
 from fleet.env.episode import Episode as Episode
 from fleet.env.episode import EpisodeFactory as EpisodeFactory
 from fleet.env.observation import Layout, Observation
-from fleet.env.picture import draw
 from fleet.env.plain import PlainShift
 from fleet.env.reward import TERMS, RewardWeights
 from fleet.env.scene import Cell
@@ -237,6 +236,8 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         shift, world = self._begun("render()"), self.world
         if self.render_mode == "ansi":
             return _table(world, shift.state)
+        from fleet.env.picture import draw  # loads Pillow, which few episodes have a use for
+
         frame = draw(world, shift.state, self._cell)
         if self._window is None:
             return frame

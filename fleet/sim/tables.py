@@ -141,11 +141,6 @@ class Offer(NamedTuple):
     """Where in its row the queue begins, int [env]."""
 
 
-def rows_of(state: State) -> Rows:
-    """The arrays of a state themselves."""
-    return Rows(**vars(state))
-
-
 def state_of(rows: Rows, first: int, last: int) -> State:
     """A state of some envs, in arrays of its own."""
     return State(**{name: values[first:last].copy() for name, values in rows._asdict().items()})
