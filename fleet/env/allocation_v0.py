@@ -5,7 +5,7 @@ whole episode. Every decision interval each answers Discrete(slots + 1): 0 waits
 claims the job in slot k. Two claims for one job or station: the lower shared difficulty wins, then the lower index.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
@@ -15,7 +15,7 @@ from pettingzoo.utils import parallel_to_aec, wrappers
 
 from fleet.bus.exchange import Exchange
 from fleet.bus.memory import MemoryExchange
-from fleet.env.arguments import at_least_one, seed_of
+from fleet.env.arguments import actions_of, agent_of, at_least_one, seed_of
 from fleet.env.episode import Episode as Episode
 from fleet.env.episode import EpisodeFactory as EpisodeFactory
 from fleet.env.observation import Layout, Observation
@@ -36,7 +36,6 @@ Array = np.ndarray
 VERSION = "allocation_v0"
 MaskPlace = Literal["obs", "info", "both"]
 RENDER_MODES = ("ansi", "rgb_array", "human")
-_LARGEST = 2**62
 FRAMES_PER_S = 10
 """Of a rendered episode, in decision intervals per second."""
 
@@ -192,17 +191,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         shift = self._begun("step()")
         if not self.agents:
             raise RuntimeError("The episode is over: call reset() before step().")
-        if not isinstance(actions, Mapping):
-            raise ValueError(f"step() takes a dictionary of agents and their actions (got {actions!r}).")
-        arms = self.possible_agents
-        chosen = np.zeros(len(arms), dtype=np.int64)
-        found = 0
-        for a, arm in enumerate(arms):
-            if arm in actions:
-                chosen[a] = _integer(arm, actions[arm])
-                found += 1
-        if found < len(actions):
-            self._known(next(iter(sorted(set(actions) - set(arms), key=str))))
+        arms, chosen = self.possible_agents, actions_of(self.possible_agents, actions)
         parts, finished = shift.step(chosen)
         last_tick = min(self.world.ticks, self._max_cycles or self.world.ticks)
         over = not finished and shift.tick >= last_tick
@@ -268,9 +257,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         return self._shift
 
     def _known(self, agent: str) -> str:
-        if agent not in self.possible_agents:
-            raise ValueError(f"No agent '{agent}' in this fleet. Agents: {', '.join(self.possible_agents)}.")
-        return agent
+        return agent_of(self.possible_agents, agent)
 
     def _observations(self) -> tuple[dict[str, Any], Array]:
         """Observations by agent, and the masks [arm, slot + 1]; all in arrays of their own."""
@@ -310,15 +297,6 @@ def _table(world: World, state: State) -> str:
         temps = " ".join(f"{t:5.1f}" for t in state.temp_c[0, a, WINDING])
         rows.append(f"{arm:>10}  {MODES[state.mode[0, a]]:<8} {name:<20} {temps}")
     return "\n".join(rows)
-
-
-def _integer(arm: str, action: Any) -> int:
-    if type(action) is int and abs(action) <= _LARGEST:
-        return action
-    value = np.asarray(action)
-    if value.size != 1 or not np.issubdtype(value.dtype, np.integer):
-        raise ValueError(f"The action of '{arm}' must be one integer (got {action!r}).")
-    return int(value.reshape(()))
 
 
 def parallel_env(make_episode: EpisodeFactory, **options: Any) -> AllocationEnv:

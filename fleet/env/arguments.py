@@ -1,8 +1,11 @@
-"""Seeds and counts as callers give them, checked alike by the single environment and the batch."""
+"""Seeds, counts and actions as callers give them, checked alike wherever they are given."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+
+_LARGEST = 2**62
 
 
 def seed_of(seed: Any) -> np.random.SeedSequence:
@@ -40,6 +43,45 @@ def at_least_one(name: str, value: Any) -> int:
     if not _whole(value) or value < 1:
         raise ValueError(f"{name} must be an integer >= 1 (got {value!r}).")
     return int(value)
+
+
+def actions_of(agents: Sequence[str], actions: Any) -> np.ndarray:
+    """What each agent does, int64 [agent]; one that is left out waits.
+
+    Raises:
+        ValueError: no dictionary, an action that is no integer, or one of an agent that is not there.
+    """
+    if not isinstance(actions, Mapping):
+        raise ValueError(f"step() takes a dictionary of agents and their actions (got {actions!r}).")
+    chosen = np.zeros(len(agents), dtype=np.int64)
+    found = 0
+    for a, agent in enumerate(agents):
+        if agent in actions:
+            chosen[a] = _integer(agent, actions[agent])
+            found += 1
+    if found < len(actions):
+        agent_of(agents, next(iter(sorted(set(actions) - set(agents), key=str))))
+    return chosen
+
+
+def agent_of(agents: Sequence[str], agent: Any) -> Any:
+    """An agent that is there.
+
+    Raises:
+        ValueError: it is not; names those that are.
+    """
+    if agent not in agents:
+        raise ValueError(f"No agent '{agent}' in this fleet. Agents: {', '.join(agents)}.")
+    return agent
+
+
+def _integer(agent: str, action: Any) -> int:
+    if type(action) is int and abs(action) <= _LARGEST:
+        return action
+    value = np.asarray(action)
+    if value.size != 1 or not np.issubdtype(value.dtype, np.integer):
+        raise ValueError(f"The action of '{agent}' must be one integer (got {action!r}).")
+    return int(value.reshape(()))
 
 
 def _whole(value: Any) -> bool:
