@@ -1,13 +1,13 @@
 """Between the threads that receive and the one that reads: a queue to wait on, and what was last said by whom."""
 
 import math
-import time
 from collections import deque
 from contextlib import suppress
-from queue import Empty, SimpleQueue
+from queue import Empty
 from typing import Generic, TypeVar
 
 from fleet.bus.exchange import Condition, Scores
+from fleet.bus.mailbox import Mailbox
 
 Content = TypeVar("Content", Condition, Scores)
 Item = TypeVar("Item")
@@ -48,7 +48,7 @@ class Inbox(Generic[Item]):
         self._samples: deque[Item] = deque(maxlen=limit)
         self._limit = limit
         self._wanted = math.inf
-        self._enough: SimpleQueue[None] = SimpleQueue()
+        self._enough: Mailbox[None] = Mailbox()
 
     def hear(self, sample: Item) -> None:
         """Take a sample; called by receiving threads."""
@@ -62,7 +62,7 @@ class Inbox(Generic[Item]):
         self._wanted = min(count, self._limit)
         if len(self._samples) < self._wanted:
             with suppress(Empty):
-                self._enough.get(timeout=max(0.0, deadline_s - time.monotonic()))
+                self._enough.get(deadline_s)
         self._wanted = math.inf
 
     def take(self) -> list[Item]:

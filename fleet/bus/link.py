@@ -12,7 +12,7 @@ import weakref
 from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from queue import Empty, SimpleQueue
+from queue import Empty
 from threading import Lock
 from typing import Any, Protocol, Self, TypeVar
 
@@ -22,6 +22,7 @@ from zenoh import ext as advanced
 
 from fleet.bus import keys
 from fleet.bus.answers import Answers, by
+from fleet.bus.mailbox import Mailbox
 from fleet.bus.messages import MalformedMessage, Refusal, encode, encoding, read_as, spoken_by
 from fleet.bus.permission import participant_at, rights_by_role
 from fleet.bus.roster import Participant
@@ -72,7 +73,7 @@ class Link:
         self.complaints: deque[str] = deque(maxlen=8)
         self.overrun = 0
         self._endpoint, self._timeout_s = endpoint, timeout_s
-        self._waiting: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._waiting: Mailbox[Callable[[], None]] = Mailbox()
         self._backlog = backlog
         self._overrunning = Lock()
         self._session: zenoh.Session | None = None
@@ -101,7 +102,7 @@ class Link:
         except zenoh.ZError as error:
             raise BusError(f"The line to {self._endpoint} did not close in order: {error}") from error
         finally:
-            self._waiting = SimpleQueue()
+            self._waiting = Mailbox()
 
     def __enter__(self) -> Self:
         return self.open()
@@ -116,16 +117,15 @@ class Link:
 
         Returns at the first pause after something was handled, or when time is up.
         """
-        wait_s = until_s - time.monotonic()
         try:
-            handle = self._waiting.get(timeout=wait_s) if wait_s > 0 else self._waiting.get_nowait()
+            handle = self._waiting.get(until_s)
         except Empty:
             return 0
         handle()
         handled = 1
-        for _ in range(self._waiting.qsize()):
+        for _ in range(len(self._waiting)):
             try:
-                handle = self._waiting.get_nowait()
+                handle = self._waiting.get()
             except Empty:  # the oldest went to make room
                 break
             handle()
@@ -134,9 +134,9 @@ class Link:
 
     def post(self, handle: Callable[[], None]) -> None:
         """Have something handled by `serve`; any thread may call this."""
-        if self._waiting.qsize() >= self._backlog:
+        if len(self._waiting) >= self._backlog:
             with self._overrunning, suppress(Empty):
-                self._waiting.get_nowait()
+                self._waiting.get()
                 self.overrun += 1
                 if self.overrun == 1 or self.overrun % 1000 == 0:
                     _LOG.warning("%d message(s) lost: they came faster than they were handled.", self.overrun)

@@ -10,9 +10,10 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from queue import Empty, SimpleQueue
+from queue import Empty
 from typing import IO
 
+from fleet.bus.mailbox import Mailbox
 from fleet.errors import FleetError
 
 _LOG = logging.getLogger(__name__)
@@ -81,7 +82,7 @@ class Supervisor:
         self.folder = folder
         self._backoff, self._patience_s = backoff or Backoff(), patience_s
         self._parts: dict[str, _Running] = {}
-        self._ended: SimpleQueue[str] = SimpleQueue()
+        self._ended: Mailbox[str] = Mailbox()
 
     def start(self, part: Part, *, ready_s: float | None = None) -> None:
         """Start a part and, if asked, wait until it says that it is ready.
@@ -162,7 +163,7 @@ class Supervisor:
                 self._launch(running)
                 running.restarts += 1
         try:
-            name = self._ended.get(timeout=wait_s) if wait_s else self._ended.get_nowait()
+            name = self._ended.get(now_s + wait_s)
         except Empty:
             return ""
         return name if self._note_end(self._parts[name]) else ""
