@@ -26,7 +26,7 @@ from fleet.bus.mailbox import Mailbox
 from fleet.bus.messages import MalformedMessage, Refusal, encode, encoding, read_as, spoken_by
 from fleet.bus.permission import participant_at, rights_by_role
 from fleet.bus.roster import Participant
-from fleet.bus.router import open_client
+from fleet.bus.router import first_words, open_client
 from fleet.errors import BusError
 
 _LOG = logging.getLogger(__name__)
@@ -100,7 +100,7 @@ class Link:
         try:
             self._resources.close()
         except zenoh.ZError as error:
-            raise BusError(f"The line to {self._endpoint} did not close in order: {error}") from error
+            raise BusError(f"The line to {self._endpoint} did not close in order: {first_words(error)}.") from error
         finally:
             self._waiting = Mailbox()
 

@@ -37,6 +37,8 @@ _ACCEPTING: Mapping[str, Any] = {
     # Lines that were begun and never opened keep new ones out when there are too many of them (by default 100, 10 s).
     "accept_pending": 1000,
     "accept_timeout": 3000,
+    # A session that closes waits for a line that it is just opening, with a router that stands still for so long.
+    "open_timeout": 3000,
 }
 _SENDING: Mapping[str, Any] = {
     "lease": LEASE_MS,
@@ -121,7 +123,7 @@ def open_client(endpoint: str, *, timeout_s: float, tls: Tls | None = None) -> z
     try:
         return zenoh.open(_config({"mode": "client", "connect": connect}, link))
     except zenoh.ZError as error:
-        reason = why_not(*_address(endpoint), tls) or _first(error)
+        reason = why_not(*_address(endpoint), tls) or first_words(error)
         raise BusError(f"No router answered at {endpoint} within {timeout_s} s ({reason}).") from error
 
 
@@ -189,7 +191,7 @@ class Router:
                     if self._port
                     else f"a free port of {self._host}."
                 )
-                problem = BusError(f"The router could not listen on {where} ({_first(error)})")
+                problem = BusError(f"The router could not listen on {where} ({first_words(error)})")
                 problem.__cause__ = error
                 continue
             try:
@@ -215,7 +217,7 @@ class Router:
         try:
             session.close()
         except zenoh.ZError as error:
-            raise BusError(f"The router did not close in order ({_first(error)}).") from error
+            raise BusError(f"The router did not close in order ({first_words(error)}).") from error
 
     def __enter__(self) -> Self:
         return self.open()
@@ -262,6 +264,6 @@ def _address(endpoint: str) -> tuple[str, int]:
     return host.strip("[]"), int(port)
 
 
-def _first(error: zenoh.ZError) -> str:
+def first_words(error: zenoh.ZError) -> str:
     """What Zenoh says, without the places in its source that it names."""
     return re.split(r" at /|\.? \[", str(error))[0]

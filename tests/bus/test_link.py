@@ -1,6 +1,7 @@
 """A line to the bus over a real router: what is said arrives, what is asked is answered, and rubbish harms nobody."""
 
 import json
+import socket
 import threading
 import time
 from contextlib import ExitStack
@@ -178,3 +179,17 @@ def test_a_closed_line_says_so(bus):
     link.close()
     with pytest.raises(BusError, match="not open"):
         link.say(keys.of_arm("f", "a", "event"), ArmEvent(arm="a", number=0, time_s=0.0, kind="finish"))
+
+
+def test_a_line_closes_soon_though_a_router_that_stands_still_has_taken_its_call():
+    """In place of the router is somebody who accepts and never says a word; Zenoh itself would wait for ten seconds."""
+    router = Router().open()
+    port = int(router.endpoint.rpartition(":")[2])
+    line = Link(router.endpoint, "f").open()
+    router.close()
+    with socket.create_server(("127.0.0.1", port)) as silent:
+        silent.settimeout(PATIENCE_S)
+        with silent.accept()[0]:
+            begun_s = time.monotonic()
+            line.close()
+            assert time.monotonic() - begun_s < 5.0
