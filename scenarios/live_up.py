@@ -55,14 +55,16 @@ def parts_of(
     router = Part(name="router", argv=(*PROGRAM, "router", "--port", str(port), *secure), ready=address)
     scored = ("--difficulty", difficulty, "--seed", str(seed))
     arms = [
-        Part(name=f"arm-{name}", argv=(*PROGRAM, "arm", scenario, name, *reach(name), *of_fleet, *scored))
+        Part(name=f"arm-{name}", argv=(*PROGRAM, "arm", scenario, name, *reach(name), *of_fleet, *scored), rank=2)
         for name in names
     ]
     kept = (*reach("recorder"), "--out", str(folder / "recording"))
-    record = Part(name="record", argv=(*PROGRAM, "record", fleet, *kept))
+    record = Part(name="record", argv=(*PROGRAM, "record", fleet, *kept), rank=1)
     how = ("--rule", rule, "--assignment", assignment, "--jobs", jobs, "--seed", str(seed))
     at = (*reach("auctioneer"), *of_fleet)
-    auction = Part(name="auction", argv=(*PROGRAM, "auction", scenario, *at, *how), essential=jobs == "scenario")
+    auction = Part(
+        name="auction", argv=(*PROGRAM, "auction", scenario, *at, *how), essential=jobs == "scenario", rank=3
+    )
     return router, arms, record, auction
 
 

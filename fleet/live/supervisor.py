@@ -50,6 +50,8 @@ class Part:
     ready: str = READY
     """How the line begins with which it says that it is there."""
     env: Mapping[str, str] = field(default_factory=dict)
+    rank: int = 0
+    """Parts of a higher rank are ended before those of a lower one, parts of one rank at the same time."""
 
 
 @dataclass(eq=False)
@@ -169,20 +171,31 @@ class Supervisor:
         return name if self._note_end(self._parts[name]) else ""
 
     def stop(self) -> None:
-        """End all, the last started first: SIGTERM, and SIGKILL for what does not heed it."""
-        for running in reversed(self._parts.values()):
+        """End all, rank after rank: SIGTERM, and SIGKILL for what does not heed it."""
+        alive: dict[int, list[_Running]] = {}
+        for running in self._parts.values():
             running.over = True
-            process = running.process
-            if process is None or process.poll() is not None:
-                continue
-            process.send_signal(signal.SIGCONT)  # one that stands still hears nothing
+            if running.process is not None and running.process.poll() is None:
+                running.process.send_signal(
+                    signal.SIGCONT
+                )  # one that stands still hears nothing, and others wait for it
+                alive.setdefault(running.part.rank, []).append(running)
+        for rank in sorted(alive, reverse=True):
+            self._end(alive[rank])
+
+    def _end(self, together: list[_Running]) -> None:
+        processes = [(running.part.name, running.process) for running in together if running.process is not None]
+        for _, process in processes:
             process.terminate()
+        deadline_s = time.monotonic() + self._patience_s
+        for name, process in processes:
             try:
-                process.wait(self._patience_s)
+                process.wait(max(0.0, deadline_s - time.monotonic()))
             except subprocess.TimeoutExpired:
-                _LOG.warning("'%s' did not end within %g s and was killed.", running.part.name, self._patience_s)
+                _LOG.warning("'%s' did not end within %g s and was killed.", name, self._patience_s)
                 process.kill()
-                process.wait(self._patience_s)
+        for _, process in processes:
+            process.wait(self._patience_s)
 
     def __enter__(self) -> "Supervisor":
         return self

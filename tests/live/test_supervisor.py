@@ -19,6 +19,24 @@ STUBBORN = f"import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); {STAY
 LOYAL = f"from fleet.live.supervisor import end_with_supervisor; end_with_supervisor(); {STAY}"
 
 
+AFTER = """
+import pathlib, signal, threading
+folder, mine, others = pathlib.Path({folder!r}), {mine!r}, {others!r}
+def end(*_):
+    (folder / mine).touch()
+    for _ in range(1000):
+        if all((folder / other).exists() for other in others):
+            threading.Event().wait(0.2 * len(others))
+            (folder / "order").open("a").write(mine + "\\n")
+            raise SystemExit(0)
+        threading.Event().wait(0.01)
+signal.signal(signal.SIGTERM, end)
+print("ready x", flush=True)
+signal.pause()
+"""
+"""Ends when others were told to end as well."""
+
+
 def part(name, code, **options):
     return Part(name=name, argv=(sys.executable, "-c", code), **options)
 
@@ -88,6 +106,28 @@ def test_what_does_not_heed_or_stands_still_is_ended_all_the_same(tmp_path):
         pids = [supervisor.pid("stubborn"), supervisor.pid("still")]
         os.kill(pids[1], signal.SIGSTOP)
     assert all(gone(pid) for pid in pids)
+
+
+def test_those_of_one_rank_end_together_and_lower_ranks_after_them(tmp_path):
+    """Two wait for each other's end; the low one may be told only when both have ended."""
+    with Supervisor(tmp_path / "logs") as supervisor:
+        for name, others, rank in (("one", ["two"], 1), ("low", [], 0), ("two", ["one"], 1)):
+            code = AFTER.format(folder=str(tmp_path), mine=name, others=others)
+            supervisor.start(part(name, code, rank=rank), ready_s=PATIENCE_S)
+        begun_s = time.monotonic()
+    assert time.monotonic() - begun_s < PATIENCE_S / 4
+    first, second, third = (tmp_path / "order").read_text().split()
+    assert ({first, second}, third) == ({"one", "two"}, "low")
+
+
+def test_many_that_do_not_heed_take_no_longer_than_one(tmp_path):
+    with Supervisor(tmp_path, patience_s=0.5) as supervisor:
+        for number in range(4):
+            supervisor.start(part(f"stubborn {number}", STUBBORN), ready_s=PATIENCE_S)
+        pids = [supervisor.pid(f"stubborn {number}") for number in range(4)]
+        begun_s = time.monotonic()
+    assert all(gone(pid) for pid in pids)
+    assert time.monotonic() - begun_s < 1.5
 
 
 def test_one_that_cannot_begin_says_why(tmp_path):
