@@ -128,6 +128,8 @@ class Consensus:
     are not counted as messages. With everybody in earshot the claims are those of `least_difficulty`.
     """
 
+    only_choices = True
+
     def __init__(self, trust: Trust | None = None) -> None:
         self._trust = trust or Trust()
 

@@ -15,6 +15,7 @@ class Wspt:
     1956); a strong rule on several unlike ones. It looks at no temperature.
     """
 
+    only_choices = True
     most_p = 1.0
     """No claim above this probability to pass the warning limit."""
 
@@ -45,4 +46,5 @@ class WsptCool(Wspt):
     It rests rather than run hot; work that nobody could do coolly waits until somebody can, or for ever.
     """
 
+    only_choices = True
     most_p = 0.5

@@ -18,6 +18,8 @@ from fleet.errors import nearest
 class RandomLegal:
     """Every free arm claims a random legal job."""
 
+    only_choices = True
+
     def __init__(self) -> None:
         self._rng = np.random.default_rng(0)
 
@@ -36,6 +38,8 @@ class RandomLegal:
 
 class RoundRobin:
     """The oldest job goes to the next arm in turn that is free and able."""
+
+    only_choices = True
 
     def __init__(self) -> None:
         self._turn = 0
@@ -61,6 +65,8 @@ class RoundRobin:
 class CoolestFirst:
     """The oldest job goes to the free arm with most headroom."""
 
+    only_choices = True
+
     def reset(self, rng: np.random.Generator) -> None:
         """Nothing to begin."""
 
@@ -85,6 +91,8 @@ class LeastDifficulty:
     middle. Where nobody has a score, free arms take the oldest jobs in the fleet's order. What a peer told a while ago
     counts for less, and a peer not heard for long is not left anything, as `agents.hearsay` has it.
     """
+
+    only_choices = True
 
     def __init__(self, trust: Trust | None = None) -> None:
         self._trust = trust or Trust()

@@ -7,13 +7,12 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
 from agents.rules import RULES
 from fleet.errors import FleetError
 from scenarios.load import load
-from scenarios.policies import label, policy_of
+from scenarios.policies import label, policy_at, policy_of
 from scenarios.terminal import Progress, out_console, progress_bar, say
 
 if TYPE_CHECKING:
@@ -121,8 +120,7 @@ def _frames(
 
 def _shift(env: "AllocationEnv", policy: str, seed: int) -> Iterator[int]:
     """Work the shift that `thermofleet run` works with this seed; decisions made, after the reset and every step."""
-    chosen = policy_of(policy)
-    chosen.reset(np.random.default_rng(np.random.SeedSequence([seed, 1]).spawn(2)[0]))
+    chosen = policy_at(policy, seed)
     env.reset(seed=seed)
     yield 0
     for decisions in count(1):

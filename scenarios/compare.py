@@ -1,6 +1,7 @@
 """Several policies on the same seeds: the seed is the unit of replication, differences are paired."""
 
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -17,23 +18,18 @@ from fleet.bus.channel import PERFECT, Channel
 from fleet.errors import FleetError
 from scenarios.build import DifficultyName, Fleet, Progress, cache_folder, prepare, quiet
 from scenarios.policies import label, policy_of
-from scenarios.run import RunResult, RunSpec, run
+from scenarios.replicate import FIGURES, Outcome, outcomes
 from scenarios.scenario import Scenario
 
 Array = np.ndarray
+Part = tuple[str, Sequence[int]]
+"""A policy, and some of the seeds."""
 
 RESAMPLES = 2000
-FIGURES: dict[str, Callable[[RunResult], float]] = {
-    "reward": lambda r: r.total_reward,
-    "value": lambda r: r.metrics.value,
-    "finished": lambda r: r.metrics.finished,
-    "on_time": lambda r: r.metrics.on_time,
-    "faults": lambda r: r.metrics.faults,
-    "above_warning_min": lambda r: r.metrics.above_warning_min,
-    "peak_c": lambda r: max(r.metrics.peak_c.values()),
-    "availability": lambda r: r.metrics.availability,
-}
-"""What is compared, by name."""
+TOGETHER = 16
+"""So many shifts of a policy are worked at a time, where they are stepped side by side."""
+HERE_S = 5.0
+"""About as long as it takes a worker to begin: what can be done meanwhile is done without any."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +78,8 @@ def compare(
 
     Args:
         channel: What becomes of the arms' words on the way, the same for every policy.
-        workers: Processes, -1 for one per core; the result does not depend on it.
+        workers: Processes, if there is work for more than some seconds; -1 for one per core. The result does not
+            depend on it.
 
     Raises:
         FleetError: unknown policy, one named twice, or a baseline that is not among the policies.
@@ -95,15 +92,14 @@ def compare(
     if baseline not in policies:
         raise FleetError(f"The baseline '{baseline}' is not among the policies compared: {', '.join(policies)}.")
     folder = cache_dir or cache_folder()  # named here: a worker may have been started under another one
-    prepare(scenario, difficulty=difficulty, cache=folder, progress=progress)  # into the cache, for all workers
-    cells = [(policy, seed) for policy in policies for seed in seeds]
-    found: list[dict[str, float]] = []
-    with Parallel(n_jobs=workers, return_as="generator") as pool:
-        for done in pool(delayed(_cell)(scenario, difficulty, channel, folder, *cell) for cell in cells):
-            assert done is not None
-            found.append(done)
-            progress("comparing", len(found) / len(cells))
-    by_policy = {p: [m for (q, _), m in zip(cells, found, strict=True) if q == p] for p in policies}
+    fleet = prepare(scenario, difficulty=difficulty, cache=folder, progress=progress)
+    together = TOGETHER if channel.perfect else 1
+    parts = [(policy, seeds[i : i + together]) for policy in policies for i in range(0, len(seeds), together)]
+    by_policy: dict[str, list[Outcome]] = {policy: [] for policy in policies}
+    worked = _worked(fleet, difficulty, channel, folder, parts, workers)
+    for n, ((policy, _), found) in enumerate(zip(parts, worked, strict=True)):
+        by_policy[policy] += found
+        progress("comparing", (n + 1) / len(parts))
     rng = np.random.default_rng(np.random.SeedSequence(0))
     figures = {
         p: {name: _figure(name, rows, by_policy[baseline], rng) for name in FIGURES} for p, rows in by_policy.items()
@@ -111,26 +107,36 @@ def compare(
     return Comparison(scenario.name, tuple(seeds), baseline, figures, channel.described(), channel.text)
 
 
+def _worked(
+    fleet: Fleet, difficulty: DifficultyName, channel: Channel, folder: Path, parts: Sequence[Part], workers: int
+) -> Iterator[list[Outcome]]:
+    """The outcomes of each part in order: of the first seconds here, then of workers, if there is anything left."""
+    began_s, todo = time.monotonic(), list(parts)
+    while todo and (workers == 1 or time.monotonic() - began_s < HERE_S):
+        yield outcomes(fleet, *todo.pop(0), channel)
+    if not todo:
+        return
+    with Parallel(n_jobs=workers, return_as="generator") as pool:
+        for found in pool(delayed(_there)(fleet.scenario, difficulty, folder, *part, channel) for part in todo):
+            assert found is not None
+            yield found
+
+
 @cache
-def _fleet(scenario: Scenario, difficulty: DifficultyName, cache_dir: Path) -> Fleet:
-    return prepare(scenario, difficulty=difficulty, cache=cache_dir)
+def _fleet(scenario: Scenario, difficulty: DifficultyName, folder: Path) -> Fleet:
+    return prepare(scenario, difficulty=difficulty, cache=folder)
 
 
-def _cell(
-    scenario: Scenario, difficulty: DifficultyName, channel: Channel, cache_dir: Path, policy: str, seed: int
-) -> dict[str, float]:
-    """The figures of one policy on one seed."""
-    fleet = _fleet(scenario, difficulty, cache_dir)
-    spec = RunSpec(policy=policy, seed=seed, bus="memory", difficulty=difficulty, channel=channel)
-    result = run(fleet, spec, record=False)
-    return {name: float(of(result)) for name, of in FIGURES.items()}
+def _there(
+    scenario: Scenario, difficulty: DifficultyName, folder: Path, policy: str, seeds: Sequence[int], channel: Channel
+) -> list[Outcome]:
+    """In a worker, which takes the fleet from the cache, once."""
+    return outcomes(_fleet(scenario, difficulty, folder), policy, seeds, channel)
 
 
-def _figure(
-    name: str, rows: Sequence[dict[str, float]], base: Sequence[dict[str, float]], rng: np.random.Generator
-) -> Figure:
-    values = np.array([each[name] for each in rows])
-    paired = values - np.array([each[name] for each in base])
+def _figure(name: str, rows: Sequence[Outcome], base: Sequence[Outcome], rng: np.random.Generator) -> Figure:
+    values = np.array([getattr(each, name) for each in rows], dtype=float)
+    paired = values - np.array([getattr(each, name) for each in base], dtype=float)
     low, high = interval(values, rng)
     d_low, d_high = interval(paired, rng)
     return Figure(

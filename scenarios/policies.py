@@ -7,9 +7,12 @@ import os
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
+
 from agents.policy import Policy
 from agents.rules import RULES, make_policy
 from fleet.errors import FleetError, nearest
+from fleet.seeds import child
 
 
 def policy_of(name: str) -> Policy:
@@ -36,6 +39,17 @@ def policy_of(name: str) -> Policy:
     if not callable(getattr(found, "reset", None)) or not callable(getattr(found, "act", None)):
         raise FleetError(f"'{name}' is no policy: it needs the methods reset(rng) and act(observations).")
     return found()
+
+
+def policy_at(name: str, seed: int) -> Policy:
+    """A fresh policy at the beginning of the shift of a seed, with the chance that is its share of it.
+
+    Raises:
+        FleetError: as `policy_of`.
+    """
+    policy = policy_of(name)
+    policy.reset(np.random.default_rng(child(np.random.SeedSequence([seed, 1]), 0)))
+    return policy
 
 
 def label(name: str) -> str:

@@ -13,11 +13,12 @@ import numpy as np
 from fleet.bus.channel import PERFECT, Channel
 from fleet.events import Event
 from fleet.metrics import Metrics
+from fleet.seeds import child
 from fleet.sim.kernel import Step
 from fleet.telemetry import Telemetry, join
 from scenarios.build import BusName, DifficultyName, Fleet, PlantName, Progress, env_of, quiet
 from scenarios.outcome import metrics_of
-from scenarios.policies import policy_of
+from scenarios.policies import policy_at
 from scenarios.provenance import provenance
 from scenarios.scenario import Scenario
 
@@ -73,10 +74,9 @@ def run(
         record: Keep telemetry; sweeps do without.
         endpoint: Of a Zenoh router on loopback that others listen on too; by default the fleet has its own.
     """
-    policy = policy_of(spec.policy)
-    policy_seed, reading_seed = np.random.SeedSequence([spec.seed, 1]).spawn(2)
-    policy.reset(np.random.default_rng(policy_seed))
-    recorder = _Recorder(fleet.scenario, np.random.default_rng(reading_seed)) if record else None
+    policy = policy_at(spec.policy, spec.seed)
+    readings = child(np.random.SeedSequence([spec.seed, 1]), 1)  # the first child is the policy's
+    recorder = _Recorder(fleet.scenario, np.random.default_rng(readings)) if record else None
     env = env_of(
         fleet,
         plant=spec.plant,

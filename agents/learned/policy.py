@@ -31,6 +31,8 @@ class LearnedPolicy:
         actor: Trained, for a fleet of any size.
     """
 
+    only_choices = True
+
     def __init__(self, actor: Actor) -> None:
         self._actor = actor.eval()
         self._rng = np.random.default_rng(0)

@@ -12,6 +12,7 @@ from agents.learned.imitation import imitate
 from agents.learned.network import Actor, Critic, NetworkSize, masked
 from agents.learned.policy import CARD, WEIGHTS, LearnedPolicy, draw, load_policy, save_policy
 from agents.learned.ppo import PpoConfig, Trainer
+from agents.policy import only_choices
 from fleet.env.adapters.torchrl import TorchRLEnv
 from fleet.env.engine import Shift, shifts_of
 from fleet.env.observation import FIELDS, Layout, Observation
@@ -162,6 +163,10 @@ def test_a_policy_is_kept_whole(tmp_path) -> None:
         policy.reset(np.random.default_rng(0))
     assert [kept.act(seen) for _ in range(20)] == [fresh.act(seen) for _ in range(20)]
     assert kept.act(seen)["arm_1"] == 0
+    assert only_choices(kept)
+    before = kept._rng.bit_generator.state
+    assert kept.act({"arm_1": seen["arm_1"]}) == {"arm_1": 0}
+    assert kept._rng.bit_generator.state == before
     assert json.loads((tmp_path / "p" / CARD).read_text())["scenario"] == "x"
     assert len({path.stat().st_mode for path in (tmp_path / "p").iterdir()}) == 1  # who may read one may read all
 

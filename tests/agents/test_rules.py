@@ -1,5 +1,6 @@
 """The dispatching rules: each does what its name says, and none ever claims what it may not."""
 
+import pickle
 from dataclasses import replace
 from fractions import Fraction
 
@@ -9,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from agents.policy import WAIT, legal_slots
+from agents.policy import WAIT, legal_slots, only_choices
 from agents.rules import RULES, LeastDifficulty, RandomLegal, make_policy
 from fleet.env.allocation_v0 import parallel_env
 from fleet.env.observation import LONG_S, Layout, Observation
@@ -84,6 +85,20 @@ def test_every_rule_is_legal_all_shift_and_gets_work_done(small, name, arms) -> 
 @pytest.mark.parametrize("name", RULES)
 def test_every_rule_waits_where_nothing_is_legal(name) -> None:
     assert act(name, fleet([[1.0, 2.0], [2.0, 1.0]], mask=[[0, 0], [0, 0]])) == [[WAIT, WAIT]]
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_every_rule_need_not_be_asked_where_nothing_is_legal(name) -> None:
+    """It draws and remembers nothing then, as it says of itself."""
+    policy = make_policy(name)
+    policy.reset(rng())
+    policy.act(fleet([[1.0, 2.0], [2.0, 1.0]]))
+    assert only_choices(policy)
+    before = pickle.dumps(policy)
+    assert policy.act(fleet([[1.0, 2.0], [2.0, 1.0]], free=[0, 0])) == {"arm_0": WAIT, "arm_1": WAIT}
+    assert pickle.dumps(policy) == before
+    mine = type("Mine", (type(policy),), {})()
+    assert not only_choices(mine)  # who makes a class of it says so anew
 
 
 @pytest.mark.parametrize("name", RULES)

@@ -166,7 +166,7 @@ class PressingCtrlC:
 
 
 def test_ctrl_c_leaves_nothing(thermofleet, small_toml, tmp_path, monkeypatch):
-    monkeypatch.setattr("scenarios.animate.policy_of", lambda name: PressingCtrlC())
+    monkeypatch.setattr("scenarios.policies.policy_of", lambda name: PressingCtrlC())
     said = thermofleet("animate", small_toml, *QUICK, "--out", tmp_path / "film.gif")
     assert said.code == 130
     assert said.err.startswith("Interrupted while working: nothing was written.")

@@ -110,7 +110,7 @@ def test_ctrl_c_while_working_keeps_what_was_done_and_the_same_command_replaces_
 ):
     out = tmp_path / "run"
     with monkeypatch.context() as patched:
-        patched.setattr("scenarios.run.policy_of", lambda name: PressingCtrlC(step=4, times=1))
+        patched.setattr("scenarios.policies.policy_of", lambda name: PressingCtrlC(step=4, times=1))
         said = thermofleet("run", small_toml, *QUICK, "--out", out)
     assert said.code == 130
     assert "Interrupted after 40 s of 180 s: the shift until then is kept in " in said.err
@@ -123,7 +123,7 @@ def test_ctrl_c_while_working_keeps_what_was_done_and_the_same_command_replaces_
 
 
 def test_a_second_ctrl_c_leaves_nothing(thermofleet, small_toml, tmp_path, monkeypatch):
-    monkeypatch.setattr("scenarios.run.policy_of", lambda name: PressingCtrlC(step=4, times=2))
+    monkeypatch.setattr("scenarios.policies.policy_of", lambda name: PressingCtrlC(step=4, times=2))
     said = thermofleet("run", small_toml, *QUICK, "--out", tmp_path / "run")
     assert said.code == 130
     assert "Interrupted while working: nothing was written." in said.err
@@ -165,14 +165,14 @@ def test_ctrl_c_while_planning_writes_nothing_and_keeps_the_plans(
 def test_a_killed_run_leaves_only_a_folder_with_a_dot(small_toml, tmp_path, plans):
     program = textwrap.dedent("""
         import os, signal, sys
-        import scenarios.run
+        import scenarios.policies
         from scenarios.cli import main
 
         class Killed:
             def reset(self, rng): pass
             def act(self, observations): os.kill(os.getpid(), signal.SIGKILL)
 
-        scenarios.run.policy_of = lambda name: Killed()
+        scenarios.policies.policy_of = lambda name: Killed()
         main(sys.argv[1:])
     """)
     where = tmp_path / "runs"

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from fleet.bus.channel import PERFECT, Channel
 from fleet.errors import FleetError
 from scenarios.compare import FIGURES, Comparison, compare, comparison_table, interval
 from scenarios.load import load
@@ -25,9 +26,21 @@ def compared(scenario: Scenario, plans: Path, workers: int, **changes) -> Compar
     return compare(scenario, difficulty="blind", cache_dir=plans, workers=workers, **how)
 
 
-def test_the_result_does_not_depend_on_the_number_of_workers(scenario, plans):
-    seeds = range(6)
-    assert compared(scenario, plans, workers=1, seeds=seeds) == compared(scenario, plans, workers=2, seeds=seeds)
+@pytest.mark.parametrize("channel", [PERFECT, Channel(topology="line", delay_s=10.0)], ids=["perfect", "late"])
+def test_the_result_does_not_depend_on_the_number_of_workers(scenario, plans, monkeypatch, channel):
+    how = {"seeds": range(6), "channel": channel}
+    alone = compared(scenario, plans, workers=1, **how)
+    monkeypatch.setattr("scenarios.compare.TOGETHER", 4)
+    assert compared(scenario, plans, workers=1, **how) == alone
+    monkeypatch.setattr("scenarios.compare.HERE_S", 0.0)
+    assert compared(scenario, plans, workers=2, **how) == alone
+
+
+def test_what_takes_no_time_needs_no_worker(scenario, plans, monkeypatch):
+    monkeypatch.setattr("scenarios.compare.Parallel", None)
+    told: list[tuple[str, float]] = []
+    compared(scenario, plans, workers=2, progress=lambda stage, share: told.append((stage, share)))
+    assert [share for stage, share in told if stage == "comparing"] == [0.5, 1.0]
 
 
 def test_a_policy_differs_from_itself_by_nothing(scenario, plans):

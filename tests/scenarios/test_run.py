@@ -96,7 +96,7 @@ def test_ctrl_c_outside_the_steps_is_not_taken_for_a_result(fleet, monkeypatch):
         def act(self, observations):
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("scenarios.run.policy_of", lambda name: Broken())
+    monkeypatch.setattr("scenarios.policies.policy_of", lambda name: Broken())
     with pytest.raises(KeyboardInterrupt):
         run(fleet, spec())
 
