@@ -92,7 +92,7 @@ def matching(lot: Lot) -> Assignment:
 
 
 ASSIGNMENTS: dict[str, AssignmentRule] = {"ssi": sequential, "matching": matching}
-"""Rules by the name under which `--assignment` knows them."""
+"""Rules by their names."""
 
 
 def assignment_by_name(name: str) -> AssignmentRule:

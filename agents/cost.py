@@ -84,7 +84,7 @@ def risk(bids: Bids) -> Array:
 
 
 COSTS: dict[str, Cost] = {"thermal": thermal, "quickest": quickest}
-"""Presets by the name under which `--rule` knows them."""
+"""Presets by their names."""
 
 
 def cost_by_name(name: str) -> Cost:

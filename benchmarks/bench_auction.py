@@ -1,6 +1,6 @@
 """What an auction costs: 50 jobs on offer to 8 arms, until all 8 awards of a batch are acknowledged.
 
-    python benchmarks/bench_auction.py [--arms 8] [--jobs 50] [--batches 100] [--rule thermal] [--assignment matching]
+    python benchmarks/bench_auction.py [--arms 8] [--jobs 50] [--batches 100] [--policy matching]
 
 Router, auctioneer and every arm are processes of their own on loopback. Ours: JSON words that are checked on both
 ends, costs, matching, and a journal that is on disk before an award is sent. Arms here have nothing to work out: they
@@ -147,12 +147,12 @@ def words(jobs: int) -> list[JobWord]:
 
 def ours(endpoint: str, folder: Path, options: argparse.Namespace) -> tuple[list[tuple[int, float]], float]:
     """Batches of an auctioneer, and the awards per second over all of them."""
-    from scenarios.live_allocation import allocation  # loads SciPy, which an arm's process does not need
+    from scenarios.live_policies import allocation  # loads SciPy, which an arm's process does not need
 
     timing = Timing(lease_s=120.0, most_offered=options.jobs)
     # There are always so many on offer, to the last batch.
     work = words(options.arms * options.batches + options.jobs)
-    allocate = allocation(options.rule, options.assignment, 60.0)
+    allocate = allocation(options.policy, 60.0)
     with Link(endpoint, FLEET) as link, Journal[Record](folder / "bench.journal", Record) as book:
         node = AuctionNode(link, "auctioneer", book, allocate=allocate, speed=1.0, timing=timing)
         deadline_s = time.monotonic() + PATIENCE_S
@@ -234,8 +234,7 @@ def main() -> None:
     parser.add_argument("--arms", type=int, default=8)
     parser.add_argument("--jobs", type=int, default=50, help="on offer at a time")
     parser.add_argument("--batches", type=int, default=100)
-    parser.add_argument("--rule", default="thermal")
-    parser.add_argument("--assignment", default="matching")
+    parser.add_argument("--policy", default="matching")
     options = parser.parse_args()
     sample = words(options.jobs)
     request = encode(QuoteRequest("auctioneer-0a1b2c3d-1", tuple(sample)))
@@ -255,7 +254,7 @@ def main() -> None:
         loose = journal_s(folder, options.arms, options.batches, unsynced)
     times = [s for _, s in batches]
     print(
-        f"{options.arms} arms, {options.jobs} jobs on offer, {options.rule} / {options.assignment}; "
+        f"{options.arms} arms, {options.jobs} jobs on offer, {options.policy}; "
         f"request {len(request)} B, quote {len(quote)} B"
     )
     print(f"{'':<44}{'p50 ms':>9}{'p95 ms':>9}{'times':>7}")

@@ -6,6 +6,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from fleet.live.body import Body
     from fleet.live.clock import FleetClock
     from fleet.live.journal import Journal
+    from fleet.live.orders import Orders, Worker
     from fleet.live.promises import Memory, Promise
     from scenarios.build import Progress
 
@@ -52,7 +54,13 @@ def arm_command(
     journal: Annotated[
         Path | None, typer.Option(help="Folder of its journal; the same one again goes on where it stopped.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Draws the noise of its sensors; 0 or more.")] = 0,
+    seed: Annotated[int, typer.Option(help="Draws the noise of its sensors, and with --policy the jobs.")] = 0,
+    policy: Annotated[
+        str, typer.Option(help="consensus: share the jobs out with the other arms; else an auctioneer awards them.")
+    ] = "",
+    jobs: Annotated[str, typer.Option(help="With --policy: scenario (its own stream, the same for all), or none.")] = (
+        "scenario"
+    ),
     endpoint: EndpointOption = ENDPOINT,
     fleet: Annotated[str, typer.Option(help="Name of the fleet; default: the scenario's name.")] = "",
 ) -> None:
@@ -60,11 +68,13 @@ def arm_command(
     from fleet.bus.link import Link
     from fleet.live.journal import Journal
     from fleet.live.promises import Promise
+    from scenarios import live_council
     from scenarios.stopping import until_stopped
     from scenarios.terminal import progress_bar
 
     chosen = load(scenario)
     _check(source, difficulty, file, speed, rate_hz, capacity, seed)
+    _check_policy(policy, jobs, file)
     with progress_bar() as progress:
         made = replayed(name, file) if file else simulated(chosen, name, difficulty, seed, progress)
     fleet = fleet or chosen.name
@@ -73,11 +83,19 @@ def arm_command(
         until_stopped() as stop,
         Link(endpoint, fleet) as link,
         Journal[Promise](folder / f"{name}.journal", Promise) as book,
+        ExitStack() as more,
     ):
         refuse_namesake(link, name)
-        node = node_of(link, book, made, chosen, speed=speed, rate_hz=rate_hz, capacity=capacity)
+        orders = None
+        if policy:
+            membership = live_council.membership_of(chosen, policy, jobs=jobs, seed=seed)
+            orders = more.enter_context(live_council.seat(folder / f"{name}.grants", membership))
+        node = node_of(link, book, made, chosen, speed=speed, rate_hz=rate_hz, capacity=capacity, orders=orders)
         typer.echo(f"ready {name} {endpoint} {os.getpid()}")
         while not stop.is_set():
+            if policy and live_council.work(node, stop):
+                typer.echo(live_council.told(node))
+                return
             node.serve(time.monotonic() + TURN_S)
         node.retire(time.monotonic() + FAREWELL_S)
         stop.leave(f"Interrupted; the journal is {book.path}, and the same command goes on.")
@@ -220,15 +238,18 @@ def node_of(
     rate_hz: float = 10.0,
     capacity: int = 1,
     nonce: str | None = None,
+    orders: "Callable[[Worker, int], Orders] | None" = None,
 ) -> "ArmNode":
     """The arm on an open line, with what its open journal remembers.
 
     Args:
         nonce: Never the same for two lives; drawn unless given.
+        orders: Where its work comes from, for the arm and the number of its life; auctioneers unless given.
     """
     from fleet.live.arm_node import ArmNode, Nature
     from fleet.live.contractor import Contractor, Terms
     from fleet.live.estimate import Estimator, NominalHeat
+    from fleet.live.orders import FromAuctioneers
 
     clock = clock_of(link, speed)
     memory = remembered(book, made.name, clock.now_s(time.monotonic()))
@@ -246,7 +267,8 @@ def node_of(
         works=made.takes_work,
     )
     body = made.body(clock.now_s(time.monotonic()), clock.speed / rate_hz)
-    return ArmNode(link, body, contractor, estimator, clock, nature)
+    given = FromAuctioneers if orders is None else lambda worker: orders(worker, memory.boot)
+    return ArmNode(link, body, contractor, estimator, clock, nature, given)
 
 
 def remembered(book: "Journal[Promise]", name: str, time_s: float) -> "Memory":
@@ -293,3 +315,14 @@ def _check(
         raise FleetError(f"--capacity must be 1 to 256 (got {capacity}).")
     if seed < 0:
         raise FleetError(f"--seed must be 0 or more (got {seed}).")
+
+
+def _check_policy(policy: str, jobs: str, file: Path | None) -> None:
+    from scenarios.live_council import among_arms
+
+    if policy and not among_arms(policy):
+        raise FleetError(f"'{policy}' takes an auctioneer: thermofleet auction --policy {policy}; arms then need none.")
+    if policy and file is not None:
+        raise FleetError("An arm that replays a log takes no jobs, so it shares none out: leave --policy out.")
+    if jobs not in ("scenario", "none"):
+        raise FleetError(f"--jobs must be scenario or none (got {jobs}).")

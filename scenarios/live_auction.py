@@ -9,11 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from agents.auction import ASSIGNMENTS
-from agents.cost import COSTS
 from fleet.errors import FleetError
 from fleet.job import Job
-from scenarios.live_options import ENDPOINT, EndpointOption
+from scenarios.live_options import ENDPOINT, EndpointOption, PolicyOption
 from scenarios.load import load
 from scenarios.scenario import Scenario
 
@@ -33,8 +31,7 @@ FAREWELL_S = (1.0, 10.0)
 def auction_command(
     scenario: Annotated[str, typer.Argument(help="A library name (see `thermofleet list`) or a .toml file.")],
     name: Annotated[str, typer.Option(help="Of the auctioneer; part of its keys.")] = "auctioneer",
-    rule: Annotated[str, typer.Option(help=f"What a job costs an arm: {', '.join(COSTS)}.")] = "thermal",
-    assignment: Annotated[str, typer.Option(help=f"Who gets what: {', '.join(ASSIGNMENTS)}.")] = "matching",
+    policy: PolicyOption = "matching",
     speed: Annotated[float, typer.Option(help="Fleet seconds per real second.")] = 1.0,
     journal: Annotated[
         Path | None, typer.Option(help="Folder of its journal; the same one again goes on where it stopped.")
@@ -51,7 +48,7 @@ def auction_command(
     from fleet.live.auction_node import AuctionNode
     from fleet.live.journal import Journal
     from fleet.live.records import Record
-    from scenarios.live_allocation import allocation
+    from scenarios.live_policies import AMONG_ARMS, allocation
     from scenarios.stopping import until_stopped
 
     chosen = load(scenario)
@@ -59,7 +56,11 @@ def auction_command(
         raise FleetError(f"--jobs must be scenario or none (got {jobs}).")
     if not 0 < speed < float("inf") or seed < 0:
         raise FleetError(f"--speed must be > 0 and --seed 0 or more (got {speed:g}, {seed}).")
-    allocate = allocation(rule, assignment, chosen.limits.warning_c)
+    allocate = allocation(policy, chosen.limits.warning_c)
+    if policy in AMONG_ARMS:
+        raise FleetError(
+            f"'{policy}' takes no auctioneer: thermofleet arm SCENARIO NAME --policy {policy}, for each arm."
+        )
     own = own_jobs(chosen, seed) if jobs == "scenario" else []
     fleet = fleet or chosen.name
     folder = journal or Path("runs") / f"live-{fleet}"

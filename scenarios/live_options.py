@@ -8,6 +8,13 @@ from fleet.errors import FleetError
 
 ENDPOINT = "tcp/127.0.0.1:7447"
 EndpointOption = Annotated[str, typer.Option(envvar="THERMOFLEET_ENDPOINT", help="Of the fleet's router.")]
+PolicyOption = Annotated[
+    str,
+    typer.Option(
+        help="Who gets what: matching, ssi (sequential single-item), each also as quickest_…, which heeds the time "
+        "until the finish and not the heat; for arms without an auctioneer: consensus."
+    ),
+]
 FleetOption = Annotated[
     str, typer.Option(envvar="THERMOFLEET_FLEET", help="Name of the fleet; not needed where only one is there.")
 ]

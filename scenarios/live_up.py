@@ -1,4 +1,4 @@
-"""`thermofleet up`: a whole fleet as processes of its own, supervised: router, arms, auctioneer, recorder."""
+"""`thermofleet up`: a whole fleet as processes of its own, supervised: router, arms, recorder, maybe an auctioneer."""
 
 import socket
 import sys
@@ -7,11 +7,11 @@ from typing import Annotated
 
 import typer
 
-from agents.auction import ASSIGNMENTS
-from agents.cost import COSTS
 from fleet.bus.security import Tls
 from fleet.errors import FleetError
 from fleet.live.supervisor import Part, Supervisor
+from scenarios.live_options import PolicyOption
+from scenarios.live_policies import AMONG_ARMS, check
 from scenarios.load import load
 from scenarios.terminal import err_console, out_console, progress_bar, say
 
@@ -30,14 +30,13 @@ def parts_of(
     fleet: str,
     folder: Path,
     speed: float,
-    rule: str,
-    assignment: str,
+    policy: str,
     difficulty: str,
     jobs: str,
     seed: int,
     tls: Path | None = None,
-) -> tuple[Part, list[Part], Part, Part]:
-    """Router, arms, recorder and auctioneer of a fleet, as `Supervisor` starts them.
+) -> tuple[Part, list[Part], Part, Part | None]:
+    """Router, arms, recorder and auctioneer, if it has one, of a fleet, as `Supervisor` starts them.
 
     Args:
         scenario: A library name or a file.
@@ -54,25 +53,31 @@ def parts_of(
     of_fleet = ("--fleet", fleet, "--speed", f"{speed:g}", "--journal", str(folder / "journals"))
     router = Part(name="router", argv=(*PROGRAM, "router", "--port", str(port), *secure), ready=address)
     scored = ("--difficulty", difficulty, "--seed", str(seed))
+    how = ("--policy", policy, "--jobs", jobs)
+    alone, ends = policy in AMONG_ARMS, jobs == "scenario"
+    if alone:
+        scored = (*scored, *how)
     arms = [
-        Part(name=f"arm-{name}", argv=(*PROGRAM, "arm", scenario, name, *reach(name), *of_fleet, *scored), rank=2)
+        Part(
+            name=f"arm-{name}",
+            argv=(*PROGRAM, "arm", scenario, name, *reach(name), *of_fleet, *scored),
+            essential=alone and ends,
+            rank=2,
+        )
         for name in names
     ]
     kept = (*reach("recorder"), "--out", str(folder / "recording"))
     record = Part(name="record", argv=(*PROGRAM, "record", fleet, *kept), rank=1)
-    how = ("--rule", rule, "--assignment", assignment, "--jobs", jobs, "--seed", str(seed))
-    at = (*reach("auctioneer"), *of_fleet)
-    auction = Part(
-        name="auction", argv=(*PROGRAM, "auction", scenario, *at, *how), essential=jobs == "scenario", rank=3
-    )
-    return router, arms, record, auction
+    if alone:
+        return router, arms, record, None
+    argv = (*PROGRAM, "auction", scenario, *reach("auctioneer"), *of_fleet, *how, "--seed", str(seed))
+    return router, arms, record, Part(name="auction", argv=argv, essential=ends, rank=3)
 
 
 def up_command(
     scenario: Annotated[str, typer.Argument(help="A library name (see `thermofleet list`) or a .toml file.")],
     speed: Annotated[float, typer.Option(help="Fleet seconds per real second.")] = 60.0,
-    rule: Annotated[str, typer.Option(help=f"What a job costs an arm: {', '.join(COSTS)}.")] = "thermal",
-    assignment: Annotated[str, typer.Option(help=f"Who gets what: {', '.join(ASSIGNMENTS)}.")] = "matching",
+    policy: PolicyOption = "matching",
     difficulty: Annotated[str, typer.Option(help="What scores the plans: twin or blind.")] = "twin",
     jobs: Annotated[
         str, typer.Option(help="scenario: its own stream, until it is done; none: what others submit, until Ctrl-C.")
@@ -95,7 +100,6 @@ def up_command(
     where the journals stop.
     """
     from scenarios.build import prepare
-    from scenarios.live_allocation import allocation
     from scenarios.stopping import until_stopped
 
     chosen = load(scenario)
@@ -103,7 +107,7 @@ def up_command(
         raise FleetError(f"--speed must be > 0, --seed >= 0, --port 0 to 65535 (got {speed:g}, {seed}, {port or 0}).")
     if difficulty not in ("twin", "blind") or jobs not in ("scenario", "none"):
         raise FleetError(f"--difficulty is twin or blind, --jobs scenario or none (got {difficulty}, {jobs}).")
-    allocation(rule, assignment, chosen.limits.warning_c)
+    check(policy)
     fleet = fleet or chosen.name
     if tls is not None and fleet != chosen.name:
         raise FleetError(f"The keys of --tls are for the fleet of their scenario; leave --fleet out (got '{fleet}').")
@@ -117,23 +121,24 @@ def up_command(
         fleet=fleet,
         folder=folder,
         speed=speed,
-        rule=rule,
-        assignment=assignment,
+        policy=policy,
         difficulty=difficulty,
         jobs=jobs,
         seed=seed,
         tls=tls,
     )
     look = Tls(tls, "monitor").endpoint(router.ready) if tls else router.ready
-    say(f"Starting the router, the recorder, {len(arms)} arms and the auctioneer …", err_console)
+    who = f"{len(arms)} arms, which share the jobs out" if auction is None else f"{len(arms)} arms and the auctioneer"
+    say(f"Starting the router, the recorder, {who} …", err_console)
     with until_stopped() as stop, Supervisor(folder / "logs") as supervisor:
         supervisor.start(router, ready_s=START_S)
         for part in (record, *arms):
             supervisor.start(part)
         for part in (record, *arms):
             supervisor.await_ready(part.name, START_S, stop.is_set)
-        supervisor.start(auction)
-        supervisor.await_ready(auction.name, START_S, stop.is_set)
+        if auction is not None:
+            supervisor.start(auction)
+            supervisor.await_ready(auction.name, START_S, stop.is_set)
         say(
             f"{fleet} is up: {len(arms)} arms at {router.ready}, {speed:g} times as fast as real time; logs in "
             f"{supervisor.folder}. Look: thermofleet watch --endpoint {look}",

@@ -178,7 +178,7 @@ def questions(fleet: Fleet, rogue: zenoh.Session) -> Iterator[Try]:
             for asker in (status.arm, ROGUE):
                 key = keys.asked_by(of_fleet, "auctioneer", topic, asker)
                 yield f"a {topic} of {status.arm} under the key of {asker}", _answered(rogue, key, word)
-            key = keys.asked_of_every_auction(of_fleet, topic, status.arm)
+            key = keys.asked_of_all(of_fleet, topic, status.arm)
             yield f"a {topic} of {status.arm} to every auctioneer", _answered(rogue, key, word)
         own = keys.asked_by(of_fleet, "auctioneer", "report", ROGUE)
         yield (

@@ -11,7 +11,12 @@ from fleet.bus import messages
 from fleet.bus.contract import CHANNELS, WAYS, Channel, Word, schemas
 from fleet.bus.specimens import SPECIMENS
 
-_WHO = {"arm": "Name of the arm", "auctioneer": "Name of the auctioneer", "fleet": "Name of the fleet"}
+_WHO = {
+    "arm": "Name of the arm",
+    "peer": "Name of the arm that asks",
+    "auctioneer": "Name of the auctioneer",
+    "fleet": "Name of the fleet",
+}
 
 
 def asyncapi() -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """The contract of the bus as data: every key with who says what there and how, and JSON schemas of every word.
 
-All of it is read from the structs in `messages` and `trade` and the keys in `keys`, so that nothing is said twice; the
-description of a field is the text under it in the source. `thermofleet contract` writes it to docs/contract.
+All of it is read from the structs in `messages`, `trade` and `council` and the keys in `keys`, so that nothing is said
+twice; the description of a field is the text under it in the source. `thermofleet contract` writes it to docs/contract.
 """
 
 import ast
@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from fleet.bus import keys, messages, trade
+from fleet.bus import council, keys, messages, trade
 from fleet.bus.keys import Role
 from fleet.bus.link import REMEMBERED
 from fleet.job import Job, Work
@@ -64,7 +64,8 @@ class Channel:
     @property
     def address(self) -> str:
         """The key with its parameters in braces."""
-        return f"{ADDRESS[self.role]}/{self.topic}{'/{arm}' if self.topic in keys.ASKED else ''}"
+        asker = "" if self.topic not in keys.ASKED else "/{peer}" if self.role == "arm" else "/{arm}"
+        return f"{ADDRESS[self.role]}/{self.topic}{asker}"
 
     @property
     def words(self) -> tuple[Word, ...]:
@@ -91,6 +92,8 @@ CHANNELS: tuple[Channel, ...] = (
     Channel("arm", "event", "remembered", trade.ArmEvent, kept=REMEMBERED),
     Channel("arm", "quote", "answered", trade.QuoteRequest, trade.Quote, to="auctioneer, or anybody for a dry run"),
     Channel("arm", "award", "answered", trade.Award, trade.Ack, to="auctioneer"),
+    Channel("arm", "bid", "remembered", council.Bid, to="arm", kept=1),
+    Channel("arm", "grant", "answered", council.Claim, council.Grant, to="arm"),
     Channel("auction", "alive", "token", by="auctioneer"),
     Channel("auction", "announce", "remembered", trade.Announce, by="auctioneer", kept=REMEMBERED),
     Channel("auction", "result", "remembered", trade.Result, by="auctioneer", kept=REMEMBERED),
@@ -165,7 +168,7 @@ def _types() -> Mapping[str, Word]:
     """Every struct that occurs in the schemas, by its name there."""
     return {
         name: value
-        for module in (messages, trade)
+        for module in (messages, trade, council)
         for name, value in vars(module).items()
         if isinstance(value, type) and issubclass(value, msgspec.Struct)
     }

@@ -1,8 +1,8 @@
 """Names on the wire: every key is built and parsed here, and nowhere else.
 
 `thermofleet/v1/{fleet}/…` with `arm/{arm}/{topic}`, `auction/{auctioneer}/{topic}`, `jobs/{topic}` and `clock/now`.
-What an arm asks an auctioneer as itself it asks under `auction/{auctioneer}/{topic}/{arm}`: the rules of a router see
-keys and nothing else, so who asks must be part of the key.
+What an arm asks an auctioneer as itself it asks under `auction/{auctioneer}/{topic}/{arm}`, and what it asks another
+under `arm/{other}/{topic}/{arm}`: the rules of a router see keys and nothing else, so who asks must be part of the key.
 Names of fleets, arms and auctioneers are percent-encoded to one chunk, so no name can smuggle a wildcard, a `/` or an
 `@` into a key (a chunk that begins with `@` is matched by no wildcard, and its history is silently lost).
 """
@@ -13,17 +13,17 @@ from typing import Literal, get_args
 from urllib.parse import quote, unquote
 
 Role = Literal["arm", "auction", "jobs", "clock"]
-ArmTopic = Literal["alive", "state", "info", "difficulty", "event", "quote", "award"]
+ArmTopic = Literal["alive", "state", "info", "difficulty", "event", "bid", "quote", "award"]
 AuctionTopic = Literal["alive", "announce", "result"]
-AskedTopic = Literal["lease", "report"]
+AskedTopic = Literal["lease", "report", "grant"]
 JobsTopic = Literal["submit", "status"]
 
 PREFIX = "thermofleet/v1"
 STATES = f"{PREFIX}/*/arm/*/state"
 """Key expression that matches the telemetry of every arm of every fleet; for rules, never for a put."""
 TOPICS: dict[Role, tuple[str, ...]] = {
-    "arm": get_args(ArmTopic),
-    "auction": get_args(AuctionTopic) + get_args(AskedTopic),
+    "arm": (*get_args(ArmTopic), "grant"),
+    "auction": (*get_args(AuctionTopic), "lease", "report"),
     "jobs": get_args(JobsTopic),
     "clock": ("now",),
 }
@@ -32,8 +32,10 @@ NAMELESS: tuple[Role, ...] = ("jobs", "clock")
 MOST_KNOWN, LONGEST_KNOWN = 4096, 256
 """Keys that need not be taken apart again, and characters of the longest of them."""
 ASKED: tuple[str, ...] = get_args(AskedTopic)
-"""Topics of an auctioneer whose keys end in the name of the arm that asks."""
+"""Topics of an auctioneer, or of an arm, whose keys end in the name of the arm that asks."""
 _ROLES: dict[str, Role] = {str(role): role for role in TOPICS}
+_ASKED: dict[AskedTopic, Role] = {"lease": "auction", "report": "auction", "grant": "arm"}
+"""Who is asked, by topic."""
 
 
 @dataclass(frozen=True)
@@ -90,19 +92,21 @@ def of_every_auction(fleet: str, topic: AuctionTopic) -> str:
     return of_auction(fleet, "x", topic).replace("/auction/x/", "/auction/*/")
 
 
-def asked_by(fleet: str, auctioneer: str, topic: AskedTopic, arm: str) -> str:
-    """Key at which one arm asks one auctioneer: `thermofleet/v1/{fleet}/auction/{auctioneer}/{topic}/{arm}`."""
-    return str(Key(fleet, "auction", auctioneer, topic, arm))
+def asked_by(fleet: str, asked: str, topic: AskedTopic, arm: str) -> str:
+    """Key at which one arm asks one auctioneer, or another arm: `thermofleet/v1/{fleet}/auction/{asked}/{topic}/{arm}`,
+    or `…/arm/{asked}/…`.
+    """
+    return str(Key(fleet, _ASKED[topic], asked, topic, arm))
 
 
-def asked_by_every_arm(fleet: str, auctioneer: str, topic: AskedTopic) -> str:
-    """Key expression under which one auctioneer answers all arms; never for an answer itself (see `answered`)."""
-    return asked_by(fleet, auctioneer, topic, "x").removesuffix("x") + "*"
+def asked_by_every_arm(fleet: str, asked: str, topic: AskedTopic) -> str:
+    """Key expression under which one auctioneer, or arm, answers all arms; never for an answer (see `answered`)."""
+    return asked_by(fleet, asked, topic, "x").removesuffix("x") + "*"
 
 
-def asked_of_every_auction(fleet: str, topic: AskedTopic, arm: str) -> str:
-    """Key expression that matches what one arm may ask any auctioneer; for rules."""
-    return asked_by(fleet, "x", topic, arm).replace("/auction/x/", "/auction/*/")
+def asked_of_all(fleet: str, topic: AskedTopic, arm: str) -> str:
+    """Key expression that matches what one arm may ask any auctioneer, or any arm."""
+    return asked_by(fleet, "x", topic, arm).replace(f"/{_ASKED[topic]}/x/", f"/{_ASKED[topic]}/*/")
 
 
 def answered(expression: str, asked: str) -> str:

@@ -136,8 +136,8 @@ def rights(fleet: str, participant: Participant) -> Rights:
     quotes, awards = keys.of_every_arm(fleet, "quote"), keys.of_every_arm(fleet, "award")
     if participant.role == "arm":
         # The key names the asker: whoever may ask under it is that arm.
-        lease, report = (keys.asked_of_every_auction(fleet, topic, participant.name) for topic in ("lease", "report"))
-        return Rights(says=(keys.all_of(fleet, "arm", participant.name),), asks=(lease, report, time))
+        asked = tuple(keys.asked_of_all(fleet, topic, participant.name) for topic in ("lease", "report", "grant"))
+        return Rights(says=(keys.all_of(fleet, "arm", participant.name),), asks=(*asked, time))
     if participant.role == "auctioneer":
         own = keys.all_of(fleet, "auction", participant.name)
         return Rights(

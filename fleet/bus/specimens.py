@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import msgspec
 
+from fleet.bus.council import Bid, Claim, Denied, Grant, Granted, Settled, Stake
 from fleet.bus.messages import DifficultyWord, Info, Refusal, State
 from fleet.bus.trade import (
     Ack,
@@ -41,6 +42,7 @@ CRATE = JobWord(
 )
 _ARM, _AUCTIONEER = "arm_0", "auctioneer"
 _ROUND, _QUOTE, _AWARD = "auctioneer-17", "arm_0-2-41", "auctioneer-17-crate_1"
+_CLAIMED = f"{_QUOTE}:crate_1"
 _OFFER = Offer(
     job="crate_1",
     feasible=True,
@@ -89,6 +91,22 @@ _ALL: tuple[msgspec.Struct, ...] = (
     ),
     Award(award=_AWARD, auction=_ROUND, auctioneer=_AUCTIONEER, quote=_QUOTE, job=CRATE, cycles=0, lease_s=6.0),
     Ack(arm=_ARM, award=_AWARD, accepted=True),
+    Bid(arm=_ARM, number=2_000_000_041, time_s=602.0, capacity=1, offers=(_OFFER,), left=2, open=("crate_1", "hold_7")),
+    Claim(
+        arm=_ARM,
+        number=2_000_000_042,
+        stakes=(Stake(award=_CLAIMED, job="crate_1", places=CRATE.places, cycles=19, phase="finishing"),),
+        settled=(
+            Settled(job="crate_0", award="arm_0-2-40:crate_0", arm=_ARM, outcome="finished", cycles=8, time_s=590.5),
+        ),
+    ),
+    Grant(
+        arm="arm_1",
+        number=2_000_000_042,
+        lease_s=6.0,
+        granted=(Granted(award=_CLAIMED, cycles=19, leave=True),),
+        denied=(Denied(award="arm_0-2-43:hold_7", reason="'arm_2' has 'hold_7'"),),
+    ),
     Announce(auctioneer=_AUCTIONEER, auction=_ROUND, time_s=601.9, jobs=("crate_1",)),
     Result(auctioneer=_AUCTIONEER, number=33, time_s=842.6, status=_DONE, auction=_ROUND, d=0.53, p_saturation=0.04),
     LeaseRequest(arm=_ARM, holds=(Hold(award=_AWARD, job="crate_1", cycles=19, phase="finishing"),)),

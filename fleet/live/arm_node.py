@@ -5,57 +5,32 @@ some 50 ms; an answer plans for at most `PLANNING_S`, says how the arm is betwee
 `not planned yet`; the rest is planned one motion a turn, so that the next question finds it.
 """
 
-import logging
 import math
 import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from fleet.bus import keys
-from fleet.bus.answers import Answers
 from fleet.bus.link import REMEMBERED, Link, Refused
 from fleet.bus.messages import DifficultyWord, Info, State
-from fleet.bus.trade import (
-    Ack,
-    ArmEvent,
-    Award,
-    Clock,
-    ClockRequest,
-    JobWord,
-    Lease,
-    LeaseRequest,
-    Offer,
-    Quote,
-    QuoteRequest,
-    Receipt,
-    Report,
-)
-from fleet.errors import BusError
+from fleet.bus.trade import Ack, ArmEvent, Award, JobWord, Offer, Quote, QuoteRequest
 from fleet.events import Event
 from fleet.live.body import Body
 from fleet.live.clock import FleetClock, next_due_s
 from fleet.live.contractor import Contractor
 from fleet.live.estimate import Estimator
+from fleet.live.orders import Complaints, FromAuctioneers, Orders, Worker
 from fleet.live.promises import Held
-
-_LOG = logging.getLogger(__name__)
 
 PLANNING_S = 0.3
 """Real seconds that one answer may spend on planning."""
 MOST_PLANNED = 256
 """Motions that wait to be planned."""
-ANSWER_S = 1.0
-"""Real seconds that an auctioneer has to answer."""
-CLOCK_S = (1.0, 30.0)
-"""Real seconds between two questions for the time: until the first answer, and after it."""
 RETRY_S = 1.0
 """Real seconds between two attempts to write what there was no room for."""
-TOLD_S = 10.0
-"""Real seconds between two complaints about the same."""
 EVENTS_OF_A_LIFE = 1_000_000_000
 """The number of an event is that of the boot times this, and a count."""
 
@@ -87,30 +62,38 @@ class ArmNode:
         clock: The fleet's time as the arm keeps it.
         behind_s: Fleet seconds by which the body was last behind that time.
         contractor: What the arm has promised.
+        link: Its line to the bus.
+        orders: Where its work comes from.
     """
 
     def __init__(
-        self, link: Link, body: Body, contractor: Contractor, estimator: Estimator, clock: FleetClock, nature: Nature
+        self,
+        link: Link,
+        body: Body,
+        contractor: Contractor,
+        estimator: Estimator,
+        clock: FleetClock,
+        nature: Nature,
+        orders: Callable[[Worker], Orders] = FromAuctioneers,
     ) -> None:
         """Take part: `link` is open."""
-        self.clock, self.contractor, self.behind_s = clock, contractor, 0.0
-        self._link, self._body, self._estimator, self._nature = link, body, estimator, nature
+        self.link, self.clock, self.contractor, self.behind_s = link, clock, contractor, 0.0
+        self._body, self._estimator, self._nature = body, estimator, nature
         self._name = contractor.arm
         self._at_work = ""
         """Award that the body is at."""
         self._unplanned: deque[JobWord] = deque(maxlen=MOST_PLANNED)
         self._reading = body.read()
         self._tick = self._events = 0
-        self._due_s = self._clock_asked_s = -math.inf
-        """Real seconds at which the next state word is due, and the time was asked for last."""
-        self._retry_s = -math.inf
-        self._complained_s: dict[str, float] = {}
-        self._clock_known = False
+        self._due_s = self._retry_s = -math.inf
+        """Real seconds at which the next state word is due, and the next attempt to write."""
+        self._complain = Complaints(self._name)
+        self.orders = orders(self)
         self._declare()
 
     def serve(self, until_s: float) -> None:
         """Live until `time.monotonic()` is `until_s`, or a little less."""
-        self._link.serve(-math.inf if self._unplanned else min(until_s, self._due_s))
+        self.link.serve(-math.inf if self._unplanned else min(until_s, self._due_s, self.orders.wake_s))
         self._turn()
         if self._unplanned:
             self._estimator.prepare(self._unplanned.popleft())
@@ -125,7 +108,7 @@ class ArmNode:
     # What it hears
 
     def _declare(self) -> None:
-        link, fleet, name = self._link, self._link.fleet, self._name
+        link, fleet, name = self.link, self.link.fleet, self._name
         self._say_state = link.publisher(keys.of_arm(fleet, name, "state"), State, remember=REMEMBERED)
         self._say_difficulty = link.publisher(keys.of_arm(fleet, name, "difficulty"), DifficultyWord, remember=1)
         self._say_event = link.publisher(keys.of_arm(fleet, name, "event"), ArmEvent, remember=REMEMBERED)
@@ -140,17 +123,13 @@ class ArmNode:
         words = {word.name: word for word in request.jobs}
         if len(words) != len(request.jobs):
             raise Refused("A job is named twice in this question.")
-        self._plan_what_is_new(request.jobs)
+        offers = self.offers(request.jobs)
         real_s = time.monotonic()
-        temp_c = np.array(self._reading.temp_c)
-        offers = self._estimator.offers(
-            request.jobs, temp_c, self._nature.air_c(self.clock.now_s(real_s)), self._busy_s()
-        )
         name = ""
         if not request.dry_run:
             can = {offer.job: (words[offer.job], offer.feasible) for offer in offers}
             name = self.contractor.quoted(can, real_s)
-            self._tell_difficulty(offers, real_s)
+            self.tell_difficulty(offers, real_s)
         return Quote(
             arm=self._name,
             auction=request.auction,
@@ -160,9 +139,15 @@ class ArmNode:
             time_s=self.clock.now_s(real_s),
             mode=self._reading.mode,
             headroom_k=self._headroom_k,
-            capacity=0 if self._unfit() else self.contractor.spare,
+            capacity=0 if self.unfit() or self.orders.objection else self.contractor.spare,
             offers=offers,
         )
+
+    def offers(self, words: tuple[JobWord, ...]) -> tuple[Offer, ...]:
+        """What jobs would cost it now; what cannot be planned in the time for it is offered as not planned yet."""
+        self._plan_what_is_new(words)
+        air_c = self._nature.air_c(self.clock.now_s(time.monotonic()))
+        return self._estimator.offers(words, np.array(self._reading.temp_c), air_c, self._busy_s())
 
     def _plan_what_is_new(self, words: tuple[JobWord, ...]) -> None:
         """Plan within the time for it, and leave the rest for later."""
@@ -176,7 +161,8 @@ class ArmNode:
             else:
                 self._unplanned.append(word)
 
-    def _tell_difficulty(self, offers: tuple[Offer, ...], real_s: float) -> None:
+    def tell_difficulty(self, offers: tuple[Offer, ...], real_s: float) -> None:
+        """Say how hard it finds jobs."""
         self._say_difficulty(
             DifficultyWord(
                 arm=self._name,
@@ -190,16 +176,22 @@ class ArmNode:
         )
 
     def _award(self, award: Award) -> Ack:
+        if self.orders.objection:
+            raise Refused(self.orders.objection)
+        return self.take(award, time.monotonic())
+
+    def take(self, award: Award, real_s: float) -> Ack:
+        """Take an award in hand, or not."""
         before = len(self.contractor.held)
-        ack = self.contractor.awarded(award, time.monotonic(), self._unfit())
+        ack = self.contractor.awarded(award, real_s, self.unfit())
         if ack.accepted and len(self.contractor.held) > before:
             way = self._estimator.way(award.job)
             score = None if way is None or way.difficulty is None else way.difficulty.total
             self._tell(Event(time_s=self._body.time_s, kind="award", job=award.job.name), score)
         return ack
 
-    def _unfit(self) -> str:
-        """Why it takes no work just now."""
+    def unfit(self) -> str:
+        """Why it takes no work just now; "" if it does."""
         if not self._nature.works:
             return "I take no jobs"
         if self._reading.mode == "faulted":
@@ -218,10 +210,10 @@ class ArmNode:
         self._live(real_s)
         self.contractor.give_up(self._body.time_s, real_s)
         for auctioneer, request in self.contractor.lease_requests(real_s):
-            self._ask_lease(auctioneer, request, real_s)
+            self.orders.lease(auctioneer, request, real_s)
         for auctioneer, report in self.contractor.reports(real_s):
-            self._report(auctioneer, report)
-        self._ask_clock(real_s)
+            self.orders.report(auctioneer, report)
+        self.orders.turn(real_s)
         if real_s >= self._due_s:
             self._due_s = next_due_s(self._due_s, real_s, 1.0 / self._nature.rate_hz)
             self._say()
@@ -310,7 +302,7 @@ class ArmNode:
     def _headroom_k(self) -> float:
         return self._nature.warning_c - max(self._reading.temp_c)
 
-    # What it says and asks
+    # What it says
 
     def _say(self) -> None:
         self._reading = reading = self._body.read()
@@ -346,55 +338,10 @@ class ArmNode:
             )
         )
 
-    def _ask_lease(self, auctioneer: str, request: LeaseRequest, asked_s: float) -> None:
-        def done(answers: Answers[Lease]) -> None:
-            for lease in answers.words.values():
-                self.contractor.leased(lease, asked_s)
-
-        key = keys.asked_by(self._link.fleet, auctioneer, "lease", self._name)
-        self._safely(partial(self._link.ask, key, request, Lease, done, timeout_s=ANSWER_S))
-
-    def _report(self, auctioneer: str, report: Report) -> None:
-        def done(answers: Answers[Receipt]) -> None:
-            for receipt in answers.words.values():
-                self.contractor.receipted(receipt)
-
-        key = keys.asked_by(self._link.fleet, auctioneer, "report", self._name)
-        self._safely(partial(self._link.ask, key, report, Receipt, done, timeout_s=ANSWER_S))
-
-    def _ask_clock(self, asked_s: float) -> None:
-        def done(answers: Answers[Clock]) -> None:
-            for said in answers.words.values():
-                self._set_clock(said, asked_s, time.monotonic())
-                return
-
-        if asked_s >= self._clock_asked_s + CLOCK_S[self._clock_known]:
-            self._clock_asked_s = asked_s
-            key = keys.of_clock(self._link.fleet)
-            self._safely(partial(self._link.ask, key, ClockRequest(), Clock, done, timeout_s=ANSWER_S))
-
-    def _set_clock(self, said: Clock, asked_s: float, answered_s: float) -> None:
-        """Take the fleet's time: at once the first time, little by little after that."""
-        clock = self.clock
-        if said.speed != clock.speed:
-            self._complain("speed", f"goes at the fleet's speed of {said.speed:g}, not at {clock.speed:g}.")
-            clock = FleetClock(said.speed, answered_s, clock.now_s(answered_s))
-            self._body.set_pace(said.speed / self._nature.rate_hz)
-        if self._clock_known:
-            self.clock = clock.corrected(asked_s, answered_s, said.time_s)
-            return
-        self._clock_known = True
-        self.clock = clock.set_by(asked_s, answered_s, said.time_s)
-        self._body.set_time(self.clock.now_s(answered_s))
-
-    def _safely(self, ask: Callable[[], None]) -> None:
-        """Ask; what cannot be asked now is asked again in its time."""
-        try:
-            ask()
-        except BusError as error:
-            self._complain("bus", str(error))
-
-    def _complain(self, what: str, sentence: str) -> None:
-        if (now_s := time.monotonic()) >= self._complained_s.get(what, -math.inf) + TOLD_S:
-            self._complained_s[what] = now_s
-            _LOG.warning("Arm '%s' %s", self._name, sentence)
+    def set_clock(self, clock: FleetClock, *, jump: bool = False) -> None:
+        """Go by another clock; with `jump` it reads another time now, and the body shall know."""
+        if clock.speed != self.clock.speed:
+            self._body.set_pace(clock.speed / self._nature.rate_hz)
+        self.clock = clock
+        if jump:
+            self._body.set_time(clock.now_s(time.monotonic()))

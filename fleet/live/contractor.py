@@ -300,8 +300,12 @@ class Contractor:
             self._asked_s[auctioneer] = now_s
             for held in waiting:
                 held.asked_s = now_s
-            due.append((auctioneer, LeaseRequest(arm=self.arm, holds=tuple(self._hold(held) for held in mine))))
+            due.append((auctioneer, LeaseRequest(arm=self.arm, holds=self.holds(auctioneer))))
         return due
+
+    def holds(self, auctioneer: str) -> tuple[Hold, ...]:
+        """What it has in hand from an auctioneer, as it tells it."""
+        return tuple(self._hold(held) for held in self.held if held.award.auctioneer == auctioneer)
 
     def leased(self, lease: Lease, asked_s: float) -> None:
         """Take the answer to a request made at the real second `asked_s`."""
@@ -354,6 +358,11 @@ class Contractor:
                 pending.wait_s = min(2 * pending.wait_s, REPORT_AGAIN_S[1])
                 due.append((pending.auctioneer, pending.report))
         return due
+
+    def unreceipted(self) -> tuple[tuple[Report, bool], ...]:
+        """Every report without a receipt, and whether it is on disk."""
+        waiting = {record.report.award for record in self.unwritten if isinstance(record, Closed)}
+        return tuple((pending.report, name not in waiting) for name, pending in self._reports.items())
 
     @property
     def owes(self) -> bool:

@@ -63,7 +63,7 @@ def test_every_key_of_the_bus_is_in_the_contract():
 
 @pytest.mark.parametrize("channel", CHANNELS, ids=lambda channel: channel.name)
 def test_an_address_filled_in_is_a_key(channel):
-    key = channel.address.format(fleet="f", arm="a", auctioneer="a")
+    key = channel.address.format(fleet="f", arm="a", auctioneer="a", peer="b")
     parsed = keys.parse(key)
     assert (parsed.role, parsed.topic) == (channel.role, channel.topic)
 
@@ -171,10 +171,10 @@ def test_asyncapi_has_every_key_and_no_loose_end():
         Draft202012Validator(schema).validate(message["examples"][0]["payload"])
 
 
-@pytest.mark.parametrize(("node", "role"), [("arm_node", "arm"), ("auction_node", "auction")])
-def test_the_participants_publish_and_answer_as_the_contract_says(node, role):
+@pytest.mark.parametrize(("nodes", "role"), [(("arm_node", "council_node"), "arm"), (("auction_node",), "auction")])
+def test_the_participants_publish_and_answer_as_the_contract_says(nodes, role):
     """Read from their source: `link.publisher(keys.of_…(…, "topic"), Kind, remember=…)` and `link.answer(…)`."""
-    source = (ROOT / "fleet" / "live" / f"{node}.py").read_text(encoding="utf-8")
+    source = "\n".join((ROOT / "fleet" / "live" / f"{node}.py").read_text(encoding="utf-8") for node in nodes)
     found = {}
     for call in ast.walk(ast.parse(source)):
         if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) and len(call.args) > 1):
@@ -182,7 +182,7 @@ def test_the_participants_publish_and_answer_as_the_contract_says(node, role):
         if call.func.attr in ("publisher", "answer") and isinstance(call.args[0], ast.Call):
             key = ast.unparse(call.args[0])
             topic = re.search(r"'(\w+)'\)$", key)
-            place = {"asked_by_every_arm": "auction"}.get(key.split(".")[1].split("(")[0]) or key.split("of_")[1]
+            place = {"asked_by_every_arm": role}.get(key.split(".")[1].split("(")[0]) or key.split("of_")[1]
             where = (place.split("(")[0], topic[1] if topic else "now")
             remember = next((ast.unparse(k.value) for k in call.keywords if k.arg == "remember"), "0")
             kept = REMEMBERED if remember == "REMEMBERED" else int(remember)

@@ -72,7 +72,10 @@ def test_all_of_one_is_what_it_says_and_no_word_of_another(one, other):
         (keys.of_every_auction("f", "result"), "thermofleet/v1/f/auction/*/result"),
         (keys.asked_by("f", "a", "lease", "arm 1/b"), "thermofleet/v1/f/auction/a/lease/arm%201%2Fb"),
         (keys.asked_by_every_arm("f", "x", "report"), "thermofleet/v1/f/auction/x/report/*"),
-        (keys.asked_of_every_auction("f", "report", "x"), "thermofleet/v1/f/auction/*/report/x"),
+        (keys.asked_of_all("f", "report", "x"), "thermofleet/v1/f/auction/*/report/x"),
+        (keys.asked_by("f", "a", "grant", "arm 1/b"), "thermofleet/v1/f/arm/a/grant/arm%201%2Fb"),
+        (keys.asked_by_every_arm("f", "x", "grant"), "thermofleet/v1/f/arm/x/grant/*"),
+        (keys.asked_of_all("f", "grant", "x"), "thermofleet/v1/f/arm/*/grant/x"),
     ],
 )
 def test_keys_are_written_as_the_design_says(built, written):
@@ -100,6 +103,8 @@ def test_keys_are_written_as_the_design_says(built, written):
         "thermofleet/v1/f/auction/a/lease/x/y",
         "thermofleet/v1/f/auction/a/result/x",
         "thermofleet/v1/f/arm/a/lease/x",
+        "thermofleet/v1/f/arm/a/grant",
+        "thermofleet/v1/f/auction/a/grant/x",
         "thermofleet/v1/f/jobs/a/lease/x",
         "thermofleet/v1/f/jobs/a/submit",
         "thermofleet/v1/f/arm/state",
@@ -122,7 +127,7 @@ def test_an_answer_goes_under_the_key_of_the_one_who_asked(key):
     everybody = keys.asked_by_every_arm(key.fleet, key.name, key.topic)
     assert zenoh.KeyExpr(everybody).includes(str(key))
     assert keys.answered(everybody, str(key)) == str(key)
-    assert keys.answered(everybody, keys.asked_of_every_auction(key.fleet, key.topic, key.asker)) == str(key)
+    assert keys.answered(everybody, keys.asked_of_all(key.fleet, key.topic, key.asker)) == str(key)
     assert keys.answered("any/concrete/key", str(key)) == "any/concrete/key"
 
 
@@ -134,7 +139,7 @@ def test_who_asks_as_nobody_is_not_answered(asked):
         keys.answered(keys.asked_by_every_arm("f", "a", "lease"), f"thermofleet/v1/f/{asked}")
 
 
-def test_only_what_an_arm_asks_an_auctioneer_ends_in_a_name():
+def test_only_what_an_arm_asks_as_itself_ends_in_a_name():
     with pytest.raises(ValueError, match=r"Nobody's name ends the keys of 'result' \(got 'x'\)"):
         str(Key("f", "auction", "a", "result", "x"))
     with pytest.raises(ValueError, match="must not be empty"):

@@ -68,7 +68,7 @@ def test_every_key_has_the_speakers_that_it_should_have(message):
 def test_what_ends_in_the_name_of_an_arm_is_asked_by_that_arm_alone():
     rules = access_control(of_arms("f", ARMS))
     asked = [key for key in EVERY_KEY if keys.parse(key).asker]
-    assert len(asked) == 2 * 2 * len(ARMS)
+    assert len(asked) == (2 * 2 + len(ARMS)) * len(ARMS)
     for key, participant in product(asked, of_arms("f", ARMS).participants):
         may = allowed(rules, participant.common_name, "ingress", "query", key)
         assert may == (participant.name == keys.parse(key).asker), (participant, key)

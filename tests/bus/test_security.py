@@ -21,6 +21,7 @@ from zenoh import ext
 from fleet.bus import keys
 from fleet.bus.answers import Answers
 from fleet.bus.certificates import issue
+from fleet.bus.council import Claim, Grant, Granted, Stake
 from fleet.bus.keyring import add, make
 from fleet.bus.link import Link, Refused
 from fleet.bus.memory import MemoryExchange
@@ -239,6 +240,7 @@ ASKERS = {
     keys.of_arm("f", "arm_0", "award"): {"auctioneer"},
     keys.asked_by("f", "auctioneer", "lease", "arm_0"): {"arm_0"},
     keys.asked_by("f", "auctioneer", "report", "arm_1"): {"arm_1"},
+    keys.asked_by("f", "arm_0", "grant", "arm_1"): {"arm_1"},
     keys.of_jobs("f", "submit"): {"submitter"},
     keys.of_jobs("f", "status"): {"submitter", "monitor", "recorder", "auctioneer"},
     keys.of_clock("f"): {"arm_0", "arm_1", "submitter", "monitor", "recorder", "auctioneer"},
@@ -310,21 +312,28 @@ def serve(condition: Callable[[], bool], *links: Link) -> None:
 
 
 @pytest.mark.parametrize("topic", keys.ASKED)
-def test_an_arm_neither_renews_nor_reports_for_another(router, side, connect, folder, topic):
+def test_an_arm_neither_renews_nor_reports_nor_claims_for_another(router, side, connect, folder, topic):
     """Neither under its own key with the other's name in the word, nor under the other's; for itself it does."""
     words = {
         "lease": lambda arm: LeaseRequest(arm, (Hold("w", "j", 0, "working"),)),
         "report": lambda arm: Report(arm, "w", "j", "finished", 1, 0.0),
+        "grant": lambda arm: Claim(arm, 1, (Stake("w", "j", ("p",), 0, "wanted"),)),
+    }
+    answers = {
+        "lease": Lease("auctioneer", 6.0, ("w",), ()),
+        "report": Receipt("auctioneer", "w"),
+        "grant": Grant("arm_0", 1, 6.0, (Granted("w", 0),)),
     }
     taken: list[str] = []
 
-    def take(word: LeaseRequest | Report) -> Lease | Receipt:
+    def take(word: LeaseRequest | Report | Claim) -> Lease | Receipt | Grant:
         taken.append(word.arm)
-        return Lease("auctioneer", 6.0, ("w",), ()) if isinstance(word, LeaseRequest) else Receipt("auctioneer", "w")
+        return answers[topic]
 
-    endpoint = Tls(folder, "auctioneer").endpoint(router.endpoint) if side == "guarded" else router.endpoint
+    owner, role = ("arm_0", "arm") if topic == "grant" else ("auctioneer", "auction")
+    endpoint = Tls(folder, owner).endpoint(router.endpoint) if side == "guarded" else router.endpoint
     with Link(endpoint, "f") as auctioneer:
-        auctioneer.answer(keys.asked_by_every_arm("f", "auctioneer", topic), type(words[topic]("x")), take)
+        auctioneer.answer(keys.asked_by_every_arm("f", owner, topic), type(words[topic]("x")), take)
         settled(raw(auctioneer))
         rogue = connect("arm_1")
 
@@ -341,10 +350,10 @@ def test_an_arm_neither_renews_nor_reports_for_another(router, side, connect, fo
             return [str(reply.ok.encoding).split(".")[1] for reply in got]
 
         def ask_as(asker: str, arm: str) -> list[str]:
-            one, every = keys.asked_by("f", "auctioneer", topic, asker), keys.asked_of_every_auction("f", topic, asker)
+            one, every = keys.asked_by("f", owner, topic, asker), keys.asked_of_all("f", topic, asker)
             return ask_under(one, arm) + ask_under(every, arm)
 
-        answer = {"lease": "Lease", "report": "Receipt"}[topic]
+        answer = type(answers[topic]).__name__
         assert ask_as("arm_1", "arm_0") == ["Refusal"] * 2
         assert taken == []
         assert auctioneer.malformed == 2
@@ -352,7 +361,7 @@ def test_an_arm_neither_renews_nor_reports_for_another(router, side, connect, fo
         assert ask_as("arm_0", "arm_0") == ([] if side == "guarded" else [answer] * 2)
         assert ask_as("arm_1", "arm_1") == [answer] * 2
         assert taken == ([] if side == "guarded" else ["arm_0"] * 2) + ["arm_1"] * 2
-        for nobody in (keys.asked_by_every_arm("f", "auctioneer", topic), keys.all_of("f", "auction", "auctioneer")):
+        for nobody in (keys.asked_by_every_arm("f", owner, topic), keys.all_of("f", role, owner)):
             assert ask_under(nobody, "arm_0") == []
         assert len(taken) == (2 if side == "guarded" else 4)
 

@@ -35,8 +35,8 @@ from fleet.live.bidding import Bidding
 from scenarios import live_auction
 from scenarios.build import make_env
 from scenarios.cli import main
-from scenarios.live_allocation import allocation, bids_of
 from scenarios.live_auction import own_jobs, word_of
+from scenarios.live_policies import allocation, bids_of
 from scenarios.live_submit import parts, read_jobs
 from scenarios.load import load
 
@@ -213,22 +213,33 @@ def test_quotes_become_arrays():
     np.testing.assert_array_equal(bids.value, [2.0, 1.0])
 
 
-@pytest.mark.parametrize("assignment", ["ssi", "matching"])
-def test_the_arm_that_would_get_hot_does_not_get_the_job(assignment):
+@pytest.mark.parametrize("policy", ["ssi", "matching", "consensus"])
+def test_the_arm_that_would_get_hot_does_not_get_the_job(policy):
     jobs = (JobWord("a", "hold", ("x",)),)
     quotes = {
         "hot": quote("hot", Offer("a", True, d=1.0, p_saturation=0.9, finish_in_s=10.0)),
         "cool": quote("cool", Offer("a", True, d=1.1, p_saturation=0.0, finish_in_s=20.0)),
     }
     bidding = Bidding("r", 0.0, jobs, quotes)
-    assert allocation("thermal", assignment, 60.0)(bidding) == {"a": "cool"}
-    assert allocation("quickest", assignment, 60.0)(bidding) == {"a": "hot"}
+    assert allocation(policy, 60.0)(bidding) == {"a": "cool"}
+    if policy != "consensus":
+        assert allocation(f"quickest_{policy}", 60.0)(bidding) == {"a": "hot"}
 
 
-def test_an_unknown_rule_is_one_sentence(capsys):
-    code, _, err = call(capsys, "auction", "quickstart", "--rule", "thermo")
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("auction", "quickstart", "--policy", "match"), "No policy 'match' of a live fleet; did you mean 'matching'?"),
+        (("up", "quickstart", "--policy", "sssi"), "did you mean 'ssi'?"),
+        (("auction", "quickstart", "--policy", "consensus"), "'consensus' takes no auctioneer: thermofleet arm"),
+        (("arm", "quickstart", "arm_0", "--policy", "ssi"), "'ssi' takes an auctioneer: thermofleet auction"),
+        (("arm", "quickstart", "arm_0", "--policy", "consensus", "--jobs", "all"), "--jobs must be scenario or none"),
+    ],
+)
+def test_a_policy_that_cannot_be_is_one_sentence(capsys, words, complaint):
+    code, _, err = call(capsys, *words)
     assert code == 2
-    assert "No rule 'thermo'; did you mean 'thermal'?" in err
+    assert complaint in " ".join(err.split())
 
 
 # the commands

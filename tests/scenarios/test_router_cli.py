@@ -147,7 +147,7 @@ def test_keys_are_made_shown_and_added_to(capsys, folder):
 
 def test_up_gives_every_process_its_own_certificate(folder):
     options = {"port": 7447, "fleet": "quickstart", "folder": Path("run"), "speed": 60.0, "seed": 0, "jobs": "none"}
-    chosen = {"rule": "thermal", "assignment": "matching", "difficulty": "blind"}
+    chosen = {"policy": "matching", "difficulty": "blind"}
     router, arms, record, auction = parts_of("quickstart", ("arm_0", "arm_1"), tls=folder, **options, **chosen)
     assert router.argv[router.argv.index("--tls") + 1] == str(folder)
     assert router.ready == "tls/127.0.0.1:7447"

@@ -1,0 +1,106 @@
+"""An arm that shares the jobs out with its peers, as `thermofleet arm --policy consensus` runs it."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fleet.errors import FleetError
+from scenarios.live_policies import AMONG_ARMS, allocation, check
+from scenarios.scenario import Scenario
+
+if TYPE_CHECKING:
+    from fleet.live.arm_node import ArmNode
+    from fleet.live.council_node import CouncilNode, Membership
+    from fleet.live.orders import Worker
+    from scenarios.stopping import Stop
+
+TURN_S = 0.25
+"""Real seconds between two looks at what else is to be done."""
+FAREWELL_S = 2.0
+"""Real seconds for the last words: peers that do not know yet that all is done ask for it."""
+
+
+def among_arms(policy: str) -> bool:
+    """Whether by this policy arms need no auctioneer.
+
+    Raises:
+        FleetError: no such policy.
+    """
+    check(policy)
+    return policy in AMONG_ARMS
+
+
+def membership_of(scenario: Scenario, policy: str, *, jobs: str, seed: int) -> "Membership":
+    """What all arms of a scenario share from the beginning.
+
+    Args:
+        jobs: scenario or none.
+        seed: Draws the scenario's jobs.
+    """
+    from fleet.live.council_node import Membership
+    from scenarios.live_auction import own_jobs
+
+    stream = tuple(own_jobs(scenario, seed)) if jobs == "scenario" else ()
+    roster = tuple(arm.name for arm in scenario.arms)
+    horizon_s = scenario.horizon_s if jobs == "scenario" else float("inf")
+    agree = allocation(policy, scenario.limits.warning_c)
+    return Membership(roster=roster, agree=agree, stream=stream, horizon_s=horizon_s)
+
+
+@contextmanager
+def seat(path: Path, membership: "Membership") -> Iterator[Any]:
+    """What gives an arm its seat among its peers, with the journal of its grants at `path` held open.
+
+    Raises:
+        FleetError: the journal cannot be used.
+    """
+    from fleet.live.council_node import CouncilNode
+    from fleet.live.granting import Deed
+    from fleet.live.journal import Journal
+
+    with Journal[Deed](path, Deed) as book:
+
+        def take_seat(worker: "Worker", life: int) -> "CouncilNode":
+            if worker.contractor.arm not in membership.roster:
+                roster = ", ".join(membership.roster)
+                raise FleetError(f"'{worker.contractor.arm}' is no arm of this scenario. Arms: {roster}.")
+            return CouncilNode(worker, membership, book, life=life)
+
+        yield take_seat
+
+
+def work(node: "ArmNode", stop: "Stop") -> bool:
+    """Live until all is done, or until told to stop; says which it was."""
+    from fleet.live.council_node import CouncilNode
+
+    orders = node.orders
+    assert isinstance(orders, CouncilNode)
+    while not stop.is_set() and not orders.over:
+        node.serve(time.monotonic() + TURN_S)
+    done = not stop.is_set()
+    until_s = time.monotonic() + FAREWELL_S
+    while done and not stop.is_set() and time.monotonic() < until_s:
+        node.serve(min(until_s, time.monotonic() + TURN_S))
+    return done
+
+
+def told(node: "ArmNode") -> str:
+    """How it stands, in a line or more."""
+    from fleet.live.council_node import CouncilNode
+
+    orders = node.orders
+    assert isinstance(orders, CouncilNode)
+    statuses = orders.statuses()
+    finished = sum(said.state == "finished" for said in statuses)
+    lines = [
+        f"{node.clock.now_s(time.monotonic()):.0f} s: {finished} of {len(statuses)} jobs finished, as this arm knows; "
+        f"it worked out {orders.council.rounds} times who gets what."
+    ]
+    lines += [
+        f"  {said.job}: {said.state}{f' at {said.arm}' if said.arm else ''}{f', {said.reason}' if said.reason else ''}"
+        for said in statuses
+        if said.state != "finished"
+    ]
+    return "\n".join(lines)
