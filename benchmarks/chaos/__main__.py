@@ -1,10 +1,11 @@
 """Faults against a whole fleet, each participant a process: what is lost or done twice, and how soon it recovers.
 
-    python benchmarks/chaos [--only NAME,NAME] [--jobs 24] [--speed 120] [--keep DIR]
+    python benchmarks/chaos [--only NAME,NAME] [--jobs 24] [--speed 120] [--keep DIR] [--no-namespaces]
 
 For every fault a fleet of four arms is started anew (router, auctioneer, recorder, arms, on loopback; `trespass` with
-TLS), gets jobs, and while they are worked on the fault strikes. Then all jobs must come to an end: finished once, or
-reported unfinished. Whether a job was done twice is read from the journals of the arms, not asked of the auctioneer.
+TLS, as is `partition` where root can make network namespaces), gets jobs, and while they are worked on the fault
+strikes. Then all jobs must come to an end: finished once, or reported unfinished. Whether a job was done twice is read
+from the journals of the arms, not asked of the auctioneer.
 Detected: real seconds until the bus shows that something is wrong (a token gone, a state older than 3 s). Recovered:
 until everybody is there and speaks again and the auctioneer answers; it counts the fault itself, where that takes time.
 Exit code 1 if a job is lost or done twice, a process has died that nobody killed, somebody did what it may not, or a
@@ -14,12 +15,14 @@ clock was thrown off. Bounded: at most `PATIENCE_S` for each part of a fault.
 import argparse
 import logging
 import math
+import signal
 import sys
 import tempfile
 from contextlib import ExitStack
 from pathlib import Path
 
 from campaign import SCENARIO, campaign
+from namespaces import why_not
 from partition import partition
 from processes import full_disk, kill_arm, kill_auctioneer, kill_router, stop_arm, stuck_subscriber
 from rubbish import replayed_awards, rubbish
@@ -52,11 +55,16 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=24)
     parser.add_argument("--speed", type=float, default=120.0, help="fleet seconds per real second")
     parser.add_argument("--keep", type=Path, help="folder in which journals, logs and recordings stay")
+    parser.add_argument("--no-namespaces", action="store_true", help="cut by a line of our own, also where root is")
     arguments = parser.parse_args()
     chosen = arguments.only.split(",")
     if unknown := [name for name in chosen if name not in FAULTS]:
         parser.error(f"no fault '{unknown[0]}'; there are {', '.join(FAULTS)}")
     logging.basicConfig(level=logging.ERROR)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # in order: namespaces outlive a process
+    no_namespaces = ""
+    if any(FAULTS[name].line for name in chosen):
+        no_namespaces = "--no-namespaces" if arguments.no_namespaces else why_not()
     prepare(load(SCENARIO), difficulty="blind")  # once, so that no arm has to plan while it is struck
     columns = ("fault", "jobs", "finished", "unfinished", "lost", "twice", "died", "detected s", "recovered s", "all s")
     widths = (18, 5, 9, 11, 5, 6, 5, 11, 12, 7)
@@ -65,7 +73,8 @@ def main() -> None:
     for name in chosen:
         with ExitStack() as stack:
             folder = arguments.keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            found = campaign(FAULTS[name], folder / name, jobs=arguments.jobs, speed=arguments.speed)
+            amount = {"jobs": arguments.jobs, "speed": arguments.speed}
+            found = campaign(FAULTS[name], folder / name, **amount, namespaces=not no_namespaces)
         good = good and found.good
         numbers = (
             len(found.lost),
@@ -75,7 +84,10 @@ def main() -> None:
             found.recovered_s,
             found.took_s,
         )
-        cells = (name, arguments.jobs, found.finished, found.unfinished, *numbers)
+        named = f"{name} ({found.by})" if found.by else name
+        if found.by == "line":
+            found.notes += (f"without namespaces: {no_namespaces}",)
+        cells = (named, arguments.jobs, found.finished, found.unfinished, *numbers)
         print("".join(f"{_text(cell):>{width}}" for cell, width in zip(cells, widths, strict=True)), flush=True)
         for what in ("lost", "twice", "died", "wrong", "notes"):
             if names := getattr(found, what):

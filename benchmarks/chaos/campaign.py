@@ -6,18 +6,20 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
+from namespaces import Namespaces
 from partition import Line
 from struck import Fault, Fleet, Outcome
 from wall_clock import WallClocks
 
 from fleet.bus import keys
+from fleet.bus.certificates import HERE
 from fleet.bus.keyring import make
 from fleet.bus.link import Link
 from fleet.bus.roster import Participant, of_arms
 from fleet.bus.router import open_client
 from fleet.bus.security import Tls
 from fleet.bus.trade import JobWord, Submission, Submitted
-from fleet.live.supervisor import Backoff, Part, Supervisor
+from fleet.live.supervisor import Backoff, Supervisor
 from scenarios.live_up import free_port, parts_of
 from scenarios.load import load
 
@@ -30,37 +32,46 @@ ROGUE = "rogue"
 """An arm of the roster that is not in the scenario."""
 
 
-def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float) -> Outcome:
+def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float, namespaces: bool) -> Outcome:
     """One fleet, one fault, and what became of it.
+
+    Args:
+        namespaces: Cut by network namespaces, with certificates, rather than by a line of ours.
 
     Raises:
         RuntimeError: the fleet did not come up, or this machine cannot make the fault.
     """
     arms, port = tuple(arm.name for arm in load(SCENARIO).arms), free_port()
-    place = folder / "keys" if fault.tls else None
-    if place is not None:
-        make(place, of_arms(SCENARIO, arms, [Participant(ROGUE, "arm")]), days=30)
-    router, of_fleet, record, auction = parts_of(
-        SCENARIO,
-        arms,
-        port=port,
-        fleet=SCENARIO,
-        folder=folder,
-        speed=speed,
-        policy="quickest_matching",
-        difficulty="blind",
-        jobs="none",
-        seed=0,
-        tls=place,
-    )
-    work = tuple(_job(number) for number in range(jobs))
+    away = arms[len(arms) // 2 :]
     with ExitStack() as stack:
+        cut = None
+        if fault.line:
+            cut = stack.enter_context(Namespaces(away, port) if namespaces else Line(port))
+        place = folder / "keys" if fault.tls or isinstance(cut, Namespaces) else None
+        if place is not None:
+            hosts = cut.hosts.values() if isinstance(cut, Namespaces) else ()
+            make(place, of_arms(SCENARIO, arms, [Participant(ROGUE, "arm")]), days=30, hosts=(*HERE, *hosts))
+        router, of_fleet, record, auction = parts_of(
+            SCENARIO,
+            arms,
+            port=port,
+            fleet=SCENARIO,
+            folder=folder,
+            speed=speed,
+            rule="quickest",
+            assignment="matching",
+            difficulty="blind",
+            jobs="none",
+            seed=0,
+            tls=place,
+        )
+        if isinstance(cut, Namespaces):
+            router = replace(router, argv=(*router.argv, "--host", "0.0.0.0"))
+        work = tuple(_job(number) for number in range(jobs))
         clocks = WallClocks(folder / "clocks") if fault.clocks else None
-        line = stack.enter_context(Line(port)) if fault.line else None
+        if cut is not None:
+            of_fleet[-len(away) :] = map(cut.through, of_fleet[-len(away) :], away)
         parts = [record, auction, *of_fleet]
-        if line is not None:
-            half = 2 + len(arms) // 2
-            parts[half:] = [_through(part, port, line.port) for part in parts[half:]]
         if clocks is not None:
             router = replace(router, env=clocks.env("router"))
             parts = [replace(part, env=clocks.env(part.name)) for part in parts]
@@ -73,7 +84,8 @@ def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float) -> Outcome:
         endpoint = router.ready if place is None else Tls(place, "submitter").endpoint(router.ready)
         link = stack.enter_context(Link(endpoint, SCENARIO))
         session = stack.enter_context(open_client(endpoint, timeout_s=5.0))
-        fleet = Fleet(supervisor, link, router.ready, session, folder, arms, keys=place, line=line, clocks=clocks)
+        fleet = Fleet(supervisor, link, router.ready, session, folder, arms, keys=place, line=cut, clocks=clocks)
+        fleet.away = away
         fleet.listen()
         if math.isinf(fleet.until(lambda: len(fleet.states) == len(arms) and len(fleet.tokens) == len(arms), 30.0)):
             raise RuntimeError(f"Only {sorted(fleet.states)} of {arms} are on the bus.")
@@ -90,14 +102,10 @@ def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float) -> Outcome:
         ended_s = time.monotonic()
         fleet.until(lambda: not _doubtful(fleet), LATE_S)
         outcome = _outcome(fleet, taken)
+        outcome.by = "" if cut is None else cut.by
         outcome.detected_s, outcome.recovered_s = detected_s, recovered_s
         outcome.took_s = ended_s - struck_s if math.isfinite(settled_s) else math.inf
     return outcome
-
-
-def _through(part: Part, port: int, line: int) -> Part:
-    """The part, reaching the router through a line."""
-    return replace(part, argv=tuple(word.replace(f"127.0.0.1:{port}", f"127.0.0.1:{line}") for word in part.argv))
 
 
 def _job(number: int) -> JobWord:

@@ -1,16 +1,21 @@
 """A cut between some arms and the router, and its healing: nothing goes through, and nobody is told.
 
-Arms reach the router through a line of ours. While it is cut nothing is read from either end, as if a cable were
-pulled: no end sees a reset, new connections are taken up by the system and say nothing. Needs no root, no namespaces.
+Where root is, the arms live in network namespaces (`namespaces`) and their cables are pulled. Elsewhere they reach the
+router through a line of ours. While it is cut nothing is read from either end: no end sees a reset, new connections are
+taken up by the system and say nothing.
 """
 
 import selectors
 import socket
 import threading
 from contextlib import suppress
+from dataclasses import replace
 from typing import Self
 
+from namespaces import Namespaces
 from struck import Fleet
+
+from fleet.live.supervisor import Part
 
 CUT_S = 12.0
 """Longer than a lease: what the arms have in hand may be given to others."""
@@ -19,6 +24,8 @@ _LOOK_S = 0.05
 
 class Line:
     """`with Line(port) as line:` hands everything that comes to `line.port` on to another port, until it is cut."""
+
+    by = "line"
 
     def __init__(self, to_port: int) -> None:
         self._to, self._listener = ("127.0.0.1", to_port), socket.create_server(("127.0.0.1", 0))
@@ -41,6 +48,11 @@ class Line:
         for end in (*self._other, self._listener):
             end.close()
         self._ready.close()
+
+    def through(self, part: Part, _arm: str) -> Part:
+        """The part, reaching the router through this line."""
+        there, here = f"127.0.0.1:{self._to[1]}", f"127.0.0.1:{self.port}"
+        return replace(part, argv=tuple(word.replace(there, here) for word in part.argv))
 
     def cut(self) -> None:
         """From now on nothing goes through."""
@@ -93,13 +105,19 @@ class Line:
 
 def partition(fleet: Fleet) -> float:
     """Half of the arms are cut off for longer than a lease, in the middle of their jobs."""
-    line = fleet.line
-    assert isinstance(line, Line)
-    away = set(fleet.arms[len(fleet.arms) // 2 :])
+    line, away = fleet.line, set(fleet.away)
+    assert isinstance(line, Line | Namespaces)
     fleet.until(lambda: any(fleet.states[arm][1].mode == "working" for arm in away), 20.0)
     line.cut()
     seen_s = fleet.until(lambda: all(map(fleet.unwell, away)), 10.0)
     fleet.until(lambda: False, CUT_S)
     line.heal()
-    fleet.note(f"{', '.join(sorted(away))} cut off for {CUT_S + min(seen_s, 10.0):.0f} s")
+    healed_s = fleet.until(lambda: not any(map(fleet.unwell, away)), 30.0)
+    how = (
+        "each in a network namespace, its link down"
+        if line.by == "netns"
+        else "behind a line of ours that says nothing"
+    )
+    cut_s = CUT_S + min(seen_s, 10.0)
+    fleet.note(f"{', '.join(sorted(away))} cut off for {cut_s:.0f} s, {how}; back {healed_s:.1f} s after it was healed")
     return seen_s

@@ -29,6 +29,8 @@ STALE_S = 3.0
 class Outcome:
     """What became of a fleet that was struck."""
 
+    by: str = ""
+    """Which of several ways to make the fault was taken."""
     finished: int = 0
     unfinished: int = 0
     lost: tuple[str, ...] = ()
@@ -64,6 +66,8 @@ class Fleet:
     """Of the participants, where the router wants certificates."""
     line: AbstractContextManager[object] | None = None
     """Between some arms and the router."""
+    away: tuple[str, ...] = ()
+    """Those arms."""
     clocks: object = None
     """The wall clocks of the participants, where they can be set."""
     notes: list[str] = field(default_factory=list)
@@ -158,6 +162,6 @@ class Fault:
     strike: Strike
     tls: bool = False
     line: bool = False
-    """Half of the arms reach the router through a line that can be cut."""
+    """Half of the arms reach the router through what can be cut: network namespaces (`tls`), or a line of ours."""
     clocks: bool = False
     """The wall clock of each participant can be set."""
