@@ -9,7 +9,8 @@ from the journals of the arms, not asked of the auctioneer.
 Detected: real seconds until the bus shows that something is wrong (a token gone, a state older than 3 s). Recovered:
 until everybody is there and speaks again and the auctioneer answers; it counts the fault itself, where that takes time.
 Exit code 1 if a job is lost or done twice, a process has died that nobody killed, somebody did what it may not, or a
-clock was thrown off. Bounded: at most `PATIENCE_S` for each part of a fault.
+clock was thrown off; 2 if all that was run went well, but this machine lacks what a fault needs, which was not run.
+Bounded: at most `PATIENCE_S` for each part of a fault.
 """
 
 import argparse
@@ -26,7 +27,7 @@ from namespaces import why_not
 from partition import partition
 from processes import full_disk, kill_arm, kill_auctioneer, kill_router, stop_arm, stuck_subscriber
 from rubbish import replayed_awards, rubbish
-from struck import Fault
+from struck import CannotStrike, Fault
 from trespass import trespass
 from wall_clock import clock_jump
 
@@ -69,12 +70,17 @@ def main() -> None:
     columns = ("fault", "jobs", "finished", "unfinished", "lost", "twice", "died", "detected s", "recovered s", "all s")
     widths = (18, 5, 9, 11, 5, 6, 5, 11, 12, 7)
     print("".join(f"{name:>{width}}" for name, width in zip(columns, widths, strict=True)), flush=True)
-    good = True
+    good, not_run = True, list[str]()
     for name in chosen:
         with ExitStack() as stack:
             folder = arguments.keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))
             amount = {"jobs": arguments.jobs, "speed": arguments.speed}
-            found = campaign(FAULTS[name], folder / name, **amount, namespaces=not no_namespaces)
+            try:
+                found = campaign(FAULTS[name], folder / name, **amount, namespaces=not no_namespaces)
+            except CannotStrike as lack:
+                print(f"{name:>{widths[0]}}  not run: {lack}.", flush=True)
+                not_run.append(name)
+                continue
         good = good and found.good
         numbers = (
             len(found.lost),
@@ -92,7 +98,9 @@ def main() -> None:
         for what in ("lost", "twice", "died", "wrong", "notes"):
             if names := getattr(found, what):
                 print(f"    {what}: {', '.join(names)}", flush=True)
-    sys.exit(0 if good else 1)
+    if not_run:
+        print(f"Not run: {', '.join(not_run)}.", flush=True)
+    sys.exit(1 if not good else 2 if not_run else 0)
 
 
 def _text(value: object) -> str:

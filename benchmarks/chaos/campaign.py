@@ -39,7 +39,8 @@ def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float, namespaces:
         namespaces: Cut by network namespaces, with certificates, rather than by a line of ours.
 
     Raises:
-        RuntimeError: the fleet did not come up, or this machine cannot make the fault.
+        RuntimeError: the fleet did not come up.
+        CannotStrike: this machine cannot make the fault.
     """
     arms, port = tuple(arm.name for arm in load(SCENARIO).arms), free_port()
     away = arms[len(arms) // 2 :]

@@ -25,6 +25,10 @@ PATIENCE_S = 150.0
 STALE_S = 3.0
 
 
+class CannotStrike(Exception):
+    """This machine cannot make a fault; says what it lacks."""
+
+
 @dataclass(eq=False)
 class Outcome:
     """What became of a fleet that was struck."""

@@ -14,7 +14,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from struck import Fleet
+from struck import CannotStrike, Fleet
 
 from fleet.bus import keys
 from fleet.bus.trade import Clock, ClockRequest
@@ -32,15 +32,19 @@ class WallClocks:
         """Make the library and the folder of clocks.
 
         Raises:
-            RuntimeError: there is no C compiler, or the library has no effect here.
+            CannotStrike: there is no C compiler, or the library has no effect here.
         """
         compiler = shutil.which("cc")
         if compiler is None or not sys.platform.startswith("linux"):
-            raise RuntimeError("a clock that jumps needs Linux and a C compiler (cc)")
+            raise CannotStrike("a wall clock that jumps needs Linux and a C compiler, cc")
         self._folder = folder
         folder.mkdir(parents=True)
         library = [compiler, "-shared", "-fPIC", "-O1", "-o", str(folder / "wall_clock.so"), str(SOURCE)]
-        subprocess.run(library, check=True)
+        built = subprocess.run(library, capture_output=True, text=True, check=False)
+        if built.returncode:
+            raise CannotStrike(
+                f"{compiler} did not build {SOURCE.name}: {(built.stderr.splitlines() or ['it says nothing'])[0]}"
+            )
         self._prove()
 
     def env(self, name: str) -> Mapping[str, str]:
@@ -71,7 +75,7 @@ class WallClocks:
             process.stdin.close()
         jumped_s, passed_s = (second - first for first, second in zip(*seen, strict=True))
         if not (abs(jumped_s - YEAR_S) < 60 and 0 <= passed_s < 60):
-            raise RuntimeError(f"the clock was to jump by {YEAR_S} s, and jumped by {jumped_s:.0f} s")
+            raise CannotStrike(f"the clock was to jump by {YEAR_S} s, and jumped by {jumped_s:.0f} s")
 
 
 def clock_jump(fleet: Fleet) -> float:

@@ -1,5 +1,6 @@
 """A short part of the campaign of benchmarks/chaos: real processes, real signals, and every job done once."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -11,13 +12,14 @@ import pytest
 CAMPAIGN = Path(__file__).parents[2] / "benchmarks" / "chaos"
 
 
-def strike(*faults, jobs):
+def strike(*faults, jobs, env=None):
     return subprocess.run(
         [sys.executable, str(CAMPAIGN), "--only", ",".join(faults), "--jobs", str(jobs), "--speed", "240"],
         capture_output=True,
         text=True,
         timeout=900,
         check=False,
+        env=env,
     )
 
 
@@ -34,6 +36,15 @@ def test_a_fleet_with_certificates_lets_no_trespasser_in():
     tried, opened = map(int, re.search(r"(\d+) ways in tried, (\d+) open", told.stdout).groups())
     assert tried >= 30
     assert opened == 0
+
+
+def test_a_fault_that_cannot_be_made_here_is_not_run_and_has_not_passed():
+    told = strike("clock-jump", jobs=12, env=os.environ | {"PATH": ""})
+    assert told.returncode == 2, told.stdout + told.stderr
+    *_, row, end = told.stdout.splitlines()
+    assert row.strip() == "clock-jump  not run: a wall clock that jumps needs Linux and a C compiler, cc."
+    assert end == "Not run: clock-jump."
+    assert told.stderr == ""
 
 
 @pytest.mark.slow
