@@ -143,24 +143,21 @@ class _Draw:
         self._lots, self._randomise = lots, randomise
         self._wild = lots > 1 or randomise != Randomisation()
         self._source = QuickSource(scenario)
-        streams = scenario.jobs
-        self._lowest = np.array([stream.repetitions[0] for stream in streams])
-        self._counts = np.array([stream.repetitions[1] - stream.repetitions[0] + 1 for stream in streams])
-        works = np.array([len(stream.payload_kg) for stream in streams])
-        self._first = np.cumsum([0, *(works * self._counts)])[:-1]
-        self._due_s = np.array([stream.due_s for stream in streams], dtype=float)
+        self._first = np.cumsum([0, *self._source.spans.prod(axis=1)])[:-1]
+        """Where the kinds of each stream begin; see `_kinds`."""
+        self._due_s = np.array([stream.due_s for stream in scenario.jobs], dtype=float)
 
     def __call__(self, seed: np.random.SeedSequence) -> Shift:
         lot, air_k, often = self._varied(seed) if self._wild else (0, 0.0, 1.0)
-        drawn = self._source.draw(seed, often)
+        source, drawn = self._source, self._source.draw(seed, often)
         stream = drawn.stream
         return Shift(
             lot=lot,
             air_k=air_k,
-            kind=self._first[stream] + drawn.payload * self._counts[stream] + drawn.more,
+            kind=self._first[stream] + drawn.payload * source.spans[stream, 1] + drawn.more,
             release_s=drawn.release_s,
             due_s=drawn.release_s + self._due_s[stream],
-            repetitions=self._lowest[stream] + drawn.more,
+            repetitions=source.lowest[stream] + drawn.more,
             after=drawn.after,
             key=children_of(seed, _SENSORS)[0][0],
         )

@@ -175,10 +175,11 @@ class QuickSource:
         self._after = np.full((len(streams), waits), -1)
         for i, stream in enumerate(streams):
             self._after[i, : len(stream.after)] = [names.index(other) for other in stream.after]
-        lowest = np.array([stream.repetitions[0] for stream in streams], dtype=int)
-        most = np.array([stream.repetitions[1] for stream in streams], dtype=int)
-        self._lowest = lowest
-        self._spans = np.stack([[len(stream.payload_kg) for stream in streams], most - lowest + 1], axis=-1)
+        lowest, most = (np.array([stream.repetitions[i] for stream in streams], dtype=int) for i in (0, 1))
+        self.lowest = lowest
+        """Fewest repetitions of each stream, int [stream]."""
+        self.spans = np.stack([[len(stream.payload_kg) for stream in streams], most - lowest + 1], axis=-1)
+        """How many payloads and repetitions each stream chooses from, int [stream, 2]."""
         self._keys = np.array([[0, i] for i in range(len(streams))], dtype=int).reshape(-1, 2)
         """A shift's first child is its jobs', and the children of that are the streams'."""
         self._generator = np.random.Generator(np.random.PCG64(0))
@@ -194,7 +195,7 @@ class QuickSource:
         """With NumPy's own generators."""
         slow = self._source.draw(child(seed, 0), often)
         return QuickJobs(
-            slow.stream, slow.payload, slow.repetitions - self._lowest[slow.stream], slow.release_s, slow.after
+            slow.stream, slow.payload, slow.repetitions - self.lowest[slow.stream], slow.release_s, slow.after
         )
 
     def draw(self, seed: np.random.SeedSequence, often: float = 1.0) -> QuickJobs:
@@ -228,7 +229,7 @@ class QuickSource:
         words = np.concatenate([np.empty(0, np.uint64), *raw])
         rank = self._source.ranks(int(counts.max(initial=0)))
         done = lay_out(
-            counts, words, begins, times_s, window_s, self._spans, rank, self._after, release_s, stream, chosen, after
+            counts, words, begins, times_s, window_s, self.spans, rank, self._after, release_s, stream, chosen, after
         )
         return QuickJobs(stream, chosen[:, 0], chosen[:, 1], release_s, after) if done else self._slow(seed, often)
 
