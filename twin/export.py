@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from fleet.drafts import drafted
 from fleet.errors import FleetError
 from fleet.motion import CHANNELS
 from twin.score import Twin
@@ -43,26 +44,25 @@ def export_onnx(twin: Twin, path: Path) -> Path:
         raise ExportError("Export to ONNX needs the extra 'onnx': pip install 'thermofleet[onnx]'.") from None
     file = path if path.suffix == ".onnx" else path / MODEL
     file.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = file.with_name(f".{file.name}.part")
     example = torch.zeros(2, twin.config.window, twin.joints, len(CHANNELS), dtype=torch.float64)
-    with warnings.catch_warnings(), torch.inference_mode(False), torch.no_grad():
-        # The exporter that replaces this one needs onnxscript; and it warns of LSTMs whose batch varies, which ours
-        # bear: they begin from zeros of the batch's own size. tests/twin/test_export.py runs other sizes.
-        warnings.simplefilter("ignore")
-        torch.onnx.export(
-            _Windows(twin),
-            (example,),
-            str(unfinished),
-            input_names=["windows"],
-            output_names=["reconstruction", "errors", "mu"],
-            dynamic_axes={name: {0: "batch"} for name in ("windows", "reconstruction", "errors", "mu")},
-            opset_version=OPSET,
-            dynamo=False,
-        )
-    model = onnx.load(str(unfinished))
-    onnx.helper.set_model_props(model, _card(twin))
-    onnx.save(model, str(unfinished))
-    unfinished.replace(file)
+    with drafted(file) as draft:
+        with warnings.catch_warnings(), torch.inference_mode(False), torch.no_grad():
+            # The exporter that replaces this one needs onnxscript; and it warns of LSTMs whose batch varies, which ours
+            # bear: they begin from zeros of the batch's own size. tests/twin/test_export.py runs other sizes.
+            warnings.simplefilter("ignore")
+            torch.onnx.export(
+                _Windows(twin),
+                (example,),
+                str(draft),
+                input_names=["windows"],
+                output_names=["reconstruction", "errors", "mu"],
+                dynamic_axes={name: {0: "batch"} for name in ("windows", "reconstruction", "errors", "mu")},
+                opset_version=OPSET,
+                dynamo=False,
+            )
+        model = onnx.load(str(draft))
+        onnx.helper.set_model_props(model, _card(twin))
+        onnx.save(model, str(draft))
     return file
 
 
