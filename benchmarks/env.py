@@ -73,7 +73,7 @@ def library(difficulty: str, arms: int = 4) -> Library:
     fleet = [prepare(load("quickstart"), difficulty=difficulty)]
     one = library_of(fleet, Randomisation(arrivals=(times, times)))
     second = ("step", "to_ambient", "root", "rates", "modes", "motor", "noise_k", "start_c", "plan", "difficulty",
-              "word", "risk")  # fmt: skip
+              "word")  # fmt: skip
     tables = one.tables._replace(
         ambient_c=np.tile(one.tables.ambient_c, (1, 1, times)),
         **{name: np.concatenate([getattr(one.tables, name)] * times, axis=1) for name in second},

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -55,13 +56,15 @@ class Engine:
             open=np.zeros(envs, int),
             queue=np.zeros((envs, jobs), np.int32),
             head=np.zeros(envs, int),
+            hand=np.zeros((envs, arms), int),
+            owed=np.zeros((envs, arms), bool),
         )
+        self._offer.mask[:, :, 0] = 1
         self._all = np.arange(envs)
         self._raw = np.zeros((len(TERMS), envs))
         self._start = np.array(layout.starts)
         self._low, self._high = layout.bounds
-        self._drawn = _no_jobs(envs, jobs, 1)
-        self._rows = _no_rows(envs, arms, jobs)
+        self._drawn, self._rows = _arrays(envs, arms, jobs, 0)
 
     @property
     def envs(self) -> int:
@@ -99,7 +102,8 @@ class Engine:
     def begin(self, env: int, shift: Shift) -> None:
         """Put a new shift into a row; `observe` then tells what its arms know."""
         count = len(shift.kind)
-        waits = shift.after.shape[1] if count else 1
+        after = shift.after[:, (shift.after >= 0).any(axis=0)]
+        waits = after.shape[1]
         if count > self._drawn.kind.shape[1] or waits > self._drawn.after.shape[2]:
             self._make_room(count, waits)
         d, s = self._drawn, self._rows
@@ -107,7 +111,7 @@ class Engine:
         d.kind[env, :count], d.repetitions[env, :count] = shift.kind, shift.repetitions
         d.release_s[env, :count], d.due_s[env, :count] = shift.release_s, shift.due_s
         d.after[env] = -1
-        d.after[env, :count, : shift.after.shape[1]] = shift.after
+        d.after[env, :count, :waits] = after
         for name in _ZERO:
             getattr(s, name)[env] = 0
         s.mode[env], s.job[env], s.clear_at_s[env] = IDLE, -1, np.inf
@@ -146,12 +150,16 @@ class Engine:
         jobs = jobs + jobs // 10 if jobs > have else have
         waits = max(self._drawn.after.shape[2], waits)
         envs, arms = self._rows.mode.shape
-        drawn, rows = _no_jobs(envs, jobs, waits), _no_rows(envs, arms, jobs)
+        drawn, rows = _arrays(envs, arms, jobs, waits)
         queue = np.zeros((envs, jobs), np.int32)
         for new, old in zip((*drawn, *rows, queue), (*self._drawn, *self._rows, self._offer.queue), strict=True):
             new[tuple(slice(0, n) for n in old.shape)] = old
         self._offer = self._offer._replace(queue=queue)
         self._drawn, self._rows = drawn, rows
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._make_room(0, 0)  # what was pickled no longer lies job by job
 
 
 _ZERO = (
@@ -161,37 +169,44 @@ _ZERO = (
 """What is zero at the beginning of a shift."""
 
 
-def _no_jobs(envs: int, jobs: int, waits: int) -> Drawn:
-    return Drawn(
+CACHE_LINE = 64
+_RECORD = ("release_s", "due_s", "queued_s", "kind", "repetitions", "cycles", "returns", "status")
+"""Of a job, what is looked at together: just a cache line, where it is looked for in as many places otherwise."""
+
+
+def _arrays(envs: int, arms: int, jobs: int, waits: int) -> tuple[Drawn, Rows]:
+    """For so many jobs, each of which waits for so many others; there are none yet."""
+    line = CACHE_LINE // 8
+    room = np.zeros(envs * jobs * line + line)
+    first = -room.ctypes.data % CACHE_LINE // 8
+    records = room[first : first + envs * jobs * line].reshape(envs, jobs, line)
+    job = {
+        name: (records if name.endswith("_s") else records.view(np.int64))[..., place]
+        for place, name in enumerate(_RECORD)
+    }
+    job["release_s"][:], job["due_s"][:], job["repetitions"][:] = np.inf, np.inf, 1
+    drawn = Drawn(
         lot=np.zeros(envs, int),
         air_k=np.zeros(envs),
         key=np.zeros(envs, np.uint64),
         jobs=np.zeros(envs, int),
-        kind=np.zeros((envs, jobs), int),
-        release_s=np.full((envs, jobs), np.inf),
-        due_s=np.full((envs, jobs), np.inf),
-        repetitions=np.ones((envs, jobs), int),
         after=np.full((envs, jobs, waits), -1),
+        **{name: job[name] for name in ("kind", "release_s", "due_s", "repetitions")},
     )
-
-
-def _no_rows(envs: int, arms: int, jobs: int) -> Rows:
     per_arm = {
         name: np.zeros((envs, arms))
         for name in ("progress_s", "clear_at_s", "peak_c", "above_warning_s", "busy_s", "lost_s", "energy_j")
     }
     counts = {name: np.zeros((envs, arms), int) for name in ("mode", "job", "todo", "last_award", "faults", "illegal")}
-    return Rows(
+    rows = Rows(
         tick=np.zeros(envs, int),
         temp_c=np.zeros((envs, arms, NODES)),
         **per_arm,
         **counts,
-        status=np.zeros((envs, jobs), int),
-        queued_s=np.zeros((envs, jobs)),
-        cycles=np.zeros((envs, jobs), int),
-        returns=np.zeros((envs, jobs), int),
         finished_s=np.zeros((envs, jobs)),
+        **{name: job[name] for name in ("status", "queued_s", "cycles", "returns")},
     )
+    return drawn, rows
 
 
 def shifts_of(drawn: Drawn, keys: Sequence[int]) -> list[Shift]:

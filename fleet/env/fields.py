@@ -15,7 +15,7 @@ from fleet.sim.boiling import hottest
 from fleet.sim.jit import entry, inner, natural
 from fleet.sim.noise import FIRST, GOLDEN, LEVELS, QUANTILES, SECOND
 from fleet.sim.rows import award, hang_out, live
-from fleet.sim.tables import LANES, Drawn, Offer, Rows, Tables
+from fleet.sim.tables import LANES, RISK, Drawn, Offer, Rows, Tables
 from fleet.telemetry import FAULTED, IDLE, WORKING
 
 Array = np.ndarray
@@ -50,16 +50,15 @@ def noise(key: Any, count: int) -> Any:
 
 
 @inner
-def at_risk(offset: Array, weight: Array, curve: Array, row: int, temp_c: Array) -> float:
-    """Probability to pass the warning limit from motor temperatures [joint]; see `Risk.at`."""
+def at_risk(scores: Array, curve: Array, row: int, temp_c: Array, a: int) -> float:
+    """Probability to pass the warning limit from motor temperatures [arm, joint, then 1]; see `Risk.at`."""
     score = -np.inf
-    for piece in range(offset.shape[1]):
-        here = offset[row, piece]
-        if here == -np.inf:
-            continue
-        for k in range(JOINTS):
-            here += weight[row, piece, k] * temp_c[k]
-        score = max(score, here)
+    for piece in range(scores.shape[1]):
+        near = scores[row, piece, 0] * temp_c[a, 0] + scores[row, piece, 1] * temp_c[a, 1]
+        near += scores[row, piece, 2] * temp_c[a, 2] + scores[row, piece, 3] * temp_c[a, 3]
+        far = scores[row, piece, 4] * temp_c[a, 4] + scores[row, piece, 5] * temp_c[a, 5]
+        far += scores[row, piece, 6] * temp_c[a, 6] + scores[row, piece, 7] * temp_c[a, 7]
+        score = max(score, near + far)
     knots = curve.shape[1]
     if knots == 0 or math.isnan(curve[row, 0, 0]):
         return 1.0 / (1.0 + math.exp(np.float32(-score)))
@@ -88,15 +87,13 @@ def perceive(
 ) -> None:
     """The vectors of the arms of some envs; arguments as in `look`."""
     lots, kinds, keys, repetitions, due_s = d.lot, d.kind, d.key, d.repetitions, d.due_s
-    ticks, temp_c, modes, in_hand, progress_s, todo = s.tick, s.temp_c, s.mode, s.job, s.progress_s, s.todo
-    last, queued_s, cycles, returns, on_offer = s.last_award, s.queued_s, s.cycles, s.returns, o.on_offer
-    noise_k, words, payload_kg, values, risks = t.noise_k, t.word, t.payload_kg, t.value, t.risk
-    offset, weight, curve = t.offset, t.weight, t.curve
+    ticks, temp_c, modes, progress_s, todo = s.tick, s.temp_c, s.mode, s.progress_s, s.todo
+    last, queued_s, cycles, returns = s.last_award, s.queued_s, s.cycles, s.returns
+    on_offer, hand = o.on_offer, o.hand
+    noise_k, words, payload_kg, values = t.noise_k, t.word, t.payload_kg, t.value
+    scores, curve = t.score, t.curve
     arms, slots = natural(modes.shape[1]), natural(on_offer.shape[1])
-    measured, headroom = np.empty(LANES), np.empty(arms, np.float32)
-    said = np.empty((2, arms * slots), np.float32)  # whether an arm knows a difficulty for a slot, and which
-    left, slack_s = np.empty(slots), np.empty(slots)
-    shared = np.zeros(5 * slots, np.float32)  # what all arms see alike of the slots, field by field
+    peers = arms - 1
     c_clock, c_mode = natural(start[CLOCK]), natural(start[MODE])
     c_busy, c_last = natural(start[BUSY]), natural(start[LAST_AWARD])
     c_temp, c_headroom = natural(start[TEMP]), natural(start[HEADROOM])
@@ -105,92 +102,90 @@ def perceive(
         c_slots, c_slots + slots, c_slots + 2 * slots, c_slots + 3 * slots, c_slots + 4 * slots, c_slots + 5 * slots,
         c_slots + 6 * slots, c_slots + 7 * slots, c_slots + 8 * slots, c_slots + 9 * slots, c_slots + 10 * slots,
     )  # fmt: skip
-    peers = arms - 1
-    c_heard_age, c_working, c_faulted, c_room = (
-        c_peers + peers,
-        c_peers + 2 * peers,
-        c_peers + 3 * peers,
-        c_peers + 4 * peers,
-    )
+    c_working, size = c_peers + 2 * peers, natural(out.shape[2])
     c_peer_known, c_told = c_peers + 5 * peers, c_peers + 5 * peers + peers * slots
     low_c, high_c, low_k, high_k = low[c_temp], high[c_temp], low[c_headroom], high[c_headroom]
     most_kg, most_value, most_returns = high[c_payload], high[c_value], high[c_returns]
+    one, measured, hot_k = np.empty(LANES), np.empty((arms, LANES)), np.empty(arms, np.float32)
+    left, slack_s, kind_of = np.empty(slots), np.empty(slots), np.empty(slots, np.int64)
+    known, told = np.zeros((arms, slots), np.float32), np.zeros((arms, slots), np.float32)
+    # The vector of the arm at hand, but for what is its own: with no job on offer, and all peers heard now.
+    frame = np.zeros(size, np.float32)
+    for k in range(slots):
+        frame[c_p + k] = 0.5
+    for peer in range(peers):
+        frame[c_peers + peer] = 1.0
+    before = 0  # jobs on offer in the env before: what is to be wiped away
     for row in rows:
         e = natural(row)
         lot, now_s, key = natural(lots[e]), ticks[e] * t.dt_s, keys[e]
         count = natural(ticks[e]) * arms * JOINTS
-        clock = now_s / (t.ticks * t.dt_s)
+        frame[c_clock] = now_s / (t.ticks * t.dt_s)
         found = 0
         while found < slots and on_offer[e, found] >= 0:
             j = natural(on_offer[e, found])
             kind = natural(kinds[e, j])
+            kind_of[found] = kind
             left[found], slack_s[found] = repetitions[e, j] - cycles[e, j], due_s[e, j] - now_s
-            shared[found] = 1.0
-            shared[slots + found] = min(max(now_s - queued_s[e, j], 0.0), LONG_S)
-            shared[2 * slots + found] = min(payload_kg[lot, kind], most_kg)
-            shared[3 * slots + found] = min(max(values[lot, kind], 0.0), most_value)
-            shared[4 * slots + found] = min(returns[e, j], most_returns)
+            frame[c_offered + found] = 1.0
+            frame[c_age + found] = min(max(now_s - queued_s[e, j], 0.0), LONG_S)
+            frame[c_payload + found] = min(payload_kg[lot, kind], most_kg)
+            frame[c_value + found] = min(max(values[lot, kind], 0.0), most_value)
+            frame[c_returns + found] = min(returns[e, j], most_returns)
             found += 1
-        for m in range(5):
-            for k in range(found, slots):
-                shared[m * slots + k] = 0.0
+        for k in range(found, before):
+            frame[c_offered + k] = frame[c_age + k] = frame[c_payload + k] = 0.0
+            frame[c_value + k] = frame[c_returns + k] = 0.0
+            for peer in range(peers):
+                frame[c_peer_known + peer * slots + k] = frame[c_told + peer * slots + k] = 0.0
+        before = found
         for a in range(arms):
-            mode = modes[e, a]
-            out[e, a, c_clock] = clock
-            for m in range(3):
-                out[e, a, c_mode + m] = m == mode
-            busy_s = 0.0
-            if mode == WORKING:
-                kind = natural(kinds[e, natural(in_hand[e, a])])
-                busy_s = words[lot, a, kind, 0] + todo[e, a] * words[lot, a, kind, 1] - progress_s[e, a]
-            out[e, a, c_busy] = min(max(busy_s, 0.0), LONG_S)
-            out[e, a, c_last] = last[e, a]
             for k in range(LANES):
-                measured[k] = temp_c[e, a, k] + noise_k[lot, a, k] * noise(key, count + k + 1)
-            for k in range(JOINTS):
-                out[e, a, c_temp + k] = min(max(measured[k], low_c), high_c)
+                one[k] = temp_c[e, a, k] + noise_k[lot, a, k] * noise(key, count + k + 1)
+                measured[a, k] = one[k]
             count += JOINTS
-            headroom[a] = min(max(t.warning_c - hottest(measured), low_k), high_k)
-            out[e, a, c_headroom] = headroom[a]
-            for k in range(slots):
-                out[e, a, c_offered + k] = shared[k]
-            for i in range(4 * slots):
-                out[e, a, c_age + i] = shared[slots + i]
+            measured[a, JOINTS] = 1.0
+            hot_k[a] = min(max(t.warning_c - hottest(one), low_k), high_k)
             for k in range(found):
-                kind = natural(kinds[e, natural(on_offer[e, k])])
+                known[a, k], told[a, k] = words[lot, a, kind_of[k], 2], words[lot, a, kind_of[k], 3]
+        for turn in range(peers + arms):  # first the peers of the first arm into the frame, then arm after arm
+            a = natural(turn - peers)
+            if turn >= peers:
+                for i in range(size):
+                    out[e, a, i] = frame[i]
+                if a == peers:
+                    break
+            # The next arm has this one where it was itself among the peers.
+            peer, b = (turn, turn + 1) if turn < peers else (a, a)
+            place = c_working + peer
+            frame[place], frame[place + peers] = modes[e, b] == WORKING, modes[e, b] == FAULTED
+            frame[place + 2 * peers] = hot_k[b]
+            place = c_peer_known + peer * slots
+            for k in range(found):
+                frame[place + k] = known[b, k]
+                frame[place + peers * slots + k] = told[b, k]
+        for a in range(arms):
+            mode = natural(modes[e, a])
+            out[e, a, c_mode + mode] = 1.0
+            if mode == WORKING:
+                kind = natural(hand[e, a])
+                busy_s = words[lot, a, kind, 0] + todo[e, a] * words[lot, a, kind, 1] - progress_s[e, a]
+                out[e, a, c_busy] = min(max(busy_s, 0.0), LONG_S)
+            out[e, a, c_last] = last[e, a]
+            for k in range(JOINTS):
+                out[e, a, c_temp + k] = min(max(measured[a, k], low_c), high_c)
+            out[e, a, c_headroom] = hot_k[a]
+            for k in range(found):
+                kind = natural(kind_of[k])
                 duration_s = words[lot, a, kind, 0] + left[k] * words[lot, a, kind, 1]
                 out[e, a, c_feasible + k] = duration_s > 0
                 out[e, a, c_duration + k] = min(duration_s, LONG_S)
                 out[e, a, c_slack + k] = min(max(slack_s[k] - duration_s, -LONG_S), LONG_S)
-                said[0, a * slots + k], said[1, a * slots + k] = words[lot, a, kind, 2], words[lot, a, kind, 3]
-                p, risk = words[lot, a, kind, 4], risks[lot, a, kind]
+                out[e, a, c_known + k], out[e, a, c_difficulty + k] = known[a, k], told[a, k]
+                p, risk = words[lot, a, kind, 4], int(words[lot, a, kind, RISK])
                 if risk >= 0:
-                    p = at_risk(offset, weight, curve, natural(risk), measured)
+                    p = at_risk(scores, curve, natural(risk), measured, a)
                 out[e, a, c_p + k] = p
-            for k in range(found, slots):
-                out[e, a, c_feasible + k] = out[e, a, c_duration + k] = out[e, a, c_slack + k] = 0.0
-                out[e, a, c_p + k] = 0.5
-                said[0, a * slots + k] = said[1, a * slots + k] = 0.0
-            for k in range(slots):
-                out[e, a, c_known + k] = said[0, a * slots + k]
-            for k in range(slots):
-                out[e, a, c_difficulty + k] = said[1, a * slots + k]
-        for a in range(arms):
-            peer = 0
-            for b in range(arms):
-                if b != a:
-                    out[e, a, c_peers + peer], out[e, a, c_heard_age + peer] = 1.0, 0.0
-                    out[e, a, c_working + peer] = modes[e, b] == WORKING
-                    out[e, a, c_faulted + peer] = modes[e, b] == FAULTED
-                    out[e, a, c_room + peer] = headroom[b]
-                    peer += 1
-            before, behind = a * slots, (arms - 1 - a) * slots
-            for m in range(2):
-                place = c_told if m else c_peer_known
-                for i in range(before):
-                    out[e, a, place + i] = said[m, i]
-                for i in range(behind):
-                    out[e, a, place + before + i] = said[m, before + slots + i]
 
 
 @entry

@@ -9,12 +9,15 @@ import math
 import numpy as np
 
 from fleet.robot import JOINTS
-from fleet.sim.faults import BISECTIONS
-from fleet.sim.jit import inner
+from fleet.sim.faults import TOLERANCE_S
+from fleet.sim.jit import inner, rare
 from fleet.sim.tables import Tables
 from fleet.thermal import NODES
 
 Array = np.ndarray
+
+MOST_STEPS = 100
+"""Of finding a crossing; some ten are enough."""
 
 
 @inner
@@ -26,7 +29,7 @@ def hottest(temp_c: Array) -> float:
     )
 
 
-@inner
+@rare
 def into_modes(t: Tables, lot: int, a: int, temp_c: Array, load_w: Array, modal: Array) -> None:
     """y and z of a stretch that begins at these temperatures, [2, mode]; the load is heat and what the air gives."""
     modal[:] = 0.0
@@ -39,7 +42,7 @@ def into_modes(t: Tables, lot: int, a: int, temp_c: Array, load_w: Array, modal:
             modal[1, m] += t.modes[lot, a, n, m] * load
 
 
-@inner
+@rare
 def at(t: Tables, lot: int, a: int, modal: Array, time_s: float, out: Array) -> None:
     """Temperatures so long after the beginning of a stretch, [node]."""
     out[:] = 0.0
@@ -52,23 +55,60 @@ def at(t: Tables, lot: int, a: int, modal: Array, time_s: float, out: Array) -> 
         out[n] /= t.root[lot, a, n]
 
 
-@inner
+@rare
+def hottest_at(t: Tables, lot: int, a: int, modal: Array, time_s: float) -> float:
+    """The hottest motor so long after the beginning of a stretch."""
+    now, top_c = np.empty(NODES), -np.inf
+    for m in range(NODES):
+        rate = t.rates[lot, a, m]
+        gone = math.expm1(-rate * time_s)
+        now[m] = modal[0, m] + gone * (modal[0, m] - modal[1, m] / rate)
+    for n in range(JOINTS):
+        root_c = 0.0
+        for m in range(NODES):
+            root_c += t.modes[lot, a, n, m] * now[m]
+        top_c = max(top_c, root_c / t.root[lot, a, n])
+    return top_c
+
+
+@rare
 def crossing_s(
-    t: Tables, lot: int, a: int, modal: Array, length_s: float, limit_c: float, rising: bool, out: Array
+    t: Tables, lot: int, a: int, modal: Array, length_s: float, limit_c: float, first_c: float, last_c: float
 ) -> float:
-    """When in a stretch the hottest motor passes a limit, from its beginning; its length if it does not."""
-    low, high = 0.0, length_s
-    for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        at(t, lot, a, modal, middle, out)
-        if (hottest(out) >= limit_c) == rising:
-            high = middle
+    """When in a stretch the hottest motor passes a limit that lies between its first and its last temperature.
+
+    Inverse quadratic interpolation where that is safe, else halving: Chandrupatla (1997), Advances in Engineering
+    Software 28(3), 145-149.
+
+    Returns:
+        The end of the bracket that is past the limit, s from the beginning of the stretch.
+    """
+    rising, x, y, other, f_other = last_c >= limit_c, length_s, last_c - limit_c, 0.0, first_c - limit_c
+    share = 0.5
+    for _ in range(MOST_STEPS):
+        width_s = abs(x - other)
+        least = 0.5 * TOLERANCE_S / width_s
+        if y == 0.0:
+            return x
+        if least > 0.25:
+            break
+        new = x + min(max(share, least), 1.0 - least) * (other - x)
+        f_new = hottest_at(t, lot, a, modal, new) - limit_c
+        if (f_new >= 0.0) == (y >= 0.0):
+            third, f_third = x, y
         else:
-            low = middle
-    return high
+            third, f_third, other, f_other = other, f_other, x, y
+        x, y = new, f_new
+        xi, phi = (x - other) / (third - other), (y - f_other) / (f_third - f_other)
+        if phi * phi < xi and (1.0 - phi) * (1.0 - phi) < 1.0 - xi:
+            share = y / (f_other - y) * f_third / (f_other - f_third)
+            share += (third - x) / (other - x) * y / (f_third - y) * f_other / (f_third - f_other)
+        else:
+            share = 0.5
+    return x if (y >= 0.0) == rising else other
 
 
-@inner
+@rare
 def braked_load(t: Tables, lot: int, a: int, air_c: float, out: Array) -> float:
     """Load of an arm on its brakes, W, [node]; returns the heat in it."""
     heat_w = 0.0
@@ -81,14 +121,13 @@ def braked_load(t: Tables, lot: int, a: int, air_c: float, out: Array) -> float:
     return heat_w
 
 
-@inner
-def above_s(t: Tables, lot: int, a: int, modal: Array, begin_c: Array, length_s: float, out: Array) -> float:
-    """How long of a stretch the hottest motor is above the warning limit; leaves its end in `out`."""
-    begins = hottest(begin_c) >= t.warning_c
-    at(t, lot, a, modal, length_s, out)
-    ends = hottest(out) >= t.warning_c
-    if begins == ends:
+@rare
+def above_s(
+    t: Tables, lot: int, a: int, modal: Array, length_s: float, first_c: float, last_c: float
+) -> float:  # fmt: skip
+    """How long of a stretch the hottest motor is above the warning limit."""
+    begins = first_c >= t.warning_c
+    if begins == (last_c >= t.warning_c):
         return length_s if begins else 0.0
-    passed_s = crossing_s(t, lot, a, modal, length_s, t.warning_c, not begins, out)
-    at(t, lot, a, modal, length_s, out)
+    passed_s = crossing_s(t, lot, a, modal, length_s, t.warning_c, first_c, last_c)
     return passed_s if begins else length_s - passed_s

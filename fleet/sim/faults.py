@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.optimize import root_scalar
 
 from fleet.events import Event, EventKind
 from fleet.sim.state import RUNNING, WAITING, State, World
@@ -12,8 +13,8 @@ from fleet.thermal import WINDING, ThermalModel, node_heat
 
 Array = np.ndarray
 
-BISECTIONS = 30
-"""Halvings of a step to find a crossing: 10 s · 2⁻³⁰ ≈ 10 ns."""
+TOLERANCE_S = 1e-10
+"""How closely the moment of a crossing is found."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,14 +35,16 @@ class Leg:
         return self.model.step(self.temp_c, self.heat_w, self.ambient_c, time_s - self.begin_s)
 
     def crossing_s(self, limit_c: float) -> float:
-        """When the hottest winding passes a limit in the direction it is going; its end if it does not."""
-        rising = hottest(self.temp_c) < limit_c
-        low, high = self.begin_s, self.end_s
-        for _ in range(BISECTIONS):
-            middle = 0.5 * (low + high)
-            above = hottest(self.at(middle)) >= limit_c
-            low, high = (low, middle) if above == rising else (middle, high)
-        return high
+        """When the hottest winding passes a limit that lies between its temperatures at both ends."""
+        sign = 1.0 if hottest(self.temp_c) < limit_c else -1.0
+
+        def past(moment_s: float) -> float:
+            return sign * (float(hottest(self.at(moment_s))) - limit_c)
+
+        if past(self.begin_s) >= 0.0:  # by rounding
+            return self.begin_s
+        found = root_scalar(past, bracket=(self.begin_s, self.end_s), method="brentq", xtol=TOLERANCE_S)
+        return min(found.root + TOLERANCE_S, self.end_s)  # the limit is passed there
 
 
 @dataclass(frozen=True, eq=False)

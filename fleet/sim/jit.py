@@ -29,7 +29,12 @@ _SOURCES = (
 
 
 def inner(function: Function) -> Function:
-    """Compile a function that only compiled functions call."""
+    """Compile a function into those that call it: handing over arrays costs more than most loops."""
+    return cast(Function, njit(function, error_model="numpy", forceinline=True))
+
+
+def rare(function: Function) -> Function:
+    """Compile a function that compiled functions seldom call."""
     return cast(Function, njit(function, error_model="numpy"))
 
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from fleet.robot import JOINTS
-from fleet.sim.boiling import above_s, braked_load, crossing_s, hottest, into_modes
-from fleet.sim.jit import inner, natural
+from fleet.sim.boiling import above_s, at, braked_load, crossing_s, hottest, into_modes
+from fleet.sim.jit import inner, natural, rare
 from fleet.sim.kernel import ROUNDING_S
 from fleet.sim.state import DONE, RUNNING, WAITING
 from fleet.sim.tables import LANES, WIDE, Drawn, Offer, Rows, Tables
@@ -32,15 +32,16 @@ def hang_out(t: Tables, d: Drawn, s: Rows, o: Offer, rows: Array) -> None:
         rows: Which envs, int [row].
     """
     lots, kinds, count, release_s, after = d.lot, d.kind, d.jobs, d.release_s, d.after
-    tick, modes, in_hand, status = s.tick, s.mode, s.job, s.status
-    on_offer, mask, queue, head = o.on_offer, o.mask, o.queue, o.head
+    tick, modes, status = s.tick, s.mode, s.status
+    on_offer, mask, queue, head, hand = o.on_offer, o.mask, o.queue, o.head, o.hand
     stations, plan = t.stations, t.plan
     arms, slots = natural(modes.shape[1]), natural(on_offer.shape[1])
     waits, places = natural(after.shape[2]), natural(stations.shape[2])
-    busy, can = np.empty(t.station_count + 1, np.bool_), np.empty(arms, np.bool_)
+    busy = np.empty(t.station_count + 1, np.bool_)
     for row in rows:
         e = natural(row)
         lot, now_s, found = natural(lots[e]), tick[e] * t.dt_s, 0
+        occupied(lot, e, modes, hand, stations, busy)
         for place in range(natural(head[e]), count[e]):
             j = natural(queue[e, place])
             if found == slots or release_s[e, j] > now_s:
@@ -50,34 +51,32 @@ def hang_out(t: Tables, d: Drawn, s: Rows, o: Offer, rows: Array) -> None:
                 before = after[e, j, n]
                 if before >= 0 and status[e, before] != DONE:
                     ready = False
-            if ready:
-                on_offer[e, found] = j
-                found += 1
-        occupied(lot, e, modes, in_hand, kinds, stations, busy)
-        for a in range(arms):
-            mask[e, a, 0], can[a] = 1, modes[e, a] == IDLE
-        for k in range(found):
-            kind, free = natural(kinds[e, on_offer[e, k]]), True
+            if not ready:
+                continue
+            kind, free = natural(kinds[e, j]), True
             for n in range(places):
                 station = stations[lot, kind, n]
                 if station >= 0 and busy[station]:
                     free = False
+            on_offer[e, found] = j
+            found += 1
             for a in range(arms):
-                mask[e, a, k + 1] = free and can[a] and plan[lot, a, kind] >= 0
-        for k in range(found, slots):
-            on_offer[e, k] = -1
+                mask[e, a, found] = free and modes[e, a] == IDLE and plan[lot, a, kind] >= 0
+        while found < slots and on_offer[e, found] >= 0:  # what hung out there before
+            on_offer[e, found] = -1
+            found += 1
             for a in range(arms):
-                mask[e, a, k + 1] = 0
+                mask[e, a, found] = 0
 
 
 @inner
-def occupied(lot: Any, e: int, modes: Array, in_hand: Array, kinds: Array, stations: Array, busy: Array) -> None:
+def occupied(lot: Any, e: int, modes: Array, hand: Array, stations: Array, busy: Array) -> None:
     """Which stations of an env have an arm at work, bool [station + 1]."""
     busy[:] = False
     for a in range(modes.shape[1]):
         if modes[e, a] == WORKING:
             for n in range(stations.shape[2]):
-                station = stations[lot, kinds[e, in_hand[e, a]], n]
+                station = stations[lot, natural(hand[e, a]), n]
                 if station >= 0:
                     busy[station] = True
 
@@ -93,7 +92,8 @@ def award(t: Tables, d: Drawn, s: Rows, o: Offer, actions: Array, rows: Array) -
     lots, kinds, repetitions = d.lot, d.kind, d.repetitions
     modes, in_hand, status, last, illegal = s.mode, s.job, s.status, s.last_award, s.illegal
     progress_s, todo, cycles = s.progress_s, s.todo, s.cycles
-    on_offer, mask, queue, head, stations, difficulty = o.on_offer, o.mask, o.queue, o.head, t.stations, t.difficulty
+    on_offer, mask, queue, head, hand, owed = o.on_offer, o.mask, o.queue, o.head, o.hand, o.owed
+    stations, difficulty = t.stations, t.difficulty
     arms, slots, places = modes.shape[1], on_offer.shape[1], stations.shape[2]
     busy, key, order = np.empty(t.station_count + 1, np.bool_), np.empty(arms), np.empty(arms, np.int64)
     for row in rows:
@@ -118,7 +118,7 @@ def award(t: Tables, d: Drawn, s: Rows, o: Offer, actions: Array, rows: Array) -
             claims += 1
         if claims == 0:
             continue
-        occupied(lot, e, modes, in_hand, kinds, stations, busy)
+        occupied(lot, e, modes, hand, stations, busy)
         for rank in range(claims):
             a = order[rank]
             j = natural(on_offer[e, actions[e, a] - 1])
@@ -137,6 +137,7 @@ def award(t: Tables, d: Drawn, s: Rows, o: Offer, actions: Array, rows: Array) -
             take_out(queue, head, e, j)
             last[e, a], status[e, j] = 1, RUNNING
             modes[e, a], in_hand[e, a], progress_s[e, a] = WORKING, j, 0.0
+            hand[e, a], owed[e, a] = kind, True
             todo[e, a] = repetitions[e, j] - cycles[e, j]
 
 
@@ -151,7 +152,7 @@ def take_out(queue: Array, head: Array, e: int, j: int) -> None:
     head[e] += 1
 
 
-@inner
+@rare
 def put_back(d: Drawn, s: Rows, o: Offer, e: int, j: int, until_s: float) -> None:
     """A job comes back into the queue, behind all that were released or came back before it.
 
@@ -180,15 +181,15 @@ def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array, rows: Array) -> Non
         rows: Which envs, int [row].
     """
     # The arrays by names of their own: a field of a tuple is counted at every use.
-    lots, airs_k, kinds, repetitions, due_s = d.lot, d.air_k, d.kind, d.repetitions, d.due_s
+    lots, airs_k, repetitions, due_s = d.lot, d.air_k, d.repetitions, d.due_s
     ticks, temp_c, modes, in_hand, progress_s, todo = s.tick, s.temp_c, s.mode, s.job, s.progress_s, s.todo
     clear_at_s, faults, peak_c, above_warning_s = s.clear_at_s, s.faults, s.peak_c, s.above_warning_s
     busy_s, lost_s, energy_j, status, queued_s = s.busy_s, s.lost_s, s.energy_j, s.status, s.queued_s
-    cycles, returns, finished_s, left = s.cycles, s.returns, s.finished_s, o.open
+    cycles, returns, finished_s, left, hand, owed = s.cycles, s.returns, s.finished_s, o.open, o.hand, o.owed
     ambient_c, steps, to_ambient = t.ambient_c, t.step, t.to_ambient
     motor, drive, times_s, plans, values = t.motor, t.drive, t.times_s, t.plan, t.value
     dt_s, alpha_kt, alpha_cu, reference_c = t.dt_s, t.alpha_kt, t.alpha_cu, t.reference_c
-    warning_c, error_c = t.warning_c, t.error_c
+    warning_c, error_c, restart_c = t.warning_c, t.error_c, t.restart_c
     power, fold = np.empty((2, LANES)), np.empty(4)  # W of windings, of friction and electronics
     begin, end = np.zeros(2 * NODES + LANES), np.empty(WIDE)  # the temperatures, the loads, and what pads them
     arms = modes.shape[1]
@@ -198,11 +199,11 @@ def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array, rows: Array) -> Non
         now_s, moment = tick * dt_s, min(tick, t.ticks - 1)
         value = late = above_s = count = energy = 0.0
         for a in range(arms):
-            mode, j = modes[e, a], in_hand[e, a]
+            mode = modes[e, a]
             plan, spent_s, done_s, home_s = 0, 0.0, np.inf, np.inf
             first_s = cycle_s = share_0 = share_1 = share_2 = 0.0
             if mode == WORKING:
-                plan = natural(plans[lot, a, natural(kinds[e, j])])
+                plan = natural(plans[lot, a, natural(hand[e, a])])
                 begin_s = progress_s[e, a]
                 until_s = begin_s + dt_s
                 first_s, cycle_s = times_s[plan, 0], times_s[plan, 1]
@@ -213,7 +214,7 @@ def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array, rows: Array) -> Non
                 span_2 = max(min(until_s, back_s) - max(begin_s, last_s), 0.0)
                 spent_s = span_0 + span_1 + span_2
                 share_0, share_1, share_2 = span_0 / dt_s, span_1 / dt_s, span_2 / dt_s
-                if status[e, j] == RUNNING and last_s - begin_s <= dt_s + ROUNDING_S:
+                if owed[e, a] and last_s - begin_s <= dt_s + ROUNDING_S:
                     done_s = min(max(last_s - begin_s, 0.0), dt_s)
                 if back_s - begin_s <= dt_s + ROUNDING_S:
                     home_s = min(max(back_s - begin_s, 0.0), dt_s)
@@ -245,8 +246,11 @@ def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array, rows: Array) -> Non
                 end[m] = into
             first_c, last_c = hottest(begin), hottest(end)
             cut_s, here_s, here_j, top_c, cool_s = dt_s, 0.0, heat_w * dt_s, last_c, np.inf
-            if mode != FAULTED and last_c < error_c and (first_c >= warning_c) == (last_c >= warning_c):
-                here_s = dt_s if first_c >= warning_c else 0.0
+            hot, same = first_c >= warning_c, (first_c >= warning_c) == (last_c >= warning_c)
+            if same and (first_c < restart_c or last_c >= restart_c if mode == FAULTED else last_c < error_c):
+                here_s = dt_s if hot else 0.0
+                if mode == FAULTED and last_c < restart_c:
+                    cool_s = 0.0
             else:
                 cut_s, here_s, here_j, top_c, cool_s = boil(t, lot, a, mode, begin, heat_w, air_c, end)
             energy_j[e, a] += here_j
@@ -259,9 +263,10 @@ def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array, rows: Array) -> Non
                 temp_c[e, a, n] = end[n]
             if mode == WORKING:
                 if done_s <= cut_s:
+                    j, owed[e, a] = natural(in_hand[e, a]), False
                     status[e, j], cycles[e, j], finished_s[e, j] = DONE, repetitions[e, j], now_s + done_s
                     left[e] -= 1
-                    worth = values[lot, kinds[e, j]]
+                    worth = values[lot, natural(hand[e, a])]
                     value += worth
                     late += worth * (max(finished_s[e, j] - due_s[e, j], 0.0) / 60.0)
                 progress_s[e, a] += cut_s
@@ -270,8 +275,8 @@ def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array, rows: Array) -> Non
             if mode == FAULTED:
                 lost_s[e, a] += dt_s
             if cut_s < dt_s:
-                j = in_hand[e, a]
-                if j >= 0 and status[e, j] == RUNNING:
+                if mode == WORKING and owed[e, a]:
+                    j = natural(in_hand[e, a])
                     kept = int((progress_s[e, a] - first_s) // cycle_s)
                     cycles[e, j] += min(max(kept, 0), todo[e, a])
                     status[e, j], queued_s[e, j] = WAITING, now_s + cut_s
@@ -291,7 +296,7 @@ def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array, rows: Array) -> Non
         ticks[e] += 1
 
 
-@inner
+@rare
 def boil(
     t: Tables, lot: int, a: int, mode: int, begin: Array, heat_w: float, air_c: float, end: Array
 ) -> tuple[float, float, float, float, float]:
@@ -304,33 +309,32 @@ def boil(
         Seconds until a fault stops it (the whole step if none does), seconds above the warning limit, energy in J,
         the hottest that counts, and the moment from which every motor is below the restart limit (inf if none).
     """
-    dt_s, now, modal = t.dt_s, np.empty(NODES), np.empty((2, NODES))
+    dt_s, modal, faulted = t.dt_s, np.empty((2, NODES)), mode == FAULTED
     into_modes(t, lot, a, begin, begin[NODES:], modal)
-    faulted, cut_s = mode == FAULTED, dt_s
-    if not faulted and hottest(end) >= t.error_c:
-        cut_s = 0.0
-        if hottest(begin) < t.error_c:
-            cut_s = crossing_s(t, lot, a, modal, dt_s, t.error_c, True, now)
-    last_c = hottest(end)
-    if cut_s == dt_s:
-        above = above_s(t, lot, a, modal, begin, dt_s, now)
+    first_c, last_c = hottest(begin), hottest(end)
+    if faulted or last_c < t.error_c:
         cool_s = np.inf
         if faulted and last_c < t.restart_c:
             cool_s = 0.0
-            if hottest(begin) >= t.restart_c:
-                cool_s = crossing_s(t, lot, a, modal, dt_s, t.restart_c, False, now)
-        return dt_s, above, heat_w * dt_s, last_c, cool_s
-    above = above_s(t, lot, a, modal, begin, cut_s, now)
-    stopped, brakes = now.copy(), np.empty(NODES)
+            if first_c >= t.restart_c:
+                cool_s = crossing_s(t, lot, a, modal, dt_s, t.restart_c, first_c, last_c)
+        return dt_s, above_s(t, lot, a, modal, dt_s, first_c, last_c), heat_w * dt_s, last_c, cool_s
+    cut_s = 0.0
+    if first_c < t.error_c:
+        cut_s = crossing_s(t, lot, a, modal, dt_s, t.error_c, first_c, last_c)
+    stopped, brakes = np.empty(NODES), np.empty(NODES)
+    at(t, lot, a, modal, cut_s, stopped)
+    stopped_c = hottest(stopped)
+    above = above_s(t, lot, a, modal, cut_s, first_c, stopped_c)
     brakes_w = braked_load(t, lot, a, air_c, brakes)
     into_modes(t, lot, a, stopped, brakes, modal)
-    left_s, peak = dt_s - cut_s, hottest(stopped)
-    above += above_s(t, lot, a, modal, stopped, left_s, now)
-    end[:NODES] = now
-    peak = max(peak, hottest(end))
-    cool_s = np.inf
-    if hottest(end) < t.restart_c:
+    left_s = dt_s - cut_s
+    at(t, lot, a, modal, left_s, end)
+    last_c = hottest(end)
+    above += above_s(t, lot, a, modal, left_s, stopped_c, last_c)
+    peak, cool_s = max(stopped_c, last_c), np.inf
+    if last_c < t.restart_c:
         cool_s = cut_s
         if peak >= t.restart_c:
-            cool_s = cut_s + crossing_s(t, lot, a, modal, left_s, t.restart_c, False, now)
+            cool_s = cut_s + crossing_s(t, lot, a, modal, left_s, t.restart_c, stopped_c, last_c)
     return cut_s, above, heat_w * cut_s + brakes_w * left_s, peak, cool_s

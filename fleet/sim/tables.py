@@ -4,7 +4,7 @@ A *lot* is one fleet as it is built: envs of one lot have the same arms. A *kind
 often it is repeated. Every array lies in one piece and belongs to the tuple alone, so that one compilation fits all.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -17,6 +17,9 @@ Array = np.ndarray
 
 LANES, WIDE = 8, 16
 """Joints and nodes are padded to so many, which a processor takes at once."""
+assert JOINTS == LANES - 1
+RISK = 5
+"""Place of the row of the risk tables in `Tables.word`."""
 
 
 class Tables(NamedTuple):
@@ -61,14 +64,12 @@ class Tables(NamedTuple):
     difficulty: Array
     """[lot, arm, kind], NaN where not known."""
     word: Array
-    """What an arm says of a kind of job, [lot, arm, kind, 5]: seconds on the way there and back, seconds a cycle (zero
-    of what it cannot do), 1 if it knows a difficulty, the difficulty or 0, and P(saturation) or 0.5."""
-    risk: Array
-    """Row of the risk tables, −1 for none, int [lot, arm, kind]."""
-    offset: Array
-    """[risk, piece]."""
-    weight: Array
-    """[risk, piece, joint]."""
+    """What an arm says of a kind of job, [lot, arm, kind, padded to `LANES`]: seconds on the way there and back, seconds
+    a cycle (zero of what it cannot do), 1 if it knows a difficulty, the difficulty or 0, P(saturation) or 0.5, and the
+    row of the risk tables that knows better, −1 for none."""
+    score: Array
+    """Weights of the motor temperatures, and then the offset (−inf where there is no such piece), [risk, piece,
+    `LANES`]."""
     curve: Array
     """[risk, knot, 2]; no knot at all where no risk has any."""
     stations: Array
@@ -127,7 +128,7 @@ class Rows(NamedTuple):
 
 
 class Offer(NamedTuple):
-    """What hangs out to be claimed; see `claims.Board`."""
+    """What hangs out to be claimed, see `claims.Board`, and what is worked at: known from the rest, but dear to ask."""
 
     on_offer: Array
     """int [env, slot]."""
@@ -139,6 +140,10 @@ class Offer(NamedTuple):
     """Jobs that wait, released or not, by the time they came, int32 [env, job]; they fill a row up to its last job."""
     head: Array
     """Where in its row the queue begins, int [env]."""
+    hand: Array
+    """Kind of the job that an arm at work has in hand, int [env, arm]."""
+    owed: Array
+    """Whether that job is still to be finished, bool [env, arm]; else the arm is on its way home."""
 
 
 def state_of(rows: Rows, first: int, last: int) -> State:
@@ -157,7 +162,7 @@ def tables_of(world: World) -> tuple[Tables, Drawn]:
         return np.repeat(values[None], envs, axis=0)
 
     limits, motors, offers = world.limits, world.motors, world.offers
-    offset, weight, curve = risk_tables(offers.risks)
+    score, curve = risk_tables(offers.risks)
     tables = Tables(
         dt_s=float(world.dt_s),
         ticks=int(world.ticks),
@@ -183,9 +188,7 @@ def tables_of(world: World) -> tuple[Tables, Drawn]:
         plan=offers.plan,
         difficulty=offers.difficulty,
         word=_words(world),
-        risk=offers.risk,
-        offset=offset,
-        weight=weight,
+        score=score,
         curve=curve,
         stations=jobs.stations,
         station_count=len(world.stations),
@@ -222,17 +225,19 @@ def _words(world: World) -> Array:
             known,
             np.where(known, offers.difficulty, 0.0),
             np.where(p_known, offers.p_saturation, 0.5),
+            offers.risk,
+            *[np.zeros(offers.plan.shape)] * (LANES - 1 - RISK),
         ],
         axis=-1,
     )
 
 
-def risk_tables(risks: Risk | None) -> tuple[Array, Array, Array]:
-    """Offset, weight and curve of stacked risks, with empty axes for what is not there."""
+def risk_tables(risks: Risk | None) -> tuple[Array, Array]:
+    """Scores and curves of stacked risks, with empty axes for what is not there."""
     if risks is None:
-        return np.empty((0, 1)), np.empty((0, 1, JOINTS)), np.empty((0, 0, 2))
+        return np.empty((0, 1, LANES)), np.empty((0, 0, 2))
     curve = np.empty((len(risks.offset), 0, 2)) if risks.curve is None else risks.curve
-    return risks.offset, risks.weight, curve
+    return np.concatenate([risks.weight, risks.offset[..., None]], axis=-1), curve
 
 
 Arrays = TypeVar("Arrays", Tables, Drawn)
@@ -262,23 +267,26 @@ def stacked(fleets: Sequence[Tables]) -> Tables:
             if getattr(other, name).shape != getattr(first, name).shape:
                 raise ValueError(f"Fleets of one batch must have as many arms and kinds of jobs as the first ({name}).")
     rows = np.cumsum([0, *(len(each.times_s) for each in fleets)])
-    risks = np.cumsum([0, *(len(each.offset) for each in fleets)])
-    pieces = max(each.offset.shape[1] for each in fleets)
+    risks = np.cumsum([0, *(len(each.score) for each in fleets)])
+    pieces = max(each.score.shape[1] for each in fleets)
     knots = max(each.curve.shape[1] for each in fleets)
     places = max(each.stations.shape[2] for each in fleets)
 
-    def shifted(name: str, by: Array) -> Array:
-        each = [getattr(t, name) for t in fleets]
+    def shifted(each: Iterable[Array], by: Array) -> Array:
         return np.concatenate([np.where(v >= 0, v + n, -1) for v, n in zip(each, by, strict=False)])
 
+    def with_pieces(score: Array) -> Array:
+        more = np.zeros((len(score), pieces - score.shape[1], LANES))
+        more[..., -1] = -np.inf
+        return np.concatenate([score, more], axis=1)
+
     joined = {name: np.concatenate([getattr(each, name) for each in fleets]) for name in _JOINED}
+    joined["word"][..., RISK] = shifted((t.word[..., RISK] for t in fleets), risks)
     return owned(
         first._replace(
             **joined,
-            plan=shifted("plan", rows),
-            risk=shifted("risk", risks),
-            offset=np.concatenate([_padded(t.offset, 1, pieces, -np.inf) for t in fleets]),
-            weight=np.concatenate([_padded(t.weight, 1, pieces, 0.0) for t in fleets]),
+            plan=shifted((t.plan for t in fleets), rows),
+            score=np.concatenate([with_pieces(t.score) for t in fleets]),
             curve=np.concatenate([_longer(t.curve, knots) for t in fleets]),
             stations=np.concatenate([_padded(t.stations, 2, places, -1) for t in fleets]),
             station_count=max(each.station_count for each in fleets),
