@@ -1,27 +1,20 @@
-"""The picture of a fleet: its colours, its places, and what it must never hide."""
+"""The picture of a fleet: its colours, what it must never hide, and that it is an image."""
 
-import logging
-import pickle
-import subprocess
-import sys
 from dataclasses import replace
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.env.floor_plan import LARGEST, SMALLEST, FloorPlan, floor_plan
+from fleet.env.floor_plan import LARGEST, FloorPlan, floor_plan
 from fleet.env.heat_colours import heat_colour
 from fleet.env.lettering import fitted, width
-from fleet.env.picture import draw, legend_x, legend_y, picture
+from fleet.env.picture import legend_x, legend_y, picture
 from fleet.env.queue_column import due
-from fleet.env.scene import Cell, MountKind, Offer, Scene, mount_kind, plain_cell, scene_of
-from fleet.env.window import Window
-from fleet.robot import JOINTS, Mount
-from fleet.sim.kernel import step
-from fleet.sim.state import initial
+from fleet.env.scene import Cell, Offer, Scene, plain_cell
+from fleet.robot import JOINTS
 from fleet.telemetry import FAULTED, IDLE, WORKING
 
 FAULT = (0xCC, 0x22, 0x22)
@@ -190,71 +183,6 @@ def test_slack_in_words(due_in_s, words) -> None:
     assert due(due_in_s) == words
 
 
-# Places
-
-metres = st.floats(-50, 50)
-points = st.tuples(metres, metres, metres)
-sizes = st.tuples(st.integers(SMALLEST[0], 1300), st.integers(SMALLEST[1], 1000))
-kinds = st.sampled_from(get_args(MountKind))
-
-
-@st.composite
-def cells(draw: st.DrawFn) -> Cell:
-    arms, stations = draw(st.integers(1, 64)), draw(st.integers(0, 30))
-    return Cell(
-        arms=tuple(f"arm_{i}" for i in range(arms)),
-        mounts_m=tuple(draw(st.lists(points, min_size=arms, max_size=arms))),
-        kinds=tuple(draw(st.lists(kinds, min_size=arms, max_size=arms))),
-        stations=tuple((f"s{i}", p) for i, p in enumerate(draw(st.lists(points, max_size=stations)))),
-    )
-
-
-def inside(x: float, y: float, box: tuple[int, int, int, int], margin: float = 0.0) -> bool:
-    left, top, right, bottom = box
-    return left + margin <= x <= right - margin and top + margin <= y <= bottom - margin
-
-
-@settings(max_examples=40)
-@given(cells(), sizes)
-def test_every_arm_and_station_is_on_the_floor(cell, size) -> None:
-    plan = floor_plan(cell, size)
-    floor = plan.floor
-    assert inside(floor[0], floor[1], (0, 0, *size))
-    assert inside(floor[2], floor[3], (0, 0, *size))
-    assert len(plan.rings) == len(cell.arms)
-    for a, (x, y) in enumerate(plan.rings):
-        assert inside(x, y, floor, plan.reach)
-        assert y + plan.reach + plan.rows * plan.text <= floor[3]
-        assert len(set(plan.motors(a))) == JOINTS
-        assert all(inside(u, v, floor, plan.motor) for u, v in plan.motors(a))
-    assert all(inside(x, y, floor, plan.station) for x, y in (*plan.stations, *plan.bases))
-
-
-@given(st.lists(points, min_size=1, max_size=6))
-def test_it_is_a_map(stations) -> None:
-    """One scale for both directions, x to the right and y up."""
-    cell = replace(row(1), stations=tuple((f"s{i}", p) for i, p in enumerate(stations)))
-    plan = floor_plan(cell)
-    apart_px = np.array(plan.stations) - plan.bases[0]
-    apart_m = np.array(stations)[:, :2] * [1.0, -1.0]
-    farthest = np.unravel_index(np.abs(apart_m).argmax(), apart_m.shape)
-    if abs(apart_m[farthest]) > 0.2:
-        per_m = apart_px[farthest] / apart_m[farthest]
-        assert per_m > 0
-        np.testing.assert_allclose(apart_px, per_m * apart_m, atol=2.5)  # whole pixels
-
-
-@pytest.mark.parametrize("arms", [2, 3, 4, 7, 16])
-@pytest.mark.parametrize("size", [(960, 640), (480, 320)])
-def test_arms_at_one_place_do_not_cover_each_other(arms, size) -> None:
-    """Floor and ceiling above each other, seen from above."""
-    cell = replace(row(arms), mounts_m=((0.0, 0.0, 0.0),) * arms)
-    plan = floor_plan(cell, size)
-    rings = np.array(plan.rings)
-    gaps = np.linalg.norm(rings[:, None] - rings[None], axis=-1)[~np.eye(arms, dtype=bool)]
-    assert gaps.min() >= 2 * (plan.ring + plan.motor)
-
-
 @pytest.mark.parametrize("size", [(960, 640), (480, 320)])
 @pytest.mark.parametrize("arms", [2, 4, 6])
 def test_what_an_arm_does_is_not_written_over_another_arm(arms, size) -> None:
@@ -270,20 +198,6 @@ def test_what_an_arm_does_is_not_written_over_another_arm(arms, size) -> None:
             for x, y in plan.motors(other) if other != a else ():
                 near = (slice(y - plan.motor, y + plan.motor + 1), slice(x - plan.motor, x + plan.motor + 1))
                 assert (busy[near] == idle[near]).all()
-
-
-@settings(max_examples=40)
-@given(cells(), sizes)
-def test_names_of_stations_cover_no_arm_and_no_other_name(cell, size) -> None:
-    plan = floor_plan(cell, size)
-    boxes = [(*label.at, width(label.text, plan.text)) for label in plan.labels]
-    for i, (x, y, long) in enumerate(boxes):
-        assert inside(x, y, plan.floor)
-        assert inside(x + long, y, plan.floor)
-        for u, v in plan.rings:
-            nearest = min(max(u, x), x + long)
-            assert np.hypot(nearest - u, y - v) >= plan.reach
-        assert all(abs(y - v) >= plan.text or x + long < u or u + other < x for u, v, other in boxes[:i])
 
 
 @pytest.mark.parametrize("size", [(319, 240), (320, 239), (LARGEST[0] + 1, 640), (-5, 640), (0, 0)])
@@ -342,101 +256,3 @@ def test_what_does_not_belong_together_is_refused() -> None:
         row(0)
     with pytest.raises(ValueError, match="must be finite"):
         replace(row(1), mounts_m=((0.0, np.nan, 0.0),))
-
-
-# From the simulator
-
-
-@pytest.mark.parametrize(
-    ("tilt_deg", "kind"),
-    [
-        ((0, 0, 0), "floor"),
-        ((0, 0, 180), "floor"),
-        ((180, 0, 0), "ceiling"),
-        ((0, 90, 0), "wall"),
-        ((90, 0, 0), "wall"),
-        ((0, -90, 30), "wall"),
-        ((45, 0, 0), "tilted"),
-        ((0, 140, 0), "tilted"),
-    ],
-)
-def test_what_an_arm_is_fixed_to(tilt_deg, kind) -> None:
-    assert mount_kind(Mount(tilt_deg=tilt_deg)) == kind
-
-
-def test_a_scene_tells_the_truth_about_a_world(small) -> None:
-    work, heavy = small.work("bench"), small.work("rack", payload_kg=2.5)
-    jobs = [small.job("now", work), small.job("next", heavy, due_s=5.0), small.job("late", work, release_s=500.0)]
-    arms = [small.arm(0, [work]), small.arm(1, [work, heavy])]
-    world, plant = small.shop([jobs], arms=arms)
-    state = step(world, initial(world), np.array([[1, 0]]), np.zeros((1, 2, 4)), plant).state
-    seen = scene_of(world, state, title="two arms")
-    assert (seen.time_s, seen.horizon_s, seen.finished, seen.waiting, seen.faults) == (10.0, 600.0, 0, 1, 0)
-    assert (seen.mode, seen.job, seen.at) == ((WORKING, IDLE), ("now", ""), (("bench",), ()))
-    assert seen.share == (pytest.approx(10.0 / (3.0 + 3 * 10.0 + 2.0)), 0.0)
-    assert seen.offers == (Offer(job="next", payload_kg=2.5, due_in_s=-5.0, able=(False, True), free=(False, True)),)
-    np.testing.assert_array_equal(seen.temp_c, state.temp_c[0, :, :JOINTS])
-    assert (draw(world, state, title="two arms") == picture(seen)).all()
-    with pytest.raises(ValueError, match=r"The cell is of the arms arm_0; the world's are arm_0, arm_1\."):
-        scene_of(world, state, row(1))
-
-
-def test_a_finished_job_and_a_fault_are_counted(small) -> None:
-    world, plant = small.shop([[small.job("a", small.work("bench"), repetitions=1)]])
-    state = initial(world)
-    for action in (1, 0):
-        state = step(world, state, np.array([[action, 0]]), np.zeros((1, 2, 4)), plant).state
-    state.faults[0, 1] = 2
-    seen = scene_of(world, state)
-    assert (seen.finished, seen.waiting, seen.faults, seen.job) == (1, 0, 2, ("", ""))
-
-
-# The window
-
-
-def test_without_a_display_it_says_so_once_and_goes_on(monkeypatch, caplog) -> None:
-    monkeypatch.setattr("matplotlib.get_backend", lambda: "agg")
-    window = Window()
-    with caplog.at_level(logging.WARNING):
-        assert [window.show(picture(scene(row(1)), (320, 240))) for _ in range(3)] == [False] * 3
-        assert window.show(np.zeros((240, 320, 3), np.uint8)) is False
-    assert len(caplog.messages) == 1
-    assert "render_mode='rgb_array'" in caplog.messages[0]
-    assert "thermofleet animate" in caplog.messages[0]
-    window.close()
-    pickle.loads(pickle.dumps(window))
-
-
-def test_a_window_follows_the_frames_until_it_is_closed(monkeypatch) -> None:
-    """As if matplotlib's own canvas were a window."""
-    import matplotlib.pyplot as plt
-    from matplotlib.backend_bases import FigureManagerBase
-
-    monkeypatch.setattr("matplotlib.get_backend", lambda: "TkAgg")
-    monkeypatch.setattr(FigureManagerBase, "show", lambda self: None)
-    plt.switch_backend("agg")
-    window, black = Window("test"), np.zeros((240, 320, 3), np.uint8)
-    assert window.show(black)
-    assert window.show(black + 255)
-    (figure,) = map(plt.figure, plt.get_fignums())
-    assert (figure.axes[0].images[0].get_array() == 255).all()
-    assert figure.get_size_inches().tolist() == [3.2, 2.4]
-    copied = pickle.loads(pickle.dumps(window))
-    plt.close(figure)  # as a person would
-    assert not window.show(black)
-    assert plt.get_fignums() == []
-    window.close()
-    assert window.show(black)
-    window.close()
-    copied.close()
-    assert plt.get_fignums() == []
-
-
-def test_matplotlib_is_loaded_for_a_window_alone() -> None:
-    code = (
-        "import sys, numpy as np; import fleet.env.window, fleet.env.picture as p; "
-        "from fleet.env.lettering import width; width('a', 12); "
-        "print([m for m in ('matplotlib', 'torch', 'mujoco', 'zenoh', 'tkinter') if m in sys.modules])"
-    )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
-    assert said.stdout.strip() == "[]"

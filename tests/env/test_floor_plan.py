@@ -1,0 +1,91 @@
+"""Where everything of a fleet is drawn: a map, on which nothing covers anything else."""
+
+from dataclasses import replace
+from typing import get_args
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet.env.floor_plan import SMALLEST, floor_plan
+from fleet.env.lettering import width
+from fleet.env.scene import Cell, MountKind, plain_cell
+from fleet.robot import JOINTS
+
+metres = st.floats(-50, 50)
+points = st.tuples(metres, metres, metres)
+sizes = st.tuples(st.integers(SMALLEST[0], 1300), st.integers(SMALLEST[1], 1000))
+kinds = st.sampled_from(get_args(MountKind))
+
+
+@st.composite
+def cells(draw: st.DrawFn) -> Cell:
+    arms, stations = draw(st.integers(1, 64)), draw(st.integers(0, 30))
+    return Cell(
+        arms=tuple(f"arm_{i}" for i in range(arms)),
+        mounts_m=tuple(draw(st.lists(points, min_size=arms, max_size=arms))),
+        kinds=tuple(draw(st.lists(kinds, min_size=arms, max_size=arms))),
+        stations=tuple((f"s{i}", p) for i, p in enumerate(draw(st.lists(points, max_size=stations)))),
+    )
+
+
+def inside(x: float, y: float, box: tuple[int, int, int, int], margin: float = 0.0) -> bool:
+    left, top, right, bottom = box
+    return left + margin <= x <= right - margin and top + margin <= y <= bottom - margin
+
+
+@settings(max_examples=40)
+@given(cells(), sizes)
+def test_every_arm_and_station_is_on_the_floor(cell, size) -> None:
+    plan = floor_plan(cell, size)
+    floor = plan.floor
+    assert inside(floor[0], floor[1], (0, 0, *size))
+    assert inside(floor[2], floor[3], (0, 0, *size))
+    assert len(plan.rings) == len(cell.arms)
+    for a, (x, y) in enumerate(plan.rings):
+        assert inside(x, y, floor, plan.reach)
+        assert y + plan.reach + plan.rows * plan.text <= floor[3]
+        assert len(set(plan.motors(a))) == JOINTS
+        assert all(inside(u, v, floor, plan.motor) for u, v in plan.motors(a))
+    assert all(inside(x, y, floor, plan.station) for x, y in (*plan.stations, *plan.bases))
+
+
+@given(st.lists(points, min_size=1, max_size=6))
+def test_it_is_a_map(stations) -> None:
+    """One scale for both directions, x to the right and y up."""
+    cell = replace(plain_cell(("arm_0",), ()), stations=tuple((f"s{i}", p) for i, p in enumerate(stations)))
+    plan = floor_plan(cell)
+    apart_px = np.array(plan.stations) - plan.bases[0]
+    apart_m = np.array(stations)[:, :2] * [1.0, -1.0]
+    farthest = np.unravel_index(np.abs(apart_m).argmax(), apart_m.shape)
+    if abs(apart_m[farthest]) > 0.2:
+        per_m = apart_px[farthest] / apart_m[farthest]
+        assert per_m > 0
+        np.testing.assert_allclose(apart_px, per_m * apart_m, atol=2.5)  # whole pixels
+
+
+@pytest.mark.parametrize("arms", [2, 3, 4, 7, 16])
+@pytest.mark.parametrize("size", [(960, 640), (480, 320)])
+def test_arms_at_one_place_do_not_cover_each_other(arms, size) -> None:
+    """Floor and ceiling above each other, seen from above."""
+    names = tuple(f"arm_{i}" for i in range(arms))
+    cell = replace(plain_cell(names, ("bench", "rack")), mounts_m=((0.0, 0.0, 0.0),) * arms)
+    plan = floor_plan(cell, size)
+    rings = np.array(plan.rings)
+    gaps = np.linalg.norm(rings[:, None] - rings[None], axis=-1)[~np.eye(arms, dtype=bool)]
+    assert gaps.min() >= 2 * (plan.ring + plan.motor)
+
+
+@settings(max_examples=40)
+@given(cells(), sizes)
+def test_names_of_stations_cover_no_arm_and_no_other_name(cell, size) -> None:
+    plan = floor_plan(cell, size)
+    boxes = [(*label.at, width(label.text, plan.text)) for label in plan.labels]
+    for i, (x, y, long) in enumerate(boxes):
+        assert inside(x, y, plan.floor)
+        assert inside(x + long, y, plan.floor)
+        for u, v in plan.rings:
+            nearest = min(max(u, x), x + long)
+            assert np.hypot(nearest - u, y - v) >= plan.reach
+        assert all(abs(y - v) >= plan.text or x + long < u or u + other < x for u, v, other in boxes[:i])

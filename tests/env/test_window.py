@@ -1,0 +1,60 @@
+"""The window that shows frames, where there is a display, and what is said where there is none."""
+
+import logging
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+
+from fleet.env.window import Window
+
+BLACK = np.zeros((240, 320, 3), np.uint8)
+
+
+def test_without_a_display_it_says_so_once_and_goes_on(monkeypatch, caplog) -> None:
+    monkeypatch.setattr("matplotlib.get_backend", lambda: "agg")
+    window = Window()
+    with caplog.at_level(logging.WARNING):
+        assert [window.show(BLACK) for _ in range(3)] == [False] * 3
+        assert window.show(BLACK + 255) is False
+    assert len(caplog.messages) == 1
+    assert "render_mode='rgb_array'" in caplog.messages[0]
+    assert "thermofleet animate" in caplog.messages[0]
+    window.close()
+    pickle.loads(pickle.dumps(window))
+
+
+def test_a_window_follows_the_frames_until_it_is_closed(monkeypatch) -> None:
+    """As if matplotlib's own canvas were a window."""
+    import matplotlib.pyplot as plt
+    from matplotlib.backend_bases import FigureManagerBase
+
+    monkeypatch.setattr("matplotlib.get_backend", lambda: "TkAgg")
+    monkeypatch.setattr(FigureManagerBase, "show", lambda self: None)
+    plt.switch_backend("agg")
+    window = Window("test")
+    assert window.show(BLACK)
+    assert window.show(BLACK + 255)
+    (figure,) = map(plt.figure, plt.get_fignums())
+    assert (figure.axes[0].images[0].get_array() == 255).all()
+    assert figure.get_size_inches().tolist() == [3.2, 2.4]
+    copied = pickle.loads(pickle.dumps(window))
+    plt.close(figure)  # as a person would
+    assert not window.show(BLACK)
+    assert plt.get_fignums() == []
+    window.close()
+    assert window.show(BLACK)
+    window.close()
+    copied.close()
+    assert plt.get_fignums() == []
+
+
+def test_matplotlib_is_loaded_for_a_window_alone() -> None:
+    code = (
+        "import sys, numpy as np; import fleet.env.window, fleet.env.picture as p; "
+        "from fleet.env.lettering import width; width('a', 12); "
+        "print([m for m in ('matplotlib', 'torch', 'mujoco', 'zenoh', 'tkinter') if m in sys.modules])"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert said.stdout.strip() == "[]"
