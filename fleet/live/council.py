@@ -146,8 +146,10 @@ class Council:
         return [job for job in self.jobs if job not in register.settled and job not in gone]
 
     def over(self, real_s: float) -> bool:
-        """Whether every arm that is there knows that every job is settled."""
+        """Whether every arm that is there, a majority at least, knows that every job is settled."""
         others = [self._bids.get(arm) for arm in self._there - {self.arm}]
+        if len(others) + 1 < self.claimant.majority:
+            return False
         known = all(bid is not None and bid[0].left == 0 and real_s < bid[1] + FRESH_S for bid in others)
         return known and not (self.left(real_s) or self.contractor.owes or self.contractor.held)
 
