@@ -55,8 +55,11 @@ _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS)
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point: errors that the user can mend are one sentence and exit code 2; Ctrl-C is 130."""
-    told = RichHandler(console=err_console, show_time=False, show_path=False, rich_tracebacks=False)
-    logging.basicConfig(level=logging.WARNING, format="%(name)s: %(message)s", handlers=[told])
+    if err_console.is_terminal:
+        told = RichHandler(console=err_console, show_time=False, show_path=False, rich_tracebacks=False)
+        logging.basicConfig(level=logging.WARNING, format="%(name)s: %(message)s", handlers=[told])
+    else:  # a file, where a line is a message
+        logging.basicConfig(level=logging.WARNING, format="%(levelname)-8s %(name)s: %(message)s")
     try:
         code = app(args=list(argv) if argv is not None else None, prog_name="thermofleet", standalone_mode=False)
     except Interrupted as interrupted:

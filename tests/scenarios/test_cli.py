@@ -346,3 +346,10 @@ def test_help_does_not_wait_for_the_learning_library():
     program = "import sys; import scenarios.cli; print([m for m in ('torch', 'zenoh', 'plotly') if m in sys.modules])"
     said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
     assert said.stdout.strip() == "[]"
+
+
+def test_a_warning_is_one_line_where_there_is_no_terminal():
+    warn = "logging.getLogger('fleet.live').warning('%s', 'word ' * 60)"
+    code = f"import logging, scenarios.cli as cli; cli.app = lambda **_: {warn}; cli.main([])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stderr == f"WARNING  fleet.live: {'word ' * 60}\n"
