@@ -1,5 +1,6 @@
 """`thermofleet submit`: hand in jobs from a file, and follow what becomes of them."""
 
+import re
 import sys
 import time
 from pathlib import Path
@@ -8,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 import typer
 
-from fleet.errors import BusError, FleetError
+from fleet.errors import BusError, FleetError, nearest
+from fleet.job import KINDS
 from scenarios.live_options import ENDPOINT, EndpointOption, FleetOption, the_fleet
 
 if TYPE_CHECKING:
@@ -26,6 +28,8 @@ LOOK_S = 0.5
 """Real seconds between two looks at how jobs stand."""
 PATIENCE_S = 30.0
 """Real seconds without an auctioneer before the following ends."""
+_NO_KIND = re.compile(r"Invalid enum value '(.*)'", re.DOTALL)
+"""So msgspec complains; nothing of a job but its kind is one of a few words."""
 FileArg = Annotated[str, typer.Argument(help="Jobs as JSON: a list, or one job a line; - reads standard input.")]
 
 
@@ -87,6 +91,8 @@ def _decoded(raw: bytes, kind: Any, where: str) -> Any:
 def plain(error: Exception) -> str:
     """What msgspec complains of as a sentence, with the place in the words of the file."""
     what, _, where = str(error).rstrip(".").partition(" - at `$")
+    if found := _NO_KIND.fullmatch(what):
+        what = f"No kind of job '{found[1]}'{nearest(found[1], KINDS)}".rstrip(".")
     where = where.rstrip("`").lstrip(".")
     return f"{what}{f' (at {where})' if where else ''}."
 

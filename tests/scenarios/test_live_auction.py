@@ -71,7 +71,10 @@ def test_jobs_come_one_a_line_or_as_a_list(tmp_path):
     [
         (f"{json.dumps(HOLD)}\n{{}}", "line 2: Object missing required field `name`."),
         (json.dumps(HOLD | {"repetitions": 0}), "line 1: Expected `int` >= 1 (at repetitions)."),
-        (json.dumps([HOLD, HOLD | {"kind": "dance"}]), "Invalid enum value 'dance' (at [1].kind)."),
+        (
+            json.dumps([HOLD, HOLD | {"kind": "dance"}]),
+            "No kind of job 'dance'. Allowed: hold, pick_place, press, sort (at [1].kind).",
+        ),
         (json.dumps(HOLD | {"places": ["a", "b"]}), "line 1: A hold needs 1 place(s), got 2."),
         ("{", "line 1: Input data was truncated."),
         ("\n", "there are no jobs in it."),
@@ -377,7 +380,9 @@ def test_ask_shows_what_a_job_would_cost_whom(endpoint, capsys):
 def test_ask_says_what_is_missing(endpoint, capsys):
     at = ("--endpoint", endpoint, "--fleet", "f")
     assert "either a FILE of jobs or one job" in call(capsys, "ask", *at)[2]
-    assert "No such job: Invalid enum value 'dance' (at kind)." in call(capsys, "ask", "--kind", "dance", *at)[2]
+    told = call(capsys, "ask", "--kind", "pick_and_place", *at)[2]
+    told_kinds = "did you mean 'pick_place'? Allowed: hold, pick_place, press, sort (at kind)."
+    assert f"No such job: No kind of job 'pick_and_place'; {told_kinds}" in " ".join(told.split())
     code, _, err = call(capsys, "ask", "--kind", "hold", "--place", "rack", *at)
     assert code == 2
     assert "No arm of fleet 'f' answered" in err
