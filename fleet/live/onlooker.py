@@ -3,6 +3,7 @@
 import logging
 import time
 from collections.abc import Callable
+from functools import partial
 
 import msgspec
 
@@ -51,10 +52,12 @@ class Onlooker:
     def serve(self, until_s: float) -> None:
         """Hear what comes until the real second `until_s`; now and then ask where the jobs stand."""
         if time.monotonic() >= self._ask_s:
-            self._ask_s = time.monotonic() + ASK_EVERY_S
+            asked_s = time.monotonic()
+            self._ask_s = asked_s + ASK_EVERY_S
             key = keys.of_jobs(self._link.fleet, "status")
             try:
-                self._link.ask(key, StatusRequest(), Status, self._told, timeout_s=ASK_EVERY_S)
+                told = partial(self._told, asked_s)
+                self._link.ask(key, StatusRequest(), Status, told, timeout_s=ASK_EVERY_S)
             except BusError as error:
                 _LOG.warning("%s", error)
         while time.monotonic() < until_s:
@@ -74,6 +77,9 @@ class Onlooker:
 
         return came
 
-    def _told(self, answers: Answers[Status]) -> None:
-        for status in answers.words.values():
+    def _told(self, asked_s: float, answers: Answers[Status]) -> None:
+        told = list(answers.words.values())
+        for status in told:
             self.overview.told(status, time.monotonic())
+        if not answers.refused:
+            self.overview.forget_all_but(told, asked_s)

@@ -4,20 +4,24 @@ Words and real time come in, a picture goes out; no clock, no I/O. However many 
 remembered is bounded: the ones not heard of for longest go first.
 """
 
+import math
 from collections import Counter, OrderedDict
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, TypeVar
 
 import msgspec
 
-from fleet.bus.messages import DifficultyWord, Info, State
+from fleet.bus import trade
+from fleet.bus.messages import DifficultyWord, Info, State, encode
 from fleet.bus.trade import Announce, ArmEvent, JobStatus, Result, Status
 from fleet.telemetry import Mode
 
 FRESH_S = 3.0
 """Real seconds: an arm is present when its token is there and its last state is no older than this."""
 MOST_ARMS, MOST_JOBS = 1024, 4096
+WHOLE_BYTES = 32_000
+"""An answer where jobs stand that is smaller, and of fewer jobs than one may hold, tells of all there are."""
 
 Role = Literal["arm", "auction"]
 Seen = TypeVar("Seen")
@@ -84,6 +88,8 @@ class _Arm:
 class _Auctioneer:
     token: bool = False
     heard_s: float | None = None
+    time_s: float = -math.inf
+    """The fleet's, when it last answered."""
 
 
 @dataclass
@@ -96,6 +102,8 @@ class Overview:
     _jobs: "OrderedDict[str, JobStatus]" = field(default_factory=OrderedDict[str, JobStatus])
     _numbers: dict[str, int] = field(default_factory=dict[str, int])
     """Number of the last result by job, so that an older one changes nothing."""
+    _heard_s: dict[str, float] = field(default_factory=dict[str, float])
+    """Real second in which a job was last heard of."""
 
     def token(self, role: Role, name: str, there: bool) -> bool:
         """Somebody came or went; says whether that is news."""
@@ -113,7 +121,7 @@ class Overview:
             _latest(self._auctioneers, name, _Auctioneer(), MOST_ARMS).heard_s = now_s
             if isinstance(word, Result) and word.number >= self._numbers.get(word.status.job, 0):
                 self._numbers[word.status.job] = word.number
-                self._stands(word.status)
+                self._stands(word.status, now_s)
             return
         if not isinstance(word, State | DifficultyWord | Info | ArmEvent):
             return
@@ -129,9 +137,26 @@ class Overview:
 
     def told(self, status: Status, now_s: float) -> None:
         """The auctioneer answered where jobs stand."""
-        _latest(self._auctioneers, status.auctioneer, _Auctioneer(), MOST_ARMS).heard_s = now_s
+        seen = _latest(self._auctioneers, status.auctioneer, _Auctioneer(), MOST_ARMS)
+        if status.time_s < seen.time_s:  # time does not run back: another fleet, or one that counts its results anew
+            self._numbers.clear()
+            if not _whole(status):
+                self._jobs.clear()
+        seen.heard_s, seen.time_s = now_s, status.time_s
         for job in status.jobs:
-            self._stands(job)
+            self._stands(job, now_s)
+
+    def forget_all_but(self, told: Sequence[Status], asked_s: float) -> None:
+        """Forget jobs of which nobody knows who was asked for all of them at the real second `asked_s`.
+
+        They are of a fleet that was there before. An answer that may have had no room for all settles nothing.
+        """
+        if not told or not all(map(_whole, told)):
+            return
+        known = {job.job for status in told for job in status.jobs}
+        for name in [name for name in self._jobs if name not in known and self._heard_s[name] < asked_s]:
+            del self._jobs[name], self._heard_s[name]
+            self._numbers.pop(name, None)
 
     def now(self, now_s: float, jobs: int = MOST_JOBS) -> FleetNow:
         """The fleet at the real second `now_s`, with so many of the jobs that changed last."""
@@ -147,17 +172,25 @@ class Overview:
             jobs=tuple(self._jobs[name] for name in names),
         )
 
-    def _stands(self, status: JobStatus) -> None:
+    def _stands(self, status: JobStatus, now_s: float) -> None:
+        self._heard_s[status.job] = now_s
         if self._jobs.get(status.job) != status:
             _latest(self._jobs, status.job, status, MOST_JOBS)
             self._jobs[status.job] = status
-            if len(self._numbers) > 2 * MOST_JOBS:
-                self._numbers = {name: number for name, number in self._numbers.items() if name in self._jobs}
+        for kept in (self._numbers, self._heard_s):
+            if len(kept) > 2 * MOST_JOBS:
+                for name in [name for name in kept if name not in self._jobs]:
+                    del kept[name]
 
 
 def counted(jobs: Iterable[JobStatus]) -> dict[str, int]:
     """Jobs by state, for example {'waiting': 3, 'finished': 12}."""
     return dict(Counter(job.state for job in jobs))
+
+
+def _whole(status: Status) -> bool:
+    """Whether an answer had room for every job there is."""
+    return len(status.jobs) < trade.MOST_JOBS and len(encode(status)) < WHOLE_BYTES
 
 
 def _arm_now(name: str, seen: _Arm, now_s: float) -> ArmNow:

@@ -18,7 +18,8 @@ from fleet.bus import keys
 from fleet.bus.link import Link
 from fleet.bus.messages import DifficultyWord, State
 from fleet.bus.router import Router
-from fleet.bus.trade import ArmEvent, JobStatus, Result, Status
+from fleet.bus.trade import ArmEvent, JobStatus, Result, Status, StatusRequest
+from fleet.live import onlooker as onlooker_module
 from fleet.live import overview as overview_module
 from fleet.live.onlooker import Onlooker
 from fleet.live.overview import FRESH_S, ArmNow, FleetNow, Overview
@@ -64,6 +65,59 @@ def test_news_is_told_once():
         False,
         True,
     ]
+
+
+def stands(time_s, *jobs, state="finished"):
+    return Status("au", time_s, tuple(JobStatus(job, state) for job in jobs))
+
+
+def test_jobs_that_the_auctioneer_does_not_know_are_of_a_fleet_before():
+    seen = Overview("f")
+    for number, job in enumerate("ab"):
+        seen.hear("au", result(40 + number, job, "finished"), 0.0)
+    seen.hear("au", result(1, "new"), 2.0)  # said after the question was
+    seen.told(stands(5.0, "b", state="waiting"), 3.0)
+    seen.forget_all_but([stands(5.0, "b", state="waiting")], 1.0)
+    assert {job.job: job.state for job in seen.now(3.0).jobs} == {"b": "waiting", "new": "awarded"}
+    seen.forget_all_but([], 9.0)  # nobody answered
+    assert seen.now(9.0).counts == {"waiting": 1, "awarded": 1}
+
+
+def test_a_fleet_that_begins_anew_counts_its_results_anew():
+    seen = Overview("f")
+    seen.hear("au", result(40, "a", "finished"), 0.0)
+    seen.told(stands(900.0, "a"), 1.0)
+    seen.told(stands(3.0, "a", state="waiting"), 2.0)
+    seen.hear("au", result(0, "a", "awarded"), 3.0)
+    assert seen.now(3.0).counts == {"awarded": 1}
+
+
+@pytest.mark.parametrize(("jobs", "letters"), [(128, 1), (20, 2000)])
+def test_an_answer_without_room_for_all_settles_nothing(jobs, letters):
+    names = [f"{number:03d}{'x' * letters}" for number in range(jobs)]
+    seen = Overview("f")
+    seen.hear("au", result(0, "old", "finished"), 0.0)
+    full = stands(5.0, *names)
+    seen.told(full, 2.0)
+    seen.forget_all_but([full], 1.0)
+    assert sum(seen.now(2.0).counts.values()) == jobs + 1
+    seen.told(stands(1.0, *names), 3.0)  # but time that ran back does
+    assert sum(seen.now(3.0).counts.values()) == jobs
+
+
+def test_an_onlooker_that_stays_counts_the_jobs_of_the_next_fleet_alone(monkeypatch):
+    monkeypatch.setattr(onlooker_module, "ASK_EVERY_S", 0.05)
+    fleets = [stands(900.0, "a", "b"), stands(5.0, "c", state="waiting")]
+    with Router() as router, Link(router.endpoint, "f") as link, Link(router.endpoint, "f") as auctioneer:
+        auctioneer.answer(keys.of_jobs("f", "status"), StatusRequest, lambda _: fleets[0])
+        seen = Onlooker(link)
+        for fleet in ({"finished": 2}, {"waiting": 1}):
+            deadline_s = time.monotonic() + PATIENCE_S
+            while seen.overview.now(0.0).counts != fleet:
+                assert time.monotonic() < deadline_s
+                seen.serve(time.monotonic() + 0.02)
+                auctioneer.serve(time.monotonic() + 0.02)
+            del fleets[:-1]
 
 
 def test_an_older_result_changes_nothing():
