@@ -76,6 +76,7 @@ def library(difficulty: str, arms: int = 4) -> Library:
               "word")  # fmt: skip
     tables = one.tables._replace(
         ambient_c=np.tile(one.tables.ambient_c, (1, 1, times)),
+        able=np.tile(one.tables.able, (1, 1, times)),
         **{name: np.concatenate([getattr(one.tables, name)] * times, axis=1) for name in second},
     )
     return Library(tuple(f"arm_{a}" for a in range(arms)), one.slots, tables, one.draw)

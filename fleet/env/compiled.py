@@ -23,7 +23,7 @@ class CompiledShift:
         tables, drawn = tables_of(world)
         (shift,) = shifts_of(drawn, [key_of(episode.sensors)])
         self._engine = Engine(tables, 1, layout, weights, jobs=world.jobs.exists.shape[1])
-        self._engine.begin(0, shift)
+        self._engine.begin(np.zeros(1, dtype=int), [shift])
         self._vectors = np.empty((1, layout.arms, layout.size), np.float32)
         self._engine.observe(np.zeros(1, dtype=int), self._vectors)
 
@@ -66,5 +66,5 @@ class CompiledShift:
         Args:
             actions: int64 [arm].
         """
-        terms, finished = self._engine.step(actions[None], self._vectors)
+        terms, _, finished = self._engine.step(actions[None], self._vectors)
         return terms[0], bool(finished[0])

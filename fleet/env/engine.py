@@ -9,10 +9,10 @@ import numpy as np
 from fleet.env.fields import look, turn
 from fleet.env.observation import Layout
 from fleet.env.reward import TERMS, RewardWeights, scale
-from fleet.sim.state import WAITING, State
+from fleet.sim.beginning import begin
+from fleet.sim.state import State
 from fleet.sim.tables import Drawn, Offer, Rows, Tables, state_of
-from fleet.telemetry import IDLE
-from fleet.thermal import NODES, WINDING
+from fleet.thermal import NODES
 
 Array = np.ndarray
 
@@ -49,7 +49,7 @@ class Engine:
     def __init__(self, tables: Tables, envs: int, layout: Layout, weights: RewardWeights, *, jobs: int = 1) -> None:
         arms, slots = layout.arms, layout.slots
         self.tables, self.layout = tables, layout
-        self._weights = np.array([getattr(weights, name) for name in TERMS])
+        self._worth = scale(np.ones(len(TERMS)), np.array([getattr(weights, name) for name in TERMS]))
         self._offer = Offer(
             on_offer=np.full((envs, slots), -1),
             mask=np.zeros((envs, arms, slots + 1), np.int8),
@@ -61,7 +61,6 @@ class Engine:
         )
         self._offer.mask[:, :, 0] = 1
         self._all = np.arange(envs)
-        self._raw = np.zeros((len(TERMS), envs))
         self._start = np.array(layout.starts)
         self._low, self._high = layout.bounds
         self._drawn, self._rows = _arrays(envs, arms, jobs, 0)
@@ -99,28 +98,24 @@ class Engine:
         """Jobs not done, int [env]."""
         return self._offer.open
 
-    def begin(self, env: int, shift: Shift) -> None:
-        """Put a new shift into a row; `observe` then tells what its arms know."""
-        count = len(shift.kind)
-        after = shift.after[:, (shift.after >= 0).any(axis=0)]
-        waits = after.shape[1]
-        if count > self._drawn.kind.shape[1] or waits > self._drawn.after.shape[2]:
-            self._make_room(count, waits)
-        d, s = self._drawn, self._rows
-        d.lot[env], d.air_k[env], d.key[env], d.jobs[env] = shift.lot, shift.air_k, shift.key, count
-        d.kind[env, :count], d.repetitions[env, :count] = shift.kind, shift.repetitions
-        d.release_s[env, :count], d.due_s[env, :count] = shift.release_s, shift.due_s
-        d.after[env] = -1
-        d.after[env, :count, :waits] = after
-        for name in _ZERO:
-            getattr(s, name)[env] = 0
-        s.mode[env], s.job[env], s.clear_at_s[env] = IDLE, -1, np.inf
-        s.temp_c[env] = self.tables.start_c[shift.lot] + shift.air_k
-        s.peak_c[env] = s.temp_c[env][:, WINDING].max(axis=-1)
-        s.status[env], s.finished_s[env] = WAITING, np.nan
-        s.queued_s[env] = d.release_s[env]
-        self._offer.open[env], self._offer.head[env] = count, 0
-        self._offer.queue[env, :count] = np.argsort(shift.release_s, kind="stable")
+    def begin(self, envs: Array, shifts: Sequence[Shift]) -> None:
+        """Put a new shift into each of some rows; `observe` then tells what their arms know."""
+        first = np.cumsum([0, *(len(shift.kind) for shift in shifts)])
+        most, have = max(shift.after.shape[1] for shift in shifts), self._drawn.kind.shape[1]
+        after = np.concatenate([_wider(shift.after, most) for shift in shifts])
+        waits = int((after >= 0).sum(axis=1).max(initial=0))
+        after = -np.sort(-after, axis=1)[:, :waits]
+        jobs = int(np.diff(first).max())
+        if jobs > have or waits > self._drawn.after.shape[2]:
+            self._make_room(jobs, waits)
+        begin(
+            self.tables, self._drawn, self._rows, self._offer, envs,
+            np.array([shift.lot for shift in shifts]), np.array([shift.air_k for shift in shifts]),
+            np.array([shift.key for shift in shifts], np.uint64), first,
+            *(np.concatenate([getattr(shift, name) for shift in shifts])
+              for name in ("kind", "release_s", "due_s", "repetitions")),
+            after,
+        )  # fmt: skip
 
     def observe(self, envs: Array, out: Array) -> None:
         """What the arms of some envs know at the beginning of a shift, into float32 [env, arm, size]."""
@@ -128,7 +123,7 @@ class Engine:
             self.tables, self._drawn, self._rows, self._offer, envs, self._start, self._low, self._high, out,
         )  # fmt: skip
 
-    def step(self, actions: Array, out: Array) -> tuple[Array, Array]:
+    def step(self, actions: Array, out: Array) -> tuple[Array, Array, Array]:
         """One decision interval of every env.
 
         Args:
@@ -136,13 +131,14 @@ class Engine:
             out: Takes what the arms know thereafter, float32 [env, arm, size].
 
         Returns:
-            Weighted reward terms [env, term], and which envs have done all their jobs, bool [env].
+            Weighted reward terms [env, term], their sum [env], and which envs have done all their jobs, bool [env].
         """
+        terms = np.empty((self.envs, len(TERMS) + 1))
         turn(
-            self.tables, self._drawn, self._rows, self._offer, actions, self._raw, self._all,
+            self.tables, self._drawn, self._rows, self._offer, actions, self._worth, terms, self._all,
             self._start, self._low, self._high, out,
         )  # fmt: skip
-        return scale(self._raw.T, self._weights), (self._offer.open == 0) & (self._drawn.jobs > 0)
+        return terms[:, :-1], terms[:, -1], (self._offer.open == 0) & (self._drawn.jobs > 0)
 
     def _make_room(self, jobs: int, waits: int) -> None:
         """For more jobs a shift, a tenth more than asked for, keeping what is there."""
@@ -162,11 +158,8 @@ class Engine:
         self._make_room(0, 0)  # what was pickled no longer lies job by job
 
 
-_ZERO = (
-    "tick", "progress_s", "todo", "last_award", "faults", "illegal", "above_warning_s", "busy_s", "lost_s",
-    "energy_j", "cycles", "returns",
-)  # fmt: skip
-"""What is zero at the beginning of a shift."""
+def _wider(after: Array, waits: int) -> Array:
+    return np.pad(after, ((0, 0), (0, waits - after.shape[1])), constant_values=-1) if after.shape[1] < waits else after
 
 
 CACHE_LINE = 64

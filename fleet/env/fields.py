@@ -219,7 +219,8 @@ def turn(
     s: Rows,
     o: Offer,
     actions: Array,
-    raw: Array,
+    worth: Array,
+    terms: Array,
     rows: Array,
     start: Array,
     low: Array,
@@ -230,13 +231,14 @@ def turn(
 
     Args:
         actions: int64 [env, arm].
-        raw: Takes the reward terms, not weighted, [term, env].
+        worth: Of a unit of each reward term, [term].
+        terms: Takes the reward terms and their sum, [env, term + 1].
         rows: All envs, int [env].
         start, low, high, out: As in `look`.
     """
     for first in range(0, len(rows), BLOCK):
         some = rows[first : first + BLOCK]
         award(t, d, s, o, actions, some)
-        live(t, d, s, o, raw, some)
+        live(t, d, s, o, worth, terms, some)
         hang_out(t, d, s, o, some)
         perceive(t, d, s, o, some, start, low, high, out)

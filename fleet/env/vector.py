@@ -145,7 +145,7 @@ class BatchEnv:
             )
         chosen = self._checked(actions)
         vectors = self._no_vectors()
-        terms, finished = self._engine.step(chosen, vectors)
+        terms, reward, finished = self._engine.step(chosen, vectors)
         truncated = ~finished & (self._engine.rows.tick >= self._last_tick)
         self._vectors, self._over = vectors, finished | truncated
         ended = np.flatnonzero(self._over)
@@ -154,7 +154,7 @@ class BatchEnv:
         info = self._info(terms, ended, last)
         if last is not None:
             self._begin(ended)
-        return self._obs(), terms.sum(axis=1), finished, truncated, info
+        return self._obs(), reward.copy(), finished, truncated, info
 
     def knowledge(self) -> Observation:
         """What the arms know now by name, leading axes [env, arm], as policies read it."""
@@ -167,9 +167,11 @@ class BatchEnv:
         """Nothing is held open."""
 
     def _begin(self, rows: Array) -> None:
-        for e in rows.tolist():
-            seeds = self._seeds[e]
-            self._engine.begin(e, self._library.draw(seeds if self._fresh[e] else seeds.spawn(1)[0]))
+        if not len(rows):
+            return
+        chosen = ((self._seeds[e], self._fresh[e]) for e in rows.tolist())
+        draw = self._library.draw
+        self._engine.begin(rows, [draw(seeds if fresh else seeds.spawn(1)[0]) for seeds, fresh in chosen])
         self._fresh[rows], self._over[rows] = False, False
         self._engine.observe(rows, self._vectors)
 

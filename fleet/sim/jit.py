@@ -22,7 +22,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 _HERE = Path(__file__).parents[1]
 _SOURCES = (
-    "sim/jit.py", "sim/noise.py", "sim/tables.py", "sim/boiling.py", "sim/rows.py", "env/fields.py",
+    "sim/jit.py", "sim/noise.py", "sim/tables.py", "sim/boiling.py", "sim/rows.py", "sim/beginning.py", "env/fields.py",
     "robot.py", "telemetry.py", "thermal.py", "sim/faults.py", "sim/kernel.py", "sim/state.py", "env/observation.py",
 )  # fmt: skip
 """All that is compiled together, and whose constants are: numba itself looks at the file of a function only."""

@@ -34,14 +34,14 @@ def hang_out(t: Tables, d: Drawn, s: Rows, o: Offer, rows: Array) -> None:
     lots, kinds, count, release_s, after = d.lot, d.kind, d.jobs, d.release_s, d.after
     tick, modes, status = s.tick, s.mode, s.status
     on_offer, mask, queue, head, hand = o.on_offer, o.mask, o.queue, o.head, o.hand
-    stations, plan = t.stations, t.plan
+    places, able = t.places, t.able
     arms, slots = natural(modes.shape[1]), natural(on_offer.shape[1])
-    waits, places = natural(after.shape[2]), natural(stations.shape[2])
-    busy = np.empty(t.station_count + 1, np.bool_)
+    waits, words = natural(after.shape[2]), natural(places.shape[2])
+    busy = np.empty(words, np.uint64)
     for row in rows:
         e = natural(row)
         lot, now_s, found = natural(lots[e]), tick[e] * t.dt_s, 0
-        occupied(lot, e, modes, hand, stations, busy)
+        occupied(lot, e, hand, places, busy)
         for place in range(natural(head[e]), count[e]):
             j = natural(queue[e, place])
             if found == slots or release_s[e, j] > now_s:
@@ -54,14 +54,12 @@ def hang_out(t: Tables, d: Drawn, s: Rows, o: Offer, rows: Array) -> None:
             if not ready:
                 continue
             kind, free = natural(kinds[e, j]), True
-            for n in range(places):
-                station = stations[lot, kind, n]
-                if station >= 0 and busy[station]:
-                    free = False
+            for w in range(words):
+                free = free and (places[lot, kind, w] & busy[w]) == 0
             on_offer[e, found] = j
             found += 1
             for a in range(arms):
-                mask[e, a, found] = free and modes[e, a] == IDLE and plan[lot, a, kind] >= 0
+                mask[e, a, found] = free & (modes[e, a] == IDLE) & able[lot, kind, a]
         while found < slots and on_offer[e, found] >= 0:  # what hung out there before
             on_offer[e, found] = -1
             found += 1
@@ -70,15 +68,12 @@ def hang_out(t: Tables, d: Drawn, s: Rows, o: Offer, rows: Array) -> None:
 
 
 @inner
-def occupied(lot: Any, e: int, modes: Array, hand: Array, stations: Array, busy: Array) -> None:
-    """Which stations of an env have an arm at work, bool [station + 1]."""
-    busy[:] = False
-    for a in range(modes.shape[1]):
-        if modes[e, a] == WORKING:
-            for n in range(stations.shape[2]):
-                station = stations[lot, natural(hand[e, a]), n]
-                if station >= 0:
-                    busy[station] = True
+def occupied(lot: Any, e: int, hand: Array, places: Array, busy: Array) -> None:
+    """Which stations of an env have an arm at work, a bit each, uint64 [word]."""
+    for w in range(len(busy)):
+        busy[w] = 0
+        for a in range(hand.shape[1]):
+            busy[w] |= places[lot, natural(hand[e, a]), w]
 
 
 @inner
@@ -93,9 +88,9 @@ def award(t: Tables, d: Drawn, s: Rows, o: Offer, actions: Array, rows: Array) -
     modes, in_hand, status, last, illegal = s.mode, s.job, s.status, s.last_award, s.illegal
     progress_s, todo, cycles = s.progress_s, s.todo, s.cycles
     on_offer, mask, queue, head, hand, owed = o.on_offer, o.mask, o.queue, o.head, o.hand, o.owed
-    stations, difficulty = t.stations, t.difficulty
-    arms, slots, places = modes.shape[1], on_offer.shape[1], stations.shape[2]
-    busy, key, order = np.empty(t.station_count + 1, np.bool_), np.empty(arms), np.empty(arms, np.int64)
+    places, difficulty = t.places, t.difficulty
+    arms, slots, words = natural(modes.shape[1]), natural(on_offer.shape[1]), natural(places.shape[2])
+    busy, key, order = np.empty(words, np.uint64), np.empty(arms), np.empty(arms, np.int64)
     for row in rows:
         e = natural(row)
         lot, claims = natural(lots[e]), 0
@@ -118,22 +113,18 @@ def award(t: Tables, d: Drawn, s: Rows, o: Offer, actions: Array, rows: Array) -
             claims += 1
         if claims == 0:
             continue
-        occupied(lot, e, modes, hand, stations, busy)
+        occupied(lot, e, hand, places, busy)
         for rank in range(claims):
             a = order[rank]
             j = natural(on_offer[e, actions[e, a] - 1])
-            kind, free = kinds[e, j], status[e, j] == WAITING
-            for n in range(places):
-                station = stations[lot, kind, n]
-                if station >= 0 and busy[station]:
-                    free = False
+            kind, free = natural(kinds[e, j]), status[e, j] == WAITING
+            for w in range(words):
+                free = free and (places[lot, kind, w] & busy[w]) == 0
             if not free:
                 last[e, a] = -1
                 continue
-            for n in range(places):
-                station = stations[lot, kind, n]
-                if station >= 0:
-                    busy[station] = True
+            for w in range(words):
+                busy[w] |= places[lot, kind, w]
             take_out(queue, head, e, j)
             last[e, a], status[e, j] = 1, RUNNING
             modes[e, a], in_hand[e, a], progress_s[e, a] = WORKING, j, 0.0
@@ -173,11 +164,12 @@ def put_back(d: Drawn, s: Rows, o: Offer, e: int, j: int, until_s: float) -> Non
 
 
 @inner
-def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array, rows: Array) -> None:
+def live(t: Tables, d: Drawn, s: Rows, o: Offer, worth: Array, terms: Array, rows: Array) -> None:
     """Every arm through one step: motion, heat, limits, the end of its job.
 
     Args:
-        raw: Takes the reward terms, not weighted, [term, env].
+        worth: Of a unit of each reward term, [term].
+        terms: Takes the reward terms and their sum, [env, term + 1].
         rows: Which envs, int [row].
     """
     # The arrays by names of their own: a field of a tuple is counted at every use.
@@ -192,7 +184,7 @@ def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array, rows: Array) -> Non
     warning_c, error_c, restart_c = t.warning_c, t.error_c, t.restart_c
     power, fold = np.empty((2, LANES)), np.empty(4)  # W of windings, of friction and electronics
     begin, end = np.zeros(2 * NODES + LANES), np.empty(WIDE)  # the temperatures, the loads, and what pads them
-    arms = modes.shape[1]
+    arms, nothing = natural(modes.shape[1]), natural(t.able.shape[1])
     for row in rows:
         e = natural(row)
         lot, tick = natural(lots[e]), natural(ticks[e])
@@ -266,12 +258,13 @@ def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array, rows: Array) -> Non
                     j, owed[e, a] = natural(in_hand[e, a]), False
                     status[e, j], cycles[e, j], finished_s[e, j] = DONE, repetitions[e, j], now_s + done_s
                     left[e] -= 1
-                    worth = values[lot, natural(hand[e, a])]
-                    value += worth
-                    late += worth * (max(finished_s[e, j] - due_s[e, j], 0.0) / 60.0)
+                    gained = values[lot, natural(hand[e, a])]
+                    value += gained
+                    late += gained * (max(finished_s[e, j] - due_s[e, j], 0.0) / 60.0)
                 progress_s[e, a] += cut_s
                 if home_s <= cut_s:
                     modes[e, a], in_hand[e, a], progress_s[e, a], todo[e, a] = IDLE, -1, 0.0, 0
+                    hand[e, a] = nothing
             if mode == FAULTED:
                 lost_s[e, a] += dt_s
             if cut_s < dt_s:
@@ -286,13 +279,16 @@ def live(t: Tables, d: Drawn, s: Rows, o: Offer, raw: Array, rows: Array) -> Non
                 faults[e, a] += 1
                 lost_s[e, a] += dt_s - cut_s
                 modes[e, a], in_hand[e, a], progress_s[e, a], todo[e, a] = FAULTED, -1, 0.0, 0
+                hand[e, a] = nothing
             if modes[e, a] == FAULTED:
                 if clear_at_s[e, a] == np.inf and cool_s < np.inf:
                     clear_at_s[e, a] = now_s + cool_s + t.clear_s
                 if clear_at_s[e, a] <= (tick + 1) * dt_s:
                     lost_s[e, a] -= dt_s - (clear_at_s[e, a] - now_s)
                     modes[e, a], clear_at_s[e, a] = IDLE, np.inf
-        raw[0, e], raw[1, e], raw[2, e], raw[3, e], raw[4, e] = value, late, above_s, count, energy
+        terms[e, 0], terms[e, 1], terms[e, 2] = value * worth[0], late * worth[1], above_s * worth[2]
+        terms[e, 3], terms[e, 4] = count * worth[3], energy * worth[4]
+        terms[e, 5] = terms[e, 0] + terms[e, 1] + terms[e, 2] + terms[e, 3] + terms[e, 4]
         ticks[e] += 1
 
 

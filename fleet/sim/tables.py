@@ -64,17 +64,18 @@ class Tables(NamedTuple):
     difficulty: Array
     """[lot, arm, kind], NaN where not known."""
     word: Array
-    """What an arm says of a kind of job, [lot, arm, kind, padded to `LANES`]: seconds on the way there and back, seconds
-    a cycle (zero of what it cannot do), 1 if it knows a difficulty, the difficulty or 0, P(saturation) or 0.5, and the
-    row of the risk tables that knows better, −1 for none."""
+    """What an arm says of a kind of job, [lot, arm, kind, padded to `LANES`]: seconds on the way there and back,
+    seconds a cycle (zero of what it cannot do), 1 if it knows a difficulty, the difficulty or 0, P(saturation) or 0.5,
+    and the row of the risk tables that knows better, −1 for none."""
     score: Array
     """Weights of the motor temperatures, and then the offset (−inf where there is no such piece), [risk, piece,
     `LANES`]."""
     curve: Array
     """[risk, knot, 2]; no knot at all where no risk has any."""
-    stations: Array
-    """int [lot, kind, n], −1 for none."""
-    station_count: int
+    able: Array
+    """Whether an arm can do a kind of job at all, bool [lot, kind, arm]."""
+    places: Array
+    """Stations of a kind of job, a bit each, uint64 [lot, kind, word]; the last kind is no job, and needs none."""
     payload_kg: Array
     """[lot, kind]."""
     value: Array
@@ -141,7 +142,7 @@ class Offer(NamedTuple):
     head: Array
     """Where in its row the queue begins, int [env]."""
     hand: Array
-    """Kind of the job that an arm at work has in hand, int [env, arm]."""
+    """Kind of the job that an arm has in hand, int [env, arm]; one more than there are if none."""
     owed: Array
     """Whether that job is still to be finished, bool [env, arm]; else the arm is on its way home."""
 
@@ -190,8 +191,8 @@ def tables_of(world: World) -> tuple[Tables, Drawn]:
         word=_words(world),
         score=score,
         curve=curve,
-        stations=jobs.stations,
-        station_count=len(world.stations),
+        able=(offers.plan >= 0).swapaxes(-1, -2),
+        places=_places(jobs.stations, len(world.stations)),
         payload_kg=jobs.payload_kg,
         value=jobs.value,
     )
@@ -212,6 +213,17 @@ def tables_of(world: World) -> tuple[Tables, Drawn]:
 def _laned(*values: Array) -> Array:
     """Values [..., joint] side by side, [..., value, joint padded to `LANES`]."""
     return _padded(np.stack(values, axis=-2), -1, LANES, 0.0)
+
+
+def _places(stations: Array, count: int) -> Array:
+    """Bits of stations, int [lot, kind, n], −1 for none."""
+    lots, kinds, most = stations.shape
+    bits = np.zeros((lots, kinds + 1, max(1, -(-count // 64))), np.uint64)
+    for n in range(most):
+        lot, kind = np.nonzero(stations[..., n] >= 0)
+        station = stations[lot, kind, n]
+        bits[lot, kind, station // 64] |= np.uint64(1) << (station % 64).astype(np.uint64)
+    return bits
 
 
 def _words(world: World) -> Array:
@@ -270,7 +282,7 @@ def stacked(fleets: Sequence[Tables]) -> Tables:
     risks = np.cumsum([0, *(len(each.score) for each in fleets)])
     pieces = max(each.score.shape[1] for each in fleets)
     knots = max(each.curve.shape[1] for each in fleets)
-    places = max(each.stations.shape[2] for each in fleets)
+    words = max(each.places.shape[2] for each in fleets)
 
     def shifted(each: Iterable[Array], by: Array) -> Array:
         return np.concatenate([np.where(v >= 0, v + n, -1) for v, n in zip(each, by, strict=False)])
@@ -288,8 +300,7 @@ def stacked(fleets: Sequence[Tables]) -> Tables:
             plan=shifted((t.plan for t in fleets), rows),
             score=np.concatenate([with_pieces(t.score) for t in fleets]),
             curve=np.concatenate([_longer(t.curve, knots) for t in fleets]),
-            stations=np.concatenate([_padded(t.stations, 2, places, -1) for t in fleets]),
-            station_count=max(each.station_count for each in fleets),
+            places=np.concatenate([_padded(t.places, 2, words, 0) for t in fleets]),
         )
     )
 
@@ -297,7 +308,7 @@ def stacked(fleets: Sequence[Tables]) -> Tables:
 _SHARED = ("dt_s", "ticks", "warning_c", "error_c", "restart_c", "clear_s", "power_off", "alpha_cu", "alpha_kt",
            "reference_c")  # fmt: skip
 _JOINED = ("ambient_c", "step", "to_ambient", "root", "rates", "modes", "motor", "noise_k",
-           "start_c", "times_s", "drive", "difficulty",
+           "start_c", "times_s", "drive", "difficulty", "able",
            "word", "payload_kg", "value")  # fmt: skip
 
 
