@@ -50,6 +50,8 @@ MOST_BYTES = 60_000
 """Of the jobs in one answer: a router may drop larger words."""
 TICK_S = 2.0
 """Real seconds between two records of the fleet's time."""
+ROLL_S, ALONE_S = 1.0, 3.0
+"""Real seconds between two questions who answers as auctioneer here; how long one is sure, after that, to be alone."""
 GROWTH = 4
 LEAST_LONG_BYTES = 1_000_000
 """A journal that has grown so many times, and to at least so many bytes, is shortened; it also is at every start."""
@@ -61,8 +63,9 @@ class AuctionNode:
     Attributes:
         auctioneer: Its state machine.
         journal: Where its promises are.
-        rivals: Other auctioneers that are in the fleet, against the rule. While there are any, it takes and awards no
-            jobs: they might be done twice, or two arms sent to one station. What arms have in hand goes on.
+        rivals: Other auctioneers that are in the fleet, against the rule; its own name stands for another of that name.
+            While there are any, it takes and awards no jobs: they might be done twice, or two arms sent to one
+            station. What arms have in hand goes on.
     """
 
     def __init__(
@@ -108,6 +111,7 @@ class AuctionNode:
             timing=self._timing,
         )
         self.rivals: set[str] = set()
+        self._roll_s = self._alone_s = -math.inf
         self._tokens: set[str] = set()
         self._heard_s: dict[str, float] = {}
         self._ticked_s = real_s
@@ -132,7 +136,10 @@ class AuctionNode:
         """
         self._link.serve(min(until_s, time.monotonic() + SCAN_S))
         real_s, time_s = self._now()
-        self.auctioneer.seen(frozenset() if self.rivals else self.present)
+        if real_s >= self._roll_s:
+            self._call_roll(real_s)
+        sure = not self.rivals and real_s - self._alone_s < ALONE_S
+        self.auctioneer.seen(self.present if sure else frozenset())
         self.auctioneer.tick(real_s, time_s)
         if real_s >= self._ticked_s + TICK_S:
             self._ticked_s = real_s
@@ -220,18 +227,38 @@ class AuctionNode:
             raise Objection(f"{self._two()}: no jobs are taken until one is stopped.")
         return self.auctioneer.submitted(word, real_s, time_s)
 
+    def _call_roll(self, real_s: float) -> None:
+        """Ask who answers as auctioneer: a token tells nothing of another of the same name, but both of them answer.
+
+        Of two that begin in the same moment at least one sees the other at once, as each can be asked before it asks.
+        """
+        self._roll_s = real_s + ROLL_S
+        key = keys.of_jobs(self._link.fleet, "status")
+
+        def called(answers: Answers[Status]) -> None:
+            mine = sum(status.auctioneer == self._name for status in answers.words.values())
+            if mine:  # its own answer may be late
+                self._alone_s = real_s
+                self._note_rival(self._name, mine > 1)
+
+        self._link.ask(key, StatusRequest(("?",)), Status, called, timeout_s=ROLL_S)
+
     def _rival(self, name: str, there: bool) -> None:
-        if name == self._name or there == (name in self.rivals):
+        if name != self._name:  # its own token and that of another of the same name are one
+            self._note_rival(name, there)
+
+    def _note_rival(self, name: str, there: bool) -> None:
+        if there == (name in self.rivals):
             return
         (self.rivals.add if there else self.rivals.discard)(name)
         if self.rivals:
             _LOG.error("%s: no jobs are taken or awarded until one is stopped.", self._two())
         else:
-            _LOG.warning("Auctioneer '%s' is gone; jobs are taken and awarded again.", name)
+            _LOG.warning("The other auctioneer '%s' is gone; jobs are taken and awarded again.", name)
 
     def _two(self) -> str:
         return (
-            f"Fleet '{self._link.fleet}' has more than one auctioneer ({', '.join(sorted({self._name, *self.rivals}))})"
+            f"Fleet '{self._link.fleet}' has more than one auctioneer ({', '.join(sorted([self._name, *self.rivals]))})"
         )
 
     def _status(self, word: StatusRequest) -> Status:

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import threading
 import time
 from contextlib import ExitStack
@@ -271,6 +272,42 @@ def test_two_auctioneers_are_both_seen_and_do_nothing_together(bus, monkeypatch)
     bus.until(lambda: not one.rivals)
     one.submit(Submission(jobs("a")))
     bus.until(lambda: states(one) == ["finished"])
+    assert arm.done == ["a"]
+
+
+def test_two_auctioneers_of_one_name_see_each_other_and_do_nothing_together(bus, monkeypatch):
+    """Begun in the same moment, neither saw the other when it looked, and their tokens are one."""
+    monkeypatch.setattr(AuctionNode, "_refuse_a_second", lambda self: None)
+    one, two = bus.auctioneer("one"), bus.auctioneer("one", folder="elsewhere")
+    for node in (one, two):  # before any of them was served
+        node.submit(Submission(jobs("a")))
+    arm = bus.arm("arm_0")
+    bus.until(lambda: one.rivals == two.rivals == {"one"} and one.present == two.present == {"arm_0"})
+    told = "Fleet 'f' has more than one auctioneer (one, one): no jobs are taken until one is stopped."
+    with pytest.raises(Objection, match=re.escape(told)):
+        one.submit(Submission(jobs("b")))
+    bus.until(partial(later, time.monotonic() + 0.5))
+    assert states(one) == states(two) == ["waiting"]
+    assert not arm.awards
+    bus.kill(two)
+    bus.until(lambda: states(one) == ["finished"])
+    assert arm.done == ["a"]
+
+
+def test_one_that_does_not_hear_itself_is_not_sure_to_be_alone(bus, monkeypatch):
+    """It awards nothing before its first look at who answers, nor long after its last."""
+    alone = bus.auctioneer("one")
+    arm = bus.arm("arm_0")
+    monkeypatch.setattr(AuctionNode, "_call_roll", lambda self, real_s: None)
+    alone.submit(Submission(jobs("a")))
+    bus.until(lambda: alone.present == {"arm_0"})
+    bus.until(partial(later, time.monotonic() + 0.3))
+    assert not arm.awards
+    monkeypatch.undo()
+    bus.until(lambda: states(alone) == ["finished"])
+    monkeypatch.setattr(auction_node, "ALONE_S", 0.0)  # it stood still for longer than that
+    alone.submit(Submission(jobs("b")))
+    bus.until(partial(later, time.monotonic() + 0.3))
     assert arm.done == ["a"]
 
 
