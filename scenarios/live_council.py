@@ -46,7 +46,8 @@ def membership_of(scenario: Scenario, policy: str, *, jobs: str, seed: int) -> "
     roster = tuple(arm.name for arm in scenario.arms)
     horizon_s = scenario.horizon_s if jobs == "scenario" else float("inf")
     agree = allocation(policy, scenario.limits.warning_c)
-    return Membership(roster=roster, agree=agree, stream=stream, horizon_s=horizon_s)
+    places = frozenset(place.name for place in scenario.places)
+    return Membership(roster=roster, agree=agree, places=places, stream=stream, horizon_s=horizon_s)
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from fleet.bus.messages import Name, finite
-from fleet.bus.trade import MOST_JOBS, Count, Offer, Positive
+from fleet.bus.trade import MOST_JOBS, Count, JobWord, Offer, Positive
 
 
 class Bid(msgspec.Struct, frozen=True):
@@ -33,7 +33,8 @@ class Bid(msgspec.Struct, frozen=True):
     left: Count
     """Jobs that are not settled yet, as far as it knows."""
     open: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
-    """The first of these. Whoever knows that one is settled tells this arm."""
+    """The first of these, by release and name. Who knows better, of a job that is settled or one that is missing, tells
+    this arm."""
 
     def __post_init__(self) -> None:
         finite("Bid", "time_s", (self.time_s,))
@@ -80,6 +81,8 @@ class Claim(msgspec.Struct, frozen=True):
     """Counts the claims of this arm; an earlier one than the last is refused."""
     stakes: Annotated[tuple[Stake, ...], msgspec.Meta(max_length=MOST_JOBS)]
     settled: Annotated[tuple[Settled, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
+    jobs: Annotated[tuple[JobWord, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
+    """Jobs that others have handed in, and that an arm does not seem to know."""
 
 
 class Granted(msgspec.Struct, frozen=True):

@@ -44,6 +44,10 @@ the last ones and no others."""
 HEARTBEAT_S = 0.5
 
 
+class LeftToOthers(Exception):
+    """The question was heard, and another one answers it."""
+
+
 class Refused(Exception):
     """Raised by a handler of questions: the asker gets this sentence instead of an answer."""
 
@@ -238,7 +242,7 @@ class Link:
     # Answering and listening
 
     def answer(self, key: str, kind: type[Asked], handle: Callable[[Asked], msgspec.Struct]) -> None:
-        """Answer what is asked under a concrete key; `handle` may raise `Refused`.
+        """Answer what is asked under a concrete key; `handle` may raise `Refused` or `LeftToOthers`.
 
         Where the key ends in `*`, the place of the asker (`keys.asked_by_every_arm`), answers go under the key that
         was asked. A question that speaks for another arm than that key names is malformed.
@@ -377,6 +381,8 @@ class Link:
                 answer = Refusal(str(error))
             except Refused as refusal:
                 answer = Refusal(str(refusal))
+            except LeftToOthers:
+                return
             query.reply(mine, encode(answer), encoding=encoding(type(answer)))
 
     def _complain(self, reason: str) -> None:

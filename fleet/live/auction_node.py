@@ -5,7 +5,6 @@ import math
 import secrets
 import time
 from collections.abc import Callable
-from itertools import accumulate
 from typing import TypeVar
 
 import msgspec
@@ -13,15 +12,13 @@ import msgspec
 from fleet.bus import keys
 from fleet.bus.answers import Answers
 from fleet.bus.link import REMEMBERED, Link, Refused
-from fleet.bus.messages import State, encode
+from fleet.bus.messages import State
 from fleet.bus.router import LEASE_MS
 from fleet.bus.trade import (
-    MOST_JOBS,
     Ack,
     Announce,
     Clock,
     ClockRequest,
-    JobStatus,
     LeaseRequest,
     Quote,
     QuoteRequest,
@@ -40,14 +37,13 @@ from fleet.live.journal import Journal
 from fleet.live.ledger import Ledger, replayed
 from fleet.live.overview import FRESH_S
 from fleet.live.records import Began, Record, Ticked
+from fleet.live.standing import first
 from fleet.live.timing import Timing
 
 _LOG = logging.getLogger(__name__)
 
 Word = TypeVar("Word", bound=msgspec.Struct)
 
-MOST_BYTES = 60_000
-"""Of the jobs in one answer: a router may drop larger words."""
 TICK_S = 2.0
 """Real seconds between two records of the fleet's time."""
 ROLL_S, ALONE_S = 1.0, 3.0
@@ -262,7 +258,7 @@ class AuctionNode:
         )
 
     def _status(self, word: StatusRequest) -> Status:
-        return Status(self._name, self.time_s, _first(self.auctioneer.status(word.jobs)))
+        return Status(self._name, self.time_s, first(self.auctioneer.status(word.jobs)))
 
     def _state(self, arm: str, _state: State) -> None:
         self._heard_s[arm] = time.monotonic()
@@ -334,11 +330,3 @@ class AuctionNode:
         for reason in filter(None, answers.refused.values()):
             _LOG.warning("No answer to an award: %s", reason)
         self._send()
-
-
-def _first(statuses: tuple[JobStatus, ...]) -> tuple[JobStatus, ...]:
-    """As many as one word may hold; those that may still change come first."""
-    if len(statuses) > MOST_JOBS:
-        statuses = tuple(sorted(statuses, key=lambda said: said.state in ("finished", "unfinished")))[:MOST_JOBS]
-    room = accumulate(len(encode(said)) + 1 for said in statuses)
-    return tuple(said for said, used in zip(statuses, room, strict=True) if used <= MOST_BYTES)

@@ -91,6 +91,7 @@ class Claimant:
         self._receipts: dict[str, set[str]] = {}
         """Arms that have a report on disk, by award."""
         self._corrections: dict[str, Settled] = {}
+        self._news: dict[str, JobWord] = {}
         self._sent: OrderedDict[int, tuple[Claim, float, int]] = OrderedDict()
         self._told: dict[str, int] = {}
         """Version of the claim that each arm has answered."""
@@ -115,6 +116,11 @@ class Claimant:
         self._corrections[settled.job] = settled
         self._due = True
 
+    def tell(self, word: JobWord) -> None:
+        """Tell the others, one of whom does not seem to know, of a job."""
+        self._news[word.name] = word
+        self._due = True
+
     def hurry(self) -> None:
         """A lease is to be renewed, leave asked for, or a report said again."""
         self._due = True
@@ -132,7 +138,8 @@ class Claimant:
         stakes, settled = self._stakes()
         corrections = list(self._corrections.values())[: min(MOST_CORRECTIONS, MOST_JOBS - len(settled))]
         self._number += 1
-        claim = Claim(self.arm, self._number, tuple(stakes), (*settled, *corrections))
+        jobs = tuple(self._news.values())[:MOST_CORRECTIONS]
+        claim = Claim(self.arm, self._number, tuple(stakes), (*settled, *corrections), jobs)
         self._claimed_s = real_s
         try:
             own = self.grantor.asked(claim, real_s)
@@ -142,6 +149,7 @@ class Claimant:
             return None
         self._due = False
         self._corrections.clear()
+        self._news.clear()
         self._sent[claim.number] = claim, real_s, self._version
         if len(self._sent) > CLAIMS:
             self._sent.popitem(last=False)

@@ -19,6 +19,7 @@ from fleet.live.claiming import Claimant
 from fleet.live.contractor import Contractor
 from fleet.live.granting import Grantor
 from fleet.live.overview import FRESH_S
+from fleet.live.standing import by_grants
 from fleet.live.timing import Timing
 
 QUIET_S = 0.05
@@ -94,7 +95,7 @@ class Council:
         """There are these jobs."""
         fresh = [word for word in words if word.name not in self.jobs]
         if fresh:
-            every = sorted([*self.jobs.values(), *fresh], key=lambda word: (word.release_s, word.name))
+            every = sorted([*self.jobs.values(), *fresh], key=_order)
             self.jobs = {word.name: word for word in every}
 
     def seen(self, there: frozenset[str]) -> None:
@@ -110,10 +111,21 @@ class Council:
         self._news = True
         if before is None or _gist(before[0]) != _gist(bid):
             self.changed_s = real_s
+        if bid.arm != self.arm:
+            self._put_right(bid, real_s)
+
+    def _put_right(self, bid: Bid, real_s: float) -> None:
+        """Tell an arm how it ended with a job that it holds for open, and of jobs that it does not know."""
+        register = self.grantor.register
         for job in bid.open:
-            settled = self.grantor.register.settled.get(job)
-            if settled is not None and bid.arm != self.arm:
-                self.claimant.correct(settled)
+            if job in register.settled:
+                self.claimant.correct(register.settled[job])
+        full = len(bid.open) == MOST_NAMED and bid.open[-1] in self.jobs
+        last = _order(self.jobs[bid.open[-1]]) if full else (math.inf, "")
+        left = self.left(real_s) if register.jobs else []
+        for job in left:
+            if job in register.jobs and job not in bid.open and _order(self.jobs[job]) < last:
+                self.claimant.tell(self.jobs[job])
 
     def asked(self, claim: Claim, real_s: float) -> Grant:
         """Answer to a peer's claim.
@@ -121,7 +133,9 @@ class Council:
         Raises:
             Objection: it is not answered.
         """
-        return self.grantor.asked(claim, real_s)
+        grant = self.grantor.asked(claim, real_s)
+        self.know(claim.jobs)
+        return grant
 
     def answered(self, grant: Grant, real_s: float) -> None:
         """A peer has answered a claim."""
@@ -155,7 +169,7 @@ class Council:
 
     def status(self, later: Iterable[JobWord], real_s: float) -> list[JobStatus]:
         """Where all jobs stand, as far as it knows; `later` ones are still to come."""
-        return [_status(word.name, self.grantor, real_s) for word in (*self.jobs.values(), *later)]
+        return [by_grants(word.name, self.grantor, real_s) for word in (*self.jobs.values(), *later)]
 
     # Who gets what
 
@@ -226,19 +240,9 @@ class Council:
         self._later_s[job] = real_s + min(most_s, first_s * 2.0 ** min(count - 1, 10)) * self._rng.uniform(0.2, 1.0)
 
 
-def _status(job: str, grantor: Grantor, real_s: float) -> JobStatus:
-    register = grantor.register
-    settled, gift, cycles = register.settled.get(job), register.gifts.get(job), register.cycles.get(job, 0)
-    if settled is not None and settled.outcome == "finished":
-        return JobStatus(job, "finished", settled.arm, settled.award, cycles, settled.time_s)
-    if settled is not None:
-        return JobStatus(job, "unfinished", settled.arm, settled.award, cycles, None, settled.reason)
-    if gift is None or not grantor.bars(job, real_s):
-        return JobStatus(job, "waiting", cycles=cycles)
-    silent = gift.leave and real_s >= gift.until_s
-    state = "unfinished" if silent else "finishing" if gift.leave else "awarded"
-    reason = f"'{gift.arm}' was about to finish it and has not been heard of since." if silent else ""
-    return JobStatus(job, state, gift.arm, gift.award, cycles, None, reason)
+def _order(word: JobWord) -> tuple[float, str]:
+    """Jobs are named in this order."""
+    return word.release_s, word.name
 
 
 def _gist(bid: Bid) -> tuple[bool, frozenset[str]]:

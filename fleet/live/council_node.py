@@ -11,12 +11,28 @@ from collections import deque
 from dataclasses import dataclass
 from random import Random
 
+import msgspec
+
 from fleet.bus import keys
 from fleet.bus.answers import Answers
 from fleet.bus.council import Bid, Claim, Grant
-from fleet.bus.link import Refused
-from fleet.bus.trade import JobStatus, JobWord, LeaseRequest, Report
+from fleet.bus.link import LeftToOthers, Refused
+from fleet.bus.trade import (
+    Admission,
+    Clock,
+    ClockRequest,
+    JobStatus,
+    JobWord,
+    LeaseRequest,
+    Offer,
+    Report,
+    Status,
+    StatusRequest,
+    Submission,
+    Submitted,
+)
 from fleet.errors import BusError, JournalFull
+from fleet.live.admission import admit
 from fleet.live.auctioneer import Objection
 from fleet.live.bidding import Allocate
 from fleet.live.clock import FleetClock
@@ -24,6 +40,7 @@ from fleet.live.council import QUIET_S, Council, Faculties
 from fleet.live.granting import Deed, Grantor, recalled, retold
 from fleet.live.journal import Journal
 from fleet.live.orders import Complaints, Worker
+from fleet.live.standing import first
 from fleet.live.timing import Timing
 
 _LOG = logging.getLogger(__name__)
@@ -49,6 +66,8 @@ class Membership:
     """All arms of the fleet: a majority is one of these, whoever is there."""
     agree: Allocate
     """What all make of all bids."""
+    places: frozenset[str] | None = None
+    """Places of the cell; None: jobs of others may name any."""
     stream: tuple[tuple[float, JobWord], ...] = ()
     """Jobs that all know of, each from a time of the fleet on."""
     horizon_s: float = math.inf
@@ -74,14 +93,14 @@ class CouncilNode:
         """
         self._worker, self._link, self.journal = worker, worker.link, journal
         self._name, self._speed = worker.contractor.arm, worker.clock.speed
-        self._horizon_s = membership.horizon_s
+        self._horizon_s, self._places = membership.horizon_s, membership.places
         register = recalled(journal.replay())
         self._long = 0
         real_s = time.monotonic()
         grantor = Grantor(
             self._name, membership.roster, register, journal.append, real_s=real_s, timing=membership.timing
         )
-        faculties = Faculties(offers=worker.offers, unfit=worker.unfit, take=worker.take)
+        faculties = Faculties(offers=self._offers, unfit=worker.unfit, take=worker.take)
         self.council = Council(
             worker.contractor,
             grantor,
@@ -129,8 +148,10 @@ class CouncilNode:
 
     @property
     def over(self) -> bool:
-        """Whether nothing is left to do: every job is settled and everybody there knows, or the shift is over."""
+        """Whether nothing is left to do: all is done and everybody there knows, or the shift, if it ends, is over."""
         real_s = time.monotonic()
+        if math.isinf(self._horizon_s):
+            return False
         if self.council.ended:
             return not (self.council.contractor.held or self.council.contractor.owes)
         return self._begun and not self._stream and self.council.over(real_s)
@@ -155,10 +176,16 @@ class CouncilNode:
         if self._begun:
             self.council.seen(frozenset(self._tokens))
             self.council.tick(real_s, time_s)
-            self._send(real_s)
+            self._send()
             self._note(real_s, time_s)
         quiet_s = self.council.changed_s + QUIET_S
         self.wake_s = quiet_s if quiet_s > real_s else math.inf
+
+    def _offers(self, words: tuple[JobWord, ...]) -> tuple[Offer, ...]:
+        """What jobs would cost the arm, as a bid tells it; how hard each joint finds them is said elsewhere."""
+        offers = self._worker.offers(words)
+        self._worker.tell_difficulty(offers, time.monotonic())
+        return tuple(msgspec.structs.replace(offer, difficulty=None) for offer in offers)
 
     def _begin(self, real_s: float) -> None:
         """Let the fleet's time begin, unless it has begun elsewhere: then that is the time."""
@@ -180,6 +207,9 @@ class CouncilNode:
         link, fleet, name = self._link, self._link.fleet, self._name
         self._say = link.publisher(keys.of_arm(fleet, name, "bid"), Bid, remember=1)
         link.answer(keys.asked_by_every_arm(fleet, name, "grant"), Claim, self._grant)
+        link.answer(keys.of_jobs(fleet, "submit"), Submission, self._submit)
+        link.answer(keys.of_jobs(fleet, "status"), StatusRequest, self._status)
+        link.answer(keys.of_clock(fleet), ClockRequest, self._clock)
         link.listen(keys.of_every_arm(fleet, "bid"), Bid, self._hear, remembered=1)
         link.watch(keys.of_every_arm(fleet, "alive"), self._token)
 
@@ -202,7 +232,42 @@ class CouncilNode:
         except Objection as objection:
             raise Refused(str(objection)) from objection
 
-    def _send(self, real_s: float) -> None:
+    # What outsiders ask: all arms hear it, and the first of those that are there answers
+
+    def _speaks(self) -> None:
+        """Leave it to another to answer, unless this arm speaks for the fleet.
+
+        Raises:
+            LeftToOthers: another one does.
+        """
+        if not self._begun or self._name != min(self._tokens & self.council.grantor.roster, default=self._name):
+            raise LeftToOthers
+
+    def _submit(self, word: Submission) -> Submitted:
+        there = {job.name: job for _, job in self._stream} | self.council.jobs
+        admissions = admit(word.jobs, there, places=self._places)
+        if self.council.ended:
+            admissions = tuple(Admission(job.name, False, "The shift is over.") for job in word.jobs)
+        taken = tuple(job for job, said in zip(word.jobs, admissions, strict=True) if said.accepted)
+        try:
+            self.council.grantor.admit(tuple(job for job in taken if job.name not in there), word.by)
+        except JournalFull as error:
+            raise Refused(str(error)) from error
+        self.council.know(taken)
+        self._speaks()
+        return Submitted(self._name, admissions)
+
+    def _status(self, word: StatusRequest) -> Status:
+        self._speaks()
+        wanted = frozenset(word.jobs)
+        statuses = tuple(said for said in self.statuses() if not wanted or said.job in wanted)
+        return Status(self._name, self._worker.clock.now_s(time.monotonic()), first(statuses))
+
+    def _clock(self, _: ClockRequest) -> Clock:
+        self._speaks()
+        return Clock(self._worker.clock.now_s(time.monotonic()), self._speed)
+
+    def _send(self) -> None:
         out = self.council.out
         while out:
             match out.popleft():

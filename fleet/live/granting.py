@@ -204,6 +204,7 @@ class Grantor:
         if claim.number <= last:
             raise Objection(f"Claim {claim.number} of '{claim.arm}' comes after its claim {last}.")
         try:
+            self.admit(claim.jobs)
             self._happen([Ended(settled) for settled in claim.settled if self._is_news(settled)])
             self._happen(self._let_go(claim))
         except JournalFull as error:

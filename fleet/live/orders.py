@@ -40,6 +40,10 @@ class Worker(Protocol):
         """What jobs would cost it now."""
         ...
 
+    def tell_difficulty(self, offers: tuple[Offer, ...], real_s: float) -> None:
+        """Say how hard it finds jobs."""
+        ...
+
     def unfit(self) -> str:
         """Why it takes no work just now; "" if it does."""
         ...

@@ -39,11 +39,12 @@ from fleet.bus.trade import (
 )
 from fleet.errors import BusError, JournalFull
 from fleet.live import auction_node
-from fleet.live.auction_node import AuctionNode, _first
+from fleet.live.auction_node import AuctionNode
 from fleet.live.auctioneer import Objection
 from fleet.live.journal import Journal
 from fleet.live.onlooker import Onlooker
 from fleet.live.records import Record
+from fleet.live.standing import first as first_of
 
 PATIENCE_S = 15.0
 
@@ -414,4 +415,4 @@ def test_a_status_of_very_many_jobs_fits_into_a_word_and_tells_the_open_ones_fir
     assert 100 < len(status.jobs) <= 256
     assert len(encode(status)) < 65_536
     first = JobStatus("done", "finished")
-    assert _first((first, *status.jobs * 2))[0].state == "waiting"
+    assert first_of((first, *status.jobs * 2))[0].state == "waiting"
