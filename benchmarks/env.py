@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from fleet.env.chance import random_legal
+from fleet.env.shelf import keep_pages
 from fleet.env.vector import BatchEnv, Library
 from scenarios.batch import Randomisation, library_of
 from scenarios.build import env_of, prepare
@@ -96,8 +97,10 @@ def batch(difficulty: str, envs: int, arms: int = 4) -> float:
     return median_rate(window)
 
 
-def torchrl(envs: int) -> float:
+def torchrl(envs: int, *, kept: bool = False) -> float:
     """TorchRL's rollout of the native env, with its random policy."""
+    if kept and not keep_pages():
+        raise SystemExit("keep_pages() needs glibc.")
     import torch
 
     from fleet.env.adapters.torchrl import TorchRLEnv
@@ -143,21 +146,14 @@ def memory(envs: int, arms: int) -> float:
 ROWS = {
     "single": lambda difficulty: single(difficulty),
     "batch": lambda difficulty, envs, arms="4": batch(difficulty, int(envs), int(arms)),
-    "torchrl": lambda envs: torchrl(int(envs)),
+    "torchrl": lambda envs, pages="": torchrl(int(envs), kept=pages == "kept"),
     "memory": lambda envs, arms: memory(int(envs), int(arms)),
 }
 
 
-KEEP_PAGES = {"MALLOC_MMAP_THRESHOLD_": str(2**32), "MALLOC_TRIM_THRESHOLD_": str(2**33)}
-"""Tells glibc not to give large arrays back to the system, which clears their pages anew every time."""
-
-
-def measured(*command: str, **settings: str) -> float | None:
+def measured(*command: str) -> float | None:
     """What a program of its own found; None, and why, where it could not."""
-    told = {**os.environ, **settings}
-    done = subprocess.run(
-        [sys.executable, *command], capture_output=True, text=True, timeout=600, check=False, env=told
-    )
+    done = subprocess.run([sys.executable, *command], capture_output=True, text=True, timeout=600, check=False)
     if done.returncode:
         print(f"  {' '.join(command[1:])} failed: {done.stderr.strip().splitlines()[-1:]}", flush=True)
         return None
@@ -182,8 +178,7 @@ def main() -> None:
         print("TorchRL is not installed: pip install 'thermofleet[learn]' -c constraints.txt")
     else:
         line("TorchRL rollout of 1024, blind", measured(here, "torchrl", "1024"), 300_000)
-        kept = measured(here, "torchrl", "1024", **KEEP_PAGES)
-        line("the same, glibc told to keep its pages", kept, 300_000)
+        line("the same after keep_pages()", measured(here, "torchrl", "1024", "kept"), 300_000)
     for name, module, envs in (("mpe", "mpe2", (1,)), ("rware", "rware", (1,)), ("vmas", "vmas", (1, 32, 1024))):
         if find_spec(module) is None:
             print(f"{name} is not installed: make bench-env installs it into .venv-adapters/bench and runs this there")

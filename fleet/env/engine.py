@@ -108,13 +108,15 @@ class Engine:
         jobs = int(np.diff(first).max())
         if jobs > have or waits > self._drawn.after.shape[2]:
             self._make_room(jobs, waits)
+
+        def jobs_by(name: str) -> Array:
+            return np.concatenate([getattr(shift, name) for shift in shifts])
+
         begin(
             self.tables, self._drawn, self._rows, self._offer, envs,
             np.array([shift.lot for shift in shifts]), np.array([shift.air_k for shift in shifts]),
             np.array([shift.key for shift in shifts], np.uint64), first,
-            *(np.concatenate([getattr(shift, name) for shift in shifts])
-              for name in ("kind", "release_s", "due_s", "repetitions")),
-            after,
+            jobs_by("kind"), jobs_by("release_s"), jobs_by("due_s"), jobs_by("repetitions"), after,
         )  # fmt: skip
 
     def observe(self, envs: Array, out: Array) -> None:

@@ -3,6 +3,7 @@
 A large array that is new at every step costs more in pages the system must first clear than in what is written to it.
 """
 
+import ctypes
 import sys
 
 import numpy as np
@@ -45,3 +46,22 @@ class Shelf:
     def __getstate__(self) -> dict[str, object]:
         """Without the arrays, which those that hold them take along themselves."""
         return {**vars(self), "_arrays": []}
+
+
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+"""Of `mallopt` in glibc's malloc.h."""
+_MOST = 2**31 - 1
+
+
+def keep_pages() -> bool:
+    """Have this process keep the memory of arrays that are gone, for those that come.
+
+    For trainers that stack every rollout into new arrays of some hundred megabytes: glibc gives such arrays back to the
+    system when they are freed, which clears their pages anew for the next ones, and that costs as much as the steps.
+    It holds for the whole process, which then stays as large as it once was.
+
+    Returns:
+        Whether it does now: False where the C library is not glibc.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    return mallopt is not None and all(mallopt(which, _MOST) == 1 for which in (_MMAP_THRESHOLD, _TRIM_THRESHOLD))

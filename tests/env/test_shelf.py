@@ -1,8 +1,12 @@
 """An array comes back only when nobody can see it any more."""
 
 import gc
+import platform
+import subprocess
+import sys
 
 import numpy as np
+import pytest
 
 from fleet.env.shelf import Shelf
 
@@ -30,3 +34,27 @@ def test_what_nobody_holds_comes_back() -> None:
     assert shelf.take().ctypes.data == place
     kept = shelf.take()
     assert shelf.take().ctypes.data != kept.ctypes.data
+
+
+TURNOVER = """
+import resource, sys
+import numpy as np
+from fleet.env.shelf import keep_pages
+if sys.argv[1] == "kept":
+    assert keep_pages()
+for _ in range(2):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    np.ones(20_000_000)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="mallopt is glibc's")
+def test_pages_are_kept_on_demand() -> None:
+    """160 MB twice: as the system counts, the second time no page is new."""
+    faults = {
+        how: int(subprocess.run([sys.executable, "-c", TURNOVER, how], capture_output=True, check=True).stdout)
+        for how in ("given back", "kept")
+    }
+    assert faults["kept"] < 100
+    assert faults["given back"] > 3 * faults["kept"]

@@ -25,6 +25,8 @@ Traps:
 - The action spec carries the mask of now, so `env.rand_action` is always legal; a policy must read the key.
 - What is sent against the mask is a wait, counted in ("arms", "info", "illegal"), never an error.
 - Pin the threads for speed (`OMP_NUM_THREADS=1`): the arrays are too small for more to help.
+- `rollout` stacks all it saw into new tensors. `fleet.env.shelf.keep_pages()`, called once, keeps the system from
+  clearing their memory anew for every rollout: half as many steps a second again.
 """
 
 # pyright: reportPrivateImportUsage=false
@@ -38,6 +40,7 @@ from torch import Size
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from fleet.env.chance import pick
 from fleet.env.reward import TERMS
 from fleet.env.vector import BatchEnv, Obs
 
@@ -103,13 +106,13 @@ class TorchRLEnv(EnvBase):
     def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         """Actions at random, each legal one as likely; also what `rollout` takes without a policy.
 
-        The same as the action spec draws, at a fifth of its price.
+        The same as the action spec draws, at a small part of its price.
         """
-        mask = self._mask
-        legal = mask.cumsum(-1, dtype=torch.int32)
-        nth = (torch.rand(mask.shape[:-1]) * legal[..., -1]).to(torch.int32)
-        action = (legal > nth[..., None]).to(torch.uint8).argmax(-1)  # the first of those, hence the legal one
-        actions = TensorDict({GROUP: TensorDict({"action": action}, mask.shape[:-1])}, self.batch_size)
+        lead = self._mask.shape[:-1]
+        action = torch.empty(lead.numel(), dtype=torch.int64)
+        rows = self._mask.view(torch.int8).reshape(len(action), -1)
+        pick(rows.numpy(), torch.rand(len(action), dtype=torch.float64).numpy(), action.numpy())
+        actions = TensorDict({GROUP: TensorDict({"action": action.reshape(lead)}, lead)}, self.batch_size)
         return actions if tensordict is None else tensordict.update(actions)
 
     def _set_seed(self, seed: int | None) -> None:
