@@ -40,7 +40,7 @@ def keys_command(
     """Keys and certificates for mutual TLS: make them, add to them, show them."""
     from fleet.bus.certificates import HERE
     from fleet.bus.keyring import add as add_to
-    from fleet.bus.keyring import ends_of, make
+    from fleet.bus.keyring import make, spans_of
 
     if add and (scenario or extra):
         raise FleetError("--add goes with the keys that are there; leave SCENARIO and --extra out.")
@@ -54,11 +54,11 @@ def keys_command(
     for text in add or ():
         add_to(folder, participant_of(text), days=days, hosts=host or HERE, overwrite=overwrite)
     roster = read_roster(folder)
-    ends = ends_of(folder, roster)
+    spans = spans_of(folder, roster)
     if as_json:
-        typer.echo(json.dumps(_plain(roster, ends), indent=1))
+        typer.echo(json.dumps(_plain(roster, {name: end for name, (_, end) in spans.items()}), indent=1))
         return
-    out_console.print(_table(roster, ends))
+    out_console.print(_table(roster, spans))
     if scenario or add:
         say(f"Keys of the fleet '{roster.fleet}' are in {folder}. Keep {folder / 'ca.key'} where no participant runs.")
 
@@ -88,16 +88,17 @@ def _roster(fleet: str, arms: list[str], extra: list[Participant]) -> Roster:
         raise FleetError(str(error)) from error
 
 
-def _table(roster: Roster, ends: dict[str, datetime]) -> Table:
+def _table(roster: Roster, spans: dict[str, tuple[datetime, datetime]]) -> Table:
     from fleet.bus.certificates import CA, told
 
     table = Table(box=None, pad_edge=False)
     for column in ("participant", "role", "certificate ends"):
         table.add_column(column)
     now = datetime.now(UTC)
-    rows = [("(authority)", "", ends[CA]), *((one.name, one.role, ends[one.name]) for one in roster.participants)]
-    for name, role, end in rows:
-        table.add_row(name, role, f"{told(end)}{', expired' if end < now else ''}")
+    rows = [("(authority)", "", spans[CA]), *((one.name, one.role, spans[one.name]) for one in roster.participants)]
+    for name, role, (begin, end) in rows:
+        not_now = ", expired" if end < now else ", not yet valid" if begin > now else ""
+        table.add_row(name, role, told(end) + not_now)
     return table
 
 

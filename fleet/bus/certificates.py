@@ -65,7 +65,7 @@ def issue(
         raise BusError(f"A certificate lasts 1 to {LONGEST_DAYS} days (got {days}).")
     now = now or datetime.now(UTC)
     authority = read(folder, CA)
-    check_dates(authority, CA, datetime.now(UTC))
+    check_dates(authority, folder / f"{CA}.pem", datetime.now(UTC))
     signer = _read_key(folder, CA)
     if signer.public_key() != authority.public_key():
         raise BusError(f"'{folder / 'ca.key'}' is not the key of '{folder / 'ca.pem'}'.")
@@ -115,23 +115,27 @@ def check(folder: Path, file: str, *, now: datetime | None = None) -> x509.Certi
         certificate.verify_directly_issued_by(authority)
     except (ValueError, TypeError, InvalidSignature) as error:
         raise BusError(f"'{where}' is not signed by the certificate authority of '{folder / 'ca.pem'}'.") from error
-    check_dates(authority, CA, now)
-    check_dates(certificate, file, now)
+    check_dates(authority, folder / f"{CA}.pem", now)
+    check_dates(certificate, folder / f"{file}.pem", now)
     return certificate
 
 
-def check_dates(certificate: x509.Certificate, file: str, now: datetime) -> None:
+def check_dates(certificate: x509.Certificate, file: Path, now: datetime) -> None:
     """Refuse a certificate that is not valid at a time.
 
     Raises:
-        BusError: names the certificate and when it ended, or begins.
+        BusError: names the file, when it ended, or begins and ends, and what time it is here.
     """
     begins, ends = certificate.not_valid_before_utc, certificate.not_valid_after_utc
     if now > ends:
-        raise BusError(f"The certificate '{file}.pem' expired on {told(ends)}; issue a new one with thermofleet keys.")
+        raise BusError(
+            f"The certificate '{file}' expired on {told(ends)}, and it is {told(now)} now; issue a new one with "
+            "thermofleet keys."
+        )
     if now < begins:
         raise BusError(
-            f"The certificate '{file}.pem' is valid only from {told(begins)}; is this machine's clock right?"
+            f"The certificate '{file}' is valid only from {told(begins)} to {told(ends)}, and it is {told(now)} now; "
+            "is this machine's clock right?"
         )
 
 

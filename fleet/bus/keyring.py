@@ -74,14 +74,15 @@ def add(
     return ends
 
 
-def ends_of(folder: Path, roster: Roster) -> dict[str, datetime]:
-    """When each certificate of a folder ends, by name, the authority among them.
+def spans_of(folder: Path, roster: Roster) -> dict[str, tuple[datetime, datetime]]:
+    """When each certificate of a folder begins and ends, by name, the authority among them.
 
     Raises:
         BusError: one is missing or damaged.
     """
     files = {CA: CA, **{one.name: one.file for one in roster.participants}}
-    return {name: read(folder, file).not_valid_after_utc for name, file in files.items()}
+    read_all = {name: read(folder, file) for name, file in files.items()}
+    return {name: (one.not_valid_before_utc, one.not_valid_after_utc) for name, one in read_all.items()}
 
 
 def _write_roster(folder: Path, roster: Roster) -> None:

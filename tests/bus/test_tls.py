@@ -64,8 +64,8 @@ def rogue_folder(place: Path, true: Path, how: str) -> Path:
 
 REFUSALS = {
     "wrong authority": "arm_0.pem' is not signed by the certificate authority",
-    "expired": "'arm_0.pem' expired on 20",
-    "not yet": "'arm_0.pem' is valid only from 20",
+    "expired": "/arm_0.pem' expired on 20",
+    "not yet": "/arm_0.pem' is valid only from 20",
     "wrong end": "arm_0.pem' is the certificate of 'router:arm_0'; only the router",
 }
 

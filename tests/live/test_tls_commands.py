@@ -160,11 +160,18 @@ def of_another_authority(place, true):
     make(place, of_arms("f", [ARM]), days=30)
 
 
-def expired(place, true):
+def expired(place, true, days=-2):
     of_another_authority(place, true)
     for name in ("ca.pem", "ca.key"):
         (place / name).write_bytes((true / name).read_bytes())
-    issue(place, Participant("monitor", "monitor"), days=1, now=datetime.now(UTC) - timedelta(days=2))
+    issue(place, Participant("monitor", "monitor"), days=1, now=datetime.now(UTC) + timedelta(days=days))
+
+
+def not_yet(place, true):
+    expired(place, true, days=2)
+
+
+MINUTE = r"20\d\d-\d\d-\d\d \d\d:\d\d UTC"
 
 
 WRONG = {
@@ -173,7 +180,8 @@ WRONG = {
     "missing": r"^There is no '\S+/nobody\.pem'; thermofleet keys makes it\.$",
     "wrong role": r"^'\S+/router\.pem' is the certificate of 'router:router'; only the router may use it\.$",
     "another authority": r"^No router answered .* is refused: .*; are the keys in '\S+' those of another fleet\?\)\.$",
-    "expired": r"^The certificate 'monitor\.pem' expired on 20.* UTC; issue a new one with thermofleet keys\.$",
+    "expired": rf"^The certificate '/\S+/k/monitor\.pem' expired on {MINUTE}, and it is {MINUTE} now; issue a new ",
+    "not yet": rf"^The certificate '/\S+/k/monitor\.pem' is valid only from {MINUTE} to {MINUTE}, and it is {MINUTE} ",
 }
 
 
@@ -187,8 +195,8 @@ SLOW = ("plain", "another authority")
 )
 def test_what_is_wrong_is_said_in_one_sentence(fleet, tmp_path, command, how):
     here = tmp_path / "k"
-    if how in ("another authority", "expired"):
-        (expired if how == "expired" else of_another_authority)(here, fleet.keys)
+    if how in ("another authority", "expired", "not yet"):
+        {"expired": expired, "not yet": not_yet}.get(how, of_another_authority)(here, fleet.keys)
     endpoint = {
         "none": fleet.endpoint,
         "plain": fleet.endpoint.replace("tls/", "tcp/"),

@@ -9,12 +9,15 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
 
 from fleet.bus import keys
+from fleet.bus.certificates import issue
+from fleet.bus.roster import Participant
 from fleet.bus.router import open_client
 from fleet.bus.security import Tls, identified
 from scenarios.cli import main
@@ -207,6 +210,17 @@ def test_a_whole_fleet_works_with_every_rule_on(capsys, small_toml, plans, tmp_p
     logs = {path.name: path.read_text(encoding="utf-8") for path in (out / "logs").iterdir()}
     assert logs["router.log"].startswith("tls/")
     assert not [name for name, said in logs.items() if "Traceback" in said or "No router answered" in said]
+
+
+def test_the_list_of_keys_tells_which_are_not_good_now(tmp_path, capsys):
+    place, now = tmp_path / "keys", datetime.now(UTC)
+    assert call(capsys, "keys", place, "quickstart")[0] == 0
+    issue(place, Participant("arm_0", "arm"), days=1, now=now - timedelta(days=3))
+    issue(place, Participant("arm_1", "arm"), days=1, now=now + timedelta(days=3))
+    rows = dict(line.split(maxsplit=1) for line in call(capsys, "keys", place)[1].splitlines()[2:])
+    assert rows["arm_0"].rstrip().endswith(f"{now - timedelta(days=2):%Y-%m-%d %H:%M} UTC, expired")
+    assert rows["arm_1"].rstrip().endswith(f"{now + timedelta(days=4):%Y-%m-%d %H:%M} UTC, not yet valid")
+    assert rows["arm_2"].rstrip().endswith("UTC")
 
 
 def test_the_port_that_everybody_knows_is_taken_where_it_is_free():
