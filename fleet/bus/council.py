@@ -32,6 +32,8 @@ class Bid(msgspec.Struct, frozen=True):
     """For jobs that could begin now, as far as it knows; none without capacity."""
     left: Count
     """Jobs that are not settled yet, as far as it knows."""
+    settled: Count = 0
+    """Jobs that are, as far as it knows. Who knows of more, for a while, tells this arm."""
     open: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
     """The first of these, by release and name. Who knows better, of a job that is settled or one that is missing, tells
     this arm."""

@@ -88,6 +88,9 @@ class Council:
         self._news = False
         self._later_s: dict[str, float] = {}
         self._pauses: dict[str, int] = {}
+        self._behind_s: dict[str, float] = {}
+        """Since when other arms know of fewer jobs that are settled, real seconds."""
+        self._retold = 0
 
     # What comes from outside
 
@@ -120,6 +123,13 @@ class Council:
         for job in bid.open:
             if job in register.settled:
                 self.claimant.correct(register.settled[job])
+        if bid.settled >= len(register.settled):
+            self._behind_s.pop(bid.arm, None)
+        elif real_s >= self._behind_s.setdefault(bid.arm, real_s) + 2 * BID_S:
+            every = list(register.settled.values())
+            for _ in range(min(MOST_NAMED, len(every))):
+                self._retold = (self._retold + 1) % len(every)
+                self.claimant.correct(every[self._retold])
         full = len(bid.open) == MOST_NAMED and bid.open[-1] in self.jobs
         last = _order(self.jobs[bid.open[-1]]) if full else (math.inf, "")
         left = self.left(real_s) if register.jobs else []
@@ -169,7 +179,8 @@ class Council:
 
     def status(self, later: Iterable[JobWord], real_s: float) -> list[JobStatus]:
         """Where all jobs stand, as far as it knows; `later` ones are still to come."""
-        return [by_grants(word.name, self.grantor, real_s) for word in (*self.jobs.values(), *later)]
+        names = dict.fromkeys([*self.jobs, *(word.name for word in later), *self.grantor.register.settled])
+        return [by_grants(name, self.grantor, real_s) for name in names]
 
     # Who gets what
 
@@ -205,7 +216,8 @@ class Council:
         self._about, self._bid_s = about, real_s
         self._number += 1
         offers = self._faculties.offers(ready) if ready else ()
-        bid = Bid(self.arm, self._number, time_s, room, offers, len(left), tuple(left[:MOST_NAMED]))
+        settled = len(self.grantor.register.settled)
+        bid = Bid(self.arm, self._number, time_s, room, offers, len(left), settled, tuple(left[:MOST_NAMED]))
         self.heard(bid, real_s)
         self.out.append(bid)
 

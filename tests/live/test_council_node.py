@@ -1,0 +1,208 @@
+"""Arms on a real bus without an auctioneer: they share jobs out, do each once, and do nothing without a majority."""
+
+import time
+from collections import Counter
+from contextlib import ExitStack
+from functools import partial
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from fleet.bus import keys
+from fleet.bus.link import Link
+from fleet.bus.router import Router
+from fleet.bus.trade import Ack, ArmEvent, Award, JobWord, Status, StatusRequest, Submission, Submitted
+from fleet.job import Place
+from fleet.live.arm_node import ArmNode, Nature
+from fleet.live.body import SimulatedBody
+from fleet.live.clock import FleetClock
+from fleet.live.contractor import Contractor, Terms
+from fleet.live.council_node import CouncilNode, Membership
+from fleet.live.estimate import Estimator, NominalHeat
+from fleet.live.granting import Deed
+from fleet.live.journal import Journal
+from fleet.live.promises import Closed, Promise, recall, restarted, retold
+from fleet.live.timing import Timing
+from fleet.robot import ThermalLimits
+from scenarios.live_policies import allocation
+
+PATIENCE_S = 20.0
+SPEED = 120.0
+ROSTER = ("arm_0", "arm_1", "arm_2")
+TIMING = Timing(lease_s=1.5, margin_s=0.1, window_s=0.3, pause_s=(0.1, 0.4))
+PLACES = {name: Place(name=name, position_m=(0.5, 0.0, 0.2)) for name in ("bench", "rack", "shelf")}
+
+
+def hold(name: str, place: str = "bench", repetitions: int = 3, **more) -> JobWord:
+    return JobWord(name=name, kind="hold", places=(place,), repetitions=repetitions, **more)
+
+
+@pytest.fixture
+def bus(tmp_path, small):
+    """A router; a maker of arms that share jobs out; and what serves them until something is true."""
+    with ExitStack() as stack:
+        router = stack.enter_context(Router())
+        arms: dict[str, SimpleNamespace] = {}
+        outsider = stack.enter_context(Link(router.endpoint, "f"))
+        finished: Counter[str] = Counter()
+        outsider.listen(
+            keys.of_every_arm("f", "event"),
+            ArmEvent,
+            lambda _, event: finished.update([event.job] if event.kind == "finish" else []),
+        )
+
+        def arm(name, **membership):
+            own = small.arm(ROSTER.index(name), [small.work(place) for place in PLACES])
+            plans = {(work.kind, work.places[0].name): plans for work, plans in own.plans.items()}
+            book = stack.enter_context(Journal(tmp_path / f"{name}.journal", Promise))
+            grants = stack.enter_context(Journal(tmp_path / f"{name}.grants", Deed))
+            memory = restarted(recall(book.replay()), name, 0.0)
+            book.rewrite(*retold(memory))
+            link = stack.enter_context(Link(router.endpoint, "f"))
+            body = SimulatedBody(
+                own, ThermalLimits(), lambda _: 25.0, dt_s=SPEED / 20, rng=np.random.default_rng(0), warm=False
+            )
+            member = Membership(roster=ROSTER, agree=allocation("consensus", 60.0), timing=TIMING, **membership)
+            node = ArmNode(
+                link,
+                body,
+                Contractor(name, book.append, memory, nonce=str(memory.boot), terms=Terms()),
+                Estimator(own.model, lambda work: plans[work.kind, work.places[0].name], PLACES, NominalHeat()),
+                FleetClock(SPEED, time.monotonic()),
+                Nature(warning_c=60.0, rate_hz=20.0, life=memory.boot),
+                partial(CouncilNode, membership=member, journal=grants, life=memory.boot),
+            )
+            arms[name] = SimpleNamespace(node=node, link=link, book=book, grants=grants, orders=node.orders)
+            return arms[name]
+
+        def serve(condition, patience_s=PATIENCE_S):
+            deadline_s = time.monotonic() + patience_s
+            while not condition():
+                if time.monotonic() > deadline_s:
+                    return False
+                for each in list(arms.values()):
+                    each.node.serve(time.monotonic() + 0.005)
+                outsider.serve(time.monotonic() + 0.001)
+            return True
+
+        def ask(key, word, kind):
+            deadline_s = time.monotonic() + PATIENCE_S
+            while time.monotonic() < deadline_s:  # nobody may be ready to answer yet
+                got = []
+                outsider.ask(key, word, kind, got.append, timeout_s=3.0)
+                assert serve(partial(bool, got))
+                if got[0].words:
+                    return next(iter(got[0].words.values()))
+                if got[0].refused:
+                    return next(iter(got[0].refused.values()))
+            raise AssertionError("nobody answers")
+
+        def submit(*jobs):
+            return ask(keys.of_jobs("f", "submit"), Submission(jobs), Submitted)
+
+        def stand():
+            return {each.job: each for each in ask(keys.of_jobs("f", "status"), StatusRequest(), Status).jobs}
+
+        def kill(name):
+            one = arms.pop(name)
+            one.link.close()
+            one.book.close()
+            one.grants.close()
+
+        def done_by_journals():
+            done: Counter[str] = Counter()
+            for name in [*arms]:
+                kill(name)
+            for path in tmp_path.glob("*.journal"):
+                with Journal(path, Promise) as book:
+                    closed = [each.report for each in book.replay() if isinstance(each, Closed)]
+                done.update(report.job for report in closed if report.outcome == "finished")
+            return done
+
+        yield SimpleNamespace(
+            arm=arm,
+            arms=arms,
+            serve=serve,
+            ask=ask,
+            submit=submit,
+            stand=stand,
+            kill=kill,
+            finished=finished,
+            done_by_journals=done_by_journals,
+        )
+
+
+def settled(bus, *names):
+    """Whether every arm that is there knows that these jobs are finished."""
+    return all(set(names) <= one.orders.council.grantor.register.settled.keys() for one in bus.arms.values())
+
+
+def test_jobs_that_are_handed_in_are_shared_out_and_done_once(bus):
+    for name in ROSTER:
+        bus.arm(name)
+    jobs = (hold("a"), hold("b", "rack"), hold("c", "shelf"), hold("d"), hold("e", "rack", after=("a",)))
+    assert all(said.accepted for said in bus.submit(*jobs).jobs)
+    assert bus.serve(lambda: settled(bus, *"abcde"))
+    assert {name: said.state for name, said in bus.stand().items()} == dict.fromkeys("abcde", "finished")
+    assert bus.serve(lambda: sum(bus.finished.values()) == 5)
+    assert bus.finished == Counter("abcde")
+    assert len({said.arm for said in bus.stand().values()}) > 1, "one arm did it all"
+    assert bus.stand()["e"].finished_s > bus.stand()["a"].finished_s
+    assert not bus.submit(hold("a", "rack")).jobs[0].accepted, "one name is one job"
+    assert not bus.submit(hold("z", after=("nothing",))).jobs[0].accepted
+    assert bus.submit(hold("a")).jobs[0].accepted, "the same again is the same job"
+
+
+def test_a_stream_that_all_know_comes_to_its_end(bus):
+    stream = tuple((10.0 * i, hold(f"job {i}", place, release_s=10.0 * i)) for i, place in enumerate(PLACES))
+    for name in ROSTER:
+        bus.arm(name, stream=stream, horizon_s=1e5)
+    assert not any(one.orders.over for one in bus.arms.values())
+    assert bus.serve(lambda: all(one.orders.over for one in bus.arms.values()))
+    times = [one.node.clock.now_s(time.monotonic()) for one in bus.arms.values()]
+    assert max(times) - min(times) < 0.5 * SPEED
+    assert bus.done_by_journals() == Counter(word.name for _, word in stream)
+
+
+def test_fewer_than_a_majority_begin_nothing(bus):
+    alone = bus.arm("arm_1", stream=((0.0, hold("a")),), horizon_s=1e5)
+    assert not bus.serve(lambda: bool(alone.node.contractor.held), patience_s=1.5)
+    assert alone.node.clock.now_s(time.monotonic()) == 0.0
+    for name in ("arm_0", "arm_2"):
+        bus.arm(name, stream=((0.0, hold("a")),), horizon_s=1e5)
+    assert bus.serve(lambda: settled(bus, "a"))
+
+
+def test_a_job_whose_arm_dies_goes_to_another_and_an_arm_that_comes_back_goes_on(bus):
+    for name in ROSTER:
+        bus.arm(name)
+    bus.submit(hold("long", repetitions=60), hold("short", "rack"))
+    assert bus.serve(lambda: any(one.node.contractor.held for one in bus.arms.values()))
+    assert bus.serve(lambda: settled(bus, "short"))
+    holder = next(name for name, one in bus.arms.items() if one.node.contractor.held)
+    bus.kill(holder)
+    others = list(bus.arms.values())
+    assert bus.serve(lambda: any(h.award.job.name == "long" for one in others for h in one.node.contractor.held))
+    back = bus.arm(holder)
+    assert bus.serve(lambda: "short" in back.orders.council.grantor.register.settled)
+    assert bus.serve(lambda: settled(bus, "long", "short"))
+    assert bus.done_by_journals() == Counter(["long", "short"])
+
+
+def test_whoever_was_away_is_told_of_jobs_and_of_how_they_ended(bus):
+    for name in ROSTER:
+        bus.arm(name)
+    bus.submit(hold("a"))
+    assert bus.serve(lambda: settled(bus, "a"))
+    bus.kill("arm_2")
+    bus.submit(hold("b"), hold("c", "rack", release_s=1e6))
+    assert bus.serve(lambda: settled(bus, "b"))
+    back = bus.arm("arm_2").orders.council
+    assert bus.serve(lambda: "b" in back.grantor.register.settled and "c" in back.jobs)
+
+
+def test_an_auctioneer_may_not_give_such_an_arm_work(bus):
+    bus.arm("arm_0")
+    award = Award("w", "r", "x", "q", hold("a"))
+    assert "I share out jobs with my peers" in bus.ask(keys.of_arm("f", "arm_0", "award"), award, Ack)
