@@ -2,10 +2,10 @@
 
     python benchmarks/chaos [--only NAME,NAME] [--jobs 24] [--speed 120] [--keep DIR] [--no-namespaces]
 
-For every fault a fleet of four arms is started anew (router, auctioneer, recorder, arms, on loopback; `trespass` with
-TLS, as is `partition` where root can make network namespaces), gets jobs, and while they are worked on the fault
-strikes. Then all jobs must come to an end: finished once, or reported unfinished. Whether a job was done twice is read
-from the journals of the arms, not asked of the auctioneer.
+For every fault a fleet of four arms is started anew (router, auctioneer, recorder, arms, on loopback; `alone-…` without
+an auctioneer, the arms share the jobs out among themselves; `trespass` with TLS, as is `partition` where root can make
+network namespaces), gets jobs, and while they are worked on the fault strikes. Then all jobs must come to an end:
+finished once, or reported unfinished. Whether a job was done twice is read from the journals of the arms, not asked.
 Detected: real seconds until the bus shows that something is wrong (a token gone, a state older than 3 s). Recovered:
 until everybody is there and speaks again and the auctioneer answers; it counts the fault itself, where that takes time.
 Exit code 1 if a job is lost or done twice, a process has died that nobody killed, somebody did what it may not, or a
@@ -23,6 +23,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from campaign import SCENARIO, campaign
+from council import cut_in_halves, cut_one_off
 from namespaces import why_not
 from partition import partition
 from processes import full_disk, kill_arm, kill_auctioneer, kill_router, stop_arm, stuck_subscriber
@@ -46,6 +47,10 @@ FAULTS = {
     "trespass": Fault(trespass, tls=True),
     "partition": Fault(partition, line=True),
     "clock-jump": Fault(clock_jump, clocks=True),
+    "alone-kill-arm": Fault(kill_arm, alone=True),
+    "alone-kill-router": Fault(kill_router, alone=True),
+    "alone-cut-one": Fault(cut_one_off, alone=True, line=True, away=1),
+    "alone-halves": Fault(cut_in_halves, alone=True, line=True),
 }
 
 

@@ -18,7 +18,7 @@ from fleet.bus.link import Link
 from fleet.bus.roster import Participant, of_arms
 from fleet.bus.router import open_client
 from fleet.bus.security import Tls
-from fleet.bus.trade import JobWord, Submission, Submitted
+from fleet.bus.trade import Clock, ClockRequest, JobWord, Submission, Submitted
 from fleet.live.supervisor import Backoff, Supervisor
 from scenarios.live_up import free_port, parts_of
 from scenarios.load import load
@@ -43,11 +43,11 @@ def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float, namespaces:
         CannotStrike: this machine cannot make the fault.
     """
     arms, port = tuple(arm.name for arm in load(SCENARIO).arms), free_port()
-    away = arms[len(arms) // 2 :]
+    away = arms[-(fault.away or len(arms) // 2) :]
     with ExitStack() as stack:
         cut = None
         if fault.line:
-            cut = stack.enter_context(Namespaces(away, port) if namespaces else Line(port))
+            cut = stack.enter_context(Namespaces(away, port) if namespaces and not fault.alone else Line(port))
         place = folder / "keys" if fault.tls or isinstance(cut, Namespaces) else None
         if place is not None:
             hosts = cut.hosts.values() if isinstance(cut, Namespaces) else ()
@@ -59,7 +59,7 @@ def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float, namespaces:
             fleet=SCENARIO,
             folder=folder,
             speed=speed,
-            policy="quickest_matching",
+            policy="consensus" if fault.alone else "quickest_matching",
             difficulty="blind",
             jobs="none",
             seed=0,
@@ -71,7 +71,7 @@ def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float, namespaces:
         clocks = WallClocks(folder / "clocks") if fault.clocks else None
         if cut is not None:
             of_fleet[-len(away) :] = map(cut.through, of_fleet[-len(away) :], away)
-        parts = [record, auction, *of_fleet]
+        parts = [record, *([] if auction is None else [auction]), *of_fleet]
         if clocks is not None:
             router = replace(router, env=clocks.env("router"))
             parts = [replace(part, env=clocks.env(part.name)) for part in parts]
@@ -89,11 +89,14 @@ def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float, namespaces:
         fleet.listen()
         if math.isinf(fleet.until(lambda: len(fleet.states) == len(arms) and len(fleet.tokens) == len(arms), 30.0)):
             raise RuntimeError(f"Only {sorted(fleet.states)} of {arms} are on the bus.")
+        fleet.until(
+            lambda: bool(fleet.link.ask_and_wait(keys.of_clock(SCENARIO), ClockRequest(), Clock, timeout_s=2.0).words)
+        )
         answers = link.ask_and_wait(keys.of_jobs(SCENARIO, "submit"), Submission(work), Submitted, timeout_s=10.0)
         taken = {job.job for word in answers.words.values() for job in word.jobs if job.accepted}
         if len(taken) != jobs:
             raise RuntimeError(f"Only {len(taken)} of {jobs} jobs were accepted: {answers.refused}")
-        fleet.until(lambda: fleet.working() is not None and sum(s.state == "finished" for _, s in fleet.results) >= 2)
+        fleet.until(lambda: fleet.working() is not None and _finished(fleet) >= 2)
         struck_s = time.monotonic()
         detected_s = fault.strike(fleet)
         well_s = fleet.until(lambda: _well(fleet))
@@ -117,6 +120,10 @@ def _job(number: int) -> JobWord:
         trays = ("tray_left", "tray_right")
         return JobWord(name=name, kind="pick_place", places=trays, payload_kg=0.5, repetitions=repetitions)
     return JobWord(name=name, kind="hold", places=("clamp",), payload_kg=3.0, dwell_s=60.0, repetitions=2)
+
+
+def _finished(fleet: Fleet) -> int:
+    return sum(job.state == "finished" for job in fleet.status().values())
 
 
 def _well(fleet: Fleet) -> bool:

@@ -169,3 +169,7 @@ class Fault:
     """Half of the arms reach the router through what can be cut: network namespaces (`tls`), or a line of ours."""
     clocks: bool = False
     """The wall clock of each participant can be set."""
+    alone: bool = False
+    """Without an auctioneer: the arms share the jobs out among themselves."""
+    away: int = 0
+    """How many arms can be cut off; 0 for half of them."""

@@ -55,6 +55,12 @@ def test_a_jump_of_the_wall_clock_harms_nothing():
 
 
 @pytest.mark.slow
+def test_arms_without_an_auctioneer_survive_a_death_and_cuts():
+    told = strike("alone-kill-arm", "alone-cut-one", "alone-halves", jobs=24)
+    assert told.returncode == 0, told.stdout + told.stderr
+
+
+@pytest.mark.slow
 def test_a_fleet_survives_every_fault():
     processes = ("kill-arm", "stop-arm", "kill-router", "stuck-subscriber", "full-disk", "partition")
     told = strike(*processes, "rubbish", "replayed-awards", jobs=24)
