@@ -68,8 +68,12 @@ def single(difficulty: str) -> float:
     return median_rate(window)
 
 
-def library(difficulty: str, arms: int = 4) -> Library:
-    """Quickstart with its four arms, or with them several times over and as many more jobs."""
+def library(difficulty: str, arms: int = 4, peers: int | None = None) -> Library:
+    """Quickstart with its four arms, or with them several times over and as many more jobs.
+
+    Args:
+        peers: How many of those before it each arm has in its vector; all others if not given.
+    """
     times = arms // 4
     fleet = [prepare(load("quickstart"), difficulty=difficulty)]
     one = library_of(fleet, Randomisation(arrivals=(times, times)))
@@ -80,12 +84,13 @@ def library(difficulty: str, arms: int = 4) -> Library:
         able=np.tile(one.tables.able, (1, 1, times)),
         **{name: np.concatenate([getattr(one.tables, name)] * times, axis=1) for name in second},
     )
-    return Library(tuple(f"arm_{a}" for a in range(arms)), one.slots, tables, one.draw)
+    near = None if peers is None else tuple(tuple((a - p - 1) % arms for p in range(peers)) for a in range(arms))
+    return Library(tuple(f"arm_{a}" for a in range(arms)), one.slots, tables, one.draw, near)
 
 
-def batch(difficulty: str, envs: int, arms: int = 4) -> float:
+def batch(difficulty: str, envs: int, arms: int = 4, peers: int | None = None) -> float:
     """The batch: env steps per CPU-second."""
-    env, rng = BatchEnv(library(difficulty, arms), envs, seed=0), np.random.default_rng(0)
+    env, rng = BatchEnv(library(difficulty, arms, peers), envs, seed=0), np.random.default_rng(0)
     seen, _ = env.reset()
 
     def window() -> int:
@@ -145,7 +150,7 @@ def memory(envs: int, arms: int) -> float:
 
 ROWS = {
     "single": lambda difficulty: single(difficulty),
-    "batch": lambda difficulty, envs, arms="4": batch(difficulty, int(envs), int(arms)),
+    "batch": lambda difficulty, envs, arms="4", *peers: batch(difficulty, int(envs), int(arms), *map(int, peers)),
     "torchrl": lambda envs, pages="": torchrl(int(envs), kept=pages == "kept"),
     "memory": lambda envs, arms: memory(int(envs), int(arms)),
 }
@@ -185,10 +190,11 @@ def main() -> None:
             continue
         for count in envs:
             line(f"{name}, {count}", measured(str(PEERS), name, str(count)))
-    for arms in (4, 8, 16, 64):
-        found = measured(here, "batch", "blind", "64", str(arms))
-        cost_ns = None if found is None else 1e9 / (found * arms)
-        line(f"batch of 64 with {arms} arms: ns per arm step", cost_ns, unit="ns")
+    for peers, what in (((), "all others"), (("3",), "3 others")):
+        for arms in (4, 8, 16, 64):
+            found = measured(here, "batch", "blind", "64", str(arms), *peers)
+            cost_ns = None if found is None else 1e9 / (found * arms)
+            line(f"64 envs of {arms} arms that see {what}: an arm step", cost_ns, unit="ns")
     line("memory of 1024 envs with 8 arms", measured(here, "memory", "1024", "8"), 200, "MB")
 
 

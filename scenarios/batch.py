@@ -1,7 +1,7 @@
 """Scenarios for the batched environment: fleets planned and scored once, shifts drawn as arrays."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from fleet.job import Job
 from fleet.seeds import child
 from fleet.sim.tables import stacked, tables_of
 from scenarios.build import DifficultyName, Fleet, Progress, chosen_of, prepare, quiet, world_of
+from scenarios.cell import near_of
 from scenarios.draw import QuickSource, children_of
 from scenarios.jobs import works_of
 from scenarios.load import override
@@ -63,13 +64,14 @@ def make_batch(
     cache: str | Path | None = None,
     max_cycles: int | None = None,
     autoreset: bool = True,
+    peers: int | None = None,
     progress: Progress = quiet,
     **overrides: Any,
 ) -> BatchEnv:
     """The batched environment of a scenario: `num_envs` shifts side by side in one process and one thread.
 
     Args:
-        scenario, difficulty, cache, overrides: As in `make_env`.
+        scenario, difficulty, cache, peers, overrides: As in `make_env`.
         seed: Env e begins the shift of `seed + e` (or of `seed[e]`): that of `make_env(…).reset(seed=…)`.
         randomise: Beyond what a scenario draws: air, arrivals, fleets.
         max_cycles, autoreset: As in `fleet.env.vector.BatchEnv`.
@@ -82,7 +84,7 @@ def make_batch(
     if not isinstance(randomise, Randomisation | None):
         raise ScenarioError(f"randomise must be a scenarios.batch.Randomisation (got {randomise!r}).")
     chosen = chosen_of(scenario, overrides, make_batch)
-    randomise = randomise or Randomisation()
+    randomise, near = randomise or Randomisation(), near_of(chosen, peers)
     specs = [chosen, *(override(chosen, **variant) for variant in randomise.variants)]
     fleets = [
         prepare(
@@ -90,7 +92,7 @@ def make_batch(
         )
         for i, spec in enumerate(specs)
     ]
-    library = library_of(fleets, randomise)
+    library = replace(library_of(fleets, randomise), near=near)
     return BatchEnv(library, num_envs, seed=seed, weights=chosen.reward, max_cycles=max_cycles, autoreset=autoreset)
 
 

@@ -27,7 +27,7 @@ from fleet.sim.plants import ProfilePlant
 from fleet.sim.state import World
 from fleet.sim.world import Arm, build_world, warm_start
 from fleet.thermal import ThermalModel, ThermalSpread, gen3_network, spread_motors, thermal_model
-from scenarios.cell import cell_of
+from scenarios.cell import cell_of, near_of
 from scenarios.jobs import all_works, draw_jobs, rehearsal_works, works_of
 from scenarios.load import load, override
 from scenarios.scenario import Scenario
@@ -321,6 +321,7 @@ def make_env(
     max_cycles: int | None = None,
     render_mode: str | None = None,
     mask_in: "MaskPlace" = "obs",
+    peers: int | None = None,
     progress: Progress = quiet,
     **overrides: Any,
 ) -> "AllocationEnv":
@@ -334,13 +335,15 @@ def make_env(
         channel: What becomes of words on the way: topology, delay, loss, partitions.
         cache: Folder of plans and twins.
         max_cycles, render_mode, mask_in: As in `fleet.env.allocation_v0.AllocationEnv`.
+        peers: So many peers are in what an arm observes, those mounted nearest to it; all if not given.
         overrides: Top-level fields of the scenario to change, for example `horizon_s=600`.
     """
     if not isinstance(channel, Channel):
         raise ScenarioError(f"channel must be a fleet.bus.channel.Channel (got {channel!r}).")
     chosen = chosen_of(scenario, overrides, make_env)
+    near = near_of(chosen, peers)
     fleet = prepare(chosen, difficulty=difficulty, cache=cache, progress=progress)
-    options = {"max_cycles": max_cycles, "render_mode": render_mode, "mask_in": mask_in}
+    options = {"max_cycles": max_cycles, "render_mode": render_mode, "mask_in": mask_in, "near": near}
     return env_of(fleet, plant=plant, bus=bus, channel=channel, **options)
 
 

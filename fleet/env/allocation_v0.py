@@ -77,6 +77,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         cell: Where arms and stations stand, for pictures; arms in a row if not given.
         mask_in: Where the mask of legal actions is: in the observation, in the info, or both. In the info alone, the
             observation is the vector by itself.
+        near: The peers each arm has in its vector; see `fleet.env.observation.Layout`.
     """
 
     metadata = {  # noqa: RUF012  # PettingZoo's
@@ -98,6 +99,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         render_mode: str | None = None,
         cell: Cell | None = None,
         mask_in: MaskPlace = "obs",
+        near: tuple[tuple[int, ...], ...] | None = None,
     ) -> None:
         if render_mode is not None and render_mode not in RENDER_MODES:
             allowed = ", ".join(map(repr, RENDER_MODES))
@@ -119,7 +121,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         self.possible_agents = list(world.arms)
         self.agents: list[str] = []
         self._exchange = exchange or MemoryExchange(world.arms)
-        self.layout = Layout(len(world.arms), world.slots)
+        self.layout = Layout(len(world.arms), world.slots, near)
         per_arm = [arm_spaces(self.layout) for _ in world.arms]
         self.observation_spaces: dict[str, spaces.Space[Any]] = {
             arm: own["observation"] if mask_in == "info" else own
@@ -246,10 +248,10 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         plain = self._keep_events or self._watch is not None
         if plain or not at_once or not isinstance(self._episode.plant, ProfilePlant):
             log = self.events if self._keep_events else None
-            return PlainShift(self._episode, exchange, self._weights, log, self._watch)
+            return PlainShift(self._episode, exchange, self._weights, log, self._watch, self.layout)
         from fleet.env.compiled import CompiledShift  # loads numba, which a live arm has no use for
 
-        return CompiledShift(self._episode, self._weights)
+        return CompiledShift(self._episode, self._weights, self.layout)
 
     def _begun(self, what: str) -> Shift:
         if self._shift is None:

@@ -16,10 +16,10 @@ Array = np.ndarray
 class CompiledShift:
     """Steps an episode as row 0 of an `Engine`; the same doors as `fleet.env.plain.PlainShift`."""
 
-    def __init__(self, episode: Episode, weights: RewardWeights) -> None:
+    def __init__(self, episode: Episode, weights: RewardWeights, layout: Layout | None = None) -> None:
         """Begin it."""
         world = episode.world
-        layout = Layout(len(world.arms), world.slots)
+        layout = layout or Layout(len(world.arms), world.slots)
         tables, drawn = tables_of(world)
         (shift,) = shifts_of(drawn, [key_of(episode.sensors)])
         self._engine = Engine(tables, 1, layout, weights, jobs=world.jobs.exists.shape[1])

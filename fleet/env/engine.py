@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet.env.fields import look, turn
+from fleet.env.fields import form_of, look, turn
 from fleet.env.observation import Layout
 from fleet.env.reward import TERMS, RewardWeights, scale
 from fleet.sim.beginning import begin
@@ -61,8 +61,7 @@ class Engine:
         )
         self._offer.mask[:, :, 0] = 1
         self._all = np.arange(envs)
-        self._start = np.array(layout.starts)
-        self._low, self._high = layout.bounds
+        self._form = form_of(layout)
         self._drawn, self._rows = _arrays(envs, arms, jobs, 0)
 
     @property
@@ -122,7 +121,7 @@ class Engine:
     def observe(self, envs: Array, out: Array) -> None:
         """What the arms of some envs know at the beginning of a shift, into float32 [env, arm, size]."""
         look(
-            self.tables, self._drawn, self._rows, self._offer, envs, self._start, self._low, self._high, out,
+            self.tables, self._drawn, self._rows, self._offer, envs, self._form, out,
         )  # fmt: skip
 
     def step(self, actions: Array, out: Array) -> tuple[Array, Array, Array]:
@@ -138,7 +137,7 @@ class Engine:
         terms = np.empty((self.envs, len(TERMS) + 1))
         turn(
             self.tables, self._drawn, self._rows, self._offer, actions, self._worth, terms, self._all,
-            self._start, self._low, self._high, out,
+            self._form, out,
         )  # fmt: skip
         return terms[:, :-1], terms[:, -1], (self._offer.open == 0) & (self._drawn.jobs > 0)
 

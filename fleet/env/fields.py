@@ -5,11 +5,11 @@ together.
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from fleet.env.observation import FIELDS, LONG_S
+from fleet.env.observation import FIELDS, LONG_S, Layout
 from fleet.robot import JOINTS
 from fleet.sim.boiling import hottest
 from fleet.sim.jit import entry, inner, natural
@@ -30,6 +30,31 @@ assert [field.name for field in FIELDS[OFFERED:]] == [
     "value", "returns", "peer_heard", "peer_age_s", "peer_working", "peer_faulted", "peer_headroom_k", "peer_known",
     "peer_difficulty",
 ]  # fmt: skip
+
+
+class Form(NamedTuple):
+    """A `Layout` as compiled code wants it."""
+
+    start: Array
+    """Where each field begins in the vector, int [field]."""
+    low: Array
+    high: Array
+    """Bounds of the vector, float32 [size]."""
+    first: Array
+    """Where the changes of each arm begin and end below, int [arm + 1]."""
+    change: Array
+    """Who is told of otherwise in an arm's vector than in that of the arm before: place and arm, int [change, 2]."""
+
+
+def form_of(layout: Layout) -> Form:
+    """Of the first arm every peer is a change; of a fleet that hears all, of any other just one."""
+    changes, first, shown = [], [0], [-1] * layout.peers
+    for peers in layout.who.tolist():
+        changes += [(place, arm) for place, arm in enumerate(peers) if shown[place] != arm]
+        first.append(len(changes))
+        shown = peers
+    low, high = layout.bounds
+    return Form(np.array(layout.starts), low, high, np.array(first), np.array(changes, dtype=int).reshape(-1, 2))
 
 
 BLOCK = 128
@@ -80,9 +105,7 @@ def perceive(
     s: Rows,
     o: Offer,
     rows: Array,
-    start: Array,
-    low: Array,
-    high: Array,
+    form: Form,
     out: Array,
 ) -> None:
     """The vectors of the arms of some envs; arguments as in `look`."""
@@ -93,7 +116,8 @@ def perceive(
     noise_k, words, payload_kg, values = t.noise_k, t.word, t.payload_kg, t.value
     scores, curve = t.score, t.curve
     arms, slots = natural(modes.shape[1]), natural(on_offer.shape[1])
-    peers = arms - 1
+    start, low, high, first, change = form.start, form.low, form.high, form.first, form.change
+    size = natural(out.shape[2])
     c_clock, c_mode = natural(start[CLOCK]), natural(start[MODE])
     c_busy, c_last = natural(start[BUSY]), natural(start[LAST_AWARD])
     c_temp, c_headroom = natural(start[TEMP]), natural(start[HEADROOM])
@@ -102,7 +126,8 @@ def perceive(
         c_slots, c_slots + slots, c_slots + 2 * slots, c_slots + 3 * slots, c_slots + 4 * slots, c_slots + 5 * slots,
         c_slots + 6 * slots, c_slots + 7 * slots, c_slots + 8 * slots, c_slots + 9 * slots, c_slots + 10 * slots,
     )  # fmt: skip
-    c_working, size = c_peers + 2 * peers, natural(out.shape[2])
+    peers = natural((size - c_peers) // (5 + 2 * slots))
+    c_working = c_peers + 2 * peers
     c_peer_known, c_told = c_peers + 5 * peers, c_peers + 5 * peers + peers * slots
     low_c, high_c, low_k, high_k = low[c_temp], high[c_temp], low[c_headroom], high[c_headroom]
     most_kg, most_value, most_returns = high[c_payload], high[c_value], high[c_returns]
@@ -148,23 +173,18 @@ def perceive(
             hot_k[a] = min(max(t.warning_c - hottest(one), low_k), high_k)
             for k in range(found):
                 known[a, k], told[a, k] = words[lot, a, kind_of[k], 2], words[lot, a, kind_of[k], 3]
-        for turn in range(peers + arms):  # first the peers of the first arm into the frame, then arm after arm
-            a = natural(turn - peers)
-            if turn >= peers:
-                for i in range(size):
-                    out[e, a, i] = frame[i]
-                if a == peers:
-                    break
-            # The next arm has this one where it was itself among the peers.
-            peer, b = (turn, turn + 1) if turn < peers else (a, a)
-            place = c_working + peer
-            frame[place], frame[place + peers] = modes[e, b] == WORKING, modes[e, b] == FAULTED
-            frame[place + 2 * peers] = hot_k[b]
-            place = c_peer_known + peer * slots
-            for k in range(found):
-                frame[place + k] = known[b, k]
-                frame[place + peers * slots + k] = told[b, k]
         for a in range(arms):
+            for n in range(first[a], first[a + 1]):
+                peer, b = natural(change[n, 0]), natural(change[n, 1])
+                place = c_working + peer
+                frame[place], frame[place + peers] = modes[e, b] == WORKING, modes[e, b] == FAULTED
+                frame[place + 2 * peers] = hot_k[b]
+                place = c_peer_known + peer * slots
+                for k in range(found):
+                    frame[place + k] = known[b, k]
+                    frame[place + peers * slots + k] = told[b, k]
+            for i in range(size):
+                out[e, a, i] = frame[i]
             mode = natural(modes[e, a])
             out[e, a, c_mode + mode] = 1.0
             if mode == WORKING:
@@ -195,21 +215,18 @@ def look(
     s: Rows,
     o: Offer,
     rows: Array,
-    start: Array,
-    low: Array,
-    high: Array,
+    form: Form,
     out: Array,
 ) -> None:
     """What the arms of some envs know, and what hangs out there.
 
     Args:
         rows: Which envs, int [row].
-        start: Where each field begins in the vector, int [field].
-        low, high: Bounds of the vector, float32 [size].
+        form: Of the vectors.
         out: Takes the vectors, float32 [env, arm, size].
     """
     hang_out(t, d, s, o, rows)
-    perceive(t, d, s, o, rows, start, low, high, out)
+    perceive(t, d, s, o, rows, form, out)
 
 
 @entry
@@ -222,9 +239,7 @@ def turn(
     worth: Array,
     terms: Array,
     rows: Array,
-    start: Array,
-    low: Array,
-    high: Array,
+    form: Form,
     out: Array,
 ) -> None:
     """One step of all envs, and what their arms know thereafter.
@@ -234,11 +249,11 @@ def turn(
         worth: Of a unit of each reward term, [term].
         terms: Takes the reward terms and their sum, [env, term + 1].
         rows: All envs, int [env].
-        start, low, high, out: As in `look`.
+        form, out: As in `look`.
     """
     for first in range(0, len(rows), BLOCK):
         some = rows[first : first + BLOCK]
         award(t, d, s, o, actions, some)
         live(t, d, s, o, worth, terms, some)
         hang_out(t, d, s, o, some)
-        perceive(t, d, s, o, some, start, low, high, out)
+        perceive(t, d, s, o, some, form, out)

@@ -107,10 +107,24 @@ class Layout:
 
     arms: int
     slots: int
+    near: tuple[tuple[int, ...], ...] | None = None
+    """The peers that each arm has in its vector, in that order; all others in the fleet's order if not given."""
+
+    @cached_property
+    def who(self) -> Array:
+        """The peers of each arm, int [arm, peer]."""
+        if self.near is None:
+            return _peers(self.arms)
+        return np.array(self.near, dtype=int).reshape(self.arms, -1)
+
+    @property
+    def peers(self) -> int:
+        """How many peers an arm has in its vector."""
+        return self.arms - 1 if self.near is None else len(self.near[0])
 
     def shape(self, field: Field) -> tuple[int, ...]:
         """Axes of a field as numbers."""
-        sizes = {"joint": JOINTS, "slot": self.slots, "peer": self.arms - 1}
+        sizes = {"joint": JOINTS, "slot": self.slots, "peer": self.peers}
         return tuple(sizes[axis] for axis in field.axes)
 
     @cached_property
@@ -156,7 +170,7 @@ class Layout:
         """The inverse of `pack`; arrays are views of the vector."""
         if vector.shape[-1] != self.size:
             raise ValueError(
-                f"An observation of {self.arms} arms and {self.slots} slots has {self.size} elements, "
+                f"An observation of {self.slots} slots and {self.peers} peer(s) has {self.size} elements, "
                 f"got {vector.shape[-1]}."
             )
         lead = vector.shape[:-1]
@@ -218,12 +232,19 @@ def remaining_s(world: World, state: State, on_offer: Array) -> Array:
 
 
 def observe(
-    world: World, state: State, on_offer: Array, mask: Array, measured_c: Array, heard: Mapping[str, Array] | Heard
+    world: World,
+    state: State,
+    on_offer: Array,
+    mask: Array,
+    measured_c: Array,
+    heard: Mapping[str, Array] | Heard,
+    who: Array | None = None,
 ) -> Observation:
     """What every arm knows now, leading axes [env, arm].
 
     Args:
         heard: What each arm received, arrays [env, receiver, sender, ...].
+        who: The peers of each arm, int [arm, peer]; all others if not given.
     """
     told = heard if isinstance(heard, Mapping) else {k: np.asarray(v)[None] for k, v in vars(heard).items()}
     envs, arms = state.mode.shape
@@ -238,7 +259,8 @@ def observe(
     own = scored(world.offers.difficulty, on_offer)
     risk = saturation(world.offers, on_offer, measured_c)
     duration = remaining_s(world, state, on_offer)
-    peer = {name: _others(values) for name, values in told.items() if name != "p_saturation"}
+    peers = _peers(arms) if who is None else who
+    peer = {name: _others(values, peers) for name, values in told.items() if name != "p_saturation"}
     total = world.plans.times_s[world.offers.plan[env, np.arange(arms), state.job]]
     left = total[..., 0] + state.todo * total[..., 1] + total[..., 2] - state.progress_s
     never, known, peer_known = np.isinf(peer["age_s"]), ~np.isnan(own), ~np.isnan(peer["difficulty"])
@@ -273,10 +295,9 @@ def observe(
     )
 
 
-def _others(values: Array) -> Array:
-    """[env, receiver, peer, ...] of [env, receiver, sender, ...]: the senders other than the receiver, in order."""
-    arms = values.shape[1]
-    return values[:, np.arange(arms)[:, None], _peers(arms)]
+def _others(values: Array, peers: Array) -> Array:
+    """[env, receiver, peer, ...] of [env, receiver, sender, ...]."""
+    return values[:, np.arange(len(peers))[:, None], peers]
 
 
 @cache

@@ -28,11 +28,12 @@ class PlainShift:
         weights: RewardWeights,
         log: list[Event] | None,
         watch: Callable[[Step], None] | None,
+        layout: Layout | None = None,
     ) -> None:
         """Begin it: every arm perceives, and tells what it knows."""
         self._episode, self._exchange, self._weights = episode, exchange, weights
         self._log, self._watch = log, watch
-        self._layout = Layout(len(episode.world.arms), episode.world.slots)
+        self._layout = layout or Layout(len(episode.world.arms), episode.world.slots)
         self._noise_key = key_of(episode.sensors)
         exchange.begin(np.random.default_rng(episode.chance))
         self._spoken_before = exchange.delivered
@@ -101,4 +102,5 @@ class PlainShift:
         measured = true_c + world.motors.sensor_noise_k * noise
         words = say(world, state, on_offer, measured, self._episode.twins)
         self._heard = self._exchange.share(words)
-        self._vectors = self._layout.pack(observe(world, state, on_offer, mask, measured, self._heard))
+        known = observe(world, state, on_offer, mask, measured, self._heard, self._layout.who)
+        self._vectors = self._layout.pack(known)

@@ -33,6 +33,8 @@ class Library:
     slots: int
     tables: Tables
     draw: Callable[[np.random.SeedSequence], Shift]
+    near: tuple[tuple[int, ...], ...] | None = None
+    """The peers each arm has in its vector; see `fleet.env.observation.Layout`."""
 
 
 class BatchEnv:
@@ -72,7 +74,7 @@ class BatchEnv:
         """Of the present shift of each env."""
         self.agents = library.arms
         """Names of the arms, in the order of the arm axis."""
-        self.layout = Layout(len(library.arms), library.slots)
+        self.layout = Layout(len(library.arms), library.slots, library.near)
         self.single_observation_space, self.single_action_space = arm_spaces(self.layout)
         """Of one arm."""
         self.autoreset = autoreset

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from fleet.bus.memory import MemoryExchange
 from fleet.env.compiled import CompiledShift
 from fleet.env.episode import Episode
+from fleet.env.observation import Layout
 from fleet.env.plain import PlainShift
 from fleet.env.reward import RewardWeights
 from fleet.robot import ThermalLimits
@@ -16,11 +17,12 @@ from fleet.sim.noise import LEVELS, key_of, standard_normal
 STEPS = 60
 
 
-def both(small, episode, seed: int):
+def both(small, episode, seed: int, near=None):
     """The same episode twice, through all of it, with actions legal and not; yields after every step."""
     weights = RewardWeights()
-    plain = PlainShift(episode, MemoryExchange(episode.world.arms), weights, None, None)
-    compiled = CompiledShift(episode, weights)
+    layout = Layout(len(episode.world.arms), episode.world.slots, near)
+    plain = PlainShift(episode, MemoryExchange(episode.world.arms), weights, None, None, layout)
+    compiled = CompiledShift(episode, weights, layout)
     rng = np.random.default_rng(seed)
     yield plain, compiled, None
     for _ in range(min(STEPS, episode.world.ticks)):
@@ -56,11 +58,15 @@ def compare(plain, compiled, results) -> None:
     slots=st.integers(1, 5),
     ambient_c=st.sampled_from([20.0, 45.0, 58.0]),
     power_off=st.booleans(),
+    data=st.data(),
 )
-def test_it_does_what_the_plain_kernel_does(small, seed, arms, jobs, slots, ambient_c, power_off) -> None:
+def test_it_does_what_the_plain_kernel_does(small, seed, arms, jobs, slots, ambient_c, power_off, data) -> None:
+    peers = data.draw(st.none() | st.integers(0, arms - 1))
+    shuffled = [data.draw(st.permutations([b for b in range(arms) if b != a])) for a in range(arms)]
+    near = None if peers is None else tuple(tuple(others[:peers]) for others in shuffled)
     limits = ThermalLimits(warning_c=56.0, error_c=60.0, restart_c=54.0, clear_s=25.0, power_off_on_fault=power_off)
     make = small.Shifts(arms=arms, jobs=jobs, slots=slots, ticks=80, ambient_c=ambient_c, limits=limits)
-    for each in both(small, make(np.random.SeedSequence(seed)), seed):
+    for each in both(small, make(np.random.SeedSequence(seed)), seed, near):
         compare(*each)
 
 

@@ -71,7 +71,9 @@ def test_what_is_out_of_range_is_clipped_to_its_field() -> None:
 
 def test_a_vector_of_another_fleet_is_refused() -> None:
     layout = Layout(2, 3)
-    with pytest.raises(ValueError, match=f"An observation of 2 arms and 3 slots has {layout.size} elements, got 5"):
+    with pytest.raises(
+        ValueError, match=rf"An observation of 3 slots and 1 peer\(s\) has {layout.size} elements, got 5"
+    ):
         layout.read(np.zeros(5, np.float32), np.ones(4, np.int8))
 
 
