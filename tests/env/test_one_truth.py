@@ -19,7 +19,7 @@ from scenarios.run import RunResult, RunSpec, run
 SEED = 2
 
 
-@pytest.fixture(scope="module", params=["blind", "oracle"])
+@pytest.fixture(scope="module", params=["blind", "oracle", pytest.param("twin", marks=pytest.mark.slow)])
 def fleet(request, cell, folder) -> Fleet:
     """The cell, ready."""
     return prepare(cell, difficulty=request.param, cache=folder)
