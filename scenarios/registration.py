@@ -8,9 +8,9 @@ from typing import Any
 
 import pettingzoo
 from pettingzoo import AECEnv
-from pettingzoo.utils import parallel_to_aec, wrappers
+from pettingzoo.utils import wrappers
 
-from fleet.env.allocation_v0 import VERSION, AllocationEnv
+from fleet.env.allocation_v0 import VERSION, AllocationEnv, InTurns
 from scenarios.build import make_env
 from scenarios.scenario import Scenario
 
@@ -24,7 +24,7 @@ def registered_parallel_env(scenario: str | Path | Scenario = "quickstart", **op
 
 def registered_aec_env(scenario: str | Path | Scenario = "quickstart", **options: Any) -> AECEnv[str, Any, Any]:
     """The same as an `AECEnv`, with PettingZoo's order check."""
-    return wrappers.OrderEnforcingWrapper(parallel_to_aec(make_env(scenario, **options)))
+    return wrappers.OrderEnforcingWrapper(InTurns(make_env(scenario, **options)))
 
 
 pettingzoo.register("parallel", NAME, f"{__name__}:registered_parallel_env")

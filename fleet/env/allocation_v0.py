@@ -11,7 +11,8 @@ from typing import Any, Literal, Protocol, get_args
 import numpy as np
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
-from pettingzoo.utils import parallel_to_aec, wrappers
+from pettingzoo.utils import wrappers
+from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
 from fleet.bus.exchange import Exchange
 from fleet.bus.memory import MemoryExchange
@@ -306,9 +307,24 @@ def parallel_env(make_episode: EpisodeFactory, **options: Any) -> AllocationEnv:
     return AllocationEnv(make_episode, **options)
 
 
+class InTurns(parallel_to_aec_wrapper[str, Any, Any]):
+    """The same for agents that act one after the other; the step is made when the last of them has answered."""
+
+    def step(self, action: Any) -> None:
+        """One agent's answer.
+
+        Raises:
+            ValueError: no integer; refused before anybody else is asked.
+        """
+        agent = self.agent_selection
+        if not (self.terminations[agent] or self.truncations[agent]):
+            actions_of([agent], {agent: action})
+        super().step(action)
+
+
 def raw_env(make_episode: EpisodeFactory, **options: Any) -> AECEnv[str, Any, Any]:
     """The same as an `AECEnv`, without wrappers."""
-    return parallel_to_aec(parallel_env(make_episode, **options))
+    return InTurns(parallel_env(make_episode, **options))
 
 
 def env(make_episode: EpisodeFactory, **options: Any) -> AECEnv[str, Any, Any]:

@@ -91,10 +91,15 @@ def test_the_turn_by_turn_env_says_it_too(small) -> None:
     with pytest.raises(AssertionError, match=r"reset\(\) needs to be called before step"):
         env.step(1)
     env.reset(seed=0)
-    env.step(1.5)
+    first, second = env.possible_agents[:2]
     env.step(0)
-    with pytest.raises(ValueError, match=r"The action of 'arm_0' must be one integer \(got 1\.5\)"):
-        env.step(0)  # all have answered
+    with pytest.raises(ValueError, match=rf"The action of '{second}' must be one integer \(got 1\.5\)"):
+        env.step(1.5)
+    assert env.agent_selection == second  # it may answer again
+    env.step(0)
+    while env.agents:
+        env.step(None if env.terminations[env.agent_selection] or env.truncations[env.agent_selection] else 0)
+    assert first not in env.agents
 
 
 # The batch
