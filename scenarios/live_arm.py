@@ -88,13 +88,13 @@ def arm_command(
         refuse_namesake(link, name)
         orders = None
         if policy:
+            live_council.refuse_auctioneer(link)
             membership = live_council.membership_of(chosen, policy, jobs=jobs, seed=seed)
             orders = more.enter_context(live_council.seat(folder / f"{name}.grants", membership))
         node = node_of(link, book, made, chosen, speed=speed, rate_hz=rate_hz, capacity=capacity, orders=orders)
         typer.echo(f"ready {name} {endpoint} {os.getpid()}")
         while not stop.is_set():
             if policy and live_council.work(node, stop):
-                typer.echo(live_council.told(node))
                 return
             node.serve(time.monotonic() + TURN_S)
         node.retire(time.monotonic() + FAREWELL_S)

@@ -6,11 +6,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fleet.errors import FleetError
+import typer
+
+from fleet.errors import BusError, FleetError
 from scenarios.live_policies import AMONG_ARMS, allocation, check
 from scenarios.scenario import Scenario
 
 if TYPE_CHECKING:
+    from fleet.bus.link import Link
     from fleet.live.arm_node import ArmNode
     from fleet.live.council_node import CouncilNode, Membership
     from fleet.live.orders import Worker
@@ -50,6 +53,19 @@ def membership_of(scenario: Scenario, policy: str, *, jobs: str, seed: int) -> "
     return Membership(roster=roster, agree=agree, places=places, stream=stream, horizon_s=horizon_s)
 
 
+def refuse_auctioneer(link: "Link") -> None:
+    """Two ways to share the same jobs out would have them done twice.
+
+    Raises:
+        BusError: the fleet has an auctioneer.
+    """
+    from fleet.bus import keys
+
+    if there := link.there(keys.of_every_auction(link.fleet, "alive"), timeout_s=2.0):
+        names = ", ".join(sorted(there))
+        raise BusError(f"Fleet '{link.fleet}' has an auctioneer: '{names}'. Stop it first, or leave --policy out.")
+
+
 @contextmanager
 def seat(path: Path, membership: "Membership") -> Iterator[Any]:
     """What gives an arm its seat among its peers, with the journal of its grants at `path` held open.
@@ -73,7 +89,7 @@ def seat(path: Path, membership: "Membership") -> Iterator[Any]:
 
 
 def work(node: "ArmNode", stop: "Stop") -> bool:
-    """Live until all is done, or until told to stop; says which it was."""
+    """Live until all is done, and tell how it stands, or until told to stop; says which it was."""
     from fleet.live.council_node import CouncilNode
 
     orders = node.orders
@@ -81,6 +97,8 @@ def work(node: "ArmNode", stop: "Stop") -> bool:
     while not stop.is_set() and not orders.over:
         node.serve(time.monotonic() + TURN_S)
     done = not stop.is_set()
+    if done:
+        typer.echo(told(node))
     until_s = time.monotonic() + FAREWELL_S
     while done and not stop.is_set() and time.monotonic() < until_s:
         node.serve(min(until_s, time.monotonic() + TURN_S))

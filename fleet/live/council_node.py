@@ -226,7 +226,7 @@ class CouncilNode:
 
     def _grant(self, claim: Claim) -> Grant:
         if claim.arm == self._name:
-            raise Refused("This is my own claim.")
+            raise LeftToOthers
         try:
             return self.council.asked(claim, time.monotonic())
         except Objection as objection:
@@ -283,6 +283,8 @@ class CouncilNode:
             for key in answers.words.keys() - read:
                 read.add(key)
                 self.council.answered(answers.words[key], time.monotonic())
+            for reason in filter(None, answers.refused.values()):
+                self._complain("claim", f"is not answered: {reason}")
 
         key = keys.asked_of_all(self._link.fleet, "grant", self._name)
         try:

@@ -13,6 +13,7 @@ from fleet.bus import keys
 from fleet.bus.link import Link
 from fleet.bus.router import Router
 from fleet.bus.trade import Ack, ArmEvent, Award, JobWord, Status, StatusRequest, Submission, Submitted
+from fleet.errors import BusError
 from fleet.job import Place
 from fleet.live.arm_node import ArmNode, Nature
 from fleet.live.body import SimulatedBody
@@ -25,6 +26,7 @@ from fleet.live.journal import Journal
 from fleet.live.promises import Closed, Promise, recall, restarted, retold
 from fleet.live.timing import Timing
 from fleet.robot import ThermalLimits
+from scenarios.live_council import refuse_auctioneer
 from scenarios.live_policies import allocation
 
 PATIENCE_S = 20.0
@@ -125,6 +127,7 @@ def bus(tmp_path, small):
             arms=arms,
             serve=serve,
             ask=ask,
+            endpoint=router.endpoint,
             submit=submit,
             stand=stand,
             kill=kill,
@@ -200,6 +203,14 @@ def test_whoever_was_away_is_told_of_jobs_and_of_how_they_ended(bus):
     assert bus.serve(lambda: settled(bus, "b"))
     back = bus.arm("arm_2").orders.council
     assert bus.serve(lambda: "b" in back.grantor.register.settled and "c" in back.jobs)
+
+
+def test_where_an_auctioneer_is_arms_do_not_share_jobs_out(bus):
+    with Link(bus.endpoint, "f") as link, Link(bus.endpoint, "f") as other:
+        refuse_auctioneer(link)
+        other.alive(keys.of_auction("f", "boss", "alive"))
+        with pytest.raises(BusError, match="has an auctioneer: 'boss'"):
+            refuse_auctioneer(link)
 
 
 def test_an_auctioneer_may_not_give_such_an_arm_work(bus):
