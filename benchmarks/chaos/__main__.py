@@ -49,6 +49,7 @@ FAULTS = {
     "clock-jump": Fault(clock_jump, clocks=True),
     "alone-kill-arm": Fault(kill_arm, alone=True),
     "alone-kill-router": Fault(kill_router, alone=True),
+    "alone-rubbish": Fault(rubbish, alone=True),
     "alone-cut-one": Fault(cut_one_off, alone=True, line=True, away=1),
     "alone-halves": Fault(cut_in_halves, alone=True, line=True),
 }

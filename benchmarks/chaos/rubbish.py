@@ -8,6 +8,7 @@ import msgspec
 from struck import Fleet
 
 from fleet.bus import keys
+from fleet.bus.council import Bid, Claim
 from fleet.bus.messages import State, encode, encoding
 from fleet.bus.trade import Award, LeaseRequest, QuoteRequest, Report, Submission
 
@@ -19,7 +20,7 @@ def rubbish(fleet: Fleet) -> float:
     rng = random.Random(0)
     of_fleet, session = fleet.link.fleet, fleet.session
     said = [str(key) for key in _every_key(of_fleet, fleet.arms)]
-    kinds = [encoding(kind) for kind in (State, Award, QuoteRequest, LeaseRequest, Report, Submission)]
+    kinds = [encoding(kind) for kind in (State, Award, Bid, Claim, QuoteRequest, LeaseRequest, Report, Submission)]
     bodies = [
         b"",
         b"{",
@@ -85,10 +86,11 @@ def awards_of(fleet: Fleet, arm: str) -> list[Award]:
 
 
 def _every_key(fleet: str, arms: tuple[str, ...]) -> list[keys.Key]:
-    named = [keys.Key(fleet, "arm", arm, topic) for arm in (*arms, "nobody") for topic in keys.TOPICS["arm"]]
-    auction = [
-        keys.Key(fleet, "auction", "auctioneer", topic, arms[0] if topic in keys.ASKED else "")
-        for topic in keys.TOPICS["auction"]
+    owners = [("arm", arm) for arm in (*arms, "nobody")] + [("auction", "auctioneer")]
+    named = [
+        keys.Key(fleet, role, name, topic, arms[0] if topic in keys.ASKED else "")
+        for role, name in owners
+        for topic in keys.TOPICS[role]
     ]
     rest = [keys.Key(fleet, role, "", topic) for role in keys.NAMELESS for topic in keys.TOPICS[role]]
-    return [*named, *auction, *rest]
+    return [*named, *rest]

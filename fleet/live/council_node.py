@@ -51,6 +51,8 @@ LISTEN_S = 0.5
 """Real seconds that an arm listens before it lets the fleet's time begin."""
 PATIENCE_S = 20.0
 """Real seconds that a majority waits for the other arms before the fleet's time begins."""
+LAST_S = 10.0
+"""Real seconds after the end of the shift that an arm waits at most for last cycles, its own and those of others."""
 NOT_YET_S = 1e9
 """Real seconds: so long the fleet's time would stand still, if nobody let it begin."""
 GROWTH = 4
@@ -116,6 +118,7 @@ class CouncilNode:
         self._complain = Complaints(self._name)
         self._tokens: set[str] = set()
         self._begun = self._busy = False
+        self._ended_s = math.inf
         self._since_s = self._ticked_s = real_s
         self.wake_s = math.inf
         worker.set_clock(FleetClock(self._speed, real_s + NOT_YET_S))
@@ -153,7 +156,9 @@ class CouncilNode:
         if math.isinf(self._horizon_s):
             return False
         if self.council.ended:
-            return not (self.council.contractor.held or self.council.contractor.owes)
+            mine = self.council.contractor.held or self.council.contractor.owes
+            others = any(said.state == "finishing" for said in self.statuses())
+            return not (mine or others) or real_s >= self._ended_s + LAST_S
         return self._begun and not self._stream and self.council.over(real_s)
 
     def statuses(self) -> list[JobStatus]:
@@ -169,7 +174,7 @@ class CouncilNode:
         while self._stream and self._begun and self._stream[0][0] <= time_s:
             self.council.know([self._stream.popleft()[1]])
         if self._begun and time_s >= self._horizon_s and not self.council.ended:
-            self.council.ended = True
+            self.council.ended, self._ended_s = True, real_s
             held = self.council.contractor.held
             if held and not held[0].leave:
                 self.council.contractor.returned(time_s, real_s, "the shift is over")

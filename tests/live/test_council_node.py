@@ -168,6 +168,16 @@ def test_a_stream_that_all_know_comes_to_its_end(bus):
     assert bus.done_by_journals() == Counter(word.name for _, word in stream)
 
 
+def test_at_the_end_of_the_shift_a_last_cycle_is_ended_and_the_rest_is_left(bus):
+    stream = ((0.0, hold("brief", repetitions=1)), (0.0, hold("long", "rack", repetitions=10_000)))
+    for name in ROSTER:
+        bus.arm(name, stream=stream, horizon_s=240.0)
+    assert bus.serve(lambda: all(one.orders.over for one in bus.arms.values()))
+    states = {said.job: said.state for said in bus.arms["arm_0"].orders.statuses()}
+    assert states == {"brief": "finished", "long": "waiting"}
+    assert not any(one.node.contractor.held for one in bus.arms.values())
+
+
 def test_fewer_than_a_majority_begin_nothing(bus):
     alone = bus.arm("arm_1", stream=((0.0, hold("a")),), horizon_s=1e5)
     assert not bus.serve(lambda: bool(alone.node.contractor.held), patience_s=1.5)
