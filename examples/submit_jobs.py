@@ -10,6 +10,7 @@ import json
 import queue
 import sys
 import time
+from contextlib import suppress
 from urllib.parse import quote
 
 import zenoh
@@ -17,7 +18,7 @@ import zenoh
 MOST = 100
 """Jobs in one word; the bus takes up to 128 and 64 KiB."""
 WAIT_S = 10.0
-"""For an auctioneer to come."""
+"""For an auctioneer, or arms that share jobs out, to come."""
 JOBS = [
     {"name": "outside 1", "kind": "hold", "places": ["fixture"], "payload_kg": 1.0, "dwell_s": 5.0},
     {"name": "outside 2", "kind": "hold", "places": ["fixture"], "payload_kg": 0.5, "dwell_s": 5.0, "repetitions": 2},
@@ -100,13 +101,12 @@ def main(port, fleet, jobs, seconds=600.0):
     except zenoh.ZError:
         sys.exit(f"No router answered at port {port}.")
     with opened as session:
-        tokens = queue.SimpleQueue()  # an auctioneer shows its token once it can answer
-        watcher = session.liveliness().declare_subscriber(f"{root}/auction/*/alive", tokens.put, history=True)
-        try:
-            tokens.get(timeout=WAIT_S)
-        except queue.Empty:
-            sys.exit(f"No auctioneer came to the fleet '{fleet}' at port {port} within {WAIT_S:.0f} s.")
-        watcher.undeclare()
+        end_s, pause = time.monotonic() + WAIT_S, queue.SimpleQueue()
+        while not ask(session, f"{root}/clock/now", "ClockRequest", {}):  # who takes jobs tells the time too
+            if time.monotonic() > end_s:
+                sys.exit(f"Nobody takes jobs in the fleet '{fleet}' at port {port} within {WAIT_S:.0f} s.")
+            with suppress(queue.Empty):
+                pause.get(timeout=0.2)
         taken = submit(session, root, jobs)
         if not taken:
             sys.exit(f"Nobody took a job in the fleet '{fleet}' at port {port}.")
