@@ -6,8 +6,10 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
@@ -96,6 +98,74 @@ class Workshop:
 
     def __call__(self, *_: Any, **__: Any) -> Watched:
         return Watched(parallel_env(self.shifts), self.name)
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How the shift of a workshop ends."""
+
+    shift: dict[str, Any]
+    """Its options."""
+    finished: bool
+    """All jobs are done, or else it is cut at its horizon of six decisions."""
+
+
+CUT = Ending({"ticks": 6}, finished=False)
+FINISHED = Ending({"jobs": 1, "ticks": 400, "ambient_c": 20.0}, finished=True)
+
+
+@dataclass(frozen=True)
+class Turn:
+    """One step of an environment without a trainer."""
+
+    before: dict[str, Any]
+    """What the arms knew."""
+    claims: dict[str, int]
+    seen: dict[str, Any]
+    """What they know after it."""
+    rewards: dict[str, float]
+    terminated: dict[str, bool]
+    truncated: dict[str, bool]
+    infos: dict[str, dict[str, Any]]
+    last: bool
+
+    @property
+    def ends(self) -> tuple[bool, bool]:
+        """Terminated and truncated, which are the same of all arms."""
+        ((terminated,), (truncated,)) = set(self.terminated.values()), set(self.truncated.values())
+        return terminated, truncated
+
+
+def turns(
+    env: ParallelEnv[str, Any, Any], seen: dict[str, Any], choose: Callable[[dict[str, Any]], dict[str, int]]
+) -> Iterator[Turn]:
+    """The second way: an episode by hand, from what the arms know at its beginning to its end.
+
+    Args:
+        choose: The claims of the arms, of what they know.
+    """
+    while env.agents:
+        claims = choose(seen)
+        before, (seen, rewards, terminated, truncated, infos) = seen, env.step(claims)
+        yield Turn(before, claims, seen, rewards, terminated, truncated, infos, last=not env.agents)
+
+
+def claim_by_chance(seed: int) -> Callable[[dict[str, Any]], dict[str, int]]:
+    """Any legal claim of each arm."""
+    rng = np.random.default_rng(seed)
+    return lambda seen: {arm: int(rng.choice(np.flatnonzero(each["action_mask"]))) for arm, each in seen.items()}
+
+
+@pytest.fixture(params=[CUT, FINISHED], ids=["cut", "finished"])
+def ending(request) -> Ending:
+    """Both ways in which a shift ends."""
+    return request.param
+
+
+@pytest.fixture(scope="session")
+def by_hand() -> SimpleNamespace:
+    """How an environment is stepped without a trainer."""
+    return SimpleNamespace(turns=turns, claim_by_chance=claim_by_chance)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -78,14 +78,12 @@ def test_the_hash_seed_changes_nothing(elsewhere) -> None:
 
 
 @pytest.mark.parametrize("masks", ["list", "array"])
-@pytest.mark.parametrize("shift", [{"ticks": 6}, {"jobs": 1, "ticks": 400, "ambient_c": 20.0}], ids=["cut", "finished"])
-def test_it_is_the_environment_with_the_mask_elsewhere(small_workshop, shift, masks) -> None:
+def test_it_is_the_environment_with_the_mask_elsewhere(small_workshop, by_hand, ending, masks) -> None:
     from fleet.env.adapters.agilerl import AgileRLEnv
 
-    env, plain = AgileRLEnv(small_workshop(**shift)(), masks=masks), small_workshop(**shift)()
-    (seen, infos), (there, infos_there) = env.reset(seed=3), plain.reset(seed=3)
-    rng, ends = np.random.default_rng(3), None
-    while True:
+    env, plain = AgileRLEnv(small_workshop(**ending.shift)(), masks=masks), small_workshop(**ending.shift)()
+
+    def same(seen, infos, there, infos_there) -> None:
         for arm in plain.possible_agents:
             assert env.observation_space(arm) is env.observation_space(arm)
             assert env.observation_space(arm).contains(seen[arm])
@@ -93,13 +91,16 @@ def test_it_is_the_environment_with_the_mask_elsewhere(small_workshop, shift, ma
             assert isinstance(infos[arm]["action_mask"], list if masks == "list" else np.ndarray)
             np.testing.assert_array_equal(infos[arm].pop("action_mask"), there[arm]["action_mask"])
             assert infos[arm] == infos_there[arm]
-        if not env.agents:
-            break
-        claims = {arm: int(rng.choice(np.flatnonzero(each["action_mask"]))) for arm, each in there.items()}
-        seen, rewards, *ends, infos = env.step(claims)
-        there, rewards_there, *ends_there, infos_there = plain.step(claims)
-        assert (rewards, ends) == (rewards_there, ends_there)
-    assert [set(end.values()) for end in ends] == [{"jobs" in shift}, {"jobs" not in shift}]
+
+    begin, infos_there = plain.reset(seed=3)
+    same(*env.reset(seed=3), begin, infos_there)
+    for turn in by_hand.turns(plain, begin, by_hand.claim_by_chance(3)):
+        seen, rewards, terminated, truncated, infos = env.step(turn.claims)
+        same(seen, infos, turn.seen, turn.infos)
+        assert (rewards, terminated, truncated) == (turn.rewards, turn.terminated, turn.truncated)
+        if turn.last:
+            assert turn.ends == (ending.finished, not ending.finished)
+    assert env.agents == []
 
 
 def test_a_reset_brings_the_infos_of_the_end_up_to_date(small_workshop) -> None:

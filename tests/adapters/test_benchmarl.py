@@ -81,14 +81,12 @@ def test_the_hash_seed_changes_nothing(elsewhere) -> None:
     assert elsewhere(__file__, 1) == elsewhere(__file__, 2)
 
 
-@pytest.mark.parametrize("shift", [{"ticks": 6}, {"jobs": 1, "ticks": 400, "ambient_c": 20.0}], ids=["cut", "finished"])
-def test_a_rollout_is_the_episode_of_the_environment(small_workshop, shift) -> None:
-    """The second way: the same claims given to the environment itself."""
+def test_a_rollout_is_the_episode_of_the_environment(small_workshop, by_hand, ending) -> None:
     import torch
 
     from fleet.env.adapters.benchmarl import AllocationTask
 
-    workshop = small_workshop(**shift)
+    workshop = small_workshop(**ending.shift)
     torch.manual_seed(0)
     task = AllocationTask("small", workshop, max_steps=400)
     env = task.get_env_fun(1, False, 5, "cpu")()
@@ -96,22 +94,20 @@ def test_a_rollout_is_the_episode_of_the_environment(small_workshop, shift) -> N
     rollout = env.rollout(task.max_steps(env))
     plain = workshop()
     plain.reset(seed=5)
-    plain.reset()  # a rollout begins with a reset of its own
-    finished = "jobs" in shift
-    for t, row in enumerate(rollout):
-        claims = dict(zip(plain.possible_agents, row["arm", "action"].tolist(), strict=True))
-        seen, rewards, terminated, truncated, infos = plain.step(claims)
+    begin, _ = plain.reset()  # a rollout begins with a reset of its own
+    drawn = iter(rollout["arm", "action"].tolist())
+    claims = by_hand.turns(plain, begin, lambda seen: dict(zip(seen, next(drawn), strict=True)))
+    for row, turn in zip(rollout, claims, strict=True):
         after = row["next"]
-        for i, arm in enumerate(plain.possible_agents):
-            np.testing.assert_array_equal(after["arm", "observation", "observation"][i], seen[arm]["observation"])
-            assert after["arm", "reward"][i].item() == pytest.approx(rewards[arm], rel=1e-6)
-            assert after["arm", "info", "illegal"][i].item() == infos[arm]["illegal"] == 0
-            if plain.agents:
-                np.testing.assert_array_equal(after["arm", "action_mask"][i], seen[arm]["action_mask"] == 1)
+        for i, (arm, seen) in enumerate(turn.seen.items()):
+            np.testing.assert_array_equal(after["arm", "observation", "observation"][i], seen["observation"])
+            assert after["arm", "reward"][i].item() == pytest.approx(turn.rewards[arm], rel=1e-6)
+            assert after["arm", "info", "illegal"][i].item() == turn.infos[arm]["illegal"] == 0
+            if not turn.last:
+                np.testing.assert_array_equal(after["arm", "action_mask"][i], seen["action_mask"] == 1)
         np.testing.assert_array_equal(after["state"], plain.state())
-        last = t == len(rollout) - 1
-        assert (after["terminated"].item(), after["truncated"].item()) == (last and finished, last and not finished)
-        assert (terminated["arm_0"], truncated["arm_0"]) == (last and finished, last and not finished)
+        assert (after["terminated"].item(), after["truncated"].item()) == turn.ends
+        assert turn.ends == (turn.last and ending.finished, turn.last and not ending.finished)
     assert plain.agents == []
     env.close()
 

@@ -92,11 +92,9 @@ def test_the_hash_seed_changes_nothing(elsewhere) -> None:
     assert elsewhere(__file__, 1) == elsewhere(__file__, 2)
 
 
-@pytest.mark.parametrize("shift", [{"ticks": 6}, {"jobs": 1, "ticks": 400, "ambient_c": 20.0}], ids=["cut", "finished"])
-def test_an_episode_ends_as_the_environment_says(small_workshop, shift) -> None:
+def test_an_episode_ends_as_the_environment_says(small_workshop, ending) -> None:
     """RLlib bootstraps the value of the last state of a cut episode, and only of such a one."""
-    algo = built(small_workshop(**shift), seed=0)
-    finished = "jobs" in shift
+    algo, finished = built(small_workshop(**ending.shift), seed=0), ending.finished
     for episode in algo.env_runner.sample(num_episodes=2, random_actions=finished):
         assert episode.is_done
         assert (episode.is_terminated, episode.is_truncated) == (finished, not finished)
@@ -106,24 +104,22 @@ def test_an_episode_ends_as_the_environment_says(small_workshop, shift) -> None:
     algo.stop()
 
 
-def test_the_last_observation_comes_with_the_end(small_workshop) -> None:
+def test_the_last_observation_comes_with_the_end(small_workshop, by_hand) -> None:
     from fleet.env.adapters.rllib import RLlibEnv
 
     env, plain = RLlibEnv(small_workshop(ticks=4)()), small_workshop(ticks=4)()
     assert env.get_observation_space(1).keys() == {"action_mask", "observations"}
-    seen, _ = env.reset(seed=1)
-    there, _ = plain.reset(seed=1)
-    for _ in range(4):
-        for i, arm in enumerate(plain.possible_agents):
-            np.testing.assert_array_equal(seen[i]["observations"], there[arm]["observation"])
-            np.testing.assert_array_equal(seen[i]["action_mask"], there[arm]["action_mask"])
+    (seen, _), (begin, _) = env.reset(seed=1), plain.reset(seed=1)
+    terminated, truncated = {}, {}
+    for turn in by_hand.turns(plain, begin, by_hand.claim_by_chance(1)):
+        for i, there in enumerate(turn.before.values()):
+            np.testing.assert_array_equal(seen[i]["observations"], there["observation"])
+            np.testing.assert_array_equal(seen[i]["action_mask"], there["action_mask"])
             assert env.get_observation_space(i).contains(seen[i])
         assert env.agents == env.possible_agents == [0, 1, 2]
-        claims = {arm: int(np.flatnonzero(there[arm]["action_mask"])[-1]) for arm in there}
-        seen, rewards, terminated, truncated, _ = env.step(dict(enumerate(claims.values())))
-        there, rewards_there, *_ = plain.step(claims)
-        assert list(rewards.values()) == list(rewards_there.values())
-    np.testing.assert_array_equal(seen[2]["observations"], there["arm_2"]["observation"])
+        seen, rewards, terminated, truncated, _ = env.step(dict(enumerate(turn.claims.values())))
+        assert list(rewards.values()) == list(turn.rewards.values())
+        np.testing.assert_array_equal(seen[2]["observations"], turn.seen["arm_2"]["observation"])
     assert (terminated, truncated, env.agents) == ({"__all__": False}, {"__all__": True}, [])
     assert env.render() is None
     env.close()

@@ -87,33 +87,28 @@ def test_the_hash_seed_changes_nothing(elsewhere) -> None:
     assert elsewhere(__file__, 1) == elsewhere(__file__, 2)
 
 
-@pytest.mark.parametrize("shift", [{"ticks": 6}, {"jobs": 1, "ticks": 400, "ambient_c": 20.0}], ids=["cut", "finished"])
-def test_turns_are_the_steps_of_the_environment(small_workshop, shift) -> None:
-    """The second way: the same claims given to the environment itself, all arms at once."""
+def test_turns_are_the_steps_of_the_environment(small_workshop, by_hand, ending) -> None:
     from fleet.env.adapters.tianshou import TianshouEnv
 
-    workshop = small_workshop(**shift)
+    workshop = small_workshop(**ending.shift)
     env, plain = TianshouEnv(workshop()), workshop()
-    seen, _ = env.reset(seed=3)
-    there, _ = plain.reset(seed=3)
-    rng, over = np.random.default_rng(3), False
-    while not over:
-        claims = {}
-        for arm in plain.possible_agents:
-            assert not over
+    (seen, _), (begin, _) = env.reset(seed=3), plain.reset(seed=3)
+    for turn in by_hand.turns(plain, begin, by_hand.claim_by_chance(3)):
+        for arm, claim in turn.claims.items():
             assert seen["agent_id"] == arm
-            np.testing.assert_array_equal(seen["obs"], there[arm]["observation"])
-            np.testing.assert_array_equal(seen["mask"], there[arm]["action_mask"] == 1)
-            claims[arm] = int(rng.choice(np.flatnonzero(seen["mask"])))
-            seen, rewards, terminated, truncated, _ = env.step(claims[arm])
-            over = terminated or truncated
+            np.testing.assert_array_equal(seen["obs"], turn.before[arm]["observation"])
+            np.testing.assert_array_equal(seen["mask"], turn.before[arm]["action_mask"] == 1)
+            seen, rewards, terminated, truncated, _ = env.step(claim)
             if arm != "arm_2":
                 assert not rewards.any()
-        there, rewards_there, terminated_there, truncated_there, _ = plain.step(claims)
-        np.testing.assert_allclose(rewards, list(rewards_there.values()), rtol=1e-6)
-        assert (terminated, truncated) == (terminated_there["arm_0"], truncated_there["arm_0"])
-    np.testing.assert_array_equal(seen["obs"], there["arm_0"]["observation"])
-    assert (terminated, truncated) == (("jobs" in shift), ("jobs" not in shift))
+                assert (terminated, truncated) == (False, False)
+                continue
+            np.testing.assert_allclose(rewards, list(turn.rewards.values()), rtol=1e-6)
+            assert (terminated, truncated) == turn.ends
+        np.testing.assert_array_equal(seen["obs"], turn.seen["arm_0"]["observation"])
+        if turn.last:
+            assert turn.ends == (ending.finished, not ending.finished)
+    assert plain.agents == []
 
 
 def test_rewards_of_a_turn_are_not_written_on(small_workshop) -> None:
