@@ -82,7 +82,7 @@ class Council:
         self._number = life * 1_000_000_000
         self._bids: dict[str, tuple[Bid, float]] = {}
         self._there: frozenset[str] = frozenset()
-        self._bid_s = self.changed_s = -math.inf
+        self._bid_s = self._decided_s = self.changed_s = -math.inf
         self._about: object = None
         """What the last bid was about."""
         self._news = False
@@ -111,9 +111,8 @@ class Council:
         if bid.arm not in self.grantor.roster or (before is not None and bid.number < before[0].number):
             return
         self._bids[bid.arm] = bid, real_s
-        self._news = True
         if before is None or _gist(before[0]) != _gist(bid):
-            self.changed_s = real_s
+            self.changed_s, self._news = real_s, True
         if bid.arm != self.arm:
             self._put_right(bid, real_s)
 
@@ -224,7 +223,8 @@ class Council:
     def _decide(self, real_s: float) -> None:
         """Work out who gets what, once everybody that is there was heard, and claim what is its own."""
         own = self._bids[self.arm][0]
-        if not (own.offers and self._news) or self.claimant.wishes or self.claimant.room < 1:
+        news = self._news or real_s >= self._decided_s + BID_S
+        if not (own.offers and news) or self.claimant.wishes or self.claimant.room < 1:
             return
         voices = {arm: bid for arm, (bid, at_s) in sorted(self._bids.items()) if real_s < at_s + FRESH_S}
         if len(voices) < self.claimant.majority:
@@ -232,7 +232,7 @@ class Council:
         hasty = self._there - voices.keys() or real_s < self.changed_s + QUIET_S
         if hasty and real_s < self._bid_s + self._timing.window_s:
             return
-        self._news = False
+        self._news, self._decided_s = False, real_s
         self.rounds += 1
         named = {offer.job for bid in voices.values() for offer in bid.offers}
         jobs = tuple(word for name, word in self._free(real_s).items() if name in named)
