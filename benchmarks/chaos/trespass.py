@@ -99,10 +99,14 @@ def words(fleet: Fleet, rogue: zenoh.Session) -> Iterator[Try]:
         keys.all_of_fleet(of_fleet),
         "**",
     ]
+    own = keys.of_arm(of_fleet, ROGUE, "event")
+    for _ in range(1000):  # until the router knows the ear, whose line is another
+        rogue.put(own, b"?")
+        if heard.get(timeout=PATIENT_S) == (own, False):
+            break
     for key in targets:
         rogue.put(key, encode(forged), encoding=encoding(State))
         rogue.delete(key)
-    own = keys.of_arm(of_fleet, ROGUE, "event")
     rogue.put(own, encode(forged), encoding=encoding(State))  # its own key: lines keep their order, so this is the last
     got = [heard.get(timeout=PATIENT_S)]
     while got[-1] != (own, True):
