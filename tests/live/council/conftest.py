@@ -1,0 +1,255 @@
+"""Arms without an auctioneer on paper, and wires between them that are not to be trusted.
+
+Every arm is the real one but for its body: time is a number, every clock runs at its own rate, a journal is a list.
+"""
+
+import random
+from dataclasses import dataclass, field
+from functools import partial
+from types import SimpleNamespace
+
+import pytest
+
+from fleet.bus.trade import JobWord, Offer
+from fleet.errors import JournalFull
+from fleet.live import granting, promises
+from fleet.live.auctioneer import Objection
+from fleet.live.contractor import Contractor, Terms
+from fleet.live.council import Council, Faculties
+from fleet.live.granting import Grantor
+from fleet.live.timing import Timing
+from scenarios.live_policies import allocation
+
+TIMING = Timing(lease_s=3.0, margin_s=0.05, window_s=0.3, pause_s=(0.2, 1.0))
+CYCLE_S = 0.2
+
+
+class Crash(Exception):
+    """The arm's process is gone in the middle of a call."""
+
+
+@dataclass(eq=False)
+class Disk:
+    """A journal in memory, and what goes wrong with it."""
+
+    records: list = field(default_factory=list)
+    full: bool = False
+    crash: str = ""
+
+    def keep(self, *records) -> None:
+        crash, self.crash = self.crash, ""
+        if crash == "before":
+            raise Crash
+        if self.full:
+            raise JournalFull("no room")
+        self.records.extend(records)
+        if crash == "after":
+            raise Crash
+
+
+class Arm:
+    """One arm's process, life after life."""
+
+    def __init__(self, fleet, name: str, rate: float) -> None:
+        self.fleet, self.name, self.rate, self.lives = fleet, name, rate, 0
+        self.promises, self.grants = Disk(), Disk()
+        self.hot, self.cycle_ends_s = False, None
+        self.start()
+
+    @property
+    def real_s(self) -> float:
+        return self.fleet.true_s * self.rate
+
+    def start(self) -> None:
+        self.lives += 1
+        self.cycle_ends_s = None
+        memory = promises.restarted(promises.recall(self.promises.records), self.name, 0.0)
+        self.promises.records[:] = promises.retold(memory)
+        register = granting.recalled(self.grants.records)
+        self.grants.records[:] = granting.retold(register)
+        terms = Terms(patience_s=8.0)
+        self.contractor = Contractor(self.name, self.promises.keep, memory, nonce="n", terms=terms)
+        grantor = Grantor(self.name, self.fleet.names, register, self.grants.keep, real_s=self.real_s, timing=TIMING)
+        faculties = Faculties(
+            offers=lambda words: tuple(self.fleet.offer(self.name, word) for word in words),
+            unfit=lambda: "hot" if self.hot else "",
+            take=self.contractor.awarded,
+        )
+        self.council = Council(
+            self.contractor,
+            grantor,
+            faculties,
+            agree=self.fleet.agree,
+            life=memory.boot,
+            rng=random.Random(f"{self.name} {self.lives}"),
+            timing=TIMING,
+        )
+        self.council.know([*self.fleet.jobs, *register.jobs.values()])
+
+    def turn(self) -> None:
+        """What an arm does again and again; it may crash in the middle."""
+        self.safely(self._turn)
+
+    def safely(self, call) -> None:
+        try:
+            call()
+        except Crash:
+            self.crash()
+
+    def crash(self) -> None:
+        self.promises.crash = self.grants.crash = ""
+        for held in promises.recall(self.promises.records).held.values():
+            if held.leave:
+                self.fleet.doubtful.add(held.award.job.name)
+        self.start()
+
+    def _turn(self) -> None:
+        self.contractor.catch_up()
+        self._work()
+        self.contractor.give_up(0.0, self.real_s)
+        if self.contractor.lease_requests(self.real_s) or self.contractor.reports(self.real_s):
+            self.council.claimant.hurry()
+        self.council.seen(self.fleet.alive_for(self.name))
+        self.council.tick(self.real_s, self.fleet.true_s)
+        while self.council.out:
+            self.fleet.send(self.name, self.council.out.popleft())
+
+    def _work(self) -> None:
+        """Cycles, one after the other; one that was begun is ended."""
+        if not self.contractor.held:
+            self.cycle_ends_s = None
+            return
+        first = self.contractor.held[0]
+        name, repetitions = first.award.job.name, first.award.job.repetitions
+        if self.cycle_ends_s is None and self.contractor.may(self.real_s) > first.cycles:
+            self.cycle_ends_s = name, self.real_s + CYCLE_S
+            if first.cycles + 1 == repetitions:
+                self.fleet.last_cycle(name)
+        elif self.cycle_ends_s is not None and self.cycle_ends_s[0] != name:
+            self.cycle_ends_s = None
+        elif self.cycle_ends_s is not None and self.real_s >= self.cycle_ends_s[1]:
+            self.cycle_ends_s = None
+            if first.cycles + 1 == repetitions:
+                self.contractor.finished(self.fleet.true_s, self.real_s)
+                return
+            self.contractor.worked(first.cycles + 1, 0.0)
+        self.contractor.worked(first.cycles, (repetitions - 1 - first.cycles) * CYCLE_S)
+
+    def fault(self) -> None:
+        """It stops in the middle of a cycle, which then is not done."""
+        if self.cycle_ends_s is not None:
+            first = self.contractor.held[0].award.job
+            if self.contractor.held[0].cycles + 1 == first.repetitions:
+                self.fleet.last_cycles[first.name] -= 1
+            self.cycle_ends_s = None
+        self.contractor.returned(0.0, self.real_s, "hot")
+
+
+class Fleet:
+    """Arms, and the wires between them: a list of words that have not come yet."""
+
+    def __init__(self, rates, jobs) -> None:
+        self.names = tuple(f"arm_{i}" for i in range(len(rates)))
+        self.true_s, self.jobs, self.agree = 100.0, list(jobs), allocation("consensus", 60.0)
+        self.wires: list = []
+        self.old: list = []
+        self.cut: set[str] = set()
+        self.last_cycles: dict[str, int] = {}
+        self.doubtful: set[str] = set()
+        self.arms = {name: Arm(self, name, rate) for name, rate in zip(self.names, rates, strict=True)}
+
+    def offer(self, arm: str, word: JobWord) -> Offer:
+        """An arm finds a job as hard as both their names say; some cannot do some."""
+        d = random.Random(f"{arm} {word.name}").random()
+        return Offer(job=word.name, feasible=d > 0.1 or arm == self.names[0], d=d, finish_in_s=10.0)
+
+    def last_cycle(self, job: str) -> None:
+        self.last_cycles[job] = self.last_cycles.get(job, 0) + 1
+        assert self.last_cycles[job] == 1, f"the last cycle of {job} was begun twice"
+
+    def reach(self, one: str, other: str) -> bool:
+        return (one in self.cut) == (other in self.cut)
+
+    def alive_for(self, arm: str) -> frozenset[str]:
+        return frozenset(other for other in self.names if self.reach(arm, other))
+
+    def send(self, speaker: str, word) -> None:
+        asked_s = self.arms[speaker].lives
+        for other in self.names:
+            if other != speaker:
+                self.wires.append((speaker, other, partial(self.come, speaker, other, word, asked_s)))
+                self.old.append(self.wires[-1])
+
+    def come(self, speaker: str, other: str, word, life: int) -> None:
+        arm = self.arms[other]
+        if type(word).__name__ == "Bid":
+            arm.safely(lambda: arm.council.heard(word, arm.real_s))
+            return
+
+        def answer() -> None:
+            try:
+                grant = arm.council.asked(word, arm.real_s)
+            except Objection:
+                return
+            self.wires.append((other, speaker, partial(self.answered, speaker, grant, life)))
+
+        arm.safely(answer)
+
+    def answered(self, speaker: str, grant, life: int) -> None:
+        arm = self.arms[speaker]
+        if arm.lives == life:  # an answer reaches only the life that asked
+            arm.safely(lambda: arm.council.answered(grant, arm.real_s))
+
+    def deliver(self, index: int, *, keep: bool = False) -> None:
+        one, other, call = self.wires[index] if keep else self.wires.pop(index)
+        if self.reach(one, other):
+            call()
+
+    def calm(self, seconds: float, step_s: float = 0.1, but: str = "") -> None:
+        """Everything comes at once and in order; one arm may stand still."""
+        for _ in range(round(seconds / step_s)):
+            for name, arm in self.arms.items():
+                if name != but:
+                    arm.turn()
+            for _ in range(1000):
+                if not self.wires:
+                    break
+                self.deliver(0)
+            self.true_s += step_s
+            self.check()
+
+    def check(self) -> None:
+        at_work = [
+            (held.award.job, arm.name, held.leave)
+            for arm in self.arms.values()
+            for held in arm.contractor.held
+            if arm.real_s < held.until_s or held.leave
+        ]
+        jobs = [job.name for job, _, _ in at_work]
+        assert len(jobs) == len(set(jobs)), at_work
+        stations = [place for job, arm, leave in at_work if not leave for place in job.places]
+        assert len(stations) == len(set(stations)), at_work
+
+    def busy(self, rng: random.Random, *, leave: bool) -> Arm | None:
+        """An arm with a job in hand, or one that may begin its last cycle, if there is one soon."""
+        for _ in range(30):
+            found = [arm for arm in self.arms.values() if arm.contractor.held]
+            found = [arm for arm in found if arm.contractor.held[0].leave or not leave]
+            if found:
+                return rng.choice(found)
+            self.calm(0.1)
+        return None
+
+    def settled(self) -> dict[str, str]:
+        """What the arms know: they never differ."""
+        told: dict[str, str] = {}
+        for arm in self.arms.values():
+            for job, settled in arm.council.grantor.register.settled.items():
+                assert told.setdefault(job, settled.outcome) == settled.outcome, job
+        return told
+
+
+@pytest.fixture(scope="session")
+def council() -> SimpleNamespace:
+    """What the tests of arms among themselves build their fleets of."""
+    return SimpleNamespace(Fleet=Fleet)
