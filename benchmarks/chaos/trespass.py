@@ -9,6 +9,7 @@ import json
 import math
 import queue
 import tempfile
+import time
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -108,8 +109,10 @@ def words(fleet: Fleet, rogue: zenoh.Session) -> Iterator[Try]:
         rogue.put(key, encode(forged), encoding=encoding(State))
         rogue.delete(key)
     rogue.put(own, encode(forged), encoding=encoding(State))  # its own key: lines keep their order, so this is the last
-    got = [heard.get(timeout=PATIENT_S)]
+    got, until_s = [heard.get(timeout=PATIENT_S)], time.monotonic() + PATIENT_S
     while got[-1] != (own, True):
+        if time.monotonic() > until_s:
+            raise TimeoutError(f"Nobody heard the rogue's own word in {PATIENT_S:g} s.")
         got.append(heard.get(timeout=PATIENT_S))
     ear.undeclare()
     through = {key for key, is_forged in got if is_forged}
