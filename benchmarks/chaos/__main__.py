@@ -48,6 +48,7 @@ FAULTS = {
     "partition": Fault(partition, line=True),
     "clock-jump": Fault(clock_jump, clocks=True),
     "alone-kill-arm": Fault(kill_arm, alone=True),
+    "alone-stop-arm": Fault(stop_arm, alone=True),
     "alone-kill-router": Fault(kill_router, alone=True),
     "alone-rubbish": Fault(rubbish, alone=True),
     "alone-cut-one": Fault(cut_one_off, alone=True, line=True, away=1),

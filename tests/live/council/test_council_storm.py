@@ -151,9 +151,9 @@ def storm(council, rates, seed: int, deeds) -> None:
     handed_in = [word for word in every if rng.random() < 0.4]
     fleet = council.Fleet(rates, [word for word in every if word not in handed_in])
     for word in handed_in:  # to one arm, which has to tell the others
-        council = fleet.arms[rng.choice(fleet.names)].council
-        council.grantor.admit((word,))
-        council.know([word])
+        one = fleet.arms[rng.choice(fleet.names)].council
+        one.grantor.admit((word,))
+        one.know([word])
     for deed in deeds:
         deed(fleet, rng)
         fleet.check()
@@ -165,6 +165,7 @@ def storm(council, rates, seed: int, deeds) -> None:
         fleet.calm(1.0)
         if all(arm.council.over(arm.real_s) for arm in fleet.arms.values()):
             break
+    fleet.calm(5.0)  # until who was away has heard of jobs that came and went meanwhile
     told = fleet.settled()
     for arm in fleet.arms.values():
         assert arm.council.grantor.register.settled.keys() == told.keys(), f"{arm.name} does not know all"
