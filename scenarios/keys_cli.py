@@ -35,6 +35,9 @@ def keys_command(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace what is there; with --add a certificate, else all of them.")
     ] = False,
+    no_auctioneer: Annotated[
+        bool, typer.Option("--no-auctioneer", help="For arms that share jobs out themselves: they answer outsiders.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print what is there as JSON.")] = False,
 ) -> None:
     """Keys and certificates for mutual TLS: make them, add to them, show them."""
@@ -44,12 +47,14 @@ def keys_command(
 
     if add and (scenario or extra):
         raise FleetError("--add goes with the keys that are there; leave SCENARIO and --extra out.")
+    if no_auctioneer and not scenario:
+        raise FleetError("--no-auctioneer goes with a new set of keys, so SCENARIO is needed.")
     if extra and not scenario:
         raise FleetError("--extra goes with a new set of keys, so SCENARIO is needed; --add adds to an old one.")
     if scenario:
         chosen = load(scenario)
         more = [participant_of(text) for text in extra or ()]
-        roster = _roster(chosen.name, [arm.name for arm in chosen.arms], more)
+        roster = _roster(chosen.name, [arm.name for arm in chosen.arms], more, auctioneer=not no_auctioneer)
         make(folder, roster, days=days, hosts=host or HERE, overwrite=overwrite)
     for text in add or ():
         add_to(folder, participant_of(text), days=days, hosts=host or HERE, overwrite=overwrite)
@@ -81,9 +86,9 @@ def participant_of(text: str) -> Participant:
     raise FleetError(f"'{text}': no role '{role}'{nearest(role, ROLES)}")
 
 
-def _roster(fleet: str, arms: list[str], extra: list[Participant]) -> Roster:
+def _roster(fleet: str, arms: list[str], extra: list[Participant], *, auctioneer: bool) -> Roster:
     try:
-        return of_arms(fleet, arms, extra)
+        return of_arms(fleet, arms, extra, auctioneer=auctioneer)
     except ValueError as error:
         raise FleetError(str(error)) from error
 
@@ -107,7 +112,7 @@ def _plain(roster: Roster, ends: dict[str, datetime]) -> dict[str, object]:
 
     def row(one: Participant) -> dict[str, object]:
         who = {"name": one.name, "role": one.role, "common_name": one.common_name, "ends": ends[one.name].isoformat()}
-        return {**who, **asdict(rights(roster.fleet, one))}
+        return {**who, **asdict(rights(roster.fleet, one, alone=roster.alone))}
 
     return {
         "fleet": roster.fleet,

@@ -80,18 +80,27 @@ class Roster(msgspec.Struct, frozen=True):
         known = nearest(name, [participant.name for participant in self.participants])
         raise BusError(f"No '{name}' takes part in the fleet '{self.fleet}'{known}")
 
+    @property
+    def alone(self) -> bool:
+        """Whether the fleet has no auctioneer: its arms share jobs out, and answer outsiders."""
+        return not self.of_role("auctioneer")
+
     def of_role(self, role: Role) -> tuple[str, ...]:
         """Names of the participants of one role."""
         return tuple(participant.name for participant in self.participants if participant.role == role)
 
 
-def of_arms(fleet: str, arms: Iterable[str], extra: Sequence[Participant] = ()) -> Roster:
+def of_arms(fleet: str, arms: Iterable[str], extra: Sequence[Participant] = (), *, auctioneer: bool = True) -> Roster:
     """The roster of a fleet with these arms: one of every other role, named like it, and the extra ones.
+
+    Args:
+        auctioneer: Whether there is to be one.
 
     Raises:
         ValueError: a name twice, empty, or too long.
     """
-    others = tuple(Participant(role, role) for role in get_args(Role) if role != "arm")
+    roles = [role for role in get_args(Role) if role != "arm" and (auctioneer or role != "auctioneer")]
+    others = tuple(Participant(role, role) for role in roles)
     return Roster(fleet, (*others, *(Participant(arm, "arm") for arm in arms), *extra))
 
 
@@ -130,14 +139,19 @@ class Rights:
     """Sends queries to these."""
 
 
-def rights(fleet: str, participant: Participant) -> Rights:
-    """What a participant may do beyond listening."""
+def rights(fleet: str, participant: Participant, *, alone: bool = False) -> Rights:
+    """What a participant may do beyond listening.
+
+    Args:
+        alone: The fleet has no auctioneer, so its arms answer outsiders.
+    """
     time, status = keys.of_clock(fleet), keys.of_jobs(fleet, "status")
     quotes, awards = keys.of_every_arm(fleet, "quote"), keys.of_every_arm(fleet, "award")
     if participant.role == "arm":
         # The key names the asker: whoever may ask under it is that arm.
         asked = tuple(keys.asked_of_all(fleet, topic, participant.name) for topic in ("lease", "report", "grant"))
-        return Rights(says=(keys.all_of(fleet, "arm", participant.name),), asks=(*asked, time))
+        answers = (keys.all_of(fleet, "jobs"), keys.all_of(fleet, "clock")) if alone else ()
+        return Rights(says=(keys.all_of(fleet, "arm", participant.name), *answers), asks=(*asked, time))
     if participant.role == "auctioneer":
         own = keys.all_of(fleet, "auction", participant.name)
         return Rights(
@@ -167,7 +181,7 @@ def access_control(roster: Roster) -> dict[str, Any]:
     for participant in roster.participants:
         if participant.role == "router":
             continue
-        who, may = participant.common_name, rights(fleet, participant)
+        who, may = participant.common_name, rights(fleet, participant, alone=roster.alone)
         own = []
         if may.says:
             own.append(_rule(f"{who} says", "ingress", _SAY, _with_caches(may.says)))

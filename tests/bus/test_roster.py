@@ -65,6 +65,20 @@ def test_every_key_has_the_speakers_that_it_should_have(message):
         assert allowed(rules, participant.common_name, "ingress", message, cache) == may, (participant, cache)
 
 
+def test_arms_without_an_auctioneer_answer_outsiders_and_nobody_else_does():
+    roster = of_arms("f", ARMS, auctioneer=False)
+    assert roster.alone
+    assert not of_arms("f", ARMS).alone
+    rules = access_control(roster)
+    for key, participant in product(EVERY_KEY, roster.participants):
+        place = keys.parse(key)
+        owner = participant.role == "arm" and (
+            place.role in NAMELESS or (place.role, place.name) == ("arm", participant.name)
+        )
+        for message in ("reply", "declare_queryable", "put"):
+            assert allowed(rules, participant.common_name, "ingress", message, key) == owner, (participant, key)
+
+
 def test_what_ends_in_the_name_of_an_arm_is_asked_by_that_arm_alone():
     rules = access_control(of_arms("f", ARMS))
     asked = [key for key in EVERY_KEY if keys.parse(key).asker]
