@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 
 _LARGEST = 2**62
+_INT64 = np.iinfo(np.int64)
 
 
 def seed_of(seed: Any) -> np.random.SeedSequence:
-    """The seed of a shift.
+    """The seed of a shift, of any size.
 
     Raises:
         ValueError: no integer, or one below 0.
@@ -28,7 +29,7 @@ def seeds_of(seed: Any, envs: int) -> list[np.random.SeedSequence]:
     if seed is None:
         return np.random.SeedSequence().spawn(envs)
     if _whole(seed):
-        return [seed_of(seed + e) for e in range(envs)]
+        return [seed_of(int(seed) + e) for e in range(envs)]  # as a uint8, 255 + 1 would be 0
     if isinstance(seed, list | tuple | range | np.ndarray) and np.shape(seed) == (envs,):
         return [seed_of(each) for each in seed]
     raise ValueError(f"seed must be one integer or one for each of {envs} envs (got {seed!r}).")
@@ -40,7 +41,7 @@ def at_least_one(name: str, value: Any) -> int:
     Raises:
         ValueError: no integer, or one below 1.
     """
-    if not _whole(value) or value < 1:
+    if not _whole(value) or value < 1 or value > _LARGEST:
         raise ValueError(f"{name} must be an integer >= 1 (got {value!r}).")
     return int(value)
 
@@ -80,14 +81,21 @@ def _integer(agent: str, action: Any) -> int:
         return action
     value = np.asarray(action)
     if value.size != 1 or not np.issubdtype(value.dtype, np.integer):
+        if isinstance(action, int) and not isinstance(action, bool):
+            raise ValueError(_too_large(agent, action))
         raise ValueError(f"The action of '{agent}' must be one integer (got {action!r}).")
-    return int(value.reshape(()))
+    number = int(value.reshape(()))
+    if number > _INT64.max:
+        raise ValueError(_too_large(agent, action))
+    return number
+
+
+def _too_large(agent: str, action: Any) -> str:
+    return f"The action of '{agent}' must be one integer of 64 bits with sign (got {action!r})."
 
 
 def _whole(value: Any) -> bool:
     """Whether it is one integer, of Python or NumPy."""
-    return (
-        isinstance(value, int | np.integer | np.ndarray)
-        and np.ndim(value) == 0
-        and np.asarray(value).dtype.kind in "iu"
-    )
+    if isinstance(value, int):
+        return not isinstance(value, bool)
+    return isinstance(value, np.integer | np.ndarray) and np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iu"

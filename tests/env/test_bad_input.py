@@ -35,6 +35,22 @@ def test_an_action_that_is_no_integer_is_refused_and_changes_nothing(make, play,
     assert play.plain(env.step({"arm_0": 1})) == play.plain(other.step({"arm_0": 1}))
 
 
+@pytest.mark.parametrize("action", [2**63, 2**64, -(2**63) - 1, 10**30, np.uint64(2**64 - 1), np.array(2**63)])
+def test_an_action_too_large_for_an_array_is_refused_for_its_size(make, action) -> None:
+    env = make()
+    env.reset(seed=1)
+    with pytest.raises(ValueError, match=r"The action of 'arm_1' must be one integer of 64 bits with sign \(got "):
+        env.step({"arm_1": action})
+
+
+@pytest.mark.parametrize("action", [2**63 - 1, -(2**63), np.int64(-1), np.uint8(200)])
+def test_any_other_integer_outside_the_space_is_a_wait(make, action) -> None:
+    env = make()
+    env.reset(seed=1)
+    *_, infos = env.step({"arm_1": action})
+    assert [info["illegal"] for info in infos.values()] == [0, 1, 0]
+
+
 @pytest.mark.parametrize("actions", [None, 1, [1, 0, 0], np.zeros(3, int), "arm_0"])
 def test_actions_that_are_no_dictionary_are_refused(make, actions) -> None:
     env = make()
@@ -166,6 +182,15 @@ def test_seeds_that_do_not_fit_are_refused(batch, seed) -> None:
     env = batch(2)
     with pytest.raises(ValueError, match=said):
         env.reset(seed=seed)
+
+
+@pytest.mark.parametrize("seed", [np.uint8(255), np.array(127, dtype=np.int8), np.int64(2**63 - 1), 2**64 - 1, 2**200])
+def test_seeds_count_up_past_the_end_of_their_type(batch, play, seed) -> None:
+    counted, listed = batch(2, seed=seed), batch(2, seed=[int(seed), int(seed) + 1])
+    for env in (counted, listed):
+        env.reset()
+    nobody = np.zeros((2, 3), int)
+    play.same(play.rows(counted.step(nobody), range(2)), play.rows(listed.step(nobody), range(2)))
 
 
 @pytest.mark.parametrize("rows", [[2], [-1], [0, 1, 2]])
