@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pettingzoo.utils import BaseParallelWrapper
 
 pytestmark = [
     pytest.mark.adapter,
@@ -110,6 +111,55 @@ def test_a_rollout_is_the_episode_of_the_environment(small_workshop, by_hand, en
         assert turn.ends == (turn.last and ending.finished, turn.last and not ending.finished)
     assert plain.agents == []
     env.close()
+
+
+class Renamed(BaseParallelWrapper):
+    """The same with arms that are called otherwise."""
+
+    def __init__(self, env, names: dict[str, str]) -> None:
+        super().__init__(env)
+        self.names = names
+        self.old = {new: old for old, new in names.items()}
+        self.possible_agents = list(names.values())
+
+    @property
+    def agents(self) -> list[str]:
+        return [self.names[arm] for arm in self.env.agents]
+
+    def observation_space(self, agent: str):
+        return self.env.observation_space(self.old[agent])
+
+    def action_space(self, agent: str):
+        return self.env.action_space(self.old[agent])
+
+    def reset(self, seed: int | None = None, options=None):
+        return tuple(self.named(each) for each in self.env.reset(seed, options))
+
+    def step(self, actions):
+        return tuple(self.named(each) for each in self.env.step({self.old[a]: k for a, k in actions.items()}))
+
+    def named(self, told):
+        return {self.names[arm]: value for arm, value in told.items()}
+
+
+def test_arms_are_one_group_whatever_their_names(small_workshop) -> None:
+    import torch
+
+    from fleet.env.adapters.benchmarl import GROUP, AllocationTask
+
+    workshop = small_workshop()
+    names = {"arm_0": "floor_left", "arm_1": "wall", "arm_2": "arm_7"}
+    rollouts = []
+    for make in (workshop, lambda: Renamed(workshop(), names)):
+        torch.manual_seed(0)
+        env = AllocationTask("small", make, max_steps=400).get_env_fun(1, False, 5, "cpu")()
+        assert list(env.group_map) == [GROUP]
+        rollouts.append(env.rollout(400))
+        assert env.group_map[GROUP] == env.possible_agents
+        env.close()
+    plain, renamed = rollouts
+    for key in ("action", ("observation", "observation"), "action_mask"):
+        assert torch.equal(plain[GROUP][key], renamed[GROUP][key])
 
 
 def test_the_example_of_the_page_runs(example) -> None:

@@ -16,6 +16,9 @@ Traps:
 - It steps one environment at a time, at most some 900 steps a second on one core whatever the environment; for speed
   use `fleet.env.adapters.torchrl`.
 - The task is pickled with the experiment: the factory must pickle (a `functools.partial` does, a lambda does not).
+- TorchRL makes a group of each agent whose name does not end in a number, and BenchMARL learns each group for itself:
+  MAPPO for an arm named "wall" would share no policy. The adapter puts all arms into one group, "arm", whatever their
+  names.
 - `max_steps` bounds evaluation only; an episode's length is the environment's own.
 """
 
@@ -28,6 +31,8 @@ from benchmarl.environments.pettingzoo.common import PettingZooClass
 from pettingzoo import ParallelEnv
 from torchrl.envs import EnvBase
 from torchrl.envs.libs.pettingzoo import PettingZooWrapper
+
+GROUP = "arm"
 
 
 class AllocationTask(PettingZooClass):
@@ -47,9 +52,19 @@ class AllocationTask(PettingZooClass):
         self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any
     ) -> Callable[[], EnvBase]:
         """Makes one environment (BenchMARL puts as many as it wants side by side)."""
-        return lambda: PettingZooWrapper(
-            self.factory(), return_state=True, categorical_actions=True, seed=seed, device=device
-        )
+
+        def make() -> EnvBase:
+            env = self.factory()
+            return PettingZooWrapper(
+                env,
+                return_state=True,
+                categorical_actions=True,
+                seed=seed,
+                device=device,
+                group_map={GROUP: list(env.possible_agents)},
+            )
+
+        return make
 
     def supports_continuous_actions(self) -> bool:
         """Claims are discrete."""
