@@ -19,9 +19,13 @@ from scenarios.cell import near_of
 from scenarios.draw import QuickSource, children_of
 from scenarios.jobs import works_of
 from scenarios.load import override
-from scenarios.scenario import Scenario
+from scenarios.scenario import Ambient, Scenario
 
 Array = np.ndarray
+
+
+MOST_ARRIVALS = 100.0
+"""So many times as often may jobs come, lest the queue outgrow the memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,13 +45,21 @@ class Randomisation:
             try:
                 low, high = getattr(self, name)
             except (TypeError, ValueError) as error:
-                raise ValueError(f"Randomisation.{name} must be (low, high) (got {getattr(self, name)}).") from error
+                raise ValueError(f"Randomisation.{name} must be (low, high) (got {getattr(self, name)!r}).") from error
+            if not all(isinstance(end, int | float | np.integer | np.floating) for end in (low, high)):
+                raise ValueError(f"Randomisation.{name} must be two numbers (got {low!r}, {high!r}).")
             if not low <= high:
                 raise ValueError(f"Randomisation.{name} needs low <= high (got {low}, {high}).")
             if not (isfinite(low) and isfinite(high)):
                 raise ValueError(f"Randomisation.{name} must be finite (got {low}, {high}).")
         if self.arrivals[0] <= 0:
             raise ValueError(f"Randomisation.arrivals must be > 0 (got {self.arrivals}).")
+        if self.arrivals[1] > MOST_ARRIVALS:
+            raise ValueError(f"Randomisation.arrivals must be at most {MOST_ARRIVALS:g} (got {self.arrivals}).")
+        if not isinstance(self.variants, list | tuple) or not all(isinstance(v, Mapping) for v in self.variants):
+            raise ValueError(
+                f"Randomisation.variants must be a list of dictionaries, one for each fleet (got {self.variants!r})."
+            )
 
 
 _SINGLE = frozenset({"plant", "bus", "channel", "render_mode", "mask_in"})
@@ -64,6 +76,7 @@ def make_batch(
     cache: str | Path | None = None,
     max_cycles: int | None = None,
     autoreset: bool = True,
+    stagger: bool = False,
     peers: int | None = None,
     progress: Progress = quiet,
     **overrides: Any,
@@ -74,7 +87,7 @@ def make_batch(
         scenario, difficulty, cache, peers, overrides: As in `make_env`.
         seed: Env e begins the shift of `seed + e` (or of `seed[e]`): that of `make_env(…).reset(seed=…)`.
         randomise: Beyond what a scenario draws: air, arrivals, fleets.
-        max_cycles, autoreset: As in `fleet.env.vector.BatchEnv`.
+        max_cycles, autoreset, stagger: As in `fleet.env.vector.BatchEnv`.
 
     Raises:
         ScenarioError: a variant that is no fleet of the same arms and jobs, or an option that only `make_env` has.
@@ -86,6 +99,8 @@ def make_batch(
     chosen = chosen_of(scenario, overrides, make_batch)
     randomise, near = randomise or Randomisation(), near_of(chosen, peers)
     specs = [chosen, *(override(chosen, **variant) for variant in randomise.variants)]
+    for spec in specs:
+        _check_air(spec, randomise)
     fleets = [
         prepare(
             spec, difficulty=difficulty, cache=cache, progress=lambda what, s, i=i: progress(what, (i + s) / len(specs))
@@ -93,7 +108,18 @@ def make_batch(
         for i, spec in enumerate(specs)
     ]
     library = replace(library_of(fleets, randomise), near=near)
-    return BatchEnv(library, num_envs, seed=seed, weights=chosen.reward, max_cycles=max_cycles, autoreset=autoreset)
+    options = {"max_cycles": max_cycles, "autoreset": autoreset, "stagger": stagger}
+    return BatchEnv(library, num_envs, seed=seed, weights=chosen.reward, **options)
+
+
+def _check_air(scenario: Scenario, randomise: Randomisation) -> None:
+    for warmer_k in randomise.ambient_k:
+        try:
+            Ambient(points=tuple((time_s, air_c + warmer_k) for time_s, air_c in scenario.ambient.points))
+        except ValueError as error:
+            raise ScenarioError(
+                f"{scenario.name}: Randomisation.ambient_k {randomise.ambient_k} goes too far: {error}."
+            ) from error
 
 
 def library_of(fleets: Sequence[Fleet], randomise: Randomisation | None = None) -> Library:

@@ -118,6 +118,8 @@ def _arms(
         every_work: Refuse a scenario in which some work can be done by none of them.
     """
     choose("difficulty", difficulty, DifficultyName)
+    if not isinstance(cache, str | Path | None):
+        raise ScenarioError(f"cache must be the path of a folder (got {cache!r}).")
     folder = Path(cache) if cache else cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -46,6 +46,17 @@ def at_least_one(name: str, value: Any) -> int:
     return int(value)
 
 
+def switch(name: str, value: Any) -> bool:
+    """A choice of yes or no.
+
+    Raises:
+        ValueError: neither.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} must be True or False (got {value!r}).")
+    return bool(value)
+
+
 def actions_of(agents: Sequence[str], actions: Any) -> np.ndarray:
     """What each agent does, int64 [agent]; one that is left out waits.
 

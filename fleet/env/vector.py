@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet.env.arguments import at_least_one, seeds_of
+from fleet.env.arguments import at_least_one, seeds_of, switch
 from fleet.env.chance import random_legal as random_legal
 from fleet.env.engine import Engine, Shift
 from fleet.env.observation import Layout, Observation
@@ -66,6 +66,7 @@ class BatchEnv:
         stagger: bool = False,
     ) -> None:
         self.num_envs = num_envs = at_least_one("num_envs", num_envs)
+        autoreset, stagger = switch("autoreset", autoreset), switch("stagger", stagger)
         ticks = library.tables.ticks
         self._whole = ticks if max_cycles is None else min(ticks, at_least_one("max_cycles", max_cycles))
         """Decision intervals of a shift that is not cut."""

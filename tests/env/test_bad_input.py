@@ -278,6 +278,12 @@ def test_an_option_of_another_type_is_refused_with_the_type_it_takes(cell, folde
     none: Any = None
     with pytest.raises(ScenarioError, match=r"channel must be a fleet\.bus\.channel\.Channel \(got 0\.3\)"):
         make_env(cell, difficulty="blind", cache=folder, channel=wrong)
+    for make in (make_env, lambda scenario, **options: make_batch(scenario, 2, **options)):
+        with pytest.raises(ScenarioError, match=r"cache must be the path of a folder \(got 0\.3\)"):
+            make(cell, difficulty="blind", cache=wrong)
+    for name in ("autoreset", "stagger"):
+        with pytest.raises(ValueError, match=rf"{name} must be True or False \(got 0\.3\)"):
+            make_batch(cell, 2, difficulty="blind", cache=folder, **{name: wrong})
     with pytest.raises(ScenarioError, match="No difficulty 'None'"):
         make_env(cell, difficulty=none, cache=folder)
     for make in (make_env, lambda scenario: make_batch(scenario, 2)):
@@ -306,6 +312,13 @@ def test_a_variant_of_another_fleet_is_refused(cell, folder) -> None:
                 make_batch(cell, 2, difficulty="blind", cache=folder, randomise=randomise)
 
 
+@pytest.mark.parametrize("warmer_k", [(0.0, 1e6), (-1000.0, 0.0)])
+def test_air_that_no_scenario_may_have_is_refused(cell, folder, warmer_k) -> None:
+    randomise = Randomisation(ambient_k=warmer_k)
+    with pytest.raises(ScenarioError, match=r"ambient_k \(.+\) goes too far: .+ between -40 and 60 °C \(got \["):
+        make_batch(cell, 2, difficulty="blind", cache=folder, randomise=randomise)
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -316,6 +329,14 @@ def test_a_variant_of_another_fleet_is_refused(cell, folder) -> None:
         ({"ambient_k": 3.0}, r"Randomisation\.ambient_k must be \(low, high\) \(got 3\.0\)"),
         ({"arrivals": (1.0, 2.0, 3.0)}, r"Randomisation\.arrivals must be \(low, high\)"),
         ({"arrivals": (float("nan"), 1.0)}, r"Randomisation\.arrivals needs low <= high"),
+        ({"arrivals": (1.0, 1e9)}, r"Randomisation\.arrivals must be at most 100 \(got \(1\.0, 1000000000\.0\)\)"),
+        ({"arrivals": None}, r"Randomisation\.arrivals must be \(low, high\) \(got None\)"),
+        ({"ambient_k": ("a", "b")}, r"Randomisation\.ambient_k must be two numbers \(got 'a', 'b'\)"),
+        ({"ambient_k": (None, 1.0)}, r"Randomisation\.ambient_k must be two numbers \(got None, 1\.0\)"),
+        ({"ambient_k": (1j, 1.0)}, r"Randomisation\.ambient_k must be two numbers"),
+        ({"variants": 3}, r"Randomisation\.variants must be a list of dictionaries, .+ \(got 3\)"),
+        ({"variants": [3]}, r"Randomisation\.variants must be a list of dictionaries"),
+        ({"variants": {"spread": {"seed": 1}}}, r"Randomisation\.variants must be a list of dictionaries"),
     ],
 )
 def test_a_range_that_is_none_is_refused(options, said) -> None:

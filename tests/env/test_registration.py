@@ -58,6 +58,13 @@ def test_a_batch_is_made_of_a_scenario(cell, folder) -> None:
     assert list(info) == list(given[-1][-1])
 
 
+def test_a_batch_can_be_spread_over_the_shift(cell, folder) -> None:
+    batch = scenarios.make_batch(cell, 2, 0, difficulty="blind", cache=folder, max_cycles=4, stagger=True)
+    batch.reset()
+    ends = [batch.step(np.zeros((2, 3), int))[3].tolist() for _ in range(4)]
+    assert ends == [[False, False], [True, False], [False, False], [False, True]]
+
+
 @pytest.mark.parametrize(
     "first",
     [
