@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.optimize import root_scalar
 
 from fleet.events import Event, EventKind
 from fleet.sim.state import RUNNING, WAITING, State, World
@@ -36,6 +35,8 @@ class Leg:
 
     def crossing_s(self, limit_c: float) -> float:
         """When the hottest winding passes a limit that lies between its temperatures at both ends."""
+        from scipy.optimize import root_scalar  # an arm's own process follows its plans and should start without it
+
         sign = 1.0 if hottest(self.temp_c) < limit_c else -1.0
 
         def past(moment_s: float) -> float:
