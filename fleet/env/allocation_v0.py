@@ -314,11 +314,15 @@ class InTurns(parallel_to_aec_wrapper[str, Any, Any]):
         """One agent's answer.
 
         Raises:
-            ValueError: no integer; refused before anybody else is asked.
+            ValueError: no integer; refused before anybody else is asked. After the end, anything but None.
         """
         agent = self.agent_selection
         if not (self.terminations[agent] or self.truncations[agent]):
             actions_of([agent], {agent: action})
+        elif action is not None:
+            raise ValueError(
+                f"The episode is over for '{agent}': step(None), or reset() for the next one (got {action!r})."
+            )
         super().step(action)
 
 

@@ -113,8 +113,14 @@ def test_the_turn_by_turn_env_says_it_too(small) -> None:
         env.step(1.5)
     assert env.agent_selection == second  # it may answer again
     env.step(0)
+    while not (env.terminations[env.agent_selection] or env.truncations[env.agent_selection]):
+        env.step(0)
+    with pytest.raises(
+        ValueError, match=rf"The episode is over for '{first}': step\(None\), or reset\(\) .+ \(got 0\)"
+    ):
+        env.step(0)
     while env.agents:
-        env.step(None if env.terminations[env.agent_selection] or env.truncations[env.agent_selection] else 0)
+        env.step(None)
     assert first not in env.agents
 
 

@@ -18,6 +18,8 @@ Traps:
   infos, so the first claims of an episode would follow a stale mask. `AgileRLEnv.reset` writes into those infos too.
 - IPPO draws its actions under the mask but learns as if there had been none (`_learn_individual`): the likelihood
   ratio, 1 by rights before the first update, was seen at 0.19. MADDPG and MATD3 have no such ratio.
+- It shares one actor among agents whose names agree up to the last "_": `arm_0` and `arm_1`, or `floor_left` and
+  `floor_right`. An arm named `wall` learns alone.
 - It knows one "done": a shift cut at the horizon counts as one that is finished.
 - `pip install agilerl` alone does not import without `peft`.
 """
