@@ -7,6 +7,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import FlattenObservation
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
+from fleet.env import allocation_v0
 from fleet.env.adapters.gymnasium_view import DispatcherEnv, DispatcherVectorEnv
 
 ARMS, SLOTS, TICKS = 3, 4, 15
@@ -107,6 +108,27 @@ def test_a_row_of_many_is_the_dispatcher_alone(many, alone, shift) -> None:
         np.testing.assert_array_equal(info.get("_final_obs", np.zeros(4, bool)), terminated | truncated)
     assert ends >= 4
     assert info["illegal"].max() == 0
+
+
+def test_what_it_cannot_take_is_refused(small, small_batch, small_workshop) -> None:
+    for wrong in (None, "quickstart", small_batch()):
+        with pytest.raises(
+            ValueError, match=r"DispatcherEnv takes an environment, as scenarios\.make_env\(\) makes it"
+        ):
+            DispatcherEnv(wrong)
+    for wrong in (None, "quickstart", small_workshop()()):
+        with pytest.raises(
+            ValueError, match=r"DispatcherVectorEnv takes a batch, as scenarios\.make_batch\(\) makes it"
+        ):
+            DispatcherVectorEnv(wrong)
+    with pytest.raises(ValueError, match="make the environment with mask_in='obs'"):
+        DispatcherEnv(allocation_v0.parallel_env(small.Shifts(), mask_in="info"))
+    DispatcherEnv(allocation_v0.parallel_env(small.Shifts(), mask_in="both")).reset(seed=0)
+
+
+def test_nothing_is_legal_before_a_reset(many) -> None:
+    with pytest.raises(RuntimeError, match=r"call reset\(\) before legal_sample\(\)"):
+        many().legal_sample()
 
 
 def test_reward_terms_sum_to_the_reward(many) -> None:

@@ -178,6 +178,10 @@ def test_what_cannot_be_is_said(small_batch) -> None:
 
     with pytest.raises(ValueError, match="'vector' or 'dict'"):
         ArmsVecEnv(small_batch(), observation="flat")
+    with pytest.raises(
+        ValueError, match=r"ArmsVecEnv takes a batch, as scenarios\.make_batch\(\) makes it \(got 'x'\)"
+    ):
+        ArmsVecEnv("x")
     with pytest.raises(ValueError, match="leave autoreset on"):
         ArmsVecEnv(small_batch(autoreset=False))
     rows = ArmsVecEnv(small_batch())

@@ -218,6 +218,12 @@ def test_a_batch_that_resets_by_itself_is_refused(make) -> None:
         TorchRLEnv(make.batch(2, autoreset=True))
 
 
+def test_what_is_no_batch_is_refused(small_workshop) -> None:
+    for wrong in (None, "quickstart", small_workshop()()):
+        with pytest.raises(ValueError, match=r"TorchRLEnv takes a batch, as scenarios\.make_batch\(\) makes it \(got "):
+            TorchRLEnv(wrong)
+
+
 def masked(frames: TensorDict) -> TensorDict:
     logits = torch.zeros(frames["arms", "action_mask"].shape)
     frames["arms", "action"] = MaskedCategorical(logits=logits, mask=frames["arms", "action_mask"]).sample()

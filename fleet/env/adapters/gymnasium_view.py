@@ -29,6 +29,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from pettingzoo import ParallelEnv
 
+from fleet.env.adapters.given import batch_for, env_for
 from fleet.env.reward import TERMS
 from fleet.env.vector import BatchEnv
 
@@ -44,7 +45,7 @@ class DispatcherEnv(gymnasium.Env[Seen, Array]):
     """
 
     def __init__(self, env: ParallelEnv[str, Any, Any]) -> None:
-        self.env = env
+        self.env = env = env_for("DispatcherEnv", env)
         self.arms = tuple(env.possible_agents)
         first: Any = env.observation_space(self.arms[0])
         actions: Any = env.action_space(self.arms[0])
@@ -96,8 +97,8 @@ class DispatcherVectorEnv(VectorEnv[Seen, Array, Array]):
     """
 
     def __init__(self, batch: BatchEnv) -> None:
+        self.batch = batch = batch_for("DispatcherVectorEnv", batch)
         arms = len(batch.agents)
-        self.batch = batch
         self.num_envs = batch.num_envs
         mode = AutoresetMode.SAME_STEP if batch.autoreset else AutoresetMode.DISABLED
         self.metadata = {"autoreset_mode": mode, "render_modes": []}
@@ -128,6 +129,8 @@ class DispatcherVectorEnv(VectorEnv[Seen, Array, Array]):
 
     def legal_sample(self, rng: np.random.Generator | None = None) -> Array:
         """A random answer for every arm of every env, each legal one as likely, int64 [env, arm]."""
+        if not self._mask.any():
+            raise RuntimeError("Nothing was begun yet: call reset() before legal_sample().")
         rng = rng or self.np_random
         counts = self._mask.cumsum(axis=-1)
         nth = rng.integers(counts[..., -1])

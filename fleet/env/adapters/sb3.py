@@ -32,6 +32,7 @@ import numpy as np
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
+from fleet.env.adapters.given import batch_for
 from fleet.env.vector import BatchEnv, Obs
 
 Array = np.ndarray
@@ -52,6 +53,7 @@ class ArmsVecEnv(VecEnv):
     def __init__(self, batch: BatchEnv, *, observation: Kind = "vector") -> None:
         if observation not in get_args(Kind):
             raise ValueError(f"observation must be 'vector' or 'dict', got {observation!r}.")
+        batch = batch_for("ArmsVecEnv", batch)
         if not batch.autoreset:
             raise ValueError("ArmsVecEnv needs a batch that begins new shifts by itself: leave autoreset on.")
         self.batch, self.arms = batch, len(batch.agents)

@@ -40,6 +40,7 @@ from torch import Size
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from fleet.env.adapters.given import batch_for
 from fleet.env.chance import pick
 from fleet.env.reward import TERMS
 from fleet.env.vector import BatchEnv, Obs
@@ -64,6 +65,7 @@ class TorchRLEnv(EnvBase):
     """
 
     def __init__(self, batch: BatchEnv, *, seed: int | None = None, state: bool = False, infos: bool = False) -> None:
+        batch = batch_for("TorchRLEnv", batch)
         if batch.autoreset:
             raise ValueError("TorchRL resets by itself: give TorchRLEnv a batch made with autoreset=False.")
         super().__init__(device="cpu", batch_size=(batch.num_envs,))
