@@ -171,7 +171,10 @@ def test_a_job_goes_from_quote_to_receipt(bus):
     bus.serve(lambda: auctioneer.reports)
     (report,) = auctioneer.reports
     assert (report.outcome, report.cycles, report.job) == ("finished", 3, "j")
-    assert report.time_s == pytest.approx(next(e.time_s for e in events if e.kind == "award") + 33.0, abs=1e-6)
+    # Where the leave to finish comes late, it stands at its end until the next step.
+    stood_s = report.time_s - next(e.time_s for e in events if e.kind == "award") - 33.0
+    assert stood_s >= -1e-6
+    assert stood_s / (SPEED / 20) == pytest.approx(round(stood_s / (SPEED / 20)), abs=1e-6)
     assert any(h.phase == "finishing" for leased in auctioneer.leases for h in leased.holds)
     bus.serve(lambda: [e.kind for e in events] == ["award", "finish", "home"])
     assert [e.number - events[0].number for e in events] == [0, 1, 2]

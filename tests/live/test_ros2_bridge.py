@@ -92,7 +92,8 @@ def test_a_state_becomes_a_joint_state(make):
 def test_a_state_becomes_diagnostics(make):
     domain = make()
     word = DifficultyWord("arm_0", 1, 12.0, "twin-1", ("press",), (0.75,), (0.5,))
-    domain.fleet.publisher(keys.of_arm("shop", "arm_0", "difficulty"), DifficultyWord, remember=1)(word)
+    tell = domain.fleet.publisher(keys.of_arm("shop", "arm_0", "difficulty"), DifficultyWord, remember=1)
+    tell(word)  # what it remembers goes when `tell` goes
 
     def whole(sample):
         return under(DIAGNOSTICS_KEY)(sample) and b"d press" in sample.payload.to_bytes()
