@@ -36,6 +36,11 @@ class Allocator:
         for reply in self.session.liveliness().get(f"{self.root}/auction/*/alive", timeout=1.0):
             if reply.ok is not None:
                 sys.exit(f"{reply.ok.key_expr} is there: a fleet has one auctioneer.")
+        for reply in self.session.get(
+            f"{self.root}/jobs/status", payload="{}", encoding=encoding("StatusRequest"), timeout=2.0
+        ):
+            if reply.ok is not None:  # one about to show its token, or an arm that answers for all
+                sys.exit(f"Somebody answers {reply.ok.key_expr} already: a fleet has one who shares the jobs out.")
         places = {
             f"{self.root}/jobs/submit": ("Submission", "Submitted", self.submit),
             f"{self.root}/jobs/status": ("StatusRequest", "Status", self.tell),

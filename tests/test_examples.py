@@ -245,6 +245,22 @@ def test_own_allocator_keeps_the_rules_towards_a_strict_arm(bus):
     assert arm.malformed == 0
 
 
+def test_own_allocator_does_not_begin_beside_arms_that_share_jobs_out(bus):
+    """They show no auctioneer's token: one of them answers for all."""
+    port, link = bus
+    arm = link()
+    arm.answer(keys.of_jobs("f", "status"), StatusRequest, lambda _: Status(auctioneer="x", time_s=1.0, jobs=()))
+    command = [sys.executable, str(ROOT / "examples" / "own_allocator.py"), str(port), "f"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            serve(lambda: process.poll() is not None, arm)
+        finally:
+            process.kill()
+        assert process.returncode == 1
+        assert "jobs/status already" in process.stderr.read()
+    assert arm.malformed == 0
+
+
 @pytest.mark.parametrize("kinds", [("own_arm", "quote"), ("own_arm", "award"), ("own_allocator", "lease")])
 @pytest.mark.parametrize(
     ("payload", "said"),
