@@ -12,7 +12,7 @@ THREAD = 1024
 MOST_NAMES = 4096
 MOST_WAITING = 256
 """Events and results that wait for one reader."""
-NEWEST_WINS = ("state", "difficulty", "info", "presence", "announce")
+NEWEST_WINS = ("state", "difficulty", "info", "bid", "presence", "announce")
 """Topics of which only the newest word of each name counts; of all others every word does."""
 
 

@@ -23,7 +23,7 @@ from fleet.live import onlooker as onlooker_module
 from fleet.live import overview as overview_module
 from fleet.live.onlooker import Onlooker
 from fleet.live.overview import FRESH_S, ArmNow, FleetNow, Overview
-from fleet.live.stream import MOST_WAITING, NEWEST_WINS, Feed, Letterbox
+from fleet.live.stream import MOST_WAITING, NEWEST_WINS, THREAD, Feed, Letterbox
 from scenarios.watch_screen import age, clock, line, scores, screen
 
 PATIENCE_S = 20.0
@@ -170,6 +170,15 @@ def test_a_reader_gets_every_event_once_and_the_newest_state(said, after):
     missed, gap = feed.since(0)
     assert not gap
     assert {entry.number for entry in missed} == {*events, *last.values()}
+
+
+def test_what_arms_bid_all_the_time_pushes_no_event_out():
+    feed, box = Feed(), Letterbox()
+    for topic in ("event", *["bid"] * (THREAD + 1), "event"):
+        box.put(feed.add(topic, "a", "{}"))
+    missed, gap = feed.since(0)
+    assert not gap
+    assert [entry.topic for entry in missed] == [entry.topic for entry in box.take()] == ["event", "bid", "event"]
 
 
 def test_a_full_letter_box_says_so_and_holds_nothing():
