@@ -75,10 +75,11 @@ def arm_command(
     chosen = load(scenario)
     _check(source, difficulty, file, speed, rate_hz, capacity, seed)
     _check_policy(policy, jobs, file)
-    with progress_bar() as progress:
-        made = replayed(name, file) if file else simulated(chosen, name, difficulty, seed, progress)
     fleet = fleet or chosen.name
     folder = journal or Path("runs") / f"live-{fleet}"
+    live_council.refuse_other_way(folder, (name,), alone=bool(policy))
+    with progress_bar() as progress:
+        made = replayed(name, file) if file else simulated(chosen, name, difficulty, seed, progress)
     with (
         until_stopped() as stop,
         Link(endpoint, fleet) as link,

@@ -48,6 +48,7 @@ def auction_command(
     from fleet.live.auction_node import AuctionNode
     from fleet.live.journal import Journal
     from fleet.live.records import Record
+    from scenarios.live_council import refuse_other_way
     from scenarios.live_policies import AMONG_ARMS, allocation
     from scenarios.stopping import until_stopped
 
@@ -64,6 +65,7 @@ def auction_command(
     own = own_jobs(chosen, seed) if jobs == "scenario" else []
     fleet = fleet or chosen.name
     folder = journal or Path("runs") / f"live-{fleet}"
+    refuse_other_way(folder, (arm.name for arm in chosen.arms), alone=False)
     with (
         until_stopped() as stop,
         Link(endpoint, fleet) as link,

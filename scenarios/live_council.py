@@ -1,7 +1,7 @@
 """An arm that shares the jobs out with its peers, as `thermofleet arm --policy consensus` runs it."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -64,6 +64,31 @@ def refuse_auctioneer(link: "Link") -> None:
     if there := link.there(keys.of_every_auction(link.fleet, "alive"), timeout_s=2.0):
         names = ", ".join(sorted(there))
         raise BusError(f"Fleet '{link.fleet}' has an auctioneer: '{names}'. Stop it first, or leave --policy out.")
+
+
+def refuse_other_way(folder: Path, arms: Iterable[str], *, alone: bool) -> None:
+    """A shift that was begun in one way does not go on in the other, which would not know what is done.
+
+    Args:
+        folder: Of the journals.
+        arms: Whose journals are looked at.
+        alone: Whether they are to share the jobs out themselves.
+
+    Raises:
+        FleetError: a journal is of the other way.
+    """
+    for arm in arms:
+        grants, journal = folder / f"{arm}.grants", folder / f"{arm}.journal"
+        if alone and not grants.exists() and journal.exists() and journal.stat().st_size:
+            raise FleetError(
+                f"{journal} has no {grants.name} beside it: it is of a shift with an auctioneer, and jobs would be "
+                "done twice. Take the --policy that it was begun with, or another folder for a new shift."
+            )
+        if not alone and grants.exists() and grants.stat().st_size:
+            raise FleetError(
+                f"{grants} is of a shift in which the arms shared the jobs out themselves, and jobs would be done "
+                "twice. Take the --policy that it was begun with, or another folder for a new shift."
+            )
 
 
 @contextmanager

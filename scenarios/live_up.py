@@ -100,6 +100,7 @@ def up_command(
     where the journals stop.
     """
     from scenarios.build import prepare
+    from scenarios.live_council import refuse_other_way
     from scenarios.stopping import until_stopped
 
     chosen = load(scenario)
@@ -112,6 +113,7 @@ def up_command(
     if tls is not None and fleet != chosen.name:
         raise FleetError(f"The keys of --tls are for the fleet of their scenario; leave --fleet out (got '{fleet}').")
     folder = out or Path("runs") / f"live-{fleet}"
+    refuse_other_way(folder / "journals", (arm.name for arm in chosen.arms), alone=policy in AMONG_ARMS)
     with progress_bar() as progress:  # once, so that no arm has to plan or train by itself
         prepare(chosen, difficulty="twin" if difficulty == "twin" else "blind", progress=progress)
     router, arms, record, auction = parts_of(

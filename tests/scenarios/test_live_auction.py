@@ -36,6 +36,7 @@ from scenarios import live_auction
 from scenarios.build import make_env
 from scenarios.cli import main
 from scenarios.live_auction import own_jobs, word_of
+from scenarios.live_council import refuse_other_way
 from scenarios.live_policies import allocation, bids_of
 from scenarios.live_submit import parts, read_jobs
 from scenarios.load import load
@@ -243,6 +244,46 @@ def test_a_policy_that_cannot_be_is_one_sentence(capsys, words, complaint):
     code, _, err = call(capsys, *words)
     assert code == 2
     assert complaint in " ".join(err.split())
+
+
+@pytest.mark.parametrize(
+    ("words", "files", "complaint"),
+    [
+        (
+            ("up", "quickstart", "--policy", "consensus", "--out"),
+            ["arm_2.journal"],
+            "it is of a shift with an auctioneer",
+        ),
+        (("up", "quickstart", "--out"), ["arm_2.journal", "arm_2.grants"], "arms shared the jobs out themselves"),
+        (("auction", "quickstart", "--journal"), ["arm_2.grants"], "arms shared the jobs out themselves"),
+        (("arm", "quickstart", "arm_2", "--journal"), ["arm_2.grants"], "arms shared the jobs out themselves"),
+        (
+            ("arm", "quickstart", "arm_2", "--policy", "consensus", "--journal"),
+            ["arm_2.journal"],
+            "has no arm_2.grants",
+        ),
+    ],
+)
+def test_a_shift_does_not_go_on_by_the_other_way(capsys, tmp_path, words, files, complaint):
+    """Who goes on from the journals of the other way does not know what is done, and would have it done again."""
+    folder = tmp_path / "journals" if words[0] == "up" else tmp_path
+    folder.mkdir(exist_ok=True)
+    for file in files:
+        (folder / file).write_text("{}\n")
+    code, _, err = call(capsys, *words, tmp_path)
+    assert code == 2
+    assert complaint in " ".join(err.split())
+
+
+def test_a_shift_goes_on_in_its_own_way_and_from_nothing(tmp_path):
+    for alone in (True, False):
+        refuse_other_way(tmp_path / "none", ("a",), alone=alone)
+    for file in ("alone.journal", "alone.grants", "led.journal"):
+        (tmp_path / file).write_text("{}\n")
+    for file in ("new.journal", "new.grants"):
+        (tmp_path / file).touch()
+    refuse_other_way(tmp_path, ("alone", "new"), alone=True)
+    refuse_other_way(tmp_path, ("led", "new"), alone=False)
 
 
 # the commands
