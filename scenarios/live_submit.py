@@ -132,7 +132,10 @@ def submitted(link: "Link", words: "tuple[JobWord, ...]", by: str) -> "tuple[Adm
             return answer.jobs
         for reason in filter(None, answers.refused.values()):
             raise FleetError(f"The auctioneer takes no jobs: {reason}")
-    raise BusError(f"No auctioneer of fleet '{link.fleet}' answered; is `thermofleet auction` running?")
+    raise BusError(
+        f"No auctioneer of fleet '{link.fleet}' answered; is `thermofleet auction` running? Arms that share the jobs "
+        "out themselves answer when all are there, or a majority has been for 20 s."
+    )
 
 
 def follow(link: "Link", names: "Sequence[str]", stop: "Stop") -> "list[str]":

@@ -185,7 +185,13 @@ class AuctionNode:
         nobody = StatusRequest(("?",))
         answers = self._link.ask_and_wait(keys.of_jobs(fleet, "status"), nobody, Status, timeout_s=2.0)
         for status in answers.words.values():
-            raise BusError(f"Fleet '{fleet}' has an auctioneer already: '{status.auctioneer}'. A fleet has one.")
+            name = status.auctioneer
+            if name in self._link.there(keys.of_every_arm(fleet, "alive"), timeout_s=2.0):
+                raise BusError(
+                    f"The arms of fleet '{fleet}' share the jobs out themselves; '{name}' answers for them. "
+                    "Stop them first."
+                )
+            raise BusError(f"Fleet '{fleet}' has an auctioneer already: '{name}'. A fleet has one.")
         if answers.refused:
             raise BusError(f"Fleet '{fleet}' has an auctioneer already, which does not answer. Stop it first.")
 

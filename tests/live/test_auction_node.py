@@ -247,6 +247,10 @@ def test_one_that_answers_and_shows_no_token_yet_is_an_auctioneer_too(bus):
     try:
         with pytest.raises(BusError, match="has an auctioneer already: 'one'"):
             bus.auctioneer("two")
+        with bus.link() as arm:
+            arm.alive(keys.of_arm("f", "one", "alive"))
+            with pytest.raises(BusError, match=r"share the jobs out themselves; 'one' answers .* Stop them first"):
+                bus.auctioneer("two")
     finally:
         stop.set()
         thread.join(PATIENCE_S)
