@@ -32,6 +32,8 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
+from fleet.env.adapters.given import env_for
+
 MaskKind = Literal["list", "array"]
 
 
@@ -46,7 +48,7 @@ class AgileRLEnv(BaseParallelWrapper[str, Any, Any]):
     def __init__(self, env: ParallelEnv[str, Any, Any], *, masks: MaskKind) -> None:
         if masks not in get_args(MaskKind):
             raise ValueError(f"masks must be 'list' (for IPPO) or 'array' (for MADDPG and MATD3), got {masks!r}.")
-        super().__init__(env)
+        super().__init__(env_for("AgileRLEnv", env))
         self.masks = masks
         self._last: dict[str, Any] = {}
         whole: dict[str, Any] = {arm: env.observation_space(arm) for arm in env.possible_agents}

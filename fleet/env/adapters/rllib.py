@@ -36,6 +36,8 @@ from ray.rllib.env.multi_agent_env import MultiAgentEnv
 from ray.rllib.examples.rl_modules.classes.action_masking_rlm import ActionMaskingTorchRLModule
 from ray.tune.registry import register_env
 
+from fleet.env.adapters.given import env_for
+
 NAME = "thermofleet/allocation_v0"
 SHARED_POLICY = "arm"
 
@@ -50,7 +52,7 @@ class RLlibEnv(MultiAgentEnv):
     """
 
     def __init__(self, env: ParallelEnv[str, Any, Any]) -> None:
-        self.env = env
+        self.env = env_for("RLlibEnv", env)
         self.arms = tuple(env.possible_agents)
         self.possible_agents = list(range(len(self.arms)))
         self.agents = list(self.possible_agents)

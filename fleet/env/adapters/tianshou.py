@@ -28,6 +28,8 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils import parallel_to_aec
 from tianshou.env.pettingzoo_env import PettingZooEnv
 
+from fleet.env.adapters.given import env_for
+
 
 class TianshouEnv(PettingZooEnv):
     """A `ParallelEnv` of Dict observations as Tianshou's `PettingZooEnv`, turn by turn.
@@ -37,7 +39,7 @@ class TianshouEnv(PettingZooEnv):
     """
 
     def __init__(self, env: ParallelEnv[str, Any, Any]) -> None:
-        super().__init__(parallel_to_aec(env))
+        super().__init__(parallel_to_aec(env_for("TianshouEnv", env)))
         self.render_mode = getattr(env, "render_mode", None)
 
     def reset(self, *args: Any, **kwargs: Any) -> tuple[dict[str, Any], dict[str, Any]]:
