@@ -82,7 +82,8 @@ def refuse_other_way(folder: Path, arms: Iterable[str], *, alone: bool) -> None:
         if alone and not grants.exists() and journal.exists() and journal.stat().st_size:
             raise FleetError(
                 f"{journal} has no {grants.name} beside it: it is of a shift with an auctioneer, or the grants are "
-                "lost, and jobs would be done twice. Take the --policy that it was begun with, or another folder for a new shift."
+                "lost, and jobs would be done twice. Take the --policy that it was begun with, or another folder for a "
+                "new shift."
             )
         if not alone and grants.exists() and grants.stat().st_size:
             raise FleetError(
