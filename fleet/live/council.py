@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from random import Random
 
+import msgspec
+
 from fleet.bus.council import Bid, Claim, Grant
 from fleet.bus.trade import Ack, Award, JobStatus, JobWord, Offer, Quote
 from fleet.live.bidding import Allocate, Bidding, sound
@@ -179,7 +181,8 @@ class Council:
     def status(self, later: Iterable[JobWord], real_s: float) -> list[JobStatus]:
         """Where all jobs stand, as far as it knows; `later` ones are still to come."""
         names = dict.fromkeys([*self.jobs, *(word.name for word in later), *self.grantor.register.settled])
-        return [by_grants(name, self.grantor, real_s) for name in names]
+        found = [by_grants(name, self.grantor, real_s) for name in names]
+        return [_given_up(said) if self.ended and said.state == "waiting" else said for said in found]
 
     # Who gets what
 
@@ -250,6 +253,10 @@ class Council:
         first_s, most_s = self._timing.pause_s
         count = self._pauses[job] = self._pauses.get(job, 0) + 1
         self._later_s[job] = real_s + min(most_s, first_s * 2.0 ** min(count - 1, 10)) * self._rng.uniform(0.2, 1.0)
+
+
+def _given_up(said: JobStatus) -> JobStatus:
+    return msgspec.structs.replace(said, state="unfinished", reason="The shift ended before it was done.")
 
 
 def _order(word: JobWord) -> tuple[float, str]:

@@ -168,13 +168,14 @@ def test_a_stream_that_all_know_comes_to_its_end(bus):
     assert bus.done_by_journals() == Counter(word.name for _, word in stream)
 
 
-def test_at_the_end_of_the_shift_a_last_cycle_is_ended_and_the_rest_is_left(bus):
+def test_at_the_end_of_the_shift_a_last_cycle_is_ended_and_the_rest_is_reported_unfinished(bus):
     stream = ((0.0, hold("brief", repetitions=1)), (0.0, hold("long", "rack", repetitions=10_000)))
     for name in ROSTER:
         bus.arm(name, stream=stream, horizon_s=150.0)
     assert bus.serve(lambda: all(one.orders.over for one in bus.arms.values()))
-    states = {said.job: said.state for said in bus.arms["arm_0"].orders.statuses()}
-    assert states == {"brief": "finished", "long": "waiting"}
+    told = {said.job: said for said in bus.arms["arm_0"].orders.statuses()}
+    assert {name: said.state for name, said in told.items()} == {"brief": "finished", "long": "unfinished"}
+    assert told["long"].reason == "The shift ended before it was done."
     assert not any(one.node.contractor.held for one in bus.arms.values())
 
 
