@@ -72,4 +72,7 @@ def describe(kind, word):
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 7447)
+    try:
+        main(int(sys.argv[1]) if len(sys.argv) > 1 else 7447)
+    except KeyboardInterrupt:
+        sys.exit(130)
