@@ -20,8 +20,6 @@ from fleet.thermal import NODES
 Array = np.ndarray
 
 LARGEST = float(np.finfo(float).max)
-TERMS = 5
-"""Reward terms, in the order of `fleet.env.reward.RewardWeights`: value, tardiness, above warning, faults, energy."""
 
 
 @inner
@@ -168,7 +166,7 @@ def live(t: Tables, d: Drawn, s: Rows, o: Offer, worth: Array, terms: Array, row
     """Every arm through one step: motion, heat, limits, the end of its job.
 
     Args:
-        worth: Of a unit of each reward term, [term].
+        worth: Of a unit of each reward term, [term], in the order of `fleet.env.reward.RewardWeights`.
         terms: Takes the reward terms and their sum, [env, term + 1].
         rows: Which envs, int [row].
     """
