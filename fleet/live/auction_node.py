@@ -34,7 +34,7 @@ from fleet.live.auctioneer import SCAN_S, Auctioneer, Give, Objection
 from fleet.live.bidding import Allocate
 from fleet.live.clock import FleetClock
 from fleet.live.journal import Journal
-from fleet.live.ledger import Ledger, replayed
+from fleet.live.ledger import replayed
 from fleet.live.overview import FRESH_S
 from fleet.live.records import Began, Record, Ticked
 from fleet.live.standing import first
@@ -48,9 +48,6 @@ TICK_S = 2.0
 """Real seconds between two records of the fleet's time."""
 ROLL_S, ALONE_S = 1.0, 3.0
 """Real seconds between two questions who answers as auctioneer here; how long one is sure, after that, to be alone."""
-GROWTH = 4
-LEAST_LONG_BYTES = 1_000_000
-"""A journal that has grown so many times, and to at least so many bytes, is shortened; it also is at every start."""
 
 
 class AuctionNode:
@@ -94,8 +91,7 @@ class AuctionNode:
         # It may have told the time until just before its next record of it, and never tells an earlier one.
         zero_s = ledger.time_s + TICK_S * speed if ledger.time_s else 0.0
         self._clock = FleetClock(speed, real_s, zero_s)
-        self._long = 0
-        self._shorten(ledger)
+        journal.shorten(ledger.standing())
         journal.append(Began(name, zero_s))
         self.auctioneer = Auctioneer(
             name,
@@ -281,16 +277,8 @@ class AuctionNode:
             self.journal.append(Ticked(time_s))
         except JournalFull as error:
             _LOG.error("The fleet's time is not noted: %s", error)
-        if self.journal.size > self._long:
-            self._shorten(self.auctioneer.ledger)
-
-    def _shorten(self, ledger: Ledger) -> None:
-        """Begin the journal anew with where its records have led, so that no restart reads through the past again."""
-        try:
-            self.journal.rewrite(ledger.standing())
-        except JournalFull as error:
-            _LOG.warning("The journal stays as long as it is: %s", error)
-        self._long = max(LEAST_LONG_BYTES, GROWTH * self.journal.size)
+        if self.journal.long:
+            self.journal.shorten(self.auctioneer.ledger.standing())
 
     # What goes out
 

@@ -55,9 +55,6 @@ LAST_S = 10.0
 """Real seconds after the end of the shift that an arm waits at most for last cycles, its own and those of others."""
 NOT_YET_S = 1e9
 """Real seconds: so long the fleet's time would stand still, if nobody let it begin."""
-GROWTH = 4
-LEAST_LONG_BYTES = 1_000_000
-"""A journal that has grown so many times, and to at least so many bytes, is shortened; it also is at every start."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +94,6 @@ class CouncilNode:
         self._name, self._speed = worker.contractor.arm, worker.clock.speed
         self._horizon_s, self._places = membership.horizon_s, membership.places
         register = recalled(journal.replay())
-        self._long = 0
         real_s = time.monotonic()
         grantor = Grantor(
             self._name, membership.roster, register, journal.append, real_s=real_s, timing=membership.timing
@@ -122,7 +118,7 @@ class CouncilNode:
         self._since_s = self._ticked_s = real_s
         self.wake_s = math.inf
         worker.set_clock(FleetClock(self._speed, real_s + NOT_YET_S))
-        self._shorten()
+        journal.shorten(*retold(register))
         self._declare()
 
     # What an arm wants of its orders
@@ -307,13 +303,5 @@ class CouncilNode:
             self.council.grantor.tick(time_s)
         except JournalFull as error:
             _LOG.error("The fleet's time is not noted: %s", error)
-        if self.journal.size > self._long:
-            self._shorten()
-
-    def _shorten(self) -> None:
-        """Begin the journal anew with where its records have led."""
-        try:
-            self.journal.rewrite(*retold(self.council.grantor.register))
-        except JournalFull as error:
-            _LOG.warning("The journal stays as long as it is: %s", error)
-        self._long = max(LEAST_LONG_BYTES, GROWTH * self.journal.size)
+        if self.journal.long:
+            self.journal.shorten(*retold(self.council.grantor.register))

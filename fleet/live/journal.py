@@ -20,6 +20,10 @@ from fleet.errors import JournalError, JournalFull
 
 _LOG = logging.getLogger(__name__)
 
+GROWTH = 4
+LEAST_LONG_BYTES = 1_000_000
+"""A journal that has grown so many times, and to at least so many bytes, is long."""
+
 Record = TypeVar("Record", bound=msgspec.Struct)
 
 _HEAD, _MIDDLE, _TAIL = b'{"crc":"', b'","records":', b"}\n"
@@ -48,7 +52,7 @@ class Journal(Generic[Record]):
         self._encoder = msgspec.json.Encoder()
         self._sync = sync
         self._file = self._lock = -1
-        self._end = 0
+        self._end = self._short = 0
         self._broken = ""
 
     def open(self) -> Self:
@@ -155,6 +159,25 @@ class Journal(Generic[Record]):
         except OSError as error:
             self._broken = f"{self._failed(error)} Nothing more is written until it is opened anew."
             raise JournalError(self._broken) from error
+
+    @property
+    def long(self) -> bool:
+        """Whether it has grown so much since it was shortened that it should be again."""
+        return self._end > max(LEAST_LONG_BYTES, GROWTH * self._short)
+
+    def shorten(self, *records: Record) -> None:
+        """Begin anew with where all records have led, so that no restart reads through the past again.
+
+        Where there is no room it stays as long as it is.
+
+        Raises:
+            JournalError: as `rewrite`.
+        """
+        try:
+            self.rewrite(*records)
+        except JournalFull as error:
+            _LOG.warning("The journal stays as long as it is: %s", error)
+        self._short = self._end
 
     # Inside
 

@@ -38,7 +38,7 @@ from fleet.bus.trade import (
     Submitted,
 )
 from fleet.errors import BusError, JournalFull
-from fleet.live import auction_node
+from fleet.live import auction_node, journal
 from fleet.live.auction_node import AuctionNode
 from fleet.live.auctioneer import Objection
 from fleet.live.journal import Journal
@@ -385,7 +385,7 @@ def test_a_journal_is_shortened_at_the_start_and_when_it_has_grown(bus, monkeypa
     assert [type(record).__name__ for record in again.journal.replay()] == ["Standing", "Began"]
     assert states(again) == ["finished"]
     monkeypatch.setattr(auction_node, "TICK_S", 0.01)
-    monkeypatch.setattr(auction_node, "LEAST_LONG_BYTES", 1)
+    monkeypatch.setattr(journal, "LEAST_LONG_BYTES", 1)
     before = again.journal.size
     bus.kill(again)
     third = bus.auctioneer()
