@@ -48,7 +48,7 @@ def at(t: Tables, lot: int, a: int, modal: Array, time_s: float, out: Array) -> 
     out[:] = 0.0
     for m in range(NODES):
         rate = t.rates[lot, a, m]
-        now = math.exp(-rate * time_s) * modal[0, m] - math.expm1(-rate * time_s) / rate * modal[1, m]
+        now = modal[0, m] + math.expm1(-rate * time_s) * (modal[0, m] - modal[1, m] / rate)
         for n in range(NODES):
             out[n] += t.modes[lot, a, n, m] * now
     for n in range(NODES):
@@ -58,17 +58,9 @@ def at(t: Tables, lot: int, a: int, modal: Array, time_s: float, out: Array) -> 
 @rare
 def hottest_at(t: Tables, lot: int, a: int, modal: Array, time_s: float) -> float:
     """The hottest motor so long after the beginning of a stretch."""
-    now, top_c = np.empty(NODES), -np.inf
-    for m in range(NODES):
-        rate = t.rates[lot, a, m]
-        gone = math.expm1(-rate * time_s)
-        now[m] = modal[0, m] + gone * (modal[0, m] - modal[1, m] / rate)
-    for n in range(JOINTS):
-        root_c = 0.0
-        for m in range(NODES):
-            root_c += t.modes[lot, a, n, m] * now[m]
-        top_c = max(top_c, root_c / t.root[lot, a, n])
-    return top_c
+    now = np.empty(NODES)
+    at(t, lot, a, modal, time_s, now)
+    return hottest(now)
 
 
 @rare
