@@ -1,7 +1,6 @@
 """Faults of a fleet without an auctioneer, whose arms share the jobs out among themselves."""
 
-from namespaces import Namespaces
-from partition import CUT_S, Line
+from partition import CUT_S, cut_at_work
 from struck import Fleet
 
 LEASE_S = 8.0
@@ -19,11 +18,7 @@ def cut_one_off(fleet: Fleet) -> float:
 
 
 def _cut(fleet: Fleet, *, may_work: bool) -> float:
-    line, away = fleet.line, set(fleet.away)
-    assert isinstance(line, Line | Namespaces)
-    fleet.until(lambda: any(fleet.states[arm][1].mode == "working" for arm in away), 20.0)
-    line.cut()
-    seen_s = fleet.until(lambda: all(map(fleet.unwell, away)), 10.0)
+    line, away, seen_s = cut_at_work(fleet)
     fleet.until(lambda: False, LEASE_S)
     before = _ended(fleet)
     fleet.until(lambda: False, CUT_S - LEASE_S)

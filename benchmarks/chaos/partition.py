@@ -103,13 +103,19 @@ class Line:
             one.close()
 
 
-def partition(fleet: Fleet) -> float:
-    """Half of the arms are cut off for longer than a lease, in the middle of their jobs."""
+def cut_at_work(fleet: Fleet) -> tuple[Line | Namespaces, set[str], float]:
+    """Cut arms off in the middle of a job: the line, who is behind it, and after how many seconds it shows."""
     line, away = fleet.line, set(fleet.away)
     assert isinstance(line, Line | Namespaces)
     fleet.until(lambda: any(fleet.states[arm][1].mode == "working" for arm in away), 20.0)
     line.cut()
     seen_s = fleet.until(lambda: all(map(fleet.unwell, away)), 10.0)
+    return line, away, seen_s
+
+
+def partition(fleet: Fleet) -> float:
+    """Half of the arms are cut off for longer than a lease, in the middle of their jobs."""
+    line, away, seen_s = cut_at_work(fleet)
     fleet.until(lambda: False, CUT_S)
     line.heal()
     healed_s = fleet.until(lambda: not any(map(fleet.unwell, away)), 30.0)
