@@ -7,13 +7,13 @@ OUT ?= out
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 GOAL := $(or $(firstword $(MAKECMDGOALS)),demo)
 
-# Each trainer has an environment of its own: what they want of one another's packages does not agree.
-# The peers that benchmarks/env.py is measured beside are no trainer, but live there too.
+# Each trainer has its own environment, because their packages conflict. So have the peers that benchmarks/env.py is
+# compared with, which are no trainers.
 PINNED := $(sort $(basename $(notdir $(wildcard constraints/*.txt))))
 ADAPTERS := $(filter-out bench,$(PINNED))
 ADAPTER_TESTS := $(ADAPTERS:%=test-adapter-%)
 
-.PHONY: demo test test-slow test-adapter test-adapters $(ADAPTER_TESTS) lint bench bench-env chaos clean install
+.PHONY: demo test test-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos clean install
 
 demo: $(STAMP)
 	@$(BIN)/thermofleet demo --out $(OUT)/demo
@@ -23,6 +23,10 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	@$(BIN)/python -m pytest -m slow
+
+# Random message loss, crashes and full disks: fresh seeds, ten times the examples of `make test`.
+storm: $(STAMP)
+	@HYPOTHESIS_PROFILE=storm $(BIN)/python -m pytest -n 2 --dist load -m 'not adapter' tests/live -k storm
 
 ifneq ($(filter $(ADAPTER),$(ADAPTERS)),)
 test-adapter: test-adapter-$(ADAPTER)
@@ -36,6 +40,10 @@ test-adapters: $(ADAPTER_TESTS)
 $(ADAPTER_TESTS): test-adapter-%: .venv-adapters/%/.installed
 	@.venv-adapters/$*/bin/python -m pytest -m adapter tests/adapters/test_$*.py
 
+# Product lines that `make test` runs; compiled functions and the processes of live fleets are not counted.
+coverage: $(STAMP)
+	@$(BIN)/python -m pytest -n 2 --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html:$(OUT)/coverage
+
 lint: $(STAMP)
 	@$(BIN)/ruff format --check .
 	@$(BIN)/ruff check .
@@ -47,14 +55,15 @@ chaos: $(STAMP)
 bench: $(STAMP)
 	@for b in benchmarks/bench_*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done
 
-.venv-adapters/bench/.installed: EXTRA := [learn]
+EXTRA := [cli]
+.venv-adapters/bench/.installed: EXTRA := [cli,learn]
 bench-env: .venv-adapters/bench/.installed
 	@.venv-adapters/bench/bin/python benchmarks/env.py
 
 install: $(STAMP)
 
-# A broken environment is taken away again, so that the next call begins anew. setuptools comes first, so that the
-# pinned one builds the package.
+# A broken environment is removed, so that the next call starts again. setuptools comes first, so that the pinned
+# version builds the package.
 $(STAMP): pyproject.toml constraints.txt
 	@command -v "$(PYTHON)" >/dev/null 2>&1 || { \
 	  echo "thermofleet needs Python 3.11 or newer, and there is no '$(PYTHON)' here. Install it, or name one: make $(GOAL) PYTHON=/path/to/python3.11"; exit 1; }
@@ -70,7 +79,7 @@ $(STAMP): pyproject.toml constraints.txt
 	  echo "All that pip said is in $(VENV)/install.log; 'make $(GOAL)' tries again."; exit 1; }
 	@touch $(STAMP)
 
-# A trainer's own pins come before the shared ones. Its packages are put in as pinned, whatever they say of one another.
+# A trainer's own pins override the shared ones. Its packages are installed as pinned, whatever they require.
 $(PINNED:%=.venv-adapters/%/.installed): .venv-adapters/%/.installed: constraints/%.txt constraints.txt pyproject.toml | $(STAMP)
 	@echo "Installing $* into .venv-adapters/$* (once, a few minutes; log in .venv-adapters/$*/install.log) …"
 	@test -x .venv-adapters/$*/bin/python || $(BIN)/python -m venv .venv-adapters/$*

@@ -1,23 +1,21 @@
-"""Dispatching rules: the ladder's lowest rungs, each with one idea.
+"""Dispatching rules, each with one idea. But for `wspt_cool` they keep the fleet busy: an arm that may work does."""
 
-All of them keep the fleet busy: an arm that may work does. They differ in who takes which job.
-"""
-
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from typing import ClassVar
 
 import numpy as np
 
-from agents.consensus import Consensus
-from agents.dispatch import Wspt, WsptCool
-from agents.hearsay import Trust, advantage
-from agents.policy import WAIT, Policy, legal_slots
-from fleet.env.observation import Observation
-from fleet.errors import nearest
+from agents.policy import WAIT, legal_slots
+from agents.staleness import Trust, advantage
+from fleet.observation import Observation
+
+Array = np.ndarray
 
 
 class RandomLegal:
-    """Every free arm claims a random legal job."""
+    """Every free arm claims a random legal job. Scope arm: it reads the arm's own mask."""
 
+    scope: ClassVar = "arm"
     only_choices = True
 
     def __init__(self) -> None:
@@ -27,18 +25,16 @@ class RandomLegal:
         """Begin a shift."""
         self._rng = rng
 
-    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
-        """A uniform choice among the legal claims of each arm; WAIT only where there is none."""
-        return {arm: self._choose(obs) for arm, obs in observations.items()}
-
-    def _choose(self, observation: Observation) -> int:
+    def choose(self, observation: Observation, place: int) -> int:
+        """A uniform choice among the legal claims; WAIT only where there is none."""
         choices = legal_slots(observation)
         return int(self._rng.choice(choices)) + 1 if choices else WAIT
 
 
 class RoundRobin:
-    """The oldest job goes to the next arm in turn that is free and able."""
+    """The oldest job goes to the next able arm in turn. Scope central: it reads the mask of every arm."""
 
+    scope: ClassVar = "central"
     only_choices = True
 
     def __init__(self) -> None:
@@ -49,7 +45,7 @@ class RoundRobin:
         self._turn = 0
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
-        """Walk the queue from the oldest job, handing each to the next able arm."""
+        """Go through the slots from the oldest job, giving each to the next able arm."""
         arms = list(observations)
         actions = dict.fromkeys(arms, WAIT)
         for slot in _slots(observations):
@@ -63,15 +59,16 @@ class RoundRobin:
 
 
 class CoolestFirst:
-    """The oldest job goes to the free arm with most headroom."""
+    """The oldest job goes to the free arm with most headroom. Scope central: it compares all headrooms."""
 
+    scope: ClassVar = "central"
     only_choices = True
 
     def reset(self, rng: np.random.Generator) -> None:
-        """Nothing to begin."""
+        """Nothing to reset."""
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
-        """Walk the queue from the oldest job, handing each to the coolest able arm."""
+        """Go through the slots from the oldest job, giving each to the coolest able arm."""
         coolest = sorted(observations, key=lambda arm: -float(observations[arm].headroom_k))
         actions = dict.fromkeys(observations, WAIT)
         for slot in _slots(observations):
@@ -83,49 +80,105 @@ class CoolestFirst:
 
 
 class LeastDifficulty:
-    """The pair of free arm and job with the least difficulty first, reckoned against what the fleet finds on average.
+    """The pair of free arm and job with the least difficulty relative to the fleet's average for that job first.
 
-    Some work is new to every twin and would be left by all if plain difficulties were compared across jobs; what one
-    arm finds harder than the others is what the choice can change. Each arm works this out by itself, from its own
-    scores, what its peers told it and its place in the fleet, which settles ties; so the rule needs nobody in the
-    middle. Where nobody has a score, free arms take the oldest jobs in the fleet's order. What a peer told a while ago
-    counts for less, and a peer not heard for long is not left anything, as `agents.hearsay` has it.
+    Work that is new to every twin would be left by all if plain difficulties were compared across jobs; relative to
+    the average, it counts who finds it easier. Scope arm: each arm works it out from its own scores, those its peers
+    shared, and its place in the fleet, which settles ties. Where nobody has a score, free arms take the oldest jobs in
+    the fleet's order. `agents.staleness` says what an old message still counts.
     """
 
+    scope: ClassVar = "arm"
     only_choices = True
 
     def __init__(self, trust: Trust | None = None) -> None:
         self._trust = trust or Trust()
 
     def reset(self, rng: np.random.Generator) -> None:
-        """Nothing to begin."""
+        """Nothing to reset."""
 
-    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
-        """Each arm's claim from its own observation."""
-        return {arm: self._choose(obs, place) for place, (arm, obs) in enumerate(observations.items())}
-
-    def _choose(self, observation: Observation, place: int) -> int:
+    def choose(self, observation: Observation, place: int) -> int:
+        """This arm's claim, if all arms do what this one expects of them."""
         mine = legal_slots(observation)
         if not mine:
             return WAIT
-        harder = advantage(observation, place, _open(observation, mine), self._trust)
+        relative = advantage(observation, place, _open(observation, mine), self._trust)
         free = self._trust.free(observation)
-        able = ~np.isnan(harder) & np.insert(free, place, True)[:, None]
-        costs = np.where(able, harder, np.inf).round(9)
-        while np.isfinite(costs).any():
-            slot, arm = np.unravel_index(int(np.argmin(costs.T)), costs.T.shape)  # ties: oldest job, first arm
+        able = ~np.isnan(relative) & np.insert(free, place, True)[:, None]
+        for arm, slot in cheapest_pairs(np.where(able, relative, np.inf).round(9)):
             if arm == place:
-                return int(slot) + 1
-            costs[arm, :] = np.inf
-            costs[:, slot] = np.inf
+                return slot + 1
         if observation.known[mine].any():
             return WAIT
-        before = int(free[:place].sum())  # free arms with the first word
+        before = int(free[:place].sum())  # free arms that choose first
         return mine[min(before, len(mine) - 1)] + 1
 
 
-def _open(observation: Observation, mine: list[int]) -> np.ndarray:
-    """Slots that somebody may claim now, bool, [slot]: not empty, and not one that only its busy station closes."""
+class Wspt:
+    """The pair of free arm and job with the highest value per time first: weighted shortest processing time.
+
+    Optimal for the weighted sum of completion times on one machine (W. E. Smith, Naval Research Logistics Quarterly 3,
+    1956); a strong rule on several unlike ones. It looks at no temperature. Scope central: it compares the arms' times.
+    """
+
+    scope: ClassVar = "central"
+    only_choices = True
+    most_p = 1.0
+    """No claim above this probability to pass the warning limit."""
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Nothing to reset."""
+
+    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+        """Pair after pair; ties go to the older job, then to the first arm."""
+        cost = np.stack([-self._rate(seen) for seen in observations.values()])  # [arm, slot]
+        return claims_of(observations, cheapest_pairs(cost))
+
+    def _rate(self, seen: Observation) -> Array:
+        """Value per second of every slot, −inf where it is not to be claimed, [slot]."""
+        allowed = seen.action_mask[1:].astype(bool) & (seen.p_saturation <= self.most_p)
+        return np.where(allowed, seen.value / np.maximum(seen.duration_s, 1.0), -np.inf).astype(float)
+
+
+class WsptCool(Wspt):
+    """As `wspt`, but an arm leaves a job in which a motor would more likely than not pass the warning limit.
+
+    It rests rather than run hot; work that no arm can do coolly waits until one can. Scope central, as `wspt`.
+    """
+
+    only_choices = True
+    most_p = 0.5
+
+
+def cheapest_pairs(cost: Array) -> list[tuple[int, int]]:
+    """Pairs (arm, slot) of a cost matrix [arm, slot], the cheapest first, then the cheapest of what is left.
+
+    Every arm and every slot once; inf is never paired. Ties go to the first slot, then to the first arm. This is the
+    outcome of a sequential single-item auction with one job per arm (Lagoudakis et al. 2005, Robotics: Science and
+    Systems; Koenig et al. 2006, AAAI).
+    """
+    slots, pairs = cost.T, list[tuple[int, int]]()
+    arms_left, slots_left = set(range(len(cost))), set(range(len(slots)))
+    # By slot, then by arm: a stable sort leaves ties in that order.
+    for place in np.argsort(slots, axis=None, kind="stable").tolist():
+        slot, arm = divmod(place, len(cost))
+        if not arms_left or not slots_left or np.isinf(slots[slot, arm]):
+            break
+        if arm in arms_left and slot in slots_left:
+            arms_left.remove(arm)
+            slots_left.remove(slot)
+            pairs.append((arm, slot))
+    return pairs
+
+
+def claims_of(observations: Mapping[str, Observation], pairs: list[tuple[int, int]]) -> dict[str, int]:
+    """The actions of pairs of arm and slot, each by its index; arms in no pair wait."""
+    arms = list(observations)
+    return dict.fromkeys(arms, WAIT) | {arms[arm]: slot + 1 for arm, slot in pairs}
+
+
+def _open(observation: Observation, mine: list[int]) -> Array:
+    """Slots that some arm may claim now, bool, [slot]: not empty, and not closed only by a busy station."""
     may = np.isin(np.arange(len(observation.offered)), mine)
     return (observation.offered > 0) & (may | (observation.feasible == 0))
 
@@ -133,26 +186,3 @@ def _open(observation: Observation, mine: list[int]) -> np.ndarray:
 def _slots(observations: Mapping[str, Observation]) -> range:
     first = next(iter(observations.values()))
     return range(len(first.offered))
-
-
-RULES: dict[str, Callable[[], Policy]] = {
-    "random": RandomLegal,
-    "round_robin": RoundRobin,
-    "coolest_first": CoolestFirst,
-    "least_difficulty": LeastDifficulty,
-    "consensus": Consensus,
-    "wspt": Wspt,
-    "wspt_cool": WsptCool,
-}
-"""Policies by the name under which `--policy` knows them."""
-
-
-def make_policy(name: str) -> Policy:
-    """A fresh policy by name.
-
-    Raises:
-        ValueError: no such policy; names the nearest one.
-    """
-    if name not in RULES:
-        raise ValueError(f"No policy '{name}'{nearest(name, RULES)}")
-    return RULES[name]()

@@ -1,11 +1,11 @@
-"""What an auction costs: 50 jobs on offer to 8 arms, until all 8 awards of a batch are acknowledged.
+"""Time of an auction: 50 offered jobs, 8 arms, until all 8 awards of a batch are acknowledged.
 
     python benchmarks/bench_auction.py [--arms 8] [--jobs 50] [--batches 100] [--policy matching]
 
-Router, auctioneer and every arm are processes of their own on loopback. Ours: JSON words that are checked on both
-ends, costs, matching, and a journal that is on disk before an award is sent. Arms here have nothing to work out: they
-quote constants, and take every award. Bare: in the same processes, a query to all arms and one to each, with payloads
-of the same sizes, half of it before and half after ours. Then the journal alone.
+Router, auctioneer and every arm are separate processes on loopback. Ours: JSON messages validated at both ends, costs,
+matching, and a journal that is on disk before an award is sent. The arms quote constants and accept every award. Bare
+Zenoh: in the same processes, a query to all arms and one to each, with payloads of the same sizes, half of it before
+and half after ours. Then the journal alone.
 """
 
 import argparse
@@ -23,15 +23,18 @@ from typing import Any
 
 import zenoh
 
-from fleet.bus import keys
-from fleet.bus.link import Link
-from fleet.bus.messages import State, encode
-from fleet.bus.router import Router, open_client
-from fleet.bus.trade import Ack, Award, JobWord, Offer, Quote, QuoteRequest, Submission
-from fleet.live.auction_node import AuctionNode
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.router import Router, open_client
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import Ack, Award, JobEstimate, JobSpec, Quote, QuoteRequest, Submission
+from fleet.bus.protocol.messages import State, encode
+from fleet.live.auction.journal_records import AuctionRecord, Awarded
+from fleet.live.auction.knowledge import LiveFleet
+from fleet.live.auction.lease_timing import Timing
+from fleet.live.auction.node import AuctionNode
 from fleet.live.journal import Journal
-from fleet.live.records import Awarded, Record
-from fleet.live.timing import Timing
+from scenarios.live.allocation import CentralAllocation
+from scenarios.policy_loader import policy_at
 
 FLEET = "bench"
 PATIENCE_S = 20.0
@@ -47,24 +50,24 @@ def route(port: Any, stop: Any) -> None:
         stop.wait()
 
 
-def offer(word: JobWord, number: int) -> Offer:
-    """What an arm says of a job: figures of the usual length, other ones for every arm."""
+def offer(word: JobSpec, number: int) -> JobEstimate:
+    """Offer with numbers of typical length, different for every arm."""
     d = tuple(0.123456789 * (1 + joint + number) for joint in range(JOINTS))
-    return Offer(word.name, True, "", d, sum(d), 0.0123456789 * number, 51.23456789, 123.456789, 234.56789)
+    return JobEstimate(word.name, True, "", d, sum(d), 0.0123456789 * number, 51.23456789, 123.456789, 234.56789)
 
 
 def arm(endpoint: str, number: int, quote_size: int, ready: Any, stop: Any) -> None:
-    """An arm's process: quotes and takes, tells its state ten times a second, and answers bare queries."""
+    """An arm's process: quotes, accepts awards, publishes its state ten times per second and answers bare queries."""
     name, numbers, said_s = f"arm_{number}", count(), 0.0
-    with Link(endpoint, FLEET, timeout_s=PATIENCE_S) as link, open_client(endpoint, timeout_s=PATIENCE_S) as bare:
+    with BusClient(endpoint, FLEET, timeout_s=PATIENCE_S) as link, open_client(endpoint, timeout_s=PATIENCE_S) as bare:
 
         def quote(request: QuoteRequest) -> Quote:
             offers = tuple(offer(word, number) for word in request.jobs)
             return Quote(name, request.auction, f"{name}-{next(numbers)}", 5.0, "t", 0.0, "idle", 20.0, 1, offers)
 
-        link.answer(keys.of_arm(FLEET, name, "quote"), QuoteRequest, quote)
-        link.answer(keys.of_arm(FLEET, name, "award"), Award, lambda word: Ack(name, word.award, True))
-        link.alive(keys.of_arm(FLEET, name, "alive"))
+        link.reply_to(keys.of_arm(FLEET, name, "quote"), QuoteRequest, quote)
+        link.reply_to(keys.of_arm(FLEET, name, "award"), Award, lambda word: Ack(name, word.award, True))
+        link.declare_token(keys.of_arm(FLEET, name, "alive"))
         sizes = {"quote": quote_size, "award": len(encode(Ack(name, "x" * 32, True)))}
         queryables = [constant(bare, f"bare/{number}/{topic}", b"x" * size) for topic, size in sizes.items()]
         ready.release()
@@ -72,14 +75,14 @@ def arm(endpoint: str, number: int, quote_size: int, ready: Any, stop: Any) -> N
             link.serve(time.monotonic() + STATE_S / 2)
             if time.monotonic() >= said_s + STATE_S:
                 said_s = time.monotonic()
-                link.say(
+                link.publish(
                     keys.of_arm(FLEET, name, "state"), State(name, next(numbers), 0.0, "idle", (30.0,) * JOINTS, 30.0)
                 )
         del queryables
 
 
 def constant(session: zenoh.Session, key: str, answer: bytes) -> zenoh.Queryable[None]:
-    """Answers the same to everything, on the receiving thread."""
+    """Queryable with a constant reply, sent on the receiving thread."""
 
     def reply(query: zenoh.Query) -> None:
         with query:
@@ -91,7 +94,7 @@ def constant(session: zenoh.Session, key: str, answer: bytes) -> zenoh.Queryable
 
 @contextmanager
 def processes(arms: int, quote_size: int) -> Iterator[str]:
-    """Router and arms; gives the endpoint."""
+    """Run router and arms; yield the endpoint."""
     spawn = multiprocessing.get_context("spawn")
     stop, port, ready = spawn.Event(), spawn.Queue(), spawn.Semaphore(0)
     router = spawn.Process(target=route, args=(port, stop))
@@ -102,7 +105,7 @@ def processes(arms: int, quote_size: int) -> Iterator[str]:
         for child in children:
             child.start()
         for _ in children:
-            assert ready.acquire(timeout=START_S), "an arm did not come up"
+            assert ready.acquire(timeout=START_S), "an arm did not start in time"
         yield endpoint
     finally:
         stop.set()
@@ -111,13 +114,13 @@ def processes(arms: int, quote_size: int) -> Iterator[str]:
 
 
 class Stopwatch:
-    """Times every batch of a node, from its question for quotes to the last answer to its awards."""
+    """Times every batch of a node, from its request for quotes to the last reply to its awards."""
 
-    def __init__(self, link: Link, node: AuctionNode) -> None:
+    def __init__(self, link: BusClient, node: AuctionNode) -> None:
         self.batches_s: list[tuple[int, float]] = []
-        """Awards in a batch, and how long it took."""
+        """Number of awards and duration of each batch."""
         self._asked_s, self._open, self._sent = 0.0, 0, 0
-        ask, acknowledged = link.ask, node.auctioneer.acknowledged
+        ask, acknowledged = link.query, node.auctioneer.apply_ack
 
         def asked(key: str, word: Any, *rest: Any, **more: Any) -> None:
             if isinstance(word, QuoteRequest):
@@ -132,13 +135,13 @@ class Stopwatch:
             if not self._open:
                 self.batches_s.append((self._sent, time.perf_counter() - self._asked_s))
 
-        link.ask, node.auctioneer.acknowledged = asked, answered
+        link.query, node.auctioneer.apply_ack = asked, answered
 
 
-def words(jobs: int) -> list[JobWord]:
-    """Jobs at stations of their own, so that every batch is full."""
+def words(jobs: int) -> list[JobSpec]:
+    """Jobs at separate stations, so that every batch is full."""
     return [
-        JobWord(
+        JobSpec(
             name=f"load_tray-{i:04d}", kind="hold", places=(f"tray_{i}",), repetitions=30, payload_kg=1.5, due_s=900.0
         )
         for i in range(jobs)
@@ -147,13 +150,12 @@ def words(jobs: int) -> list[JobWord]:
 
 def ours(endpoint: str, folder: Path, options: argparse.Namespace) -> tuple[list[tuple[int, float]], float]:
     """Batches of an auctioneer, and the awards per second over all of them."""
-    from scenarios.live_policies import allocation  # loads SciPy, which an arm's process does not need
 
-    timing = Timing(lease_s=120.0, most_offered=options.jobs)
-    # There are always so many on offer, to the last batch.
+    timing = Timing(lease_s=120.0, max_jobs=options.jobs)
+    # Enough jobs to keep the number of offers constant until the last batch.
     work = words(options.arms * options.batches + options.jobs)
-    allocate = allocation(options.policy, 60.0)
-    with Link(endpoint, FLEET) as link, Journal[Record](folder / "bench.journal", Record) as book:
+    allocate = CentralAllocation(policy_at(options.policy, 0), LiveFleet(arms=(), warning_c=60.0))
+    with BusClient(endpoint, FLEET) as link, Journal[AuctionRecord](folder / "bench.journal", AuctionRecord) as book:
         node = AuctionNode(link, "auctioneer", book, allocate=allocate, speed=1.0, timing=timing)
         deadline_s = time.monotonic() + PATIENCE_S
         while len(node.present) < options.arms and time.monotonic() < deadline_s:
@@ -169,7 +171,7 @@ def ours(endpoint: str, folder: Path, options: argparse.Namespace) -> tuple[list
 
 
 def bare_batch(session: zenoh.Session, arms: int, request: bytes, award: bytes) -> float:
-    """A query to all, then one to each, s."""
+    """Duration of a query to all, then one to each, s."""
     begun_s = time.perf_counter()
     gather(session, ["bare/*/quote"], request, arms)
     gather(session, [f"bare/{i}/award" for i in range(arms)], award, arms)
@@ -177,7 +179,7 @@ def bare_batch(session: zenoh.Session, arms: int, request: bytes, award: bytes) 
 
 
 def gather(session: zenoh.Session, asked: list[str], payload: bytes, answers: int) -> None:
-    """Ask under each key; wait until all of it is over, and see that everybody has answered."""
+    """Query each key, wait for the end of all, and check the number of replies."""
     left, came, done = count(len(asked) - 1, -1), count(1), Event()
     last = [0]
 
@@ -204,9 +206,9 @@ def gather(session: zenoh.Session, asked: list[str], payload: bytes, answers: in
 
 
 def journal_s(folder: Path, arms: int, times: int, sync: Callable[[int], None]) -> list[float]:
-    """How long it takes to write the awards of a batch, s each."""
+    """Durations of writing the awards of a batch, s."""
     out = []
-    with Journal[Record](folder / f"alone-{sync.__name__}.journal", Record, sync=sync) as book:
+    with Journal[AuctionRecord](folder / f"alone-{sync.__name__}.journal", AuctionRecord, sync=sync) as book:
         for batch in range(times):
             made = [
                 Awarded(f"auctioneer-0a1b2c3d-{batch}:job-{i}", "a" * 24, f"job-{i}", f"arm_{i}", "q" * 16, 0, 1.0, 2.0)
@@ -219,7 +221,7 @@ def journal_s(folder: Path, arms: int, times: int, sync: Callable[[int], None]) 
 
 
 def unsynced(_file: int) -> None:
-    """Leaves it to the system when to write."""
+    """Replaces fsync: the system decides when to write."""
 
 
 def row(what: str, seconds: list[float]) -> str:
@@ -229,7 +231,7 @@ def row(what: str, seconds: list[float]) -> str:
 
 
 def main() -> None:
-    """Print the table, and whether the targets are met."""
+    """Print the table and whether the targets are met."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--arms", type=int, default=8)
     parser.add_argument("--jobs", type=int, default=50, help="on offer at a time")
@@ -266,8 +268,8 @@ def main() -> None:
         f"awards per second: {per_s:.0f}; full batches: {sum(n == options.arms for n, _ in batches)} of {len(batches)}"
     )
     p95_ms = 1e3 * sorted(times)[int(0.95 * len(times))]
-    told = {True: "met", False: "missed"}
-    print(f"targets: p95 of a batch <= 50 ms: {told[p95_ms <= 50.0]}; >= 100 awards/s: {told[per_s >= 100.0]}")
+    verdict = {True: "met", False: "missed"}
+    print(f"targets: p95 of a batch <= 50 ms: {verdict[p95_ms <= 50.0]}; >= 100 awards/s: {verdict[per_s >= 100.0]}")
 
 
 if __name__ == "__main__":

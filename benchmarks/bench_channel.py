@@ -1,13 +1,13 @@
-"""What a fleet loses when its arms hear each other late, badly or not at all.
+"""Performance of a fleet when messages between its arms are late, lost or restricted.
 
     python benchmarks/bench_channel.py [SCENARIO] [--seeds 5] [--first-seed 100] [--policies least_difficulty,consensus]
 
-Means over the seeds, and in brackets the mean paired difference to the same policy and seed on a perfect channel, *
-where its 95 % bootstrap interval excludes zero (with a handful of seeds these intervals are too narrow). `heard`: words
-that came, of all pairs of arms. `lost`: claims whose job or station somebody else won. Policies that ask no peer
-(round_robin) are the same on every channel. In memory, on the profile plant, with the arms' twins, on all cores. As it
-is: 130 shifts, some eight minutes of processor time, half of that on two free cores (and a few minutes for the twins
-where they are not in the cache yet); `heat_wave` takes three times that.
+Means over the seeds; in brackets the mean paired difference to the same policy and seed on a perfect channel, with *
+if its 95 % bootstrap interval excludes zero (too narrow for a handful of seeds). `heard`: share of messages delivered,
+over all pairs of arms. `lost`: claims for a job or station that another arm won. Policies that use no peer messages
+(round_robin) are equal on every channel. In memory, with the profile plant and the arms' twins, on all cores. The
+defaults are 130 shifts: some eight minutes of CPU time, half of that on two idle cores, and a few minutes more if the
+twins are not cached. `heat_wave` takes three times as long.
 """
 
 import argparse
@@ -22,19 +22,20 @@ from typing import Any
 import numpy as np
 from joblib import Parallel, delayed
 
-from fleet.bus.channel import Channel, Partition
-from scenarios.build import cache_folder, prepare
-from scenarios.compare import interval
+from fleet.bus.exchange.channel import Channel, Partition
+from fleet.files import cache_folder
 from scenarios.load import load
-from scenarios.run import RunSpec, run
-from scenarios.scenario import Scenario
+from scenarios.prepare.fleet import prepare
+from scenarios.run.compare import interval
+from scenarios.run.shift import RunSpec, run
+from scenarios.schema import Scenario
 
 FIGURES = ("value", "on_time", "faults", "above_warning_min", "lost", "heard")
 DIGITS = {"value": 1, "on_time": 1, "faults": 2, "above_warning_min": 0, "lost": 1}
 
 
 def channels(scenario: Scenario) -> dict[str, Channel]:
-    """What is compared, by name; the first is perfect."""
+    """Compared channels by name; the first is perfect."""
     arms = [arm.name for arm in scenario.arms]
     half, third_s = len(arms) // 2, scenario.horizon_s / 3
     cut = Partition(third_s, 2 * third_s, (tuple(arms[:half]), tuple(arms[half:])))
@@ -57,7 +58,7 @@ def channels(scenario: Scenario) -> dict[str, Channel]:
 
 
 def shifts(scenario: Scenario, cache: Path, policy: str, channel: Channel, seeds: range) -> np.ndarray:
-    """The `FIGURES` of the shift of every seed, [seed, figure]."""
+    """`FIGURES` of the shift of every seed, [seed, figure]."""
     fleet, arms = prepare(scenario, cache=cache), len(scenario.arms)
     rows = []
     for seed in seeds:

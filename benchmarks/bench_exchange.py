@@ -1,10 +1,10 @@
-"""What a tick costs: `share` over Zenoh and in memory, beside bare Zenoh doing the same deliveries.
+"""Time of a tick: `share` over Zenoh and in memory, beside the same deliveries with bare Zenoh.
 
     python benchmarks/bench_exchange.py [--arms 4 16 64] [--ticks 200]
 
-Bare Zenoh: as many client sessions on the same kind of router, each puts two payloads of the same sizes per tick and
-counts what its peers put, without reading it. Ping-pong: one put to a peer and its callback's put back, halved. All
-run in one process on loopback, taking turns, so that a busy machine slows them alike.
+Bare Zenoh: as many client sessions on the same kind of router; each puts two payloads of the same sizes per tick and
+counts the puts of its peers without decoding them. Ping-pong: one put to a peer and the put of its callback, halved.
+All run in one process on loopback and alternate, so that other load slows them equally.
 """
 
 import argparse
@@ -21,23 +21,23 @@ from pathlib import Path
 import numpy as np
 import zenoh
 
-from fleet.bus.exchange import Words
-from fleet.bus.memory import MemoryExchange
-from fleet.bus.messages import encode
-from fleet.bus.router import Router, open_client
-from fleet.bus.session import ZenohExchange, seats_of
-from fleet.bus.wording import spoken
+from fleet.bus.client.router import Router, open_client
+from fleet.bus.exchange.group import messages_of
+from fleet.bus.exchange.memory import MemoryExchange
+from fleet.bus.exchange.protocol import Broadcast
+from fleet.bus.exchange.zenoh import ZenohExchange, sessions_for
+from fleet.bus.protocol.messages import encode
 
 SLOTS = 8
 WARM_UP = 5
 TIMEOUT_S = 30.0
 
 
-def words_at(tick: int, arms: int, rng: np.random.Generator) -> Words:
-    """Words of the size a scenario has: seven joints, eight slots, one score in five not known."""
+def words_at(tick: int, arms: int, rng: np.random.Generator) -> Broadcast:
+    """Broadcasts of a typical size: seven joints, eight slots, one score in five unknown."""
     difficulty, p_saturation = rng.random((2, arms, SLOTS))
     difficulty[rng.random((arms, SLOTS)) < 0.2] = np.nan
-    return Words(
+    return Broadcast(
         time_s=10.0 * tick,
         mode=rng.integers(0, 3, arms),
         temp_c=rng.normal(40.0, 10.0, (arms, 7)),
@@ -50,11 +50,11 @@ def words_at(tick: int, arms: int, rng: np.random.Generator) -> Words:
 
 
 class Bare:
-    """Zenoh alone: put, and count in callbacks until all has come."""
+    """Bare Zenoh: put, and count in callbacks until all messages have arrived."""
 
     def __init__(self, arms: int, resources: ExitStack) -> None:
         endpoint = resources.enter_context(Router()).endpoint
-        seats = seats_of(arms)
+        seats = sessions_for(arms)
         self._expected = messages(arms)
         self._came = 0
         self._lock = threading.Lock()
@@ -89,7 +89,7 @@ class Bare:
 
 
 class PingPong:
-    """One client puts, another one's callback puts back."""
+    """One client puts, the callback of another puts back."""
 
     def __init__(self, resources: ExitStack) -> None:
         endpoint = resources.enter_context(Router()).endpoint
@@ -117,18 +117,18 @@ class PingPong:
 
 
 def messages(arms: int) -> int:
-    """Messages that arrive in a tick: two words of every arm, at every session but their own unless arms share it."""
-    seats = seats_of(arms)
+    """Deliveries per tick: two messages of every arm, to every session but its own unless arms share sessions."""
+    seats = sessions_for(arms)
     return 2 * arms * (arms - 1 if seats == arms else seats)
 
 
 def await_router(session: zenoh.Session) -> None:
-    """Return when the router has taken what the session declared: it answers in order."""
+    """Return when the router has processed the declarations of the session; it replies in order."""
     assert list(session.get("@/*/router", timeout=TIMEOUT_S))
 
 
 def timed(call: Callable[[], object]) -> float:
-    """How long a call takes, s."""
+    """Duration of a call, s."""
     start_s = time.perf_counter()
     call()
     return time.perf_counter() - start_s
@@ -145,7 +145,7 @@ def measure(arms: int, ticks: int) -> str:
         bare = Bare(arms, resources)
         for tick in range(ticks + WARM_UP):
             words = words_at(tick, arms, rng)
-            payloads = [(encode(state), encode(word)) for state, word in spoken(words, names, tick)]
+            payloads = [(encode(state), encode(word)) for state, word in messages_of(words, names, tick)]
             zenoh_s.append(timed(lambda words=words: bus.share(words)))
             memory_s.append(timed(lambda words=words: memory.share(words)))
             bare_s.append(timed(lambda payloads=payloads: bare.tick(payloads)))
@@ -157,10 +157,10 @@ def measure(arms: int, ticks: int) -> str:
 
 
 def start(arms: int, pipe: Connection) -> None:
-    """In a process of its own: seconds until the exchange is open and until all have heard all, and MB for it."""
+    """In a separate process: seconds until the exchange is open and until every arm has all messages, and its MB."""
     rng = np.random.default_rng(0)
     words = words_at(0, arms, rng)
-    with Router() as router, open_client(router.endpoint, timeout_s=TIMEOUT_S):  # what Zenoh itself takes once
+    with Router() as router, open_client(router.endpoint, timeout_s=TIMEOUT_S):  # the fixed cost of Zenoh
         before_mb, begun_s = resident_mb(), time.perf_counter()
         with ZenohExchange(tuple(f"arm_{i}" for i in range(arms)), "start", timeout_s=TIMEOUT_S) as bus:
             open_s = time.perf_counter() - begun_s
@@ -175,7 +175,7 @@ def resident_mb() -> float:
 
 
 def started(arms: int, times: int) -> str:
-    """One line on how an exchange of so many arms starts, the median of some starts."""
+    """One line about the start of an exchange with `arms` arms, medians of `times` starts."""
     spawn = multiprocessing.get_context("spawn")
     found = []
     for _ in range(times):
@@ -185,10 +185,10 @@ def started(arms: int, times: int) -> str:
         found.append(here.recv())
         process.join(TIMEOUT_S)
     open_s, heard_s, mb, late = (statistics.median(column) for column in zip(*found, strict=True))
-    told = {True: "met", False: "missed"}
+    verdict = {True: "met", False: "missed"}
     return (
-        f"{arms} arms from nothing: open after {open_s:.2f} s, all have heard all after {heard_s:.2f} s, {mb:.0f} MB, "
-        f"{late:.0f} late (targets: <= 1 s {told[heard_s <= 1]}, <= 120 MB {told[mb <= 120]})"
+        f"{arms} arms from start: open after {open_s:.2f} s, all messages delivered after {heard_s:.2f} s, "
+        f"{mb:.0f} MB, {late:.0f} late (targets: <= 1 s {verdict[heard_s <= 1]}, <= 120 MB {verdict[mb <= 120]})"
     )
 
 

@@ -1,15 +1,15 @@
-"""What an arm's process costs: 64 of them at work, ten state words a second each, beside a bare Zenoh publisher.
+"""Cost of an arm's process: 64 working arms that publish ten states per second each, beside a bare Zenoh publisher.
 
     python benchmarks/bench_fleet.py [--arms 64] [--seconds 20] [--rate 10] [--speed 1]
 
-Every arm is `thermofleet arm`, a process of its own, blind, in a cell of its own; all meet at one router. This process
-deals: it gives each arm one long pick-and-place job and renews its lease, so the body moves and gets warm. It also
-listens as a recorder does: every word is checked, gaps are filled from the arm's cache within `GRACE_S`, and the ticks
-that came are counted against those that were said (`--plain`: what is dropped on a busy machine stays away). Beside
-them in the same run: one process that puts as many bytes as often, by Zenoh alone.
+Every arm is `thermofleet arm`, a separate process, blind, in its own cell; all connect to one router. This process
+deals: it awards each arm one long pick-and-place job and renews its lease, so that the arm moves and heats up. It also
+listens as a recorder does: every message is validated, gaps are filled from the arm's cache within `GRACE_S`, and the
+received ticks are compared with the published ones (`--plain`: without recovery of dropped messages). In the same run
+one process publishes as many bytes at the same rate with bare Zenoh.
 
-Processor time is that of the kernel's books over the window (/proc/PID/stat, user and system, all threads). PSS counts
-a page that n processes share 1/n to each, so the sum over the arms is what they really take.
+CPU time is user and system time of all threads over the window (/proc/PID/stat). PSS divides shared pages between the
+processes that share them, so its sum over the arms is the memory that they really use.
 """
 
 import argparse
@@ -25,15 +25,14 @@ from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
 
-from fleet.bus import keys
-from fleet.bus.link import Answers, Link
-from fleet.bus.messages import State, encode
-from fleet.bus.trade import (
+from fleet.bus.client.client import BusClient, Replies
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import (
     Ack,
     Award,
     Clock,
     ClockRequest,
-    JobWord,
+    JobSpec,
     Lease,
     LeaseRequest,
     Quote,
@@ -41,14 +40,15 @@ from fleet.bus.trade import (
     Receipt,
     Report,
 )
+from fleet.bus.protocol.messages import State, encode
 from fleet.live.supervisor import Part, Supervisor
-from scenarios.build import prepare
-from scenarios.live_up import PROGRAM, free_port
+from scenarios.cli.live.up import PROGRAM, free_port
 from scenarios.load import load
+from scenarios.prepare.fleet import prepare
 
 FLEET, DEALER = "bench", "dealer"
 TARGET = 0.04
-"""Of a core, each arm."""
+"""Share of a core per arm."""
 START_S, SETTLE_S, GRACE_S, FAREWELL_S = 300.0, 5.0, 1.5, 10.0
 LEASE_S = 6.0
 JOINTS = 7
@@ -85,38 +85,40 @@ with zenoh.open(zenoh.Config.from_json5(config % endpoint)) as session:
 
 
 class Dealer:
-    """Gives every arm one job and lets it go on with it; counts what the arms say."""
+    """Awards every arm one job, renews its lease, and counts the arms' messages."""
 
-    def __init__(self, link: Link, speed: float, remembered: int) -> None:
+    def __init__(self, link: BusClient, speed: float, history: bool) -> None:
         self.ticks: dict[str, list[int]] = defaultdict(list)
-        """Of the state words that came, by arm."""
+        """Ticks of the received states, by arm."""
         self.working: set[str] = set()
-        """Arms whose last word says so."""
+        """Arms whose last state is `working`."""
         self.refused: list[str] = []
         self._link, self._speed, self._began_s = link, speed, time.monotonic()
-        link.listen(keys.of_every_arm(FLEET, "state"), State, self._heard, remembered=remembered)
-        link.answer(keys.asked_by_every_arm(FLEET, DEALER, "lease"), LeaseRequest, self._lease)
-        link.answer(keys.asked_by_every_arm(FLEET, DEALER, "report"), Report, lambda word: Receipt(DEALER, word.award))
-        link.answer(keys.of_clock(FLEET), ClockRequest, lambda _: Clock(self._now_s(), speed))
+        link.subscribe(keys.of_every_arm(FLEET, "state"), State, self._heard, history=history)
+        link.reply_to(keys.asked_by_every_arm(FLEET, DEALER, "lease"), LeaseRequest, self._lease)
+        link.reply_to(
+            keys.asked_by_every_arm(FLEET, DEALER, "report"), Report, lambda word: Receipt(DEALER, word.award)
+        )
+        link.reply_to(keys.of_clock(FLEET), ClockRequest, lambda _: Clock(self._now_s(), speed))
 
     def deal(self, arm: str) -> None:
-        """Ask an arm for a quote and award it its job."""
-        job = JobWord(f"load-{arm}", "pick_place", ("belt", "tray"), 100_000, 0.5)
+        """Request a quote of an arm and award it its job."""
+        job = JobSpec(f"load-{arm}", "pick_place", ("belt", "tray"), 100_000, 0.5)
 
-        def quoted(answers: Answers[Quote]) -> None:
+        def quoted(answers: Replies[Quote]) -> None:
             self.refused += answers.refused.values()
-            for quote in answers.words.values():
+            for quote in answers.messages.values():
                 award = Award(f"a-{arm}", f"q-{arm}", DEALER, quote.quote, job, 0, LEASE_S)
-                self._link.ask(keys.of_arm(FLEET, arm, "award"), award, Ack, told, timeout_s=START_S)
+                self._link.query(keys.of_arm(FLEET, arm, "award"), award, Ack, told, timeout_s=START_S)
 
-        def told(answers: Answers[Ack]) -> None:
-            self.refused += [ack.reason for ack in answers.words.values() if not ack.accepted]
+        def told(answers: Replies[Ack]) -> None:
+            self.refused += [ack.reason for ack in answers.messages.values() if not ack.accepted]
 
         request = QuoteRequest(f"q-{arm}", (job,))
-        self._link.ask(keys.of_arm(FLEET, arm, "quote"), request, Quote, quoted, timeout_s=START_S)
+        self._link.query(keys.of_arm(FLEET, arm, "quote"), request, Quote, quoted, timeout_s=START_S)
 
     def serve(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
-        """Deal and listen for so long, or until something has come true."""
+        """Serve for `seconds`, or until the condition is true."""
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s and not until():
             self._link.serve(min(end_s, time.monotonic() + 0.2))
@@ -126,7 +128,7 @@ class Dealer:
         (self.working.add if word.mode == "working" else self.working.discard)(arm)
 
     def _lease(self, word: LeaseRequest) -> Lease:
-        return Lease(DEALER, LEASE_S, tuple(hold.award for hold in word.holds), ())
+        return Lease(DEALER, LEASE_S, tuple(hold.award for hold in word.entries), ())
 
     def _now_s(self) -> float:
         return self._speed * (time.monotonic() - self._began_s)
@@ -139,7 +141,7 @@ def cpu_s(pid: int) -> float:
 
 
 def memory_mb(pid: int) -> tuple[float, float, int]:
-    """Resident set and proportional set of a process, MB, and how many threads it has."""
+    """Resident and proportional set size of a process, MB, and its number of threads."""
     status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
     shares = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
     pss_kb = next(int(line.split()[1]) for line in shares if line.startswith("Pss:"))
@@ -147,7 +149,7 @@ def memory_mb(pid: int) -> tuple[float, float, int]:
 
 
 def arms_of(folder: Path, names: list[str], endpoint: str, options: argparse.Namespace) -> list[Part]:
-    """The arms' processes; their common plans are made beforehand, as `thermofleet up` does."""
+    """The arms' processes; their common plans are computed first, as by `thermofleet up`."""
     cells = [folder / f"{name}.toml" for name in names]
     for name, cell in zip(names, cells, strict=True):
         cell.write_text(CELL.format(arm=name), encoding="utf-8")
@@ -161,7 +163,7 @@ def arms_of(folder: Path, names: list[str], endpoint: str, options: argparse.Nam
 
 
 def end(supervisor: Supervisor, dealer: Dealer, names: list[str]) -> None:
-    """Ask all arms to go, and take their last reports."""
+    """Terminate all arms and receive their last reports."""
     pids = [pid for name in names if (pid := supervisor.pid(name)) is not None]
     for pid in pids:
         os.kill(pid, signal.SIGTERM)
@@ -169,24 +171,24 @@ def end(supervisor: Supervisor, dealer: Dealer, names: list[str]) -> None:
 
 
 def row(what: str, values: list[float], form: str = "{:.2f}") -> str:
-    """Median, 95th percentile and most."""
+    """Median, 95th percentile and maximum."""
     ordered = sorted(values)
     cells = (statistics.median(ordered), ordered[int(0.95 * (len(ordered) - 1))], ordered[-1])
     return f"{what:<36}" + "".join(f"{form.format(cell):>10}" for cell in cells)
 
 
 def main() -> None:
-    """Print the table, and whether the targets are met."""
+    """Print the table and whether the targets are met."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--arms", type=int, default=64)
-    parser.add_argument("--seconds", type=float, default=20.0, help="window, after all are there and at work")
-    parser.add_argument("--rate", type=float, default=10.0, help="state words of each a second")
-    parser.add_argument("--plain", action="store_true", help="listen without recovery of what was dropped")
+    parser.add_argument("--seconds", type=float, default=20.0, help="measurement window, once all arms work")
+    parser.add_argument("--rate", type=float, default=10.0, help="states per arm and second")
+    parser.add_argument("--plain", action="store_true", help="listen without recovery of dropped messages")
     parser.add_argument("--speed", type=float, default=1.0, help="fleet seconds per real second")
     options = parser.parse_args()
     names = [f"arm_{i:02d}" for i in range(options.arms)]
     size = len(encode(State("arm_00", 1000, 123.456789, "working", *[(12.345678901234567,) * JOINTS] * 1, 12.3456789)))
-    size += 4 * JOINTS * 20  # joint positions, speeds, torques and currents, as a simulated arm tells them
+    size += 4 * JOINTS * 20  # joint positions, speeds, torques and currents, as published by a simulated arm
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         supervisor = stack.enter_context(Supervisor(folder / "logs"))
@@ -196,7 +198,7 @@ def main() -> None:
         supervisor.await_ready("router", START_S)
         bare = (sys.executable, "-c", BARE, endpoint, str(size), str(options.rate))
         supervisor.start(Part(name="bare", argv=bare, ready="ready"), ready_s=START_S)
-        dealer = Dealer(stack.enter_context(Link(endpoint, FLEET)), options.speed, 0 if options.plain else 1)
+        dealer = Dealer(stack.enter_context(BusClient(endpoint, FLEET)), options.speed, 0 if options.plain else 1)
         parts = arms_of(folder, names, endpoint, options)
         began_s = time.monotonic()
         for part in parts:
@@ -209,7 +211,7 @@ def main() -> None:
             dealer.deal(name)
         dealer.serve(START_S, lambda: len(dealer.working) == len(names) or bool(dealer.refused))
         assert not dealer.refused, dealer.refused[0]
-        assert len(dealer.working) == len(names), f"{len(dealer.working)} of {len(names)} arms are at work"
+        assert len(dealer.working) == len(names), f"{len(dealer.working)} of {len(names)} arms work"
         dealer.serve(SETTLE_S)
         pids = {name: supervisor.pid(name) or 0 for name in (*names, "bare", "router")} | {"this": os.getpid()}
         before = {name: cpu_s(pid) for name, pid in pids.items()}
@@ -227,24 +229,26 @@ def main() -> None:
     came = sum(map(len, ticks.values()))
     said = sum(last - first + 1 for first, last in bounds.values())
     orderly = all(b > a for of in ticks.values() for a, b in pairwise(of))
-    told_hz = [(last - first) / took_s for first, last in bounds.values()]
+    said_hz = [(last - first) / took_s for first, last in bounds.values()]
     arms = [100 * share[name] for name in names]
     print(f"{len(names)} arms, {os.cpu_count()} cores, {options.rate:g} Hz, speed {options.speed:g}, {took_s:.1f} s;")
-    print(f"all ready {started_s:.1f} s after the first was started; {still} at work at the end\n")
-    print(f"{'each arm':<36}{'median':>10}{'p95':>10}{'most':>10}")
+    print(f"all ready {started_s:.1f} s after the first start; {still} working at the end\n")
+    print(f"{'each arm':<36}{'median':>10}{'p95':>10}{'max':>10}")
     print(row("processor, % of a core", arms))
     print(row("RSS, MB", [memory[name][0] for name in names], "{:.1f}"))
     print(row("PSS, MB", [memory[name][1] for name in names], "{:.1f}"))
     print(row("threads", [float(memory[name][2]) for name in names], "{:.0f}"))
-    print(row("words a second", told_hz))
-    print(f"\n{'beside them':<36}{'% of core':>10}{'RSS MB':>10}{'PSS MB':>10}")
+    print(row("states per second", said_hz))
+    print(f"\n{'other processes':<36}{'% of core':>10}{'RSS MB':>10}{'PSS MB':>10}")
     for what, name in (("bare publisher", "bare"), ("router", "router"), ("dealer and listener", "this")):
         print(f"{what:<36}{100 * share[name]:>10.2f}{memory[name][0]:>10.1f}{memory[name][1]:>10.1f}")
     print(f"\nall arms: {sum(arms) / 100:.2f} cores, {sum(memory[name][1] for name in names):.0f} MB (PSS)")
     print(f"delivered: {came} of {said} ({came / max(said, 1):.2%}){'' if orderly else ', out of order'}")
-    told = {True: "met", False: "missed"}
-    everything = came == said and orderly and len(bounds) == len(names)
-    print(f"targets: 100 % delivered: {told[everything]}; <= 4 % of a core each: {told[max(arms) <= 100 * TARGET]}")
+    verdict = {True: "met", False: "missed"}
+    delivered = came == said and orderly and len(bounds) == len(names)
+    print(
+        f"targets: 100 % delivered: {verdict[delivered]}; <= 4 % of a core each: {verdict[max(arms) <= 100 * TARGET]}"
+    )
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""How soon a difficulty that one process says is used by another, beside bare Zenoh in the same run.
+"""Latency of a difficulty message from one process to another, beside bare Zenoh in the same run.
 
     python benchmarks/bench_link.py [--words 1500] [--rate 100]
 
-A speaker and a listener, each a process of its own, meet at a router in a third. The speaker takes turns: a word by
-`Link` (checked, remembered for late joiners, JSON) and the same bytes by a bare Zenoh publisher into a bare callback.
-Both carry the monotonic clock, which processes of one machine share; a word counts as used when the listener's handler
-has it as a checked message. Microseconds; the target is the ratio.
+A publisher and a listener, in separate processes, connect to a router in a third. The publisher alternates between a
+message by `BusClient` (validated, kept for late joiners, JSON) and the same bytes by a bare Zenoh publisher to a bare
+callback. Both carry the monotonic clock, which the processes of one machine share. A message counts as used when the
+listener's handler has it validated. Microseconds; the target is the ratio.
 """
 
 import argparse
@@ -15,10 +15,10 @@ import statistics
 import time
 from multiprocessing.connection import Connection
 
-from fleet.bus import keys
-from fleet.bus.link import Link
-from fleet.bus.messages import DifficultyWord, encode
-from fleet.bus.router import Router, open_client
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.router import Router, open_client
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.messages import DifficultyScores, encode
 
 FLEET = "bench"
 SLOTS = 8
@@ -26,30 +26,30 @@ TARGET = 1.5
 PATIENCE_S = 30.0
 
 
-def word(tick: int) -> DifficultyWord:
-    """What an arm says of eight jobs, at this moment."""
+def word(tick: int) -> DifficultyScores:
+    """Difficulties of eight jobs, with the present time."""
     jobs = tuple(f"hold_at_fixture-{slot:03d}" for slot in range(SLOTS))
     scores = tuple(0.1 * slot + 2.0 for slot in range(SLOTS))
-    return DifficultyWord("arm_0", tick, time.monotonic(), "0123456789abcdef", jobs, scores, scores)
+    return DifficultyScores("arm_0", tick, time.monotonic(), "0123456789abcdef", jobs, scores, scores)
 
 
 def listen(endpoint: str, words: int, pipe: Connection) -> None:
-    """Take both kinds and send back how old each was, s."""
+    """Receive both kinds of message and send back their ages, s."""
     ours: list[float] = []
     bare: list[float] = []
-    with Link(endpoint, FLEET) as link, open_client(endpoint, timeout_s=10.0) as session:
-        link.listen(
+    with BusClient(endpoint, FLEET) as link, open_client(endpoint, timeout_s=10.0) as session:
+        link.subscribe(
             keys.of_every_arm(FLEET, "difficulty"),
-            DifficultyWord,
+            DifficultyScores,
             lambda _, said: ours.append(time.monotonic() - said.time_s),
-            remembered=1,
+            history=True,
         )
 
         def took(sample: object) -> None:
             bare.append(time.monotonic() - json.loads(sample.payload.to_bytes())["time_s"])  # type: ignore[attr-defined]
 
         subscriber = session.declare_subscriber("bare/difficulty", took)
-        link.alive(keys.of_arm(FLEET, "listener", "alive"))
+        link.declare_token(keys.of_arm(FLEET, "listener", "alive"))
         pipe.send("ready")
         deadline_s = time.monotonic() + PATIENCE_S
         while len(ours) < words and time.monotonic() < deadline_s:
@@ -62,7 +62,7 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--words", type=int, default=1500)
-    parser.add_argument("--rate", type=float, default=100.0, help="words of each kind a second")
+    parser.add_argument("--rate", type=float, default=100.0, help="messages of each kind per second")
     arguments = parser.parse_args()
     spawn = multiprocessing.get_context("spawn")
     router_end, router_other = spawn.Pipe()
@@ -73,11 +73,11 @@ def main() -> None:
     listener = spawn.Process(target=listen, args=(endpoint, arguments.words, there), daemon=True)
     listener.start()
     assert here.recv() == "ready"
-    with Link(endpoint, FLEET) as link, open_client(endpoint, timeout_s=10.0) as session:
-        say = link.publisher(keys.of_arm(FLEET, "arm_0", "difficulty"), DifficultyWord, remember=1)
+    with BusClient(endpoint, FLEET) as link, open_client(endpoint, timeout_s=10.0) as session:
+        say = link.publisher(keys.of_arm(FLEET, "arm_0", "difficulty"), DifficultyScores)
         put = session.declare_publisher("bare/difficulty")
         seen: list[str] = []
-        link.watch(keys.of_every_arm(FLEET, "alive"), lambda arm, _: seen.append(arm))
+        link.watch_tokens(keys.of_every_arm(FLEET, "alive"), lambda arm, _: seen.append(arm))
         due_s = time.monotonic() + 0.5
         link.serve(due_s)
         for tick in range(arguments.words):
@@ -88,8 +88,8 @@ def main() -> None:
                 speak()
         ours, bare = here.recv()
     router_end.send("end")
-    print(f"{'one way, us':<26}{'words':>7}{'p50':>8}{'p99':>9}")
-    rows = {"bare put → callback": bare, "ours, said → used": ours}
+    print(f"{'one way, us':<26}{'count':>7}{'p50':>8}{'p99':>9}")
+    rows = {"bare put → callback": bare, "ours, publish → used": ours}
     quantiles: dict[str, list[float]] = {}
     for name, ages in rows.items():
         cuts = statistics.quantiles(ages, n=100)

@@ -1,11 +1,10 @@
-"""What the closed loop costs: simulated steps per second of the MuJoCo plant, beside bare `mj_step` of its scene.
+"""Speed of closed-loop simulation: steps per second of the MuJoCo plant, beside bare `mj_step` of its scene.
 
     python benchmarks/bench_plant.py
 
-The plant is driven through ticks of the quickstart scenario in which its arms are at work: references, control, payload
-switches, simulation and heat. Bare is MuJoCo's own loop (`mj_step(model, data, nstep)`) over the same model and as
-many steps, with the arms held at home; contacts, of which there are none, are off in both. The two take turns, on one
-core; speeds are medians.
+The plant is driven through ticks of the quickstart scenario in which its arms work: references, control, payload
+changes, simulation and heat. Bare is MuJoCo's own loop (`mj_step(model, data, nstep)`) with the same model and number
+of steps and the arms held at home; contacts are disabled in both. The two alternate on one core; speeds are medians.
 """
 
 # MuJoCo is compiled and ships no type stubs.
@@ -23,27 +22,28 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from agents.rules import make_policy
-from fleet.sim.kernel import Step
-from fleet.sim.mujoco_plant import MujocoPlant
-from scenarios.build import ShiftFactory, env_of, prepare
+from agents.registry import make_policy
+from fleet.engine.state import State
+from fleet.physics.mujoco_plant import MujocoPlant
 from scenarios.load import load
+from scenarios.prepare.fleet import ShiftFactory, env_of, prepare
 
 TICKS = 20
 RUNS = 9
 
 
-def at_work(factory: ShiftFactory) -> list[Step]:
-    """The first steps of a shift, as the profile plant works it."""
-    steps: list[Step] = []
+def at_work(factory: ShiftFactory) -> list[State]:
+    """States in the first steps of a shift with the profile plant."""
+    states: list[State] = []
     policy = make_policy("round_robin")
     policy.reset(np.random.default_rng(0))
-    env = env_of(factory.fleet, watch=steps.append, max_cycles=TICKS)
+    env = env_of(factory.fleet, max_cycles=TICKS)
     env.reset(seed=0)
     while env.agents:
+        states.append(env.truth)
         env.step(policy.act(env.knowledge()))
     env.close()
-    return steps
+    return states
 
 
 def seconds(call: Callable[[], object]) -> float:
@@ -56,13 +56,13 @@ def seconds(call: Callable[[], object]) -> float:
 def measure(arms: int) -> str:
     """One row of the table."""
     base = load("quickstart")
-    # Everything is there from the start, so that the arms work.
+    # All jobs are released at the start, so that the arms work.
     jobs = tuple(
         replace(s, arrivals=replace(s.arrivals, kind="batch", every_s=None, count=4), repetitions=(40, 40))
         for s in base.jobs
     )
     fleet = prepare(replace(base, arms=base.arms[:arms], jobs=jobs, horizon_s=TICKS * 10.0), difficulty="blind")
-    steps = at_work(ShiftFactory(fleet))
+    states = at_work(ShiftFactory(fleet))
     episode = ShiftFactory(fleet, "mujoco")(np.random.SeedSequence(0))
     plant, world = episode.plant, episode.world
     assert isinstance(plant, MujocoPlant)
@@ -70,8 +70,8 @@ def measure(arms: int) -> str:
     held.qpos[:] = held.ctrl[:] = np.concatenate([arm.robot.home_q() for arm in fleet.arms])
 
     def driven() -> None:
-        for done in steps:
-            plant.drive(world, done.began, done.path)
+        for state in states:
+            plant.drive(world, state)
 
     speeds = [
         (count / seconds(lambda: mujoco.mj_step(plant.model, held, count)), count / seconds(driven))
@@ -79,7 +79,7 @@ def measure(arms: int) -> str:
     ]
     bare, ours = (statistics.median(column) for column in zip(*speeds, strict=True))
     ratio = statistics.median(b / a for a, b in speeds)
-    busy = np.mean([done.began.mode[0] == 1 for done in steps])
+    busy = np.mean([state.mode[0] == 1 for state in states])
     real_time = ours * plant.model.opt.timestep
     return f"{arms:>5}{busy:>8.0%}{bare:>16,.0f}{ours:>16,.0f}{ratio:>9.2f}{real_time:>13,.0f} x"
 

@@ -1,10 +1,10 @@
-"""What a shift of eight hours costs on one core, from the first decision to the metrics.
+"""CPU time of a shift of eight hours on one core, from the first decision to the metrics.
 
     python benchmarks/bench_shift.py
 
 The quickstart scenario over 8 h with its 4 arms, and with four such cells side by side; no twin, exchange in memory,
-round robin. Plans are made before the clock starts. Recording keeps a sensor reading per second and arm. The arms do
-as planned (profile plant); for the closed loop see bench_plant.py.
+round robin. Planning is not timed. Recording keeps one sensor reading per second and arm. The arms follow their plans
+exactly (profile plant); bench_plant.py measures the closed loop.
 """
 
 import os
@@ -17,21 +17,21 @@ from dataclasses import replace
 from typing import TypeVar
 
 from fleet.job import Place
-from scenarios.build import Fleet, prepare
 from scenarios.load import load
-from scenarios.run import RunSpec, run
-from scenarios.scenario import ArmSpec, Scenario
+from scenarios.prepare.fleet import Fleet, prepare
+from scenarios.run.shift import RunSpec, run
+from scenarios.schema import ArmSpec, Scenario
 
 HOURS = 8
 RUNS = 3
 CELL_M = 5.0
-"""From cell to cell; no arm reaches into the next."""
+"""Distance between cells; no arm reaches into the next."""
 
 Standing = TypeVar("Standing", Place, ArmSpec)
 
 
 def side_by_side(base: Scenario, cells: int) -> Scenario:
-    """So many copies of a cell in a row, each with its own arms, places and jobs, as one scenario."""
+    """Scenario with `cells` copies of a cell in a row, each with its own arms, places and jobs."""
 
     def moved(thing: Standing, cell: int) -> Standing:
         x, y, z = thing.position_m

@@ -1,11 +1,11 @@
-"""What TLS, rules and limits cost: a round trip through the router and the opening of a line, beside bare Zenoh.
+"""Cost of TLS, access rules and rate limits: a round trip through the router and opening a session, beside bare Zenoh.
 
     python benchmarks/bench_tls.py [--rounds 2000] [--opens 40]
 
 Three routers in one process on loopback: bare Zenoh, ours with plain TCP (size and rate limits), ours with mutual TLS
-(limits, and the rules of a fleet of 16 arms). A round trip is a put of 256 bytes from one client through the router to
-another, whose callback puts it back; `open` is `zenoh.open` of a client with all checks of its certificate. The three
-take turns, so that a busy machine slows them alike.
+(limits, and the access rules of a fleet of 16 arms). A round trip is a put of 256 bytes from one client through the
+router to another, whose callback puts it back; `open` is `zenoh.open` of a client with all checks of its certificate.
+The three alternate, so that other load slows them equally.
 """
 
 import argparse
@@ -19,12 +19,12 @@ from pathlib import Path
 
 import zenoh
 
-from fleet.bus import keys
-from fleet.bus.keyring import make
-from fleet.bus.limits import Limits
-from fleet.bus.roster import of_arms
-from fleet.bus.router import Router, open_client
-from fleet.bus.security import Tls
+from fleet.bus.client.rate_limits import Limits
+from fleet.bus.client.router import Router, open_client
+from fleet.bus.protocol import keys
+from fleet.bus.security.access_control import of_arms
+from fleet.bus.security.keyring import make
+from fleet.bus.security.tls import Tls
 
 ARMS = [f"arm_{i}" for i in range(16)]
 PATIENT_S = 20.0
@@ -34,7 +34,7 @@ QUIET = {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": Fals
 
 
 class PingPong:
-    """Two arms that throw a word to and fro under their own keys."""
+    """Two arms that exchange messages on their own keys."""
 
     def __init__(self, open_arm: Callable[[str], zenoh.Session], stack: ExitStack) -> None:
         one, other = (stack.enter_context(open_arm(name)) for name in ARMS[:2])
@@ -45,8 +45,8 @@ class PingPong:
         heard = zenoh.handlers.Callback(lambda sample: answer.put(sample.payload), indirect=False)
         ended = zenoh.handlers.Callback(lambda _: self._came.put(None), indirect=False)
         self._kept = (other.declare_subscriber(there, heard), one.declare_subscriber(back, ended))
-        for session in (one, other):  # answered in order: what was declared is known to the router
-            list(session.get(keys.caches_of("thermofleet/v1/bench/arm/nobody"), timeout=PATIENT_S))
+        for session in (one, other):  # replies come in order, so the router knows the declarations
+            list(session.get(keys.caches_of("thermofleet/v2/bench/arm/nobody"), timeout=PATIENT_S))
 
     def round_s(self) -> float:
         """Seconds of one round trip."""
@@ -57,7 +57,7 @@ class PingPong:
 
 
 def bare_router(stack: ExitStack) -> str:
-    """A router with nothing of ours; its endpoint."""
+    """Endpoint of a plain Zenoh router."""
     config = {
         "mode": "router",
         "listen": {"endpoints": ["tcp/127.0.0.1:0"]},
@@ -72,7 +72,7 @@ def bare_router(stack: ExitStack) -> str:
 
 
 def bare_client(endpoint: str) -> zenoh.Session:
-    """A client with nothing of ours."""
+    """A plain Zenoh client."""
     config = {
         "mode": "client",
         "connect": {"endpoints": [endpoint]},
@@ -83,7 +83,7 @@ def bare_client(endpoint: str) -> zenoh.Session:
 
 
 def opened_s(open_arm: Callable[[str], zenoh.Session]) -> float:
-    """Seconds that opening one line takes."""
+    """Duration of opening a session, s."""
     began_s = time.perf_counter()
     with open_arm(ARMS[2]):
         return time.perf_counter() - began_s

@@ -1,11 +1,11 @@
-"""Whether the arms' P(saturation) can be trusted at work: what they said at each award, and what became of it.
+"""Calibration of the arms' P(saturation) in shifts: the probability at each award against the outcome.
 
     python benchmarks/bench_trust.py [quickstart] [--seeds 10] [--first-seed 100]
 
-Every shift runs under `round_robin`, which takes no notice of the probability. A job counts when its arm said a
-probability and was below the warning limit; it passed when the arm gave a warning before it was done with the job. The
-models learned from rehearsed jobs only, in other air and from other starts. Beside P: the paper's sum d, for ranking,
-and saying the same for every job, for the Brier score.
+Every shift runs with `round_robin`, which ignores the probability. A job counts if its arm had a probability and was
+below the warning limit at the award; it passed if the arm gave a warning before the end of the job. The models learned
+from simulated past jobs only, at other ambient temperatures and other starts. Beside P: the paper's sum d, for ranking,
+and one constant probability for all jobs, for the Brier score.
 """
 
 import argparse
@@ -15,15 +15,15 @@ from rich.console import Console
 from rich.table import Table
 from sklearn.metrics import average_precision_score, roc_auc_score
 
-from scenarios.build import Fleet, env_of, prepare
+from scenarios.cli.terminal import progress_bar
 from scenarios.load import load
-from scenarios.policies import policy_of
-from scenarios.terminal import progress_bar
-from twin.reliability import brier, calibration_error, reliability
+from scenarios.policy_loader import policy_of
+from scenarios.prepare.fleet import Fleet, env_of, prepare
+from twin.saturation.reliability import brier, reliability
 
 POLICY = "round_robin"
 UNKNOWN = 0.5
-"""What an observation holds where the arm has no probability (`fleet.env.observation.FIELDS`)."""
+"""Value of an observation without a probability (`fleet.observation.FIELDS`)."""
 
 
 def awards(fleet: Fleet, seed: int) -> list[tuple[float, float, bool]]:
@@ -31,7 +31,7 @@ def awards(fleet: Fleet, seed: int) -> list[tuple[float, float, bool]]:
     policy = policy_of(POLICY)
     policy.reset(np.random.default_rng(seed))
     env = env_of(fleet, keep_events=True)
-    told: dict[tuple[str, str, float], tuple[float, float]] = {}
+    scores: dict[tuple[str, str, float], tuple[float, float]] = {}
     try:
         env.reset(seed=seed)
         while env.agents:
@@ -45,18 +45,18 @@ def awards(fleet: Fleet, seed: int) -> list[tuple[float, float, bool]]:
                     slot = actions[event.arm] - 1
                     p, d = float(before.p_saturation[slot]), float(before.difficulty[slot])
                     if p != UNKNOWN:
-                        told[event.arm, event.job, event.time_s] = p, d
+                        scores[event.arm, event.job, event.time_s] = p, d
         ends = [e for e in env.events if e.kind in ("home", "return")]
         warnings = [e for e in env.events if e.kind == "warning"]
     finally:
         env.close()
-    found = []
-    for (arm, job, begun_s), (p, d) in told.items():
+    rows = []
+    for (arm, job, begun_s), (p, d) in scores.items():
         own_ends = [e.time_s for e in ends if e.arm == arm and e.job == job and e.time_s > begun_s]
         until_s = min(own_ends, default=np.inf)
         passed = any(e.arm == arm and begun_s <= e.time_s <= until_s for e in warnings)
-        found.append((p, d, passed))
-    return found
+        rows.append((p, d, passed))
+    return rows
 
 
 def main() -> None:
@@ -75,15 +75,15 @@ def main() -> None:
     share = event.mean()
     console.print(f"{given.scenario}, seeds {seeds.start} to {seeds.stop - 1}: {len(p)} awards, {share:.1%} passed.")
     if not 0 < share < 1:
-        console.print("Nothing to tell apart.")
+        console.print("All jobs have the same outcome: there is nothing to rank.")
         return
-    table = Table("", "P(saturation)", "d (paper)", "the same for all", box=None)
+    table = Table("", "P(saturation)", "d (paper)", "constant", box=None)
     table.add_row("AUROC", f"{roc_auc_score(event, p):.3f}", f"{roc_auc_score(event, d):.3f}", "0.500")
     table.add_row(
         "AUPRC", f"{average_precision_score(event, p):.3f}", f"{average_precision_score(event, d):.3f}", f"{share:.3f}"
     )
     table.add_row("Brier", f"{brier(p, event):.4f}", "", f"{share * (1 - share):.4f}")
-    table.add_row("ECE", f"{calibration_error(p, event):.4f}", "", "0.0000")
+    table.add_row("ECE", f"{reliability(p, event).error:.4f}", "", "0.0000")
     console.print(table)
     bins = Table("mean P", "share that passed", "95 % interval", "awards", box=None)
     found = reliability(p, event)

@@ -1,11 +1,11 @@
-"""What a twin costs: a training step, the training of seven joints, and scoring, beside plain `nn.LSTM` and the floor.
+"""Cost of a twin: a training step, the training of seven joints, and scoring, beside plain `nn.LSTM` and a lower bound.
 
     python benchmarks/bench_twin.py [--full]
 
-CPU time on one core, medians; ours and the others take turns. Plain is `nn.LSTM` autoencoding with nothing around it:
-encoder, linear layers, decoder, loss and backward, or the forward pass alone. The floor is the matrix multiplications
-of the same passes alone, as `torch.mm` of their shapes. Training is projected from its steps; --full does it, on random
-smooth motion. A job of the target has four windows; that of a real plan is the median of the quickstart's.
+CPU time on one core, medians; ours and the others alternate. Plain is a bare `nn.LSTM` autoencoder: encoder, linear
+layers, decoder, loss and backward pass, or the forward pass alone. The lower bound ("floor") is the matrix
+multiplications of the same passes, as `torch.mm` of their shapes. Training is extrapolated from its steps; --full runs
+it on random smooth motion. A job of the target has four windows; a real plan has the median number of the quickstart's.
 """
 
 import os
@@ -22,12 +22,12 @@ import torch
 from torch import Tensor
 
 from fleet.motion import RATE_HZ
-from twin.export import export_onnx
-from twin.forward import Networks
-from twin.model import LstmVae, TwinConfig, build
-from twin.score import Fit, Twin
-from twin.train import Run, train
-from twin.window import Scaler
+from twin.vae.inference import reconstruct
+from twin.vae.model import LstmVae, TwinConfig, build
+from twin.vae.onnx import export_onnx
+from twin.vae.train import Run, train
+from twin.vae.twin import Fit, Twin
+from twin.vae.window import Scaler
 
 JOINTS = 7
 RUNS = 15
@@ -41,7 +41,7 @@ def seconds(call: Callable[[], object]) -> float:
 
 
 def in_turns(calls: dict[str, Callable[[], object]], runs: int) -> dict[str, float]:
-    """Median CPU time of each call, s, after one that does not count."""
+    """Median CPU time of each call, s, after a warm-up call."""
     for call in calls.values():
         call()
     times: dict[str, list[float]] = {name: [] for name in calls}
@@ -52,11 +52,11 @@ def in_turns(calls: dict[str, Callable[[], object]], runs: int) -> dict[str, flo
 
 
 def plain_forward(net: LstmVae, x: Tensor) -> Tensor:
-    """The same layers in the plainest words."""
+    """Forward pass of the same layers without our code."""
     _, (last, _) = net.encoder(x)
     latent = net.mu(torch.tanh(net.summary(last[-1])))
-    told = torch.tanh(net.expand(latent))[:, None].expand(-1, x.shape[1], -1)
-    return net.out(net.decoder(told)[0])
+    expanded = torch.tanh(net.expand(latent))[:, None].expand(-1, x.shape[1], -1)
+    return net.out(net.decoder(expanded)[0])
 
 
 def plain_step(net: LstmVae, x: Tensor, optimizer: torch.optim.Optimizer) -> None:
@@ -67,7 +67,7 @@ def plain_step(net: LstmVae, x: Tensor, optimizer: torch.optim.Optimizer) -> Non
 
 
 def floor(config: TwinConfig, batch: int, passes: int, nets: int) -> Callable[[], None]:
-    """The recurrent multiplications of encoder and decoder, one time step after another, so many times over."""
+    """The recurrent multiplications of encoder and decoder, step by step, for all passes and networks."""
     hidden, weight = torch.randn(batch, config.hidden), torch.randn(config.hidden, 4 * config.hidden)
     out = torch.empty(batch, 4 * config.hidden)
 
@@ -88,7 +88,7 @@ def smooth(rng: np.random.Generator, length_s: float) -> np.ndarray:
 
 
 def untrained(config: TwinConfig) -> Twin:
-    """Random weights cost as much as good ones."""
+    """A twin with random weights, which cost as much as trained ones."""
     scaler = Scaler(np.zeros(JOINTS), np.zeros((JOINTS, 3)), np.ones((JOINTS, 3)), np.zeros(JOINTS, dtype=bool))
     count, channels = config.networks(JOINTS), config.channels(JOINTS)
     nets = [build(config, seed, channels=channels) for seed in range(count)]
@@ -97,7 +97,7 @@ def untrained(config: TwinConfig) -> Twin:
 
 
 def training(config: TwinConfig, name: str) -> None:
-    """A step beside plain, and what it makes of a whole training."""
+    """Duration of a training step beside plain, and of a whole training."""
     channels, nets = config.channels(JOINTS), config.networks(JOINTS)
     x = torch.randn(config.batch, config.window, channels)
     run = Run(x, torch.zeros(channels), TwinConfig(**{**vars(config), "epochs": 10_000}), seed=0)
@@ -125,7 +125,6 @@ def scoring(config: TwinConfig, name: str, windows: int, runs: int) -> None:
     """Reconstruction beside plain forward passes, the floor and ONNX Runtime."""
     twin = untrained(config)
     z = np.random.default_rng(0).standard_normal((windows, config.window, JOINTS, 3)).astype(np.float32)
-    networks = Networks(twin.nets)
     parts = [
         torch.from_numpy(np.ascontiguousarray(x))
         for x in np.moveaxis(z.reshape(*z.shape[:2], len(twin.nets), -1), 2, 0)
@@ -138,7 +137,7 @@ def scoring(config: TwinConfig, name: str, windows: int, runs: int) -> None:
 
     calls: dict[str, Callable[[], object]] = {
         "features": lambda: twin.window_features(z),
-        "ours": lambda: networks.reconstruct(z),
+        "ours": lambda: reconstruct(twin.networks, z),
         "plain": plain,
         "floor": floor(config, windows, 1, len(twin.nets)),
     }
@@ -148,7 +147,7 @@ def scoring(config: TwinConfig, name: str, windows: int, runs: int) -> None:
 
 
 def _onnx(twin: Twin, z: np.ndarray) -> dict[str, Callable[[], object]]:
-    """The exported twin, if ONNX Runtime is there."""
+    """The exported twin, if ONNX Runtime is installed."""
     try:
         import onnxruntime
     except ImportError:

@@ -1,8 +1,8 @@
-"""How fast other environments step, each measured by this program of its own: one line with steps per CPU-second.
+"""Steps per CPU-second of other environments, each measured in a separate process; prints one line.
 
     python benchmarks/peers.py mpe|rware|vmas ENVS
 
-They are no part of thermofleet and nothing of it imports them; `make bench-env` installs them. VMAS is under GPL-3.
+They are not part of thermofleet and it imports none of them; `make bench-env` installs them. VMAS is under GPL-3.
 """
 
 import os
@@ -23,7 +23,7 @@ WINDOWS, WINDOW_S = 3, 1.5
 
 
 def rate(step: Callable[[], None], envs: int) -> float:
-    """Env steps per CPU-second, median of the windows, after one that does not count."""
+    """Env steps per CPU-second, median of the windows after a warm-up window."""
     found = []
     for _ in range(WINDOWS + 1):
         begin, steps = time.process_time(), 0
@@ -35,7 +35,7 @@ def rate(step: Callable[[], None], envs: int) -> float:
 
 
 def mpe() -> Callable[[], None]:
-    """PettingZoo's MPE simple_spread, parallel, as it comes: three agents, 25 cycles."""
+    """PettingZoo's MPE simple_spread, parallel, with defaults: three agents, 25 cycles."""
     from mpe2 import simple_spread_v3
 
     env, rng = simple_spread_v3.parallel_env(), np.random.default_rng(0)
@@ -67,7 +67,7 @@ def rware() -> Callable[[], None]:
 
 
 def vmas(envs: int) -> Callable[[], None]:
-    """VMAS simple_spread with its own random actions, begun anew every 100 steps."""
+    """VMAS simple_spread with its own random actions, reset every 100 steps."""
     import torch
     from vmas import make_env
 
@@ -86,7 +86,7 @@ def vmas(envs: int) -> Callable[[], None]:
 
 
 def main() -> None:
-    """One peer, as named."""
+    """Measure the named peer."""
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     name, envs = sys.argv[1], int(sys.argv[2])
     step = {"mpe": mpe, "rware": rware, "vmas": lambda: vmas(envs)}[name]()

@@ -1,14 +1,14 @@
 // Watch a fleet from Node (18 or newer), with no package at all, through `thermofleet gateway`.
 //
-//     node examples/monitor.mjs http://127.0.0.1:8080/v1 [seconds]
+//     node examples/monitor.mjs http://127.0.0.1:8080/v2 [seconds]
 //
 // Reads the stream of server-sent events and prints a table every second. When the stream breaks it comes back and says
 // the last number it has seen, so no event is missed. A token, if the gateway wants one: THERMOFLEET_TOKEN.
 
-const [base = "http://127.0.0.1:8080/v1", seconds = "0"] = process.argv.slice(2);
+const [base = "http://127.0.0.1:8080/v2", seconds = "0"] = process.argv.slice(2);
 const arms = new Map(); // name -> what is known of it
 const jobs = new Map(); // name -> state
-let last = ""; // number of the last word
+let last = ""; // number of the last message
 
 const headers = () => ({
   Accept: "text/event-stream",
@@ -21,26 +21,26 @@ function arm(name) {
   return arms.get(name);
 }
 
-// One word of the stream: {name, word}, the word as docs/bus.md has it.
-function heard(topic, { name, word }) {
+// One message of the stream: {name, message}, the message as docs/bus.md has it.
+function heard(topic, { name, message }) {
   if (topic === "state") {
-    const hottest = Math.max(...word.temp_c);
+    const hottest = Math.max(...message.temp_c);
     Object.assign(arm(name), {
-      mode: word.mode,
+      mode: message.mode,
       "hottest °C": hottest.toFixed(1),
-      joint: word.temp_c.indexOf(hottest) + 1,
-      headroom: word.headroom_k.toFixed(1),
-      job: word.job ?? "", // left out when there is none
+      joint: message.temp_c.indexOf(hottest) + 1,
+      headroom: message.headroom_k.toFixed(1),
+      job: message.job ?? "", // left out when there is none
     });
   } else if (topic === "difficulty") {
-    const scores = word.jobs.map((job, i) => [job, word.difficulty[i]]).filter(([, d]) => d !== null);
+    const scores = message.jobs.map((job, i) => [job, message.difficulty[i]]).filter(([, d]) => d !== null);
     arm(name).difficulty = scores.map(([job, d]) => `${job} ${d.toFixed(2)}`).join(", ");
-  } else if (topic === "presence" && word.role === "arm") {
-    arm(word.name).token = word.there ? "yes" : "no";
+  } else if (topic === "presence" && message.role === "arm") {
+    arm(message.name).token = message.there ? "yes" : "no";
   } else if (topic === "result") {
-    jobs.set(word.status.job, word.status.state);
+    jobs.set(message.status.job, message.status.state);
   } else if (topic === "event") {
-    console.log(`${word.time_s.toFixed(0)} s  ${name}: ${word.kind} ${word.job ?? ""} ${word.reason ?? ""}`);
+    console.log(`${message.time_s.toFixed(0)} s  ${name}: ${message.kind} ${message.job ?? ""} ${message.reason ?? ""}`);
   }
 }
 

@@ -12,7 +12,7 @@ import sys
 
 import zenoh
 
-ARMS, AUCTIONS = "thermofleet/v1/*/arm/*/{}", "thermofleet/v1/*/auction/*/{}"
+ARMS, AUCTIONS = "thermofleet/v2/*/arm/*/{}", "thermofleet/v2/*/auction/*/{}"
 WAIT_S = 600.0
 """For the fleet to come: at first it trains its twins."""
 QUIET_S = 5.0

@@ -23,7 +23,7 @@ class Allocator:
     """All that it knows; its methods run on one thread, questions to arms may wait."""
 
     def __init__(self, session, fleet):
-        self.session, self.root = session, f"thermofleet/v1/{quote(fleet, safe='')}"
+        self.session, self.root = session, f"thermofleet/v2/{quote(fleet, safe='')}"
         self.mine = f"{self.root}/auction/{ME}"
         self.inbox, self.started_s = queue.SimpleQueue(), time.monotonic()
         self.jobs = {}  # name -> job as it was handed in
@@ -42,7 +42,7 @@ class Allocator:
             if reply.ok is not None:  # one about to show its token, or an arm that answers for all
                 sys.exit(f"Somebody answers {reply.ok.key_expr} already: a fleet has one who shares the jobs out.")
         places = {
-            f"{self.root}/jobs/submit": ("Submission", "Submitted", self.submit),
+            f"{self.root}/jobs/submit": ("Submission", "SubmissionReply", self.submit),
             f"{self.root}/jobs/status": ("StatusRequest", "Status", self.tell),
             f"{self.root}/clock/now": ("ClockRequest", "Clock", lambda _: {"time_s": self.now_s(), "speed": 1.0}),
             f"{self.mine}/lease/*": ("LeaseRequest", "Lease", self.lease),
@@ -129,8 +129,8 @@ class Allocator:
         quotes = self.ask(f"{self.root}/arm/*/quote", "QuoteRequest", {"auction": name, "jobs": waiting}, WINDOW_S)
         free = {arm: quote["capacity"] for arm, quote in quotes.items()}
         for index, job in enumerate(waiting):
-            offers = {arm: quote["offers"][index] for arm, quote in quotes.items() if free[arm] > 0}
-            easy = [(o.get("d") or 0.0, arm) for arm, o in offers.items() if o["feasible"]]
+            offers = {arm: quote["estimates"][index] for arm, quote in quotes.items() if free[arm] > 0}
+            easy = [(o.get("difficulty") or 0.0, arm) for arm, o in offers.items() if o["feasible"]]
             if easy and taken.isdisjoint(job["places"]):  # a station serves one arm at a time
                 _, arm = min(easy)
                 free[arm] -= 1
@@ -175,7 +175,7 @@ class Allocator:
     def lease(self, word):
         """May the arm go on? Our count begins at the answer, the arm's at its question: the arm's ends first."""
         granted, lost, leave = [], [], []
-        for hold in word["holds"]:
+        for hold in word["entries"]:
             award = self.award_of.get(hold["award"])
             if award is None or award["arm"] != word["arm"]:
                 lost.append(hold["award"])
@@ -188,7 +188,7 @@ class Allocator:
                 leave.append(hold["award"])
                 if status["state"] != "finishing":
                     self.now_stands(award["job"], state="finishing")
-        return {"auctioneer": ME, "lease_s": LEASE_S, "granted": granted, "lost": lost, "leave": leave}
+        return {"auctioneer": ME, "lease_s": LEASE_S, "granted": granted, "revoked": lost, "may_commit": leave}
 
     def expire(self):
         """Awards whose lease has ended: the job waits again; but not if its arm had leave to finish."""
@@ -245,7 +245,7 @@ class Allocator:
 
 def encoding(kind):
     """What every word carries beside its payload; others are refused."""
-    return f"application/json;thermofleet.{kind}.v1"
+    return f"application/json;thermofleet.{kind}.v2"
 
 
 def main(port, fleet, seconds=float("inf")):

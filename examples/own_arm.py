@@ -27,7 +27,7 @@ class Arm:
 
     def __init__(self, session, fleet, name):
         self.session, self.name, self.inbox = session, name, queue.SimpleQueue()
-        self.root = f"thermofleet/v1/{quote(fleet, safe='')}"
+        self.root = f"thermofleet/v2/{quote(fleet, safe='')}"
         self.mine = f"{self.root}/arm/{quote(name, safe='')}"
         self.temp_c, self.tick = AMBIENT_C, 0
         self.zero_s, self.speed = self.clock()
@@ -58,7 +58,7 @@ class Arm:
         alive = self.session.liveliness().declare_token(f"{self.mine}/alive")
         info = self.remembering("info", "Info", 1)
         info.put(json.dumps({"arm": self.name, "joints": 1, "twin": "mock"}))
-        self.difficulty = self.remembering("difficulty", "DifficultyWord", 1)
+        self.difficulty = self.remembering("difficulty", "DifficultyScores", 1)
         print(f"ready {self.name}", flush=True)
         tick_s = asked_s = time.monotonic()
         end_s = tick_s + seconds
@@ -120,7 +120,7 @@ class Arm:
             "mode": "working" if self.hold else "idle",
             "headroom_k": LIMIT_C - self.temp_c,
             "capacity": 0 if self.hold else 1,
-            "offers": offers,
+            "estimates": offers,
         }
 
     def offer(self, job):
@@ -131,8 +131,8 @@ class Arm:
         return {
             "job": job["name"],
             "feasible": True,
-            "difficulty": [d],
-            "d": d,
+            "joint_difficulty": [d],
+            "difficulty": d,
             "peak_c": self.temp_c + 0.1 * cycles,
             "duration_s": CYCLE_S * cycles,
             "finish_in_s": CYCLE_S * cycles,
@@ -199,7 +199,7 @@ class Arm:
             last = hold["cycles"] >= hold["wanted"] - 1
             held = {name: hold[name] for name in ("award", "job", "cycles")}
             holds = [{**held, "phase": "finishing" if last else "working"}]
-            request = {"arm": self.name, "holds": holds}
+            request = {"arm": self.name, "entries": holds}
             self.send(hold["auctioneer"], "lease", "LeaseRequest", request, lambda lease: self.leased(lease, asked_s))
 
     def leased(self, lease, asked_s):
@@ -207,11 +207,11 @@ class Arm:
         hold = self.hold
         if hold is None:
             return
-        if hold["award"] in lease.get("leave", ()):
+        if hold["award"] in lease.get("may_commit", ()):
             hold["leave"] = True
         if hold["award"] in lease["granted"]:
             hold["until_s"] = asked_s + (1 - DRIFT) * lease["lease_s"]
-        elif hold["award"] in lease["lost"] and not hold["leave"]:
+        elif hold["award"] in lease["revoked"] and not hold["leave"]:
             self.hold = None
 
     def receipt(self, word):
@@ -239,7 +239,7 @@ class Arm:
             "time_s": self.now_s(),
             "twin": "mock",
             "jobs": [offer["job"] for offer in offers],
-            "difficulty": [offer.get("d") for offer in offers],
+            "difficulty": [offer.get("difficulty") for offer in offers],
             "p_saturation": [None for _ in offers],
         }
         self.difficulty.put(json.dumps(word))
@@ -266,7 +266,7 @@ class Arm:
 
 def encoding(kind):
     """What every word carries beside its payload; others are refused."""
-    return f"application/json;thermofleet.{kind}.v1"
+    return f"application/json;thermofleet.{kind}.v2"
 
 
 def connect(port):

@@ -2,7 +2,7 @@
 
     python examples/submit_jobs.py 7447 quickstart jobs.json
 
-The file holds a list of jobs as docs/bus.md has them (JobWord); without one, three small jobs of the scenario
+The file holds a list of jobs as docs/bus.md has them (JobSpec); without one, three small jobs of the scenario
 `quickstart` are handed in. Handing the same job in twice is harmless: it stays one job.
 """
 
@@ -72,7 +72,7 @@ def ask(session, key, kind, word):
     replies = session.get(
         key,
         payload=json.dumps(word),
-        encoding=f"application/json;thermofleet.{kind}.v1",
+        encoding=f"application/json;thermofleet.{kind}.v2",
         target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE,
         timeout=5.0,
@@ -81,7 +81,7 @@ def ask(session, key, kind, word):
     for reply in replies:
         if reply.ok is None:  # Zenoh's own: nobody answered in time
             print(f"no answer: {reply.err.payload.to_bytes().decode()}", flush=True)
-        elif str(reply.ok.encoding) == "application/json;thermofleet.Refusal.v1":
+        elif str(reply.ok.encoding) == "application/json;thermofleet.Refusal.v2":
             print(f"refused: {json.loads(reply.ok.payload.to_bytes())['reason']}", flush=True)
         else:
             answers.append(json.loads(reply.ok.payload.to_bytes()))
@@ -95,7 +95,7 @@ def main(port, fleet, jobs, seconds=600.0):
         "connect": {"endpoints": [f"tcp/127.0.0.1:{port}"], "timeout_ms": 10_000},
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
     }
-    root = f"thermofleet/v1/{quote(fleet, safe='')}"
+    root = f"thermofleet/v2/{quote(fleet, safe='')}"
     try:
         opened = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
     except zenoh.ZError:

@@ -1,1 +1,1 @@
-"""The world: laws, nouns, simulator, environment and bus. Imports none of the other packages."""
+"""The simulated world: physical laws, domain types, engine, environment, bus and live participants."""

@@ -1,9 +1,17 @@
-"""When jobs arrive: a Poisson stream, batches, or a trace."""
+"""Job arrivals: a Poisson stream, batches, or a trace."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf
+from typing import Any, NamedTuple
 
 import numpy as np
+
+from fleet.jit import jit_inline
+from fleet.seeding import random_uniform
+
+Array = np.ndarray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +31,7 @@ class Poisson:
 
 @dataclass(frozen=True, kw_only=True)
 class Batch:
-    """`count` jobs at `start_s`, and again every `every_s` if that is given."""
+    """`count` jobs at `start_s`, repeated every `every_s` if given."""
 
     count: int
     start_s: float = 0.0
@@ -40,7 +48,7 @@ class Batch:
 
 @dataclass(frozen=True, kw_only=True)
 class Trace:
-    """Arrivals at the given times, s, in order."""
+    """Arrivals at given times, s, in order."""
 
     times_s: tuple[float, ...]
 
@@ -52,26 +60,74 @@ class Trace:
 Arrivals = Poisson | Batch | Trace
 
 
-def release_times(arrivals: Arrivals, horizon_s: float, rng: np.random.Generator) -> np.ndarray:
-    """Arrival times before the horizon, s, [job], in order."""
-    match arrivals:
-        case Poisson():
-            stop = max(min(arrivals.stop_s, horizon_s), arrivals.start_s)
-            # Conditioned on their number, the arrivals of a Poisson process are uniform order statistics.
-            count = rng.poisson((stop - arrivals.start_s) / arrivals.every_s)
-            return np.sort(rng.uniform(arrivals.start_s, stop, size=count))
-        case Batch():
-            starts = [arrivals.start_s]
-            if arrivals.every_s is not None:
-                starts = list(np.arange(arrivals.start_s, horizon_s, arrivals.every_s))
-            times = np.repeat(np.array(starts, dtype=float), arrivals.count)
-        case Trace():
-            times = np.array(arrivals.times_s, dtype=float)
-    return times[times < horizon_s]
+class ArrivalTable(NamedTuple):
+    """Several streams of arrivals as arrays; a stream is Poisson, or its times are given."""
+
+    start_s: Array
+    """Of a Poisson stream, [stream]."""
+    stop_s: Array
+    """[stream]."""
+    every_s: Array
+    """Mean gap of a Poisson stream, NaN of the others, [stream]."""
+    times_s: Array
+    """Given times of all streams, [arrival]."""
+    first: Array
+    """Where the given times of each stream begin, int [stream + 1]."""
 
 
-def oftener(arrivals: Arrivals, factor: float) -> Arrivals:
-    """The same so many times as often; single batches and traces stay as they are."""
+def arrival_table(streams: Sequence[Arrivals], horizon_s: float) -> ArrivalTable:
+    """The arrivals before the horizon, s."""
+    start_s, stop_s, every_s = (np.full(len(streams), np.nan) for _ in range(3))
+    given: list[Array] = []
+    for i, arrivals in enumerate(streams):
+        times = np.zeros(0)
+        match arrivals:
+            case Poisson():
+                start_s[i], every_s[i] = arrivals.start_s, arrivals.every_s
+                stop_s[i] = min(arrivals.stop_s, horizon_s)
+            case Batch():
+                starts = np.array([arrivals.start_s])
+                if arrivals.every_s is not None:
+                    starts = np.arange(arrivals.start_s, horizon_s, arrivals.every_s)
+                times = np.repeat(starts, arrivals.count)
+            case Trace():
+                times = np.array(arrivals.times_s, dtype=float)
+        given.append(times[times < horizon_s])
+    first = np.cumsum([0, *map(len, given)])
+    return ArrivalTable(start_s, stop_s, every_s, np.concatenate([np.zeros(0), *given]), first)
+
+
+@jit_inline
+def sample_arrivals(table: ArrivalTable, stream: int, key: Any, out: Array) -> int:
+    """Put the arrival times of a stream into `out`, in order, and return their number, or −1 if there is no room.
+
+    Gaps of a Poisson stream are exponential, from the uniform values of `fleet.seeding` at counts 0, 1, 2, …
+
+    Args:
+        key: Of the stream, uint64.
+        out: [room].
+    """
+    count = 0
+    if np.isnan(table.every_s[stream]):
+        for n in range(table.first[stream], table.first[stream + 1]):
+            if count == len(out):
+                return -1
+            out[count] = table.times_s[n]
+            count += 1
+        return count
+    time_s = table.start_s[stream]
+    while True:
+        time_s -= table.every_s[stream] * math.log1p(-random_uniform(key, np.uint64(count)))
+        if time_s >= table.stop_s[stream]:
+            return count
+        if count == len(out):
+            return -1
+        out[count] = time_s
+        count += 1
+
+
+def scale_rate(arrivals: Arrivals, factor: float) -> Arrivals:
+    """The arrivals at `factor` times the rate; single batches and traces are unchanged."""
     if isinstance(arrivals, Trace) or arrivals.every_s is None:
         return arrivals
     return replace(arrivals, every_s=arrivals.every_s / factor)

@@ -1,9 +1,10 @@
-"""Thermal difficulty: how hard a planned motion is for one arm's motors, and who can say so.
+"""Thermal difficulty of a planned motion for one arm's motors, and the protocol of models that score it.
 
 d = Σ_k d_k, d_k = 1 − exp(−e_k) with e_k the time mean of the absolute reconstruction error of joint k, summed
-over the channels (E. Guiffo Kaigom, arXiv 2509.12740; the reading in which d_k → 1 for motion not known).
+over the channels (E. Guiffo Kaigom, arXiv 2509.12740; read so that d_k → 1 for unknown motion).
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,7 +12,9 @@ from typing import Protocol
 
 import numpy as np
 
+from fleet.jit import jit_inline
 from fleet.motion import Plan
+from fleet.robot import JOINTS
 
 Array = np.ndarray
 
@@ -23,19 +26,19 @@ def difficulty_of_error(error: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Risk:
-    """How the probability that a motor passes the warning limit depends on the motor temperatures at the start.
+    """Probability that a motor passes the warning limit, as a function of the motor temperatures at the start.
 
-    P = link(max over pieces of offset + weight @ temp_c): one piece is a logistic regression, one piece per joint and
-    time a thermal network that is linear in its start. Leading axes [...] for several plans.
+    P = link(max over pieces of offset + weight @ temp_c). One piece is a logistic regression; one piece per joint and
+    time is a thermal network that is linear in its start. Leading axes [...] for several plans.
     """
 
     offset: Array
-    """Score of each piece at 0 °C, [..., piece]; −inf for a piece that does not count."""
+    """Score of each piece at 0 °C, [..., piece]; −inf for an unused piece."""
     weight: Array
     """Slope of each piece, 1/K, [..., piece, joint]."""
     curve: Array | None = None
-    """Score and probability [..., knot, 2], neither falling, linear between and constant beyond the knots; without
-    one, and where its first score is NaN, the link is the logistic function."""
+    """Link function as score and probability [..., knot, 2], both non-decreasing, linear between the knots and constant
+    beyond. None, or NaN as first score: the logistic function."""
 
     def __post_init__(self) -> None:
         if self.offset.shape[-1:] in ((), (0,)) or self.weight.shape[:-1] != self.offset.shape:
@@ -51,21 +54,29 @@ class Risk:
             raise ValueError(f"Risk.curve must be [..., knot, 2] (got {self.curve.shape}).")
 
     def at(self, temp_c: Array) -> Array:
-        """Probability at motor temperatures [..., joint] as measured now, °C, each in [0, 1], [...]."""
+        """Probability [...] at measured motor temperatures [..., joint], °C."""
         temp = np.asarray(temp_c, dtype=float)
-        score = (self.offset + (self.weight @ temp[..., None])[..., 0]).max(axis=-1)
-        logistic = 0.5 * (1.0 + np.tanh(0.5 * score))  # the logistic function, without overflow
-        if self.curve is None:
-            return logistic
-        return np.where(np.isnan(self.curve[..., 0, 0]), logistic, _interpolated(score, self.curve))
+        lead = np.broadcast_shapes(self.offset.shape[:-1], temp.shape[:-1])
+        offset = np.broadcast_to(self.offset, (*lead, *self.offset.shape[-1:]))
+        weight = np.broadcast_to(self.weight, (*lead, *self.weight.shape[-2:]))
+        temp = np.broadcast_to(temp, (*lead, *temp.shape[-1:]))
+        curve = (
+            np.zeros((*lead, 0, 2))
+            if self.curve is None
+            else np.broadcast_to(self.curve, (*lead, *self.curve.shape[-2:]))
+        )
+        p = np.empty(lead)
+        for row in np.ndindex(lead):
+            p[row] = passing_probability(offset[row], weight[row], curve[row], temp[row])
+        return p
 
     def __getitem__(self, row: Array | int) -> "Risk":
-        """The risks of some rows of the first axis."""
+        """Rows of the first axis."""
         return Risk(self.offset[row], self.weight[row], None if self.curve is None else self.curve[row])
 
 
 def stack_risks(risks: Sequence[Risk]) -> Risk:
-    """Risks of single plans, of unequal numbers of pieces and knots, as one with a leading axis [risk, ...]."""
+    """Risks of single plans as one with a leading axis [risk, ...]; numbers of pieces and knots may differ."""
     pieces = max(len(risk.offset) for risk in risks)
     knots = max(0 if risk.curve is None else len(risk.curve) for risk in risks)
     offset = np.full((len(risks), pieces), -np.inf)
@@ -79,34 +90,47 @@ def stack_risks(risks: Sequence[Risk]) -> Risk:
     return Risk(offset, weight, curve if knots else None)
 
 
-def _interpolated(score: Array, curve: Array) -> Array:
-    """Linear interpolation in a curve [..., knot, 2] at scores [...], constant beyond its ends."""
-    knots, p = np.moveaxis(curve, -1, 0)
-    right = (score[..., None] >= knots).sum(axis=-1)[..., None]  # 0: left of all
-    above, below = np.minimum(right, knots.shape[-1] - 1), np.maximum(right - 1, 0)
-    (x0, p0), (x1, p1) = (
-        [
-            np.take_along_axis(np.broadcast_to(v, (*score.shape, knots.shape[-1])), k, axis=-1)[..., 0]
-            for v in (knots, p)
-        ]
-        for k in (below, above)
-    )
-    inside = np.isfinite(x1) & (x1 > x0)
-    share = np.divide(score - x0, x1 - x0, out=np.zeros_like(score), where=inside)
-    return p0 + np.clip(share, 0.0, 1.0) * np.where(inside, p1 - p0, 0.0)
+@jit_inline
+def passing_probability(offset: Array, weight: Array, curve: Array, temp_c: Array) -> float:
+    """Probability that a motor passes the warning limit; see `Risk`.
+
+    Args:
+        offset: [piece].
+        weight: [piece, joint].
+        curve: [knot, 2]; without knots, and where the first score is NaN, the link is the logistic function.
+        temp_c: Motor temperatures, °C, [joint].
+    """
+    score = -np.inf
+    for piece in range(len(offset)):
+        linear = offset[piece]
+        for k in range(JOINTS):
+            linear += weight[piece, k] * temp_c[k]
+        score = max(score, linear)
+    knots = len(curve)
+    if knots == 0 or math.isnan(curve[0, 0]):
+        return 0.5 * (1.0 + math.tanh(0.5 * score))  # the logistic function, without overflow
+    right = 0
+    while right < knots and score >= curve[right, 0]:
+        right += 1
+    below, above = max(right - 1, 0), min(right, knots - 1)
+    x0, p0 = curve[below, 0], curve[below, 1]
+    x1, p1 = curve[above, 0], curve[above, 1]
+    if not (math.isfinite(x1) and x1 > x0):
+        return p0
+    return p0 + min(max((score - x0) / (x1 - x0), 0.0), 1.0) * (p1 - p0)
 
 
 @dataclass(frozen=True, eq=False)
 class Difficulty:
-    """What a model says of one plan."""
+    """Scores of one plan by a difficulty model."""
 
     per_joint: Array
     """d_k, [joint], each in [0, 1)."""
     p_saturation: float | None = None
-    """Probability that a motor passes the warning limit, of a model that takes the start for granted; None where
-    the model cannot say, or says it by `risk`."""
+    """Probability that a motor passes the warning limit, by a model that assumes the start temperatures; None if the
+    model has none, or gives `risk`."""
     risk: Risk | None = None
-    """The same of a model that knows how it depends on the motor temperatures at the start."""
+    """The probability as a function of the motor temperatures at the start."""
 
     def __post_init__(self) -> None:
         if self.p_saturation is not None and self.risk is not None:
@@ -118,29 +142,29 @@ class Difficulty:
         return float(np.sum(self.per_joint))
 
     def p_at(self, temp_c: Array) -> float | None:
-        """Probability that a motor passes the warning limit from motor temperatures [joint]; None where not known."""
+        """Probability that a motor passes the warning limit from motor temperatures [joint]; None if unknown."""
         return self.p_saturation if self.risk is None else float(self.risk.at(temp_c))
 
 
 class DifficultyModel(Protocol):
-    """Says how hard a plan is for one arm, without moving it."""
+    """Scores plans of one arm without moving it."""
 
     @property
     def version(self) -> str:
-        """What produced the score, for the digital thread."""
+        """Version of the model, recorded with each score."""
         ...
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty | None:
-        """Difficulty of doing the plan so many times; None when the model has no opinion."""
+        """Difficulty of repeating the plan's cycle `repetitions` times; None if the model has no score."""
         ...
 
 
 @dataclass(frozen=True)
 class Blind:
-    """Knows nothing and says so: every score is None."""
+    """A model without knowledge: every score is None."""
 
     version: str = "blind"
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty | None:
-        """None, always."""
+        """Always None."""
         return None

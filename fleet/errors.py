@@ -1,4 +1,4 @@
-"""What a caller may want to catch, and the words that help the person at the keyboard."""
+"""Exceptions that callers may want to catch, and hints for unknown names."""
 
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -9,15 +9,15 @@ class FleetError(Exception):
 
 
 class ScenarioError(FleetError):
-    """A scenario file says something that cannot be: names the file, the place and what is allowed."""
+    """Invalid scenario file; names the file, the place in it and what is allowed."""
 
 
 class InfeasibleJob(FleetError):
-    """An arm cannot do a piece of work.
+    """An arm cannot do a work.
 
     Attributes:
         arm: Name of the arm.
-        place: Name of the place it cannot serve.
+        place: Name of the place that it cannot serve.
         reason: One of `reach`, `joint limit`, `torque`, `collision`, `no IK solution`, with its numbers.
     """
 
@@ -32,24 +32,24 @@ class InfeasibleJob(FleetError):
 
 
 class BusError(FleetError):
-    """The bus could not be opened, or a word on it could not be delivered in time."""
+    """The bus cannot be opened, or a message was not delivered in time."""
 
 
 class IdentificationError(FleetError):
-    """Recordings cannot tell an arm's thermal parameters; says what to record."""
+    """Recordings do not determine an arm's thermal parameters; says what to record."""
 
 
 class CheckpointError(FleetError):
-    """A stored twin does not fit what is asked of it; names what differs."""
+    """A stored twin does not fit its use; names the difference."""
 
 
 class LogError(FleetError):
-    """A log file cannot be used as it is.
+    """A log file cannot be used.
 
     Attributes:
-        file: The file, as it was given.
-        line: Line of a text file, or row of a table, from 1; None where the whole file is meant.
-        reason: What is wrong, and what would be right.
+        file: The file as given.
+        line: Line of a text file, or row of a table, from 1; None for the whole file.
+        reason: What is wrong and what is allowed.
     """
 
     def __init__(self, file: str, line: int | None, reason: str) -> None:
@@ -63,15 +63,15 @@ class LogError(FleetError):
 
 
 class JournalError(FleetError):
-    """A journal cannot be used as it is: damaged, in use by another, or not writable; names the file."""
+    """A journal is damaged, in use by another process, or not writable; names the file."""
 
 
 class JournalFull(JournalError):
-    """There is no room for a record; the journal is as it was before."""
+    """No space for a record; the journal is unchanged."""
 
 
 def nearest(name: str, allowed: Iterable[str]) -> str:
-    """The end of an error sentence: the allowed names, and the nearest one if there is one.
+    """End of an error message: the allowed names, and the most similar one if there is one.
 
     Returns:
         For example `; did you mean 'ambient_c'? Allowed: ambient_c, arms.`

@@ -1,4 +1,4 @@
-"""What happened: one line of the digital thread per award, completion, warning, fault and recovery."""
+"""Events of an episode: awards, completions, warnings, faults and recoveries."""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -17,14 +17,14 @@ EventKind = Literal[
     "recover",
 ]
 EVENT_KINDS: tuple[str, ...] = get_args(EventKind)
-"""release: job may be claimed; award: claim won, lost: claim lost; illegal: claim not allowed, so a wait;
-torque_warning: the awarded plan passes the torque warning; finish: last cycle done; home: arm free again;
+"""release: job may be claimed; award: claim won; lost: claim lost; illegal: claim not allowed, counted as a wait;
+torque_warning: the awarded plan exceeds the torque warning; finish: last cycle done; home: arm free again;
 warning, fault: motor limit passed; return: job back in the queue; recover: fault cleared."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Event:
-    """One thing that happened, at its exact time."""
+    """One event with its exact time."""
 
     time_s: float
     kind: EventKind
@@ -32,8 +32,7 @@ class Event:
     arm: str = ""
     job: str = ""
     joint: int = 0
-    """1..7 where a motor is meant, else 0."""
+    """Motor 1..7; 0 if the event has none."""
     value: float = float("nan")
-    """What the kind measures: temperature °C, torque N·m, difficulty of an award, cycles kept of a return."""
+    """Quantity of the kind: temperature °C, torque N·m, difficulty of an award, cycles kept of a return."""
     reason: str = ""
-    """In words."""

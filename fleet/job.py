@@ -1,4 +1,4 @@
-"""Work in the cell: places, what an arm must physically do, and the jobs that ask for it."""
+"""Places of the cell, works that arms do at them, and jobs that request works."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ KINDS: tuple[str, ...] = get_args(Kind)
 
 @dataclass(frozen=True, kw_only=True)
 class Place:
-    """A pose in the cell at which a hand works; also the name of the station that one arm at a time may use."""
+    """A pose in the cell at which a hand works; also a station, which one arm at a time may use."""
 
     name: str
     position_m: tuple[float, float, float]
@@ -21,7 +21,7 @@ class Place:
     """Roll, pitch, yaw of the tool frame about the fixed world axes, deg; its z axis points out of the hand.
     (180, 0, 0) points down, (0, 90, 0) along world x."""
     retreat_m: float = 0.08
-    """How far the hand backs off along its own z axis before it travels."""
+    """Distance that the hand retracts along its own z axis before it moves on."""
 
     def __post_init__(self) -> None:
         if not self.name:
@@ -32,15 +32,15 @@ class Place:
 
 @dataclass(frozen=True, kw_only=True)
 class Work:
-    """What the hand must do once: the content of a job that a motion is planned for."""
+    """What the hand does in one repetition of a job; plans are made for it."""
 
     kind: Kind
     places: tuple[Place, ...]
-    """pick_place, sort: from, to. hold, press: the one place."""
+    """pick_place, sort: from, to. hold, press: one place."""
     payload_kg: float = 0.0
-    """Carried from grasp to release; a hold grasps at its place and releases there."""
+    """Carried from grasp to release; a hold grasps and releases at its place."""
     dwell_s: float = 0.5
-    """pick_place, sort: closing or opening the hand. hold, press: how long one repetition lasts."""
+    """pick_place, sort: time to close or open the hand. hold, press: duration of one repetition."""
     force_n: float = 0.0
     """press: contact force along the tool's z axis, N."""
 
@@ -65,17 +65,17 @@ class Work:
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """A piece of work that arrives, is worth something, and must be repeated so many times."""
+    """A request for a number of repetitions of a work, with release, due date and value."""
 
     name: str
     work: Work
     repetitions: int
     release_s: float
     due_s: float
-    """Soft: being later is tardiness, not failure."""
+    """Soft: a later finish is tardiness, not failure."""
     value: float
     after: tuple[str, ...] = ()
-    """Names of the jobs that must be finished first."""
+    """Names of the jobs that must finish first."""
 
     def __post_init__(self) -> None:
         if self.repetitions < 1:
@@ -85,10 +85,10 @@ class Job:
 
 
 def precedence(jobs: Sequence[Job]) -> nx.DiGraph:
-    """Which job waits for which, as a graph of names with edges from earlier to later.
+    """Precedence of jobs as a graph of names with edges from earlier to later.
 
     Raises:
-        ValueError: a name occurs twice, a predecessor does not exist, or the jobs wait for each other in a ring.
+        ValueError: two jobs have one name, a predecessor does not exist, or the jobs wait for each other in a ring.
     """
     graph = nx.DiGraph()
     for job in jobs:

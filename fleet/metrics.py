@@ -1,4 +1,4 @@
-"""What a shift came to, in the figures of the field."""
+"""Metrics of one shift."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ import numpy as np
 
 @dataclass(frozen=True, kw_only=True)
 class Metrics:
-    """Outcome of one shift."""
+    """Metrics of one shift; times from its beginning."""
 
     jobs: int
     """Released before the horizon."""
@@ -18,27 +18,27 @@ class Metrics:
     on_time: int
     """Finished by their due time."""
     tardiness_min: float
-    """Summed over finished jobs; lateness that is negative counts as nothing."""
+    """Sum over finished jobs of max(0, finish − due)."""
     mean_wait_s: float
-    """From release to the first award, over the jobs that were awarded."""
+    """From release to the first award, mean over the awarded jobs."""
     makespan_s: float
-    """When the last job was finished."""
+    """Time at which the last job was finished."""
     jobs_per_hour: float
     faults: int
     above_warning_min: float
-    """Summed over arms."""
+    """Sum over arms of the time with a motor above the warning limit."""
     peak_c: dict[str, float]
-    """Hottest motor of each arm."""
+    """Highest motor temperature of each arm."""
     availability: float
-    """Share of arm time not lost to faults."""
+    """Share of the arms' time not lost to faults."""
     utilisation: float
-    """Share of arm time spent on jobs."""
+    """Share of the arms' time spent on jobs."""
     energy_wh: float
-    """Turned to heat in the motors, over all arms."""
+    """Energy turned to heat in the motors of all arms."""
     heat_gini: float
-    """Inequality of the arms' shares of that heat: 0 all alike, towards 1 one arm takes all."""
+    """Gini coefficient of the arms' shares of that heat: 0 all equal, near 1 one arm has all."""
     messages: int
-    """Words that reached a peer."""
+    """Messages delivered to a peer."""
     lost_claims: int
     illegal_actions: int
 

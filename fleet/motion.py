@@ -1,5 +1,6 @@
-"""Planned motion: what an arm will do with its joints, sampled in time, before it moves."""
+"""Planned joint motion, sampled in time, and the mean heat drive that it causes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,12 +13,12 @@ Array = np.ndarray
 RATE_HZ = 50.0
 """Samples per second of every planned profile."""
 CHANNELS = ("q", "qd", "tau")
-"""The channel axis of a profile: rad, rad/s, N·m."""
+"""Channel axis of a profile: rad, rad/s, N·m."""
 
 
 @dataclass(frozen=True, eq=False)
 class Phase:
-    """A stretch of motion. Sample i stands for the time from i/RATE_HZ to (i+1)/RATE_HZ."""
+    """A part of a plan. Sample i holds from i/RATE_HZ to (i+1)/RATE_HZ."""
 
     profile: Array
     """float32 [time, channel, joint]: q rad, qd rad/s, tau N·m at the joint output (friction not included)."""
@@ -32,24 +33,24 @@ class Phase:
 
     @property
     def duration_s(self) -> float:
-        """How long it lasts, s; zero for an empty phase."""
+        """Duration, s; zero for an empty phase."""
         return len(self.profile) / RATE_HZ
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """One way (elbow, speed) in which one arm would do one work: from rest, so many cycles, back to rest."""
+    """One variant (elbow, speed) of how an arm does a work: from home, through repeated cycles, back home."""
 
     arm: str
     work: Work
     elbow: int
-    """Index of the inverse kinematics branch, 0 first found."""
+    """Index of the elbow posture, 0 is the fastest."""
     speed: float
     """Share of the joint limits that the motion uses, (0, 1]."""
     approach: Phase
-    """From the arm's home posture to where the cycle begins."""
+    """From the home posture to the start of the cycle."""
     cycle: Phase
-    """One repetition; ends where it begins."""
+    """One repetition; ends where it starts."""
     retreat: Phase
     """Back to the home posture."""
 
@@ -59,18 +60,18 @@ class Plan:
         return (self.approach, self.cycle, self.retreat)
 
     def duration_s(self, repetitions: int) -> float:
-        """From leaving home to being home again, s."""
+        """Time from leaving home to being home again, s."""
         return self.approach.duration_s + repetitions * self.cycle.duration_s + self.retreat.duration_s
 
     def weights(self, repetitions: int) -> Array:
-        """Share of the job's time that each phase takes, [phase], sums to one."""
+        """Share of each phase in the job's time, [phase], sums to one."""
         times = np.array([self.approach.duration_s, repetitions * self.cycle.duration_s, self.retreat.duration_s])
         return times / times.sum()
 
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """What heats the motors during a stretch of motion, averaged over its time."""
+    """Causes of motor heat during a motion, averaged over its time."""
 
     current_sq: Array
     """Mean squared current at the magnets' reference temperature, A², [..., joint]."""
@@ -79,10 +80,26 @@ class Drive:
 
 
 def drive(profile: Array, motors: Motors) -> Drive:
-    """Mean heat drive of a profile [time, channel, joint] with the motors of one arm; zeros for no samples."""
+    """Mean heat drive of a profile [time, channel, joint] for the motors of one arm; zeros for no samples."""
     if len(profile) == 0:
         joints = profile.shape[-1]
         return Drive(np.zeros(joints), np.zeros(joints))
     _, qd, tau = np.asarray(profile, dtype=float).transpose(1, 0, 2)
     amps = reference_current(tau, qd, motors)
     return Drive((amps**2).mean(axis=0), friction_heat(qd, motors).mean(axis=0))
+
+
+def static_drive(tau: Array, motors: Motors) -> Drive:
+    """Heat drive of standing still with torques, N·m, [..., joint]."""
+    still = np.zeros_like(tau)
+    return Drive(reference_current(tau, still, motors) ** 2, still)
+
+
+def drives(profiles: Sequence[Array], motors: Motors) -> Drive:
+    """Mean heat drive of several profiles, arrays [profile, joint]."""
+    each = [drive(profile, motors) for profile in profiles]
+    shape = (len(each), len(motors.eta))
+    return Drive(
+        np.array([one.current_sq for one in each]).reshape(shape),
+        np.array([one.friction_w for one in each]).reshape(shape),
+    )

@@ -1,7 +1,8 @@
-"""Who did what when: the event log of a shift, read back as assignments and outages."""
+"""Schedule of a shift, derived from its events: assignments and outages of each arm."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Literal
 
 from fleet.errors import nearest
@@ -10,41 +11,41 @@ from fleet.events import Event
 Outcome = Literal["finished", "returned", "running"]
 
 _ORDER = ("recover", "finish", "home", "award", "fault", "return")
-"""The kinds that shape a schedule, in the order they can follow one another at one moment."""
+"""The event kinds that determine a schedule, in the order in which they can occur at the same time."""
 
 SAME_MOMENT_DIGITS = 6
-"""Events are ordered on the microsecond: a tick's end and the next one's beginning may differ in the last bit."""
+"""Times are rounded to microseconds: the end of a tick and the start of the next may differ in the last bit."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Assignment:
-    """One arm at one job, from the award until it is home again or faults."""
+    """One arm on one job, from the award until it is home again or faults."""
 
     arm: str
     job: str
     start_s: float
     end_s: float
-    """Home again, faulted, or the horizon."""
+    """Time of arrival home or of the fault, or the horizon."""
     finished_s: float | None = None
-    """When the last cycle was done; None if it was not."""
+    """End of the last cycle; None if it was not reached."""
     outcome: Outcome
-    """finished: the work was done, even if the arm was not home yet; returned: a fault sent it back to the queue."""
+    """finished: all cycles done, even if the arm was not home yet; returned: a fault put the job back in the queue."""
     late_s: float | None = None
-    """Tardiness of a finished job, 0 if on time."""
+    """Tardiness of a finished job; 0 if on time."""
     cycles_kept: int | None = None
-    """Of a returned job: cycles this arm did that need not be done again."""
+    """Cycles of a returned job that this arm has done and that count."""
     difficulty: float = float("nan")
     """Score of the award."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outage:
-    """One arm lost to a fault."""
+    """Time of one arm lost to a fault."""
 
     arm: str
     start_s: float
     end_s: float
-    """Recovered, or the horizon."""
+    """Time of recovery, or the horizon."""
     joint: int
     """Motor that caused it, 1..7."""
     recovered: bool
@@ -53,7 +54,7 @@ class Outage:
 
 @dataclass(frozen=True)
 class Schedule:
-    """What happened to the arms up to a horizon; in order of the arms, then of time."""
+    """Assignments and outages up to a horizon, in order of the arms, then of time."""
 
     assignments: tuple[Assignment, ...]
     outages: tuple[Outage, ...]
@@ -61,15 +62,15 @@ class Schedule:
 
 
 def schedule(events: Sequence[Event], arms: Sequence[str], horizon_s: float, *, env: int = 0) -> Schedule:
-    """The schedule that an event log tells of; the order of events within the log does not matter.
+    """Schedule of an event log; the order of events within the log does not matter.
 
     Args:
-        horizon_s: Where the log ends; whatever is still open runs until here.
-        env: Which of several parallel shifts.
+        horizon_s: End of the log; open assignments and outages last until then.
+        env: Index of one of several parallel shifts.
 
     Raises:
-        ValueError: the log names an arm that is not in the fleet, or tells what cannot be (an award to a busy arm,
-            an arm home from nowhere).
+        ValueError: an arm that is not in the fleet, or an impossible sequence (an award to a busy arm, an arrival
+            home without a finished job).
     """
     own: dict[str, list[Event]] = {arm: [] for arm in arms}
     for event in events:
@@ -88,7 +89,7 @@ def schedule(events: Sequence[Event], arms: Sequence[str], horizon_s: float, *, 
 
 
 def _assignments(arm: str, log: Sequence[Event], horizon_s: float) -> list[Assignment]:
-    """Of one arm, from its events in order."""
+    """Assignments of one arm, from its events in order."""
     out: list[Assignment] = []
     award: Event | None = None
     finish: Event | None = None
@@ -104,62 +105,52 @@ def _assignments(arm: str, log: Sequence[Event], horizon_s: float) -> list[Assig
         elif event.kind == "home":
             if award is None or finish is None:
                 raise ValueError(f"{_at(event)}: '{arm}' is home from '{event.job}', which it did not finish.")
-            out.append(_assignment(award, finish, event.time_s))
+            out.append(_assignment(award, finish, event.time_s, "finished"))
             award = None
         elif event.kind == "fault" and award is not None:
-            returned = (e for e in log[i + 1 :] if e.kind == "return" and e.job == award.job)
-            out.append(_assignment(award, finish, event.time_s, None if finish else next(returned, None)))
+            returned = next((e for e in log[i + 1 :] if e.kind == "return" and e.job == award.job), None)
+            out.append(_assignment(award, finish, event.time_s, "returned", returned))
             award = None
     if award is not None:
-        out.append(_assignment(award, finish, max(horizon_s, award.time_s), running=True))
+        out.append(_assignment(award, finish, max(horizon_s, award.time_s), "running"))
     return out
 
 
 def _assignment(
-    award: Event, finish: Event | None, end_s: float, returned: Event | None = None, *, running: bool = False
+    award: Event, finish: Event | None, end_s: float, outcome: Outcome, returned: Event | None = None
 ) -> Assignment:
-    outcome: Outcome = "finished" if finish else "running" if running else "returned"
     return Assignment(
         arm=award.arm,
         job=award.job,
         start_s=award.time_s,
         end_s=end_s,
         finished_s=finish.time_s if finish else None,
-        outcome=outcome,
+        outcome="finished" if finish else outcome,
         late_s=finish.value if finish else None,
-        cycles_kept=round(returned.value) if returned else None,
+        cycles_kept=round(returned.value) if returned and not finish else None,
         difficulty=award.value,
     )
 
 
 def _outages(arm: str, log: Sequence[Event], horizon_s: float) -> list[Outage]:
-    """Of one arm, from its events in order."""
-    out: list[Outage] = []
-    fault: Event | None = None
-    for event in log:
-        if event.kind == "fault":
-            if fault is not None:
-                raise ValueError(f"{_at(event)}: '{arm}' faults while it is faulted.")
-            fault = event
-        elif event.kind == "recover":
-            if fault is None:
-                raise ValueError(f"{_at(event)}: '{arm}' recovers without a fault.")
-            out.append(_outage(fault, event.time_s, recovered=True))
-            fault = None
-    if fault is not None:
-        out.append(_outage(fault, max(horizon_s, fault.time_s), recovered=False))
-    return out
-
-
-def _outage(fault: Event, end_s: float, *, recovered: bool) -> Outage:
-    return Outage(
-        arm=fault.arm,
-        start_s=fault.time_s,
-        end_s=end_s,
-        joint=fault.joint,
-        recovered=recovered,
-        reason=fault.reason,
-    )
+    """Outages of one arm, from its events in order."""
+    changes = [event for event in log if event.kind in ("fault", "recover")]
+    for i, event in enumerate(changes):
+        if event.kind == "fault" and i % 2:
+            raise ValueError(f"{_at(event)}: '{arm}' faults while it is faulted.")
+        if event.kind == "recover" and not i % 2:
+            raise ValueError(f"{_at(event)}: '{arm}' recovers without a fault.")
+    return [
+        Outage(
+            arm=arm,
+            start_s=fault.time_s,
+            end_s=recovery.time_s if recovery else max(horizon_s, fault.time_s),
+            joint=fault.joint,
+            recovered=recovery is not None,
+            reason=fault.reason,
+        )
+        for fault, recovery in zip_longest(changes[::2], changes[1::2])
+    ]
 
 
 def _at(event: Event) -> str:

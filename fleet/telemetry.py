@@ -1,4 +1,4 @@
-"""What an arm's sensors said, over time."""
+"""Sensor readings of the arms over time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -10,13 +10,13 @@ Array = np.ndarray
 
 Mode = Literal["idle", "working", "faulted"]
 MODES: tuple[Mode, ...] = get_args(Mode)
-"""Index = the number that stands for the mode in arrays."""
+"""Arrays hold the index of a mode in this tuple."""
 IDLE, WORKING, FAULTED = range(len(MODES))
 
 
 @dataclass(frozen=True, eq=False)
 class Telemetry:
-    """Sensor readings of a fleet, equally long arrays with the sample axis first."""
+    """Sensor readings of a fleet; equally long arrays, sample axis first."""
 
     time_s: Array
     """[sample]."""
@@ -31,11 +31,11 @@ class Telemetry:
     current_a: Array
     """[sample, arm, joint]."""
     temp_c: Array
-    """Motor (winding) temperature as read, with sensor noise, [sample, arm, joint]."""
+    """Motor (winding) temperature with sensor noise, [sample, arm, joint]."""
 
 
 def join(parts: Sequence[Telemetry]) -> Telemetry:
-    """Readings one after the other as one."""
+    """Readings joined in time."""
     if not parts:
-        raise ValueError("There is no telemetry to join.")
+        raise ValueError("Telemetry to join must have at least one part (got none).")
     return Telemetry(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Telemetry)))

@@ -1,15 +1,18 @@
-"""The thermal network: windings, housings and ambient as a graph, and its exact step for constant heat.
+"""Thermal network of an arm: windings, housings and ambient as a graph, with an exact step for constant heat.
 
 C_w Tw' = P_w − (Tw − Th)/R_wh;  C_h Th' = (Tw − Th)/R_wh − (Th − Ta)/R_ha + Σ_nb G (Th_nb − Th) + P_h.
-Lumped capacitance with two nodes per joint (Kawaharazuka et al., arXiv 2407.08055); numbers in
-`fleet/data/gen3_thermal.json`. State order: windings of joints 1..7, then housings of joints 1..7.
+Lumped capacitance with two nodes per joint (Kawaharazuka et al., arXiv 2407.08055); parameters in
+`fleet/data/gen3_thermal.json`. Order of nodes: windings of joints 1..7, then housings of joints 1..7.
 """
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 
 import networkx as nx
 import numpy as np
 
+from fleet.motion import Drive
 from fleet.motor import Motors, copper_loss, magnet_factor, thermal_data
 from fleet.robot import JOINTS, Cooling
 
@@ -26,17 +29,17 @@ AMBIENT_FACTOR: dict[Cooling, float] = {
     "immersion": 10.0,
     "vacuum": 0.5,
 }
-"""Conductance housing → surroundings over that in still air, by cooling strategy.
+"""Conductance from housing to ambient relative to still air, by cooling strategy.
 
-Still air at a link's surface carries about 5 W/m²K by convection and 5.5 by radiation (4·ε·σ·T³, ε ≈ 0.9,
+Still air at the surface of a link carries about 5 W/m²K by convection and 5.5 by radiation (4·ε·σ·T³, ε ≈ 0.9,
 T ≈ 305 K), so vacuum keeps about half. The others are the lower ends of the film coefficients in Incropera &
-DeWitt, table 1.1, limited by the conduction through the shell. Engineering values, not measured on a Gen3.
+DeWitt, table 1.1, limited by conduction through the shell. Engineering values, not measured on a Gen3.
 """
 
 
 @dataclass(frozen=True, kw_only=True)
 class ThermalSpread:
-    """Log-normal standard deviations by which arms of one make differ, per joint; zero turns one off."""
+    """Log-normal standard deviations, per joint, of the differences between arms of one model; 0 is no difference."""
 
     copper: float = 0.0
     winding_housing: float = 0.0
@@ -51,7 +54,7 @@ class ThermalSpread:
 
     @classmethod
     def gen3(cls, scale: float = 1.0) -> "ThermalSpread":
-        """The spread seen between Gen3 joints of one class, times `scale`."""
+        """The spread measured between Gen3 joints of one size, times `scale`."""
         data = thermal_data()["spread"]
         return cls(**{name: scale * data[name] for name in cls.__dataclass_fields__})
 
@@ -77,8 +80,8 @@ def gen3_network(
 
     Args:
         cooling: Scales every edge to ambient by `AMBIENT_FACTOR`.
-        cooling_factor: A further scale on the same edges (dust, a blocked fan).
-        spread: How far this arm may differ from the nominal one; drawn from `rng`.
+        cooling_factor: A further scale of the same edges (dust, a blocked fan).
+        spread: Random differences from the nominal arm, drawn from `rng`.
     """
     if cooling not in AMBIENT_FACTOR:
         raise ValueError(f"Unknown cooling '{cooling}'. Allowed: {', '.join(AMBIENT_FACTOR)}.")
@@ -100,7 +103,7 @@ def gen3_network(
 
 
 def spread_motors(motors: Motors, spread: ThermalSpread, rng: np.random.Generator) -> Motors:
-    """The same motors with copper loss and idle heat of one arm's own."""
+    """Motors with copper loss and idle heat of an individual arm."""
     shape = motors.copper_w_per_a2.shape
     return replace(
         motors,
@@ -114,23 +117,23 @@ def _factors(spread: ThermalSpread | None, rng: np.random.Generator | None) -> d
     if spread is None:
         return {name: np.ones((2, JOINTS)) for name in names}
     if rng is None:
-        raise ValueError("A thermal spread needs an rng to draw from.")
+        raise ValueError("A thermal spread needs an rng (got None).")
     return {name: np.exp(getattr(spread, name) * rng.standard_normal((2, JOINTS))) for name in names}
 
 
 @dataclass(frozen=True, eq=False)
 class ThermalModel:
-    """A thermal network as matrices, ready for exact steps of any length; leading axes for several arms.
+    """A thermal network as matrices for exact steps of any length; leading axes for several arms.
 
-    C T' = −L T + g Ta + P is symmetric under C^(1/2), so its modes are real and the step never grows.
+    C T' = −L T + g Ta + P is symmetric under C^(1/2), so its modes are real and every step is stable.
     """
 
     capacity: Array
-    """J/K, [..., node]."""
+    """Heat capacity C, J/K, [..., node]."""
     laplacian: Array
     """L with the conductance to ambient on the diagonal, W/K, [..., node, node]."""
     to_ambient: Array
-    """g, W/K, [..., node]."""
+    """Conductance to ambient g, W/K, [..., node]."""
     rates: Array
     """Inverse time constants, 1/s, [..., mode]."""
     modes: Array
@@ -140,12 +143,12 @@ class ThermalModel:
         """Φ(dt) [..., node, node] and Γ(dt) [..., node, node] of T⁺ = Φ T + Γ (P + g Ta), Γ in K/W.
 
         Args:
-            dt_s: A length, or one per leading index, s, >= 0.
+            dt_s: Length of the step, or one per leading index, s, >= 0.
         """
         dt = np.asarray(dt_s, dtype=float)[..., None]
         root = np.sqrt(self.capacity)
         decay = np.exp(-self.rates * dt)
-        # ∫ exp(−λ s) ds, exact also where λ·dt is tiny.
+        # ∫ exp(−λ s) ds, exact also for tiny λ·dt.
         gain = -np.expm1(-self.rates * dt) / self.rates
         left = self.modes / root[..., :, None]
         right = np.swapaxes(self.modes, -1, -2)
@@ -154,12 +157,12 @@ class ThermalModel:
         return phi, gamma
 
     def steady(self, heat_w: Array, ambient_c: Array | float) -> Array:
-        """Temperatures at which nothing changes any more, °C, [..., node], for constant heat W, [..., node]."""
+        """Steady temperatures, °C, [..., node], for constant heat, W, [..., node]."""
         load = heat_w + self.to_ambient * np.asarray(ambient_c, dtype=float)[..., None]
         return np.linalg.solve(self.laplacian, load[..., None])[..., 0]
 
     def step(self, temp_c: Array, heat_w: Array, ambient_c: Array | float, dt_s: Array | float) -> Array:
-        """Temperatures after constant heat for `dt_s`, °C, [..., node]. Exact, so independent of step size."""
+        """Temperatures after constant heat for `dt_s`, °C, [..., node]; exact for any step length."""
         phi, gamma = self.step_matrices(dt_s)
         return advance(temp_c, heat_w, ambient_c, phi, gamma, self.to_ambient)
 
@@ -167,17 +170,17 @@ class ThermalModel:
 def advance(
     temp_c: Array, heat_w: Array, ambient_c: Array | float, phi: Array, gamma: Array, to_ambient: Array
 ) -> Array:
-    """One step with matrices at hand: Φ T + Γ (P + g Ta), °C, [..., node]."""
+    """Temperatures after a step with the matrices of `step_matrices`: Φ T + Γ (P + g Ta), °C, [..., node]."""
     load = heat_w + to_ambient * np.asarray(ambient_c, dtype=float)[..., None]
     return (phi @ temp_c[..., None] + gamma @ load[..., None])[..., 0]
 
 
 def thermal_model(network: nx.Graph) -> ThermalModel:
-    """Matrices of a network made by `gen3_network` (or of the same nodes with other numbers).
+    """Matrices of a network with the nodes of `gen3_network`.
 
     Raises:
-        ValueError: a node, capacity or conductance is missing or out of range, a node is not a Gen3's, or a node
-            has no path to ambient.
+        ValueError: a node, capacity or conductance is missing or out of range, there is another node, or a node has
+            no path to ambient.
     """
     names = [winding(j) for j in range(JOINTS)] + [housing(j) for j in range(JOINTS)]
     _check(network, names)
@@ -194,7 +197,9 @@ def _check(network: nx.Graph, names: list[str]) -> None:
     if missing := sorted(expected - set(network)):
         raise ValueError(f"The thermal network lacks the nodes {', '.join(missing)}.")
     if unknown := sorted(set(network) - expected):
-        raise ValueError(f"The thermal network has nodes that no Gen3 has: {', '.join(unknown)}.")
+        raise ValueError(
+            f"The thermal network has unknown nodes: {', '.join(unknown)}. Allowed: {', '.join(sorted(expected))}."
+        )
     for name in names:
         capacity = network.nodes[name].get("capacity_j_per_k")
         if capacity is None or not 0 < capacity < np.inf:
@@ -202,7 +207,7 @@ def _check(network: nx.Graph, names: list[str]) -> None:
     for one, other, conductance in network.edges(data="conductance_w_per_k"):
         if conductance is None or not 0 <= conductance < np.inf:
             raise ValueError(f"Edge '{one}' - '{other}' needs a conductance_w_per_k >= 0 (got {conductance}).")
-    # By reachability: the smallest rate of a cut-off node is rounding noise of either sign, not zero.
+    # By reachability, since the smallest rate of a cut-off node is not zero but rounding noise of either sign.
     open_edges = [(a, b) for a, b, conductance in network.edges(data="conductance_w_per_k") if conductance > 0]
     cooled = nx.node_connected_component(nx.Graph([("ambient", "ambient"), *open_edges]), "ambient")
     if trapped := [name for name in names if name not in cooled]:
@@ -210,19 +215,19 @@ def _check(network: nx.Graph, names: list[str]) -> None:
 
 
 def stack_models(models: list[ThermalModel]) -> ThermalModel:
-    """Models of several arms as one, arrays [arm, ...]."""
+    """Models of several arms as one value, arrays [arm, ...]."""
     return ThermalModel(
         *(np.stack([getattr(m, f) for m in models]) for f in ("capacity", "laplacian", "to_ambient", "rates", "modes"))
     )
 
 
 def node_heat(winding_w: Array, housing_w: Array) -> Array:
-    """Heat per node, W, [..., node], from heat into windings and into housings, each [..., joint] or broadcast."""
+    """Heat per node, W, [..., node], from heat into windings and housings, each [..., joint] or broadcast to it."""
     return np.concatenate(np.broadcast_arrays(winding_w, housing_w), axis=-1)
 
 
 def drive_heat(temp_c: Array, current_sq: Array, friction_w: Array, motors: Motors) -> Array:
-    """Heat per node of a powered arm at its temperatures, W, [..., node].
+    """Heat per node of a powered arm, W, [..., node].
 
     Args:
         temp_c: °C, [..., node].
@@ -233,18 +238,96 @@ def drive_heat(temp_c: Array, current_sq: Array, friction_w: Array, motors: Moto
     return node_heat(copper_loss(warm_sq, temp_c[..., WINDING], motors), motors.idle_w + friction_w)
 
 
+STEP_S = 10.0
+"""Longest simulated step: heat depends on temperature and is updated at least this often."""
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedTemperatures:
+    """Result of `simulate_temperatures`."""
+
+    end_c: Array
+    """Temperatures at the end, °C, [case, node]."""
+    highest_c: Array
+    """Highest temperature of each winding, start and end included, °C, [case, joint]."""
+
+
+def simulate_temperatures(
+    load: Drive,
+    duration_s: Array | Sequence[float],
+    *,
+    motors: Motors,
+    thermal: ThermalModel,
+    start_c: Array,
+    ambient_c: Array | float,
+) -> SimulatedTemperatures:
+    """Temperatures of one powered arm after each load has lasted its time, in equal steps of at most `STEP_S`.
+
+    Args:
+        load: Mean drives, [case, joint] or [joint] for all cases.
+        duration_s: >= 0, [case].
+        start_c: Temperatures at the start, [case, node] or [node].
+        ambient_c: [case] or one for all.
+    """
+    duration = np.asarray(duration_s, dtype=float)
+    steps = np.ceil(duration / STEP_S)
+    rows = temperature_steps(
+        repeat(load, int(steps.max(initial=0.0))),
+        duration / np.maximum(steps, 1),
+        motors=motors,
+        thermal=thermal,
+        start_c=np.broadcast_to(np.asarray(start_c, dtype=float), (len(duration), NODES)),
+        ambient_c=np.broadcast_to(ambient_c, duration.shape),
+        steps=steps,
+    )
+    end_c = next(rows)
+    highest_c = end_c[:, WINDING]
+    for end_c in rows:
+        highest_c = np.maximum(highest_c, end_c[:, WINDING])
+    return SimulatedTemperatures(end_c, highest_c)
+
+
+def temperature_steps(
+    loads: Iterable[Drive],
+    dt_s: Array | float,
+    *,
+    motors: Motors,
+    thermal: ThermalModel,
+    start_c: Array,
+    ambient_c: Array | float,
+    steps: Array | None = None,
+) -> Iterator[Array]:
+    """Yield the temperatures of one powered arm at the start and after each load, °C, [..., node].
+
+    Args:
+        loads: Mean drive of each step, [..., joint]; `itertools.repeat` for a constant one.
+        dt_s: Length of every step, or one per case.
+        start_c: [..., node].
+        ambient_c: One, or one per case.
+        steps: Number of steps of each case, [case], after which it keeps its temperatures; by default all.
+    """
+    phi, gamma = thermal.step_matrices(dt_s)
+    temp_c = start_c
+    yield temp_c
+    for step, load in enumerate(loads):
+        heat_w = drive_heat(temp_c, load.current_sq, load.friction_w, motors)
+        next_c = advance(temp_c, heat_w, ambient_c, phi, gamma, thermal.to_ambient)
+        temp_c = next_c if steps is None else np.where((step < steps)[:, None], next_c, temp_c)
+        yield temp_c
+
+
 NEWTON_STEPS = 100
 
 
-def settled(
+def steady_state(
     model: ThermalModel, current_sq: Array, friction_w: Array, motors: Motors, ambient_c: float
 ) -> Array | None:
-    """Temperatures at which one arm settles under a constant drive, °C, [node]; None when it never does.
+    """Steady temperatures of one arm under a constant drive, °C, [node]; None for thermal runaway.
 
-    Copper loss grows with the winding's temperature and the current with the magnets', so beyond some load no
-    temperature balances the heat. The cold arm is below every balance, heat grows with every temperature and ever
-    faster, so Newton's steps climb to the lowest balance as long as the inverse Jacobian has no negative entry
-    (Ortega & Rheinboldt, Iterative Solution of Nonlinear Equations, theorem 13.3.4); where it has one, there is none.
+    Copper loss grows with winding temperature and current with magnet temperature, so beyond some load there is no
+    equilibrium. Newton's method starts from the cold arm, below every equilibrium. As heat grows convexly with each
+    temperature, it rises to the lowest equilibrium as long as the inverse Jacobian has no negative entry (Ortega &
+    Rheinboldt, Iterative Solution of Nonlinear Equations, theorem 13.3.4); with a negative entry there is none.
 
     Args:
         current_sq: Mean squared current at the magnets' reference temperature, A², [joint].
@@ -267,7 +350,7 @@ def settled(
 
 
 def _heat_slope(temp_c: Array, current_sq: Array, motors: Motors) -> Array:
-    """Derivative of `drive_heat` by the temperatures, W/K, [node, node]."""
+    """Derivative of `drive_heat` with respect to the temperatures, W/K, [node, node]."""
     factor = magnet_factor(temp_c[HOUSING], motors)
     warm_sq = current_sq / factor**2
     slope = np.zeros((NODES, NODES))
@@ -279,7 +362,7 @@ def _heat_slope(temp_c: Array, current_sq: Array, motors: Motors) -> Array:
 
 
 def _inverse_or_none(jacobian: Array) -> Array | None:
-    """Inverse of a matrix with off-diagonal entries <= 0, None unless it is non-negative (an M-matrix)."""
+    """Inverse of a matrix with off-diagonal entries <= 0; None unless the inverse is non-negative (an M-matrix)."""
     try:
         inverse = np.linalg.inv(jacobian)
     except np.linalg.LinAlgError:  # Singular: exactly at the fold.

@@ -1,25 +1,26 @@
-"""What to try: scenarios, and the composition root that puts fleet, twin and agents together."""
+"""Scenarios, and everything that combines fleet, twin and agents."""
 
 import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from scenarios.batch import make_batch as make_batch
-    from scenarios.build import make_env as make_env
+    from scenarios.prepare.fleet import make_env as make_env
+    from scenarios.run.batch import make_batch as make_batch
 
 __all__ = ["make_batch", "make_env"]
 
 
-def __getattr__(name: str) -> Any:
-    """The public doors, opened when they are used: the command line need not load MuJoCo to print its help."""
+def __getattr__(name: str) -> Any:  # one of several functions
+    """Import the public functions when they are used, so that the command line prints its help without MuJoCo."""
     if name not in __all__:
         raise AttributeError(f"module 'scenarios' has no attribute '{name}'.")
-    import_module("scenarios.registration")
-    from scenarios import batch, build
+    import_module("scenarios.prepare.env_registration")
+    from scenarios.prepare import fleet
+    from scenarios.run import batch
 
-    return batch.make_batch if name == "make_batch" else build.make_env
+    return batch.make_batch if name == "make_batch" else fleet.make_env
 
 
-if "pettingzoo" in sys.modules:  # whoever works with it finds the environment under its name
-    import_module("scenarios.registration")
+if "pettingzoo" in sys.modules:  # `pettingzoo.make` then knows the environment
+    import_module("scenarios.prepare.env_registration")

@@ -12,17 +12,17 @@ from typing import Any, get_args, get_origin, get_type_hints
 import msgspec
 
 from fleet.errors import ScenarioError, nearest
-from scenarios.complaint import check_finite, complaint, plain_kind
-from scenarios.scenario import JobStream, Scenario
+from scenarios.schema import JobStream, Scenario
+from scenarios.schema_errors import check_finite, plain_kind, readable_error
 
 MOST_JOBS = 100_000
-"""More than anybody would wait for; a mistyped gap gives billions."""
+"""Largest number of expected jobs in a shift: a mistyped gap gives billions."""
 APART_M = 0.2
-"""Two bases closer than this would stand in one place: a Gen3 base is 0.09 m wide and needs its first joint free."""
+"""Smallest distance of two bases: a Gen3 base is 0.09 m wide, and its first joint must turn freely."""
 
 
 def library() -> dict[str, Path]:
-    """Scenarios that come with thermofleet, by name."""
+    """Files of the scenarios that come with thermofleet, by name."""
     folder = resources.files("scenarios").joinpath("library")
     return {Path(str(f)).stem: Path(str(f)) for f in sorted(folder.iterdir(), key=str) if f.name.endswith(".toml")}
 
@@ -47,38 +47,38 @@ def load(name_or_path: str | Path) -> Scenario:
         raise ScenarioError(f"{path.name}: not valid TOML: {error}.") from error
     except UnicodeDecodeError as error:
         raise ScenarioError(f"{path.name}: not a UTF-8 text file.") from error
-    return checked({"name": path.stem, **raw}, path)
+    return parse_scenario({"name": path.stem, **raw}, path)
 
 
-def checked(raw: Mapping[str, Any], path: Path) -> Scenario:
-    """The scenario of a parsed file; `path` names it in errors and locates what it refers to."""
+def parse_scenario(raw: Mapping[str, object], path: Path) -> Scenario:
+    """The scenario of a parsed TOML file; `path` names the file in errors and locates the files it refers to."""
     _known_keys(raw, Scenario, path.name, "")
     check_finite(raw, path.name)
-    raw = {"arms": (), "places": (), "jobs": (), **raw}  # so that having none and not naming any is said alike
+    raw = {"arms": (), "places": (), "jobs": (), **raw}  # an absent list and an empty one give the same error
     try:
         scenario = msgspec.convert(raw, Scenario, strict=True)
     except msgspec.ValidationError as error:
-        raise ScenarioError(f"{path.name}: {complaint(error, raw, Scenario)}") from error
+        raise ScenarioError(f"{path.name}: {readable_error(error, raw, Scenario)}") from error
     _check(scenario, path)
     return _with_traces(scenario, path)
 
 
-def override(scenario: Scenario, **changes: Any) -> Scenario:
-    """The scenario with some of its top-level fields changed.
+def override(scenario: Scenario, **changes: object) -> Scenario:
+    """A copy of the scenario with some top-level fields changed.
 
     Raises:
-        ScenarioError: no such field, or a value it cannot take.
+        ScenarioError: there is no such field, or its value is not allowed.
     """
     where = f"{scenario.name} with overrides"
     try:
         plain = msgspec.to_builtins(changes)
     except TypeError as error:
         raise ScenarioError(f"{where}: {error}.") from error
-    return checked({**msgspec.to_builtins(scenario), **plain}, Path(where))
+    return parse_scenario({**msgspec.to_builtins(scenario), **plain}, Path(where))
 
 
-def _known_keys(raw: Any, kind: Any, file: str, place: str) -> None:
-    """Refuse keys that the dataclass `kind` does not have, all the way down."""
+def _known_keys(raw: object, kind: Any, file: str, place: str) -> None:
+    """Check that the dataclass `kind` (an annotation, hence Any) has all the keys, at every depth."""
     kind = plain_kind(kind)
     if get_origin(kind) is tuple and isinstance(raw, list):
         for i, item in enumerate(raw):
@@ -95,12 +95,12 @@ def _known_keys(raw: Any, kind: Any, file: str, place: str) -> None:
 
 
 def _check(scenario: Scenario, path: Path) -> None:
-    """What no single field can know: names that must be different, exist, or lie apart."""
+    """Check what concerns several fields: unique names, references, distances."""
     file = path.name
     if not scenario.arms:
-        raise ScenarioError(f"{file}: arms: the cell has no arm; at least one [[arms]] is needed.")
+        raise ScenarioError(f"{file}: arms: there are no arms; at least one [[arms]] is needed.")
     if not scenario.jobs:
-        raise ScenarioError(f"{file}: jobs: there is nothing to do; at least one [[jobs]] is needed.")
+        raise ScenarioError(f"{file}: jobs: there are no jobs; at least one [[jobs]] is needed.")
     for kind in ("arms", "places", "jobs"):
         names = [item.name for item in getattr(scenario, kind)]
         for i, name in enumerate(names):
@@ -128,8 +128,8 @@ def _check(scenario: Scenario, path: Path) -> None:
             )
         for name in stream.after:
             if name not in streams[:i]:
-                above = nearest(name, streams[:i]) if i else "; there is none."
-                raise ScenarioError(f"{file}: jobs[{i}].after: '{name}' is no stream above this one{above}")
+                known = nearest(name, streams[:i]) if i else "; there is none."
+                raise ScenarioError(f"{file}: jobs[{i}].after: there is no stream '{name}' above this one{known}")
     total = sum(_expected_jobs(stream, scenario.horizon_s) for stream in scenario.jobs)
     if total > MOST_JOBS:
         raise ScenarioError(f"{file}: jobs: about {total:.3g} jobs would arrive in a shift; allowed are {MOST_JOBS}.")
@@ -142,7 +142,7 @@ def _expected_jobs(stream: JobStream, horizon_s: float) -> float:
 
 
 def _with_traces(scenario: Scenario, path: Path) -> Scenario:
-    """Arrival times that the scenario keeps in files, read in."""
+    """The scenario with the arrival times of its trace files."""
     streams = []
     for i, stream in enumerate(scenario.jobs):
         spec = stream.arrivals
@@ -170,9 +170,9 @@ def _trace(where: Path, place: str) -> tuple[float, ...]:
         try:
             times.append(float(line))
         except ValueError as error:
-            raise ScenarioError(f"{place}: line {number} of '{where.name}' is no time in seconds: {line!r}.") from error
+            raise ScenarioError(f"{place}: line {number} of '{where.name}' is no time, s: {line!r}.") from error
     if not times:
-        raise ScenarioError(f"{place}: '{where.name}' holds no time; one arrival time in seconds per line is needed.")
+        raise ScenarioError(f"{place}: '{where.name}' holds no times; one arrival time in seconds per line is needed.")
     for before, time in pairwise([0.0, *times]):
         if not (isfinite(time) and before <= time):
             raise ScenarioError(f"{place}: the times in '{where.name}' must be >= 0 and in order ({time} s is not).")

@@ -1,5 +1,6 @@
 """Small worlds in which every figure is known beforehand: constant torques, whole seconds, no MuJoCo and no twin."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
@@ -9,22 +10,25 @@ import pytest
 from hypothesis import settings
 
 from fleet.difficulty import Difficulty, DifficultyModel
+from fleet.engine.batch import Shift
+from fleet.engine.profile_plant import ProfilePlant
+from fleet.engine.state import World
+from fleet.engine.tables import tables_of
+from fleet.engine.world import Arm, build_world
 from fleet.env.allocation_v0 import Episode
-from fleet.env.engine import Shift
 from fleet.env.vector import Library
 from fleet.job import Job, Place, Work
 from fleet.motion import RATE_HZ, Phase, Plan
 from fleet.motor import Motors, gen3_motors
 from fleet.robot import JOINTS, Robot, ThermalLimits
-from fleet.sim.noise import key_of
-from fleet.sim.plants import ProfilePlant
-from fleet.sim.state import World
-from fleet.sim.tables import tables_of
-from fleet.sim.world import Arm, build_world
+from fleet.seeding import key_of
 from fleet.thermal import ThermalModel, gen3_network, thermal_model
 
-settings.register_profile("thermofleet", deadline=None)  # a busy machine is no reason to fail
-settings.load_profile("thermofleet")
+# No deadline: a busy machine is no reason to fail.
+settings.register_profile("thermofleet", deadline=None)
+settings.register_profile("ci", deadline=None, derandomize=True, print_blob=True)
+settings.register_profile("storm", deadline=None, derandomize=False, print_blob=True, max_examples=1000)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE") or ("ci" if os.environ.get("CI") else "thermofleet"))
 
 LIGHT, WARM, HOT = 0.0, 4.0, 8.0
 """Payloads, kg: cool for ever; past 60 °C within the hour; past 75 °C within minutes."""
@@ -199,14 +203,14 @@ class AsArrays:
         jobs, sensors = self.shifts.drawn(seed)
         index = {each.name: j for j, each in enumerate(jobs)}
         return Shift(
-            lot=0,
-            air_k=0.0,
+            fleet=0,
+            ambient_offset_k=0.0,
             kind=np.array([KINDS.index((each.work, each.repetitions, each.value)) for each in jobs], dtype=int),
             release_s=np.array([each.release_s for each in jobs]),
             due_s=np.array([each.due_s for each in jobs]),
             repetitions=np.array([each.repetitions for each in jobs], dtype=int),
             after=np.array([[index[name] for name in each.after] or [-1] for each in jobs], dtype=int).reshape(-1, 1),
-            key=key_of(sensors),
+            noise_key=key_of(sensors),
         )
 
 

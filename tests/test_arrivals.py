@@ -1,4 +1,4 @@
-"""Arrivals against the theory of Poisson streams, and batches and traces told by hand."""
+"""Arrivals: Poisson streams against theory, batches and traces against worked examples."""
 
 import numpy as np
 import pytest
@@ -6,18 +6,33 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from fleet.arrivals import Batch, Poisson, Trace, release_times
+from fleet.arrivals import Arrivals, Batch, Poisson, Trace, arrival_table, sample_arrivals, scale_rate
+from fleet.jit import kernel
+from fleet.seeding import key_of
 
 HORIZON_S = 8 * 3600.0
 
 
-def rng(seed: int = 0) -> np.random.Generator:
-    return np.random.default_rng(np.random.SeedSequence(seed))
+@kernel
+def sample(table, stream, key, out):
+    """The inlined function as one that Python calls."""
+    return sample_arrivals(table, stream, key, out)
+
+
+def release_times(stream: Arrivals, horizon_s: float, seed: int = 0) -> np.ndarray:
+    """The arrivals of the second of three streams."""
+    table = arrival_table([Batch(count=2), stream, Trace(times_s=(1.0,))], horizon_s)
+    key, out = np.uint64(key_of(np.random.SeedSequence(seed))), np.full(200_000, np.nan)
+    count = sample.chosen()(table, 1, key, out)
+    assert np.isnan(out[count:]).all()
+    if count:
+        assert sample.chosen()(table, 1, key, out[: count - 1]) == -1  # no room
+    return out[:count].copy()
 
 
 def test_poisson_counts_have_the_mean_and_the_spread_of_theory() -> None:
     stream, shifts = Poisson(every_s=600.0), 4000
-    counts = np.array([len(release_times(stream, HORIZON_S, rng(s))) for s in range(shifts)])
+    counts = np.array([len(release_times(stream, HORIZON_S, s)) for s in range(shifts)])
     mean = HORIZON_S / 600.0
     # The mean of n counts has the deviation √(μ/n); their variance, μ √(2/n + 1/(μ n)). Four deviations each.
     assert counts.mean() == pytest.approx(mean, abs=4 * np.sqrt(mean / shifts))
@@ -25,7 +40,7 @@ def test_poisson_counts_have_the_mean_and_the_spread_of_theory() -> None:
 
 
 def test_poisson_gaps_are_exponential_and_times_uniform() -> None:
-    times = release_times(Poisson(every_s=10.0), 1e6, rng(5))
+    times = release_times(Poisson(every_s=10.0), 1e6, 5)
     gaps = np.diff(times, prepend=0.0)
     assert stats.kstest(gaps, "expon", args=(0, 10.0)).pvalue > 0.01
     assert stats.kstest(times, "uniform", args=(0, 1e6)).pvalue > 0.01
@@ -40,10 +55,10 @@ def test_poisson_gaps_are_exponential_and_times_uniform() -> None:
 )
 def test_poisson_arrivals_are_in_order_and_inside(every_s, start_s, length_s, horizon_s, seed) -> None:
     stream = Poisson(every_s=every_s, start_s=start_s, stop_s=start_s + length_s)
-    times = release_times(stream, horizon_s, rng(seed))
+    times = release_times(stream, horizon_s, seed)
     assert (np.diff(times) >= 0).all()
     assert ((times >= start_s) & (times <= min(start_s + length_s, horizon_s))).all()
-    np.testing.assert_array_equal(times, release_times(stream, horizon_s, rng(seed)))
+    np.testing.assert_array_equal(times, release_times(stream, horizon_s, seed))
 
 
 @pytest.mark.parametrize(
@@ -61,7 +76,17 @@ def test_poisson_arrivals_are_in_order_and_inside(every_s, start_s, length_s, ho
     ],
 )
 def test_arrivals_stop_before_the_horizon(stream, expected) -> None:
-    assert release_times(stream, 100.0, rng()).tolist() == expected
+    assert release_times(stream, 100.0).tolist() == expected
+
+
+def test_a_scaled_stream_arrives_more_often() -> None:
+    stream, shifts = Poisson(every_s=600.0, start_s=10.0), 2000
+    counts = [len(release_times(scale_rate(stream, 2.5), HORIZON_S, s)) for s in range(shifts)]
+    mean = 2.5 * (HORIZON_S - 10.0) / 600.0
+    assert np.mean(counts) == pytest.approx(mean, abs=4 * np.sqrt(mean / shifts))
+    assert scale_rate(Batch(count=2, every_s=30.0), 3.0) == Batch(count=2, every_s=10.0)
+    for fixed in (Batch(count=2), Trace(times_s=(1.0, 2.0))):
+        assert scale_rate(fixed, 3.0) == fixed
 
 
 @pytest.mark.parametrize(

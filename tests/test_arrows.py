@@ -1,20 +1,21 @@
-"""The folders are the theory: what may import what, read from the source itself."""
+"""Which module may import which, read from the source itself."""
 
 import ast
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+import networkx as nx
 import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("fleet", "twin", "agents", "scenarios")
 SOURCES = sorted(path.relative_to(ROOT) for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 
-LAWS = ("motor", "thermal", "motion", "aging", "drift")
-NOUNS_OF_LAWS = ("robot", "job", "errors")
-"""Nouns without which no law could be written down: how many joints, what work, which errors."""
+LAWS = ("motor", "thermal", "motion")
+NOUNS_OF_LAWS = ("robot", "job", "errors", "jit")
+"""What laws need besides: the number of joints, the kinds of work, the errors, and compilation."""
 
 SIM_LIBRARIES = ("mujoco", "mink", "ruckig")
 TRAINERS = ("agilerl", "benchmarl", "ray", "sb3_contrib", "stable_baselines3", "tianshou")
@@ -23,24 +24,25 @@ HEAVY = ("torch", "mujoco", "zenoh")
 
 
 def name_of(path: Path) -> str:
-    """`fleet/sim/__init__.py` is `fleet.sim`."""
+    """`fleet/engine/__init__.py` is `fleet.engine`."""
     parts = path.with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
 MODULES = {name_of(path) for path in SOURCES}
-NOUNS = {name for name in MODULES if name.count(".") == 1 and name.startswith("fleet.")} - {
-    "fleet.sim",
-    "fleet.env",
-    "fleet.bus",
-    "fleet.live",
-}
+NOUNS = {name_of(path) for path in SOURCES if path.parent == Path("fleet") and path.name != "__init__.py"}
+LARGEST_FOLDER = 16
+"""Most files in a folder, without `__init__.py`."""
+LONGEST_FILE = 400
+"""Lines."""
+STILL_LONGER = {"fleet/live/auction/auctioneer.py": 413}
 
 
-def imports(path: Path) -> Iterator[str]:
-    """Full names of the modules that a source file imports, wherever in the file."""
+def imports(path: Path, *, on_load: bool = False) -> Iterator[str]:
+    """Full names of the modules that a source file imports, anywhere or only when it is loaded."""
     package = name_of(path) if path.name == "__init__.py" else name_of(path).rpartition(".")[0]
-    for node in ast.walk(ast.parse((ROOT / path).read_text(encoding="utf-8"))):
+    tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
+    for node in run_on_load(tree) if on_load else ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -51,8 +53,32 @@ def imports(path: Path) -> Iterator[str]:
                 yield deeper if deeper in MODULES else base
 
 
+def run_on_load(node: ast.AST) -> Iterator[ast.AST]:
+    """The nodes that run when a module is loaded: neither function bodies nor imports for type checkers."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        if isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING":
+            continue
+        yield child
+        yield from run_on_load(child)
+
+
 def below(name: str, *parents: str) -> bool:
     return any(name == parent or name.startswith(f"{parent}.") for parent in parents)
+
+
+IN_MEMORY = tuple(f"fleet.bus.exchange.{name}" for name in ("protocol", "memory"))
+BELOW = {
+    "fleet.planning": ("fleet.physics",),
+    "fleet.physics": ("fleet.planning", "fleet.engine"),
+    "fleet.engine": IN_MEMORY,
+    "fleet.bus": (),
+    "fleet.env": ("fleet.engine", *IN_MEMORY),
+    "fleet.live": ("fleet.bus", "fleet.engine", "fleet.planning", "fleet.physics"),
+    "fleet.ros2": ("fleet.bus", "fleet.live"),
+}
+"""Which folders of fleet a folder of fleet may import, besides itself and the nouns."""
 
 
 def allowed(importer: str, imported: str) -> bool:
@@ -62,15 +88,10 @@ def allowed(importer: str, imported: str) -> bool:
     if below(importer, "twin"):
         return below(imported, "twin") or imported in NOUNS
     if below(importer, "agents"):
-        return below(imported, "agents") or imported in NOUNS or imported == "fleet.env.observation"
-    if below(importer, "fleet.env"):
-        return below(imported, "fleet.env", "fleet.sim", "fleet.bus.exchange", "fleet.bus.memory") or imported in NOUNS
-    if below(importer, "fleet.sim"):
-        return below(imported, "fleet.sim") or imported in NOUNS
-    if below(importer, "fleet.live"):
-        return below(imported, "fleet.live", "fleet.bus", "fleet.sim") or imported in NOUNS
-    if below(importer, "fleet.bus"):
-        return below(imported, "fleet.bus") or imported in NOUNS
+        return below(imported, "agents") or imported in NOUNS
+    folder = ".".join(importer.split(".")[:2])
+    if folder in BELOW:
+        return below(imported, folder, *BELOW[folder]) or imported in NOUNS
     if importer.removeprefix("fleet.") in LAWS:
         return imported.removeprefix("fleet.") in (*LAWS, *NOUNS_OF_LAWS)
     return imported in NOUNS
@@ -79,18 +100,17 @@ def allowed(importer: str, imported: str) -> bool:
 def library_allowed(importer: str, library: str) -> bool:
     """Whether a module of ours may import a library that is kept in one place."""
     if library in SIM_LIBRARIES:
-        return below(importer, "fleet.sim")
+        return below(importer, "fleet.planning", "fleet.physics")
     if library == "zenoh":
-        # ros2: other keys, bytes and attachments than ours, which `Link` knows nothing of.
+        # ros2: other keys, bytes and attachments than ours, which `BusClient` knows nothing of.
         return importer in (
-            "fleet.bus.session",
-            "fleet.bus.seat",
-            "fleet.bus.router",
-            "fleet.bus.link",
-            "fleet.bus.ros2",
+            "fleet.bus.exchange.zenoh",
+            "fleet.bus.client.router",
+            "fleet.bus.client.client",
+            "fleet.ros2.node",
         )
     if library == "rosbags":
-        return importer == "fleet.bus.ros2_cdr"
+        return importer == "fleet.ros2.cdr"
     if library in TRAINERS:
         return below(importer, "fleet.env.adapters")
     if library in TENSORS:
@@ -116,21 +136,21 @@ def test_each_library_stays_in_its_place(path):
 @pytest.mark.parametrize(
     ("importer", "imported"),
     [
-        ("fleet.job", "twin.score"),
-        ("fleet.sim.kernel", "agents.rules"),
+        ("fleet.job", "twin.vae.twin"),
+        ("fleet.engine.step", "agents.rules"),
         ("fleet.motion", "fleet.difficulty"),
-        ("fleet.thermal", "fleet.sim.state"),
-        ("fleet.job", "fleet.bus.keys"),
-        ("fleet.sim.kernel", "fleet.env.reward"),
-        ("fleet.sim.kernel", "fleet.bus.memory"),
-        ("fleet.bus.memory", "fleet.sim.state"),
-        ("fleet.env.allocation_v0", "fleet.bus.session"),
-        ("agents.rules", "fleet.sim.state"),
+        ("fleet.thermal", "fleet.engine.state"),
+        ("fleet.job", "fleet.bus.protocol.keys"),
+        ("fleet.engine.step", "fleet.env.vector"),
+        ("fleet.engine.step", "fleet.bus.client.client"),
+        ("fleet.bus.exchange.memory", "fleet.engine.state"),
+        ("fleet.env.allocation_v0", "fleet.bus.exchange.zenoh"),
+        ("agents.rules", "fleet.engine.state"),
         ("agents.rules", "fleet.env.allocation_v0"),
-        ("agents.rules", "twin.score"),
-        ("twin.score", "agents.rules"),
-        ("twin.score", "fleet.sim.oracle"),
-        ("twin.score", "scenarios.build"),
+        ("agents.rules", "twin.vae.twin"),
+        ("twin.vae.twin", "agents.rules"),
+        ("twin.vae.twin", "fleet.engine.oracle"),
+        ("twin.vae.twin", "scenarios.prepare.fleet"),
     ],
 )
 def test_the_wrong_way_is_seen(importer, imported):
@@ -140,15 +160,15 @@ def test_the_wrong_way_is_seen(importer, imported):
 @pytest.mark.parametrize(
     ("importer", "library"),
     [
-        ("scenarios.build", "mujoco"),
-        ("fleet.bus.memory", "zenoh"),
+        ("scenarios.prepare.fleet", "mujoco"),
+        ("fleet.bus.exchange.memory", "zenoh"),
         ("agents.rules", "torch"),
         ("fleet.env.x", "mink"),
-        ("fleet.bus.ros2", "rosbags"),
+        ("fleet.ros2.node", "rosbags"),
         ("fleet.env.allocation_v0", "ray"),
         ("agents.learned.train", "stable_baselines3"),
         ("fleet.env.vector", "torch"),
-        ("twin.train", "torchrl"),
+        ("twin.vae.train", "torchrl"),
     ],
 )
 def test_a_library_out_of_its_place_is_seen(importer, library):
@@ -158,21 +178,24 @@ def test_a_library_out_of_its_place_is_seen(importer, library):
 def test_imports_are_found_in_every_form(tmp_path, monkeypatch):
     (tmp_path / "agents").mkdir()
     late = "def late():\n    from .rules import RULES\n    from . import policy\n"
-    source = f"import torch.nn as nn\nfrom fleet import job\n{late}"
+    typed = "if TYPE_CHECKING:\n    from fleet import robot\n"
+    source = f"import torch.nn as nn\ntry:\n    from fleet import job\nfinally:\n    pass\n{typed}{late}"
     (tmp_path / "agents" / "probe.py").write_text(source, encoding="utf-8")
     monkeypatch.setattr(sys.modules[__name__], "ROOT", tmp_path)
-    assert set(imports(Path("agents/probe.py"))) == {"torch.nn", "fleet.job", "agents.rules", "agents.policy"}
+    every = {"torch.nn", "fleet.job", "fleet.robot", "agents.rules", "agents.policy"}
+    assert set(imports(Path("agents/probe.py"))) == every
+    assert set(imports(Path("agents/probe.py"), on_load=True)) == {"torch.nn", "fleet.job"}
 
 
 @pytest.mark.parametrize("path", [path for path in SOURCES if path.name == "__init__.py"], ids=str)
-def test_a_package_file_holds_a_docstring_and_at_most_its_public_door(path):
+def test_a_package_file_holds_a_docstring_and_at_most_its_public_names(path):
     docstring, *rest = ast.parse((ROOT / path).read_text(encoding="utf-8")).body
     assert isinstance(docstring, ast.Expr)
     assert isinstance(docstring.value, ast.Constant)
     for statement in rest:
         if isinstance(statement, ast.ImportFrom) and statement.level:
             assert all(alias.asname == alias.name for alias in statement.names)
-        else:  # doors that open when they are used
+        else:  # functions that are imported when they are used
             assert path == Path("scenarios/__init__.py")
             assert isinstance(statement, ast.Import | ast.ImportFrom) or ast.unparse(statement).startswith(
                 ("if TYPE_CHECKING:", "__all__ =", "def __getattr__(", "if 'pettingzoo' in sys.modules:")
@@ -187,11 +210,51 @@ def loaded_by(*modules: str) -> set[str]:
 
 @pytest.mark.parametrize(
     "modules",
-    [["fleet"], sorted(NOUNS), ["fleet.bus.memory"], ["fleet.env.observation"], ["agents.rules"], ["scenarios.cli"]],
+    [
+        ["fleet"],
+        sorted(NOUNS),
+        ["fleet.bus.exchange.memory"],
+        ["fleet.observation"],
+        ["agents.rules"],
+        ["scenarios.cli.main"],
+    ],
     ids=["fleet", "nouns", "memory", "observation", "rules", "command line"],
 )
 def test_what_is_light_loads_no_heavy_library(modules):
     assert loaded_by(*modules) & set(HEAVY) == set()
+
+
+def circles(edges: Iterable[tuple[str, str]]) -> list[set[str]]:
+    """Groups of names that import one another, directly or through others."""
+    graph = nx.DiGraph((one, other) for one, other in edges if one != other)
+    return [group for group in nx.strongly_connected_components(graph) if len(group) > 1]
+
+
+def loads() -> list[tuple[str, str]]:
+    """Every import that runs when a module is loaded: importer, imported."""
+    return [(name_of(path), name) for path in SOURCES for name in imports(path, on_load=True) if name in MODULES]
+
+
+def folder_of(module: str) -> str:
+    return module if module in PACKAGE_FILES else module.rpartition(".")[0]
+
+
+PACKAGE_FILES = {name_of(path) for path in SOURCES if path.name == "__init__.py"}
+OPEN_CIRCLES = ({"fleet.bus.client", "fleet.bus.protocol", "fleet.bus.security"},)
+"""Folders that still import one another."""
+
+
+def test_no_modules_load_one_another():
+    assert circles(loads()) == []
+
+
+def test_no_folders_load_one_another():
+    found = circles((folder_of(one), folder_of(other)) for one, other in loads())
+    assert [group for group in found if not any(group <= known for known in OPEN_CIRCLES)] == []
+
+
+def test_a_circle_is_found():
+    assert circles([("a", "b"), ("b", "c"), ("c", "a"), ("c", "d"), ("d", "d")]) == [{"a", "b", "c"}]
 
 
 def test_nobody_but_the_root_imports_an_adapter():
@@ -199,6 +262,24 @@ def test_nobody_but_the_root_imports_an_adapter():
         (name_of(path), name) for path in SOURCES for name in imports(path) if below(name, "fleet.env.adapters")
     ]
     assert [pair for pair in adapters if not below(pair[0], "fleet.env.adapters", "scenarios")] == []
+
+
+def test_nothing_in_the_product_depends_on_a_study():
+    studies = [(name_of(path), name) for path in SOURCES for name in imports(path) if below(name, "scenarios.studies")]
+    assert [pair for pair in studies if not below(pair[0], "scenarios.studies", "scenarios.cli")] == []
+
+
+def test_no_folder_holds_more_than_a_reader_takes_in():
+    folders: dict[Path, int] = {}
+    for path in SOURCES:
+        folders[path.parent] = folders.get(path.parent, 0) + (path.name != "__init__.py")
+    large = {str(folder): count for folder, count in folders.items() if count > LARGEST_FOLDER}
+    assert large == {}
+
+
+def test_no_file_is_longer_than_a_reader_takes_in():
+    lines = {str(path): len((ROOT / path).read_text(encoding="utf-8").splitlines()) for path in SOURCES}
+    assert {path for path, count in lines.items() if count > max(LONGEST_FILE, STILL_LONGER.get(path, 0))} == set()
 
 
 def test_every_package_is_walked():

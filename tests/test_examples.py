@@ -14,20 +14,19 @@ from types import ModuleType
 
 import pytest
 
-from fleet.bus import keys
-from fleet.bus.link import Link
-from fleet.bus.messages import DifficultyWord, State
-from fleet.bus.router import Router
-from fleet.bus.trade import (
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.router import Router
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import (
     Ack,
     Award,
     Clock,
     ClockRequest,
-    Hold,
-    JobWord,
+    JobEstimate,
+    JobSpec,
     Lease,
+    LeaseEntry,
     LeaseRequest,
-    Offer,
     Quote,
     QuoteRequest,
     Receipt,
@@ -36,9 +35,10 @@ from fleet.bus.trade import (
     Status,
     StatusRequest,
 )
+from fleet.bus.protocol.messages import DifficultyScores, State
 
 ROOT = Path(__file__).parents[1]
-COMMAND = [sys.executable, "-c", "from scenarios.cli import main; main()"]
+COMMAND = [sys.executable, "-c", "from scenarios.cli.main import main; main()"]
 
 
 def example(name: str) -> ModuleType:
@@ -91,7 +91,7 @@ def test_monitor_hears_every_arm_from_another_process(tmp_path) -> None:
 
 
 PATIENCE_S = 20.0
-JOB = JobWord(name="crate 1", kind="hold", places=("rack",), repetitions=3, payload_kg=1.0)
+JOB = JobSpec(name="crate 1", kind="hold", places=("rack",), repetitions=3, payload_kg=1.0)
 
 
 @contextmanager
@@ -114,7 +114,7 @@ def bus():
     with ExitStack() as stack:
         router = stack.enter_context(Router())
         port = int(router.endpoint.rsplit(":", 1)[1])
-        yield port, lambda: stack.enter_context(Link(router.endpoint, "f"))
+        yield port, lambda: stack.enter_context(BusClient(router.endpoint, "f"))
 
 
 def serve(condition, *links):
@@ -128,7 +128,7 @@ def serve(condition, *links):
 def only(answers):
     """The one answer to a question."""
     assert not answers.refused
-    (word,) = answers.words.values()
+    (word,) = answers.messages.values()
     return word
 
 
@@ -138,20 +138,20 @@ def test_own_arm_keeps_the_rules_towards_a_strict_auctioneer(bus):
 
     def lease(request):
         asked.append(request)
-        held = tuple(hold.award for hold in request.holds)
-        return Lease(auctioneer="a", lease_s=6.0, granted=held, lost=(), leave=held if leave else ())
+        held = tuple(hold.award for hold in request.entries)
+        return Lease(auctioneer="a", lease_s=6.0, granted=held, revoked=(), may_commit=held if leave else ())
 
     def report(word):
         reports.append(word)
         return Receipt(auctioneer="a", award=word.award)
 
-    auctioneer.answer(keys.asked_by_every_arm("f", "a", "lease"), LeaseRequest, lease)
-    auctioneer.answer(keys.asked_by_every_arm("f", "a", "report"), Report, report)
-    auctioneer.answer(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=5000.0, speed=60.0))
-    auctioneer.listen(keys.of_every_arm("f", "state"), State, lambda _, word: states.append(word))
+    auctioneer.reply_to(keys.asked_by_every_arm("f", "a", "lease"), LeaseRequest, lease)
+    auctioneer.reply_to(keys.asked_by_every_arm("f", "a", "report"), Report, report)
+    auctioneer.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=5000.0, speed=60.0))
+    auctioneer.subscribe(keys.of_every_arm("f", "state"), State, lambda _, word: states.append(word))
     scores, told = [], []
-    auctioneer.listen(keys.of_every_arm("f", "difficulty"), DifficultyWord, lambda _, word: scores.append(word))
-    auctioneer.watch(keys.of_every_arm("f", "alive"), lambda arm, there: told.append((arm, there)))
+    auctioneer.subscribe(keys.of_every_arm("f", "difficulty"), DifficultyScores, lambda _, word: scores.append(word))
+    auctioneer.watch_tokens(keys.of_every_arm("f", "alive"), lambda arm, there: told.append((arm, there)))
     command = [sys.executable, "-u", str(ROOT / "examples" / "own_arm.py"), str(port), "f", "arm 1/b"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
@@ -159,14 +159,14 @@ def test_own_arm_keeps_the_rules_towards_a_strict_auctioneer(bus):
         assert states[0].time_s >= 5000.0
 
         def question(key, word, kind):
-            return only(auctioneer.ask_and_wait(keys.of_arm("f", "arm 1/b", key), word, kind, timeout_s=PATIENCE_S))
+            return only(auctioneer.query_and_wait(keys.of_arm("f", "arm 1/b", key), word, kind, timeout_s=PATIENCE_S))
 
         dry = question("quote", QuoteRequest(auction="r", jobs=(JOB,), dry_run=True), Quote)
         assert dry.quote == ""
         quote = question("quote", QuoteRequest(auction="r", jobs=(JOB,)), Quote)
-        assert quote.offers[0].feasible
+        assert quote.estimates[0].feasible
         serve(lambda: scores, auctioneer)
-        assert scores[0].difficulty == (quote.offers[0].d,)
+        assert scores[0].difficulty == (quote.estimates[0].difficulty,)
         award = Award(award="r-crate", auction="r", auctioneer="a", quote=quote.quote, job=JOB)
         first, again = (question("award", award, Ack) for _ in range(2))
         assert first == again
@@ -176,10 +176,10 @@ def test_own_arm_keeps_the_rules_towards_a_strict_auctioneer(bus):
         unheard = Award(award="r-unheard", auction="r", auctioneer="a", quote="never made", job=JOB)
         assert not question("award", unheard, Ack).accepted
 
-        serve(lambda: any(hold.phase == "finishing" for request in asked for hold in request.holds), auctioneer)
+        serve(lambda: any(hold.phase == "finishing" for request in asked for hold in request.entries), auctioneer)
         asked.clear()
         serve(lambda: asked, auctioneer)  # it waits at its last cycle until it may begin it
-        assert asked[0].holds[0].cycles == JOB.repetitions - 1
+        assert asked[0].entries[0].cycles == JOB.repetitions - 1
         assert not reports
         leave.append(True)
         serve(lambda: reports, auctioneer)
@@ -197,21 +197,21 @@ def test_own_allocator_keeps_the_rules_towards_a_strict_arm(bus):
     leases, receipts = [], []
 
     def offer(job):
-        return Offer(job=job.name, feasible=True, d=0.5)
+        return JobEstimate(job=job.name, feasible=True, difficulty=0.5)
 
     def quote(request):
         return Quote(
             arm="x", auction=request.auction, quote=f"x-{request.auction}", valid_s=3.0, twin="t", time_s=1.0,
-            mode="idle", headroom_k=20.0, capacity=0 if awards else 1, offers=tuple(map(offer, request.jobs)),
+            mode="idle", headroom_k=20.0, capacity=0 if awards else 1, estimates=tuple(map(offer, request.jobs)),
         )  # fmt: skip
 
     def take(award):
         awards.append(award)
         return Ack(arm="x", award=award.award, accepted=True)
 
-    arm.answer(keys.of_arm("f", "x", "quote"), QuoteRequest, quote)
-    arm.answer(keys.of_arm("f", "x", "award"), Award, take)
-    arm.listen(keys.of_every_auction("f", "result"), Result, lambda _, word: results.append(word.status.state))
+    arm.reply_to(keys.of_arm("f", "x", "quote"), QuoteRequest, quote)
+    arm.reply_to(keys.of_arm("f", "x", "award"), Award, take)
+    arm.subscribe(keys.of_every_auction("f", "result"), Result, lambda _, word: results.append(word.status.state))
     with running("own_allocator", port, "f"):
         command = [sys.executable, str(ROOT / "examples" / "submit_jobs.py"), str(port), "f"]
         outsider = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
@@ -219,25 +219,27 @@ def test_own_allocator_keeps_the_rules_towards_a_strict_arm(bus):
             serve(lambda: awards, arm)
 
             def hold(phase, cycles):
-                holds = (Hold(award=awards[0].award, job=awards[0].job.name, cycles=cycles, phase=phase),)
+                holds = (LeaseEntry(award=awards[0].award, job=awards[0].job.name, cycles=cycles, phase=phase),)
                 key = keys.asked_by("f", "own", "lease", "x")
-                request = LeaseRequest(arm="x", holds=holds)
-                arm.ask(key, request, Lease, lambda answers: leases.append(only(answers)), timeout_s=PATIENCE_S)
+                request = LeaseRequest(arm="x", entries=holds)
+                arm.query(key, request, Lease, lambda answers: leases.append(only(answers)), timeout_s=PATIENCE_S)
                 serve(lambda: leases, arm)
                 return leases.pop()
 
-            assert awards[0].award not in hold("working", 0).leave
-            assert awards[0].award in hold("finishing", 0).leave
+            assert awards[0].award not in hold("working", 0).may_commit
+            assert awards[0].award in hold("finishing", 0).may_commit
             word = Report(
                 arm="x", award=awards[0].award, job=awards[0].job.name, outcome="finished", cycles=1, time_s=3.0
             )
             for _ in range(2):
                 key = keys.asked_by("f", "own", "report", "x")
-                arm.ask(key, word, Receipt, lambda answers: receipts.append(only(answers)), timeout_s=PATIENCE_S)
+                arm.query(key, word, Receipt, lambda answers: receipts.append(only(answers)), timeout_s=PATIENCE_S)
             serve(lambda: len(receipts) == 2 and "finished" in results, arm)
             assert receipts[0] == receipts[1]
-            assert awards[0].award in hold("working", 0).lost
-            status = only(arm.ask_and_wait(keys.of_jobs("f", "status"), StatusRequest(), Status, timeout_s=PATIENCE_S))
+            assert awards[0].award in hold("working", 0).revoked
+            status = only(
+                arm.query_and_wait(keys.of_jobs("f", "status"), StatusRequest(), Status, timeout_s=PATIENCE_S)
+            )
             assert {word.job: word.state for word in status.jobs}[awards[0].job.name] == "finished"
         finally:
             outsider.kill()
@@ -249,7 +251,7 @@ def test_own_allocator_does_not_begin_beside_arms_that_share_jobs_out(bus):
     """They show no auctioneer's token: one of them answers for all."""
     port, link = bus
     arm = link()
-    arm.answer(keys.of_jobs("f", "status"), StatusRequest, lambda _: Status(auctioneer="x", time_s=1.0, jobs=()))
+    arm.reply_to(keys.of_jobs("f", "status"), StatusRequest, lambda _: Status(auctioneer="x", time_s=1.0, jobs=()))
     command = [sys.executable, str(ROOT / "examples" / "own_allocator.py"), str(port), "f"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
@@ -277,15 +279,15 @@ def rubbish_at():
     with ExitStack() as stack:
         router = stack.enter_context(Router())
         port = int(router.endpoint.rsplit(":", 1)[1])
-        line = stack.enter_context(Link(router.endpoint, "f"))
+        line = stack.enter_context(BusClient(router.endpoint, "f"))
         stack.enter_context(running("own_arm", port, "f", "x"))
         stack.enter_context(running("own_allocator", port, "f"))
 
         def ask(example, topic, payload, said):
             key = keys.of_arm("f", "x", topic) if example == "own_arm" else keys.asked_by("f", "own", topic, "x")
-            encoding = said or f"application/json;thermofleet.{words[topic]}.v1"
+            encoding = said or f"application/json;thermofleet.{words[topic]}.v2"
             (reply,) = list(line._session.get(key, payload=payload, encoding=encoding, timeout=PATIENCE_S))
-            assert str(reply.ok.encoding) == "application/json;thermofleet.Refusal.v1"
+            assert str(reply.ok.encoding) == "application/json;thermofleet.Refusal.v2"
             return json.loads(reply.ok.payload.to_string())["reason"]
 
         yield ask
@@ -294,8 +296,8 @@ def rubbish_at():
 def test_the_examples_make_a_fleet_of_their_own(bus):
     port, link = bus
     watcher, heard = link(), []
-    watcher.listen(keys.of_every_auction("f", "result"), Result, lambda _, word: heard.append(word.status))
-    watcher.listen(keys.of_every_arm("f", "state"), State, lambda _, word: None)
+    watcher.subscribe(keys.of_every_auction("f", "result"), Result, lambda _, word: heard.append(word.status))
+    watcher.subscribe(keys.of_every_arm("f", "state"), State, lambda _, word: None)
     monitor = subprocess.Popen(
         [sys.executable, "-u", str(ROOT / "examples" / "monitor.py"), str(port)], stdout=subprocess.PIPE, text=True
     )
@@ -322,8 +324,8 @@ def test_own_arm_and_the_submitter_work_with_the_real_auctioneer(bus, tmp_path):
     """The auctioneer of `thermofleet auction`, an arm and a submitter that know it from docs/bus.md alone."""
     port, link = bus
     watcher, heard = link(), []
-    watcher.listen(
-        keys.of_every_auction("f", "result"), Result, lambda _, word: heard.append(word.status), remembered=64
+    watcher.subscribe(
+        keys.of_every_auction("f", "result"), Result, lambda _, word: heard.append(word.status), history=True
     )
     options = [
         "--jobs",
@@ -364,8 +366,8 @@ def test_own_allocator_has_real_arms_do_the_jobs(bus, tmp_path):
     """`thermofleet arm`, which plans and simulates, under an allocator that knows it from docs/bus.md alone."""
     port, link = bus
     watcher, heard = link(), []
-    watcher.listen(keys.of_every_auction("f", "result"), Result, lambda _, word: heard.append(word.status))
-    watcher.listen(keys.of_every_arm("f", "state"), State, lambda _, word: None)
+    watcher.subscribe(keys.of_every_auction("f", "result"), Result, lambda _, word: heard.append(word.status))
+    watcher.subscribe(keys.of_every_arm("f", "state"), State, lambda _, word: None)
     with running("own_allocator", port, "f") as allocator, ExitStack() as stack:
         for name in ("arm_0", "arm_1"):
             options = ["--difficulty", "blind", "--fleet", "f", "--endpoint", f"tcp/127.0.0.1:{port}"]

@@ -14,7 +14,8 @@ from typer.testing import CliRunner
 from fleet.motor import gen3_motors, reference_current
 from fleet.robot import JOINTS, POSTURES
 from fleet.thermal import NODES, drive_heat, gen3_network, thermal_model
-from scenarios.hold import LIMITS_C, HoldError, as_json, as_table, courses, hold, hold_command
+from scenarios.motion.hold import LIMITS_C, as_json, as_table, courses, hold, hold_command
+from scenarios.motion.posture import PostureError
 
 J2, J4 = 1, 3
 
@@ -120,7 +121,7 @@ def test_runaway_has_no_settling_temperature_but_has_times():
     result = hold(7.0, "outstretched")
     assert result.cold.steady_c == (None,) * JOINTS
     assert result.cold.t75_min[J2] is not None
-    assert "never settles" in result.note
+    assert "has no steady temperature" in result.note
     assert "torque warning of 56.7" in result.note
 
 
@@ -222,5 +223,5 @@ def test_every_named_posture_can_be_held():
 
 
 def test_the_library_raises_its_own_error():
-    with pytest.raises(HoldError, match="No posture 'flat'"):
+    with pytest.raises(PostureError, match="No posture 'flat'"):
         hold(1.0, "flat")

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from agents.rules import RULES
+from agents.registry import RULES
 from fleet.robot import JOINTS
-from scenarios.build import Fleet, prepare
-from scenarios.folder import telemetry_table
-from scenarios.jobs import all_works
+from scenarios.job_stream import all_works
 from scenarios.load import library, load
-from scenarios.run import RunSpec, run
+from scenarios.prepare.fleet import Fleet, prepare
+from scenarios.run.run_folder import telemetry_table
+from scenarios.run.shift import RunSpec, run
 
 ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / "scenarios" / "library").glob("*.toml"))

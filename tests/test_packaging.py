@@ -11,9 +11,12 @@ import tomllib
 import venv
 from importlib import import_module
 from importlib.metadata import packages_distributions, version
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+
+from scenarios import extras
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("fleet", "agents", "twin", "scenarios")
@@ -38,7 +41,11 @@ def pinned_in(file: str) -> dict[str, str]:
 
 APART = sorted(path.stem for path in (ROOT / "constraints").glob("*.txt"))
 """What has an environment and pins of its own: trainers of reinforcement learning, and peers to measure beside."""
-EXTRAS = PROJECT["optional-dependencies"]
+EXTRAS = {
+    extra: [each for each in wanted if not each.startswith("thermofleet[")]
+    for extra, wanted in PROJECT["optional-dependencies"].items()
+}
+"""What each extra adds itself, without the extras that it includes."""
 SHARED = [*PROJECT["dependencies"], *(each for extra in EXTRAS if extra not in APART for each in EXTRAS[extra])]
 
 
@@ -58,8 +65,32 @@ def test_every_direct_dependency_is_pinned_within_its_range(requirement, file):
     assert high is None or pinned[0] < int(high)
 
 
+def name_of(requirement: str) -> str:
+    return re.split(r"[\[><=]", requirement)[0]
+
+
+@pytest.mark.parametrize("extra", extras.EXTRAS)
+def test_a_missing_library_is_told_with_the_extra_that_has_it(extra):
+    distributions = packages_distributions()
+    libraries = [library for library in extras.EXTRAS[extra] if find_spec(library)]  # meshes are not installed
+    of_libraries = {each.lower() for library in libraries for each in distributions[library]}
+    assert of_libraries == {name_of(each) for each in EXTRAS[extra]} or not libraries
+
+
+def test_every_extra_that_is_no_trainer_is_told_of():
+    assert set(extras.EXTRAS) == {name for name in EXTRAS if name not in (*APART, "all", "dev")}
+
+
+WITHOUT_EXTRAS = f"""
+import sys
+for library in {sorted(library for libraries in extras.EXTRAS.values() for library in libraries)}:
+    sys.modules[library] = None
+"""
+"""Makes every import of an optional library fail, as if it were not installed."""
+
+
 def test_nothing_is_pinned_that_is_not_asked_for():
-    assert set(pinned_in("constraints.txt")) == {re.split("[><=]", requirement)[0] for requirement in SHARED}
+    assert set(pinned_in("constraints.txt")) == {name_of(requirement) for requirement in SHARED}
 
 
 OTHERWISE = {"agilerl": {"tensordict"}, "benchmarl": {"tensordict", "torchrl"}, "rllib": {"gymnasium"}}
@@ -83,14 +114,14 @@ def written_by_hand() -> list[Path]:
     """Text files of the repository."""
     here = [
         ROOT / ".ci" / "run",
-        *ROOT.glob("*.*"),
+        *(path for path in ROOT.glob("*.*") if path.name != ".git"),  # a file in a worktree
         *ROOT.glob("constraints/*"),
         ROOT / "Makefile",
         ROOT / ".gitignore",
     ]
     folders = (*PACKAGES, "tests", "benchmarks", "examples", "docs")
     inside = [path for folder in folders for path in (ROOT / folder).rglob("*")]
-    kinds = (".py", ".toml", ".md", ".txt", ".json", ".xml", "")
+    kinds = (".py", ".toml", ".md", ".txt", ".json", ".xml", ".yaml", "")
     return [path for path in (*here, *inside) if path.is_file() and path.suffix in kinds]
 
 
@@ -157,7 +188,7 @@ def test_the_wheel_is_what_is_imported_there(elsewhere):
 def test_the_wheel_brings_its_data(elsewhere):
     program = """
 from importlib.resources import files
-for package, path in (("fleet", "sim/assets/gen3.xml"), ("fleet", "data/gen3_thermal.json")):
+for package, path in (("fleet", "physics/assets/gen3.xml"), ("fleet", "data/gen3_thermal.json")):
     assert files(package).joinpath(path).is_file(), path
 print(*sorted(f.name for f in files("scenarios").joinpath("library").iterdir() if f.name.endswith(".toml")))
 """
@@ -173,15 +204,31 @@ def test_the_command_works_there(elsewhere):
     assert told["cold"]["t75_min"][1] == pytest.approx(30.0, abs=1.5)
 
 
-def test_an_episode_runs_there(elsewhere):
-    program = """
-from scenarios.build import make_env
+def test_an_episode_runs_there_without_any_extra(elsewhere):
+    program = f"""{WITHOUT_EXTRAS}
+from scenarios import make_env
 env = make_env("quickstart", difficulty="blind", horizon_s=120)
 env.reset(seed=0)
 steps = 0
 while env.agents:
-    env.step({arm: 0 for arm in env.agents})
+    env.step(dict.fromkeys(env.agents, 0))
     steps += 1
 print(steps)
 """
     assert int(there(elsewhere, "python", "-c", program)) == 12
+
+
+@pytest.mark.parametrize(
+    ("call", "extra"),
+    [
+        ("from scenarios import make_env; make_env('quickstart')", "twin"),
+        ("from scenarios.prepare.fleet import open_exchange; open_exchange('zenoh', ('a', 'b'), 'fleet')", "bus"),
+        ("sys.argv = ['thermofleet', 'list']; from scenarios.__main__ import main; main()", "cli"),
+    ],
+)
+def test_a_missing_extra_is_one_sentence(call, extra):
+    program = f"{WITHOUT_EXTRAS}\n{call}"
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
+    assert said.returncode
+    sentence = r"This needs the library '\w+', which is not installed: pip install 'thermofleet\[(\w+)\]'\."
+    assert re.findall(sentence, said.stderr.splitlines()[-1]) == [extra]

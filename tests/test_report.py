@@ -19,9 +19,9 @@ from plotly.offline import get_plotlyjs
 from fleet.events import Event
 from fleet.schedule import schedule
 from fleet.telemetry import Telemetry
-from scenarios.figure import decimate, figure
-from scenarios.gantt import stream_of
-from scenarios.report import ROWS, report_html
+from scenarios.report.gantt import stream_of
+from scenarios.report.run_page import ROWS, report_html
+from scenarios.report.timeline import decimate, figure
 
 ARMS = ("arm_0", "arm_1")
 HOSTILE = '</script><img src="https://evil.example/x"><b>-001'
@@ -227,7 +227,7 @@ def test_a_long_log_is_cut_from_the_least_serious_end_and_says_by_how_much() -> 
 
 
 def test_telemetry_of_another_fleet_is_refused() -> None:
-    with pytest.raises(ValueError, match="telemetry is of 2 arms, the fleet has 3"):
+    with pytest.raises(ValueError, match="telemetry has 2 arms, the fleet 3"):
         page(arms=("a", "b", "c"), events=(), readings=telemetry(10, 2))
 
 

@@ -3,6 +3,8 @@
 # MuJoCo is compiled and ships no type stubs.
 # pyright: reportAttributeAccessIssue=false
 
+from itertools import repeat
+
 import mujoco
 import networkx as nx
 import numpy as np
@@ -13,6 +15,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
+from fleet.motion import Drive
 from fleet.motor import Motors, gen3_motors, reference_current
 from fleet.robot import JOINTS
 from fleet.thermal import (
@@ -20,12 +23,12 @@ from fleet.thermal import (
     NODES,
     WINDING,
     ThermalModel,
-    advance,
     drive_heat,
     gen3_network,
     housing,
     node_heat,
-    settled,
+    steady_state,
+    temperature_steps,
     thermal_model,
     winding,
 )
@@ -61,12 +64,9 @@ def history(
     motors: Motors = MOTORS,
 ) -> np.ndarray:
     """Temperatures at 0, dt, 2·dt, …, °C, [time, node], with the heat refreshed once per step."""
-    phi, gamma = model.step_matrices(dt_s)
-    rows = [start_c]
-    for _ in range(round(60.0 * minutes / dt_s)):
-        heat = drive_heat(rows[-1], current_sq, REST, motors)
-        rows.append(advance(rows[-1], heat, ambient_c, phi, gamma, model.to_ambient))
-    return np.array(rows)
+    loads = repeat(Drive(current_sq, REST), round(60.0 * minutes / dt_s))
+    steps = temperature_steps(loads, dt_s, motors=motors, thermal=model, start_c=start_c, ambient_c=ambient_c)
+    return np.array(list(steps))
 
 
 def crossing_min(temp_c: np.ndarray, limit_c: float, dt_s: float) -> float | None:
@@ -116,7 +116,7 @@ def test_idle_arm_settles_where_the_logged_one_does():
 
 def test_published_settling_temperature_of_the_rated_continuous_payload():
     # 1.1 kg at full reach is what Kinova rates for continuous use; it passes the warning, never the fault.
-    end = settled(MODEL, holding(33.2, 12.3), REST, MOTORS, 25.0)
+    end = steady_state(MODEL, holding(33.2, 12.3), REST, MOTORS, 25.0)
     assert end is not None
     assert end[J2] == pytest.approx(63.0, abs=1.5)
 
@@ -234,7 +234,7 @@ def test_a_long_step_ends_in_the_steady_state():
 
 @pytest.mark.parametrize("tau2_nm", [0.0, 23.5, 41.2, 58.9])
 def test_settled_is_where_a_long_hold_ends(tau2_nm):
-    end = settled(MODEL, holding(tau2_nm, 15.0), REST, MOTORS, 25.0)
+    end = steady_state(MODEL, holding(tau2_nm, 15.0), REST, MOTORS, 25.0)
     assert end is not None
     run = history(holding(tau2_nm, 15.0), np.full(NODES, 25.0), minutes=60 * 24, dt_s=20.0)
     np.testing.assert_allclose(end, run[-1], atol=1e-3)
@@ -242,7 +242,7 @@ def test_settled_is_where_a_long_hold_ends(tau2_nm):
 
 def test_beyond_some_load_nothing_settles():
     def joint_2(tau2_nm: float) -> float | None:
-        end = settled(MODEL, holding(tau2_nm, 0.0), REST, MOTORS, 25.0)
+        end = steady_state(MODEL, holding(tau2_nm, 0.0), REST, MOTORS, 25.0)
         return None if end is None else float(end[J2])
 
     fold_nm = next(tau for tau in np.arange(50.0, 100.0, 0.1) if joint_2(tau) is None)
@@ -257,7 +257,7 @@ def test_beyond_some_load_nothing_settles():
 def test_settled_is_a_balance_above_the_room_or_nothing(tau_nm, ambient_c):
     # Newton's method without care would also find balances far below absolute zero, or the unstable ones.
     current_sq = reference_current(tau_nm, REST, MOTORS) ** 2
-    end = settled(MODEL, current_sq, REST, MOTORS, ambient_c)
+    end = steady_state(MODEL, current_sq, REST, MOTORS, ambient_c)
     if end is not None:
         assert np.all(end >= ambient_c)
         heat_w = drive_heat(end, current_sq, REST, MOTORS)
@@ -268,12 +268,12 @@ def test_settled_is_a_balance_above_the_room_or_nothing(tau_nm, ambient_c):
 
 def test_a_hopeless_load_on_a_wrist_settles_nowhere():
     current_sq = reference_current(np.array([0, 0, 0, 0, 0, 0, 96.2]), REST, MOTORS) ** 2
-    assert settled(MODEL, current_sq, REST, MOTORS, 25.0) is None
+    assert steady_state(MODEL, current_sq, REST, MOTORS, 25.0) is None
 
 
 def test_friction_and_idle_heat_enter_the_housings():
     friction_w = np.arange(7.0)
-    end = settled(MODEL, REST, friction_w, MOTORS, 22.0)
+    end = steady_state(MODEL, REST, friction_w, MOTORS, 22.0)
     assert end is not None
     np.testing.assert_allclose(end, MODEL.steady(node_heat(REST, MOTORS.idle_w + friction_w), 22.0))
 

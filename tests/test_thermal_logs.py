@@ -13,8 +13,8 @@ import pytest
 from fleet.motor import Motors, copper_loss, friction_heat, gen3_motors
 from fleet.robot import JOINTS
 from fleet.thermal import HOUSING, WINDING, gen3_network, node_heat, thermal_model
-from twin.logs import read, read_folder
-from twin.recording import Recording, interval_current_sq, interval_speed
+from twin.logs.reader import read, read_folder
+from twin.logs.recording import Recording, interval_current_sq, interval_speed
 
 LOGS = Path(__file__).parents[1] / "../shared/data/gen3_logs"
 AMBIENT_C = 22.0

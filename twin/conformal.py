@@ -1,4 +1,4 @@
-"""The p-value of split conformal prediction: how rarely a job like the reference scores so high."""
+"""The p-value of split conformal prediction."""
 
 import numpy as np
 
@@ -8,10 +8,10 @@ Array = np.ndarray
 def p_value(ordered: Array, score: Array) -> Array:
     """(1 + #{reference ≥ score}) / (n + 1) of each score, in (0, 1], same shape as the scores.
 
-    Of a job exchangeable with the reference it is ≤ α with probability ≤ α, for every α.
+    For a job exchangeable with the reference it is ≤ α with probability ≤ α, for every α.
 
     Args:
-        ordered: Scores of the n reference jobs, rising, [job].
+        ordered: Scores of the n reference jobs, ascending, [job].
 
     Source: Vovk, Gammerman & Shafer, Algorithmic Learning in a Random World, 2005, prop. 2.8.
     """

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from fleet.env.observation import Layout
+from fleet.observation import Layout
 
 OWN, SLOT, PEER, PAIR = 14, 12, 5, 3
 """Features of an arm itself, of a slot, of a peer, and of a peer's word on a slot."""

@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from agents.learned.network import Actor, masked
-from fleet.env.observation import Layout
+from fleet.observation import Layout
 
 Array = np.ndarray
 

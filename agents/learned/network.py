@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from agents.learned.features import OWN, PAIR, PEER, SLOT, sets_of
-from fleet.env.observation import Layout
+from fleet.observation import Layout
 
 RARELY = -3.0
 """Logit by which a fresh actor rather claims than waits: it begins as a rule that keeps the fleet busy."""

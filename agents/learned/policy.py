@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -12,9 +12,10 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 
 from agents.learned.network import Actor, NetworkSize, masked
-from fleet.drafts import drafted
-from fleet.env.observation import Layout, Observation
+from agents.policy import WAIT
 from fleet.errors import CheckpointError
+from fleet.files import atomic_path
+from fleet.observation import Layout, Observation
 
 FORMAT = 2
 """Raised when the network or what it is fed changes."""
@@ -22,15 +23,16 @@ WEIGHTS, CARD = "policy.safetensors", "policy.json"
 
 
 class LearnedPolicy:
-    """Every arm draws from what the actor finds likely, as it did in training.
+    """Every arm draws its action from the actor's probabilities, as in training. Scope arm: one observation decides.
 
-    The likeliest action alone would not do: arms that see the same would all claim the same job, and an arm that
-    waits now and then would wait for ever.
+    Taking the likeliest action would not do: arms with the same observation would all claim the same job, and an arm
+    that waits now and then would wait for ever.
 
     Args:
         actor: Trained, for a fleet of any size.
     """
 
+    scope: ClassVar = "arm"
     only_choices = True
 
     def __init__(self, actor: Actor) -> None:
@@ -41,9 +43,13 @@ class LearnedPolicy:
         """Begin a shift."""
         self._rng = rng
 
+    def choose(self, observation: Observation, place: int) -> int:
+        """An action of one arm; WAIT where there is no choice."""
+        return self.act({"": observation})[""]
+
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
-        """An action of every arm; WAIT where there is no choice."""
-        actions = dict.fromkeys(observations, 0)
+        """What each arm chooses, in one call of the network."""
+        actions = dict.fromkeys(observations, WAIT)
         choosing = [arm for arm, seen in observations.items() if seen.action_mask[1:].any()]
         if not choosing:
             return actions
@@ -68,11 +74,11 @@ def save_policy(actor: Actor, size: NetworkSize, folder: Path, **told: Any) -> N
         told: What the card shall say besides: scenario, algorithm, steps.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with drafted(folder / WEIGHTS) as draft:
+    with atomic_path(folder / WEIGHTS) as draft:
         # Not save_file, which hides its file from the group and others.
         draft.write_bytes(save({name: value.contiguous() for name, value in actor.state_dict().items()}))
     card = {"format": FORMAT, "size": asdict(size), **told}
-    with drafted(folder / CARD) as draft:
+    with atomic_path(folder / CARD) as draft:
         draft.write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
 
 

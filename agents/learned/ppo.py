@@ -25,9 +25,9 @@ from torchrl.objectives.value.functional import vec_generalized_advantage_estima
 
 from agents.learned.network import Actor, Critic, NetworkSize, masked
 from agents.learned.policy import draw
-from fleet.drafts import drafted
-from fleet.env.observation import Layout
 from fleet.errors import CheckpointError
+from fleet.files import atomic_path
+from fleet.observation import Layout
 
 Algorithm = Literal["mappo", "ippo"]
 SEEN, MASK, ACTION, LIKELIHOOD = ("arms", "observation"), ("arms", "action_mask"), ("arms", "action"), "log_prob"
@@ -240,7 +240,7 @@ class Trainer:
 
     def save(self, path: Path, **told: float) -> None:
         """Write all that goes on when training is resumed, and some numbers; the file appears whole or not at all."""
-        with drafted(path) as draft:
+        with atomic_path(path) as draft:
             torch.save({"trainer": self.state(), **told}, draft)
 
     def load(self, path: Path) -> dict[str, Any]:

@@ -32,8 +32,8 @@ from struck import CannotStrike, Fault
 from trespass import trespass
 from wall_clock import clock_jump
 
-from scenarios.build import prepare
 from scenarios.load import load
+from scenarios.prepare.fleet import prepare
 
 FAULTS = {
     "kill-arm": Fault(kill_arm),

@@ -11,16 +11,16 @@ from partition import Line
 from struck import Fault, Fleet, Outcome
 from wall_clock import WallClocks
 
-from fleet.bus import keys
-from fleet.bus.certificates import HERE
-from fleet.bus.keyring import make
-from fleet.bus.link import Link
-from fleet.bus.roster import Participant, of_arms
-from fleet.bus.router import open_client
-from fleet.bus.security import Tls
-from fleet.bus.trade import Clock, ClockRequest, JobWord, Submission, Submitted
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.router import open_client
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import Clock, ClockRequest, JobSpec, Submission, SubmissionReply
+from fleet.bus.security.access_control import Participant, of_arms
+from fleet.bus.security.certificates import HERE
+from fleet.bus.security.keyring import make
+from fleet.bus.security.tls import Tls
 from fleet.live.supervisor import Backoff, Supervisor
-from scenarios.live_up import free_port, parts_of
+from scenarios.cli.live.up import free_port, parts_of
 from scenarios.load import load
 
 START_S = 60.0
@@ -82,7 +82,7 @@ def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float, namespaces:
         for part in parts:
             supervisor.await_ready(part.name, START_S)
         endpoint = router.ready if place is None else Tls(place, "submitter").endpoint(router.ready)
-        link = stack.enter_context(Link(endpoint, SCENARIO))
+        link = stack.enter_context(BusClient(endpoint, SCENARIO))
         session = stack.enter_context(open_client(endpoint, timeout_s=5.0))
         fleet = Fleet(supervisor, link, router.ready, session, folder, arms, keys=place, line=cut, clocks=clocks)
         fleet.away = away
@@ -90,10 +90,14 @@ def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float, namespaces:
         if math.isinf(fleet.until(lambda: len(fleet.states) == len(arms) and len(fleet.tokens) == len(arms), 30.0)):
             raise RuntimeError(f"Only {sorted(fleet.states)} of {arms} are on the bus.")
         fleet.until(
-            lambda: bool(fleet.link.ask_and_wait(keys.of_clock(SCENARIO), ClockRequest(), Clock, timeout_s=2.0).words)
+            lambda: bool(
+                fleet.link.query_and_wait(keys.of_clock(SCENARIO), ClockRequest(), Clock, timeout_s=2.0).messages
+            )
         )
-        answers = link.ask_and_wait(keys.of_jobs(SCENARIO, "submit"), Submission(work), Submitted, timeout_s=10.0)
-        taken = {job.job for word in answers.words.values() for job in word.jobs if job.accepted}
+        answers = link.query_and_wait(
+            keys.of_jobs(SCENARIO, "submit"), Submission(work), SubmissionReply, timeout_s=10.0
+        )
+        taken = {job.job for word in answers.messages.values() for job in word.jobs if job.accepted}
         if len(taken) != jobs:
             raise RuntimeError(f"Only {len(taken)} of {jobs} jobs were accepted: {answers.refused}")
         fleet.until(lambda: fleet.working() is not None and _finished(fleet) >= 2)
@@ -111,15 +115,15 @@ def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float, namespaces:
     return outcome
 
 
-def _job(number: int) -> JobWord:
+def _job(number: int) -> JobSpec:
     """Work that the scenario's arms have planned, at three pairs of stations in turn, some minutes each."""
     name, repetitions = f"job {number:03d}", 4 + number % 3
     if number % 3 == 0:
-        return JobWord(name=name, kind="sort", places=("belt", "bin"), payload_kg=0.1, repetitions=repetitions)
+        return JobSpec(name=name, kind="sort", places=("belt", "bin"), payload_kg=0.1, repetitions=repetitions)
     if number % 3 == 1:
         trays = ("tray_left", "tray_right")
-        return JobWord(name=name, kind="pick_place", places=trays, payload_kg=0.5, repetitions=repetitions)
-    return JobWord(name=name, kind="hold", places=("clamp",), payload_kg=3.0, dwell_s=60.0, repetitions=2)
+        return JobSpec(name=name, kind="pick_place", places=trays, payload_kg=0.5, repetitions=repetitions)
+    return JobSpec(name=name, kind="hold", places=("clamp",), payload_kg=3.0, dwell_s=60.0, repetitions=2)
 
 
 def _finished(fleet: Fleet) -> int:

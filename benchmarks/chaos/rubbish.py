@@ -7,10 +7,10 @@ import random
 import msgspec
 from struck import Fleet
 
-from fleet.bus import keys
-from fleet.bus.council import Bid, Claim
-from fleet.bus.messages import State, encode, encoding
-from fleet.bus.trade import Award, LeaseRequest, QuoteRequest, Report, Submission
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import Award, LeaseRequest, QuoteRequest, Report, Submission
+from fleet.bus.protocol.consensus import Bid, Claim
+from fleet.bus.protocol.messages import State, encode, encoding
 
 RUBBISH = 100_000
 
@@ -52,7 +52,7 @@ def rubbish(fleet: Fleet) -> float:
         else:
             session.put(key, body, encoding=kind)
         if number % 500 == 0:
-            fleet.supervisor.look()
+            fleet.supervisor.poll()
             fleet.link.serve()
     return math.nan
 
@@ -68,7 +68,7 @@ def replayed_awards(fleet: Fleet) -> float:
             encoding=encoding(Award),
             timeout=2.0,
         )
-        fleet.supervisor.look()
+        fleet.supervisor.poll()
         fleet.link.serve()
     return math.nan
 
@@ -81,7 +81,7 @@ def awards_of(fleet: Fleet, arm: str) -> list[Award]:
         msgspec.convert(record["award"], Award)
         for records in lines
         for record in records
-        if record["type"] == "accepted"
+        if record["type"] == "award_accepted"
     ]
 
 

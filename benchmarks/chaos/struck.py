@@ -13,12 +13,12 @@ from pathlib import Path
 
 import zenoh
 
-from fleet.bus import keys
-from fleet.bus.link import Link
-from fleet.bus.messages import State
-from fleet.bus.trade import JobStatus, Result, Status, StatusRequest
+from fleet.bus.client.client import BusClient
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import JobStatus, Result, Status, StatusRequest
+from fleet.bus.protocol.messages import State
+from fleet.live.arm.journal_records import ArmRecord, Closed
 from fleet.live.journal import Journal
-from fleet.live.promises import Closed, Promise
 from fleet.live.supervisor import Supervisor
 
 PATIENCE_S = 150.0
@@ -59,7 +59,7 @@ class Fleet:
     """A fleet of processes, and a line by which it is watched."""
 
     supervisor: Supervisor
-    link: Link
+    link: BusClient
     endpoint: str
     session: zenoh.Session
     """A stranger's, to speak rubbish with."""
@@ -85,9 +85,9 @@ class Fleet:
     def listen(self) -> None:
         """Hear who is there, how they are, and what becomes of jobs."""
         fleet = self.link.fleet
-        self.link.watch(keys.of_every_arm(fleet, "alive"), self._token)
-        self.link.listen(keys.of_every_arm(fleet, "state"), State, self._state)
-        self.link.listen(keys.of_every_auction(fleet, "result"), Result, self._result)
+        self.link.watch_tokens(keys.of_every_arm(fleet, "alive"), self._token)
+        self.link.subscribe(keys.of_every_arm(fleet, "state"), State, self._state)
+        self.link.subscribe(keys.of_every_auction(fleet, "result"), Result, self._result)
 
     def note(self, what: str) -> None:
         """Say something beside the figures."""
@@ -99,7 +99,7 @@ class Fleet:
         while time.monotonic() - began_s < patience_s:
             if condition():
                 return time.monotonic() - began_s
-            self.supervisor.look()
+            self.supervisor.poll()
             self.link.serve(time.monotonic() + 0.02)
         return math.inf
 
@@ -124,10 +124,10 @@ class Fleet:
 
     def status(self) -> dict[str, JobStatus]:
         """What the auctioneer says of all jobs; nothing, if it does not answer."""
-        answers = self.link.ask_and_wait(
+        answers = self.link.query_and_wait(
             keys.of_jobs(self.link.fleet, "status"), StatusRequest(), Status, timeout_s=2.0
         )
-        return {job.job: job for word in answers.words.values() for job in word.jobs}
+        return {job.job: job for word in answers.messages.values() for job in word.jobs}
 
     def done_by(self) -> Counter[str]:
         """How often each job was finished, by the journals of the arms."""
@@ -137,11 +137,11 @@ class Fleet:
                 continue
             copy = Path(tempfile.mkdtemp()) / path.name  # the arm holds its own
             copy.write_bytes(path.read_bytes())
-            with Journal[Promise](copy, Promise) as journal:
+            with Journal[ArmRecord](copy, ArmRecord) as journal:
                 done.update(
-                    record.report.job
-                    for record in journal.replay()
-                    if isinstance(record, Closed) and record.report.outcome == "finished"
+                    record.job
+                    for record in journal.records()
+                    if isinstance(record, Closed) and record.outcome == "finished"
                 )
         return done
 

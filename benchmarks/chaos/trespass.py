@@ -19,25 +19,25 @@ import zenoh
 from rubbish import awards_of
 from struck import Fleet
 
-from fleet.bus import keys
-from fleet.bus.certificates import issue
-from fleet.bus.keyring import make
-from fleet.bus.messages import Refusal, State, encode, encoding
-from fleet.bus.roster import Participant, of_arms
-from fleet.bus.router import open_client
-from fleet.bus.security import Tls
-from fleet.bus.trade import (
+from fleet.bus.client.router import open_client
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import (
     Award,
     Clock,
     ClockRequest,
-    Hold,
-    JobWord,
+    JobSpec,
+    LeaseEntry,
     LeaseRequest,
     QuoteRequest,
     Report,
     StatusRequest,
     Submission,
 )
+from fleet.bus.protocol.messages import Refusal, State, encode, encoding
+from fleet.bus.security.access_control import Participant, of_arms
+from fleet.bus.security.certificates import issue
+from fleet.bus.security.keyring import make
+from fleet.bus.security.tls import Tls
 
 ROGUE = "rogue"
 PATIENT_S = 10.0
@@ -159,8 +159,8 @@ def answers(fleet: Fleet, rogue: zenoh.Session) -> Iterator[Try]:
 
     held = [rogue.declare_queryable(place, lie(place), complete=True) for place in places]
     _settle(rogue, of_fleet)
-    clock = fleet.link.ask_and_wait(keys.of_clock(of_fleet), ClockRequest(), Clock, timeout_s=PATIENT_S)
-    if not clock.words or not fleet.status():
+    clock = fleet.link.query_and_wait(keys.of_clock(of_fleet), ClockRequest(), Clock, timeout_s=PATIENT_S)
+    if not clock.messages or not fleet.status():
         raise RuntimeError("Nobody answers where the rogue tried to.")
     fleet.until(lambda: False, 3.0)  # rounds, leases and reports go on meanwhile
     yield from ((f"an answer under {place}", count > 0) for place, count in asked.items())
@@ -178,7 +178,7 @@ def questions(fleet: Fleet, rogue: zenoh.Session) -> Iterator[Try]:
     if not in_hand:
         raise RuntimeError("No arm has a job in hand that could be stolen; give the fleet more jobs.")
     for status in in_hand:
-        hold = Hold(status.award, status.job, 0, "finishing")
+        hold = LeaseEntry(status.award, status.job, 0, "finishing")
         lease = LeaseRequest(status.arm, (hold,))
         report = Report(status.arm, status.award, status.job, "finished", 1, 0.0)
         for word, topic in ((lease, "lease"), (report, "report")):
@@ -199,7 +199,7 @@ def questions(fleet: Fleet, rogue: zenoh.Session) -> Iterator[Try]:
         where = keys.of_arm(of_fleet, arm, "award")
         for who, session in ((ROGUE, rogue), ("the submitter", fleet.session)):
             yield f"award {award.award} again by {who}", _answered(session, where, award)
-    job = JobWord(name="of the rogue", kind="hold", places=("clamp",))
+    job = JobSpec(name="of the rogue", kind="hold", places=("clamp",))
     for key, word in (
         (keys.of_every_arm(of_fleet, "quote"), QuoteRequest("r", (job,))),
         (keys.of_jobs(of_fleet, "submit"), Submission((job,))),

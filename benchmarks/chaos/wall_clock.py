@@ -16,8 +16,8 @@ from pathlib import Path
 
 from struck import CannotStrike, Fleet
 
-from fleet.bus import keys
-from fleet.bus.trade import Clock, ClockRequest
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import Clock, ClockRequest
 
 SOURCE = Path(__file__).with_suffix(".c")
 EACH_S, OFF_S = 1.5, 1.0
@@ -107,8 +107,8 @@ def clock_jump(fleet: Fleet) -> float:
 def furthest_off_s(fleet: Fleet) -> float:
     """By how many real seconds the arm that is furthest off differs from the fleet's time; infinite if nobody tells."""
     asked_s = time.monotonic()
-    answers = fleet.link.ask_and_wait(keys.of_clock(fleet.link.fleet), ClockRequest(), Clock, timeout_s=2.0)
-    for clock in answers.words.values():
+    answers = fleet.link.query_and_wait(keys.of_clock(fleet.link.fleet), ClockRequest(), Clock, timeout_s=2.0)
+    for clock in answers.messages.values():
         middle_s = asked_s + 0.5 * answers.took_s
         states = [fleet.states[arm] for arm in fleet.arms]
         return max(abs((said.time_s - clock.time_s) / clock.speed + middle_s - heard_s) for heard_s, said in states)

@@ -1,12 +1,11 @@
 """Thermal job allocation, version 0: arms claim jobs, heat up, and must not fault.
 
-A PettingZoo `ParallelEnv` as a thin view of the one engine `fleet.sim.kernel`. Agents are the arms, fixed for the
+A PettingZoo `ParallelEnv` as a thin view of the one engine `fleet.engine.step`. Agents are the arms, fixed for the
 whole episode. Every decision interval each answers Discrete(slots + 1): 0 waits or goes on and is always legal, k
 claims the job in slot k. Two claims for one job or station: the lower shared difficulty wins, then the lower index.
 """
 
-from collections.abc import Callable
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from gymnasium import spaces
@@ -14,21 +13,19 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import wrappers
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
-from fleet.bus.exchange import Exchange
-from fleet.bus.memory import MemoryExchange
-from fleet.env.arguments import actions_of, agent_of, at_least_one, seed_of
-from fleet.env.episode import Episode as Episode
-from fleet.env.episode import EpisodeFactory as EpisodeFactory
-from fleet.env.observation import Layout, Observation
-from fleet.env.plain import PlainShift
-from fleet.env.reward import TERMS, RewardWeights
-from fleet.env.scene import Cell
+from fleet.bus.exchange.memory import MemoryExchange
+from fleet.bus.exchange.protocol import Exchange
+from fleet.engine.reward import TERMS, RewardWeights
+from fleet.engine.shift import Episode as Episode
+from fleet.engine.shift import EpisodeFactory as EpisodeFactory
+from fleet.engine.shift import ShiftRunner, Watch
+from fleet.engine.state import State, World
+from fleet.env.render.renderer import Renderer
+from fleet.env.render.scene import Cell
 from fleet.env.spaces import arm_spaces
-from fleet.env.window import Window
+from fleet.env.validation import actions_of, agent_of, at_least_one, seed_of
 from fleet.events import Event
-from fleet.sim.kernel import Step
-from fleet.sim.plants import ProfilePlant
-from fleet.sim.state import State, World
+from fleet.observation import Layout, Observation
 from fleet.telemetry import MODES
 from fleet.thermal import WINDING
 
@@ -41,44 +38,22 @@ FRAMES_PER_S = 10
 """Of a rendered episode, in decision intervals per second."""
 
 
-class Shift(Protocol):
-    """One episode that is being stepped: `fleet.env.plain.PlainShift` or `fleet.env.compiled.CompiledShift`."""
-
-    @property
-    def state(self) -> State: ...
-    @property
-    def vectors(self) -> Array: ...
-    @property
-    def mask(self) -> Array: ...
-    @property
-    def messages(self) -> int: ...
-    @property
-    def counts(self) -> tuple[Array, Array, Array, Array, int]: ...
-    @property
-    def tick(self) -> int: ...
-    def step(self, actions: Array, /) -> tuple[Array, bool]: ...
-
-
 class AllocationEnv(ParallelEnv[str, Any, Any]):
-    """The environment itself; `parallel_env` is its public door.
-
-    Arms that follow their plans and hear each other at once are stepped by the compiled engine of the batch,
-    `fleet.env.vector`; with an event log, a watcher, another plant or another exchange the plain kernel steps them, to
-    the same end.
+    """The environment; `parallel_env` makes it.
 
     Args:
-        make_episode: Makes the shift of a seed.
-        exchange: Carries what arms tell each other; perfect and immediate if not given. The env closes it.
+        make_episode: Makes the episode of a seed.
+        exchange: Carries the messages between arms; perfect and immediate if not given. The env closes it.
         weights: Of the reward terms.
         max_cycles: Ends the episode earlier than the shift's horizon, in decision intervals.
         keep_events: Collect an event log in `events`.
-        watch: Called with every `Step` of the kernel, for recording.
+        watch: Called with the `StepRecord` of every step, for recording.
         render_mode: "rgb_array" for a picture from above, "human" for a window that shows it, "ansi" for a table of
             the fleet as text, or None.
         cell: Where arms and stations stand, for pictures; arms in a row if not given.
         mask_in: Where the mask of legal actions is: in the observation, in the info, or both. In the info alone, the
             observation is the vector by itself.
-        near: The peers each arm has in its vector; see `fleet.env.observation.Layout`.
+        near: The peers each arm has in its vector; see `fleet.observation.Layout`.
     """
 
     metadata = {  # noqa: RUF012  # PettingZoo's
@@ -96,7 +71,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         weights: RewardWeights | None = None,
         max_cycles: int | None = None,
         keep_events: bool = False,
-        watch: Callable[[Step], None] | None = None,
+        watch: Watch | None = None,
         render_mode: str | None = None,
         cell: Cell | None = None,
         mask_in: MaskPlace = "obs",
@@ -114,7 +89,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         self._max_cycles = None if max_cycles is None else at_least_one("max_cycles", max_cycles)
         self._keep_events = keep_events
         self._watch = watch
-        self._cell, self._window = cell, Window() if render_mode == "human" else None
+        self._renderer = Renderer(cell)
         self._mask_in = mask_in
         self._seeds = np.random.SeedSequence()
         self._episode = make_episode(np.random.SeedSequence(0))
@@ -133,26 +108,31 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         }
         low, high = self.layout.bounds
         self.state_space = spaces.Box(np.tile(low, len(world.arms)), np.tile(high, len(world.arms)), dtype=np.float32)
-        self._shift: Shift | None = None
+        self._shift: ShiftRunner | None = None
 
     @property
     def world(self) -> World:
-        """The world of the present episode (the simulator's truth: not for policies)."""
+        """The world of the current episode (simulator truth: not for policies)."""
         return self._episode.world
 
     @property
     def episode(self) -> Episode:
-        """The present episode."""
+        """The current episode."""
         return self._episode
 
     @property
     def truth(self) -> State:
-        """The simulator's state (not for policies)."""
-        return self._begun("looking at its state").state
+        """A copy of the simulator's state (not for policies)."""
+        return self._begun("looking at its state").state.copy()
+
+    @property
+    def tick(self) -> int:
+        """Decision intervals of this episode that are over."""
+        return self._begun("counting steps").tick
 
     @property
     def messages(self) -> int:
-        """Words that reached a peer in this episode."""
+        """Messages delivered to a peer in this episode."""
         return self._begun("counting messages").messages
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
@@ -166,7 +146,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-        """Begin a new shift: observations and infos by agent. Without a seed, the next one of the last seed's row.
+        """Start a new episode; return observations and infos by agent. Without a seed: the next child of the last seed.
 
         Raises:
             ValueError: a seed that is no integer >= 0.
@@ -178,7 +158,15 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         self._episode = self._make_episode(entropy)
         self.agents = list(self.possible_agents)
         self.events = []
-        self._shift = self._laid_out()
+        self._shift = ShiftRunner(
+            self._episode,
+            self._weights,
+            exchange=self._exchange,
+            keep_events=self._keep_events,
+            watch=self._watch,
+            layout=self.layout,
+        )
+        self.events = self._shift.events
         observations, masks = self._observations()
         return observations, self._infos(np.zeros(len(TERMS)), masks)
 
@@ -195,7 +183,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         if not self.agents:
             raise RuntimeError("The episode is over: call reset() before step().")
         arms, chosen = self.possible_agents, actions_of(self.possible_agents, actions)
-        parts, finished = shift.step(chosen)
+        parts, reward, finished = shift.step(chosen)
         last_tick = min(self.world.ticks, self._max_cycles or self.world.ticks)
         over = not finished and shift.tick >= last_tick
         observations, masks = self._observations()
@@ -204,7 +192,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
             self.agents = []
         return (
             observations,
-            dict.fromkeys(arms, float(parts.sum())),
+            dict.fromkeys(arms, reward),
             dict.fromkeys(arms, finished),
             dict.fromkeys(arms, over),
             infos,
@@ -228,35 +216,20 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         shift, world = self._begun("render()"), self.world
         if self.render_mode == "ansi":
             return _table(world, shift.state)
-        from fleet.env.picture import draw  # loads Pillow, which few episodes have a use for
-
-        frame = draw(world, shift.state, self._cell)
-        if self._window is None:
+        frame = self._renderer.frame(world, shift.state)
+        if self.render_mode == "rgb_array":
             return frame
-        self._window.show(frame)
+        self._renderer.show(frame)
         return None
 
     def close(self) -> None:
         """Close the exchange, and the window if there is one."""
         self._exchange.close()
-        if self._window is not None:
-            self._window.close()
+        self._renderer.close()
 
-    def _laid_out(self) -> Shift:
-        """The new episode, ready to be stepped."""
-        exchange = self._exchange
-        at_once = isinstance(exchange, MemoryExchange) and exchange.perfect
-        plain = self._keep_events or self._watch is not None
-        if plain or not at_once or not isinstance(self._episode.plant, ProfilePlant):
-            log = self.events if self._keep_events else None
-            return PlainShift(self._episode, exchange, self._weights, log, self._watch, self.layout)
-        from fleet.env.compiled import CompiledShift  # loads numba, which a live arm has no use for
-
-        return CompiledShift(self._episode, self._weights, self.layout)
-
-    def _begun(self, what: str) -> Shift:
+    def _begun(self, what: str) -> ShiftRunner:
         if self._shift is None:
-            raise RuntimeError(f"No episode has begun: call reset() before {what}.")
+            raise RuntimeError(f"No episode has started: call reset() before {what}.")
         return self._shift
 
     def _known(self, agent: str) -> str:
@@ -272,24 +245,33 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         return {arm: {"observation": vectors[a], "action_mask": masks[a]} for a, arm in enumerate(arms)}, masks
 
     def _infos(self, parts: Array, masks: Array) -> dict[str, dict[str, Any]]:
-        *per_arm, done = self._begun("infos").counts
-        named = {f"reward_{name}": part for name, part in zip(TERMS, parts.tolist(), strict=True)}
-        infos: dict[str, dict[str, Any]] = {}
-        for arm, faults, illegal, peak_c, above_s in zip(
-            self.possible_agents, *(values.tolist() for values in per_arm), strict=True
-        ):
-            infos[arm] = {
+        shift = self._begun("infos")
+        state = shift.state
+        named = {"jobs_done": float(shift.jobs_done), **dict(zip(_REWARDS, parts.tolist(), strict=True))}
+        infos = {
+            arm: {
                 "faults": float(faults),
                 "illegal": float(illegal),
                 "peak_c": peak_c,
                 "above_warning_s": above_s,
-                "jobs_done": float(done),
                 **named,
             }
+            for arm, faults, illegal, peak_c, above_s in zip(
+                self.possible_agents,
+                state.faults[0].tolist(),
+                state.illegal[0].tolist(),
+                state.peak_c[0].tolist(),
+                state.above_warning_s[0].tolist(),
+                strict=True,
+            )
+        }
         if self._mask_in != "obs":
             for a, info in enumerate(infos.values()):
                 info["action_mask"] = masks[a].copy()
         return infos
+
+
+_REWARDS = tuple(f"reward_{name}" for name in TERMS)
 
 
 def _table(world: World, state: State) -> str:

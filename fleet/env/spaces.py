@@ -3,7 +3,7 @@
 import numpy as np
 from gymnasium import spaces
 
-from fleet.env.observation import Layout
+from fleet.observation import Layout
 
 
 def arm_spaces(layout: Layout) -> tuple[spaces.Dict, spaces.Discrete]:

@@ -10,15 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from fleet.env.arguments import at_least_one, seeds_of, switch
-from fleet.env.chance import random_legal as random_legal
-from fleet.env.engine import Engine, Shift
-from fleet.env.observation import Layout, Observation
-from fleet.env.reward import TERMS, RewardWeights
-from fleet.env.shelf import Shelf
+from fleet.bus.exchange.protocol import Exchange
+from fleet.engine.batch import Engine, Shift
+from fleet.engine.peers import deliver
+from fleet.engine.reward import TERMS, RewardWeights
+from fleet.engine.state import State
+from fleet.engine.tables import Tables
+from fleet.env.buffers import Shelf
+from fleet.env.random_actions import random_legal as random_legal
 from fleet.env.spaces import arm_spaces
-from fleet.sim.state import State
-from fleet.sim.tables import Tables
+from fleet.env.validation import at_least_one, seeds_of, switch
+from fleet.observation import Layout, Observation
+from fleet.seeding import exchange_seed
 
 Array = np.ndarray
 Obs = dict[str, Array]
@@ -27,14 +30,14 @@ Obs = dict[str, Array]
 
 @dataclass(frozen=True, eq=False)
 class Library:
-    """Fleets that are planned and scored, and the shifts that can be drawn for them."""
+    """Fleets with plans and scores, and a sampler of their shifts."""
 
     arms: tuple[str, ...]
     slots: int
     tables: Tables
     draw: Callable[[np.random.SeedSequence], Shift]
     near: tuple[tuple[int, ...], ...] | None = None
-    """The peers each arm has in its vector; see `fleet.env.observation.Layout`."""
+    """The peers each arm has in its vector; see `fleet.observation.Layout`."""
 
 
 class BatchEnv:
@@ -52,6 +55,8 @@ class BatchEnv:
         autoreset: Begin a new shift by itself; otherwise `reset(rows=…)` must, before the next step.
         stagger: Cut the first shift of env e after (e + 1) / num_envs of its length, so that from then on the envs are
             spread over the hours of a shift, as a learner wants them that sees a few hours at a time.
+        threads: Step the envs on this many threads; results do not depend on it. Pays from a few hundred envs on.
+        exchanges: What carries the messages of the arms of each env; perfect and immediate if not given.
     """
 
     def __init__(
@@ -64,6 +69,8 @@ class BatchEnv:
         max_cycles: int | None = None,
         autoreset: bool = True,
         stagger: bool = False,
+        threads: int = 1,
+        exchanges: Sequence[Exchange] | None = None,
     ) -> None:
         self.num_envs = num_envs = at_least_one("num_envs", num_envs)
         autoreset, stagger = switch("autoreset", autoreset), switch("stagger", stagger)
@@ -81,18 +88,25 @@ class BatchEnv:
         self.autoreset = autoreset
         self._shelf = Shelf((num_envs, len(library.arms), self.layout.size), np.float32)
         self._library = library
-        self._engine = Engine(library.tables, num_envs, self.layout, weights or RewardWeights())
+        self._engine = Engine(
+            library.tables, num_envs, self.layout, weights or RewardWeights(), threads=at_least_one("threads", threads)
+        )
         self._seeds = seeds_of(seed, num_envs)
         self._fresh = np.ones(num_envs, dtype=bool)
         """Rows whose next shift is that of their seed itself."""
         self._over = np.ones(num_envs, dtype=bool)
         self._begun = False
+        if exchanges is not None and len(exchanges) != num_envs:
+            raise ValueError(f"exchanges must be one per env ({num_envs}, got {len(exchanges)}).")
+        self._exchanges = exchanges
+        self._delivered = None if exchanges is None else self._no_vectors()
+        """What the arms know with the messages that reached them; only with exchanges."""
 
     @property
     def state(self) -> State:
         """The simulator's truth of all envs, in arrays of its own (not for policies)."""
         self._check_begun("looking at its state")
-        return self._engine.state_of_all()
+        return self._engine.state.copy()
 
     def reset(
         self, seed: int | Sequence[int] | None = None, *, rows: Array | Sequence[int] | None = None
@@ -115,11 +129,11 @@ class BatchEnv:
             self._seeds, self._fresh = seeds_of(seed, self.num_envs), np.ones(self.num_envs, dtype=bool)
         chosen = self._rows_of(rows)
         if not self._begun and len(chosen) < self.num_envs:
-            raise RuntimeError("Nothing was begun yet: call reset() for all envs before reset(rows=…).")
+            raise RuntimeError("No episode has started: call reset() for all envs before reset(rows=…).")
         self._vectors = self._no_vectors()
         self._begin(chosen)
         if len(chosen) < self.num_envs:
-            self._engine.observe(np.setdiff1d(np.arange(self.num_envs), chosen), self._vectors)
+            self._observe(np.setdiff1d(np.arange(self.num_envs), chosen), self._vectors)
         self._begun = True
         raw = np.zeros((self.num_envs, len(TERMS)))
         return self._obs(), self._info(raw, np.zeros(0, dtype=int), None)
@@ -149,7 +163,8 @@ class BatchEnv:
         chosen = self._checked(actions)
         vectors = self._no_vectors()
         terms, reward, finished = self._engine.step(chosen, vectors)
-        truncated = ~finished & (self._engine.rows.tick >= self._last_tick)
+        self._deliver(np.arange(self.num_envs), vectors)
+        truncated = ~finished & (self._engine.state.tick >= self._last_tick)
         self._vectors, self._over = vectors, finished | truncated
         ended = np.flatnonzero(self._over)
         self._last_tick[ended] = self._whole
@@ -162,21 +177,40 @@ class BatchEnv:
     def knowledge(self) -> Observation:
         """What the arms know now by name, leading axes [env, arm], as policies read it."""
         self._check_begun("knowledge()")
-        vectors = self._no_vectors()  # what was handed out may have been written into
-        self._engine.observe(np.arange(self.num_envs), vectors)
+        vectors = self._no_vectors()  # the caller may have written into the last ones
+        self._observe(np.arange(self.num_envs), vectors)
         return self.layout.read(vectors, self._engine.mask.copy())
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Release nothing: a batch holds no resources."""
 
     def _begin(self, rows: Array) -> None:
         if not len(rows):
             return
-        chosen = ((self._seeds[e], self._fresh[e]) for e in rows.tolist())
-        draw = self._library.draw
-        self._engine.begin(rows, [draw(seeds if fresh else seeds.spawn(1)[0]) for seeds, fresh in chosen])
+        seeds = [self._seeds[e] if self._fresh[e] else self._seeds[e].spawn(1)[0] for e in rows.tolist()]
+        self._engine.reset(rows, [self._library.draw(seed) for seed in seeds])
         self._fresh[rows], self._over[rows] = False, False
         self._engine.observe(rows, self._vectors)
+        for e, seed in zip(rows.tolist(), seeds, strict=True):
+            if self._exchanges is not None:
+                self._exchanges[e].begin(np.random.default_rng(exchange_seed(seed)))
+        self._deliver(rows, self._vectors)
+
+    def _observe(self, rows: Array, vectors: Array) -> None:
+        """Put what the arms of some envs know now into `vectors` once more."""
+        if self._delivered is None:
+            self._engine.observe(rows, vectors)
+        else:
+            vectors[rows] = self._delivered[rows]
+
+    def _deliver(self, rows: Array, vectors: Array) -> None:
+        """Replace what arms observe of their peers by what the exchanges delivered."""
+        if self._exchanges is None or self._delivered is None:
+            return
+        names = [str(j) for j in range(self._engine.jobs.kind.shape[1])]
+        for e in rows.tolist():
+            deliver(self._exchanges[e], self._engine, vectors[e], names, ("",) * len(self.agents), e)
+        self._delivered[rows] = vectors[rows]
 
     def _obs(self, rows: Array | None = None) -> Obs:
         if rows is None:
@@ -184,7 +218,7 @@ class BatchEnv:
         return {"observation": self._vectors[rows], "action_mask": self._engine.mask[rows]}
 
     def _info(self, terms: Array, ended: Array, last: Obs | None) -> dict[str, Any]:
-        rows, drawn = self._engine.rows, self._engine.drawn
+        state = self._engine.state
         if last is None:
             arms, slots = self.layout.arms, self.layout.slots
             last = {
@@ -192,18 +226,18 @@ class BatchEnv:
                 "action_mask": np.zeros((0, arms, slots + 1), np.int8),
             }
         return {
-            "faults": rows.faults.copy(),
-            "illegal": rows.illegal.copy(),
-            "peak_c": rows.peak_c.copy(),
-            "above_warning_s": rows.above_warning_s.copy(),
-            "jobs_done": drawn.jobs - self._engine.open,
+            "faults": state.faults.copy(),
+            "illegal": state.illegal.copy(),
+            "peak_c": state.peak_c.copy(),
+            "above_warning_s": state.above_warning_s.copy(),
+            "jobs_done": self._engine.jobs.number - self._engine.unfinished,
             **{f"reward_{name}": terms[:, n] for n, name in enumerate(TERMS)},
             "final_envs": ended,
             "final_obs": last,
         }
 
     def _no_vectors(self) -> Array:
-        """For vectors to be written to: of earlier steps, if nobody has them any more."""
+        """An array for vectors: one of an earlier step that is no longer in use, if there is one."""
         return self._shelf.take()
 
     def _checked(self, actions: Any) -> Array:
@@ -234,4 +268,4 @@ class BatchEnv:
 
     def _check_begun(self, what: str) -> None:
         if not self._begun:
-            raise RuntimeError(f"Nothing was begun yet: call reset() before {what}.")
+            raise RuntimeError(f"No episode has started: call reset() before {what}.")

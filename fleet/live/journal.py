@@ -1,8 +1,8 @@
-"""What must not be forgotten: an append-only file of records that are on disk before anybody hears of them.
+"""Append-only journal: records are on disk before anyone acts on them.
 
-One line is one `append`: `{"crc":"0a1b2c3d","records":[…]}`, the CRC-32 over the records as they are written. A line is
-there as a whole or not at all: one without its end was torn by a crash before anybody was told, and is taken away;
-anything else that is not what it was when it was written is damage, and refused.
+Each line is one `append`: `{"crc":"0a1b2c3d","records":[…]}`, with the CRC-32 of the encoded records. A line is
+complete or absent: an unfinished last line was torn by a crash before `append` returned, and is removed on opening. Any
+other line whose checksum differs is damage, and the journal refuses to open.
 """
 
 import errno
@@ -10,19 +10,21 @@ import fcntl
 import logging
 import os
 import zlib
-from collections.abc import Callable, Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, Generic, Self, TypeVar
+from types import UnionType
+from typing import Generic, Self, TypeVar, cast
 
 import msgspec
 
 from fleet.errors import JournalError, JournalFull
+from fleet.files import atomic_path
 
 _LOG = logging.getLogger(__name__)
 
-GROWTH = 4
-LEAST_LONG_BYTES = 1_000_000
-"""A journal that has grown so many times, and to at least so many bytes, is long."""
+COMPACT_FACTOR, COMPACT_BYTES = 4, 1_000_000
+"""A journal needs compaction once it has grown by this factor since the last one, and to this size."""
 
 Record = TypeVar("Record", bound=msgspec.Struct)
 
@@ -32,40 +34,58 @@ _START = _CRC_END + len(_MIDDLE)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
+class JournalState(ABC, Generic[Record]):
+    """State that follows from journal records alone."""
+
+    @abstractmethod
+    def apply(self, record: Record) -> object:
+        """Change the state as the record says."""
+
+    @abstractmethod
+    def compact(self) -> tuple[Record, ...]:
+        """Return the fewest records that give the same state."""
+
+    def replay(self, records: Iterable[Record]) -> Self:
+        """Apply records, oldest first, and return the state."""
+        for record in records:
+            self.apply(record)
+        return self
+
+
 class Journal(Generic[Record]):
-    """`with Journal(path, Opened | Closed) as journal:` holds the file alone until the end of the block.
+    """`with Journal(path, Opened | Closed) as journal:` keeps the file open, for this process alone.
 
     Attributes:
         path: The file.
-        torn: Bytes of an unfinished last line that were taken away when it was opened.
+        torn: Bytes of an unfinished last line that were removed on opening.
     """
 
-    def __init__(self, path: Path, kind: Any, *, sync: Callable[[int], None] = os.fsync) -> None:
-        """Prepare a journal of records of a `msgspec.Struct`, or of a union of tagged ones.
+    def __init__(self, path: Path, kind: type[Record] | UnionType, *, sync: Callable[[int], None] = os.fsync) -> None:
+        """Prepare a journal of records of one `msgspec.Struct`, or of a union of tagged ones.
 
         Args:
-            sync: Brings an open file to the disk.
+            sync: Writes an open file through to the disk.
         """
         self.path = path
         self.torn = 0
-        self._decoder: msgspec.json.Decoder[list[Record]] = msgspec.json.Decoder(list[kind])
+        self._decoder = msgspec.json.Decoder(cast(type[list[Record]], list[kind]))
         self._encoder = msgspec.json.Encoder()
         self._sync = sync
         self._file = self._lock = -1
-        self._end = self._short = 0
+        self._end = self._compacted = 0
         self._broken = ""
 
     def open(self) -> Self:
-        """Take hold of the file, made if it is missing, and check it line by line.
+        """Open and lock the file, create it if it is missing, and check every line.
 
         Raises:
-            JournalError: another process has it, it is damaged, or it cannot be made.
+            JournalError: another process has it open, it is damaged, or it cannot be created.
         """
         if self._file >= 0:
             return self
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._lock = self._locked()
+            self._lock = self._lock_file()
             fresh = not self.path.exists()
             self._file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
             if fresh:
@@ -73,7 +93,7 @@ class Journal(Generic[Record]):
             self._end = sum(len(line) for line, _ in self._lines())
             self.torn = os.fstat(self._file).st_size - self._end
             if self.torn:
-                _LOG.warning("%s: its last line was torn (%d bytes) and is taken away.", self.path, self.torn)
+                _LOG.warning("%s: removed an unfinished last line (%d bytes).", self.path, self.torn)
                 os.ftruncate(self._file, self._end)
                 self._sync(self._file)
         except OSError as error:
@@ -85,7 +105,7 @@ class Journal(Generic[Record]):
         return self
 
     def close(self) -> None:
-        """Let go of the file; twice is fine."""
+        """Close and unlock the file; a second call does nothing."""
         for handle in (self._file, self._lock):
             if handle >= 0:
                 os.close(handle)
@@ -99,11 +119,11 @@ class Journal(Generic[Record]):
 
     @property
     def size(self) -> int:
-        """Of the file, bytes."""
+        """Size of the file, bytes."""
         return self._end
 
-    def replay(self) -> Iterator[Record]:
-        """All records, oldest first.
+    def records(self) -> Iterator[Record]:
+        """Yield all records, oldest first.
 
         Raises:
             JournalError: the file was damaged while it was open.
@@ -112,63 +132,59 @@ class Journal(Generic[Record]):
             yield from records
 
     def append(self, *records: Record) -> None:
-        """Write records and return when they are on disk, all of them or, by an exception, none.
+        """Write records and return when they are on disk: all of them or, if it raises, none.
 
         Raises:
-            JournalFull: there is no room; the file is as it was.
-            JournalError: the disk failed, so nobody knows what is on it; nothing more is written.
+            JournalFull: no space on the disk; the file is unchanged.
+            JournalError: the disk failed and the content of the file is uncertain; further writes are refused.
         """
         if self._broken:
             raise JournalError(self._broken)
         if not records:
             return
-        line = self._line(records)
+        line = self._encode(records)
         try:
             self._write(self._opened(), line)
             self._sync(self._file)
         except OSError as error:
-            self._take_back(error)
+            self._undo_append(error)
         self._end += len(line)
 
     def rewrite(self, *records: Record) -> None:
-        """Replace all that is there by these records, at once: after a crash it is the old or the new file.
+        """Replace the whole content by these records; after a crash the file is the old one or the new one.
 
         Raises:
-            JournalFull: there is no room; the file is as it was.
-            JournalError: the disk failed; the file is as it was, or it is the new one and must be opened anew.
+            JournalFull: no space on the disk; the file is unchanged.
+            JournalError: the disk failed; the file is unchanged, or it is the new one and must be reopened.
         """
-        draft = self.path.with_name(f"{self.path.name}.new")
-        line = self._line(records) if records else b""
+        line = self._encode(records) if records else b""
         file = -1
         try:
             self._opened()
-            file = os.open(draft, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC, 0o600)
-            self._write(file, line)
-            self._sync(file)
-            os.replace(draft, self.path)
+            with atomic_path(self.path) as draft:
+                file = os.open(draft, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC, 0o600)
+                self._write(file, line)
+                self._sync(file)
         except OSError as error:
             if file >= 0:
                 os.close(file)
-            draft.unlink(missing_ok=True)
-            raise self._failed(error) from error
-        # From here on the old file has no name, and what would be written there were lost.
+            raise self._failure(error) from error
+        # The old file has no name any more: what is written there would be lost.
         os.close(self._file)
         self._file, self._end, self._broken = file, len(line), ""
         try:
             self._sync_folder()
         except OSError as error:
-            self._broken = f"{self._failed(error)} Nothing more is written until it is opened anew."
+            self._broken = f"{self._failure(error)} No further writes until it is reopened."
             raise JournalError(self._broken) from error
 
     @property
-    def long(self) -> bool:
-        """Whether it has grown so much since it was shortened that it should be again."""
-        return self._end > max(LEAST_LONG_BYTES, GROWTH * self._short)
+    def needs_compaction(self) -> bool:
+        """Whether the file has grown so much since the last compaction that it is time for the next."""
+        return self._end > max(COMPACT_BYTES, COMPACT_FACTOR * self._compacted)
 
-    def shorten(self, *records: Record) -> None:
-        """Begin anew with where all records have led, so that no restart reads through the past again.
-
-        Where there is no room it stays as long as it is.
+    def compact(self, *records: Record) -> None:
+        """Replace all records by fewer that give the same state; without space on the disk, leave the file as it is.
 
         Raises:
             JournalError: as `rewrite`.
@@ -176,8 +192,8 @@ class Journal(Generic[Record]):
         try:
             self.rewrite(*records)
         except JournalFull as error:
-            _LOG.warning("The journal stays as long as it is: %s", error)
-        self._short = self._end
+            _LOG.warning("The journal is not compacted: %s", error)
+        self._compacted = self._end
 
     # Inside
 
@@ -186,8 +202,8 @@ class Journal(Generic[Record]):
             raise JournalError(f"Journal '{self.path}' is not open.")
         return self._file
 
-    def _locked(self) -> int:
-        """A lock that ends with this process, whatever happens to it."""
+    def _lock_file(self) -> int:
+        """Lock that ends with this process, however the process ends."""
         path = self.path.with_name(f"{self.path.name}.lock")
         lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
@@ -195,64 +211,67 @@ class Journal(Generic[Record]):
         except BlockingIOError as error:
             os.close(lock)
             raise JournalError(
-                f"Journal '{self.path}' is in use by another process; two that write it would both be wrong."
+                f"Journal '{self.path}' is in use by another process. Stop that process, or choose another folder."
             ) from error
         return lock
 
-    def _line(self, records: tuple[Record, ...]) -> bytes:
+    def _encode(self, records: tuple[Record, ...]) -> bytes:
         body = self._encoder.encode(records)
         return b"".join((_HEAD, b"%08x" % zlib.crc32(body), _MIDDLE, body, _TAIL))
 
     def _lines(self) -> Iterator[tuple[bytes, list[Record]]]:
-        """Every whole line, with its records."""
+        """Yield every complete line with its records."""
         with open(os.dup(self._opened()), "rb") as file:
             file.seek(0)
             for number, line in enumerate(file, start=1):
                 if line.endswith(b"\n"):
-                    yield line, self._read(line, number)
+                    yield line, self._decode(line, number)
 
-    def _read(self, line: bytes, number: int) -> list[Record]:
+    def _decode(self, line: bytes, number: int) -> list[Record]:
         body = line[_START : -len(_TAIL)]
-        whole = line.startswith(_HEAD) and line[_CRC_END:_START] == _MIDDLE and line.endswith(_TAIL)
-        if not whole or line[len(_HEAD) : _CRC_END] != b"%08x" % zlib.crc32(body):
+        complete = line.startswith(_HEAD) and line[_CRC_END:_START] == _MIDDLE and line.endswith(_TAIL)
+        if not complete or line[len(_HEAD) : _CRC_END] != b"%08x" % zlib.crc32(body):
             raise JournalError(
-                f"{self.path}, line {number}: damaged (its checksum does not fit). What was promised there is not "
-                "known any more; put the file aside to begin anew."
+                f"{self.path}, line {number}: damaged (wrong checksum), so its records are lost. Move the file away to "
+                "start with an empty journal."
             )
         try:
             return self._decoder.decode(body)
         except msgspec.DecodeError as error:
-            raise JournalError(f"{self.path}, line {number}: no record of this version ({error}).") from error
+            raise JournalError(
+                f"{self.path}, line {number}: not a record of this version ({error}). Move the file away to start with "
+                "an empty journal."
+            ) from error
 
     def _write(self, file: int, line: bytes) -> None:
         rest = memoryview(line)
-        while rest:  # each turn writes some or raises
+        while rest:  # each call writes some bytes or raises
             rest = rest[os.write(file, rest) :]
 
-    def _take_back(self, error: OSError) -> None:
-        """Leave the file as it was before a line that could not be written.
+    def _undo_append(self, error: OSError) -> None:
+        """Remove a line that could not be written.
 
         Raises:
             JournalError: always.
         """
-        failed = self._failed(error)
-        if not isinstance(failed, JournalFull):
-            # After a failed fsync the cache may say what the disk does not hold.
-            self._broken = f"{failed} Nothing more is written until it is opened anew."
+        failure = self._failure(error)
+        if not isinstance(failure, JournalFull):
+            # After a failed fsync the page cache may differ from the disk.
+            self._broken = f"{failure} No further writes until it is reopened."
         try:
             os.ftruncate(self._file, self._end)
             self._sync(self._file)
         except OSError as worse:
-            self._broken = f"Journal '{self.path}' could not be put right ({worse.strerror}); it must be opened anew."
-        raise failed from error
+            self._broken = f"Journal '{self.path}' could not be restored ({worse.strerror}); it must be reopened."
+        raise failure from error
 
-    def _failed(self, error: OSError) -> JournalError:
+    def _failure(self, error: OSError) -> JournalError:
         if error.errno in _FULL:
-            return JournalFull(f"Journal '{self.path}' has no room for more: {error.strerror}.")
+            return JournalFull(f"Journal '{self.path}': no space left to write ({error.strerror}).")
         return JournalError(f"Journal '{self.path}' cannot be written: {error.strerror}.")
 
     def _sync_folder(self) -> None:
-        """The name of a new file is on disk only with its folder."""
+        """Write the folder through to the disk: only then is the name of a new file safe."""
         folder = os.open(self.path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
             self._sync(folder)

@@ -1,4 +1,4 @@
-"""Keeps the processes of a fleet running: one log each, started again with back-off, ended in order."""
+"""Run the processes of a fleet: one log each, restarts with back-off, ordered shutdown."""
 
 import logging
 import os
@@ -13,30 +13,34 @@ from pathlib import Path
 from queue import Empty
 from typing import IO
 
-from fleet.bus.mailbox import Mailbox
+from fleet.bus.client.queue import Mailbox
 from fleet.errors import FleetError
 
 _LOG = logging.getLogger(__name__)
 
 READY = "ready "
-"""So begins the line with which a participant says that it is there."""
+"""A participant that has started prints a line that begins so."""
 SUPERVISED = "THERMOFLEET_SUPERVISOR"
-"""In the environment of what is supervised: the process of the supervisor."""
+"""Environment variable of supervised processes: the process id of the supervisor."""
+
+
+LOG_S = 1.0
+"""Real seconds to wait for the last output of an exited process."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Backoff:
-    """How long to wait before a process that ended is started again."""
+    """Delays before an exited process is restarted."""
 
     first_s: float = 0.5
     factor: float = 2.0
-    most_s: float = 30.0
-    calm_s: float = 30.0
-    """One that ran so long began well: it waits as if for the first time."""
+    max_s: float = 30.0
+    stable_s: float = 30.0
+    """A process that ran longer than this starts with the first delay again."""
 
     def wait_s(self, failures: int) -> float:
-        """Before the start after so many failures in a row, 1 or more."""
-        return min(self.first_s * self.factor ** (failures - 1), self.most_s)
+        """Delay after a number of failures in a row, 1 or more."""
+        return min(self.first_s * self.factor ** (failures - 1), self.max_s)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,21 +50,23 @@ class Part:
     name: str
     argv: tuple[str, ...]
     essential: bool = False
-    """Its good end is the end of the fleet."""
+    """The fleet ends when it exits with code 0."""
     ready: str = READY
-    """How the line begins with which it says that it is there."""
+    """Start of the line that it prints once it has started."""
     env: Mapping[str, str] = field(default_factory=dict)
     rank: int = 0
-    """Parts of a higher rank are ended before those of a lower one, parts of one rank at the same time."""
+    """Parts of a higher rank are stopped first, parts of one rank together."""
 
 
 @dataclass(eq=False)
 class _Running:
     part: Part
     process: subprocess.Popen[str] | None = None
+    copier: threading.Thread | None = None
+    """Copies its output to the log."""
     began_s: float = 0.0
     due_s: float = 0.0
-    """When it is to be started (again)."""
+    """When the next start is due."""
     failures: int = 0
     restarts: int = 0
     ready: threading.Event = field(default_factory=threading.Event)
@@ -68,18 +74,17 @@ class _Running:
 
 
 class Supervisor:
-    """Starts parts and keeps them running until the end of the `with` block.
+    """Starts processes and restarts them until the end of the `with` block.
 
     Attributes:
-        folder: Where the logs are, `NAME.log`.
+        folder: Folder of the logs, `NAME.log`.
     """
 
     def __init__(self, folder: Path, *, backoff: Backoff | None = None, patience_s: float = 10.0) -> None:
-        """Prepare a supervisor.
+        """Prepare.
 
         Args:
-            folder: For the logs.
-            patience_s: Real seconds that a process has to end in order before it is killed.
+            patience_s: Real seconds between SIGTERM and SIGKILL when a process is stopped.
         """
         self.folder = folder
         self._backoff, self._patience_s = backoff or Backoff(), patience_s
@@ -87,13 +92,13 @@ class Supervisor:
         self._ended: Mailbox[str] = Mailbox()
 
     def start(self, part: Part, *, ready_s: float | None = None) -> None:
-        """Start a part and, if asked, wait until it says that it is ready.
+        """Start a process and, if asked, wait until it is ready.
 
         Raises:
-            FleetError: it cannot be started, ended at once, or was not ready in time; what it said last is told.
+            FleetError: it cannot be started, exited, or was not ready in time; gives the last line of its log.
         """
         if part.name in self._parts:
-            raise ValueError(f"There is a process '{part.name}' already.")
+            raise ValueError(f"Names of processes must be unique (got '{part.name}' twice).")
         running = self._parts[part.name] = _Running(part)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -104,61 +109,64 @@ class Supervisor:
             self.await_ready(part.name, ready_s)
 
     def await_ready(self, name: str, ready_s: float, stopped: Callable[[], bool] = lambda: False) -> None:
-        """Wait until a part that was started says that it is ready, or until told to stop.
+        """Wait until a process is ready, or until `stopped`.
 
         Raises:
-            FleetError: it ended, or was not ready in time; what it said last is told.
+            FleetError: it exited, or was not ready in time; gives the last line of its log.
         """
         running = self._parts[name]
         deadline_s = time.monotonic() + ready_s
         while not running.ready.wait(0.05) and not stopped():
             if running.process is not None and running.process.poll() is not None:
-                raise FleetError(f"'{name}' ended at once: {self.last_words(name)}")
+                if running.copier is not None:
+                    running.copier.join(LOG_S)
+                raise FleetError(f"'{name}' exited at once: {self.last_log_line(name)}")
             if time.monotonic() > deadline_s:
-                raise FleetError(f"'{name}' was not ready within {ready_s:g} s: {self.last_words(name)}")
+                raise FleetError(f"'{name}' was not ready within {ready_s:g} s: {self.last_log_line(name)}")
 
     def ready(self, name: str) -> bool:
-        """Whether a part has said so since its last start."""
+        """Whether a process is ready since its last start."""
         return self._parts[name].ready.is_set()
 
     def restarts(self) -> dict[str, int]:
-        """How often each was started again."""
+        """Number of restarts of each process."""
         return {name: running.restarts for name, running in self._parts.items()}
 
     def pid(self, name: str) -> int | None:
-        """Of a part that runs."""
+        """Process id; None while it is not running."""
         process = self._parts[name].process
         return process.pid if process is not None and process.poll() is None else None
 
     def log(self, name: str) -> Path:
-        """The file with all that a part has said."""
+        """Path of its log."""
         return self.folder / f"{name}.log"
 
-    def last_words(self, name: str) -> str:
-        """The last line of its log; where it is, if there is none."""
+    def last_log_line(self, name: str) -> str:
+        """Last line of its log, or where the log is if it is empty."""
         lines = (
             self.log(name).read_text(encoding="utf-8", errors="replace").splitlines() if self.log(name).exists() else []
         )
-        return lines[-1] if lines else f"it said nothing (see {self.log(name)})."
+        return lines[-1] if lines else f"no output (log: {self.log(name)})."
 
-    def since_ready(self, name: str) -> str:
-        """What a part has said since it last was ready; all of it, if it never was."""
+    def log_since_ready(self, name: str) -> str:
+        """Its log since it was last ready; all of it, if it never was."""
         lines = self.log(name).read_text(encoding="utf-8", errors="replace").splitlines()
         last = max((i for i, line in enumerate(lines) if line.startswith(self._parts[name].part.ready)), default=-1)
         return "\n".join(lines[last + 1 :])
 
-    def run(self, stopped: Callable[[], bool], *, look_s: float = 0.2) -> str:
-        """Keep all running until told to stop, or until an essential part has ended well; returns the name of that one.
+    def run(self, stopped: Callable[[], bool], *, poll_s: float = 0.2) -> str:
+        """Restart exited processes until `stopped`, or until an essential one exits with code 0.
 
-        Returns "" if it was told to stop.
+        Returns:
+            Name of the essential one; "" if it was stopped.
         """
         while not stopped():
-            if ended := self.look(look_s):
+            if ended := self.poll(poll_s):
                 return ended
         return ""
 
-    def look(self, wait_s: float = 0.0) -> str:
-        """Start what is due, and wait so long for an end; the name of an essential part that has ended well, or ""."""
+    def poll(self, wait_s: float = 0.0) -> str:
+        """Start what is due, and wait for an exit; return the name of an exited essential process (code 0), or ""."""
         now_s = time.monotonic()
         for running in self._parts.values():
             if running.process is None and not running.over and running.due_s <= now_s:
@@ -168,17 +176,15 @@ class Supervisor:
             name = self._ended.get(now_s + wait_s)
         except Empty:
             return ""
-        return name if self._note_end(self._parts[name]) else ""
+        return name if self._handle_exit(self._parts[name]) else ""
 
     def stop(self) -> None:
-        """End all, rank after rank: SIGTERM, and SIGKILL for what does not heed it."""
+        """Stop all, rank after rank: by SIGTERM, and by SIGKILL after `patience_s`."""
         alive: dict[int, list[_Running]] = {}
         for running in self._parts.values():
             running.over = True
             if running.process is not None and running.process.poll() is None:
-                running.process.send_signal(
-                    signal.SIGCONT
-                )  # one that stands still hears nothing, and others wait for it
+                running.process.send_signal(signal.SIGCONT)  # a suspended process would not receive SIGTERM
                 alive.setdefault(running.part.rank, []).append(running)
         for rank in sorted(alive, reverse=True):
             self._end(alive[rank])
@@ -192,7 +198,7 @@ class Supervisor:
             try:
                 process.wait(max(0.0, deadline_s - time.monotonic()))
             except subprocess.TimeoutExpired:
-                _LOG.warning("'%s' did not end within %g s and was killed.", name, self._patience_s)
+                _LOG.warning("'%s' did not exit within %g s and was killed.", name, self._patience_s)
                 process.kill()
         for _, process in processes:
             process.wait(self._patience_s)
@@ -215,15 +221,16 @@ class Supervisor:
             text=True,
             errors="replace",
             env={**os.environ, "PYTHONUNBUFFERED": "1", SUPERVISED: str(os.getpid()), **part.env},
-            start_new_session=True,  # Ctrl-C is for the supervisor, which ends them in order
+            start_new_session=True,  # Ctrl-C goes to the supervisor alone, which stops them in order
         )
         running.process = process
         assert process.stdout is not None
-        threading.Thread(target=self._listen, args=(running, process, process.stdout), daemon=True).start()
+        running.copier = threading.Thread(target=self._copy_log, args=(running, process, process.stdout), daemon=True)
+        running.copier.start()
 
-    def _listen(self, running: _Running, process: "subprocess.Popen[str]", said: IO[str]) -> None:
-        with said, self.log(running.part.name).open("a", encoding="utf-8") as log:
-            for line in said:
+    def _copy_log(self, running: _Running, process: "subprocess.Popen[str]", output: IO[str]) -> None:
+        with output, self.log(running.part.name).open("a", encoding="utf-8") as log:
+            for line in output:
                 log.write(line)
                 log.flush()
                 if line.startswith(running.part.ready):
@@ -231,20 +238,20 @@ class Supervisor:
         process.wait()
         self._ended.put(running.part.name)
 
-    def _note_end(self, running: _Running) -> bool:
-        """Whether the end of a process is that of the fleet; otherwise it is due again after a while."""
+    def _handle_exit(self, running: _Running) -> bool:
+        """Return whether the fleet ends with this process; otherwise schedule its restart."""
         process, now_s = running.process, time.monotonic()
         if process is None or process.poll() is None:
             return False
         if process.returncode == 0 and running.part.essential:
             running.over = True
             return True
-        running.failures = 1 if now_s - running.began_s > self._backoff.calm_s else running.failures + 1
+        running.failures = 1 if now_s - running.began_s > self._backoff.stable_s else running.failures + 1
         wait_s = self._backoff.wait_s(running.failures)
         running.process, running.due_s = None, now_s + wait_s
         how = f"signal {-process.returncode}" if process.returncode < 0 else f"code {process.returncode}"
         _LOG.warning(
-            "'%s' ended with %s; started again in %.1f s (log: %s).",
+            "'%s' exited with %s; restart in %.1f s (log: %s).",
             running.part.name,
             how,
             wait_s,
@@ -253,10 +260,10 @@ class Supervisor:
         return False
 
 
-def end_with_supervisor() -> None:
-    """Have the kernel end this process when its supervisor does, however that ends; for participants to call.
+def exit_with_supervisor() -> None:
+    """Have the kernel stop this process when its supervisor exits, however that exits; called by participants.
 
-    Linux alone can do so (prctl(2), PR_SET_PDEATHSIG); elsewhere, and without a supervisor, nothing happens.
+    Only Linux can do so (prctl(2), PR_SET_PDEATHSIG); elsewhere, and without a supervisor, it does nothing.
     """
     supervisor = os.environ.get(SUPERVISED)
     if supervisor is None or sys.platform != "linux":
@@ -264,5 +271,5 @@ def end_with_supervisor() -> None:
     import ctypes
 
     ctypes.CDLL(None).prctl(1, signal.SIGTERM)
-    if os.getppid() != int(supervisor):  # it ended before the kernel knew
+    if os.getppid() != int(supervisor):  # it exited before the call
         os.kill(os.getpid(), signal.SIGTERM)

@@ -124,5 +124,5 @@ def test_rewards_of_a_turn_are_not_written_on(small_workshop) -> None:
 
 
 def test_the_example_of_the_page_runs(example) -> None:
-    seen = example("Tianshou")["seen"]
+    seen = example("Tianshou")["observation"]
     assert (seen["agent_id"], seen["mask"][0]) == ("arm_0", True)

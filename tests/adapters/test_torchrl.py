@@ -8,8 +8,8 @@ from torchrl.collectors import Collector
 from torchrl.envs import RewardSum, TransformedEnv, check_env_specs
 from torchrl.modules import MaskedCategorical
 
+from fleet.engine.reward import TERMS
 from fleet.env.adapters.torchrl import TorchRLEnv
-from fleet.env.reward import TERMS
 from fleet.env.vector import BatchEnv
 
 ARMS, SLOTS, TICKS = 3, 4, 15
@@ -220,7 +220,7 @@ def test_a_batch_that_resets_by_itself_is_refused(make) -> None:
 
 def test_what_is_no_batch_is_refused(small_workshop) -> None:
     for wrong in (None, "quickstart", small_workshop()()):
-        with pytest.raises(ValueError, match=r"TorchRLEnv takes a batch, as scenarios\.make_batch\(\) makes it \(got "):
+        with pytest.raises(ValueError, match=r"TorchRLEnv takes a batch made by scenarios\.make_batch\(\) \(got "):
             TorchRLEnv(wrong)
 
 

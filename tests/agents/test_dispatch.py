@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.dispatch import Wspt, WsptCool
-from fleet.env.observation import Layout, Observation
+from agents.rules import Wspt, WsptCool
+from fleet.observation import Layout, Observation
 
 
 def seen(value, duration_s, p, mask) -> dict[str, Observation]:

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.hearsay import Trust, advantage
-from agents.policy import Policy
+from agents.policy import EveryArm
 from agents.rules import LeastDifficulty
+from agents.staleness import Trust, advantage
 from fleet.env.allocation_v0 import parallel_env
-from fleet.env.observation import LONG_S, Layout, Observation
+from fleet.observation import LONG_S, Layout, Observation
 
 
 def heard(own: list[float], peers: list[list[float]], ages_s: list[float]) -> Observation:
@@ -37,9 +37,9 @@ def heard(own: list[float], peers: list[list[float]], ages_s: list[float]) -> Ob
     )
 
 
-def choice(policy: Policy, observation: Observation) -> int:
+def choice(policy: LeastDifficulty, observation: Observation) -> int:
     """The first arm's claim."""
-    return policy.act({"arm_0": observation})["arm_0"]
+    return policy.choose(observation, 0)
 
 
 def test_a_word_counts_for_one_part_in_e_after_the_time_in_which_it_fades():
@@ -97,7 +97,8 @@ def test_a_peer_with_an_old_claim_gives_way_to_one_with_a_fresh_one():
 
 
 def test_a_shift_with_fresh_words_does_not_depend_on_trust(small):
-    def trace(policy: Policy) -> list[dict[str, int]]:
+    def trace(trust: Trust | None = None) -> list[dict[str, int]]:
+        policy = EveryArm(lambda: LeastDifficulty(trust))
         env = parallel_env(small.Shifts(arms=3, jobs=15, ticks=80))
         env.reset(seed=2)
         said = []
@@ -106,8 +107,8 @@ def test_a_shift_with_fresh_words_does_not_depend_on_trust(small):
             env.step(said[-1])
         return said
 
-    assert trace(LeastDifficulty()) == trace(LeastDifficulty(Trust(fading_s=0.1, expiry_s=0.1)))
-    assert trace(LeastDifficulty()) == trace(LeastDifficulty(Trust(fading_s=1e12, expiry_s=math.inf)))
+    assert trace() == trace(Trust(fading_s=0.1, expiry_s=0.1))
+    assert trace() == trace(Trust(fading_s=1e12, expiry_s=math.inf))
 
 
 @pytest.mark.parametrize("changes", [{"fading_s": 0.0}, {"expiry_s": -1.0}, {"fading_s": math.nan}])

@@ -13,13 +13,13 @@ from agents.learned.network import Actor, Critic, NetworkSize, masked
 from agents.learned.policy import CARD, WEIGHTS, LearnedPolicy, draw, load_policy, save_policy
 from agents.learned.ppo import PpoConfig, Trainer
 from agents.policy import only_choices
+from fleet.engine.batch import Shift, shifts_of
+from fleet.engine.tables import tables_of
 from fleet.env.adapters.torchrl import TorchRLEnv
-from fleet.env.engine import Shift, shifts_of
-from fleet.env.observation import FIELDS, Layout, Observation
 from fleet.env.vector import BatchEnv, Library
 from fleet.errors import CheckpointError
-from fleet.sim.noise import key_of
-from fleet.sim.tables import tables_of
+from fleet.observation import FIELDS, Layout, Observation
+from fleet.seeding import key_of
 
 
 @pytest.fixture(autouse=True)

@@ -1,4 +1,4 @@
-"""Words to say, for every test of an exchange."""
+"""Broadcasts for every test of an exchange."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 import zenoh
 
-from fleet.bus.exchange import Heard, Words
+from fleet.bus.exchange.protocol import Broadcast, PeerView
 
 
-def random_words(rng: np.random.Generator, arms: int, time_s: float, slots: int = 4) -> Words:
-    """Words with awkward floats, unknown scores, empty slots, and jobs that come and go between ticks."""
+def random_words(rng: np.random.Generator, arms: int, time_s: float, slots: int = 4) -> Broadcast:
+    """Broadcasts with awkward floats, unknown scores, empty slots, and jobs that come and go between ticks."""
     jobs = [f"job {number}" for number in rng.choice(8, size=slots, replace=False)]
     for slot in np.flatnonzero(rng.random(slots) < 0.25):
         jobs[slot] = ""
     difficulty, p_saturation = rng.random((2, arms, slots)) * 10.0 ** rng.integers(-300, 1, (2, arms, slots))
     difficulty[rng.random((arms, slots)) < 0.3] = np.nan
     p_saturation[rng.random((arms, slots)) < 0.3] = np.nan
-    return Words(
+    return Broadcast(
         time_s=time_s,
         mode=rng.integers(0, 3, arms),
         temp_c=rng.normal(40.0, 10.0, (arms, 7)),
@@ -30,19 +30,19 @@ def random_words(rng: np.random.Generator, arms: int, time_s: float, slots: int 
     )
 
 
-def assert_equal(one: Heard, other: Heard) -> None:
+def assert_equal(one: PeerView, other: PeerView) -> None:
     """The same arrays to the last bit; NaN equals NaN."""
     for name in ("mode", "headroom_k", "difficulty", "p_saturation", "age_s"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name, strict=True)
 
 
 @pytest.fixture
-def make_words() -> Callable[..., Words]:
+def make_words() -> Callable[..., Broadcast]:
     return random_words
 
 
 @pytest.fixture
-def assert_same() -> Callable[[Heard, Heard], None]:
+def assert_same() -> Callable[[PeerView, PeerView], None]:
     return assert_equal
 
 

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.bus import certificates
-from fleet.bus.certificates import LONGEST_DAYS, check, issue, new_authority, read
-from fleet.bus.keyring import add, make, spans_of
-from fleet.bus.roster import ROSTER, Participant, Roster, of_arms, read_roster
+from fleet.bus.security import certificates
+from fleet.bus.security.access_control import ROSTER, Participant, Roster, of_arms, read_roster
+from fleet.bus.security.certificates import LONGEST_DAYS, check, issue, new_authority, read
+from fleet.bus.security.keyring import add, make, spans_of
 from fleet.errors import BusError
 
 ARMS = ("arm_0", "arm 2/*@")

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.bus.channel import PERFECT, TOPOLOGIES, Channel, Partition
+from fleet.bus.exchange.channel import PERFECT, TOPOLOGIES, Channel, Partition
 
 ARMS = ("a", "b", "c", "d", "e")
 

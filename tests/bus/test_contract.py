@@ -12,35 +12,37 @@ from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 from typer.testing import CliRunner
 
-from fleet.bus import keys, messages, trade
-from fleet.bus.asyncapi import asyncapi
-from fleet.bus.contract import CHANNELS, WORDS, descriptions, schema_document
-from fleet.bus.link import REMEMBERED
-from fleet.bus.messages import MalformedMessage
-from fleet.bus.specimens import SPECIMENS
-from fleet.bus.trade import JobWord
-from scenarios.cli import app
-from scenarios.contract_cli import documents
-from scenarios.contract_page import filled
+from fleet.bus.client.client import BusClient
+from fleet.bus.protocol import auction as trade
+from fleet.bus.protocol import keys, messages
+from fleet.bus.protocol.asyncapi import asyncapi
+from fleet.bus.protocol.auction import JobSpec
+from fleet.bus.protocol.examples import EXAMPLES
+from fleet.bus.protocol.messages import MalformedMessage
+from fleet.bus.protocol.registry import CHANNELS, MESSAGES, channel_of
+from fleet.bus.protocol.schemas import descriptions, schema_document
+from scenarios.cli.contract import documents
+from scenarios.cli.doc_tables import filled
+from scenarios.cli.main import app
 
 ROOT = Path(__file__).parents[2]
 DOCUMENT = schema_document()
 VALIDATORS = {
-    word: Draft202012Validator({"$ref": f"#/$defs/{word.__name__}", "$defs": DOCUMENT["$defs"]}) for word in WORDS
+    word: Draft202012Validator({"$ref": f"#/$defs/{word.__name__}", "$defs": DOCUMENT["$defs"]}) for word in MESSAGES
 }
-NAMED = [pytest.param(word, id=word.__name__) for word in WORDS]
+NAMED = [pytest.param(word, id=word.__name__) for word in MESSAGES]
 JUNK = st.sampled_from([None, True, -1, 0, 2.5, "", "x", [], [0.5], [""], {}, 10**9, "idle"])
 
 
 def example(word):
     """The specimen of a word as plain JSON values."""
-    return json.loads(messages.encode(SPECIMENS[word]))
+    return json.loads(messages.encode(EXAMPLES[word]))
 
 
 def refused(word, value) -> str:
     """Why the struct refuses a value: "" if it does not, "schema" for its types, "rule" for what it says beyond."""
     try:
-        messages.read(word, json.dumps(value).encode())
+        messages.decode(word, json.dumps(value).encode())
     except MalformedMessage as error:
         by_rule = isinstance(error.__cause__, BaseException) and isinstance(error.__cause__.__cause__, ValueError)
         return "rule" if by_rule else "schema"
@@ -69,7 +71,7 @@ def test_an_address_filled_in_is_a_key(channel):
 
 
 def test_every_word_has_an_example():
-    assert set(SPECIMENS) == set(WORDS)
+    assert set(EXAMPLES) == set(MESSAGES)
 
 
 def test_the_schemas_are_schemas():
@@ -81,7 +83,7 @@ def test_an_example_is_accepted_by_struct_and_schema(word):
     for value in (example(word), {**example(word), "from a later version": 1}):
         VALIDATORS[word].validate(value)
         assert refused(word, value) == ""
-    assert messages.read(word, messages.encode(SPECIMENS[word])) == SPECIMENS[word]
+    assert messages.decode(word, messages.encode(EXAMPLES[word])) == EXAMPLES[word]
 
 
 @pytest.mark.parametrize("word", NAMED)
@@ -112,15 +114,15 @@ def test_struct_and_schema_refuse_the_same(word, data):
     ("word", "change"),
     [
         (messages.State, {"q": [0.0]}),
-        (messages.DifficultyWord, {"difficulty": [0.1]}),
-        (messages.DifficultyWord, {"jobs": ["twice", "twice"]}),
-        (JobWord, {"places": ["one"]}),
-        (JobWord, {"kind": "hold"}),
-        (JobWord, {"release_s": 10.0, "due_s": 9.0}),
+        (messages.DifficultyScores, {"difficulty": [0.1]}),
+        (messages.DifficultyScores, {"jobs": ["twice", "twice"]}),
+        (JobSpec, {"places": ["one"]}),
+        (JobSpec, {"kind": "hold"}),
+        (JobSpec, {"release_s": 10.0, "due_s": 9.0}),
     ],
 )
 def test_what_only_the_structs_refuse(word, change):
-    whole = example(trade.Submission)["jobs"][0] if word is JobWord else example(word)
+    whole = example(trade.Submission)["jobs"][0] if word is JobSpec else example(word)
     value = {**whole, **change}
     assert Draft202012Validator({"$ref": f"#/$defs/{word.__name__}", "$defs": DOCUMENT["$defs"]}).is_valid(value)
     assert refused(word, value) == "rule"
@@ -144,8 +146,8 @@ def test_a_whole_number_written_with_a_point_is_the_one_known_difference():
 
 def test_fields_are_described_by_the_text_under_them():
     assert descriptions(messages.State)["tau"] == "N·m at the joint output, [joint]."
-    assert descriptions(JobWord)["payload_kg"].startswith("Carried from grasp to release")
-    assert descriptions(JobWord)["release_s"] == "Not before this."
+    assert descriptions(JobSpec)["payload_kg"].startswith("Carried from grasp to release")
+    assert descriptions(JobSpec)["release_s"] == "Not before this."
 
 
 def test_asyncapi_has_every_key_and_no_loose_end():
@@ -171,30 +173,41 @@ def test_asyncapi_has_every_key_and_no_loose_end():
         Draft202012Validator(schema).validate(message["examples"][0]["payload"])
 
 
-@pytest.mark.parametrize(("nodes", "role"), [(("arm_node", "council_node"), "arm"), (("auction_node",), "auction")])
+@pytest.mark.parametrize(("nodes", "role"), [(("arm/node", "consensus/node"), "arm"), (("auction/node",), "auction")])
 def test_the_participants_publish_and_answer_as_the_contract_says(nodes, role):
-    """Read from their source: `link.publisher(keys.of_…(…, "topic"), Kind, remember=…)` and `link.answer(…)`."""
+    """Read from their source: `link.publisher(keys.of_…(…, "topic"), Kind)` and `link.reply_to(…)`."""
     source = "\n".join((ROOT / "fleet" / "live" / f"{node}.py").read_text(encoding="utf-8") for node in nodes)
     found = {}
     for call in ast.walk(ast.parse(source)):
         if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) and len(call.args) > 1):
             continue
-        if call.func.attr in ("publisher", "answer") and isinstance(call.args[0], ast.Call):
+        if call.func.attr in ("publisher", "reply_to") and isinstance(call.args[0], ast.Call):
             key = ast.unparse(call.args[0])
             topic = re.search(r"'(\w+)'\)$", key)
             place = {"asked_by_every_arm": role}.get(key.split(".")[1].split("(")[0]) or key.split("of_")[1]
-            where = (place.split("(")[0], topic[1] if topic else "now")
-            remember = next((ast.unparse(k.value) for k in call.keywords if k.arg == "remember"), "0")
-            kept = REMEMBERED if remember == "REMEMBERED" else int(remember)
-            found[where] = (ast.unparse(call.args[1]), kept)
-    said = {
-        (channel.role, channel.topic): (channel.word.__name__, channel.kept)
+            found[place.split("(")[0], topic[1] if topic else "now"] = ast.unparse(call.args[1])
+    expected = {
+        (channel.role, channel.topic): channel.message.__name__
         for channel in CHANNELS
-        if channel.word is not None
-        # Where there is no auctioneer, arms answer outsiders.
-        and (channel.by == {"arm": "arm", "auction": "auctioneer"}[role] or channel.role in keys.NAMELESS)
+        if channel.message is not None
+        # Where there is no auctioneer, arms reply to outsiders.
+        and (channel.sender == {"arm": "arm", "auction": "auctioneer"}[role] or channel.role in keys.NAMELESS)
     }
-    assert found == said
+    assert found == expected
+
+
+@pytest.mark.parametrize("channel", CHANNELS, ids=lambda channel: channel.name)
+def test_a_key_is_used_as_the_registry_says_or_not_at_all(channel):
+    key = channel.address.format(fleet="f", arm="a", auctioneer="a", peer="b")
+    assert channel_of(key) is channel
+    assert channel_of(key.replace("/a/", "/*/")) is channel
+    client = BusClient("tcp/127.0.0.1:1", "f")
+    with pytest.raises(ValueError, match="is for"):
+        client.publisher(key, messages.Refusal)
+    with pytest.raises(ValueError, match="is for"):
+        client.subscribe(key, messages.Refusal, print)
+    with pytest.raises(ValueError, match="is for"):
+        client.reply_to(key, messages.Refusal, print)
 
 
 def test_no_binding_is_claimed_that_asyncapi_does_not_know():
@@ -217,7 +230,7 @@ def test_stale_documents_are_named_and_made_anew(tmp_path):
     told = CliRunner().invoke(app, ["contract", "--check", "--out", str(out)])
     assert "schemas.json" in str(told.exception)
     assert not out.exists()
-    (tmp_path / "bus.md").write_text("a\n<!-- made by thermofleet contract: ways -->\nold\n<!-- end -->\nz\n")
+    (tmp_path / "bus.md").write_text("a\n<!-- made by thermofleet contract: patterns -->\nold\n<!-- end -->\nz\n")
     assert CliRunner().invoke(app, ["contract", "--out", str(out)]).exit_code == 0
     page = (tmp_path / "bus.md").read_text()
     assert "old" not in page

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.bus.channel import Channel, Partition
-from fleet.bus.delivery import Delivery
-from fleet.bus.exchange import Condition, Scores
+from fleet.bus.exchange.channel import Channel, Partition
+from fleet.bus.exchange.delivery import Delivery
+from fleet.bus.exchange.protocol import Condition, Scores
 
 ARMS = ("a", "b", "c")
 DT_S = 10.0

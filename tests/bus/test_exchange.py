@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fleet.bus.exchange import UNHEARD, Condition, Scores, assemble
+from fleet.bus.exchange.protocol import UNHEARD, Condition, Scores, assemble
 
 
 def test_age_is_that_of_the_older_of_the_two_words():

@@ -7,8 +7,8 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.bus import keys
-from fleet.bus.keys import ASKED, NAMELESS, TOPICS, Key
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.keys import ASKED, NAMELESS, TOPICS, Key
 
 names = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=30)
 wild = st.sampled_from(
@@ -63,19 +63,19 @@ def test_all_of_one_is_what_it_says_and_no_word_of_another(one, other):
 @pytest.mark.parametrize(
     ("built", "written"),
     [
-        (keys.of_arm("f", "arm_0", "state"), "thermofleet/v1/f/arm/arm_0/state"),
-        (keys.of_arm("hall 2", "a/b", "alive"), "thermofleet/v1/hall%202/arm/a%2Fb/alive"),
-        (keys.of_every_arm("x", "difficulty"), "thermofleet/v1/x/arm/*/difficulty"),
-        (keys.of_auction("f", "@boss", "announce"), "thermofleet/v1/f/auction/%40boss/announce"),
-        (keys.of_jobs("f", "submit"), "thermofleet/v1/f/jobs/submit"),
-        (keys.of_clock("f"), "thermofleet/v1/f/clock/now"),
-        (keys.of_every_auction("f", "result"), "thermofleet/v1/f/auction/*/result"),
-        (keys.asked_by("f", "a", "lease", "arm 1/b"), "thermofleet/v1/f/auction/a/lease/arm%201%2Fb"),
-        (keys.asked_by_every_arm("f", "x", "report"), "thermofleet/v1/f/auction/x/report/*"),
-        (keys.asked_of_all("f", "report", "x"), "thermofleet/v1/f/auction/*/report/x"),
-        (keys.asked_by("f", "a", "grant", "arm 1/b"), "thermofleet/v1/f/arm/a/grant/arm%201%2Fb"),
-        (keys.asked_by_every_arm("f", "x", "grant"), "thermofleet/v1/f/arm/x/grant/*"),
-        (keys.asked_of_all("f", "grant", "x"), "thermofleet/v1/f/arm/*/grant/x"),
+        (keys.of_arm("f", "arm_0", "state"), "thermofleet/v2/f/arm/arm_0/state"),
+        (keys.of_arm("hall 2", "a/b", "alive"), "thermofleet/v2/hall%202/arm/a%2Fb/alive"),
+        (keys.of_every_arm("x", "difficulty"), "thermofleet/v2/x/arm/*/difficulty"),
+        (keys.of_auction("f", "@boss", "announce"), "thermofleet/v2/f/auction/%40boss/announce"),
+        (keys.of_jobs("f", "submit"), "thermofleet/v2/f/jobs/submit"),
+        (keys.of_clock("f"), "thermofleet/v2/f/clock/now"),
+        (keys.of_every_auction("f", "result"), "thermofleet/v2/f/auction/*/result"),
+        (keys.asked_by("f", "a", "lease", "arm 1/b"), "thermofleet/v2/f/auction/a/lease/arm%201%2Fb"),
+        (keys.asked_by_every_arm("f", "x", "report"), "thermofleet/v2/f/auction/x/report/*"),
+        (keys.asked_of_all("f", "report", "x"), "thermofleet/v2/f/auction/*/report/x"),
+        (keys.asked_by("f", "a", "claim", "arm 1/b"), "thermofleet/v2/f/arm/a/claim/arm%201%2Fb"),
+        (keys.asked_by_every_arm("f", "x", "claim"), "thermofleet/v2/f/arm/x/claim/*"),
+        (keys.asked_of_all("f", "claim", "x"), "thermofleet/v2/f/arm/*/claim/x"),
     ],
 )
 def test_keys_are_written_as_the_design_says(built, written):
@@ -86,35 +86,35 @@ def test_keys_are_written_as_the_design_says(built, written):
     "text",
     [
         "",
-        "thermofleet/v1",
-        "thermofleet/v2/f/arm/a/state",
-        "other/v1/f/arm/a/state",
-        "thermofleet/v1/f/arm/*/state",
-        "thermofleet/v1/**",
-        "thermofleet/v1/f/arm//state",
-        "thermofleet/v1//arm/a/state",
-        "thermofleet/v1/f/arm/a/state/x",
-        "thermofleet/v1/f/arm/a/announce",
-        "thermofleet/v1/f/auction/a/state",
-        "thermofleet/v1/f/auction/a/lease",
-        "thermofleet/v1/f/auction/a/lease/",
-        "thermofleet/v1/f/auction/a/lease/*",
-        "thermofleet/v1/f/auction/a/lease/%61",
-        "thermofleet/v1/f/auction/a/lease/x/y",
-        "thermofleet/v1/f/auction/a/result/x",
-        "thermofleet/v1/f/arm/a/lease/x",
-        "thermofleet/v1/f/arm/a/grant",
-        "thermofleet/v1/f/auction/a/grant/x",
-        "thermofleet/v1/f/jobs/a/lease/x",
-        "thermofleet/v1/f/jobs/a/submit",
-        "thermofleet/v1/f/arm/state",
-        "thermofleet/v1/f/robot/a/state",
-        "thermofleet/v1/f/arm/a%zz/state",
-        "thermofleet/v1/f/arm/%ff/state",
-        "thermofleet/v1/f/arm/a b/state",
-        "thermofleet/v1/f/arm/%61/state",
-        "thermofleet/v1/f/arm/a%2f/state",
-        "thermofleet/v1/@f/arm/a/state",
+        "thermofleet/v2",
+        "thermofleet/v1/f/arm/a/state",
+        "other/v2/f/arm/a/state",
+        "thermofleet/v2/f/arm/*/state",
+        "thermofleet/v2/**",
+        "thermofleet/v2/f/arm//state",
+        "thermofleet/v2//arm/a/state",
+        "thermofleet/v2/f/arm/a/state/x",
+        "thermofleet/v2/f/arm/a/announce",
+        "thermofleet/v2/f/auction/a/state",
+        "thermofleet/v2/f/auction/a/lease",
+        "thermofleet/v2/f/auction/a/lease/",
+        "thermofleet/v2/f/auction/a/lease/*",
+        "thermofleet/v2/f/auction/a/lease/%61",
+        "thermofleet/v2/f/auction/a/lease/x/y",
+        "thermofleet/v2/f/auction/a/result/x",
+        "thermofleet/v2/f/arm/a/lease/x",
+        "thermofleet/v2/f/arm/a/claim",
+        "thermofleet/v2/f/auction/a/claim/x",
+        "thermofleet/v2/f/jobs/a/lease/x",
+        "thermofleet/v2/f/jobs/a/submit",
+        "thermofleet/v2/f/arm/state",
+        "thermofleet/v2/f/robot/a/state",
+        "thermofleet/v2/f/arm/a%zz/state",
+        "thermofleet/v2/f/arm/%ff/state",
+        "thermofleet/v2/f/arm/a b/state",
+        "thermofleet/v2/f/arm/%61/state",
+        "thermofleet/v2/f/arm/a%2f/state",
+        "thermofleet/v2/@f/arm/a/state",
     ],
 )
 def test_what_is_no_concrete_key_is_refused(text):
@@ -136,7 +136,7 @@ def test_an_answer_goes_under_the_key_of_the_one_who_asked(key):
 )
 def test_who_asks_as_nobody_is_not_answered(asked):
     with pytest.raises(ValueError, match=r"no key of this bus|not written|no such place"):
-        keys.answered(keys.asked_by_every_arm("f", "a", "lease"), f"thermofleet/v1/f/{asked}")
+        keys.answered(keys.asked_by_every_arm("f", "a", "lease"), f"thermofleet/v2/f/{asked}")
 
 
 def test_only_what_an_arm_asks_as_itself_ends_in_a_name():

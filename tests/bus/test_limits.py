@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from fleet.bus import keys
-from fleet.bus.keyring import make
-from fleet.bus.limits import Limits
-from fleet.bus.roster import of_arms
-from fleet.bus.router import Router, open_client
-from fleet.bus.security import Tls
+from fleet.bus.client.rate_limits import Limits
+from fleet.bus.client.router import Router, open_client
+from fleet.bus.protocol import keys
+from fleet.bus.security.access_control import of_arms
+from fleet.bus.security.keyring import make
+from fleet.bus.security.tls import Tls
 
 PATIENT_S = 20.0
 LIMIT = 65_536
@@ -65,7 +65,7 @@ def sizes(connect: Connect, key: str, say_all: Callable[[zenoh.Session], object]
 
 def settled(session: zenoh.Session) -> None:
     """Wait until the router has taken all that the session said or declared before."""
-    assert list(session.get(keys.caches_of("thermofleet/v1/f/arm/nobody"), timeout=PATIENT_S)) == []
+    assert list(session.get(keys.caches_of("thermofleet/v2/f/arm/nobody"), timeout=PATIENT_S)) == []
 
 
 EVENT = keys.of_arm("f", "arm_0", "event")
@@ -152,7 +152,7 @@ def test_telemetry_too_often_is_thinned_to_the_limit(connect):
 def test_a_flood_of_telemetry_takes_nothing_from_other_words_and_other_arms(connect):
     heard: queue.Queue[str] = queue.Queue()
     listener = connect("monitor").declare_subscriber(
-        "thermofleet/v1/f/**", lambda sample: heard.put(str(sample.key_expr))
+        "thermofleet/v2/f/**", lambda sample: heard.put(str(sample.key_expr))
     )
     settled(connect("monitor"))
     settled(connect("arm_1"))

@@ -8,11 +8,11 @@ from contextlib import ExitStack
 
 import pytest
 
-from fleet.bus import keys
-from fleet.bus.link import Link, Refused
-from fleet.bus.messages import Refusal, encoding
-from fleet.bus.router import Router
-from fleet.bus.trade import Admission, ArmEvent, Clock, ClockRequest, JobWord, Submission, Submitted
+from fleet.bus.client.client import BusClient, Refused
+from fleet.bus.client.router import Router
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import Admission, ArmEvent, Clock, ClockRequest, JobSpec, Submission, SubmissionReply
+from fleet.bus.protocol.messages import Refusal, encoding
 from fleet.errors import BusError
 
 PATIENCE_S = 10.0
@@ -23,7 +23,7 @@ def bus():
     """A router, and what makes lines to it."""
     with ExitStack() as stack:
         router = stack.enter_context(Router())
-        yield lambda **options: stack.enter_context(Link(router.endpoint, "f", **options))
+        yield lambda **options: stack.enter_context(BusClient(router.endpoint, "f", **options))
 
 
 def serve(condition, *links):
@@ -39,8 +39,8 @@ def meet(*links):
     """What each has declared is known to all: a token is declared last, and seen after the rest."""
     seen = [set() for _ in links]
     for number, (link, names) in enumerate(zip(links, seen, strict=True)):
-        link.alive(keys.of_arm("f", f"guest_{number}", "alive"))
-        link.watch(keys.of_every_arm("f", "alive"), lambda arm, _, names=names: names.add(arm))
+        link.declare_token(keys.of_arm("f", f"guest_{number}", "alive"))
+        link.watch_tokens(keys.of_every_arm("f", "alive"), lambda arm, _, names=names: names.add(arm))
     serve(lambda: all(len(names) >= len(links) for names in seen), *links)
 
 
@@ -51,20 +51,20 @@ def raw(link):
 
 def test_an_answer_reaches_the_one_who_asked(bus):
     asker, teller = bus(), bus()
-    teller.answer(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=12.5, speed=60.0))
+    teller.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=12.5, speed=60.0))
     meet(asker, teller)
     got = []
-    asker.ask(keys.of_clock("f"), ClockRequest(), Clock, got.append, timeout_s=5.0)
+    asker.query(keys.of_clock("f"), ClockRequest(), Clock, got.append, timeout_s=5.0)
     serve(lambda: got, asker, teller)
-    assert list(got[0].words.values()) == [Clock(time_s=12.5, speed=60.0)]
+    assert list(got[0].messages.values()) == [Clock(time_s=12.5, speed=60.0)]
     assert not got[0].refused
     assert got[0].took_s < PATIENCE_S
 
 
 def test_a_question_to_nobody_is_over_at_once(bus):
     asker = bus()
-    answers = asker.ask_and_wait(keys.of_clock("f"), ClockRequest(), Clock, timeout_s=30.0)
-    assert not answers.words
+    answers = asker.query_and_wait(keys.of_clock("f"), ClockRequest(), Clock, timeout_s=30.0)
+    assert not answers.messages
     assert answers.took_s < PATIENCE_S
 
 
@@ -74,43 +74,43 @@ def test_a_refusal_is_told_in_words(bus):
     def refuse(_):
         raise Refused("No clock here.")
 
-    teller.answer(keys.of_clock("f"), ClockRequest, refuse)
+    teller.reply_to(keys.of_clock("f"), ClockRequest, refuse)
     meet(asker, teller)
     got = []
-    asker.ask(keys.of_clock("f"), ClockRequest(), Clock, got.append, timeout_s=5.0)
+    asker.query(keys.of_clock("f"), ClockRequest(), Clock, got.append, timeout_s=5.0)
     serve(lambda: got, asker, teller)
     assert got[0].refused == {keys.of_clock("f"): "No clock here."}
 
 
 def test_two_that_ask_each_other_do_not_block(bus):
     one, other = bus(), bus()
-    job = JobWord(name="j", kind="hold", places=("rack",))
+    job = JobSpec(name="j", kind="hold", places=("rack",))
     got = []
 
     def answered(jobs):
-        other.ask(keys.of_clock("f"), ClockRequest(), Clock, got.append, timeout_s=5.0)
-        return Submitted(auctioneer="a", jobs=tuple(Admission(j.name, True) for j in jobs.jobs))
+        other.query(keys.of_clock("f"), ClockRequest(), Clock, got.append, timeout_s=5.0)
+        return SubmissionReply(auctioneer="a", jobs=tuple(Admission(j.name, True) for j in jobs.jobs))
 
-    other.answer(keys.of_jobs("f", "submit"), Submission, answered)
-    one.answer(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=1.0, speed=1.0))
+    other.reply_to(keys.of_jobs("f", "submit"), Submission, answered)
+    one.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=1.0, speed=1.0))
     meet(one, other)
-    one.ask(keys.of_jobs("f", "submit"), Submission((job,)), Submitted, got.append, timeout_s=5.0)
+    one.query(keys.of_jobs("f", "submit"), Submission((job,)), SubmissionReply, got.append, timeout_s=5.0)
     serve(lambda: len(got) == 2, one, other)
-    assert all(len(answers.words) == 1 for answers in got)
+    assert all(len(answers.messages) == 1 for answers in got)
 
 
 @pytest.mark.parametrize(
     ("payload", "said", "complaint"),
     [
-        (b"{", encoding(ClockRequest), "Not a thermofleet.ClockRequest.v1"),
-        (b"\xff\xfe", encoding(ClockRequest), "Not a thermofleet.ClockRequest.v1"),
+        (b"{", encoding(ClockRequest), "Not a thermofleet.ClockRequest.v2"),
+        (b"\xff\xfe", encoding(ClockRequest), "Not a thermofleet.ClockRequest.v2"),
         (b"{}", "application/json;thermofleet.ClockRequest.v9", "encoded as"),
         (b"{}", "text/plain", "encoded as"),
     ],
 )
 def test_a_malformed_question_is_answered_with_what_is_wrong(bus, payload, said, complaint):
     asker, teller = bus(), bus()
-    teller.answer(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=1.0, speed=1.0))
+    teller.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=1.0, speed=1.0))
     meet(asker, teller)
     replies = []
     raw(asker).get(keys.of_clock("f"), replies.append, payload=payload, encoding=said, timeout=5.0)
@@ -122,12 +122,12 @@ def test_a_malformed_question_is_answered_with_what_is_wrong(bus, payload, said,
 
 def test_a_late_joiner_hears_the_last_words(bus):
     arm = bus()
-    say = arm.publisher(keys.of_arm("f", "arm_0", "event"), ArmEvent, remember=8)
+    say = arm.publisher(keys.of_arm("f", "arm_0", "event"), ArmEvent)
     for number in range(3):
         say(ArmEvent(arm="arm_0", number=number, time_s=1.0, kind="finish"))
     late, heard = bus(), []
-    late.listen(
-        keys.of_every_arm("f", "event"), ArmEvent, lambda arm, word: heard.append((arm, word.number)), remembered=8
+    late.subscribe(
+        keys.of_every_arm("f", "event"), ArmEvent, lambda arm, word: heard.append((arm, word.number)), history=True
     )
     serve(lambda: len(heard) == 3, late)
     assert heard == [("arm_0", 0), ("arm_0", 1), ("arm_0", 2)]
@@ -135,13 +135,13 @@ def test_a_late_joiner_hears_the_last_words(bus):
 
 def test_words_that_speak_for_another_are_left_out(bus):
     listener, stranger, heard = bus(), bus(), []
-    listener.listen(keys.of_every_arm("f", "event"), ArmEvent, lambda arm, word: heard.append(arm))
+    listener.subscribe(keys.of_every_arm("f", "event"), ArmEvent, lambda arm, word: heard.append(arm))
     meet(listener, stranger)
     lie = ArmEvent(arm="arm_1", number=0, time_s=1.0, kind="finish")
     truth = ArmEvent(arm="arm_2", number=0, time_s=1.0, kind="finish")
-    stranger.say(keys.of_arm("f", "arm_0", "event"), lie)
-    raw(stranger).put("thermofleet/v1/f/arm/*/event", json.dumps({"arm": "arm_0"}), encoding=encoding(ArmEvent))
-    stranger.say(keys.of_arm("f", "arm_2", "event"), truth)
+    stranger.publish(keys.of_arm("f", "arm_0", "event"), lie)
+    raw(stranger).put("thermofleet/v2/f/arm/*/event", json.dumps({"arm": "arm_0"}), encoding=encoding(ArmEvent))
+    stranger.publish(keys.of_arm("f", "arm_2", "event"), truth)
     serve(lambda: heard, listener)
     assert heard == ["arm_2"]
     assert listener.malformed == 2
@@ -149,9 +149,9 @@ def test_words_that_speak_for_another_are_left_out(bus):
 
 def test_who_comes_and_goes_is_seen(bus):
     watcher, seen = bus(), []
-    watcher.watch(keys.of_every_arm("f", "alive"), lambda arm, there: seen.append((arm, there)))
+    watcher.watch_tokens(keys.of_every_arm("f", "alive"), lambda arm, there: seen.append((arm, there)))
     arm = bus()
-    arm.alive(keys.of_arm("f", "arm_0", "alive"))
+    arm.declare_token(keys.of_arm("f", "arm_0", "alive"))
     serve(lambda: ("arm_0", True) in seen, watcher)
     arm.close()
     serve(lambda: ("arm_0", False) in seen, watcher)
@@ -160,11 +160,11 @@ def test_who_comes_and_goes_is_seen(bus):
 
 def test_what_nobody_handles_pushes_out_the_oldest(bus):
     listener, sender, heard = bus(backlog=10), bus(), []
-    listener.listen(keys.of_every_arm("f", "event"), ArmEvent, lambda arm, word: heard.append(word.number))
+    listener.subscribe(keys.of_every_arm("f", "event"), ArmEvent, lambda arm, word: heard.append(word.number))
     meet(listener, sender)
     for number in range(50):
-        sender.say(keys.of_arm("f", "a", "event"), ArmEvent(arm="a", number=number, time_s=0.0, kind="finish"))
-    sender.say(keys.of_arm("f", "a", "event"), ArmEvent(arm="a", number=50, time_s=0.0, kind="finish"))
+        sender.publish(keys.of_arm("f", "a", "event"), ArmEvent(arm="a", number=number, time_s=0.0, kind="finish"))
+    sender.publish(keys.of_arm("f", "a", "event"), ArmEvent(arm="a", number=50, time_s=0.0, kind="finish"))
     deadline_s = time.monotonic() + PATIENCE_S
     patience = threading.Event()
     while listener.overrun < 41 and time.monotonic() < deadline_s:
@@ -178,14 +178,14 @@ def test_a_closed_line_says_so(bus):
     link = bus()
     link.close()
     with pytest.raises(BusError, match="not open"):
-        link.say(keys.of_arm("f", "a", "event"), ArmEvent(arm="a", number=0, time_s=0.0, kind="finish"))
+        link.publish(keys.of_arm("f", "a", "event"), ArmEvent(arm="a", number=0, time_s=0.0, kind="finish"))
 
 
 def test_a_line_closes_soon_though_a_router_that_stands_still_has_taken_its_call():
     """In place of the router is somebody who accepts and never says a word; Zenoh itself would wait for ten seconds."""
     router = Router().open()
     port = int(router.endpoint.rpartition(":")[2])
-    line = Link(router.endpoint, "f").open()
+    line = BusClient(router.endpoint, "f").open()
     router.close()
     with socket.create_server(("127.0.0.1", port)) as silent:
         silent.settimeout(PATIENCE_S)

@@ -8,9 +8,8 @@ from queue import Empty
 
 import pytest
 
-from fleet.bus.inbox import Inbox
-from fleet.bus.link import Link
-from fleet.bus.mailbox import Mailbox
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.queue import Mailbox
 from fleet.live.supervisor import Supervisor
 
 PATIENCE_S = 20.0
@@ -44,11 +43,11 @@ def late_signal():
     "wait",
     [
         lambda until_s, _: get(Mailbox(), until_s),
-        lambda until_s, _: Inbox(4).wait(1, until_s),
-        lambda until_s, _: Link("tcp/127.0.0.1:1", "f").serve(until_s),
-        lambda until_s, folder: Supervisor(folder).look(until_s - time.monotonic()),
+        lambda until_s, _: Mailbox().wait(4, until_s),
+        lambda until_s, _: BusClient("tcp/127.0.0.1:1", "f").serve(until_s),
+        lambda until_s, folder: Supervisor(folder).poll(until_s - time.monotonic()),
     ],
-    ids=["Mailbox.get", "Inbox.wait", "Link.serve", "Supervisor.look"],
+    ids=["Mailbox.get", "Mailbox.wait", "BusClient.serve", "Supervisor.look"],
 )
 def test_a_signal_that_takes_as_long_as_the_wait_does_not_make_it_endless(late_signal, wait, tmp_path):
     until_s = time.monotonic() + WAIT_S

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fleet.bus.channel import Channel
-from fleet.bus.exchange import UNHEARD, Heard
-from fleet.bus.memory import MemoryExchange
+from fleet.bus.exchange.channel import Channel
+from fleet.bus.exchange.memory import MemoryExchange
+from fleet.bus.exchange.protocol import UNHEARD, PeerView
 from fleet.errors import BusError
 
 ARMS = ("a", "b", "c", "d")
@@ -105,7 +105,7 @@ def test_all_is_lost_with_loss_one(make_words):
 
 
 def test_the_same_seed_loses_the_same_words(make_words, assert_same):
-    def episode(seed: int) -> list[Heard]:
+    def episode(seed: int) -> list[PeerView]:
         rng = np.random.default_rng(0)
         exchange = MemoryExchange(ARMS, Channel(loss=0.3), rng=np.random.default_rng(seed))
         return [exchange.share(make_words(rng, 4, 10.0 * tick)) for tick in range(10)]
@@ -127,7 +127,7 @@ def test_relabelling_the_arms_relabels_what_is_heard(make_words, assert_same):
             words, **{f: getattr(words, f)[order] for f in per_arm}, twin=tuple(words.twin[i] for i in order)
         )
         one, other = plain.share(words), turned.share(moved)
-        assert_same(Heard(**{f.name: getattr(one, f.name)[np.ix_(order, order)] for f in fields(Heard)}), other)
+        assert_same(PeerView(**{f.name: getattr(one, f.name)[np.ix_(order, order)] for f in fields(PeerView)}), other)
 
 
 def test_a_new_episode_knows_nothing_of_the_last(make_words):
@@ -143,7 +143,7 @@ def test_a_new_episode_knows_nothing_of_the_last(make_words):
 def test_a_new_episode_may_bring_its_own_chance(make_words, assert_same):
     exchange = MemoryExchange(ARMS, Channel(loss=0.5), rng=np.random.default_rng(0))
 
-    def episode() -> list[Heard]:
+    def episode() -> list[PeerView]:
         exchange.begin(np.random.default_rng(3))
         rng = np.random.default_rng(1)
         return [exchange.share(make_words(rng, 4, 10.0 * tick)) for tick in range(10)]
@@ -199,7 +199,7 @@ def test_no_slot_is_fine(make_words):
 )
 def test_words_that_cannot_be_said_are_refused(make_words, changes, named):
     exchange = MemoryExchange(ARMS)
-    with pytest.raises(ValueError, match=f"Words.{named}"):
+    with pytest.raises(ValueError, match=f"Broadcast.{named}"):
         exchange.share(replace(make_words(np.random.default_rng(0), 4, 0.0), **changes))
 
 

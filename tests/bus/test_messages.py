@@ -7,7 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.bus.messages import DifficultyWord, Info, MalformedMessage, State, decode, encode, encoding, schema
+from fleet.bus.protocol.messages import (
+    DifficultyScores,
+    Info,
+    MalformedMessage,
+    State,
+    check_name,
+    decode,
+    encode,
+    encoding,
+    schema,
+)
 from fleet.errors import BusError
 
 numbers = st.floats(allow_nan=False, allow_infinity=False)
@@ -28,18 +38,23 @@ states = st.builds(
 def difficulty_words(draw):
     jobs = tuple(draw(st.lists(names, max_size=5, unique=True)))
     columns = st.lists(st.none() | numbers, min_size=len(jobs), max_size=len(jobs)).map(tuple)
-    return DifficultyWord(draw(names), draw(ticks), draw(numbers), draw(names), jobs, draw(columns), draw(columns))
+    return DifficultyScores(draw(names), draw(ticks), draw(numbers), draw(names), jobs, draw(columns), draw(columns))
 
 
 infos = st.builds(Info, arm=names, joints=st.integers(1, 9), twin=names)
 
 STATE = State("arm_0", 3, 30.0, "working", (41.5, 40.0), 18.5)
-WORD = DifficultyWord("arm_0", 3, 30.0, "twin-1", ("a", "b"), (0.25, None), (None, 1e-300))
+WORD = DifficultyScores("arm_0", 3, 30.0, "twin-1", ("a", "b"), (0.25, None), (None, 1e-300))
+
+
+def received(kind, payload, arm):
+    """The message that came under the key of an arm."""
+    return check_name(decode(kind, payload), arm, "arm")
 
 
 @given(states | difficulty_words() | infos)
 def test_what_is_said_arrives_to_the_last_bit(message):
-    assert decode(type(message), encode(message), arm=message.arm) == message
+    assert received(type(message), encode(message), message.arm) == message
 
 
 @given(states | difficulty_words() | infos)
@@ -58,9 +73,9 @@ def test_no_number_is_said_that_is_none(bad):
     with pytest.raises(ValueError, match="headroom_k"):
         State("a", 0, 0.0, "idle", (20.0,), bad)
     with pytest.raises(ValueError, match="difficulty"):
-        DifficultyWord("a", 0, 0.0, "", ("j",), (bad,), (None,))
+        DifficultyScores("a", 0, 0.0, "", ("j",), (bad,), (None,))
     with pytest.raises(ValueError, match="p_saturation"):
-        DifficultyWord("a", 0, 0.0, "", ("j",), (None,), (bad,))
+        DifficultyScores("a", 0, 0.0, "", ("j",), (None,), (bad,))
 
 
 def changed(message, **changes):
@@ -96,8 +111,8 @@ def changed(message, **changes):
     ],
 )
 def test_a_malformed_state_is_refused_with_words(payload):
-    with pytest.raises(MalformedMessage, match=r"thermofleet\.State\.v1"):
-        decode(State, payload, arm="arm_0")
+    with pytest.raises(MalformedMessage, match=r"thermofleet\.State\.v2"):
+        received(State, payload, "arm_0")
 
 
 @pytest.mark.parametrize(
@@ -113,12 +128,12 @@ def test_a_malformed_state_is_refused_with_words(payload):
 )
 def test_a_malformed_difficulty_is_refused(payload):
     with pytest.raises(MalformedMessage):
-        decode(DifficultyWord, payload, arm="arm_0")
+        received(DifficultyScores, payload, "arm_0")
 
 
 def test_nobody_speaks_for_another_arm():
     with pytest.raises(MalformedMessage, match="'arm_1' claims to be by 'arm_0'"):
-        decode(State, encode(STATE), arm="arm_1")
+        received(State, encode(STATE), "arm_1")
 
 
 def test_a_malformed_message_is_a_bus_error_and_a_value_error():
@@ -127,13 +142,13 @@ def test_a_malformed_message_is_a_bus_error_and_a_value_error():
 
 
 def test_what_a_later_version_adds_is_ignored():
-    assert decode(State, changed(STATE, mood="good"), arm="arm_0") == STATE
+    assert received(State, changed(STATE, mood="good"), "arm_0") == STATE
 
 
 def test_an_integer_is_a_number():
-    assert decode(State, changed(STATE, headroom_k=18), arm="arm_0").headroom_k == 18.0
+    assert received(State, changed(STATE, headroom_k=18), "arm_0").headroom_k == 18.0
 
 
 def test_a_schema_has_a_version():
-    assert schema(Info) == "thermofleet.Info.v1"
-    assert encoding(State) == "application/json;thermofleet.State.v1"
+    assert schema(Info) == "thermofleet.Info.v2"
+    assert encoding(State) == "application/json;thermofleet.State.v2"

@@ -14,8 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from zenoh.ext import Int64, z_deserialize
 
-from fleet.bus.ros2 import Node
-from fleet.bus.ros2_names import (
+from fleet.bus.client.router import Router
+from fleet.errors import BusError
+from fleet.ros2.node import Node
+from fleet.ros2.topics import (
     NO_HASH,
     Topic,
     attachment,
@@ -24,8 +26,6 @@ from fleet.bus.ros2_names import (
     plain_name,
     publisher_token,
 )
-from fleet.bus.router import Router
-from fleet.errors import BusError
 
 PATIENCE_S = 10.0
 STRING = "std_msgs/msg/String"

@@ -13,8 +13,8 @@ from pycdr2 import IdlStruct
 from pycdr2.types import float64, int32, sequence, uint8, uint32
 from rosbags.typesys import Stores, get_typestore
 
-from fleet.bus.messages import MalformedMessage
-from fleet.bus.ros2_cdr import (
+from fleet.bus.protocol.messages import MalformedMessage
+from fleet.ros2.cdr import (
     DIAGNOSTICS,
     JOINT_STATE,
     MOST,
@@ -24,7 +24,7 @@ from fleet.bus.ros2_cdr import (
     write_diagnostics,
     write_joints,
 )
-from fleet.bus.ros2_words import Diagnostic, Joints
+from fleet.ros2.conversion import Diagnostic, Joints
 
 STORES = {name: get_typestore(Stores[f"ROS2_{name}"]) for name in ("HUMBLE", "JAZZY", "LYRICAL")}
 

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet.bus.messages import DifficultyWord, MalformedMessage, State
-from fleet.bus.ros2_cdr import read_diagnostics, read_joints, write_diagnostics, write_joints
-from fleet.bus.ros2_words import (
+from fleet.bus.protocol.messages import DifficultyScores, MalformedMessage, State
+from fleet.robot import ThermalLimits
+from fleet.ros2.cdr import read_diagnostics, read_joints, write_diagnostics, write_joints
+from fleet.ros2.conversion import (
     ERROR,
     OK,
     STALE,
@@ -22,7 +23,6 @@ from fleet.bus.ros2_words import (
     joints_of,
     temperatures,
 )
-from fleet.robot import ThermalLimits
 
 UNHURRIED = settings(deadline=None, max_examples=50)
 LIMITS = ThermalLimits()
@@ -112,7 +112,7 @@ def test_what_was_not_heard_of_for_long_is_stale():
     assert {status.level for status in told(age_s=2.5, word=WORD)} == {OK}
 
 
-WORD = DifficultyWord("arm_0", 1, 12.0, "twin-1", ("j", "k", "l"), (0.5, None, 0.25), (0.1, None, None))
+WORD = DifficultyScores("arm_0", 1, 12.0, "twin-1", ("j", "k", "l"), (0.5, None, 0.25), (0.1, None, None))
 
 
 def test_the_difficulty_of_every_job_on_offer_is_told():

@@ -9,9 +9,9 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.bus import keys
-from fleet.bus.keys import ASKED, NAMELESS, TOPICS
-from fleet.bus.roster import ROLES, Participant, access_control, of_arms, rights
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.keys import ASKED, NAMELESS, TOPICS
+from fleet.bus.security.access_control import ROLES, Participant, access_control, of_arms, rights
 from fleet.errors import BusError
 
 DOCS = (Path(__file__).parents[2] / "docs" / "security.md").read_text(encoding="utf-8")
@@ -35,7 +35,7 @@ def test_the_documentation_has_the_rules_that_are_kept():
     start = keys.all_of_fleet("f").removesuffix("**")
     kept = {role: rights("f", Participant("NAME", role)) for role in ROLES if role != "router"}
     assert documented() == {
-        role: ([key.removeprefix(start) for key in may.says], [key.removeprefix(start) for key in may.asks])
+        role: ([key.removeprefix(start) for key in may.publishes], [key.removeprefix(start) for key in may.queries])
         for role, may in kept.items()
     }
 
@@ -95,7 +95,7 @@ def test_nobody_deletes_and_everybody_but_the_router_hears_its_own_fleet_alone()
     rules = access_control(roster)
     assert rules["default_permission"] == "deny"
     assert not [rule for rule in rules["rules"] if "delete" in rule["messages"] or rule["permission"] != "allow"]
-    elsewhere = [keys.of_arm("g", "arm_0", "state"), "**", "thermofleet/v1/**", "@/*/router", "other"]
+    elsewhere = [keys.of_arm("g", "arm_0", "state"), "**", "thermofleet/v2/**", "@/*/router", "other"]
     for one in roster.participants:
         who, hears = one.common_name, one.role != "router"
         for key in EVERY_KEY:
@@ -112,7 +112,7 @@ def test_no_name_of_an_arm_reaches_into_another(arms):
         roster = of_arms("f", arms)
     except ValueError:
         return
-    owned = [zenoh.KeyExpr(key) for arm in arms for key in rights("f", roster.named(arm)).says]
+    owned = [zenoh.KeyExpr(key) for arm in arms for key in rights("f", roster.named(arm)).publishes]
     assert not [1 for one, other in product(owned, owned) if one is not other and one.intersects(other)]
     assert len(access_control(roster)["subjects"]) == len(arms) + 4
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from fleet.bus.router import Router, loopback, open_client, reachable
-from fleet.bus.security import Tls, identified
+from fleet.bus.client.router import Router, loopback, open_client, reachable
+from fleet.bus.security.tls import Tls, identified
 from fleet.errors import BusError
 
 

@@ -18,23 +18,32 @@ import pytest
 import zenoh
 from zenoh import ext
 
-from fleet.bus import keys
-from fleet.bus.answers import Answers
-from fleet.bus.certificates import issue
-from fleet.bus.council import Claim, Grant, Granted, Stake
-from fleet.bus.keyring import add, make
-from fleet.bus.link import Link, Refused
-from fleet.bus.memory import MemoryExchange
-from fleet.bus.messages import encode, encoding
-from fleet.bus.roster import Participant, of_arms
-from fleet.bus.router import Router, open_client
-from fleet.bus.security import Tls
-from fleet.bus.session import ZenohExchange
-from fleet.bus.trade import Clock, ClockRequest, Hold, Lease, LeaseRequest, Receipt, Report
+from fleet.bus.client.client import BusClient, Refused
+from fleet.bus.client.replies import Replies
+from fleet.bus.client.router import Router, open_client
+from fleet.bus.exchange.memory import MemoryExchange
+from fleet.bus.exchange.zenoh import ZenohExchange
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import (
+    Ack,
+    Award,
+    JobSpec,
+    Lease,
+    LeaseEntry,
+    LeaseRequest,
+    Receipt,
+    Report,
+)
+from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, GrantedEntry
+from fleet.bus.protocol.messages import encode, encoding
+from fleet.bus.security.access_control import Participant, of_arms
+from fleet.bus.security.certificates import issue
+from fleet.bus.security.keyring import add, make
+from fleet.bus.security.tls import Tls
 
 ARMS = ("arm_0", "arm_1", "arm 2/*@")
 PATIENT_S = 20.0
-HERE = "thermofleet/v1/f"
+HERE = "thermofleet/v2/f"
 Connect = Callable[[str], zenoh.Session]
 
 
@@ -240,7 +249,7 @@ ASKERS = {
     keys.of_arm("f", "arm_0", "award"): {"auctioneer"},
     keys.asked_by("f", "auctioneer", "lease", "arm_0"): {"arm_0"},
     keys.asked_by("f", "auctioneer", "report", "arm_1"): {"arm_1"},
-    keys.asked_by("f", "arm_0", "grant", "arm_1"): {"arm_1"},
+    keys.asked_by("f", "arm_0", "claim", "arm_1"): {"arm_1"},
     keys.of_jobs("f", "submit"): {"submitter"},
     keys.of_jobs("f", "status"): {"submitter", "monitor", "recorder", "auctioneer"},
     keys.of_clock("f"): {"arm_0", "arm_1", "submitter", "monitor", "recorder", "auctioneer"},
@@ -281,28 +290,30 @@ def test_an_error_of_zenohs_is_lost_under_a_wildcard_and_a_refusal_is_not(router
     assert reasons(everywhere) == ([] if side == "guarded" else ["too warm"])
     kept.undeclare()
 
-    def too_warm(_: ClockRequest) -> Clock:
+    def too_warm(_: Award) -> Ack:
         raise Refused("too warm")
+
+    award = Award("w", "r", "auctioneer", "q", JobSpec("j", "hold", ("p",)))
 
     endpoint = Tls(folder, "arm_0").endpoint(router.endpoint) if side == "guarded" else router.endpoint
     asker = Tls(folder, "auctioneer").endpoint(router.endpoint) if side == "guarded" else router.endpoint
-    with Link(endpoint, "f") as answers, Link(asker, "f") as asks:
-        answers.answer(key, ClockRequest, too_warm)
+    with BusClient(endpoint, "f") as answers, BusClient(asker, "f") as asks:
+        answers.reply_to(key, Award, too_warm)
         settled(raw(answers))
         for where in (key, everywhere):
-            got: list[Answers[Clock]] = []
-            asks.ask(where, ClockRequest(), Clock, got.append, timeout_s=PATIENT_S)
+            got: list[Replies[Ack]] = []
+            asks.query(where, award, Ack, got.append, timeout_s=PATIENT_S)
             serve(lambda got=got: bool(got), answers, asks)
             assert got[0].refused == {key: "too warm"}
 
 
-def raw(link: Link) -> zenoh.Session:
+def raw(link: BusClient) -> zenoh.Session:
     """The session beneath."""
     assert link._session is not None
     return link._session
 
 
-def serve(condition: Callable[[], bool], *links: Link) -> None:
+def serve(condition: Callable[[], bool], *links: BusClient) -> None:
     """Serve all until the condition holds."""
     deadline_s = time.monotonic() + PATIENT_S
     while not condition():
@@ -315,25 +326,25 @@ def serve(condition: Callable[[], bool], *links: Link) -> None:
 def test_an_arm_neither_renews_nor_reports_nor_claims_for_another(router, side, connect, folder, topic):
     """Neither under its own key with the other's name in the word, nor under the other's; for itself it does."""
     words = {
-        "lease": lambda arm: LeaseRequest(arm, (Hold("w", "j", 0, "working"),)),
+        "lease": lambda arm: LeaseRequest(arm, (LeaseEntry("w", "j", 0, "working"),)),
         "report": lambda arm: Report(arm, "w", "j", "finished", 1, 0.0),
-        "grant": lambda arm: Claim(arm, 1, (Stake("w", "j", ("p",), 0, "wanted"),)),
+        "claim": lambda arm: Claim(arm, 1, (ClaimEntry("w", "j", ("p",), 0, "requested"),)),
     }
     answers = {
         "lease": Lease("auctioneer", 6.0, ("w",), ()),
         "report": Receipt("auctioneer", "w"),
-        "grant": Grant("arm_0", 1, 6.0, (Granted("w", 0),)),
+        "claim": ClaimReply("arm_0", 1, 6.0, (GrantedEntry("w", 0),)),
     }
     taken: list[str] = []
 
-    def take(word: LeaseRequest | Report | Claim) -> Lease | Receipt | Grant:
+    def take(word: LeaseRequest | Report | Claim) -> Lease | Receipt | ClaimReply:
         taken.append(word.arm)
         return answers[topic]
 
-    owner, role = ("arm_0", "arm") if topic == "grant" else ("auctioneer", "auction")
+    owner, role = ("arm_0", "arm") if topic == "claim" else ("auctioneer", "auction")
     endpoint = Tls(folder, owner).endpoint(router.endpoint) if side == "guarded" else router.endpoint
-    with Link(endpoint, "f") as auctioneer:
-        auctioneer.answer(keys.asked_by_every_arm("f", owner, topic), type(words[topic]("x")), take)
+    with BusClient(endpoint, "f") as auctioneer:
+        auctioneer.reply_to(keys.asked_by_every_arm("f", owner, topic), type(words[topic]("x")), take)
         settled(raw(auctioneer))
         rogue = connect("arm_1")
 
@@ -357,7 +368,7 @@ def test_an_arm_neither_renews_nor_reports_nor_claims_for_another(router, side, 
         assert ask_as("arm_1", "arm_0") == ["Refusal"] * 2
         assert taken == []
         assert auctioneer.malformed == 2
-        assert "under the key of 'arm_1' claims to be by 'arm_0'" in auctioneer.complaints[-1]
+        assert "under the key of 'arm_1' claims to be by 'arm_0'" in auctioneer.rejections[-1]
         assert ask_as("arm_0", "arm_0") == ([] if side == "guarded" else [answer] * 2)
         assert ask_as("arm_1", "arm_1") == [answer] * 2
         assert taken == ([] if side == "guarded" else ["arm_0"] * 2) + ["arm_1"] * 2

@@ -4,10 +4,10 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from agents.rules import make_policy
-from fleet.bus.channel import Channel, Partition
-from fleet.bus.memory import MemoryExchange
-from fleet.bus.session import ZenohExchange
+from agents.registry import make_policy
+from fleet.bus.exchange.channel import Channel, Partition
+from fleet.bus.exchange.memory import MemoryExchange
+from fleet.bus.exchange.zenoh import ZenohExchange
 from fleet.env.allocation_v0 import parallel_env
 
 ARMS = ("arm_0", "arm_1", "arm_2", "arm_3")

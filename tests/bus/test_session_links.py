@@ -9,9 +9,9 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from fleet.bus.router import Router
-from fleet.bus.seat import SILENT_AFTER
-from fleet.bus.session import ZenohExchange
+from fleet.bus.client.router import Router
+from fleet.bus.exchange.group import SILENT_AFTER
+from fleet.bus.exchange.zenoh import ZenohExchange
 
 ARMS = ("arm_0", "arm_1", "arm_2")
 PATIENT_S = 30.0

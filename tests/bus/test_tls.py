@@ -12,15 +12,15 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from fleet.bus import keys
-from fleet.bus.certificates import issue
-from fleet.bus.discover import fleets_at
-from fleet.bus.keyring import make
-from fleet.bus.link import Link
-from fleet.bus.roster import Participant, of_arms
-from fleet.bus.router import Router, open_client
-from fleet.bus.security import Tls
-from fleet.bus.trade import Clock, ClockRequest
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.discover import fleets_at
+from fleet.bus.client.router import Router, open_client
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import ArmEvent, Clock, ClockRequest
+from fleet.bus.security.access_control import Participant, of_arms
+from fleet.bus.security.certificates import issue
+from fleet.bus.security.keyring import make
+from fleet.bus.security.tls import Tls
 from fleet.errors import BusError
 
 ARMS = ("arm_0", "arm_1")
@@ -81,9 +81,11 @@ def test_a_certificate_that_is_not_good_is_refused_at_both_ends(open_stranger, g
 
 def test_an_endpoint_that_says_who_connects_is_enough_for_every_command(guarded, folder):
     endpoint = Tls(folder, "monitor").endpoint(guarded.endpoint)
-    with Link(endpoint, "f") as link:
-        link.say(keys.of_arm("f", "monitor", "event"), ClockRequest())  # not its own key: dropped
-        assert not link.ask_and_wait(keys.of_clock("f"), ClockRequest(), Clock, timeout_s=PATIENT_S).words
+    with BusClient(endpoint, "f") as link:
+        link.publish(
+            keys.of_arm("f", "monitor", "event"), ArmEvent("monitor", 0, 0.0, "finish")
+        )  # not its own key: dropped
+        assert not link.query_and_wait(keys.of_clock("f"), ClockRequest(), Clock, timeout_s=PATIENT_S).messages
     assert fleets_at(endpoint) == ("f",)
     with pytest.raises(BusError, match="say whose, as tls/"):
         open_client(guarded.endpoint, timeout_s=PATIENT_S)
@@ -191,7 +193,7 @@ def test_a_router_with_tls_may_listen_elsewhere_and_without_it_not(folder):
 def test_rubbish_at_the_door_harms_no_line_that_is_open_and_delays_new_ones_alone(guarded, folder):
     """Zenoh waits 0.1 s after every handshake that fails."""
     host, port = guarded.endpoint.removeprefix("tls/").split(":")
-    cache = keys.caches_of("thermofleet/v1/f/arm/nobody")
+    cache = keys.caches_of("thermofleet/v2/f/arm/nobody")
     with open_client(guarded.endpoint, timeout_s=PATIENT_S, tls=Tls(folder, "arm_0")) as arm:
         for number in range(10):
             with socket.create_connection((host, int(port)), timeout=PATIENT_S) as line:
@@ -209,4 +211,4 @@ def test_the_documented_configuration_opens_a_line(guarded, folder):
     config = block.replace("ENDPOINT", guarded.endpoint).replace("DIR", str(folder)).replace("NAME", "monitor")
     with zenoh.open(zenoh.Config.from_json5(config)) as client:
         assert len(client.info.routers_zid()) == 1
-        assert list(client.get(keys.caches_of("thermofleet/v1/f/arm/nobody"), timeout=PATIENT_S)) == []
+        assert list(client.get(keys.caches_of("thermofleet/v2/f/arm/nobody"), timeout=PATIENT_S)) == []

@@ -1,4 +1,4 @@
-"""How environments are played through, and what they gave is compared."""
+"""Play environments through, and compare what they returned."""
 
 import hashlib
 from collections.abc import Callable
@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from fleet.difficulty import Difficulty, Risk
+from fleet.engine.state import DONE, WAITING, State, World
 from fleet.env.allocation_v0 import AllocationEnv, parallel_env
 from fleet.env.vector import BatchEnv
 from fleet.robot import JOINTS
-from scenarios.load import checked
-from scenarios.scenario import Scenario
+from scenarios.load import parse_scenario
+from scenarios.schema import Scenario
 
 Trace = list[tuple[Any, ...]]
 
@@ -29,7 +30,7 @@ def wild(env: AllocationEnv, rng: np.random.Generator) -> dict[str, int]:
 
 
 def go_on(env: AllocationEnv, rng: np.random.Generator, steps: int = 10_000) -> Trace:
-    """Everything the env gives until the end of the episode, or for so many steps."""
+    """Everything the env returns until the end of the episode, or for a number of steps."""
     trace: Trace = []
     while env.agents and len(trace) < steps:
         trace.append(env.step(wild(env, rng)))
@@ -44,6 +45,19 @@ def chosen(mask: np.ndarray, numbers: np.ndarray) -> np.ndarray:
     return np.where(numbers[..., 1] < 0.9, legal, np.floor(numbers[..., 0] * slots).astype(int))
 
 
+def slots_of(world: World, state: State) -> list[int]:
+    """Jobs in the slots of env 0 by the rule: released, waiting, nothing to wait for; oldest first; −1 for none."""
+    jobs, status = world.jobs, state.status[0]
+    ready = [
+        j
+        for j in np.flatnonzero(jobs.exists[0] & (status == WAITING)).tolist()
+        if jobs.release_s[0, j] <= state.tick[0] * world.dt_s
+        and all(status[before] == DONE for before in jobs.after[0, j].tolist() if before >= 0)
+    ]
+    ready.sort(key=lambda j: (state.queued_s[0, j], j))
+    return (ready + [-1] * world.slots)[: world.slots]
+
+
 def plain(trace: Any) -> Any:
     """The same in lists and numbers, so that two can be compared with ==."""
     if isinstance(trace, dict):
@@ -54,7 +68,7 @@ def plain(trace: Any) -> Any:
 
 
 def rows(given: Any, which: Any) -> dict[str, Any]:
-    """Some rows of what a batch gave at a step or a reset, by name; `which` are env numbers."""
+    """Some rows of what a batch returned at a step or a reset, by name; `which` are env numbers."""
     obs, info = given[0], given[-1]
     which = np.atleast_1d(np.asarray(which, dtype=int))
     out = {name: values[which] for name, values in obs.items()}
@@ -67,7 +81,7 @@ def rows(given: Any, which: Any) -> dict[str, Any]:
 
 
 def single(env: AllocationEnv, given: Any) -> dict[str, Any]:
-    """What a single env gave at a step or a reset, as the only row of a batch."""
+    """What a single env returned at a step or a reset, as the only row of a batch."""
     arms = env.possible_agents
     seen, infos = given[0], given[-1]
     out = {name: np.stack([seen[arm][name] for arm in arms])[None] for name in ("observation", "action_mask")}
@@ -81,7 +95,7 @@ def single(env: AllocationEnv, given: Any) -> dict[str, Any]:
 
 
 def same(one: dict[str, Any], other: dict[str, Any]) -> None:
-    """To the last bit."""
+    """Assert that two are equal to the last bit."""
     assert list(one) == list(other)
     for name, values in one.items():
         np.testing.assert_array_equal(values, other[name], err_msg=name)
@@ -93,26 +107,26 @@ PER_ARM = ("faults", "illegal", "peak_c", "above_warning_s")
 
 def digest(*given: Any) -> str:
     """A hash of everything in dictionaries, tuples and arrays, in the order it comes in."""
-    told = hashlib.sha256()
+    digest = hashlib.sha256()
 
-    def tell(value: Any) -> None:
+    def add(value: Any) -> None:
         if isinstance(value, dict):
             for key, each in value.items():
-                told.update(str(key).encode())
-                tell(each)
+                digest.update(str(key).encode())
+                add(each)
         elif isinstance(value, list | tuple):
             for each in value:
-                tell(each)
+                add(each)
         else:
             array = np.asarray(value)
-            told.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
+            digest.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
 
-    tell(given)
-    return told.hexdigest()
+    add(given)
+    return digest.hexdigest()
 
 
 class Learned:
-    """Knows how the risk depends on the temperatures: by a logistic of one or two pieces, or by a curve."""
+    """A risk that depends on the temperatures: logistic of some pieces, or by a curve."""
 
     version = "learned"
 
@@ -128,10 +142,10 @@ class Learned:
 
 @pytest.fixture(scope="session")
 def play() -> SimpleNamespace:
-    """How environments are played through, and what they gave is compared."""
+    """Play environments through, and compare what they returned."""
     return SimpleNamespace(
-        wild=wild, go_on=go_on, chosen=chosen, plain=plain, rows=rows, same=same, single=single, digest=digest,
-        Learned=Learned, PATH=__file__,
+        wild=wild, go_on=go_on, chosen=chosen, slots_of=slots_of, plain=plain, rows=rows, same=same, single=single,
+        digest=digest, Learned=Learned, PATH=__file__,
     )  # fmt: skip
 
 
@@ -157,14 +171,14 @@ def batch(small) -> Callable[..., BatchEnv]:
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of plans, which all tests of a run share; never the user's."""
+    """The plan cache of all tests of a run; never the user's."""
     return tmp_path_factory.getbasetemp() / "cache"
 
 
 @pytest.fixture(scope="session")
 def cell() -> Scenario:
     """A cell of three arms, planned in a second, hot enough to fault."""
-    return checked(CELL, Path("cell.toml"))
+    return parse_scenario(CELL, Path("cell.toml"))
 
 
 CELL: dict[str, Any] = {

@@ -1,10 +1,10 @@
-"""What a shift comes to: how it ends, and what is seen of it besides observations."""
+"""The single environment: how an episode ends, exchanges, text and watchers."""
 
 import numpy as np
 
-from fleet.bus.session import ZenohExchange
+from fleet.bus.exchange.zenoh import ZenohExchange
 
-# How it ends
+# End of an episode
 
 
 def test_it_ends_at_the_horizon_for_all_at_once(make) -> None:
@@ -23,7 +23,7 @@ def test_max_cycles_ends_it_earlier(make, play) -> None:
     assert len(play.go_on(env, np.random.default_rng(0))) == 7
 
 
-def test_it_ends_when_all_work_is_done(make, small, play) -> None:
+def test_it_ends_when_all_jobs_are_done(make, small, play) -> None:
     env = make({"arms": 2, "jobs": 1, "ticks": 400, "ambient_c": 20.0})
     env.reset(seed=2)
     trace = play.go_on(env, np.random.default_rng(2))
@@ -33,7 +33,7 @@ def test_it_ends_when_all_work_is_done(make, small, play) -> None:
     assert env.world.jobs.due_s[0, 0] < env.world.horizon_s
 
 
-def test_work_done_in_the_last_step_is_done_and_not_cut_short(make, play) -> None:
+def test_jobs_done_in_the_last_step_terminate_and_do_not_truncate(make, play) -> None:
     def last(max_cycles: int | None = None) -> tuple[int, bool, bool]:
         env = make({"arms": 2, "jobs": 1, "ticks": 400, "ambient_c": 20.0}, max_cycles=max_cycles)
         env.reset(seed=2)
@@ -45,7 +45,7 @@ def test_work_done_in_the_last_step_is_done_and_not_cut_short(make, play) -> Non
     assert last(steps - 1) == (steps - 1, False, True)
 
 
-def test_a_shift_without_jobs_is_stood_through(make, play) -> None:
+def test_a_shift_without_jobs_lasts_to_the_horizon(make, play) -> None:
     env = make({"jobs": 0, "ticks": 9})
     env.reset(seed=0)
     trace = play.go_on(env, np.random.default_rng(0))
@@ -53,11 +53,11 @@ def test_a_shift_without_jobs_is_stood_through(make, play) -> None:
     assert set(trace[-1][3].values()) == {True}
 
 
-# Who carries the words, and who watches
+# Exchanges and watchers
 
 
 def test_zenoh_and_memory_give_the_same_episode(make, play) -> None:
-    memory = make({"ticks": 12}, keep_events=True)  # both by the plain kernel: to the last bit
+    memory = make({"ticks": 12}, keep_events=True)
     over_zenoh = make(
         {"ticks": 12}, exchange=ZenohExchange(memory.possible_agents, fleet="same episode", timeout_s=20.0)
     )
@@ -69,7 +69,7 @@ def test_zenoh_and_memory_give_the_same_episode(make, play) -> None:
         over_zenoh.close()
 
 
-def test_the_fleet_can_be_seen_as_text(make) -> None:
+def test_the_fleet_is_rendered_as_text(make) -> None:
     env = make(render_mode="ansi")
     env.reset(seed=0)
     lines = (env.render() or "").splitlines()
@@ -77,13 +77,14 @@ def test_the_fleet_can_be_seen_as_text(make) -> None:
     assert make().render() is None
 
 
-def test_watcher_and_event_log_see_every_step(make, play) -> None:
+def test_watcher_and_event_log_record_every_step(make, play) -> None:
     steps = []
     env = make(watch=steps.append, keep_events=True)
     env.reset(seed=8)
     trace = play.go_on(env, np.random.default_rng(8))
     assert len(steps) == len(trace)
-    assert steps[-1].state is env.truth
+    np.testing.assert_array_equal(steps[-1].end_c, env.truth.temp_c)
+    assert [int(step.tick[0]) for step in steps] == list(range(len(steps)))
     kinds = [e.kind for e in env.events]
     assert kinds.count("finish") == trace[-1][4]["arm_0"]["jobs_done"]
     assert {"award", "release", "finish", "home"} <= set(kinds)

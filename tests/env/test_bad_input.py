@@ -9,7 +9,7 @@ import pytest
 from fleet.env import allocation_v0
 from fleet.errors import ScenarioError
 from scenarios import make_batch, make_env
-from scenarios.batch import Randomisation
+from scenarios.run.batch import Randomisation
 
 NO_SEEDS = (-1, 1.5, "a", True, [1, 2], np.array([1, 2]), np.array(3.0))
 
@@ -72,7 +72,7 @@ def test_before_a_reset_and_after_the_end_it_says_what_to_call(make, play) -> No
     env = make(render_mode="ansi")
     calls = (lambda: env.step({}), env.state, env.knowledge, env.render, lambda: env.truth, lambda: env.messages)
     for call in calls:
-        with pytest.raises(RuntimeError, match=r"No episode has begun: call reset\(\) before .+\."):
+        with pytest.raises(RuntimeError, match=r"No episode has started: call reset\(\) before .+\."):
             call()
     env.reset(seed=0)
     play.go_on(env, np.random.default_rng(0))
@@ -161,7 +161,7 @@ def test_a_batch_says_what_to_call_before_a_reset_and_after_an_end(batch) -> Non
     env = batch(2, {"ticks": 3}, seed=0, autoreset=False)
     nobody = np.zeros((2, 3), int)
     for call in (lambda: env.step(nobody), env.knowledge, lambda: env.state):
-        with pytest.raises(RuntimeError, match=r"Nothing was begun yet: call reset\(\) before "):
+        with pytest.raises(RuntimeError, match=r"No episode has started: call reset\(\) before "):
             call()
     with pytest.raises(RuntimeError, match=r"call reset\(\) for all envs before reset\(rows=…\)"):
         env.reset(rows=[0])
@@ -282,7 +282,7 @@ def test_a_cache_folder_may_be_a_text(cell, folder) -> None:
 def test_an_option_of_another_type_is_refused_with_the_type_it_takes(cell, folder) -> None:
     wrong: Any = 0.3
     none: Any = None
-    with pytest.raises(ScenarioError, match=r"channel must be a fleet\.bus\.channel\.Channel \(got 0\.3\)"):
+    with pytest.raises(ScenarioError, match=r"channel must be a fleet\.bus\.exchange\.channel\.Channel \(got 0\.3\)"):
         make_env(cell, difficulty="blind", cache=folder, channel=wrong)
     for make in (make_env, lambda scenario, **options: make_batch(scenario, 2, **options)):
         with pytest.raises(ScenarioError, match=r"cache must be the path of a folder \(got 0\.3\)"):
@@ -295,7 +295,7 @@ def test_an_option_of_another_type_is_refused_with_the_type_it_takes(cell, folde
     for make in (make_env, lambda scenario: make_batch(scenario, 2)):
         with pytest.raises(ScenarioError, match=r"scenario must be a library name, .+ \(got 0\.3\)"):
             make(wrong)
-    with pytest.raises(ScenarioError, match=r"randomise must be a scenarios\.batch\.Randomisation \(got 0\.3\)"):
+    with pytest.raises(ScenarioError, match=r"randomise must be a scenarios\.run\.batch\.Randomisation \(got 0\.3\)"):
         make_batch(cell, 2, difficulty="blind", cache=folder, randomise=wrong)
 
 

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from scipy.stats import chisquare
 
-from fleet.env.chance import random_legal
+from fleet.env.random_actions import random_legal
 
 masks = npst.arrays(
     np.int8, st.tuples(st.integers(1, 4), st.integers(1, 5), st.integers(1, 9)), elements=st.integers(0, 1)

@@ -18,8 +18,8 @@ from pettingzoo.test import (
     state_test,
 )
 
+from fleet.engine.reward import TERMS
 from fleet.env import allocation_v0
-from fleet.env.reward import TERMS
 
 HOT = {"arms": 3, "ambient_c": 38.0}
 
@@ -234,13 +234,13 @@ def test_nothing_that_a_batch_hands_out_is_its_own(batch, play) -> None:
                 if isinstance(part[name], np.ndarray):
                     part[name][...] = 1
                 part[f"{name} of mine"] = None
-        for values in (*handed[1:-1], *vars(env.state).values()):
+        for values in (*handed[1:-1], *env.state):
             values[...] = 1
         if step % 3 == 0:  # looking might heal what was spoiled
             for values in vars(env.knowledge()).values():
                 values[...] = 1
             play.same(vars(env.knowledge()), vars(untouched.knowledge()))
-        play.same(vars(env.state), vars(untouched.state))
+        play.same(env.state._asdict(), untouched.state._asdict())
         if step % 7 == 3:
             some = {"rows": [1, 4]}
             handed, kept = env.reset(**some), untouched.reset(**some)

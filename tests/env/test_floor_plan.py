@@ -8,9 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet.env.floor_plan import SMALLEST, floor_plan
-from fleet.env.lettering import width
-from fleet.env.scene import Cell, MountKind, plain_cell
+from fleet.env.render.floor_plan import SMALLEST, floor_plan, text_width
+from fleet.env.render.scene import Cell, MountKind, grid_cell
 from fleet.robot import JOINTS
 
 metres = st.floats(-50, 50)
@@ -42,19 +41,19 @@ def test_every_arm_and_station_is_on_the_floor(cell, size) -> None:
     floor = plan.floor
     assert inside(floor[0], floor[1], (0, 0, *size))
     assert inside(floor[2], floor[3], (0, 0, *size))
-    assert len(plan.rings) == len(cell.arms)
-    for a, (x, y) in enumerate(plan.rings):
+    assert len(plan.centres) == len(cell.arms)
+    for a, (x, y) in enumerate(plan.centres.tolist()):
         assert inside(x, y, floor, plan.reach)
         assert y + plan.reach + plan.rows * plan.text <= floor[3]
-        assert len(set(plan.motors(a))) == JOINTS
-        assert all(inside(u, v, floor, plan.motor) for u, v in plan.motors(a))
+        assert len(np.unique(plan.motors[a], axis=0)) == JOINTS
+        assert all(inside(u, v, floor, plan.motor) for u, v in plan.motors[a])
     assert all(inside(x, y, floor, plan.station) for x, y in (*plan.stations, *plan.bases))
 
 
 @given(st.lists(points, min_size=1, max_size=6))
 def test_it_is_a_map(stations) -> None:
     """One scale for both directions, x to the right and y up."""
-    cell = replace(plain_cell(("arm_0",), ()), stations=tuple((f"s{i}", p) for i, p in enumerate(stations)))
+    cell = replace(grid_cell(("arm_0",), ()), stations=tuple((f"s{i}", p) for i, p in enumerate(stations)))
     plan = floor_plan(cell)
     apart_px = np.array(plan.stations) - plan.bases[0]
     apart_m = np.array(stations)[:, :2] * [1.0, -1.0]
@@ -70,22 +69,22 @@ def test_it_is_a_map(stations) -> None:
 def test_arms_at_one_place_do_not_cover_each_other(arms, size) -> None:
     """Floor and ceiling above each other, seen from above."""
     names = tuple(f"arm_{i}" for i in range(arms))
-    cell = replace(plain_cell(names, ("bench", "rack")), mounts_m=((0.0, 0.0, 0.0),) * arms)
+    cell = replace(grid_cell(names, ("bench", "rack")), mounts_m=((0.0, 0.0, 0.0),) * arms)
     plan = floor_plan(cell, size)
-    rings = np.array(plan.rings)
+    rings = plan.centres
     gaps = np.linalg.norm(rings[:, None] - rings[None], axis=-1)[~np.eye(arms, dtype=bool)]
-    assert gaps.min() >= 2 * (plan.ring + plan.motor)
+    assert gaps.min() >= 1.82 * plan.reach  # motors; the arcs of the work done may touch
 
 
 @settings(max_examples=40)
 @given(cells(), sizes)
 def test_names_of_stations_cover_no_arm_and_no_other_name(cell, size) -> None:
     plan = floor_plan(cell, size)
-    boxes = [(*label.at, width(label.text, plan.text)) for label in plan.labels]
+    boxes = [(*at, text_width(text, plan.text)) for text, at, _ in plan.labels]
     for i, (x, y, long) in enumerate(boxes):
         assert inside(x, y, plan.floor)
         assert inside(x + long, y, plan.floor)
-        for u, v in plan.rings:
+        for u, v in plan.centres:
             nearest = min(max(u, x), x + long)
             assert np.hypot(nearest - u, y - v) >= plan.reach
         assert all(abs(y - v) >= plan.text or x + long < u or u + other < x for u, v, other in boxes[:i])

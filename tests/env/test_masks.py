@@ -1,4 +1,4 @@
-"""Masks are exact: what is legal does something, what is not does nothing, and no arm is left without an action."""
+"""Action masks: legal claims made alone are won, illegal actions only counted, waiting is always legal."""
 
 from itertools import product
 from typing import Any
@@ -42,7 +42,9 @@ def test_a_legal_claim_made_alone_is_won_and_an_illegal_one_is_only_counted(batc
             if k == 0 or not legal:
                 here["illegal"] = idle["illegal"]
                 play.same(here, idle)
-                assert all(np.array_equal(v[e], v[-1], equal_nan=True) for n, v in vars(now).items() if n != "illegal")
+                assert all(
+                    np.array_equal(v[e], v[-1], equal_nan=True) for n, v in now._asdict().items() if n != "illegal"
+                )
                 seen["illegal"] += not legal
                 continue
             assert now.last_award[e].tolist() == [int(b == a) for b in range(arms)]

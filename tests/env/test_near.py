@@ -6,7 +6,7 @@ from scipy.spatial import KDTree
 
 from fleet.errors import ScenarioError
 from scenarios import make_batch, make_env
-from scenarios.cell import cell_of, near_of
+from scenarios.cell_layout import cell_of, near_of
 from scenarios.load import load
 
 

@@ -1,27 +1,36 @@
-"""What arms know: one layout both ways, and every number where it belongs."""
+"""Observations: the layout, and every field against a reference written from `World` and `State`."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import expit
 
-from fleet.bus.channel import Channel
-from fleet.bus.exchange import UNHEARD, Heard
-from fleet.bus.memory import MemoryExchange
+from fleet.bus.exchange.channel import Channel
+from fleet.bus.exchange.memory import MemoryExchange
+from fleet.bus.exchange.protocol import UNHEARD, PeerView
 from fleet.difficulty import Difficulty, Risk
+from fleet.engine.batch import Engine, shifts_of
+from fleet.engine.peers import broadcast, write_peers
+from fleet.engine.profile_plant import sensor_noise
+from fleet.engine.reward import RewardWeights
+from fleet.engine.shift import Episode, ShiftRunner
+from fleet.engine.state import State, World, initial
+from fleet.engine.tables import tables_of
 from fleet.env.allocation_v0 import parallel_env
-from fleet.env.observation import FIELDS, LONG_S, Layout, Observation, observe, remaining_s, saturation, say
 from fleet.motion import Plan
-from fleet.sim.claims import board
-from fleet.sim.kernel import step
-from fleet.sim.state import initial
+from fleet.motor import gen3_motors
+from fleet.observation import FIELDS, LONG_S, Layout, Observation
+from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, IDLE, WORKING
 
+NO_NOISE = replace(gen3_motors(), sensor_noise_k=np.zeros(7))
 
-def heard(arms: int, slots: int, **told: np.ndarray) -> Heard:
-    """Every peer heard just now, idle, scores unknown."""
+
+def received(arms: int, slots: int, **changes: np.ndarray) -> PeerView:
+    """A message of every peer arrived just now: idle, difficulties unknown."""
     base = {
         "mode": np.zeros((arms, arms), int),
         "headroom_k": np.full((arms, arms), 30.0),
@@ -29,14 +38,32 @@ def heard(arms: int, slots: int, **told: np.ndarray) -> Heard:
         "p_saturation": np.full((arms, arms, slots), np.nan),
         "age_s": np.zeros((arms, arms)),
     }
-    return Heard(**(base | told))
+    return PeerView(**(base | changes))
 
 
-def look(world, state, told: Heard, measured_c=None) -> Observation:
-    """The observation of all arms of env 0, [1, arm, ...]."""
-    now = board(world, state)
-    measured = state.temp_c[..., :7] if measured_c is None else measured_c
-    return observe(world, state, now.on_offer, now.mask, measured, told)
+def peers_of(layout: Layout, view: PeerView) -> Observation:
+    """What the vectors say of peers, leading axis [arm]."""
+    vectors = np.zeros((layout.arms, layout.size), np.float32)
+    write_peers(layout, view, vectors)
+    return layout.read(vectors, np.ones((layout.arms, layout.slots + 1), np.int8))
+
+
+def engine_at(world: World, state: State) -> tuple[Engine, np.ndarray]:
+    """An engine in this state, and the vectors of its arms, [env, arm, size]."""
+    tables, drawn = tables_of(world)
+    layout, rows = Layout(len(world.arms), world.slots), np.arange(world.envs)
+    engine = Engine(tables, world.envs, layout, RewardWeights(), jobs=state.status.shape[1], compiled=False)
+    engine.reset(rows, shifts_of(drawn, [0] * world.envs))
+    engine.load(state)
+    vectors = np.empty((world.envs, layout.arms, layout.size), np.float32)
+    engine.observe(rows, vectors)
+    return engine, vectors
+
+
+def observe(world: World, state: State) -> Observation:
+    """The observations in a state, leading axes [env, arm]."""
+    engine, vectors = engine_at(world, state)
+    return engine.layout.read(vectors, engine.mask)
 
 
 def test_fields_and_attributes_are_the_same_in_the_same_order() -> None:
@@ -77,62 +104,172 @@ def test_a_vector_of_another_fleet_is_refused() -> None:
         layout.read(np.zeros(5, np.float32), np.ones(4, np.int8))
 
 
-def test_peers_are_the_others_in_order(small) -> None:
-    world, _ = small.shop([[small.job("a")]], arms=4, slots=2)
+# The reference
+
+
+def reference(world: World, state: State, slots: list[int], key: int) -> dict[str, np.ndarray]:
+    """The fields of all arms of env 0, [arm, ...], computed one by one; of peers, those of this moment."""
+    arms, now_s, jobs, offers = len(world.arms), state.tick[0] * world.dt_s, world.jobs, world.offers
+    measured_c = state.temp_c[0, :, :7] + world.motors.sensor_noise_k * sensor_noise(key, state.tick[0], arms, 7)
+    own: list[dict[str, object]] = []
+    for a in range(arms):
+        mode, current = state.mode[0, a], state.job[0, a]
+
+        def lasts_s(j: int, cycles: int, a: int = a) -> float:
+            plan = offers.plan[0, a, j]
+            return 0.0 if plan < 0 else float(world.plans.times_s[plan] @ [1, cycles, 1])
+
+        known = {
+            "clock": now_s / world.horizon_s, "idle": mode == IDLE, "working": mode == WORKING,
+            "faulted": mode == FAULTED, "last_award": state.last_award[0, a], "temp_c": measured_c[a],
+            "busy_s": lasts_s(current, state.todo[0, a]) - state.progress_s[0, a] if current >= 0 else 0.0,
+            "headroom_k": world.limits.warning_c - measured_c[a].max(),
+        }  # fmt: skip
+        rows = []
+        for j in slots:
+            if j < 0:
+                rows.append([0, 0, 0, 0, 0.5, 0, 0, 0, 0, 0, 0])
+                continue
+            left_s = lasts_s(j, jobs.repetitions[0, j] - state.cycles[0, j])
+            d, p, r = offers.difficulty[0, a, j], offers.p_saturation[0, a, j], offers.risk[0, a, j]
+            if r >= 0:
+                assert offers.risks is not None
+                score = (offers.risks.offset[r] + offers.risks.weight[r] @ measured_c[a]).max()
+                curve = np.zeros((0, 2)) if offers.risks.curve is None else offers.risks.curve[r]
+                curve = curve[np.isfinite(curve[:, 0])]
+                p = np.interp(score, *curve.T) if len(curve) else expit(score)
+            slack_s, age_s = jobs.due_s[0, j] - now_s - left_s, now_s - state.queued_s[0, j]
+            rows.append([
+                1, offers.plan[0, a, j] >= 0, not np.isnan(d), np.nan_to_num(d), 0.5 if np.isnan(p) else p, left_s,
+                slack_s, age_s, jobs.payload_kg[0, j], jobs.value[0, j], state.returns[0, j],
+            ])  # fmt: skip
+        names = ("offered", "feasible", "known", "difficulty", "p_saturation", "duration_s", "slack_s", "age_s")
+        columns = np.array(rows, dtype=float).T
+        own.append(known | dict(zip((*names, "payload_kg", "value", "returns"), columns, strict=True)))
+    for a, mine in enumerate(own):
+        others = [own[b] for b in range(arms) if b != a]
+        mine |= {
+            f"peer_{n}": [o[n] for o in others] for n in ("working", "faulted", "headroom_k", "known", "difficulty")
+        }
+        mine |= {"peer_heard": [1.0] * len(others), "peer_age_s": [0.0] * len(others)}
+    return {name: np.array([each[name] for each in own], dtype=float) for name in own[0]}
+
+
+def compare_with_reference(play, episode: Episode, seed: int) -> State:
+    """Play a shift and compare every vector; returns the last state."""
+    world, rng = episode.world, np.random.default_rng(seed)
+    runner = ShiftRunner(episode, RewardWeights())
+    layout = Layout(len(world.arms), world.slots)
+    while True:
+        slots = play.slots_of(world, runner.state)
+        assert runner.slot_job.tolist() == slots
+        found = layout.read(runner.vectors, runner.mask)
+        expected = reference(world, runner.state, slots, episode.noise_key)
+        assert set(expected) == {field.name for field in FIELDS}
+        for name, values in expected.items():
+            seen = getattr(found, name)
+            np.testing.assert_allclose(seen, values.reshape(seen.shape), rtol=1e-6, atol=2e-5, err_msg=name)
+        if runner.tick == world.ticks:
+            return runner.state.copy()
+        runner.step(play.chosen(runner.mask, rng.random((len(world.arms), 2))))
+
+
+@settings(max_examples=25)
+@given(
+    seed=st.integers(0, 2**31), arms=st.integers(1, 4), jobs=st.integers(0, 9), slots=st.integers(1, 5),
+    ambient_c=st.sampled_from([20.0, 45.0, 58.0]), power_off=st.booleans(),
+)  # fmt: skip
+def test_vectors_are_those_of_the_reference(small, play, seed, arms, jobs, slots, ambient_c, power_off) -> None:
+    limits = ThermalLimits(warning_c=56.0, error_c=60.0, restart_c=54.0, clear_s=25.0, power_off_on_fault=power_off)
+    make = small.Shifts(arms=arms, jobs=jobs, slots=slots, ticks=60, ambient_c=ambient_c, limits=limits)
+    compare_with_reference(play, make(np.random.SeedSequence(seed)), seed)
+
+
+def test_shifts_of_that_comparison_fault_recover_and_return_jobs(small, play) -> None:
+    limits = ThermalLimits(warning_c=56.0, error_c=60.0, restart_c=54.0, clear_s=25.0)
+    make = small.Shifts(arms=3, jobs=9, ticks=80, ambient_c=45.0, limits=limits)
+    last = [compare_with_reference(play, make(np.random.SeedSequence(seed)), seed) for seed in range(4)]
+    assert sum(int(state.faults.sum()) for state in last) > 0
+    assert sum(int(state.returns.sum()) for state in last) > 0
+    assert sum(int(((state.faults > 0) & (state.mode != FAULTED)).sum()) for state in last) > 0
+
+
+@pytest.mark.parametrize(("pieces", "curve"), [(1, False), (3, False), (2, True)])
+def test_risks_are_those_of_the_reference(small, play, pieces, curve) -> None:
+    content = [small.work(place, payload) for place in ("a", "b") for payload in (small.LIGHT, small.HOT)]
+    arms = [
+        small.arm(0, content, model=play.Learned(pieces, curve=curve)),
+        small.arm(1, content[:2], model=play.Learned(1, curve=False)),
+        small.arm(2, content),
+    ]
+    jobs = [small.job(f"j{i}", content[i % 4], release_s=50.0 * (i % 3)) for i in range(6)]
+    world, plant = small.shop([jobs], arms=arms, ticks=60)
+    compare_with_reference(play, Episode(world, plant, ("t",) * 3, np.random.SeedSequence(1)), 3)
+
+
+# Single fields
+
+
+def test_peers_are_the_others_in_order() -> None:
     receiver, sender = np.indices((4, 4))
-    told = heard(
+    view = received(
         4, 2,
         headroom_k=10.0 * receiver + sender,
         age_s=100.0 * receiver + sender,
         difficulty=np.stack([receiver + sender / 10, np.full((4, 4), np.nan)], axis=-1),
         mode=np.where(sender == 3, FAULTED, np.where(sender == 1, WORKING, IDLE)),
     )  # fmt: skip
-    seen = look(world, initial(world), told)
+    seen = peers_of(Layout(4, 2), view)
     for me in range(4):
         others = [a for a in range(4) if a != me]
-        assert seen.peer_headroom_k[0, me].tolist() == [10.0 * me + a for a in others]
-        assert seen.peer_age_s[0, me].tolist() == [100.0 * me + a for a in others]
-        assert seen.peer_difficulty[0, me, :, 0].tolist() == [me + a / 10 for a in others]
-        assert seen.peer_known[0, me].tolist() == [[True, False]] * 3
-        assert (seen.peer_difficulty[0, me, :, 1] == 0).all()
-        assert seen.peer_working[0, me].tolist() == [a == 1 for a in others]
-        assert seen.peer_faulted[0, me].tolist() == [a == 3 for a in others]
-        assert seen.peer_heard[0, me].all()
+        assert seen.peer_headroom_k[me].tolist() == [10.0 * me + a for a in others]
+        assert seen.peer_age_s[me].tolist() == [100.0 * me + a for a in others]
+        assert seen.peer_difficulty[me, :, 0].tolist() == pytest.approx([me + a / 10 for a in others])
+        assert seen.peer_known[me].tolist() == [[1, 0]] * 3
+        assert (seen.peer_difficulty[me, :, 1] == 0).all()
+        assert seen.peer_working[me].tolist() == [a == 1 for a in others]
+        assert seen.peer_faulted[me].tolist() == [a == 3 for a in others]
+        assert seen.peer_heard[me].all()
 
 
-def test_a_peer_never_heard_says_nothing(small) -> None:
-    world, _ = small.shop([[small.job("a")]], arms=3, slots=2)
+def test_peers_are_the_near_ones_in_the_order_of_the_layout() -> None:
+    near = ((2, 1), (3, 0), (3, 1), (0, 2))
+    _, sender = np.indices((4, 4))
+    seen = peers_of(Layout(4, 2, near), received(4, 2, headroom_k=1.0 * sender))
+    assert seen.peer_headroom_k.tolist() == [list(map(float, peers)) for peers in near]
+
+
+def test_a_peer_whose_messages_never_arrived_is_unknown() -> None:
     silent = np.array([[0, 1, 0]] * 3, bool)
-    told = heard(
+    view = received(
         3, 2,
         mode=np.where(silent, UNHEARD, WORKING),
         headroom_k=np.where(silent, np.nan, 5.0),
         age_s=np.where(silent, np.inf, 7.0),
     )  # fmt: skip
-    seen = look(world, initial(world), told)
-    assert seen.peer_heard[0, 0].tolist() == [False, True]
-    assert seen.peer_age_s[0, 0].tolist() == [LONG_S, 7.0]
-    assert seen.peer_headroom_k[0, 0].tolist() == [0.0, 5.0]
-    assert seen.peer_working[0, 0].tolist() == [False, True]
-    assert seen.peer_faulted[0, 0].tolist() == [False, False]
-    assert np.isfinite(Layout(3, 2).pack(seen)).all()
+    seen = peers_of(Layout(3, 2), view)
+    assert seen.peer_heard[0].tolist() == [0, 1]
+    assert seen.peer_age_s[0].tolist() == [LONG_S, 7.0]
+    assert seen.peer_headroom_k[0].tolist() == [0.0, 5.0]
+    assert seen.peer_working[0].tolist() == [0, 1]
+    assert seen.peer_faulted[0].tolist() == [0, 0]
+    assert all(np.isfinite(values).all() for values in vars(seen).values())
 
 
-def test_slots_hold_this_arm_s_own_view_of_the_jobs(small) -> None:
+def test_slots_hold_each_arm_s_own_view_of_the_jobs(small) -> None:
     bench, rack = small.work("bench", 4.0), small.work("rack", 1.0)
     arms = [small.arm(0, [bench, rack]), small.arm(1, [bench], times=small.Times(1.0, 20.0, 4.0))]
     jobs = [
         small.job("a", bench, repetitions=5, due_s=100.0, value=3.0),
         small.job("b", rack, repetitions=2, release_s=15.0, due_s=50.0, value=2.0),
     ]
-    world, plant = small.shop([jobs], arms=arms, slots=3)
+    world, _ = small.shop([jobs], arms=arms, slots=3)
     state = initial(world)
-    for _ in range(2):
-        state = step(world, state, np.zeros((1, 2), int), np.zeros((1, 2, 3)), plant).state
-    seen = look(world, state, heard(2, 3))
+    state.tick[:] = 2
+    seen = observe(world, state)
     assert seen.offered[0].tolist() == [[1, 1, 0]] * 2
-    assert seen.feasible[0].tolist() == [[True, True, False], [True, False, False]]
-    assert seen.known[0].tolist() == [[True, True, False], [True, False, False]]
+    assert seen.feasible[0].tolist() == [[1, 1, 0], [1, 0, 0]]
+    assert seen.known[0].tolist() == [[1, 1, 0], [1, 0, 0]]
     # 3 + 5 · 10 + 2, 3 + 2 · 10 + 2, and 1 + 5 · 20 + 4 s; now is 20 s.
     assert seen.duration_s[0].tolist() == [[55.0, 25.0, 0.0], [105.0, 0.0, 0.0]]
     assert seen.slack_s[0].tolist() == [[25.0, 5.0, 0.0], [-25.0, 30.0, 0.0]]
@@ -143,40 +280,49 @@ def test_slots_hold_this_arm_s_own_view_of_the_jobs(small) -> None:
     assert expected is not None
     assert seen.difficulty[0, 1].tolist() == pytest.approx([expected.total, 0.0, 0.0])
     assert seen.p_saturation[0, 1].tolist() == pytest.approx([expected.p_saturation, 0.5, 0.5])
-    assert seen.clock[0].tolist() == [20.0 / world.horizon_s] * 2
+    assert seen.clock[0].tolist() == pytest.approx([20.0 / world.horizon_s] * 2)
     assert seen.action_mask[0].tolist() == [[1, 1, 1, 0], [1, 1, 0, 0]]
 
 
 def test_busy_time_counts_down_to_home(small) -> None:
     world, plant = small.shop([[small.job("a")]], arms=2)
-    state, left = initial(world), []
-    for tick in range(5):
-        state = step(world, state, np.array([[int(tick == 0), 0]]), np.zeros((1, 2, 4)), plant).state
-        seen = look(world, state, heard(2, 4))
-        left.append(float(seen.busy_s[0, 0]))
-        assert seen.busy_s[0, 1] == 0.0
-        assert (seen.working[0, 0], seen.idle[0, 1]) == (left[-1] > 0, True)
-    assert left == [25.0, 15.0, 5.0, 0.0, 0.0]  # 3 + 3 · 10 + 2 s
+    env, left = parallel_env(lambda seed: Episode(world, plant, ("t",) * 2, seed)), []
+    env.reset(seed=0)
+    for tick in range(4):
+        terminated = env.step({"arm_0": int(tick == 0)})[2]["arm_0"]
+        seen = env.knowledge()
+        left.append(float(seen["arm_0"].busy_s))
+        assert seen["arm_1"].busy_s == 0.0
+        assert (seen["arm_0"].working, seen["arm_1"].idle) == (left[-1] > 0, True)
+    assert left == [25.0, 15.0, 5.0, 0.0]  # 3 + 3 · 10 + 2 s
+    assert terminated
 
 
 def test_what_is_left_of_a_returned_job_takes_less_time(small) -> None:
-    world, _ = small.shop([[small.job("a", repetitions=10)]], arms=1)
+    world, _ = small.shop([[small.job("a", repetitions=10)]], arms=1, slots=2)
     state = initial(world)
     state.cycles[0, 0] = 7
-    assert remaining_s(world, state, np.array([[0, -1]])).tolist() == [[[3.0 + 3 * 10.0 + 2.0, 0.0]]]
+    assert observe(world, state).duration_s.tolist() == [[[3.0 + 3 * 10.0 + 2.0, 0.0]]]
 
 
-def test_an_arm_says_what_it_measures_and_thinks(small) -> None:
-    world, _ = small.shop([[small.job("a"), small.job("b", release_s=99.0)]], arms=2, slots=3)
+def test_an_arm_broadcasts_what_it_measures_and_its_scores(small) -> None:
+    content = small.work()
+    arms = [small.arm(i, [content], motors=NO_NOISE) for i in range(2)]
+    world, _ = small.shop([[small.job("a"), small.job("b", release_s=99.0)]], arms=arms, slots=3)
     state = initial(world)
     measured = np.arange(14.0).reshape(1, 2, 7) + 40.0
-    words = say(world, state, board(world, state).on_offer, measured, ("x", "y"))
-    assert words.jobs == ("a", "", "")
-    assert words.headroom_k.tolist() == [60.0 - 46.0, 60.0 - 53.0]
-    assert words.temp_c.tolist() == measured[0].tolist()
-    np.testing.assert_array_equal(words.difficulty[:, 0], world.offers.difficulty[0, :, 0])
-    assert np.isnan(words.difficulty[:, 1:]).all()
-    assert np.isnan(words.p_saturation[:, 1:]).all()
+    state.temp_c[..., :7] = measured
+    engine, vectors = engine_at(world, state)
+    message = broadcast(engine, vectors[0], world.jobs.names[0], ("x", "y"))
+    assert message.time_s == 0.0
+    assert message.twin == ("x", "y")
+    assert message.jobs == ("a", "", "")
+    assert message.headroom_k.tolist() == [60.0 - 46.0, 60.0 - 53.0]
+    assert message.temp_c.tolist() == measured[0].tolist()
+    np.testing.assert_array_equal(message.difficulty[:, 0], world.offers.difficulty[0, :, 0])
+    assert message.p_saturation[:, 0] == pytest.approx(world.offers.p_saturation[0, :, 0])
+    assert np.isnan(message.difficulty[:, 1:]).all()
+    assert np.isnan(message.p_saturation[:, 1:]).all()
 
 
 class SecondJointDecides:
@@ -191,36 +337,38 @@ class SecondJointDecides:
 
 def test_the_probability_is_that_of_the_temperatures_now(small) -> None:
     bench, rack = small.work("bench"), small.work("rack")
-    arms = [small.arm(0, [bench]), small.arm(1, [bench, rack], model=SecondJointDecides())]
+    arms = [
+        small.arm(0, [bench], motors=NO_NOISE),
+        small.arm(1, [bench, rack], model=SecondJointDecides(), motors=NO_NOISE),
+    ]
     jobs = [
         [small.job("a", bench, repetitions=4), small.job("b", rack, repetitions=8)],
         [small.job("a", bench, repetitions=20)],
     ]
     world, _ = small.shop(jobs, arms=arms, slots=3)
-    state, on_offer = initial(world), np.array([[1, 0, -1], [0, -1, -1]])
-    measured = np.full((2, 2, 7), 25.0)
-    measured[0, 1, 1], measured[1, 1, 1] = 46.0, 35.0
-    p = saturation(world.offers, on_offer, measured)
-    # Joint 2 at 46 and 35 °C; one half at 46 (8 repetitions), 48 (4) and 40 (20).
-    assert p[0, 1] == pytest.approx([0.5, 1 / (1 + np.exp(0.4)), np.nan], nan_ok=True)
-    assert p[1, 1] == pytest.approx([1 / (1 + np.exp(1.0)), np.nan, np.nan], nan_ok=True)
-    # The other arm's model takes the start for granted, and cannot do the second job.
+    state = initial(world)
+    state.temp_c[..., :7] = 25.0
+    state.temp_c[0, 1, 1], state.temp_c[1, 1, 1] = 46.0, 35.0
+    p = observe(world, state).p_saturation
+    # Joint 2 at 46 and 35 °C; one half at 48 (4 repetitions), 46 (8) and 40 (20); one half too where not known.
+    assert p[0, 1] == pytest.approx([1 / (1 + np.exp(0.4)), 0.5, 0.5])
+    assert p[1, 1] == pytest.approx([1 / (1 + np.exp(1.0)), 0.5, 0.5])
+    # The other arm's model ignores the start, and it cannot do the second job.
     fixed = arms[0].model.score(arms[0].plans[bench][0], 4)
-    assert p[0, 0] == pytest.approx([np.nan, fixed.p_saturation, np.nan], nan_ok=True)
-    assert (saturation(world.offers, on_offer, measured + 1.0)[:, 1] >= p[:, 1])[~np.isnan(p[:, 1])].all()
-
-    seen = observe(world, state, on_offer, np.ones((2, 2, 4), bool), measured, vars(both_heard(2, 3)))
-    np.testing.assert_array_equal(seen.p_saturation, np.where(np.isnan(p), 0.5, p))
-    words = say(world, state, on_offer, measured, ("x", "y"))
-    np.testing.assert_array_equal(words.p_saturation, p[0])
-
-
-def both_heard(arms: int, slots: int) -> Heard:
-    """What `heard` makes, for two envs."""
-    return Heard(**{name: np.stack([values] * 2) for name, values in vars(heard(arms, slots)).items()})
+    assert fixed is not None
+    assert p[0, 0] == pytest.approx([fixed.p_saturation, 0.5, 0.5])
+    engine, vectors = engine_at(world, state)
+    message = broadcast(engine, vectors[0], world.jobs.names[0], ("x", "y"))
+    assert message.p_saturation[1] == pytest.approx([1 / (1 + np.exp(0.4)), 0.5, np.nan], nan_ok=True)
+    assert message.p_saturation[0] == pytest.approx([fixed.p_saturation, np.nan, np.nan], nan_ok=True)
+    state.temp_c[..., :7] += 1.0
+    assert (observe(world, state).p_saturation[0, 1, :2] > p[0, 1, :2]).all()
 
 
-def test_what_peers_told_is_what_they_know_themselves(small) -> None:
+# Peers and sensors in an episode
+
+
+def test_peers_observe_what_the_arm_observes_of_itself(small) -> None:
     env = parallel_env(small.Shifts(arms=3, jobs=10))
     env.reset(seed=3)
     rng = np.random.default_rng(0)
@@ -239,7 +387,7 @@ def test_what_peers_told_is_what_they_know_themselves(small) -> None:
         env.step({a: int(rng.choice(np.flatnonzero(o.action_mask))) for a, o in seen.items()})
 
 
-def test_a_word_that_takes_its_time_is_as_old_as_it_took(small) -> None:
+def test_a_delayed_message_is_as_old_as_its_delay(small) -> None:
     exchange = MemoryExchange(("arm_0", "arm_1"), Channel(delay_s=20.0))
     env = parallel_env(small.Shifts(arms=2), exchange=exchange)
     env.reset(seed=1)
@@ -252,7 +400,7 @@ def test_a_word_that_takes_its_time_is_as_old_as_it_took(small) -> None:
     env.close()
 
 
-def test_temperatures_are_read_with_the_noise_of_the_sensors(small) -> None:
+def test_temperatures_are_measured_with_the_noise_of_the_sensors(small) -> None:
     env = parallel_env(small.Shifts(arms=2, jobs=0, ticks=400))
     env.reset(seed=1)
     errors = []

@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from fleet.env.observation import FIELDS, Layout
-from fleet.env.reward import TERMS, RewardWeights
+from fleet.engine.reward import TERMS, RewardWeights
+from fleet.observation import FIELDS, Layout
 from scenarios import make_batch, make_env
-from scenarios.cli import app
-from scenarios.contract_page import filled
+from scenarios.cli.doc_tables import filled
+from scenarios.cli.main import app
 from scenarios.load import override
 
 PAGE = Path(__file__).parents[2] / "docs" / "env.md"
@@ -74,7 +74,7 @@ def test_its_example_runs(monkeypatch, cell, folder) -> None:
 
     monkeypatch.setattr("scenarios.make_env", env, raising=False)
     monkeypatch.setattr("scenarios.make_batch", batch, raising=False)
-    monkeypatch.setattr("scenarios.registration.make_env", env)
+    monkeypatch.setattr("scenarios.prepare.env_registration.make_env", env)
     told: dict[str, Any] = {}
     exec(TEXT.split("```python\n")[1].split("```")[0], told)
     assert told["env"].agents == []

@@ -1,4 +1,4 @@
-"""What holds in every shift, of whatever fleet: nothing is lost, done twice, or in two places."""
+"""Invariants of random shifts of random fleets: no job is lost, done twice, or in two places."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -7,11 +7,10 @@ import numpy as np
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
 
+from fleet.engine.state import DONE, RUNNING, WAITING, State
 from fleet.env.allocation_v0 import AllocationEnv, Episode, parallel_env
 from fleet.job import Job
 from fleet.robot import ThermalLimits
-from fleet.sim.claims import slots
-from fleet.sim.state import DONE, RUNNING, WAITING, State
 from fleet.telemetry import FAULTED, IDLE, WORKING
 
 TICKS, DT_S = 45, 10.0
@@ -20,7 +19,7 @@ PLACES = ("bench", "press", "rack")
 
 @dataclass(frozen=True)
 class Draft:
-    """A scenario as it is drawn."""
+    """A scenario as drawn."""
 
     works: tuple[tuple[str, str | None, float], ...]
     """From, to (None for a hold), and kg."""
@@ -64,7 +63,7 @@ def drafts(draw: Any) -> Draft:
     )
 
 
-def laid_out(small, draft: Draft, **options: Any) -> AllocationEnv:
+def env_of(small, draft: Draft, **options: Any) -> AllocationEnv:
     """The environment of a draft."""
     works = [small.work(place, kg, to=to) for place, to, kg in draft.works]
     arms = [
@@ -96,18 +95,18 @@ def laid_out(small, draft: Draft, **options: Any) -> AllocationEnv:
 
 @settings(max_examples=100)
 @given(draft=drafts())
-def test_every_shift_keeps_its_books(small, play, draft) -> None:
-    env, rng = laid_out(small, draft), np.random.default_rng(draft.seed)
+def test_invariants_of_a_shift(small, play, draft) -> None:
+    env, rng = env_of(small, draft), np.random.default_rng(draft.seed)
     seen, infos = env.reset(seed=draft.seed)
     before, value = env.truth, 0.0
-    looks_right(env, seen)
+    check_observations(env, seen, play)
     while env.agents:
-        claims_only_what_hangs_out(env)
+        check_offers(env)
         seen, rewards, terminated, truncated, infos = env.step(play.wild(env, rng))
         now = env.truth
-        is_sound(env, now)
-        goes_forward(env, before, now)
-        looks_right(env, seen)
+        check_state(env, now)
+        check_progress(env, before, now)
+        check_observations(env, seen, play)
         assert np.isfinite(list(rewards.values())).all()
         value += infos["arm_0"]["reward_finished_value"]
         before = now
@@ -122,8 +121,8 @@ def test_every_shift_keeps_its_books(small, play, draft) -> None:
     )
 
 
-def is_sound(env: AllocationEnv, now: State) -> None:
-    """One moment by itself."""
+def check_state(env: AllocationEnv, now: State) -> None:
+    """Invariants of one moment."""
     world, jobs, exists = env.world, env.world.jobs, env.world.jobs.exists[0]
     mode, job, status = now.mode[0], now.job[0], now.status[0]
     elapsed_s = now.tick[0] * world.dt_s
@@ -131,12 +130,12 @@ def is_sound(env: AllocationEnv, now: State) -> None:
     assert (now.temp_c > world.ambient_c.min() - 1e-6).all()
     # Never two arms on one job or at one station, and none on a job that waits.
     working = np.flatnonzero(mode == WORKING)
-    in_hand = job[working]
-    assert len(set(in_hand.tolist())) == len(in_hand)
+    current = job[working]
+    assert len(set(current.tolist())) == len(current)
     assert (job[mode != WORKING] == -1).all()
-    assert (status[in_hand] != WAITING).all()
-    assert set(np.flatnonzero(status == RUNNING).tolist()) <= set(in_hand.tolist())
-    places = [s for j in in_hand.tolist() for s in set(jobs.stations[0, j].tolist()) if s >= 0]
+    assert (status[current] != WAITING).all()
+    assert set(np.flatnonzero(status == RUNNING).tolist()) <= set(current.tolist())
+    places = [s for j in current.tolist() for s in set(jobs.stations[0, j].tolist()) if s >= 0]
     assert len(set(places)) == len(places)
     # Cycles and completions.
     cycles, asked = now.cycles[0][exists], jobs.repetitions[0][exists]
@@ -164,31 +163,31 @@ def is_sound(env: AllocationEnv, now: State) -> None:
     assert (now.faults[0][mode == FAULTED] > 0).all()
 
 
-def goes_forward(env: AllocationEnv, before: State, now: State) -> None:
-    """From one moment to the next nothing is taken back."""
+def check_progress(env: AllocationEnv, before: State, now: State) -> None:
+    """Invariants from one moment to the next."""
     assert now.tick[0] == before.tick[0] + 1
     for name in ("faults", "illegal", "peak_c", "above_warning_s", "busy_s", "lost_s", "energy_j", "cycles", "returns"):
         assert (getattr(now, name) >= getattr(before, name) - 1e-9).all(), name
     was = before.status[0] == DONE
     assert (now.status[0][was] == DONE).all()
     np.testing.assert_array_equal(now.finished_s[0][was], before.finished_s[0][was])
-    # Two arms do not work on one job in one step: who has it lets go only by the end or by a fault.
+    # A job changes arms only through its end or a fault.
     for a in np.flatnonzero(before.mode[0] == WORKING).tolist():
         j = before.job[0, a]
         others = np.delete(now.job[0], a)
         assert j not in others.tolist() or now.faults[0, a] > before.faults[0, a]
 
 
-def looks_right(env: AllocationEnv, seen: dict[str, Any]) -> None:
-    """The masks follow from the rules, and the observation says the same."""
+def check_observations(env: AllocationEnv, seen: dict[str, Any], play: Any) -> None:
+    """Masks and offers follow from the rules, and the observation agrees."""
     world, now, known = env.world, env.truth, env.knowledge()
-    on_offer = slots(world, now)[0]
+    slot_job = play.slots_of(world, now)
     taken = {s for j in now.job[0][now.mode[0] == WORKING].tolist() for s in world.jobs.stations[0, j].tolist()} - {-1}
     for a, arm in enumerate(env.possible_agents):
         own, mask = known[arm], seen[arm]["action_mask"]
         assert env.observation_space(arm).contains(seen[arm])
         assert mask[0] == 1
-        for k, j in enumerate(on_offer.tolist()):
+        for k, j in enumerate(slot_job):
             able = j >= 0 and world.offers.plan[0, a, j] >= 0
             free = j >= 0 and not taken & set(world.jobs.stations[0, j].tolist())
             assert mask[k + 1] == (able and free and now.mode[0, a] == IDLE)
@@ -203,21 +202,21 @@ def looks_right(env: AllocationEnv, seen: dict[str, Any]) -> None:
         assert (own.busy_s > 0) == (now.mode[0, a] == WORKING)
 
 
-def claims_only_what_hangs_out(env: AllocationEnv) -> None:
-    """What is offered is released, waits, and has all it waits for done."""
+def check_offers(env: AllocationEnv) -> None:
+    """Exactly as many slots are filled as jobs are released, wait, and have the jobs before them done."""
     world, now = env.world, env.truth
-    for j in slots(world, now)[0].tolist():
-        if j >= 0:
-            assert now.status[0, j] == WAITING
-            assert world.jobs.release_s[0, j] <= now.tick[0] * world.dt_s
-            assert (now.status[0][world.jobs.after[0, j][world.jobs.after[0, j] >= 0]] == DONE).all()
+    after, done = world.jobs.after[0], now.status[0] == DONE
+    ready = world.jobs.exists[0] & (now.status[0] == WAITING)
+    ready &= (world.jobs.release_s[0] <= now.tick[0] * world.dt_s) & (done[after] | (after < 0)).all(axis=1)
+    for seen in env.knowledge().values():
+        assert seen.offered.sum() == min(ready.sum(), world.slots)
 
 
-def test_a_shift_of_many_jobs_that_wait_for_two_is_as_large_as_it_is(small) -> None:
-    """Room for what is waited for is made without room for more jobs: pictures and tables go by the world's."""
+def test_the_state_has_as_many_jobs_as_the_world(small) -> None:
+    """Room for predecessors is made without room for more jobs: pictures and tables use the world's number."""
     many = tuple((0, 1, 0.0, frozenset(range(j - 2, j)) if j > 2 else frozenset[int]()) for j in range(12))
     draft = Draft((("bench", None, 0.0),), (frozenset({0}),), many, 3, 75.0, 25.0, False, False, 0)
-    env = laid_out(small, draft, render_mode="ansi")
+    env = env_of(small, draft, render_mode="ansi")
     env.reset(seed=0)
     assert env.truth.status.shape == env.world.jobs.exists.shape == (1, 12)
     env.step({"arm_0": 1})

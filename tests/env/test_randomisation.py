@@ -1,4 +1,4 @@
-"""Scenarios in a batch: the shifts of `make_env`, and how far they are let vary."""
+"""Scenarios in a batch: the shifts of `make_env`, and their randomisation."""
 
 from dataclasses import replace
 from typing import Any
@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet.env.engine import shifts_of
+from fleet.engine.batch import shifts_of
+from fleet.engine.tables import stack_tables, tables_of
 from fleet.env.vector import BatchEnv, Library
-from fleet.sim.tables import stacked, tables_of
 from scenarios import make_batch, make_env
-from scenarios.batch import Randomisation, library_of
-from scenarios.build import Fleet, prepare
-from scenarios.jobs import draw_jobs
+from scenarios.job_stream import draw_jobs
+from scenarios.prepare.fleet import Fleet, prepare
+from scenarios.run.batch import Randomisation, library_of
 
 SEED = 30
 
@@ -91,13 +91,13 @@ def test_what_varies_stays_within_its_bounds_and_reaches_all_of_them(fleet) -> N
     randomise = Randomisation(ambient_k=(-2.0, 6.0), arrivals=(0.5, 2.0))
     library = library_of([fleet] * 3, randomise)
     shifts = [library.draw(np.random.SeedSequence(seed)) for seed in range(300)]
-    air = np.array([shift.air_k for shift in shifts])
-    assert -2.0 <= air.min() < -1.8
-    assert 5.8 < air.max() <= 6.0
-    assert air.mean() == pytest.approx(2.0, abs=4 * 8.0 / np.sqrt(12 * 300))
-    lots = np.bincount([shift.lot for shift in shifts], minlength=3)
-    assert len(lots) == 3
-    assert np.abs(lots - 100).max() < 4 * np.sqrt(300 * 2 / 9)
+    offset_k = np.array([shift.ambient_offset_k for shift in shifts])
+    assert -2.0 <= offset_k.min() < -1.8
+    assert 5.8 < offset_k.max() <= 6.0
+    assert offset_k.mean() == pytest.approx(2.0, abs=4 * 8.0 / np.sqrt(12 * 300))
+    fleets = np.bincount([shift.fleet for shift in shifts], minlength=3)
+    assert len(fleets) == 3
+    assert np.abs(fleets - 100).max() < 4 * np.sqrt(300 * 2 / 9)
     # 240 s at one in 60 s and 200 s at one in 40 s are 9 jobs, on the mean 1.25 times as often, and 3 at once.
     often = Randomisation(arrivals=(3.0, 3.0))
     for chosen, expected in ((Randomisation(), 12.0), (randomise, 3 + 9 * 1.25), (often, 3 + 9 * 3.0)):
@@ -111,14 +111,14 @@ def test_a_variation_is_of_its_seed_and_leaves_the_noise_alone(fleet, play) -> N
     for seed in range(4):
         plain, one, again = (lib.draw(np.random.SeedSequence(seed)) for lib in (library_of([fleet]), library, library))
         assert all(np.array_equal(value, getattr(again, name)) for name, value in vars(one).items())
-        assert (one.key, plain.air_k) == (plain.key, 0.0)
-        assert one.air_k > 0.0
+        assert (one.noise_key, plain.ambient_offset_k) == (plain.noise_key, 0.0)
+        assert one.ambient_offset_k > 0.0
     three, seven = BatchEnv(library, 3, seed=4), BatchEnv(library, 7, seed=2)
     rows = three.reset()[0], seven.reset()[0]
     play.same(rows[0], {name: values[2:5] for name, values in rows[1].items()})
 
 
-def test_warmer_air_is_felt_by_every_motor(cell, folder) -> None:
+def test_a_warmer_cell_warms_every_motor(cell, folder) -> None:
     options: dict[str, Any] = {"difficulty": "blind", "cache": folder, "limits": {}}
     cool = make_batch(cell, 5, 0, **options)
     warm = make_batch(cell, 5, 0, randomise=Randomisation(ambient_k=(3.0, 3.0)), **options)
@@ -141,19 +141,19 @@ def test_a_variant_is_its_fleet(cell, folder, play) -> None:
     both = make_batch(cell, 12, SEED, randomise=Randomisation(variants=[variant]), **options)
     alone = [make_batch(cell, 12, SEED, **options, **each) for each in ({}, variant)]
     obs, given = both.reset()[0], [env.reset()[0] for env in alone]
-    lot = (obs["observation"] == given[1]["observation"]).all(axis=(1, 2)).astype(int)
+    fleet = (obs["observation"] == given[1]["observation"]).all(axis=(1, 2)).astype(int)
     for step in range(70):
         is_one = [(obs["observation"] == each["observation"]).all(axis=(1, 2)) for each in given]
-        assert np.choose(lot, is_one).all()
+        assert np.choose(fleet, is_one).all()
         assert not (is_one[0] & is_one[1]).any()
         for each, env in enumerate(alone):
-            np.testing.assert_array_equal(env.state.temp_c[lot == each], both.state.temp_c[lot == each])
+            np.testing.assert_array_equal(env.state.temp_c[fleet == each], both.state.temp_c[fleet == each])
         actions = actions_of(play, obs["action_mask"], step)
         (obs, _, terminated, truncated, _), given = both.step(actions), [env.step(actions)[0] for env in alone]
         if (terminated | truncated).any():  # the next shift of a row may be of the other fleet
             break
     assert step > 10
-    assert 0 < lot.sum() < 12
+    assert 0 < fleet.sum() < 12
 
 
 def test_fleets_of_unlike_risks_in_one_table_are_each_its_own(small, play) -> None:
@@ -166,20 +166,20 @@ def test_fleets_of_unlike_risks_in_one_table_are_each_its_own(small, play) -> No
     works = [small.work("bench", small.HOT), small.work("rack", 1.0, to="bench"), small.work("rack")]
     flat = [small.work("bench", small.HOT), small.work("rack", 1.0), small.work("rack")]
     tables, shifts = [], []
-    for lot, own in enumerate(models):
-        content = flat if lot == 1 else works
-        arms = [small.arm(i, content, model=model, times=small.Times(cycle=8.0 + lot)) for i, model in enumerate(own)]
+    for fleet, own in enumerate(models):
+        content = flat if fleet == 1 else works
+        arms = [small.arm(i, content, model=model, times=small.Times(cycle=8.0 + fleet)) for i, model in enumerate(own)]
         jobs = [small.job(f"j{j}", content[j % 3], release_s=30.0 * (j // 2), repetitions=2 + j % 2) for j in range(9)]
-        world, _ = small.shop([jobs], arms=arms, ticks=40, ambient_c=30.0 + lot)
+        world, _ = small.shop([jobs], arms=arms, ticks=40, ambient_c=30.0 + fleet)
         own_tables, drawn = tables_of(world)
         tables.append(own_tables)
         shifts += shifts_of(drawn, [77])
-    assert len({table.score.shape for table in tables}) == 3
-    assert len({int(np.bitwise_count(table.places).max()) for table in tables}) == 2
-    names, together = ("arm_0", "arm_1", "arm_2"), stacked(tables)
-    for lot, own_tables in enumerate(tables):
-        in_all = replace(shifts[lot], lot=lot)
-        alone = BatchEnv(Library(names, 4, own_tables, lambda _, lot=lot: shifts[lot]), 1, seed=0)
+    assert len({table.risk_offset.shape for table in tables}) == 3
+    assert len({int(np.bitwise_count(table.stations).max()) for table in tables}) == 2
+    names, together = ("arm_0", "arm_1", "arm_2"), stack_tables(tables)
+    for fleet, own_tables in enumerate(tables):
+        in_all = replace(shifts[fleet], fleet=fleet)
+        alone = BatchEnv(Library(names, 4, own_tables, lambda _, fleet=fleet: shifts[fleet]), 1, seed=0)
         among = BatchEnv(Library(names, 4, together, lambda _, shift=in_all: shift), 1, seed=0)
         one, other = alone.reset(), among.reset()
         for step in range(40):

@@ -70,7 +70,7 @@ def test_a_batch_can_be_spread_over_the_shift(cell, folder) -> None:
     [
         "import pettingzoo, scenarios",
         "import scenarios, pettingzoo; scenarios.make_env",
-        "import scenarios.registration",
+        "import scenarios.prepare.env_registration",
     ],
 )
 def test_the_name_is_there_once_scenarios_is_imported(first) -> None:

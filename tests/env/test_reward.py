@@ -1,47 +1,53 @@
-"""Reward terms: each what its name says, and together what the shift came to."""
+"""Reward terms, against numbers worked by hand and against the event log."""
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 
 import numpy as np
 import pytest
 
-from fleet.env.allocation_v0 import parallel_env
-from fleet.env.reward import TERMS, RewardWeights, terms
+from fleet.engine.reward import TERMS, RewardWeights
+from fleet.env.allocation_v0 import AllocationEnv, Episode, parallel_env
 from fleet.robot import ThermalLimits
-from fleet.sim.state import DONE, initial
 
 
-def test_each_term_is_its_weight_times_its_measure(small) -> None:
-    jobs = [small.job("a", value=3.0, due_s=100.0), small.job("b", value=2.0, due_s=500.0), small.job("c", value=9.0)]
-    world, _ = small.shop([jobs])
-    before = initial(world)
-    before.status[0, 2], before.finished_s[0, 2] = DONE, 1.0  # paid earlier
-    after = before.copy()
-    after.status[0, :2], after.finished_s[0, :2] = DONE, [220.0, 400.0]
-    after.above_warning_s[0] += [30.0, 60.0]
-    after.faults[0, 1] += 2
-    after.energy_j[0] += [3600.0, 7200.0]
-    weights = RewardWeights(finished_value=2.0, tardiness=-1.0, above_warning=-10.0, faults=-7.0, energy=-0.5)
-    found = {name: float(value[0]) for name, value in terms(world, before, after, weights).items()}
-    assert found == {
-        "finished_value": 2.0 * 5.0,
-        "tardiness": -1.0 * 3.0 * 2.0,  # two minutes late
-        "above_warning": -10.0 * 1.5,
-        "faults": -7.0 * 2,
-        "energy": -0.5 * 3.0,
-    }
-    assert tuple(found) == TERMS
+def played(small, jobs, weights=None, *, ticks: int, **world) -> tuple[AllocationEnv, dict[str, np.ndarray]]:
+    """One arm that claims the oldest job whenever it may, and the reward terms of each step."""
+    made, plant = small.shop([jobs], arms=1, ticks=ticks, **world)
+    env = parallel_env(
+        lambda seed: Episode(made, plant, ("t",), seed), weights=weights or RewardWeights(), keep_events=True
+    )
+    observations, _ = env.reset(seed=0)
+    terms: dict[str, list[float]] = {name: [] for name in TERMS}
+    while env.agents:
+        observations, _, _, _, infos = env.step({"arm_0": int(observations["arm_0"]["action_mask"][1])})
+        for name, values in terms.items():
+            values.append(infos["arm_0"][f"reward_{name}"])
+    return env, {name: np.array(values) for name, values in terms.items()}
 
 
-def test_nothing_happening_is_worth_nothing(small) -> None:
-    world, _ = small.shop([[small.job("a")], [small.job("a"), small.job("b")]])
-    state = initial(world)
-    for value in terms(world, state, state, RewardWeights()).values():
-        assert value.tolist() == [0.0, 0.0]
+def test_value_and_tardiness_are_paid_in_the_step_in_which_a_job_is_finished(small) -> None:
+    """A job lasts 3 s + 3 · 10 s, and 2 s more on the way home: the jobs begin at 0 s and at 40 s."""
+    jobs = [small.job("a", value=3.0, due_s=100.0), small.job("b", value=2.0, due_s=13.0)]
+    weights = RewardWeights(finished_value=2.0, tardiness=-1.0)
+    _, terms = played(small, jobs, weights, ticks=20)
+    assert terms["finished_value"].tolist() == [0.0, 0.0, 0.0, 6.0, 0.0, 0.0, 0.0, 4.0]
+    assert terms["tardiness"] == pytest.approx([0.0] * 7 + [-2.0 * (73.0 - 13.0) / 60.0])
+    assert not terms["faults"].any()
+    assert not terms["above_warning"].any()
+
+
+def test_an_idle_step_costs_its_energy_alone(small) -> None:
+    env, terms = played(small, [small.job("a", release_s=5000.0)], RewardWeights(energy=-0.5), ticks=6)
+    for name in TERMS[:-1]:
+        assert not terms[name].any()
+    assert terms["energy"].sum() == pytest.approx(-0.5 * env.truth.energy_j.sum() / 3600.0)
+    # Idle drives and the current that holds the arm at home, at 25 °C and little more.
+    watts = env.world.motors.idle_w.sum() + (env.world.motors.copper_w_per_a2 * env.world.rest.current_sq).sum()
+    assert terms["energy"].sum() == pytest.approx(-0.5 * watts * 60.0 / 3600.0, rel=1e-3)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_the_rewards_of_an_episode_add_up_to_what_it_came_to(small, seed) -> None:
+def test_the_rewards_of_an_episode_add_up_to_the_event_log(small, seed) -> None:
     limits = ThermalLimits(warning_c=45.0, error_c=50.0, restart_c=42.0)
     weights = RewardWeights(tardiness=-0.1)
     env = parallel_env(small.Shifts(jobs=15, ticks=100, limits=limits), weights=weights, keep_events=True)
@@ -73,9 +79,11 @@ def test_the_rewards_of_an_episode_add_up_to_what_it_came_to(small, seed) -> Non
 
 
 def test_a_job_is_paid_once_though_it_was_returned(small) -> None:
-    world, _ = small.shop([[small.job("a", value=4.0)]])
-    done = initial(world)
-    done.status[0, 0], done.finished_s[0, 0] = DONE, 5.0
-    only = replace(RewardWeights(), tardiness=0.0, energy=0.0)
-    paid = [terms(world, a, b, only)["finished_value"][0] for a, b in ((initial(world), done), (done, done.copy()))]
-    assert paid == [4.0, 0.0]
+    jobs = [small.job("a", small.work(payload_kg=small.HOT), value=4.0, repetitions=40)]
+    env, terms = played(small, jobs, RewardWeights(faults=-7.0, above_warning=-10.0), ticks=600)
+    faults = [event.time_s for event in env.events if event.kind == "fault"]
+    assert len(faults) == env.truth.returns[0, 0] > 0
+    assert terms["finished_value"].sum() == 4.0
+    assert np.flatnonzero(terms["faults"]).tolist() == [int(time_s // 10.0) for time_s in faults]
+    assert terms["faults"].sum() == -7.0 * len(faults)
+    assert terms["above_warning"].sum() == pytest.approx(-10.0 * env.truth.above_warning_s.sum() / 60.0)

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from fleet.env.picture import draw, picture
-from fleet.env.scene import Offer, mount_kind, plain_cell, scene_of
+from fleet.engine.shift import step
+from fleet.engine.state import initial
+from fleet.env.render.scene import QueuedJob, grid_cell, mount_kind, scene_of
 from fleet.robot import JOINTS, Mount
-from fleet.sim.kernel import step
-from fleet.sim.state import initial
 from fleet.telemetry import IDLE, WORKING
 
 
@@ -33,23 +32,22 @@ def test_a_scene_tells_the_truth_about_a_world(small) -> None:
     jobs = [small.job("now", work), small.job("next", heavy, due_s=5.0), small.job("late", work, release_s=500.0)]
     arms = [small.arm(0, [work]), small.arm(1, [work, heavy])]
     world, plant = small.shop([jobs], arms=arms)
-    state = step(world, initial(world), np.array([[1, 0]]), np.zeros((1, 2, 4)), plant).state
+    state = step(world, initial(world), np.array([[1, 0]]), plant).state
     seen = scene_of(world, state, title="two arms")
     assert (seen.time_s, seen.horizon_s, seen.finished, seen.waiting, seen.faults) == (10.0, 600.0, 0, 1, 0)
     assert (seen.mode, seen.job, seen.at) == ((WORKING, IDLE), ("now", ""), (("bench",), ()))
-    assert seen.share == (pytest.approx(10.0 / (3.0 + 3 * 10.0 + 2.0)), 0.0)
-    assert seen.offers == (Offer(job="next", payload_kg=2.5, due_in_s=-5.0, able=(False, True), free=(False, True)),)
+    assert seen.progress == (pytest.approx(10.0 / (3.0 + 3 * 10.0 + 2.0)), 0.0)
+    assert seen.queue == (QueuedJob(job="next", payload_kg=2.5, due_in_s=-5.0, able=(False, True), free=(False, True)),)
     np.testing.assert_array_equal(seen.temp_c, state.temp_c[0, :, :JOINTS])
-    assert (draw(world, state, title="two arms") == picture(seen)).all()
-    with pytest.raises(ValueError, match=r"The cell is of the arms arm_0; the world's are arm_0, arm_1\."):
-        scene_of(world, state, plain_cell(("arm_0",), ()))
+    with pytest.raises(ValueError, match=r"The cell has the arms arm_0; the world has arm_0, arm_1\."):
+        scene_of(world, state, grid_cell(("arm_0",), ()))
 
 
 def test_a_finished_job_and_a_fault_are_counted(small) -> None:
     world, plant = small.shop([[small.job("a", small.work("bench"), repetitions=1)]])
     state = initial(world)
     for action in (1, 0):
-        state = step(world, state, np.array([[action, 0]]), np.zeros((1, 2, 4)), plant).state
+        state = step(world, state, np.array([[action, 0]]), plant).state
     state.faults[0, 1] = 2
     seen = scene_of(world, state)
     assert (seen.finished, seen.waiting, seen.faults, seen.job) == (1, 0, 2, ("", ""))

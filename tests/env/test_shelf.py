@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from fleet.env.shelf import Shelf
+from fleet.env.buffers import Shelf
 
 
 def test_what_somebody_holds_is_never_given_out_again() -> None:
@@ -39,7 +39,7 @@ def test_what_nobody_holds_comes_back() -> None:
 TURNOVER = """
 import resource, sys
 import numpy as np
-from fleet.env.shelf import keep_pages
+from fleet.env.buffers import keep_pages
 if sys.argv[1] == "kept":
     assert keep_pages()
 for _ in range(2):

@@ -6,15 +6,18 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 
-from fleet.env.window import Window
+from fleet.engine.state import initial
+from fleet.env.render.renderer import Renderer
+from fleet.errors import FleetError
 
 BLACK = np.zeros((240, 320, 3), np.uint8)
 
 
 def test_without_a_display_it_says_so_once_and_goes_on(monkeypatch, caplog) -> None:
     monkeypatch.setattr("matplotlib.get_backend", lambda: "agg")
-    window = Window()
+    window = Renderer()
     with caplog.at_level(logging.WARNING):
         assert [window.show(BLACK) for _ in range(3)] == [False] * 3
         assert window.show(BLACK + 255) is False
@@ -33,7 +36,7 @@ def test_a_window_follows_the_frames_until_it_is_closed(monkeypatch) -> None:
     monkeypatch.setattr("matplotlib.get_backend", lambda: "TkAgg")
     monkeypatch.setattr(FigureManagerBase, "show", lambda self: None)
     plt.switch_backend("agg")
-    window = Window("test")
+    window = Renderer(title="test")
     assert window.show(BLACK)
     assert window.show(BLACK + 255)
     (figure,) = map(plt.figure, plt.get_fignums())
@@ -50,11 +53,17 @@ def test_a_window_follows_the_frames_until_it_is_closed(monkeypatch) -> None:
     assert plt.get_fignums() == []
 
 
-def test_matplotlib_is_loaded_for_a_window_alone() -> None:
+def test_matplotlib_is_loaded_for_frames_alone() -> None:
     code = (
-        "import sys, numpy as np; import fleet.env.window, fleet.env.picture as p; "
-        "from fleet.env.lettering import width; width('a', 12); "
-        "print([m for m in ('matplotlib', 'torch', 'mujoco', 'zenoh', 'tkinter') if m in sys.modules])"
+        "import sys; import fleet.env.allocation_v0, fleet.env.render.renderer; "
+        "print([m for m in ('matplotlib', 'PIL', 'torch', 'mujoco', 'zenoh', 'tkinter') if m in sys.modules])"
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     assert said.stdout.strip() == "[]"
+
+
+def test_without_matplotlib_the_error_names_the_extra(monkeypatch, small) -> None:
+    world, _ = small.shop([[small.job("a", small.work("bench"))]])
+    monkeypatch.setitem(sys.modules, "fleet.env.render.picture", None)
+    with pytest.raises(FleetError, match=r"pip install 'thermofleet\[report\]'"):
+        Renderer().frame(world, initial(world))

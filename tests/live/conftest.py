@@ -1,4 +1,5 @@
-"""A fleet on paper: an auctioneer, arms that keep the rule of `fleet.bus.trade`, and a network not to be trusted.
+"""A fleet on paper: an auctioneer, arms that keep the rule of `fleet.bus.protocol.auction`, and a network not to be
+trusted.
 
 Time is a number, every clock runs at its own rate, and a journal is a list.
 """
@@ -11,31 +12,32 @@ from types import SimpleNamespace
 
 import pytest
 
-from fleet.bus.trade import (
+from fleet.bus.protocol.auction import (
     Ack,
-    Announce,
+    Announcement,
     Award,
-    Hold,
-    JobWord,
+    JobEstimate,
+    JobSpec,
     Lease,
+    LeaseEntry,
     LeaseRequest,
-    Offer,
     Quote,
     QuoteRequest,
     Receipt,
     Report,
     Result,
     Submission,
-    Submitted,
+    SubmissionReply,
 )
 from fleet.errors import JournalFull
-from fleet.live.auctioneer import Auctioneer, Give
-from fleet.live.ledger import replayed
-from fleet.live.records import Began, Closed, Record
-from fleet.live.timing import Timing
+from fleet.live.auction.auctioneer import Auctioneer, SendAward
+from fleet.live.auction.journal_records import AuctionRecord, Closed, Started
+from fleet.live.auction.lease_timing import Timing
+from fleet.live.auction.ledger import Ledger
+from fleet.live.auction.round import Allocate
 
 VALID_S = 2.0
-TIMING = Timing(lease_s=3.0, margin_s=0.05, window_s=0.5, ack_s=0.5, most_offered=8)
+TIMING = Timing(lease_s=3.0, margin_s=0.05, window_s=0.5, ack_s=0.5, max_jobs=8)
 
 
 def first_come(bidding) -> Mapping[str, str]:
@@ -86,7 +88,7 @@ class ModelArm:
     def quote(self, request: QuoteRequest, true_s: float) -> Quote:
         name = f"{self.name}.{self.lives}.{len(self.quotes)}"
         self.quotes[name] = self.own_s(true_s)
-        offers = tuple(Offer(job.name, True, finish_in_s=1.0) for job in request.jobs)
+        offers = tuple(JobEstimate(job.name, True, finish_in_s=1.0) for job in request.jobs)
         return Quote(
             self.name, request.auction, name, VALID_S, "model", 0.0, "idle", 10.0, max(0, 1 - len(self.holds)), offers
         )
@@ -126,7 +128,7 @@ class ModelArm:
 
     def request(self) -> LeaseRequest:
         holds = tuple(
-            Hold(
+            LeaseEntry(
                 name,
                 w.award.job.name,
                 w.cycles,
@@ -140,8 +142,8 @@ class ModelArm:
         for name in lease.granted:
             if name in self.holds:
                 self.holds[name].until_s = max(self.holds[name].until_s, asked_s + lease.lease_s)
-                self.holds[name].leave |= name in lease.leave
-        for name in lease.lost:
+                self.holds[name].leave |= name in lease.may_commit
+        for name in lease.revoked:
             if name in self.holds and not self.holds[name].begun:
                 del self.holds[name]
 
@@ -182,14 +184,16 @@ def speaker(wire: Wire) -> str:
 class ModelFleet:
     """The auctioneer, its arms and what is under way between them."""
 
-    def __init__(self, arms: list[ModelArm], rate: float = 1.0, timing: Timing = TIMING) -> None:
-        self.true_s = 0.0
+    def __init__(
+        self, arms: list[ModelArm], rate: float = 1.0, timing: Timing = TIMING, allocate: Allocate = first_come
+    ) -> None:
+        self.true_s, self.allocate = 0.0, allocate
         self.rate, self.timing = rate, timing
         self.arms = {arm.name: arm for arm in arms}
-        self.journal: list[Record] = []
+        self.journal: list[AuctionRecord] = []
         self.wires: list[Wire] = []
         self.results: dict[int, Result] = {}
-        self.accepted: dict[str, JobWord] = {}
+        self.accepted: dict[str, JobSpec] = {}
         self.doubtful: set[str] = set()
         """Jobs that an arm brought back and is not sure of."""
         self.lives = 0
@@ -204,21 +208,21 @@ class ModelFleet:
     def born(self) -> Auctioneer:
         """The auctioneer comes up from its journal, which it shortens in every second life."""
         self.lives += 1
-        ledger = replayed(self.journal)
+        ledger = Ledger().replay(self.journal)
         if self.lives % 2:
-            self.journal[:] = [ledger.standing()]
-        self.journal.append(Began("auctioneer", self.true_s))
+            self.journal[:] = ledger.compact()
+        self.journal.append(Started("auctioneer", self.true_s))
         return Auctioneer(
             "auctioneer",
             ledger,
-            allocate=first_come,
+            allocate=self.allocate,
             keep=self.keep,
             life=str(self.lives),
             real_s=self.real_s,
             timing=self.timing,
         )
 
-    def keep(self, *records: Record) -> None:
+    def keep(self, *records: AuctionRecord) -> None:
         if self.full:
             raise JournalFull("no room")
         self.journal.extend(records)
@@ -241,23 +245,23 @@ class ModelFleet:
             match self.auctioneer.out.popleft():
                 case QuoteRequest() as request:
                     self.wires.extend(Wire(name, request) for name in self.arms)
-                case Give(arm, award):
+                case SendAward(arm, award):
                     self.wires.append(Wire(arm, award))
                 case Result() as result:
                     assert self.results.setdefault(result.number, result) == result, "two results of one number"
-                case Announce():
+                case Announcement():
                     pass
         return answer
 
-    def submit(self, *words: JobWord) -> None:
-        said = self.attempt(lambda: self.auctioneer.submitted(Submission(words), self.real_s, self.true_s))
-        if isinstance(said, Submitted):
+    def submit(self, *words: JobSpec) -> None:
+        said = self.attempt(lambda: self.auctioneer.submit(Submission(words), self.real_s, self.true_s))
+        if isinstance(said, SubmissionReply):
             self.accepted |= {word.name: word for word in words}
 
     def step(self, dt_s: float, but: str = "") -> None:
         """Time goes on; the auctioneer sees who is there, and does what is due."""
         self.true_s += dt_s
-        self.auctioneer.seen(frozenset(name for name, arm in self.arms.items() if arm.up and name != but))
+        self.auctioneer.set_present(frozenset(name for name, arm in self.arms.items() if arm.up and name != but))
         self.attempt(lambda: self.auctioneer.tick(self.real_s, self.true_s))
 
     def arm_turn(self, name: str) -> None:
@@ -294,13 +298,13 @@ class ModelFleet:
         """What the auctioneer answers to an arm."""
         match word:
             case Quote():
-                return self.auctioneer.quoted(word, self.real_s, self.true_s)
+                return self.auctioneer.add_quote(word, self.real_s, self.true_s)
             case Ack():
-                return self.auctioneer.acknowledged(word, self.real_s, self.true_s)
+                return self.auctioneer.apply_ack(word, self.real_s, self.true_s)
             case LeaseRequest():
-                return self.auctioneer.leased(word, self.real_s, self.true_s)
+                return self.auctioneer.renew_leases(word, self.real_s, self.true_s)
             case Report():
-                return self.auctioneer.reported(word, self.real_s, self.true_s)
+                return self.auctioneer.apply_report(word, self.real_s, self.true_s)
 
     def deliver_all(self, rng: random.Random | None = None) -> None:
         """Hand over what is under way now, in order, or in any order."""

@@ -8,17 +8,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fleet.bus import keys
-from fleet.bus.link import Link
-from fleet.bus.messages import DifficultyWord, Info, State
-from fleet.bus.router import Router
-from fleet.bus.trade import (
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.router import Router
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import (
     Ack,
     ArmEvent,
     Award,
     Clock,
     ClockRequest,
-    JobWord,
+    JobSpec,
     Lease,
     LeaseRequest,
     Quote,
@@ -26,22 +25,23 @@ from fleet.bus.trade import (
     Receipt,
     Report,
 )
+from fleet.bus.protocol.messages import DifficultyScores, Info, State
 from fleet.errors import InfeasibleJob
 from fleet.job import Place
-from fleet.live.arm_node import PLANNING_S, ArmNode, Nature
-from fleet.live.body import SimulatedBody
+from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
+from fleet.live.arm.estimator import NOT_PLANNED, Estimator, NominalPeaks
+from fleet.live.arm.journal_records import ArmHistory, ArmRecord
+from fleet.live.arm.node import PLANNING_S, ArmConfig, ArmNode
+from fleet.live.arm.replay_body import ReplayBody, SensorLog
+from fleet.live.arm.simulated_body import SimulatedBody
 from fleet.live.clock import FleetClock
-from fleet.live.contractor import Contractor, Terms
-from fleet.live.estimate import NOT_YET, Estimator, NominalHeat
 from fleet.live.journal import Journal
-from fleet.live.log_body import LogBody, Readings
-from fleet.live.promises import Promise, recall, restarted, retold
 from fleet.robot import ThermalLimits
 
 PATIENCE_S = 15.0
 LIMITS = ThermalLimits()
 SPEED = 60.0
-JOB = JobWord(name="j", kind="hold", places=("bench",), repetitions=3)
+JOB = JobSpec(name="j", kind="hold", places=("bench",), repetitions=3)
 PLACES = {name: Place(name=name, position_m=(0.5, 0.0, 0.2)) for name in ("bench", "rack")}
 
 
@@ -50,13 +50,13 @@ class Auctioneer:
 
     def __init__(self, link):
         self.link, self.grants, self.leases, self.reports, self.words = link, True, [], [], []
-        link.answer(keys.asked_by_every_arm("f", "x", "lease"), LeaseRequest, self.lease)
-        link.answer(keys.asked_by_every_arm("f", "x", "report"), Report, self.report)
+        link.reply_to(keys.asked_by_every_arm("f", "x", "lease"), LeaseRequest, self.lease)
+        link.reply_to(keys.asked_by_every_arm("f", "x", "report"), Report, self.report)
 
     def lease(self, request):
         self.leases.append(request)
-        names = tuple(h.award for h in request.holds) if self.grants else ()
-        leave = tuple(h.award for h in request.holds if self.grants and h.phase == "finishing")
+        names = tuple(h.award for h in request.entries) if self.grants else ()
+        leave = tuple(h.award for h in request.entries if self.grants and h.phase == "finishing")
         return Lease("x", 2.0, names, (), leave)
 
     def report(self, report):
@@ -72,24 +72,26 @@ def bus(tmp_path, small):
         nodes, links = [], []
 
         def link():
-            links.append(stack.enter_context(Link(router.endpoint, "f")))
+            links.append(stack.enter_context(BusClient(router.endpoint, "f")))
             return links[-1]
 
-        def arm(plan=None, body=None, speed=SPEED, clock_s=100.0, limits=LIMITS, warm=True, **nature):
+        def arm(plan=None, body=None, speed=SPEED, clock_s=100.0, limits=LIMITS, warm=True, **config):
             content = small.work("bench")
             own = small.arm(0, [content])
-            book = stack.enter_context(Journal(tmp_path / "arm_0.jsonl", Promise))
-            memory = restarted(recall(book.replay()), "arm_0", 0.0)
-            book.rewrite(*retold(memory))
+            book = stack.enter_context(Journal(tmp_path / "arm_0.jsonl", ArmRecord))
+            history = ArmHistory().replay(book.records()).after_restart("arm_0", 0.0)
+            book.rewrite(*history.compact())
             body = body or SimulatedBody(
                 own, limits, lambda _: 25.0, dt_s=speed / 20, rng=np.random.default_rng(0), time_s=clock_s, warm=warm
             )
-            line = stack.enter_context(Link(router.endpoint, "f"))
-            contractor = Contractor("arm_0", book.append, memory, nonce=str(memory.boot), terms=Terms(valid_s=3.0))
-            estimator = Estimator(own.model, plan or (lambda work: own.plans[content]), PLACES, NominalHeat())
+            line = stack.enter_context(BusClient(router.endpoint, "f"))
+            executor = AwardExecutor(
+                "arm_0", book.append, history, nonce=str(history.boot), config=ExecutorConfig(valid_s=3.0)
+            )
+            estimator = Estimator(own.model, plan or (lambda work: own.plans[content]), PLACES, NominalPeaks())
             clock = FleetClock(speed, time.monotonic(), clock_s)
-            nature = Nature(**{"warning_c": 60.0, "rate_hz": 20.0, "life": memory.boot, **nature})
-            node = ArmNode(line, body, contractor, estimator, clock, nature)
+            config = ArmConfig(**{"warning_c": 60.0, "rate_hz": 20.0, "boot": history.boot, **config})
+            node = ArmNode(line, body, executor, estimator, clock, config)
             nodes.append(node)
             return SimpleNamespace(node=node, link=line, book=book, body=body)
 
@@ -105,11 +107,11 @@ def bus(tmp_path, small):
         def ask(line, topic, word, kind):
             for _ in range(50):  # the router may not know yet that the arm answers
                 got = []
-                line.ask(keys.of_arm("f", "arm_0", topic), word, kind, got.append, timeout_s=5.0)
+                line.query(keys.of_arm("f", "arm_0", topic), word, kind, got.append, timeout_s=5.0)
                 serve(partial(bool, got))
                 assert not got[0].refused, got[0].refused
-                if got[0].words:
-                    return next(iter(got[0].words.values()))
+                if got[0].messages:
+                    return next(iter(got[0].messages.values()))
             raise AssertionError("nobody answers")
 
         def crash(one):
@@ -130,15 +132,15 @@ def award(quote, job=JOB, name="w"):
 
 def test_it_says_what_it_is_and_how_it_is(bus):
     watcher, heard = bus.link(), {}
-    for topic, kind, remembered in (("state", State, 0), ("info", Info, 1)):
-        watcher.listen(
+    for topic, kind, history in (("state", State, False), ("info", Info, True)):
+        watcher.subscribe(
             keys.of_every_arm("f", topic),
             kind,
             lambda arm, word, t=topic: heard.update({t: word}),
-            remembered=remembered,
+            history=history,
         )
     there = []
-    watcher.watch(keys.of_every_arm("f", "alive"), lambda name, is_there: there.append((name, is_there)))
+    watcher.watch_tokens(keys.of_every_arm("f", "alive"), lambda name, is_there: there.append((name, is_there)))
     bus.arm()
     bus.serve(lambda: {"state", "info"} <= heard.keys() and there)
     assert there[0] == ("arm_0", True)
@@ -152,7 +154,7 @@ def test_it_says_what_it_is_and_how_it_is(bus):
 def test_who_comes_late_still_learns_what_it_is(bus):
     bus.arm()
     late, heard = bus.link(), []
-    late.listen(keys.of_every_arm("f", "info"), Info, lambda _, word: heard.append(word), remembered=1)
+    late.subscribe(keys.of_every_arm("f", "info"), Info, lambda _, word: heard.append(word), history=True)
     bus.serve(lambda: heard)
     assert heard == [Info("arm_0", 7, "by payload")]
 
@@ -160,12 +162,12 @@ def test_who_comes_late_still_learns_what_it_is(bus):
 def test_a_job_goes_from_quote_to_receipt(bus):
     auctioneer, events, words = Auctioneer(bus.link()), [], []
     line = bus.link()
-    line.listen(keys.of_every_arm("f", "event"), ArmEvent, lambda _, e: events.append(e), remembered=64)
-    line.listen(keys.of_every_arm("f", "difficulty"), DifficultyWord, lambda _, w: words.append(w), remembered=1)
+    line.subscribe(keys.of_every_arm("f", "event"), ArmEvent, lambda _, e: events.append(e), history=True)
+    line.subscribe(keys.of_every_arm("f", "difficulty"), DifficultyScores, lambda _, w: words.append(w), history=True)
     arm = bus.arm()
     quote = bus.ask(line, "quote", request(), Quote)
     assert (quote.capacity, quote.valid_s, quote.twin) == (1, 3.0, "by payload")
-    (offer,) = quote.offers
+    (offer,) = quote.estimates
     assert offer.duration_s == pytest.approx(35.0)
     assert bus.ask(line, "award", award(quote.quote), Ack).accepted
     bus.serve(lambda: auctioneer.reports)
@@ -175,26 +177,26 @@ def test_a_job_goes_from_quote_to_receipt(bus):
     stood_s = report.time_s - next(e.time_s for e in events if e.kind == "award") - 33.0
     assert stood_s >= -1e-6
     assert stood_s / (SPEED / 20) == pytest.approx(round(stood_s / (SPEED / 20)), abs=1e-6)
-    assert any(h.phase == "finishing" for leased in auctioneer.leases for h in leased.holds)
+    assert any(h.phase == "finishing" for leased in auctioneer.leases for h in leased.entries)
     bus.serve(lambda: [e.kind for e in events] == ["award", "finish", "home"])
     assert [e.number - events[0].number for e in events] == [0, 1, 2]
     assert words[-1].jobs == ("j",)
-    bus.serve(lambda: not recall(arm.book.replay()).reports)
+    bus.serve(lambda: not ArmHistory().replay(arm.book.records()).reports)
     assert bus.ask(line, "quote", request(), Quote).capacity == 1
 
 
 def test_a_dry_run_changes_nothing(bus):
     words, line = [], bus.link()
-    line.listen(keys.of_every_arm("f", "difficulty"), DifficultyWord, lambda _, w: words.append(w), remembered=1)
+    line.subscribe(keys.of_every_arm("f", "difficulty"), DifficultyScores, lambda _, w: words.append(w), history=True)
     arm = bus.arm()
-    before = list(arm.book.replay())
+    before = list(arm.book.records())
     quote = bus.ask(line, "quote", request(dry_run=True), Quote)
     assert quote.quote == ""
-    assert quote.offers[0].feasible
+    assert quote.estimates[0].feasible
     bus.ask(line, "quote", request(), Quote)
     bus.serve(lambda: words)
     assert len(words) == 1
-    assert list(arm.book.replay()) == before
+    assert list(arm.book.records()) == before
 
 
 def test_without_leave_nothing_is_finished_and_without_a_lease_nothing_goes_on(bus):
@@ -203,8 +205,8 @@ def test_without_leave_nothing_is_finished_and_without_a_lease_nothing_goes_on(b
     arm = bus.arm()
     quote = bus.ask(line, "quote", request(), Quote)
     assert bus.ask(line, "award", award(quote.quote), Ack).accepted
-    held = arm.node.contractor.held[0]
-    bus.serve(lambda: time.monotonic() > held.until_s and arm.body.read().mode == "idle")
+    held = arm.node.executor.active[0]
+    bus.serve(lambda: time.monotonic() > held.lease_end_s and arm.body.read_sensors().mode == "idle")
     assert held.cycles < 3
     assert arm.body.job == "j"
     auctioneer.grants = True
@@ -238,7 +240,7 @@ def test_an_arm_that_is_stopped_gives_back_its_job_and_is_sure(bus):
     bus.serve(lambda: auctioneer.reports)
     (report,) = auctioneer.reports
     assert (report.outcome, report.unsure, report.reason) == ("returned", False, "the arm was stopped")
-    bus.serve(lambda: not arm.node.contractor.owes)
+    bus.serve(lambda: not arm.node.executor.has_pending_reports)
     again = bus.ask(line, "quote", request(), Quote)
     assert again.capacity == 0
     assert not bus.ask(line, "award", award(again.quote, name="w2"), Ack).accepted
@@ -246,10 +248,10 @@ def test_an_arm_that_is_stopped_gives_back_its_job_and_is_sure(bus):
 
 def test_an_arm_that_faults_gives_back_its_job_with_the_cycles(bus):
     auctioneer, line, events = Auctioneer(bus.link()), bus.link(), []
-    line.listen(keys.of_every_arm("f", "event"), ArmEvent, lambda _, e: events.append(e), remembered=64)
+    line.subscribe(keys.of_every_arm("f", "event"), ArmEvent, lambda _, e: events.append(e), history=True)
     limits = ThermalLimits(warning_c=33.0, error_c=34.0, restart_c=30.0)
     bus.arm(limits=limits, warning_c=1000.0, speed=600.0, warm=False)
-    long = JobWord(name="j", kind="hold", places=("bench",), repetitions=5000)
+    long = JobSpec(name="j", kind="hold", places=("bench",), repetitions=5000)
     quote = bus.ask(line, "quote", request(long), Quote)
     assert bus.ask(line, "award", award(quote.quote, long), Ack).accepted
     bus.serve(lambda: auctioneer.reports)
@@ -276,7 +278,7 @@ def test_an_arm_that_is_hot_offers_but_takes_nothing(bus):
 def test_the_time_is_the_auctioneers_from_the_first_word_on(bus):
     line = bus.link()
     start_s = time.monotonic()
-    line.answer(keys.of_clock("f"), ClockRequest, lambda _: Clock(5000.0 + 30.0 * (time.monotonic() - start_s), 30.0))
+    line.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(5000.0 + 30.0 * (time.monotonic() - start_s), 30.0))
     arm = bus.arm()
     bus.serve(lambda: arm.node.clock.speed == 30.0)
     off_s = arm.node.clock.now_s(time.monotonic()) - 5000.0 - 30.0 * (time.monotonic() - start_s)
@@ -300,27 +302,27 @@ def test_planning_never_keeps_an_arm_from_its_words_for_longer_than_one_plan(bus
         return next(iter(own.plans.values()))
 
     line, came = bus.link(), []
-    line.listen(keys.of_every_arm("f", "state"), State, lambda _, state: came.append(state.time_s))
+    line.subscribe(keys.of_every_arm("f", "state"), State, lambda _, state: came.append(state.time_s))
     bus.arm(plan=slowly, speed=1.0)
     bus.serve(lambda: len(came) > 3)
-    jobs = tuple(JobWord(name=f"j{i}", kind="hold", places=("bench",), payload_kg=float(i)) for i in range(20))
+    jobs = tuple(JobSpec(name=f"j{i}", kind="hold", places=("bench",), payload_kg=float(i)) for i in range(20))
     del came[:-1]
     began_s = time.monotonic()
     quote = bus.ask(line, "quote", request(*jobs), Quote)
     assert time.monotonic() - began_s < PLANNING_S + 0.4
     bus.serve(lambda: came and came[-1] - came[0] > 0.5)
     assert np.diff(came).max() < 0.8 * PLANNING_S
-    late = [o.job for o in quote.offers if o.reason == NOT_YET]
+    late = [o.job for o in quote.estimates if o.reason == NOT_PLANNED]
     assert 0 < len(late) < 20
     bus.serve(lambda: len(planned) == 20)
     quote = bus.ask(line, "quote", request(*jobs), Quote)
-    assert [o.feasible for o in quote.offers] == [True] * 19 + [False]
+    assert [o.feasible for o in quote.estimates] == [True] * 19 + [False]
 
 
 def test_a_log_lives_as_an_arm_and_takes_no_work(bus):
     time_s = np.linspace(0.0, 20.0, 201)
     ramp = np.tile(time_s[:, None], (1, 7))
-    readings = Readings(
+    readings = SensorLog(
         time_s=time_s + 77.0, temp_c=30.0 + ramp, q=0.1 * ramp, qd=np.full_like(ramp, 0.1), tau=ramp, current_a=-ramp
     )
 
@@ -328,8 +330,8 @@ def test_a_log_lives_as_an_arm_and_takes_no_work(bus):
         raise InfeasibleJob("arm_0", work.places[0].name, "it replays a log")
 
     line, states = bus.link(), []
-    line.listen(keys.of_every_arm("f", "state"), State, lambda _, state: states.append(state))
-    bus.arm(plan=refuse, body=LogBody(readings, time_s=100.0), speed=20.0, works=False)
+    line.subscribe(keys.of_every_arm("f", "state"), State, lambda _, state: states.append(state))
+    bus.arm(plan=refuse, body=ReplayBody(readings, time_s=100.0), speed=20.0, takes_jobs=False)
     bus.serve(lambda: states and states[-1].time_s > 125.0)
     for state in states:
         into_s = min(np.floor((state.time_s - 100.0) * 10 + 1e-6) / 10, 20.0)
@@ -338,6 +340,6 @@ def test_a_log_lives_as_an_arm_and_takes_no_work(bus):
         assert state.mode == ("idle" if into_s == 20.0 else "working")
     assert states[-1].qd == (0.0,) * 7
     quote = bus.ask(line, "quote", request(), Quote)
-    assert (quote.capacity, quote.offers[0].feasible) == (0, False)
-    assert "replays a log" in quote.offers[0].reason
+    assert (quote.capacity, quote.estimates[0].feasible) == (0, False)
+    assert "replays a log" in quote.estimates[0].reason
     assert not bus.ask(line, "award", award(quote.quote), Ack).accepted

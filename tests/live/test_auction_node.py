@@ -11,22 +11,21 @@ from itertools import count
 
 import pytest
 
-from fleet.bus import keys
-from fleet.bus.link import Link
-from fleet.bus.messages import State, encode
-from fleet.bus.router import Router
-from fleet.bus.trade import (
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.router import Router
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import (
     Ack,
-    Announce,
+    Announcement,
     Award,
     Clock,
     ClockRequest,
-    Hold,
+    JobEstimate,
+    JobSpec,
     JobStatus,
-    JobWord,
     Lease,
+    LeaseEntry,
     LeaseRequest,
-    Offer,
     Quote,
     QuoteRequest,
     Receipt,
@@ -35,16 +34,18 @@ from fleet.bus.trade import (
     Status,
     StatusRequest,
     Submission,
-    Submitted,
+    SubmissionReply,
 )
+from fleet.bus.protocol.messages import State, encode
 from fleet.errors import BusError, JournalFull
-from fleet.live import auction_node, journal
-from fleet.live.auction_node import AuctionNode
-from fleet.live.auctioneer import Objection
+from fleet.live import journal
+from fleet.live.auction import node as auction_node
+from fleet.live.auction.auctioneer import Objection
+from fleet.live.auction.journal_records import AuctionRecord
+from fleet.live.auction.node import AuctionNode
+from fleet.live.auction.status_message import statuses_that_fit
 from fleet.live.journal import Journal
-from fleet.live.onlooker import Onlooker
-from fleet.live.records import Record
-from fleet.live.standing import first as first_of
+from fleet.live.monitor.listener import FleetListener
 
 PATIENCE_S = 15.0
 
@@ -64,12 +65,12 @@ class Arm:
         self._numbers = count()
         self._hold, self._answers, self._said_s, self._asked = None, {}, 0.0, False
         fleet = link.fleet
-        link.answer(keys.of_arm(fleet, name, "quote"), QuoteRequest, self.quote)
-        link.answer(keys.of_arm(fleet, name, "award"), Award, self.take)
-        link.alive(keys.of_arm(fleet, name, "alive"))
+        link.reply_to(keys.of_arm(fleet, name, "quote"), QuoteRequest, self.quote)
+        link.reply_to(keys.of_arm(fleet, name, "award"), Award, self.take)
+        link.declare_token(keys.of_arm(fleet, name, "alive"))
 
     def quote(self, request):
-        offers = tuple(Offer(word.name, True, finish_in_s=1.0) for word in request.jobs)
+        offers = tuple(JobEstimate(word.name, True, finish_in_s=1.0) for word in request.jobs)
         quote = f"{self.name}-{next(self._numbers)}"
         room = int(self._hold is None)
         return Quote(self.name, request.auction, quote, 5.0, "none", 0.0, "idle", 20.0, room, offers)
@@ -85,28 +86,28 @@ class Arm:
         self.link.serve(time.monotonic() + 0.005)
         if time.monotonic() > self._said_s + 0.1:
             self._said_s = time.monotonic()
-            self.link.say(keys.of_arm(self.link.fleet, self.name, "state"), self.state())
+            self.link.publish(keys.of_arm(self.link.fleet, self.name, "state"), self.state())
             if self._hold is not None and not self._asked:
                 self._asked = True
-                hold = Hold(self._hold.award, self._hold.job.name, 0, "finishing")
+                hold = LeaseEntry(self._hold.award, self._hold.job.name, 0, "finishing")
                 key = keys.asked_by(self.link.fleet, self._hold.auctioneer, "lease", self.name)
-                self.link.ask(key, LeaseRequest(self.name, (hold,)), Lease, self.leased, timeout_s=1.0)
+                self.link.query(key, LeaseRequest(self.name, (hold,)), Lease, self.leased, timeout_s=1.0)
 
     def state(self):
         return State(self.name, next(self._numbers), 0.0, "idle", (30.0,), 30.0)
 
     def leased(self, answers):
         self._asked = False
-        for lease in answers.words.values():
-            if self._hold is not None and self._hold.award in lease.leave:
+        for lease in answers.messages.values():
+            if self._hold is not None and self._hold.award in lease.may_commit:
                 award, self._asked = self._hold, True
                 self.done.append(award.job.name)
                 report = Report(self.name, award.award, award.job.name, "finished", 1, 0.0)
                 key = keys.asked_by(self.link.fleet, award.auctioneer, "report", self.name)
-                self.link.ask(key, report, Receipt, self.receipted, timeout_s=1.0)
+                self.link.query(key, report, Receipt, self.receipted, timeout_s=1.0)
 
     def receipted(self, answers):
-        assert answers.words
+        assert answers.messages
         self._hold, self._asked = None, False
 
 
@@ -119,21 +120,21 @@ class Bus:
         self.arms, self.nodes, self.links = [], [], []
 
     def link(self):
-        link = Link(self.endpoint, "f")
+        link = BusClient(self.endpoint, "f")
         self.stack.enter_context(link)
         self.links.append(link)
         return link
 
     def arm(self, name):
-        self.arms.append(Arm(self.stack.enter_context(Link(self.endpoint, "f")), name))
+        self.arms.append(Arm(self.stack.enter_context(BusClient(self.endpoint, "f")), name))
         return self.arms[-1]
 
     def auctioneer(self, name="auctioneer", sync=None, folder="", **options):
         """A node with a life of its own, that `kill` may end."""
         extra = {} if sync is None else {"sync": sync}
         with ExitStack() as life:
-            link = life.enter_context(Link(self.endpoint, "f"))
-            book = life.enter_context(Journal[Record](self.folder / folder / name, Record, **extra))
+            link = life.enter_context(BusClient(self.endpoint, "f"))
+            book = life.enter_context(Journal[AuctionRecord](self.folder / folder / name, AuctionRecord, **extra))
             node = AuctionNode(link, name, book, **{"allocate": cheapest, "speed": 60.0, **options})
             node.life = self.stack.enter_context(life.pop_all())
         self.nodes.append(node)
@@ -157,7 +158,7 @@ class Bus:
     def ask(self, key, word, kind):
         """What is answered to a question of an outsider."""
         got = []
-        self.link().ask(key, word, kind, got.append, timeout_s=5.0)
+        self.link().query(key, word, kind, got.append, timeout_s=5.0)
         self.until(lambda: got)
         return got[0]
 
@@ -169,7 +170,7 @@ def bus(tmp_path):
 
 
 def jobs(*names, place="rack", **changes):
-    return tuple(JobWord(name=name, kind="hold", places=(place,), **changes) for name in names)
+    return tuple(JobSpec(name=name, kind="hold", places=(place,), **changes) for name in names)
 
 
 def states(node):
@@ -181,12 +182,12 @@ def test_jobs_are_taken_awarded_and_finished(bus):
     bus.arm("arm_0")
     bus.arm("arm_1")
     word = Submission((*jobs("a"), *jobs("b", place="bin"), *jobs("c", place="moon")), "test")
-    answers = bus.ask(keys.of_jobs("f", "submit"), word, Submitted)
-    (answer,) = answers.words.values()
+    answers = bus.ask(keys.of_jobs("f", "submit"), word, SubmissionReply)
+    (answer,) = answers.messages.values()
     assert [said.accepted for said in answer.jobs] == [True, True, False]
     bus.until(lambda: states(node) == ["finished", "finished"])
     assert sorted(job for arm in bus.arms for job in arm.done) == ["a", "b"]
-    (status,) = bus.ask(keys.of_jobs("f", "status"), StatusRequest(("b", "nobody")), Status).words.values()
+    (status,) = bus.ask(keys.of_jobs("f", "status"), StatusRequest(("b", "nobody")), Status).messages.values()
     assert [said.state for said in status.jobs] == ["finished"]
 
 
@@ -197,8 +198,10 @@ def test_who_comes_late_hears_the_last_results(bus):
     bus.until(lambda: states(node) == ["finished"])
     results, rounds = [], []
     late = bus.link()
-    late.listen(keys.of_every_auction("f", "result"), Result, lambda _, word: results.append(word), remembered=64)
-    late.listen(keys.of_every_auction("f", "announce"), Announce, lambda _, word: rounds.append(word), remembered=64)
+    late.subscribe(keys.of_every_auction("f", "result"), Result, lambda _, word: results.append(word), history=True)
+    late.subscribe(
+        keys.of_every_auction("f", "announce"), Announcement, lambda _, word: rounds.append(word), history=True
+    )
     bus.until(lambda: len(results) == 4 and rounds)
     assert [result.status.state for result in results] == ["waiting", "awarded", "finishing", "finished"]
     assert [result.number for result in results] == [0, 1, 2, 3]
@@ -232,8 +235,8 @@ def test_a_fleet_has_one_auctioneer(bus):
 
 def test_one_that_answers_and_shows_no_token_yet_is_an_auctioneer_too(bus):
     early = bus.link()
-    early.answer(keys.of_jobs("f", "status"), StatusRequest, lambda _: Status("one", 0.0, ()))
-    early.watch(keys.of_every_arm("f", "alive"), lambda *_: None)
+    early.reply_to(keys.of_jobs("f", "status"), StatusRequest, lambda _: Status("one", 0.0, ()))
+    early.watch_tokens(keys.of_every_arm("f", "alive"), lambda *_: None)
     with pytest.raises(BusError, match="has an auctioneer already, which does not answer"):
         bus.auctioneer("two")
     stop = threading.Event()
@@ -248,7 +251,7 @@ def test_one_that_answers_and_shows_no_token_yet_is_an_auctioneer_too(bus):
         with pytest.raises(BusError, match="has an auctioneer already: 'one'"):
             bus.auctioneer("two")
         with bus.link() as arm:
-            arm.alive(keys.of_arm("f", "one", "alive"))
+            arm.declare_token(keys.of_arm("f", "one", "alive"))
             with pytest.raises(BusError, match=r"share the jobs out themselves; 'one' answers .* Stop them first"):
                 bus.auctioneer("two")
     finally:
@@ -262,8 +265,8 @@ def test_two_auctioneers_are_both_seen_and_do_nothing_together(bus, monkeypatch)
     one, two = bus.auctioneer("one"), bus.auctioneer("two")
     arm = bus.arm("arm_0")
     bus.until(lambda: one.rivals == {"two"} and two.rivals == {"one"} and one.present == {"arm_0"})
-    answers = bus.ask(keys.of_jobs("f", "submit"), Submission(jobs("a")), Submitted)
-    assert not answers.words
+    answers = bus.ask(keys.of_jobs("f", "submit"), Submission(jobs("a")), SubmissionReply)
+    assert not answers.messages
     assert (
         sorted(answers.refused.values())
         == ["Fleet 'f' has more than one auctioneer (one, two): no jobs are taken until one is stopped."] * 2
@@ -271,8 +274,8 @@ def test_two_auctioneers_are_both_seen_and_do_nothing_together(bus, monkeypatch)
     with pytest.raises(Objection, match="more than one auctioneer"):
         one.submit(Submission(jobs("a")))
     status = bus.ask(keys.of_jobs("f", "status"), StatusRequest(), Status)
-    assert sorted(word.auctioneer for word in status.words.values()) == ["one", "two"]
-    assert len(bus.ask(keys.of_clock("f"), ClockRequest(), Clock).words) == 2
+    assert sorted(word.auctioneer for word in status.messages.values()) == ["one", "two"]
+    assert len(bus.ask(keys.of_clock("f"), ClockRequest(), Clock).messages) == 2
     bus.kill(two)
     bus.until(lambda: not one.rivals)
     one.submit(Submission(jobs("a")))
@@ -325,9 +328,9 @@ def test_what_was_taken_before_a_second_auctioneer_came_is_awarded_by_nobody_mea
     arm = bus.arm("arm_0")
     bus.until(lambda: one.present == {"arm_0"})
     seen = bus.link()
-    onlooker = Onlooker(seen)
+    onlooker = FleetListener(seen)
     bus.until(
-        lambda: {said.auctioneer for said in onlooker.overview.now(0.0).auctioneers if said.token} == {"one", "two"}
+        lambda: {said.auctioneer for said in onlooker.view.snapshot(0.0).auctioneers if said.token} == {"one", "two"}
     )
     bus.until(partial(later, time.monotonic() + 0.5))
     assert states(one) == ["waiting"]
@@ -342,8 +345,8 @@ def later(at_s):
 
 def test_the_fleets_time_runs_at_its_speed(bus):
     bus.auctioneer(speed=1000.0)
-    (one,) = bus.ask(keys.of_clock("f"), ClockRequest(), Clock).words.values()
-    (two,) = bus.ask(keys.of_clock("f"), ClockRequest(), Clock).words.values()
+    (one,) = bus.ask(keys.of_clock("f"), ClockRequest(), Clock).messages.values()
+    (two,) = bus.ask(keys.of_clock("f"), ClockRequest(), Clock).messages.values()
     assert one.speed == 1000.0
     assert 0.0 <= one.time_s < two.time_s
 
@@ -351,7 +354,7 @@ def test_the_fleets_time_runs_at_its_speed(bus):
 def test_an_arm_with_a_token_that_says_nothing_is_not_there(bus):
     node = bus.auctioneer()
     mute = bus.link()
-    mute.alive(keys.of_arm("f", "mute", "alive"))
+    mute.declare_token(keys.of_arm("f", "mute", "alive"))
     bus.arm("arm_0")
     bus.until(lambda: node.present == {"arm_0"} and "mute" in node._tokens)
 
@@ -366,26 +369,26 @@ def test_a_full_disk_is_a_refusal_and_no_end(bus):
 
     node = bus.auctioneer(sync=sync)
     full.append(errno.ENOSPC)
-    answers = bus.ask(keys.of_jobs("f", "submit"), Submission(jobs("a")), Submitted)
-    assert "has no room for more" in next(iter(answers.refused.values()))
+    answers = bus.ask(keys.of_jobs("f", "submit"), Submission(jobs("a")), SubmissionReply)
+    assert "no space left" in next(iter(answers.refused.values()))
     full.append(errno.ENOSPC)
     with pytest.raises(JournalFull):
         node.submit(Submission(jobs("a")))
-    assert bus.ask(keys.of_jobs("f", "submit"), Submission(jobs("a")), Submitted).words
+    assert bus.ask(keys.of_jobs("f", "submit"), Submission(jobs("a")), SubmissionReply).messages
     assert states(node) == ["waiting"]
 
 
 def test_a_journal_is_shortened_at_the_start_and_when_it_has_grown(bus, monkeypatch):
     first = bus.auctioneer()
     bus.arm("arm_0")
-    bus.ask(keys.of_jobs("f", "submit"), Submission(jobs("a"), "test"), Submitted)
+    bus.ask(keys.of_jobs("f", "submit"), Submission(jobs("a"), "test"), SubmissionReply)
     bus.until(lambda: states(first) == ["finished"])
     bus.kill(first)
     again = bus.auctioneer()
-    assert [type(record).__name__ for record in again.journal.replay()] == ["Standing", "Began"]
+    assert [type(record).__name__ for record in again.journal.records()] == ["LedgerSnapshot", "Started"]
     assert states(again) == ["finished"]
     monkeypatch.setattr(auction_node, "TICK_S", 0.01)
-    monkeypatch.setattr(journal, "LEAST_LONG_BYTES", 1)
+    monkeypatch.setattr(journal, "COMPACT_BYTES", 1)
     before = again.journal.size
     bus.kill(again)
     third = bus.auctioneer()
@@ -397,13 +400,18 @@ def test_a_journal_is_shortened_at_the_start_and_when_it_has_grown(bus, monkeypa
 
 def test_a_journal_that_cannot_be_shortened_is_gone_on_with(bus, monkeypatch, caplog):
     first = bus.auctioneer()
-    bus.ask(keys.of_jobs("f", "submit"), Submission(jobs("a"), "test"), Submitted)
+    bus.ask(keys.of_jobs("f", "submit"), Submission(jobs("a"), "test"), SubmissionReply)
     bus.kill(first)
     with monkeypatch.context() as full:
         full.setattr(Journal, "rewrite", refuse)
         again = bus.auctioneer()
-    assert "stays as long as it is: no room" in caplog.text
-    assert [type(record).__name__ for record in again.journal.replay()] == ["Standing", "Began", "Accepted", "Began"]
+    assert "is not compacted: no room" in caplog.text
+    assert [type(record).__name__ for record in again.journal.records()] == [
+        "LedgerSnapshot",
+        "Started",
+        "JobsAccepted",
+        "Started",
+    ]
     assert states(again) == ["waiting"]
 
 
@@ -415,8 +423,8 @@ def test_a_status_of_very_many_jobs_fits_into_a_word_and_tells_the_open_ones_fir
     node = bus.auctioneer()
     long = "x" * 100
     node.submit(Submission(jobs(*(f"{long}{i}" for i in range(1500)))))
-    (status,) = bus.ask(keys.of_jobs("f", "status"), StatusRequest(), Status).words.values()
+    (status,) = bus.ask(keys.of_jobs("f", "status"), StatusRequest(), Status).messages.values()
     assert 100 < len(status.jobs) <= 256
     assert len(encode(status)) < 65_536
     first = JobStatus("done", "finished")
-    assert first_of((first, *status.jobs * 2))[0].state == "waiting"
+    assert statuses_that_fit((first, *status.jobs * 2))[0].state == "waiting"

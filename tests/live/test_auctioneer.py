@@ -2,12 +2,12 @@
 
 import pytest
 
-from fleet.bus.trade import (
+from fleet.bus.protocol.auction import (
     Award,
-    Hold,
-    JobWord,
+    JobEstimate,
+    JobSpec,
+    LeaseEntry,
     LeaseRequest,
-    Offer,
     Quote,
     QuoteRequest,
     Receipt,
@@ -15,7 +15,7 @@ from fleet.bus.trade import (
     Submission,
 )
 from fleet.errors import JournalFull
-from fleet.live.auctioneer import Objection
+from fleet.live.auction.auctioneer import Objection
 
 
 @pytest.fixture
@@ -23,15 +23,15 @@ def fleet_of(live):
     return lambda count: live.Fleet([live.Arm(f"arm_{i}") for i in range(count)])
 
 
-def hold(name: str, place: str = "rack", repetitions: int = 3, **changes) -> JobWord:
-    return JobWord(name=name, kind="hold", places=(place,), repetitions=repetitions, **changes)
+def hold(name: str, place: str = "rack", repetitions: int = 3, **changes) -> JobSpec:
+    return JobSpec(name=name, kind="hold", places=(place,), repetitions=repetitions, **changes)
 
 
 def under_way(fleet, kind: type) -> list:
     return [wire.word for wire in fleet.wires if isinstance(wire.word, kind)]
 
 
-def bid(fleet, *words: JobWord) -> None:
+def bid(fleet, *words: JobSpec) -> None:
     """Hand in jobs, open a round and let every arm answer."""
     fleet.submit(*words)
     fleet.step(0.1)
@@ -127,7 +127,7 @@ def test_a_report_on_the_award_of_another_is_refused(fleet_of):
     (award,) = under_way(fleet, Award)
     lie = Report("arm_1", award.award, "a", "finished", 3, 1.0)
     with pytest.raises(Objection, match="is of 'a' to 'arm_0', not of 'a' to 'arm_1'"):
-        fleet.auctioneer.reported(lie, fleet.real_s, fleet.true_s)
+        fleet.auctioneer.apply_report(lie, fleet.real_s, fleet.true_s)
     assert fleet.auctioneer.status()[0].state == "awarded"
 
 
@@ -137,16 +137,16 @@ def test_the_same_report_again_changes_nothing(fleet_of):
     fleet.deliver_all()
     fleet.arms["arm_0"].give_back(fleet.true_s)
     (report,) = fleet.arms["arm_0"].reports.values()
-    first = fleet.auctioneer.reported(report, fleet.real_s, fleet.true_s)
+    first = fleet.auctioneer.apply_report(report, fleet.real_s, fleet.true_s)
     written = len(fleet.journal)
-    assert fleet.auctioneer.reported(report, fleet.real_s, fleet.true_s) == first
+    assert fleet.auctioneer.apply_report(report, fleet.real_s, fleet.true_s) == first
     assert len(fleet.journal) == written
 
 
 def test_a_report_on_an_award_that_nobody_made_changes_nothing(fleet_of):
     fleet = fleet_of(1)
     fleet.submit(hold("a"))
-    receipt = fleet.auctioneer.reported(Report("arm_0", "old", "a", "finished", 3, 1.0), 0.0, 0.0)
+    receipt = fleet.auctioneer.apply_report(Report("arm_0", "old", "a", "finished", 3, 1.0), 0.0, 0.0)
     assert receipt == Receipt("auctioneer", "old")
     assert fleet.auctioneer.status()[0].state == "waiting"
 
@@ -155,9 +155,9 @@ def test_a_lease_of_another_arm_is_lost(fleet_of):
     fleet = fleet_of(2)
     bid(fleet, hold("a"))
     (award,) = under_way(fleet, Award)
-    holds = (Hold(award.award, "a", 2, "finishing"),)
-    lease = fleet.auctioneer.leased(LeaseRequest("arm_1", holds), fleet.real_s, fleet.true_s)
-    assert (lease.granted, lease.lost, lease.leave) == ((), (award.award,), ())
+    holds = (LeaseEntry(award.award, "a", 2, "finishing"),)
+    lease = fleet.auctioneer.renew_leases(LeaseRequest("arm_1", holds), fleet.real_s, fleet.true_s)
+    assert (lease.granted, lease.revoked, lease.may_commit) == ((), (award.award,), ())
 
 
 def test_who_asks_late_keeps_a_job_that_was_not_taken_back(fleet_of, live):
@@ -167,10 +167,10 @@ def test_who_asks_late_keeps_a_job_that_was_not_taken_back(fleet_of, live):
     fleet.true_s += 10 * live.TIMING.lease_s  # as if the auctioneer had stood still
     (award,) = fleet.arms["arm_0"].holds
     request = fleet.arms["arm_0"].request()
-    assert fleet.auctioneer.leased(request, fleet.real_s, fleet.true_s).granted == (award,)
+    assert fleet.auctioneer.renew_leases(request, fleet.real_s, fleet.true_s).granted == (award,)
     fleet.true_s += 2 * live.TIMING.lease_s
     fleet.auctioneer.tick(fleet.real_s, fleet.true_s)
-    assert fleet.auctioneer.leased(request, fleet.real_s, fleet.true_s).lost == (award,)
+    assert fleet.auctioneer.renew_leases(request, fleet.real_s, fleet.true_s).revoked == (award,)
 
 
 def test_what_no_arm_can_do_says_why(fleet_of):
@@ -178,9 +178,9 @@ def test_what_no_arm_can_do_says_why(fleet_of):
     fleet.submit(hold("a"))
     fleet.step(0.1)
     (request,) = under_way(fleet, QuoteRequest)
-    offers = (Offer("a", False, "reach: 1.2 m"),)
+    offers = (JobEstimate("a", False, "reach: 1.2 m"),)
     quote = Quote("arm_0", request.auction, "q", 1.0, "model", 0.0, "idle", 10.0, 1, offers)
-    fleet.auctioneer.quoted(quote, fleet.real_s, fleet.true_s)
+    fleet.auctioneer.add_quote(quote, fleet.real_s, fleet.true_s)
     assert fleet.auctioneer.status()[0].reason == "No arm can do it: arm_0: reach: 1.2 m."
 
 
@@ -188,15 +188,15 @@ def test_what_cannot_be_written_is_not_promised(fleet_of):
     fleet = fleet_of(1)
     fleet.full = True
     with pytest.raises(JournalFull):
-        fleet.auctioneer.submitted(Submission((hold("a"),)), 0.0, 0.0)
+        fleet.auctioneer.submit(Submission((hold("a"),)), 0.0, 0.0)
     assert fleet.auctioneer.status() == ()
     fleet.full = False
     bid(fleet, hold("a", repetitions=1))
     fleet.deliver_all()
     fleet.full = True
     (award,) = fleet.arms["arm_0"].holds
-    lease = fleet.auctioneer.leased(fleet.arms["arm_0"].request(), fleet.real_s, fleet.true_s)
-    assert (lease.granted, lease.leave) == ((award,), ())
+    lease = fleet.auctioneer.renew_leases(fleet.arms["arm_0"].request(), fleet.real_s, fleet.true_s)
+    assert (lease.granted, lease.may_commit) == ((award,), ())
 
 
 def test_the_last_results_are_said_again_after_a_restart(fleet_of):
@@ -217,5 +217,5 @@ def test_the_end_of_the_shift_is_reported_for_what_is_not_done(fleet_of):
     fleet.deliver_all()
     fleet.auctioneer.end(7200.0)
     assert [said.state for said in fleet.auctioneer.status()] == ["unfinished", "unfinished"]
-    lease = fleet.auctioneer.leased(fleet.arms["arm_0"].request(), fleet.real_s, fleet.true_s)
-    assert len(lease.lost) == 1
+    lease = fleet.auctioneer.renew_leases(fleet.arms["arm_0"].request(), fleet.real_s, fleet.true_s)
+    assert len(lease.revoked) == 1

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet.env.allocation_v0 import Episode, parallel_env
-from fleet.live.body import MOST_STEPS, SimulatedBody
+from fleet.live.arm.simulated_body import MAX_STEPS, SimulatedBody
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED
 from fleet.thermal import WINDING
@@ -17,8 +17,8 @@ DT_S = 10.0
 LIMITS = ThermalLimits()
 
 
-def body_of(arm, *, dt_s=DT_S, limits=LIMITS, air_c=lambda time_s: 25.0, warm=False, seed=0):
-    return SimulatedBody(arm, limits, air_c, dt_s=dt_s, rng=np.random.default_rng(seed), warm=warm)
+def body_of(arm, *, dt_s=DT_S, limits=LIMITS, ambient_c=lambda time_s: 25.0, warm=False, seed=0):
+    return SimulatedBody(arm, limits, ambient_c, dt_s=dt_s, rng=np.random.default_rng(seed), warm=warm)
 
 
 def one_job(small, *, repetitions=3, payload=None, times=None):
@@ -55,7 +55,7 @@ def test_it_lives_through_the_same_shift_as_the_simulator(small, data):
         lambda seed: Episode(world=world, plant=plant, twins=("t",), sensors=np.random.SeedSequence(0)),
         keep_events=True,
     )
-    body = body_of(arm, limits=limits, air_c=lambda time_s: float(air[int(time_s / DT_S), 0]))
+    body = body_of(arm, limits=limits, ambient_c=lambda time_s: float(air[int(time_s / DT_S), 0]))
     shift.reset(seed=0)
     waiting = {job.name: job.release_s for job in jobs}
     done, by_name, lived = dict.fromkeys(waiting, 0), {job.name: job for job in jobs}, []
@@ -64,11 +64,11 @@ def test_it_lives_through_the_same_shift_as_the_simulator(small, data):
         shift.step({"arm_0": 1 if legal[1] else 0})
         order = sorted(waiting, key=lambda n: (waiting[n], list(by_name).index(n)))
         ready = [n for n in order if waiting[n] <= tick * DT_S]
-        if body.free and ready:
+        if body.is_free and ready:
             job = by_name[ready[0]]
             del waiting[job.name]
-            body.begin(job, arm.plans[job.work][0], done[job.name])
-            body.permit(job.repetitions)
+            body.start(job, arm.plans[job.work][0], done[job.name])
+            body.allow_cycles(job.repetitions)
         for each in body.advance((tick + 1) * DT_S):
             lived.append(each)
             if each.kind == "return":
@@ -89,42 +89,42 @@ def test_a_job_ends_at_its_planned_moment_whatever_the_step(small):
     arm, job, plan = one_job(small)
     for dt_s in (0.3, 0.7, 6.0):
         body = body_of(arm, dt_s=dt_s)
-        body.begin(job, plan, 1)
-        assert body.last_in_s() == pytest.approx(3.0 + 10.0)
+        body.start(job, plan, 1)
+        assert body.last_cycle_in_s() == pytest.approx(3.0 + 10.0)
         assert body.free_in_s() == pytest.approx(3.0 + 20.0 + 2.0)
-        body.permit(3)
+        body.allow_cycles(3)
         events = body.advance(60.0)
         assert [(e.kind, e.job) for e in events if e.kind in ("finish", "home")] == [("finish", "a"), ("home", "a")]
         assert [e.time_s for e in events if e.kind in ("finish", "home")] == pytest.approx([23.0, 25.0])
-        assert body.free
+        assert body.is_free
 
 
 def test_without_leave_it_stops_before_the_last_cycle_and_comes_home(small):
     arm, job, plan = one_job(small)
     body = body_of(arm, dt_s=1.0)
-    body.begin(job, plan, 0)
-    body.permit(2)
+    body.start(job, plan, 0)
+    body.allow_cycles(2)
     events = body.advance(24.0)
     assert body.cycles == 2
-    assert body.last_in_s() == pytest.approx(1.0 + 3.0)  # on its way home, and back again
+    assert body.last_cycle_in_s() == pytest.approx(1.0 + 3.0)  # on its way home, and back again
     events += body.advance(100.0)
     assert [e.kind for e in events] == ["home"]
     assert events[0].time_s == pytest.approx(25.0)
-    assert (body.job, body.cycles, body.free) == ("a", 2, False)
-    body.permit(3)
+    assert (body.job, body.cycles, body.is_free) == ("a", 2, False)
+    body.allow_cycles(3)
     events = body.advance(200.0)
     assert [(e.kind, e.time_s) for e in events] == [("finish", pytest.approx(113.0)), ("home", pytest.approx(115.0))]
-    assert body.free
+    assert body.is_free
 
 
 def test_leave_in_time_makes_it_one_stint(small):
     arm, job, plan = one_job(small)
     body = body_of(arm, dt_s=1.0)
-    body.begin(job, plan, 0)
-    body.permit(2)
+    body.start(job, plan, 0)
+    body.allow_cycles(2)
     body.advance(22.0)
-    assert body.last_in_s() == pytest.approx(1.0)
-    body.permit(3)
+    assert body.last_cycle_in_s() == pytest.approx(1.0)
+    body.allow_cycles(3)
     assert [e.time_s for e in body.advance(60.0) if e.kind == "finish"] == pytest.approx([33.0])
 
 
@@ -134,10 +134,10 @@ def test_leave_in_time_makes_it_one_stint(small):
 def test_paused_it_ends_the_cycle_it_began_and_goes_home(small, when, cycles, home_s):
     arm, job, plan = one_job(small)
     body = body_of(arm, dt_s=0.5)
-    body.begin(job, plan, 0)
-    body.permit(3)
+    body.start(job, plan, 0)
+    body.allow_cycles(3)
     body.advance(when)
-    body.permit(body.cycles)
+    body.allow_cycles(body.cycles)
     events = body.advance(50.0)
     assert [(e.kind, e.time_s) for e in events] == [("home", pytest.approx(home_s))]
     assert (body.job, body.cycles) == ("a", cycles)
@@ -146,46 +146,46 @@ def test_paused_it_ends_the_cycle_it_began_and_goes_home(small, when, cycles, ho
 def test_a_pause_that_is_over_before_it_takes_effect_is_none(small):
     arm, job, plan = one_job(small)
     body = body_of(arm, dt_s=0.5)
-    body.begin(job, plan, 0)
-    body.permit(3)
+    body.start(job, plan, 0)
+    body.allow_cycles(3)
     body.advance(9.0)
-    body.permit(0)
+    body.allow_cycles(0)
     body.advance(11.0)
-    body.permit(3)
+    body.allow_cycles(3)
     assert [e.time_s for e in body.advance(60.0) if e.kind == "finish"] == pytest.approx([33.0])
 
 
 def test_nothing_moves_before_it_may(small):
     arm, job, plan = one_job(small, repetitions=1)
     body = body_of(arm)
-    body.begin(job, plan, 0)
+    body.start(job, plan, 0)
     assert body.advance(300.0) == []
-    assert (body.job, body.cycles, body.free) == ("a", 0, False)
-    assert body.last_in_s() == pytest.approx(3.0)
+    assert (body.job, body.cycles, body.is_free) == ("a", 0, False)
+    assert body.last_cycle_in_s() == pytest.approx(3.0)
 
 
 def test_what_it_lets_go_of_is_forgotten_when_it_is_home(small):
     arm, job, plan = one_job(small)
     body = body_of(arm, dt_s=1.0)
-    body.begin(job, plan, 0)
-    body.permit(3)
+    body.start(job, plan, 0)
+    body.allow_cycles(3)
     body.advance(8.0)
-    body.let_go()
-    assert (body.job, body.free) == ("", False)
+    body.release()
+    assert (body.job, body.is_free) == ("", False)
     assert [(e.kind, e.time_s) for e in body.advance(30.0)] == [("home", pytest.approx(15.0))]
-    assert body.free
-    body.begin(job, plan, 0)
-    body.let_go()
-    assert body.free
+    assert body.is_free
+    body.start(job, plan, 0)
+    body.release()
+    assert body.is_free
 
 
 def test_letting_go_in_the_last_cycle_finishes_nothing(small):
     arm, job, plan = one_job(small)
     body = body_of(arm, dt_s=1.0)
-    body.begin(job, plan, 2)
-    body.permit(3)
+    body.start(job, plan, 2)
+    body.allow_cycles(3)
     body.advance(8.0)
-    body.let_go()
+    body.release()
     assert [e.kind for e in body.advance(60.0)] == ["home"]
 
 
@@ -193,8 +193,8 @@ def test_a_fault_gives_the_job_back_with_its_cycles_and_the_arm_recovers(small):
     arm, job, plan = one_job(small, repetitions=5000, payload=small.HOT)
     limits = ThermalLimits(warning_c=60.0, error_c=75.0, restart_c=50.0)
     body = body_of(arm, limits=limits)
-    body.begin(job, plan, 7)
-    body.permit(5000)
+    body.start(job, plan, 7)
+    body.allow_cycles(5000)
     events = [event for hour in range(40) for event in body.advance((hour + 1) * 360.0)]
     kinds = [e.kind for e in events]
     assert kinds[:4] == ["torque_warning", "warning", "fault", "return"]
@@ -202,7 +202,7 @@ def test_a_fault_gives_the_job_back_with_its_cycles_and_the_arm_recovers(small):
     assert returned.time_s == fault.time_s
     assert returned.value == 7 + (fault.time_s - 3.0) // 10.0
     assert kinds[4:] == ["recover"]
-    assert body.free
+    assert body.is_free
     assert body.job == ""
     peak = body.truth.peak_c[0, 0]
     assert 75.0 <= peak < 76.0
@@ -211,37 +211,37 @@ def test_a_fault_gives_the_job_back_with_its_cycles_and_the_arm_recovers(small):
 def test_a_faulted_body_is_not_free_and_says_when_not(small):
     arm, job, plan = one_job(small, repetitions=5000, payload=small.HOT)
     body = body_of(arm)
-    body.begin(job, plan, 0)
-    body.permit(5000)
+    body.start(job, plan, 0)
+    body.allow_cycles(5000)
     while body.truth.mode[0, 0] != FAULTED:
         body.advance(body.time_s + DT_S)
-    assert not body.free
+    assert not body.is_free
     assert body.free_in_s() == np.inf
-    assert body.last_in_s() == np.inf
-    assert body.read().mode == "faulted"
-    assert set(body.read().current_a) == {0.0}
-    with pytest.raises(ValueError, match="cannot begin"):
-        body.begin(job, plan, 0)
+    assert body.last_cycle_in_s() == np.inf
+    assert body.read_sensors().mode == "faulted"
+    assert set(body.read_sensors().current_a) == {0.0}
+    with pytest.raises(ValueError, match="not free and cannot start"):
+        body.start(job, plan, 0)
 
 
 def test_what_it_reads_is_what_it_does(small):
     arm, job, plan = one_job(small, payload=small.WARM)
     body = body_of(arm, dt_s=1.0, warm=True)
-    rest = body.read()
+    rest = body.read_sensors()
     assert rest.mode == "idle"
     np.testing.assert_allclose(rest.q, arm.robot.home_q())
     np.testing.assert_allclose(rest.tau, arm.rest_tau)
     noise_k = arm.motors.sensor_noise_k
     assert (np.abs(np.array(rest.temp_c) - body.truth.temp_c[0, 0, WINDING]) < 6 * noise_k).all()
-    body.begin(job, plan, 0)
-    body.permit(3)
+    body.start(job, plan, 0)
+    body.allow_cycles(3)
     body.advance(5.0)
-    working = body.read()
+    working = body.read_sensors()
     assert working.mode == "working"
     np.testing.assert_allclose(working.tau, small.torque(small.WARM), rtol=1e-6)
     assert working.current_a[1] > rest.current_a[1] > 0
     body.advance(60.0)
-    np.testing.assert_allclose(body.read().current_a, rest.current_a, rtol=1e-3)
+    np.testing.assert_allclose(body.read_sensors().current_a, rest.current_a, rtol=1e-3)
 
 
 def test_its_time_can_be_set_and_it_catches_up_in_bounded_steps(small):
@@ -250,11 +250,11 @@ def test_its_time_can_be_set_and_it_catches_up_in_bounded_steps(small):
     body.advance(10.0)
     body.set_time(5000.0)
     assert body.time_s == pytest.approx(5000.0)
-    body.begin(job, plan, 0)
-    body.permit(3)
+    body.start(job, plan, 0)
+    body.allow_cycles(3)
     assert [e.time_s for e in body.advance(5060.0) if e.kind == "finish"] == pytest.approx([5033.0])
     body.advance(1e6)
-    assert body.time_s == pytest.approx(5060.0 + MOST_STEPS)
+    assert body.time_s == pytest.approx(5060.0 + MAX_STEPS)
 
 
 def test_a_change_of_pace_changes_nothing_else(small):
@@ -262,12 +262,12 @@ def test_a_change_of_pace_changes_nothing_else(small):
     arm, job, plan = one_job(small, repetitions=5000, payload=small.HOT)
     bodies = [body_of(arm, dt_s=5.0), body_of(arm, dt_s=5.0)]
     for body in bodies:
-        body.begin(job, plan, 0)
-        body.permit(5000)
+        body.start(job, plan, 0)
+        body.allow_cycles(5000)
         while body.truth.mode[0, 0] != FAULTED:
             body.advance(body.time_s + 5.0)
     steady, changed = bodies
-    changed.set_pace(2.5)
+    changed.set_step(2.5)
     assert changed.time_s == pytest.approx(steady.time_s)
     until_s = steady.time_s + 2 * 3600.0
     events = [[], []]
@@ -283,10 +283,10 @@ def test_a_change_of_pace_changes_nothing_else(small):
 def test_no_step_is_longer_than_it_may_be(small):
     arm, _, _ = one_job(small)
     body = SimulatedBody(
-        arm, LIMITS, lambda time_s: 25.0, dt_s=60.0, longest_s=10.0, rng=np.random.default_rng(0), warm=False
+        arm, LIMITS, lambda time_s: 25.0, dt_s=60.0, max_dt_s=10.0, rng=np.random.default_rng(0), warm=False
     )
     body.advance(10.0)
     assert body.time_s == 10.0
-    body.set_pace(100.0)
+    body.set_step(100.0)
     body.advance(20.0)
     assert body.time_s == 20.0

@@ -10,15 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet.bus import keys
-from fleet.bus.link import REMEMBERED, Link
-from fleet.bus.messages import State
-from fleet.bus.router import Router
-from fleet.bus.trade import ArmEvent, JobStatus, Result
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.router import Router
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
+from fleet.bus.protocol.messages import State
 from fleet.errors import FleetError
-from scenarios.bus_recording import CARD, Recorder, part_files, read_card, read_parts, states
-from scenarios.bus_replay import Replay
-from scenarios.live_record import alone, record
+from scenarios.cli.live.record import lock_folder, record
+from scenarios.live.recorder import CARD, Recorder, part_files, read_card, read_parts, states
+from scenarios.live.replayer import Replay
 
 PATIENCE_S = 20.0
 
@@ -44,24 +44,24 @@ def event(arm, number):
 
 def result(number):
     status = JobStatus(job=f"job {number}", state="finished", arm="a", award="x", cycles=3, finished_s=number / 2)
-    return Result(auctioneer="boss", number=number, time_s=number / 2, status=status, d=0.5)
+    return Result(auctioneer="boss", number=number, time_s=number / 2, status=status, difficulty=0.5)
 
 
 def test_what_was_said_is_what_is_read(tmp_path):
     recorder = Recorder.open(tmp_path, "f")
     said = [state(arm, tick) for tick in range(5) for arm in ("a", "b")]
     for word in said:
-        recorder.state(word.arm, word)
+        recorder.add(word.arm, word)
     for number in range(3):
-        recorder.event("a", event("a", number))
-        recorder.result("boss", result(number))
+        recorder.add("a", event("a", number))
+        recorder.add("boss", result(number))
     recorder.write(status="finished")
     read = list(states(read_parts(tmp_path, "telemetry")))
     assert sorted(read, key=lambda w: (w.tick, w.arm)) == sorted(said, key=lambda w: (w.tick, w.arm))
     told = Replay.of(tmp_path)
-    assert [w for w in told.words() if isinstance(w, ArmEvent)] == [event("a", n) for n in range(3)]
-    assert [w for w in told.words() if isinstance(w, Result)] == [result(n) for n in range(3)]
-    assert read_card(tmp_path)["status"] == "finished"
+    assert [w for w in told.messages() if isinstance(w, ArmEvent)] == [event("a", n) for n in range(3)]
+    assert [w for w in told.messages() if isinstance(w, Result)] == [result(n) for n in range(3)]
+    assert read_card(tmp_path).status == "finished"
 
 
 @settings(max_examples=50, deadline=None)
@@ -72,7 +72,7 @@ def test_every_word_is_kept_once_and_gaps_are_counted(tmp_path_factory, ticks):
     for tick in ticks:  # a word is new if it is later than all before
         if not kept or tick > kept[-1]:
             kept.append(tick)
-        recorder.state("a", state("a", tick))
+        recorder.add("a", state("a", tick))
     count = recorder.counts["state of a"]
     assert count.kept == len(kept)
     assert count.twice == len(ticks) - len(kept)
@@ -82,31 +82,31 @@ def test_every_word_is_kept_once_and_gaps_are_counted(tmp_path_factory, ticks):
 def test_an_arm_that_began_anew_is_heard_again(tmp_path):
     recorder = Recorder.open(tmp_path, "f")
     for word in (state("a", 7, 70.0), state("a", 0, 80.0), state("a", 1, 81.0), state("a", 0, 80.0)):
-        recorder.state("a", word)
+        recorder.add("a", word)
     assert (recorder.counts["state of a"].kept, recorder.counts["state of a"].missed) == (3, 0)
 
 
 def test_it_is_readable_while_it_goes_on_and_goes_on_where_it_stopped(tmp_path):
     first = Recorder.open(tmp_path, "f")
-    first.state("a", state("a", 0))
+    first.add("a", state("a", 0))
     first.write()
     assert read_parts(tmp_path, "telemetry").num_rows == 1
-    first.state("a", state("a", 1))  # never written: the process died
+    first.add("a", state("a", 1))  # never written: the process died
     again = Recorder.open(tmp_path, "f")
-    again.state("a", state("a", 0))  # from a cache
-    again.state("a", state("a", 1))
+    again.add("a", state("a", 0))  # from a cache
+    again.add("a", state("a", 1))
     again.write()
     assert read_parts(tmp_path, "telemetry")["tick"].to_pylist() == [0, 1]
     assert [path.name for path in part_files(tmp_path, "telemetry")] == [
         "telemetry-000001.parquet",
         "telemetry-000002.parquet",
     ]
-    assert read_card(tmp_path)["status"] == "recording"
+    assert read_card(tmp_path).status == "recording"
 
 
 def test_a_full_disk_loses_nothing(tmp_path, monkeypatch):
     recorder = Recorder.open(tmp_path, "f")
-    recorder.state("a", state("a", 0))
+    recorder.add("a", state("a", 0))
 
     def full(*_):
         raise OSError(28, "No space left on device")
@@ -121,7 +121,7 @@ def test_a_full_disk_loses_nothing(tmp_path, monkeypatch):
 
 def test_what_is_no_recording_is_refused(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(FleetError, match="holds other things"):
+    with pytest.raises(FleetError, match="holds other files"):
         Recorder.open(tmp_path, "f")
     with pytest.raises(FleetError, match="neither a run"):
         Replay.of(tmp_path)
@@ -142,7 +142,7 @@ class Recording:
         self.recorder = None
 
     def _run(self, endpoint, folder):
-        with Link(endpoint, "f") as link:
+        with BusClient(endpoint, "f") as link:
             self.recorder = record(link, folder, rotate_s=0.2, stopped=self._stop.is_set)
 
     def __enter__(self):
@@ -172,8 +172,8 @@ def test_nothing_is_lost_when_the_router_is_started_again(tmp_path):
     with ExitStack() as stack:
         router = Router().open()
         port = int(router.endpoint.rpartition(":")[2])
-        arm = stack.enter_context(Link(router.endpoint, "f"))
-        say = arm.publisher(keys.of_arm("f", "a", "state"), State, remember=REMEMBERED)
+        arm = stack.enter_context(BusClient(router.endpoint, "f"))
+        say = arm.publisher(keys.of_arm("f", "a", "state"), State)
         recording = stack.enter_context(Recording(router.endpoint, tmp_path))
         for tick in range(50):
             say(state("a", tick))
@@ -200,16 +200,16 @@ def test_nothing_is_lost_when_the_router_is_started_again(tmp_path):
 def test_a_replay_says_the_same_again_and_refuses_to_speak_for_those_who_are_there(tmp_path):
     first = Recorder.open(tmp_path / "first", "f")
     for tick in range(20):
-        first.state("a", state("a", tick))
-        first.event("a", event("a", tick))
-        first.result("boss", result(tick))
+        first.add("a", state("a", tick))
+        first.add("a", event("a", tick))
+        first.add("boss", result(tick))
     first.write()
     told = Replay.of(tmp_path / "first")
-    with Router() as router, Recording(router.endpoint, tmp_path / "second"), Link(router.endpoint, "f") as link:
+    with Router() as router, Recording(router.endpoint, tmp_path / "second"), BusClient(router.endpoint, "f") as link:
         wait_for(lambda: (tmp_path / "second" / CARD).exists(), link)
         assert told.play(link, speed=100.0, stopped=lambda: False) == 60
         wait_for(lambda: rows(tmp_path / "second", "results") == 20, link)
-        with Link(router.endpoint, "f") as other, pytest.raises(FleetError, match="on the bus already"):
+        with BusClient(router.endpoint, "f") as other, pytest.raises(FleetError, match="on the bus already"):
             told.play(other, speed=100.0, stopped=lambda: False)
     for kind in ("telemetry", "events", "results"):
         assert read_parts(tmp_path / "second", kind).equals(read_parts(tmp_path / "first", kind)), kind
@@ -217,7 +217,7 @@ def test_a_replay_says_the_same_again_and_refuses_to_speak_for_those_who_are_the
 
 def test_two_do_not_record_in_one_folder(tmp_path):
     rec = tmp_path / "rec"
-    with alone(rec), pytest.raises(FleetError, match="Another process records"), alone(rec):
+    with lock_folder(rec), pytest.raises(FleetError, match="Another process records"), lock_folder(rec):
         pass
-    with alone(rec):  # the first has ended
+    with lock_folder(rec):  # the first has ended
         pass

@@ -33,7 +33,7 @@ def test_it_never_goes_backwards_and_its_rate_is_bounded(speed, start, correctio
         asked, real_s = real_s + wait, real_s + wait + trip
         shown = clock.now_s(real_s)
         assert shown >= before
-        clock = clock.corrected(asked, real_s, said)
+        clock = clock.slewed_to(asked, real_s, said)
         assert clock.now_s(real_s) == shown  # the correction itself is no jump
         before = shown
     for step in spans:
@@ -52,14 +52,14 @@ def test_after_a_correction_it_is_right_within_half_a_round_trip(speed, asked, t
     answered = asked + trip
     said = speed * (asked + share * trip + 100.0)
     settled = answered + (abs(ahead) + trip) / SLEW + 1.0
-    off = clock.corrected(asked, answered, said).now_s(settled) - speed * (settled + 100.0)
+    off = clock.slewed_to(asked, answered, said).now_s(settled) - speed * (settled + 100.0)
     assert abs(off) <= speed * trip / 2 + 1e-6 * speed
-    at_once = clock.set_by(asked, answered, said).now_s(answered) - speed * (answered + 100.0)
+    at_once = clock.set_to(asked, answered, said).now_s(answered) - speed * (answered + 100.0)
     assert abs(at_once) <= speed * trip / 2 + 1e-6 * speed
 
 
 def test_what_is_owed_is_made_up_for_at_a_tenth_of_the_speed():
-    clock = FleetClock(2.0, 0.0, 0.0).corrected(0.0, 0.0, 4.0)
+    clock = FleetClock(2.0, 0.0, 0.0).slewed_to(0.0, 0.0, 4.0)
     assert clock.now_s(10.0) == pytest.approx(20.0 + 2.0)
     assert clock.now_s(20.0) == pytest.approx(40.0 + 4.0)
     assert clock.now_s(30.0) == pytest.approx(60.0 + 4.0)
@@ -72,8 +72,8 @@ def test_a_speed_must_be_a_positive_number(speed):
 
 
 def test_an_answer_before_its_question_is_refused():
-    with pytest.raises(ValueError, match="after its question"):
-        FleetClock(1.0).corrected(2.0, 1.0, 0.0)
+    with pytest.raises(ValueError, match="answered_s must be >= asked_s"):
+        FleetClock(1.0).slewed_to(2.0, 1.0, 0.0)
 
 
 WALL = {("time", "time"), ("time", "time_ns"), ("datetime", "now"), ("datetime", "utcnow"), ("date", "today")}

@@ -12,32 +12,32 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.bus import keys
-from fleet.bus.link import Link
-from fleet.bus.messages import State
-from fleet.bus.router import Router
-from fleet.bus.trade import Clock, ClockRequest
-from fleet.live.diagnosis import OFFSET_S, Sounding, diagnosed
-from fleet.live.overview import FRESH_S, ArmNow, AuctioneerNow, FleetNow
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.router import Router
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import Clock, ClockRequest
+from fleet.bus.protocol.messages import State
+from fleet.live.monitor.health import OFFSET_S, ClockProbe, check_health
+from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, AuctioneerSnapshot, FleetSnapshot
 
 PATIENCE_S = 30.0
-ASKED = Sounding(asked_s=100.0, answered_s=100.01, time_s=5000.0, speed=60.0)
+ASKED = ClockProbe(asked_s=100.0, answered_s=100.01, time_s=5000.0, speed=60.0)
 """The fleet's time is 5000 s at the real second 100.005."""
 
-ALONE = (AuctioneerNow("au", True, 0.1),)
+ALONE = (AuctioneerSnapshot("au", True, 0.1),)
 
 
 def arm(**change):
     known = {"arm": "a", "token": True, "present": True, "mode": "idle", "time_s": 5060.0, "state_age_s": 0.5}
-    return ArmNow(**{**known, **change})
+    return ArmSnapshot(**{**known, **change})
 
 
 def fleet(*arms, auctioneers=ALONE, counts=None):
-    return FleetNow("f", arms, auctioneers, counts or {}, ())
+    return FleetSnapshot("f", arms, auctioneers, counts or {}, ())
 
 
-def faults(now, *soundings, **more):
-    found = diagnosed(now, 101.505, soundings or [ASKED], **more)
+def faults(now, *probes, **more):
+    found = check_health(now, 101.505, probes or [ASKED], **more)
     return [finding.what for finding in found.findings if finding.level == "fault"], found
 
 
@@ -57,9 +57,9 @@ def test_a_healthy_fleet_is_called_healthy():
         (fleet(arm(), arm(arm="b", present=False, state_age_s=FRESH_S + 1.0, time_s=4850.0)), "b is stale"),
         (
             fleet(arm(), arm(arm="b", present=False, state_age_s=None, time_s=None)),
-            "b shows its token but says no state",
+            "b shows its token but publishes no state",
         ),
-        (fleet(arm(), arm(arm="b", present=False, token=False)), "b says its state but shows no token"),
+        (fleet(arm(), arm(arm="b", present=False, token=False)), "b publishes its state but shows no token"),
         (fleet(arm(), arm(arm="b", time_s=5060.0 + 60.0 * 3)), "3.0 s ahead"),
         (fleet(arm(), arm(arm="b", time_s=5060.0 - 60.0 * 3)), "3.0 s behind"),
     ],
@@ -72,56 +72,56 @@ def test_each_illness_of_an_arm_is_named_alone(now, says):
 
 
 @pytest.mark.parametrize(
-    ("sounding", "auctioneers", "says"),
+    ("probe", "auctioneers", "says"),
     [
-        (Sounding(1.0, 1.1), (), "No auctioneer"),
-        (Sounding(1.0, 1.1), (AuctioneerNow("au", True),), "does it hang"),
-        (ASKED, (AuctioneerNow("x", True), AuctioneerNow("y", True)), "2 auctioneers"),
+        (ClockProbe(1.0, 1.1), (), "No auctioneer"),
+        (ClockProbe(1.0, 1.1), (AuctioneerSnapshot("au", True),), "process may hang"),
+        (ASKED, (AuctioneerSnapshot("x", True), AuctioneerSnapshot("y", True)), "2 auctioneers"),
     ],
 )
-def test_each_illness_of_an_auctioneer_is_named(sounding, auctioneers, says):
-    told, _ = faults(fleet(arm(), auctioneers=auctioneers), sounding)
+def test_each_illness_of_an_auctioneer_is_named(probe, auctioneers, says):
+    told, _ = faults(fleet(arm(), auctioneers=auctioneers), probe)
     assert len(told) == 1
     assert says in told[0]
 
 
 def test_a_fleet_without_an_auctioneer_by_intention_is_healthy():
-    silence = Sounding(100.0, 100.1)
+    silence = ClockProbe(100.0, 100.1)
     assert faults(fleet(arm(), auctioneers=()), silence)[0] == [
-        "No auctioneer shows a token or answers: nobody hands out jobs, and every arm keeps its own time. "
-        "If this fleet has none by intention, say --no-auctioneer."
+        "No auctioneer shows a token or answers: nobody awards jobs, and every arm keeps its own time. "
+        "If this fleet needs none, give --no-auctioneer."
     ]
     told, found = faults(fleet(arm(), auctioneers=()), silence, auctioneer=False)
     assert (told, found.findings, found.time_s) == ([], (), None)
     told, found = faults(fleet(arm()), auctioneer=False)
     assert told == []
-    assert "au is there, though" in found.findings[0].what
+    assert "au is present, though" in found.findings[0].what
     assert "2 auctioneers" in faults(fleet(arm(), auctioneers=(*ALONE, *ALONE)), auctioneer=False)[0][0]
 
 
 def test_malformed_words_are_a_fault_with_their_reason():
     told, _ = faults(fleet(arm()), malformed=3, complaints=("under 'k': not JSON",))
-    assert told == ["3 malformed word(s), the last: under 'k': not JSON"]
+    assert told == ["3 malformed message(s), the last: under 'k': not JSON"]
 
 
 def test_what_is_wrong_again_and_again_is_said_once():
     told, _ = faults(fleet(arm()), malformed=3, complaints=["no JSON.", "no State.", "no JSON."])
-    assert told == ["3 malformed word(s), the last: no JSON.; no State."]
+    assert told == ["3 malformed message(s), the last: no JSON.; no State."]
 
 
 def test_an_arm_that_went_before_anybody_listened_is_missed_only_by_name():
     assert faults(fleet(arm()))[0] == []
-    assert faults(fleet(arm()), expected=("a", "b", "c"))[0] == ["Not there: b, c."]
+    assert faults(fleet(arm()), expected=("a", "b", "c"))[0] == ["Not present: b, c."]
     left = arm(arm="b", token=False, present=False, state_age_s=None, time_s=None)
-    assert faults(fleet(arm(), left), expected=("a", "b"))[0] == ["Not there: b."]
+    assert faults(fleet(arm(), left), expected=("a", "b"))[0] == ["Not present: b."]
 
 
 def test_what_somebody_should_look_at_is_no_fault():
     hot = arm(mode="faulted", hottest_c=76.0, joint=2)
-    told, found = faults(fleet(hot, counts={"unfinished": 1}), Sounding(100.0, 100.4, 5000.0, 60.0), overrun=5)
+    told, found = faults(fleet(hot, counts={"unfinished": 1}), ClockProbe(100.0, 100.4, 5000.0, 60.0), overrun=5)
     assert told == []
     warned = " ".join(finding.what for finding in found.findings)
-    for word in ("joint 2 is at 76.0", "400 ms", "5 word(s)", "1 job(s) are unfinished"):
+    for word in ("joint 2 is at 76.0", "400 ms", "5 message(s)", "1 job(s) are unfinished"):
         assert word in warned
 
 
@@ -132,12 +132,12 @@ def test_what_somebody_should_look_at_is_no_fault():
 )
 def test_the_offset_of_a_clock_is_known_to_half_a_round_trip(delay_s, speed, ahead_s):
     """Cristian's bound, whatever the way there and the way back take."""
-    soundings = [
-        Sounding(100.0 + k, 100.0 + k + there + back, speed * (100.0 + k + there), speed)
+    probes = [
+        ClockProbe(100.0 + k, 100.0 + k + there + back, speed * (100.0 + k + there), speed)
         for k, (there, back) in enumerate(delay_s)
     ]
     seen = arm(time_s=speed * (106.0 + ahead_s), state_age_s=0.5)
-    found = diagnosed(fleet(seen), 106.5, soundings)
+    found = check_health(fleet(seen), 106.5, probes)
     best_s = min(there + back for there, back in delay_s)
     assert abs(found.offsets_s["a"] - ahead_s) <= best_s / 2 + 1e-6
     if abs(ahead_s) > OFFSET_S + 0.41:
@@ -149,22 +149,22 @@ def participants(endpoint, *, states=True, clocks=1):
     """One arm and so many auctioneers, on a thread of their own."""
     stop = threading.Event()
     with ExitStack() as stack:
-        arm_link = stack.enter_context(Link(endpoint, "f"))
-        arm_link.alive(keys.of_arm("f", "a", "alive"))
-        lines = [stack.enter_context(Link(endpoint, "f")) for _ in range(clocks)]
+        arm_link = stack.enter_context(BusClient(endpoint, "f"))
+        arm_link.declare_token(keys.of_arm("f", "a", "alive"))
+        lines = [stack.enter_context(BusClient(endpoint, "f")) for _ in range(clocks)]
         began_s = time.monotonic()
 
         def now_s():
             return 10.0 * (time.monotonic() - began_s)
 
         for number, line in enumerate(lines):
-            line.alive(keys.of_auction("f", f"au{number}", "alive"))
-            line.answer(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=now_s(), speed=10.0))
+            line.declare_token(keys.of_auction("f", f"au{number}", "alive"))
+            line.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=now_s(), speed=10.0))
 
         def live():
             while not stop.is_set():
                 if states:
-                    arm_link.say(keys.of_arm("f", "a", "state"), State("a", 1, now_s(), "idle", (30.0,), 30.0))
+                    arm_link.publish(keys.of_arm("f", "a", "state"), State("a", 1, now_s(), "idle", (30.0,), 30.0))
                 for line in (arm_link, *lines):
                     line.serve(time.monotonic() + 0.03)
 
@@ -178,7 +178,7 @@ def participants(endpoint, *, states=True, clocks=1):
 
 
 def doctor(endpoint, *options):
-    command = [sys.executable, "-c", "from scenarios.cli import main; main()", "doctor", "--endpoint", endpoint]
+    command = [sys.executable, "-c", "from scenarios.cli.main import main; main()", "doctor", "--endpoint", endpoint]
     done = subprocess.run(
         [*command, "--seconds", "1", *options], capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
@@ -188,7 +188,7 @@ def doctor(endpoint, *options):
 def test_a_healthy_fleet_gives_exit_code_0():
     with Router() as router, participants(router.endpoint):
         code, told = doctor(router.endpoint)
-        assert (code, "The fleet is well." in told) == (0, True), told
+        assert (code, "The fleet is healthy." in told) == (0, True), told
         code, told = doctor(router.endpoint, "--json")
     found = json.loads(told)
     assert (code, found["healthy"], found["findings"]) == (0, True, [])
@@ -209,23 +209,23 @@ def test_a_sick_fleet_gives_exit_code_1_and_all_reasons():
         stop.set()
         thread.join(PATIENCE_S)
     assert code == 1
-    for says in ("a shows its token but says no state", "2 auctioneers", "No arm is present", "malformed word"):
+    for says in ("a shows its token but publishes no state", "2 auctioneers", "No arm is present", "malformed message"):
         assert says in told
 
 
 def test_the_doctor_is_told_that_no_auctioneer_is_meant():
     with Router() as router, participants(router.endpoint, clocks=0):
         code, told = doctor(router.endpoint)
-        assert (code, "say --no-auctioneer" in told) == (1, True)
+        assert (code, "give --no-auctioneer" in told) == (1, True)
         code, told = doctor(router.endpoint, "--no-auctioneer")
-    assert (code, "The fleet is well." in told, "time nobody tells it" in told) == (0, True, True), told
+    assert (code, "The fleet is healthy." in told, "time unknown" in told) == (0, True, True), told
 
 
 def test_nobody_at_the_router_is_not_healthy():
     with Router() as router:
         code, told = doctor(router.endpoint)
     assert code == 1
-    assert "answers. Nobody is there" in told
+    assert "answers. There is no fleet" in told
 
 
 def test_a_router_that_is_not_there_gives_exit_code_2_and_says_how_to_start_one():
@@ -241,7 +241,7 @@ def test_something_else_at_the_port_is_recognised():
     with socket.create_server(("127.0.0.1", 0)) as other:
         code, told = doctor(f"tcp/127.0.0.1:{other.getsockname()[1]}")
     assert code == 2
-    assert "does not speak as our router does" in told
+    assert "not a router of ours" in told
 
 
 @pytest.mark.parametrize("wrong", [["--endpoint", "http://x"], ["--seconds", "0"]])

@@ -17,29 +17,29 @@ from pathlib import Path
 
 import pytest
 
-from fleet.bus import keys
-from fleet.bus.link import Link, Refused
-from fleet.bus.messages import DifficultyWord, State
-from fleet.bus.router import Router
-from fleet.bus.trade import (
+from fleet.bus.client.client import BusClient, Refused
+from fleet.bus.client.router import Router
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import (
     Admission,
     ArmEvent,
+    JobEstimate,
     JobStatus,
-    Offer,
     Quote,
     QuoteRequest,
     Status,
     StatusRequest,
     Submission,
-    Submitted,
+    SubmissionReply,
 )
+from fleet.bus.protocol.messages import DifficultyScores, State
 from fleet.errors import FleetError
-from fleet.live.gateway import Gateway
-from scenarios.gateway_app import MOST_BYTES, Readers, application
-from scenarios.live_gateway import check, listening, server_of
+from fleet.live.monitor.async_bridge import AsyncBridge
+from scenarios.cli.live.gateway import check, listen, server_of
+from scenarios.live.http_app import MAX_BYTES, Readers, application
 
 ROOT = Path(__file__).parents[2]
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 CRATE_JSON = {"name": "crate 1", "kind": "hold", "places": ["rack"]}
 
 
@@ -47,16 +47,16 @@ class StandIn:
     """A fleet of one arm `a/1` and an auctioneer, on a thread of its own."""
 
     def __init__(self, endpoint):
-        self.link, self.stop, self.asked = Link(endpoint, "f"), threading.Event(), []
+        self.link, self.stop, self.asked = BusClient(endpoint, "f"), threading.Event(), []
         self.thread = threading.Thread(target=self.serve)
 
     def __enter__(self):
         link = self.link.open()
-        link.answer(keys.of_arm("f", "a/1", "quote"), QuoteRequest, self.quote)
-        link.alive(keys.of_arm("f", "a/1", "alive"))
-        self.event = link.publisher(keys.of_arm("f", "a/1", "event"), ArmEvent, remember=8)
-        link.answer(keys.of_jobs("f", "submit"), Submission, self.submit)
-        link.answer(keys.of_jobs("f", "status"), StatusRequest, self.status)
+        link.reply_to(keys.of_arm("f", "a/1", "quote"), QuoteRequest, self.quote)
+        link.declare_token(keys.of_arm("f", "a/1", "alive"))
+        self.event = link.publisher(keys.of_arm("f", "a/1", "event"), ArmEvent)
+        link.reply_to(keys.of_jobs("f", "submit"), Submission, self.submit)
+        link.reply_to(keys.of_jobs("f", "status"), StatusRequest, self.status)
         self.thread.start()
         return self
 
@@ -71,25 +71,25 @@ class StandIn:
 
     def quote(self, request):
         assert request.dry_run
-        offers = tuple(Offer(job=job.name, feasible=True, d=0.25) for job in request.jobs)
+        offers = tuple(JobEstimate(job=job.name, feasible=True, difficulty=0.25) for job in request.jobs)
         return Quote("a/1", request.auction, "", 3.0, "t", 1.0, "idle", 20.0, 1, offers)
 
     def submit(self, word):
         if word.by == "disk full":
             raise Refused("The journal has no room.")
         self.asked.append(word)
-        return Submitted("au", tuple(Admission(job.name, True) for job in word.jobs))
+        return SubmissionReply("au", tuple(Admission(job.name, True) for job in word.jobs))
 
     def status(self, word):
         return Status("au", 9.0, (JobStatus("crate 1", "waiting"),))
 
     def state(self, tick, arm="a/1"):
         word = State(arm=arm, tick=tick, time_s=float(tick), mode="idle", temp_c=(30.0, 41.5), headroom_k=18.5)
-        self.link.say(keys.of_arm("f", arm, "state"), word)
+        self.link.publish(keys.of_arm("f", arm, "state"), word)
 
     def difficulty(self):
-        word = DifficultyWord("a/1", 1, 1.0, "t", ("crate 1",), (0.5,), (None,))
-        self.link.say(keys.of_arm("f", "a/1", "difficulty"), word)
+        word = DifficultyScores("a/1", 1, 1.0, "t", ("crate 1",), (0.5,), (None,))
+        self.link.publish(keys.of_arm("f", "a/1", "difficulty"), word)
 
     def happens(self, number, reason=""):
         self.event(ArmEvent(arm="a/1", number=number, time_s=1.0, kind="warning", joint=2, reason=reason))
@@ -105,8 +105,8 @@ class Served:
 
     async def run(self):
         stuck_s = self.options.get("stuck_s", 10.0)
-        with listening("127.0.0.1", 0, stuck_s) as bound, Link(self.endpoint, "f") as link:
-            async with Gateway(link, self.readers.tell) as self.gateway:
+        with listen("127.0.0.1", 0, stuck_s) as bound, BusClient(self.endpoint, "f") as link:
+            async with AsyncBridge(link, self.readers.put) as self.gateway:
                 self.server = server_of(application(self.gateway, self.readers, **self.options), self.readers)
                 self.port = bound.getsockname()[1]
                 self.started.set()
@@ -142,7 +142,7 @@ class Served:
             line.settimeout(PATIENCE_S)
             line.connect(("127.0.0.1", self.port))
             head = "".join(f"{name}: {value}\r\n" for name, value in dict(headers).items())
-            line.sendall(f"GET /v1/events HTTP/1.1\r\nHost: localhost:{self.port}\r\n{head}\r\n".encode())
+            line.sendall(f"GET /v2/events HTTP/1.1\r\nHost: localhost:{self.port}\r\n{head}\r\n".encode())
             with line.makefile("r", encoding="utf-8", newline="\n") as file:
                 yield line, file
 
@@ -170,7 +170,7 @@ def of(topic, found):
 
 def numbers_of(found):
     """What the arm numbered its events with."""
-    return [data["word"]["number"] for data in of("event", found)]
+    return [data["message"]["number"] for data in of("event", found)]
 
 
 @pytest.fixture(scope="module")
@@ -204,7 +204,7 @@ def until(condition, make=lambda: None):
 
 def test_the_fleet_is_told_with_ages(gateway, arm):
     def fleet():
-        _, kind, told = gateway.ask("GET", "/v1/fleet")
+        _, kind, told = gateway.ask("GET", "/v2/fleet")
         assert kind == "application/json"
         return told if told["arms"] and told["arms"][0]["present"] and told["jobs"] else None
 
@@ -217,30 +217,30 @@ def test_the_fleet_is_told_with_ages(gateway, arm):
 
 
 def test_jobs_go_in_and_answers_come_out(gateway, arm):
-    status, _, told = gateway.ask("POST", "/v1/jobs", {"jobs": [CRATE_JSON], "by": "me"})
+    status, _, told = gateway.ask("POST", "/v2/jobs", {"jobs": [CRATE_JSON], "by": "me"})
     assert (status, told["jobs"][0]["accepted"]) == (200, True)
     assert arm.asked[-1].jobs[0].name == "crate 1"
-    status, _, told = gateway.ask("GET", "/v1/jobs?job=crate%201")
+    status, _, told = gateway.ask("GET", "/v2/jobs?job=crate%201")
     assert (status, told["jobs"][0]["state"]) == (200, "waiting")
-    status, _, told = gateway.ask("POST", "/v1/ask", {"jobs": [CRATE_JSON]})
-    assert (status, told["quotes"][0]["offers"][0]["d"]) == (200, 0.25)
+    status, _, told = gateway.ask("POST", "/v2/ask", {"jobs": [CRATE_JSON]})
+    assert (status, told["quotes"][0]["estimates"][0]["difficulty"]) == (200, 0.25)
 
 
 @pytest.mark.parametrize(
     ("method", "path", "body", "headers", "status", "says"),
     [
-        ("POST", "/v1/jobs", "{", {}, 422, "Not a thermofleet.Submission"),
-        ("POST", "/v1/jobs", {"jobs": []}, {}, 422, "length >= 1"),
-        ("POST", "/v1/jobs", {"jobs": [{**CRATE_JSON, "places": ["a", "b"]}]}, {}, 422, "place"),
-        ("POST", "/v1/jobs", b"\xff", {}, 422, "Not a"),
-        ("POST", "/v1/jobs", {"jobs": [CRATE_JSON]}, {"Content-Type": "text/plain"}, 415, "application/json"),
-        ("POST", "/v1/jobs", {"jobs": [CRATE_JSON], "by": "disk full"}, {}, 503, "no room"),
-        ("POST", "/v1/ask", {"jobs": []}, {}, 422, "length >= 1"),
-        ("POST", "/v1/jobs", b" " * (MOST_BYTES + 1), {}, 413, "at most"),
-        ("GET", "/v1/nothing", None, {}, 404, "Not Found"),
-        ("DELETE", "/v1/jobs", None, {}, 405, "Not Allowed"),
-        ("GET", "/v1/fleet", None, {"Host": "evil.example"}, 421, "evil.example"),
-        ("GET", "/v1/fleet", None, {"Host": "evil.example:80"}, 421, "evil.example"),
+        ("POST", "/v2/jobs", "{", {}, 422, "Not a thermofleet.Submission"),
+        ("POST", "/v2/jobs", {"jobs": []}, {}, 422, "length >= 1"),
+        ("POST", "/v2/jobs", {"jobs": [{**CRATE_JSON, "places": ["a", "b"]}]}, {}, 422, "place"),
+        ("POST", "/v2/jobs", b"\xff", {}, 422, "Not a"),
+        ("POST", "/v2/jobs", {"jobs": [CRATE_JSON]}, {"Content-Type": "text/plain"}, 415, "application/json"),
+        ("POST", "/v2/jobs", {"jobs": [CRATE_JSON], "by": "disk full"}, {}, 503, "no room"),
+        ("POST", "/v2/ask", {"jobs": []}, {}, 422, "length >= 1"),
+        ("POST", "/v2/jobs", b" " * (MAX_BYTES + 1), {}, 413, "at most"),
+        ("GET", "/v2/nothing", None, {}, 404, "Not Found"),
+        ("DELETE", "/v2/jobs", None, {}, 405, "Not Allowed"),
+        ("GET", "/v2/fleet", None, {"Host": "evil.example"}, 421, "evil.example"),
+        ("GET", "/v2/fleet", None, {"Host": "evil.example:80"}, 421, "evil.example"),
     ],
 )
 def test_what_is_wrong_is_told_as_a_problem(gateway, method, path, body, headers, status, says):
@@ -253,7 +253,7 @@ def test_what_is_wrong_is_told_as_a_problem(gateway, method, path, body, headers
 def test_a_body_of_unknown_length_is_cut_off_too(gateway):
     line = http.client.HTTPConnection("127.0.0.1", gateway.port, timeout=PATIENCE_S)
     parts = (b" " * 10_000 for _ in range(7))
-    line.request("POST", "/v1/jobs", parts, {"Content-Type": "application/json"}, encode_chunked=True)
+    line.request("POST", "/v2/jobs", parts, {"Content-Type": "application/json"}, encode_chunked=True)
     assert line.getresponse().status == 413
     line.close()
 
@@ -262,7 +262,7 @@ def test_a_body_that_does_not_come_is_not_waited_for(router):
     with Served(router, body_s=0.2) as served, socket.create_connection(("127.0.0.1", served.port)) as line:
         line.settimeout(PATIENCE_S)
         head = (
-            "POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n{"
+            "POST /v2/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n{"
         )
         line.sendall(head.encode())
         assert b" 408 " in line.recv(1000)
@@ -270,9 +270,9 @@ def test_a_body_that_does_not_come_is_not_waited_for(router):
 
 def test_without_an_auctioneer_the_gateway_says_so():
     with Router() as empty, Served(empty.endpoint) as served:
-        status, _, told = served.ask("POST", "/v1/jobs", {"jobs": [CRATE_JSON]})
+        status, _, told = served.ask("POST", "/v2/jobs", {"jobs": [CRATE_JSON]})
         assert (status, told["detail"]) == (503, "There is no auctioneer in this fleet.")
-        status, _, told = served.ask("GET", "/v1/fleet")
+        status, _, told = served.ask("GET", "/v2/fleet")
         assert (status, told["arms"]) == (200, [])
 
 
@@ -281,11 +281,11 @@ def test_only_who_shows_the_token_gets_in(router):
     with Served(router, token=token) as served:
         for wrong in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": f"Basic {token}"},
                       {"Authorization": f"Bearer {token}x"}, {"Authorization": f"Bearer {token[:-1]}"}):  # fmt: skip
-            status, kind, _ = served.ask("GET", "/v1/fleet", headers=wrong)
+            status, kind, _ = served.ask("GET", "/v2/fleet", headers=wrong)
             assert (status, kind) == (401, "application/problem+json")
         with served.stream() as (_, file):
             assert " 401 " in file.readline()
-        status, _, _ = served.ask("GET", "/v1/fleet", headers={"Authorization": f"bearer {token}", "Host": "any"})
+        status, _, _ = served.ask("GET", "/v2/fleet", headers={"Authorization": f"bearer {token}", "Host": "any"})
         assert status == 200
 
 
@@ -311,7 +311,7 @@ def test_with_a_token_any_address_goes_and_the_log_warns(caplog):
 
 def test_no_other_origin_is_ever_allowed(gateway):
     line = http.client.HTTPConnection("127.0.0.1", gateway.port, timeout=PATIENCE_S)
-    line.request("GET", "/v1/fleet", headers={"Origin": "http://evil.example"})
+    line.request("GET", "/v2/fleet", headers={"Origin": "http://evil.example"})
     assert not [name for name in line.getresponse().headers if name.lower().startswith("access-control")]
     line.close()
 
@@ -322,10 +322,10 @@ def test_the_stream_tells_all_that_is_said(gateway, arm):
         arm.difficulty()
         arm.happens(0)
         found = events(file, lambda found: {"state", "difficulty", "event"} <= {name for _, name, _ in found})
-    assert of("presence", found)[0]["word"] == {"role": "arm", "name": "a/1", "there": True}
+    assert of("presence", found)[0]["message"] == {"role": "arm", "name": "a/1", "there": True}
     assert of("state", found)[0]["name"] == "a/1"
-    assert of("state", found)[0]["word"]["temp_c"] == [30.0, 41.5]
-    assert of("event", found)[0]["word"]["kind"] == "warning"
+    assert of("state", found)[0]["message"]["temp_c"] == [30.0, 41.5]
+    assert of("event", found)[0]["message"]["kind"] == "warning"
     numbers = [int(number.partition("-")[2]) for number, _, _ in found]
     assert numbers == sorted(set(numbers))
 
@@ -346,7 +346,7 @@ def test_who_comes_back_misses_no_event(gateway, arm):
 
 def test_a_silent_stream_shows_signs_of_life():
     with Router() as empty, Served(empty.endpoint, heartbeat_s=0.05) as served, served.stream() as (_, file):
-        assert any(": still here" in file.readline() for _ in range(30))
+        assert any(": heartbeat" in file.readline() for _ in range(30))
 
 
 def test_a_stuck_reader_is_dropped_and_slows_nobody(router, arm):
@@ -355,7 +355,7 @@ def test_a_stuck_reader_is_dropped_and_slows_nobody(router, arm):
         _,
         file,
     ):  # fmt: skip
-        until(lambda: len(served.readers.there) == 2)
+        until(lambda: len(served.readers.connected) == 2)
         slowest_s = 0.0
         for number in range(600):  # far more than socket buffers hold
             said_s = time.monotonic()
@@ -367,7 +367,7 @@ def test_a_stuck_reader_is_dropped_and_slows_nobody(router, arm):
                 )
                 slowest_s = max(slowest_s, time.monotonic() - said_s)
         assert slowest_s < 5.0
-        until(lambda: len(served.readers.there) == 1)  # the stuck one is gone, the other still reads
+        until(lambda: len(served.readers.connected) == 1)  # the stuck one is gone, the other still reads
         arm.happens(600)
         assert events(file, lambda found: 600 in numbers_of(found))
         until(lambda: len(served.server.server_state.connections) == 1)  # and so is its connection
@@ -377,23 +377,23 @@ def test_a_reader_that_vanishes_is_forgotten(gateway, arm):
     for _ in range(3):
         with gateway.stream() as (_, file):
             file.readline()
-            until(lambda: gateway.readers.there)
-        until(lambda: not gateway.readers.there, lambda: arm.state(1))
+            until(lambda: gateway.readers.connected)
+        until(lambda: not gateway.readers.connected, lambda: arm.state(1))
 
 
 def test_there_are_only_so_many_readers(gateway):
     with ExitStack() as stack:
         for _ in range(64):
             stack.enter_context(gateway.stream())
-        until(lambda: len(gateway.readers.there) == 64)
-        assert gateway.ask("GET", "/v1/events")[0] == 503
-        assert gateway.ask("GET", "/v1/fleet")[0] == 200
+        until(lambda: len(gateway.readers.connected) == 64)
+        assert gateway.ask("GET", "/v2/events")[0] == 503
+        assert gateway.ask("GET", "/v2/fleet")[0] == 200
 
 
 @contextmanager
 def process(endpoint, *options):
     """The command in a process of its own, from when it says that it is ready, and its address."""
-    command = [sys.executable, "-u", "-c", "from scenarios.cli import main; main()", "gateway", "--fleet", "f"]
+    command = [sys.executable, "-u", "-c", "from scenarios.cli.main import main; main()", "gateway", "--fleet", "f"]
     started = subprocess.Popen(
         [*command, "--endpoint", endpoint, "--port", "0", *options],
         stdout=subprocess.PIPE,
@@ -414,7 +414,7 @@ def test_the_command_ends_in_order_even_while_somebody_reads(router, number, cod
     with process(router) as (started, address):
         port = int(address.split(":")[2].split("/")[0])
         line = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
-        line.request("GET", "/v1/events")
+        line.request("GET", "/v2/events")
         assert line.getresponse().status == 200
         started.send_signal(number)
         assert started.wait(PATIENCE_S) == code
@@ -430,8 +430,12 @@ def test_the_monitor_in_javascript_shows_the_fleet(router, arm):
         arm.happens(7)
         command = ["node", str(ROOT / "examples" / "monitor.mjs"), address, "3"]
         node = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | {"NO_COLOR": "1"})
-        until(lambda: node.poll() is not None, lambda: (arm.state(1), arm.difficulty()))
-        told, _ = node.communicate(timeout=PATIENCE_S)
+        try:
+            until(lambda: node.poll() is not None, lambda: (arm.state(1), arm.difficulty(), arm.happens(7)))
+            told, _ = node.communicate(timeout=PATIENCE_S)
+        finally:
+            node.kill()
+            node.wait(timeout=PATIENCE_S)
     assert node.returncode == 0
     assert re.search(r"a/1 .*idle.*41\.5.*2 .*18\.5", told)
     assert "warning" in told

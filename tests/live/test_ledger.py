@@ -7,22 +7,34 @@ import msgspec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet.bus.trade import JobWord
-from fleet.live.admission import admit
-from fleet.live.ledger import Ledger, replayed
-from fleet.live.records import Accepted, Awarded, Closed, Ended, Heard, Leave, Record, Silent, Ticked
+from fleet.bus.protocol.auction import JobSpec
+from fleet.live.auction.admission import admit
+from fleet.live.auction.journal_records import (
+    AuctionRecord,
+    Awarded,
+    ClockTick,
+    Closed,
+    CommitPermitted,
+    ContactLost,
+    ContactRegained,
+    JobsAccepted,
+    ShiftEnded,
+)
+from fleet.live.auction.ledger import Ledger
 
 
-def word(name: str, *after: str, place: str = "rack", **changes) -> JobWord:
-    return JobWord(name=name, kind="hold", places=(place,), after=after, **{"repetitions": 4, **changes})
+def word(name: str, *after: str, place: str = "rack", **changes) -> JobSpec:
+    return JobSpec(name=name, kind="hold", places=(place,), after=after, **{"repetitions": 4, **changes})
 
 
-def ledger(*words: JobWord) -> Ledger:
-    return replayed([Accepted(words, "test", 0.0)])
+def ledger(*words: JobSpec) -> Ledger:
+    return Ledger().replay([JobsAccepted(words, "test", 0.0)])
 
 
 def award(job: str, number: int = 0, arm: str = "arm_0", cycles: int = 0) -> Awarded:
-    return Awarded(f"{number}:{job}", f"round {number}", job, arm, "quote", cycles, 1.0, d=0.5, p_saturation=0.1)
+    return Awarded(
+        f"{number}:{job}", f"round {number}", job, arm, "quote", cycles, 1.0, difficulty=0.5, p_saturation=0.1
+    )
 
 
 def names(words) -> list[str]:
@@ -114,7 +126,7 @@ def test_a_job_goes_from_waiting_to_finished():
     book = ledger(word("a"))
     said = [
         change.status
-        for record in (award("a"), Leave("0:a", 2.0), Closed("0:a", "finished", 4, 3.0))
+        for record in (award("a"), CommitPermitted("0:a", 2.0), Closed("0:a", "finished", 4, 3.0))
         for change in book.apply(record)
     ]
     assert [s.state for s in said] == ["awarded", "finishing", "finished"]
@@ -135,14 +147,14 @@ def test_cycles_done_are_kept_but_the_last_one_is_never_taken_for_granted():
 
 def test_silence_after_leave_is_unfinished_until_heard_of():
     book = ledger(word("a"))
-    for record in (award("a"), Leave("0:a", 2.0), Silent("0:a", 8.0)):
+    for record in (award("a"), CommitPermitted("0:a", 2.0), ContactLost("0:a", 8.0)):
         book.apply(record)
     (status,) = book.status()
     assert (status.state, status.arm) == ("unfinished", "arm_0")
     assert "0:a" in book.open
     assert book.ready(99.0, 9) == []
     assert book.taken() == frozenset()
-    book.apply(Heard("0:a", 9.0))
+    book.apply(ContactRegained("0:a", 9.0))
     assert book.status()[0].state == "finishing"
     book.apply(Closed("0:a", "finished", 4, 9.5))
     assert book.status()[0].state == "finished"
@@ -150,7 +162,7 @@ def test_silence_after_leave_is_unfinished_until_heard_of():
 
 def test_who_is_unsure_of_the_last_cycle_leaves_the_job_unfinished_for_good():
     book = ledger(word("a"))
-    for record in (award("a"), Leave("0:a", 2.0), Closed("0:a", "returned", 3, 8.0, "crashed", unsure=True)):
+    for record in (award("a"), CommitPermitted("0:a", 2.0), Closed("0:a", "returned", 3, 8.0, "crashed", unsure=True)):
         book.apply(record)
     assert book.status()[0].state == "unfinished"
     assert book.ready(99.0, 9) == []
@@ -172,7 +184,7 @@ def test_the_end_of_the_shift_leaves_nothing_open_to_offer():
     book.apply(award("a"))
     book.apply(award("b"))
     book.apply(Closed("0:b", "finished", 4, 5.0))
-    book.apply(Ended(7200.0))
+    book.apply(ShiftEnded(7200.0))
     assert {s.job: s.state for s in book.status()} == {"a": "unfinished", "b": "finished", "c": "unfinished"}
     assert book.ready(9999.0, 9) == []
     assert "shift is over" in book.admit([word("d")])[0].reason
@@ -184,7 +196,9 @@ steps = st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 9)), max_size=
 
 
 def begun() -> Ledger:
-    return replayed([Accepted((word("a"), word("b", "a", place="bin"), word("c", place="belt")), "test", 0.0)])
+    return Ledger().replay(
+        [JobsAccepted((word("a"), word("b", "a", place="bin"), word("c", place="belt")), "test", 0.0)]
+    )
 
 
 def next_record(book: Ledger, job: str, choice: int, time_s: int):
@@ -193,15 +207,15 @@ def next_record(book: Ledger, job: str, choice: int, time_s: int):
     if entry.state == "waiting" and job in names(book.ready(float(time_s), 9)):
         return award(job, time_s)
     if entry.award not in book.open:
-        return Ticked(float(time_s))
+        return ClockTick(float(time_s))
     promise = book.awards[entry.award]
     may = [Closed(entry.award, "finished", 4, time_s), Closed(entry.award, "returned", choice, time_s)]
     if promise.silent:
-        may.append(Heard(entry.award, time_s))
-    elif promise.leave:
-        may.append(Silent(entry.award, time_s))
+        may.append(ContactRegained(entry.award, time_s))
+    elif promise.may_commit:
+        may.append(ContactLost(entry.award, time_s))
     else:
-        may += [Leave(entry.award, time_s), Closed(entry.award, "dropped", 0, time_s)]
+        may += [CommitPermitted(entry.award, time_s), Closed(entry.award, "dropped", 0, time_s)]
         may += [Closed(entry.award, "refused", 0, time_s, "not now")]
     return may[choice % len(may)]
 
@@ -210,11 +224,11 @@ def next_record(book: Ledger, job: str, choice: int, time_s: int):
 @given(steps)
 def test_the_journal_alone_makes_the_same_ledger_again(steps):
     """Any life of three jobs: replayed in one go it gives the same states, and the same numbers on its changes."""
-    book, written, said = begun(), [Accepted(tuple(e.word for e in begun().jobs.values()), "test", 0.0)], []
+    book, written, said = begun(), [JobsAccepted(tuple(e.word for e in begun().jobs.values()), "test", 0.0)], []
     for time_s, (job, choice) in enumerate(steps, start=1):
         written.append(next_record(book, job, choice, time_s))
         said.extend(book.apply(written[-1]))
-    again = replayed(written)
+    again = Ledger().replay(written)
     assert again == book
     assert [change.number for change in said] == list(range(3, 3 + len(said)))
     assert again.number == 3 + len(said)
@@ -228,9 +242,9 @@ def test_where_records_have_led_can_stand_for_them(steps, later, ends):
     for time_s, (job, choice) in enumerate(steps, start=1):
         book.apply(next_record(book, job, choice, time_s))
     if ends:
-        book.apply(Ended(50.0))
-    record = msgspec.json.decode(msgspec.json.encode(book.standing()), type=Record)
-    short = replayed([record])
+        book.apply(ShiftEnded(50.0))
+    record = msgspec.json.decode(msgspec.json.encode(book.compact()[0]), type=AuctionRecord)
+    short = Ledger().replay([record])
     for time_s, (job, choice) in enumerate(later, start=100):
         happens = next_record(book, job, choice, time_s)
         assert short.apply(happens) == book.apply(happens)
@@ -251,7 +265,7 @@ def test_a_late_report_changes_as_much_after_the_journal_was_shortened(steps, da
     reported = [name for name, promise in book.awards.items() if promise.outcome != "refused"]
     if not reported:
         return
-    short, name = replayed([book.standing()]), data.draw(st.sampled_from(reported))
+    short, name = Ledger().replay(book.compact()), data.draw(st.sampled_from(reported))
     late = Closed(name, data.draw(st.sampled_from(["finished", "returned"])), 2, 100.0)
     before = book.status()
     changes = book.apply(late)
@@ -265,10 +279,10 @@ def test_a_late_report_changes_as_much_after_the_journal_was_shortened(steps, da
 def test_a_ledger_and_what_stands_for_it_share_nothing():
     book = ledger(word("a"))
     book.apply(award("a"))
-    record = book.standing()
-    short = replayed([record])
-    book.apply(Leave("0:a", 2.0))
-    assert not record.awards[0].leave
+    (record,) = book.compact()
+    short = Ledger().replay([record])
+    book.apply(CommitPermitted("0:a", 2.0))
+    assert not record.awards[0].may_commit
     assert short.status()[0].state == "awarded"
     short.apply(Closed("0:a", "finished", 4, 3.0))
     assert record.jobs[0].state == "awarded"
@@ -282,6 +296,6 @@ def test_what_stands_for_a_week_is_short():
         book.apply(award(job, i))
         book.apply(Closed(f"{i}:{job}", "refused" if i < 2700 else "finished", 4, float(i)))
         for _ in range(100):
-            book.apply(Ticked(float(i)))
+            book.apply(ClockTick(float(i)))
     assert len(book.awards) == 3000
-    assert len(book.standing().awards) == 300
+    assert len(book.compact()[0].awards) == 300

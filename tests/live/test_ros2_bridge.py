@@ -9,13 +9,13 @@ import zenoh
 from rosbags.typesys import Stores, get_typestore
 from zenoh.ext import Int64, z_deserialize
 
-from fleet.bus import keys
-from fleet.bus.link import Link
-from fleet.bus.messages import DifficultyWord, State
-from fleet.bus.ros2 import Node
-from fleet.bus.router import Router, open_client
-from fleet.live import ros2_bridge
-from fleet.live.ros2_bridge import Bridge
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.router import Router, open_client
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.messages import DifficultyScores, State
+from fleet.ros2 import bridge as ros2_bridge
+from fleet.ros2.bridge import Bridge
+from fleet.ros2.node import Node
 
 PATIENCE_S = 15.0
 HUMBLE, JAZZY = (get_typestore(Stores[f"ROS2_{name}"]) for name in ("HUMBLE", "JAZZY"))
@@ -38,13 +38,13 @@ class Domain:
         self.session = stack.enter_context(open_client(router.endpoint, timeout_s=5.0))
         self.came: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
         self.ear = self.session.declare_subscriber("0/**", self.came.put)
-        self.fleet = stack.enter_context(Link(router.endpoint, fleet))
-        self.link = stack.enter_context(Link(router.endpoint, fleet))
+        self.fleet = stack.enter_context(BusClient(router.endpoint, fleet))
+        self.link = stack.enter_context(BusClient(router.endpoint, fleet))
         self.bridge = Bridge(self.link, stack.enter_context(Node(router.endpoint, "bridge")), **how)
 
     def say(self, *states):
         for each in states:
-            self.fleet.say(keys.of_arm(self.fleet.fleet, each.arm, "state"), each)
+            self.fleet.publish(keys.of_arm(self.fleet.fleet, each.arm, "state"), each)
 
     def until(self, condition, *states):
         """What ROS 2 heard until it holds, while the fleet says its states again and again."""
@@ -91,8 +91,8 @@ def test_a_state_becomes_a_joint_state(make):
 
 def test_a_state_becomes_diagnostics(make):
     domain = make()
-    word = DifficultyWord("arm_0", 1, 12.0, "twin-1", ("press",), (0.75,), (0.5,))
-    tell = domain.fleet.publisher(keys.of_arm("shop", "arm_0", "difficulty"), DifficultyWord, remember=1)
+    word = DifficultyScores("arm_0", 1, 12.0, "twin-1", ("press",), (0.75,), (0.5,))
+    tell = domain.fleet.publisher(keys.of_arm("shop", "arm_0", "difficulty"), DifficultyScores)
     tell(word)  # what it remembers goes when `tell` goes
 
     def whole(sample):

@@ -13,16 +13,16 @@ from hypothesis import strategies as st
 from pycdr2 import IdlStruct
 from pycdr2.types import float64, int32, sequence, uint8, uint32
 
-from fleet.bus import keys
-from fleet.bus.link import Link
-from fleet.bus.messages import Info, MalformedMessage, State
-from fleet.bus.ros2 import Node
-from fleet.bus.ros2_words import Joints, joint_names
-from fleet.bus.router import Router, open_client
-from fleet.bus.trade import Ack, Award, Clock, ClockRequest, JobWord, Quote, QuoteRequest
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.router import Router, open_client
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import Ack, Award, Clock, ClockRequest, JobSpec, Quote, QuoteRequest
+from fleet.bus.protocol.messages import Info, MalformedMessage, State
 from fleet.errors import BusError
 from fleet.live.clock import FleetClock
-from fleet.live.ros2_follower import FRESH_S, WARM_S, Follower, Reality
+from fleet.ros2.conversion import Joints, joint_names
+from fleet.ros2.follower import FRESH_S, WARM_S, Follower, Reality
+from fleet.ros2.node import Node
 
 PATIENCE_S = 15.0
 NAMES = joint_names(7)
@@ -168,13 +168,13 @@ class Place:
     def __init__(self, stack: ExitStack) -> None:
         router = stack.enter_context(Router())
         self.ros = stack.enter_context(open_client(router.endpoint, timeout_s=5.0))
-        self.link, self.peer = (stack.enter_context(Link(router.endpoint, "shop")) for _ in range(2))
+        self.link, self.peer = (stack.enter_context(BusClient(router.endpoint, "shop")) for _ in range(2))
         self.states: list[State] = []
         self.infos: list[Info] = []
         self.present: list[bool] = []
-        self.peer.listen(keys.of_every_arm("shop", "state"), State, lambda _, word: self.states.append(word))
-        self.peer.listen(keys.of_every_arm("shop", "info"), Info, lambda _, w: self.infos.append(w), remembered=1)
-        self.peer.watch(keys.of_every_arm("shop", "alive"), lambda _, there: self.present.append(there))
+        self.peer.subscribe(keys.of_every_arm("shop", "state"), State, lambda _, word: self.states.append(word))
+        self.peer.subscribe(keys.of_every_arm("shop", "info"), Info, lambda _, w: self.infos.append(w), history=True)
+        self.peer.watch_tokens(keys.of_every_arm("shop", "alive"), lambda _, there: self.present.append(there))
         node = stack.enter_context(Node(router.endpoint, "follower", domain=3))
         clock = FleetClock(1.0, time.monotonic())
         reality = Reality(NAMES, "gen3")
@@ -256,22 +256,22 @@ def test_it_takes_no_work_and_says_why(place):
         place.warm(warmth())
 
     place.until(lambda: place.states, live)
-    job = JobWord(name="j", kind="hold", places=("rack",))
+    job = JobSpec(name="j", kind="hold", places=("rack",))
     got = []
-    place.peer.ask(keys.of_every_arm("shop", "quote"), QuoteRequest("a", (job,)), Quote, got.append, timeout_s=5.0)
+    place.peer.query(keys.of_every_arm("shop", "quote"), QuoteRequest("a", (job,)), Quote, got.append, timeout_s=5.0)
     award = Award("a.j", "a", "boss", "q", job)
-    place.peer.ask(keys.of_arm("shop", "real", "award"), award, Ack, got.append, timeout_s=5.0)
+    place.peer.query(keys.of_arm("shop", "real", "award"), award, Ack, got.append, timeout_s=5.0)
     place.until(lambda: len(got) == 2, live)
-    words = [word for answers in got for word in answers.words.values()]
+    words = [word for answers in got for word in answers.messages.values()]
     (quote,) = (word for word in words if isinstance(word, Quote))
     (ack,) = (word for word in words if isinstance(word, Ack))
-    assert (quote.capacity, [offer.feasible for offer in quote.offers]) == (0, [False])
-    assert "takes no work" in quote.offers[0].reason
+    assert (quote.capacity, [offer.feasible for offer in quote.estimates]) == (0, [False])
+    assert "takes no work" in quote.estimates[0].reason
     assert not ack.accepted
 
 
 def test_it_takes_the_time_of_the_fleet(place):
-    place.peer.answer(keys.of_clock("shop"), ClockRequest, lambda _: Clock(time_s=1e6, speed=1.0))
+    place.peer.reply_to(keys.of_clock("shop"), ClockRequest, lambda _: Clock(time_s=1e6, speed=1.0))
 
     def live():
         place.play(joint_state())
@@ -282,6 +282,6 @@ def test_it_takes_the_time_of_the_fleet(place):
 
 
 def test_a_fleet_in_quick_motion_is_no_place_for_a_real_arm(place):
-    place.peer.answer(keys.of_clock("shop"), ClockRequest, lambda _: Clock(time_s=0.0, speed=60.0))
+    place.peer.reply_to(keys.of_clock("shop"), ClockRequest, lambda _: Clock(time_s=0.0, speed=60.0))
     with pytest.raises(BusError, match="60 times as fast"):
         place.until(lambda: False, lambda: None)

@@ -16,7 +16,7 @@ from fleet.live.supervisor import Backoff, Part, Supervisor
 PATIENCE_S = 20.0
 STAY = "import signal; print('ready x', flush=True); signal.pause()"
 STUBBORN = f"import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); {STAY}; signal.pause()"
-LOYAL = f"from fleet.live.supervisor import end_with_supervisor; end_with_supervisor(); {STAY}"
+LOYAL = f"from fleet.live.supervisor import exit_with_supervisor; exit_with_supervisor(); {STAY}"
 
 
 AFTER = """
@@ -60,12 +60,12 @@ def until(condition):
 
 
 @given(st.integers(1, 60), st.floats(0.1, 2.0), st.floats(1.0, 4.0), st.floats(2.0, 60.0))
-def test_each_wait_is_as_long_or_longer_and_bounded(failures, first_s, factor, most_s):
-    backoff = Backoff(first_s=first_s, factor=factor, most_s=most_s)
+def test_each_wait_is_as_long_or_longer_and_bounded(failures, first_s, factor, max_s):
+    backoff = Backoff(first_s=first_s, factor=factor, max_s=max_s)
     waits = [backoff.wait_s(n) for n in range(1, failures + 2)]
     assert waits == sorted(waits)
-    assert waits[0] == pytest.approx(min(first_s, most_s))
-    assert waits[-1] <= most_s
+    assert waits[0] == pytest.approx(min(first_s, max_s))
+    assert waits[-1] <= max_s
 
 
 def test_a_process_that_is_killed_comes_again(tmp_path):
@@ -73,7 +73,7 @@ def test_a_process_that_is_killed_comes_again(tmp_path):
         supervisor.start(part("a", STAY), ready_s=PATIENCE_S)
         first = supervisor.pid("a")
         os.kill(first, signal.SIGKILL)
-        supervisor.run(until(lambda: supervisor.restarts()["a"] == 1 and supervisor.ready("a")), look_s=0.02)
+        supervisor.run(until(lambda: supervisor.restarts()["a"] == 1 and supervisor.ready("a")), poll_s=0.02)
         second = supervisor.pid("a")
         assert second not in (None, first)
     assert gone(second)
@@ -84,7 +84,7 @@ def test_one_that_always_fails_is_not_started_all_the_time(tmp_path):
     begun_s = time.monotonic()
     with Supervisor(tmp_path, backoff=Backoff(first_s=0.2, factor=2.0)) as supervisor:
         supervisor.start(part("a", "raise SystemExit(3)"))
-        supervisor.run(until(lambda: supervisor.restarts()["a"] == 3), look_s=0.02)
+        supervisor.run(until(lambda: supervisor.restarts()["a"] == 3), poll_s=0.02)
     assert time.monotonic() - begun_s >= 0.2 + 0.4 + 0.8
 
 
@@ -95,8 +95,8 @@ def test_the_good_end_of_an_essential_part_is_the_end(tmp_path):
         supervisor.start(part("done", "print('finished')", essential=True))
         assert supervisor.run(until(lambda: False)) == "done"
     assert gone(stays)
-    assert supervisor.last_words("done") == supervisor.since_ready("done") == "finished"
-    assert supervisor.since_ready("stays") == ""
+    assert supervisor.last_log_line("done") == supervisor.log_since_ready("done") == "finished"
+    assert supervisor.log_since_ready("stays") == ""
 
 
 def test_what_does_not_heed_or_stands_still_is_ended_all_the_same(tmp_path):
@@ -132,9 +132,9 @@ def test_many_that_do_not_heed_take_no_longer_than_one(tmp_path):
 
 def test_one_that_cannot_begin_says_why(tmp_path):
     with Supervisor(tmp_path) as supervisor:
-        with pytest.raises(FleetError, match="'a' ended at once: no such port"):
+        with pytest.raises(FleetError, match="'a' exited at once: no such port"):
             supervisor.start(part("a", "raise SystemExit('no such port')"), ready_s=PATIENCE_S)
-        with pytest.raises(FleetError, match=r"'b' was not ready within 0\.2 s: it said nothing"):
+        with pytest.raises(FleetError, match=r"'b' was not ready within 0\.2 s: no output"):
             supervisor.start(part("b", "import signal; signal.pause()"), ready_s=0.2)
         with pytest.raises(FleetError, match="'c' cannot be started"):
             supervisor.start(Part(name="c", argv=("/no/such/program",)))

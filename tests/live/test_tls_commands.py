@@ -13,29 +13,29 @@ from types import SimpleNamespace
 import pytest
 from typer.testing import CliRunner
 
-from fleet.bus import keys
-from fleet.bus.certificates import issue
-from fleet.bus.keyring import make
-from fleet.bus.link import Link
-from fleet.bus.messages import State
-from fleet.bus.roster import Participant, of_arms
-from fleet.bus.router import Router
-from fleet.bus.security import Tls
-from fleet.bus.trade import (
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.router import Router
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import (
     Admission,
     Clock,
     ClockRequest,
+    JobEstimate,
     JobStatus,
-    Offer,
     Quote,
     QuoteRequest,
     Status,
     StatusRequest,
     Submission,
-    Submitted,
+    SubmissionReply,
 )
+from fleet.bus.protocol.messages import State
+from fleet.bus.security.access_control import Participant, of_arms
+from fleet.bus.security.certificates import issue
+from fleet.bus.security.keyring import make
+from fleet.bus.security.tls import Tls
 from fleet.errors import BusError
-from scenarios.cli import app
+from scenarios.cli.main import app
 
 PATIENCE_S = 30.0
 ARM = "arm 1/b"
@@ -56,29 +56,29 @@ def fleet(tmp_path_factory):
         router = stack.enter_context(Router(tls=Tls(place, "router")))
 
         def line(name):
-            return stack.enter_context(Link(Tls(place, name).endpoint(router.endpoint), "f"))
+            return stack.enter_context(BusClient(Tls(place, name).endpoint(router.endpoint), "f"))
 
         arm, auctioneer, began_s = line(ARM), line("auctioneer"), time.monotonic()
 
         def quote(request):
-            offers = tuple(Offer(job=job.name, feasible=True, d=0.25) for job in request.jobs)
+            offers = tuple(JobEstimate(job=job.name, feasible=True, difficulty=0.25) for job in request.jobs)
             return Quote(ARM, request.auction, "", 3.0, "t", 1.0, "idle", 20.0, 1, offers)
 
         def now_s():
             return time.monotonic() - began_s
 
-        arm.answer(keys.of_arm("f", ARM, "quote"), QuoteRequest, quote)
-        arm.alive(keys.of_arm("f", ARM, "alive"))
-        auctioneer.answer(keys.of_clock("f"), ClockRequest, lambda _: Clock(now_s(), 1.0))
+        arm.reply_to(keys.of_arm("f", ARM, "quote"), QuoteRequest, quote)
+        arm.declare_token(keys.of_arm("f", ARM, "alive"))
+        auctioneer.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(now_s(), 1.0))
         status = Status("auctioneer", 1.0, (JobStatus("j", "waiting"),))
-        auctioneer.answer(keys.of_jobs("f", "status"), StatusRequest, lambda _: status)
-        taken = Submitted("auctioneer", (Admission("crate", True),))
-        auctioneer.answer(keys.of_jobs("f", "submit"), Submission, lambda _: taken)
-        auctioneer.alive(keys.of_auction("f", "auctioneer", "alive"))
+        auctioneer.reply_to(keys.of_jobs("f", "status"), StatusRequest, lambda _: status)
+        taken = SubmissionReply("auctioneer", (Admission("crate", True),))
+        auctioneer.reply_to(keys.of_jobs("f", "submit"), Submission, lambda _: taken)
+        auctioneer.declare_token(keys.of_auction("f", "auctioneer", "alive"))
 
         def live():
             while not stop.is_set():
-                arm.say(keys.of_arm("f", ARM, "state"), State(ARM, 1, now_s(), "idle", (30.0,), 30.0))
+                arm.publish(keys.of_arm("f", ARM, "state"), State(ARM, 1, now_s(), "idle", (30.0,), 30.0))
                 for each in (arm, auctioneer):
                     each.serve(time.monotonic() + 0.02)
 
@@ -103,13 +103,13 @@ def test_a_monitor_watches(fleet):
 
 def test_the_doctor_finds_a_fleet_with_rules_well(fleet):
     done = run("doctor", Tls(fleet.keys, "monitor").endpoint(fleet.endpoint))
-    assert (done.exit_code, "The fleet is well." in done.stdout) == (0, True), done.stdout
+    assert (done.exit_code, "The fleet is healthy." in done.stdout) == (0, True), done.stdout
 
 
 @contextmanager
 def gateway(fleet, name):
     """The address of a gateway with the certificate of this one."""
-    command = [sys.executable, "-c", "from scenarios.cli import main; main()", *COMMANDS["gateway"]]
+    command = [sys.executable, "-c", "from scenarios.cli.main import main; main()", *COMMANDS["gateway"]]
     started = subprocess.Popen(
         [*command, "--endpoint", Tls(fleet.keys, name).endpoint(fleet.endpoint)],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -138,22 +138,22 @@ JOBS = {"jobs": [{"name": "crate", "kind": "hold", "places": ["rack"]}]}
 
 def test_the_gateway_hands_in_with_the_certificate_of_a_submitter(fleet):
     with gateway(fleet, "gateway") as port:
-        code, told = asked(port, "POST", "/v1/jobs", JOBS)
+        code, told = asked(port, "POST", "/v2/jobs", JOBS)
         assert (code, told["jobs"][0]["accepted"]) == (200, True), told
-        code, told = asked(port, "POST", "/v1/ask", JOBS)
+        code, told = asked(port, "POST", "/v2/ask", JOBS)
         assert (code, [quote["arm"] for quote in told["quotes"]]) == (200, [ARM]), told
-        code, told = asked(port, "GET", "/v1/fleet")
+        code, told = asked(port, "GET", "/v2/fleet")
         assert (code, [arm["arm"] for arm in told["arms"]]) == (200, [ARM])
 
 
 def test_the_gateway_says_that_a_monitor_may_only_look(fleet):
     with gateway(fleet, "monitor") as port:
-        assert asked(port, "GET", "/v1/jobs?job=j")[0] == 200
-        for path in ("/v1/jobs", "/v1/ask"):
+        assert asked(port, "GET", "/v2/jobs?job=j")[0] == 200
+        for path in ("/v2/jobs", "/v2/ask"):
             code, told = asked(port, "POST", path, JOBS)
             assert code == 503
-            assert "'monitor:monitor' may not ask" in told["detail"]
-            assert "takes the certificate of one in the role" in told["detail"]
+            assert "'monitor:monitor' may not query" in told["detail"]
+            assert "takes a certificate of the role" in told["detail"]
 
 
 def of_another_authority(place, true):

@@ -1,4 +1,4 @@
-"""What an onlooker knows of a fleet, and how it is shown: present is token and fresh state, and no name is too many."""
+"""What an listener knows of a fleet, and how it is shown: present is token and fresh state, and no name is too many."""
 
 import json
 import re
@@ -14,17 +14,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from fleet.bus import keys
-from fleet.bus.link import Link
-from fleet.bus.messages import DifficultyWord, State
-from fleet.bus.router import Router
-from fleet.bus.trade import ArmEvent, JobStatus, Result, Status, StatusRequest
-from fleet.live import onlooker as onlooker_module
-from fleet.live import overview as overview_module
-from fleet.live.onlooker import Onlooker
-from fleet.live.overview import FRESH_S, ArmNow, FleetNow, Overview
-from fleet.live.stream import MOST_WAITING, NEWEST_WINS, THREAD, Feed, Letterbox
-from scenarios.watch_screen import age, clock, line, scores, screen
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.router import Router
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result, Status, StatusRequest
+from fleet.bus.protocol.messages import DifficultyScores, State
+from fleet.live.monitor import listener as listener_module
+from fleet.live.monitor import snapshot as snapshot_module
+from fleet.live.monitor.event_feed import HISTORY, MAX_WAITING, NEWEST_ONLY, EventFeed, ReaderBuffer
+from fleet.live.monitor.listener import FleetListener
+from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetSnapshot, FleetView
+from scenarios.live.dashboard import arm_line, format_age, format_scores, format_time, screen
 
 PATIENCE_S = 20.0
 
@@ -40,25 +40,25 @@ def result(number, job="j", to="awarded"):
 
 @given(token=st.booleans(), age_s=st.floats(0.0, 10.0), spoke=st.booleans())
 def test_present_is_token_and_fresh_state(token, age_s, spoke):
-    seen = Overview("f")
-    seen.token("arm", "a", token)
+    seen = FleetView("f")
+    seen.set_token("arm", "a", token)
     if spoke:
-        seen.hear("a", state(), 100.0)
-    (arm,) = seen.now(100.0 + age_s).arms
+        seen.update("a", state(), 100.0)
+    (arm,) = seen.snapshot(100.0 + age_s).arms
     assert arm.present == (token and spoke and (100.0 + age_s) - 100.0 <= FRESH_S)
     assert arm.state_age_s == (pytest.approx(age_s, abs=1e-9) if spoke else None)
 
 
 def test_the_hottest_motor_is_named_by_its_joint():
-    seen = Overview("f")
-    seen.hear("a", state(), 0.0)
-    (arm,) = seen.now(0.0).arms
+    seen = FleetView("f")
+    seen.update("a", state(), 0.0)
+    (arm,) = seen.snapshot(0.0).arms
     assert (arm.hottest_c, arm.joint) == (52.5, 2)
 
 
 def test_news_is_told_once():
-    seen = Overview("f")
-    assert [seen.token("arm", "a", there) for there in (True, True, False, False, True)] == [
+    seen = FleetView("f")
+    assert [seen.set_token("arm", "a", there) for there in (True, True, False, False, True)] == [
         True,
         False,
         True,
@@ -72,48 +72,48 @@ def stands(time_s, *jobs, state="finished"):
 
 
 def test_jobs_that_the_auctioneer_does_not_know_are_of_a_fleet_before():
-    seen = Overview("f")
+    seen = FleetView("f")
     for number, job in enumerate("ab"):
-        seen.hear("au", result(40 + number, job, "finished"), 0.0)
-    seen.hear("au", result(1, "new"), 2.0)  # said after the question was
-    seen.told(stands(5.0, "b", state="waiting"), 3.0)
-    seen.forget_all_but([stands(5.0, "b", state="waiting")], 1.0)
-    assert {job.job: job.state for job in seen.now(3.0).jobs} == {"b": "waiting", "new": "awarded"}
-    seen.forget_all_but([], 9.0)  # nobody answered
-    assert seen.now(9.0).counts == {"waiting": 1, "awarded": 1}
+        seen.update("au", result(40 + number, job, "finished"), 0.0)
+    seen.update("au", result(1, "new"), 2.0)  # said after the question was
+    seen.update_jobs(stands(5.0, "b", state="waiting"), 3.0)
+    seen.forget_other_jobs([stands(5.0, "b", state="waiting")], 1.0)
+    assert {job.job: job.state for job in seen.snapshot(3.0).jobs} == {"b": "waiting", "new": "awarded"}
+    seen.forget_other_jobs([], 9.0)  # nobody answered
+    assert seen.snapshot(9.0).counts == {"waiting": 1, "awarded": 1}
 
 
 def test_a_fleet_that_begins_anew_counts_its_results_anew():
-    seen = Overview("f")
-    seen.hear("au", result(40, "a", "finished"), 0.0)
-    seen.told(stands(900.0, "a"), 1.0)
-    seen.told(stands(3.0, "a", state="waiting"), 2.0)
-    seen.hear("au", result(0, "a", "awarded"), 3.0)
-    assert seen.now(3.0).counts == {"awarded": 1}
+    seen = FleetView("f")
+    seen.update("au", result(40, "a", "finished"), 0.0)
+    seen.update_jobs(stands(900.0, "a"), 1.0)
+    seen.update_jobs(stands(3.0, "a", state="waiting"), 2.0)
+    seen.update("au", result(0, "a", "awarded"), 3.0)
+    assert seen.snapshot(3.0).counts == {"awarded": 1}
 
 
 @pytest.mark.parametrize(("jobs", "letters"), [(128, 1), (20, 2000)])
 def test_an_answer_without_room_for_all_settles_nothing(jobs, letters):
     names = [f"{number:03d}{'x' * letters}" for number in range(jobs)]
-    seen = Overview("f")
-    seen.hear("au", result(0, "old", "finished"), 0.0)
+    seen = FleetView("f")
+    seen.update("au", result(0, "old", "finished"), 0.0)
     full = stands(5.0, *names)
-    seen.told(full, 2.0)
-    seen.forget_all_but([full], 1.0)
-    assert sum(seen.now(2.0).counts.values()) == jobs + 1
-    seen.told(stands(1.0, *names), 3.0)  # but time that ran back does
-    assert sum(seen.now(3.0).counts.values()) == jobs
+    seen.update_jobs(full, 2.0)
+    seen.forget_other_jobs([full], 1.0)
+    assert sum(seen.snapshot(2.0).counts.values()) == jobs + 1
+    seen.update_jobs(stands(1.0, *names), 3.0)  # but time that ran back does
+    assert sum(seen.snapshot(3.0).counts.values()) == jobs
 
 
 def test_an_onlooker_that_stays_counts_the_jobs_of_the_next_fleet_alone(monkeypatch):
-    monkeypatch.setattr(onlooker_module, "ASK_EVERY_S", 0.05)
+    monkeypatch.setattr(listener_module, "STATUS_EVERY_S", 0.05)
     fleets = [stands(900.0, "a", "b"), stands(5.0, "c", state="waiting")]
-    with Router() as router, Link(router.endpoint, "f") as link, Link(router.endpoint, "f") as auctioneer:
-        auctioneer.answer(keys.of_jobs("f", "status"), StatusRequest, lambda _: fleets[0])
-        seen = Onlooker(link)
+    with Router() as router, BusClient(router.endpoint, "f") as link, BusClient(router.endpoint, "f") as auctioneer:
+        auctioneer.reply_to(keys.of_jobs("f", "status"), StatusRequest, lambda _: fleets[0])
+        seen = FleetListener(link)
         for fleet in ({"finished": 2}, {"waiting": 1}):
             deadline_s = time.monotonic() + PATIENCE_S
-            while seen.overview.now(0.0).counts != fleet:
+            while seen.view.snapshot(0.0).counts != fleet:
                 assert time.monotonic() < deadline_s
                 seen.serve(time.monotonic() + 0.02)
                 auctioneer.serve(time.monotonic() + 0.02)
@@ -121,27 +121,27 @@ def test_an_onlooker_that_stays_counts_the_jobs_of_the_next_fleet_alone(monkeypa
 
 
 def test_an_older_result_changes_nothing():
-    seen = Overview("f")
+    seen = FleetView("f")
     for word in (result(2, to="finished"), result(1, to="awarded")):
-        seen.hear("au", word, 0.0)
-    assert seen.now(0.0).counts == {"finished": 1}
+        seen.update("au", word, 0.0)
+    assert seen.snapshot(0.0).counts == {"finished": 1}
 
 
 def test_the_auctioneers_answer_fills_in_what_was_not_heard():
-    seen = Overview("f")
-    seen.told(Status("au", 1.0, (JobStatus("x", "waiting"), JobStatus("y", "finished"))), 0.0)
-    assert seen.now(4.0).counts == {"waiting": 1, "finished": 1}
-    assert seen.now(4.0).auctioneers[0].heard_age_s == 4.0
+    seen = FleetView("f")
+    seen.update_jobs(Status("au", 1.0, (JobStatus("x", "waiting"), JobStatus("y", "finished"))), 0.0)
+    assert seen.snapshot(4.0).counts == {"waiting": 1, "finished": 1}
+    assert seen.snapshot(4.0).auctioneers[0].heard_age_s == 4.0
 
 
 def test_invented_names_push_out_the_oldest(monkeypatch):
-    monkeypatch.setattr(overview_module, "MOST_ARMS", 3)
-    monkeypatch.setattr(overview_module, "MOST_JOBS", 3)
-    seen = Overview("f")
+    monkeypatch.setattr(snapshot_module, "MAX_NAMES", 3)
+    monkeypatch.setattr(snapshot_module, "MAX_JOBS", 3)
+    seen = FleetView("f")
     for number in range(10):
-        seen.hear(f"a{number}", state(f"a{number}"), 0.0)
-        seen.hear("au", result(number, f"j{number}"), 0.0)
-    now = seen.now(0.0)
+        seen.update(f"a{number}", state(f"a{number}"), 0.0)
+        seen.update("au", result(number, f"j{number}"), 0.0)
+    now = seen.snapshot(0.0)
     assert [arm.arm for arm in now.arms] == ["a7", "a8", "a9"]
     assert [job.job for job in now.jobs] == ["j7", "j8", "j9"]
     assert len(seen._numbers) <= 6
@@ -155,7 +155,7 @@ def test_invented_names_push_out_the_oldest(monkeypatch):
 )
 def test_a_reader_gets_every_event_once_and_the_newest_state(said, after):
     """Taken in two helpings or one, in order: the letter box and the feed tell the same."""
-    feed, box, got = Feed(), Letterbox(), []
+    feed, box, got = EventFeed(), ReaderBuffer(), []
     for count, (topic, name) in enumerate(said):
         box.put(feed.add(topic, name, str(count)))
         if count == after:
@@ -163,18 +163,18 @@ def test_a_reader_gets_every_event_once_and_the_newest_state(said, after):
     got += box.take()
     numbers = [entry.number for entry in got]
     assert numbers == sorted(set(numbers))
-    events = [number for number, (topic, _) in enumerate(said, 1) if topic not in NEWEST_WINS]
-    assert [entry.number for entry in got if entry.topic not in NEWEST_WINS] == events
-    last = {where: number for number, where in enumerate(said, 1) if where[0] in NEWEST_WINS}
-    assert {(entry.topic, entry.name): entry.number for entry in got if entry.topic in NEWEST_WINS} == last
+    events = [number for number, (topic, _) in enumerate(said, 1) if topic not in NEWEST_ONLY]
+    assert [entry.number for entry in got if entry.topic not in NEWEST_ONLY] == events
+    last = {where: number for number, where in enumerate(said, 1) if where[0] in NEWEST_ONLY}
+    assert {(entry.topic, entry.name): entry.number for entry in got if entry.topic in NEWEST_ONLY} == last
     missed, gap = feed.since(0)
     assert not gap
     assert {entry.number for entry in missed} == {*events, *last.values()}
 
 
 def test_what_arms_bid_all_the_time_pushes_no_event_out():
-    feed, box = Feed(), Letterbox()
-    for topic in ("event", *["bid"] * (THREAD + 1), "event"):
+    feed, box = EventFeed(), ReaderBuffer()
+    for topic in ("event", *["bid"] * (HISTORY + 1), "event"):
         box.put(feed.add(topic, "a", "{}"))
     missed, gap = feed.since(0)
     assert not gap
@@ -182,23 +182,23 @@ def test_what_arms_bid_all_the_time_pushes_no_event_out():
 
 
 def test_a_full_letter_box_says_so_and_holds_nothing():
-    feed, box = Feed(), Letterbox()
-    for _ in range(MOST_WAITING + 1):
+    feed, box = EventFeed(), ReaderBuffer()
+    for _ in range(MAX_WAITING + 1):
         box.put(feed.add("event", "a", "{}"))
     assert box.full
     assert box.take() == []
 
 
 def test_telemetry_never_fills_a_letter_box():
-    feed, box = Feed(), Letterbox()
-    for number in range(10 * MOST_WAITING):
+    feed, box = EventFeed(), ReaderBuffer()
+    for number in range(10 * MAX_WAITING):
         box.put(feed.add("state", f"arm {number % 5}", "{}"))
     assert not box.full
     assert len(box.take()) == 5
 
 
 def test_what_is_forgotten_leaves_a_gap():
-    feed = Feed()
+    feed = EventFeed()
     for _ in range(1100):
         feed.add("event", "a", "{}")
     assert feed.since(10)[1]
@@ -213,7 +213,7 @@ def shown(now, width=80, height=24, events=()):
 
 
 def fleet_of(arms):
-    return FleetNow("f", tuple(arms), (), {"waiting": 2, "finished": 1}, ())
+    return FleetSnapshot("f", tuple(arms), (), {"waiting": 2, "finished": 1}, ())
 
 
 def arm_now(name="a", **change):
@@ -221,7 +221,7 @@ def arm_now(name="a", **change):
         "token": True, "present": True, "mode": "working", "time_s": 3661.0, "hottest_c": 52.5, "joint": 2,
         "headroom_k": 7.5, "job": "crate 1", "difficulty": {"x": 0.5, "y": None, "z": 0.25}, "state_age_s": 0.1,
     }  # fmt: skip
-    return ArmNow(arm=name, **{**known, **change})
+    return ArmSnapshot(arm=name, **{**known, **change})
 
 
 def test_the_screen_says_what_is_known():
@@ -250,13 +250,13 @@ def test_where_there_is_no_room_the_arms_in_need_stay():
 
 
 def test_nobody_is_shown_as_nobody():
-    told = shown(FleetNow("f", (), (), {}, ()))
+    told = shown(FleetSnapshot("f", (), (), {}, ()))
     assert "no auctioneer" in told
     assert "jobs: none" in told
 
 
 def test_ages_and_times_are_short():
-    assert [age(value) for value in (None, -0.1, 0.04, 9.94, 12.4, 130.0)] == [
+    assert [format_age(value) for value in (None, -0.1, 0.04, 9.94, 12.4, 130.0)] == [
         "—",
         "0.0 s",
         "0.0 s",
@@ -264,22 +264,29 @@ def test_ages_and_times_are_short():
         "12 s",
         "2 min",
     ]
-    assert [clock(value) for value in (0.0, 59.9, 3600.0, 86461.0)] == ["0:00:00", "0:00:59", "1:00:00", "24:01:01"]
-    assert scores(SimpleNamespace(difficulty={})) == ""
-    assert "headroom 7.5 K  does crate 1" in line(arm_now())
-    assert "no token" in line(arm_now(token=False))
+    assert [format_time(value) for value in (0.0, 59.9, 3600.0, 86461.0)] == [
+        "0:00:00",
+        "0:00:59",
+        "1:00:00",
+        "24:01:01",
+    ]
+    assert format_scores(SimpleNamespace(difficulty={})) == ""
+    assert "headroom 7.5 K  job crate 1" in arm_line(arm_now())
+    assert "no token" in arm_line(arm_now(token=False))
 
 
 @pytest.fixture
 def fleet():
     """A fleet of one arm that says its words whenever it is asked to."""
-    with Router() as router, Link(router.endpoint, "f") as link:
-        link.alive(keys.of_arm("f", "a", "alive"))
-        event = link.publisher(keys.of_arm("f", "a", "event"), ArmEvent, remember=8)
+    with Router() as router, BusClient(router.endpoint, "f") as link:
+        link.declare_token(keys.of_arm("f", "a", "alive"))
+        event = link.publisher(keys.of_arm("f", "a", "event"), ArmEvent)
 
         def say():
-            link.say(keys.of_arm("f", "a", "state"), state(headroom_k=7.5))
-            link.say(keys.of_arm("f", "a", "difficulty"), DifficultyWord("a", 1, 1.0, "t", ("j",), (0.5,), (None,)))
+            link.publish(keys.of_arm("f", "a", "state"), state(headroom_k=7.5))
+            link.publish(
+                keys.of_arm("f", "a", "difficulty"), DifficultyScores("a", 1, 1.0, "t", ("j",), (0.5,), (None,))
+            )
 
         yield SimpleNamespace(endpoint=router.endpoint, say=say, link=link, event=event)
 
@@ -287,13 +294,15 @@ def fleet():
 def test_an_onlooker_hears_a_whole_fleet(fleet):
     heard, came = [], []
     fleet.event(ArmEvent(arm="a", number=0, time_s=1.0, kind="warning", joint=2))
-    with Link(fleet.endpoint, "f") as link:
-        onlooker = Onlooker(link, heard=lambda *said: heard.append(said[:2]), came=lambda *who: came.append(who))
+    with BusClient(fleet.endpoint, "f") as link:
+        listener = FleetListener(
+            link, on_message=lambda *said: heard.append(said[:2]), on_presence=lambda *who: came.append(who)
+        )
         deadline_s = time.monotonic() + PATIENCE_S
         while len({topic for topic, _ in heard}) < 3 and time.monotonic() < deadline_s:
             fleet.say()
-            onlooker.serve(time.monotonic() + 0.05)
-        (arm,) = onlooker.overview.now(time.monotonic()).arms
+            listener.serve(time.monotonic() + 0.05)
+        (arm,) = listener.view.snapshot(time.monotonic()).arms
     assert {topic for topic, _ in heard} == {"state", "difficulty", "event"}  # the event was said before
     assert came == [("arm", "a", True)]
     assert arm.present
@@ -301,7 +310,7 @@ def test_an_onlooker_hears_a_whole_fleet(fleet):
 
 
 def command(*arguments):
-    return [sys.executable, "-u", "-c", "from scenarios.cli import main; main()", "watch", *arguments]
+    return [sys.executable, "-u", "-c", "from scenarios.cli.main import main; main()", "watch", *arguments]
 
 
 def test_without_a_terminal_lines_are_printed_until_told_to_stop(fleet):
@@ -310,11 +319,11 @@ def test_without_a_terminal_lines_are_printed_until_told_to_stop(fleet):
             command("--endpoint", fleet.endpoint), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
         )
         try:
-            assert process.stdout.readline() == "a came\n"
+            assert process.stdout.readline() == "a joined\n"
             fleet.say()
             while "52.5 °C J2" not in (told := process.stdout.readline()):
                 assert told
-            assert "finds j 0.50" in told
+            assert "difficulty j 0.50" in told
             process.send_signal(number)
             assert process.wait(PATIENCE_S) == code
         finally:
@@ -334,11 +343,11 @@ def test_a_snapshot_is_json(fleet):
 @pytest.mark.parametrize("fleets", [(), ("f", "g")])
 def test_which_fleet_is_meant_must_be_clear(fleets):
     with Router() as router:
-        links = [Link(router.endpoint, name).open() for name in fleets]
+        links = [BusClient(router.endpoint, name).open() for name in fleets]
         for link in links:
-            link.alive(keys.of_arm(link.fleet, "a", "alive"))
+            link.declare_token(keys.of_arm(link.fleet, "a", "alive"))
         done = subprocess.run(command("--endpoint", router.endpoint), capture_output=True, text=True, timeout=60)
         for link in links:
             link.close()
     assert done.returncode == 2
-    assert ("Several fleets" if fleets else "Nobody is at") in done.stderr.replace("\n", " ")
+    assert ("several fleets" if fleets else "no fleet") in done.stderr.replace("\n", " ")

@@ -8,16 +8,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from fleet.engine.oracle import peaks
 from fleet.motor import gen3_motors
+from fleet.planning.random_motions import random_jobs
 from fleet.robot import Robot
-from fleet.sim.exercise import random_jobs
-from fleet.sim.oracle import peaks
 from fleet.thermal import NODES, ThermalSpread, gen3_network, spread_motors, thermal_model
-from scenarios.cli import main
-from scenarios.perform import alone
-from scenarios.records import records
-from twin.model import TwinConfig
-from twin.train import train
+from scenarios.cli.main import main
+from scenarios.motion.perform import bare_arm
+from scenarios.prepare.cool_motion import records
+from twin.vae.model import TwinConfig
+from twin.vae.train import train
 
 SMALL = """
 description = "Two arms hold and sort for three minutes."
@@ -92,7 +92,7 @@ def subject() -> SimpleNamespace:
     jobs = tuple(job for job, highest in zip(drawn, peak_c, strict=True) if highest < 40.0)
     config = TwinConfig(hidden=16, max_windows=384, epochs=40, batch=64, restarts=1)
     twin = train(records(jobs), config, np.random.SeedSequence(3), arm=robot.name)
-    return SimpleNamespace(arm=alone(robot, motors, thermal), jobs=jobs, twin=twin)
+    return SimpleNamespace(arm=bare_arm(robot, motors, thermal), jobs=jobs, twin=twin)
 
 
 @pytest.fixture

@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from agents.rules import make_policy
-from fleet.env.picture import draw
-from fleet.env.scene import mount_kind
-from scenarios.animate import FRAMES
-from scenarios.build import make_env
-from scenarios.cell import cell_of
-from scenarios.gif import HOLD_S
+from agents.registry import make_policy
+from fleet.env.render.picture import Picture
+from fleet.env.render.scene import mount_kind, scene_of
+from scenarios.cell_layout import cell_of
+from scenarios.cli.animate import FRAMES
 from scenarios.load import library, load
+from scenarios.prepare.fleet import make_env
+from scenarios.report.gif import HOLD_S
 
+WHOLE = 1
+"""Seed of a shift that lasts to its horizon."""
 QUICK = ("--difficulty", "blind", "--policy", "round_robin", "--size", "480x320")
 TICKS = 18
 """Of the small scenario."""
@@ -40,7 +42,7 @@ def read(path: Path) -> tuple[list[np.ndarray], list[float]]:
 )
 def test_a_film_has_the_beginning_the_steps_and_the_end(thermofleet, small_toml, tmp_path, options, count, seconds):
     out = tmp_path / "new" / "film.gif"
-    said = thermofleet("animate", small_toml, *QUICK, *options, "--out", out)
+    said = thermofleet("animate", small_toml, *QUICK, "--seed", WHOLE, *options, "--out", out)
     assert said.code == 0, said.err
     frames, lasts_s = read(out)
     assert len(frames) == count
@@ -67,9 +69,8 @@ def test_it_shows_the_shift_that_run_records(thermofleet, small_toml, tmp_path):
     told = json.loads((folder / "run.json").read_text(encoding="utf-8"))
     assert told["metrics"]["finished"] == int((env.truth.finished_s[0] >= 0).sum()) > 0
     scenario = load(small_toml)
-    expected = draw(
-        env.world, env.truth, cell_of(scenario), (480, 320), title=f"{scenario.name} · round_robin · seed 3"
-    )
+    title = f"{scenario.name} · round_robin · seed 3"
+    expected = Picture((480, 320)).frame(scene_of(env.world, env.truth, cell_of(scenario), title=title))
     last = read(out)[0][-1]
     apart = np.abs(last.astype(int) - expected.astype(int)).max(axis=-1)
     assert (apart == 0).mean() > 0.9  # areas are exact
@@ -89,8 +90,8 @@ def test_a_film_is_kept_until_told_otherwise(thermofleet, small_toml, tmp_path):
     out.write_text("mine", encoding="utf-8")
     said = thermofleet("animate", small_toml, *QUICK, "--out", out)
     assert (said.code, out.read_text("utf-8")) == (2, "mine")
-    assert said.err == f"Error: '{out}' is there already; give another --out, or --overwrite to replace it.\n"
-    assert thermofleet("animate", small_toml, *QUICK, "--out", out, "--overwrite").code == 0
+    assert said.err == f"Error: '{out}' exists; give another --out, or --overwrite to replace it.\n"
+    assert thermofleet("animate", small_toml, *QUICK, "--seed", WHOLE, "--out", out, "--overwrite").code == 0
     assert len(read(out)[0]) == TICKS + 1
 
 
@@ -129,7 +130,7 @@ def test_bad_input_gets_one_sentence_and_leaves_nothing(
 
 
 def test_too_many_frames_are_refused_before_the_work(thermofleet, small_toml, tmp_path, monkeypatch):
-    monkeypatch.setattr("scenarios.build.prepare", None)
+    monkeypatch.setattr("scenarios.prepare.fleet.prepare", None)
     options = ("--every", 1, "--out", tmp_path / "film.gif", "--size", "3840x2160", "--seconds", 1)
     long = small_toml.read_text("utf-8").replace("horizon_s = 180", "horizon_s = 7200")
     small_toml.write_text(long, encoding="utf-8")
@@ -166,7 +167,7 @@ class PressingCtrlC:
 
 
 def test_ctrl_c_leaves_nothing(thermofleet, small_toml, tmp_path, monkeypatch):
-    monkeypatch.setattr("scenarios.policies.policy_of", lambda name: PressingCtrlC())
+    monkeypatch.setattr("scenarios.policy_loader.policy_of", lambda name: PressingCtrlC())
     said = thermofleet("animate", small_toml, *QUICK, "--out", tmp_path / "film.gif")
     assert said.code == 130
     assert said.err.startswith("Interrupted while working: nothing was written.")

@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenarios.autonomy import GENERATED, OWN, PRIOR, autonomy, prior_records, proposed, remaining
-from scenarios.detection import Detection
-from scenarios.quality import QUESTIONS, table
-from scenarios.rehearse import trained
-from scenarios.study import make_study
-from twin.model import TwinConfig
-from twin.rivals import untrained
+from scenarios.prepare.train_twins import train_or_load
+from scenarios.studies.detection_metrics import Detection
+from scenarios.studies.ranking import QUESTIONS, table
+from scenarios.studies.self_training import GENERATED, OWN, PRIOR, autonomy, generated_plans, prior_records, remaining
+from scenarios.studies.setup import make_study
+from twin.baselines.reconstruction import untrained_config
+from twin.vae.model import TwinConfig
 
-TINY = replace(untrained(TwinConfig()), hidden=4, max_windows=64)
+TINY = replace(untrained_config(TwinConfig()), hidden=4, max_windows=64)
 SEED = np.random.SeedSequence(1)
 
 
@@ -59,7 +59,7 @@ def test_what_is_proposed_is_told_how_much_and_by_which_seed(study, folder):
 
 
 def test_prior_samples_are_windows_of_the_twin_in_si_units(study, folder):
-    twin = trained(study.train.records(), TINY, SEED, arm="arm", folder=folder)
+    twin = train_or_load(study.train.records(), TINY, SEED, arm="arm", folder=folder)
     drawn = prior_records(twin, 40, np.random.default_rng(0))
     assert len(drawn) == 40
     assert drawn[0].shape == (TINY.window, 3, 7)
@@ -82,7 +82,7 @@ def test_what_remains_by_hand():
 @pytest.mark.slow
 def test_a_trained_twin_proposes_motion_to_learn_from(tmp_path):
     study = make_study(SEED, train=40, reference=0, test=0, novel=0)
-    twin = trained(study.train.records(), TwinConfig.quick(), SEED, arm="arm", folder=tmp_path)
-    plans = proposed(study, twin, 3, 1)
+    twin = train_or_load(study.train.records(), TwinConfig.quick(), SEED, arm="arm", folder=tmp_path)
+    plans = generated_plans(study, twin, 3, 1)
     assert len(plans) == 3
     assert all(plan.arm == study.robot.name for plan in plans)

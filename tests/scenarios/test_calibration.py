@@ -8,10 +8,11 @@ import pytest
 
 from fleet.motion import drive
 from fleet.robot import ThermalLimits
-from scenarios.build import body_of, quiet
-from scenarios.calibration import calibrated_twins, rehearse_saturation
 from scenarios.load import load
-from twin.measures import Features
+from scenarios.prepare.calibrate_twins import calibrate_twins, simulate_experience
+from scenarios.prepare.planned_arm import PlannedArm, hardware_of
+from scenarios.progress import quiet
+from twin.vae.measures import Features
 
 
 @dataclass(frozen=True)
@@ -33,38 +34,44 @@ def scenario():
 
 
 def test_a_rehearsal_holds_both_outcomes_and_repeats(scenario) -> None:
-    body = body_of(scenario, 0)
-    past = rehearse_saturation(scenario, 0, body, {}, Seer(body[1]), jobs=60)
+    hardware = hardware_of(scenario, 0)
+    past = simulate_experience(scenario, PlannedArm(0, hardware, {}), Seer(hardware.motors), jobs=60)
     assert 5 <= past.passed.sum() <= 40
     assert len(past) == 60
     assert past.temp_c.min() > 15.0
     assert past.temp_c.max() < 60.5
-    assert rehearse_saturation(scenario, 0, body, {}, Seer(body[1]), jobs=60).data_hash == past.data_hash
-    assert rehearse_saturation(scenario, 1, body, {}, Seer(body[1]), jobs=60).data_hash != past.data_hash
+    assert (
+        simulate_experience(scenario, PlannedArm(0, hardware, {}), Seer(hardware.motors), jobs=60).data_hash
+        == past.data_hash
+    )
+    assert (
+        simulate_experience(scenario, PlannedArm(1, hardware, {}), Seer(hardware.motors), jobs=60).data_hash
+        != past.data_hash
+    )
 
 
 def test_a_calibrated_twin_is_kept_for_the_same_arm_only(scenario, tmp_path: Path, caplog) -> None:
-    body = body_of(scenario, 0)
-    first = calibrated_twins(scenario, [body], [{}], [Seer(body[1])], tmp_path, quiet, jobs=60)
+    hardware = hardware_of(scenario, 0)
+    first = calibrate_twins(scenario, [PlannedArm(0, hardware, {})], [Seer(hardware.motors)], tmp_path, quiet, jobs=60)
     (home,) = (tmp_path / "saturation").iterdir()
     (home / "saturation.json").touch()
     stamp = (home / "saturation.json").stat().st_mtime_ns
-    again = calibrated_twins(scenario, [body], [{}], [Seer(body[1])], tmp_path, quiet, jobs=60)
+    again = calibrate_twins(scenario, [PlannedArm(0, hardware, {})], [Seer(hardware.motors)], tmp_path, quiet, jobs=60)
     assert again[0].saturation == first[0].saturation
     assert (home / "saturation.json").stat().st_mtime_ns == stamp
-    other = body_of(scenario, 1)
-    calibrated_twins(scenario, [other], [{}], [Seer(other[1])], tmp_path, quiet, jobs=60)
+    other = hardware_of(scenario, 1)
+    calibrate_twins(scenario, [PlannedArm(0, other, {})], [Seer(other.motors)], tmp_path, quiet, jobs=60)
     assert len(list((tmp_path / "saturation").iterdir())) == 2
     (home / "saturation.json").write_text("{")
-    mended = calibrated_twins(scenario, [body], [{}], [Seer(body[1])], tmp_path, quiet, jobs=60)
+    mended = calibrate_twins(scenario, [PlannedArm(0, hardware, {})], [Seer(hardware.motors)], tmp_path, quiet, jobs=60)
     assert mended[0].saturation == first[0].saturation
-    assert "fitting anew" in caplog.text
+    assert "making it again" in caplog.text
 
 
 def test_an_arm_that_nothing_heats_keeps_its_twin_and_says_why(scenario, tmp_path: Path, caplog) -> None:
-    body, twin = body_of(scenario, 0), Seer(body_of(scenario, 0)[1])
+    hardware, twin = hardware_of(scenario, 0), Seer(hardware_of(scenario, 0).motors)
     lax = replace(scenario, limits=ThermalLimits(warning_c=500.0, error_c=600.0))
-    assert calibrated_twins(lax, [body], [{}], [twin], tmp_path, quiet, jobs=40) == [twin]
-    assert f"quickstart: arm '{body[0].name}' cannot say" in caplog.text
+    assert calibrate_twins(lax, [PlannedArm(0, hardware, {})], [twin], tmp_path, quiet, jobs=40) == [twin]
+    assert f"quickstart: arm '{hardware.robot.name}' gets no probability of saturation" in caplog.text
     assert "In 0 of 40 past jobs" in caplog.text
     assert not (tmp_path / "saturation").exists()

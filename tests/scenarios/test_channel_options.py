@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from fleet.bus.channel import Channel, Partition
+from fleet.bus.exchange.channel import Channel, Partition
 from fleet.errors import FleetError
-from scenarios.channel_options import channel_of, partition_of
+from scenarios.cli.run import channel_of, parse_partition
 from scenarios.load import load
 
 QUICK = ("--difficulty", "blind", "--policy", "least_difficulty")
@@ -14,14 +14,14 @@ HARD = ("--topology", "line", "--delay-s", 20, "--jitter-s", 5, "--loss", 0.2, "
 
 
 def test_a_partition_is_read_from_a_text():
-    assert partition_of("600:1200:a, b|c") == Partition(600.0, 1200.0, (("a", "b"), ("c",)))
-    assert partition_of("0:1e3:arm:1") == Partition(0.0, 1000.0, (("arm:1",),))
+    assert parse_partition("600:1200:a, b|c") == Partition(600.0, 1200.0, (("a", "b"), ("c",)))
+    assert parse_partition("0:1e3:arm:1") == Partition(0.0, 1000.0, (("arm:1",),))
 
 
 @pytest.mark.parametrize("text", ["", "600", "600:1200", "a:b:left", "1200:600:left|right", "0:10:left|", "0:10:a,a"])
 def test_a_text_that_is_no_partition_is_refused(text):
     with pytest.raises(ValueError, match=r"partition .*\(got|names 'a' twice"):
-        partition_of(text)
+        parse_partition(text)
 
 
 def test_options_make_a_channel(small_toml):
@@ -78,7 +78,7 @@ def test_a_comparison_says_what_lay_between(thermofleet, small_toml):
 
 
 def test_an_exchange_of_strangers_is_an_error_of_the_user(small_toml):
-    from scenarios.build import open_exchange
+    from scenarios.prepare.fleet import open_exchange
 
     with pytest.raises(FleetError, match="No arm 'z'"):
         open_exchange("memory", ("a", "b"), "f", channel=Channel(partitions=(Partition(0.0, 1.0, (("z",),)),)))

@@ -7,13 +7,16 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
-from agents.rules import RULES, make_policy
-from scenarios.folder import FILES
+from agents.registry import RULES, make_policy
+from fleet.bus.exchange.channel import TOPOLOGIES
+from scenarios.cli.main import COMMANDS
 from scenarios.load import library
+from scenarios.run.run_folder import FILES
 
 QUICK = ("--difficulty", "blind", "--bus", "memory", "--policy", "round_robin")
 
@@ -52,7 +55,7 @@ def test_the_same_seed_gives_the_same_files_in_another_process(thermofleet, smal
     one, two = tmp_path / "one", tmp_path / "two"
     assert thermofleet("run", small_toml, *QUICK, "--out", one).code == 0
     env = {**os.environ, "THERMOFLEET_CACHE": str(plans), "PYTHONHASHSEED": "7"}
-    command = [sys.executable, "-c", "from scenarios.cli import main; main()", "run", str(small_toml), *QUICK]
+    command = [sys.executable, "-c", "from scenarios.cli.main import main; main()", "run", str(small_toml), *QUICK]
     subprocess.run([*command, "--out", str(two)], check=True, env=env, capture_output=True, timeout=60)
     for name in FILES:
         assert (one / name).read_bytes() == (two / name).read_bytes(), name
@@ -110,7 +113,7 @@ def test_ctrl_c_while_working_keeps_what_was_done_and_the_same_command_replaces_
 ):
     out = tmp_path / "run"
     with monkeypatch.context() as patched:
-        patched.setattr("scenarios.policies.policy_of", lambda name: PressingCtrlC(step=4, times=1))
+        patched.setattr("scenarios.policy_loader.policy_of", lambda name: PressingCtrlC(step=4, times=1))
         said = thermofleet("run", small_toml, *QUICK, "--out", out)
     assert said.code == 130
     assert "Interrupted after 40 s of 180 s: the shift until then is kept in " in said.err
@@ -123,7 +126,7 @@ def test_ctrl_c_while_working_keeps_what_was_done_and_the_same_command_replaces_
 
 
 def test_a_second_ctrl_c_leaves_nothing(thermofleet, small_toml, tmp_path, monkeypatch):
-    monkeypatch.setattr("scenarios.policies.policy_of", lambda name: PressingCtrlC(step=4, times=2))
+    monkeypatch.setattr("scenarios.policy_loader.policy_of", lambda name: PressingCtrlC(step=4, times=2))
     said = thermofleet("run", small_toml, *QUICK, "--out", tmp_path / "run")
     assert said.code == 130
     assert "Interrupted while working: nothing was written." in said.err
@@ -139,7 +142,7 @@ def test_afterwards_ctrl_c_is_as_it_was(thermofleet, small_toml, tmp_path):
 def test_ctrl_c_while_planning_writes_nothing_and_keeps_the_plans(
     thermofleet, small_toml, tmp_path, monkeypatch, plans
 ):
-    from fleet.sim.planner import Planner
+    from fleet.planning.planner import Planner
 
     made = 0
     plan = Planner.plan
@@ -165,14 +168,14 @@ def test_ctrl_c_while_planning_writes_nothing_and_keeps_the_plans(
 def test_a_killed_run_leaves_only_a_folder_with_a_dot(small_toml, tmp_path, plans):
     program = textwrap.dedent("""
         import os, signal, sys
-        import scenarios.policies
-        from scenarios.cli import main
+        import scenarios.policy_loader
+        from scenarios.cli.main import main
 
         class Killed:
             def reset(self, rng): pass
             def act(self, observations): os.kill(os.getpid(), signal.SIGKILL)
 
-        scenarios.policies.policy_of = lambda name: Killed()
+        scenarios.policy_loader.policy_of = lambda name: Killed()
         main(sys.argv[1:])
     """)
     where = tmp_path / "runs"
@@ -194,7 +197,12 @@ def too_heavy(text: str) -> str:
 BAD_INPUT: list[tuple[str, Callable[[str], str] | None, list[str], str]] = [
     ("unknown key", lambda t: t + "\n[reward]\nfaullts = 1\n", [], "heat.toml: reward: unknown key 'faullts'; did you"),
     ("wrong type", lambda t: t.replace("= 180", '= "long"'), [], "heat.toml: horizon_s: expected a number, got a text"),
-    ("negative mass", lambda t: t.replace("[2.0]", "[-2.0]"), [], "heat.toml: jobs[0].payload_kg must be some masses"),
+    (
+        "negative mass",
+        lambda t: t.replace("[2.0]", "[-2.0]"),
+        [],
+        "jobs[0].payload_kg must be a non-empty list of masses",
+    ),
     ("one place", lambda t: t.replace("[0.45, 0", "[-0.45, 0"), [], "'right' stands 0.00 m from 'left' (arms[0]);"),
     ("not a number", lambda t: t.replace("= 180", "= nan"), [], "heat.toml: horizon_s: expected a finite number,"),
     ("bad TOML", lambda t: t + "\n[[", [], "heat.toml: not valid TOML: "),
@@ -202,7 +210,7 @@ BAD_INPUT: list[tuple[str, Callable[[str], str] | None, list[str], str]] = [
         "no arm",
         lambda t: t.replace("[[arms]]", "[[places]]").replace("tilt_deg", "tool_deg"),
         [],
-        "the cell has no arm",
+        "there are no arms",
     ),
     ("no trace", lambda t: t.replace('"batch", count = 2', '"trace", file = "t.txt"'), [], "there is no file '"),
     (
@@ -231,7 +239,7 @@ BAD_INPUT: list[tuple[str, Callable[[str], str] | None, list[str], str]] = [
     ("option", None, ["--sed", "1"], "No such option: --sed"),
     ("out is a file", None, ["--out", "HERE/heat.toml"], "it is a file; --out needs a folder."),
     ("out below a file", None, ["--out", "HERE/heat.toml/run"], "heat.toml' is a file, not a folder."),
-    ("out is taken", None, ["--out", "HERE"], "holds other things ('heat.toml'); --out needs a new folder"),
+    ("out is taken", None, ["--out", "HERE"], "holds other files ('heat.toml'); --out needs a new folder"),
 ]
 
 
@@ -261,7 +269,7 @@ def test_bad_input_is_told_in_one_sentence_and_nothing_is_written(
         (["show", "quikstart"], "No scenario 'quikstart'; did you mean 'quickstart'? Allowed: "),
         (["run"], "Missing argument 'scenario'."),
         (["rnu"], "No such command 'rnu'. Did you mean 'run'?"),
-        (["compare", "quickstart", "--seeds", "1"], "--seeds must be 2 or more, so that there is something to compare"),
+        (["compare", "quickstart", "--seeds", "1"], "--seeds must be 2 or more, because intervals need several"),
         (["compare", "quickstart", "--policies", "random,rnd"], "No policy 'rnd'; did you mean 'random'?"),
         (["compare", "quickstart", "--baseline", "best"], "The baseline 'best' is not among the policies compared: "),
         (["hold", "--payload", "-1"], "The payload must be a mass of 0 kg or more (got -1.0)."),
@@ -317,12 +325,12 @@ def test_without_round_robin_the_first_policy_is_the_baseline(thermofleet, small
 
 
 def test_the_demo_sets_two_policies_side_by_side(thermofleet, tmp_path, monkeypatch, plans):
-    from scenarios.build import prepare
+    from scenarios.prepare.fleet import prepare
 
     def without_twins(scenario, *, difficulty, progress):
         return prepare(scenario, difficulty="blind", cache=plans, progress=progress)
 
-    monkeypatch.setattr("scenarios.build.prepare", without_twins)
+    monkeypatch.setattr("scenarios.prepare.fleet.prepare", without_twins)
     said = thermofleet("demo", "--out", tmp_path / "demo")
     assert said.code == 0
     head = said.out.splitlines()[1].split()
@@ -334,22 +342,60 @@ def test_the_demo_sets_two_policies_side_by_side(thermofleet, tmp_path, monkeypa
     assert str(tmp_path / "demo" / "least_difficulty" / "report.html") in said.out
 
 
-def test_help_names_every_command_and_every_policy(thermofleet):
+def test_help_names_every_command_by_group_and_run_names_every_policy_and_topology(thermofleet):
     said = thermofleet("--help")
     assert said.code == 0
-    assert all(command in said.out for command in ("run", "list", "show", "compare", "demo", "hold"))
+    assert all(f"│ {name} " in said.out for name in COMMANDS)
+    assert all(f"─ {entry.panel} ─" in said.out for entry in COMMANDS.values())
     wide = " ".join(thermofleet("run", "--help").out.replace("│", " ").split())
-    assert all(policy in wide for policy in RULES)
+    assert all(name in wide for name in (*RULES, *TOPOLOGIES))
 
 
-def test_help_does_not_wait_for_the_learning_library():
-    program = "import sys; import scenarios.cli; print([m for m in ('torch', 'zenoh', 'plotly') if m in sys.modules])"
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_listed_command_can_be_imported_and_explains_itself(thermofleet, name):
+    said = thermofleet(name, "--help")
+    assert said.code == 0
+    assert f"Usage: thermofleet {name}" in said.out
+
+
+def test_the_version_is_printed(thermofleet):
+    said = thermofleet("--version")
+    assert (said.code, said.out) == (0, f"thermofleet {version('thermofleet')}\n")
+
+
+def test_help_imports_no_large_library():
+    """The page takes 0.2 s of CPU time; NumPy alone would take as much again."""
+    program = textwrap.dedent("""
+        import contextlib, sys
+        from scenarios.cli.main import main
+
+        with contextlib.suppress(SystemExit):
+            main(["--help"])
+        print([m for m in ("numpy", "networkx", "torch", "zenoh", "plotly", "mujoco", "numba") if m in sys.modules])
+    """)
     said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
-    assert said.stdout.strip() == "[]"
+    assert said.stdout.splitlines()[-1] == "[]"
+
+
+@pytest.mark.parametrize(
+    ("words", "completions"),
+    [
+        ("thermofleet re", ["record", "replay"]),
+        ("thermofleet run --pl", ["--plant"]),
+        ("thermofleet twin re", ["recover", "report"]),
+    ],
+)
+def test_the_shell_completes_commands_and_their_options(words, completions):
+    program = "from scenarios.cli.main import main; main()"
+    last = str(len(words.split()) - 1)
+    asked = {"_THERMOFLEET_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": last}
+    command = [sys.executable, "-c", program]
+    said = subprocess.run(command, env={**os.environ, **asked}, capture_output=True, text=True, timeout=60, check=True)
+    assert sorted(said.stdout.split()) == completions
 
 
 def test_a_warning_is_one_line_where_there_is_no_terminal():
     warn = "logging.getLogger('fleet.live').warning('%s', 'word ' * 60)"
-    code = f"import logging, scenarios.cli as cli; cli.app = lambda **_: {warn}; cli.main([])"
+    code = f"import logging, scenarios.cli.main as cli; cli.app = lambda **_: {warn}; cli.main([])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert done.stderr == f"WARNING  fleet.live: {'word ' * 60}\n"

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from fleet.bus.channel import PERFECT, Channel
+from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError
-from scenarios.compare import FIGURES, Comparison, compare, comparison_table, interval
 from scenarios.load import load
-from scenarios.scenario import Scenario
+from scenarios.run.compare import FIGURES, Comparison, compare, comparison_table, interval
+from scenarios.schema import Scenario
 
 POLICIES = ("random", "round_robin")
 
@@ -30,14 +30,14 @@ def compared(scenario: Scenario, plans: Path, workers: int, **changes) -> Compar
 def test_the_result_does_not_depend_on_the_number_of_workers(scenario, plans, monkeypatch, channel):
     how = {"seeds": range(6), "channel": channel}
     alone = compared(scenario, plans, workers=1, **how)
-    monkeypatch.setattr("scenarios.compare.TOGETHER", 4)
+    monkeypatch.setattr("scenarios.run.compare.TOGETHER", 4)
     assert compared(scenario, plans, workers=1, **how) == alone
-    monkeypatch.setattr("scenarios.compare.HERE_S", 0.0)
+    monkeypatch.setattr("scenarios.run.compare.HERE_S", 0.0)
     assert compared(scenario, plans, workers=2, **how) == alone
 
 
 def test_what_takes_no_time_needs_no_worker(scenario, plans, monkeypatch):
-    monkeypatch.setattr("scenarios.compare.Parallel", None)
+    monkeypatch.setattr("scenarios.run.compare.Parallel", None)
     told: list[tuple[str, float]] = []
     compared(scenario, plans, workers=2, progress=lambda stage, share: told.append((stage, share)))
     assert [share for stage, share in told if stage == "comparing"] == [0.5, 1.0]
@@ -108,3 +108,15 @@ def test_the_table_fits_eighty_columns_without_losing_a_word(scenario, plans):
     figure = result.figures["random"]["peak_c"]
     assert f"{figure.mean:.1f}" in text
     assert f"{figure.difference_low:+.1f} … {figure.difference_high:+.1f}" in text
+
+
+def test_the_scope_of_every_policy_is_shown_and_which_read_no_messages(scenario, plans):
+    late = Channel(delay_s=10.0)
+    for channel, said in ((PERFECT, False), (late, True)):
+        result = compared(scenario, plans, workers=1, seeds=range(2), channel=channel)
+        assert result.scopes == {"random": "arm", "round_robin": "central"}
+        page = io.StringIO()
+        Console(file=page, width=80).print(comparison_table(result))
+        lines = [" ".join(line.split()) for line in page.getvalue().splitlines()]
+        assert {"random arm", "round_robin central"} <= set(lines)
+        assert ("Central policies read no messages: round_robin." in lines) is said

@@ -1,4 +1,4 @@
-"""Who takes part, and that twins are read as they score themselves; tiny studies, networks left untrained."""
+"""Who takes part, and that twins are read as they score themselves; tiny studies, networks left untrained_config."""
 
 from dataclasses import replace
 
@@ -6,28 +6,28 @@ import numpy as np
 import pytest
 
 from fleet.thermal import NODES
-from scenarios.contest import (
-    RIVALS,
-    TOLD_OF_HEAT,
+from scenarios.prepare.train_twins import train_or_load
+from scenarios.studies.benchmark import (
+    BASELINES,
+    THERMAL,
     VAE,
     TwinScorer,
-    chosen,
+    chosen_variants,
     difficulty,
-    identified,
+    identified_twin,
     jobs_of,
     quality,
-    readings,
+    twin_scorers,
     variants,
 )
-from scenarios.quality import CARRIER, HEAT, MEASURES, verdicts
-from scenarios.rehearse import trained
-from scenarios.study import make_study
-from twin.model import TwinConfig
-from twin.rc import RcTwin
-from twin.rivals import Modelled, untrained
+from scenarios.studies.ranking import CARRIER, HEAT, MEASURES, verdicts
+from scenarios.studies.setup import make_study
+from twin.baselines.reconstruction import ModelScorer, untrained_config
+from twin.thermal.thermal_twin import RcTwin
+from twin.vae.model import TwinConfig
 
 SEED = np.random.SeedSequence(1)
-TINY = replace(untrained(TwinConfig()), hidden=4, max_windows=64)
+TINY = replace(untrained_config(TwinConfig()), hidden=4, max_windows=64)
 
 
 def tiny(seed):
@@ -42,7 +42,7 @@ def study():
 @pytest.fixture(scope="module")
 def twin(study, tmp_path_factory):
     folder = tmp_path_factory.mktemp("twins")
-    return trained(study.train.records(), TINY, SEED, arm="arm", folder=folder)
+    return train_or_load(study.train.records(), TINY, SEED, arm="arm", folder=folder)
 
 
 def test_jobs_fill_the_horizon(study):
@@ -55,14 +55,14 @@ def test_jobs_fill_the_horizon(study):
 def test_a_twin_is_read_as_it_scores_itself(study, twin):
     jobs = jobs_of(study.novel, study.horizon_s)
     read = TwinScorer(VAE, twin, difficulty).scores(jobs.plans, jobs.repetitions)
-    told = Modelled(VAE, twin).scores(jobs.plans, jobs.repetitions)
+    told = ModelScorer(VAE, twin).scores(jobs.plans, jobs.repetitions)
     np.testing.assert_allclose(read.per_joint, told.per_joint)
     np.testing.assert_allclose(read.total, told.total)
 
 
 def test_d_cal_is_zero_for_half_of_the_reference_and_one_half_at_its_95th_percentile(study, twin):
     jobs = jobs_of(study.reference, study.horizon_s)
-    scorers = {s.name: s for s in readings({VAE: twin}, jobs)}
+    scorers = {s.name: s for s in twin_scorers({VAE: twin}, jobs)}
     d_cal = scorers["VAE d_cal"].scores(jobs.plans, jobs.repetitions).per_joint
     np.testing.assert_array_equal((d_cal == 0).sum(axis=0), 10)
     assert np.all((d_cal > 0.5).sum(axis=0) == 1)
@@ -84,7 +84,7 @@ def result(study, tmp_path_factory):
 
 def test_everybody_takes_part_and_is_measured(result):
     names = {row.scorer for row in result.rows}
-    assert set(RIVALS) <= names
+    assert set(BASELINES) <= names
     assert {VAE, "VAE d_cal", "VAE torque channel", "VAE one-sided torque", "VAE z=8", "VAE whole arm"} <= names
     for row in result.rows:
         for measure in MEASURES:
@@ -93,13 +93,16 @@ def test_everybody_takes_part_and_is_measured(result):
 
 def test_who_is_told_of_heat_knows_best(result):
     """The label follows from the thermal law, so that of a nominal arm and the arm's own find nearly all."""
-    assert [name for name in RIVALS if result.knows(name) == HEAT] == list(TOLD_OF_HEAT)
+    assert [name for name in BASELINES if result.knows(name) == HEAT] == list(THERMAL)
     for name in ("rc nominal", "rc identified"):
         for question in ("any joint, total", "joint 2, joint 2"):
             row = result.row(name, question)
             assert row.values("auroc")[0] > 0.97
             assert row.values("spearman")[0] > 0.97
-    assert all("were told of motors and heat, VAE is beaten by" in said for said in verdicts(result, VAE, RIVALS)[1::2])
+    assert all(
+        "with motor data and the thermal law, VAE is beaten by" in said
+        for said in verdicts(result, VAE, BASELINES)[1::2]
+    )
 
 
 def test_logs_of_cool_jobs_tell_the_arm(study):
@@ -109,16 +112,16 @@ def test_logs_of_cool_jobs_tell_the_arm(study):
     nominal = RcTwin.nominal(ambient_c=study.ambient_c)
     wrong_k = [
         rc.peaks(jobs.plans, jobs.repetitions, start_c=start_c)[:, CARRIER] - jobs.peak_c[:, CARRIER]
-        for rc in (nominal, identified(study, SEED, logs=2))
+        for rc in (nominal, identified_twin(study, SEED, logs=2))
     ]
     assert np.abs(wrong_k[1]).mean() < 0.5 * np.abs(wrong_k[0]).mean()
 
 
 def test_fewer_networks_may_take_part_but_not_without_the_twin():
-    few = chosen(TINY, (VAE, "AE"))
+    few = chosen_variants(TINY, (VAE, "AE"))
     assert list(few) == [VAE, "AE"]
     assert few[VAE] == TINY
-    assert chosen(TINY, None) == variants(TINY)
+    assert chosen_variants(TINY, None) == variants(TINY)
     for networks in (("AE",), (VAE, "GAN")):
-        with pytest.raises(ValueError, match="A contest is of the 'VAE' and any of"):
-            chosen(TINY, networks)
+        with pytest.raises(ValueError, match="A benchmark takes 'VAE' and any of"):
+            chosen_variants(TINY, networks)

@@ -11,10 +11,11 @@ from fleet.motion import drive
 from fleet.motor import gen3_motors
 from fleet.robot import Robot
 from fleet.thermal import NODES, WINDING, drive_heat, gen3_network, thermal_model
-from scenarios.cool import cold_peaks, cool_plans, some_cool_plans
 from scenarios.load import library, load
+from scenarios.prepare.cool_motion import cold_peaks, cool_plans, require_cool_plans
+from scenarios.prepare.planned_arm import ArmHardware
 
-BODY = (Robot(name="arm_0"), gen3_motors(), thermal_model(gen3_network()))
+HARDWARE = ArmHardware(Robot(name="arm_0"), gen3_motors(), thermal_model(gen3_network()))
 PAYLOADS_KG = (0.0, 1.0, 2.0, 3.0, 4.0)
 
 
@@ -33,7 +34,7 @@ def plans(small):
 @pytest.fixture
 def courses(plans, scenario):
     """Second method: Runge-Kutta over the horizon, winding temperatures [joint, time] of each plan."""
-    _, motors, thermal = BODY
+    _, motors, thermal = HARDWARE
     spec = scenario.twin
     found = []
     for plan in plans:
@@ -51,7 +52,7 @@ def courses(plans, scenario):
 
 def test_peaks_from_a_cold_start_are_those_of_an_independent_integration(plans, courses, scenario):
     spec = scenario.twin
-    found = cold_peaks(plans, *BODY[1:], ambient_c=spec.ambient_c, horizon_s=spec.horizon_s)
+    found = cold_peaks(plans, *HARDWARE[1:], ambient_c=spec.ambient_c, horizon_s=spec.horizon_s)
     assert found == pytest.approx(np.array([course.max(axis=1) for course in courses]), abs=0.1)
 
 
@@ -60,18 +61,18 @@ def test_what_gets_hot_within_the_horizon_is_left_out_although_it_begins_cool(pl
     assert all(course[:, 0].max() < spec.cool_c for course in courses)
     stays = [bool(course.max() <= spec.cool_c) for course in courses]
     assert 0 < sum(stays) < len(plans)
-    kept = cool_plans(plans, BODY, spec)
+    kept = cool_plans(plans, HARDWARE, spec)
     assert list(kept) == [plan for plan, cool in zip(plans, stays, strict=True) if cool]
-    assert some_cool_plans(plans, BODY, scenario) == kept
+    assert require_cool_plans(plans, HARDWARE, scenario) == kept
 
 
 def test_a_shorter_horizon_lets_more_pass_and_none_of_nothing_is_cool(plans, scenario):
     brief = replace(scenario.twin, horizon_s=10.0)
-    assert cool_plans(plans, BODY, brief) == tuple(plans)
-    assert cool_plans([], BODY, brief) == ()
+    assert cool_plans(plans, HARDWARE, brief) == tuple(plans)
+    assert cool_plans([], HARDWARE, brief) == ()
 
 
 def test_an_arm_without_cool_motion_is_told_what_to_change(plans, scenario):
     strict = replace(scenario, twin=replace(scenario.twin, cool_c=22.5))
     with pytest.raises(FleetError, match=r"quickstart: arm 'arm_0' has no motion .* below 22.5 °C for 1800 s.*cool_c"):
-        some_cool_plans(plans, BODY, strict)
+        require_cool_plans(plans, HARDWARE, strict)

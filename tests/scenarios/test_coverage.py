@@ -10,11 +10,11 @@ import pytest
 from fleet.motor import gen3_motors
 from fleet.robot import JOINTS, Robot
 from fleet.thermal import gen3_network, thermal_model
-from scenarios import coverage as module
-from scenarios.coverage import READ, coverage
-from scenarios.study import Sample, Study
-from twin.measures import Features
-from twin.model import TwinConfig
+from scenarios.studies import exploration as module
+from scenarios.studies.exploration import READ, coverage
+from scenarios.studies.setup import Sample, Study
+from twin.vae.measures import Features
+from twin.vae.model import TwinConfig
 
 SEEDS = [np.random.SeedSequence(seed) for seed in (5, 6)]
 HORIZON_S = 95.0
@@ -82,7 +82,7 @@ def trainings(monkeypatch) -> list[dict[str, Any]]:
         seen.append({"explored": explored, "work": len(payloads) - explored, "seed": seed, "config": config})
         return ByExcess(explored > 0)
 
-    monkeypatch.setattr(module, "trained", train)
+    monkeypatch.setattr(module, "train_or_load", train)
     return seen
 
 

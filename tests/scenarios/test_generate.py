@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import scenarios.generate as module
+import scenarios.motion.generate as module
 from fleet.job import Place, Work
 from fleet.motion import RATE_HZ, Phase
 from fleet.robot import GEN3
 from fleet.thermal import NODES, WINDING
-from scenarios.generate import GenerationError, Verification, generate
-from scenarios.perform import perform
-from twin.generate import vary
+from scenarios.motion.generate import GenerationError, Verification, generate
+from scenarios.motion.perform import perform
+from twin.vae.generate import vary
 
 
 @pytest.fixture(scope="module")

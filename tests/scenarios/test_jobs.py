@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenarios.jobs import all_works, draw_jobs, rehearsal_works, works_of
+from scenarios.job_stream import all_works, draw_jobs, rehearsal_works, works_of
 from scenarios.load import load
-from scenarios.scenario import ArrivalSpec, Scenario
+from scenarios.schema import ArrivalSpec, Scenario
 
 
 @pytest.fixture

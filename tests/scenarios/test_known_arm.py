@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from fleet.errors import FleetError
-from scenarios.generate import peak_of
-from scenarios.known_arm import known_arm
 from scenarios.load import load, override
+from scenarios.motion.generate import peak_of
+from scenarios.motion.known_arm import known_arm
 
 LEFT: Any = SimpleNamespace(arm="left")
 

@@ -12,20 +12,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet.bus import keys
-from fleet.bus.link import Link
-from fleet.bus.messages import Info, State
-from fleet.bus.router import Router
-from fleet.bus.trade import JobWord, Quote, QuoteRequest
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.router import Router
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import JobSpec, Quote, QuoteRequest
+from fleet.bus.protocol.messages import Info, State
 from fleet.errors import BusError, FleetError, LogError
-from fleet.sim.known_plans import rest_torque
-from fleet.sim.models import ArmModel
-from scenarios.build import prepare, prepare_arm, quiet
-from scenarios.live_arm import air_of, refuse_namesake, replayed, simulated
+from fleet.physics.models import ArmModel
+from fleet.planning.plan_cache import rest_torque
+from scenarios.cli.live.arm import ambient_of, replayed_arm, simulated_arm, wait_for_name
 from scenarios.load import load
-from scenarios.scenario import Ambient
-from twin.logs import read
-from twin.recording import CHANNELS
+from scenarios.prepare.fleet import prepare, prepare_arm
+from scenarios.progress import quiet
+from scenarios.schema import Ambient
+from twin.logs.reader import read
+from twin.logs.recording import READINGS
 
 LOGS = Path(__file__).parents[2] / "../shared/data/gen3_logs"
 PATIENCE_S = 60.0
@@ -35,10 +36,10 @@ TIME_S = np.arange(0.0, 4.0, 0.1)
 @pytest.fixture
 def log(tmp_path):
     """A plain log in which every channel of joint k rises by k a second from its own start."""
-    starts = dict(zip(CHANNELS, (0.0, 1.0, 2.0, 3.0, 30.0), strict=True))
+    starts = dict(zip(READINGS, (0.0, 1.0, 2.0, 3.0, 30.0), strict=True))
     rise = TIME_S[:, None] * np.arange(1, 8) / 100
     columns = np.hstack([TIME_S[:, None] + 50.0, *(start + rise for start in starts.values())])
-    header = ",".join(["time_s", *(f"{channel}_{k}" for channel in CHANNELS for k in range(1, 8))])
+    header = ",".join(["time_s", *(f"{channel}_{k}" for channel in READINGS for k in range(1, 8))])
     path = tmp_path / "real.csv"
     np.savetxt(path, columns, delimiter=",", header=header, comments="", fmt="%.12g")
     return path
@@ -48,7 +49,7 @@ class Process:
     """`thermofleet arm …` until the end of the block."""
 
     def __init__(self, *args, cache, cwd):
-        program = "import sys; from scenarios.cli import main; main(sys.argv[1:])"
+        program = "import sys; from scenarios.cli.main import main; main(sys.argv[1:])"
         self.process = subprocess.Popen(
             [sys.executable, "-c", program, "arm", *map(str, args)],
             stdout=subprocess.PIPE,
@@ -79,8 +80,8 @@ class Process:
 def heard_from(link, fleet, enough):
     """State words and the info of an arm, once there are enough."""
     states, infos = [], []
-    link.listen(keys.of_every_arm(fleet, "state"), State, lambda _, word: states.append(word))
-    link.listen(keys.of_every_arm(fleet, "info"), Info, lambda _, word: infos.append(word), remembered=1)
+    link.subscribe(keys.of_every_arm(fleet, "state"), State, lambda _, word: states.append(word))
+    link.subscribe(keys.of_every_arm(fleet, "info"), Info, lambda _, word: infos.append(word), history=True)
     deadline_s = time.monotonic() + PATIENCE_S
     while not (infos and enough(states)):
         assert time.monotonic() < deadline_s, "waited in vain"
@@ -137,7 +138,7 @@ def test_one_arm_alone_has_the_twin_that_it_has_in_the_fleet(small_toml, tmp_pat
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
 def test_an_arm_lives_as_a_process_and_ends_when_told(small_toml, plans, tmp_path, number, code):
-    with Router() as router, Link(router.endpoint, "heat") as link:
+    with Router() as router, BusClient(router.endpoint, "heat") as link:
         options = ["--endpoint", router.endpoint, "--difficulty", "blind", "--rate-hz", 20]
         with Process(small_toml, "left", *options, cache=plans, cwd=tmp_path) as arm:
             assert arm.ready.split() == ["ready", "left", router.endpoint, str(arm.process.pid)]
@@ -148,23 +149,23 @@ def test_an_arm_lives_as_a_process_and_ends_when_told(small_toml, plans, tmp_pat
     assert (info.twin, states[-1].mode) == ("blind", "idle")
     assert (tmp_path / "runs/live-heat/left.journal").is_file()
     if number == signal.SIGINT:
-        assert "the same command goes on" in said.replace("\n", " ")
+        assert "the same command continues" in said.replace("\n", " ")
 
 
 def test_a_log_lives_as_an_arm(small_toml, plans, log, tmp_path):
-    with Router() as router, Link(router.endpoint, "heat") as link:
+    with Router() as router, BusClient(router.endpoint, "heat") as link:
         options = ["--source", "log", "--endpoint", router.endpoint, "--speed", 4, "--rate-hz", 20]
         with Process(small_toml, "museum", log, *options, cache=plans, cwd=tmp_path) as arm:
             assert arm.ready.startswith("ready museum")
             states, info = heard_from(link, "heat", lambda states: states and states[-1].mode == "idle")
-            job = JobWord(name="j", kind="hold", places=("bench",))
-            answers = link.ask_and_wait(
+            job = JobSpec(name="j", kind="hold", places=("bench",))
+            answers = link.query_and_wait(
                 keys.of_every_arm("heat", "quote"), QuoteRequest("q", (job,), dry_run=True), Quote, timeout_s=10.0
             )
             assert arm.end(signal.SIGTERM)[0] == 0
     assert info.twin == "log real.csv"
-    (quote,) = answers.words.values()
-    assert "replays the log 'real.csv'" in quote.offers[0].reason
+    (quote,) = answers.messages.values()
+    assert "replays the log 'real.csv'" in quote.estimates[0].reason
     rise = np.arange(1, 8) / 100
     for state in states:
         into_s = (state.temp_c[0] - 30.0) * 100  # what the first joint says of the time, the others must say too
@@ -182,23 +183,23 @@ def test_a_log_lives_as_an_arm(small_toml, plans, log, tmp_path):
 
 
 def test_no_second_arm_lives_under_a_name():
-    with Router(0) as router, Link(router.endpoint, "f") as first, Link(router.endpoint, "f") as second:
-        first.alive(keys.of_arm("f", "a", "alive"))
-        refuse_namesake(second, "b", patience_s=PATIENCE_S)
-        with pytest.raises(BusError, match="has an arm 'a' already"):
-            refuse_namesake(second, "a", patience_s=0.3)
+    with Router(0) as router, BusClient(router.endpoint, "f") as first, BusClient(router.endpoint, "f") as second:
+        first.declare_token(keys.of_arm("f", "a", "alive"))
+        wait_for_name(second, "b", patience_s=PATIENCE_S)
+        with pytest.raises(BusError, match="Arm 'a' of fleet 'f' is already running"):
+            wait_for_name(second, "a", patience_s=0.3)
 
 
 def test_an_arm_waits_for_the_token_of_its_last_life_to_go():
-    with Router(0) as router, Link(router.endpoint, "f") as second:
-        with Link(router.endpoint, "f") as first:
-            first.alive(keys.of_arm("f", "a", "alive"))
-            assert second.there(keys.of_arm("f", "a", "alive"), timeout_s=PATIENCE_S)
+    with Router(0) as router, BusClient(router.endpoint, "f") as second:
+        with BusClient(router.endpoint, "f") as first:
+            first.declare_token(keys.of_arm("f", "a", "alive"))
+            assert second.tokens(keys.of_arm("f", "a", "alive"), timeout_s=PATIENCE_S)
             leaves = threading.Timer(0.3, first.close)
             leaves.start()
-            refuse_namesake(second, "a", patience_s=PATIENCE_S)
+            wait_for_name(second, "a", patience_s=PATIENCE_S)
             leaves.join()
-        assert not second.there(keys.of_arm("f", "a", "alive"), timeout_s=PATIENCE_S)
+        assert not second.tokens(keys.of_arm("f", "a", "alive"), timeout_s=PATIENCE_S)
 
 
 def test_a_log_without_temperatures_or_of_others_is_refused(log, tmp_path):
@@ -206,22 +207,22 @@ def test_a_log_without_temperatures_or_of_others_is_refused(log, tmp_path):
     lines = log.read_text().splitlines()
     bare.write_text("\n".join(",".join(line.split(",")[:22]) for line in lines))
     with pytest.raises(LogError, match="no motor temperatures"):
-        replayed("arm", bare)
+        replayed_arm("arm", bare)
 
 
 def test_a_name_that_the_scenario_does_not_have_is_refused(small_toml, plans):
     with pytest.raises(FleetError, match="No arm 'museum'"):
-        simulated(load(small_toml), "museum", "blind", 0, quiet, plans)
+        simulated_arm(load(small_toml), "museum", "blind", 0, quiet, plans)
 
 
 @pytest.mark.skipif(not LOGS.is_dir(), reason="the real logs are not here")
 def test_a_real_arm_is_replayed_as_it_was_logged():
     file = sorted(LOGS.glob("*.csv.gz"))[0]
     (recording,) = read(file, damaged="skip")
-    body = replayed("kinova", file).body(1000.0, 0.1)
+    body = replayed_arm("kinova", file).body(1000.0, 0.1)
     for row in np.linspace(0, len(recording.time_s) - 2, 50).astype(int).tolist():
         body.advance(1000.0 + recording.time_s[row] - recording.time_s[0] + 1e-6)
-        reading = body.read()
+        reading = body.read_sensors()
         np.testing.assert_array_equal(reading.temp_c, recording.temp_c[row])
         np.testing.assert_array_equal(reading.q, recording.q[row])
         np.testing.assert_array_equal(reading.current_a, recording.current_a[row])
@@ -231,7 +232,7 @@ def test_a_real_arm_is_replayed_as_it_was_logged():
 def test_the_air_is_that_of_the_scenario_at_any_time(points):
     scenario = replace(load("quickstart"), ambient=Ambient(points=points))
     for time_s in (-1.0, 0.0, 150.0, 600.0, 1e6):
-        assert air_of(scenario)(time_s) == np.interp(time_s, *zip(*points, strict=True))
+        assert ambient_of(scenario)(time_s) == np.interp(time_s, *zip(*points, strict=True))
 
 
 def test_a_blind_arm_whose_plans_are_known_loads_no_physics(tmp_path):
@@ -240,10 +241,10 @@ def test_a_blind_arm_whose_plans_are_known_loads_no_physics(tmp_path):
     program = f"""
 import sys
 from pathlib import Path
-from scenarios.build import quiet
-from scenarios.live_arm import simulated
+from scenarios.progress import quiet
+from scenarios.cli.live.arm import simulated_arm
 from scenarios.load import load
-made = simulated(load("quickstart"), "arm_0", "blind", 0, quiet, Path({str(tmp_path)!r}))
+made = simulated_arm(load("quickstart"), "arm_0", "blind", 0, quiet, Path({str(tmp_path)!r}))
 made.body(0.0, 0.1).advance(1.0)
 print(*sys.modules)
 """

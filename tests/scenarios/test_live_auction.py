@@ -11,35 +11,32 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
-from fleet.bus import keys
-from fleet.bus.link import Link
-from fleet.bus.router import Router
-from fleet.bus.trade import (
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.router import Router
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import (
     Admission,
+    JobEstimate,
+    JobSpec,
     JobStatus,
-    JobWord,
-    Offer,
     Quote,
     QuoteRequest,
     Status,
     StatusRequest,
     Submission,
-    Submitted,
+    SubmissionReply,
 )
 from fleet.errors import FleetError
 from fleet.job import Job, Place, Work
-from fleet.live.bidding import Bidding
-from scenarios import live_auction
-from scenarios.build import make_env
-from scenarios.cli import main
-from scenarios.live_auction import own_jobs, word_of
-from scenarios.live_council import refuse_other_way
-from scenarios.live_policies import allocation, bids_of
-from scenarios.live_submit import parts, read_jobs
+from scenarios.cli.live import auction as live_auction
+from scenarios.cli.live.auction import own_jobs, word_of
+from scenarios.cli.live.consensus import refuse_other_way
+from scenarios.cli.live.submit import batches, read_jobs
+from scenarios.cli.main import main
 from scenarios.load import load
+from scenarios.prepare.fleet import make_env
 
 ROOT = Path(__file__).parents[2]
 PATIENT_S = 20.0
@@ -93,12 +90,12 @@ def test_what_is_no_job_is_told_by_its_line(tmp_path, text, complaint):
 
 
 def test_jobs_in_several_words_come_after_those_they_wait_for():
-    words = [JobWord(f"j{i:03d}", "hold", ("x",), after=(f"j{i + 1:03d}",) if i < 199 else ()) for i in range(200)]
-    handed_in = list(parts(words))
+    words = [JobSpec(f"j{i:03d}", "hold", ("x",), after=(f"j{i + 1:03d}",) if i < 199 else ()) for i in range(200)]
+    handed_in = list(batches(words))
     assert [len(part) for part in handed_in] == [64, 64, 64, 8]
     assert [word.name for part in handed_in for word in part] == [word.name for word in reversed(words)]
-    ring = [JobWord("a", "hold", ("x",), after=("b",)), JobWord("b", "hold", ("x",), after=("a",))]
-    assert list(parts(ring)) == [tuple(ring)]
+    ring = [JobSpec("a", "hold", ("x",), after=("b",)), JobSpec("b", "hold", ("x",), after=("a",))]
+    assert list(batches(ring)) == [tuple(ring)]
 
 
 def test_a_missing_file_is_one_sentence(capsys):
@@ -150,10 +147,10 @@ class Stage:
         self.time_s += 3600.0
         self.open = []
 
-    def submit(self, word: Submission) -> Submitted:
+    def submit(self, word: Submission) -> SubmissionReply:
         self.handed_in.append((self.time_s, [job.name for job in word.jobs]))
         self.open = list(word.jobs)
-        return Submitted("auctioneer", tuple(Admission(job.name, True) for job in word.jobs))
+        return SubmissionReply("auctioneer", tuple(Admission(job.name, True) for job in word.jobs))
 
     def end(self) -> None:
         self.ended = True
@@ -164,7 +161,7 @@ def test_a_stream_is_handed_in_as_time_goes_on_until_all_is_done_or_the_shift_is
     monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
     stage, never = Stage(), SimpleNamespace(is_set=lambda: False)
     names = {"a": 0.0, "b": 3700.0, "c": 7000.0, "d": 10000.0}
-    live_auction.work(stage, [(at_s, JobWord(n, "hold", ("x",))) for n, at_s in names.items()], horizon_s, never)
+    live_auction.work(stage, [(at_s, JobSpec(n, "hold", ("x",))) for n, at_s in names.items()], horizon_s, never)
     all_of_it = [(3600.0, ["a"]), (7200.0, ["b", "c"]), (10800.0, ["d"])]
     assert stage.handed_in == (all_of_it[:2] if ended else all_of_it)
     assert stage.ended is ended
@@ -174,7 +171,7 @@ def test_nothing_of_a_shift_that_is_over_is_handed_in_again(monkeypatch):
     monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
     stage, never = Stage(), SimpleNamespace(is_set=lambda: False)
     stage.auctioneer.ledger.ended = True
-    live_auction.work(stage, [(0.0, JobWord("a", "hold", ("x",)))], 1.0, never)
+    live_auction.work(stage, [(0.0, JobSpec("a", "hold", ("x",)))], 1.0, never)
     assert stage.handed_in == []
 
 
@@ -182,7 +179,7 @@ def test_nothing_is_handed_in_while_there_is_another_auctioneer(monkeypatch):
     monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
     stage, never = Stage(), SimpleNamespace(is_set=lambda: False)
     stage.alone_s = 7200.0
-    live_auction.work(stage, [(0.0, JobWord("a", "hold", ("x",)))], 1e6, never)
+    live_auction.work(stage, [(0.0, JobSpec("a", "hold", ("x",)))], 1e6, never)
     assert stage.handed_in == [(7200.0, ["a"])]
 
 
@@ -190,53 +187,28 @@ def test_a_job_travels_whole():
     place = Place(name="rack", position_m=(0.0, 0.0, 0.0))
     work = Work(kind="press", places=(place,), force_n=30.0, dwell_s=20.0)
     job = Job(name="p", work=work, repetitions=6, release_s=1.0, due_s=9.0, value=3.0, after=("q",))
-    assert word_of(job) == JobWord("p", "press", ("rack",), 6, 0.0, 20.0, 30.0, 1.0, 9.0, 3.0, ("q",))
+    assert word_of(job) == JobSpec("p", "press", ("rack",), 6, 0.0, 20.0, 30.0, 1.0, 9.0, 3.0, ("q",))
 
 
-# costs
-
-
-def quote(arm: str, *offers: Offer) -> Quote:
-    return Quote(arm, "r", "q", 5.0, "t", 0.0, "idle", 20.0, 1, offers)
-
-
-def test_quotes_become_arrays():
-    jobs = (JobWord("a", "hold", ("x",), due_s=150.0, value=2.0), JobWord("b", "hold", ("y",)))
-    quotes = {
-        "one": quote("one", Offer("a", True, "", None, 1.5, 0.25, 55.0, 60.0, 100.0), Offer("b", False, "reach")),
-        "two": quote("two", Offer("b", True)),
-    }
-    bids = bids_of(Bidding("r", 100.0, jobs, quotes), ("one", "two"), 60.0)
-    nan = np.nan
-    np.testing.assert_array_equal(bids.feasible, [[True, False], [False, True]])
-    np.testing.assert_array_equal(bids.difficulty, [[1.5, nan], [nan, nan]])
-    np.testing.assert_array_equal(bids.p_saturation, [[0.25, nan], [nan, nan]])
-    np.testing.assert_array_equal(bids.peak_headroom_k, [[5.0, nan], [nan, nan]])
-    np.testing.assert_array_equal(bids.finish_s, [[100.0, nan], [nan, nan]])
-    np.testing.assert_array_equal(bids.tardiness_s, [[50.0, nan], [nan, nan]])
-    np.testing.assert_array_equal(bids.value, [2.0, 1.0])
-
-
-@pytest.mark.parametrize("policy", ["ssi", "matching", "consensus"])
-def test_the_arm_that_would_get_hot_does_not_get_the_job(policy):
-    jobs = (JobWord("a", "hold", ("x",)),)
-    quotes = {
-        "hot": quote("hot", Offer("a", True, d=1.0, p_saturation=0.9, finish_in_s=10.0)),
-        "cool": quote("cool", Offer("a", True, d=1.1, p_saturation=0.0, finish_in_s=20.0)),
-    }
-    bidding = Bidding("r", 0.0, jobs, quotes)
-    assert allocation(policy, 60.0)(bidding) == {"a": "cool"}
-    if policy != "consensus":
-        assert allocation(f"quickest_{policy}", 60.0)(bidding) == {"a": "hot"}
+# policies
 
 
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (("auction", "quickstart", "--policy", "match"), "No policy 'match' of a live fleet; did you mean 'matching'?"),
+        (("auction", "quickstart", "--policy", "match"), "No policy 'match'; did you mean 'matching'?"),
         (("up", "quickstart", "--policy", "sssi"), "did you mean 'ssi'?"),
         (("auction", "quickstart", "--policy", "consensus"), "'consensus' takes no auctioneer: thermofleet arm"),
-        (("arm", "quickstart", "arm_0", "--policy", "ssi"), "'ssi' takes an auctioneer: thermofleet auction"),
+        (("auction", "quickstart", "--policy", "random"), "'random' takes no auctioneer: thermofleet arm"),
+        (
+            ("arm", "quickstart", "arm_0", "--policy", "wspt"),
+            "'wspt' needs an auctioneer: start it with thermofleet auction",
+        ),
+        (("arm", "quickstart", "arm_9", "--policy", "random"), "No arm 'arm_9' in quickstart"),
+        (
+            ("arm", "quickstart", "arm_0", "--policy", "ssi"),
+            "'ssi' needs an auctioneer: start it with thermofleet auction",
+        ),
         (("arm", "quickstart", "arm_0", "--policy", "consensus", "--jobs", "all"), "--jobs must be scenario or none"),
     ],
 )
@@ -292,7 +264,7 @@ def test_a_shift_goes_on_in_its_own_way_and_from_nothing(tmp_path):
 @contextmanager
 def auctioneer(endpoint: str, folder: Path, *words: object) -> Iterator[subprocess.Popen[str]]:
     """The command as a process that has said that it is ready."""
-    program = [sys.executable, "-c", "from scenarios.cli import main; main()", "auction"]
+    program = [sys.executable, "-c", "from scenarios.cli.main import main; main()", "auction"]
     options = ["--endpoint", endpoint, "--journal", folder, *words]
     command = [*program, *map(str, options)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
@@ -353,14 +325,14 @@ def test_nobody_to_hand_in_to_is_one_sentence(endpoint, tmp_path, capsys):
     file.write_text(json.dumps(HOLD))
     code, _, err = call(capsys, "submit", file, "--endpoint", endpoint, "--fleet", "f")
     assert code == 2
-    assert "No auctioneer of fleet 'f' answered" in err
+    assert "No auctioneer of fleet 'f' replied" in err
 
 
 @contextmanager
-def served(endpoint: str, declare: Callable[[Link], None]) -> Iterator[None]:
+def served(endpoint: str, declare: Callable[[BusClient], None]) -> Iterator[None]:
     """A participant of fleet f on a thread of its own."""
     stop = threading.Event()
-    with Link(endpoint, "f") as link:
+    with BusClient(endpoint, "f") as link:
         declare(link)
 
         def serve() -> None:
@@ -383,10 +355,10 @@ def arm(endpoint: str) -> Iterator[list[QuoteRequest]]:
 
     def answer(request: QuoteRequest) -> Quote:
         asked.append(request)
-        offers = (Offer(request.jobs[0].name, True, "", (0.5,) * 7, 3.5, 0.125, 52.34, 100.0, 160.0),)
+        offers = (JobEstimate(request.jobs[0].name, True, "", (0.5,) * 7, 3.5, 0.125, 52.34, 100.0, 160.0),)
         return Quote("arm_0", request.auction, "", 5.0, "t", 0.0, "idle", 20.0, 1, offers)
 
-    with served(endpoint, lambda link: link.answer(keys.of_arm("f", "arm_0", "quote"), QuoteRequest, answer)):
+    with served(endpoint, lambda link: link.reply_to(keys.of_arm("f", "arm_0", "quote"), QuoteRequest, answer)):
         yield asked
 
 
@@ -394,10 +366,10 @@ def arm(endpoint: str) -> Iterator[list[QuoteRequest]]:
 def test_jobs_can_be_followed_to_their_end(endpoint, tmp_path, capsys, end, code):
     states = iter([JobStatus("a", "waiting"), JobStatus("a", "awarded", "arm_0"), JobStatus("a", end, "arm_0")])
 
-    def declare(link: Link) -> None:
-        taken = Submitted("auctioneer", (Admission("a", True),))
-        link.answer(keys.of_jobs("f", "submit"), Submission, lambda _: taken)
-        link.answer(keys.of_jobs("f", "status"), StatusRequest, lambda _: Status("auctioneer", 0.0, (next(states),)))
+    def declare(link: BusClient) -> None:
+        taken = SubmissionReply("auctioneer", (Admission("a", True),))
+        link.reply_to(keys.of_jobs("f", "submit"), Submission, lambda _: taken)
+        link.reply_to(keys.of_jobs("f", "status"), StatusRequest, lambda _: Status("auctioneer", 0.0, (next(states),)))
 
     file = tmp_path / "jobs"
     file.write_text(json.dumps(HOLD))
@@ -413,7 +385,7 @@ def test_ask_shows_what_a_job_would_cost_whom(endpoint, capsys):
         assert code == 0
         assert "hold  arm_0  3.50     0.12     52.3      100        160" in out
         code, out, _ = call(capsys, "ask", *job, "--endpoint", endpoint, "--fleet", "f", "--json")
-        assert json.loads(out)[0]["offers"][0]["d"] == 3.5
+        assert json.loads(out)[0]["estimates"][0]["difficulty"] == 3.5
     assert [request.dry_run for request in asked] == [True, True]
     assert asked[0].jobs[0].payload_kg == 2.0
 
@@ -426,4 +398,4 @@ def test_ask_says_what_is_missing(endpoint, capsys):
     assert f"No such job: No kind of job 'pick_and_place'; {told_kinds}" in " ".join(told.split())
     code, _, err = call(capsys, "ask", "--kind", "hold", "--place", "rack", *at)
     assert code == 2
-    assert "No arm of fleet 'f' answered" in err
+    assert "No arm of fleet 'f' replied" in err

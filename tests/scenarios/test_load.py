@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.errors import ScenarioError
-from scenarios.load import checked, library, load, override
+from scenarios.load import library, load, override, parse_scenario
 
 FILE = Path("heat.toml")
 
@@ -50,7 +50,7 @@ def told(edit: Callable[[dict[str, Any]], None]) -> str:
     raw = small()
     edit(raw)
     with pytest.raises(ScenarioError) as error:
-        checked(raw, FILE)
+        parse_scenario(raw, FILE)
     return str(error.value)
 
 
@@ -62,7 +62,7 @@ WRONG = [
     (put("arms", 1, "tool_kg", -1), "heat.toml: arms[1].tool_kg must be >= 0 (got -1.0)."),
     (put("arms", 0, "position_m", [0, 0]), "heat.toml: arms[0].position_m: expected 3 values, got 2."),
     (put("arms", 0, "position_m", [0, "a", 0]), "arms[0].position_m[1]: expected a number, got a text ('a')."),
-    (put("arms", 0, "cooling", "stil_air"), "arms[0].cooling: 'stil_air' is not possible; did you mean 'still_air'?"),
+    (put("arms", 0, "cooling", "stil_air"), "arms[0].cooling: 'stil_air' is not allowed; did you mean 'still_air'?"),
     (put("arms", 0, "home", "hom"), "heat.toml: arms[0].home 'hom' is no posture; did you mean 'home'? Allowed: home,"),
     (put("arms", 0, "name", "a b"), "heat.toml: arms[0].name must be non-empty, without any of / * $ ? # @ or space"),
     (put("arms", 0, "name", 3), "heat.toml: arms[0].name: expected a text, got a whole number (3)."),
@@ -72,10 +72,10 @@ WRONG = [
         put("arms", 1, "position_m", [-0.45, 0.0, 0.05]),
         "arms[1].position_m: 'right' stands 0.05 m from 'left' (arms[0]); bases must be at least 0.2 m apart.",
     ),
-    (put("arms", []), "heat.toml: arms: the cell has no arm; at least one [[arms]] is needed."),
-    (drop("arms"), "heat.toml: arms: the cell has no arm; at least one [[arms]] is needed."),
+    (put("arms", []), "heat.toml: arms: there are no arms; at least one [[arms]] is needed."),
+    (drop("arms"), "heat.toml: arms: there are no arms; at least one [[arms]] is needed."),
     (put("arms", {"name": "x"}), "heat.toml: arms: expected a list, got a table."),
-    (drop("jobs"), "heat.toml: jobs: there is nothing to do; at least one [[jobs]] is needed."),
+    (drop("jobs"), "heat.toml: jobs: there are no jobs; at least one [[jobs]] is needed."),
     (drop("horizon_s"), "heat.toml: 'horizon_s' is missing."),
     (put("horizon_s", -1), "heat.toml: horizon_s must be > 0 (got -1.0)."),
     (put("horizon_s", True), "heat.toml: horizon_s: expected a number, got true or false (true)."),
@@ -84,17 +84,23 @@ WRONG = [
     (put("horizon_s", 1e9), "heat.toml: horizon_s must be at most 1000000 times telemetry_interval_s"),
     (put("telemetry_interval_s", 100), "heat.toml: telemetry_interval_s must not exceed decision_interval_s"),
     (put("slots", 2.5), "heat.toml: slots: expected a whole number, got a number (2.5)."),
-    (put("slots", 0), "heat.toml: slots must lie between 1 and 256 (got 0)."),
-    (put("name", "../up"), "heat.toml: name must be non-empty, begin with no dot and hold no slash (got '../up')."),
+    (put("slots", 0), "heat.toml: slots must be between 1 and 256 (got 0)."),
+    (
+        put("name", "../up"),
+        "heat.toml: name must be non-empty, without a leading dot and without slashes (got '../up').",
+    ),
     (
         put("places", 0, "position_m", [0.0, math.nan, 0.0]),
         "places[0].position_m[1]: expected a finite number, got nan",
     ),
     (put("places", 1, "name", "bench"), "heat.toml: places[1].name: 'bench' is taken; names must differ."),
-    (put("jobs", 0, "payload_kg", [-1.0]), "heat.toml: jobs[0].payload_kg must be some masses >= 0 (got [-1.0])."),
+    (
+        put("jobs", 0, "payload_kg", [-1.0]),
+        "heat.toml: jobs[0].payload_kg must be a non-empty list of masses >= 0 (got [-1.0]).",
+    ),
     (put("jobs", 0, "payload_kg", 1.0), "heat.toml: jobs[0].payload_kg: expected a list, got a number (1.0)."),
     (put("jobs", 0, "value", math.inf), "heat.toml: jobs[0].value: expected a finite number, got inf."),
-    (put("jobs", 0, "kind", "hol"), "jobs[0].kind: 'hol' is not possible; did you mean 'hold'? Allowed: hold, pick_"),
+    (put("jobs", 0, "kind", "hol"), "jobs[0].kind: 'hol' is not allowed; did you mean 'hold'? Allowed: hold, pick_"),
     (
         put("jobs", 0, "places", ["bnch"]),
         "jobs[0].places: no place 'bnch'; did you mean 'bench'? Allowed: bench, shelf.",
@@ -104,8 +110,8 @@ WRONG = [
     (put("jobs", 0, "repetitions", [5, 2]), "jobs[0].repetitions must be [fewest, most] with 1 <= fewest <= most"),
     (put("jobs", 0, "repetitions", [1, 10**30]), "jobs[0].repetitions must be [fewest, most] with 1 <= fewest"),
     (put("jobs", 0, "dwell_s", 1e7), "jobs[0].dwell_s must be at most 3600 s (got 10000000.0)"),
-    (put("jobs", 0, "after", ["hold"]), "jobs[0].after: 'hold' is no stream above this one; there is none."),
-    (put("jobs", 1, "after", ["hol"]), "jobs[1].after: 'hol' is no stream above this one; did you mean 'hold'?"),
+    (put("jobs", 0, "after", ["hold"]), "jobs[0].after: there is no stream 'hold' above this one; there is none."),
+    (put("jobs", 1, "after", ["hol"]), "jobs[1].after: there is no stream 'hol' above this one; did you mean 'hold'?"),
     (drop("jobs", 0, "arrivals"), "heat.toml: jobs[0]: 'arrivals' is missing."),
     (put("jobs", 0, "arrivals", []), "heat.toml: jobs[0].arrivals: expected a table, got a list."),
     (put("jobs", 0, "arrivals", {"kind": "poisson"}), "jobs[0].arrivals: arrivals of kind 'poisson' need 'every_s'."),
@@ -118,12 +124,15 @@ WRONG = [
     (put("jobs", 0, "arrivals", {"kind": "trace"}), "arrivals of kind 'trace' need either 'times_s' or 'file'."),
     (put("limits", "warning_c", 90), "heat.toml: limits need restart_c < warning_c < error_c (got 50.0, 90.0, 75.0)."),
     (put("ambient", "points", [[0]]), "heat.toml: ambient.points[0]: expected 2 values, got 1."),
-    (put("ambient", "points", [[0, 400]]), "heat.toml: ambient.points must lie between -40 and 60 °C (got [400.0])."),
+    (put("ambient", "points", [[0, 400]]), "heat.toml: ambient.points must be between -40 and 60 °C (got [400.0])."),
     (put("reward", "faullts", 1), "heat.toml: reward: unknown key 'faullts'; did you mean 'faults'?"),
-    (put("planning", "speeds", []), "heat.toml: planning.speeds must be some shares between 0.05 and 1 (got [])."),
+    (
+        put("planning", "speeds", []),
+        "heat.toml: planning.speeds must be a non-empty list of shares between 0.05 and 1 (got []).",
+    ),
     (
         put("twin", "size", "ful"),
-        "heat.toml: twin.size: 'ful' is not possible; did you mean 'full'? Allowed: full, quick.",
+        "heat.toml: twin.size: 'ful' is not allowed; did you mean 'full'? Allowed: full, quick.",
     ),
     (put("spread", "seed", 1.5), "heat.toml: spread.seed: expected a whole number, got a number (1.5)."),
 ]
@@ -140,7 +149,7 @@ def test_a_wrong_entry_is_told_by_file_place_value_and_what_is_allowed(edit, sen
 
 
 def test_the_small_scenario_itself_is_right():
-    scenario = checked(small(), FILE)
+    scenario = parse_scenario(small(), FILE)
     assert [arm.name for arm in scenario.arms] == ["left", "right"]
     assert scenario.jobs[0].arrivals.count == 2
     assert scenario.name == "heat"
@@ -166,7 +175,7 @@ def test_whatever_stands_in_a_field_gives_a_scenario_or_a_sentence(where, value)
     put(*where, value)(raw)
     said = "heat.toml: fine"
     try:
-        checked(raw, FILE)
+        parse_scenario(raw, FILE)
     except ScenarioError as error:
         said = str(error)
     assert said.startswith("heat.toml: ")
@@ -208,8 +217,8 @@ def test_a_byte_order_mark_does_no_harm(tmp_path, small_toml):
 
 TRACES = [
     (None, "heat.toml: jobs[0].arrivals.file: there is no file '"),
-    (b"", "'times.txt' holds no time; one arrival time in seconds per line is needed."),
-    (b"0\n5 s\n", "heat.toml: jobs[0].arrivals.file: line 2 of 'times.txt' is no time in seconds: '5 s'."),
+    (b"", "'times.txt' holds no times; one arrival time in seconds per line is needed."),
+    (b"0\n5 s\n", "heat.toml: jobs[0].arrivals.file: line 2 of 'times.txt' is no time, s: '5 s'."),
     (b"0\n5\n3\n", "the times in 'times.txt' must be >= 0 and in order (3.0 s is not)."),
     (b"-1\n", "must be >= 0 and in order (-1.0 s is not)."),
     (b"0\nnan\n5\n", "must be >= 0 and in order (nan s is not)."),
@@ -225,7 +234,7 @@ def test_a_missing_or_broken_trace_is_told(tmp_path, content, sentence):
     raw = small()
     raw["jobs"][0]["arrivals"] = {"kind": "trace", "file": "times.txt"}
     with pytest.raises(ScenarioError) as error:
-        checked(raw, tmp_path / "heat.toml")
+        parse_scenario(raw, tmp_path / "heat.toml")
     assert sentence in str(error.value)
 
 
@@ -233,11 +242,11 @@ def test_a_trace_file_lies_beside_its_scenario(tmp_path):
     (tmp_path / "times.txt").write_text("# shift of Monday\n0\n\n12.5\n", encoding="utf-8")
     raw = small()
     raw["jobs"][0]["arrivals"] = {"kind": "trace", "file": "times.txt"}
-    assert checked(raw, tmp_path / "heat.toml").jobs[0].arrivals.times_s == (0.0, 12.5)
+    assert parse_scenario(raw, tmp_path / "heat.toml").jobs[0].arrivals.times_s == (0.0, 12.5)
 
 
 def test_an_override_changes_that_field_and_no_other():
-    base = checked(small(), FILE)
+    base = parse_scenario(small(), FILE)
     changed = override(base, horizon_s=60, ambient={"points": [(0, 30)]})
     assert changed.horizon_s == 60
     assert changed.ambient.points == ((0.0, 30.0),)
@@ -253,12 +262,12 @@ def test_an_override_changes_that_field_and_no_other():
         ({"horizon_s": math.inf}, "heat with overrides: horizon_s: expected a finite number, got inf."),
         ({"slots": "a"}, "heat with overrides: slots: expected a whole number, got a text ('a')."),
         ({"slots": object()}, "heat with overrides: Encoding objects of type object is unsupported."),
-        ({"arms": []}, "heat with overrides: arms: the cell has no arm; at least one [[arms]] is needed."),
+        ({"arms": []}, "heat with overrides: arms: there are no arms; at least one [[arms]] is needed."),
     ],
 )
 def test_a_wrong_override_is_told(changes, sentence):
     with pytest.raises(ScenarioError) as error:
-        override(checked(small(), FILE), **changes)
+        override(parse_scenario(small(), FILE), **changes)
     assert sentence in str(error.value)
 
 

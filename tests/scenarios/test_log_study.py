@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from fleet.errors import FleetError
-from scenarios.log_study import AHEAD_S, CONFIG, LogStudy, hot_and_cool, log_study, peak_within
-from twin.logs import read_folder
-from twin.recording import Recording
-from twin.score import Twin
+from scenarios.studies.real_logs import AHEAD_S, CONFIG, LogStudy, hot_and_cool, log_study, peak_within
+from twin.logs.reader import read_folder
+from twin.logs.recording import Recording
+from twin.vae.twin import Twin
 
 LOGS = Path(__file__).parents[2] / "../shared/data/gen3_logs"
 QUICK = replace(CONFIG, epochs=1, hidden=4, allow_collapse=True)

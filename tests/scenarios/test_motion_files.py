@@ -7,12 +7,12 @@ import pyarrow.csv as pc
 import pyarrow.parquet as pq
 import pytest
 
-import scenarios.motion_files as module
+import scenarios.motion.motion_files as module
 from fleet.errors import FleetError
 from fleet.motion import RATE_HZ
-from scenarios.generate import Verification, generate
-from scenarios.motion_files import save_generated, save_recovery
-from scenarios.recover import Recovery
+from scenarios.motion.generate import Verification, generate
+from scenarios.motion.motion_files import save_generated, save_recovery
+from scenarios.motion.recover import Recovery
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ def test_only_its_like_is_replaced_and_only_when_asked(found, made, tmp_path):
     save_recovery(found, tmp_path / "out")
     with pytest.raises(FleetError, match="holds a finished recovery"):
         save_recovery(found, tmp_path / "out")
-    with pytest.raises(FleetError, match="holds other things"):
+    with pytest.raises(FleetError, match="holds other files"):
         save_generated(made, tmp_path / "out", overwrite=True)
     save_recovery(found, tmp_path / "out", format="csv", overwrite=True)
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["recovery.csv", "recovery.json"]

@@ -5,26 +5,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fleet.engine.oracle import peaks
 from fleet.motion import RATE_HZ, Phase
 from fleet.motor import gen3_motors
+from fleet.physics.models import ArmModel
+from fleet.planning.random_motions import plan_motion, random_jobs
 from fleet.robot import Robot
-from fleet.sim.exercise import exercise, random_jobs
-from fleet.sim.models import ArmModel
-from fleet.sim.oracle import peaks
 from fleet.thermal import NODES, gen3_network, thermal_model
-from scenarios.perform import alone, perform
+from scenarios.motion.perform import bare_arm, perform
 
 ROBOT = Robot(name="arm", tool_kg=0.9)
-ARM = alone(ROBOT, gen3_motors(), thermal_model(gen3_network()))
+ARM = bare_arm(ROBOT, gen3_motors(), thermal_model(gen3_network()))
 MODEL = ArmModel(ROBOT)
 STIFFNESS = np.array([2000.0] * 4 + [500.0] * 3)
-"""Of the servos, N·m/rad (fleet/sim/assets/gen3.xml)."""
+"""Of the servos, N·m/rad (fleet/physics/assets/gen3.xml)."""
 COLD_C = np.full(NODES, 23.0)
 REACHING = np.array([0.3, 0.8, np.pi, -1.2, 0.0, 0.9, 1.57])
 
 
 def hold(seconds=8.0, payload_kg=0.0):
-    return exercise(MODEL, REACHING[None], dwell_s=seconds, payload_kg=payload_kg, speed=0.6)
+    return plan_motion(MODEL, REACHING[None], dwell_s=seconds, payload_kg=payload_kg, speed=0.6)
 
 
 def test_what_is_measured_is_what_was_planned():

@@ -1,32 +1,71 @@
 """Policies by name: rules, own files, own modules, and what is said when there is none."""
 
+from typing import ClassVar
+
+import numpy as np
 import pytest
 
-from agents.rules import RULES, LeastDifficulty
+from agents.policy import EveryArm
+from agents.registry import RULES
+from agents.rules import LeastDifficulty
 from fleet.errors import FleetError
-from scenarios.policies import label, policy_of
+from scenarios.policy_loader import arm_policy_of, label, policy_of, scope_of
 
 
 @pytest.fixture
 def own(tmp_path):
     file = tmp_path / "mine.py"
     file.write_text(
-        "class Idle:\n def reset(self, rng): ...\n def act(self, o): return dict.fromkeys(o, 0)\nclass No: ...\n"
+        "class Idle:\n scope = 'central'\n def reset(self, rng): ...\n def act(self, o): return dict.fromkeys(o, 0)\n"
+        "class Lone:\n scope = 'arm'\n def reset(self, rng): ...\n def choose(self, o, place): return place\n"
+        "class Old:\n def reset(self, rng): ...\n def act(self, o): return dict.fromkeys(o, 0)\n"
+        "class No:\n scope = 'central'\n"
     )
     return file
 
 
 @pytest.mark.parametrize("name", RULES)
 def test_a_rule_by_its_name(name):
-    assert type(policy_of(name)) is RULES[name]
+    policy = policy_of(name)
+    assert (policy.kind if isinstance(policy, EveryArm) else type(policy)) is RULES[name].kind
+    assert policy.scope == scope_of(name) == RULES[name].scope
     assert label(name) == name
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_an_arm_policy_can_be_had_alone_and_a_central_one_cannot(name):
+    if scope_of(name) == "arm":
+        assert type(arm_policy_of(name)) is RULES[name].kind
+    else:
+        with pytest.raises(FleetError, match=f"'{name}' is a central policy"):
+            arm_policy_of(name)
+
+
+def test_every_arm_has_an_instance_of_its_own(own):
+    assert policy_of(f"{own}:Lone").act({"a": None, "b": None}) == {"a": 0, "b": 1}  # pyright: ignore[reportArgumentType]
+
+    class Counting:
+        scope: ClassVar = "arm"
+        asked = 0
+
+        def reset(self, rng):
+            """Nothing to reset."""
+
+        def choose(self, observation, place):
+            self.asked += 1
+            return self.asked
+
+    every = EveryArm(Counting)
+    assert [every.act({"a": None, "b": None}) for _ in range(2)] == [{"a": 1, "b": 1}, {"a": 2, "b": 2}]  # pyright: ignore[reportArgumentType]
+    every.reset(np.random.default_rng(0))
+    assert every.act({"b": None}) == {"b": 1}  # pyright: ignore[reportArgumentType]
 
 
 def test_an_own_class_from_a_file_or_a_module(own):
     found = policy_of(f"{own}:Idle")
     assert found.act({"arm_0": None}) == {"arm_0": 0}  # pyright: ignore[reportArgumentType]  # it never looks
     assert label(f"{own}:Idle") == "Idle"
-    assert isinstance(policy_of("agents.rules:LeastDifficulty"), LeastDifficulty)
+    assert isinstance(arm_policy_of("agents.rules:LeastDifficulty"), LeastDifficulty)
 
 
 @pytest.mark.parametrize(
@@ -34,7 +73,11 @@ def test_an_own_class_from_a_file_or_a_module(own):
     [
         ("least_dificulty", "did you mean 'least_difficulty'"),
         ("{own}:Idel", "did you mean 'Idle'"),
-        ("{own}:No", r"is no policy: it needs the methods reset\(rng\) and act"),
+        ("{own}:No", r"is no policy: of scope central it needs the methods reset\(rng\) and act\(observations\)"),
+        (
+            "{own}:Old",
+            r"Old' has no scope \(got None\). Add to the class: scope = .central. if its act",
+        ),
         ("nowhere.py:Idle", "there is no file 'nowhere.py'"),
         ("no_such_module:Idle", "cannot import 'no_such_module'"),
     ],

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from scipy.stats import spearmanr
 
 from fleet.motor import gen3_motors, reference_current
-from fleet.sim.models import ArmModel
-from fleet.thermal import HOUSING, WINDING, advance, drive_heat, gen3_network, settled, thermal_model
-from scenarios.posture_search import Nearby, course, holding, housing_estimate
+from fleet.physics.models import ArmModel
+from fleet.thermal import HOUSING, WINDING, advance, drive_heat, gen3_network, steady_state, thermal_model
+from scenarios.motion.posture_search import Nearby, course, holding, housing_estimate
 
 MOTORS, THERMAL = gen3_motors(), thermal_model(gen3_network())
 Q = np.deg2rad([0.0, 60.0, 180.0, -60.0, 0.0, 55.0, 90.0])
@@ -18,7 +18,7 @@ Q = np.deg2rad([0.0, 60.0, 180.0, -60.0, 0.0, 55.0, 90.0])
 def test_a_long_hold_ends_where_it_settles():
     tau = np.array([0.0, -30.0, 0.0, 15.0, 0.0, 5.0, 0.0])
     temps = course(np.full(14, 23.0), tau, MOTORS, THERMAL, 23.0, 40 * 3600.0)
-    end_c = settled(THERMAL, reference_current(tau, np.zeros(7), MOTORS) ** 2, np.zeros(7), MOTORS, 23.0)
+    end_c = steady_state(THERMAL, reference_current(tau, np.zeros(7), MOTORS) ** 2, np.zeros(7), MOTORS, 23.0)
     assert end_c is not None
     np.testing.assert_allclose(temps[-1], end_c[WINDING], atol=0.05)
     np.testing.assert_array_equal(temps[0], np.full(7, 23.0))

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from fleet.errors import FleetError
-from scenarios.detection import Detection, alarms, detection
-from scenarios.quality import MEASURES, QUESTIONS, Jobs, judge, spread, table, text, verdicts
-from twin.rivals import Scores
+from scenarios.studies.detection_metrics import Detection, alarms, detection
+from scenarios.studies.ranking import MEASURES, QUESTIONS, Jobs, judge, spread, table, verdicts
+from twin.baselines.reconstruction import Scores
 
 REFERENCE = np.arange(19.0)
 
@@ -89,7 +89,7 @@ def test_each_question_asks_its_own_score(parts):
     assert found["rises", "joint 2, joint 2"] == Detection(
         auroc=1.0, auprc=1.0, spearman=1.0, caught=1.0, false_novel=0.0
     )
-    with pytest.raises(ValueError, match="names of their own"):
+    with pytest.raises(ValueError, match="must be unique"):
         judge([ByRepetitions("a", np.arange(60.0))] * 2, **parts)
 
 
@@ -142,26 +142,26 @@ def test_the_words_follow_the_numbers():
                 },
             ]
         ),
-        told_of_heat=("rc",),
+        thermal=("rc",),
     )
     everybody = ("mixed", "better", "turns", "worse", "as the table shows it", "absent", "rc")
     said = verdicts(quality, "VAE", everybody)
     assert len(said) == 2 * len(QUESTIONS)
     assert said[4] == (
-        "Does joint 2 overheat, asked of its own score? Among those that know motion alone, VAE is beaten by better "
+        "Joint 2 overheats, by its own score. Among scorers with motion alone, VAE is beaten by better "
         "(AUROC +.075). It is partly beaten by mixed (AUROC +.010, but Spearman −.100). It ties with turns and as the "
         "table shows it. It beats worse."
     )
-    assert said[5].endswith("Among those that were told of motors and heat, VAE is beaten by rc (AUROC +.080).")
+    assert said[5].endswith("Among scorers with motor data and the thermal law, VAE is beaten by rc (AUROC +.080).")
 
 
 def test_a_table_has_a_row_per_scorer_and_question_in_order():
     quality = table(by_seed([{"b": some(), "a": some(auroc=1.0)}]))
     assert [(row.question, row.scorer) for row in quality.rows] == [(q, s) for q in QUESTIONS for s in ("b", "a")]
     assert quality.row("a", QUESTIONS[1]).values("auroc").tolist() == [1.0]
-    assert "| a | motion | 1.000 | .800 | .700 | .500 | .500 |" in text(quality)
-    assert "| a | heat | 1.000 |" in text(replace(quality, told_of_heat=("a",)))
-    assert spread(np.array([-0.5])) == "-.500"
+    assert quality.knows("a") == "motion"
+    assert replace(quality, thermal=("a",)).knows("a") == "heat"
+    assert spread(np.array([-0.5])) == "-0.500"
     with pytest.raises(ValueError, match="No scorer 'c'"):
         quality.row("c", QUESTIONS[0])
     with pytest.raises(ValueError, match="same scorers under each"):

@@ -8,19 +8,22 @@ import numpy as np
 import pytest
 
 from fleet.errors import FleetError
+from fleet.robot import JOINTS
 from fleet.thermal import WINDING
-from scenarios.log_rc import log_rc
-from scenarios.log_study import CONFIG, LogStudy, log_study
-from scenarios.own_logs import AIR_SD_K, own_logs
-from scenarios.rc_study import lines, rc_trust
-from scenarios.study import Study, make_study
-from scenarios.twin_heat import network_of
-from twin.identified import Body, nominal_body
-from twin.identify import identify
-from twin.logs import read_folder
-from twin.rc import RcTwin
-from twin.recording import Recording
-from twin.replay import replay
+from scenarios.studies.real_logs import CONFIG, LogStudy, log_study
+from scenarios.studies.real_logs_forecast import log_rc
+from scenarios.studies.report.saturation_chapters import network_of
+from scenarios.studies.saturation import judge_networks, past_work
+from scenarios.studies.setup import Study, make_study
+from scenarios.studies.simulated_logs import AIR_SD_K, own_logs
+from twin.logs.heat_log import heat_logs
+from twin.logs.reader import read_folder
+from twin.logs.recording import Recording
+from twin.thermal.identify import identify
+from twin.thermal.least_squares import Noise, Problem
+from twin.thermal.parameters import ParameterVector
+from twin.thermal.result import HeatModel, nominal_heat_model
+from twin.thermal.thermal_twin import RcTwin
 
 LOGS = Path(__file__).parents[2] / "../shared/data/gen3_logs"
 
@@ -37,35 +40,39 @@ def test_intervals_hold_the_truth_on_brisk_work_logged_at_2_hz():
         brisk = make_study(np.random.SeedSequence(seed), train=6, reference=0, test=0, novel=0)
         logs = own_logs(brisk, brisk.train.plans, np.random.default_rng(seed))
         found = identify(logs, ambient_c=brisk.ambient_c, ambient_sd_k=AIR_SD_K)
-        truth = Body(brisk.motors, network_of(brisk.thermal))
+        truth = HeatModel(brisk.motors, network_of(brisk.thermal))
         for p in found.parameters:
             true = float(truth.value(p.name)[0 if p.joint is None else p.joint - 1])
             inside.append(p.low <= true <= p.high)
     assert np.mean(inside) >= 0.8  # 171 values, three arms whose errors are not independent
 
 
-def test_own_logs_are_what_the_arm_itself_would_replay(study: Study):
+def test_own_logs_are_what_the_network_simulates(study: Study):
     (log,) = own_logs(study, study.test.plans[:1], np.random.default_rng(0), work_s=300.0, rest_s=100.0)
     assert log.time_s[-1] == 400.0
     assert log.temp_c is not None
     # Idle-warm, in the study's air, at the start.
     idle = RcTwin.nominal(ambient_c=study.ambient_c).idle_c[WINDING]
     np.testing.assert_allclose(log.temp_c[0], idle, atol=12.0)
-    seen = replay(nominal_body(), log, ambient_c=study.ambient_c)
-    assert seen.rms_k.max() < 1.0
+    layout = ParameterVector(nominal_heat_model())
+    heat = heat_logs(log, layout.nominal.motors, "current", step_s=0.0)
+    problem = Problem(heat, study.ambient_c, 0.0, layout, Noise(np.full(JOINTS, 0.01), np.ones(JOINTS)))
+    (error_k,) = problem.unexplained(layout.mean)
+    assert np.sqrt(np.mean(error_k**2, axis=0)).max() < 1.0
 
 
 def test_an_identified_arm_knows_its_peaks_and_both_are_trusted(study: Study):
-    pair = rc_trust(study, seed=5, labelled=80, watched=0)
+    pair = judge_networks(past_work(study, seed=5, labelled=80, watched=0))
     nominal, identified = pair
-    assert (nominal.name, identified.name) == ("nominal", "identified")
+    assert (nominal.name, identified.name) == ("rc nominal", "rc identified")
     assert nominal.table.count.sum() == 80
     assert min(each.auroc for each in pair) > 0.95
     assert max(each.brier for each in pair) < 0.08
+    assert identified.peak_error_k is not None
+    assert nominal.peak_error_k is not None
     assert identified.peak_error_k < 0.7 * nominal.peak_error_k
-    assert any("identified" in line for line in lines([pair]))
     with pytest.raises(ValueError, match="more than 150 \\+ 10 test jobs"):
-        rc_trust(study, seed=5, labelled=150, watched=10)
+        past_work(study, seed=5, labelled=150, watched=10)
 
 
 class _Clock:

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from fleet.sim.models import ArmModel
-from scenarios.generate import Verification
-from scenarios.posture_search import Nearby, RecoveryError
-from scenarios.recover import recover, warmed
+from fleet.physics.models import ArmModel
+from scenarios.motion.generate import Verification
+from scenarios.motion.posture_search import Nearby, RecoveryError
+from scenarios.motion.recover import hold_until, recover
 
 HOLDS = {
     "reaching": ((0.0, 60.0, 180.0, -30.0, 0.0, 55.0, 90.0), 3.0, 57.0),
@@ -24,7 +24,7 @@ def asked(subject):
 def test_the_hottest_motor_cools_and_is_cooler_than_without(subject, asked, name):
     degrees, payload_kg, until_c = HOLDS[name]
     q = np.deg2rad(degrees)
-    start_c = warmed(subject.arm, q, payload_kg, ambient_c=23.0, until_c=until_c)
+    start_c = hold_until(subject.arm, q, payload_kg, ambient_c=23.0, until_c=until_c)
     hold = {"start_c": start_c, "verification": asked, "hold_s": 150.0, "nearby": Nearby(candidates=200)}
     found = recover(subject.twin, subject.arm, q, payload_kg, seed=len(name), **hold)
     hot = found.hottest
@@ -52,7 +52,7 @@ def test_the_hottest_motor_cools_and_is_cooler_than_without(subject, asked, name
 
 def test_nothing_better_near_is_said(subject, asked):
     q = np.deg2rad(HOLDS["reaching"][0])
-    start_c = warmed(subject.arm, q, 3.0, ambient_c=23.0, until_c=50.0)
+    start_c = hold_until(subject.arm, q, 3.0, ambient_c=23.0, until_c=50.0)
     with pytest.raises(RecoveryError, match=r"No better posture near: of \d+ within 0.01 rad per joint") as said:
         recover(subject.twin, subject.arm, q, 3.0, start_c=start_c, verification=asked, nearby=Nearby(joint_rad=0.01))
     assert "would not cool" in str(said.value)
@@ -67,7 +67,7 @@ def test_a_hold_that_is_over_before_the_arm_has_watched_is_refused(subject, aske
 
 def test_a_light_hold_does_not_get_warm(subject):
     with pytest.raises(RecoveryError, match=r"does not get warm: holding 0.5 kg there for 30 min"):
-        warmed(subject.arm, np.zeros(7), 0.5, ambient_c=23.0, until_c=55.0, most_s=1800.0)
+        hold_until(subject.arm, np.zeros(7), 0.5, ambient_c=23.0, until_c=55.0, most_s=1800.0)
 
 
 @pytest.mark.parametrize(

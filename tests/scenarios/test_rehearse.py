@@ -8,15 +8,17 @@ import pytest
 
 from fleet.errors import FleetError
 from fleet.motor import gen3_motors
+from fleet.physics.models import ArmModel
+from fleet.planning.random_motions import light_jobs
 from fleet.robot import Mount, Robot
-from fleet.sim.exercise import light_jobs
-from fleet.sim.models import ArmModel
 from fleet.thermal import gen3_network, thermal_model
-from scenarios import rehearse
 from scenarios.load import library, load
-from scenarios.records import records
-from twin.model import TwinConfig
-from twin.train import train
+from scenarios.prepare import model_cache
+from scenarios.prepare import train_twins as rehearse
+from scenarios.prepare.cool_motion import records, require_cool_plans
+from scenarios.prepare.planned_arm import ArmHardware, PlannedArm
+from twin.vae.model import TwinConfig
+from twin.vae.train import train
 
 TINY = TwinConfig(max_windows=64, epochs=2, restarts=1, hidden=4, allow_collapse=True)
 
@@ -39,56 +41,63 @@ def tiny(monkeypatch):
     monkeypatch.setattr(TwinConfig, "quick", classmethod(lambda cls: TINY))
 
 
-def bodies(count):
-    return [(Robot(name=f"arm_{i}"), gen3_motors(), thermal_model(gen3_network())) for i in range(count)]
+def hardware(index=0):
+    return ArmHardware(Robot(name=f"arm_{index}"), gen3_motors(), thermal_model(gen3_network()))
+
+
+def arms(count, plans=None):
+    return [PlannedArm(i, hardware(i), plans or {}) for i in range(count)]
+
+
+def silent(stage, fraction):
+    pass
 
 
 def test_a_fleet_that_gets_hot_at_everything_is_told_what_to_change(plans, scenario, tmp_path):
     strict = replace(scenario, twin=replace(scenario.twin, cool_c=22.5))
     with pytest.raises(FleetError, match=r"arm 'arm_0' has no motion that stays below 22.5 °C .* Raise twin.cool_c"):
-        rehearse.twins(strict, bodies(1), [plans], tmp_path, lambda stage, share: None)
+        rehearse.train_twins(strict, arms(1, plans), tmp_path, silent)
 
 
 def test_twins_are_trained_once_and_then_taken_from_the_cache(plans, scenario, tmp_path, tiny, monkeypatch):
-    monkeypatch.setattr(rehearse, "cpu_count", lambda: 1)
+    monkeypatch.setattr(model_cache, "cpu_count", lambda: 1)
     told = []
-    first = rehearse.twins(scenario, bodies(2), [plans, plans], tmp_path, lambda *tell: told.append(tell))
+    first = rehearse.train_twins(scenario, arms(2, plans), tmp_path, lambda *tell: told.append(tell))
     assert told[-1] == ("training", 1.0)
     assert first[0].version != first[1].version  # each arm has a seed of its own
 
     def never(*_args, **_more):
         raise AssertionError("trained again")
 
-    monkeypatch.setattr(rehearse, "Parallel", never)
-    again = rehearse.twins(scenario, bodies(2), [plans, plans], tmp_path, lambda *tell: None)
+    monkeypatch.setattr(model_cache, "Parallel", never)
+    again = rehearse.train_twins(scenario, arms(2, plans), tmp_path, silent)
     assert [t.version for t in again] == [t.version for t in first]
     other = replace(scenario, twin=replace(scenario.twin, cool_c=200.0))  # hot motion is in the records as well
     with pytest.raises(AssertionError, match="trained again"):
-        rehearse.twins(other, bodies(2), [plans, plans], tmp_path, lambda *tell: None)
+        rehearse.train_twins(other, arms(2, plans), tmp_path, silent)
 
 
 def test_twins_do_not_depend_on_how_many_work(plans, scenario, tmp_path, tiny, monkeypatch):
-    both = rehearse.twins(scenario, bodies(2), [plans, plans], tmp_path / "two", lambda *tell: None)
-    monkeypatch.setattr(rehearse, "cpu_count", lambda: 1)
-    alone = rehearse.twins(scenario, bodies(2), [plans, plans], tmp_path / "one", lambda *tell: None)
+    both = rehearse.train_twins(scenario, arms(2, plans), tmp_path / "two", silent)
+    monkeypatch.setattr(model_cache, "cpu_count", lambda: 1)
+    alone = rehearse.train_twins(scenario, arms(2, plans), tmp_path / "one", silent)
     assert [t.version for t in both] == [t.version for t in alone]
 
 
 def test_a_spoilt_checkpoint_is_trained_anew_with_a_word(plans, scenario, tmp_path, tiny, caplog):
-    (twin,) = rehearse.twins(scenario, bodies(1), [plans], tmp_path, lambda *tell: None)
+    (twin,) = rehearse.train_twins(scenario, arms(1, plans), tmp_path, silent)
     (stored,) = (tmp_path / "twins").iterdir()
     (stored / "twin.json").write_text("{", encoding="utf-8")
     with caplog.at_level(logging.WARNING):
-        (anew,) = rehearse.twins(scenario, bodies(1), [plans], tmp_path, lambda *tell: None)
-    assert "training anew" in caplog.text
+        (anew,) = rehearse.train_twins(scenario, arms(1, plans), tmp_path, silent)
+    assert "making it again" in caplog.text
     assert anew.version == twin.version
 
 
 def test_an_arm_explores_with_light_motion_that_stays_cool_on_its_own_mount(scenario):
     """Second method: the torque at the first sample is the arm's own gravity torque, wherever it hangs."""
     ceiling = Robot(name="arm_1", mount=Mount(position_m=(0.0, 0.0, 1.2), tilt_deg=(180.0, 0.0, 0.0)))
-    (_, motors, thermal), _ = bodies(2)
-    explored = rehearse.explored_records(scenario, 1, (ceiling, motors, thermal))
+    explored = rehearse.exploration_records(scenario, PlannedArm(1, hardware(1)._replace(robot=ceiling), {}))
     assert len(explored) == 3 * scenario.twin.exploration
     arm = ArmModel(ceiling)
     for approach in explored[::3]:
@@ -98,51 +107,52 @@ def test_an_arm_explores_with_light_motion_that_stays_cool_on_its_own_mount(scen
 
 
 def test_exploration_that_gets_hot_is_left_out(scenario):
-    (body,) = bodies(1)
+    (arm,) = arms(1)
     strict = replace(scenario, twin=replace(scenario.twin, cool_c=22.5))
-    assert rehearse.explored_records(strict, 0, body) == []
+    assert rehearse.exploration_records(strict, arm) == []
 
 
 def test_an_arm_that_does_not_explore_learns_from_its_work_alone(plans, scenario, tmp_path, tiny):
     none = replace(scenario, twin=replace(scenario.twin, exploration=0))
-    (body,) = bodies(1)
-    assert rehearse.explored_records(none, 0, body) == []
-    (twin,) = rehearse.twins(none, [body], [plans], tmp_path, lambda *tell: None)
-    (explorer,) = rehearse.twins(scenario, [body], [plans], tmp_path, lambda *tell: None)
-    own = records(rehearse.cool_motion(plans, body, none))
+    (arm,) = arms(1)
+    assert rehearse.exploration_records(none, arm) == []
+    (twin,) = rehearse.train_twins(none, arms(1, plans), tmp_path, silent)
+    (explorer,) = rehearse.train_twins(scenario, arms(1, plans), tmp_path, silent)
+    own = records(require_cool_plans(arms(1, plans)[0].all_plans, hardware(), none))
     seed = np.random.SeedSequence([none.spread.seed, 0])
     assert twin.data_hash == train(own, TINY, seed, arm="arm_0").data_hash
-    both = [*own, *rehearse.explored_records(scenario, 0, body)]
+    both = [*own, *rehearse.exploration_records(scenario, arm)]
     assert explorer.data_hash == train(both, TINY, seed, arm="arm_0").data_hash
 
 
 def test_every_arm_explores_in_its_own_way_and_the_same_every_time(scenario):
-    first, other = bodies(2)
-    one = rehearse.explored_records(scenario, 0, first)
-    again = rehearse.explored_records(scenario, 0, first)
+    first, other = arms(2)
+    one = rehearse.exploration_records(scenario, first)
+    again = rehearse.exploration_records(scenario, first)
     assert all(np.array_equal(a, b) for a, b in zip(one, again, strict=True))
-    elsewhere = rehearse.explored_records(scenario, 1, other)
+    elsewhere = rehearse.exploration_records(scenario, other)
     assert not np.array_equal(one[0][-1], elsewhere[0][-1])
 
 
 def test_other_motors_are_another_twin_since_other_exploration_stays_cool(plans, scenario, tmp_path, tiny):
-    (body,) = bodies(1)
-    rehearse.twins(scenario, [body], [plans], tmp_path, lambda *tell: None)
-    warmer = (body[0], replace(body[1], idle_w=body[1].idle_w * 1.001), body[2])
-    rehearse.twins(scenario, [warmer], [plans], tmp_path, lambda *tell: None)
+    (arm,) = arms(1)
+    rehearse.train_twins(scenario, arms(1, plans), tmp_path, silent)
+    motors = arm.hardware.motors
+    warmer = arm.hardware._replace(motors=replace(motors, idle_w=motors.idle_w * 1.001))
+    rehearse.train_twins(scenario, [PlannedArm(0, warmer, plans)], tmp_path, silent)
     assert len(list((tmp_path / "twins").iterdir())) == 2
 
 
 def test_a_twin_is_told_what_is_usual_by_fresh_motion_and_as_much_of_its_own(plans, scenario, monkeypatch):
     """Second method: train on what was handed to the training, and calibrate by hand."""
     explores = replace(scenario, twin=replace(scenario.twin, exploration=9))
-    (body,) = bodies(1)
+    (arm,) = arms(1)
     drawn = []
     monkeypatch.setattr(rehearse, "light_jobs", lambda *some: drawn.append(light_jobs(*some)) or drawn[-1])
     seed = rehearse.arm_seed(0, 0)
     own = [plan for variants in plans.values() for plan in variants]
     assert 0 < len(own) < 9  # all of it is chosen
-    twin = rehearse.taught(own, TINY, seed, scenario=explores, index=0, body=body)
+    twin = rehearse.train_twin(own, TINY, seed, scenario=explores, arm=arm)
     learned, held_out = drawn
     assert not {plan.cycle.profile.tobytes() for plan in learned} & {plan.cycle.profile.tobytes() for plan in held_out}
     untold = train([*records(own), *records(learned)], TINY, seed, arm="arm_0")
@@ -155,16 +165,16 @@ def test_a_twin_is_told_what_is_usual_by_fresh_motion_and_as_much_of_its_own(pla
 
 def test_of_much_own_work_only_as_much_is_usual_as_there_is_fresh_motion(plans, scenario):
     explores = replace(scenario, twin=replace(scenario.twin, exploration=9))
-    (body,) = bodies(1)
+    (arm,) = arms(1)
     own = [plan for variants in plans.values() for plan in variants] * 8
-    twin = rehearse.taught(own, TINY, rehearse.arm_seed(0, 0), scenario=explores, index=0, body=body)
-    fresh = len(rehearse._explored(explores, 0, body, rehearse.HELD_OUT))
+    twin = rehearse.train_twin(own, TINY, rehearse.arm_seed(0, 0), scenario=explores, arm=arm)
+    fresh = len(rehearse._cool_exploration(explores, arm, rehearse.HELD_OUT))
     assert len(own) > fresh
     assert len(twin.calibration.reference.packed) == 2 * fresh
 
 
 def test_too_few_held_out_motions_leave_a_twin_uncalibrated(scenario):
-    (body,) = bodies(1)
-    twin = rehearse.taught([], TINY, rehearse.arm_seed(0, 0), scenario=scenario, index=0, body=body)
+    (arm,) = arms(1)
+    twin = rehearse.train_twin([], TINY, rehearse.arm_seed(0, 0), scenario=scenario, arm=arm)
     assert scenario.twin.exploration == 3
     assert twin.calibration is None

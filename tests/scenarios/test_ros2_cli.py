@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from fleet.bus import keys
-from fleet.bus.link import Link
-from fleet.bus.messages import State
-from fleet.bus.router import Router
-from scenarios.cli import main
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.router import Router
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.messages import State
+from scenarios.cli.main import main
 
 ROOT = Path(__file__).parents[2]
 PATIENCE_S = 60.0
@@ -27,7 +27,7 @@ def started(stack, *words):
     environment.pop("ROS_DOMAIN_ID", None)
     process = stack.enter_context(
         subprocess.Popen(
-            [sys.executable, "-c", "from scenarios.cli import main; main()", "ros2", *words],
+            [sys.executable, "-c", "from scenarios.cli.main import main; main()", "ros2", *words],
             cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )
     )  # fmt: skip
@@ -46,9 +46,9 @@ def ended(process, number):
 def test_an_arm_goes_out_to_ros_and_comes_back():
     with ExitStack() as stack:
         router = stack.enter_context(Router())
-        link = stack.enter_context(Link(router.endpoint, "shop"))
+        link = stack.enter_context(BusClient(router.endpoint, "shop"))
         heard: list[State] = []
-        link.listen(keys.of_arm("shop", "mirror", "state"), State, lambda _, word: heard.append(word))
+        link.subscribe(keys.of_arm("shop", "mirror", "state"), State, lambda _, word: heard.append(word))
         here = ["--endpoint", router.endpoint, "--fleet", "shop"]
         bridge = started(stack, "bridge", *here)
         listen = started(stack, "listen", "/shop/arm_0/joint_states", "--temperatures", "/diagnostics",
@@ -59,7 +59,7 @@ def test_an_arm_goes_out_to_ros_and_comes_back():
             assert time.monotonic() < deadline_s, "waited in vain"
             tick += 1
             said = State("arm_0", tick, 0.1 * tick, "working", TEMP_C, 24.0, q=(0.1,) * 7, qd=(0.2,) * 7)
-            link.say(keys.of_arm("shop", "arm_0", "state"), said)
+            link.publish(keys.of_arm("shop", "arm_0", "state"), said)
             link.serve(time.monotonic() + 0.1)
         assert (heard[0].temp_c, heard[0].q, heard[0].qd, heard[0].tau) == (TEMP_C, (0.1,) * 7, (0.2,) * 7, ())
         assert heard[0].mode == "working"
@@ -70,7 +70,7 @@ def test_an_arm_goes_out_to_ros_and_comes_back():
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["listen", "/joint_states"], "tells no motor temperatures"),
+        (["listen", "/joint_states"], "has no motor temperatures"),
         (["listen", "/j", "--temperatures", "/d", "--joints", "a,a"], "different names"),
         (["listen", "/j", "--temperatures", "/d", "--arm", ""], "--arm needs a name"),
         (["listen", "/j", "--temperatures", "/d", "--rate-hz", "0"], "--rate-hz must be"),

@@ -15,15 +15,15 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from fleet.bus import keys
-from fleet.bus.certificates import issue
-from fleet.bus.roster import Participant
-from fleet.bus.router import open_client
-from fleet.bus.security import Tls, identified
+from fleet.bus.client.router import open_client
+from fleet.bus.protocol import keys
+from fleet.bus.security.access_control import Participant
+from fleet.bus.security.certificates import issue
+from fleet.bus.security.tls import Tls, identified
+from fleet.live.arm.journal_records import ArmRecord, Closed
 from fleet.live.journal import Journal
-from fleet.live.promises import Closed, Promise
-from scenarios.cli import main
-from scenarios.live_up import free_port, parts_of
+from scenarios.cli.live.up import free_port, parts_of
+from scenarios.cli.main import main
 
 ROOT = Path(__file__).parents[2]
 PATIENT_S = 20.0
@@ -41,7 +41,7 @@ def call(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, 
 @contextmanager
 def started(*words: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """The router as a process, and the line that it prints when it listens."""
-    command = [sys.executable, "-c", "from scenarios.cli import main; main()", "router", *map(str, words)]
+    command = [sys.executable, "-c", "from scenarios.cli.main import main; main()", "router", *map(str, words)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         try:
@@ -79,9 +79,9 @@ def test_a_router_with_tls_knows_the_fleet_and_thins_its_telemetry(folder):
         ):
             heard: list[str] = []
             listener = monitor.declare_subscriber(
-                "thermofleet/v1/quickstart/**", lambda s: heard.append(str(s.key_expr))
+                "thermofleet/v2/quickstart/**", lambda s: heard.append(str(s.key_expr))
             )
-            cache = keys.caches_of("thermofleet/v1/quickstart/arm/nobody")
+            cache = keys.caches_of("thermofleet/v2/quickstart/arm/nobody")
             assert list(monitor.get(cache, timeout=PATIENT_S)) == []
             for _ in range(100):
                 arm.put(keys.of_arm("quickstart", "arm_0", "state"), b"")
@@ -110,8 +110,8 @@ def test_a_port_in_use_is_one_sentence(capsys):
         (("--host", "192.0.2.1"), "is not on loopback"),
         (("--port", "70000"), "--port must be 0 to 65535"),
         (("--state-hz", "-1"), "--state-hz must be 0 or more"),
-        (("--scenario", "quickstart"), "--scenario goes with --tls"),
-        (("--tls", "{keys}", "--scenario", "heat_wave"), "are of the fleet 'quickstart', not of 'heat_wave'"),
+        (("--scenario", "quickstart"), "--scenario needs --tls"),
+        (("--tls", "{keys}", "--scenario", "heat_wave"), "are for the fleet 'quickstart', not for 'heat_wave'"),
         (("--tls", "{keys}/none"), "There is no '"),
         (("--tls", "{keys}", "--name", "arm_0"), "a router needs that of a router"),
     ],
@@ -129,7 +129,7 @@ def test_an_arm_without_a_certificate_is_named_before_the_router_starts(capsys, 
     (folder / "roster.json").write_text(json.dumps(told))
     code, _, err = call(capsys, "router", "--tls", folder, "--scenario", "quickstart")
     assert code == 2
-    assert "--add arm_1:arm makes one" in " ".join(err.split())
+    assert "--add arm_1:arm." in " ".join(err.split())
 
 
 def test_keys_are_made_shown_and_added_to(capsys, folder):
@@ -193,8 +193,8 @@ def reports(folder):
     """What the arms have noted of the ends of their jobs."""
     for path in folder.glob("*.journal"):
         if path.stem != "auctioneer":
-            with Journal(path, Promise) as book:
-                yield from (each.report for each in book.replay() if isinstance(each, Closed))
+            with Journal(path, ArmRecord) as book:
+                yield from (each for each in book.records() if isinstance(each, Closed))
 
 
 @pytest.mark.slow
@@ -205,7 +205,7 @@ def test_a_whole_fleet_works_with_every_rule_on(capsys, small_toml, plans, tmp_p
     assert call(capsys, "keys", place, small_toml, *(["--no-auctioneer"] if policy == "consensus" else []))[0] == 0
     words = ("up", small_toml, "--tls", place, "--speed", 20, "--difficulty", "blind", "--out", out, "--policy", policy)
     done = subprocess.run(
-        [sys.executable, "-c", "from scenarios.cli import main; main()", *map(str, words)],
+        [sys.executable, "-c", "from scenarios.cli.main import main; main()", *map(str, words)],
         cwd=ROOT,
         env={**os.environ, "THERMOFLEET_CACHE": str(plans)},
         capture_output=True,

@@ -1,4 +1,4 @@
-"""A shift from beginning to end: repeatable, whole, and the same over either bus."""
+"""A shift from beginning to end: reproducible, complete, and the same over either bus."""
 
 import json
 from dataclasses import replace
@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.rules import RULES
-from scenarios.build import Fleet, prepare
+from agents.registry import RULES
 from scenarios.load import load
-from scenarios.run import RunResult, RunSpec, run, scenario_hash, summary
+from scenarios.prepare.fleet import Fleet, prepare
+from scenarios.run.shift import RunResult, RunSpec, run, scenario_hash, summary
 
 TICKS = 18
 
@@ -96,7 +96,7 @@ def test_ctrl_c_outside_the_steps_is_not_taken_for_a_result(fleet, monkeypatch):
         def act(self, observations):
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("scenarios.policies.policy_of", lambda name: Broken())
+    monkeypatch.setattr("scenarios.policy_loader.policy_of", lambda name: Broken())
     with pytest.raises(KeyboardInterrupt):
         run(fleet, spec())
 
@@ -107,6 +107,26 @@ def test_telemetry_is_read_once_a_second_from_every_arm(fleet):
     assert np.array_equal(result.telemetry.time_s, np.arange(1, len(result.telemetry.time_s) + 1))
     assert result.telemetry.temp_c.shape == (len(result.telemetry.time_s), 2, 7)
     assert run(fleet, spec(), record=False).telemetry is None
+
+
+def test_telemetry_at_the_end_of_a_step_is_what_the_policy_observes_next(fleet, monkeypatch):
+    """The temperatures with the same noise."""
+    seen = []
+
+    class Watching:
+        def reset(self, rng):
+            """Begin."""
+
+        def act(self, observations):
+            seen.append(np.stack([each.temp_c for each in observations.values()]))
+            return {arm: int(each.action_mask[1]) for arm, each in observations.items()}
+
+    monkeypatch.setattr("scenarios.policy_loader.policy_of", lambda name: Watching())
+    telemetry = run(fleet, spec()).telemetry
+    assert telemetry is not None
+    ends = telemetry.time_s % fleet.scenario.decision_interval_s == 0
+    assert len(seen) > 5
+    np.testing.assert_allclose(telemetry.temp_c[ends][: len(seen) - 1], seen[1:], rtol=1e-6, atol=0)
 
 
 def test_the_metrics_agree_with_the_event_log(fleet):
@@ -124,16 +144,16 @@ def test_the_metrics_agree_with_the_event_log(fleet):
 
 
 def test_the_summary_says_how_the_run_was_made_and_holds_no_clock_time(fleet):
-    told = summary(run(fleet, spec(seed=4)))
-    assert told["status"] == "finished"
-    assert told["seed"] == 4
-    assert told["policy"] == "round_robin"
-    assert told["bus"] == "memory"
-    assert told["difficulty"] == "blind"
-    assert told["scenario_hash"] == scenario_hash(fleet.scenario)
-    assert {"thermofleet", "mujoco", "python"} <= set(told["versions"])
-    assert told["twins"] == {"left": {"version": "blind"}, "right": {"version": "blind"}}
-    assert json.loads(json.dumps(told, allow_nan=False))["metrics"] == told["metrics"]
+    page = summary(run(fleet, spec(seed=4)))
+    assert page["status"] == "finished"
+    assert page["seed"] == 4
+    assert page["policy"] == "round_robin"
+    assert page["bus"] == "memory"
+    assert page["difficulty"] == "blind"
+    assert page["scenario_hash"] == scenario_hash(fleet.scenario)
+    assert {"thermofleet", "mujoco", "python"} <= set(page["versions"])
+    assert page["twins"] == {"left": {"version": "blind"}, "right": {"version": "blind"}}
+    assert json.loads(json.dumps(page, allow_nan=False))["metrics"] == page["metrics"]
 
 
 def test_the_hash_names_the_content_of_a_scenario(fleet):

@@ -7,9 +7,9 @@ import pytest
 from scipy.stats import binom
 
 from fleet.motion import drive
-from scenarios.saturation_study import lines, trust
-from scenarios.study import Study, make_study
-from twin.measures import Features
+from scenarios.studies.saturation import PastWork, judge_twin, past_work
+from scenarios.studies.setup import Study, make_study
+from twin.vae.measures import Features
 
 
 @dataclass(frozen=True)
@@ -33,42 +33,42 @@ def study() -> Study:
 
 
 @pytest.fixture(scope="module")
-def judged(study: Study):
-    return {sees: trust(study, Seer(study, sees), seed=5, exploration=0, labelled=120, watched=100) for sees in (0, 1)}
+def work(study: Study) -> PastWork:
+    return past_work(study, seed=5, labelled=120, watched=100)
 
 
-def test_who_sees_the_heat_is_trusted_and_who_sees_noise_is_not(judged) -> None:
-    def figures(sees):
-        return {(s.evidence, s.method): s for s in judged[sees].stated}
+@pytest.fixture(scope="module")
+def judged(study: Study, work: PastWork):
+    """Predictions by name and alarms by score, of a twin that sees noise and of one that sees the heat."""
+    results = [judge_twin(work, Seer(study, sees)) for sees in (False, True)]
+    return [({p.name: p for p in predictions}, {a.score: a for a in alarms}) for predictions, alarms in results]
 
-    assert figures(1)["excess", "logistic"].auroc > 0.97
-    assert figures(1)["excess", "logistic"].brier < 0.06
+
+def test_who_sees_the_heat_is_trusted_and_who_sees_noise_is_not(judged, work) -> None:
+    (noise, _), (heat, _) = judged
+    assert heat["excess, logistic"].auroc > 0.97
+    assert heat["excess, logistic"].brier < 0.06
     # Duration and temperature remain to who sees noise: better than chance, and no more.
-    assert 0.5 < figures(0)["excess", "logistic"].auroc < 0.9
-    for stated in judged[0].stated:
-        assert stated.table.count.sum() == len(stated.p) == len(stated.passed) == 140
-        assert stated.passed.mean() == judged[0].share_passed
+    assert 0.5 < noise["excess, logistic"].auroc < 0.9
+    assert all(prediction.table.count.sum() == 140 for prediction in noise.values())
+    assert len(work.held_out) == 140
 
 
-def test_alarms_are_rarely_false_whatever_they_go_by(judged) -> None:
-    for sees in (0, 1):
-        for alarm in judged[sees].alarms:
+def test_alarms_are_rarely_false_whatever_they_go_by(judged, work) -> None:
+    for _, alarms in judged:
+        for alarm in alarms.values():
             # A calibration at its worst of a thousand, and the luck of the held-out jobs on top.
-            calm = round(140 * (1 - judged[sees].share_passed))
+            calm = round(140 * (1 - work.share_passed))
             assert alarm.false_alarms <= binom.ppf(0.999, calm, 0.13) / calm
             assert alarm.expected[0] < 0.05 < alarm.expected[1]
-    caught = {sees: {a.score: a.caught for a in judged[sees].alarms} for sees in (0, 1)}
-    assert caught[1]["p_excess"] > 0.85 > 0.5 > caught[0]["sum"]
+    assert judged[1][1]["p_excess"].caught > 0.85 > 0.5 > judged[0][1]["sum"].caught
 
 
-def test_a_study_repeats_and_prints(study, judged) -> None:
-    again = trust(study, Seer(study, True), seed=5, exploration=0, labelled=120, watched=100)
-    assert again.alarms == judged[1].alarms
-    said = lines([again, again])
-    assert "0.000" in said[-1]
-    assert len(said) == 3 + len(again.stated) + len(again.alarms)
+def test_a_study_repeats(study, judged) -> None:
+    again = judge_twin(past_work(study, seed=5, labelled=120, watched=100), Seer(study, True))
+    assert {a.score: a for a in again[1]} == judged[1][1]
 
 
 def test_nothing_held_out_is_refused(study) -> None:
     with pytest.raises(ValueError, match=r"more than 300 \+ 60 test jobs \(got 360\)"):
-        trust(study, Seer(study, True), seed=5, exploration=0, labelled=300, watched=60)
+        past_work(study, seed=5, labelled=300, watched=60)

@@ -6,8 +6,8 @@ import threading
 
 import pytest
 
-from scenarios.stopping import until_stopped
-from scenarios.terminal import Interrupted
+from scenarios.cli.signals import until_stopped
+from scenarios.cli.terminal import Interrupted
 
 PATIENCE_S = 10.0
 

@@ -10,11 +10,11 @@ from scipy.integrate import solve_ivp
 
 from fleet.errors import FleetError
 from fleet.motion import drive
+from fleet.physics.models import ArmModel
 from fleet.robot import JOINTS
-from fleet.sim.models import ArmModel
 from fleet.thermal import NODES, WINDING, ThermalSpread, drive_heat
-from scenarios.past_jobs import past_jobs
-from scenarios.study import Study, make_study
+from scenarios.prepare.simulated_history import past_jobs
+from scenarios.studies.setup import Study, make_study
 
 SEED = np.random.SeedSequence(11)
 SIZES: dict[str, Any] = {"train": 12, "reference": 10, "test": 60, "novel": 12}
@@ -27,7 +27,7 @@ def study() -> Study:
 
 @pytest.fixture(scope="module")
 def past(study):
-    return past_jobs(study, study.test.plans, np.random.default_rng(3))
+    return past_jobs(study.hardware, study.test.plans, np.random.default_rng(3), warning_c=study.warning_c)
 
 
 def integrated(study: Study, stretches: Sequence, start_c: np.ndarray, ambient_c: float):
@@ -122,7 +122,7 @@ def test_impossible_sizes_are_refused(wrong: dict[str, Any]):
 
 
 def test_an_arm_without_cool_motion_is_told_so(monkeypatch):
-    monkeypatch.setattr("scenarios.study._MOST_BATCHES", 1)
+    monkeypatch.setattr("scenarios.studies.setup._MOST_BATCHES", 1)
     with pytest.raises(FleetError, match=r"none stays below 23.1 °C for 1800 s from 23 °C; raise cool_c"):
         make_study(SEED, **SIZES, cool_c=23.1)
 
@@ -173,15 +173,15 @@ def test_sensors_say_the_start_with_their_own_noise(study, past):
 
 def test_an_arm_that_idles_above_the_limit_begins_below_it_all_the_same(study):
     hot = replace(study, motors=replace(study.motors, idle_w=3.0 * study.motors.idle_w))
-    past = past_jobs(hot, hot.test.plans[:8], np.random.default_rng(3))
+    past = past_jobs(hot.hardware, hot.test.plans[:8], np.random.default_rng(3), warning_c=hot.warning_c)
     assert past.start_c[:, WINDING].max() < 60.0
 
 
 def test_past_jobs_repeat_and_none_are_none(study, past):
-    again = past_jobs(study, study.test.plans, np.random.default_rng(3))
+    again = past_jobs(study.hardware, study.test.plans, np.random.default_rng(3), warning_c=study.warning_c)
     assert np.array_equal(again.peak_c, past.peak_c)
     assert np.array_equal(again.measured_c, past.measured_c)
-    nothing = past_jobs(study, [], np.random.default_rng(3))
+    nothing = past_jobs(study.hardware, [], np.random.default_rng(3), warning_c=study.warning_c)
     assert len(nothing) == 0
     assert nothing.passed.shape == (0,)
     assert nothing.start_c.shape == (0, NODES)

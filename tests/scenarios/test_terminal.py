@@ -1,6 +1,6 @@
 """What a long command says where there is no terminal to draw a bar on, and when it is interrupted."""
 
-from scenarios.terminal import LONG_STAGES, Interrupted, progress_bar
+from scenarios.cli.terminal import LONG_STAGES, Interrupted, progress_bar
 
 
 def interrupted(stage: str, **bar: str) -> str:
@@ -40,7 +40,7 @@ def test_an_interruption_says_what_is_kept_and_where(monkeypatch, tmp_path):
     monkeypatch.setenv("THERMOFLEET_CACHE", str(tmp_path))
     assert interrupted("training") == (
         "Interrupted while training: nothing was written. Plans and twins already made are kept in "
-        f"{tmp_path}, and the same command goes on from there."
+        f"{tmp_path}, and the same command continues from there."
     )
 
 

@@ -7,10 +7,10 @@ import pytest
 from agents.learned.policy import load_policy
 from agents.learned.ppo import PpoConfig
 from fleet.errors import FleetError
-from scenarios.cli import main
+from scenarios.cli.main import main
 from scenarios.load import load, override
-from scenarios.policies import label, policy_of
-from scenarios.train import CURVE, LOG, STATE, VALIDATION_SEED, TrainingPlan, train
+from scenarios.policy_loader import label, policy_of
+from scenarios.run.train_policy import CURVE, LOG, STATE, VALIDATION_SEED, TrainingPlan, train
 
 SMALL = {"horizon_s": 300.0}
 

@@ -8,9 +8,9 @@ import shutil
 import numpy as np
 import pytest
 
-from scenarios.cli import main
-from scenarios.twin_page import Section
-from twin.model import TwinConfig
+from scenarios.cli.main import main
+from scenarios.report.page import Section
+from twin.vae.model import TwinConfig
 
 TINY = ("--hidden", 8, "--epochs", 10, "--max-windows", 150, "--restarts", 1, "--allow-collapse")
 RATE_HZ = 2.0
@@ -90,7 +90,7 @@ def test_ctrl_c_while_learning_a_log_promises_nothing(thermofleet, logs, tmp_pat
     def interrupted(*_args, **_more):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("scenarios.twin_training.train", interrupted)
+    monkeypatch.setattr("scenarios.prepare.twin_folder.train", interrupted)
     said = thermofleet("twin", "train", "--log", logs / "cool", *TINY, "--out", tmp_path / "twins")
     assert said.code == 130
     first, *_, last = said.err.splitlines()
@@ -153,7 +153,7 @@ def test_the_twin_of_one_arm_of_a_scenario_scores_its_jobs(thermofleet, small_to
         (["generate", "quickstart", "--count", "0"], "--count must be 1 or more"),
         (["generate", "quickstart", "--twins", "HERE"], "holds no twin"),
         (["generate", "quickstart", "--format", "npz"], "No format 'npz'."),
-        (["recover", "quickstart", "--posture", "raisd"], "a name; did you mean 'raised'?"),
+        (["recover", "quickstart", "--posture", "raisd"], "No posture 'raisd'; did you mean 'raised'?"),
         (["recover", "quickstart", "--hold", "0"], "--hold must be > 0 (got 0)."),
     ],
 )
@@ -200,7 +200,7 @@ def test_a_log_shorter_than_a_window_is_told_so(thermofleet, tmp_path):
     assert said.code == 2
     assert said.err == (
         "Error: What was recorded is shorter than one window: 25 s are needed, the longest stretch has 20 s. Log for "
-        "longer, or take a smaller --window.\n"
+        "longer, or choose a smaller --window.\n"
     )
     assert thermofleet(*train, "--window", 20).code == 0
 
@@ -221,7 +221,7 @@ def test_an_exported_twin_ends_in_onnx(thermofleet, twins, tmp_path):
     assert version in thermofleet("twin", "export", twins, "--out", out).out
     assert version.encode() in out.read_bytes()
     again = thermofleet("twin", "export", twins, "--out", out)
-    assert (again.code, "twin.onnx' is there already; give another --out" in again.err) == (2, True)
+    assert (again.code, "twin.onnx' exists; give another --out" in again.err) == (2, True)
     assert thermofleet("twin", "export", twins, "--out", out, "--overwrite").code == 0
 
 
@@ -233,8 +233,8 @@ def test_an_identified_arm_is_told_whole_with_its_air_and_its_place_and_is_not_r
     assert "…" not in said.out  # also the longest name fits into 80 columns
     assert "winding_housing_k_per_w" in said.out
     assert (
-        f"Air of 22 °C was taken as given; if yours was another, give it with --ambient.\nWritten to {tmp_path / 'rc'}"
-        in (said.out)
+        f"Ambient temperature assumed: 22 °C; give another one with --ambient.\nWritten to {tmp_path / 'rc'}"
+        in said.out
     )
     before = (tmp_path / "rc" / "rc.json").read_bytes()
     again = thermofleet(*identify, "--ambient", 25)
@@ -242,7 +242,7 @@ def test_an_identified_arm_is_told_whole_with_its_air_and_its_place_and_is_not_r
     assert "holds an identified arm; give another --out, or --overwrite to replace it." in again.err
     assert (tmp_path / "rc" / "rc.json").read_bytes() == before
     replaced = thermofleet(*identify, "--ambient", 25, "--overwrite")
-    assert "Air of 25 °C was taken as given.\n" in replaced.out
+    assert "Ambient temperature assumed: 25 °C.\n" in replaced.out
     assert json.loads((tmp_path / "rc" / "rc.json").read_text(encoding="utf-8"))["ambient_c"] == 25.0
 
 
@@ -250,8 +250,10 @@ def test_a_report_of_logs_that_stay_cool_says_what_is_missing_and_leaves_with_co
     thermofleet, logs, tmp_path, monkeypatch
 ):
     small = TwinConfig(rate_hz=2.0, record_hz=2.0, hidden=8, epochs=3, restarts=1, max_windows=64, allow_collapse=True)
-    monkeypatch.setattr("scenarios.log_study.CONFIG", small)
-    monkeypatch.setattr("scenarios.twin_logbook.log_epochs_chapter", lambda book: Section(key="epochs", title="Epochs"))
+    monkeypatch.setattr("scenarios.studies.real_logs.CONFIG", small)
+    monkeypatch.setattr(
+        "scenarios.studies.report.log_chapters.log_epochs_chapter", lambda book: Section(key="epochs", title="Epochs")
+    )
     some = tmp_path / "logs"
     some.mkdir()
     for day in ("monday", "tuesday", "friday"):

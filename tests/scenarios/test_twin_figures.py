@@ -8,27 +8,23 @@ from matplotlib import image
 from matplotlib.colors import same_color, to_rgb
 from scipy.stats import multivariate_normal
 
-from scenarios.twin_charts import (
-    courses_figure,
-    curves_figure,
-    motions_figure,
-    pairs_figure,
+from scenarios.studies.report.figures import (
+    CRITICAL,
+    MOST_POINTS,
+    NORMAL,
+    Line,
+    bars_figure,
+    density,
+    difficulty_figure,
+    latent_map_figure,
+    latent_scatter_figure,
+    lines_figure,
+    png,
     ranked,
     ranking_figure,
     reliability_figure,
-    roc_figure,
+    signals_figure,
 )
-from scenarios.twin_figures import (
-    MOST_POINTS,
-    data_figure,
-    density,
-    difficulty_figure,
-    epochs_figure,
-    latent_map_figure,
-    latent_scatter_figure,
-    reconstruction_figure,
-)
-from scenarios.twin_style import CRITICAL, NORMAL, png
 
 RECORD = np.arange(20 * 3 * 7, dtype=float).reshape(20, 3, 7)
 
@@ -46,7 +42,8 @@ def legend_of(figure):
 
 
 def test_records_stand_channel_by_channel_with_their_joint_in_its_colour():
-    figure = data_figure(RECORD, 2 * RECORD, 10.0, joint=1, title="finding")
+    pair, others = (RECORD[:, :, 1], 2 * RECORD[:, :, 1]), np.delete(RECORD, 1, axis=2)
+    figure = signals_figure(pair, 10.0, joint=1, title="finding", others=(others, 2 * others))
     axes = figure.axes
     assert len(axes) == 6
     assert [a.get_ylabel() for a in axes[::2]] == ["q (rad)", "dq/dt (rad/s)", "τ (N·m)"]
@@ -61,14 +58,22 @@ def test_records_stand_channel_by_channel_with_their_joint_in_its_colour():
 
 
 def test_the_noise_of_a_still_joint_does_not_fill_its_axis():
-    still = np.full((20, 3, 7), 1e-7) * np.arange(20)[:, None, None]
-    low, high = data_figure(still, still, 10.0, joint=1, title="finding").axes[2].get_ylim()
+    still = np.full((20, 3), 1e-7) * np.arange(20)[:, None]
+    low, high = signals_figure((still, still), 10.0, joint=1, title="finding").axes[2].get_ylim()
     assert high - low == pytest.approx(0.1)
+
+
+def test_neither_record_is_cut_off():
+    seen = RECORD[:, :, 0]
+    figure = signals_figure((seen, 3 * seen), 10.0, joint=1, title="finding")
+    low, high = figure.axes[4].get_ylim()
+    assert low <= seen[:, 2].min()
+    assert high >= 3 * seen[:, 2].max()
 
 
 def test_a_reconstruction_is_drawn_against_what_was_seen():
     seen = RECORD[:, :, 0]
-    figure = reconstruction_figure(seen, seen + 1, seen, seen - 2, 10.0, joint=3, title="finding")
+    figure = signals_figure((seen, seen), 10.0, joint=3, title="finding", made=(seen + 1, seen - 2))
     (made,) = lines(figure.axes[1], "reconstruction")
     np.testing.assert_array_equal(made.get_ydata(), seen[:, 0] - 2)
     assert legend_of(figure) == ["joint 4, normal", "joint 4, critical", "reconstruction"]
@@ -114,9 +119,21 @@ def test_difficulty_is_a_box_per_joint_and_kind_at_its_quartiles():
     assert figure.axes[1].get_xlabel() == "d, sum over the joints"
 
 
+def epochs_figure(epochs, known, held_out):
+    panels = {
+        name: {
+            "trained on": Line(epochs, known[:, :, c], NORMAL, "o"),
+            "held out": Line(epochs, held_out[:, :, c], "k"),
+        }
+        for c, name in ((2, "torque"), (0, "position"), (1, "velocity"))
+    }
+    ticks = {"log": True, "ticks": epochs, "from_zero": True}
+    return lines_figure(panels, title="finding", x_label="epochs", y_label="σ", **ticks)
+
+
 def test_epochs_show_the_mean_and_the_range_of_the_seeds():
     epochs, known = np.array([20, 60, 240]), rng().uniform(0.2, 1, (4, 3, 3))
-    figure = epochs_figure(epochs, known, known + 1, title="finding")
+    figure = epochs_figure(epochs, known, known + 1)
     assert [a.get_title(loc="left") for a in figure.axes] == ["torque", "position", "velocity"]
     (line,) = lines(figure.axes[0], "trained on")
     np.testing.assert_allclose(line.get_ydata(), known[:, :, 2].mean(axis=0))
@@ -153,7 +170,7 @@ def test_reliability_has_the_diagonal_and_the_counts():
 
 
 def test_pairs_stand_at_the_mean_of_their_seeds():
-    figure = pairs_figure(
+    figure = bars_figure(
         {"torque": {"cool": np.array([0.2, 0.4]), "hot": np.array([1.0, 1.0])}}, title="finding", y_label="σ"
     )
     cool, hot = figure.axes[0].patches
@@ -162,24 +179,24 @@ def test_pairs_stand_at_the_mean_of_their_seeds():
     assert [t.get_text() for t in figure.axes[0].texts] == ["0.3", "1"]
 
 
-def test_curves_courses_motions_and_rocs_carry_their_data_and_units():
-    curve = curves_figure(
-        np.array([10, 50]), {"raw": np.array([[1.0, 2.0], [3.0, 4.0]])}, title="f", x_label="n", y_label="K", log=True
+def test_lines_carry_their_data_and_units():
+    raw = Line(np.array([10, 50]), np.array([[1.0, 2.0], [3.0, 4.0]]), NORMAL)
+    level = (60.0, "warning limit, 60 °C")
+    labels = {"x_label": "n", "y_label": "motor temperature (°C)"}
+    figure = lines_figure({"": {"raw": raw, "_hidden": raw}}, title="f", **labels, log=True, level=level)
+    np.testing.assert_array_equal(lines(figure.axes[0], "raw")[0].get_ydata(), [2.0, 3.0])
+    assert figure.axes[0].get_xscale() == "log"
+    assert "°C" in figure.axes[0].get_ylabel()
+    assert legend_of(figure) == ["raw", "warning limit, 60 °C"]
+    roc = lines_figure(
+        {"": {"d": Line(np.array([0, 1]), np.array([0, 1]), NORMAL)}}, title="f", **labels, diagonal=True
     )
-    np.testing.assert_array_equal(lines(curve.axes[0], "raw")[0].get_ydata(), [2.0, 3.0])
-    assert curve.axes[0].get_xscale() == "log"
-    course = courses_figure(np.arange(3), {"with": (np.array([50, 45, 40]), NORMAL)}, title="f", limit_c=60.0)
-    assert "°C" in course.axes[0].get_ylabel()
-    assert "warning limit, 60 °C" in legend_of(course)
-    motion = motions_figure(RECORD[:, 0], [RECORD[:5, 0], RECORD[:, 0] + 1], 10.0, joints=(0, 1), title="f")
-    assert len(motion.axes[0].get_lines()) == 3
-    assert legend_of(motion) == ["generated", "original"]
-    roc = roc_figure({"d": (np.array([0, 1]), np.array([0, 1]), 0.5)}, title="f")
-    assert [t.get_text() for t in roc.axes[0].get_legend().get_texts()] == ["d: AUROC 0.500"]
+    assert [line.get_linestyle() for line in roc.axes[0].get_lines()] == ["-", "--"]
+    assert legend_of(roc) == ["d"]
 
 
 def test_the_same_figure_is_the_same_png_and_nothing_is_cut_off():
-    figures = [epochs_figure(np.array([20, 60]), *rng().uniform(0, 1, (2, 3, 2, 3)), title="finding") for _ in range(2)]
+    figures = [epochs_figure(np.array([20, 60]), *rng().uniform(0, 1, (2, 3, 2, 3))) for _ in range(2)]
     first, second = map(png, figures)
     assert first == second
     pixels = image.imread(io.BytesIO(first))[..., :3]

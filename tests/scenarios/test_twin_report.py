@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 
 from fleet.errors import FleetError
-from scenarios.epochs import epoch_study
-from scenarios.twin_chapters import active_units
-from scenarios.twin_claims import ahead, claims
-from scenarios.twin_page import PNG_HEAD, Picture, Section, Table, page, spread
-from scenarios.twin_report import provenance, write
-from scenarios.twin_sections import Entry, Shelf, basis, computed
-from scenarios.twin_style import png, sheet
-from twin.model import TwinConfig
+from scenarios.report.page import PNG_HEAD, Picture, Section, Table, sections_page
+from scenarios.studies.epochs import epoch_study
+from scenarios.studies.ranking import spread
+from scenarios.studies.report.build import provenance, write
+from scenarios.studies.report.claims import ahead, claims
+from scenarios.studies.report.figures import png, sheet
+from scenarios.studies.report.paper_chapters import active_units
+from scenarios.studies.report.section_cache import Chapter, SectionCache, basis, compute_sections
+from twin.vae.model import TwinConfig
 
 
 def picture(name="dots", alt="Three dots."):
@@ -62,7 +63,7 @@ class Seen(HTMLParser):
 
 def test_a_page_holds_every_section_and_picture_inside_itself(section):
     other = replace(section, key="more", title="More")
-    seen = Seen(page("Title & more", ["Lead."], [section, other]))
+    seen = Seen(sections_page("Title & more", ["Lead."], [section, other]))
     assert seen.sections == ["dots", "more"]
     assert seen.outside == []
     assert [image["alt"] for image in seen.images] == ["Three dots.", "Three dots."]
@@ -74,7 +75,7 @@ def test_a_page_holds_every_section_and_picture_inside_itself(section):
 
 
 def test_what_failed_is_said_on_top_and_in_its_place(section):
-    text = page("Title", [], [section, Section(key="hard", title="Hard", failed="no job is critical.")])
+    text = sections_page("Title", [], [section, Section(key="hard", title="Hard", failed="no job is critical.")])
     seen = Seen(text)
     assert "1 of 2 sections could not be computed: Hard." in seen.words
     assert "Not computed: no job is critical." in seen.words
@@ -84,61 +85,67 @@ def test_a_chapter_that_fails_leaves_its_reason_and_the_others(section):
     def fails(_):
         raise FleetError("nothing is hot")
 
-    found = computed([entry("a", fails), entry("dots", lambda _: section)], None)
+    found = compute_sections([entry("a", fails), entry("dots", lambda _: section)], None)
     assert [s.failed for s in found] == ["nothing is hot", None]
     assert "Chapter a" in claims(found).sentences[-1]
 
 
 def entry(key, chapter, **more):
-    return Entry(key=key, title=f"Chapter {key}", chapter=chapter, **more)
+    return Chapter(key, f"Chapter {key}", chapter, **more)
 
 
 def test_a_finished_section_is_kept_though_a_later_one_breaks(section, tmp_path):
     def breaks(_):
         raise KeyboardInterrupt
 
-    shelf = Shelf(tmp_path, basis("inputs", 1))
+    cache = SectionCache(tmp_path, basis("inputs", 1))
     chapters = [entry("dots", lambda _: section, load=2), entry("late", breaks)]
     with pytest.raises(KeyboardInterrupt):
-        computed(chapters, None, shelf=shelf)
-    kept = shelf.read("dots")
-    assert kept == replace(section, numbers={"dots": [0, 1, 2], "none": None, "one": 1.5})
+        compute_sections(chapters, None, cache=cache)
+    kept = cache.read("dots")
+    numbers = {"dots": [0, 1, 2], "none": None, "one": 1.5}
+    assert kept == replace(section, title="Chapter dots", numbers=numbers)
 
     def never(_):
         raise AssertionError("was kept")
 
-    assert computed([entry("dots", never)], None, shelf=shelf) == [kept]
-    assert Shelf(tmp_path, basis("inputs", 2)).read("dots") is None
+    assert compute_sections([entry("dots", never)], None, cache=cache) == [kept]
+    assert SectionCache(tmp_path, basis("inputs", 2)).read("dots") is None
 
 
 def test_what_failed_or_is_damaged_is_computed_anew(section, tmp_path):
     def fails(_):
         raise FleetError("not yet")
 
-    shelf = Shelf(tmp_path, "b")
-    assert computed([entry("dots", fails)], None, shelf=shelf)[0].failed == "not yet"
-    assert shelf.read("dots") is None
-    shelf.keep(section)
+    cache = SectionCache(tmp_path, "b")
+    assert compute_sections([entry("dots", fails)], None, cache=cache)[0].failed == "not yet"
+    assert cache.read("dots") is None
+    cache.write(section)
     (kept,) = (tmp_path / "sections").iterdir()
     kept.write_bytes(kept.read_bytes()[:-20])
-    assert computed([entry("dots", lambda _: section)], None, shelf=shelf) == [section]
+    assert compute_sections([entry("dots", lambda _: section)], None, cache=cache) == [
+        replace(section, title="Chapter dots")
+    ]
 
 
 @pytest.mark.parametrize("processes", [1, 2])
 def test_sections_come_in_order_whatever_is_computed_first_or_beside(processes, tmp_path):
     how = {"a": {}, "b": {"group": "g"}, "c": {"group": "g", "load": 9}}
     chapters = [entry(key, itemgetter(key), **more) for key, more in how.items()]
-    sections = {key: Section(key=key, title=key) for key in how}
-    shelf = Shelf(tmp_path, "basis")
+    sections = {key: Section(key=key, title=f"Chapter {key}") for key in how}
+    cache = SectionCache(tmp_path, "basis")
     told = []
-    found = computed(chapters, sections, shelf=shelf, processes=processes, progress=lambda *tell: told.append(tell))
+    found = compute_sections(
+        chapters, sections, cache=cache, processes=processes, progress=lambda *tell: told.append(tell)
+    )
     assert found == list(sections.values())
     stages = [stage for stage, _ in told if stage.startswith("computing ")]
-    # Titles of sections are their keys here, those of chapters are not.
     assert sorted(stage[-1] for stage in stages) == ["a", "b", "c"]
-    count = [f"section {n} of 3: Chapter " if processes == 1 else f"sections, {n} of 3 done: " for n in (1, 2, 3)]
+    count = [
+        f"section {n} of 3: Chapter " if processes == 1 else f"sections, {n} of 3 done: Chapter " for n in (1, 2, 3)
+    ]
     assert [stage[:-1] for stage in stages] == [f"computing {words}" for words in count]
-    assert [shelf.read(key) for key in how] == found
+    assert [cache.read(key) for key in how] == found
 
 
 def quality_of(**auroc):
@@ -148,11 +155,11 @@ def quality_of(**auroc):
 def test_a_baseline_is_named_only_if_it_is_ahead_in_every_seed():
     rivals = {"kNN-5": [0.95, 0.95], "PCA-2": [0.99, 0.80], "rc nominal": [0.99, 0.98]}
     (said,) = ahead(quality_of(VAE=[0.9, 0.92], **rivals))
-    assert "kNN-5 (0.950 ± 0.000), which know motion alone" in said
-    assert "rc nominal (0.985 ± 0.007), which were told of heat" in said
+    assert "with motion alone: kNN-5 (0.950 ± 0.000)" in said
+    assert "with thermal knowledge: rc nominal (0.985 ± 0.007)" in said
     assert "PCA-2" not in said
     (said,) = ahead(quality_of(VAE=[0.9, 0.92], **{"PCA-2": [0.99, 0.80]}))
-    assert said.startswith("No rival")
+    assert said.startswith("No baseline")
     assert ahead({}) == ()
 
 

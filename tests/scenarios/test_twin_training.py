@@ -5,15 +5,16 @@ from dataclasses import replace
 
 import pytest
 
-from scenarios.build import body_of, plan_works, quiet
-from scenarios.jobs import rehearsal_works
-from scenarios.known_arm import known_arm
+from scenarios.job_stream import rehearsal_works
 from scenarios.load import load, override
-from scenarios.rehearse import taught, twins
-from scenarios.scenario import Scenario
-from scenarios.twin_training import quality, train_arms
-from twin.model import TwinConfig
-from twin.score import Twin
+from scenarios.motion.known_arm import known_arm
+from scenarios.prepare.planned_arm import plan_arms
+from scenarios.prepare.train_twins import train_twin, train_twins
+from scenarios.prepare.twin_folder import quality, train_arms
+from scenarios.progress import quiet
+from scenarios.schema import Scenario
+from twin.vae.model import TwinConfig
+from twin.vae.twin import Twin
 
 TINY = TwinConfig(max_windows=64, epochs=2, restarts=1, hidden=4, allow_collapse=True)
 
@@ -28,11 +29,9 @@ def scenario(small_toml, plans, monkeypatch) -> Scenario:
 def fleet(scenario, monkeypatch, plans) -> list[Twin]:
     """The twins with which the scenario's fleet works."""
     monkeypatch.setattr(TwinConfig, "quick", classmethod(lambda cls: TINY))
-    monkeypatch.setattr("scenarios.rehearse.cpu_count", lambda: 1)
-    bodies = [body_of(scenario, index) for index in range(2)]
-    works = rehearsal_works(scenario)
-    planned = [plan_works(body[0], works, scenario, plans, lambda share: None)[0] for body in bodies]
-    return twins(scenario, bodies, planned, plans, quiet)
+    monkeypatch.setattr("scenarios.prepare.model_cache.cpu_count", lambda: 1)
+    planned = plan_arms(scenario, range(2), rehearsal_works(scenario), plans, quiet)
+    return train_twins(scenario, planned, plans, quiet)
 
 
 def test_a_twin_trained_by_hand_is_that_of_the_fleet(scenario, fleet, plans, tmp_path, monkeypatch):
@@ -52,7 +51,7 @@ def test_the_twins_of_the_fleet_are_not_trained_again(scenario, fleet, monkeypat
     def never(*_args, **_more):
         raise AssertionError("trained again")
 
-    monkeypatch.setattr("scenarios.rehearse.taught", never)
+    monkeypatch.setattr("scenarios.prepare.train_twins.train_twin", never)
     kept = train_arms(scenario, [0, 1], TINY)
     assert [quality(twin) for twin in kept] == [quality(twin) for twin in fleet]
     with pytest.raises(AssertionError, match="trained again"):
@@ -64,10 +63,10 @@ def test_what_is_trained_by_hand_is_kept_by_its_seed_and_that_of_its_exploration
     trained = []
 
     def counted(*args, **more):
-        trained.append(more["index"])
-        return taught(*args, **more)
+        trained.append(more["arm"].index)
+        return train_twin(*args, **more)
 
-    monkeypatch.setattr("scenarios.rehearse.taught", counted)
+    monkeypatch.setattr("scenarios.prepare.train_twins.train_twin", counted)
     (again,) = train_arms(scenario, [1], TINY, seed=6)
     assert (again.version, trained) == (first.version, [])
     # Arms of one body and one plan, but other exploration: weights of seed 6 are not those of scenario 6.

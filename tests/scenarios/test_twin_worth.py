@@ -7,19 +7,18 @@ import numpy as np
 import pytest
 
 from fleet.thermal import gen3_network, thermal_model
-from scenarios import twin_heat as heat
-from scenarios import twin_worth as worth
-from scenarios.autonomy import GENERATED, OWN, PRIOR
-from scenarios.coverage import Coverage
-from scenarios.detection import Detection
-from scenarios.quality import QUESTIONS, QualityTable, Row
-from scenarios.rc_study import RcTrust
-from scenarios.saturation_study import Alarmed, Stated, Trust
-from scenarios.transfer import TransferRow
-from scenarios.twin_lab import QUICK
-from scenarios.twin_page import page
-from scenarios.twin_sections import plain
-from twin.reliability import reliability
+from scenarios.report.page import sections_page
+from scenarios.studies.detection_metrics import Detection
+from scenarios.studies.exploration import Coverage
+from scenarios.studies.ranking import QUESTIONS, QualityTable, Row
+from scenarios.studies.report import baseline_chapters as worth
+from scenarios.studies.report import saturation_chapters as heat
+from scenarios.studies.report.context import QUICK
+from scenarios.studies.report.section_cache import plain
+from scenarios.studies.saturation import Alarm, Prediction
+from scenarios.studies.self_training import GENERATED, OWN, PRIOR
+from scenarios.studies.transfer import TransferRow
+from twin.saturation.reliability import reliability
 
 
 @pytest.fixture
@@ -56,7 +55,7 @@ def whole(section):
     assert section.failed is None
     assert section.pictures
     json.dumps(plain(dict(section.numbers)), allow_nan=False)
-    return page("t", [], [section])
+    return sections_page("t", [], [section])
 
 
 def test_a_rival_that_wins_is_named_and_a_missed_target_too(lab, monkeypatch):
@@ -73,7 +72,7 @@ def test_a_rival_that_wins_is_named_and_a_missed_target_too(lab, monkeypatch):
 def test_where_none_wins_it_says_so(lab, monkeypatch):
     monkeypatch.setattr(worth, "quality", lambda seeds, **how: table_of({"VAE": 0.95, "PCA-2": 0.7}))
     section = worth.quality_chapter(lab)
-    assert "know motion alone, VAE beats PCA-2." in " ".join(section.sentences)
+    assert "with motion alone, VAE beats PCA-2." in " ".join(section.sentences)
     assert "beaten" not in " ".join(section.sentences[:-1])
     assert "AUROC 0.955 ± 0.007 (target 0.93: reached)" in section.sentences[0]
 
@@ -83,31 +82,26 @@ def test_saturation_names_the_head_with_the_least_brier(lab, monkeypatch):
     p = rng.uniform(size=300)
     passed = rng.uniform(size=300) < p
 
-    def told(study, twin, *, seed, exploration, **parts):
-        stated = [
-            Stated(evidence=e, method="logistic", auroc=0.9, brier=b, table=reliability(p, passed), p=p, passed=passed)
-            for e, b in (("load", 0.07), ("errors", 0.04))
-        ]
-        alarm = Alarmed(score="sum", false_alarms=0.05, expected=(0.02, 0.08), false_novel=0.7, caught=0.2)
-        return Trust(seed=seed, exploration=exploration, share_passed=0.5, stated=tuple(stated), alarms=(alarm,))
+    def prediction(name, auroc, brier, peak_error_k=None):
+        table = reliability(p, passed)
+        return Prediction(name=name, auroc=auroc, brier=brier, table=table, peak_error_k=peak_error_k)
 
-    def physical(study, *, seed, **parts):
-        alike = {"seed": seed, "share_passed": 0.5, "auroc": 0.99, "table": reliability(p, passed)}
-        return (
-            RcTrust(name="nominal", brier=0.03, peak_error_k=4.0, **alike),
-            RcTrust(name="identified", brier=0.02, peak_error_k=1.0, **alike),
-        )
-
-    monkeypatch.setattr(heat, "trust", told)
-    monkeypatch.setattr(heat, "rc_trust", physical)
-    monkeypatch.setattr(heat, "trained", lambda *some, **more: None)
+    learned = [prediction(f"{evidence}, logistic", 0.9, b) for evidence, b in (("load", 0.07), ("errors", 0.04))]
+    alarm = Alarm(score="sum", false_alarms=0.05, expected=(0.02, 0.08), false_novel=0.7, caught=0.2)
+    networks = prediction("rc nominal", 0.99, 0.03, 4.0), prediction("rc identified", 0.99, 0.02, 1.0)
+    monkeypatch.setattr(heat, "past_work", lambda study, **parts: None)
+    monkeypatch.setattr(heat, "judge_twin", lambda work, twin: (learned, [alarm]))
+    monkeypatch.setattr(heat, "judge_networks", lambda work: networks)
+    monkeypatch.setattr(heat, "train_or_load", lambda *some, **more: None)
     section = heat.saturation_chapter(lab)
     assert "The best head of the learned twin (errors, logistic)" in section.sentences[0]
     assert (
         "AUROC 0.900 ± 0.000 (target 0.97: not reached), Brier 0.040 ± 0.000 (target 0.05: reached)"
         in (section.sentences[0])
     )
-    assert "1.0 ± 0.0 K instead of 4.0 ± 0.0 K: it pays in degrees rather than in ranking." in section.sentences[2]
+    assert (
+        "1.0 ± 0.0 K instead of 4.0 ± 0.0 K: it improves temperatures rather than the ranking." in section.sentences[2]
+    )
     assert section.tables[1].rows == (("sum", "0.050 ± 0.000", "0.700 ± 0.000", "0.200 ± 0.000"),)
     assert [row[0] for row in section.tables[0].rows] == [
         "load, logistic",
@@ -139,7 +133,7 @@ def test_coverage_says_from_what_to_what(lab, monkeypatch):
 
 def test_autonomy_counts_what_remains_above_chance(lab, monkeypatch):
     found = table_of({OWN: 0.9, GENERATED: 0.7, PRIOR: 0.6})
-    monkeypatch.setattr(worth.again, "autonomy", lambda seeds, **how: found)
+    monkeypatch.setattr(worth.self_training, "autonomy", lambda seeds, **how: found)
     section = worth.autonomy_chapter(lab)
     remaining = section.numbers["remaining"]["auroc"]
     np.testing.assert_allclose(remaining, [0.2 / 0.4, 0.21 / 0.41])

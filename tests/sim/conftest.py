@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from fleet.difficulty import Blind
+from fleet.engine.profile_plant import ProfilePlant, recorded_noise, telemetry_of
+from fleet.engine.shift import step
+from fleet.engine.state import initial
+from fleet.engine.world import Arm, build_world
 from fleet.job import Job, Place, Work
 from fleet.motor import gen3_motors
+from fleet.physics.models import ArmModel
+from fleet.physics.mujoco_plant import MujocoPlant
+from fleet.planning.planner import Planner
 from fleet.robot import Mount, Robot, ThermalLimits
-from fleet.sim.kernel import step
-from fleet.sim.models import ArmModel
-from fleet.sim.mujoco_plant import MujocoPlant
-from fleet.sim.planner import Planner
-from fleet.sim.plants import ProfilePlant
-from fleet.sim.state import initial
-from fleet.sim.world import Arm, build_world
 from fleet.thermal import gen3_network, thermal_model
 
 ROBOTS = (
@@ -85,7 +85,7 @@ def work_through(world, plant, first=(1, 0), watch=None):
     state, states = initial(world), []
     for tick in range(world.ticks):
         actions = np.array([first]) if tick == 0 else (np.arange(len(world.arms)) == tick % len(world.arms))[None]
-        done = step(world, state, actions.astype(int), np.zeros((1, len(world.arms), world.slots)), plant)
+        done = step(world, state, actions.astype(int), plant)
         if watch is not None:
             watch(done)
         state = done.state
@@ -93,12 +93,19 @@ def work_through(world, plant, first=(1, 0), watch=None):
     return states
 
 
+def read(world, plant, done, offsets_s):
+    """Readings of a step, `Telemetry` [sample, arm, ...]."""
+    record = done.record
+    noise = recorded_noise(0, record, offsets_s, world.dt_s, len(world.arms))
+    return telemetry_of(world, record, offsets_s, plant.motion(world, record, offsets_s), noise)
+
+
 def recorded(world, plant, offsets_s, **options):
     """Readings of a shift, one `Telemetry` per tick, and its steps."""
-    parts, steps, rng = [], [], np.random.default_rng(0)
+    parts, steps = [], []
 
     def watch(done):
-        parts.append(plant.readings(world, done, offsets_s, rng))
+        parts.append(read(world, plant, done, offsets_s))
         steps.append(done)
 
     work_through(world, plant, watch=watch, **options)
@@ -110,5 +117,5 @@ def cell() -> SimpleNamespace:
     """The cell, and how its shifts are worked and recorded."""
     return SimpleNamespace(
         robots=ROBOTS, works=WORKS, plans=planned(), places=(NEAR, FAR), HOT=HOT,
-        shift=shift, job=job, work_through=work_through, recorded=recorded,
+        shift=shift, job=job, work_through=work_through, recorded=recorded, read=read,
     )  # fmt: skip

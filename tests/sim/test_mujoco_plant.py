@@ -8,17 +8,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fleet.engine.profile_plant import sample
+from fleet.engine.shift import step
+from fleet.engine.state import initial
 from fleet.errors import FleetError
 from fleet.job import KINDS
 from fleet.motion import RATE_HZ, Phase, Plan
+from fleet.physics.gen3 import gen3_xml
+from fleet.physics.models import ArmModel, build_cell
+from fleet.physics.mujoco_plant import STRIDE, TIMESTEP_S, MujocoPlant, load_hands
+from fleet.physics.servo_control import control, reference, still
 from fleet.robot import GEN3
-from fleet.sim.description import gen3_xml
-from fleet.sim.kernel import step
-from fleet.sim.models import ArmModel, build_cell
-from fleet.sim.mujoco_plant import STRIDE, TIMESTEP_S, MujocoPlant, load_hands
-from fleet.sim.plants import sample
-from fleet.sim.reference import control, reference, still
-from fleet.sim.state import initial
 from fleet.telemetry import FAULTED, WORKING
 
 SAMPLE_S = STRIDE * TIMESTEP_S
@@ -111,10 +111,10 @@ def test_torque_is_what_changes_the_momentum(cell, clips):
     state = initial(world)
     state.mode[:], state.job[:], state.todo[:] = WORKING, 0, 5
     states = [state]
-    for tick in range(2):  # The second tick is looked at: the press begins in it.
-        state = step(world, states[-1], np.zeros((1, 1), int), np.zeros((1, 1, 8)), plant)
-        read = plant.readings(world, state, np.arange(1, 201) * SAMPLE_S, np.random.default_rng(tick))
-        states.append(state.state)
+    for _ in range(2):  # The second tick is looked at: the press begins in it.
+        done = step(world, states[-1], np.zeros((1, 1), int), plant)
+        read = cell.read(world, plant, done, np.arange(1, 201) * SAMPLE_S)
+        states.append(done.state)
     model = build_cell(cell.robots[:1])
     data, scratch = mujoco.MjData(model), mujoco.MjData(model)
     kp, kv = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
@@ -170,8 +170,8 @@ def test_only_faulted_arms_heat_nothing(cell):
     plant = plants["mujoco"]
     inner = plant.drive
 
-    def spy(world, state, timeline):
-        drives.append((state.mode[0].copy(), inner(world, state, timeline)))
+    def spy(world, state):
+        drives.append((state.mode[0].copy(), inner(world, state)))
         return drives[-1][1]
 
     plant.drive = spy
@@ -188,10 +188,10 @@ def test_looking_at_the_sensors_changes_nothing(cell):
     seen, unseen = [], []
     for states, watched in ((seen, True), (unseen, False)):
         world, plants = cell.shift(cell.job("hold", repetitions=20), ticks=40, limits=cell.HOT)
-        plant, rng = plants["mujoco"], np.random.default_rng(0)
+        plant = plants["mujoco"]
 
-        def watch(done, world=world, plant=plant, rng=rng):
-            plant.readings(world, done, np.array([5.0]), rng)
+        def watch(done, world=world, plant=plant):
+            cell.read(world, plant, done, np.array([5.0]))
 
         states += cell.work_through(world, plant, watch=watch if watched else None)
         states.append(plant.data.qpos.copy())
@@ -205,29 +205,29 @@ def test_tick_zero_starts_afresh(cell):
     np.testing.assert_array_equal(first, second)
 
 
-# What the person at the keyboard is told
+# Errors
 
 
 def test_many_envs_are_refused(cell):
     world, plants = cell.shift(cell.job("sort"), shifts=2)
     with pytest.raises(ValueError, match=r"simulates one env \(got 2\)"):
-        step(world, initial(world), np.zeros((2, 2), int), np.zeros((2, 2, 8)), plants["mujoco"])
+        step(world, initial(world), np.zeros((2, 2), int), plants["mujoco"])
 
 
 def test_ticks_must_come_in_order(cell):
     world, plants = cell.shift(cell.job("sort"))
-    done = step(world, initial(world), np.zeros((1, 2), int), np.zeros((1, 2, 8)), plants["mujoco"])
-    later = replace(done.state, tick=done.state.tick + 1)
+    done = step(world, initial(world), np.zeros((1, 2), int), plants["mujoco"])
+    later = done.state._replace(tick=done.state.tick + 1)
     with pytest.raises(ValueError, match=r"1 is next \(got 2\)"):
-        step(world, later, np.zeros((1, 2), int), np.zeros((1, 2, 8)), plants["mujoco"])
+        step(world, later, np.zeros((1, 2), int), plants["mujoco"])
 
 
 def test_only_the_last_tick_can_be_read(cell):
     world, plants = cell.shift(cell.job("sort"))
-    done = step(world, initial(world), np.zeros((1, 2), int), np.zeros((1, 2, 8)), plants["mujoco"])
-    step(world, done.state, np.zeros((1, 2), int), np.zeros((1, 2, 8)), plants["mujoco"])
+    done = step(world, initial(world), np.zeros((1, 2), int), plants["mujoco"])
+    step(world, done.state, np.zeros((1, 2), int), plants["mujoco"])
     with pytest.raises(ValueError, match=r"tick 1 only \(got 0\)"):
-        plants["mujoco"].readings(world, done, np.array([1.0]), np.random.default_rng(0))
+        plants["mujoco"].motion(world, done.record, np.array([1.0]))
 
 
 def test_a_simulation_that_diverges_is_an_error(cell, tmp_path, monkeypatch):
@@ -236,13 +236,13 @@ def test_a_simulation_that_diverges_is_an_error(cell, tmp_path, monkeypatch):
     world, _ = cell.shift(cell.job("press"), robots=cell.robots[:1])
     plant = MujocoPlant(cell.robots[:1], [replace(plan, work=replace(plan.work, force_n=1e12))], np.zeros((1, 7)))
     with pytest.raises(FleetError, match="diverged in tick 0"):
-        step(world, initial(world), np.ones((1, 1), int), np.zeros((1, 1, 8)), plant)
+        step(world, initial(world), np.ones((1, 1), int), plant)
 
 
 def test_a_step_must_be_whole_samples(cell):
     world, plants = cell.shift(cell.job("sort"), dt_s=1.01)
     with pytest.raises(ValueError, match=r"whole 0.02 s \(got 1.01 s\)"):
-        step(world, initial(world), np.zeros((1, 2), int), np.zeros((1, 2, 8)), plants["mujoco"])
+        step(world, initial(world), np.zeros((1, 2), int), plants["mujoco"])
 
 
 @pytest.mark.parametrize("timestep_s", [0.003, 0.02, 0.005])

@@ -5,14 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fleet.engine.profile_plant import sample, sample_row
 from fleet.job import KINDS
 from fleet.motion import RATE_HZ
 from fleet.motor import gen3_motors
-from fleet.sim.mujoco_plant import MujocoPlant
-from fleet.sim.plants import row, sample
+from fleet.physics.mujoco_plant import MujocoPlant
 from fleet.telemetry import FAULTED, IDLE
-from scenarios.build import make_env
-from scenarios.scenario import ArmSpec, ArrivalSpec, JobStream, Planning, Scenario
+from scenarios.prepare.fleet import make_env
+from scenarios.schema import ArmSpec, ArrivalSpec, JobStream, Planning, Scenario
 
 # The profile plant
 
@@ -28,36 +28,37 @@ def test_every_cycle_is_the_cycle(cell, kind, arm, cycle, more):
 def test_rows_of_a_job_are_approach_cycles_and_retreat(cell):
     plan = cell.plans[0][cell.works["sort"]][0]
     a, c, r = (len(phase.profile) for phase in plan.phases)
-    rows = row(plan, np.arange(a + 2 * c + r + 5) / RATE_HZ, 2)
+    rows = sample_row(np.array([a, c, r]), np.arange(a + 2 * c + r + 5) / RATE_HZ, 2)
     expected = [*range(a + c), *range(a, a + c), *range(a + c, a + c + r)]
     np.testing.assert_array_equal(rows[: len(expected)], expected)
     np.testing.assert_array_equal(rows[len(expected) :], a + c + r - 1)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_heat_drive_of_a_job_adds_up_to_that_of_its_motion(cell, kind):
-    """The ticks' means times their length, against the motion sampled from end to end."""
+def test_heat_of_a_job_adds_up_to_that_of_its_motion(cell, kind):
+    """Heat of all steps, taken back through the motor law, against the motion sampled from end to end."""
     repetitions = 3
     world, plants = cell.shift(cell.job(kind, repetitions=repetitions), ticks=10)
-    drives = []
-
-    def watch(done):
-        drives.append(plants["profile"].drive(world, done.began, done.path))
-
-    states = cell.work_through(world, plants["profile"], watch=watch)
+    steps = []
+    states = cell.work_through(world, plants["profile"], watch=steps.append)
     assert states[-1].mode[0, 0] == IDLE
     plan = cell.plans[0][cell.works[kind]][0]
     length_s = plan.duration_s(repetitions)
     whole = sample(plan, np.arange(round(length_s * RATE_HZ)) / RATE_HZ, repetitions).astype(float)
     motors = gen3_motors()
-    amps = (
-        whole[:, 2] / motors.eta
-        + motors.coulomb_nm * np.tanh(whole[:, 1] / motors.v0_rad_s)
-        + motors.viscous_nms_per_rad * whole[:, 1]
-    ) / motors.torque_per_amp
-    expected = (amps**2).sum(axis=0) / RATE_HZ + (world.horizon_s - length_s) * world.rest.current_sq[0]
-    total = sum(drive.current_sq[0, 0] for drive in drives) * world.dt_s
-    np.testing.assert_allclose(total, expected, rtol=1e-6)
+    friction = motors.coulomb_nm * np.tanh(whole[:, 1] / motors.v0_rad_s) + motors.viscous_nms_per_rad * whole[:, 1]
+    amps = (whole[:, 2] / motors.eta + friction) / motors.torque_per_amp
+    rest_s, current_sq, friction_w = world.horizon_s - length_s, 0.0, 0.0
+    for done in steps:
+        winding_c, housing_c = done.record.start_c[0, 0, :7], done.record.start_c[0, 0, 7:]
+        copper = motors.copper_w_per_a2 * (1 + motors.alpha_cu_per_k * (winding_c - motors.reference_c))
+        magnets = 1 + motors.alpha_kt_per_k * (housing_c - motors.reference_c)
+        current_sq += done.record.heat_w[0, 0, :7] / copper * magnets**2 * world.dt_s
+        friction_w += (done.record.heat_w[0, 0, 7:] - motors.idle_w) * world.dt_s
+    expected = (amps**2).sum(axis=0) / RATE_HZ + rest_s * world.rest.current_sq[0]
+    np.testing.assert_allclose(current_sq, expected, rtol=1e-6)
+    expected = (friction * whole[:, 1]).sum(axis=0) / RATE_HZ + rest_s * world.rest.friction_w[0]
+    np.testing.assert_allclose(friction_w, expected, rtol=1e-6, atol=1e-9)
 
 
 # Both plants
@@ -104,12 +105,12 @@ def test_a_fault_cuts_the_tick_and_the_brakes_hold_until_somebody_clears_it(cell
     world, plants = cell.shift(cell.job(kind, repetitions=60), ticks=90, limits=cell.HOT)
     offsets = np.arange(1, 501) / RATE_HZ
     parts, steps = cell.recorded(world, plants[name], offsets)
-    cuts = [i for i, done in enumerate(steps) if done.cut_s[0, 0] < world.dt_s]
+    cuts = [i for i, done in enumerate(steps) if done.record.cut_s[0, 0] < world.dt_s]
     assert len(cuts) >= 2
     for cut in cuts[:-1]:
         recovered = next(i for i in range(cut + 1, len(steps)) if steps[i].state.mode[0, 0] == IDLE)
         assert recovered > cut + 2
-        braked = offsets >= steps[cut].cut_s[0, 0]
+        braked = offsets >= steps[cut].record.cut_s[0, 0]
         assert 0 < braked.sum() < len(offsets)
         stood = parts[cut].q[braked, 0]
         np.testing.assert_array_equal(stood, np.tile(stood[0], (len(stood), 1)))

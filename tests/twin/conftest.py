@@ -7,9 +7,9 @@ import pytest
 
 from fleet.job import Place, Work
 from fleet.motion import RATE_HZ, Phase, Plan
-from twin.model import TwinConfig
-from twin.score import Twin
-from twin.train import train
+from twin.vae.model import TwinConfig
+from twin.vae.train import train
+from twin.vae.twin import Twin
 
 GRAVITY_NM = np.array([2.0, 20.0, 5.0, 10.0, 1.0, 3.0, 1.5])
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import binom
 
-from twin.alarm import ConformalAlarm, TooFewJobs
+from twin.saturation.alarm import ConformalAlarm, TooFewJobs
 
 
 @pytest.mark.parametrize("draw", ["normal", "exponential", "coarse"])

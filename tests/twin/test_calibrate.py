@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import roc_auc_score
 
-from twin.calibrate import (
+from twin.saturation.fit import (
     LEAST_JOBS,
     LEAST_OF_EACH,
     Experience,
@@ -18,8 +18,8 @@ from twin.calibrate import (
     logistic,
     monotone_curve,
 )
-from twin.measures import Features
-from twin.reliability import brier, calibration_error
+from twin.saturation.reliability import brier, reliability
+from twin.vae.measures import Features
 
 
 def true_score(packed: np.ndarray, duration_s: np.ndarray, temp_c: np.ndarray) -> np.ndarray:
@@ -104,7 +104,7 @@ def test_two_hundred_jobs_tell_more_than_their_share(evidence, method) -> None:
     assert roc_auc_score(new.passed, p) > 0.75
     share = past.passed.mean()
     assert brier(p, new.passed) < 0.9 * share * (1 - share)
-    assert calibration_error(p, new.passed) < 0.1
+    assert reliability(p, new.passed).error < 0.1
     # What was said of the fit is what new jobs find.
     if method == "logistic":
         q = np.clip(p, 1e-9, 1 - 1e-9)
@@ -120,7 +120,7 @@ def test_a_curve_mends_a_link_that_is_not_logistic() -> None:
     new, p = world(4_000, 6, steps)
     straight, curved = fit_saturation(past, evidence="load"), fit_saturation(past, evidence="load", method="isotonic")
     assert np.abs(told(curved, new) - p).mean() < 0.7 * np.abs(told(straight, new) - p).mean()
-    assert calibration_error(told(curved, new), new.passed) < 0.03
+    assert reliability(told(curved, new), new.passed).error < 0.03
     # The ranking is that of the logistic scores.
     assert curved.score(new.features, new.duration_s, new.temp_c) == pytest.approx(
         straight.score(new.features, new.duration_s, new.temp_c)
@@ -177,7 +177,7 @@ def test_units_do_not_matter_and_what_never_varied_teaches_nothing() -> None:
     ("passed", "says"),
     [
         (np.ones(LEAST_JOBS - 1, bool), f"needs {LEAST_JOBS} past jobs, better 200 \\(got {LEAST_JOBS - 1}\\)"),
-        (np.zeros(200, bool), "In 0 of 200 past jobs a motor passed the limit; 5 are needed.*Rehearse heavier"),
+        (np.zeros(200, bool), "In 0 of 200 past jobs a motor passed the limit; 5 are needed.*Simulate heavier"),
         (np.arange(200) < LEAST_OF_EACH - 1, "In 4 of 200 past jobs"),
         (np.ones(200, bool), "In all but 0 of 200 past jobs.*Add lighter"),
     ],

@@ -7,8 +7,8 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from fleet.errors import CheckpointError
-from twin.checkpoint import CARD, WEIGHTS, load, save
-from twin.train import train
+from twin.vae.checkpoint import CARD, WEIGHTS, load, save
+from twin.vae.train import train
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def test_a_file_cut_short_is_named(folder, name):
 
 def test_another_format_is_refused(folder):
     edit(folder, lambda card: card.update(format=99, surprise=1))
-    with pytest.raises(CheckpointError, match="format 99 is not the one read here, 2"):
+    with pytest.raises(CheckpointError, match="format 99 is not supported, only 2"):
         load(folder)
 
 

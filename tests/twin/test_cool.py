@@ -5,8 +5,8 @@ import pickle
 import numpy as np
 import pytest
 
-from twin.cool import NothingCool, TooShort, cool_moments, cool_stretches
-from twin.recording import Recording
+from twin.logs.recording import Recording
+from twin.training_data import NothingCool, TooShort, cool_moments, cool_stretches
 
 JOINTS = 7
 

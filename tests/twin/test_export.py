@@ -4,8 +4,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from twin.export import MODEL, ExportError, export_onnx
-from twin.train import train
+from twin.vae.onnx import MODEL, ExportError, export_onnx
+from twin.vae.train import train
 
 onnxruntime = pytest.importorskip("onnxruntime")
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from fleet.motion import RATE_HZ, Phase
 from fleet.robot import GEN3
-from twin.generate import STRIDE, rest_to_rest, timed, vary
-from twin.model import TwinConfig
+from twin.vae.generate import STRIDE, rest_to_rest, time_spline, vary
+from twin.vae.model import TwinConfig
 
 LIMITS = [np.array(limit) for limit in (GEN3.velocity, GEN3.acceleration, GEN3.jerk)]
 PEAKS = (15 / 8, 10 / np.sqrt(3), 60.0)
@@ -95,7 +95,7 @@ def test_time_is_the_least_that_the_limits_allow(distance, joint, speed, duratio
         (peak * distance / (speed * limit[joint])) ** (1 / order)
         for order, (peak, limit) in enumerate(zip(PEAKS, LIMITS, strict=True), start=1)
     )
-    motion, factor = timed(spline, 0.5, speed)
+    motion, factor = time_spline(spline, 0.5, speed)
     assert factor == pytest.approx(max(1.0, least / 0.5), rel=1e-3)
     assert motion.shape[1] == pytest.approx(np.ceil(max(0.5, least) * RATE_HZ), abs=1)
     for order, limit in ((1, LIMITS[0]), (2, LIMITS[1])):

@@ -17,17 +17,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.errors import LogError
+from fleet.physics.models import ArmModel
 from fleet.robot import Robot
-from fleet.sim.models import ArmModel
 from fleet.telemetry import Telemetry
-from scenarios.folder import telemetry_table
-from twin.log_table import backwards
-from twin.logs import read, read_folder
-from twin.recording import CHANNELS
+from scenarios.run.run_folder import telemetry_table
+from twin.logs.reader import read, read_folder
+from twin.logs.recording import READINGS
+from twin.logs.table import time_damage
 
 LOGS = Path(__file__).parents[2] / "../shared/data/gen3_logs"
 GEN3 = ["Time (s)", *(f"{g}_{j}" for g in ("Pos", "Temp", "Torque", "Current", "Velocity") for j in range(7))]
-PLAIN = ["time_s", *(f"{c}_{j}" for c in CHANNELS for j in range(1, 8))]
+PLAIN = ["time_s", *(f"{c}_{j}" for c in READINGS for j in range(1, 8))]
 TIME_S = (0.0, 0.5, 1.1, 1.5)
 
 
@@ -88,13 +88,13 @@ def test_all_formats_say_the_same_in_si(tmp_path: Path, gen3: Callable[..., Path
 
 def test_a_run_gives_a_recording_per_arm(tmp_path: Path):
     rng = np.random.default_rng(0)
-    numbers = {c: rng.uniform(20, 30, (5, 2, 7)) if c == "temp_c" else rng.uniform(-2, 2, (5, 2, 7)) for c in CHANNELS}
+    numbers = {c: rng.uniform(20, 30, (5, 2, 7)) if c == "temp_c" else rng.uniform(-2, 2, (5, 2, 7)) for c in READINGS}
     telemetry = Telemetry(time_s=np.arange(5.0), mode=np.zeros((5, 2), dtype=int), **numbers)
     pq.write_table(telemetry_table(telemetry, ["left", "right"]), tmp_path / "telemetry.parquet")
     pq.write_table(pa.table({"kind": ["fault"]}), tmp_path / "events.parquet")
     for recordings in (read(tmp_path / "telemetry.parquet"), read_folder(tmp_path)):
         assert [r.name for r in recordings] == ["telemetry/left", "telemetry/right"]
-        for channel in CHANNELS:
+        for channel in READINGS:
             np.testing.assert_allclose(getattr(recordings[1], channel), numbers[channel][:, 1].astype(np.float32))
 
 
@@ -119,12 +119,12 @@ def test_columns_may_come_in_any_order_and_currents_and_temperatures_may_lack(tm
         ({(4, "Time (s)"): "0.2"}, 4, "time runs backwards: 0.2 s beside 0.5 s"),
         ({(4, "Time (s)"): "0.5"}, 4, "time repeats: 0.5 s"),
         ({(3, "Time (s)"): "900"}, 3, "time jumps ahead: 900 s"),
-        ({(5, "Temp_2"): "310.2"}, 5, "motor 3 at 310.2 is no °C"),
+        ({(5, "Temp_2"): "310.2"}, 5, "motor 3 at 310.2 is not a motor temperature"),
     ],
 )
 def test_a_damaged_line_is_named_and_the_rest_read_on_demand(gen3, cells, line, match, caplog):
     path = gen3(cells)
-    assert 'read with damaged="skip"' in str(refused(path, match, line))
+    assert 'Use damaged="skip"' in str(refused(path, match, line))
     with caplog.at_level(logging.WARNING):
         (recording,) = read(path, damaged="skip")
     keep = [i for i in range(4) if i != line - 2]
@@ -147,7 +147,7 @@ def test_an_end_in_the_middle_of_a_line_is_no_whole_line(gen3):
 def test_many_damaged_lines_are_told_shortly(gen3):
     cells = {(line, "Pos_0"): "x" for line in (*range(5, 15), 20)}
     path = gen3(cells, count=30)
-    assert "and 10 more damaged places. The good rest" in str(refused(path, "field 2, 'x'", 5))
+    assert "and 10 more damaged places. Use damaged" in str(refused(path, "field 2, 'x'", 5))
     (recording,) = read(path, damaged="skip")
     assert [sentence.partition(":")[0] for sentence in recording.dropped] == ["lines 5 to 14", "line 20"]
     assert len(recording.time_s) == 19
@@ -159,7 +159,7 @@ def test_a_clock_set_anew_is_two_recordings(tmp_path: Path):
     path = tmp_path / "twice.csv"
     path.write_text(text(GEN3, [gen3_row(t) for t in (*range(10), *range(8))]))
     for damaged in ("refuse", "skip"):
-        with pytest.raises(LogError, match=r"anew at line 12 .9 s, then 0 s.: these are several recordings"):
+        with pytest.raises(LogError, match=r"again at line 12 .9 s, then 0 s.: the file holds several recordings"):
             read(path, damaged=damaged)
 
 
@@ -173,7 +173,7 @@ def test_as_many_samples_stay_as_can(times):
         if all(a < b for a, b in pairwise(chosen))
     )
     try:
-        left_out = [damage.line for damage in backwards(np.array(times, float), np.arange(len(times)))]
+        left_out = [damage.line for damage in time_damage(np.array(times, float), np.arange(len(times)))]
     except ValueError:
         assert len(times) - best > 3
         return
@@ -190,11 +190,11 @@ def test_as_many_samples_stay_as_can(times):
         (text(GEN3, []).encode(), None, "holds no good line"),
         (b"a,b\r\n1,2\r\n", 1, "begins with 'a,b', where a Gen3 log has 'Time .s.' and a plain one 'time_s'"),
         (text(GEN3, []).replace(",", ";").encode(), 1, "separated by commas"),
-        (text(GEN3[:-2], []).encode(), 1, "misses the columns Velocity_5, Velocity_6 of a Gen3 log"),
-        (text(GEN3[:-1], []).encode(), 1, "misses the column Velocity_6 of a Gen3 log"),
+        (text(GEN3[:-2], []).encode(), 1, "lacks the columns Velocity_5, Velocity_6 of a Gen3 log"),
+        (text(GEN3[:-1], []).encode(), 1, "lacks the column Velocity_6 of a Gen3 log"),
         (text([n for n in GEN3 if not n.endswith("_6")], []).encode(), 1, "an arm with 6 joints; a Gen3 has 7"),
-        (text([n for n in PLAIN if n != "temp_c_3"], []).encode(), 1, "misses the column temp_c_3 of a plain log"),
-        (text([*PLAIN[:15], *(f"torque_{j}" for j in range(1, 8))], []).encode(), 1, "misses the columns tau_1, tau_2"),
+        (text([n for n in PLAIN if n != "temp_c_3"], []).encode(), 1, "lacks the column temp_c_3 of a plain log"),
+        (text([*PLAIN[:15], *(f"torque_{j}" for j in range(1, 8))], []).encode(), 1, "lacks the columns tau_1, tau_2"),
         (text([*GEN3, "Pos_0"], []).encode(), 1, "names the column 'Pos_0' twice"),
         (text(GEN3, map(gen3_row, TIME_S)).encode("utf-16"), 1, "is not text in UTF-8"),
         (text(PLAIN, [["0", *["89.5"] * 7, *["0"] * 28]]).encode(), 2, "joint 2 at 89.5 is beyond its stops; q is in"),
@@ -209,7 +209,7 @@ def test_a_file_that_is_no_log_says_why(tmp_path: Path, content: bytes, line: in
 def test_strange_columns_are_left_out_on_demand(tmp_path: Path):
     path = tmp_path / "more.csv"
     path.write_text(text([*GEN3, "Note"], [[*gen3_row(t), "1"] for t in TIME_S]))
-    refused(path, "columns Note are none of a Gen3 log", None)
+    refused(path, "columns Note are unknown to a Gen3 log", None)
     (recording,) = read(path, damaged="skip")
     assert "Note" in recording.dropped[0]
     np.testing.assert_allclose(recording.time_s, TIME_S)
@@ -245,21 +245,21 @@ def test_a_line_in_another_encoding_is_a_damaged_line(gen3):
 def test_a_table_that_is_no_telemetry_says_why(tmp_path: Path):
     path = tmp_path / "telemetry.parquet"
     path.write_bytes(b"PAR1 and no more")
-    refused(path, "is no whole parquet file", None)
+    refused(path, "is not a complete parquet file", None)
     columns = {"time_s": [0.0, 1.0, 2.0], **{name: [0.5] * 3 for name in PLAIN[1:]}}
     pq.write_table(pa.table(columns), path)
-    refused(path, "misses the column arm", None)
+    refused(path, "lacks the column arm", None)
     pq.write_table(pa.table({"arm": ["a"] * 3, **columns, "q_3": ["x"] * 3}), path)
-    refused(path, "column q_3 holds string, no numbers", None)
+    refused(path, "column q_3 holds string, not numbers", None)
     pq.write_table(pa.table({"arm": ["a"] * 3, **{k: v for k, v in columns.items() if k != "q_3"}}), path)
-    refused(path, "misses the column q_3", None)
+    refused(path, "lacks the column q_3", None)
     pq.write_table(pa.table({"arm": ["a"] * 3, **columns, "tau_2": [0.0, None, 0.0]}), path)
     refused(path, "tau_2 is missing or not a finite number", 2)
     assert read(path, damaged="skip")[0].time_s.tolist() == [0.0, 2.0]
     pq.write_table(pa.table({"arm": ["a"], **{k: v[:1] for k, v in columns.items() if k != "time_s"}}), path)
-    refused(path, "misses the column time_s", None)
+    refused(path, "lacks the column time_s", None)
     pq.write_table(pa.table({"arm": ["a"]}), path)
-    refused(path, "misses the column time_s", None)
+    refused(path, "lacks the column time_s", None)
     pq.write_table(pa.table({"arm": ["a", None, "a"], **columns}), path)
     refused(path, "names no arm", 2)
     pq.write_table(pa.table({"arm": pa.array([], pa.string()), "time_s": pa.array([], pa.float64())}), path)
@@ -280,24 +280,24 @@ def test_a_folder_is_read_whole_or_says_what_is_left_out(tmp_path: Path, gen3, c
     (tmp_path / "notes.txt").write_text("kept apart")
     assert [r.name for r in read_folder(tmp_path)] == ["a", "b"]
     (tmp_path / "c.csv").write_text("no log\n")
-    with pytest.raises(LogError, match=r"c\.csv, line 1: is no log"):
+    with pytest.raises(LogError, match=r"c\.csv, line 1: is not a log"):
         read_folder(tmp_path)
     with caplog.at_level(logging.WARNING):
         assert [r.name for r in read_folder(tmp_path, damaged="skip")] == ["a", "b"]
-    assert "left out" in caplog.text
+    assert "skipped" in caplog.text
     assert "c.csv" in caplog.text
     (tmp_path / "a.csv.gz").write_bytes(gzip.compress((tmp_path / "a.csv").read_bytes()))
-    with pytest.raises(LogError, match=r"'a.csv' and 'a.csv.gz' are one log"):
+    with pytest.raises(LogError, match=r"'a.csv' and 'a.csv.gz' are the same log"):
         read_folder(tmp_path)
-    with pytest.raises(LogError, match="no such folder"):
+    with pytest.raises(LogError, match="does not exist"):
         read_folder(tmp_path / "none")
-    with pytest.raises(LogError, match="is no folder"):
+    with pytest.raises(LogError, match="is not a folder"):
         read_folder(tmp_path / "a.csv")
 
 
 def test_a_folder_without_one_good_log_is_an_error(tmp_path: Path):
     (tmp_path / "c.csv").write_text("no log\n")
-    with pytest.raises(LogError, match="none of its 1 logs can be read"):
+    with pytest.raises(LogError, match="none of its 1 logs is usable"):
         read_folder(tmp_path, damaged="skip")
 
 
@@ -349,5 +349,5 @@ def test_a_real_log_cut_anywhere_keeps_its_whole_lines(tmp_path: Path):
         with pytest.raises(LogError, match="cut off"):
             read(path)
         (rest,) = read(path, damaged="skip")
-        for channel in CHANNELS:
+        for channel in READINGS:
             np.testing.assert_array_equal(getattr(rest, channel), getattr(whole, channel)[: len(rest.time_s)])

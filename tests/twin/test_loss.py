@@ -2,8 +2,8 @@ import numpy as np
 import torch
 from torch.distributions import Independent, Normal, kl_divergence
 
-from twin.loss import active_units, collapsed, kl, negative_elbo, reconstruction
-from twin.model import TwinConfig, build
+from twin.vae.loss import active_units, collapsed, kl, negative_elbo, reconstruction
+from twin.vae.model import TwinConfig, build
 
 DRAW = torch.Generator().manual_seed(0)
 

@@ -9,9 +9,9 @@ from hypothesis.extra.numpy import arrays
 
 from fleet.errors import CheckpointError
 from fleet.motion import Phase
-from twin.checkpoint import CARD, load, save
-from twin.measures import TIE, Calibration, Features, measures_of, score_of
-from twin.window import cut, resample
+from twin.vae.checkpoint import CARD, load, save
+from twin.vae.measures import TIE, Calibration, Features, measures_of, score_of
+from twin.vae.window import cut, resample
 
 errors = st.floats(0.0, 20.0)
 
@@ -33,7 +33,7 @@ def jobs(make_plan, motion):
 
 @pytest.fixture(scope="module")
 def known(twin, jobs):
-    return twin.calibrated(jobs)
+    return twin.with_calibration(jobs)
 
 
 def heavier(plan, joint, factor):
@@ -106,7 +106,7 @@ def test_a_score_may_be_one_joint_and_must_exist(calibration, rng):
     np.testing.assert_array_equal(score_of(features, "joint_2"), features.difficulty[:, 1])
     with pytest.raises(ValueError, match="No score 'joint_8'; did you mean 'joint_"):
         score_of(features, "joint_8")
-    with pytest.raises(ValueError, match=r"needs a twin with a calibration: Twin\.calibrated"):
+    with pytest.raises(ValueError, match=r"needs a twin with a calibration: Twin\.with_calibration"):
         score_of(features, "calibrated_sum")
 
 
@@ -182,17 +182,16 @@ def test_without_a_calibration_there_is_no_opinion_on_what_is_usual(twin, jobs):
     measures = twin.measure(*jobs[0])
     assert measures.calibrated is None
     assert measures.p_value is None
-    np.testing.assert_allclose(measures.shares, twin.shares(*jobs[0]))
+    errors = twin.features(*([each] for each in jobs[0])).errors[0]
+    np.testing.assert_allclose(measures.shares, errors / errors.sum())
     assert measures.total == pytest.approx(twin.score(*jobs[0]).total)
 
 
-def test_a_recorded_stretch_has_measures_too(known, jobs):
-    plan = jobs[0][0]
-    features = known.profile_features(plan.cycle.profile, 50.0)
-    measures = known.measures_of(features, score="joint_2")
-    np.testing.assert_allclose(features.errors, known.phase_errors([plan])[0, 1], rtol=1e-6)
-    assert measures.calibrated.shape == (7,)
-    assert 0 < measures.p_value <= 1
+def test_windows_have_measures_too(known, jobs):
+    windows = cut(resample(jobs[0][0].cycle.profile, 50.0, 12.5), 50, 50)
+    measures = known.measures_of(known.window_features(windows), score="joint_2")
+    assert measures.calibrated.shape == (len(windows), 7)
+    assert np.all((measures.p_value > 0) & (measures.p_value <= 1))
 
 
 def test_a_calibration_is_kept_in_the_checkpoint_and_in_the_version(twin, known, jobs, tmp_path):

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from twin.model import LOGVAR_RANGE, TwinConfig, build, one_thread
+from twin.vae.model import LOGVAR_RANGE, TwinConfig, build, one_thread
 
 
 @pytest.mark.parametrize("latent", [1, 2, 5])

@@ -3,23 +3,33 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleet.motion import RATE_HZ, drive
+from fleet.engine.oracle import peaks
+from fleet.motion import RATE_HZ, drive, drives
 from fleet.motor import friction_heat, reference_current
 from fleet.robot import JOINTS
-from fleet.sim.oracle import peaks, warmed
-from fleet.thermal import HOUSING, NODES, WINDING, ThermalSpread, drive_heat, gen3_network, settled, spread_motors
-from twin.calibrate import NotEnoughExperience
-from twin.forecast import continued_peaks, planned_peaks
-from twin.heat_log import heat_logs
-from twin.identified import nominal_body
-from twin.identify import identify
-from twin.observer import observe
-from twin.rc import RcTwin
-from twin.rc_checkpoint import load_twin, save
-from twin.rc_risk import fit_head
-from twin.recording import Recording
-from twin.reliability import brier, calibration_error
-from twin.thermal_values import Body
+from fleet.thermal import (
+    HOUSING,
+    NODES,
+    WINDING,
+    ThermalSpread,
+    drive_heat,
+    gen3_network,
+    simulate_temperatures,
+    spread_motors,
+    steady_state,
+)
+from twin.logs.heat_log import heat_logs
+from twin.logs.recording import Recording
+from twin.saturation.fit import NotEnoughExperience
+from twin.saturation.reliability import brier, reliability
+from twin.thermal.checkpoint import load_twin, save
+from twin.thermal.forecast import continued_peaks, planned_peaks
+from twin.thermal.identify import identify
+from twin.thermal.kalman import estimate_temperatures
+from twin.thermal.parameters import HeatModel
+from twin.thermal.result import nominal_heat_model
+from twin.thermal.risk import fit_head
+from twin.thermal.thermal_twin import RcTwin
 
 AIR_C = 22.0
 FULL_REACH_NM = np.array([0.0, 50.1, 0.0, 21.3, 0.0, 1.0, 0.0])
@@ -99,8 +109,8 @@ def test_pieces_are_the_step_by_step_prediction(holds, rng):
         higher = replace(twin, warning_c=twin.warning_c + 1.0).pieces([plan], [times])[0]
         scale = 1.0 / (found.offset - higher.offset)
         by_pieces = (scaled * scale + twin.warning_c).reshape(-1, JOINTS)
-        load, duration = twin._load([plan], [times])
-        course = twin.course(load, duration, twin.likely_start(temp_c))[:, 0, WINDING]
+        load, duration = twin._mean_drive([plan], [times])
+        course = twin.simulate(load, duration, twin.likely_start(temp_c))[:, 0, WINDING]
         np.testing.assert_allclose(by_pieces[0], temp_c, atol=1e-9)
         np.testing.assert_allclose(by_pieces[-1], course[-1], rtol=0.02)  # magnets frozen halfway
 
@@ -117,15 +127,15 @@ def test_risk_rises_with_every_temperature_and_needs_past_jobs(holds, rng):
     temps = rng.uniform(25, 50, (60, JOINTS))
     repeats = [100] * 60
     passed = np.array([twin.pieces([p], [100])[0].margin(t) for p, t in zip(plans, temps, strict=True)]) > 0
-    taught = twin.learned(plans, repeats, temp_c=temps, passed=passed)
+    taught = twin.with_past_jobs(plans, repeats, temp_c=temps, passed=passed)
     risk = taught.score(plan, 100).risk
     assert risk is not None
     p = [risk.at(np.full(JOINTS, t)) for t in (20.0, 40.0, 55.0, 70.0)]
     assert p[0] < p[1] < p[2] < p[3]
     with pytest.raises(NotEnoughExperience, match="needs 30 past jobs"):
-        twin.learned(plans[:10], repeats[:10], temp_c=temps[:10], passed=passed[:10])
+        twin.with_past_jobs(plans[:10], repeats[:10], temp_c=temps[:10], passed=passed[:10])
     with pytest.raises(NotEnoughExperience, match="0 passing"):
-        twin.learned(plans, repeats, temp_c=temps, passed=np.zeros(60, dtype=bool))
+        twin.with_past_jobs(plans, repeats, temp_c=temps, passed=np.zeros(60, dtype=bool))
 
 
 def test_bad_plans_are_refused(holds, make_plan):
@@ -165,7 +175,7 @@ def working(twin: RcTwin, minutes: float, rng: np.random.Generator) -> tuple[Rec
 def test_the_observer_finds_the_housings_and_says_how_well(rng):
     twin = RcTwin.nominal()
     recording, truth = working(twin, 40.0, rng)
-    seen = observe(twin, recording)
+    seen = estimate_temperatures(twin, recording)
     error = np.abs(seen.temp_c[:, HOUSING] - truth[seen.time_s.astype(int), HOUSING])
     assert (error[0] > 3.5).all()
     assert error[-1].max() < 1.0
@@ -193,15 +203,15 @@ def test_forecasts_know_the_coming_load_or_take_the_last_one_for_granted(rng):
     np.testing.assert_allclose(continued[60], planned[60], atol=0.15)
 
 
-def own_arm(seed: int) -> tuple[RcTwin, Body]:
+def own_arm(seed: int) -> tuple[RcTwin, HeatModel]:
     rng, spread = np.random.default_rng(seed), ThermalSpread.gen3()
-    body = nominal_body()
-    return RcTwin.nominal(), Body(spread_motors(body.motors, spread, rng), gen3_network(spread=spread, rng=rng))
+    body = nominal_heat_model()
+    return RcTwin.nominal(), HeatModel(spread_motors(body.motors, spread, rng), gen3_network(spread=spread, rng=rng))
 
 
 def test_an_identified_arm_predicts_its_own_heat_better_than_the_nominal_one(holds, rng, tmp_path):
     nominal, body = own_arm(11)
-    true = RcTwin(arm="own", body=body, ambient_c=AIR_C, base="true")
+    true = RcTwin(arm="own", heat_model=body, ambient_c=AIR_C, base="true")
     recordings = [replace(working(true, 40.0, rng)[0], name=f"{i}") for i in range(2)]
     got = identify(recordings, ambient_sd_k=0.0, step_s=20.0)
     plans = [holds(s * FULL_REACH_NM) for s in (0.5, 0.8, 1.1)]
@@ -230,12 +240,12 @@ def test_probability_from_past_jobs_of_an_arm_unlike_the_nominal_one(holds):
     repetitions = rng.integers(300, 12000, count)
     winding = rng.uniform(22, 50, (count, 1)) + rng.normal(0, 2, (count, JOINTS))
     start = np.concatenate([winding, winding - rng.uniform(0, 5, (count, JOINTS))], axis=1)
-    loads = [drive(plan.cycle.profile, body.motors) for plan in plans]
+    loads = drives([plan.cycle.profile for plan in plans], body.motors)
     lasts = np.array([plan.duration_s(int(n)) for plan, n in zip(plans, repetitions, strict=True)])
     air = np.full(count, 24.0)
-    true = warmed(loads, lasts, motors=body.motors, thermal=body.thermal(), start_c=start, ambient_c=air)
+    true = simulate_temperatures(loads, lasts, motors=body.motors, thermal=body.thermal(), start_c=start, ambient_c=air)
     passed = true.highest_c.max(axis=1) >= 60.0
-    twin = nominal.learned(plans[:taught], repetitions[:taught], temp_c=winding[:taught], passed=passed[:taught])
+    twin = nominal.with_past_jobs(plans[:taught], repetitions[:taught], temp_c=winding[:taught], passed=passed[:taught])
     assert twin.head is not None
     p = np.array(
         [
@@ -245,13 +255,13 @@ def test_probability_from_past_jobs_of_an_arm_unlike_the_nominal_one(holds):
     )
     assert 0.1 < passed.mean() < 0.9
     assert brier(p, passed[taught:]) <= 0.045
-    assert calibration_error(p, passed[taught:]) <= 0.04
+    assert reliability(p, passed[taught:]).error <= 0.04
 
 
 def test_the_warm_end_is_where_newton_says_it_settles(holds):
     twin = RcTwin.nominal()
     plan = holds(0.5 * FULL_REACH_NM)
     load = drive(plan.cycle.profile, twin.motors)
-    end = settled(twin.thermal, load.current_sq, load.friction_w, twin.motors, AIR_C)
+    end = steady_state(twin.thermal, load.current_sq, load.friction_w, twin.motors, AIR_C)
     _, temp_c = twin.predict(plan, 15000, np.full(JOINTS, 30.0))
     np.testing.assert_allclose(temp_c[-1], end[WINDING], atol=0.05)

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from fleet.telemetry import Telemetry
-from twin.recording import CHANNELS, Recording, interval_current_sq, interval_speed, of_telemetry
+from twin.logs.recording import READINGS, Recording, interval_current_sq, interval_speed
 
 
 def recording(time_s: list[float], joints: int = 7, **channels: np.ndarray) -> Recording:
@@ -12,7 +11,7 @@ def recording(time_s: list[float], joints: int = 7, **channels: np.ndarray) -> R
     return Recording(name="a", time_s=np.array(time_s), **{"q": still, "qd": still, "tau": still, **channels})
 
 
-@pytest.mark.parametrize("channel", CHANNELS)
+@pytest.mark.parametrize("channel", READINGS)
 def test_channels_must_fit_the_time_and_be_finite(channel: str):
     with pytest.raises(ValueError, match=r"\(2, 7\)" if channel != "q" else "must be"):
         recording([0.0, 1.0], **{channel: np.zeros((3, 7))})
@@ -45,18 +44,6 @@ def test_a_part_holds_the_same_samples():
     assert part.temp_c[:, 0].tolist() == [0.0, 14.0]
     assert part.current_a is None
     assert (whole.duration_s, whole.part(slice(0, 0)).duration_s, whole.joints) == (2.0, 0.0, 7)
-
-
-def test_telemetry_of_a_fleet_is_one_recording_per_arm():
-    shape = (4, 2, 7)
-    numbers = {channel: np.random.default_rng(i).normal(size=shape) for i, channel in enumerate(CHANNELS)}
-    telemetry = Telemetry(time_s=np.arange(4.0), mode=np.zeros(shape[:2], dtype=int), **numbers)
-    left, right = of_telemetry(telemetry, ("left", "right"))
-    assert (left.name, right.name) == ("left", "right")
-    for channel in CHANNELS:
-        np.testing.assert_array_equal(getattr(right, channel), numbers[channel][:, 1])
-    with pytest.raises(ValueError, match="2 arms needs 2 names"):
-        of_telemetry(telemetry, ("left",))
 
 
 def test_angles_wrap_and_short_moves_count():

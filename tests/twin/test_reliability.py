@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from sklearn.calibration import calibration_curve
 from sklearn.metrics import brier_score_loss
 
-from twin.reliability import brier, calibration_error, reliability, wilson
+from twin.saturation.reliability import brier, reliability, wilson
 
 jobs = st.builds(
     lambda seed, n, steps: (
@@ -43,19 +43,19 @@ def test_the_error_of_two_bins_by_hand() -> None:
     p = np.array([0.1, 0.2, 0.3, 0.9, 0.9, 1.0])
     event = np.array([0, 0, 1, 1, 1, 0], bool)
     # Means 0.2 and 2.8/3, shares 1/3 and 2/3, three jobs each.
-    assert calibration_error(p, event, bins=2) == pytest.approx(0.5 * (1 / 3 - 0.2) + 0.5 * (2.8 / 3 - 2 / 3))
+    assert reliability(p, event, bins=2).error == pytest.approx(0.5 * (1 / 3 - 0.2) + 0.5 * (2.8 / 3 - 2 / 3))
 
 
 def test_a_true_probability_has_little_error_and_a_boast_has_much() -> None:
     rng = np.random.default_rng(0)
     p = rng.random(20_000)
     event = rng.random(20_000) < p
-    assert calibration_error(p, event) < 0.01
+    assert reliability(p, event).error < 0.01
     # A forecast pushed to the ends errs by the mean distance between what it says and what it knew.
     share = np.square(p) / (np.square(p) + np.square(1 - p))
     grid = np.linspace(0, 1, 100_001)
     expected = np.mean(np.abs(np.square(grid) / (np.square(grid) + np.square(1 - grid)) - grid))
-    assert calibration_error(share, event) == pytest.approx(expected, abs=0.012)
+    assert reliability(share, event).error == pytest.approx(expected, abs=0.012)
 
 
 def test_the_interval_is_wilson_s() -> None:

@@ -6,18 +6,26 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from sklearn.covariance import LedoitWolf
+from sklearn.neighbors import NearestNeighbors
 
 from fleet.difficulty import Difficulty, difficulty_of_error
 from fleet.motion import Phase
 from fleet.motor import gen3_motors
-from fleet.thermal import WINDING, drive_heat, gen3_network, settled, thermal_model
-from twin.features import FEATURES, window_features
-from twin.model import TwinConfig
-from twin.nominal import TorqueRms, continuous_torque, torque_over_continuous, torque_over_known
-from twin.novelty import Mahalanobis, Neighbours, isolation_forest, mahalanobis, nearest_neighbours
-from twin.reading import read_jobs
-from twin.rivals import Modelled, collapsed, known, pca, untrained
-from twin.train import train
+from fleet.thermal import WINDING, drive_heat, gen3_network, steady_state, thermal_model
+from twin.baselines.detectors import (
+    FEATURES,
+    isolation_forest,
+    mahalanobis,
+    mahalanobis_distance,
+    nearest_neighbours,
+    neighbour_distance,
+    window_statistics,
+)
+from twin.baselines.reconstruction import ModelScorer, collapsed_config, cool_windows, pca, untrained_config
+from twin.baselines.torque import TorqueRms, continuous_torque, torque_over_continuous, torque_over_known
+from twin.vae.model import TwinConfig
+from twin.vae.train import train
+from twin.vae.window import cut_jobs
 
 SEED = np.random.SeedSequence(5)
 CONFIG = TwinConfig(window=20, rate_hz=12.5, stride=10, score_stride=20, max_windows=200)
@@ -25,7 +33,7 @@ CONFIG = TwinConfig(window=20, rate_hz=12.5, stride=10, score_stride=20, max_win
 
 @pytest.fixture(scope="module")
 def cool(records):
-    return known(records[:12], CONFIG, SEED)
+    return cool_windows(records[:12], CONFIG, SEED)
 
 
 @pytest.fixture(scope="module")
@@ -48,18 +56,18 @@ def fitted(cool, records):
 @pytest.fixture(scope="module")
 def born(records, small):
     """A twin with random weights: what is told of its scores here holds for any."""
-    return train(records[:20], untrained(small), SEED, arm="arm_0")
+    return train(records[:20], untrained_config(small), SEED, arm="arm_0")
 
 
 def test_the_reading_of_a_jobs_time_is_the_twins(born, jobs):
-    reading = read_jobs(jobs, [3, 1, 20, 7], born.config)
+    reading = cut_jobs(jobs, [3, 1, 20, 7], born.config)
     z = born.scaler.to_z(reading.windows)
     error = np.abs(z - born.scaler.to_z(born.reconstruct(reading.windows)))
-    np.testing.assert_allclose(reading.mean(error), born.plans_errors(jobs, [3, 1, 20, 7]), atol=2e-5)
+    np.testing.assert_allclose(reading.mean(error), born.features(jobs, [3, 1, 20, 7]).errors, atol=2e-5)
 
 
 def test_shares_of_time_sum_to_one_per_job(jobs):
-    reading = read_jobs(jobs, [1, 2, 3, 4], CONFIG)
+    reading = cut_jobs(jobs, [1, 2, 3, 4], CONFIG)
     np.testing.assert_allclose(reading.mean(np.ones((*reading.weight.shape, 2))), 1.0)
 
 
@@ -73,7 +81,7 @@ def test_pca_of_k_dimensions_leaves_nothing_of_a_k_dimensional_motion(make_plan)
         return np.repeat(samples, 4, axis=0)  # exactly as it is after averaging to 12.5 Hz
 
     # 3 channels of 3 shapes and the mean: 9 dimensions per joint, and one less is too few.
-    cool = known([record(1.0) for _ in range(60)], CONFIG, SEED)
+    cool = cool_windows([record(1.0) for _ in range(60)], CONFIG, SEED)
     plans = [make_plan(record(1.0), record(3.0), record(1.0)) for _ in range(3)]
     assert pca(cool, 9).scores(plans, [1, 2, 3]).per_joint.max() < 1e-5
     assert pca(cool, 8).scores(plans, [1, 2, 3]).per_joint.min() > 1e-3
@@ -86,7 +94,7 @@ def test_pca_is_the_singular_value_decomposition(cool, make_plan, motion):
     known_windows = cool.z[:, :, 1].astype(float).reshape(len(cool.z), -1)
     mean = known_windows.mean(axis=0)
     leading = np.linalg.svd(known_windows - mean)[2][:3]
-    asked = cool.scaler.to_z(read_jobs([plan], [1], CONFIG).windows)[0, :, 1].astype(float).ravel()
+    asked = cool.scaler.to_z(cut_jobs([plan], [1], CONFIG).windows)[0, :, 1].astype(float).ravel()
     error = np.abs(asked - mean - (asked - mean) @ leading.T @ leading).reshape(20, 3).sum(axis=1).mean()
     assert pca(cool, 3).scores([plan], [1]).per_joint[0, 1] == pytest.approx(1 - np.exp(-error), rel=1e-6)
 
@@ -97,20 +105,22 @@ def test_mahalanobis_is_the_closed_form():
     fit = LedoitWolf().fit(x)
     away = rng.normal(size=(5, 4)) - x.mean(axis=0)
     by_hand = [np.sqrt(a @ np.linalg.inv(fit.covariance_) @ a) for a in away]
-    np.testing.assert_allclose(Mahalanobis.fit(x).distance(away + x.mean(axis=0)), by_hand)
+    np.testing.assert_allclose(mahalanobis_distance(fit, away + x.mean(axis=0)), by_hand)
 
 
 def test_neighbours_are_brute_force():
     rng = np.random.default_rng(2)
     x, asked = rng.normal(size=(50, 3)), rng.normal(size=(6, 3))
     all_distances = np.sort(np.linalg.norm(asked[:, None] - x, axis=-1), axis=1)
-    np.testing.assert_allclose(Neighbours.fit(x, 4).distance(asked), all_distances[:, :4].mean(axis=1))
+    np.testing.assert_allclose(
+        neighbour_distance(NearestNeighbors(n_neighbors=4).fit(x), asked), all_distances[:, :4].mean(axis=1)
+    )
 
 
 def test_features_of_a_window_by_hand():
     window = np.zeros((1, 4, 2, 3))
     window[0, :, 1, 2] = [3.0, -1.0, 1.0, 1.0]
-    found = dict(zip(FEATURES, window_features(window)[0, 1], strict=True))
+    found = dict(zip(FEATURES, window_statistics(window)[0, 1], strict=True))
     assert found["mean_tau"] == 1.0
     assert found["std_tau"] == pytest.approx(np.sqrt(2.0))
     assert found["rms_tau"] == pytest.approx(np.sqrt(3.0))
@@ -141,7 +151,7 @@ def test_the_continuous_torque_holds_the_limit():
     for joint in range(7):
         current_sq = np.zeros(7)
         current_sq[joint] = (torque_nm[joint] / motors.eta[joint] / motors.torque_per_amp[joint]) ** 2
-        temp_c = settled(thermal, current_sq, np.zeros(7), motors, 25.0)
+        temp_c = steady_state(thermal, current_sq, np.zeros(7), motors, 25.0)
         assert temp_c is not None
         assert temp_c[WINDING][joint] == pytest.approx(60.0, abs=1e-6)
         heat = drive_heat(temp_c, current_sq, np.zeros(7), motors)
@@ -180,7 +190,7 @@ def test_the_seed_alone_decides(records, make_plan, motion):
     plan = make_plan(*(motion(np.random.default_rng(3), 3.0)[..., 3:4] for _ in range(3)))
 
     def scores(seed):
-        learned = known(elbow, replace(CONFIG, max_windows=50), np.random.SeedSequence(seed))
+        learned = cool_windows(elbow, replace(CONFIG, max_windows=50), np.random.SeedSequence(seed))
         return isolation_forest(learned, np.random.SeedSequence(seed)).scores([plan], [1]).total
 
     np.testing.assert_array_equal(scores(1), scores(1))
@@ -198,7 +208,7 @@ def test_a_sum_over_joints_except_for_the_torque_rule(fitted, jobs):
 
 def test_the_mean_of_squares_collapses_the_latent_and_no_training_learns_nothing(records, small, born):
     shoulder = [record[..., 1:3] for record in records[:20]]
-    dead = train(shoulder, collapsed(replace(small, epochs=15)), SEED, arm="arm_0")
+    dead = train(shoulder, collapsed_config(replace(small, epochs=15)), SEED, arm="arm_0")
     assert max(fit.kl for fit in dead.fits) < 0.05
     assert min(fit.mean_squared_error for fit in born.fits) > 0.9
     assert max(fit.mean_squared_error for fit in born.fits) < 1.2
@@ -213,14 +223,14 @@ class Silent:
 
 
 def test_a_difficulty_model_scores_like_the_rest(born, jobs):
-    scores = Modelled("VAE", born).scores(jobs, [1, 2, 3, 4])
-    errors = born.plans_errors(jobs, [1, 2, 3, 4]).sum(axis=-1)
+    scores = ModelScorer("VAE", born).scores(jobs, [1, 2, 3, 4])
+    errors = born.features(jobs, [1, 2, 3, 4]).errors.sum(axis=-1)
     np.testing.assert_allclose(scores.per_joint, difficulty_of_error(errors))
     np.testing.assert_allclose(scores.total, scores.per_joint.sum(axis=1))
-    worst = Modelled("VAE", born, worst=True).scores(jobs, [1, 2, 3, 4])
+    worst = ModelScorer("VAE", born, worst=True).scores(jobs, [1, 2, 3, 4])
     np.testing.assert_array_equal(worst.total, scores.per_joint.max(axis=1))
-    with pytest.raises(ValueError, match="'silent' has no opinion on job 2"):
-        Modelled("silent", Silent()).scores(jobs, [1, 1, 2, 1])
+    with pytest.raises(ValueError, match="'silent' has no score for job 2"):
+        ModelScorer("silent", Silent()).scores(jobs, [1, 1, 2, 1])
 
 
 def test_what_cannot_be_scored_says_so(fitted, cool, jobs, make_plan, motion, rng):
@@ -239,10 +249,10 @@ def test_what_cannot_be_scored_says_so(fitted, cool, jobs, make_plan, motion, rn
     with pytest.raises(ValueError, match="needs 1 to 60 components"):
         pca(cool, 61)
     with pytest.raises(ValueError, match="as many training windows"):
-        Neighbours.fit(np.zeros((3, 2)))
+        nearest_neighbours(cool, 10_000)
     with pytest.raises(ValueError, match="at least one record"):
         torque_over_known([])
     with pytest.raises(ValueError, match="torque > 0"):
         TorqueRms("broken", np.zeros(7))
     with pytest.raises(ValueError, match="Windows must be"):
-        window_features(np.zeros((1, 1, 7, 3)))
+        window_statistics(np.zeros((1, 1, 7, 3)))

@@ -10,9 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.errors import CheckpointError
-from twin.measures import Features
-from twin.saturation import CalibratedTwin, SaturationModel, evidence_of
-from twin.saturation_file import FILE, load_calibrated, load_saturation, save_saturation
+from twin.saturation.model import (
+    FILE,
+    CalibratedTwin,
+    SaturationModel,
+    evidence_of,
+    load_calibrated,
+    load_saturation,
+    save_saturation,
+)
+from twin.vae.measures import Features
 
 MODEL = SaturationModel(
     twin="t",
@@ -87,7 +94,7 @@ def test_a_job_without_duration_is_refused(duration_s) -> None:
 
 
 def test_a_job_of_another_arm_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"reads \(7, 1\) numbers \[joint, column\] of a job \(got \(6, 1\)\)"):
+    with pytest.raises(ValueError, match=r"needs \(7, 1\) numbers \[joint, column\] of a job \(got \(6, 1\)\)"):
         MODEL.risk(Features(np.zeros((6, 5))), 10.0)
 
 
@@ -150,7 +157,7 @@ def test_a_model_of_other_data_or_another_twin_is_refused_by_name(tmp_path: Path
     ("change", "says"),
     [
         (lambda card: b"{", "truncated"),
-        (lambda card: card | {"format": 2}, "format 2 is not the one read here, 1"),
+        (lambda card: card | {"format": 2}, "format 2 is not supported, only 1"),
         (lambda card: card | {"model": card["model"] | {"offset": -9.0}}, "content has changed"),
         (lambda card: card | {"model": card["model"] | {"of_temp": "warm"}}, "of_temp"),
         (lambda card: card | {"model": card["model"] | {"of_log_duration": -1.0}}, "slope"),

@@ -7,9 +7,21 @@ import pytest
 
 from fleet.difficulty import DifficultyModel
 from fleet.motion import Phase
-from twin.measures import Features
-from twin.score import Twin
-from twin.window import cut, resample
+from twin.vae.measures import Features
+from twin.vae.twin import Twin
+from twin.vae.window import cut, resample
+
+NOTHING = Phase(np.zeros((0, 3, 7), np.float32), np.zeros(0, np.float32))
+
+
+def job_errors(twin, plan, repetitions=1):
+    return twin.features([plan], [repetitions]).errors[0]
+
+
+def phase_errors(twin, plan):
+    """Errors of each phase as a job of its own, [phase, joint, channel]."""
+    alone = [replace(plan, approach=NOTHING, cycle=phase, retreat=NOTHING) for phase in plan.phases]
+    return twin.features(alone, [1, 1, 1]).errors
 
 
 def test_the_twin_is_a_difficulty_model(twin, plan):
@@ -25,7 +37,7 @@ def test_a_score_repeats_even_in_another_batch_or_process(twin, plan, make_plan,
     others = [make_plan(*(motion(rng, s) for s in (2.0, 6.0, 2.0))) for _ in range(9)]
     first = twin.score(plan, 3).per_joint
     fresh = pickle.loads(pickle.dumps(twin))
-    fresh.phase_errors([*others, plan])
+    fresh.features([*others, plan], [1] * 10)
     np.testing.assert_array_equal(first, twin.score(plan, 3).per_joint)
     np.testing.assert_allclose(first, fresh.score(plan, 3).per_joint, rtol=1e-6)
 
@@ -42,7 +54,8 @@ def test_more_torque_than_known_raises_the_score_of_that_joint_alone(twin, plan,
     rise = twin.score(loaded_plan, 10).per_joint - known
     assert rise[joint] > 0.05
     assert np.all(np.abs(np.delete(rise, joint)) < 1e-6)
-    assert twin.shares(loaded_plan, 10)[joint, 2] > twin.shares(plan, 10)[joint, 2]
+    loaded_shares, known_shares = (twin.measure(each, 10).shares for each in (loaded_plan, plan))
+    assert loaded_shares[joint, 2] > known_shares[joint, 2]
 
 
 def test_errors_far_beyond_training_stay_below_one(twin, plan):
@@ -53,59 +66,57 @@ def test_errors_far_beyond_training_stay_below_one(twin, plan):
 
 
 def test_many_repetitions_approach_the_cycle_alone(twin, plan):
-    cycle = twin.phase_errors([plan])[0, 1]
-    gaps = [np.abs(twin.job_errors(plan, n) - cycle).max() for n in (1, 10, 100, 10_000)]
+    cycle = phase_errors(twin, plan)[1]
+    gaps = [np.abs(job_errors(twin, plan, n) - cycle).max() for n in (1, 10, 100, 10_000)]
     assert gaps == sorted(gaps, reverse=True)
     assert gaps[-1] < 1e-3
 
 
 def test_the_job_error_is_the_mean_over_its_time(twin, plan):
-    per_phase = twin.phase_errors([plan])[0]
+    per_phase = phase_errors(twin, plan)
     times = np.array([3.0, 4 * 10.0, 2.5])
     want = (times[:, None, None] * per_phase).sum(0) / times.sum()
-    np.testing.assert_allclose(twin.job_errors(plan, 4), want)
+    np.testing.assert_allclose(job_errors(twin, plan, 4), want)
 
 
 def test_the_phase_error_is_the_plain_mean_of_the_reconstruction_error(twin, make_plan, motion, rng):
     plan = make_plan(motion(rng, 4.0), motion(rng, 8.0), motion(rng, 4.0))
     windows = cut(resample(plan.cycle.profile, 50.0, 12.5), 50, 50)
     away = np.abs(windows - twin.reconstruct(windows)) / twin.scaler.std
-    np.testing.assert_allclose(twin.phase_errors([plan])[0, 1], away.mean(axis=(0, 1)), rtol=1e-4)
+    np.testing.assert_allclose(phase_errors(twin, plan)[1], away.mean(axis=(0, 1)), rtol=1e-4)
 
 
 def test_shares_sum_to_one(twin, plan):
-    shares = twin.shares(plan, 2)
+    shares = twin.measure(plan, 2).shares
     assert shares.shape == (7, 3)
     assert np.all(shares >= 0)
     assert shares.sum() == pytest.approx(1.0)
 
 
 def test_an_empty_phase_weighs_nothing(twin, plan):
-    nothing = Phase(np.zeros((0, 3, 7), np.float32), np.zeros(0, np.float32))
-    still = replace(plan, approach=nothing, retreat=nothing)
-    np.testing.assert_allclose(twin.job_errors(still, 1), twin.phase_errors([plan])[0, 1], rtol=1e-6)
+    still = replace(plan, approach=NOTHING, retreat=NOTHING)
+    np.testing.assert_allclose(job_errors(twin, still, 1), job_errors(twin, still, 9), rtol=1e-12)
     with pytest.raises(ValueError, match="no motion"):
-        twin.score(replace(still, cycle=nothing), 1)
+        twin.score(replace(still, cycle=NOTHING), 1)
 
 
 def test_plans_are_remembered_only_while_they_live(twin, make_plan, motion, rng):
     fresh = pickle.loads(pickle.dumps(twin))
     plan = make_plan(*(motion(rng, 2.0) for _ in range(3)))
     fresh.score(plan, 1)
-    assert len(fresh._known) == 1
+    assert len(fresh._scored) == 1
     del plan
     gc.collect()
-    assert len(fresh._known) == 0
+    assert len(fresh._scored) == 0
 
 
 def test_plans_in_one_call_keep_their_order(twin, make_plan, motion, rng):
     plans = [make_plan(*(motion(rng, s) for s in (1.0, 5.0, 1.5))) for _ in range(4)]
-    together = twin.phase_errors([*plans, plans[0]])
+    together = twin.features([*plans, plans[0]], [1] * 5).errors
     fresh = pickle.loads(pickle.dumps(twin))
-    alone = np.stack([fresh.phase_errors([plan])[0] for plan in [*plans, plans[0]]])
-    assert together.shape == (5, 3, 7, 3)
+    alone = np.stack([job_errors(fresh, plan) for plan in [*plans, plans[0]]])
+    assert together.shape == (5, 7, 3)
     np.testing.assert_allclose(together, alone, rtol=1e-6)
-    assert twin.phase_errors([]).shape == (0, 3, 7, 3)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -142,21 +153,12 @@ def test_windows_that_do_not_fit_are_refused(twin, bad):
         twin.latent(bad)
 
 
-def test_a_recorded_stretch_scores_like_a_phase_of_a_plan_at_any_rate(twin, plan):
-    cycle = plan.cycle.profile
-    np.testing.assert_allclose(twin.profile_errors(cycle, 50.0), twin.phase_errors([plan])[0, 1], rtol=1e-6)
-    held = np.repeat(cycle, 2, axis=0)
-    np.testing.assert_allclose(twin.profile_errors(held, 100.0), twin.profile_errors(cycle, 50.0), rtol=1e-4)
-    with pytest.raises(ValueError, match="without samples"):
-        twin.profile_errors(cycle[:0], 50.0)
-
-
 def test_many_jobs_score_as_each_alone(twin, make_plan, motion, rng):
     plans = [make_plan(*(motion(rng, s) for s in (1.0, 5.0, 1.5))) for _ in range(3)]
-    together = twin.plans_errors(plans, [1, 5, 9])
+    together = twin.features(plans, [1, 5, 9]).errors
     for plan, n, errors in zip(plans, [1, 5, 9], together, strict=True):
-        np.testing.assert_array_equal(errors, twin.job_errors(plan, n))
-    assert twin.plans_errors([], []).shape == (0, 7, 3)
+        np.testing.assert_array_equal(errors, job_errors(twin, plan, n))
+    assert twin.features([], []).errors.shape == (0, 7, 3)
 
 
 def test_window_errors_are_the_mean_distance_to_the_reconstruction(twin, plan):
@@ -176,7 +178,7 @@ def test_decoding_the_posterior_mean_is_the_reconstruction(twin, plan):
 
 
 def test_every_plan_needs_its_repetitions(twin, plan):
-    with pytest.raises(ValueError, match="Every plan needs its repetitions"):
+    with pytest.raises(ValueError, match="Each job needs its repetitions: 1 plans, 2 repetitions"):
         twin.features([plan], [1, 2])
 
 
@@ -195,4 +197,4 @@ def test_a_twin_needs_its_networks(twin):
 
 def test_a_calibration_of_another_arm_is_refused(twin):
     with pytest.raises(ValueError, match="calibration is for 6 joints, the twin has 7"):
-        twin.calibrated_by(Features(np.zeros((4, 6, 5))))
+        twin.with_reference(Features(np.zeros((4, 6, 5))))

@@ -5,9 +5,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from twin.recording import Recording
-from twin.stretches import on_clock, stretches
-from twin.window import CONTINUOUS
+from twin.logs.recording import CONTINUOUS, Recording
+from twin.logs.resampling import at_rate, stretches
 
 JOINTS = 7
 rates = st.floats(0.2, 60.0)
@@ -27,7 +26,7 @@ def times(steps_s: list[float]) -> np.ndarray:
 @given(steps, rates, st.floats(-3, 3), st.floats(-1, 1))
 def test_constants_and_ramps_are_kept_whatever_the_clocks(steps_s, rate_hz, level, slope):
     time_s = times(steps_s)
-    moments, values = on_clock(time_s, np.stack([np.full_like(time_s, level), slope * time_s], axis=1), rate_hz)
+    moments, values = at_rate(time_s, np.stack([np.full_like(time_s, level), slope * time_s], axis=1), rate_hz)
     np.testing.assert_allclose(values, np.stack([np.full_like(moments, level), slope * moments], axis=1), atol=1e-9)
     np.testing.assert_allclose(np.diff(moments), 1 / rate_hz, rtol=1e-6)
     assert len(moments) >= np.floor((time_s[-1] - time_s[0]) * rate_hz)
@@ -39,7 +38,7 @@ def test_a_slower_clock_keeps_means(steps_s, seed, samples):
     values = np.random.default_rng(seed).normal(size=len(time_s))
     whole_s = time_s[-1] - time_s[0]
     assume(np.median(steps_s) < whole_s / samples * 0.999)
-    moments, means = on_clock(time_s, values, samples / whole_s)
+    moments, means = at_rate(time_s, values, samples / whole_s)
     assert len(moments) == samples
     # Trapezoidal rule: the time mean of the polygon through the readings.
     np.testing.assert_allclose(means.mean(), np.trapezoid(values, time_s) / whole_s, atol=1e-9)
@@ -48,7 +47,7 @@ def test_a_slower_clock_keeps_means(steps_s, seed, samples):
 def test_the_same_clock_changes_nothing():
     time_s = 7.0 + np.arange(40) / 2.0
     values = np.random.default_rng(0).normal(size=(40, 3, JOINTS))
-    moments, same = on_clock(time_s, values, 2.0)
+    moments, same = at_rate(time_s, values, 2.0)
     np.testing.assert_allclose(moments, time_s)
     np.testing.assert_allclose(same, values, atol=1e-9)
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from fleet.errors import FleetError
-from twin.loss import negative_elbo
-from twin.model import TwinConfig, build
-from twin.train import CollapsedPosterior, Diverged, hash_records, seed_text, train, training_key
+from twin.vae.loss import negative_elbo
+from twin.vae.model import TwinConfig, build
+from twin.vae.train import CollapsedPosterior, Diverged, hash_records, seed_text, train, training_key
 
 SEED = np.random.SeedSequence(11)
 

@@ -4,7 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from twin.window import STD_FLOOR, Scaler, cover, cut, resample, starts, windows_of
+from twin.vae.model import TwinConfig
+from twin.vae.window import STD_FLOOR, Scaler, cover, cut, resample, starts, windows_of
 
 lengths = st.integers(1, 300)
 windows = st.integers(2, 60)
@@ -84,14 +85,14 @@ def test_a_limited_joint_is_not_moved_by_turns():
 
 
 def test_z_scores_of_training_have_mean_zero_and_deviation_one(records):
-    cool = windows_of(records, from_hz=50, rate_hz=12.5, window=50, stride=10)
+    cool = windows_of(records, TwinConfig())
     z = Scaler.fit(cool).to_z(cool)
     np.testing.assert_allclose(z.mean(axis=(0, 1)), 0, atol=1e-4)
     np.testing.assert_allclose(z.std(axis=(0, 1)), 1, atol=1e-3)
 
 
 def test_the_scaler_does_not_learn_from_what_it_scales(records):
-    cool = windows_of(records, from_hz=50, rate_hz=12.5, window=50, stride=10)
+    cool = windows_of(records, TwinConfig())
     scaler = Scaler.fit(cool)
     heavy = cool.copy()
     heavy[..., 2] *= 3
@@ -99,7 +100,7 @@ def test_the_scaler_does_not_learn_from_what_it_scales(records):
 
 
 def test_a_still_joint_is_scaled_by_the_floor_and_called_still(records):
-    cool = windows_of(records, from_hz=50, rate_hz=12.5, window=50, stride=10)
+    cool = windows_of(records, TwinConfig())
     cool[:, :, 4] = 1.0
     scaler = Scaler.fit(cool)
     np.testing.assert_array_equal(scaler.std[4], STD_FLOOR)
@@ -108,7 +109,7 @@ def test_a_still_joint_is_scaled_by_the_floor_and_called_still(records):
 
 
 def test_z_scores_go_back_to_si(records):
-    cool = windows_of(records[:3], from_hz=50, rate_hz=12.5, window=50, stride=10)
+    cool = windows_of(records[:3], TwinConfig())
     scaler = Scaler.fit(cool)
     np.testing.assert_allclose(scaler.to_si(scaler.to_z(cool)), cool, atol=1e-5)
 
@@ -116,17 +117,17 @@ def test_z_scores_go_back_to_si(records):
 @pytest.mark.parametrize("shape", [(5, 7), (5, 2, 7)])
 def test_a_misshapen_record_is_named(shape):
     with pytest.raises(ValueError, match=r"Record 0 must be \[time, 3, joint\]"):
-        windows_of([np.zeros(shape)], from_hz=50, rate_hz=12.5, window=50, stride=10)
+        windows_of([np.zeros(shape)], TwinConfig())
 
 
 def test_a_record_with_nan_says_where(rng, motion):
     bad = motion(rng, 2.0)
     bad[4, 2, 1] = np.nan
     with pytest.raises(ValueError, match="Record 1 is not finite: tau of joint 2 at sample 4"):
-        windows_of([motion(rng, 2.0), bad], from_hz=50, rate_hz=12.5, window=50, stride=10)
+        windows_of([motion(rng, 2.0), bad], TwinConfig())
 
 
 @pytest.mark.parametrize("nothing", [[], [np.zeros((0, 3, 7))]])
 def test_no_records_are_refused(nothing):
     with pytest.raises(ValueError, match="at least one record"):
-        windows_of(nothing, from_hz=50, rate_hz=12.5, window=50, stride=10)
+        windows_of(nothing, TwinConfig())

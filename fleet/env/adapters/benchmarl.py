@@ -1,57 +1,49 @@
-"""The environment as a BenchMARL task: any algorithm of theirs with masks, the state for central critics.
+"""The environment as a BenchMARL task: any of its algorithms with masks, and the state for central critics.
 
-    from functools import partial
-    from fleet.env.adapters.benchmarl import AllocationTask
-    from scenarios import make_env
-    task = AllocationTask("quickstart", partial(make_env, "quickstart", difficulty="blind"), max_steps=180)
-    Experiment(task, MappoConfig.get_from_yaml(), MlpConfig.get_from_yaml(), seed=0, config=config).run()
-
-Install: `pip install 'thermofleet[benchmarl]' -c constraints/benchmarl.txt`. Run with benchmarl 1.5.2, torchrl 0.11.1,
-tensordict 0.11.0, torch 2.13.0.
+Example, installation and tested versions: docs/trainers.md.
 
 Traps:
 
-- BenchMARL 1.5 wants torchrl < 0.12 and av < 14, older than the extra `learn`: give it an environment of its own.
+- BenchMARL 1.5 needs torchrl < 0.12 and av < 14, older than the extra `learn`: use a separate virtual environment.
 - TorchRL warns of every PettingZoo but 1.24.3. What is used here was run with 1.27.
-- It steps one environment at a time, at most some 900 steps a second on one core whatever the environment; for speed
-  use `fleet.env.adapters.torchrl`.
-- The task is pickled with the experiment: the factory must pickle (a `functools.partial` does, a lambda does not).
-- TorchRL makes a group of each agent whose name does not end in a number, and BenchMARL learns each group for itself:
-  MAPPO for an arm named "wall" would share no policy. The adapter puts all arms into one group, "arm", whatever their
-  names.
-- `max_steps` bounds evaluation only; an episode's length is the environment's own.
+- BenchMARL steps one environment at a time, at most some 900 steps per second on one core whatever the environment;
+  for speed use `fleet.env.adapters.torchrl`.
+- The task is pickled with the experiment, so the factory must pickle (a `functools.partial` does, a lambda does not).
+- TorchRL puts each agent whose name does not end in a number into a group of its own, and BenchMARL trains each group
+  alone: an arm named "wall" would share no MAPPO policy. The adapter puts all arms into one group, "arm".
+- `max_steps` limits evaluation only; the environment sets an episode's length.
 """
 
 # pyright: reportMissingImports=false
 
 from collections.abc import Callable
-from typing import Any
 
 from benchmarl.environments.pettingzoo.common import PettingZooClass
-from pettingzoo import ParallelEnv
 from torchrl.envs import EnvBase
 from torchrl.envs.libs.pettingzoo import PettingZooWrapper
+
+from fleet.env.adapters.arguments import Env
 
 GROUP = "arm"
 
 
 class AllocationTask(PettingZooClass):
-    """A task of BenchMARL whose environments a factory makes.
+    """A BenchMARL task with environments made by a factory.
 
     Args:
-        name: Of the task, in BenchMARL's folders and logs.
+        name: Task name in BenchMARL's folders and logs.
         factory: Makes an environment; must pickle.
-        max_steps: Decisions after which an evaluation episode is cut.
+        max_steps: Decisions after which an evaluation episode is truncated.
     """
 
-    def __init__(self, name: str, factory: Callable[[], ParallelEnv[str, Any, Any]], *, max_steps: int) -> None:
+    def __init__(self, name: str, factory: Callable[[], Env], *, max_steps: int) -> None:
         super().__init__(name, {"max_steps": max_steps})
         self.factory = factory
 
     def get_env_fun(
-        self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any
+        self, num_envs: int, continuous_actions: bool, seed: int | None, device: str
     ) -> Callable[[], EnvBase]:
-        """Makes one environment (BenchMARL puts as many as it wants side by side)."""
+        """Factory of one environment; BenchMARL runs as many of them as it needs."""
 
         def make() -> EnvBase:
             env = self.factory()
@@ -67,23 +59,23 @@ class AllocationTask(PettingZooClass):
         return make
 
     def supports_continuous_actions(self) -> bool:
-        """Claims are discrete."""
+        """False: claims are discrete."""
         return False
 
     def supports_discrete_actions(self) -> bool:
-        """Claims are discrete."""
+        """True: claims are discrete."""
         return True
 
     def has_state(self) -> bool:
-        """The environment has a `state()`."""
+        """True: the environment has `state()`."""
         return True
 
     def has_render(self, env: EnvBase) -> bool:
-        """No pictures in evaluation."""
+        """False: evaluation renders nothing."""
         return False
 
     def max_steps(self, env: EnvBase) -> int:
-        """Decisions after which an evaluation episode is cut."""
+        """Decisions after which an evaluation episode is truncated."""
         return self.config["max_steps"]
 
     @staticmethod

@@ -1,25 +1,21 @@
-"""The environment for Gymnasium: one dispatcher decides for all arms, alone or in many shifts at once.
+"""The environment for Gymnasium: one dispatcher decides for all arms, in one episode or in many at once.
 
-    from fleet.env.adapters.gymnasium_view import DispatcherEnv, DispatcherVectorEnv
-    from scenarios import make_batch, make_env
-    env = DispatcherEnv(make_env("quickstart", difficulty="blind"))
-    many = DispatcherVectorEnv(make_batch("quickstart", 64, difficulty="blind"))
-    seen, info = many.reset(seed=0)
-    seen, *_ = many.step(many.legal_sample())
+Example, installation and tested versions: docs/trainers.md.
 
-Both observe Dict {"observation": float32 [arm, size], "action_mask": int8 [arm, slot + 1]} and answer
-MultiDiscrete [arm]; the reward is the team's, once. Nothing to install: Gymnasium comes with thermofleet.
+Observations are Dict {"observation": float32 [arm, size], "action_mask": int8 [arm, slot + 1]}, actions are
+MultiDiscrete [arm], the reward is the team's.
 
 Traps:
 
-- Every arm has a mask of its own. `action_space.sample(mask=info["action_mask"])` is legal for `DispatcherEnv`; two
-  arms may still claim the same job, and then the better score wins.
-- The vector form begins a new shift in the same step (`AutoresetMode.SAME_STEP`): the last observation is in
-  `info["final_obs"]`, its rows given by `info["_final_obs"]`. Of a batch made with `autoreset=False` it resets where
-  `options={"reset_mask": bool [env]}` says (`AutoresetMode.DISABLED`).
-- Observations are in raw units; `FlattenObservation` and the like take them as any Dict.
+- Every arm has its own mask. `action_space.sample(mask=info["action_mask"])` is legal for `DispatcherEnv`; two arms may
+  still claim the same job, and then the better score wins.
+- The vector form starts the next episode in the same step (`AutoresetMode.SAME_STEP`): the last observation is in
+  `info["final_obs"]`, its rows are given by `info["_final_obs"]`. With a batch made with `autoreset=False` it resets
+  the rows of `options={"reset_mask": bool [env]}` (`AutoresetMode.DISABLED`).
+- Observations are in raw units; wrappers such as `FlattenObservation` take them like any Dict.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -27,77 +23,75 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from pettingzoo import ParallelEnv
 
-from fleet.env.adapters.given import batch_for, env_for
-from fleet.env.reward import TERMS
+from fleet.env.adapters.arguments import ARM_INFOS, TEAM_INFOS, Env, Infos, arm_space, check_batch, check_env
 from fleet.env.vector import BatchEnv
 
 Array = np.ndarray
-Seen = dict[str, Array]
+Observation = dict[str, Array]
 
 
-class DispatcherEnv(gymnasium.Env[Seen, Array]):
-    """A `ParallelEnv` of Dict observations as a Gymnasium `Env` with one agent for all arms.
+class DispatcherEnv(gymnasium.Env[Observation, Array]):
+    """A `ParallelEnv` with Dict observations as a Gymnasium `Env` with one agent for all arms.
 
-    Infos are of the team: `action_mask`, a tuple of int8 [slot + 1] for each arm, and each number of the arms' infos,
-    as float64 [arm].
+    Infos are `action_mask`, a tuple of int8 [slot + 1] for each arm, and each number of the arms' infos, as float64
+    [arm].
     """
 
-    def __init__(self, env: ParallelEnv[str, Any, Any]) -> None:
-        self.env = env = env_for("DispatcherEnv", env)
+    def __init__(self, env: Env) -> None:
+        self.env = env = check_env("DispatcherEnv", env)
         self.arms = tuple(env.possible_agents)
-        first: Any = env.observation_space(self.arms[0])
-        actions: Any = env.action_space(self.arms[0])
-        self.observation_space = dispatcher_space(first, len(self.arms))
-        self.action_space = spaces.MultiDiscrete([int(actions.n)] * len(self.arms))
+        self.observation_space = dispatcher_space(arm_space(env, self.arms[0]), len(self.arms))
+        discrete: Any = env.action_space(self.arms[0])  # Discrete
+        actions = int(discrete.n)
+        self.action_space = spaces.MultiDiscrete([actions] * len(self.arms))
         self.render_mode = getattr(env, "render_mode", None)
         self.metadata = dict(env.metadata)
-        self._mask = np.zeros((len(self.arms), int(actions.n)), np.int8)
+        self._mask = np.zeros((len(self.arms), actions), np.int8)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
-        """Begin a shift."""
+    def reset(self, *, seed: int | None = None, options: Infos | None = None) -> tuple[Observation, Infos]:
+        """Start an episode."""
         super().reset(seed=seed)
-        return self._told(*self.env.reset(seed=seed, options=options))
+        return self._stacked(*self.env.reset(seed=seed, options=options))
 
-    def step(self, action: Array) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
-        """One decision for all arms, int [arm]: 0 waits or goes on, k claims slot k; the team's reward."""
+    def step(self, action: Array) -> tuple[Observation, float, bool, bool, Infos]:
+        """One decision for all arms, int [arm]: 0 waits or continues, k claims slot k. Returns the team's reward."""
         values = np.asarray(action)
         if values.shape != (len(self.arms),):
             raise ValueError(f"action must be one integer for each of {len(self.arms)} arms (got {action!r}).")
-        seen, rewards, terminated, truncated, infos = self.env.step(dict(zip(self.arms, values, strict=True)))
-        told, info = self._told(seen, infos)
+        each, rewards, terminated, truncated, infos = self.env.step(dict(zip(self.arms, values, strict=True)))
+        observation, info = self._stacked(each, infos)
         arm = self.arms[0]
-        return told, float(rewards[arm]), terminated[arm], truncated[arm], info
+        return observation, float(rewards[arm]), terminated[arm], truncated[arm], info
 
     def action_masks(self) -> Array:
         """The masks of all arms one after the other, bool [arm * (slot + 1)], as sb3-contrib reads them."""
         return self._mask.reshape(-1) == 1
 
-    def render(self) -> Any:
-        """What the environment renders."""
+    def render(self) -> Any:  # as Gymnasium has it
+        """The environment's picture."""
         return self.env.render()
 
     def close(self) -> None:
         """Close the environment."""
         self.env.close()
 
-    def _told(self, seen: dict[str, Any], infos: dict[str, dict[str, Any]]) -> tuple[Seen, dict[str, Any]]:
-        told = {key: np.stack([seen[arm][key] for arm in self.arms]) for key in ("observation", "action_mask")}
-        self._mask = told["action_mask"]
+    def _stacked(self, each: dict[str, Observation], infos: dict[str, Infos]) -> tuple[Observation, Infos]:
+        stacked = {key: np.stack([each[arm][key] for arm in self.arms]) for key in ("observation", "action_mask")}
+        self._mask = stacked["action_mask"]
         numbers = {key: np.array([infos[arm][key] for arm in self.arms], float) for key in infos[self.arms[0]]}
-        return told, {**numbers, "action_mask": tuple(self._mask.copy())}
+        return stacked, {**numbers, "action_mask": tuple(self._mask.copy())}
 
 
-class DispatcherVectorEnv(VectorEnv[Seen, Array, Array]):
-    """A `BatchEnv` as a Gymnasium `VectorEnv`: a dispatcher in each env, arrays throughout.
+class DispatcherVectorEnv(VectorEnv[Observation, Array, Array]):
+    """A `BatchEnv` as a Gymnasium `VectorEnv` with one dispatcher in each env.
 
-    Infos are arrays [env, …]: `action_mask`, those of `BatchEnv.step`, and where a shift ended `final_obs` and
-    `final_info`, with the rows in `_final_obs` and `_final_info` as Gymnasium has it.
+    Infos are arrays [env, …]: `action_mask`, the infos of `BatchEnv.step`, and where an episode ended `final_obs` and
+    `final_info`, with the rows in `_final_obs` and `_final_info` as in Gymnasium.
     """
 
     def __init__(self, batch: BatchEnv) -> None:
-        self.batch = batch = batch_for("DispatcherVectorEnv", batch)
+        self.batch = batch = check_batch("DispatcherVectorEnv", batch)
         arms = len(batch.agents)
         self.num_envs = batch.num_envs
         mode = AutoresetMode.SAME_STEP if batch.autoreset else AutoresetMode.DISABLED
@@ -108,45 +102,45 @@ class DispatcherVectorEnv(VectorEnv[Seen, Array, Array]):
         self.action_space = batch_space(self.single_action_space, batch.num_envs)
         self._mask = np.zeros((batch.num_envs, arms, batch.layout.slots + 1), np.int8)
 
-    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
-        """Begin new shifts: env e that of seed + e, or of seed[e]; or only where `options["reset_mask"]` is true."""
+    def reset(
+        self, *, seed: int | Sequence[int] | None = None, options: Infos | None = None
+    ) -> tuple[Observation, Infos]:
+        """Start episodes with seed + e or seed[e] in env e; only where `options["reset_mask"]` is true, if given."""
         super().reset(seed=seed if isinstance(seed, int) else None)
         obs, info = self.batch.reset(seed, rows=(options or {}).get("reset_mask"))
         self._mask = obs["action_mask"]
         return dict(obs), self._numbers(info)
 
-    def step(self, actions: Array) -> tuple[Seen, Array, Array, Array, dict[str, Any]]:
-        """One decision of every env, int [env, arm]."""
+    def step(self, actions: Array) -> tuple[Observation, Array, Array, Array, Infos]:
+        """One decision of every arm of every env, int [env, arm]."""
         obs, reward, terminated, truncated, info = self.batch.step(actions)
         self._mask = obs["action_mask"]
-        told = self._numbers(info)
-        ended = info["final_envs"]
-        if self.batch.autoreset and len(ended):
-            over = terminated | truncated
-            told |= {"final_obs": self._last(info), "_final_obs": over}
-            told |= {"final_info": self._numbers(info, masks=False), "_final_info": over}
-        return dict(obs), reward, terminated, truncated, told
+        numbers = self._numbers(info)
+        if self.batch.autoreset and len(info["final_envs"]):
+            ended = terminated | truncated
+            numbers |= {"final_obs": self._last(info), "_final_obs": ended}
+            numbers |= {"final_info": self._numbers(info, masks=False), "_final_info": ended}
+        return dict(obs), reward, terminated, truncated, numbers
 
     def legal_sample(self, rng: np.random.Generator | None = None) -> Array:
-        """A random answer for every arm of every env, each legal one as likely, int64 [env, arm]."""
+        """Random legal actions, all equally likely, int64 [env, arm]."""
         if not self._mask.any():
-            raise RuntimeError("Nothing was begun yet: call reset() before legal_sample().")
+            raise RuntimeError("Call reset() before legal_sample(): there is no episode yet.")
         rng = rng or self.np_random
         counts = self._mask.cumsum(axis=-1)
         nth = rng.integers(counts[..., -1])
         return (counts > nth[..., None]).argmax(axis=-1)
 
-    def close_extras(self, **_: Any) -> None:
+    def close_extras(self, **_: object) -> None:
         """Close the batch."""
         self.batch.close()
 
-    def _numbers(self, info: dict[str, Any], *, masks: bool = True) -> dict[str, Any]:
-        names = ("faults", "illegal", "peak_c", "above_warning_s", "jobs_done", *(f"reward_{term}" for term in TERMS))
-        numbers = {name: info[name] for name in names}
+    def _numbers(self, info: Infos, *, masks: bool = True) -> Infos:
+        numbers = {name: info[name] for name in (*ARM_INFOS, *TEAM_INFOS)}
         return numbers | {"action_mask": self._mask} if masks else numbers
 
-    def _last(self, info: dict[str, Any]) -> Seen:
-        """What the dispatchers saw at the end of a shift, zeros where none ended, [env, arm, …]."""
+    def _last(self, info: Infos) -> Observation:
+        """Last observation of each episode that ended, zeros for the others, [env, arm, …]."""
         last = {}
         for key, values in info["final_obs"].items():
             last[key] = np.zeros((self.num_envs, *values.shape[1:]), values.dtype)
@@ -155,11 +149,11 @@ class DispatcherVectorEnv(VectorEnv[Seen, Array, Array]):
 
 
 def dispatcher_space(arm: spaces.Dict, arms: int) -> spaces.Space[Any]:
-    """What a dispatcher observes where each arm observes `arm`: the same with an axis of arms before."""
-    inner: dict[str, Any] = dict(arm.items())
+    """Observation space of a dispatcher: the space of one arm with a leading axis of arms."""
     return spaces.Dict(
         {
             key: spaces.Box(np.tile(box.low, (arms, 1)), np.tile(box.high, (arms, 1)), dtype=box.dtype)
-            for key, box in inner.items()
+            for key, box in arm.items()
+            if isinstance(box, spaces.Box)
         }
     )

@@ -1,26 +1,19 @@
 """The batch for Stable-Baselines3: every arm of every env is a row of one `VecEnv`, with masks for MaskablePPO.
 
-    from sb3_contrib import MaskablePPO
-    from fleet.env.adapters.sb3 import ArmsVecEnv
-    from scenarios import make_batch
-    rows = ArmsVecEnv(make_batch("quickstart", 16, difficulty="blind"))
-    MaskablePPO("MlpPolicy", rows, seed=0).learn(100_000)
+Example, installation and tested versions: docs/trainers.md.
 
-One policy is shared by all arms, and each row gets the team's reward.
+All arms share one policy, and each row gets the team's reward.
 
-Install: `pip install 'thermofleet[sb3]' -c constraints/sb3.txt`. Run with stable-baselines3 2.9.2, sb3-contrib 2.9.2,
-torch 2.13.0.
-
-What SuperSuit does otherwise, and why it is not used here: MaskablePPO finds no masks through it (`has_attr` is
-missing), `seed` fails, and most of its wrappers refuse Dict observations.
+Why SuperSuit is not used: MaskablePPO finds no masks through it (`has_attr` is missing), `seed` fails, and most of its
+wrappers refuse Dict observations.
 
 Traps:
 
-- PPO, A2C and DQN of Stable-Baselines3 itself know no masks: what they send against the mask is a wait, counted in
-  `illegal` of the infos at an episode's end. Take MaskablePPO.
+- PPO, A2C and DQN of Stable-Baselines3 itself read no masks. Their illegal actions are waits, counted in `illegal` of
+  the infos at an episode's end. Use MaskablePPO.
 - `n_steps` and `total_timesteps` count rows: a step of 16 envs with 4 arms is 64 timesteps.
-- The observation is in raw units. `VecNormalize` scales it, and passes the masks on.
-- A shift that ends begins anew in the same step; the last observation is `terminal_observation` in the infos.
+- Observations are in raw units. `VecNormalize` scales them and passes the masks on.
+- The next episode starts in the step that ends one; the last observation is `terminal_observation` in the infos.
 """
 
 # pyright: reportMissingImports=false
@@ -32,7 +25,7 @@ import numpy as np
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
-from fleet.env.adapters.given import batch_for
+from fleet.env.adapters.arguments import check_batch, check_choice
 from fleet.env.vector import BatchEnv, Obs
 
 Array = np.ndarray
@@ -42,21 +35,17 @@ Kind = Literal["vector", "dict"]
 class ArmsVecEnv(VecEnv):
     """A `BatchEnv` as a `VecEnv` of num_envs * arms rows: row env * arms + arm.
 
-    Infos are empty but for the end of a shift: `terminal_observation`, `TimeLimit.truncated`, `episode` with return
-    "r" and length "l", and the arm's `faults` and `illegal`.
+    Infos are empty except at the end of an episode: `terminal_observation`, `TimeLimit.truncated`, `episode` with
+    return "r" and length "l", and the arm's `faults` and `illegal`.
 
     Args:
-        batch: The shifts, with `autoreset` on.
-        observation: "vector" for "MlpPolicy", or "dict" with vector and mask, for "MultiInputPolicy".
+        batch: The episodes, with `autoreset` on.
+        observation: "vector" for "MlpPolicy", or "dict" with vector and mask for "MultiInputPolicy".
     """
 
     def __init__(self, batch: BatchEnv, *, observation: Kind = "vector") -> None:
-        if observation not in get_args(Kind):
-            raise ValueError(f"observation must be 'vector' or 'dict', got {observation!r}.")
-        batch = batch_for("ArmsVecEnv", batch)
-        if not batch.autoreset:
-            raise ValueError("ArmsVecEnv needs a batch that begins new shifts by itself: leave autoreset on.")
-        self.batch, self.arms = batch, len(batch.agents)
+        check_choice("observation", observation, get_args(Kind))
+        self.batch, self.arms = check_batch("ArmsVecEnv", batch, autoreset=True), len(batch.agents)
         self.kind: Kind = observation
         space = batch.single_observation_space
         rows = batch.num_envs * self.arms
@@ -67,12 +56,12 @@ class ArmsVecEnv(VecEnv):
         self._returns, self._lengths = np.zeros(batch.num_envs), np.zeros(batch.num_envs, dtype=int)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """With the next `reset`, env e begins the shift of seed + e; gives the seed of each row's env."""
+        """Seed env e with seed + e at the next `reset`; returns the seed of each row's env."""
         self._next = int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else int(seed)
         return [self._next + row // self.arms for row in range(self.num_envs)]
 
     def reset(self) -> Array | dict[str, Array]:
-        """Begin new shifts in all envs."""
+        """Start new episodes in all envs."""
         seed, self._next = self._next, None
         obs, _ = self.batch.reset(seed)
         self._returns[:], self._lengths[:] = 0.0, 0
@@ -82,11 +71,11 @@ class ArmsVecEnv(VecEnv):
         return self._rows(obs)
 
     def step_async(self, actions: Array) -> None:
-        """Note the actions, int [row]."""
+        """Keep the actions, int [row], for `step_wait`."""
         self._actions = np.asarray(actions).reshape(-1, self.arms)
 
     def step_wait(self) -> tuple[Array | dict[str, Array], Array, Array, list[dict[str, Any]]]:
-        """One decision of every row: what they see, float32 rewards, ends and infos, [row]."""
+        """One decision of every row: observations, float32 rewards, ends and infos, [row]."""
         obs, reward, terminated, truncated, info = self.batch.step(self._actions)
         self._returns += reward
         self._lengths += 1
@@ -102,8 +91,8 @@ class ArmsVecEnv(VecEnv):
                     "illegal": int(info["illegal"][env, arm]),
                 }
             self._returns[env], self._lengths[env] = 0.0, 0
-        over = np.repeat(terminated | truncated, self.arms)
-        return self._rows(obs), np.repeat(reward.astype(np.float32), self.arms), over, infos
+        done = np.repeat(terminated | truncated, self.arms)
+        return self._rows(obs), np.repeat(reward.astype(np.float32), self.arms), done, infos
 
     def action_masks(self) -> Array:
         """Legal actions now, bool [row, slot + 1]."""
@@ -114,11 +103,12 @@ class ArmsVecEnv(VecEnv):
         self.batch.close()
 
     def has_attr(self, attr_name: str) -> bool:
-        """Whether the rows have an attribute; `action_masks` is one."""
+        """Whether the rows have this attribute; `action_masks` is one."""
         return attr_name in ("action_masks", "render_mode")
 
+    # Any: the signatures are Stable-Baselines3's.
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute of the rows, one by one."""
+        """Attribute of each row."""
         if attr_name == "render_mode":
             return [None for _ in self._get_indices(indices)]
         if attr_name == "action_masks":
@@ -126,17 +116,17 @@ class ArmsVecEnv(VecEnv):
         raise AttributeError(f"A row has no {attr_name!r}. There are: action_masks, render_mode.")
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Nothing can be set: the rows are one batch."""
+        """Raise an AttributeError: the rows are one batch."""
         raise AttributeError(f"The rows are one batch: {attr_name!r} cannot be set in them.")
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        """Calls `action_masks`, the only method of a row."""
+        """Result of `action_masks`, the only method of a row, for each row."""
         if method_name != "action_masks":
             raise AttributeError(f"A row has no method {method_name!r}. There is: action_masks.")
         return list(self._mask) if indices is None else [self._mask[row] for row in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
-        """True for `Monitor`: the infos carry what it would put there."""
+        """True for `Monitor`: the infos already have what it would add."""
         rows: Iterable[int] = self._get_indices(indices)
         return [wrapper_class is Monitor for _ in rows]
 

@@ -10,15 +10,16 @@ from types import SimpleNamespace
 
 import pytest
 
-from fleet.bus.trade import JobWord, Offer
+from agents.consensus import Consensus
+from fleet.bus.protocol.auction import JobEstimate, JobSpec
 from fleet.errors import JournalFull
-from fleet.live import granting, promises
-from fleet.live.auctioneer import Objection
-from fleet.live.contractor import Contractor, Terms
-from fleet.live.council import Council, Faculties
-from fleet.live.granting import Grantor
-from fleet.live.timing import Timing
-from scenarios.live_policies import allocation
+from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
+from fleet.live.arm.journal_records import ArmHistory
+from fleet.live.auction.auctioneer import Objection
+from fleet.live.auction.knowledge import LiveFleet
+from fleet.live.auction.lease_timing import Timing
+from fleet.live.consensus.granter import Granter, Register
+from fleet.live.consensus.participant import ArmInterface, Participant
 
 TIMING = Timing(lease_s=3.0, margin_s=0.05, window_s=0.3, pause_s=(0.2, 1.0))
 CYCLE_S = 0.2
@@ -30,7 +31,7 @@ class Crash(Exception):
 
 @dataclass(eq=False)
 class Disk:
-    """A journal in memory, and what goes wrong with it."""
+    """A journal in history, and what goes wrong with it."""
 
     records: list = field(default_factory=list)
     full: bool = False
@@ -63,28 +64,29 @@ class Arm:
     def start(self) -> None:
         self.lives += 1
         self.cycle_ends_s = None
-        memory = promises.restarted(promises.recall(self.promises.records), self.name, 0.0)
-        self.promises.records[:] = promises.retold(memory)
-        register = granting.recalled(self.grants.records)
-        self.grants.records[:] = granting.retold(register)
-        terms = Terms(patience_s=8.0)
-        self.contractor = Contractor(self.name, self.promises.keep, memory, nonce="n", terms=terms)
-        grantor = Grantor(self.name, self.fleet.names, register, self.grants.keep, real_s=self.real_s, timing=TIMING)
-        faculties = Faculties(
+        history = ArmHistory().replay(self.promises.records).after_restart(self.name, 0.0)
+        self.promises.records[:] = history.compact()
+        register = Register().replay(self.grants.records)
+        self.grants.records[:] = register.compact()
+        config = ExecutorConfig(return_after_s=8.0)
+        self.executor = AwardExecutor(self.name, self.promises.keep, history, nonce="n", config=config)
+        granter = Granter(self.name, self.fleet.names, register, self.grants.keep, real_s=self.real_s, timing=TIMING)
+        interface = ArmInterface(
             offers=lambda words: tuple(self.fleet.offer(self.name, word) for word in words),
             unfit=lambda: "hot" if self.hot else "",
-            take=self.contractor.awarded,
+            take=self.executor.answer_award,
         )
-        self.council = Council(
-            self.contractor,
-            grantor,
-            faculties,
-            agree=self.fleet.agree,
-            life=memory.boot,
+        self.council = Participant(
+            self.executor,
+            granter,
+            interface,
+            fleet=LiveFleet(arms=self.fleet.names, warning_c=60.0),
+            choose=self.fleet.policy().choose,
+            life=history.boot,
             rng=random.Random(f"{self.name} {self.lives}"),
             timing=TIMING,
         )
-        self.council.know([*self.fleet.jobs, *register.jobs.values()])
+        self.council.add_jobs([*self.fleet.jobs, *register.jobs.values()])
 
     def turn(self) -> None:
         """What an arm does again and again; it may crash in the middle."""
@@ -98,30 +100,30 @@ class Arm:
 
     def crash(self) -> None:
         self.promises.crash = self.grants.crash = ""
-        for held in promises.recall(self.promises.records).held.values():
-            if held.leave:
+        for held in ArmHistory().replay(self.promises.records).active.values():
+            if held.may_commit:
                 self.fleet.doubtful.add(held.award.job.name)
         self.start()
 
     def _turn(self) -> None:
-        self.contractor.catch_up()
+        self.executor.retry_writes()
         self._work()
-        self.contractor.give_up(0.0, self.real_s)
-        if self.contractor.lease_requests(self.real_s) or self.contractor.reports(self.real_s):
-            self.council.claimant.hurry()
-        self.council.seen(self.fleet.alive_for(self.name))
+        self.executor.return_expired(0.0, self.real_s)
+        if self.executor.lease_requests(self.real_s) or self.executor.due_reports(self.real_s):
+            self.council.claimant.claim_soon()
+        self.council.set_present(self.fleet.alive_for(self.name))
         self.council.tick(self.real_s, self.fleet.true_s)
         while self.council.out:
             self.fleet.send(self.name, self.council.out.popleft())
 
     def _work(self) -> None:
         """Cycles, one after the other; one that was begun is ended."""
-        if not self.contractor.held:
+        if not self.executor.active:
             self.cycle_ends_s = None
             return
-        first = self.contractor.held[0]
+        first = self.executor.active[0]
         name, repetitions = first.award.job.name, first.award.job.repetitions
-        if self.cycle_ends_s is None and self.contractor.may(self.real_s) > first.cycles:
+        if self.cycle_ends_s is None and self.executor.allowed_cycles(self.real_s) > first.cycles:
             self.cycle_ends_s = name, self.real_s + CYCLE_S
             if first.cycles + 1 == repetitions:
                 self.fleet.last_cycle(name)
@@ -130,27 +132,27 @@ class Arm:
         elif self.cycle_ends_s is not None and self.real_s >= self.cycle_ends_s[1]:
             self.cycle_ends_s = None
             if first.cycles + 1 == repetitions:
-                self.contractor.finished(self.fleet.true_s, self.real_s)
+                self.executor.finish(self.fleet.true_s, self.real_s)
                 return
-            self.contractor.worked(first.cycles + 1, 0.0)
-        self.contractor.worked(first.cycles, (repetitions - 1 - first.cycles) * CYCLE_S)
+            self.executor.record_progress(first.cycles + 1, 0.0)
+        self.executor.record_progress(first.cycles, (repetitions - 1 - first.cycles) * CYCLE_S)
 
     def fault(self) -> None:
         """It stops in the middle of a cycle, which then is not done."""
         if self.cycle_ends_s is not None:
-            first = self.contractor.held[0].award.job
-            if self.contractor.held[0].cycles + 1 == first.repetitions:
+            first = self.executor.active[0].award.job
+            if self.executor.active[0].cycles + 1 == first.repetitions:
                 self.fleet.last_cycles[first.name] -= 1
             self.cycle_ends_s = None
-        self.contractor.returned(0.0, self.real_s, "hot")
+        self.executor.return_all(0.0, self.real_s, "hot")
 
 
 class Fleet:
     """Arms, and the wires between them: a list of words that have not come yet."""
 
-    def __init__(self, rates, jobs) -> None:
+    def __init__(self, rates, jobs, policy=Consensus) -> None:
         self.names = tuple(f"arm_{i}" for i in range(len(rates)))
-        self.true_s, self.jobs, self.agree = 100.0, list(jobs), allocation("consensus", 60.0)
+        self.true_s, self.jobs, self.policy = 100.0, list(jobs), policy
         self.wires: list = []
         self.old: list = []
         self.cut: set[str] = set()
@@ -158,10 +160,10 @@ class Fleet:
         self.doubtful: set[str] = set()
         self.arms = {name: Arm(self, name, rate) for name, rate in zip(self.names, rates, strict=True)}
 
-    def offer(self, arm: str, word: JobWord) -> Offer:
+    def offer(self, arm: str, word: JobSpec) -> JobEstimate:
         """An arm finds a job as hard as both their names say; some cannot do some."""
         d = random.Random(f"{arm} {word.name}").random()
-        return Offer(job=word.name, feasible=d > 0.1 or arm == self.names[0], d=d, finish_in_s=10.0)
+        return JobEstimate(job=word.name, feasible=d > 0.1 or arm == self.names[0], difficulty=d, finish_in_s=10.0)
 
     def last_cycle(self, job: str) -> None:
         self.last_cycles[job] = self.last_cycles.get(job, 0) + 1
@@ -183,12 +185,12 @@ class Fleet:
     def come(self, speaker: str, other: str, word, life: int) -> None:
         arm = self.arms[other]
         if type(word).__name__ == "Bid":
-            arm.safely(lambda: arm.council.heard(word, arm.real_s))
+            arm.safely(lambda: arm.council.apply_bid(word, arm.real_s))
             return
 
         def answer() -> None:
             try:
-                grant = arm.council.asked(word, arm.real_s)
+                grant = arm.council.answer_claim(word, arm.real_s)
             except Objection:
                 return
             self.wires.append((other, speaker, partial(self.answered, speaker, grant, life)))
@@ -198,7 +200,7 @@ class Fleet:
     def answered(self, speaker: str, grant, life: int) -> None:
         arm = self.arms[speaker]
         if arm.lives == life:  # an answer reaches only the life that asked
-            arm.safely(lambda: arm.council.answered(grant, arm.real_s))
+            arm.safely(lambda: arm.council.apply_reply(grant, arm.real_s))
 
     def deliver(self, index: int, *, keep: bool = False) -> None:
         one, other, call = self.wires[index] if keep else self.wires.pop(index)
@@ -220,10 +222,10 @@ class Fleet:
 
     def check(self) -> None:
         at_work = [
-            (held.award.job, arm.name, held.leave)
+            (held.award.job, arm.name, held.may_commit)
             for arm in self.arms.values()
-            for held in arm.contractor.held
-            if arm.real_s < held.until_s or held.leave
+            for held in arm.executor.active
+            if arm.real_s < held.lease_end_s or held.may_commit
         ]
         jobs = [job.name for job, _, _ in at_work]
         assert len(jobs) == len(set(jobs)), at_work
@@ -233,8 +235,8 @@ class Fleet:
     def busy(self, rng: random.Random, *, leave: bool) -> Arm | None:
         """An arm with a job in hand, or one that may begin its last cycle, if there is one soon."""
         for _ in range(30):
-            found = [arm for arm in self.arms.values() if arm.contractor.held]
-            found = [arm for arm in found if arm.contractor.held[0].leave or not leave]
+            found = [arm for arm in self.arms.values() if arm.executor.active]
+            found = [arm for arm in found if arm.executor.active[0].may_commit or not leave]
             if found:
                 return rng.choice(found)
             self.calm(0.1)
@@ -244,7 +246,7 @@ class Fleet:
         """What the arms know: they never differ."""
         told: dict[str, str] = {}
         for arm in self.arms.values():
-            for job, settled in arm.council.grantor.register.settled.items():
+            for job, settled in arm.council.granter.register.settled.items():
                 assert told.setdefault(job, settled.outcome) == settled.outcome, job
         return told
 

@@ -9,35 +9,37 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fleet.bus import keys
-from fleet.bus.link import Link
-from fleet.bus.router import Router
-from fleet.bus.trade import Ack, ArmEvent, Award, JobWord, Status, StatusRequest, Submission, Submitted
+from agents.consensus import Consensus
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.router import Router
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import Ack, ArmEvent, Award, JobSpec, Status, StatusRequest, Submission, SubmissionReply
 from fleet.errors import BusError
 from fleet.job import Place
-from fleet.live.arm_node import ArmNode, Nature
-from fleet.live.body import SimulatedBody
+from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
+from fleet.live.arm.estimator import Estimator, NominalPeaks
+from fleet.live.arm.journal_records import ArmHistory, ArmRecord, Closed
+from fleet.live.arm.node import ArmConfig, ArmNode
+from fleet.live.arm.simulated_body import SimulatedBody
+from fleet.live.auction.knowledge import LiveFleet
+from fleet.live.auction.lease_timing import Timing
 from fleet.live.clock import FleetClock
-from fleet.live.contractor import Contractor, Terms
-from fleet.live.council_node import CouncilNode, Membership
-from fleet.live.estimate import Estimator, NominalHeat
-from fleet.live.granting import Deed
+from fleet.live.consensus.granter import GrantRecord
+from fleet.live.consensus.node import ConsensusNode, Membership
 from fleet.live.journal import Journal
-from fleet.live.promises import Closed, Promise, recall, restarted, retold
-from fleet.live.timing import Timing
 from fleet.robot import ThermalLimits
-from scenarios.live_council import refuse_auctioneer
-from scenarios.live_policies import allocation
+from scenarios.cli.live.consensus import refuse_auctioneer
 
 PATIENCE_S = 20.0
 SPEED = 120.0
 ROSTER = ("arm_0", "arm_1", "arm_2")
+FLEET = LiveFleet(arms=ROSTER, warning_c=60.0)
 TIMING = Timing(lease_s=1.0, margin_s=0.1, window_s=0.3, pause_s=(0.1, 0.4))
 PLACES = {name: Place(name=name, position_m=(0.5, 0.0, 0.2)) for name in ("bench", "rack", "shelf")}
 
 
-def hold(name: str, place: str = "bench", repetitions: int = 3, **more) -> JobWord:
-    return JobWord(name=name, kind="hold", places=(place,), repetitions=repetitions, **more)
+def hold(name: str, place: str = "bench", repetitions: int = 3, **more) -> JobSpec:
+    return JobSpec(name=name, kind="hold", places=(place,), repetitions=repetitions, **more)
 
 
 @pytest.fixture
@@ -46,9 +48,9 @@ def bus(tmp_path, small):
     with ExitStack() as stack:
         router = stack.enter_context(Router())
         arms: dict[str, SimpleNamespace] = {}
-        outsider = stack.enter_context(Link(router.endpoint, "f"))
+        outsider = stack.enter_context(BusClient(router.endpoint, "f"))
         finished: Counter[str] = Counter()
-        outsider.listen(
+        outsider.subscribe(
             keys.of_every_arm("f", "event"),
             ArmEvent,
             lambda _, event: finished.update([event.job] if event.kind == "finish" else []),
@@ -57,25 +59,25 @@ def bus(tmp_path, small):
         def arm(name, **membership):
             own = small.arm(ROSTER.index(name), [small.work(place) for place in PLACES])
             plans = {(work.kind, work.places[0].name): plans for work, plans in own.plans.items()}
-            book = stack.enter_context(Journal(tmp_path / f"{name}.journal", Promise))
-            grants = stack.enter_context(Journal(tmp_path / f"{name}.grants", Deed))
-            memory = restarted(recall(book.replay()), name, 0.0)
-            book.rewrite(*retold(memory))
-            link = stack.enter_context(Link(router.endpoint, "f"))
+            book = stack.enter_context(Journal(tmp_path / f"{name}.journal", ArmRecord))
+            grants = stack.enter_context(Journal(tmp_path / f"{name}.grants", GrantRecord))
+            history = ArmHistory().replay(book.records()).after_restart(name, 0.0)
+            book.rewrite(*history.compact())
+            link = stack.enter_context(BusClient(router.endpoint, "f"))
             body = SimulatedBody(
                 own, ThermalLimits(), lambda _: 25.0, dt_s=SPEED / 20, rng=np.random.default_rng(0), warm=False
             )
-            member = Membership(roster=ROSTER, agree=allocation("consensus", 60.0), timing=TIMING, **membership)
+            member = Membership(fleet=FLEET, choose=Consensus().choose, timing=TIMING, **membership)
             node = ArmNode(
                 link,
                 body,
-                Contractor(name, book.append, memory, nonce=str(memory.boot), terms=Terms()),
-                Estimator(own.model, lambda work: plans[work.kind, work.places[0].name], PLACES, NominalHeat()),
+                AwardExecutor(name, book.append, history, nonce=str(history.boot), config=ExecutorConfig()),
+                Estimator(own.model, lambda work: plans[work.kind, work.places[0].name], PLACES, NominalPeaks()),
                 FleetClock(SPEED, time.monotonic()),
-                Nature(warning_c=60.0, rate_hz=20.0, life=memory.boot),
-                partial(CouncilNode, membership=member, journal=grants, life=memory.boot),
+                ArmConfig(warning_c=60.0, rate_hz=20.0, boot=history.boot),
+                partial(ConsensusNode, membership=member, journal=grants, life=history.boot),
             )
-            arms[name] = SimpleNamespace(node=node, link=link, book=book, grants=grants, orders=node.orders)
+            arms[name] = SimpleNamespace(node=node, link=link, book=book, grants=grants, work_source=node.work_source)
             return arms[name]
 
         def serve(condition, patience_s=PATIENCE_S):
@@ -92,16 +94,16 @@ def bus(tmp_path, small):
             deadline_s = time.monotonic() + PATIENCE_S
             while time.monotonic() < deadline_s:  # nobody may be ready to answer yet
                 got = []
-                outsider.ask(key, word, kind, got.append, timeout_s=3.0)
+                outsider.query(key, word, kind, got.append, timeout_s=3.0)
                 assert serve(partial(bool, got))
-                if got[0].words:
-                    return next(iter(got[0].words.values()))
+                if got[0].messages:
+                    return next(iter(got[0].messages.values()))
                 if got[0].refused:
                     return next(iter(got[0].refused.values()))
             raise AssertionError("nobody answers")
 
         def submit(*jobs):
-            return ask(keys.of_jobs("f", "submit"), Submission(jobs), Submitted)
+            return ask(keys.of_jobs("f", "submit"), Submission(jobs), SubmissionReply)
 
         def stand():
             return {each.job: each for each in ask(keys.of_jobs("f", "status"), StatusRequest(), Status).jobs}
@@ -117,8 +119,8 @@ def bus(tmp_path, small):
             for name in [*arms]:
                 kill(name)
             for path in tmp_path.glob("*.journal"):
-                with Journal(path, Promise) as book:
-                    closed = [each.report for each in book.replay() if isinstance(each, Closed)]
+                with Journal(path, ArmRecord) as book:
+                    closed = [each for each in book.records() if isinstance(each, Closed)]
                 done.update(report.job for report in closed if report.outcome == "finished")
             return done
 
@@ -138,7 +140,7 @@ def bus(tmp_path, small):
 
 def settled(bus, *names):
     """Whether every arm that is there knows that these jobs are finished."""
-    return all(set(names) <= one.orders.council.grantor.register.settled.keys() for one in bus.arms.values())
+    return all(set(names) <= one.work_source.participant.granter.register.settled.keys() for one in bus.arms.values())
 
 
 def test_jobs_that_are_handed_in_are_shared_out_and_done_once(bus):
@@ -161,8 +163,8 @@ def test_a_stream_that_all_know_comes_to_its_end(bus):
     stream = tuple((10.0 * i, hold(f"job {i}", place, release_s=10.0 * i)) for i, place in enumerate(PLACES))
     for name in ROSTER:
         bus.arm(name, stream=stream, horizon_s=1e5)
-    assert not any(one.orders.over for one in bus.arms.values())
-    assert bus.serve(lambda: all(one.orders.over for one in bus.arms.values()))
+    assert not any(one.work_source.over for one in bus.arms.values())
+    assert bus.serve(lambda: all(one.work_source.over for one in bus.arms.values()))
     times = [one.node.clock.now_s(time.monotonic()) for one in bus.arms.values()]
     assert max(times) - min(times) < 0.5 * SPEED
     assert bus.done_by_journals() == Counter(word.name for _, word in stream)
@@ -172,16 +174,16 @@ def test_at_the_end_of_the_shift_a_last_cycle_is_ended_and_the_rest_is_reported_
     stream = ((0.0, hold("brief", repetitions=1)), (0.0, hold("long", "rack", repetitions=10_000)))
     for name in ROSTER:
         bus.arm(name, stream=stream, horizon_s=150.0)
-    assert bus.serve(lambda: all(one.orders.over for one in bus.arms.values()))
-    told = {said.job: said for said in bus.arms["arm_0"].orders.statuses()}
+    assert bus.serve(lambda: all(one.work_source.over for one in bus.arms.values()))
+    told = {said.job: said for said in bus.arms["arm_0"].work_source.statuses()}
     assert {name: said.state for name, said in told.items()} == {"brief": "finished", "long": "unfinished"}
     assert told["long"].reason == "The shift ended before it was done."
-    assert not any(one.node.contractor.held for one in bus.arms.values())
+    assert not any(one.node.executor.active for one in bus.arms.values())
 
 
 def test_fewer_than_a_majority_begin_nothing(bus):
     alone = bus.arm("arm_1", stream=((0.0, hold("a")),), horizon_s=1e5)
-    assert not bus.serve(lambda: bool(alone.node.contractor.held), patience_s=1.0)
+    assert not bus.serve(lambda: bool(alone.node.executor.active), patience_s=1.0)
     assert alone.node.clock.now_s(time.monotonic()) == 0.0
     for name in ("arm_0", "arm_2"):
         bus.arm(name, stream=((0.0, hold("a")),), horizon_s=1e5)
@@ -192,14 +194,14 @@ def test_a_job_whose_arm_dies_goes_to_another_and_an_arm_that_comes_back_goes_on
     for name in ROSTER:
         bus.arm(name)
     bus.submit(hold("long", repetitions=30), hold("short", "rack"))
-    assert bus.serve(lambda: any(one.node.contractor.held for one in bus.arms.values()))
+    assert bus.serve(lambda: any(one.node.executor.active for one in bus.arms.values()))
     assert bus.serve(lambda: settled(bus, "short"))
-    holder = next(name for name, one in bus.arms.items() if one.node.contractor.held)
+    holder = next(name for name, one in bus.arms.items() if one.node.executor.active)
     bus.kill(holder)
     others = list(bus.arms.values())
-    assert bus.serve(lambda: any(h.award.job.name == "long" for one in others for h in one.node.contractor.held))
+    assert bus.serve(lambda: any(h.award.job.name == "long" for one in others for h in one.node.executor.active))
     back = bus.arm(holder)
-    assert bus.serve(lambda: "short" in back.orders.council.grantor.register.settled)
+    assert bus.serve(lambda: "short" in back.work_source.participant.granter.register.settled)
     assert bus.serve(lambda: settled(bus, "long", "short"))
     assert bus.done_by_journals() == Counter(["long", "short"])
 
@@ -212,14 +214,14 @@ def test_whoever_was_away_is_told_of_jobs_and_of_how_they_ended(bus):
     bus.kill("arm_2")
     bus.submit(hold("b"), hold("c", "rack", release_s=1e6))
     assert bus.serve(lambda: settled(bus, "b"))
-    back = bus.arm("arm_2").orders.council
-    assert bus.serve(lambda: "b" in back.grantor.register.settled and "c" in back.jobs)
+    back = bus.arm("arm_2").work_source.participant
+    assert bus.serve(lambda: "b" in back.granter.register.settled and "c" in back.jobs)
 
 
 def test_where_an_auctioneer_is_arms_do_not_share_jobs_out(bus):
-    with Link(bus.endpoint, "f") as link, Link(bus.endpoint, "f") as other:
+    with BusClient(bus.endpoint, "f") as link, BusClient(bus.endpoint, "f") as other:
         refuse_auctioneer(link)
-        other.alive(keys.of_auction("f", "boss", "alive"))
+        other.declare_token(keys.of_auction("f", "boss", "alive"))
         with pytest.raises(BusError, match="has an auctioneer: 'boss'"):
             refuse_auctioneer(link)
 

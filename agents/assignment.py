@@ -1,0 +1,90 @@
+"""Central policies that assign jobs by a cost matrix [arm, slot] of `agents.costs`.
+
+Two jobs that share a station may be assigned together: as after any claims, the arm with the lower difficulty gets its
+job, and the other one is asked again.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+import numpy as np
+
+from agents.costs import quickest, thermal
+from agents.policy import WAIT
+from agents.rules import cheapest_pairs, claims_of
+from fleet.observation import Observation
+
+Array = np.ndarray
+
+
+class Ssi:
+    """Sequential single-item auction: the cheapest pair of arm and job first, then the cheapest of what is left.
+
+    Scope central: it compares the costs of all arms.
+    """
+
+    scope: ClassVar = "central"
+    only_choices = True
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Nothing to reset."""
+
+    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+        """The claims of the pairs that `pairs` finds."""
+        if not any(seen.action_mask[1:].any() for seen in observations.values()):
+            return dict.fromkeys(observations, WAIT)
+        return claims_of(observations, self.pairs(self.cost(list(observations.values()))))
+
+    def cost(self, observations: Sequence[Observation]) -> Array:
+        """[arm, slot] of the observations of all arms."""
+        return thermal(observations)
+
+    def pairs(self, cost: Array) -> list[tuple[int, int]]:
+        """Pairs (arm, slot) of a cost matrix [arm, slot]."""
+        return cheapest_pairs(cost)
+
+
+class Matching(Ssi):
+    """As many jobs as possible at the least total cost: an optimal matching of arms and jobs.
+
+    Scope central: it compares the costs of all arms.
+    """
+
+    only_choices = True
+
+    def pairs(self, cost: Array) -> list[tuple[int, int]]:
+        """Pairs (arm, slot) of a cost matrix [arm, slot]."""
+        return matching(cost)
+
+
+class QuickestSsi(Ssi):
+    """As `ssi`, by the time until the finish alone. Scope central."""
+
+    only_choices = True
+
+    def cost(self, observations: Sequence[Observation]) -> Array:
+        """[arm, slot] of the observations of all arms."""
+        return quickest(observations)
+
+
+class QuickestMatching(QuickestSsi, Matching):
+    """As `matching`, by the time until the finish alone. Scope central."""
+
+    only_choices = True
+
+
+def matching(cost: Array) -> list[tuple[int, int]]:
+    """The cheapest of the largest matchings of a cost matrix [arm, slot], as pairs (arm, slot); inf is never paired.
+
+    Source: Kuhn 1955; Crouse 2016 for rectangular matrices.
+    """
+    from scipy.optimize import linear_sum_assignment  # slow to import, and few processes need it
+
+    allowed = np.isfinite(cost)
+    if not allowed.any():
+        return []
+    cost = cost - cost[allowed].min()
+    # So expensive that no saving elsewhere makes up for a pair that is not allowed.
+    forbidden = (cost[allowed].max() + 1.0) * (min(cost.shape) + 1)
+    rows, columns = linear_sum_assignment(np.where(allowed, cost, forbidden))
+    return [(a, j) for a, j in zip(rows.tolist(), columns.tolist(), strict=True) if allowed[a, j]]

@@ -1,0 +1,67 @@
+"""Cost of giving each job to each arm: matrices [arm, slot] from the observations of all arms.
+
++inf where the arm may not claim the job. Lower is better, and only differences count.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from fleet.observation import Observation
+
+Array = np.ndarray
+
+RISK = 9.0
+"""A job in which a motor surely passes its warning limit counts 1 + RISK times its difficulty."""
+LATE_PER_H = 1.0
+"""Cost of an hour of tardiness for each unit of a job's value, in units of difficulty."""
+TIME_PER_H = 0.01
+"""Cost of an hour until the finish: it decides where difficulties are equal."""
+DIGITS = 9
+"""Costs are rounded to this many digits, so that rounding errors do not break ties."""
+
+
+def thermal(observations: Sequence[Observation]) -> Array:
+    """Difficulty weighted by risk, relative to the fleet's average for that job; late and valuable jobs come first.
+
+    An arm's difficulty counts 1 + RISK · P(saturation) times. As in `agents.rules.LeastDifficulty` it is relative to
+    the average of the arms that may claim the job. An unknown difficulty counts as that average. Where no arm has a
+    difficulty the risk decides, and after it the time until the finish.
+    """
+    able = _able(observations)
+    difficulty, known = _stack(observations, "difficulty"), _stack(observations, "known") > 0
+    difficulty = np.where(known, difficulty, np.where((known & able).any(axis=0), _mean(difficulty, known & able), 1.0))
+    tardiness_s = np.maximum(0.0, _busy_s(observations) - _stack(observations, "slack_s"))
+    late = LATE_PER_H * _stack(observations, "value") * tardiness_s / 3600.0
+    time = TIME_PER_H * _finish_s(observations) / 3600.0
+    cost = difficulty * (1.0 + RISK * _stack(observations, "p_saturation")) + late + time
+    # A job that waits is late for whichever arm takes it: the average decides between jobs, not between arms.
+    return np.where(able, cost - _mean(cost, able) - _mean(late, able), np.inf).round(DIGITS)
+
+
+def quickest(observations: Sequence[Observation]) -> Array:
+    """Seconds until the arm would have finished the job; heat counts nothing."""
+    return np.where(_able(observations), _finish_s(observations), np.inf).round(DIGITS)
+
+
+def _able(observations: Sequence[Observation]) -> Array:
+    """Whether the arm may claim the job now, bool, [arm, slot]."""
+    return np.stack([seen.action_mask[1:] for seen in observations]) > 0
+
+
+def _finish_s(observations: Sequence[Observation]) -> Array:
+    """Seconds until the arm would have finished the job, its current one first, [arm, slot]."""
+    return _busy_s(observations) + _stack(observations, "duration_s")
+
+
+def _busy_s(observations: Sequence[Observation]) -> Array:
+    return np.array([[float(seen.busy_s)] for seen in observations])
+
+
+def _stack(observations: Sequence[Observation], field: str) -> Array:
+    return np.stack([np.asarray(getattr(seen, field), dtype=float) for seen in observations])
+
+
+def _mean(values: Array, where: Array) -> Array:
+    """Average over some of the arms, [slot]; 0 where there is none."""
+    return np.where(where, values, 0.0).sum(axis=0) / np.maximum(where.sum(axis=0), 1)

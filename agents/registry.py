@@ -1,0 +1,72 @@
+"""Every policy by its name: what `--policy` accepts in `run`, `compare`, `train`, `up`, `auction` and `arm`."""
+
+from dataclasses import dataclass
+
+from agents.assignment import Matching, QuickestMatching, QuickestSsi, Ssi
+from agents.consensus import Consensus
+from agents.policy import ArmPolicy, Policy, for_all_arms
+from agents.rules import CoolestFirst, LeastDifficulty, RandomLegal, RoundRobin, Wspt, WsptCool
+from fleet.errors import nearest
+
+
+@dataclass(frozen=True)
+class Rule:
+    """One policy that comes with the project."""
+
+    kind: type[Policy] | type[ArmPolicy]
+    cost: str
+    """What it minimises, for a table."""
+    source: str = ""
+
+    @property
+    def scope(self) -> str:
+        """See `agents.policy`."""
+        return self.kind.scope
+
+
+_RELATIVE, _THERMAL, _TIME = "difficulty relative to the fleet", "thermal", "time until the finish"
+_SSI, _KUHN = "Koenig et al. 2006", "Kuhn 1955"
+
+RULES: dict[str, Rule] = {
+    "random": Rule(RandomLegal, "none"),
+    "round_robin": Rule(RoundRobin, "none"),
+    "coolest_first": Rule(CoolestFirst, "hottest motor"),
+    "least_difficulty": Rule(LeastDifficulty, _RELATIVE),
+    "consensus": Rule(Consensus, _RELATIVE, "Choi, Brunet & How 2009"),
+    "wspt": Rule(Wspt, "time per value", "Smith 1956"),
+    "wspt_cool": Rule(WsptCool, "time per value, P(saturation) ≤ 0.5", "Smith 1956"),
+    "ssi": Rule(Ssi, _THERMAL, _SSI),
+    "matching": Rule(Matching, _THERMAL, _KUHN),
+    "quickest_ssi": Rule(QuickestSsi, _TIME, _SSI),
+    "quickest_matching": Rule(QuickestMatching, _TIME, _KUHN),
+}
+"""The policies, simple ones first."""
+
+
+def names_of(scope: str) -> str:
+    """The policies of a scope, for a sentence."""
+    return ", ".join(name for name, rule in RULES.items() if rule.scope == scope)
+
+
+NAMES_HELP = f"{', '.join(RULES)}, your own as FILE.py:CLASS, or a folder of train."
+"""For `--help`: what a policy may be called."""
+
+
+def rule_of(name: str) -> Rule:
+    """The policy of a name.
+
+    Raises:
+        ValueError: no such policy; names the nearest one.
+    """
+    if name not in RULES:
+        raise ValueError(f"No policy '{name}'{nearest(name, RULES)}")
+    return RULES[name]
+
+
+def make_policy(name: str) -> Policy:
+    """A fresh policy by name, for all arms.
+
+    Raises:
+        ValueError: no such policy; names the nearest one.
+    """
+    return for_all_arms(rule_of(name).kind)

@@ -1,0 +1,60 @@
+"""Discount stale peer messages.
+
+A difficulty is a claim about a job and fades: after an age it counts exp(−age / fading) of a fresh one, both in the
+fleet's average and in the peer's distance from that average. So an old claim neither wins nor loses a job against a
+fresh one. A state is a claim about a moment and expires: nobody knows whether a peer is free whose last message is
+older than `expiry_s`, so no job is left to it. Messages of age 0 count in full.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleet.observation import Observation
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trust:
+    """How long peer messages count."""
+
+    fading_s: float = 60.0
+    """Age at which a difficulty counts for 1/e."""
+    expiry_s: float = 60.0
+    """Age from which a peer's state is ignored."""
+
+    def __post_init__(self) -> None:
+        for name in ("fading_s", "expiry_s"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"Trust.{name} must be > 0 (got {getattr(self, name)}).")
+
+    def weights(self, observation: Observation) -> Array:
+        """Weight of each peer's difficulties, from 0 to 1, [peer]."""
+        return np.exp(-observation.peer_age_s.astype(float) / self.fading_s)
+
+    def free(self, observation: Observation) -> Array:
+        """Peers that are free as far as this arm knows, bool, [peer]."""
+        heard = (observation.peer_heard > 0) & (observation.peer_age_s < self.expiry_s)
+        return heard & (observation.peer_working == 0) & (observation.peer_faulted == 0)
+
+
+def advantage(observation: Observation, place: int, open_slots: Array, trust: Trust) -> Array:
+    """How much harder than the fleet on average each arm finds each job, as this arm knows it, [arm, slot].
+
+    Args:
+        place: Index of this arm in the fleet.
+        open_slots: Slots that count, bool, [slot].
+
+    Returns:
+        NaN where nothing is known.
+    """
+    own = np.where(observation.known > 0, observation.difficulty, np.nan)
+    peers = np.where(observation.peer_known > 0, observation.peer_difficulty, np.nan)
+    shared = np.insert(peers.astype(float), place, own, axis=0)  # [arm, slot], in the fleet's order
+    shared[:, ~open_slots] = np.nan
+    weight = np.insert(trust.weights(observation), place, 1.0)[:, None]
+    counts = np.where(np.isnan(shared), 0.0, weight)
+    total = counts.sum(axis=0)
+    average = np.where(np.isnan(shared), 0.0, counts * shared).sum(axis=0) / np.where(total > 0, total, 1.0)
+    return weight * (shared - average)

@@ -1,0 +1,1 @@
+"""The Zenoh client, its router, and what both need."""

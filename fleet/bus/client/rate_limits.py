@@ -1,0 +1,45 @@
+"""Limits of what a router forwards from each session, so that one faulty session does not disturb the rest."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from fleet.bus.protocol import keys
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """What a router forwards from each session; the rest is dropped silently."""
+
+    message_bytes: int = 65_536
+    """Largest payload with its attachment, of a publication, a request or a reply."""
+    state_hz: float | None = None
+    """Telemetry messages a second, real time, of each session; None for any number. A steady stream needs a limit of
+    twice its rate, as Zenoh limits the gap between two messages, which varies."""
+
+    def __post_init__(self) -> None:
+        if self.message_bytes < 1:
+            raise ValueError(f"Limits.message_bytes must be >= 1 (got {self.message_bytes}).")
+        if self.state_hz is not None and not 0 < self.state_hz < 1e6:
+            raise ValueError(f"Limits.state_hz must be > 0, or None (got {self.state_hz}).")
+
+    def settings(self) -> dict[str, Any]:
+        """Settings for Zenoh's configuration."""
+        size = {
+            "flows": ["ingress"],
+            "messages": ["put", "delete", "query", "reply"],
+            "key_exprs": ["**", keys.caches_of("**")],
+            "size_limit": self.message_bytes,
+        }
+        if self.state_hz is None:
+            return {"low_pass_filter": [size]}
+        rate = {
+            "flows": ["ingress"],
+            "messages": ["put", "delete"],
+            "rules": [{"key_expr": keys.STATES, "freq": self.state_hz}],
+        }
+        return {"low_pass_filter": [size], "downsampling": [rate]}
+
+    @property
+    def assembled_bytes(self) -> int:
+        """Largest fragmented message that the router assembles in memory before it checks its size."""
+        return 2 * self.message_bytes + 65_536

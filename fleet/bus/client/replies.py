@@ -1,0 +1,66 @@
+"""Replies to one query: messages, refusals and timeouts, by the key of the replier."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+import msgspec
+
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.messages import MalformedMessage, Refusal, check_name, decode, decode_as, encoding
+
+Message = TypeVar("Message", bound=msgspec.Struct)
+Entry = TypeVar("Entry")
+
+
+@dataclass(eq=False)
+class Replies(Generic[Message]):
+    """Replies so far; complete when the handler gets them."""
+
+    messages: dict[str, Message] = field(default_factory=dict)
+    """By the key of the replier; a second reply under the same key gets a number, as `KEY (2)`."""
+    refused: dict[str, str] = field(default_factory=dict)
+    """Reasons by the key of the replier; "" for one that did not reply in time, whose key is not known."""
+    took_s: float = math.nan
+    """Real seconds until they were complete."""
+
+    def take(self, key: str, sent_encoding: str, payload: bytes, kind: type[Message]) -> None:
+        """Add a reply of this kind, or a refusal.
+
+        Raises:
+            MalformedMessage: it is neither, or names another sender than its key; added to `refused`.
+        """
+        try:
+            sender = keys.parse(key)
+            if sent_encoding == encoding(Refusal):
+                _add(self.refused, key, decode(Refusal, payload).reason)
+            else:
+                _add(self.messages, key, check_sender(decode_as(kind, sent_encoding, payload), sender))
+        except ValueError as error:
+            _add(self.refused, key, str(error))
+            raise MalformedMessage(str(error)) from error
+
+    def miss(self, reason: str) -> None:
+        """Add an error of Zenoh's own, which does not say whose it is."""
+        _add(self.refused, "?", "" if reason == "Timeout" else reason)
+
+
+def check_sender(message: Message, sender: keys.Key) -> Message:
+    """The message, if it names no other sender than its key does.
+
+    Raises:
+        MalformedMessage: it does.
+    """
+    for field_name, role in (("arm", "arm"), ("auctioneer", "auction")):
+        if sender.role == role and hasattr(message, field_name):
+            return check_name(message, sender.name, field_name)
+    return message
+
+
+def _add(table: dict[str, Entry], key: str, entry: Entry) -> None:
+    """Add without replacing another entry: several may reply under one key, as two auctioneers do."""
+    name, number = key, 1
+    while name in table:
+        number += 1
+        name = f"{key} ({number})"
+    table[name] = entry

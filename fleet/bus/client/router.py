@@ -1,0 +1,268 @@
+"""The router of a fleet, and the transport settings of every session on the bus.
+
+Without TLS no participant proves its identity, so the bus is limited to loopback. With TLS both ends of every
+connection are authenticated, and the router enforces the access control of its roster.
+"""
+
+import ipaddress
+import json
+import logging
+import re
+from collections.abc import Mapping
+from typing import Any, Self
+
+import zenoh
+
+from fleet.bus.client.rate_limits import Limits
+from fleet.bus.protocol.registry import SESSION_LEASE_S
+from fleet.bus.security.access_control import access_control, read_roster
+from fleet.bus.security.tls import Tls, identified, why_not
+from fleet.errors import BusError
+
+_LOG = logging.getLogger(__name__)
+
+_ATTEMPTS = 3
+_ENDPOINT = re.compile(r"(?P<how>tcp|tls)/(?:\[(?P<v6>[0-9A-Fa-f:.]+)\]|(?P<host>[^:\[\]/?#]+)):(?P<port>\d{1,5})")
+_ANY_ADDRESS = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}
+"""Addresses that stand for all addresses of this machine, and how this machine itself reaches them."""
+
+_SCOUTING: Mapping[str, Any] = {
+    # Otherwise a router waits half a second to discover others.
+    "delay": 0,
+    "multicast": {"enabled": False},
+    "gossip": {"enabled": False},
+}
+_ACCEPTING: Mapping[str, Any] = {
+    # Too many half-open connections keep new ones out (by default 100, 10 s).
+    "accept_pending": 1000,
+    "accept_timeout": 3000,
+    # A session that closes waits this long for a connection that it is opening to a stopped router.
+    "open_timeout": 3000,
+}
+_SENDING: Mapping[str, Any] = {
+    "lease": round(1000 * SESSION_LEASE_S),
+    "queue": {
+        "size": {"data": 16},
+        # Microseconds: long enough for a burst of a whole fleet on a busy machine, too short for a stuck peer.
+        "congestion_control": {"drop": {"wait_before_drop": 20_000}, "block": {"wait_before_close": 1_000_000}},
+    },
+}
+
+
+def loopback(endpoint: str) -> str:
+    """The endpoint, when it is `tcp/<address>:<port>` on this machine's loopback.
+
+    Raises:
+        BusError: anything else, with the reason.
+    """
+    match = _ENDPOINT.fullmatch(endpoint)
+    if match is None or match["how"] != "tcp" or not 0 <= int(match["port"]) <= 65535:
+        raise BusError(
+            f"'{endpoint}' is no endpoint of this bus. Expected tcp/<address>:<port>, as tcp/127.0.0.1:7447."
+        )
+    host = match["v6"] or match["host"]
+    if host == "localhost":
+        return endpoint
+    try:
+        address = ipaddress.ip_address(host)
+    except ValueError as error:
+        raise BusError(
+            f"Endpoint '{endpoint}': the name '{host}' may lead anywhere. Allowed: 127.0.0.1, [::1], localhost."
+        ) from error
+    if not address.is_loopback:
+        raise BusError(
+            f"Endpoint '{endpoint}' is not on loopback. Without TLS the bus has no authentication, so whoever reaches "
+            "it could speak for any arm; it stays on 127.0.0.1, [::1] or localhost. With the certificates of "
+            "thermofleet keys, tls/ may lead elsewhere."
+        )
+    return endpoint
+
+
+def reachable(endpoint: str, tls: Tls | None = None) -> str:
+    """The endpoint, when a session may connect to it: on loopback without TLS, anywhere with it.
+
+    Raises:
+        BusError: anything else, with the reason.
+    """
+    match = _ENDPOINT.fullmatch(endpoint)
+    if tls is None and match is not None and match["how"] == "tls":
+        raise BusError(f"Endpoint '{endpoint}' needs a certificate: say whose, as {endpoint}#FOLDER/NAME.")
+    if tls is None:
+        return loopback(endpoint)
+    if match is None or match["how"] != "tls" or not 0 < int(match["port"]) <= 65535:
+        raise BusError(
+            f"'{endpoint}' is no endpoint to show the certificate of '{tls.name}' at. Expected tls/<address>:<port>, "
+            "as tls/127.0.0.1:7447."
+        )
+    return endpoint
+
+
+def open_client(endpoint: str, *, timeout_s: float, tls: Tls | None = None) -> zenoh.Session:
+    """A client session on the router at `endpoint`.
+
+    Args:
+        endpoint: As `tcp/127.0.0.1:7447`, or with who connects as `tls/127.0.0.1:7447#FOLDER/NAME`.
+        tls: Who connects, for an endpoint that begins with `tls/` and does not say so itself.
+
+    Raises:
+        BusError: the endpoint is not on loopback and has no TLS, the certificate is not good, or no router answered
+            within `timeout_s`.
+    """
+    if tls is None:
+        endpoint, tls = identified(endpoint)
+    connect = {
+        "endpoints": [reachable(endpoint, tls)],
+        "timeout_ms": max(1, round(1000 * timeout_s)),
+        "retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
+    }
+    link = {"tx": _SENDING}
+    if tls is not None:
+        tls.check(serves=False)
+        link["tls"] = tls.link(serves=False)
+    try:
+        return zenoh.open(_config({"mode": "client", "connect": connect}, link))
+    except zenoh.ZError as error:
+        reason = why_not(*_address(endpoint), tls) or plain_reason(error)
+        raise BusError(f"No router answered at {endpoint} within {timeout_s} s ({reason}).") from error
+
+
+class Router:
+    """A router in this process, for the sessions of one fleet.
+
+    `with Router() as router:` listens on a free port of 127.0.0.1 until the end of the block.
+    """
+
+    def __init__(
+        self, port: int = 0, *, host: str = "127.0.0.1", tls: Tls | None = None, limits: Limits | None = None
+    ) -> None:
+        """Prepare a router.
+
+        Args:
+            port: TCP port; 0 lets the system choose a free one.
+            host: Address to listen on; without TLS one of loopback.
+            tls: The router's own certificate; the folder's roster gives the rules. None for plain TCP.
+
+        Raises:
+            BusError: plain TCP beyond loopback.
+        """
+        if not 0 <= port <= 65535:
+            raise ValueError(f"A port is 0..65535 (got {port}).")
+        self._host = f"[{host}]" if ":" in host and not host.startswith("[") else host
+        self._port = port
+        self._tls = tls
+        self._limits = limits or Limits()
+        self._listen = f"{'tcp' if tls is None else 'tls'}/{self._host}:{port}"
+        if tls is None:
+            loopback(self._listen)
+        elif _ENDPOINT.fullmatch(self._listen) is None:
+            raise BusError(f"'{host}' is no address to listen on, as 127.0.0.1 or 0.0.0.0.")
+        self._session: zenoh.Session | None = None
+        self._endpoint: str | None = None
+
+    @property
+    def endpoint(self) -> str:
+        """Where sessions connect, for example `tcp/127.0.0.1:7447`.
+
+        Raises:
+            BusError: the router is not open.
+        """
+        if self._endpoint is None:
+            raise BusError("The router is not open.")
+        return self._endpoint
+
+    def open(self) -> Self:
+        """Listen.
+
+        Raises:
+            BusError: the port is taken, the system gives none, or the router's certificate is not good.
+        """
+        if self._session is not None:
+            return self
+        config = self._settings()
+        problem = BusError("The router did not open.")
+        # A second attempt only helps if the system chooses the port.
+        for attempt in range(1, 1 + (1 if self._port else _ATTEMPTS)):
+            try:
+                session = zenoh.open(config)
+            except zenoh.ZError as error:
+                where = (
+                    f"port {self._port} of {self._host}; is it in use?"
+                    if self._port
+                    else f"a free port of {self._host}."
+                )
+                problem = BusError(f"The router could not listen on {where} ({plain_reason(error)})")
+                problem.__cause__ = error
+                continue
+            try:
+                self._endpoint = self._where(session)
+            except BusError as error:
+                problem = error
+                session.close()
+                continue
+            self._session = session
+            _LOG.debug("Router at %s (attempt %d).", self._endpoint, attempt)
+            return self
+        raise problem
+
+    def close(self) -> None:
+        """Stop listening and drop every link; twice is fine.
+
+        Raises:
+            BusError: the router could not be closed in order.
+        """
+        session, self._session, self._endpoint = self._session, None, None
+        if session is None:
+            return
+        try:
+            session.close()
+        except zenoh.ZError as error:
+            raise BusError(f"The router did not close in order ({plain_reason(error)}).") from error
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def _settings(self) -> zenoh.Config:
+        own = {
+            "mode": "router",
+            "listen": {"endpoints": [self._listen]},
+            # Only the router's own description contains the port that the system chose.
+            "adminspace": {"enabled": True, "permissions": {"read": True, "write": False}},
+            **self._limits.settings(),
+        }
+        link = {"tx": _SENDING, "rx": {"max_message_size": self._limits.assembled_bytes}}
+        if self._tls is not None:
+            self._tls.check(serves=True)
+            link["tls"] = self._tls.link(serves=True)
+            own["access_control"] = access_control(read_roster(self._tls.folder))
+        return _config(own, link)
+
+    def _where(self, session: zenoh.Session) -> str:
+        """The endpoint that a router session listens on, from its own description."""
+        for reply in session.get(f"@/{session.zid()}/router", timeout=5.0):
+            if reply.ok is None:
+                continue
+            locators = json.loads(reply.ok.payload.to_bytes())["locators"]
+            ports = {locator.rsplit(":", 1)[1] for locator in locators}
+            if len(ports) == 1:
+                host = _ANY_ADDRESS.get(self._host.strip("[]"), self._host)
+                return f"{self._listen[:3]}/{host}:{ports.pop()}"
+        raise BusError("The router opened, but does not tell on which port it listens.")
+
+
+def _config(own: Mapping[str, Any], link: Mapping[str, Any]) -> zenoh.Config:
+    transport = {"shared_memory": {"enabled": False}, "unicast": _ACCEPTING, "link": link}
+    return zenoh.Config.from_json5(json.dumps({"scouting": _SCOUTING, "transport": transport, **own}))
+
+
+def _address(endpoint: str) -> tuple[str, int]:
+    """Host and port of a valid endpoint."""
+    host, port = endpoint[len("tcp/") :].rsplit(":", 1)
+    return host.strip("[]"), int(port)
+
+
+def plain_reason(error: zenoh.ZError) -> str:
+    """Zenoh's error text without locations in its source."""
+    return re.split(r" at /|\.? \[", str(error))[0]

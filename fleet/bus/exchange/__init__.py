@@ -1,0 +1,1 @@
+"""What arms of a simulated shift share with each other: in memory or over Zenoh."""

@@ -1,0 +1,226 @@
+"""The exchange: what every arm broadcasts at a step, and what every arm then knows of every other.
+
+There are two: `MemoryExchange` without a bus, and `ZenohExchange` over one. With the same channel and random generator
+they return the same arrays. `begin` starts a new episode and forgets everything received.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, Self, TypeVar
+
+import numpy as np
+
+from fleet.telemetry import MODES
+
+Array = np.ndarray
+
+UNHEARD = -1
+"""The mode of an arm of which nothing was received."""
+
+
+@dataclass(frozen=True, eq=False)
+class Broadcast:
+    """What every arm broadcasts at one step."""
+
+    time_s: float
+    mode: Array
+    """int, [arm]: 0 idle, 1 working, 2 faulted."""
+    temp_c: Array
+    """Measured motor temperatures, [arm, joint]."""
+    headroom_k: Array
+    """Warning limit minus hottest motor, [arm]."""
+    jobs: tuple[str, ...]
+    """Names of the open jobs, [slot]; "" for an empty slot, which is not broadcast."""
+    difficulty: Array
+    """[arm, slot], NaN where the arm has no score or cannot do the job."""
+    p_saturation: Array
+    """[arm, slot], NaN where unknown."""
+    twin: tuple[str, ...]
+    """Twin version per arm."""
+
+
+@dataclass(frozen=True, eq=False)
+class PeerView:
+    """What every arm knows of every arm after a step: [receiver, sender, ...]; of itself, its own broadcast."""
+
+    mode: Array
+    """int, [receiver, sender]; UNHEARD if nothing was received."""
+    headroom_k: Array
+    """[receiver, sender], NaN if nothing was received."""
+    difficulty: Array
+    """[receiver, sender, slot] for the present slots (matched by job name), NaN where not broadcast."""
+    p_saturation: Array
+    """[receiver, sender, slot], NaN where not broadcast."""
+    age_s: Array
+    """[receiver, sender]: simulation seconds since that broadcast; inf if nothing was received."""
+
+
+class Exchange(Protocol):
+    """Carries the broadcasts of one step from every arm to every arm."""
+
+    arms: tuple[str, ...]
+    delivered: int
+    """Broadcasts delivered to a peer in time, over all steps; one per receiver and sender."""
+    malformed: int
+    """Messages that were malformed: counted, logged and dropped."""
+    late: int
+    """Broadcasts that did not reach a peer in their step, over all steps."""
+
+    def begin(self, rng: np.random.Generator | None = None) -> None:
+        """Begin an episode: forget what was received; a channel with chance draws from `rng` from now on."""
+        ...
+
+    def share(self, words: Broadcast) -> PeerView:
+        """Broadcast one step, and return what every arm knows thereafter.
+
+        Raises:
+            ValueError: the broadcast does not fit the arms, holds infinite numbers, or is older than the last one
+                (`begin` first).
+            BusError: the bus could not be opened, or is closed.
+        """
+        ...
+
+    def close(self) -> None:
+        """Release all resources; may be called twice."""
+        ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: Any, /) -> None: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Condition:
+    """State of an arm in its last broadcast."""
+
+    time_s: float
+    mode: int
+    headroom_k: float
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Difficulties of the open jobs in an arm's last broadcast."""
+
+    time_s: float
+    jobs: tuple[str, ...]
+    difficulty: Sequence[float] | Array
+    """[job], NaN where unknown."""
+    p_saturation: Sequence[float] | Array
+    """[job], NaN where unknown."""
+
+
+Word = TypeVar("Word", Condition, Scores)
+
+
+def assemble(
+    now_s: float,
+    jobs: tuple[str, ...],
+    conditions: Sequence[Sequence[Condition | None]],
+    scores: Sequence[Sequence[Scores | None]],
+) -> PeerView:
+    """The view of every arm, from the last content that each receiver has of each sender, [receiver][sender].
+
+    Age is that of the older of both contents. One content that several receivers have is laid out once.
+    """
+    arms, slots = len(conditions), len(jobs)
+    state_row, states = _interned(conditions)
+    mode = np.array([*(word.mode for word in states), UNHEARD])[state_row]
+    headroom = np.array([*(word.headroom_k for word in states), math.nan])[state_row]
+    state_time = np.array([*(word.time_s for word in states), -math.inf])[state_row]
+
+    score_row, said = _interned(scores)
+    table = np.full((2, len(said) + 1, slots), np.nan)
+    for row, word in enumerate(said):
+        if word.jobs == jobs:
+            table[0, row] = word.difficulty
+            table[1, row] = word.p_saturation
+            continue
+        columns = {name: column for column, name in enumerate(word.jobs)}
+        for slot, name in enumerate(jobs):
+            if name in columns:
+                table[0, row, slot] = word.difficulty[columns[name]]
+                table[1, row, slot] = word.p_saturation[columns[name]]
+    empty = [slot for slot, name in enumerate(jobs) if not name]
+    table[:, :, empty] = np.nan
+    score_time = np.array([*(word.time_s for word in said), -math.inf])[score_row]
+    known = table[:, score_row]
+    assert known.shape == (2, arms, arms, slots)
+    return PeerView(mode, headroom, known[0], known[1], now_s - np.minimum(state_time, score_time))
+
+
+def checked_arms(arms: Sequence[str]) -> tuple[str, ...]:
+    """The names of the arms as a tuple.
+
+    Raises:
+        ValueError: no arm, a name twice, or an empty name.
+    """
+    names = tuple(arms)
+    if not names or not all(names) or len(set(names)) != len(names):
+        raise ValueError(f"An exchange needs arms with different, non-empty names (got {names}).")
+    return names
+
+
+def check(words: Broadcast, arms: tuple[str, ...]) -> None:
+    """Refuse a broadcast that does not fit the arms or that no bus could carry.
+
+    Raises:
+        ValueError: names the field, what it is and what it should be.
+    """
+    slots = len(words.jobs)
+    shapes = {
+        "mode": (len(arms),),
+        "headroom_k": (len(arms),),
+        "difficulty": (len(arms), slots),
+        "p_saturation": (len(arms), slots),
+    }
+    for name, shape in shapes.items():
+        if np.shape(getattr(words, name)) != shape:
+            raise ValueError(f"Broadcast.{name} must have the shape {shape} (got {np.shape(getattr(words, name))}).")
+    if words.temp_c.ndim != 2 or len(words.temp_c) != len(arms) or not words.temp_c.shape[1]:
+        raise ValueError(
+            f"Broadcast.temp_c must be [arm, joint] with {len(arms)} arms (got shape {words.temp_c.shape})."
+        )
+    if len(words.twin) != len(arms):
+        raise ValueError(f"Broadcast.twin needs one version per arm ({len(arms)}, got {len(words.twin)}).")
+    named = [job for job in words.jobs if job]
+    if len(set(named)) != len(named):
+        raise ValueError(f"Broadcast.jobs names a job twice (got {words.jobs}).")
+    if not math.isfinite(words.time_s):
+        raise ValueError(f"Broadcast.time_s must be finite (got {words.time_s}).")
+    for name in ("temp_c", "headroom_k"):
+        if not np.isfinite(getattr(words, name)).all():
+            raise ValueError(f"Broadcast.{name} must be finite (got {getattr(words, name)}).")
+    for name in ("difficulty", "p_saturation"):
+        if np.isinf(getattr(words, name)).any():
+            raise ValueError(f"Broadcast.{name} must be finite, or NaN where not known (got {getattr(words, name)}).")
+    if not np.isin(words.mode, range(len(MODES))).all():
+        raise ValueError(f"Broadcast.mode must be one of 0..{len(MODES) - 1} (got {words.mode}).")
+
+
+def check_order(time_s: float, last_s: float) -> None:
+    """Refuse a broadcast that is older than the last one."""
+    if time_s < last_s:
+        raise ValueError(f"Broadcast of {time_s:g} s come after those of {last_s:g} s: begin() starts a new episode.")
+
+
+def _interned(known: Sequence[Sequence[Word | None]]) -> tuple[Array, list[Word]]:
+    """[receiver, sender] index of each content in the list of different ones; -1 (its end) for none."""
+    place: dict[int, int] = {id(None): -1}
+    different: list[Word] = []
+    rows: list[list[int]] = []
+    last: object = None
+    for row in known:
+        if row is last:  # the same row for several receivers
+            rows.append(rows[-1])
+            continue
+        last = row
+        rows.append([])
+        for word in row:
+            index = place.get(id(word))
+            if index is None and word is not None:
+                index = place[id(word)] = len(different)
+                different.append(word)
+            rows[-1].append(-1 if index is None else index)
+    return np.array(rows, dtype=int), different

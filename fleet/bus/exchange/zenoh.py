@@ -1,0 +1,267 @@
+"""The exchange over Zenoh: every arm knows of its peers only what came over the bus.
+
+A few arms have a client each, many share some: what n sessions receive of n arms grows with n², and with it the time
+to discover each other and the memory.
+
+At each step an arm publishes its `state` and then its `difficulty`. Both travel the same connection in this order.
+`info` is published when it changes, and a liveliness token shows that the arm is present.
+"""
+
+import logging
+import math
+import time
+import weakref
+from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import zenoh
+
+from fleet.bus.client.client import BACKLOG, BusClient
+from fleet.bus.client.router import Router, reachable
+from fleet.bus.exchange.channel import PERFECT, Channel
+from fleet.bus.exchange.delivery import Delivery
+from fleet.bus.exchange.group import Content, Contents, Group, messages_of
+from fleet.bus.exchange.protocol import (
+    Broadcast,
+    PeerView,
+    assemble,
+    check,
+    check_order,
+    checked_arms,
+)
+from fleet.bus.protocol import keys
+from fleet.bus.security.tls import Tls
+from fleet.errors import BusError
+
+_LOG = logging.getLogger(__name__)
+
+MOST_OWN_SESSIONS, SHARED_SESSIONS = 8, 4
+"""Up to so many arms have a session each; more of them share so many sessions."""
+MOST_NAMED = 8
+"""Arms listed in one message."""
+_OPEN_TIMEOUT_S = 20.0
+
+
+def sessions_for(arms: int) -> int:
+    """Sessions of so many arms, unless each has to show a certificate of its own."""
+    return arms if arms <= MOST_OWN_SESSIONS else SHARED_SESSIONS
+
+
+class ZenohExchange:
+    """Shares broadcasts through Zenoh: a router and the clients of the arms, all in this process.
+
+    Nothing is opened before the first `share` or the `with` block. One thread at a time may use an exchange.
+
+    A channel that is not perfect is applied by the receivers: the bus carries every message to every arm, and each
+    delays and drops what the channel says, so that the fleet knows the same as with a `MemoryExchange`.
+    """
+
+    def __init__(
+        self,
+        arms: Sequence[str],
+        fleet: str,
+        endpoint: str | None = None,
+        *,
+        channel: Channel = PERFECT,
+        tls: Path | None = None,
+        timeout_s: float = 2.0,
+        sessions: int | None = None,
+    ) -> None:
+        """Prepare an exchange between `arms`.
+
+        Args:
+            fleet: Name of the fleet, part of every key.
+            endpoint: Of a router on loopback, as `tcp/127.0.0.1:7447`; None for a router of its own on a free port.
+            tls: Folder with a certificate of every arm (and of `router`, for a router of its own); the endpoint then
+                begins with `tls/`, and may be on any host.
+            timeout_s: How long `share` waits for messages that do not arrive.
+            sessions: That the arms share, at most; None for `sessions_for` them. With `tls` every arm has its own.
+
+        Raises:
+            BusError: the endpoint is not on loopback.
+            ValueError: the channel names an arm that is not there.
+        """
+        self.arms = checked_arms(arms)
+        if not 0 < timeout_s < math.inf:
+            raise ValueError(f"timeout_s must be finite and > 0 (got {timeout_s}).")
+        if sessions is not None and sessions < 1:
+            raise ValueError(f"sessions must be >= 1 (got {sessions}).")
+        self.delivered = 0
+        self.malformed = 0
+        self.late = 0
+        count = len(self.arms)
+        self._sessions = count if tls is not None else min(sessions or sessions_for(count), count)
+        keys.chunk(fleet)
+        self._fleet = fleet
+        self._tls = {arm: None if tls is None else Tls(tls, arm) for arm in self.arms}
+        self._own_tls = None if tls is None else Tls(tls, "router")
+        self._endpoint = None if endpoint is None else reachable(endpoint, self._tls[self.arms[0]])
+        self._timeout_s = timeout_s
+        self._delivery = None if channel.perfect else Delivery(self.arms, channel)
+        self._groups: list[Group] = []
+        self._tick = -1
+        self._now_s = -math.inf
+        self._missed: set[tuple[int, int]] = set()
+        self._closed = False
+        self._resources = ExitStack()
+        # A process that exits without closing its router would hang.
+        self._at_exit = weakref.finalize(self, self._resources.close)
+
+    @property
+    def endpoint(self) -> str | None:
+        """Where the router listens; None before the exchange is open."""
+        return self._endpoint
+
+    def open(self) -> Self:
+        """Start the router when none was given, connect every arm, and wait until all see each other.
+
+        Raises:
+            BusError: no router, an arm of this name is already there, the arms do not find each other, or closed.
+        """
+        if self._closed:
+            raise BusError("This exchange is closed.")
+        if self._groups:
+            return self
+        try:
+            if self._endpoint is None:
+                self._endpoint = self._resources.enter_context(Router(tls=self._own_tls)).endpoint
+            clients = [self._resources.enter_context(self._client(arm)) for arm in self.arms[: self._sessions]]
+            self._refuse_namesakes(clients[0])
+            everybody = range(len(self.arms))
+            contents = Contents()
+            self._groups = [
+                Group(client, self.arms, everybody[i :: len(clients)], contents) for i, client in enumerate(clients)
+            ]
+            deadline_s = time.monotonic() + _OPEN_TIMEOUT_S
+            for group in self._groups:
+                if missing := group.await_peers(deadline_s):
+                    raise BusError(
+                        f"Arm '{self.arms[group.members[0]]}' did not see {_named(self.arms[i] for i in missing)} on "
+                        f"the bus within {_OPEN_TIMEOUT_S} s."
+                    )
+        except zenoh.ZError as error:
+            self._give_up()
+            raise BusError(f"The bus at {self._endpoint} could not be opened: {error}") from error
+        except BaseException:
+            self._give_up()
+            raise
+        return self
+
+    def begin(self, rng: np.random.Generator | None = None) -> None:
+        """Begin an episode: forget what was received; a channel with chance draws from `rng` from now on."""
+        if self._delivery is not None:
+            self._delivery.begin(rng)
+        for group in self._groups:
+            group.begin_step(self._tick, self._now_s)  # what is in the queue belongs to the last episode
+            group.forget(self._tick)
+        self._now_s = -math.inf
+
+    def share(self, words: Broadcast) -> PeerView:
+        """Publish the broadcast of one step, and return what every arm knows thereafter.
+
+        Waits until every arm has received the messages of every present peer, at most `timeout_s`. A message that
+        did not arrive in time leaves the last one known, with its age, and is counted in `late`.
+
+        Raises:
+            ValueError: the broadcast does not fit the arms or holds infinite numbers; or the channel draws by chance,
+                and there is no rng.
+            BusError: the bus could not be opened, was lost, or is closed.
+        """
+        check(words, self.arms)
+        check_order(words.time_s, self._now_s)
+        self.open()
+        for group in self._groups:
+            group.begin_step(self._tick, self._now_s)
+        self._tick += 1
+        self._now_s = float(words.time_s)
+        try:
+            messages = messages_of(words, self.arms, self._tick)
+            for group in self._groups:
+                group.publish(self._tick, self._now_s, messages)
+        except zenoh.ZError as error:
+            raise BusError(f"The bus at {self._endpoint} was lost: {error}") from error
+        deadline_s = time.monotonic() + self._timeout_s
+        self._count(
+            {
+                (receiver, sender)
+                for group in self._groups
+                for sender in group.await_messages(deadline_s)
+                for receiver in group.members
+                if receiver != sender
+            }
+        )
+        self.malformed = sum(group.client.malformed for group in self._groups)
+        if self._delivery is None:
+            conditions = self._by_receiver([group.conditions.last for group in self._groups])
+            scores = self._by_receiver([group.scores.last for group in self._groups])
+            return assemble(self._now_s, words.jobs, conditions, scores)
+        # To a channel that is not perfect, a message that the bus itself brings a step late is lost.
+        conditions = self._by_receiver([group.conditions.of(self._tick) for group in self._groups])
+        scores = self._by_receiver([group.scores.of(self._tick) for group in self._groups])
+        self._delivery.carry(self._now_s, conditions, scores)
+        self.delivered, self.late = self._delivery.delivered, self._delivery.late
+        return assemble(self._now_s, words.jobs, self._delivery.conditions, self._delivery.scores)
+
+    def close(self) -> None:
+        """Disconnect every arm and stop the router; may be called twice.
+
+        Raises:
+            BusError: something did not close cleanly; everything else is closed all the same.
+        """
+        self._closed = True
+        self._groups = []
+        try:
+            self._resources.close()
+        except (zenoh.ZError, BusError) as error:
+            raise BusError(f"The exchange did not close cleanly: {error}") from error
+        finally:
+            self._at_exit.detach()
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if error is None:
+            self.close()
+        else:
+            self._give_up()
+
+    def _client(self, arm: str) -> BusClient:
+        assert self._endpoint is not None
+        tls = self._tls[arm]
+        endpoint = self._endpoint if tls is None else tls.endpoint(self._endpoint)
+        return BusClient(endpoint, self._fleet, timeout_s=self._timeout_s, backlog=max(BACKLOG, 16 * len(self.arms)))
+
+    def _give_up(self) -> None:
+        """Close while another exception is raised, which must not be hidden."""
+        try:
+            self.close()
+        except BusError:
+            _LOG.exception("While closing after another error:")
+
+    def _by_receiver(self, of_groups: list[list[Content | None]]) -> list[list[Content | None]]:
+        """[receiver][sender], from what each group received."""
+        return [of_groups[i % len(of_groups)] for i in range(len(self.arms))]
+
+    def _refuse_namesakes(self, client: BusClient) -> None:
+        there = client.tokens(keys.of_every_arm(self._fleet, "alive"), timeout_s=self._timeout_s)
+        if taken := sorted(there & set(self.arms)):
+            raise BusError(f"Fleet '{self._fleet}' already has {', '.join(taken)} on the bus at {self._endpoint}.")
+
+    def _count(self, missed: set[tuple[int, int]]) -> None:
+        self.late += len(missed)
+        self.delivered += len(self.arms) * (len(self.arms) - 1) - len(missed)
+        if fresh := sorted(missed - self._missed):
+            pairs = _named(f"{self.arms[sender]} by {self.arms[receiver]}" for receiver, sender in fresh)
+            _LOG.warning("Not received at %s s (logged once until received again): %s.", self._now_s, pairs)
+        self._missed = missed
+
+
+def _named(names: Iterable[str]) -> str:
+    """The first names of a list, and how many more there are."""
+    every = list(names)
+    more = f" and {len(every) - MOST_NAMED} more" if len(every) > MOST_NAMED else ""
+    return ", ".join(every[:MOST_NAMED]) + more

@@ -1,0 +1,1 @@
+"""The bus contract: keys, messages, and the schemas made from them."""

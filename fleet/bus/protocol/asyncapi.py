@@ -1,0 +1,107 @@
+"""The bus as an AsyncAPI 3 document, generated from the registry.
+
+AsyncAPI has no binding for Zenoh and refuses unknown ones; what is specific to Zenoh is under `x-zenoh`.
+"""
+
+import msgspec
+
+from fleet.bus.protocol import messages
+from fleet.bus.protocol.examples import EXAMPLES
+from fleet.bus.protocol.registry import CHANNELS, PATTERNS, Channel, MessageType
+from fleet.bus.protocol.schemas import Schema, schemas
+
+_PARAMETERS = {
+    "arm": "Name of the arm",
+    "peer": "Name of the arm that sends the query",
+    "auctioneer": "Name of the auctioneer",
+    "fleet": "Name of the fleet",
+}
+
+
+def asyncapi() -> Schema:
+    """The document: a router as server, a channel per key, an operation per thing that can be done there."""
+    return {
+        "asyncapi": "3.0.0",
+        "info": {
+            "title": "thermofleet",
+            "version": f"{messages.VERSION}.0.0",
+            "description": "Arms, auctioneers and outsiders of one fleet on a Zenoh router. See docs/bus.md.",
+            "license": {"name": "Apache-2.0"},
+        },
+        "defaultContentType": "application/json",
+        "servers": {
+            "router": {
+                "host": "127.0.0.1:7447",
+                "protocol": "zenoh",
+                "description": "The router of the fleet; everybody else is a client of it.",
+                "x-zenoh": {"mode": "client", "connect": "tcp/127.0.0.1:7447", "scouting": False},
+            }
+        },
+        "channels": {channel.name: _channel(channel) for channel in CHANNELS},
+        "operations": {name: operation for channel in CHANNELS for name, operation in _operations(channel).items()},
+        "components": {
+            "messages": {kind.__name__: _message(kind) for kind in EXAMPLES},
+            "schemas": schemas("#/components/schemas/{name}"),
+        },
+    }
+
+
+def _channel(channel: Channel) -> Schema:
+    parameters = [name for name in _PARAMETERS if f"{{{name}}}" in channel.address]
+    zenoh: Schema = {"pattern": channel.pattern, "sender": channel.sender, "receiver": channel.receiver}
+    if channel.pattern != "token":
+        zenoh |= {"congestionControl": channel.congestion, "priority": channel.priority, "reliability": "RELIABLE"}
+    if channel.pattern == "publish":
+        zenoh |= {"cache": channel.history, "sporadicHeartbeatSeconds": channel.heartbeat_s}
+    if channel.pattern == "query":
+        zenoh |= {"complete": True, "target": "ALL", "consolidation": "NONE"}
+    numbers = {"rateHz": channel.rate_hz, "limitHz": channel.limit_hz, "leaseSeconds": channel.lease_s}
+    zenoh |= {name: number for name, number in numbers.items() if number is not None}
+    return {
+        "address": channel.address,
+        "description": f"From {channel.sender} to {channel.receiver}: {PATTERNS[channel.pattern]}.",
+        "parameters": {name: {"description": f"{_PARAMETERS[name]}, percent-encoded."} for name in parameters},
+        "messages": {kind.__name__: {"$ref": f"#/components/messages/{kind.__name__}"} for kind in channel.messages},
+        "x-zenoh": zenoh,
+    }
+
+
+def _operations(channel: Channel) -> Schema:
+    """What can be done at a key: a publication, or a query and its reply."""
+    if channel.message is None:
+        return {}
+    operation = {
+        "action": "send",
+        "channel": {"$ref": f"#/channels/{channel.name}"},
+        "summary": first_line(channel.message),
+        "messages": [_in(channel, channel.message)],
+        "x-zenoh": {"by": channel.receiver if channel.reply else channel.sender},
+    }
+    if channel.reply is None:
+        return {f"publish_{channel.name}": operation}
+    reply = {
+        "channel": {"$ref": f"#/channels/{channel.name}"},
+        "messages": [_in(channel, kind) for kind in channel.messages[1:]],
+    }
+    return {f"query_{channel.name}": {**operation, "reply": reply}}
+
+
+def _in(channel: Channel, kind: MessageType) -> dict[str, str]:
+    return {"$ref": f"#/channels/{channel.name}/messages/{kind.__name__}"}
+
+
+def _message(kind: MessageType) -> Schema:
+    return {
+        "name": messages.schema(kind),
+        "title": kind.__name__,
+        "summary": first_line(kind),
+        "contentType": "application/json",
+        "payload": {"$ref": f"#/components/schemas/{kind.__name__}"},
+        "examples": [{"payload": msgspec.json.decode(messages.encode(EXAMPLES[kind]))}],
+        "x-zenoh": {"encoding": messages.encoding(kind)},
+    }
+
+
+def first_line(kind: MessageType) -> str:
+    """The first line of a message's docstring."""
+    return (kind.__doc__ or "").strip().partition("\n")[0]

@@ -1,0 +1,322 @@
+"""Messages of the auction between arms, auctioneers and outsiders.
+
+The life of a job: a `Submission` is acknowledged; the auctioneer queries all arms for a `Quote` and sends the `Award`
+to one, which replies with an `Ack`. While the arm has the job it renews its lease with a `LeaseRequest`; before the
+last cycle it requests permission to commit. Then it repeats a `Report` until there is a `Receipt`.
+
+Why no job is done twice: an arm accepts an award only within `Quote.valid_s` of its own quote, works only under a lease
+that it counts from the moment it sent the request, and begins the last cycle only with permission to commit. The
+auctioneer counts the same lease from the moment it replied, so at the auctioneer it always ends later. Only after that
+does another arm get the job, and never once permission to commit was given. Durations are real seconds on each one's
+own monotonic clock; wall clocks do not matter. (Leases: Gray & Cheriton 1989, SOSP.)
+
+Units: fields that end in `_s` are seconds of fleet time, unless they say *real*.
+"""
+
+from typing import Annotated, Literal
+
+import msgspec
+
+from fleet.bus.protocol.messages import Name, finite
+from fleet.job import Kind
+from fleet.telemetry import Mode
+
+Count = Annotated[int, msgspec.Meta(ge=0)]
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0)]
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
+LEASE_S = 6.0
+"""Real seconds that an arm may work on a job without renewing its lease."""
+MOST_JOBS = 128
+"""In one message; more are sent as several messages, so that none exceeds the router's size limit."""
+
+
+class JobSpec(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A job on the bus; fields as in `fleet.job.Work` and `fleet.job.Job`."""
+
+    name: Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
+    """Unique in the fleet; a second job with this name is the same job."""
+    kind: Kind
+    places: Annotated[tuple[Name, ...], msgspec.Meta(min_length=1, max_length=2)]
+    """Places of the cell: from and to for pick_place and sort; one for hold and press."""
+    repetitions: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 1
+    payload_kg: NotNegative = 0.0
+    dwell_s: Positive = 0.5
+    force_n: NotNegative = 0.0
+    release_s: NotNegative = 0.0
+    """Not before this."""
+    due_s: float | None = None
+    """Soft deadline; null for none."""
+    value: float = 1.0
+    after: tuple[Name, ...] = ()
+    """Jobs that must be finished before."""
+
+    def __post_init__(self) -> None:
+        wanted = 2 if self.kind in ("pick_place", "sort") else 1
+        if len(self.places) != wanted:
+            raise ValueError(f"A {self.kind} needs {wanted} place(s), got {len(self.places)}.")
+        if self.due_s is not None and self.due_s < self.release_s:
+            raise ValueError(f"JobSpec.due_s must be >= release_s = {self.release_s:g} (got {self.due_s:g}).")
+        for name in ("payload_kg", "dwell_s", "force_n", "release_s", "due_s", "value"):
+            finite("JobSpec", name, (getattr(self, name),))
+
+
+Jobs = Annotated[tuple[JobSpec, ...], msgspec.Meta(min_length=1, max_length=MOST_JOBS)]
+
+
+class Submission(msgspec.Struct, frozen=True):
+    """Request to `jobs/submit`: add jobs. The same job submitted twice is one job."""
+
+    jobs: Jobs
+    by: str = ""
+    """Who submits, for the records."""
+
+
+class Admission(msgspec.Struct, frozen=True):
+    """Whether one submitted job was accepted."""
+
+    job: str
+    accepted: bool
+    """Also true for an identical job that is already known."""
+    reason: str = ""
+
+
+class SubmissionReply(msgspec.Struct, frozen=True):
+    """Reply to a `Submission`; every accepted job is on the auctioneer's disk."""
+
+    auctioneer: Name
+    jobs: tuple[Admission, ...]
+
+
+class QuoteRequest(msgspec.Struct, frozen=True):
+    """Request to `arm/*/quote`: estimate the cost of these jobs."""
+
+    auction: Name
+    """Name of this round; any text for a dry run."""
+    jobs: Jobs
+    dry_run: bool = False
+    """Only an estimate: the quote cannot be awarded, and nothing changes at the arm."""
+
+
+class JobEstimate(msgspec.Struct, frozen=True):
+    """Cost of one job for one arm; unknown values are null."""
+
+    job: Name
+    feasible: bool
+    reason: str = ""
+    """Why the job is not feasible."""
+    joint_difficulty: tuple[float, ...] | None = None
+    """d_k, [joint]."""
+    difficulty: float | None = None
+    """Sum of `joint_difficulty`."""
+    p_saturation: Share | None = None
+    """Probability that a motor passes the warning limit, starting from the present temperatures."""
+    peak_c: float | None = None
+    """Predicted temperature of the hottest motor during the job."""
+    duration_s: float | None = None
+    """Duration of the job alone."""
+    finish_in_s: float | None = None
+    """From now until it would be finished, after the current jobs of the arm."""
+
+    def __post_init__(self) -> None:
+        finite("JobEstimate", "joint_difficulty", self.joint_difficulty or ())
+        for name in ("difficulty", "p_saturation", "peak_c", "duration_s", "finish_in_s"):
+            finite("JobEstimate", name, (getattr(self, name),))
+
+
+class Quote(msgspec.Struct, frozen=True):
+    """Reply to a `QuoteRequest`."""
+
+    arm: Name
+    auction: Name
+    quote: str
+    """Name of this quote, which this arm never uses again, not even after a restart; "" for a dry run."""
+    valid_s: float
+    """Real seconds during which the arm accepts an award that refers to it, counted by the arm."""
+    twin: str
+    """Version of the twin that scored."""
+    time_s: float
+    mode: Mode
+    headroom_k: float
+    capacity: Count
+    """How many more jobs the arm would accept now."""
+    estimates: tuple[JobEstimate, ...]
+    """One per requested job, in that order."""
+
+    def __post_init__(self) -> None:
+        for name in ("valid_s", "time_s", "headroom_k"):
+            finite("Quote", name, (getattr(self, name),))
+
+
+class Award(msgspec.Struct, frozen=True):
+    """Request to `arm/{arm}/award`: take this job. The same award again gets the same reply and changes nothing.
+
+    A rejection is final: the arm later accepts neither this award nor another for the same job and quote.
+    """
+
+    award: Name
+    """Unique per job and auction."""
+    auction: Name
+    auctioneer: Name
+    quote: Name
+    """The quote that it refers to."""
+    job: JobSpec
+    cycles: Count = 0
+    """Cycles of the job that others have done already."""
+    lease_s: Positive = LEASE_S
+    """Real seconds that the arm may work on it without renewing the lease, counted from its quote."""
+
+
+class Ack(msgspec.Struct, frozen=True):
+    """Reply to an `Award`, on the arm's disk before it is sent."""
+
+    arm: Name
+    award: Name
+    accepted: bool
+    reason: str = ""
+    """Why the award is rejected."""
+
+
+class LeaseEntry(msgspec.Struct, frozen=True):
+    """A current job of an arm, for which it holds or requests a lease."""
+
+    award: Name
+    job: Name
+    cycles: Count
+    """Done so far, including those of others."""
+    phase: Literal["queued", "working", "finishing"]
+    """finishing: requests permission to commit (to begin the last cycle), or has it."""
+
+
+class LeaseRequest(msgspec.Struct, frozen=True):
+    """Request to `auction/{auctioneer}/lease/{arm}`: renew the leases of these jobs."""
+
+    arm: Name
+    entries: Annotated[tuple[LeaseEntry, ...], msgspec.Meta(max_length=MOST_JOBS)]
+
+
+class Lease(msgspec.Struct, frozen=True):
+    """Reply to a `LeaseRequest`."""
+
+    auctioneer: Name
+    lease_s: Positive
+    """Real seconds, counted by the arm from the moment it sent the request."""
+    granted: tuple[str, ...]
+    """Awards whose lease is renewed."""
+    revoked: tuple[str, ...]
+    """Awards that the arm has lost: it must release those jobs, unless it has permission to commit."""
+    may_commit: tuple[str, ...] = ()
+    """Awards with permission to commit: the last cycle may begin, and no other arm gets these jobs any more."""
+
+
+class Report(msgspec.Struct, frozen=True):
+    """Request to `auction/{auctioneer}/report/{arm}`: outcome of an award. Repeated until there is a `Receipt`."""
+
+    arm: Name
+    award: Name
+    job: Name
+    outcome: Literal["finished", "returned"]
+    cycles: Count
+    """Done so far, including those of others."""
+    time_s: float
+    """When it was finished or returned."""
+    reason: str = ""
+    unsure: bool = False
+    """With `returned`: the arm crashed after it got permission to commit, so it is unknown whether the last cycle was
+    done. The job becomes unfinished; another arm might do that cycle a second time."""
+
+    def __post_init__(self) -> None:
+        finite("Report", "time_s", (self.time_s,))
+
+
+class Receipt(msgspec.Struct, frozen=True):
+    """Reply to a `Report`, which is on the auctioneer's disk."""
+
+    auctioneer: Name
+    award: Name
+
+
+JobState = Literal["waiting", "awarded", "finishing", "finished", "unfinished"]
+"""waiting: for its release, its predecessors or an arm; finishing: in its last cycle; unfinished: the arm had
+permission to commit and is silent since, or the shift ended before the job was done."""
+
+
+class JobStatus(msgspec.Struct, frozen=True):
+    """State of one job."""
+
+    job: Name
+    state: JobState
+    arm: str = ""
+    award: str = ""
+    cycles: Count = 0
+    finished_s: float | None = None
+    reason: str = ""
+
+
+class StatusRequest(msgspec.Struct, frozen=True):
+    """Request to `jobs/status`: state of these jobs, or of all if none is named. Of more than 128 jobs, those that may
+    still change come first; a reply holds as many as fit into one message."""
+
+    jobs: tuple[str, ...] = ()
+
+
+class Status(msgspec.Struct, frozen=True):
+    """Reply to a `StatusRequest`; unknown names are left out."""
+
+    auctioneer: Name
+    time_s: float
+    jobs: tuple[JobStatus, ...]
+
+
+class Announcement(msgspec.Struct, frozen=True):
+    """Published under `auction/{auctioneer}/announce`: a round begins."""
+
+    auctioneer: Name
+    auction: Name
+    time_s: float
+    jobs: tuple[str, ...]
+
+
+class Result(msgspec.Struct, frozen=True):
+    """Published under `auction/{auctioneer}/result`: the state of a job has changed."""
+
+    auctioneer: Name
+    number: Count
+    """Counts the results of this auctioneer, across restarts."""
+    time_s: float
+    status: JobStatus
+    auction: str = ""
+    difficulty: float | None = None
+    """Quoted by the arm."""
+    p_saturation: float | None = None
+
+
+class ArmEvent(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Published under `arm/{arm}/event`: something happened to an arm; kinds as in `fleet.events`."""
+
+    arm: Name
+    number: Count
+    """Counts the events of this arm; unique, with a gap after a restart."""
+    time_s: float
+    kind: Name
+    job: str = ""
+    joint: Annotated[int, msgspec.Meta(ge=0)] = 0
+    value: float | None = None
+    reason: str = ""
+
+
+class ClockRequest(msgspec.Struct, frozen=True):
+    """Request to `clock/now`: the fleet time."""
+
+
+class Clock(msgspec.Struct, frozen=True):
+    """Reply to a `ClockRequest`."""
+
+    time_s: float
+    """Fleet time of the reply."""
+    speed: Positive
+    """Fleet seconds per real second."""
+
+    def __post_init__(self) -> None:
+        finite("Clock", "time_s", (self.time_s,))
+        finite("Clock", "speed", (self.speed,))

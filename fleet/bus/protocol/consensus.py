@@ -1,0 +1,120 @@
+"""Messages between arms that allocate jobs without an auctioneer.
+
+Every arm publishes a `Bid`: which jobs it would take, and at what cost. From the same bids every arm computes the same
+allocation. The arm that gets a job by it sends all peers a `Claim`, and begins when a majority of the fleet, as the
+scenario names it, has granted the job in a `ClaimReply`.
+
+Why no job is done twice: two majorities have an arm in common, and an arm grants a job to one peer at a time. A grant
+is a lease: the claimer counts it from the moment it sent the claim, the granter from the moment it replied. Permission
+to commit is granted once and for good. The granter has all of it on disk before it replies.
+(Leases: Gray & Cheriton 1989, SOSP. Majorities: Thomas 1979, ACM TODS 4.)
+"""
+
+from typing import Annotated, Literal
+
+import msgspec
+
+from fleet.bus.protocol.auction import MOST_JOBS, Count, JobEstimate, JobSpec, Positive
+from fleet.bus.protocol.messages import Name, finite
+
+
+class Bid(msgspec.Struct, frozen=True):
+    """Published under `arm/{arm}/bid`: jobs that an arm would take, and at what cost."""
+
+    arm: Name
+    number: Count
+    """Counts the bids of this arm; unique, with a gap after a restart."""
+    time_s: float
+    """Fleet time of this arm; the latest time of any arm is that of the fleet."""
+    capacity: Count
+    """How many more jobs it would accept now."""
+    estimates: Annotated[tuple[JobEstimate, ...], msgspec.Meta(max_length=MOST_JOBS)]
+    """Of jobs that could begin now, as far as this arm knows; none without capacity."""
+    open_count: Count
+    """Number of jobs without an outcome, as far as this arm knows."""
+    closed_count: Count = 0
+    """Number of jobs with an outcome, as far as this arm knows. A peer that knows more for a while sends them."""
+    open_jobs: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
+    """The first jobs without an outcome, by release and name. A peer that knows an outcome, or a missing job, sends
+    it."""
+    choice: str = ""
+    """The job among the estimates that this arm's policy chose; "" for none yet."""
+
+    def __post_init__(self) -> None:
+        finite("Bid", "time_s", (self.time_s,))
+
+
+class ClaimEntry(msgspec.Struct, frozen=True):
+    """A job that an arm has or requests."""
+
+    award: Name
+    """Unique per job and attempt; this arm never uses it again."""
+    job: Name
+    places: Annotated[tuple[Name, ...], msgspec.Meta(min_length=1, max_length=2)]
+    """Stations that it occupies."""
+    cycles: Count
+    """Done so far, including those of others."""
+    phase: Literal["requested", "queued", "working", "finishing"]
+    """requested: not granted yet; finishing: requests permission to commit (to begin the last cycle), or has it."""
+
+
+class JobOutcome(msgspec.Struct, frozen=True):
+    """Outcome of a job, or of one attempt at it."""
+
+    job: Name
+    award: Name
+    arm: Name
+    """The arm that had the job."""
+    outcome: Literal["finished", "unfinished", "returned"]
+    """unfinished: the arm crashed after it got permission to commit, and no arm does the job again; returned: the job
+    is open again."""
+    cycles: Count
+    time_s: float
+    reason: str = ""
+
+    def __post_init__(self) -> None:
+        finite("JobOutcome", "time_s", (self.time_s,))
+
+
+class Claim(msgspec.Struct, frozen=True):
+    """Request to `arm/*/claim/{arm}`: all jobs that an arm has or requests, and outcomes. A job that was granted to it
+    before and is not in here is released."""
+
+    arm: Name
+    number: Count
+    """Counts the claims of this arm; a claim that is older than the last one is refused."""
+    entries: Annotated[tuple[ClaimEntry, ...], msgspec.Meta(max_length=MOST_JOBS)]
+    outcomes: Annotated[tuple[JobOutcome, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
+    jobs: Annotated[tuple[JobSpec, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
+    """Jobs that outsiders submitted and that a peer does not seem to know."""
+
+
+class GrantedEntry(msgspec.Struct, frozen=True):
+    """A granted job."""
+
+    award: Name
+    cycles: Count
+    """Of the job: known to be done."""
+    may_commit: bool = False
+    """Permission to commit, by this granter: the last cycle may begin, and it grants the job to no other arm."""
+
+
+class DeniedEntry(msgspec.Struct, frozen=True):
+    """A job that is denied now."""
+
+    award: Name
+    reason: str
+    outcome: JobOutcome | None = None
+    """Its outcome, if it has one."""
+
+
+class ClaimReply(msgspec.Struct, frozen=True):
+    """Reply to a `Claim`, on the granter's disk before it is sent."""
+
+    arm: Name
+    number: Count
+    """Of the claim."""
+    lease_s: Positive
+    """Real seconds, counted by the claimer from the moment it sent the claim."""
+    granted: tuple[GrantedEntry, ...] = ()
+    denied: tuple[DeniedEntry, ...] = ()

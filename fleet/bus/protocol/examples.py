@@ -1,0 +1,140 @@
+"""One example of every word on the bus: a job `crate_1` from submission to receipt, and what is said besides."""
+
+from collections.abc import Mapping
+
+import msgspec
+
+from fleet.bus.protocol.auction import (
+    Ack,
+    Admission,
+    Announcement,
+    ArmEvent,
+    Award,
+    Clock,
+    ClockRequest,
+    JobEstimate,
+    JobSpec,
+    JobStatus,
+    Lease,
+    LeaseEntry,
+    LeaseRequest,
+    Quote,
+    QuoteRequest,
+    Receipt,
+    Report,
+    Result,
+    Status,
+    StatusRequest,
+    Submission,
+    SubmissionReply,
+)
+from fleet.bus.protocol.consensus import Bid, Claim, ClaimEntry, ClaimReply, DeniedEntry, GrantedEntry, JobOutcome
+from fleet.bus.protocol.messages import DifficultyScores, Info, Refusal, State
+
+CRATE = JobSpec(
+    name="crate_1",
+    kind="pick_place",
+    places=("conveyor", "pallet"),
+    repetitions=20,
+    payload_kg=1.5,
+    due_s=1800.0,
+    value=2.0,
+)
+_ARM, _AUCTIONEER = "arm_0", "auctioneer"
+_ROUND, _QUOTE, _AWARD = "auctioneer-17", "arm_0-2-41", "auctioneer-17-crate_1"
+_CLAIMED = f"{_QUOTE}:crate_1"
+_OFFER = JobEstimate(
+    job="crate_1",
+    feasible=True,
+    joint_difficulty=(0.02, 0.31, 0.05, 0.12, 0.01, 0.0, 0.02),
+    difficulty=0.53,
+    p_saturation=0.04,
+    peak_c=51.5,
+    duration_s=212.0,
+    finish_in_s=240.5,
+)
+_DONE = JobStatus(job="crate_1", state="finished", arm=_ARM, award=_AWARD, cycles=20, finished_s=842.5)
+
+_ALL: tuple[msgspec.Struct, ...] = (
+    State(
+        arm=_ARM,
+        tick=7012,
+        time_s=640.0,
+        mode="working",
+        temp_c=(31.2, 48.9, 35.0, 40.1, 30.2, 29.8, 30.0),
+        headroom_k=11.1,
+        job="crate_1",
+    ),
+    Info(arm=_ARM, joints=7, twin="lstm-vae-3f9a"),
+    DifficultyScores(
+        arm=_ARM,
+        tick=7012,
+        time_s=640.0,
+        twin="lstm-vae-3f9a",
+        jobs=("crate_2", "hold_7"),
+        difficulty=(0.61, None),
+        p_saturation=(0.07, None),
+    ),
+    ArmEvent(arm=_ARM, number=58, time_s=611.3, kind="warning", job="crate_1", joint=2, value=60.0),
+    QuoteRequest(auction=_ROUND, jobs=(CRATE,)),
+    Quote(
+        arm=_ARM,
+        auction=_ROUND,
+        quote=_QUOTE,
+        valid_s=3.0,
+        twin="lstm-vae-3f9a",
+        time_s=602.0,
+        mode="idle",
+        headroom_k=14.2,
+        capacity=1,
+        estimates=(_OFFER,),
+    ),
+    Award(award=_AWARD, auction=_ROUND, auctioneer=_AUCTIONEER, quote=_QUOTE, job=CRATE, cycles=0, lease_s=6.0),
+    Ack(arm=_ARM, award=_AWARD, accepted=True),
+    Bid(
+        arm=_ARM,
+        number=2_000_000_041,
+        time_s=602.0,
+        capacity=1,
+        estimates=(_OFFER,),
+        open_count=2,
+        open_jobs=("crate_1", "hold_7"),
+    ),
+    Claim(
+        arm=_ARM,
+        number=2_000_000_042,
+        entries=(ClaimEntry(award=_CLAIMED, job="crate_1", places=CRATE.places, cycles=19, phase="finishing"),),
+        outcomes=(
+            JobOutcome(job="crate_0", award="arm_0-2-40:crate_0", arm=_ARM, outcome="finished", cycles=8, time_s=590.5),
+        ),
+    ),
+    ClaimReply(
+        arm="arm_1",
+        number=2_000_000_042,
+        lease_s=6.0,
+        granted=(GrantedEntry(award=_CLAIMED, cycles=19, may_commit=True),),
+        denied=(DeniedEntry(award="arm_0-2-43:hold_7", reason="'arm_2' has 'hold_7'"),),
+    ),
+    Announcement(auctioneer=_AUCTIONEER, auction=_ROUND, time_s=601.9, jobs=("crate_1",)),
+    Result(
+        auctioneer=_AUCTIONEER,
+        number=33,
+        time_s=842.6,
+        status=_DONE,
+        auction=_ROUND,
+        difficulty=0.53,
+        p_saturation=0.04,
+    ),
+    LeaseRequest(arm=_ARM, entries=(LeaseEntry(award=_AWARD, job="crate_1", cycles=19, phase="finishing"),)),
+    Lease(auctioneer=_AUCTIONEER, lease_s=6.0, granted=(_AWARD,), revoked=(), may_commit=(_AWARD,)),
+    Report(arm=_ARM, award=_AWARD, job="crate_1", outcome="finished", cycles=20, time_s=842.5),
+    Receipt(auctioneer=_AUCTIONEER, award=_AWARD),
+    Refusal(reason="Award 'auctioneer-17-crate_1' is of 'crate_1' to 'arm_1', not of 'crate_1' to 'arm_0'."),
+    Submission(jobs=(CRATE,), by="shop floor"),
+    SubmissionReply(auctioneer=_AUCTIONEER, jobs=(Admission(job="crate_1", accepted=True),)),
+    StatusRequest(jobs=("crate_1",)),
+    Status(auctioneer=_AUCTIONEER, time_s=900.0, jobs=(_DONE,)),
+    ClockRequest(),
+    Clock(time_s=600.0, speed=60.0),
+)
+EXAMPLES: Mapping[type[msgspec.Struct], msgspec.Struct] = {type(word): word for word in _ALL}

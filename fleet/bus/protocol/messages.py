@@ -1,0 +1,176 @@
+"""Messages that arms publish about themselves, and how every message is encoded: JSON with a versioned schema.
+
+A message is validated when it is constructed, so by its sender and by its reader: NaN and infinity are refused (a JSON
+writer would silently turn them into `null`), an unknown score is `null`. Unknown fields are ignored, so a later version
+may add some; a change that a reader of this version could misread takes a new version in the schema name.
+"""
+
+from functools import cache
+from math import isfinite
+from typing import Annotated, TypeVar
+
+import msgspec
+
+from fleet.errors import BusError
+from fleet.telemetry import Mode
+
+VERSION = 2
+Name = Annotated[str, msgspec.Meta(min_length=1)]
+Tick = Annotated[int, msgspec.Meta(ge=0)]
+
+
+class MalformedMessage(BusError, ValueError):
+    """A message that does not fit its key or its schema; says what is wrong with it."""
+
+
+class State(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Telemetry of an arm; the newest one counts. Quantities that nobody measures are left out."""
+
+    arm: Name
+    tick: Tick
+    """Counts the states of this arm; in a simulated shift, state and difficulty of one step have the same tick."""
+    time_s: float
+    mode: Mode
+    temp_c: tuple[float, ...]
+    """Measured motor temperatures, [joint]."""
+    headroom_k: float
+    """Warning limit minus hottest motor."""
+    job: str = ""
+    """The current job; "" for none."""
+    q: tuple[float, ...] = ()
+    """rad, [joint]."""
+    qd: tuple[float, ...] = ()
+    """rad/s, [joint]."""
+    tau: tuple[float, ...] = ()
+    """N·m at the joint output, [joint]."""
+    current_a: tuple[float, ...] = ()
+    """[joint]."""
+
+    def __post_init__(self) -> None:
+        for name in ("time_s", "headroom_k"):
+            finite("State", name, (getattr(self, name),))
+        for name in ("temp_c", "q", "qd", "tau", "current_a"):
+            values = getattr(self, name)
+            finite("State", name, values)
+            if values and len(values) != len(self.temp_c):
+                raise ValueError(f"State.{name} needs one value per joint ({len(self.temp_c)}, got {len(values)}).")
+
+
+class DifficultyScores(msgspec.Struct, frozen=True):
+    """How difficult the open jobs are for an arm, by its twin."""
+
+    arm: Name
+    tick: Tick
+    """Counts the scores of this arm; in a simulated shift, state and difficulty of one step have the same tick."""
+    time_s: float
+    twin: str
+    """Version of the twin that scored."""
+    jobs: tuple[Name, ...]
+    """Names of the open jobs, each once; the columns of the lists below."""
+    difficulty: tuple[float | None, ...]
+    """d, [job]; null where the arm has no score or cannot do the job."""
+    p_saturation: tuple[float | None, ...]
+    """Probability that a motor passes the warning limit, [job]; null where unknown."""
+
+    def __post_init__(self) -> None:
+        finite("DifficultyScores", "time_s", (self.time_s,))
+        for name, values in (("difficulty", self.difficulty), ("p_saturation", self.p_saturation)):
+            if len(values) != len(self.jobs):
+                raise ValueError(
+                    f"DifficultyScores.{name} needs one value per job ({len(self.jobs)}, got {len(values)})."
+                )
+            finite("DifficultyScores", name, values)
+        if len(set(self.jobs)) != len(self.jobs):
+            raise ValueError(f"DifficultyScores.jobs names a job twice (got {self.jobs}).")
+
+
+class Info(msgspec.Struct, frozen=True):
+    """Constants of an arm: published at its start, and again when they change."""
+
+    arm: Name
+    joints: Annotated[int, msgspec.Meta(ge=1)]
+    twin: str
+    """Version of its twin."""
+
+
+class Refusal(msgspec.Struct, frozen=True):
+    """Instead of any other reply, under the key of the replier: the reason why there is none.
+
+    It is a reply like others. An error reply of Zenoh travels under the key of the query: if that has a wildcard it is
+    nobody's own key, and a router that enforces access control drops it.
+    """
+
+    reason: str
+    """A sentence."""
+
+
+Message = TypeVar("Message", bound=msgspec.Struct)
+
+_ENCODER = msgspec.json.Encoder()
+
+
+@cache
+def _decoder(kind: type[Message]) -> msgspec.json.Decoder[Message]:
+    return msgspec.json.Decoder(kind)
+
+
+def schema(kind: type[msgspec.Struct]) -> str:
+    """Name and version of a message's schema, for example `thermofleet.State.v2`."""
+    return f"thermofleet.{kind.__name__}.v{VERSION}"
+
+
+@cache
+def encoding(kind: type[msgspec.Struct]) -> str:
+    """The encoding that travels with every message, for example `application/json;thermofleet.State.v2`."""
+    return f"application/json;{schema(kind)}"
+
+
+def encode(message: msgspec.Struct) -> bytes:
+    """The message as JSON; floats come back exactly."""
+    return _ENCODER.encode(message)
+
+
+def decode(kind: type[Message], payload: bytes) -> Message:
+    """The message of this type in a payload.
+
+    Raises:
+        MalformedMessage: not JSON, not of this type, or not finite.
+    """
+    try:
+        return _decoder(kind).decode(payload)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise MalformedMessage(f"Not a {schema(kind)}: {error}") from error
+
+
+def decode_as(kind: type[Message], sent_encoding: str, payload: bytes) -> Message:
+    """The message of this type in a payload that was sent with an encoding.
+
+    Raises:
+        MalformedMessage: another encoding, or not of this type.
+    """
+    if sent_encoding != encoding(kind):
+        raise MalformedMessage(f"It is encoded as '{sent_encoding}', not as '{encoding(kind)}'.")
+    return decode(kind, payload)
+
+
+def check_name(message: Message, name: str, field: str) -> Message:
+    """The message, if its field `field` holds the name in its key.
+
+    Raises:
+        MalformedMessage: it names another.
+    """
+    claimed = getattr(message, field)
+    if claimed != name:
+        raise MalformedMessage(f"A {schema(type(message))} under the key of '{name}' claims to be by '{claimed}'.")
+    return message
+
+
+def finite(kind: str, name: str, values: tuple[float | None, ...]) -> None:
+    """Refuse NaN and infinity in a field.
+
+    Raises:
+        ValueError: names the field.
+    """
+    for value in values:
+        if value is not None and not isfinite(value):
+            raise ValueError(f"{kind}.{name} must be finite (got {value}).")

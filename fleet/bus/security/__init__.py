@@ -1,0 +1,1 @@
+"""Certificates, roles and key permissions for mutual TLS."""

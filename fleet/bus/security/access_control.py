@@ -1,0 +1,220 @@
+"""The roster of a fleet, and the access control that a router with TLS enforces.
+
+Everybody in the roster may subscribe to everything in its own fleet, histories included. Beyond that a participant may
+publish, reply and query what its role needs; everything else is denied.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import msgspec
+
+from fleet.bus.protocol import keys
+from fleet.errors import BusError, nearest
+
+Role = Literal["router", "arm", "auctioneer", "submitter", "monitor", "recorder"]
+ROLES: tuple[str, ...] = get_args(Role)
+LONGEST_COMMON_NAME = 64
+"""Characters (X.520, ub-common-name)."""
+ROSTER = "roster.json"
+"""File name of the roster in a folder of keys."""
+_TAKEN = ("ca",)
+"""File names that are not a participant's."""
+
+_SAY = ("put", "liveliness_token", "declare_queryable", "reply")
+_LISTEN = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query")
+_HEAR = ("put", "liveliness_token", "declare_subscriber", "declare_queryable", "query", "reply")
+
+
+class Participant(msgspec.Struct, frozen=True):
+    """A participant that may connect."""
+
+    name: str
+    """Of an arm or an auctioneer: the name in its keys."""
+    role: Role
+
+    def __post_init__(self) -> None:
+        if self.file.casefold() in _TAKEN:
+            raise ValueError(f"No participant may be named '{self.name}': its files are those of something else.")
+        if len(self.common_name) > LONGEST_COMMON_NAME:
+            raise ValueError(
+                f"The name '{self.name}' is too long for a certificate: '{self.common_name}' has "
+                f"{len(self.common_name)} characters, and {LONGEST_COMMON_NAME} are allowed."
+            )
+
+    @property
+    def file(self) -> str:
+        """Name of its files, without the ending; no name can leave the folder."""
+        return file_of(self.name)
+
+    @property
+    def common_name(self) -> str:
+        """Common name in its certificate: `arm:arm_0`. Access control knows a participant by this alone."""
+        return f"{self.role}:{self.file}"
+
+
+class Roster(msgspec.Struct, frozen=True):
+    """The participants of one fleet."""
+
+    fleet: str
+    participants: tuple[Participant, ...]
+
+    def __post_init__(self) -> None:
+        keys.chunk(self.fleet)
+        files = [participant.file.casefold() for participant in self.participants]
+        for i, participant in enumerate(self.participants):
+            if files[i] in files[:i]:
+                raise ValueError(f"The name '{participant.name}' is taken; participants need names that differ.")
+
+    def named(self, name: str) -> Participant:
+        """The participant of a name.
+
+        Raises:
+            BusError: there is none.
+        """
+        for participant in self.participants:
+            if participant.name == name:
+                return participant
+        known = nearest(name, [participant.name for participant in self.participants])
+        raise BusError(f"No '{name}' takes part in the fleet '{self.fleet}'{known}")
+
+    @property
+    def alone(self) -> bool:
+        """Whether the fleet has no auctioneer: its arms allocate jobs themselves and reply to outsiders."""
+        return not self.of_role("auctioneer")
+
+    def of_role(self, role: Role) -> tuple[str, ...]:
+        """Names of the participants of one role."""
+        return tuple(participant.name for participant in self.participants if participant.role == role)
+
+
+def of_arms(fleet: str, arms: Iterable[str], extra: Sequence[Participant] = (), *, auctioneer: bool = True) -> Roster:
+    """The roster of a fleet with these arms: one of every other role, named like it, and the extra ones.
+
+    Args:
+        auctioneer: Whether there is to be one.
+
+    Raises:
+        ValueError: a name twice, empty, or too long.
+    """
+    roles = [role for role in get_args(Role) if role != "arm" and (auctioneer or role != "auctioneer")]
+    others = tuple(Participant(role, role) for role in roles)
+    return Roster(fleet, (*others, *(Participant(arm, "arm") for arm in arms), *extra))
+
+
+def read_roster(folder: Path) -> Roster:
+    """The roster of a folder of keys.
+
+    Raises:
+        BusError: there is none, or it is damaged.
+    """
+    path = folder / ROSTER
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=Roster)
+    except FileNotFoundError as error:
+        raise BusError(f"There is no '{path}': it is no folder of keys. thermofleet keys makes one.") from error
+    except OSError as error:
+        raise BusError(f"Cannot read '{path}': {error.strerror}.") from error
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise BusError(f"'{path}' is no roster: {error}.") from error
+
+
+def file_of(name: str) -> str:
+    """What the files of a participant are called, without their ending: its name as in keys, but never hidden, and
+    never `.` or `..`; `urllib.parse.unquote` is the inverse.
+    """
+    written = keys.chunk(name)
+    return f"%2E{written[1:]}" if written.startswith(".") else written
+
+
+@dataclass(frozen=True)
+class Rights:
+    """What one participant may do, as key expressions."""
+
+    publishes: tuple[str, ...] = ()
+    """May publish (not delete), show tokens, declare queryables and reply under these."""
+    queries: tuple[str, ...] = ()
+    """May query these."""
+
+
+def rights(fleet: str, participant: Participant, *, alone: bool = False) -> Rights:
+    """What a participant may do beyond subscribing.
+
+    Args:
+        alone: The fleet has no auctioneer, so its arms reply to outsiders.
+    """
+    time, status = keys.of_clock(fleet), keys.of_jobs(fleet, "status")
+    quotes, awards = keys.of_every_arm(fleet, "quote"), keys.of_every_arm(fleet, "award")
+    if participant.role == "arm":
+        # The key names the querier, so only that arm may use it.
+        asked = tuple(keys.asked_of_all(fleet, topic, participant.name) for topic in ("lease", "report", "claim"))
+        answers = (keys.all_of(fleet, "jobs"), keys.all_of(fleet, "clock")) if alone else ()
+        return Rights(publishes=(keys.all_of(fleet, "arm", participant.name), *answers), queries=(*asked, time))
+    if participant.role == "auctioneer":
+        own = keys.all_of(fleet, "auction", participant.name)
+        return Rights(
+            publishes=(own, keys.all_of(fleet, "jobs"), keys.all_of(fleet, "clock")),
+            queries=(quotes, awards, time, status),
+        )
+    if participant.role == "submitter":
+        return Rights(queries=(keys.of_jobs(fleet, "submit"), status, quotes, time))
+    if participant.role in ("monitor", "recorder"):
+        return Rights(queries=(status, time))
+    return Rights()
+
+
+def rights_by_role(fleet: str, name: str) -> dict[Role, Rights]:
+    """What a participant of this name could do in each role."""
+    return {role: rights(fleet, Participant(name, role)) for role in get_args(Role)}
+
+
+def access_control(roster: Roster) -> dict[str, Any]:
+    """The rules of a roster for Zenoh's configuration; everything that they do not allow is denied.
+
+    ingress is what a participant sends to the router, egress what the router sends to it. A rule allows a message when
+    a key expression of the rule includes the whole key expression of the message: `arm/*/state` is in no arm's rule.
+    """
+    fleet = roster.fleet
+    everything = _with_caches([keys.all_of_fleet(fleet)])
+    rules = [
+        _rule("listen", "ingress", _LISTEN, everything),
+        _rule("hear", "egress", _HEAR, everything),
+        _rule("recall", "ingress", ("query",), [keys.caches_of(keys.all_of_fleet(fleet))]),
+    ]
+    subjects, policies = [], []
+    for participant in roster.participants:
+        if participant.role == "router":
+            continue
+        who, granted = participant.common_name, rights(fleet, participant, alone=roster.alone)
+        own = []
+        if granted.publishes:
+            own.append(_rule(f"{who} says", "ingress", _SAY, _with_caches(granted.publishes)))
+        if granted.queries:
+            own.append(_rule(f"{who} asks", "ingress", ("query",), granted.queries))
+        rules += own
+        subjects.append({"id": who, "cert_common_names": [who]})
+        policies.append({"subjects": [who], "rules": ["listen", "hear", "recall", *(rule["id"] for rule in own)]})
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": subjects,
+        "policies": policies,
+    }
+
+
+def _with_caches(expressions: Iterable[str]) -> list[str]:
+    """The expressions, and what advanced publishers and subscribers need beside them."""
+    return [found for expression in expressions for found in (expression, keys.caches_of(expression))]
+
+
+def _rule(name: str, flow: str, messages: Sequence[str], expressions: Sequence[str]) -> dict[str, Any]:
+    return {
+        "id": name,
+        "permission": "allow",
+        "flows": [flow],
+        "messages": list(messages),
+        "key_exprs": list(expressions),
+    }

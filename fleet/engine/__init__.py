@@ -1,0 +1,1 @@
+"""The one engine: state, step, claims, limit crossings, observation and reset of simulated shifts."""

@@ -1,0 +1,378 @@
+"""The engine: any number of shifts side by side in arrays, stepped by the same loops for one env or a thousand."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fleet.engine.claims import resolve_claims, update_offers
+from fleet.engine.event_log import PER_ARM, event_buffer
+from fleet.engine.observe import observe
+from fleet.engine.reset import reset_rows
+from fleet.engine.reward import TERMS, RewardWeights, weights_per_unit
+from fleet.engine.state import DONE, WAITING, State
+from fleet.engine.step import step_arms
+from fleet.engine.tables import LANES, Jobs, MeasuredDrive, OpenJobs, Simulation, Tables, Trace, form_of
+from fleet.jit import kernel
+from fleet.motion import Drive
+from fleet.observation import Layout
+from fleet.robot import JOINTS
+from fleet.telemetry import WORKING
+from fleet.thermal import NODES
+
+Array = np.ndarray
+
+FEWEST_JOBS = 2
+"""Arrays of one job would count as contiguous, which the kernels would be compiled for once more."""
+BLOCK = 128
+"""Envs that go through a whole step together, few enough to stay in the processor's cache."""
+CLAIM, MOVE, OBSERVE = 1, 2, 4
+"""Parts of a step, to be added up."""
+
+
+@kernel
+def step_rows(
+    sim: Simulation, parts: int, actions: Array, weights: Array, terms: Array, rows: Array, out: Array
+) -> None:
+    """Take some envs through parts of a step.
+
+    Args:
+        parts: CLAIM resolves claims, MOVE steps the arms, OBSERVE updates the offers and fills `out`.
+        actions: int64 [env, arm].
+        weights: Reward per unit of each term, [term].
+        terms: Receives the reward terms and their sum, [env, term + 1].
+        rows: int [row].
+        out: Receives the observation vectors, float32 [env, arm, size].
+    """
+    for first in range(0, len(rows), BLOCK):
+        some = rows[first : first + BLOCK]
+        if parts & CLAIM:
+            resolve_claims(sim, actions, some)
+        if parts & MOVE:
+            step_arms(sim, weights, terms, some)
+        if parts & OBSERVE:
+            update_offers(sim.tables, sim.jobs, sim.state, sim.offers, some)
+            observe(sim, some, out)
+
+
+@dataclass(frozen=True, eq=False)
+class Shift:
+    """What was drawn for one shift; arrays [job], in the order of release."""
+
+    fleet: int
+    """Which fleet of the tables."""
+    ambient_offset_k: float
+    """Added to the fleet's ambient temperature."""
+    kind: Array
+    release_s: Array
+    due_s: Array
+    repetitions: Array
+    after: Array
+    """int [job, n], −1 for none."""
+    noise_key: int
+    """Of the sensor noise, 64 bits; see `fleet.seeding`."""
+
+
+class Engine:
+    """Steps shifts in place; `reset` puts a new shift into a row.
+
+    Args:
+        tables: What does not change.
+        envs: Number of rows.
+        layout: Of the observation.
+        weights: Of the reward terms.
+        jobs: Room for this many jobs a shift from the start; more is made when needed.
+        events: Record the events of each step in `events`.
+        trace: Record in `trace` how each arm spent the last step.
+        compiled: Compile the loops, or run them in plain Python; by default as `Kernel.chosen` decides.
+        threads: Rows are divided among this many threads; results do not depend on it.
+    """
+
+    def __init__(
+        self,
+        tables: Tables,
+        envs: int,
+        layout: Layout,
+        weights: RewardWeights,
+        *,
+        jobs: int = 1,
+        events: bool = False,
+        trace: bool = False,
+        compiled: bool | None = None,
+        threads: int = 1,
+    ) -> None:
+        arms, slots, jobs = layout.arms, layout.slots, max(jobs, FEWEST_JOBS)
+        self.tables, self.layout = tables, layout
+        self._options = (events, trace, compiled, threads)
+        self._weights = weights_per_unit(weights)
+        self._all = np.arange(envs)
+        offers = OpenJobs(
+            slot_job=np.full((envs, slots), -1),
+            mask=np.zeros((envs, arms, slots + 1), np.int8),
+            unfinished=np.zeros(envs, int),
+            queue=np.zeros((envs, jobs), np.int32),
+            head=np.zeros(envs, int),
+            current_kind=np.full((envs, arms), tables.feasible.shape[1]),
+            pending=np.zeros((envs, arms), bool),
+        )
+        offers.mask[:, :, 0] = 1
+        drawn, state = _arrays(envs, arms, jobs, 0)
+        traced = envs if trace else 0
+        self._simulation = Simulation(
+            tables,
+            drawn,
+            state,
+            offers,
+            event_buffer(envs * arms * PER_ARM if events else 0),
+            _trace(traced, arms),
+            MeasuredDrive(*(np.zeros((0, arms, LANES)) for _ in range(2))),
+            form_of(layout),
+        )
+        self._prepare()
+
+    def _prepare(self) -> None:
+        _, _, compiled, threads = self._options
+        self._step, self._reset = step_rows.chosen(compiled), reset_rows.chosen(compiled)
+        self._bundle: Any = self._simulation  # numba's where the loops are compiled
+        if self._step is not step_rows.interpreted:
+            from fleet.engine.bundle import bundle_of
+
+            self._bundle = bundle_of(self._simulation)
+        self._pool = ThreadPoolExecutor(threads - 1) if threads > 1 else None
+        size = -(-len(self._all) // (threads * BLOCK)) * BLOCK if threads > 1 else len(self._all)
+        self._shares = [self._all[first : first + size] for first in range(0, len(self._all), size)]
+
+    @property
+    def envs(self) -> int:
+        """Number of rows."""
+        return len(self._all)
+
+    @property
+    def offers(self) -> OpenJobs:
+        """Jobs that can be claimed now, and the action mask; views that the next step overwrites."""
+        return self._simulation.offers
+
+    @property
+    def mask(self) -> Array:
+        """Legal actions now, int8 [env, arm, slot + 1]; a view that the next step overwrites."""
+        return self._simulation.offers.mask
+
+    @property
+    def state(self) -> State:
+        """The state itself; views that the next step overwrites. After writing into it call `refresh`."""
+        return self._simulation.state
+
+    @property
+    def jobs(self) -> Jobs:
+        """The jobs of the shifts; not to be written into."""
+        return self._simulation.jobs
+
+    @property
+    def unfinished(self) -> Array:
+        """Jobs not done, int [env]."""
+        return self._simulation.offers.unfinished
+
+    @property
+    def events(self) -> Any:
+        """The `EventBuffer` of the last step."""
+        return self._simulation.events
+
+    @property
+    def trace(self) -> Trace:
+        """How each arm spent the last step."""
+        return self._simulation.trace
+
+    def reset(self, envs: Array, shifts: Sequence[Shift]) -> None:
+        """Put a new shift into each of some rows; `observe` then gives what their arms know."""
+        first = np.cumsum([0, *(len(shift.kind) for shift in shifts)])
+        most, room = max(shift.after.shape[1] for shift in shifts), self.jobs.kind.shape[1]
+        after = np.concatenate([_widen(shift.after, most) for shift in shifts])
+        waits = int((after >= 0).sum(axis=1).max(initial=0))
+        after = -np.sort(-after, axis=1)[:, :waits]
+        jobs = int(np.diff(first).max())
+        if jobs > room or waits > self.jobs.after.shape[2]:
+            self._make_room(jobs, waits)
+
+        def of_all(name: str) -> Array:
+            return np.concatenate([getattr(shift, name) for shift in shifts])
+
+        self._reset(
+            self._bundle, envs,
+            np.array([shift.fleet for shift in shifts]), np.array([shift.ambient_offset_k for shift in shifts]),
+            np.array([shift.noise_key for shift in shifts], np.uint64), first,
+            of_all("kind"), of_all("release_s"), of_all("due_s"), of_all("repetitions"), after,
+        )  # fmt: skip
+
+    def observe(self, envs: Array, out: Array) -> None:
+        """Put what the arms of some envs know now into `out`, float32 [env, arm, size]."""
+        self._run(OBSERVE, _NO_ACTIONS, _NO_TERMS, envs, out)
+
+    def step(self, actions: Array, out: Array) -> tuple[Array, Array, Array]:
+        """One decision interval of every env.
+
+        Args:
+            actions: int64 [env, arm]; anything outside the mask is a wait, and counted.
+            out: Receives what the arms know afterwards, float32 [env, arm, size].
+
+        Returns:
+            Weighted reward terms [env, term], their sum [env], and which envs have done all their jobs, bool [env].
+        """
+        return self._stepped(CLAIM + MOVE + OBSERVE, actions, out)
+
+    def claim(self, actions: Array) -> None:
+        """The first part of `step` alone: award jobs. `move` must follow."""
+        self._clear_events()
+        self._run(CLAIM, actions, _NO_TERMS, self._all, _NO_VECTORS)
+
+    def move(self, drive: Drive, out: Array) -> tuple[Array, Array, Array]:
+        """The rest of `step`, for arms that were seen to move.
+
+        Args:
+            drive: Mean heat drive over the step, each [env, arm, joint].
+            out: As in `step`, like the result.
+        """
+        measured = self._simulation.drive
+        if not len(measured.current_sq):
+            measured = MeasuredDrive(*(np.zeros((self.envs, self.layout.arms, LANES)) for _ in range(2)))
+            self._simulation = self._simulation._replace(drive=measured)
+            self._prepare()
+        measured.current_sq[..., :JOINTS], measured.friction_w[..., :JOINTS] = drive.current_sq, drive.friction_w
+        return self._stepped(MOVE + OBSERVE, _NO_ACTIONS, out)
+
+    def _stepped(self, parts: int, actions: Array, out: Array) -> tuple[Array, Array, Array]:
+        terms = np.empty((self.envs, len(TERMS) + 1))
+        if parts & CLAIM:
+            self._clear_events()
+        if self._pool is None:
+            self._run(parts, actions, terms, self._all, out)
+        else:
+            own, *others = self._shares
+            done = [self._pool.submit(self._run, parts, actions, terms, share, out) for share in others]
+            self._run(parts, actions, terms, own, out)
+            for each in done:
+                each.result()
+        return terms[:, :-1], terms[:, -1], (self.unfinished == 0) & (self.jobs.number > 0)
+
+    def _clear_events(self) -> None:
+        self._simulation.events.used[0] = 0
+
+    def _run(self, parts: int, actions: Array, terms: Array, rows: Array, out: Array) -> None:
+        self._step(self._bundle, parts, actions, self._weights, terms, rows, out)
+
+    def load(self, state: State) -> None:
+        """Take over a state with at most as many jobs, and what follows from it."""
+        for mine, given in zip(self.state, state, strict=True):
+            mine[tuple(slice(0, n) for n in given.shape)] = given
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Derive queue and current jobs again from the state."""
+        state, jobs, offers = self.state, self.jobs, self.offers
+        room = state.status.shape[1]
+        exists = np.arange(room) < jobs.number[:, None]
+        waiting = exists & (state.status == WAITING)
+        order = np.argsort(np.where(waiting, state.queued_s, -np.inf), axis=1, kind="stable")
+        # Waiting jobs fill a row up to its last job.
+        for e in range(self.envs):
+            count, n = int(jobs.number[e]), int(waiting[e].sum())
+            offers.queue[e, count - n : count] = order[e, room - n :]
+            offers.head[e] = count - n
+        offers.unfinished[:] = (exists & (state.status != DONE)).sum(axis=1)
+        env = np.arange(self.envs)[:, None]
+        working = state.mode == WORKING
+        offers.current_kind[:] = np.where(working, jobs.kind[env, state.job], self.tables.feasible.shape[1])
+        offers.pending[:] = working & (state.status[env, state.job] != DONE)
+
+    def _make_room(self, jobs: int, waits: int) -> None:
+        """For more jobs a shift, a tenth more than asked for, keeping what is there."""
+        room = self.jobs.kind.shape[1]
+        jobs = jobs + jobs // 10 if jobs > room else room
+        waits = max(self.jobs.after.shape[2], waits)
+        envs, arms = self.state.mode.shape
+        drawn, state = _arrays(envs, arms, jobs, waits)
+        queue = np.zeros((envs, jobs), np.int32)
+        before = self._simulation
+        for new, old in zip((*drawn, *state, queue), (*before.jobs, *before.state, before.offers.queue), strict=True):
+            new[tuple(slice(0, n) for n in old.shape)] = old
+        self._simulation = before._replace(jobs=drawn, state=state, offers=before.offers._replace(queue=queue))
+        self._prepare()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {k: v for k, v in vars(self).items() if k not in ("_step", "_reset", "_bundle", "_pool", "_shares")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._make_room(0, 0)  # unpickled arrays no longer lie job by job; prepares too
+
+
+_NO_ACTIONS, _NO_TERMS = np.zeros((0, 0), np.int64), np.zeros((0, 0))
+_NO_VECTORS = np.zeros((0, 0, 0), np.float32)
+
+
+def _widen(after: Array, waits: int) -> Array:
+    return np.pad(after, ((0, 0), (0, waits - after.shape[1])), constant_values=-1)
+
+
+def _trace(envs: int, arms: int) -> Trace:
+    whole = {name: np.zeros((envs, arms), int) for name in ("mode", "plan", "todo")}
+    times = {name: np.zeros((envs, arms)) for name in ("progress_s", "home_s", "cut_s")}
+    return Trace(**whole, **times, heat_w=np.zeros((envs, arms, NODES)), start_c=np.zeros((envs, arms, NODES)))
+
+
+CACHE_LINE = 64
+_RECORD = ("release_s", "due_s", "queued_s", "kind", "repetitions", "cycles", "returns", "status")
+"""What is looked up together of a job lies in one cache line."""
+
+
+def _arrays(envs: int, arms: int, jobs: int, waits: int) -> tuple[Jobs, State]:
+    """Arrays for a number of jobs, each of which waits for up to `waits` others; there are none yet."""
+    line = CACHE_LINE // 8
+    room = np.zeros(envs * jobs * line + line)
+    first = -room.ctypes.data % CACHE_LINE // 8
+    records = room[first : first + envs * jobs * line].reshape(envs, jobs, line)
+    job = {
+        name: (records if name.endswith("_s") else records.view(np.int64))[..., place]
+        for place, name in enumerate(_RECORD)
+    }
+    job["release_s"][:], job["due_s"][:], job["repetitions"][:] = np.inf, np.inf, 1
+    drawn = Jobs(
+        fleet=np.zeros(envs, int),
+        ambient_offset_k=np.zeros(envs),
+        noise_key=np.zeros(envs, np.uint64),
+        number=np.zeros(envs, int),
+        after=np.full((envs, jobs, waits), -1),
+        **{name: job[name] for name in ("kind", "release_s", "due_s", "repetitions")},
+    )
+    per_arm = {
+        name: np.zeros((envs, arms))
+        for name in ("progress_s", "clear_at_s", "peak_c", "above_warning_s", "busy_s", "lost_s", "energy_j")
+    }
+    counts = {name: np.zeros((envs, arms), int) for name in ("mode", "job", "todo", "last_award", "faults", "illegal")}
+    state = State(
+        tick=np.zeros(envs, int),
+        temp_c=np.zeros((envs, arms, NODES)),
+        **per_arm,
+        **counts,
+        finished_s=np.zeros((envs, jobs)),
+        **{name: job[name] for name in ("status", "queued_s", "cycles", "returns")},
+    )
+    return drawn, state
+
+
+def shifts_of(drawn: Jobs, noise_keys: Sequence[int]) -> list[Shift]:
+    """The shifts of a world as `tables_of` gives it, with the keys of their sensor noise."""
+    return [
+        Shift(
+            fleet=int(drawn.fleet[e]),
+            ambient_offset_k=float(drawn.ambient_offset_k[e]),
+            kind=drawn.kind[e, :count],
+            release_s=drawn.release_s[e, :count],
+            due_s=drawn.due_s[e, :count],
+            repetitions=drawn.repetitions[e, :count],
+            after=drawn.after[e, :count],
+            noise_key=key,
+        )
+        for e, (count, key) in enumerate(zip(drawn.number.tolist(), noise_keys, strict=True))
+    ]

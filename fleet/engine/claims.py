@@ -1,0 +1,171 @@
+"""Claims on jobs: what may be claimed, and one winner per job and station.
+
+A job can be claimed once it is released, all jobs before it are done, and nobody works on it. Waiting jobs queue by
+release; a job that a fault returned queues again at the end, so it does not block the others. Of two claims for one
+job or station the lower shared difficulty wins, then the lower arm index.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from fleet.engine.event_log import AWARD, ILLEGAL, LOST, record_event
+from fleet.engine.state import DONE, RUNNING, WAITING, State
+from fleet.engine.tables import Jobs, OpenJobs, Simulation, Tables
+from fleet.jit import jit, jit_inline, nonnegative
+from fleet.telemetry import IDLE, WORKING
+
+Array = np.ndarray
+
+LARGEST = float(np.finfo(float).max)
+"""Claims without a difficulty are ordered behind all others."""
+
+
+@jit_inline
+def update_offers(t: Tables, d: Jobs, s: State, o: OpenJobs, rows: Array) -> None:
+    """Fill the slots of some envs, oldest job in the queue first, and their action masks.
+
+    Args:
+        rows: Envs, int [row].
+    """
+    fleets, kinds, count, release_s, after = d.fleet, d.kind, d.number, d.release_s, d.after
+    tick, modes, status = s.tick, s.mode, s.status
+    slot_job, mask, queue, head, current = o.slot_job, o.mask, o.queue, o.head, o.current_kind
+    stations, feasible = t.stations, t.feasible
+    arms, slots = nonnegative(modes.shape[1]), nonnegative(slot_job.shape[1])
+    waits, words = nonnegative(after.shape[2]), nonnegative(stations.shape[2])
+    busy = np.empty(words, np.uint64)
+    for row in rows:
+        e = nonnegative(row)
+        fleet, now_s, filled = nonnegative(fleets[e]), tick[e] * t.dt_s, 0
+        mark_busy_stations(fleet, e, current, stations, busy)
+        for place in range(nonnegative(head[e]), count[e]):
+            j = nonnegative(queue[e, place])
+            if filled == slots or release_s[e, j] > now_s:
+                break
+            ready = True
+            for n in range(waits):
+                before = after[e, j, n]
+                if before >= 0 and status[e, before] != DONE:
+                    ready = False
+            if not ready:
+                continue
+            kind, free = nonnegative(kinds[e, j]), True
+            for w in range(words):
+                free = free and (stations[fleet, kind, w] & busy[w]) == 0
+            slot_job[e, filled] = j
+            filled += 1
+            for a in range(arms):
+                mask[e, a, filled] = free & (modes[e, a] == IDLE) & feasible[fleet, kind, a]
+        while filled < slots and slot_job[e, filled] >= 0:  # slots of the step before
+            slot_job[e, filled] = -1
+            filled += 1
+            for a in range(arms):
+                mask[e, a, filled] = 0
+
+
+@jit_inline
+def mark_busy_stations(fleet: Any, e: int, current: Array, stations: Array, busy: Array) -> None:
+    """Put the stations of an env with an arm at work into `busy`, one bit each, uint64 [word]."""
+    for w in range(len(busy)):
+        busy[w] = 0
+        for a in range(current.shape[1]):
+            busy[w] |= stations[fleet, nonnegative(current[e, a]), w]
+
+
+@jit_inline
+def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
+    """Award every claimed job to one arm; an action outside the mask is counted and waits.
+
+    Args:
+        actions: int [env, arm].
+        rows: Envs, int [row].
+    """
+    t, d, s, o, events = sim.tables, sim.jobs, sim.state, sim.offers, sim.events
+    fleets, kinds, repetitions = d.fleet, d.kind, d.repetitions
+    modes, jobs, status, last, illegal = s.mode, s.job, s.status, s.last_award, s.illegal
+    progress_s, todo, cycles = s.progress_s, s.todo, s.cycles
+    slot_job, mask, queue, head, current, pending = o.slot_job, o.mask, o.queue, o.head, o.current_kind, o.pending
+    stations, work, recording = t.stations, t.work, len(events.what) > 0
+    arms, slots, words = (
+        nonnegative(modes.shape[1]),
+        nonnegative(slot_job.shape[1]),
+        nonnegative(stations.shape[2]),
+    )
+    busy, key, order = np.empty(words, np.uint64), np.empty(arms), np.empty(arms, np.int64)
+    for row in rows:
+        e = nonnegative(row)
+        fleet, claims = nonnegative(fleets[e]), 0
+        for a in range(arms):
+            action = actions[e, a]
+            last[e, a] = 0
+            if action == 0:
+                continue
+            if action < 0 or action > slots or mask[e, a, action] == 0:
+                illegal[e, a] += 1
+                if recording:
+                    record_event(events, ILLEGAL, e, a, -1, -1, 0.0, 0.0)
+                continue
+            score = work[fleet, a, kinds[e, slot_job[e, action - 1]]]["difficulty"]
+            if not score < np.inf:
+                score = LARGEST
+            place = claims
+            while place > 0 and key[place - 1] > score:
+                key[place], order[place] = key[place - 1], order[place - 1]
+                place -= 1
+            key[place], order[place] = score, a
+            claims += 1
+        if claims == 0:
+            continue
+        mark_busy_stations(fleet, e, current, stations, busy)
+        for rank in range(claims):
+            a = order[rank]
+            j = nonnegative(slot_job[e, actions[e, a] - 1])
+            kind, free = nonnegative(kinds[e, j]), status[e, j] == WAITING
+            for w in range(words):
+                free = free and (stations[fleet, kind, w] & busy[w]) == 0
+            if not free:
+                last[e, a] = -1
+                if recording:
+                    record_event(events, LOST, e, a, j, -1, 0.0, 0.0)
+                continue
+            for w in range(words):
+                busy[w] |= stations[fleet, kind, w]
+            remove_from_queue(queue, head, e, j)
+            last[e, a], status[e, j] = 1, RUNNING
+            modes[e, a], jobs[e, a], progress_s[e, a] = WORKING, j, 0.0
+            current[e, a], pending[e, a] = kind, True
+            todo[e, a] = repetitions[e, j] - cycles[e, j]
+            if recording:
+                record_event(events, AWARD, e, a, j, -1, 0.0, float(work[fleet, a, kind]["difficulty"]))
+
+
+@jit_inline
+def remove_from_queue(queue: Array, head: Array, e: int, j: int) -> None:
+    """Remove a job from the queue: those before it move up."""
+    place = head[e]
+    ahead = queue[e, place]
+    while ahead != j:
+        place += 1
+        ahead, queue[e, place] = queue[e, place], ahead
+    head[e] += 1
+
+
+@jit
+def return_to_queue(d: Jobs, s: State, o: OpenJobs, e: int, j: int, until_s: float) -> None:
+    """Put a job back into the queue, behind all that were released or returned before it.
+
+    Args:
+        until_s: End of the step: what is released later comes later.
+    """
+    queue, queued_s = o.queue, s.queued_s
+    since_s, place = queued_s[e, j], o.head[e] - 1
+    o.head[e] = place
+    while place + 1 < d.number[e]:
+        ahead = queue[e, place + 1]
+        came_s = queued_s[e, ahead]
+        if d.release_s[e, ahead] > until_s or came_s > since_s or (came_s == since_s and ahead > j):
+            break
+        queue[e, place] = ahead
+        place += 1
+    queue[e, place] = j

@@ -1,0 +1,207 @@
+"""Exact moments at which a motor crosses a temperature limit within a step, and the step that contains one.
+
+Under constant heat the network's temperatures are T(t) = M (y + (exp(−λt) − 1)(y − z/λ)) with M = C^(−1/2) V,
+y = Vᵀ C^(1/2) T₀ and z = Vᵀ C^(−1/2) (P + g Ta), λ and V the rates and modes of `fleet.thermal.ThermalModel`.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from fleet.engine.tables import Tables
+from fleet.jit import jit, jit_inline
+from fleet.robot import JOINTS
+from fleet.telemetry import FAULTED
+from fleet.thermal import NODES
+
+Array = np.ndarray
+
+TOLERANCE_S = 1e-10
+"""Accuracy of a crossing's moment."""
+MOST_STEPS = 100
+"""Iterations of the root search; about ten are enough."""
+
+
+class Crossed(NamedTuple):
+    """A step in which a limit was crossed."""
+
+    cut_s: float
+    """Seconds until a fault stopped the arm; the whole step if none did."""
+    above_s: float
+    """Seconds above the warning limit."""
+    energy_j: float
+    peak_c: float
+    """Hottest motor at the fault and at the end of the step."""
+    cool_s: float
+    """Moment from which every motor is below the restart limit; inf if there is none."""
+    warned_s: float
+    """Moment at which the warning limit was crossed upwards; inf if it was not."""
+    warned_joint: int
+    """Motor that crossed it."""
+    fault_joint: int
+    """Motor that crossed the error limit."""
+
+
+@jit_inline
+def hottest(temp_c: Array) -> float:
+    """Temperature of the hottest motor, from [node]."""
+    return max(
+        max(max(temp_c[0], temp_c[1]), max(temp_c[2], temp_c[3])),
+        max(max(temp_c[4], temp_c[5]), temp_c[6]),
+    )
+
+
+@jit
+def to_modes(t: Tables, fleet: int, a: int, temp_c: Array, load_w: Array, modal: Array) -> None:
+    """Put y and z of an interval that begins at these temperatures into `modal` [2, mode].
+
+    Args:
+        load_w: Heat plus conductance to ambient times ambient temperature, W, [node].
+    """
+    modal[:] = 0.0
+    for n in range(NODES):
+        root = t.root_capacity[fleet, a, n]
+        warm = root * temp_c[n]
+        load = load_w[n] / root
+        for m in range(NODES):
+            modal[0, m] += t.modes[fleet, a, n, m] * warm
+            modal[1, m] += t.modes[fleet, a, n, m] * load
+
+
+@jit
+def temperatures_at(t: Tables, fleet: int, a: int, modal: Array, time_s: float, out: Array) -> None:
+    """Put the temperatures at a moment of an interval into `out` [node]."""
+    out[:] = 0.0
+    for m in range(NODES):
+        rate = t.rates[fleet, a, m]
+        now = modal[0, m] + math.expm1(-rate * time_s) * (modal[0, m] - modal[1, m] / rate)
+        for n in range(NODES):
+            out[n] += t.modes[fleet, a, n, m] * now
+    for n in range(NODES):
+        out[n] /= t.root_capacity[fleet, a, n]
+
+
+@jit
+def hottest_at(t: Tables, fleet: int, a: int, modal: Array, time_s: float) -> float:
+    """Return the temperature of the hottest motor at a moment of an interval."""
+    now = np.empty(NODES)
+    temperatures_at(t, fleet, a, modal, time_s, now)
+    return hottest(now)
+
+
+@jit
+def hottest_joint_at(t: Tables, fleet: int, a: int, modal: Array, time_s: float) -> int:
+    """Return the index of the hottest motor at a moment of an interval."""
+    now = np.empty(NODES)
+    temperatures_at(t, fleet, a, modal, time_s, now)
+    return int(np.argmax(now[:JOINTS]))
+
+
+@jit
+def crossing_s(
+    t: Tables, fleet: int, a: int, modal: Array, length_s: float, limit_c: float, first_c: float, last_c: float
+) -> float:
+    """Return when the hottest motor crosses a limit that lies between its first and last temperature.
+
+    Inverse quadratic interpolation where it is safe, else bisection: Chandrupatla (1997), Advances in Engineering
+    Software 28(3), 145-149.
+
+    Returns:
+        The end of the bracket that is past the limit, s from the beginning of the interval.
+    """
+    rising, x, y, other, f_other = last_c >= limit_c, length_s, last_c - limit_c, 0.0, first_c - limit_c
+    share, third, f_third = 0.5, 0.0, 0.0
+    for _ in range(MOST_STEPS):
+        width_s = abs(x - other)
+        least = 0.5 * TOLERANCE_S / width_s
+        if y == 0.0:
+            return x
+        if least > 0.25:
+            break
+        new = x + min(max(share, least), 1.0 - least) * (other - x)
+        f_new = hottest_at(t, fleet, a, modal, new) - limit_c
+        if (f_new >= 0.0) == (y >= 0.0):
+            third, f_third = x, y
+        else:
+            third, f_third, other, f_other = other, f_other, x, y
+        x, y = new, f_new
+        xi, phi = (x - other) / (third - other), (y - f_other) / (f_third - f_other)
+        if phi * phi < xi and (1.0 - phi) * (1.0 - phi) < 1.0 - xi:
+            share = y / (f_other - y) * f_third / (f_other - f_third)
+            share += (third - x) / (other - x) * y / (f_third - y) * f_other / (f_third - f_other)
+        else:
+            share = 0.5
+    return x if (y >= 0.0) == rising else other
+
+
+@jit
+def braked_load(t: Tables, fleet: int, a: int, ambient_c: float, out: Array) -> float:
+    """Put the load of an arm on its brakes into `out`, W, [node]; return the heat in it."""
+    heat_w = 0.0
+    for n in range(NODES):
+        out[n] = t.to_ambient[fleet, a, n] * ambient_c
+    if not t.power_off:
+        for j in range(JOINTS):
+            out[JOINTS + j] += t.idle_w[fleet, a, j]
+            heat_w += t.idle_w[fleet, a, j]
+    return heat_w
+
+
+@jit
+def step_with_crossing(
+    t: Tables, fleet: int, a: int, mode: int, begin: Array, heat_w: float, ambient_c: float, end: Array
+) -> Crossed:
+    """Step an arm that crosses a limit or is faulted; `end` becomes its true temperatures at the end.
+
+    Args:
+        begin: Temperatures, then loads (heat, and conductance times ambient temperature), [from].
+        heat_w: Total heat until a fault.
+    """
+    dt_s, modal, faulted = t.dt_s, np.empty((2, NODES)), mode == FAULTED
+    to_modes(t, fleet, a, begin, begin[NODES:], modal)
+    first_c, last_c = hottest(begin), hottest(end)
+    if faulted or last_c < t.error_c:
+        cool_s = np.inf
+        if faulted and last_c < t.restart_c:
+            cool_s = 0.0
+            if first_c >= t.restart_c:
+                cool_s = crossing_s(t, fleet, a, modal, dt_s, t.restart_c, first_c, last_c)
+        above, warned_s, joint = warning_in(t, fleet, a, modal, dt_s, first_c, last_c)
+        return Crossed(dt_s, above, heat_w * dt_s, last_c, cool_s, warned_s, joint, -1)
+    cut_s = 0.0
+    if first_c < t.error_c:
+        cut_s = crossing_s(t, fleet, a, modal, dt_s, t.error_c, first_c, last_c)
+    stopped, brakes = np.empty(NODES), np.empty(NODES)
+    temperatures_at(t, fleet, a, modal, cut_s, stopped)
+    stopped_c, fault_joint = hottest(stopped), int(np.argmax(stopped[:JOINTS]))
+    above, warned_s, joint = warning_in(t, fleet, a, modal, cut_s, first_c, stopped_c)
+    brakes_w = braked_load(t, fleet, a, ambient_c, brakes)
+    to_modes(t, fleet, a, stopped, brakes, modal)
+    left_s = dt_s - cut_s
+    temperatures_at(t, fleet, a, modal, left_s, end)
+    last_c = hottest(end)
+    above_braked, warned_braked_s, joint_braked = warning_in(t, fleet, a, modal, left_s, stopped_c, last_c)
+    if warned_braked_s < np.inf:
+        warned_s, joint = cut_s + warned_braked_s, joint_braked
+    peak, cool_s = max(stopped_c, last_c), np.inf
+    if last_c < t.restart_c:
+        cool_s = cut_s
+        if peak >= t.restart_c:
+            cool_s = cut_s + crossing_s(t, fleet, a, modal, left_s, t.restart_c, stopped_c, last_c)
+    energy_j = heat_w * cut_s + brakes_w * left_s
+    return Crossed(cut_s, above + above_braked, energy_j, peak, cool_s, warned_s, joint, fault_joint)
+
+
+@jit
+def warning_in(
+    t: Tables, fleet: int, a: int, modal: Array, length_s: float, first_c: float, last_c: float
+) -> tuple[float, float, int]:
+    """Return seconds above the warning limit in an interval, the moment it is crossed upwards (inf), and the motor."""
+    begins = first_c >= t.warning_c
+    if begins == (last_c >= t.warning_c):
+        return (length_s if begins else 0.0), np.inf, -1
+    passed_s = crossing_s(t, fleet, a, modal, length_s, t.warning_c, first_c, last_c)
+    if begins:
+        return passed_s, np.inf, -1
+    return length_s - passed_s, passed_s, hottest_joint_at(t, fleet, a, modal, passed_s)

@@ -1,0 +1,282 @@
+"""One shift, step by step: the engine with one row, a plant, an exchange, an event log and a watcher."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Protocol
+
+import numpy as np
+
+from fleet.bus.exchange.memory import MemoryExchange
+from fleet.bus.exchange.protocol import Exchange
+from fleet.engine.batch import Engine, shifts_of
+from fleet.engine.event_log import events_of
+from fleet.engine.peers import deliver
+from fleet.engine.reward import RewardWeights
+from fleet.engine.state import State, World
+from fleet.engine.tables import tables_of
+from fleet.events import Event
+from fleet.motion import Drive
+from fleet.observation import Layout
+from fleet.seeding import child, key_of
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class StepRecord:
+    """How the arms of one env spent consecutive steps."""
+
+    tick: Array
+    """int [step]."""
+    mode: Array
+    """At the beginning, with the awards made, int [step, arm]."""
+    plan: Array
+    """Row of the plan table, int [step, arm]; 0 where there is no job."""
+    progress_s: Array
+    """Time since leaving home, at the beginning, [step, arm]."""
+    todo: Array
+    """Cycles the arm set out to do, int [step, arm]."""
+    home_s: Array
+    """Seconds into the step at which the arm is free again; inf if not in it, [step, arm]."""
+    cut_s: Array
+    """Seconds the arm moved before a fault stopped it; the whole step if none did, [step, arm]."""
+    heat_w: Array
+    """Until the fault, [step, arm, node]."""
+    start_c: Array
+    """[step, arm, node]."""
+    end_c: Array
+    """[step, arm, node]."""
+
+
+class Plant(Protocol):
+    """Moves the arms of one env."""
+
+    follows_plans: bool
+    """Whether arms move as planned; then `drive` is not asked for."""
+    most_steps: int
+    """Steps that `motion` can give at a time, the latest ones."""
+
+    def drive(self, world: World, state: State) -> Drive:
+        """Mean heat drive over the coming step, each [env, arm, joint].
+
+        Args:
+            state: At the beginning of the step, with the awards made.
+        """
+        ...
+
+    def motion(self, world: World, record: StepRecord, offsets_s: Array) -> Array:
+        """Joint motion at moments of steps, [step, sample, arm, channel, joint]; called for each step once, in order.
+
+        Args:
+            offsets_s: Moments within each step, [sample], in (0, dt_s].
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """One shift, ready to run."""
+
+    world: World
+    plant: Plant
+    twins: tuple[str, ...]
+    """Version of each arm's difficulty model."""
+    sensors: np.random.SeedSequence
+    """Of the sensors' noise; its first child is the seed of the exchange."""
+
+    @property
+    def noise_key(self) -> int:
+        """Key of the sensors' noise; see `fleet.seeding`."""
+        return key_of(self.sensors)
+
+
+EpisodeFactory = Callable[[np.random.SeedSequence], Episode]
+"""Makes the episode of a seed; the fleet must be the same for every seed."""
+Watch = Callable[[StepRecord], None]
+
+
+class ShiftRunner:
+    """Steps one shift.
+
+    Args:
+        exchange: Carries what arms tell each other; perfect and immediate if not given.
+        keep_events: Collect events in `events`.
+        watch: Called with the record of every step.
+        layout: Of the observation; all peers if not given.
+        compiled: As in `Engine`.
+    """
+
+    def __init__(
+        self,
+        episode: Episode,
+        weights: RewardWeights,
+        *,
+        exchange: Exchange | None = None,
+        keep_events: bool = False,
+        watch: Watch | None = None,
+        layout: Layout | None = None,
+        compiled: bool | None = None,
+    ) -> None:
+        world = episode.world
+        self._episode, self._watch = episode, watch
+        self._layout = layout or Layout(len(world.arms), world.slots)
+        at_once = exchange is None or (isinstance(exchange, MemoryExchange) and exchange.perfect)
+        self._exchange = None if at_once else exchange
+        self._delivered_before = 0
+        if self._exchange is not None:
+            self._exchange.begin(np.random.default_rng(child(episode.sensors, 0)))
+            self._delivered_before = self._exchange.delivered
+        self.events: list[Event] = []
+        tables, drawn = tables_of(world)
+        room = world.jobs.exists.shape[1]
+        self._engine = Engine(
+            tables, 1, self._layout, weights, jobs=room, events=keep_events, trace=watch is not None, compiled=compiled
+        )
+        self._engine.reset(_FIRST, shifts_of(drawn, [episode.noise_key]))
+        self._vectors = np.empty((1, self._layout.arms, self._layout.size), np.float32)
+        self._engine.observe(_FIRST, self._vectors)
+        self._deliver()
+
+    @property
+    def state(self) -> State:
+        """The simulator's state, [1, ...]; views that the next step overwrites."""
+        return _without_room(self._engine.state, self._episode.world)
+
+    @property
+    def vectors(self) -> Array:
+        """What each arm knows, float32 [arm, size]; the next step overwrites it."""
+        return self._vectors[0]
+
+    @property
+    def mask(self) -> Array:
+        """Legal actions, int8 [arm, slot + 1]; the next step overwrites it."""
+        return self._engine.mask[0]
+
+    @property
+    def slot_job(self) -> Array:
+        """Jobs in the slots, int [slot], −1 for an empty one; the next step overwrites it."""
+        return self._engine.offers.slot_job[0]
+
+    @property
+    def messages(self) -> int:
+        """Messages delivered to a peer."""
+        if self._exchange is not None:
+            return self._exchange.delivered - self._delivered_before
+        return self._layout.arms * (self._layout.arms - 1) * (self.tick + 1)
+
+    @property
+    def jobs_done(self) -> int:
+        """Finished so far."""
+        return int(self._engine.jobs.number[0] - self._engine.unfinished[0])
+
+    @property
+    def tick(self) -> int:
+        """Decision intervals that are over."""
+        return int(self._engine.state.tick[0])
+
+    def step(self, actions: Array) -> tuple[Array, float, bool]:
+        """One decision interval: weighted reward terms [term], their sum, and whether all jobs are done.
+
+        Args:
+            actions: int64 [arm].
+        """
+        engine, world, plant = self._engine, self._episode.world, self._episode.plant
+        terms, reward, finished = _stepped(engine, world, plant, actions[None], self._vectors)
+        if len(engine.events.what):
+            self.events += events_of(world, engine.state, engine.events)
+        if self._watch is not None:
+            self._watch(record_of(engine))
+        self._deliver()
+        return terms[0], float(reward[0]), bool(finished[0])
+
+    def _deliver(self) -> None:
+        """Replace what the arms observe of their peers by what the exchange delivered."""
+        if self._exchange is not None:
+            names, twins = self._episode.world.jobs.names[0], self._episode.twins
+            deliver(self._exchange, self._engine, self._vectors[0], names, twins)
+
+
+_FIRST = np.zeros(1, dtype=int)
+
+
+def _stepped(engine: Engine, world: World, plant: Plant, actions: Array, out: Array) -> tuple[Array, Array, Array]:
+    if plant.follows_plans:
+        return engine.step(actions, out)
+    engine.claim(actions)
+    return engine.move(plant.drive(world, engine.state), out)
+
+
+def _without_room(state: State, world: World) -> State:
+    """Views of the state with as many jobs as the world has; an engine may have room for more."""
+    jobs = world.jobs.exists.shape[1]
+    per_job = ("status", "queued_s", "cycles", "returns", "finished_s")
+    return state._replace(**{name: getattr(state, name)[:, :jobs] for name in per_job})
+
+
+def record_of(engine: Engine, env: int = 0) -> StepRecord:
+    """The record of the last step of one env, with one step."""
+    row = slice(env, env + 1)
+    traced = {name: values[row].copy() for name, values in engine.trace._asdict().items()}
+    return StepRecord(tick=engine.state.tick[row] - 1, end_c=engine.state.temp_c[row].copy(), **traced)
+
+
+def stack_records(records: list[StepRecord]) -> StepRecord:
+    """Records of consecutive steps as one."""
+    return StepRecord(*(np.concatenate([getattr(r, name) for r in records]) for name in StepRecord.__annotations__))
+
+
+@dataclass(frozen=True, eq=False)
+class Stepped:
+    """Result of `step`."""
+
+    state: State
+    """After the step."""
+    record: StepRecord
+    """Of each env, its only step: [env, arm, ...]."""
+
+
+def step(
+    world: World,
+    before: State,
+    actions: Array,
+    plant: Plant,
+    log: list[Event] | None = None,
+    *,
+    compiled: bool | None = None,
+) -> Stepped:
+    """One decision interval from a given state, which is left untouched.
+
+    Args:
+        actions: 0 waits or goes on, k claims slot k, int [env, arm].
+        log: Receives the events, if given.
+        compiled: As in `Engine`; a single arm in real time runs uncompiled.
+    """
+    engine, out = _engine_of(world, compiled)
+    engine.load(before)
+    engine.observe(np.arange(world.envs), out)  # offers of this state
+    _stepped(engine, world, plant, np.ascontiguousarray(actions, dtype=np.int64), out)
+    if log is not None:
+        log += events_of(world, engine.state, engine.events)
+    traced = {name: values.copy() for name, values in engine.trace._asdict().items()}
+    record = StepRecord(tick=before.tick.copy(), end_c=engine.state.temp_c.copy(), **traced)
+    return Stepped(_without_room(engine.state, world).copy(), record)
+
+
+def open_jobs(world: World, state: State, *, compiled: bool | None = None) -> tuple[Array, Array]:
+    """Jobs in the slots, int [env, slot], and legal actions, int8 [env, arm, slot + 1], in a state."""
+    engine, out = _engine_of(world, compiled)
+    engine.load(state)
+    engine.observe(np.arange(world.envs), out)
+    return engine.offers.slot_job.copy(), engine.mask.copy()
+
+
+@lru_cache(maxsize=4)
+def _engine_of(world: World, compiled: bool | None) -> tuple[Engine, Array]:
+    """An engine for a world, and room for its observations."""
+    tables, drawn = tables_of(world)
+    layout = Layout(len(world.arms), world.slots)
+    room = world.jobs.exists.shape[1]
+    engine = Engine(tables, world.envs, layout, RewardWeights(), jobs=room, events=True, trace=True, compiled=compiled)
+    engine.reset(np.arange(world.envs), shifts_of(drawn, [0] * world.envs))
+    return engine, np.empty((world.envs, layout.arms, layout.size), np.float32)

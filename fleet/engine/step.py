@@ -1,0 +1,185 @@
+"""One step of the arms of many envs: motion, heat, limits, the end of jobs.
+
+Heat is constant over a step (the mean of what the motors do in it, with losses from the temperatures at its start) and
+the thermal step is exact for it, so the moments at which a limit is crossed are exact too. A row's result does not
+depend on how many rows there are.
+"""
+
+import numpy as np
+
+from fleet.engine.claims import return_to_queue
+from fleet.engine.crossings import hottest, step_with_crossing
+from fleet.engine.event_log import FAULT, FINISH, HOME, RECOVER, RETURN, WARNING, record_event
+from fleet.engine.state import DONE, WAITING
+from fleet.engine.tables import LANES, WIDE, Simulation
+from fleet.jit import jit_inline, nonnegative
+from fleet.motor import magnet_factor, winding_heat
+from fleet.robot import JOINTS
+from fleet.telemetry import FAULTED, IDLE, WORKING
+from fleet.thermal import NODES
+
+Array = np.ndarray
+
+ROUNDING_S = 1e-9
+"""Sums of phases may be off by this much; a whole step must not be lost to it."""
+
+
+@jit_inline
+def step_arms(sim: Simulation, weights: Array, terms: Array, rows: Array) -> None:
+    """Take every arm of some envs through one step.
+
+    Args:
+        weights: Reward per unit of each term, [term], in the order of `fleet.engine.reward.TERMS`.
+        terms: Receives the reward terms and their sum, [env, term + 1].
+        rows: Envs, int [row].
+    """
+    t, d, s, o, events, trace, measured = sim.tables, sim.jobs, sim.state, sim.offers, sim.events, sim.trace, sim.drive
+    # Arrays under local names: the compiler then loads their addresses once.
+    fleets, offsets_k, repetitions, due_s = d.fleet, d.ambient_offset_k, d.repetitions, d.due_s
+    ticks, temp_c, modes, jobs, progress_s, todo = s.tick, s.temp_c, s.mode, s.job, s.progress_s, s.todo
+    clear_at_s, faults, peak_c, above_warning_s = s.clear_at_s, s.faults, s.peak_c, s.above_warning_s
+    busy_s, lost_s, energy_j, status, queued_s = s.busy_s, s.lost_s, s.energy_j, s.status, s.queued_s
+    cycles, returns, finished_s = s.cycles, s.returns, s.finished_s
+    unfinished, current, pending = o.unfinished, o.current_kind, o.pending
+    ambient, thermal_step, to_ambient = t.ambient_c, t.thermal_step, t.to_ambient
+    copper, idle_w, rest_sq, rest_w = t.copper_w_per_a2, t.idle_w, t.rest_current_sq, t.rest_friction_w
+    plan_sq, plan_w, times_s, plans, values = t.current_sq, t.friction_w, t.times_s, t.plan, t.value
+    dt_s, warning_c, error_c, restart_c = t.dt_s, t.warning_c, t.error_c, t.restart_c
+    recording, tracing, driven = len(events.what) > 0, len(trace.plan) > 0, len(measured.current_sq) > 0
+    copper_w, other_w, fold = np.empty(LANES), np.empty(LANES), np.empty(4)
+    begin, end = np.zeros(2 * NODES + LANES), np.empty(WIDE)  # temperatures, loads, padding
+    arms, no_kind = nonnegative(modes.shape[1]), nonnegative(t.feasible.shape[1])
+    for row in rows:
+        e = nonnegative(row)
+        fleet, tick = nonnegative(fleets[e]), nonnegative(ticks[e])
+        now_s, moment = tick * dt_s, min(tick, t.ticks - 1)
+        value = late = above_s = count = energy = 0.0
+        for a in range(arms):
+            mode = modes[e, a]
+            plan, spent_s, done_s, home_s = 0, 0.0, np.inf, np.inf
+            first_s = cycle_s = share_0 = share_1 = share_2 = 0.0
+            if mode == WORKING:
+                plan = nonnegative(plans[fleet, a, nonnegative(current[e, a])])
+                begin_s = progress_s[e, a]
+                until_s = begin_s + dt_s
+                first_s, cycle_s = times_s[plan, 0], times_s[plan, 1]
+                last_s = first_s + cycle_s * todo[e, a]
+                back_s = last_s + times_s[plan, 2]
+                span_0 = max(min(until_s, first_s) - begin_s, 0.0)
+                span_1 = max(min(until_s, last_s) - max(begin_s, first_s), 0.0)
+                span_2 = max(min(until_s, back_s) - max(begin_s, last_s), 0.0)
+                spent_s = span_0 + span_1 + span_2
+                share_0, share_1, share_2 = span_0 / dt_s, span_1 / dt_s, span_2 / dt_s
+                if pending[e, a] and last_s - begin_s <= dt_s + ROUNDING_S:
+                    done_s = min(max(last_s - begin_s, 0.0), dt_s)
+                if back_s - begin_s <= dt_s + ROUNDING_S:
+                    home_s = min(max(back_s - begin_s, 0.0), dt_s)
+            rest = 0.0 if mode == FAULTED else (dt_s - spent_s) / dt_s
+            powered = 0.0 if t.power_off and mode == FAULTED else 1.0
+            ambient_c = ambient[fleet, moment, a] + offsets_k[e]
+            for n in range(NODES):
+                begin[n] = temp_c[e, a, n]
+            for k in range(LANES):
+                amps_sq = share_0 * plan_sq[plan, 0, k] + share_1 * plan_sq[plan, 1, k]
+                copper_w[k] = amps_sq + (share_2 * plan_sq[plan, 2, k] + rest * rest_sq[fleet, a, k])
+                friction_w = share_0 * plan_w[plan, 0, k] + share_1 * plan_w[plan, 1, k]
+                other_w[k] = friction_w + (share_2 * plan_w[plan, 2, k] + rest * rest_w[fleet, a, k])
+            if driven:
+                for k in range(LANES):
+                    copper_w[k], other_w[k] = measured.current_sq[e, a, k], measured.friction_w[e, a, k]
+            for k in range(LANES):
+                factor = magnet_factor(begin[JOINTS + k], t)
+                copper_w[k] = winding_heat(copper[fleet, a, k], copper_w[k] / (factor * factor), begin[k], t)
+                other_w[k] += powered * idle_w[fleet, a, k]
+            for k in range(4):
+                fold[k] = (copper_w[k] + other_w[k]) + (copper_w[4 + k] + other_w[4 + k])
+            heat_w = (fold[0] + fold[1]) + (fold[2] + fold[3])
+            for k in range(JOINTS):
+                begin[NODES + k] = copper_w[k] + to_ambient[fleet, a, k] * ambient_c
+                begin[NODES + JOINTS + k] = other_w[k] + to_ambient[fleet, a, JOINTS + k] * ambient_c
+            for m in range(WIDE):
+                total = 0.0
+                for n in range(2 * NODES):
+                    total += thermal_step[fleet, a, n, m] * begin[n]
+                end[m] = total
+            first_c, last_c = hottest(begin), hottest(end)
+            cut_s, here_s, here_j, top_c, cool_s = dt_s, 0.0, heat_w * dt_s, last_c, np.inf
+            fault_joint = -1
+            if tracing:
+                trace.mode[e, a], trace.plan[e, a], trace.progress_s[e, a] = mode, plan, progress_s[e, a]
+                trace.todo[e, a], trace.home_s[e, a] = todo[e, a], home_s
+                for n in range(NODES):
+                    trace.start_c[e, a, n] = begin[n]
+                    trace.heat_w[e, a, n] = copper_w[n] if n < JOINTS else other_w[n - JOINTS]
+            hot, same = first_c >= warning_c, (first_c >= warning_c) == (last_c >= warning_c)
+            if same and (first_c < restart_c or last_c >= restart_c if mode == FAULTED else last_c < error_c):
+                here_s = dt_s if hot else 0.0
+                if mode == FAULTED and last_c < restart_c:
+                    cool_s = 0.0
+            else:
+                crossed = step_with_crossing(t, fleet, a, mode, begin, heat_w, ambient_c, end)
+                cut_s, here_s, here_j = crossed.cut_s, crossed.above_s, crossed.energy_j
+                top_c, cool_s, fault_joint = crossed.peak_c, crossed.cool_s, crossed.fault_joint
+                if recording and crossed.warned_s < np.inf:
+                    j = jobs[e, a]
+                    record_event(events, WARNING, e, a, j, crossed.warned_joint, crossed.warned_s, warning_c)
+            if tracing:
+                trace.cut_s[e, a] = cut_s
+            energy_j[e, a] += here_j
+            above_warning_s[e, a] += here_s
+            peak_c[e, a] = max(peak_c[e, a], top_c)
+            busy_s[e, a] += min(spent_s, cut_s)
+            above_s += here_s
+            energy += here_j
+            for n in range(NODES):
+                temp_c[e, a, n] = end[n]
+            if mode == WORKING:
+                if done_s <= cut_s:
+                    j, pending[e, a] = nonnegative(jobs[e, a]), False
+                    status[e, j], cycles[e, j], finished_s[e, j] = DONE, repetitions[e, j], now_s + done_s
+                    unfinished[e] -= 1
+                    gained = values[fleet, nonnegative(current[e, a])]
+                    value += gained
+                    late += gained * (max(finished_s[e, j] - due_s[e, j], 0.0) / 60.0)
+                    if recording:
+                        record_event(events, FINISH, e, a, j, -1, done_s, 0.0)
+                progress_s[e, a] += cut_s
+                if home_s <= cut_s:
+                    if recording:
+                        record_event(events, HOME, e, a, jobs[e, a], -1, home_s, 0.0)
+                    modes[e, a], jobs[e, a], progress_s[e, a], todo[e, a] = IDLE, -1, 0.0, 0
+                    current[e, a] = no_kind
+            if mode == FAULTED:
+                lost_s[e, a] += dt_s
+            if cut_s < dt_s:
+                if recording:
+                    record_event(events, FAULT, e, a, jobs[e, a], fault_joint, cut_s, error_c)
+                if mode == WORKING and pending[e, a]:
+                    j = nonnegative(jobs[e, a])
+                    kept = int((progress_s[e, a] - first_s) // cycle_s)
+                    kept = min(max(kept, 0), todo[e, a])
+                    cycles[e, j] += kept
+                    status[e, j], queued_s[e, j] = WAITING, now_s + cut_s
+                    returns[e, j] += 1
+                    return_to_queue(d, s, o, e, j, now_s + dt_s)
+                    pending[e, a] = False
+                    if recording:
+                        record_event(events, RETURN, e, a, j, -1, cut_s, kept)
+                count += 1.0
+                faults[e, a] += 1
+                lost_s[e, a] += dt_s - cut_s
+                modes[e, a], jobs[e, a], progress_s[e, a], todo[e, a] = FAULTED, -1, 0.0, 0
+                current[e, a] = no_kind
+            if modes[e, a] == FAULTED:
+                if clear_at_s[e, a] == np.inf and cool_s < np.inf:
+                    clear_at_s[e, a] = now_s + cool_s + t.clear_s
+                if clear_at_s[e, a] <= (tick + 1) * dt_s:
+                    recovered_s = clear_at_s[e, a] - now_s
+                    lost_s[e, a] -= dt_s - recovered_s
+                    modes[e, a], clear_at_s[e, a] = IDLE, np.inf
+                    if recording:
+                        record_event(events, RECOVER, e, a, -1, -1, recovered_s, restart_c)
+        terms[e, 0], terms[e, 1], terms[e, 2] = value * weights[0], late * weights[1], above_s * weights[2]
+        terms[e, 3], terms[e, 4] = count * weights[3], energy * weights[4]
+        terms[e, 5] = terms[e, 0] + terms[e, 1] + terms[e, 2] + terms[e, 3] + terms[e, 4]
+        ticks[e] += 1

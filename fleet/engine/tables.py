@@ -1,0 +1,384 @@
+"""The arrays that the engine's kernels read and write, by name.
+
+Axis `fleet`: one fleet as it is built; all envs of one fleet have the same arms. Axis `kind`: one kind of job, that is
+its work and its number of repetitions. Last axes `lane` and `wide` are joints and nodes padded with zeros to what a
+processor takes at once. Every array is contiguous and owned, so one compilation serves all scenarios.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from fleet.difficulty import Risk
+from fleet.engine.state import State, World
+from fleet.observation import Layout, Offsets
+from fleet.robot import JOINTS
+
+Array = np.ndarray
+
+LANES, WIDE = 8, 16
+"""Padded lengths of the joint and the node axis."""
+assert JOINTS == LANES - 1
+
+
+WORK = np.dtype(
+    {
+        "names": ["travel_s", "cycle_s", "difficulty", "p_saturation", "risk"],
+        "formats": ["f8", "f8", "f8", "f8", "i8"],
+        "itemsize": 64,  # one cache line
+    }
+)
+"""What an arm knows of a kind of job: seconds of approach and retreat, and of one repetition, both 0 where it cannot do
+it; difficulty; P(saturation) from models that ignore the start temperature, both NaN where not known; row of the risk
+tables, −1 for none."""
+
+
+class Tables(NamedTuple):
+    """What does not change from shift to shift; see `World` for the meaning."""
+
+    dt_s: float
+    ticks: int
+    warning_c: float
+    error_c: float
+    restart_c: float
+    clear_s: float
+    power_off: bool
+    alpha_cu_per_k: float
+    alpha_kt_per_k: float
+    reference_c: float
+    ambient_c: Array
+    """[fleet, tick, arm]."""
+    thermal_step: Array
+    """Exact thermal step, [fleet, arm, from, wide]: rows 0..13 Φ transposed (temperatures), 14..27 Γ (loads)."""
+    to_ambient: Array
+    """Conductance to ambient, W/K, [fleet, arm, node]."""
+    root_capacity: Array
+    """Square root of the heat capacities, [fleet, arm, node]."""
+    rates: Array
+    """Inverse time constants of the thermal modes, 1/s, [fleet, arm, mode]."""
+    modes: Array
+    """[fleet, arm, node, mode]."""
+    sensor_noise_k: Array
+    """[fleet, arm, lane]."""
+    copper_w_per_a2: Array
+    """[fleet, arm, lane]."""
+    idle_w: Array
+    """[fleet, arm, lane]."""
+    rest_current_sq: Array
+    """[fleet, arm, lane]."""
+    rest_friction_w: Array
+    """[fleet, arm, lane]."""
+    start_c: Array
+    """[fleet, arm, node]."""
+    times_s: Array
+    """[plan, phase]."""
+    current_sq: Array
+    """[plan, phase, lane]."""
+    friction_w: Array
+    """[plan, phase, lane]."""
+    plan: Array
+    """Row of the plan tables, −1 where the arm cannot do it, int [fleet, arm, kind]."""
+    work: Array
+    """What an arm knows of a kind of job, `WORK` [fleet, arm, kind]."""
+    risk_offset: Array
+    """[risk, piece]; see `fleet.difficulty.Risk`."""
+    risk_weight: Array
+    """[risk, piece, joint]."""
+    risk_curve: Array
+    """[risk, knot, 2]; no knots where no risk has a curve."""
+    feasible: Array
+    """Whether an arm can do a kind of job at all, bool [fleet, kind, arm]."""
+    stations: Array
+    """Stations of a kind of job, one bit each, uint64 [fleet, kind + 1, word]; the last row, no job, has none."""
+    payload_kg: Array
+    """[fleet, kind]."""
+    value: Array
+    """[fleet, kind]."""
+
+
+class Jobs(NamedTuple):
+    """What was drawn for the shift of each env."""
+
+    fleet: Array
+    """int [env]."""
+    ambient_offset_k: Array
+    """Added to the ambient temperature of the tables, [env]."""
+    noise_key: Array
+    """Of the sensor noise, uint64 [env]."""
+    number: Array
+    """Number of jobs, int [env]; they come first in their row."""
+    kind: Array
+    """int [env, job]."""
+    release_s: Array
+    """[env, job]."""
+    due_s: Array
+    """[env, job]."""
+    repetitions: Array
+    """int [env, job]."""
+    after: Array
+    """Jobs that must be done first, int [env, job, n], −1 for none."""
+
+
+class OpenJobs(NamedTuple):
+    """Jobs that can be claimed, and what follows from the state but is slow to look up."""
+
+    slot_job: Array
+    """int [env, slot], −1 for an empty slot."""
+    mask: Array
+    """Legal actions, int8 [env, arm, slot + 1]."""
+    unfinished: Array
+    """Jobs not done, int [env]."""
+    queue: Array
+    """Waiting jobs, released or not, by queueing time, int32 [env, job], at the end of each row."""
+    head: Array
+    """Where in its row the queue begins, int [env]."""
+    current_kind: Array
+    """Kind of an arm's current job, int [env, arm]; the number of kinds if it has none."""
+    pending: Array
+    """Whether the current job is still to be finished, bool [env, arm]; False on the way home."""
+
+
+class EventBuffer(NamedTuple):
+    """Events of one step; a buffer without rows records nothing."""
+
+    used: Array
+    """Rows in use, int [1]."""
+    what: Array
+    """Kind (see `fleet.engine.event_log`), env, arm, job, joint, int [row, 5]; −1 for none."""
+    numbers: Array
+    """Seconds into the step, value, [row, 2]."""
+
+
+class Trace(NamedTuple):
+    """How each arm spent the last step; arrays without rows record nothing."""
+
+    mode: Array
+    """At the beginning, with the awards made, int [env, arm]."""
+    plan: Array
+    """Row of the plan tables, int [env, arm]; 0 where there is no job."""
+    progress_s: Array
+    """At the beginning, [env, arm]."""
+    todo: Array
+    """int [env, arm]."""
+    home_s: Array
+    """Seconds into the step at which the arm is free again; inf if not in it, [env, arm]."""
+    cut_s: Array
+    """Seconds the arm moved before a fault stopped it; the whole step if none did, [env, arm]."""
+    heat_w: Array
+    """Until the fault, [env, arm, node]."""
+    start_c: Array
+    """[env, arm, node]."""
+
+
+class MeasuredDrive(NamedTuple):
+    """Heat drive from a plant that computes the motion; without rows the planned drive counts."""
+
+    current_sq: Array
+    """Mean over the step, [env, arm, lane]."""
+    friction_w: Array
+    """Mean over the step, [env, arm, lane]."""
+
+
+class Form(NamedTuple):
+    """A `Layout` as the kernels want it."""
+
+    offsets: Offsets
+    """Where each field begins in the vector."""
+    low: Array
+    """Bounds of the vector, float32 [size]."""
+    high: Array
+    first_change: Array
+    """Where the rows of an arm begin in `change`, int [arm + 1]."""
+    change: Array
+    """Place among the peers and peer, where an arm's peers differ from those of the arm before, int [change, 2]."""
+
+
+class Simulation(NamedTuple):
+    """Everything that a kernel works on."""
+
+    tables: Tables
+    jobs: Jobs
+    state: State
+    offers: OpenJobs
+    events: EventBuffer
+    trace: Trace
+    drive: MeasuredDrive
+    form: Form
+
+
+def form_of(layout: Layout) -> Form:
+    """Every peer of the first arm is a change; in a fleet where each arm observes all others, later arms have one."""
+    changes: list[tuple[int, int]] = []
+    first, shown = [0], [-1] * layout.peers
+    for peers in layout.who.tolist():
+        changes += [(place, arm) for place, arm in enumerate(peers) if shown[place] != arm]
+        first.append(len(changes))
+        shown = peers
+    low, high = layout.bounds
+    return Form(layout.offsets, low, high, np.array(first), np.array(changes, dtype=int).reshape(-1, 2))
+
+
+def tables_of(world: World) -> tuple[Tables, Jobs]:
+    """A world as tables: each env is a fleet of its own, and each job a kind."""
+    envs, jobs = world.envs, world.jobs
+    count = jobs.exists.sum(axis=1)
+    if not np.array_equal(jobs.exists, np.arange(jobs.exists.shape[1]) < count[:, None]):
+        raise ValueError("The jobs of an env must be the first of its row.")
+
+    def per_fleet(values: Array) -> Array:
+        return np.repeat(values[None], envs, axis=0)
+
+    limits, motors, offers, rest = world.limits, world.motors, world.offers, world.rest
+    can = offers.plan >= 0
+    times_s = np.where(can[..., None], world.plans.times_s[offers.plan], 0.0)
+    work = np.zeros(can.shape, WORK)
+    work["travel_s"], work["cycle_s"] = times_s[..., 0] + times_s[..., 2], times_s[..., 1]
+    work["difficulty"], work["p_saturation"], work["risk"] = offers.difficulty, offers.p_saturation, offers.risk
+    risk_offset, risk_weight, risk_curve = _risk_tables(offers.risks)
+    thermal_step = np.concatenate([world.phi, world.gamma], axis=-1).swapaxes(-1, -2)
+    tables = Tables(
+        dt_s=float(world.dt_s),
+        ticks=int(world.ticks),
+        warning_c=float(limits.warning_c),
+        error_c=float(limits.error_c),
+        restart_c=float(limits.restart_c),
+        clear_s=float(limits.clear_s),
+        power_off=bool(limits.power_off_on_fault),
+        alpha_cu_per_k=float(motors.alpha_cu_per_k),
+        alpha_kt_per_k=float(motors.alpha_kt_per_k),
+        reference_c=float(motors.reference_c),
+        ambient_c=per_fleet(world.ambient_c),
+        thermal_step=per_fleet(pad(thermal_step, -1, WIDE)),
+        to_ambient=per_fleet(world.thermal.to_ambient),
+        root_capacity=per_fleet(np.sqrt(world.thermal.capacity)),
+        rates=per_fleet(world.thermal.rates),
+        modes=per_fleet(world.thermal.modes),
+        sensor_noise_k=per_fleet(pad(motors.sensor_noise_k)),
+        copper_w_per_a2=per_fleet(pad(motors.copper_w_per_a2)),
+        idle_w=per_fleet(pad(motors.idle_w)),
+        rest_current_sq=per_fleet(pad(rest.current_sq)),
+        rest_friction_w=per_fleet(pad(rest.friction_w)),
+        start_c=per_fleet(world.start_c),
+        times_s=world.plans.times_s,
+        current_sq=pad(world.plans.current_sq),
+        friction_w=pad(world.plans.friction_w),
+        plan=offers.plan,
+        work=work,
+        risk_offset=risk_offset,
+        risk_weight=risk_weight,
+        risk_curve=risk_curve,
+        feasible=can.swapaxes(-1, -2),
+        stations=_station_bits(jobs.stations, len(world.stations)),
+        payload_kg=jobs.payload_kg,
+        value=jobs.value,
+    )
+    drawn = Jobs(
+        fleet=np.arange(envs),
+        ambient_offset_k=np.zeros(envs),
+        noise_key=np.zeros(envs, np.uint64),
+        number=count,
+        kind=np.repeat(np.arange(jobs.exists.shape[1])[None], envs, axis=0),
+        release_s=jobs.release_s,
+        due_s=jobs.due_s,
+        repetitions=jobs.repetitions,
+        after=jobs.after,
+    )
+    return owned(tables), owned(drawn)
+
+
+def pad(values: Array, axis: int = -1, size: int = LANES, fill: float = 0.0) -> Array:
+    """The values with an axis padded to a size."""
+    width = [(0, 0)] * values.ndim
+    width[axis] = (0, size - values.shape[axis])
+    return np.pad(values, width, constant_values=fill)
+
+
+def _station_bits(stations: Array, count: int) -> Array:
+    """Bits of stations given as int [fleet, kind, n], −1 for none."""
+    fleets, kinds, most = stations.shape
+    bits = np.zeros((fleets, kinds + 1, max(1, -(-count // 64))), np.uint64)
+    for n in range(most):
+        fleet, kind = np.nonzero(stations[..., n] >= 0)
+        station = stations[fleet, kind, n]
+        bits[fleet, kind, station // 64] |= np.uint64(1) << (station % 64).astype(np.uint64)
+    return bits
+
+
+def _risk_tables(risks: Risk | None) -> tuple[Array, Array, Array]:
+    """Offsets, weights and curves of stacked risks; empty axes for what is not there."""
+    if risks is None:
+        return np.empty((0, 1)), np.empty((0, 1, JOINTS)), np.empty((0, 0, 2))
+    curve = np.empty((len(risks.offset), 0, 2)) if risks.curve is None else risks.curve
+    return risks.offset, risks.weight, curve
+
+
+Arrays = TypeVar("Arrays", Tables, Jobs)
+
+
+def owned(arrays: Arrays) -> Arrays:
+    """The same with every array contiguous, writeable and owned."""
+    return arrays._replace(
+        **{name: np.array(v, order="C") for name, v in arrays._asdict().items() if isinstance(v, np.ndarray)}
+    )
+
+
+_SCALARS = tuple(name for name, kind in Tables.__annotations__.items() if kind is not Array)
+_RENUMBERED = ("plan", "risk_offset", "risk_weight", "risk_curve", "stations")
+
+
+def stack_tables(fleets: Sequence[Tables]) -> Tables:
+    """The tables of several fleets as one.
+
+    Raises:
+        ValueError: they differ in what they share: the length of a step or a shift, limits, arms, or kinds of jobs.
+    """
+    first = fleets[0]
+    for other in fleets[1:]:
+        for name in _SCALARS:
+            if getattr(other, name) != getattr(first, name):
+                raise ValueError(
+                    f"Fleets of one batch must agree in {name} ({getattr(first, name)}, {getattr(other, name)})."
+                )
+        for name in ("ambient_c", "plan"):
+            if getattr(other, name).shape != getattr(first, name).shape:
+                raise ValueError(f"Fleets of one batch must have as many arms and kinds of jobs as the first ({name}).")
+    plans = np.cumsum([0, *(len(each.times_s) for each in fleets)])
+    risks = np.cumsum([0, *(len(each.risk_offset) for each in fleets)])
+    pieces = max(each.risk_offset.shape[1] for each in fleets)
+    knots = max(each.risk_curve.shape[1] for each in fleets)
+    words = max(each.stations.shape[2] for each in fleets)
+
+    def shifted(each: Iterable[Array], by: Array) -> Array:
+        return np.concatenate([np.where(v >= 0, v + n, -1) for v, n in zip(each, by, strict=False)])
+
+    joined = {
+        name: np.concatenate([getattr(each, name) for each in fleets])
+        for name in Tables._fields
+        if name not in (*_SCALARS, *_RENUMBERED)
+    }
+    joined["work"]["risk"] = shifted((t.work["risk"] for t in fleets), risks)
+    return owned(
+        first._replace(
+            **joined,
+            plan=shifted((t.plan for t in fleets), plans),
+            risk_offset=np.concatenate([pad(t.risk_offset, 1, pieces, -np.inf) for t in fleets]),
+            risk_weight=np.concatenate([pad(t.risk_weight, 1, pieces) for t in fleets]),
+            risk_curve=np.concatenate([_extend_curve(t.risk_curve, knots) for t in fleets]),
+            stations=np.concatenate([pad(t.stations, 2, words) for t in fleets]),
+        )
+    )
+
+
+def _extend_curve(curve: Array, knots: int) -> Array:
+    """Curves [risk, knot, 2] with more knots: constant beyond the last; NaN where there is no curve."""
+    more = knots - curve.shape[1]
+    if not len(curve):
+        return np.zeros((0, knots, 2))
+    if not more:
+        return curve
+    if not curve.shape[1]:
+        return np.full((len(curve), knots, 2), np.nan)
+    beyond = np.repeat(curve[:, -1:], more, axis=1)
+    beyond[..., 0] = np.where(np.isnan(curve[:, :1, 0]), np.nan, np.inf)
+    return np.concatenate([curve, beyond], axis=1)

@@ -1,0 +1,220 @@
+"""From nouns to arrays: the plan table, the offers of every arm for every job, and the world of a shift."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from fleet.difficulty import Difficulty, DifficultyModel, Risk, stack_risks
+from fleet.engine.state import JobTable, Offers, PlanTable, World
+from fleet.job import Job, Work, precedence
+from fleet.motion import Drive, Plan, drive
+from fleet.motor import Motors, stack_motors
+from fleet.robot import GEN3, Robot, ThermalLimits
+from fleet.thermal import ThermalModel, stack_models, steady_state
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """One arm with everything that is its own."""
+
+    robot: Robot
+    motors: Motors
+    """[joint]."""
+    thermal: ThermalModel
+    rest_tau: Array
+    """Torque that holds the home posture, N·m, [joint]."""
+    model: DifficultyModel
+    """Its twin, or what stands in for it."""
+    plans: Mapping[Work, tuple[Plan, ...]]
+    """Variants per work it can do; a work it cannot do is missing."""
+
+    @cached_property
+    def _offered(self) -> dict[tuple[Work, int], tuple[Plan, Difficulty | None] | None]:
+        return {}
+
+    @cached_property
+    def warm_c(self) -> dict[float, Array]:
+        """Settled temperatures by the air they settled in, as `warm_start` finds them."""
+        return {}
+
+    @cached_property
+    def _driven(self) -> dict[int, tuple[Plan, Array, Array, Array]]:
+        return {}
+
+    def offer(self, work: Work, repetitions: int) -> tuple[Plan, Difficulty | None] | None:
+        """As `best_offer`, asked of its twin once: shift after shift wants the same."""
+        key = (work, repetitions)
+        if key not in self._offered:
+            variants = self.plans.get(work, ())
+            scored = [(plan, self.model.score(plan, repetitions)) for plan in variants]
+            self._offered[key] = min(
+                scored, key=lambda pair: pair[1].total if pair[1] is not None else 0.0, default=None
+            )
+        return self._offered[key]
+
+    def driven(self, plan: Plan) -> tuple[Array, Array, Array]:
+        """Of one of its plans: mean squared current and friction heat, [phase, joint], and largest torques, [joint]."""
+        if id(plan) not in self._driven:  # with the plan itself, so that its id stays its own
+            drives = [drive(phase.profile, self.motors) for phase in plan.phases]
+            peak = np.abs(np.concatenate([phase.profile[:, 2] for phase in plan.phases])).max(axis=0)
+            current_sq, friction_w = (np.array([getattr(d, n) for d in drives]) for n in ("current_sq", "friction_w"))
+            self._driven[id(plan)] = (plan, current_sq, friction_w, peak)
+        return self._driven[id(plan)][1:]
+
+    def rest_drive(self) -> Drive:
+        """Mean heat drive of standing at home, each [joint]."""
+        still = np.stack([self.robot.home_q(), np.zeros_like(self.rest_tau), self.rest_tau])[None]
+        return drive(still, self.motors)
+
+
+def warm_start(arm: Arm, ambient_c: float) -> Array:
+    """Temperatures of an arm that has stood powered at home for hours, °C, [node].
+
+    Raises:
+        ValueError: standing at home alone overheats it.
+    """
+    known = arm.warm_c.get(ambient_c)
+    if known is None:
+        rest = arm.rest_drive()
+        known = steady_state(arm.thermal, rest.current_sq, rest.friction_w, arm.motors, ambient_c)
+    if known is None:
+        raise ValueError(f"Arm '{arm.robot.name}' never settles while standing at home in air of {ambient_c:g} °C.")
+    arm.warm_c[ambient_c] = known
+    return known.copy()
+
+
+def best_offer(arm: Arm, job: Job) -> tuple[Plan, Difficulty | None] | None:
+    """The variant of a job that the arm's twin finds easiest (without a score: the first), or None if it cannot."""
+    return arm.offer(job.work, job.repetitions)
+
+
+def build_world(
+    arms: Sequence[Arm],
+    shifts: Sequence[Sequence[Job]],
+    *,
+    limits: ThermalLimits,
+    dt_s: float,
+    ticks: int,
+    slots: int,
+    ambient_c: Array,
+    start_warm: bool,
+) -> tuple[World, tuple[Plan, ...]]:
+    """The world of one or more parallel shifts, and the plans behind the rows of its plan table.
+
+    Args:
+        shifts: The jobs of each env.
+        ambient_c: Air at each arm during each tick, [tick, arm].
+        start_warm: Arms begin at their idle equilibrium rather than at ambient.
+    """
+    motors, thermal, rest, phi, gamma = _laws(tuple(arms), dt_s)
+    plans, offers = _offers(arms, shifts)
+    start = np.repeat(ambient_c[0][:, None], thermal.capacity.shape[-1], axis=1)
+    if start_warm:
+        start = np.stack([warm_start(a, c) for a, c in zip(arms, ambient_c[0].tolist(), strict=True)])
+    stations = tuple(dict.fromkeys(name for jobs in shifts for job in jobs for name in job.work.stations()))
+    world = World(
+        arms=tuple(arm.robot.name for arm in arms),
+        stations=stations,
+        dt_s=dt_s,
+        ticks=ticks,
+        slots=slots,
+        ambient_c=ambient_c,
+        thermal=thermal,
+        motors=motors,
+        limits=limits,
+        torque_warning=np.array(GEN3.torque_warning),
+        rest=rest,
+        plans=_plan_table(plans, {arm.robot.name: arm for arm in arms}),
+        jobs=_job_table(shifts, stations),
+        offers=offers,
+        start_c=start,
+        phi=phi,
+        gamma=gamma,
+    )
+    return world, plans
+
+
+@lru_cache(maxsize=8)
+def _laws(arms: tuple[Arm, ...], dt_s: float) -> tuple[Motors, ThermalModel, Drive, Array, Array]:
+    """Motors, thermal models and rest of a fleet, [arm, ...], and the matrices of a step: the same in every shift."""
+    thermal, drives = stack_models([arm.thermal for arm in arms]), [arm.rest_drive() for arm in arms]
+    rest = Drive(np.stack([d.current_sq for d in drives]), np.stack([d.friction_w for d in drives]))
+    return stack_motors([arm.motors for arm in arms]), thermal, rest, *thermal.step_matrices(dt_s)
+
+
+def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]]) -> tuple[tuple[Plan, ...], Offers]:
+    shape = (len(shifts), len(arms), max(1, *(len(jobs) for jobs in shifts)))
+    plan, total, p_saturation = np.full(shape, -1), np.full(shape, np.nan), np.full(shape, np.nan)
+    risk = np.full(shape, -1)
+    rows: dict[int, int] = {}
+    plans: list[Plan] = []
+    risks: dict[int, tuple[int, Risk]] = {}
+    for e, jobs in enumerate(shifts):
+        for j, job in enumerate(jobs):
+            for a, arm in enumerate(arms):
+                offer = best_offer(arm, job)
+                if offer is None:
+                    continue
+                best, score = offer
+                if id(best) not in rows:
+                    rows[id(best)] = len(plans)
+                    plans.append(best)
+                plan[e, a, j] = rows[id(best)]
+                if score is not None:
+                    total[e, a, j] = score.total
+                    p_saturation[e, a, j] = np.nan if score.p_saturation is None else score.p_saturation
+                    if score.risk is not None:
+                        risk[e, a, j] = risks.setdefault(id(score.risk), (len(risks), score.risk))[0]
+    stack = stack_risks([r for _, r in risks.values()]) if risks else None
+    return tuple(plans), Offers(plan=plan, difficulty=total, p_saturation=p_saturation, risk=risk, risks=stack)
+
+
+def _plan_table(plans: Sequence[Plan], arms: Mapping[str, Arm]) -> PlanTable:
+    if not plans:
+        joints = len(GEN3.velocity)
+        empty = np.zeros((1, 3, joints))
+        return PlanTable(np.zeros((1, 3)), empty, empty, np.zeros((1, joints)))
+    driven = [arms[plan.arm].driven(plan) for plan in plans]
+    return PlanTable(
+        times_s=np.array([[phase.duration_s for phase in plan.phases] for plan in plans]),
+        current_sq=np.array([current_sq for current_sq, _, _ in driven]),
+        friction_w=np.array([friction_w for _, friction_w, _ in driven]),
+        peak_tau=np.array([peak for _, _, peak in driven], dtype=float),
+    )
+
+
+def _job_table(shifts: Sequence[Sequence[Job]], stations: Sequence[str]) -> JobTable:
+    most = max(1, *(len(jobs) for jobs in shifts))
+    waits = max((len(job.after) for jobs in shifts for job in jobs), default=0) or 1
+    places = max((len(job.work.stations()) for jobs in shifts for job in jobs), default=0) or 1
+    station = {name: i for i, name in enumerate(stations)}
+
+    def padded(value: float, dtype: type = float) -> Array:
+        return np.full((len(shifts), most), value, dtype=dtype)
+
+    table = JobTable(
+        names=tuple(tuple(job.name for job in jobs) for jobs in shifts),
+        exists=padded(False, bool),
+        release_s=padded(np.inf),
+        due_s=padded(np.inf),
+        value=padded(0.0),
+        payload_kg=padded(0.0),
+        repetitions=padded(1, int),
+        after=np.full((len(shifts), most, waits), -1),
+        stations=np.full((len(shifts), most, places), -1),
+    )
+    for e, jobs in enumerate(shifts):
+        precedence(jobs)
+        index = {job.name: j for j, job in enumerate(jobs)}
+        for j, job in enumerate(jobs):
+            table.exists[e, j] = True
+            table.release_s[e, j], table.due_s[e, j], table.value[e, j] = job.release_s, job.due_s, job.value
+            table.payload_kg[e, j], table.repetitions[e, j] = job.work.payload_kg, job.repetitions
+            table.after[e, j, : len(job.after)] = [index[name] for name in job.after]
+            names = job.work.stations()
+            table.stations[e, j, : len(names)] = [station[name] for name in names]
+    return table

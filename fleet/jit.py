@@ -1,0 +1,113 @@
+"""Compile loops with numba, lazily; every function also runs uncompiled, to the same result.
+
+Decorated functions are plain Python over arrays and scalars. Numba is imported, and a kernel compiled, when
+`Kernel.compiled` is first asked for. Compiled code is cached in the user's cache folder from process to process.
+"""
+
+import hashlib
+import logging
+import os
+from collections.abc import Callable
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from fleet.files import user_cache_folder
+
+log = logging.getLogger(__name__)
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+_PACKAGE = Path(__file__).parent
+_OPTIONS: dict[str, Any] = {"error_model": "numpy"}
+_inlined: list[Callable[..., Any]] = []
+_called: list[Callable[..., Any]] = []
+
+
+def jit_inline(function: Function) -> Function:
+    """Compile a function into its compiled callers: passing arrays costs more than most loops."""
+    _inlined.append(function)
+    return function
+
+
+def jit(function: Function) -> Function:
+    """Compile a function that compiled functions seldom call."""
+    _called.append(function)
+    return function
+
+
+@jit_inline
+def nonnegative(index: Any) -> Any:
+    """Return the same index; the compiler then omits the check for negative indices."""
+    return index & 0x7FFFFFFF
+
+
+class Kernel:
+    """A function that Python calls, compiled or not.
+
+    Args:
+        function: Its arguments are arrays, scalars, named tuples of them, and bundles (`fleet.engine.bundle`).
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+        self.__doc__, self.__name__ = function.__doc__, function.__name__
+
+    @cached_property
+    def compiled(self) -> Callable[..., Any]:
+        """The compiled function; the first call in a process loads it, the first on a machine compiles it."""
+        return compile_cached(self._function)
+
+    @cached_property
+    def interpreted(self) -> Callable[..., Any]:
+        """The same in plain Python, without numba."""
+
+        def call(*arguments: Any) -> Any:
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # as compiled: integers wrap around
+                return self._function(*arguments)
+
+        return call
+
+    def chosen(self, compile_it: bool | None = None) -> Callable[..., Any]:
+        """Return `compiled`, or `interpreted` where compiling is not wanted or switched off (NUMBA_DISABLE_JIT=1)."""
+        wanted = os.environ.get("NUMBA_DISABLE_JIT", "0") in ("", "0") if compile_it is None else compile_it
+        return self.compiled if wanted else self.interpreted
+
+
+def kernel(function: Callable[..., Any]) -> Kernel:
+    """Make a function one that Python calls, compiled or not."""
+    return Kernel(function)
+
+
+@cache
+def _cache_of_this_code() -> str:
+    """Cache folder for the present source of all that is compiled together: numba itself looks at one file only."""
+    import numba
+
+    digest = hashlib.sha256(numba.__version__.encode())
+    names = ("jit", "arrivals", "seeding", "motor", "difficulty", "robot", "telemetry", "thermal", "observation")
+    for path in (*(_PACKAGE / f"{name}.py" for name in names), *sorted((_PACKAGE / "engine").glob("*.py"))):
+        digest.update(path.read_bytes())
+    folder = user_cache_folder() / "compiled" / digest.hexdigest()[:16]
+    if not folder.exists():
+        log.warning("Compiling the simulation engine (about 30 s of one core, once); cached in %s.", folder)
+    return str(folder)
+
+
+def compile_cached(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function, and keep its code in the user's cache folder."""
+    from numba import config, njit
+    from numba.extending import register_jitable
+
+    while _inlined:
+        register_jitable(forceinline=True, **_OPTIONS)(_inlined.pop())
+    while _called:
+        register_jitable(**_OPTIONS)(_called.pop())
+    options: Any = config  # numba sets its options by name
+    before, options.CACHE_DIR = options.CACHE_DIR, _cache_of_this_code()
+    try:
+        return njit(function, cache=True, nogil=True, **_OPTIONS)
+    finally:
+        options.CACHE_DIR = before

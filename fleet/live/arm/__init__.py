@@ -1,0 +1,1 @@
+"""A live arm: state, quotes, awards, execution."""

@@ -1,0 +1,399 @@
+"""Award executor: which awards an arm accepts, how far it may work on them, and what it reports.
+
+A state machine without a clock and without I/O: real time is an argument; records go to `keep`, which returns once
+they are on disk. Why no job is done twice is explained in `fleet.bus.protocol.auction`; the arm's part of it:
+
+- an award counts only on a quote of this start of the arm that is still valid, once per job of that quote, and the
+  answer is on disk before it is sent;
+- the arm works on a job up to `allowed_cycles`: to the last cycle while the lease is valid, and through the last one
+  only with permission to commit, which is on disk before the cycle begins;
+- the end of a job is on disk before it is reported, and the report is repeated until it is acknowledged.
+"""
+
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+from fleet.bus.protocol.auction import Ack, Award, JobSpec, Lease, LeaseEntry, LeaseRequest, Receipt, Report
+from fleet.errors import JournalError
+from fleet.live.arm.journal_records import (
+    ActiveAward,
+    ArmHistory,
+    ArmRecord,
+    AwardAccepted,
+    ReportReceived,
+    bounded,
+    closed,
+)
+from fleet.live.journal_records import Closed, CommitPermitted, Progress, Released
+
+_LOG = logging.getLogger(__name__)
+
+Phase = Literal["queued", "working", "finishing"]
+
+CLOCK_DRIFT = 0.01
+"""Clocks may differ in rate by this share; an arm counts its leases shorter by as much."""
+RENEWALS = 3
+"""Lease requests per length of a lease."""
+COMMIT_RETRY_S = 0.3
+"""Real seconds between two requests for permission to commit."""
+REPORT_RETRY_S = (0.5, 8.0)
+"""Real seconds between two sends of the same report, first and at most."""
+MAX_REPORTS = 256
+"""Reports not acknowledged; with more, the arm accepts no work."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExecutorConfig:
+    """Limits and times of an arm's work."""
+
+    capacity: int = 1
+    """Maximum concurrent jobs."""
+    valid_s: float = 5.0
+    """Real seconds during which it accepts an award on a quote."""
+    quotes: int = 64
+    """Quotes kept; an award on an older one is refused."""
+    return_after_s: float = 60.0
+    """Real seconds after the end of a lease at which the arm returns the job."""
+    commit_lead_s: float = 1.0
+    """Real seconds before the last cycle at which the arm requests permission to commit."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not value > 0:
+                raise ValueError(f"ExecutorConfig.{name} must be > 0 (got {value}).")
+
+
+@dataclass(eq=False)
+class _Quote:
+    """A quote on which an award may come."""
+
+    made_s: float
+    jobs: dict[str, tuple[JobSpec, bool]]
+    """Jobs that were asked for, and whether the arm can do each."""
+    answers: dict[str, Ack] = field(default_factory=dict)
+    """Answer to the first award of each job."""
+
+
+@dataclass(eq=False)
+class _PendingReport:
+    """A report that is not acknowledged."""
+
+    auctioneer: str
+    report: Report
+    next_s: float
+    wait_s: float = REPORT_RETRY_S[0]
+
+
+class AwardExecutor:
+    """The awards of one arm.
+
+    Attributes:
+        arm: Name of the arm.
+        config: Limits and times of its work.
+        unwritten: Records for which the disk had no space yet; while there are any, it accepts no award.
+    """
+
+    def __init__(
+        self,
+        arm: str,
+        keep: Callable[..., None],
+        history: ArmHistory,
+        *,
+        nonce: str,
+        config: ExecutorConfig | None = None,
+    ) -> None:
+        """Start.
+
+        Args:
+            keep: Writes records and returns when they are on disk; if it raises a JournalError, none is.
+            history: As `ArmHistory.after_restart` returns it, and on disk.
+            nonce: Different at every start, so that names of quotes stay unique even if the disk was wiped.
+        """
+        self.arm = arm
+        self.config = config or ExecutorConfig()
+        self.unwritten: list[ArmRecord] = []
+        self._keep = keep
+        self._quote_prefix = f"{history.boot}-{nonce}"
+        self._count = 0
+        self._quotes: dict[str, _Quote] = {}
+        self._active: dict[str, ActiveAward] = {}
+        self._accepted = dict(history.accepted)
+        self._reports = {
+            name: _PendingReport(award.auctioneer, report, -math.inf)
+            for name, (award, report) in history.reports.items()
+        }
+        self._asked_s: dict[str, float] = {}
+
+    # Quotes and awards
+
+    @property
+    def spare_capacity(self) -> int:
+        """Number of further jobs it would accept now."""
+        blocked = self.unwritten or len(self._reports) >= MAX_REPORTS
+        return 0 if blocked else max(0, self.config.capacity - len(self._active))
+
+    def add_quote(self, jobs: dict[str, tuple[JobSpec, bool]], now_s: float) -> str:
+        """Register a quote and return its name.
+
+        Args:
+            jobs: By name, each with whether the arm can do it.
+        """
+        self._count += 1
+        name = f"{self._quote_prefix}-{self._count}"
+        self._quotes[name] = _Quote(now_s, jobs)
+        for old, quote in list(self._quotes.items()):
+            if len(self._quotes) > self.config.quotes or now_s > quote.made_s + self.config.valid_s:
+                del self._quotes[old]
+        return name
+
+    def answer_award(self, award: Award, now_s: float, unfit: str = "") -> Ack:
+        """Accept or refuse an award; the same award gets the same answer again.
+
+        Args:
+            unfit: Why the arm can accept no work at all now; "" if it can.
+        """
+        name = award.job.name
+        job = self._accepted.get(award.award)
+        if job is not None:
+            return self._accept(award) if job == name else self._refuse(award, f"this award was for the job '{job}'")
+        quote = self._quotes.get(award.quote)
+        if quote is None:
+            return self._refuse(award, f"no quote '{award.quote}' of mine is still valid")
+        if name not in quote.jobs:
+            return self._refuse(award, f"the quote is not for a job '{name}'")
+        earlier = quote.answers.get(name)
+        if earlier is None:
+            earlier = quote.answers[name] = self._first_answer(award, quote, now_s, unfit)
+        elif earlier.award != award.award:
+            return self._refuse(award, f"that job was awarded on this quote by '{earlier.award}'")
+        return earlier
+
+    def _first_answer(self, award: Award, quote: _Quote, now_s: float, unfit: str) -> Ack:
+        """Answer to the first award of a job on a quote."""
+        lease_end_s = quote.made_s + (1 - CLOCK_DRIFT) * award.lease_s
+        earlier = next((active for active in self._active.values() if active.job == award.job.name), None)
+        reason = self._objection(award, quote, now_s) or unfit
+        if not reason and now_s >= lease_end_s:
+            reason = "its lease has expired"
+        elif not reason and earlier is not None and earlier.may_commit:
+            reason = "I am finishing that job already"
+        elif not reason and earlier is None and not self.spare_capacity:
+            reason = self._why_no_capacity()
+        if reason:
+            return self._refuse(award, reason)
+        records: list[ArmRecord] = [AwardAccepted(award)]
+        if earlier is not None:  # A new award for the job means that the earlier one has ended.
+            records.insert(0, self._release(earlier))
+        try:
+            self._keep(*records)
+        except JournalError as error:
+            return self._refuse(award, f"my journal cannot be written: {error}")
+        if earlier is not None:
+            del self._active[earlier.award.award]
+        self._active[award.award] = ActiveAward(
+            award, award.cycles, lease_end_s, cycles_on_disk=award.cycles, lease_s=award.lease_s
+        )
+        self._accepted[award.award] = award.job.name
+        self._accepted = bounded(self._accepted, [*self._active, *self._reports])
+        self._asked_s.setdefault(award.auctioneer, quote.made_s)
+        return self._accept(award)
+
+    def _objection(self, award: Award, quote: _Quote, now_s: float) -> str:
+        job, feasible = quote.jobs[award.job.name]
+        if self.unwritten:
+            return "my journal has no space left"
+        if job != award.job:
+            return "the job is not the one that the quote was for"
+        if not feasible:
+            return "the quote says that I cannot do it"
+        if now_s > quote.made_s + self.config.valid_s:
+            return f"the quote was valid for {self.config.valid_s:g} s"
+        if award.cycles >= award.job.repetitions:
+            return f"{award.cycles} of {award.job.repetitions} cycles are done: none is left"
+        if any(p.report.job == award.job.name and p.report.outcome == "finished" for p in self._reports.values()):
+            return "I have finished that job"
+        return ""
+
+    def _why_no_capacity(self) -> str:
+        if len(self._reports) >= MAX_REPORTS:
+            return f"{len(self._reports)} of my reports are not acknowledged"
+        return f"I have {len(self._active)} job(s) and accept no more at a time"
+
+    def _accept(self, award: Award) -> Ack:
+        return Ack(arm=self.arm, award=award.award, accepted=True)
+
+    def _refuse(self, award: Award, reason: str) -> Ack:
+        return Ack(arm=self.arm, award=award.award, accepted=False, reason=reason)
+
+    # Work
+
+    @property
+    def active(self) -> tuple[ActiveAward, ...]:
+        """All awards accepted and not closed, the current one first."""
+        return tuple(self._active.values())
+
+    @property
+    def _current(self) -> ActiveAward:
+        return next(iter(self._active.values()))
+
+    def allowed_cycles(self, now_s: float) -> int:
+        """Number of cycles of the current job that may be begun, including those done."""
+        current = self._current
+        if current.may_commit:
+            return current.award.job.repetitions
+        return current.award.job.repetitions - 1 if now_s < current.lease_end_s else current.cycles
+
+    def record_progress(self, cycles: int, last_cycle_in_s: float) -> None:
+        """Update the current job.
+
+        Args:
+            cycles: Done, by any arm.
+            last_cycle_in_s: Real seconds until its last cycle could begin.
+        """
+        self._current.cycles, self._current.last_cycle_in_s = cycles, last_cycle_in_s
+
+    def finish(self, time_s: float, now_s: float) -> None:
+        """Close the current job: its last cycle ended at `time_s`."""
+        current = self._current
+        assert current.may_commit, "the last cycle needs permission to commit"
+        current.cycles = current.award.job.repetitions
+        self._close(current, "finished", time_s, now_s, "")
+
+    def return_all(self, time_s: float, now_s: float, reason: str) -> None:
+        """Return every active award: the arm cannot continue."""
+        for active in self.active:
+            self._close(active, "returned", time_s, now_s, reason)
+
+    def return_expired(self, time_s: float, now_s: float) -> None:
+        """Return the awards whose lease expired more than `return_after_s` ago."""
+        for active in self.active:
+            if not active.may_commit and now_s > active.lease_end_s + self.config.return_after_s:
+                self._close(active, "returned", time_s, now_s, f"no lease for {now_s - active.lease_end_s:.0f} s")
+
+    def _close(
+        self, active: ActiveAward, outcome: Literal["finished", "returned"], time_s: float, now_s: float, reason: str
+    ) -> None:
+        name = active.award.award
+        report = Report(self.arm, name, active.job, outcome, active.cycles, time_s, reason)
+        del self._active[name]
+        self._reports[name] = _PendingReport(active.award.auctioneer, report, now_s)
+        self._write(closed(report))
+
+    # Leases
+
+    def lease_requests(self, now_s: float) -> list[tuple[str, LeaseRequest]]:
+        """Lease requests that are due now, by auctioneer; they count as sent."""
+        due: list[tuple[str, LeaseRequest]] = []
+        auctioneers = dict.fromkeys(active.award.auctioneer for active in self.active)
+        self._asked_s = {name: asked_s for name, asked_s in self._asked_s.items() if name in auctioneers}
+        for auctioneer in auctioneers:
+            mine = [active for active in self.active if active.award.auctioneer == auctioneer]
+            renew_s = self._asked_s.get(auctioneer, -math.inf) + min(active.lease_s for active in mine) / RENEWALS
+            waiting = [active for active in mine if self._phase(active) == "finishing" and not active.may_commit]
+            if now_s < renew_s and all(now_s < active.commit_asked_s + COMMIT_RETRY_S for active in waiting):
+                continue
+            self._asked_s[auctioneer] = now_s
+            for active in waiting:
+                active.commit_asked_s = now_s
+            due.append((auctioneer, LeaseRequest(arm=self.arm, entries=self.lease_entries(auctioneer))))
+        return due
+
+    def lease_entries(self, auctioneer: str) -> tuple[LeaseEntry, ...]:
+        """Active awards of an auctioneer, as its lease request names them."""
+        return tuple(self._lease_entry(active) for active in self.active if active.award.auctioneer == auctioneer)
+
+    def apply_lease(self, lease: Lease, asked_s: float) -> None:
+        """Apply the answer to a request that was made at the real second `asked_s`."""
+        lease_end_s = asked_s + (1 - CLOCK_DRIFT) * lease.lease_s
+        for active in self.active:
+            name = active.award.award
+            if active.award.auctioneer != lease.auctioneer:
+                continue
+            if name in lease.may_commit and not active.may_commit:
+                try:
+                    self._keep(CommitPermitted(name))
+                except JournalError as error:
+                    _LOG.warning("Permission to commit '%s' could not be written: %s", active.job, error)
+                else:
+                    active.may_commit = True
+            if name in lease.revoked and not active.may_commit:  # Permission to commit cannot be withdrawn.
+                del self._active[name]
+                self._write(self._release(active))
+            elif name in lease.granted:
+                active.lease_end_s, active.lease_s = max(active.lease_end_s, lease_end_s), lease.lease_s
+
+    def _release(self, active: ActiveAward) -> Released:
+        return Released(active.award.award, active.job, self.arm)
+
+    def _phase(self, active: ActiveAward) -> Phase:
+        if active is not self._current:
+            return "queued"
+        # A job of one cycle begins only with permission to commit, however far the way to its place is.
+        only_last = active.cycles >= active.award.job.repetitions - 1
+        near = active.last_cycle_in_s <= self.config.commit_lead_s
+        return "finishing" if active.may_commit or only_last or near else "working"
+
+    def _lease_entry(self, active: ActiveAward) -> LeaseEntry:
+        """Entry of a lease request: it names no more cycles than are on disk."""
+        if active.cycles_on_disk != active.cycles:
+            try:
+                self._keep(Progress(active.job, active.cycles))
+            except JournalError as error:
+                _LOG.warning("The cycles of '%s' could not be written: %s", active.job, error)
+            else:
+                active.cycles_on_disk = active.cycles
+        return LeaseEntry(active.award.award, active.job, active.cycles_on_disk, self._phase(active))
+
+    # Reports
+
+    def due_reports(self, now_s: float) -> list[tuple[str, Report]]:
+        """Reports to send now, by auctioneer, each of which is on disk; they count as sent."""
+        unwritten = self._unwritten_reports()
+        due: list[tuple[str, Report]] = []
+        for name, pending in self._reports.items():
+            if pending.next_s <= now_s and name not in unwritten:
+                pending.next_s = now_s + pending.wait_s
+                pending.wait_s = min(2 * pending.wait_s, REPORT_RETRY_S[1])
+                due.append((pending.auctioneer, pending.report))
+        return due
+
+    def pending_reports(self) -> tuple[tuple[Report, bool], ...]:
+        """Every report that is not acknowledged, and whether it is on disk."""
+        unwritten = self._unwritten_reports()
+        return tuple((pending.report, name not in unwritten) for name, pending in self._reports.items())
+
+    @property
+    def has_pending_reports(self) -> bool:
+        """Whether a report is not acknowledged."""
+        return bool(self._reports)
+
+    def apply_receipt(self, receipt: Receipt) -> None:
+        """Forget the report that the auctioneer acknowledges."""
+        pending = self._reports.get(receipt.award)
+        if pending is not None and pending.auctioneer == receipt.auctioneer:
+            del self._reports[receipt.award]
+            self._write(ReportReceived(receipt.award))
+
+    # The disk
+
+    def _unwritten_reports(self) -> set[str]:
+        return {record.award for record in self.unwritten if isinstance(record, Closed)}
+
+    def _write(self, record: ArmRecord) -> None:
+        """Write what has already happened; without space on the disk, later."""
+        self.unwritten.append(record)
+        self.retry_writes()
+
+    def retry_writes(self) -> None:
+        """Write the records for which there was no space."""
+        if not self.unwritten:
+            return
+        try:
+            self._keep(*self.unwritten)
+        except JournalError as error:
+            _LOG.warning("%d record(s) not written yet: %s", len(self.unwritten), error)
+        else:
+            self.unwritten.clear()

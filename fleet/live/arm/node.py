@@ -1,0 +1,347 @@
+"""An arm on the bus: publishes its state, quotes jobs, accepts awards and executes them in fleet time.
+
+One thread runs it. Planning a new motion takes some 50 ms, which must not delay its state messages: a reply plans for
+at most `PLANNING_S`, publishes the state between two plans, and calls the remaining jobs `NOT_PLANNED`; these are
+planned later, one motion per step, so that the next request finds them planned.
+"""
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fleet.bus.client.client import BusClient, Refused
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import Ack, ArmEvent, Award, JobEstimate, JobSpec, Quote, QuoteRequest
+from fleet.bus.protocol.messages import DifficultyScores, Info, State
+from fleet.bus.protocol.registry import STATE_HZ
+from fleet.events import Event
+from fleet.live.arm.auctioneer_client import AuctioneerClient, LiveArm, RateLimitedWarnings, WorkSource
+from fleet.live.arm.award_executor import AwardExecutor
+from fleet.live.arm.body import Body
+from fleet.live.arm.estimator import Estimator
+from fleet.live.arm.journal_records import ActiveAward
+from fleet.live.clock import FleetClock, next_due_s
+
+PLANNING_S = 0.3
+"""Real seconds that one reply may spend on planning."""
+MAX_UNPLANNED = 256
+"""Jobs that wait to be planned."""
+WRITE_RETRY_S = 1.0
+"""Real seconds between two attempts to write records for which the disk had no space."""
+EVENTS_PER_BOOT = 1_000_000_000
+"""The number of an event is the boot number times this, plus a count."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmConfig:
+    """How an arm takes part in the fleet."""
+
+    warning_c: float
+    """Motor temperature above which it accepts no work."""
+    rate_hz: float = STATE_HZ
+    """State messages per real second."""
+    boot: int = 1
+    """Number of this start."""
+    ambient_c: Callable[[float], float] = lambda time_s: 25.0
+    """Measured ambient temperature of the cell by fleet time."""
+    takes_jobs: bool = True
+
+    def __post_init__(self) -> None:
+        if not 0 < self.rate_hz <= 1000:
+            raise ValueError(f"ArmConfig.rate_hz must be > 0 and <= 1000 (got {self.rate_hz:g}).")
+
+
+class ArmNode:
+    """One arm of a fleet.
+
+    Attributes:
+        clock: Fleet time, as the arm keeps it.
+        lag_s: Fleet seconds by which the body was behind at the last step.
+        executor: The awards of the arm.
+        link: Its connection to the bus.
+        work_source: Where its work comes from.
+    """
+
+    def __init__(
+        self,
+        link: BusClient,
+        body: Body,
+        executor: AwardExecutor,
+        estimator: Estimator,
+        clock: FleetClock,
+        config: ArmConfig,
+        work_source: Callable[[LiveArm], WorkSource] = AuctioneerClient,
+    ) -> None:
+        """Join the fleet; `link` is open."""
+        self.link, self.clock, self.executor, self.lag_s = link, clock, executor, 0.0
+        self._body, self._estimator, self._config = body, estimator, config
+        self._name = executor.arm
+        self._body_award = ""
+        """Award that the body works on."""
+        self._unplanned: deque[JobSpec] = deque(maxlen=MAX_UNPLANNED)
+        self._reading = body.read_sensors()
+        self._tick = self._events = 0
+        self._state_due_s = self._retry_s = -math.inf
+        """Real seconds at which the next state message and the next attempt to write are due."""
+        self._warn = RateLimitedWarnings(self._name)
+        self.work_source = work_source(self)
+        self._declare()
+
+    def serve(self, until_s: float) -> None:
+        """Handle messages and run the arm until `time.monotonic()` is `until_s`, or slightly less."""
+        self.link.serve(-math.inf if self._unplanned else min(until_s, self._state_due_s, self.work_source.wake_s))
+        self._step()
+        if self._unplanned:
+            self._estimator.prepare(self._unplanned.popleft())
+
+    def retire(self, until_s: float) -> None:
+        """Return all awards, and report them until they are acknowledged or `time.monotonic()` is `until_s`."""
+        self._config = replace(self._config, takes_jobs=False)
+        self.executor.return_all(self._body.time_s, time.monotonic(), "the arm was stopped")
+        while self.executor.has_pending_reports and time.monotonic() < until_s:
+            self.serve(until_s)
+
+    # Requests
+
+    def _declare(self) -> None:
+        link, fleet, name = self.link, self.link.fleet, self._name
+        self._publish_state = link.publisher(keys.of_arm(fleet, name, "state"), State)
+        self._publish_difficulty = link.publisher(keys.of_arm(fleet, name, "difficulty"), DifficultyScores)
+        self._publish_event = link.publisher(keys.of_arm(fleet, name, "event"), ArmEvent)
+        self._publish_info = link.publisher(keys.of_arm(fleet, name, "info"), Info)  # holds the last one
+        self._publish_info(Info(name, len(self._reading.temp_c), self._estimator.model.version))
+        link.reply_to(keys.of_arm(fleet, name, "quote"), QuoteRequest, self._quote)
+        link.reply_to(keys.of_arm(fleet, name, "award"), Award, self._award)
+        link.declare_token(keys.of_arm(fleet, name, "alive"))
+        self._step()
+
+    def _quote(self, request: QuoteRequest) -> Quote:
+        jobs = {job.name: job for job in request.jobs}
+        if len(jobs) != len(request.jobs):
+            raise Refused("The request names a job twice.")
+        estimates = self.estimate(request.jobs)
+        real_s = time.monotonic()
+        name = ""
+        if not request.dry_run:
+            feasible = {estimate.job: (jobs[estimate.job], estimate.feasible) for estimate in estimates}
+            name = self.executor.add_quote(feasible, real_s)
+            self.publish_difficulty(estimates, real_s)
+        return Quote(
+            arm=self._name,
+            auction=request.auction,
+            quote=name,
+            valid_s=self.executor.config.valid_s,
+            twin=self._estimator.model.version,
+            time_s=self.clock.now_s(real_s),
+            mode=self._reading.mode,
+            headroom_k=self._headroom_k,
+            capacity=0 if self.unfit() or self.work_source.objection else self.executor.spare_capacity,
+            estimates=estimates,
+        )
+
+    def estimate(self, jobs: tuple[JobSpec, ...]) -> tuple[JobEstimate, ...]:
+        """Estimate what jobs would cost the arm now; those that cannot be planned in time are called `NOT_PLANNED`."""
+        until_s = time.monotonic() + PLANNING_S
+        for job in jobs:
+            if self._estimator.is_prepared(job):
+                continue
+            if time.monotonic() < until_s:
+                self._estimator.prepare(job)
+                self._step()
+            else:
+                self._unplanned.append(job)
+        ambient_c = self._config.ambient_c(self.clock.now_s(time.monotonic()))
+        return self._estimator.estimate(jobs, np.array(self._reading.temp_c), ambient_c, self._busy_s())
+
+    def publish_difficulty(self, estimates: tuple[JobEstimate, ...], real_s: float) -> None:
+        """Publish how difficult jobs are for the arm."""
+        self._publish_difficulty(
+            DifficultyScores(
+                arm=self._name,
+                tick=self._tick,
+                time_s=self.clock.now_s(real_s),
+                twin=self._estimator.model.version,
+                jobs=tuple(estimate.job for estimate in estimates),
+                difficulty=tuple(estimate.difficulty for estimate in estimates),
+                p_saturation=tuple(estimate.p_saturation for estimate in estimates),
+            )
+        )
+
+    def _award(self, award: Award) -> Ack:
+        if self.work_source.objection:
+            raise Refused(self.work_source.objection)
+        return self.answer_award(award, time.monotonic())
+
+    def answer_award(self, award: Award, real_s: float) -> Ack:
+        """Accept or refuse an award."""
+        before = len(self.executor.active)
+        ack = self.executor.answer_award(award, real_s, self.unfit())
+        if ack.accepted and len(self.executor.active) > before:
+            scored = self._estimator.best_plan(award.job)
+            score = None if scored is None or scored.difficulty is None else scored.difficulty.total
+            self._report_event(Event(time_s=self._body.time_s, kind="award", job=award.job.name), score)
+        return ack
+
+    def unfit(self) -> str:
+        """Why the arm accepts no work now; "" if it does."""
+        if not self._config.takes_jobs:
+            return "I take no jobs"
+        if self._reading.mode == "faulted":
+            return "I am faulted"
+        if self._headroom_k <= 0:
+            return f"I am too hot: a motor is {-self._headroom_k:.1f} K above the warning limit"
+        return ""
+
+    # One step
+
+    def _step(self) -> None:
+        real_s = time.monotonic()
+        if real_s >= self._retry_s:
+            self._retry_s = real_s + WRITE_RETRY_S
+            self.executor.retry_writes()
+        self._advance_body(real_s)
+        self.executor.return_expired(self._body.time_s, real_s)
+        for auctioneer, request in self.executor.lease_requests(real_s):
+            self.work_source.request_leases(auctioneer, request, real_s)
+        for auctioneer, report in self.executor.due_reports(real_s):
+            self.work_source.send_report(auctioneer, report)
+        self.work_source.step(real_s)
+        if real_s >= self._state_due_s:
+            self._state_due_s = next_due_s(self._state_due_s, real_s, 1.0 / self._config.rate_hz)
+            self._send_state()
+
+    @property
+    def _current(self) -> ActiveAward | None:
+        return next(iter(self.executor.active), None)
+
+    def _advance_body(self, real_s: float) -> None:
+        """Advance the body to the present, as far as leases allow."""
+        now_s, current = self.clock.now_s(real_s), self._current
+        self._assign(current)
+        if current is not None and not current.may_commit and current.lease_end_s < real_s:
+            # Work done within the lease counts, even if this process was stopped since.
+            lease_end_s = math.nextafter(current.lease_end_s, -math.inf)
+            self._advance(self.clock.now_s(lease_end_s), current, lease_end_s, real_s)
+            current = self._current
+        self._advance(now_s, current, real_s, real_s)
+        self.lag_s = now_s - self._body.time_s
+        if self.lag_s > 2.0 * self.clock.speed:
+            self._warn("lag", f"is {self.lag_s:.1f} s of fleet time behind.")
+
+    def _assign(self, current: ActiveAward | None) -> None:
+        """Have the body release a job that is no longer the arm's own, and start the current one."""
+        name = "" if current is None else current.award.award
+        if self._body_award not in ("", name):
+            self._body.release()
+            self._body_award = ""
+        if current is None or not self._body.is_free:
+            return
+        job, scored = self._estimator.job(current.award.job), self._estimator.best_plan(current.award.job)
+        assert job is not None, "an award of an infeasible job is refused"
+        assert scored is not None, "an award of an infeasible job is refused"
+        self._body.start(job, scored.plan, current.cycles)
+        self._body_award = name
+
+    def _advance(self, until_s: float, current: ActiveAward | None, leased_s: float, real_s: float) -> None:
+        if current is not None and self._body_award == current.award.award:
+            allowed = self.executor.allowed_cycles(leased_s)
+            if self._waits_to_commit(current, real_s):
+                allowed = current.cycles  # leaving home just to come back for the last cycle would be wasted
+            self._body.allow_cycles(allowed)
+        for event in self._body.advance(until_s):
+            self._handle_event(event, real_s)
+        if self._reading.mode == "faulted" and self.executor.active:
+            self.executor.return_all(self._body.time_s, real_s, "the arm is faulted")
+            self._body_award = ""
+        if current := self._current:
+            at_work = self._body_award == current.award.award and self._body.job
+            cycles = self._body.cycles if at_work else current.cycles
+            self.executor.record_progress(cycles, self._last_cycle_in_s(current) / self.clock.speed)
+
+    def _waits_to_commit(self, current: ActiveAward, real_s: float) -> bool:
+        """Whether the arm is at home, its last cycle is near, and permission to commit may arrive at any moment."""
+        near = current.last_cycle_in_s <= self.executor.config.commit_lead_s and not current.may_commit
+        return near and self._reading.mode != "working" and real_s < current.lease_end_s
+
+    def _last_cycle_in_s(self, current: ActiveAward) -> float:
+        """Fleet seconds until the last cycle of the current job could begin."""
+        if self._body_award == current.award.award:
+            return self._body.last_cycle_in_s()
+        scored = self._estimator.best_plan(current.award.job)
+        if scored is None:
+            return math.inf
+        left, plan = current.award.job.repetitions - 1 - current.cycles, scored.plan
+        return self._body.free_in_s() + plan.approach.duration_s + left * plan.cycle.duration_s
+
+    def _handle_event(self, event: Event, real_s: float) -> None:
+        """Update the awards after an event of the body, and publish it."""
+        if event.kind == "finish":
+            self._body_award = ""
+            self.executor.finish(event.time_s, real_s)
+        elif event.kind == "return":
+            self._body_award = ""
+            self.executor.record_progress(int(event.value), math.inf)
+            self.executor.return_all(event.time_s, real_s, f"the arm faulted; {event.reason}")
+            self._reading = self._body.read_sensors()  # estimates from now on know of the fault
+        self._report_event(event)
+
+    def _busy_s(self) -> float:
+        """Fleet seconds until the arm has finished all its jobs."""
+        busy_s = self._body.free_in_s()
+        for active in self.executor.active:
+            scored = self._estimator.best_plan(active.award.job)
+            if active.award.award != self._body_award and scored is not None:
+                busy_s += scored.plan.duration_s(active.award.job.repetitions - active.cycles)
+        return busy_s
+
+    @property
+    def _headroom_k(self) -> float:
+        return self._config.warning_c - max(self._reading.temp_c)
+
+    # Publishing
+
+    def _send_state(self) -> None:
+        self._reading = reading = self._body.read_sensors()
+        self._tick += 1
+        state = State(
+            arm=self._name,
+            tick=self._tick,
+            time_s=self._body.time_s,
+            mode=reading.mode,
+            temp_c=reading.temp_c,
+            headroom_k=self._headroom_k,
+            job=next((active.job for active in self.executor.active), ""),
+            q=reading.q,
+            qd=reading.qd,
+            tau=reading.tau,
+            current_a=reading.current_a,
+        )
+        self._publish_state(state)
+
+    def _report_event(self, event: Event, value: float | None = None) -> None:
+        self._events += 1
+        value = event.value if value is None and math.isfinite(event.value) else value
+        self._publish_event(
+            ArmEvent(
+                arm=self._name,
+                number=self._config.boot * EVENTS_PER_BOOT + self._events,
+                time_s=event.time_s,
+                kind=event.kind,
+                job=event.job,
+                joint=event.joint,
+                value=value,
+                reason=event.reason,
+            )
+        )
+
+    def set_clock(self, clock: FleetClock, *, jump: bool = False) -> None:
+        """Use another clock; with `jump` it reads another time now, and the body is set to that time."""
+        if clock.speed != self.clock.speed:
+            self._body.set_step(clock.speed / self._config.rate_hz)
+        self.clock = clock
+        if jump:
+            self._body.set_time(clock.now_s(time.monotonic()))

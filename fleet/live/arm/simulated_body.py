@@ -1,0 +1,333 @@
+"""Simulated body of one live arm.
+
+It steps the engine of the simulator, `fleet.engine.step`, in a world of one arm and its current job. A job is done in
+stints: the arm leaves home, does the cycles that it is allowed, and returns home. The allowed cycles can grow during a
+stint, so a job that is allowed to its end is one stint, as in a simulated shift.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import ceil, floor
+from typing import Literal
+
+import numpy as np
+
+from fleet.difficulty import Blind
+from fleet.engine.profile_plant import ProfilePlant, telemetry_of
+from fleet.engine.shift import StepRecord, step
+from fleet.engine.state import DONE, State, World, initial
+from fleet.engine.step import ROUNDING_S
+from fleet.engine.world import Arm, build_world
+from fleet.events import Event
+from fleet.job import Job
+from fleet.live.arm.body import SensorReading
+from fleet.motion import Plan
+from fleet.motor import current
+from fleet.robot import ThermalLimits
+from fleet.telemetry import FAULTED, MODES, WORKING
+from fleet.thermal import HOUSING, WINDING
+
+Array = np.ndarray
+
+MAX_STEPS = 200
+"""Steps per call: a body that is far behind catches up gradually."""
+_REPORTED = ("torque_warning", "home", "warning", "fault", "recover")
+"""Events of the engine that a live arm reports unchanged."""
+_CARRIED = (
+    "tick",
+    "temp_c",
+    "mode",
+    "clear_at_s",
+    "faults",
+    "peak_c",
+    "above_warning_s",
+    "busy_s",
+    "lost_s",
+    "energy_j",
+)
+"""Fields of the state that are kept when the job changes."""
+
+
+@dataclass(eq=False)
+class _Current:
+    """The current job."""
+
+    job: Job
+    plan: Plan
+    before: int
+    """Cycles done before this stint."""
+    allowed: int
+    """Cycles that may be begun, including those done."""
+    released: bool = False
+    """Finished or released: only the way home is left."""
+
+
+class SimulatedBody:
+    """One arm of the simulator in real time.
+
+    Args:
+        arm: True parameters of the arm; its plans and its model are not used.
+        ambient_c: Ambient temperature at the arm, °C, by fleet time.
+        dt_s: Length of a step, fleet seconds.
+        max_dt_s: Upper limit of the length of a step.
+        time_s: Fleet time at the start.
+        warm: Whether it has been powered at home for hours; else all is at ambient temperature.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        limits: ThermalLimits,
+        ambient_c: Callable[[float], float],
+        *,
+        dt_s: float,
+        rng: np.random.Generator,
+        max_dt_s: float = np.inf,
+        time_s: float = 0.0,
+        warm: bool = True,
+    ) -> None:
+        if not (dt_s > 0 and max_dt_s > 0):
+            raise ValueError(f"SimulatedBody.dt_s and max_dt_s must be > 0 (got {dt_s}, {max_dt_s}).")
+        self._arm, self._limits, self._ambient_c, self._rng = arm, limits, ambient_c, rng
+        self._dt_s, self._max_dt_s = min(dt_s, max_dt_s), max_dt_s
+        self._start_s = time_s
+        self._task: _Current | None = None
+        self._world, self._plant = self._build_world(None, warm=warm)
+        self._state = initial(self._world)
+        self._last: tuple[World, StepRecord] | None = None
+
+    # Properties
+
+    @property
+    def time_s(self) -> float:
+        """Simulated up to this fleet time."""
+        return self._start_s + float(self._state.tick[0]) * self._dt_s
+
+    @property
+    def job(self) -> str:
+        """Name of the current job; "" for none."""
+        return "" if self._task is None or self._task.released else self._task.job.name
+
+    @property
+    def is_free(self) -> bool:
+        """Whether it is at home, not faulted, and without a job."""
+        return self._task is None and self._state.mode[0, 0] not in (WORKING, FAULTED)
+
+    @property
+    def cycles(self) -> int:
+        """Cycles of the current job that are done, by any arm."""
+        assert self._task is not None, "no current job"
+        return self._task.before + self._begun(done=True)
+
+    @property
+    def truth(self) -> State:
+        """State of the simulator, for tests only."""
+        return self._state
+
+    def last_cycle_in_s(self) -> float:
+        """Seconds until the last cycle of the current job could begin; inf without a job."""
+        task = self._task
+        if task is None or task.released or self._faulted:
+            return np.inf
+        last = task.job.repetitions - 1
+        if self._in_stint:
+            approach_s, cycle_s, _ = self._times_s
+            return max(0.0, approach_s + (last - task.before) * cycle_s - self._progress_s)
+        return self._home_in_s + task.plan.approach.duration_s + (last - self.cycles) * task.plan.cycle.duration_s
+
+    def free_in_s(self) -> float:
+        """Seconds until it could be free if it may do all of the current job; inf while it is faulted."""
+        if self._faulted:
+            return np.inf
+        last_s = self.last_cycle_in_s()
+        if self._task is None or not np.isfinite(last_s):
+            return self._home_in_s
+        return last_s + self._task.plan.cycle.duration_s + self._task.plan.retreat.duration_s
+
+    def read_sensors(self) -> SensorReading:
+        """Return the present sensor values."""
+        if self._last is None:
+            still = np.zeros_like(self._arm.rest_tau)
+            temp_c, motors, tau = self._state.temp_c[0, 0], self._arm.motors, self._arm.rest_tau
+            noisy_c = temp_c[WINDING] + motors.sensor_noise_k * self._rng.standard_normal(still.shape)
+            values = (noisy_c, self._arm.robot.home_q(), still, tau, current(tau, still, temp_c[HOUSING], motors))
+            return SensorReading("idle", *(tuple(v.tolist()) for v in values))
+        world, record = self._last
+        end_s = np.array([world.dt_s])
+        motion = self._plant.motion(world, record, end_s)
+        said = telemetry_of(world, record, end_s, motion, self._rng.standard_normal((1, 1, 1, motion.shape[-1])))
+        values = (said.temp_c, said.q, said.qd, said.tau, said.current_a)
+        return SensorReading(MODES[self._state.mode[0, 0]], *(tuple(value[0, 0].tolist()) for value in values))
+
+    # Commands
+
+    def start(self, job: Job, plan: Plan, cycles: int) -> None:
+        """Take a job of which `cycles` are done; it must be free. Nothing moves before `allow_cycles`."""
+        if not self.is_free:
+            raise ValueError(f"Arm '{self._arm.robot.name}' is not free and cannot start '{job.name}'.")
+        if not 0 <= cycles < job.repetitions:
+            raise ValueError(f"cycles must be 0 to {job.repetitions - 1} for '{job.name}' (got {cycles}).")
+        self._task = _Current(job, plan, cycles, allowed=cycles)
+        self._world, self._plant = self._build_world(self._task)
+        self._state = self._carried(self._world)
+
+    def allow_cycles(self, cycles: int) -> None:
+        """Limit the cycles of the current job that may be begun, including those done; one in progress is finished."""
+        if self._task is not None and not self._task.released:
+            self._task.allowed = min(cycles, self._task.job.repetitions)
+
+    def release(self) -> None:
+        """Finish the cycle, return home, release the job."""
+        if self._task is not None:
+            self._task.allowed, self._task.released = 0, True
+            if not self._working:
+                self._task = None
+
+    def set_time(self, time_s: float) -> None:
+        """Set the fleet time without advancing."""
+        self._start_s += time_s - self.time_s
+
+    def set_step(self, dt_s: float) -> None:
+        """Set the length of a step, fleet seconds, up to `max_dt_s`."""
+        time_s, ticks, dt_s = self.time_s, float(self._state.tick[0]), min(dt_s, self._max_dt_s)
+        phi, gamma = self._world.thermal.step_matrices(dt_s)
+        # The engine counts its time in ticks of the new length.
+        clear_at_s = self._state.clear_at_s + ticks * (dt_s - self._dt_s)
+        self._world = replace(self._world, dt_s=dt_s, phi=phi, gamma=gamma)
+        self._state = self._state._replace(clear_at_s=clear_at_s)
+        self._dt_s = dt_s
+        self.set_time(time_s)
+
+    def advance(self, until_s: float) -> list[Event]:
+        """Simulate up to a fleet time, at most `MAX_STEPS` steps; the events `finish` and `return` end the job."""
+        events: list[Event] = []
+        steps = int((until_s - self.time_s) / self._dt_s + 1e-6)
+        for _ in range(min(max(steps, 0), MAX_STEPS)):
+            events += self._step()
+        return events
+
+    # One step
+
+    def _step(self) -> list[Event]:
+        task, log, shift_s = self._task, list[Event](), self._start_s
+        ambient_c = self._ambient_c(self.time_s + 0.5 * self._dt_s)
+        if ambient_c != self._world.ambient_c[0, 0]:
+            self._world = replace(self._world, ambient_c=np.array([[ambient_c]]))
+        leaves = task is not None and self._prepare_stint(task)
+        done = step(self._world, self._state, np.array([[int(leaves)]]), self._plant, log, compiled=False)
+        self._last, self._state = (self._world, done.record), done.state
+        events = [replace(e, time_s=e.time_s + shift_s) for e in log if e.kind in _REPORTED]
+        return events if task is None else events + self._job_events(task, int(done.record.todo[0, 0]), log, shift_s)
+
+    def _prepare_stint(self, task: _Current) -> bool:
+        """Apply the allowed cycles to the next step; return whether the arm leaves home in it."""
+        state = self._state
+        if self._faulted:
+            return False
+        if not self._working:
+            if task.allowed <= task.before:
+                return False
+            table = replace(self._world.jobs, repetitions=np.array([[task.allowed - task.before]]))
+            self._world = replace(self._world, jobs=table)
+            self._state = self._carried(self._world)
+            return True
+        if self._in_stint:
+            todo = max(task.allowed - task.before, self._begun())
+            if todo != state.todo[0, 0]:
+                self._state = state._replace(todo=np.array([[todo]]))
+        return False
+
+    def _job_events(self, task: _Current, done: int, log: list[Event], shift_s: float) -> list[Event]:
+        """Return the events of the current job in a step; drop the job where it ended.
+
+        Args:
+            done: Cycles of the stint, if it ended.
+        """
+        events: list[Event] = []
+        for each in log:
+            at_s = each.time_s + shift_s
+            if each.kind == "finish":
+                task.before += done
+                if task.before == task.job.repetitions and not task.released:
+                    late_s = max(0.0, at_s - task.job.due_s)
+                    text = f"late by {late_s:.0f} s" if late_s else "on time"
+                    events.append(self._event(task, at_s, "finish", late_s, text))
+                    task.released = True
+            elif each.kind == "home":
+                if task.released:
+                    self._task = None
+            elif each.kind == "fault":
+                kept = next((int(e.value) for e in log if e.kind == "return"), 0)
+                if not task.released:
+                    cycles = task.before + kept
+                    text = f"{cycles} of {task.job.repetitions} cycles kept"
+                    events.append(self._event(task, at_s, "return", float(cycles), text))
+                self._task = None
+        return events
+
+    def _event(
+        self, task: _Current, at_s: float, kind: Literal["finish", "return"], value: float, reason: str
+    ) -> Event:
+        name = self._arm.robot.name
+        return Event(time_s=at_s, kind=kind, arm=name, job=task.job.name, value=value, reason=reason)
+
+    # Arrays of the engine
+
+    def _build_world(self, task: _Current | None, *, warm: bool = False) -> tuple[World, ProfilePlant]:
+        plans = {} if task is None else {task.job.work: (task.plan,)}
+        jobs = [] if task is None else [replace(task.job, release_s=0.0, due_s=np.inf, after=())]
+        world, rows = build_world(
+            [replace(self._arm, model=Blind(), plans=plans)],
+            [jobs],
+            limits=self._limits,
+            dt_s=self._dt_s,
+            ticks=1,
+            slots=1,
+            ambient_c=np.array([[self._ambient_c(self._start_s)]]),
+            start_warm=warm,
+        )
+        return world, ProfilePlant(rows, self._arm.robot.home_q()[None], self._arm.rest_tau[None])
+
+    def _carried(self, world: World) -> State:
+        """State at home before a stint, with temperatures and counters of the present state."""
+        return initial(world)._replace(**{name: getattr(self._state, name).copy() for name in _CARRIED})
+
+    @property
+    def _faulted(self) -> bool:
+        return bool(self._state.mode[0, 0] == FAULTED)
+
+    @property
+    def _working(self) -> bool:
+        return bool(self._state.mode[0, 0] == WORKING)
+
+    @property
+    def _in_stint(self) -> bool:
+        """Whether it is at work, and not yet on its way home."""
+        return self._working and bool(self._state.status[0, 0] != DONE)
+
+    @property
+    def _progress_s(self) -> float:
+        return float(self._state.progress_s[0, 0])
+
+    @property
+    def _times_s(self) -> tuple[float, float, float]:
+        """Durations of approach, cycle and retreat."""
+        approach, cycle, retreat = self._world.plans.times_s[0].tolist()
+        return approach, cycle, retreat
+
+    def _begun(self, *, done: bool = False) -> int:
+        """Cycles of this stint that were begun, or with `done` those that are complete."""
+        if not self._in_stint:
+            return 0
+        approach_s, cycle_s, _ = self._times_s
+        count = (self._progress_s - approach_s) / cycle_s
+        whole = floor(count + ROUNDING_S) if done else ceil(count - ROUNDING_S)
+        return min(max(whole, 0), int(self._state.todo[0, 0]))
+
+    @property
+    def _home_in_s(self) -> float:
+        """Seconds until it is home if this stint is not extended."""
+        if not self._working:
+            return 0.0
+        approach_s, cycle_s, retreat_s = self._times_s
+        return max(0.0, approach_s + float(self._state.todo[0, 0]) * cycle_s + retreat_s - self._progress_s)

@@ -1,0 +1,1 @@
+"""The auctioneer: rounds, ledger, leases."""

@@ -1,0 +1,1 @@
+"""Allocation without an auctioneer: claims granted by a majority of the arms."""

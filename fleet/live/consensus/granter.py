@@ -1,0 +1,284 @@
+"""What an arm grants to its peers.
+
+A state machine without a clock and without I/O. Real time comes as an argument. Records go to `keep`, which returns
+once they are on disk, and take effect only then. The rules that make it safe (`fleet.bus.protocol.consensus` says why):
+
+- A job is granted to one arm at a time; to another arm only after the lease of the first has ended, or the first has
+  released the job.
+- While a job is granted, no other job at one of its stations is.
+- Permission to commit, that is to begin the last cycle, is granted once and stays, unless its arm releases the job.
+- A settled job is granted to no arm.
+- After a crash every grant counts as leased from the restart.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+import msgspec
+
+from fleet.bus.protocol.auction import Count, JobSpec, Name
+from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, DeniedEntry, GrantedEntry, JobOutcome
+from fleet.errors import JournalFull
+from fleet.live.auction.auctioneer import Objection
+from fleet.live.auction.lease_timing import Timing
+from fleet.live.journal import JournalState
+from fleet.live.journal_records import ClockTick, JobsAccepted, Progress, Released
+
+
+class JobGranted(msgspec.Struct, frozen=True, tag="job_granted"):
+    """A job is granted to an arm, or its grant is updated with more cycles done."""
+
+    arm: Name
+    number: Count
+    """Of the claim."""
+    award: Name
+    job: Name
+    places: tuple[Name, ...]
+    cycles: Count
+    may_commit: bool = False
+
+
+class JobSettled(msgspec.Struct, frozen=True, tag="job_settled"):
+    """A job, or an attempt at one, has ended."""
+
+    settled: JobOutcome
+
+
+class ClaimNumbered(msgspec.Struct, frozen=True, tag="claim_numbered"):
+    """The last claim of an arm had this number."""
+
+    arm: Name
+    number: Count
+
+
+GrantRecord = JobGranted | Released | JobSettled | JobsAccepted | ClockTick | ClaimNumbered | Progress
+
+
+@dataclass(eq=False)
+class Grant:
+    """A job that is granted to an arm."""
+
+    arm: str
+    award: str
+    places: tuple[str, ...]
+    may_commit: bool = False
+    until_s: float = 0.0
+    """Real second at which its lease ends."""
+
+
+@dataclass(eq=False)
+class Register(JournalState[GrantRecord]):
+    """The state that follows from the records; only `apply` changes it."""
+
+    grants: dict[str, Grant] = field(default_factory=dict)
+    """By job."""
+    settled: dict[str, JobOutcome] = field(default_factory=dict)
+    """By job; finished or unfinished for good."""
+    cycles: dict[str, int] = field(default_factory=dict)
+    """Cycles known to be done, by job."""
+    numbers: dict[str, int] = field(default_factory=dict)
+    """Number of the last claim, by arm."""
+    jobs: dict[str, JobSpec] = field(default_factory=dict)
+    """Submitted ones, by name."""
+    time_s: float = 0.0
+
+    def apply(self, record: GrantRecord) -> None:
+        """Apply a record that is on disk."""
+        match record:
+            case JobGranted():
+                self._count(record.job, record.cycles)
+                self._number(record.arm, record.number)
+                self.grants[record.job] = Grant(record.arm, record.award, record.places, record.may_commit)
+            case Released():
+                self._number(record.arm, record.number)
+                grant = self.grants.get(record.job)
+                if grant is not None and grant.award == record.award:
+                    del self.grants[record.job]
+            case JobSettled(settled):
+                self._count(settled.job, settled.cycles)
+                self.time_s = max(self.time_s, settled.time_s)
+                if settled.outcome != "returned":
+                    self.settled[settled.job] = settled
+                    self.grants.pop(settled.job, None)
+            case JobsAccepted(jobs):
+                self.jobs |= {word.name: word for word in jobs}
+            case ClockTick(time_s):
+                self.time_s = max(self.time_s, time_s)
+            case ClaimNumbered(arm, number):
+                self._number(arm, number)
+            case Progress(job, cycles):
+                self._count(job, cycles)
+
+    def compact(self) -> tuple[GrantRecord, ...]:
+        """Return the fewest records that give the same register."""
+        out: list[GrantRecord] = [ClockTick(self.time_s)]
+        out += [ClaimNumbered(arm, number) for arm, number in self.numbers.items()]
+        out += [Progress(job, cycles) for job, cycles in self.cycles.items()]
+        out += [JobsAccepted((word,)) for word in self.jobs.values()]
+        for job, grant in self.grants.items():
+            number, cycles = self.numbers.get(grant.arm, 0), self.cycles.get(job, 0)
+            out.append(JobGranted(grant.arm, number, grant.award, job, grant.places, cycles, grant.may_commit))
+        out += [JobSettled(settled) for settled in self.settled.values()]
+        return tuple(out)
+
+    def _count(self, job: str, cycles: int) -> None:
+        self.cycles[job] = max(cycles, self.cycles.get(job, 0))
+
+    def _number(self, arm: str, number: int) -> None:
+        self.numbers[arm] = max(number, self.numbers.get(arm, -1))
+
+
+class Granter:
+    """Grants of one arm to its peers.
+
+    Attributes:
+        register: The state on its disk.
+    """
+
+    def __init__(
+        self,
+        arm: str,
+        roster: Iterable[str],
+        register: Register,
+        keep: Callable[..., None],
+        *,
+        real_s: float,
+        timing: Timing | None = None,
+    ) -> None:
+        """Start with the grants of a register.
+
+        Args:
+            roster: All arms of the fleet, present or not.
+            keep: Writes records; returns when they are on disk, or raises `JournalError` and has written none.
+        """
+        self.arm, self.roster = arm, frozenset(roster)
+        self.register = register
+        self._keep, self._timing = keep, timing or Timing()
+        for grant in register.grants.values():
+            grant.until_s = real_s + self._timing.counted_lease_s
+
+    def answer_claim(self, claim: Claim, real_s: float) -> ClaimReply:
+        """The answer to a claim; every grant in it is on disk.
+
+        Raises:
+            Objection: an arm of another fleet, a claim older than the latest of that arm, or a full journal.
+        """
+        if claim.arm not in self.roster:
+            raise Objection(f"'{claim.arm}' is no arm of this fleet. Arms: {', '.join(sorted(self.roster))}.")
+        last = self.register.numbers.get(claim.arm, -1)
+        if claim.number <= last:
+            raise Objection(f"Stale claim {claim.number} from '{claim.arm}' (latest {last}).")
+        try:
+            self.add_jobs(claim.jobs)
+            self._record([JobSettled(settled) for settled in claim.outcomes if self._is_news(settled)])
+            self._record(self._released(claim))
+        except JournalFull as error:
+            raise Objection(str(error)) from error
+        self.register.numbers[claim.arm] = claim.number
+        granted: list[GrantedEntry] = []
+        denied: list[DeniedEntry] = []
+        for entry in claim.entries:
+            why = self._objection(claim.arm, entry, real_s)
+            if not why:
+                why = self._grant(claim, entry, real_s)
+            if why:
+                denied.append(DeniedEntry(entry.award, why, self.register.settled.get(entry.job)))
+            else:
+                grant = self.register.grants[entry.job]
+                granted.append(GrantedEntry(entry.award, self.register.cycles.get(entry.job, 0), grant.may_commit))
+        return ClaimReply(self.arm, claim.number, self._timing.lease_s, tuple(granted), tuple(denied))
+
+    def apply_outcome(self, settled: JobOutcome) -> None:
+        """Take the outcome of a job from a peer.
+
+        Raises:
+            JournalError: it is not on disk, and nothing has changed.
+        """
+        if self._is_news(settled):
+            self._record([JobSettled(settled)])
+
+    def add_jobs(self, jobs: tuple[JobSpec, ...], by: str = "") -> None:
+        """Add submitted jobs.
+
+        Raises:
+            JournalError: none is on disk.
+        """
+        fresh = tuple(word for word in jobs if word.name not in self.register.jobs)
+        self._record([JobsAccepted(fresh, by)] if fresh else [])
+
+    def record_time(self, time_s: float) -> None:
+        """Record the fleet's time.
+
+        Raises:
+            JournalError: it is not on disk.
+        """
+        self._record([ClockTick(time_s)])
+
+    def is_granted(self, job: str, real_s: float) -> bool:
+        """Whether an arm has a job, or may have it."""
+        grant = self.register.grants.get(job)
+        return grant is not None and (grant.may_commit or real_s < grant.until_s)
+
+    def busy_stations(self, real_s: float) -> frozenset[str]:
+        """Stations at which an arm may be at work."""
+        return frozenset(
+            place for grant in self.register.grants.values() if real_s < grant.until_s for place in grant.places
+        )
+
+    def out_of_contact(self, real_s: float) -> frozenset[str]:
+        """Jobs whose arm had permission to commit and has not renewed its lease since."""
+        grants = self.register.grants.items()
+        return frozenset(job for job, grant in grants if grant.may_commit and real_s >= grant.until_s)
+
+    # Inside
+
+    def _is_news(self, settled: JobOutcome) -> bool:
+        if settled.outcome == "returned":
+            return settled.cycles > self.register.cycles.get(settled.job, 0)
+        return settled.job not in self.register.settled
+
+    def _released(self, claim: Claim) -> list[GrantRecord]:
+        kept = {entry.award for entry in claim.entries}
+        return [
+            Released(grant.award, job, claim.arm, claim.number)
+            for job, grant in self.register.grants.items()
+            if grant.arm == claim.arm and grant.award not in kept
+        ]
+
+    def _objection(self, arm: str, entry: ClaimEntry, real_s: float) -> str:
+        if entry.job in self.register.settled:
+            return f"'{entry.job}' is settled"
+        grant = self.register.grants.get(entry.job)
+        mine = grant is not None and (grant.arm, grant.award) == (arm, entry.award)
+        if grant is not None and not mine and self.is_granted(entry.job, real_s):
+            return f"'{grant.arm}' has '{entry.job}'"
+        if mine and grant is not None and (grant.may_commit or real_s < grant.until_s):
+            return ""
+        for job, other in self.register.grants.items():
+            if job != entry.job and real_s < other.until_s and set(other.places) & set(entry.places):
+                return f"'{other.arm}' is at the same station with '{job}'"
+        return ""
+
+    def _grant(self, claim: Claim, entry: ClaimEntry, real_s: float) -> str:
+        """Grant a job, or extend its grant; returns why not, if it cannot be written to disk."""
+        before = self.register.grants.get(entry.job)
+        same = before is not None and before.award == entry.award
+        leave = entry.phase == "finishing" or (same and before is not None and before.may_commit)
+        cycles = max(entry.cycles, self.register.cycles.get(entry.job, 0))
+        news = cycles > self.register.cycles.get(entry.job, 0)
+        if before is None or not same or leave != before.may_commit or news:
+            record = JobGranted(claim.arm, claim.number, entry.award, entry.job, entry.places, cycles, leave)
+            try:
+                self._record([record])
+            except JournalFull as error:
+                return str(error)
+        self.register.grants[entry.job].until_s = real_s + self._timing.counted_lease_s
+        return ""
+
+    def _record(self, records: list[GrantRecord]) -> None:
+        """Write records, then apply them."""
+        if not records:
+            return
+        self._keep(*records)
+        for record in records:
+            self.register.apply(record)

@@ -1,0 +1,74 @@
+"""Records that the journals of arms and auctioneers have in common; each journal adds a few of its own.
+
+One name means one thing in every journal. Times are fleet seconds, 0 where the writer does not know the time.
+"""
+
+from typing import Literal
+
+import msgspec
+
+from fleet.bus.protocol.auction import Count, JobSpec, Name
+
+
+class Started(msgspec.Struct, frozen=True, tag="started"):
+    """The process starts, for the first time or again."""
+
+    name: str = ""
+    """Of the arm or auctioneer."""
+    time_s: float = 0.0
+    boot: Count = 0
+    """Counts the starts of an arm from 1."""
+
+
+class ClockTick(msgspec.Struct, frozen=True, tag="clock_tick"):
+    """Fleet time has reached this value."""
+
+    time_s: float
+
+
+class JobsAccepted(msgspec.Struct, frozen=True, tag="jobs_accepted"):
+    """These jobs were submitted and accepted."""
+
+    jobs: tuple[JobSpec, ...]
+    by: str = ""
+    time_s: float = 0.0
+
+
+class Progress(msgspec.Struct, frozen=True, tag="progress"):
+    """Number of cycles of a job that are done, by any arm."""
+
+    job: Name
+    cycles: Count
+
+
+class CommitPermitted(msgspec.Struct, frozen=True, tag="commit_permitted"):
+    """The arm may begin the last cycle; from now on the job goes to no other arm."""
+
+    award: Name
+    time_s: float = 0.0
+
+
+class Released(msgspec.Struct, frozen=True, tag="released"):
+    """The arm no longer has the award, and has nothing to report on it."""
+
+    award: Name
+    job: str = ""
+    arm: str = ""
+    number: Count = 0
+    """Number of the claim that released it, where arms allocate by consensus."""
+
+
+class Closed(msgspec.Struct, frozen=True, tag="closed"):
+    """An award has ended."""
+
+    award: Name
+    outcome: Literal["finished", "returned", "refused", "dropped"]
+    """refused: the arm did not accept it; dropped: its lease has expired."""
+    cycles: Count
+    """Done so far, by any arm."""
+    time_s: float
+    reason: str = ""
+    unsure: bool = False
+    """As in `fleet.bus.protocol.auction.Report`."""
+    job: str = ""
+    arm: str = ""

@@ -1,0 +1,1 @@
+"""Participants that only listen: fleet snapshot, health checks, event feed."""

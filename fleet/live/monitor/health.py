@@ -1,0 +1,170 @@
+"""Health of a fleet: findings from a snapshot, clock replies and malformed messages."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import median
+from typing import Literal
+
+import msgspec
+
+from fleet.live.clock import FleetClock
+from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetSnapshot
+
+OFFSET_S, SLOW_S = 1.0, 0.1
+"""Real seconds: clock offsets and round trips above these are findings."""
+
+
+class Finding(msgspec.Struct, frozen=True):
+    """One statement about the fleet."""
+
+    level: Literal["fault", "warning"]
+    """fault: the fleet cannot do its work; warning: it can, but somebody should look."""
+    what: str
+
+
+@dataclass(frozen=True)
+class ClockProbe:
+    """One request for the fleet time; real seconds are of this machine's monotonic clock."""
+
+    asked_s: float
+    answered_s: float
+    time_s: float | None = None
+    """The reply; None if the router answered but no participant did."""
+    speed: float = 1.0
+
+
+class HealthReport(msgspec.Struct, frozen=True):
+    """Health of a fleet."""
+
+    fleet: str
+    round_trip_s: float | None
+    """Median of the clock requests, real seconds."""
+    time_s: float | None
+    """Fleet time now; None without a clock reply."""
+    offsets_s: dict[str, float]
+    """Real seconds by which each arm's clock is ahead of the auctioneer's."""
+    malformed: int
+    findings: tuple[Finding, ...]
+
+    @property
+    def healthy(self) -> bool:
+        """Whether there is no fault."""
+        return all(finding.level != "fault" for finding in self.findings)
+
+
+def check_health(
+    fleet: FleetSnapshot,
+    now_s: float,
+    probes: Sequence[ClockProbe],
+    *,
+    malformed: int = 0,
+    complaints: Sequence[str] = (),
+    overrun: int = 0,
+    auctioneer: bool = True,
+    secure: bool = False,
+    expected: Sequence[str] = (),
+) -> HealthReport:
+    """Check a fleet that was listened to for a while.
+
+    Args:
+        fleet: Snapshot at the real second `now_s`.
+        complaints: Reasons why the last malformed messages were dropped.
+        overrun: Messages lost because they came faster than they were handled.
+        auctioneer: Whether the fleet should have one.
+        secure: Whether the listener used a certificate; one that the router does not know receives nothing.
+        expected: Arms that should be present: one that left earlier leaves no trace.
+    """
+    trips_s = [probe.answered_s - probe.asked_s for probe in probes]
+    clock = best_clock(probes)
+    offsets_s = {arm.arm: offset_s(arm, now_s, clock) for arm in fleet.arms if arm.time_s is not None} if clock else {}
+    findings = [
+        *check_auctioneers(fleet, probes, auctioneer),
+        *(finding for arm in fleet.arms for finding in check_arm(arm, offsets_s.get(arm.arm))),
+    ]
+    if missing := [name for name in expected if name not in {arm.arm for arm in fleet.arms if arm.token}]:
+        findings.append(Finding("fault", f"Not present: {', '.join(missing)}."))
+    if not any(arm.present for arm in fleet.arms):
+        unheard = secure and not any(arm.token for arm in fleet.arms)
+        hint = " Or the router does not know this certificate: it reads its roster when it starts." if unheard else ""
+        findings.append(Finding("fault", f"No arm is present: none shows both a token and a fresh state.{hint}"))
+    if trips_s and median(trips_s) > SLOW_S:
+        findings.append(Finding("warning", f"The router is slow: a round trip takes {1000 * median(trips_s):.0f} ms."))
+    if malformed:
+        reasons = "; ".join(dict.fromkeys(complaints))  # each reason once
+        findings.append(Finding("fault", f"{malformed} malformed message(s), the last: {reasons}"))
+    if overrun:
+        findings.append(Finding("warning", f"{overrun} message(s) came faster than they were handled, and were lost."))
+    if unfinished := fleet.counts.get("unfinished", 0):
+        findings.append(Finding("warning", f"{unfinished} job(s) are unfinished: it is not known if they were done."))
+    return HealthReport(
+        fleet=fleet.fleet,
+        round_trip_s=median(trips_s) if trips_s else None,
+        time_s=clock.now_s(now_s) if clock else None,
+        offsets_s=offsets_s,
+        malformed=malformed,
+        findings=tuple(findings),
+    )
+
+
+def check_auctioneers(fleet: FleetSnapshot, probes: Sequence[ClockProbe], wanted: bool = True) -> list[Finding]:
+    """Check that exactly one auctioneer answers; or, where none is wanted, that there is none."""
+    names = [auctioneer.auctioneer for auctioneer in fleet.auctioneers if auctioneer.token]
+    if len(names) > 1:
+        count = f"{len(names)} auctioneers are present ({', '.join(names)})"
+        return [Finding("fault", f"{count}, but a fleet has one: stop all but one.")]
+    if not wanted:
+        unwanted = f"Auctioneer {', '.join(names)} is present, though the fleet should have none."
+        return [Finding("warning", unwanted)] if names else []
+    if any(probe.time_s is not None for probe in probes):
+        return []
+    if names:
+        return [Finding("fault", f"Auctioneer {names[0]} shows its token but does not answer: its process may hang.")]
+    return [
+        Finding(
+            "fault",
+            "No auctioneer shows a token or answers: nobody awards jobs, and every arm keeps its own time. "
+            "If this fleet needs none, give --no-auctioneer.",
+        )
+    ]
+
+
+def check_arm(arm: ArmSnapshot, offset_s: float | None) -> list[Finding]:
+    """Check the token, state, mode and clock of one arm."""
+    findings: list[Finding] = []
+    age_s = arm.state_age_s
+    if not arm.token and age_s is None:
+        return [Finding("warning", f"{arm.arm} has left: some of its messages are kept, but it shows no token.")]
+    if not arm.token:
+        problem = "publishes its state but shows no token: it left, or another process uses its name."
+        findings.append(Finding("fault", f"{arm.arm} {problem}"))
+    elif age_s is None:
+        findings.append(Finding("fault", f"{arm.arm} shows its token but publishes no state: its process may hang."))
+    elif age_s > FRESH_S:
+        findings.append(
+            Finding("fault", f"{arm.arm} is stale: its last state is {age_s:.1f} s old. Its process may hang.")
+        )
+    if arm.mode == "faulted":
+        findings.append(Finding("warning", f"{arm.arm} is faulted: joint {arm.joint} is at {arm.hottest_c:.1f} °C."))
+    if offset_s is not None and abs(offset_s) > OFFSET_S:
+        side = "ahead of" if offset_s > 0 else "behind"
+        findings.append(
+            Finding("fault", f"{arm.arm} is {abs(offset_s):.1f} s {side} fleet time: its machine may be overloaded.")
+        )
+    return findings
+
+
+def best_clock(probes: Sequence[ClockProbe]) -> FleetClock | None:
+    """Fleet clock from the request with the shortest round trip; None without a reply."""
+    answered = [probe for probe in probes if probe.time_s is not None]
+    if not answered:
+        return None
+    best = min(answered, key=lambda probe: probe.answered_s - probe.asked_s)
+    assert best.time_s is not None
+    return FleetClock(best.speed).set_to(best.asked_s, best.answered_s, best.time_s)
+
+
+def offset_s(arm: ArmSnapshot, now_s: float, clock: FleetClock) -> float:
+    """Real seconds by which an arm's clock was ahead when it last published its state."""
+    assert arm.time_s is not None
+    assert arm.state_age_s is not None
+    return (arm.time_s - clock.now_s(now_s)) / clock.speed + arm.state_age_s

@@ -1,0 +1,238 @@
+"""Snapshot of a fleet: who is present, the last message of each participant and its age, and the state of every job.
+
+`FleetView` is fed with messages and real time, and has no clock and no I/O. Its memory is bounded, however many names
+are published: those not heard of for longest are dropped first.
+"""
+
+import math
+from collections import Counter, OrderedDict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, TypeVar
+
+import msgspec
+
+from fleet.bus.protocol import auction
+from fleet.bus.protocol.auction import Announcement, ArmEvent, JobStatus, Result, Status
+from fleet.bus.protocol.messages import DifficultyScores, Info, State, encode
+from fleet.telemetry import Mode
+
+FRESH_S = 3.0
+"""Real seconds: an arm is present when it shows its token and its last state is no older than this."""
+MAX_NAMES, MAX_JOBS = 1024, 4096
+COMPLETE_BYTES = 32_000
+"""A status reply that is smaller, and has fewer jobs than one message may have, names all jobs."""
+
+Role = Literal["arm", "auction"]
+Value = TypeVar("Value")
+Message = TypeVar("Message", bound=msgspec.Struct)
+
+
+class ArmSnapshot(msgspec.Struct, frozen=True):
+    """An arm as its messages show it; ages are real seconds, None without a message."""
+
+    arm: str
+    token: bool
+    present: bool
+    """It shows its token and a fresh state."""
+    mode: Mode | None = None
+    time_s: float | None = None
+    """Fleet time of its last state."""
+    hottest_c: float | None = None
+    joint: int | None = None
+    """The hottest motor, 1..7."""
+    headroom_k: float | None = None
+    job: str = ""
+    difficulty: dict[str, float | None] = {}
+    """Difficulty of the open jobs; None without a score."""
+    joints: int | None = None
+    twin: str = ""
+    event: str = ""
+    """Its last event."""
+    state_age_s: float | None = None
+    difficulty_age_s: float | None = None
+
+
+class AuctioneerSnapshot(msgspec.Struct, frozen=True):
+    """An auctioneer as its messages show it."""
+
+    auctioneer: str
+    token: bool
+    heard_age_s: float | None = None
+    """Real seconds since its last message."""
+
+
+class FleetSnapshot(msgspec.Struct, frozen=True):
+    """A fleet at one moment."""
+
+    fleet: str
+    arms: tuple[ArmSnapshot, ...]
+    auctioneers: tuple[AuctioneerSnapshot, ...]
+    counts: dict[str, int]
+    """Number of jobs by state."""
+    jobs: tuple[JobStatus, ...]
+    """The most recently changed last."""
+
+
+@dataclass
+class _Arm:
+    token: bool = False
+    messages: dict[type, tuple[msgspec.Struct, float]] = field(default_factory=dict)
+    """The last message of each type, and the real second it came."""
+
+    def last(self, kind: type[Message]) -> tuple[Message | None, float]:
+        message, at_s = self.messages.get(kind, (None, 0.0))
+        return message if isinstance(message, kind) else None, at_s
+
+
+@dataclass
+class _Auctioneer:
+    token: bool = False
+    heard_s: float | None = None
+    time_s: float = -math.inf
+    """Fleet time of its last reply."""
+
+
+@dataclass
+class FleetView:
+    """What the messages heard so far say about a fleet."""
+
+    fleet: str
+    _arms: "OrderedDict[str, _Arm]" = field(default_factory=OrderedDict[str, _Arm])
+    _auctioneers: "OrderedDict[str, _Auctioneer]" = field(default_factory=OrderedDict[str, _Auctioneer])
+    _jobs: "OrderedDict[str, JobStatus]" = field(default_factory=OrderedDict[str, JobStatus])
+    _numbers: dict[str, int] = field(default_factory=dict[str, int])
+    """Number of the last result of each job: an older one changes nothing."""
+    _heard_s: dict[str, float] = field(default_factory=dict[str, float])
+    """Real second at which a job was last named."""
+
+    def set_token(self, role: Role, name: str, present: bool) -> bool:
+        """Note that a token appeared or disappeared; return whether that is a change."""
+        participant = self._arm(name) if role == "arm" else self._auctioneer(name)
+        changed, participant.token = participant.token != present, present
+        return changed
+
+    def update(self, name: str, message: msgspec.Struct, now_s: float) -> None:
+        """Take in a message that came at the real second `now_s`; other types are ignored."""
+        if isinstance(message, Announcement | Result):
+            self._auctioneer(name).heard_s = now_s
+            if isinstance(message, Result) and message.number >= self._numbers.get(message.status.job, 0):
+                self._numbers[message.status.job] = message.number
+                self._set_status(message.status, now_s)
+        elif isinstance(message, State | DifficultyScores | Info | ArmEvent):
+            self._arm(name).messages[type(message)] = message, now_s
+
+    def update_jobs(self, reply: Status, now_s: float) -> None:
+        """Take in the auctioneer's reply to a status request."""
+        auctioneer = self._auctioneer(reply.auctioneer)
+        if reply.time_s < auctioneer.time_s:  # another fleet, or one that was restarted with new result numbers
+            self._numbers.clear()
+            if not _complete(reply):
+                self._jobs.clear()
+        auctioneer.heard_s, auctioneer.time_s = now_s, reply.time_s
+        for status in reply.jobs:
+            self._set_status(status, now_s)
+
+    def forget_other_jobs(self, replies: Sequence[Status], asked_s: float) -> None:
+        """Forget jobs that no reply to a request for all jobs names, unless they were named since `asked_s`.
+
+        They are of an earlier fleet. A reply that may not have had room for all jobs changes nothing.
+        """
+        if not replies or not all(map(_complete, replies)):
+            return
+        named = {status.job for reply in replies for status in reply.jobs}
+        for name in [name for name in self._jobs if name not in named and self._heard_s[name] < asked_s]:
+            del self._jobs[name], self._heard_s[name]
+            self._numbers.pop(name, None)
+
+    def snapshot(self, now_s: float, jobs: int = MAX_JOBS) -> FleetSnapshot:
+        """The fleet at the real second `now_s`, with at most `jobs` of the jobs that changed last."""
+        return FleetSnapshot(
+            fleet=self.fleet,
+            arms=tuple(_arm_snapshot(name, self._arms[name], now_s) for name in sorted(self._arms)),
+            auctioneers=tuple(
+                AuctioneerSnapshot(name, known.token, None if known.heard_s is None else now_s - known.heard_s)
+                for name, known in sorted(self._auctioneers.items())
+            ),
+            counts=count_states(self._jobs.values()),
+            jobs=tuple(self._jobs.values())[-jobs:] if jobs > 0 else (),
+        )
+
+    def _arm(self, name: str) -> _Arm:
+        return _most_recent(self._arms, name, _Arm(), MAX_NAMES)
+
+    def _auctioneer(self, name: str) -> _Auctioneer:
+        return _most_recent(self._auctioneers, name, _Auctioneer(), MAX_NAMES)
+
+    def _set_status(self, status: JobStatus, now_s: float) -> None:
+        self._heard_s[status.job] = now_s
+        if self._jobs.get(status.job) != status:
+            _most_recent(self._jobs, status.job, status, MAX_JOBS)
+            self._jobs[status.job] = status
+        for by_job in (self._numbers, self._heard_s):
+            if len(by_job) > 2 * MAX_JOBS:
+                for name in [name for name in by_job if name not in self._jobs]:
+                    del by_job[name]
+
+
+def count_states(jobs: Iterable[JobStatus]) -> dict[str, int]:
+    """Number of jobs by state, for example {'waiting': 3, 'finished': 12}."""
+    return dict(Counter(job.state for job in jobs))
+
+
+def describe_event(event: ArmEvent) -> str:
+    """Short text of an event, for example `warning joint 2 60.0 (crate_1)`."""
+    parts = [
+        event.kind,
+        f"joint {event.joint}" if event.joint else "",
+        "" if event.value is None else f"{event.value:.1f}",
+        f"({event.job})" if event.job else "",
+        event.reason,
+    ]
+    return " ".join(filter(None, parts))
+
+
+def describe_status(status: JobStatus) -> str:
+    """Short text of a job's status, for example `crate_1: finished by arm_0 at 842 s`."""
+    arm = f" {'to' if status.state == 'awarded' else 'by'} {status.arm}" if status.arm else ""
+    end = "" if status.finished_s is None else f" at {status.finished_s:.0f} s"
+    return f"{status.job}: {status.state}{arm}{end}{f': {status.reason}' if status.reason else ''}"
+
+
+def _complete(reply: Status) -> bool:
+    """Whether a status reply had room for every job."""
+    return len(reply.jobs) < auction.MOST_JOBS and len(encode(reply)) < COMPLETE_BYTES
+
+
+def _arm_snapshot(name: str, arm: _Arm, now_s: float) -> ArmSnapshot:
+    (state, state_s), (scores, scores_s) = arm.last(State), arm.last(DifficultyScores)
+    (info, _), (event, _) = arm.last(Info), arm.last(ArmEvent)
+    age_s = now_s - state_s if state else None
+    temps_c = state.temp_c if state else ()
+    hottest_c = max(temps_c, default=None)
+    return ArmSnapshot(
+        arm=name,
+        token=arm.token,
+        present=arm.token and age_s is not None and age_s <= FRESH_S,
+        mode=state.mode if state else None,
+        time_s=state.time_s if state else None,
+        hottest_c=hottest_c,
+        joint=None if hottest_c is None else temps_c.index(hottest_c) + 1,
+        headroom_k=state.headroom_k if state else None,
+        job=state.job if state else "",
+        difficulty=dict(zip(scores.jobs, scores.difficulty, strict=True)) if scores else {},
+        joints=info.joints if info else None,
+        twin=info.twin if info else "",
+        event=describe_event(event) if event else "",
+        state_age_s=age_s,
+        difficulty_age_s=now_s - scores_s if scores else None,
+    )
+
+
+def _most_recent(values: "OrderedDict[str, Value]", name: str, new: Value, most: int) -> Value:
+    """Return the value of a name, `new` if it has none, and mark the name as the most recent of at most `most`."""
+    value = values.setdefault(name, new)
+    values.move_to_end(name)
+    if len(values) > most:
+        values.popitem(last=False)
+    return value

@@ -1,0 +1,1 @@
+"""From a job to joint motion: inverse kinematics, trajectories, limits, collision checks, plan cache."""

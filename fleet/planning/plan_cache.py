@@ -1,0 +1,153 @@
+"""Plans and home torques of one arm, cached on disk by content.
+
+The physics is loaded only for what is not in the cache.
+"""
+
+import hashlib
+import json
+import logging
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from fleet.errors import InfeasibleJob
+from fleet.files import atomic_path
+from fleet.job import Work
+from fleet.motion import RATE_HZ, Phase, Plan
+from fleet.physics.gen3 import ELBOW_ANGLES_DEG, GRAVITY_M_S2, gen3_xml
+from fleet.planning.task_phases import GRASP_S
+from fleet.robot import GEN3, Robot
+
+if TYPE_CHECKING:
+    from fleet.planning.planner import Planner
+
+Array = np.ndarray
+T = TypeVar("T")
+log = logging.getLogger(__name__)
+
+PLANNER_VERSION = 1
+"""Raised whenever the planner's answer to the same question changes."""
+
+
+class CachedPlanner:
+    """A `fleet.planning.planner.Planner` that computes each plan set once."""
+
+    def __init__(
+        self, robot: Robot, *, elbows: int = 3, speeds: tuple[float, ...] = (1.0, 0.6), cache_dir: Path
+    ) -> None:
+        """Arguments as for a `Planner`, and the folder of the cache."""
+        self._robot, self._elbows, self._folder = robot, elbows, cache_dir
+        self._speeds = tuple(sorted(set(speeds), reverse=True))
+        self._planner: Planner | None = None
+
+    def plan(self, work: Work) -> tuple[Plan, ...]:
+        """All variants, as `Planner.plan`.
+
+        Raises:
+            InfeasibleJob: there is none.
+        """
+        key = {
+            "planner": PLANNER_VERSION,
+            "rate_hz": RATE_HZ,
+            "limits": asdict(GEN3),
+            **_torque_key(self._robot),
+            "work": asdict(work),
+            "grasp_s": GRASP_S,
+            "elbow_angles_deg": ELBOW_ANGLES_DEG,
+            "elbows": self._elbows,
+            "speeds": self._speeds,
+        }
+        path = _path(self._folder, key)
+        plans = _read(path, lambda arrays: _unpack(arrays, self._robot.name, work))
+        if plans is None:
+            plans = self._compute(work)
+            _write(path, _pack(plans))
+        if isinstance(plans, InfeasibleJob):
+            raise plans
+        return plans
+
+    def _compute(self, work: Work) -> tuple[Plan, ...] | InfeasibleJob:
+        if self._planner is None:
+            from fleet.planning.planner import Planner
+
+            self._planner = Planner(self._robot, elbows=self._elbows, speeds=self._speeds)
+        try:
+            return self._planner.plan(work)
+        except InfeasibleJob as error:
+            return error
+
+
+def rest_torque(robot: Robot, cache_dir: Path) -> Array:
+    """Torque that holds an arm at home, N·m, [joint]."""
+    path = _path(cache_dir, {"what": "torque at home", **_torque_key(robot)})
+    tau = _read(path, lambda arrays: arrays["rest_tau"])
+    if tau is None:
+        from fleet.physics.models import ArmModel
+
+        tau = ArmModel(robot).gravity_torque(robot.home_q())
+        _write(path, {"rest_tau": tau})
+    return tau
+
+
+def _torque_key(robot: Robot) -> dict[str, object]:
+    """Everything that determines the torques of an arm; its name and its heat do not."""
+    return {
+        "model": hashlib.sha256(gen3_xml()).hexdigest(),
+        "gravity": GRAVITY_M_S2,
+        "mount": asdict(robot.mount),
+        "home": robot.home_q().tolist(),
+        "tool_kg": robot.tool_kg,
+    }
+
+
+def _path(folder: Path, key: dict[str, object]) -> Path:
+    return folder / f"{hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:32]}.npz"
+
+
+def _read(path: Path, unpack: Callable[[Mapping[str, Array]], T]) -> T | None:
+    """The content of a file; None if there is no file, or if it is damaged."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            return unpack(arrays)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        log.warning("Cannot read plan file %s (%s); planning again.", path, error)
+        return None
+
+
+def _write(path: Path, arrays: Mapping[str, Array]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as draft, draft.open("wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)
+
+
+def _pack(plans: tuple[Plan, ...] | InfeasibleJob) -> dict[str, Array]:
+    if isinstance(plans, InfeasibleJob):
+        return {"infeasible": np.array([plans.place, plans.reason])}
+    phases = [phase for plan in plans for phase in plan.phases]
+    return {
+        "profile": np.concatenate([phase.profile for phase in phases]),
+        "payload_kg": np.concatenate([phase.payload_kg for phase in phases]),
+        "lengths": np.array([[len(phase.profile) for phase in plan.phases] for plan in plans]),
+        "variants": np.array([(plan.elbow, plan.speed) for plan in plans]),
+    }
+
+
+def _unpack(arrays: Mapping[str, Array], arm: str, work: Work) -> tuple[Plan, ...] | InfeasibleJob:
+    """The inverse of `_pack`, for an arm and work of these names."""
+    if "infeasible" in arrays:
+        place, reason = arrays["infeasible"].tolist()
+        return InfeasibleJob(arm, place, reason)
+    profile, lengths, variants = arrays["profile"], arrays["lengths"], arrays["variants"]
+    if lengths.sum() != len(profile) or len(lengths) != len(variants):
+        raise ValueError(f"its {len(lengths)} plans have {lengths.sum()} samples in all, but {len(profile)} are stored")
+    ends = np.cumsum(lengths.ravel())[:-1]
+    phases = iter(map(Phase, np.split(profile, ends), np.split(arrays["payload_kg"], ends)))
+    return tuple(
+        Plan(arm, work, int(elbow), float(speed), next(phases), next(phases), next(phases)) for elbow, speed in variants
+    )

@@ -1,0 +1,116 @@
+"""ROS 2's messages as bytes: CDR, little endian, behind a header of four bytes. Needs the extra `ros2` (rosbags).
+
+The types used here are the same in every ROS 2 version from Humble on, and so are their hashes.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_typestore
+
+from fleet.bus.protocol.messages import MalformedMessage
+from fleet.ros2.conversion import Diagnostic, Joints
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+MOST = 4096
+"""Items in one list of a message that is read; more are refused before anything is made of them."""
+_NS = 1_000_000_000
+_SECONDS = range(-(2**31), 2**31)
+
+_STORE = get_typestore(Stores.ROS2_JAZZY)
+_STORE.max_sequence_length = MOST
+_TYPES: dict[str, Any] = dict(_STORE.types)
+
+
+def type_hash(kind: str) -> str:
+    """`RIHS01_…`, by which ROS 2 (Iron and later) tells versions of a type apart (REP 2016)."""
+    return _STORE.hash_rihs01(kind)
+
+
+def write_joints(joints: Joints) -> bytes:
+    """A JointState.
+
+    Raises:
+        ValueError: its time is none that ROS 2 can tell.
+    """
+    arrays = [np.array(values, dtype=np.float64) for values in (joints.q, joints.qd, joints.tau)]
+    message = _TYPES[JOINT_STATE](_header(joints.time_s), [_text(name) for name in joints.names], *arrays)
+    return bytes(_STORE.serialize_cdr(message, JOINT_STATE))
+
+
+def read_joints(payload: bytes) -> Joints:
+    """What a JointState says.
+
+    Raises:
+        MalformedMessage: no JointState, or one whose lists do not fit each other.
+    """
+    message = _read(payload, JOINT_STATE)
+    stamp = message.header.stamp
+    names = tuple(message.name)
+    found = {"position": message.position, "velocity": message.velocity, "effort": message.effort}
+    for field, values in found.items():
+        if len(values) not in (0, len(names)):
+            raise MalformedMessage(f"A JointState of {len(names)} name(s) has {len(values)} value(s) of {field}.")
+    q, qd, tau = (tuple(values.tolist()) for values in found.values())
+    return Joints(stamp.sec + stamp.nanosec / _NS, names, q, qd, tau)
+
+
+def write_diagnostics(time_s: float, diagnostics: Sequence[Diagnostic]) -> bytes:
+    """A DiagnosticArray.
+
+    Raises:
+        ValueError: its time is none that ROS 2 can tell.
+    """
+    status, pair = _TYPES["diagnostic_msgs/msg/DiagnosticStatus"], _TYPES["diagnostic_msgs/msg/KeyValue"]
+    statuses = [
+        status(
+            level=each.level,
+            name=_text(each.name),
+            message=_text(each.message),
+            hardware_id=_text(each.hardware),
+            values=[pair(key=_text(key), value=_text(value)) for key, value in each.values],
+        )
+        for each in diagnostics
+    ]
+    return bytes(_STORE.serialize_cdr(_TYPES[DIAGNOSTICS](_header(time_s), statuses), DIAGNOSTICS))
+
+
+def read_diagnostics(payload: bytes) -> tuple[Diagnostic, ...]:
+    """What a DiagnosticArray says.
+
+    Raises:
+        MalformedMessage: no DiagnosticArray.
+    """
+    return tuple(
+        Diagnostic(
+            level=status.level,
+            name=status.name,
+            message=status.message,
+            hardware=status.hardware_id,
+            values=tuple((pair.key, pair.value) for pair in status.values),
+        )
+        for status in _read(payload, DIAGNOSTICS).status
+    )
+
+
+def _read(payload: bytes, kind: str) -> Any:
+    try:
+        return _STORE.deserialize_cdr(payload, kind)
+    except SerdeError as error:
+        raise MalformedMessage(f"Not a {kind}: {error}") from error
+
+
+def _header(time_s: float) -> Any:
+    sec, nanosec = divmod(round(time_s * _NS), _NS) if abs(time_s) < 2**32 else (_SECONDS.stop, 0)
+    if sec not in _SECONDS:
+        raise ValueError(f"ROS 2 tells times from {_SECONDS[0]} s to {_SECONDS[-1]} s (got {time_s:g}).")
+    stamp = _TYPES["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
+    return _TYPES["std_msgs/msg/Header"](stamp=stamp, frame_id="")
+
+
+def _text(text: str) -> str:
+    """Strings of CDR end with a zero, so none may be inside."""
+    return text.replace("\0", "\N{REPLACEMENT CHARACTER}")

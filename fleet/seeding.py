@@ -1,0 +1,71 @@
+"""Seeds that follow from a seed, and counter-based random numbers.
+
+A counter-based generator gives the same value for the same key and count, in whatever order values are drawn, so a row
+of a batch needs no generator and no memory. SplitMix64 (Steele, Lea & Flood, OOPSLA 2014) scrambles the counter.
+"""
+
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+
+from fleet.jit import jit_inline
+
+Array = np.ndarray
+
+LEVELS = 4096
+"""Normal quantiles in the table: two of them, 12 bits each, give 2²³ values up to 5 standard deviations."""
+
+
+def _quantiles() -> Array:
+    values = np.array([NormalDist().inv_cdf((level + 0.5) / LEVELS) for level in range(LEVELS)])
+    return values / np.sqrt(2.0 * np.mean(values**2))
+
+
+QUANTILES: Array = _quantiles()
+"""[level], of standard deviation 1/√2."""
+_GOLDEN, _FIRST, _SECOND = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+_11, _27, _30, _31, _32 = np.uint64(11), np.uint64(27), np.uint64(30), np.uint64(31), np.uint64(32)
+_MASK = np.uint64(LEVELS - 1)
+
+
+def key_of(seed: np.random.SeedSequence) -> int:
+    """The 64-bit key of a seed."""
+    return int(seed.generate_state(1, np.uint64)[0])
+
+
+@jit_inline
+def random_word(key: Any, count: Any) -> Any:
+    """64 random bits for a key and a count, uint64; elementwise over arrays."""
+    word = key + count * _GOLDEN
+    word = (word ^ (word >> _30)) * _FIRST
+    word = (word ^ (word >> _27)) * _SECOND
+    return word ^ (word >> _31)
+
+
+@jit_inline
+def random_uniform(key: Any, count: Any) -> Any:
+    """A uniform value in [0, 1) for a key and a count, uint64; elementwise over arrays."""
+    return (random_word(key, count) >> _11) * (1.0 / 9007199254740992.0)
+
+
+@jit_inline
+def random_normal(key: Any, count: Any) -> Any:
+    """A standard normal value for a key and a count, uint64; elementwise over arrays."""
+    word = random_word(key, count)
+    return QUANTILES[word & _MASK] + QUANTILES[(word >> _32) & _MASK]
+
+
+def child(seed: np.random.SeedSequence, *path: int) -> np.random.SeedSequence:
+    """Child seed at a spawn path; stateless, unlike `SeedSequence.spawn`."""
+    return np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, *path))
+
+
+def shift_seeds(seed: np.random.SeedSequence) -> tuple[np.random.SeedSequence, np.random.SeedSequence]:
+    """Seeds of a shift's jobs and of its sensors."""
+    return child(seed, 0), child(seed, 1)
+
+
+def exchange_seed(seed: np.random.SeedSequence) -> np.random.SeedSequence:
+    """Seed of what happens to messages in a shift."""
+    return child(seed, 1, 0)

@@ -1,1 +1,0 @@
-"""One engine: kernel, plants and planner. MuJoCo lives here and nowhere else."""

@@ -1,0 +1,125 @@
+"""`thermofleet keys`: the certificate authority of a fleet, and a certificate for each participant."""
+
+import json
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, get_args
+
+import typer
+from rich.table import Table
+
+from fleet.bus.security.access_control import ROLES, Participant, Role, Roster, of_arms, read_roster, rights
+from fleet.errors import FleetError, nearest
+from scenarios.cli.terminal import out_console, say
+from scenarios.load import load
+
+DAYS = 365
+
+
+def keys_command(
+    folder: Annotated[Path, typer.Argument(help="Folder of one fleet's keys.", metavar="DIR")],
+    scenario: Annotated[
+        str | None, typer.Argument(help="Make new keys for the arms of this scenario; default: show the present keys.")
+    ] = None,
+    extra: Annotated[
+        list[str] | None, typer.Option(help=f"NAME:ROLE, another participant; roles: {', '.join(ROLES)}.")
+    ] = None,
+    add: Annotated[
+        list[str] | None, typer.Option(help="NAME:ROLE, a new certificate from the present authority.")
+    ] = None,
+    days: Annotated[int, typer.Option(help="Lifetime of the participants' certificates, days.")] = DAYS,
+    host: Annotated[
+        list[str] | None,
+        typer.Option(help="Another name or address of the router than localhost, 127.0.0.1 and ::1."),
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace all keys; with --add, replace one certificate.")
+    ] = False,
+    no_auctioneer: Annotated[
+        bool,
+        typer.Option(
+            "--no-auctioneer", help="For a fleet whose arms allocate jobs by consensus and answer submitters."
+        ),
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Make, extend and show keys and certificates for mutual TLS."""
+    from fleet.bus.security.certificates import HERE
+    from fleet.bus.security.keyring import add as add_to
+    from fleet.bus.security.keyring import make, spans_of
+
+    if add and (scenario or extra):
+        raise FleetError("--add extends the present keys; leave SCENARIO and --extra out.")
+    if no_auctioneer and not scenario:
+        raise FleetError("--no-auctioneer is for new keys, so SCENARIO is needed.")
+    if extra and not scenario:
+        raise FleetError("--extra is for new keys, so SCENARIO is needed; --add extends present ones.")
+    if scenario:
+        chosen = load(scenario)
+        more = [participant_of(text) for text in extra or ()]
+        roster = _roster(chosen.name, [arm.name for arm in chosen.arms], more, auctioneer=not no_auctioneer)
+        make(folder, roster, days=days, hosts=host or HERE, overwrite=overwrite)
+    for text in add or ():
+        add_to(folder, participant_of(text), days=days, hosts=host or HERE, overwrite=overwrite)
+    roster = read_roster(folder)
+    spans = spans_of(folder, roster)
+    if as_json:
+        typer.echo(json.dumps(_plain(roster, {name: end for name, (_, end) in spans.items()}), indent=1))
+        return
+    out_console.print(_table(roster, spans))
+    if scenario or add:
+        say(f"Keys of the fleet '{roster.fleet}' are in {folder}. Keep {folder / 'ca.key'} where no participant runs.")
+
+
+def participant_of(text: str) -> Participant:
+    """The participant of `NAME:ROLE`; a name may hold colons.
+
+    Raises:
+        FleetError: the text has another form, or the name or the role is not allowed.
+    """
+    name, colon, role = text.rpartition(":")
+    if not colon or not name:
+        raise FleetError(f"'{text}' is not NAME:ROLE, as in gateway:submitter.")
+    for known in get_args(Role):
+        if role == known:
+            try:
+                return Participant(name, known)
+            except ValueError as error:
+                raise FleetError(str(error)) from error
+    raise FleetError(f"'{text}': no role '{role}'{nearest(role, ROLES)}")
+
+
+def _roster(fleet: str, arms: list[str], extra: list[Participant], *, auctioneer: bool) -> Roster:
+    try:
+        return of_arms(fleet, arms, extra, auctioneer=auctioneer)
+    except ValueError as error:
+        raise FleetError(str(error)) from error
+
+
+def _table(roster: Roster, spans: dict[str, tuple[datetime, datetime]]) -> Table:
+    from fleet.bus.security.certificates import CA, told
+
+    table = Table(box=None, pad_edge=False)
+    for column in ("participant", "role", "certificate ends"):
+        table.add_column(column)
+    now = datetime.now(UTC)
+    rows = [("(authority)", "", spans[CA]), *((one.name, one.role, spans[one.name]) for one in roster.participants)]
+    for name, role, (begin, end) in rows:
+        not_now = ", expired" if end < now else ", not yet valid" if begin > now else ""
+        table.add_row(name, role, told(end) + not_now)
+    return table
+
+
+def _plain(roster: Roster, ends: dict[str, datetime]) -> dict[str, object]:
+    from fleet.bus.security.certificates import CA
+
+    def row(one: Participant) -> dict[str, object]:
+        who = {"name": one.name, "role": one.role, "common_name": one.common_name, "ends": ends[one.name].isoformat()}
+        return {**who, **asdict(rights(roster.fleet, one, alone=roster.alone))}
+
+    return {
+        "fleet": roster.fleet,
+        "authority_ends": ends[CA].isoformat(),
+        "participants": [row(one) for one in roster.participants],
+    }

@@ -1,0 +1,118 @@
+"""`thermofleet ask`: request quotes of all arms without submitting anything."""
+
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
+import typer
+from rich.table import Table
+
+from fleet.errors import BusError, FleetError
+from scenarios.cli.live.submit import JOBS_HELP, explain, read_jobs
+from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
+from scenarios.cli.terminal import out_console, say
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from fleet.bus.protocol.auction import JobEstimate, JobSpec, Quote
+
+REPLY_S = 5.0
+"""Real seconds to wait for arms: planning a new motion takes a while."""
+
+
+def ask_command(
+    file: Annotated[str, typer.Argument(help=JOBS_HELP)] = "",
+    kind: Annotated[str, typer.Option(help="One job instead of a file: pick_place, hold, press, sort.")] = "",
+    place: Annotated[list[str] | None, typer.Option(help="Place of the cell; twice for pick_place and sort.")] = None,
+    payload: Annotated[float, typer.Option(help="Payload, kg.")] = 0.0,
+    repetitions: Annotated[int, typer.Option(help="Number of cycles.")] = 1,
+    dwell: Annotated[float, typer.Option(help="Duration of one repetition of a hold or press, s.")] = 0.5,
+    force: Annotated[float, typer.Option(help="Force of a press, N.")] = 0.0,
+    timeout: Annotated[float, typer.Option(help="Real seconds to wait for arms.")] = REPLY_S,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the quotes as JSON.")] = False,
+    endpoint: EndpointOption = ENDPOINT,
+    fleet: FleetOption = "",
+) -> None:
+    """Ask every arm what jobs would cost: difficulty, risk, peak temperature, finish, or why it cannot do them.
+
+    The duration of a job includes the ways to its place and home. It is finished after its last cycle, once the arm's
+    present jobs are done.
+    """
+    from fleet.bus.client.client import BusClient
+    from fleet.bus.protocol import keys
+    from fleet.bus.protocol.auction import MOST_JOBS, Quote, QuoteRequest
+
+    if bool(file) == bool(kind):
+        raise FleetError("Give either a FILE of jobs or one job by --kind and --place.")
+    jobs = read_jobs(file) if file else [one_job(kind, place or [], payload, repetitions, dwell, force)]
+    if len(jobs) > MOST_JOBS:
+        raise FleetError(f"A request can name at most {MOST_JOBS} jobs (got {len(jobs)}).")
+    with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
+        request = QuoteRequest("dry run", tuple(jobs), dry_run=True)
+        answers = link.query_and_wait(keys.of_every_arm(link.fleet, "quote"), request, Quote, timeout_s=timeout)
+        name = link.fleet
+    quotes = {quote.arm: quote for quote in sorted(answers.messages.values(), key=lambda quote: quote.arm)}
+    if not quotes and not answers.refused:
+        raise BusError(f"No arm of fleet '{name}' replied. Is `thermofleet arm` running?")
+    if as_json:
+        typer.echo(msgspec.json.format(msgspec.json.encode(list(quotes.values())), indent=1).decode())
+    else:
+        out_console.print(quote_table(jobs, quotes))
+    for reason in answers.refused.values():
+        say(f"Refused: {reason}" if reason else f"An arm did not reply within {timeout:g} s.")
+
+
+def one_job(
+    kind: str, places: "Sequence[str]", payload_kg: float, repetitions: int, dwell_s: float, force_n: float
+) -> "JobSpec":
+    """Make the job that the options describe.
+
+    Raises:
+        FleetError: there is no such job.
+    """
+    from fleet.bus.protocol.auction import JobSpec
+
+    fields = {
+        "name": kind,
+        "kind": kind,
+        "places": list(places),
+        "payload_kg": payload_kg,
+        "repetitions": repetitions,
+        "dwell_s": dwell_s,
+        "force_n": force_n,
+    }
+    try:
+        return msgspec.convert(fields, JobSpec)
+    except msgspec.ValidationError as error:
+        raise FleetError(f"No such job: {explain(error)}") from error
+
+
+def quote_table(jobs: "Sequence[JobSpec]", quotes: "Mapping[str, Quote]") -> Table:
+    """All estimates: jobs in the given order, and under each job the arms."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("job")
+    table.add_column("arm")
+    for column in ("d", "P(warm)", "peak °C", "takes s", "done in s"):
+        table.add_column(column, justify="right")
+    table.add_column("")
+    for index, job in enumerate(jobs):
+        for row, (arm, quote) in enumerate(quotes.items()):
+            estimate = next((each for each in quote.estimates if each.job == job.name), None)
+            last = row == len(quotes) - 1 and index > 0
+            table.add_row("" if row else job.name, arm, *cells(estimate), end_section=last)
+    return table
+
+
+def cells(estimate: "JobEstimate | None") -> list[str]:
+    """Cells of an estimate; a dash for what the arm does not know."""
+    if estimate is None:
+        return ["–"] * 5 + ["no reply"]
+    figures = (
+        (estimate.difficulty, ".2f"),
+        (estimate.p_saturation, ".2f"),
+        (estimate.peak_c, ".1f"),
+        (estimate.duration_s, ".0f"),
+        (estimate.finish_in_s, ".0f"),
+    )
+    values = ["–" if value is None else format(value, form) for value, form in figures]
+    return [*values, "" if estimate.feasible else f"cannot: {estimate.reason}"]

@@ -1,0 +1,150 @@
+"""`thermofleet doctor`: check the health of a fleet."""
+
+import re
+import socket
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
+import typer
+
+from fleet.errors import BusError, FleetError
+from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption
+from scenarios.cli.terminal import out_console, say
+from scenarios.load import load
+
+if TYPE_CHECKING:
+    from fleet.bus.client.client import BusClient
+    from fleet.bus.client.replies import Replies
+    from fleet.bus.protocol.auction import Clock
+    from fleet.live.monitor.health import HealthReport
+    from fleet.live.monitor.snapshot import FleetSnapshot
+
+UNHEALTHY = 1
+"""Exit code; 0 is a healthy fleet, and 2, as for every error of use, one that cannot be reached."""
+PROBE_EVERY_S, REPLY_S = 0.3, 1.0
+_COLORS = {"fault": "red", "warning": "yellow"}
+
+
+def doctor_command(
+    endpoint: EndpointOption = ENDPOINT,
+    fleet: FleetOption = "",
+    seconds: Annotated[float, typer.Option(help="Real seconds to listen.")] = 3.0,
+    auctioneer: Annotated[bool, typer.Option(help="Whether the fleet should have an auctioneer.")] = True,
+    scenario: Annotated[
+        str,
+        typer.Option(help="Expect every arm of this scenario. Default: only arms that are heard."),
+    ] = "",
+    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+) -> None:
+    """Check the health of a fleet: exit code 0 healthy, 1 unhealthy, 2 unreachable."""
+    from fleet.bus.client.discover import fleets_at
+
+    if not 0 < seconds <= 600:
+        raise FleetError(f"--seconds must be more than 0 and at most 600 (got {seconds:g}).")
+    expected = tuple(arm.name for arm in load(scenario).arms) if scenario else ()
+    try:
+        fleets = fleets_at(endpoint)
+    except BusError as error:
+        raise BusError(f"{error} {why_unreachable(endpoint)}".strip()) from error
+    if not fleet and len(fleets) != 1:
+        several = f"There are several fleets: {', '.join(fleets)}. Choose one with --fleet."
+        none = "There is no fleet: no arm and no auctioneer shows a token."
+        say(f"The router at {endpoint} answers. {several if fleets else none}")
+        raise typer.Exit(UNHEALTHY)
+    snapshot, report = examine(endpoint, fleet or fleets[0], seconds, auctioneer=auctioneer, expected=expected)
+    if as_json:
+        fields = {"healthy": report.healthy, **msgspec.to_builtins(report)}
+        typer.echo(msgspec.json.format(msgspec.json.encode(fields)).decode())
+    else:
+        show(endpoint, snapshot, report)
+        if fleets and fleet and fleet not in fleets:
+            say(f"Fleets at {endpoint}: {', '.join(fleets)}.", out_console)
+    raise typer.Exit(0 if report.healthy else UNHEALTHY)
+
+
+def examine(
+    endpoint: str, fleet: str, seconds: float, *, auctioneer: bool = True, expected: tuple[str, ...] = ()
+) -> "tuple[FleetSnapshot, HealthReport]":
+    """Listen to a fleet for some real seconds; return its last snapshot and its health.
+
+    Args:
+        auctioneer: Whether it should have one.
+        expected: Arms that should be present.
+
+    Raises:
+        BusError: no router answered.
+    """
+    from fleet.bus.client.client import BusClient
+    from fleet.bus.protocol import keys
+    from fleet.bus.protocol.auction import Clock, ClockRequest
+    from fleet.bus.security.tls import identified
+    from fleet.live.monitor.health import ClockProbe, check_health
+    from fleet.live.monitor.listener import FleetListener
+
+    probes: list[ClockProbe] = []
+
+    def probe_clock(link: "BusClient") -> None:
+        asked_s = time.monotonic()
+
+        def done(answers: "Replies[Clock]") -> None:
+            reply = next(iter(answers.messages.values()), None)
+            probe = ClockProbe(asked_s, asked_s + answers.took_s)
+            probes.append(replace(probe, time_s=reply.time_s, speed=reply.speed) if reply else probe)
+
+        link.query(keys.of_clock(fleet), ClockRequest(), Clock, done, timeout_s=REPLY_S)
+
+    with BusClient(endpoint, fleet) as link:
+        listener = FleetListener(link)
+        end_s = time.monotonic() + seconds
+        while time.monotonic() < end_s:
+            probe_clock(link)
+            listener.serve(min(end_s, time.monotonic() + PROBE_EVERY_S))
+        now_s = time.monotonic()
+        snapshot = listener.view.snapshot(now_s)
+        problems = {"malformed": link.malformed, "complaints": tuple(link.rejections), "overrun": link.overrun}
+    secure = identified(endpoint)[1] is not None
+    report = check_health(snapshot, now_s, probes, auctioneer=auctioneer, secure=secure, expected=expected, **problems)
+    return snapshot, report
+
+
+def show(endpoint: str, fleet: "FleetSnapshot", report: "HealthReport") -> None:
+    """Print the report on the terminal."""
+    from scenarios.live.dashboard import arm_table, format_time, jobs_line
+
+    trip = "no answer" if report.round_trip_s is None else f"{1000 * report.round_trip_s:.1f} ms"
+    out_console.print(f"router      {endpoint}, round trip {trip}", highlight=False)
+    fleet_time = "unknown" if report.time_s is None else format_time(report.time_s)
+    out_console.print(f"fleet       {report.fleet}, time {fleet_time}", highlight=False, markup=False)
+    if report.offsets_s:
+        worst = max(report.offsets_s, key=lambda arm: abs(report.offsets_s[arm]))
+        line = f"clocks      {worst} is furthest off: {report.offsets_s[worst]:+.2f} s"
+        out_console.print(line, highlight=False, markup=False)
+    out_console.print(f"malformed   {report.malformed}", highlight=False)
+    if fleet.arms:
+        out_console.print(arm_table(fleet.arms))
+    out_console.print(jobs_line(fleet))
+    for finding in report.findings:
+        out_console.print(
+            f"{finding.level}: {finding.what}", style=_COLORS.get(finding.level, ""), highlight=False, markup=False
+        )
+    out_console.print("The fleet is healthy." if report.healthy else "The fleet is not healthy.", highlight=False)
+
+
+def why_unreachable(endpoint: str) -> str:
+    """What a plain connection to the endpoint shows; "" for TLS or an invalid endpoint, where the error says it."""
+    match = re.fullmatch(r"tcp/\[?([^\]/]+?)\]?:(\d{1,5})", endpoint)
+    if match is None or int(match[2]) > 65535:
+        return ""
+    from fleet.bus.security.tls import why_not
+
+    host, port = match[1], int(match[2])
+    try:
+        with socket.create_connection((host, port), timeout=REPLY_S):
+            known = why_not(host, port, None)  # the error says it already
+            return "" if known else f"Port {port} is open, but it is not a router of ours."
+    except ConnectionRefusedError:
+        return f"Nothing listens at port {port} of {host}; start it with: thermofleet router --port {port}"
+    except OSError as error:
+        return f"A plain connection fails too: {error.strerror or error}."

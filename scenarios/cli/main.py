@@ -1,0 +1,155 @@
+"""The command line `thermofleet`: its commands by group, and how errors end it.
+
+The module of a command is imported when the command runs, so that `--help` is fast.
+"""
+
+import errno
+import logging
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.metadata import version
+from typing import Annotated, Any, NamedTuple
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from fleet.errors import FleetError
+from scenarios.cli.terminal import INTERRUPTED, Interrupted, err_console, say
+from scenarios.extras import missing_extra
+
+USAGE = 2
+"""Exit code of an error that the user can correct."""
+_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS)
+
+
+class LazyCommand(NamedTuple):
+    """A command whose module is imported when it runs."""
+
+    panel: str
+    """Its group in `thermofleet --help`."""
+    target: str
+    """MODULE:NAME of its function or `typer.Typer`, the module relative to this package."""
+    help: str
+
+
+_LOOK, _POLICIES, _LIVE = "Run and look", "Evaluate policies", "Run a live fleet"
+_TWIN, _TOOLS = "Digital twin", "Tools"
+COMMANDS = {
+    "demo": LazyCommand(_LOOK, "run:demo_command", "Run the quickstart shift under two policies."),
+    "run": LazyCommand(_LOOK, "run:run_command", "Run one shift of a scenario and record it."),
+    "list": LazyCommand(_LOOK, "library:list_command", "List the scenarios that come with thermofleet."),
+    "show": LazyCommand(_LOOK, "library:show_command", "Show a scenario: arms, jobs, thermal load factor."),
+    "animate": LazyCommand(_LOOK, "animate:animate_command", "Draw one shift as a GIF."),
+    "compare": LazyCommand(_POLICIES, "compare:compare_command", "Compare policies on the same seeds."),
+    "train": LazyCommand(_POLICIES, "train:train_command", "Train a policy by reinforcement learning."),
+    "up": LazyCommand(_LIVE, "live.up:up_command", "Start a whole fleet, one process per participant."),
+    "router": LazyCommand(_LIVE, "router:router_command", "Run the Zenoh router of a fleet."),
+    "arm": LazyCommand(_LIVE, "live.arm:arm_command", "Run one arm of a fleet."),
+    "auction": LazyCommand(_LIVE, "live.auction:auction_command", "Run the auctioneer of a fleet."),
+    "submit": LazyCommand(_LIVE, "live.submit:submit_command", "Submit jobs to a fleet."),
+    "ask": LazyCommand(_LIVE, "live.ask:ask_command", "Ask every arm for a quote."),
+    "watch": LazyCommand(_LIVE, "live.watch:watch_command", "Watch a fleet in the terminal."),
+    "doctor": LazyCommand(_LIVE, "live.doctor:doctor_command", "Check the health of a fleet."),
+    "gateway": LazyCommand(_LIVE, "live.gateway:gateway_command", "Serve a fleet over HTTP."),
+    "record": LazyCommand(_LIVE, "live.record:record_command", "Record a fleet to Parquet."),
+    "replay": LazyCommand(_LIVE, "live.record:replay_command", "Replay a run or a recording on the bus."),
+    "ros2": LazyCommand(_LIVE, "ros2:ros2_app", "Connect a fleet and ROS 2."),
+    "keys": LazyCommand(_LIVE, "keys:keys_command", "Make and show TLS keys and certificates."),
+    "twin": LazyCommand(_TWIN, "twin:twin_app", "Train, score and use the digital twin of an arm."),
+    "hold": LazyCommand(_TWIN, "scenarios.motion.hold:hold_command", "Compute how long an arm can hold a payload."),
+    "contract": LazyCommand(_TOOLS, "contract:contract_command", "Write schemas and AsyncAPI document of the bus."),
+}
+
+
+class LazyGroup(TyperGroup):
+    """The commands of `COMMANDS`: listed by their entries, imported when they run."""
+
+    def __init__(self, **attributes: Any) -> None:  # whatever typer passes on to its base class
+        super().__init__(**attributes)
+        for name, entry in COMMANDS.items():
+            self.add_command(TyperCommand(name, help=entry.help, rich_help_panel=entry.panel))
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
+        """Import the command in place of its entry, for running it and for shell completion.
+
+        Any: typer keeps the classes of contexts and commands private.
+        """
+        name, listed, rest = super().resolve_command(ctx, args)
+        return name, listed and load_command(str(name)), rest
+
+
+def load_command(name: str) -> Any:
+    """Import a command. Any: typer keeps the class of commands private."""
+    module, _, attribute = COMMANDS[name].target.partition(":")
+    prefix = "" if module.startswith("scenarios.") else "scenarios.cli."
+    target = getattr(import_module(prefix + module), attribute)
+    if not isinstance(target, typer.Typer):
+        alone = typer.Typer(add_completion=False)
+        alone.command(name)(target)
+        target = alone
+    command = typer.main.get_command(target)
+    command.name = name
+    return command
+
+
+app = typer.Typer(
+    cls=LazyGroup,
+    help="Robot fleets that know how hard a job is on their motors, tell each other, and share the work.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"thermofleet {version('thermofleet')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    pass
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command line: an error that the user can correct is one sentence and exit code 2; Ctrl-C is 130."""
+    _log_warnings()
+    try:
+        code = app(args=list(argv) if argv is not None else None, prog_name="thermofleet", standalone_mode=False)
+    except Interrupted as interrupted:
+        say(str(interrupted))
+        sys.exit(INTERRUPTED)
+    except FleetError as error:
+        say(f"Error: {error}")
+        sys.exit(USAGE)
+    except ModuleNotFoundError as error:
+        if missing_extra(error) is None:
+            raise
+        say(f"Error: {missing_extra(error)}")
+        sys.exit(USAGE)
+    except typer.TyperException as error:
+        message = error.format_message()
+        if message:  # empty if the help was shown instead
+            say(f"Error: {message.rstrip('.')}{'' if message.endswith('?') else '.'} See thermofleet --help.")
+        sys.exit(USAGE)
+    except OSError as error:
+        if error.errno not in _DISK:
+            raise
+        say(f"Error: '{error.filename or 'disk'}': {error.strerror}.")
+        sys.exit(USAGE)
+    sys.exit(code or 0)
+
+
+def _log_warnings() -> None:
+    if not err_console.is_terminal:  # a file, in which every line is one message
+        logging.basicConfig(level=logging.WARNING, format="%(levelname)-8s %(name)s: %(message)s")
+        return
+    from rich.logging import RichHandler
+
+    handler = RichHandler(console=err_console, show_time=False, show_path=False, rich_tracebacks=False)
+    logging.basicConfig(level=logging.WARNING, format="%(name)s: %(message)s", handlers=[handler])

@@ -1,0 +1,159 @@
+"""`thermofleet ros2`: publish a fleet in ROS 2, and add a real arm with a ROS 2 driver to a fleet."""
+
+import os
+import time
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fleet.errors import FleetError
+from fleet.robot import ThermalLimits
+from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
+from scenarios.extras import require_extra
+
+if TYPE_CHECKING:
+    from fleet.ros2.node import Node
+
+ros2_app = typer.Typer(
+    help="Connect a fleet and ROS 2 over Zenoh (rmw_zenoh), in both directions; needs the extra ros2.",
+    no_args_is_help=True,
+    add_completion=False,
+)
+TURN_S = 0.25
+"""Real seconds between two checks for a stop signal."""
+DEFAULTS = ThermalLimits()
+
+DomainOption = Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", help="The ROS 2 domain.")]
+RouterOption = Annotated[
+    str, typer.Option(help="Router of ROS 2 (rmw_zenohd), as tcp/127.0.0.1:7447; default: the fleet's router.")
+]
+WarningOption = Annotated[float, typer.Option(help="Motor temperature at which a warning begins, °C.")]
+
+
+@ros2_app.command("bridge")
+def bridge_command(
+    endpoint: EndpointOption = ENDPOINT,
+    fleet: FleetOption = "",
+    domain: DomainOption = 0,
+    router: RouterOption = "",
+    humble: Annotated[bool, typer.Option("--humble", help="For ROS 2 Humble, whose keys have no type hash.")] = False,
+    warning_c: WarningOption = DEFAULTS.warning_c,
+    error_c: Annotated[float, typer.Option(help="Motor temperature at which an error begins, °C.")] = DEFAULTS.error_c,
+) -> None:
+    """Publish every arm of a fleet as JointState and DiagnosticArray, until Ctrl-C or SIGTERM."""
+    where = ros2_router(router, endpoint)
+    node = node_at(where, "thermofleet", domain)
+    from fleet.bus.client.client import BusClient
+    from fleet.ros2.bridge import Bridge
+    from scenarios.cli.signals import until_stopped
+
+    limits = limits_of(warning_c, error_c)
+    with until_stopped() as stop, BusClient(endpoint, the_fleet(fleet, endpoint)) as link, node:
+        bridge = Bridge(link, node, limits=limits, humble=humble)
+        typer.echo(f"ready ros2 bridge {where} {os.getpid()}")
+        while not stop.is_set():
+            bridge.serve(time.monotonic() + TURN_S)
+        stop.leave("The bridge was interrupted.")
+
+
+@ros2_app.command("listen")
+def listen_command(
+    topic: Annotated[str, typer.Argument(help="Topic of the arm's sensor_msgs/JointState, as /joint_states.")],
+    arm: Annotated[str, typer.Option(help="Name of the arm in the fleet.")] = "real",
+    temperatures: Annotated[
+        str, typer.Option(help="Topic of the diagnostic_msgs/DiagnosticArray with its motor temperatures.")
+    ] = "",
+    hardware: Annotated[
+        str, typer.Option(help="Text before /JOINT in the hardware_id of these diagnostics; default: none.")
+    ] = "",
+    joints: Annotated[str, typer.Option(help="Names of its joints in ROS 2, from joint 1 on.")] = "",
+    endpoint: EndpointOption = ENDPOINT,
+    fleet: FleetOption = "",
+    domain: DomainOption = 0,
+    router: RouterOption = "",
+    rate_hz: Annotated[float, typer.Option(help="State messages per real second.")] = 10.0,
+    warning_c: WarningOption = DEFAULTS.warning_c,
+) -> None:
+    """Show a real arm with a ROS 2 driver as an arm of the fleet that takes no jobs, until Ctrl-C or SIGTERM."""
+    if not temperatures:
+        raise FleetError(
+            "A JointState has no motor temperatures, and a fleet needs them: name the topic of a DiagnosticArray that "
+            "has them with --temperatures. docs/ros2.md describes its content."
+        )
+    if not 0 < rate_hz <= 100:
+        raise FleetError(f"--rate-hz must be > 0 and at most 100 (got {rate_hz:g}).")
+    if not arm:
+        raise FleetError("--arm needs a name.")
+    names, where = names_of(joints), ros2_router(router, endpoint)
+    node = node_at(where, f"thermofleet_{arm}", domain)
+    from fleet.bus.client.client import BusClient
+    from fleet.live.clock import FleetClock
+    from fleet.ros2.follower import Follower, Reality
+    from scenarios.cli.signals import until_stopped
+
+    with until_stopped() as stop, BusClient(endpoint, the_fleet(fleet, endpoint)) as link, node:
+        clock = FleetClock(1.0, time.monotonic())
+        limits = limits_of(warning_c, max(warning_c + 1.0, DEFAULTS.error_c))
+        reality, topics = Reality(names, hardware), (topic, temperatures)
+        follower = Follower(link, node, arm, reality, topics, clock, limits=limits, rate_hz=rate_hz)
+        typer.echo(f"ready {arm} {topic} {os.getpid()}")
+        while not stop.is_set():
+            follower.serve(time.monotonic() + TURN_S)
+        stop.leave(f"Stopped listening to {topic}.")
+
+
+def ros2_router(router: str, endpoint: str) -> str:
+    """Endpoint of the router of ROS 2: the given one, or the fleet's.
+
+    Raises:
+        FleetError: the fleet's router enforces access rules, which do not include ROS 2.
+    """
+    if not router and endpoint.startswith("tls/"):
+        raise FleetError(
+            "With TLS the fleet's router forwards the fleet's own keys only: name the router of ROS 2 with --router, "
+            "as tcp/127.0.0.1:7447."
+        )
+    return router or endpoint
+
+
+def node_at(router: str, name: str, domain: int) -> "Node":
+    """A ROS 2 node, not yet open.
+
+    Raises:
+        FleetError: the extra is not installed, or there is no such domain.
+    """
+    require_extra("ros2")
+    from fleet.ros2.node import Node
+    from fleet.ros2.topics import DOMAINS
+
+    if domain not in DOMAINS:
+        raise FleetError(f"--domain must be 0 to {DOMAINS[-1]} (got {domain}).")
+    return Node(router, name, domain=domain)
+
+
+def names_of(joints: str) -> tuple[str, ...]:
+    """The given joint names, or those of a Gen3.
+
+    Raises:
+        FleetError: a name is empty or given twice.
+    """
+    from fleet.robot import JOINTS
+    from fleet.ros2.conversion import joint_names
+
+    if not joints:
+        return joint_names(JOINTS)
+    names = tuple(name.strip() for name in joints.split(","))
+    if "" in names or len(set(names)) != len(names):
+        raise FleetError(f"--joints needs different names, as joint_1,joint_2 (got {joints}).")
+    return names
+
+
+def limits_of(warning_c: float, error_c: float) -> ThermalLimits:
+    """Limits at which diagnostics change their level.
+
+    Raises:
+        FleetError: the limits are not in order.
+    """
+    if not warning_c < error_c < float("inf"):
+        raise FleetError(f"--warning-c must be less than --error-c (got {warning_c:g} and {error_c:g}).")
+    return ThermalLimits(warning_c=warning_c, error_c=error_c, restart_c=min(DEFAULTS.restart_c, warning_c - 1.0))

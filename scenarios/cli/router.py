@@ -1,0 +1,62 @@
+"""`thermofleet router`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fleet.bus.protocol.registry import CHANNEL
+from fleet.errors import FleetError
+from scenarios.cli.signals import until_stopped
+from scenarios.load import load
+
+PORT = 7447
+
+
+def router_command(
+    port: Annotated[int, typer.Option(help="TCP port; 0 is any free one.")] = PORT,
+    host: Annotated[str, typer.Option(help="Address to listen on; beyond loopback only with --tls.")] = "127.0.0.1",
+    tls: Annotated[
+        Path | None,
+        typer.Option(help="Folder that `thermofleet keys` made: mutual TLS, and access by role."),
+    ] = None,
+    name: Annotated[str, typer.Option(help="--tls: participant whose certificate the router presents.")] = "router",
+    scenario: Annotated[
+        str | None, typer.Option(help="--tls: refuse to start unless every arm of this scenario has a certificate.")
+    ] = None,
+    state_hz: Annotated[
+        float, typer.Option(help="Telemetry messages forwarded per second and session; 0 is unlimited.")
+    ] = CHANNEL["arm", "state"].limit_hz or 0.0,
+) -> None:
+    """Run the Zenoh router of a fleet until Ctrl-C or SIGTERM; it prints its endpoint once it listens."""
+    from fleet.bus.client.rate_limits import Limits
+    from fleet.bus.client.router import Router
+    from fleet.bus.security.tls import Tls
+
+    if not 0 <= port <= 65535:
+        raise FleetError(f"--port must be 0 to 65535 (got {port}).")
+    if not 0 <= state_hz < 1e6:
+        raise FleetError(f"--state-hz must be 0 or more (got {state_hz:g}).")
+    if scenario is not None:
+        _check_roster(tls, scenario)
+    limits = Limits(state_hz=state_hz or None)
+    with until_stopped() as stop, Router(port, host=host, tls=Tls(tls, name) if tls else None, limits=limits) as router:
+        typer.echo(router.endpoint)  # flushed: a supervisor reads this line
+        stop.wait()
+        stop.leave("The router was interrupted; its clients keep trying to reconnect.")
+
+
+def _check_roster(folder: Path | None, scenario: str) -> None:
+    from fleet.bus.security.access_control import read_roster
+
+    if folder is None:
+        raise FleetError("--scenario needs --tls: without TLS there are no certificates to check.")
+    chosen, roster = load(scenario), read_roster(folder)
+    if roster.fleet != chosen.name:
+        raise FleetError(f"The keys in '{folder}' are for the fleet '{roster.fleet}', not for '{chosen.name}'.")
+    missing = [arm.name for arm in chosen.arms if arm.name not in roster.of_role("arm")]
+    if missing:
+        raise FleetError(
+            f"No certificate in '{folder}' for {', '.join(missing)}; make one with: thermofleet keys {folder} --add "
+            f"{missing[0]}:arm."
+        )

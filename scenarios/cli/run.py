@@ -1,0 +1,248 @@
+"""`thermofleet run` and `thermofleet demo`."""
+
+import json
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.table import Table
+
+from agents.registry import NAMES_HELP
+from fleet.bus.exchange.channel import PERFECT, Channel, Partition
+from fleet.errors import FleetError
+from fleet.metrics import Metrics
+from scenarios.cli import options
+from scenarios.cli.terminal import INTERRUPTED, Interrupted, out_console, progress_bar, say
+from scenarios.load import load
+from scenarios.policy_loader import label, policy_of
+from scenarios.progress import Progress
+from scenarios.result_folder import check_free, new_folder
+from scenarios.schema import Scenario
+
+if TYPE_CHECKING:  # slow to import
+    from scenarios.prepare.fleet import Fleet
+    from scenarios.run.shift import RunResult, RunSpec
+
+
+def run_command(
+    scenario: options.ScenarioArg,
+    policy: Annotated[str, typer.Option(help=NAMES_HELP)] = "least_difficulty",
+    seed: options.SeedOption = 0,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the recording; default: runs/SCENARIO-POLICY-SEED.")
+    ] = None,
+    plant: Annotated[
+        str, typer.Option(help="profile (heat from the plan) or mujoco (closed loop in one scene).")
+    ] = "profile",
+    bus: Annotated[str, typer.Option(help="zenoh (in-process router) or memory.")] = "zenoh",
+    difficulty: options.DifficultyOption = "twin",
+    overwrite: options.OverwriteOption = False,
+    listen: Annotated[
+        int, typer.Option(help="Loopback port of the Zenoh router, for others to subscribe; 0 is any free port.")
+    ] = 0,
+    as_json: options.JsonOption = False,
+    topology: options.TopologyOption = "complete",
+    radius: options.RadiusOption = 0.5,
+    topology_seed: options.TopologySeedOption = 0,
+    delay_s: options.DelayOption = 0.0,
+    jitter_s: options.JitterOption = 0.0,
+    loss: options.LossOption = 0.0,
+    partition: options.PartitionOption = None,
+) -> None:
+    """Run one shift of a scenario and record it."""
+    from scenarios.run.run_folder import RUN
+
+    chosen = load(scenario)
+    channel = channel_of(chosen, topology, radius, topology_seed, delay_s, jitter_s, loss, partition)
+    spec = _spec(policy, seed, plant, bus, difficulty, channel)
+    if not 0 <= listen <= 65535 or (listen and bus == "memory"):
+        raise FleetError(f"--listen needs a port from 1 to 65535 and --bus zenoh (got {listen}, {bus}).")
+    where = out or Path("runs") / f"{chosen.name}-{label(policy)}-{seed}"
+    check_free(where, RUN, overwrite=overwrite)
+    with router_at(listen) as endpoint, progress_bar() as progress:
+        _, result = _run_into(chosen, spec, where, overwrite, progress, endpoint=endpoint)
+    if as_json:
+        typer.echo(json.dumps({"out": str(where), **_figures(result)}, indent=1))
+    else:
+        say(f"{chosen.name}, seed {seed}", out_console)
+        out_console.print(metrics_table({label(policy): result.metrics}))
+        if result.finished:
+            say(f"Recorded in {where}; open {where / 'report.html'} in a browser.", out_console)
+    if not result.finished:
+        say(
+            f"Interrupted after {result.time_s:g} s of {chosen.horizon_s:g} s: the shift until then is kept in {where} "
+            "(status 'interrupted'). The same command runs the whole shift again with the cached plans and twins."
+        )
+        raise typer.Exit(INTERRUPTED)
+
+
+def demo_command(
+    out: Annotated[Path, typer.Option(help="Folder of the two recordings.")] = Path("out/demo"),
+    seed: options.SeedOption = 5,
+) -> None:
+    """Run the quickstart shift under two policies, side by side."""
+    chosen = load("quickstart")
+    results: dict[str, Metrics] = {}
+    fleet = None
+    with progress_bar() as progress:
+        for policy in ("round_robin", "least_difficulty"):
+            spec = _spec(policy, seed, "profile", "zenoh", "twin", PERFECT)
+            fleet, result = _run_into(chosen, spec, out / policy, True, progress, fleet=fleet)
+            if not result.finished:
+                raise Interrupted(f"Interrupted while working; recordings are in {out}.")
+            results[policy] = result.metrics
+    say(f"{chosen.name}, seed {seed}: {chosen.description}", out_console)
+    out_console.print(metrics_table(results))
+    say(f"Open {out / 'least_difficulty' / 'report.html'} in a browser to see what happened.", out_console)
+
+
+def _spec(policy: str, seed: int, plant: str, bus: str, difficulty: str, channel: Channel) -> "RunSpec":
+    from scenarios.prepare.fleet import BusName, DifficultyName, PlantName, choose
+    from scenarios.run.shift import RunSpec
+
+    policy_of(policy)
+    if seed < 0:
+        raise FleetError(f"--seed must be 0 or more (got {seed}).")
+    return RunSpec(
+        policy=policy,
+        seed=seed,
+        plant=choose("plant", plant, PlantName),
+        bus=choose("bus", bus, BusName),
+        difficulty=choose("difficulty", difficulty, DifficultyName),
+        channel=channel,
+    )
+
+
+def _run_into(
+    scenario: Scenario,
+    spec: "RunSpec",
+    out: Path,
+    overwrite: bool,
+    progress: Progress,
+    *,
+    endpoint: str | None = None,
+    fleet: "Fleet | None" = None,
+) -> tuple["Fleet", "RunResult"]:
+    """Run a shift and write it to `out`; the fleet is prepared unless it is given."""
+    from scenarios.prepare.fleet import prepare
+    from scenarios.run.run_folder import RUN, write
+    from scenarios.run.shift import run
+
+    with new_folder(out, RUN, overwrite=overwrite) as folder:
+        fleet = fleet or prepare(scenario, difficulty=spec.difficulty, progress=progress)
+        with stop_on_interrupt() as stopped:
+            result = run(fleet, spec, progress=progress, stopped=stopped, endpoint=endpoint)
+            progress("writing", 0.0)
+            write(result, folder)
+    return fleet, result
+
+
+@contextmanager
+def router_at(port: int) -> Iterator[str | None]:
+    """The endpoint of a router on a loopback port, opened before the fleet connects so that no message is missed."""
+    if not port:
+        yield None
+        return
+    from fleet.bus.client.router import Router
+
+    with Router(port) as router:
+        yield router.endpoint
+
+
+@contextmanager
+def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
+    """A function that returns True after Ctrl-C, so that a shift ends between two steps; a second Ctrl-C aborts it."""
+    pressed = threading.Event()
+
+    def note(_signal: int, _frame: object) -> None:
+        if pressed.is_set():
+            raise KeyboardInterrupt
+        pressed.set()
+
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
+        yield pressed.is_set
+        return
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield pressed.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def channel_of(
+    scenario: Scenario,
+    topology: str = "complete",
+    radius: float = 0.5,
+    topology_seed: int = 0,
+    delay_s: float = 0.0,
+    jitter_s: float = 0.0,
+    loss: float = 0.0,
+    partition: list[str] | None = None,
+) -> Channel:
+    """The channel that the options of the command line describe.
+
+    Raises:
+        FleetError: names the option, what was given and what is allowed.
+    """
+    # Any: the channel checks the name of the topology, which is a Literal.
+    fields: dict[str, Any] = {"topology": topology, "radius": radius, "topology_seed": topology_seed}
+    fields |= {"delay_s": delay_s, "jitter_s": jitter_s, "loss": loss}
+    try:
+        channel = Channel(partitions=tuple(parse_partition(text) for text in partition or ()), **fields)
+        channel.check([arm.name for arm in scenario.arms])
+    except ValueError as error:
+        field, space, rest = str(error).partition(" ")
+        raise FleetError(f"--{field.replace('_', '-')}{space}{rest}" if field in fields else str(error)) from error
+    return channel
+
+
+def parse_partition(text: str) -> Partition:
+    """The partition of a text such as `600:1200:arm_0,arm_1|arm_2,arm_3`.
+
+    Raises:
+        ValueError: the text has another form.
+    """
+    begin, _, rest = text.partition(":")
+    end, _, groups = rest.partition(":")
+    try:
+        from_s, to_s = float(begin), float(end)
+    except ValueError:
+        raise ValueError(
+            f"--partition needs FROM_S:TO_S:ARM,ARM|ARM,ARM, as in 600:1200:arm_0,arm_1|arm_2 (got '{text}')."
+        ) from None
+    arms = (tuple(arm.strip() for arm in group.split(",") if arm.strip()) for group in groups.split("|"))
+    return Partition(from_s, to_s, tuple(arms))
+
+
+def _figures(result: "RunResult") -> dict[str, Any]:  # JSON values
+    from scenarios.run.shift import summary
+
+    whole = summary(result)
+    return {key: whole[key] for key in ("status", "policy", "seed", "plant", "bus", "difficulty", "metrics")}
+
+
+def metrics_table(results: dict[str, Metrics]) -> Table:
+    """Key figures, one column per policy."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("")
+    for name in results:
+        table.add_column(name, justify="right")
+    rows: list[tuple[str, Callable[[Metrics], str]]] = [
+        ("jobs finished", lambda m: f"{m.finished} of {m.jobs}"),
+        ("value", lambda m: f"{m.value:g} of {m.value_offered:g}"),
+        ("on time", lambda m: str(m.on_time)),
+        ("tardiness, min", lambda m: f"{m.tardiness_min:.1f}"),
+        ("faults", lambda m: str(m.faults)),
+        ("min above warning", lambda m: f"{m.above_warning_min:.1f}"),
+        ("availability", lambda m: f"{m.availability:.1%}"),
+        ("energy, Wh", lambda m: f"{m.energy_wh:.0f}"),
+    ]
+    for figure, text in rows:
+        table.add_row(figure, *(text(m) for m in results.values()))
+    for arm in next(iter(results.values())).peak_c:
+        table.add_row(f"peak {arm}, °C", *(f"{m.peak_c[arm]:.1f}" for m in results.values()))
+    return table

@@ -1,0 +1,69 @@
+"""Sentences and a progress bar on the terminal, for every command."""
+
+import textwrap
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+
+from fleet.errors import FleetError
+from fleet.files import cache_folder
+from scenarios.progress import COUNTED, Progress
+
+out_console = Console()
+err_console = Console(stderr=True)
+
+LONG_STAGES = {
+    "training": "Training the twins that are not in the cache: up to a minute per arm and core, full size minutes …",
+    "learning the log": "Training the twin of the log: up to a minute, at full size some minutes …",
+    "teaching": "Training the networks that the report compares and the cache lacks: the longest part …",
+    "comparing": "Comparing the policies …",
+}
+"""Lines printed for long stages when there is no terminal to draw a bar on."""
+INTERRUPTED = 130
+"""Exit code after Ctrl-C."""
+
+
+class Interrupted(FleetError):
+    """Ctrl-C before there was a result to keep; names the stage."""
+
+
+@contextmanager
+def progress_bar(*, kept: str = "Plans and twins already made are") -> Iterator[Progress]:
+    """A bar on standard error that names the stage; without a terminal, one line for each long stage.
+
+    Args:
+        kept: What an interruption leaves in the cache, as the beginning of a sentence; empty for nothing.
+
+    Raises:
+        Interrupted: Ctrl-C in a stage that keeps nothing but the cache.
+    """
+    from rich.progress import BarColumn, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    is_terminal = err_console.is_terminal
+    name = TextColumn("{task.description:<9}")
+    columns = (SpinnerColumn(), name, BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
+    with Bar(*columns, console=err_console, transient=True, disable=not is_terminal) as bar:
+        task = bar.add_task("starting", total=1.0)
+
+        def report(stage: str, fraction: float) -> None:
+            if not is_terminal and stage != bar.tasks[0].description:
+                if stage.startswith(COUNTED):
+                    say(f"{stage[0].upper()}{stage[1:]}")
+                elif fraction < 1.0 and stage in LONG_STAGES:
+                    say(LONG_STAGES[stage])
+            bar.update(task, description=stage, completed=fraction)
+
+        try:
+            yield report
+        except KeyboardInterrupt:
+            rest = f" {kept} kept in {cache_folder()}, and the same command continues from there." if kept else ""
+            raise Interrupted(f"Interrupted while {bar.tasks[0].description}: nothing was written.{rest}") from None
+
+
+def say(sentence: str, console: Console = err_console) -> None:
+    """Print a sentence, by default on standard error; a terminal wraps it between words, so that paths stay whole."""
+    if console.is_terminal:
+        sentence = textwrap.fill(sentence, console.width, break_long_words=False, break_on_hyphens=False)
+    console.print(sentence, markup=False, highlight=False, soft_wrap=True)

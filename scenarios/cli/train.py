@@ -1,0 +1,64 @@
+"""`thermofleet train`."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from fleet.errors import FleetError
+from scenarios.cli.options import DifficultyOption, ScenarioArg
+from scenarios.cli.terminal import out_console, progress_bar, say
+from scenarios.extras import require_extra
+from scenarios.load import load
+from scenarios.policy_loader import policy_of
+
+
+def train_command(
+    scenario: ScenarioArg,
+    algo: Annotated[
+        str, typer.Option(help="mappo (one critic for the whole fleet) or ippo (one critic per arm).")
+    ] = "mappo",
+    minutes: Annotated[float, typer.Option(help="Training time without that of the twins, min.")] = 30.0,
+    iterations: Annotated[int | None, typer.Option(help="Stop earlier, after this many iterations in total.")] = None,
+    warm_start: Annotated[
+        str, typer.Option(help="Rule that the network imitates first, for example wspt; default: none.")
+    ] = "",
+    envs: Annotated[int, typer.Option(help="Shifts simulated in parallel.")] = 64,
+    seed: Annotated[int, typer.Option(help="Seed for shifts, initialisation and minibatches.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="Folder of the policy; default: runs/SCENARIO-ALGO-SEED.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the training in --out.")] = False,
+    threads: Annotated[int, typer.Option(help="Threads of the network's computations.")] = 1,
+    difficulty: DifficultyOption = "twin",
+) -> None:
+    """Train a policy by reinforcement learning, with checkpoints and learning curves; Ctrl-C keeps the result so far.
+
+    The folder can be used as a policy: `thermofleet compare SCENARIO --policies random,FOLDER`.
+    """
+    chosen = load(scenario)
+    if threads < 1 or seed < 0:
+        raise FleetError(f"--threads must be 1 or more and --seed 0 or more (got {threads}, {seed}).")
+    if warm_start:
+        policy_of(warm_start)
+    where = out or Path("runs") / f"{chosen.name}-{algo}-{seed}"
+    require_extra("learn")
+    from agents.learned.ppo import PpoConfig, use_threads
+    from scenarios.prepare.fleet import DifficultyName, choose
+    from scenarios.run.train_policy import CURVE, TrainingPlan, train
+
+    use_threads(threads)
+    algorithm: Any = algo  # a Literal, checked by PpoConfig
+    try:
+        config = PpoConfig(algorithm=algorithm, envs=envs, seed=seed, warm_start=warm_start)
+    except ValueError as error:
+        raise FleetError(str(error)) from error
+    plan = TrainingPlan(minutes=minutes, iterations=iterations)
+    scorer = choose("difficulty", difficulty, DifficultyName)
+    with progress_bar() as progress:
+        done = train(chosen, config, where, plan, difficulty=scorer, resume=resume, progress=progress, tell=say)
+    stopped = "Interrupted after" if done.interrupted else "Trained"
+    say(
+        f"{stopped} {done.iterations} iterations, {done.env_steps} env steps, {done.seconds:.0f} s; the best network "
+        f"has a mean reward of {done.best:.1f} a shift on the validation seeds.",
+        out_console,
+    )
+    say(f"Curves: {where / CURVE}. Try it: thermofleet compare {scenario} --policies random,{where}", out_console)

@@ -1,0 +1,264 @@
+"""`thermofleet twin train`, `score` and `report`, and the list of the `twin` commands."""
+
+import json
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.table import Table
+
+from fleet.errors import FleetError, nearest
+from scenarios.cli import options
+from scenarios.cli.terminal import out_console, progress_bar, say
+from scenarios.cli.twin_motion import export_command, generate_command, identify_command, recover_command
+from scenarios.load import load
+
+if TYPE_CHECKING:  # slow to import
+    from twin.vae.model import TwinConfig
+
+twin_app = typer.Typer(
+    help="Train, score and use the digital twin of an arm: an LSTM variational autoencoder of its cool motion.",
+    no_args_is_help=True,
+    add_completion=False,
+)
+
+
+@twin_app.command("train")
+def train_command(
+    scenario: options.ScenarioOrLog = None,
+    log: options.LogOption = None,
+    out: Annotated[Path, typer.Option(help="Folder of the twins.")] = Path("runs/twins"),
+    arm: options.ArmOption = None,
+    size: Annotated[str | None, typer.Option(help="quick or full; default: as the scenario says.")] = None,
+    scope: Annotated[str | None, typer.Option(help="joint (a network per joint) or arm (one of 21 channels).")] = None,
+    kind: Annotated[str | None, typer.Option(help="vae or ae (a plain autoencoder, as a baseline).")] = None,
+    latent: Annotated[int | None, typer.Option(help="Dimensions of the latent space.")] = None,
+    hidden: Annotated[int | None, typer.Option(help="Units of each LSTM.")] = None,
+    layers: Annotated[int | None, typer.Option(help="Layers of each LSTM.")] = None,
+    window: Annotated[int | None, typer.Option(help="Samples per window.")] = None,
+    rate_hz: Annotated[float | None, typer.Option("--rate", help="Samples per second inside a window.")] = None,
+    epochs: Annotated[int | None, typer.Option(help="Passes over the training windows.")] = None,
+    restarts: Annotated[int | None, typer.Option(help="Trainings per network; the best ELBO is kept.")] = None,
+    beta: Annotated[float | None, typer.Option(help="Weight of the KL term.")] = None,
+    max_windows: Annotated[int | None, typer.Option(help="Largest number of training windows.")] = None,
+    cool: Annotated[
+        float,
+        typer.Option(help="--log: motion is normal if motors 1 to 4 stay below this, °C; wrists do not count."),
+    ] = 40.0,
+    allow_collapse: Annotated[
+        bool, typer.Option("--allow-collapse", help="Keep a twin whose latent space collapsed, as a baseline.")
+    ] = False,
+    seed: Annotated[
+        int | None, typer.Option(help="Seed of weights and training; 0 or more. Default: the scenario's, for logs 0.")
+    ] = None,
+    skip_damaged: options.DamagedOption = False,
+    overwrite: options.OverwriteOption = False,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Train the twins of a scenario's arms, or the twin of the arm whose logs are given.
+
+    Several arms are trained at a time. The quick size takes up to a minute per arm and core, the full size about four
+    minutes. Cached twins, as those of the fleet after a run of the scenario, take seconds. A twin of logs is kept in
+    --out only.
+    """
+    options.check_one_source(scenario, log)
+    if seed is not None and seed < 0:
+        raise FleetError(f"--seed must be 0 or more (got {seed}).")
+    if size not in (None, "quick", "full"):
+        raise FleetError(f"No size '{size}'{nearest(size or '', ('quick', 'full'))}")
+    if log is not None and arm is not None:
+        raise FleetError("--arm chooses among a scenario's arms; a log has one arm, so leave it out with --log.")
+    network = dict(scope=scope, kind=kind, latent=latent, hidden=hidden, layers=layers, window=window, rate_hz=rate_hz)
+    training = dict(epochs=epochs, restarts=restarts, beta=beta, max_windows=max_windows)
+    fields = network | training | {"allow_collapse": allow_collapse or None}
+    given = {name: value for name, value in fields.items() if value is not None}
+    from scenarios.prepare.twin_folder import TWINS, save_twins, train_arms, train_log
+    from scenarios.result_folder import check_free, new_folder
+
+    check_free(out, TWINS, overwrite=overwrite)
+    bar = progress_bar() if log is None else progress_bar(kept="")  # the twin of a log is not cached
+    with explain_in_options(), bar as progress, new_folder(out, TWINS, overwrite=overwrite) as folder:
+        if log is not None:
+            config = config_of("quick" if size is None else size, given, of_log=True)
+            twins = [
+                train_log(options.recordings_of(log, skip_damaged), config, seed or 0, cool_c=cool, progress=progress)
+            ]
+            source = f"log {log}"
+        else:
+            of_scenario = load(str(scenario))
+            config = config_of(size or of_scenario.twin.size, given)
+            arms = range(len(of_scenario.arms)) if arm is None else [of_scenario.index_of(arm)]
+            twins = train_arms(of_scenario, list(arms), config, seed, progress)
+            source = f"scenario {of_scenario.name}"
+        card = save_twins(twins, folder, source)
+    if as_json:
+        typer.echo(json.dumps({"out": str(out), **card}, indent=1))
+        return
+    for twin in card["twins"]:
+        out_console.print(quality_table(twin))
+    say(f"Written to {out}; score with: thermofleet twin score {out}", out_console)
+
+
+@twin_app.command("score")
+def score_command(
+    twins: options.TwinsArg,
+    scenario: Annotated[str | None, typer.Argument(help="Score this scenario's jobs; or use --log.")] = None,
+    log: options.LogOption = None,
+    arm: options.WhichOption = None,
+    format_: Annotated[str, typer.Option("--format", help="table, csv or json.")] = "table",
+    skip_damaged: options.DamagedOption = False,
+) -> None:
+    """Score every job of a scenario, or a log window by window; every line names the version of the twin.
+
+    Takes seconds, and half a minute if the jobs must be planned first.
+    """
+    options.check_one_source(scenario, log)
+    if format_ not in ("table", "csv", "json"):
+        raise FleetError(f"No format '{format_}'{nearest(format_, ('table', 'csv', 'json'))}")
+    from scenarios.prepare.twin_folder import open_twin
+    from scenarios.report.score_table import job_rows, render, window_rows
+
+    if log is not None:
+        twin = open_twin(twins, arm)
+        rows = [row for recording in options.recordings_of(log, skip_damaged) for row in window_rows(twin, recording)]
+    else:
+        chosen = load(str(scenario))
+        twin = open_twin(twins, arm)
+        with progress_bar() as progress:
+            rows = job_rows(twin, chosen, progress)
+    shown = render(rows, format_, caption=f"twin of {twin.arm}, version {twin.version}, data {twin.data_hash}")
+    if isinstance(shown, str):
+        typer.echo(shown, nl=False)
+    else:
+        out_console.print(shown)
+
+
+twin_app.command("identify")(identify_command)
+twin_app.command("generate")(generate_command)
+twin_app.command("recover")(recover_command)
+twin_app.command("export")(export_command)
+
+
+@contextmanager
+def explain_in_options() -> Iterator[None]:
+    """Reword training errors so that they name the options of the command line.
+
+    Raises:
+        FleetError: the log is too short or too warm, or the latent space collapsed.
+    """
+    from twin.training_data import NothingCool, TooShort
+    from twin.vae.train import CollapsedPosterior
+
+    try:
+        yield
+    except TooShort as error:
+        raise FleetError(f"{error.fact} Log for longer, or choose a smaller --window.") from error
+    except NothingCool as error:
+        raise FleetError(f"{error.fact} Raise --cool, or log lighter work.") from error
+    except CollapsedPosterior as error:
+        fields = r"\b(epochs|max_windows|allow_collapse|beta)\b"
+        raise FleetError(re.sub(fields, lambda f: f"--{f[1].replace('_', '-')}", str(error))) from error
+
+
+@twin_app.command("report")
+def report_command(
+    scenario: options.ScenarioOrLog = None,
+    log: options.LogOption = None,
+    out: Annotated[Path, typer.Option(help="Folder of report.html, report.json and the pictures.")] = Path(
+        "runs/twin_report"
+    ),
+    arm: Annotated[str | None, typer.Option(help="Arm of the scenario; default: the first.")] = None,
+    seeds: Annotated[int, typer.Option(help="Number of seeds; figures with a spread are repeated for each.")] = 3,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Fewer jobs, smaller trainings: about 20 min on two cores.")
+    ] = False,
+    skip_damaged: options.DamagedOption = False,
+    overwrite: options.OverwriteOption = False,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Write the paper's pictures and tables as one offline HTML page, with PNGs and report.json.
+
+    For a scenario, one arm is studied on 1 200 test jobs, and every baseline is trained for each seed; that takes
+    hours. --quick uses 200 jobs, small trainings and fewer baselines. Twins and finished sections are cached, so the
+    same command continues after an interruption. A section that fails gives its reason in the page, and the command
+    ends with exit code 1.
+    """
+    options.check_one_source(scenario, log)
+    if seeds < 1:
+        raise FleetError(f"--seeds must be 1 or more (got {seeds}).")
+    if log is not None and arm is not None:
+        raise FleetError("--arm chooses among a scenario's arms; a log has one arm, so leave it out with --log.")
+    from scenarios.result_folder import check_free, new_folder
+    from scenarios.studies.report.build import REPORT, report_logs, report_scenario, write
+    from scenarios.studies.report.context import QUICK, Size
+
+    check_free(out, REPORT, overwrite=overwrite)
+    command = f"thermofleet twin report {f'--log {log.name}' if log else scenario} --seeds {seeds}{' --quick' * quick}"
+    bar = progress_bar(kept="Twins and sections already made are")
+    with bar as progress, new_folder(out, REPORT, overwrite=overwrite) as folder:
+        common: Any = {"seeds": range(seeds), "command": command, "progress": progress}  # keyword arguments
+        if log is not None:
+            sections = report_logs(options.recordings_of(log, skip_damaged), quick=quick, **common)
+            title = f"The twin of the logs in {log.name}"
+        else:
+            of_scenario = load(str(scenario))
+            index = 0 if arm is None else of_scenario.index_of(arm)
+            sections = report_scenario(of_scenario, index, size=QUICK if quick else Size(), **common)
+            title = f"The twin of {of_scenario.arms[index].name} in {of_scenario.name}"
+        card = write(sections, folder, title=title, lead=("Every section gives a result and the method.",))
+    if as_json:
+        typer.echo((out / "report.json").read_text(encoding="utf-8"), nl=False)
+    else:
+        say(f"Open {out / 'report.html'} in a browser.", out_console)
+    if card["failed"]:
+        reasons = "; ".join(f"{key}: {why}" for key, why in card["failed"].items())
+        say(f"{len(card['failed'])} of {len(sections)} sections could not be computed ({reasons})")
+        raise typer.Exit(1)
+
+
+def config_of(size: str, given: dict[str, Any], *, of_log: bool = False) -> "TwinConfig":
+    """The configuration of a size, with the options given on the command line (Any: one per field).
+
+    Raises:
+        FleetError: a value is not allowed; names the option.
+    """
+    from dataclasses import replace
+
+    from scenarios.prepare.twin_folder import log_config
+    from twin.vae.model import TwinConfig
+
+    base = TwinConfig.quick() if size == "quick" else TwinConfig()
+    # A window smaller than the usual stride would leave gaps between windows.
+    window = max(1, given.get("window", base.window))
+    base = replace(base, stride=min(base.stride, window), score_stride=min(base.score_stride, window))
+    try:
+        return replace(log_config(base) if of_log else base, **given)
+    except ValueError as error:
+        option = re.sub(r"TwinConfig\.(\w+)", lambda field: f"--{field[1].replace('_', '-')}", str(error), count=1)
+        raise FleetError(option.replace("--rate-hz", "--rate")) from error
+
+
+def quality_table(twin: dict[str, Any]) -> Table:  # JSON of twins.json
+    """Fit of each network of a twin, with the version and the data of the twin."""
+    table = Table(
+        title=f"Twin of {twin['arm']}: version {twin['version']}",
+        caption=f"data {twin['data_hash']}, seed {twin['seed']}, calibrated on {twin['calibrated_on']} held-out jobs",
+        caption_justify="left",
+        box=None,
+        pad_edge=False,
+        title_justify="left",
+    )
+    for head in ("network", "ELBO, nat", "KL, nat", "active units", "MSE, σ²"):
+        table.add_column(head, justify="left" if head == "network" else "right")
+    for fit in twin["networks"]:
+        table.add_row(
+            fit["name"].replace("_", " "),
+            f"{fit['elbo']:.1f}",
+            f"{fit['kl']:.2f}",
+            str(fit["active_units"]),
+            f"{fit['mean_squared_error']:.3f}",
+        )
+    return table

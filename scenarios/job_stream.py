@@ -1,0 +1,173 @@
+"""The jobs of a shift: what a scenario's streams ask for, drawn for one seed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from fleet.arrivals import ArrivalTable, arrival_table, sample_arrivals, scale_rate
+from fleet.jit import kernel
+from fleet.job import Job, Work
+from fleet.seeding import random_uniform, random_word
+from scenarios.schema import JobStream, Scenario
+
+Array = np.ndarray
+
+
+def works_of(scenario: Scenario, stream: JobStream, payload_kg: Sequence[float] | None = None) -> tuple[Work, ...]:
+    """The works a stream can ask for, one per payload (its own payloads unless others are given)."""
+    place = {p.name: p for p in scenario.places}
+    return tuple(
+        Work(
+            kind=stream.kind,
+            places=tuple(place[name] for name in stream.places),
+            payload_kg=float(payload),
+            dwell_s=stream.dwell_s,
+            force_n=stream.force_n,
+        )
+        for payload in (stream.payload_kg if payload_kg is None else payload_kg)
+    )
+
+
+def all_works(scenario: Scenario) -> tuple[Work, ...]:
+    """Every different work of a scenario."""
+    return tuple(dict.fromkeys(work for stream in scenario.jobs for work in works_of(scenario, stream)))
+
+
+@dataclass(frozen=True, eq=False)
+class SampledJobs:
+    """The jobs of one shift as arrays [job], in order of release, then of stream and number."""
+
+    stream: Array
+    """Index into the scenario's streams."""
+    number: Array
+    """Of the job in its stream, from 0."""
+    payload: Array
+    """Index into the stream's payloads."""
+    extra: Array
+    """Repetitions beyond the fewest of the stream."""
+    release_s: Array
+    after: Array
+    """Indices of the jobs that must be done first, int [job, n], −1 for none."""
+
+
+@kernel
+def sample_jobs(
+    table: ArrivalTable, key: Array, choices: Array, after_streams: Array, release_s: Array, job: Array, after: Array
+) -> int:
+    """Draw the jobs of one shift; return their number, or −1 if there is no room.
+
+    Every value depends on the key, its stream and its number alone, so no stream disturbs another.
+
+    Args:
+        key: Of the shift's jobs, uint64 [1].
+        choices: Numbers of payloads and of repetitions to choose from, int [stream, 2].
+        after_streams: Streams that a stream's jobs come after, int [stream, n], −1 for none.
+        release_s: Receives the times, [room].
+        job: Receives stream, number, payload and extra repetitions, int [room, 4].
+        after: Receives the jobs to be done first, int [room, n].
+    """
+    streams, total = len(choices), 0
+    first = np.zeros(streams + 1, np.int64)
+    times = np.empty(len(release_s))
+    drawn = np.empty((len(release_s), 4), np.int64)
+    for i in range(streams):
+        own = random_word(key[0], np.uint64(i + 1))
+        count = sample_arrivals(table, i, own, times[total:])
+        if count < 0:
+            return -1
+        chosen = random_word(own, np.uint64(0))
+        for n in range(count):
+            drawn[total + n, 0], drawn[total + n, 1] = i, n
+            for c in range(2):
+                share = random_uniform(chosen, np.uint64(2 * n + c))
+                drawn[total + n, 2 + c] = int(share * choices[i, c])
+        total += count
+        first[i + 1] = total
+    order = np.argsort(times[:total], kind="mergesort")
+    place = np.empty(total, np.int64)
+    for n in range(total):
+        place[order[n]] = n
+    for n in range(total):
+        row = order[n]
+        release_s[n] = times[row]
+        for c in range(4):
+            job[n, c] = drawn[row, c]
+        for w in range(after.shape[1]):
+            before, number = after_streams[drawn[row, 0], w], drawn[row, 1]
+            found = before >= 0 and number < first[before + 1] - first[before]
+            after[n, w] = place[first[before] + number] if found else -1
+    return total
+
+
+class JobSampler:
+    """Draws the jobs of a scenario's shifts."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        streams = scenario.jobs
+        self._arrivals = [stream.arrivals.arrivals() for stream in streams]
+        self._horizon_s = scenario.ticks * scenario.decision_interval_s
+        self._table = arrival_table(self._arrivals, self._horizon_s)
+        lowest, most = (np.array([stream.repetitions[i] for stream in streams], dtype=int) for i in (0, 1))
+        self.fewest = lowest
+        """Fewest repetitions of each stream, int [stream]."""
+        self.choices = np.stack(
+            [np.array([len(stream.payload_kg) for stream in streams], dtype=int), most - lowest + 1], axis=-1
+        )
+        """Numbers of payloads and of repetitions to choose from, int [stream, 2]."""
+        index = {stream.name: i for i, stream in enumerate(streams)}
+        waits = max((len(stream.after) for stream in streams), default=0) or 1
+        self._after = np.full((len(streams), waits), -1)
+        for i, stream in enumerate(streams):
+            self._after[i, : len(stream.after)] = [index[name] for name in stream.after]
+        self._room = 64
+
+    def sample(self, seed: np.random.SeedSequence, rate: float = 1.0) -> SampledJobs:
+        """The jobs of one shift.
+
+        Args:
+            rate: Factor on the rates of Poisson streams and repeated batches.
+        """
+        table = self._table
+        if rate != 1.0:
+            table = arrival_table([scale_rate(each, rate) for each in self._arrivals], self._horizon_s)
+        key = seed.generate_state(1, np.uint64)
+        while True:
+            release_s = np.empty(self._room)
+            job, after = np.empty((self._room, 4), int), np.empty((self._room, self._after.shape[1]), int)
+            total = sample_jobs.chosen()(table, key, self.choices, self._after, release_s, job, after)
+            if total >= 0:
+                break
+            self._room *= 2
+        stream, number, payload, extra = job[:total].T
+        return SampledJobs(stream, number, payload, extra, release_s[:total], after[:total])
+
+
+def draw_jobs(scenario: Scenario, seed: np.random.SeedSequence) -> tuple[Job, ...]:
+    """The jobs of one shift in order of release."""
+    sampler = JobSampler(scenario)
+    sampled = sampler.sample(seed)
+    streams = scenario.jobs
+    works = [works_of(scenario, stream) for stream in streams]
+    rows = zip(sampled.stream.tolist(), sampled.number.tolist(), strict=True)
+    names = [f"{streams[i].name}-{number + 1:03d}" for i, number in rows]
+    return tuple(
+        Job(
+            name=names[j],
+            work=works[i][sampled.payload[j]],
+            repetitions=int(sampler.fewest[i] + sampled.extra[j]),
+            release_s=float(sampled.release_s[j]),
+            due_s=float(sampled.release_s[j]) + streams[i].due_s,
+            value=streams[i].value,
+            after=tuple(names[k] for k in sampled.after[j].tolist() if k >= 0),
+        )
+        for j, i in enumerate(sampled.stream.tolist())
+    )
+
+
+def rehearsal_works(scenario: Scenario) -> tuple[Work, ...]:
+    """What an arm rehearses: every motion of the scenario, with its own payloads and with light ones."""
+    light = scenario.twin.payload_kg
+    both = product(scenario.jobs, (None, light))
+    return tuple(dict.fromkeys(w for stream, payload in both for w in works_of(scenario, stream, payload)))

@@ -1,0 +1,1 @@
+"""Live fleets: allocation, recording, replay, dashboard, HTTP."""

@@ -1,0 +1,52 @@
+"""Policies in a live fleet: a central one allocates the jobs of each round of the auctioneer."""
+
+from agents.policy import Policy
+from fleet.env.validation import actions_of
+from fleet.errors import FleetError
+from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
+from fleet.live.auction.round import Allocate, Bidding, resolve_claims
+from scenarios.policy_loader import policy_at, scope_of
+from scenarios.schema import Scenario
+
+
+class CentralAllocation:
+    """An allocation rule of the auctioneer, made of a central policy."""
+
+    def __init__(self, policy: Policy, fleet: LiveFleet) -> None:
+        """Take a policy that was reset."""
+        self._policy, self._fleet = policy, fleet
+        self._lost: set[str] = set()
+
+    def __call__(self, bidding: Bidding) -> dict[str, str]:
+        """Arm of each job that is assigned: the claims of the policy, resolved as in simulation."""
+        seen = observe(bidding, self._fleet, lost=self._lost)
+        actions = actions_of(list(seen), self._policy.act(seen)).tolist()
+        claims = claimed_jobs(bidding, seen, dict(zip(seen, actions, strict=True)))
+        awarded = resolve_claims(bidding, claims, self._fleet.order(bidding.quotes))
+        self._lost = set(claims) - set(awarded.values())
+        return awarded
+
+
+def live_fleet(scenario: Scenario) -> LiveFleet:
+    """What policies are told of a scenario."""
+    return LiveFleet(
+        arms=tuple(arm.name for arm in scenario.arms),
+        warning_c=scenario.limits.warning_c,
+        horizon_s=scenario.horizon_s,
+    )
+
+
+def central_allocation(policy: str, scenario: Scenario, seed: int) -> Allocate:
+    """How the auctioneer of a scenario allocates jobs.
+
+    Args:
+        policy: As `scenarios.policy_loader` takes it.
+
+    Raises:
+        FleetError: no such policy, or one of scope `arm`, which takes no auctioneer.
+    """
+    if scope_of(policy) == "arm":
+        raise FleetError(
+            f"'{policy}' takes no auctioneer: thermofleet arm SCENARIO NAME --policy {policy}, for each arm."
+        )
+    return CentralAllocation(policy_at(policy, seed), live_fleet(scenario))

@@ -1,0 +1,280 @@
+"""The bus over HTTP: the fleet as JSON, messages as server-sent events, job submissions and quotes.
+
+The bus is served on a thread of its own (`fleet.live.monitor.async_bridge`); feed and reader buffers are used on the
+event loop only. Errors are problem details (RFC 9457).
+"""
+
+import asyncio
+import hmac
+import secrets
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from typing import TypeVar
+
+import msgspec
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import Response
+from starlette.routing import Route
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from fleet.bus.protocol.auction import JobSpec, QuoteRequest, StatusRequest, Submission
+from fleet.bus.protocol.messages import MalformedMessage, decode, encode
+from fleet.live.monitor.async_bridge import AsyncBridge, NoReply
+from fleet.live.monitor.event_feed import Entry, ReaderBuffer
+
+MAX_BYTES = 60_000
+"""Of a body: what the router passes, less the overhead of a message."""
+MAX_READERS, MAX_REQUESTS = 64, 16
+BODY_S, STUCK_S, HEARTBEAT_S = 10.0, 10.0, 15.0
+"""Real seconds: for a body to arrive; for a reader to take what was sent; between two heartbeats."""
+LOCAL = ("127.0.0.1", "localhost", "[::1]")
+Body = TypeVar("Body", bound=msgspec.Struct)
+Reply = TypeVar("Reply")
+
+
+class Problem(Exception):
+    """An HTTP error with a sentence that says what is wrong."""
+
+    def __init__(self, status: HTTPStatus, detail: str) -> None:
+        super().__init__(detail)
+        self.status, self.detail = status, detail
+
+
+class AskBody(msgspec.Struct, frozen=True):
+    """Body of /v2/ask: jobs to be quoted, not done."""
+
+    jobs: tuple[JobSpec, ...]
+
+
+@dataclass(eq=False)
+class Reader:
+    """One reader of the event stream."""
+
+    buffer: ReaderBuffer = field(default_factory=ReaderBuffer)
+    wake: asyncio.Event = field(default_factory=asyncio.Event)
+
+
+@dataclass(eq=False)
+class Readers:
+    """All readers of the event stream; used on the event loop only."""
+
+    connected: set[Reader] = field(default_factory=set[Reader])
+    closed: bool = False
+
+    def put(self, entry: Entry) -> None:
+        """Pass an entry to every reader."""
+        for reader in self.connected:
+            reader.buffer.put(entry)
+            reader.wake.set()
+
+    def close(self) -> None:
+        """End every stream."""
+        self.closed = True
+        for reader in self.connected:
+            reader.wake.set()
+
+
+def application(
+    bridge: AsyncBridge,
+    readers: Readers,
+    *,
+    token: str = "",
+    heartbeat_s: float = HEARTBEAT_S,
+    stuck_s: float = STUCK_S,
+    body_s: float = BODY_S,
+) -> Starlette:
+    """Make the application; with a token every request must show it, without one only local requests are served."""
+    boot = secrets.token_hex(4)  # event numbers are valid for one start of the gateway
+    slots = asyncio.Semaphore(MAX_REQUESTS)
+
+    async def limited(request: Callable[[], Awaitable[Reply]]) -> Reply:
+        if slots.locked():
+            raise Problem(HTTPStatus.SERVICE_UNAVAILABLE, f"{MAX_REQUESTS} requests are waiting; try again.")
+        async with slots:
+            return await request()
+
+    async def fleet(request: Request) -> Response:
+        return json_response(await bridge.snapshot())
+
+    async def post_jobs(request: Request) -> Response:
+        submission = await read_body(request, Submission, body_s)
+        return json_response(await limited(lambda: bridge.submit(submission)))
+
+    async def get_jobs(request: Request) -> Response:
+        names = tuple(request.query_params.getlist("job"))
+        return json_response(await limited(lambda: bridge.status(StatusRequest(names))))
+
+    async def post_ask(request: Request) -> Response:
+        ask = await read_body(request, AskBody, body_s)
+        try:
+            quote_request = decode(QuoteRequest, encode(QuoteRequest("http", ask.jobs, dry_run=True)))
+        except MalformedMessage as error:
+            raise Problem(HTTPStatus.UNPROCESSABLE_ENTITY, str(error)) from error
+        return json_response(await limited(lambda: bridge.quotes(quote_request)))
+
+    async def events(request: Request) -> Response:
+        if readers.closed or len(readers.connected) >= MAX_READERS:
+            detail = f"{len(readers.connected)} readers are connected; try again later."
+            raise Problem(HTTPStatus.SERVICE_UNAVAILABLE, detail)
+        last = request.headers.get("last-event-id", "")
+        last_boot, _, number = last.partition("-")
+        seen = int(number) if last_boot == boot and number.isdecimal() and len(number) < 20 else 0
+        return EventStream(bridge, readers, boot, seen, bool(last), heartbeat_s, stuck_s)
+
+    routes = [
+        Route("/v2/fleet", fleet),
+        Route("/v2/events", events),
+        Route("/v2/jobs", get_jobs),
+        Route("/v2/jobs", post_jobs, methods=["POST"]),
+        Route("/v2/ask", post_ask, methods=["POST"]),
+    ]
+    handlers = dict.fromkeys((Problem, NoReply, HTTPException, Exception), error_response)
+    return Starlette(routes=routes, exception_handlers=handlers, middleware=[Middleware(AccessCheck, token=token)])
+
+
+class AccessCheck:
+    """Passes requests that show the token; without a token, requests to this machine's local names.
+
+    The name is checked since a page of another site must not reach the gateway under a name of its own.
+    """
+
+    def __init__(self, app: ASGIApp, token: str) -> None:
+        self.app, self.token = app, token.encode()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Refuse the request or pass it on."""
+        refusal = self.refusal(dict(scope["headers"])) if scope["type"] == "http" else None
+        await (refusal or self.app)(scope, receive, send)
+
+    def refusal(self, headers: dict[bytes, bytes]) -> Response | None:
+        """Error response, None if the request may pass."""
+        if not self.token:
+            host = headers.get(b"host", b"").decode("latin-1")
+            name = host if host.endswith("]") else host.rpartition(":")[0] or host
+            if name in LOCAL:
+                return None
+            return problem_response(HTTPStatus.MISDIRECTED_REQUEST, f"This gateway is {LOCAL[0]}, not '{name}'.")
+        shown = headers.get(b"authorization", b"")
+        if shown[:7].lower() == b"bearer " and hmac.compare_digest(shown[7:], self.token):
+            return None
+        detail = "This gateway needs its token: Authorization: Bearer …."
+        return problem_response(HTTPStatus.UNAUTHORIZED, detail, {"WWW-Authenticate": "Bearer"})
+
+
+class EventStream(Response):
+    """Server-sent events until the reader disconnects or falls behind, or the gateway stops."""
+
+    def __init__(
+        self,
+        bridge: AsyncBridge,
+        readers: Readers,
+        boot: str,
+        seen: int,
+        reconnected: bool,
+        heartbeat_s: float,
+        stuck_s: float,
+    ) -> None:
+        super().__init__(media_type="text/event-stream", headers={"Cache-Control": "no-store"})
+        del self.headers["content-length"]
+        self._bridge, self._readers, self._boot, self._seen = bridge, readers, boot, seen
+        self._reconnected, self._heartbeat_s, self._stuck_s = reconnected, heartbeat_s, stuck_s
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Write the stream."""
+        reader = Reader()
+        self._readers.connected.add(reader)
+        gone = asyncio.ensure_future(wait_for_disconnect(receive, reader))
+        try:
+            await send({"type": "http.response.start", "status": 200, "headers": self.raw_headers})
+            missed, gap = self._bridge.feed.since(self._seen)
+            text = "retry: 1000\n\n" + ("event: gap\ndata: {}\n\n" if gap and self._reconnected else "")
+            await self._send(send, text + "".join(map(self._event, missed)))
+            seen = missed[-1].number if missed else 0
+            while not (gone.done() or self._readers.closed or reader.buffer.full):
+                try:
+                    await asyncio.wait_for(reader.wake.wait(), self._heartbeat_s)
+                except TimeoutError:
+                    await self._send(send, ": heartbeat\n\n")
+                    continue
+                reader.wake.clear()
+                entries = [entry for entry in reader.buffer.take() if entry.number > seen]
+                if entries and not reader.buffer.full:
+                    await self._send(send, "".join(map(self._event, entries)))
+            if not gone.done():
+                await self._send(send, "", more=False)
+        except TimeoutError:
+            pass  # the reader is stuck: the server closes the connection of an unfinished stream
+        finally:
+            self._readers.connected.discard(reader)
+            gone.cancel()
+
+    def _event(self, entry: Entry) -> str:
+        name = msgspec.json.encode(entry.name).decode()
+        data = f'{{"name":{name},"message":{entry.data}}}'
+        return f"id: {self._boot}-{entry.number}\nevent: {entry.topic}\ndata: {data}\n\n"
+
+    async def _send(self, send: Send, text: str, more: bool = True) -> None:
+        message = {"type": "http.response.body", "body": text.encode(), "more_body": more}
+        await asyncio.wait_for(send(message), self._stuck_s)
+
+
+async def wait_for_disconnect(receive: Receive, reader: Reader) -> None:
+    """Return when the reader has disconnected, and wake its stream."""
+    while (await receive())["type"] != "http.disconnect":
+        pass
+    reader.wake.set()
+
+
+async def read_body(request: Request, kind: type[Body], body_s: float) -> Body:
+    """Read the message that is the body of a request.
+
+    Raises:
+        Problem: too large, too slow, not JSON, or not a message of this kind.
+    """
+    content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if content_type != "application/json":
+        detail = f"The body must be application/json (got '{content_type}')."
+        raise Problem(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, detail)
+    parts: list[bytes] = []
+    try:
+        async with asyncio.timeout(body_s):
+            async for part in request.stream():
+                parts.append(part)
+                if sum(map(len, parts)) > MAX_BYTES:
+                    detail = f"A body has at most {MAX_BYTES} bytes; send several requests."
+                    raise Problem(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)
+        return decode(kind, b"".join(parts))
+    except TimeoutError as error:
+        raise Problem(HTTPStatus.REQUEST_TIMEOUT, f"The body did not arrive within {body_s:g} s.") from error
+    except ClientDisconnect as error:
+        raise Problem(HTTPStatus.BAD_REQUEST, "The body is incomplete.") from error
+    except MalformedMessage as error:
+        raise Problem(HTTPStatus.UNPROCESSABLE_ENTITY, str(error)) from error
+
+
+def json_response(value: object) -> Response:
+    """Response with a value as JSON."""
+    return Response(msgspec.json.encode(value), media_type="application/json", headers={"Cache-Control": "no-store"})
+
+
+def error_response(_: Request, error: Exception) -> Response:
+    """Problem details of an error."""
+    match error:
+        case Problem():
+            return problem_response(error.status, error.detail)
+        case NoReply():
+            return problem_response(HTTPStatus.SERVICE_UNAVAILABLE, str(error))
+        case HTTPException():
+            return problem_response(HTTPStatus(error.status_code), str(error.detail), error.headers)
+        case _:
+            return problem_response(HTTPStatus.INTERNAL_SERVER_ERROR, "The gateway failed; the reason is in its log.")
+
+
+def problem_response(status: HTTPStatus, detail: str, headers: Mapping[str, str] | None = None) -> Response:
+    """Problem details, RFC 9457."""
+    fields = {"type": "about:blank", "title": status.phrase, "status": status.value, "detail": detail}
+    return Response(msgspec.json.encode(fields), status.value, headers, media_type="application/problem+json")

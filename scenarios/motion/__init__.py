@@ -1,0 +1,1 @@
+"""Motion of one arm: hold times, generation, posture recovery."""

@@ -1,0 +1,291 @@
+"""How long an arm may hold a payload still: torque, current, steady temperature and minutes to the limits.
+
+Gravity torque comes from MuJoCo, temperatures from the thermal network. The arm starts cold (everything at ambient
+temperature) or idle-warm (powered for hours without load).
+"""
+
+import json
+from dataclasses import dataclass
+from typing import Annotated, get_args
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from fleet.errors import FleetError, nearest
+from fleet.motion import static_drive
+from fleet.motor import Motors, current, gen3_motors, thermal_data
+from fleet.robot import GEN3, JOINTS, POSTURES, Cooling, Robot, ThermalLimits
+from fleet.thermal import (
+    HOUSING,
+    NODES,
+    WINDING,
+    ThermalModel,
+    advance,
+    drive_heat,
+    gen3_network,
+    node_heat,
+    steady_state,
+    thermal_model,
+)
+from scenarios.motion.posture import parse_posture
+
+Array = np.ndarray
+PerJoint = tuple[float, ...]
+MaybePerJoint = tuple[float | None, ...]
+
+LIMITS_C = (ThermalLimits().warning_c, ThermalLimits().error_c)
+AMBIENT_RANGE_C = (-40.0, 60.0)
+STEP_S = 2.0
+"""Time step; heat is taken at its midpoint, so the error is of second order."""
+LONGEST_S = 24 * 3600.0
+"""A limit that is not passed within this time counts as never passed."""
+BURNT_C = 250.0
+"""Where the simulation of a runaway ends: far above every insulation class (H: 180 °C)."""
+
+
+class HoldError(FleetError):
+    """A hold that cannot be calculated; says what is allowed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Course:
+    """Effect of a hold on the seven joints from one start; tuples of 7."""
+
+    t60_min: MaybePerJoint
+    """Minutes until the motor passes the warning limit, 60 °C; None when never."""
+    t75_min: MaybePerJoint
+    """Minutes until the motor passes the error limit, 75 °C, where the arm faults; None when never."""
+    steady_c: MaybePerJoint
+    """Steady motor temperature; None for a thermal runaway."""
+    torque_nm: PerJoint
+    """Holding torque, magnitude."""
+    current_a: PerJoint
+    """Motor current at the start temperature, magnitude."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HoldResult:
+    """A hold from both starts."""
+
+    payload_kg: float
+    posture: str
+    q_deg: PerJoint
+    ambient_c: float
+    cooling: Cooling
+    tool_kg: float
+    cold: Course
+    idle_warm: Course
+    note: str
+    """Limits of these numbers."""
+
+
+def hold(
+    payload_kg: float,
+    posture: str = "outstretched",
+    ambient_c: float = 25.0,
+    *,
+    cooling: str = "still_air",
+    tool_kg: float = 0.0,
+) -> HoldResult:
+    """Torque, current and temperatures of a nominal Gen3 on the floor that holds a payload still.
+
+    Args:
+        payload_kg: A point mass at the flange.
+        posture: A name from `fleet.robot.POSTURES`, or seven comma-separated joint angles in degrees.
+        tool_kg: Mass of the gripper, at the flange.
+
+    Raises:
+        HoldError: an argument is out of range, or the hold needs more torque than a motor has.
+        PostureError: the posture is unknown, or beyond a joint stop.
+    """
+    from fleet.physics.models import ArmModel  # loads MuJoCo
+
+    for name, value in (("payload", payload_kg), ("tool mass", tool_kg)):
+        if not 0 <= value < np.inf:
+            raise HoldError(f"The {name} must be a mass of 0 kg or more (got {value}).")
+    low_c, high_c = AMBIENT_RANGE_C
+    if not low_c <= ambient_c <= high_c:
+        raise HoldError(f"The ambient temperature must lie in {low_c:g} … {high_c:g} °C (got {ambient_c}).")
+    strategy = _cooling(cooling)
+    arm = ArmModel(Robot(name="arm", tool_kg=tool_kg))
+    q = parse_posture(posture, arm.position_range)
+    tau = arm.gravity_torque(q, payload_kg)
+    _check_torque(tau, payload_kg, posture)
+    cold, idle_warm = courses(tau, ambient_c, thermal_model(gen3_network(cooling=strategy)), gen3_motors())
+    return HoldResult(
+        payload_kg=payload_kg,
+        posture=posture,
+        q_deg=_rounded(np.rad2deg(q)),
+        ambient_c=ambient_c,
+        cooling=strategy,
+        tool_kg=tool_kg,
+        cold=cold,
+        idle_warm=idle_warm,
+        note=_note(tau, cold),
+    )
+
+
+def courses(tau: Array, ambient_c: float, model: ThermalModel, motors: Motors) -> tuple[Course, Course]:
+    """Hold with torques, N·m, [joint], from a cold and from an idle-warm start."""
+    rest, current_sq = np.zeros(JOINTS), static_drive(tau, motors).current_sq
+    end_c = steady_state(model, current_sq, rest, motors, ambient_c)
+    start_c = np.stack([np.full(NODES, ambient_c), model.steady(node_heat(rest, motors.idle_w), ambient_c)])
+    minutes = passing_times(model, current_sq, motors, ambient_c, start_c, end_c) / 60.0
+    cold, idle_warm = (
+        Course(
+            t60_min=_rounded_or_none(minutes[s, 0]),
+            t75_min=_rounded_or_none(minutes[s, 1]),
+            steady_c=_rounded_or_none(np.full(JOINTS, np.inf) if end_c is None else end_c[WINDING]),
+            torque_nm=_rounded(np.abs(tau)),
+            current_a=_rounded(np.abs(current(tau, rest, start_c[s, HOUSING], motors))),
+        )
+        for s in range(2)
+    )
+    return cold, idle_warm
+
+
+def passing_times(
+    model: ThermalModel, current_sq: Array, motors: Motors, ambient_c: float, start_c: Array, end_c: Array | None
+) -> Array:
+    """When each winding passes each of `LIMITS_C`, s, [start, limit, joint]; infinite where it never does.
+
+    From a start below the steady state a constant load only heats, so a limit is passed at most once, and exactly when
+    the steady temperature lies above it.
+
+    Args:
+        current_sq: Squared current at the magnets' reference temperature, A², [joint].
+        start_c: °C, [start, node].
+        end_c: Steady temperatures, °C, [node]; None for a runaway, which is simulated until `BURNT_C`.
+    """
+    limits_c = np.array(LIMITS_C)[:, None]  # [limit, joint]
+    times_s = np.where(start_c[:, None, WINDING] >= limits_c, 0.0, np.inf)
+    to_come = (
+        np.ones(times_s.shape, bool) if end_c is None else np.broadcast_to(end_c[WINDING] > limits_c, times_s.shape)
+    )
+    no_friction_w = np.zeros(JOINTS)
+    half, full = model.step_matrices(STEP_S / 2), model.step_matrices(STEP_S)
+    temp_c = start_c
+    for step in range(round(LONGEST_S / STEP_S)):
+        burnt = temp_c.max(axis=1) > BURNT_C if end_c is None else np.zeros(len(temp_c), bool)  # [start]
+        if not np.any((to_come & np.isinf(times_s))[~burnt]):
+            break
+        heat = drive_heat(temp_c, current_sq, no_friction_w, motors)
+        middle_c = advance(temp_c, heat, ambient_c, *half, model.to_ambient)
+        heat = drive_heat(middle_c, current_sq, no_friction_w, motors)
+        next_c = np.where(burnt[:, None], temp_c, advance(temp_c, heat, ambient_c, *full, model.to_ambient))
+        before, after = temp_c[:, None, WINDING], next_c[:, None, WINDING]
+        passed = (before < limits_c) & (after >= limits_c)
+        share = (limits_c - before) / np.where(passed, after - before, 1.0)
+        times_s = np.where(passed, (step + share) * STEP_S, times_s)
+        temp_c = next_c
+    return times_s
+
+
+def as_json(result: HoldResult) -> dict[str, object]:
+    """The result as plain values: lists of 7 (joint 1 first), null for never."""
+    return {
+        "payload": result.payload_kg,
+        "posture": result.posture,
+        "q_deg": list(result.q_deg),
+        "ambient_c": result.ambient_c,
+        "cooling": result.cooling,
+        "tool_kg": result.tool_kg,
+        "cold": {name: list(values) for name, values in vars(result.cold).items()},
+        "idle_warm": {name: list(values) for name, values in vars(result.idle_warm).items()},
+        "note": result.note,
+    }
+
+
+def as_table(result: HoldResult) -> Table:
+    """The result for people: one row per joint."""
+    tool = f" and a tool of {result.tool_kg:g} kg" if result.tool_kg else ""
+    table = Table(
+        title=f"Holding {result.payload_kg:g} kg{tool}, {result.posture}, {result.ambient_c:g} °C, {result.cooling}",
+        caption=f"{result.note}\nMinutes from a cold start | from idle-warm; – is never.",
+        caption_justify="left",
+    )
+    for heading in ("joint", "torque N·m", "current A", "settles °C", "min to 60 °C", "min to 75 °C"):
+        table.add_column(heading, justify="right")
+    cold, warm = result.cold, result.idle_warm
+    for j in range(JOINTS):
+        style = "red" if cold.t75_min[j] is not None else "yellow" if cold.t60_min[j] is not None else ""
+        table.add_row(
+            str(j + 1),
+            f"{cold.torque_nm[j]:.1f}",
+            f"{cold.current_a[j]:.2f} | {warm.current_a[j]:.2f}",
+            _cell(cold.steady_c[j]),
+            f"{_cell(cold.t60_min[j])} | {_cell(warm.t60_min[j])}",
+            f"{_cell(cold.t75_min[j])} | {_cell(warm.t75_min[j])}",
+            style=style,
+        )
+    return table
+
+
+def hold_command(
+    payload: Annotated[float, typer.Option(help="Payload at the flange, kg.")] = 0.0,
+    posture: Annotated[
+        str, typer.Option(help=f"{', '.join(POSTURES)}, or seven comma-separated angles in degrees.")
+    ] = "outstretched",
+    ambient: Annotated[float, typer.Option(help="Air around the arm, °C.")] = 25.0,
+    json_: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+    cooling: Annotated[str, typer.Option(help=f"{', '.join(get_args(Cooling))}.")] = "still_air",
+    tool_kg: Annotated[float, typer.Option(help="Mass of the gripper at the flange, kg.")] = 0.0,
+) -> None:
+    """How long an arm may hold a payload still before its motors warn and fault."""
+    try:
+        result = hold(payload, posture, ambient, cooling=cooling, tool_kg=tool_kg)
+    except FleetError as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(2) from None
+    if json_:
+        typer.echo(json.dumps(as_json(result), indent=2, allow_nan=False, ensure_ascii=False))
+    else:
+        Console().print(as_table(result))
+
+
+def _cooling(name: str) -> Cooling:
+    for known in get_args(Cooling):
+        if name == known:
+            return known
+    raise HoldError(f"Unknown cooling '{name}'{nearest(name, get_args(Cooling))}")
+
+
+def _check_torque(tau: Array, payload_kg: float, posture: str) -> None:
+    clip = np.array(GEN3.torque_clip)
+    for j in np.flatnonzero(np.abs(tau) > clip):
+        raise HoldError(
+            f"Holding {payload_kg:g} kg in posture '{posture}' takes {abs(tau[j]):.1f} N·m at joint {j + 1}; "
+            f"its motor gives at most {clip[j]:g} N·m."
+        )
+
+
+def _note(tau: Array, course: Course) -> str:
+    limit_c = thermal_data()["identified_below_c"]
+    sentences = [
+        f"Above {limit_c:g} °C the model extrapolates: it was identified on logs of a real arm that stayed below."
+    ]
+    warning = np.array(GEN3.torque_warning)
+    sentences += [
+        f"Joint {j + 1} needs {abs(tau[j]):.1f} N·m, above the arm's torque warning of {warning[j]:g} N·m."
+        for j in np.flatnonzero(np.abs(tau) > warning)
+    ]
+    if course.steady_c[0] is None:
+        sentences.append(
+            "The hold has no steady temperature, because copper loss grows faster than cooling. "
+            f"The simulation ends when a motor reaches {BURNT_C:g} °C."
+        )
+    return " ".join(sentences)
+
+
+def _rounded(values: Array) -> PerJoint:
+    return tuple(round(float(value), 3) for value in values)
+
+
+def _rounded_or_none(values: Array) -> MaybePerJoint:
+    return tuple(round(float(value), 3) if np.isfinite(value) else None for value in values)
+
+
+def _cell(value: float | None) -> str:
+    return "–" if value is None else f"{value:.1f}"

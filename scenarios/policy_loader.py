@@ -1,0 +1,118 @@
+"""Policies by name: one of `agents.registry`, a class of your own as `FILE.py:CLASS` or `MODULE:CLASS`, or the folder
+of a trained one."""
+
+import importlib
+import importlib.util
+import os
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from agents.policy import SCOPES, ArmPolicy, Policy, for_all_arms
+from agents.registry import RULES, rule_of
+from fleet.errors import FleetError, nearest
+from fleet.seeding import child
+
+METHODS = {
+    "central": {"reset": "rng", "act": "observations"},
+    "arm": {"reset": "rng", "choose": "observation, place"},
+}
+"""Methods, and their arguments, that a policy of each scope must have."""
+
+
+def policy_of(name: str) -> Policy:
+    """A fresh policy for all arms.
+
+    Raises:
+        FleetError: no such rule, file, module, class or folder, or one that is not a policy.
+    """
+    return for_all_arms(_maker(name))
+
+
+def arm_policy_of(name: str) -> ArmPolicy:
+    """A fresh policy of scope `arm`, for one arm.
+
+    Raises:
+        FleetError: as `policy_of`, or the policy is a central one.
+    """
+    if scope_of(name) != "arm":
+        raise FleetError(f"'{name}' is a central policy: it needs the observations of all arms, not of one.")
+    return _maker(name)()  # pyright: ignore[reportReturnType]  # by its scope
+
+
+def scope_of(name: str) -> str:
+    """The scope of a policy; no trained one is loaded for it.
+
+    Raises:
+        FleetError: as `policy_of`.
+    """
+    return "arm" if Path(name).is_dir() else _class_of(name).scope
+
+
+def policy_at(name: str, seed: int) -> Policy:
+    """A fresh policy at the beginning of the shift of a seed, with its random generator.
+
+    Raises:
+        FleetError: as `policy_of`.
+    """
+    policy = policy_of(name)
+    policy.reset(np.random.default_rng(child(np.random.SeedSequence([seed, 1]), 0)))
+    return policy
+
+
+def label(name: str) -> str:
+    """What a table calls a policy: the rule, the class, or the last folder."""
+    if Path(name).is_dir():
+        return Path(os.path.abspath(name)).name
+    return name.rpartition(":")[2]
+
+
+def _maker(name: str) -> Callable[[], Policy] | Callable[[], ArmPolicy]:
+    if Path(name).is_dir():
+        from agents.learned.policy import load_policy  # loads torch
+
+        return lambda: load_policy(Path(name))
+    return _class_of(name)
+
+
+def _class_of(name: str) -> type[Policy] | type[ArmPolicy]:
+    if ":" not in name:
+        try:
+            return rule_of(name).kind
+        except ValueError as error:
+            raise FleetError(f"{error} Or name your own as FILE.py:CLASS, or the folder of a trained one.") from error
+    where, _, kind = name.rpartition(":")
+    module = _module(where, name)
+    found = getattr(module, kind, None)
+    if not isinstance(found, type):
+        classes = [key for key, value in vars(module).items() if isinstance(value, type)]
+        raise FleetError(f"No class '{kind}' in '{where}'{nearest(kind, classes)}")
+    scope = getattr(found, "scope", None)
+    if scope not in SCOPES:
+        raise FleetError(
+            f"The policy '{name}' has no scope (got {scope!r}). Add to the class: scope = \"central\" if its "
+            'act(observations) sees all arms, or scope = "arm" if its choose(observation, place) sees one.'
+        )
+    missing = [method for method in METHODS[scope] if not callable(getattr(found, method, None))]
+    if missing:
+        needed = " and ".join(f"{method}({arguments})" for method, arguments in METHODS[scope].items())
+        raise FleetError(f"'{name}' is no policy: of scope {scope} it needs the methods {needed}.")
+    return found
+
+
+def _module(where: str, name: str) -> ModuleType:
+    if not where.endswith(".py"):
+        try:
+            return importlib.import_module(where)
+        except ImportError as error:
+            rules = ", ".join(RULES)
+            raise FleetError(f"Policy '{name}': cannot import '{where}' ({error}). Rules: {rules}.") from error
+    path = Path(where)
+    spec = importlib.util.spec_from_file_location(f"own_policy_{path.stem}", path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise FleetError(f"Policy '{name}': there is no file '{where}'.")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

@@ -1,0 +1,331 @@
+"""From a scenario to a fleet of arms with plans and twins, and to the environment."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from dataclasses import fields as dataclass_fields
+from inspect import Parameter, signature
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import numpy as np
+
+from fleet.bus.exchange.channel import PERFECT, Channel
+from fleet.bus.exchange.memory import MemoryExchange
+from fleet.bus.exchange.protocol import Exchange
+from fleet.difficulty import Blind, DifficultyModel
+from fleet.engine.profile_plant import ProfilePlant
+from fleet.engine.state import World
+from fleet.engine.world import Arm, build_world, warm_start
+from fleet.errors import FleetError, InfeasibleJob, ScenarioError, nearest
+from fleet.files import cache_folder
+from fleet.job import Job
+from fleet.motion import Plan
+from fleet.motor import thermal_data
+from fleet.planning.plan_cache import rest_torque
+from fleet.seeding import shift_seeds
+from scenarios.cell_layout import cell_of, near_of
+from scenarios.extras import require_extra
+from scenarios.job_stream import all_works, draw_jobs, rehearsal_works, works_of
+from scenarios.load import load, override
+from scenarios.prepare.planned_arm import PlannedArm, plan_arms
+from scenarios.progress import Progress, quiet
+from scenarios.schema import Scenario
+
+if TYPE_CHECKING:  # a single arm needs neither the environment nor MuJoCo
+    from fleet.engine.shift import Episode, Plant
+    from fleet.env.allocation_v0 import AllocationEnv, MaskPlace
+
+DifficultyName = Literal["twin", "blind", "oracle"]
+PlantName = Literal["profile", "mujoco"]
+BusName = Literal["zenoh", "memory"]
+
+
+@dataclass(frozen=True, eq=False)
+class Fleet:
+    """A scenario's arms, with plans and difficulty models."""
+
+    scenario: Scenario
+    arms: tuple[Arm, ...]
+    infeasible: tuple[InfeasibleJob, ...]
+    """Work that single arms cannot do, with reasons."""
+
+
+def choose(kind: str, name: str, allowed: Any) -> Any:
+    """The name, if it is one of a Literal type. (Any: Python cannot say that a parameter is a Literal type.)
+
+    Raises:
+        ScenarioError: names the nearest allowed one.
+    """
+    if name not in get_args(allowed):
+        raise ScenarioError(f"No {kind} '{name}'{nearest(str(name), get_args(allowed))}")
+    return name
+
+
+def prepare(
+    scenario: Scenario,
+    *,
+    difficulty: DifficultyName = "twin",
+    cache: str | Path | None = None,
+    progress: Progress = quiet,
+) -> Fleet:
+    """Plan every work for every arm, and give each arm its difficulty model; both are cached by content.
+
+    Raises:
+        ScenarioError: no arm can do some work.
+        MissingExtra: twins are wanted, and their libraries are not installed.
+    """
+    arms, refused = _arms(scenario, range(len(scenario.arms)), difficulty, cache, progress, every_work=True)
+    return Fleet(scenario, tuple(arms), tuple(refused))
+
+
+def prepare_arm(
+    scenario: Scenario,
+    name: str,
+    *,
+    difficulty: DifficultyName = "twin",
+    cache: str | Path | None = None,
+    progress: Progress = quiet,
+) -> Arm:
+    """One arm of a scenario, equal to the arm of the same name in the prepared fleet.
+
+    Raises:
+        FleetError: the scenario has no such arm.
+    """
+    (arm,), _ = _arms(scenario, [scenario.index_of(name)], difficulty, cache, progress, every_work=False)
+    return arm
+
+
+def _arms(
+    scenario: Scenario,
+    indices: Sequence[int],
+    difficulty: DifficultyName,
+    cache: str | Path | None,
+    progress: Progress,
+    *,
+    every_work: bool,
+) -> tuple[list[Arm], list[InfeasibleJob]]:
+    """The arms at these places of the scenario, and the work that single arms cannot do.
+
+    Args:
+        every_work: Raise if none of the arms can do some work.
+    """
+    choose("difficulty", difficulty, DifficultyName)
+    if difficulty == "twin":
+        require_extra("twin")
+    if not isinstance(cache, str | Path | None):
+        raise ScenarioError(f"cache must be the path of a folder (got {cache!r}).")
+    folder = Path(cache) if cache else cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FleetError(f"Cannot keep plans and twins in '{folder}': {error.strerror}.") from error
+    asked = all_works(scenario)
+    works = rehearsal_works(scenario) if difficulty == "twin" else asked
+    planned = plan_arms(scenario, indices, works, folder, progress)
+    if every_work:
+        _check_feasible(scenario, planned)
+    working = [replace(arm, plans={w: arm.plans[w] for w in asked if w in arm.plans}) for arm in planned]
+    models: Sequence[DifficultyModel] = [Blind()] * len(planned)
+    if difficulty == "twin":
+        from scenarios.prepare.calibrate_twins import calibrate_twins  # both import torch
+        from scenarios.prepare.train_twins import train_twins
+
+        twins = train_twins(scenario, planned, folder, progress)
+        models = calibrate_twins(scenario, working, twins, folder, progress)
+    arms = []
+    for of_scenario, model in zip(working, models, strict=True):
+        robot, motors, thermal = of_scenario.hardware
+        rest_tau = rest_torque(robot, folder / "plans")
+        plans = of_scenario.plans
+        arm = Arm(robot=robot, motors=motors, thermal=thermal, rest_tau=rest_tau, model=model, plans=plans)
+        arms.append(_with_oracle(scenario, arm) if difficulty == "oracle" else arm)
+    return arms, [error for arm in planned for error in arm.infeasible]
+
+
+REASONS = 4
+"""Most reasons listed in one error message."""
+
+
+def _check_feasible(scenario: Scenario, arms: Sequence[PlannedArm]) -> None:
+    """Check that every work can be done by some arm.
+
+    Raises:
+        ScenarioError: names the job stream, and why each arm cannot do it.
+    """
+    infeasible = [error for arm in arms for error in arm.infeasible]
+    for i, stream in enumerate(scenario.jobs):
+        for work in works_of(scenario, stream):
+            if any(work in arm.plans for arm in arms):
+                continue
+            reasons = list(
+                dict.fromkeys(f"{e.arm} at '{e.place}': {e.reason}" for e in infeasible if e.place in stream.places)
+            )
+            more = f"; and {len(reasons) - REASONS} more" if len(reasons) > REASONS else ""
+            raise ScenarioError(
+                f"{scenario.name}.toml: jobs[{i}].places: no arm can do '{stream.name}' with {work.payload_kg:g} kg "
+                f"({'; '.join(reasons[:REASONS])}{more}); move the places or an arm, or make the load lighter."
+            )
+
+
+def _with_oracle(scenario: Scenario, arm: Arm) -> Arm:
+    from fleet.engine.oracle import Oracle
+
+    of_cell = float(np.mean(scenario.ambient.at(np.linspace(0, scenario.horizon_s, 100))))
+    ambient_c = of_cell + arm.robot.ambient_offset_k
+    model = Oracle(arm.motors, arm.thermal, warm_start(arm, ambient_c), ambient_c, scenario.limits.warning_c)
+    return replace(arm, model=model)
+
+
+def world_of(fleet: Fleet, jobs: Sequence[Job]) -> tuple[World, tuple[Plan, ...]]:
+    """The world of a shift with these jobs, and the plan of each row of its plan table."""
+    scenario = fleet.scenario
+    times = (np.arange(scenario.ticks) + 0.5) * scenario.decision_interval_s
+    return build_world(
+        fleet.arms,
+        [jobs],
+        limits=scenario.limits,
+        dt_s=scenario.decision_interval_s,
+        ticks=scenario.ticks,
+        slots=scenario.slots,
+        ambient_c=scenario.ambient.at(times)[:, None] + air_offsets(scenario),
+        start_warm=scenario.start == "idle_warm",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ShiftFactory:
+    """Makes the episode of a seed for one fleet."""
+
+    fleet: Fleet
+    plant: PlantName = "profile"
+
+    def __call__(self, seed: np.random.SeedSequence) -> "Episode":
+        """Draw the jobs and build the world; the same seed gives the same episode."""
+        from fleet.engine.shift import Episode
+
+        scenario, arms = self.fleet.scenario, self.fleet.arms
+        jobs_seed, sensor_seed = shift_seeds(seed)
+        world, plans = world_of(self.fleet, draw_jobs(scenario, jobs_seed))
+        robots, rest_tau = [arm.robot for arm in arms], np.stack([arm.rest_tau for arm in arms])
+        plant: Plant
+        if self.plant == "mujoco":
+            from fleet.physics.mujoco_plant import MujocoPlant
+
+            plant = MujocoPlant(robots, plans, rest_tau, scenario.places)
+        else:
+            plant = ProfilePlant(plans, np.stack([robot.home_q() for robot in robots]), rest_tau)
+        twins = tuple(arm.model.version for arm in arms)
+        return Episode(world=world, plant=plant, twins=twins, sensors=sensor_seed)
+
+
+def air_offsets(scenario: Scenario) -> np.ndarray:
+    """Ambient temperature at each arm minus that of the cell, K, [arm]: given by the scenario, plus a random part."""
+    sd = scenario.spread.scale * thermal_data()["spread"]["ambient_k"]
+    rng = np.random.default_rng(np.random.SeedSequence([scenario.spread.seed, len(scenario.arms), 1]))
+    drawn = sd * rng.standard_normal(len(scenario.arms))
+    return drawn + np.array([arm.ambient_offset_k for arm in scenario.arms])
+
+
+def open_exchange(
+    bus: BusName, arms: tuple[str, ...], fleet: str, endpoint: str | None = None, channel: Channel = PERFECT
+) -> Exchange:
+    """The exchange of a name; over Zenoh it uses the router at the endpoint, or an in-process router.
+
+    Raises:
+        FleetError: there is no such bus, the channel names other arms, or the library of the bus is not installed.
+    """
+    choose("bus", bus, BusName)
+    try:
+        if bus == "memory":
+            return MemoryExchange(arms, channel)
+        require_extra("bus")
+        from fleet.bus.exchange.zenoh import ZenohExchange
+
+        return ZenohExchange(arms, fleet, endpoint, channel=channel)
+    except ValueError as error:
+        raise FleetError(str(error)) from error
+
+
+def scenario_with(
+    scenario: str | Path | Scenario, overrides: Mapping[str, Any], function: Callable[..., object]
+) -> Scenario:
+    """The scenario with overrides, which may be values of any field.
+
+    Args:
+        function: Called with the overrides; its own options are named in errors, too.
+
+    Raises:
+        ScenarioError: an override is neither a field nor an option; names the nearest.
+    """
+    if not isinstance(scenario, str | Path | Scenario):
+        raise ScenarioError(f"scenario must be a library name, a .toml file or a Scenario (got {scenario!r}).")
+    chosen = scenario if isinstance(scenario, Scenario) else load(scenario)
+    fields = [field.name for field in dataclass_fields(Scenario)]
+    options = [name for name, p in signature(function).parameters.items() if p.kind is Parameter.KEYWORD_ONLY]
+    for name in overrides:
+        if name == "seed":
+            raise ScenarioError("make_env() takes no seed: give it to reset(seed=…).")
+        if name not in fields:
+            allowed = nearest(name, [*fields, *options])
+            raise ScenarioError(f"{chosen.name} with overrides: unknown key '{name}'{allowed}")
+    return override(chosen, **overrides) if overrides else chosen
+
+
+def make_env(
+    scenario: str | Path | Scenario,
+    *,
+    difficulty: DifficultyName = "twin",
+    plant: PlantName = "profile",
+    bus: BusName = "memory",
+    channel: Channel = PERFECT,
+    cache: str | Path | None = None,
+    max_cycles: int | None = None,
+    render_mode: str | None = None,
+    mask_in: "MaskPlace" = "obs",
+    peers: int | None = None,
+    progress: Progress = quiet,
+    **overrides: Any,
+) -> "AllocationEnv":
+    """The PettingZoo `ParallelEnv` of a scenario.
+
+    Args:
+        scenario: A library name, a .toml file, or a `Scenario`.
+        difficulty: What scores the plans: the arms' twins (from the cache, or trained), `blind` or `oracle`.
+        plant: What moves the arms.
+        bus: What carries the messages between arms.
+        channel: Topology, delay, loss and partitions of the messages.
+        cache: Folder of plans and twins.
+        max_cycles, render_mode, mask_in: As in `fleet.env.allocation_v0.AllocationEnv`.
+        peers: Number of peers in an arm's observation, the nearest ones; default: all.
+        overrides: Top-level fields of the scenario to change, for example `horizon_s=600`; Any, as fields differ.
+
+    Raises:
+        ScenarioError: an argument is not allowed.
+        FleetError: the fleet cannot be prepared.
+    """
+    if not isinstance(channel, Channel):
+        raise ScenarioError(f"channel must be a fleet.bus.exchange.channel.Channel (got {channel!r}).")
+    chosen = scenario_with(scenario, overrides, make_env)
+    near = near_of(chosen, peers)
+    fleet = prepare(chosen, difficulty=difficulty, cache=cache, progress=progress)
+    options = {"max_cycles": max_cycles, "render_mode": render_mode, "mask_in": mask_in, "near": near}
+    return env_of(fleet, plant=plant, bus=bus, channel=channel, **options)
+
+
+def env_of(
+    fleet: Fleet,
+    *,
+    plant: PlantName = "profile",
+    bus: BusName = "memory",
+    endpoint: str | None = None,
+    channel: Channel = PERFECT,
+    **options: Any,
+) -> "AllocationEnv":
+    """The `ParallelEnv` of a prepared fleet; arguments as in `open_exchange`, options (Any) as in `AllocationEnv`."""
+    from fleet.env.allocation_v0 import parallel_env
+
+    choose("plant", plant, PlantName)
+    names = tuple(arm.robot.name for arm in fleet.arms)
+    exchange = open_exchange(bus, names, fleet.scenario.name, endpoint, channel)
+    options = {"weights": fleet.scenario.reward, "cell": cell_of(fleet.scenario), **options}
+    return parallel_env(ShiftFactory(fleet, plant), exchange=exchange, **options)

@@ -1,0 +1,100 @@
+"""One arm of a scenario: its hardware, and its plans for the scenario's work."""
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from fleet.errors import InfeasibleJob
+from fleet.job import Work
+from fleet.motion import Plan
+from fleet.motor import Motors, gen3_motors
+from fleet.planning.plan_cache import CachedPlanner
+from fleet.robot import Robot
+from fleet.thermal import ThermalModel, ThermalSpread, gen3_network, spread_motors, thermal_model
+from scenarios.progress import Progress
+from scenarios.schema import Scenario
+
+log = logging.getLogger(__name__)
+
+
+class ArmHardware(NamedTuple):
+    """An arm's robot, its motors and its thermal model."""
+
+    robot: Robot
+    motors: Motors
+    thermal: ThermalModel
+
+    def content(self) -> bytes:
+        """Every parameter of motors and thermal model, for cache keys."""
+        values = (*vars(self.motors).values(), *vars(self.thermal).values())
+        return b"".join(np.asarray(value, dtype=float).tobytes() for value in values)
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedArm:
+    """An arm of a scenario with its plans."""
+
+    index: int
+    """Place in the scenario's list of arms; random draws for the arm depend on it."""
+    hardware: ArmHardware
+    plans: Mapping[Work, tuple[Plan, ...]]
+    infeasible: tuple[InfeasibleJob, ...] = ()
+    """Work that the arm cannot do, with reasons."""
+
+    @property
+    def all_plans(self) -> list[Plan]:
+        """The plans of all works."""
+        return [plan for variants in self.plans.values() for plan in variants]
+
+
+def hardware_of(scenario: Scenario, index: int) -> ArmHardware:
+    """The hardware of one arm, with its random deviation from the nominal Gen3; the same for every seed of a run."""
+    spec = scenario.arms[index]
+    rng = np.random.default_rng(np.random.SeedSequence([scenario.spread.seed, index]))
+    spread = ThermalSpread.gen3(scenario.spread.scale)
+    motors = spread_motors(gen3_motors(wear=spec.wear), spread, rng)
+    network = gen3_network(cooling=spec.cooling, cooling_factor=spec.cooling_factor, spread=spread, rng=rng)
+    return ArmHardware(spec.robot(), motors, thermal_model(network))
+
+
+def planner_of(robot: Robot, scenario: Scenario, folder: Path) -> CachedPlanner:
+    """A planner with the scenario's settings; it caches plans in `folder`."""
+    spec = scenario.planning
+    return CachedPlanner(robot, elbows=spec.elbows, speeds=spec.speeds, cache_dir=folder / "plans")
+
+
+def plan_works(
+    robot: Robot, works: Sequence[Work], scenario: Scenario, folder: Path, progress: Callable[[float], None]
+) -> tuple[dict[Work, tuple[Plan, ...]], list[InfeasibleJob]]:
+    """An arm's plans for the works it can do (cached in `folder`), and the reasons why it cannot do the others."""
+    planner = planner_of(robot, scenario, folder)
+    plans: dict[Work, tuple[Plan, ...]] = {}
+    infeasible: list[InfeasibleJob] = []
+    for i, work in enumerate(works):
+        progress(i / len(works))
+        try:
+            plans[work] = planner.plan(work)
+        except InfeasibleJob as error:
+            infeasible.append(error)
+            log.info("%s", error)
+    return plans, infeasible
+
+
+def plan_arms(
+    scenario: Scenario, indices: Sequence[int], works: Sequence[Work], folder: Path, progress: Progress
+) -> list[PlannedArm]:
+    """The arms at these places of the scenario, each with its plans for the works."""
+    planned = []
+    for done, index in enumerate(indices):
+
+        def report(fraction: float, done: int = done) -> None:
+            progress("planning", (done + fraction) / len(indices))
+
+        hardware = hardware_of(scenario, index)
+        plans, infeasible = plan_works(hardware.robot, works, scenario, folder, report)
+        planned.append(PlannedArm(index, hardware, plans, tuple(infeasible)))
+    return planned

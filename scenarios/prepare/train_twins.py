@@ -1,0 +1,154 @@
+"""Train the twin of every arm on motion whose whole horizon stays cool.
+
+Besides the motion of its work, an arm explores light motions of other kinds: a twin that knows only the work would
+take every new motion for a danger. `scenarios/studies/exploration.py` measures the gain.
+"""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from fleet.motion import Plan
+from fleet.planning.random_motions import RANDOM_MOTIONS_VERSION, light_jobs
+from scenarios.prepare.cool_motion import cool_plans, records, require_cool_plans
+from scenarios.prepare.model_cache import CachedModel, load_or_make
+from scenarios.prepare.planned_arm import ArmHardware, PlannedArm
+from scenarios.progress import Progress
+from scenarios.schema import Scenario, TwinSpec
+from twin.vae.checkpoint import load, save
+from twin.vae.model import TwinConfig
+from twin.vae.train import train, training_key
+from twin.vae.twin import Twin
+
+Array = np.ndarray
+
+REHEARSAL_VERSION = 3
+"""Raise it whenever the same arm would get other training or calibration data."""
+
+EXPLORATION, HELD_OUT, USUAL = 1, 2, 3
+"""Spawn keys that keep the random draws of one arm apart."""
+FEWEST_HELD_OUT = 8
+"""With fewer held-out motions a twin stays uncalibrated."""
+
+
+def train_twins(
+    scenario: Scenario,
+    arms: Sequence[PlannedArm],
+    folder: Path,
+    progress: Progress,
+    *,
+    config: TwinConfig | None = None,
+    seed: int | None = None,
+) -> list[Twin]:
+    """The twin of every arm: from the cache while its inputs are unchanged, else trained, several arms at a time.
+
+    Args:
+        config: Default: the size that the scenario names.
+        seed: Of weights and training; default: the scenario's own. The training data do not depend on it.
+
+    Raises:
+        FleetError: an arm has no motion that stays cool, so its twin cannot know what is normal.
+    """
+    if config is None:
+        config = TwinConfig.quick() if scenario.twin.size == "quick" else TwinConfig()
+    of_scenario = scenario.spread.seed
+    exploration_seed = of_scenario if seed not in (None, of_scenario) else None
+    models = []
+    for arm in arms:
+        own = require_cool_plans(arm.all_plans, arm.hardware, scenario)
+        training_seed = arm_seed(of_scenario if seed is None else seed, arm.index)
+        key = training_key(records(own), config, training_seed)
+        home = folder / "twins" / _key(key, scenario.twin, arm.hardware, exploration_seed)
+        models.append(CachedModel(home, load, partial(_train_and_save, own, config, training_seed, scenario, arm)))
+    return load_or_make(models, "training", progress)
+
+
+def _train_and_save(
+    own: Sequence[Plan],
+    config: TwinConfig,
+    seed: np.random.SeedSequence,
+    scenario: Scenario,
+    arm: PlannedArm,
+    folder: Path,
+    progress: Callable[[float], None],
+) -> None:
+    save(train_twin(own, config, seed, scenario=scenario, arm=arm, progress=progress), folder)
+
+
+def train_twin(
+    own: Sequence[Plan],
+    config: TwinConfig,
+    seed: np.random.SeedSequence,
+    *,
+    scenario: Scenario,
+    arm: PlannedArm,
+    progress: Callable[[float], None] | None = None,
+) -> Twin:
+    """The twin of an arm: trained on its own cool motion and its exploration, calibrated on what is usual.
+
+    Usual is new exploration that was not trained on, and as much of its own work, that was. Own work recurs as it is;
+    measured against slow exploration alone, a fifth of fast cool work would count as unusual.
+
+    Args:
+        own: The arm's cool plans.
+        progress: Called with the fraction of the training that is done.
+    """
+    trained_on = [*records(own), *exploration_records(scenario, arm)]
+    twin = train(trained_on, config, seed, arm=arm.hardware.robot.name, progress=progress)
+    held_out = _cool_exploration(scenario, arm, HELD_OUT)
+    if len(held_out) < FEWEST_HELD_OUT:
+        return twin
+    rng = np.random.default_rng(_draw_seed(scenario, arm, USUAL))
+    chosen = rng.choice(len(own), size=min(len(own), len(held_out)), replace=False)
+    return twin.with_calibration([(plan, 1) for plan in (*held_out, *(own[i] for i in chosen))])
+
+
+def exploration_records(scenario: Scenario, arm: PlannedArm) -> list[Array]:
+    """Training data from the arm's exploration, [time, 3, joint] each; the same for every seed of a run."""
+    return records(_cool_exploration(scenario, arm, EXPLORATION))
+
+
+def _cool_exploration(scenario: Scenario, arm: PlannedArm, draw: int) -> tuple[Plan, ...]:
+    rng = np.random.default_rng(_draw_seed(scenario, arm, draw))
+    light = light_jobs(arm.hardware.robot, scenario.twin.exploration, rng)
+    return cool_plans(light, arm.hardware, scenario.twin)
+
+
+def _draw_seed(scenario: Scenario, arm: PlannedArm, draw: int) -> np.random.SeedSequence:
+    return np.random.SeedSequence([scenario.spread.seed, arm.index], spawn_key=(draw,))
+
+
+def arm_seed(seed: int, index: int) -> np.random.SeedSequence:
+    """The seed of an arm's training, by its place in the scenario; it does not depend on the other arms trained."""
+    return np.random.SeedSequence([seed, index])
+
+
+def _key(own: str, spec: TwinSpec, hardware: ArmHardware, exploration_seed: int | None = None) -> str:
+    """Cache key of a twin: the key of its own motion, and everything that decides on its exploration.
+
+    Args:
+        exploration_seed: Seed of the exploration if it is not the one in the key of the own motion.
+    """
+    if not spec.exploration:
+        return own
+    parts = [own, REHEARSAL_VERSION, RANDOM_MOTIONS_VERSION, asdict(spec), asdict(hardware.robot)]
+    digest = hashlib.sha256(msgspec.json.encode(parts if exploration_seed is None else [*parts, exploration_seed]))
+    digest.update(hardware.content())
+    return digest.hexdigest()[: len(own)]
+
+
+def train_or_load(
+    records: list[Array], config: TwinConfig, seed: np.random.SeedSequence, *, arm: str, folder: Path
+) -> Twin:
+    """The twin of these records: from the folder while its inputs are unchanged, else trained and kept there."""
+
+    def make(home: Path, _report: Callable[[float], None]) -> None:
+        save(train(records, config, seed, arm=arm), home)
+
+    home = folder / "twins" / training_key(records, config, seed)
+    return load_or_make([CachedModel(home, load, make)], "training")[0]

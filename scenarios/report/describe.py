@@ -1,0 +1,109 @@
+"""Describe a scenario in sentences and tables."""
+
+from collections.abc import Callable
+from itertools import groupby
+
+import numpy as np
+from rich.table import Table
+from rich.text import Text
+
+from scenarios.prepare.fleet import ShiftFactory, prepare
+from scenarios.progress import Progress, quiet
+from scenarios.report.load_factor import LoadFactor, load_factor
+from scenarios.schema import ArmSpec, JobStream, Scenario
+
+SEEDS = 5
+"""Shifts over which the load factor is averaged."""
+
+
+def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | Text]:
+    """Heading, arms, jobs, unreachable places, and the load. Plans the scenario's work (cached)."""
+    fleet = prepare(scenario, difficulty="blind", progress=progress)
+    factory = ShiftFactory(fleet)
+    factors = [load_factor(factory(np.random.SeedSequence(seed)).world) for seed in range(SEEDS)]
+    thermal = float(np.mean([f.thermal for f in factors]))
+    blind = float(np.mean([f.blind for f in factors]))
+    time = float(np.mean([f.time for f in factors]))
+    points = [f"{c:g} °C at {t / 3600:g} h" for t, c in scenario.ambient.points]
+    air = ", ".join(points) if len(points) > 1 else f"{scenario.ambient.at(np.zeros(1))[0]:g} °C"
+    head = (
+        f"{scenario.name}: {scenario.description}\n{scenario.horizon_s / 3600:g} h, a decision every "
+        f"{scenario.decision_interval_s:g} s, {scenario.slots} slots, ambient {air}\n"
+        f"thermal load factor {thermal:.2f} under the best assignment, {blind:.2f} under a blind one, "
+        f"time load {time:.2f} (mean of {SEEDS} seeds): {_regime(factors)}"
+    )
+    refused = [
+        f"{arm}: {', '.join(sorted({e.place for e in es}))}" for arm, es in groupby(fleet.infeasible, lambda e: e.arm)
+    ]
+    tail = Text("Out of reach: " + "; ".join(refused) if refused else "Every arm reaches every place.")
+    gap = Text("")
+    return [Text(head), gap, _arms(scenario), gap, _jobs(scenario), gap, tail]
+
+
+def _regime(factors: list[LoadFactor]) -> str:
+    words = [f.regime for f in factors]
+    return max(set(words), key=words.count)
+
+
+def _arms(scenario: Scenario) -> Table:
+    """One row per arm; columns with default values only are left out."""
+    usual = ArmSpec(name="usual")
+    columns: list[tuple[str, Callable[[ArmSpec], str]]] = [
+        ("home", lambda a: a.home),
+        ("tool, kg", lambda a: f"{a.tool_kg:g}"),
+        ("cooling", lambda a: a.cooling if a.cooling_factor == 1 else f"{a.cooling} × {a.cooling_factor:g}"),
+        ("air, K", lambda a: f"{a.ambient_offset_k:+g}"),
+        ("wear", lambda a: f"{a.wear:g}"),
+    ]
+    shown = [(name, text) for name, text in columns if any(text(a) != text(usual) for a in scenario.arms)]
+    table = _table("arms", "position, m", "tilt, deg", *(name for name, _ in shown))
+    for a in scenario.arms:
+        where = ", ".join(f"{v:g}" for v in a.position_m)
+        tilt = ", ".join(f"{v:g}" for v in a.tilt_deg)
+        table.add_row(a.name, where, tilt, *(text(a) for _, text in shown))
+    return table
+
+
+def _jobs(scenario: Scenario) -> Table:
+    """One row per stream, as sentences that fit any terminal."""
+    table = _table("jobs", "")
+    for s in scenario.jobs:
+        table.add_row(s.name, f"{_work(s)}\nworth {s.value:g}, due after {s.due_s / 60:g} min; {_arrivals(s)}")
+    return table
+
+
+def _work(stream: JobStream) -> str:
+    loads = " or ".join(f"{p:g}" for p in stream.payload_kg)
+    low, high = stream.repetitions
+    times = f"{low}" if low == high else f"{low}–{high}"
+    where = " → ".join(stream.places)
+    match stream.kind:
+        case "hold":
+            return f"hold {loads} kg at {where}, {times} × {stream.dwell_s:g} s"
+        case "press":
+            held = f" and {loads} kg" if any(stream.payload_kg) else ""
+            return f"press {where} with {stream.force_n:g} N{held}, {times} × {stream.dwell_s:g} s"
+        case "pick_place" | "sort":
+            return f"{stream.kind} {where}, {loads} kg, {times} times"
+
+
+def _arrivals(stream: JobStream) -> str:
+    spec = stream.arrivals
+    after = f", after {', '.join(stream.after)}" if stream.after else ""
+    match spec.kind:
+        case "poisson":
+            first = f" from {spec.start_s:g} s" if spec.start_s else ""
+            last = f" until {spec.stop_s:g} s" if spec.stop_s is not None else ""
+            return f"Poisson, one every {spec.every_s:g} s{first}{last}{after}"
+        case "batch":
+            again = f", again every {spec.every_s:g} s" if spec.every_s else ""
+            return f"{spec.count} at {spec.start_s:g} s{again}{after}"
+        case "trace":
+            return f"a trace of {len(spec.times_s or ())}{after}"
+
+
+def _table(*columns: str) -> Table:
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in columns:
+        table.add_column(column, overflow="fold")
+    return table

@@ -1,0 +1,177 @@
+"""The report of a run: one HTML file that opens offline."""
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any  # values of run.json
+
+from fleet.events import Event
+from fleet.schedule import schedule
+from fleet.telemetry import Telemetry
+from scenarios.report.gantt import clock
+from scenarios.report.page import escape, figure_place, html_page, paragraph, table
+from scenarios.report.timeline import figure
+
+ROWS = 300
+"""Most rows of the event table."""
+
+NOTABLE = ("fault", "recover", "return", "warning", "torque_warning", "lost")
+"""Event kinds of the event table, most important first; the least important are dropped first."""
+
+
+def report_html(
+    run: Mapping[str, Any],
+    telemetry: Telemetry,
+    events: Sequence[Event],
+    arms: Sequence[str],
+    *,
+    warning_c: float,
+    error_c: float,
+) -> str:
+    """The report of a run as one HTML page; the same input gives the same text.
+
+    Args:
+        run: Content of `run.json`; missing metrics are left out of the report.
+        telemetry: Arms in the order of `arms`; may be empty.
+        events: Event log of the run, in any order.
+        warning_c, error_c: Limits of the motor temperature.
+
+    Raises:
+        ValueError: the telemetry has another number of arms, or the events contradict each other.
+    """
+    if telemetry.temp_c.shape[1] != len(arms):
+        raise ValueError(f"The telemetry has {telemetry.temp_c.shape[1]} arms, the fleet {len(arms)}.")
+    events = sorted(events, key=lambda e: (e.time_s, e.arm, e.kind, e.job))
+    reached_s = _reached_s(run, telemetry, events)
+    plan = schedule(events, arms, reached_s)
+    drawing = figure(plan, telemetry, events, arms, warning_c=warning_c, error_c=error_c)
+    body = [
+        *_head(run, arms, reached_s),
+        _key_figures(run.get("metrics") or {}),
+        figure_place(),
+        *_event_table(events),
+        _provenance(run),
+    ]
+    return html_page(_title(run), body, figure=drawing)
+
+
+def _reached_s(run: Mapping[str, Any], telemetry: Telemetry, events: Sequence[Event]) -> float:
+    """Last time of the shift that was recorded, s."""
+    last = [float(t) for t in telemetry.time_s[-1:]] + [e.time_s for e in events]
+    return max(last, default=float(run.get("scenario", {}).get("horizon_s", 0.0)))
+
+
+def _title(run: Mapping[str, Any]) -> str:
+    scenario = run.get("scenario", {}).get("name", "unnamed scenario")
+    return f"{scenario} · {run.get('policy', 'unknown policy')} · seed {run.get('seed', '?')}"
+
+
+def _head(run: Mapping[str, Any], arms: Sequence[str], reached_s: float) -> list[str]:
+    scenario = run.get("scenario", {})
+    horizon_s = scenario.get("horizon_s")
+    length = f"{_duration(horizon_s)} shift" if horizon_s is not None else "Shift"
+    how = [f"{length} of {len(arms)} arm{'s' if len(arms) != 1 else ''}"]
+    how += [f"{name} {run[name]}" for name in ("plant", "bus", "difficulty") if run.get(name) is not None]
+    status = str(run.get("status", "unknown"))
+    words = {
+        "finished": "Finished",
+        "interrupted": f"Interrupted after {_duration(reached_s)}: everything here covers that part only",
+    }.get(status, f"Status: {status}")
+    lines = [paragraph(str(scenario["description"]))] if scenario.get("description") else []
+    look = "status good" if status == "finished" else "status bad"
+    return [*lines, paragraph(" · ".join(how), "faint"), paragraph(words, look)]
+
+
+KEY_FIGURES = (
+    ("jobs finished", "finished", ",.4g", "", "jobs"),
+    ("value", "value", ",.4g", "", "value_offered"),
+    ("on time", "on_time", ",.4g", "", "finished"),
+    ("tardiness", "tardiness_min", ",.1f", " min", ""),
+    ("jobs per hour", "jobs_per_hour", ".1f", "", ""),
+    ("faults", "faults", ".0f", "", ""),
+    ("above warning", "above_warning_min", ",.1f", " min", ""),
+    ("hottest motor", "hottest_c", ".1f", " °C", ""),
+    ("availability", "availability", ".1%", "", ""),
+    ("utilisation", "utilisation", ".1%", "", ""),
+    ("energy to heat", "energy_wh", ",.0f", " Wh", ""),
+    ("lost claims", "lost_claims", ",.0f", "", ""),
+)
+"""Label, metric, format, unit, and the metric it is a part of."""
+
+
+def _key_figures(metrics: Mapping[str, Any]) -> str:
+    """The most important metrics as a row of tiles; metrics without a number are left out."""
+    values = {k: float(v) for k, v in metrics.items() if isinstance(v, int | float) and math.isfinite(v)}
+    peaks = {k: v for k, v in (metrics.get("peak_c") or {}).items() if v is not None and math.isfinite(v)}
+    hottest = max(peaks, key=lambda arm: peaks[arm], default="")
+    if hottest:
+        values["hottest_c"] = peaks[hottest]
+    tiles = []
+    for label, name, form, unit, whole in KEY_FIGURES:
+        if name in values:
+            small = f" of {values[whole]:{form}}" if whole in values else f"{unit} {hottest * (name == 'hottest_c')}"
+            style = ' class="bad"' if name == "faults" and values[name] > 0 else ""
+            number = f"<dd>{values[name]:{form}}<small>{escape(small.rstrip())}</small></dd>"
+            tiles.append(f"<div{style}><dt>{label}</dt>{number}</div>")
+    return f'<dl class="figures">{"".join(tiles)}</dl>'
+
+
+def _event_table(events: Sequence[Event]) -> list[str]:
+    """The notable events by time, and how many were left out."""
+    notable = [e for e in events if e.kind in NOTABLE]
+    first = sorted(notable, key=lambda e: (NOTABLE.index(e.kind), e.time_s))
+    kept, left = first[:ROWS], first[ROWS:]
+    lines = ["<h2>Events</h2>"]
+    if not notable:
+        return [*lines, paragraph("No fault, no warning, no lost claim.")]
+    counts = Counter(e.kind for e in notable)
+    lines.append(paragraph(f"{_counted(counts)}.", "faint"))
+    if left:
+        omitted = _counted(Counter(e.kind for e in left))
+        lines.append(
+            paragraph(f"{len(kept)} of {len(notable)} are listed; left out: {omitted}. The event log has all of them.")
+        )
+    if counts["lost"]:
+        on = "" if len(counts) > 1 else " checked"
+        lines.append(f'<input type="checkbox" id="lost"{on}> <label for="lost">show lost claims</label>')
+    kept.sort(key=lambda e: (e.time_s, e.arm, NOTABLE.index(e.kind)))
+    rows = [(clock(e.time_s), _words(e.kind), e.arm, e.job, e.reason) for e in kept]
+    head = ("time", "event", "arm", "job", "reason")
+    return [*lines, table(head, rows, style="events", kinds=[e.kind for e in kept])]
+
+
+def _words(kind: str) -> str:
+    return {"lost": "claim lost", "return": "job returned", "recover": "recovered"}.get(kind, kind.replace("_", " "))
+
+
+def _counted(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{counts[kind]} × {_words(kind)}" for kind in NOTABLE if counts.get(kind))
+
+
+def _provenance(run: Mapping[str, Any]) -> str:
+    """Everything else in `run.json`, folded away."""
+    rows = []
+    scenario = {f"scenario {k}": v for k, v in run.get("scenario", {}).items() if k not in ("name", "description")}
+    rest = {k: v for k, v in run.items() if k not in ("scenario", "status", "policy", "seed")}
+    for key, value in (rest | scenario).items():
+        parts = value.items() if isinstance(value, Mapping) else [("", value)]
+        rows += [(f"{key} {part}".strip(), _plain(inner)) for part, inner in parts]
+    return f"<details><summary>Provenance and all figures</summary>{table((), rows)}</details>"
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_plain(inner)}" for key, inner in value.items())
+    if isinstance(value, list | tuple) and any(isinstance(inner, Mapping | list | tuple) for inner in value):
+        return f"{len(value)} of them"
+    return ", ".join(map(_plain, value)) if isinstance(value, list | tuple) else str(value)
+
+
+def _duration(time_s: float) -> str:
+    """3 h, 54 min, 1 h 30 min, 20 s."""
+    hours, minutes = divmod(round(time_s / 60), 60)
+    if time_s < 60:
+        return f"{time_s:.0f} s"
+    return " ".join(f"{n} {unit}" for n, unit in ((hours, "h"), (minutes, "min")) if n)

@@ -1,0 +1,108 @@
+"""Folders of results, written atomically: a reader finds either the complete folder or none."""
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from fleet.errors import FleetError
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResultKind:
+    """How to recognise an earlier result, so that a command replaces only a result of its own kind."""
+
+    name: str
+    """For error messages, as in "a finished run"."""
+    card: str
+    """A JSON file with a field `status`: finished or interrupted."""
+    files: tuple[str, ...]
+    """Patterns of every file the folder may hold."""
+
+
+@contextmanager
+def new_folder(out: Path, kind: ResultKind, *, overwrite: bool = False) -> Iterator[Path]:
+    """A temporary folder that is renamed to `out` when the block succeeds, and removed when it fails.
+
+    Raises:
+        FleetError: `out` cannot be written, or holds files that must not be replaced.
+    """
+    check_free(out, kind, overwrite=overwrite)
+    target = Path(os.path.abspath(out))
+    created = [parent for parent in target.parents if not parent.exists()]
+    with disk_errors(out):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
+    try:
+        yield work
+        with disk_errors(out):
+            work.chmod(0o755)
+            _replace(target, work)
+    finally:
+        if work.exists():
+            shutil.rmtree(work)
+            for parent in created:
+                with suppress(OSError):  # another process has put a file there in the meantime
+                    parent.rmdir()
+
+
+def _replace(target: Path, work: Path) -> None:
+    if not target.exists():
+        work.rename(target)
+        return
+    old = Path(tempfile.mkdtemp(prefix=f".{target.name}.old.", dir=target.parent))
+    target.rename(old / target.name)
+    work.rename(target)
+    shutil.rmtree(old)
+
+
+@contextmanager
+def disk_errors(out: Path) -> Iterator[None]:
+    """Turn an `OSError` into a `FleetError` that names the folder.
+
+    Raises:
+        FleetError: the folder cannot be read or written.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise FleetError(f"Cannot write to '{out}': {error.strerror or error}.") from error
+
+
+def check_free(out: Path, kind: ResultKind, *, overwrite: bool) -> None:
+    """Check that a result may be written to `out`: it is free, or holds an earlier result of this kind.
+
+    Raises:
+        FleetError: names what is there and what is allowed.
+    """
+    with disk_errors(out):
+        for parent in out.parents:
+            if parent.exists() and not parent.is_dir():
+                raise FleetError(f"Cannot write to '{out}': '{parent}' is a file, not a folder.")
+        if not out.exists():
+            return
+        if not out.is_dir():
+            raise FleetError(f"Cannot write to '{out}': it is a file; --out needs a folder.")
+        present = sorted(p.name for p in out.iterdir())
+    status = _status(out / kind.card)
+    foreign = [name for name in present if not status or not any(fnmatchcase(name, known) for known in kind.files)]
+    if foreign:
+        raise FleetError(
+            f"'{out}' holds other files ('{foreign[0]}'); --out needs a new folder or an earlier {kind.name}."
+        )
+    if status == "finished" and not overwrite:
+        raise FleetError(f"'{out}' holds a finished {kind.name}; give another --out, or --overwrite to replace it.")
+
+
+def _status(card: Path) -> str | None:
+    """The status on a card; None if there is no card or it is not one of ours."""
+    try:
+        status = json.loads(card.read_text(encoding="utf-8"))["status"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return status if status in ("finished", "interrupted") else None

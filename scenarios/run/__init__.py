@@ -1,0 +1,1 @@
+"""Run, compare and record shifts; train policies."""

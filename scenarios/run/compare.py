@@ -1,0 +1,196 @@
+"""Several policies on the same seeds: the seed is the unit of replication, differences are paired."""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from joblib import Parallel, delayed
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+from scipy.stats import bootstrap, trim_mean
+
+from fleet.bus.exchange.channel import PERFECT, Channel
+from fleet.errors import FleetError
+from fleet.files import cache_folder
+from scenarios.policy_loader import label, policy_of, scope_of
+from scenarios.prepare.fleet import DifficultyName, Fleet, prepare
+from scenarios.progress import Progress, quiet
+from scenarios.run.evaluate import FIGURES, Outcome, outcomes
+from scenarios.schema import Scenario
+
+Array = np.ndarray
+Part = tuple[str, Sequence[int]]
+"""A policy, and some of the seeds."""
+
+RESAMPLES = 2000
+TOGETHER = 16
+"""So many shifts of a policy are worked at a time, where they are stepped side by side."""
+HERE_S = 5.0
+"""About as long as it takes a worker to begin: what can be done meanwhile is done without any."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure of one policy over the seeds."""
+
+    mean: float
+    iqm: float
+    """Interquartile mean (Agarwal et al., NeurIPS 2021)."""
+    low: float
+    high: float
+    """95 % bootstrap interval of the mean."""
+    difference: float
+    """Mean paired difference to the baseline."""
+    difference_low: float
+    difference_high: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Policies on the same seeds."""
+
+    scenario: str
+    seeds: tuple[int, ...]
+    baseline: str
+    figures: dict[str, dict[str, Figure]]
+    """[policy][figure]."""
+    scopes: dict[str, str]
+    """[policy]: central or arm, see `agents.policy`."""
+    channel: dict[str, Any]
+    """`Channel.described` of what lay between the arms."""
+    channel_text: str
+
+
+def compare(
+    scenario: Scenario,
+    policies: Sequence[str],
+    *,
+    seeds: Sequence[int],
+    baseline: str,
+    difficulty: DifficultyName = "twin",
+    channel: Channel = PERFECT,
+    cache_dir: Path | None = None,
+    workers: int = -1,
+    progress: Progress = quiet,
+) -> Comparison:
+    """Run every policy on every seed, in memory and on the profile plant.
+
+    Args:
+        channel: What becomes of the arms' words on the way, the same for every policy.
+        workers: Processes, if there is work for more than some seconds; -1 for one per core. The result does not
+            depend on it.
+
+    Raises:
+        FleetError: unknown policy, one named twice, or a baseline that is not among the policies.
+    """
+    for policy in policies:
+        policy_of(policy)
+    for i, policy in enumerate(policies):
+        if policy in policies[:i]:
+            raise FleetError(f"The policy '{policy}' is named twice; every policy is compared once.")
+    if baseline not in policies:
+        raise FleetError(f"The baseline '{baseline}' is not among the policies compared: {', '.join(policies)}.")
+    folder = cache_dir or cache_folder()  # named here: a worker may have been started under another one
+    fleet = prepare(scenario, difficulty=difficulty, cache=folder, progress=progress)
+    together = TOGETHER if channel.perfect else 1
+    parts = [(policy, seeds[i : i + together]) for policy in policies for i in range(0, len(seeds), together)]
+    by_policy: dict[str, list[Outcome]] = {policy: [] for policy in policies}
+    worked = _worked(fleet, difficulty, channel, folder, parts, workers)
+    for n, ((policy, _), found) in enumerate(zip(parts, worked, strict=True)):
+        by_policy[policy] += found
+        progress("comparing", (n + 1) / len(parts))
+    rng = np.random.default_rng(np.random.SeedSequence(0))
+    figures = {
+        p: {name: _figure(name, rows, by_policy[baseline], rng) for name in FIGURES} for p, rows in by_policy.items()
+    }
+    scopes = {policy: scope_of(policy) for policy in policies}
+    return Comparison(scenario.name, tuple(seeds), baseline, figures, scopes, channel.described(), channel.text)
+
+
+def _worked(
+    fleet: Fleet, difficulty: DifficultyName, channel: Channel, folder: Path, parts: Sequence[Part], workers: int
+) -> Iterator[list[Outcome]]:
+    """The outcomes of each part in order: of the first seconds here, then of workers, if there is anything left."""
+    began_s, todo = time.monotonic(), list(parts)
+    while todo and (workers == 1 or time.monotonic() - began_s < HERE_S):
+        yield outcomes(fleet, *todo.pop(0), channel)
+    if not todo:
+        return
+    with Parallel(n_jobs=workers, return_as="generator") as pool:
+        for found in pool(delayed(_there)(fleet.scenario, difficulty, folder, *part, channel) for part in todo):
+            assert found is not None
+            yield found
+
+
+@cache
+def _fleet(scenario: Scenario, difficulty: DifficultyName, folder: Path) -> Fleet:
+    return prepare(scenario, difficulty=difficulty, cache=folder)
+
+
+def _there(
+    scenario: Scenario, difficulty: DifficultyName, folder: Path, policy: str, seeds: Sequence[int], channel: Channel
+) -> list[Outcome]:
+    """In a worker, which takes the fleet from the cache, once."""
+    return outcomes(_fleet(scenario, difficulty, folder), policy, seeds, channel)
+
+
+def _figure(name: str, rows: Sequence[Outcome], base: Sequence[Outcome], rng: np.random.Generator) -> Figure:
+    values = np.array([getattr(each, name) for each in rows], dtype=float)
+    paired = values - np.array([getattr(each, name) for each in base], dtype=float)
+    low, high = interval(values, rng)
+    d_low, d_high = interval(paired, rng)
+    return Figure(
+        mean=float(values.mean()),
+        iqm=float(trim_mean(values, 0.25)),
+        low=low,
+        high=high,
+        difference=float(paired.mean()),
+        difference_low=d_low,
+        difference_high=d_high,
+    )
+
+
+def interval(values: Array, rng: np.random.Generator) -> tuple[float, float]:
+    """95 % percentile bootstrap interval of the mean over seeds, [seed]."""
+    if np.ptp(values) == 0:
+        return float(values[0]), float(values[0])
+    found = bootstrap((values,), np.mean, n_resamples=RESAMPLES, method="percentile", rng=rng, vectorized=True)
+    return float(found.confidence_interval.low), float(found.confidence_interval.high)
+
+
+def comparison_table(result: Comparison) -> Group:
+    """A block per figure: mean and paired difference, each with its interval; narrow enough for 80 columns."""
+    title = (
+        f"{result.scenario}, seeds {result.seeds[0]} to {result.seeds[-1]}: mean, paired difference to "
+        f"{result.baseline}, 95 % intervals; * excludes 0"
+    )
+    if result.channel != PERFECT.described():
+        title += f"\nWords travel: {result.channel_text}."
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("", overflow="fold")
+    for name in ("mean", "interval", "difference", "interval", ""):
+        table.add_column(name, justify="right")
+    table.add_row("[bold]scope[/bold]")
+    for policy, scope in result.scopes.items():
+        table.add_row(f"  {label(policy)}", scope)
+    for name in FIGURES:
+        table.add_row(f"[bold]{name}[/bold]")
+        digits = 3 if name == "availability" else 1
+        for policy, figures in result.figures.items():
+            f = figures[name]
+            mean = (f"{f.mean:.{digits}f}", f"{f.low:.{digits}f} … {f.high:.{digits}f}")
+            if policy == result.baseline:
+                table.add_row(f"  {label(policy)}", *mean)
+                continue
+            between = f"{f.difference_low:+.{digits}f} … {f.difference_high:+.{digits}f}"
+            star = "*" if f.difference_low > 0 or f.difference_high < 0 else ""
+            table.add_row(f"  {label(policy)}", *mean, f"{f.difference:+.{digits}f}", between, star)
+    central = [label(policy) for policy, scope in result.scopes.items() if scope == "central"]
+    if result.channel == PERFECT.described() or not central:
+        return Group(Text(title), table)
+    return Group(Text(title), table, Text(f"Central policies read no messages: {', '.join(central)}."))

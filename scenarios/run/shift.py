@@ -1,0 +1,171 @@
+"""One shift from beginning to end, recorded."""
+
+import hashlib
+import platform
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from fleet.bus.exchange.channel import PERFECT, Channel
+from fleet.engine.profile_plant import recorded_noise, telemetry_of
+from fleet.engine.shift import StepRecord, stack_records
+from fleet.env.allocation_v0 import AllocationEnv
+from fleet.events import Event
+from fleet.metrics import Metrics
+from fleet.telemetry import Telemetry, join
+from scenarios.policy_loader import policy_at
+from scenarios.prepare.fleet import BusName, DifficultyName, Fleet, PlantName, env_of
+from scenarios.progress import Progress, quiet
+from scenarios.run.outcome import metrics_of
+from scenarios.run.provenance import provenance
+from scenarios.schema import Scenario
+
+RUN_FORMAT = 3
+"""Raised when run.json or the columns of the recordings change."""
+_LIBRARIES = ("thermofleet", "numpy", "mujoco", "torch", "pettingzoo", "eclipse-zenoh", "pyarrow")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSpec:
+    """What to run, apart from the fleet."""
+
+    policy: str
+    seed: int = 0
+    plant: PlantName = "profile"
+    bus: BusName = "zenoh"
+    difficulty: DifficultyName = "twin"
+    channel: Channel = PERFECT
+    """What becomes of the arms' words on the way."""
+
+
+@dataclass(frozen=True, eq=False)
+class RunResult:
+    """What came out of a shift."""
+
+    spec: RunSpec
+    scenario: Scenario
+    metrics: Metrics
+    telemetry: Telemetry | None
+    """None if the shift was interrupted before its first step."""
+    events: tuple[Event, ...]
+    twins: dict[str, dict[str, Any]]
+    """`provenance` of each arm's difficulty model."""
+    finished: bool
+    """False if interrupted."""
+    time_s: float
+    """How far the shift got."""
+    total_reward: float
+
+
+def run(
+    fleet: Fleet,
+    spec: RunSpec,
+    *,
+    progress: Progress = quiet,
+    stopped: Callable[[], bool] = lambda: False,
+    record: bool = True,
+    endpoint: str | None = None,
+) -> RunResult:
+    """Work the shift; `stopped` turning true ends it early, between two steps, with what there is.
+
+    Args:
+        record: Keep telemetry; sweeps do without.
+        endpoint: Of a Zenoh router on loopback that others listen on too; by default the fleet has its own.
+    """
+    policy = policy_at(spec.policy, spec.seed)
+    recorder = _Recorder(fleet.scenario) if record else None
+    env = env_of(
+        fleet,
+        plant=spec.plant,
+        bus=spec.bus,
+        endpoint=endpoint,
+        channel=spec.channel,
+        keep_events=True,
+        watch=recorder,
+    )
+    finished, reward = False, 0.0
+    try:
+        if recorder is not None:
+            recorder.env = env
+        env.reset(seed=spec.seed)
+        while env.agents and not stopped():
+            _, rewards, _, _, _ = env.step(policy.act(env.knowledge()))
+            reward += next(iter(rewards.values()))
+            progress("working", env.tick / env.world.ticks)
+        finished = not env.agents
+    finally:
+        env.close()
+    state, world = env.truth, env.world
+    events = tuple(sorted(env.events, key=lambda event: event.time_s))
+    return RunResult(
+        spec=spec,
+        scenario=fleet.scenario,
+        metrics=metrics_of(world, state, events, env.messages),
+        telemetry=recorder.telemetry() if recorder is not None else None,
+        events=events,
+        twins={arm.robot.name: provenance(arm.model) for arm in fleet.arms},
+        finished=finished,
+        time_s=float(state.tick[0] * world.dt_s),
+        total_reward=reward,
+    )
+
+
+class _Recorder:
+    """Keeps how every step went, and reads the sensors a few times in each.
+
+    Args:
+        env: The environment of the shift; set before its reset.
+    """
+
+    env: AllocationEnv
+
+    def __init__(self, scenario: Scenario) -> None:
+        every_s, dt_s = scenario.telemetry_interval_s, scenario.decision_interval_s
+        self._offsets_s = np.arange(1, int(np.floor(dt_s / every_s + 1e-9)) + 1) * every_s
+        self._records: list[StepRecord] = []
+        self._parts: list[Telemetry] = []
+
+    def __call__(self, record: StepRecord) -> None:
+        self._records.append(record)
+        if len(self._records) == self.env.episode.plant.most_steps:
+            self._read()
+
+    def telemetry(self) -> Telemetry | None:
+        """All readings; None before the first step."""
+        if self._records:
+            self._read()
+        return join(self._parts) if self._parts else None
+
+    def _read(self) -> None:
+        episode, record = self.env.episode, stack_records(self._records)
+        world, offsets_s = episode.world, self._offsets_s
+        motion = episode.plant.motion(world, record, offsets_s)
+        noise = recorded_noise(episode.noise_key, record, offsets_s, world.dt_s, len(world.arms))
+        self._parts.append(telemetry_of(world, record, offsets_s, motion, noise))
+        self._records.clear()
+
+
+def scenario_hash(scenario: Scenario) -> str:
+    """Name of a scenario by its content."""
+    return hashlib.sha256(msgspec.json.encode(scenario)).hexdigest()[:16]
+
+
+def summary(result: RunResult) -> dict[str, Any]:
+    """The content of run.json. Holds no clock time, so the same seed gives the same file."""
+    return {
+        "format": RUN_FORMAT,
+        "status": "finished" if result.finished else "interrupted",
+        "time_s": result.time_s,
+        "scenario": msgspec.to_builtins(result.scenario),
+        "scenario_hash": scenario_hash(result.scenario),
+        **asdict(replace(result.spec, channel=PERFECT)),
+        "channel": result.spec.channel.described(),
+        "twins": result.twins,
+        "versions": {"python": platform.python_version()} | {name: version(name) for name in _LIBRARIES},
+        "reward": result.total_reward,
+        "metrics": asdict(result.metrics),
+    }

@@ -1,0 +1,293 @@
+"""The schema of scenario files, with the defaults that no noun of `fleet` defines."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from fleet.arrivals import Arrivals, Batch, Poisson, Trace
+from fleet.engine.reward import RewardWeights
+from fleet.errors import FleetError, nearest
+from fleet.job import Kind, Place
+from fleet.robot import Cooling, Mount, Robot, ThermalLimits
+
+LONGEST_DWELL_S = 3600.0
+"""Of one repetition, because every motion is stored sample by sample."""
+MOST_REPETITIONS = 100_000
+MOST_SAMPLES = 1_000_000
+"""Telemetry samples of an arm in a shift: eleven days at one per second."""
+MOST_SLOTS = 256
+MOST_EXPLORATION = 10_000
+
+
+def _positive(owner: str, **values: float) -> None:
+    for name, value in values.items():
+        if not 0 < value < np.inf:
+            raise ValueError(f"{owner}.{name} must be > 0 (got {value})")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmSpec:
+    """One arm of a scenario; `fleet.robot.Robot` and `Mount` define the fields."""
+
+    name: str
+    position_m: tuple[float, float, float] = Mount.position_m
+    tilt_deg: tuple[float, float, float] = Mount.tilt_deg
+    home: str = Robot.home
+    tool_kg: float = Robot.tool_kg
+    cooling: Cooling = Robot.cooling
+    cooling_factor: float = Robot.cooling_factor
+    ambient_offset_k: float = Robot.ambient_offset_k
+    wear: float = Robot.wear
+
+    def __post_init__(self) -> None:
+        self.robot()
+
+    def robot(self) -> Robot:
+        """The arm as `fleet` knows it."""
+        return Robot(
+            name=self.name,
+            mount=Mount(position_m=self.position_m, tilt_deg=self.tilt_deg),
+            home=self.home,
+            tool_kg=self.tool_kg,
+            cooling=self.cooling,
+            cooling_factor=self.cooling_factor,
+            ambient_offset_k=self.ambient_offset_k,
+            wear=self.wear,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArrivalSpec:
+    """When jobs of a stream arrive."""
+
+    kind: Literal["poisson", "batch", "trace"]
+    every_s: float | None = None
+    """poisson: mean gap. batch: gap between batches; None for a single batch."""
+    count: int | None = None
+    """batch: jobs per batch."""
+    start_s: float = 0.0
+    stop_s: float | None = None
+    """poisson: no arrivals after this."""
+    times_s: tuple[float, ...] | None = None
+    """trace: the arrival times."""
+    file: str | None = None
+    """trace: a text file beside the scenario, one arrival time in seconds per line."""
+
+    def __post_init__(self) -> None:
+        allowed = {
+            "poisson": {"every_s", "stop_s"},
+            "batch": {"every_s", "count"},
+            "trace": {"times_s", "file"},
+        }[self.kind]
+        for name in ("every_s", "count", "stop_s", "times_s", "file"):
+            if getattr(self, name) is not None and name not in allowed:
+                raise ValueError(
+                    f"arrivals of kind '{self.kind}' take no '{name}'; they take {_list(allowed | {'start_s'})}"
+                )
+        missing = {"poisson": self.every_s, "batch": self.count}.get(self.kind, 0)
+        if missing is None:
+            raise ValueError(
+                f"arrivals of kind '{self.kind}' need '{'every_s' if self.kind == 'poisson' else 'count'}'"
+            )
+        if self.kind == "trace" and (self.times_s is None) == (self.file is None):
+            raise ValueError("arrivals of kind 'trace' need either 'times_s' or 'file'")
+        if self.file is None:
+            self.arrivals()
+
+    def arrivals(self, from_file: tuple[float, ...] = ()) -> Arrivals:
+        """The arrival process; `from_file` are the times from the file of a trace."""
+        if self.kind == "poisson":
+            assert self.every_s is not None
+            stop_s = np.inf if self.stop_s is None else self.stop_s
+            return Poisson(every_s=self.every_s, start_s=self.start_s, stop_s=stop_s)
+        if self.kind == "batch":
+            assert self.count is not None
+            return Batch(count=self.count, start_s=self.start_s, every_s=self.every_s)
+        return Trace(times_s=tuple(t + self.start_s for t in (self.times_s or from_file)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class JobStream:
+    """A kind of job that arrives repeatedly; payload and repetitions are drawn for each job."""
+
+    name: str
+    kind: Kind
+    places: tuple[str, ...]
+    """Names of places: [from, to] for pick_place and sort, one for hold and press."""
+    arrivals: ArrivalSpec
+    payload_kg: tuple[float, ...] = (0.0,)
+    repetitions: tuple[int, int] = (1, 1)
+    """Fewest and most."""
+    dwell_s: float = 0.5
+    """See `fleet.job.Work`: duration of one repetition of a hold or press."""
+    force_n: float = 0.0
+    value: float = 1.0
+    due_s: float = 1800.0
+    """Time from release to due date."""
+    after: tuple[str, ...] = ()
+    """Streams whose job of the same number must finish first."""
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise ValueError("JobStream.name must not be empty")
+        if not self.payload_kg or min(self.payload_kg) < 0:
+            raise ValueError(
+                f"JobStream.payload_kg must be a non-empty list of masses >= 0 (got {list(self.payload_kg)})"
+            )
+        low, high = self.repetitions
+        if not 1 <= low <= high <= MOST_REPETITIONS:
+            raise ValueError(
+                f"JobStream.repetitions must be [fewest, most] with 1 <= fewest <= most <= {MOST_REPETITIONS} "
+                f"(got {low}, {high})"
+            )
+        _positive("JobStream", dwell_s=self.dwell_s, due_s=self.due_s)
+        if self.dwell_s > LONGEST_DWELL_S:
+            raise ValueError(
+                f"JobStream.dwell_s must be at most {LONGEST_DWELL_S:g} s (got {self.dwell_s}); use repetitions"
+            )
+        if self.value < 0 or self.force_n < 0:
+            raise ValueError(f"JobStream.value and force_n must be >= 0 (got {self.value}, {self.force_n})")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ambient:
+    """Ambient temperature of the cell over the shift."""
+
+    points: tuple[tuple[float, float], ...] = ((0.0, 25.0),)
+    """(time s, °C), linear in between, constant outside."""
+
+    def __post_init__(self) -> None:
+        times = [t for t, _ in self.points]
+        if not times or times != sorted(times):
+            raise ValueError("Ambient.points must be a non-empty list of [time_s, temperature_c] in order of time")
+        if not all(-40 <= c <= 60 for _, c in self.points):
+            raise ValueError(f"Ambient.points must be between -40 and 60 °C (got {[c for _, c in self.points]})")
+
+    def at(self, time_s: np.ndarray) -> np.ndarray:
+        """Ambient temperatures at the times, °C, of the same shape."""
+        times, temps = zip(*self.points, strict=True)
+        return np.interp(time_s, times, temps)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Planning:
+    """Which plans each arm makes for a work."""
+
+    elbows: int = 3
+    speeds: tuple[float, ...] = (1.0, 0.6)
+    """Shares of the arm's speed limits."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.elbows <= 12:
+            raise ValueError(f"Planning.elbows must be between 1 and 12 (got {self.elbows})")
+        if not self.speeds or not all(0.05 <= speed <= 1 for speed in self.speeds):
+            raise ValueError(
+                f"Planning.speeds must be a non-empty list of shares between 0.05 and 1 (got {list(self.speeds)})"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwinSpec:
+    """How the twins of the arms are trained."""
+
+    size: Literal["quick", "full"] = "full"
+    """quick: fewer windows and fewer epochs."""
+    cool_c: float = 40.0
+    """A motion is cool if no motor passes this temperature within the horizon."""
+    horizon_s: float = 1800.0
+    ambient_c: float = 22.0
+    """Ambient temperature while the motion repeats from a cold start."""
+    payload_kg: tuple[float, ...] = (0.0, 0.5, 1.0)
+    """Light payloads with which every motion of the scenario is also simulated for training."""
+    exploration: int = 64
+    """Number of further light motions for training: folded, elbow out, fast wrist, turned base; 0: none."""
+
+    def __post_init__(self) -> None:
+        _positive("TwinSpec", horizon_s=self.horizon_s)
+        if self.cool_c <= self.ambient_c:
+            raise ValueError(f"TwinSpec.cool_c must be above ambient_c (got {self.cool_c}, {self.ambient_c})")
+        if min(self.payload_kg, default=0.0) < 0:
+            raise ValueError(f"TwinSpec.payload_kg must be masses >= 0 (got {list(self.payload_kg)})")
+        if not 0 <= self.exploration <= MOST_EXPLORATION:
+            raise ValueError(f"TwinSpec.exploration must be between 0 and {MOST_EXPLORATION} (got {self.exploration})")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spread:
+    """Random deviation of the arms from the nominal Gen3; the same for every seed of a run."""
+
+    scale: float = 1.0
+    """Factor on the log-normal standard deviations of `fleet.thermal.ThermalSpread.gen3`; 0: all arms are equal."""
+    seed: int = 0
+    """Seed of the deviations."""
+
+    def __post_init__(self) -> None:
+        if self.scale < 0 or self.seed < 0:
+            raise ValueError(f"Spread.scale and seed must be >= 0 (got {self.scale}, {self.seed})")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenario:
+    """One shift of one fleet in one cell."""
+
+    name: str
+    description: str
+    horizon_s: float
+    arms: tuple[ArmSpec, ...]
+    places: tuple[Place, ...]
+    jobs: tuple[JobStream, ...]
+    decision_interval_s: float = 10.0
+    slots: int = 8
+    start: Literal["idle_warm", "cold"] = "idle_warm"
+    telemetry_interval_s: float = 1.0
+    ambient: Ambient = field(default_factory=Ambient)
+    limits: ThermalLimits = field(default_factory=ThermalLimits)
+    reward: RewardWeights = field(default_factory=RewardWeights)
+    planning: Planning = field(default_factory=Planning)
+    twin: TwinSpec = field(default_factory=TwinSpec)
+    spread: Spread = field(default_factory=Spread)
+
+    def __post_init__(self) -> None:
+        _positive(
+            "Scenario",
+            horizon_s=self.horizon_s,
+            decision_interval_s=self.decision_interval_s,
+            telemetry_interval_s=self.telemetry_interval_s,
+        )
+        if self.telemetry_interval_s > self.decision_interval_s:
+            raise ValueError(
+                "Scenario.telemetry_interval_s must not exceed decision_interval_s "
+                f"(got {self.telemetry_interval_s}, {self.decision_interval_s})"
+            )
+        if not 1 <= self.slots <= MOST_SLOTS:
+            raise ValueError(f"Scenario.slots must be between 1 and {MOST_SLOTS} (got {self.slots})")
+        if self.horizon_s / self.telemetry_interval_s > MOST_SAMPLES:
+            raise ValueError(
+                f"Scenario.horizon_s must be at most {MOST_SAMPLES} times telemetry_interval_s "
+                f"(got {self.horizon_s}, {self.telemetry_interval_s})"
+            )
+        if not self.name.strip() or self.name[0] == "." or any(c in "/\\" or not c.isprintable() for c in self.name):
+            raise ValueError(
+                f"Scenario.name must be non-empty, without a leading dot and without slashes (got '{self.name}')"
+            )
+
+    @property
+    def ticks(self) -> int:
+        """Decision intervals in the shift."""
+        return max(1, round(self.horizon_s / self.decision_interval_s))
+
+    def index_of(self, arm: str) -> int:
+        """Index of an arm in `arms`.
+
+        Raises:
+            FleetError: there is no such arm; names the known ones.
+        """
+        names = [spec.name for spec in self.arms]
+        if arm not in names:
+            raise FleetError(f"No arm '{arm}' in {self.name}{nearest(arm, names)}")
+        return names.index(arm)
+
+
+def _list(names: set[str]) -> str:
+    return ", ".join(sorted(names))

@@ -1,0 +1,1 @@
+"""Research studies of the twin; nothing else depends on them."""

@@ -1,0 +1,210 @@
+"""Twins trained on cool logs of a real arm, tested on hot ones: the paper's claim on held-out files."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from sklearn.metrics import average_precision_score, roc_auc_score
+
+from fleet.difficulty import difficulty_of_error
+from fleet.errors import FleetError
+from fleet.motion import CHANNELS
+from scenarios.prepare.train_twins import train_or_load
+from twin.logs.recording import Recording
+from twin.logs.resampling import Stretch, stretches
+from twin.training_data import cool_stretches
+from twin.vae.model import TwinConfig
+from twin.vae.train import train
+from twin.vae.twin import Twin
+from twin.vae.window import cut, starts
+
+Array = np.ndarray
+
+JOINT = 1
+"""Joint 2 (index 0..6) carries the whole arm of a standing Gen3 and gets hot."""
+HOT_C = 40.0
+"""Mean temperature of joint 2 from which a window is hot; a file that never reaches it is cool."""
+AHEAD_S = 300.0
+"""Time after a window in which its peak temperature is taken."""
+TRAIN_SHARE = 0.6
+"""Share of the cool files that train the twin."""
+CONFIG = TwinConfig(rate_hz=2.0, record_hz=2.0, window=50, stride=10, epochs=40, restarts=1)
+"""Windows of 25 s at the sampling rate of the logs."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LogStudy:
+    """One twin and every window of the held-out files."""
+
+    twin: Twin
+    train_files: tuple[str, ...]
+    """Recordings that the twin was trained on; none of them reaches `HOT_C` on joint 2."""
+    test_files: tuple[str, ...]
+    """All others."""
+    file: Array
+    """Name of the recording of each window, str [window]."""
+    start_s: Array
+    """Middle of its first sample in the recording's time, [window]."""
+    end_s: Array
+    """Middle of its last sample, [window]."""
+    windows: Array
+    """Motion, SI, float32 [window, time, joint, channel]."""
+    temp_c: Array
+    """Mean motor temperature in the window, [window, joint]."""
+    end_c: Array
+    """Motor temperature at its last sample, [window, joint]."""
+    peak_next_c: Array
+    """Highest temperature within `AHEAD_S` after its end; nan where the recording ends before, [window, joint]."""
+    errors: Array
+    """Time mean of the absolute error in training standard deviations, [window, joint, channel]."""
+
+    @property
+    def hot(self) -> Array:
+        """Windows in which joint 2 is at `HOT_C` or more on average, bool [window]."""
+        return self.temp_c[:, JOINT] >= HOT_C
+
+    @property
+    def difficulty(self) -> Array:
+        """d_k = 1 − exp(−sum of the errors), [window, joint]."""
+        return difficulty_of_error(self.errors.sum(axis=-1))
+
+    @property
+    def rms_torque(self) -> Array:
+        """N·m, [window, joint]: a baseline without training."""
+        return np.sqrt(np.square(self.windows[..., CHANNELS.index("tau")], dtype=float).mean(axis=1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class HotAndCool:
+    """Errors and scores of joint 2 in hot and in cool windows of the test files."""
+
+    cool_windows: int
+    hot_windows: int
+    cool_error: tuple[float, ...]
+    """Mean over windows of the absolute error per channel q, qd, tau, z units."""
+    hot_error: tuple[float, ...]
+    ratio: float
+    """Hot over cool, of the mean over windows of the error summed over channels."""
+    median_ratio: float
+    """The same of the medians over windows, which a few unusual cool motions do not change."""
+    cool_difficulty: float
+    """Median d_2."""
+    hot_difficulty: float
+    auroc: dict[str, float]
+    """Hot against cool by d_2, by the error of each channel, and by RMS torque."""
+    auprc: dict[str, float]
+
+
+def log_study(
+    recordings: Sequence[Recording],
+    seed: int,
+    *,
+    config: TwinConfig = CONFIG,
+    progress: Callable[[float], None] | None = None,
+    folder: Path | None = None,
+) -> LogStudy:
+    """A twin trained on `TRAIN_SHARE` of the cool files, drawn by the seed, and its errors on all other files.
+
+    Args:
+        folder: Cache of trained twins.
+
+    Raises:
+        FleetError: too few files are cool, or none is left to test on.
+        ValueError: a recording without temperatures.
+    """
+    cool = [r.name for r in recordings if _temperatures(r)[:, JOINT].max(initial=-np.inf) < HOT_C]
+    count = round(TRAIN_SHARE * len(cool))
+    if not 0 < count < len(recordings):
+        raise FleetError(
+            f"{len(cool)} of {len(recordings)} logs stay below {HOT_C:g} °C on joint {JOINT + 1}: to train on "
+            f"{TRAIN_SHARE:.0%} of them and test on the rest needs at least two; add logs of light work."
+        )
+    drawn = np.random.default_rng(seed).permutation(len(cool))[:count]
+    names = {cool[i] for i in drawn}
+    taught = [r for r in recordings if r.name in names]
+    normal = cool_stretches(taught, config.rate_hz, cool_c=HOT_C, horizon_s=np.inf, joints=(JOINT,))
+    records = [stretch.profile for stretch in normal]
+    own = np.random.SeedSequence(seed)
+    if folder is None:
+        twin = train(records, config, own, arm="logged", progress=progress)
+    else:
+        twin = train_or_load(records, config, own, arm="logged", folder=folder)
+    rest = [r for r in recordings if r.name not in names]
+    parts = [
+        _windows(r, s, config) for r in rest for s in stretches(r, config.rate_hz) if len(s.time_s) >= config.window
+    ]
+    if not parts:
+        raise FleetError(
+            f"None of the {len(rest)} test logs lasts {config.window / config.rate_hz:g} s; add longer logs."
+        )
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return LogStudy(
+        twin=twin,
+        train_files=tuple(r.name for r in taught),
+        test_files=tuple(r.name for r in rest),
+        errors=twin.window_errors(joined["windows"]),
+        **joined,
+    )
+
+
+def hot_and_cool(study: LogStudy) -> HotAndCool:
+    """The errors of joint 2 in hot against cool test windows.
+
+    Raises:
+        FleetError: all test windows are hot, or none.
+    """
+    hot = study.hot
+    if hot.all() or not hot.any():
+        raise FleetError(
+            f"{hot.sum()} of {len(hot)} test windows are hot (joint 2 at {HOT_C:g} °C): nothing to compare."
+        )
+    errors, d = study.errors[:, JOINT], study.difficulty[:, JOINT]
+    scores = {"d": errors.sum(axis=1), **{c: errors[:, i] for i, c in enumerate(CHANNELS)}}
+    scores["rms_torque"] = study.rms_torque[:, JOINT]
+    mean = {kind: errors[mask].mean(axis=0) for kind, mask in (("cool", ~hot), ("hot", hot))}
+    return HotAndCool(
+        cool_windows=int((~hot).sum()),
+        hot_windows=int(hot.sum()),
+        cool_error=tuple(mean["cool"].tolist()),
+        hot_error=tuple(mean["hot"].tolist()),
+        ratio=float(mean["hot"].sum() / mean["cool"].sum()),
+        median_ratio=float(np.median(scores["d"][hot]) / np.median(scores["d"][~hot])),
+        cool_difficulty=float(np.median(d[~hot])),
+        hot_difficulty=float(np.median(d[hot])),
+        auroc={name: float(roc_auc_score(hot, score)) for name, score in scores.items()},
+        auprc={name: float(average_precision_score(hot, score)) for name, score in scores.items()},
+    )
+
+
+def _temperatures(recording: Recording) -> Array:
+    if recording.temp_c is None:
+        raise ValueError(f"Recording '{recording.name}' has no motor temperatures; the study needs them.")
+    return recording.temp_c
+
+
+def _windows(recording: Recording, stretch: Stretch, config: TwinConfig) -> dict[str, Array]:
+    """The windows of one stretch, with the temperatures during, at the end of and after each."""
+    assert stretch.temp_c is not None
+    first = starts(len(stretch.time_s), config.window, config.stride)
+    last = first + config.window - 1
+    end_s = stretch.time_s[last]
+    temps = np.stack([stretch.temp_c[a : b + 1].mean(axis=0) for a, b in zip(first, last, strict=True)])
+    return {
+        "file": np.full(len(first), recording.name),
+        "start_s": stretch.time_s[first],
+        "end_s": end_s,
+        "windows": cut(stretch.profile, config.window, config.stride).astype(np.float32),
+        "temp_c": temps,
+        "end_c": stretch.temp_c[last],
+        "peak_next_c": np.stack([peak_within(recording, moment, AHEAD_S) for moment in end_s]),
+    }
+
+
+def peak_within(recording: Recording, from_s: float, ahead_s: float) -> Array:
+    """Highest temperature from `from_s` to `ahead_s` later, °C, [joint]; NaN if the recording ends before."""
+    until_s = from_s + ahead_s
+    if not len(recording.time_s) or recording.time_s[-1] < until_s:
+        return np.full(recording.joints, np.nan)
+    rows = slice(*np.searchsorted(recording.time_s, [from_s, until_s], side="right"))
+    return _temperatures(recording)[rows].max(axis=0, initial=-np.inf)

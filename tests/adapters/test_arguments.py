@@ -1,0 +1,44 @@
+"""What adapters are given is checked, so that no trainer fails on it later."""
+
+import numpy as np
+import pytest
+
+from fleet.env.adapters.arguments import check_batch, check_choice, check_env
+from fleet.env.allocation_v0 import parallel_env
+
+
+def test_an_environment_with_the_masks_in_the_observations_is_taken(small) -> None:
+    env = parallel_env(small.Shifts())
+    assert check_env("It", env) is env
+
+
+@pytest.mark.parametrize("place", ["info", "both"])
+def test_masks_must_be_in_the_observations(small, place) -> None:
+    env = parallel_env(small.Shifts(), mask_in=place)
+    if place == "both":
+        assert check_env("It", env) is env
+        return
+    with pytest.raises(ValueError, match=r"It needs the masks in the observations: .*mask_in='obs'\."):
+        check_env("It", env)
+
+
+@pytest.mark.parametrize("given", [None, 3, "quickstart", np.zeros(3)])
+def test_other_values_are_named(given) -> None:
+    with pytest.raises(ValueError, match=r"It takes an environment made by scenarios\.make_env\(\) \(got "):
+        check_env("It", given)
+    with pytest.raises(ValueError, match=r"It takes a batch made by scenarios\.make_batch\(\) \(got "):
+        check_batch("It", given)
+
+
+@pytest.mark.parametrize("autoreset", [True, False])
+def test_a_batch_must_reset_as_the_adapter_needs(small_batch, autoreset) -> None:
+    batch = small_batch(num_envs=2, autoreset=autoreset)
+    assert check_batch("It", batch) is check_batch("It", batch, autoreset=autoreset) is batch
+    with pytest.raises(ValueError, match=f"It needs a batch made with autoreset={not autoreset} "):
+        check_batch("It", batch, autoreset=not autoreset)
+
+
+def test_a_choice_names_what_is_allowed() -> None:
+    check_choice("masks", "list", ("list", "array"))
+    with pytest.raises(ValueError, match=r"masks must be one of 'list', 'array' \(got 'tuple'\)\."):
+        check_choice("masks", "tuple", ("list", "array"))

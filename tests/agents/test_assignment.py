@@ -1,0 +1,198 @@
+"""Assignment rules against every assignment there is, and the cost matrices against what they promise."""
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from agents.assignment import matching
+from agents.costs import RISK, quickest, thermal
+from agents.registry import RULES, make_policy
+from agents.rules import cheapest_pairs
+from fleet.observation import LONG_S, Layout, Observation
+
+INF = np.inf
+ASSIGNMENTS = {"ssi": cheapest_pairs, "matching": matching}
+COSTS = {"thermal": thermal, "quickest": quickest}
+
+
+@st.composite
+def costs(draw) -> np.ndarray:
+    arms, jobs = draw(st.integers(1, 4)), draw(st.integers(1, 4))
+    cell = st.sampled_from([-2.0, 0.0, 0.5, 0.5, 1.0, 3.0, 10.0, INF])
+    return np.array(draw(st.lists(st.lists(cell, min_size=jobs, max_size=jobs), min_size=arms, max_size=arms)))
+
+
+def allowed(cost: np.ndarray, pairs: list[tuple[int, int]]) -> bool:
+    arms, jobs = [a for a, _ in pairs], [j for _, j in pairs]
+    once = len(set(arms)) == len(arms) and len(set(jobs)) == len(jobs)
+    return once and all(np.isfinite(cost[a, j]) for a, j in pairs)
+
+
+def every_assignment(cost: np.ndarray):
+    """All that are allowed, by trying every arm, or none, for every job."""
+    for choice in product((None, *range(len(cost))), repeat=cost.shape[1]):
+        pairs = [(arm, job) for job, arm in enumerate(choice) if arm is not None]
+        if allowed(cost, pairs):
+            yield pairs
+
+
+def worth(cost: np.ndarray, pairs: list[tuple[int, int]]) -> tuple[int, float]:
+    return -len(pairs), float(sum(cost[a, j] for a, j in pairs))
+
+
+@settings(max_examples=200, deadline=None)
+@given(costs())
+def test_matching_is_the_best_of_all_assignments(cost):
+    best = min(worth(cost, pairs) for pairs in every_assignment(cost))
+    assert worth(cost, matching(cost)) == pytest.approx(best)
+
+
+@pytest.mark.parametrize("rule", ASSIGNMENTS.values(), ids=ASSIGNMENTS)
+@settings(max_examples=200, deadline=None)
+@given(cost=costs())
+def test_no_rule_gives_what_is_not_allowed(rule, cost):
+    assert allowed(cost, rule(cost))
+
+
+@settings(max_examples=200, deadline=None)
+@given(costs())
+def test_ssi_leaves_nothing_that_an_arm_could_have(cost):
+    pairs = cheapest_pairs(cost)
+    for arm, job in np.argwhere(np.isfinite(cost)).tolist():
+        assert not allowed(cost, [*pairs, (arm, job)])
+
+
+def test_ssi_takes_the_cheapest_pair_first_and_settles_ties_by_order():
+    assert cheapest_pairs(np.array([[1.0, 2.0], [0.0, 9.0]])) == [(1, 0), (0, 1)]
+    assert cheapest_pairs(np.array([[1.0, 1.0], [1.0, 1.0]])) == [(0, 0), (1, 1)]
+
+
+def test_matching_sees_what_the_greedy_rule_does_not():
+    # The cheapest pair (0) leaves the expensive one (10); together 1 + 1 is less.
+    cost = np.array([[0.0, 1.0], [1.0, 10.0]])
+    assert cheapest_pairs(cost) == [(0, 0), (1, 1)]
+    assert sorted(matching(cost)) == [(0, 1), (1, 0)]
+
+
+def test_a_large_matching_beats_a_cheap_small_one():
+    # Only arm 0 can do job 1; the cheap job 0 must go to arm 1.
+    assert sorted(matching(np.array([[0.0, 5.0], [100.0, INF]]))) == [(0, 1), (1, 0)]
+
+
+@pytest.mark.parametrize("rule", ASSIGNMENTS.values(), ids=ASSIGNMENTS)
+def test_nothing_is_given_where_nothing_is_possible(rule):
+    assert rule(np.array([[INF, INF]])) == []
+    assert rule(np.zeros((0, 2))) == []
+    assert rule(np.zeros((2, 0))) == []
+
+
+# cost
+
+
+def fleet(difficulty, **other) -> list[Observation]:
+    """What the arms know that find the jobs so difficult, [arm][slot], NaN unknown; every arm may claim every job."""
+    d = np.array(difficulty, dtype=float)
+    layout = Layout(*d.shape)
+    blank = layout.read(np.zeros(layout.size, np.float32), np.ones(layout.slots + 1, np.int8))
+    base = {
+        "known": ~np.isnan(d),
+        "difficulty": np.nan_to_num(d),
+        "slack_s": np.full(d.shape, LONG_S),
+        "value": np.ones(d.shape),
+        **{name: np.broadcast_to(np.array(value, dtype=float), d.shape) for name, value in other.items()},
+    }
+    return [replace(blank, **{name: value[arm] for name, value in base.items()}) for arm in range(len(d))]
+
+
+def test_thermal_is_difficulty_against_the_average_of_that_job():
+    # Job 0 is new to both twins; what counts is who finds it easier.
+    assert thermal(fleet([[5.0, 1.0], [5.5, 0.2]])).tolist() == [[-0.25, 0.4], [0.25, -0.4]]
+
+
+def test_thermal_weighs_difficulty_by_the_probability_of_saturation():
+    # Alike but for the risk: 1·(1 + RISK·0.5) against 1.
+    cost = thermal(fleet([[1.0], [1.0]], p_saturation=[[0.5], [0.0]]))
+    assert cost[:, 0].tolist() == [RISK / 4, -RISK / 4]
+
+
+def test_an_unknown_difficulty_counts_as_average():
+    nan = np.nan
+    assert thermal(fleet([[2.0], [nan], [4.0]]))[:, 0].tolist() == [-1.0, 0.0, 1.0]
+
+
+def test_where_no_arm_has_a_score_the_earlier_finish_wins():
+    cost = thermal(fleet([[np.nan], [np.nan]], duration_s=[[600.0], [60.0]]))
+    assert cost[1, 0] < cost[0, 0]
+
+
+def test_late_and_valuable_work_comes_first():
+    late = {"slack_s": [[-3600.0, 0.0, -3600.0]], "value": [1.0, 1.0, 4.0]}
+    cost = thermal(fleet([[1.0, 1.0, 1.0]], **late))[0]
+    assert cost[2] < cost[0] < cost[1]
+
+
+def test_quickest_is_the_time_until_the_finish():
+    one, two = fleet([[9.0, 0.0], [0.0, 0.0]], duration_s=[[5.0, 7.0], [5.0, 7.0]])
+    assert quickest([one, replace(two, busy_s=np.float32(10.0))]).tolist() == [[5.0, 7.0], [15.0, 17.0]]
+
+
+@pytest.mark.parametrize("cost", COSTS.values(), ids=COSTS)
+@settings(max_examples=150, deadline=None)
+@given(data=st.data())
+def test_every_cost_is_infinite_exactly_where_an_arm_may_not_claim(cost, data):
+    arms, jobs = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 4))
+
+    def table(values):
+        return np.array([[data.draw(values) for _ in range(jobs)] for _ in range(arms)], dtype=float)
+
+    some = fleet(
+        table(st.one_of(st.just(np.nan), st.floats(0, 7))),
+        p_saturation=table(st.floats(0, 1)),
+        duration_s=table(st.floats(0, 1e4)),
+        slack_s=table(st.floats(-1e4, 1e4)),
+    )
+    legal = table(st.integers(0, 1))
+    some = [replace(seen, action_mask=np.append(1, row).astype(np.int8)) for seen, row in zip(some, legal, strict=True)]
+    matrix = cost(some)
+    assert not np.isnan(matrix).any()
+    assert (np.isposinf(matrix) == (legal == 0)).all()
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(st.floats(0, 7), min_size=2, max_size=5), st.data())
+def test_more_risk_never_makes_an_arm_cheaper_than_before(difficulty, data):
+    p = data.draw(st.lists(st.floats(0, 0.5), min_size=len(difficulty), max_size=len(difficulty)))
+    before = thermal(fleet([[d] for d in difficulty], p_saturation=[[x] for x in p]))[:, 0]
+    p[0] += data.draw(st.floats(0, 0.5))
+    after = thermal(fleet([[d] for d in difficulty], p_saturation=[[x] for x in p]))[:, 0]
+    assert (after[0] - after[1:] >= before[0] - before[1:] - 1e-8).all()
+
+
+def test_the_arm_that_would_get_hot_does_not_get_the_job():
+    one_job = fleet([[1.0], [1.1]], p_saturation=[[0.9], [0.0]], duration_s=[[10.0], [20.0]])
+    seen = dict(zip("hc", one_job, strict=True))
+    for name in ("ssi", "matching"):
+        assert make_policy(name).act(seen) == {"h": 0, "c": 1}
+        assert make_policy(f"quickest_{name}").act(seen) == {"h": 1, "c": 0}
+
+
+@pytest.mark.parametrize("name", [name for name, rule in RULES.items() if rule.scope == "central"])
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32))
+def test_a_central_policy_reads_no_messages(name, seed):
+    rng, layout = np.random.default_rng(seed), Layout(3, 4)
+    mask = np.insert(rng.integers(0, 2, (3, 4)), 0, 1, axis=1).astype(np.int8)
+    low, high = layout.bounds
+    vectors = rng.uniform(np.maximum(low, -100.0), np.minimum(high, 100.0), (2, 3, layout.size)).astype(np.float32)
+    first = [layout.read(vectors[0, arm], mask[arm]) for arm in range(3)]
+    other = [layout.read(vectors[1, arm], mask[arm]) for arm in range(3)]
+    told = [
+        replace(one, **{field: value for field, value in vars(two).items() if field.startswith("peer_")})
+        for one, two in zip(first, other, strict=True)
+    ]
+    named = [dict(zip("abc", seen, strict=True)) for seen in (first, told)]
+    assert make_policy(name).act(named[0]) == make_policy(name).act(named[1])

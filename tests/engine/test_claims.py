@@ -1,0 +1,138 @@
+"""Claims on jobs: the action mask and the awards, against a referee written in plain Python, and in worked examples."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet.engine.shift import open_jobs, step
+from fleet.engine.state import World, initial
+from fleet.telemetry import IDLE, WORKING
+
+
+def world_of(small, places, arms=3, slots=4, **more):
+    """One job per place (or pair of places); every arm can do all."""
+    jobs = [small.job(f"j{i}", small.work(*(p if isinstance(p, tuple) else (p,)))) for i, p in enumerate(places)]
+    return small.shop([jobs], arms=arms, slots=slots, **more)
+
+
+def with_difficulty(world: World, difficulty) -> World:
+    """The world with other difficulties, broadcast to [env, arm, job]; they decide between claims."""
+    offers = world.offers
+    return replace(world, offers=replace(offers, difficulty=np.broadcast_to(difficulty, offers.difficulty.shape)))
+
+
+def referee(slot_job, mask, stations, actions, difficulty, occupied):
+    """Claims in order of (difficulty, arm); a job and its stations go to the first. Returns jobs, losers, illegal."""
+    arms = len(actions)
+    legal = [0 <= a < mask.shape[1] and bool(mask[i, a]) for i, a in enumerate(actions)]
+    claims = []
+    for i, action in enumerate(actions):
+        if legal[i] and action > 0:
+            job = slot_job[action - 1]
+            claims.append((np.inf if np.isnan(difficulty[i, job]) else difficulty[i, job], i, job))
+    won, taken, busy = [-1] * arms, set(), set(occupied)
+    for _, i, job in sorted(claims):
+        if job not in taken and not stations[job] & busy:
+            won[i] = job
+            taken.add(job)
+            busy |= stations[job]
+    return won, [won[i] < 0 and i in {c[1] for c in claims} for i in range(arms)], [not ok for ok in legal]
+
+
+PLACES = ["bench", "rack", ("bench", "rack"), ("rack", "press"), "press", "shelf"]
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.data())
+def test_awards_are_those_of_the_referee(small, data) -> None:
+    places = data.draw(st.lists(st.sampled_from(PLACES), min_size=1, max_size=6))
+    arms = data.draw(st.integers(1, 4))
+    stations = {j: set(p if isinstance(p, tuple) else (p,)) for j, p in enumerate(places)}
+    pairs = [(p[0], 0.0, p[1]) if isinstance(p, tuple) else (p,) for p in places]
+    world, plant = world_of(small, pairs, arms=arms)
+    state, count = initial(world), len(places)
+    value = st.sampled_from([0.1, 0.5, 0.5, 2.0, float("nan")])
+    for _ in range(3):
+        actions = np.array(data.draw(st.lists(st.integers(-2, 6), min_size=arms, max_size=arms)))
+        row = st.lists(value, min_size=count, max_size=count)
+        difficulty = np.array(data.draw(st.lists(row, min_size=arms, max_size=arms)))
+        world = with_difficulty(world, difficulty)
+        slot_job, mask = open_jobs(world, state, compiled=False)
+        held = [j for j in state.job[0].tolist() if j >= 0]
+        busy = set().union(*(stations[j] for j in held))
+        for slot, j in enumerate(slot_job[0].tolist()):
+            for a in range(arms):
+                may = j >= 0 and state.mode[0, a] == IDLE and not stations[j] & busy
+                assert mask[0, a, slot + 1] == may
+        won, lost, illegal = referee(slot_job[0], mask[0], stations, actions, difficulty, busy)
+        after = step(world, state, actions[None], plant, compiled=False).state
+        assert (after.illegal - state.illegal)[0].tolist() == illegal
+        assert (after.last_award[0] == -1).tolist() == lost
+        assert (after.last_award[0] == 1).tolist() == [job >= 0 for job in won]
+        # Three steps are too short to be home again.
+        expected = [h if h >= 0 else w for h, w in zip(state.job[0].tolist(), won, strict=True)]
+        assert after.job[0].tolist() == expected
+        state = after
+
+
+def test_a_number_beats_no_number_and_the_lower_index_a_tie(small) -> None:
+    world, plant = world_of(small, ["bench"])
+    for scores, winner in (([np.nan, 3.0, 3.0], 1), ([0.5, 0.2, 0.2], 1), ([np.nan] * 3, 0), ([6.9, np.nan, 7.0], 0)):
+        world = with_difficulty(world, np.array(scores)[None, :, None])
+        state = step(world, initial(world), np.ones((1, 3), int), plant).state
+        assert (state.mode[0] == WORKING).nonzero()[0].tolist() == [winner]
+        expected = [-1, -1, -1]
+        expected[winner] = 1
+        assert state.last_award[0].tolist() == expected
+
+
+def test_two_jobs_of_one_station_are_not_worked_at_once(small) -> None:
+    world, plant = world_of(small, ["bench", "bench", "rack"], arms=2)
+    world = with_difficulty(world, np.array([2.0, 1.0])[None, :, None])
+    both = step(world, initial(world), np.array([[1, 2]]), plant).state
+    assert both.job[0].tolist() == [-1, 1]
+    assert open_jobs(world, both)[1][0, 0].tolist() == [1, 0, 1, 0, 0]
+    # The station is free again when the arm is home: 3 + 3 · 10 + 2 s.
+    state = both
+    for _ in range(3):
+        assert not open_jobs(world, state)[1][0, 0, 1]
+        state = step(world, state, np.zeros((1, 2), int), plant).state
+    assert state.mode[0, 1] == IDLE
+    assert open_jobs(world, state)[1][0, 0, 1]
+
+
+def test_an_arm_that_cannot_do_a_job_may_not_claim_it(small) -> None:
+    bench, rack = small.work("bench"), small.work("rack")
+    arms = [small.arm(0, [bench]), small.arm(1, [bench, rack])]
+    world, plant = small.shop([[small.job("a", rack), small.job("b", bench)]], arms=arms)
+    assert open_jobs(world, initial(world))[1][0].tolist() == [[1, 0, 1, 0, 0], [1, 1, 1, 0, 0]]
+    after = step(world, initial(world), np.array([[1, 0]]), plant).state
+    assert after.illegal.tolist() == [[1, 0]]
+    assert after.job.tolist() == [[-1, -1]]
+
+
+@pytest.mark.parametrize("slots", [1, 3, 9])
+def test_slots_hold_the_oldest_jobs_first(small, slots) -> None:
+    jobs = [small.job(f"j{i}", release_s=r) for i, r in enumerate([0.0, 25.0, 5.0, 5.0, 5000.0])]
+    world, plant = small.shop([jobs], slots=slots)
+    state = initial(world)
+    for _ in range(3):
+        state = step(world, state, np.zeros((1, 2), int), plant).state
+    assert open_jobs(world, state)[0][0].tolist() == ([0, 2, 3, 1] + [-1] * 9)[:slots]
+
+
+@pytest.mark.parametrize("stations", [64, 65, 130])
+def test_any_number_of_stations_is_told_apart(small, stations) -> None:
+    """Stations are bits of 64-bit words."""
+    world, plant = world_of(small, [f"place_{i}" for i in range(stations)], arms=2, slots=stations)
+    state = step(world, initial(world), np.array([[stations, 0]]), plant).state
+    mask = open_jobs(world, state)[1][0, 1]
+    assert mask.tolist() == [1] * stations + [0]  # the job in work has left its slot
+    jobs = [small.job(f"again_{i}", small.work(f"place_{i}")) for i in range(stations)]
+    jobs += [small.job(f"more_{i}", small.work(f"place_{i}")) for i in (0, stations - 1)]
+    world, plant = small.shop([jobs], arms=2, slots=len(jobs))
+    state = step(world, initial(world), np.array([[stations, 0]]), plant).state
+    assert open_jobs(world, state)[1][0, 1, 1:].tolist() == [1] * stations + [0, 0]

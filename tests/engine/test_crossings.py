@@ -1,0 +1,264 @@
+"""Moments at which limits are crossed, against SciPy, and what warnings, faults and recoveries lead to."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+from scipy.optimize import brentq
+
+from fleet.engine.crossings import crossing_s, hottest_at, to_modes
+from fleet.engine.shift import Stepped, open_jobs, step
+from fleet.engine.state import DONE, WAITING, World, initial
+from fleet.engine.tables import tables_of
+from fleet.events import Event
+from fleet.robot import ThermalLimits
+from fleet.telemetry import FAULTED, IDLE
+from fleet.thermal import NODES, WINDING
+
+DT_S, AMBIENT_C = 10.0, 25.0
+
+
+def work_on(world: World, plant, log: list[Event]) -> list[Stepped]:
+    """Arm 0 claims the oldest job whenever it may; the others wait."""
+    state, steps = initial(world), []
+    for _ in range(world.ticks):
+        actions = np.zeros((1, len(world.arms)), dtype=int)
+        legal = np.flatnonzero(open_jobs(world, state)[1][0, 0, 1:])
+        actions[0, 0] = legal[0] + 1 if len(legal) else 0
+        steps.append(step(world, state, actions, plant, log))
+        state = steps[-1].state
+    return steps
+
+
+def hot_shop(small, *, payload_kg=8.0, repetitions=200, arms=1, start_c=25.0, **more):
+    content = small.work(payload_kg=payload_kg)
+    fleet = [small.arm(i, [content]) for i in range(arms)]
+    jobs = [small.job("a", content, repetitions=repetitions)]
+    return small.shop([jobs], arms=fleet, ambient_c=start_c, **more)
+
+
+def hottest(temp_c) -> np.ndarray:
+    """Temperature of the hottest motor, from [..., node]."""
+    return temp_c[..., WINDING].max(axis=-1)
+
+
+def one(log: list[Event], kind: str) -> Event:
+    return next(e for e in log if e.kind == kind)
+
+
+def integrated(world: World, start_c, heat_w, seconds) -> tuple[np.ndarray, np.ndarray]:
+    """Times and hottest winding by Runge-Kutta under constant heat, every 5 ms."""
+    m = world.thermal
+    grid = np.arange(0.0, seconds + 1e-9, 0.005)
+
+    def slope(_, t):
+        return (heat_w + m.to_ambient[0] * AMBIENT_C - m.laplacian[0] @ t) / m.capacity[0]
+
+    law = solve_ivp(slope, (0.0, grid[-1] + 1e-9), start_c, t_eval=grid, rtol=1e-10, atol=1e-10)
+    return law.t, law.y[WINDING].max(axis=0)
+
+
+def winding_after(world: World, start_c, heat_w, seconds: float) -> float:
+    """Hottest motor after constant heat, by the matrix exponential."""
+    m = world.thermal
+    law = np.zeros((NODES + 1, NODES + 1))
+    law[:NODES, :NODES] = -m.laplacian[0] / m.capacity[0][:, None]
+    law[:NODES, NODES] = (heat_w + m.to_ambient[0] * AMBIENT_C) / m.capacity[0]
+    return float((expm(law * seconds) @ [*start_c, 1.0])[WINDING].max())
+
+
+@pytest.mark.parametrize("start_c", [30.0, 80.0], ids=["warming", "cooling"])
+def test_a_limit_is_crossed_where_brentq_finds_the_root(small, start_c) -> None:
+    """Also where the search hits the limit exactly; the moment is never on the near side of the limit."""
+    world, _ = small.shop([[small.job("a")]])
+    tables = tables_of(world)[0]
+    heat_w, temp_c, modal = np.zeros(NODES), np.full(NODES, start_c), np.empty((2, NODES))
+    heat_w[1] = 90.0 if start_c < 50.0 else 0.0
+    temp_c[1] += 1.0
+    to_modes(tables, 0, 0, temp_c, heat_w + tables.to_ambient[0, 0] * AMBIENT_C, modal)
+    first_c, last_c = (winding_after(world, temp_c, heat_w, time_s) for time_s in (0.0, DT_S))
+    assert (last_c > first_c) == (start_c < 50.0)
+    exact = 0
+    limits = np.random.default_rng(3).uniform(min(first_c, last_c), max(first_c, last_c), size=400)
+    for limit_c in limits.tolist():
+        root_s = crossing_s(tables, 0, 0, modal, DT_S, limit_c, first_c, last_c)
+        expected_s = brentq(lambda s, c=limit_c: winding_after(world, temp_c, heat_w, s) - c, 0.0, DT_S, xtol=1e-12)
+        assert root_s == pytest.approx(expected_s, rel=0, abs=1e-9)
+        there_c = hottest_at(tables, 0, 0, modal, root_s)
+        exact += there_c == limit_c
+        assert there_c == limit_c or (there_c > limit_c) == (last_c > first_c)
+    assert exact > 3
+
+
+@pytest.mark.parametrize("payload_kg", [6.0, 8.0, 10.0])
+def test_warning_and_fault_come_when_an_integration_by_scipy_says(small, payload_kg) -> None:
+    world, plant = hot_shop(small, payload_kg=payload_kg, ticks=120)
+    log: list[Event] = []
+    steps = work_on(world, plant, log)
+    for kind, limit_c in (("warning", 60.0), ("fault", 75.0)):
+        event = one(log, kind)
+        s = steps[int(event.time_s // DT_S)]
+        t, hot = integrated(world, s.record.start_c[0, 0], s.record.heat_w[0, 0], DT_S)
+        assert event.time_s % DT_S == pytest.approx(t[np.argmax(hot >= limit_c)], abs=0.05)
+        assert (event.joint, event.value, event.job) == (2, limit_c, "a")
+    assert s.state.peak_c[0, 0] == pytest.approx(75.0, abs=1e-6)  # the hottest it got was at the fault
+
+
+def test_time_above_the_warning_limit_is_exact(small) -> None:
+    limits = ThermalLimits(warning_c=45.0, error_c=200.0, restart_c=40.0)
+    world, plant = hot_shop(small, repetitions=20, limits=limits, ticks=60)
+    log: list[Event] = []
+    steps = work_on(world, plant, log)
+    above = 0.0
+    for s in steps:
+        t, hot = integrated(world, s.record.start_c[0, 0], s.record.heat_w[0, 0], DT_S)
+        above += np.trapezoid((hot >= 45.0).astype(float), t)
+    last = steps[-1].state
+    assert hottest(last.temp_c)[0, 0] < 45.0
+    assert last.above_warning_s[0, 0] == pytest.approx(above, abs=0.05)
+    assert last.peak_c[0, 0] == pytest.approx(max(hottest(s.state.temp_c)[0, 0] for s in steps))
+    assert len([e for e in log if e.kind == "warning"]) == 1
+
+
+@pytest.mark.parametrize("power_off", [True, False])
+def test_recovery_takes_until_every_motor_is_cool_and_then_the_clearing(small, power_off) -> None:
+    limits = ThermalLimits(restart_c=45.0, clear_s=33.0, power_off_on_fault=power_off)
+    world, plant = hot_shop(small, limits=limits, ticks=600)
+    log: list[Event] = []
+    steps = work_on(world, plant, log)
+    fault, recover = one(log, "fault"), one(log, "recover")
+    s = steps[int(fault.time_s // DT_S)]
+    t, _ = integrated(world, s.record.start_c[0, 0], s.record.heat_w[0, 0], fault.time_s % DT_S)
+    m = world.thermal
+    slope = lambda temp, heat: (heat + m.to_ambient[0] * 25.0 - m.laplacian[0] @ temp) / m.capacity[0]  # noqa: E731
+    heat_w = s.record.heat_w[0, 0]
+    there = solve_ivp(lambda _, x: slope(x, heat_w), (0, fault.time_s % DT_S), s.record.start_c[0, 0], rtol=1e-9)
+    braked = np.concatenate([np.zeros(7), np.zeros(7) if power_off else world.motors.idle_w[0]])
+    cool = solve_ivp(
+        lambda _, x: slope(x, braked), (0, 6000), there.y[:, -1], rtol=1e-9, atol=1e-9,
+        events=lambda _, x: x[WINDING].max() - 45.0,
+    )  # fmt: skip
+    assert t[-1] == pytest.approx(fault.time_s % DT_S, abs=0.01)
+    assert recover.time_s == pytest.approx(fault.time_s + cool.t_events[0][0] + 33.0, abs=0.05)
+    lost = steps[int(recover.time_s // DT_S)].state.lost_s[0, 0]
+    assert lost == pytest.approx(recover.time_s - fault.time_s, abs=1e-6)
+
+
+def test_an_arm_switched_off_cools_faster(small) -> None:
+    ends = {}
+    for off in (True, False):
+        world, plant = hot_shop(small, limits=ThermalLimits(power_off_on_fault=off), ticks=80)
+        log: list[Event] = []
+        last = work_on(world, plant, log)[-1]
+        assert last.state.mode[0, 0] == FAULTED
+        ends[off] = last.state.temp_c[0, 0]
+    # Both had the same heat up to the same moment; the difference is the idle heat alone.
+    assert (ends[True] < ends[False]).all()
+
+
+def test_a_faulted_arm_may_only_wait(small) -> None:
+    world, plant = hot_shop(small, arms=2, ticks=200)
+    seen = 0
+    for s in work_on(world, plant, []):
+        faulted = s.state.mode[0] == FAULTED
+        mask = open_jobs(world, s.state)[1][0]
+        seen += faulted.sum()
+        assert (mask[:, 0] == 1).all()
+        assert not mask[faulted, 1:].any()
+    assert seen > 10
+
+
+def test_a_returned_job_keeps_its_whole_cycles_and_the_rest_is_done_later(small) -> None:
+    world, plant = hot_shop(small, repetitions=40, ticks=600)
+    log: list[Event] = []
+    steps = work_on(world, plant, log)
+    fault, back, awards = one(log, "fault"), one(log, "return"), [e for e in log if e.kind == "award"]
+    kept = math.floor((fault.time_s - awards[0].time_s - 3.0) / 10.0)
+    assert 0 < kept < 40
+    assert (back.time_s, back.value) == (fault.time_s, kept)
+    finishes = [e for e in log if e.kind == "finish"]
+    returns = [e for e in log if e.kind == "return"]
+    left = 40 - sum(e.value for e in returns)
+    assert len(finishes) == 1
+    assert finishes[0].time_s == pytest.approx(awards[-1].time_s + 3.0 + left * 10.0)
+    assert steps[-1].state.cycles[0, 0] == 40
+    assert steps[-1].state.returns[0, 0] == len(returns)
+
+
+def test_a_returned_job_queues_at_the_end(small) -> None:
+    hot, cool = small.work("bench", small.HOT), small.work("rack")
+    jobs = [small.job("hot", hot, repetitions=200)]
+    jobs += [small.job(f"cool-{i}", cool, release_s=5.0 * i) for i in range(3)]
+    jobs += [small.job("new", cool, release_s=1500.0)]
+    world, plant = small.shop([jobs], ticks=200)
+    log: list[Event] = []
+    state = initial(world)
+    for tick in range(200):
+        state = step(world, state, np.array([[int(tick == 0), 0]]), plant, log).state
+        order = [world.jobs.names[0][j] for j in open_jobs(world, state)[0][0].tolist() if j >= 0]
+        if state.returns[0, 0]:
+            assert order[:4] == ["cool-0", "cool-1", "cool-2", "hot"]
+    assert state.returns[0, 0] == 1
+
+
+def test_a_fault_on_the_way_home_returns_nothing(small) -> None:
+    content = small.work(payload_kg=10.0)
+    arms = [small.arm(0, [content], times=small.Times(1.0, 1.0, 900.0))]
+    world, plant = small.shop([[small.job("a", content, repetitions=1)]], arms=arms, ticks=90)
+    log: list[Event] = []
+    last = work_on(world, plant, log)[-1].state
+    assert [e.kind for e in log if e.kind in ("finish", "fault", "return", "home")] == ["finish", "fault"]
+    assert last.status[0, 0] == DONE
+
+
+def test_an_arm_that_begins_too_hot_faults_at_once(small) -> None:
+    world, plant = hot_shop(small, start_c=80.0, ticks=3)
+    log: list[Event] = []
+    steps = work_on(world, plant, log)
+    assert one(log, "fault").time_s == 0.0
+    assert steps[0].state.mode[0, 0] == FAULTED
+    assert steps[0].state.busy_s[0, 0] == 0.0
+    assert steps[0].state.lost_s[0, 0] == DT_S
+    assert (steps[0].state.status[0, 0], steps[0].state.cycles[0, 0]) == (WAITING, 0)
+
+
+@settings(max_examples=12, deadline=None)
+@given(narrow=st.floats(0.02, 3.0), clear_s=st.floats(0.0, 25.0), dt_s=st.sampled_from([5.0, 10.0, 60.0]))
+def test_events_come_in_order_however_near_the_limits_are(small, narrow, clear_s, dt_s) -> None:
+    """A fault and the fall below the restart limit may be in one step."""
+    limits = ThermalLimits(warning_c=75.0 - narrow / 2, error_c=75.0, restart_c=75.0 - narrow, clear_s=clear_s)
+    world, plant = hot_shop(small, limits=limits, dt_s=dt_s, ticks=round(900 / dt_s))
+    log: list[Event] = []
+    steps = work_on(world, plant, log)
+    events = sorted((e for e in log if e.kind in ("fault", "recover")), key=lambda e: e.time_s)
+    assert [e.kind for e in events] == ["fault", "recover"] * (len(events) // 2) + ["fault"] * (len(events) % 2)
+    assert len(events) > 2
+    for fault, recover in zip(events[::2], events[1::2], strict=False):
+        assert recover.time_s >= fault.time_s + clear_s - 1e-6
+    m, first = world.thermal, events[0]
+    s = steps[int(first.time_s // dt_s)]
+    there = solve_ivp(
+        lambda _, x: (s.record.heat_w[0, 0] + m.to_ambient[0] * 25.0 - m.laplacian[0] @ x) / m.capacity[0],
+        (0, first.time_s % dt_s), s.record.start_c[0, 0], rtol=1e-10, atol=1e-10,
+    ).y[:, -1]  # fmt: skip
+    cool = solve_ivp(
+        lambda _, x: (m.to_ambient[0] * 25.0 - m.laplacian[0] @ x) / m.capacity[0], (0, 900), there,
+        rtol=1e-10, atol=1e-10, events=lambda _, x: x[WINDING].max() - limits.restart_c,
+    )  # fmt: skip
+    assert events[1].time_s == pytest.approx(first.time_s + cool.t_events[0][0] + clear_s, abs=0.01)
+
+
+def test_an_idle_arm_can_fault_too(small) -> None:
+    limits = ThermalLimits(warning_c=30.0, error_c=31.0, restart_c=29.0)
+    world, plant = hot_shop(small, arms=1, limits=limits, start_c=28.0, ticks=400)
+    log: list[Event] = []
+    state = initial(world)
+    for _ in range(400):
+        state = step(world, state, np.zeros((1, 1), int), plant, log).state
+    assert one(log, "fault").job == ""
+    assert state.busy_s[0, 0] == 0.0
+    assert state.mode[0, 0] in (IDLE, FAULTED)

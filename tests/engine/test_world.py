@@ -1,0 +1,144 @@
+"""From nouns to arrays: what the tables of a world say of jobs, plans and offers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fleet.difficulty import Blind, Difficulty, Risk
+from fleet.engine.state import initial
+from fleet.engine.world import best_offer, warm_start
+from fleet.motion import Plan
+from fleet.motor import gen3_motors
+
+
+class Scripted:
+    """Says the same of a plan every time; None where the script has nothing."""
+
+    version = "scripted"
+
+    def __init__(self, by_elbow: dict[int, float | None]) -> None:
+        self._by_elbow = by_elbow
+
+    def score(self, plan: Plan, repetitions: int) -> Difficulty | None:
+        total = self._by_elbow[plan.elbow]
+        return None if total is None else Difficulty(np.full(7, total / 7.0), 0.25)
+
+
+def with_variants(small, by_elbow):
+    content = small.work()
+    arm = small.arm(0, [content])
+    plan = arm.plans[content][0]
+    return replace(arm, model=Scripted(by_elbow), plans={content: tuple(replace(plan, elbow=k) for k in by_elbow)})
+
+
+def test_an_arm_offers_the_variant_it_finds_easiest(small) -> None:
+    arm = with_variants(small, {0: 3.0, 1: 1.0, 2: 2.0})
+    offer = best_offer(arm, small.job("a"))
+    assert offer is not None
+    assert offer[0].elbow == 1
+    world, _ = small.shop([[small.job("a")]], arms=[arm])
+    assert world.offers.difficulty[0, 0, 0] == pytest.approx(1.0)
+    assert world.offers.p_saturation[0, 0, 0] == 0.25
+    assert len(world.plans.times_s) == 1
+
+
+def test_without_a_score_it_offers_the_first_and_says_nothing(small) -> None:
+    for arm in (
+        with_variants(small, {0: None, 1: None}),
+        replace(with_variants(small, {0: 1.0, 1: 0.5}), model=Blind()),
+    ):
+        offer = best_offer(arm, small.job("a"))
+        assert offer is not None
+        assert (offer[0].elbow, offer[1]) == (0, None)
+        world, _ = small.shop([[small.job("a")]], arms=[arm])
+        assert np.isnan(world.offers.difficulty).all()
+        assert (world.offers.plan == 0).all()
+
+
+def test_more_of_the_same_work_is_scored_for_itself(small) -> None:
+    class ByLength:
+        version = "by length"
+
+        def score(self, plan: Plan, repetitions: int) -> Difficulty:
+            return Difficulty(np.full(7, repetitions / 100.0))
+
+    content = small.work()
+    jobs = [small.job("a", content, repetitions=5), small.job("b", content, repetitions=9)]
+    world, _ = small.shop([jobs], arms=[small.arm(0, [content], model=ByLength())])
+    assert world.offers.difficulty[0, 0] == pytest.approx([0.35, 0.63])
+    assert world.offers.plan[0, 0].tolist() == [0, 0]
+
+
+def test_a_work_nobody_planned_is_no_offer(small) -> None:
+    arm = small.arm(0, [small.work("rack")])
+    assert best_offer(arm, small.job("a")) is None
+    world, _ = small.shop([[small.job("a")]], arms=[arm])
+    assert world.offers.plan.tolist() == [[[-1]]]
+
+
+def test_the_plan_table_holds_times_mean_heat_and_peaks(small) -> None:
+    content = small.work(payload_kg=2.0)
+    world, _ = small.shop([[small.job("a", content)]], arms=[small.arm(0, [content], qd=0.5)])
+    tau = small.torque(2.0)
+    assert world.plans.times_s.tolist() == [[3.0, 10.0, 2.0]]
+    assert world.plans.peak_tau[0] == pytest.approx(tau)
+    motors = gen3_motors()
+    assert world.plans.current_sq[0, 0] == pytest.approx((tau / motors.eta / motors.torque_per_amp) ** 2)
+    assert (world.plans.friction_w[0, [0, 2]] == 0).all()
+    friction = motors.coulomb_nm * np.tanh(0.5 / motors.v0_rad_s) + motors.viscous_nms_per_rad * 0.5
+    assert world.plans.friction_w[0, 1] == pytest.approx(friction * 0.5)
+
+
+def test_the_job_table_says_what_the_jobs_say(small) -> None:
+    first = small.job("first", small.work("bench", 2.0, to="rack"), release_s=5.0, due_s=9.0, value=7.0, repetitions=4)
+    second = small.job("second", small.work("rack"), after=("first",))
+    world, _ = small.shop([[first, second], [second.__class__(**{**vars(second), "after": ()})]])
+    table = world.jobs
+    assert world.stations == ("bench", "rack")
+    assert table.exists.tolist() == [[True, True], [True, False]]
+    assert table.stations.tolist() == [[[0, 1], [1, -1]], [[1, -1], [-1, -1]]]
+    assert table.after.tolist() == [[[-1], [0]], [[-1], [-1]]]
+    assert table.names == (("first", "second"), ("second",))
+    row = (table.release_s, table.due_s, table.value, table.payload_kg, table.repetitions)
+    assert [column[0, 0] for column in row] == [5.0, 9.0, 7.0, 2.0, 4]
+
+
+def test_jobs_in_a_ring_are_refused(small) -> None:
+    with pytest.raises(ValueError, match="in a ring"):
+        small.shop([[small.job("a", after=("b",)), small.job("b", after=("a",))]])
+
+
+def test_arms_begin_at_ambient_or_idle_warm(small) -> None:
+    arms = [small.arm(0, [small.work()])]
+    cold, _ = small.shop([[small.job("a")]], arms=arms, ambient_c=21.0)
+    warm, _ = small.shop([[small.job("a")]], arms=arms, ambient_c=21.0, start_warm=True)
+    assert (initial(cold).temp_c == 21.0).all()
+    assert initial(warm).temp_c[0, 0] == pytest.approx(warm_start(arms[0], 21.0))
+    assert (initial(warm).temp_c > 21.0).all()
+
+
+def test_an_arm_that_overheats_standing_at_home_is_refused(small) -> None:
+    arm = replace(small.arm(0, [small.work()]), rest_tau=np.full(7, 500.0))
+    with pytest.raises(ValueError, match="Arm 'arm_0' never settles while standing at home in air of 25 °C"):
+        small.shop([[small.job("a")]], arms=[arm], start_warm=True)
+
+
+def test_risks_are_tabled_once_and_found_by_their_row(small) -> None:
+    class ByLength:
+        version = "by length"
+
+        def score(self, plan: Plan, repetitions: int) -> Difficulty:
+            return Difficulty(
+                np.zeros(7), risk=Risk(np.full(repetitions, -1.0 * repetitions), np.zeros((repetitions, 7)))
+            )
+
+    content = small.work()
+    jobs = [small.job("a", content, repetitions=2), small.job("b", content, repetitions=3), small.job("c", content)]
+    arms = [small.arm(0, [content], model=ByLength()), small.arm(1, [content])]
+    offers = small.shop([jobs, jobs[:1]], arms=arms)[0].offers
+    assert offers.risk.tolist() == [[[0, 1, 1], [-1, -1, -1]], [[0, -1, -1], [-1, -1, -1]]]
+    assert offers.risks is not None
+    assert offers.risks.offset.tolist() == [[-2.0, -2.0, -np.inf], [-3.0] * 3]
+    assert np.isnan(offers.p_saturation[:, 0]).all()
+    assert small.shop([jobs], arms=[arms[1]])[0].offers.risks is None

@@ -1,0 +1,376 @@
+"""What one arm promises: which awards it takes, what it may do with them, and what its journal makes of a crash."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from fleet.bus.protocol.auction import Award, JobSpec, Lease, Receipt
+from fleet.errors import JournalFull
+from fleet.live.arm.award_executor import CLOCK_DRIFT, AwardExecutor, ExecutorConfig
+from fleet.live.arm.journal_records import MAX_PAST_AWARDS, ArmHistory, ArmRecord, Started
+from fleet.live.journal import Journal
+
+JOB = JobSpec(name="j", kind="hold", places=("p",), repetitions=3)
+OTHER = JobSpec(name="k", kind="hold", places=("p",))
+VALID_S, LEASE_S = 5.0, 6.0
+
+
+class Disk(list):
+    """A journal that may be full."""
+
+    full = False
+
+    def keep(self, *records) -> None:
+        if self.full:
+            raise JournalFull("there is no room")
+        self.extend(records)
+
+
+def shop(disk=None, boot_nonce="n", **config):
+    """A executor at its start, and its disk."""
+    disk = Disk() if disk is None else disk
+    history = ArmHistory().replay(disk).after_restart("a", 7.0)
+    disk[:] = history.compact()
+    config = ExecutorConfig(**{"valid_s": VALID_S, **config})
+    return AwardExecutor("a", disk.keep, history, nonce=boot_nonce, config=config), disk
+
+
+def award_on(quote, job=JOB, **changes):
+    base = Award(award=f"w-{job.name}", auction="r", auctioneer="x", quote=quote, job=job, lease_s=LEASE_S)
+    return replace(base, **changes)
+
+
+def quoted(executor, *jobs, now_s=0.0, can=True):
+    return executor.add_quote({job.name: (job, can) for job in jobs or (JOB,)}, now_s)
+
+
+def taken(executor, now_s=0.0, **changes):
+    """An award that the arm has taken."""
+    award = award_on(quoted(executor, now_s=now_s), **changes)
+    assert executor.answer_award(award, now_s) == replace(executor.answer_award(award, now_s), accepted=True)
+    return award
+
+
+def test_an_award_on_a_good_quote_is_taken_and_on_disk():
+    executor, disk = shop()
+    award = taken(executor)
+    assert [held.award for held in executor.active] == [award]
+    assert list(ArmHistory().replay(disk).active) == [award.award]
+    assert executor.spare_capacity == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "now_s", "reason"),
+    [
+        ({"quote": "1-n-99"}, 0.0, "no quote '1-n-99'"),
+        ({"job": OTHER}, 0.0, "not for a job 'k'"),
+        ({"job": replace(JOB, payload_kg=4.0)}, 0.0, "not the one that the quote was for"),
+        ({"cycles": 3}, 0.0, "none is left"),
+        ({"lease_s": 60.0}, VALID_S + 0.01, "valid for 5 s"),
+        ({"lease_s": 2.0}, 2.0 * (1 - CLOCK_DRIFT), "lease has expired"),
+    ],
+)
+def test_an_award_that_does_not_fit_is_refused_with_the_reason(change, now_s, reason):
+    executor, disk = shop()
+    award = replace(award_on(quoted(executor)), **change)
+    before = list(disk)
+    ack = executor.answer_award(award, now_s)
+    assert not ack.accepted
+    assert reason in ack.reason
+    assert disk == before
+    assert not executor.active
+
+
+def test_the_last_moment_of_a_quote_is_good():
+    executor, _ = shop()
+    assert executor.answer_award(award_on(quoted(executor), lease_s=60.0), VALID_S).accepted
+
+
+def test_an_arm_that_is_unfit_full_or_unable_refuses():
+    executor, _ = shop()
+    assert "too hot" in executor.answer_award(award_on(quoted(executor)), 0.0, "I am too hot").reason
+    assert "cannot do it" in executor.answer_award(award_on(quoted(executor, can=False)), 0.0).reason
+    taken(executor)
+    full = executor.answer_award(award_on(quoted(executor, OTHER), OTHER), 0.0)
+    assert "I have 1 job(s)" in full.reason
+
+
+def test_a_refusal_is_final_although_the_reason_has_gone():
+    executor, _ = shop()
+    award = award_on(quoted(executor))
+    refused = executor.answer_award(award, 0.0, "I am too hot")
+    assert executor.answer_award(award, 0.1) == refused
+    assert not executor.answer_award(replace(award, award="another"), 0.1).accepted
+
+
+def test_the_same_award_gets_the_same_answer_and_changes_nothing():
+    executor, disk = shop(capacity=3)
+    award = taken(executor)
+    before = list(disk)
+    assert executor.answer_award(award, 100.0, "I am too hot") == executor.answer_award(award, 0.0)
+    assert disk == before
+    assert len(executor.active) == 1
+    assert "was for the job 'j'" in executor.answer_award(replace(award, job=OTHER), 0.0).reason
+
+
+def test_one_award_for_each_job_of_a_quote():
+    executor, _ = shop(capacity=3)
+    quote = quoted(executor, JOB, OTHER)
+    assert executor.answer_award(award_on(quote), 0.0).accepted
+    assert executor.answer_award(award_on(quote, OTHER), 0.0).accepted
+    assert "by 'w-j'" in executor.answer_award(award_on(quote, award="w2"), 0.0).reason
+
+
+def test_a_later_award_for_a_job_in_hand_takes_the_place_of_the_earlier():
+    executor, disk = shop()
+    taken(executor)
+    executor.record_progress(1, 9.0)
+    again = award_on(quoted(executor, now_s=10.0), award="w2", cycles=1)
+    assert executor.answer_award(again, 10.0).accepted
+    assert [held.award for held in executor.active] == [again]
+    assert list(ArmHistory().replay(disk).active) == ["w2"]
+
+
+def test_names_of_quotes_are_never_used_again():
+    names, disk = [], Disk()
+    for life in range(3):
+        executor, _ = shop(disk, boot_nonce=f"n{life}")
+        names += [quoted(executor) for _ in range(100)]
+    wiped, _ = shop(boot_nonce="n9")
+    names += [quoted(wiped) for _ in range(100)]
+    assert len(set(names)) == 400
+
+
+def test_only_so_many_quotes_are_remembered():
+    executor, _ = shop(quotes=4)
+    names = [quoted(executor) for _ in range(6)]
+    assert "no quote" in executor.answer_award(award_on(names[1]), 0.0).reason
+    assert executor.answer_award(award_on(names[2]), 0.0).accepted
+
+
+# Leases and leave
+
+
+def test_a_lease_lasts_from_the_quote_and_then_from_the_question():
+    executor, _ = shop()
+    award = taken(executor, now_s=10.0)
+    end_s = 10.0 + LEASE_S * (1 - CLOCK_DRIFT)
+    assert executor.allowed_cycles(end_s - 1e-6) == 2  # all but the last cycle
+    assert executor.allowed_cycles(end_s) == 0
+    executor.apply_lease(Lease("x", 4.0, (award.award,), ()), 15.0)
+    assert executor.allowed_cycles(15.0 + 4.0 * (1 - CLOCK_DRIFT) - 1e-6) == 2
+    assert executor.allowed_cycles(18.97) == 0
+    executor.apply_lease(Lease("x", 4.0, (award.award,), ()), 12.0)  # a late answer takes nothing back
+    assert executor.allowed_cycles(18.0) == 2
+
+
+def test_a_lease_of_another_auctioneer_counts_for_nothing():
+    executor, _ = shop()
+    award = taken(executor)
+    executor.apply_lease(Lease("y", 100.0, (award.award,), (), (award.award,)), 0.0)
+    executor.apply_lease(Lease("y", 100.0, (), (award.award,)), 0.0)
+    assert executor.allowed_cycles(50.0) == 0
+
+
+def test_leases_are_asked_for_three_times_in_each_and_leave_at_once():
+    executor, _ = shop()
+    taken(executor)
+    asked = [s / 100 for s in range(600) if executor.lease_requests(s / 100)]
+    assert asked == [2.0, 4.0]
+    executor.record_progress(2, 0.9)
+    ((auctioneer, request),) = executor.lease_requests(4.01)
+    assert (auctioneer, request.entries[0].phase) == ("x", "finishing")
+    assert not executor.lease_requests(4.02)
+    assert executor.lease_requests(4.32)
+
+
+def test_the_last_cycle_needs_leave_which_is_on_disk_and_for_good():
+    executor, disk = shop()
+    award = taken(executor)
+    executor.record_progress(2, 0.0)
+    leave = Lease("x", 4.0, (award.award,), (), (award.award,))
+    disk.full = True
+    executor.apply_lease(leave, 1.0)
+    assert executor.allowed_cycles(1.0) == 2
+    disk.full = False
+    executor.apply_lease(leave, 1.0)
+    assert executor.allowed_cycles(1000.0) == 3
+    executor.apply_lease(Lease("x", 4.0, (), (award.award,)), 2.0)
+    executor.return_expired(0.0, 1000.0)
+    assert executor.allowed_cycles(1000.0) == 3
+    assert ArmHistory().replay(disk).active[award.award].may_commit
+
+
+def test_what_is_lost_is_let_go_of_without_a_report():
+    executor, disk = shop()
+    award = taken(executor)
+    executor.apply_lease(Lease("x", 4.0, (), (award.award,)), 2.0)
+    assert not executor.active
+    assert not executor.due_reports(2.0)
+    assert not ArmHistory().replay(disk).active
+
+
+def test_without_a_lease_for_long_the_job_is_given_back():
+    executor, _ = shop(return_after_s=20.0)
+    taken(executor)
+    executor.return_expired(1.0, 25.9)
+    assert executor.active
+    executor.return_expired(2.0, 26.0)
+    ((_, report),) = executor.due_reports(26.0)
+    assert (report.outcome, report.time_s, report.reason) == ("returned", 2.0, "no lease for 20 s")
+
+
+def test_no_more_cycles_are_told_than_are_on_disk():
+    executor, disk = shop()
+    taken(executor)
+    executor.record_progress(1, 9.0)
+    disk.full = True
+    assert executor.lease_requests(2.0)[0][1].entries[0].cycles == 0
+    disk.full = False
+    assert executor.lease_requests(4.0)[0][1].entries[0].cycles == 1
+    assert next(iter(ArmHistory().replay(disk).active.values())).cycles == 1
+
+
+# Reports
+
+
+def finished(executor, award, now_s=1.0):
+    executor.apply_lease(Lease("x", LEASE_S, (award.award,), (), (award.award,)), now_s)
+    executor.finish(33.0, now_s)
+
+
+def test_a_report_is_said_again_ever_more_seldom_until_its_receipt():
+    executor, _ = shop()
+    award = taken(executor)
+    finished(executor, award, 1.0)
+    said = [s / 10 for s in range(10, 600) if executor.due_reports(s / 10)]
+    assert said == [1.0, 1.5, 2.5, 4.5, 8.5, 16.5, 24.5, 32.5, 40.5, 48.5, 56.5]
+    executor.apply_receipt(Receipt("y", award.award))
+    assert executor.due_reports(100.0)
+    executor.apply_receipt(Receipt("x", award.award))
+    assert not executor.due_reports(200.0)
+
+
+def test_a_finished_job_for_which_there_is_no_room_is_reported_once_there_is():
+    executor, disk = shop()
+    award = taken(executor)
+    executor.apply_lease(Lease("x", LEASE_S, (award.award,), (), (award.award,)), 1.0)
+    disk.full = True
+    executor.finish(33.0, 1.0)
+    assert not executor.active
+    assert not executor.due_reports(2.0)
+    assert executor.spare_capacity == 0
+    assert "no space left" in executor.answer_award(award_on(quoted(executor, OTHER), OTHER), 0.0).reason
+    disk.full = False
+    executor.retry_writes()
+    ((_, report),) = executor.due_reports(3.0)
+    assert (report.outcome, report.cycles, report.time_s) == ("finished", 3, 33.0)
+
+
+def test_a_full_disk_takes_no_work():
+    executor, disk = shop()
+    award = award_on(quoted(executor))
+    disk.full = True
+    ack = executor.answer_award(award, 0.0)
+    assert "journal cannot be written: there is no room" in ack.reason
+    disk.full = False
+    assert executor.answer_award(award, 0.0) == ack
+
+
+def test_a_faulted_arm_gives_back_all_it_has():
+    executor, _ = shop(capacity=2)
+    quote = quoted(executor, JOB, OTHER)
+    for job in (JOB, OTHER):
+        executor.answer_award(award_on(quote, job), 0.0)
+    executor.record_progress(1, 9.0)
+    executor.return_all(5.0, 1.0, "too hot")
+    assert [(r.job, r.cycles, r.unsure) for _, r in executor.due_reports(1.0)] == [("j", 1, False), ("k", 0, False)]
+
+
+# After a crash
+
+
+def test_what_was_finished_is_reported_again_in_the_next_life():
+    executor, disk = shop()
+    finished(executor, taken(executor))
+    next_life, _ = shop(disk)
+    ((auctioneer, report),) = next_life.due_reports(0.0)
+    assert (auctioneer, report.outcome, report.time_s) == ("x", "finished", 33.0)
+    next_life.apply_receipt(Receipt("x", report.award))
+    assert not shop(disk)[0].due_reports(0.0)
+
+
+def test_what_was_in_hand_is_given_back_in_the_next_life_with_the_cycles_on_disk():
+    executor, disk = shop()
+    taken(executor, cycles=1)
+    executor.record_progress(2, 9.0)  # not on disk yet
+    ((_, report),) = shop(disk)[0].due_reports(0.0)
+    assert (report.outcome, report.cycles, report.time_s, report.unsure) == ("returned", 1, 7.0, False)
+
+
+def test_an_award_is_known_over_many_restarts_and_the_journal_stays_small():
+    disk = Disk()
+    for life in range(MAX_PAST_AWARDS + 50):
+        executor, _ = shop(disk, boot_nonce=str(life))
+        award = taken(executor, award=f"w{life}")
+        finished(executor, award)
+        executor.apply_receipt(Receipt("x", award.award))
+    executor, _ = shop(disk)
+    assert executor.answer_award(award, 99.0).accepted
+    assert len(disk) <= MAX_PAST_AWARDS + 2
+    assert ArmHistory().replay(disk).boot == MAX_PAST_AWARDS + 51
+
+
+@given(st.integers(0, 5), st.booleans(), st.booleans())
+def test_a_memory_retold_is_the_same_memory(cycles, leave, closed):
+    executor, disk = shop(capacity=3)
+    award = taken(executor)
+    executor.record_progress(min(cycles, 2), 0.0)
+    executor.lease_requests(3.0)
+    if leave:
+        executor.apply_lease(Lease("x", 4.0, (), (), (award.award,)), 1.0)
+    if closed:
+        executor.return_all(5.0, 1.0, "too hot")
+    history = ArmHistory().replay(disk)
+    told = ArmHistory().replay(history.compact())
+    assert (told.boot, told.accepted, told.reports) == (history.boot, history.accepted, history.reports)
+    assert {n: (h.award, h.cycles, h.may_commit) for n, h in told.active.items()} == {
+        n: (h.award, h.cycles, h.may_commit) for n, h in history.active.items()
+    }
+
+
+def test_a_real_journal_keeps_the_promises(tmp_path):
+    with Journal(tmp_path / "a.jsonl", ArmRecord) as journal:
+        history = ArmHistory().replay(journal.records()).after_restart("a", 0.0)
+        journal.rewrite(*history.compact())
+        award = taken(AwardExecutor("a", journal.append, history, nonce="n"))
+    with Journal(tmp_path / "a.jsonl", ArmRecord) as journal:
+        again = ArmHistory().replay(journal.records())
+    assert list(again.active) == [award.award]
+    assert again.boot == 1
+
+
+def test_a_first_start_is_the_first_boot():
+    assert ArmHistory().after_restart("a", 0.0).boot == 1
+    history = ArmHistory().replay([Started(boot=4)]).after_restart("a", 0.0)
+    assert history.compact() == (Started(boot=5),)
+
+
+@pytest.mark.parametrize(
+    ("repetitions", "done", "phase"), [(1, 0, "finishing"), (3, 2, "finishing"), (3, 1, "working")]
+)
+def test_an_arm_that_has_only_the_last_cycle_left_asks_for_leave_from_afar(repetitions, done, phase):
+    """It may not set out without: waiting until the last cycle is near, it would wait for ever."""
+    executor, _ = shop()
+    job = replace(JOB, repetitions=repetitions)
+    executor.answer_award(award_on(quoted(executor, job), job), 0.0)
+    executor.record_progress(done, last_cycle_in_s=100.0)
+    ((_, request),) = executor.lease_requests(3.0)
+    assert request.entries[0].phase == phase
+
+
+@pytest.mark.parametrize("name", ["capacity", "valid_s", "quotes", "return_after_s", "commit_lead_s"])
+def test_terms_must_be_positive(name):
+    with pytest.raises(ValueError, match=rf"ExecutorConfig\.{name}"):
+        ExecutorConfig(**{name: 0})

@@ -1,0 +1,120 @@
+"""What an arm offers: its best variant, the reason where it has none, and a peak that a fine integration confirms."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from fleet.bus.protocol.auction import JobSpec
+from fleet.difficulty import Blind
+from fleet.errors import InfeasibleJob
+from fleet.job import Place
+from fleet.live.arm.estimator import NOT_PLANNED, Estimator, NominalPeaks
+from fleet.motion import drive
+from fleet.motor import gen3_motors
+from fleet.thermal import WINDING, drive_heat, gen3_network, thermal_model
+
+PLACES = {"bench": Place(name="bench", position_m=(0.5, 0.0, 0.2))}
+WARM_C = np.full(7, 31.0)
+
+
+def spec(**changes):
+    return JobSpec(**{"name": "j", "kind": "hold", "places": ("bench",), "repetitions": 3, **changes})
+
+
+@pytest.fixture
+def arm(small):
+    return small.arm(0, [small.work("bench", 4.0)])
+
+
+def estimator_of(arm, *, model=None, peaks=None):
+    asked = []
+
+    def plan(work):
+        asked.append(work)
+        if work.payload_kg > 5:
+            raise InfeasibleJob(arm.robot.name, "bench", "torque: too much")
+        return tuple(p for plans in arm.plans.values() for p in plans)
+
+    made = Estimator(model or arm.model, plan, PLACES, peaks or NominalPeaks())
+    return made, asked
+
+
+@pytest.mark.parametrize("minutes", [1, 20, 90])
+def test_the_foreseen_peak_is_that_of_the_nominal_network(arm, minutes):
+    """Second method: scipy integrates the same heat law finely."""
+    ((plan,),) = arm.plans.values()
+    repetitions = 6 * minutes
+    motors, model = gen3_motors(), thermal_model(gen3_network())
+    drives = [drive(phase.profile, motors) for phase in plan.phases]
+    weights = plan.weights(repetitions)
+    current_sq, friction_w = (
+        sum(w * getattr(d, name) for w, d in zip(weights, drives, strict=True)) for name in ("current_sq", "friction_w")
+    )
+
+    def slope(_, temp_c):
+        heat = drive_heat(temp_c, current_sq, friction_w, motors)
+        return (heat + model.to_ambient * 25.0 - model.laplacian @ temp_c) / model.capacity
+
+    start = np.tile(WARM_C, 2)
+    fine = solve_ivp(slope, (0.0, plan.duration_s(repetitions)), start, rtol=1e-8, atol=1e-8, method="BDF")
+    (peak,) = NominalPeaks().peaks_c([plan], [repetitions], WARM_C, 25.0)
+    expected = fine.y[WINDING].max()
+    assert peak == pytest.approx(expected, abs=0.02 * (expected - 31.0) + 0.01)
+
+
+def test_an_offer_says_what_is_known(arm):
+    estimator, _ = estimator_of(arm)
+    estimator.prepare(spec(payload_kg=4.0))
+    ((plan,),) = arm.plans.values()
+    (estimate,) = estimator.estimate([spec(payload_kg=4.0)], WARM_C, 25.0, 100.0)
+    score = arm.model.score(plan, 3)
+    assert estimate.feasible
+    assert estimate.difficulty == pytest.approx(score.total)
+    assert estimate.joint_difficulty == pytest.approx(tuple(score.per_joint))
+    assert estimate.p_saturation == score.p_saturation
+    assert estimate.duration_s == pytest.approx(3.0 + 30.0 + 2.0)
+    assert estimate.finish_in_s == pytest.approx(100.0 + 33.0)
+    assert estimate.peak_c > 31.0
+
+
+def test_a_blind_arm_offers_without_a_score(arm):
+    estimator, _ = estimator_of(arm, model=Blind())
+    estimator.prepare(spec())
+    (estimate,) = estimator.estimate([spec()], WARM_C, 25.0, np.inf)
+    assert (estimate.feasible, estimate.difficulty, estimate.p_saturation, estimate.finish_in_s) == (
+        True,
+        None,
+        None,
+        None,
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"places": ("moon",)}, "no place 'moon' in this cell; places: bench"),
+        ({"payload_kg": 9.0}, "at 'bench': torque: too much"),
+        ({"force_n": 3.0}, "Only a press"),
+    ],
+)
+def test_what_cannot_be_done_says_why(arm, changes, reason):
+    estimator, _ = estimator_of(arm)
+    estimator.prepare(spec(**changes))
+    (estimate,) = estimator.estimate([spec(**changes)], WARM_C, 25.0, 0.0)
+    assert not estimate.feasible
+    assert reason in estimate.reason
+    assert estimator.best_plan(spec(**changes)) is None
+
+
+def test_what_is_not_planned_yet_says_so_and_every_work_is_planned_once(arm):
+    estimator, asked = estimator_of(arm)
+    one, other = spec(), spec(name="k", payload_kg=1.0)
+    assert not estimator.is_prepared(one)
+    assert [o.reason for o in estimator.estimate([one, other], WARM_C, 25.0, 0.0)] == [NOT_PLANNED, NOT_PLANNED]
+    assert not asked
+    for _ in range(3):
+        estimator.prepare(one)
+        estimator.prepare(spec(name="l", repetitions=9))
+    assert len(asked) == 1
+    assert [o.feasible for o in estimator.estimate([one, other], WARM_C, 25.0, 0.0)] == [True, False]
+    assert not asked[1:]

@@ -1,0 +1,206 @@
+"""Every policy live: the same choice from the same knowledge as in simulation, and a shift that gets done."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from agents.policy import EveryArm, Policy, for_all_arms
+from agents.registry import RULES, make_policy
+from fleet.bus.protocol.auction import JobEstimate as Estimate
+from fleet.bus.protocol.auction import JobSpec, Quote
+from fleet.bus.protocol.messages import State
+from fleet.env.allocation_v0 import parallel_env
+from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
+from fleet.live.auction.round import Bidding, resolve_claims
+from fleet.observation import FIELDS, LONG_S, Observation
+from scenarios.live.allocation import CentralAllocation
+
+CENTRAL = [name for name, rule in RULES.items() if rule.scope == "central"]
+SIMULATED_ONLY = {"last_award", "clock", "busy_s"}
+"""Fields that quotes do not tell of an arm at work, and that no rule reads of it."""
+
+
+def quote(arm: str, *offers: Estimate, **changes) -> Quote:
+    facts = {"mode": "idle", "headroom_k": 20.0, "capacity": 1, **changes}
+    return Quote(arm=arm, auction="r", quote="q", valid_s=5.0, twin="t", time_s=0.0, estimates=offers, **facts)
+
+
+def quoted(seen: dict[str, Observation], time_s: float) -> Bidding:
+    """What arms with this knowledge answer to an auctioneer; every job at a station of its own."""
+    first = next(iter(seen.values()))
+    slots = [slot for slot in range(len(first.offered)) if first.offered[slot]]
+    jobs, quotes, states = [], {}, {}
+    for slot in slots:
+        due_s = {float(o.slack_s[slot]) + float(o.duration_s[slot]) + time_s for o in seen.values()}
+        jobs.append(
+            JobSpec(
+                name=f"j{slot}",
+                kind="hold",
+                places=(f"p{slot}",),
+                payload_kg=float(first.payload_kg[slot]),
+                value=float(first.value[slot]),
+                release_s=max(0.0, min(time_s - float(first.age_s[slot]), *due_s)),
+                due_s=None if max(due_s) > LONG_S / 2 else max(due_s),
+            )
+        )
+    for arm, o in seen.items():
+        offers = [
+            Estimate(
+                job=f"j{slot}",
+                feasible=bool(o.feasible[slot]),
+                difficulty=float(o.difficulty[slot]) if o.known[slot] else None,
+                p_saturation=float(o.p_saturation[slot]),
+                duration_s=float(o.duration_s[slot]),
+                finish_in_s=float(o.busy_s + o.duration_s[slot]),
+            )
+            for slot in slots
+        ]
+        mode = "idle" if o.idle else "working" if o.working else "faulted"
+        facts = {"mode": mode, "headroom_k": float(o.headroom_k), "capacity": int(bool(o.idle))}
+        quotes[arm] = quote(arm, *offers, **facts)
+        temp_c = tuple(o.temp_c.tolist())
+        states[arm] = State(arm=arm, tick=0, time_s=time_s, mode=mode, temp_c=temp_c, headroom_k=float(o.headroom_k))
+    return Bidding(
+        auction="r",
+        time_s=time_s,
+        jobs=tuple(jobs),
+        quotes={arm: one for arm, one in quotes.items() if one.capacity},
+        full={arm: one for arm, one in quotes.items() if not one.capacity},
+        states=states,
+        returned={f"j{slot}": (int(first.returns[slot]), time_s - float(first.age_s[slot])) for slot in slots},
+    )
+
+
+def fresh(name: str) -> Policy:
+    policy = make_policy(name)
+    policy.reset(np.random.default_rng(0))
+    return policy
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_the_same_knowledge_gives_the_same_choice_simulated_and_live(small, name) -> None:
+    """Every moment of a shift at which somebody may choose, told as quotes and read from them again."""
+    env = parallel_env(small.Shifts(arms=3, jobs=16, ticks=80, ambient_c=36.0))
+    env.reset(seed=4)
+    simulated, live, compared = fresh(name), fresh(name), 0
+    while env.agents:
+        seen = env.knowledge()
+        actions = simulated.act(seen)
+        open_slots = [slot for slot in range(len(seen["arm_0"].offered)) if seen["arm_0"].offered[slot]]
+        if any(o.action_mask[1:].any() for o in seen.values()):
+            time_s = float(env.truth.tick[0] * env.world.dt_s)
+            fleet = LiveFleet(arms=tuple(seen), warning_c=env.world.limits.warning_c, horizon_s=env.world.horizon_s)
+            again = observe(quoted(seen, time_s), fleet)
+            for arm, o in seen.items():
+                # Which station is busy is no part of a quote.
+                again[arm] = replace(again[arm], action_mask=o.action_mask[: len(open_slots) + 1])
+                for field in FIELDS:
+                    if field.name not in SIMULATED_ONLY:
+                        told = getattr(o, field.name)
+                        told = told[..., : len(open_slots)] if "slot" in field.axes else told
+                        np.testing.assert_allclose(getattr(again[arm], field.name), told, atol=0.02, err_msg=field.name)
+            assert live.act(again) == actions
+            compared += 1
+        else:
+            live.act(seen)
+        env.step(actions)
+    assert compared > 5
+
+
+def test_quotes_become_observations() -> None:
+    jobs = (JobSpec("a", "hold", ("x",), due_s=150.0, value=2.0, release_s=40.0), JobSpec("b", "hold", ("y",)))
+    quotes = {
+        "one": quote("one", Estimate("a", True, "", None, 1.5, 0.25, 55.0, 60.0, 100.0), Estimate("b", False, "reach")),
+        "two": quote("two", Estimate("b", True, peak_c=61.0), headroom_k=5.0),
+    }
+    full = {"three": quote("three", Estimate("a", True, duration_s=50.0), capacity=0, mode="working")}
+    states = {"two": State("two", 0, 0.0, "idle", (30.0,) * 6 + (55.0,), 5.0)}
+    bidding = Bidding("r", 100.0, jobs, quotes, full, states, {"two": 7.0}, {"a": (2, 90.0)})
+    seen = observe(bidding, LiveFleet(arms=("two", "one", "four"), warning_c=60.0, horizon_s=400.0), lost={"one"})
+    assert list(seen) == ["two", "one", "four", "three"]
+    one, two, three, four = (seen[name] for name in ("one", "two", "three", "four"))
+    assert [o.action_mask.tolist() for o in (one, two, three, four)] == [[1, 1, 0], [1, 0, 1], [1, 0, 0], [1, 0, 0]]
+    assert (one.clock, one.busy_s, one.last_award, two.last_award) == (0.25, 40.0, -1.0, 0.0)
+    assert [float(o.idle) for o in (one, two, three, four)] == [1, 1, 0, 0]
+    assert [float(o.working) for o in (one, two, three, four)] == [0, 0, 1, 0]
+    assert one.known.tolist() == [1, 0]
+    assert one.difficulty.tolist() == [1.5, 0]
+    assert one.p_saturation.tolist() == [0.25, 0.5]
+    assert two.p_saturation.tolist() == [0.5, 1.0]  # by its peak
+    assert one.duration_s.tolist() == [60.0, 0.0]
+    assert two.duration_s.tolist() == [0.0, 60.0]  # not told: as the longest
+    assert one.slack_s.tolist() == [-10.0, LONG_S]
+    assert one.age_s.tolist() == [10.0, 100.0]
+    assert one.returns.tolist() == [2, 0]
+    assert two.temp_c.tolist() == [30.0] * 6 + [55.0]
+    assert one.temp_c.tolist() == [40.0] * 7
+    assert one.peer_heard.tolist() == [1, 0, 1]  # two, four, three
+    assert one.peer_age_s.tolist() == [7.0, LONG_S, 0.0]
+    assert one.peer_working.tolist() == [0, 0, 1]
+    assert two.peer_known.tolist() == [[1, 0], [0, 0], [0, 0]]
+    assert two.peer_difficulty.tolist() == [[1.5, 0], [0, 0], [0, 0]]
+
+
+@pytest.mark.parametrize("name", CENTRAL)
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32))
+def test_every_central_policy_awards_what_was_bid_for_once(name, seed) -> None:
+    rng = np.random.default_rng(seed)
+    jobs = tuple(JobSpec(f"j{i}", "hold", (f"p{rng.integers(3)}",)) for i in range(rng.integers(1, 6)))
+    quotes = {
+        arm: quote(
+            arm,
+            *(Estimate(word.name, bool(rng.integers(2)), difficulty=rng.random(), duration_s=60.0) for word in jobs),
+        )
+        for arm in ("a", "b", "c")[: rng.integers(1, 4)]
+    }
+    bidding = Bidding("r", 0.0, jobs, quotes)
+    awarded = CentralAllocation(fresh(name), LiveFleet(arms=("a", "b", "c"), warning_c=60.0))(bidding)
+    assert all(bidding.offer(arm, job) for job, arm in awarded.items())
+    assert len(set(awarded.values())) == len(awarded)
+    taken = [word.places[0] for word in jobs if word.name in awarded]
+    assert len(set(taken)) == len(taken)
+    cool = name != "wspt_cool"
+    assert awarded or not cool or not any(offer.feasible for one in quotes.values() for offer in one.estimates)
+
+
+@pytest.mark.parametrize("name", CENTRAL)
+def test_every_central_policy_gets_the_jobs_of_an_auctioneer_done(live, name) -> None:
+    rule = CentralAllocation(fresh(name), LiveFleet(arms=("arm_0", "arm_1", "arm_2"), warning_c=60.0))
+    fleet = live.Fleet([live.Arm(f"arm_{i}") for i in range(3)], allocate=rule)
+    fleet.submit(*(JobSpec(name=f"j{i}", kind="hold", places=("xyz"[i % 3],), repetitions=2) for i in range(7)))
+    for _ in range(40):
+        fleet.run_fair(1.0)
+        fleet.check()
+    fleet.settled()
+
+
+def test_of_claims_for_one_job_or_station_the_lower_difficulty_wins_then_the_first_arm() -> None:
+    jobs = (JobSpec("j", "hold", ("x",)), JobSpec("k", "hold", ("x",)), JobSpec("l", "hold", ("y",)))
+
+    def bidding(**scores):
+        quotes = {arm: quote(arm, *(Estimate(w.name, True, difficulty=d) for w in jobs)) for arm, d in scores.items()}
+        return Bidding("r", 0.0, jobs, quotes)
+
+    order = ("a", "b", "c")
+    assert resolve_claims(bidding(a=2.0, b=1.0), {"a": "j", "b": "j"}, order) == {"j": "b"}
+    assert resolve_claims(bidding(a=1.0, b=1.0), {"a": "j", "b": "j"}, order) == {"j": "a"}
+    assert resolve_claims(bidding(a=None, b=9.0), {"a": "j", "b": "j"}, order) == {"j": "b"}
+    assert resolve_claims(bidding(a=2.0, b=1.0, c=5.0), {"a": "j", "b": "k", "c": "l"}, order) == {"k": "b", "l": "c"}
+    assert resolve_claims(bidding(a=1.0), {"a": "unknown"}, order) == {}
+
+
+def test_an_illegal_action_is_a_wait_and_says_so(caplog) -> None:
+    bidding = Bidding("r", 0.0, (JobSpec("j", "hold", ("x",)),), {"a": quote("a", Estimate("j", True))})
+    seen = observe(bidding, LiveFleet(arms=("a",), warning_c=60.0))
+    assert [claimed_jobs(bidding, seen, {"a": action}) for action in (0, 1, 2, -1)] == [{}, {"a": "j"}, {}, {}]
+    assert caplog.text.count("The policy chose the illegal action") == 2
+
+
+def test_a_class_of_scope_arm_runs_for_all_arms_in_simulation_only_by_the_adapter() -> None:
+    for rule in RULES.values():
+        policy = for_all_arms(rule.kind)
+        assert isinstance(policy, EveryArm) == (not hasattr(rule.kind, "act"))

@@ -1,0 +1,92 @@
+"""Cached plans: equal to computed ones, one file per question, damaged files replaced."""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fleet.errors import InfeasibleJob
+from fleet.job import KINDS, Place, Work
+from fleet.motion import Plan
+from fleet.planning.plan_cache import CachedPlanner
+from fleet.planning.planner import Planner
+from fleet.robot import Mount, Robot
+
+ROBOT = Robot(name="floor")
+NEAR = Place(name="near", position_m=(0.45, 0.15, 0.25))
+FAR = Place(name="far", position_m=(0.40, -0.30, 0.30))
+FACE = Place(name="face", position_m=(0.55, 0.0, 0.45), tool_deg=(0.0, 90.0, 0.0))
+WORKS = {
+    "pick_place": Work(kind="pick_place", places=(NEAR, FAR), payload_kg=2.0),
+    "sort": Work(kind="sort", places=(NEAR, FAR), payload_kg=0.2, dwell_s=0.2),
+    "hold": Work(kind="hold", places=(FACE,), payload_kg=3.0, dwell_s=4.0),
+    "press": Work(kind="press", places=(NEAR,), force_n=40.0, dwell_s=2.0),
+}
+
+
+def assert_same(plans: tuple[Plan, ...], others: tuple[Plan, ...]) -> None:
+    assert len(plans) == len(others)
+    for plan, other in zip(plans, others, strict=True):
+        assert (plan.arm, plan.work, plan.elbow, plan.speed) == (other.arm, other.work, other.elbow, other.speed)
+        for a, b in zip(plan.phases, other.phases, strict=True):
+            np.testing.assert_array_equal(a.profile, b.profile)
+            np.testing.assert_array_equal(a.payload_kg, b.payload_kg)
+
+
+@pytest.fixture
+def no_planning(monkeypatch):
+    """Call it, and planning fails the test."""
+    return lambda: monkeypatch.setattr(Planner, "plan", lambda *_: pytest.fail("planned although it was cached"))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_cached_plans_equal_computed_ones(kind, tmp_path, no_planning):
+    fresh = Planner(ROBOT, elbows=2).plan(WORKS[kind])
+    folder = tmp_path / "plans"
+    assert_same(CachedPlanner(ROBOT, elbows=2, cache_dir=folder).plan(WORKS[kind]), fresh)
+    assert [path.suffix for path in folder.iterdir()] == [".npz"]
+    no_planning()
+    cached = CachedPlanner(replace(ROBOT, name="other"), elbows=2, cache_dir=folder).plan(WORKS[kind])
+    assert {plan.arm for plan in cached} == {"other"}
+    assert_same(tuple(replace(plan, arm="floor") for plan in cached), fresh)
+
+
+@pytest.mark.parametrize(
+    ("robot", "work"),
+    [
+        (replace(ROBOT, tool_kg=0.1), WORKS["hold"]),
+        (replace(ROBOT, home="retract"), WORKS["hold"]),
+        (replace(ROBOT, mount=Mount(position_m=(0.0, 0.01, 0.0))), WORKS["hold"]),
+        (ROBOT, replace(WORKS["hold"], payload_kg=3.1)),
+    ],
+)
+def test_another_question_is_another_file(robot, work, tmp_path):
+    CachedPlanner(ROBOT, elbows=1, cache_dir=tmp_path).plan(WORKS["hold"])
+    CachedPlanner(robot, elbows=1, cache_dir=tmp_path).plan(work)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+@pytest.mark.parametrize("damage", [b"", b"not a plan", None])
+def test_a_damaged_file_is_replaced_with_a_warning(damage, tmp_path, caplog):
+    planner = CachedPlanner(ROBOT, elbows=1, cache_dir=tmp_path)
+    plans = planner.plan(WORKS["sort"])
+    (file,) = tmp_path.iterdir()
+    file.write_bytes(file.read_bytes()[:5000] if damage is None else damage)
+    with caplog.at_level(logging.WARNING):
+        assert_same(planner.plan(WORKS["sort"]), plans)
+    assert "planning again" in caplog.text
+    caplog.clear()
+    assert_same(planner.plan(WORKS["sort"]), plans)
+    assert not caplog.records
+
+
+def test_an_infeasible_job_is_cached_too(tmp_path, no_planning):
+    planner = CachedPlanner(ROBOT, cache_dir=tmp_path)
+    heavy = replace(WORKS["hold"], payload_kg=40.0)
+    with pytest.raises(InfeasibleJob, match="'floor' cannot work at 'face': torque") as first:
+        planner.plan(heavy)
+    no_planning()
+    with pytest.raises(InfeasibleJob) as second:
+        planner.plan(heavy)
+    assert str(second.value) == str(first.value)

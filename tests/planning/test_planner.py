@@ -1,0 +1,299 @@
+"""Plans against their limits, their own derivatives, independent kinematics, and themselves a second time."""
+
+import re
+import warnings
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+
+from fleet.errors import InfeasibleJob
+from fleet.job import KINDS, Place, Work
+from fleet.motion import RATE_HZ, Plan
+from fleet.physics.models import ArmModel
+from fleet.planning.collision import CollisionChecker
+from fleet.planning.kinematics import InverseKinematics, Pose, Unreachable, angle_between, nearest_turn
+from fleet.planning.planner import Planner
+from fleet.robot import GEN3, POSTURES, Mount, Robot, rotation
+
+DT_S = 1.0 / RATE_HZ
+ROBOTS = {
+    "floor": Robot(name="floor"),
+    "wall": Robot(name="wall", mount=Mount(position_m=(-0.3, 0.0, 0.7), tilt_deg=(0.0, 90.0, 0.0)), tool_kg=0.5),
+    "ceiling": Robot(name="ceiling", mount=Mount(position_m=(0.1, 0.0, 1.2), tilt_deg=(180.0, 0.0, 0.0))),
+}
+ARMS = {name: ArmModel(robot) for name, robot in ROBOTS.items()}
+PLANNERS = {name: Planner(robot, elbows=2) for name, robot in ROBOTS.items()}
+NEAR = Place(name="near", position_m=(0.45, 0.15, 0.25))
+FAR = Place(name="far", position_m=(0.40, -0.30, 0.30))
+FACE = Place(name="face", position_m=(0.55, 0.0, 0.45), tool_deg=(0.0, 90.0, 0.0))
+
+
+def work(kind: str, **changes) -> Work:
+    """An ordinary work of each kind."""
+    base = {
+        "pick_place": Work(kind="pick_place", places=(NEAR, FAR), payload_kg=2.0),
+        "sort": Work(kind="sort", places=(NEAR, FAR), payload_kg=0.2, dwell_s=0.2),
+        "hold": Work(kind="hold", places=(FACE,), payload_kg=3.0, dwell_s=4.0),
+        "press": Work(kind="press", places=(NEAR,), force_n=40.0, dwell_s=2.0),
+    }[kind]
+    return replace(base, **changes)
+
+
+def samples(plan: Plan) -> np.ndarray:
+    """The plan's phases one after the other, [time, channel, joint]."""
+    return np.concatenate([phase.profile for phase in plan.phases]).astype(float)
+
+
+@st.composite
+def places(draw):
+    azimuth, radius = draw(st.floats(-1.5, 1.5)), draw(st.floats(0.35, 0.6))
+    position_m = (radius * np.cos(azimuth), radius * np.sin(azimuth), draw(st.floats(0.1, 0.5)))
+    tool_deg = draw(st.sampled_from([(180.0, 0.0, 0.0), (180.0, 0.0, 90.0), (180.0, -30.0, 0.0), (0.0, 90.0, 0.0)]))
+    return Place(name=f"at {azimuth:.2f}", position_m=position_m, tool_deg=tool_deg)
+
+
+@st.composite
+def works(draw):
+    kind = draw(st.sampled_from(KINDS))
+    wanted = 2 if kind in ("pick_place", "sort") else 1
+    return Work(
+        kind=kind,
+        places=tuple(draw(places()) for _ in range(wanted)),
+        payload_kg=draw(st.floats(0.0, 4.0)),
+        dwell_s=draw(st.floats(0.1, 2.0)),
+        force_n=draw(st.floats(0.0, 60.0)) if kind == "press" else 0.0,
+    )
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@given(what=works())
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.filter_too_much])
+def test_every_sample_keeps_the_limits(name, what):
+    try:
+        plans = PLANNERS[name].plan(what)
+    except InfeasibleJob:
+        assume(False)
+        return
+    low, high = ARMS[name].position_range.T
+    for plan in plans:
+        profile = samples(plan)
+        q, qd, tau = profile.transpose(1, 0, 2)
+        mean_qdd = np.diff(qd, axis=0) / DT_S
+        assert np.isfinite(profile).all()
+        assert (q >= low - 1e-6).all()
+        assert (q <= high + 1e-6).all()
+        assert (np.abs(qd) <= plan.speed * np.array(GEN3.velocity) + 1e-5).all()
+        assert (np.abs(mean_qdd) <= plan.speed * np.array(GEN3.acceleration) + 1e-3).all()
+        assert (np.abs(np.diff(mean_qdd, axis=0)) <= plan.speed * np.array(GEN3.jerk) * DT_S + 1e-3).all()
+        assert (np.abs(tau) <= np.array(GEN3.torque_clip) + 1e-4).all()
+        # Trapezoidal rule; its error is at most jerk · dt³ / 12 on either side of a kink.
+        np.testing.assert_allclose(np.diff(q, axis=0), DT_S * (qd[:-1] + qd[1:]) / 2, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_phases_join_at_rest_and_start_and_end_at_home(name, kind):
+    for plan in PLANNERS[name].plan(work(kind)):
+        home = ROBOTS[name].home_q()
+        approach, cycle, retreat = (phase.profile.astype(float) for phase in plan.phases)
+        for first in (approach, cycle, retreat):
+            np.testing.assert_allclose(first[0, 1], 0.0, atol=1e-6)
+        np.testing.assert_allclose(approach[0, 0], home, atol=1e-6)
+        # The sample after the last of a cycle is its first: half a sample of the last speed away, at most.
+        for last, then in ((approach, cycle[0, 0]), (cycle, cycle[0, 0]), (cycle, retreat[0, 0]), (retreat, home)):
+            np.testing.assert_allclose(last[-1, 0] + last[-1, 1] * DT_S / 2, then, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_tool_stands_at_the_places_while_it_dwells(name, kind):
+    what = work(kind)
+    for plan in PLANNERS[name].plan(what):
+        q, qd, _ = plan.cycle.profile.astype(float).transpose(1, 0, 2)
+        still = q[(qd == 0).all(axis=1)]
+        for place in what.places:
+            misses = []
+            for posture in still:
+                position, turn = ARMS[name].tool_pose(posture)
+                angle_deg = np.rad2deg(angle_between(turn, rotation(place.tool_deg)))
+                misses.append((np.linalg.norm(position - place.position_m) < 1e-3) and angle_deg < 0.5)
+            assert sum(misses) >= round(what.dwell_s * RATE_HZ)
+
+
+def test_a_payload_hangs_from_grasp_to_release():
+    plan = PLANNERS["floor"].plan(work("pick_place"))[0]
+    carried = plan.cycle.payload_kg
+    assert set(np.unique(carried)) == {0.0, 2.0}
+    assert not plan.approach.payload_kg.any()
+    assert not plan.retreat.payload_kg.any()
+    changes = np.flatnonzero(np.diff(carried)) + 1
+    assert len(changes) == 2
+    for change, place in zip(changes, (NEAR, FAR), strict=True):
+        dwell = plan.cycle.profile[change - 25 : change + 1]
+        assert not dwell[:, 1].any()
+        position, _ = ARMS["floor"].tool_pose(dwell[-1, 0].astype(float))
+        np.testing.assert_allclose(position, place.position_m, atol=1e-3)
+
+
+def test_a_hold_carries_all_the_time_and_lasts_its_dwell():
+    plan = PLANNERS["floor"].plan(work("hold"))[0]
+    assert plan.cycle.duration_s == 4.0
+    assert (plan.cycle.payload_kg == 3.0).all()
+    expected = ARMS["floor"].gravity_torque(plan.cycle.profile[0, 0].astype(float), 3.0)
+    np.testing.assert_allclose(plan.cycle.profile[:, 2], np.tile(expected, (200, 1)), atol=1e-4)
+
+
+@given(heavy=st.floats(1.0, 4.0), share=st.floats(0.0, 1.0))
+@settings(max_examples=10, deadline=None)
+def test_torque_is_affine_in_the_payload(heavy, share):
+    planner = PLANNERS["floor"]
+    none, some, all_ = (planner.plan(work("pick_place", payload_kg=kg))[0] for kg in (0.0, share * heavy, heavy))
+    for a, b, c in zip(none.phases, some.phases, all_.phases, strict=True):
+        between = (1 - share) * a.profile[:, 2].astype(float) + share * c.profile[:, 2].astype(float)
+        np.testing.assert_allclose(b.profile[:, 2], between, atol=1e-4)
+
+
+def test_a_press_is_a_hold_plus_the_force_through_the_jacobian():
+    place = replace(FACE, tool_deg=(150.0, 20.0, 10.0))
+    pressed = PLANNERS["wall"].plan(work("press", places=(place,)))[0].cycle.profile
+    held = PLANNERS["wall"].plan(work("hold", places=(place,), payload_kg=0.0))[0].cycle.profile
+    q = pressed[0, 0].astype(float)
+    step = 1e-6
+    jacobian = np.stack(
+        [
+            (ARMS["wall"].tool_pose(q + step * e)[0] - ARMS["wall"].tool_pose(q - step * e)[0]) / (2 * step)
+            for e in np.eye(7)
+        ],
+        axis=1,
+    )
+    push = 40.0 * rotation(place.tool_deg)[:, 2]
+    np.testing.assert_allclose(pressed[0, 0], held[0, 0])
+    np.testing.assert_allclose(pressed[0, 2] - held[0, 2], jacobian.T @ push, atol=1e-3)
+
+
+def test_variants_are_numbered_from_the_quickest_and_differ():
+    plans = Planner(ROBOTS["floor"], elbows=3, speeds=(0.6, 1.0)).plan(work("pick_place"))
+    assert [(plan.elbow, plan.speed) for plan in plans] == [(e, s) for e in range(3) for s in (1.0, 0.6)]
+    fastest = [plan.duration_s(1) for plan in plans[::2]]
+    assert fastest == sorted(fastest)
+    elbows = [ARMS["floor"].elbow_position(plan.cycle.profile[0, 0].astype(float)) for plan in plans[::2]]
+    assert all(np.linalg.norm(a - b) > 0.05 for a, b in combinations(elbows, 2))
+
+
+def test_an_outstretched_arm_has_one_elbow():
+    far_out = Place(name="far out", position_m=(0.902, 0.0, 0.285), tool_deg=(0.0, 90.0, 0.0), retreat_m=0.0)
+    plans = Planner(ROBOTS["floor"], speeds=(1.0,)).plan(work("hold", places=(far_out,), payload_kg=1.0))
+    assert [plan.elbow for plan in plans] == [0]
+
+
+def assert_same(plans: tuple[Plan, ...], others: tuple[Plan, ...]) -> None:
+    assert len(plans) == len(others)
+    for plan, other in zip(plans, others, strict=True):
+        assert (plan.arm, plan.work, plan.elbow, plan.speed) == (other.arm, other.work, other.elbow, other.speed)
+        for a, b in zip(plan.phases, other.phases, strict=True):
+            np.testing.assert_array_equal(a.profile, b.profile)
+            np.testing.assert_array_equal(a.payload_kg, b.payload_kg)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_plans_repeat(kind):
+    assert_same(Planner(ROBOTS["floor"], elbows=2).plan(work(kind)), PLANNERS["floor"].plan(work(kind)))
+
+
+@pytest.mark.parametrize(
+    ("what", "place", "reason"),
+    [
+        (work("pick_place", places=(NEAR, replace(FAR, position_m=(1.5, 0.0, 0.3)))), "far", r"^reach: 1\.\d+ m"),
+        (work("hold", payload_kg=40.0), "face", r"^torque: joint_\d needs \d+\.\d N·m, allowed 104\.0 N·m, with 40 kg"),
+        (
+            work("hold", places=(replace(FACE, position_m=(0.167, 0.0, 0.4)),)),
+            "face",
+            "joint limit: joint_4 would have to be",
+        ),
+        (work("hold", places=(replace(NEAR, position_m=(0.5, 0.0, -0.1)),)), "near", "collision: .* inside the floor"),
+    ],
+)
+def test_an_infeasible_job_names_the_arm_the_place_and_the_reason(what, place, reason):
+    with pytest.raises(InfeasibleJob, match=f"'floor' cannot work at '{place}'") as error:
+        PLANNERS["floor"].plan(what)
+    assert error.value.place == place
+    assert re.search(reason, error.value.reason), error.value.reason
+
+
+def test_continuous_joints_take_the_short_way():
+    """No joint without stops turns further than half a turn on the way to the first place."""
+    for azimuth in np.linspace(-3.0, 3.0, 7):
+        place = replace(NEAR, position_m=(0.5 * np.cos(azimuth), 0.5 * np.sin(azimuth), 0.3))
+        for plan in PLANNERS["floor"].plan(work("hold", places=(place,))):
+            turned = plan.cycle.profile[0, 0] - plan.approach.profile[0, 0]
+            assert np.abs(turned[::2]).max() <= np.pi + 0.3  # the place is a little further than the stop above it
+
+
+@given(q=st.tuples(*[st.floats(-1.8, 1.8)] * 7).map(np.array), elbow_deg=st.sampled_from([0.0, 60.0, -60.0]))
+@settings(max_examples=60, deadline=None)
+def test_inverse_kinematics_finds_poses_that_exist(q, elbow_deg):
+    robot = ROBOTS["wall"]
+    inverse = InverseKinematics(ARMS["wall"])
+    pose = Pose(*ARMS["wall"].tool_pose(q))
+    found, reason = None, ""
+    try:
+        found = inverse.solve(pose, elbow_deg, robot.home_q())
+    except Unreachable as error:
+        reason = str(error)
+    if found is None:
+        # Some elbow turns need a joint beyond its stop, and none is left to an outstretched arm.
+        assert reason.startswith("joint limit") or (abs(q[3]) < 0.2 and reason.startswith("reach"))
+        return
+    distance_m, angle_rad = inverse.error(pose, found)
+    assert distance_m < 1e-3
+    assert np.rad2deg(angle_rad) < 0.5
+
+
+@pytest.mark.parametrize(
+    "beyond",
+    [
+        (0.0, 2.25, 3.14, -1.87, 0.0, 0.96, 1.57),
+        (0.0, 0.40, 3.14, -2.62, 0.0, 0.96, 1.57),
+        (0.0, 0.40, 3.14, -2.09, 0.0, 2.14, 1.57),
+    ],
+)
+def test_inverse_kinematics_stays_within_the_stops(beyond):
+    """Poses that an arm without stops would take with joint 2, 4 or 6 a little beyond them."""
+    arm, q = ARMS["floor"], np.array(beyond)
+    try:
+        found = InverseKinematics(arm).solve(Pose(*arm.tool_pose(q)), 0.0, q)
+    except Unreachable as error:
+        found = np.zeros(7) if "at its stop" in str(error) else np.full(7, np.nan)
+    assert (np.abs(found) <= arm.position_range[:, 1] + 1e-9).all()
+
+
+@given(q=st.tuples(*[st.floats(-20.0, 20.0)] * 7).map(np.array), near=st.tuples(*[st.floats(-9.0, 9.0)] * 7))
+def test_the_nearest_turn_is_within_half_a_turn(q, near):
+    turned = nearest_turn(q, np.array(near))
+    assert np.abs(turned - near)[::2].max() <= np.pi + 1e-9
+    np.testing.assert_array_equal(turned[1::2], q[1::2])
+    np.testing.assert_allclose(np.cos(turned), np.cos(q), atol=1e-9)
+
+
+def test_named_postures_are_clear_and_a_folded_arm_is_not():
+    checker = CollisionChecker(ARMS["floor"])
+    assert checker.first_collision(np.array(list(POSTURES.values()))) is None
+    assert "inside the floor" in str(checker.first_collision(np.array([[0.0, 2.2, 0.0, 0.0, 0.0, 0.0, 0.0]])))
+    assert "inside the base" in str(checker.first_collision(np.array([[0.0, 2.1, 0.0, 2.5, 0.0, 0.0, 0.0]])))
+
+
+@pytest.mark.parametrize("wrong", [{"elbows": 0}, {"speeds": ()}, {"speeds": (1.2,)}, {"speeds": (0.0,)}])
+def test_a_planner_refuses_senseless_variants(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        Planner(ROBOTS["floor"], **wrong)
+
+
+def test_planning_is_quiet(capfd):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        PLANNERS["floor"].plan(work("pick_place"))
+    assert capfd.readouterr() == ("", "")

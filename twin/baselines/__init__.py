@@ -1,0 +1,1 @@
+"""Rival detectors and nominal loads that the twin is compared with."""

@@ -1,0 +1,129 @@
+"""Read logs of real and simulated arms: Gen3 CSV, plain CSV (both plain or gzip), telemetry.parquet."""
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from fleet.errors import LogError
+from twin.logs.formats import PLAIN, Format, channels, check_columns, format_of, implausible_readings
+from twin.logs.lines import read_lines
+from twin.logs.parquet import read_arms
+from twin.logs.recording import Recording
+from twin.logs.table import Damage, Table, damage_summary, table_of, time_damage
+
+Damaged = Literal["refuse", "skip"]
+"""What to do with a file that has unusable lines."""
+SUFFIXES = (".csv.gz", ".csv", ".parquet")
+NOT_LOGS = ("events.parquet",)
+"""Other parquet files of a run folder."""
+
+log = logging.getLogger(__name__)
+
+
+def read(path: str | Path, *, damaged: Damaged = "refuse") -> list[Recording]:
+    """The recordings of one file: one, or in a telemetry.parquet one per arm.
+
+    Args:
+        damaged: "refuse" raises on any unusable line; "skip" drops such lines, logs a warning, and lists them in
+            `Recording.dropped`.
+
+    Raises:
+        LogError: file, line and reason.
+        ValueError: another value of `damaged`.
+    """
+    if damaged not in get_args(Damaged):
+        raise ValueError(f"damaged must be one of {', '.join(get_args(Damaged))} (got {damaged!r}).")
+    path = Path(path)
+    name = _name(path)
+    if path.is_dir():
+        raise LogError(str(path), None, "is a folder; a log is a file.")
+    if path.suffix == ".parquet":
+        return [_recording(path, f"{name}/{arm}", PLAIN, table, (), damaged) for arm, table in read_arms(path).items()]
+    lines = read_lines(path)
+    try:
+        table = table_of(lines)
+        known = format_of(table.names)
+    except ValueError as error:
+        raise LogError(str(path), 1, str(error)) from error
+    return [_recording(path, name, known, table, (lines.broken,) if lines.broken else (), damaged)]
+
+
+def read_folder(path: str | Path, *, damaged: Damaged = "refuse") -> list[Recording]:
+    """The recordings of all logs of a folder, by file name, without its subfolders.
+
+    With damaged="skip" a file without any good line is skipped too, with a warning.
+
+    Raises:
+        LogError: as `read` for the first unusable file; or no log, no usable log, or two logs of one name.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        raise LogError(str(path), None, "is not a folder." if path.exists() else "does not exist.")
+    files = sorted(f for f in path.iterdir() if f.name.lower().endswith(SUFFIXES) and f.name not in NOT_LOGS)
+    if not files:
+        raise LogError(str(path), None, f"holds no log; a log ends in {', '.join(SUFFIXES)}.")
+    by_name = {_name(f): f for f in files}
+    for f in files:
+        if by_name[_name(f)] != f:
+            raise LogError(str(path), None, f"'{f.name}' and '{by_name[_name(f)].name}' are the same log; keep one.")
+    recordings: list[Recording] = []
+    for f in files:
+        try:
+            recordings += read(f, damaged=damaged)
+        except LogError as error:
+            if damaged == "refuse":
+                raise
+            log.warning("skipped %s", error)
+    if not recordings:
+        raise LogError(str(path), None, f"none of its {len(files)} logs is usable; see the warnings.")
+    return recordings
+
+
+def _name(path: Path) -> str:
+    return next((path.name[: -len(s)] for s in SUFFIXES if path.name.lower().endswith(s)), path.name)
+
+
+def _recording(
+    path: Path, name: str, known: Format, table: Table, broken: Sequence[str], damaged: Damaged
+) -> Recording:
+    """A recording from the good rows of a table; `broken` lists damage of the whole file."""
+    try:
+        groups, unknown = check_columns(known, table.names)
+    except ValueError as error:
+        raise LogError(str(path), None if path.suffix == ".parquet" else 1, str(error)) from error
+    readings = channels(known, groups, table)
+    damage = [*table.damage, *implausible_readings(known, readings, table.where)]
+    good = ~np.isin(table.where, [d.line for d in damage])
+    time_s = table.values[:, table.names.index(known.time)]
+    try:
+        damage += time_damage(time_s[good], table.where[good])
+    except ValueError as error:
+        raise LogError(str(path), None, str(error)) from error
+    if unknown:
+        broken = (*broken, f"its columns {', '.join(unknown)} are unknown to a {known.name}")
+    if damaged == "refuse":
+        _refuse(path, broken, damage)
+    keep = ~np.isin(table.where, [d.line for d in damage])
+    dropped = (*broken, *damage_summary(damage))
+    for sentence in dropped:
+        log.warning("%s: dropped: %s", path, sentence)
+    if not keep.any():
+        raise LogError(str(path), None, f"holds no good line of numbers{': ' if dropped else '.'}{'; '.join(dropped)}")
+    kept = {channel: np.ascontiguousarray(values[keep]) for channel, values in readings.items()}
+    return Recording(name=name, time_s=time_s[keep], **kept, dropped=dropped)
+
+
+def _refuse(path: Path, broken: Sequence[str], damage: Sequence[Damage]) -> None:
+    """Raise the first damage, if any."""
+    others = len(broken) + len(damage) - 1
+    if others < 0:
+        return
+    more = f", and {others} more damaged place{'s' * (others > 1)}" if others else ""
+    ask = f'{more}. Use damaged="skip" to read the good rest.'
+    if broken:
+        raise LogError(str(path), None, f"{broken[0]}{ask}")
+    first = min(damage, key=lambda d: d.line)
+    raise LogError(str(path), first.line, f"{first.reason}{ask}")

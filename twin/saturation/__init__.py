@@ -1,0 +1,1 @@
+"""Calibrated probability that a motor passes its warning limit."""

@@ -1,0 +1,82 @@
+"""An alarm with a bounded rate of false alarms: split conformal prediction over whole jobs.
+
+The bound holds on average over calibrations, for jobs exchangeable with the calibration jobs. Motion of another kind is
+not, whatever alpha. Whole jobs, because windows of one job are not exchangeable.
+Source: Vovk, Gammerman & Shafer, Algorithmic Learning in a Random World, 2005, ch. 4; Laxhammar & Falkman 2010.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import beta
+
+from fleet.errors import FleetError
+from twin.conformal import p_value
+
+Array = np.ndarray
+
+
+class TooFewJobs(FleetError):
+    """Too few jobs for the false-alarm rate; the message says how many are needed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConformalAlarm:
+    """Warns of jobs that score higher than almost all jobs without the event."""
+
+    alpha: float
+    """Bound on the rate of false alarms, (0, 1)."""
+    scores: tuple[float, ...]
+    """Scores of the calibration jobs, none of which had the event, ascending."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.alpha < 1:
+            raise ValueError(f"ConformalAlarm.alpha must be between 0 and 1 (got {self.alpha}).")
+        if not np.isfinite(self.scores).all():
+            raise ValueError("ConformalAlarm.scores must be finite.")
+        if list(self.scores) != sorted(self.scores):
+            raise ValueError("ConformalAlarm.scores must be sorted.")
+        if self._allowed() < 1:
+            least = int(np.ceil(1 / self.alpha - 1 - 1e-9))
+            raise TooFewJobs(
+                f"A false-alarm rate of {self.alpha:g} can be guaranteed from {least} jobs without the event on "
+                f"(got {len(self.scores)}). Collect more of them, or ask for a larger alpha."
+            )
+
+    @classmethod
+    def fit(cls, scores: Sequence[float] | Array, alpha: float = 0.05) -> "ConformalAlarm":
+        """The alarm from scores [job] of jobs without the event that the score was not fitted on.
+
+        Raises:
+            TooFewJobs: fewer than 1/alpha − 1.
+            ValueError: alpha outside (0, 1), or scores that are not finite.
+        """
+        return cls(alpha=alpha, scores=tuple(np.sort(np.asarray(scores, dtype=float)).tolist()))
+
+    @property
+    def threshold(self) -> float:
+        """The alarm is raised above this score."""
+        return self.scores[-self._allowed()]
+
+    def __call__(self, score: Array) -> Array:
+        """Whether to warn, bool of the same shape as the scores; warns of NaN."""
+        return ~(np.asarray(score, dtype=float) <= self.threshold)
+
+    def p_value(self, score: Array) -> Array:
+        """Share of jobs without the event that score as high, (0, 1]; the alarm is p <= alpha."""
+        return p_value(np.array(self.scores), np.asarray(score, dtype=float))
+
+    def spread(self, confidence: float = 0.9) -> tuple[float, float]:
+        """Interval of the rate of false alarms of this one calibration, for scores without ties.
+
+        Given the calibration, the rate is Beta(m, n + 1 − m), m = floor(alpha (n + 1)) (Vovk 2012, Prop. 2a).
+        """
+        m = self._allowed()
+        tail = 0.5 * (1 - confidence)
+        low, high = beta.ppf([tail, 1 - tail], m, len(self.scores) + 1 - m)
+        return float(low), float(high)
+
+    def _allowed(self) -> int:
+        """floor(alpha (n + 1)): how far from the top the threshold lies."""
+        return int(np.floor(self.alpha * (len(self.scores) + 1) + 1e-9))

@@ -1,0 +1,105 @@
+"""An identified arm in one file, `rc.json`: readable numbers with their intervals and their origin."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import cast
+
+import msgspec
+import networkx as nx
+import numpy as np
+
+from fleet.errors import CheckpointError
+from fleet.motor import Motors
+from fleet.robot import JOINTS
+from fleet.thermal import thermal_model
+from twin.json_file import check_version, read_card, write_card
+from twin.logs.heat_log import CurrentSource
+from twin.thermal.parameters import HeatModel
+from twin.thermal.result import Identified, Parameter
+from twin.thermal.risk import MarginHead
+from twin.thermal.thermal_twin import RcTwin
+
+FORMAT = 1
+CARD = "rc.json"
+
+
+class _Card(msgspec.Struct, forbid_unknown_fields=True):
+    """The content of `rc.json`."""
+
+    format: int
+    version: str
+    arm: str
+    data_hash: str
+    ambient_c: float
+    ambient_sd_k: float
+    source: CurrentSource
+    seconds: float
+    parameters: list[Parameter]
+    rms_k: dict[str, tuple[float, ...]]
+    memory_s: tuple[float, ...]
+    motors: dict[str, float | list[float]]
+    capacity_j_per_k: dict[str, float]
+    conductance_w_per_k: list[tuple[str, str, float]]
+    saturation: MarginHead | None = None
+
+
+_SHARED = ("arm", "data_hash", "ambient_c", "ambient_sd_k", "source", "seconds", "rms_k", "memory_s")
+
+
+def save(identified: Identified, folder: Path, *, saturation: MarginHead | None = None) -> None:
+    """Write an identified arm, with its P(saturation) if given, atomically into a folder, made if need be."""
+    folder.mkdir(parents=True, exist_ok=True)
+    motors, network = identified.heat_model.motors, identified.heat_model.network
+    card = _Card(
+        format=FORMAT,
+        version=identified.version,
+        parameters=list(identified.parameters),
+        motors={name: np.asarray(value).tolist() for name, value in vars(motors).items()},
+        capacity_j_per_k={name: node["capacity_j_per_k"] for name, node in network.nodes.items() if node},
+        conductance_w_per_k=list(network.edges(data="conductance_w_per_k")),
+        saturation=saturation,
+        **{name: getattr(identified, name) for name in _SHARED},
+    )
+    write_card(card, folder / CARD)
+
+
+def load(folder: Path) -> Identified:
+    """The identified arm that `save` wrote.
+
+    Raises:
+        CheckpointError: the file is missing, damaged, of another format or for another number of joints, or its
+            numbers are not those that were saved.
+    """
+    return _identified(_read(folder / CARD), folder / CARD)
+
+
+def load_twin(folder: Path) -> RcTwin:
+    """The physical twin of what `save` wrote, with P(saturation) if it was saved; raises as `load`."""
+    card = _read(folder / CARD)
+    return RcTwin.of(_identified(card, folder / CARD)).with_head(card.saturation)
+
+
+def _read(path: Path) -> _Card:
+    return read_card(path, _Card, format_=FORMAT, what="identified arm")
+
+
+def _identified(card: _Card, path: Path) -> Identified:
+    widths = {name: len(value) for name, value in card.motors.items() if isinstance(value, list)}
+    if wrong := {name: width for name, width in widths.items() if width != JOINTS}:
+        raise CheckpointError(f"{path}: motors must have {JOINTS} joints, not so: {wrong}.")
+    graph = nx.Graph()
+    graph.add_node("ambient")
+    for name, value in card.capacity_j_per_k.items():
+        graph.add_node(name, capacity_j_per_k=value)
+    for one, other, value in card.conductance_w_per_k:
+        graph.add_edge(one, other, conductance_w_per_k=value)
+    values = {name: np.array(value) if isinstance(value, list) else value for name, value in card.motors.items()}
+    try:
+        thermal_model(graph)
+        motors = cast("Callable[..., Motors]", Motors)(**values)  # names and values of a file, checked by Motors
+    except (TypeError, ValueError) as error:
+        raise CheckpointError(f"{path}: {error}") from error
+    shared = {name: getattr(card, name) for name in _SHARED}
+    identified = Identified(heat_model=HeatModel(motors, graph), parameters=tuple(card.parameters), **shared)
+    check_version(path, card.version, identified.version)
+    return identified

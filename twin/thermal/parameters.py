@@ -1,0 +1,159 @@
+"""Identifiable parameters of an arm's thermal network: names, priors, and conversion to a network."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import networkx as nx
+import numpy as np
+
+from fleet.motor import Motors
+from fleet.robot import JOINTS
+from fleet.thermal import HOUSING, NODES, WINDING, ThermalModel, housing, thermal_model, winding
+
+Array = np.ndarray
+
+LARGE = 4
+"""Joints 1..4 of a Gen3 have the large actuator, 5..7 the small one."""
+
+_FRICTION_SD = (0.25, 0.25)
+"""Engineering value: running friction within one joint class; breakaway (2.5 to 5.3 N·m in the logs) varies more."""
+
+PRIOR_SD: Mapping[str, tuple[float, float]] = {
+    "copper_w_per_a2": (0.24, 0.39),
+    "winding_j_per_k": (0.23, 0.23),
+    "winding_housing_k_per_w": (0.26, 0.30),
+    "housing_j_per_k": (0.15, 0.17),
+    "housing_ambient_k_per_w": (0.19, 0.22),
+    "idle_w": (0.20, 0.20),
+    "neighbour_w_per_k": (0.85, 0.85),
+    "coulomb_nm": _FRICTION_SD,
+    "viscous_nms_per_rad": _FRICTION_SD,
+}
+"""Relative standard deviations of large and small joints, read as those of a log-normal.
+
+Source: the fit of 65 public Gen3 logs behind `fleet/data/gen3_thermal.json`, spread of repeated fits with the prior on
+the absolute scale; the names are those of that file.
+"""
+
+THERMAL = tuple(name for name in PRIOR_SD if name not in ("coulomb_nm", "viscous_nms_per_rad"))
+"""Free parameters if an arm's friction is known. Fixed friction watts set the absolute scale of all heat, so an error
+in them, or in the speed between slow samples, enters every parameter and no interval shows it."""
+
+
+@dataclass(frozen=True, eq=False)
+class HeatModel:
+    """One arm's motors and thermal network."""
+
+    motors: Motors
+    network: nx.Graph
+
+    def value(self, name: str) -> Array:
+        """A parameter of `PRIOR_SD`, [joint]; [1] for the conductance between neighbours."""
+        if hasattr(self.motors, name):
+            return np.array(getattr(self.motors, name), dtype=float)
+        nodes, edge = self.network.nodes, self._conductance
+        if name == "winding_j_per_k":
+            return np.array([nodes[winding(j)]["capacity_j_per_k"] for j in range(JOINTS)])
+        if name == "housing_j_per_k":
+            return np.array([nodes[housing(j)]["capacity_j_per_k"] for j in range(JOINTS)])
+        if name == "winding_housing_k_per_w":
+            return np.array([1.0 / edge(winding(j), housing(j)) for j in range(JOINTS)])
+        if name == "housing_ambient_k_per_w":
+            return np.array([1.0 / edge(housing(j), "ambient") for j in range(JOINTS)])
+        return np.array([np.mean([edge(housing(j - 1), housing(j)) for j in range(1, JOINTS)])])
+
+    def _conductance(self, one: str, other: str) -> float:
+        return self.network.edges[one, other]["conductance_w_per_k"]
+
+    def with_values(self, values: Mapping[str, Array]) -> "HeatModel":
+        """The same arm with some parameters of `PRIOR_SD` replaced, each [joint] or [1] as `value` gives them."""
+        graph = self.network.copy()
+        motors = replace(self.motors, **{n: np.array(v) for n, v in values.items() if hasattr(self.motors, n)})
+        for j in range(JOINTS):
+            for name, node in (("winding_j_per_k", winding(j)), ("housing_j_per_k", housing(j))):
+                if name in values:
+                    graph.nodes[node]["capacity_j_per_k"] = float(values[name][j])
+            for name, end in (("winding_housing_k_per_w", winding(j)), ("housing_ambient_k_per_w", "ambient")):
+                if name in values:
+                    graph.edges[end, housing(j)]["conductance_w_per_k"] = 1.0 / float(values[name][j])
+            if j and "neighbour_w_per_k" in values:
+                edge = graph.edges[housing(j - 1), housing(j)]
+                edge["conductance_w_per_k"] = float(values["neighbour_w_per_k"][0])
+        return HeatModel(motors, graph)
+
+    def thermal(self) -> ThermalModel:
+        """The network as matrices."""
+        return thermal_model(self.network)
+
+
+class ParameterVector:
+    """Free parameters of one arm as a vector of logarithms, with their Gaussian prior around a nominal arm."""
+
+    def __init__(self, nominal: HeatModel, free: Sequence[str] = tuple(PRIOR_SD)) -> None:
+        """Raises ValueError for a name that is none of `PRIOR_SD` or given twice, and for a nominal value of zero."""
+        if not free or set(free) - set(PRIOR_SD) or len(set(free)) != len(free):
+            raise ValueError(f"Free parameters must be some of {', '.join(PRIOR_SD)}, each once (got {tuple(free)}).")
+        self.nominal = nominal
+        self.free = tuple(free)
+        self._held = {name: nominal.value(name) for name in PRIOR_SD}
+        centre = [nominal.value(name) for name in free]
+        if none := [name for name, values in zip(free, centre, strict=True) if not np.all(values > 0)]:
+            raise ValueError(f"A free parameter needs a nominal value > 0; not so: {', '.join(none)}.")
+        self.mean = np.log(np.concatenate(centre))
+        """Prior mean of the logarithms, [parameter]."""
+        self.sd = np.concatenate([_sd(name, len(values)) for name, values in zip(free, centre, strict=True)])
+        """Prior standard deviation of the logarithms, [parameter]."""
+        self.names = tuple(
+            (name, joint if len(values) > 1 else None)
+            for name, values in zip(free, centre, strict=True)
+            for joint in range(len(values))
+        )
+        """Name and joint (0..6, None for the one value of all neighbours) of each entry."""
+
+    def __len__(self) -> int:
+        return len(self.mean)
+
+    def values(self, x: Array) -> dict[str, Array]:
+        """Values by name, [..., joint], also of those that are not free, for logarithms [..., parameter]."""
+        out = {name: np.broadcast_to(held, (*x.shape[:-1], len(held))) for name, held in self._held.items()}
+        first = 0
+        for name in self.free:
+            width = len(self._held[name])
+            out[name] = np.exp(x[..., first : first + width])
+            first += width
+        return out
+
+    def heat_model(self, x: Array) -> HeatModel:
+        """The arm with these logarithms, [parameter]."""
+        values = self.values(x)
+        return self.nominal.with_values({name: values[name] for name in self.free})
+
+    def models(self, x: Array) -> ThermalModel:
+        """Networks of several sets of logarithms [set, parameter] as one model, arrays [set, ...].
+
+        The same matrices as by `heat_model`, without a graph for each: the Laplacian is linear in the conductances.
+        """
+        values = self.values(x)
+        between = np.broadcast_to(values["neighbour_w_per_k"], (*x.shape[:-1], JOINTS - 1))
+        to_air = 1.0 / values["housing_ambient_k_per_w"]
+        conductance = np.concatenate([1.0 / values["winding_housing_k_per_w"], to_air, between], axis=-1)
+        laplacian = np.einsum("...e,en,em->...nm", conductance, _INCIDENCE, _INCIDENCE)
+        capacity = np.concatenate([values["winding_j_per_k"], values["housing_j_per_k"]], axis=-1)
+        root = np.sqrt(capacity)
+        rates, modes = np.linalg.eigh(laplacian / (root[..., :, None] * root[..., None, :]))
+        return ThermalModel(capacity, laplacian, np.concatenate([np.zeros_like(to_air), to_air], -1), rates, modes)
+
+
+def _incidence() -> Array:
+    """Ends of the edges winding–housing, housing–ambient and housing–housing, ±1, [edge, node]; ambient is no node."""
+    rows = np.eye(NODES)
+    inner = rows[WINDING] - rows[HOUSING]
+    return np.concatenate([inner, rows[HOUSING], np.diff(rows[HOUSING], axis=0)])
+
+
+_INCIDENCE = _incidence()
+
+
+def _sd(name: str, width: int) -> Array:
+    large, small = PRIOR_SD[name]
+    return np.array([large] * LARGE + [small] * (JOINTS - LARGE)) if width > 1 else np.array([large])

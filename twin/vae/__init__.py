@@ -1,0 +1,1 @@
+"""The LSTM variational autoencoder: windows, model, training, scores."""

@@ -1,0 +1,61 @@
+"""The trained networks of one arm as one module on windows of all its joints, and on NumPy arrays."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from fleet.motion import CHANNELS
+from twin.vae.model import LstmVae, one_thread
+
+Array = np.ndarray
+
+_CHUNK = 512
+"""Windows per pass: keeps the activations in cache."""
+
+
+class Networks(nn.Module):
+    """Networks that each read their share of an arm's channels, in z-scores; nothing is drawn at random."""
+
+    def __init__(self, nets: Sequence[LstmVae]) -> None:
+        super().__init__()
+        self.nets = tuple(net.eval().requires_grad_(False) for net in nets)
+
+    def encode(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Posterior mean and log variance, [batch, net, latent], of windows [batch, time, joint, channel]."""
+        parts = z.flatten(2).chunk(len(self.nets), dim=2)
+        posteriors = [net.encode(part) for net, part in zip(self.nets, parts, strict=True)]
+        return torch.stack([mu for mu, _ in posteriors], dim=1), torch.stack([var for _, var in posteriors], dim=1)
+
+    def decode(self, latent: Tensor, steps: int) -> Tensor:
+        """Windows that latents [batch, net, latent] stand for, [batch, time, joint, channel]."""
+        parts = [net.decode(latent[:, n], steps) for n, net in enumerate(self.nets)]
+        return torch.cat(parts, dim=2).unflatten(2, (-1, len(CHANNELS)))
+
+    def forward(self, z: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+        """Windows decoded from their posterior means, [batch, time, joint, channel], and these means."""
+        mu = self.encode(z)[0]
+        return self.decode(mu, steps), mu
+
+
+def posterior(networks: Networks, z: Array) -> tuple[Array, Array]:
+    """Mean and standard deviation of the latent of windows [batch, time, joint, channel], [batch, net, latent]."""
+    with one_thread(), torch.inference_mode():
+        parts = [networks.encode(part) for part in torch.from_numpy(z).split(_CHUNK)]
+        mu, logvar = (torch.cat(each) for each in zip(*parts, strict=True))
+        return mu.numpy(), torch.exp(0.5 * logvar).numpy()
+
+
+def decode(networks: Networks, latent: Array, steps: int) -> Array:
+    """Windows that latents [batch, net, latent] stand for, float32 [batch, time, joint, channel]."""
+    with one_thread(), torch.inference_mode():
+        parts = torch.from_numpy(np.asarray(latent, dtype=np.float32)).split(_CHUNK)
+        return torch.cat([networks.decode(part, steps) for part in parts]).numpy()
+
+
+def reconstruct(networks: Networks, z: Array) -> Array:
+    """Windows [batch, time, joint, channel] decoded from the means of their posteriors, float32."""
+    with one_thread(), torch.inference_mode():
+        parts = torch.from_numpy(z).split(_CHUNK)
+        return torch.cat([networks(part, z.shape[1])[0] for part in parts]).numpy()

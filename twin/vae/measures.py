@@ -1,0 +1,221 @@
+"""Measures of a job from a twin's errors: difficulty per joint, its cause, and a p-value against cool jobs.
+
+The paper's difficulty d_k is in `fleet.difficulty`. It is far from zero even for normal jobs, since a latent of two
+numbers cannot encode a window exactly. The calibrated measures start from the median of held-out cool jobs instead.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from fleet.difficulty import difficulty_of_error
+from fleet.errors import nearest
+from fleet.motion import CHANNELS
+from twin.conformal import p_value
+
+Array = np.ndarray
+
+ERROR_CAP = 30.0
+"""Beyond this e_k, 1 − exp(−e_k) rounds to one; d_k stays below it."""
+LEAST_SPREAD = 0.01
+"""Least p95 − median of a joint's error, z units: below it, held-out jobs differ by rounding and sensor noise."""
+TAU = CHANNELS.index("tau")
+PARTS = len(CHANNELS) + 2
+"""Numbers per joint in packed features: error of each channel, one-sided torque error, excess tau²."""
+TIE = 1e-5
+"""Scores closer than this relative difference are equal: the last digits of float32 depend on the batch, and counting
+a tie as higher keeps the p-value valid."""
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Reconstruction errors of motion, time means; any leading axes, such as [job]."""
+
+    packed: Array
+    """[..., joint, part]; see `PARTS`."""
+
+    def __post_init__(self) -> None:
+        if self.packed.ndim < 2 or self.packed.shape[-1] != PARTS:
+            raise ValueError(f"Features.packed must be [..., joint, {PARTS}] (got {self.packed.shape}).")
+
+    @property
+    def errors(self) -> Array:
+        """|x − x̂| in training standard deviations, [..., joint, channel]."""
+        return self.packed[..., : len(CHANNELS)]
+
+    @property
+    def one_sided(self) -> Array:
+        """max(0, |tau| − |tau_hat|) in training standard deviations, [..., joint]: torque above the reconstruction."""
+        return self.packed[..., len(CHANNELS)]
+
+    @property
+    def excess_sq(self) -> Array:
+        """max(0, tau² − tau_hat²), (N·m)², [..., joint]: torque that heats beyond the reconstruction."""
+        return self.packed[..., len(CHANNELS) + 1]
+
+    @property
+    def difficulty(self) -> Array:
+        """d_k = 1 − exp(−e_k) with e_k the error summed over channels, [..., joint], each in [0, 1)."""
+        return _saturated(self.errors.sum(axis=-1))
+
+    @property
+    def load(self) -> Array:
+        """One-sided torque difficulty 1 − exp(−one-sided error), [..., joint], each in [0, 1)."""
+        return _saturated(self.one_sided)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The features of held-out cool jobs, on none of which the twin was trained."""
+
+    reference: Features
+    """[job, joint, part]."""
+
+    def __post_init__(self) -> None:
+        if self.reference.packed.ndim != 3 or len(self.reference.packed) < 2:
+            raise ValueError(
+                "A calibration needs the features of two or more held-out cool jobs, better a hundred "
+                f"(got shape {self.reference.packed.shape})."
+            )
+
+    @cached_property
+    def floor(self) -> Array:
+        """Median e_k of the cool jobs, [joint]."""
+        return np.median(self.reference.errors.sum(axis=-1), axis=0)
+
+    @cached_property
+    def spread(self) -> Array:
+        """95th percentile minus median of e_k, at least `LEAST_SPREAD`, [joint]."""
+        high = np.percentile(self.reference.errors.sum(axis=-1), 95, axis=0)
+        return np.maximum(high - self.floor, LEAST_SPREAD)
+
+    @cached_property
+    def usual(self) -> Array:
+        """Median error of each channel, [joint, channel]."""
+        return np.median(self.reference.errors, axis=0)
+
+    def difficulty(self, features: Features) -> Array:
+        """1 − exp(−ln 2 · max(0, e_k − median) / (p95 − median)), [..., joint].
+
+        Zero for half of the cool jobs, one half at their 95th percentile, almost one far beyond.
+        """
+        beyond = np.maximum(features.errors.sum(axis=-1) - self.floor, 0.0) / self.spread
+        return _saturated(np.log(2) * beyond)
+
+    def p_value(self, features: Features, score: str) -> Array:
+        """Share of cool jobs that score as high, [...]; see `twin.conformal.p_value`.
+
+        Valid for cool jobs exchangeable with the reference (one-class: Bates et al., Annals of Statistics 51, 2023),
+        not for light motion of a new kind.
+        """
+        scores = score_of(features, score, self)
+        return p_value(np.sort(score_of(self.reference, score, self)), scores - TIE * np.abs(scores))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Measures:
+    """All measures of one job, or of many with a leading axis [job]."""
+
+    difficulty: Array
+    """d_k of the paper, [joint]; their sum is d."""
+    calibrated: Array | None
+    """d_k measured from the median of cool jobs, [joint]; None without a calibration."""
+    load: Array
+    """One-sided torque difficulty, [joint]: counts only torque above the reconstruction."""
+    shares: Array
+    """Share of each joint and channel in the error above the median of cool jobs (in all error, without a calibration),
+    [joint, channel]. Sums to one, or to zero without such error."""
+    heavier: Array
+    """Whether a joint's torque error is mostly more load, bool [joint]."""
+    p_value: Array | None
+    """Conformal p-value, scalar; None without a calibration."""
+    version: str
+    """Version of the twin."""
+
+    @property
+    def total(self) -> Array:
+        """d = Σ_k d_k, scalar."""
+        return self.difficulty.sum(axis=-1)
+
+    def of_job(self, i: int) -> "Measures":
+        """The measures of one of many jobs."""
+        if self.difficulty.ndim < 2:
+            raise ValueError("These are the measures of one job.")
+        return Measures(
+            difficulty=self.difficulty[i],
+            calibrated=None if self.calibrated is None else self.calibrated[i],
+            load=self.load[i],
+            shares=self.shares[i],
+            heavier=self.heavier[i],
+            p_value=None if self.p_value is None else self.p_value[i],
+            version=self.version,
+        )
+
+    def why(self, most: int = 2) -> str:
+        """The largest causes as text, `joint 2: more load (61 %), joint 4: a new place (20 %)`."""
+        if self.shares.ndim != 2:
+            raise ValueError("Ask for the reasons of one job: measures.of_job(i).why().")
+        order = np.argsort(-self.shares, axis=None, kind="stable")[:most]
+        places = [divmod(int(flat), len(CHANNELS)) for flat in order if self.shares.flat[flat] > 0]
+        causes = [f"joint {j + 1}: {self._cause(j, c)} ({100 * self.shares[j, c]:.0f} %)" for j, c in places]
+        return ", ".join(causes) or "nothing beyond the usual"
+
+    def _cause(self, joint: int, channel: int) -> str:
+        if channel == TAU:
+            return "more load" if self.heavier[joint] else "another load"
+        return ("a new place", "a new speed")[channel]
+
+
+def measures_of(features: Features, calibration: Calibration | None, *, score: str, version: str) -> Measures:
+    """Measures of features with any leading axes; the p-value ranks jobs by `score`."""
+    beyond = features.errors
+    if calibration is not None:
+        beyond = np.maximum(beyond - calibration.usual, 0.0)
+    whole = beyond.sum(axis=(-2, -1), keepdims=True)
+    return Measures(
+        difficulty=features.difficulty,
+        calibrated=None if calibration is None else calibration.difficulty(features),
+        load=features.load,
+        shares=np.divide(beyond, whole, out=np.zeros_like(beyond), where=whole > 0),
+        heavier=features.one_sided > 0.5 * features.errors[..., TAU],
+        p_value=None if calibration is None else calibration.p_value(features, score),
+        version=version,
+    )
+
+
+def score_of(features: Features, score: str, calibration: Calibration | None = None) -> Array:
+    """One number per job, [...]: any of `SCORES`, or `joint_k` for d of joint k, counted from one.
+
+    Raises:
+        ValueError: another name, or `calibrated_…` without a calibration.
+    """
+    if score in SCORES:
+        return SCORES[score](features)
+    if score in _CALIBRATED:
+        if calibration is None:
+            raise ValueError(f"The score '{score}' needs a twin with a calibration: Twin.with_calibration.")
+        return _CALIBRATED[score](calibration.difficulty(features))
+    joints = {f"joint_{k + 1}": k for k in range(features.packed.shape[-2])}
+    if score in joints:
+        return features.difficulty[..., joints[score]]
+    raise ValueError(f"No score '{score}'{nearest(score, [*SCORES, *_CALIBRATED, *joints])}")
+
+
+SCORES: Mapping[str, Callable[[Features], Array]] = {
+    "sum": lambda features: features.difficulty.sum(axis=-1),
+    "max": lambda features: features.difficulty.max(axis=-1),
+    "load": lambda features: features.load.sum(axis=-1),
+    "load_max": lambda features: features.load.max(axis=-1),
+    "excess": lambda features: features.excess_sq.sum(axis=-1),
+}
+"""Sum and maximum over joints of the paper's d, and of the one-sided torque difficulty; sum of the excess tau²."""
+_CALIBRATED: Mapping[str, Callable[[Array], Array]] = {
+    "calibrated_sum": lambda difficulty: difficulty.sum(axis=-1),
+    "calibrated_max": lambda difficulty: difficulty.max(axis=-1),
+}
+
+
+def _saturated(error: Array) -> Array:
+    return difficulty_of_error(np.minimum(error, ERROR_CAP))

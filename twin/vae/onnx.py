@@ -1,0 +1,96 @@
+"""A twin as one ONNX file, which scores motion without Python or torch.
+
+Input `windows` in SI units, double [batch, time, joint, channel]: an angle of several turns over a small standard
+deviation needs more digits than a float has. Outputs `reconstruction` (SI, double, angles near the training data),
+`errors` (time mean of |x − x̂| in z-scores, [batch, joint, channel]) and `mu` ([batch, net, latent]).
+"""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from fleet.errors import FleetError
+from fleet.files import atomic_path
+from fleet.motion import CHANNELS
+from twin.logs.recording import CONTINUOUS
+from twin.vae.twin import Twin
+from twin.vae.window import Q
+
+MODEL = "twin.onnx"
+OPSET = 17
+
+
+class ExportError(FleetError):
+    """A twin could not be exported; the message names what is missing."""
+
+
+def export_onnx(twin: Twin, path: Path) -> Path:
+    """Write the twin as ONNX; its metadata names arm, version, training data, channels and rate.
+
+    Args:
+        path: A file that ends in `.onnx`, or a folder, made if need be, for `twin.onnx`.
+
+    Returns:
+        The file.
+
+    Raises:
+        ExportError: the package onnx is not installed.
+    """
+    try:
+        import onnx
+    except ImportError:
+        raise ExportError("Export to ONNX needs the extra 'onnx': pip install 'thermofleet[onnx]'.") from None
+    file = path if path.suffix == ".onnx" else path / MODEL
+    file.parent.mkdir(parents=True, exist_ok=True)
+    example = torch.zeros(2, twin.config.window, twin.joints, len(CHANNELS), dtype=torch.float64)
+    with atomic_path(file) as draft:
+        with warnings.catch_warnings(), torch.inference_mode(False), torch.no_grad():
+            # The dynamo exporter needs onnxscript. The warning about LSTMs with a varying batch does not apply: ours
+            # start from zeros of the batch's own size. tests/twin/test_export.py runs other sizes.
+            warnings.simplefilter("ignore")
+            torch.onnx.export(
+                _OnnxTwin(twin),
+                (example,),
+                str(draft),
+                input_names=["windows"],
+                output_names=["reconstruction", "errors", "mu"],
+                dynamic_axes={name: {0: "batch"} for name in ("windows", "reconstruction", "errors", "mu")},
+                opset_version=OPSET,
+                dynamo=False,
+            )
+        model = onnx.load(str(draft))
+        metadata = {
+            "twin_version": twin.version,
+            "arm": twin.arm,
+            "data_hash": twin.data_hash,
+            "channels": ",".join(CHANNELS),
+            "rate_hz": repr(twin.config.rate_hz),
+            "window": str(twin.config.window),
+        }
+        onnx.helper.set_model_props(model, metadata)
+        onnx.save(model, str(draft))
+    return file
+
+
+class _OnnxTwin(nn.Module):
+    """Windows in SI units to reconstruction, errors and latent means, as `Twin` computes them."""
+
+    def __init__(self, twin: Twin) -> None:
+        super().__init__()
+        self.networks, self.steps = twin.networks, twin.config.window
+        turns = np.zeros((twin.joints, len(CHANNELS)))
+        turns[[j for j in CONTINUOUS if j < twin.joints], Q] = 2 * np.pi
+        home = np.zeros_like(turns)
+        home[:, Q] = twin.scaler.turn_q
+        for name, value in (("turn", turns), ("home", home), ("mean", twin.scaler.mean), ("std", twin.scaler.std)):
+            self.register_buffer(name, torch.from_numpy(np.array(value, dtype=float)))
+
+    def forward(self, windows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        turn, home, mean, std = (self.get_buffer(name) for name in ("turn", "home", "mean", "std"))
+        away = (windows.mean(dim=1, keepdim=True) - home) / (2 * torch.pi)
+        z = ((windows - turn * torch.round(away) - mean) / std).float()
+        z_hat, mu = self.networks(z, self.steps)
+        return z_hat.double() * std + mean, (z - z_hat).abs().mean(dim=1), mu

@@ -1,0 +1,255 @@
+"""The twin of one arm: how far motion is from the motion that the arm was trained on, joint by joint."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from weakref import WeakKeyDictionary
+
+import msgspec
+import numpy as np
+import torch
+
+from fleet.difficulty import Difficulty
+from fleet.motion import CHANNELS, Plan
+from twin.vae import inference
+from twin.vae.measures import PARTS, TAU, Calibration, Features, Measures, measures_of
+from twin.vae.model import LstmVae, TwinConfig
+from twin.vae.window import PHASES, Scaler, check_jobs, cut_phases
+
+Array = np.ndarray
+
+_CHUNK = 128
+"""Plans per pass: bounds the memory for their windows and keeps it in cache."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit:
+    """How well one network reconstructs its training windows, and how its training went."""
+
+    elbo: float
+    """Nats per window, without the constant of the likelihood; of an autoencoder, minus half the squared error."""
+    kl: float
+    """Nats per window; 0 for an autoencoder, which has none."""
+    active_units: int
+    """Latent units that tell windows apart."""
+    mean_squared_error: float
+    """In z-scores, decoded from the posterior mean."""
+    restart: int
+    """Index of the restart that was kept."""
+    restart_elbos: tuple[float | None, ...] = ()
+    """ELBO by which the restarts were compared; None for one that diverged."""
+    elbo_by_epoch: tuple[float, ...] = ()
+    """Mean over the epoch's batches, nats per window, with sensor noise and β as trained."""
+    kl_by_epoch: tuple[float, ...] = ()
+    """The same of the KL, 0 for an autoencoder."""
+
+
+class Twin:
+    """A trained twin; implements `fleet.difficulty.DifficultyModel`. Scores are kept while their plan is alive.
+
+    Args:
+        nets: One network per joint, or one for the arm.
+        arm: Name of the arm.
+        data_hash: Hash of the training data.
+        seed: Training seed, as text.
+        fits: Quality of each network.
+        calibration: Features of held-out cool jobs; None until `with_calibration`.
+    """
+
+    def __init__(
+        self,
+        config: TwinConfig,
+        scaler: Scaler,
+        nets: Sequence[LstmVae],
+        *,
+        arm: str,
+        data_hash: str,
+        seed: str,
+        fits: Sequence[Fit],
+        calibration: Calibration | None = None,
+    ) -> None:
+        wanted = config.networks(scaler.joints)
+        if not len(nets) == len(fits) == wanted:
+            raise ValueError(
+                f"A twin of scope '{config.scope}' for {scaler.joints} joints needs {wanted} network(s) and fits "
+                f"(got {len(nets)} and {len(fits)})."
+            )
+        if calibration is not None and calibration.reference.packed.shape[1] != scaler.joints:
+            raise ValueError(
+                f"The calibration is for {calibration.reference.packed.shape[1]} joints, the twin has {scaler.joints}."
+            )
+        self.config = config
+        self.scaler = scaler
+        self.arm = arm
+        self.data_hash = data_hash
+        self.seed = seed
+        self.fits = tuple(fits)
+        self.calibration = calibration
+        self.networks = inference.Networks(nets)
+        self._scored: WeakKeyDictionary[Plan, Array] = WeakKeyDictionary()
+
+    def __getstate__(self) -> dict[str, object]:
+        return {name: value for name, value in self.__dict__.items() if name != "_scored"}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        self.__dict__.update(state)
+        self._scored = WeakKeyDictionary()
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return self.scaler.joints
+
+    @property
+    def nets(self) -> tuple[LstmVae, ...]:
+        """The networks, one per joint or one for the arm."""
+        return self.networks.nets
+
+    @property
+    def version(self) -> str:
+        """Hash of configuration, scaler, weights, training data and calibration."""
+        return self._content_hash
+
+    @cached_property
+    def _content_hash(self) -> str:
+        digest = hashlib.sha256()
+        digest.update(msgspec.json.encode([self.config, self.arm, self.data_hash, self.seed, self.fits]))
+        for name in ("turn_q", "mean", "std", "still"):
+            digest.update(np.ascontiguousarray(getattr(self.scaler, name)).tobytes())
+        for name, tensor in sorted(self.tensors().items()):
+            digest.update(f"{name}{tuple(tensor.shape)}".encode())
+            digest.update(tensor.numpy().tobytes())
+        if self.calibration is not None:
+            digest.update(np.ascontiguousarray(self.calibration.reference.packed, dtype=float).tobytes())
+        return digest.hexdigest()[:16]
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """All weights by name, such as `joint_1.encoder.weight_ih_l0` or `arm.encoder.weight_ih_l0`."""
+        names = net_names(self.config, self.joints)
+        return {
+            f"{net_name}.{name}": tensor.contiguous()
+            for net_name, net in zip(names, self.nets, strict=True)
+            for name, tensor in net.state_dict().items()
+        }
+
+    def score(self, plan: Plan, repetitions: int) -> Difficulty:
+        """Difficulty of doing the plan so many times: d_k = 1 − exp(−e_k), e_k the mean error over the job's time.
+
+        Raises:
+            ValueError: repetitions < 1, an empty plan, or a plan that is not finite or has other joints.
+        """
+        return Difficulty(self.features([plan], [repetitions]).difficulty[0])
+
+    def measure(self, plan: Plan, repetitions: int, *, score: str = "load") -> Measures:
+        """All measures of one job; `score` is what the p-value ranks jobs by (`measures.score_of`)."""
+        return self.measures([plan], [repetitions], score=score).of_job(0)
+
+    def measures(self, plans: Sequence[Plan], repetitions: Sequence[int], *, score: str = "load") -> Measures:
+        """All measures of many jobs, arrays with a leading axis [job]."""
+        return self.measures_of(self.features(plans, repetitions), score=score)
+
+    def measures_of(self, features: Features, *, score: str = "load") -> Measures:
+        """All measures of this twin's features, of jobs or of windows."""
+        return measures_of(features, self.calibration, score=score, version=self.version)
+
+    def with_calibration(self, jobs: Sequence[tuple[Plan, int]]) -> "Twin":
+        """The same twin, calibrated on held-out cool jobs (plan, repetitions).
+
+        Raises:
+            ValueError: fewer than two jobs.
+        """
+        return self.with_reference(self.features([plan for plan, _ in jobs], [times for _, times in jobs]))
+
+    def with_reference(self, reference: Features) -> "Twin":
+        """The same twin, calibrated on the features [job, joint, part] of held-out cool jobs."""
+        return Twin(
+            self.config,
+            self.scaler,
+            self.nets,
+            arm=self.arm,
+            data_hash=self.data_hash,
+            seed=self.seed,
+            fits=self.fits,
+            calibration=Calibration(reference),
+        )
+
+    def features(self, plans: Sequence[Plan], repetitions: Sequence[int]) -> Features:
+        """Time means over whole jobs, [job, joint]; new plans go through the networks together.
+
+        Raises:
+            ValueError: as `score`, or unequal numbers of plans and repetitions.
+        """
+        check_jobs(plans, repetitions, least=0)
+        new = [plan for plan in dict.fromkeys(plans) if plan not in self._scored]
+        for first in range(0, len(new), _CHUNK):
+            self._score_phases(new[first : first + _CHUNK])
+        weights = [plan.weights(times) for plan, times in zip(plans, repetitions, strict=True)]
+        shares = np.reshape(weights, (len(plans), len(PHASES)))
+        packed = np.reshape([self._scored[plan] for plan in plans], (*shares.shape, self.joints, PARTS))
+        return Features(np.einsum("np,npjf->njf", shares, packed))
+
+    def window_features(self, windows: Array) -> Features:
+        """Time means of windows [batch, time, joint, channel] in SI units, [batch, joint]."""
+        return Features(self._window_features(self._to_z(windows), np.full(windows.shape[:2], 1.0 / windows.shape[1])))
+
+    def window_errors(self, windows: Array) -> Array:
+        """Time mean of |x − x̂| of windows in SI units, in training standard deviations, [batch, joint, channel]."""
+        return self.window_features(windows).errors
+
+    def posterior(self, windows: Array) -> tuple[Array, Array]:
+        """Mean and standard deviation of the latent of windows in SI units, each [batch, net, latent]."""
+        return inference.posterior(self.networks, self._to_z(windows))
+
+    def latent(self, windows: Array) -> Array:
+        """Posterior means of windows [batch, time, joint, channel] in SI units, [batch, net, latent]."""
+        return self.posterior(windows)[0]
+
+    def decode(self, latent: Array) -> Array:
+        """Decoded latents [batch, net, latent], SI units, [batch, time, joint, channel]."""
+        wanted = (len(self.nets), self.config.latent)
+        if latent.ndim != 3 or latent.shape[1:] != wanted:
+            raise ValueError(f"Latents must be [batch, {wanted[0]}, {wanted[1]}] (got {latent.shape}).")
+        return self.scaler.to_si(inference.decode(self.networks, latent, self.config.window))
+
+    def reconstruct(self, windows: Array) -> Array:
+        """Reconstructed windows, SI units, [batch, time, joint, channel]; angles near the training data."""
+        return self.scaler.to_si(inference.reconstruct(self.networks, self._to_z(windows)))
+
+    def _to_z(self, windows: Array) -> Array:
+        wanted = (self.config.window, self.joints, len(CHANNELS))
+        if windows.ndim != 4 or windows.shape[1:] != wanted:
+            raise ValueError(f"Windows must be [batch, {wanted[0]}, {wanted[1]}, {wanted[2]}] (got {windows.shape}).")
+        if not np.isfinite(windows).all():
+            raise ValueError("Windows must be finite.")
+        return self.scaler.to_z(windows)
+
+    def _score_phases(self, plans: Sequence[Plan]) -> None:
+        """Keep the features of each phase, [phase, joint, part], while the plan lives; zeros for an empty phase."""
+        for plan in plans:
+            for name, phase in zip(PHASES, plan.phases, strict=True):
+                if phase.profile.shape[-1] != self.joints:
+                    raise ValueError(
+                        f"The twin of '{self.arm}' has {self.joints} joints, {name.capitalize()} of arm '{plan.arm}' "
+                        f"{phase.profile.shape[-1]}."
+                    )
+        phases = cut_phases(plans, self.config)
+        packed = phases.total(self._window_features(self.scaler.to_z(phases.windows), phases.weight))
+        for plan, of_plan in zip(plans, np.split(packed, len(plans)), strict=True):
+            self._scored[plan] = of_plan
+
+    def _window_features(self, z: Array, weights: Array) -> Array:
+        """Packed features of windows in z-scores, summed over time with weights [batch, time], [batch, joint, part]."""
+        z_hat = inference.reconstruct(self.networks, z)
+        std, offset = self.scaler.std[:, TAU], self.scaler.mean[:, TAU] / self.scaler.std[:, TAU]
+        size, size_hat = np.abs(z[..., TAU] + offset), np.abs(z_hat[..., TAU] + offset)
+        packed = np.empty((len(z), self.joints, PARTS))
+        packed[..., : len(CHANNELS)] = np.einsum("bt,btjc->bjc", weights, np.abs(z - z_hat))
+        packed[..., -2] = np.einsum("bt,btj->bj", weights, np.maximum(size - size_hat, 0.0))
+        packed[..., -1] = np.einsum("bt,btj->bj", weights, np.maximum(size**2 - size_hat**2, 0.0)) * std**2
+        return packed
+
+
+def net_names(config: TwinConfig, joints: int) -> list[str]:
+    """Names of the networks in a checkpoint and in errors."""
+    return ["arm"] if config.scope == "arm" else [f"joint_{j + 1}" for j in range(joints)]
