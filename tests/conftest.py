@@ -1,6 +1,8 @@
 """Small worlds in which every figure is known beforehand: constant torques, whole seconds, no MuJoCo and no twin."""
 
 import os
+import threading
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
@@ -212,6 +214,19 @@ class AsArrays:
             after=np.array([[index[name] for name in each.after] or [-1] for each in jobs], dtype=int).reshape(-1, 1),
             noise_key=key_of(sensors),
         )
+
+
+@pytest.fixture(scope="session")
+def token_reaches():
+    """Waits until a client sees a token that another has just declared: it passes through the router first."""
+
+    def wait(link, key):
+        deadline_s, pause = time.monotonic() + 60.0, threading.Event()
+        while not link.tokens(key, timeout_s=60.0):
+            assert time.monotonic() < deadline_s, f"{key} was not seen"
+            pause.wait(0.02)
+
+    return wait
 
 
 @pytest.fixture(scope="session")

@@ -222,8 +222,9 @@ def test_nothing_is_lost_while_the_auctioneer_is_gone(bus):
     assert len({award.award for award in arm.awards}) == 2
 
 
-def test_a_fleet_has_one_auctioneer(bus):
+def test_a_fleet_has_one_auctioneer(bus, token_reaches):
     node = bus.auctioneer("one")
+    token_reaches(bus.link(), keys.of_auction("f", "one", "alive"))
     # While the second one asks, the first is not served, as if it stood still: its token tells.
     with pytest.raises(BusError, match=r"has an auctioneer already: 'one'. A fleet has one"):
         bus.auctioneer("two")
@@ -233,7 +234,7 @@ def test_a_fleet_has_one_auctioneer(bus):
     assert states(bus.auctioneer("one")) == []
 
 
-def test_one_that_answers_and_shows_no_token_yet_is_an_auctioneer_too(bus):
+def test_one_that_answers_and_shows_no_token_yet_is_an_auctioneer_too(bus, token_reaches):
     early = bus.link()
     early.reply_to(keys.of_jobs("f", "status"), StatusRequest, lambda _: Status("one", 0.0, ()))
     early.watch_tokens(keys.of_every_arm("f", "alive"), lambda *_: None)
@@ -252,6 +253,7 @@ def test_one_that_answers_and_shows_no_token_yet_is_an_auctioneer_too(bus):
             bus.auctioneer("two")
         with bus.link() as arm:
             arm.declare_token(keys.of_arm("f", "one", "alive"))
+            token_reaches(early, keys.of_arm("f", "one", "alive"))
             with pytest.raises(BusError, match=r"share the jobs out themselves; 'one' answers .* Stop them first"):
                 bus.auctioneer("two")
     finally:

@@ -341,11 +341,12 @@ def test_a_snapshot_is_json(fleet):
 
 
 @pytest.mark.parametrize("fleets", [(), ("f", "g")])
-def test_which_fleet_is_meant_must_be_clear(fleets):
+def test_which_fleet_is_meant_must_be_clear(fleets, token_reaches):
     with Router() as router:
         links = [BusClient(router.endpoint, name).open() for name in fleets]
         for link in links:
             link.declare_token(keys.of_arm(link.fleet, "a", "alive"))
+            token_reaches(links[0], keys.of_arm(link.fleet, "a", "alive"))
         done = subprocess.run(command("--endpoint", router.endpoint), capture_output=True, text=True, timeout=60)
         for link in links:
             link.close()

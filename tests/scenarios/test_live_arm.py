@@ -182,19 +182,20 @@ def test_a_log_lives_as_an_arm(small_toml, plans, log, tmp_path):
             assert state.time_s - began_s == pytest.approx(into_s, abs=0.1 + 1e-6)
 
 
-def test_no_second_arm_lives_under_a_name():
+def test_no_second_arm_lives_under_a_name(token_reaches):
     with Router(0) as router, BusClient(router.endpoint, "f") as first, BusClient(router.endpoint, "f") as second:
         first.declare_token(keys.of_arm("f", "a", "alive"))
+        token_reaches(second, keys.of_arm("f", "a", "alive"))
         wait_for_name(second, "b", patience_s=PATIENCE_S)
         with pytest.raises(BusError, match="Arm 'a' of fleet 'f' is already running"):
             wait_for_name(second, "a", patience_s=0.3)
 
 
-def test_an_arm_waits_for_the_token_of_its_last_life_to_go():
+def test_an_arm_waits_for_the_token_of_its_last_life_to_go(token_reaches):
     with Router(0) as router, BusClient(router.endpoint, "f") as second:
         with BusClient(router.endpoint, "f") as first:
             first.declare_token(keys.of_arm("f", "a", "alive"))
-            assert second.tokens(keys.of_arm("f", "a", "alive"), timeout_s=PATIENCE_S)
+            token_reaches(second, keys.of_arm("f", "a", "alive"))
             leaves = threading.Timer(0.3, first.close)
             leaves.start()
             wait_for_name(second, "a", patience_s=PATIENCE_S)

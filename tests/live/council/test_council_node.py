@@ -218,10 +218,11 @@ def test_whoever_was_away_is_told_of_jobs_and_of_how_they_ended(bus):
     assert bus.serve(lambda: "b" in back.granter.register.settled and "c" in back.jobs)
 
 
-def test_where_an_auctioneer_is_arms_do_not_share_jobs_out(bus):
+def test_where_an_auctioneer_is_arms_do_not_share_jobs_out(bus, token_reaches):
     with BusClient(bus.endpoint, "f") as link, BusClient(bus.endpoint, "f") as other:
         refuse_auctioneer(link)
         other.declare_token(keys.of_auction("f", "boss", "alive"))
+        token_reaches(link, keys.of_auction("f", "boss", "alive"))
         with pytest.raises(BusError, match="has an auctioneer: 'boss'"):
             refuse_auctioneer(link)
 
