@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, get_args
 
 import networkx as nx
@@ -58,6 +59,7 @@ class Work:
         if self.force_n and self.kind != "press":
             raise ValueError(f"Only a press has a contact force; this is a {self.kind} with {self.force_n} N.")
 
+    @cached_property
     def stations(self) -> tuple[str, ...]:
         """Names of the stations it occupies."""
         return tuple(dict.fromkeys(place.name for place in self.places))
@@ -84,23 +86,22 @@ class Job:
             raise ValueError(f"Job '{self.name}': needs 0 <= release_s <= due_s (got {self.release_s}, {self.due_s}).")
 
 
-def precedence(jobs: Sequence[Job]) -> nx.DiGraph:
-    """Precedence of jobs as a graph of names with edges from earlier to later.
+def check_precedence(jobs: Sequence[Job]) -> None:
+    """Check that the jobs can be done in some order.
 
     Raises:
         ValueError: two jobs have one name, a predecessor does not exist, or the jobs wait for each other in a ring.
     """
-    graph = nx.DiGraph()
+    names: set[str] = set()
     for job in jobs:
-        if job.name in graph:
+        if job.name in names:
             raise ValueError(f"Two jobs are called '{job.name}'.")
-        graph.add_node(job.name)
-    for job in jobs:
-        for name in job.after:
-            if name not in graph:
-                raise ValueError(f"Job '{job.name}' waits for '{name}', which does not exist.")
-            graph.add_edge(name, job.name)
-    if not nx.is_directed_acyclic_graph(graph):
+        names.add(job.name)
+    edges = [(before, job.name) for job in jobs for before in job.after]
+    for before, name in edges:
+        if before not in names:
+            raise ValueError(f"Job '{name}' waits for '{before}', which does not exist.")
+    graph = nx.DiGraph(edges)
+    if edges and not nx.is_directed_acyclic_graph(graph):
         ring = " → ".join(edge[0] for edge in nx.find_cycle(graph))
         raise ValueError(f"Jobs wait for each other in a ring: {ring}.")
-    return graph

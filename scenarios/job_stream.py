@@ -106,6 +106,8 @@ class JobSampler:
 
     def __init__(self, scenario: Scenario) -> None:
         streams = scenario.jobs
+        self._streams = streams
+        self._works = [works_of(scenario, stream) for stream in streams]
         self._arrivals = [stream.arrivals.arrivals() for stream in streams]
         self._horizon_s = scenario.ticks * scenario.decision_interval_s
         self._table = arrival_table(self._arrivals, self._horizon_s)
@@ -143,27 +145,31 @@ class JobSampler:
         stream, number, payload, extra = job[:total].T
         return SampledJobs(stream, number, payload, extra, release_s[:total], after[:total])
 
+    def jobs(self, seed: np.random.SeedSequence) -> tuple[Job, ...]:
+        """The jobs of one shift in order of release."""
+        sampled, streams = self.sample(seed), self._streams
+        stream, number, payload, release_s = (
+            getattr(sampled, name).tolist() for name in ("stream", "number", "payload", "release_s")
+        )
+        repetitions = (self.fewest[sampled.stream] + sampled.extra).tolist()
+        names = [f"{streams[i].name}-{n + 1:03d}" for i, n in zip(stream, number, strict=True)]
+        return tuple(
+            Job(
+                name=names[j],
+                work=self._works[i][payload[j]],
+                repetitions=repetitions[j],
+                release_s=release_s[j],
+                due_s=release_s[j] + streams[i].due_s,
+                value=streams[i].value,
+                after=tuple(names[k] for k in after if k >= 0),
+            )
+            for j, (i, after) in enumerate(zip(stream, sampled.after.tolist(), strict=True))
+        )
+
 
 def draw_jobs(scenario: Scenario, seed: np.random.SeedSequence) -> tuple[Job, ...]:
     """The jobs of one shift in order of release."""
-    sampler = JobSampler(scenario)
-    sampled = sampler.sample(seed)
-    streams = scenario.jobs
-    works = [works_of(scenario, stream) for stream in streams]
-    rows = zip(sampled.stream.tolist(), sampled.number.tolist(), strict=True)
-    names = [f"{streams[i].name}-{number + 1:03d}" for i, number in rows]
-    return tuple(
-        Job(
-            name=names[j],
-            work=works[i][sampled.payload[j]],
-            repetitions=int(sampler.fewest[i] + sampled.extra[j]),
-            release_s=float(sampled.release_s[j]),
-            due_s=float(sampled.release_s[j]) + streams[i].due_s,
-            value=streams[i].value,
-            after=tuple(names[k] for k in sampled.after[j].tolist() if k >= 0),
-        )
-        for j, i in enumerate(sampled.stream.tolist())
-    )
+    return JobSampler(scenario).jobs(seed)
 
 
 def rehearsal_works(scenario: Scenario) -> tuple[Work, ...]:

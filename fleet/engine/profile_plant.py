@@ -1,6 +1,7 @@
 """The plant whose arms follow their plans exactly, and the sensor readings of any plant."""
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 
@@ -32,12 +33,23 @@ class ProfilePlant:
         self._rest = np.stack([rest_q, np.zeros_like(rest_q), rest_tau], axis=1)  # [arm, channel, joint]
         self._stopped = self._rest.copy()
         """Where the brakes stopped each arm last."""
-        phases = [phase for plan in plans for phase in plan.phases]
-        self._lengths = np.array([len(phase.profile) for phase in phases], dtype=int).reshape(-1, 3)
+        self._phases = [phase for plan in plans for phase in plan.phases]
+
+    @cached_property
+    def _lengths(self) -> Array:
         """Samples of each phase, [plan, phase]."""
-        self._first = np.cumsum([0, *self._lengths.sum(axis=1)])
+        return np.array([len(phase.profile) for phase in self._phases], dtype=int).reshape(-1, 3)
+
+    @cached_property
+    def _first(self) -> Array:
         """Where the samples of each plan begin."""
-        self._samples = np.concatenate([phase.profile for phase in phases]) if phases else np.zeros((1, 3, JOINTS))
+        return np.cumsum([0, *self._lengths.sum(axis=1)])
+
+    @cached_property
+    def _samples(self) -> Array:
+        """Of all plans, one after the other."""
+        profiles = [phase.profile for phase in self._phases]
+        return np.concatenate(profiles) if profiles else np.zeros((1, 3, JOINTS))
 
     def drive(self, world: World, state: State) -> Drive:
         """Not asked for: the engine has the plans' drive in its tables."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -138,10 +138,13 @@ class ShiftRunner:
         self._engine.observe(_FIRST, self._vectors)
         self._deliver()
 
-    @property
+    @cached_property
     def state(self) -> State:
         """The simulator's state, [1, ...]; views that the next step overwrites."""
         return _without_room(self._engine.state, self._episode.world)
+
+    def __getstate__(self) -> dict[str, object]:
+        return {name: value for name, value in vars(self).items() if name != "state"}  # a copy has views of its own
 
     @property
     def vectors(self) -> Array:

@@ -289,9 +289,11 @@ def tables_of(world: World) -> tuple[Tables, Jobs]:
 
 def pad(values: Array, axis: int = -1, size: int = LANES, fill: float = 0.0) -> Array:
     """The values with an axis padded to a size."""
-    width = [(0, 0)] * values.ndim
-    width[axis] = (0, size - values.shape[axis])
-    return np.pad(values, width, constant_values=fill)
+    shape = list(values.shape)
+    shape[axis] = size
+    padded = np.full(shape, fill, values.dtype)
+    padded.swapaxes(axis, -1)[..., : values.shape[axis]] = values.swapaxes(axis, -1)
+    return padded
 
 
 def _station_bits(stations: Array, count: int) -> Array:

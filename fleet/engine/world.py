@@ -1,6 +1,6 @@
 """From nouns to arrays: the plan table, the offers of every arm for every job, and the world of a shift."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from fleet.difficulty import Difficulty, DifficultyModel, Risk, stack_risks
 from fleet.engine.state import JobTable, Offers, PlanTable, World
-from fleet.job import Job, Work, precedence
+from fleet.job import Job, Work, check_precedence
 from fleet.motion import Drive, Plan, drive
 from fleet.motor import Motors, stack_motors
 from fleet.robot import GEN3, Robot, ThermalLimits
@@ -33,7 +33,7 @@ class Arm:
     """Variants per work it can do; a work it cannot do is missing."""
 
     @cached_property
-    def _offered(self) -> dict[tuple[Work, int], tuple[Plan, Difficulty | None] | None]:
+    def _offered(self) -> dict[Work, "ScoredVariants"]:
         return {}
 
     @cached_property
@@ -42,33 +42,46 @@ class Arm:
         return {}
 
     @cached_property
-    def _driven(self) -> dict[int, tuple[Plan, Array, Array, Array]]:
+    def _driven(self) -> dict[int, tuple[Plan, tuple[Array, Array, Array, Array]]]:
         return {}
 
-    def offer(self, work: Work, repetitions: int) -> tuple[Plan, Difficulty | None] | None:
-        """As `best_offer`, asked of its twin once: shift after shift wants the same."""
-        key = (work, repetitions)
-        if key not in self._offered:
-            variants = self.plans.get(work, ())
-            scored = [(plan, self.model.score(plan, repetitions)) for plan in variants]
-            self._offered[key] = min(
-                scored, key=lambda pair: pair[1].total if pair[1] is not None else 0.0, default=None
-            )
-        return self._offered[key]
+    def offers(self, work: Work) -> "ScoredVariants":
+        """Its best variant of a work by number of repetitions; kept, because shift after shift asks for the same."""
+        if work not in self._offered:
+            self._offered[work] = ScoredVariants(self.model, self.plans.get(work, ()))
+        return self._offered[work]
 
-    def driven(self, plan: Plan) -> tuple[Array, Array, Array]:
-        """Of one of its plans: mean squared current and friction heat, [phase, joint], and largest torques, [joint]."""
+    def driven(self, plan: Plan) -> tuple[Array, Array, Array, Array]:
+        """Of one of its plans: durations, s, [phase], mean squared current and friction heat, [phase, joint], and
+        largest torques, [joint]."""
         if id(plan) not in self._driven:  # with the plan itself, so that its id stays its own
+            times_s = np.array([phase.duration_s for phase in plan.phases])
             drives = [drive(phase.profile, self.motors) for phase in plan.phases]
-            peak = np.abs(np.concatenate([phase.profile[:, 2] for phase in plan.phases])).max(axis=0)
+            peak = np.abs(np.concatenate([phase.profile[:, 2] for phase in plan.phases])).max(axis=0).astype(float)
             current_sq, friction_w = (np.array([getattr(d, n) for d in drives]) for n in ("current_sq", "friction_w"))
-            self._driven[id(plan)] = (plan, current_sq, friction_w, peak)
-        return self._driven[id(plan)][1:]
+            self._driven[id(plan)] = plan, (times_s, current_sq, friction_w, peak)
+        return self._driven[id(plan)][1]
 
     def rest_drive(self) -> Drive:
         """Mean heat drive of standing at home, each [joint]."""
         still = np.stack([self.robot.home_q(), np.zeros_like(self.rest_tau), self.rest_tau])[None]
         return drive(still, self.motors)
+
+
+class ScoredVariants(dict[int, tuple[Plan, Difficulty | None] | None]):
+    """The variant with the least difficulty, and that, by number of repetitions; without scores the first variant.
+
+    None where there is no variant. Scored when first asked for.
+    """
+
+    def __init__(self, model: DifficultyModel, variants: Sequence[Plan]) -> None:
+        super().__init__()
+        self._model, self._variants = model, variants
+
+    def __missing__(self, repetitions: int) -> tuple[Plan, Difficulty | None] | None:
+        scored = [(plan, self._model.score(plan, repetitions)) for plan in self._variants]
+        self[repetitions] = min(scored, key=lambda pair: pair[1].total if pair[1] is not None else 0.0, default=None)
+        return self[repetitions]
 
 
 def warm_start(arm: Arm, ambient_c: float) -> Array:
@@ -85,11 +98,6 @@ def warm_start(arm: Arm, ambient_c: float) -> Array:
         raise ValueError(f"Arm '{arm.robot.name}' never settles while standing at home in air of {ambient_c:g} °C.")
     arm.warm_c[ambient_c] = known
     return known.copy()
-
-
-def best_offer(arm: Arm, job: Job) -> tuple[Plan, Difficulty | None] | None:
-    """The variant of a job that the arm's twin finds easiest (without a score: the first), or None if it cannot."""
-    return arm.offer(job.work, job.repetitions)
 
 
 def build_world(
@@ -115,7 +123,7 @@ def build_world(
     start = np.repeat(ambient_c[0][:, None], thermal.capacity.shape[-1], axis=1)
     if start_warm:
         start = np.stack([warm_start(a, c) for a, c in zip(arms, ambient_c[0].tolist(), strict=True)])
-    stations = tuple(dict.fromkeys(name for jobs in shifts for job in jobs for name in job.work.stations()))
+    stations = tuple(dict.fromkeys(name for jobs in shifts for job in jobs for name in job.work.stations))
     world = World(
         arms=tuple(arm.robot.name for arm in arms),
         stations=stations,
@@ -147,16 +155,19 @@ def _laws(arms: tuple[Arm, ...], dt_s: float) -> tuple[Motors, ThermalModel, Dri
 
 
 def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]]) -> tuple[tuple[Plan, ...], Offers]:
-    shape = (len(shifts), len(arms), max(1, *(len(jobs) for jobs in shifts)))
+    shape = (len(shifts), len(arms), max(1, *map(len, shifts)))
     plan, total, p_saturation = np.full(shape, -1), np.full(shape, np.nan), np.full(shape, np.nan)
     risk = np.full(shape, -1)
     rows: dict[int, int] = {}
     plans: list[Plan] = []
     risks: dict[int, tuple[int, Risk]] = {}
+    offered: dict[int, list[ScoredVariants]] = {}  # by id: hashing a work takes longer than the rest
     for e, jobs in enumerate(shifts):
         for j, job in enumerate(jobs):
-            for a, arm in enumerate(arms):
-                offer = best_offer(arm, job)
+            if id(job.work) not in offered:
+                offered[id(job.work)] = [arm.offers(job.work) for arm in arms]
+            for a, offers in enumerate(offered[id(job.work)]):
+                offer = offers[job.repetitions]
                 if offer is None:
                     continue
                 best, score = offer
@@ -178,43 +189,35 @@ def _plan_table(plans: Sequence[Plan], arms: Mapping[str, Arm]) -> PlanTable:
         joints = len(GEN3.velocity)
         empty = np.zeros((1, 3, joints))
         return PlanTable(np.zeros((1, 3)), empty, empty, np.zeros((1, joints)))
-    driven = [arms[plan.arm].driven(plan) for plan in plans]
-    return PlanTable(
-        times_s=np.array([[phase.duration_s for phase in plan.phases] for plan in plans]),
-        current_sq=np.array([current_sq for current_sq, _, _ in driven]),
-        friction_w=np.array([friction_w for _, friction_w, _ in driven]),
-        peak_tau=np.array([peak for _, _, peak in driven], dtype=float),
-    )
+    return PlanTable(*map(np.array, zip(*(arms[plan.arm].driven(plan) for plan in plans), strict=True)))
 
 
 def _job_table(shifts: Sequence[Sequence[Job]], stations: Sequence[str]) -> JobTable:
-    most = max(1, *(len(jobs) for jobs in shifts))
-    waits = max((len(job.after) for jobs in shifts for job in jobs), default=0) or 1
-    places = max((len(job.work.stations()) for jobs in shifts for job in jobs), default=0) or 1
     station = {name: i for i, name in enumerate(stations)}
-
-    def padded(value: float, dtype: type = float) -> Array:
-        return np.full((len(shifts), most), value, dtype=dtype)
-
-    table = JobTable(
-        names=tuple(tuple(job.name for job in jobs) for jobs in shifts),
-        exists=padded(False, bool),
-        release_s=padded(np.inf),
-        due_s=padded(np.inf),
-        value=padded(0.0),
-        payload_kg=padded(0.0),
-        repetitions=padded(1, int),
-        after=np.full((len(shifts), most, waits), -1),
-        stations=np.full((len(shifts), most, places), -1),
-    )
-    for e, jobs in enumerate(shifts):
-        precedence(jobs)
+    after: list[list[list[int]]] = []
+    for jobs in shifts:
+        check_precedence(jobs)
         index = {job.name: j for j, job in enumerate(jobs)}
-        for j, job in enumerate(jobs):
-            table.exists[e, j] = True
-            table.release_s[e, j], table.due_s[e, j], table.value[e, j] = job.release_s, job.due_s, job.value
-            table.payload_kg[e, j], table.repetitions[e, j] = job.work.payload_kg, job.repetitions
-            table.after[e, j, : len(job.after)] = [index[name] for name in job.after]
-            names = job.work.stations()
-            table.stations[e, j, : len(names)] = [station[name] for name in names]
-    return table
+        after.append([[index[name] for name in job.after] for job in jobs])
+    most = max(1, *map(len, shifts))
+
+    def table(of: Callable[[Job], float], missing: float, dtype: type = float) -> Array:
+        rows = [[of(job) for job in jobs] + [missing] * (most - len(jobs)) for jobs in shifts]
+        return np.array(rows, dtype=dtype)
+
+    def lists(rows: Sequence[Sequence[Sequence[int]]]) -> Array:
+        longest = max((len(each) for row in rows for each in row), default=0) or 1
+        full = [[[*each, *[-1] * (longest - len(each))] for each in row] for row in rows]
+        return np.array([row + [[-1] * longest] * (most - len(row)) for row in full], dtype=int)
+
+    return JobTable(
+        names=tuple(tuple(job.name for job in jobs) for jobs in shifts),
+        exists=np.arange(most) < np.array([[len(jobs)] for jobs in shifts]),
+        release_s=table(lambda job: job.release_s, np.inf),
+        due_s=table(lambda job: job.due_s, np.inf),
+        value=table(lambda job: job.value, 0.0),
+        payload_kg=table(lambda job: job.work.payload_kg, 0.0),
+        repetitions=table(lambda job: job.repetitions, 1, int),
+        after=lists(after),
+        stations=lists([[[station[name] for name in job.work.stations] for job in jobs] for jobs in shifts]),
+    )

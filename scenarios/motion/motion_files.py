@@ -98,7 +98,7 @@ def generated_summary(made: Generated, format: Format = "parquet") -> dict[str, 
                 "file": f"motion_{i:03d}.{format}",
                 "source": {
                     "kind": motion.source.work.kind,
-                    "places": list(motion.source.work.stations()),
+                    "places": list(motion.source.work.stations),
                     "elbow": motion.source.elbow,
                     "speed": motion.source.speed,
                 },

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import fields as dataclass_fields
+from functools import cached_property
 from inspect import Parameter, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
@@ -25,7 +26,7 @@ from fleet.planning.plan_cache import rest_torque
 from fleet.seeding import shift_seeds
 from scenarios.cell_layout import cell_of, near_of
 from scenarios.extras import require_extra
-from scenarios.job_stream import all_works, draw_jobs, rehearsal_works, works_of
+from scenarios.job_stream import JobSampler, all_works, rehearsal_works, works_of
 from scenarios.load import load, override
 from scenarios.prepare.planned_arm import PlannedArm, plan_arms
 from scenarios.progress import Progress, quiet
@@ -199,13 +200,17 @@ class ShiftFactory:
     fleet: Fleet
     plant: PlantName = "profile"
 
+    @cached_property
+    def _sampler(self) -> JobSampler:
+        return JobSampler(self.fleet.scenario)
+
     def __call__(self, seed: np.random.SeedSequence) -> "Episode":
         """Draw the jobs and build the world; the same seed gives the same episode."""
         from fleet.engine.shift import Episode
 
         scenario, arms = self.fleet.scenario, self.fleet.arms
         jobs_seed, sensor_seed = shift_seeds(seed)
-        world, plans = world_of(self.fleet, draw_jobs(scenario, jobs_seed))
+        world, plans = world_of(self.fleet, self._sampler.jobs(jobs_seed))
         robots, rest_tau = [arm.robot for arm in arms], np.stack([arm.rest_tau for arm in arms])
         plant: Plant
         if self.plant == "mujoco":

@@ -7,7 +7,7 @@ import pytest
 
 from fleet.difficulty import Blind, Difficulty, Risk
 from fleet.engine.state import initial
-from fleet.engine.world import best_offer, warm_start
+from fleet.engine.world import warm_start
 from fleet.motion import Plan
 from fleet.motor import gen3_motors
 
@@ -34,7 +34,7 @@ def with_variants(small, by_elbow):
 
 def test_an_arm_offers_the_variant_it_finds_easiest(small) -> None:
     arm = with_variants(small, {0: 3.0, 1: 1.0, 2: 2.0})
-    offer = best_offer(arm, small.job("a"))
+    offer = arm.offers(small.work())[3]
     assert offer is not None
     assert offer[0].elbow == 1
     world, _ = small.shop([[small.job("a")]], arms=[arm])
@@ -48,7 +48,7 @@ def test_without_a_score_it_offers_the_first_and_says_nothing(small) -> None:
         with_variants(small, {0: None, 1: None}),
         replace(with_variants(small, {0: 1.0, 1: 0.5}), model=Blind()),
     ):
-        offer = best_offer(arm, small.job("a"))
+        offer = arm.offers(small.work())[3]
         assert offer is not None
         assert (offer[0].elbow, offer[1]) == (0, None)
         world, _ = small.shop([[small.job("a")]], arms=[arm])
@@ -72,7 +72,7 @@ def test_more_of_the_same_work_is_scored_for_itself(small) -> None:
 
 def test_a_work_nobody_planned_is_no_offer(small) -> None:
     arm = small.arm(0, [small.work("rack")])
-    assert best_offer(arm, small.job("a")) is None
+    assert arm.offers(small.work())[3] is None
     world, _ = small.shop([[small.job("a")]], arms=[arm])
     assert world.offers.plan.tolist() == [[[-1]]]
 
