@@ -1,0 +1,46 @@
+"""Links, anchors and file names in the pages of the project lead somewhere."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
+TOP_FOLDERS = ("fleet", "twin", "agents", "scenarios", "tests", "benchmarks", "examples", "docs", "constraints")
+
+
+def anchors(page: Path) -> set[str]:
+    """Anchors of the headings of a page, as GitHub makes them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_link_leads_to_a_file_and_a_heading(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        if target.startswith("http"):
+            continue
+        file, _, anchor = target.partition("#")
+        path = (page.parent / file).resolve() if file else page
+        assert path.exists(), target
+        assert not anchor or anchor in anchors(path), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_path_in_a_page_exists(page):
+    paths = re.findall(rf"\b((?:{'|'.join(TOP_FOLDERS)})/[\w./-]*)", page.read_text(encoding="utf-8"))
+    for path in paths:
+        assert (ROOT / path.rstrip(".")).exists(), path
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_module_in_a_page_exists(page):
+    for name in re.findall(r"\b((?:fleet|twin|agents|scenarios)(?:\.\w+){2,})", page.read_text(encoding="utf-8")):
+        parts = name.split(".")
+        module = [ROOT.joinpath(*parts[:n]) for n in range(len(parts), 0, -1)]
+        found = next(path for path in module if path.is_dir() or path.with_suffix(".py").is_file())
+        rest = parts[len(found.relative_to(ROOT).parts) :]
+        source = found / "__init__.py" if found.is_dir() else found.with_suffix(".py")
+        assert not rest or re.search(rf"\b{rest[0]}\b", source.read_text(encoding="utf-8")), name
