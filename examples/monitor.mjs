@@ -1,12 +1,12 @@
-// Watch a fleet from Node (18 or newer), with no package at all, through `thermofleet gateway`.
+// Monitor a fleet through `thermofleet gateway`, with Node 18 or newer and no packages.
 //
 //     node examples/monitor.mjs http://127.0.0.1:8080/v2 [seconds]
 //
-// Reads the stream of server-sent events and prints a table every second. When the stream breaks it comes back and says
-// the last number it has seen, so no event is missed. A token, if the gateway wants one: THERMOFLEET_TOKEN.
+// Reads the stream of server-sent events and prints a table every second. If the stream ends, it connects again with the
+// number of the last message, so that no event is missed. Set THERMOFLEET_TOKEN if the gateway requires a token.
 
 const [base = "http://127.0.0.1:8080/v2", seconds = "0"] = process.argv.slice(2);
-const arms = new Map(); // name -> what is known of it
+const arms = new Map(); // name -> row of the table
 const jobs = new Map(); // name -> state
 let last = ""; // number of the last message
 
@@ -21,8 +21,8 @@ function arm(name) {
   return arms.get(name);
 }
 
-// One message of the stream: {name, message}, the message as docs/bus.md has it.
-function heard(topic, { name, message }) {
+// Apply one message of the stream: {name, message}, with a message of docs/bus.md.
+function apply(topic, { name, message }) {
   if (topic === "state") {
     const hottest = Math.max(...message.temp_c);
     Object.assign(arm(name), {
@@ -30,7 +30,7 @@ function heard(topic, { name, message }) {
       "hottest °C": hottest.toFixed(1),
       joint: message.temp_c.indexOf(hottest) + 1,
       headroom: message.headroom_k.toFixed(1),
-      job: message.job ?? "", // left out when there is none
+      job: message.job ?? "", // optional
     });
   } else if (topic === "difficulty") {
     const scores = message.jobs.map((job, i) => [job, message.difficulty[i]]).filter(([, d]) => d !== null);
@@ -44,27 +44,27 @@ function heard(topic, { name, message }) {
   }
 }
 
-// Blocks end with an empty line; lines are "field: value", and a line that begins with ":" is a sign of life.
-function take(block) {
+// Parse a block of the stream: lines are "field: value"; a line that begins with ":" is a keep-alive.
+function parse(block) {
   const fields = {};
   for (const line of block.split("\n")) {
     const at = line.indexOf(":");
     if (at > 0) fields[line.slice(0, at)] = line.slice(at + 1).replace(/^ /, "");
   }
   if (fields.id) last = fields.id;
-  if (fields.event === "gap") console.log("some events are missing: we were away for too long");
-  else if (fields.data) heard(fields.event, JSON.parse(fields.data));
+  if (fields.event === "gap") console.log("some events were missed: the connection was lost for too long");
+  else if (fields.data) apply(fields.event, JSON.parse(fields.data));
 }
 
 async function read(signal) {
   const response = await fetch(`${base}/events`, { headers: headers(), signal });
   if (!response.ok) throw new Error((await response.json()).detail);
   const text = response.body.pipeThrough(new TextDecoderStream());
-  let rest = "";
+  let rest = ""; // of the last, incomplete block
   for await (const part of text) {
     const blocks = (rest + part).split("\n\n");
     rest = blocks.pop();
-    blocks.forEach(take);
+    blocks.forEach(parse);
   }
 }
 
@@ -82,9 +82,9 @@ while (!end.signal.aborted) {
   try {
     await read(end.signal);
   } catch (error) {
-    if (!end.signal.aborted) console.error(`${error.message}; trying again`);
+    if (!end.signal.aborted) console.error(`${error.message}; connecting again`);
   }
-  if (!end.signal.aborted) await new Promise((again) => setTimeout(again, 1000));
+  if (!end.signal.aborted) await new Promise((resolve) => setTimeout(resolve, 1000));
 }
 clearInterval(pace);
 show();

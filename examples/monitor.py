@@ -1,9 +1,9 @@
-"""Watch a fleet from another process, with nothing but `eclipse-zenoh` and `json`.
+"""Monitor a fleet with `eclipse-zenoh` and `json` only.
 
 In one terminal:  python examples/monitor.py 7447
 In another:       thermofleet run quickstart --listen 7447 --overwrite
 
-A fleet of processes (thermofleet router, auction, arm) also says what happens to its arms and its jobs.
+In a live fleet (thermofleet up) it also prints the events of arms and the results of jobs.
 """
 
 import json
@@ -12,15 +12,17 @@ import sys
 
 import zenoh
 
-ARMS, AUCTIONS = "thermofleet/v2/*/arm/*/{}", "thermofleet/v2/*/auction/*/{}"
+ARM_KEY, AUCTION_KEY = "thermofleet/v2/*/arm/*/{}", "thermofleet/v2/*/auction/*/{}"
 WAIT_S = 600.0
-"""For the fleet to come: at first it trains its twins."""
+"""Longest wait for the first message: a fleet may train its twins first."""
 QUIET_S = 5.0
-"""Without a word for so long, it has gone."""
+"""Without a message for this time, the fleet has ended."""
+PRINT_EVERY_S = 600.0
+"""Fleet time between two printed states of an arm."""
 
 
 def main(port):
-    """Print, every ten minutes of the shift, how each arm says it is; return how many words were heard."""
+    """Print messages until the fleet ends; return their number."""
     config = {
         "mode": "client",
         "connect": {
@@ -31,7 +33,7 @@ def main(port):
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
     }
     inbox = queue.SimpleQueue()
-    heard, shown = 0, {}
+    count, next_print_s = 0, {}
     print(f"waiting for a fleet at port {port}", flush=True)
     try:
         opened = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
@@ -39,36 +41,36 @@ def main(port):
         sys.exit(f"No fleet listened at port {port} within {WAIT_S:.0f} s; start one with --listen {port}.")
     with opened as session:
         for topic in ("state", "difficulty", "event"):
-            session.declare_subscriber(ARMS.format(topic), inbox.put)
-        session.declare_subscriber(AUCTIONS.format("result"), inbox.put)
+            session.declare_subscriber(ARM_KEY.format(topic), inbox.put)
+        session.declare_subscriber(AUCTION_KEY.format("result"), inbox.put)
         while True:
             try:
-                sample = inbox.get(timeout=QUIET_S if heard else WAIT_S)
+                sample = inbox.get(timeout=QUIET_S if count else WAIT_S)
             except queue.Empty:
                 break
-            heard += 1
-            word = json.loads(sample.payload.to_bytes())
-            kind = str(sample.key_expr).rsplit("/", 1)[1]
-            who = word.get("arm") or word["auctioneer"]
-            if kind in ("event", "result") or word["time_s"] >= shown.get((who, kind), 0.0):
-                shown[who, kind] = word["time_s"] + 600.0
-                print(f"{word['time_s']:7.0f} s  {who:<12} {describe(kind, word)}", flush=True)
-    print(f"heard {heard} words")
-    return heard
+            count += 1
+            message = json.loads(sample.payload.to_bytes())
+            topic = str(sample.key_expr).rsplit("/", 1)[1]
+            sender = message.get("arm") or message["auctioneer"]
+            if topic in ("event", "result") or message["time_s"] >= next_print_s.get((sender, topic), 0.0):
+                next_print_s[sender, topic] = message["time_s"] + PRINT_EVERY_S
+                print(f"{message['time_s']:7.0f} s  {sender:<12} {describe(topic, message)}", flush=True)
+    print(f"{count} messages received")
+    return count
 
 
-def describe(kind, word):
-    """One word in a line."""
-    if kind == "state":
-        return f"{word['mode']:<8} hottest motor {max(word['temp_c']):5.1f} °C"
-    if kind == "event":
-        return f"{word['kind']} {word.get('job', '')} {word.get('reason', '')}".rstrip()
-    if kind == "result":
-        job = word["status"]
+def describe(topic, message):
+    """Summarise a message in one line."""
+    if topic == "state":
+        return f"{message['mode']:<8} hottest motor {max(message['temp_c']):5.1f} °C"
+    if topic == "event":
+        return f"{message['kind']} {message.get('job', '')} {message.get('reason', '')}".rstrip()
+    if topic == "result":
+        job = message["status"]
         return f"{job['job']} is {job['state']} {job.get('arm', '')} {job.get('reason', '')}".rstrip()
-    scores = zip(word["jobs"], word["difficulty"], strict=True)
-    told = ", ".join(f"{job} {d:.2f}" for job, d in scores if d is not None)
-    return f"finds {told}" if told else "finds nothing on offer"
+    pairs = zip(message["jobs"], message["difficulty"], strict=True)
+    scores = ", ".join(f"{job} {d:.2f}" for job, d in pairs if d is not None)
+    return f"difficulty {scores or '-'}"
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""An arm of your own on the bus, with nothing but `eclipse-zenoh` and `json`, by the rules of docs/bus.md.
+"""Example of your own arm on the bus, with `eclipse-zenoh` and `json` only, by the rules of docs/bus.md.
 
     python examples/own_arm.py 7447 my_fleet my_arm
 
-It is a mock: a cycle of a job takes a tenth of a second and warms its one motor a little. It keeps nothing on disk:
-after a crash it comes back with empty hands and takes no award that rests on an old quote, so no job is done twice;
-what it was about to finish is reported unfinished by the auctioneer. An arm with a disk would remember.
+The arm is a mock: a cycle of a job takes 0.1 s and warms its only motor a little. It has no disk: after a crash it
+restarts without jobs and accepts no award on an old quote, so no job is done twice. The auctioneer reports the job that
+it was about to finish as unfinished. An arm with a disk would continue.
 """
 
 import json
@@ -17,27 +17,27 @@ from urllib.parse import quote
 import zenoh
 from zenoh import ext
 
-STATE_S, CYCLE_S, VALID_S = 0.1, 0.1, 3.0
+STATE_S, CYCLE_S, VALID_S, RENEW_S = 0.1, 0.1, 3.0, 0.5
 LIMIT_C, AMBIENT_C = 60.0, 25.0
-DRIFT = 0.01  # clocks may go at rates that differ by so much: our count of a lease must end first
+DRIFT = 0.01  # largest relative difference between two clocks: our measure of a lease must end first
 
 
 class Arm:
-    """All that it knows; its methods run on one thread."""
+    """State of the arm. All methods run on one thread."""
 
     def __init__(self, session, fleet, name):
         self.session, self.name, self.inbox = session, name, queue.SimpleQueue()
         self.root = f"thermofleet/v2/{quote(fleet, safe='')}"
-        self.mine = f"{self.root}/arm/{quote(name, safe='')}"
+        self.own_key = f"{self.root}/arm/{quote(name, safe='')}"
         self.temp_c, self.tick = AMBIENT_C, 0
-        self.zero_s, self.speed = self.clock()
+        self.zero_s, self.speed = self.query_clock()
         self.quotes = {}  # name of a quote -> when it was made
-        self.answers = {}  # name of an award -> what was answered
-        self.hold = None  # the job in hand
+        self.acks = {}  # name of an award -> our reply
+        self.job = None  # the current job
         self.reports = {}  # name of an award -> a report without receipt
 
-    def clock(self):
-        """The fleet's time when our clock began, and its speed; without an auctioneer our own time at speed 1."""
+    def query_clock(self):
+        """Return the fleet time at zero of our clock, and its speed; without an auctioneer, our own time at speed 1."""
         for reply in self.session.get(
             f"{self.root}/clock/now", payload="{}", encoding=encoding("ClockRequest"), timeout=1.0
         ):
@@ -47,20 +47,19 @@ class Arm:
         return -time.monotonic(), 1.0
 
     def now_s(self):
-        """The fleet's time."""
+        """Fleet time."""
         return self.zero_s + self.speed * time.monotonic()
 
     def run(self, seconds):
-        """Live on the bus for so long."""
-        for topic, kind in (("quote", "QuoteRequest"), ("award", "Award")):
-            put = self.ask(topic, kind)
-            self.session.declare_queryable(f"{self.mine}/{topic}", put, complete=True)
-        alive = self.session.liveliness().declare_token(f"{self.mine}/alive")
-        info = self.remembering("info", "Info", 1)
+        """Take part in the fleet for this time."""
+        for topic, name in (("quote", "QuoteRequest"), ("award", "Award")):
+            self.session.declare_queryable(f"{self.own_key}/{topic}", self.enqueue(topic, name), complete=True)
+        alive = self.session.liveliness().declare_token(f"{self.own_key}/alive")
+        info = self.declare_publisher("info", "Info", 1)
         info.put(json.dumps({"arm": self.name, "joints": 1, "twin": "mock"}))
-        self.difficulty = self.remembering("difficulty", "DifficultyScores", 1)
+        self.difficulty = self.declare_publisher("difficulty", "DifficultyScores", 1)
         print(f"ready {self.name}", flush=True)
-        tick_s = asked_s = time.monotonic()
+        tick_s = renewed_s = time.monotonic()
         end_s = tick_s + seconds
         while (now := time.monotonic()) < end_s:
             try:
@@ -68,63 +67,63 @@ class Arm:
             except queue.Empty:
                 tick_s = time.monotonic() + STATE_S
                 self.work()
-                self.say_state()
-                if (self.hold or self.reports) and time.monotonic() > asked_s + 0.5:
-                    asked_s = time.monotonic()
-                    self.renew()
+                self.publish_state()
+                if (self.job or self.reports) and time.monotonic() > renewed_s + RENEW_S:
+                    renewed_s = time.monotonic()
+                    self.renew_lease()
         alive.undeclare()
 
-    def remembering(self, topic, kind, kept):
-        """A publisher whose last words also reach those who come later."""
+    def declare_publisher(self, topic, name, history):
+        """Return a publisher whose last messages also reach late subscribers."""
         return ext.declare_advanced_publisher(
             self.session,
-            f"{self.mine}/{topic}",
-            encoding=encoding(kind),
-            cache=ext.CacheConfig(kept),
+            f"{self.own_key}/{topic}",
+            encoding=encoding(name),
+            cache=ext.CacheConfig(history),
             publisher_detection=True,
             sample_miss_detection=ext.MissDetectionConfig(sporadic_heartbeat=0.5),
         )
 
-    def ask(self, topic, kind):
-        """What Zenoh calls with a question: only a hand-over, the answer is made on our own thread."""
-        return lambda query: self.inbox.put(lambda: self.answer(query, topic, kind))
+    def enqueue(self, topic, name):
+        """Return a callback for Zenoh's thread; the reply is made on our own thread."""
+        return lambda query: self.inbox.put(lambda: self.reply(query, topic, name))
 
-    def answer(self, query, topic, kind):
-        """Answer a question, or say what is wrong with it; either way the query must end."""
+    def reply(self, query, topic, name):
+        """Reply to a query; a malformed request gets a refusal. Every query is finished."""
         with query:
             try:
-                if str(query.encoding) != encoding(kind):
-                    raise ValueError(f"encoded as {query.encoding}, not as {encoding(kind)}")
-                word = json.loads(query.payload.to_bytes())
-                said = self.make_quote(word) if topic == "quote" else self.take(word)
-                reply = {"quote": "Quote", "award": "Ack"}[topic]
+                if str(query.encoding) != encoding(name):
+                    raise ValueError(f"encoding {query.encoding}, expected {encoding(name)}")
+                request = json.loads(query.payload.to_bytes())
+                reply = self.make_quote(request) if topic == "quote" else self.accept(request)
+                reply_name = {"quote": "Quote", "award": "Ack"}[topic]
             except (ValueError, KeyError, TypeError, AttributeError) as error:
-                said, reply = {"reason": f"Not a good {kind}: {error!r}"}, "Refusal"
-            query.reply(f"{self.mine}/{topic}", json.dumps(said), encoding=encoding(reply))
+                reply, reply_name = {"reason": f"Malformed {name}: {error!r}"}, "Refusal"
+            query.reply(f"{self.own_key}/{topic}", json.dumps(reply), encoding=encoding(reply_name))
 
-    def make_quote(self, word):
-        """What each job would cost; a dry run leaves no trace."""
-        name = "" if word.get("dry_run") else f"{self.name}-{uuid.uuid4().hex}"  # never the same again
-        offers = [self.offer(job) for job in word["jobs"]]
+    def make_quote(self, request):
+        """Estimate the cost of each job. The quote of a dry run is not stored."""
+        name = "" if request.get("dry_run") else f"{self.name}-{uuid.uuid4().hex}"  # unique, also after a restart
+        estimates = [self.estimate(job) for job in request["jobs"]]
         if name:
             now = time.monotonic()
             self.quotes = {old: made_s for old, made_s in self.quotes.items() if now < made_s + VALID_S} | {name: now}
-            self.say_difficulty(offers)
+            self.publish_difficulty(estimates)
         return {
             "arm": self.name,
-            "auction": word["auction"],
+            "auction": request["auction"],
             "quote": name,
             "valid_s": VALID_S,
             "twin": "mock",
             "time_s": self.now_s(),
-            "mode": "working" if self.hold else "idle",
+            "mode": "working" if self.job else "idle",
             "headroom_k": LIMIT_C - self.temp_c,
-            "capacity": 0 if self.hold else 1,
-            "estimates": offers,
+            "capacity": 0 if self.job else 1,
+            "estimates": estimates,
         }
 
-    def offer(self, job):
-        """What is not known is left out."""
+    def estimate(self, job):
+        """Return a JobEstimate; unknown values are left out."""
         if job["kind"] == "press":
             return {"job": job["name"], "feasible": False, "reason": "This arm cannot press."}
         cycles, d = job.get("repetitions", 1), 0.1 * job.get("payload_kg", 0.0)
@@ -138,139 +137,138 @@ class Arm:
             "finish_in_s": CYCLE_S * cycles,
         }
 
-    def take(self, award):
-        """Take an award, or say why not. The same award gets the same answer; a quote is good once and for VALID_S."""
+    def accept(self, award):
+        """Accept or reject an award. The same award gets the same reply; a quote is valid once and for VALID_S."""
         name = award["award"]
-        if name not in self.answers:
+        if name not in self.acks:
             quoted_s = self.quotes.pop(award["quote"], None)
             reason = ""
             if quoted_s is None or time.monotonic() > quoted_s + VALID_S:
-                reason = "That quote is too old, or not mine."
-            elif self.hold:
-                reason = "I have my hands full."
+                reason = "The quote is unknown or too old."
+            elif self.job:
+                reason = "This arm has a job."
             else:
-                # The lease is counted from the quote: the auctioneer counts from its award, so its own ends later.
+                # The arm measures the lease from its quote, the auctioneer from its award: the arm's lease ends first.
                 lease_s = award.get("lease_s", 6.0)
-                self.hold = {
+                self.job = {
                     "award": name,
                     "job": award["job"]["name"],
                     "cycles": award.get("cycles", 0),
-                    "wanted": award["job"].get("repetitions", 1),
+                    "repetitions": award["job"].get("repetitions", 1),
                     "auctioneer": award["auctioneer"],
-                    "until_s": quoted_s + (1 - DRIFT) * lease_s,
-                    "leave": False,
+                    "lease_end_s": quoted_s + (1 - DRIFT) * lease_s,
+                    "may_commit": False,
                     "ready_s": time.monotonic() + CYCLE_S,
                 }
-            self.answers[name] = {"arm": self.name, "award": name, "accepted": not reason, "reason": reason}
-        return self.answers[name]
+            self.acks[name] = {"arm": self.name, "award": name, "accepted": not reason, "reason": reason}
+        return self.acks[name]
 
     def work(self):
-        """One cycle, when it is time and the lease holds; the last one only with leave to finish."""
+        """Do a cycle if it is time and the lease is valid; the last one only with permission to commit."""
         self.temp_c += 0.01 * (AMBIENT_C - self.temp_c)
-        hold, now = self.hold, time.monotonic()
-        if hold is None or now < hold["ready_s"] or (now > hold["until_s"] and not hold["leave"]):
+        job, now = self.job, time.monotonic()
+        if job is None or now < job["ready_s"] or (now > job["lease_end_s"] and not job["may_commit"]):
             return
-        if hold["cycles"] >= hold["wanted"] - 1 and not hold["leave"]:
+        if job["cycles"] >= job["repetitions"] - 1 and not job["may_commit"]:
             return
-        hold["cycles"] += 1
-        hold["ready_s"] = now + CYCLE_S
+        job["cycles"] += 1
+        job["ready_s"] = now + CYCLE_S
         self.temp_c += 0.1
-        if hold["cycles"] >= hold["wanted"]:
-            self.hold = None
-            self.reports[hold["award"]] = (
-                hold["auctioneer"],
-                {
-                    "arm": self.name,
-                    "award": hold["award"],
-                    "job": hold["job"],
-                    "outcome": "finished",
-                    "cycles": hold["cycles"],
-                    "time_s": self.now_s(),
-                },
-            )
-            self.send(hold["auctioneer"], "report", "Report", self.reports[hold["award"]][1], self.receipt)
+        if job["cycles"] >= job["repetitions"]:
+            self.job = None
+            report = {
+                "arm": self.name,
+                "award": job["award"],
+                "job": job["job"],
+                "outcome": "finished",
+                "cycles": job["cycles"],
+                "time_s": self.now_s(),
+            }
+            self.reports[job["award"]] = (job["auctioneer"], report)
+            self.send(job["auctioneer"], "report", "Report", report, self.apply_receipt)
 
-    def renew(self):
-        """Ask whether the job is still ours, and say again what nobody has acknowledged."""
+    def renew_lease(self):
+        """Request the lease of the current job again, and repeat reports without receipt."""
         for auctioneer, report in self.reports.values():
-            self.send(auctioneer, "report", "Report", report, self.receipt)
-        if self.hold:
-            hold, asked_s = self.hold, time.monotonic()
-            last = hold["cycles"] >= hold["wanted"] - 1
-            held = {name: hold[name] for name in ("award", "job", "cycles")}
-            holds = [{**held, "phase": "finishing" if last else "working"}]
-            request = {"arm": self.name, "entries": holds}
-            self.send(hold["auctioneer"], "lease", "LeaseRequest", request, lambda lease: self.leased(lease, asked_s))
+            self.send(auctioneer, "report", "Report", report, self.apply_receipt)
+        if self.job:
+            job, sent_s = self.job, time.monotonic()
+            last = job["cycles"] >= job["repetitions"] - 1
+            entry = {name: job[name] for name in ("award", "job", "cycles")}
+            request = {"arm": self.name, "entries": [{**entry, "phase": "finishing" if last else "working"}]}
+            self.send(
+                job["auctioneer"], "lease", "LeaseRequest", request, lambda lease: self.apply_lease(lease, sent_s)
+            )
 
-    def leased(self, lease, asked_s):
-        """The lease is counted from the moment we asked. Leave to finish, once given, is not taken back."""
-        hold = self.hold
-        if hold is None:
+    def apply_lease(self, lease, sent_s):
+        """Extend the lease, measured from when the request was sent. Permission to commit is never withdrawn."""
+        job = self.job
+        if job is None:
             return
-        if hold["award"] in lease.get("may_commit", ()):
-            hold["leave"] = True
-        if hold["award"] in lease["granted"]:
-            hold["until_s"] = asked_s + (1 - DRIFT) * lease["lease_s"]
-        elif hold["award"] in lease["revoked"] and not hold["leave"]:
-            self.hold = None
+        if job["award"] in lease.get("may_commit", ()):
+            job["may_commit"] = True
+        if job["award"] in lease["granted"]:
+            job["lease_end_s"] = sent_s + (1 - DRIFT) * lease["lease_s"]
+        elif job["award"] in lease["revoked"] and not job["may_commit"]:
+            self.job = None
 
-    def receipt(self, word):
-        """The auctioneer has it on disk."""
-        if self.reports.pop(word["award"], None):
-            print(f"finished {word['award']}", flush=True)
+    def apply_receipt(self, receipt):
+        """Stop repeating a report: it is on the auctioneer's disk."""
+        if self.reports.pop(receipt["award"], None):
+            print(f"finished {receipt['award']}", flush=True)
 
-    def send(self, auctioneer, topic, kind, word, done):
-        """Ask the auctioneer something without waiting; no answer is no answer."""
+    def send(self, auctioneer, topic, name, request, apply):
+        """Query the auctioneer without waiting; call `apply` with the reply, if there is one."""
 
-        def came(reply):
+        def receive(reply):
             if reply.ok is not None and str(reply.ok.encoding) != encoding("Refusal"):
-                answer = json.loads(reply.ok.payload.to_bytes())
-                self.inbox.put(lambda: done(answer))
+                message = json.loads(reply.ok.payload.to_bytes())
+                self.inbox.put(lambda: apply(message))
 
-        me = quote(self.name, safe="")  # who asks is part of the key
-        key = f"{self.root}/auction/{quote(auctioneer, safe='')}/{topic}/{me}"
-        self.session.get(key, came, payload=json.dumps(word), encoding=encoding(kind), timeout=1.0)
+        querier = quote(self.name, safe="")  # the last chunk of the key
+        key = f"{self.root}/auction/{quote(auctioneer, safe='')}/{topic}/{querier}"
+        self.session.get(key, receive, payload=json.dumps(request), encoding=encoding(name), timeout=1.0)
 
-    def say_difficulty(self, offers):
-        """What the jobs on offer would be like, for everybody to know."""
-        word = {
+    def publish_difficulty(self, estimates):
+        """Publish the difficulty of the open jobs."""
+        message = {
             "arm": self.name,
             "tick": self.tick,
             "time_s": self.now_s(),
             "twin": "mock",
-            "jobs": [offer["job"] for offer in offers],
-            "difficulty": [offer.get("difficulty") for offer in offers],
-            "p_saturation": [None for _ in offers],
+            "jobs": [estimate["job"] for estimate in estimates],
+            "difficulty": [estimate.get("difficulty") for estimate in estimates],
+            "p_saturation": [None for _ in estimates],
         }
-        self.difficulty.put(json.dumps(word))
+        self.difficulty.put(json.dumps(message))
 
-    def say_state(self):
-        """Telemetry: the newest counts, so it may be dropped."""
+    def publish_state(self):
+        """Publish telemetry; older messages may be dropped."""
         self.tick += 1
         state = {
             "arm": self.name,
             "tick": self.tick,
             "time_s": self.now_s(),
-            "mode": "working" if self.hold else "idle",
+            "mode": "working" if self.job else "idle",
             "temp_c": [self.temp_c],
             "headroom_k": LIMIT_C - self.temp_c,
-            "job": self.hold["job"] if self.hold else "",
+            "job": self.job["job"] if self.job else "",
         }
         self.session.put(
-            f"{self.mine}/state",
+            f"{self.own_key}/state",
             json.dumps(state),
             encoding=encoding("State"),
             congestion_control=zenoh.CongestionControl.DROP,
         )
 
 
-def encoding(kind):
-    """What every word carries beside its payload; others are refused."""
-    return f"application/json;thermofleet.{kind}.v2"
+def encoding(name):
+    """Return the Zenoh encoding of a message type; messages with another one are malformed."""
+    return f"application/json;thermofleet.{name}.v2"
 
 
 def connect(port):
-    """A client of the fleet's router; nothing is searched for."""
+    """Open a client session to the fleet's router, without discovery."""
     config = {
         "mode": "client",
         "connect": {"endpoints": [f"tcp/127.0.0.1:{port}"], "timeout_ms": 10_000},
@@ -280,12 +278,12 @@ def connect(port):
 
 
 def main(port, fleet, name, seconds=float("inf")):
-    """Be an arm until Ctrl-C, or for so many seconds."""
+    """Run the arm until Ctrl-C, or for this time."""
     try:
         session = connect(port)
     except zenoh.ZError:
-        sys.exit(f"No router answered at port {port}.")
-    with session:  # one that is not closed keeps the process from ending
+        sys.exit(f"No router at port {port}.")
+    with session:  # an open session could keep the process from exiting
         Arm(session, fleet, name).run(seconds)
 
 

@@ -1,8 +1,8 @@
-"""A policy of your own: least difficulty, but an arm with little headroom rests.
+"""Example of your own policy: least difficulty, but an arm with little headroom waits.
 
-Compare it with the rules that come along:
+Compare it with built-in policies:
     thermofleet compare active_waiting --policies round_robin,least_difficulty,examples/own_policy.py:Careful
-Or work one shift by hand, as below:
+Run one shift in the environment, as below:
     python examples/own_policy.py
 """
 
@@ -13,9 +13,9 @@ HEADROOM_K = 3.0
 
 
 class Careful:
-    """What least_difficulty chooses, unless the hottest motor is close to its warning limit.
+    """As `least_difficulty`, but wait if the hottest motor is close to its warning limit.
 
-    Scope "arm": it sees what one arm knows. One of scope "central" has `act(observations)` instead, and sees all arms.
+    Scope "arm": it chooses for one arm. A policy of scope "central" has `act(observations)` and chooses for all arms.
     """
 
     scope = "arm"
@@ -24,11 +24,11 @@ class Careful:
         self._rule = LeastDifficulty()
 
     def reset(self, rng):
-        """Begin a shift; `rng` is the only source of chance a policy should use."""
+        """Begin a shift; draw all random numbers from `rng`."""
         self._rule.reset(rng)
 
     def choose(self, observation, place):
-        """WAIT, or k for the job in slot k; see fleet/observation.py for what an arm knows.
+        """Return WAIT, or k to claim the job in slot k; fleet/observation.py defines the observation.
 
         `place` is the arm's index in the fleet.
         """
@@ -36,7 +36,7 @@ class Careful:
 
 
 def main(horizon_s=7200, difficulty="twin"):
-    """One shift of quickstart under each of the two."""
+    """Run one shift of quickstart with each of the two policies."""
     import numpy as np
 
     import scenarios
@@ -49,7 +49,7 @@ def main(horizon_s=7200, difficulty="twin"):
         reward, infos = 0.0, {}
         while env.agents:
             _, rewards, _, _, infos = env.step(policy.act(env.knowledge()))
-            reward += rewards["arm_0"]  # all arms share one reward
+            reward += rewards["arm_0"]  # all arms get the same reward
         peaks = ", ".join(f"{arm} {info['peak_c']:.1f} °C" for arm, info in infos.items())
         print(f"{kind.__name__}: reward {reward:.1f}, jobs {infos['arm_0']['jobs_done']:.0f}, peaks {peaks}")
     env.close()

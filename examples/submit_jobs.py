@@ -1,9 +1,9 @@
-"""Hand jobs to a fleet and see them done, with nothing but `eclipse-zenoh` and `json`.
+"""Submit jobs to a fleet and wait until they are done, with `eclipse-zenoh` and `json` only.
 
     python examples/submit_jobs.py 7447 quickstart jobs.json
 
-The file holds a list of jobs as docs/bus.md has them (JobSpec); without one, three small jobs of the scenario
-`quickstart` are handed in. Handing the same job in twice is harmless: it stays one job.
+The file contains a list of jobs (JobSpec in docs/bus.md). Without a file, three small jobs for the scenario
+`quickstart` are submitted. The same job submitted twice is one job.
 """
 
 import json
@@ -15,10 +15,10 @@ from urllib.parse import quote
 
 import zenoh
 
-MOST = 100
-"""Jobs in one word; the bus takes up to 128 and 64 KiB."""
+MAX_JOBS = 100
+"""Jobs in one message; the limits of the bus are 128 jobs and 64 KiB."""
 WAIT_S = 10.0
-"""For an auctioneer, or arms that share jobs out, to come."""
+"""Longest wait for an auctioneer, or for arms that allocate jobs without one."""
 JOBS = [
     {"name": "outside 1", "kind": "hold", "places": ["fixture"], "payload_kg": 1.0, "dwell_s": 5.0},
     {"name": "outside 2", "kind": "hold", "places": ["fixture"], "payload_kg": 0.5, "dwell_s": 5.0, "repetitions": 2},
@@ -27,69 +27,69 @@ JOBS = [
 
 
 def submit(session, root, jobs):
-    """Names of the jobs that were taken, which are safe on the auctioneer's disk then; says why others were not."""
-    taken = []
-    for first in range(0, len(jobs), MOST):
-        word = {"jobs": jobs[first : first + MOST], "by": "submit_jobs.py"}
-        for submitted in ask(session, f"{root}/jobs/submit", "Submission", word):
-            for job in submitted["jobs"]:
-                told = "taken" if job["accepted"] else f"not taken: {job.get('reason')}"
-                print(f"{job['job']}: {told}", flush=True)
-                taken += [job["job"]] if job["accepted"] else []
-    return taken
+    """Submit jobs and print the replies; return the names of accepted jobs, which are on the auctioneer's disk."""
+    accepted = []
+    for first in range(0, len(jobs), MAX_JOBS):
+        request = {"jobs": jobs[first : first + MAX_JOBS], "by": "submit_jobs.py"}
+        for reply in query(session, f"{root}/jobs/submit", "Submission", request):
+            for job in reply["jobs"]:
+                print(
+                    f"{job['job']}: " + ("accepted" if job["accepted"] else f"rejected: {job.get('reason')}"),
+                    flush=True,
+                )
+                accepted += [job["job"]] if job["accepted"] else []
+    return accepted
 
 
-def follow(session, root, names, seconds):
-    """How the jobs ended, by name, as far as they did within so many seconds."""
+def wait_for_results(session, root, names, seconds):
+    """Print and return the final state of each job, by name; jobs that take longer than `seconds` are left out."""
     results = queue.SimpleQueue()
-    ended, end_s = {}, time.monotonic() + seconds
+    final, end_s = {}, time.monotonic() + seconds
     subscriber = session.declare_subscriber(f"{root}/auction/*/result", results.put)
-    while names - ended.keys() and time.monotonic() < end_s:
-        # What ended before we listened, or was lost on the way, is asked for.
-        words = [job for status in ask(session, f"{root}/jobs/status", "StatusRequest", {}) for job in status["jobs"]]
+    while names - final.keys() and time.monotonic() < end_s:
+        # Results before the subscription, and lost ones, are in the status.
+        statuses = [
+            job for reply in query(session, f"{root}/jobs/status", "StatusRequest", {}) for job in reply["jobs"]
+        ]
         try:
-            while True:  # until it is quiet for two seconds
-                for status in words:
-                    if status["job"] in names - ended.keys() and status["state"] in ("finished", "unfinished"):
-                        ended[status["job"]] = status["state"]
-                        print(" ".join([f"{status['job']}: {status['state']}", *said(status)]), flush=True)
-                if names <= ended.keys():
+            while True:  # until there is no result for two seconds
+                for status in statuses:
+                    if status["job"] in names - final.keys() and status["state"] in ("finished", "unfinished"):
+                        final[status["job"]] = status["state"]
+                        details = filter(None, (status["state"], status.get("arm"), status.get("reason")))
+                        print(f"{status['job']}: {' '.join(details)}", flush=True)
+                if names <= final.keys():
                     break
-                words = [json.loads(results.get(timeout=2.0).payload.to_bytes())["status"]]
+                statuses = [json.loads(results.get(timeout=2.0).payload.to_bytes())["status"]]
         except queue.Empty:
             continue
     subscriber.undeclare()
-    return ended
+    return final
 
 
-def said(status):
-    """What else a status tells: the arm, and why."""
-    return filter(None, (status.get("arm"), status.get("reason")))
-
-
-def ask(session, key, kind, word):
-    """All answers to a question; what was refused is printed."""
+def query(session, key, name, request):
+    """Return all replies to a request; print refusals and timeouts."""
     replies = session.get(
         key,
-        payload=json.dumps(word),
-        encoding=f"application/json;thermofleet.{kind}.v2",
+        payload=json.dumps(request),
+        encoding=f"application/json;thermofleet.{name}.v2",
         target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE,
         timeout=5.0,
     )
-    answers = []
+    messages = []
     for reply in replies:
-        if reply.ok is None:  # Zenoh's own: nobody answered in time
-            print(f"no answer: {reply.err.payload.to_bytes().decode()}", flush=True)
+        if reply.ok is None:  # from Zenoh itself: no reply in time
+            print(f"no reply: {reply.err.payload.to_bytes().decode()}", flush=True)
         elif str(reply.ok.encoding) == "application/json;thermofleet.Refusal.v2":
             print(f"refused: {json.loads(reply.ok.payload.to_bytes())['reason']}", flush=True)
         else:
-            answers.append(json.loads(reply.ok.payload.to_bytes()))
-    return answers
+            messages.append(json.loads(reply.ok.payload.to_bytes()))
+    return messages
 
 
 def main(port, fleet, jobs, seconds=600.0):
-    """Hand in, follow, and say whether all is finished."""
+    """Submit jobs and wait for their results; return whether all are finished."""
     config = {
         "mode": "client",
         "connect": {"endpoints": [f"tcp/127.0.0.1:{port}"], "timeout_ms": 10_000},
@@ -99,19 +99,19 @@ def main(port, fleet, jobs, seconds=600.0):
     try:
         opened = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
     except zenoh.ZError:
-        sys.exit(f"No router answered at port {port}.")
+        sys.exit(f"No router at port {port}.")
     with opened as session:
         end_s, pause = time.monotonic() + WAIT_S, queue.SimpleQueue()
-        while not ask(session, f"{root}/clock/now", "ClockRequest", {}):  # who takes jobs tells the time too
+        while not query(session, f"{root}/clock/now", "ClockRequest", {}):  # the participant that accepts jobs replies
             if time.monotonic() > end_s:
-                sys.exit(f"Nobody takes jobs in the fleet '{fleet}' at port {port} within {WAIT_S:.0f} s.")
+                sys.exit(f"No auctioneer of the fleet '{fleet}' replied at port {port} within {WAIT_S:.0f} s.")
             with suppress(queue.Empty):
                 pause.get(timeout=0.2)
-        taken = submit(session, root, jobs)
-        if not taken:
-            sys.exit(f"Nobody took a job in the fleet '{fleet}' at port {port}.")
-        ended = follow(session, root, set(taken), seconds)
-    finished = sum(state == "finished" for state in ended.values())
+        accepted = submit(session, root, jobs)
+        if not accepted:
+            sys.exit(f"The fleet '{fleet}' at port {port} accepted no job.")
+        final = wait_for_results(session, root, set(accepted), seconds)
+    finished = sum(state == "finished" for state in final.values())
     print(f"{finished} of {len(jobs)} jobs finished")
     return finished == len(jobs)
 

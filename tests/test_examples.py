@@ -269,7 +269,7 @@ def test_own_allocator_does_not_begin_beside_arms_that_share_jobs_out(bus):
     [(b"{", None), (b"[]", None), (b"{}", None), (b"\xff", None), (b"{}", "text/plain"), (b'{"jobs": 3}', None)],
 )
 def test_an_example_survives_rubbish_and_says_what_is_wrong(rubbish_at, kinds, payload, said):
-    assert "Not a good" in rubbish_at(*kinds, payload, said)
+    assert "Malformed" in rubbish_at(*kinds, payload, said)
 
 
 @pytest.fixture(scope="module")
@@ -313,7 +313,7 @@ def test_the_examples_make_a_fleet_of_their_own(bus):
     finally:
         monitor.kill()
     assert re.search(r"own +outside 1 is finished [ab]\n", told)
-    assert re.search(r" [ab] +finds outside 1 0\.10", told)
+    assert re.search(r" [ab] +difficulty outside 1 0\.10", told)
     finished = [status.job for status in heard if status.state == "finished"]
     assert sorted(finished) == ["outside 1", "outside 2", "outside 3"]
     assert finished.index("outside 1") < finished.index("outside 3")
