@@ -46,7 +46,7 @@ def live(scenario: str, policy: str, seed: int, speed: float, shift_s: float) ->
 
 
 def listed() -> str:
-    """The policies that come along, as a Markdown table."""
+    """Print the built-in policies as a Markdown table."""
     rows = [f"| `{name}` | {rule.scope} | {rule.cost} | {rule.source} |" for name, rule in RULES.items()]
     return "\n".join(["| policy | scope | minimises | source |", "|---|---|---|---|", *rows])
 

@@ -1,13 +1,12 @@
-"""Env steps per CPU-second, ours and the peers', on one core in one thread.
+"""Env steps per CPU-second on one core and one thread, beside other environments.
 
-    make bench-env                          # installs the peers and runs this with them
-    .venv/bin/python benchmarks/env.py      # ours, and whatever of the peers is there
+    make bench-env                          # installs the other environments and runs this
+    .venv/bin/python benchmarks/env.py      # skips environments that are not installed
 
-Every row is a program of its own, pinned to one core, and the median of three windows of a whole shift each (720
-steps), so beginning the next shift is in the figure. Actions are random among the legal ones, and choosing them is in
-the figure too: `fleet.env.random_actions.random_legal` for the batch, the same by hand for the single
-environment. Growth and
-memory take quickstart's cell, its four arms as often as wanted and its jobs as much oftener, with 8 slots.
+Every row is a separate process, pinned to one core, and the median of three windows. A window is a whole shift (720
+steps), so resets are included. Actions are random legal ones, and choosing them is included:
+`fleet.env.random_actions.random_legal` for the batch, the same by hand for the single environment. For more than four
+arms, the arms of quickstart are repeated, and its arrival rates multiplied; there are always 8 slots.
 """
 
 import os
@@ -36,17 +35,17 @@ PEERS = Path(__file__).parent / "peers.py"
 
 
 def median_rate(window: Callable[[], int]) -> float:
-    """Steps per CPU-second, median of the windows, after one that does not count."""
-    found = []
+    """Return steps per CPU-second: the median of the windows after one warm-up window."""
+    rates = []
     for _ in range(WINDOWS + 1):
         begin = time.process_time()
         steps = window()
-        found.append(steps / (time.process_time() - begin))
-    return statistics.median(found[1:])
+        rates.append(steps / (time.process_time() - begin))
+    return statistics.median(rates[1:])
 
 
 def single(difficulty: str) -> float:
-    """The `ParallelEnv`, dicts in and out."""
+    """Measure the `ParallelEnv`."""
     env = env_of(prepare(load("quickstart"), difficulty=difficulty))
     rng, seen = np.random.default_rng(0), {}
 
@@ -64,16 +63,16 @@ def single(difficulty: str) -> float:
         return steps
 
     seen, _ = env.reset(seed=0)
-    for _ in range(10):  # a twin is asked once for every job there can be
+    for _ in range(10):  # fills the caches: a twin scores every possible job once
         env.reset()
     return median_rate(window)
 
 
 def library(difficulty: str, arms: int = 4, peers: int | None = None) -> Library:
-    """Quickstart with its four arms, or with them several times over and as many more jobs.
+    """Return quickstart with its four arms repeated, and arrival rates multiplied accordingly.
 
     Args:
-        peers: How many of those before it each arm has in its vector; all others if not given.
+        peers: Number of peers in the vector of each arm; default: all others.
     """
     times = arms // 4
     fleet = [prepare(load("quickstart"), difficulty=difficulty)]
@@ -92,7 +91,7 @@ def library(difficulty: str, arms: int = 4, peers: int | None = None) -> Library
 
 
 def batch(difficulty: str, envs: int, arms: int = 4, peers: int | None = None) -> float:
-    """The batch: env steps per CPU-second."""
+    """Measure a batch."""
     env, rng = BatchEnv(library(difficulty, arms, peers), envs, seed=0), np.random.default_rng(0)
     seen, _ = env.reset()
 
@@ -106,7 +105,7 @@ def batch(difficulty: str, envs: int, arms: int = 4, peers: int | None = None) -
 
 
 def two_threads(envs: int) -> float:
-    """Steps per second on two threads, relative to one; median of alternating windows."""
+    """Return the speed on two threads relative to one; median of alternating windows."""
     shared, ratios = library("blind"), []
     batches = [BatchEnv(shared, envs, seed=0, threads=threads) for threads in (1, 2)]
     seen = [env.reset()[0] for env in batches]
@@ -124,7 +123,7 @@ def two_threads(envs: int) -> float:
 
 
 def torchrl(envs: int, *, kept: bool = False) -> float:
-    """TorchRL's rollout of the native env, with its random policy."""
+    """Measure rollouts of TorchRL with its random policy."""
     if kept and not keep_pages():
         raise SystemExit("keep_pages() needs glibc.")
     import torch
@@ -146,12 +145,12 @@ def torchrl(envs: int, *, kept: bool = False) -> float:
 
 
 def resident_mb() -> float:
-    """Memory of this process, MB."""
+    """Return the memory of this process, MB."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def memory(envs: int, arms: int) -> float:
-    """MB that so many envs add to a process that has one."""
+    """Return the MB that a batch adds to a process with one env."""
     shared, rng = library("blind", arms), np.random.default_rng(0)
 
     def run(count: int) -> BatchEnv:
@@ -179,7 +178,7 @@ ROWS = {
 
 
 def measured(*command: str) -> float | None:
-    """What a program of its own found; None, and why, where it could not."""
+    """Run a measurement in a separate process; if it fails, print the reason and return None."""
     done = subprocess.run([sys.executable, *command], capture_output=True, text=True, timeout=600, check=False)
     if done.returncode:
         print(f"  {' '.join(command[1:])} failed: {done.stderr.strip().splitlines()[-1:]}", flush=True)
@@ -188,13 +187,13 @@ def measured(*command: str) -> float | None:
 
 
 def line(what: str, value: float | None, target: float | None = None, unit: str = "") -> None:
-    """One row of the table."""
+    """Print one row of the table."""
     aim = "" if target is None else f"{target:>12,.0f}"
     print(f"{what:<52}{'-' if value is None else f'{value:,.0f}':>12}{aim:>12} {unit}", flush=True)
 
 
 def main() -> None:
-    """The table."""
+    """Print the table."""
     here = str(Path(__file__))
     print(f"{'env steps per CPU-second, one core':<52}{'measured':>12}{'target':>12}")
     for difficulty in ("blind", "twin"):
@@ -203,21 +202,21 @@ def main() -> None:
         line(f"batch of 1024, {difficulty}", measured(here, "batch", difficulty, "1024"), 1_350_000)
     print(f"two threads against one, 1024 envs, wall clock: {measured(here, 'threads', '1024')} times (target 1.8)")
     if find_spec("torchrl") is None:
-        print("TorchRL is not installed: pip install 'thermofleet[learn]' -c constraints.txt")
+        print("TorchRL is not installed; install it with: pip install 'thermofleet[learn]' -c constraints.txt")
     else:
         line("TorchRL rollout of 1024, blind", measured(here, "torchrl", "1024"), 300_000)
         line("the same after keep_pages()", measured(here, "torchrl", "1024", "kept"), 300_000)
     for name, module, envs in (("mpe", "mpe2", (1,)), ("rware", "rware", (1,)), ("vmas", "vmas", (1, 32, 1024))):
         if find_spec(module) is None:
-            print(f"{name} is not installed: make bench-env installs it into .venv-adapters/bench and runs this there")
+            print(f"{name} is not installed; make bench-env installs it")
             continue
         for count in envs:
             line(f"{name}, {count}", measured(str(PEERS), name, str(count)))
-    for peers, what in (((), "all others"), (("3",), "3 others")):
+    for peers, what in (((), "all peers"), (("3",), "3 peers")):
         for arms in (4, 8, 16, 64):
-            found = measured(here, "batch", "blind", "64", str(arms), *peers)
-            cost_ns = None if found is None else 1e9 / (found * arms)
-            line(f"64 envs of {arms} arms that see {what}: an arm step", cost_ns, unit="ns")
+            rate = measured(here, "batch", "blind", "64", str(arms), *peers)
+            cost_ns = None if rate is None else 1e9 / (rate * arms)
+            line(f"64 envs of {arms} arms that observe {what}: one arm step", cost_ns, unit="ns")
     line("memory of 1024 envs with 8 arms", measured(here, "memory", "1024", "8"), 200, "MB")
 
 

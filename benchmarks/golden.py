@@ -1,10 +1,10 @@
-"""Record what the simulator does, and compare two records: a check for changes that must not alter behaviour.
+"""Record the results of the simulator, and compare two records: a check for changes that must not alter behaviour.
 
     python benchmarks/golden.py record FOLDER        # every scenario, policy and seed; about 20 minutes of one core
     python benchmarks/golden.py compare OLD NEW      # every difference, the largest of each kind
 
-A record holds numbers, not hashes: two implementations of one law may differ in the last bits. Times and readings are
-compared within `TOLERANCE`, names and counts exactly. Telemetry is kept once a minute.
+A record contains numbers, not hashes, because two correct implementations may differ in the last bits. Times and
+readings are compared within `TOLERANCE`, names and counts exactly. Telemetry is recorded once a minute.
 """
 
 import argparse
@@ -31,7 +31,7 @@ TOLERANCE = 1e-6
 
 
 def thermofleet(*argv: str) -> str:
-    """Run a command of this checkout in this process; return what it printed."""
+    """Run a command of this checkout in this process; return its output."""
     entry = tomllib.loads(Path("pyproject.toml").read_text())["project"]["scripts"]["thermofleet"]
     module, _, name = entry.partition(":")
     main = getattr(importlib.import_module(module), name)
@@ -46,7 +46,7 @@ def thermofleet(*argv: str) -> str:
 
 
 def record(folder: Path) -> None:
-    """Write the record of this checkout into a folder; what is there already is kept."""
+    """Write the record of this checkout into a folder; existing files are kept."""
     folder.mkdir(parents=True, exist_ok=True)
     for scenario in SCENARIOS:
         for difficulty in DIFFICULTIES:
@@ -79,7 +79,7 @@ def _once(path: Path, make: Any) -> None:
 
 
 def _run(scenario: str, difficulty: str, policy: str, seed: int, bus: str, plant: str, *more: str) -> dict[str, Any]:
-    """Events, readings once a minute, and metrics of a recorded shift."""
+    """Return events, readings once a minute, and metrics of a recorded shift."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         thermofleet(
@@ -103,7 +103,7 @@ def _run(scenario: str, difficulty: str, policy: str, seed: int, bus: str, plant
 
 
 def _comparison(scenario: str, difficulty: str) -> dict[str, Any]:
-    """Every number of `compare --json`."""
+    """Return every number of `compare --json`."""
     printed = thermofleet("compare", scenario, "--difficulty", difficulty, "--policies", ",".join(POLICIES), "--json")
     return {f"compare {name}": np.array(value) for name, value in _flat(json.loads(printed)["figures"])}
 
@@ -116,7 +116,7 @@ def _flat(values: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
 
 
 def _rollouts(scenario: str, difficulty: str) -> dict[str, Any]:
-    """Observations, masks, rewards and infos of the single and the batched environment under random legal actions."""
+    """Return observations, masks, rewards and infos of the single env and of a batch under random legal actions."""
     import scenarios
 
     out: dict[str, Any] = {}
@@ -148,7 +148,7 @@ def _rollouts(scenario: str, difficulty: str) -> dict[str, Any]:
 
 
 def compare(old: Path, new: Path) -> int:
-    """Print every kind of difference between two records; return how many files differ."""
+    """Print the differences between two records; return the number of files that differ."""
     differing, worst = 0, {}
     names = sorted(p.name for p in old.glob("*.npz"))
     for name in names:
@@ -157,10 +157,10 @@ def compare(old: Path, new: Path) -> int:
             differing += 1
             continue
         one, other = np.load(old / name), np.load(new / name)
-        found = [text for key in one.files if (text := _difference(key, one, other, worst))]
-        if found:
+        differences = [text for key in one.files if (text := _difference(key, one, other, worst))]
+        if differences:
             differing += 1
-            print(f"{name}:", "; ".join(found[:6]), f"(+{len(found) - 6})" if len(found) > 6 else "")
+            print(f"{name}:", "; ".join(differences[:6]), f"(+{len(differences) - 6})" if len(differences) > 6 else "")
     print(f"{differing} of {len(names)} files differ")
     for key, size in sorted(worst.items()):
         print(f"  {key:<28} largest difference {size:.3g}")
@@ -187,11 +187,11 @@ def _difference(key: str, old: Any, new: Any, worst: dict[str, float]) -> str:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("record", "compare"))
+    parser.add_argument("command", choices=("record", "compare"))
     parser.add_argument("folders", nargs="+", type=Path)
     chosen = parser.parse_args()
     sys.path.insert(0, str(Path.cwd()))
-    if chosen.what == "record":
+    if chosen.command == "record":
         record(chosen.folders[0])
     else:
         sys.exit(bool(compare(*chosen.folders)))

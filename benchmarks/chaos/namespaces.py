@@ -1,9 +1,8 @@
-"""Arms in network namespaces of their own, each on a cable that can be pulled: the kernel's partition, for root alone.
+"""Partition by network namespaces, one per arm; needs root.
 
-Every arm has a pair of virtual Ethernet interfaces to the router's side; a cut takes the router's end down, so packets
-are lost on the way as with a real cable. Beyond loopback the bus wants certificates, so such a fleet runs with TLS, as
-one on several machines does. Addresses are of 198.18.0.0/15, which is kept for measurements (RFC 2544). What is left
-behind by a campaign that was killed is cleared away by the next.
+Every arm has a pair of virtual Ethernet interfaces to the router. A cut takes the router's end down, so packets are
+lost as with a real cable. The fleet is not on loopback, so it uses TLS. Addresses are of 198.18.0.0/15, which is
+reserved for benchmarks (RFC 2544). Namespaces of a killed run are removed by the next one.
 """
 
 import os
@@ -24,10 +23,10 @@ _COMMAND_S = 10.0
 
 
 class Namespaces:
-    """`with Namespaces(arms, port) as cables:` gives each arm a namespace, until the end of the block.
+    """`with Namespaces(arms, port) as namespaces:` makes a namespace per arm, and removes them at the end.
 
     Attributes:
-        hosts: Addresses under which the router is reached from there, by arm.
+        hosts: Address of the router from each arm's namespace, by arm.
     """
 
     by = "netns"
@@ -38,12 +37,12 @@ class Namespaces:
         self._resources = ExitStack()
 
     def __enter__(self) -> Self:
-        """Make them.
+        """Make the namespaces.
 
         Raises:
-            FleetError: this machine does not let us; nothing is left behind.
+            FleetError: this machine does not permit it; nothing is left behind.
         """
-        clear_away()
+        remove_stale()
         try:
             for arm, name in self._names.items():
                 self._make(name, self.hosts[arm])
@@ -56,25 +55,25 @@ class Namespaces:
         self._resources.close()
 
     def through(self, part: Part, arm: str) -> Part:
-        """The part in the arm's namespace, where the router has another address."""
+        """Return the part, to run in the arm's namespace with the router's address there."""
         there = tuple(word.replace(f"127.0.0.1:{self._port}", f"{self.hosts[arm]}:{self._port}") for word in part.argv)
         return replace(part, argv=("ip", "netns", "exec", self._names[arm], *there))
 
     def cut(self) -> None:
-        """Pull all the cables."""
+        """Take all links down."""
         for name in self._names.values():
             _ip("link", "set", name, "down")
 
     def heal(self) -> None:
-        """Plug them in again."""
+        """Take all links up."""
         for name in self._names.values():
             _ip("link", "set", name, "up")
 
     def _make(self, name: str, host: str) -> None:
-        """A namespace and a cable, whose end here has the namespace's name."""
+        """Make a namespace and its link, whose outer end has the name of the namespace."""
         inner = host.removesuffix(".1") + ".2"
         _ip("netns", "add", name)
-        self._resources.callback(_forget, name)
+        self._resources.callback(_remove, name)
         _ip("link", "add", name, "type", "veth", "peer", "name", "eth0", "netns", name)
         _ip("addr", "add", f"{host}/30", "dev", name)
         _ip("link", "set", name, "up")
@@ -85,8 +84,8 @@ class Namespaces:
             _ip("-n", name, *command)
 
 
-def why_not() -> str:
-    """Why there can be no namespaces here; "" if there can."""
+def unavailable_reason() -> str:
+    """Return why namespaces cannot be made here; "" if they can."""
     if not sys.platform.startswith("linux") or shutil.which("ip") is None:
         return "network namespaces need Linux and its command ip"
     if os.geteuid() != 0:
@@ -98,16 +97,16 @@ def why_not() -> str:
         return str(error)
 
 
-def clear_away() -> None:
-    """Forget what campaigns left behind that are no longer there."""
+def remove_stale() -> None:
+    """Remove the namespaces of processes that no longer exist."""
     for line in _ip("netns", "list").splitlines():
-        found = _NAMED.match(line)
-        if found is not None and not os.path.exists(f"/proc/{found['pid']}"):
-            _forget(found.group())
+        match = _NAMED.match(line)
+        if match is not None and not os.path.exists(f"/proc/{match['pid']}"):
+            _remove(match.group())
 
 
-def _forget(name: str) -> None:
-    """Take away a namespace and its cable, as far as they are there."""
+def _remove(name: str) -> None:
+    """Remove a namespace and its link, if they exist."""
     for command in (("link", "del", name), ("netns", "del", name)):
         subprocess.run(["ip", *command], capture_output=True, timeout=_COMMAND_S, check=False)
 
@@ -116,6 +115,6 @@ def _ip(*words: str) -> str:
     try:
         done = subprocess.run(["ip", *words], capture_output=True, text=True, timeout=_COMMAND_S, check=True)
     except (OSError, subprocess.SubprocessError) as error:
-        said = (getattr(error, "stderr", None) or str(error)).strip()
-        raise FleetError(f"'ip {' '.join(words)}' failed: {said}") from error
+        reason = (getattr(error, "stderr", None) or str(error)).strip()
+        raise FleetError(f"'ip {' '.join(words)}' failed: {reason}") from error
     return done.stdout

@@ -1,8 +1,8 @@
-"""A cut between some arms and the router, and its healing: nothing goes through, and nobody is told.
+"""Cut the connection between some arms and the router without closing it, and restore it.
 
-Where root is, the arms live in network namespaces (`namespaces`) and their cables are pulled. Elsewhere they reach the
-router through a line of ours. While it is cut nothing is read from either end: no end sees a reset, new connections are
-taken up by the system and say nothing.
+As root, the arms run in network namespaces (`namespaces`) whose links are taken down. Otherwise they reach the router
+through a proxy. While it is cut, it reads from neither side: neither sees a reset, and the system accepts new
+connections, which receive nothing.
 """
 
 import selectors
@@ -12,20 +12,20 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Self
 
+from fleet_under_test import Fleet
 from namespaces import Namespaces
-from struck import Fleet
 
 from fleet.live.supervisor import Part
 
 CUT_S = 12.0
-"""Longer than a lease: what the arms have in hand may be given to others."""
+"""Longer than a lease, so that other arms may get the jobs."""
 _LOOK_S = 0.05
 
 
-class Line:
-    """`with Line(port) as line:` hands everything that comes to `line.port` on to another port, until it is cut."""
+class Proxy:
+    """`with Proxy(port) as proxy:` forwards connections from `proxy.port` to `port`, until it is cut."""
 
-    by = "line"
+    by = "proxy"
 
     def __init__(self, to_port: int) -> None:
         self._to, self._listener = ("127.0.0.1", to_port), socket.create_server(("127.0.0.1", 0))
@@ -34,7 +34,7 @@ class Line:
         self._whole.set()
         self._other: dict[socket.socket, socket.socket] = {}
         self._ready = selectors.DefaultSelector()
-        self._thread = threading.Thread(target=self._carry, name="line")
+        self._thread = threading.Thread(target=self._run, name="proxy")
 
     def __enter__(self) -> Self:
         self._ready.register(self._listener, selectors.EVENT_READ)
@@ -50,19 +50,19 @@ class Line:
         self._ready.close()
 
     def through(self, part: Part, _arm: str) -> Part:
-        """The part, reaching the router through this line."""
+        """Return the part with the address of this proxy in place of the router's."""
         there, here = f"127.0.0.1:{self._to[1]}", f"127.0.0.1:{self.port}"
         return replace(part, argv=tuple(word.replace(there, here) for word in part.argv))
 
     def cut(self) -> None:
-        """From now on nothing goes through."""
+        """Stop forwarding."""
         self._whole.clear()
 
     def heal(self) -> None:
-        """Go on; what waited goes through, where somebody still holds the other end."""
+        """Forward again, also what has arrived meanwhile on connections that are still open."""
         self._whole.set()
 
-    def _carry(self) -> None:
+    def _run(self) -> None:
         while not self._end.is_set():
             self._whole.wait()
             for key, _ in self._ready.select(_LOOK_S):
@@ -73,28 +73,28 @@ class Line:
                 if end is self._listener:
                     self._accept()
                 elif end in self._other:
-                    self._hand_on(end)
+                    self._forward(end)
 
     def _accept(self) -> None:
-        caller, _ = self._listener.accept()
+        client, _ = self._listener.accept()
         try:
-            called = socket.create_connection(self._to, timeout=1.0)
+            server = socket.create_connection(self._to, timeout=1.0)
         except OSError:
-            caller.close()
+            client.close()
             return
-        for one, other in ((caller, called), (called, caller)):
+        for one, other in ((client, server), (server, client)):
             one.settimeout(1.0)
             self._other[one] = other
             self._ready.register(one, selectors.EVENT_READ)
 
-    def _hand_on(self, end: socket.socket) -> None:
+    def _forward(self, end: socket.socket) -> None:
         try:
-            said = end.recv(65_536)
-            if said:
-                self._other[end].sendall(said)
+            data = end.recv(65_536)
+            if data:
+                self._other[end].sendall(data)
                 return
         except OSError:
-            pass  # as good as an end
+            pass  # treated as the end of the connection
         other = self._other.pop(end)
         del self._other[other]
         for one in (end, other):
@@ -103,27 +103,26 @@ class Line:
             one.close()
 
 
-def cut_at_work(fleet: Fleet) -> tuple[Line | Namespaces, set[str], float]:
-    """Cut arms off in the middle of a job: the line, who is behind it, and after how many seconds it shows."""
-    line, away = fleet.line, set(fleet.away)
-    assert isinstance(line, Line | Namespaces)
-    fleet.until(lambda: any(fleet.states[arm][1].mode == "working" for arm in away), 20.0)
-    line.cut()
-    seen_s = fleet.until(lambda: all(map(fleet.unwell, away)), 10.0)
-    return line, away, seen_s
+def cut_at_work(fleet: Fleet) -> tuple[Proxy | Namespaces, set[str], float]:
+    """Cut off arms during a job; return the cut, its arms, and the seconds until the bus shows it."""
+    cut, cut_arms = fleet.cut, set(fleet.cut_arms)
+    assert isinstance(cut, Proxy | Namespaces)
+    fleet.wait_until(lambda: any(fleet.states[arm][1].mode == "working" for arm in cut_arms), 20.0)
+    cut.cut()
+    seen_s = fleet.wait_until(lambda: all(map(fleet.is_absent, cut_arms)), 10.0)
+    return cut, cut_arms, seen_s
 
 
 def partition(fleet: Fleet) -> float:
-    """Half of the arms are cut off for longer than a lease, in the middle of their jobs."""
-    line, away, seen_s = cut_at_work(fleet)
-    fleet.until(lambda: False, CUT_S)
-    line.heal()
-    healed_s = fleet.until(lambda: not any(map(fleet.unwell, away)), 30.0)
-    how = (
-        "each in a network namespace, its link down"
-        if line.by == "netns"
-        else "behind a line of ours that says nothing"
-    )
+    """Cut off half of the arms during their jobs, for longer than a lease."""
+    cut, cut_arms, seen_s = cut_at_work(fleet)
+    fleet.wait_until(lambda: False, CUT_S)
+    cut.heal()
+    healed_s = fleet.wait_until(lambda: not any(map(fleet.is_absent, cut_arms)), 30.0)
+    how = "each in a network namespace, link down" if cut.by == "netns" else "behind a proxy"
     cut_s = CUT_S + min(seen_s, 10.0)
-    fleet.note(f"{', '.join(sorted(away))} cut off for {cut_s:.0f} s, {how}; back {healed_s:.1f} s after it was healed")
+    fleet.note(
+        f"{', '.join(sorted(cut_arms))} cut off for {cut_s:.0f} s, {how}; "
+        f"present again {healed_s:.1f} s after the cut ended"
+    )
     return seen_s

@@ -1,4 +1,4 @@
-"""Faults of processes and of the disk: killed, stopped, stuck, full."""
+"""Faults of processes and of the disk."""
 
 import math
 import os
@@ -8,42 +8,42 @@ import subprocess
 import sys
 import threading
 
-from struck import Fleet
+from fleet_under_test import Fleet
 
 
 def kill_arm(fleet: Fleet) -> float:
-    """SIGKILL of an arm in the middle of a job."""
-    arm = fleet.working() or fleet.arms[0]
-    fleet.kill(f"arm-{arm}")
-    return fleet.until(lambda: fleet.unwell(arm), 10.0)
+    """SIGKILL an arm during a job."""
+    arm = fleet.working_arm() or fleet.arms[0]
+    fleet.send_signal(f"arm-{arm}")
+    return fleet.wait_until(lambda: fleet.is_absent(arm), 10.0)
 
 
 def stop_arm(fleet: Fleet) -> float:
-    """SIGSTOP of an arm in the middle of a job, for longer than its lease, then SIGCONT."""
-    arm = fleet.working() or fleet.arms[0]
-    fleet.kill(f"arm-{arm}", signal.SIGSTOP)
-    seen_s = fleet.until(lambda: fleet.unwell(arm), 10.0)
-    fleet.until(lambda: False, 12.0)
-    fleet.kill(f"arm-{arm}", signal.SIGCONT)
+    """SIGSTOP an arm during a job, for longer than its lease, then SIGCONT."""
+    arm = fleet.working_arm() or fleet.arms[0]
+    fleet.send_signal(f"arm-{arm}", signal.SIGSTOP)
+    seen_s = fleet.wait_until(lambda: fleet.is_absent(arm), 10.0)
+    fleet.wait_until(lambda: False, 12.0)
+    fleet.send_signal(f"arm-{arm}", signal.SIGCONT)
     return seen_s
 
 
 def kill_auctioneer(fleet: Fleet) -> float:
-    """SIGKILL of the auctioneer while a batch is under way."""
+    """SIGKILL the auctioneer during an auction."""
     begun = len(fleet.results)
-    fleet.until(lambda: len(fleet.results) > begun, 20.0)  # it has just decided something
-    fleet.kill(fleet.auction)
+    fleet.wait_until(lambda: len(fleet.results) > begun, 20.0)  # it has just published a result
+    fleet.send_signal(fleet.auction)
     return math.nan
 
 
 def kill_router(fleet: Fleet) -> float:
-    """SIGKILL of the router."""
-    fleet.kill("router")
-    return fleet.until(lambda: not fleet.tokens, 10.0)
+    """SIGKILL the router."""
+    fleet.send_signal("router")
+    return fleet.wait_until(lambda: not fleet.tokens, 10.0)
 
 
 def stuck_subscriber(fleet: Fleet) -> float:
-    """A stranger that hears everything and stands still, and one that takes 50 ms for every word."""
+    """Add two subscribers to all keys: one is stopped, one takes 50 ms for every message."""
     code = (
         "import sys, time, zenoh, json\n"
         "config = zenoh.Config.from_json5(json.dumps({'mode': 'client', 'connect': {'endpoints': [sys.argv[1]]},"
@@ -66,13 +66,13 @@ def stuck_subscriber(fleet: Fleet) -> float:
 
 
 def full_disk(fleet: Fleet) -> float:
-    """No room in the journals of an arm and of the auctioneer for ten seconds."""
-    arm = fleet.working() or fleet.arms[0]
+    """Leave no space for the journals of an arm and of the auctioneer for ten seconds."""
+    arm = fleet.working_arm() or fleet.arms[0]
     struck = [fleet.supervisor.pid(name) for name in (f"arm-{arm}", fleet.auction)]
     pids = [pid for pid in struck if pid is not None]
     for pid in pids:
         resource.prlimit(pid, resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
-    fleet.until(lambda: False, 10.0)
+    fleet.wait_until(lambda: False, 10.0)
     for pid in pids:
         resource.prlimit(pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     return math.nan

@@ -1,4 +1,4 @@
-"""A fleet of processes that is struck: how it is watched, and what became of it."""
+"""The live fleet of a fault: what the bus and the journals show, and the outcome."""
 
 import math
 import os
@@ -21,28 +21,28 @@ from fleet.live.arm.journal_records import ArmRecord, Closed
 from fleet.live.journal import Journal
 from fleet.live.supervisor import Supervisor
 
-PATIENCE_S = 150.0
+TIMEOUT_S = 150.0
 STALE_S = 3.0
 
 
-class CannotStrike(Exception):
-    """This machine cannot make a fault; says what it lacks."""
+class CannotInject(Exception):
+    """This machine cannot inject a fault; the message says what it lacks."""
 
 
 @dataclass(eq=False)
 class Outcome:
-    """What became of a fleet that was struck."""
+    """Jobs, processes and times after a fault."""
 
     by: str = ""
-    """Which of several ways to make the fault was taken."""
+    """How the fault was injected, if there are several ways."""
     finished: int = 0
     unfinished: int = 0
     lost: tuple[str, ...] = ()
     twice: tuple[str, ...] = ()
-    died: tuple[str, ...] = ()
-    """Processes that ended and that nobody had killed."""
-    wrong: tuple[str, ...] = ()
-    """What must not have been: a trespass that was let in, a clock that was thrown off."""
+    exited: tuple[str, ...] = ()
+    """Processes that exited without being killed."""
+    violations: tuple[str, ...] = ()
+    """Successful trespasses and wrong clocks."""
     notes: tuple[str, ...] = ()
     detected_s: float = math.nan
     recovered_s: float = math.nan
@@ -50,60 +50,60 @@ class Outcome:
 
     @property
     def good(self) -> bool:
-        """Whether every job was done once or reported, nobody died of it, and nothing was as it must not be."""
-        return not (self.lost or self.twice or self.died or self.wrong)
+        """Whether no job was lost or done twice, no process exited by itself, and there are no violations."""
+        return not (self.lost or self.twice or self.exited or self.violations)
 
 
 @dataclass(eq=False)
 class Fleet:
-    """A fleet of processes, and a line by which it is watched."""
+    """A fleet of processes, and the client that monitors it."""
 
     supervisor: Supervisor
-    link: BusClient
+    client: BusClient
     endpoint: str
     session: zenoh.Session
-    """A stranger's, to speak rubbish with."""
+    """Of a process outside the fleet, which sends malformed messages."""
     folder: Path
     arms: tuple[str, ...]
     auction: str = "auction"
     keys: Path | None = None
-    """Of the participants, where the router wants certificates."""
-    line: AbstractContextManager[object] | None = None
-    """Between some arms and the router."""
-    away: tuple[str, ...] = ()
-    """Those arms."""
+    """Folder of certificates, if the fleet uses TLS."""
+    cut: AbstractContextManager[object] | None = None
+    """Can cut the connection between some arms and the router."""
+    cut_arms: tuple[str, ...] = ()
+    """The arms that it can cut off."""
     clocks: object = None
-    """The wall clocks of the participants, where they can be set."""
+    """Wall clocks of the participants, if they can be set."""
     notes: list[str] = field(default_factory=list)
-    wrong: list[str] = field(default_factory=list)
+    violations: list[str] = field(default_factory=list)
     killed: Counter[str] = field(default_factory=Counter)
     tokens: set[str] = field(default_factory=set)
     states: dict[str, tuple[float, State]] = field(default_factory=dict)
-    """By arm: when the last one came, real seconds, and what it said."""
+    """By arm: real time of the last state, and the state."""
     results: list[tuple[float, JobStatus]] = field(default_factory=list)
 
     def listen(self) -> None:
-        """Hear who is there, how they are, and what becomes of jobs."""
-        fleet = self.link.fleet
-        self.link.watch_tokens(keys.of_every_arm(fleet, "alive"), self._token)
-        self.link.subscribe(keys.of_every_arm(fleet, "state"), State, self._state)
-        self.link.subscribe(keys.of_every_auction(fleet, "result"), Result, self._result)
+        """Subscribe to tokens, states and results."""
+        fleet = self.client.fleet
+        self.client.watch_tokens(keys.of_every_arm(fleet, "alive"), self._token)
+        self.client.subscribe(keys.of_every_arm(fleet, "state"), State, self._state)
+        self.client.subscribe(keys.of_every_auction(fleet, "result"), Result, self._result)
 
     def note(self, what: str) -> None:
-        """Say something beside the figures."""
+        """Add a note to the outcome."""
         self.notes.append(what)
 
-    def until(self, condition: Callable[[], bool], patience_s: float = PATIENCE_S) -> float:
-        """Real seconds until it holds, infinite if it never does."""
+    def wait_until(self, condition: Callable[[], bool], timeout_s: float = TIMEOUT_S) -> float:
+        """Wait for a condition; return the real seconds until it was true, infinite after the timeout."""
         began_s = time.monotonic()
-        while time.monotonic() - began_s < patience_s:
+        while time.monotonic() - began_s < timeout_s:
             if condition():
                 return time.monotonic() - began_s
             self.supervisor.poll()
-            self.link.serve(time.monotonic() + 0.02)
+            self.client.serve(time.monotonic() + 0.02)
         return math.inf
 
-    def kill(self, name: str, number: int = signal.SIGKILL) -> None:
+    def send_signal(self, name: str, number: int = signal.SIGKILL) -> None:
         """Send a signal to a participant."""
         pid = self.supervisor.pid(name)
         if pid is not None:
@@ -111,31 +111,31 @@ class Fleet:
             if number == signal.SIGKILL:
                 self.killed[name] += 1
 
-    def working(self) -> str | None:
-        """An arm that has a job in hand, by its last state."""
+    def working_arm(self) -> str | None:
+        """Return an arm that works, by its last state."""
         for arm in self.arms:
             if arm in self.states and self.states[arm][1].mode == "working":
                 return arm
         return None
 
-    def unwell(self, arm: str) -> bool:
-        """Whether the bus shows that an arm is not as it should be."""
+    def is_absent(self, arm: str) -> bool:
+        """Whether an arm has no token or no recent state."""
         return arm not in self.tokens or time.monotonic() - self.states[arm][0] > STALE_S
 
     def status(self) -> dict[str, JobStatus]:
-        """What the auctioneer says of all jobs; nothing, if it does not answer."""
-        answers = self.link.query_and_wait(
-            keys.of_jobs(self.link.fleet, "status"), StatusRequest(), Status, timeout_s=2.0
+        """Query the status of all jobs; empty without a reply."""
+        answers = self.client.query_and_wait(
+            keys.of_jobs(self.client.fleet, "status"), StatusRequest(), Status, timeout_s=2.0
         )
         return {job.job: job for word in answers.messages.values() for job in word.jobs}
 
-    def done_by(self) -> Counter[str]:
-        """How often each job was finished, by the journals of the arms."""
+    def count_finished(self) -> Counter[str]:
+        """Count how often each job was finished, by the journals of the arms."""
         done: Counter[str] = Counter()
         for path in sorted((self.folder / "journals").glob("*.journal")):
             if path.stem == "auctioneer":
                 continue
-            copy = Path(tempfile.mkdtemp()) / path.name  # the arm holds its own
+            copy = Path(tempfile.mkdtemp()) / path.name  # the arm has locked its own
             copy.write_bytes(path.read_bytes())
             with Journal[ArmRecord](copy, ArmRecord) as journal:
                 done.update(
@@ -155,21 +155,21 @@ class Fleet:
         self.results.append((time.monotonic(), word.status))
 
 
-Strike = Callable[[Fleet], float]
-"""Does the harm; real seconds until it was detected, NaN where there is nothing to see."""
+Inject = Callable[[Fleet], float]
+"""Injects a fault; returns the real seconds until the bus shows it, NaN if it never does."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault, and the fleet that it needs."""
+    """A fault and the kind of fleet that it needs."""
 
-    strike: Strike
+    inject: Inject
     tls: bool = False
-    line: bool = False
-    """Half of the arms reach the router through what can be cut: network namespaces (`tls`), or a line of ours."""
+    cut: bool = False
+    """The connection of some arms can be cut: by network namespaces (with TLS), or by a proxy."""
     clocks: bool = False
-    """The wall clock of each participant can be set."""
-    alone: bool = False
-    """Without an auctioneer: the arms share the jobs out among themselves."""
-    away: int = 0
-    """How many arms can be cut off; 0 for half of them."""
+    """The wall clock of every participant can be set."""
+    no_auctioneer: bool = False
+    """The arms allocate the jobs by consensus."""
+    cut_arms: int = 0
+    """Number of arms that can be cut off; 0 for half of them."""

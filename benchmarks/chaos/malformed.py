@@ -1,25 +1,25 @@
-"""A stranger on plain TCP that says what nobody should: rubbish on every key, and awards that were made before."""
+"""Messages of a process outside the fleet, over plain TCP: malformed ones on every key, and old awards."""
 
 import json
 import math
 import random
 
 import msgspec
-from struck import Fleet
+from fleet_under_test import Fleet
 
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Award, LeaseRequest, QuoteRequest, Report, Submission
 from fleet.bus.protocol.consensus import Bid, Claim
 from fleet.bus.protocol.messages import State, encode, encoding
 
-RUBBISH = 100_000
+MESSAGES = 100_000
 
 
 def rubbish(fleet: Fleet) -> float:
-    """100 000 malformed, oversized and adversarial messages, on every key there is."""
+    """Send 100 000 malformed, oversized and extreme messages on all keys."""
     rng = random.Random(0)
-    of_fleet, session = fleet.link.fleet, fleet.session
-    said = [str(key) for key in _every_key(of_fleet, fleet.arms)]
+    fleet_name, session = fleet.client.fleet, fleet.session
+    all_keys = [str(key) for key in _every_key(fleet_name, fleet.arms)]
     kinds = [encoding(kind) for kind in (State, Award, Bid, Claim, QuoteRequest, LeaseRequest, Report, Submission)]
     bodies = [
         b"",
@@ -45,36 +45,36 @@ def rubbish(fleet: Fleet) -> float:
             }
         ).encode(),
     ]
-    for number in range(RUBBISH):
-        key, body, kind = rng.choice(said), rng.choice(bodies), rng.choice(kinds)
+    for number in range(MESSAGES):
+        key, body, kind = rng.choice(all_keys), rng.choice(bodies), rng.choice(kinds)
         if number % 50 == 0:
             session.get(key, lambda _reply: None, payload=body, encoding=kind, timeout=1.0)
         else:
             session.put(key, body, encoding=kind)
         if number % 500 == 0:
             fleet.supervisor.poll()
-            fleet.link.serve()
+            fleet.client.serve()
     return math.nan
 
 
 def replayed_awards(fleet: Fleet) -> float:
-    """Awards that were made before are sent again, by somebody else."""
+    """Send the awards of an arm again, 50 times."""
     arm = fleet.arms[0]
     for award in awards_of(fleet, arm) * 50:
         fleet.session.get(
-            keys.of_arm(fleet.link.fleet, arm, "award"),
+            keys.of_arm(fleet.client.fleet, arm, "award"),
             lambda _reply: None,
             payload=encode(award),
             encoding=encoding(Award),
             timeout=2.0,
         )
         fleet.supervisor.poll()
-        fleet.link.serve()
+        fleet.client.serve()
     return math.nan
 
 
 def awards_of(fleet: Fleet, arm: str) -> list[Award]:
-    """What an arm has been awarded so far, by its journal."""
+    """Return the awards of an arm, by its journal."""
     path = fleet.folder / "journals" / f"{arm}.journal"
     lines = [json.loads(line)["records"] for line in path.read_bytes().splitlines() if line.endswith(b"}")]
     return [
