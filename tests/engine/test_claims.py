@@ -1,4 +1,4 @@
-"""Claims on jobs: the action mask and the awards, against a referee written in plain Python, and in worked examples."""
+"""Claims on jobs: action masks and awards, against a reference in plain Python and in examples."""
 
 from dataclasses import replace
 
@@ -13,19 +13,19 @@ from fleet.telemetry import IDLE, WORKING
 
 
 def world_of(small, places, arms=3, slots=4, **more):
-    """One job per place (or pair of places); every arm can do all."""
+    """Return a shift with one job per place or pair of places; every arm can do all."""
     jobs = [small.job(f"j{i}", small.work(*(p if isinstance(p, tuple) else (p,)))) for i, p in enumerate(places)]
     return small.shop([jobs], arms=arms, slots=slots, **more)
 
 
 def with_difficulty(world: World, difficulty) -> World:
-    """The world with other difficulties, broadcast to [env, arm, job]; they decide between claims."""
+    """Return the world with other difficulties, broadcast to [env, arm, job], which decide between claims."""
     offers = world.offers
     return replace(world, offers=replace(offers, difficulty=np.broadcast_to(difficulty, offers.difficulty.shape)))
 
 
 def referee(slot_job, mask, stations, actions, difficulty, occupied):
-    """Claims in order of (difficulty, arm); a job and its stations go to the first. Returns jobs, losers, illegal."""
+    """Award claims in order of (difficulty, arm); return jobs, losers, illegal."""
     arms = len(actions)
     legal = [0 <= a < mask.shape[1] and bool(mask[i, a]) for i, a in enumerate(actions)]
     claims = []
@@ -47,7 +47,7 @@ PLACES = ["bench", "rack", ("bench", "rack"), ("rack", "press"), "press", "shelf
 
 @settings(max_examples=150, deadline=None)
 @given(st.data())
-def test_awards_are_those_of_the_referee(small, data) -> None:
+def test_awards_equal_the_reference(small, data) -> None:
     places = data.draw(st.lists(st.sampled_from(PLACES), min_size=1, max_size=6))
     arms = data.draw(st.integers(1, 4))
     stations = {j: set(p if isinstance(p, tuple) else (p,)) for j, p in enumerate(places)}
@@ -72,13 +72,13 @@ def test_awards_are_those_of_the_referee(small, data) -> None:
         assert (after.illegal - state.illegal)[0].tolist() == illegal
         assert (after.last_award[0] == -1).tolist() == lost
         assert (after.last_award[0] == 1).tolist() == [job >= 0 for job in won]
-        # Three steps are too short to be home again.
+        # After three steps no arm is home again.
         expected = [h if h >= 0 else w for h, w in zip(state.job[0].tolist(), won, strict=True)]
         assert after.job[0].tolist() == expected
         state = after
 
 
-def test_a_number_beats_no_number_and_the_lower_index_a_tie(small) -> None:
+def test_a_score_beats_no_score_and_the_lower_index_wins_a_tie(small) -> None:
     world, plant = world_of(small, ["bench"])
     for scores, winner in (([np.nan, 3.0, 3.0], 1), ([0.5, 0.2, 0.2], 1), ([np.nan] * 3, 0), ([6.9, np.nan, 7.0], 0)):
         world = with_difficulty(world, np.array(scores)[None, :, None])
@@ -89,7 +89,7 @@ def test_a_number_beats_no_number_and_the_lower_index_a_tie(small) -> None:
         assert state.last_award[0].tolist() == expected
 
 
-def test_two_jobs_of_one_station_are_not_worked_at_once(small) -> None:
+def test_one_station_serves_one_job_at_a_time(small) -> None:
     world, plant = world_of(small, ["bench", "bench", "rack"], arms=2)
     world = with_difficulty(world, np.array([2.0, 1.0])[None, :, None])
     both = step(world, initial(world), np.array([[1, 2]]), plant).state
@@ -125,12 +125,12 @@ def test_slots_hold_the_oldest_jobs_first(small, slots) -> None:
 
 
 @pytest.mark.parametrize("stations", [64, 65, 130])
-def test_any_number_of_stations_is_told_apart(small, stations) -> None:
-    """Stations are bits of 64-bit words."""
+def test_more_than_64_stations_are_distinguished(small, stations) -> None:
+    """Stations are bits of 64-bit integers."""
     world, plant = world_of(small, [f"place_{i}" for i in range(stations)], arms=2, slots=stations)
     state = step(world, initial(world), np.array([[stations, 0]]), plant).state
     mask = open_jobs(world, state)[1][0, 1]
-    assert mask.tolist() == [1] * stations + [0]  # the job in work has left its slot
+    assert mask.tolist() == [1] * stations + [0]  # the current job is no longer in a slot
     jobs = [small.job(f"again_{i}", small.work(f"place_{i}")) for i in range(stations)]
     jobs += [small.job(f"more_{i}", small.work(f"place_{i}")) for i in (0, stations - 1)]
     world, plant = small.shop([jobs], arms=2, slots=len(jobs))

@@ -1,4 +1,4 @@
-"""The engine's loops, compiled and uncompiled: one shift gives the same to the last bit."""
+"""Compiled and uncompiled loops of the engine give equal results, bit for bit."""
 
 import numpy as np
 import pytest
@@ -49,7 +49,7 @@ def check_equal(episode: Episode, seed: int, **options) -> ShiftRunner:
     return slow
 
 
-def test_shifts_with_faults_and_returns(small) -> None:
+def test_compiled_and_uncompiled_agree_with_faults_and_returned_jobs(small) -> None:
     make = small.Shifts(arms=3, jobs=9, ticks=80, ambient_c=45.0, limits=LIMITS)
     runs = [check_equal(make(np.random.SeedSequence(seed)), seed) for seed in range(3)]
     kinds = {event.kind for run in runs for event in run.events}
@@ -57,12 +57,12 @@ def test_shifts_with_faults_and_returns(small) -> None:
 
 
 @pytest.mark.parametrize(("arms", "jobs", "slots"), [(1, 0, 1), (1, 1, 3), (4, 12, 5)])
-def test_shifts_of_any_size(small, arms, jobs, slots) -> None:
+def test_compiled_and_uncompiled_agree_for_any_size(small, arms, jobs, slots) -> None:
     make = small.Shifts(arms=arms, jobs=jobs, slots=slots, ticks=40, ambient_c=45.0, limits=LIMITS)
     check_equal(make(np.random.SeedSequence(5)), 5)
 
 
-def test_messages_that_are_late_and_lost(small) -> None:
+def test_compiled_and_uncompiled_agree_with_late_and_lost_messages(small) -> None:
     make = small.Shifts(arms=3, jobs=6, ticks=30)
     run = check_equal(
         make(np.random.SeedSequence(2)), 2, exchange=lambda arms: MemoryExchange(arms, Channel(delay_s=20.0, loss=0.3))
@@ -70,7 +70,7 @@ def test_messages_that_are_late_and_lost(small) -> None:
     assert 0 < run.messages < 3 * 2 * (run.tick + 1)
 
 
-def test_a_plant_that_measures_its_drive(small) -> None:
+def test_compiled_and_uncompiled_agree_with_a_plant_that_measures_its_drive(small) -> None:
     content = small.work(payload_kg=small.HOT)
     world, plant = small.shop([[small.job("a", content, repetitions=60)]], ticks=80)
 

@@ -1,4 +1,4 @@
-"""Moments at which limits are crossed, against SciPy, and what warnings, faults and recoveries lead to."""
+"""Times of limit crossings against SciPy, and the effects of warnings, faults and recoveries."""
 
 import math
 
@@ -23,7 +23,7 @@ DT_S, AMBIENT_C = 10.0, 25.0
 
 
 def work_on(world: World, plant, log: list[Event]) -> list[Stepped]:
-    """Arm 0 claims the oldest job whenever it may; the others wait."""
+    """Play a shift in which arm 0 claims the oldest job if it may; the others wait."""
     state, steps = initial(world), []
     for _ in range(world.ticks):
         actions = np.zeros((1, len(world.arms)), dtype=int)
@@ -42,7 +42,7 @@ def hot_shop(small, *, payload_kg=8.0, repetitions=200, arms=1, start_c=25.0, **
 
 
 def hottest(temp_c) -> np.ndarray:
-    """Temperature of the hottest motor, from [..., node]."""
+    """Return the temperature of the hottest motor, from [..., node]."""
     return temp_c[..., WINDING].max(axis=-1)
 
 
@@ -51,7 +51,7 @@ def one(log: list[Event], kind: str) -> Event:
 
 
 def integrated(world: World, start_c, heat_w, seconds) -> tuple[np.ndarray, np.ndarray]:
-    """Times and hottest winding by Runge-Kutta under constant heat, every 5 ms."""
+    """Return times and hottest winding under constant heat by Runge-Kutta, every 5 ms."""
     m = world.thermal
     grid = np.arange(0.0, seconds + 1e-9, 0.005)
 
@@ -63,7 +63,7 @@ def integrated(world: World, start_c, heat_w, seconds) -> tuple[np.ndarray, np.n
 
 
 def winding_after(world: World, start_c, heat_w, seconds: float) -> float:
-    """Hottest motor after constant heat, by the matrix exponential."""
+    """Return the hottest motor after constant heat by the matrix exponential."""
     m = world.thermal
     law = np.zeros((NODES + 1, NODES + 1))
     law[:NODES, :NODES] = -m.laplacian[0] / m.capacity[0][:, None]
@@ -72,8 +72,8 @@ def winding_after(world: World, start_c, heat_w, seconds: float) -> float:
 
 
 @pytest.mark.parametrize("start_c", [30.0, 80.0], ids=["warming", "cooling"])
-def test_a_limit_is_crossed_where_brentq_finds_the_root(small, start_c) -> None:
-    """Also where the search hits the limit exactly; the moment is never on the near side of the limit."""
+def test_crossing_times_equal_brentq(small, start_c) -> None:
+    """Also if the search hits the limit exactly; the time is never before the crossing."""
     world, _ = small.shop([[small.job("a")]])
     tables = tables_of(world)[0]
     heat_w, temp_c, modal = np.zeros(NODES), np.full(NODES, start_c), np.empty((2, NODES))
@@ -95,7 +95,7 @@ def test_a_limit_is_crossed_where_brentq_finds_the_root(small, start_c) -> None:
 
 
 @pytest.mark.parametrize("payload_kg", [6.0, 8.0, 10.0])
-def test_warning_and_fault_come_when_an_integration_by_scipy_says(small, payload_kg) -> None:
+def test_times_of_warning_and_fault_equal_scipy(small, payload_kg) -> None:
     world, plant = hot_shop(small, payload_kg=payload_kg, ticks=120)
     log: list[Event] = []
     steps = work_on(world, plant, log)
@@ -105,7 +105,7 @@ def test_warning_and_fault_come_when_an_integration_by_scipy_says(small, payload
         t, hot = integrated(world, s.record.start_c[0, 0], s.record.heat_w[0, 0], DT_S)
         assert event.time_s % DT_S == pytest.approx(t[np.argmax(hot >= limit_c)], abs=0.05)
         assert (event.joint, event.value, event.job) == (2, limit_c, "a")
-    assert s.state.peak_c[0, 0] == pytest.approx(75.0, abs=1e-6)  # the hottest it got was at the fault
+    assert s.state.peak_c[0, 0] == pytest.approx(75.0, abs=1e-6)  # the highest temperature is that at the fault
 
 
 def test_time_above_the_warning_limit_is_exact(small) -> None:
@@ -125,7 +125,7 @@ def test_time_above_the_warning_limit_is_exact(small) -> None:
 
 
 @pytest.mark.parametrize("power_off", [True, False])
-def test_recovery_takes_until_every_motor_is_cool_and_then_the_clearing(small, power_off) -> None:
+def test_recovery_waits_for_every_motor_and_the_clearing_time(small, power_off) -> None:
     limits = ThermalLimits(restart_c=45.0, clear_s=33.0, power_off_on_fault=power_off)
     world, plant = hot_shop(small, limits=limits, ticks=600)
     log: list[Event] = []
@@ -136,10 +136,10 @@ def test_recovery_takes_until_every_motor_is_cool_and_then_the_clearing(small, p
     m = world.thermal
     slope = lambda temp, heat: (heat + m.to_ambient[0] * 25.0 - m.laplacian[0] @ temp) / m.capacity[0]  # noqa: E731
     heat_w = s.record.heat_w[0, 0]
-    there = solve_ivp(lambda _, x: slope(x, heat_w), (0, fault.time_s % DT_S), s.record.start_c[0, 0], rtol=1e-9)
+    at_fault = solve_ivp(lambda _, x: slope(x, heat_w), (0, fault.time_s % DT_S), s.record.start_c[0, 0], rtol=1e-9)
     braked = np.concatenate([np.zeros(7), np.zeros(7) if power_off else world.motors.idle_w[0]])
     cool = solve_ivp(
-        lambda _, x: slope(x, braked), (0, 6000), there.y[:, -1], rtol=1e-9, atol=1e-9,
+        lambda _, x: slope(x, braked), (0, 6000), at_fault.y[:, -1], rtol=1e-9, atol=1e-9,
         events=lambda _, x: x[WINDING].max() - 45.0,
     )  # fmt: skip
     assert t[-1] == pytest.approx(fault.time_s % DT_S, abs=0.01)
@@ -156,23 +156,23 @@ def test_an_arm_switched_off_cools_faster(small) -> None:
         last = work_on(world, plant, log)[-1]
         assert last.state.mode[0, 0] == FAULTED
         ends[off] = last.state.temp_c[0, 0]
-    # Both had the same heat up to the same moment; the difference is the idle heat alone.
+    # Both had the same heat up to the fault; the difference is the idle heat only.
     assert (ends[True] < ends[False]).all()
 
 
 def test_a_faulted_arm_may_only_wait(small) -> None:
     world, plant = hot_shop(small, arms=2, ticks=200)
-    seen = 0
+    count = 0
     for s in work_on(world, plant, []):
         faulted = s.state.mode[0] == FAULTED
         mask = open_jobs(world, s.state)[1][0]
-        seen += faulted.sum()
+        count += faulted.sum()
         assert (mask[:, 0] == 1).all()
         assert not mask[faulted, 1:].any()
-    assert seen > 10
+    assert count > 10
 
 
-def test_a_returned_job_keeps_its_whole_cycles_and_the_rest_is_done_later(small) -> None:
+def test_a_returned_job_keeps_its_complete_cycles(small) -> None:
     world, plant = hot_shop(small, repetitions=40, ticks=600)
     log: list[Event] = []
     steps = work_on(world, plant, log)
@@ -228,7 +228,7 @@ def test_an_arm_that_begins_too_hot_faults_at_once(small) -> None:
 
 @settings(max_examples=12, deadline=None)
 @given(narrow=st.floats(0.02, 3.0), clear_s=st.floats(0.0, 25.0), dt_s=st.sampled_from([5.0, 10.0, 60.0]))
-def test_events_come_in_order_however_near_the_limits_are(small, narrow, clear_s, dt_s) -> None:
+def test_events_are_in_order_for_any_distance_of_limits(small, narrow, clear_s, dt_s) -> None:
     """A fault and the fall below the restart limit may be in one step."""
     limits = ThermalLimits(warning_c=75.0 - narrow / 2, error_c=75.0, restart_c=75.0 - narrow, clear_s=clear_s)
     world, plant = hot_shop(small, limits=limits, dt_s=dt_s, ticks=round(900 / dt_s))
@@ -241,12 +241,12 @@ def test_events_come_in_order_however_near_the_limits_are(small, narrow, clear_s
         assert recover.time_s >= fault.time_s + clear_s - 1e-6
     m, first = world.thermal, events[0]
     s = steps[int(first.time_s // dt_s)]
-    there = solve_ivp(
+    at_fault = solve_ivp(
         lambda _, x: (s.record.heat_w[0, 0] + m.to_ambient[0] * 25.0 - m.laplacian[0] @ x) / m.capacity[0],
         (0, first.time_s % dt_s), s.record.start_c[0, 0], rtol=1e-10, atol=1e-10,
     ).y[:, -1]  # fmt: skip
     cool = solve_ivp(
-        lambda _, x: (m.to_ambient[0] * 25.0 - m.laplacian[0] @ x) / m.capacity[0], (0, 900), there,
+        lambda _, x: (m.to_ambient[0] * 25.0 - m.laplacian[0] @ x) / m.capacity[0], (0, 900), at_fault,
         rtol=1e-10, atol=1e-10, events=lambda _, x: x[WINDING].max() - limits.restart_c,
     )  # fmt: skip
     assert events[1].time_s == pytest.approx(first.time_s + cool.t_events[0][0] + clear_s, abs=0.01)

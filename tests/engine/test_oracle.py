@@ -1,4 +1,4 @@
-"""The oracle against the shift itself, and against the law integrated on its own."""
+"""The oracle against a shift, and against the heat law integrated by SciPy."""
 
 import math
 
@@ -30,7 +30,7 @@ def oracle(start_c=None) -> Oracle:
 
 
 @pytest.mark.parametrize(("payload_kg", "repetitions"), [(0.0, 30), (4.0, 90), (8.0, 40)])
-def test_peaks_are_those_of_the_same_plan_in_a_shift(small, payload_kg, repetitions) -> None:
+def test_peaks_equal_those_of_a_shift(small, payload_kg, repetitions) -> None:
     content = small.work(payload_kg=payload_kg)
     arms = [small.arm(0, [content], times=small.Times(0.0, 10.0, 0.02))]
     jobs = [small.job("a", content, repetitions=repetitions)]
@@ -40,13 +40,13 @@ def test_peaks_are_those_of_the_same_plan_in_a_shift(small, payload_kg, repetiti
         state = step(world, state, np.array([[int(tick == 0)]]), plant).state
     plan = arms[0].plans[content][0]
     start = np.full(14, 25.0)
-    (found,) = peaks([plan], [10.0 * repetitions], motors=MOTORS, thermal=THERMAL, start_c=start, ambient_c=25.0)
-    assert found == pytest.approx(state.temp_c[0, 0, WINDING], abs=1e-9)
-    assert found.max() == pytest.approx(state.peak_c[0, 0], abs=1e-9)
+    (actual,) = peaks([plan], [10.0 * repetitions], motors=MOTORS, thermal=THERMAL, start_c=start, ambient_c=25.0)
+    assert actual == pytest.approx(state.temp_c[0, 0, WINDING], abs=1e-9)
+    assert actual.max() == pytest.approx(state.peak_c[0, 0], abs=1e-9)
 
 
 @pytest.mark.parametrize("duration_s", [0.0, 2.0, 12.0, 99.0])
-def test_a_plan_heats_for_as_long_as_it_lasts(small, duration_s) -> None:
+def test_heating_time_is_the_duration_of_the_plan(small, duration_s) -> None:
     plan = plan_of(small, 6.0)
     start = np.full(14, 30.0)
     load = drive(plan.cycle.profile, MOTORS)
@@ -56,9 +56,9 @@ def test_a_plan_heats_for_as_long_as_it_lasts(small, duration_s) -> None:
         return (heat + THERMAL.to_ambient * 25.0 - THERMAL.laplacian @ temp_c) / THERMAL.capacity
 
     law = solve_ivp(slope, (0.0, duration_s), start, rtol=1e-9, atol=1e-9).y[WINDING]
-    other = plan_of(small, 0.0)  # plans of other lengths beside it change nothing
-    found = peaks([plan, other], [duration_s, 55.0], motors=MOTORS, thermal=THERMAL, start_c=start, ambient_c=25.0)
-    assert found[0, 1] == pytest.approx(law[1].max(), abs=0.01 + 0.02 * (law[1].max() - 30.0))
+    other = plan_of(small, 0.0)  # other plans in the same call have no effect
+    actual = peaks([plan, other], [duration_s, 55.0], motors=MOTORS, thermal=THERMAL, start_c=start, ambient_c=25.0)
+    assert actual[0, 1] == pytest.approx(law[1].max(), abs=0.01 + 0.02 * (law[1].max() - 30.0))
 
 
 def test_no_plans_have_no_peaks() -> None:
@@ -86,7 +86,7 @@ def test_difficulty_follows_its_formula(small) -> None:
     assert score.per_joint == pytest.approx([1.0 - math.exp(-(c - 25.0) / (60.0 - 25.0)) for c in peak])
 
 
-def test_a_warm_start_is_the_settled_rest(small) -> None:
+def test_a_warm_start_is_the_steady_state_at_rest(small) -> None:
     arm = small.arm(0, [small.work()])
     rest = arm.rest_drive()
     assert warm_start(arm, 25.0) == pytest.approx(steady_state(THERMAL, rest.current_sq, rest.friction_w, MOTORS, 25.0))

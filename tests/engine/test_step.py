@@ -21,7 +21,7 @@ DT_S = 10.0
 
 
 def play(world, plant, actions, log=None, state=None) -> list[Stepped]:
-    """Every step of a shift; actions [tick][arm] are those of all envs, and all arms wait afterwards."""
+    """Play a shift with actions [tick][arm] for all envs; afterwards all arms wait."""
     state = initial(world) if state is None else state
     steps = []
     for tick in range(world.ticks):
@@ -34,7 +34,7 @@ def play(world, plant, actions, log=None, state=None) -> list[Stepped]:
 
 
 def with_random_difficulty(world: World, rng: np.random.Generator) -> World:
-    """The world with other difficulties, which decide between claims."""
+    """Return the world with other difficulties, which decide between claims."""
     return replace(world, offers=replace(world.offers, difficulty=rng.random(world.offers.difficulty.shape)))
 
 
@@ -43,7 +43,7 @@ def times(log: list[Event], kind: str) -> list[float]:
 
 
 def rhs(temp_c, current_sq, friction_w, ambient_c, powered=True):
-    """The heat law of each joint from the data file, K/s, [node]."""
+    """Return the heat law of each joint from the data file, K/s, [node]."""
     d, out = thermal_data(), np.empty(2 * JOINTS)
     for j in range(JOINTS):
         winding, housing = temp_c[j], temp_c[JOINTS + j]
@@ -61,7 +61,7 @@ def rhs(temp_c, current_sq, friction_w, ambient_c, powered=True):
 
 
 def amps_sq(tau):
-    """Squared current of a standing arm, A², [joint]."""
+    """Return the squared current of an arm at rest, A², [joint]."""
     d = thermal_data()
     return (tau / np.array(d["eta"]) / (d["gear_ratio"] * np.array(d["kt_nm_per_a"]))) ** 2
 
@@ -96,15 +96,15 @@ def test_a_job_is_finished_and_its_arm_home_at_the_planned_moment(
     assert times(log, "home") == pytest.approx([home] if home <= world.horizon_s else [])
 
 
-def test_an_arm_home_at_the_end_of_a_step_is_free_in_the_next(small) -> None:
+def test_an_arm_that_is_home_at_the_end_of_a_step_is_free_in_the_next(small) -> None:
     content = small.work()
-    # 0.1 + 3 · 0.1 + 9.6 s is a whole step, though not in floating point.
+    # 0.1 + 3 · 0.1 + 9.6 s is a whole step, but not in floating point.
     spans = small.Times(0.1, 0.1, 9.6)
     world, plant = small.shop([[small.job("a", content)]], arms=[small.arm(0, [content], times=spans)], ticks=2)
     assert play(world, plant, [[1]])[0].state.mode[0, 0] == IDLE
 
 
-def test_a_job_waits_for_its_release_and_for_the_jobs_before_it(small) -> None:
+def test_a_job_waits_for_its_release_and_its_predecessors(small) -> None:
     first, second = small.work("bench"), small.work("rack")
     jobs = [
         small.job("late", second, release_s=31.0),
@@ -151,7 +151,7 @@ def test_one_step_of_a_constant_drive_is_the_exact_solution(small, payload_kg) -
     spans = small.Times(3.0, 10.0, 2.0)
     world, plant = small.shop([[small.job("a", content, repetitions=100)]], arms=[small.arm(0, [content], times=spans)])
     steps = play(world, plant, [[1]])
-    # Step 30, so that temperatures differ; the loss is that at its beginning.
+    # Step 30, so that temperatures differ; the loss is constant within a step.
     before, after = steps[30].record.start_c[0, 0], steps[30].state.temp_c[0, 0]
     frozen = rhs(before, amps_sq(small.torque(payload_kg)), np.zeros(JOINTS), 25.0)
     laplacian = thermal_model(gen3_network()).laplacian / thermal_model(gen3_network()).capacity[:, None]
@@ -176,7 +176,7 @@ def test_a_long_job_follows_the_heat_law_integrated_by_scipy(small) -> None:
     assert got == pytest.approx(law.y[:, -1], abs=0.15)  # the loss lags by a step
 
 
-def test_shorter_steps_give_nearly_the_same_temperatures(small) -> None:
+def test_temperatures_converge_with_the_step_size(small) -> None:
     content = small.work(payload_kg=small.WARM)
     ends = []
     for dt_s in (10.0, 5.0, 1.0):
@@ -184,18 +184,18 @@ def test_shorter_steps_give_nearly_the_same_temperatures(small) -> None:
         ends.append(play(world, plant, [[1, 0]])[-1].state.temp_c)
     coarse, middle, fine = ends
     assert np.abs(coarse - fine).max() < 0.2
-    # First order: the error against dt → 0 halves with the step. e(10) : e(5) seen from 1 s is 9 : 4.
+    # First order: the error is proportional to the step. Against 1 s, e(10) : e(5) = 9 : 4.
     assert np.abs(coarse - fine).max() / np.abs(middle - fine).max() == pytest.approx(9 / 4, rel=0.1)
 
 
-def test_an_idle_warm_fleet_stays_as_it_is(small) -> None:
+def test_an_idle_warm_fleet_is_in_steady_state(small) -> None:
     content = small.work()
     world, plant = small.shop([[]], arms=[small.arm(0, [content])], ticks=60, start_warm=True)
     assert play(world, plant, [])[-1].state.temp_c == pytest.approx(initial(world).temp_c, abs=1e-6)
 
 
 @pytest.mark.parametrize("power_off", [True, False])
-def test_energy_equals_the_heat_stored_and_the_heat_lost_to_ambient(small, power_off) -> None:
+def test_energy_equals_stored_heat_plus_heat_lost_to_ambient(small, power_off) -> None:
     content = small.work(payload_kg=small.HOT)
     limits = ThermalLimits(power_off_on_fault=power_off)
     world, plant = small.shop([[small.job("a", content, repetitions=60)]], ticks=120, limits=limits)
@@ -217,7 +217,7 @@ def test_energy_equals_the_heat_stored_and_the_heat_lost_to_ambient(small, power
 
 
 def heated(world: World, a: int, start_c, heat_w, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-    """Temperatures after constant heat at 25 °C, and the time integral of what is above 25 °C, [node], by expm."""
+    """Return temperatures after constant heat, and the time integral of (T − 25 °C), [node], by expm."""
     m, n = world.thermal, 2 * JOINTS
     law = np.zeros((2 * n + 1, 2 * n + 1))  # of temperatures above ambient, their integral, and 1
     law[:n, :n], law[:n, -1] = -m.laplacian[a] / m.capacity[a][:, None], heat_w / m.capacity[a]
@@ -231,7 +231,7 @@ def heated(world: World, a: int, start_c, heat_w, seconds: float) -> tuple[np.nd
 
 @st.composite
 def shifts(draw):
-    """A small shift, and a seed of legal and illegal actions."""
+    """Draw a small shift, and a seed for legal and illegal actions."""
     arms, jobs = draw(st.integers(1, 3)), draw(st.integers(0, 6))
     rows = [
         (
@@ -296,7 +296,7 @@ def test_jobs_and_time_are_conserved(small, shift) -> None:
             assert table.release_s[0, j] <= time_s
         assert ((state.status == DONE) == ~np.isnan(state.finished_s)).all()
         assert (state.cycles[state.status == DONE] == table.repetitions[state.status == DONE]).all()
-        # Seconds: busy, lost, and the rest.
+        # Seconds busy, lost and idle.
         assert (state.busy_s >= -1e-9).all()
         assert (state.lost_s >= -1e-9).all()
         assert (state.busy_s + state.lost_s <= time_s + 1e-6).all()
@@ -310,7 +310,7 @@ def test_jobs_and_time_are_conserved(small, shift) -> None:
 
 
 def _check_seconds(world, state, log) -> None:
-    """Busy and lost time computed from the event log."""
+    """Compute busy and lost time from the event log."""
     for a, name in enumerate(world.arms):
         busy = lost = 0.0
         since_award = since_fault = None
@@ -334,7 +334,7 @@ def _check_seconds(world, state, log) -> None:
 
 
 @pytest.mark.parametrize("envs", [2, 5])
-def test_a_row_does_not_depend_on_how_many_rows_there_are(small, envs) -> None:
+def test_a_row_does_not_depend_on_the_number_of_rows(small, envs) -> None:
     works = [small.work(p, kg) for p in ("bench", "rack") for kg in (small.LIGHT, small.HOT)]
     shifts = [
         [small.job(f"j{i}", works[(i + e) % 4], repetitions=50 + i, release_s=20.0 * i) for i in range(3 + e)]
@@ -366,7 +366,7 @@ def test_a_row_does_not_depend_on_how_many_rows_there_are(small, envs) -> None:
 def test_relabelling_the_arms_relabels_the_shift(small) -> None:
     works = [small.work(p, kg) for p in ("bench", "rack", "press") for kg in (small.LIGHT, small.HOT)]
     jobs = [small.job(f"j{i}", works[i], repetitions=20) for i in range(6)]
-    # Two motors that differ, so that the arms can be told apart.
+    # Two different motors, so that the arms differ.
     kinds = [small.arm(i, works, times=small.Times(3, 8 + i, 2)) for i in range(3)]
     order = [2, 0, 1]
     straight, plant = small.shop([jobs], arms=kinds)

@@ -1,4 +1,4 @@
-"""From nouns to arrays: what the tables of a world say of jobs, plans and offers."""
+"""Arrays of a world: jobs, plans and offers."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from fleet.motor import gen3_motors
 
 
 class Scripted:
-    """Says the same of a plan every time; None where the script has nothing."""
+    """Returns a given score for each elbow variant, or None."""
 
     version = "scripted"
 
@@ -32,7 +32,7 @@ def with_variants(small, by_elbow):
     return replace(arm, model=Scripted(by_elbow), plans={content: tuple(replace(plan, elbow=k) for k in by_elbow)})
 
 
-def test_an_arm_offers_the_variant_it_finds_easiest(small) -> None:
+def test_an_arm_offers_its_plan_of_lowest_difficulty(small) -> None:
     arm = with_variants(small, {0: 3.0, 1: 1.0, 2: 2.0})
     offer = arm.offers(small.work())[3]
     assert offer is not None
@@ -43,7 +43,7 @@ def test_an_arm_offers_the_variant_it_finds_easiest(small) -> None:
     assert len(world.plans.times_s) == 1
 
 
-def test_without_a_score_it_offers_the_first_and_says_nothing(small) -> None:
+def test_without_a_score_it_offers_the_first_plan(small) -> None:
     for arm in (
         with_variants(small, {0: None, 1: None}),
         replace(with_variants(small, {0: 1.0, 1: 0.5}), model=Blind()),
@@ -56,7 +56,7 @@ def test_without_a_score_it_offers_the_first_and_says_nothing(small) -> None:
         assert (world.offers.plan == 0).all()
 
 
-def test_more_of_the_same_work_is_scored_for_itself(small) -> None:
+def test_each_number_of_repetitions_has_its_own_score(small) -> None:
     class ByLength:
         version = "by length"
 
@@ -70,7 +70,7 @@ def test_more_of_the_same_work_is_scored_for_itself(small) -> None:
     assert world.offers.plan[0, 0].tolist() == [0, 0]
 
 
-def test_a_work_nobody_planned_is_no_offer(small) -> None:
+def test_unplanned_work_is_not_offered(small) -> None:
     arm = small.arm(0, [small.work("rack")])
     assert arm.offers(small.work())[3] is None
     world, _ = small.shop([[small.job("a")]], arms=[arm])
@@ -90,7 +90,7 @@ def test_the_plan_table_holds_times_mean_heat_and_peaks(small) -> None:
     assert world.plans.friction_w[0, 1] == pytest.approx(friction * 0.5)
 
 
-def test_the_job_table_says_what_the_jobs_say(small) -> None:
+def test_the_job_table_equals_the_jobs(small) -> None:
     first = small.job("first", small.work("bench", 2.0, to="rack"), release_s=5.0, due_s=9.0, value=7.0, repetitions=4)
     second = small.job("second", small.work("rack"), after=("first",))
     world, _ = small.shop([[first, second], [second.__class__(**{**vars(second), "after": ()})]])
@@ -104,7 +104,7 @@ def test_the_job_table_says_what_the_jobs_say(small) -> None:
     assert [column[0, 0] for column in row] == [5.0, 9.0, 7.0, 2.0, 4]
 
 
-def test_jobs_in_a_ring_are_refused(small) -> None:
+def test_cyclic_predecessors_are_refused(small) -> None:
     with pytest.raises(ValueError, match="in a ring"):
         small.shop([[small.job("a", after=("b",)), small.job("b", after=("a",))]])
 
@@ -124,7 +124,7 @@ def test_an_arm_that_overheats_standing_at_home_is_refused(small) -> None:
         small.shop([[small.job("a")]], arms=[arm], start_warm=True)
 
 
-def test_risks_are_tabled_once_and_found_by_their_row(small) -> None:
+def test_offers_index_rows_of_the_risk_table(small) -> None:
     class ByLength:
         version = "by length"
 

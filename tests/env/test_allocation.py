@@ -1,4 +1,4 @@
-"""The single environment: how an episode ends, exchanges, text and watchers."""
+"""The single environment: end of an episode, exchanges, text, watchers."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from fleet.bus.exchange.zenoh import ZenohExchange
 # End of an episode
 
 
-def test_it_ends_at_the_horizon_for_all_at_once(make) -> None:
+def test_all_arms_end_at_the_horizon(make) -> None:
     env = make({"ticks": 12})
     env.reset(seed=1)
     ends = [env.step(dict.fromkeys(env.possible_agents, 0)) for _ in range(12)]
@@ -17,13 +17,13 @@ def test_it_ends_at_the_horizon_for_all_at_once(make) -> None:
     assert env.agents == []
 
 
-def test_max_cycles_ends_it_earlier(make, play) -> None:
+def test_max_cycles_end_an_episode_earlier(make, play) -> None:
     env = make({"ticks": 50}, max_cycles=7)
     env.reset(seed=1)
     assert len(play.go_on(env, np.random.default_rng(0))) == 7
 
 
-def test_it_ends_when_all_jobs_are_done(make, small, play) -> None:
+def test_an_episode_ends_when_all_jobs_are_done(make, small, play) -> None:
     env = make({"arms": 2, "jobs": 1, "ticks": 400, "ambient_c": 20.0})
     env.reset(seed=2)
     trace = play.go_on(env, np.random.default_rng(2))

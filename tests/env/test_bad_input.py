@@ -1,4 +1,4 @@
-"""What a caller may do wrong: one sentence each that says what was given, what is allowed, and what to call."""
+"""Errors of the environment: each says what was given, what is allowed, and what to do."""
 
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ def test_actions_may_be_numpy_integers(make, play) -> None:
 
 
 @pytest.mark.parametrize("action", [1.0, np.array(0.0), "1", None, True, np.array([0, 1]), 2**70, [], {}])
-def test_an_action_that_is_no_integer_is_refused_and_changes_nothing(make, play, action) -> None:
+def test_non_integer_actions_are_refused_without_effect(make, play, action) -> None:
     env, other = make(), make()
     env.reset(seed=1)
     other.reset(seed=1)
@@ -36,7 +36,7 @@ def test_an_action_that_is_no_integer_is_refused_and_changes_nothing(make, play,
 
 
 @pytest.mark.parametrize("action", [2**63, 2**64, -(2**63) - 1, 10**30, np.uint64(2**64 - 1), np.array(2**63)])
-def test_an_action_too_large_for_an_array_is_refused_for_its_size(make, action) -> None:
+def test_actions_beyond_int64_are_refused(make, action) -> None:
     env = make()
     env.reset(seed=1)
     with pytest.raises(ValueError, match=r"The action of 'arm_1' must be one integer of 64 bits with sign \(got "):
@@ -44,7 +44,7 @@ def test_an_action_too_large_for_an_array_is_refused_for_its_size(make, action) 
 
 
 @pytest.mark.parametrize("action", [2**63 - 1, -(2**63), np.int64(-1), np.uint8(200)])
-def test_any_other_integer_outside_the_space_is_a_wait(make, action) -> None:
+def test_integers_outside_the_space_are_waits(make, action) -> None:
     env = make()
     env.reset(seed=1)
     *_, infos = env.step({"arm_1": action})
@@ -52,7 +52,7 @@ def test_any_other_integer_outside_the_space_is_a_wait(make, action) -> None:
 
 
 @pytest.mark.parametrize("actions", [None, 1, [1, 0, 0], np.zeros(3, int), "arm_0"])
-def test_actions_that_are_no_dictionary_are_refused(make, actions) -> None:
+def test_actions_must_be_a_dictionary(make, actions) -> None:
     env = make()
     env.reset(seed=1)
     with pytest.raises(ValueError, match=r"step\(\) takes a dictionary of agents and their actions \(got "):
@@ -60,7 +60,7 @@ def test_actions_that_are_no_dictionary_are_refused(make, actions) -> None:
 
 
 @pytest.mark.parametrize("name", ["arm_9", 0, None])
-def test_an_agent_that_is_not_there_is_named_with_those_that_are(make, name) -> None:
+def test_unknown_agents_are_refused_with_the_valid_names(make, name) -> None:
     env = make()
     env.reset(seed=0)
     for call in (lambda: env.step({name: 0}), lambda: env.observation_space(name), lambda: env.action_space(name)):
@@ -68,7 +68,7 @@ def test_an_agent_that_is_not_there_is_named_with_those_that_are(make, name) -> 
             call()
 
 
-def test_before_a_reset_and_after_the_end_it_says_what_to_call(make, play) -> None:
+def test_errors_before_reset_and_after_the_end_name_the_call_to_make(make, play) -> None:
     env = make(render_mode="ansi")
     calls = (lambda: env.step({}), env.state, env.knowledge, env.render, lambda: env.truth, lambda: env.messages)
     for call in calls:
@@ -83,13 +83,13 @@ def test_before_a_reset_and_after_the_end_it_says_what_to_call(make, play) -> No
 
 
 @pytest.mark.parametrize("seed", NO_SEEDS)
-def test_a_seed_that_is_none_is_refused(make, seed) -> None:
+def test_invalid_seeds_are_refused(make, seed) -> None:
     with pytest.raises(ValueError, match=r"seed must be an integer >= 0 \(got "):
         make().reset(seed=seed)
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"render_mode": "tv"}, r"render_mode must be None or one of 'ansi', 'rgb_array', 'human' \(got 'tv'\)\."),
         ({"mask_in": "none"}, r"mask_in must be one of obs, info, both \(got 'none'\)\."),
@@ -97,12 +97,12 @@ def test_a_seed_that_is_none_is_refused(make, seed) -> None:
         ({"max_cycles": 2.5}, r"max_cycles must be an integer >= 1 \(got 2\.5\)\."),
     ],
 )
-def test_an_option_that_there_is_not_is_refused(make, options, said) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_invalid_options_are_refused(make, options, message) -> None:
+    with pytest.raises(ValueError, match=message):
         make(**options)
 
 
-def test_the_turn_by_turn_env_says_it_too(small) -> None:
+def test_the_aec_env_refuses_wrong_actions(small) -> None:
     env = allocation_v0.env(small.Shifts())
     with pytest.raises(AssertionError, match=r"reset\(\) needs to be called before step"):
         env.step(1)
@@ -111,7 +111,7 @@ def test_the_turn_by_turn_env_says_it_too(small) -> None:
     env.step(0)
     with pytest.raises(ValueError, match=rf"The action of '{second}' must be one integer \(got 1\.5\)"):
         env.step(1.5)
-    assert env.agent_selection == second  # it may answer again
+    assert env.agent_selection == second  # it may choose again
     env.step(0)
     while not (env.terminations[env.agent_selection] or env.truncations[env.agent_selection]):
         env.step(0)
@@ -134,7 +134,7 @@ def test_the_turn_by_turn_env_says_it_too(small) -> None:
         np.zeros((2, 3, 1), int), [[0, 0, 0], [0, 0]], [[0, 0, 0], [0, 0, 2**70]], [[0, 0, None]] * 2,
     ],
 )  # fmt: skip
-def test_actions_of_another_type_or_shape_are_refused_and_change_nothing(batch, play, actions) -> None:
+def test_actions_of_wrong_type_or_shape_are_refused_without_effect(batch, play, actions) -> None:
     env, other = batch(2, seed=0), batch(2, seed=0)
     env.reset()
     other.reset()
@@ -145,7 +145,7 @@ def test_actions_of_another_type_or_shape_are_refused_and_change_nothing(batch, 
 
 
 @pytest.mark.parametrize("kind", [np.int8, np.uint8, np.int32, np.uint64])
-def test_actions_may_be_of_any_integer_type_and_order(batch, play, kind) -> None:
+def test_actions_may_have_any_integer_type_and_memory_order(batch, play, kind) -> None:
     env, other = batch(2, seed=0), batch(2, seed=0)
     env.reset()
     other.reset()
@@ -157,7 +157,7 @@ def test_actions_may_be_of_any_integer_type_and_order(batch, play, kind) -> None
     play.same(play.rows(given[0], range(2)), play.rows(given[1], range(2)))
 
 
-def test_a_batch_says_what_to_call_before_a_reset_and_after_an_end(batch) -> None:
+def test_batch_errors_before_reset_and_after_the_end_name_the_call_to_make(batch) -> None:
     env = batch(2, {"ticks": 3}, seed=0, autoreset=False)
     nobody = np.zeros((2, 3), int)
     for call in (lambda: env.step(nobody), env.knowledge, lambda: env.state):
@@ -181,17 +181,17 @@ def test_a_batch_says_what_to_call_before_a_reset_and_after_an_end(batch) -> Non
 @pytest.mark.parametrize(
     "seed", [*(each for each in NO_SEEDS if np.ndim(each) == 0), [1], [1, 2, 3], [1, -2], [1, "x"]]
 )
-def test_seeds_that_do_not_fit_are_refused(batch, seed) -> None:
-    said = r"seed must be (an integer >= 0|one integer or one for each of 2 envs) \(got "
-    with pytest.raises(ValueError, match=said):
+def test_invalid_batch_seeds_are_refused(batch, seed) -> None:
+    message = r"seed must be (an integer >= 0|one integer or one for each of 2 envs) \(got "
+    with pytest.raises(ValueError, match=message):
         batch(2, seed=seed)
     env = batch(2)
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         env.reset(seed=seed)
 
 
 @pytest.mark.parametrize("seed", [np.uint8(255), np.array(127, dtype=np.int8), np.int64(2**63 - 1), 2**64 - 1, 2**200])
-def test_seeds_count_up_past_the_end_of_their_type(batch, play, seed) -> None:
+def test_seeds_count_up_past_the_largest_integer_of_their_type(batch, play, seed) -> None:
     counted, listed = batch(2, seed=seed), batch(2, seed=[int(seed), int(seed) + 1])
     for env in (counted, listed):
         env.reset()
@@ -208,20 +208,20 @@ def test_rows_out_of_range_are_refused(batch, rows) -> None:
 
 
 @pytest.mark.parametrize("rows", [1, "x", [[0]], [0.5], np.array([True]), {0}])
-def test_rows_of_another_shape_are_refused(batch, rows) -> None:
+def test_rows_of_wrong_shape_are_refused(batch, rows) -> None:
     env = batch(2, seed=0)
     env.reset()
     with pytest.raises(ValueError, match=r"rows must be int \[n\] or bool \[2\] \(got "):
         env.reset(rows=rows)
 
 
-def test_seed_and_rows_do_not_go_together(batch) -> None:
+def test_seed_and_rows_exclude_each_other(batch) -> None:
     with pytest.raises(ValueError, match="give seed or rows, not both"):
         batch(2).reset(seed=0, rows=[0])
 
 
 @pytest.mark.parametrize("count", [0, -3, 2.5, "x", None, True])
-def test_a_batch_needs_an_env_and_a_step(batch, count) -> None:
+def test_num_envs_and_max_cycles_must_be_positive(batch, count) -> None:
     with pytest.raises(ValueError, match=r"num_envs must be an integer >= 1 \(got "):
         batch(count)
     if count is not None:
@@ -233,20 +233,20 @@ def test_a_batch_needs_an_env_and_a_step(batch, count) -> None:
 
 
 def beyond(cell) -> dict[str, Any]:
-    """The cell with its shelf where no arm reaches."""
+    """Return the cell with its shelf out of reach."""
     places = [{"name": p.name, "position_m": list(p.position_m)} for p in cell.places]
     places[1]["position_m"] = [9.0, 0.0, 0.2]
     return {"places": places}
 
 
-def test_jobs_that_no_arm_can_do_are_refused_with_what_to_change(cell, folder) -> None:
-    said = r"jobs\[1\]\.places: no arm can do 'sort' with 0\.2 kg \(left at 'shelf': .+\); move the places or an arm"
+def test_jobs_that_no_arm_can_do_are_refused_with_a_remedy(cell, folder) -> None:
+    message = r"jobs\[1\]\.places: no arm can do 'sort' with 0\.2 kg \(left at 'shelf': .+\); move the places or an arm"
     for make in (make_env, lambda scenario, **options: make_batch(scenario, 2, **options)):
-        with pytest.raises(ScenarioError, match=said):
+        with pytest.raises(ScenarioError, match=message):
             make(cell, difficulty="blind", cache=folder, **beyond(cell))
 
 
-def test_a_scenario_or_a_field_that_there_is_not_is_refused(cell, folder) -> None:
+def test_unknown_scenarios_and_fields_are_refused(cell, folder) -> None:
     for make in (make_env, lambda scenario, **options: make_batch(scenario, 2, **options)):
         with pytest.raises(ScenarioError, match="No scenario 'quickstrat'; did you mean 'quickstart'"):
             make("quickstrat")
@@ -258,7 +258,7 @@ def test_a_scenario_or_a_field_that_there_is_not_is_refused(cell, folder) -> Non
             make(cell, difficulty="twins", cache=folder)
 
 
-def test_a_name_that_is_neither_field_nor_option_is_told_the_nearest_of_both(cell, folder) -> None:
+def test_unknown_overrides_are_refused_with_the_nearest_name(cell, folder) -> None:
     with pytest.raises(ScenarioError, match="unknown key 'render_mod'; did you mean 'render_mode'"):
         make_env(cell, difficulty="blind", cache=folder, render_mod="ansi")
     with pytest.raises(ScenarioError, match="unknown key 'randomize'; did you mean 'randomise'"):
@@ -269,17 +269,17 @@ def test_a_name_that_is_neither_field_nor_option_is_told_the_nearest_of_both(cel
             make_batch(cell, 2, difficulty="blind", cache=folder, **{name: value})
 
 
-def test_a_seed_is_told_where_it_belongs(cell, folder) -> None:
+def test_a_seed_override_is_refused_with_where_it_belongs(cell, folder) -> None:
     with pytest.raises(ScenarioError, match=r"make_env\(\) takes no seed: give it to reset\(seed=…\)"):
         make_env(cell, difficulty="blind", cache=folder, seed=3)
 
 
-def test_a_cache_folder_may_be_a_text(cell, folder) -> None:
+def test_a_cache_folder_may_be_a_string(cell, folder) -> None:
     make_env(cell, difficulty="blind", cache=str(folder)).reset(seed=0)
     make_batch(cell, 1, difficulty="blind", cache=str(folder)).reset()
 
 
-def test_an_option_of_another_type_is_refused_with_the_type_it_takes(cell, folder) -> None:
+def test_options_of_wrong_type_are_refused_with_the_valid_type(cell, folder) -> None:
     wrong: Any = 0.3
     none: Any = None
     with pytest.raises(ScenarioError, match=r"channel must be a fleet\.bus\.exchange\.channel\.Channel \(got 0\.3\)"):
@@ -299,7 +299,7 @@ def test_an_option_of_another_type_is_refused_with_the_type_it_takes(cell, folde
         make_batch(cell, 2, difficulty="blind", cache=folder, randomise=wrong)
 
 
-def test_a_variant_of_another_fleet_is_refused(cell, folder) -> None:
+def test_variants_with_other_arms_are_refused(cell, folder) -> None:
     arms = [{"name": a.name, "position_m": list(a.position_m), "tilt_deg": list(a.tilt_deg)} for a in cell.arms]
     other = [dict(arms[0], name="west"), *arms[1:]]
     stream = {"name": "x", "kind": "hold", "places": ["bench"], "arrivals": {"kind": "batch", "count": 1}}
@@ -319,14 +319,14 @@ def test_a_variant_of_another_fleet_is_refused(cell, folder) -> None:
 
 
 @pytest.mark.parametrize("warmer_k", [(0.0, 1e6), (-1000.0, 0.0)])
-def test_air_that_no_scenario_may_have_is_refused(cell, folder, warmer_k) -> None:
+def test_invalid_ambient_temperatures_are_refused(cell, folder, warmer_k) -> None:
     randomise = Randomisation(ambient_k=warmer_k)
     with pytest.raises(ScenarioError, match=r"ambient_k \(.+\) goes too far: .+ between -40 and 60 °C \(got \["):
         make_batch(cell, 2, difficulty="blind", cache=folder, randomise=randomise)
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"ambient_k": (2.0, 1.0)}, r"Randomisation\.ambient_k needs low <= high \(got 2\.0, 1\.0\)"),
         ({"arrivals": (2.0, 1.0)}, r"Randomisation\.arrivals needs low <= high"),
@@ -345,6 +345,6 @@ def test_air_that_no_scenario_may_have_is_refused(cell, folder, warmer_k) -> Non
         ({"variants": {"spread": {"seed": 1}}}, r"Randomisation\.variants must be a list of dictionaries"),
     ],
 )
-def test_a_range_that_is_none_is_refused(options, said) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_invalid_ranges_are_refused(options, message) -> None:
+    with pytest.raises(ValueError, match=message):
         Randomisation(**options)

@@ -1,4 +1,4 @@
-"""The environment's contract: PettingZoo's own checks, and what they leave open."""
+"""The contract of the environment: PettingZoo's tests, and what they do not check."""
 
 import warnings
 from collections.abc import Iterator
@@ -26,19 +26,19 @@ HOT = {"arms": 3, "ambient_c": 38.0}
 
 @pytest.fixture
 def quiet() -> Iterator[None]:
-    """Without what PettingZoo's tests say of every environment of this layout."""
+    """Ignore warnings that PettingZoo's tests give for every Dict observation."""
     with warnings.catch_warnings():
-        # A dictionary of vector and mask is the layout the field agrees on; api_test says so of every such env.
+        # api_test warns of every Dict observation, the usual layout of vector and mask.
         warnings.filterwarnings("ignore", message="Observation space for each agent probably should be")
         warnings.filterwarnings("ignore", message="Observation is not a NumPy array")
-        # Its wrapper of parallel envs has these properties, and reading them warns.
+        # PettingZoo's wrapper of parallel envs warns when these properties are read.
         warnings.filterwarnings("ignore", message="The `(observation|action)_spaces` dictionary is deprecated")
         yield
 
 
 @pytest.fixture
 def module(small) -> SimpleNamespace:
-    """The environment of small shifts with the doors of a PettingZoo module."""
+    """Return an environment of small shifts with the entry points of a PettingZoo module."""
     shifts = small.Shifts()
     return SimpleNamespace(
         env=lambda **options: allocation_v0.env(shifts, **options),
@@ -51,50 +51,50 @@ def module(small) -> SimpleNamespace:
 
 
 @pytest.mark.parametrize("arms", [1, 2, 4])
-def test_it_is_a_parallel_env(make, arms) -> None:
+def test_pettingzoo_parallel_test_passes(make, arms) -> None:
     parallel_api_test(make({"arms": arms}), num_cycles=200)
 
 
 @pytest.mark.parametrize("door", ["env", "raw_env"])
-def test_it_is_an_aec_env(module, quiet, door) -> None:
+def test_pettingzoo_aec_test_passes(module, quiet, door) -> None:
     env = getattr(module, door)()
     api_test(env, num_cycles=120)
     assert env.metadata["name"] == "allocation_v0"
 
 
 @pytest.mark.parametrize("keep_events", [False, True])
-def test_the_same_seed_gives_the_same_episode_to_pettingzoo(module, keep_events) -> None:
+def test_pettingzoo_seed_test_passes(module, keep_events) -> None:
     parallel_seed_test(lambda: module.parallel_env(keep_events=keep_events), num_cycles=100)
     seed_test(lambda: module.env(keep_events=keep_events), num_cycles=100)
 
 
-def test_max_cycles_are_those_pettingzoo_asks_for(module) -> None:
+def test_pettingzoo_max_cycles_test_passes(module) -> None:
     max_cycles_test(module)
 
 
-def test_it_renders_as_pettingzoo_asks(module, monkeypatch) -> None:
-    monkeypatch.setattr("matplotlib.get_backend", lambda: "agg")  # no window pops up
+def test_pettingzoo_render_test_passes(module, monkeypatch) -> None:
+    monkeypatch.setattr("matplotlib.get_backend", lambda: "agg")  # opens no window
     render_test(module.env, {"ansi": lambda text: text.startswith("t = ")})
 
 
-def test_its_state_is_as_pettingzoo_asks(module, quiet) -> None:
+def test_pettingzoo_state_test_passes(module, quiet) -> None:
     state_test(module.env(), module.parallel_env(), num_cycles=50)
 
 
-# What they leave open: every step of whole episodes
+# Every step of whole episodes
 
 
 @pytest.mark.parametrize("options", [{}, {"keep_events": True}, {"mask_in": "both"}, {"mask_in": "info"}])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_all_that_a_parallel_env_gives_is_in_its_spaces(make, play, seed, options) -> None:
+def test_results_of_a_parallel_env_are_in_its_spaces(make, play, seed, options) -> None:
     env = make(HOT, **options)
     observations, infos = env.reset(seed=seed)
     rng, keys, ended = np.random.default_rng(seed), list(infos["arm_0"]), []
     while True:
         assert list(observations) == list(infos) == env.possible_agents
-        for arm, seen in observations.items():
-            fits(env.observation_space(arm), seen)
-            masks = [each["action_mask"] for each in (seen, infos[arm]) if "action_mask" in each]
+        for arm, observed in observations.items():
+            fits(env.observation_space(arm), observed)
+            masks = [each["action_mask"] for each in (observed, infos[arm]) if "action_mask" in each]
             assert len(masks) == (2 if options.get("mask_in") == "both" else 1)
             for mask in masks:
                 assert mask.dtype == np.int8
@@ -117,14 +117,14 @@ def test_all_that_a_parallel_env_gives_is_in_its_spaces(make, play, seed, option
     assert ended == [0] * (len(ended) - 1) + [1]
 
 
-def test_all_that_an_aec_env_gives_is_in_its_spaces(module) -> None:
+def test_results_of_an_aec_env_are_in_its_spaces(module) -> None:
     env = module.env()
     for seed in range(3):
         env.reset(seed=seed)
         rng, keys, turns, ends = np.random.default_rng(seed), None, 0, set()
         for arm in env.agent_iter():
-            seen, reward, terminated, truncated, info = env.last()
-            fits(env.observation_space(arm), seen)
+            observed, reward, terminated, truncated, info = env.last()
+            fits(env.observation_space(arm), observed)
             assert np.isfinite(reward)
             keys = keys or list(info)
             assert list(info) == keys
@@ -134,12 +134,12 @@ def test_all_that_an_aec_env_gives_is_in_its_spaces(module) -> None:
                 continue
             assert arm == env.possible_agents[turns % env.max_num_agents]
             turns += 1
-            env.step(int(rng.choice(np.flatnonzero(seen["action_mask"]))))
+            env.step(int(rng.choice(np.flatnonzero(observed["action_mask"]))))
         assert len(ends) == 1
         assert turns % env.max_num_agents == 0
 
 
-def test_all_that_a_batch_gives_is_in_its_spaces(batch, play) -> None:
+def test_results_of_a_batch_are_in_its_spaces(batch, play) -> None:
     env, rng = batch(9, HOT, seed=0), np.random.default_rng(0)
     given = env.reset()
     keys = list(given[1])
@@ -165,10 +165,10 @@ def test_all_that_a_batch_gives_is_in_its_spaces(batch, play) -> None:
         np.testing.assert_array_equal(np.flatnonzero(terminated | truncated), info["final_envs"])
 
 
-def fits(space: Any, seen: Any) -> None:
-    """In its space and a number throughout."""
-    assert space.contains(seen)
-    assert np.isfinite(seen["observation"] if isinstance(space, Dict) else seen).all()
+def fits(space: Any, observed: Any) -> None:
+    """Assert that an observation is in its space and finite."""
+    assert space.contains(observed)
+    assert np.isfinite(observed["observation"] if isinstance(space, Dict) else observed).all()
 
 
 # Objects
@@ -184,10 +184,10 @@ def test_spaces_are_the_same_objects_at_every_call(make) -> None:
     env.step({})
     after = [*env.observation_spaces.values(), *env.action_spaces.values(), env.state_space]
     assert all(one is other for one, other in zip(before, after, strict=True))
-    assert len(set(map(id, before))) == len(before)  # so that seeding one agent's space seeds no other
+    assert len(set(map(id, before))) == len(before)  # seeding the space of one agent seeds no other
 
 
-def test_wrappers_find_what_they_look_for(make) -> None:
+def test_wrappers_find_the_attributes_that_they_read(make) -> None:
     env = make(render_mode="ansi")
     assert env.unwrapped.render_mode == "ansi"
     assert env.metadata["is_parallelizable"]
@@ -198,7 +198,7 @@ def test_wrappers_find_what_they_look_for(make) -> None:
 
 
 @pytest.mark.parametrize("keep_events", [False, True])
-def test_nothing_that_is_handed_out_is_the_env_s_own(make, play, keep_events) -> None:
+def test_returned_objects_belong_to_the_caller(make, play, keep_events) -> None:
     options = {"keep_events": keep_events, "mask_in": "both"}
     env, untouched = make(**options), make(**options)
     rng, other = np.random.default_rng(2), np.random.default_rng(2)
@@ -213,17 +213,17 @@ def test_nothing_that_is_handed_out_is_the_env_s_own(make, play, keep_events) ->
         for part in handed:
             part["__all__"] = part.pop("arm_0")  # as RLlib does
         env.state()[:] = 0.0
-        for seen in env.knowledge().values():
-            seen.temp_c[:] = 0.0
-            seen.action_mask[:] = 0
+        for observed in env.knowledge().values():
+            observed.temp_c[:] = 0.0
+            observed.action_mask[:] = 0
         assert play.plain(env.state()) == play.plain(untouched.state())
-        for arm, seen in untouched.knowledge().items():
-            assert play.plain(vars(env.knowledge()[arm])) == play.plain(vars(seen))
+        for arm, observed in untouched.knowledge().items():
+            assert play.plain(vars(env.knowledge()[arm])) == play.plain(vars(observed))
         env.agents.reverse()
         handed, kept = env.step(play.wild(env, rng)), untouched.step(play.wild(untouched, other))
 
 
-def test_nothing_that_a_batch_hands_out_is_its_own(batch, play) -> None:
+def test_returned_arrays_of_a_batch_belong_to_the_caller(batch, play) -> None:
     env, untouched = (batch(6, {"jobs": 4, "ticks": 12}, seed=3) for _ in range(2))
     rng, handed, kept = np.random.default_rng(2), env.reset(), untouched.reset()
     for step in range(30):
@@ -236,7 +236,7 @@ def test_nothing_that_a_batch_hands_out_is_its_own(batch, play) -> None:
                 part[f"{name} of mine"] = None
         for values in (*handed[1:-1], *env.state):
             values[...] = 1
-        if step % 3 == 0:  # looking might heal what was spoiled
+        if step % 3 == 0:  # reading may refresh cached arrays
             for values in vars(env.knowledge()).values():
                 values[...] = 1
             play.same(vars(env.knowledge()), vars(untouched.knowledge()))

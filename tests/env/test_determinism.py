@@ -1,4 +1,4 @@
-"""Reproducibility: by seed, in another process, from a copy made midway, and with the arms in another order."""
+"""Reproducibility: by seed, in another process, from a copy, and with the arms in another order."""
 
 import copy
 import pickle
@@ -89,7 +89,7 @@ def test_zero_is_a_seed_and_none_is_not(make, batch, play) -> None:
 
 
 def test_global_generators_are_neither_read_nor_changed(make, batch, play) -> None:
-    """An env does not depend on NumPy's global generator, nor change it."""
+    """An env neither uses nor changes NumPy's global generator."""
     results = []
     for seed in (1, 2):
         np.random.seed(seed)  # noqa: NPY002  # the global one is what this is about
@@ -101,7 +101,7 @@ def test_global_generators_are_neither_read_nor_changed(make, batch, play) -> No
     assert results[0] == results[1]
 
 
-def test_two_processes_with_other_hash_seeds_agree(small, play) -> None:
+def test_processes_with_different_hash_seeds_agree(small, play) -> None:
     runs = [
         subprocess.run(
             [sys.executable, "-W", "error", "-c", WHOLE, small.PATH, play.PATH],
@@ -117,7 +117,7 @@ def test_two_processes_with_other_hash_seeds_agree(small, play) -> None:
 
 
 def test_an_episode_with_losses_and_delay_repeats_by_seed(small) -> None:
-    """Also when the same env has run another one in between."""
+    """Also if the env has run another episode in between."""
     make = small.Shifts(arms=3, jobs=6, ticks=30)
     names = make(np.random.SeedSequence(0)).world.arms
     exchange = MemoryExchange(names, Channel(loss=0.4, delay_s=20.0))
@@ -142,7 +142,7 @@ def test_an_episode_with_losses_and_delay_repeats_by_seed(small) -> None:
 
 @pytest.mark.parametrize("options", [{}, {"keep_events": True}, {"mask_in": "info"}], ids=["default", "events", "info"])
 @pytest.mark.parametrize("way", COPIES)
-def test_a_copy_made_in_the_middle_goes_on_the_same(make, play, way, options) -> None:
+def test_a_copy_within_an_episode_continues_identically(make, play, way, options) -> None:
     env = make({"ambient_c": 40.0}, **options)
     env.reset(seed=9)
     play.go_on(env, np.random.default_rng(0), steps=15)
@@ -156,7 +156,7 @@ def test_a_copy_made_in_the_middle_goes_on_the_same(make, play, way, options) ->
 
 
 @pytest.mark.parametrize("way", COPIES)
-def test_a_copy_of_a_batch_made_in_the_middle_goes_on_the_same(batch, play, way) -> None:
+def test_a_copy_of_a_batch_continues_identically(batch, play, way) -> None:
     def go_on(env, obs) -> list[Any]:
         rng, given = np.random.default_rng(1), []
         for _ in range(60):
@@ -180,13 +180,13 @@ def test_a_copy_of_a_batch_made_in_the_middle_goes_on_the_same(batch, play, way)
 
 @pytest.mark.parametrize("keep_events", [False, True])
 @pytest.mark.parametrize("order", [(2, 0, 1), (0, 2, 1), (2, 1, 0)])
-def test_arms_in_another_order_do_the_same(small, order, keep_events) -> None:
-    """With sensors without noise, which would be drawn in the order of the arms."""
+def test_the_order_of_arms_does_not_matter(small, order, keep_events) -> None:
+    """Without sensor noise, which depends on the order of the arms."""
     exact = replace(gen3_motors(), sensor_noise_k=np.zeros(7))
     works = [small.work(place, kg) for place in ("bench", "rack") for kg in (small.LIGHT, small.HOT)]
     arms = [
         small.arm(i, works[i:] if i else works, times=small.Times(cycle=10.0 + i), motors=exact) for i in range(3)
-    ]  # of unlike speed, ability and measure, so that no two are a tie
+    ]  # of different speed, ability and score, so that there are no ties
     jobs = [
         small.job(f"j{i}", works[i % 4], release_s=40.0 * i, due_s=60.0 * i, repetitions=i % 3 + 2) for i in range(9)
     ]
@@ -207,14 +207,14 @@ def test_arms_in_another_order_do_the_same(small, order, keep_events) -> None:
             peers = [p for p in names if p != arm]
             place = [[p for p in other.possible_agents if p != arm].index(p) for p in peers]
             for field, values in vars(mine).items():
-                found = getattr(its, field)
-                np.testing.assert_array_equal(found[place] if field.startswith("peer_") else found, values, field)
-        actions = {arm: int(rng.choice([1, 1, 1, 0, 2, 3, 4])) for arm in names}  # so that they meet
-        given, found = one.step(actions), other.step(actions)
+                actual = getattr(its, field)
+                np.testing.assert_array_equal(actual[place] if field.startswith("peer_") else actual, values, field)
+        actions = {arm: int(rng.choice([1, 1, 1, 0, 2, 3, 4])) for arm in names}  # so that claims compete
+        given, actual = one.step(actions), other.step(actions)
         for arm in names:
-            assert found[1][arm] == pytest.approx(given[1][arm], rel=1e-12, abs=1e-12)
-            assert [found[i][arm] for i in (2, 3)] == [given[i][arm] for i in (2, 3)]
-            assert found[4][arm] == pytest.approx(given[4][arm], rel=1e-12, abs=1e-12)
+            assert actual[1][arm] == pytest.approx(given[1][arm], rel=1e-12, abs=1e-12)
+            assert [actual[i][arm] for i in (2, 3)] == [given[i][arm] for i in (2, 3)]
+            assert actual[4][arm] == pytest.approx(given[4][arm], rel=1e-12, abs=1e-12)
         lost += int((one.truth.last_award == -1).sum())
     assert one.truth.faults.sum() > 0
     np.testing.assert_array_equal(one.truth.finished_s, other.truth.finished_s)

@@ -1,4 +1,4 @@
-"""Where everything of a fleet is drawn: a map, on which nothing covers anything else."""
+"""Floor plan: drawn to scale, without overlaps."""
 
 from dataclasses import replace
 from typing import get_args
@@ -51,7 +51,7 @@ def test_every_arm_and_station_is_on_the_floor(cell, size) -> None:
 
 
 @given(st.lists(points, min_size=1, max_size=6))
-def test_it_is_a_map(stations) -> None:
+def test_distances_on_the_floor_plan_are_to_scale(stations) -> None:
     """One scale for both directions, x to the right and y up."""
     cell = replace(grid_cell(("arm_0",), ()), stations=tuple((f"s{i}", p) for i, p in enumerate(stations)))
     plan = floor_plan(cell)
@@ -67,7 +67,7 @@ def test_it_is_a_map(stations) -> None:
 @pytest.mark.parametrize("arms", [2, 3, 4, 7, 16])
 @pytest.mark.parametrize("size", [(960, 640), (480, 320)])
 def test_arms_at_one_place_do_not_cover_each_other(arms, size) -> None:
-    """Floor and ceiling above each other, seen from above."""
+    """An arm on the ceiling above one on the floor."""
     names = tuple(f"arm_{i}" for i in range(arms))
     cell = replace(grid_cell(names, ("bench", "rack")), mounts_m=((0.0, 0.0, 0.0),) * arms)
     plan = floor_plan(cell, size)

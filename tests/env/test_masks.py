@@ -18,12 +18,12 @@ WARM: dict[str, Any] = {
 
 
 def test_a_legal_claim_made_alone_is_won_and_an_illegal_one_is_only_counted(batch, play) -> None:
-    """Every action of every arm at many moments, each in a row of its own beside one in which all wait."""
+    """Try every action of every arm at many steps, each in its own row, beside a row in which all wait."""
     slots, arms = 4, 3
     tries = [(a, action) for a in range(arms) for action in range(-1, slots + 2)]
     envs = len(tries) + 1
     rows, (arm, action) = np.arange(len(tries)), np.array(tries).T
-    seen = dict.fromkeys(("legal", "illegal", "at work", "faulted", "taken"), 0)
+    counts = dict.fromkeys(("legal", "illegal", "at work", "faulted", "taken"), 0)
     for seed, stop in product(range(3), range(2, 32, 3)):
         env, rng = batch(envs, WARM, seed=[seed] * envs, autoreset=False), np.random.default_rng(seed)
         obs, _ = env.reset()
@@ -45,28 +45,28 @@ def test_a_legal_claim_made_alone_is_won_and_an_illegal_one_is_only_counted(batc
                 assert all(
                     np.array_equal(v[e], v[-1], equal_nan=True) for n, v in now._asdict().items() if n != "illegal"
                 )
-                seen["illegal"] += not legal
+                counts["illegal"] += not legal
                 continue
             assert now.last_award[e].tolist() == [int(b == a) for b in range(arms)]
             job = np.flatnonzero(now.status[e] != now.status[-1])
             assert len(job) == 1 or now.faults[e, a] > before.faults[e, a]
             assert now.busy_s[e, a] > before.busy_s[e, a]
-            seen["legal"] += 1
+            counts["legal"] += 1
         assert mask[:, 0].all()
         for a in range(arms):
             if before.mode[0, a] != IDLE:
                 assert mask[a].tolist() == [1] + [0] * slots
-        seen["at work"] += int((before.mode[0] == WORKING).sum())
-        seen["faulted"] += int((before.mode[0] == FAULTED).sum())
+        counts["at work"] += int((before.mode[0] == WORKING).sum())
+        counts["faulted"] += int((before.mode[0] == FAULTED).sum())
         offered = env.layout.read(obs["observation"][0], mask).offered.astype(bool)
-        seen["taken"] += int((offered & (mask[:, 1:] == 0))[before.mode[0] == IDLE].sum())
-    assert min(seen.values()) > 10, seen
+        counts["taken"] += int((offered & (mask[:, 1:] == 0))[before.mode[0] == IDLE].sum())
+    assert min(counts.values()) > 10, counts
 
 
-def test_legal_claims_are_awarded_or_lost_and_illegal_ones_only_counted(make) -> None:
+def test_legal_claims_are_won_or_lost_and_illegal_ones_only_counted(make) -> None:
     env = make({"jobs": 12, "ticks": 80})
     env.reset(seed=5)
-    rng, seen = np.random.default_rng(5), {"won": 0, "lost": 0, "illegal": 0}
+    rng, counts = np.random.default_rng(5), {"won": 0, "lost": 0, "illegal": 0}
     while env.agents:
         before, masks = env.truth, {a: o.action_mask for a, o in env.knowledge().items()}
         actions = {arm: int(rng.integers(env.world.slots + 1)) for arm in env.possible_agents}
@@ -76,14 +76,14 @@ def test_legal_claims_are_awarded_or_lost_and_illegal_ones_only_counted(make) ->
             assert infos[arm]["illegal"] - before.illegal[0, a] == (not legal)
             award = env.truth.last_award[0, a]
             assert award == 0 if not legal or actions[arm] == 0 else award in (1, -1)
-            seen["won"] += award == 1
-            seen["lost"] += award == -1
-            seen["illegal"] += not legal
-    assert min(seen.values()) > 0
+            counts["won"] += award == 1
+            counts["lost"] += award == -1
+            counts["illegal"] += not legal
+    assert min(counts.values()) > 0
 
 
 @pytest.mark.parametrize("winner", [0, 1, 2])
-def test_of_two_claims_that_of_the_lower_shared_difficulty_wins(small, winner) -> None:
+def test_the_claim_of_lower_shared_difficulty_wins(small, winner) -> None:
     content = small.work()
     arms = [small.arm(i, [content], model=small.ByPayload(1.0 if i == winner else 2.0)) for i in range(3)]
     world, plant = small.shop([[small.job("a", content)]], arms=arms)
@@ -93,7 +93,7 @@ def test_of_two_claims_that_of_the_lower_shared_difficulty_wins(small, winner) -
     assert env.truth.last_award[0].tolist() == [1 if i == winner else -1 for i in range(3)]
 
 
-def test_a_wait_differs_in_nothing_from_an_illegal_action_nor_from_none(make, play) -> None:
+def test_illegal_and_missing_actions_equal_a_wait(make, play) -> None:
     options = {"keep_events": True}
     for envs in ([make(), make(), make()], [make(**options), make(**options), make(**options)]):
         for env in envs:
@@ -110,7 +110,7 @@ def test_a_wait_differs_in_nothing_from_an_illegal_action_nor_from_none(make, pl
             assert given[0] == given[1] == given[2]
 
 
-def test_a_faulted_arm_stays_and_may_only_wait(make, play) -> None:
+def test_a_faulted_arm_remains_an_agent_and_may_only_wait(make, play) -> None:
     limits = ThermalLimits(warning_c=40.0, error_c=45.0, restart_c=38.0, clear_s=10.0)
     env = make({"jobs": 20, "ticks": 80, "limits": limits})
     observations, _ = env.reset(seed=4)

@@ -1,4 +1,4 @@
-"""Observations: the layout, and every field against a reference written from `World` and `State`."""
+"""Observations: the layout, and every field against a reference computed from `World` and `State`."""
 
 from dataclasses import fields, replace
 
@@ -30,7 +30,7 @@ NO_NOISE = replace(gen3_motors(), sensor_noise_k=np.zeros(7))
 
 
 def received(arms: int, slots: int, **changes: np.ndarray) -> PeerView:
-    """A message of every peer arrived just now: idle, difficulties unknown."""
+    """Return a view in which a message of every peer has just arrived: idle, no difficulties."""
     base = {
         "mode": np.zeros((arms, arms), int),
         "headroom_k": np.full((arms, arms), 30.0),
@@ -42,14 +42,14 @@ def received(arms: int, slots: int, **changes: np.ndarray) -> PeerView:
 
 
 def peers_of(layout: Layout, view: PeerView) -> Observation:
-    """What the vectors say of peers, leading axis [arm]."""
+    """Return the peer fields of the vectors, leading axis [arm]."""
     vectors = np.zeros((layout.arms, layout.size), np.float32)
     write_peers(layout, view, vectors)
     return layout.read(vectors, np.ones((layout.arms, layout.slots + 1), np.int8))
 
 
 def engine_at(world: World, state: State) -> tuple[Engine, np.ndarray]:
-    """An engine in this state, and the vectors of its arms, [env, arm, size]."""
+    """Return an engine in this state, and the vectors of its arms, [env, arm, size]."""
     tables, drawn = tables_of(world)
     layout, rows = Layout(len(world.arms), world.slots), np.arange(world.envs)
     engine = Engine(tables, world.envs, layout, RewardWeights(), jobs=state.status.shape[1], compiled=False)
@@ -61,7 +61,7 @@ def engine_at(world: World, state: State) -> tuple[Engine, np.ndarray]:
 
 
 def observe(world: World, state: State) -> Observation:
-    """The observations in a state, leading axes [env, arm]."""
+    """Return the observations in a state, leading axes [env, arm]."""
     engine, vectors = engine_at(world, state)
     return engine.layout.read(vectors, engine.mask)
 
@@ -74,7 +74,7 @@ def test_fields_and_attributes_are_the_same_in_the_same_order() -> None:
 @given(
     arms=st.integers(1, 6), slots=st.integers(1, 9), lead=st.sampled_from([(), (2,), (3, 2)]), seed=st.integers(0, 99)
 )
-def test_what_is_packed_is_read_again(arms, slots, lead, seed) -> None:
+def test_a_packed_observation_is_read_back(arms, slots, lead, seed) -> None:
     layout, rng = Layout(arms, slots), np.random.default_rng(seed)
     named = {f.name: rng.uniform(f.low, f.high, (*lead, *layout.shape(f))).astype(np.float32) for f in FIELDS}
     mask = rng.integers(0, 2, (*lead, slots + 1)).astype(np.int8)
@@ -88,7 +88,7 @@ def test_what_is_packed_is_read_again(arms, slots, lead, seed) -> None:
     assert layout.size == sum(int(np.prod(layout.shape(f))) for f in FIELDS)
 
 
-def test_what_is_out_of_range_is_clipped_to_its_field() -> None:
+def test_values_out_of_range_are_clipped() -> None:
     layout = Layout(2, 3)
     named = {f.name: np.full(layout.shape(f), 1e9) for f in FIELDS}
     again = layout.read(layout.pack(Observation(**named, action_mask=np.ones(4, np.int8))), np.ones(4, np.int8))
@@ -96,7 +96,7 @@ def test_what_is_out_of_range_is_clipped_to_its_field() -> None:
         assert (getattr(again, f.name) == np.float32(f.high)).all()
 
 
-def test_a_vector_of_another_fleet_is_refused() -> None:
+def test_vectors_of_wrong_size_are_refused() -> None:
     layout = Layout(2, 3)
     with pytest.raises(
         ValueError, match=rf"An observation of 3 slots and 1 peer\(s\) has {layout.size} elements, got 5"
@@ -108,7 +108,7 @@ def test_a_vector_of_another_fleet_is_refused() -> None:
 
 
 def reference(world: World, state: State, slots: list[int], key: int) -> dict[str, np.ndarray]:
-    """The fields of all arms of env 0, [arm, ...], computed one by one; of peers, those of this moment."""
+    """Compute the fields of all arms of env 0, [arm, ...], one by one; peers as of this moment."""
     arms, now_s, jobs, offers = len(world.arms), state.tick[0] * world.dt_s, world.jobs, world.offers
     measured_c = state.temp_c[0, :, :7] + world.motors.sensor_noise_k * sensor_noise(key, state.tick[0], arms, 7)
     own: list[dict[str, object]] = []
@@ -156,19 +156,19 @@ def reference(world: World, state: State, slots: list[int], key: int) -> dict[st
 
 
 def compare_with_reference(play, episode: Episode, seed: int) -> State:
-    """Play a shift and compare every vector; returns the last state."""
+    """Play a shift and compare every vector; return the last state."""
     world, rng = episode.world, np.random.default_rng(seed)
     runner = ShiftRunner(episode, RewardWeights())
     layout = Layout(len(world.arms), world.slots)
     while True:
         slots = play.slots_of(world, runner.state)
         assert runner.slot_job.tolist() == slots
-        found = layout.read(runner.vectors, runner.mask)
+        actual = layout.read(runner.vectors, runner.mask)
         expected = reference(world, runner.state, slots, episode.noise_key)
         assert set(expected) == {field.name for field in FIELDS}
         for name, values in expected.items():
-            seen = getattr(found, name)
-            np.testing.assert_allclose(seen, values.reshape(seen.shape), rtol=1e-6, atol=2e-5, err_msg=name)
+            observed = getattr(actual, name)
+            np.testing.assert_allclose(observed, values.reshape(observed.shape), rtol=1e-6, atol=2e-5, err_msg=name)
         if runner.tick == world.ticks:
             return runner.state.copy()
         runner.step(play.chosen(runner.mask, rng.random((len(world.arms), 2))))
@@ -179,13 +179,13 @@ def compare_with_reference(play, episode: Episode, seed: int) -> State:
     seed=st.integers(0, 2**31), arms=st.integers(1, 4), jobs=st.integers(0, 9), slots=st.integers(1, 5),
     ambient_c=st.sampled_from([20.0, 45.0, 58.0]), power_off=st.booleans(),
 )  # fmt: skip
-def test_vectors_are_those_of_the_reference(small, play, seed, arms, jobs, slots, ambient_c, power_off) -> None:
+def test_vectors_equal_the_reference(small, play, seed, arms, jobs, slots, ambient_c, power_off) -> None:
     limits = ThermalLimits(warning_c=56.0, error_c=60.0, restart_c=54.0, clear_s=25.0, power_off_on_fault=power_off)
     make = small.Shifts(arms=arms, jobs=jobs, slots=slots, ticks=60, ambient_c=ambient_c, limits=limits)
     compare_with_reference(play, make(np.random.SeedSequence(seed)), seed)
 
 
-def test_shifts_of_that_comparison_fault_recover_and_return_jobs(small, play) -> None:
+def test_shifts_of_the_comparison_include_faults_and_returned_jobs(small, play) -> None:
     limits = ThermalLimits(warning_c=56.0, error_c=60.0, restart_c=54.0, clear_s=25.0)
     make = small.Shifts(arms=3, jobs=9, ticks=80, ambient_c=45.0, limits=limits)
     last = [compare_with_reference(play, make(np.random.SeedSequence(seed)), seed) for seed in range(4)]
@@ -195,7 +195,7 @@ def test_shifts_of_that_comparison_fault_recover_and_return_jobs(small, play) ->
 
 
 @pytest.mark.parametrize(("pieces", "curve"), [(1, False), (3, False), (2, True)])
-def test_risks_are_those_of_the_reference(small, play, pieces, curve) -> None:
+def test_risks_equal_the_reference(small, play, pieces, curve) -> None:
     content = [small.work(place, payload) for place in ("a", "b") for payload in (small.LIGHT, small.HOT)]
     arms = [
         small.arm(0, content, model=play.Learned(pieces, curve=curve)),
@@ -219,24 +219,24 @@ def test_peers_are_the_others_in_order() -> None:
         difficulty=np.stack([receiver + sender / 10, np.full((4, 4), np.nan)], axis=-1),
         mode=np.where(sender == 3, FAULTED, np.where(sender == 1, WORKING, IDLE)),
     )  # fmt: skip
-    seen = peers_of(Layout(4, 2), view)
+    observed = peers_of(Layout(4, 2), view)
     for me in range(4):
         others = [a for a in range(4) if a != me]
-        assert seen.peer_headroom_k[me].tolist() == [10.0 * me + a for a in others]
-        assert seen.peer_age_s[me].tolist() == [100.0 * me + a for a in others]
-        assert seen.peer_difficulty[me, :, 0].tolist() == pytest.approx([me + a / 10 for a in others])
-        assert seen.peer_known[me].tolist() == [[1, 0]] * 3
-        assert (seen.peer_difficulty[me, :, 1] == 0).all()
-        assert seen.peer_working[me].tolist() == [a == 1 for a in others]
-        assert seen.peer_faulted[me].tolist() == [a == 3 for a in others]
-        assert seen.peer_heard[me].all()
+        assert observed.peer_headroom_k[me].tolist() == [10.0 * me + a for a in others]
+        assert observed.peer_age_s[me].tolist() == [100.0 * me + a for a in others]
+        assert observed.peer_difficulty[me, :, 0].tolist() == pytest.approx([me + a / 10 for a in others])
+        assert observed.peer_known[me].tolist() == [[1, 0]] * 3
+        assert (observed.peer_difficulty[me, :, 1] == 0).all()
+        assert observed.peer_working[me].tolist() == [a == 1 for a in others]
+        assert observed.peer_faulted[me].tolist() == [a == 3 for a in others]
+        assert observed.peer_heard[me].all()
 
 
-def test_peers_are_the_near_ones_in_the_order_of_the_layout() -> None:
+def test_nearest_peers_are_in_the_order_of_the_layout() -> None:
     near = ((2, 1), (3, 0), (3, 1), (0, 2))
     _, sender = np.indices((4, 4))
-    seen = peers_of(Layout(4, 2, near), received(4, 2, headroom_k=1.0 * sender))
-    assert seen.peer_headroom_k.tolist() == [list(map(float, peers)) for peers in near]
+    observed = peers_of(Layout(4, 2, near), received(4, 2, headroom_k=1.0 * sender))
+    assert observed.peer_headroom_k.tolist() == [list(map(float, peers)) for peers in near]
 
 
 def test_a_peer_whose_messages_never_arrived_is_unknown() -> None:
@@ -247,13 +247,13 @@ def test_a_peer_whose_messages_never_arrived_is_unknown() -> None:
         headroom_k=np.where(silent, np.nan, 5.0),
         age_s=np.where(silent, np.inf, 7.0),
     )  # fmt: skip
-    seen = peers_of(Layout(3, 2), view)
-    assert seen.peer_heard[0].tolist() == [0, 1]
-    assert seen.peer_age_s[0].tolist() == [LONG_S, 7.0]
-    assert seen.peer_headroom_k[0].tolist() == [0.0, 5.0]
-    assert seen.peer_working[0].tolist() == [0, 1]
-    assert seen.peer_faulted[0].tolist() == [0, 0]
-    assert all(np.isfinite(values).all() for values in vars(seen).values())
+    observed = peers_of(Layout(3, 2), view)
+    assert observed.peer_heard[0].tolist() == [0, 1]
+    assert observed.peer_age_s[0].tolist() == [LONG_S, 7.0]
+    assert observed.peer_headroom_k[0].tolist() == [0.0, 5.0]
+    assert observed.peer_working[0].tolist() == [0, 1]
+    assert observed.peer_faulted[0].tolist() == [0, 0]
+    assert all(np.isfinite(values).all() for values in vars(observed).values())
 
 
 def test_slots_hold_each_arm_s_own_view_of_the_jobs(small) -> None:
@@ -266,22 +266,22 @@ def test_slots_hold_each_arm_s_own_view_of_the_jobs(small) -> None:
     world, _ = small.shop([jobs], arms=arms, slots=3)
     state = initial(world)
     state.tick[:] = 2
-    seen = observe(world, state)
-    assert seen.offered[0].tolist() == [[1, 1, 0]] * 2
-    assert seen.feasible[0].tolist() == [[1, 1, 0], [1, 0, 0]]
-    assert seen.known[0].tolist() == [[1, 1, 0], [1, 0, 0]]
+    observed = observe(world, state)
+    assert observed.offered[0].tolist() == [[1, 1, 0]] * 2
+    assert observed.feasible[0].tolist() == [[1, 1, 0], [1, 0, 0]]
+    assert observed.known[0].tolist() == [[1, 1, 0], [1, 0, 0]]
     # 3 + 5 · 10 + 2, 3 + 2 · 10 + 2, and 1 + 5 · 20 + 4 s; now is 20 s.
-    assert seen.duration_s[0].tolist() == [[55.0, 25.0, 0.0], [105.0, 0.0, 0.0]]
-    assert seen.slack_s[0].tolist() == [[25.0, 5.0, 0.0], [-25.0, 30.0, 0.0]]
-    assert seen.age_s[0].tolist() == [[20.0, 5.0, 0.0]] * 2
-    assert seen.payload_kg[0].tolist() == [[4.0, 1.0, 0.0]] * 2
-    assert seen.value[0].tolist() == [[3.0, 2.0, 0.0]] * 2
+    assert observed.duration_s[0].tolist() == [[55.0, 25.0, 0.0], [105.0, 0.0, 0.0]]
+    assert observed.slack_s[0].tolist() == [[25.0, 5.0, 0.0], [-25.0, 30.0, 0.0]]
+    assert observed.age_s[0].tolist() == [[20.0, 5.0, 0.0]] * 2
+    assert observed.payload_kg[0].tolist() == [[4.0, 1.0, 0.0]] * 2
+    assert observed.value[0].tolist() == [[3.0, 2.0, 0.0]] * 2
     expected = arms[1].model.score(arms[1].plans[bench][0], 5)
     assert expected is not None
-    assert seen.difficulty[0, 1].tolist() == pytest.approx([expected.total, 0.0, 0.0])
-    assert seen.p_saturation[0, 1].tolist() == pytest.approx([expected.p_saturation, 0.5, 0.5])
-    assert seen.clock[0].tolist() == pytest.approx([20.0 / world.horizon_s] * 2)
-    assert seen.action_mask[0].tolist() == [[1, 1, 1, 0], [1, 1, 0, 0]]
+    assert observed.difficulty[0, 1].tolist() == pytest.approx([expected.total, 0.0, 0.0])
+    assert observed.p_saturation[0, 1].tolist() == pytest.approx([expected.p_saturation, 0.5, 0.5])
+    assert observed.clock[0].tolist() == pytest.approx([20.0 / world.horizon_s] * 2)
+    assert observed.action_mask[0].tolist() == [[1, 1, 1, 0], [1, 1, 0, 0]]
 
 
 def test_busy_time_counts_down_to_home(small) -> None:
@@ -290,15 +290,15 @@ def test_busy_time_counts_down_to_home(small) -> None:
     env.reset(seed=0)
     for tick in range(4):
         terminated = env.step({"arm_0": int(tick == 0)})[2]["arm_0"]
-        seen = env.knowledge()
-        left.append(float(seen["arm_0"].busy_s))
-        assert seen["arm_1"].busy_s == 0.0
-        assert (seen["arm_0"].working, seen["arm_1"].idle) == (left[-1] > 0, True)
+        observed = env.knowledge()
+        left.append(float(observed["arm_0"].busy_s))
+        assert observed["arm_1"].busy_s == 0.0
+        assert (observed["arm_0"].working, observed["arm_1"].idle) == (left[-1] > 0, True)
     assert left == [25.0, 15.0, 5.0, 0.0]  # 3 + 3 · 10 + 2 s
     assert terminated
 
 
-def test_what_is_left_of_a_returned_job_takes_less_time(small) -> None:
+def test_a_returned_job_takes_only_its_remaining_time(small) -> None:
     world, _ = small.shop([[small.job("a", repetitions=10)]], arms=1, slots=2)
     state = initial(world)
     state.cycles[0, 0] = 7
@@ -326,7 +326,7 @@ def test_an_arm_broadcasts_what_it_measures_and_its_scores(small) -> None:
 
 
 class SecondJointDecides:
-    """P passes one half where joint 2 is at 50 °C less half a kelvin for every repetition."""
+    """P is one half if joint 2 is at 50 °C minus 0.5 K per repetition."""
 
     version = "second joint decides"
 
@@ -335,7 +335,7 @@ class SecondJointDecides:
         return Difficulty(np.full(7, 0.1), risk=risk)
 
 
-def test_the_probability_is_that_of_the_temperatures_now(small) -> None:
+def test_p_saturation_follows_the_present_temperatures(small) -> None:
     bench, rack = small.work("bench"), small.work("rack")
     arms = [
         small.arm(0, [bench], motors=NO_NOISE),
@@ -350,10 +350,10 @@ def test_the_probability_is_that_of_the_temperatures_now(small) -> None:
     state.temp_c[..., :7] = 25.0
     state.temp_c[0, 1, 1], state.temp_c[1, 1, 1] = 46.0, 35.0
     p = observe(world, state).p_saturation
-    # Joint 2 at 46 and 35 °C; one half at 48 (4 repetitions), 46 (8) and 40 (20); one half too where not known.
+    # Joint 2 at 46 and 35 °C. P is 0.5 at 48 °C (4 repetitions), 46 °C (8) and 40 °C (20), and where it is unknown.
     assert p[0, 1] == pytest.approx([1 / (1 + np.exp(0.4)), 0.5, 0.5])
     assert p[1, 1] == pytest.approx([1 / (1 + np.exp(1.0)), 0.5, 0.5])
-    # The other arm's model ignores the start, and it cannot do the second job.
+    # The model of the other arm ignores the temperatures, and it cannot do the second job.
     fixed = arms[0].model.score(arms[0].plans[bench][0], 4)
     assert fixed is not None
     assert p[0, 0] == pytest.approx([fixed.p_saturation, 0.5, 0.5])
@@ -373,18 +373,18 @@ def test_peers_observe_what_the_arm_observes_of_itself(small) -> None:
     env.reset(seed=3)
     rng = np.random.default_rng(0)
     while env.agents:
-        seen = env.knowledge()
+        observed = env.knowledge()
         for me, arm in enumerate(env.possible_agents):
             peers = [p for p in range(3) if p != me]
             for row, peer in enumerate(peers):
-                other = seen[env.possible_agents[peer]]
-                assert seen[arm].peer_age_s[row] == 0.0
-                assert seen[arm].peer_headroom_k[row] == other.headroom_k
-                assert seen[arm].peer_working[row] == other.working
-                assert seen[arm].peer_faulted[row] == other.faulted
-                np.testing.assert_array_equal(seen[arm].peer_difficulty[row], other.difficulty)
-                np.testing.assert_array_equal(seen[arm].peer_known[row], other.known)
-        env.step({a: int(rng.choice(np.flatnonzero(o.action_mask))) for a, o in seen.items()})
+                other = observed[env.possible_agents[peer]]
+                assert observed[arm].peer_age_s[row] == 0.0
+                assert observed[arm].peer_headroom_k[row] == other.headroom_k
+                assert observed[arm].peer_working[row] == other.working
+                assert observed[arm].peer_faulted[row] == other.faulted
+                np.testing.assert_array_equal(observed[arm].peer_difficulty[row], other.difficulty)
+                np.testing.assert_array_equal(observed[arm].peer_known[row], other.known)
+        env.step({a: int(rng.choice(np.flatnonzero(o.action_mask))) for a, o in observed.items()})
 
 
 def test_a_delayed_message_is_as_old_as_its_delay(small) -> None:
@@ -393,8 +393,8 @@ def test_a_delayed_message_is_as_old_as_its_delay(small) -> None:
     env.reset(seed=1)
     ages = []
     for _ in range(5):
-        seen = env.knowledge()["arm_0"]
-        ages.append((float(seen.peer_heard[0]), float(seen.peer_age_s[0])))
+        observed = env.knowledge()["arm_0"]
+        ages.append((float(observed.peer_heard[0]), float(observed.peer_age_s[0])))
         env.step({})
     assert ages == [(0.0, LONG_S), (0.0, LONG_S), (1.0, 20.0), (1.0, 20.0), (1.0, 20.0)]
     env.close()
@@ -408,6 +408,6 @@ def test_temperatures_are_measured_with_the_noise_of_the_sensors(small) -> None:
         truth = env.truth.temp_c[0, :, :7]
         errors.append([env.knowledge()[arm].temp_c - truth[a] for a, arm in enumerate(env.possible_agents)])
         env.step({})
-    found = np.array(errors).std(axis=0)
-    # The standard deviation of n readings is off by 1/√(2n) of itself; four times that, for 14 sensors.
-    assert found == pytest.approx(env.world.motors.sensor_noise_k, rel=4 / np.sqrt(800))
+    actual = np.array(errors).std(axis=0)
+    # The relative error of a standard deviation from n readings is 1/√(2n); four times that, for 14 sensors.
+    assert actual == pytest.approx(env.world.motors.sensor_noise_k, rel=4 / np.sqrt(800))

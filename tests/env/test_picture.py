@@ -1,4 +1,4 @@
-"""The picture of a fleet: its colours, what it must never hide, and that it is an image."""
+"""The picture of a fleet: colours, visibility, the array."""
 
 from dataclasses import replace
 from typing import Any
@@ -15,7 +15,7 @@ from fleet.robot import JOINTS
 from fleet.telemetry import FAULTED, IDLE, WORKING
 
 FAULT = (0xCC, 0x22, 0x22)
-"""The report's red."""
+"""Red of the report."""
 BENCHES = (("bench", (0.5, 0.5, 0.2)), ("rack", (-0.5, 0.5, 0.2)))
 
 
@@ -24,7 +24,7 @@ def picture(scene: Scene, size: Pixel = NORMAL) -> np.ndarray:
 
 
 def row(arms: int) -> Cell:
-    """Arms a metre apart on the floor."""
+    """Return a cell with arms one metre apart on the floor."""
     return Cell(
         arms=tuple(f"arm_{i}" for i in range(arms)),
         mounts_m=tuple((float(i), 0.0, 0.0) for i in range(arms)),
@@ -34,7 +34,7 @@ def row(arms: int) -> Cell:
 
 
 def scene(cell: Cell, temp_c: float = 30.0, mode: int = IDLE, **changes: Any) -> Scene:
-    """Nothing happens, everything has one temperature."""
+    """Return a scene of an idle fleet at one temperature."""
     arms = len(cell.arms)
     quiet = Scene(
         cell=cell,
@@ -56,20 +56,20 @@ def scene(cell: Cell, temp_c: float = 30.0, mode: int = IDLE, **changes: Any) ->
 
 
 def luminance(colour: Any) -> np.ndarray:
-    """Relative luminance of sRGB [..., 3], by WCAG 2.1: how bright it looks, whatever the hue."""
+    """Relative luminance of sRGB [..., 3], by WCAG 2.1."""
     srgb = np.asarray(colour)
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     return linear @ np.array([0.2126, 0.7152, 0.0722])
 
 
 def on_motor(frame: np.ndarray, plan: FloorPlan, arm: int, joint: int) -> tuple[int, ...]:
-    """The colour of a motor, above its number."""
+    """Return the colour of a motor, above its number."""
     x, y = plan.motors[arm, joint].round().astype(int)
     return tuple(frame[y - plan.motor + 3, x].tolist())
 
 
 def around(frame: np.ndarray, plan: FloorPlan, arm: int) -> np.ndarray:
-    """What is drawn of an arm."""
+    """Return the part of a picture around an arm."""
     x, y = plan.centres[arm]
     return frame[y - plan.reach : y + plan.reach + 1, x - plan.reach : x + plan.reach + 1]
 
@@ -78,26 +78,26 @@ def around(frame: np.ndarray, plan: FloorPlan, arm: int) -> np.ndarray:
 
 
 @given(st.floats(-20, 150), st.floats(-20, 150))
-def test_hotter_is_never_brighter(one_c, other_c) -> None:
+def test_hotter_colours_are_never_brighter(one_c, other_c) -> None:
     low, high = heat_colour(np.sort([one_c, other_c]), 60.0, 75.0)
     assert luminance(high) <= luminance(low) + 1e-9
 
 
 @given(st.floats(20, 79))
-def test_five_kelvin_more_are_darker_to_see(temp_c) -> None:
+def test_five_kelvin_are_a_visible_difference(temp_c) -> None:
     cool, hot = heat_colour(np.array([temp_c, temp_c + 5.0]), 60.0, 75.0)
     assert luminance(hot) < luminance(cool) - 0.009
 
 
 @given(st.floats(-30, 100), st.floats(1, 50))
-def test_the_limits_have_the_report_s_colours_whatever_they_are(warning_c, apart_k) -> None:
+def test_limits_have_the_colours_of_the_report(warning_c, apart_k) -> None:
     at_limits = heat_colour(np.array([warning_c, warning_c + apart_k]), warning_c, warning_c + apart_k)
     np.testing.assert_allclose(255 * at_limits, [[0xE0, 0x8A, 0x00], FAULT])
 
 
 @pytest.mark.parametrize("temp_c", [20.0, 40.0, 60.0, 67.0, 75.0, 85.0])
 @pytest.mark.parametrize("size", [(960, 640), (480, 320)])
-def test_a_motor_has_the_legend_s_colour_at_its_temperature(temp_c, size) -> None:
+def test_motors_have_the_colour_of_the_legend(temp_c, size) -> None:
     cell = row(3)
     temps = np.full((3, JOINTS), 30.0)
     temps[1, 4] = temp_c
@@ -118,7 +118,7 @@ def test_each_motor_shows_its_own_temperature() -> None:
     assert len(set(shown)) == 2 * JOINTS
 
 
-# What must be seen
+# Visibility
 
 
 @pytest.mark.parametrize("size", [(960, 640), (480, 320)])
@@ -133,7 +133,7 @@ def test_a_faulted_arm_stands_out(arms, size) -> None:
         assert (red[1] >= 20) == (last == FAULTED)
 
 
-def test_an_arm_at_work_is_joined_to_its_station() -> None:
+def test_a_line_connects_a_working_arm_to_its_station() -> None:
     cell = row(2)
     plan = floor_plan(cell)
     idle = picture(scene(cell))
@@ -145,7 +145,7 @@ def test_an_arm_at_work_is_joined_to_its_station() -> None:
     assert (around(idle, plan, 1) == around(busy, plan, 1)).all()
 
 
-def test_work_done_closes_the_arc() -> None:
+def test_the_arc_shows_the_progress_of_a_job() -> None:
     cell = row(1)
     blue = []
     for share in (0.0, 0.25, 0.5, 1.0):
@@ -156,7 +156,7 @@ def test_work_done_closes_the_arc() -> None:
     assert blue[2] == pytest.approx(blue[3] / 2, rel=0.15)
 
 
-def test_every_word_of_a_scene_changes_the_picture() -> None:
+def test_every_field_of_a_scene_changes_the_picture() -> None:
     cell = row(2)
     offer = QueuedJob(job="sort-001", payload_kg=0.5, due_in_s=300.0, able=(True, True), free=(True, False))
     base = scene(cell, queue=(offer,), waiting=1, title="one")
@@ -181,13 +181,13 @@ def test_every_word_of_a_scene_changes_the_picture() -> None:
 @pytest.mark.parametrize(
     ("due_in_s", "words"), [(0.0, "0 min left"), (720.0, "12 min left"), (-180.0, "3 min late"), (9000.0, "2.5 h left")]
 )
-def test_slack_in_words(due_in_s, words) -> None:
+def test_slack_is_formatted(due_in_s, words) -> None:
     assert time_left(due_in_s) == words
 
 
 @pytest.mark.parametrize("size", [(960, 640), (480, 320)])
 @pytest.mark.parametrize("arms", [2, 4, 6])
-def test_what_an_arm_does_is_not_written_over_another_arm(arms, size) -> None:
+def test_labels_of_arms_do_not_cover_other_arms(arms, size) -> None:
     cell = replace(row(arms), mounts_m=((0.0, 0.0, 0.0),) * arms)
     plan = floor_plan(cell, size)
     idle = picture(scene(cell), size)
@@ -203,7 +203,7 @@ def test_what_an_arm_does_is_not_written_over_another_arm(arms, size) -> None:
 
 
 @pytest.mark.parametrize("size", [(319, 240), (320, 239), (LARGEST[0] + 1, 640), (-5, 640), (0, 0)])
-def test_a_size_nobody_can_read_is_refused(size) -> None:
+def test_too_small_pictures_are_refused(size) -> None:
     with pytest.raises(ValueError, match=rf"from 320x240 to 3840x2160 px \(got {size[0]}x{size[1]}\)"):
         picture(scene(row(2)), size)
 
@@ -213,13 +213,13 @@ def test_a_size_nobody_can_read_is_refused(size) -> None:
 
 @pytest.mark.parametrize("size", [(320, 240), (480, 320), (961, 641)])
 @pytest.mark.parametrize("arms", [1, 2, 64])
-def test_it_is_an_image_of_the_size_asked_for_and_repeats(arms, size) -> None:
+def test_pictures_have_the_requested_size_and_repeat(arms, size) -> None:
     busy = scene(row(arms), temp_c=61.0, mode=WORKING)
     frame = picture(busy, size)
     assert frame.shape == (size[1], size[0], 3)
     assert frame.dtype == np.uint8
     before = frame.copy()
-    frame[:] = 0  # what is kept between frames is nobody's to change
+    frame[:] = 0  # cached parts must not change
     assert (picture(busy, size) == before).all()
 
 
@@ -235,7 +235,7 @@ def test_any_name_can_be_drawn(arm, station, job, title) -> None:
 
 
 @given(words, st.integers(0, 200))
-def test_a_name_is_cut_to_its_room_and_keeps_both_ends(name, room_px) -> None:
+def test_long_names_are_shortened_in_the_middle(name, room_px) -> None:
     short = shortened(name, 12, room_px)
     assert short.isprintable()
     assert text_width(short, 12) <= room_px or not short
@@ -248,7 +248,7 @@ def test_a_name_is_cut_to_its_room_and_keeps_both_ends(name, room_px) -> None:
         assert name.endswith(tail)
 
 
-def test_what_does_not_belong_together_is_refused() -> None:
+def test_inconsistent_scenes_are_refused() -> None:
     with pytest.raises(ValueError, match=r"Scene\.mode needs one entry per arm, 2 \(got 1\)"):
         replace(scene(row(2)), mode=(IDLE,))
     with pytest.raises(ValueError, match="warning_c < error_c"):

@@ -19,14 +19,14 @@ PLACES = ("bench", "press", "rack")
 
 @dataclass(frozen=True)
 class Draft:
-    """A scenario as drawn."""
+    """A random scenario."""
 
     works: tuple[tuple[str, str | None, float], ...]
-    """From, to (None for a hold), and kg."""
+    """From, to (None for a hold), kg."""
     able: tuple[frozenset[int], ...]
-    """Which works each arm can do."""
+    """Works that each arm can do."""
     jobs: tuple[tuple[int, int, float, frozenset[int]], ...]
-    """Work, repetitions, release and what comes before."""
+    """Work, repetitions, release and predecessors."""
     slots: int
     error_c: float
     ambient_c: float
@@ -37,7 +37,7 @@ class Draft:
 
 @st.composite
 def drafts(draw: Any) -> Draft:
-    """Small scenarios; every work can be done by some arm."""
+    """Draw small scenarios; some arm can do every work."""
     payload = st.sampled_from([8.0, 4.0, 0.0])
     pair = st.tuples(st.sampled_from(PLACES), st.none() | st.sampled_from(PLACES), payload)
     works = draw(st.lists(pair.filter(lambda w: w[0] != w[1]), min_size=1, max_size=4, unique=True))
@@ -64,7 +64,7 @@ def drafts(draw: Any) -> Draft:
 
 
 def env_of(small, draft: Draft, **options: Any) -> AllocationEnv:
-    """The environment of a draft."""
+    """Return the environment of a draft."""
     works = [small.work(place, kg, to=to) for place, to, kg in draft.works]
     arms = [
         small.arm(i, [works[w] for w in sorted(able)], times=small.Times(3.0 + i, 7.0 + 2 * i, 2.0))
@@ -97,16 +97,16 @@ def env_of(small, draft: Draft, **options: Any) -> AllocationEnv:
 @given(draft=drafts())
 def test_invariants_of_a_shift(small, play, draft) -> None:
     env, rng = env_of(small, draft), np.random.default_rng(draft.seed)
-    seen, infos = env.reset(seed=draft.seed)
+    observed, infos = env.reset(seed=draft.seed)
     before, value = env.truth, 0.0
-    check_observations(env, seen, play)
+    check_observations(env, observed, play)
     while env.agents:
         check_offers(env)
-        seen, rewards, terminated, truncated, infos = env.step(play.wild(env, rng))
+        observed, rewards, terminated, truncated, infos = env.step(play.wild(env, rng))
         now = env.truth
         check_state(env, now)
         check_progress(env, before, now)
-        check_observations(env, seen, play)
+        check_observations(env, observed, play)
         assert np.isfinite(list(rewards.values())).all()
         value += infos["arm_0"]["reward_finished_value"]
         before = now
@@ -122,13 +122,13 @@ def test_invariants_of_a_shift(small, play, draft) -> None:
 
 
 def check_state(env: AllocationEnv, now: State) -> None:
-    """Invariants of one moment."""
+    """Check the invariants of one state."""
     world, jobs, exists = env.world, env.world.jobs, env.world.jobs.exists[0]
     mode, job, status = now.mode[0], now.job[0], now.status[0]
     elapsed_s = now.tick[0] * world.dt_s
     assert np.isfinite(now.temp_c).all()
     assert (now.temp_c > world.ambient_c.min() - 1e-6).all()
-    # Never two arms on one job or at one station, and none on a job that waits.
+    # No two arms have one job or one station, and no arm has a job that waits.
     working = np.flatnonzero(mode == WORKING)
     current = job[working]
     assert len(set(current.tolist())) == len(current)
@@ -138,11 +138,11 @@ def check_state(env: AllocationEnv, now: State) -> None:
     places = [s for j in current.tolist() for s in set(jobs.stations[0, j].tolist()) if s >= 0]
     assert len(set(places)) == len(places)
     # Cycles and completions.
-    cycles, asked = now.cycles[0][exists], jobs.repetitions[0][exists]
+    cycles, repetitions = now.cycles[0][exists], jobs.repetitions[0][exists]
     done = status[exists] == DONE
     assert (cycles >= 0).all()
-    assert (cycles <= asked).all()
-    assert (cycles[done] == asked[done]).all()
+    assert (cycles <= repetitions).all()
+    assert (cycles[done] == repetitions[done]).all()
     finished_s = now.finished_s[0][exists]
     assert (np.isnan(finished_s) == ~done).all()
     assert (finished_s[done] >= jobs.release_s[0][exists][done]).all()
@@ -164,7 +164,7 @@ def check_state(env: AllocationEnv, now: State) -> None:
 
 
 def check_progress(env: AllocationEnv, before: State, now: State) -> None:
-    """Invariants from one moment to the next."""
+    """Check the invariants from one step to the next."""
     assert now.tick[0] == before.tick[0] + 1
     for name in ("faults", "illegal", "peak_c", "above_warning_s", "busy_s", "lost_s", "energy_j", "cycles", "returns"):
         assert (getattr(now, name) >= getattr(before, name) - 1e-9).all(), name
@@ -178,14 +178,14 @@ def check_progress(env: AllocationEnv, before: State, now: State) -> None:
         assert j not in others.tolist() or now.faults[0, a] > before.faults[0, a]
 
 
-def check_observations(env: AllocationEnv, seen: dict[str, Any], play: Any) -> None:
-    """Masks and offers follow from the rules, and the observation agrees."""
+def check_observations(env: AllocationEnv, observed: dict[str, Any], play: Any) -> None:
+    """Check masks and offers by the rules, and the observation."""
     world, now, known = env.world, env.truth, env.knowledge()
     slot_job = play.slots_of(world, now)
     taken = {s for j in now.job[0][now.mode[0] == WORKING].tolist() for s in world.jobs.stations[0, j].tolist()} - {-1}
     for a, arm in enumerate(env.possible_agents):
-        own, mask = known[arm], seen[arm]["action_mask"]
-        assert env.observation_space(arm).contains(seen[arm])
+        own, mask = known[arm], observed[arm]["action_mask"]
+        assert env.observation_space(arm).contains(observed[arm])
         assert mask[0] == 1
         for k, j in enumerate(slot_job):
             able = j >= 0 and world.offers.plan[0, a, j] >= 0
@@ -196,24 +196,24 @@ def check_observations(env: AllocationEnv, seen: dict[str, Any], play: Any) -> N
             assert own.known[k] == able
         assert [own.idle, own.working, own.faulted] == [now.mode[0, a] == m for m in (IDLE, WORKING, FAULTED)]
         filled = own.offered == 1
-        assert (np.diff(filled.astype(int)) <= 0).all()  # slots fill from the front
-        assert (np.diff(own.age_s[filled]) <= 1e-3).all()  # the oldest first
+        assert (np.diff(filled.astype(int)) <= 0).all()  # no gaps between filled slots
+        assert (np.diff(own.age_s[filled]) <= 1e-3).all()  # in order of age
         assert own.last_award == now.last_award[0, a]
         assert (own.busy_s > 0) == (now.mode[0, a] == WORKING)
 
 
 def check_offers(env: AllocationEnv) -> None:
-    """Exactly as many slots are filled as jobs are released, wait, and have the jobs before them done."""
+    """Check that slots hold the jobs that are released, wait, and have finished predecessors."""
     world, now = env.world, env.truth
     after, done = world.jobs.after[0], now.status[0] == DONE
     ready = world.jobs.exists[0] & (now.status[0] == WAITING)
     ready &= (world.jobs.release_s[0] <= now.tick[0] * world.dt_s) & (done[after] | (after < 0)).all(axis=1)
-    for seen in env.knowledge().values():
-        assert seen.offered.sum() == min(ready.sum(), world.slots)
+    for observed in env.knowledge().values():
+        assert observed.offered.sum() == min(ready.sum(), world.slots)
 
 
 def test_the_state_has_as_many_jobs_as_the_world(small) -> None:
-    """Room for predecessors is made without room for more jobs: pictures and tables use the world's number."""
+    """More predecessors do not add jobs: pictures and tables use the number of the world."""
     many = tuple((0, 1, 0.0, frozenset(range(j - 2, j)) if j > 2 else frozenset[int]()) for j in range(12))
     draft = Draft((("bench", None, 0.0),), (frozenset({0}),), many, 3, 75.0, 25.0, False, False, 0)
     env = env_of(small, draft, render_mode="ansi")

@@ -1,4 +1,4 @@
-"""Scenarios in a batch: the shifts of `make_env`, and their randomisation."""
+"""Batches of a scenario: equal to `make_env`, and randomised."""
 
 from dataclasses import replace
 from typing import Any
@@ -21,39 +21,41 @@ SEED = 30
 
 @pytest.fixture(scope="module")
 def fleet(cell, folder) -> Fleet:
-    """The cell, ready."""
+    """Return the prepared cell."""
     return prepare(cell, difficulty="blind", cache=folder)
 
 
 def actions_of(play, mask: np.ndarray, step: int) -> np.ndarray:
-    """For every row alike, whatever rows there are."""
+    """Return actions that do not depend on the number of rows."""
     return play.chosen(mask, np.random.default_rng(step).random((1, 3, 2)))
 
 
-# As it is
+# Without randomisation
 
 
 @pytest.mark.parametrize("difficulty", ["blind", "oracle"])
 @pytest.mark.parametrize("e", [0, 4])
-def test_a_row_is_the_env_of_the_scenario_with_that_seed(cell, folder, play, e, difficulty) -> None:
+def test_a_row_equals_make_env_with_the_same_seed(cell, folder, play, e, difficulty) -> None:
     options: dict[str, Any] = {"difficulty": difficulty, "cache": folder}
     batch, env = make_batch(cell, 6, SEED, **options), make_env(cell, **options)
     obs, _ = batch.reset()
-    seen = play.single(env, env.reset(seed=SEED + e))
+    observed = play.single(env, env.reset(seed=SEED + e))
     ends, faults = [], 0
     for step in range(140):
-        play.same({n: v[e : e + 1] for n, v in obs.items()}, {n: seen[n] for n in obs})
+        play.same({n: v[e : e + 1] for n, v in obs.items()}, {n: observed[n] for n in obs})
         actions = actions_of(play, obs["action_mask"], step)
         given = batch.step(actions)
         obs = given[0]
-        seen = play.single(env, env.step(dict(zip(env.possible_agents, actions[e].tolist(), strict=True))))
+        observed = play.single(env, env.step(dict(zip(env.possible_agents, actions[e].tolist(), strict=True))))
         expected = play.rows(given, e)
-        play.same({n: v for n, v in seen.items() if n not in obs}, {n: expected[n] for n in seen if n not in obs})
-        faults += int(seen["faults"].sum())
+        play.same(
+            {n: v for n, v in observed.items() if n not in obs}, {n: expected[n] for n in observed if n not in obs}
+        )
+        faults += int(observed["faults"].sum())
         if not env.agents:
-            ends.append(bool(seen["terminated"]))
-            play.same({n: expected[f"final_{n}"] for n in obs}, {n: seen[n] for n in obs})
-            seen = play.single(env, env.reset())
+            ends.append(bool(observed["terminated"]))
+            play.same({n: expected[f"final_{n}"] for n in obs}, {n: observed[n] for n in obs})
+            observed = play.single(env, env.reset())
     assert len(ends) >= 2
     assert faults > 0
 
@@ -77,17 +79,17 @@ def test_a_shift_as_arrays_has_the_jobs_of_the_scenario(fleet, seed) -> None:
     assert all(np.array_equal(value, getattr(again, name)) for name, value in vars(shift).items())
 
 
-# Varied
+# With randomisation
 
 
-def test_no_variation_is_that_of_none(fleet) -> None:
+def test_an_empty_randomisation_changes_nothing(fleet) -> None:
     plain, zero = library_of([fleet]), library_of([fleet], Randomisation(ambient_k=(0.0, 0.0), arrivals=(1.0, 1.0)))
     for seed in range(5):
         one, other = (lib.draw(np.random.SeedSequence(seed)) for lib in (plain, zero))
         assert all(np.array_equal(value, getattr(other, name)) for name, value in vars(one).items())
 
 
-def test_what_varies_stays_within_its_bounds_and_reaches_all_of_them(fleet) -> None:
+def test_randomised_values_cover_their_range(fleet) -> None:
     randomise = Randomisation(ambient_k=(-2.0, 6.0), arrivals=(0.5, 2.0))
     library = library_of([fleet] * 3, randomise)
     shifts = [library.draw(np.random.SeedSequence(seed)) for seed in range(300)]
@@ -98,14 +100,14 @@ def test_what_varies_stays_within_its_bounds_and_reaches_all_of_them(fleet) -> N
     fleets = np.bincount([shift.fleet for shift in shifts], minlength=3)
     assert len(fleets) == 3
     assert np.abs(fleets - 100).max() < 4 * np.sqrt(300 * 2 / 9)
-    # 240 s at one in 60 s and 200 s at one in 40 s are 9 jobs, on the mean 1.25 times as often, and 3 at once.
+    # 240 s / 60 s + 200 s / 40 s = 9 jobs, times 1.25 on average, and 3 at once.
     often = Randomisation(arrivals=(3.0, 3.0))
     for chosen, expected in ((Randomisation(), 12.0), (randomise, 3 + 9 * 1.25), (often, 3 + 9 * 3.0)):
         counts = [len(library_of([fleet], chosen).draw(np.random.SeedSequence(s)).kind) for s in range(200)]
         assert np.mean(counts) == pytest.approx(expected, abs=4 * np.std(counts) / np.sqrt(200))
 
 
-def test_a_variation_is_of_its_seed_and_leaves_the_noise_alone(fleet, play) -> None:
+def test_randomisation_depends_on_the_seed_and_not_on_noise(fleet, play) -> None:
     randomise = Randomisation(ambient_k=(0.0, 5.0), arrivals=(0.8, 1.2))
     library = library_of([fleet], randomise)
     for seed in range(4):
@@ -131,11 +133,11 @@ def test_a_warmer_cell_warms_every_motor(cell, folder) -> None:
             batch.step(nobody)
     warmer = warm.state.temp_c - cool.state.temp_c
     assert warmer.min() > 3.0 - 1e-9
-    assert 3.0 + 1e-6 < warmer.max() < 3.1  # the losses of a warmer motor are a little higher
+    assert 3.0 + 1e-6 < warmer.max() < 3.1  # a warmer motor has slightly higher losses
 
 
-def test_a_variant_is_its_fleet(cell, folder, play) -> None:
-    """Rows of a batch of two fleets, each beside the batch of that fleet alone."""
+def test_rows_of_two_variants_equal_batches_of_each(cell, folder, play) -> None:
+    """Compare the rows of a batch of two variants with a batch of each."""
     options: dict[str, Any] = {"difficulty": "oracle", "cache": folder}
     variant = {"spread": {"scale": 2.0, "seed": 9}}
     both = make_batch(cell, 12, SEED, randomise=Randomisation(variants=[variant]), **options)
@@ -150,14 +152,14 @@ def test_a_variant_is_its_fleet(cell, folder, play) -> None:
             np.testing.assert_array_equal(env.state.temp_c[fleet == each], both.state.temp_c[fleet == each])
         actions = actions_of(play, obs["action_mask"], step)
         (obs, _, terminated, truncated, _), given = both.step(actions), [env.step(actions)[0] for env in alone]
-        if (terminated | truncated).any():  # the next shift of a row may be of the other fleet
+        if (terminated | truncated).any():  # the next shift of a row may be of the other variant
             break
     assert step > 10
     assert 0 < fleet.sum() < 12
 
 
-def test_fleets_of_unlike_risks_in_one_table_are_each_its_own(small, play) -> None:
-    """Without risks, with one piece, with three and a curve; of one station and of two."""
+def test_variants_with_different_risk_models_do_not_mix(small, play) -> None:
+    """Variants without risks, with risks of one piece, of three pieces and a curve; with one and two stations."""
     models = [
         [small.ByPayload(1.0 + 0.1 * i) for i in range(3)],
         [play.Learned(1, curve=False) for _ in range(3)],

@@ -1,4 +1,4 @@
-"""The doors: by name in PettingZoo's registry, and `make_env` and `make_batch`."""
+"""Entry points: PettingZoo's registry, `make_env`, `make_batch`."""
 
 import subprocess
 import sys
@@ -15,7 +15,7 @@ from fleet.env.vector import BatchEnv
 NAME = "thermofleet/allocation_v0"
 
 
-def test_pettingzoo_makes_it_by_name(cell, folder, play) -> None:
+def test_pettingzoo_makes_the_env_by_name(cell, folder, play) -> None:
     options = {"scenario": cell, "difficulty": "blind", "cache": folder, "max_cycles": 5}
     env = pettingzoo.make("parallel", NAME, **options, mask_in="both")
     assert isinstance(env, ParallelEnv)
@@ -33,7 +33,7 @@ def test_pettingzoo_makes_it_by_name(cell, folder, play) -> None:
     np.testing.assert_array_equal(first["observation"], ours.reset(seed=1)[0]["left"]["observation"])
 
 
-def test_overrides_are_of_the_scenario_or_of_the_env(cell, folder) -> None:
+def test_overrides_are_fields_of_the_scenario_or_options_of_the_env(cell, folder) -> None:
     env = pettingzoo.make("parallel", NAME, scenario=cell, difficulty="blind", cache=folder, horizon_s=100, slots=2)
     env.reset(seed=0)
     assert env.action_space("left").n == 3
@@ -41,12 +41,12 @@ def test_overrides_are_of_the_scenario_or_of_the_env(cell, folder) -> None:
 
 
 @pytest.mark.parametrize("kind", ["parallel", "aec"])
-def test_a_scenario_that_there_is_not_is_named(kind) -> None:
+def test_an_unknown_scenario_is_named(kind) -> None:
     with pytest.raises(Exception, match="No scenario 'quickstrat'; did you mean 'quickstart'"):
         pettingzoo.make(kind, NAME, scenario="quickstrat")
 
 
-def test_a_batch_is_made_of_a_scenario(cell, folder) -> None:
+def test_make_batch_takes_a_scenario(cell, folder) -> None:
     batch = scenarios.make_batch(cell, num_envs=3, seed=0, difficulty="blind", cache=folder, slots=2, max_cycles=4)
     assert isinstance(batch, BatchEnv)
     obs, info = batch.reset()
@@ -58,7 +58,7 @@ def test_a_batch_is_made_of_a_scenario(cell, folder) -> None:
     assert list(info) == list(given[-1][-1])
 
 
-def test_a_batch_can_be_spread_over_the_shift(cell, folder) -> None:
+def test_make_batch_staggers_envs(cell, folder) -> None:
     batch = scenarios.make_batch(cell, 2, 0, difficulty="blind", cache=folder, max_cycles=4, stagger=True)
     batch.reset()
     ends = [batch.step(np.zeros((2, 3), int))[3].tolist() for _ in range(4)]
@@ -73,7 +73,7 @@ def test_a_batch_can_be_spread_over_the_shift(cell, folder) -> None:
         "import scenarios.prepare.env_registration",
     ],
 )
-def test_the_name_is_there_once_scenarios_is_imported(first) -> None:
+def test_importing_scenarios_registers_the_name(first) -> None:
     code = f"{first}; import pettingzoo as p; print([p.spec(kind, {NAME!r}).name for kind in ('parallel', 'aec')])"
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
-    assert said.stdout.strip() == "['allocation', 'allocation']", said.stderr
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
+    assert done.stdout.strip() == "['allocation', 'allocation']", done.stderr

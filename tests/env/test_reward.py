@@ -1,4 +1,4 @@
-"""Reward terms, against numbers worked by hand and against the event log."""
+"""Reward terms against numbers computed by hand and against the event log."""
 
 from dataclasses import asdict
 
@@ -11,7 +11,7 @@ from fleet.robot import ThermalLimits
 
 
 def played(small, jobs, weights=None, *, ticks: int, **world) -> tuple[AllocationEnv, dict[str, np.ndarray]]:
-    """One arm that claims the oldest job whenever it may, and the reward terms of each step."""
+    """Play one arm that claims the oldest job if it may; return the reward terms of each step."""
     made, plant = small.shop([jobs], arms=1, ticks=ticks, **world)
     env = parallel_env(
         lambda seed: Episode(made, plant, ("t",), seed), weights=weights or RewardWeights(), keep_events=True
@@ -25,7 +25,7 @@ def played(small, jobs, weights=None, *, ticks: int, **world) -> tuple[Allocatio
     return env, {name: np.array(values) for name, values in terms.items()}
 
 
-def test_value_and_tardiness_are_paid_in_the_step_in_which_a_job_is_finished(small) -> None:
+def test_value_and_tardiness_are_rewarded_in_the_step_that_finishes_a_job(small) -> None:
     """A job lasts 3 s + 3 · 10 s, and 2 s more on the way home: the jobs begin at 0 s and at 40 s."""
     jobs = [small.job("a", value=3.0, due_s=100.0), small.job("b", value=2.0, due_s=13.0)]
     weights = RewardWeights(finished_value=2.0, tardiness=-1.0)
@@ -36,12 +36,12 @@ def test_value_and_tardiness_are_paid_in_the_step_in_which_a_job_is_finished(sma
     assert not terms["above_warning"].any()
 
 
-def test_an_idle_step_costs_its_energy_alone(small) -> None:
+def test_an_idle_step_costs_only_its_energy(small) -> None:
     env, terms = played(small, [small.job("a", release_s=5000.0)], RewardWeights(energy=-0.5), ticks=6)
     for name in TERMS[:-1]:
         assert not terms[name].any()
     assert terms["energy"].sum() == pytest.approx(-0.5 * env.truth.energy_j.sum() / 3600.0)
-    # Idle drives and the current that holds the arm at home, at 25 °C and little more.
+    # Idle drives, and the current that holds the arm at home, near 25 °C.
     watts = env.world.motors.idle_w.sum() + (env.world.motors.copper_w_per_a2 * env.world.rest.current_sq).sum()
     assert terms["energy"].sum() == pytest.approx(-0.5 * watts * 60.0 / 3600.0, rel=1e-3)
 
@@ -78,7 +78,7 @@ def test_the_rewards_of_an_episode_add_up_to_the_event_log(small, seed) -> None:
     assert total == pytest.approx(sum(got.values()))
 
 
-def test_a_job_is_paid_once_though_it_was_returned(small) -> None:
+def test_a_returned_job_is_rewarded_once(small) -> None:
     jobs = [small.job("a", small.work(payload_kg=small.HOT), value=4.0, repetitions=40)]
     env, terms = played(small, jobs, RewardWeights(faults=-7.0, above_warning=-10.0), ticks=600)
     faults = [event.time_s for event in env.events if event.kind == "fault"]

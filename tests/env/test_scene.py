@@ -1,4 +1,4 @@
-"""What of a world is drawn: its mounts, its work, and no more than is true."""
+"""Scenes: mounts, jobs and temperatures of a world."""
 
 import numpy as np
 import pytest
@@ -23,22 +23,30 @@ from fleet.telemetry import IDLE, WORKING
         ((0, 140, 0), "tilted"),
     ],
 )
-def test_what_an_arm_is_fixed_to(tilt_deg, kind) -> None:
+def test_mounts_are_named(tilt_deg, kind) -> None:
     assert mount_kind(Mount(tilt_deg=tilt_deg)) == kind
 
 
-def test_a_scene_tells_the_truth_about_a_world(small) -> None:
+def test_a_scene_equals_the_state_of_its_world(small) -> None:
     work, heavy = small.work("bench"), small.work("rack", payload_kg=2.5)
     jobs = [small.job("now", work), small.job("next", heavy, due_s=5.0), small.job("late", work, release_s=500.0)]
     arms = [small.arm(0, [work]), small.arm(1, [work, heavy])]
     world, plant = small.shop([jobs], arms=arms)
     state = step(world, initial(world), np.array([[1, 0]]), plant).state
-    seen = scene_of(world, state, title="two arms")
-    assert (seen.time_s, seen.horizon_s, seen.finished, seen.waiting, seen.faults) == (10.0, 600.0, 0, 1, 0)
-    assert (seen.mode, seen.job, seen.at) == ((WORKING, IDLE), ("now", ""), (("bench",), ()))
-    assert seen.progress == (pytest.approx(10.0 / (3.0 + 3 * 10.0 + 2.0)), 0.0)
-    assert seen.queue == (QueuedJob(job="next", payload_kg=2.5, due_in_s=-5.0, able=(False, True), free=(False, True)),)
-    np.testing.assert_array_equal(seen.temp_c, state.temp_c[0, :, :JOINTS])
+    observed = scene_of(world, state, title="two arms")
+    assert (observed.time_s, observed.horizon_s, observed.finished, observed.waiting, observed.faults) == (
+        10.0,
+        600.0,
+        0,
+        1,
+        0,
+    )
+    assert (observed.mode, observed.job, observed.at) == ((WORKING, IDLE), ("now", ""), (("bench",), ()))
+    assert observed.progress == (pytest.approx(10.0 / (3.0 + 3 * 10.0 + 2.0)), 0.0)
+    assert observed.queue == (
+        QueuedJob(job="next", payload_kg=2.5, due_in_s=-5.0, able=(False, True), free=(False, True)),
+    )
+    np.testing.assert_array_equal(observed.temp_c, state.temp_c[0, :, :JOINTS])
     with pytest.raises(ValueError, match=r"The cell has the arms arm_0; the world has arm_0, arm_1\."):
         scene_of(world, state, grid_cell(("arm_0",), ()))
 
@@ -49,5 +57,5 @@ def test_a_finished_job_and_a_fault_are_counted(small) -> None:
     for action in (1, 0):
         state = step(world, state, np.array([[action, 0]]), plant).state
     state.faults[0, 1] = 2
-    seen = scene_of(world, state)
-    assert (seen.finished, seen.waiting, seen.faults, seen.job) == (1, 0, 2, ("", ""))
+    observed = scene_of(world, state)
+    assert (observed.finished, observed.waiting, observed.faults, observed.job) == (1, 0, 2, ("", ""))

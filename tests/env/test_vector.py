@@ -1,4 +1,4 @@
-"""The batch: a row equals the single environment bit for bit, whatever the other rows are."""
+"""The batch: a row equals the single environment bit for bit, and does not depend on other rows."""
 
 from dataclasses import replace
 from typing import Any
@@ -14,18 +14,18 @@ from fleet.engine.batch import BLOCK
 from fleet.env.vector import BatchEnv, Library
 
 SHIFT: dict[str, Any] = {"arms": 3, "jobs": 4, "ticks": 22, "ambient_c": 20.0}
-"""Some of these shifts end with the work, some at the horizon, at different times."""
+"""Some of these shifts end when all jobs are finished, some at the horizon, at different times."""
 STEPS = 110
 SEED = 100
 
 
 def numbers(env: int, steps: int = STEPS, arms: int = 3) -> np.ndarray:
-    """Random numbers that decide the actions of one env, [step, arm, 2]."""
+    """Return random numbers for the actions of one env, [step, arm, 2]."""
     return np.random.default_rng(1000 + env).random((steps, arms, 2))
 
 
 def played(env: BatchEnv, play, who: list[int], steps: int = STEPS) -> list[dict[str, Any]]:
-    """Everything that rows returned from reset on, with the actions of the envs `who`."""
+    """Return all results of a batch from reset on, with the actions of the envs `who`."""
     all_numbers = np.stack([numbers(e, steps) for e in who], axis=1)
     given = env.reset()
     trace = [play.rows(given, range(env.num_envs))]
@@ -36,7 +36,7 @@ def played(env: BatchEnv, play, who: list[int], steps: int = STEPS) -> list[dict
 
 
 def row(step: dict[str, Any], e: int) -> dict[str, Any]:
-    """One row of a step of `played`."""
+    """Return one row of a step of `played`."""
     place = int(np.count_nonzero(step["ended"][:e]))
     ended = bool(step["ended"][e])
     return {n: v[place : place + ended] if n.startswith("final_") else v[e : e + 1] for n, v in step.items()}
@@ -44,26 +44,26 @@ def row(step: dict[str, Any], e: int) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def library(small) -> Library:
-    """Library of these shifts."""
+    """Return the library of these shifts."""
     return small.Shifts(**SHIFT).library()
 
 
 @pytest.fixture(scope="module")
 def many(library, play) -> list[dict[str, Any]]:
-    """Everything that 64 envs returned."""
+    """Return all results of 64 envs."""
     return played(BatchEnv(library, 64, seed=SEED), play, list(range(64)))
 
 
 # Independence of rows
 
 
-def test_shifts_of_these_tests_end_in_both_ways_and_at_different_times(many) -> None:
+def test_shifts_of_these_tests_terminate_and_truncate_at_different_times(many) -> None:
     terminated = np.array([step["terminated"] for step in many[1:]])
     truncated = np.array([step["truncated"] for step in many[1:]])
     assert min(terminated.sum(), truncated.sum()) > 20
     assert not (terminated & truncated).any()
     assert len(set((terminated | truncated).argmax(axis=0).tolist())) > 5
-    assert (terminated | truncated).sum(axis=0).min() >= 3  # each env is in its fourth shift at least
+    assert (terminated | truncated).sum(axis=0).min() >= 3  # each env is at least in its fourth shift
 
 
 @pytest.mark.parametrize("who", [[0], [1], [40], [63], [5, 6, 7, 8, 9, 10, 11], [63, 2, 31, 0, 17, 30, 44]])
@@ -74,8 +74,8 @@ def test_a_row_does_not_depend_on_the_other_rows_or_their_order(many, batch, pla
             play.same(row(one, place), row(all_rows, e))
 
 
-def test_a_row_of_a_thousand_is_the_row_alone(library, play) -> None:
-    """Also on either side of a block of the engine."""
+def test_a_row_of_a_thousand_equals_the_row_alone(library, play) -> None:
+    """Also at the boundaries of the engine's blocks of rows."""
     thousand = played(BatchEnv(library, 1024, seed=SEED), play, list(range(1024)), steps=50)
     for e in (0, BLOCK - 1, BLOCK, 1023):
         for one, all_rows in zip(played(BatchEnv(library, 1, seed=SEED + e), play, [e], 50), thousand, strict=True):
@@ -84,25 +84,25 @@ def test_a_row_of_a_thousand_is_the_row_alone(library, play) -> None:
 
 @pytest.mark.parametrize("keep_events", [False, True])
 @pytest.mark.parametrize("e", [0, 1, 5, 40])
-def test_a_row_is_the_single_env_through_all_its_resets(many, make, play, e, keep_events) -> None:
+def test_a_row_equals_the_single_env_over_several_episodes(many, make, play, e, keep_events) -> None:
     env = make(SHIFT, keep_events=keep_events)
     contained(play, play.single(env, env.reset(seed=SEED + e)), row(many[0], e))
     for step, each in zip(many[1:], numbers(e), strict=True):
-        mask = np.stack([seen.action_mask for seen in env.knowledge().values()])
+        mask = np.stack([observed.action_mask for observed in env.knowledge().values()])
         actions = dict(zip(env.possible_agents, play.chosen(mask, each).tolist(), strict=True))
-        found, expected = play.single(env, env.step(actions)), row(step, e)
+        actual, expected = play.single(env, env.step(actions)), row(step, e)
         assert expected["ended"][0] == (not env.agents)
         if not env.agents:
-            last = {name: found[name] for name in ("observation", "action_mask")}
+            last = {name: actual[name] for name in ("observation", "action_mask")}
             play.same(last, {name: expected[f"final_{name}"] for name in last})
             first = play.single(env, env.reset())
-            found |= {name: first[name] for name in last}
-        contained(play, found, expected)
+            actual |= {name: first[name] for name in last}
+        contained(play, actual, expected)
 
 
-def contained(play, found: dict[str, Any], expected: dict[str, Any]) -> None:
-    """Assert that what was found is part of what was expected."""
-    play.same(found, {name: expected[name] for name in found})
+def contained(play, actual: dict[str, Any], expected: dict[str, Any]) -> None:
+    """Assert that all actual values are among the expected ones."""
+    play.same(actual, {name: expected[name] for name in actual})
 
 
 @pytest.mark.parametrize("threads", [2, 3, 7])
@@ -119,29 +119,29 @@ LATE = Channel(delay_s=25.0, loss=0.3)
 
 
 @pytest.mark.parametrize("e", [0, 3, 6])
-def test_a_row_with_an_exchange_is_the_single_env_with_that_exchange(make, batch, play, e) -> None:
+def test_a_row_with_an_exchange_equals_the_single_env(make, batch, play, e) -> None:
     arms = make(SHIFT).possible_agents
     exchanges = [MemoryExchange(arms, LATE) for _ in range(7)]
     env, many = make(SHIFT, exchange=MemoryExchange(arms, LATE)), batch(7, SHIFT, seed=SEED, exchanges=exchanges)
-    found, given = play.single(env, env.reset(seed=SEED + e)), many.reset()
-    heard, ends = [], 0
+    actual, given = play.single(env, env.reset(seed=SEED + e)), many.reset()
+    arrived, ends = [], 0
     for each in np.stack([numbers(e) for e in range(7)], axis=1):
-        play.same({n: found[n] for n in given[0]}, {n: values[[e]] for n, values in given[0].items()})
-        for a, seen in enumerate(env.knowledge().values()):
-            heard.append(seen.peer_heard.mean())
-            play.same({n: values[e, a] for n, values in vars(many.knowledge()).items()}, vars(seen))
+        play.same({n: actual[n] for n in given[0]}, {n: values[[e]] for n, values in given[0].items()})
+        for a, observed in enumerate(env.knowledge().values()):
+            arrived.append(observed.peer_heard.mean())
+            play.same({n: values[e, a] for n, values in vars(many.knowledge()).items()}, vars(observed))
         actions = play.chosen(given[0]["action_mask"], each)
         step = env.step(dict(zip(arms, actions[e].tolist(), strict=True)))
-        found, given = play.single(env, step), many.step(actions)
+        actual, given = play.single(env, step), many.step(actions)
         if not env.agents:
             ends += 1
-            found = play.single(env, env.reset())
+            actual = play.single(env, env.reset())
     assert ends > 1
-    assert 0 < np.mean(heard) < 1
+    assert 0 < np.mean(arrived) < 1
 
 
-def test_rows_that_go_on_keep_what_was_delivered_to_them(batch, play) -> None:
-    """When others are reset, and whatever was written into observations that were handed out."""
+def test_resetting_other_rows_keeps_delivered_messages(batch, play) -> None:
+    """Also if the caller has overwritten returned observations."""
     one, other = (
         batch(3, SHIFT, seed=SEED, autoreset=False, exchanges=[MemoryExchange(("arm_0", "arm_1", "arm_2"), LATE)] * 3)
         for _ in range(2)
@@ -160,7 +160,7 @@ def test_rows_that_go_on_keep_what_was_delivered_to_them(batch, play) -> None:
     assert (known.peer_age_s[1:] >= 25.0).all()
 
 
-def test_one_seed_counts_up_and_a_list_is_taken_as_it_is(batch, play) -> None:
+def test_one_seed_counts_up_and_a_list_gives_one_per_row(batch, play) -> None:
     up, listed = batch(5, SHIFT, seed=7).reset(), batch(5, SHIFT, seed=[7, 8, 9, 10, 11]).reset()
     play.same(up[0], listed[0])
     again = batch(5, SHIFT, seed=1)
@@ -175,8 +175,8 @@ def test_one_seed_counts_up_and_a_list_is_taken_as_it_is(batch, play) -> None:
 # Resets
 
 
-def test_the_first_of_the_new_shift_is_what_a_reset_gives(batch, play) -> None:
-    """With and without going on by itself: the same shifts, one step later or not."""
+def test_autoreset_returns_the_first_observation_of_a_reset(batch, play) -> None:
+    """With `autoreset` the same shifts begin one step earlier than without it."""
     by_itself, by_hand = batch(16, SHIFT, seed=3), batch(16, SHIFT, seed=3, autoreset=False)
     one, other = by_itself.reset(), by_hand.reset()
     play.same(one[0], other[0])
@@ -190,7 +190,7 @@ def test_the_first_of_the_new_shift_is_what_a_reset_gives(batch, play) -> None:
         np.testing.assert_array_equal(np.flatnonzero(over), other[4]["final_envs"])
         np.testing.assert_array_equal(one[4]["final_envs"], other[4]["final_envs"])
         play.same(one[4]["final_obs"], {name: values[over] for name, values in other[0].items()})
-        for name in ("faults", "peak_c", "jobs_done", "reward_energy"):  # of the step made, not of the shift begun
+        for name in ("faults", "peak_c", "jobs_done", "reward_energy"):  # infos are of the step, not of the new shift
             np.testing.assert_array_equal(one[4][name], other[4][name])
         assert len(other[4]["final_obs"]["observation"]) == 0
         if over.any():
@@ -206,7 +206,7 @@ def test_the_first_of_the_new_shift_is_what_a_reset_gives(batch, play) -> None:
 
 @settings(max_examples=20)
 @given(chosen=st.sets(st.integers(0, 5)), as_mask=st.booleans(), at=st.integers(0, 30))
-def test_resetting_some_rows_leaves_the_others_as_they_are(library, play, chosen, as_mask, at) -> None:
+def test_resetting_some_rows_does_not_change_the_others(library, play, chosen, as_mask, at) -> None:
     one, other, rng = BatchEnv(library, 6, seed=1), BatchEnv(library, 6, seed=1), np.random.default_rng(at)
     here, there = one.reset(), other.reset()
     for _ in range(at):
@@ -223,7 +223,7 @@ def test_resetting_some_rows_leaves_the_others_as_they_are(library, play, chosen
         play.same(play.rows(here, rest), play.rows(there, rest))
 
 
-def test_a_reset_leaves_nothing_of_the_shift_before(batch, play) -> None:
+def test_a_reset_clears_the_previous_shift(batch, play) -> None:
     used, fresh = batch(8, SHIFT, seed=5), batch(8, SHIFT, seed=5)
     one, rng = used.reset(), np.random.default_rng(0)
     for _ in range(37):
@@ -235,8 +235,8 @@ def test_a_reset_leaves_nothing_of_the_shift_before(batch, play) -> None:
         one, other = used.step(actions), fresh.step(actions)
 
 
-def test_room_for_more_jobs_is_made_without_a_trace(small, library, play) -> None:
-    """A row with many jobs makes room in all; those of few jobs never need it."""
+def test_growing_the_job_arrays_changes_no_result(small, library, play) -> None:
+    """A row with many jobs enlarges the arrays of all rows."""
     few, lots = library.draw, small.Shifts(**{**SHIFT, "jobs": 23}).library().draw
     mixing = replace(library, draw=lambda seed: (lots if seed.entropy == 2 else few)(seed))
     mixed, alone = BatchEnv(mixing, 3, seed=0), BatchEnv(library, 2, seed=0)
@@ -255,13 +255,13 @@ def test_max_cycles_end_a_shift_earlier(batch) -> None:
     assert [all(end) for end in ends] == [False] * 4 + [True] + [False] * 4 + [True, False]
 
 
-def test_the_knowledge_of_a_batch_is_that_of_its_rows(batch, make, play) -> None:
+def test_knowledge_of_a_batch_equals_that_of_its_rows(batch, make, play) -> None:
     env, one = batch(3, SHIFT, seed=8), make(SHIFT)
     env.reset()
     one.reset(seed=9)
     known = vars(env.knowledge())
-    for a, seen in enumerate(one.knowledge().values()):
-        play.same({name: values[1, a] for name, values in known.items()}, vars(seen))
+    for a, observed in enumerate(one.knowledge().values()):
+        play.same({name: values[1, a] for name, values in known.items()}, vars(observed))
 
 
 def test_staggered_envs_end_their_first_shifts_one_after_the_other(small) -> None:

@@ -1,4 +1,4 @@
-"""A recorded run, replayed action by action through every entry point, is the same shift."""
+"""Every entry point repeats a recorded run, given its actions."""
 
 from dataclasses import replace
 
@@ -19,32 +19,32 @@ SEED = 2
 
 @pytest.fixture(scope="module", params=["blind", "oracle", pytest.param("twin", marks=pytest.mark.slow)])
 def fleet(request, cell, folder) -> Fleet:
-    """The cell, ready."""
+    """Return the prepared cell."""
     return prepare(cell, difficulty=request.param, cache=folder)
 
 
 @pytest.fixture(scope="module", params=["random", "round_robin"])
 def recorded(request, fleet) -> RunResult:
-    """A run as `thermofleet run` records it."""
+    """Return a run as recorded by `thermofleet run`."""
     return run(fleet, RunSpec(policy=request.param, seed=SEED, bus="memory"))
 
 
 def actions_of(result: RunResult, offered: list[str], arms: list[str], now_s: float) -> dict[str, int]:
-    """The claims of the arms at a moment, from the record: those won and lost."""
+    """Return the claims of the arms at a step, won and lost ones, from the record."""
     claims = [e for e in result.events if e.time_s == now_s and e.kind in ("award", "lost")]
     return {arm: next((offered.index(e.job) + 1 for e in claims if e.arm == arm), 0) for arm in arms}
 
 
-def check_equal(found: State, expected: State, jobs: int) -> None:
-    """Assert that the states of one env are equal, but for room for more jobs."""
+def check_equal(actual: State, expected: State, jobs: int) -> None:
+    """Assert that the states of one env are equal, apart from unused job entries."""
     for name, values in expected._asdict().items():
-        own = getattr(found, name)
+        own = getattr(actual, name)
         if name in ("status", "queued_s", "cycles", "returns", "finished_s"):
             own, values = own[:, :jobs], values[:, :jobs]
         np.testing.assert_array_equal(own, values, err_msg=name)
 
 
-def test_a_recorded_run_replayed_through_every_entry_point_is_the_same_shift(fleet, recorded, play) -> None:
+def test_every_entry_point_repeats_a_recorded_run(fleet, recorded, play) -> None:
     logged, single = env_of(fleet, keep_events=True), env_of(fleet)
     batch = BatchEnv(library_of([fleet]), 3, seed=[SEED - 1, SEED, SEED + 1], weights=fleet.scenario.reward)
     logged.reset(seed=SEED)
@@ -73,14 +73,14 @@ def test_a_recorded_run_replayed_through_every_entry_point_is_the_same_shift(fle
             if name.startswith("reward_"):
                 assert value == other[4]["left"][name] == many[4][name][1]
                 terms[name] = terms.get(name, 0.0) + value
-    # All of them are what was recorded.
+    # All of them equal the record.
     happened = [(e.time_s, e.kind, e.arm, e.job) for e in sorted(logged.events, key=lambda e: e.time_s)]
     assert happened == [(e.time_s, e.kind, e.arm, e.job) for e in recorded.events]
     np.testing.assert_allclose(rewards, recorded.total_reward, rtol=1e-9)
     finished = {e.job: e.time_s for e in recorded.events if e.kind == "finish"}
     truth, world = single.truth, single.world
-    found = {n: truth.finished_s[0, j] for j, n in enumerate(world.jobs.names[0]) if truth.status[0, j] == DONE}
-    assert found == pytest.approx(finished, rel=1e-9)
+    actual = {n: truth.finished_s[0, j] for j, n in enumerate(world.jobs.names[0]) if truth.status[0, j] == DONE}
+    assert actual == pytest.approx(finished, rel=1e-9)
     assert truth.faults.sum() == sum(e.kind == "fault" for e in recorded.events) == recorded.metrics.faults > 0
     assert dict(zip(arms, truth.peak_c[0].tolist(), strict=True)) == pytest.approx(recorded.metrics.peak_c, rel=1e-9)
     measured = recorded.telemetry.temp_c[-1]
@@ -88,14 +88,14 @@ def test_a_recorded_run_replayed_through_every_entry_point_is_the_same_shift(fle
     assert terms["reward_finished_value"] == pytest.approx(recorded.metrics.value, rel=1e-9)
 
 
-def test_the_bus_and_the_watcher_change_nothing(fleet, recorded) -> None:
+def test_bus_and_watcher_do_not_change_a_run(fleet, recorded) -> None:
     over_zenoh = run(fleet, RunSpec(policy=recorded.spec.policy, seed=SEED, bus="zenoh"), record=False)
-    assert list(map(repr, over_zenoh.events)) == list(map(repr, recorded.events))  # NaN is what it is, too
+    assert list(map(repr, over_zenoh.events)) == list(map(repr, recorded.events))  # as text, because NaN != NaN
     assert over_zenoh.total_reward == recorded.total_reward
 
 
-def test_the_simulated_arms_come_to_the_same_in_half_an_hour(cell, folder) -> None:
-    """All arms in MuJoCo, told to do what those of the profile plant did."""
+def test_both_plants_agree_over_half_an_hour(cell, folder) -> None:
+    """All arms in MuJoCo, with the actions recorded with the profile plant."""
     streams = tuple(replace(s, arrivals=replace(s.arrivals, stop_s=None)) for s in cell.jobs[:2])
     longer = replace(cell, horizon_s=1800.0, jobs=streams, limits=ThermalLimits())
     fleet = prepare(longer, difficulty="blind", cache=folder)

@@ -1,4 +1,4 @@
-"""An array comes back only when nobody can see it any more."""
+"""Buffers are reused only if nothing references them."""
 
 import gc
 import platform
@@ -11,7 +11,7 @@ import pytest
 from fleet.env.buffers import Shelf
 
 
-def test_what_somebody_holds_is_never_given_out_again() -> None:
+def test_referenced_arrays_are_never_reused() -> None:
     shelf = Shelf((3, 4), np.float32, keep=2)
     held = [shelf.take() for _ in range(5)]
     assert len({id(array) for array in held}) == 5
@@ -28,7 +28,7 @@ def test_what_somebody_holds_is_never_given_out_again() -> None:
     assert raw[0, 0] == 7.0
 
 
-def test_what_nobody_holds_comes_back() -> None:
+def test_released_arrays_are_reused() -> None:
     shelf = Shelf((8,), np.int64)
     place = shelf.take().ctypes.data
     assert shelf.take().ctypes.data == place
@@ -50,8 +50,8 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="mallopt is glibc's")
-def test_pages_are_kept_on_demand() -> None:
-    """160 MB twice: as the system counts, the second time no page is new."""
+def test_keep_pages_reuses_memory() -> None:
+    """Allocate 160 MB twice: the second time the process gets no new pages."""
     faults = {
         how: int(subprocess.run([sys.executable, "-c", TURNOVER, how], capture_output=True, check=True).stdout)
         for how in ("given back", "kept")

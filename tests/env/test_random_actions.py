@@ -1,4 +1,4 @@
-"""Random actions are legal, and no legal one is preferred."""
+"""Random legal actions."""
 
 import numpy as np
 from hypothesis import given
@@ -14,7 +14,7 @@ masks = npst.arrays(
 
 
 @given(mask=masks, seed=st.integers(0, 2**32))
-def test_every_action_is_legal_where_one_is(mask, seed) -> None:
+def test_every_action_is_legal_if_one_is(mask, seed) -> None:
     actions = random_legal(mask, np.random.default_rng(seed))
     assert actions.shape == mask.shape[:-1]
     assert actions.dtype == np.int64
@@ -32,7 +32,7 @@ def test_legal_actions_are_equally_likely() -> None:
     assert chisquare(counts[legal]).pvalue > 0.001
 
 
-def test_a_mask_of_booleans_and_the_same_seed_give_the_same() -> None:
+def test_masks_may_be_boolean_and_a_seed_repeats() -> None:
     mask = np.random.default_rng(0).random((7, 3, 5)) < 0.5
     one, other = (random_legal(each, np.random.default_rng(1)) for each in (mask, mask.astype(np.int8)))
     np.testing.assert_array_equal(one, other)

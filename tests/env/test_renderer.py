@@ -1,4 +1,4 @@
-"""The window that shows frames, where there is a display, and what is said where there is none."""
+"""The window for frames, and the warning without a display."""
 
 import logging
 import pickle
@@ -15,7 +15,7 @@ from fleet.errors import FleetError
 BLACK = np.zeros((240, 320, 3), np.uint8)
 
 
-def test_without_a_display_it_says_so_once_and_goes_on(monkeypatch, caplog) -> None:
+def test_without_a_display_it_warns_once_and_continues(monkeypatch, caplog) -> None:
     monkeypatch.setattr("matplotlib.get_backend", lambda: "agg")
     window = Renderer()
     with caplog.at_level(logging.WARNING):
@@ -29,7 +29,7 @@ def test_without_a_display_it_says_so_once_and_goes_on(monkeypatch, caplog) -> N
 
 
 def test_a_window_follows_the_frames_until_it_is_closed(monkeypatch) -> None:
-    """As if matplotlib's own canvas were a window."""
+    """Use matplotlib's canvas in place of a window."""
     import matplotlib.pyplot as plt
     from matplotlib.backend_bases import FigureManagerBase
 
@@ -43,7 +43,7 @@ def test_a_window_follows_the_frames_until_it_is_closed(monkeypatch) -> None:
     assert (figure.axes[0].images[0].get_array() == 255).all()
     assert figure.get_size_inches().tolist() == [3.2, 2.4]
     copied = pickle.loads(pickle.dumps(window))
-    plt.close(figure)  # as a person would
+    plt.close(figure)  # as a user does
     assert not window.show(BLACK)
     assert plt.get_fignums() == []
     window.close()
@@ -58,8 +58,8 @@ def test_matplotlib_is_loaded_for_frames_alone() -> None:
         "import sys; import fleet.env.allocation_v0, fleet.env.render.renderer; "
         "print([m for m in ('matplotlib', 'PIL', 'torch', 'mujoco', 'zenoh', 'tkinter') if m in sys.modules])"
     )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
-    assert said.stdout.strip() == "[]"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.strip() == "[]"
 
 
 def test_without_matplotlib_the_error_names_the_extra(monkeypatch, small) -> None:

@@ -1,4 +1,4 @@
-"""Arms that have but their nearest peers in their vectors."""
+"""Observations of the nearest peers only."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def test_the_peers_are_the_nearest_in_space(name, peers) -> None:
         np.testing.assert_allclose(np.linalg.norm(mounts_m[list(own)] - mounts_m[a], axis=1), far_m[a, 1:])
 
 
-def test_they_are_told_of_as_in_the_vector_of_all(folder) -> None:
+def test_fields_of_the_nearest_peers_equal_those_of_all_peers(folder) -> None:
     options = {"difficulty": "blind", "cache": folder, "horizon_s": 600}
     all_, few = (make_batch("quickstart", 3, seed=5, peers=n, **options) for n in (None, 2))
     single = make_env("quickstart", peers=2, **options)
@@ -49,7 +49,7 @@ def test_they_are_told_of_as_in_the_vector_of_all(folder) -> None:
 
 
 @pytest.mark.parametrize("peers", [-1, 4, 1.5, True, "all"])
-def test_other_numbers_are_refused(peers) -> None:
+def test_invalid_numbers_of_peers_are_refused(peers) -> None:
     for make in (lambda **more: make_batch("quickstart", 2, **more), lambda **more: make_env("quickstart", **more)):
         with pytest.raises(ScenarioError, match=r"peers must be None or an integer from 0 to 3 \(got "):
             make(difficulty="blind", peers=peers)

@@ -1,4 +1,4 @@
-"""docs/env.md says what the environment does: its tables are made of it, and its example runs."""
+"""docs/env.md is correct: its generated tables are current, and its example runs."""
 
 import re
 from pathlib import Path
@@ -18,11 +18,11 @@ PAGE = Path(__file__).parents[2] / "docs" / "env.md"
 TEXT = PAGE.read_text(encoding="utf-8")
 
 
-def test_its_tables_are_current() -> None:
+def test_tables_are_current() -> None:
     assert filled(TEXT) == TEXT, "write it anew with: thermofleet contract"
 
 
-def test_the_command_says_when_a_table_is_not_current(tmp_path) -> None:
+def test_the_command_reports_an_outdated_table(tmp_path) -> None:
     page, call = tmp_path / "env.md", CliRunner().invoke
     page.write_text(TEXT.replace("| `clock` | 0 |", "| `clock` | 7 |"), encoding="utf-8")
     out = ["contract", "--out", str(tmp_path / "contract")]
@@ -32,7 +32,7 @@ def test_the_command_says_when_a_table_is_not_current(tmp_path) -> None:
     assert call(app, [*out, "--check"]).exit_code == 0
 
 
-def test_every_field_lies_where_the_table_says() -> None:
+def test_offsets_of_the_table_are_correct() -> None:
     layout = Layout(4, 8)
     rows = dict(re.findall(r"^\| `(\w+)` \| ([\d–]+) \| [^|]+ \| [^|]+ \| [^|]+ …", TEXT, re.MULTILINE))
     assert list(rows) == [field.name for field in FIELDS]
@@ -42,23 +42,23 @@ def test_every_field_lies_where_the_table_says() -> None:
 
 
 @pytest.mark.parametrize(("n", "slots"), [(1, 1), (4, 8), (7, 3)])
-def test_the_size_is_what_the_page_says(n, slots) -> None:
+def test_the_size_in_the_page_is_correct(n, slots) -> None:
     a, b, c, d = map(int, re.findall(r"size = (\d+) \+ (\d+) K \+ \(n − 1\)\((\d+) \+ (\d+) K\)", TEXT)[0])
     assert Layout(n, slots).size == a + b * slots + (n - 1) * (c + d * slots)
 
 
-def test_every_info_is_told_of(make, batch) -> None:
+def test_every_info_is_in_the_page(make, batch) -> None:
     infos = make().reset(seed=0)[1]["arm_0"]
-    told = set(re.findall(r"`(?:info\[\")?(\w+)(?:\"\])?`", TEXT))
-    assert {name for name in (*infos, *batch(1).reset()[1]) if name not in told} == set()
+    named = set(re.findall(r"`(?:info\[\")?(\w+)(?:\"\])?`", TEXT))
+    assert {name for name in (*infos, *batch(1).reset()[1]) if name not in named} == set()
     weights = RewardWeights()
     for name in TERMS:
         weight = f"{getattr(weights, name):g}".replace("-", "−")
         assert f"| `reward_{name}` | {weight} |" in TEXT
 
 
-def test_its_example_runs(monkeypatch, cell, folder) -> None:
-    """On a cell that is planned in a moment."""
+def test_the_example_of_the_page_runs(monkeypatch, cell, folder) -> None:
+    """With a cell that takes little time to plan."""
 
     def small(given: dict[str, Any]) -> dict[str, Any]:
         fields = {name: given.pop(name) for name in ("horizon_s",) if name in given}
@@ -75,8 +75,8 @@ def test_its_example_runs(monkeypatch, cell, folder) -> None:
     monkeypatch.setattr("scenarios.make_env", env, raising=False)
     monkeypatch.setattr("scenarios.make_batch", batch, raising=False)
     monkeypatch.setattr("scenarios.prepare.env_registration.make_env", env)
-    told: dict[str, Any] = {}
-    exec(TEXT.split("```python\n")[1].split("```")[0], told)
-    assert told["env"].agents == []
-    assert told["by_name"].possible_agents == list(told["batch"].agents)
-    assert told["reward"].shape == (32,)
+    namespace: dict[str, Any] = {}
+    exec(TEXT.split("```python\n")[1].split("```")[0], namespace)
+    assert namespace["env"].agents == []
+    assert namespace["by_name"].possible_agents == list(namespace["batch"].agents)
+    assert namespace["reward"].shape == (32,)
