@@ -7,8 +7,8 @@ OUT ?= out
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 GOAL := $(or $(firstword $(MAKECMDGOALS)),demo)
 
-# Each trainer has its own environment, because their packages conflict. So have the peers that benchmarks/env.py is
-# compared with, which are no trainers.
+# Each trainer has its own environment, because their packages conflict. So do the environments that benchmarks/env.py
+# compares with.
 PINNED := $(sort $(basename $(notdir $(wildcard constraints/*.txt))))
 ADAPTERS := $(filter-out bench,$(PINNED))
 ADAPTER_TESTS := $(ADAPTERS:%=test-adapter-%)
@@ -40,7 +40,7 @@ test-adapters: $(ADAPTER_TESTS)
 $(ADAPTER_TESTS): test-adapter-%: .venv-adapters/%/.installed
 	@.venv-adapters/$*/bin/python -m pytest -m adapter tests/adapters/test_$*.py
 
-# Product lines that `make test` runs; compiled functions and the processes of live fleets are not counted.
+# Share of product lines that tests run, without compiled functions and the processes of live fleets.
 coverage: $(STAMP)
 	@$(BIN)/python -m pytest -n 2 --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html:$(OUT)/coverage
 
@@ -62,8 +62,8 @@ bench-env: .venv-adapters/bench/.installed
 
 install: $(STAMP)
 
-# A broken environment is removed, so that the next call starts again. setuptools comes first, so that the pinned
-# version builds the package.
+# A broken environment is removed, so that the next call builds a new one. setuptools is installed first, so that its
+# pinned version builds the package.
 $(STAMP): pyproject.toml constraints.txt
 	@command -v "$(PYTHON)" >/dev/null 2>&1 || { \
 	  echo "thermofleet needs Python 3.11 or newer, and there is no '$(PYTHON)' here. Install it, or name one: make $(GOAL) PYTHON=/path/to/python3.11"; exit 1; }
