@@ -4,12 +4,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from fleet.errors import check_nonnegative, check_positive
 from fleet.jit import jit_inline
-from fleet.seeding import random_uniform
+from fleet.seeding import Bits, random_uniform
 
 Array = np.ndarray
 
@@ -23,8 +24,7 @@ class Poisson:
     stop_s: float = inf
 
     def __post_init__(self) -> None:
-        if not 0 < self.every_s < inf:
-            raise ValueError(f"Poisson.every_s must be > 0 and finite (got {self.every_s}).")
+        check_positive(self, "every_s")
         if not (0 <= self.start_s <= self.stop_s and self.start_s < inf):
             raise ValueError(f"Poisson needs 0 <= start_s <= stop_s (got {self.start_s}, {self.stop_s}).")
 
@@ -40,10 +40,9 @@ class Batch:
     def __post_init__(self) -> None:
         if self.count < 1:
             raise ValueError(f"Batch.count must be >= 1 (got {self.count}).")
-        if not 0 <= self.start_s < inf:
-            raise ValueError(f"Batch.start_s must be >= 0 and finite (got {self.start_s}).")
-        if self.every_s is not None and not 0 < self.every_s < inf:
-            raise ValueError(f"Batch.every_s must be > 0 and finite (got {self.every_s}).")
+        check_nonnegative(self, "start_s")
+        if self.every_s is not None:
+            check_positive(self, "every_s")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,8 +97,8 @@ def arrival_table(streams: Sequence[Arrivals], horizon_s: float) -> ArrivalTable
 
 
 @jit_inline
-def sample_arrivals(table: ArrivalTable, stream: int, key: Any, out: Array) -> int:
-    """Put the arrival times of a stream into `out`, in order, and return their number, or −1 if there is no room.
+def sample_arrivals(table: ArrivalTable, stream: int, key: Bits, out: Array) -> int:
+    """Put the arrival times of a stream into `out`, in order, and return their number; −1 if `out` is too short.
 
     Gaps of a Poisson stream are exponential, from the uniform values of `fleet.seeding` at counts 0, 1, 2, …
 

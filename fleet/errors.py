@@ -1,7 +1,9 @@
-"""Exceptions that callers may want to catch, and hints for unknown names."""
+"""Exceptions that callers may want to catch, checks of numbers, and hints for unknown names."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from difflib import get_close_matches
+from math import inf
 
 
 class FleetError(Exception):
@@ -12,23 +14,18 @@ class ScenarioError(FleetError):
     """Invalid scenario file; names the file, the place in it and what is allowed."""
 
 
+@dataclass(eq=False)
 class InfeasibleJob(FleetError):
-    """An arm cannot do a work.
+    """An arm cannot do a work."""
 
-    Attributes:
-        arm: Name of the arm.
-        place: Name of the place that it cannot serve.
-        reason: One of `reach`, `joint limit`, `torque`, `collision`, `no IK solution`, with its numbers.
-    """
+    arm: str
+    place: str
+    """Name of the place that the arm cannot serve."""
+    reason: str
+    """One of `reach`, `joint limit`, `torque`, `collision`, `no IK solution`, with its numbers."""
 
-    def __init__(self, arm: str, place: str, reason: str) -> None:
-        super().__init__(f"Arm '{arm}' cannot work at '{place}': {reason}.")
-        self.arm = arm
-        self.place = place
-        self.reason = reason
-
-    def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
-        return type(self), (self.arm, self.place, self.reason)
+    def __str__(self) -> str:
+        return f"Arm '{self.arm}' cannot work at '{self.place}': {self.reason}."
 
 
 class BusError(FleetError):
@@ -43,23 +40,17 @@ class CheckpointError(FleetError):
     """A stored twin does not fit its use; names the difference."""
 
 
+@dataclass(eq=False)
 class LogError(FleetError):
-    """A log file cannot be used.
+    """A log file cannot be used."""
 
-    Attributes:
-        file: The file as given.
-        line: Line of a text file, or row of a table, from 1; None for the whole file.
-        reason: What is wrong and what is allowed.
-    """
+    file: str
+    line: int | None
+    """Line of a text file, or row of a table, from 1; None for the whole file."""
+    reason: str
 
-    def __init__(self, file: str, line: int | None, reason: str) -> None:
-        super().__init__(f"{file}: {reason}" if line is None else f"{file}, line {line}: {reason}")
-        self.file = file
-        self.line = line
-        self.reason = reason
-
-    def __reduce__(self) -> tuple[type, tuple[str, int | None, str]]:
-        return type(self), (self.file, self.line, self.reason)
+    def __str__(self) -> str:
+        return f"{self.file}: {self.reason}" if self.line is None else f"{self.file}, line {self.line}: {self.reason}"
 
 
 class JournalError(FleetError):
@@ -68,6 +59,20 @@ class JournalError(FleetError):
 
 class JournalFull(JournalError):
     """No space for a record; the journal is unchanged."""
+
+
+def check_positive(value: object, *fields: str) -> None:
+    """Raise a ValueError unless these fields of a dataclass are finite numbers > 0."""
+    for name in fields:
+        if not 0 < getattr(value, name) < inf:
+            raise ValueError(f"{type(value).__name__}.{name} must be > 0 and finite (got {getattr(value, name)}).")
+
+
+def check_nonnegative(value: object, *fields: str) -> None:
+    """Raise a ValueError unless these fields of a dataclass are finite numbers >= 0."""
+    for name in fields:
+        if not 0 <= getattr(value, name) < inf:
+            raise ValueError(f"{type(value).__name__}.{name} must be >= 0 and finite (got {getattr(value, name)}).")
 
 
 def nearest(name: str, allowed: Iterable[str]) -> str:

@@ -1,7 +1,7 @@
-"""Seeds that follow from a seed, and counter-based random numbers.
+"""Child seeds, and counter-based random numbers.
 
-A counter-based generator gives the same value for the same key and count, in whatever order values are drawn, so a row
-of a batch needs no generator and no memory. SplitMix64 (Steele, Lea & Flood, OOPSLA 2014) scrambles the counter.
+A counter-based generator gives the same value for the same key and count, in whatever order values are drawn. So a row
+of a batch needs no generator of its own. SplitMix64 (Steele, Lea & Flood, OOPSLA 2014) scrambles the counter.
 """
 
 from statistics import NormalDist
@@ -12,6 +12,8 @@ import numpy as np
 from fleet.jit import jit_inline
 
 Array = np.ndarray
+Bits = Any
+"""np.uint64 or an array of them, which numba compiles alike."""
 
 LEVELS = 4096
 """Normal quantiles in the table: two of them, 12 bits each, give 2²³ values up to 5 standard deviations."""
@@ -35,7 +37,7 @@ def key_of(seed: np.random.SeedSequence) -> int:
 
 
 @jit_inline
-def random_word(key: Any, count: Any) -> Any:
+def random_word(key: Bits, count: Bits) -> Bits:
     """64 random bits for a key and a count, uint64; elementwise over arrays."""
     word = key + count * _GOLDEN
     word = (word ^ (word >> _30)) * _FIRST
@@ -44,13 +46,13 @@ def random_word(key: Any, count: Any) -> Any:
 
 
 @jit_inline
-def random_uniform(key: Any, count: Any) -> Any:
+def random_uniform(key: Bits, count: Bits) -> Any:  # a float or an array
     """A uniform value in [0, 1) for a key and a count, uint64; elementwise over arrays."""
     return (random_word(key, count) >> _11) * (1.0 / 9007199254740992.0)
 
 
 @jit_inline
-def random_normal(key: Any, count: Any) -> Any:
+def random_normal(key: Bits, count: Bits) -> Any:  # a float or an array
     """A standard normal value for a key and a count, uint64; elementwise over arrays."""
     word = random_word(key, count)
     return QUANTILES[word & _MASK] + QUANTILES[(word >> _32) & _MASK]
@@ -66,6 +68,6 @@ def shift_seeds(seed: np.random.SeedSequence) -> tuple[np.random.SeedSequence, n
     return child(seed, 0), child(seed, 1)
 
 
-def exchange_seed(seed: np.random.SeedSequence) -> np.random.SeedSequence:
-    """Seed of what happens to messages in a shift."""
-    return child(seed, 1, 0)
+def exchange_seed(sensors: np.random.SeedSequence) -> np.random.SeedSequence:
+    """Seed of the delays and losses of messages in a shift, from the seed of its sensors."""
+    return child(sensors, 0)

@@ -50,8 +50,8 @@ def test_a_value_depends_on_its_key_and_its_count_alone() -> None:
 def test_child_seeds_differ_and_leave_no_trace() -> None:
     seed = np.random.SeedSequence(9)
     jobs, sensors = shift_seeds(seed)
-    keys = [key_of(each) for each in (seed, jobs, sensors, exchange_seed(seed), child(seed, 0, 1))]
+    keys = [key_of(each) for each in (seed, jobs, sensors, exchange_seed(sensors), child(seed, 0, 1))]
     assert len(set(keys)) == 5
     assert seed.n_children_spawned == 0
-    assert key_of(exchange_seed(seed)) == key_of(child(sensors, 0))
+    assert key_of(exchange_seed(sensors)) == key_of(child(seed, 1, 0))
     assert [key_of(each) for each in shift_seeds(seed)] == [key_of(jobs), key_of(sensors)]

@@ -18,7 +18,7 @@ from fleet.engine.tables import tables_of
 from fleet.events import Event
 from fleet.motion import Drive
 from fleet.observation import Layout
-from fleet.seeding import child, key_of
+from fleet.seeding import exchange_seed, key_of
 
 Array = np.ndarray
 
@@ -83,7 +83,7 @@ class Episode:
     twins: tuple[str, ...]
     """Version of each arm's difficulty model."""
     sensors: np.random.SeedSequence
-    """Of the sensors' noise; its first child is the seed of the exchange."""
+    """Of the sensors' noise; `fleet.seeding.exchange_seed` follows from it."""
 
     @property
     def noise_key(self) -> int:
@@ -125,7 +125,7 @@ class ShiftRunner:
         self._exchange = None if at_once else exchange
         self._delivered_before = 0
         if self._exchange is not None:
-            self._exchange.begin(np.random.default_rng(child(episode.sensors, 0)))
+            self._exchange.begin(np.random.default_rng(exchange_seed(episode.sensors)))
             self._delivered_before = self._exchange.delivered
         self.events: list[Event] = []
         tables, drawn = tables_of(world)

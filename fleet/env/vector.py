@@ -21,7 +21,7 @@ from fleet.env.random_actions import random_legal as random_legal
 from fleet.env.spaces import arm_spaces
 from fleet.env.validation import at_least_one, seeds_of, switch
 from fleet.observation import Layout, Observation
-from fleet.seeding import exchange_seed
+from fleet.seeding import exchange_seed, shift_seeds
 
 Array = np.ndarray
 Obs = dict[str, Array]
@@ -138,7 +138,7 @@ class BatchEnv:
         raw = np.zeros((self.num_envs, len(TERMS)))
         return self._obs(), self._info(raw, np.zeros(0, dtype=int), None)
 
-    def step(self, actions: Any) -> tuple[Obs, Array, Array, Array, dict[str, Any]]:
+    def step(self, actions: object) -> tuple[Obs, Array, Array, Array, dict[str, Any]]:
         """One decision interval of every env.
 
         Args:
@@ -193,7 +193,7 @@ class BatchEnv:
         self._engine.observe(rows, self._vectors)
         for e, seed in zip(rows.tolist(), seeds, strict=True):
             if self._exchanges is not None:
-                self._exchanges[e].begin(np.random.default_rng(exchange_seed(seed)))
+                self._exchanges[e].begin(np.random.default_rng(exchange_seed(shift_seeds(seed)[1])))
         self._deliver(rows, self._vectors)
 
     def _observe(self, rows: Array, vectors: Array) -> None:
@@ -240,7 +240,7 @@ class BatchEnv:
         """An array for vectors: one of an earlier step that is no longer in use, if there is one."""
         return self._shelf.take()
 
-    def _checked(self, actions: Any) -> Array:
+    def _checked(self, actions: object) -> Array:
         shape = (self.num_envs, self.layout.arms)
         try:
             values = np.asarray(actions)
