@@ -55,20 +55,8 @@ class Risk:
 
     def at(self, temp_c: Array) -> Array:
         """Probability [...] at measured motor temperatures [..., joint], °C."""
-        temp = np.asarray(temp_c, dtype=float)
-        lead = np.broadcast_shapes(self.offset.shape[:-1], temp.shape[:-1])
-        offset = np.broadcast_to(self.offset, (*lead, *self.offset.shape[-1:]))
-        weight = np.broadcast_to(self.weight, (*lead, *self.weight.shape[-2:]))
-        temp = np.broadcast_to(temp, (*lead, *temp.shape[-1:]))
-        curve = (
-            np.zeros((*lead, 0, 2))
-            if self.curve is None
-            else np.broadcast_to(self.curve, (*lead, *self.curve.shape[-2:]))
-        )
-        p = np.empty(lead)
-        for row in np.ndindex(lead):
-            p[row] = passing_probability(offset[row], weight[row], curve[row], temp[row])
-        return p
+        curve = np.zeros((0, 2)) if self.curve is None else self.curve
+        return _PROBABILITIES(self.offset, self.weight, curve, np.asarray(temp_c, dtype=float))
 
     def __getitem__(self, row: Array | int) -> "Risk":
         """Rows of the first axis."""
@@ -120,6 +108,9 @@ def passing_probability(offset: Array, weight: Array, curve: Array, temp_c: Arra
     return p0 + min(max((score - x0) / (x1 - x0), 0.0), 1.0) * (p1 - p0)
 
 
+_PROBABILITIES = np.vectorize(passing_probability, otypes=[float], signature="(p),(p,j),(k,c),(j)->()")
+
+
 @dataclass(frozen=True, eq=False)
 class Difficulty:
     """Scores of one plan by a difficulty model."""
@@ -161,10 +152,10 @@ class DifficultyModel(Protocol):
 
 @dataclass(frozen=True)
 class Blind:
-    """A model without knowledge: every score is None."""
+    """A model without scores: every difficulty is None."""
 
     version: str = "blind"
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty | None:
-        """Always None."""
+        """Return None."""
         return None

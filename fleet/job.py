@@ -7,6 +7,8 @@ from typing import Literal, get_args
 
 import networkx as nx
 
+from fleet.errors import check_nonnegative, check_positive
+
 Kind = Literal["pick_place", "hold", "press", "sort"]
 KINDS: tuple[str, ...] = get_args(Kind)
 
@@ -27,8 +29,7 @@ class Place:
     def __post_init__(self) -> None:
         if not self.name:
             raise ValueError("Place.name must not be empty.")
-        if self.retreat_m < 0:
-            raise ValueError(f"Place.retreat_m must be >= 0 (got {self.retreat_m}).")
+        check_nonnegative(self, "retreat_m")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,11 +52,8 @@ class Work:
         wanted = 2 if self.kind in ("pick_place", "sort") else 1
         if len(self.places) != wanted:
             raise ValueError(f"A {self.kind} needs {wanted} place(s), got {len(self.places)}.")
-        for name in ("payload_kg", "force_n"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"Work.{name} must be >= 0 (got {getattr(self, name)}).")
-        if self.dwell_s <= 0:
-            raise ValueError(f"Work.dwell_s must be > 0 (got {self.dwell_s}).")
+        check_nonnegative(self, "payload_kg", "force_n")
+        check_positive(self, "dwell_s")
         if self.force_n and self.kind != "press":
             raise ValueError(f"Only a press has a contact force; this is a {self.kind} with {self.force_n} N.")
 
@@ -90,12 +88,12 @@ def check_precedence(jobs: Sequence[Job]) -> None:
     """Check that the jobs can be done in some order.
 
     Raises:
-        ValueError: two jobs have one name, a predecessor does not exist, or the jobs wait for each other in a ring.
+        ValueError: two jobs have one name, a predecessor does not exist, or the precedence has a cycle.
     """
     names: set[str] = set()
     for job in jobs:
         if job.name in names:
-            raise ValueError(f"Two jobs are called '{job.name}'.")
+            raise ValueError(f"Names of jobs must be unique; given more than once: {job.name}.")
         names.add(job.name)
     edges = [(before, job.name) for job in jobs for before in job.after]
     for before, name in edges:
@@ -103,5 +101,5 @@ def check_precedence(jobs: Sequence[Job]) -> None:
             raise ValueError(f"Job '{name}' waits for '{before}', which does not exist.")
     graph = nx.DiGraph(edges)
     if edges and not nx.is_directed_acyclic_graph(graph):
-        ring = " → ".join(edge[0] for edge in nx.find_cycle(graph))
-        raise ValueError(f"Jobs wait for each other in a ring: {ring}.")
+        cycle = " → ".join(edge[0] for edge in nx.find_cycle(graph))
+        raise ValueError(f"Jobs must not wait for each other in a cycle: {cycle}.")

@@ -15,6 +15,8 @@ import numpy as np
 from fleet.jit import jit_inline
 
 Array = np.ndarray
+Numbers = Any
+"""An array or one number, which numba compiles alike."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -59,24 +61,11 @@ def thermal_data() -> dict[str, Any]:  # Any: values of parsed JSON
 def gen3_motors(*, wear: float = 0.0) -> Motors:
     """Motors of a nominal Gen3 with joint friction increased by the share `wear`."""
     data = thermal_data()
-
-    def per_joint(name: str) -> Array:
-        return np.array(data[name], dtype=float)
-
-    return Motors(
-        torque_per_amp=data["gear_ratio"] * per_joint("kt_nm_per_a"),
-        eta=per_joint("eta"),
-        coulomb_nm=per_joint("coulomb_nm") * (1.0 + wear),
-        viscous_nms_per_rad=per_joint("viscous_nms_per_rad") * (1.0 + wear),
-        copper_w_per_a2=per_joint("copper_w_per_a2"),
-        idle_w=per_joint("idle_w"),
-        current_max_a=per_joint("current_max_a"),
-        sensor_noise_k=per_joint("sensor_noise_k"),
-        alpha_cu_per_k=data["alpha_cu_per_k"],
-        alpha_kt_per_k=data["alpha_kt_per_k"],
-        reference_c=data["reference_c"],
-        v0_rad_s=data["v0_rad_s"],
-    )
+    values = {name: np.array(value, dtype=float) if isinstance(value, list) else value for name, value in data.items()}
+    nominal: dict[str, Any] = {field.name: values[field.name] for field in fields(Motors) if field.name in values}
+    for name in ("coulomb_nm", "viscous_nms_per_rad"):
+        nominal[name] = nominal[name] * (1.0 + wear)
+    return Motors(torque_per_amp=values["gear_ratio"] * values["kt_nm_per_a"], **nominal)
 
 
 def stack_motors(motors: list[Motors]) -> Motors:
@@ -87,7 +76,6 @@ def stack_motors(motors: list[Motors]) -> Motors:
     """
     if not motors:
         raise ValueError("stack_motors needs the motors of at least one arm.")
-    first = motors[0]
     arrays = {}
     for name in (f.name for f in fields(Motors)):
         values = [getattr(m, name) for m in motors]
@@ -95,7 +83,7 @@ def stack_motors(motors: list[Motors]) -> Motors:
             arrays[name] = np.stack(values)
         elif any(value != values[0] for value in values):
             raise ValueError(f"Motors.{name} must be equal for all stacked arms (got {values}).")
-    return replace(first, **arrays)
+    return replace(motors[0], **arrays)
 
 
 def friction_torque(qd: Array, motors: Motors) -> Array:
@@ -117,7 +105,7 @@ def reference_current(tau: Array, qd: Array, motors: Motors) -> Array:
 
 
 @jit_inline
-def magnet_factor(housing_c: Any, motors: Any) -> Any:
+def magnet_factor(housing_c: Numbers, motors: Any) -> Numbers:  # motors: see below
     """Torque constant at a housing temperature over that at the reference temperature, same shape.
 
     Args:
@@ -133,7 +121,7 @@ def current(tau: Array, qd: Array, housing_c: Array, motors: Motors) -> Array:
 
 
 @jit_inline
-def winding_heat(copper_w_per_a2: Any, current_sq: Any, winding_c: Any, motors: Any) -> Any:
+def winding_heat(copper_w_per_a2: Numbers, current_sq: Numbers, winding_c: Numbers, motors: Any) -> Numbers:
     """Heat in the winding, W: K_cu (1 + a_cu (Tw − 25)) i², elementwise over arrays or single numbers.
 
     Args:

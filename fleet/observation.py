@@ -1,14 +1,14 @@
 """What an arm knows when it decides: named fields in one layout.
 
-An arm knows its own sensors, its own scores for the open jobs, and what its peers shared, with its age. Nothing of the
-simulator's truth is in here.
+An arm knows its own sensors, its own scores of the open jobs, and its peers' messages with their age. The observation
+holds no true state of the simulation.
 """
 
 from collections import namedtuple
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, get_type_hints
 
 import numpy as np
 
@@ -25,81 +25,65 @@ LONG_S = 1e5
 class Field:
     """One named part of the observation vector."""
 
-    name: str
     axes: tuple[Axis, ...]
     unit: str
     low: float
     high: float
     text: str
+    name: str = ""
+    """Set from the attribute of `Observation`."""
 
 
-FIELDS: tuple[Field, ...] = (
-    Field("clock", (), "1", 0, 1, "share of the shift that has passed"),
-    Field("idle", (), "1", 0, 1, "1 when this arm is free"),
-    Field("working", (), "1", 0, 1, "1 when it has a current job"),
-    Field("faulted", (), "1", 0, 1, "1 when it is faulted by heat"),
-    Field("busy_s", (), "s", 0, LONG_S, "time until the current job is done and the arm at home"),
-    Field("last_award", (), "1", -1, 1, "1 last claim won, -1 lost, 0 none made"),
-    Field("temp_c", ("joint",), "°C", -60, 200, "own motor temperatures as measured"),
-    Field("headroom_k", (), "K", -150, 150, "warning limit minus hottest motor"),
-    Field("offered", ("slot",), "1", 0, 1, "1 when the slot holds a job"),
-    Field("feasible", ("slot",), "1", 0, 1, "1 when this arm could do it at all"),
-    Field("known", ("slot",), "1", 0, 1, "1 when this arm has a difficulty for it"),
-    Field("difficulty", ("slot",), "1", 0, JOINTS, "own thermal difficulty d of its plan, 0 where not known"),
-    Field("p_saturation", ("slot",), "1", 0, 1, "probability to pass the warning limit from now, 0.5 if not known"),
-    Field("duration_s", ("slot",), "s", 0, LONG_S, "how long this arm would take for what is left of it"),
-    Field("slack_s", ("slot",), "s", -LONG_S, LONG_S, "due date minus now minus duration"),
-    Field("age_s", ("slot",), "s", 0, LONG_S, "time since it was released or came back"),
-    Field("payload_kg", ("slot",), "kg", 0, 100, "carried mass"),
-    Field("value", ("slot",), "1", 0, 1e6, "worth of finishing it"),
-    Field("returns", ("slot",), "1", 0, 1e3, "how often a fault sent it back"),
-    Field("peer_heard", ("peer",), "1", 0, 1, "1 when a message of the peer ever arrived"),
-    Field("peer_age_s", ("peer",), "s", 0, LONG_S, "age of the peer's last message"),
-    Field("peer_working", ("peer",), "1", 0, 1, "1 when the peer was at work then"),
-    Field("peer_faulted", ("peer",), "1", 0, 1, "1 when the peer was faulted then"),
-    Field("peer_headroom_k", ("peer",), "K", -150, 150, "headroom the peer shared, 0 where nothing arrived"),
-    Field("peer_known", ("peer", "slot"), "1", 0, 1, "1 when the peer shared a difficulty for the slot's job"),
-    Field("peer_difficulty", ("peer", "slot"), "1", 0, JOINTS, "difficulty the peer shared, 0 where it shared none"),
-)
-"""The layout: the order of this tuple is the order in the vector."""
-
-
-Offsets = namedtuple("Offsets", [field.name for field in FIELDS])  # pyright: ignore[reportUntypedNamedTuple]
-"""Where each field begins in the vector, by name."""
+_JOINT: tuple[Axis, ...] = ("joint",)
+_SLOT: tuple[Axis, ...] = ("slot",)
+_PEER: tuple[Axis, ...] = ("peer",)
+_PEER_SLOT: tuple[Axis, ...] = ("peer", "slot")
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What arms know, by name; leading axes [...] are free. See `FIELDS` for units and meaning."""
+    """What arms know, by name; leading axes [...] are free. Each `Field` gives axes, unit, lowest and highest value."""
 
-    clock: Array
-    idle: Array
-    working: Array
-    faulted: Array
-    busy_s: Array
-    last_award: Array
-    temp_c: Array
-    headroom_k: Array
-    offered: Array
-    feasible: Array
-    known: Array
-    difficulty: Array
-    p_saturation: Array
-    duration_s: Array
-    slack_s: Array
-    age_s: Array
-    payload_kg: Array
-    value: Array
-    returns: Array
-    peer_heard: Array
-    peer_age_s: Array
-    peer_working: Array
-    peer_faulted: Array
-    peer_headroom_k: Array
-    peer_known: Array
-    peer_difficulty: Array
+    clock: Annotated[Array, Field((), "1", 0, 1, "share of the shift that has passed")]
+    idle: Annotated[Array, Field((), "1", 0, 1, "1 when this arm is free")]
+    working: Annotated[Array, Field((), "1", 0, 1, "1 when it has a current job")]
+    faulted: Annotated[Array, Field((), "1", 0, 1, "1 when it is faulted by heat")]
+    busy_s: Annotated[Array, Field((), "s", 0, LONG_S, "time until the current job is done and the arm at home")]
+    last_award: Annotated[Array, Field((), "1", -1, 1, "1 last claim won, -1 lost, 0 none made")]
+    temp_c: Annotated[Array, Field(_JOINT, "°C", -60, 200, "own motor temperatures as measured")]
+    headroom_k: Annotated[Array, Field((), "K", -150, 150, "warning limit minus hottest motor")]
+    offered: Annotated[Array, Field(_SLOT, "1", 0, 1, "1 when the slot holds a job")]
+    feasible: Annotated[Array, Field(_SLOT, "1", 0, 1, "1 when this arm can do it")]
+    known: Annotated[Array, Field(_SLOT, "1", 0, 1, "1 when this arm has a difficulty for it")]
+    difficulty: Annotated[Array, Field(_SLOT, "1", 0, JOINTS, "own thermal difficulty d of its plan, 0 if unknown")]
+    p_saturation: Annotated[Array, Field(_SLOT, "1", 0, 1, "probability to pass the warning limit, 0.5 if unknown")]
+    duration_s: Annotated[Array, Field(_SLOT, "s", 0, LONG_S, "time this arm needs for the rest of it")]
+    slack_s: Annotated[Array, Field(_SLOT, "s", -LONG_S, LONG_S, "due date minus now minus duration")]
+    age_s: Annotated[Array, Field(_SLOT, "s", 0, LONG_S, "time since it was released or came back")]
+    payload_kg: Annotated[Array, Field(_SLOT, "kg", 0, 100, "carried mass")]
+    value: Annotated[Array, Field(_SLOT, "1", 0, 1e6, "value of finishing it")]
+    returns: Annotated[Array, Field(_SLOT, "1", 0, 1e3, "number of faults that returned it")]
+    peer_heard: Annotated[Array, Field(_PEER, "1", 0, 1, "1 when a message of the peer has arrived")]
+    peer_age_s: Annotated[Array, Field(_PEER, "s", 0, LONG_S, "age of the peer's last message")]
+    peer_working: Annotated[Array, Field(_PEER, "1", 0, 1, "1 when the peer was working then")]
+    peer_faulted: Annotated[Array, Field(_PEER, "1", 0, 1, "1 when the peer was faulted then")]
+    peer_headroom_k: Annotated[Array, Field(_PEER, "K", -150, 150, "headroom the peer shared, 0 if none")]
+    peer_known: Annotated[Array, Field(_PEER_SLOT, "1", 0, 1, "1 when the peer shared a difficulty for the slot's job")]
+    peer_difficulty: Annotated[Array, Field(_PEER_SLOT, "1", 0, JOINTS, "difficulty the peer shared, 0 if none")]
     action_mask: Array
     """Legal actions, int8 [..., slot + 1]."""
+
+
+def _fields() -> Iterator[Field]:
+    for name, kind in get_type_hints(Observation, include_extras=True).items():
+        for field in getattr(kind, "__metadata__", ()):
+            yield replace(field, name=name)
+
+
+FIELDS: tuple[Field, ...] = tuple(_fields())
+"""The layout: the order of this tuple is the order in the vector."""
+Offsets = namedtuple("Offsets", [field.name for field in FIELDS])  # pyright: ignore[reportUntypedNamedTuple]
+"""Where each field begins in the vector, by name."""
 
 
 @dataclass(frozen=True)

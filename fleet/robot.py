@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from fleet.errors import nearest
+from fleet.errors import check_nonnegative, check_positive, nearest
 
 JOINTS = 7
 """Number of joints of a Gen3; length of the last axis of every joint array."""
@@ -67,8 +67,7 @@ class ThermalLimits:
                 "ThermalLimits need restart_c < warning_c < error_c "
                 f"(got {self.restart_c}, {self.warning_c}, {self.error_c})."
             )
-        if self.clear_s < 0:
-            raise ValueError(f"ThermalLimits.clear_s must be >= 0 (got {self.clear_s}).")
+        check_nonnegative(self, "clear_s")
 
 
 def rotation(roll_pitch_yaw_deg: tuple[float, float, float]) -> np.ndarray:
@@ -128,12 +127,8 @@ class Robot:
             raise ValueError(f"Robot.name must be non-empty, without any of / * $ ? # @ or space (got '{self.name}').")
         if self.home not in POSTURES:
             raise ValueError(f"Robot.home '{self.home}' is no posture{nearest(self.home, POSTURES)}")
-        if self.tool_kg < 0:
-            raise ValueError(f"Robot.tool_kg must be >= 0 (got {self.tool_kg}).")
-        if self.cooling_factor <= 0:
-            raise ValueError(f"Robot.cooling_factor must be > 0 (got {self.cooling_factor}).")
-        if self.wear < 0:
-            raise ValueError(f"Robot.wear must be >= 0 (got {self.wear}).")
+        check_nonnegative(self, "tool_kg", "wear")
+        check_positive(self, "cooling_factor")
 
     def home_q(self) -> np.ndarray:
         """Joint positions at home, rad, [joint]."""

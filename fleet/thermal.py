@@ -6,12 +6,13 @@ Lumped capacitance with two nodes per joint (Kawaharazuka et al., arXiv 2407.080
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import repeat
 
 import networkx as nx
 import numpy as np
 
+from fleet.errors import check_nonnegative
 from fleet.motion import Drive
 from fleet.motor import Motors, copper_loss, magnet_factor, thermal_data
 from fleet.robot import JOINTS, Cooling
@@ -39,7 +40,7 @@ DeWitt, table 1.1, limited by conduction through the shell. Engineering values, 
 
 @dataclass(frozen=True, kw_only=True)
 class ThermalSpread:
-    """Log-normal standard deviations, per joint, of the differences between arms of one model; 0 is no difference."""
+    """Log-normal standard deviations, per joint, of the differences between arms of one model; 0: no difference."""
 
     copper: float = 0.0
     winding_housing: float = 0.0
@@ -48,9 +49,7 @@ class ThermalSpread:
     idle: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not value >= 0:
-                raise ValueError(f"ThermalSpread.{name} must be >= 0 (got {value}).")
+        check_nonnegative(self, *vars(self))
 
     @classmethod
     def gen3(cls, scale: float = 1.0) -> "ThermalSpread":
@@ -125,7 +124,7 @@ def _factors(spread: ThermalSpread | None, rng: np.random.Generator | None) -> d
 class ThermalModel:
     """A thermal network as matrices for exact steps of any length; leading axes for several arms.
 
-    C T' = −L T + g Ta + P is symmetric under C^(1/2), so its modes are real and every step is stable.
+    C T' = −L T + g Ta + P. Scaled by C^(1/2) the system is symmetric, so its modes are real and every step is stable.
     """
 
     capacity: Array
@@ -211,14 +210,12 @@ def _check(network: nx.Graph, names: list[str]) -> None:
     open_edges = [(a, b) for a, b, conductance in network.edges(data="conductance_w_per_k") if conductance > 0]
     cooled = nx.node_connected_component(nx.Graph([("ambient", "ambient"), *open_edges]), "ambient")
     if trapped := [name for name in names if name not in cooled]:
-        raise ValueError(f"No path to ambient, heat could not leave: {', '.join(trapped)}.")
+        raise ValueError(f"Nodes without a path to ambient: {', '.join(trapped)}.")
 
 
 def stack_models(models: list[ThermalModel]) -> ThermalModel:
     """Models of several arms as one value, arrays [arm, ...]."""
-    return ThermalModel(
-        *(np.stack([getattr(m, f) for m in models]) for f in ("capacity", "laplacian", "to_ambient", "rates", "modes"))
-    )
+    return ThermalModel(*(np.stack([getattr(model, f.name) for model in models]) for f in fields(ThermalModel)))
 
 
 def node_heat(winding_w: Array, housing_w: Array) -> Array:
@@ -239,7 +236,7 @@ def drive_heat(temp_c: Array, current_sq: Array, friction_w: Array, motors: Moto
 
 
 STEP_S = 10.0
-"""Longest simulated step: heat depends on temperature and is updated at least this often."""
+"""Longest simulated step; each step computes the heat anew, since it depends on temperature."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,11 +258,11 @@ def simulate_temperatures(
     start_c: Array,
     ambient_c: Array | float,
 ) -> SimulatedTemperatures:
-    """Temperatures of one powered arm after each load has lasted its time, in equal steps of at most `STEP_S`.
+    """Simulate one powered arm under constant loads, in equal steps of at most `STEP_S`.
 
     Args:
         load: Mean drives, [case, joint] or [joint] for all cases.
-        duration_s: >= 0, [case].
+        duration_s: Duration of each load, >= 0, [case].
         start_c: Temperatures at the start, [case, node] or [node].
         ambient_c: [case] or one for all.
     """
@@ -304,7 +301,7 @@ def temperature_steps(
         dt_s: Length of every step, or one per case.
         start_c: [..., node].
         ambient_c: One, or one per case.
-        steps: Number of steps of each case, [case], after which it keeps its temperatures; by default all.
+        steps: Number of steps of each case, [case], after which its temperatures stay constant; default: all.
     """
     phi, gamma = thermal.step_matrices(dt_s)
     temp_c = start_c
@@ -325,9 +322,9 @@ def steady_state(
     """Steady temperatures of one arm under a constant drive, °C, [node]; None for thermal runaway.
 
     Copper loss grows with winding temperature and current with magnet temperature, so beyond some load there is no
-    equilibrium. Newton's method starts from the cold arm, below every equilibrium. As heat grows convexly with each
-    temperature, it rises to the lowest equilibrium as long as the inverse Jacobian has no negative entry (Ortega &
-    Rheinboldt, Iterative Solution of Nonlinear Equations, theorem 13.3.4); with a negative entry there is none.
+    equilibrium. Newton's method starts from the cold arm, below every equilibrium. Heat is convex in each temperature.
+    So the iteration rises to the lowest equilibrium while the inverse Jacobian has no negative entry (Ortega &
+    Rheinboldt, Iterative Solution of Nonlinear Equations, theorem 13.3.4); a negative entry means that there is none.
 
     Args:
         current_sq: Mean squared current at the magnets' reference temperature, A², [joint].
@@ -365,6 +362,6 @@ def _inverse_or_none(jacobian: Array) -> Array | None:
     """Inverse of a matrix with off-diagonal entries <= 0; None unless the inverse is non-negative (an M-matrix)."""
     try:
         inverse = np.linalg.inv(jacobian)
-    except np.linalg.LinAlgError:  # Singular: exactly at the fold.
+    except np.linalg.LinAlgError:  # singular, at the largest load with an equilibrium
         return None
     return inverse if inverse.min() >= -1e-9 * np.abs(inverse).max() else None

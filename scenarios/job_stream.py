@@ -1,4 +1,4 @@
-"""The jobs of a shift: what a scenario's streams ask for, drawn for one seed."""
+"""The jobs of a shift, drawn from a scenario's streams for one seed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ Array = np.ndarray
 
 
 def works_of(scenario: Scenario, stream: JobStream, payload_kg: Sequence[float] | None = None) -> tuple[Work, ...]:
-    """The works a stream can ask for, one per payload (its own payloads unless others are given)."""
+    """The works of a stream, one per payload (its own payloads unless others are given)."""
     place = {p.name: p for p in scenario.places}
     return tuple(
         Work(
@@ -42,31 +42,31 @@ class SampledJobs:
     stream: Array
     """Index into the scenario's streams."""
     number: Array
-    """Of the job in its stream, from 0."""
+    """Number of the job in its stream, from 0."""
     payload: Array
     """Index into the stream's payloads."""
     extra: Array
-    """Repetitions beyond the fewest of the stream."""
+    """Repetitions above the minimum of the stream."""
     release_s: Array
     after: Array
-    """Indices of the jobs that must be done first, int [job, n], −1 for none."""
+    """Indices of the jobs that must finish first, int [job, n], −1 for none."""
 
 
 @kernel
 def sample_jobs(
     table: ArrivalTable, key: Array, choices: Array, after_streams: Array, release_s: Array, job: Array, after: Array
 ) -> int:
-    """Draw the jobs of one shift; return their number, or −1 if there is no room.
+    """Draw the jobs of one shift; return their number, or −1 if the output arrays are too short.
 
-    Every value depends on the key, its stream and its number alone, so no stream disturbs another.
+    A value depends on the key, its stream and its number only, so streams are independent.
 
     Args:
-        key: Of the shift's jobs, uint64 [1].
-        choices: Numbers of payloads and of repetitions to choose from, int [stream, 2].
-        after_streams: Streams that a stream's jobs come after, int [stream, n], −1 for none.
-        release_s: Receives the times, [room].
-        job: Receives stream, number, payload and extra repetitions, int [room, 4].
-        after: Receives the jobs to be done first, int [room, n].
+        key: Key of the shift's jobs, uint64 [1].
+        choices: Numbers of possible payloads and repetitions, int [stream, 2].
+        after_streams: Streams that must finish before a stream's jobs, int [stream, n], −1 for none.
+        release_s: Output, release times, [room].
+        job: Output, stream, number, payload and extra repetitions, int [room, 4].
+        after: Output, jobs that must finish first, int [room, n].
     """
     streams, total = len(choices), 0
     first = np.zeros(streams + 1, np.int64)
@@ -96,8 +96,8 @@ def sample_jobs(
             job[n, c] = drawn[row, c]
         for w in range(after.shape[1]):
             before, number = after_streams[drawn[row, 0], w], drawn[row, 1]
-            found = before >= 0 and number < first[before + 1] - first[before]
-            after[n, w] = place[first[before] + number] if found else -1
+            exists = before >= 0 and number < first[before + 1] - first[before]
+            after[n, w] = place[first[before] + number] if exists else -1
     return total
 
 
@@ -117,7 +117,7 @@ class JobSampler:
         self.choices = np.stack(
             [np.array([len(stream.payload_kg) for stream in streams], dtype=int), most - lowest + 1], axis=-1
         )
-        """Numbers of payloads and of repetitions to choose from, int [stream, 2]."""
+        """Numbers of possible payloads and repetitions, int [stream, 2]."""
         index = {stream.name: i for i, stream in enumerate(streams)}
         waits = max((len(stream.after) for stream in streams), default=0) or 1
         self._after = np.full((len(streams), waits), -1)
@@ -173,7 +173,7 @@ def draw_jobs(scenario: Scenario, seed: np.random.SeedSequence) -> tuple[Job, ..
 
 
 def rehearsal_works(scenario: Scenario) -> tuple[Work, ...]:
-    """What an arm rehearses: every motion of the scenario, with its own payloads and with light ones."""
+    """Works for a twin's training: every motion of the scenario, with its own payloads and with light ones."""
     light = scenario.twin.payload_kg
     both = product(scenario.jobs, (None, light))
     return tuple(dict.fromkeys(w for stream, payload in both for w in works_of(scenario, stream, payload)))

@@ -1,4 +1,4 @@
-"""From a TOML file to a `Scenario`, or to one sentence that says what is wrong with it."""
+"""Load scenario files: a `Scenario`, or an error of one sentence."""
 
 import dataclasses
 import tomllib
@@ -16,7 +16,7 @@ from scenarios.schema import JobStream, Scenario
 from scenarios.schema_errors import check_finite, plain_kind, readable_error
 
 MOST_JOBS = 100_000
-"""Largest number of expected jobs in a shift: a mistyped gap gives billions."""
+"""Largest number of expected jobs in a shift: a mistyped gap would give billions."""
 APART_M = 0.2
 """Smallest distance of two bases: a Gen3 base is 0.09 m wide, and its first joint must turn freely."""
 
@@ -95,22 +95,22 @@ def _known_keys(raw: object, kind: Any, file: str, place: str) -> None:
 
 
 def _check(scenario: Scenario, path: Path) -> None:
-    """Check what concerns several fields: unique names, references, distances."""
+    """Check rules across fields: unique names, references, distances."""
     file = path.name
     if not scenario.arms:
-        raise ScenarioError(f"{file}: arms: there are no arms; at least one [[arms]] is needed.")
+        raise ScenarioError(f"{file}: arms: there are no arms; give at least one [[arms]].")
     if not scenario.jobs:
-        raise ScenarioError(f"{file}: jobs: there are no jobs; at least one [[jobs]] is needed.")
+        raise ScenarioError(f"{file}: jobs: there are no jobs; give at least one [[jobs]].")
     for kind in ("arms", "places", "jobs"):
         names = [item.name for item in getattr(scenario, kind)]
         for i, name in enumerate(names):
             if name in names[:i]:
-                raise ScenarioError(f"{file}: {kind}[{i}].name: '{name}' is taken; names must differ.")
+                raise ScenarioError(f"{file}: {kind}[{i}].name: '{name}' is given twice; names must be unique.")
     for (i, one), (j, other) in combinations(enumerate(scenario.arms), 2):
         apart = dist(one.position_m, other.position_m)
         if apart < APART_M:
             raise ScenarioError(
-                f"{file}: arms[{j}].position_m: '{other.name}' stands {apart:.2f} m from '{one.name}' (arms[{i}]); "
+                f"{file}: arms[{j}].position_m: '{other.name}' is {apart:.2f} m from '{one.name}' (arms[{i}]); "
                 f"bases must be at least {APART_M} m apart."
             )
     places = [place.name for place in scenario.places]
@@ -128,11 +128,13 @@ def _check(scenario: Scenario, path: Path) -> None:
             )
         for name in stream.after:
             if name not in streams[:i]:
-                known = nearest(name, streams[:i]) if i else "; there is none."
+                known = nearest(name, streams[:i]) if i else "."
                 raise ScenarioError(f"{file}: jobs[{i}].after: there is no stream '{name}' above this one{known}")
     total = sum(_expected_jobs(stream, scenario.horizon_s) for stream in scenario.jobs)
     if total > MOST_JOBS:
-        raise ScenarioError(f"{file}: jobs: about {total:.3g} jobs would arrive in a shift; allowed are {MOST_JOBS}.")
+        raise ScenarioError(
+            f"{file}: jobs: about {total:.3g} jobs would arrive in a shift; at most {MOST_JOBS} are allowed."
+        )
 
 
 def _expected_jobs(stream: JobStream, horizon_s: float) -> float:
@@ -170,9 +172,11 @@ def _trace(where: Path, place: str) -> tuple[float, ...]:
         try:
             times.append(float(line))
         except ValueError as error:
-            raise ScenarioError(f"{place}: line {number} of '{where.name}' is no time, s: {line!r}.") from error
+            raise ScenarioError(
+                f"{place}: line {number} of '{where.name}' is not a number of seconds: {line!r}."
+            ) from error
     if not times:
-        raise ScenarioError(f"{place}: '{where.name}' holds no times; one arrival time in seconds per line is needed.")
+        raise ScenarioError(f"{place}: '{where.name}' holds no times; give one arrival time in seconds per line.")
     for before, time in pairwise([0.0, *times]):
         if not (isfinite(time) and before <= time):
             raise ScenarioError(f"{place}: the times in '{where.name}' must be >= 0 and in order ({time} s is not).")

@@ -1,4 +1,4 @@
-"""The schema of scenario files, with the defaults that no noun of `fleet` defines."""
+"""The schema of scenario files, with the defaults that `fleet` does not define."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -7,7 +7,7 @@ import numpy as np
 
 from fleet.arrivals import Arrivals, Batch, Poisson, Trace
 from fleet.engine.reward import RewardWeights
-from fleet.errors import FleetError, nearest
+from fleet.errors import FleetError, check_nonnegative, check_positive, nearest
 from fleet.job import Kind, Place
 from fleet.robot import Cooling, Mount, Robot, ThermalLimits
 
@@ -18,12 +18,6 @@ MOST_SAMPLES = 1_000_000
 """Telemetry samples of an arm in a shift: eleven days at one per second."""
 MOST_SLOTS = 256
 MOST_EXPLORATION = 10_000
-
-
-def _positive(owner: str, **values: float) -> None:
-    for name, value in values.items():
-        if not 0 < value < np.inf:
-            raise ValueError(f"{owner}.{name} must be > 0 (got {value})")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,17 +38,9 @@ class ArmSpec:
         self.robot()
 
     def robot(self) -> Robot:
-        """The arm as `fleet` knows it."""
-        return Robot(
-            name=self.name,
-            mount=Mount(position_m=self.position_m, tilt_deg=self.tilt_deg),
-            home=self.home,
-            tool_kg=self.tool_kg,
-            cooling=self.cooling,
-            cooling_factor=self.cooling_factor,
-            ambient_offset_k=self.ambient_offset_k,
-            wear=self.wear,
-        )
+        """The arm with its mount."""
+        own = {name: value for name, value in vars(self).items() if name not in ("position_m", "tilt_deg")}
+        return Robot(mount=Mount(position_m=self.position_m, tilt_deg=self.tilt_deg), **own)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,21 +61,14 @@ class ArrivalSpec:
     """trace: a text file beside the scenario, one arrival time in seconds per line."""
 
     def __post_init__(self) -> None:
-        allowed = {
-            "poisson": {"every_s", "stop_s"},
-            "batch": {"every_s", "count"},
-            "trace": {"times_s", "file"},
-        }[self.kind]
-        for name in ("every_s", "count", "stop_s", "times_s", "file"):
-            if getattr(self, name) is not None and name not in allowed:
-                raise ValueError(
-                    f"arrivals of kind '{self.kind}' take no '{name}'; they take {_list(allowed | {'start_s'})}"
-                )
-        missing = {"poisson": self.every_s, "batch": self.count}.get(self.kind, 0)
-        if missing is None:
-            raise ValueError(
-                f"arrivals of kind '{self.kind}' need '{'every_s' if self.kind == 'poisson' else 'count'}'"
-            )
+        kinds = {"poisson": ("every_s", "stop_s"), "batch": ("count", "every_s"), "trace": ("file", "times_s")}
+        for name in sorted({name for names in kinds.values() for name in names} - {*kinds[self.kind]}):
+            if getattr(self, name) is not None:
+                allowed = ", ".join(sorted((*kinds[self.kind], "start_s")))
+                raise ValueError(f"arrivals of kind '{self.kind}' take no '{name}'; they take {allowed}")
+        needed = kinds[self.kind][0]
+        if self.kind != "trace" and getattr(self, needed) is None:
+            raise ValueError(f"arrivals of kind '{self.kind}' need '{needed}'")
         if self.kind == "trace" and (self.times_s is None) == (self.file is None):
             raise ValueError("arrivals of kind 'trace' need either 'times_s' or 'file'")
         if self.file is None:
@@ -132,22 +111,20 @@ class JobStream:
         if not self.name:
             raise ValueError("JobStream.name must not be empty")
         if not self.payload_kg or min(self.payload_kg) < 0:
-            raise ValueError(
-                f"JobStream.payload_kg must be a non-empty list of masses >= 0 (got {list(self.payload_kg)})"
-            )
+            given = list(self.payload_kg)
+            raise ValueError(f"JobStream.payload_kg must be a non-empty list of masses >= 0 (got {given})")
         low, high = self.repetitions
         if not 1 <= low <= high <= MOST_REPETITIONS:
             raise ValueError(
                 f"JobStream.repetitions must be [fewest, most] with 1 <= fewest <= most <= {MOST_REPETITIONS} "
                 f"(got {low}, {high})"
             )
-        _positive("JobStream", dwell_s=self.dwell_s, due_s=self.due_s)
+        check_positive(self, "dwell_s", "due_s")
+        check_nonnegative(self, "value", "force_n")
         if self.dwell_s > LONGEST_DWELL_S:
             raise ValueError(
                 f"JobStream.dwell_s must be at most {LONGEST_DWELL_S:g} s (got {self.dwell_s}); use repetitions"
             )
-        if self.value < 0 or self.force_n < 0:
-            raise ValueError(f"JobStream.value and force_n must be >= 0 (got {self.value}, {self.force_n})")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,7 +181,7 @@ class TwinSpec:
     """Number of further light motions for training: folded, elbow out, fast wrist, turned base; 0: none."""
 
     def __post_init__(self) -> None:
-        _positive("TwinSpec", horizon_s=self.horizon_s)
+        check_positive(self, "horizon_s")
         if self.cool_c <= self.ambient_c:
             raise ValueError(f"TwinSpec.cool_c must be above ambient_c (got {self.cool_c}, {self.ambient_c})")
         if min(self.payload_kg, default=0.0) < 0:
@@ -223,8 +200,7 @@ class Spread:
     """Seed of the deviations."""
 
     def __post_init__(self) -> None:
-        if self.scale < 0 or self.seed < 0:
-            raise ValueError(f"Spread.scale and seed must be >= 0 (got {self.scale}, {self.seed})")
+        check_nonnegative(self, "scale", "seed")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -249,12 +225,7 @@ class Scenario:
     spread: Spread = field(default_factory=Spread)
 
     def __post_init__(self) -> None:
-        _positive(
-            "Scenario",
-            horizon_s=self.horizon_s,
-            decision_interval_s=self.decision_interval_s,
-            telemetry_interval_s=self.telemetry_interval_s,
-        )
+        check_positive(self, "horizon_s", "decision_interval_s", "telemetry_interval_s")
         if self.telemetry_interval_s > self.decision_interval_s:
             raise ValueError(
                 "Scenario.telemetry_interval_s must not exceed decision_interval_s "
@@ -287,7 +258,3 @@ class Scenario:
         if arm not in names:
             raise FleetError(f"No arm '{arm}' in {self.name}{nearest(arm, names)}")
         return names.index(arm)
-
-
-def _list(names: set[str]) -> str:
-    return ", ".join(sorted(names))

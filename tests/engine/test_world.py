@@ -105,7 +105,7 @@ def test_the_job_table_equals_the_jobs(small) -> None:
 
 
 def test_cyclic_predecessors_are_refused(small) -> None:
-    with pytest.raises(ValueError, match="in a ring"):
+    with pytest.raises(ValueError, match="in a cycle"):
         small.shop([[small.job("a", after=("b",)), small.job("b", after=("a",))]])
 
 
