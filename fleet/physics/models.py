@@ -17,7 +17,7 @@ from fleet.robot import GEN3, JOINTS, Robot, rotation
 Array = np.ndarray
 
 SAME_PLACE_M = 0.01
-"""Bases closer than this are at the same place."""
+"""Bases closer than this count as the same place."""
 
 
 def build_cell(
@@ -114,7 +114,7 @@ class ArmModel:
         """
         samples = len(q)
         mass_kg = np.broadcast_to(np.asarray(payload_kg, dtype=float), (samples,))
-        force = None if force_world is None else np.broadcast_to(force_world, (samples, 3))
+        force_n = np.broadcast_to(np.zeros(3) if force_world is None else force_world, (samples, 3))
         tau = np.empty((samples, JOINTS))
         model, data = self.model, self.data
         jacobian = np.empty((3, JOINTS))
@@ -125,9 +125,9 @@ class ArmModel:
                 data.qpos[:], data.qvel[:], data.qacc[:] = q[i], qd[i], qdd[i]
                 mujoco.mj_inverse(model, data)
                 tau[i] = data.qfrc_inverse
-                if force is not None and force[i].any():
+                if force_n[i].any():
                     mujoco.mj_jacSite(model, data, jacobian, None, self._tool)
-                    tau[i] -= jacobian.T @ force[i]
+                    tau[i] -= jacobian.T @ force_n[i]
         finally:
             model.body_mass[self._payload] = 0.0
         return tau
@@ -137,8 +137,7 @@ def _check(robots: Sequence[Robot], places: Sequence[Place]) -> None:
     if not robots:
         raise ValueError("A cell needs at least one arm.")
     for what, names in (("arms", [r.name for r in robots]), ("places", [p.name for p in places])):
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
+        if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"Names of {what} must be unique; given more than once: {', '.join(twice)}.")
     for a, b in combinations(robots, 2):
         apart_m = float(np.linalg.norm(np.subtract(a.mount.position_m, b.mount.position_m)))

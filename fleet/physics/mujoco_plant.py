@@ -1,4 +1,4 @@
-"""Plant that simulates the motion: all arms in one MuJoCo scene, each under computed-torque control along its plan."""
+"""Plant that simulates all arms in one MuJoCo scene, each under computed-torque control along its plan."""
 
 # MuJoCo is compiled and ships no type stubs.
 # pyright: reportAttributeAccessIssue=false
@@ -36,21 +36,19 @@ _DIVERGED = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL,
 class MujocoPlant:
     """Arms that follow their plans in closed loop, in one scene; one env.
 
-    When jobs are finished is the kernel's timeline, as with `ProfilePlant`; what the motors do on the way, and so
-    heat and readings, come from the simulation. The payload's mass is there from grasp to release, the contact force
-    of a press acts on the tool point. A faulted arm stands on its brakes in the posture of the fault, without current
-    and with an empty hand, since the payload went back to the queue with its job. When it recovers it stands at home:
-    the operator who cleared the fault has jogged it there.
+    Finish times come from the engine, as with `ProfilePlant`; motor motion, heat and readings come from the simulation.
+    The payload has mass from grasp to release, and the contact force of a press acts on the tool point. A faulted arm
+    is braked in its posture, without current and with an empty hand, since its job returned to the queue. It recovers
+    at home, where the operator who cleared the fault has jogged it.
 
-    The plant carries the arms from tick to tick, so it must be driven through every tick in order; tick 0 starts
-    afresh.
+    Ticks must be driven in order, from tick 0.
 
     Args:
-        robots: The arms, in the order of the world's.
-        plans: The plans behind the rows of the world's plan table.
+        robots: The arms in the order of the world.
+        plans: The plans of the rows of the world's plan table.
         rest_tau: Torque that holds the home postures, N·m, [arm, joint].
         places: Stations to show.
-        timestep_s: Of the simulation; a whole number, and a multiple of `STRIDE`, must fit into a planned sample.
+        timestep_s: Simulation step; a whole multiple of `STRIDE` steps must make up a planned sample.
     """
 
     follows_plans = False
@@ -66,7 +64,7 @@ class MujocoPlant:
         timestep_s: float = TIMESTEP_S,
     ) -> None:
         self._steps = round(1.0 / (RATE_HZ * timestep_s))
-        """Per planned sample."""
+        """Simulation steps per planned sample."""
         if self._steps < STRIDE or self._steps % STRIDE or not np.isclose(self._steps * timestep_s * RATE_HZ, 1.0):
             allowed = ", ".join(f"{1e3 / RATE_HZ / n:g}" for n in (STRIDE, 2 * STRIDE, 4 * STRIDE))
             raise ValueError(f"MujocoPlant.timestep_s must be {allowed}, ... ms (got {timestep_s * 1e3:g} ms).")
@@ -91,14 +89,14 @@ class MujocoPlant:
         self._at = np.concatenate([[0.0], self._home_q.ravel(), np.zeros(arms * JOINTS)])
         """Time, then joint positions, then speeds: MuJoCo's physics state."""
         self._held: dict[int, Reference] = {}
-        """Of the arms on their brakes."""
+        """References of the braked arms."""
         self._faults = np.zeros(arms, dtype=int)
         self._lost_s = np.zeros(arms)
         self._motion = np.zeros((0, arms, 3, JOINTS))
-        """What the arms did in the tick last driven, [sample, arm, channel, joint]."""
+        """Motion in the last tick, [sample, arm, channel, joint]."""
 
     def drive(self, world: World, state: State) -> Drive:
-        """Mean heat drive over the coming step, each [env, arm, joint], from the torque that the servos really exert.
+        """Simulate the coming step; return its mean heat drive from the servos' true torque, each [env, arm, joint].
 
         Raises:
             ValueError: more than one env, a tick out of order, or a step that is no whole number of planned samples.
@@ -146,14 +144,14 @@ class MujocoPlant:
         return samples
 
     def _follow(self, world: World, state: State, samples: int) -> None:
-        """Take over what the kernel made of the tick before: brakes on, or an arm jogged home."""
+        """Apply the faults and recoveries of the tick before: brake arms, or place them at home."""
         tick = int(state.tick[0])
         if tick == 0:
             self._reset()
         elif tick != self._tick + 1:
             raise ValueError(f"MujocoPlant must be driven tick by tick: {self._tick + 1} is next (got {tick}).")
         for a in np.flatnonzero(state.faults[0] > self._faults).tolist():
-            # A fault loses the rest of its tick, so this is when it came.
+            # A fault loses the rest of its tick, which gives its time.
             at_s = world.dt_s - (state.lost_s[0, a] - self._lost_s[a])
             q = self._motion[self._sample_of(np.array(at_s)), a, 0]
             self._place(a, q)
@@ -184,14 +182,14 @@ class MujocoPlant:
             part = slice(first * self._steps, last * self._steps)
             self._load(payload_kg[first])
             self._roll(ctrl[part], force_n[first], path[:, part])
-        self._motion = self._look(ctrl, path[0])
+        self._motion = self._motion_of(ctrl, path[0])
 
     def _roll(self, ctrl: Array, force_n: Array, path: Array) -> None:
         """Simulate under constant load and fill path [1, step, state]."""
         spec = _CTRL
         if force_n.any():
             applied = np.zeros((self.model.nbody, 6))
-            applied[self._payload, :3] = force_n  # The payload's frame is the tool's, so there is no moment.
+            applied[self._payload, :3] = force_n  # the payload's frame is the tool's: no moment
             ctrl = np.concatenate([ctrl, np.broadcast_to(applied.ravel(), (len(ctrl), applied.size))], axis=1)
             spec = _CTRL_AND_FORCE
         rollout.rollout(self.model, self.data, self._at[None], ctrl[None], control_spec=spec, state=path)
@@ -199,7 +197,7 @@ class MujocoPlant:
             raise FleetError(f"The simulation diverged in tick {self._tick}; a smaller timestep_s may help.")
         self._at = path[0, -1].copy()
 
-    def _look(self, ctrl: Array, path: Array) -> Array:
+    def _motion_of(self, ctrl: Array, path: Array) -> Array:
         """Motion every `STRIDE` steps, [sample, arm, channel, joint], with the torque exerted in the step before.
 
         The integrator applies a servo's force at the start of a step and its damping at the end, unless the force is
@@ -235,7 +233,7 @@ class MujocoPlant:
         self._at[own.start + joints : own.stop + joints] = 0.0
 
     def _gravity(self, a: int) -> Array:
-        """Torque that holds a resting arm with an empty hand at its present posture, N·m, [joint]."""
+        """Torque that holds an arm with an empty hand in its present posture, N·m, [joint]."""
         self._load(np.zeros(len(self._payload)))
         mujoco.mj_setState(self.model, self.data, self._at, _STATE)
         mujoco.mj_forward(self.model, self.data)

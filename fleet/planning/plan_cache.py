@@ -1,7 +1,4 @@
-"""Plans and home torques of one arm, cached on disk by content.
-
-The physics is loaded only for what is not in the cache.
-"""
+"""Plans and home torques of one arm, cached on disk by content; MuJoCo is loaded only for missing ones."""
 
 import hashlib
 import json
@@ -30,16 +27,15 @@ T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 PLANNER_VERSION = 1
-"""Raised whenever the planner's answer to the same question changes."""
+"""Increment it whenever the plans of the same work change."""
 
 
 class CachedPlanner:
-    """A `fleet.planning.planner.Planner` that computes each plan set once."""
+    """A `fleet.planning.planner.Planner` with the same arguments that computes each set of plans once."""
 
     def __init__(
         self, robot: Robot, *, elbows: int = 3, speeds: tuple[float, ...] = (1.0, 0.6), cache_dir: Path
     ) -> None:
-        """Arguments as for a `Planner`, and the folder of the cache."""
         self._robot, self._elbows, self._folder = robot, elbows, cache_dir
         self._speeds = tuple(sorted(set(speeds), reverse=True))
         self._planner: Planner | None = None
@@ -94,7 +90,7 @@ def rest_torque(robot: Robot, cache_dir: Path) -> Array:
 
 
 def _torque_key(robot: Robot) -> dict[str, object]:
-    """Everything that determines the torques of an arm; its name and its heat do not."""
+    """Everything that determines the torques of an arm."""
     return {
         "model": hashlib.sha256(gen3_xml()).hexdigest(),
         "gravity": GRAVITY_M_S2,

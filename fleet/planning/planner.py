@@ -1,4 +1,4 @@
-"""Plans of one arm for a work: several elbow postures and speeds, as sampled motion with its torque."""
+"""Plans of one arm for a work: several elbow postures and speeds, as sampled motion with torque."""
 
 import logging
 from dataclasses import replace

@@ -1,7 +1,7 @@
-"""Motions between given or random postures as plans, without inverse kinematics, so that many are made quickly.
+"""Motions between given or random postures as plans, made quickly, without inverse kinematics.
 
-Random motions are either a typical mix of work, on which a twin is judged, or light motions unlike it, with which
-twin training explores.
+Random motions are either a typical mix of work, on which twins are evaluated, or light motions of other kinds, for
+training.
 """
 
 import logging
@@ -78,20 +78,20 @@ def plan_motion(
     )
     home, first = arm.robot.home_q(), stops[0]
 
-    def leg(motion: Motion, to: int = 0, kg: float = 0.0) -> LoadedMotion:
+    def part(motion: Motion, to: int = 0, kg: float = 0.0) -> LoadedMotion:
         return LoadedMotion(motion, places[to].name, kg)
 
-    approach, retreat = [leg(move(home, first, speed))], [leg(move(first, home, speed))]
+    approach, retreat = [part(move(home, first, speed))], [part(move(first, home, speed))]
     if len(stops) == 1:
-        approach.append(leg(rest(first, GRASP_S)))
-        cycle = [leg(rest(first, dwell[0]), 0, payload_kg)]
-        retreat.insert(0, leg(rest(first, GRASP_S), 0, payload_kg))
+        approach.append(part(rest(first, GRASP_S)))
+        cycle = [part(rest(first, dwell[0]), 0, payload_kg)]
+        retreat.insert(0, part(rest(first, GRASP_S), 0, payload_kg))
     else:
-        cycle = [leg(rest(first, dwell[0]))]
+        cycle = [part(rest(first, dwell[0]))]
         for i in range(1, len(stops)):
-            cycle.append(leg(move(stops[i - 1], stops[i], speed), i, payload_kg))
-            cycle.append(leg(rest(stops[i], dwell[i]), i, payload_kg))
-        cycle.append(leg(move(stops[-1], first, speed)))
+            cycle.append(part(move(stops[i - 1], stops[i], speed), i, payload_kg))
+            cycle.append(part(rest(stops[i], dwell[i]), i, payload_kg))
+        cycle.append(part(move(stops[-1], first, speed)))
     return Plan(arm.robot.name, work, 0, speed, *(build_phase(arm, parts) for parts in (approach, cycle, retreat)))
 
 
@@ -176,10 +176,10 @@ def _reaching(rng: np.random.Generator, count: int) -> Array:
     """Postures in front of the arm, all about equally far from it, elbow up, rad, [posture, joint]."""
     near = np.array([0.0, 0.0, np.pi, -2.1, 0.0, 0.9, 1.57])
     far = np.array([0.0, 1.4, np.pi, -0.3, 0.0, 0.9, 1.57])
-    return near + rng.beta(*REACH) * (far - near) + rng.uniform(-1.0, 1.0, (count, JOINTS)) * _SCATTER
+    return _around(rng, near + rng.beta(*REACH) * (far - near), _SCATTER, count)
 
 
-def _around(rng: np.random.Generator, posture: Array, width: Sequence[float], count: int = 2) -> Array:
+def _around(rng: np.random.Generator, posture: Array, width: Sequence[float] | Array, count: int = 2) -> Array:
     return posture + rng.uniform(-1.0, 1.0, (count, JOINTS)) * np.array(width)
 
 
@@ -216,16 +216,11 @@ def _dwell_times(stops: Array, dwell_s: float | Sequence[float] | Array) -> Arra
 
 
 def _places(arm: ArmModel, stops: Array, name: str) -> tuple[Place, ...]:
-    poses = [arm.tool_pose(q) for q in stops]
-    return tuple(
-        Place(
-            name=f"{name}/stop_{i}",
-            position_m=(float(x[0]), float(x[1]), float(x[2])),
-            tool_deg=angles_deg(turned),
-            retreat_m=0.0,
-        )
-        for i, (x, turned) in enumerate(poses, start=1)
-    )
+    places = []
+    for i, (position_m, turn) in enumerate(map(arm.tool_pose, stops), start=1):
+        x, y, z = position_m.tolist()
+        places.append(Place(name=f"{name}/stop_{i}", position_m=(x, y, z), tool_deg=angles_deg(turn), retreat_m=0.0))
+    return tuple(places)
 
 
 def _check_path(arm: ArmModel, stops: Array, places: tuple[Place, ...]) -> None:

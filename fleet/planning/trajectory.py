@@ -17,7 +17,7 @@ Array = np.ndarray
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Sampled joint motion. It ends one sample after the last one, where the next motion begins."""
+    """Sampled joint motion; it ends one sample after the last row, where the next motion begins."""
 
     q: Array
     """rad, [time, joint]."""
@@ -85,11 +85,9 @@ def build_phase(arm: ArmModel, parts: Sequence[LoadedMotion]) -> Phase:
         InfeasibleJob: a limit of the arm is exceeded; names the place and the load.
     """
     lengths = [len(part.motion) for part in parts]
-    q, qd, qdd = (
-        np.concatenate([np.empty((0, JOINTS)), *(getattr(part.motion, name) for part in parts)])
-        for name in ("q", "qd", "qdd")
-    )
-    tau = np.concatenate([np.empty((0, JOINTS)), *(_torque(arm, part) for part in parts)])
+    none = np.empty((0, JOINTS))
+    q, qd, qdd = (np.concatenate([none, *(getattr(part.motion, n) for part in parts)]) for n in ("q", "qd", "qdd"))
+    tau = np.concatenate([none, *(_torque(arm, part) for part in parts)])
     if violation := limit_violation(q, qd, qdd, tau, arm.position_range):
         sample, reason = violation
         part = parts[np.repeat(np.arange(len(parts)), lengths)[sample]]
