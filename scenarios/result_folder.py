@@ -95,8 +95,14 @@ def check_free(out: Path, kind: ResultKind, *, overwrite: bool) -> None:
         raise FleetError(
             f"'{out}' holds other files ('{foreign[0]}'); --out needs a new folder or an earlier {kind.name}."
         )
-    if status == "finished" and not overwrite:
-        raise FleetError(f"'{out}' holds a finished {kind.name}; give another --out, or --overwrite to replace it.")
+    if status == "finished":
+        check_overwrite(out, overwrite, f"holds a finished {kind.name}")
+
+
+def check_overwrite(out: Path, overwrite: bool, what: str = "exists") -> None:
+    """Raise a FleetError if `out` exists and must not be replaced."""
+    if out.exists() and not overwrite:
+        raise FleetError(f"'{out}' {what}; give another --out, or --overwrite to replace it.")
 
 
 def _status(card: Path) -> str | None:

@@ -1,6 +1,6 @@
-"""Readable validation errors for scenario files.
+"""Readable errors for scenario files and for names among several.
 
-`kind` is a type annotation such as `float | None`, for which Python has no type: Any.
+`kind` is a type annotation such as `float | None`, for which Python has no type (hence Any).
 """
 
 import math
@@ -80,6 +80,17 @@ def check_finite(raw: object, file: str, place: str = "") -> None:
             check_finite(value, file, f"{place}[{i}]")
     elif isinstance(raw, float) and not math.isfinite(raw):
         raise ScenarioError(f"{file}: {place}: expected a finite number, got {raw}.")
+
+
+def choose(what: str, name: str, kind: Any) -> Any:
+    """Return the name if it is one of a Literal type.
+
+    Raises:
+        ScenarioError: names the nearest allowed one.
+    """
+    if name not in get_args(kind):
+        raise ScenarioError(f"No {what} '{name}'{nearest(str(name), get_args(kind))}")
+    return name
 
 
 def plain_kind(kind: Any) -> Any:

@@ -3,20 +3,22 @@
 import math
 import re
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from agents.registry import NAMES_HELP
 from fleet.errors import FleetError
 from fleet.files import atomic_path
+from scenarios.cli.options import DifficultyOption, ScenarioArg, check_least
 from scenarios.cli.terminal import out_console, progress_bar, say
 from scenarios.load import load
 from scenarios.policy_loader import label, policy_at, policy_of
 from scenarios.progress import Progress
+from scenarios.result_folder import check_overwrite, disk_errors
+from scenarios.schema_errors import choose
 
 if TYPE_CHECKING:
     import numpy as np
@@ -29,11 +31,11 @@ SECONDS = 20.0
 FRAMES = 240
 """Default number of frames, about."""
 MOST_PIXELS = 600_000_000
-"""In all frames together, which are in memory until the file is written, one byte per pixel."""
+"""Of all frames together: they stay in memory until the file is written, one byte per pixel."""
 
 
 def animate_command(
-    scenario: Annotated[str, typer.Argument(help="A library name (see `thermofleet list`) or a .toml file.")],
+    scenario: ScenarioArg,
     policy: Annotated[str, typer.Option(help=NAMES_HELP)] = "least_difficulty",
     seed: Annotated[int, typer.Option(help="Random seed, 0 or more; same shift as in `thermofleet run`.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Output file; default runs/SCENARIO-POLICY-SEED.gif.")] = None,
@@ -44,13 +46,12 @@ def animate_command(
     seconds: Annotated[
         float, typer.Option(help="Length of the animation, s; the last frame is held 1 s longer.")
     ] = SECONDS,
-    difficulty: Annotated[str, typer.Option(help="Difficulty model: twin, blind or oracle.")] = "twin",
+    difficulty: DifficultyOption = "twin",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace --out if it exists.")] = False,
 ) -> None:
     """Simulate one shift and draw it as a GIF: the cell from above, motors coloured by temperature."""
     chosen = load(scenario)
-    if seed < 0:
-        raise FleetError(f"--seed must be 0 or more (got {seed}).")
+    check_least(0, seed=seed)
     if not 1.0 <= seconds <= 3600.0:
         raise FleetError(f"--seconds must be from 1 to 3600 (got {seconds:g}).")
     pixels = _size(size)
@@ -60,37 +61,21 @@ def animate_command(
     check_out(where, overwrite=overwrite)
     from scenarios.report.gif import write_gif
 
-    with progress_bar() as progress, draft(where) as file:
+    with disk_errors(where):
+        where.parent.mkdir(parents=True, exist_ok=True)
+    with progress_bar() as progress, disk_errors(where), atomic_path(where) as file:
         frames = _frames(chosen, policy, seed, difficulty, stride, pixels, progress)
         images, length_s = write_gif(file, frames, seconds)
     say(f"Drew {images} frames, {length_s:.1f} s, {where.stat().st_size / 1e6:.1f} MB: {where}.", out_console)
 
 
 def check_out(out: Path, *, overwrite: bool) -> None:
-    """Refuse a file that cannot be written.
-
-    Raises:
-        FleetError: `out` does not end in .gif, is a folder, or exists and may not be replaced.
-    """
+    """Raise a FleetError unless `out` ends in .gif, is no folder, and is free or may be replaced."""
     if out.suffix.lower() != ".gif":
         raise FleetError(f"--out must end in .gif (got '{out}').")
     if out.is_dir():
         raise FleetError(f"Cannot write to '{out}': it is a folder.")
-    if out.exists() and not overwrite:
-        raise FleetError(f"'{out}' exists; give another --out, or --overwrite to replace it.")
-
-
-@contextmanager
-def draft(out: Path) -> Iterator[Path]:
-    """Path of a file that replaces `out` when the block ends without an error, and is removed otherwise."""
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_path(out) as path, ExitStack() as on_error:
-            on_error.callback(path.unlink, missing_ok=True)
-            yield path
-            on_error.pop_all()
-    except OSError as error:
-        raise FleetError(f"Cannot write to '{out}': {error.strerror or error}.") from error
+    check_overwrite(out, overwrite)
 
 
 def _size(asked: str) -> "Pixel":
@@ -127,10 +112,9 @@ def _frames(
     from fleet.env.render.picture import Picture
     from fleet.env.render.scene import scene_of
     from scenarios.cell_layout import cell_of
-    from scenarios.prepare.fleet import DifficultyName, choose, env_of, prepare
+    from scenarios.prepare.fleet import DifficultyName, env_of, prepare
 
-    choose("difficulty", difficulty, DifficultyName)
-    fleet = prepare(scenario, difficulty=cast(DifficultyName, difficulty), progress=progress)
+    fleet = prepare(scenario, difficulty=choose("difficulty", difficulty, DifficultyName), progress=progress)
     cell, picture, chosen = cell_of(scenario), Picture(size), policy_at(policy, seed)
     title = f"{scenario.name} · {label(policy)} · seed {seed}"
     env = env_of(fleet)

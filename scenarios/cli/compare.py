@@ -2,15 +2,14 @@
 
 from typing import Annotated
 
-import msgspec
 import typer
 
 from agents.registry import RULES
 from fleet.errors import FleetError
 from scenarios.cli import options
-from scenarios.cli.run import channel_of
-from scenarios.cli.terminal import out_console, progress_bar
+from scenarios.cli.terminal import out_console, print_json, progress_bar
 from scenarios.load import load
+from scenarios.schema_errors import choose
 
 
 def compare_command(
@@ -38,15 +37,17 @@ def compare_command(
     partition: options.PartitionOption = None,
 ) -> None:
     """Compare policies on the same seeds, with confidence intervals."""
-    from scenarios.prepare.fleet import DifficultyName, choose
+    from scenarios.prepare.fleet import DifficultyName
     from scenarios.run.compare import compare, comparison_table
 
     chosen = load(scenario)
     if seeds < 2:
         raise FleetError(f"--seeds must be 2 or more, because intervals need several shifts (got {seeds}).")
-    if first_seed < 0:
-        raise FleetError(f"--first-seed must be 0 or more (got {first_seed}).")
-    channel = channel_of(chosen, topology, radius, topology_seed, delay_s, jitter_s, loss, partition)
+    options.check_least(0, first_seed=first_seed)
+    channel = options.channel_of(
+        chosen, partition, topology=topology, radius=radius, topology_seed=topology_seed, delay_s=delay_s,
+        jitter_s=jitter_s, loss=loss,
+    )  # fmt: skip
     names = [name.strip() for name in policies.split(",")]
     with progress_bar() as progress:
         result = compare(
@@ -59,6 +60,6 @@ def compare_command(
             progress=progress,
         )
     if as_json:
-        typer.echo(msgspec.json.format(msgspec.json.encode(result), indent=1).decode())
+        print_json(result)
     else:
         out_console.print(comparison_table(result))

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
 from math import prod
 
@@ -23,33 +23,22 @@ from fleet.observation import FIELDS, Layout
 _PART = re.compile(r"(<!-- made by thermofleet contract: (?P<name>\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
-def filled(page: str) -> str:
-    """The page with every marked part made anew.
+def fill_tables(page: str) -> str:
+    """Replace every marked part of a page.
 
     Raises:
-        FleetError: a part is asked for that is not made here.
+        FleetError: a mark names an unknown table.
     """
-    parts = {
-        "keys": key_table,
-        "patterns": pattern_table,
-        "transport": transport_table,
-        "messages": message_tables,
-        "times": time_table,
-        "limits": limit_table,
-        "observation": observation_table,
-        "rewards": reward_table,
-    }
 
-    def part(match: re.Match[str]) -> str:
-        if match["name"] not in parts:
-            raise FleetError(f"The page asks for '{match['name']}'. There are: {', '.join(parts)}.")
-        return f"{match[1]}\n{parts[match['name']]()}\n\n{match[3]}"
+    def fill(match: re.Match[str]) -> str:
+        if match["name"] not in _TABLES:
+            raise FleetError(f"Unknown table '{match['name']}' in the page. Allowed: {', '.join(_TABLES)}.")
+        return f"{match[1]}\n{_TABLES[match['name']]()}\n\n{match[3]}"
 
-    return _PART.sub(part, page)
+    return _PART.sub(fill, page)
 
 
-def key_table() -> str:
-    """Every key: who sends what there to whom, and how."""
+def _key_table() -> str:
     rows = [
         (f"`{_short(channel)}`", channel.sender, channel.receiver, channel.pattern, _links(channel))
         for channel in CHANNELS
@@ -57,9 +46,7 @@ def key_table() -> str:
     return table(("key", "from", "to", "pattern", "message"), rows)
 
 
-def transport_table() -> str:
-    """Every key: history, heartbeat, rates, lease, priority and congestion control."""
-
+def _transport_table() -> str:
     def number(value: float | None) -> str:
         return "" if value is None else f"{value:g}"
 
@@ -78,27 +65,12 @@ def transport_table() -> str:
     return table(("key", "history", "heartbeat s", "rate Hz", "limit Hz", "lease s", "priority, congestion"), rows)
 
 
-def pattern_table() -> str:
-    """What the patterns mean."""
-    return table(("pattern", "meaning"), list(PATTERNS.items()))
-
-
-def message_tables() -> str:
-    """Every message field by field, with its encoding and an example; nested structs after the messages."""
+def _message_tables() -> str:
+    """Each message by field, with its encoding and an example; nested structs after the messages."""
     parts = schemas()
     kinds = {kind.__name__: kind for kind in EXAMPLES}
     order = [*kinds, *(name for name in parts if name not in kinds)]
     return "\n\n".join(_message(name, parts[name], kinds.get(name)) for name in order if name in parts)
-
-
-def observation_table() -> str:
-    """What an arm knows, field by field."""
-    return table(("field", "of 4 arms, 8 slots", "shape", "unit", "range", "meaning"), field_rows())
-
-
-def reward_table() -> str:
-    """What the reward is made of."""
-    return table(("info", "weight", "what for"), reward_rows())
 
 
 def _message(name: str, part: Schema, message: MessageType | None) -> str:
@@ -108,15 +80,11 @@ def _message(name: str, part: Schema, message: MessageType | None) -> str:
         parts.append(f"{where}Encoding `{messages.encoding(message)}`.")
     if part.get("properties"):
         required = part.get("required", ())
-        rows = [
-            (
-                f"`{field}`",
-                _type(kind),
-                "required" if field in required else _default(kind),
-                kind.get("description", ""),
-            )
-            for field, kind in part["properties"].items()
-        ]
+        rows: list[tuple[str, ...]] = []
+        for field, kind in part["properties"].items():
+            default = f"`{json.dumps(kind['default'])}`" if "default" in kind else ""
+            if_absent = "required" if field in required else default
+            rows.append((f"`{field}`", _type(kind), if_absent, kind.get("description", "")))
         parts.append(table(("field", "type", "if left out", "meaning"), rows))
     else:
         parts.append("No fields: the payload is `{}`.")
@@ -126,12 +94,12 @@ def _message(name: str, part: Schema, message: MessageType | None) -> str:
 
 
 def _short(channel: Channel) -> str:
-    """The key without its first chunks, which are the same everywhere."""
+    """The key without the prefix that all keys share."""
     return f"…/{channel.address.split('/{fleet}/')[1]}"
 
 
 def _own(channel: Channel) -> list[MessageType]:
-    """The messages of a key, without the refusal that may come instead of any reply."""
+    """The messages of a key, without the refusal, which can replace any reply."""
     return [kind for kind in (channel.message, channel.reply) if kind is not None]
 
 
@@ -168,21 +136,16 @@ def _span(kind: Schema, low: str, high: str) -> str:
     return ", not empty" if low in kind else ""
 
 
-def _default(kind: Schema) -> str:
-    return f"`{json.dumps(kind['default'])}`" if "default" in kind else ""
-
-
-def table(head: tuple[str, ...], rows: Sequence[Sequence[str]]) -> str:
+def table(head: tuple[str, ...], rows: Iterable[Sequence[str]]) -> str:
     """A table in Markdown."""
     lines = [head, tuple("---" for _ in head), *rows]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
-def time_table() -> str:
-    """Durations in real seconds."""
+def _time_table() -> str:
     timing, terms = Timing(), ExecutorConfig()
     again_s, most_s = REPORT_RETRY_S
-    short_s, attempts = timing.lease_s * (1 - DRIFT), timing.attempts
+    short_s, margin_s, attempts = timing.lease_s * (1 - DRIFT), timing.margin_s, timing.attempts
     state = CHANNEL["arm", "state"]
     rows = [
         (f"{SESSION_LEASE_S:g}", "all", "without a sign of life Zenoh closes a session and withdraws its token"),
@@ -194,11 +157,7 @@ def time_table() -> str:
         (f"{timing.ack_s:g}", "auctioneer", f"without an `Ack` the same award is sent again, {attempts} times in all"),
         (f"{timing.lease_s:g}", "auctioneer", "`lease_s`: length of a lease"),
         (f"{short_s:.2f}", "arm", f"how it counts that lease: {DRIFT:.0%} shorter, as clocks differ in rate"),
-        (
-            f"{timing.counted_lease_s:.2f}",
-            "auctioneer",
-            f"how it counts it: {DRIFT:.0%} and {timing.margin_s:g} s longer",
-        ),
+        (f"{timing.counted_lease_s:.2f}", "auctioneer", f"how it counts it: {DRIFT:.0%} and {margin_s:g} s longer"),
         (f"{timing.lease_s / RENEWALS:g}", "arm", "between two requests to renew the lease"),
         (f"{terms.commit_lead_s:g}", "arm", "before its last cycle could begin it requests permission to commit"),
         (f"{COMMIT_RETRY_S:g}", "arm", "until it requests that permission again"),
@@ -208,16 +167,12 @@ def time_table() -> str:
     return table(("real s", "of", "what"), rows)
 
 
-def limit_table() -> str:
-    """How large, how many, how often."""
+def _limit_table() -> str:
     state = CHANNEL["arm", "state"]
     longest = schemas()["JobSpec"]["properties"]["name"]["maxLength"]
     rows = [
         (f"{Limits().message_bytes:,} bytes", "any message with its attachment; the router silently drops larger ones"),
-        (
-            f"{state.limit_hz:g} a second",
-            "`state` messages of one session; the router drops more (`--state-hz`)",
-        ),
+        (f"{state.limit_hz:g} a second", "`state` messages of one session; the router drops more (`--state-hz`)"),
         (f"{MOST_JOBS}", "jobs in one message; of more, a `Status` holds those that may still change first"),
         (f"{MOST_KEPT:,}", "jobs that one auctioneer keeps, finished ones included"),
         (f"{longest}", "characters of a job's name"),
@@ -229,32 +184,36 @@ _SHAPES = {(): "1", ("joint",): "7", ("slot",): "K", ("peer",): "n − 1", ("pee
 _EXAMPLE = Layout(arms=4, slots=8)
 
 
-def field_rows() -> list[tuple[str, ...]]:
-    """Every field in its order: name, its places in the vector of four arms and eight slots, shape, unit, range,
-    meaning."""
+def _observation_table() -> str:
     rows: list[tuple[str, ...]] = []
     for field, start in zip(FIELDS, _EXAMPLE.offsets, strict=True):
         last = start + prod(_EXAMPLE.shape(field)) - 1
-        rows.append(
-            (
-                f"`{field.name}`",
-                str(start) if last == start else f"{start}–{last}",
-                _SHAPES[field.axes],
-                field.unit,
-                f"{_number(field.low)} … {_number(field.high)}",
-                field.text,
-            )
-        )
-    return rows
+        place = str(start) if last == start else f"{start}–{last}"
+        span = f"{_number(field.low)} … {_number(field.high)}"
+        rows.append((f"`{field.name}`", place, _SHAPES[field.axes], field.unit, span, field.text))
+    return table(("field", "of 4 arms, 8 slots", "shape", "unit", "range", "meaning"), rows)
 
 
-def reward_rows() -> list[tuple[str, ...]]:
-    """Every term: its name in the infos, its weight where the scenario names none, and what it is for."""
-    told = descriptions(RewardWeights)
-    return [
-        (f"`reward_{f.name}`", _number(getattr(RewardWeights, f.name)), told[f.name]) for f in fields(RewardWeights)
-    ]
+def _reward_table() -> str:
+    text = descriptions(RewardWeights)
+    rows = (
+        (f"`reward_{f.name}`", _number(getattr(RewardWeights, f.name)), text[f.name]) for f in fields(RewardWeights)
+    )
+    return table(("info", "weight", "what for"), rows)
 
 
 def _number(value: float) -> str:
     return f"{value:.15g}".replace("-", "−")
+
+
+_TABLES: dict[str, Callable[[], str]] = {
+    "keys": _key_table,
+    "patterns": lambda: table(("pattern", "meaning"), PATTERNS.items()),
+    "transport": _transport_table,
+    "messages": _message_tables,
+    "times": _time_table,
+    "limits": _limit_table,
+    "observation": _observation_table,
+    "rewards": _reward_table,
+}
+"""Text of each table by the name in its mark."""

@@ -1,6 +1,5 @@
 """`thermofleet keys`: the certificate authority of a fleet, and a certificate for each participant."""
 
-import json
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,7 +10,8 @@ from rich.table import Table
 
 from fleet.bus.security.access_control import ROLES, Participant, Role, Roster, of_arms, read_roster, rights
 from fleet.errors import FleetError, nearest
-from scenarios.cli.terminal import out_console, say
+from scenarios.cli.options import JsonOption
+from scenarios.cli.terminal import out_console, plain_table, print_json, say
 from scenarios.load import load
 
 DAYS = 365
@@ -37,12 +37,9 @@ def keys_command(
         bool, typer.Option("--overwrite", help="Replace all keys; with --add, replace one certificate.")
     ] = False,
     no_auctioneer: Annotated[
-        bool,
-        typer.Option(
-            "--no-auctioneer", help="For a fleet whose arms allocate jobs by consensus and answer submitters."
-        ),
+        bool, typer.Option("--no-auctioneer", help="For arms that allocate jobs by consensus and reply to submitters.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Make, extend and show keys and certificates for mutual TLS."""
     from fleet.bus.security.certificates import HERE
@@ -58,14 +55,17 @@ def keys_command(
     if scenario:
         chosen = load(scenario)
         more = [participant_of(text) for text in extra or ()]
-        roster = _roster(chosen.name, [arm.name for arm in chosen.arms], more, auctioneer=not no_auctioneer)
+        try:
+            roster = of_arms(chosen.name, [arm.name for arm in chosen.arms], more, auctioneer=not no_auctioneer)
+        except ValueError as error:
+            raise FleetError(str(error)) from error
         make(folder, roster, days=days, hosts=host or HERE, overwrite=overwrite)
     for text in add or ():
         add_to(folder, participant_of(text), days=days, hosts=host or HERE, overwrite=overwrite)
     roster = read_roster(folder)
     spans = spans_of(folder, roster)
     if as_json:
-        typer.echo(json.dumps(_plain(roster, {name: end for name, (_, end) in spans.items()}), indent=1))
+        print_json(_plain(roster, {name: end for name, (_, end) in spans.items()}))
         return
     out_console.print(_table(roster, spans))
     if scenario or add:
@@ -90,19 +90,10 @@ def participant_of(text: str) -> Participant:
     raise FleetError(f"'{text}': no role '{role}'{nearest(role, ROLES)}")
 
 
-def _roster(fleet: str, arms: list[str], extra: list[Participant], *, auctioneer: bool) -> Roster:
-    try:
-        return of_arms(fleet, arms, extra, auctioneer=auctioneer)
-    except ValueError as error:
-        raise FleetError(str(error)) from error
-
-
 def _table(roster: Roster, spans: dict[str, tuple[datetime, datetime]]) -> Table:
     from fleet.bus.security.certificates import CA, told
 
-    table = Table(box=None, pad_edge=False)
-    for column in ("participant", "role", "certificate ends"):
-        table.add_column(column)
+    table = plain_table("participant", "role", "certificate ends", numbers=False)
     now = datetime.now(UTC)
     rows = [("(authority)", "", spans[CA]), *((one.name, one.role, spans[one.name]) for one in roster.participants)]
     for name, role, (begin, end) in rows:

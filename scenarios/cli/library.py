@@ -1,13 +1,7 @@
 """`thermofleet list` and `thermofleet show`."""
 
-import json
-
-import msgspec
-import typer
-from rich.table import Table
-
 from scenarios.cli.options import JsonOption, ScenarioArg
-from scenarios.cli.terminal import out_console, progress_bar
+from scenarios.cli.terminal import out_console, plain_table, print_json, progress_bar
 from scenarios.load import library, load
 
 
@@ -15,11 +9,9 @@ def list_command(as_json: JsonOption = False) -> None:
     """List the scenarios that come with thermofleet."""
     scenarios = {name: load(path) for name, path in library().items()}
     if as_json:
-        typer.echo(json.dumps({name: s.description for name, s in scenarios.items()}, indent=1))
+        print_json({name: s.description for name, s in scenarios.items()})
         return
-    table = Table(box=None, pad_edge=False)
-    for column in ("scenario", "arms", "hours", "description"):
-        table.add_column(column)
+    table = plain_table("scenario", "arms", "hours", "description", numbers=False)
     for name, s in scenarios.items():
         table.add_row(name, str(len(s.arms)), f"{s.horizon_s / 3600:g}", s.description)
     out_console.print(table)
@@ -31,7 +23,7 @@ def show_command(scenario: ScenarioArg, as_json: JsonOption = False) -> None:
 
     chosen = load(scenario)
     if as_json:
-        typer.echo(msgspec.json.format(msgspec.json.encode(chosen), indent=1).decode())
+        print_json(chosen)
         return
     with progress_bar() as progress:
         parts = describe(chosen, progress)

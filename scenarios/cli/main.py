@@ -1,6 +1,6 @@
-"""The command line `thermofleet`: its commands by group, and how errors end it.
+"""The command line `thermofleet`: its commands by group, and the exit codes of errors.
 
-The module of a command is imported when the command runs, so that `--help` is fast.
+The module of a command is imported when the command runs, so `--help` is fast.
 """
 
 import errno
@@ -8,7 +8,6 @@ import logging
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from importlib.metadata import version
 from typing import Annotated, Any, NamedTuple
 
 import typer
@@ -58,7 +57,9 @@ COMMANDS = {
     "keys": LazyCommand(_LIVE, "keys:keys_command", "Make and show TLS keys and certificates."),
     "twin": LazyCommand(_TWIN, "twin:twin_app", "Train, score and use the digital twin of an arm."),
     "hold": LazyCommand(_TWIN, "scenarios.motion.hold:hold_command", "Compute how long an arm can hold a payload."),
-    "contract": LazyCommand(_TOOLS, "contract:contract_command", "Write schemas and AsyncAPI document of the bus."),
+    "contract": LazyCommand(
+        _TOOLS, "contract:contract_command", "Write the schemas of the bus and the tables of docs."
+    ),
 }
 
 
@@ -80,7 +81,7 @@ class LazyGroup(TyperGroup):
 
 
 def load_command(name: str) -> Any:
-    """Import a command. Any: typer keeps the class of commands private."""
+    """Import a command (Any: typer keeps the class of commands private)."""
     module, _, attribute = COMMANDS[name].target.partition(":")
     prefix = "" if module.startswith("scenarios.") else "scenarios.cli."
     target = getattr(import_module(prefix + module), attribute)
@@ -95,7 +96,7 @@ def load_command(name: str) -> Any:
 
 app = typer.Typer(
     cls=LazyGroup,
-    help="Robot fleets that know how hard a job is on their motors, tell each other, and share the work.",
+    help="Simulate and run fleets of robot arms that share jobs by how hard each job is on their motors.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
@@ -103,6 +104,8 @@ app = typer.Typer(
 
 def _print_version(wanted: bool) -> None:
     if wanted:
+        from importlib.metadata import version
+
         typer.echo(f"thermofleet {version('thermofleet')}")
         raise typer.Exit
 

@@ -1,14 +1,16 @@
 """Options that several commands share."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from agents.registry import names_of
 from fleet.errors import FleetError, LogError
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # slow to import
+    from fleet.bus.exchange.channel import Channel, Partition
+    from scenarios.schema import Scenario
     from twin.logs.recording import Recording
 
 ScenarioArg = Annotated[str, typer.Argument(help="A library name (see `thermofleet list`) or a .toml file.")]
@@ -76,6 +78,50 @@ TwinsArg = Annotated[Path, typer.Argument(help="A folder that `thermofleet twin 
 WhichOption = Annotated[str | None, typer.Option("--arm", help="The arm of the twin, if the folder holds several.")]
 
 
+def check_least(least: float, **options: float | None) -> None:
+    """Raise a FleetError if an option is below the least allowed value; None is an option that was left out."""
+    for name, value in options.items():
+        if value is not None and not value >= least:
+            raise FleetError(f"--{name.replace('_', '-')} must be {least:g} or more (got {value:g}).")
+
+
+def channel_of(scenario: "Scenario", partition: list[str] | None = None, **fields: Any) -> "Channel":
+    """The channel that the command line describes; `fields` are those of `Channel`, which checks them (hence Any).
+
+    Raises:
+        FleetError: names the option, what was given and what is allowed.
+    """
+    from fleet.bus.exchange.channel import Channel
+
+    try:
+        channel = Channel(partitions=tuple(parse_partition(text) for text in partition or ()), **fields)
+        channel.check([arm.name for arm in scenario.arms])
+    except ValueError as error:
+        field, space, rest = str(error).partition(" ")
+        raise FleetError(f"--{field.replace('_', '-')}{space}{rest}" if field in fields else str(error)) from error
+    return channel
+
+
+def parse_partition(text: str) -> "Partition":
+    """The partition of a text such as `600:1200:arm_0,arm_1|arm_2,arm_3`.
+
+    Raises:
+        ValueError: the text has another form.
+    """
+    from fleet.bus.exchange.channel import Partition
+
+    begin, _, rest = text.partition(":")
+    end, _, groups = rest.partition(":")
+    try:
+        from_s, to_s = float(begin), float(end)
+    except ValueError:
+        raise ValueError(
+            f"--partition needs FROM_S:TO_S:ARM,ARM|ARM,ARM, as in 600:1200:arm_0,arm_1|arm_2 (got '{text}')."
+        ) from None
+    arms = (tuple(arm.strip() for arm in group.split(",") if arm.strip()) for group in groups.split("|"))
+    return Partition(from_s, to_s, tuple(arms))
+
+
 def the_fleet(name: str, endpoint: str) -> str:
     """The named fleet, or the only one at the router.
 
@@ -92,17 +138,6 @@ def the_fleet(name: str, endpoint: str) -> str:
     if fleets:
         raise FleetError(f"There are several fleets at {endpoint}: {', '.join(fleets)}. Choose one with --fleet.")
     raise FleetError(f"There is no fleet at {endpoint} yet. Name the one to wait for with --fleet.")
-
-
-def check_one_source(scenario: str | None, log: Path | None) -> None:
-    """Check that either a scenario or a log is given.
-
-    Raises:
-        FleetError: none or both are given.
-    """
-    if (scenario is None) == (log is None):
-        given = "neither" if scenario is None else "both"
-        raise FleetError(f"Give either a scenario or --log FILE_OR_FOLDER (got {given}).")
 
 
 def recordings_of(log: Path, skip_damaged: bool) -> "list[Recording]":

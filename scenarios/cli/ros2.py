@@ -20,7 +20,7 @@ ros2_app = typer.Typer(
     add_completion=False,
 )
 TURN_S = 0.25
-"""Real seconds between two checks for a stop signal."""
+"""Real seconds between two checks for a stop request."""
 DEFAULTS = ThermalLimits()
 
 DomainOption = Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", help="The ROS 2 domain.")]
@@ -103,11 +103,7 @@ def listen_command(
 
 
 def ros2_router(router: str, endpoint: str) -> str:
-    """Endpoint of the router of ROS 2: the given one, or the fleet's.
-
-    Raises:
-        FleetError: the fleet's router enforces access rules, which do not include ROS 2.
-    """
+    """Endpoint of the router of ROS 2: the given one, or the fleet's, but not with TLS, which excludes ROS 2."""
     if not router and endpoint.startswith("tls/"):
         raise FleetError(
             "With TLS the fleet's router forwards the fleet's own keys only: name the router of ROS 2 with --router, "
@@ -117,11 +113,7 @@ def ros2_router(router: str, endpoint: str) -> str:
 
 
 def node_at(router: str, name: str, domain: int) -> "Node":
-    """A ROS 2 node, not yet open.
-
-    Raises:
-        FleetError: the extra is not installed, or there is no such domain.
-    """
+    """A ROS 2 node, not yet open, after a check of the domain and of the installed extra."""
     require_extra("ros2")
     from fleet.ros2.node import Node
     from fleet.ros2.topics import DOMAINS
@@ -132,11 +124,7 @@ def node_at(router: str, name: str, domain: int) -> "Node":
 
 
 def names_of(joints: str) -> tuple[str, ...]:
-    """The given joint names, or those of a Gen3.
-
-    Raises:
-        FleetError: a name is empty or given twice.
-    """
+    """The given joint names, which must differ, or those of a Gen3."""
     from fleet.robot import JOINTS
     from fleet.ros2.conversion import joint_names
 
@@ -149,11 +137,7 @@ def names_of(joints: str) -> tuple[str, ...]:
 
 
 def limits_of(warning_c: float, error_c: float) -> ThermalLimits:
-    """Limits at which diagnostics change their level.
-
-    Raises:
-        FleetError: the limits are not in order.
-    """
+    """Limits at which diagnostics change their level."""
     if not warning_c < error_c < float("inf"):
         raise FleetError(f"--warning-c must be less than --error-c (got {warning_c:g} and {error_c:g}).")
     return ThermalLimits(warning_c=warning_c, error_c=error_c, restart_c=min(DEFAULTS.restart_c, warning_c - 1.0))

@@ -1,27 +1,27 @@
 """`thermofleet run` and `thermofleet demo`."""
 
-import json
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.table import Table
 
 from agents.registry import NAMES_HELP
-from fleet.bus.exchange.channel import PERFECT, Channel, Partition
+from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError
 from fleet.metrics import Metrics
 from scenarios.cli import options
-from scenarios.cli.terminal import INTERRUPTED, Interrupted, out_console, progress_bar, say
+from scenarios.cli.terminal import INTERRUPTED, Interrupted, out_console, plain_table, print_json, progress_bar, say
 from scenarios.load import load
 from scenarios.policy_loader import label, policy_of
 from scenarios.progress import Progress
 from scenarios.result_folder import check_free, new_folder
 from scenarios.schema import Scenario
+from scenarios.schema_errors import choose
 
 if TYPE_CHECKING:  # slow to import
     from scenarios.prepare.fleet import Fleet
@@ -55,18 +55,29 @@ def run_command(
 ) -> None:
     """Run one shift of a scenario and record it."""
     from scenarios.run.run_folder import RUN
+    from scenarios.run.shift import summary
 
     chosen = load(scenario)
-    channel = channel_of(chosen, topology, radius, topology_seed, delay_s, jitter_s, loss, partition)
+    channel = options.channel_of(
+        chosen, partition, topology=topology, radius=radius, topology_seed=topology_seed, delay_s=delay_s,
+        jitter_s=jitter_s, loss=loss,
+    )  # fmt: skip
     spec = _spec(policy, seed, plant, bus, difficulty, channel)
     if not 0 <= listen <= 65535 or (listen and bus == "memory"):
         raise FleetError(f"--listen needs a port from 1 to 65535 and --bus zenoh (got {listen}, {bus}).")
     where = out or Path("runs") / f"{chosen.name}-{label(policy)}-{seed}"
     check_free(where, RUN, overwrite=overwrite)
-    with router_at(listen) as endpoint, progress_bar() as progress:
+    with ExitStack() as open_until_end:
+        endpoint = None
+        if listen:  # before the fleet connects, so that listeners miss no message
+            from fleet.bus.client.router import Router
+
+            endpoint = open_until_end.enter_context(Router(listen)).endpoint
+        progress = open_until_end.enter_context(progress_bar())
         _, result = _run_into(chosen, spec, where, overwrite, progress, endpoint=endpoint)
     if as_json:
-        typer.echo(json.dumps({"out": str(where), **_figures(result)}, indent=1))
+        run, keys = summary(result), ("status", "policy", "seed", "plant", "bus", "difficulty", "metrics")
+        print_json({"out": str(where), **{key: run[key] for key in keys}})
     else:
         say(f"{chosen.name}, seed {seed}", out_console)
         out_console.print(metrics_table({label(policy): result.metrics}))
@@ -101,12 +112,11 @@ def demo_command(
 
 
 def _spec(policy: str, seed: int, plant: str, bus: str, difficulty: str, channel: Channel) -> "RunSpec":
-    from scenarios.prepare.fleet import BusName, DifficultyName, PlantName, choose
+    from scenarios.prepare.fleet import BusName, DifficultyName, PlantName
     from scenarios.run.shift import RunSpec
 
     policy_of(policy)
-    if seed < 0:
-        raise FleetError(f"--seed must be 0 or more (got {seed}).")
+    options.check_least(0, seed=seed)
     return RunSpec(
         policy=policy,
         seed=seed,
@@ -142,18 +152,6 @@ def _run_into(
 
 
 @contextmanager
-def router_at(port: int) -> Iterator[str | None]:
-    """The endpoint of a router on a loopback port, opened before the fleet connects so that no message is missed."""
-    if not port:
-        yield None
-        return
-    from fleet.bus.client.router import Router
-
-    with Router(port) as router:
-        yield router.endpoint
-
-
-@contextmanager
 def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
     """A function that returns True after Ctrl-C, so that a shift ends between two steps; a second Ctrl-C aborts it."""
     pressed = threading.Event()
@@ -173,64 +171,9 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, before)
 
 
-def channel_of(
-    scenario: Scenario,
-    topology: str = "complete",
-    radius: float = 0.5,
-    topology_seed: int = 0,
-    delay_s: float = 0.0,
-    jitter_s: float = 0.0,
-    loss: float = 0.0,
-    partition: list[str] | None = None,
-) -> Channel:
-    """The channel that the options of the command line describe.
-
-    Raises:
-        FleetError: names the option, what was given and what is allowed.
-    """
-    # Any: the channel checks the name of the topology, which is a Literal.
-    fields: dict[str, Any] = {"topology": topology, "radius": radius, "topology_seed": topology_seed}
-    fields |= {"delay_s": delay_s, "jitter_s": jitter_s, "loss": loss}
-    try:
-        channel = Channel(partitions=tuple(parse_partition(text) for text in partition or ()), **fields)
-        channel.check([arm.name for arm in scenario.arms])
-    except ValueError as error:
-        field, space, rest = str(error).partition(" ")
-        raise FleetError(f"--{field.replace('_', '-')}{space}{rest}" if field in fields else str(error)) from error
-    return channel
-
-
-def parse_partition(text: str) -> Partition:
-    """The partition of a text such as `600:1200:arm_0,arm_1|arm_2,arm_3`.
-
-    Raises:
-        ValueError: the text has another form.
-    """
-    begin, _, rest = text.partition(":")
-    end, _, groups = rest.partition(":")
-    try:
-        from_s, to_s = float(begin), float(end)
-    except ValueError:
-        raise ValueError(
-            f"--partition needs FROM_S:TO_S:ARM,ARM|ARM,ARM, as in 600:1200:arm_0,arm_1|arm_2 (got '{text}')."
-        ) from None
-    arms = (tuple(arm.strip() for arm in group.split(",") if arm.strip()) for group in groups.split("|"))
-    return Partition(from_s, to_s, tuple(arms))
-
-
-def _figures(result: "RunResult") -> dict[str, Any]:  # JSON values
-    from scenarios.run.shift import summary
-
-    whole = summary(result)
-    return {key: whole[key] for key in ("status", "policy", "seed", "plant", "bus", "difficulty", "metrics")}
-
-
 def metrics_table(results: dict[str, Metrics]) -> Table:
     """Key figures, one column per policy."""
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("")
-    for name in results:
-        table.add_column(name, justify="right")
+    table = plain_table("", *results)
     rows: list[tuple[str, Callable[[Metrics], str]]] = [
         ("jobs finished", lambda m: f"{m.finished} of {m.jobs}"),
         ("value", lambda m: f"{m.value:g} of {m.value_offered:g}"),

@@ -15,8 +15,8 @@ NUMBERS = (signal.SIGINT, signal.SIGTERM)
 class Stop:
     """Whether a stop was requested, and by which signal.
 
-    Zenoh has its own threads, and a signal that one of them receives does not wake a lock or queue on which the main
-    thread waits: seen in every second try. A socket into which the signal is written always does.
+    A signal that one of Zenoh's threads receives often does not wake a lock or queue on which the main thread waits.
+    A socket into which the signal is written always does.
     """
 
     def __init__(self, receiver: socket.socket) -> None:
@@ -29,7 +29,7 @@ class Stop:
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait for a stop request; return whether there is one."""
-        while not self._number and self._receiver.fileno() >= 0:  # it is closed after the block
+        while not self._number and self._receiver.fileno() >= 0:  # closed after the block
             ready, _, _ = select.select([self._receiver], [], [], timeout_s)
             if not ready:
                 return False
@@ -37,11 +37,7 @@ class Stop:
         return self._number > 0
 
     def leave(self, sentence: str) -> None:
-        """Call it after the cleanup: Ctrl-C ends the process with the sentence and exit code 130, SIGTERM with 0.
-
-        Raises:
-            Interrupted: the signal was Ctrl-C.
-        """
+        """After the cleanup, raise `Interrupted` with the sentence if the signal was Ctrl-C, and not SIGTERM."""
         if self.is_set() and self._number == signal.SIGINT:
             raise Interrupted(sentence)
 

@@ -1,10 +1,12 @@
-"""Sentences and a progress bar on the terminal, for every command."""
+"""Output of every command: sentences, tables, JSON and a progress bar."""
 
 import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import typer
 from rich.console import Console
+from rich.table import Table
 
 from fleet.errors import FleetError
 from fleet.files import cache_folder
@@ -30,13 +32,13 @@ class Interrupted(FleetError):
 
 @contextmanager
 def progress_bar(*, kept: str = "Plans and twins already made are") -> Iterator[Progress]:
-    """A bar on standard error that names the stage; without a terminal, one line for each long stage.
+    """Show a bar on standard error that names the stage; without a terminal, one line for each long stage.
 
     Args:
         kept: What an interruption leaves in the cache, as the beginning of a sentence; empty for nothing.
 
     Raises:
-        Interrupted: Ctrl-C in a stage that keeps nothing but the cache.
+        Interrupted: Ctrl-C.
     """
     from rich.progress import BarColumn, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
@@ -60,6 +62,21 @@ def progress_bar(*, kept: str = "Plans and twins already made are") -> Iterator[
         except KeyboardInterrupt:
             rest = f" {kept} kept in {cache_folder()}, and the same command continues from there." if kept else ""
             raise Interrupted(f"Interrupted while {bar.tasks[0].description}: nothing was written.{rest}") from None
+
+
+def print_json(value: object) -> None:
+    """Print a value on standard output as JSON."""
+    import msgspec
+
+    typer.echo(msgspec.json.format(msgspec.json.encode(value), indent=1).decode())
+
+
+def plain_table(*heads: str, numbers: bool = True, title: str | None = None, caption: str | None = None) -> Table:
+    """An empty table without lines; with `numbers` all columns but the first are aligned to the right."""
+    table = Table(box=None, pad_edge=False, title=title, caption=caption, title_justify="left", caption_justify="left")
+    for column, head in enumerate(heads):
+        table.add_column(head, justify="right" if numbers and column else "left", no_wrap=numbers and not column)
+    return table
 
 
 def say(sentence: str, console: Console = err_console) -> None:

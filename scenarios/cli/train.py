@@ -1,16 +1,17 @@
 """`thermofleet train`."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from fleet.errors import FleetError
-from scenarios.cli.options import DifficultyOption, ScenarioArg
+from scenarios.cli.options import DifficultyOption, ScenarioArg, check_least
 from scenarios.cli.terminal import out_console, progress_bar, say
 from scenarios.extras import require_extra
 from scenarios.load import load
 from scenarios.policy_loader import policy_of
+from scenarios.schema_errors import choose
 
 
 def train_command(
@@ -35,18 +36,18 @@ def train_command(
     The folder can be used as a policy: `thermofleet compare SCENARIO --policies random,FOLDER`.
     """
     chosen = load(scenario)
-    if threads < 1 or seed < 0:
-        raise FleetError(f"--threads must be 1 or more and --seed 0 or more (got {threads}, {seed}).")
+    check_least(1, threads=threads)
+    check_least(0, seed=seed)
     if warm_start:
         policy_of(warm_start)
     where = out or Path("runs") / f"{chosen.name}-{algo}-{seed}"
     require_extra("learn")
-    from agents.learned.ppo import PpoConfig, use_threads
-    from scenarios.prepare.fleet import DifficultyName, choose
+    from agents.learned.ppo import Algorithm, PpoConfig, use_threads
+    from scenarios.prepare.fleet import DifficultyName
     from scenarios.run.train_policy import CURVE, TrainingPlan, train
 
     use_threads(threads)
-    algorithm: Any = algo  # a Literal, checked by PpoConfig
+    algorithm = choose("algorithm", algo, Algorithm)
     try:
         config = PpoConfig(algorithm=algorithm, envs=envs, seed=seed, warm_start=warm_start)
     except ValueError as error:

@@ -1,20 +1,20 @@
 """`thermofleet twin train`, `score` and `report`, and the list of the `twin` commands."""
 
-import json
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.table import Table
 
-from fleet.errors import FleetError, nearest
+from fleet.errors import FleetError
 from scenarios.cli import options
-from scenarios.cli.terminal import out_console, progress_bar, say
+from scenarios.cli.terminal import out_console, plain_table, print_json, progress_bar, say
 from scenarios.cli.twin_motion import export_command, generate_command, identify_command, recover_command
 from scenarios.load import load
+from scenarios.schema_errors import choose
 
 if TYPE_CHECKING:  # slow to import
     from twin.vae.model import TwinConfig
@@ -60,20 +60,17 @@ def train_command(
 ) -> None:
     """Train the twins of a scenario's arms, or the twin of the arm whose logs are given.
 
-    Several arms are trained at a time. The quick size takes up to a minute per arm and core, the full size about four
-    minutes. Cached twins, as those of the fleet after a run of the scenario, take seconds. A twin of logs is kept in
-    --out only.
+    The quick size takes up to a minute per arm and core, the full size four.
+    Cached twins take seconds. A twin of logs is kept in --out only.
     """
-    options.check_one_source(scenario, log)
-    if seed is not None and seed < 0:
-        raise FleetError(f"--seed must be 0 or more (got {seed}).")
-    if size not in (None, "quick", "full"):
-        raise FleetError(f"No size '{size}'{nearest(size or '', ('quick', 'full'))}")
-    if log is not None and arm is not None:
-        raise FleetError("--arm chooses among a scenario's arms; a log has one arm, so leave it out with --log.")
-    network = dict(scope=scope, kind=kind, latent=latent, hidden=hidden, layers=layers, window=window, rate_hz=rate_hz)
-    training = dict(epochs=epochs, restarts=restarts, beta=beta, max_windows=max_windows)
-    fields = network | training | {"allow_collapse": allow_collapse or None}
+    check_source(scenario, log, arm)
+    options.check_least(0, seed=seed)
+    if size is not None:
+        choose("size", size, Literal["quick", "full"])
+    fields = dict(
+        scope=scope, kind=kind, latent=latent, hidden=hidden, layers=layers, window=window, rate_hz=rate_hz,
+        epochs=epochs, restarts=restarts, beta=beta, max_windows=max_windows, allow_collapse=allow_collapse or None,
+    )  # fmt: skip
     given = {name: value for name, value in fields.items() if value is not None}
     from scenarios.prepare.twin_folder import TWINS, save_twins, train_arms, train_log
     from scenarios.result_folder import check_free, new_folder
@@ -82,10 +79,9 @@ def train_command(
     bar = progress_bar() if log is None else progress_bar(kept="")  # the twin of a log is not cached
     with explain_in_options(), bar as progress, new_folder(out, TWINS, overwrite=overwrite) as folder:
         if log is not None:
-            config = config_of("quick" if size is None else size, given, of_log=True)
-            twins = [
-                train_log(options.recordings_of(log, skip_damaged), config, seed or 0, cool_c=cool, progress=progress)
-            ]
+            config = config_of(size or "quick", given, of_log=True)
+            recordings = options.recordings_of(log, skip_damaged)
+            twins = [train_log(recordings, config, seed or 0, cool_c=cool, progress=progress)]
             source = f"log {log}"
         else:
             of_scenario = load(str(scenario))
@@ -95,7 +91,7 @@ def train_command(
             source = f"scenario {of_scenario.name}"
         card = save_twins(twins, folder, source)
     if as_json:
-        typer.echo(json.dumps({"out": str(out), **card}, indent=1))
+        print_json({"out": str(out), **card})
         return
     for twin in card["twins"]:
         out_console.print(quality_table(twin))
@@ -111,24 +107,22 @@ def score_command(
     format_: Annotated[str, typer.Option("--format", help="table, csv or json.")] = "table",
     skip_damaged: options.DamagedOption = False,
 ) -> None:
-    """Score every job of a scenario, or a log window by window; every line names the version of the twin.
+    """Score every job of a scenario, or a log window by window, with the version of the twin.
 
     Takes seconds, and half a minute if the jobs must be planned first.
     """
-    options.check_one_source(scenario, log)
-    if format_ not in ("table", "csv", "json"):
-        raise FleetError(f"No format '{format_}'{nearest(format_, ('table', 'csv', 'json'))}")
+    check_source(scenario, log)
+    choose("format", format_, Literal["table", "csv", "json"])
     from scenarios.prepare.twin_folder import open_twin
     from scenarios.report.score_table import job_rows, render, window_rows
 
-    if log is not None:
-        twin = open_twin(twins, arm)
-        rows = [row for recording in options.recordings_of(log, skip_damaged) for row in window_rows(twin, recording)]
-    else:
-        chosen = load(str(scenario))
-        twin = open_twin(twins, arm)
+    chosen, twin = load(scenario) if scenario else None, open_twin(twins, arm)
+    if chosen is not None:
         with progress_bar() as progress:
             rows = job_rows(twin, chosen, progress)
+    else:
+        recordings = options.recordings_of(Path(str(log)), skip_damaged)
+        rows = [row for recording in recordings for row in window_rows(twin, recording)]
     shown = render(rows, format_, caption=f"twin of {twin.arm}, version {twin.version}, data {twin.data_hash}")
     if isinstance(shown, str):
         typer.echo(shown, nl=False)
@@ -142,13 +136,18 @@ twin_app.command("recover")(recover_command)
 twin_app.command("export")(export_command)
 
 
+def check_source(scenario: str | None, log: Path | None, arm: str | None = None) -> None:
+    """Raise a FleetError unless either a scenario or a log is given, and --arm only with a scenario."""
+    if (scenario is None) == (log is None):
+        given = "neither" if scenario is None else "both"
+        raise FleetError(f"Give either a scenario or --log FILE_OR_FOLDER (got {given}).")
+    if log is not None and arm is not None:
+        raise FleetError("--arm chooses among a scenario's arms; a log has one arm, so leave it out with --log.")
+
+
 @contextmanager
 def explain_in_options() -> Iterator[None]:
-    """Reword training errors so that they name the options of the command line.
-
-    Raises:
-        FleetError: the log is too short or too warm, or the latent space collapsed.
-    """
+    """Reword training errors as FleetErrors that name the options of the command line."""
     from twin.training_data import NothingCool, TooShort
     from twin.vae.train import CollapsedPosterior
 
@@ -181,16 +180,13 @@ def report_command(
 ) -> None:
     """Write the paper's pictures and tables as one offline HTML page, with PNGs and report.json.
 
-    For a scenario, one arm is studied on 1 200 test jobs, and every baseline is trained for each seed; that takes
-    hours. --quick uses 200 jobs, small trainings and fewer baselines. Twins and finished sections are cached, so the
-    same command continues after an interruption. A section that fails gives its reason in the page, and the command
-    ends with exit code 1.
+    For a scenario, one arm is studied on 1 200 test jobs, and every baseline is
+    trained for each seed: hours. --quick uses 200 jobs and fewer, smaller trainings.
+    After an interruption the same command continues from the cache.
+    A section that fails gives its reason in the page, and the exit code is 1.
     """
-    options.check_one_source(scenario, log)
-    if seeds < 1:
-        raise FleetError(f"--seeds must be 1 or more (got {seeds}).")
-    if log is not None and arm is not None:
-        raise FleetError("--arm chooses among a scenario's arms; a log has one arm, so leave it out with --log.")
+    check_source(scenario, log, arm)
+    options.check_least(1, seeds=seeds)
     from scenarios.result_folder import check_free, new_folder
     from scenarios.studies.report.build import REPORT, report_logs, report_scenario, write
     from scenarios.studies.report.context import QUICK, Size
@@ -199,7 +195,7 @@ def report_command(
     command = f"thermofleet twin report {f'--log {log.name}' if log else scenario} --seeds {seeds}{' --quick' * quick}"
     bar = progress_bar(kept="Twins and sections already made are")
     with bar as progress, new_folder(out, REPORT, overwrite=overwrite) as folder:
-        common: Any = {"seeds": range(seeds), "command": command, "progress": progress}  # keyword arguments
+        common: dict[str, Any] = {"seeds": range(seeds), "command": command, "progress": progress}  # arguments
         if log is not None:
             sections = report_logs(options.recordings_of(log, skip_damaged), quick=quick, **common)
             title = f"The twin of the logs in {log.name}"
@@ -220,14 +216,10 @@ def report_command(
 
 
 def config_of(size: str, given: dict[str, Any], *, of_log: bool = False) -> "TwinConfig":
-    """The configuration of a size, with the options given on the command line (Any: one per field).
-
-    Raises:
-        FleetError: a value is not allowed; names the option.
-    """
+    """The configuration of a size, with the options given on the command line (Any: one per field)."""
     from dataclasses import replace
 
-    from scenarios.prepare.twin_folder import log_config
+    from scenarios.prepare.twin_folder import LOG_RATE_HZ
     from twin.vae.model import TwinConfig
 
     base = TwinConfig.quick() if size == "quick" else TwinConfig()
@@ -235,7 +227,7 @@ def config_of(size: str, given: dict[str, Any], *, of_log: bool = False) -> "Twi
     window = max(1, given.get("window", base.window))
     base = replace(base, stride=min(base.stride, window), score_stride=min(base.score_stride, window))
     try:
-        return replace(log_config(base) if of_log else base, **given)
+        return replace(base, **({"rate_hz": LOG_RATE_HZ} if of_log else {}) | given)
     except ValueError as error:
         option = re.sub(r"TwinConfig\.(\w+)", lambda field: f"--{field[1].replace('_', '-')}", str(error), count=1)
         raise FleetError(option.replace("--rate-hz", "--rate")) from error
@@ -243,22 +235,15 @@ def config_of(size: str, given: dict[str, Any], *, of_log: bool = False) -> "Twi
 
 def quality_table(twin: dict[str, Any]) -> Table:  # JSON of twins.json
     """Fit of each network of a twin, with the version and the data of the twin."""
-    table = Table(
-        title=f"Twin of {twin['arm']}: version {twin['version']}",
-        caption=f"data {twin['data_hash']}, seed {twin['seed']}, calibrated on {twin['calibrated_on']} held-out jobs",
-        caption_justify="left",
-        box=None,
-        pad_edge=False,
-        title_justify="left",
-    )
-    for head in ("network", "ELBO, nat", "KL, nat", "active units", "MSE, σ²"):
-        table.add_column(head, justify="left" if head == "network" else "right")
+    caption = f"data {twin['data_hash']}, seed {twin['seed']}, calibrated on {twin['calibrated_on']} held-out jobs"
+    title = f"Twin of {twin['arm']}: version {twin['version']}"
+    table = plain_table("network", "ELBO, nat", "KL, nat", "active units", "MSE, σ²", title=title, caption=caption)
     for fit in twin["networks"]:
-        table.add_row(
-            fit["name"].replace("_", " "),
+        numbers = (
             f"{fit['elbo']:.1f}",
             f"{fit['kl']:.2f}",
             str(fit["active_units"]),
             f"{fit['mean_squared_error']:.3f}",
         )
+        table.add_row(fit["name"].replace("_", " "), *numbers)
     return table

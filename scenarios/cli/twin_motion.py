@@ -1,25 +1,24 @@
 """`thermofleet twin identify`, `generate`, `recover` and `export`."""
 
-import json
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.table import Table
 
-from fleet.errors import FleetError, nearest
+from fleet.errors import FleetError
 from fleet.robot import POSTURES
 from scenarios.cli import options
-from scenarios.cli.terminal import out_console, progress_bar, say
+from scenarios.cli.terminal import out_console, plain_table, print_json, progress_bar, say
 from scenarios.load import load
+from scenarios.result_folder import check_overwrite
+from scenarios.schema_errors import choose
 from twin.thermal.result import AMBIENT_C
 
 if TYPE_CHECKING:  # slow to import
     from twin.thermal.result import Identified
     from twin.vae.twin import Twin
-
-FORMATS = ("parquet", "csv")
 
 ArmOfScenario = Annotated[str | None, typer.Option("--arm", help="Arm of the scenario; default: the first.")]
 TwinsOption = Annotated[
@@ -50,8 +49,7 @@ def identify_command(
     if out is not None and out.exists():
         if not out.is_dir():
             raise FleetError(f"Cannot write to '{out}': it is a file; --out needs a folder.")
-        if (out / CARD).exists() and not overwrite:
-            raise FleetError(f"'{out}' holds an identified arm; give another --out, or --overwrite to replace it.")
+        check_overwrite(out / CARD, overwrite)
     ambient_c = AMBIENT_C if ambient is None else ambient
     recordings = options.recordings_of(log, skip_damaged)
     with progress_bar(kept="") as progress:
@@ -63,7 +61,7 @@ def identify_command(
         card: dict[str, object] = {"arm": arm, "version": network.version, "data_hash": network.data_hash}
         card |= {"out": None if out is None else str(out), "ambient_c": ambient_c, "rms_k": network.rms_k}
         card["parameters"] = [{**vars(p), "informed": p.informed} for p in network.parameters]
-        typer.echo(json.dumps(card, indent=1))
+        print_json(card)
         return
     out_console.print(parameter_table(network))
     worst = sorted(max(rms) for rms in network.rms_k.values())
@@ -77,9 +75,7 @@ def identify_command(
 def parameter_table(network: "Identified") -> Table:
     """The parameters of an identified thermal network with their intervals."""
     caption = f"version {network.version}, data {network.data_hash}; informed: whether the logs say more than the prior"
-    table = Table(box=None, pad_edge=False, caption=caption, caption_justify="left")
-    for head in ("parameter", "joint", "value", "95 % from", "to", "prior", "informed"):
-        table.add_column(head, justify="left" if head == "parameter" else "right", no_wrap=head == "parameter")
+    table = plain_table("parameter", "joint", "value", "95 % from", "to", "prior", "informed", caption=caption)
     for p in network.parameters:
         numbers = (f"{v:.4g}" for v in (p.value, p.low, p.high, p.prior))
         table.add_row(p.name, "–" if p.joint is None else str(p.joint), *numbers, "yes" if p.informed else "no")
@@ -104,24 +100,22 @@ def generate_command(
 
     Takes about 20 s once the arm's twin is in the cache.
     """
-    check_choices(seed, format_)
-    if count < 1 or not strength >= 0:
-        raise FleetError(f"--count must be 1 or more and --s 0 or more (got {count}, {strength:g}).")
+    options.check_least(0, seed=seed, s=strength)
+    options.check_least(1, count=count)
     from scenarios.motion.generate import generate
     from scenarios.motion.known_arm import known_arm
-    from scenarios.motion.motion_files import GENERATED, generated_summary, save_generated
+    from scenarios.motion.motion_files import GENERATED, Format, generated_summary, save_generated
     from scenarios.result_folder import check_free
 
-    chosen = load(scenario)
+    chosen, format_name = load(scenario), choose("format", format_, Format)
     check_free(out, GENERATED, overwrite=overwrite)
     with progress_bar() as progress:
         known = known_arm(chosen, arm, twin=twin_of(twins, arm or chosen.arms[0].name), progress=progress)
         how = {"s": strength, "count": count, "seed": seed, "verification": known.verification}
         made = generate(known.twin, known.arm, known.sources, **how, progress=partial(progress, "generating"))
-    format_name: Any = format_  # a Literal, checked above
     save_generated(made, out, format=format_name, overwrite=overwrite)
     if as_json:
-        typer.echo(json.dumps({"out": str(out), **generated_summary(made, format_name)}, indent=1))
+        print_json({"out": str(out), **generated_summary(made, format_name)})
         return
     reasons = ", ".join(f"{reason} {times}" for reason, times in made.rejected.items()) or "none"
     cool = f"{made.truly_cool:.1%} truly stay below {made.verification.cool_c:g} °C"
@@ -148,17 +142,17 @@ def recover_command(
 
     Takes about 20 s once the arm's twin is in the cache.
     """
-    check_choices(seed, format_)
+    options.check_least(0, seed=seed)
     if not hold_s > 0:
         raise FleetError(f"--hold must be > 0 (got {hold_s:g}).")
     from fleet.physics.models import ArmModel
     from scenarios.motion.known_arm import known_arm
-    from scenarios.motion.motion_files import RECOVERY, recovery_summary, save_recovery
+    from scenarios.motion.motion_files import RECOVERY, Format, recovery_summary, save_recovery
     from scenarios.motion.posture import parse_posture
     from scenarios.motion.recover import check_hold, hold_until, recover
     from scenarios.result_folder import check_free
 
-    chosen = load(scenario)
+    chosen, format_name = load(scenario), choose("format", format_, Format)
     spec = chosen.arms[0 if arm is None else chosen.index_of(arm)]
     model = ArmModel(spec.robot())
     q = parse_posture(posture, model.position_range)
@@ -170,10 +164,9 @@ def recover_command(
         start_c = hold_until(known.arm, q, payload, ambient_c=known.verification.ambient_c, until_c=warm)
         how = {"start_c": start_c, "verification": known.verification, "hold_s": hold_s, "seed": seed}
         recovery = recover(known.twin, known.arm, q, payload, **how)
-    format_name: Any = format_  # a Literal, checked above
     save_recovery(recovery, out, format=format_name, overwrite=overwrite)
     if as_json:
-        typer.echo(json.dumps({"out": str(out), **recovery_summary(recovery)}, indent=1))
+        print_json({"out": str(out), **recovery_summary(recovery)})
         return
     hot = recovery.hottest
     say(
@@ -193,25 +186,12 @@ def export_command(
     """Export a twin as ONNX, for scoring without Python; needs the extra onnx, which `make` installs."""
     if out.suffix != ".onnx":
         raise FleetError(f"--out must name a file that ends in .onnx (got '{out}').")
-    if out.exists() and not overwrite:
-        raise FleetError(f"'{out}' exists; give another --out, or --overwrite to replace it.")
+    check_overwrite(out, overwrite)
     from scenarios.prepare.twin_folder import open_twin
     from twin.vae.onnx import export_onnx
 
     twin = open_twin(twins, arm)
     say(f"Twin of {twin.arm}, version {twin.version}, written to {export_onnx(twin, out)}.", out_console)
-
-
-def check_choices(seed: int, format_: str) -> None:
-    """Check a seed and a file format.
-
-    Raises:
-        FleetError: names the option and what is allowed.
-    """
-    if seed < 0:
-        raise FleetError(f"--seed must be 0 or more (got {seed}).")
-    if format_ not in FORMATS:
-        raise FleetError(f"No format '{format_}'{nearest(format_, FORMATS)}")
 
 
 def twin_of(folder: Path | None, arm: str) -> "Twin | None":

@@ -6,7 +6,7 @@ from dataclasses import fields as dataclass_fields
 from functools import cached_property
 from inspect import Parameter, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from scenarios.load import load, override
 from scenarios.prepare.planned_arm import PlannedArm, plan_arms
 from scenarios.progress import Progress, quiet
 from scenarios.schema import Scenario
+from scenarios.schema_errors import choose
 
 if TYPE_CHECKING:  # a single arm needs neither the environment nor MuJoCo
     from fleet.engine.shift import Episode, Plant
@@ -49,17 +50,6 @@ class Fleet:
     arms: tuple[Arm, ...]
     infeasible: tuple[InfeasibleJob, ...]
     """Work that single arms cannot do, with reasons."""
-
-
-def choose(kind: str, name: str, allowed: Any) -> Any:
-    """The name, if it is one of a Literal type. (Any: Python cannot say that a parameter is a Literal type.)
-
-    Raises:
-        ScenarioError: names the nearest allowed one.
-    """
-    if name not in get_args(allowed):
-        raise ScenarioError(f"No {kind} '{name}'{nearest(str(name), get_args(allowed))}")
-    return name
 
 
 def prepare(
@@ -110,8 +100,7 @@ def _arms(
     Args:
         every_work: Raise if none of the arms can do some work.
     """
-    choose("difficulty", difficulty, DifficultyName)
-    if difficulty == "twin":
+    if choose("difficulty", difficulty, DifficultyName) == "twin":
         require_extra("twin")
     if not isinstance(cache, str | Path | None):
         raise ScenarioError(f"cache must be the path of a folder (got {cache!r}).")
@@ -134,33 +123,27 @@ def _arms(
         twins = train_twins(scenario, planned, folder, progress)
         models = calibrate_twins(scenario, working, twins, folder, progress)
     arms = []
-    for of_scenario, model in zip(working, models, strict=True):
-        robot, motors, thermal = of_scenario.hardware
+    for each, model in zip(working, models, strict=True):
+        robot, motors, thermal = each.hardware
         rest_tau = rest_torque(robot, folder / "plans")
-        plans = of_scenario.plans
-        arm = Arm(robot=robot, motors=motors, thermal=thermal, rest_tau=rest_tau, model=model, plans=plans)
+        arm = Arm(robot=robot, motors=motors, thermal=thermal, rest_tau=rest_tau, model=model, plans=each.plans)
         arms.append(_with_oracle(scenario, arm) if difficulty == "oracle" else arm)
     return arms, [error for arm in planned for error in arm.infeasible]
 
 
 REASONS = 4
-"""Most reasons listed in one error message."""
+"""Maximum number of reasons in one error message."""
 
 
 def _check_feasible(scenario: Scenario, arms: Sequence[PlannedArm]) -> None:
-    """Check that every work can be done by some arm.
-
-    Raises:
-        ScenarioError: names the job stream, and why each arm cannot do it.
-    """
+    """Raise a ScenarioError if no arm can do the work of some job stream; names the reason for each arm."""
     infeasible = [error for arm in arms for error in arm.infeasible]
     for i, stream in enumerate(scenario.jobs):
+        here = [error for error in infeasible if error.place in stream.places]
+        reasons = list(dict.fromkeys(f"{error.arm} at '{error.place}': {error.reason}" for error in here))
         for work in works_of(scenario, stream):
             if any(work in arm.plans for arm in arms):
                 continue
-            reasons = list(
-                dict.fromkeys(f"{e.arm} at '{e.place}': {e.reason}" for e in infeasible if e.place in stream.places)
-            )
             more = f"; and {len(reasons) - REASONS} more" if len(reasons) > REASONS else ""
             raise ScenarioError(
                 f"{scenario.name}.toml: jobs[{i}].places: no arm can do '{stream.name}' with {work.payload_kg:g} kg "
@@ -171,8 +154,8 @@ def _check_feasible(scenario: Scenario, arms: Sequence[PlannedArm]) -> None:
 def _with_oracle(scenario: Scenario, arm: Arm) -> Arm:
     from fleet.engine.oracle import Oracle
 
-    of_cell = float(np.mean(scenario.ambient.at(np.linspace(0, scenario.horizon_s, 100))))
-    ambient_c = of_cell + arm.robot.ambient_offset_k
+    cell_c = float(np.mean(scenario.ambient.at(np.linspace(0, scenario.horizon_s, 100))))
+    ambient_c = cell_c + arm.robot.ambient_offset_k
     model = Oracle(arm.motors, arm.thermal, warm_start(arm, ambient_c), ambient_c, scenario.limits.warning_c)
     return replace(arm, model=model)
 
@@ -289,7 +272,7 @@ def make_env(
     mask_in: "MaskPlace" = "obs",
     peers: int | None = None,
     progress: Progress = quiet,
-    **overrides: Any,
+    **overrides: Any,  # one type per field
 ) -> "AllocationEnv":
     """The PettingZoo `ParallelEnv` of a scenario.
 
@@ -324,7 +307,7 @@ def env_of(
     bus: BusName = "memory",
     endpoint: str | None = None,
     channel: Channel = PERFECT,
-    **options: Any,
+    **options: Any,  # passed on
 ) -> "AllocationEnv":
     """The `ParallelEnv` of a prepared fleet; arguments as in `open_exchange`, options (Any) as in `AllocationEnv`."""
     from fleet.env.allocation_v0 import parallel_env

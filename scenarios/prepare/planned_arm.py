@@ -1,7 +1,7 @@
 """One arm of a scenario: its hardware, and its plans for the scenario's work."""
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -67,34 +67,22 @@ def planner_of(robot: Robot, scenario: Scenario, folder: Path) -> CachedPlanner:
     return CachedPlanner(robot, elbows=spec.elbows, speeds=spec.speeds, cache_dir=folder / "plans")
 
 
-def plan_works(
-    robot: Robot, works: Sequence[Work], scenario: Scenario, folder: Path, progress: Callable[[float], None]
-) -> tuple[dict[Work, tuple[Plan, ...]], list[InfeasibleJob]]:
-    """An arm's plans for the works it can do (cached in `folder`), and the reasons why it cannot do the others."""
-    planner = planner_of(robot, scenario, folder)
-    plans: dict[Work, tuple[Plan, ...]] = {}
-    infeasible: list[InfeasibleJob] = []
-    for i, work in enumerate(works):
-        progress(i / len(works))
-        try:
-            plans[work] = planner.plan(work)
-        except InfeasibleJob as error:
-            infeasible.append(error)
-            log.info("%s", error)
-    return plans, infeasible
-
-
 def plan_arms(
     scenario: Scenario, indices: Sequence[int], works: Sequence[Work], folder: Path, progress: Progress
 ) -> list[PlannedArm]:
-    """The arms at these places of the scenario, each with its plans for the works."""
+    """The arms at these places of the scenario, each with its plans for the works (cached in `folder`)."""
     planned = []
     for done, index in enumerate(indices):
-
-        def report(fraction: float, done: int = done) -> None:
-            progress("planning", (done + fraction) / len(indices))
-
         hardware = hardware_of(scenario, index)
-        plans, infeasible = plan_works(hardware.robot, works, scenario, folder, report)
+        planner = planner_of(hardware.robot, scenario, folder)
+        plans: dict[Work, tuple[Plan, ...]] = {}
+        infeasible: list[InfeasibleJob] = []
+        for i, work in enumerate(works):
+            progress("planning", (done + i / len(works)) / len(indices))
+            try:
+                plans[work] = planner.plan(work)
+            except InfeasibleJob as error:
+                infeasible.append(error)
+                log.info("%s", error)
         planned.append(PlannedArm(index, hardware, plans, tuple(infeasible)))
     return planned

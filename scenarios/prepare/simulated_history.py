@@ -1,7 +1,7 @@
-"""Simulated past jobs of an arm, with what the arm's own records would say about them.
+"""Simulated past jobs of an arm, with the records that a real arm would have of them.
 
-Each job begins at the temperature that earlier work left, in ambient air that nobody measured. The records hold the
-duration, the motor temperatures before the job, and the hottest temperatures during it.
+Each job begins at the temperature that earlier work left, at an ambient temperature that is not measured. The records
+hold the duration, the motor temperatures before the job, and the hottest temperatures during it.
 """
 
 from collections.abc import Sequence
@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet.motion import Drive, Plan, drives
-from fleet.motor import reference_current
+from fleet.motion import Drive, Plan, drives, static_drive
 from fleet.physics.models import ArmModel
 from fleet.thermal import NODES, WINDING, SimulatedTemperatures, simulate_temperatures
 from scenarios.prepare.planned_arm import ArmHardware
@@ -20,7 +19,7 @@ from twin.vae.twin import Twin
 Array = np.ndarray
 
 AMBIENT_C = (19.0, 27.0)
-"""Range of the ambient temperature, unknown to any model."""
+"""Range of the ambient temperature, which no model receives."""
 DURATION_S = (180.0, 2700.0)
 EARLIER_S = (300.0, 3600.0)
 """Range of the duration of the job before."""
@@ -140,9 +139,7 @@ class _Simulator:
     def rest(self, start: Array, duration_s: Array, ambient: Array) -> Array:
         """Temperatures after standing at home, powered."""
         robot, motors, _ = self.hardware
-        still = np.zeros(motors.idle_w.shape)
-        tau = ArmModel(robot).gravity_torque(robot.home_q())
-        idle = Drive(reference_current(tau, still, motors) ** 2, still)
+        idle = static_drive(ArmModel(robot).gravity_torque(robot.home_q()), motors)
         return self._simulate(idle, duration_s, start, ambient).end_c
 
     def _hot(self, temp: Array) -> Array:

@@ -1,13 +1,12 @@
 """Train the twin of every arm on motion whose whole horizon stays cool.
 
-Besides the motion of its work, an arm explores light motions of other kinds: a twin that knows only the work would
-take every new motion for a danger. `scenarios/studies/exploration.py` measures the gain.
+Training data hold the motion of the arm's work and random light motions of other kinds. Without the latter, every new
+motion would score as difficult. `scenarios/studies/exploration.py` measures the gain.
 """
 
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -52,32 +51,25 @@ def train_twins(
         seed: Of weights and training; default: the scenario's own. The training data do not depend on it.
 
     Raises:
-        FleetError: an arm has no motion that stays cool, so its twin cannot know what is normal.
+        FleetError: an arm has no motion that stays cool.
     """
     if config is None:
         config = TwinConfig.quick() if scenario.twin.size == "quick" else TwinConfig()
-    of_scenario = scenario.spread.seed
-    exploration_seed = of_scenario if seed not in (None, of_scenario) else None
-    models = []
-    for arm in arms:
-        own = require_cool_plans(arm.all_plans, arm.hardware, scenario)
-        training_seed = arm_seed(of_scenario if seed is None else seed, arm.index)
-        key = training_key(records(own), config, training_seed)
-        home = folder / "twins" / _key(key, scenario.twin, arm.hardware, exploration_seed)
-        models.append(CachedModel(home, load, partial(_train_and_save, own, config, training_seed, scenario, arm)))
+    own_seed = scenario.spread.seed
+    models = [_model(scenario, arm, folder, config, own_seed if seed is None else seed) for arm in arms]
     return load_or_make(models, "training", progress)
 
 
-def _train_and_save(
-    own: Sequence[Plan],
-    config: TwinConfig,
-    seed: np.random.SeedSequence,
-    scenario: Scenario,
-    arm: PlannedArm,
-    folder: Path,
-    progress: Callable[[float], None],
-) -> None:
-    save(train_twin(own, config, seed, scenario=scenario, arm=arm, progress=progress), folder)
+def _model(scenario: Scenario, arm: PlannedArm, folder: Path, config: TwinConfig, seed: int) -> CachedModel[Twin]:
+    own = require_cool_plans(arm.all_plans, arm.hardware, scenario)
+    training_seed = arm_seed(seed, arm.index)
+
+    def make(home: Path, report: Callable[[float], None]) -> None:
+        save(train_twin(own, config, training_seed, scenario=scenario, arm=arm, progress=report), home)
+
+    key = training_key(records(own), config, training_seed)
+    exploration_seed = scenario.spread.seed if seed != scenario.spread.seed else None
+    return CachedModel(folder / "twins" / _key(key, scenario.twin, arm.hardware, exploration_seed), load, make)
 
 
 def train_twin(
@@ -89,10 +81,10 @@ def train_twin(
     arm: PlannedArm,
     progress: Callable[[float], None] | None = None,
 ) -> Twin:
-    """The twin of an arm: trained on its own cool motion and its exploration, calibrated on what is usual.
+    """The twin of an arm: trained on its own cool motion and its exploration, and calibrated.
 
-    Usual is new exploration that was not trained on, and as much of its own work, that was. Own work recurs as it is;
-    measured against slow exploration alone, a fifth of fast cool work would count as unusual.
+    Half of the calibration data is new exploration, half is own work that was trained on, since own work recurs
+    unchanged. Against slow exploration alone, a fifth of fast cool work would score as unusual.
 
     Args:
         own: The arm's cool plans.
@@ -109,7 +101,7 @@ def train_twin(
 
 
 def exploration_records(scenario: Scenario, arm: PlannedArm) -> list[Array]:
-    """Training data from the arm's exploration, [time, 3, joint] each; the same for every seed of a run."""
+    """Training data of the arm's exploration, [time, 3, joint] each; the same for every seed of a run."""
     return records(_cool_exploration(scenario, arm, EXPLORATION))
 
 
@@ -124,12 +116,12 @@ def _draw_seed(scenario: Scenario, arm: PlannedArm, draw: int) -> np.random.Seed
 
 
 def arm_seed(seed: int, index: int) -> np.random.SeedSequence:
-    """The seed of an arm's training, by its place in the scenario; it does not depend on the other arms trained."""
+    """The seed of an arm's training, by its place in the scenario, whichever other arms are trained."""
     return np.random.SeedSequence([seed, index])
 
 
 def _key(own: str, spec: TwinSpec, hardware: ArmHardware, exploration_seed: int | None = None) -> str:
-    """Cache key of a twin: the key of its own motion, and everything that decides on its exploration.
+    """Cache key of a twin: the key of its own motion, and everything that determines its exploration.
 
     Args:
         exploration_seed: Seed of the exploration if it is not the one in the key of the own motion.

@@ -38,8 +38,8 @@ def train_arms(
 ) -> list[Twin]:
     """The twins of some arms of a scenario, trained on the same data as the twins of its fleet.
 
-    With the scenario's own configuration and seed they are the twins of its fleet. They come from the cache while
-    their inputs are unchanged; else they are trained and cached.
+    With the scenario's own configuration and seed they are the twins of its fleet. They come from the cache if they
+    are in it.
 
     Args:
         arms: Indices in the scenario. The twin of an arm does not depend on the other arms in the list.
@@ -55,12 +55,7 @@ def train_arms(
 LOG_RATE_HZ = 2.0
 """Common rate of Gen3 loggers; a window of 50 samples then covers 25 s."""
 LOADED = (0, 1, 2, 3)
-"""Motors that decide whether a log is cool, index 0..6: the large ones. Idle wrists are above 40 °C."""
-
-
-def log_config(base: TwinConfig) -> TwinConfig:
-    """The configuration at the rate of logs."""
-    return replace(base, rate_hz=LOG_RATE_HZ)
+"""The large motors, index 0..6, which determine whether a log is cool: idle wrists are above 40 °C."""
 
 
 def train_log(
@@ -106,14 +101,7 @@ def quality(twin: Twin) -> dict[str, Any]:  # JSON
         "seed": twin.seed,
         "calibrated_on": 0 if twin.calibration is None else len(twin.calibration.reference.packed),
         "networks": [
-            {
-                "name": name,
-                "elbo": fit.elbo,
-                "kl": fit.kl,
-                "active_units": fit.active_units,
-                "mean_squared_error": fit.mean_squared_error,
-                "restart": fit.restart,
-            }
+            {"name": name, **{field: value for field, value in vars(fit).items() if field != "restart_elbos"}}
             for name, fit in zip(net_names(twin.config, twin.joints), twin.fits, strict=True)
         ],
     }
@@ -126,7 +114,7 @@ def save_twins(twins: Sequence[Twin], folder: Path, source: str) -> dict[str, An
         source: The scenario or the log that they were trained on, as text.
     """
     for twin in twins:
-        save(twin, folder / _home(twin.arm))
+        save(twin, folder / f"{quote(twin.arm, safe='')}.twin")
     card = {
         "status": "finished",
         "source": source,
@@ -156,7 +144,3 @@ def open_twin(folder: Path, arm: str | None = None) -> Twin:
     if name not in homes:
         raise CheckpointError(f"No twin of arm '{arm}' in '{folder}'{nearest(name, homes)}")
     return load(homes[name])
-
-
-def _home(arm: str) -> str:
-    return f"{quote(arm, safe='')}.twin"

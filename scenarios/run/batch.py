@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import isfinite
+from math import inf
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -25,37 +26,29 @@ Array = np.ndarray
 
 
 MOST_ARRIVALS = 100.0
-"""Largest factor on the rate of arrivals: bounds the memory of the queue."""
+"""Largest factor on the rate of arrivals, which bounds the memory of the queue."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Randomisation:
-    """Ranges from which each shift of a batch draws, besides its jobs."""
+    """Ranges from which each shift of a batch is drawn."""
 
     ambient_k: tuple[float, float] = (0.0, 0.0)
     """Added to the ambient temperature of the cell, K."""
     arrivals: tuple[float, float] = (1.0, 1.0)
-    """Jobs of a stream come so many times as often; a trace stays as it is."""
+    """Factor on the rates of Poisson streams and repeated batches."""
     variants: Sequence[Mapping[str, Any]] = ()
     """Fleets to choose from besides the scenario's own, as overrides of its top-level fields: `arms` with other
     mounts, wear or cooling, `spread` with another seed. Each is planned and scored once."""
 
     def __post_init__(self) -> None:
         for name in ("ambient_k", "arrivals"):
-            try:
-                low, high = getattr(self, name)
-            except (TypeError, ValueError) as error:
-                raise ValueError(f"Randomisation.{name} must be (low, high) (got {getattr(self, name)!r}).") from error
-            if not all(isinstance(end, int | float | np.integer | np.floating) for end in (low, high)):
-                raise ValueError(f"Randomisation.{name} must be two numbers (got {low!r}, {high!r}).")
-            if not low <= high:
-                raise ValueError(f"Randomisation.{name} needs low <= high (got {low}, {high}).")
-            if not (isfinite(low) and isfinite(high)):
-                raise ValueError(f"Randomisation.{name} must be finite (got {low}, {high}).")
-        if self.arrivals[0] <= 0:
-            raise ValueError(f"Randomisation.arrivals must be > 0 (got {self.arrivals}).")
-        if self.arrivals[1] > MOST_ARRIVALS:
-            raise ValueError(f"Randomisation.arrivals must be at most {MOST_ARRIVALS:g} (got {self.arrivals}).")
+            given = getattr(self, name)
+            numbers = isinstance(given, tuple | list) and all(isinstance(end, Real) for end in given)
+            if not (numbers and len(given) == 2 and -inf < given[0] <= given[1] < inf):
+                raise ValueError(f"Randomisation.{name} must be two finite numbers, low <= high (got {given!r}).")
+        if not 0 < self.arrivals[0] <= self.arrivals[1] <= MOST_ARRIVALS:
+            raise ValueError(f"Randomisation.arrivals must be > 0 and at most {MOST_ARRIVALS:g} (got {self.arrivals}).")
         if not isinstance(self.variants, list | tuple) or not all(isinstance(v, Mapping) for v in self.variants):
             raise ValueError(
                 f"Randomisation.variants must be a list of dictionaries, one for each fleet (got {self.variants!r})."
@@ -80,7 +73,7 @@ def make_batch(
     peers: int | None = None,
     threads: int = 1,
     progress: Progress = quiet,
-    **overrides: Any,
+    **overrides: Any,  # one type per field
 ) -> BatchEnv:
     """The batched environment of a scenario: `num_envs` shifts side by side in one process.
 

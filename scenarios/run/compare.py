@@ -1,4 +1,4 @@
-"""Several policies on the same seeds: the seed is the unit of replication, differences are paired."""
+"""Several policies on the same seeds, with paired differences."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -29,9 +29,9 @@ Part = tuple[str, Sequence[int]]
 
 RESAMPLES = 2000
 TOGETHER = 16
-"""So many shifts of a policy are worked at a time, where they are stepped side by side."""
+"""Shifts of a policy that are stepped side by side."""
 HERE_S = 5.0
-"""About as long as it takes a worker to begin: what can be done meanwhile is done without any."""
+"""About the time that a worker process takes to start; until then this process does the work."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Comparison:
     scopes: dict[str, str]
     """[policy]: central or arm, see `agents.policy`."""
     channel: dict[str, Any]
-    """`Channel.described` of what lay between the arms."""
+    """`Channel.described`."""
     channel_text: str
 
 
@@ -81,28 +81,27 @@ def compare(
     """Run every policy on every seed, in memory and on the profile plant.
 
     Args:
-        channel: What becomes of the arms' words on the way, the same for every policy.
+        channel: Topology, delay and loss of the arms' messages, the same for every policy.
         workers: Processes, if there is work for more than some seconds; -1 for one per core. The result does not
             depend on it.
 
     Raises:
-        FleetError: unknown policy, one named twice, or a baseline that is not among the policies.
+        FleetError: unknown policy, one given twice, or a baseline that is not among the policies.
     """
-    for policy in policies:
-        policy_of(policy)
     for i, policy in enumerate(policies):
+        policy_of(policy)
         if policy in policies[:i]:
-            raise FleetError(f"The policy '{policy}' is named twice; every policy is compared once.")
+            raise FleetError(f"The policy '{policy}' is given twice; names must be unique.")
     if baseline not in policies:
         raise FleetError(f"The baseline '{baseline}' is not among the policies compared: {', '.join(policies)}.")
-    folder = cache_dir or cache_folder()  # named here: a worker may have been started under another one
+    folder = cache_dir or cache_folder()  # here: a worker may have started with another one
     fleet = prepare(scenario, difficulty=difficulty, cache=folder, progress=progress)
     together = TOGETHER if channel.perfect else 1
     parts = [(policy, seeds[i : i + together]) for policy in policies for i in range(0, len(seeds), together)]
     by_policy: dict[str, list[Outcome]] = {policy: [] for policy in policies}
-    worked = _worked(fleet, difficulty, channel, folder, parts, workers)
-    for n, ((policy, _), found) in enumerate(zip(parts, worked, strict=True)):
-        by_policy[policy] += found
+    results = _run_parts(fleet, difficulty, channel, folder, parts, workers)
+    for n, ((policy, _), result) in enumerate(zip(parts, results, strict=True)):
+        by_policy[policy] += result
         progress("comparing", (n + 1) / len(parts))
     rng = np.random.default_rng(np.random.SeedSequence(0))
     figures = {
@@ -112,19 +111,21 @@ def compare(
     return Comparison(scenario.name, tuple(seeds), baseline, figures, scopes, channel.described(), channel.text)
 
 
-def _worked(
+def _run_parts(
     fleet: Fleet, difficulty: DifficultyName, channel: Channel, folder: Path, parts: Sequence[Part], workers: int
 ) -> Iterator[list[Outcome]]:
-    """The outcomes of each part in order: of the first seconds here, then of workers, if there is anything left."""
+    """The outcomes of each part in order, from this process in the first seconds, then from workers."""
     began_s, todo = time.monotonic(), list(parts)
     while todo and (workers == 1 or time.monotonic() - began_s < HERE_S):
         yield outcomes(fleet, *todo.pop(0), channel)
     if not todo:
         return
     with Parallel(n_jobs=workers, return_as="generator") as pool:
-        for found in pool(delayed(_there)(fleet.scenario, difficulty, folder, *part, channel) for part in todo):
-            assert found is not None
-            yield found
+        for result in pool(
+            delayed(_run_in_worker)(fleet.scenario, difficulty, folder, *part, channel) for part in todo
+        ):
+            assert result is not None
+            yield result
 
 
 @cache
@@ -132,35 +133,25 @@ def _fleet(scenario: Scenario, difficulty: DifficultyName, folder: Path) -> Flee
     return prepare(scenario, difficulty=difficulty, cache=folder)
 
 
-def _there(
+def _run_in_worker(
     scenario: Scenario, difficulty: DifficultyName, folder: Path, policy: str, seeds: Sequence[int], channel: Channel
 ) -> list[Outcome]:
-    """In a worker, which takes the fleet from the cache, once."""
     return outcomes(_fleet(scenario, difficulty, folder), policy, seeds, channel)
 
 
 def _figure(name: str, rows: Sequence[Outcome], base: Sequence[Outcome], rng: np.random.Generator) -> Figure:
     values = np.array([getattr(each, name) for each in rows], dtype=float)
     paired = values - np.array([getattr(each, name) for each in base], dtype=float)
-    low, high = interval(values, rng)
-    d_low, d_high = interval(paired, rng)
-    return Figure(
-        mean=float(values.mean()),
-        iqm=float(trim_mean(values, 0.25)),
-        low=low,
-        high=high,
-        difference=float(paired.mean()),
-        difference_low=d_low,
-        difference_high=d_high,
-    )
+    mean, iqm = float(values.mean()), float(trim_mean(values, 0.25))
+    return Figure(mean, iqm, *interval(values, rng), float(paired.mean()), *interval(paired, rng))
 
 
 def interval(values: Array, rng: np.random.Generator) -> tuple[float, float]:
     """95 % percentile bootstrap interval of the mean over seeds, [seed]."""
     if np.ptp(values) == 0:
         return float(values[0]), float(values[0])
-    found = bootstrap((values,), np.mean, n_resamples=RESAMPLES, method="percentile", rng=rng, vectorized=True)
-    return float(found.confidence_interval.low), float(found.confidence_interval.high)
+    result = bootstrap((values,), np.mean, n_resamples=RESAMPLES, method="percentile", rng=rng, vectorized=True)
+    return float(result.confidence_interval.low), float(result.confidence_interval.high)
 
 
 def comparison_table(result: Comparison) -> Group:
@@ -170,8 +161,8 @@ def comparison_table(result: Comparison) -> Group:
         f"{result.baseline}, 95 % intervals; * excludes 0"
     )
     if result.channel != PERFECT.described():
-        title += f"\nWords travel: {result.channel_text}."
-    table = Table(box=None, pad_edge=False, header_style="bold")
+        title += f"\nChannel: {result.channel_text}."
+    table = Table(box=None, pad_edge=False)
     table.add_column("", overflow="fold")
     for name in ("mean", "interval", "difference", "interval", ""):
         table.add_column(name, justify="right")
@@ -183,14 +174,13 @@ def comparison_table(result: Comparison) -> Group:
         digits = 3 if name == "availability" else 1
         for policy, figures in result.figures.items():
             f = figures[name]
-            mean = (f"{f.mean:.{digits}f}", f"{f.low:.{digits}f} … {f.high:.{digits}f}")
-            if policy == result.baseline:
-                table.add_row(f"  {label(policy)}", *mean)
-                continue
-            between = f"{f.difference_low:+.{digits}f} … {f.difference_high:+.{digits}f}"
-            star = "*" if f.difference_low > 0 or f.difference_high < 0 else ""
-            table.add_row(f"  {label(policy)}", *mean, f"{f.difference:+.{digits}f}", between, star)
+            cells = [f"  {label(policy)}", f"{f.mean:.{digits}f}", f"{f.low:.{digits}f} … {f.high:.{digits}f}"]
+            if policy != result.baseline:
+                star = "*" if f.difference_low > 0 or f.difference_high < 0 else ""
+                between = f"{f.difference_low:+.{digits}f} … {f.difference_high:+.{digits}f}"
+                cells += [f"{f.difference:+.{digits}f}", between, star]
+            table.add_row(*cells)
     central = [label(policy) for policy, scope in result.scopes.items() if scope == "central"]
-    if result.channel == PERFECT.described() or not central:
-        return Group(Text(title), table)
-    return Group(Text(title), table, Text(f"Central policies read no messages: {', '.join(central)}."))
+    if result.channel != PERFECT.described() and central:
+        return Group(Text(title), table, Text(f"Central policies read no messages: {', '.join(central)}."))
+    return Group(Text(title), table)

@@ -1,4 +1,4 @@
-"""Where a difficulty comes from: which twin, trained on what, calibrated on which past jobs."""
+"""Provenance of a difficulty: twin, training data and calibration."""
 
 from typing import Any
 
@@ -6,21 +6,13 @@ from fleet.difficulty import DifficultyModel
 
 
 def provenance(model: DifficultyModel) -> dict[str, Any]:
-    """What a recording says of a difficulty model: its version, and for a twin the names of its data and its seed.
+    """Version of a difficulty model; for a twin also the hash of its training data, and its seed.
 
-    The version is that in `thermofleet twin score`, in the checkpoint's `twin.json` and in the arm's words on the bus;
-    the data hash names the content of the training records.
+    The version is that in `thermofleet twin score`, in the checkpoint's `twin.json` and in the arm's messages.
     """
-    told: dict[str, Any] = {"version": model.version}
-    twin: Any = getattr(model, "twin", model)
-    if hasattr(twin, "data_hash"):
-        told["twin"] = {"version": twin.version, "data_hash": twin.data_hash, "seed": twin.seed}
-    saturation = getattr(model, "saturation", None)
-    if saturation is not None:
-        told["saturation"] = {
-            "version": saturation.version,
-            "data_hash": saturation.data_hash,
-            "jobs": saturation.jobs,
-            "passed": saturation.passed,
-        }
-    return told
+    fields = {"twin": ("version", "data_hash", "seed"), "saturation": ("version", "data_hash", "jobs", "passed")}
+    parts: dict[str, object] = {"twin": getattr(model, "twin", model), "saturation": getattr(model, "saturation", None)}
+    found = {name: part for name, part in parts.items() if hasattr(part, "data_hash")}
+    return {"version": model.version} | {
+        name: {field: getattr(part, field) for field in fields[name]} for name, part in found.items()
+    }

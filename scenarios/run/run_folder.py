@@ -1,8 +1,6 @@
 """The files of a recorded run."""
 
 import json
-from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +16,14 @@ from scenarios.result_folder import ResultKind, disk_errors
 from scenarios.run.shift import RunResult, summary
 
 FILES = ("run.json", "telemetry.parquet", "events.parquet", "report.html")
-
-
 RUN = ResultKind(name="run", card="run.json", files=FILES)
 
 
 def write(result: RunResult, folder: Path) -> None:
-    """Lay down the files of a run in an existing folder.
+    """Write the files of a run to an existing folder.
 
     Raises:
-        FleetError: the disk refuses.
+        FleetError: the folder cannot be written.
     """
     run = summary(result)
     arms = [arm.name for arm in result.scenario.arms]
@@ -37,15 +33,13 @@ def write(result: RunResult, folder: Path) -> None:
         if result.telemetry is None:
             return
         pq.write_table(telemetry_table(result.telemetry, arms), folder / "telemetry.parquet")
-        limits = result.scenario.limits
-        html = report_html(
-            run, result.telemetry, result.events, arms, warning_c=limits.warning_c, error_c=limits.error_c
-        )
+        limits = {"warning_c": result.scenario.limits.warning_c, "error_c": result.scenario.limits.error_c}
+        html = report_html(run, result.telemetry, result.events, arms, **limits)
         (folder / "report.html").write_text(html, encoding="utf-8")
 
 
 UNITS = {"q": "rad", "qd": "rad/s", "tau": "N·m", "current_a": "A", "temp_c": "°C"}
-"""Of the readings of each joint, also in the metadata of the columns."""
+"""Units of the readings of each joint, also in the metadata of the columns."""
 
 
 def telemetry_table(telemetry: Telemetry, arms: list[str]) -> pa.Table:
@@ -70,17 +64,15 @@ def telemetry_table(telemetry: Telemetry, arms: list[str]) -> pa.Table:
 
 
 def event_table(events: tuple[Event, ...]) -> pa.Table:
-    """One row per event, the fields of `Event` but for the env."""
-    rows: list[Mapping[str, Any]] = [{k: v for k, v in asdict(e).items() if k != "env"} for e in events]
-    schema = pa.schema(
-        [
-            ("time_s", pa.float64()),
-            ("kind", pa.string()),
-            ("arm", pa.string()),
-            ("job", pa.string()),
-            ("joint", pa.int8()),
-            ("value", pa.float64()),
-            ("reason", pa.string()),
-        ]
-    )
-    return pa.Table.from_pylist(rows, schema=schema)
+    """One row per event: the fields of `Event` without the env."""
+    number, text = pa.float64(), pa.string()
+    types = {
+        "time_s": number,
+        "kind": text,
+        "arm": text,
+        "job": text,
+        "joint": pa.int8(),
+        "value": number,
+        "reason": text,
+    }
+    return pa.table({name: pa.array([getattr(e, name) for e in events], kind) for name, kind in types.items()})

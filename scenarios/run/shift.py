@@ -31,7 +31,7 @@ _LIBRARIES = ("thermofleet", "numpy", "mujoco", "torch", "pettingzoo", "eclipse-
 
 @dataclass(frozen=True, kw_only=True)
 class RunSpec:
-    """What to run, apart from the fleet."""
+    """What to run, without the fleet."""
 
     policy: str
     seed: int = 0
@@ -39,12 +39,12 @@ class RunSpec:
     bus: BusName = "zenoh"
     difficulty: DifficultyName = "twin"
     channel: Channel = PERFECT
-    """What becomes of the arms' words on the way."""
+    """Topology, delay and loss of the arms' messages."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunResult:
-    """What came out of a shift."""
+    """Result of a shift."""
 
     spec: RunSpec
     scenario: Scenario
@@ -57,7 +57,7 @@ class RunResult:
     finished: bool
     """False if interrupted."""
     time_s: float
-    """How far the shift got."""
+    """Simulated time at the end."""
     total_reward: float
 
 
@@ -70,11 +70,11 @@ def run(
     record: bool = True,
     endpoint: str | None = None,
 ) -> RunResult:
-    """Work the shift; `stopped` turning true ends it early, between two steps, with what there is.
+    """Run one shift; once `stopped` returns True it ends early, between two steps.
 
     Args:
-        record: Keep telemetry; sweeps do without.
-        endpoint: Of a Zenoh router on loopback that others listen on too; by default the fleet has its own.
+        record: Keep telemetry.
+        endpoint: Zenoh router on loopback, for other listeners; by default the fleet has its own.
     """
     policy = policy_at(spec.policy, spec.seed)
     recorder = _Recorder(fleet.scenario) if record else None
@@ -115,7 +115,7 @@ def run(
 
 
 class _Recorder:
-    """Keeps how every step went, and reads the sensors a few times in each.
+    """Keeps the record of every step, and reads the sensors several times in each.
 
     Args:
         env: The environment of the shift; set before its reset.
@@ -150,12 +150,12 @@ class _Recorder:
 
 
 def scenario_hash(scenario: Scenario) -> str:
-    """Name of a scenario by its content."""
+    """Hash of a scenario's content."""
     return hashlib.sha256(msgspec.json.encode(scenario)).hexdigest()[:16]
 
 
 def summary(result: RunResult) -> dict[str, Any]:
-    """The content of run.json. Holds no clock time, so the same seed gives the same file."""
+    """The content of run.json. It holds no clock time, so the same seed gives the same file."""
     return {
         "format": RUN_FORMAT,
         "status": "finished" if result.finished else "interrupted",

@@ -22,7 +22,7 @@ from fleet.bus.protocol.messages import MalformedMessage
 from fleet.bus.protocol.registry import CHANNELS, MESSAGES, channel_of
 from fleet.bus.protocol.schemas import descriptions, schema_document
 from scenarios.cli.contract import documents
-from scenarios.cli.doc_tables import filled
+from scenarios.cli.doc_tables import fill_tables
 from scenarios.cli.main import app
 
 ROOT = Path(__file__).parents[2]
@@ -236,5 +236,5 @@ def test_stale_documents_are_named_and_made_anew(tmp_path):
     assert "old" not in page
     assert page.startswith("a\n")
     assert page.endswith("<!-- end -->\nz\n")
-    assert filled(page) == page
+    assert fill_tables(page) == page
     assert CliRunner().invoke(app, ["contract", "--check", "--out", str(out)]).exit_code == 0

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from fleet.engine.reward import TERMS, RewardWeights
 from fleet.observation import FIELDS, Layout
 from scenarios import make_batch, make_env
-from scenarios.cli.doc_tables import filled
+from scenarios.cli.doc_tables import fill_tables
 from scenarios.cli.main import app
 from scenarios.load import override
 
@@ -19,7 +19,7 @@ TEXT = PAGE.read_text(encoding="utf-8")
 
 
 def test_tables_are_current() -> None:
-    assert filled(TEXT) == TEXT, "write it anew with: thermofleet contract"
+    assert fill_tables(TEXT) == TEXT, "write it anew with: thermofleet contract"
 
 
 def test_the_command_reports_an_outdated_table(tmp_path) -> None:

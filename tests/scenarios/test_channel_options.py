@@ -6,7 +6,7 @@ import pytest
 
 from fleet.bus.exchange.channel import Channel, Partition
 from fleet.errors import FleetError
-from scenarios.cli.run import channel_of, parse_partition
+from scenarios.cli.options import channel_of, parse_partition
 from scenarios.load import load
 
 QUICK = ("--difficulty", "blind", "--policy", "least_difficulty")
@@ -25,7 +25,7 @@ def test_a_text_that_is_no_partition_is_refused(text):
 
 
 def test_options_make_a_channel(small_toml):
-    made = channel_of(load(small_toml), "ring", delay_s=3.0, partition=["0:10:left", "20:30:right"])
+    made = channel_of(load(small_toml), ["0:10:left", "20:30:right"], topology="ring", delay_s=3.0)
     cuts = (Partition(0.0, 10.0, (("left",),)), Partition(20.0, 30.0, (("right",),)))
     assert made == Channel(topology="ring", delay_s=3.0, partitions=cuts)
     assert channel_of(load(small_toml)).perfect
@@ -71,8 +71,8 @@ def test_a_run_records_its_channel_and_is_the_same_over_either_bus(thermofleet, 
 def test_a_comparison_says_what_lay_between(thermofleet, small_toml):
     call = ("compare", small_toml, "--difficulty", "blind", "--seeds", 2, "--policies", "round_robin")
     plain, hard = thermofleet(*call), thermofleet(*call, *HARD)
-    assert "Words travel" not in plain.out
-    said = "Words travel: line, 20 to 25 s late, 20 % lost, cut from 30 to 60 s."
+    assert "Channel" not in plain.out
+    said = "Channel: line, 20 to 25 s late, 20 % lost, cut from 30 to 60 s."
     assert said in " ".join(hard.out.split())
     assert json.loads(thermofleet(*call, *HARD, "--json").out)["channel"]["delay_s"] == 20.0
 

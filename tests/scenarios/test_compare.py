@@ -86,7 +86,7 @@ def test_equal_values_have_an_interval_of_no_width():
     ("changes", "sentence"),
     [
         ({"policies": ("rnd", "round_robin")}, "No policy 'rnd'; did you mean 'random'?"),
-        ({"policies": ("random", "random")}, "The policy 'random' is named twice"),
+        ({"policies": ("random", "random")}, "The policy 'random' is given twice"),
         ({"baseline": "coolest_first"}, "The baseline 'coolest_first' is not among the policies compared: random, "),
     ],
 )

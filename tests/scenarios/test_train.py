@@ -64,7 +64,7 @@ def test_validation_seeds_are_nobody_elses() -> None:
 
 def test_what_cannot_be_is_refused(tmp_path, capsys) -> None:
     for words, reason in (
-        (["--algo", "dqn"], "algorithm must be one of mappo, ippo"),
+        (["--algo", "dqn"], "No algorithm 'dqn'. Allowed: ippo, mappo."),
         (["--minutes", "0"], "minutes must be > 0"),
         (["--envs", "0"], "envs must be >= 1"),
         (["--threads", "0"], "--threads must be 1 or more"),

@@ -239,7 +239,7 @@ def test_an_identified_arm_is_told_whole_with_its_air_and_its_place_and_is_not_r
     before = (tmp_path / "rc" / "rc.json").read_bytes()
     again = thermofleet(*identify, "--ambient", 25)
     assert again.code == 2
-    assert "holds an identified arm; give another --out, or --overwrite to replace it." in again.err
+    assert "rc.json' exists; give another --out, or --overwrite to replace it." in again.err
     assert (tmp_path / "rc" / "rc.json").read_bytes() == before
     replaced = thermofleet(*identify, "--ambient", 25, "--overwrite")
     assert "Ambient temperature assumed: 25 °C.\n" in replaced.out
