@@ -3,9 +3,10 @@
 import os
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -247,3 +248,52 @@ def small() -> SimpleNamespace:
         HOT=HOT,
         PATH=__file__,
     )
+
+
+@pytest.fixture(scope="session")
+def three_arms() -> dict[str, Any]:
+    """A parsed scenario of three different arms, planned in a second and hot enough to fault; add a name and jobs."""
+    return {
+        "description": "Three different arms over their limits.",
+        "horizon_s": 900.0,
+        "slots": 4,
+        "ambient": {"points": [[0.0, 30.0], [900.0, 33.0]]},
+        "limits": {"warning_c": 34.5, "error_c": 35.0, "restart_c": 34.0, "clear_s": 15.0},
+        "start": "cold",
+        "arms": [
+            {"name": "left", "position_m": [-0.45, 0.0, 0.0]},
+            {"name": "right", "position_m": [0.45, 0.0, 0.0], "tilt_deg": [0.0, 0.0, 180.0], "wear": 0.3},
+            {"name": "far", "position_m": [0.0, 0.9, 0.55], "tilt_deg": [90.0, 0.0, 0.0]},
+        ],
+        "places": [
+            {"name": "bench", "position_m": [0.0, 0.2, 0.25]},
+            {"name": "shelf", "position_m": [0.0, -0.2, 0.25]},
+            {"name": "rack", "position_m": [0.0, 0.0, 0.3]},
+        ],
+        "planning": {"elbows": 1, "speeds": [1.0]},
+    }
+
+
+@pytest.fixture(scope="session")
+def job_streams() -> Callable[..., dict[str, dict[str, Any]]]:
+    """A function of job streams for `three_arms`, by name."""
+
+    def make(hold_until_s: float, sort_until_s: float | None, sort_due_s: float) -> dict[str, dict[str, Any]]:
+        stop = {} if sort_until_s is None else {"stop_s": sort_until_s}
+        return {
+            "hold": {
+                "name": "hold", "kind": "hold", "places": ["bench"], "payload_kg": [3.0, 4.0], "repetitions": [2, 4],
+                "dwell_s": 15.0, "arrivals": {"kind": "poisson", "every_s": 60.0, "stop_s": hold_until_s},
+                "value": 3.0, "due_s": 120.0,
+            },
+            "sort": {
+                "name": "sort", "kind": "sort", "places": ["shelf", "rack"], "payload_kg": [0.2, 0.5],
+                "repetitions": [1, 3], "arrivals": {"kind": "poisson", "every_s": 40.0, **stop}, "due_s": sort_due_s,
+            },
+            "check": {
+                "name": "check", "kind": "press", "places": ["rack"], "force_n": 20.0, "dwell_s": 4.0,
+                "arrivals": {"kind": "batch", "count": 3, "start_s": 60.0}, "after": ["sort"], "value": 2.0,
+            },
+        }  # fmt: skip
+
+    return make

@@ -176,43 +176,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def cell() -> Scenario:
+def cell(three_arms: dict[str, Any], job_streams) -> Scenario:
     """A cell of three arms, planned in a second, hot enough to fault."""
-    return parse_scenario(CELL, Path("cell.toml"))
-
-
-CELL: dict[str, Any] = {
-    "name": "cell",
-    "description": "Three arms, one of which cannot hold.",
-    "horizon_s": 600.0,
-    "slots": 4,
-    "ambient": {"points": [[0.0, 30.0], [600.0, 32.0]]},
-    "limits": {"warning_c": 34.5, "error_c": 35.0, "restart_c": 34.0, "clear_s": 15.0},
-    "start": "cold",
-    "arms": [
-        {"name": "left", "position_m": [-0.45, 0.0, 0.0]},
-        {"name": "right", "position_m": [0.45, 0.0, 0.0], "tilt_deg": [0.0, 0.0, 180.0], "wear": 0.3},
-        {"name": "far", "position_m": [0.0, 0.9, 0.55], "tilt_deg": [90.0, 0.0, 0.0]},
-    ],
-    "places": [
-        {"name": "bench", "position_m": [0.0, 0.2, 0.25]},
-        {"name": "shelf", "position_m": [0.0, -0.2, 0.25]},
-        {"name": "rack", "position_m": [0.0, 0.0, 0.3]},
-    ],
-    "jobs": [
-        {
-            "name": "hold", "kind": "hold", "places": ["bench"], "payload_kg": [3.0, 4.0], "repetitions": [2, 4],
-            "dwell_s": 15.0, "arrivals": {"kind": "poisson", "every_s": 60.0, "stop_s": 240.0}, "value": 3.0,
-            "due_s": 120.0,
-        },
-        {
-            "name": "sort", "kind": "sort", "places": ["shelf", "rack"], "payload_kg": [0.2, 0.5],
-            "repetitions": [1, 3], "arrivals": {"kind": "poisson", "every_s": 40.0, "stop_s": 200.0}, "due_s": 100.0,
-        },
-        {
-            "name": "check", "kind": "press", "places": ["rack"], "force_n": 20.0, "dwell_s": 4.0,
-            "arrivals": {"kind": "batch", "count": 3, "start_s": 60.0}, "after": ["sort"], "value": 2.0,
-        },
-    ],
-    "planning": {"elbows": 1, "speeds": [1.0]},
-}  # fmt: skip
+    streams = job_streams(hold_until_s=240.0, sort_until_s=200.0, sort_due_s=100.0)
+    own = {"name": "cell", "horizon_s": 600.0, "ambient": {"points": [[0.0, 30.0], [600.0, 32.0]]}}
+    return parse_scenario({**three_arms, **own, "jobs": list(streams.values())}, Path("cell.toml"))

@@ -19,52 +19,6 @@ from scenarios.run.shift import RunSpec, run
 SEEDS = (0, 3, 12)
 LATE = Channel(delay_s=25.0, loss=0.3)
 LIBRARY = sorted(path.stem for path in (Path(__file__).parents[2] / "scenarios" / "library").glob("*.toml"))
-HOT: dict[str, Any] = {
-    "name": "hot",
-    "description": "Three unlike arms over their limits: they fault, and are late.",
-    "horizon_s": 900.0,
-    "slots": 4,
-    "ambient": {"points": [[0.0, 30.0], [900.0, 33.0]]},
-    "limits": {"warning_c": 34.5, "error_c": 35.0, "restart_c": 34.0, "clear_s": 15.0},
-    "start": "cold",
-    "arms": [
-        {"name": "left", "position_m": [-0.45, 0.0, 0.0]},
-        {"name": "right", "position_m": [0.45, 0.0, 0.0], "tilt_deg": [0.0, 0.0, 180.0], "wear": 0.3},
-        {"name": "far", "position_m": [0.0, 0.9, 0.55], "tilt_deg": [90.0, 0.0, 0.0]},
-    ],
-    "places": [
-        {"name": "bench", "position_m": [0.0, 0.2, 0.25]},
-        {"name": "shelf", "position_m": [0.0, -0.2, 0.25]},
-        {"name": "rack", "position_m": [0.0, 0.0, 0.3]},
-    ],
-    "jobs": [
-        {
-            "name": "hold", "kind": "hold", "places": ["bench"], "payload_kg": [3.0, 4.0], "repetitions": [2, 4],
-            "dwell_s": 15.0, "arrivals": {"kind": "poisson", "every_s": 60.0, "stop_s": 400.0}, "value": 3.0,
-            "due_s": 120.0,
-        },
-        {
-            "name": "sort", "kind": "sort", "places": ["shelf", "rack"], "payload_kg": [0.2, 0.5],
-            "repetitions": [1, 3], "arrivals": {"kind": "poisson", "every_s": 40.0}, "due_s": 40.0,
-        },
-    ],
-    "planning": {"elbows": 1, "speeds": [1.0]},
-}  # fmt: skip
-IN_TURN: dict[str, Any] = HOT | {
-    "name": "in_turn",
-    "description": "One job waits for another, and all are done before the end.",
-    "limits": {},
-    "jobs": [
-        {
-            "name": "sort", "kind": "sort", "places": ["shelf", "rack"], "payload_kg": [0.2, 0.5],
-            "repetitions": [1, 3], "arrivals": {"kind": "poisson", "every_s": 40.0, "stop_s": 200.0}, "due_s": 30.0,
-        },
-        {
-            "name": "check", "kind": "press", "places": ["rack"], "force_n": 20.0, "dwell_s": 4.0,
-            "arrivals": {"kind": "batch", "count": 3, "start_s": 60.0}, "after": ["sort"], "value": 2.0,
-        },
-    ],
-}  # fmt: skip
 
 
 class Restless:
@@ -100,13 +54,23 @@ def fleet(request, plans: Path, tmp_path_factory: pytest.TempPathFactory) -> Fle
         path = tmp_path_factory.mktemp("small") / "small.toml"
         path.write_text(text.split('"""')[0], encoding="utf-8")
         return prepare(load(path), difficulty="blind", cache=plans)
-    given = {"hot": HOT, "in_turn": IN_TURN}[request.param]
-    return prepare(parse_scenario(given, Path(f"{request.param}.toml")), difficulty="oracle", cache=plans)
+    return request.getfixturevalue(request.param)
 
 
 @pytest.fixture(scope="module")
-def hot(plans: Path) -> Fleet:
-    return prepare(parse_scenario(HOT, Path("hot.toml")), difficulty="oracle", cache=plans)
+def hot(plans: Path, three_arms, job_streams) -> Fleet:
+    """Three arms over their limits: they fault, and are late."""
+    streams = job_streams(hold_until_s=400.0, sort_until_s=None, sort_due_s=40.0)
+    given = {**three_arms, "name": "hot", "jobs": [streams["hold"], streams["sort"]]}
+    return prepare(parse_scenario(given, Path("hot.toml")), difficulty="oracle", cache=plans)
+
+
+@pytest.fixture(scope="module")
+def in_turn(plans: Path, three_arms, job_streams) -> Fleet:
+    """One job waits for another, and all finish before the end."""
+    streams = job_streams(hold_until_s=0.0, sort_until_s=200.0, sort_due_s=30.0)
+    given = {**three_arms, "name": "in_turn", "limits": {}, "jobs": [streams["sort"], streams["check"]]}
+    return prepare(parse_scenario(given, Path("in_turn.toml")), difficulty="oracle", cache=plans)
 
 
 def own(kind: type) -> str:
@@ -140,11 +104,10 @@ def test_the_batch_gives_the_figures_of_each_shift_run_alone(fleet, policy) -> N
     check_equal(outcomes(fleet, policy, SEEDS), one_by_one(fleet, policy, SEEDS))
 
 
-def test_no_figure_of_these_shifts_is_trivial(hot, plans) -> None:
+def test_no_figure_of_these_shifts_is_trivial(hot, in_turn) -> None:
     found = outcomes(hot, "round_robin", SEEDS)
     assert all(min(each.faults, each.above_warning_min, 1.0 - each.availability) > 0 for each in found)
     assert 0 < sum(each.on_time for each in found) < sum(each.finished for each in found)
-    in_turn = prepare(parse_scenario(IN_TURN, Path("in_turn.toml")), difficulty="oracle", cache=plans)
     assert all(each.availability == 1 for each in outcomes(in_turn, "random", SEEDS))
     worked = run(in_turn, RunSpec(policy="random", seed=SEEDS[0], bus="memory"), record=False)
     assert worked.finished
