@@ -39,7 +39,7 @@ def jit(function: Function) -> Function:
 
 
 @jit_inline
-def nonnegative(index: Any) -> Any:
+def nonnegative(index: Any) -> Any:  # any integer type
     """Return the same index; the compiler then omits the check for negative indices."""
     return index & 0x7FFFFFFF
 
@@ -64,7 +64,7 @@ class Kernel:
     def interpreted(self) -> Callable[..., Any]:
         """The same in plain Python, without numba."""
 
-        def call(*arguments: Any) -> Any:
+        def call(*arguments: Any) -> Any:  # as the function
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # as compiled: integers wrap around
                 return self._function(*arguments)
 

@@ -30,7 +30,7 @@ def sets_of(layout: Layout, vectors: Tensor) -> Sets:
     Nothing depends on the number of arms or slots, nor on their order.
     """
     alike: Any = vectors  # a tensor is cut and shaped as an array is
-    o: Any = layout.read(alike, alike[..., :0])
+    o: Any = layout.read(alike, alike[..., :0])  # an Observation of tensors
     own = torch.stack(
         [o.clock, o.idle, o.working, o.faulted, _minutes(o.busy_s), o.last_award, o.headroom_k / 20.0], dim=-1
     )

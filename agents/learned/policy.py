@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -67,7 +67,7 @@ def draw(logits: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return (logits + rng.gumbel(size=logits.shape)).argmax(axis=-1)
 
 
-def save_policy(actor: Actor, size: NetworkSize, folder: Path, **told: Any) -> None:
+def save_policy(actor: Actor, size: NetworkSize, folder: Path, **told: object) -> None:
     """Write an actor into a folder, made if need be; files appear whole or not at all.
 
     Args:

@@ -188,7 +188,7 @@ class Trainer:
             },
             batch_size=[count],
         )
-        everything: Any = seen[SEEN]
+        everything: Any = seen[SEEN]  # a tensor; the stub allows any entry
         vectors, target = everything.flatten(0, 1), target.flatten(0, 1)
         batches = max(1, -(-count // config.minibatch))
         told: list[tuple[float, float, float]] = []
@@ -206,7 +206,7 @@ class Trainer:
     def _step(
         self, chosen: TensorDictBase, rows: Tensor, vectors: Tensor, target: Tensor
     ) -> tuple[float, float, float]:
-        losses: Any = self._loss(chosen[rows])
+        losses: Any = self._loss(chosen[rows])  # a TensorDict of tensors
         value_loss = nn.functional.smooth_l1_loss(self.critic(self.layout, vectors), target)
         loss = losses["loss_objective"] + losses["loss_entropy"] + value_loss
         self.optimizer.zero_grad()
@@ -222,7 +222,7 @@ class Trainer:
         A shift's end, also that at the horizon, is an end: the clock is in the observation.
         """
         values = self.critic(self.layout, seen[SEEN])
-        afterwards: Any = seen["next", *SEEN]
+        afterwards: Any = seen["next", *SEEN]  # a tensor; the stub allows any entry
         last = self.critic(self.layout, afterwards[:, -1:])
         following = torch.cat([values[:, 1:], last], dim=1)  # what comes after an end does not count
         done = seen["next", "done"].expand(*values.shape)

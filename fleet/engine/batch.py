@@ -175,7 +175,7 @@ class Engine:
         return self._simulation.offers.unfinished
 
     @property
-    def events(self) -> Any:
+    def events(self) -> Any:  # numba's where the loops are compiled
         """The `EventBuffer` of the last step."""
         return self._simulation.events
 

@@ -5,8 +5,6 @@ release; a job that a fault returned queues again at the end, so it does not blo
 job or station the lower shared difficulty wins, then the lower arm index.
 """
 
-from typing import Any
-
 import numpy as np
 
 from fleet.engine.event_log import AWARD, ILLEGAL, LOST, record_event
@@ -65,7 +63,7 @@ def update_offers(t: Tables, d: Jobs, s: State, o: OpenJobs, rows: Array) -> Non
 
 
 @jit_inline
-def mark_busy_stations(fleet: Any, e: int, current: Array, stations: Array, busy: Array) -> None:
+def mark_busy_stations(fleet: int, e: int, current: Array, stations: Array, busy: Array) -> None:
     """Put the stations of an env with an arm at work into `busy`, one bit each, uint64 [word]."""
     for w in range(len(busy)):
         busy[w] = 0

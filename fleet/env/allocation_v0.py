@@ -284,7 +284,7 @@ def _table(world: World, state: State) -> str:
     return "\n".join(rows)
 
 
-def parallel_env(make_episode: EpisodeFactory, **options: Any) -> AllocationEnv:
+def parallel_env(make_episode: EpisodeFactory, **options: Any) -> AllocationEnv:  # passed on
     """The `ParallelEnv`; options as in `AllocationEnv`."""
     return AllocationEnv(make_episode, **options)
 
@@ -292,7 +292,7 @@ def parallel_env(make_episode: EpisodeFactory, **options: Any) -> AllocationEnv:
 class InTurns(parallel_to_aec_wrapper[str, Any, Any]):
     """The same for agents that act one after the other; the step is made when the last of them has answered."""
 
-    def step(self, action: Any) -> None:
+    def step(self, action: Any) -> None:  # as PettingZoo has it
         """One agent's answer.
 
         Raises:
@@ -308,11 +308,11 @@ class InTurns(parallel_to_aec_wrapper[str, Any, Any]):
         super().step(action)
 
 
-def raw_env(make_episode: EpisodeFactory, **options: Any) -> AECEnv[str, Any, Any]:
+def raw_env(make_episode: EpisodeFactory, **options: Any) -> AECEnv[str, Any, Any]:  # passed on
     """The same as an `AECEnv`, without wrappers."""
     return InTurns(parallel_env(make_episode, **options))
 
 
-def env(make_episode: EpisodeFactory, **options: Any) -> AECEnv[str, Any, Any]:
+def env(make_episode: EpisodeFactory, **options: Any) -> AECEnv[str, Any, Any]:  # passed on
     """The same as an `AECEnv`, with PettingZoo's order check."""
     return wrappers.OrderEnforcingWrapper(raw_env(make_episode, **options))

@@ -1,7 +1,7 @@
 """Seeds, counts and actions as callers give them, checked alike wherever they are given."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TypeGuard
 
 import numpy as np
 
@@ -9,7 +9,7 @@ _LARGEST = 2**62
 _INT64 = np.iinfo(np.int64)
 
 
-def seed_of(seed: Any) -> np.random.SeedSequence:
+def seed_of(seed: object) -> np.random.SeedSequence:
     """The seed of a shift, of any size.
 
     Raises:
@@ -20,7 +20,7 @@ def seed_of(seed: Any) -> np.random.SeedSequence:
     return np.random.SeedSequence(int(seed))
 
 
-def seeds_of(seed: Any, envs: int) -> list[np.random.SeedSequence]:
+def seeds_of(seed: object, envs: int) -> list[np.random.SeedSequence]:
     """The seeds of a batch: counted up from one, or one each, or by chance where there is none.
 
     Raises:
@@ -35,7 +35,7 @@ def seeds_of(seed: Any, envs: int) -> list[np.random.SeedSequence]:
     raise ValueError(f"seed must be one integer or one for each of {envs} envs (got {seed!r}).")
 
 
-def at_least_one(name: str, value: Any) -> int:
+def at_least_one(name: str, value: object) -> int:
     """A count.
 
     Raises:
@@ -46,7 +46,7 @@ def at_least_one(name: str, value: Any) -> int:
     return int(value)
 
 
-def switch(name: str, value: Any) -> bool:
+def switch(name: str, value: object) -> bool:
     """A choice of yes or no.
 
     Raises:
@@ -57,7 +57,7 @@ def switch(name: str, value: Any) -> bool:
     return bool(value)
 
 
-def actions_of(agents: Sequence[str], actions: Any) -> np.ndarray:
+def actions_of(agents: Sequence[str], actions: object) -> np.ndarray:
     """What each agent does, int64 [agent]; one that is left out waits.
 
     Raises:
@@ -76,7 +76,7 @@ def actions_of(agents: Sequence[str], actions: Any) -> np.ndarray:
     return chosen
 
 
-def agent_of(agents: Sequence[str], agent: Any) -> Any:
+def agent_of(agents: Sequence[str], agent: object) -> str:
     """An agent that is there.
 
     Raises:
@@ -84,10 +84,10 @@ def agent_of(agents: Sequence[str], agent: Any) -> Any:
     """
     if agent not in agents:
         raise ValueError(f"No agent '{agent}' in this fleet. Agents: {', '.join(agents)}.")
-    return agent
+    return str(agent)
 
 
-def _integer(agent: str, action: Any) -> int:
+def _integer(agent: str, action: object) -> int:
     if type(action) is int and abs(action) <= _LARGEST:
         return action
     value = np.asarray(action)
@@ -101,11 +101,11 @@ def _integer(agent: str, action: Any) -> int:
     return number
 
 
-def _too_large(agent: str, action: Any) -> str:
+def _too_large(agent: str, action: object) -> str:
     return f"The action of '{agent}' must be one integer of 64 bits with sign (got {action!r})."
 
 
-def _whole(value: Any) -> bool:
+def _whole(value: object) -> TypeGuard[int]:
     """Whether it is one integer, of Python or NumPy."""
     if isinstance(value, int):
         return not isinstance(value, bool)

@@ -96,14 +96,14 @@ def read_diagnostics(payload: bytes) -> tuple[Diagnostic, ...]:
     )
 
 
-def _read(payload: bytes, kind: str) -> Any:
+def _read(payload: bytes, kind: str) -> Any:  # rosbags makes its classes at run time
     try:
         return _STORE.deserialize_cdr(payload, kind)
     except SerdeError as error:
         raise MalformedMessage(f"Not a {kind}: {error}") from error
 
 
-def _header(time_s: float) -> Any:
+def _header(time_s: float) -> Any:  # see _read
     sec, nanosec = divmod(round(time_s * _NS), _NS) if abs(time_s) < 2**32 else (_SECONDS.stop, 0)
     if sec not in _SECONDS:
         raise ValueError(f"ROS 2 tells times from {_SECONDS[0]} s to {_SECONDS[-1]} s (got {time_s:g}).")

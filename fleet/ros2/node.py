@@ -109,6 +109,7 @@ class Node:
             if sample.kind == zenoh.SampleKind.PUT:
                 handle(str(sample.key_expr).rpartition("/")[2], sample.payload.to_bytes())
 
+        # The stub of zenoh types handlers by their internals.
         direct: Any = zenoh.handlers.Callback(came, indirect=False)
         subscriber = self._open().declare_subscriber(topic.any_hash, direct)
         self._resources.callback(lambda: subscriber)

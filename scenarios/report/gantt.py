@@ -86,7 +86,7 @@ def _work_bars(plan: Schedule, events: Sequence[Event], arms: Sequence[str], uni
     ]
 
 
-def _bars(name: str, spans: Sequence[tuple[int, float, float, str]], unit_s: float, **marker: Any) -> Trace:
+def _bars(name: str, spans: Sequence[tuple[int, float, float, str]], unit_s: float, **marker: object) -> Trace:
     """Horizontal bars from (row, start_s, end_s, hover text)."""
     return {
         "type": "bar",

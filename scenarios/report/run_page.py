@@ -159,7 +159,7 @@ def _provenance(run: Mapping[str, Any]) -> str:
     return f"<details><summary>Provenance and all figures</summary>{table((), rows)}</details>"
 
 
-def _plain(value: Any) -> str:
+def _plain(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, Mapping):

@@ -394,6 +394,6 @@ class BusClient:
             query.reply(own_key, encode(reply), encoding=encoding(type(reply)))
 
 
-def _direct(handle: Callable[[Any], None]) -> Any:
+def _direct(handle: Callable[[Any], None]) -> Any:  # as above
     """A handler on Zenoh's receiving thread itself: it only enqueues, so a Python thread between would only cost."""
     return zenoh.handlers.Callback(handle, indirect=False)

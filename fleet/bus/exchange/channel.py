@@ -169,7 +169,7 @@ class Channel:
 
     def described(self) -> dict[str, Any]:
         """The channel as JSON values, for a recording."""
-        topology: Any = self.topology if isinstance(self.topology, str) else _edges(self.topology)
+        topology: object = self.topology if isinstance(self.topology, str) else _edges(self.topology)
         drawn = {"radius": self.radius, "topology_seed": self.topology_seed}
         return {
             "topology": topology,

@@ -42,7 +42,8 @@ class DispatcherEnv(gymnasium.Env[Observation, Array]):
         self.env = env = check_env("DispatcherEnv", env)
         self.arms = tuple(env.possible_agents)
         self.observation_space = dispatcher_space(arm_space(env, self.arms[0]), len(self.arms))
-        discrete: Any = env.action_space(self.arms[0])  # Discrete
+        discrete = env.action_space(self.arms[0])
+        assert isinstance(discrete, spaces.Discrete)
         actions = int(discrete.n)
         self.action_space = spaces.MultiDiscrete([actions] * len(self.arms))
         self.render_mode = getattr(env, "render_mode", None)

@@ -144,7 +144,7 @@ def _compute(chapter: Chapter[Subject], subject: Subject, cache: SectionCache | 
     return section
 
 
-def plain(value: Any) -> Any:
+def plain(value: Any) -> Any:  # JSON
     """Plain JSON values: NaN becomes null, NumPy scalars and arrays become numbers and lists."""
     if isinstance(value, dict):
         return {str(key): plain(inner) for key, inner in value.items()}
