@@ -228,7 +228,7 @@ def hold_command(
     posture: Annotated[
         str, typer.Option(help=f"{', '.join(POSTURES)}, or seven comma-separated angles in degrees.")
     ] = "outstretched",
-    ambient: Annotated[float, typer.Option(help="Air around the arm, °C.")] = 25.0,
+    ambient: Annotated[float, typer.Option(help="Ambient temperature, °C.")] = 25.0,
     json_: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
     cooling: Annotated[str, typer.Option(help=f"{', '.join(get_args(Cooling))}.")] = "still_air",
     tool_kg: Annotated[float, typer.Option(help="Mass of the gripper at the flange, kg.")] = 0.0,
