@@ -43,7 +43,7 @@ def auction_command(
     endpoint: EndpointOption = ENDPOINT,
     fleet: Annotated[str, typer.Option(help="Name of the fleet; default: the scenario's name.")] = "",
 ) -> None:
-    """Auction jobs to the arms of a fleet, keep its time, and hold what was promised on disk."""
+    """Auction jobs to the arms of a fleet, keep its time, and record awards in a journal."""
     from fleet.bus.client.client import BusClient
     from fleet.live.auction.journal_records import AuctionRecord
     from fleet.live.auction.lease_timing import Timing
