@@ -15,8 +15,8 @@ from fleet.bus.protocol.schemas import Schema, descriptions, schemas
 from fleet.engine.reward import RewardWeights
 from fleet.errors import FleetError
 from fleet.live.arm.award_executor import COMMIT_RETRY_S, RENEWALS, REPORT_RETRY_S, ExecutorConfig
-from fleet.live.auction.admission import MOST_JOBS as MOST_KEPT
-from fleet.live.auction.lease_timing import DRIFT, Timing
+from fleet.live.auction.job_rules import MAX_KEPT_JOBS
+from fleet.live.auction.round import DRIFT, Timing
 from fleet.live.monitor.snapshot import FRESH_S
 from fleet.observation import FIELDS, Layout
 
@@ -219,7 +219,7 @@ def limit_table() -> str:
             "`state` messages of one session; the router drops more (`--state-hz`)",
         ),
         (f"{MOST_JOBS}", "jobs in one message; of more, a `Status` holds those that may still change first"),
-        (f"{MOST_KEPT:,}", "jobs that one auctioneer keeps, finished ones included"),
+        (f"{MAX_KEPT_JOBS:,}", "jobs that one auctioneer keeps, finished ones included"),
         (f"{longest}", "characters of a job's name"),
     ]
     return table(("limit", "of"), rows)

@@ -31,10 +31,9 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.errors import JournalFull
 from fleet.live.auction.auctioneer import Auctioneer, SendAward
-from fleet.live.auction.journal_records import AuctionRecord, Closed, Started
-from fleet.live.auction.lease_timing import Timing
-from fleet.live.auction.ledger import Ledger
-from fleet.live.auction.round import Allocate
+from fleet.live.auction.ledger import AuctionRecord, Ledger
+from fleet.live.auction.round import Allocate, Timing
+from fleet.live.journal_records import Closed, Started
 
 VALID_S = 2.0
 TIMING = Timing(lease_s=3.0, margin_s=0.05, window_s=0.5, ack_s=0.5, max_jobs=8)
@@ -217,7 +216,7 @@ class ModelFleet:
             ledger,
             allocate=self.allocate,
             keep=self.keep,
-            life=str(self.lives),
+            boot=str(self.lives),
             real_s=self.real_s,
             timing=self.timing,
         )
@@ -227,7 +226,7 @@ class ModelFleet:
             raise JournalFull("no room")
         self.journal.extend(records)
         awards = self.auctioneer.ledger.awards
-        self.doubtful |= {awards[r.award].made.job for r in records if isinstance(r, Closed) and r.unsure}
+        self.doubtful |= {awards[r.award].record.job for r in records if isinstance(r, Closed) and r.unsure}
         if self.kill_next:
             raise Killed
 
@@ -359,7 +358,7 @@ class ModelFleet:
         ledger = self.auctioneer.ledger
         states = {status.job: status.state for status in self.auctioneer.status()}
         for job, state in states.items():
-            blocked = any(states[before] != "finished" for before in ledger.jobs[job].word.after)
+            blocked = any(states[before] != "finished" for before in ledger.jobs[job].spec.after)
             expected = "unfinished" if job in self.doubtful else "waiting" if blocked else "finished"
             assert state == expected or (job in self.doubtful and state == "finished"), f"'{job}' is {state}"
 

@@ -37,13 +37,12 @@ from fleet.bus.protocol.auction import (
     SubmissionReply,
 )
 from fleet.bus.protocol.messages import State, encode
-from fleet.errors import BusError, JournalFull
+from fleet.errors import BusError, JournalFull, Refused
 from fleet.live import journal
 from fleet.live.auction import node as auction_node
-from fleet.live.auction.auctioneer import Objection
-from fleet.live.auction.journal_records import AuctionRecord
+from fleet.live.auction.job_rules import statuses_that_fit
+from fleet.live.auction.ledger import AuctionRecord
 from fleet.live.auction.node import AuctionNode
-from fleet.live.auction.status_message import statuses_that_fit
 from fleet.live.journal import Journal
 from fleet.live.monitor.listener import FleetListener
 
@@ -228,7 +227,7 @@ def test_a_fleet_has_one_auctioneer(bus, token_reaches):
     # While the second one asks, the first is not served, as if it stood still: its token tells.
     with pytest.raises(BusError, match=r"has an auctioneer already: 'one'. A fleet has one"):
         bus.auctioneer("two")
-    with pytest.raises(BusError, match=r"has an auctioneer 'one' already: its token is there. Stop that one first"):
+    with pytest.raises(BusError, match=r"has an auctioneer 'one' already: its token is present. Stop that one first"):
         bus.auctioneer("one", folder="elsewhere")
     bus.kill(node)
     assert states(bus.auctioneer("one")) == []
@@ -238,7 +237,7 @@ def test_one_that_answers_and_shows_no_token_yet_is_an_auctioneer_too(bus, token
     early = bus.link()
     early.reply_to(keys.of_jobs("f", "status"), StatusRequest, lambda _: Status("one", 0.0, ()))
     early.watch_tokens(keys.of_every_arm("f", "alive"), lambda *_: None)
-    with pytest.raises(BusError, match="has an auctioneer already, which does not answer"):
+    with pytest.raises(BusError, match="has an auctioneer already, which does not reply"):
         bus.auctioneer("two")
     stop = threading.Event()
 
@@ -254,7 +253,7 @@ def test_one_that_answers_and_shows_no_token_yet_is_an_auctioneer_too(bus, token
         with bus.link() as arm:
             arm.declare_token(keys.of_arm("f", "one", "alive"))
             token_reaches(early, keys.of_arm("f", "one", "alive"))
-            with pytest.raises(BusError, match=r"share the jobs out themselves; 'one' answers .* Stop them first"):
+            with pytest.raises(BusError, match=r"allocate the jobs themselves; 'one' replies .* Stop them first"):
                 bus.auctioneer("two")
     finally:
         stop.set()
@@ -263,7 +262,7 @@ def test_one_that_answers_and_shows_no_token_yet_is_an_auctioneer_too(bus, token
 
 def test_two_auctioneers_are_both_seen_and_do_nothing_together(bus, monkeypatch):
     """Two may come together after a cut: neither saw the other when it began."""
-    monkeypatch.setattr(AuctionNode, "_refuse_a_second", lambda self: None)
+    monkeypatch.setattr(AuctionNode, "_check_no_auctioneer", lambda self: None)
     one, two = bus.auctioneer("one"), bus.auctioneer("two")
     arm = bus.arm("arm_0")
     bus.until(lambda: one.rivals == {"two"} and two.rivals == {"one"} and one.present == {"arm_0"})
@@ -271,9 +270,9 @@ def test_two_auctioneers_are_both_seen_and_do_nothing_together(bus, monkeypatch)
     assert not answers.messages
     assert (
         sorted(answers.refused.values())
-        == ["Fleet 'f' has more than one auctioneer (one, two): no jobs are taken until one is stopped."] * 2
+        == ["Fleet 'f' has more than one auctioneer (one, two): no jobs are accepted until one is stopped."] * 2
     )
-    with pytest.raises(Objection, match="more than one auctioneer"):
+    with pytest.raises(Refused, match="more than one auctioneer"):
         one.submit(Submission(jobs("a")))
     status = bus.ask(keys.of_jobs("f", "status"), StatusRequest(), Status)
     assert sorted(word.auctioneer for word in status.messages.values()) == ["one", "two"]
@@ -287,14 +286,14 @@ def test_two_auctioneers_are_both_seen_and_do_nothing_together(bus, monkeypatch)
 
 def test_two_auctioneers_of_one_name_see_each_other_and_do_nothing_together(bus, monkeypatch):
     """Begun in the same moment, neither saw the other when it looked, and their tokens are one."""
-    monkeypatch.setattr(AuctionNode, "_refuse_a_second", lambda self: None)
+    monkeypatch.setattr(AuctionNode, "_check_no_auctioneer", lambda self: None)
     one, two = bus.auctioneer("one"), bus.auctioneer("one", folder="elsewhere")
     for node in (one, two):  # before any of them was served
         node.submit(Submission(jobs("a")))
     arm = bus.arm("arm_0")
     bus.until(lambda: one.rivals == two.rivals == {"one"} and one.present == two.present == {"arm_0"})
-    told = "Fleet 'f' has more than one auctioneer (one, one): no jobs are taken until one is stopped."
-    with pytest.raises(Objection, match=re.escape(told)):
+    told = "Fleet 'f' has more than one auctioneer (one, one): no jobs are accepted until one is stopped."
+    with pytest.raises(Refused, match=re.escape(told)):
         one.submit(Submission(jobs("b")))
     bus.until(partial(later, time.monotonic() + 0.5))
     assert states(one) == states(two) == ["waiting"]
@@ -308,7 +307,7 @@ def test_one_that_does_not_hear_itself_is_not_sure_to_be_alone(bus, monkeypatch)
     """It awards nothing before its first look at who answers, nor long after its last."""
     alone = bus.auctioneer("one")
     arm = bus.arm("arm_0")
-    monkeypatch.setattr(AuctionNode, "_call_roll", lambda self, real_s: None)
+    monkeypatch.setattr(AuctionNode, "_check_rivals", lambda self, real_s: None)
     alone.submit(Submission(jobs("a")))
     bus.until(lambda: alone.present == {"arm_0"})
     bus.until(partial(later, time.monotonic() + 0.3))
@@ -322,7 +321,7 @@ def test_one_that_does_not_hear_itself_is_not_sure_to_be_alone(bus, monkeypatch)
 
 
 def test_what_was_taken_before_a_second_auctioneer_came_is_awarded_by_nobody_meanwhile(bus, monkeypatch):
-    monkeypatch.setattr(AuctionNode, "_refuse_a_second", lambda self: None)
+    monkeypatch.setattr(AuctionNode, "_check_no_auctioneer", lambda self: None)
     one = bus.auctioneer("one")
     one.submit(Submission(jobs("a")))
     two = bus.auctioneer("two")
@@ -389,7 +388,7 @@ def test_a_journal_is_shortened_at_the_start_and_when_it_has_grown(bus, monkeypa
     again = bus.auctioneer()
     assert [type(record).__name__ for record in again.journal.records()] == ["LedgerSnapshot", "Started"]
     assert states(again) == ["finished"]
-    monkeypatch.setattr(auction_node, "TICK_S", 0.01)
+    monkeypatch.setattr(journal, "TICK_S", 0.01)
     monkeypatch.setattr(journal, "COMPACT_BYTES", 1)
     before = again.journal.size
     bus.kill(again)

@@ -14,8 +14,7 @@ from fleet.bus.protocol.auction import (
     Report,
     Submission,
 )
-from fleet.errors import JournalFull
-from fleet.live.auction.auctioneer import Objection
+from fleet.errors import JournalFull, Refused
 
 
 @pytest.fixture
@@ -126,7 +125,7 @@ def test_a_report_on_the_award_of_another_is_refused(fleet_of):
     bid(fleet, hold("a"))
     (award,) = under_way(fleet, Award)
     lie = Report("arm_1", award.award, "a", "finished", 3, 1.0)
-    with pytest.raises(Objection, match="is of 'a' to 'arm_0', not of 'a' to 'arm_1'"):
+    with pytest.raises(Refused, match="is of 'a' to 'arm_0', not of 'a' to 'arm_1'"):
         fleet.auctioneer.apply_report(lie, fleet.real_s, fleet.true_s)
     assert fleet.auctioneer.status()[0].state == "awarded"
 

@@ -12,7 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet.errors import FleetError, JournalError, JournalFull
-from fleet.live.journal import Journal
+from fleet.live import journal
+from fleet.live.consensus.granter import GrantRecord, Register
+from fleet.live.journal import Journal, TimeRecorder
 
 ROOT = Path(__file__).parents[2]
 
@@ -338,3 +340,17 @@ def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(JournalError, match="cannot be opened"):
         Journal(tmp_path / "file" / "j", KIND).open()
+
+
+def test_fleet_time_never_runs_backwards_after_a_restart(tmp_path, monkeypatch):
+    """Not even if the journal was compacted after the last job event."""
+    monkeypatch.setattr(journal, "COMPACT_BYTES", 1)
+    with Journal[GrantRecord](tmp_path / "j", GrantRecord) as book:
+        recorder = TimeRecorder(book, Register(), real_s=0.0)
+        assert recorder.start_s(speed=60.0) == 0.0
+        for real_s in range(1, 30):
+            recorder.step(float(real_s), 60.0 * real_s)
+        assert len(list(book.records())) < 10
+    with Journal[GrantRecord](tmp_path / "j", GrantRecord) as book:
+        again = TimeRecorder(book, Register().replay(book.records()), real_s=0.0)
+        assert 29 * 60.0 <= again.start_s(speed=60.0) <= 31 * 60.0

@@ -8,19 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet.bus.protocol.auction import JobSpec
-from fleet.live.auction.admission import admit
-from fleet.live.auction.journal_records import (
-    AuctionRecord,
-    Awarded,
-    ClockTick,
-    Closed,
-    CommitPermitted,
-    ContactLost,
-    ContactRegained,
-    JobsAccepted,
-    ShiftEnded,
-)
-from fleet.live.auction.ledger import Ledger
+from fleet.live.auction.job_rules import admit
+from fleet.live.auction.ledger import AuctionRecord, Awarded, ContactLost, ContactRegained, Ledger, ShiftEnded
+from fleet.live.journal_records import ClockTick, Closed, CommitPermitted, JobsAccepted
 
 
 def word(name: str, *after: str, place: str = "rack", **changes) -> JobSpec:
@@ -51,7 +41,7 @@ def test_the_same_job_again_is_taken_and_another_of_its_name_is_not():
     assert twice.accepted
     assert not other.accepted
     assert not third.accepted
-    assert other.reason == "Another job is called 'a' already; one name is one job."
+    assert other.reason == "Another job has the name 'a'; names must be unique."
 
 
 def test_jobs_handed_in_together_may_wait_for_each_other_in_any_order():
@@ -61,8 +51,8 @@ def test_jobs_handed_in_together_may_wait_for_each_other_in_any_order():
 def test_who_waits_for_what_will_never_be_is_refused_with_the_reason():
     words = [word("a", "nobody"), word("b", "a"), word("c", "d"), word("d", "c"), word("e", "e"), word("f")]
     a, b, c, d, e, f = admit(words, {})
-    assert a.reason == "It waits for 'nobody', which is not there or was not taken."
-    assert b.reason == "It waits for 'a', which is not taken either."
+    assert a.reason == "It waits for 'nobody', which is unknown or was not accepted."
+    assert b.reason == "It waits for 'a', which is not accepted either."
     assert c.reason == "Jobs wait for each other in a ring: c → d → c."
     assert d.reason == "Jobs wait for each other in a ring: d → c → d."
     assert e.reason == "Jobs wait for each other in a ring: e → e."
@@ -72,13 +62,13 @@ def test_who_waits_for_what_will_never_be_is_refused_with_the_reason():
 def test_an_unknown_place_is_refused_and_takes_its_followers_with_it():
     first, second = admit([word("a", place="moon"), word("b", "a")], {}, places=frozenset({"rack", "bin"}))
     assert first.reason == "No place 'moon' in this cell. Places: bin, rack."
-    assert second.reason == "It waits for 'a', which is not there or was not taken."
+    assert second.reason == "It waits for 'a', which is unknown or was not accepted."
 
 
 def test_no_more_jobs_than_there_is_room_for():
-    admissions = admit([word("b"), word("c"), word("a")], {"a": word("a")}, most=2)
+    admissions = admit([word("b"), word("c"), word("a")], {"a": word("a")}, limit=2)
     assert [a.accepted for a in admissions] == [True, False, True]
-    assert admissions[1].reason == "There are 2 jobs already, and more are not taken."
+    assert admissions[1].reason == "There are 2 jobs already; no more are accepted."
 
 
 @settings(max_examples=200, deadline=None)
@@ -153,7 +143,7 @@ def test_silence_after_leave_is_unfinished_until_heard_of():
     assert (status.state, status.arm) == ("unfinished", "arm_0")
     assert "0:a" in book.open
     assert book.ready(99.0, 9) == []
-    assert book.taken() == frozenset()
+    assert book.busy_stations() == frozenset()
     book.apply(ContactRegained("0:a", 9.0))
     assert book.status()[0].state == "finishing"
     book.apply(Closed("0:a", "finished", 4, 9.5))
@@ -224,7 +214,7 @@ def next_record(book: Ledger, job: str, choice: int, time_s: int):
 @given(steps)
 def test_the_journal_alone_makes_the_same_ledger_again(steps):
     """Any life of three jobs: replayed in one go it gives the same states, and the same numbers on its changes."""
-    book, written, said = begun(), [JobsAccepted(tuple(e.word for e in begun().jobs.values()), "test", 0.0)], []
+    book, written, said = begun(), [JobsAccepted(tuple(e.spec for e in begun().jobs.values()), "test", 0.0)], []
     for time_s, (job, choice) in enumerate(steps, start=1):
         written.append(next_record(book, job, choice, time_s))
         said.extend(book.apply(written[-1]))
@@ -299,3 +289,39 @@ def test_what_stands_for_a_week_is_short():
             book.apply(ClockTick(float(i)))
     assert len(book.awards) == 3000
     assert len(book.compact()[0].awards) == 300
+
+
+FIRST_VERSION = """[
+{"type": "ledger_snapshot", "time_s": 7.0, "number": 8, "ended": false, "jobs": [
+  {"word": {"name": "a", "kind": "hold", "places": ["rack"], "repetitions": 4}, "by": "test", "state": "awarded",
+   "award": "s:a", "cycles": 3, "finished_s": null, "reason": "", "returns": 1, "returned_s": 6.0}],
+ "awards": [
+  {"made": {"type": "awarded", "award": "r:a", "auction": "r", "job": "a", "arm": "arm_0", "quote": "q", "cycles": 0,
+    "time_s": 2.0, "difficulty": 0.5, "p_saturation": 0.1},
+   "may_commit": true, "silent": false, "outcome": "returned"},
+  {"made": {"type": "awarded", "award": "s:a", "auction": "s", "job": "a", "arm": "arm_1", "quote": "q", "cycles": 3,
+    "time_s": 7.0, "difficulty": null, "p_saturation": null}, "may_commit": false, "silent": false, "outcome": ""}],
+ "open": ["s:a"],
+ "recent": [{"number": 7, "time_s": 7.0, "auction": "s", "difficulty": null, "p_saturation": null, "status": {
+  "job": "a", "state": "awarded", "arm": "arm_1", "award": "s:a", "cycles": 3, "finished_s": null, "reason": ""}}]},
+{"type": "started", "name": "auctioneer", "time_s": 9.0, "boot": 0},
+{"type": "jobs_accepted", "by": "test", "time_s": 9.5, "jobs": [
+  {"name": "b", "kind": "hold", "places": ["bin"], "after": ["a"]}]},
+{"type": "clock_tick", "time_s": 10.0},
+{"type": "commit_permitted", "award": "s:a", "time_s": 11.0},
+{"type": "contact_lost", "award": "s:a", "time_s": 12.0},
+{"type": "contact_regained", "award": "s:a", "time_s": 13.0},
+{"type": "closed", "award": "s:a", "outcome": "finished", "cycles": 4, "time_s": 14.0, "reason": "", "unsure": false,
+ "job": "", "arm": ""},
+{"type": "shift_ended", "time_s": 15.0}]"""
+
+
+def test_records_of_the_first_version_are_readable():
+    records = msgspec.json.decode(FIRST_VERSION, type=list[AuctionRecord])
+    book = Ledger().replay(records)
+    assert {status.job: (status.state, status.arm) for status in book.status()} == {
+        "a": ("finished", "arm_1"),
+        "b": ("unfinished", ""),
+    }
+    assert (book.time_s, book.number, book.recent[0].status.state) == (15.0, 14, "awarded")
+    assert msgspec.json.decode(msgspec.json.encode(records)) == msgspec.json.decode(FIRST_VERSION)

@@ -109,7 +109,7 @@ def seat(path: Path, membership: "Membership") -> Iterator[Any]:
     with Journal[GrantRecord](path, GrantRecord) as book:
 
         def take_seat(worker: "LiveArm", life: int) -> "ConsensusNode":
-            return ConsensusNode(worker, membership, book, life=life)
+            return ConsensusNode(worker, membership, book, boot=life)
 
         yield take_seat
 

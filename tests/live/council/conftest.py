@@ -12,14 +12,13 @@ import pytest
 
 from agents.consensus import Consensus
 from fleet.bus.protocol.auction import JobEstimate, JobSpec
-from fleet.errors import JournalFull
+from fleet.errors import JournalFull, Refused
 from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
 from fleet.live.arm.journal_records import ArmHistory
-from fleet.live.auction.auctioneer import Objection
 from fleet.live.auction.knowledge import LiveFleet
-from fleet.live.auction.lease_timing import Timing
+from fleet.live.auction.round import Timing
 from fleet.live.consensus.granter import Granter, Register
-from fleet.live.consensus.participant import ArmInterface, Participant
+from fleet.live.consensus.participant import ArmInterface, Membership, Participant
 
 TIMING = Timing(lease_s=3.0, margin_s=0.05, window_s=0.3, pause_s=(0.2, 1.0))
 CYCLE_S = 0.2
@@ -72,19 +71,21 @@ class Arm:
         self.executor = AwardExecutor(self.name, self.promises.keep, history, nonce="n", config=config)
         granter = Granter(self.name, self.fleet.names, register, self.grants.keep, real_s=self.real_s, timing=TIMING)
         interface = ArmInterface(
-            offers=lambda words: tuple(self.fleet.offer(self.name, word) for word in words),
+            estimate=lambda words: tuple(self.fleet.offer(self.name, word) for word in words),
             unfit=lambda: "hot" if self.hot else "",
-            take=self.executor.answer_award,
+            answer_award=self.executor.answer_award,
         )
         self.council = Participant(
             self.executor,
             granter,
             interface,
-            fleet=LiveFleet(arms=self.fleet.names, warning_c=60.0),
-            choose=self.fleet.policy().choose,
-            life=history.boot,
+            Membership(
+                fleet=LiveFleet(arms=self.fleet.names, warning_c=60.0),
+                choose=self.fleet.policy().choose,
+                timing=TIMING,
+            ),
+            boot=history.boot,
             rng=random.Random(f"{self.name} {self.lives}"),
-            timing=TIMING,
         )
         self.council.add_jobs([*self.fleet.jobs, *register.jobs.values()])
 
@@ -191,7 +192,7 @@ class Fleet:
         def answer() -> None:
             try:
                 grant = arm.council.answer_claim(word, arm.real_s)
-            except Objection:
+            except Refused:
                 return
             self.wires.append((other, speaker, partial(self.answered, speaker, grant, life)))
 
@@ -200,7 +201,7 @@ class Fleet:
     def answered(self, speaker: str, grant, life: int) -> None:
         arm = self.arms[speaker]
         if arm.lives == life:  # an answer reaches only the life that asked
-            arm.safely(lambda: arm.council.apply_reply(grant, arm.real_s))
+            arm.safely(lambda: arm.council.claimant.apply_reply(grant, arm.real_s))
 
     def deliver(self, index: int, *, keep: bool = False) -> None:
         one, other, call = self.wires[index] if keep else self.wires.pop(index)

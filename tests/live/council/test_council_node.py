@@ -22,7 +22,7 @@ from fleet.live.arm.journal_records import ArmHistory, ArmRecord, Closed
 from fleet.live.arm.node import ArmConfig, ArmNode
 from fleet.live.arm.simulated_body import SimulatedBody
 from fleet.live.auction.knowledge import LiveFleet
-from fleet.live.auction.lease_timing import Timing
+from fleet.live.auction.round import Timing
 from fleet.live.clock import FleetClock
 from fleet.live.consensus.granter import GrantRecord
 from fleet.live.consensus.node import ConsensusNode, Membership
@@ -75,7 +75,7 @@ def bus(tmp_path, small):
                 Estimator(own.model, lambda work: plans[work.kind, work.places[0].name], PLACES, NominalPeaks()),
                 FleetClock(SPEED, time.monotonic()),
                 ArmConfig(warning_c=60.0, rate_hz=20.0, boot=history.boot),
-                partial(ConsensusNode, membership=member, journal=grants, life=history.boot),
+                partial(ConsensusNode, membership=member, journal=grants, boot=history.boot),
             )
             arms[name] = SimpleNamespace(node=node, link=link, book=book, grants=grants, work_source=node.work_source)
             return arms[name]
@@ -230,4 +230,4 @@ def test_where_an_auctioneer_is_arms_do_not_share_jobs_out(bus, token_reaches):
 def test_an_auctioneer_may_not_give_such_an_arm_work(bus):
     bus.arm("arm_0")
     award = Award("w", "r", "x", "q", hold("a"))
-    assert "I share out jobs with my peers" in bus.ask(keys.of_arm("f", "arm_0", "award"), award, Ack)
+    assert "I allocate jobs together with my peers" in bus.ask(keys.of_arm("f", "arm_0", "award"), award, Ack)

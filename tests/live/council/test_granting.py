@@ -4,11 +4,10 @@ import pytest
 
 from fleet.bus.protocol.auction import Award, JobSpec
 from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, DeniedEntry, GrantedEntry, JobOutcome
-from fleet.errors import JournalFull
+from fleet.errors import JournalFull, Refused
 from fleet.live.arm.award_executor import AwardExecutor
 from fleet.live.arm.journal_records import ArmHistory
-from fleet.live.auction.auctioneer import Objection
-from fleet.live.auction.lease_timing import Timing
+from fleet.live.auction.round import Timing
 from fleet.live.consensus.claimant import Claimant
 from fleet.live.consensus.granter import Granter, Register
 
@@ -122,20 +121,20 @@ def test_a_claim_of_before_changes_nothing(granter, disk, again):
     granter.answer_claim(claim("a", 7, entry()), 0.0)
     one = reborn(disk, 0.0) if again else granter
     for old in (6, 7):
-        with pytest.raises(Objection, match="Stale claim"):
+        with pytest.raises(Refused, match="Stale claim"):
             one.answer_claim(claim("a", old), 0.1)
     assert one.is_granted("j", 0.2)
 
 
 def test_a_stranger_is_granted_nothing(granter):
-    with pytest.raises(Objection, match=r"'z' is no arm of this fleet. Arms: a, b, c, d"):
+    with pytest.raises(Refused, match=r"'z' is no arm of this fleet. Arms: a, b, c, d"):
         granter.answer_claim(claim("z", 1, entry()), 0.0)
 
 
 def test_what_cannot_be_written_down_is_not_granted(granter, disk):
     disk.full = True
     assert granter.answer_claim(claim("a", 1, entry()), 0.0).denied[0].reason == "no room"
-    with pytest.raises(Objection, match="no room"):
+    with pytest.raises(Refused, match="no room"):
         granter.answer_claim(claim("a", 2, settled=[finished()]), 0.0)
     assert not granter.register.settled
 
@@ -168,7 +167,7 @@ class One:
             "a", roster, Register().replay(self.grants.records), self.grants.keep, real_s=0.0, timing=TIMING
         )
         self.claimant = Claimant(
-            self.executor, self.granter, self.executor.answer_award, life=history.boot, timing=TIMING
+            self.executor, self.granter, self.executor.answer_award, boot=history.boot, timing=TIMING
         )
 
     def say(self, real_s) -> Claim:
