@@ -156,7 +156,6 @@ class Journal(Generic[Record]):
         line = self._encode(records)
         try:
             self._write(self._opened(), line)
-            self._sync(self._file)
         except OSError as error:
             self._undo_append(error)
         self._end += len(line)
@@ -175,7 +174,6 @@ class Journal(Generic[Record]):
             with atomic_path(self.path) as draft:
                 file = os.open(draft, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC, 0o600)
                 self._write(file, line)
-                self._sync(file)
         except OSError as error:
             if file >= 0:
                 os.close(file)
@@ -255,9 +253,11 @@ class Journal(Generic[Record]):
             ) from error
 
     def _write(self, file: int, line: bytes) -> None:
+        """Write a line through to the disk."""
         rest = memoryview(line)
         while rest:  # each call writes some bytes or raises
             rest = rest[os.write(file, rest) :]
+        self._sync(file)
 
     def _undo_append(self, error: OSError) -> None:
         """Remove a line that could not be written.

@@ -297,7 +297,8 @@ class ModelFleet:
         """What the auctioneer answers to an arm."""
         match word:
             case Quote():
-                return self.auctioneer.add_quote(word, self.real_s, self.true_s)
+                self.auctioneer.add_quote(word)
+                return self.auctioneer.tick(self.real_s, self.true_s)
             case Ack():
                 return self.auctioneer.apply_ack(word, self.real_s, self.true_s)
             case LeaseRequest():

@@ -179,7 +179,8 @@ def test_what_no_arm_can_do_says_why(fleet_of):
     (request,) = under_way(fleet, QuoteRequest)
     offers = (JobEstimate("a", False, "reach: 1.2 m"),)
     quote = Quote("arm_0", request.auction, "q", 1.0, "model", 0.0, "idle", 10.0, 1, offers)
-    fleet.auctioneer.add_quote(quote, fleet.real_s, fleet.true_s)
+    fleet.auctioneer.add_quote(quote)
+    fleet.step(0.0)
     assert fleet.auctioneer.status()[0].reason == "No arm can do it: arm_0: reach: 1.2 m."
 
 

@@ -173,18 +173,15 @@ class Auctioneer:
                 self._delay(real_s, (report.job,))
         return receipt
 
-    def add_quote(self, quote: Quote, real_s: float, time_s: float) -> None:
-        """Add a quote; the last one that the round waits for closes it."""
-        open_round = self._round
-        if open_round is not None and quote.auction == open_round.auction:
-            open_round.quotes[quote.arm] = quote
-            if open_round.complete(self._present):
-                self._close_round(open_round, real_s, time_s)
+    def add_quote(self, quote: Quote) -> None:
+        """Add a quote; after the last one that the round waits for, the next tick closes it."""
+        if self._round is not None and quote.auction == self._round.auction:
+            self._round.quotes[quote.arm] = quote
 
-    def end_quotes(self, auction: str, real_s: float, time_s: float) -> None:
-        """Close a round: no more quotes will arrive."""
+    def end_quotes(self, auction: str) -> None:
+        """Have the next tick close a round: no more quotes will arrive."""
         if self._round is not None and self._round.auction == auction:
-            self._close_round(self._round, real_s, time_s)
+            self._round.until_s = -math.inf
 
     def apply_ack(self, ack: Ack, real_s: float, time_s: float) -> None:
         """Apply an arm's answer to an award."""

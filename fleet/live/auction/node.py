@@ -5,6 +5,7 @@ import math
 import secrets
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import TypeVar
 
 import msgspec
@@ -275,7 +276,9 @@ class AuctionNode:
         while out:
             match out.popleft():
                 case QuoteRequest() as request:
-                    self._request_quotes(request)
+                    key, done = keys.of_every_arm(fleet, "quote"), partial(self._end_quotes, request.auction)
+                    window_s, add = self._timing.window_s, self.auctioneer.add_quote
+                    self._link.query(key, request, Quote, done, timeout_s=window_s, each=add)
                 case SendAward(arm, award):
                     key = keys.of_arm(fleet, arm, "award")
                     self._link.query(key, award, Ack, self._apply_acks, timeout_s=self._timing.ack_s)
@@ -284,17 +287,10 @@ class AuctionNode:
                 case Result() as result:
                     self._result(result)
 
-    def _request_quotes(self, request: QuoteRequest) -> None:
-        def done(replies: Replies[Quote]) -> None:
-            for reason in filter(None, replies.refused.values()):
-                _LOG.warning("No quote: %s", reason)
-            self.auctioneer.end_quotes(request.auction, *self._now())
-
-        def add(quote: Quote) -> None:
-            self.auctioneer.add_quote(quote, *self._now())
-
-        key = keys.of_every_arm(self._link.fleet, "quote")
-        self._link.query(key, request, Quote, done, timeout_s=self._timing.window_s, each=add)
+    def _end_quotes(self, auction: str, replies: Replies[Quote]) -> None:
+        for reason in filter(None, replies.refused.values()):
+            _LOG.warning("No quote: %s", reason)
+        self.auctioneer.end_quotes(auction)
 
     def _apply_acks(self, replies: Replies[Ack]) -> None:
         for ack in replies.messages.values():

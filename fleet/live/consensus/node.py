@@ -17,8 +17,6 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Clock,
     ClockRequest,
-    JobEstimate,
-    JobSpec,
     JobStatus,
     LeaseRequest,
     Report,
@@ -35,7 +33,7 @@ from fleet.live.auction.job_rules import admit, statuses_that_fit
 from fleet.live.auction.round import Timing
 from fleet.live.clock import FleetClock
 from fleet.live.consensus.granter import Granter, GrantRecord, Register
-from fleet.live.consensus.participant import QUIET_S, ArmInterface, Membership, Participant
+from fleet.live.consensus.participant import QUIET_S, Membership, Participant
 from fleet.live.journal import Journal, TimeRecorder
 
 LISTEN_S = 0.5
@@ -72,9 +70,7 @@ class ConsensusNode:
         self._recorder = TimeRecorder(journal, register, real_s)
         roster = membership.fleet.arms
         granter = Granter(self._name, roster, register, journal.append, real_s=real_s, timing=self._timing)
-        interface = ArmInterface(estimate=self._estimate, unfit=arm.unfit, answer_award=arm.answer_award)
-        rng = Random(f"{self._name} {boot}")
-        self.participant = Participant(arm.executor, granter, interface, membership, boot=boot, rng=rng)
+        self.participant = Participant(arm, granter, membership, boot=boot, rng=Random(f"{self._name} {boot}"))
         self.participant.add_jobs(register.jobs.values())
         self._stream = deque(membership.stream)
         self._warn = RateLimitedWarnings(self._name)
@@ -165,12 +161,6 @@ class ConsensusNode:
         self._begun = True
         self._arm.set_clock(FleetClock(self._speed, real_s, time_s), jump=True)
 
-    def _estimate(self, jobs: tuple[JobSpec, ...]) -> tuple[JobEstimate, ...]:
-        """Return estimates for a bid, without the difficulty of each joint; that is published under its own key."""
-        estimates = self._arm.estimate(jobs)
-        self._arm.publish_difficulty(estimates, time.monotonic())
-        return tuple(replace(estimate, joint_difficulty=None) for estimate in estimates)
-
     def _declare(self) -> None:
         link, fleet, name = self._link, self._link.fleet, self._name
         self._publish_bid = link.publisher(keys.of_arm(fleet, name, "bid"), Bid)
@@ -235,7 +225,10 @@ class ConsensusNode:
         while out:
             match out.popleft():
                 case Bid() as bid:
-                    self._publish_bid(bid)
+                    if bid.estimates:  # the difficulty of each joint is published under its own key
+                        self._arm.publish_difficulty(bid.estimates, time.monotonic())
+                    estimates = tuple(replace(estimate, joint_difficulty=None) for estimate in bid.estimates)
+                    self._publish_bid(replace(bid, estimates=estimates))
                 case Claim() as claim:
                     self._query_claim(claim)
 

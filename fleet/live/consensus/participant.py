@@ -20,10 +20,10 @@ from random import Random
 
 from msgspec.structs import replace
 
-from fleet.bus.protocol.auction import Ack, Award, JobEstimate, JobSpec, JobStatus, Quote
+from fleet.bus.protocol.auction import JobSpec, JobStatus, Quote
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply
 from fleet.bus.protocol.messages import State
-from fleet.live.arm.award_executor import AwardExecutor
+from fleet.live.arm.auctioneer_client import LiveArm
 from fleet.live.auction.job_rules import SHIFT_ENDED, ready_jobs
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.round import Bidding, Timing, resolve_claims
@@ -41,18 +41,6 @@ MAX_OPEN_JOBS = 32
 
 Choose = Callable[[Observation, int], int]
 """The action of an arm by its observation and its index in the fleet: 0 waits, k claims slot k."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ArmInterface:
-    """Functions of the arm itself."""
-
-    estimate: Callable[[tuple[JobSpec, ...]], tuple[JobEstimate, ...]]
-    """Estimates what jobs would cost it now."""
-    unfit: Callable[[], str]
-    """Says why it accepts no job now; "" if it does."""
-    answer_award: Callable[[Award, float], Ack]
-    """Accepts or refuses an award."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,30 +76,21 @@ class Participant:
         changed_s: Real second of the last change of a bid or choice.
     """
 
-    def __init__(
-        self,
-        executor: AwardExecutor,
-        granter: Granter,
-        interface: ArmInterface,
-        membership: Membership,
-        *,
-        boot: int,
-        rng: Random,
-    ) -> None:
+    def __init__(self, arm: LiveArm, granter: Granter, membership: Membership, *, boot: int, rng: Random) -> None:
         """Start.
 
         Args:
             boot: Number of this start of the arm.
             rng: Draws the pauses after rejected claims.
         """
-        self.arm, self.executor, self.granter = executor.arm, executor, granter
+        self.name, self.executor, self.granter = arm.executor.arm, arm.executor, granter
         self._timing = membership.timing or Timing()
-        self.claimant = Claimant(executor, granter, interface.answer_award, boot=boot, timing=self._timing)
+        self.claimant = Claimant(arm.executor, granter, arm.answer_award, boot=boot, timing=self._timing)
         self.jobs: dict[str, JobSpec] = {}
         self.states: dict[str, State] = {}
         self.out: deque[Bid | Claim] = deque()
         self.ended, self.rounds = False, 0
-        self._interface, self._fleet, self._policy = interface, membership.fleet, membership.choose
+        self._arm, self._fleet, self._policy = arm, membership.fleet, membership.choose
         self._slots, self._rng = min(membership.slots, MAX_OPEN_JOBS), rng
         self._number = boot * NUMBERS_PER_BOOT
         self._bids: dict[str, tuple[Bid, float]] = {}
@@ -152,7 +131,7 @@ class Participant:
             self.changed_s, self._new_bids = real_s, True
         elif before[0].choice != bid.choice:
             self.changed_s = real_s
-        if bid.arm != self.arm:
+        if bid.arm != self.name:
             self._send_corrections(bid, real_s)
 
     def _send_corrections(self, bid: Bid, real_s: float) -> None:
@@ -208,7 +187,7 @@ class Participant:
 
     def all_settled(self, real_s: float) -> bool:
         """Return whether every present arm, a majority at least, knows that every job is settled."""
-        others = [self._bids.get(arm) for arm in self._present - {self.arm}]
+        others = [self._bids.get(arm) for arm in self._present - {self.name}]
         if len(others) + 1 < self.claimant.majority:
             return False
         known = all(bid is not None and bid[0].open_count == 0 and real_s < bid[1] + FRESH_S for bid in others)
@@ -245,7 +224,7 @@ class Participant:
 
     def _bid(self, real_s: float, time_s: float) -> None:
         """Publish a bid when its content has changed, and every `BID_S`."""
-        capacity = 0 if self.ended or self._interface.unfit() else max(0, self.claimant.capacity)
+        capacity = 0 if self.ended or self._arm.unfit() else max(0, self.claimant.capacity)
         ready = self._ready(real_s, time_s) if capacity else []
         names = [job.name for job in ready]
         if self._choice not in names or self.claimant.pending:
@@ -257,11 +236,11 @@ class Participant:
         self._last_bid, self._bid_s = content, real_s
         self._number += 1
         bid = Bid(
-            arm=self.arm,
+            arm=self.name,
             number=self._number,
             time_s=time_s,
             capacity=capacity,
-            estimates=self._interface.estimate(tuple(ready)) if ready else (),
+            estimates=self._arm.estimate(tuple(ready)) if ready else (),
             open_count=len(open_jobs),
             closed_count=len(self.granter.register.settled),
             open_jobs=tuple(open_jobs[:MAX_OPEN_JOBS]),
@@ -272,7 +251,7 @@ class Participant:
 
     def _choose(self, real_s: float, time_s: float) -> None:
         """Let the policy choose a job, once the bids of all present arms have arrived."""
-        own = self._bids[self.arm][0]
+        own = self._bids[self.name][0]
         due = self._new_bids or real_s >= self._chosen_s + BID_S
         if not (own.estimates and due) or self.claimant.pending or self.claimant.capacity < 1:
             return
@@ -285,9 +264,9 @@ class Participant:
         self._new_bids, self._chosen_s = False, real_s
         self.rounds += 1
         bidding = self._bidding(bids, [offer.job for offer in own.estimates])
-        observations = observe(bidding, self._fleet, lost={self.arm} if self._lost else ())
-        action = self._policy(observations[self.arm], self._fleet.arms.index(self.arm))
-        self._choice = claimed_jobs(bidding, observations, {self.arm: action}).get(self.arm, "")
+        observations = observe(bidding, self._fleet, lost={self.name} if self._lost else ())
+        action = self._policy(observations[self.name], self._fleet.arms.index(self.name))
+        self._choice = claimed_jobs(bidding, observations, {self.name: action}).get(self.name, "")
         self._lost = False
         for job in bidding.jobs:
             if all(bidding.offer(arm, job.name) is None for arm in bidding.quotes):
@@ -303,7 +282,7 @@ class Participant:
         choices = {arm: bid.choice for arm, bid in bids.items() if bid.choice}
         bidding = self._bidding(bids, choices.values())
         job, self._choice = self._choice, ""
-        if resolve_claims(bidding, choices, self._fleet.arms).get(job) == self.arm:
+        if resolve_claims(bidding, choices, self._fleet.arms).get(job) == self.name:
             self.claimant.request(self.jobs[job], real_s)
         else:
             self._lost = True

@@ -18,7 +18,7 @@ from fleet.live.arm.journal_records import ArmHistory
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.round import Timing
 from fleet.live.consensus.granter import Granter, Register
-from fleet.live.consensus.participant import ArmInterface, Membership, Participant
+from fleet.live.consensus.participant import Membership, Participant
 
 TIMING = Timing(lease_s=3.0, margin_s=0.05, window_s=0.3, pause_s=(0.2, 1.0))
 CYCLE_S = 0.2
@@ -70,15 +70,15 @@ class Arm:
         config = ExecutorConfig(return_after_s=8.0)
         self.executor = AwardExecutor(self.name, self.promises.keep, history, nonce="n", config=config)
         granter = Granter(self.name, self.fleet.names, register, self.grants.keep, real_s=self.real_s, timing=TIMING)
-        interface = ArmInterface(
+        arm = SimpleNamespace(
+            executor=self.executor,
             estimate=lambda words: tuple(self.fleet.offer(self.name, word) for word in words),
             unfit=lambda: "hot" if self.hot else "",
             answer_award=self.executor.answer_award,
         )
         self.council = Participant(
-            self.executor,
+            arm,
             granter,
-            interface,
             Membership(
                 fleet=LiveFleet(arms=self.fleet.names, warning_c=60.0),
                 choose=self.fleet.policy().choose,
