@@ -128,11 +128,6 @@ class Journal(Generic[Record]):
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    @property
-    def size(self) -> int:
-        """Size of the file, bytes."""
-        return self._end
-
     def records(self) -> Iterator[Record]:
         """Yield all records, oldest first.
 

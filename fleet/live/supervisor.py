@@ -18,7 +18,7 @@ from fleet.errors import FleetError
 _LOG = logging.getLogger(__name__)
 
 READY = "ready "
-"""A participant that has started prints a line that begins so."""
+"""Start of the line that a participant prints once it has started."""
 SUPERVISED = "THERMOFLEET_SUPERVISOR"
 """Environment variable of supervised processes: the process id of the supervisor."""
 LOG_S = 1.0

@@ -321,15 +321,6 @@ def test_when_nobody_knows_which_file_has_the_name_nothing_more_is_promised(tmp_
     assert read(path) == [Said("new")]
 
 
-def test_a_journal_knows_its_size(tmp_path):
-    with Journal(tmp_path / "j", KIND) as journal:
-        assert journal.size == 0
-        journal.append(Said("a"), Counted(1))
-        assert journal.size == journal.path.stat().st_size
-        journal.rewrite(Said("b"))
-        assert journal.size == journal.path.stat().st_size
-
-
 def test_a_closed_journal_says_so(tmp_path):
     journal = Journal(tmp_path / "j", KIND)
     with pytest.raises(JournalError, match="not open"):

@@ -15,7 +15,7 @@ MAX_BYTES = 60_000
 SHIFT_ENDED = "The shift ended before it was done."
 
 
-def silence(arm: str) -> str:
+def reason_for_silence(arm: str) -> str:
     """Return why a job is unfinished whose arm stopped renewing its lease after permission to commit."""
     return f"'{arm}' was about to finish it and has not renewed its lease since."
 
@@ -80,6 +80,11 @@ def _never_ready(new: Mapping[str, JobSpec], known: Mapping[str, JobSpec]) -> di
             before = next(before for before in new[name].after if before in stuck)
             reasons[name] = f"It waits for '{before}', which is not accepted either."
     return reasons
+
+
+def job_order(job: JobSpec) -> tuple[float, str]:
+    """Return the key by which jobs are sorted: the oldest are offered first."""
+    return job.release_s, job.name
 
 
 def ready_jobs(

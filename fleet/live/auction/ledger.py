@@ -4,7 +4,6 @@ A record is on disk before it is applied, so a replay gives the same ledger, wit
 ends of leases are not recorded: after a restart every open award counts as leased from then on.
 """
 
-from bisect import insort
 from collections import deque
 from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +12,7 @@ import msgspec
 from msgspec.structs import asdict, replace
 
 from fleet.bus.protocol.auction import Admission, JobSpec, JobState, JobStatus
-from fleet.live.auction.job_rules import SHIFT_ENDED, admit, ready_jobs, silence
+from fleet.live.auction.job_rules import SHIFT_ENDED, admit, job_order, ready_jobs, reason_for_silence
 from fleet.live.journal import TimedState
 from fleet.live.journal_records import ClockTick, Closed, CommitPermitted, JobsAccepted, Started
 
@@ -90,6 +89,7 @@ class AwardState(msgspec.Struct):
     record: Awarded = msgspec.field(name="made")
     may_commit: bool = False
     silent: bool = False
+    """The arm has permission to commit, and has not renewed its lease."""
     outcome: str = ""
 
 
@@ -129,6 +129,7 @@ class Ledger(TimedState[AuctionRecord]):
     places: frozenset[str] | None = None
     """Places of the cell; None allows any name."""
     jobs: dict[str, JobEntry] = field(default_factory=dict)
+    """By release and name."""
     awards: dict[str, AwardState] = field(default_factory=dict)
     time_s: float = 0.0
     """Latest time of all records."""
@@ -138,8 +139,6 @@ class Ledger(TimedState[AuctionRecord]):
     recent: deque[Change] = field(default_factory=lambda: deque(maxlen=MAX_RECENT))
     open: dict[str, AwardState] = field(default_factory=dict)
     """Awards that are not closed, by name."""
-    _waiting: list[str] = field(default_factory=list)
-    """Jobs without an open award, by release and name."""
 
     def admit(self, jobs: Sequence[JobSpec]) -> tuple[Admission, ...]:
         """Return which submitted jobs can be accepted; changes nothing."""
@@ -150,7 +149,8 @@ class Ledger(TimedState[AuctionRecord]):
         """Return the first jobs that can begin now: released, predecessors finished, stations free."""
         if self.ended:
             return []
-        waiting = (self.jobs[name].spec for name in self._waiting if name not in excluded)
+        entries = (entry for name, entry in self.jobs.items() if name not in excluded)
+        waiting = (entry.spec for entry in entries if entry.state == "waiting")
         busy = self.busy_stations()
         return ready_jobs(waiting, time_s, limit, busy, lambda name: self.jobs[name].state == "finished")
 
@@ -196,24 +196,24 @@ class Ledger(TimedState[AuctionRecord]):
         changed: list[JobEntry] = []
         match record:
             case JobsAccepted():
-                changed = self._accept(record)
+                changed = [JobEntry(job, record.by) for job in record.jobs if job.name not in self.jobs]
+                self._set_jobs([*self.jobs.values(), *changed])
             case Awarded():
                 entry = self.jobs[record.job]
                 self.awards[record.award] = self.open[record.award] = AwardState(record)
                 entry.state, entry.award, entry.reason = "awarded", record.award, ""
-                self._waiting.remove(record.job)
                 changed = [entry]
             case CommitPermitted() | ContactLost() | ContactRegained():
                 award, entry = self.awards[record.award], self._entry(record.award)
                 award.may_commit, award.silent = True, isinstance(record, ContactLost)
                 entry.state, entry.reason = "finishing", ""
                 if award.silent:
-                    entry.state, entry.reason = "unfinished", silence(award.record.arm)
+                    entry.state, entry.reason = "unfinished", reason_for_silence(award.record.arm)
                 changed = [entry]
             case Closed():
                 changed = self._close(record)
             case ShiftEnded():
-                self.ended, self._waiting = True, []
+                self.ended = True
                 changed = [self.jobs[name] for name in self.unsettled()]
                 for entry in changed:
                     entry.state, entry.reason = "unfinished", entry.reason or SHIFT_ENDED
@@ -226,24 +226,19 @@ class Ledger(TimedState[AuctionRecord]):
 
     # Inside
 
-    def _accept(self, record: JobsAccepted) -> list[JobEntry]:
-        new = [JobEntry(job, record.by) for job in record.jobs if job.name not in self.jobs]
-        self.jobs |= {entry.spec.name: entry for entry in new}
-        self._waiting = sorted([*self._waiting, *(entry.spec.name for entry in new)], key=self._order)
-        return new
+    def _set_jobs(self, entries: Iterable[JobEntry]) -> None:
+        self.jobs = {entry.spec.name: entry for entry in sorted(entries, key=lambda entry: job_order(entry.spec))}
 
     def _close(self, record: Closed) -> list[JobEntry]:
         award = self.awards[record.award]
         award.silent, award.outcome = False, record.outcome
         self.open.pop(record.award, None)
-        entry, name = self.jobs[award.record.job], award.record.job
+        entry = self.jobs[award.record.job]
         if entry.state == "finished":
             return []
         entry.cycles = max(entry.cycles, min(record.cycles, entry.spec.repetitions))
         if record.outcome == "finished":
             self.open.pop(entry.award, None)  # a later award of the same job has no purpose any more
-            if name in self._waiting:
-                self._waiting.remove(name)
             entry.state, entry.award, entry.reason, entry.finished_s = "finished", record.award, "", record.time_s
         elif entry.award != record.award:
             return []  # the job was awarded again since
@@ -254,24 +249,18 @@ class Ledger(TimedState[AuctionRecord]):
             if record.outcome == "returned":
                 entry.returns, entry.returned_s = entry.returns + 1, record.time_s
             entry.cycles = min(entry.cycles, entry.spec.repetitions - 1)  # the last cycle is never assumed done
-            if name not in self._waiting:
-                insort(self._waiting, name, key=self._order)
         return [entry]
 
     def _restore(self, snapshot: LedgerSnapshot) -> None:
         self.number, self.ended = snapshot.number, snapshot.ended
-        self.jobs = {entry.spec.name: replace(entry) for entry in snapshot.jobs}
+        self._set_jobs(map(replace, snapshot.jobs))
         self.awards = {award.record.award: replace(award) for award in snapshot.awards}
         self.open = {name: self.awards[name] for name in snapshot.open}
         self.recent = deque(snapshot.recent, maxlen=MAX_RECENT)
-        self._waiting = sorted((n for n, entry in self.jobs.items() if entry.state == "waiting"), key=self._order)
 
     def _may_count(self, award: AwardState) -> bool:
         """Whether a report on a closed award could change the state of its job."""
         return award.outcome != "refused" and self.jobs[award.record.job].state != "finished"
-
-    def _order(self, name: str) -> tuple[float, str]:
-        return self.jobs[name].spec.release_s, name
 
     def _entry(self, award: str) -> JobEntry:
         return self.jobs[self.awards[award].record.job]

@@ -19,7 +19,7 @@ import msgspec
 from fleet.bus.protocol.auction import Count, JobSpec, JobStatus, Name
 from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, DeniedEntry, GrantedEntry, JobOutcome
 from fleet.errors import JournalFull, Refused
-from fleet.live.auction.job_rules import silence
+from fleet.live.auction.job_rules import reason_for_silence
 from fleet.live.auction.round import Timing
 from fleet.live.journal import TimedState
 from fleet.live.journal_records import ClockTick, JobsAccepted, Progress, Released
@@ -228,7 +228,7 @@ class Granter:
         if grant is None or not self.is_granted(job, real_s):
             return JobStatus(job, "waiting", cycles=cycles)
         if grant.may_commit and real_s >= grant.until_s:
-            return JobStatus(job, "unfinished", grant.arm, grant.award, cycles, None, silence(grant.arm))
+            return JobStatus(job, "unfinished", grant.arm, grant.award, cycles, None, reason_for_silence(grant.arm))
         return JobStatus(job, "finishing" if grant.may_commit else "awarded", grant.arm, grant.award, cycles)
 
     # Inside

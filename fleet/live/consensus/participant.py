@@ -24,7 +24,7 @@ from fleet.bus.protocol.auction import JobSpec, JobStatus, Quote
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply
 from fleet.bus.protocol.messages import State
 from fleet.live.arm.auctioneer_client import LiveArm
-from fleet.live.auction.job_rules import SHIFT_ENDED, ready_jobs
+from fleet.live.auction.job_rules import SHIFT_ENDED, job_order, ready_jobs
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.round import Bidding, Timing, resolve_claims
 from fleet.live.consensus.claimant import NUMBERS_PER_BOOT, Claimant
@@ -115,7 +115,7 @@ class Participant:
         """Add jobs that it does not know yet."""
         new = {job.name: job for job in jobs if job.name not in self.jobs}
         if new:
-            self.jobs = {job.name: job for job in sorted((self.jobs | new).values(), key=_order)}
+            self.jobs = {job.name: job for job in sorted((self.jobs | new).values(), key=job_order)}
 
     def set_present(self, present: frozenset[str]) -> None:
         """Set which arms are present."""
@@ -148,9 +148,9 @@ class Participant:
                 self._corrected = (self._corrected + 1) % len(outcomes)
                 self.claimant.send_outcome(outcomes[self._corrected])
         full = len(bid.open_jobs) == MAX_OPEN_JOBS and bid.open_jobs[-1] in self.jobs
-        last = _order(self.jobs[bid.open_jobs[-1]]) if full else (math.inf, "")
+        last = job_order(self.jobs[bid.open_jobs[-1]]) if full else (math.inf, "")
         for job in self.open_jobs(real_s) if register.jobs else []:
-            if job in register.jobs and job not in bid.open_jobs and _order(self.jobs[job]) < last:
+            if job in register.jobs and job not in bid.open_jobs and job_order(self.jobs[job]) < last:
                 self.claimant.send_job(self.jobs[job])
 
     def answer_claim(self, claim: Claim, real_s: float) -> ClaimReply:
@@ -308,10 +308,6 @@ class Participant:
         count = self._pauses[job] = self._pauses.get(job, 0) + 1
         pause_s = min(longest_s, first_s * 2.0 ** min(count - 1, 10))
         self._later_s[job] = real_s + pause_s * self._rng.uniform(0.2, 1.0)
-
-
-def _order(job: JobSpec) -> tuple[float, str]:
-    return job.release_s, job.name
 
 
 def _offered(bid: Bid) -> tuple[bool, frozenset[str]]:
