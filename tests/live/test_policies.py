@@ -173,9 +173,9 @@ def test_every_central_policy_gets_the_jobs_of_an_auctioneer_done(live, name) ->
     fleet = live.Fleet([live.Arm(f"arm_{i}") for i in range(3)], allocate=rule)
     fleet.submit(*(JobSpec(name=f"j{i}", kind="hold", places=("xyz"[i % 3],), repetitions=2) for i in range(7)))
     for _ in range(40):
-        fleet.run_fair(1.0)
+        fleet.run_without_faults(1.0)
         fleet.check()
-    fleet.settled()
+    fleet.check_settled()
 
 
 def test_of_claims_for_one_job_or_station_the_lower_difficulty_wins_then_the_first_arm() -> None:
