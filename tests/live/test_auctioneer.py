@@ -114,7 +114,7 @@ def test_a_station_gets_one_job_at_a_time(fleet_of):
 
 def test_an_allocation_against_the_bids_is_not_awarded(fleet_of, caplog):
     fleet = fleet_of(1)
-    fleet.auctioneer._allocate = lambda bidding: {"a": "nobody", "b": "arm_0", "c": "arm_0", "x": "arm_0"}
+    fleet.auctioneer._allocate = lambda bidding: {"a": "unknown", "b": "arm_0", "c": "arm_0", "x": "arm_0"}
     bid(fleet, hold("a"), hold("b", "bin"), hold("c", "belt"))
     assert [award.job.name for award in in_transit(fleet, Award)] == ["b"]
     assert caplog.text.count("The allocation rule gives") == 3
