@@ -13,6 +13,9 @@ from typing import Self
 SLEW = 0.1
 """Relative change of a clock's speed while it removes an offset."""
 
+CLOCK_DRIFT = 0.01
+"""Largest difference in rate between the clocks of two participants, relative."""
+
 
 @dataclass(frozen=True)
 class FleetClock:

@@ -16,7 +16,8 @@ from fleet.engine.reward import RewardWeights
 from fleet.errors import FleetError
 from fleet.live.arm.award_executor import COMMIT_RETRY_S, RENEWALS, REPORT_RETRY_S, ExecutorConfig
 from fleet.live.auction.job_rules import MAX_KEPT_JOBS
-from fleet.live.auction.round import DRIFT, Timing
+from fleet.live.auction.round import Timing
+from fleet.live.clock import CLOCK_DRIFT
 from fleet.live.monitor.snapshot import FRESH_S
 from fleet.observation import FIELDS, Layout
 
@@ -182,7 +183,7 @@ def time_table() -> str:
     """Durations in real seconds."""
     timing, terms = Timing(), ExecutorConfig()
     again_s, most_s = REPORT_RETRY_S
-    short_s, attempts = timing.lease_s * (1 - DRIFT), timing.attempts
+    short_s, attempts = timing.lease_s * (1 - CLOCK_DRIFT), timing.attempts
     state = CHANNEL["arm", "state"]
     rows = [
         (f"{SESSION_LEASE_S:g}", "all", "without a sign of life Zenoh closes a session and withdraws its token"),
@@ -193,11 +194,11 @@ def time_table() -> str:
         (f"{terms.valid_s:g}", "arm", "`valid_s`: it accepts an award on its quote"),
         (f"{timing.ack_s:g}", "auctioneer", f"without an `Ack` the same award is sent again, {attempts} times in all"),
         (f"{timing.lease_s:g}", "auctioneer", "`lease_s`: length of a lease"),
-        (f"{short_s:.2f}", "arm", f"how it counts that lease: {DRIFT:.0%} shorter, as clocks differ in rate"),
+        (f"{short_s:.2f}", "arm", f"how it counts that lease: {CLOCK_DRIFT:.0%} shorter, as clocks differ in rate"),
         (
             f"{timing.counted_lease_s:.2f}",
             "auctioneer",
-            f"how it counts it: {DRIFT:.0%} and {timing.margin_s:g} s longer",
+            f"how it counts it: {CLOCK_DRIFT:.0%} and {timing.margin_s:g} s longer",
         ),
         (f"{timing.lease_s / RENEWALS:g}", "arm", "between two requests to renew the lease"),
         (f"{terms.commit_lead_s:g}", "arm", "before its last cycle could begin it requests permission to commit"),

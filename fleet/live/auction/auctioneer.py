@@ -308,8 +308,9 @@ class Auctioneer:
     def _close_round(self, closing: Round, real_s: float, time_s: float) -> None:
         self._round = None
         busy = self.ledger.busy_stations()
-        open_jobs = [job for job in closing.jobs if self.ledger.jobs[job.name].state == "waiting"]
-        jobs = tuple(job for job in open_jobs if not busy & frozenset(job.places))
+        entries = [self.ledger.jobs[job.name] for job in closing.jobs]
+        entries = [entry for entry in entries if entry.state == "waiting" and not busy & frozenset(entry.spec.places)]
+        jobs = tuple(entry.spec for entry in entries)
         quotes = {arm: quote for arm, quote in closing.quotes.items() if arm in closing.asked & self._present}
         bidding = Bidding(
             closing.auction,
@@ -318,7 +319,7 @@ class Auctioneer:
             {arm: quote for arm, quote in quotes.items() if quote.capacity},
             {arm: quote for arm, quote in quotes.items() if not quote.capacity},
             states=self.states,
-            returned=self.ledger.returned(jobs),
+            returned={entry.spec.name: (entry.returns, entry.returned_s) for entry in entries if entry.returns},
         )
         self._notes |= infeasible_jobs(bidding)
         allocation = drop_invalid(bidding, self._allocate(bidding)) if bidding.quotes and jobs else {}

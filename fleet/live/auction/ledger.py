@@ -108,18 +108,8 @@ class LedgerSnapshot(msgspec.Struct, frozen=True, tag="ledger_snapshot"):
     recent: tuple[Change, ...]
 
 
-AuctionRecord = (
-    Started
-    | ClockTick
-    | JobsAccepted
-    | Awarded
-    | CommitPermitted
-    | ContactLost
-    | ContactRegained
-    | Closed
-    | ShiftEnded
-    | LedgerSnapshot
-)
+AwardRecord = Awarded | CommitPermitted | ContactLost | ContactRegained | Closed
+AuctionRecord = Started | ClockTick | JobsAccepted | AwardRecord | ShiftEnded | LedgerSnapshot
 
 
 @dataclass
@@ -158,11 +148,6 @@ class Ledger(TimedState[AuctionRecord]):
         """Return the stations at which an arm may be at work; a silent arm does not block its station."""
         active = (award.record.job for award in self.open.values() if not award.silent)
         return frozenset(place for job in active for place in self.jobs[job].spec.places)
-
-    def returned(self, jobs: Iterable[JobSpec]) -> dict[str, tuple[int, float]]:
-        """Return number of returns and time of the last one, of those jobs that were ever returned."""
-        entries = {job.name: self.jobs[job.name] for job in jobs}
-        return {name: (entry.returns, entry.returned_s) for name, entry in entries.items() if entry.returns}
 
     def unsettled(self) -> list[str]:
         """Return the names of jobs that are neither finished nor unfinished for good."""

@@ -8,11 +8,10 @@ from functools import cached_property
 
 from fleet.bus.protocol.auction import LEASE_S, JobEstimate, JobSpec, Quote
 from fleet.bus.protocol.messages import State
+from fleet.live.clock import CLOCK_DRIFT
 
 _LOG = logging.getLogger(__name__)
 
-DRIFT = 0.01
-"""Clocks may differ in rate by this share; leases are counted longer by as much."""
 MAX_REASON = 500
 """Characters of a reason, so that a message does not grow with the number of arms."""
 
@@ -45,8 +44,8 @@ class Timing:
 
     @property
     def counted_lease_s(self) -> float:
-        """Length of a lease as the granting side counts it."""
-        return self.lease_s * (1.0 + DRIFT) + self.margin_s
+        """Length of a lease as the granting side counts it: longer than the arm does, as clocks differ in rate."""
+        return self.lease_s * (1.0 + CLOCK_DRIFT) + self.margin_s
 
 
 @dataclass(frozen=True, eq=False)

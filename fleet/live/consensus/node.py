@@ -30,7 +30,6 @@ from fleet.bus.protocol.messages import State
 from fleet.errors import BusError
 from fleet.live.arm.auctioneer_client import LiveArm, RateLimitedWarnings
 from fleet.live.auction.job_rules import admit, statuses_that_fit
-from fleet.live.auction.round import Timing
 from fleet.live.clock import FleetClock
 from fleet.live.consensus.granter import Granter, GrantRecord, Register
 from fleet.live.consensus.participant import QUIET_S, Membership, Participant
@@ -64,12 +63,11 @@ class ConsensusNode:
         """
         self._arm, self._link, self._membership = arm, arm.link, membership
         self._name, self._speed = arm.executor.arm, arm.clock.speed
-        self._timing = membership.timing or Timing()
         register = Register().replay(journal.records())
         real_s = time.monotonic()
         self._recorder = TimeRecorder(journal, register, real_s)
         roster = membership.fleet.arms
-        granter = Granter(self._name, roster, register, journal.append, real_s=real_s, timing=self._timing)
+        granter = Granter(self._name, roster, register, journal.append, real_s=real_s, timing=membership.timing)
         self.participant = Participant(arm, granter, membership, boot=boot, rng=Random(f"{self._name} {boot}"))
         self.participant.add_jobs(register.jobs.values())
         self._stream = deque(membership.stream)
@@ -242,6 +240,6 @@ class ConsensusNode:
 
         key = keys.asked_of_all(self._link.fleet, "claim", self._name)
         try:
-            self._link.query(key, claim, ClaimReply, done, timeout_s=self._timing.ack_s, each=apply)
+            self._link.query(key, claim, ClaimReply, done, timeout_s=self._membership.timing.ack_s, each=apply)
         except BusError as error:
             self._warn("bus", str(error))

@@ -15,7 +15,7 @@ job: where messages are lost two arms may claim one, and the one without a major
 import math
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from random import Random
 
 from msgspec.structs import replace
@@ -59,7 +59,7 @@ class Membership:
     """Jobs that all arms know, each with the fleet time from which on it is offered."""
     horizon_s: float = math.inf
     """Fleet time at which the shift is over."""
-    timing: Timing | None = None
+    timing: Timing = field(default_factory=Timing)
 
 
 class Participant:
@@ -84,7 +84,7 @@ class Participant:
             rng: Draws the pauses after rejected claims.
         """
         self.name, self.executor, self.granter = arm.executor.arm, arm.executor, granter
-        self._timing = membership.timing or Timing()
+        self._timing = membership.timing
         self.claimant = Claimant(arm.executor, granter, arm.answer_award, boot=boot, timing=self._timing)
         self.jobs: dict[str, JobSpec] = {}
         self.states: dict[str, State] = {}
