@@ -28,7 +28,8 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply
 from fleet.bus.protocol.messages import State
 from fleet.errors import BusError
-from fleet.live.arm.auctioneer_client import LiveArm, RateLimitedWarnings
+from fleet.live.arm.auctioneer_client import RateLimitedWarnings
+from fleet.live.arm.node import ArmNode
 from fleet.live.auction.job_rules import admit, statuses_that_fit
 from fleet.live.clock import FleetClock
 from fleet.live.consensus.granter import Granter, GrantRecord, Register
@@ -55,7 +56,7 @@ class ConsensusNode:
 
     objection = "I allocate jobs together with my peers, and accept none from an auctioneer"
 
-    def __init__(self, arm: LiveArm, membership: Membership, journal: Journal[GrantRecord], *, boot: int) -> None:
+    def __init__(self, arm: ArmNode, membership: Membership, journal: Journal[GrantRecord], *, boot: int) -> None:
         """Join; the arm's client and the journal are open.
 
         Args:

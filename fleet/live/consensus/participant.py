@@ -23,7 +23,7 @@ from msgspec.structs import replace
 from fleet.bus.protocol.auction import JobSpec, JobStatus, Quote
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply
 from fleet.bus.protocol.messages import State
-from fleet.live.arm.auctioneer_client import LiveArm
+from fleet.live.arm.node import ArmNode
 from fleet.live.auction.job_rules import SHIFT_ENDED, job_order, ready_jobs
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.round import Bidding, Timing, resolve_claims
@@ -76,7 +76,7 @@ class Participant:
         changed_s: Real second of the last change of a bid or choice.
     """
 
-    def __init__(self, arm: LiveArm, granter: Granter, membership: Membership, *, boot: int, rng: Random) -> None:
+    def __init__(self, arm: ArmNode, granter: Granter, membership: Membership, *, boot: int, rng: Random) -> None:
         """Start.
 
         Args:
