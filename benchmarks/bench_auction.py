@@ -28,10 +28,10 @@ from fleet.bus.client.router import Router, open_client
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Ack, Award, JobEstimate, JobSpec, Quote, QuoteRequest, Submission
 from fleet.bus.protocol.messages import State, encode
-from fleet.live.auction.journal_records import AuctionRecord, Awarded
 from fleet.live.auction.knowledge import LiveFleet
-from fleet.live.auction.lease_timing import Timing
+from fleet.live.auction.ledger import AuctionRecord, Awarded
 from fleet.live.auction.node import AuctionNode
+from fleet.live.auction.round import Timing
 from fleet.live.journal import Journal
 from scenarios.live.allocation import CentralAllocation
 from scenarios.policy_loader import policy_at

@@ -53,12 +53,16 @@ class LogError(FleetError):
         return f"{self.file}: {self.reason}" if self.line is None else f"{self.file}, line {self.line}: {self.reason}"
 
 
+class Refused(FleetError):
+    """A request is refused; its sender gets this sentence instead of a reply."""
+
+
 class JournalError(FleetError):
     """A journal is damaged, in use by another process, or not writable; names the file."""
 
 
-class JournalFull(JournalError):
-    """No space for a record; the journal is unchanged."""
+class JournalFull(JournalError, Refused):
+    """No space for a record; the journal is unchanged, and a request that needs the record is refused."""
 
 
 def check_positive(value: object, *fields: str) -> None:

@@ -1,9 +1,9 @@
 """Fleet time: seconds since the fleet started, at a given speed, read from a monotonic clock.
 
 A clock is a value: real time is an argument (`time.monotonic()`, which a jump of the wall clock does not change), and a
-correction returns another clock. It never runs backwards: it removes an offset gradually. Another clock is read by
-Cristian's algorithm: its reading counts for the middle between request and reply, so the error is at most half the time
-between them. (Cristian 1989, Distributed Computing 3, 146-158.)
+correction returns a new clock. Corrections are gradual, so a clock never runs backwards. Another clock is read by
+Cristian's algorithm: its reading is taken as the time halfway between request and reply, so the error is at most half
+of the time between them. (Cristian 1989, Distributed Computing 3, 146-158.)
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,10 @@ from math import isfinite
 from typing import Self
 
 SLEW = 0.1
-"""Share of its speed by which a clock runs faster or slower while it removes an offset."""
+"""Relative change of a clock's speed while it removes an offset."""
+
+CLOCK_DRIFT = 0.01
+"""Largest difference in rate between the clocks of two participants, relative."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ class FleetClock:
         return type(self)(self.speed, answered_s, now_s, self._reading_s(asked_s, answered_s, time_s) - now_s)
 
     def set_to(self, asked_s: float, answered_s: float, time_s: float) -> Self:
-        """Return a clock that reads the other clock's time at once: before anybody has used this one."""
+        """Return a clock that reads the other clock's time at once, for use before the first reading."""
         return type(self)(self.speed, answered_s, self._reading_s(asked_s, answered_s, time_s))
 
     def _reading_s(self, asked_s: float, answered_s: float, time_s: float) -> float:
@@ -66,9 +69,9 @@ class FleetClock:
 
 
 def next_due_s(due_s: float, now_s: float, period_s: float) -> float:
-    """Next time of something that is done every `period_s`, was due at `due_s` and is done now.
+    """Return when a periodic action is due again that was due at `due_s` and is done now.
 
-    The rate is right on average, but the gap is never less than half a period: missed turns are not made up for, and a
-    router that limits a rate by the gap between two messages drops the second of two at once.
+    The mean rate is right, but the gap is never less than half a period: a router that limits rates by the gap between
+    messages would drop the second of two.
     """
     return max(due_s + period_s, now_s + 0.5 * period_s)

@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from queue import Empty
-from typing import IO
 
 from fleet.bus.client.queue import Mailbox
 from fleet.errors import FleetError
@@ -19,11 +18,9 @@ from fleet.errors import FleetError
 _LOG = logging.getLogger(__name__)
 
 READY = "ready "
-"""A participant that has started prints a line that begins so."""
+"""Start of the line that a participant prints once it has started."""
 SUPERVISED = "THERMOFLEET_SUPERVISOR"
 """Environment variable of supervised processes: the process id of the supervisor."""
-
-
 LOG_S = 1.0
 """Real seconds to wait for the last output of an exited process."""
 
@@ -71,6 +68,11 @@ class _Running:
     restarts: int = 0
     ready: threading.Event = field(default_factory=threading.Event)
     over: bool = False
+    """It is not started again."""
+
+    @property
+    def alive(self) -> bool:
+        return self.process is not None and self.process.poll() is None
 
 
 class Supervisor:
@@ -117,9 +119,9 @@ class Supervisor:
         running = self._parts[name]
         deadline_s = time.monotonic() + ready_s
         while not running.ready.wait(0.05) and not stopped():
-            if running.process is not None and running.process.poll() is not None:
-                if running.copier is not None:
-                    running.copier.join(LOG_S)
+            if running.process is not None and not running.alive:
+                assert running.copier is not None
+                running.copier.join(LOG_S)
                 raise FleetError(f"'{name}' exited at once: {self.last_log_line(name)}")
             if time.monotonic() > deadline_s:
                 raise FleetError(f"'{name}' was not ready within {ready_s:g} s: {self.last_log_line(name)}")
@@ -135,22 +137,24 @@ class Supervisor:
     def pid(self, name: str) -> int | None:
         """Process id; None while it is not running."""
         process = self._parts[name].process
-        return process.pid if process is not None and process.poll() is None else None
+        return process.pid if process is not None and self._parts[name].alive else None
 
     def log(self, name: str) -> Path:
         """Path of its log."""
         return self.folder / f"{name}.log"
 
+    def _log_lines(self, name: str) -> list[str]:
+        path = self.log(name)
+        return path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
+
     def last_log_line(self, name: str) -> str:
-        """Last line of its log, or where the log is if it is empty."""
-        lines = (
-            self.log(name).read_text(encoding="utf-8", errors="replace").splitlines() if self.log(name).exists() else []
-        )
+        """Last line of its log, or the path of the log if it is empty."""
+        lines = self._log_lines(name)
         return lines[-1] if lines else f"no output (log: {self.log(name)})."
 
     def log_since_ready(self, name: str) -> str:
         """Its log since it was last ready; all of it, if it never was."""
-        lines = self.log(name).read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = self._log_lines(name)
         last = max((i for i, line in enumerate(lines) if line.startswith(self._parts[name].part.ready)), default=-1)
         return "\n".join(lines[last + 1 :])
 
@@ -180,28 +184,24 @@ class Supervisor:
 
     def stop(self) -> None:
         """Stop all, rank after rank: by SIGTERM, and by SIGKILL after `patience_s`."""
-        alive: dict[int, list[_Running]] = {}
-        for running in self._parts.values():
+        ranks: dict[int, dict[str, subprocess.Popen[str]]] = {}
+        for name, running in self._parts.items():
             running.over = True
-            if running.process is not None and running.process.poll() is None:
+            if running.process is not None and running.alive:
                 running.process.send_signal(signal.SIGCONT)  # a suspended process would not receive SIGTERM
-                alive.setdefault(running.part.rank, []).append(running)
-        for rank in sorted(alive, reverse=True):
-            self._end(alive[rank])
-
-    def _end(self, together: list[_Running]) -> None:
-        processes = [(running.part.name, running.process) for running in together if running.process is not None]
-        for _, process in processes:
-            process.terminate()
-        deadline_s = time.monotonic() + self._patience_s
-        for name, process in processes:
-            try:
-                process.wait(max(0.0, deadline_s - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                _LOG.warning("'%s' did not exit within %g s and was killed.", name, self._patience_s)
-                process.kill()
-        for _, process in processes:
-            process.wait(self._patience_s)
+                ranks.setdefault(running.part.rank, {})[name] = running.process
+        for _, processes in sorted(ranks.items(), reverse=True):
+            for process in processes.values():
+                process.terminate()
+            deadline_s = time.monotonic() + self._patience_s
+            for name, process in processes.items():
+                try:
+                    process.wait(max(0.0, deadline_s - time.monotonic()))
+                except subprocess.TimeoutExpired:
+                    _LOG.warning("'%s' did not exit within %g s and was killed.", name, self._patience_s)
+                    process.kill()
+            for process in processes.values():
+                process.wait(self._patience_s)
 
     def __enter__(self) -> "Supervisor":
         return self
@@ -224,12 +224,12 @@ class Supervisor:
             start_new_session=True,  # Ctrl-C goes to the supervisor alone, which stops them in order
         )
         running.process = process
-        assert process.stdout is not None
-        running.copier = threading.Thread(target=self._copy_log, args=(running, process, process.stdout), daemon=True)
+        running.copier = threading.Thread(target=self._copy_log, args=(running, process), daemon=True)
         running.copier.start()
 
-    def _copy_log(self, running: _Running, process: "subprocess.Popen[str]", output: IO[str]) -> None:
-        with output, self.log(running.part.name).open("a", encoding="utf-8") as log:
+    def _copy_log(self, running: _Running, process: "subprocess.Popen[str]") -> None:
+        assert process.stdout is not None
+        with process.stdout as output, self.log(running.part.name).open("a", encoding="utf-8") as log:
             for line in output:
                 log.write(line)
                 log.flush()
@@ -240,8 +240,8 @@ class Supervisor:
 
     def _handle_exit(self, running: _Running) -> bool:
         """Return whether the fleet ends with this process; otherwise schedule its restart."""
-        process, now_s = running.process, time.monotonic()
-        if process is None or process.poll() is None:
+        process, now_s, name = running.process, time.monotonic(), running.part.name
+        if process is None or running.alive:
             return False
         if process.returncode == 0 and running.part.essential:
             running.over = True
@@ -250,13 +250,7 @@ class Supervisor:
         wait_s = self._backoff.wait_s(running.failures)
         running.process, running.due_s = None, now_s + wait_s
         how = f"signal {-process.returncode}" if process.returncode < 0 else f"code {process.returncode}"
-        _LOG.warning(
-            "'%s' exited with %s; restart in %.1f s (log: %s).",
-            running.part.name,
-            how,
-            wait_s,
-            self.log(running.part.name),
-        )
+        _LOG.warning("'%s' exited with %s; restart in %.1f s (log: %s).", name, how, wait_s, self.log(name))
         return False
 
 

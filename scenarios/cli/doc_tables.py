@@ -15,8 +15,9 @@ from fleet.bus.protocol.schemas import Schema, descriptions, schemas
 from fleet.engine.reward import RewardWeights
 from fleet.errors import FleetError
 from fleet.live.arm.award_executor import COMMIT_RETRY_S, RENEWALS, REPORT_RETRY_S, ExecutorConfig
-from fleet.live.auction.admission import MOST_JOBS as MOST_KEPT
-from fleet.live.auction.lease_timing import DRIFT, Timing
+from fleet.live.auction.job_rules import MAX_KEPT_JOBS
+from fleet.live.auction.round import Timing
+from fleet.live.clock import CLOCK_DRIFT
 from fleet.live.monitor.snapshot import FRESH_S
 from fleet.observation import FIELDS, Layout
 
@@ -145,7 +146,7 @@ def table(head: tuple[str, ...], rows: Iterable[Sequence[str]]) -> str:
 def _time_table() -> str:
     timing, terms = Timing(), ExecutorConfig()
     again_s, most_s = REPORT_RETRY_S
-    short_s, margin_s, attempts = timing.lease_s * (1 - DRIFT), timing.margin_s, timing.attempts
+    short_s, margin_s, attempts = timing.lease_s * (1 - CLOCK_DRIFT), timing.margin_s, timing.attempts
     state = CHANNEL["arm", "state"]
     rows = [
         (f"{SESSION_LEASE_S:g}", "all", "without a sign of life Zenoh closes a session and withdraws its token"),
@@ -156,8 +157,12 @@ def _time_table() -> str:
         (f"{terms.valid_s:g}", "arm", "`valid_s`: it accepts an award on its quote"),
         (f"{timing.ack_s:g}", "auctioneer", f"without an `Ack` the same award is sent again, {attempts} times in all"),
         (f"{timing.lease_s:g}", "auctioneer", "`lease_s`: length of a lease"),
-        (f"{short_s:.2f}", "arm", f"how it counts that lease: {DRIFT:.0%} shorter, as clocks differ in rate"),
-        (f"{timing.counted_lease_s:.2f}", "auctioneer", f"how it counts it: {DRIFT:.0%} and {margin_s:g} s longer"),
+        (f"{short_s:.2f}", "arm", f"how it counts that lease: {CLOCK_DRIFT:.0%} shorter, as clocks differ in rate"),
+        (
+            f"{timing.counted_lease_s:.2f}",
+            "auctioneer",
+            f"how it counts it: {CLOCK_DRIFT:.0%} and {margin_s:g} s longer",
+        ),
         (f"{timing.lease_s / RENEWALS:g}", "arm", "between two requests to renew the lease"),
         (f"{terms.commit_lead_s:g}", "arm", "before its last cycle could begin it requests permission to commit"),
         (f"{COMMIT_RETRY_S:g}", "arm", "until it requests that permission again"),
@@ -174,7 +179,7 @@ def _limit_table() -> str:
         (f"{Limits().message_bytes:,} bytes", "any message with its attachment; the router silently drops larger ones"),
         (f"{state.limit_hz:g} a second", "`state` messages of one session; the router drops more (`--state-hz`)"),
         (f"{MOST_JOBS}", "jobs in one message; of more, a `Status` holds those that may still change first"),
-        (f"{MOST_KEPT:,}", "jobs that one auctioneer keeps, finished ones included"),
+        (f"{MAX_KEPT_JOBS:,}", "jobs that one auctioneer keeps, finished ones included"),
         (f"{longest}", "characters of a job's name"),
     ]
     return table(("limit", "of"), rows)

@@ -1,4 +1,4 @@
-"""The fleet's time: monotone whatever it is corrected by, and right within half a round trip."""
+"""Fleet time: monotone under any correction, and right within half a round trip."""
 
 import ast
 import math
@@ -25,40 +25,40 @@ def test_a_minute_at_sixtyfold_speed_is_an_hour():
 
 
 @given(speed, moment, corrections, st.lists(span, min_size=2, max_size=20))
-def test_it_never_goes_backwards_and_its_rate_is_bounded(speed, start, corrections, spans):
+def test_a_clock_never_runs_backwards_and_its_rate_is_bounded(speed, start, corrections, spans):
     clock, real_s = FleetClock(speed, start), start
     before = clock.now_s(real_s)
-    said_first = before
-    for wait, trip, said in corrections:
+    first_s = before
+    for wait, trip, reading_s in corrections:
         asked, real_s = real_s + wait, real_s + wait + trip
-        shown = clock.now_s(real_s)
-        assert shown >= before
-        clock = clock.slewed_to(asked, real_s, said)
-        assert clock.now_s(real_s) == shown  # the correction itself is no jump
-        before = shown
+        now_s = clock.now_s(real_s)
+        assert now_s >= before
+        clock = clock.slewed_to(asked, real_s, reading_s)
+        assert clock.now_s(real_s) == now_s  # the correction itself is no jump
+        before = now_s
     for step in spans:
         later = clock.now_s(real_s + step)
         passed = speed * ((real_s + step) - real_s)
         rounding = 1e-9 * (1.0 + abs(later))
         assert before + (1 - SLEW) * passed - rounding <= later <= before + (1 + SLEW) * passed + rounding
         before, real_s = later, real_s + step
-    assert before >= said_first
+    assert before >= first_s
 
 
 @given(speed, span, st.floats(0.0, 5.0), st.floats(0.0, 1.0), st.floats(-100.0, 100.0))
-def test_after_a_correction_it_is_right_within_half_a_round_trip(speed, asked, trip, share, ahead):
-    """The other clock answers at any moment between question and answer; the truth is `speed · real`."""
+def test_after_a_correction_a_clock_is_right_within_half_a_round_trip(speed, asked, trip, share, ahead):
+    """The other clock is read at any moment between request and reply."""
     clock = FleetClock(speed, 0.0, speed * 100.0 + speed * ahead)  # the truth is speed · (real + 100)
     answered = asked + trip
-    said = speed * (asked + share * trip + 100.0)
+    reading_s = speed * (asked + share * trip + 100.0)
     settled = answered + (abs(ahead) + trip) / SLEW + 1.0
-    off = clock.slewed_to(asked, answered, said).now_s(settled) - speed * (settled + 100.0)
+    off = clock.slewed_to(asked, answered, reading_s).now_s(settled) - speed * (settled + 100.0)
     assert abs(off) <= speed * trip / 2 + 1e-6 * speed
-    at_once = clock.set_to(asked, answered, said).now_s(answered) - speed * (answered + 100.0)
+    at_once = clock.set_to(asked, answered, reading_s).now_s(answered) - speed * (answered + 100.0)
     assert abs(at_once) <= speed * trip / 2 + 1e-6 * speed
 
 
-def test_what_is_owed_is_made_up_for_at_a_tenth_of_the_speed():
+def test_an_offset_is_removed_at_a_tenth_of_the_speed():
     clock = FleetClock(2.0, 0.0, 0.0).slewed_to(0.0, 0.0, 4.0)
     assert clock.now_s(10.0) == pytest.approx(20.0 + 2.0)
     assert clock.now_s(20.0) == pytest.approx(40.0 + 4.0)
@@ -71,13 +71,13 @@ def test_a_speed_must_be_a_positive_number(speed):
         FleetClock(speed)
 
 
-def test_an_answer_before_its_question_is_refused():
+def test_a_reply_before_its_request_is_refused():
     with pytest.raises(ValueError, match="answered_s must be >= asked_s"):
         FleetClock(1.0).slewed_to(2.0, 1.0, 0.0)
 
 
 WALL = {("time", "time"), ("time", "time_ns"), ("datetime", "now"), ("datetime", "utcnow"), ("date", "today")}
-OF_THE_DAY = {"certificates.py": "validity", "security.py": "validity", "ros2.py": "stamps of ROS messages"}
+ALLOWED = {"certificates.py": "validity", "security.py": "validity", "ros2.py": "stamps of ROS messages"}
 
 
 @pytest.mark.parametrize(
@@ -85,19 +85,19 @@ OF_THE_DAY = {"certificates.py": "validity", "security.py": "validity", "ros2.py
     [*(ROOT / "fleet" / "live").glob("*.py"), *(ROOT / "fleet" / "bus").glob("*.py")],
     ids=lambda path: path.name,
 )
-def test_no_participant_goes_by_the_wall_clock(path):
-    """A jump of it then harms nothing; benchmarks/chaos shows it on a fleet of processes."""
+def test_no_participant_reads_the_wall_clock(path):
+    """So a jump of the wall clock has no effect; benchmarks/chaos tests it on a fleet of processes."""
     read = {
         (node.value.id, node.attr)
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)
     }
-    assert not read & WALL or path.name in OF_THE_DAY
+    assert not read & WALL or path.name in ALLOWED
 
 
 @given(st.lists(st.floats(0.0, 5.0), min_size=1, max_size=40))
-def test_what_is_due_again_and_again_keeps_its_rate_and_never_comes_twice_at_once(delays_s):
-    """Done late by some delay each time: never closer than half a period, never ahead of its rate."""
+def test_a_periodic_action_keeps_its_rate_and_never_runs_twice_at_once(delays_s):
+    """Each run is late by some delay: never closer than half a period, never ahead of its rate."""
     period_s, due_s, last_s = 0.1, 0.0, -math.inf
     for number, delay_s in enumerate(delays_s):
         now_s = max(due_s, last_s) + delay_s

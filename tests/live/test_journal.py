@@ -1,4 +1,4 @@
-"""A journal gives back what was written, and refuses to guess."""
+"""A journal returns what was written, and refuses damaged files."""
 
 import errno
 import os
@@ -12,12 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet.errors import FleetError, JournalError, JournalFull
-from fleet.live.journal import Journal
+from fleet.live import journal
+from fleet.live.consensus.granter import GrantRecord, Register
+from fleet.live.journal import Journal, TimeRecorder
 
 ROOT = Path(__file__).parents[2]
 
 
-class Said(msgspec.Struct, frozen=True, tag="said"):
+class Text(msgspec.Struct, frozen=True, tag="text"):
     text: str
 
 
@@ -26,14 +28,14 @@ class Counted(msgspec.Struct, frozen=True, tag="counted"):
     share: float = 0.0
 
 
-KIND = Said | Counted
-record = st.builds(Said, st.text()) | st.builds(
+KIND = Text | Counted
+record = st.builds(Text, st.text()) | st.builds(
     Counted, st.integers(-(2**60), 2**60), st.floats(allow_nan=False, allow_infinity=False)
 )
 
 
 def written(path, *batches, **options):
-    """The journal's file with these batches, and its bytes."""
+    """Write a journal of these batches, and return its bytes."""
     with Journal(path, KIND, **options) as journal:
         for batch in batches:
             journal.append(*batch)
@@ -47,7 +49,7 @@ def read(path):
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.lists(record, max_size=4), max_size=6), st.lists(record, max_size=3))
-def test_what_is_written_comes_back_in_order(tmp_path_factory, batches, later):
+def test_records_are_read_in_the_order_of_writing(tmp_path_factory, batches, later):
     path = tmp_path_factory.mktemp("journal") / "deep" / "arm.jsonl"
     quick = {"sync": lambda file: None}
     written(path, *batches, **quick)
@@ -55,42 +57,42 @@ def test_what_is_written_comes_back_in_order(tmp_path_factory, batches, later):
     assert read(path) == [each for batch in [*batches, later] for each in batch]
 
 
-def test_every_line_is_json_for_anybody(tmp_path):
-    lines = written(tmp_path / "j", [Said("a\nb"), Counted(1)], [Said("ä")]).splitlines()
+def test_every_line_is_plain_json(tmp_path):
+    lines = written(tmp_path / "j", [Text("a\nb"), Counted(1)], [Text("ä")]).splitlines()
     assert [msgspec.json.decode(line)["records"] for line in lines] == [
-        [{"type": "said", "text": "a\nb"}, {"type": "counted", "number": 1, "share": 0.0}],
-        [{"type": "said", "text": "ä"}],
+        [{"type": "text", "text": "a\nb"}, {"type": "counted", "number": 1, "share": 0.0}],
+        [{"type": "text", "text": "ä"}],
     ]
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.data())
-def test_a_torn_last_line_is_taken_away_and_said(tmp_path_factory, data):
+def test_an_unfinished_last_line_is_removed_and_counted(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("journal") / "j"
-    first = len(written(path, [Said("kept")]))
-    whole = written(path, [Said("torn"), Counted(7)])
+    first = len(written(path, [Text("kept")]))
+    whole = written(path, [Text("torn"), Counted(7)])
     cut = data.draw(st.integers(first + 1, len(whole) - 1))
     path.write_bytes(whole[:cut])
     with Journal(path, KIND) as journal:
         assert journal.torn == cut - first
-        assert list(journal.records()) == [Said("kept")]
-        journal.append(Said("after"))
+        assert list(journal.records()) == [Text("kept")]
+        journal.append(Text("after"))
     assert path.read_bytes()[:first] == whole[:first]
-    assert read(path) == [Said("kept"), Said("after")]
+    assert read(path) == [Text("kept"), Text("after")]
 
 
-def test_a_torn_line_is_logged(tmp_path, caplog):
+def test_an_unfinished_line_is_logged(tmp_path, caplog):
     path = tmp_path / "j"
-    path.write_bytes(written(path, [Said("a")]) + b'{"crc":"')
+    path.write_bytes(written(path, [Text("a")]) + b'{"crc":"')
     read(path)
     assert "last line (8 bytes)" in caplog.text
 
 
 @settings(max_examples=100, deadline=None)
 @given(st.data())
-def test_damage_is_refused_with_file_and_line(tmp_path_factory, data):
+def test_damage_is_reported_with_file_and_line(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("journal") / "j"
-    whole = written(path, [Said("one")], [Said("two"), Counted(2)], [Said("three")])
+    whole = written(path, [Text("one")], [Text("two"), Counted(2)], [Text("three")])
     where = data.draw(st.integers(0, len(whole) - 2))
     byte = data.draw(st.integers(0, 255).filter(lambda b: b != whole[where]))
     path.write_bytes(whole[:where] + bytes([byte]) + whole[where + 1 :])
@@ -99,9 +101,9 @@ def test_damage_is_refused_with_file_and_line(tmp_path_factory, data):
         read(path)
 
 
-def test_a_line_that_is_missing_from_the_middle_of_another_is_damage(tmp_path):
+def test_a_cut_line_before_another_one_is_damage(tmp_path):
     path = tmp_path / "j"
-    lines = written(path, [Said("one")], [Said("two")]).splitlines(keepends=True)
+    lines = written(path, [Text("one")], [Text("two")]).splitlines(keepends=True)
     path.write_bytes(lines[0] + lines[1][:9] + b"\n" + lines[1])
     with pytest.raises(JournalError, match="line 2: damaged"):
         read(path)
@@ -109,12 +111,12 @@ def test_a_line_that_is_missing_from_the_middle_of_another_is_damage(tmp_path):
 
 def test_records_of_another_version_are_refused_with_their_line(tmp_path):
     path = tmp_path / "j"
-    written(path, [Said("one")], [Counted(2)])
-    with pytest.raises(JournalError, match="line 2: not a record of this version"), Journal(path, Said):
+    written(path, [Text("one")], [Counted(2)])
+    with pytest.raises(JournalError, match="line 2: not a record of this version"), Journal(path, Text):
         pass
 
 
-def test_two_at_one_journal_are_refused_and_the_next_is_not(tmp_path):
+def test_a_journal_is_open_in_one_process_at_a_time(tmp_path):
     path = tmp_path / "j"
     program = f"""
 from pathlib import Path
@@ -130,107 +132,107 @@ except JournalError as error:
     with Journal(path, KIND):
         with pytest.raises(JournalError, match="in use by another"):
             Journal(path, KIND).open()
-        said = subprocess.run(ask, capture_output=True, text=True, check=True, timeout=60, cwd=ROOT)
-        assert "in use by another process" in said.stdout
+        result = subprocess.run(ask, capture_output=True, text=True, check=True, timeout=60, cwd=ROOT)
+        assert "in use by another process" in result.stdout
     assert subprocess.run(ask, capture_output=True, text=True, check=True, timeout=60, cwd=ROOT).stdout == ""
 
 
-def test_nothing_is_told_before_it_is_on_disk(tmp_path):
+def test_append_returns_after_the_records_are_on_disk(tmp_path):
     """The last fsync of an append comes after its last byte."""
     sizes = []
     with Journal(tmp_path / "j", KIND, sync=lambda file: sizes.append(os.fstat(file).st_size)) as journal:
         del sizes[:]
-        journal.append(Said("a"), Said("b"))
+        journal.append(Text("a"), Text("b"))
         assert sizes == [journal.path.stat().st_size]
 
 
-class ShortOfRoom:
-    """An `os.write` that takes a few bytes more, and then finds the disk full."""
+class AlmostFullDisk:
+    """An `os.write` that writes some bytes, and then fails since the disk is full."""
 
-    def __init__(self, room):
-        self.room, self.write = room, os.write
+    def __init__(self, space):
+        self.space, self.write = space, os.write
 
     def __call__(self, file, data):
-        if not self.room:
+        if not self.space:
             raise OSError(errno.ENOSPC, "No space left on device")
-        taken = self.write(file, bytes(data[: self.room]))
-        self.room -= taken
+        taken = self.write(file, bytes(data[: self.space]))
+        self.space -= taken
         return taken
 
 
-@pytest.mark.parametrize("room", [0, 1, 20])
-def test_a_full_disk_leaves_the_file_whole(tmp_path, monkeypatch, room):
+@pytest.mark.parametrize("space", [0, 1, 20])
+def test_a_full_disk_leaves_the_file_unchanged(tmp_path, monkeypatch, space):
     path = tmp_path / "j"
-    before = written(path, [Said("kept")])
+    before = written(path, [Text("kept")])
     with Journal(path, KIND) as journal:
         with monkeypatch.context() as full:
-            full.setattr(os, "write", ShortOfRoom(room))
+            full.setattr(os, "write", AlmostFullDisk(space))
             with pytest.raises(JournalFull, match="no space left to write \\(No space left") as raised:
-                journal.append(Said("too much"))
+                journal.append(Text("too much"))
         assert isinstance(raised.value, FleetError)
         assert path.read_bytes() == before
-        journal.append(Said("room again"))
-        assert list(journal.records()) == [Said("kept"), Said("room again")]
+        journal.append(Text("space again"))
+        assert list(journal.records()) == [Text("kept"), Text("space again")]
 
 
-def test_a_real_limit_of_the_file_size_leaves_the_file_whole(tmp_path):
-    """The kernel's own refusal: RLIMIT_FSIZE cuts a write short, then refuses the rest."""
+def test_a_file_size_limit_of_the_kernel_leaves_the_file_unchanged(tmp_path):
+    """RLIMIT_FSIZE cuts a write short, then refuses the rest."""
     program = f"""
 import resource, sys
 from pathlib import Path
 sys.path.insert(0, {str(Path(__file__).parent)!r})
-from test_journal import KIND, Said
+from test_journal import KIND, Text
 from fleet.errors import JournalFull
 from fleet.live.journal import Journal
 with Journal(Path({str(tmp_path / "j")!r}), KIND) as journal:
-    journal.append(Said("kept"))
+    journal.append(Text("kept"))
     resource.setrlimit(resource.RLIMIT_FSIZE, (journal.path.stat().st_size + 10,) * 2)
     try:
-        journal.append(Said("x" * 100))
+        journal.append(Text("x" * 100))
     except JournalFull as full:
         print("full")
     print(list(journal.records()), journal.path.read_bytes().count(b"xx"))
 """
-    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
-    assert said.stdout.splitlines() == ["full", "[Said(text='kept')] 0"]
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
+    assert result.stdout.splitlines() == ["full", "[Text(text='kept')] 0"]
 
 
-def test_after_a_failed_sync_nothing_more_is_promised(tmp_path):
+def test_after_a_failed_sync_further_writes_are_refused(tmp_path):
     path = tmp_path / "j"
-    before = written(path, [Said("kept")])
+    before = written(path, [Text("kept")])
 
     def fail(file):
         raise OSError(errno.EIO, "Input/output error")
 
     with Journal(path, KIND, sync=fail) as journal:
-        for said in ("cannot be written: Input/output error", "must be reopened"):
-            with pytest.raises(JournalError, match=said):
-                journal.append(Said("lost"))
+        for result in ("cannot be written: Input/output error", "must be reopened"):
+            with pytest.raises(JournalError, match=result):
+                journal.append(Text("lost"))
     assert path.read_bytes() == before
 
 
-def test_a_rewritten_journal_holds_only_what_it_was_given(tmp_path, monkeypatch):
+def test_a_rewritten_journal_contains_only_the_new_records(tmp_path, monkeypatch):
     path = tmp_path / "j"
     written(path, *[[Counted(n)] for n in range(50)])
     with Journal(path, KIND) as journal:
         journal.rewrite(Counted(49))
-        journal.append(Said("next"))
-        assert list(journal.records()) == [Counted(49), Said("next")]
+        journal.append(Text("next"))
+        assert list(journal.records()) == [Counted(49), Text("next")]
         with monkeypatch.context() as full:
-            full.setattr(os, "write", ShortOfRoom(5))
+            full.setattr(os, "write", AlmostFullDisk(5))
             with pytest.raises(JournalFull):
-                journal.rewrite(Said("too much"))
-        journal.append(Said("still"))
-    assert read(path) == [Counted(49), Said("next"), Said("still")]
+                journal.rewrite(Text("too much"))
+        journal.append(Text("still"))
+    assert read(path) == [Counted(49), Text("next"), Text("still")]
     assert sorted(each.name for each in tmp_path.iterdir()) == ["j", "j.lock"]
 
 
 class Crash(BaseException):
-    """The process is gone, or the power."""
+    """The process is killed, or the power is lost."""
 
 
 class Disk:
-    """Counts what is done to files, ends all at one moment, and knows what was brought to the disk by then."""
+    """Counts file operations, crashes at a given one, and records what is on disk by then."""
 
     def __init__(self, moment):
         self.left, self.synced = moment, {}
@@ -246,7 +248,7 @@ class Disk:
         return self.open(*args)
 
     def writes(self, file, data):
-        """Half of it, so that every line is written in many pieces."""
+        """Write half, so that every line is written in several pieces."""
         self._tick()
         return self.write(file, bytes(data[: (len(data) + 1) // 2]))
 
@@ -259,7 +261,7 @@ class Disk:
         self.synced[os.fstat(file).st_ino] = os.fstat(file).st_size
 
     def lose_power(self, folder):
-        """Whatever was not brought to the disk is not there."""
+        """Remove what was not synced."""
         for path in folder.iterdir():
             if path.name == "j" or path.name.startswith(".j."):
                 os.truncate(path, self.synced.get(path.stat().st_ino, 0))
@@ -267,7 +269,7 @@ class Disk:
 
 @pytest.mark.parametrize("power", [False, True], ids=["killed", "without power"])
 def test_a_crash_at_any_moment_of_a_rewrite_leaves_the_old_records_or_the_new(tmp_path, monkeypatch, power):
-    old, new, later = [Said("one"), Counted(2)], [Counted(1)], Said("later")
+    old, new, later = [Text("one"), Counted(2)], [Counted(1)], Text("later")
     seen = set()
     for moment in range(60):
         path = tmp_path / str(moment) / "j"
@@ -290,10 +292,10 @@ def test_a_crash_at_any_moment_of_a_rewrite_leaves_the_old_records_or_the_new(tm
         if power:
             disk.lose_power(path.parent)
         allowed = {0: [old, new], 1: [new, [*new, later]], 2: [[*new, later]]}[stage]
-        found = read(path)
-        assert found in allowed, f"crash at {moment}"
-        seen.add(tuple(found))
-        with Journal(path, KIND) as journal:  # whatever the crash left behind, it can be done again
+        records = read(path)
+        assert records in allowed, f"crash at {moment}"
+        seen.add(tuple(records))
+        with Journal(path, KIND) as journal:  # the rewrite works after any crash
             journal.rewrite(*new)
         assert read(path) == new
         if stage == 2:
@@ -302,10 +304,10 @@ def test_a_crash_at_any_moment_of_a_rewrite_leaves_the_old_records_or_the_new(tm
     assert seen == {tuple(old), tuple(new), (*new, later)}
 
 
-def test_when_nobody_knows_which_file_has_the_name_nothing_more_is_promised(tmp_path):
-    """The folder cannot be brought to the disk after the new file took the name of the old one."""
+def test_after_a_failed_sync_of_the_folder_further_writes_are_refused(tmp_path):
+    """The sync fails after the new file has replaced the old one."""
     path = tmp_path / "j"
-    written(path, [Said("old")])
+    written(path, [Text("old")])
 
     def fail(file):
         if os.path.isdir(f"/proc/self/fd/{file}"):
@@ -313,28 +315,33 @@ def test_when_nobody_knows_which_file_has_the_name_nothing_more_is_promised(tmp_
 
     with Journal(path, KIND, sync=fail) as journal:
         with pytest.raises(JournalError, match="No further writes until"):
-            journal.rewrite(Said("new"))
+            journal.rewrite(Text("new"))
         with pytest.raises(JournalError, match="until it is reopened"):
-            journal.append(Said("lost"))
-    assert read(path) == [Said("new")]
+            journal.append(Text("lost"))
+    assert read(path) == [Text("new")]
 
 
-def test_a_journal_knows_its_size(tmp_path):
-    with Journal(tmp_path / "j", KIND) as journal:
-        assert journal.size == 0
-        journal.append(Said("a"), Counted(1))
-        assert journal.size == journal.path.stat().st_size
-        journal.rewrite(Said("b"))
-        assert journal.size == journal.path.stat().st_size
-
-
-def test_a_closed_journal_says_so(tmp_path):
+def test_a_closed_journal_refuses_records(tmp_path):
     journal = Journal(tmp_path / "j", KIND)
     with pytest.raises(JournalError, match="not open"):
-        journal.append(Said("a"))
+        journal.append(Text("a"))
 
 
-def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
+def test_an_error_names_a_folder_that_cannot_be_created(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(JournalError, match="cannot be opened"):
         Journal(tmp_path / "file" / "j", KIND).open()
+
+
+def test_fleet_time_never_runs_backwards_after_a_restart(tmp_path, monkeypatch):
+    """Not even if the journal was compacted after the last job event."""
+    monkeypatch.setattr(journal, "COMPACT_BYTES", 1)
+    with Journal[GrantRecord](tmp_path / "j", GrantRecord) as book:
+        recorder = TimeRecorder(book, Register(), real_s=0.0)
+        assert recorder.start_s(speed=60.0) == 0.0
+        for real_s in range(1, 30):
+            recorder.step(float(real_s), 60.0 * real_s)
+        assert len(list(book.records())) < 10
+    with Journal[GrantRecord](tmp_path / "j", GrantRecord) as book:
+        again = TimeRecorder(book, Register().replay(book.records()), real_s=0.0)
+        assert 29 * 60.0 <= again.start_s(speed=60.0) <= 31 * 60.0

@@ -1,4 +1,4 @@
-"""Cables between network namespaces, as the campaign pulls them: what is cut is silent, and nothing is left."""
+"""Network namespaces of the fault campaign: a cut link is silent, and nothing is left behind."""
 
 import importlib
 import os
@@ -26,13 +26,13 @@ def namespaces(monkeypatch):
     return module
 
 
-def there(pid):
-    """Namespaces and interfaces that bear the number of a process."""
+def leftovers(pid):
+    """Return the namespaces and interfaces that a process has created."""
     listed = subprocess.run("ip netns list; ip -o link", shell=True, capture_output=True, text=True, check=True).stdout
     return [word for word in listed.split() if word.startswith(f"tf{pid}-")]
 
 
-def test_a_pulled_cable_lets_nothing_through_and_tells_nobody(namespaces):
+def test_a_cut_link_delivers_nothing_and_reports_nothing(namespaces):
     with socket.create_server(("0.0.0.0", 0)) as server:
         server.settimeout(PATIENCE_S)
         port = server.getsockname()[1]
@@ -47,36 +47,36 @@ def test_a_pulled_cable_lets_nothing_through_and_tells_nobody(namespaces):
                     cables.cut()
                     line.sendall(b"y")
                     with pytest.raises(subprocess.TimeoutExpired):
-                        caller.wait(0.5)  # neither heard it nor was told
-                    cables.heal()  # what was lost is sent again by TCP
+                        caller.wait(0.5)  # it got neither data nor an error
+                    cables.heal()  # TCP resends what was lost
                     assert caller.wait(PATIENCE_S) == 0
-    assert there(os.getpid()) == []
+    assert leftovers(os.getpid()) == []
 
 
-def test_nothing_is_left_where_one_of_them_cannot_be_made(namespaces):
+def test_nothing_is_left_after_a_namespace_could_not_be_created(namespaces):
     subprocess.run(["ip", "netns", "add", f"tf{os.getpid()}-1"], check=True)
     try:
         with pytest.raises(FleetError, match=f"'ip netns add tf{os.getpid()}-1' failed: .*File exists"):
             namespaces.Namespaces(["a", "b"], 1).__enter__()
-        assert there(os.getpid()) == [f"tf{os.getpid()}-1"]
+        assert leftovers(os.getpid()) == [f"tf{os.getpid()}-1"]
     finally:
         subprocess.run(["ip", "netns", "del", f"tf{os.getpid()}-1"], check=True)
 
 
-def test_what_a_killed_campaign_left_is_cleared_away_and_nothing_else(namespaces):
+def test_only_the_namespaces_of_killed_campaigns_are_removed(namespaces):
     with subprocess.Popen([sys.executable, "-c", "pass"]) as ended:
         pass
     left = f"tf{ended.pid}-0"
     subprocess.run(["ip", "netns", "add", left], check=True)
     subprocess.run(f"ip link add {left} type veth peer name eth0 netns {left}".split(), check=True)
     with namespaces.Namespaces(["a"], 1):
-        assert there(ended.pid) == []
+        assert leftovers(ended.pid) == []
         namespaces.clear_away()
-        assert there(os.getpid())
-    assert there(os.getpid()) == []
+        assert leftovers(os.getpid())
+    assert leftovers(os.getpid()) == []
 
 
-def test_without_root_it_says_why(namespaces, monkeypatch):
+def test_without_root_the_reason_is_given(namespaces, monkeypatch):
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     assert namespaces.why_not() == "network namespaces need root"
     monkeypatch.setenv("PATH", "")

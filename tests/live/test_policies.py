@@ -1,4 +1,4 @@
-"""Every policy live: the same choice from the same knowledge as in simulation, and a shift that gets done."""
+"""Every policy live: the same choice from the same observation as in simulation, and a shift that is completed."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ from scenarios.live.allocation import CentralAllocation
 
 CENTRAL = [name for name, rule in RULES.items() if rule.scope == "central"]
 SIMULATED_ONLY = {"last_award", "clock", "busy_s"}
-"""Fields that quotes do not tell of an arm at work, and that no rule reads of it."""
+"""Fields that quotes of a working arm do not contain, and that no rule reads."""
 
 
 def quote(arm: str, *offers: Estimate, **changes) -> Quote:
@@ -29,7 +29,7 @@ def quote(arm: str, *offers: Estimate, **changes) -> Quote:
 
 
 def quoted(seen: dict[str, Observation], time_s: float) -> Bidding:
-    """What arms with this knowledge answer to an auctioneer; every job at a station of its own."""
+    """Return observations as quotes to an auctioneer; every job has a separate station."""
     first = next(iter(seen.values()))
     slots = [slot for slot in range(len(first.offered)) if first.offered[slot]]
     jobs, quotes, states = [], {}, {}
@@ -81,8 +81,8 @@ def fresh(name: str) -> Policy:
 
 
 @pytest.mark.parametrize("name", RULES)
-def test_the_same_knowledge_gives_the_same_choice_simulated_and_live(small, name) -> None:
-    """Every moment of a shift at which somebody may choose, told as quotes and read from them again."""
+def test_the_same_observation_gives_the_same_choice_simulated_and_live(small, name) -> None:
+    """Each step of a shift at which an arm may choose, converted to quotes and back."""
     env = parallel_env(small.Shifts(arms=3, jobs=16, ticks=80, ambient_c=36.0))
     env.reset(seed=4)
     simulated, live, compared = fresh(name), fresh(name), 0
@@ -93,16 +93,18 @@ def test_the_same_knowledge_gives_the_same_choice_simulated_and_live(small, name
         if any(o.action_mask[1:].any() for o in seen.values()):
             time_s = float(env.truth.tick[0] * env.world.dt_s)
             fleet = LiveFleet(arms=tuple(seen), warning_c=env.world.limits.warning_c, horizon_s=env.world.horizon_s)
-            again = observe(quoted(seen, time_s), fleet)
+            live_seen = observe(quoted(seen, time_s), fleet)
             for arm, o in seen.items():
-                # Which station is busy is no part of a quote.
-                again[arm] = replace(again[arm], action_mask=o.action_mask[: len(open_slots) + 1])
+                # A quote does not contain busy stations.
+                live_seen[arm] = replace(live_seen[arm], action_mask=o.action_mask[: len(open_slots) + 1])
                 for field in FIELDS:
                     if field.name not in SIMULATED_ONLY:
-                        told = getattr(o, field.name)
-                        told = told[..., : len(open_slots)] if "slot" in field.axes else told
-                        np.testing.assert_allclose(getattr(again[arm], field.name), told, atol=0.02, err_msg=field.name)
-            assert live.act(again) == actions
+                        expected = getattr(o, field.name)
+                        expected = expected[..., : len(open_slots)] if "slot" in field.axes else expected
+                        np.testing.assert_allclose(
+                            getattr(live_seen[arm], field.name), expected, atol=0.02, err_msg=field.name
+                        )
+            assert live.act(live_seen) == actions
             compared += 1
         else:
             live.act(seen)
@@ -131,7 +133,7 @@ def test_quotes_become_observations() -> None:
     assert one.p_saturation.tolist() == [0.25, 0.5]
     assert two.p_saturation.tolist() == [0.5, 1.0]  # by its peak
     assert one.duration_s.tolist() == [60.0, 0.0]
-    assert two.duration_s.tolist() == [0.0, 60.0]  # not told: as the longest
+    assert two.duration_s.tolist() == [0.0, 60.0]  # missing: as the longest
     assert one.slack_s.tolist() == [-10.0, LONG_S]
     assert one.age_s.tolist() == [10.0, 100.0]
     assert one.returns.tolist() == [2, 0]
@@ -147,13 +149,13 @@ def test_quotes_become_observations() -> None:
 @pytest.mark.parametrize("name", CENTRAL)
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32))
-def test_every_central_policy_awards_what_was_bid_for_once(name, seed) -> None:
+def test_every_central_policy_awards_jobs_with_a_bid_once(name, seed) -> None:
     rng = np.random.default_rng(seed)
     jobs = tuple(JobSpec(f"j{i}", "hold", (f"p{rng.integers(3)}",)) for i in range(rng.integers(1, 6)))
     quotes = {
         arm: quote(
             arm,
-            *(Estimate(word.name, bool(rng.integers(2)), difficulty=rng.random(), duration_s=60.0) for word in jobs),
+            *(Estimate(job.name, bool(rng.integers(2)), difficulty=rng.random(), duration_s=60.0) for job in jobs),
         )
         for arm in ("a", "b", "c")[: rng.integers(1, 4)]
     }
@@ -161,24 +163,24 @@ def test_every_central_policy_awards_what_was_bid_for_once(name, seed) -> None:
     awarded = CentralAllocation(fresh(name), LiveFleet(arms=("a", "b", "c"), warning_c=60.0))(bidding)
     assert all(bidding.offer(arm, job) for job, arm in awarded.items())
     assert len(set(awarded.values())) == len(awarded)
-    taken = [word.places[0] for word in jobs if word.name in awarded]
+    taken = [job.places[0] for job in jobs if job.name in awarded]
     assert len(set(taken)) == len(taken)
     cool = name != "wspt_cool"
     assert awarded or not cool or not any(offer.feasible for one in quotes.values() for offer in one.estimates)
 
 
 @pytest.mark.parametrize("name", CENTRAL)
-def test_every_central_policy_gets_the_jobs_of_an_auctioneer_done(live, name) -> None:
+def test_every_central_policy_completes_the_jobs_of_an_auctioneer(live, name) -> None:
     rule = CentralAllocation(fresh(name), LiveFleet(arms=("arm_0", "arm_1", "arm_2"), warning_c=60.0))
     fleet = live.Fleet([live.Arm(f"arm_{i}") for i in range(3)], allocate=rule)
     fleet.submit(*(JobSpec(name=f"j{i}", kind="hold", places=("xyz"[i % 3],), repetitions=2) for i in range(7)))
     for _ in range(40):
-        fleet.run_fair(1.0)
+        fleet.run_without_faults(1.0)
         fleet.check()
-    fleet.settled()
+    fleet.check_settled()
 
 
-def test_of_claims_for_one_job_or_station_the_lower_difficulty_wins_then_the_first_arm() -> None:
+def test_the_lower_difficulty_wins_a_job_or_station_then_the_first_arm() -> None:
     jobs = (JobSpec("j", "hold", ("x",)), JobSpec("k", "hold", ("x",)), JobSpec("l", "hold", ("y",)))
 
     def bidding(**scores):
@@ -193,7 +195,7 @@ def test_of_claims_for_one_job_or_station_the_lower_difficulty_wins_then_the_fir
     assert resolve_claims(bidding(a=1.0), {"a": "unknown"}, order) == {}
 
 
-def test_an_illegal_action_is_a_wait_and_says_so(caplog) -> None:
+def test_an_illegal_action_is_logged_and_waits(caplog) -> None:
     bidding = Bidding("r", 0.0, (JobSpec("j", "hold", ("x",)),), {"a": quote("a", Estimate("j", True))})
     seen = observe(bidding, LiveFleet(arms=("a",), warning_c=60.0))
     assert [claimed_jobs(bidding, seen, {"a": action}) for action in (0, 1, 2, -1)] == [{}, {"a": "j"}, {}, {}]

@@ -1,4 +1,4 @@
-"""Processes that end are started again, later and later; the end of the whole leaves none behind."""
+"""Exited processes are restarted after growing delays; no process outlives its supervisor."""
 
 import os
 import signal
@@ -14,12 +14,12 @@ from fleet.errors import FleetError
 from fleet.live.supervisor import Backoff, Part, Supervisor
 
 PATIENCE_S = 20.0
-STAY = "import signal; print('ready x', flush=True); signal.pause()"
-STUBBORN = f"import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); {STAY}; signal.pause()"
-LOYAL = f"from fleet.live.supervisor import exit_with_supervisor; exit_with_supervisor(); {STAY}"
+WAIT = "import signal; print('ready x', flush=True); signal.pause()"
+IGNORES_SIGTERM = f"import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); {WAIT}; signal.pause()"
+SUPERVISED = f"from fleet.live.supervisor import exit_with_supervisor; exit_with_supervisor(); {WAIT}"
 
 
-AFTER = """
+EXIT_TOGETHER = """
 import pathlib, signal, threading
 folder, mine, others = pathlib.Path({folder!r}), {mine!r}, {others!r}
 def end(*_):
@@ -34,14 +34,14 @@ signal.signal(signal.SIGTERM, end)
 print("ready x", flush=True)
 signal.pause()
 """
-"""Ends when others were told to end as well."""
+"""Program that exits once others were stopped as well."""
 
 
 def part(name, code, **options):
     return Part(name=name, argv=(sys.executable, "-c", code), **options)
 
 
-def gone(pid):
+def exited(pid):
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -53,14 +53,14 @@ def until(condition):
     deadline_s = time.monotonic() + PATIENCE_S
 
     def stopped():
-        assert time.monotonic() < deadline_s, "waited in vain"
+        assert time.monotonic() < deadline_s, "the condition was never met"
         return condition()
 
     return stopped
 
 
 @given(st.integers(1, 60), st.floats(0.1, 2.0), st.floats(1.0, 4.0), st.floats(2.0, 60.0))
-def test_each_wait_is_as_long_or_longer_and_bounded(failures, first_s, factor, max_s):
+def test_delays_grow_up_to_a_limit(failures, first_s, factor, max_s):
     backoff = Backoff(first_s=first_s, factor=factor, max_s=max_s)
     waits = [backoff.wait_s(n) for n in range(1, failures + 2)]
     assert waits == sorted(waits)
@@ -68,69 +68,69 @@ def test_each_wait_is_as_long_or_longer_and_bounded(failures, first_s, factor, m
     assert waits[-1] <= max_s
 
 
-def test_a_process_that_is_killed_comes_again(tmp_path):
+def test_a_killed_process_is_restarted(tmp_path):
     with Supervisor(tmp_path, backoff=Backoff(first_s=0.05)) as supervisor:
-        supervisor.start(part("a", STAY), ready_s=PATIENCE_S)
+        supervisor.start(part("a", WAIT), ready_s=PATIENCE_S)
         first = supervisor.pid("a")
         os.kill(first, signal.SIGKILL)
         supervisor.run(until(lambda: supervisor.restarts()["a"] == 1 and supervisor.ready("a")), poll_s=0.02)
         second = supervisor.pid("a")
         assert second not in (None, first)
-    assert gone(second)
+    assert exited(second)
     assert supervisor.log("a").read_text() == "ready x\nready x\n"
 
 
-def test_one_that_always_fails_is_not_started_all_the_time(tmp_path):
-    begun_s = time.monotonic()
+def test_a_process_that_always_fails_is_restarted_with_delays(tmp_path):
+    start_s = time.monotonic()
     with Supervisor(tmp_path, backoff=Backoff(first_s=0.2, factor=2.0)) as supervisor:
         supervisor.start(part("a", "raise SystemExit(3)"))
         supervisor.run(until(lambda: supervisor.restarts()["a"] == 3), poll_s=0.02)
-    assert time.monotonic() - begun_s >= 0.2 + 0.4 + 0.8
+    assert time.monotonic() - start_s >= 0.2 + 0.4 + 0.8
 
 
-def test_the_good_end_of_an_essential_part_is_the_end(tmp_path):
+def test_the_fleet_ends_when_an_essential_process_exits_with_code_0(tmp_path):
     with Supervisor(tmp_path) as supervisor:
-        supervisor.start(part("stays", STAY), ready_s=PATIENCE_S)
+        supervisor.start(part("stays", WAIT), ready_s=PATIENCE_S)
         stays = supervisor.pid("stays")
         supervisor.start(part("done", "print('finished')", essential=True))
         assert supervisor.run(until(lambda: False)) == "done"
-    assert gone(stays)
+    assert exited(stays)
     assert supervisor.last_log_line("done") == supervisor.log_since_ready("done") == "finished"
     assert supervisor.log_since_ready("stays") == ""
 
 
-def test_what_does_not_heed_or_stands_still_is_ended_all_the_same(tmp_path):
+def test_processes_that_ignore_sigterm_or_are_suspended_are_stopped(tmp_path):
     with Supervisor(tmp_path, patience_s=0.3) as supervisor:
-        supervisor.start(part("stubborn", STUBBORN), ready_s=PATIENCE_S)
-        supervisor.start(part("still", STAY), ready_s=PATIENCE_S)
+        supervisor.start(part("stubborn", IGNORES_SIGTERM), ready_s=PATIENCE_S)
+        supervisor.start(part("still", WAIT), ready_s=PATIENCE_S)
         pids = [supervisor.pid("stubborn"), supervisor.pid("still")]
         os.kill(pids[1], signal.SIGSTOP)
-    assert all(gone(pid) for pid in pids)
+    assert all(exited(pid) for pid in pids)
 
 
-def test_those_of_one_rank_end_together_and_lower_ranks_after_them(tmp_path):
-    """Two wait for each other's end; the low one may be told only when both have ended."""
+def test_processes_of_one_rank_are_stopped_together_and_lower_ranks_after_them(tmp_path):
+    """Two wait for each other; the one of the lower rank is stopped only after both have exited."""
     with Supervisor(tmp_path / "logs") as supervisor:
         for name, others, rank in (("one", ["two"], 1), ("low", [], 0), ("two", ["one"], 1)):
-            code = AFTER.format(folder=str(tmp_path), mine=name, others=others)
+            code = EXIT_TOGETHER.format(folder=str(tmp_path), mine=name, others=others)
             supervisor.start(part(name, code, rank=rank), ready_s=PATIENCE_S)
-        begun_s = time.monotonic()
-    assert time.monotonic() - begun_s < PATIENCE_S / 4
+        start_s = time.monotonic()
+    assert time.monotonic() - start_s < PATIENCE_S / 4
     first, second, third = (tmp_path / "order").read_text().split()
     assert ({first, second}, third) == ({"one", "two"}, "low")
 
 
-def test_many_that_do_not_heed_take_no_longer_than_one(tmp_path):
+def test_four_processes_that_ignore_sigterm_take_no_longer_than_one(tmp_path):
     with Supervisor(tmp_path, patience_s=0.5) as supervisor:
         for number in range(4):
-            supervisor.start(part(f"stubborn {number}", STUBBORN), ready_s=PATIENCE_S)
+            supervisor.start(part(f"stubborn {number}", IGNORES_SIGTERM), ready_s=PATIENCE_S)
         pids = [supervisor.pid(f"stubborn {number}") for number in range(4)]
-        begun_s = time.monotonic()
-    assert all(gone(pid) for pid in pids)
-    assert time.monotonic() - begun_s < 1.5
+        start_s = time.monotonic()
+    assert all(exited(pid) for pid in pids)
+    assert time.monotonic() - start_s < 1.5
 
 
-def test_one_that_cannot_begin_says_why(tmp_path):
+def test_a_process_that_cannot_start_gives_the_reason(tmp_path):
     with Supervisor(tmp_path) as supervisor:
         with pytest.raises(FleetError, match="'a' exited at once: no such port"):
             supervisor.start(part("a", "raise SystemExit('no such port')"), ready_s=PATIENCE_S)
@@ -140,15 +140,15 @@ def test_one_that_cannot_begin_says_why(tmp_path):
             supervisor.start(Part(name="c", argv=("/no/such/program",)))
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="the kernel's help is Linux's")
-def test_nobody_outlives_a_supervisor_that_is_killed(tmp_path):
-    """A supervisor in a process of its own is killed; its child's end closes the pipe that it holds."""
+@pytest.mark.skipif(sys.platform != "linux", reason="needs prctl(2) of Linux")
+def test_no_process_outlives_a_killed_supervisor(tmp_path):
+    """A supervisor in a separate process is killed; the kernel stops its child."""
     code = f"""
 import sys, threading
 from pathlib import Path
 from fleet.live.supervisor import Part, Supervisor
 supervisor = Supervisor(Path({str(tmp_path)!r}))
-supervisor.start(Part(name="a", argv=(sys.executable, "-c", {LOYAL!r})), ready_s=20)
+supervisor.start(Part(name="a", argv=(sys.executable, "-c", {SUPERVISED!r})), ready_s=20)
 print(supervisor.pid("a"), flush=True)
 threading.Event().wait(60)
 """
@@ -158,6 +158,6 @@ threading.Event().wait(60)
         child = int(process.stdout.readline())
         process.kill()
     deadline_s = time.monotonic() + PATIENCE_S
-    while not gone(child) and time.monotonic() < deadline_s:
+    while not exited(child) and time.monotonic() < deadline_s:
         threading.Event().wait(0.02)
-    assert gone(child)
+    assert exited(child)

@@ -293,7 +293,7 @@ def test_jobs_handed_in_are_kept_over_a_kill(endpoint, tmp_path, capsys):
         assert out.startswith("a: accepted\nb: refused: No place 'moon' in this cell. Places: ")
         code, _, err = call(capsys, "auction", "quickstart", "--endpoint", endpoint, "--journal", tmp_path / "other")
         assert code == 2
-        assert "Fleet 'quickstart' has an auctioneer 'auctioneer' already: its token is there." in err
+        assert "Fleet 'quickstart' has an auctioneer 'auctioneer' already: its token is present." in err
         other = ("--name", "other", "--journal", tmp_path / "other")
         code, _, err = call(capsys, "auction", "quickstart", "--endpoint", endpoint, *other)
         assert code == 2

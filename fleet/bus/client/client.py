@@ -30,7 +30,7 @@ from fleet.bus.protocol.messages import MalformedMessage, Refusal, check_name, d
 from fleet.bus.protocol.registry import channel_for
 from fleet.bus.security.access_control import Participant, rights_by_role
 from fleet.bus.security.tls import participant_at
-from fleet.errors import BusError
+from fleet.errors import BusError, Refused
 
 _LOG = logging.getLogger(__name__)
 
@@ -45,10 +45,6 @@ _CONGESTION = {"DROP": zenoh.CongestionControl.DROP, "BLOCK": zenoh.CongestionCo
 
 class AnotherReplies(Exception):
     """Raised by a handler of requests: another participant will reply."""
-
-
-class Refused(Exception):
-    """Raised by a handler of requests: the querier gets this sentence instead of a reply."""
 
 
 class BusClient:
@@ -178,14 +174,14 @@ class BusClient:
         done: Callable[[Replies[Reply]], None],
         *,
         timeout_s: float,
-        each: Callable[[Replies[Reply]], None] | None = None,
+        each: Callable[[Reply], None] = lambda reply: None,
     ) -> None:
         """Query all that reply under a key or key expression; `done` gets the replies when all are there or time is up.
 
         Args:
             kind: Message type of the replies; one that names another sender than its key is malformed.
             timeout_s: Real seconds. A stopped process costs this long, unless `each` finds enough replies before.
-            each: Called after every reply with all that are there.
+            each: Called with every reply as it arrives.
 
         Raises:
             BusError: the client is not open, or its certificate does not allow the query: a router would drop it.
@@ -356,18 +352,19 @@ class BusClient:
         reply: zenoh.Reply,
         kind: type[Reply],
         replies: Replies[Reply],
-        each: Callable[[Replies[Reply]], None] | None,
+        each: Callable[[Reply], None],
     ) -> None:
         if reply.ok is None:
             replies.miss("" if reply.err is None else reply.err.payload.to_bytes().decode(errors="replace"))
             return
         key = str(reply.ok.key_expr)
         try:
-            replies.take(key, str(reply.ok.encoding), reply.ok.payload.to_bytes(), kind)
+            message = replies.take(key, str(reply.ok.encoding), reply.ok.payload.to_bytes(), kind)
         except MalformedMessage as error:
             self.reject(f"reply under '{key}': {error}")
-        if each is not None:
-            each(replies)
+        else:
+            if message is not None:
+                each(message)
 
     def _reply(
         self, key: str, query: zenoh.Query, kind: type[Request], handle: Callable[[Request], msgspec.Struct]

@@ -24,8 +24,8 @@ class Replies(Generic[Message]):
     took_s: float = math.nan
     """Real seconds until they were complete."""
 
-    def take(self, key: str, sent_encoding: str, payload: bytes, kind: type[Message]) -> None:
-        """Add a reply of this kind, or a refusal.
+    def take(self, key: str, sent_encoding: str, payload: bytes, kind: type[Message]) -> Message | None:
+        """Add a reply of this kind, or a refusal; return the reply.
 
         Raises:
             MalformedMessage: it is neither, or names another sender than its key; added to `refused`.
@@ -34,11 +34,13 @@ class Replies(Generic[Message]):
             sender = keys.parse(key)
             if sent_encoding == encoding(Refusal):
                 _add(self.refused, key, decode(Refusal, payload).reason)
-            else:
-                _add(self.messages, key, check_sender(decode_as(kind, sent_encoding, payload), sender))
+                return None
+            message = check_sender(decode_as(kind, sent_encoding, payload), sender)
         except ValueError as error:
             _add(self.refused, key, str(error))
             raise MalformedMessage(str(error)) from error
+        _add(self.messages, key, message)
+        return message
 
     def miss(self, reason: str) -> None:
         """Add an error of Zenoh's own, which does not say whose it is."""

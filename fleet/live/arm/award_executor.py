@@ -27,14 +27,13 @@ from fleet.live.arm.journal_records import (
     bounded,
     closed,
 )
+from fleet.live.clock import CLOCK_DRIFT
 from fleet.live.journal_records import Closed, CommitPermitted, Progress, Released
 
 _LOG = logging.getLogger(__name__)
 
 Phase = Literal["queued", "working", "finishing"]
 
-CLOCK_DRIFT = 0.01
-"""Clocks may differ in rate by this share; an arm counts its leases shorter by as much."""
 RENEWALS = 3
 """Lease requests per length of a lease."""
 COMMIT_RETRY_S = 0.3

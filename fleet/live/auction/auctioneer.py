@@ -1,11 +1,11 @@
-"""The auctioneer: asks for quotes, awards jobs, renews leases and takes reports, so that no job is done twice.
+"""The auctioneer: requests quotes, awards jobs, renews leases and accepts reports, so that no job is done twice.
 
-A state machine without a clock and without I/O. Real seconds (`real_s`, monotonic) and the fleet's time (`time_s`) come
-as arguments. Records go to `keep`, which returns once they are on disk. Messages to send are in `out`. The rules that
+A state machine without a clock and without I/O. Real seconds (`real_s`, monotonic) and fleet time (`time_s`) are
+arguments. Records go to `keep`, which returns once they are on disk. Messages to send are in `out`. The rules that
 make it safe (`fleet.bus.protocol.auction` says why):
 
-- An award is on disk before it is sent. From then on it counts as leased for `Timing.counted_lease_s`, answered or not;
-  a renewal counts from the moment it is answered.
+- An award is on disk before it is sent. From then on it counts as leased for `Timing.counted_lease_s`, with or without
+  an answer; a renewal counts from the moment of the reply.
 - A job is offered again only after its lease has ended here, or its arm has refused or returned it.
 - Permission to commit, that is to begin the last cycle, is on disk before it is given; no other arm gets the job then.
 - After a crash every open award counts as leased from the restart.
@@ -16,6 +16,8 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+
+from msgspec.structs import asdict, replace
 
 from fleet.bus.protocol.auction import (
     Ack,
@@ -34,30 +36,15 @@ from fleet.bus.protocol.auction import (
     SubmissionReply,
 )
 from fleet.bus.protocol.messages import State
-from fleet.errors import FleetError, JournalFull
-from fleet.live.auction.journal_records import (
-    AuctionRecord,
-    Awarded,
-    Change,
-    Closed,
-    CommitPermitted,
-    ContactLost,
-    ContactRegained,
-    JobsAccepted,
-    ShiftEnded,
-)
-from fleet.live.auction.lease_timing import Timing
-from fleet.live.auction.ledger import Ledger
-from fleet.live.auction.round import REASON_CHARACTERS, Allocate, Bidding, Round, drop_invalid, infeasible_jobs
+from fleet.errors import JournalFull, Refused
+from fleet.live.auction.ledger import AuctionRecord, Awarded, Change, ContactLost, ContactRegained, Ledger, ShiftEnded
+from fleet.live.auction.round import MAX_REASON, Allocate, Bidding, Round, Timing, drop_invalid, infeasible_jobs
+from fleet.live.journal_records import Closed, CommitPermitted, JobsAccepted
 
 _LOG = logging.getLogger(__name__)
 
 SCAN_S = 0.05
 """Real seconds between two checks for jobs that have become ready."""
-
-
-class Objection(FleetError):
-    """A request that is refused; its sender receives this sentence."""
 
 
 @dataclass(frozen=True)
@@ -72,11 +59,16 @@ Out = QuoteRequest | SendAward | Announcement | Result
 
 
 @dataclass(eq=False)
-class _Sent:
-    """An award without an answer."""
+class _Lease:
+    """Lease of an open award, as the auctioneer counts it."""
 
-    give: SendAward
-    at_s: float
+    until_s: float
+    """Real second at which it ends."""
+    cycles: int = 0
+    """Last reported progress."""
+    unanswered: SendAward | None = None
+    """The award, until its arm answers."""
+    sent_s: float = -math.inf
     attempts: int = 1
 
 
@@ -86,7 +78,6 @@ class Auctioneer:
     Attributes:
         ledger: Its jobs and awards.
         out: Messages to send, oldest first; the driver takes them out.
-        cycles: Last reported progress of the open awards.
         states: The last state of each arm; the driver puts them in.
     """
 
@@ -97,7 +88,7 @@ class Auctioneer:
         *,
         allocate: Allocate,
         keep: Callable[..., None],
-        life: str,
+        boot: str,
         real_s: float,
         timing: Timing | None = None,
     ) -> None:
@@ -105,110 +96,105 @@ class Auctioneer:
 
         Args:
             keep: Writes records; returns when they are on disk, or raises `JournalError` and has written none.
-            life: Part of the names of auctions and awards; unique for each start of an auctioneer of this name.
+            boot: Part of the names of auctions and awards; unique for each start of an auctioneer of this name.
         """
         self.name, self.ledger = name, ledger
         self.out: deque[Out] = deque(self._result(change) for change in ledger.recent)
-        self.cycles: dict[str, int] = {}
         self.states: dict[str, State] = {}
-        self._allocate, self._keep, self._life = allocate, keep, life
+        self._allocate, self._keep, self._boot = allocate, keep, boot
         self._timing = timing or Timing()
-        self._until_s = dict.fromkeys(ledger.open, real_s + self._timing.counted_lease_s)
-        self._unanswered: dict[str, _Sent] = {}
+        self._leases = {award: _Lease(real_s + self._timing.counted_lease_s) for award in ledger.open}
         self._round: Round | None = None
         self._rounds = 0
         self._present: frozenset[str] = frozenset()
         self._later_s: dict[str, float] = {}
+        """Real second from which a job may be offered again."""
         self._notes: dict[str, str] = {}
+        """Why no arm can do a job."""
         self._scan_s = -math.inf
         self._pause_s = self._timing.pause_s[0]
 
     # Messages
 
-    def submit(self, word: Submission, real_s: float, time_s: float) -> SubmissionReply:
+    def submit(self, submission: Submission, real_s: float, time_s: float) -> SubmissionReply:
         """Accept jobs; every accepted one is on disk when this returns."""
-        admissions = self.ledger.admit(word.jobs)
-        taken = {job.name: job for job, said in zip(word.jobs, admissions, strict=True) if said.accepted}
-        fresh = tuple(job for name, job in taken.items() if name not in self.ledger.jobs)
-        if fresh:
-            self._record(JobsAccepted(fresh, word.by, time_s))
+        admissions = self.ledger.admit(submission.jobs)
+        accepted = {job.name: job for job, reply in zip(submission.jobs, admissions, strict=True) if reply.accepted}
+        new = tuple(job for name, job in accepted.items() if name not in self.ledger.jobs)
+        if new:
+            self._record(JobsAccepted(new, submission.by, time_s))
             self._retry_now()
         return SubmissionReply(self.name, admissions)
 
-    def renew_leases(self, word: LeaseRequest, real_s: float, time_s: float) -> Lease:
+    def renew_leases(self, request: LeaseRequest, real_s: float, time_s: float) -> Lease:
         """Renew leases, and permit to commit where an arm asks for it.
 
-        An arm that asks after the end of its lease, but before its job was taken back, keeps it: no other arm has it.
+        An arm that asks after the end of its lease, but before its award was closed, keeps it: no other arm has it.
         """
-        mine = {hold.award: hold for hold in word.entries if self._is_held(hold, word.arm)}
-        for award, hold in mine.items():
-            self._unanswered.pop(award, None)
-            self.cycles[award] = max(hold.cycles, self.cycles.get(award, 0))
-            self._until_s[award] = real_s + self._timing.counted_lease_s
-        self._permit_commits(mine, time_s)
+        leased = {entry.award: entry for entry in request.entries if self._is_leased(entry, request.arm)}
+        for award, entry in leased.items():
+            lease = self._leases[award]
+            lease.unanswered, lease.cycles = None, max(entry.cycles, lease.cycles)
+            lease.until_s = real_s + self._timing.counted_lease_s
+        self._permit_commits(leased, time_s)
         return Lease(
             auctioneer=self.name,
             lease_s=self._timing.lease_s,
-            granted=tuple(mine),
-            revoked=tuple(hold.award for hold in word.entries if hold.award not in mine),
-            may_commit=tuple(award for award in mine if self.ledger.open[award].may_commit),
+            granted=tuple(leased),
+            revoked=tuple(entry.award for entry in request.entries if entry.award not in leased),
+            may_commit=tuple(award for award in leased if self.ledger.open[award].may_commit),
         )
 
-    def apply_report(self, word: Report, real_s: float, time_s: float) -> Receipt:
-        """Record how an award ended; the same report again changes nothing.
+    def apply_report(self, report: Report, real_s: float, time_s: float) -> Receipt:
+        """Record the outcome of an award; the same report again changes nothing.
 
         Raises:
-            Objection: the award is another arm's, or for another job.
+            Refused: the award is another arm's, or for another job.
         """
-        promise = self.ledger.awards.get(word.award)
-        if promise is None:
-            # Of a lost journal: it is receipted, so that the arm does not repeat it for ever.
-            _LOG.warning("'%s' reports on an award that is not known here: %s.", word.arm, word.award)
-            return Receipt(self.name, word.award)
-        if (promise.made.arm, promise.made.job) != (word.arm, word.job):
-            raise Objection(
-                f"Award '{word.award}' is of '{promise.made.job}' to '{promise.made.arm}', not of '{word.job}' to "
-                f"'{word.arm}'."
+        receipt = Receipt(self.name, report.award)
+        award = self.ledger.awards.get(report.award)
+        if award is None:
+            # Its journal is lost. The receipt ends the repetition of the report.
+            _LOG.warning("'%s' reports on an unknown award: %s.", report.arm, report.award)
+            return receipt
+        if (award.record.arm, award.record.job) != (report.arm, report.job):
+            raise Refused(
+                f"Award '{report.award}' is of '{award.record.job}' to '{award.record.arm}', not of '{report.job}' to "
+                f"'{report.arm}'."
             )
-        if promise.outcome not in ("finished", "returned"):
-            if word.outcome == "finished" and not promise.may_commit:
-                _LOG.error("'%s' finished '%s' without permission to commit.", word.arm, word.job)
-            done_s = min(word.time_s, time_s)
-            why = word.reason[:REASON_CHARACTERS]
-            self._record(Closed(word.award, word.outcome, word.cycles, done_s, why, word.unsure))
-            self._forget(word.award)
-            if word.outcome == "finished":
+        if award.outcome not in ("finished", "returned"):
+            if report.outcome == "finished" and not award.may_commit:
+                _LOG.error("'%s' finished '%s' without permission to commit.", report.arm, report.job)
+            done_s, reason = min(report.time_s, time_s), report.reason[:MAX_REASON]
+            self._record(Closed(report.award, report.outcome, report.cycles, done_s, reason, report.unsure))
+            if report.outcome == "finished":
                 self._retry_now()
             else:
-                self._delay(real_s, (word.job,))
-        return Receipt(self.name, word.award)
+                self._delay(real_s, (report.job,))
+        return receipt
 
-    def add_quote(self, quote: Quote, real_s: float, time_s: float) -> None:
-        """Take a quote; the round closes with the last one that it waits for."""
-        open_round = self._round
-        if open_round is not None and quote.auction == open_round.auction:
-            open_round.quotes[quote.arm] = quote
-            if open_round.complete(self._present):
-                self._close_round(open_round, real_s, time_s)
+    def add_quote(self, quote: Quote) -> None:
+        """Add a quote; after the last one that the round waits for, the next tick closes it."""
+        if self._round is not None and quote.auction == self._round.auction:
+            self._round.quotes[quote.arm] = quote
 
-    def end_quotes(self, auction: str, real_s: float, time_s: float) -> None:
-        """No more quotes will come: close the round."""
+    def end_quotes(self, auction: str) -> None:
+        """Have the next tick close a round: no more quotes will arrive."""
         if self._round is not None and self._round.auction == auction:
-            self._close_round(self._round, real_s, time_s)
+            self._round.until_s = -math.inf
 
     def apply_ack(self, ack: Ack, real_s: float, time_s: float) -> None:
-        """Take an arm's answer to an award."""
-        sent = self._unanswered.get(ack.award)
-        if sent is None or sent.give.arm != ack.arm:
+        """Apply an arm's answer to an award."""
+        lease = self._leases.get(ack.award)
+        if lease is None or lease.unanswered is None or lease.unanswered.arm != ack.arm:
             return
         if not ack.accepted:
-            why = f"'{ack.arm}' refused it: {ack.reason}"[:REASON_CHARACTERS]
-            self._record(Closed(ack.award, "refused", 0, time_s, why))
-            self._forget(ack.award)
-            self._delay(real_s, (sent.give.award.job.name,))
-        self._unanswered.pop(ack.award, None)
-        if not self._unanswered:
-            self._scan_s = -math.inf  # the next round waits for nobody
+            reason = f"'{ack.arm}' refused it: {ack.reason}"[:MAX_REASON]
+            self._record(Closed(ack.award, "refused", 0, time_s, reason))
+            self._delay(real_s, (lease.unanswered.award.job.name,))
+        lease.unanswered = None
+        if not any(self._unanswered()):
+            self._scan_s = -math.inf  # the next round can begin
 
     def set_present(self, present: frozenset[str]) -> None:
         """Set which arms are present."""
@@ -219,7 +205,10 @@ class Auctioneer:
     def tick(self, real_s: float, time_s: float) -> None:
         """Do what is due."""
         self._expire(real_s, time_s)
-        self._resend(real_s)
+        for lease, message in self._unanswered():
+            if real_s >= lease.sent_s + self._timing.ack_s and lease.attempts < self._timing.attempts:
+                lease.sent_s, lease.attempts = real_s, lease.attempts + 1
+                self.out.append(message)
         if self._round is None:
             if real_s >= self._scan_s:
                 self._scan_s = real_s + SCAN_S
@@ -228,120 +217,112 @@ class Auctioneer:
             self._close_round(self._round, real_s, time_s)
 
     def end(self, time_s: float) -> None:
-        """End the shift: nothing more is offered, and jobs that are not done are reported unfinished."""
+        """End the shift: nothing more is offered, and open jobs are reported unfinished."""
         if not self.ledger.ended:
             self._round = None
             self._record(ShiftEnded(time_s))
 
     def finishing(self) -> bool:
-        """Whether a present arm may be in the last cycle of a job."""
-        return any(promise.may_commit and promise.made.arm in self._present for promise in self.ledger.open.values())
+        """Return whether a present arm may be in the last cycle of a job."""
+        return any(award.may_commit and award.record.arm in self._present for award in self.ledger.open.values())
 
     def status(self, names: Iterable[str] = ()) -> tuple[JobStatus, ...]:
-        """Status of jobs, with the last reported progress."""
-        return tuple(
-            JobStatus(
-                job=said.job,
-                state=said.state,
-                arm=said.arm,
-                award=said.award,
-                cycles=max(said.cycles, self.cycles.get(said.award, 0)),
-                finished_s=said.finished_s,
-                reason=said.reason or (self._notes.get(said.job, "") if said.state == "waiting" else ""),
-            )
-            for said in self.ledger.status(names)
-        )
+        """Return the status of jobs, with the last reported progress."""
+        return tuple(map(self._with_progress, self.ledger.status(names)))
 
     # Leases
 
-    def _is_held(self, hold: LeaseEntry, arm: str) -> bool:
-        promise = self.ledger.open.get(hold.award)
-        if promise is None or (promise.made.arm, promise.made.job) != (arm, hold.job):
-            return False
-        return promise.may_commit or not self.ledger.ended
+    def _unanswered(self) -> list[tuple[_Lease, SendAward]]:
+        return [(lease, lease.unanswered) for lease in self._leases.values() if lease.unanswered is not None]
 
-    def _permit_commits(self, mine: dict[str, LeaseEntry], time_s: float) -> None:
+    def _with_progress(self, status: JobStatus) -> JobStatus:
+        lease = self._leases.get(status.award)
+        cycles = status.cycles if lease is None else max(status.cycles, lease.cycles)
+        note = self._notes.get(status.job, "") if status.state == "waiting" else ""
+        return replace(status, cycles=cycles, reason=status.reason or note)
+
+    def _is_leased(self, entry: LeaseEntry, arm: str) -> bool:
+        award = self.ledger.open.get(entry.award)
+        if award is None or (award.record.arm, award.record.job) != (arm, entry.job):
+            return False
+        return award.may_commit or not self.ledger.ended
+
+    def _permit_commits(self, leased: dict[str, LeaseEntry], time_s: float) -> None:
         records: list[AuctionRecord] = []
-        for award, hold in mine.items():
-            promise = self.ledger.open[award]
-            if hold.phase == "finishing" and not promise.may_commit:
-                records.append(CommitPermitted(award, time_s))
-            elif promise.silent and not self.ledger.ended:
-                records.append(ContactRegained(award, time_s))
+        for name, entry in leased.items():
+            award = self.ledger.open[name]
+            if entry.phase == "finishing" and not award.may_commit:
+                records.append(CommitPermitted(name, time_s))
+            elif award.silent and not self.ledger.ended:
+                records.append(ContactRegained(name, time_s))
         try:
             self._record(*records)
         except JournalFull as error:
             _LOG.error("No permission to commit is given: %s", error)
 
     def _expire(self, real_s: float, time_s: float) -> None:
-        """Take back jobs whose lease has ended; one that may be committed stays with its arm."""
-        for award in [award for award, until_s in self._until_s.items() if real_s >= until_s]:
-            promise = self.ledger.open[award]
-            did = "answer the award" if award in self._unanswered else "renew its lease"
-            why = f"'{promise.made.arm}' did not {did}."
+        """Close awards whose lease has ended; one with permission to commit stays open."""
+        for name, lease in [(name, lease) for name, lease in self._leases.items() if real_s >= lease.until_s]:
+            award = self.ledger.open[name]
+            missing = "renew its lease" if lease.unanswered is None else "answer the award"
             try:
-                if not promise.may_commit:
-                    self._record(Closed(award, "dropped", self.cycles.get(award, 0), time_s, why))
-                    self._forget(award)
+                if not award.may_commit:
+                    reason = f"'{award.record.arm}' did not {missing}."
+                    self._record(Closed(name, "dropped", lease.cycles, time_s, reason))
                     self._retry_now()
-                elif not promise.silent and not self.ledger.ended:
-                    self._record(ContactLost(award, time_s))
-                    self._until_s[award] = math.inf
+                elif not award.silent and not self.ledger.ended:
+                    self._record(ContactLost(name, time_s))
+                    lease.until_s = math.inf
             except JournalFull as error:
-                _LOG.error("'%s' stays with '%s': %s", promise.made.job, promise.made.arm, error)
+                _LOG.error("'%s' stays with '%s': %s", award.record.job, award.record.arm, error)
                 return
-
-    def _forget(self, award: str) -> None:
-        """Drop the timers of closed awards: this one, and one that it has superseded."""
-        for table in (self._until_s, self._unanswered, self.cycles):
-            for closed in [name for name in table if name == award or name not in self.ledger.open]:
-                del table[closed]
 
     # Rounds
 
     def _retry_now(self) -> None:
-        """Offer rejected jobs again at once: something has changed."""
+        """Offer delayed jobs again at once: something has changed."""
         self._later_s.clear()
         self._scan_s = -math.inf
         self._pause_s = self._timing.pause_s[0]
 
     def _delay(self, real_s: float, jobs: Iterable[str]) -> None:
-        """Offer these jobs again only after a while, longer each time in a row."""
+        """Offer these jobs again after a pause, which is longer each time in a row."""
         self._later_s |= dict.fromkeys(jobs, real_s + self._pause_s)
         self._pause_s = min(2 * self._pause_s, self._timing.pause_s[1])
 
     def _open_round(self, real_s: float, time_s: float) -> None:
-        busy = {sent.give.arm for sent in self._unanswered.values()}
-        bidders = self._present - busy
-        recent = any(real_s < sent.at_s + self._timing.window_s for sent in self._unanswered.values())
-        if not bidders or recent:
+        unanswered = self._unanswered()
+        bidders = self._present - {message.arm for _, message in unanswered}
+        if not bidders or any(real_s < lease.sent_s + self._timing.window_s for lease, _ in unanswered):
             return
-        later = {job for job, at_s in self._later_s.items() if at_s > real_s}
-        jobs = tuple(self.ledger.ready(time_s, self._timing.max_jobs, but=later))
+        delayed = {job for job, at_s in self._later_s.items() if at_s > real_s}
+        jobs = tuple(self.ledger.ready(time_s, self._timing.max_jobs, excluded=delayed))
         if not jobs:
             return
         self._rounds += 1
-        auction = f"{self.name}-{self._life}-{self._rounds}"
+        auction = f"{self.name}-{self._boot}-{self._rounds}"
         self._round = Round(auction, jobs, bidders, real_s + self._timing.window_s)
-        self.out.append(Announcement(self.name, auction, time_s, tuple(word.name for word in jobs)))
+        self.out.append(Announcement(self.name, auction, time_s, tuple(job.name for job in jobs)))
         self.out.append(QuoteRequest(auction, jobs))
 
     def _close_round(self, closing: Round, real_s: float, time_s: float) -> None:
         self._round = None
-        taken = self.ledger.taken()
-        jobs = tuple(
-            word
-            for word in closing.jobs
-            if self.ledger.jobs[word.name].state == "waiting" and not taken & frozenset(word.places)
-        )
-        heard = {arm: quote for arm, quote in closing.quotes.items() if arm in closing.asked & self._present}
-        room = {arm: quote for arm, quote in heard.items() if quote.capacity}
-        full = {arm: quote for arm, quote in heard.items() if not quote.capacity}
+        busy = self.ledger.busy_stations()
+        entries = [self.ledger.jobs[job.name] for job in closing.jobs]
+        entries = [entry for entry in entries if entry.state == "waiting" and not busy & frozenset(entry.spec.places)]
+        jobs = tuple(entry.spec for entry in entries)
+        quotes = {arm: quote for arm, quote in closing.quotes.items() if arm in closing.asked & self._present}
         bidding = Bidding(
-            closing.auction, time_s, jobs, room, full, states=self.states, returned=self.ledger.returned(jobs)
+            closing.auction,
+            time_s,
+            jobs,
+            {arm: quote for arm, quote in quotes.items() if quote.capacity},
+            {arm: quote for arm, quote in quotes.items() if not quote.capacity},
+            states=self.states,
+            returned={entry.spec.name: (entry.returns, entry.returned_s) for entry in entries if entry.returns},
         )
         self._notes |= infeasible_jobs(bidding)
-        allocation = drop_invalid(bidding, self._allocate(bidding)) if room and jobs else {}
+        allocation = drop_invalid(bidding, self._allocate(bidding)) if bidding.quotes and jobs else {}
         try:
             self._award(bidding, allocation, real_s, time_s)
         except JournalFull as error:
@@ -350,43 +331,30 @@ class Auctioneer:
         if allocation:
             self._scan_s, self._pause_s = -math.inf, self._timing.pause_s[0]
         else:
-            if not room:  # whatever else might be offered: nobody takes more
+            if not bidding.quotes:  # no arm has capacity for any job
                 self._scan_s = real_s + self._pause_s
-            self._delay(real_s, (word.name for word in closing.jobs))
+            self._delay(real_s, (job.name for job in closing.jobs))
 
     def _award(self, bidding: Bidding, allocation: dict[str, str], real_s: float, time_s: float) -> None:
+        auction = bidding.auction
         records: list[Awarded] = []
         for job, arm in allocation.items():
             offer = bidding.offer(arm, job)
-            assert offer is not None  # `drop_invalid` keeps jobs with a bid
+            assert offer is not None, "drop_invalid keeps jobs with a bid"
+            quote, cycles = bidding.quotes[arm].quote, self.ledger.jobs[job].cycles
+            award = f"{auction}:{job}"
             records.append(
-                Awarded(
-                    award=f"{bidding.auction}:{job}",
-                    auction=bidding.auction,
-                    job=job,
-                    arm=arm,
-                    quote=bidding.quotes[arm].quote,
-                    cycles=self.ledger.jobs[job].cycles,
-                    time_s=time_s,
-                    difficulty=offer.difficulty,
-                    p_saturation=offer.p_saturation,
-                )
+                Awarded(award, auction, job, arm, quote, cycles, time_s, offer.difficulty, offer.p_saturation)
             )
         self._record(*records)
-        for made in records:
-            self._notes.pop(made.job, None)
-            word = self.ledger.jobs[made.job].word
-            award = Award(made.award, made.auction, self.name, made.quote, word, made.cycles, self._timing.lease_s)
-            give = SendAward(made.arm, award)
-            self._unanswered[made.award] = _Sent(give, real_s)
-            self._until_s[made.award] = real_s + self._timing.counted_lease_s
-            self.out.append(give)
-
-    def _resend(self, real_s: float) -> None:
-        for sent in self._unanswered.values():
-            if real_s >= sent.at_s + self._timing.ack_s and sent.attempts < self._timing.attempts:
-                sent.at_s, sent.attempts = real_s, sent.attempts + 1
-                self.out.append(sent.give)
+        for record in records:
+            self._notes.pop(record.job, None)
+            spec = self.ledger.jobs[record.job].spec
+            award = Award(record.award, auction, self.name, record.quote, spec, record.cycles, self._timing.lease_s)
+            message = SendAward(record.arm, award)
+            until_s = real_s + self._timing.counted_lease_s
+            self._leases[record.award] = _Lease(until_s, unanswered=message, sent_s=real_s)
+            self.out.append(message)
 
     # Records
 
@@ -394,20 +362,14 @@ class Auctioneer:
         """Write records, then apply them.
 
         Raises:
-            JournalError: nothing was written, and nothing has happened.
+            JournalError: nothing was written, and nothing has changed.
         """
-        if records:
-            self._keep(*records)
-            for record in records:
-                self.out.extend(self._result(change) for change in self.ledger.apply(record))
+        if not records:
+            return
+        self._keep(*records)
+        for record in records:
+            self.out.extend(map(self._result, self.ledger.apply(record)))
+        self._leases = {award: lease for award, lease in self._leases.items() if award in self.ledger.open}
 
     def _result(self, change: Change) -> Result:
-        return Result(
-            auctioneer=self.name,
-            number=change.number,
-            time_s=change.time_s,
-            status=change.status,
-            auction=change.auction,
-            difficulty=change.difficulty,
-            p_saturation=change.p_saturation,
-        )
+        return Result(self.name, **asdict(change))

@@ -1,118 +1,169 @@
-"""What an auctioneer knows about its jobs: a state that follows from journal records and from nothing else.
+"""Ledger of an auctioneer: journal records of its jobs and awards, and the state that follows from them alone.
 
-Whatever happens to a job is a record: it is written to the journal first and applied here after that, so a replay of
-the journal gives the same ledger again, with the same numbers on its results. What cannot be known after a crash, how
-long an arm still holds its lease, is not in here: whoever replays lets every open award count as leased from then.
+A record is on disk before it is applied, so a replay gives the same ledger, with the same numbers on its results. The
+ends of leases are not recorded: after a restart every open award counts as leased from then on.
 """
 
-from bisect import insort
 from collections import deque
 from collections.abc import Container, Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import islice
+from dataclasses import dataclass, field
 
-from fleet.bus.protocol.auction import Admission, JobSpec, JobStatus
-from fleet.live.auction.admission import MOST_JOBS, admit
-from fleet.live.auction.journal_records import (
-    AuctionRecord,
-    Awarded,
-    AwardState,
-    Change,
-    ClockTick,
-    Closed,
-    CommitPermitted,
-    ContactLost,
-    ContactRegained,
-    Entry,
-    JobsAccepted,
-    LedgerSnapshot,
-    ShiftEnded,
-    Started,
-)
-from fleet.live.journal import JournalState
+import msgspec
+from msgspec.structs import asdict, replace
 
-REMEMBERED = 64
-"""Last changes, for those who may have missed them when the auctioneer was gone."""
+from fleet.bus.protocol.auction import Admission, JobSpec, JobState, JobStatus
+from fleet.live.auction.job_rules import SHIFT_ENDED, admit, job_order, ready_jobs, reason_for_silence
+from fleet.live.journal import TimedState
+from fleet.live.journal_records import ClockTick, Closed, CommitPermitted, JobsAccepted, Started
+
+MAX_RECENT = 64
+"""Latest changes, published again after a restart for those who missed them."""
+
+
+class Awarded(msgspec.Struct, frozen=True, tag="awarded"):
+    """A job is awarded to an arm, which may have a lease on it from now on."""
+
+    award: str
+    auction: str
+    job: str
+    arm: str
+    quote: str
+    cycles: int
+    """Done by other arms before."""
+    time_s: float
+    difficulty: float | None = None
+    p_saturation: float | None = None
+
+
+class ContactLost(msgspec.Struct, frozen=True, tag="contact_lost"):
+    """The lease of an arm with permission to commit has ended: it is unknown whether the job is done."""
+
+    award: str
+    time_s: float
+
+
+class ContactRegained(msgspec.Struct, frozen=True, tag="contact_regained"):
+    """The arm renews its lease again, and still has the job."""
+
+    award: str
+    time_s: float
+
+
+class ShiftEnded(msgspec.Struct, frozen=True, tag="shift_ended"):
+    """The fleet's shift is over; open jobs stay unfinished."""
+
+    time_s: float
+
+
+class Change(msgspec.Struct, frozen=True):
+    """A job's state has changed; fields as in `fleet.bus.protocol.auction.Result`."""
+
+    number: int
+    time_s: float
+    status: JobStatus
+    auction: str = ""
+    difficulty: float | None = None
+    p_saturation: float | None = None
+
+
+class JobEntry(msgspec.Struct):
+    """State of one job."""
+
+    spec: JobSpec = msgspec.field(name="word")
+    by: str
+    state: JobState = "waiting"
+    award: str = ""
+    """The open one, or the last one."""
+    cycles: int = 0
+    finished_s: float | None = None
+    reason: str = ""
+    returns: int = 0
+    """How many times an arm returned it."""
+    returned_s: float = 0.0
+    """Fleet time of the last return."""
+
+
+class AwardState(msgspec.Struct):
+    """State of one award."""
+
+    record: Awarded = msgspec.field(name="made")
+    may_commit: bool = False
+    silent: bool = False
+    """The arm has permission to commit, and has not renewed its lease."""
+    outcome: str = ""
+
+
+class LedgerSnapshot(msgspec.Struct, frozen=True, tag="ledger_snapshot"):
+    """The whole ledger, in place of the records before."""
+
+    time_s: float
+    number: int
+    """Of the next change."""
+    ended: bool
+    jobs: tuple[JobEntry, ...]
+    awards: tuple[AwardState, ...]
+    """Awards on which a report could still change something."""
+    open: tuple[str, ...]
+    """Names of open awards."""
+    recent: tuple[Change, ...]
+
+
+AwardRecord = Awarded | CommitPermitted | ContactLost | ContactRegained | Closed
+AuctionRecord = Started | ClockTick | JobsAccepted | AwardRecord | ShiftEnded | LedgerSnapshot
 
 
 @dataclass
-class Ledger(JournalState[AuctionRecord]):
-    """Jobs and awards. Only `apply` changes it."""
+class Ledger(TimedState[AuctionRecord]):
+    """Jobs and awards; only `apply` changes it."""
 
     places: frozenset[str] | None = None
-    """Places of the cell; None: any name goes."""
-    most: int = MOST_JOBS
-    jobs: dict[str, Entry] = field(default_factory=dict)
+    """Places of the cell; None allows any name."""
+    jobs: dict[str, JobEntry] = field(default_factory=dict)
+    """By release and name."""
     awards: dict[str, AwardState] = field(default_factory=dict)
     time_s: float = 0.0
-    """Latest of all records."""
+    """Latest time of all records."""
     number: int = 0
     """Of the next change."""
     ended: bool = False
-    recent: deque[Change] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    recent: deque[Change] = field(default_factory=lambda: deque(maxlen=MAX_RECENT))
     open: dict[str, AwardState] = field(default_factory=dict)
-    """Awards that an arm may still hold, by name."""
-    _waiting: list[str] = field(default_factory=list)
-    """Jobs that nobody holds, in the order of their release, then of their names."""
+    """Awards that are not closed, by name."""
 
-    # What is asked
+    def admit(self, jobs: Sequence[JobSpec]) -> tuple[Admission, ...]:
+        """Return which submitted jobs can be accepted; changes nothing."""
+        known = {name: entry.spec for name, entry in self.jobs.items()}
+        return admit(jobs, known, places=self.places, ended=self.ended)
 
-    def admit(self, words: Sequence[JobSpec]) -> tuple[Admission, ...]:
-        """What becomes of jobs that are handed in together; nothing is changed yet."""
-        if self.ended:
-            return tuple(Admission(word.name, False, "The shift is over, no more jobs are taken.") for word in words)
-        there = {name: entry.word for name, entry in self.jobs.items()}
-        return admit(words, there, places=self.places, most=self.most)
-
-    def ready(self, time_s: float, most: int, *, but: Container[str] = ()) -> list[JobSpec]:
-        """The first jobs, `but` for some, that may begin now: released, after their predecessors, at free stations."""
+    def ready(self, time_s: float, limit: int, *, excluded: Container[str] = ()) -> list[JobSpec]:
+        """Return the first jobs that can begin now: released, predecessors finished, stations free."""
         if self.ended:
             return []
-        taken = self.taken()
-        found = (
-            word
-            for name in self._waiting
-            for word in [self.jobs[name].word]
-            if word.release_s <= time_s
-            and name not in but
-            and not taken & frozenset(word.places)
-            and all(self.jobs[before].state == "finished" for before in word.after)
-        )
-        return list(islice(found, most))
+        entries = (entry for name, entry in self.jobs.items() if name not in excluded)
+        waiting = (entry.spec for entry in entries if entry.state == "waiting")
+        busy = self.busy_stations()
+        return ready_jobs(waiting, time_s, limit, busy, lambda name: self.jobs[name].state == "finished")
 
-    def taken(self) -> frozenset[str]:
-        """Stations at which an arm may be at work. One that went silent in its last cycle does not bar its station."""
-        return frozenset(
-            place
-            for promise in self.open.values()
-            if not promise.silent
-            for place in self.jobs[promise.made.job].word.places
-        )
-
-    def returned(self, words: Iterable[JobSpec]) -> dict[str, tuple[int, float]]:
-        """How often each of these jobs came back unfinished, and when last; those that never did are left out."""
-        entries = {word.name: self.jobs[word.name] for word in words}
-        return {name: (entry.returns, entry.returned_s) for name, entry in entries.items() if entry.returns}
+    def busy_stations(self) -> frozenset[str]:
+        """Return the stations at which an arm may be at work; a silent arm does not block its station."""
+        active = (award.record.job for award in self.open.values() if not award.silent)
+        return frozenset(place for job in active for place in self.jobs[job].spec.places)
 
     def unsettled(self) -> list[str]:
-        """Names of the jobs that are neither finished nor given up."""
+        """Return the names of jobs that are neither finished nor unfinished for good."""
         return [name for name, entry in self.jobs.items() if entry.state not in ("finished", "unfinished")]
 
     def status(self, names: Iterable[str] = ()) -> list[JobStatus]:
-        """Where jobs stand, all of them if none is named; names that nobody knows are left out."""
+        """Return the status of these jobs, without unknown ones; of all jobs if none is named."""
         wanted = dict.fromkeys(names) or self.jobs
         return [self._status(self.jobs[name]) for name in wanted if name in self.jobs]
 
     def compact(self) -> tuple[LedgerSnapshot]:
-        """Return the fewest records that give the same ledger: one.
-
-        Of an award that was refused, and of those for a finished job but the one that finished it, nothing is kept:
-        whatever may still be said of them changes nothing.
-        """
+        """Return one record that gives the same ledger, without awards on which a report would change nothing."""
         kept = [
-            promise
-            for name, promise in self.awards.items()
-            if name in self.open or self._of(name).award == name or self._may_count(promise)
+            award
+            for name, award in self.awards.items()
+            if name in self.open or self._entry(name).award == name or self._may_count(award)
         ]
         snapshot = LedgerSnapshot(
             time_s=self.time_s,
@@ -125,128 +176,93 @@ class Ledger(JournalState[AuctionRecord]):
         )
         return (snapshot,)
 
-    # What happens
-
     def apply(self, record: AuctionRecord) -> list[Change]:
-        """Let a record that is in the journal take effect; returns whose state has changed."""
+        """Apply a record that is on disk, and return the changes of job states."""
+        changed: list[JobEntry] = []
         match record:
             case JobsAccepted():
-                touched = self._accept(record)
+                changed = [JobEntry(job, record.by) for job in record.jobs if job.name not in self.jobs]
+                self._set_jobs([*self.jobs.values(), *changed])
             case Awarded():
                 entry = self.jobs[record.job]
                 self.awards[record.award] = self.open[record.award] = AwardState(record)
                 entry.state, entry.award, entry.reason = "awarded", record.award, ""
-                self._waiting.remove(record.job)
-                touched = [entry]
-            case CommitPermitted():
-                touched = [self._of(record.award)]
-                self.awards[record.award].may_commit = True
-                touched[0].state = "finishing"
-            case ContactLost():
-                touched = [self._of(record.award)]
-                self.awards[record.award].silent = True
-                arm = self.awards[record.award].made.arm
-                touched[0].state = "unfinished"
-                touched[0].reason = f"'{arm}' was about to finish it and has not been heard of since."
-            case ContactRegained():
-                touched = [self._of(record.award)]
-                self.awards[record.award].silent = False
-                touched[0].state, touched[0].reason = "finishing", ""
+                changed = [entry]
+            case CommitPermitted() | ContactLost() | ContactRegained():
+                award, entry = self.awards[record.award], self._entry(record.award)
+                award.may_commit, award.silent = True, isinstance(record, ContactLost)
+                entry.state, entry.reason = "finishing", ""
+                if award.silent:
+                    entry.state, entry.reason = "unfinished", reason_for_silence(award.record.arm)
+                changed = [entry]
             case Closed():
-                touched = self._close(record)
+                changed = self._close(record)
             case ShiftEnded():
                 self.ended = True
-                touched = [self.jobs[name] for name in self.unsettled()]
-                for entry in touched:
-                    entry.reason = entry.reason or "The shift ended before it was done."
-                    entry.state = "unfinished"
-                self._waiting = []
+                changed = [self.jobs[name] for name in self.unsettled()]
+                for entry in changed:
+                    entry.state, entry.reason = "unfinished", entry.reason or SHIFT_ENDED
             case LedgerSnapshot():
-                self._stand(record)
-                touched = []
+                self._restore(record)
             case Started() | ClockTick():
-                touched = []
+                pass
         self.time_s = max(self.time_s, record.time_s)
-        return [self._change(entry, record.time_s) for entry in touched]
+        return [self._change(entry, record.time_s) for entry in changed]
 
     # Inside
 
-    def _accept(self, record: JobsAccepted) -> list[Entry]:
-        fresh = [Entry(word, record.by) for word in record.jobs if word.name not in self.jobs]
-        self.jobs |= {entry.word.name: entry for entry in fresh}
-        self._waiting = sorted([*self._waiting, *(e.word.name for e in fresh)], key=self._release)
-        return fresh
+    def _set_jobs(self, entries: Iterable[JobEntry]) -> None:
+        self.jobs = {entry.spec.name: entry for entry in sorted(entries, key=lambda entry: job_order(entry.spec))}
 
-    def _close(self, record: Closed) -> list[Entry]:
-        promise = self.awards[record.award]
-        promise.silent, promise.outcome = False, record.outcome
+    def _close(self, record: Closed) -> list[JobEntry]:
+        award = self.awards[record.award]
+        award.silent, award.outcome = False, record.outcome
         self.open.pop(record.award, None)
-        entry = self.jobs[promise.made.job]
+        entry = self.jobs[award.record.job]
         if entry.state == "finished":
             return []
-        entry.cycles = max(entry.cycles, min(record.cycles, entry.word.repetitions))
+        entry.cycles = max(entry.cycles, min(record.cycles, entry.spec.repetitions))
         if record.outcome == "finished":
-            self.open.pop(entry.award, None)  # done is done, whoever else was given it meanwhile
-            if entry.word.name in self._waiting:
-                self._waiting.remove(entry.word.name)
+            self.open.pop(entry.award, None)  # a later award of the same job has no purpose any more
             entry.state, entry.award, entry.reason, entry.finished_s = "finished", record.award, "", record.time_s
         elif entry.award != record.award:
-            return []  # another one holds it now
+            return []  # the job was awarded again since
         elif record.unsure or self.ended:
-            entry.state = "unfinished"
-            entry.reason = record.reason or "Nobody knows whether its last cycle was done."
+            entry.state, entry.reason = "unfinished", record.reason or "It is unknown whether its last cycle was done."
         else:
             entry.state, entry.reason = "waiting", record.reason
             if record.outcome == "returned":
                 entry.returns, entry.returned_s = entry.returns + 1, record.time_s
-            # Somebody has to do at least the last cycle of it.
-            entry.cycles = min(entry.cycles, entry.word.repetitions - 1)
-            if entry.word.name not in self._waiting:
-                insort(self._waiting, entry.word.name, key=self._release)
+            entry.cycles = min(entry.cycles, entry.spec.repetitions - 1)  # the last cycle is never assumed done
         return [entry]
 
-    def _stand(self, record: LedgerSnapshot) -> None:
-        self.number, self.ended = record.number, record.ended
-        self.jobs = {entry.word.name: replace(entry) for entry in record.jobs}
-        self.awards = {promise.made.award: replace(promise) for promise in record.awards}
-        self.open = {name: self.awards[name] for name in record.open}
-        self.recent = deque(record.recent, maxlen=REMEMBERED)
-        self._waiting = sorted((n for n, entry in self.jobs.items() if entry.state == "waiting"), key=self._release)
+    def _restore(self, snapshot: LedgerSnapshot) -> None:
+        self.number, self.ended = snapshot.number, snapshot.ended
+        self._set_jobs(map(replace, snapshot.jobs))
+        self.awards = {award.record.award: replace(award) for award in snapshot.awards}
+        self.open = {name: self.awards[name] for name in snapshot.open}
+        self.recent = deque(snapshot.recent, maxlen=MAX_RECENT)
 
-    def _may_count(self, promise: AwardState) -> bool:
-        """Whether a report on an award that nobody holds any more could change where its job stands."""
-        return promise.outcome != "refused" and self.jobs[promise.made.job].state != "finished"
+    def _may_count(self, award: AwardState) -> bool:
+        """Whether a report on a closed award could change the state of its job."""
+        return award.outcome != "refused" and self.jobs[award.record.job].state != "finished"
 
-    def _release(self, name: str) -> tuple[float, str]:
-        return self.jobs[name].word.release_s, name
+    def _entry(self, award: str) -> JobEntry:
+        return self.jobs[self.awards[award].record.job]
 
-    def _of(self, award: str) -> Entry:
-        return self.jobs[self.awards[award].made.job]
-
-    def _status(self, entry: Entry) -> JobStatus:
-        held = entry.state in ("awarded", "finishing", "finished") or (
+    def _status(self, entry: JobEntry) -> JobStatus:
+        assigned = entry.state in ("awarded", "finishing", "finished") or (
             entry.state == "unfinished" and entry.award in self.open
         )
-        return JobStatus(
-            job=entry.word.name,
-            state=entry.state,
-            arm=self.awards[entry.award].made.arm if held else "",
-            award=entry.award if held else "",
-            cycles=entry.cycles,
-            finished_s=entry.finished_s,
-            reason=entry.reason,
-        )
+        award = entry.award if assigned else ""
+        arm = self.awards[award].record.arm if assigned else ""
+        return JobStatus(entry.spec.name, entry.state, arm, award, entry.cycles, entry.finished_s, entry.reason)
 
-    def _change(self, entry: Entry, time_s: float) -> Change:
-        made = self.awards[entry.award].made if entry.award else None
-        change = Change(
-            number=self.number,
-            time_s=time_s,
-            status=self._status(entry),
-            auction="" if made is None else made.auction,
-            difficulty=None if made is None else made.difficulty,
-            p_saturation=None if made is None else made.p_saturation,
-        )
+    def _change(self, entry: JobEntry, time_s: float) -> Change:
+        change = Change(self.number, time_s, self._status(entry))
+        if entry.award:
+            award = asdict(self.awards[entry.award].record)
+            change = replace(change, **{name: award[name] for name in ("auction", "difficulty", "p_saturation")})
         self.number += 1
         self.recent.append(change)
         return change

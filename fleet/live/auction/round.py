@@ -1,104 +1,138 @@
-"""One round of an auction: which jobs are on offer, what the arms bid, and who gets which job."""
+"""One round of an auction: its time limits, the bids of the arms, and which arm gets which job."""
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
-from fleet.bus.protocol.auction import JobEstimate, JobSpec, Quote
+from fleet.bus.protocol.auction import LEASE_S, JobEstimate, JobSpec, Quote
 from fleet.bus.protocol.messages import State
+from fleet.live.clock import CLOCK_DRIFT
 
 _LOG = logging.getLogger(__name__)
 
-REASON_CHARACTERS = 500
-"""Length at which a reason is cut, so that a message does not grow with the number of arms."""
+MAX_REASON = 500
+"""Characters of a reason, so that a message does not grow with the number of arms."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timing:
+    """Auction timeouts, in real seconds."""
+
+    lease_s: float = LEASE_S
+    """Length of a lease: an arm may work this long without renewing it."""
+    margin_s: float = 0.25
+    """Between the end of a lease and the next offer of its job."""
+    window_s: float = 0.5
+    """A round closes after this, if not every arm has answered before."""
+    ack_s: float = 1.0
+    """To wait for the answer to an award."""
+    attempts: int = 3
+    """Maximum number of times that an award is sent."""
+    pause_s: tuple[float, float] = (0.25, 2.0)
+    """Between rounds in which nothing was awarded: the first pause and the longest."""
+    max_jobs: int = 64
+    """Jobs in one round; a quote for more would be a large message."""
+
+    def __post_init__(self) -> None:
+        for name in ("lease_s", "margin_s", "window_s", "ack_s", "attempts", "max_jobs"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"Timing.{name} must be > 0 (got {getattr(self, name)}).")
+        if not 0 < self.pause_s[0] <= self.pause_s[1]:
+            raise ValueError(f"Timing.pause_s must be 0 < first <= longest (got {self.pause_s}).")
+
+    @property
+    def counted_lease_s(self) -> float:
+        """Length of a lease as the granting side counts it: longer than the arm does, as clocks differ in rate."""
+        return self.lease_s * (1.0 + CLOCK_DRIFT) + self.margin_s
 
 
 @dataclass(frozen=True, eq=False)
 class Bidding:
-    """What an allocation rule decides on."""
+    """Input of an allocation rule."""
 
     auction: str
     time_s: float
-    """The fleet's time."""
+    """Fleet time."""
     jobs: tuple[JobSpec, ...]
     quotes: Mapping[str, Quote]
-    """Of every arm that answered and has room for a job."""
+    """Quotes of the arms with capacity for a job."""
     full: Mapping[str, Quote] = field(default_factory=dict)
-    """Of every arm that answered and takes no job now."""
+    """Quotes of the arms without."""
     states: Mapping[str, State] = field(default_factory=dict)
-    """The last state that each arm published."""
+    """Latest published state of each arm."""
     ages_s: Mapping[str, float] = field(default_factory=dict)
-    """Age of an answer, fleet seconds; 0 where none is given."""
+    """Age of a quote, fleet seconds; 0 where none is given."""
     returned: Mapping[str, tuple[int, float]] = field(default_factory=dict)
-    """How often a job came back unfinished, and when last (the fleet's time); jobs that never did are left out."""
+    """Number of returns of a job, and fleet time of the last one; only of jobs that were ever returned."""
 
     def offer(self, arm: str, job: str) -> JobEstimate | None:
-        """What an arm bid for a job; None if it did not, or cannot do it."""
+        """Return an arm's estimate for a job of the round; None if the arm did not bid for it, or cannot do it."""
         return self._offers.get((arm, job))
 
     @cached_property
     def _offers(self) -> dict[tuple[str, str], JobEstimate]:
-        pairs = ((arm, offer) for arm, quote in self.quotes.items() for offer in quote.estimates if offer.feasible)
-        return {(arm, offer.job): offer for arm, offer in pairs}
+        names = {job.name for job in self.jobs}
+        pairs = ((arm, offer) for arm, quote in self.quotes.items() for offer in quote.estimates)
+        return {(arm, offer.job): offer for arm, offer in pairs if offer.feasible and offer.job in names}
 
 
 Allocate = Callable[[Bidding], Mapping[str, str]]
-"""Arm of each job that is assigned. An arm gets one job in a round: after that its other bids no longer hold, and in
-the next round it bids again."""
+"""Arm of each assigned job. An arm gets one job a round, since its other bids no longer hold after that."""
 
 
 def resolve_claims(bidding: Bidding, claims: Mapping[str, str], order: Sequence[str]) -> dict[str, str]:
-    """Arm of each job, of what arms claim: the lower quoted difficulty wins, then the arm that comes first in `order`.
+    """Return the arm of each job: the lower quoted difficulty wins, then the arm that comes first in `order`.
 
-    As in simulation, a job goes to one arm, a station serves one job, and no difficulty loses against any.
+    As in simulation, a job goes to one arm, a station serves one job, and an unknown difficulty loses.
 
     Args:
         claims: The job that each arm claims; a claim without a feasible offer is ignored.
     """
-    places = {word.name: frozenset(word.places) for word in bidding.jobs}
     ranked: list[tuple[float, int, str, str]] = []
     for arm, job in claims.items():
-        if (offer := bidding.offer(arm, job)) is not None and job in places:
-            ranked.append((math.inf if offer.difficulty is None else offer.difficulty, order.index(arm), arm, job))
-    out: dict[str, str] = {}
-    taken: set[str] = set()
-    for _, _, arm, job in sorted(ranked):
-        if job not in out and not taken & places[job]:
-            out[job] = arm
-            taken |= places[job]
-    return out
+        if (offer := bidding.offer(arm, job)) is not None:
+            ranked.append((math.inf if offer.difficulty is None else offer.difficulty, order.index(arm), job, arm))
+    return _without_conflicts(bidding, [(job, arm) for _, _, job, arm in sorted(ranked)])
 
 
-def drop_invalid(bidding: Bidding, wanted: Mapping[str, str]) -> dict[str, str]:
-    """What of an allocation may be awarded: with a bid, one job per arm and per station. The rest is logged."""
-    places = {word.name: frozenset(word.places) for word in bidding.jobs}
-    out: dict[str, str] = {}
-    taken: set[str] = set()
-    for job, arm in sorted(wanted.items()):
-        if job not in places or bidding.offer(arm, job) is None:
+def drop_invalid(bidding: Bidding, allocation: Mapping[str, str]) -> dict[str, str]:
+    """Return the valid part of an allocation: jobs with a bid, one job per arm and per station. Log the rest."""
+    pairs = sorted(allocation.items())
+    valid = _without_conflicts(bidding, [pair for pair in pairs if bidding.offer(pair[1], pair[0]) is not None])
+    for job, arm in pairs:
+        if bidding.offer(arm, job) is None:
             _LOG.error("The allocation rule gives '%s' to '%s', which did not bid for it: not awarded.", job, arm)
-        elif arm in out.values() or taken & places[job]:
+        elif job not in valid:
             _LOG.error("The allocation rule gives '%s' to '%s' against a job of the same arm or station.", job, arm)
-        else:
-            out[job] = arm
-            taken |= places[job]
-    return out
+    return valid
+
+
+def _without_conflicts(bidding: Bidding, pairs: Iterable[tuple[str, str]]) -> dict[str, str]:
+    """Return the arm of each job; of pairs with the same job, arm or station the first is kept."""
+    places = {job.name: frozenset(job.places) for job in bidding.jobs}
+    arms: dict[str, str] = {}
+    busy: set[str] = set()
+    for job, arm in pairs:
+        if job not in arms and arm not in arms.values() and not busy & places[job]:
+            arms[job] = arm
+            busy |= places[job]
+    return arms
 
 
 def infeasible_jobs(bidding: Bidding) -> dict[str, str]:
-    """Jobs that every arm which answered calls infeasible, with the arms' reasons."""
-    answered = {**bidding.quotes, **bidding.full}
+    """Return the jobs that every arm with a quote calls infeasible, with the reasons of the arms."""
+    quotes = {**bidding.quotes, **bidding.full}
     reasons: dict[str, dict[str, str]] = {}
-    for arm, quote in sorted(answered.items()):
+    for arm, quote in sorted(quotes.items()):
         for offer in quote.estimates:
             if not offer.feasible:
                 reasons.setdefault(offer.job, {})[arm] = offer.reason or "infeasible"
     return {
-        job: f"No arm can do it: {'; '.join(f'{arm}: {reason}' for arm, reason in by_arm.items())}."[:REASON_CHARACTERS]
+        job: f"No arm can do it: {'; '.join(f'{arm}: {reason}' for arm, reason in by_arm.items())}."[:MAX_REASON]
         for job, by_arm in reasons.items()
-        if len(by_arm) == len(answered)
+        if len(by_arm) == len(quotes)
     }
 
 
@@ -109,11 +143,11 @@ class Round:
     auction: str
     jobs: tuple[JobSpec, ...]
     asked: frozenset[str]
-    """Arms whose answer it waits for."""
+    """Arms whose quotes it waits for."""
     until_s: float
-    """Real second at which it closes anyway."""
+    """Real second at which it closes in any case."""
     quotes: dict[str, Quote] = field(default_factory=dict)
 
     def complete(self, present: frozenset[str]) -> bool:
-        """Whether every arm that was asked and is still present has answered."""
+        """Return whether every arm that was asked and is still present has answered."""
         return (self.asked & present) <= self.quotes.keys()

@@ -1,58 +1,58 @@
-"""Claims of an arm, and what follows from the answers of a majority.
+"""Claims of an arm, and what follows from the replies of a majority.
 
 A state machine without a clock and without I/O. To the arm's `AwardExecutor` it acts as an auctioneer: a job that a
-majority grants is an award, its lease counts from the moment at which the majority was asked, and an outcome that a
-majority has on disk is receipted. Every claim lists all that the arm holds, requests and reports: a peer that no longer
-finds a job there that it has granted knows that the arm has released it.
+majority grants is an award, its lease counts from the moment of the query to the last arm of a majority, and an outcome
+that a majority has on disk is receipted. Every claim lists all jobs that the arm has, requests and reports: a peer that
+misses a job there that it has granted knows that the arm has released it.
 """
 
 import logging
 import math
-from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from fleet.bus.protocol.auction import MOST_JOBS, Ack, Award, JobSpec, Lease, Receipt, Report
 from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, JobOutcome
-from fleet.errors import JournalError
+from fleet.errors import JournalError, Refused
 from fleet.live.arm.award_executor import AwardExecutor
-from fleet.live.auction.auctioneer import Objection
-from fleet.live.auction.lease_timing import Timing
+from fleet.live.auction.round import Timing
 from fleet.live.consensus.granter import Granter
 
 _LOG = logging.getLogger(__name__)
 
 CLAIM_S = 0.5
-"""Real seconds after which a claim is repeated for peers that have not answered."""
+"""Real seconds after which a claim is repeated for peers that have not replied."""
 PENDING_S = 2.0
-"""Real seconds after which an arm gives up a requested job that no majority grants."""
-MOST_CORRECTIONS = 32
+"""Real seconds after which an arm withdraws a request that no majority grants."""
+MAX_CORRECTIONS = 32
 """In one claim."""
-CLAIMS = 64
-"""Latest claims whose answers count."""
+MAX_CLAIMS = 64
+"""Latest claims whose replies count."""
+NUMBERS_PER_BOOT = 1_000_000_000
+"""The number of a claim or bid is the boot number times this, plus a count."""
 
 
 @dataclass(eq=False)
 class Vote:
-    """Answers of the fleet about one award."""
+    """Replies of the fleet about one award."""
 
     granted_s: dict[str, float] = field(default_factory=dict)
-    """When each arm that granted it was asked, real seconds, the latest time."""
+    """Real second of the last query that each arm granted."""
     denied: set[str] = field(default_factory=set)
     may_commit: set[str] = field(default_factory=set)
     cycles: int = 0
 
     def since_s(self, majority: int) -> float:
-        """When the latest majority was asked; -inf for none."""
-        asked = sorted(self.granted_s.values(), reverse=True)
-        return asked[majority - 1] if len(asked) >= majority else -math.inf
+        """Return the real second of the latest query that a majority granted; -inf for none."""
+        asked_s = sorted(self.granted_s.values(), reverse=True)
+        return asked_s[majority - 1] if len(asked_s) >= majority else -math.inf
 
 
 @dataclass(frozen=True, eq=False)
 class PendingClaim:
-    """A job that the arm requests and does not hold yet."""
+    """A job that the arm requests and does not have yet."""
 
-    word: JobSpec
+    job: JobSpec
     quote: str
     made_s: float
 
@@ -61,105 +61,99 @@ class Claimant:
     """Claims of one arm, from one start of its process to the next.
 
     Attributes:
-        majority: Arms that make one, of the whole roster.
+        majority: Number of arms that make one, of the whole roster.
         pending: Requested jobs, by award.
-        rejected: Jobs that it requested and did not get, oldest first; the driver takes them out.
+        rejected: Requested jobs that were not granted, oldest first; the driver takes them out.
     """
 
     def __init__(
         self,
         executor: AwardExecutor,
         granter: Granter,
-        take: Callable[[Award, float], Ack],
+        answer_award: Callable[[Award, float], Ack],
         *,
-        life: int,
+        boot: int,
         timing: Timing | None = None,
     ) -> None:
-        """Begin.
+        """Start.
 
         Args:
-            take: Accepts an award for the arm.
-            life: Counts up with every start of the arm.
+            answer_award: Accepts or refuses an award for the arm.
+            boot: Number of this start of the arm.
         """
         self.arm, self.executor, self.granter = executor.arm, executor, granter
         self.majority = len(granter.roster) // 2 + 1
         self.pending: dict[str, PendingClaim] = {}
         self.rejected: list[str] = []
-        self._take_up, self._timing = take, timing or Timing()
-        self._number = life * 1_000_000_000
+        self._answer_award, self._timing = answer_award, timing or Timing()
+        self._number = boot * NUMBERS_PER_BOOT
         self._votes: dict[str, Vote] = {}
         self._receipts: dict[str, set[str]] = {}
         """Arms that have the outcome on disk, by award."""
         self._last_entries: dict[str, ClaimEntry] = {}
-        """What it claimed last, by award: a job whose report is not on disk is claimed on."""
+        """Entries of the last claim, by award: a job is claimed until its report is on disk."""
         self._corrections: dict[str, JobOutcome] = {}
-        self._news: dict[str, JobSpec] = {}
-        self._sent: OrderedDict[int, tuple[Claim, float, int]] = OrderedDict()
+        self._new_jobs: dict[str, JobSpec] = {}
+        self._sent: dict[int, tuple[Claim, float, int]] = {}
+        """Claims by number, each with its real second and version."""
         self._answered: dict[str, int] = {}
-        """Version of the claim that each arm has answered."""
+        """Version of the last claim to which each arm has replied."""
         self._version, self._due, self._claimed_s = 1, True, -math.inf
 
     @property
-    def room(self) -> int:
+    def capacity(self) -> int:
         """How many more jobs it may request."""
-        word = MOST_JOBS - len(self.executor.active) - len(self.executor.pending_reports())
-        return min(self.executor.spare_capacity, word) - len(self.pending)
+        in_message = MOST_JOBS - len(self.executor.active) - len(self.executor.pending_reports())
+        return min(self.executor.spare_capacity, in_message) - len(self.pending)
 
-    def request(self, word: JobSpec, real_s: float) -> None:
+    def request(self, job: JobSpec, real_s: float) -> None:
         """Request a job."""
-        quote = self.executor.add_quote({word.name: (word, True)}, real_s)
-        award = f"{self.arm}-{quote}:{word.name}"
-        self.pending[award] = PendingClaim(word, quote, real_s)
+        quote = self.executor.add_quote({job.name: (job, True)}, real_s)
+        award = f"{self.arm}-{quote}:{job.name}"
+        self.pending[award] = PendingClaim(job, quote, real_s)
         self._votes[award] = Vote()
         self._change()
 
-    def send_outcome(self, settled: JobOutcome) -> None:
+    def send_outcome(self, outcome: JobOutcome) -> None:
         """Send the outcome of a job with the next claim: a peer seems to miss it."""
-        self._corrections[settled.job] = settled
+        self._corrections[outcome.job] = outcome
         self._due = True
 
-    def send_job(self, word: JobSpec) -> None:
+    def send_job(self, job: JobSpec) -> None:
         """Send a job with the next claim: a peer seems to miss it."""
-        self._news[word.name] = word
+        self._new_jobs[job.name] = job
         self._due = True
 
     def claim_soon(self) -> None:
         """Claim with the next tick: a lease, a permission to commit or a receipt is due."""
         self._due = True
 
-    def claim(self, there: frozenset[str], real_s: float) -> Claim | None:
-        """The claim to send now, if any: it has news, a lease is due, or a present arm has not answered.
-
-        Args:
-            there: Arms that show that they are alive.
-        """
+    def claim(self, present: frozenset[str], real_s: float) -> Claim | None:
+        """Return the claim to send now, if it has changed, a lease is due, or a present arm has not replied."""
         self._expire(real_s)
-        untold = any(self._answered.get(arm, 0) < self._version for arm in there)
-        if not self._due and not (untold and real_s >= self._claimed_s + CLAIM_S):
+        unanswered = any(self._answered.get(arm, 0) < self._version for arm in present)
+        if not self._due and not (unanswered and real_s >= self._claimed_s + CLAIM_S):
             return None
-        entries, settled = self._entries()
-        corrections = list(self._corrections.values())[: min(MOST_CORRECTIONS, MOST_JOBS - len(settled))]
+        entries, outcomes = self._entries()
+        corrections = list(self._corrections.values())[: min(MAX_CORRECTIONS, MOST_JOBS - len(outcomes))]
         self._number += 1
-        jobs = tuple(self._news.values())[:MOST_CORRECTIONS]
-        claim = Claim(self.arm, self._number, tuple(entries), (*settled, *corrections), jobs)
-        self._claimed_s = real_s
+        jobs = tuple(self._new_jobs.values())[:MAX_CORRECTIONS]
+        claim = Claim(self.arm, self._number, tuple(entries), (*outcomes, *corrections), jobs)
+        self._claimed_s, self._due = real_s, False
         try:
-            own = self.granter.answer_claim(claim, real_s)
-        except Objection as objection:
-            self._due = False  # tried again when something is due, or after CLAIM_S
-            _LOG.warning("Nothing is claimed: %s", objection)
+            own_reply = self.granter.answer_claim(claim, real_s)
+        except Refused as error:  # repeated when something is due, or after `CLAIM_S`
+            _LOG.warning("Nothing is claimed: %s", error)
             return None
-        self._due = False
         self._corrections.clear()
-        self._news.clear()
+        self._new_jobs.clear()
+        self._sent = {number: sent for number, sent in self._sent.items() if number > claim.number - MAX_CLAIMS}
         self._sent[claim.number] = claim, real_s, self._version
-        if len(self._sent) > CLAIMS:
-            self._sent.popitem(last=False)
-        self.apply_reply(own, real_s)
+        self.apply_reply(own_reply, real_s)
         return claim
 
     def apply_reply(self, reply: ClaimReply, real_s: float) -> None:
-        """Take the answer of a peer, or of this arm itself, to a claim."""
+        """Apply the reply of a peer, or of this arm itself, to a claim."""
         sent = self._sent.get(reply.number)
         if sent is None or reply.arm not in self.granter.roster:
             return
@@ -179,104 +173,102 @@ class Claimant:
             if vote is not None and asked_s >= vote.granted_s.get(reply.arm, -math.inf):
                 vote.granted_s.pop(reply.arm, None)
                 vote.denied.add(reply.arm)
-        for settled in claim.outcomes:
-            self._receipts.get(settled.award, set()).add(reply.arm)
+        for outcome in claim.outcomes:
+            self._receipts.get(outcome.award, set()).add(reply.arm)
         self._count_votes(real_s)
 
     # Inside
 
     def _change(self) -> None:
-        """Mark news that every arm has to receive."""
+        """Mark a change that every arm has to receive."""
         self._version += 1
         self._due = True
 
     def _entries(self) -> tuple[list[ClaimEntry], list[JobOutcome]]:
-        """What it holds and requests, and the outcomes to report; without its report on disk a job is still held."""
-        places = {held.award.award: held.award.job.places for held in self.executor.active}
-        holds = self.executor.lease_entries(self.arm)
-        entries = [ClaimEntry(hold.award, hold.job, places[hold.award], hold.cycles, hold.phase) for hold in holds]
+        """Return the jobs that it has and requests, and outcomes; a job is claimed until its report is on disk."""
+        places = {active.award.award: active.award.job.places for active in self.executor.active}
+        entries: list[ClaimEntry] = []
+        for lease in self.executor.lease_entries(self.arm):
+            entries.append(ClaimEntry(lease.award, lease.job, places[lease.award], lease.cycles, lease.phase))
+            self._votes.setdefault(lease.award, Vote())
         for award, pending in self.pending.items():
-            entries.append(ClaimEntry(award, pending.word.name, pending.word.places, 0, "requested"))
-        settled: list[JobOutcome] = []
-        for report, written in self.executor.pending_reports():
-            if written:
-                settled.append(_settled(report))
+            entries.append(ClaimEntry(award, pending.job.name, pending.job.places, 0, "requested"))
+        outcomes: list[JobOutcome] = []
+        for report, on_disk in self.executor.pending_reports():
+            if on_disk:
+                outcomes.append(_outcome_of(report))
+                self._receipts.setdefault(report.award, set())
             elif last := self._last_entries.get(report.award):
                 phase = "finishing" if last.phase == "finishing" else "working"
                 entries.append(ClaimEntry(report.award, report.job, last.places, report.cycles, phase))
         self._last_entries = {entry.award: entry for entry in entries}
-        for hold in holds:
-            self._votes.setdefault(hold.award, Vote())
-        for each in settled:
-            self._receipts.setdefault(each.award, set())
-        return entries, settled
+        return entries, outcomes
 
     def _count_votes(self, real_s: float) -> None:
-        """Act on what a majority has answered."""
+        """Act on the replies of a majority."""
         for award, pending in list(self.pending.items()):
             vote = self._votes[award]
             if len(vote.granted_s) >= self.majority:
                 self._accept(award, pending, vote, real_s)
             elif self._is_denied(vote):
                 self._reject(award)
-        for held in self.executor.active:
-            if vote := self._votes.get(held.award.award):
-                self._renew(held.award.award, vote, held.may_commit, real_s)
+        for active in self.executor.active:
+            if vote := self._votes.get(active.award.award):
+                self._renew(active.award.award, vote, active.may_commit, real_s)
         for report, _ in self.executor.pending_reports():
             if len(self._receipts.get(report.award, ())) >= self.majority:
                 del self._receipts[report.award]
                 self.executor.apply_receipt(Receipt(self.arm, report.award))
 
-    def _renew(self, award: str, vote: Vote, left: bool, real_s: float) -> None:
-        """Pass the lease of a held award on to the executor."""
+    def _renew(self, award: str, vote: Vote, may_commit: bool, real_s: float) -> None:
+        """Apply the votes on an active award as a lease."""
         lease_s, asked_s = self._timing.lease_s, vote.since_s(self.majority)
-        leave = (award,) if len(vote.may_commit) >= self.majority else ()
-        if self._is_denied(vote) and not left and not leave:
+        permitted = (award,) if len(vote.may_commit) >= self.majority else ()
+        if self._is_denied(vote) and not may_commit and not permitted:
             self.executor.apply_lease(Lease(self.arm, lease_s, (), (award,)), real_s)
             self._change()
         elif asked_s > -math.inf:
-            self.executor.apply_lease(Lease(self.arm, lease_s, (award,), (), leave), asked_s)
-        elif leave:
-            self.executor.apply_lease(Lease(self.arm, lease_s, (), (), leave), real_s)
+            self.executor.apply_lease(Lease(self.arm, lease_s, (award,), (), permitted), asked_s)
+        elif permitted:
+            self.executor.apply_lease(Lease(self.arm, lease_s, (), (), permitted), real_s)
 
     def _is_denied(self, vote: Vote) -> bool:
         return len(vote.denied) > len(self.granter.roster) - self.majority
 
     def _accept(self, award: str, pending: PendingClaim, vote: Vote, real_s: float) -> None:
-        cycles = min(vote.cycles, pending.word.repetitions - 1)  # at least the last one is left to do
-        given = Award(award, award, self.arm, pending.quote, pending.word, cycles, self._timing.lease_s)
-        ack = self._take_up(given, real_s)
+        cycles = min(vote.cycles, pending.job.repetitions - 1)  # the last cycle is never assumed done
+        granted = Award(award, award, self.arm, pending.quote, pending.job, cycles, self._timing.lease_s)
+        ack = self._answer_award(granted, real_s)
         if ack.accepted:
             del self.pending[award]
         else:
-            _LOG.info("'%s' is not taken: %s", pending.word.name, ack.reason)
+            _LOG.info("'%s' is not accepted: %s", pending.job.name, ack.reason)
             self._reject(award)
 
     def _reject(self, award: str) -> None:
         """Withdraw a request; peers learn of it with the next claim."""
-        self.rejected.append(self.pending.pop(award).word.name)
+        self.rejected.append(self.pending.pop(award).job.name)
         self._change()
 
     def _expire(self, real_s: float) -> None:
-        """Withdraw requests that are not granted in time, drop votes of no use, and mark new reports."""
+        """Withdraw requests that are not granted in time, drop unneeded votes, and mark new reports."""
         for award, pending in list(self.pending.items()):
             if real_s >= pending.made_s + PENDING_S:
                 self._reject(award)
-        needed = {*self.pending, *(held.award.award for held in self.executor.active)}
-        for award in self._votes.keys() - needed:
-            del self._votes[award]
-        reports = {report.award for report, written in self.executor.pending_reports() if written}
+        needed = {*self.pending, *(active.award.award for active in self.executor.active)}
+        self._votes = {award: vote for award, vote in self._votes.items() if award in needed}
+        reports = {report.award for report, on_disk in self.executor.pending_reports() if on_disk}
         if reports - self._receipts.keys():
             self._change()
 
-    def _apply_outcome(self, settled: JobOutcome) -> None:
+    def _apply_outcome(self, outcome: JobOutcome) -> None:
         try:
-            self.granter.apply_outcome(settled)
+            self.granter.apply_outcome(outcome)
         except JournalError as error:
-            _LOG.error("Could not persist outcome of '%s': %s", settled.job, error)
+            _LOG.error("Could not persist outcome of '%s': %s", outcome.job, error)
 
 
-def _settled(report: Report) -> JobOutcome:
-    """A report as a job outcome for peers."""
+def _outcome_of(report: Report) -> JobOutcome:
+    """Return a report as a job outcome for peers."""
     outcome = "finished" if report.outcome == "finished" else "unfinished" if report.unsure else "returned"
     return JobOutcome(report.job, report.award, report.arm, outcome, report.cycles, report.time_s, report.reason)

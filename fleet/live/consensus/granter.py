@@ -1,7 +1,7 @@
-"""What an arm grants to its peers.
+"""Grants of an arm to its peers.
 
-A state machine without a clock and without I/O. Real time comes as an argument. Records go to `keep`, which returns
-once they are on disk, and take effect only then. The rules that make it safe (`fleet.bus.protocol.consensus` says why):
+A state machine without a clock and without I/O. Real time is an argument. Records go to `keep`, which returns once they
+are on disk, and are applied only then. The rules that make it safe (`fleet.bus.protocol.consensus` says why):
 
 - A job is granted to one arm at a time; to another arm only after the lease of the first has ended, or the first has
   released the job.
@@ -16,12 +16,12 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from fleet.bus.protocol.auction import Count, JobSpec, Name
+from fleet.bus.protocol.auction import Count, JobSpec, JobStatus, Name
 from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, DeniedEntry, GrantedEntry, JobOutcome
-from fleet.errors import JournalFull
-from fleet.live.auction.auctioneer import Objection
-from fleet.live.auction.lease_timing import Timing
-from fleet.live.journal import JournalState
+from fleet.errors import JournalFull, Refused
+from fleet.live.auction.job_rules import reason_for_silence
+from fleet.live.auction.round import Timing
+from fleet.live.journal import TimedState
 from fleet.live.journal_records import ClockTick, JobsAccepted, Progress, Released
 
 
@@ -67,7 +67,7 @@ class Grant:
 
 
 @dataclass(eq=False)
-class Register(JournalState[GrantRecord]):
+class Register(TimedState[GrantRecord]):
     """The state that follows from the records; only `apply` changes it."""
 
     grants: dict[str, Grant] = field(default_factory=dict)
@@ -94,14 +94,14 @@ class Register(JournalState[GrantRecord]):
                 grant = self.grants.get(record.job)
                 if grant is not None and grant.award == record.award:
                     del self.grants[record.job]
-            case JobSettled(settled):
-                self._count(settled.job, settled.cycles)
-                self.time_s = max(self.time_s, settled.time_s)
-                if settled.outcome != "returned":
-                    self.settled[settled.job] = settled
-                    self.grants.pop(settled.job, None)
+            case JobSettled(outcome):
+                self._count(outcome.job, outcome.cycles)
+                self.time_s = max(self.time_s, outcome.time_s)
+                if outcome.outcome != "returned":
+                    self.settled[outcome.job] = outcome
+                    self.grants.pop(outcome.job, None)
             case JobsAccepted(jobs):
-                self.jobs |= {word.name: word for word in jobs}
+                self.jobs |= {job.name: job for job in jobs}
             case ClockTick(time_s):
                 self.time_s = max(self.time_s, time_s)
             case ClaimNumbered(arm, number):
@@ -111,15 +111,15 @@ class Register(JournalState[GrantRecord]):
 
     def compact(self) -> tuple[GrantRecord, ...]:
         """Return the fewest records that give the same register."""
-        out: list[GrantRecord] = [ClockTick(self.time_s)]
-        out += [ClaimNumbered(arm, number) for arm, number in self.numbers.items()]
-        out += [Progress(job, cycles) for job, cycles in self.cycles.items()]
-        out += [JobsAccepted((word,)) for word in self.jobs.values()]
+        records: list[GrantRecord] = [ClockTick(self.time_s)]
+        records += [ClaimNumbered(arm, number) for arm, number in self.numbers.items()]
+        records += [Progress(job, cycles) for job, cycles in self.cycles.items()]
+        records += [JobsAccepted((job,)) for job in self.jobs.values()]
         for job, grant in self.grants.items():
             number, cycles = self.numbers.get(grant.arm, 0), self.cycles.get(job, 0)
-            out.append(JobGranted(grant.arm, number, grant.award, job, grant.places, cycles, grant.may_commit))
-        out += [JobSettled(settled) for settled in self.settled.values()]
-        return tuple(out)
+            records.append(JobGranted(grant.arm, number, grant.award, job, grant.places, cycles, grant.may_commit))
+        records += [JobSettled(outcome) for outcome in self.settled.values()]
+        return tuple(records)
 
     def _count(self, job: str, cycles: int) -> None:
         self.cycles[job] = max(cycles, self.cycles.get(job, 0))
@@ -158,44 +158,40 @@ class Granter:
             grant.until_s = real_s + self._timing.counted_lease_s
 
     def answer_claim(self, claim: Claim, real_s: float) -> ClaimReply:
-        """The answer to a claim; every grant in it is on disk.
+        """Return the reply to a claim; every grant in it is on disk.
 
         Raises:
-            Objection: an arm of another fleet, a claim older than the latest of that arm, or a full journal.
+            Refused: an arm of another fleet, a claim older than the latest of that arm, or a full journal.
         """
+        register = self.register
         if claim.arm not in self.roster:
-            raise Objection(f"'{claim.arm}' is no arm of this fleet. Arms: {', '.join(sorted(self.roster))}.")
-        last = self.register.numbers.get(claim.arm, -1)
+            raise Refused(f"'{claim.arm}' is no arm of this fleet. Arms: {', '.join(sorted(self.roster))}.")
+        last = register.numbers.get(claim.arm, -1)
         if claim.number <= last:
-            raise Objection(f"Stale claim {claim.number} from '{claim.arm}' (latest {last}).")
-        try:
-            self.add_jobs(claim.jobs)
-            self._record([JobSettled(settled) for settled in claim.outcomes if self._is_news(settled)])
-            self._record(self._released(claim))
-        except JournalFull as error:
-            raise Objection(str(error)) from error
-        self.register.numbers[claim.arm] = claim.number
+            raise Refused(f"Stale claim {claim.number} from '{claim.arm}' (latest {last}).")
+        self.add_jobs(claim.jobs)
+        self._record([JobSettled(outcome) for outcome in claim.outcomes if self._is_new(outcome)])
+        self._record(self._released(claim))
+        register.numbers[claim.arm] = claim.number
         granted: list[GrantedEntry] = []
         denied: list[DeniedEntry] = []
         for entry in claim.entries:
-            why = self._objection(claim.arm, entry, real_s)
-            if not why:
-                why = self._grant(claim, entry, real_s)
-            if why:
-                denied.append(DeniedEntry(entry.award, why, self.register.settled.get(entry.job)))
+            reason = self._objection(claim.arm, entry, real_s) or self._grant(claim, entry, real_s)
+            if reason:
+                denied.append(DeniedEntry(entry.award, reason, register.settled.get(entry.job)))
             else:
-                grant = self.register.grants[entry.job]
-                granted.append(GrantedEntry(entry.award, self.register.cycles.get(entry.job, 0), grant.may_commit))
+                may_commit = register.grants[entry.job].may_commit
+                granted.append(GrantedEntry(entry.award, register.cycles.get(entry.job, 0), may_commit))
         return ClaimReply(self.arm, claim.number, self._timing.lease_s, tuple(granted), tuple(denied))
 
-    def apply_outcome(self, settled: JobOutcome) -> None:
-        """Take the outcome of a job from a peer.
+    def apply_outcome(self, outcome: JobOutcome) -> None:
+        """Record the outcome of a job that a peer knows.
 
         Raises:
             JournalError: it is not on disk, and nothing has changed.
         """
-        if self._is_news(settled):
-            self._record([JobSettled(settled)])
+        if self._is_new(outcome):
+            self._record([JobSettled(outcome)])
 
     def add_jobs(self, jobs: tuple[JobSpec, ...], by: str = "") -> None:
         """Add submitted jobs.
@@ -203,39 +199,44 @@ class Granter:
         Raises:
             JournalError: none is on disk.
         """
-        fresh = tuple(word for word in jobs if word.name not in self.register.jobs)
-        self._record([JobsAccepted(fresh, by)] if fresh else [])
-
-    def record_time(self, time_s: float) -> None:
-        """Record the fleet's time.
-
-        Raises:
-            JournalError: it is not on disk.
-        """
-        self._record([ClockTick(time_s)])
+        new = tuple(job for job in jobs if job.name not in self.register.jobs)
+        self._record([JobsAccepted(new, by)] if new else [])
 
     def is_granted(self, job: str, real_s: float) -> bool:
-        """Whether an arm has a job, or may have it."""
+        """Return whether an arm has a job, or may have it."""
         grant = self.register.grants.get(job)
         return grant is not None and (grant.may_commit or real_s < grant.until_s)
 
     def busy_stations(self, real_s: float) -> frozenset[str]:
-        """Stations at which an arm may be at work."""
-        return frozenset(
-            place for grant in self.register.grants.values() if real_s < grant.until_s for place in grant.places
-        )
+        """Return the stations at which an arm may be at work."""
+        leased = (grant for grant in self.register.grants.values() if real_s < grant.until_s)
+        return frozenset(place for grant in leased for place in grant.places)
 
     def out_of_contact(self, real_s: float) -> frozenset[str]:
-        """Jobs whose arm had permission to commit and has not renewed its lease since."""
+        """Return the jobs whose arm got permission to commit and has not renewed its lease since."""
         grants = self.register.grants.items()
         return frozenset(job for job, grant in grants if grant.may_commit and real_s >= grant.until_s)
 
+    def status(self, job: str, real_s: float) -> JobStatus:
+        """Return the status of a job, as far as this arm knows from its grants and from received outcomes."""
+        outcome, grant = self.register.settled.get(job), self.register.grants.get(job)
+        cycles = self.register.cycles.get(job, 0)
+        if outcome is not None and outcome.outcome == "finished":
+            return JobStatus(job, "finished", outcome.arm, outcome.award, cycles, outcome.time_s)
+        if outcome is not None:
+            return JobStatus(job, "unfinished", outcome.arm, outcome.award, cycles, None, outcome.reason)
+        if grant is None or not self.is_granted(job, real_s):
+            return JobStatus(job, "waiting", cycles=cycles)
+        if grant.may_commit and real_s >= grant.until_s:
+            return JobStatus(job, "unfinished", grant.arm, grant.award, cycles, None, reason_for_silence(grant.arm))
+        return JobStatus(job, "finishing" if grant.may_commit else "awarded", grant.arm, grant.award, cycles)
+
     # Inside
 
-    def _is_news(self, settled: JobOutcome) -> bool:
-        if settled.outcome == "returned":
-            return settled.cycles > self.register.cycles.get(settled.job, 0)
-        return settled.job not in self.register.settled
+    def _is_new(self, outcome: JobOutcome) -> bool:
+        if outcome.outcome == "returned":
+            return outcome.cycles > self.register.cycles.get(outcome.job, 0)
+        return outcome.job not in self.register.settled
 
     def _released(self, claim: Claim) -> list[GrantRecord]:
         kept = {entry.award for entry in claim.entries}
@@ -246,28 +247,27 @@ class Granter:
         ]
 
     def _objection(self, arm: str, entry: ClaimEntry, real_s: float) -> str:
+        """Return why a job cannot be granted now, or ""."""
         if entry.job in self.register.settled:
             return f"'{entry.job}' is settled"
         grant = self.register.grants.get(entry.job)
-        mine = grant is not None and (grant.arm, grant.award) == (arm, entry.award)
-        if grant is not None and not mine and self.is_granted(entry.job, real_s):
-            return f"'{grant.arm}' has '{entry.job}'"
-        if mine and grant is not None and (grant.may_commit or real_s < grant.until_s):
-            return ""
+        if grant is not None and self.is_granted(entry.job, real_s):
+            same = (grant.arm, grant.award) == (arm, entry.award)
+            return "" if same else f"'{grant.arm}' has '{entry.job}'"
         for job, other in self.register.grants.items():
             if job != entry.job and real_s < other.until_s and set(other.places) & set(entry.places):
                 return f"'{other.arm}' is at the same station with '{job}'"
         return ""
 
     def _grant(self, claim: Claim, entry: ClaimEntry, real_s: float) -> str:
-        """Grant a job, or extend its grant; returns why not, if it cannot be written to disk."""
-        before = self.register.grants.get(entry.job)
-        same = before is not None and before.award == entry.award
-        leave = entry.phase == "finishing" or (same and before is not None and before.may_commit)
-        cycles = max(entry.cycles, self.register.cycles.get(entry.job, 0))
-        news = cycles > self.register.cycles.get(entry.job, 0)
-        if before is None or not same or leave != before.may_commit or news:
-            record = JobGranted(claim.arm, claim.number, entry.award, entry.job, entry.places, cycles, leave)
+        """Grant a job, or extend its grant; return why it could not be written to disk, or ""."""
+        done = self.register.cycles.get(entry.job, 0)
+        cycles = max(entry.cycles, done)
+        grant = self.register.grants.get(entry.job)
+        permitted = grant.may_commit if grant is not None and grant.award == entry.award else None
+        may_commit = entry.phase == "finishing" or bool(permitted)
+        if permitted != may_commit or cycles > done:
+            record = JobGranted(claim.arm, claim.number, entry.award, entry.job, entry.places, cycles, may_commit)
             try:
                 self._record([record])
             except JournalFull as error:
@@ -277,8 +277,7 @@ class Granter:
 
     def _record(self, records: list[GrantRecord]) -> None:
         """Write records, then apply them."""
-        if not records:
-            return
-        self._keep(*records)
+        if records:
+            self._keep(*records)
         for record in records:
             self.register.apply(record)

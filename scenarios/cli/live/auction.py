@@ -45,9 +45,9 @@ def auction_command(
 ) -> None:
     """Auction jobs to the arms of a fleet, keep its time, and record awards in a journal."""
     from fleet.bus.client.client import BusClient
-    from fleet.live.auction.journal_records import AuctionRecord
-    from fleet.live.auction.lease_timing import Timing
+    from fleet.live.auction.ledger import AuctionRecord
     from fleet.live.auction.node import AuctionNode
+    from fleet.live.auction.round import Timing
     from fleet.live.journal import Journal
     from scenarios.cli.live.consensus import refuse_other_way
     from scenarios.cli.signals import until_stopped

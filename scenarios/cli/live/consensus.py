@@ -16,7 +16,6 @@ from scenarios.schema import Scenario
 
 if TYPE_CHECKING:
     from fleet.bus.client.client import BusClient
-    from fleet.live.arm.auctioneer_client import LiveArm
     from fleet.live.arm.node import ArmNode
     from fleet.live.consensus.node import ConsensusNode, Membership
     from scenarios.cli.signals import Stop
@@ -108,8 +107,8 @@ def seat(path: Path, membership: "Membership") -> Iterator[Any]:
 
     with Journal[GrantRecord](path, GrantRecord) as book:
 
-        def take_seat(worker: "LiveArm", life: int) -> "ConsensusNode":
-            return ConsensusNode(worker, membership, book, life=life)
+        def take_seat(worker: "ArmNode", life: int) -> "ConsensusNode":
+            return ConsensusNode(worker, membership, book, boot=life)
 
         yield take_seat
 

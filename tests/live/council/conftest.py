@@ -1,6 +1,6 @@
-"""Arms without an auctioneer on paper, and wires between them that are not to be trusted.
+"""Model of a fleet without an auctioneer, on an unreliable network.
 
-Every arm is the real one but for its body: time is a number, every clock runs at its own rate, a journal is a list.
+Every arm is real except for its body: time is a number, every clock runs at its own rate, a journal is a list.
 """
 
 import random
@@ -12,26 +12,25 @@ import pytest
 
 from agents.consensus import Consensus
 from fleet.bus.protocol.auction import JobEstimate, JobSpec
-from fleet.errors import JournalFull
+from fleet.errors import JournalFull, Refused
 from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
 from fleet.live.arm.journal_records import ArmHistory
-from fleet.live.auction.auctioneer import Objection
 from fleet.live.auction.knowledge import LiveFleet
-from fleet.live.auction.lease_timing import Timing
+from fleet.live.auction.round import Timing
 from fleet.live.consensus.granter import Granter, Register
-from fleet.live.consensus.participant import ArmInterface, Participant
+from fleet.live.consensus.participant import Membership, Participant
 
 TIMING = Timing(lease_s=3.0, margin_s=0.05, window_s=0.3, pause_s=(0.2, 1.0))
 CYCLE_S = 0.2
 
 
 class Crash(Exception):
-    """The arm's process is gone in the middle of a call."""
+    """The arm's process is killed during a call."""
 
 
 @dataclass(eq=False)
 class Disk:
-    """A journal in history, and what goes wrong with it."""
+    """A journal in memory, and its faults."""
 
     records: list = field(default_factory=list)
     full: bool = False
@@ -49,11 +48,11 @@ class Disk:
 
 
 class Arm:
-    """One arm's process, life after life."""
+    """One arm's process, which may be restarted."""
 
     def __init__(self, fleet, name: str, rate: float) -> None:
-        self.fleet, self.name, self.rate, self.lives = fleet, name, rate, 0
-        self.promises, self.grants = Disk(), Disk()
+        self.fleet, self.name, self.rate, self.boots = fleet, name, rate, 0
+        self.journal, self.grants = Disk(), Disk()
         self.hot, self.cycle_ends_s = False, None
         self.start()
 
@@ -62,62 +61,64 @@ class Arm:
         return self.fleet.true_s * self.rate
 
     def start(self) -> None:
-        self.lives += 1
+        self.boots += 1
         self.cycle_ends_s = None
-        history = ArmHistory().replay(self.promises.records).after_restart(self.name, 0.0)
-        self.promises.records[:] = history.compact()
+        history = ArmHistory().replay(self.journal.records).after_restart(self.name, 0.0)
+        self.journal.records[:] = history.compact()
         register = Register().replay(self.grants.records)
         self.grants.records[:] = register.compact()
         config = ExecutorConfig(return_after_s=8.0)
-        self.executor = AwardExecutor(self.name, self.promises.keep, history, nonce="n", config=config)
+        self.executor = AwardExecutor(self.name, self.journal.keep, history, nonce="n", config=config)
         granter = Granter(self.name, self.fleet.names, register, self.grants.keep, real_s=self.real_s, timing=TIMING)
-        interface = ArmInterface(
-            offers=lambda words: tuple(self.fleet.offer(self.name, word) for word in words),
+        arm = SimpleNamespace(
+            executor=self.executor,
+            estimate=lambda jobs: tuple(self.fleet.offer(self.name, job) for job in jobs),
             unfit=lambda: "hot" if self.hot else "",
-            take=self.executor.answer_award,
+            answer_award=self.executor.answer_award,
         )
-        self.council = Participant(
-            self.executor,
+        self.participant = Participant(
+            arm,
             granter,
-            interface,
-            fleet=LiveFleet(arms=self.fleet.names, warning_c=60.0),
-            choose=self.fleet.policy().choose,
-            life=history.boot,
-            rng=random.Random(f"{self.name} {self.lives}"),
-            timing=TIMING,
+            Membership(
+                fleet=LiveFleet(arms=self.fleet.names, warning_c=60.0),
+                choose=self.fleet.policy().choose,
+                timing=TIMING,
+            ),
+            boot=history.boot,
+            rng=random.Random(f"{self.name} {self.boots}"),
         )
-        self.council.add_jobs([*self.fleet.jobs, *register.jobs.values()])
+        self.participant.add_jobs([*self.fleet.jobs, *register.jobs.values()])
 
-    def turn(self) -> None:
-        """What an arm does again and again; it may crash in the middle."""
-        self.safely(self._turn)
+    def step(self) -> None:
+        """Do what is due; it may crash at any moment."""
+        self.run_until_crash(self._step)
 
-    def safely(self, call) -> None:
+    def run_until_crash(self, call) -> None:
         try:
             call()
         except Crash:
             self.crash()
 
     def crash(self) -> None:
-        self.promises.crash = self.grants.crash = ""
-        for held in ArmHistory().replay(self.promises.records).active.values():
-            if held.may_commit:
-                self.fleet.doubtful.add(held.award.job.name)
+        self.journal.crash = self.grants.crash = ""
+        for active in ArmHistory().replay(self.journal.records).active.values():
+            if active.may_commit:
+                self.fleet.unsure_jobs.add(active.award.job.name)
         self.start()
 
-    def _turn(self) -> None:
+    def _step(self) -> None:
         self.executor.retry_writes()
         self._work()
         self.executor.return_expired(0.0, self.real_s)
         if self.executor.lease_requests(self.real_s) or self.executor.due_reports(self.real_s):
-            self.council.claimant.claim_soon()
-        self.council.set_present(self.fleet.alive_for(self.name))
-        self.council.tick(self.real_s, self.fleet.true_s)
-        while self.council.out:
-            self.fleet.send(self.name, self.council.out.popleft())
+            self.participant.claimant.claim_soon()
+        self.participant.set_present(self.fleet.alive_for(self.name))
+        self.participant.tick(self.real_s, self.fleet.true_s)
+        while self.participant.out:
+            self.fleet.send(self.name, self.participant.out.popleft())
 
     def _work(self) -> None:
-        """Cycles, one after the other; one that was begun is ended."""
+        """Work cycle after cycle; a cycle that has begun is completed."""
         if not self.executor.active:
             self.cycle_ends_s = None
             return
@@ -138,7 +139,7 @@ class Arm:
         self.executor.record_progress(first.cycles, (repetitions - 1 - first.cycles) * CYCLE_S)
 
     def fault(self) -> None:
-        """It stops in the middle of a cycle, which then is not done."""
+        """Stop during a cycle, which then does not count."""
         if self.cycle_ends_s is not None:
             first = self.executor.active[0].award.job
             if self.executor.active[0].cycles + 1 == first.repetitions:
@@ -148,22 +149,22 @@ class Arm:
 
 
 class Fleet:
-    """Arms, and the wires between them: a list of words that have not come yet."""
+    """Arms, and the messages in transit between them."""
 
     def __init__(self, rates, jobs, policy=Consensus) -> None:
         self.names = tuple(f"arm_{i}" for i in range(len(rates)))
         self.true_s, self.jobs, self.policy = 100.0, list(jobs), policy
-        self.wires: list = []
+        self.packets: list = []
         self.old: list = []
         self.cut: set[str] = set()
         self.last_cycles: dict[str, int] = {}
-        self.doubtful: set[str] = set()
+        self.unsure_jobs: set[str] = set()
         self.arms = {name: Arm(self, name, rate) for name, rate in zip(self.names, rates, strict=True)}
 
-    def offer(self, arm: str, word: JobSpec) -> JobEstimate:
-        """An arm finds a job as hard as both their names say; some cannot do some."""
-        d = random.Random(f"{arm} {word.name}").random()
-        return JobEstimate(job=word.name, feasible=d > 0.1 or arm == self.names[0], difficulty=d, finish_in_s=10.0)
+    def offer(self, arm: str, job: JobSpec) -> JobEstimate:
+        """Return an estimate that depends on the names of arm and job only; some pairs are infeasible."""
+        d = random.Random(f"{arm} {job.name}").random()
+        return JobEstimate(job=job.name, feasible=d > 0.1 or arm == self.names[0], difficulty=d, finish_in_s=10.0)
 
     def last_cycle(self, job: str) -> None:
         self.last_cycles[job] = self.last_cycles.get(job, 0) + 1
@@ -175,46 +176,46 @@ class Fleet:
     def alive_for(self, arm: str) -> frozenset[str]:
         return frozenset(other for other in self.names if self.reach(arm, other))
 
-    def send(self, speaker: str, word) -> None:
-        asked_s = self.arms[speaker].lives
+    def send(self, sender: str, message) -> None:
+        boot = self.arms[sender].boots
         for other in self.names:
-            if other != speaker:
-                self.wires.append((speaker, other, partial(self.come, speaker, other, word, asked_s)))
-                self.old.append(self.wires[-1])
+            if other != sender:
+                self.packets.append((sender, other, partial(self.receive, sender, other, message, boot)))
+                self.old.append(self.packets[-1])
 
-    def come(self, speaker: str, other: str, word, life: int) -> None:
+    def receive(self, sender: str, other: str, message, boot: int) -> None:
         arm = self.arms[other]
-        if type(word).__name__ == "Bid":
-            arm.safely(lambda: arm.council.apply_bid(word, arm.real_s))
+        if type(message).__name__ == "Bid":
+            arm.run_until_crash(lambda: arm.participant.apply_bid(message, arm.real_s))
             return
 
         def answer() -> None:
             try:
-                grant = arm.council.answer_claim(word, arm.real_s)
-            except Objection:
+                reply = arm.participant.answer_claim(message, arm.real_s)
+            except Refused:
                 return
-            self.wires.append((other, speaker, partial(self.answered, speaker, grant, life)))
+            self.packets.append((other, sender, partial(self.receive_reply, sender, reply, boot)))
 
-        arm.safely(answer)
+        arm.run_until_crash(answer)
 
-    def answered(self, speaker: str, grant, life: int) -> None:
-        arm = self.arms[speaker]
-        if arm.lives == life:  # an answer reaches only the life that asked
-            arm.safely(lambda: arm.council.apply_reply(grant, arm.real_s))
+    def receive_reply(self, sender: str, reply, boot: int) -> None:
+        arm = self.arms[sender]
+        if arm.boots == boot:  # a reply does not reach a restarted process
+            arm.run_until_crash(lambda: arm.participant.claimant.apply_reply(reply, arm.real_s))
 
     def deliver(self, index: int, *, keep: bool = False) -> None:
-        one, other, call = self.wires[index] if keep else self.wires.pop(index)
+        one, other, call = self.packets[index] if keep else self.packets.pop(index)
         if self.reach(one, other):
             call()
 
-    def calm(self, seconds: float, step_s: float = 0.1, but: str = "") -> None:
-        """Everything comes at once and in order; one arm may stand still."""
+    def run(self, seconds: float, step_s: float = 0.1, stopped: str = "") -> None:
+        """Run without message loss; one arm may be stopped."""
         for _ in range(round(seconds / step_s)):
             for name, arm in self.arms.items():
-                if name != but:
-                    arm.turn()
+                if name != stopped:
+                    arm.step()
             for _ in range(1000):
-                if not self.wires:
+                if not self.packets:
                     break
                 self.deliver(0)
             self.true_s += step_s
@@ -222,36 +223,36 @@ class Fleet:
 
     def check(self) -> None:
         at_work = [
-            (held.award.job, arm.name, held.may_commit)
+            (active.award.job, arm.name, active.may_commit)
             for arm in self.arms.values()
-            for held in arm.executor.active
-            if arm.real_s < held.lease_end_s or held.may_commit
+            for active in arm.executor.active
+            if arm.real_s < active.lease_end_s or active.may_commit
         ]
         jobs = [job.name for job, _, _ in at_work]
         assert len(jobs) == len(set(jobs)), at_work
-        stations = [place for job, arm, leave in at_work if not leave for place in job.places]
+        stations = [place for job, arm, may_commit in at_work if not may_commit for place in job.places]
         assert len(stations) == len(set(stations)), at_work
 
-    def busy(self, rng: random.Random, *, leave: bool) -> Arm | None:
-        """An arm with a job in hand, or one that may begin its last cycle, if there is one soon."""
+    def busy_arm(self, rng: random.Random, *, may_commit: bool) -> Arm | None:
+        """Return an arm with a job, or with permission to commit; None if none appears soon."""
         for _ in range(30):
-            found = [arm for arm in self.arms.values() if arm.executor.active]
-            found = [arm for arm in found if arm.executor.active[0].may_commit or not leave]
-            if found:
-                return rng.choice(found)
-            self.calm(0.1)
+            arms = [arm for arm in self.arms.values() if arm.executor.active]
+            arms = [arm for arm in arms if arm.executor.active[0].may_commit or not may_commit]
+            if arms:
+                return rng.choice(arms)
+            self.run(0.1)
         return None
 
     def settled(self) -> dict[str, str]:
-        """What the arms know: they never differ."""
-        told: dict[str, str] = {}
+        """Return the outcomes that the arms know; they never differ."""
+        outcomes: dict[str, str] = {}
         for arm in self.arms.values():
-            for job, settled in arm.council.granter.register.settled.items():
-                assert told.setdefault(job, settled.outcome) == settled.outcome, job
-        return told
+            for job, outcome in arm.participant.granter.register.settled.items():
+                assert outcomes.setdefault(job, outcome.outcome) == outcome.outcome, job
+        return outcomes
 
 
 @pytest.fixture(scope="session")
 def council() -> SimpleNamespace:
-    """What the tests of arms among themselves build their fleets of."""
+    """Classes of the model fleet."""
     return SimpleNamespace(Fleet=Fleet)

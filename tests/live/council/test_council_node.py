@@ -1,4 +1,4 @@
-"""Arms on a real bus without an auctioneer: they share jobs out, do each once, and do nothing without a majority."""
+"""Arms on a real bus without an auctioneer: they do each job once, and nothing without a majority."""
 
 import time
 from collections import Counter
@@ -22,7 +22,7 @@ from fleet.live.arm.journal_records import ArmHistory, ArmRecord, Closed
 from fleet.live.arm.node import ArmConfig, ArmNode
 from fleet.live.arm.simulated_body import SimulatedBody
 from fleet.live.auction.knowledge import LiveFleet
-from fleet.live.auction.lease_timing import Timing
+from fleet.live.auction.round import Timing
 from fleet.live.clock import FleetClock
 from fleet.live.consensus.granter import GrantRecord
 from fleet.live.consensus.node import ConsensusNode, Membership
@@ -44,7 +44,7 @@ def hold(name: str, place: str = "bench", repetitions: int = 3, **more) -> JobSp
 
 @pytest.fixture
 def bus(tmp_path, small):
-    """A router; a maker of arms that share jobs out; and what serves them until something is true."""
+    """A router, with functions that start, serve and kill arms."""
     with ExitStack() as stack:
         router = stack.enter_context(Router())
         arms: dict[str, SimpleNamespace] = {}
@@ -75,7 +75,7 @@ def bus(tmp_path, small):
                 Estimator(own.model, lambda work: plans[work.kind, work.places[0].name], PLACES, NominalPeaks()),
                 FleetClock(SPEED, time.monotonic()),
                 ArmConfig(warning_c=60.0, rate_hz=20.0, boot=history.boot),
-                partial(ConsensusNode, membership=member, journal=grants, life=history.boot),
+                partial(ConsensusNode, membership=member, journal=grants, boot=history.boot),
             )
             arms[name] = SimpleNamespace(node=node, link=link, book=book, grants=grants, work_source=node.work_source)
             return arms[name]
@@ -90,22 +90,22 @@ def bus(tmp_path, small):
                 outsider.serve(time.monotonic() + 0.001)
             return True
 
-        def ask(key, word, kind):
+        def ask(key, request, kind):
             deadline_s = time.monotonic() + PATIENCE_S
-            while time.monotonic() < deadline_s:  # nobody may be ready to answer yet
+            while time.monotonic() < deadline_s:  # no arm may be ready to reply yet
                 got = []
-                outsider.query(key, word, kind, got.append, timeout_s=3.0)
+                outsider.query(key, request, kind, got.append, timeout_s=3.0)
                 assert serve(partial(bool, got))
                 if got[0].messages:
                     return next(iter(got[0].messages.values()))
                 if got[0].refused:
                     return next(iter(got[0].refused.values()))
-            raise AssertionError("nobody answers")
+            raise AssertionError("no arm replies")
 
         def submit(*jobs):
             return ask(keys.of_jobs("f", "submit"), Submission(jobs), SubmissionReply)
 
-        def stand():
+        def statuses():
             return {each.job: each for each in ask(keys.of_jobs("f", "status"), StatusRequest(), Status).jobs}
 
         def kill(name):
@@ -131,7 +131,7 @@ def bus(tmp_path, small):
             ask=ask,
             endpoint=router.endpoint,
             submit=submit,
-            stand=stand,
+            statuses=statuses,
             kill=kill,
             finished=finished,
             done_by_journals=done_by_journals,
@@ -139,27 +139,27 @@ def bus(tmp_path, small):
 
 
 def settled(bus, *names):
-    """Whether every arm that is there knows that these jobs are finished."""
+    """Return whether every present arm knows that these jobs are finished."""
     return all(set(names) <= one.work_source.participant.granter.register.settled.keys() for one in bus.arms.values())
 
 
-def test_jobs_that_are_handed_in_are_shared_out_and_done_once(bus):
+def test_submitted_jobs_are_allocated_to_several_arms_and_done_once(bus):
     for name in ROSTER:
         bus.arm(name)
     jobs = (hold("a"), hold("b", "rack"), hold("c", "shelf"), hold("d"), hold("e", "rack", after=("a",)))
-    assert all(said.accepted for said in bus.submit(*jobs).jobs)
+    assert all(each.accepted for each in bus.submit(*jobs).jobs)
     assert bus.serve(lambda: settled(bus, *"abcde"))
-    assert {name: said.state for name, said in bus.stand().items()} == dict.fromkeys("abcde", "finished")
+    assert {name: each.state for name, each in bus.statuses().items()} == dict.fromkeys("abcde", "finished")
     assert bus.serve(lambda: sum(bus.finished.values()) == 5)
     assert bus.finished == Counter("abcde")
-    assert len({said.arm for said in bus.stand().values()}) > 1, "one arm did it all"
-    assert bus.stand()["e"].finished_s > bus.stand()["a"].finished_s
-    assert not bus.submit(hold("a", "rack")).jobs[0].accepted, "one name is one job"
+    assert len({each.arm for each in bus.statuses().values()}) > 1, "one arm did it all"
+    assert bus.statuses()["e"].finished_s > bus.statuses()["a"].finished_s
+    assert not bus.submit(hold("a", "rack")).jobs[0].accepted, "names are unique"
     assert not bus.submit(hold("z", after=("nothing",))).jobs[0].accepted
-    assert bus.submit(hold("a")).jobs[0].accepted, "the same again is the same job"
+    assert bus.submit(hold("a")).jobs[0].accepted, "an identical job is accepted again"
 
 
-def test_a_stream_that_all_know_comes_to_its_end(bus):
+def test_all_jobs_of_a_common_stream_are_done(bus):
     stream = tuple((10.0 * i, hold(f"job {i}", place, release_s=10.0 * i)) for i, place in enumerate(PLACES))
     for name in ROSTER:
         bus.arm(name, stream=stream, horizon_s=1e5)
@@ -167,21 +167,21 @@ def test_a_stream_that_all_know_comes_to_its_end(bus):
     assert bus.serve(lambda: all(one.work_source.over for one in bus.arms.values()))
     times = [one.node.clock.now_s(time.monotonic()) for one in bus.arms.values()]
     assert max(times) - min(times) < 0.5 * SPEED
-    assert bus.done_by_journals() == Counter(word.name for _, word in stream)
+    assert bus.done_by_journals() == Counter(job.name for _, job in stream)
 
 
-def test_at_the_end_of_the_shift_a_last_cycle_is_ended_and_the_rest_is_reported_unfinished(bus):
+def test_at_the_end_of_the_shift_last_cycles_are_completed_and_other_jobs_reported_unfinished(bus):
     stream = ((0.0, hold("brief", repetitions=1)), (0.0, hold("long", "rack", repetitions=10_000)))
     for name in ROSTER:
         bus.arm(name, stream=stream, horizon_s=150.0)
     assert bus.serve(lambda: all(one.work_source.over for one in bus.arms.values()))
-    told = {said.job: said for said in bus.arms["arm_0"].work_source.statuses()}
-    assert {name: said.state for name, said in told.items()} == {"brief": "finished", "long": "unfinished"}
-    assert told["long"].reason == "The shift ended before it was done."
+    statuses = {each.job: each for each in bus.arms["arm_0"].work_source.statuses()}
+    assert {name: each.state for name, each in statuses.items()} == {"brief": "finished", "long": "unfinished"}
+    assert statuses["long"].reason == "The shift ended before it was done."
     assert not any(one.node.executor.active for one in bus.arms.values())
 
 
-def test_fewer_than_a_majority_begin_nothing(bus):
+def test_fewer_arms_than_a_majority_begin_no_job(bus):
     alone = bus.arm("arm_1", stream=((0.0, hold("a")),), horizon_s=1e5)
     assert not bus.serve(lambda: bool(alone.node.executor.active), patience_s=1.0)
     assert alone.node.clock.now_s(time.monotonic()) == 0.0
@@ -190,7 +190,7 @@ def test_fewer_than_a_majority_begin_nothing(bus):
     assert bus.serve(lambda: settled(bus, "a"))
 
 
-def test_a_job_whose_arm_dies_goes_to_another_and_an_arm_that_comes_back_goes_on(bus):
+def test_the_job_of_a_killed_arm_goes_to_another_and_a_restarted_arm_continues(bus):
     for name in ROSTER:
         bus.arm(name)
     bus.submit(hold("long", repetitions=30), hold("short", "rack"))
@@ -206,7 +206,7 @@ def test_a_job_whose_arm_dies_goes_to_another_and_an_arm_that_comes_back_goes_on
     assert bus.done_by_journals() == Counter(["long", "short"])
 
 
-def test_whoever_was_away_is_told_of_jobs_and_of_how_they_ended(bus):
+def test_a_restarted_arm_receives_missed_jobs_and_outcomes(bus):
     for name in ROSTER:
         bus.arm(name)
     bus.submit(hold("a"))
@@ -218,7 +218,7 @@ def test_whoever_was_away_is_told_of_jobs_and_of_how_they_ended(bus):
     assert bus.serve(lambda: "b" in back.granter.register.settled and "c" in back.jobs)
 
 
-def test_where_an_auctioneer_is_arms_do_not_share_jobs_out(bus, token_reaches):
+def test_arms_do_not_start_where_an_auctioneer_is_present(bus, token_reaches):
     with BusClient(bus.endpoint, "f") as link, BusClient(bus.endpoint, "f") as other:
         refuse_auctioneer(link)
         other.declare_token(keys.of_auction("f", "boss", "alive"))
@@ -227,7 +227,7 @@ def test_where_an_auctioneer_is_arms_do_not_share_jobs_out(bus, token_reaches):
             refuse_auctioneer(link)
 
 
-def test_an_auctioneer_may_not_give_such_an_arm_work(bus):
+def test_an_auctioneer_may_not_award_jobs_to_such_an_arm(bus):
     bus.arm("arm_0")
     award = Award("w", "r", "x", "q", hold("a"))
-    assert "I share out jobs with my peers" in bus.ask(keys.of_arm("f", "arm_0", "award"), award, Ack)
+    assert "I allocate jobs together with my peers" in bus.ask(keys.of_arm("f", "arm_0", "award"), award, Ack)

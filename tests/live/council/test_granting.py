@@ -1,14 +1,13 @@
-"""What an arm grants its peers, and what they make of it, one step at a time; storms are in `test_council_storm`."""
+"""Grants and claims, step by step; random faults are in `test_council_storm`."""
 
 import pytest
 
 from fleet.bus.protocol.auction import Award, JobSpec
 from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, DeniedEntry, GrantedEntry, JobOutcome
-from fleet.errors import JournalFull
+from fleet.errors import JournalFull, Refused
 from fleet.live.arm.award_executor import AwardExecutor
 from fleet.live.arm.journal_records import ArmHistory
-from fleet.live.auction.auctioneer import Objection
-from fleet.live.auction.lease_timing import Timing
+from fleet.live.auction.round import Timing
 from fleet.live.consensus.claimant import Claimant
 from fleet.live.consensus.granter import Granter, Register
 
@@ -18,14 +17,14 @@ JOB = JobSpec(name="j", kind="hold", places=("x",), repetitions=3)
 
 
 class Disk:
-    """A journal in history."""
+    """A journal in memory."""
 
     def __init__(self):
         self.records, self.full = [], False
 
     def keep(self, *records):
         if self.full:
-            raise JournalFull("no room")
+            raise JournalFull("no space")
         self.records.extend(records)
 
 
@@ -39,7 +38,7 @@ def granter(disk):
     return Granter("d", ROSTER, Register(), disk.keep, real_s=0.0, timing=TIMING)
 
 
-def reborn(disk, real_s):
+def restarted(disk, real_s):
     return Granter("d", ROSTER, Register().replay(disk.records), disk.keep, real_s=real_s, timing=TIMING)
 
 
@@ -59,7 +58,7 @@ def granted(grant: ClaimReply) -> list[str]:
     return [each.award for each in grant.granted]
 
 
-def test_a_job_is_one_arms_until_its_lease_is_over(granter):
+def test_a_job_is_granted_to_one_arm_until_its_lease_ends(granter):
     assert granted(granter.answer_claim(claim("a", 1, entry()), 0.0)) == ["a-1:j"]
     other = entry("b-1:j")
     denied = granter.answer_claim(claim("b", 1, other), TIMING.counted_lease_s - 0.01)
@@ -68,7 +67,7 @@ def test_a_job_is_one_arms_until_its_lease_is_over(granter):
     assert granted(granter.answer_claim(claim("a", 2, entry()), TIMING.counted_lease_s + 0.02)) == []
 
 
-def test_the_same_claim_again_renews_and_writes_nothing(granter, disk):
+def test_a_repeated_claim_renews_the_lease_and_writes_nothing(granter, disk):
     for number in range(5):
         assert granted(granter.answer_claim(claim("a", number, entry()), 2.0 * number)) == ["a-1:j"]
     assert len(disk.records) == 1
@@ -80,37 +79,37 @@ def test_a_station_serves_one_job_at_a_time(granter):
     assert granted(granter.answer_claim(same, 1.0)) == ["b-1:l"]
 
 
-def test_what_is_no_more_in_a_claim_is_let_go(granter):
+def test_a_job_that_a_claim_does_not_list_is_released(granter):
     granter.answer_claim(claim("a", 1, entry()), 0.0)
     granter.answer_claim(claim("a", 2), 0.1)
     assert granted(granter.answer_claim(claim("b", 1, entry("b-1:j")), 0.2)) == ["b-1:j"]
 
 
-def test_leave_outlives_the_lease_and_a_restart(granter, disk):
+def test_permission_to_commit_outlasts_the_lease_and_a_restart(granter, disk):
     answer = granter.answer_claim(claim("a", 1, entry(cycles=2, phase="finishing")), 0.0)
     assert answer.granted == (GrantedEntry("a-1:j", 2, may_commit=True),)
-    for each in (granter, reborn(disk, 0.0)):
+    for each in (granter, restarted(disk, 0.0)):
         assert granted(each.answer_claim(claim("b", each.register.numbers.get("b", 0) + 1, entry("b-1:j")), 1e6)) == []
-    assert not granter.busy_stations(1e6), "one that went silent does not bar its station"
+    assert not granter.busy_stations(1e6), "a silent arm does not block its station"
 
 
 @pytest.mark.parametrize("outcome", ["finished", "unfinished"])
-def test_what_is_settled_is_nobodys_and_whoever_asks_is_told(granter, disk, outcome):
+def test_a_settled_job_is_denied_with_its_outcome(granter, disk, outcome):
     granter.answer_claim(claim("a", 1, settled=[finished(outcome=outcome)]), 0.0)
-    for each in (granter, reborn(disk, 0.0)):
+    for each in (granter, restarted(disk, 0.0)):
         answer = each.answer_claim(claim("b", each.register.numbers.get("b", 0) + 1, entry("b-1:j")), 9.0)
         assert answer.denied[0].outcome == finished(outcome=outcome)
 
 
-def test_a_job_that_is_given_back_keeps_its_cycles(granter):
+def test_a_returned_job_keeps_its_cycles(granter):
     granter.answer_claim(claim("a", 1, entry(cycles=1)), 0.0)
     granter.answer_claim(claim("a", 2, settled=[JobOutcome("j", "a-1:j", "a", "returned", 2, 9.0)]), 0.1)
     assert granter.answer_claim(claim("b", 1, entry("b-1:j")), 0.2).granted == (GrantedEntry("b-1:j", 2),)
 
 
-def test_after_a_restart_every_grant_counts_as_leased_from_then(granter, disk):
+def test_after_a_restart_every_grant_counts_as_leased_from_the_restart(granter, disk):
     granter.answer_claim(claim("a", 1, entry()), 0.0)
-    again = reborn(disk, 100.0)
+    again = restarted(disk, 100.0)
     assert granted(again.answer_claim(claim("b", 1, entry("b-1:j")), 100.0 + TIMING.counted_lease_s - 0.01)) == []
     assert granted(again.answer_claim(claim("b", 2, entry("b-1:j")), 100.0 + TIMING.counted_lease_s + 0.01)) == [
         "b-1:j"
@@ -118,46 +117,46 @@ def test_after_a_restart_every_grant_counts_as_leased_from_then(granter, disk):
 
 
 @pytest.mark.parametrize("again", [False, True], ids=["", "after a restart"])
-def test_a_claim_of_before_changes_nothing(granter, disk, again):
+def test_an_old_claim_changes_nothing(granter, disk, again):
     granter.answer_claim(claim("a", 7, entry()), 0.0)
-    one = reborn(disk, 0.0) if again else granter
+    one = restarted(disk, 0.0) if again else granter
     for old in (6, 7):
-        with pytest.raises(Objection, match="Stale claim"):
+        with pytest.raises(Refused, match="Stale claim"):
             one.answer_claim(claim("a", old), 0.1)
     assert one.is_granted("j", 0.2)
 
 
-def test_a_stranger_is_granted_nothing(granter):
-    with pytest.raises(Objection, match=r"'z' is no arm of this fleet. Arms: a, b, c, d"):
+def test_an_arm_of_another_fleet_is_granted_nothing(granter):
+    with pytest.raises(Refused, match=r"'z' is no arm of this fleet. Arms: a, b, c, d"):
         granter.answer_claim(claim("z", 1, entry()), 0.0)
 
 
-def test_what_cannot_be_written_down_is_not_granted(granter, disk):
+def test_nothing_is_granted_without_space_on_the_disk(granter, disk):
     disk.full = True
-    assert granter.answer_claim(claim("a", 1, entry()), 0.0).denied[0].reason == "no room"
-    with pytest.raises(Objection, match="no room"):
+    assert granter.answer_claim(claim("a", 1, entry()), 0.0).denied[0].reason == "no space"
+    with pytest.raises(Refused, match="no space"):
         granter.answer_claim(claim("a", 2, settled=[finished()]), 0.0)
     assert not granter.register.settled
 
 
-def test_a_register_is_told_again_in_few_words(granter, disk):
+def test_a_compacted_register_has_fewer_records(granter, disk):
     granter.add_jobs((JOB,))
     for number in range(9):
         granter.answer_claim(claim("a", number, entry(cycles=number)), 0.1 * number)
     granter.answer_claim(claim("b", 1, settled=[finished("k")]), 1.0)
     granter.answer_claim(claim("c", 4, entry("c-1:l", "l", place="y", phase="finishing")), 1.0)
-    told = granter.register.compact()
-    assert len(told) < len(disk.records)
-    assert Register().replay(told).compact() == told
-    assert Register().replay(told).settled == granter.register.settled
-    assert Register().replay(told).numbers == granter.register.numbers
+    records = granter.register.compact()
+    assert len(records) < len(disk.records)
+    assert Register().replay(records).compact() == records
+    assert Register().replay(records).settled == granter.register.settled
+    assert Register().replay(records).numbers == granter.register.numbers
 
 
-# The one who claims
+# Claims
 
 
 class One:
-    """One arm that claims, with a executor and a granter of its own; its peers are played by the test."""
+    """One arm that claims; the test sends the replies of its peers."""
 
     def __init__(self, roster=ROSTER, disk=None, grants=None):
         self.disk, self.grants = disk or Disk(), grants or Disk()
@@ -168,121 +167,121 @@ class One:
             "a", roster, Register().replay(self.grants.records), self.grants.keep, real_s=0.0, timing=TIMING
         )
         self.claimant = Claimant(
-            self.executor, self.granter, self.executor.answer_award, life=history.boot, timing=TIMING
+            self.executor, self.granter, self.executor.answer_award, boot=history.boot, timing=TIMING
         )
 
-    def say(self, real_s) -> Claim:
-        said = self.claimant.claim(frozenset("bcd"), real_s)
-        assert said is not None
-        return said
+    def send_claim(self, real_s) -> Claim:
+        claimed = self.claimant.claim(frozenset("bcd"), real_s)
+        assert claimed is not None
+        return claimed
 
-    def hear(self, said: Claim, real_s: float, *peers: str, leave: bool = False) -> None:
+    def receive(self, claimed: Claim, real_s: float, *peers: str, may_commit: bool = False) -> None:
         for peer in peers:
-            grants = tuple(GrantedEntry(each.award, each.cycles, leave) for each in said.entries)
-            self.claimant.apply_reply(ClaimReply(peer, said.number, TIMING.lease_s, grants), real_s)
+            grants = tuple(GrantedEntry(each.award, each.cycles, may_commit) for each in claimed.entries)
+            self.claimant.apply_reply(ClaimReply(peer, claimed.number, TIMING.lease_s, grants), real_s)
 
 
-def test_only_a_majority_of_the_roster_gives_a_job():
+def test_only_a_majority_of_the_roster_grants_a_job():
     one = One()
     one.claimant.request(JOB, 0.0)
-    said = one.say(0.0)
-    one.hear(said, 0.1, "b")
+    claimed = one.send_claim(0.0)
+    one.receive(claimed, 0.1, "b")
     assert not one.executor.active, "two of four are no majority"
-    one.hear(said, 0.1, "b", "z")
-    assert not one.executor.active, "nor with one who is not of the fleet"
-    one.hear(said, 0.1, "c")
-    assert [held.award.job for held in one.executor.active] == [JOB]
+    one.receive(claimed, 0.1, "b", "z")
+    assert not one.executor.active, "nor with an arm of another fleet"
+    one.receive(claimed, 0.1, "c")
+    assert [active.award.job for active in one.executor.active] == [JOB]
 
 
-def test_a_lease_is_counted_from_when_the_last_of_a_majority_was_asked():
+def test_a_lease_counts_from_the_query_to_the_last_arm_of_a_majority():
     one = One()
     one.claimant.request(JOB, 0.0)
-    said = one.say(0.0)
-    one.hear(said, 0.9, "b", "c")
+    claimed = one.send_claim(0.0)
+    one.receive(claimed, 0.9, "b", "c")
     assert one.executor.allowed_cycles(2.96) == 2
     assert one.executor.allowed_cycles(2.98) == 0
     one.claimant.claim_soon()
-    later = one.say(2.0)
-    one.hear(later, 2.5, "b")
+    later = one.send_claim(2.0)
+    one.receive(later, 2.5, "b")
     assert one.executor.allowed_cycles(2.98) == 0, "two of four have renewed it: itself and b"
-    one.hear(later, 2.9, "d")
+    one.receive(later, 2.9, "d")
     assert one.executor.allowed_cycles(4.96) == 2
     assert one.executor.allowed_cycles(4.98) == 0
 
 
-def held_with_leave(one: One) -> None:
+def obtain_permission(one: One) -> None:
     one.claimant.request(JOB, 0.0)
-    one.hear(one.say(0.0), 0.1, "b", "c")
+    one.receive(one.send_claim(0.0), 0.1, "b", "c")
     one.executor.record_progress(2, 0.0)
     one.claimant.claim_soon()
-    said = one.say(0.2)
-    assert said.entries[0].phase == "finishing"
-    one.hear(said, 0.3, "b", leave=True)
+    claimed = one.send_claim(0.2)
+    assert claimed.entries[0].phase == "finishing"
+    one.receive(claimed, 0.3, "b", may_commit=True)
     assert not one.executor.active[0].may_commit
-    one.hear(said, 0.3, "c", leave=True)
+    one.receive(claimed, 0.3, "c", may_commit=True)
     assert one.executor.active[0].may_commit
 
 
-def test_the_first_claim_after_a_crash_says_what_nobody_knows():
-    """Without it, its peers would take the job for let go of, and do its last cycle again."""
+def test_the_first_claim_after_a_crash_reports_an_unsure_job():
+    """Else its peers would take the job as released, and do its last cycle again."""
     one = One()
-    held_with_leave(one)
+    obtain_permission(one)
     again = One(disk=one.disk, grants=one.grants)
-    said = again.say(1.0)
-    assert [(each.job, each.outcome) for each in said.outcomes] == [("j", "unfinished")]
-    assert said.number > 1_000_000_000
+    claimed = again.send_claim(1.0)
+    assert [(each.job, each.outcome) for each in claimed.outcomes] == [("j", "unfinished")]
+    assert claimed.number > 1_000_000_000
 
 
-def test_what_is_finished_and_not_on_disk_is_still_held():
+def test_a_finished_job_is_claimed_until_its_report_is_on_disk():
     one = One()
-    held_with_leave(one)
+    obtain_permission(one)
     one.disk.full = True
     one.executor.finish(9.0, 0.5)
     one.claimant.claim_soon()
-    said = one.say(0.6)
-    assert ([each.job for each in said.entries], said.outcomes) == (["j"], ())
+    claimed = one.send_claim(0.6)
+    assert ([each.job for each in claimed.entries], claimed.outcomes) == (["j"], ())
     one.disk.full = False
     one.executor.retry_writes()
-    said = one.say(0.7)
-    assert ([*said.entries], [each.outcome for each in said.outcomes]) == ([], ["finished"])
-    one.hear(said, 0.8, "b")
+    claimed = one.send_claim(0.7)
+    assert ([*claimed.entries], [each.outcome for each in claimed.outcomes]) == ([], ["finished"])
+    one.receive(claimed, 0.8, "b")
     assert one.executor.has_pending_reports
-    one.hear(said, 0.8, "c")
+    one.receive(claimed, 0.8, "c")
     assert not one.executor.has_pending_reports, "a majority has it on disk"
 
 
-def test_what_is_finished_and_not_on_disk_is_still_held_without_a_grant_of_its_own():
-    """Its own grants were not written either; else its peers would take the job for released."""
+def test_a_finished_job_is_claimed_until_its_report_is_on_disk_without_an_own_grant():
+    """Its own grant was not written either; else its peers would take the job as released."""
     one = One()
-    held_with_leave(one)
+    obtain_permission(one)
     one.claimant.granter.register.grants.clear()
     one.disk.full = True
     one.executor.finish(9.0, 0.5)
     one.claimant.claim_soon()
-    (entry,) = one.say(0.6).entries
+    (entry,) = one.send_claim(0.6).entries
     assert (entry.job, entry.places, entry.phase) == ("j", ("x",), "finishing")
 
 
-def test_a_job_that_a_majority_denies_is_let_go_of():
+def test_a_request_that_a_majority_denies_is_withdrawn():
     one = One()
     one.claimant.request(JOB, 0.0)
-    said = one.say(0.0)
+    claimed = one.send_claim(0.0)
     for peer in ("b", "c"):
-        denied = ClaimReply(peer, said.number, 3.0, (), (denial(said),))
+        denied = ClaimReply(peer, claimed.number, 3.0, (), (denial(claimed),))
         one.claimant.apply_reply(denied, 0.1)
     assert one.claimant.rejected == ["j"]
-    assert not one.say(0.2).entries
+    assert not one.send_claim(0.2).entries
     late = Award("x", "x", "a", "q", JOB)
     assert not one.executor.answer_award(late, 0.2).accepted
 
 
-def denial(said: Claim) -> DeniedEntry:
-    return DeniedEntry(said.entries[0].award, "'d' has 'j'")
+def denial(claimed: Claim) -> DeniedEntry:
+    return DeniedEntry(claimed.entries[0].award, "'d' has 'j'")
 
 
-def test_nobody_answers_and_the_wish_is_given_up():
+def test_a_request_without_replies_is_withdrawn():
     one = One()
     one.claimant.request(JOB, 0.0)
-    one.say(0.0)
-    assert one.say(0.6).entries, "said again to those who have not answered"
-    assert not one.say(2.1).entries
+    one.send_claim(0.0)
+    assert one.send_claim(0.6).entries, "repeated for peers that have not replied"
+    assert not one.send_claim(2.1).entries

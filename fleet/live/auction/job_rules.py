@@ -1,0 +1,108 @@
+"""Which jobs are accepted, which can begin, and which statuses fit in a reply: the same with and without auctioneer."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import accumulate, islice
+
+import networkx as nx
+
+from fleet.bus.protocol.auction import MOST_JOBS, Admission, JobSpec, JobStatus
+from fleet.bus.protocol.messages import encode
+
+MAX_KEPT_JOBS = 10_000
+"""Jobs that one auctioneer keeps, finished ones included."""
+MAX_BYTES = 60_000
+"""Size of the statuses in one reply: a router may drop larger messages."""
+SHIFT_ENDED = "The shift ended before it was done."
+
+
+def reason_for_silence(arm: str) -> str:
+    """Return why a job is unfinished whose arm stopped renewing its lease after permission to commit."""
+    return f"'{arm}' was about to finish it and has not renewed its lease since."
+
+
+def admit(
+    jobs: Sequence[JobSpec],
+    known: Mapping[str, JobSpec],
+    *,
+    places: frozenset[str] | None = None,
+    limit: int = MAX_KEPT_JOBS,
+    ended: bool = False,
+) -> tuple[Admission, ...]:
+    """Return which jobs of one submission can be accepted; they may name one another as predecessors in any order.
+
+    Args:
+        known: Jobs that were accepted before. An identical job is accepted again and changes nothing.
+        places: Places of the cell; None allows any name.
+        ended: Whether the shift is over.
+    """
+    rejected: dict[int, str] = {}
+    new: dict[str, JobSpec] = {}
+    for index, job in enumerate(jobs):
+        same_name = known.get(job.name) or new.get(job.name)
+        unknown = [place for place in job.places if places is not None and place not in places]
+        if ended:
+            rejected[index] = "The shift is over: no more jobs are accepted."
+        elif same_name == job:
+            continue
+        elif same_name is not None:
+            rejected[index] = f"Another job has the name '{job.name}'; names must be unique."
+        elif unknown:
+            rejected[index] = f"No place '{unknown[0]}' in this cell. Places: {', '.join(sorted(places or ()))}."
+        elif len(known) + len(new) >= limit:
+            rejected[index] = f"There are {limit} jobs already; no more are accepted."
+        else:
+            new[job.name] = job
+    never = _never_ready(new, known)
+    reasons = [rejected.get(index) or never.get(job.name, "") for index, job in enumerate(jobs)]
+    return tuple(Admission(job.name, not reason, reason) for job, reason in zip(jobs, reasons, strict=True))
+
+
+def _never_ready(new: Mapping[str, JobSpec], known: Mapping[str, JobSpec]) -> dict[str, str]:
+    """Return why jobs can never begin, by name."""
+    waits = nx.DiGraph((job.name, before) for job in new.values() for before in job.after if before not in known)
+    rings = {
+        name: group
+        for group in nx.strongly_connected_components(waits)
+        for name in group
+        if len(group) > 1 or waits.has_edge(name, name)
+    }
+    stuck = {name for name in waits if name not in new or name in rings}
+    stuck.update(*(nx.ancestors(waits, name) for name in list(stuck)))
+    reasons: dict[str, str] = {}
+    for name in new.keys() & stuck:
+        missing = [before for before in new[name].after if before not in known and before not in new]
+        if missing:
+            reasons[name] = f"It waits for '{missing[0]}', which is unknown or was not accepted."
+        elif name in rings:
+            cycle = [edge[0] for edge in nx.find_cycle(waits.subgraph(rings[name]), name)]
+            reasons[name] = f"Jobs wait for each other in a ring: {' → '.join([*cycle, cycle[0]])}."
+        else:
+            before = next(before for before in new[name].after if before in stuck)
+            reasons[name] = f"It waits for '{before}', which is not accepted either."
+    return reasons
+
+
+def job_order(job: JobSpec) -> tuple[float, str]:
+    """Return the key by which jobs are sorted: the oldest are offered first."""
+    return job.release_s, job.name
+
+
+def ready_jobs(
+    jobs: Iterable[JobSpec], time_s: float, limit: int, busy: frozenset[str], finished: Callable[[str], bool]
+) -> list[JobSpec]:
+    """Return the first jobs that can begin at a fleet time: released, predecessors finished, no station busy."""
+    ready = (
+        job
+        for job in jobs
+        if job.release_s <= time_s and not busy & frozenset(job.places) and all(map(finished, job.after))
+    )
+    return list(islice(ready, limit))
+
+
+def statuses_that_fit(statuses: Iterable[JobStatus]) -> tuple[JobStatus, ...]:
+    """Return as many statuses as one message may contain; of more, those that may still change come first."""
+    kept = list(statuses)
+    if len(kept) > MOST_JOBS:
+        kept = sorted(kept, key=lambda status: status.state in ("finished", "unfinished"))[:MOST_JOBS]
+    sizes = accumulate(len(encode(status)) + 1 for status in kept)
+    return tuple(status for status, size in zip(kept, sizes, strict=True) if size <= MAX_BYTES)

@@ -1,0 +1,159 @@
+"""An auctioneer over a real router: jobs are accepted, awarded and finished, also across its restart."""
+
+import errno
+import os
+
+import pytest
+
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import (
+    Announcement,
+    Clock,
+    ClockRequest,
+    JobStatus,
+    Result,
+    Status,
+    StatusRequest,
+    Submission,
+    SubmissionReply,
+)
+from fleet.bus.protocol.messages import encode
+from fleet.errors import JournalFull
+from fleet.live import journal
+from fleet.live.auction.job_rules import statuses_that_fit
+from fleet.live.journal import Journal
+
+
+def test_jobs_are_accepted_awarded_and_finished(bus):
+    node = bus.auctioneer(places=frozenset({"rack", "bin"}))
+    bus.arm("arm_0")
+    bus.arm("arm_1")
+    submission = Submission((*bus.jobs("a"), *bus.jobs("b", place="bin"), *bus.jobs("c", place="moon")), "test")
+    replies = bus.ask(keys.of_jobs("f", "submit"), submission, SubmissionReply)
+    (reply,) = replies.messages.values()
+    assert [admission.accepted for admission in reply.jobs] == [True, True, False]
+    bus.until(lambda: bus.states(node) == ["finished", "finished"])
+    assert sorted(job for arm in bus.arms for job in arm.done) == ["a", "b"]
+    (status,) = bus.ask(keys.of_jobs("f", "status"), StatusRequest(("b", "unknown")), Status).messages.values()
+    assert [each.state for each in status.jobs] == ["finished"]
+
+
+def test_a_late_subscriber_gets_the_last_results(bus):
+    node = bus.auctioneer()
+    bus.arm("arm_0")
+    node.submit(Submission(bus.jobs("a")))
+    bus.until(lambda: bus.states(node) == ["finished"])
+    results, rounds = [], []
+    late = bus.link()
+    late.subscribe(keys.of_every_auction("f", "result"), Result, lambda _, result: results.append(result), history=True)
+    late.subscribe(
+        keys.of_every_auction("f", "announce"),
+        Announcement,
+        lambda _, announcement: rounds.append(announcement),
+        history=True,
+    )
+    bus.until(lambda: len(results) == 4 and rounds)
+    assert [result.status.state for result in results] == ["waiting", "awarded", "finishing", "finished"]
+    assert [result.number for result in results] == [0, 1, 2, 3]
+    assert rounds[0].jobs == ("a",)
+
+
+def test_no_job_is_lost_while_the_auctioneer_is_stopped(bus):
+    first = bus.auctioneer()
+    first.submit(Submission(bus.jobs("a", "b")))
+    arm = bus.arm("arm_0")
+    bus.until(lambda: "awarded" in bus.states(first))
+    time_s = first.time_s
+    bus.kill(first)
+    second = bus.auctioneer()
+    assert second.time_s >= time_s
+    bus.until(lambda: bus.states(second) == ["finished", "finished"])
+    assert sorted(arm.done) == ["a", "b"]
+    assert len({award.award for award in arm.awards}) == 2
+
+
+def test_fleet_time_runs_at_its_speed(bus):
+    bus.auctioneer(speed=1000.0)
+    (one,) = bus.ask(keys.of_clock("f"), ClockRequest(), Clock).messages.values()
+    (two,) = bus.ask(keys.of_clock("f"), ClockRequest(), Clock).messages.values()
+    assert one.speed == 1000.0
+    assert 0.0 <= one.time_s < two.time_s
+
+
+def test_an_arm_with_a_token_but_without_a_state_is_not_present(bus):
+    node = bus.auctioneer()
+    silent = bus.link()
+    silent.declare_token(keys.of_arm("f", "silent", "alive"))
+    bus.arm("arm_0")
+    bus.until(lambda: node.present == {"arm_0"} and "silent" in node._tokens)
+
+
+def test_with_a_full_disk_jobs_are_refused_and_the_auctioneer_continues(bus):
+    full = []
+
+    def sync(file):
+        if full:
+            raise OSError(full.pop(), "No space left on device")
+        os.fsync(file)
+
+    node = bus.auctioneer(sync=sync)
+    full.append(errno.ENOSPC)
+    replies = bus.ask(keys.of_jobs("f", "submit"), Submission(bus.jobs("a")), SubmissionReply)
+    assert "no space left" in next(iter(replies.refused.values()))
+    full.append(errno.ENOSPC)
+    with pytest.raises(JournalFull):
+        node.submit(Submission(bus.jobs("a")))
+    assert bus.ask(keys.of_jobs("f", "submit"), Submission(bus.jobs("a")), SubmissionReply).messages
+    assert bus.states(node) == ["waiting"]
+
+
+def test_the_journal_is_compacted_at_the_start_and_when_it_has_grown(bus, monkeypatch):
+    first = bus.auctioneer()
+    bus.arm("arm_0")
+    bus.ask(keys.of_jobs("f", "submit"), Submission(bus.jobs("a"), "test"), SubmissionReply)
+    bus.until(lambda: bus.states(first) == ["finished"])
+    bus.kill(first)
+    again = bus.auctioneer()
+    assert [type(record).__name__ for record in again.journal.records()] == ["LedgerSnapshot", "Started"]
+    assert bus.states(again) == ["finished"]
+    monkeypatch.setattr(journal, "TICK_S", 0.01)
+    monkeypatch.setattr(journal, "COMPACT_BYTES", 1)
+    before = again.journal.path.stat().st_size
+    bus.kill(again)
+    third = bus.auctioneer()
+    sizes = []
+    bus.until(lambda: sizes.append(third.journal.path.stat().st_size) or (len(sizes) > 1 and sizes[-1] < sizes[-2]))
+    assert max(sizes) < 5 * before
+    assert bus.states(third) == ["finished"]
+
+
+def test_a_journal_that_cannot_be_compacted_is_continued(bus, monkeypatch, caplog):
+    first = bus.auctioneer()
+    bus.ask(keys.of_jobs("f", "submit"), Submission(bus.jobs("a"), "test"), SubmissionReply)
+    bus.kill(first)
+    with monkeypatch.context() as full:
+        full.setattr(Journal, "rewrite", refuse)
+        again = bus.auctioneer()
+    assert "is not compacted: no room" in caplog.text
+    assert [type(record).__name__ for record in again.journal.records()] == [
+        "LedgerSnapshot",
+        "Started",
+        "JobsAccepted",
+        "Started",
+    ]
+    assert bus.states(again) == ["waiting"]
+
+
+def refuse(*_records):
+    raise JournalFull("no room")
+
+
+def test_the_status_of_1500_jobs_fits_into_one_message_with_open_jobs_first(bus):
+    node = bus.auctioneer()
+    long = "x" * 100
+    node.submit(Submission(bus.jobs(*(f"{long}{i}" for i in range(1500)))))
+    (status,) = bus.ask(keys.of_jobs("f", "status"), StatusRequest(), Status).messages.values()
+    assert 100 < len(status.jobs) <= 256
+    assert len(encode(status)) < 65_536
+    first = JobStatus("done", "finished")
+    assert statuses_that_fit((first, *status.jobs * 2))[0].state == "waiting"
