@@ -46,7 +46,7 @@ def _arms(scenario: Scenario) -> Table:
         ("home", lambda a: a.home),
         ("tool, kg", lambda a: f"{a.tool_kg:g}"),
         ("cooling", lambda a: a.cooling if a.cooling_factor == 1 else f"{a.cooling} × {a.cooling_factor:g}"),
-        ("air, K", lambda a: f"{a.ambient_offset_k:+g}"),
+        ("ambient, K", lambda a: f"{a.ambient_offset_k:+g}"),
         ("wear", lambda a: f"{a.wear:g}"),
     ]
     shown = [(name, text) for name, text in columns if any(text(a) != text(usual) for a in scenario.arms)]

@@ -82,9 +82,9 @@ def _least(load: Array, possible: Array, busy: Array | None = None, most: float 
     arms, jobs = load.shape
     whole = np.hstack([np.tile(np.eye(jobs), arms), np.zeros((jobs, 1))])
     # Variables: the share of each job on each arm, arm by arm, and the largest load.
-    per_arm, bound = [np.hstack([block_diag(*load), np.full((arms, 1), -1.0)])], [np.zeros(arms)]
+    per_arm, bound = [np.hstack([np.asarray(block_diag(*load)), np.full((arms, 1), -1.0)])], [np.zeros(arms)]
     if busy is not None:
-        per_arm.append(np.hstack([block_diag(*busy), np.zeros((arms, 1))]))
+        per_arm.append(np.hstack([np.asarray(block_diag(*busy)), np.zeros((arms, 1))]))
         bound.append(np.full(arms, most * (1.0 + 1e-9)))
     result = linprog(
         np.append(np.zeros(arms * jobs), 1.0),

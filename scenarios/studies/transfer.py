@@ -6,9 +6,9 @@ The twin was trained without labels; the regressor gets a few jobs with their tr
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
+from sklearn.compose import TransformedTargetRegressor
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import RidgeCV
 from sklearn.metrics import r2_score, root_mean_squared_error
@@ -17,11 +17,9 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from fleet.errors import FleetError
-from scenarios.prepare.train_twins import train_or_load
-from scenarios.studies.benchmark import Make, jobs_of
+from scenarios.studies.benchmark import jobs_of
 from scenarios.studies.ranking import Jobs
-from scenarios.studies.setup import make_study
-from twin.vae.model import TwinConfig
+from scenarios.studies.setup import Bench
 from twin.vae.twin import Twin
 from twin.vae.window import JobWindows, cut_jobs
 
@@ -31,7 +29,13 @@ LABELS = (10, 50, 200)
 DRAWS = 10
 """Random choices of the labelled jobs per number and seed."""
 INPUTS = ("latent", "raw", "both")
-REGRESSORS = ("ridge", "MLP")
+REGRESSORS: dict[str, Callable[[int], RidgeCV | MLPRegressor]] = {
+    "ridge": lambda _: RidgeCV(alphas=np.logspace(-2, 4, 13)),  # leave-one-out
+    "MLP": lambda seed: MLPRegressor(
+        hidden_layer_sizes=(32,), alpha=1.0, solver="lbfgs", max_iter=300, random_state=seed
+    ),
+}
+"""By name, from a seed."""
 _CHUNK = 256
 """Jobs read at a time."""
 
@@ -76,25 +80,14 @@ def over_time(reading: JobWindows, values: Array) -> Array:
     return np.concatenate([mean, np.sqrt(variance)], axis=1)
 
 
-def fit(regressor: str, x: Array, y: Array, seed: int) -> Callable[[Array], Array]:
-    """A regressor of y [job] fitted on x [job, feature], both standardised inside.
-
-    Raises:
-        ValueError: an unknown regressor.
-    """
-    if regressor == "ridge":
-        model = RidgeCV(alphas=np.logspace(-2, 4, 13))  # leave-one-out
-    elif regressor == "MLP":
-        model = MLPRegressor(hidden_layer_sizes=(32,), alpha=1.0, solver="lbfgs", max_iter=300, random_state=seed)
-    else:
-        raise ValueError(f"No regressor '{regressor}'. Allowed: {', '.join(REGRESSORS)}.")
-    mean, scale = float(y.mean()), float(y.std()) or 1.0
-    pipeline = make_pipeline(StandardScaler(), model)
+def fit(regressor: str, x: Array, y: Array, seed: int) -> TransformedTargetRegressor:
+    """A regressor of `REGRESSORS` for y [job] fitted on x [job, feature], both standardised."""
+    pipeline = make_pipeline(StandardScaler(), REGRESSORS[regressor](seed))
+    model = TransformedTargetRegressor(pipeline, transformer=StandardScaler())
     with warnings.catch_warnings():
         # The iterations are limited on purpose, as early stopping.
         warnings.simplefilter("ignore", ConvergenceWarning)
-        pipeline.fit(x, (y - mean) / scale)
-    return lambda new: mean + scale * np.asarray(pipeline.predict(new))
+        return model.fit(x, y)
 
 
 def compare(
@@ -123,7 +116,7 @@ def compare(
     for name, x in inputs.items():
         for regressor in REGRESSORS:
             for n, picks in chosen.items():
-                predictions = [fit(regressor, x[some], rise_k[some], seed)(x[held_out]) for some, seed in picks]
+                predictions = [fit(regressor, x[some], rise_k[some], seed).predict(x[held_out]) for some, seed in picks]
                 rows.append(
                     TransferRow(
                         inputs=name,
@@ -136,35 +129,19 @@ def compare(
     return rows
 
 
-def transfer(
-    seeds: Sequence[np.random.SeedSequence],
-    *,
-    config: TwinConfig,
-    folder: Path,
-    make: Make = make_study,
-    labels: Sequence[int] = LABELS,
-    draws: int = DRAWS,
-) -> list[TransferRow]:
-    """Latent against raw features for the rise of the hottest winding, with a study and a twin per seed.
+def transfer(bench: Bench, *, labels: Sequence[int] = LABELS, draws: int = DRAWS) -> list[TransferRow]:
+    """Latent against raw features for the rise of the hottest winding.
 
     Raises:
         ValueError: no seeds.
         FleetError: fewer than twice as many test jobs as labels.
     """
-    if not seeds:
-        raise ValueError("Transfer needs at least one seed.")
     per_seed = []
-    for seed in seeds:
-        study = make(seed)
-        twin = train_or_load(study.train.records(), config, seed, arm=study.robot.name, folder=folder)
+    for seed, study, twin in bench.studies():
         rise_k = study.test.peak_c.max(axis=1) - study.ambient_c
         inputs = job_inputs(twin, jobs_of(study.test, study.horizon_s))
         per_seed.append(compare(inputs, rise_k, np.random.default_rng(seed), labels=labels, draws=draws))
     return [
-        replace(
-            rows[0],
-            rmse_k=tuple(value for row in rows for value in row.rmse_k),
-            r2=tuple(value for row in rows for value in row.r2),
-        )
+        replace(rows[0], rmse_k=sum((row.rmse_k for row in rows), ()), r2=sum((row.r2 for row in rows), ()))
         for rows in zip(*per_seed, strict=True)
     ]

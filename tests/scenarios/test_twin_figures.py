@@ -19,7 +19,7 @@ from scenarios.studies.report.figures import (
     latent_map_figure,
     latent_scatter_figure,
     lines_figure,
-    png,
+    picture,
     ranked,
     ranking_figure,
     reliability_figure,
@@ -197,7 +197,7 @@ def test_lines_carry_their_data_and_units():
 
 def test_the_same_figure_is_the_same_png_and_nothing_is_cut_off():
     figures = [epochs_figure(np.array([20, 60]), *rng().uniform(0, 1, (2, 3, 2, 3))) for _ in range(2)]
-    first, second = map(png, figures)
+    first, second = (picture("epochs", figure, "Epochs.").png for figure in figures)
     assert first == second
     pixels = image.imread(io.BytesIO(first))[..., :3]
     border = np.concatenate([pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]])

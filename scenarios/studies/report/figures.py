@@ -15,19 +15,21 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
+from scenarios.report.page import Picture
+
 Array = np.ndarray
-Pair = tuple[Array, Array]
-"""The same of a normal and of a critical record."""
+Pair = Sequence[Array]
+"""The same of a normal and of a critical record, or (mu, sigma) of a posterior."""
 
 NORMAL, CRITICAL, BETWEEN = "#0072B2", "#D55E00", "#8A8A8A"
-"""Stays cool, passes the warning limit, neither. Blue and vermilion of Okabe & Ito are told apart by every eye."""
+"""Stays cool, passes the warning limit, neither. Blue and vermilion of Okabe & Ito suit colour-blind readers."""
 INK, FAINT, ACCENT = "#222222", "#dddddd", "#009E73"
 LINES = (NORMAL, ACCENT, "#E69F00", "#CC79A7", INK, BETWEEN)
 MARKS = ("o", "s", "^", "D", "v", "x")
 CHANNEL_NAMES = ("position", "velocity", "torque")
 CHANNEL_LABELS = ("q (rad)", "dq/dt (rad/s)", "τ (N·m)")
 LEAST_SPAN = (0.1, 0.1, 2.0)
-"""Smallest range of an axis of q, qd, tau: less is noise of a joint that holds still."""
+"""Smallest range of an axis of q, qd, tau: less is noise of a joint at rest."""
 DPI = 110
 BASE_PT = 10.5
 MOST_POINTS = 500
@@ -74,11 +76,11 @@ def sheet(
     return figure, [list(row) for row in grid]
 
 
-def png(figure: Figure) -> bytes:
-    """The figure as PNG; the same figure gives the same bytes."""
+def picture(name: str, figure: Figure, alt: str) -> Picture:
+    """The figure as PNG of a section; the same figure gives the same bytes."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
-    return buffer.getvalue()
+    return Picture(name=name, png=buffer.getvalue(), alt=alt)
 
 
 def signals_figure(
@@ -166,7 +168,7 @@ def latent_scatter_figure(mu: Array, temp_c: Array, *, limit_c: float, joint: in
 
     Args:
         mu: [window, latent]; the first two units are shown.
-        temp_c: Temperature that belongs to each window, [window].
+        temp_c: Temperature of each window, [window].
         limit_c: High from here on.
     """
     figure, ((left, right),) = sheet(1, 2, width=10.4, height=4.8, title=title, sharex=True, sharey=True)
@@ -339,7 +341,7 @@ def bars_figure(
 
 
 def reliability_figure(tables: Mapping[str, tuple[Array, Array, Array]], *, title: str) -> Figure:
-    """Predicted against observed: how often jobs saturate by their predicted probability, and how many jobs those are.
+    """Predicted against observed: share of jobs with saturation by predicted probability, and their number.
 
     Args:
         tables: By method: mean predicted probability, observed share, count; each [bin], empty bins left out.
