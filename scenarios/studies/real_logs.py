@@ -35,13 +35,11 @@ CONFIG = TwinConfig(rate_hz=2.0, record_hz=2.0, window=50, stride=10, epochs=40,
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LogStudy:
-    """One twin and every window of the held-out files."""
+    """One twin and every window of the held-out files, which are all but the training files."""
 
     twin: Twin
     train_files: tuple[str, ...]
     """Recordings that the twin was trained on; none of them reaches `HOT_C` on joint 2."""
-    test_files: tuple[str, ...]
-    """All others."""
     file: Array
     """Name of the recording of each window, str [window]."""
     start_s: Array
@@ -129,7 +127,6 @@ def log_study(
     return LogStudy(
         twin=twin,
         train_files=tuple(r.name for r in training),
-        test_files=tuple(r.name for r in test),
         errors=twin.window_errors(joined["windows"]),
         **joined,
     )

@@ -5,7 +5,7 @@ The twin was trained without labels; the regressor gets a few jobs with their tr
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from sklearn.compose import TransformedTargetRegressor
@@ -40,15 +40,9 @@ _CHUNK = 256
 """Jobs read at a time."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class TransferRow:
-    """Errors on held-out jobs, one entry per seed and draw of labels."""
-
-    inputs: str
-    regressor: str
-    labels: int
-    rmse_k: tuple[float, ...]
-    r2: tuple[float, ...]
+Errors = dict[tuple[str, str, int], dict[str, list[float]]]
+"""[inputs, regressor, number of labels][measure] → one value per seed and draw of labels, on held-out jobs."""
+MEASURES = {"rmse_k": root_mean_squared_error, "r2": r2_score}
 
 
 def job_inputs(twin: Twin, jobs: Jobs) -> dict[str, Array]:
@@ -97,7 +91,7 @@ def compare(
     *,
     labels: Sequence[int] = LABELS,
     draws: int = DRAWS,
-) -> list[TransferRow]:
+) -> Errors:
     """Errors of every input and regressor by number of labels; all get the same draws, and half of the jobs test.
 
     Args:
@@ -112,24 +106,16 @@ def compare(
     order = rng.permutation(len(rise_k))
     pool, held_out = order[: len(order) // 2], order[len(order) // 2 :]
     chosen = {n: [(rng.permutation(pool)[:n], int(rng.integers(2**31))) for _ in range(draws)] for n in labels}
-    rows = []
-    for name, x in inputs.items():
-        for regressor in REGRESSORS:
-            for n, picks in chosen.items():
-                predictions = [fit(regressor, x[some], rise_k[some], seed).predict(x[held_out]) for some, seed in picks]
-                rows.append(
-                    TransferRow(
-                        inputs=name,
-                        regressor=regressor,
-                        labels=n,
-                        rmse_k=tuple(float(root_mean_squared_error(rise_k[held_out], y)) for y in predictions),
-                        r2=tuple(float(r2_score(rise_k[held_out], y)) for y in predictions),
-                    )
-                )
-    return rows
+    errors: Errors = {}
+    for (name, x), regressor, (n, picks) in product(inputs.items(), REGRESSORS, chosen.items()):
+        predictions = [fit(regressor, x[some], rise_k[some], seed).predict(x[held_out]) for some, seed in picks]
+        errors[name, regressor, n] = {
+            measure: [float(of(rise_k[held_out], y)) for y in predictions] for measure, of in MEASURES.items()
+        }
+    return errors
 
 
-def transfer(bench: Bench, *, labels: Sequence[int] = LABELS, draws: int = DRAWS) -> list[TransferRow]:
+def transfer(bench: Bench, *, labels: Sequence[int] = LABELS, draws: int = DRAWS) -> Errors:
     """Latent against raw features for the rise of the hottest winding.
 
     Raises:
@@ -141,7 +127,7 @@ def transfer(bench: Bench, *, labels: Sequence[int] = LABELS, draws: int = DRAWS
         rise_k = study.test.peak_c.max(axis=1) - study.ambient_c
         inputs = job_inputs(twin, jobs_of(study.test, study.horizon_s))
         per_seed.append(compare(inputs, rise_k, np.random.default_rng(seed), labels=labels, draws=draws))
-    return [
-        replace(rows[0], rmse_k=sum((row.rmse_k for row in rows), ()), r2=sum((row.r2 for row in rows), ()))
-        for rows in zip(*per_seed, strict=True)
-    ]
+    return {
+        row: {measure: [value for errors in per_seed for value in errors[row][measure]] for measure in MEASURES}
+        for row in per_seed[0]
+    }

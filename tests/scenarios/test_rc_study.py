@@ -116,7 +116,6 @@ def windows_of(recordings: list[Recording]) -> LogStudy:
     return LogStudy(
         twin=cast(Any, _Clock()),
         train_files=(recordings[0].name,),
-        test_files=tuple(r.name for r in recordings),
         file=np.array(files),
         start_s=np.tile(end_s - 24.5, len(recordings)),
         end_s=np.tile(end_s, len(recordings)),

@@ -62,13 +62,12 @@ def test_the_small_network_learns_what_ridge_cannot(rng):
 def test_more_labels_help_and_an_input_that_knows_beats_noise(rng):
     x = rng.normal(size=(120, 6))
     rise_k = 20.0 + 5.0 * x[:, 0] + rng.normal(0, 0.5, 120)
-    rows = compare({"knows": x, "noise": rng.normal(size=(120, 6))}, rise_k, rng, labels=(6, 40), draws=2)
-    by = {(row.inputs, row.regressor, row.labels): row for row in rows}
+    by = compare({"knows": x, "noise": rng.normal(size=(120, 6))}, rise_k, rng, labels=(6, 40), draws=2)
     assert len(by) == 2 * len(REGRESSORS) * 2
-    assert np.mean(by["knows", "ridge", 40].rmse_k) < np.mean(by["knows", "ridge", 6].rmse_k)
-    assert np.mean(by["knows", "ridge", 40].r2) > 0.97
-    assert np.mean(by["noise", "ridge", 40].r2) < 0.1
-    assert all(len(row.r2) == len(row.rmse_k) == 2 for row in rows)
+    assert np.mean(by["knows", "ridge", 40]["rmse_k"]) < np.mean(by["knows", "ridge", 6]["rmse_k"])
+    assert np.mean(by["knows", "ridge", 40]["r2"]) > 0.97
+    assert np.mean(by["noise", "ridge", 40]["r2"]) < 0.1
+    assert all(len(row["r2"]) == len(row["rmse_k"]) == 2 for row in by.values())
     with pytest.raises(FleetError, match="61 labels need 122 jobs"):
         compare({"knows": x}, rise_k, rng, labels=(61,))
 
@@ -92,9 +91,9 @@ def test_transfer_runs_from_study_to_table_and_repeats(tiny, folder):
     seeds = [np.random.SeedSequence(1), np.random.SeedSequence(2)]
     first = transfer(Bench(seeds, TINY, folder, tiny), labels=(8,), draws=1)
     again = transfer(Bench(seeds[:1], TINY, folder, tiny), labels=(8,), draws=1)
-    assert [row.rmse_k[:1] for row in first] == [row.rmse_k for row in again]
-    assert [(row.inputs, row.regressor) for row in first] == [(i, r) for i in INPUTS for r in REGRESSORS]
-    assert all(len(row.r2) == 2 for row in first)
+    assert [row["rmse_k"][:1] for row in first.values()] == [row["rmse_k"] for row in again.values()]
+    assert list(first) == [(i, r, 8) for i in INPUTS for r in REGRESSORS]
+    assert all(len(row["r2"]) == 2 for row in first.values())
     with pytest.raises(ValueError, match="at least one seed"):
         transfer(Bench([], TINY, folder, tiny))
 

@@ -15,7 +15,6 @@ from scenarios.studies.report.context import QUICK
 from scenarios.studies.report.section_cache import plain
 from scenarios.studies.saturation import Alarm, Prediction
 from scenarios.studies.self_training import GENERATED, OWN, PRIOR
-from scenarios.studies.transfer import TransferRow
 from twin.saturation.reliability import reliability
 
 
@@ -117,11 +116,11 @@ def test_autonomy_counts_what_remains_above_chance(lab, monkeypatch):
     ("latent", "said"), [((5.0, 4.0), "Raw features beat latent ones"), ((2.0, 4.0), "with 10 labels (ridge)")]
 )
 def test_transfer_says_with_how_many_labels_the_latent_helps(lab, monkeypatch, latent, said):
-    rows = [
-        TransferRow(inputs=name, regressor="ridge", labels=n, rmse_k=(e, e + 0.2), r2=(0.5, 0.6))
+    rows = {
+        (name, "ridge", n): {"rmse_k": [e, e + 0.2], "r2": [0.5, 0.6]}
         for name, errors in (("latent", latent), ("raw", (3.0, 2.0)))
         for n, e in zip((10, 50), errors, strict=True)
-    ]
+    }
     monkeypatch.setattr(worth, "transfer", lambda bench, **sizes: rows)
     section = worth.transfer_chapter(lab)
     assert said in section.sentences[0]

@@ -121,13 +121,14 @@ def transfer_chapter(lab: Lab) -> Section:
     """Latent features as input of a small regressor."""
     lab.progress("transfer", 0.0)
     size = lab.size
-    rows = transfer(lab.bench, labels=size.labels)
-    first, labels = rows[0].regressor, sorted({row.labels for row in rows})
-    rmse_k = {(row.inputs, row.labels): np.array(row.rmse_k) for row in rows if row.regressor == first}
+    errors = transfer(lab.bench, labels=size.labels)
+    (_, first, _), labels = next(iter(errors)), sorted({n for _, _, n in errors})
     curves = {
-        name: np.stack([rmse_k[name, n] for n in labels], axis=1) for name in dict.fromkeys(name for name, _ in rmse_k)
+        name: np.stack([errors[name, first, n]["rmse_k"] for n in labels], axis=1)
+        for name in dict.fromkeys(name for name, *_ in errors)
     }
-    better = [n for n in labels if rmse_k["latent", n].mean() < rmse_k["raw", n].mean()]
+    latent, raw = (curves[name].mean(axis=0) for name in ("latent", "raw"))
+    better = [n for n, is_better in zip(labels, latent < raw, strict=True) if is_better]
     finding = (
         f"Latent features beat raw ones with {', '.join(map(str, better))} labels ({first})."
         if better
@@ -153,9 +154,10 @@ def transfer_chapter(lab: Lab) -> Section:
             Table(
                 head=("input, regressor, labels", "RMSE, K", "R²"),
                 rows=tuple(
-                    (f"{r.inputs}, {r.regressor}, {r.labels} labels", spread(r.rmse_k, 2), spread(r.r2)) for r in rows
+                    (f"{name}, {regressor}, {n} labels", spread(row["rmse_k"], 2), spread(row["r2"]))
+                    for (name, regressor, n), row in errors.items()
                 ),
             ),
         ),
-        numbers={f"{r.inputs}/{r.regressor}/{r.labels}": {"rmse_k": r.rmse_k, "r2": r.r2} for r in rows},
+        numbers={f"{name}/{regressor}/{n}": row for (name, regressor, n), row in errors.items()},
     )
