@@ -179,6 +179,14 @@ def test_pairs_stand_at_the_mean_of_their_seeds():
     assert [t.get_text() for t in figure.axes[0].texts] == ["0.3", "1"]
 
 
+def test_a_long_title_fits_into_the_figure():
+    zero = {"sum": {"work only": np.zeros(2), "with exploration": np.zeros(2)}}
+    figure = bars_figure(zero, title="Exploration lowers false alarms " * 4, y_label="false alarms")
+    figure.canvas.draw()
+    assert figure.texts[0].get_window_extent().x1 < figure.bbox.width
+    assert figure.axes[0].get_ylim()[0] == 0.0
+
+
 def test_lines_carry_their_data_and_units():
     raw = Line(np.array([10, 50]), np.array([[1.0, 2.0], [3.0, 4.0]]), NORMAL)
     level = (60.0, "warning limit, 60 °C")

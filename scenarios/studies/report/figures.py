@@ -4,6 +4,7 @@ Every function takes plain arrays and returns a matplotlib Figure; none uses pyp
 """
 
 import io
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -32,6 +33,8 @@ LEAST_SPAN = (0.1, 0.1, 2.0)
 """Smallest range of an axis of q, qd, tau: less is noise of a joint at rest."""
 DPI = 110
 BASE_PT = 10.5
+TITLE_PER_INCH = 8.4
+"""Characters of a title in one line."""
 MOST_POINTS = 500
 """Per kind in a scatter plot; more would cover one another."""
 ELLIPSES = 60
@@ -72,6 +75,7 @@ def sheet(
         axes.grid(True, color=FAINT, linewidth=0.6)
         axes.set_axisbelow(True)
     if title:
+        title = textwrap.fill(title, int(TITLE_PER_INCH * width))
         figure.suptitle(title, fontsize=BASE_PT + 2, fontweight="bold", color=INK, x=0.01, ha="left")
     return figure, [list(row) for row in grid]
 
@@ -335,6 +339,8 @@ def bars_figure(
     axes.set_xticks(np.arange(len(groups)), list(groups))
     axes.grid(False, axis="x")
     axes.margins(y=0.15)
+    if all(np.min(values) >= 0 for group in groups.values() for values in group.values()):
+        axes.set_ylim(bottom=0)
     _label(axes, y=y_label)
     _legend(figure, axes)
     return figure
