@@ -24,9 +24,7 @@ Cell = str | float | None
 Row = dict[str, Cell]
 LOADED = 2
 """Joint 2 carries most of a standing arm's load and ranks jobs best, so a table shows its d."""
-TRACE = ("twin", "data")
-"""The twin's version and the hash of its training data, for every score."""
-OMITTED = (*TRACE, "log", "elbow", "end_s", *(f"d_{joint}" for joint in range(1, 8) if joint != LOADED))
+OMITTED = ("twin", "data", "log", "elbow", "end_s", *(f"d_{joint}" for joint in range(1, 8) if joint != LOADED))
 """Columns omitted from tables, which are 80 characters wide; CSV and JSON hold them all."""
 
 

@@ -18,7 +18,7 @@ SCORES = ("sum", "joint_2", "load", "excess")
 """Scores that are compared, by the names of `twin.vae.measures.score_of`."""
 
 
-def coverage(bench: Bench, *, exploration: int = 80, train: int = 200) -> dict[int, dict[str, dict[str, Array]]]:
+def coverage(bench: Bench, *, exploration: int, train: int) -> dict[int, dict[str, dict[str, Array]]]:
     """Quality of a twin trained on `train` cool jobs of work, and of one trained on a mix with light motions.
 
     Thresholds come from held-out cool jobs of work, of which 5 % may raise an alarm.

@@ -12,6 +12,7 @@ from fleet.errors import FleetError
 from fleet.files import cache_folder
 from fleet.motion import CHANNELS
 from scenarios.prepare.train_twins import train_or_load
+from scenarios.studies.ranking import CARRIER
 from twin.logs.recording import Recording
 from twin.logs.resampling import Stretch, stretches
 from twin.training_data import cool_stretches
@@ -21,8 +22,6 @@ from twin.vae.window import cut, starts
 
 Array = np.ndarray
 
-JOINT = 1
-"""Joint 2 (index 0..6) carries the whole arm of a standing Gen3 and gets hot."""
 HOT_C = 40.0
 """Mean temperature of joint 2 from which a window is hot; a file that never reaches it is cool."""
 AHEAD_S = 300.0
@@ -60,7 +59,7 @@ class LogStudy:
     @property
     def hot(self) -> Array:
         """Windows in which joint 2 is at `HOT_C` or more on average, bool [window]."""
-        return self.temp_c[:, JOINT] >= HOT_C
+        return self.temp_c[:, CARRIER] >= HOT_C
 
     @property
     def difficulty(self) -> Array:
@@ -103,16 +102,16 @@ def log_study(
         FleetError: too few files are cool, or none is left to test on.
         ValueError: a recording without temperatures.
     """
-    cool = [r.name for r in recordings if _temperatures(r)[:, JOINT].max(initial=-np.inf) < HOT_C]
+    cool = [r.name for r in recordings if _temperatures(r)[:, CARRIER].max(initial=-np.inf) < HOT_C]
     count = round(TRAIN_SHARE * len(cool))
     if not 0 < count < len(recordings):
         raise FleetError(
-            f"{len(cool)} of {len(recordings)} logs stay below {HOT_C:g} °C on joint {JOINT + 1}: to train on "
+            f"{len(cool)} of {len(recordings)} logs stay below {HOT_C:g} °C on joint {CARRIER + 1}: to train on "
             f"{TRAIN_SHARE:.0%} of them and test on the rest needs at least two; add logs of light work."
         )
     names = {cool[i] for i in np.random.default_rng(seed).permutation(len(cool))[:count]}
     training, test = ([r for r in recordings if (r.name in names) == wanted] for wanted in (True, False))
-    normal = cool_stretches(training, config.rate_hz, cool_c=HOT_C, horizon_s=np.inf, joints=(JOINT,))
+    normal = cool_stretches(training, config.rate_hz, cool_c=HOT_C, horizon_s=np.inf, joints=(CARRIER,))
     records = [stretch.profile for stretch in normal]
     own = np.random.SeedSequence(seed)
     twin = train_or_load(records, config, own, arm="logged", folder=folder or cache_folder())
@@ -143,9 +142,9 @@ def hot_and_cool(study: LogStudy) -> HotAndCool:
         raise FleetError(
             f"{hot.sum()} of {len(hot)} test windows are hot (joint 2 at {HOT_C:g} °C): nothing to compare."
         )
-    errors, d = study.errors[:, JOINT], study.difficulty[:, JOINT]
+    errors, d = study.errors[:, CARRIER], study.difficulty[:, CARRIER]
     scores = {"d": errors.sum(axis=1), **dict(zip(CHANNELS, errors.T, strict=True))}
-    scores["rms_torque"] = study.rms_torque[:, JOINT]
+    scores["rms_torque"] = study.rms_torque[:, CARRIER]
     cool_error, hot_error = errors[~hot].mean(axis=0), errors[hot].mean(axis=0)
     return HotAndCool(
         cool_windows=int((~hot).sum()),

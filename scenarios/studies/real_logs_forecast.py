@@ -13,7 +13,8 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from fleet.errors import FleetError
-from scenarios.studies.real_logs import AHEAD_S, HOT_C, JOINT, LogStudy, ranking
+from scenarios.studies.ranking import CARRIER
+from scenarios.studies.real_logs import AHEAD_S, HOT_C, LogStudy, ranking
 from twin.logs.heat_log import heat_logs
 from twin.logs.recording import Recording
 from twin.thermal.forecast import continued_peaks, planned_peaks
@@ -69,12 +70,12 @@ def log_rc(study: LogStudy, recordings: Sequence[Recording], *, identified: Iden
     """
     by_name = {r.name: r for r in recordings}
     arm = identified or identify([by_name[name] for name in study.train_files], arm="logged")
-    scores = {"d": study.difficulty[:, JOINT], "temperature": study.end_c[:, JOINT]}
+    scores = {"d": study.difficulty[:, CARRIER], "temperature": study.end_c[:, CARRIER]}
     for label, twin in (("rc", RcTwin.of(arm)), ("nominal rc", RcTwin.nominal())):
         continued, planned = forecasts(study, by_name, twin)
         scores |= {f"{label}, load continued": continued, f"{label}, load planned": planned}
-    complete = np.isfinite(study.peak_next_c[:, JOINT]) & np.all([np.isfinite(s) for s in scores.values()], axis=0)
-    below = complete & (study.end_c[:, JOINT] < HOT_C)
+    complete = np.isfinite(study.peak_next_c[:, CARRIER]) & np.all([np.isfinite(s) for s in scores.values()], axis=0)
+    below = complete & (study.end_c[:, CARRIER] < HOT_C)
     return LogRc(identified=arm, below=_passing(study, scores, below), every=_passing(study, scores, complete))
 
 
@@ -94,15 +95,15 @@ def forecasts(study: LogStudy, recordings: dict[str, Recording], twin: RcTwin) -
                 (continued, continued_peaks(twin, past, states, AHEAD_S, past_s=past_s)),
                 (planned, planned_peaks(twin, coming, states, AHEAD_S)),
             ):
-                out[mine[here]] = peaks[edge[here], JOINT]
+                out[mine[here]] = peaks[edge[here], CARRIER]
     return continued, planned
 
 
 def _passing(study: LogStudy, scores: dict[str, Array], chosen: Array) -> Passing:
-    passes, files = study.peak_next_c[chosen, JOINT] >= HOT_C, study.file[chosen]
+    passes, files = study.peak_next_c[chosen, CARRIER] >= HOT_C, study.file[chosen]
     if passes.all() or not passes.any():
         raise FleetError(
-            f"Joint {JOINT + 1} passes {HOT_C:g} °C after {passes.sum()} of {len(passes)} test windows: nothing to "
+            f"Joint {CARRIER + 1} passes {HOT_C:g} °C after {passes.sum()} of {len(passes)} test windows: nothing to "
             "tell apart. Add logs of heavier or of lighter work."
         )
     picked = {name: values[chosen] for name, values in scores.items()}

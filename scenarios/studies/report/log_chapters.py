@@ -1,19 +1,18 @@
 """Chapters of a report on a real arm's logs: the paper's claim on files outside the twin's training data."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from sklearn.metrics import roc_curve
 
-from fleet.files import cache_folder
 from fleet.motion import CHANNELS
-from scenarios.progress import Progress, quiet
+from scenarios.progress import Progress
 from scenarios.report.page import Section, Table
-from scenarios.studies.epochs import EPOCHS, epoch_study
-from scenarios.studies.ranking import spread
-from scenarios.studies.real_logs import AHEAD_S, HOT_C, JOINT, HotAndCool, LogStudy, hot_and_cool, log_study
+from scenarios.studies.epochs import epoch_study
+from scenarios.studies.ranking import CARRIER, spread
+from scenarios.studies.real_logs import AHEAD_S, HOT_C, HotAndCool, LogStudy, hot_and_cool, log_study
 from scenarios.studies.real_logs_forecast import log_rc
 from scenarios.studies.report.context import median_of
 from scenarios.studies.report.figures import (
@@ -49,9 +48,9 @@ class Logbook:
     recordings: tuple[Recording, ...]
     seeds: tuple[int, ...]
     config: TwinConfig
-    progress: Progress = quiet
-    epochs: tuple[int, ...] = EPOCHS
-    folder: Path = field(default_factory=cache_folder)
+    progress: Progress
+    epochs: tuple[int, ...]
+    folder: Path
     """Cache of trained twins."""
 
     @cached_property
@@ -84,14 +83,14 @@ class Logbook:
 def log_data_chapter(book: Logbook) -> Section:
     """A cool and a hot window as recorded."""
     study, pair = book.first, book.examples
-    cool, hot = (f"{study.file[i]}, {study.start_s[i] / 60:.1f} min, {study.temp_c[i, JOINT]:.1f} °C" for i in pair)
+    cool, hot = (f"{study.file[i]}, {study.start_s[i] / 60:.1f} min, {study.temp_c[i, CARRIER]:.1f} °C" for i in pair)
     finding = f"Cool: {cool}. Hot: {hot}."
     records = tuple(study.windows[pair].transpose(0, 1, 3, 2))
     title = "Recorded: a cool and a hot window of joint 2"
     return Section(
         sentences=(finding,),
         how=f"Windows of held-out files, each with the median d of joint 2 of its kind; hot is {HOT_C:g} °C or more.",
-        pictures=(data_picture(records, book.config.rate_hz, JOINT, title, finding),),
+        pictures=(data_picture(records, book.config.rate_hz, CARRIER, title, finding),),
         numbers={
             "cool": cool,
             "hot": hot,
@@ -107,12 +106,12 @@ def log_latent_chapter(book: Logbook) -> Section:
     study, rng = book.first, np.random.default_rng(0)
     chosen = [rng.permutation(np.flatnonzero(study.hot == hot))[:MOST_WINDOWS] for hot in (False, True)]
     index = np.concatenate(chosen)
-    mu, sigma = (part[:, JOINT] for part in study.twin.posterior(study.windows[index]))
+    mu, sigma = (part[:, CARRIER] for part in study.twin.posterior(study.windows[index]))
     cool, hot = (mu[study.hot[index] == kind].mean(axis=0) for kind in (False, True))
     apart = float(np.linalg.norm(cool - hot))
     finding = f"The centres of cool and hot windows lie {apart:.2f} apart; the prior has standard deviation 1."
     return replace(
-        latent_section(mu, sigma, study.temp_c[index, JOINT], HOT_C, finding),
+        latent_section(mu, sigma, study.temp_c[index, CARRIER], HOT_C, finding),
         how=f"Posteriors of held-out windows under the network of joint 2, at most {MOST_WINDOWS} of each kind.",
         numbers={"distance_of_centres": apart},
     )
@@ -140,8 +139,8 @@ def log_difficulty_chapter(book: Logbook) -> Section:
     groups = {f"cool, below {HOT_C:g} °C": study.difficulty[~study.hot], "hot": study.difficulty[study.hot]}
     curves = {}
     for key, values, colour in (
-        ("d", study.errors[:, JOINT].sum(axis=-1), NORMAL),
-        ("rms_torque", study.rms_torque[:, JOINT], ACCENT),
+        ("d", study.errors[:, CARRIER].sum(axis=-1), NORMAL),
+        ("rms_torque", study.rms_torque[:, CARRIER], ACCENT),
     ):
         false_alarms, hits, _ = roc_curve(study.hot, values)
         curves[f"{_score_name(key)}: AUROC {auroc[key][0]:.3f}"] = Line(false_alarms, hits, colour)
