@@ -159,7 +159,7 @@ def _plain(value: Any) -> str:
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {_plain(inner)}" for key, inner in value.items())
     if isinstance(value, list | tuple) and any(isinstance(inner, Mapping | list | tuple) for inner in value):
-        return f"{len(value)} entries"
+        return f"list of {len(value)}"
     return ", ".join(map(_plain, value)) if isinstance(value, list | tuple) else str(value)
 
 
