@@ -1,6 +1,7 @@
 """Describe a scenario in sentences and tables."""
 
 from collections.abc import Callable
+from dataclasses import astuple
 from itertools import groupby
 
 import numpy as np
@@ -9,7 +10,7 @@ from rich.text import Text
 
 from scenarios.prepare.fleet import ShiftFactory, prepare
 from scenarios.progress import Progress, quiet
-from scenarios.report.load_factor import LoadFactor, load_factor
+from scenarios.report.load_factor import load_factor
 from scenarios.schema import ArmSpec, JobStream, Scenario
 
 SEEDS = 5
@@ -21,28 +22,21 @@ def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | Tex
     fleet = prepare(scenario, difficulty="blind", progress=progress)
     factory = ShiftFactory(fleet)
     factors = [load_factor(factory(np.random.SeedSequence(seed)).world) for seed in range(SEEDS)]
-    thermal = float(np.mean([f.thermal for f in factors]))
-    blind = float(np.mean([f.blind for f in factors]))
-    time = float(np.mean([f.time for f in factors]))
+    thermal, blind, time = np.mean([astuple(f) for f in factors], axis=0)
+    regimes = [f.regime for f in factors]
     points = [f"{c:g} °C at {t / 3600:g} h" for t, c in scenario.ambient.points]
-    air = ", ".join(points) if len(points) > 1 else f"{scenario.ambient.at(np.zeros(1))[0]:g} °C"
+    ambient = ", ".join(points) if len(points) > 1 else f"{scenario.ambient.at(np.zeros(1))[0]:g} °C"
     head = (
         f"{scenario.name}: {scenario.description}\n{scenario.horizon_s / 3600:g} h, a decision every "
-        f"{scenario.decision_interval_s:g} s, {scenario.slots} slots, ambient {air}\n"
+        f"{scenario.decision_interval_s:g} s, {scenario.slots} slots, ambient {ambient}\n"
         f"thermal load factor {thermal:.2f} under the best assignment, {blind:.2f} under a blind one, "
-        f"time load {time:.2f} (mean of {SEEDS} seeds): {_regime(factors)}"
+        f"time load {time:.2f} (mean of {SEEDS} seeds): {max(set(regimes), key=regimes.count)}"
     )
     refused = [
         f"{arm}: {', '.join(sorted({e.place for e in es}))}" for arm, es in groupby(fleet.infeasible, lambda e: e.arm)
     ]
     tail = Text("Out of reach: " + "; ".join(refused) if refused else "Every arm reaches every place.")
-    gap = Text("")
-    return [Text(head), gap, _arms(scenario), gap, _jobs(scenario), gap, tail]
-
-
-def _regime(factors: list[LoadFactor]) -> str:
-    words = [f.regime for f in factors]
-    return max(set(words), key=words.count)
+    return [Text(head), Text(""), _arms(scenario), Text(""), _jobs(scenario), Text(""), tail]
 
 
 def _arms(scenario: Scenario) -> Table:
@@ -52,7 +46,7 @@ def _arms(scenario: Scenario) -> Table:
         ("home", lambda a: a.home),
         ("tool, kg", lambda a: f"{a.tool_kg:g}"),
         ("cooling", lambda a: a.cooling if a.cooling_factor == 1 else f"{a.cooling} × {a.cooling_factor:g}"),
-        ("air, K", lambda a: f"{a.ambient_offset_k:+g}"),
+        ("ambient, K", lambda a: f"{a.ambient_offset_k:+g}"),
         ("wear", lambda a: f"{a.wear:g}"),
     ]
     shown = [(name, text) for name, text in columns if any(text(a) != text(usual) for a in scenario.arms)]

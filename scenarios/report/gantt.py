@@ -1,26 +1,51 @@
 """Gantt chart as Plotly traces: bars of work and outages, marks of faults and warnings, one row per arm."""
 
 import html
-from collections.abc import Sequence
-from typing import Any  # values of Plotly's schema
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar  # Any: values of Plotly's schema
 
 import numpy as np
 
 from fleet.events import Event
-from fleet.schedule import Assignment, Schedule
+from fleet.schedule import Assignment, Outage, Schedule
 
 Trace = dict[str, Any]
+Span = TypeVar("Span", Assignment, Outage)
 
 STREAM_COLOURS = ("#4477aa", "#ddaa33", "#228833", "#aa4499", "#66ccee", "#997755", "#999933", "#555566")
 FAULT, WARNING, INK = "#cc2222", "#e08a00", "#222222"
-BAR = 0.62
-"""Height of a bar, in rows."""
+BAR = {"type": "bar", "orientation": "h", "legend": "legend"}
+BAR_HEIGHT = 0.62
+"""In rows."""
+LATE = {"color": INK, "width": 1.6}
 HATCH = {"fillmode": "overlay", "fgcolor": "white", "fgopacity": 1.0, "size": 7, "solidity": 0.35}
+UNFINISHED = 0.55
+"""Opacity of work that was returned or is still running."""
+MARKS = (("fault", "x", FAULT), ("warning", "triangle-up", WARNING))
 
 
 def gantt(plan: Schedule, events: Sequence[Event], arms: Sequence[str], unit_s: float) -> list[Trace]:
     """All traces; the row of an arm is its index, times are in units of `unit_s`."""
-    return [*_work_bars(plan, events, arms, unit_s), *_outage_bars(plan, arms, unit_s), *_marks(events, arms, unit_s)]
+    traces = _work_bars(plan, events, arms, unit_s)
+    if plan.outages:
+        look = {"color": FAULT, "opacity": 0.8, "line": {"width": 0}}
+        traces.append(_bars("out after a fault", plan.outages, _outage_text, arms, unit_s, look))
+    for kind, symbol, colour in MARKS:  # above the bars of their arm
+        own = [e for e in events if e.kind == kind and e.arm in arms]
+        if own:
+            traces.append(
+                {
+                    "type": "scatter",
+                    "mode": "markers",
+                    "name": kind,
+                    "x": [round(e.time_s / unit_s, 5) for e in own],
+                    "y": [arms.index(e.arm) - 0.42 for e in own],
+                    "marker": {"symbol": symbol, "color": colour, "size": 9, "line": {"color": "white", "width": 1}},
+                    **_hover([_event_text(e) for e in own]),
+                    "legend": "legend",
+                }
+            )
+    return traces
 
 
 def stream_of(job: str) -> str:
@@ -40,6 +65,7 @@ def clock(time_s: float) -> str:
 
 
 def _work_bars(plan: Schedule, events: Sequence[Event], arms: Sequence[str], unit_s: float) -> list[Trace]:
+    """Bars of every stream, then samples of the looks for the legend."""
     # Streams of all jobs, done or not, so that a stream has the same colour in every policy's report.
     streams = sorted({stream_of(event.job) for event in events if event.job})
     traces = []
@@ -47,60 +73,44 @@ def _work_bars(plan: Schedule, events: Sequence[Event], arms: Sequence[str], uni
         own = [a for a in plan.assignments if stream_of(a.job) == stream]
         if not own:
             continue
-        colour = STREAM_COLOURS[i % len(STREAM_COLOURS)]
-        traces.append(
-            _bars(
-                plain(stream),
-                [(arms.index(a.arm), a.start_s, a.end_s, _assignment_text(a)) for a in own],
-                unit_s,
-                color=colour,
-                opacity=[1.0 if a.outcome == "finished" else 0.55 for a in own],
-                line={
-                    "color": [INK if a.late_s else "white" for a in own],
-                    "width": [1.6 if a.late_s else 0.6 for a in own],
-                },
-                pattern=HATCH | {"shape": ["/" if a.outcome == "returned" else "" for a in own]},
-            )
-        )
-    keys = (
-        ("late", any(a.late_s for a in plan.assignments), {"color": "white", "line": {"color": INK, "width": 1.6}}),
-        (
-            "returned",
-            any(a.outcome == "returned" for a in plan.assignments),
-            {"color": "#888888", "pattern": HATCH | {"shape": "/"}},
-        ),
-        ("still running", any(a.outcome == "running" for a in plan.assignments), {"color": "#888888", "opacity": 0.55}),
+        look = {
+            "color": STREAM_COLOURS[i % len(STREAM_COLOURS)],
+            "opacity": [1.0 if a.outcome == "finished" else UNFINISHED for a in own],
+            "line": {
+                "color": [LATE["color"] if a.late_s else "white" for a in own],
+                "width": [LATE["width"] if a.late_s else 0.6 for a in own],
+            },
+            "pattern": HATCH | {"shape": ["/" if a.outcome == "returned" else "" for a in own]},
+        }
+        traces.append(_bars(plain(stream), own, _assignment_text, arms, unit_s, look))
+    outcomes = {a.outcome for a in plan.assignments}
+    samples = (
+        ("late", any(a.late_s for a in plan.assignments), {"color": "white", "line": LATE}),
+        ("returned", "returned" in outcomes, {"color": "#888888", "pattern": HATCH | {"shape": "/"}}),
+        ("still running", "running" in outcomes, {"color": "#888888", "opacity": UNFINISHED}),
     )
     return traces + [
-        {
-            "type": "bar",
-            "orientation": "h",
-            "name": name,
-            "x": [None],
-            "y": [None],
-            "marker": marker,
-            "legend": "legend",
-        }
-        for name, used, marker in keys
-        if used
+        BAR | {"name": name, "x": [None], "y": [None], "marker": look} for name, used, look in samples if used
     ]
 
 
-def _bars(name: str, spans: Sequence[tuple[int, float, float, str]], unit_s: float, **marker: object) -> Trace:
-    """Horizontal bars from (row, start_s, end_s, hover text)."""
-    return {
-        "type": "bar",
-        "orientation": "h",
+def _bars(
+    name: str, spans: Sequence[Span], text: Callable[[Span], str], arms: Sequence[str], unit_s: float, look: Trace
+) -> Trace:
+    """Horizontal bars of assignments or outages."""
+    return BAR | {
         "name": name,
-        "y": [row for row, *_ in spans],
-        "base": [round(start / unit_s, 5) for _, start, _, _ in spans],
-        "x": [round((end - start) / unit_s, 5) for _, start, end, _ in spans],
-        "width": BAR,
-        "marker": marker,
-        "customdata": [text for *_, text in spans],
-        "hovertemplate": "%{customdata}<extra></extra>",
-        "legend": "legend",
+        "y": [arms.index(span.arm) for span in spans],
+        "base": [round(span.start_s / unit_s, 5) for span in spans],
+        "x": [round((span.end_s - span.start_s) / unit_s, 5) for span in spans],
+        "width": BAR_HEIGHT,
+        "marker": look,
+        **_hover([text(span) for span in spans]),
     }
+
+
+def _hover(texts: list[str]) -> Trace:
+    return {"customdata": texts, "hovertemplate": "%{customdata}<extra></extra>"}
 
 
 def _assignment_text(a: Assignment) -> str:
@@ -117,38 +127,10 @@ def _assignment_text(a: Assignment) -> str:
     return f"<b>{plain(a.job)}</b> on {plain(a.arm)}<br>{clock(a.start_s)} – {clock(a.end_s)}<br>{end}{score}"
 
 
-def _outage_bars(plan: Schedule, arms: Sequence[str], unit_s: float) -> list[Trace]:
-    if not plan.outages:
-        return []
-    spans = []
-    for o in plan.outages:
-        end = "recovered" if o.recovered else "not recovered"
-        text = f"<b>{plain(o.arm)} lost</b><br>{clock(o.start_s)} – {clock(o.end_s)}, {end}<br>{plain(o.reason)}"
-        spans.append((arms.index(o.arm), o.start_s, o.end_s, text))
-    return [_bars("out after a fault", spans, unit_s, color=FAULT, opacity=0.8, line={"width": 0})]
-
-
-def _marks(events: Sequence[Event], arms: Sequence[str], unit_s: float) -> list[Trace]:
-    """Faults and warnings, above the bars of their arm."""
-    looks = (("fault", "x", FAULT), ("warning", "triangle-up", WARNING))
-    traces = []
-    for kind, symbol, colour in looks:
-        own = [e for e in events if e.kind == kind and e.arm in arms]
-        if own:
-            traces.append(
-                {
-                    "type": "scatter",
-                    "mode": "markers",
-                    "name": kind,
-                    "x": [round(e.time_s / unit_s, 5) for e in own],
-                    "y": [arms.index(e.arm) - 0.42 for e in own],
-                    "marker": {"symbol": symbol, "color": colour, "size": 9, "line": {"color": "white", "width": 1}},
-                    "customdata": [_event_text(e) for e in own],
-                    "hovertemplate": "%{customdata}<extra></extra>",
-                    "legend": "legend",
-                }
-            )
-    return traces
+def _outage_text(o: Outage) -> str:
+    """Hover text of one outage."""
+    end = "recovered" if o.recovered else "not recovered"
+    return f"<b>{plain(o.arm)} lost</b><br>{clock(o.start_s)} – {clock(o.end_s)}, {end}<br>{plain(o.reason)}"
 
 
 def _event_text(e: Event) -> str:

@@ -17,6 +17,7 @@ does. In between the choice of arm decides.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.optimize import linprog
 
 from fleet.engine.state import World
@@ -58,53 +59,41 @@ def load_factor(world: World) -> LoadFactor:
 
 
 def _heat_share(world: World, plan: Array) -> Array:
-    """Share of the room up to the warning limit that the cycle of each plan would use when settled, [arm, job]."""
-    limit = world.limits.warning_c
-    at_limit = np.full(world.start_c.shape, limit)
-    air = world.ambient_c.mean(axis=0)
-    rest = _settled(world, at_limit, world.rest.current_sq, world.rest.friction_w, air)
-    room = np.maximum(limit - rest, 1.0)  # an arm that idles at the limit has none left
-    out = np.empty(plan.shape)
-    for j in range(plan.shape[1]):
-        rows = np.maximum(plan[:, j], 0)
-        sq, friction = world.plans.current_sq[rows, 1], world.plans.friction_w[rows, 1]
-        hot = _settled(world, at_limit, sq, friction, air)
-        out[:, j] = np.maximum((hot - rest) / room, 0.0).max(axis=-1)
-    return out
+    """Share of the room up to the warning limit that the cycle of each plan uses in steady state, [arm, job]."""
+    at_limit = np.full(world.start_c.shape, world.limits.warning_c)
+    ambient_c = world.ambient_c.mean(axis=0)
 
+    def steady_c(current_sq: Array, friction_w: Array) -> Array:
+        """Motor temperatures [arm, joint] for the losses at the limit: linear, so shares of time add up."""
+        heat_w = drive_heat(at_limit, current_sq, friction_w, world.motors)
+        return world.thermal.steady(heat_w, ambient_c)[..., WINDING]
 
-def _settled(world: World, temp_c: Array, current_sq: Array, friction_w: Array, air_c: Array) -> Array:
-    """Settled motor temperatures for the losses at `temp_c`, [arm, joint]: linear, so shares of time add up."""
-    return world.thermal.steady(drive_heat(temp_c, current_sq, friction_w, world.motors), air_c)[..., WINDING]
+    rest_c = steady_c(world.rest.current_sq, world.rest.friction_w)
+    room_k = np.maximum(world.limits.warning_c - rest_c, 1.0)  # an arm that idles at the limit has none left
+    shares = np.empty(plan.shape)
+    for j, rows in enumerate(np.maximum(plan.T, 0)):
+        hot_c = steady_c(world.plans.current_sq[rows, 1], world.plans.friction_w[rows, 1])
+        shares[:, j] = np.maximum((hot_c - rest_c) / room_k, 0.0).max(axis=-1)
+    return shares
 
 
 def _least(load: Array, possible: Array, busy: Array | None = None, most: float = np.inf) -> float:
     """Least largest load of an arm when every job is shared out, [arm, job], while no arm's `busy` passes `most`."""
     arms, jobs = load.shape
-    cost = np.append(np.zeros(arms * jobs), 1.0)
     whole = np.hstack([np.tile(np.eye(jobs), arms), np.zeros((jobs, 1))])
-    per_arm = [np.hstack([_block(load), np.full((arms, 1), -1.0)])]
-    bound = [np.zeros(arms)]
+    # Variables: the share of each job on each arm, arm by arm, and the largest load.
+    per_arm, bound = [np.hstack([np.asarray(block_diag(*load)), np.full((arms, 1), -1.0)])], [np.zeros(arms)]
     if busy is not None:
-        per_arm.append(np.hstack([_block(busy), np.zeros((arms, 1))]))
+        per_arm.append(np.hstack([np.asarray(block_diag(*busy)), np.zeros((arms, 1))]))
         bound.append(np.full(arms, most * (1.0 + 1e-9)))
-    upper = np.append(np.where(possible.ravel(), 1.0, 0.0), np.inf)
-    found = linprog(
-        cost,
+    result = linprog(
+        np.append(np.zeros(arms * jobs), 1.0),
         np.vstack(per_arm),
         np.concatenate(bound),
         whole,
         np.ones(jobs),
-        bounds=np.column_stack([np.zeros(len(cost)), upper]),
+        bounds=[*((0.0, float(open_)) for open_ in possible.ravel()), (0.0, np.inf)],
     )
-    if not found.success:
-        raise ValueError(f"The load of the shift could not be computed: {found.message}")
-    return float(found.x[-1])
-
-
-def _block(values: Array) -> Array:
-    """[arm, arm · job] with row a holding the values of arm a in its own columns, for [arm, job]."""
-    arms, jobs = values.shape
-    out = np.zeros((arms, arms, jobs))
-    out[np.arange(arms), np.arange(arms)] = values
-    return out.reshape(arms, arms * jobs)
+    if not result.success:
+        raise ValueError(f"The load of the shift could not be computed: {result.message}")
+    return float(result.x[-1])

@@ -65,7 +65,7 @@ class Picture:
     """File name without its ending."""
     png: bytes
     alt: str
-    """Text for readers who cannot see the picture."""
+    """Text in place of the picture."""
 
     def __post_init__(self) -> None:
         if not self.png.startswith(PNG_HEAD):

@@ -42,7 +42,8 @@ def report_html(
     if telemetry.temp_c.shape[1] != len(arms):
         raise ValueError(f"The telemetry has {telemetry.temp_c.shape[1]} arms, the fleet {len(arms)}.")
     events = sorted(events, key=lambda e: (e.time_s, e.arm, e.kind, e.job))
-    reached_s = _reached_s(run, telemetry, events)
+    last = [*telemetry.time_s[-1:].tolist(), *(e.time_s for e in events)]
+    reached_s = max(last, default=float(run.get("scenario", {}).get("horizon_s", 0.0)))
     plan = schedule(events, arms, reached_s)
     drawing = figure(plan, telemetry, events, arms, warning_c=warning_c, error_c=error_c)
     body = [
@@ -52,18 +53,9 @@ def report_html(
         *_event_table(events),
         _provenance(run),
     ]
-    return html_page(_title(run), body, figure=drawing)
-
-
-def _reached_s(run: Mapping[str, Any], telemetry: Telemetry, events: Sequence[Event]) -> float:
-    """Last time of the shift that was recorded, s."""
-    last = [float(t) for t in telemetry.time_s[-1:]] + [e.time_s for e in events]
-    return max(last, default=float(run.get("scenario", {}).get("horizon_s", 0.0)))
-
-
-def _title(run: Mapping[str, Any]) -> str:
     scenario = run.get("scenario", {}).get("name", "unnamed scenario")
-    return f"{scenario} · {run.get('policy', 'unknown policy')} · seed {run.get('seed', '?')}"
+    title = f"{scenario} · {run.get('policy', 'unknown policy')} · seed {run.get('seed', '?')}"
+    return html_page(title, body, figure=drawing)
 
 
 def _head(run: Mapping[str, Any], arms: Sequence[str], reached_s: float) -> list[str]:
@@ -73,13 +65,13 @@ def _head(run: Mapping[str, Any], arms: Sequence[str], reached_s: float) -> list
     how = [f"{length} of {len(arms)} arm{'s' if len(arms) != 1 else ''}"]
     how += [f"{name} {run[name]}" for name in ("plant", "bus", "difficulty") if run.get(name) is not None]
     status = str(run.get("status", "unknown"))
-    words = {
+    summary = {
         "finished": "Finished",
         "interrupted": f"Interrupted after {_duration(reached_s)}: everything here covers that part only",
     }.get(status, f"Status: {status}")
     lines = [paragraph(str(scenario["description"]))] if scenario.get("description") else []
     look = "status good" if status == "finished" else "status bad"
-    return [*lines, paragraph(" · ".join(how), "faint"), paragraph(words, look)]
+    return [*lines, paragraph(" · ".join(how), "faint"), paragraph(summary, look)]
 
 
 KEY_FIGURES = (
@@ -117,35 +109,37 @@ def _key_figures(metrics: Mapping[str, Any]) -> str:
 
 
 def _event_table(events: Sequence[Event]) -> list[str]:
-    """The notable events by time, and how many were left out."""
+    """The notable events by time, and the number of events without a row."""
     notable = [e for e in events if e.kind in NOTABLE]
     first = sorted(notable, key=lambda e: (NOTABLE.index(e.kind), e.time_s))
-    kept, left = first[:ROWS], first[ROWS:]
+    listed, rest = first[:ROWS], first[ROWS:]
     lines = ["<h2>Events</h2>"]
     if not notable:
         return [*lines, paragraph("No fault, no warning, no lost claim.")]
     counts = Counter(e.kind for e in notable)
     lines.append(paragraph(f"{_counted(counts)}.", "faint"))
-    if left:
-        omitted = _counted(Counter(e.kind for e in left))
+    if rest:
+        omitted = _counted(Counter(e.kind for e in rest))
         lines.append(
-            paragraph(f"{len(kept)} of {len(notable)} are listed; left out: {omitted}. The event log has all of them.")
+            paragraph(
+                f"{len(listed)} of {len(notable)} are listed; left out: {omitted}. The event log has all of them."
+            )
         )
     if counts["lost"]:
         on = "" if len(counts) > 1 else " checked"
         lines.append(f'<input type="checkbox" id="lost"{on}> <label for="lost">show lost claims</label>')
-    kept.sort(key=lambda e: (e.time_s, e.arm, NOTABLE.index(e.kind)))
-    rows = [(clock(e.time_s), _words(e.kind), e.arm, e.job, e.reason) for e in kept]
+    listed.sort(key=lambda e: (e.time_s, e.arm, NOTABLE.index(e.kind)))
+    rows = [(clock(e.time_s), _label(e.kind), e.arm, e.job, e.reason) for e in listed]
     head = ("time", "event", "arm", "job", "reason")
-    return [*lines, table(head, rows, style="events", kinds=[e.kind for e in kept])]
+    return [*lines, table(head, rows, style="events", kinds=[e.kind for e in listed])]
 
 
-def _words(kind: str) -> str:
+def _label(kind: str) -> str:
     return {"lost": "claim lost", "return": "job returned", "recover": "recovered"}.get(kind, kind.replace("_", " "))
 
 
 def _counted(counts: Mapping[str, int]) -> str:
-    return ", ".join(f"{counts[kind]} × {_words(kind)}" for kind in NOTABLE if counts.get(kind))
+    return ", ".join(f"{counts[kind]} × {_label(kind)}" for kind in NOTABLE if counts.get(kind))
 
 
 def _provenance(run: Mapping[str, Any]) -> str:
@@ -165,7 +159,7 @@ def _plain(value: object) -> str:
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {_plain(inner)}" for key, inner in value.items())
     if isinstance(value, list | tuple) and any(isinstance(inner, Mapping | list | tuple) for inner in value):
-        return f"{len(value)} of them"
+        return f"list of {len(value)}"
     return ", ".join(map(_plain, value)) if isinstance(value, list | tuple) else str(value)
 
 

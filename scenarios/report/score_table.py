@@ -24,10 +24,8 @@ Cell = str | float | None
 Row = dict[str, Cell]
 LOADED = 2
 """Joint 2 carries most of a standing arm's load and ranks jobs best, so a table shows its d."""
-TRACE = ("twin", "data")
-"""The twin's version and the hash of its training data, for every score."""
-LEFT_OUT = (*TRACE, "log", "elbow", "end_s", *(f"d_{joint}" for joint in range(1, 8) if joint != LOADED))
-"""Columns left out of tables, which are 80 characters wide; CSV and JSON hold them all."""
+OMITTED = ("twin", "data", "log", "elbow", "end_s", *(f"d_{joint}" for joint in range(1, 8) if joint != LOADED))
+"""Columns omitted from tables, which are 80 characters wide; CSV and JSON hold them all."""
 
 
 def job_rows(twin: Twin, scenario: Scenario, progress: Progress = quiet) -> list[Row]:
@@ -123,11 +121,11 @@ def render(rows: Sequence[Row], how: str, *, caption: str) -> str | Table:
         return held.getvalue()
     caption = f"{caption}; --format csv or json for every joint"
     table = Table(box=None, pad_edge=False, caption=caption, caption_justify="left")
-    for head in (head for head in heads if head not in LEFT_OUT):
-        words = isinstance(rows[0][head], str)
-        table.add_column(SHORT.get(head, head), justify="left" if words else "right", no_wrap=not words)
+    for head in (head for head in heads if head not in OMITTED):
+        text = isinstance(rows[0][head], str)
+        table.add_column(SHORT.get(head, head), justify="left" if text else "right", no_wrap=not text)
     for row in rows:
-        table.add_row(*(_cell(value) for head, value in row.items() if head not in LEFT_OUT))
+        table.add_row(*(_cell(value) for head, value in row.items() if head not in OMITTED))
     return table
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from operator import attrgetter
 
 import numpy as np
 
@@ -10,10 +10,9 @@ from fleet.difficulty import difficulty_of_error
 from fleet.motion import CHANNELS, Plan
 from fleet.motor import gen3_motors
 from fleet.thermal import gen3_network, thermal_model
-from scenarios.prepare.train_twins import train_or_load
-from scenarios.studies.ranking import Jobs, Judged, QualityTable, judge, table
-from scenarios.studies.setup import Sample, Study, make_study
-from scenarios.studies.simulated_logs import AIR_SD_K, own_logs
+from scenarios.studies.ranking import Jobs, Judged, Quality, judge, side_by_side
+from scenarios.studies.setup import Bench, Sample, Study
+from scenarios.studies.simulated_logs import LOGS, identify_from_work
 from twin.baselines.detectors import isolation_forest, mahalanobis, nearest_neighbours
 from twin.baselines.reconstruction import (
     ModelScorer,
@@ -25,7 +24,6 @@ from twin.baselines.reconstruction import (
     untrained_config,
 )
 from twin.baselines.torque import torque_over_continuous, torque_over_known
-from twin.thermal.identify import identify
 from twin.thermal.thermal_twin import RcTwin
 from twin.vae.measures import Calibration, Features
 from twin.vae.model import TwinConfig
@@ -52,9 +50,7 @@ BASELINES = (
 )
 """Scorers that are not the twin."""
 THERMAL = ("RMS torque / continuous", "rc nominal", "rc identified")
-"""Scorers that were given motor data and the thermal law; all others saw nothing but cool motion."""
-LOGS = 6
-"""Training jobs that are logged with their temperatures, half an hour each, to identify the arm."""
+"""Scorers that use motor data and the thermal law; all others use cool motion alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,24 +59,14 @@ class TwinScorer:
 
     name: str
     twin: Twin
-    of_features: Callable[[Features], Array]
-    """Score [job, joint] from features of jobs."""
+    of_features: Callable[[Features], Array] = attrgetter("difficulty")
+    """Score [job, joint] from features of jobs; by default d_k of the paper."""
 
     def scores(self, plans: Sequence[Plan], repetitions: Sequence[int]) -> Scores:
         """Score of each job; raises as `twin.baselines.reconstruction.Scorer` says."""
         check_jobs(plans, repetitions)
         per_joint = self.of_features(self.twin.features(plans, repetitions))
         return Scores(per_joint, per_joint.sum(axis=1))
-
-
-def difficulty(features: Features) -> Array:
-    """d_k of the paper, [job, joint]."""
-    return features.difficulty
-
-
-def torque_difficulty(features: Features) -> Array:
-    """d_k from the torque channel alone, [job, joint]."""
-    return difficulty_of_error(features.errors[..., TAU])
 
 
 def jobs_of(sample: Sample, horizon_s: float) -> Jobs:
@@ -111,25 +97,29 @@ def twin_scorers(twins: dict[str, Twin], reference: Jobs) -> list[Scorer]:
     vae = twins[VAE]
     calibration = Calibration(vae.features(reference.plans, reference.repetitions))
     scorers: list[Scorer] = [
-        TwinScorer(VAE, vae, difficulty),
+        TwinScorer(VAE, vae),
         TwinScorer("VAE d_cal", vae, calibration.difficulty),
-        TwinScorer("VAE torque channel", vae, torque_difficulty),
-        TwinScorer("VAE one-sided torque", vae, lambda features: features.load),
-        TwinScorer("VAE excess torque²", vae, lambda features: features.excess_sq),
+        TwinScorer("VAE torque channel", vae, lambda features: difficulty_of_error(features.errors[..., TAU])),
+        TwinScorer("VAE one-sided torque", vae, attrgetter("load")),
+        TwinScorer("VAE excess torque²", vae, attrgetter("excess_sq")),
     ]
     for name, twin in twins.items():
         if name != VAE:
-            scorers.append(TwinScorer(name, twin, difficulty))
+            scorers.append(TwinScorer(name, twin))
         if twin.config.scope == "arm":
-            scorers.append(TwinScorer(f"{name}, one-sided torque", twin, lambda features: features.load))
+            scorers.append(TwinScorer(f"{name}, one-sided torque", twin, attrgetter("load")))
     return scorers
 
 
-def baseline_scorers(study: Study, config: TwinConfig, seed: np.random.SeedSequence, logs: int = LOGS) -> list[Scorer]:
-    """All baselines without a trained network; thermal ones know a nominal Gen3 or the arm's logs, not its truth."""
+def baseline_scorers(study: Study, config: TwinConfig, seed: np.random.SeedSequence) -> list[Scorer]:
+    """All baselines without a trained network; thermal ones use a nominal Gen3 or the arm's logs, not its truth."""
     records = study.train.records()
     cool = cool_windows(records, replace(config, max_windows=TwinConfig().max_windows), seed)
     motors, thermal = gen3_motors(), thermal_model(gen3_network())
+    networks = {
+        "rc nominal": RcTwin.nominal(study.robot.name, ambient_c=study.ambient_c),
+        "rc identified": RcTwin.of(identify_from_work(study, study.train.plans[:LOGS], np.random.default_rng(seed))),
+    }
     return [
         pca(cool, 2),
         pca(cool, 8),
@@ -138,54 +128,32 @@ def baseline_scorers(study: Study, config: TwinConfig, seed: np.random.SeedSeque
         isolation_forest(cool, seed),
         torque_over_known(records),
         torque_over_continuous(motors, thermal, limit_c=study.warning_c, ambient_c=study.ambient_c),
-        _physical("rc nominal", RcTwin.nominal(study.robot.name, ambient_c=study.ambient_c), study),
-        _physical("rc identified", identified_twin(study, seed, logs), study),
+        *(ModelScorer(name, replace(rc, warning_c=study.warning_c), worst=True) for name, rc in networks.items()),
     ]
 
 
-def identified_twin(study: Study, seed: np.random.SeedSequence, logs: int = LOGS) -> RcTwin:
-    """Thermal twin identified from logs of the arm's cool training jobs; none of them overheats."""
-    recordings = own_logs(study, study.train.plans[:logs], np.random.default_rng(seed))
-    return RcTwin.of(identify(recordings, arm=study.robot.name, ambient_c=study.ambient_c, ambient_sd_k=AIR_SD_K))
-
-
-def _physical(name: str, rc: RcTwin, study: Study) -> ModelScorer:
-    return ModelScorer(name, replace(rc, warning_c=study.warning_c), worst=True)
-
-
-Make = Callable[..., Study]
-"""Makes the study of a seed; sizes as in `make_study`."""
-
-
-def benchmark(
-    seed: np.random.SeedSequence,
-    *,
-    config: TwinConfig,
-    folder: Path,
-    make: Make = make_study,
-    networks: Sequence[str] | None = None,
-    logs: int = LOGS,
-) -> Judged:
-    """Quality of every scorer under one seed, with its own study and trainings.
+def quality(bench: Bench, networks: Sequence[str] | None = None) -> Quality:
+    """Quality of every scorer under every seed.
 
     Args:
-        folder: Cache of trained twins.
         networks: Names of the `variants` to train, the VAE among them; all by default.
-        logs: Training jobs that are logged to identify the arm.
 
     Raises:
-        ValueError: an unknown network, or no VAE.
+        ValueError: an unknown network, no VAE, or no seeds.
         FleetError: no test job is critical, or all are.
     """
-    configs = chosen_variants(config, networks)
-    study = make(seed)
+    configs, per_seed = chosen_variants(bench.config, networks), []
+    for seed, study, vae in bench.studies():
+        records = study.train.records()
+        others = {name: bench.train(records, study, seed, each) for name, each in configs.items() if name != VAE}
+        own = twin_scorers({VAE: vae, **others}, jobs_of(study.reference, study.horizon_s))
+        per_seed.append(judge_on(study, [*own, *baseline_scorers(study, bench.config, seed)]))
+    return side_by_side(per_seed)
+
+
+def judge_on(study: Study, scorers: Sequence[Scorer]) -> Judged:
+    """Quality of the scorers on the study's test jobs; raises as `judge`."""
     test, reference, novel = (jobs_of(part, study.horizon_s) for part in (study.test, study.reference, study.novel))
-    records = study.train.records()
-    twins = {
-        name: train_or_load(records, variant, seed, arm=study.robot.name, folder=folder)
-        for name, variant in configs.items()
-    }
-    scorers = [*twin_scorers(twins, reference), *baseline_scorers(study, config, seed, logs)]
     return judge(scorers, test=test, reference=reference, novel=novel, limit_c=study.warning_c)
 
 
@@ -200,19 +168,3 @@ def chosen_variants(config: TwinConfig, networks: Sequence[str] | None) -> dict[
     if VAE not in names or not set(names) <= set(every):
         raise ValueError(f"A benchmark takes '{VAE}' and any of {', '.join(every)} (got {', '.join(names)}).")
     return {name: variant for name, variant in every.items() if name in names}
-
-
-def quality(
-    seeds: Sequence[np.random.SeedSequence],
-    *,
-    config: TwinConfig,
-    folder: Path,
-    make: Make = make_study,
-    networks: Sequence[str] | None = None,
-    logs: int = LOGS,
-) -> QualityTable:
-    """The benchmark under every seed; raises as `benchmark`, and without seeds."""
-    per_seed = [
-        benchmark(seed, config=config, folder=folder, make=make, networks=networks, logs=logs) for seed in seeds
-    ]
-    return table(per_seed, thermal=THERMAL)

@@ -7,7 +7,7 @@ from scipy.stats import spearmanr
 from sklearn.metrics import average_precision_score, roc_auc_score
 
 from fleet.errors import FleetError
-from twin.conformal import p_value
+from twin.saturation.alarm import ConformalAlarm
 
 Array = np.ndarray
 
@@ -33,9 +33,7 @@ class Detection:
     """Share of light new motions that raise an alarm although they stay cool."""
 
 
-def detection(
-    score: Array, peak_c: Array, *, reference: Array, novel: Array, limit_c: float = LIMIT_C, rate: float = ALARM_RATE
-) -> Detection:
+def detection(score: Array, peak_c: Array, *, reference: Array, novel: Array, limit_c: float = LIMIT_C) -> Detection:
     """Quality of scores [job] of held-out jobs with true peaks [job], °C.
 
     Args:
@@ -43,8 +41,8 @@ def detection(
         novel: Scores of light new motions, [job].
 
     Raises:
-        ValueError: scores that are not finite, or another number of them than of peaks.
-        FleetError: no job is critical or all are, or too few reference jobs for the rate.
+        ValueError: scores that are not finite, or not one per peak.
+        FleetError: no job is critical or all are, or too few reference jobs for the alarm.
     """
     if score.shape != peak_c.shape or score.ndim != 1:
         raise ValueError(f"Scores and peaks must be [job] alike (got {score.shape} and {peak_c.shape}).")
@@ -56,25 +54,11 @@ def detection(
             f"{critical.sum()} of {len(critical)} test jobs reach {limit_c:g} °C: without some of both kinds no "
             "quality can be measured. Change the payloads, the ambient temperature or the limit."
         )
+    alarm = ConformalAlarm.fit(reference, ALARM_RATE)
     return Detection(
         auroc=float(roc_auc_score(critical, score)),
         auprc=float(average_precision_score(critical, score)),
         spearman=float(np.asarray(spearmanr(score, peak_c))[0]),
-        caught=float(alarms(score[critical], reference, rate).mean()),
-        false_novel=float(alarms(novel, reference, rate).mean()) if len(novel) else float("nan"),
+        caught=float(alarm(score[critical]).mean()),
+        false_novel=float(alarm(novel).mean()) if len(novel) else float("nan"),
     )
-
-
-def alarms(score: Array, reference: Array, rate: float = ALARM_RATE) -> Array:
-    """Whether each score [job] stands out of the reference scores [job], bool [job].
-
-    p = (1 + reference scores at least as high) / (1 + references) <= rate, so a job exchangeable with the reference
-    raises an alarm with probability <= rate (Vovk et al., Algorithmic Learning in a Random World, 2005, ch. 2).
-
-    Raises:
-        FleetError: so few references that no score could ever stand out.
-    """
-    least = int(np.ceil(1 / rate - 1e-9)) - 1
-    if len(reference) < least:
-        raise FleetError(f"Alarms at {rate:.0%} need at least {least} held-out cool jobs (got {len(reference)}).")
-    return p_value(np.sort(reference), score) <= rate + 1e-9

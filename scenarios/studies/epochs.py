@@ -3,12 +3,14 @@
 The paper's table (E. Guiffo Kaigom, arXiv 2509.12740): errors fall with epochs, not always, and velocity is hardest.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from joblib import Parallel, cpu_count, delayed
 
+from scenarios.progress import Progress, quiet
 from twin.vae.model import TwinConfig
 from twin.vae.train import train
 from twin.vae.window import windows_of
@@ -17,7 +19,7 @@ Array = np.ndarray
 
 EPOCHS = (20, 40, 60, 120, 240)
 RECORDS = 5
-"""Jobs of the record: so few that more epochs still help."""
+"""Jobs of the record: few enough that more epochs still help."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,23 +27,17 @@ class EpochStudy:
     """Mean absolute reconstruction errors in z units, from the posterior mean, averaged over windows."""
 
     epochs: tuple[int, ...]
-    seeds: tuple[int, ...]
     windows: int
     """In the training record, of one seed on average."""
-    known: Array
+    trained_on: Array
     """On the training record, [seed, epochs, joint, channel]."""
     held_out: Array
     """On other records of the same kind, [seed, epochs, joint, channel]."""
 
-    def table(self, joint: int | None = None) -> tuple[Array, Array]:
-        """Known and held-out errors [seed, epochs, channel]: of one joint (0-based), or the mean over all."""
-        if joint is None:
-            return self.known.mean(axis=2), self.held_out.mean(axis=2)
-        return self.known[:, :, joint], self.held_out[:, :, joint]
-
-    def rising(self, joint: int | None = None) -> Array:
-        """Share of seeds whose error rises somewhere from one number of epochs to the next, [known/held, channel]."""
-        return np.stack([(np.diff(errors, axis=1) > 0).any(axis=1).mean(axis=0) for errors in self.table(joint)])
+    def rising(self, joint: int) -> Array:
+        """Share of seeds whose error rises somewhere with more epochs, [trained on/held out, channel]."""
+        errors = np.stack([self.trained_on[:, :, joint], self.held_out[:, :, joint]])
+        return (np.diff(errors, axis=2) > 0).any(axis=2).mean(axis=1)
 
 
 def epoch_study(
@@ -52,7 +48,7 @@ def epoch_study(
     config: TwinConfig | None = None,
     records: int = RECORDS,
     workers: int = -1,
-    progress: Callable[[str, float], None] = lambda stage, share: None,
+    progress: Progress = quiet,
 ) -> EpochStudy:
     """Train a new twin for every number of epochs and seed; each seed draws the jobs of its record.
 
@@ -70,30 +66,30 @@ def epoch_study(
     if not epochs or not seeds or min(epochs) < 1:
         raise ValueError(f"The epoch table needs seeds, and epochs >= 1 (got {seeds!r}, {epochs!r}).")
     base = replace(config or TwinConfig(restarts=1), allow_collapse=True)
-    tasks = [(seed, count) for seed in seeds for count in epochs]
-    cells = []
     # Longest first, so that no core ends with a long training alone.
-    order = sorted(range(len(tasks)), key=lambda i: -tasks[i][1])
-    work = (delayed(_cell)(jobs, replace(base, epochs=tasks[i][1]), tasks[i][0], records) for i in order)
-    total, done = sum(count for _, count in tasks), 0
+    tasks = sorted(product(range(len(seeds)), range(len(epochs))), key=lambda task: -epochs[task[1]])
+    cells = (delayed(_cell)(jobs, replace(base, epochs=epochs[e]), seeds[s], records) for s, e in tasks)
+    total, done, results = len(seeds) * sum(epochs), 0, []
     with Parallel(n_jobs=min(len(tasks), cpu_count()) if workers < 0 else workers, return_as="generator") as pool:
-        for i, cell in zip(order, pool(work), strict=True):
-            cells.append((i, cell))
-            done += tasks[i][1]
+        for (_, e), result in zip(tasks, pool(cells), strict=True):
+            results.append(result)
+            done += epochs[e]
             progress("epoch table", done / total)
-    ordered = [cell for _, cell in sorted(cells, key=lambda pair: pair[0])]
-    shape = (len(seeds), len(epochs))
-    known, held = (np.stack([cell[k] for cell in ordered]).reshape(*shape, *ordered[0][k].shape) for k in range(2))
-    windows = round(float(np.mean([cell[2] for cell in ordered])))
-    return EpochStudy(tuple(epochs), tuple(seeds), windows, known, held)
+    errors = np.empty((2, len(seeds), len(epochs), *results[0][0].shape[1:]))
+    for (s, e), (cell, _) in zip(tasks, results, strict=True):
+        errors[:, s, e] = cell
+    windows = round(float(np.mean([count for _, count in results])))
+    return EpochStudy(tuple(epochs), windows, errors[0], errors[1])
 
 
-def _cell(jobs: Sequence[Sequence[Array]], config: TwinConfig, seed: int, records: int) -> tuple[Array, Array, int]:
-    """Errors on the training record and on other jobs, [joint, channel], and the windows trained on."""
+def _cell(jobs: Sequence[Sequence[Array]], config: TwinConfig, seed: int, records: int) -> tuple[Array, int]:
+    """Errors [trained on/held out, joint, channel], and the number of windows trained on."""
     rng = np.random.default_rng(np.random.SeedSequence([seed, 1]))
     chosen = rng.permutation(len(jobs))
-    taught = [phase for i in chosen[:records] for phase in jobs[i] if len(phase)]
-    others = [phase for i in chosen[records : 5 * records] for phase in jobs[i] if len(phase)]
-    twin = train(taught, config, np.random.SeedSequence(seed), arm="epochs")
-    seen, new = (windows_of(part, config) for part in (taught, others))
-    return twin.window_errors(seen).mean(axis=0), twin.window_errors(new).mean(axis=0), len(seen)
+    record, others = (
+        [phase for i in some for phase in jobs[i] if len(phase)]
+        for some in (chosen[:records], chosen[records : 5 * records])
+    )
+    twin = train(record, config, np.random.SeedSequence(seed), arm="epochs")
+    windows = [windows_of(part, config) for part in (record, others)]
+    return np.stack([twin.window_errors(part).mean(axis=0) for part in windows]), len(windows[0])

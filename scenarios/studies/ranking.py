@@ -1,7 +1,7 @@
 """Compare scorers on the same held-out jobs, over several seeds."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 
@@ -13,13 +13,12 @@ Array = np.ndarray
 
 CARRIER = 1
 """Joint 2 carries the stretched arm: nearly every critical job is critical there (index 0..6)."""
-QUESTIONS = ("any joint, total", "any joint, joint 2", "joint 2, joint 2")
-"""Which joint must reach the limit, and which score predicts it: the job's total or that of joint 2."""
-WORDS = {
+QUESTIONS = {
     "any joint, total": "Any joint overheats, by the job's total score",
     "any joint, joint 2": "Any joint overheats, by the score of joint 2",
     "joint 2, joint 2": "Joint 2 overheats, by its own score",
 }
+"""Which joint must reach the limit, and which score predicts it: the job's total or that of joint 2."""
 RANKING = ("auroc", "auprc", "spearman")
 """Measures that need no threshold."""
 LABELS = {
@@ -28,12 +27,16 @@ LABELS = {
     "spearman": "Spearman",
     "caught": "TPR at 5 %",
     "false_novel": "FPR novel",
+    "brier": "Brier",
+    "ece": "ECE",
 }
-HEAT, MOTION = "heat", "motion"
+"""Names of measures in tables."""
 MEASURES = tuple(field.name for field in fields(Detection))
 
-Judged = dict[tuple[str, str], Detection]
-"""By scorer and question."""
+Judged = dict[str, dict[str, Detection]]
+"""[question][scorer] of one seed."""
+Quality = dict[str, dict[str, dict[str, Array]]]
+"""[question][scorer][measure] → one value per seed, [seed]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,47 +57,8 @@ class Jobs:
             )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Row:
-    """Quality of one scorer for one question."""
-
-    scorer: str
-    question: str
-    seeds: tuple[Detection, ...]
-    """One per seed, each with its own study and trainings."""
-
-    def values(self, measure: str) -> Array:
-        """One of `MEASURES`, [seed]."""
-        return np.array([getattr(each, measure) for each in self.seeds])
-
-
-@dataclass(frozen=True, kw_only=True)
-class QualityTable:
-    """Rows in the order in which the scorers were given, question by question."""
-
-    rows: tuple[Row, ...]
-    thermal: tuple[str, ...] = ()
-    """Scorers that were given motor data and the thermal law; the others know motion alone."""
-
-    def knows(self, scorer: str) -> str:
-        """What a scorer was given: heat or motion."""
-        return HEAT if scorer in self.thermal else MOTION
-
-    def row(self, scorer: str, question: str) -> Row:
-        """The row of a scorer.
-
-        Raises:
-            ValueError: no such row.
-        """
-        for row in self.rows:
-            if (row.scorer, row.question) == (scorer, question):
-                return row
-        names = ", ".join(dict.fromkeys(row.scorer for row in self.rows))
-        raise ValueError(f"No scorer '{scorer}' under '{question}'. Scorers: {names}; questions: {QUESTIONS}.")
-
-
 def judge(scorers: Sequence[Scorer], *, test: Jobs, reference: Jobs, novel: Jobs, limit_c: float = LIMIT_C) -> Judged:
-    """Detection of every scorer for every question, by (scorer, question).
+    """Detection by every scorer for every question.
 
     Raises:
         ValueError: two scorers of one name.
@@ -103,99 +67,92 @@ def judge(scorers: Sequence[Scorer], *, test: Jobs, reference: Jobs, novel: Jobs
     names = [scorer.name for scorer in scorers]
     if len(set(names)) < len(names):
         raise ValueError(f"Names of scorers must be unique (got {', '.join(names)}).")
-    quality: Judged = {}
+    judged: Judged = {question: {} for question in QUESTIONS}
     for scorer in scorers:
         results = [scorer.scores(jobs.plans, jobs.repetitions) for jobs in (test, reference, novel)]
-        for question in QUESTIONS:
+        for question, by_scorer in judged.items():
             score, at_reference, at_novel = (_score(scores, question) for scores in results)
-            quality[scorer.name, question] = detection(
-                score, _truth(test.peak_c, question), reference=at_reference, novel=at_novel, limit_c=limit_c
-            )
-    return quality
-
-
-def table(per_seed: Sequence[Judged], thermal: Sequence[str] = ()) -> QualityTable:
-    """Quality under several seeds, side by side.
-
-    Args:
-        thermal: As `QualityTable.thermal`.
-
-    Raises:
-        ValueError: no seed, or seeds with other scorers.
-    """
-    if not per_seed or any(each.keys() != per_seed[0].keys() for each in per_seed):
-        raise ValueError("A quality table needs at least one seed, and the same scorers under each.")
-    scorers = list(dict.fromkeys(scorer for scorer, _ in per_seed[0]))
-    return QualityTable(
-        rows=tuple(
-            Row(scorer=scorer, question=question, seeds=tuple(each[scorer, question] for each in per_seed))
-            for question in QUESTIONS
-            for scorer in scorers
-        ),
-        thermal=tuple(thermal),
-    )
+            peak_c = test.peak_c.max(axis=1) if question.startswith("any") else test.peak_c[:, CARRIER]
+            by_scorer[scorer.name] = detection(score, peak_c, reference=at_reference, novel=at_novel, limit_c=limit_c)
+    return judged
 
 
 def _score(scores: Scores, question: str) -> Array:
     return scores.total if question.endswith("total") else scores.per_joint[:, CARRIER]
 
 
-def _truth(peak_c: Array, question: str) -> Array:
-    return peak_c.max(axis=1) if question.startswith("any") else peak_c[:, CARRIER]
+def side_by_side(per_seed: Sequence[Judged]) -> Quality:
+    """Quality under several seeds.
+
+    Raises:
+        ValueError: no seed, or seeds with other scorers.
+    """
+    scorers = [[*next(iter(judged.values()))] for judged in per_seed]
+    if not scorers or any(set(each) != set(scorers[0]) for each in scorers):
+        raise ValueError("A quality table needs at least one seed, and the same scorers under each.")
+    return {
+        question: {name: by_measure([judged[question][name] for judged in per_seed]) for name in scorers[0]}
+        for question in per_seed[0]
+    }
 
 
-def verdicts(quality: QualityTable, subject: str, baselines: Sequence[str]) -> tuple[str, ...]:
+def by_measure(seeds: Sequence[Detection]) -> dict[str, Array]:
+    """Each of `MEASURES`, [seed]."""
+    rows = [asdict(each) for each in seeds]
+    return {measure: np.array([row[measure] for row in rows]) for measure in MEASURES}
+
+
+def verdicts(
+    quality: Quality, subject: str, baselines: Sequence[str], *, thermal: Sequence[str] = ()
+) -> tuple[str, ...]:
     """Compare baselines with a scorer: a sentence per question and kind of knowledge.
 
-    One is ahead of the other in a measure if it is ahead under every seed; between equals this happens by chance in
-    one of four cases with three seeds. Everything else is a tie. Baselines without rows are skipped.
+    A scorer is better in a measure if it is better under every seed; between equals this happens by chance in one of
+    four cases with three seeds. Everything else is a tie. Baselines that were not measured are skipped.
+
+    Args:
+        thermal: Baselines that use motor data and the thermal law; the others use motion alone.
     """
-    present = [name for name in baselines if any(row.scorer == name for row in quality.rows)]
-    groups = [(kind, [name for name in present if quality.knows(name) == kind]) for kind in (MOTION, HEAT)]
-    return tuple(
-        _verdict(quality, question, subject, kind, some) for question in QUESTIONS for kind, some in groups if some
-    )
+    sentences = []
+    for question, scorers in quality.items():
+        for given, is_thermal in (("motion alone", False), ("motor data and the thermal law", True)):
+            names = [name for name in baselines if name in scorers and (name in thermal) == is_thermal]
+            if names:
+                text = _verdict({name: scorers[name] for name in names}, scorers[subject])
+                sentences.append(f"{QUESTIONS[question]}. Among scorers with {given}, {subject} {text}.")
+    return tuple(sentences)
 
 
-def _verdict(quality: QualityTable, question: str, subject: str, kind: str, baselines: Sequence[str]) -> str:
-    own = quality.row(subject, question)
-    rows = sorted((quality.row(name, question) for name in baselines), key=lambda row: -_mean_lead(row, own, "auroc"))
+def _verdict(baselines: dict[str, dict[str, Array]], own: dict[str, Array]) -> str:
+    leads = {name: {m: values[m] - own[m] for m in RANKING} for name, values in baselines.items()}
     groups: dict[str, list[str]] = {"is beaten by": [], "is partly beaten by": [], "ties with": [], "beats": []}
-    for row in rows:
-        leads = {m: _mean_lead(row, own, m) for m in RANKING if _always_one_side(row, own, m)}
-        if not leads:
-            groups["ties with"].append(row.scorer)
-        elif max(leads.values()) < 0:
-            groups["beats"].append(row.scorer)
+    for name, lead in sorted(leads.items(), key=lambda item: -item[1]["auroc"].mean()):
+        clear = {m: float(values.mean()) for m, values in lead.items() if _same_sign(values)}
+        if not clear:
+            groups["ties with"].append(name)
+        elif max(clear.values()) < 0:
+            groups["beats"].append(name)
         else:
-            outcome = "is beaten by" if min(leads.values()) > 0 else "is partly beaten by"
-            groups[outcome].append(f"{row.scorer} ({_leads(leads)})")
-    given = "with motion alone" if kind == MOTION else "with motor data and the thermal law"
-    text = ". It ".join(f"{outcome} {_listed(names)}" for outcome, names in groups.items() if names)
-    return f"{WORDS[question]}. Among scorers {given}, {subject} {text}."
+            outcome = "is beaten by" if min(clear.values()) > 0 else "is partly beaten by"
+            groups[outcome].append(f"{name} ({_leads(clear)})")
+    return ". It ".join(f"{outcome} {_listed(names)}" for outcome, names in groups.items() if names)
+
+
+def _same_sign(leads: Array) -> bool:
+    """Whether the same scorer is better under every seed, to three digits."""
+    return bool(abs(np.sign(np.round(leads, 3)).sum()) == len(leads))
 
 
 def _leads(leads: dict[str, float]) -> str:
     """Leads and then deficits: `AUROC +.020, but Spearman −.100`."""
-    more, less = (
-        ", ".join(f"{LABELS[m]} {sign}{_short(abs(lead))}" for m, lead in leads.items() if (lead > 0) == (sign == "+"))
-        for sign in ("+", "−")
-    )
-    return f"{more}, but {less}" if less else more
-
-
-def _mean_lead(row: Row, own: Row, measure: str) -> float:
-    return float((row.values(measure) - own.values(measure)).mean())
-
-
-def _always_one_side(row: Row, own: Row, measure: str) -> bool:
-    """Whether the same scorer is ahead under every seed, to three digits."""
-    ahead = np.round(row.values(measure) - own.values(measure), 3)
-    return bool(np.all(ahead > 0) or np.all(ahead < 0))
+    parts = []
+    for sign, chosen in (("+", lambda lead: lead > 0), ("−", lambda lead: lead <= 0)):
+        parts.append(", ".join(f"{LABELS[m]} {sign}{_short(abs(lead))}" for m, lead in leads.items() if chosen(lead)))
+    return ", but ".join(filter(None, parts))
 
 
 def _listed(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + f" and {names[-1]}"
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
 def spread(values: Sequence[float] | Array, digits: int = 3) -> str:
@@ -209,4 +166,4 @@ def spread(values: Sequence[float] | Array, digits: int = 3) -> str:
 
 
 def _short(value: float) -> str:
-    return f"{value:.3f}".replace("0.", ".", 1) if abs(value) < 1 else f"{value:.3f}"
+    return f"{value:.3f}".removeprefix("0")

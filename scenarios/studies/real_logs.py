@@ -1,6 +1,6 @@
 """Twins trained on cool logs of a real arm, tested on hot ones: the paper's claim on held-out files."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,20 +9,19 @@ from sklearn.metrics import average_precision_score, roc_auc_score
 
 from fleet.difficulty import difficulty_of_error
 from fleet.errors import FleetError
+from fleet.files import cache_folder
 from fleet.motion import CHANNELS
 from scenarios.prepare.train_twins import train_or_load
+from scenarios.studies.ranking import CARRIER
 from twin.logs.recording import Recording
 from twin.logs.resampling import Stretch, stretches
 from twin.training_data import cool_stretches
 from twin.vae.model import TwinConfig
-from twin.vae.train import train
 from twin.vae.twin import Twin
 from twin.vae.window import cut, starts
 
 Array = np.ndarray
 
-JOINT = 1
-"""Joint 2 (index 0..6) carries the whole arm of a standing Gen3 and gets hot."""
 HOT_C = 40.0
 """Mean temperature of joint 2 from which a window is hot; a file that never reaches it is cool."""
 AHEAD_S = 300.0
@@ -35,13 +34,11 @@ CONFIG = TwinConfig(rate_hz=2.0, record_hz=2.0, window=50, stride=10, epochs=40,
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LogStudy:
-    """One twin and every window of the held-out files."""
+    """One twin and every window of the held-out files, which are all but the training files."""
 
     twin: Twin
     train_files: tuple[str, ...]
     """Recordings that the twin was trained on; none of them reaches `HOT_C` on joint 2."""
-    test_files: tuple[str, ...]
-    """All others."""
     file: Array
     """Name of the recording of each window, str [window]."""
     start_s: Array
@@ -62,7 +59,7 @@ class LogStudy:
     @property
     def hot(self) -> Array:
         """Windows in which joint 2 is at `HOT_C` or more on average, bool [window]."""
-        return self.temp_c[:, JOINT] >= HOT_C
+        return self.temp_c[:, CARRIER] >= HOT_C
 
     @property
     def difficulty(self) -> Array:
@@ -75,74 +72,60 @@ class LogStudy:
         return np.sqrt(np.square(self.windows[..., CHANNELS.index("tau")], dtype=float).mean(axis=1))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class HotAndCool:
     """Errors and scores of joint 2 in hot and in cool windows of the test files."""
 
     cool_windows: int
     hot_windows: int
-    cool_error: tuple[float, ...]
+    cool_error: Array
     """Mean over windows of the absolute error per channel q, qd, tau, z units."""
-    hot_error: tuple[float, ...]
+    hot_error: Array
     ratio: float
     """Hot over cool, of the mean over windows of the error summed over channels."""
-    median_ratio: float
-    """The same of the medians over windows, which a few unusual cool motions do not change."""
     cool_difficulty: float
     """Median d_2."""
     hot_difficulty: float
-    auroc: dict[str, float]
-    """Hot against cool by d_2, by the error of each channel, and by RMS torque."""
-    auprc: dict[str, float]
+    ranking: dict[str, dict[str, float]]
+    """AUROC and AUPRC of hot against cool by d_2, by the error of each channel, and by RMS torque."""
 
 
 def log_study(
-    recordings: Sequence[Recording],
-    seed: int,
-    *,
-    config: TwinConfig = CONFIG,
-    progress: Callable[[float], None] | None = None,
-    folder: Path | None = None,
+    recordings: Sequence[Recording], seed: int, *, config: TwinConfig = CONFIG, folder: Path | None = None
 ) -> LogStudy:
     """A twin trained on `TRAIN_SHARE` of the cool files, drawn by the seed, and its errors on all other files.
 
     Args:
-        folder: Cache of trained twins.
+        folder: Cache of trained twins; by default that of all twins.
 
     Raises:
         FleetError: too few files are cool, or none is left to test on.
         ValueError: a recording without temperatures.
     """
-    cool = [r.name for r in recordings if _temperatures(r)[:, JOINT].max(initial=-np.inf) < HOT_C]
+    cool = [r.name for r in recordings if _temperatures(r)[:, CARRIER].max(initial=-np.inf) < HOT_C]
     count = round(TRAIN_SHARE * len(cool))
     if not 0 < count < len(recordings):
         raise FleetError(
-            f"{len(cool)} of {len(recordings)} logs stay below {HOT_C:g} °C on joint {JOINT + 1}: to train on "
+            f"{len(cool)} of {len(recordings)} logs stay below {HOT_C:g} °C on joint {CARRIER + 1}: to train on "
             f"{TRAIN_SHARE:.0%} of them and test on the rest needs at least two; add logs of light work."
         )
-    drawn = np.random.default_rng(seed).permutation(len(cool))[:count]
-    names = {cool[i] for i in drawn}
-    taught = [r for r in recordings if r.name in names]
-    normal = cool_stretches(taught, config.rate_hz, cool_c=HOT_C, horizon_s=np.inf, joints=(JOINT,))
+    names = {cool[i] for i in np.random.default_rng(seed).permutation(len(cool))[:count]}
+    training, test = ([r for r in recordings if (r.name in names) == wanted] for wanted in (True, False))
+    normal = cool_stretches(training, config.rate_hz, cool_c=HOT_C, horizon_s=np.inf, joints=(CARRIER,))
     records = [stretch.profile for stretch in normal]
     own = np.random.SeedSequence(seed)
-    if folder is None:
-        twin = train(records, config, own, arm="logged", progress=progress)
-    else:
-        twin = train_or_load(records, config, own, arm="logged", folder=folder)
-    rest = [r for r in recordings if r.name not in names]
+    twin = train_or_load(records, config, own, arm="logged", folder=folder or cache_folder())
     parts = [
-        _windows(r, s, config) for r in rest for s in stretches(r, config.rate_hz) if len(s.time_s) >= config.window
+        _windows(r, s, config) for r in test for s in stretches(r, config.rate_hz) if len(s.time_s) >= config.window
     ]
     if not parts:
         raise FleetError(
-            f"None of the {len(rest)} test logs lasts {config.window / config.rate_hz:g} s; add longer logs."
+            f"None of the {len(test)} test logs lasts {config.window / config.rate_hz:g} s; add longer logs."
         )
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return LogStudy(
         twin=twin,
-        train_files=tuple(r.name for r in taught),
-        test_files=tuple(r.name for r in rest),
+        train_files=tuple(r.name for r in training),
         errors=twin.window_errors(joined["windows"]),
         **joined,
     )
@@ -159,22 +142,26 @@ def hot_and_cool(study: LogStudy) -> HotAndCool:
         raise FleetError(
             f"{hot.sum()} of {len(hot)} test windows are hot (joint 2 at {HOT_C:g} °C): nothing to compare."
         )
-    errors, d = study.errors[:, JOINT], study.difficulty[:, JOINT]
-    scores = {"d": errors.sum(axis=1), **{c: errors[:, i] for i, c in enumerate(CHANNELS)}}
-    scores["rms_torque"] = study.rms_torque[:, JOINT]
-    mean = {kind: errors[mask].mean(axis=0) for kind, mask in (("cool", ~hot), ("hot", hot))}
+    errors, d = study.errors[:, CARRIER], study.difficulty[:, CARRIER]
+    scores = {"d": errors.sum(axis=1), **dict(zip(CHANNELS, errors.T, strict=True))}
+    scores["rms_torque"] = study.rms_torque[:, CARRIER]
+    cool_error, hot_error = errors[~hot].mean(axis=0), errors[hot].mean(axis=0)
     return HotAndCool(
         cool_windows=int((~hot).sum()),
         hot_windows=int(hot.sum()),
-        cool_error=tuple(mean["cool"].tolist()),
-        hot_error=tuple(mean["hot"].tolist()),
-        ratio=float(mean["hot"].sum() / mean["cool"].sum()),
-        median_ratio=float(np.median(scores["d"][hot]) / np.median(scores["d"][~hot])),
+        cool_error=cool_error,
+        hot_error=hot_error,
+        ratio=float(hot_error.sum() / cool_error.sum()),
         cool_difficulty=float(np.median(d[~hot])),
         hot_difficulty=float(np.median(d[hot])),
-        auroc={name: float(roc_auc_score(hot, score)) for name, score in scores.items()},
-        auprc={name: float(average_precision_score(hot, score)) for name, score in scores.items()},
+        ranking=ranking(hot, scores),
     )
+
+
+def ranking(event: Array, scores: Mapping[str, Array]) -> dict[str, dict[str, float]]:
+    """AUROC and AUPRC of scores [window] for an event, bool [window]: [measure][score]."""
+    measures = {"auroc": roc_auc_score, "auprc": average_precision_score}
+    return {m: {name: float(of(event, score)) for name, score in scores.items()} for m, of in measures.items()}
 
 
 def _temperatures(recording: Recording) -> Array:

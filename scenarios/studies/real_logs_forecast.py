@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from sklearn.linear_model import LogisticRegression
-from sklearn.metrics import average_precision_score, roc_auc_score
 from sklearn.model_selection import GroupKFold, cross_val_predict
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from fleet.errors import FleetError
-from scenarios.studies.real_logs import AHEAD_S, HOT_C, JOINT, LogStudy
+from scenarios.studies.ranking import CARRIER
+from scenarios.studies.real_logs import AHEAD_S, HOT_C, LogStudy, ranking
 from twin.logs.heat_log import heat_logs
 from twin.logs.recording import Recording
 from twin.thermal.forecast import continued_peaks, planned_peaks
@@ -41,9 +41,9 @@ class Passing:
     """Files with such windows; windows of one file are much alike."""
     auroc: dict[str, float]
     """`d`: difficulty of joint 2 in the window. `temperature`: of joint 2 at its end. `rc, load continued`: peak
-    predicted by the identified network, observed up to the window's end, its load going on. `rc, load planned`: the
-    same with q, qd, tau of the coming five minutes known, as of a plan. `all`: logistic of d, temperature and
-    `rc, load continued`, held out by files. `nominal rc, …`: by the project's defaults."""
+    predicted by the identified network if the load of the window continues. `rc, load planned`: the same with q, qd,
+    tau of the next five minutes, as from a plan. `all`: logistic of d, temperature and `rc, load continued`, held out
+    by files. `nominal rc, …`: by the project's defaults."""
     auprc: dict[str, float]
 
 
@@ -70,13 +70,13 @@ def log_rc(study: LogStudy, recordings: Sequence[Recording], *, identified: Iden
     """
     by_name = {r.name: r for r in recordings}
     arm = identified or identify([by_name[name] for name in study.train_files], arm="logged")
-    scores = {"d": study.difficulty[:, JOINT], "temperature": study.end_c[:, JOINT]}
+    scores = {"d": study.difficulty[:, CARRIER], "temperature": study.end_c[:, CARRIER]}
     for label, twin in (("rc", RcTwin.of(arm)), ("nominal rc", RcTwin.nominal())):
         continued, planned = forecasts(study, by_name, twin)
         scores |= {f"{label}, load continued": continued, f"{label}, load planned": planned}
-    known = np.isfinite(study.peak_next_c[:, JOINT]) & np.all([np.isfinite(s) for s in scores.values()], axis=0)
-    below = known & (study.end_c[:, JOINT] < HOT_C)
-    return LogRc(identified=arm, below=_passing(study, scores, below), every=_passing(study, scores, known))
+    complete = np.isfinite(study.peak_next_c[:, CARRIER]) & np.all([np.isfinite(s) for s in scores.values()], axis=0)
+    below = complete & (study.end_c[:, CARRIER] < HOT_C)
+    return LogRc(identified=arm, below=_passing(study, scores, below), every=_passing(study, scores, complete))
 
 
 def forecasts(study: LogStudy, recordings: dict[str, Recording], twin: RcTwin) -> tuple[Array, Array]:
@@ -95,15 +95,15 @@ def forecasts(study: LogStudy, recordings: dict[str, Recording], twin: RcTwin) -
                 (continued, continued_peaks(twin, past, states, AHEAD_S, past_s=past_s)),
                 (planned, planned_peaks(twin, coming, states, AHEAD_S)),
             ):
-                out[mine[here]] = peaks[edge[here], JOINT]
+                out[mine[here]] = peaks[edge[here], CARRIER]
     return continued, planned
 
 
 def _passing(study: LogStudy, scores: dict[str, Array], chosen: Array) -> Passing:
-    passes, files = study.peak_next_c[chosen, JOINT] >= HOT_C, study.file[chosen]
+    passes, files = study.peak_next_c[chosen, CARRIER] >= HOT_C, study.file[chosen]
     if passes.all() or not passes.any():
         raise FleetError(
-            f"Joint {JOINT + 1} passes {HOT_C:g} °C after {passes.sum()} of {len(passes)} test windows: nothing to "
+            f"Joint {CARRIER + 1} passes {HOT_C:g} °C after {passes.sum()} of {len(passes)} test windows: nothing to "
             "tell apart. Add logs of heavier or of lighter work."
         )
     picked = {name: values[chosen] for name, values in scores.items()}
@@ -114,13 +114,12 @@ def _passing(study: LogStudy, scores: dict[str, Array], chosen: Array) -> Passin
         passing=int(passes.sum()),
         files=len(np.unique(files)),
         files_passing=len(np.unique(files[passes])),
-        auroc={name: float(roc_auc_score(passes, score)) for name, score in picked.items()},
-        auprc={name: float(average_precision_score(passes, score)) for name, score in picked.items()},
+        **ranking(passes, picked),
     )
 
 
 def _together(scores: list[Array], passes: Array, files: Array) -> Array:
-    """Score by a logistic regression that has not seen the window's file, [window]."""
+    """Cross-validated score of a logistic regression, held out by files, [window]."""
     model = make_pipeline(StandardScaler(), LogisticRegression())
     folds = GroupKFold(FOLDS, shuffle=True, random_state=0)
     x = np.column_stack(scores)

@@ -1,12 +1,15 @@
 """Jobs on which twins are judged: one arm with cool training jobs, a natural mix of test jobs, and light novel motions.
 
-Labels come from the simulator's true thermal law, which no twin sees.
+Labels come from the simulator's true thermal law, which no twin uses.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
+from functools import cached_property
+from itertools import count, islice
+from pathlib import Path
 
+import networkx as nx
 import numpy as np
 
 from fleet.errors import FleetError
@@ -18,13 +21,16 @@ from fleet.seeding import child
 from fleet.thermal import ThermalModel, ThermalSpread, gen3_network, spread_motors, thermal_model
 from scenarios.prepare.cool_motion import cold_peaks, records
 from scenarios.prepare.planned_arm import ArmHardware
+from scenarios.prepare.train_twins import train_or_load
+from twin.vae.model import TwinConfig
+from twin.vae.twin import Twin
 
 Array = np.ndarray
 
 GRIPPER_KG = 0.925
 """Robotiq 2F-85 with its coupling."""
 SUBJECT = Robot(name="arm", tool_kg=GRIPPER_KG)
-"""On the floor, as most arms stand."""
+"""On the floor, as most arms."""
 _BATCH = 25
 _MOST_BATCHES = 400
 
@@ -49,13 +55,14 @@ class Sample:
         return records(self.plans)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Study:
     """One arm with its own thermal parameters, and four disjoint samples of jobs."""
 
     robot: Robot
     motors: Motors
-    thermal: ThermalModel
+    network: nx.Graph
+    """Thermal network."""
     ambient_c: float
     """Ambient temperature, and every temperature at the start."""
     horizon_s: float
@@ -69,6 +76,11 @@ class Study:
     """The natural mix, cool to critical."""
     novel: Sample
     """Light motions of other kinds; none is critical."""
+
+    @cached_property
+    def thermal(self) -> ThermalModel:
+        """The arm's thermal law."""
+        return thermal_model(self.network)
 
     @property
     def hardware(self) -> ArmHardware:
@@ -111,65 +123,91 @@ def make_study(
             "A study needs sizes >= 0 and exploration <= train (got "
             f"train={train}, reference={reference}, test={test}, novel={novel}, exploration={exploration})."
         )
-    body, *draws = _children(seed, 6)
-    motors, thermal = _body(robot, spread or ThermalSpread.gen3(), body)
-    arm = _Subject(robot, motors, thermal, ambient_c, horizon_s)
-    natural, explored = arm.cool_jobs(draws[0], cool_c), arm.cool_jobs(draws[4], cool_c, light=True)
-    learned = _gathered([*islice(natural, train - exploration), *islice(explored, exploration)])
-    held_out = _gathered(islice(arm.cool_jobs(draws[1], cool_c), reference))
-    mixed = arm.judged(random_jobs(robot, test, draws[2], name="test"))
-    news = arm.judged(light_jobs(robot, novel, draws[3], name="novel"))
-    limit_c = ThermalLimits().warning_c
-    return Study(robot, motors, thermal, ambient_c, horizon_s, cool_c, limit_c, learned, held_out, mixed, news)
-
-
-def _children(seed: np.random.SeedSequence, count: int) -> list[np.random.Generator]:
-    """Independent generators."""
-    return [np.random.default_rng(child(seed, i)) for i in range(count)]
-
-
-def _body(robot: Robot, spread: ThermalSpread, rng: np.random.Generator) -> tuple[Motors, ThermalModel]:
-    motors = spread_motors(gen3_motors(wear=robot.wear), spread, rng)
-    network = gen3_network(cooling=robot.cooling, cooling_factor=robot.cooling_factor, spread=spread, rng=rng)
-    return motors, thermal_model(network)
+    body, *draws = (np.random.default_rng(child(seed, i)) for i in range(6))
+    spread = spread or ThermalSpread.gen3()
+    motors = spread_motors(gen3_motors(wear=robot.wear), spread, body)
+    network = gen3_network(cooling=robot.cooling, cooling_factor=robot.cooling_factor, spread=spread, rng=body)
+    arm = _Simulator(robot, motors, thermal_model(network), ambient_c, horizon_s, cool_c)
+    return Study(
+        robot=robot,
+        motors=motors,
+        network=network,
+        ambient_c=ambient_c,
+        horizon_s=horizon_s,
+        cool_c=cool_c,
+        warning_c=ThermalLimits().warning_c,
+        train=arm.cool_jobs((random_jobs, draws[0], train - exploration), (light_jobs, draws[4], exploration)),
+        reference=arm.cool_jobs((random_jobs, draws[1], reference)),
+        test=arm.sample(random_jobs(robot, test, draws[2], name="test")),
+        novel=arm.sample(light_jobs(robot, novel, draws[3], name="novel")),
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class _Subject:
+class Bench:
+    """Seeds, each with its own study, and how to train their twins."""
+
+    seeds: Sequence[np.random.SeedSequence]
+    config: TwinConfig
+    folder: Path
+    """Cache of trained twins."""
+    make: Callable[..., Study] = make_study
+    """Makes the study of a seed; sizes as in `make_study`."""
+
+    def studies(self, **sizes: int) -> Iterator[tuple[np.random.SeedSequence, Study, Twin]]:
+        """Every seed, its study in these sizes, and the twin trained on it.
+
+        Raises:
+            ValueError: no seeds.
+        """
+        if not self.seeds:
+            raise ValueError("A bench needs at least one seed.")
+        for seed in self.seeds:
+            study = self.make(seed, **sizes)
+            yield seed, study, self.train(study.train.records(), study, seed)
+
+    def train(
+        self, records: list[Array], study: Study, seed: np.random.SeedSequence, config: TwinConfig | None = None
+    ) -> Twin:
+        """A twin of these records, by default with the configuration of the bench."""
+        return train_or_load(records, config or self.config, seed, arm=study.robot.name, folder=self.folder)
+
+
+@dataclass(frozen=True, eq=False)
+class _Simulator:
     robot: Robot
     motors: Motors
     thermal: ThermalModel
     ambient_c: float
     horizon_s: float
+    cool_c: float
 
-    def judged(self, plans: Sequence[Plan]) -> Sample:
+    def sample(self, plans: Sequence[Plan]) -> Sample:
         """The plans with their peak temperatures."""
-        highest = cold_peaks(plans, self.motors, self.thermal, ambient_c=self.ambient_c, horizon_s=self.horizon_s)
-        return Sample(tuple(plans), highest)
+        peak_c = cold_peaks(plans, self.motors, self.thermal, ambient_c=self.ambient_c, horizon_s=self.horizon_s)
+        return Sample(tuple(plans), peak_c)
 
-    def cool_jobs(
-        self, rng: np.random.Generator, cool_c: float, *, light: bool = False
-    ) -> Iterator[tuple[Plan, Array]]:
-        """Jobs that stay cool over the whole horizon, with their peaks, one by one without end.
+    def cool_jobs(self, *parts: tuple[Callable[..., Sequence[Plan]], np.random.Generator, int]) -> Sample:
+        """Jobs that stay cool over the whole horizon: for each part how to draw them, and their number."""
+        jobs = [job for draw, rng, wanted in parts for job in islice(self._cool_jobs(draw, rng), wanted)]
+        peak_c = np.array([peak for _, peak in jobs]).reshape(len(jobs), JOINTS)
+        return Sample(tuple(plan for plan, _ in jobs), peak_c)
+
+    def _cool_jobs(self, draw: Callable[..., Sequence[Plan]], rng: np.random.Generator) -> Iterator[tuple[Plan, Array]]:
+        """Cool jobs with their peaks, one by one without end.
 
         Raises:
             FleetError: many batches without a cool job.
         """
-        draw = light_jobs if light else random_jobs
+        kind = "light" if draw is light_jobs else "job"
         barren = 0
-        for batch in range(10**9):
-            drawn = self.judged(draw(self.robot, _BATCH, rng, name=f"{'light' if light else 'job'}_{batch}"))
-            cool = ~(drawn.peak_c.max(axis=1) > cool_c)
+        for batch in count():
+            drawn = self.sample(draw(self.robot, _BATCH, rng, name=f"{kind}_{batch}"))
+            cool = ~(drawn.peak_c.max(axis=1) > self.cool_c)
             barren = 0 if cool.any() else barren + 1
             if barren == _MOST_BATCHES:
                 raise FleetError(
-                    f"Of {barren * _BATCH} jobs of arm '{self.robot.name}' none stays below {cool_c:g} °C for "
+                    f"Of {barren * _BATCH} jobs of arm '{self.robot.name}' none stays below {self.cool_c:g} °C for "
                     f"{self.horizon_s:g} s from {self.ambient_c:g} °C; raise cool_c."
                 )
-            yield from ((plan, drawn.peak_c[i]) for i, plan in enumerate(drawn.plans) if cool[i])
-
-
-def _gathered(jobs: Sequence[tuple[Plan, Array]] | Iterator[tuple[Plan, Array]]) -> Sample:
-    kept = list(jobs)
-    highest = np.array([peak for _, peak in kept]).reshape(len(kept), JOINTS)
-    return Sample(tuple(plan for plan, _ in kept), highest)
+            yield from ((drawn.plans[i], drawn.peak_c[i]) for i in np.flatnonzero(cool))

@@ -10,6 +10,8 @@ from fleet.physics.models import ArmModel
 from fleet.thermal import HOUSING, WINDING, node_heat, temperature_steps
 from scenarios.studies.setup import Study
 from twin.logs.recording import Recording
+from twin.thermal.identify import identify
+from twin.thermal.result import Identified
 
 Array = np.ndarray
 
@@ -17,6 +19,16 @@ LOG_HZ = 2.0
 """Sampling rate of the public logs of a real Gen3."""
 AIR_SD_K = 1.5
 """Standard deviation of a recording's ambient temperature around the study's."""
+
+
+LOGS = 6
+"""Recordings, half an hour each, from which the arm is identified."""
+
+
+def identify_from_work(study: Study, plans: Sequence[Plan], rng: np.random.Generator) -> Identified:
+    """The studied arm identified from logs of these plans; none of them should overheat it."""
+    logs = own_logs(study, plans, rng)
+    return identify(logs, arm=study.robot.name, ambient_c=study.ambient_c, ambient_sd_k=AIR_SD_K)
 
 
 def own_logs(
@@ -40,10 +52,13 @@ def _log(study: Study, plan: Plan, rng: np.random.Generator, work_s: float, rest
     shown = np.concatenate([moving[::every], np.broadcast_to(still, (rest + 1, *still.shape))])
     loads = [drive(part, motors) for part in moving.reshape(work, every, *moving.shape[1:])]
     loads += [static_drive(still[2], motors)] * rest
-    air_c = study.ambient_c + AIR_SD_K * rng.standard_normal()
-    start_c = thermal.steady(node_heat(np.zeros_like(home), motors.idle_w), air_c)
-    alike = {"motors": motors, "thermal": thermal, "start_c": start_c, "ambient_c": air_c}
-    temps = np.stack(list(temperature_steps(loads, 1.0 / LOG_HZ, **alike)))
+    ambient_c = study.ambient_c + AIR_SD_K * rng.standard_normal()
+    start_c = thermal.steady(node_heat(np.zeros_like(home), motors.idle_w), ambient_c)
+    temps = np.stack(
+        list(
+            temperature_steps(loads, 1.0 / LOG_HZ, motors=motors, thermal=thermal, start_c=start_c, ambient_c=ambient_c)
+        )
+    )
     q, qd, tau = shown.transpose(1, 0, 2)
     noise = motors.sensor_noise_k * rng.standard_normal((len(temps), len(home)))
     return Recording(

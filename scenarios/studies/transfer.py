@@ -5,10 +5,10 @@ The twin was trained without labels; the regressor gets a few jobs with their tr
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from itertools import product
 
 import numpy as np
+from sklearn.compose import TransformedTargetRegressor
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import RidgeCV
 from sklearn.metrics import r2_score, root_mean_squared_error
@@ -17,11 +17,9 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from fleet.errors import FleetError
-from scenarios.prepare.train_twins import train_or_load
-from scenarios.studies.benchmark import Make, jobs_of
+from scenarios.studies.benchmark import jobs_of
 from scenarios.studies.ranking import Jobs
-from scenarios.studies.setup import make_study
-from twin.vae.model import TwinConfig
+from scenarios.studies.setup import Bench
 from twin.vae.twin import Twin
 from twin.vae.window import JobWindows, cut_jobs
 
@@ -31,20 +29,20 @@ LABELS = (10, 50, 200)
 DRAWS = 10
 """Random choices of the labelled jobs per number and seed."""
 INPUTS = ("latent", "raw", "both")
-REGRESSORS = ("ridge", "MLP")
+REGRESSORS: dict[str, Callable[[int], RidgeCV | MLPRegressor]] = {
+    "ridge": lambda _: RidgeCV(alphas=np.logspace(-2, 4, 13)),  # leave-one-out
+    "MLP": lambda seed: MLPRegressor(
+        hidden_layer_sizes=(32,), alpha=1.0, solver="lbfgs", max_iter=300, random_state=seed
+    ),
+}
+"""By name, from a seed."""
 _CHUNK = 256
 """Jobs read at a time."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class TransferRow:
-    """Errors on held-out jobs, one entry per seed and draw of labels."""
-
-    inputs: str
-    regressor: str
-    labels: int
-    rmse_k: tuple[float, ...]
-    r2: tuple[float, ...]
+Errors = dict[tuple[str, str, int], dict[str, list[float]]]
+"""[inputs, regressor, number of labels][measure] → one value per seed and draw of labels, on held-out jobs."""
+MEASURES = {"rmse_k": root_mean_squared_error, "r2": r2_score}
 
 
 def job_inputs(twin: Twin, jobs: Jobs) -> dict[str, Array]:
@@ -76,25 +74,14 @@ def over_time(reading: JobWindows, values: Array) -> Array:
     return np.concatenate([mean, np.sqrt(variance)], axis=1)
 
 
-def fit(regressor: str, x: Array, y: Array, seed: int) -> Callable[[Array], Array]:
-    """A regressor of y [job] fitted on x [job, feature], both standardised inside.
-
-    Raises:
-        ValueError: an unknown regressor.
-    """
-    if regressor == "ridge":
-        model = RidgeCV(alphas=np.logspace(-2, 4, 13))  # leave-one-out
-    elif regressor == "MLP":
-        model = MLPRegressor(hidden_layer_sizes=(32,), alpha=1.0, solver="lbfgs", max_iter=300, random_state=seed)
-    else:
-        raise ValueError(f"No regressor '{regressor}'. Allowed: {', '.join(REGRESSORS)}.")
-    mean, scale = float(y.mean()), float(y.std()) or 1.0
-    pipeline = make_pipeline(StandardScaler(), model)
+def fit(regressor: str, x: Array, y: Array, seed: int) -> TransformedTargetRegressor:
+    """A regressor of `REGRESSORS` for y [job] fitted on x [job, feature], both standardised."""
+    pipeline = make_pipeline(StandardScaler(), REGRESSORS[regressor](seed))
+    model = TransformedTargetRegressor(pipeline, transformer=StandardScaler())
     with warnings.catch_warnings():
         # The iterations are limited on purpose, as early stopping.
         warnings.simplefilter("ignore", ConvergenceWarning)
-        pipeline.fit(x, (y - mean) / scale)
-    return lambda new: mean + scale * np.asarray(pipeline.predict(new))
+        return model.fit(x, y)
 
 
 def compare(
@@ -104,7 +91,7 @@ def compare(
     *,
     labels: Sequence[int] = LABELS,
     draws: int = DRAWS,
-) -> list[TransferRow]:
+) -> Errors:
     """Errors of every input and regressor by number of labels; all get the same draws, and half of the jobs test.
 
     Args:
@@ -119,52 +106,28 @@ def compare(
     order = rng.permutation(len(rise_k))
     pool, held_out = order[: len(order) // 2], order[len(order) // 2 :]
     chosen = {n: [(rng.permutation(pool)[:n], int(rng.integers(2**31))) for _ in range(draws)] for n in labels}
-    rows = []
-    for name, x in inputs.items():
-        for regressor in REGRESSORS:
-            for n, picks in chosen.items():
-                predictions = [fit(regressor, x[some], rise_k[some], seed)(x[held_out]) for some, seed in picks]
-                rows.append(
-                    TransferRow(
-                        inputs=name,
-                        regressor=regressor,
-                        labels=n,
-                        rmse_k=tuple(float(root_mean_squared_error(rise_k[held_out], y)) for y in predictions),
-                        r2=tuple(float(r2_score(rise_k[held_out], y)) for y in predictions),
-                    )
-                )
-    return rows
+    errors: Errors = {}
+    for (name, x), regressor, (n, picks) in product(inputs.items(), REGRESSORS, chosen.items()):
+        predictions = [fit(regressor, x[some], rise_k[some], seed).predict(x[held_out]) for some, seed in picks]
+        errors[name, regressor, n] = {
+            measure: [float(of(rise_k[held_out], y)) for y in predictions] for measure, of in MEASURES.items()
+        }
+    return errors
 
 
-def transfer(
-    seeds: Sequence[np.random.SeedSequence],
-    *,
-    config: TwinConfig,
-    folder: Path,
-    make: Make = make_study,
-    labels: Sequence[int] = LABELS,
-    draws: int = DRAWS,
-) -> list[TransferRow]:
-    """Latent against raw features for the rise of the hottest winding, with a study and a twin per seed.
+def transfer(bench: Bench, *, labels: Sequence[int] = LABELS, draws: int = DRAWS) -> Errors:
+    """Latent against raw features for the rise of the hottest winding.
 
     Raises:
         ValueError: no seeds.
         FleetError: fewer than twice as many test jobs as labels.
     """
-    if not seeds:
-        raise ValueError("Transfer needs at least one seed.")
     per_seed = []
-    for seed in seeds:
-        study = make(seed)
-        twin = train_or_load(study.train.records(), config, seed, arm=study.robot.name, folder=folder)
+    for seed, study, twin in bench.studies():
         rise_k = study.test.peak_c.max(axis=1) - study.ambient_c
         inputs = job_inputs(twin, jobs_of(study.test, study.horizon_s))
         per_seed.append(compare(inputs, rise_k, np.random.default_rng(seed), labels=labels, draws=draws))
-    return [
-        replace(
-            rows[0],
-            rmse_k=tuple(value for row in rows for value in row.rmse_k),
-            r2=tuple(value for row in rows for value in row.r2),
-        )
-        for rows in zip(*per_seed, strict=True)
-    ]
+    return {
+        row: {measure: [value for errors in per_seed for value in errors[row][measure]] for measure in MEASURES}
+        for row in per_seed[0]
+    }

@@ -7,9 +7,9 @@ import pytest
 
 from scenarios.prepare.train_twins import train_or_load
 from scenarios.studies.detection_metrics import Detection
-from scenarios.studies.ranking import QUESTIONS, table
+from scenarios.studies.ranking import QUESTIONS, side_by_side
 from scenarios.studies.self_training import GENERATED, OWN, PRIOR, autonomy, generated_plans, prior_records, remaining
-from scenarios.studies.setup import make_study
+from scenarios.studies.setup import Bench, make_study
 from twin.baselines.reconstruction import untrained_config
 from twin.vae.model import TwinConfig
 
@@ -29,17 +29,13 @@ def folder(tmp_path_factory):
 
 
 def test_a_twin_that_is_given_its_own_data_again_is_the_same_twin(study, folder):
-    result = autonomy(
-        [SEED],
-        config=TINY,
-        folder=folder,
-        make=lambda _: study,
-        propose=lambda study, twin, count, seed: study.train.plans,
-    )
+    bench = Bench([SEED], TINY, folder, lambda _: study)
+    result = autonomy(bench, propose=lambda study, twin, count, seed: study.train.plans)
     for question in QUESTIONS:
-        assert result.row(OWN, question).seeds == result.row(GENERATED, question).seeds
-        assert result.row(PRIOR, question).seeds != result.row(OWN, question).seeds
-        for share in remaining(result, question).values():
+        scorers = result[question]
+        np.testing.assert_equal(scorers[GENERATED], scorers[OWN])
+        assert any((scorers[PRIOR][m] != scorers[OWN][m]).any() for m in scorers[OWN])
+        for share in remaining(scorers).values():
             np.testing.assert_allclose(share, 1.0)
 
 
@@ -50,12 +46,13 @@ def test_what_is_proposed_is_told_how_much_and_by_which_seed(study, folder):
         told.append((count, seed))
         return study.train.plans[:count]
 
+    bench = Bench([SEED], TINY, folder, lambda _: study)
     for _ in range(2):
-        autonomy([SEED], config=TINY, folder=folder, make=lambda _: study, propose=propose, count=3)
+        autonomy(bench, propose=propose, count=3)
     assert told[0] == told[1]
     assert told[0][0] == 3
     with pytest.raises(ValueError, match="at least one generated job"):
-        autonomy([SEED], config=TINY, folder=folder, make=lambda _: study, count=0)
+        autonomy(bench, count=0)
 
 
 def test_prior_samples_are_windows_of_the_twin_in_si_units(study, folder):
@@ -73,8 +70,9 @@ def some(auroc, auprc, spearman):
 
 def test_what_remains_by_hand():
     real, again = some(0.9, 0.8, 0.5), some(0.7, 0.4, 0.5)
-    quality = table([{(name, q): found for q in QUESTIONS for name, found in ((OWN, real), (GENERATED, again))}])
-    assert {name: share[0] for name, share in remaining(quality, QUESTIONS[0]).items()} == pytest.approx(
+    quality = side_by_side([{key: {OWN: real, GENERATED: again} for key in QUESTIONS}])
+    shares = remaining(quality["any joint, total"])
+    assert {name: share[0] for name, share in shares.items()} == pytest.approx(
         {"auroc": 0.5, "auprc": 0.5, "spearman": 1.0}
     )
 

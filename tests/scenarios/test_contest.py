@@ -1,4 +1,4 @@
-"""Who takes part, and that twins are read as they score themselves; tiny studies, networks left untrained_config."""
+"""Scorers of the benchmark, on tiny studies with untrained networks."""
 
 from dataclasses import replace
 
@@ -13,15 +13,14 @@ from scenarios.studies.benchmark import (
     VAE,
     TwinScorer,
     chosen_variants,
-    difficulty,
-    identified_twin,
     jobs_of,
     quality,
     twin_scorers,
     variants,
 )
-from scenarios.studies.ranking import CARRIER, HEAT, MEASURES, verdicts
-from scenarios.studies.setup import make_study
+from scenarios.studies.ranking import CARRIER, MEASURES, verdicts
+from scenarios.studies.setup import Bench, make_study
+from scenarios.studies.simulated_logs import identify_from_work
 from twin.baselines.reconstruction import ModelScorer, untrained_config
 from twin.thermal.thermal_twin import RcTwin
 from twin.vae.model import TwinConfig
@@ -52,9 +51,9 @@ def test_jobs_fill_the_horizon(study):
         assert (times - 1) * plan.cycle.duration_s < study.horizon_s
 
 
-def test_a_twin_is_read_as_it_scores_itself(study, twin):
+def test_the_scorer_of_a_twin_gives_its_own_score(study, twin):
     jobs = jobs_of(study.novel, study.horizon_s)
-    read = TwinScorer(VAE, twin, difficulty).scores(jobs.plans, jobs.repetitions)
+    read = TwinScorer(VAE, twin).scores(jobs.plans, jobs.repetitions)
     told = ModelScorer(VAE, twin).scores(jobs.plans, jobs.repetitions)
     np.testing.assert_allclose(read.per_joint, told.per_joint)
     np.testing.assert_allclose(read.total, told.total)
@@ -78,41 +77,44 @@ def test_the_variants_differ_in_one_thing_each():
 
 @pytest.fixture(scope="module")
 def result(study, tmp_path_factory):
-    """Everybody's quality under one seed."""
-    return quality([SEED], config=TINY, folder=tmp_path_factory.mktemp("twins"), make=lambda _: study, logs=1)
+    """Quality of every scorer under one seed."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("scenarios.studies.benchmark.LOGS", 1)
+        return quality(Bench([SEED], TINY, tmp_path_factory.mktemp("twins"), lambda _: study))
 
 
-def test_everybody_takes_part_and_is_measured(result):
-    names = {row.scorer for row in result.rows}
-    assert set(BASELINES) <= names
-    assert {VAE, "VAE d_cal", "VAE torque channel", "VAE one-sided torque", "VAE z=8", "VAE whole arm"} <= names
-    for row in result.rows:
-        for measure in MEASURES:
-            assert -1 <= row.values(measure)[0] <= 1, (row.scorer, measure)
+def test_every_scorer_is_measured(result):
+    for scorers in result.values():
+        assert set(BASELINES) <= set(scorers)
+        assert {VAE, "VAE d_cal", "VAE torque channel", "VAE one-sided torque", "VAE z=8", "VAE whole arm"} <= set(
+            scorers
+        )
+        for name, values in scorers.items():
+            assert list(values) == list(MEASURES)
+            assert all(-1 <= seeds[0] <= 1 for seeds in values.values()), name
 
 
-def test_who_is_told_of_heat_knows_best(result):
-    """The label follows from the thermal law, so that of a nominal arm and the arm's own find nearly all."""
-    assert [name for name in BASELINES if result.knows(name) == HEAT] == list(THERMAL)
+def test_thermal_networks_rank_best(result):
+    """The label follows from the thermal law, so the networks of a nominal arm and of the arm rank nearly all."""
     for name in ("rc nominal", "rc identified"):
         for question in ("any joint, total", "joint 2, joint 2"):
-            row = result.row(name, question)
-            assert row.values("auroc")[0] > 0.97
-            assert row.values("spearman")[0] > 0.97
+            assert result[question][name]["auroc"][0] > 0.97
+            assert result[question][name]["spearman"][0] > 0.97
     assert all(
-        "with motor data and the thermal law, VAE is beaten by" in said
-        for said in verdicts(result, VAE, BASELINES)[1::2]
+        "with motor data and the thermal law, VAE is beaten by" in sentence
+        for sentence in verdicts(result, VAE, BASELINES, thermal=THERMAL)[1::2]
     )
 
 
-def test_logs_of_cool_jobs_tell_the_arm(study):
+def test_logs_of_cool_jobs_identify_the_arm(study):
     """Nearer to the truth than a nominal arm, for jobs that overheat too, none of which was logged."""
     jobs = jobs_of(study.test, study.horizon_s)
     start_c = np.full(NODES, study.ambient_c)
     nominal = RcTwin.nominal(ambient_c=study.ambient_c)
+    own = identify_from_work(study, study.train.plans[:2], np.random.default_rng(SEED))
     wrong_k = [
         rc.peaks(jobs.plans, jobs.repetitions, start_c=start_c)[:, CARRIER] - jobs.peak_c[:, CARRIER]
-        for rc in (nominal, identified_twin(study, SEED, logs=2))
+        for rc in (nominal, RcTwin.of(own))
     ]
     assert np.abs(wrong_k[1]).mean() < 0.5 * np.abs(wrong_k[0]).mean()
 

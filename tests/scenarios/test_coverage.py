@@ -1,6 +1,5 @@
-"""What exploration is worth: rates counted by hand on a few jobs, whose scores are their payloads."""
+"""Effect of exploration: rates counted by hand on a few jobs, whose scores are their payloads."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +8,9 @@ import pytest
 
 from fleet.motor import gen3_motors
 from fleet.robot import JOINTS, Robot
-from fleet.thermal import gen3_network, thermal_model
-from scenarios.studies import exploration as module
-from scenarios.studies.exploration import READ, coverage
-from scenarios.studies.setup import Sample, Study
+from fleet.thermal import gen3_network
+from scenarios.studies.exploration import SCORES, coverage
+from scenarios.studies.setup import Bench, Sample, Study
 from twin.vae.measures import Features
 from twin.vae.model import TwinConfig
 
@@ -56,7 +54,7 @@ def make(small):
         return Study(
             robot=Robot(name="arm"),
             motors=gen3_motors(),
-            thermal=thermal_model(gen3_network()),
+            network=gen3_network(),
             ambient_c=23.0,
             horizon_s=HORIZON_S,
             cool_c=40.0,
@@ -82,38 +80,43 @@ def trainings(monkeypatch) -> list[dict[str, Any]]:
         seen.append({"explored": explored, "work": len(payloads) - explored, "seed": seed, "config": config})
         return ByExcess(explored > 0)
 
-    monkeypatch.setattr(module, "train_or_load", train)
+    monkeypatch.setattr("scenarios.studies.setup.train_or_load", train)
     return seen
 
 
 def test_rates_are_those_counted_by_hand(make, trainings):
-    found = coverage(SEEDS, config=TwinConfig(), folder=Path("none"), exploration=3, train=8, make=make)
-    assert (found.exploration, found.train) == (3, 8)
-    assert set(found.without) == set(found.explored) == set(READ)
+    found = coverage(Bench(SEEDS, TwinConfig(), Path("none"), make), exploration=3, train=8)
+    assert list(found) == [0, 3]
+    assert set(found[0]) == set(found[3]) == set(SCORES)
     for seed in range(len(SEEDS)):
-        without, explored = found.without["excess"][seed], found.explored["excess"][seed]
+        without, explored = ({m: row[seed] for m, row in found[count]["excess"].items()} for count in (0, 3))
         # Ranked 3 kg (critical), 2, 1 (critical), 0.5: three of four pairs are in order.
-        assert without.auroc == 0.75
-        assert without.auprc == pytest.approx(0.5 * 1 + 0.5 * 2 / 3)
-        assert without.spearman == pytest.approx(1 - 6 * (0 + 1 + 1 + 4) / 60)  # ranks 4 2 1 3 and 4 3 2 1
+        assert without["auroc"] == 0.75
+        assert without["auprc"] == pytest.approx(0.5 * 1 + 0.5 * 2 / 3)
+        assert without["spearman"] == pytest.approx(1 - 6 * (0 + 1 + 1 + 4) / 60)  # ranks 4 2 1 3 and 4 3 2 1
         # At 5 % of 19 references only what is above all of them, 1.8 kg, raises an alarm.
-        assert without.caught == 0.5
-        assert without.false_novel == 0.5
-        assert explored == replace(without, false_novel=0.0)
+        assert without["caught"] == 0.5
+        assert without["false_novel"] == 0.5
+        assert explored == {**without, "false_novel": 0.0}
         # Its errors fall with the payload: no test job stands out, and only one pair is in order.
-        falling = found.without["joint_2"][seed]
-        assert (falling.auroc, falling.caught, falling.false_novel) == (0.25, 0.0, 0.0)
+        falling = {m: row[seed] for m, row in found[0]["joint_2"].items()}
+        assert (falling["auroc"], falling["caught"], falling["false_novel"]) == (0.25, 0.0, 0.0)
 
 
 def test_both_twins_get_as_many_jobs_and_the_same_seed(make, trainings):
     config = TwinConfig.quick()
-    coverage(SEEDS, config=config, folder=Path("none"), exploration=3, train=8, make=make)
-    assert [(t["work"], t["explored"]) for t in trainings] == [(8, 0), (5, 3)] * 2
-    assert [t["seed"] for t in trainings] == [SEEDS[0], SEEDS[0], SEEDS[1], SEEDS[1]]
+    coverage(Bench(SEEDS, config, Path("none"), make), exploration=3, train=8)
+    assert [(t["work"], t["explored"]) for t in trainings] == [(8, 0)] * 2 + [(5, 3)] * 2
+    assert [t["seed"] for t in trainings] == [*SEEDS, *SEEDS]
     assert all(t["config"] == config for t in trainings)
 
 
-@pytest.mark.parametrize(("seeds", "exploration"), [([], 3), (SEEDS, 0), (SEEDS, 9)])
-def test_no_seed_and_no_or_too_much_exploration_are_refused(make, seeds, exploration):
-    with pytest.raises(ValueError, match="a seed and 0 < exploration <= train"):
-        coverage(seeds, config=TwinConfig(), folder=Path("none"), exploration=exploration, train=8, make=make)
+@pytest.mark.parametrize("exploration", [0, 9])
+def test_no_or_too_much_exploration_is_refused(make, exploration):
+    with pytest.raises(ValueError, match="0 < exploration <= train"):
+        coverage(Bench(SEEDS, TwinConfig(), Path("none"), make), exploration=exploration, train=8)
+
+
+def test_no_seed_is_refused(make):
+    with pytest.raises(ValueError, match="at least one seed"):
+        coverage(Bench([], TwinConfig(), Path("none"), make), exploration=3, train=8)

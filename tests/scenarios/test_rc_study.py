@@ -12,7 +12,6 @@ from fleet.robot import JOINTS
 from fleet.thermal import WINDING
 from scenarios.studies.real_logs import CONFIG, LogStudy, log_study
 from scenarios.studies.real_logs_forecast import log_rc
-from scenarios.studies.report.saturation_chapters import network_of
 from scenarios.studies.saturation import judge_networks, past_work
 from scenarios.studies.setup import Study, make_study
 from scenarios.studies.simulated_logs import AIR_SD_K, own_logs
@@ -40,7 +39,7 @@ def test_intervals_hold_the_truth_on_brisk_work_logged_at_2_hz():
         brisk = make_study(np.random.SeedSequence(seed), train=6, reference=0, test=0, novel=0)
         logs = own_logs(brisk, brisk.train.plans, np.random.default_rng(seed))
         found = identify(logs, ambient_c=brisk.ambient_c, ambient_sd_k=AIR_SD_K)
-        truth = HeatModel(brisk.motors, network_of(brisk.thermal))
+        truth = HeatModel(brisk.motors, brisk.network)
         for p in found.parameters:
             true = float(truth.value(p.name)[0 if p.joint is None else p.joint - 1])
             inside.append(p.low <= true <= p.high)
@@ -68,8 +67,6 @@ def test_an_identified_arm_knows_its_peaks_and_both_are_trusted(study: Study):
     assert nominal.table.count.sum() == 80
     assert min(each.auroc for each in pair) > 0.95
     assert max(each.brier for each in pair) < 0.08
-    assert identified.peak_error_k is not None
-    assert nominal.peak_error_k is not None
     assert identified.peak_error_k < 0.7 * nominal.peak_error_k
     with pytest.raises(ValueError, match="more than 150 \\+ 10 test jobs"):
         past_work(study, seed=5, labelled=150, watched=10)
@@ -119,7 +116,6 @@ def windows_of(recordings: list[Recording]) -> LogStudy:
     return LogStudy(
         twin=cast(Any, _Clock()),
         train_files=(recordings[0].name,),
-        test_files=tuple(r.name for r in recordings),
         file=np.array(files),
         start_s=np.tile(end_s - 24.5, len(recordings)),
         end_s=np.tile(end_s, len(recordings)),

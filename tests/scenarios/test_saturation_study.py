@@ -1,4 +1,4 @@
-"""Whether the study of trust finds what is there: with twins whose sight is known beforehand."""
+"""Quality of P(saturation), for stand-ins of a twin that report the true heat or noise."""
 
 from dataclasses import dataclass
 
@@ -58,9 +58,8 @@ def test_alarms_are_rarely_false_whatever_they_go_by(judged, work) -> None:
     for _, alarms in judged:
         for alarm in alarms.values():
             # A calibration at its worst of a thousand, and the luck of the held-out jobs on top.
-            calm = round(140 * (1 - work.share_passed))
+            calm = round(140 * (1 - work.jobs.passed[work.held_out].mean()))
             assert alarm.false_alarms <= binom.ppf(0.999, calm, 0.13) / calm
-            assert alarm.expected[0] < 0.05 < alarm.expected[1]
     assert judged[1][1]["p_excess"].caught > 0.85 > 0.5 > judged[0][1]["sum"].caught
 
 

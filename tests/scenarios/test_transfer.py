@@ -8,7 +8,7 @@ import pytest
 from fleet.errors import FleetError
 from scenarios.prepare.train_twins import train_or_load
 from scenarios.studies.benchmark import jobs_of
-from scenarios.studies.setup import make_study
+from scenarios.studies.setup import Bench, make_study
 from scenarios.studies.transfer import INPUTS, REGRESSORS, compare, fit, job_inputs, moments, over_time, transfer
 from twin.baselines.reconstruction import untrained_config
 from twin.vae.model import TwinConfig
@@ -44,7 +44,7 @@ def rng():
 def test_what_depends_linearly_is_learned_exactly(rng):
     x = rng.normal(size=(60, 4))
     y = 30.0 + x @ np.array([1.0, -2.0, 0.5, 0.0])
-    said = fit("ridge", x[:40], y[:40], seed=0)(x[40:])
+    said = fit("ridge", x[:40], y[:40], seed=0).predict(x[40:])
     solved, *_ = np.linalg.lstsq(np.c_[np.ones(40), x[:40]], y[:40], rcond=None)
     np.testing.assert_allclose(said, np.c_[np.ones(20), x[40:]] @ solved, atol=0.02)
     np.testing.assert_allclose(said, y[40:], atol=0.02)
@@ -53,26 +53,23 @@ def test_what_depends_linearly_is_learned_exactly(rng):
 def test_the_small_network_learns_what_ridge_cannot(rng):
     x = rng.uniform(-1, 1, (400, 1))
     y = 40.0 + 10.0 * x[:, 0] ** 2
-    errors = {name: np.std(fit(name, x[:200], y[:200], seed=1)(x[200:]) - y[200:]) for name in REGRESSORS}
+    errors = {name: np.std(fit(name, x[:200], y[:200], seed=1).predict(x[200:]) - y[200:]) for name in REGRESSORS}
     assert errors["MLP"] < 0.3 * errors["ridge"]
-    repeated = fit("MLP", x[:50], y[:50], seed=2)(x), fit("MLP", x[:50], y[:50], seed=2)(x)
+    repeated = [fit("MLP", x[:50], y[:50], seed=2).predict(x) for _ in range(2)]
     np.testing.assert_array_equal(*repeated)
 
 
 def test_more_labels_help_and_an_input_that_knows_beats_noise(rng):
     x = rng.normal(size=(120, 6))
     rise_k = 20.0 + 5.0 * x[:, 0] + rng.normal(0, 0.5, 120)
-    rows = compare({"knows": x, "noise": rng.normal(size=(120, 6))}, rise_k, rng, labels=(6, 40), draws=2)
-    by = {(row.inputs, row.regressor, row.labels): row for row in rows}
+    by = compare({"knows": x, "noise": rng.normal(size=(120, 6))}, rise_k, rng, labels=(6, 40), draws=2)
     assert len(by) == 2 * len(REGRESSORS) * 2
-    assert np.mean(by["knows", "ridge", 40].rmse_k) < np.mean(by["knows", "ridge", 6].rmse_k)
-    assert np.mean(by["knows", "ridge", 40].r2) > 0.97
-    assert np.mean(by["noise", "ridge", 40].r2) < 0.1
-    assert all(len(row.r2) == len(row.rmse_k) == 2 for row in rows)
+    assert np.mean(by["knows", "ridge", 40]["rmse_k"]) < np.mean(by["knows", "ridge", 6]["rmse_k"])
+    assert np.mean(by["knows", "ridge", 40]["r2"]) > 0.97
+    assert np.mean(by["noise", "ridge", 40]["r2"]) < 0.1
+    assert all(len(row["r2"]) == len(row["rmse_k"]) == 2 for row in by.values())
     with pytest.raises(FleetError, match="61 labels need 122 jobs"):
         compare({"knows": x}, rise_k, rng, labels=(61,))
-    with pytest.raises(ValueError, match="No regressor 'forest'"):
-        fit("forest", x, rise_k, 0)
 
 
 def test_aggregation_by_hand(small):
@@ -92,13 +89,13 @@ def test_moments_by_hand():
 
 def test_transfer_runs_from_study_to_table_and_repeats(tiny, folder):
     seeds = [np.random.SeedSequence(1), np.random.SeedSequence(2)]
-    first = transfer(seeds, config=TINY, folder=folder, make=tiny, labels=(8,), draws=1)
-    again = transfer(seeds[:1], config=TINY, folder=folder, make=tiny, labels=(8,), draws=1)
-    assert [row.rmse_k[:1] for row in first] == [row.rmse_k for row in again]
-    assert [(row.inputs, row.regressor) for row in first] == [(i, r) for i in INPUTS for r in REGRESSORS]
-    assert all(len(row.r2) == 2 for row in first)
+    first = transfer(Bench(seeds, TINY, folder, tiny), labels=(8,), draws=1)
+    again = transfer(Bench(seeds[:1], TINY, folder, tiny), labels=(8,), draws=1)
+    assert [row["rmse_k"][:1] for row in first.values()] == [row["rmse_k"] for row in again.values()]
+    assert list(first) == [(i, r, 8) for i in INPUTS for r in REGRESSORS]
+    assert all(len(row["r2"]) == 2 for row in first.values())
     with pytest.raises(ValueError, match="at least one seed"):
-        transfer([], config=TINY, folder=folder, make=tiny)
+        transfer(Bench([], TINY, folder, tiny))
 
 
 def test_inputs_follow_their_jobs(tiny, folder):

@@ -19,7 +19,7 @@ from scenarios.studies.report.figures import (
     latent_map_figure,
     latent_scatter_figure,
     lines_figure,
-    png,
+    picture,
     ranked,
     ranking_figure,
     reliability_figure,
@@ -179,6 +179,14 @@ def test_pairs_stand_at_the_mean_of_their_seeds():
     assert [t.get_text() for t in figure.axes[0].texts] == ["0.3", "1"]
 
 
+def test_a_long_title_fits_into_the_figure():
+    zero = {"sum": {"work only": np.zeros(2), "with exploration": np.zeros(2)}}
+    figure = bars_figure(zero, title="Exploration lowers false alarms " * 4, y_label="false alarms")
+    figure.canvas.draw()
+    assert figure.texts[0].get_window_extent().x1 < figure.bbox.width
+    assert figure.axes[0].get_ylim()[0] == 0.0
+
+
 def test_lines_carry_their_data_and_units():
     raw = Line(np.array([10, 50]), np.array([[1.0, 2.0], [3.0, 4.0]]), NORMAL)
     level = (60.0, "warning limit, 60 °C")
@@ -197,7 +205,7 @@ def test_lines_carry_their_data_and_units():
 
 def test_the_same_figure_is_the_same_png_and_nothing_is_cut_off():
     figures = [epochs_figure(np.array([20, 60]), *rng().uniform(0, 1, (2, 3, 2, 3))) for _ in range(2)]
-    first, second = map(png, figures)
+    first, second = (picture("epochs", figure, "Epochs.").png for figure in figures)
     assert first == second
     pixels = image.imread(io.BytesIO(first))[..., :3]
     border = np.concatenate([pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]])

@@ -29,7 +29,7 @@ PLATES = ("#ffffff", "#dfe9f3", "#f9d9d9")
 HEAT = ("#cbe2f4", "#efd382", "#e08a00", FAULT, "#4d0a2a")
 """Cool, halfway to the warning limit, warning, error, beyond; ever darker. Warning and error as in the run report."""
 COOL_C, BEYOND_K = 20.0, 10.0
-"""The colour scale begins at `COOL_C` and ends so far above the error limit."""
+"""The colour scale begins at `COOL_C` and ends `BEYOND_K` above the error limit."""
 MOUNTS: dict[MountKind, str] = {"floor": "■", "wall": "▬", "ceiling": "○", "tilted": "◆"}
 """Symbol of what an arm is fixed to."""
 MOST_MARKS = 12
@@ -50,11 +50,14 @@ def heat_colour(temp_c: Array, warning_c: float, error_c: float) -> Array:
 
 
 class Picture:
-    """Draws scenes in one size. The artists of a cell are made once and updated for every scene."""
+    """Draws scenes in one size.
+
+    The artists of a cell are made once and updated for every scene. Coordinates are pixels from the upper left corner.
+    """
 
     def __init__(self, size: Pixel = NORMAL) -> None:
         self.size = size
-        self._drawing: _Drawing | None = None
+        self._key: object = None
 
     def frame(self, scene: Scene) -> Array:
         """The scene as uint8 [height, width, 3].
@@ -63,23 +66,24 @@ class Picture:
             ValueError: the size is too small to read or too large to draw.
         """
         key = (scene.cell, scene.warning_c, scene.error_c)
-        if self._drawing is None or self._drawing.key != key:
-            self._drawing = _Drawing(scene, self.size)
-        return self._drawing.frame(scene)
+        if self._key != key:
+            self._prepare(scene)
+            self._key = key
+        self.canvas.restore_region(self.background)
+        self._draw_work(scene)
+        self._draw_arms(scene)
+        self._draw_header(scene)
+        self._draw_queue(scene)
+        self._draw_texts()
+        return np.array(self.canvas.buffer_rgba())[..., :3]
 
-    def __reduce__(self) -> tuple[type["Picture"], tuple[Pixel]]:
-        return Picture, (self.size,)
-
-
-class _Drawing:
-    """Artists of one cell, drawn one by one; coordinates are pixels from the upper left corner."""
-
-    def __init__(self, scene: Scene, size: Pixel) -> None:
-        self.key = (scene.cell, scene.warning_c, scene.error_c)
-        self.plan = plan = floor_plan(scene.cell, size)
-        figure = Figure(figsize=(size[0] / 72, size[1] / 72), dpi=72, facecolor=PAPER)  # 1 pt = 1 px
+    def _prepare(self, scene: Scene) -> None:
+        """Make the artists of a cell, and draw its background."""
+        self.plan = plan = floor_plan(scene.cell, self.size)
+        wide, high = self.size
+        figure = Figure(figsize=(wide / 72, high / 72), dpi=72, facecolor=PAPER)  # 1 pt = 1 px
         self.canvas = FigureCanvasAgg(figure)
-        self.axes = figure.add_axes((0, 0, 1, 1), xlim=(0, size[0]), ylim=(size[1], 0))
+        self.axes = figure.add_axes((0, 0, 1, 1), xlim=(0, wide), ylim=(high, 0))
         self.axes.set_axis_off()
         self.canvas.draw()
         self.texts = self.axes.add_collection(PathCollection([], offset_transform=self.axes.transData), autolim=False)
@@ -94,16 +98,6 @@ class _Drawing:
         self._draw_background(scene)
         self.background = self.canvas.copy_from_bbox(figure.bbox)
 
-    def frame(self, scene: Scene) -> Array:
-        """The scene over the background, uint8 [height, width, 3]."""
-        self.canvas.restore_region(self.background)
-        self._draw_work(scene)
-        self._draw_arms(scene)
-        self._draw_header(scene)
-        self._draw_queue(scene)
-        self._draw_texts()
-        return np.array(self.canvas.buffer_rgba())[..., :3]
-
     def _draw_background(self, scene: Scene) -> None:
         plan, text = self.plan, self.plan.text
         self._box(plan.floor, GROUND)
@@ -111,7 +105,7 @@ class _Drawing:
         self._draw_lines(away, "#9a9a9a", 1)
         for at in plan.stations:
             self._square(at, PAPER, FAINT)
-        moved = np.hypot(*(plan.bases - plan.centres).T) > 0.5 * plan.reach  # drawn away from where they stand
+        moved = np.hypot(*(plan.bases - plan.centres).T) > 0.5 * plan.reach  # drawn beside their true position
         self._draw_lines(np.stack([plan.bases, plan.centres], axis=1)[moved], "#9a9a9a", 1)
         marks, (begin, end), y = heat_marks(scene.warning_c, scene.error_c), legend_ends(plan), legend_row(plan)
         x, half = np.arange(begin, end + 1) + 0.5, max(3, text // 3)
@@ -181,14 +175,14 @@ class _Drawing:
         room = wide - after - text_width(whole, text) - 2 * text
         self._write((wide - margin, first), shortened(scene.title, text, room), FAINT, ha="right")
         hottest_c = float(scene.temp_c.max())
-        for words, bad in (
+        for part, bad in (
             (f"{scene.finished} finished", False),
             (f"{scene.waiting} waiting", False),
             (f"{scene.faults} fault{'' if scene.faults == 1 else 's'}", scene.faults > 0),
             (f"hottest {hottest_c:.1f} °C", hottest_c >= scene.warning_c),
         ):
-            self._write((x, round(2.2 * text)), words, FAULT if bad else INK, bold=bad)
-            x += text_width(words, text, bad) + round(1.6 * text)
+            self._write((x, round(2.2 * text)), part, FAULT if bad else INK, bold=bad)
+            x += text_width(part, text, bad) + round(1.6 * text)
         share = min(1.0, scene.time_s / scene.horizon_s) if scene.horizon_s > 0 else 1.0
         self._box((0, bottom - 3, wide, bottom), "#e6e6e6")
         self._box((0, bottom - 3, round(share * wide), bottom), FAINT)

@@ -147,8 +147,7 @@ def scene_of(world: World, state: State, cell: Cell | None = None, *, env: int =
         job=tuple(jobs.names[env][j] if j >= 0 else "" for j in current),
         progress=tuple(_progress(world, state, env, a, j) for a, j in enumerate(current)),
         at=tuple(
-            tuple(world.stations[s] for s in jobs.stations[env, j].tolist() if s >= 0) if j >= 0 else ()
-            for j in current
+            tuple(world.stations[s] for s in jobs.stations[env, j].tolist() if s >= 0 and j >= 0) for j in current
         ),
         queue=tuple(
             QueuedJob(
@@ -169,6 +168,7 @@ def scene_of(world: World, state: State, cell: Cell | None = None, *, env: int =
 
 
 def _progress(world: World, state: State, env: int, arm: int, job: int) -> float:
+    """Finished share of the job of an arm; 0 for no job, -1."""
     if job < 0:
         return 0.0
     approach, cycle, retreat = world.plans.times_s[world.offers.plan[env, arm, job]].tolist()

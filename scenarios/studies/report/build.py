@@ -15,7 +15,13 @@ from scenarios.progress import Progress, quiet
 from scenarios.report.page import Section, Table, sections_page
 from scenarios.result_folder import ResultKind
 from scenarios.schema import Scenario
+from scenarios.studies import real_logs
 from scenarios.studies.benchmark import VAE, variants
+from scenarios.studies.report import baseline_chapters as baseline
+from scenarios.studies.report import generation_chapters as motion
+from scenarios.studies.report import log_chapters as log
+from scenarios.studies.report import paper_chapters as paper
+from scenarios.studies.report import saturation_chapters as heat
 from scenarios.studies.report.claims import claims
 from scenarios.studies.report.context import QUICK, Lab, Size
 from scenarios.studies.report.section_cache import Chapter, SectionCache, basis, compute_sections, plain
@@ -39,25 +45,19 @@ def report_scenario(
 
     Finished sections are cached.
     """
-    from scenarios.studies.report import baseline_chapters as baseline
-    from scenarios.studies.report import generation_chapters as motion
-    from scenarios.studies.report import paper_chapters as paper
-    from scenarios.studies.report import saturation_chapters as heat
 
     lab = Lab(scenario.arms[arm].robot(), tuple(seeds), size or Size(), cache_folder(), progress)
-    quality = "Quality of the difficulty, against baselines"
-    shared = "first"
     chapters = [
-        Chapter("data", "Training and anomalous data", paper.data_chapter, 0.3, shared),
-        Chapter("latent", "Latent map", paper.latent_chapter, 0.3, shared),
+        Chapter("data", "Training and anomalous data", paper.data_chapter, 0.3, "first"),
+        Chapter("latent", "Latent map", paper.latent_chapter, 0.3, "first"),
         Chapter(
-            "reconstruction", "Reconstruction of a normal and a hot record", paper.reconstruction_chapter, 0.3, shared
+            "reconstruction", "Reconstruction of a normal and a hot record", paper.reconstruction_chapter, 0.3, "first"
         ),
-        Chapter("difficulty", "Thermal difficulty of critical and other jobs", paper.difficulty_chapter, 0.3, shared),
+        Chapter("difficulty", "Thermal difficulty of critical and other jobs", paper.difficulty_chapter, 0.3, "first"),
         Chapter("epochs", "Reconstruction error against epochs", paper.epochs_chapter, 2),
         Chapter("generation", "Generated motions", motion.generation_chapter, 2),
         Chapter("recovery", "Posture recovery", motion.recovery_chapter, 1),
-        Chapter("quality", quality, baseline.quality_chapter, 4),
+        Chapter("quality", "Quality of the difficulty, against baselines", baseline.quality_chapter, 4),
         Chapter("saturation", "Probability of saturation, and its alarm", heat.saturation_chapter, 3),
         Chapter("identification", "The arm's own thermal network", heat.identification_chapter),
         Chapter("coverage", "Effect of exploration", baseline.coverage_chapter, 2),
@@ -70,9 +70,8 @@ def report_scenario(
         networks = (lab.size.networks or tuple(variants(lab.size.config))) if "quality" in missing else (VAE,)
         lab.train_twins(networks, explored=bool(missing & {"saturation", "coverage"}))
     sections = compute_sections(chapters, lab, cache=cache, processes=cpu_count(), progress=progress)
-    data = next((section.numbers for section in sections if section.key == "data"), {})
-    twins = {name: data[name] for name in ("twin", "data") if name in data}
-    source = {"scenario": scenario.name, "arm": lab.robot.name, "quick": lab.size == QUICK} | twins
+    source = {"scenario": scenario.name, "arm": lab.robot.name, "quick": lab.size == QUICK}
+    source |= _data_numbers(sections, "twin", "data")
     return [claims(sections, simulated=True), *sections, provenance(source, seeds, command)]
 
 
@@ -85,29 +84,27 @@ def report_logs(
     progress: Progress = quiet,
 ) -> list[Section]:
     """All chapters that recorded motion allows; finished sections are cached."""
-    from scenarios.studies.real_logs import CONFIG
-    from scenarios.studies.report import log_chapters as log
-
     epochs = QUICK.epochs if quick else Size().epochs
-    book = log.Logbook(tuple(recordings), tuple(seeds), CONFIG, progress, epochs, cache_folder())
+    book = log.Logbook(tuple(recordings), tuple(seeds), real_logs.CONFIG, progress, epochs, cache_folder())
     chapters = [
-        Chapter(key, title, compute, group="logs")
-        for key, title, compute in (
-            ("data", "Training and anomalous data", log.log_data_chapter),
-            ("latent", "Latent map", log.log_latent_chapter),
-            ("reconstruction", "Reconstruction of a cool and a hot record", log.log_reconstruction_chapter),
-            ("difficulty", "Error and difficulty, hot against cool", log.log_difficulty_chapter),
-            ("rc", "With temperature and a thermal network", log.log_rc_chapter),
-            ("epochs", "Reconstruction error against epochs", log.log_epochs_chapter),
-        )
+        Chapter("data", "Training and anomalous data", log.log_data_chapter),
+        Chapter("latent", "Latent map", log.log_latent_chapter),
+        Chapter("reconstruction", "Reconstruction of a cool and a hot record", log.log_reconstruction_chapter),
+        Chapter("difficulty", "Error and difficulty, hot against cool", log.log_difficulty_chapter),
+        Chapter("rc", "With temperature and a thermal network", log.log_rc_chapter),
+        Chapter("epochs", "Reconstruction error against epochs", log.log_epochs_chapter),
     ]
     content = recordings_hash(recordings)
-    cache = SectionCache(book.folder, basis("logs", content, tuple(seeds), CONFIG, epochs))
+    cache = SectionCache(book.folder, basis("logs", content, tuple(seeds), real_logs.CONFIG, epochs))
     sections = compute_sections(chapters, book, cache=cache, progress=progress)
-    data = next((section.numbers for section in sections if section.key == "data"), {})
-    source = {"logs": len(recordings), "data": content, "quick": quick}
-    source |= {"twins": data["twins"]} if "twins" in data else {}
+    source = {"logs": len(recordings), "data": content, "quick": quick} | _data_numbers(sections, "twins")
     return [claims(sections), *sections, provenance(source, seeds, command)]
+
+
+def _data_numbers(sections: Sequence[Section], *names: str) -> dict[str, Any]:
+    """These numbers of the section on the data; none if it could not be computed."""
+    numbers = next(section.numbers for section in sections if section.key == "data")
+    return {name: numbers[name] for name in names if name in numbers}
 
 
 def provenance(source: dict[str, Any], seeds: Sequence[int], command: str) -> Section:

@@ -10,12 +10,11 @@ from joblib import Parallel, cpu_count, delayed
 
 from fleet.errors import FleetError
 from fleet.robot import Robot
-from scenarios.prepare.train_twins import train_or_load
 from scenarios.progress import Progress, quiet
-from scenarios.studies.benchmark import VAE, Make, chosen_variants, jobs_of
+from scenarios.studies.benchmark import VAE, chosen_variants, jobs_of
 from scenarios.studies.epochs import EPOCHS
 from scenarios.studies.ranking import CARRIER, Jobs
-from scenarios.studies.setup import Sample, Study, make_study
+from scenarios.studies.setup import Bench, Study, make_study
 from scenarios.studies.transfer import LABELS
 from twin.vae.model import TwinConfig
 from twin.vae.twin import Twin
@@ -76,33 +75,19 @@ class Lab:
         seeds: Every figure with a spread is repeated under each.
         size: Amount of computation.
         folder: Cache of trained twins.
+        bench: The seeds' studies in this size.
     """
 
     def __init__(
         self, robot: Robot, seeds: tuple[int, ...], size: Size, folder: Path, progress: Progress = quiet
     ) -> None:
         self.robot, self.seeds, self.size, self.folder, self.progress = robot, seeds, size, folder, progress
+        sizes = {name: getattr(size, name) for name in ("train", "reference", "test", "novel")}
+        make = partial(make_study, robot=robot, **sizes)
+        self.bench = Bench([np.random.SeedSequence(seed) for seed in seeds], size.config, folder, make)
 
     def __reduce__(self) -> tuple[type["Lab"], tuple[Robot, tuple[int, ...], Size, Path]]:
         return Lab, (self.robot, self.seeds, self.size, self.folder)
-
-    @property
-    def sequences(self) -> list[np.random.SeedSequence]:
-        """The seeds as SeedSequences."""
-        return [np.random.SeedSequence(seed) for seed in self.seeds]
-
-    @property
-    def make(self) -> Make:
-        """The study of a seed, in this report's size."""
-        size = self.size
-        return partial(
-            make_study,
-            robot=self.robot,
-            train=size.train,
-            reference=size.reference,
-            test=size.test,
-            novel=size.novel,
-        )
 
     def train_twins(self, networks: Sequence[str] = (VAE,), *, explored: bool = False) -> None:
         """Train every twin that is not cached yet, all seeds in parallel.
@@ -122,39 +107,38 @@ class Lab:
     def study(self) -> Study:
         """The study of the first seed, for figures."""
         self.progress("drawing jobs", 0.0)
-        return self.make(self.sequences[0])
+        return self.bench.make(self.bench.seeds[0])
 
     @cached_property
     def twin(self) -> Twin:
         """Twin trained on the first study's cool jobs and calibrated on its held-out ones."""
         self.progress("training", 0.0)
-        records = self.study.train.records()
-        twin = train_or_load(records, self.size.config, self.sequences[0], arm=self.robot.name, folder=self.folder)
-        held_out = self.jobs(self.study.reference)
+        twin = self.bench.train(self.study.train.records(), self.study, self.bench.seeds[0])
+        held_out = jobs_of(self.study.reference, self.study.horizon_s)
         return twin.with_calibration(list(zip(held_out.plans, held_out.repetitions, strict=True)))
 
-    def jobs(self, sample: Sample) -> Jobs:
-        """A sample as jobs that fill the horizon."""
-        return jobs_of(sample, self.study.horizon_s)
+    @cached_property
+    def test(self) -> Jobs:
+        """The test jobs, each repeated to fill the horizon."""
+        return jobs_of(self.study.test, self.study.horizon_s)
 
     @cached_property
     def windows(self) -> tuple[Array, Array]:
         """Windows of test jobs [window, time, joint, channel], and the peak of joint 2 in the job of each, °C."""
-        index = np.flatnonzero(self.study.test.passes(self.study.warning_c) | ~self.warm)[:MOST_JOBS]
-        jobs = self.jobs(self.study.test)
-        reading = cut_jobs([jobs.plans[i] for i in index], [jobs.repetitions[i] for i in index], self.twin.config)
-        return reading.windows, jobs.peak_c[index][reading.job, CARRIER]
+        index = np.flatnonzero(self.cool | self.study.critical)[:MOST_JOBS]
+        plans, repetitions = [self.test.plans[i] for i in index], [self.test.repetitions[i] for i in index]
+        reading = cut_jobs(plans, repetitions, self.twin.config)
+        return reading.windows, self.test.peak_c[index][reading.job, CARRIER]
 
     @property
-    def warm(self) -> Array:
-        """Test jobs that are neither cool nor critical, bool [job]."""
-        return self.study.test.passes(self.study.cool_c) & ~self.study.critical
+    def cool(self) -> Array:
+        """Test jobs in which every motor stays below the cool limit, bool [job]."""
+        return ~self.study.test.passes(self.study.cool_c)
 
     @cached_property
     def difficulty(self) -> Array:
         """d_k of the test jobs, [job, joint]."""
-        jobs = self.jobs(self.study.test)
-        return self.twin.measures(jobs.plans, jobs.repetitions).difficulty
+        return self.twin.measures(self.test.plans, self.test.repetitions).difficulty
 
     @cached_property
     def examples(self) -> tuple[int, int]:
@@ -163,26 +147,27 @@ class Lab:
         Raises:
             FleetError: the test jobs lack a kind.
         """
-        kinds = self.study.critical, ~self.warm & ~self.study.critical
-        if not all(kind.any() for kind in kinds):
+        cool, critical = np.flatnonzero(self.cool), np.flatnonzero(self.study.critical)
+        if not len(cool) or not len(critical):
             raise FleetError(
-                f"Of {len(self.study.test)} test jobs {kinds[0].sum()} are critical and {kinds[1].sum()} cool: without "
+                f"Of {len(self.study.test)} test jobs {len(critical)} are critical and {len(cool)} cool: without "
                 "some of both there is nothing to compare. Take another arm, or leave out --quick."
             )
-        d = self.difficulty[:, CARRIER]
-        return tuple(  # pyright: ignore[reportReturnType]
-            int(index[np.argsort(d[index])[len(index) // 2]])
-            for index in (np.flatnonzero(~self.warm & ~self.study.critical), np.flatnonzero(self.study.critical))
-        )
+        return median_of(cool, self.difficulty), median_of(critical, self.difficulty)
 
 
 MOST_JOBS = 240
 """Largest number of jobs in a latent map."""
 
 
+def median_of(index: Array, difficulty: Array) -> int:
+    """The one of these jobs or windows with the median difficulty [job, joint] of joint 2."""
+    return int(index[np.argsort(difficulty[index, CARRIER])[len(index) // 2]])
+
+
 def _train(lab: Lab, seed: int, network: str, exploration: int) -> None:
     sequence = np.random.SeedSequence(seed)
     # The other samples do not affect the training.
-    study = lab.make(sequence, exploration=exploration, reference=0, test=0, novel=0)
+    study = lab.bench.make(sequence, exploration=exploration, reference=0, test=0, novel=0)
     config = chosen_variants(lab.size.config, (VAE, network))[network]
-    train_or_load(study.train.records(), config, sequence, arm=study.robot.name, folder=lab.folder)
+    lab.bench.train(study.train.records(), study, sequence, config)

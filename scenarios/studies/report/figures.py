@@ -4,6 +4,7 @@ Every function takes plain arrays and returns a matplotlib Figure; none uses pyp
 """
 
 import io
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -15,21 +16,25 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
+from scenarios.report.page import Picture
+
 Array = np.ndarray
-Pair = tuple[Array, Array]
-"""The same of a normal and of a critical record."""
+Pair = Sequence[Array]
+"""The same of a normal and of a critical record, or (mu, sigma) of a posterior."""
 
 NORMAL, CRITICAL, BETWEEN = "#0072B2", "#D55E00", "#8A8A8A"
-"""Stays cool, passes the warning limit, neither. Blue and vermilion of Okabe & Ito are told apart by every eye."""
+"""Stays cool, passes the warning limit, neither. Blue and vermilion of Okabe & Ito suit colour-blind readers."""
 INK, FAINT, ACCENT = "#222222", "#dddddd", "#009E73"
 LINES = (NORMAL, ACCENT, "#E69F00", "#CC79A7", INK, BETWEEN)
 MARKS = ("o", "s", "^", "D", "v", "x")
 CHANNEL_NAMES = ("position", "velocity", "torque")
 CHANNEL_LABELS = ("q (rad)", "dq/dt (rad/s)", "τ (N·m)")
 LEAST_SPAN = (0.1, 0.1, 2.0)
-"""Smallest range of an axis of q, qd, tau: less is noise of a joint that holds still."""
+"""Smallest range of an axis of q, qd, tau: less is noise of a joint at rest."""
 DPI = 110
 BASE_PT = 10.5
+TITLE_PER_INCH = 8.4
+"""Characters of a title in one line."""
 MOST_POINTS = 500
 """Per kind in a scatter plot; more would cover one another."""
 ELLIPSES = 60
@@ -70,15 +75,16 @@ def sheet(
         axes.grid(True, color=FAINT, linewidth=0.6)
         axes.set_axisbelow(True)
     if title:
+        title = textwrap.fill(title, int(TITLE_PER_INCH * width))
         figure.suptitle(title, fontsize=BASE_PT + 2, fontweight="bold", color=INK, x=0.01, ha="left")
     return figure, [list(row) for row in grid]
 
 
-def png(figure: Figure) -> bytes:
-    """The figure as PNG; the same figure gives the same bytes."""
+def picture(name: str, figure: Figure, alt: str) -> Picture:
+    """The figure as PNG of a section; the same figure gives the same bytes."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
-    return buffer.getvalue()
+    return Picture(name=name, png=buffer.getvalue(), alt=alt)
 
 
 def signals_figure(
@@ -166,7 +172,7 @@ def latent_scatter_figure(mu: Array, temp_c: Array, *, limit_c: float, joint: in
 
     Args:
         mu: [window, latent]; the first two units are shown.
-        temp_c: Temperature that belongs to each window, [window].
+        temp_c: Temperature of each window, [window].
         limit_c: High from here on.
     """
     figure, ((left, right),) = sheet(1, 2, width=10.4, height=4.8, title=title, sharex=True, sharey=True)
@@ -333,13 +339,15 @@ def bars_figure(
     axes.set_xticks(np.arange(len(groups)), list(groups))
     axes.grid(False, axis="x")
     axes.margins(y=0.15)
+    if all(np.min(values) >= 0 for group in groups.values() for values in group.values()):
+        axes.set_ylim(bottom=0)
     _label(axes, y=y_label)
     _legend(figure, axes)
     return figure
 
 
 def reliability_figure(tables: Mapping[str, tuple[Array, Array, Array]], *, title: str) -> Figure:
-    """Predicted against observed: how often jobs saturate by their predicted probability, and how many jobs those are.
+    """Predicted against observed: share of jobs with saturation by predicted probability, and their number.
 
     Args:
         tables: By method: mean predicted probability, observed share, count; each [bin], empty bins left out.

@@ -1,4 +1,4 @@
-"""Motion from the twin, chapter by chapter: generated near what it knows, and away from what heats."""
+"""Chapters on motion from the twin: generated near its training data, and recovery to a cooler posture."""
 
 import numpy as np
 
@@ -7,10 +7,10 @@ from fleet.robot import POSTURES
 from scenarios.motion.generate import Verification, generate
 from scenarios.motion.perform import bare_arm
 from scenarios.motion.recover import hold_until, recover
-from scenarios.report.page import Picture, Section, Table
+from scenarios.report.page import Section, Table
 from scenarios.studies.ranking import CARRIER
 from scenarios.studies.report.context import Lab
-from scenarios.studies.report.figures import ACCENT, CRITICAL, NORMAL, Line, lines_figure, png
+from scenarios.studies.report.figures import ACCENT, CRITICAL, NORMAL, Line, lines_figure, picture
 
 STRENGTHS = (0.0, 0.5, 1.0, 2.0, 4.0)
 """Perturbations, in posterior standard deviations."""
@@ -26,8 +26,8 @@ def generation_chapter(lab: Lab) -> Section:
     arm, made = bare_arm(study.robot, study.motors, study.thermal), []
     for done, s in enumerate(STRENGTHS):
         lab.progress("generating", done / len(STRENGTHS))
-        known = {"count": lab.size.generated, "seed": lab.seeds[0], "verification": verification}
-        made.append(generate(lab.twin, arm, study.train.plans, s=s, **known))
+        how = {"count": lab.size.generated, "seed": lab.seeds[0], "verification": verification}
+        made.append(generate(lab.twin, arm, study.train.plans, s=s, **how))
     distance = np.array([np.mean([motion.distance_rad for motion in each.motions]) for each in made])
     cool = float(np.mean([motion.peak_c.max() < study.cool_c for each in made for motion in each.motions]))
     accepted, drawn = sum(len(each.motions) for each in made), sum(each.draws for each in made)
@@ -82,15 +82,15 @@ def generation_chapter(lab: Lab) -> Section:
         "and slowed down to the limits, torque from inverse dynamics. A motion passes if the nominal thermal network "
         "predicts that it stays cool and MuJoCo performs it. The true motors are only measured afterwards.",
         pictures=(
-            Picture(name="motions", png=png(motions), alt="Joint angles of a source and of generated motions."),
-            Picture(name="distance", png=png(by_strength), alt="Distance against s. " + sentences[1]),
+            picture("motions", motions, "Joint angles of a source and of generated motions."),
+            picture("distance", by_strength, "Distance against s. " + sentences[1]),
         ),
         tables=(
             Table(head=("strength", "accepted", "truly cool", "distance, rad", "distance, σ", "rejected"), rows=rows),
         ),
         numbers={
             "s": list(STRENGTHS),
-            "distance_rad": distance.tolist(),
+            "distance_rad": distance,
             "truly_cool": [each.truly_cool for each in made],
             "rejected": [dict(each.rejected) for each in made],
         },
@@ -140,11 +140,11 @@ def recovery_chapter(lab: Lab) -> Section:
         how=f"The arm holds {HOLD_KG:g} kg in posture '{POSTURE}' until the hottest motor is at {WARM_C:g} °C. The "
         "twin's one-sided torque difficulty ranks nearby postures; the best reachable one is performed in MuJoCo, with "
         "the true motors of the studied arm.",
-        pictures=(Picture(name="recovery", png=png(drawn), alt="Temperature with and without. " + finding),),
+        pictures=(picture("recovery", drawn, "Temperature with and without. " + finding),),
         numbers={
-            "time_s": result.time_s.tolist(),
-            "with_c": with_c.tolist(),
-            "without_c": without_c.tolist(),
+            "time_s": result.time_s,
+            "with_c": with_c,
+            "without_c": without_c,
             "cooled_k": result.cooled_k,
             "spared_k": result.spared_k,
         },

@@ -1,20 +1,20 @@
-"""Chapters of a report on a real arm's logs: the paper's claim on files that the twin was not trained on."""
+"""Chapters of a report on a real arm's logs: the paper's claim on files outside the twin's training data."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from sklearn.metrics import roc_curve
 
-from fleet.files import cache_folder
 from fleet.motion import CHANNELS
-from scenarios.progress import Progress, quiet
-from scenarios.report.page import Picture, Section, Table
-from scenarios.studies.epochs import EPOCHS, epoch_study
-from scenarios.studies.ranking import spread
-from scenarios.studies.real_logs import AHEAD_S, HOT_C, JOINT, HotAndCool, LogStudy, hot_and_cool, log_study
+from scenarios.progress import Progress
+from scenarios.report.page import Section, Table
+from scenarios.studies.epochs import epoch_study
+from scenarios.studies.ranking import CARRIER, spread
+from scenarios.studies.real_logs import AHEAD_S, HOT_C, HotAndCool, LogStudy, hot_and_cool, log_study
 from scenarios.studies.real_logs_forecast import log_rc
+from scenarios.studies.report.context import median_of
 from scenarios.studies.report.figures import (
     ACCENT,
     CHANNEL_NAMES,
@@ -23,14 +23,13 @@ from scenarios.studies.report.figures import (
     bars_figure,
     difficulty_figure,
     lines_figure,
-    png,
+    picture,
     ranking_figure,
 )
 from scenarios.studies.report.paper_chapters import (
-    active_units,
     data_picture,
     epochs_section,
-    latent_pictures,
+    latent_section,
     reconstruction_section,
 )
 from twin.logs.recording import Recording
@@ -49,9 +48,9 @@ class Logbook:
     recordings: tuple[Recording, ...]
     seeds: tuple[int, ...]
     config: TwinConfig
-    progress: Progress = quiet
-    epochs: tuple[int, ...] = EPOCHS
-    folder: Path = field(default_factory=cache_folder)
+    progress: Progress
+    epochs: tuple[int, ...]
+    folder: Path
     """Cache of trained twins."""
 
     @cached_property
@@ -59,11 +58,8 @@ class Logbook:
         """One twin per seed; each draws its training files."""
         studies = []
         for done, seed in enumerate(self.seeds):
-
-            def progress(share: float, done: int = done) -> None:
-                self.progress("training", (done + share) / len(self.seeds))
-
-            studies.append(log_study(self.recordings, seed, config=self.config, progress=progress, folder=self.folder))
+            self.progress("training", done / len(self.seeds))
+            studies.append(log_study(self.recordings, seed, config=self.config, folder=self.folder))
         return studies
 
     @cached_property
@@ -80,21 +76,21 @@ class Logbook:
     @property
     def examples(self) -> list[int]:
         """A cool and a hot window, each with the median difficulty of joint 2 of its kind."""
-        kinds = [np.flatnonzero(self.first.hot == hot) for hot in (False, True)]
-        return [int(i[np.argsort(self.first.difficulty[i, JOINT])[len(i) // 2]]) for i in kinds]
+        study = self.first
+        return [median_of(np.flatnonzero(study.hot == hot), study.difficulty) for hot in (False, True)]
 
 
 def log_data_chapter(book: Logbook) -> Section:
     """A cool and a hot window as recorded."""
     study, pair = book.first, book.examples
-    cool, hot = (f"{study.file[i]}, {study.start_s[i] / 60:.1f} min, {study.temp_c[i, JOINT]:.1f} °C" for i in pair)
-    records = study.windows[pair].transpose(0, 1, 3, 2)
+    cool, hot = (f"{study.file[i]}, {study.start_s[i] / 60:.1f} min, {study.temp_c[i, CARRIER]:.1f} °C" for i in pair)
     finding = f"Cool: {cool}. Hot: {hot}."
+    records = tuple(study.windows[pair].transpose(0, 1, 3, 2))
     title = "Recorded: a cool and a hot window of joint 2"
     return Section(
         sentences=(finding,),
         how=f"Windows of held-out files, each with the median d of joint 2 of its kind; hot is {HOT_C:g} °C or more.",
-        pictures=(data_picture((records[0], records[1]), book.config.rate_hz, JOINT, title, finding),),
+        pictures=(data_picture(records, book.config.rate_hz, CARRIER, title, finding),),
         numbers={
             "cool": cool,
             "hot": hot,
@@ -110,44 +106,41 @@ def log_latent_chapter(book: Logbook) -> Section:
     study, rng = book.first, np.random.default_rng(0)
     chosen = [rng.permutation(np.flatnonzero(study.hot == hot))[:MOST_WINDOWS] for hot in (False, True)]
     index = np.concatenate(chosen)
-    mu, sigma = (part[:, JOINT] for part in study.twin.posterior(study.windows[index]))
+    mu, sigma = (part[:, CARRIER] for part in study.twin.posterior(study.windows[index]))
     cool, hot = (mu[study.hot[index] == kind].mean(axis=0) for kind in (False, True))
     apart = float(np.linalg.norm(cool - hot))
     finding = f"The centres of cool and hot windows lie {apart:.2f} apart; the prior has standard deviation 1."
-    return Section(
-        sentences=(finding, active_units(mu)),
+    return replace(
+        latent_section(mu, sigma, study.temp_c[index, CARRIER], HOT_C, finding),
         how=f"Posteriors of held-out windows under the network of joint 2, at most {MOST_WINDOWS} of each kind.",
-        pictures=latent_pictures(mu, sigma, study.temp_c[index, JOINT], HOT_C, JOINT, finding),
         numbers={"distance_of_centres": apart},
     )
 
 
 def log_reconstruction_chapter(book: Logbook) -> Section:
-    """What the twin makes of the two windows."""
+    """The two windows and their reconstructions."""
     study = book.first
-    return reconstruction_section(study.twin, study.windows[book.examples], JOINT, "The two windows above")
+    return reconstruction_section(study.twin, study.windows[book.examples], "The two windows above")
 
 
 def log_difficulty_chapter(book: Logbook) -> Section:
     """Error and difficulty, hot against cool, and how well they separate."""
     study, seeds = book.first, book.compared
-    ratios, scores = [each.ratio for each in seeds], list(seeds[0].auroc)
+    ratios, scores = [each.ratio for each in seeds], list(seeds[0].ranking["auroc"])
+    by_seed = {"cool": [each.cool_error for each in seeds], "hot": [each.hot_error for each in seeds]}
     errors = {
-        name: {
-            "cool": np.array([each.cool_error[c] for each in seeds]),
-            "hot": np.array([each.hot_error[c] for each in seeds]),
-        }
-        for c, name in enumerate(CHANNEL_NAMES)
+        name: {kind: np.array(values)[:, c] for kind, values in by_seed.items()} for c, name in enumerate(CHANNEL_NAMES)
     }
-    auroc = {key: [each.auroc[key] for each in seeds] for key in scores}
-    auprc = {key: [each.auprc[key] for each in seeds] for key in scores}
+    auroc, auprc = (
+        {key: [each.ranking[measure][key] for each in seeds] for key in scores} for measure in ("auroc", "auprc")
+    )
     best = max(auroc, key=lambda key: np.mean(auroc[key]))
     ratio = f"The error of joint 2 is {spread(ratios, 2)} times larger in hot windows than in cool ones"
     groups = {f"cool, below {HOT_C:g} °C": study.difficulty[~study.hot], "hot": study.difficulty[study.hot]}
     curves = {}
     for key, values, colour in (
-        ("d", study.errors[:, JOINT].sum(axis=-1), NORMAL),
-        ("rms_torque", study.rms_torque[:, JOINT], ACCENT),
+        ("d", study.errors[:, CARRIER].sum(axis=-1), NORMAL),
+        ("rms_torque", study.rms_torque[:, CARRIER], ACCENT),
     ):
         false_alarms, hits, _ = roc_curve(study.hot, values)
         curves[f"{_score_name(key)}: AUROC {auroc[key][0]:.3f}"] = Line(false_alarms, hits, colour)
@@ -173,9 +166,9 @@ def log_difficulty_chapter(book: Logbook) -> Section:
         f"anew for each of {len(seeds)} seeds. The others are tested: {seeds[0].cool_windows} cool and "
         f"{seeds[0].hot_windows} hot windows of the first seed.",
         pictures=(
-            Picture(name="hot_and_cool", png=png(drawn_errors), alt=f"{ratio}."),
-            Picture(name="difficulty", png=png(drawn_d), alt="Boxes of d per joint, and the sum."),
-            Picture(name="roc", png=png(roc), alt="Hits against false alarms."),
+            picture("hot_and_cool", drawn_errors, f"{ratio}."),
+            picture("difficulty", drawn_d, "Boxes of d per joint, and the sum."),
+            picture("roc", roc, "Hits against false alarms."),
         ),
         tables=(
             Table(
@@ -185,8 +178,7 @@ def log_difficulty_chapter(book: Logbook) -> Section:
         ),
         numbers={
             "ratio": ratios,
-            "auroc": [dict(each.auroc) for each in seeds],
-            "auprc": [dict(each.auprc) for each in seeds],
+            **{measure: [each.ranking[measure] for each in seeds] for measure in ("auroc", "auprc")},
         },
     )
 
@@ -208,7 +200,6 @@ def log_epochs_chapter(book: Logbook) -> Section:
     )
     return epochs_section(
         epochs,
-        JOINT,
         (f"{epochs.windows} recorded windows are trained on; other windows of the same files are held out.",),
         f"Joint 2, a separate training for each number of epochs and each of {len(book.seeds)} seeds.",
         "Error against epochs on recorded windows",
@@ -247,7 +238,7 @@ def log_rc_chapter(book: Logbook) -> Section:
         how="A thermal network identified from the twin's training files alone (rc), and a nominal one, both started "
         "at the measured temperatures of each window; first seed. Windows of one file are much alike, so the number of "
         "files counts.",
-        pictures=(Picture(name="rc", png=png(drawn), alt=finding),),
+        pictures=(picture("rc", drawn, finding),),
         tables=(
             Table(
                 head=("ranked by", "AUROC, still below", "AUPRC, still below", "AUROC, all"),

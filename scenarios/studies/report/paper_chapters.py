@@ -1,6 +1,5 @@
 """The paper's own figures, each with its finding: data, latent map, reconstruction, difficulty, error by epochs."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +22,7 @@ from scenarios.studies.report.figures import (
     latent_map_figure,
     latent_scatter_figure,
     lines_figure,
-    png,
+    picture,
     signals_figure,
 )
 from twin.vae.twin import Twin
@@ -66,11 +65,10 @@ def _motion(plan: Plan) -> Array:
 
 def data_picture(records: Pair, rate_hz: float, joint: int, title: str, finding: str) -> Picture:
     """A normal and a critical record, [time, 3, joint] each, with one joint before the others."""
-    normal, critical = records
-    others = np.delete(normal, joint, axis=2), np.delete(critical, joint, axis=2)
-    own = normal[:, :, joint], critical[:, :, joint]
+    others = tuple(np.delete(each, joint, axis=2) for each in records)
+    own = tuple(each[:, :, joint] for each in records)
     drawn = signals_figure(own, rate_hz, joint=joint, title=title, others=others)
-    return Picture(name="data", png=png(drawn), alt=f"Position, velocity and torque over time. {finding}")
+    return picture("data", drawn, f"Position, velocity and torque over time. {finding}")
 
 
 def latent_chapter(lab: Lab) -> Section:
@@ -88,26 +86,27 @@ def latent_chapter(lab: Lab) -> Section:
         "neighbour closer than 95 % of normal windows have one. Where the kinds overlap, the map alone cannot separate "
         "them."
     )
-    return Section(
-        sentences=(finding, active_units(mu)),
+    section = latent_section(mu, sigma, temp_c, lab.study.warning_c, finding)
+    return replace(
+        section,
         how=f"Posteriors of {len(windows)} windows of test jobs under the network of joint 2. The temperature is the "
         "peak of joint 2 when the job is repeated over the horizon. Jobs between cool and critical are left out.",
-        pictures=latent_pictures(mu, sigma, temp_c, lab.study.warning_c, CARRIER, finding),
         numbers={"windows": len(windows), "overlap": overlap},
     )
 
 
-def latent_pictures(
-    mu: Array, sigma: Array, temp_c: Array, limit_c: float, joint: int, finding: str
-) -> tuple[Picture, Picture]:
-    """Density and scatter plot of posteriors (mu, sigma) [window, latent] with temperatures [window]."""
+def latent_section(mu: Array, sigma: Array, temp_c: Array, limit_c: float, finding: str) -> Section:
+    """Density and scatter plot of posteriors (mu, sigma) [window, latent] of joint 2 with temperatures [window]."""
     hot = temp_c >= limit_c
     kinds = (mu[~hot], sigma[~hot]), (mu[hot], sigma[hot])
-    maps = latent_map_figure(*kinds, joint=joint, title="Latent map of normal and critical windows of joint 2")
-    dots = latent_scatter_figure(mu, temp_c, limit_c=limit_c, joint=joint, title="Posterior means by temperature")
-    return (
-        Picture(name="latent_map", png=png(maps), alt=f"Density of normal and critical windows. {finding}"),
-        Picture(name="latent_scatter", png=png(dots), alt=f"Posterior means coloured by temperature. {finding}"),
+    maps = latent_map_figure(*kinds, joint=CARRIER, title="Latent map of normal and critical windows of joint 2")
+    dots = latent_scatter_figure(mu, temp_c, limit_c=limit_c, joint=CARRIER, title="Posterior means by temperature")
+    return Section(
+        sentences=(finding, active_units(mu)),
+        pictures=(
+            picture("latent_map", maps, f"Density of normal and critical windows. {finding}"),
+            picture("latent_scatter", dots, f"Posterior means coloured by temperature. {finding}"),
+        ),
     )
 
 
@@ -129,68 +128,67 @@ def _overlap(normal: Array, critical: Array) -> float:
 
 
 def reconstruction_chapter(lab: Lab) -> Section:
-    """What the twin makes of a normal and of a critical window."""
+    """A normal and a critical window and their reconstructions."""
     config = lab.twin.config
     cycles = [lab.study.test.plans[i].cycle.profile for i in lab.examples]
     samples = [resample(profile, RATE_HZ, config.rate_hz) for profile in cycles]
     windows = np.concatenate([cut(each, config.window, config.window)[:1] for each in samples])
-    return reconstruction_section(lab.twin, windows, CARRIER, "First window of the cycle of the two jobs above")
+    return reconstruction_section(lab.twin, windows, "First window of the cycle of the two jobs above")
 
 
-def reconstruction_section(twin: Twin, windows: Array, joint: int, source: str) -> Section:
-    """A normal and a critical window, [2, time, joint, channel], and their reconstructions."""
-    seen = twin.scaler.to_si(twin.scaler.to_z(windows))[:, :, joint]
-    made, error = twin.reconstruct(windows)[:, :, joint], twin.window_errors(windows)[:, joint]
+def reconstruction_section(twin: Twin, windows: Array, source: str) -> Section:
+    """Joint 2 of a normal and of a critical window, [2, time, joint, channel], and its reconstructions."""
+    recorded = twin.scaler.to_si(twin.scaler.to_z(windows))[:, :, CARRIER]
+    made, error = twin.reconstruct(windows)[:, :, CARRIER], twin.window_errors(windows)[:, CARRIER]
     title = f"Torque error: {error[1][TAU]:.1f} σ in the critical window, {error[0][TAU]:.1f} σ in the normal one"
-    drawn = signals_figure((seen[0], seen[1]), twin.config.rate_hz, joint=joint, title=title, made=(made[0], made[1]))
-    rows = tuple((name, f"{error[0][c]:.2f}", f"{error[1][c]:.2f}") for c, name in enumerate(CHANNEL_NAMES))
+    drawn = signals_figure(tuple(recorded), twin.config.rate_hz, joint=CARRIER, title=title, made=tuple(made))
     return Section(
         sentences=("The shaded area is the error from which the difficulty is computed.",),
         how=f"{source}, decoded from the posterior mean.",
-        pictures=(Picture(name="reconstruction", png=png(drawn), alt="Recorded and reconstructed motion and torque."),),
-        tables=(Table(head=("mean |error|, σ", "normal", "critical"), rows=rows),),
-        numbers={"normal": error[0].tolist(), "critical": error[1].tolist()},
+        pictures=(picture("reconstruction", drawn, "Recorded and reconstructed motion and torque."),),
+        tables=(
+            Table(
+                head=("mean |error|, σ", "normal", "critical"),
+                rows=tuple((name, *(f"{e:.2f}" for e in error[:, c])) for c, name in enumerate(CHANNEL_NAMES)),
+            ),
+        ),
+        numbers={"normal": error[0], "critical": error[1]},
     )
 
 
 def difficulty_chapter(lab: Lab) -> Section:
     """Difficulty of critical and non-critical jobs."""
     d, study = lab.difficulty, lab.study
-    critical, warm = study.critical, lab.warm
+    critical, cool = study.critical, lab.cool
     groups = {
-        f"cool, below {study.cool_c:g} °C": d[~critical & ~warm],
-        "between": d[warm],
+        f"cool, below {study.cool_c:g} °C": d[cool],
+        "between": d[~cool & ~critical],
         f"critical, {study.warning_c:g} °C and more": d[critical],
     }
     if not all(len(values) for values in groups.values()):
         raise FleetError("The test jobs lack a kind (cool, between or critical), so there is nothing to compare.")
     medians = {name: np.median(values, axis=0) for name, values in groups.items()}
-    cool, _, hot = medians.values()
+    of_cool, _, of_critical = medians.values()
     auroc = [float(roc_auc_score(critical, d[:, j])) for j in range(d.shape[1])]
     best, of_sum = int(np.argmax(auroc)), float(roc_auc_score(critical, d.sum(axis=1)))
     title = f"Joint {best + 1} separates critical jobs best (AUROC {auroc[best]:.2f}); the sum gets {of_sum:.2f}"
+    drawn = difficulty_figure(groups, title=title)
     rows = tuple((name, *(f"{v:.2f}" for v in m), f"{m.sum():.2f}") for name, m in medians.items())
     return Section(
         sentences=(
-            f"Median d of joint {best + 1}: {cool[best]:.2f} for cool jobs, {hot[best]:.2f} for critical ones. Even "
-            "cool jobs are far from zero, because two latent numbers never describe a window completely. Joints "
-            "without load carry only novelty, which the plain sum adds up.",
+            f"Median d of joint {best + 1}: {of_cool[best]:.2f} for cool jobs, {of_critical[best]:.2f} for critical "
+            "ones. Even cool jobs are far from zero, because two latent numbers never describe a window completely. "
+            "Joints without load carry only novelty, which the plain sum adds up.",
         ),
         how=f"d_k = 1 − exp(−e_k), with e_k the time mean of the absolute error of joint k summed over the channels, "
         f"for {len(d)} held-out jobs repeated for {study.horizon_s / 60:g} min.",
-        pictures=(
-            Picture(
-                name="difficulty",
-                png=png(difficulty_figure(groups, title=title)),
-                alt="Boxes of d per joint and histograms of the sum.",
-            ),
-        ),
+        pictures=(picture("difficulty", drawn, "Boxes of d per joint and histograms of the sum."),),
         tables=(Table(head=("median d", *(f"joint {j + 1}" for j in range(d.shape[1])), "sum"), rows=rows),),
         numbers={
-            "median": {name: m.tolist() for name, m in medians.items()},
+            "median": medians,
             "joint": best + 1,
-            "cool": float(cool[best]),
-            "critical": float(hot[best]),
+            "cool": float(of_cool[best]),
+            "critical": float(of_critical[best]),
             "auroc": auroc,
             "auroc_of_sum": of_sum,
         },
@@ -202,9 +200,9 @@ def epochs_chapter(lab: Lab) -> Section:
     jobs = [[phase.profile for phase in plan.phases] for plan in lab.study.train.plans]
     seeds = tuple(range(lab.size.epoch_seeds))
     study = epoch_study(jobs, epochs=lab.size.epochs, seeds=seeds, workers=1, progress=lab.progress)
-    known, held_out = study.table(CARRIER)
+    trained_on, held_out = (errors[:, :, CARRIER].mean(axis=0) for errors in (study.trained_on, study.held_out))
     rising = study.rising(CARRIER)
-    left, left_new = (errors[:, -1].mean(axis=0) / errors[:, 0].mean(axis=0) for errors in (known, held_out))
+    left, left_new = trained_on[-1] / trained_on[0], held_out[-1] / held_out[0]
     hardest = CHANNEL_NAMES[int(np.argmax(left))]
     first, last = study.epochs[0], study.epochs[-1]
     sentences = (
@@ -220,23 +218,18 @@ def epochs_chapter(lab: Lab) -> Section:
         f"{study.windows} windows). 20 other cool jobs are held out."
     )
     title = f"From {first} to {last} epochs {hardest} gains least, torque falls to {left[TAU]:.0%}"
-    section = epochs_section(study, CARRIER, sentences, how, title)
-    return replace(section, numbers={**section.numbers, "rising": rising.tolist()})
+    section = epochs_section(study, sentences, how, title)
+    return replace(section, numbers={**section.numbers, "rising": rising})
 
 
-def epochs_section(study: EpochStudy, joint: int, sentences: Sequence[str], how: str, title: str) -> Section:
-    """Errors of one joint by number of epochs, as figure and table."""
-    known, held_out = study.table(joint)
+def epochs_section(study: EpochStudy, sentences: tuple[str, ...], how: str, title: str) -> Section:
+    """Errors of joint 2 by number of epochs, as figure and table."""
     epochs = np.array(study.epochs)
-    panels = {
-        CHANNEL_NAMES[c]: {
-            "trained on": Line(epochs, known[:, :, c], NORMAL, "o"),
-            "held out": Line(epochs, held_out[:, :, c], INK, "s"),
-        }
-        for c in (TAU, 0, 1)
-    }
+    kinds = {"trained on": study.trained_on[:, :, CARRIER], "held out": study.held_out[:, :, CARRIER]}
+    looks = {"trained on": (NORMAL, "o"), "held out": (INK, "s")}
+    channels = {CHANNEL_NAMES[c]: c for c in (TAU, 0, 1)}
     drawn = lines_figure(
-        panels,
+        {name: {k: Line(epochs, kinds[k][:, :, c], *looks[k]) for k in kinds} for name, c in channels.items()},
         title=title,
         x_label="epochs",
         y_label="mean |error| (σ of the training data)",
@@ -246,14 +239,14 @@ def epochs_section(study: EpochStudy, joint: int, sentences: Sequence[str], how:
         from_zero=True,
     )
     rows = tuple(
-        (f"{CHANNEL_NAMES[c]}, {kind}", *(spread(errors[:, i, c], 2) for i in range(len(epochs))))
-        for c in (TAU, 0, 1)
-        for kind, errors in (("trained on", known), ("held out", held_out))
+        (f"{name}, {kind}", *(spread(seeds, 2) for seeds in errors[:, :, c].T))
+        for name, c in channels.items()
+        for kind, errors in kinds.items()
     )
     return Section(
-        sentences=tuple(sentences),
+        sentences=sentences,
         how=f"{how} Mean and standard deviation over the seeds, in standard deviations of the training data.",
-        pictures=(Picture(name="epochs", png=png(drawn), alt="Error against epochs. " + " ".join(sentences)),),
+        pictures=(picture("epochs", drawn, "Error against epochs. " + " ".join(sentences)),),
         tables=(Table(head=("mean |error|, σ", *(f"{n} epochs" for n in study.epochs)), rows=rows),),
-        numbers={"epochs": list(study.epochs), "known": known.tolist(), "held_out": held_out.tolist()},
+        numbers={"epochs": study.epochs, "known": kinds["trained on"], "held_out": kinds["held out"]},
     )

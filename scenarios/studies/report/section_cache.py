@@ -103,7 +103,7 @@ def compute_sections(
 
     Args:
         subject: What the chapters work on; pickled for several processes.
-        progress: Called before each section; with several processes, after each.
+        progress: Called after each group of sections.
     """
     done = {each.key: section for each in chapters if cache and (section := cache.read(each.key))}
     groups: dict[str, list[Chapter[Subject]]] = {}
@@ -112,36 +112,29 @@ def compute_sections(
             groups.setdefault(each.group or each.key, []).append(each)
     ordered = sorted(groups.values(), key=lambda group: -sum(each.load for each in group))
     loads = {each.key: each.load for group in ordered for each in group}
-    total, finished = sum(loads.values()), 0.0
-    if processes > 1 and len(ordered) > 1:
-        progress("sections", 0.0)
-        with Parallel(n_jobs=min(processes, len(ordered)), return_as="generator_unordered") as pool:
-            for sections in pool(delayed(_compute_group)(group, subject, cache) for group in ordered):
-                for section in sections or ():
-                    done[section.key] = section
-                    finished += loads[section.key]
-                    stage = f"{COUNTED}sections, {len(done)} of {len(chapters)} done: {section.title}"
-                    progress(stage, finished / total)
-    else:
-        for each in (each for group in ordered for each in group):
-            progress(f"{COUNTED}section {len(done) + 1} of {len(chapters)}: {each.title}", finished / total)
-            done[each.key] = _compute(each, subject, cache)
-            finished += each.load
+    finished = 0.0
+    progress("sections", 0.0)
+    with Parallel(n_jobs=max(1, min(processes, len(ordered))), return_as="generator_unordered") as pool:
+        results = pool(delayed(_compute)(group, subject, cache) for group in ordered)
+        for section in (section for sections in results for section in sections or ()):
+            done[section.key] = section
+            finished += loads[section.key]
+            stage = f"{COUNTED}sections, {len(done)} of {len(chapters)} done: {section.title}"
+            progress(stage, finished / sum(loads.values()))
     return [done[each.key] for each in chapters]
 
 
-def _compute_group(group: Sequence[Chapter[Subject]], subject: Subject, cache: SectionCache | None) -> list[Section]:
-    return [_compute(each, subject, cache) for each in group]
-
-
-def _compute(chapter: Chapter[Subject], subject: Subject, cache: SectionCache | None) -> Section:
-    try:
-        section = replace(chapter.compute(subject), key=chapter.key, title=chapter.title)
-    except (FleetError, ValueError) as error:
-        return Section(key=chapter.key, title=chapter.title, failed=f"{error}")
-    if cache is not None:
-        cache.write(section)
-    return section
+def _compute(group: Sequence[Chapter[Subject]], subject: Subject, cache: SectionCache | None) -> list[Section]:
+    sections = []
+    for chapter in group:
+        try:
+            section = replace(chapter.compute(subject), key=chapter.key, title=chapter.title)
+            if cache is not None:
+                cache.write(section)
+        except (FleetError, ValueError) as error:
+            section = Section(key=chapter.key, title=chapter.title, failed=f"{error}")
+        sections.append(section)
+    return sections
 
 
 def plain(value: Any) -> Any:  # JSON
