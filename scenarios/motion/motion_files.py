@@ -14,6 +14,7 @@ from fleet.robot import JOINTS
 from scenarios.motion.generate import Generated
 from scenarios.motion.recover import Recovery
 from scenarios.result_folder import ResultKind, new_folder
+from twin.vae.window import PHASES
 
 Array = np.ndarray
 Format = Literal["parquet", "csv"]
@@ -26,7 +27,6 @@ RECOVERY = ResultKind(
     name="recovery", card="recovery.json", files=("recovery.json", "recovery.parquet", "recovery.csv")
 )
 """Temperatures with and without recovery, and a card with the postures."""
-PHASES = ("approach", "cycle", "retreat")
 
 
 def save_generated(made: Generated, out: Path, *, format: Format = "parquet", overwrite: bool = False) -> None:
@@ -56,24 +56,27 @@ def motion_table(plan: Plan) -> pa.Table:
     """A plan as one row per sample: time_s, phase, payload_kg, q_1_rad …, qd_1_rad_s …, tau_1_nm …"""
     profile = np.concatenate([phase.profile for phase in plan.phases])
     lengths = [len(phase.profile) for phase in plan.phases]
-    columns: dict[str, Array] = {
-        "time_s": np.arange(len(profile)) / RATE_HZ,
-        "phase": np.repeat(PHASES, lengths),
-        "payload_kg": np.concatenate([phase.payload_kg for phase in plan.phases]),
-    }
-    for channel, (name, unit) in enumerate((("q", "rad"), ("qd", "rad_s"), ("tau", "nm"))):
-        for j in range(JOINTS):
-            columns[f"{name}_{j + 1}_{unit}"] = profile[:, channel, j]
-    return pa.table(columns)
+    return pa.table(
+        {
+            "time_s": np.arange(len(profile)) / RATE_HZ,
+            "phase": np.repeat(PHASES, lengths),
+            "payload_kg": np.concatenate([phase.payload_kg for phase in plan.phases]),
+            **_by_joint("q", "_rad", profile[:, 0]),
+            **_by_joint("qd", "_rad_s", profile[:, 1]),
+            **_by_joint("tau", "_nm", profile[:, 2]),
+        }
+    )
 
 
 def recovery_table(found: Recovery) -> pa.Table:
     """Winding temperatures as one row per moment: time_s, without_1_c …, with_1_c …"""
-    columns: dict[str, Array] = {"time_s": found.time_s}
-    for name, temp_c in (("without", found.without_c), ("with", found.with_c)):
-        for j in range(JOINTS):
-            columns[f"{name}_{j + 1}_c"] = temp_c[:, j]
-    return pa.table(columns)
+    temperatures = {**_by_joint("without", "_c", found.without_c), **_by_joint("with", "_c", found.with_c)}
+    return pa.table({"time_s": found.time_s, **temperatures})
+
+
+def _by_joint(name: str, unit: str, values: Array) -> dict[str, Array]:
+    """Columns `name_1unit` … of values [row, joint]."""
+    return {f"{name}_{j + 1}{unit}": values[:, j] for j in range(JOINTS)}
 
 
 def generated_summary(made: Generated, format: Format = "parquet") -> dict[str, Any]:
@@ -88,10 +91,7 @@ def generated_summary(made: Generated, format: Format = "parquet") -> dict[str, 
         "handed_out": len(made.motions),
         "rejected": dict(made.rejected),
         "truly_cool": made.truly_cool,
-        "cool_c": made.verification.cool_c,
-        "margin_k": made.verification.margin_k,
-        "horizon_s": made.verification.horizon_s,
-        "ambient_c": made.verification.ambient_c,
+        **{name: getattr(made.verification, name) for name in ("cool_c", "margin_k", "horizon_s", "ambient_c")},
         "rate_hz": RATE_HZ,
         "motions": [
             {

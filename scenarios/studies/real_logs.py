@@ -101,7 +101,7 @@ def log_study(
     seed: int,
     *,
     config: TwinConfig = CONFIG,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] = lambda share: None,
     folder: Path | None = None,
 ) -> LogStudy:
     """A twin trained on `TRAIN_SHARE` of the cool files, drawn by the seed, and its errors on all other files.
@@ -143,7 +143,7 @@ def log_study(
         twin=twin,
         train_files=tuple(r.name for r in taught),
         test_files=tuple(r.name for r in rest),
-        errors=twin.window_errors(joined["windows"]),
+        errors=twin.window_features(joined["windows"]).errors,
         **joined,
     )
 

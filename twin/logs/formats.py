@@ -13,8 +13,6 @@ Array = np.ndarray
 
 TEMP_RANGE_C = (-40.0, 200.0)
 """Range of a motor's temperature sensor; values outside are faults or kelvin."""
-LIMITED = tuple(j for j in range(JOINTS) if j not in CONTINUOUS)
-"""Joints with end stops, index 0..6, all within half a turn."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,10 +60,10 @@ PLAIN = Format(
 
 
 def format_of(names: Sequence[str]) -> Format:
-    """The format, recognised by its time column.
+    """The format with this time column.
 
     Raises:
-        ValueError: neither time column is there.
+        ValueError: there is no time column of a known format.
     """
     for known in (GEN3, PLAIN):
         if known.time in names:
@@ -78,28 +76,22 @@ def format_of(names: Sequence[str]) -> Format:
 
 
 def check_columns(known: Format, names: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The groups found, and the columns that belong to none.
+    """The groups of a format that a log has, and its columns that belong to no group.
 
     Raises:
         ValueError: columns are missing, or the arm has another number of joints.
     """
-    counts = {group: sum(_is_of(group, name) for name in names) for group in known.groups}
+    of_group = [name.rpartition("_")[0] for name in names if name.rpartition("_")[2].isdigit()]
+    counts = {group: of_group.count(group) for group in known.groups}
     groups = [g for i, g in enumerate(known.groups) if i < known.required or counts[g]]
     joints = {counts[g] if set(known.columns(g, counts[g])) <= set(names) else 0 for g in groups}
     if len(joints) == 1 and joints not in ({JOINTS}, {0}):
-        raise ValueError(
-            f"is of an arm with {joints.pop()} joints; a Gen3 has {JOINTS}, and only its logs can be read."
-        )
+        raise ValueError(f"has {joints.pop()} joints; only logs of a Gen3, which has {JOINTS}, can be read.")
     wanted = [known.time, *(column for g in groups for column in known.columns(g))]
     missing = [column for column in wanted if column not in names]
     if missing:
         raise ValueError(f"lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)} of a {known.name}.")
     return groups, [name for name in names if name not in wanted]
-
-
-def _is_of(group: str, name: str) -> bool:
-    start, _, joint = name.rpartition("_")
-    return start == group and joint.isdigit()
 
 
 def channels(known: Format, groups: Sequence[str], table: Table) -> dict[str, Array]:
@@ -123,12 +115,10 @@ def implausible_readings(known: Format, readings: dict[str, Array], where: Array
     damage: list[Damage] = []
     if not known.turns:
         # Beyond half a turn a joint with end stops has passed them.
-        q = np.where(np.isin(np.arange(JOINTS), LIMITED), readings["q"], 0.0)
-        damage += out_of_range(
-            q, where, (-np.pi, np.pi), "joint {joint} at {value:.5g} is beyond its stops; q is in rad"
-        )
+        q = np.where(np.isin(np.arange(JOINTS), CONTINUOUS), 0.0, readings["q"])
+        reason = "joint {joint} at {value:.5g} is beyond its stops; q is in rad"
+        damage += out_of_range(q, where, (-np.pi, np.pi), reason)
     if "temp_c" in readings:
-        damage += out_of_range(
-            readings["temp_c"], where, TEMP_RANGE_C, "motor {joint} at {value:.5g} is not a motor temperature in °C"
-        )
+        reason = "motor {joint} at {value:.5g} is not a motor temperature in °C"
+        damage += out_of_range(readings["temp_c"], where, TEMP_RANGE_C, reason)
     return damage

@@ -21,6 +21,7 @@ from twin.vae.window import Q
 
 MODEL = "twin.onnx"
 OPSET = 17
+OUTPUTS = ["reconstruction", "errors", "mu"]
 
 
 class ExportError(FleetError):
@@ -56,8 +57,8 @@ def export_onnx(twin: Twin, path: Path) -> Path:
                 (example,),
                 str(draft),
                 input_names=["windows"],
-                output_names=["reconstruction", "errors", "mu"],
-                dynamic_axes={name: {0: "batch"} for name in ("windows", "reconstruction", "errors", "mu")},
+                output_names=OUTPUTS,
+                dynamic_axes={name: {0: "batch"} for name in ("windows", *OUTPUTS)},
                 opset_version=OPSET,
                 dynamo=False,
             )
@@ -85,7 +86,8 @@ class _OnnxTwin(nn.Module):
         turns[[j for j in CONTINUOUS if j < twin.joints], Q] = 2 * np.pi
         home = np.zeros_like(turns)
         home[:, Q] = twin.scaler.turn_q
-        for name, value in (("turn", turns), ("home", home), ("mean", twin.scaler.mean), ("std", twin.scaler.std)):
+        constants = {"turn": turns, "home": home, "mean": twin.scaler.mean, "std": twin.scaler.std}
+        for name, value in constants.items():
             self.register_buffer(name, torch.from_numpy(np.array(value, dtype=float)))
 
     def forward(self, windows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
