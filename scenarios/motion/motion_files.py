@@ -41,15 +41,15 @@ def save_generated(made: Generated, out: Path, *, format: Format = "parquet", ov
         _write_card(generated_summary(made, format), folder / GENERATED.card)
 
 
-def save_recovery(found: Recovery, out: Path, *, format: Format = "parquet", overwrite: bool = False) -> None:
+def save_recovery(recovery: Recovery, out: Path, *, format: Format = "parquet", overwrite: bool = False) -> None:
     """Write `recovery.parquet` (or .csv) and `recovery.json`.
 
     Raises:
         FleetError: `out` cannot be written, or holds something that is not ours to replace.
     """
     with new_folder(out, RECOVERY, overwrite=overwrite) as folder:
-        _write(recovery_table(found), folder / f"recovery.{format}")
-        _write_card(recovery_summary(found), folder / RECOVERY.card)
+        _write(recovery_table(recovery), folder / f"recovery.{format}")
+        _write_card(recovery_summary(recovery), folder / RECOVERY.card)
 
 
 def motion_table(plan: Plan) -> pa.Table:
@@ -68,10 +68,10 @@ def motion_table(plan: Plan) -> pa.Table:
     )
 
 
-def recovery_table(found: Recovery) -> pa.Table:
+def recovery_table(recovery: Recovery) -> pa.Table:
     """Winding temperatures as one row per moment: time_s, without_1_c …, with_1_c …"""
-    temperatures = {**_by_joint("without", "_c", found.without_c), **_by_joint("with", "_c", found.with_c)}
-    return pa.table({"time_s": found.time_s, **temperatures})
+    temperatures = {**_by_joint("without", "_c", recovery.without_c), **_by_joint("with", "_c", recovery.with_c)}
+    return pa.table({"time_s": recovery.time_s, **temperatures})
 
 
 def _by_joint(name: str, unit: str, values: Array) -> dict[str, Array]:
@@ -115,29 +115,29 @@ def generated_summary(made: Generated, format: Format = "parquet") -> dict[str, 
     }
 
 
-def recovery_summary(found: Recovery) -> dict[str, Any]:
+def recovery_summary(recovery: Recovery) -> dict[str, Any]:
     """The recovery as plain values; joints are counted from one."""
     return {
         "status": "finished",
-        "arm": found.arm,
-        "twin": found.twin_version,
-        "payload_kg": found.payload_kg,
-        "hottest_joint": found.hottest + 1,
-        "q_before_rad": found.q_before.tolist(),
-        "q_after_rad": found.q_after.tolist(),
-        "origin": found.origin,
-        "most_moved_rad": float(np.abs(found.moved_rad).max()),
-        "tool_moved_m": found.tool_m,
-        "difficulty_before": found.difficulty_before.tolist(),
-        "difficulty_after": found.difficulty_after.tolist(),
-        "best_error": found.best_error,
-        "passed_over": found.passed_over,
-        "start_c": float(found.with_c[0, found.hottest]),
-        "end_with_c": float(found.with_c[-1, found.hottest]),
-        "end_without_c": float(found.without_c[-1, found.hottest]),
-        "cooled_k": found.cooled_k,
-        "spared_k": found.spared_k,
-        "tracking_error_rad": found.error_rad,
+        "arm": recovery.arm,
+        "twin": recovery.twin_version,
+        "payload_kg": recovery.payload_kg,
+        "hottest_joint": recovery.hottest + 1,
+        "q_before_rad": recovery.q_before.tolist(),
+        "q_after_rad": recovery.q_after.tolist(),
+        "origin": recovery.origin,
+        "most_moved_rad": float(np.abs(recovery.moved_rad).max()),
+        "tool_moved_m": recovery.tool_m,
+        "difficulty_before": recovery.difficulty_before.tolist(),
+        "difficulty_after": recovery.difficulty_after.tolist(),
+        "best_error": recovery.best_error,
+        "passed_over": recovery.passed_over,
+        "start_c": float(recovery.with_c[0, recovery.hottest]),
+        "end_with_c": float(recovery.with_c[-1, recovery.hottest]),
+        "end_without_c": float(recovery.without_c[-1, recovery.hottest]),
+        "cooled_k": recovery.cooled_k,
+        "spared_k": recovery.spared_k,
+        "tracking_error_rad": recovery.error_rad,
     }
 
 

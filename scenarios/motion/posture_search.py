@@ -93,7 +93,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class SearchResult:
     """Result of a search."""
 
     candidate: Candidate
@@ -129,7 +129,7 @@ class Search:
         """The hottest motor, index 0..6."""
         return int(np.argmax(self.winding_c))
 
-    def best(self, rng: np.random.Generator) -> Found:
+    def best(self, rng: np.random.Generator) -> SearchResult:
         """The easiest candidate that passes every check.
 
         Raises:
@@ -147,7 +147,7 @@ class Search:
                 break
             plan = self._plan_or_reason(candidate.q)
             if isinstance(plan, Plan):
-                return Found(candidate, plan, dict(passed_over), _best_by_origin(first))
+                return SearchResult(candidate, plan, dict(passed_over), _best_by_origin(first))
             passed_over[plan] += 1
         raise RecoveryError(self._failure(len(ranked), passed_over))
 

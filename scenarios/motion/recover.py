@@ -124,21 +124,21 @@ def recover(
     search = Search(
         twin, model, verification, near, np.asarray(q, dtype=float), payload_kg, before_c, now_c, hold_s - near.watch_s
     )
-    found = search.best(np.random.default_rng(np.random.SeedSequence(seed)))
-    recovered = on(found.plan)
+    result = search.best(np.random.default_rng(np.random.SeedSequence(seed)))
+    recovered = on(result.plan)
     return Recovery(
         arm=arm.robot.name,
         twin_version=twin.version,
         payload_kg=payload_kg,
         q_before=search.q,
-        q_after=found.candidate.q,
-        origin=found.candidate.origin,
+        q_after=result.candidate.q,
+        origin=result.candidate.origin,
         hottest=search.hottest,
         difficulty_before=holding(twin, model, search.q[None], payload_kg).load[0],
-        difficulty_after=holding(twin, model, found.candidate.q[None], payload_kg).load[0],
-        tool_m=found.candidate.tool_m,
-        passed_over=found.passed_over,
-        best_error=found.best_error,
+        difficulty_after=holding(twin, model, result.candidate.q[None], payload_kg).load[0],
+        tool_m=result.candidate.tool_m,
+        passed_over=result.passed_over,
+        best_error=result.best_error,
         time_s=time_s,
         without_c=_held(stayed, time_s),
         with_c=_held(recovered, time_s),

@@ -96,4 +96,4 @@ def _cell(jobs: Sequence[Sequence[Array]], config: TwinConfig, seed: int, record
     others = [phase for i in chosen[records : 5 * records] for phase in jobs[i] if len(phase)]
     twin = train(taught, config, np.random.SeedSequence(seed), arm="epochs")
     seen, new = (windows_of(part, config) for part in (taught, others))
-    return twin.window_features(seen).errors.mean(axis=0), twin.window_features(new).errors.mean(axis=0), len(seen)
+    return twin.window_errors(seen).mean(axis=0), twin.window_errors(new).mean(axis=0), len(seen)

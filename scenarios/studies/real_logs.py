@@ -143,7 +143,7 @@ def log_study(
         twin=twin,
         train_files=tuple(r.name for r in taught),
         test_files=tuple(r.name for r in rest),
-        errors=twin.window_features(joined["windows"]).errors,
+        errors=twin.window_errors(joined["windows"]),
         **joined,
     )
 

@@ -83,21 +83,21 @@ def _recording(path: Path, name: str, table: Table, damaged: Damaged) -> Recordi
     """A recording from the good rows of a table."""
     is_csv = path.suffix != ".parquet"
     try:
-        known = format_of(table.names) if is_csv else PLAIN
-        groups, unknown = check_columns(known, table.names)
+        layout = format_of(table.names) if is_csv else PLAIN
+        groups, unknown = check_columns(layout, table.names)
     except ValueError as error:
         raise LogError(str(path), 1 if is_csv else None, str(error)) from error
-    readings = channels(known, groups, table)
-    damage = [*table.damage, *implausible_readings(known, readings, table.where)]
+    readings = channels(layout, groups, table)
+    damage = [*table.damage, *implausible_readings(layout, readings, table.where)]
     good = ~np.isin(table.where, [d.line for d in damage])
-    time_s = table.values[:, table.names.index(known.time)]
+    time_s = table.values[:, table.names.index(layout.time)]
     try:
         damage += time_damage(time_s[good], table.where[good])
     except ValueError as error:
         raise LogError(str(path), None, str(error)) from error
     broken = table.broken
     if unknown:
-        broken = (*broken, f"its columns {', '.join(unknown)} are unknown to a {known.name}")
+        broken = (*broken, f"its columns {', '.join(unknown)} are unknown to a {layout.name}")
     if damaged == "refuse" and (broken or damage):
         others = len(broken) + len(damage) - 1
         more = f", and {others} more damaged place{'s' * (others > 1)}" if others else ""

@@ -56,10 +56,9 @@ class Experience:
 
     def __post_init__(self) -> None:
         packed = self.features.packed
-        wanted = {"duration_s": packed.shape[:1], "temp_c": packed.shape[:2], "passed": packed.shape[:1]}
-        for name, shape in wanted.items():
-            if getattr(self, name).shape != shape:
-                raise ValueError(f"Experience.{name} must be {shape} (got {getattr(self, name).shape}).")
+        for name, axes in (("duration_s", 1), ("temp_c", 2), ("passed", 1)):
+            if getattr(self, name).shape != packed.shape[:axes]:
+                raise ValueError(f"Experience.{name} must be {packed.shape[:axes]} (got {getattr(self, name).shape}).")
         if self.passed.dtype != bool:
             raise ValueError(f"Experience.passed must be bool (got {self.passed.dtype}).")
         for name, values in (("features", packed), ("duration_s", self.duration_s), ("temp_c", self.temp_c)):

@@ -110,17 +110,10 @@ def _step(logs: Sequence[HeatLog]) -> float:
 def _parameters(vector: ParameterVector, x: Array, jacobian: Array) -> tuple[Parameter, ...]:
     sd = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
     value, low, high = (np.exp(x + shift * sd) for shift in (0.0, -_SIGMA_95, _SIGMA_95))
+    prior = np.exp(vector.mean)
+    columns = {"value": value, "low": low, "high": high, "prior": prior, "prior_sd": vector.sd, "sd": sd}
     return tuple(
-        Parameter(
-            name=name,
-            joint=None if joint is None else joint + 1,
-            value=float(value[i]),
-            low=float(low[i]),
-            high=float(high[i]),
-            prior=float(np.exp(vector.mean[i])),
-            prior_sd=float(vector.sd[i]),
-            sd=float(sd[i]),
-        )
+        Parameter(name=name, joint=None if joint is None else joint + 1, **{c: float(v[i]) for c, v in columns.items()})
         for i, (name, joint) in enumerate(vector.names)
     )
 

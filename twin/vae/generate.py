@@ -118,9 +118,9 @@ def _correlated_noise(shape: tuple[int, ...], share: float, rng: np.random.Gener
     return eps
 
 
-def _align_turns(q: Array, known: Array) -> Array:
-    """Decoded angles [window, time, joint] shifted by whole turns to near the known ones."""
-    turns = np.round((known.mean(axis=1) - q.mean(axis=1)) / (2 * np.pi))
+def _align_turns(q: Array, source_q: Array) -> Array:
+    """Decoded angles [window, time, joint] shifted by whole turns to near the source's."""
+    turns = np.round((source_q.mean(axis=1) - q.mean(axis=1)) / (2 * np.pi))
     return q + 2 * np.pi * np.where(np.isin(np.arange(q.shape[-1]), CONTINUOUS), turns, 0.0)[:, None]
 
 
@@ -220,8 +220,8 @@ def time_spline(spline: BSpline, duration_s: float, speed: float) -> tuple[Array
 
 def _position_errors(phase: Phase, motion: PhaseMotion) -> Array:
     """Generated minus source positions at equal shares of the phase's time, [time, joint]."""
-    known = resample(phase.profile, RATE_HZ, RATE_HZ)[:, Q]
-    if len(known) == 0:
-        return known
-    at, samples = np.linspace(0.0, len(motion.q) - 1.0, len(known)), np.arange(len(motion.q))
-    return np.stack([np.interp(at, samples, q) for q in motion.q.T], axis=-1) - known
+    source_q = resample(phase.profile, RATE_HZ, RATE_HZ)[:, Q]
+    if len(source_q) == 0:
+        return source_q
+    at, samples = np.linspace(0.0, len(motion.q) - 1.0, len(source_q)), np.arange(len(motion.q))
+    return np.stack([np.interp(at, samples, q) for q in motion.q.T], axis=-1) - source_q

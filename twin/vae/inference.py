@@ -1,4 +1,4 @@
-"""The trained networks of one arm as one module on windows of all its joints, and on NumPy arrays."""
+"""The trained networks of one arm as one module on windows of all joints, and functions of NumPy arrays."""
 
 from collections.abc import Callable, Sequence
 
@@ -34,7 +34,7 @@ class Networks(nn.Module):
         return torch.cat(parts, dim=2).unflatten(2, (-1, len(CHANNELS)))
 
     def forward(self, z: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-        """Windows decoded from their posterior means, [batch, time, joint, channel], and these means."""
+        """Windows decoded from their posterior means, [batch, time, joint, channel], and the means."""
         mu = self.encode(z)[0]
         return self.decode(mu, steps), mu
 

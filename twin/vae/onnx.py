@@ -50,7 +50,7 @@ def export_onnx(twin: Twin, path: Path) -> Path:
     with atomic_path(file) as draft:
         with warnings.catch_warnings(), torch.inference_mode(False), torch.no_grad():
             # The dynamo exporter needs onnxscript. The warning about LSTMs with a varying batch does not apply: ours
-            # start from zeros of the batch's own size. tests/twin/test_export.py runs other sizes.
+            # start from zeros of the batch's own size. tests/twin/test_onnx.py runs other sizes.
             warnings.simplefilter("ignore")
             torch.onnx.export(
                 _OnnxTwin(twin),

@@ -168,6 +168,10 @@ class Twin:
         """Time means of windows [batch, time, joint, channel] in SI units, [batch, joint]."""
         return Features(self._window_features(self._to_z(windows), np.full(windows.shape[:2], 1.0 / windows.shape[1])))
 
+    def window_errors(self, windows: Array) -> Array:
+        """Time mean of |x − x̂| of windows in SI units, in training standard deviations, [batch, joint, channel]."""
+        return self.window_features(windows).errors
+
     def posterior(self, windows: Array) -> tuple[Array, Array]:
         """Mean and standard deviation of the latent of windows in SI units, each [batch, net, latent]."""
         return inference.posterior(self.networks, self._to_z(windows))

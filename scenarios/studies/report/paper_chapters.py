@@ -140,7 +140,7 @@ def reconstruction_chapter(lab: Lab) -> Section:
 def reconstruction_section(twin: Twin, windows: Array, joint: int, source: str) -> Section:
     """A normal and a critical window, [2, time, joint, channel], and their reconstructions."""
     seen = twin.scaler.to_si(twin.scaler.to_z(windows))[:, :, joint]
-    made, error = twin.reconstruct(windows)[:, :, joint], twin.window_features(windows).errors[:, joint]
+    made, error = twin.reconstruct(windows)[:, :, joint], twin.window_errors(windows)[:, joint]
     title = f"Torque error: {error[1][TAU]:.1f} σ in the critical window, {error[0][TAU]:.1f} σ in the normal one"
     drawn = signals_figure((seen[0], seen[1]), twin.config.rate_hz, joint=joint, title=title, made=(made[0], made[1]))
     rows = tuple((name, f"{error[0][c]:.2f}", f"{error[1][c]:.2f}") for c, name in enumerate(CHANNEL_NAMES))
