@@ -1,7 +1,7 @@
 """Central policies that assign jobs by a cost matrix [arm, slot] of `agents.costs`.
 
-Two jobs that share a station may be assigned together: as after any claims, the arm with the lower difficulty gets its
-job, and the other one is asked again.
+They may assign two jobs that share a station. As with any claims, the arm with the lower difficulty then gets its job,
+and the other arm chooses again.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,14 +11,14 @@ import numpy as np
 
 from agents.costs import quickest, thermal
 from agents.policy import WAIT
-from agents.rules import cheapest_pairs, claims_of
+from agents.rules import Stateless, cheapest_pairs, claims_of
 from fleet.observation import Observation
 
 Array = np.ndarray
 
 
-class Ssi:
-    """Sequential single-item auction: the cheapest pair of arm and job first, then the cheapest of what is left.
+class Ssi(Stateless):
+    """Sequential single-item auction: greedy, the cheapest pair of arm and job first.
 
     Scope central: it compares the costs of all arms.
     """
@@ -26,11 +26,8 @@ class Ssi:
     scope: ClassVar = "central"
     only_choices = True
 
-    def reset(self, rng: np.random.Generator) -> None:
-        """Nothing to reset."""
-
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
-        """The claims of the pairs that `pairs` finds."""
+        """The claims of the pairs of arm and job."""
         if not any(seen.action_mask[1:].any() for seen in observations.values()):
             return dict.fromkeys(observations, WAIT)
         return claims_of(observations, self.pairs(self.cost(list(observations.values()))))
@@ -78,13 +75,13 @@ def matching(cost: Array) -> list[tuple[int, int]]:
 
     Source: Kuhn 1955; Crouse 2016 for rectangular matrices.
     """
-    from scipy.optimize import linear_sum_assignment  # slow to import, and few processes need it
+    from scipy.optimize import linear_sum_assignment  # slow import that few processes need
 
     allowed = np.isfinite(cost)
     if not allowed.any():
         return []
     cost = cost - cost[allowed].min()
-    # So expensive that no saving elsewhere makes up for a pair that is not allowed.
+    # More than any saving elsewhere, so that a forbidden pair is the last resort.
     forbidden = (cost[allowed].max() + 1.0) * (min(cost.shape) + 1)
     rows, columns = linear_sum_assignment(np.where(allowed, cost, forbidden))
     return [(a, j) for a, j in zip(rows.tolist(), columns.tolist(), strict=True) if allowed[a, j]]

@@ -1,10 +1,10 @@
-"""Allocation by agreement: arms bid, pass on the best bids they know of, and give way to better ones.
+"""The consensus-based auction algorithm for one job per arm: arms bid, and forward the best bids they received.
 
-The consensus-based auction algorithm for one job per arm. In a round every arm without a job bids for the one that
-costs it least among those where it beats the best bid it knows of. Then it adopts, for every job, the best bid that it
-or a neighbour knows of, and loses its job where that bid is another arm's. After at most (diameter × the fewer of arms
-and jobs) rounds all connected arms agree, no job has two winners, and the outcome is that of choosing the cheapest pair
-of arm and job first with knowledge of every bid. Each component of a disconnected graph agrees separately.
+In a round every arm without a job bids for its cheapest job among those where it beats the best bid it knows. Then it
+adopts, for every job, the best bid of its own and its neighbours' beliefs, and loses its job if that bid is another
+arm's. After at most (diameter × the smaller number of arms and jobs) rounds all connected arms agree, and no job has
+two winners. The outcome is that of the greedy choice of the cheapest pair by a central auctioneer. Each component of a
+disconnected graph agrees separately.
 
 Source: Choi, Brunet & How (2009), Consensus-Based Decentralized Auctions for Robust Task Allocation, IEEE T-RO 25(4),
 algorithms 1 and 2 and theorem 1; here a bid is a cost, and the lower one wins.
@@ -26,27 +26,27 @@ Array = np.ndarray
 NOBODY = -1
 """The winner of a job without a bid."""
 _UNKNOWN = JOINTS + 1.0
-"""Cost of a job that an arm can do but has no score for: above every score, as two differ by at most JOINTS."""
+"""Cost of a feasible job without a score: above every score, because two scores differ by at most JOINTS."""
 
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """The best bid that arms know of for each job, and whose it is; leading axes [...] are those of the arms."""
+    """The best bid known for each job, and its bidder; leading axes [...] are those of the arms."""
 
     cost: Array
-    """[..., job], inf where there is no bid."""
+    """[..., job], inf without a bid."""
     winner: Array
-    """Index of the arm, int [..., job], NOBODY where there is no bid. An arm has the job that it believes it won."""
+    """Index of the arm, int [..., job], NOBODY without a bid. An arm has the job that it believes to have won."""
 
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """What the arms believe in the end."""
+    """Beliefs of the arms after the last round."""
 
     belief: Belief
     """[arm, job]."""
     rounds: int
-    """Rounds in which some arm's belief changed."""
+    """Number of rounds in which some arm's belief changed."""
 
     @property
     def claims(self) -> Array:
@@ -56,11 +56,11 @@ class Agreement:
 
 
 def bid(belief: Belief, cost: Array, me: Array | int) -> Belief:
-    """What arms believe after those without a job bid for the cheapest one they can win; ties: the first job.
+    """Beliefs after every arm without a job has bid for the cheapest one it can win; ties: the first job.
 
     Args:
         belief: [..., job].
-        cost: Of each job to the arm, [..., job], inf where it cannot do it.
+        cost: Of each job to the arm, [..., job], inf for infeasible ones.
         me: Index of the arm, [...].
     """
     mine = np.asarray(me)[..., None]
@@ -72,7 +72,7 @@ def bid(belief: Belief, cost: Array, me: Array | int) -> Belief:
 
 
 def merge(received: Belief) -> Belief:
-    """The best of the beliefs [..., sender, job] that reached an arm, its own included; ties: the first arm."""
+    """The best of the beliefs [..., sender, job] received by an arm, its own included; ties: the first arm."""
     cost = received.cost.min(axis=-2)
     none = np.iinfo(received.winner.dtype).max
     winner = np.where(received.cost == cost[..., None, :], received.winner, none).min(axis=-2)
@@ -83,37 +83,37 @@ def agree(cost: Array, links: Array) -> Agreement:
     """Rounds of bids and messages until no arm's belief changes.
 
     Args:
-        cost: Of each job to each arm, [arm, job], inf where it cannot do it.
-        links: Whose messages reach whom, bool, [receiver, sender].
+        cost: Of each job to each arm, [arm, job], inf for infeasible ones.
+        links: Whether messages are delivered, bool, [receiver, sender].
     """
     arms, jobs = cost.shape
     belief = Belief(np.full((arms, jobs), np.inf), np.full((arms, jobs), NOBODY))
     if not jobs:
         return Agreement(belief, 0)
     received = (links | np.eye(arms, dtype=bool))[..., None]  # [receiver, sender, 1]
-    # Every change is a better bid for a job somewhere, or a bid passed on: one-way links cannot make more.
+    # Every change is a better bid for a job, or a forwarded bid, which bounds the rounds also with one-way links.
     for rounds in range(arms * (jobs * arms + 1)):
         sent = bid(belief, cost, np.arange(arms))
         merged = merge(Belief(np.where(received, sent.cost, np.inf), np.where(received, sent.winner, NOBODY)))
         if np.array_equal(merged.cost, belief.cost) and np.array_equal(merged.winner, belief.winner):
             return Agreement(belief, rounds)
         belief = merged
-    raise AssertionError("bids only ever get better, so the loop ends")
+    raise AssertionError("bids only improve, so the loop ends")
 
 
 class Consensus(LeastDifficulty):
-    """Arms bid their difficulty relative to the fleet's average, and agree on who does which job.
+    """Arms bid their difficulty relative to the fleet's average, and agree on the allocation of jobs.
 
-    Scope arm. With messages from all peers an arm works out the agreement by itself: it is what `least_difficulty`
-    chooses. In simulation, `act` runs the rounds of bids along the links whose message of this moment arrived, so arms
-    out of each other's reach agree through those between them; over late messages no arm agrees with another, and each
-    claims for itself. Rounds take no time and are not counted as messages.
+    Scope arm. With messages from all peers an arm can compute the agreement alone: the choice of `least_difficulty`. In
+    simulation, `act` runs the rounds of bids along the links that delivered a message at this step, so distant arms
+    agree through the arms between them. Late messages do not count: arms without a link claim independently. Rounds
+    take no time and are not counted as messages.
     """
 
     only_choices = True
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
-        """Each arm's claim after as many rounds as it takes."""
+        """Each arm's claim after the last round."""
         seen = list(observations.values())
         cost = np.array([self._bids(obs, place) for place, obs in enumerate(seen)])
         if not np.isfinite(cost).any():
@@ -124,7 +124,7 @@ class Consensus(LeastDifficulty):
         return {arm: WAIT if claim == NOBODY else claim + 1 for arm, claim in zip(observations, claims, strict=True)}
 
     def _bids(self, observation: Observation, place: int) -> Array:
-        """Cost of each slot to this arm, inf where it may not claim it, [slot]."""
+        """Cost of each slot to this arm, [slot]; inf for those that it may not claim."""
         legal = observation.action_mask[1:] > 0
         if not legal.any():
             return np.full(len(legal), np.inf)

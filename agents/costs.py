@@ -12,7 +12,7 @@ from fleet.observation import Observation
 Array = np.ndarray
 
 RISK = 9.0
-"""A job in which a motor surely passes its warning limit counts 1 + RISK times its difficulty."""
+"""The cost of a job in which a motor surely passes its warning limit is 1 + RISK times its difficulty."""
 LATE_PER_H = 1.0
 """Cost of an hour of tardiness for each unit of a job's value, in units of difficulty."""
 TIME_PER_H = 0.01
@@ -24,9 +24,9 @@ DIGITS = 9
 def thermal(observations: Sequence[Observation]) -> Array:
     """Difficulty weighted by risk, relative to the fleet's average for that job; late and valuable jobs come first.
 
-    An arm's difficulty counts 1 + RISK · P(saturation) times. As in `agents.rules.LeastDifficulty` it is relative to
-    the average of the arms that may claim the job. An unknown difficulty counts as that average. Where no arm has a
-    difficulty the risk decides, and after it the time until the finish.
+    The difficulty is weighted by 1 + RISK · P(saturation). As in `agents.rules.LeastDifficulty` it is relative to the
+    average of the arms that may claim the job, and an unknown difficulty equals that average. If no arm has a
+    difficulty, the risk decides, then the time until the finish.
     """
     able = _able(observations)
     difficulty, known = _stack(observations, "difficulty"), _stack(observations, "known") > 0
@@ -35,12 +35,12 @@ def thermal(observations: Sequence[Observation]) -> Array:
     late = LATE_PER_H * _stack(observations, "value") * tardiness_s / 3600.0
     time = TIME_PER_H * _finish_s(observations) / 3600.0
     cost = difficulty * (1.0 + RISK * _stack(observations, "p_saturation")) + late + time
-    # A job that waits is late for whichever arm takes it: the average decides between jobs, not between arms.
+    # Waiting makes a job late for every arm: the average lateness decides between jobs, not between arms.
     return np.where(able, cost - _mean(cost, able) - _mean(late, able), np.inf).round(DIGITS)
 
 
 def quickest(observations: Sequence[Observation]) -> Array:
-    """Seconds until the arm would have finished the job; heat counts nothing."""
+    """Seconds until the arm would finish the job; heat is ignored."""
     return np.where(_able(observations), _finish_s(observations), np.inf).round(DIGITS)
 
 
@@ -50,7 +50,7 @@ def _able(observations: Sequence[Observation]) -> Array:
 
 
 def _finish_s(observations: Sequence[Observation]) -> Array:
-    """Seconds until the arm would have finished the job, its current one first, [arm, slot]."""
+    """Seconds until the arm would finish the job, after its current one, [arm, slot]."""
     return _busy_s(observations) + _stack(observations, "duration_s")
 
 
@@ -63,5 +63,5 @@ def _stack(observations: Sequence[Observation], field: str) -> Array:
 
 
 def _mean(values: Array, where: Array) -> Array:
-    """Average over some of the arms, [slot]; 0 where there is none."""
+    """Average over some of the arms, [slot]; 0 without any."""
     return np.where(where, values, 0.0).sum(axis=0) / np.maximum(where.sum(axis=0), 1)

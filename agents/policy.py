@@ -1,8 +1,8 @@
-"""What a policy is: it reads observations and answers with actions.
+"""The protocol of policies, which choose actions from observations.
 
-Every policy has a scope. A `central` one sees the observations of all arms, as an allocator does that has asked them
-all; in a live fleet it runs in the auctioneer. An `arm` one sees a single observation: what one arm knows of itself and
-what its peers shared; in a live fleet it runs in the process of each arm.
+Every policy has a scope. A `central` policy sees the observations of all arms; in a live fleet it runs in the
+auctioneer. An `arm` policy sees one observation: an arm's own state and what its peers shared; in a live fleet it runs
+in the process of each arm.
 """
 
 from collections.abc import Callable, Mapping
@@ -15,51 +15,43 @@ from fleet.observation import Observation
 SCOPES = ("central", "arm")
 
 WAIT = 0
-"""The action that is always legal: wait, or go on with the current job."""
+"""The action that is always legal: wait, or continue the current job."""
 
 
-class Policy(Protocol):
-    """Chooses one slot (or WAIT) for every arm.
-
-    A policy of scope `arm` is made one with `EveryArm`, unless it brings an `act` of its own.
-    """
-
+class _Resettable(Protocol):
     scope: ClassVar[str]
 
     def reset(self, rng: np.random.Generator) -> None:
         """Begin a shift; `rng` is the policy's only source of randomness."""
         ...
+
+
+class Policy(_Resettable, Protocol):
+    """Chooses one slot (or WAIT) for every arm.
+
+    `EveryArm` makes one from a policy of scope `arm` without an `act` of its own.
+    """
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
         """One action per arm: WAIT, or k to claim the job in slot k (k = 1 is `observation.difficulty[0]`)."""
         ...
 
 
-class ArmPolicy(Protocol):
+class ArmPolicy(_Resettable, Protocol):
     """Chooses one slot (or WAIT) for one arm; every arm has an instance of its own."""
 
-    scope: ClassVar[str]
-
-    def reset(self, rng: np.random.Generator) -> None:
-        """Begin a shift; `rng` is the policy's only source of randomness."""
-        ...
-
     def choose(self, observation: Observation, place: int) -> int:
-        """WAIT, or k to claim the job in slot k.
-
-        Args:
-            place: Index of this arm in the fleet, for example to settle ties.
-        """
+        """WAIT, or k to claim the job in slot k; `place` is the arm's index in the fleet, for example to break ties."""
         ...
 
 
 class EveryArm:
-    """Runs an arm policy where all arms are asked: one instance for each arm, each given its own observation only."""
+    """Runs an arm policy for all arms: one instance per arm, which sees this arm's observation only."""
 
     scope: ClassVar = "arm"
 
     def __init__(self, make: Callable[[], ArmPolicy]) -> None:
-        """Prepare it; `make` is the class of the policy."""
+        """`make` is the class of the policy."""
         self._make, self.kind = make, type(make())
         self.reset(np.random.default_rng(0))
 
@@ -69,29 +61,27 @@ class EveryArm:
         self._instances: dict[str, ArmPolicy] = {}
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
-        """What each arm chooses."""
-        return {arm: self._of(arm).choose(seen, place) for place, (arm, seen) in enumerate(observations.items())}
-
-    def _of(self, arm: str) -> ArmPolicy:
-        if arm not in self._instances:
-            self._instances[arm] = self._make()
-            self._instances[arm].reset(self._rng)
-        return self._instances[arm]
+        """The choice of each arm."""
+        for arm in observations:
+            if arm not in self._instances:
+                self._instances[arm] = self._make()
+                self._instances[arm].reset(self._rng)
+        return {arm: self._instances[arm].choose(seen, i) for i, (arm, seen) in enumerate(observations.items())}
 
 
 def for_all_arms(make: Callable[[], Policy] | Callable[[], ArmPolicy]) -> Policy:
-    """A fresh policy for all arms: an arm policy without an `act` of its own is run by `EveryArm`."""
+    """A new policy for all arms; `EveryArm` runs an arm policy without an `act` of its own."""
     policy: Policy | ArmPolicy = make()
     if hasattr(policy, "act"):
-        return policy  # pyright: ignore[reportReturnType]  # it has the method
-    return EveryArm(make)  # pyright: ignore[reportArgumentType]  # it lacks the other method
+        return policy  # pyright: ignore[reportReturnType]  # hasattr does not narrow the type
+    return EveryArm(make)  # pyright: ignore[reportArgumentType]
 
 
 def only_choices(policy: Policy) -> bool:
-    """Whether the policy need not be asked while no arm may claim anything.
+    """Whether calls of the policy can be skipped while no arm may claim a job, which is nine steps of ten.
 
-    A class says so with `only_choices = True`: it then answers WAIT for all arms, draws no random number and remembers
-    nothing. This saves nine calls of ten. A subclass has to repeat it.
+    A class declares `only_choices = True` if it then returns WAIT for all arms, draws no random number and changes no
+    state. A subclass must declare it again.
     """
     kind = policy.kind if isinstance(policy, EveryArm) else type(policy)
     return vars(kind).get("only_choices") is True

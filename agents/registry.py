@@ -1,4 +1,4 @@
-"""Every policy by its name: what `--policy` accepts in `run`, `compare`, `train`, `up`, `auction` and `arm`."""
+"""Policies by name, as `--policy` accepts them in `run`, `compare`, `train`, `up`, `auction` and `arm`."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ class Rule:
 
     kind: type[Policy] | type[ArmPolicy]
     cost: str
-    """What it minimises, for a table."""
+    """The quantity that it minimises, for a table."""
     source: str = ""
 
     @property
@@ -44,12 +44,12 @@ RULES: dict[str, Rule] = {
 
 
 def names_of(scope: str) -> str:
-    """The policies of a scope, for a sentence."""
+    """The policies of a scope, separated by commas."""
     return ", ".join(name for name, rule in RULES.items() if rule.scope == scope)
 
 
 NAMES_HELP = f"{', '.join(RULES)}, your own as FILE.py:CLASS, or a folder of train."
-"""For `--help`: what a policy may be called."""
+"""Allowed names of a policy, for `--help`."""
 
 
 def rule_of(name: str) -> Rule:
@@ -64,9 +64,5 @@ def rule_of(name: str) -> Rule:
 
 
 def make_policy(name: str) -> Policy:
-    """A fresh policy by name, for all arms.
-
-    Raises:
-        ValueError: no such policy; names the nearest one.
-    """
+    """A new policy by name, for all arms; raises as `rule_of`."""
     return for_all_arms(rule_of(name).kind)

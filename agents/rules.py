@@ -1,4 +1,4 @@
-"""Dispatching rules, each with one idea. But for `wspt_cool` they keep the fleet busy: an arm that may work does."""
+"""Dispatching rules. Except `wspt_cool` they are non-idling: an arm that may claim a job does so."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -12,6 +12,13 @@ from fleet.observation import Observation
 Array = np.ndarray
 
 
+class Stateless:
+    """A policy without state from step to step."""
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Nothing to reset."""
+
+
 class RandomLegal:
     """Every free arm claims a random legal job. Scope arm: it reads the arm's own mask."""
 
@@ -19,14 +26,14 @@ class RandomLegal:
     only_choices = True
 
     def __init__(self) -> None:
-        self._rng = np.random.default_rng(0)
+        self.reset(np.random.default_rng(0))
 
     def reset(self, rng: np.random.Generator) -> None:
         """Begin a shift."""
         self._rng = rng
 
     def choose(self, observation: Observation, place: int) -> int:
-        """A uniform choice among the legal claims; WAIT only where there is none."""
+        """A uniform choice among the legal claims; WAIT without one."""
         choices = legal_slots(observation)
         return int(self._rng.choice(choices)) + 1 if choices else WAIT
 
@@ -45,47 +52,41 @@ class RoundRobin:
         self._turn = 0
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
-        """Go through the slots from the oldest job, giving each to the next able arm."""
+        """One pass over the slots from the oldest job; each goes to the next able arm."""
         arms = list(observations)
         actions = dict.fromkeys(arms, WAIT)
-        for slot in _slots(observations):
-            for step in range(len(arms)):
-                arm = arms[(self._turn + step) % len(arms)]
-                if actions[arm] == WAIT and observations[arm].action_mask[slot + 1]:
-                    actions[arm] = slot + 1
-                    self._turn = (self._turn + step + 1) % len(arms)
-                    break
+        for slot in range(_slots(observations)):
+            in_turn = [arms[(self._turn + step) % len(arms)] for step in range(len(arms))]
+            arm = _first_able(in_turn, slot, observations, actions)
+            if arm is not None:
+                actions[arm] = slot + 1
+                self._turn = (arms.index(arm) + 1) % len(arms)
         return actions
 
 
-class CoolestFirst:
+class CoolestFirst(Stateless):
     """The oldest job goes to the free arm with most headroom. Scope central: it compares all headrooms."""
 
     scope: ClassVar = "central"
     only_choices = True
 
-    def reset(self, rng: np.random.Generator) -> None:
-        """Nothing to reset."""
-
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
-        """Go through the slots from the oldest job, giving each to the coolest able arm."""
+        """One pass over the slots from the oldest job; each goes to the coolest able arm."""
         coolest = sorted(observations, key=lambda arm: -float(observations[arm].headroom_k))
         actions = dict.fromkeys(observations, WAIT)
-        for slot in _slots(observations):
-            for arm in coolest:
-                if actions[arm] == WAIT and observations[arm].action_mask[slot + 1]:
-                    actions[arm] = slot + 1
-                    break
+        for slot in range(_slots(observations)):
+            arm = _first_able(coolest, slot, observations, actions)
+            if arm is not None:
+                actions[arm] = slot + 1
         return actions
 
 
-class LeastDifficulty:
+class LeastDifficulty(Stateless):
     """The pair of free arm and job with the least difficulty relative to the fleet's average for that job first.
 
-    Work that is new to every twin would be left by all if plain difficulties were compared across jobs; relative to
-    the average, it counts who finds it easier. Scope arm: each arm works it out from its own scores, those its peers
-    shared, and its place in the fleet, which settles ties. Where nobody has a score, free arms take the oldest jobs in
-    the fleet's order. `agents.staleness` says what an old message still counts.
+    With absolute difficulties no arm would claim work that is new to every twin. Scope arm: each arm computes it from
+    its own scores, those its peers shared, and its place in the fleet, which breaks ties. Without any score, free arms
+    claim the oldest jobs in the fleet's order. `agents.staleness` discounts old messages.
     """
 
     scope: ClassVar = "arm"
@@ -94,11 +95,8 @@ class LeastDifficulty:
     def __init__(self, trust: Trust | None = None) -> None:
         self._trust = trust or Trust()
 
-    def reset(self, rng: np.random.Generator) -> None:
-        """Nothing to reset."""
-
     def choose(self, observation: Observation, place: int) -> int:
-        """This arm's claim, if all arms do what this one expects of them."""
+        """This arm's claim under the assumption that its peers follow the same rule."""
         mine = legal_slots(observation)
         if not mine:
             return WAIT
@@ -114,36 +112,33 @@ class LeastDifficulty:
         return mine[min(before, len(mine) - 1)] + 1
 
 
-class Wspt:
+class Wspt(Stateless):
     """The pair of free arm and job with the highest value per time first: weighted shortest processing time.
 
     Optimal for the weighted sum of completion times on one machine (W. E. Smith, Naval Research Logistics Quarterly 3,
-    1956); a strong rule on several unlike ones. It looks at no temperature. Scope central: it compares the arms' times.
+    1956), a strong rule on unrelated machines. It ignores temperatures. Scope central: it compares the arms' times.
     """
 
     scope: ClassVar = "central"
     only_choices = True
     most_p = 1.0
-    """No claim above this probability to pass the warning limit."""
-
-    def reset(self, rng: np.random.Generator) -> None:
-        """Nothing to reset."""
+    """Largest P(saturation) of a claim."""
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
-        """Pair after pair; ties go to the older job, then to the first arm."""
+        """The claims; ties go to the older job, then to the first arm."""
         cost = np.stack([-self._rate(seen) for seen in observations.values()])  # [arm, slot]
         return claims_of(observations, cheapest_pairs(cost))
 
     def _rate(self, seen: Observation) -> Array:
-        """Value per second of every slot, −inf where it is not to be claimed, [slot]."""
+        """Value per second of every slot, [slot]; −inf for those that must not be claimed."""
         allowed = seen.action_mask[1:].astype(bool) & (seen.p_saturation <= self.most_p)
         return np.where(allowed, seen.value / np.maximum(seen.duration_s, 1.0), -np.inf).astype(float)
 
 
 class WsptCool(Wspt):
-    """As `wspt`, but an arm leaves a job in which a motor would more likely than not pass the warning limit.
+    """As `wspt`, but no arm claims a job in which a motor would more likely than not pass the warning limit.
 
-    It rests rather than run hot; work that no arm can do coolly waits until one can. Scope central, as `wspt`.
+    Such a job waits until an arm has cooled. Scope central, as `wspt`.
     """
 
     only_choices = True
@@ -151,11 +146,11 @@ class WsptCool(Wspt):
 
 
 def cheapest_pairs(cost: Array) -> list[tuple[int, int]]:
-    """Pairs (arm, slot) of a cost matrix [arm, slot], the cheapest first, then the cheapest of what is left.
+    """Pairs (arm, slot) of a cost matrix [arm, slot], chosen greedily, the cheapest first.
 
-    Every arm and every slot once; inf is never paired. Ties go to the first slot, then to the first arm. This is the
-    outcome of a sequential single-item auction with one job per arm (Lagoudakis et al. 2005, Robotics: Science and
-    Systems; Koenig et al. 2006, AAAI).
+    Each arm and each slot is in at most one pair; inf is never paired. Ties go to the first slot, then to the first
+    arm. This is the outcome of a sequential single-item auction with one job per arm (Lagoudakis et al. 2005, Robotics:
+    Science and Systems; Koenig et al. 2006, AAAI).
     """
     slots, pairs = cost.T, list[tuple[int, int]]()
     arms_left, slots_left = set(range(len(cost))), set(range(len(slots)))
@@ -183,6 +178,12 @@ def _open(observation: Observation, mine: list[int]) -> Array:
     return (observation.offered > 0) & (may | (observation.feasible == 0))
 
 
-def _slots(observations: Mapping[str, Observation]) -> range:
-    first = next(iter(observations.values()))
-    return range(len(first.offered))
+def _slots(observations: Mapping[str, Observation]) -> int:
+    return len(next(iter(observations.values())).offered)
+
+
+def _first_able(
+    arms: list[str], slot: int, observations: Mapping[str, Observation], actions: Mapping[str, int]
+) -> str | None:
+    """The first of the arms that may claim the slot and has no claim yet."""
+    return next((a for a in arms if actions[a] == WAIT and observations[a].action_mask[slot + 1]), None)

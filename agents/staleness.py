@@ -1,9 +1,8 @@
 """Discount stale peer messages.
 
-A difficulty is a claim about a job and fades: after an age it counts exp(−age / fading) of a fresh one, both in the
-fleet's average and in the peer's distance from that average. So an old claim neither wins nor loses a job against a
-fresh one. A state is a claim about a moment and expires: nobody knows whether a peer is free whose last message is
-older than `expiry_s`, so no job is left to it. Messages of age 0 count in full.
+A difficulty describes a job and fades: at an age its weight is exp(−age / fading), both in the fleet's average and in
+the peer's distance from that average. So old scores have little influence on an assignment. A state describes a moment
+and expires: a peer whose last message is older than `expiry_s` counts as busy, so no job is left to it.
 """
 
 from dataclasses import dataclass
@@ -17,10 +16,10 @@ Array = np.ndarray
 
 @dataclass(frozen=True, kw_only=True)
 class Trust:
-    """How long peer messages count."""
+    """Time scales on which peer messages lose their weight."""
 
     fading_s: float = 60.0
-    """Age at which a difficulty counts for 1/e."""
+    """Age at which a difficulty has the weight 1/e."""
     expiry_s: float = 60.0
     """Age from which a peer's state is ignored."""
 
@@ -34,20 +33,17 @@ class Trust:
         return np.exp(-observation.peer_age_s.astype(float) / self.fading_s)
 
     def free(self, observation: Observation) -> Array:
-        """Peers that are free as far as this arm knows, bool, [peer]."""
-        heard = (observation.peer_heard > 0) & (observation.peer_age_s < self.expiry_s)
-        return heard & (observation.peer_working == 0) & (observation.peer_faulted == 0)
+        """Peers that are free by their last messages, bool, [peer]."""
+        current = (observation.peer_heard > 0) & (observation.peer_age_s < self.expiry_s)
+        return current & (observation.peer_working == 0) & (observation.peer_faulted == 0)
 
 
 def advantage(observation: Observation, place: int, open_slots: Array, trust: Trust) -> Array:
-    """How much harder than the fleet on average each arm finds each job, as this arm knows it, [arm, slot].
+    """Difficulty of each job for each arm relative to the fleet's average, as this arm knows it, [arm, slot].
 
     Args:
         place: Index of this arm in the fleet.
-        open_slots: Slots that count, bool, [slot].
-
-    Returns:
-        NaN where nothing is known.
+        open_slots: Slots to compare, bool, [slot]; others are NaN, as are unknown difficulties.
     """
     own = np.where(observation.known > 0, observation.difficulty, np.nan)
     peers = np.where(observation.peer_known > 0, observation.peer_difficulty, np.nan)

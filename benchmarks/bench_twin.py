@@ -170,7 +170,7 @@ def main() -> None:
     parser.add_argument("--full", action="store_true", help="train seven joints at the default configuration")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    default, arm = TwinConfig(), TwinConfig.whole_arm()
+    default, arm = TwinConfig(), TwinConfig(scope="arm", hidden=64, latent=8)
     print(f"{'training step, batch 128':<26}{'ours ms':>9}{'plain':>9}{'floor':>9}{'ratio':>8}")
     training(default, "one joint of seven")
     training(arm, "whole arm")

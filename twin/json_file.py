@@ -1,4 +1,4 @@
-"""JSON files of a known format version, written atomically and checked when read."""
+"""JSON files of a fixed format version, written atomically and checked when read."""
 
 from pathlib import Path
 from typing import TypeVar
@@ -18,39 +18,31 @@ class _Head(msgspec.Struct):
 
 
 def write_card(card: msgspec.Struct, path: Path) -> None:
-    """Write a card atomically into an existing folder."""
+    """Write a card atomically; its folder is made if need be."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as draft:
         draft.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=2))
 
 
 def read_card(path: Path, kind: type[Card], *, format_: int, what: str) -> Card:
-    """The card in a file.
-
-    Args:
-        format_: The supported format version.
-        what: What the card describes, for the error.
+    """The card in a file of the supported format version; `what` names its content in errors.
 
     Raises:
         CheckpointError: the file is missing or damaged, or of another format.
     """
     try:
         text = path.read_bytes()
-    except FileNotFoundError:
-        raise CheckpointError(f"No {what} in {path.parent}: {path.name} is missing.") from None
-    try:
         head = msgspec.json.decode(text, type=_Head)
         if head.format != format_:
             raise CheckpointError(f"{path}: format {head.format} is not supported, only {format_}.")
         return msgspec.json.decode(text, type=kind)
+    except FileNotFoundError:
+        raise CheckpointError(f"No {what} in {path.parent}: {path.name} is missing.") from None
     except msgspec.DecodeError as error:  # not JSON, or (ValidationError) JSON of another shape
         raise CheckpointError(f"{path}: {error}") from error
 
 
 def check_version(where: Path, stated: str, actual: str) -> None:
-    """Refuse content that differs from what was saved.
-
-    Raises:
-        CheckpointError: the hash of the content is not the version in the card.
-    """
+    """Raise CheckpointError if the hash of the content is not the version stated in its card."""
     if actual != stated:
         raise CheckpointError(f"{where}: the content has changed since it was saved (version {stated}, now {actual}).")

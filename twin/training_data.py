@@ -1,6 +1,6 @@
 """Select the parts of an arm's recordings on which its twin is trained.
 
-They are chosen by the temperatures after them, not by those at the time: a heavy job begins cool too.
+They are chosen by the later temperatures, not by those at the time: a heavy job begins cool too.
 """
 
 from collections.abc import Sequence
@@ -18,22 +18,7 @@ TREND_S = 60.0
 
 
 class NothingCool(FleetError):
-    """No part of the recordings stayed cool, so there is no training data.
-
-    Attributes:
-        fact: The message without its advice.
-    """
-
-    def __init__(self, fact: str, advice: str) -> None:
-        super().__init__(f"{fact} {advice}")
-        self.fact, self.advice = fact, advice
-
-    def __reduce__(self) -> tuple[type, tuple[str, str]]:
-        return type(self), (self.fact, self.advice)
-
-
-class TooShort(NothingCool):
-    """The parts that stayed cool are shorter than a window."""
+    """No part of the recordings stayed cool for long enough, so there is no training data."""
 
 
 def cool_stretches(
@@ -46,7 +31,7 @@ def cool_stretches(
     least_s: float = 0.0,
     gap_s: float = GAP_S,
 ) -> list[Stretch]:
-    """The stretches from every moment of which no motor reaches `cool_c` within the horizon.
+    """The stretches at every moment of which no motor reaches `cool_c` within the horizon.
 
     Where a recording ends within the horizon, its temperatures are extrapolated linearly from the last minute. That is
     on the safe side: the warmer a motor, the faster it cools.
@@ -60,12 +45,11 @@ def cool_stretches(
         least_s: Least length of a stretch, such as a twin's window.
 
     Raises:
-        TooShort: there are such stretches, all shorter than `least_s`.
-        NothingCool: there is no such stretch; the message names the warm motors.
+        NothingCool: there is no such stretch, which names the warm motors, or all are shorter than `least_s`.
         ValueError: no recordings, one without temperatures, or limits of another number of joints.
     """
     if not recordings:
-        raise ValueError("There are no recordings to choose from.")
+        raise ValueError("Training data needs at least one recording (got none).")
     cool_parts: list[Stretch] = []
     whole = True
     for recording in recordings:
@@ -75,10 +59,15 @@ def cool_stretches(
         for piece in _runs(cool):
             cool_parts += stretches(recording.part(piece), rate_hz, gap_s=gap_s)
     if not cool_parts:
-        raise _nothing_cool(recordings, cool_c, joints, horizon_s)
+        raise NothingCool(_no_cool_moment(recordings, cool_c, joints, horizon_s))
     long = [s for s in cool_parts if len(s.time_s) >= least_s * rate_hz]
     if not long:
-        raise _too_short(max(len(s.time_s) for s in cool_parts) / rate_hz, least_s, whole=whole)
+        longest_s = max(len(s.time_s) for s in cool_parts) / rate_hz
+        what = "The recording" if whole else "The part that stays cool"
+        raise NothingCool(
+            f"{what} is shorter than one window: {least_s:.4g} s are needed, the longest stretch has {longest_s:.4g} "
+            "s. Record for longer, or choose a smaller window (--window)."
+        )
     return long
 
 
@@ -136,37 +125,23 @@ def _runs(mask: Array) -> list[slice]:
     return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
-def _nothing_cool(
+def _no_cool_moment(
     recordings: Sequence[Recording],
     cool_c: float | Sequence[float] | Array,
     joints: Sequence[int] | None,
     horizon_s: float,
-) -> NothingCool:
+) -> str:
     coolest = np.min([r.temp_c.min(axis=0) for r in recordings if r.temp_c is not None and len(r.time_s)], axis=0)
     limit_c = _limits(recordings[0], cool_c, joints)
     counted = np.flatnonzero(np.isfinite(limit_c))
-    names = ", ".join(str(j + 1) for j in counted)
-    some = f"motor {names} never" if len(counted) == 1 else f"none of motors {names}"
-    who = "no motor" if len(counted) == len(limit_c) else some
     least_c, most_c = limit_c[counted].min(), limit_c[counted].max()
     limit = f"{least_c:g} °C" if least_c == most_c else f"its {least_c:g} to {most_c:g} °C"
-    until = f"{horizon_s:g} s" if np.isfinite(horizon_s) else "a rest of the recording"
+    until = f"for {horizon_s:g} s" if np.isfinite(horizon_s) else "for the rest of its recording"
     always = [f"{j + 1} ({coolest[j]:.1f} °C)" for j in np.flatnonzero(coolest >= limit_c)]
-    least = f" Of all samples the coolest of joint {', '.join(always)} is over its limit." if always else ""
-    return NothingCool(
-        f"No moment of {_counted(len(recordings))} is followed by {until} in which {who} reaches {limit}.{least}",
-        "Raise cool_c (idle wrists of a Gen3 sit at 40 to 43 °C: limits may differ by joint), count fewer joints, "
-        "shorten horizon_s, or record light work.",
+    return (
+        f"At no moment of {len(recordings)} recording(s) do the motors {', '.join(str(j + 1) for j in counted)} stay "
+        f"below {limit} {until}."
+        + (f" Always above: {', '.join(always)}, the coolest sample." if always else "")
+        + " Raise the limit (--cool; it may differ by joint, idle wrists of a Gen3 are at 40 to 43 °C), count fewer "
+        "joints, shorten the horizon, or record light work."
     )
-
-
-def _too_short(longest_s: float, least_s: float, *, whole: bool) -> TooShort:
-    what = "What was recorded" if whole else "What stays cool"
-    return TooShort(
-        f"{what} is shorter than one window: {least_s:.4g} s are needed, the longest stretch has {longest_s:.4g} s.",
-        "Record for longer, or look at less at a time (least_s).",
-    )
-
-
-def _counted(recordings: int) -> str:
-    return "one recording" if recordings == 1 else f"{recordings} recordings"

@@ -1,1 +1,1 @@
-"""Policies that are trained: one shared network over sets of jobs and peers, and how it learns."""
+"""Trained policies: one shared network over sets of jobs and peers, and its training."""

@@ -1,4 +1,4 @@
-"""A warm start: an actor learns what a rule does before it learns what is better."""
+"""Warm start of a training: the actor imitates a rule before it learns by reinforcement."""
 
 from collections.abc import Iterable
 
@@ -15,39 +15,38 @@ Array = np.ndarray
 def imitate(
     actor: Actor,
     layout: Layout,
-    shown: Iterable[tuple[Array, Array, Array]],
+    batches: Iterable[tuple[Array, Array, Array]],
     rng: np.random.Generator,
     *,
     epochs: int = 4,
     minibatch: int = 512,
     learning_rate: float = 2e-3,
 ) -> list[float]:
-    """Learn from what a rule chose, by cross-entropy.
+    """Learn the actions of a rule by cross-entropy.
 
     Args:
-        shown: Batches of vectors float32 [row, size], masks [row, slot + 1] and actions int [row]; rows in which there
-            was no choice are left out.
+        batches: Vectors float32 [row, size], masks [row, slot + 1] and actions int [row]; rows without a choice are
+            ignored.
 
     Returns:
         Mean cross-entropy of each batch in its last epoch, nat.
     """
     optimizer = torch.optim.Adam(actor.parameters(), lr=learning_rate)
-    told: list[float] = []
-    for vectors, masks, actions in shown:
+    batch_means: list[float] = []
+    for vectors, masks, actions in batches:
         choice = masks.sum(axis=-1) > 1
         if not choice.any():
             continue
-        seen, legal, done = (torch.from_numpy(np.ascontiguousarray(part[choice])) for part in (vectors, masks, actions))
+        seen, legal, chosen = (torch.from_numpy(np.ascontiguousarray(a[choice])) for a in (vectors, masks, actions))
         losses: list[float] = []
         for _ in range(epochs):
-            order = rng.permutation(len(seen))
             losses = []
-            for rows in np.array_split(order, -(-len(order) // minibatch)):
+            for rows in np.array_split(rng.permutation(len(seen)), -(-len(seen) // minibatch)):
                 at = torch.from_numpy(rows)
-                loss = nn.functional.cross_entropy(masked(actor(layout, seen[at]), legal[at]), done[at].long())
+                loss = nn.functional.cross_entropy(masked(actor(layout, seen[at]), legal[at]), chosen[at].long())
                 optimizer.zero_grad()
                 loss.backward()
                 optimizer.step()
                 losses.append(float(loss.detach()))
-        told.append(float(np.mean(losses)))
-    return told
+        batch_means.append(float(np.mean(losses)))
+    return batch_means

@@ -1,7 +1,7 @@
 """The shared network: one actor for every arm of every fleet, and the critics that train it.
 
-Deep sets (Zaheer et al., NeurIPS 2017): slots and peers enter by the same small networks and are pooled, so the
-logits move with the slots, and neither the order of peers nor their number matters.
+Deep sets (Zaheer et al., NeurIPS 2017): small shared networks encode slots and peers, and their outputs are pooled. So
+the logits are equivariant in the slots, and invariant to the order and number of peers.
 """
 
 from collections.abc import Sequence
@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from agents.learned.features import OWN, PAIR, PEER, SLOT, sets_of
 from fleet.observation import Layout
 
-RARELY = -3.0
-"""Logit by which a fresh actor rather claims than waits: it begins as a rule that keeps the fleet busy."""
+WAIT_BIAS = -3.0
+"""Initial bias of the logit of waiting, so that an untrained actor claims jobs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +33,7 @@ class NetworkSize:
 
 
 class Actor(nn.Module):
-    """What an arm would rather do: logits over wait and the slots."""
+    """Logits over waiting and the slots."""
 
     def __init__(self, size: NetworkSize | None = None) -> None:
         super().__init__()
@@ -44,7 +44,7 @@ class Actor(nn.Module):
         self.claim = _mlp([2 * size.slot + size.arm, size.slot, 1], last=False)
         self.wait = _mlp([size.slot + size.arm, size.slot, 1], last=False)
         self._pair = size.pair
-        nn.init.constant_(last_bias(self.wait), RARELY)
+        nn.init.constant_(_last_linear(self.wait).bias, WAIT_BIAS)
 
     def forward(self, layout: Layout, vectors: Tensor) -> Tensor:
         """Logits before the mask, [row, slot + 1], of vectors [row, size]."""
@@ -52,20 +52,14 @@ class Actor(nn.Module):
         slots, peers = slot_in.shape[-2], peer_in.shape[-2]
         own = self.own(own_in)
         if peers:
-            said = torch.cat(
-                [
-                    pair_in,
-                    peer_in[..., :, None, :].expand(*pair_in.shape[:-1], PEER),
-                    slot_in[..., None, :, :].expand(*pair_in.shape[:-1], SLOT),
-                ],
-                dim=-1,
-            )
-            heard = self.pair(said)
-            crowd = torch.cat([heard.mean(dim=-3), heard.amax(dim=-3)], dim=-1)
+            of_peer = peer_in[..., :, None, :].expand(*pair_in.shape[:-1], PEER)
+            of_slot = slot_in[..., None, :, :].expand(*pair_in.shape[:-1], SLOT)
+            pairs = self.pair(torch.cat([pair_in, of_peer, of_slot], dim=-1))
+            pooled = torch.cat([pairs.mean(dim=-3), pairs.amax(dim=-3)], dim=-1)
         else:
-            crowd = slot_in.new_zeros(*slot_in.shape[:-1], 2 * self._pair)
+            pooled = slot_in.new_zeros(*slot_in.shape[:-1], 2 * self._pair)
         mine = own[..., None, :].expand(*slot_in.shape[:-1], own.shape[-1])
-        slot = self.slot(torch.cat([slot_in, crowd, mine], dim=-1))
+        slot = self.slot(torch.cat([slot_in, pooled, mine], dim=-1))
         offered = slot_in[..., :1]
         queue = (offered * slot).sum(dim=-2) / offered.sum(dim=-2).clamp(min=1.0)
         waiting = queue[..., None, :].expand(*queue.shape[:-1], slots, queue.shape[-1])
@@ -74,7 +68,7 @@ class Actor(nn.Module):
 
 
 class Critic(nn.Module):
-    """What a fleet's state is worth: of all arms together (MAPPO), or as each sees it (IPPO)."""
+    """Value of the state from the observations of all arms (MAPPO), or of each arm alone (IPPO)."""
 
     def __init__(self, size: NetworkSize | None = None, *, central: bool = True) -> None:
         super().__init__()
@@ -98,14 +92,12 @@ class Critic(nn.Module):
 
 
 def masked(logits: Tensor, mask: Tensor) -> Tensor:
-    """Logits with those of illegal actions at the lowest finite value, so that their probability is zero."""
+    """Logits with the lowest finite value for illegal actions, so that their probability is zero."""
     return logits.masked_fill(~mask.bool(), torch.finfo(logits.dtype).min)
 
 
-def last_bias(layers: nn.Sequential) -> Tensor:
-    """The bias of the last linear layer."""
-    linear = [layer for layer in layers if isinstance(layer, nn.Linear)][-1]
-    return linear.bias
+def _last_linear(layers: nn.Sequential) -> nn.Linear:
+    return [layer for layer in layers if isinstance(layer, nn.Linear)][-1]
 
 
 def _mlp(widths: Sequence[int], *, last: bool = True) -> nn.Sequential:

@@ -1,4 +1,4 @@
-"""A trained policy: the shared actor as a `Policy`, and how it is kept (safetensors and JSON)."""
+"""A trained policy: the shared actor as a `Policy`, saved as safetensors and JSON."""
 
 import json
 from collections.abc import Mapping
@@ -18,18 +18,18 @@ from fleet.files import atomic_path
 from fleet.observation import Layout, Observation
 
 FORMAT = 2
-"""Raised when the network or what it is fed changes."""
+"""Increase it when the network or its inputs change."""
 WEIGHTS, CARD = "policy.safetensors", "policy.json"
 
 
 class LearnedPolicy:
-    """Every arm draws its action from the actor's probabilities, as in training. Scope arm: one observation decides.
+    """Every arm draws its action from the actor's probabilities, as in training. Scope arm: it reads one observation.
 
-    Taking the likeliest action would not do: arms with the same observation would all claim the same job, and an arm
-    that waits now and then would wait for ever.
+    The most probable action would be worse: arms with equal observations would all claim the same job, and an arm that
+    waits with a high probability would wait forever.
 
     Args:
-        actor: Trained, for a fleet of any size.
+        actor: A trained actor; it serves fleets of any size.
     """
 
     scope: ClassVar = "arm"
@@ -48,7 +48,7 @@ class LearnedPolicy:
         return self.act({"": observation})[""]
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
-        """What each arm chooses, in one call of the network."""
+        """The actions of all arms, from one call of the network."""
         actions = dict.fromkeys(observations, WAIT)
         choosing = [arm for arm, seen in observations.items() if seen.action_mask[1:].any()]
         if not choosing:
@@ -63,21 +63,21 @@ class LearnedPolicy:
 
 
 def draw(logits: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A draw from softmax(logits), int [...], of logits [..., action] (Gumbel's trick)."""
+    """A draw from softmax(logits) by Gumbel's trick, logits [..., action] to int [...]."""
     return (logits + rng.gumbel(size=logits.shape)).argmax(axis=-1)
 
 
-def save_policy(actor: Actor, size: NetworkSize, folder: Path, **told: object) -> None:
-    """Write an actor into a folder, made if need be; files appear whole or not at all.
+def save_policy(actor: Actor, size: NetworkSize, folder: Path, **details: object) -> None:
+    """Write an actor into a folder, made if need be; each file is written atomically.
 
     Args:
-        told: What the card shall say besides: scenario, algorithm, steps.
+        details: Additional JSON values of the card: scenario, algorithm, steps.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_path(folder / WEIGHTS) as draft:
-        # Not save_file, which hides its file from the group and others.
+        # save_file would make the file unreadable for group and others.
         draft.write_bytes(save({name: value.contiguous() for name, value in actor.state_dict().items()}))
-    card = {"format": FORMAT, "size": asdict(size), **told}
+    card = {"format": FORMAT, "size": asdict(size), **details}
     with atomic_path(folder / CARD) as draft:
         draft.write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
 
@@ -91,7 +91,7 @@ def load_policy(folder: Path) -> LearnedPolicy:
     try:
         card = json.loads((folder / CARD).read_text(encoding="utf-8"))
         if card["format"] != FORMAT:
-            raise CheckpointError(f"{folder / CARD}: format {card['format']} is not {FORMAT}: train it again.")
+            raise CheckpointError(f"{folder / CARD}: format {card['format']} is not {FORMAT}. Train the policy again.")
         size = NetworkSize(**card["size"])
     except FileNotFoundError as error:
         raise CheckpointError(f"There is no trained policy in '{folder}': no {CARD}.") from error

@@ -1,8 +1,8 @@
-"""MAPPO and IPPO through TorchRL: proximal policy optimisation of one actor that all arms share.
+"""MAPPO and IPPO with TorchRL: proximal policy optimisation of one actor that all arms share.
 
-Clipped surrogate (Schulman et al., arXiv 1707.06347) with generalised advantages (arXiv 1506.02438); a critic of the
-whole fleet (MAPPO, Yu et al., NeurIPS 2022) or of each arm by itself (IPPO, de Witt et al., arXiv 2011.09533). Only
-moments at which an arm has a choice train the actor: an arm at work can only go on.
+Clipped surrogate (Schulman et al., arXiv 1707.06347) with generalised advantages (arXiv 1506.02438); the critic sees
+the whole fleet (MAPPO, Yu et al., NeurIPS 2022) or one arm (IPPO, de Witt et al., arXiv 2011.09533). The actor trains
+only on steps at which an arm has a choice; a working arm has none.
 """
 
 import pickle
@@ -31,76 +31,80 @@ from fleet.observation import Layout
 
 Algorithm = Literal["mappo", "ippo"]
 SEEN, MASK, ACTION, LIKELIHOOD = ("arms", "observation"), ("arms", "action_mask"), ("arms", "action"), "log_prob"
+_STATE = ("actor", "critic", "optimizer")
 EnvFactory = Callable[[int, int], EnvBase]
-"""Makes a native batched environment of so many envs from a seed; keys as in `fleet.env.adapters.torchrl`."""
+"""From a number of envs and a seed to a batched environment with the keys of `fleet.env.adapters.torchrl`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PpoConfig:
-    """How it is trained."""
+    """Hyperparameters of a training."""
 
     algorithm: Algorithm = "mappo"
     size: NetworkSize = field(default_factory=NetworkSize)
     envs: int = 64
     steps: int = 128
-    """Decision intervals of every env in an iteration."""
+    """Steps of every env in an iteration."""
     epochs: int = 4
-    """Over the choices; the critic sees every moment once."""
+    """Passes of the actor over an iteration's choices; the critic makes one over all steps."""
     minibatch: int = 512
-    """Choices of arms in a step of the actor."""
+    """Choices in one optimiser step of the actor."""
     learning_rate: float = 3e-4
     gamma: float = 0.99
     lmbda: float = 0.98
-    """Near 1: the value of the job in hand is not in the observation, so it is the reward itself that must arrive."""
+    """Near 1: the value of the current job is not in the observation, so the return must contain its reward."""
     clip: float = 0.2
     entropy: float = 0.002
     """Weight of the entropy bonus."""
     max_gradient: float = 0.5
     reward_scale: float = 0.1
     warm_start: str = ""
-    """Rule that the actor imitates first; empty for none."""
+    """Policy that the actor imitates first; empty for none."""
     seed: int = 0
 
     def __post_init__(self) -> None:
         if self.algorithm not in get_args(Algorithm):
             raise ValueError(f"algorithm must be one of {', '.join(get_args(Algorithm))} (got {self.algorithm!r}).")
-        for name in ("envs", "steps", "epochs", "minibatch"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be >= 1 (got {getattr(self, name)}).")
-        for name in ("learning_rate", "clip", "max_gradient", "reward_scale"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be > 0 (got {getattr(self, name)}).")
-        for name in ("gamma", "lmbda"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"{name} must be in (0, 1] (got {getattr(self, name)}).")
+        whole, positive = (
+            ("envs", "steps", "epochs", "minibatch"),
+            ("learning_rate", "clip", "max_gradient", "reward_scale"),
+        )
+        for names, allowed, valid in (
+            (whole, ">= 1", lambda value: value >= 1),
+            (positive, "> 0", lambda value: value > 0),
+            (("gamma", "lmbda"), "in (0, 1]", lambda value: 0 < value <= 1),
+        ):
+            for name in names:
+                if not valid(getattr(self, name)):
+                    raise ValueError(f"{name} must be {allowed} (got {getattr(self, name)}).")
 
 
 @dataclass(frozen=True)
 class Iteration:
-    """What one iteration saw and did."""
+    """Statistics of one iteration."""
 
     number: int
     """From 1."""
     env_steps: int
-    """So far."""
+    """In all iterations."""
     reward: float
-    """Mean reward per env step, not scaled."""
+    """Mean per env step, not scaled."""
     choices: int
-    """Moments at which an arm had a choice."""
+    """Number of steps at which an arm had a choice."""
     entropy: float
-    """Of those choices, nat."""
+    """Of the action distribution at those choices, nat."""
     clipped: float
-    """Share of choices whose likelihood ratio was clipped."""
+    """Share of choices with a clipped likelihood ratio."""
     value_loss: float
 
 
 def use_threads(count: int) -> None:
-    """Threads of the networks' arithmetic, for the whole process."""
+    """Set the number of torch threads of this process."""
     torch.set_num_threads(count)
 
 
 class Chooser(nn.Module):
-    """Logits of every arm; the network is asked only where there is a choice."""
+    """Logits of every arm; zeros where an arm has no choice."""
 
     def __init__(self, actor: Actor, layout: Layout) -> None:
         super().__init__()
@@ -116,16 +120,16 @@ class Chooser(nn.Module):
 
 
 class Trainer:
-    """Trains an actor; `iterate` goes on for ever, iteration by iteration."""
+    """Trains an actor and a critic."""
 
     def __init__(self, make_env: EnvFactory, layout: Layout, config: PpoConfig) -> None:
         self.config, self.layout = config, layout
         self.done = 0
-        """Iterations."""
+        """Number of finished iterations."""
         torch.manual_seed(self._seed_of(0))
         self.actor, self.critic = Actor(config.size), Critic(config.size, central=config.algorithm == "mappo")
         chooser = TensorDictModule(Chooser(self.actor, layout), in_keys=[SEEN, MASK], out_keys=[("arms", "logits")])
-        keys: Any = {"logits": ("arms", "logits"), "mask": MASK}  # a dict is taken, and not in the annotation
+        keys: Any = {"logits": ("arms", "logits"), "mask": MASK}  # TorchRL accepts a dict, its annotation does not
         self.policy = ProbabilisticActor(
             chooser,
             in_keys=keys,
@@ -138,17 +142,17 @@ class Trainer:
             self.policy, None, clip_epsilon=config.clip, entropy_coeff=config.entropy, critic_coeff=None
         )
         self._loss.set_keys(action=ACTION, sample_log_prob=("arms", LIKELIHOOD), advantage="advantage")
-        networks = [*self.actor.parameters(), *self.critic.parameters()]
-        self.optimizer = torch.optim.Adam(networks, lr=config.learning_rate, eps=1e-5)
+        self._parameters = [*self.actor.parameters(), *self.critic.parameters()]
+        self.optimizer = torch.optim.Adam(self._parameters, lr=config.learning_rate, eps=1e-5)
         self._make_env = make_env
 
     @property
     def env_steps(self) -> int:
-        """So far."""
+        """Env steps in all finished iterations."""
         return self.done * self.config.envs * self.config.steps
 
     def iterate(self) -> Iterator[Iteration]:
-        """Collect, learn, tell; for ever. What follows is drawn by the number of iterations done."""
+        """Endless iterations of collecting and learning; random draws depend on the number of finished iterations."""
         frames = self.config.envs * self.config.steps
         torch.manual_seed(self._seed_of(1))
         self._order = np.random.default_rng(self._seed_of(2))
@@ -161,115 +165,94 @@ class Trainer:
             auto_register_policy_transforms=False,
         )
         try:
-            for seen in collector:
-                yield self._learn(seen)
+            for rollout in collector:
+                yield self._learn(rollout)
         finally:
             collector.shutdown()
 
     def _seed_of(self, purpose: int) -> int:
-        """For the network's start, its choices, the order of learning, and the shifts."""
+        """Seed of the initial weights (0), the actions (1), the minibatches (2) and the episodes (3)."""
         seed = np.random.SeedSequence([self.config.seed, purpose, self.done])
         return int(seed.generate_state(1)[0])
 
-    def _learn(self, seen: TensorDictBase) -> Iteration:
+    def _learn(self, rollout: TensorDictBase) -> Iteration:
         config = self.config
-        advantage, target = self._advantages(seen)
-        choice = seen[MASK].sum(dim=-1) > 1
-        raw = advantage[choice]
-        advantage = (advantage - raw.mean()) / (raw.std() + 1e-6)
+        advantage, target = self._advantages(rollout)
+        choice = rollout[MASK].sum(dim=-1) > 1
+        at_choices = advantage[choice]
+        advantage = (advantage - at_choices.mean()) / (at_choices.std() + 1e-6)
         count = int(choice.sum())
-        chosen = TensorDict(
-            {
-                SEEN: seen[SEEN][choice],
-                MASK: seen[MASK][choice],
-                ACTION: seen[ACTION][choice],
-                ("arms", LIKELIHOOD): seen["arms", LIKELIHOOD][choice],
-                "advantage": advantage[choice][..., None],
-            },
-            batch_size=[count],
-        )
-        everything: Any = seen[SEEN]  # a tensor; the stub allows any entry
+        kept = (SEEN, MASK, ACTION, ("arms", LIKELIHOOD))
+        chosen = TensorDict({key: rollout[key][choice] for key in kept}, batch_size=[count])
+        chosen["advantage"] = advantage[choice][..., None]
+        everything: Any = rollout[SEEN]  # a tensor; the stub allows any entry
         vectors, target = everything.flatten(0, 1), target.flatten(0, 1)
         batches = max(1, -(-count // config.minibatch))
-        told: list[tuple[float, float, float]] = []
+        statistics: list[tuple[float, float, float]] = []
         for _ in range(config.epochs):
             rows = np.array_split(self._order.permutation(count), batches)
             moments = np.array_split(self._order.permutation(len(vectors))[: len(vectors) // config.epochs], batches)
             for row, moment in zip(rows, moments, strict=True):
                 at = torch.from_numpy(moment)
-                told.append(self._step(chosen, torch.from_numpy(row), vectors[at], target[at]))
+                statistics.append(self._step(chosen[torch.from_numpy(row)], vectors[at], target[at]))
         self.done += 1
-        entropy, clipped, value_loss = np.mean(told, axis=0).tolist()
-        reward = float(seen["next", "arms", "reward"].mean())
+        entropy, clipped, value_loss = np.mean(statistics, axis=0).tolist()
+        reward = float(rollout["next", "arms", "reward"].mean())
         return Iteration(self.done, self.env_steps, reward, count, entropy, clipped, value_loss)
 
-    def _step(
-        self, chosen: TensorDictBase, rows: Tensor, vectors: Tensor, target: Tensor
-    ) -> tuple[float, float, float]:
-        losses: Any = self._loss(chosen[rows])  # a TensorDict of tensors
+    def _step(self, choices: TensorDictBase, vectors: Tensor, target: Tensor) -> tuple[float, float, float]:
+        """One step of the optimiser; entropy, clipped share and value loss."""
+        losses: Any = self._loss(choices)  # a TensorDict of tensors
         value_loss = nn.functional.smooth_l1_loss(self.critic(self.layout, vectors), target)
         loss = losses["loss_objective"] + losses["loss_entropy"] + value_loss
         self.optimizer.zero_grad()
         loss.backward()
-        nn.utils.clip_grad_norm_([*self.actor.parameters(), *self.critic.parameters()], self.config.max_gradient)
+        nn.utils.clip_grad_norm_(self._parameters, self.config.max_gradient)
         self.optimizer.step()
         return float(losses["entropy"]), float(losses["clip_fraction"]), float(value_loss.detach())
 
     @torch.no_grad()
-    def _advantages(self, seen: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def _advantages(self, rollout: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Advantages and value targets, [env, time, arm].
 
-        A shift's end, also that at the horizon, is an end: the clock is in the observation.
+        The horizon terminates an episode too, because the clock is in the observation.
         """
-        values = self.critic(self.layout, seen[SEEN])
-        afterwards: Any = seen["next", *SEEN]  # a tensor; the stub allows any entry
-        last = self.critic(self.layout, afterwards[:, -1:])
-        following = torch.cat([values[:, 1:], last], dim=1)  # what comes after an end does not count
-        done = seen["next", "done"].expand(*values.shape)
-        reward = seen["next", "arms", "reward"][..., 0] * self.config.reward_scale
+        values = self.critic(self.layout, rollout[SEEN])
+        next_seen: Any = rollout["next", *SEEN]  # a tensor; the stub allows any entry
+        next_values = torch.cat([values[:, 1:], self.critic(self.layout, next_seen[:, -1:])], dim=1)  # ignored at ends
+        done = rollout["next", "done"].expand(*values.shape)
+        reward = rollout["next", "arms", "reward"][..., 0] * self.config.reward_scale
         return vec_generalized_advantage_estimate(
-            self.config.gamma, self.config.lmbda, values, following, reward, done, done
+            self.config.gamma, self.config.lmbda, values, next_values, reward, done, done
         )
 
     def act(self, vectors: np.ndarray, mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Draws of the actor as it is now, int [...], at vectors float32 [..., size] and masks."""
+        """Actions of the present actor, int [...], at vectors float32 [..., size] and masks."""
         legal = torch.from_numpy(mask)
         with torch.inference_mode():
             logits = Chooser(self.actor, self.layout)(torch.from_numpy(vectors), legal)
             return draw(masked(logits, legal).numpy(), rng)
 
-    def save(self, path: Path, **told: float) -> None:
-        """Write all that goes on when training is resumed, and some numbers; the file appears whole or not at all."""
+    def save(self, path: Path, **numbers: float) -> None:
+        """Write the state of the training and some numbers atomically."""
+        state = {name: getattr(self, name).state_dict() for name in _STATE} | {"done": self.done}
         with atomic_path(path) as draft:
-            torch.save({"trainer": self.state(), **told}, draft)
+            torch.save({"trainer": state, **numbers}, draft)
 
     def load(self, path: Path) -> dict[str, Any]:
-        """Go on from what `save` wrote; returns the numbers.
+        """Restore what `save` wrote, and return the numbers; environments begin new episodes.
 
         Raises:
             CheckpointError: the file is damaged, or of another network.
         """
         if not zipfile.is_zipfile(path):
-            raise CheckpointError(f"{path}: no training to go on from: the file is damaged.")
+            raise CheckpointError(f"{path}: the training cannot be resumed, because the file is damaged.")
         try:
-            kept = torch.load(path, weights_only=True)
-            self.resume(kept.pop("trainer"))
+            saved = torch.load(path, weights_only=True)
+            state = saved.pop("trainer")
+            for name in _STATE:
+                getattr(self, name).load_state_dict(state[name])
+            self.done = state["done"]
         except (RuntimeError, KeyError, ValueError, EOFError, pickle.UnpicklingError) as error:
-            raise CheckpointError(f"{path}: no training to go on from ({error}).") from error
-        return kept
-
-    def state(self) -> dict[str, Any]:
-        """All that goes on when training is resumed."""
-        return {
-            "actor": self.actor.state_dict(),
-            "critic": self.critic.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "done": self.done,
-        }
-
-    def resume(self, state: dict[str, Any]) -> None:
-        """Go on from what `state` told. Environments begin new shifts."""
-        self.actor.load_state_dict(state["actor"])
-        self.critic.load_state_dict(state["critic"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.done = state["done"]
+            raise CheckpointError(f"{path}: the training cannot be resumed ({error}).") from error
+        return saved

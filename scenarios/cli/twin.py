@@ -148,15 +148,10 @@ def check_source(scenario: str | None, log: Path | None, arm: str | None = None)
 @contextmanager
 def explain_in_options() -> Iterator[None]:
     """Reword training errors as FleetErrors that name the options of the command line."""
-    from twin.training_data import NothingCool, TooShort
     from twin.vae.train import CollapsedPosterior
 
     try:
         yield
-    except TooShort as error:
-        raise FleetError(f"{error.fact} Log for longer, or choose a smaller --window.") from error
-    except NothingCool as error:
-        raise FleetError(f"{error.fact} Raise --cool, or log lighter work.") from error
     except CollapsedPosterior as error:
         fields = r"\b(epochs|max_windows|allow_collapse|beta)\b"
         raise FleetError(re.sub(fields, lambda f: f"--{f[1].replace('_', '-')}", str(error))) from error

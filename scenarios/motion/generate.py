@@ -29,14 +29,14 @@ from twin.vae.twin import Twin
 
 Array = np.ndarray
 
-LOOK_S = 0.1
+CLEARANCE_STEP_S = 0.1
 """Time between postures that are checked for clearance."""
 MOST_DRAWS = 20
 """Most attempts per requested motion."""
 
 
 class GenerationError(FleetError):
-    """No motion passed the verification; gives the reasons."""
+    """No motion passed the verification."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -75,8 +75,6 @@ class Motion:
     """Root mean square distance of the joint positions from the source's."""
     distance_z: float
     """The same in training standard deviations."""
-    slowed: float
-    """Factor by which its slowest piece takes longer than the source, to keep the limits."""
     predicted_c: Array
     """Peak temperature predicted from the measured torque, °C, [joint]."""
     peak_c: Array
@@ -130,13 +128,13 @@ def generate(
     verification: Verification,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Generated:
-    """`count` verified motions near known ones; fewer where most fail, with the reasons counted.
+    """`count` verified motions near known ones, or fewer if most are rejected.
 
     The same arguments give the same motions; a larger count begins with the same ones.
 
     Args:
-        arm: The true arm, to perform on and to measure `Motion.peak_c`.
-        sources: Known, cool motion of this arm. Presses are left out, because their motion needs the contact.
+        arm: The true arm, which performs the motions.
+        sources: Known, cool motion of this arm. Presses are ignored, because their motion needs the contact.
         s: Perturbation in posterior standard deviations; 0 reconstructs.
 
     Raises:
@@ -173,19 +171,16 @@ def generate(
 def _verified(
     made: Variation, source: Plan, arm: Arm, model: ArmModel, clearance: CollisionChecker, asked: Verification
 ) -> Motion:
-    """Verify a variation.
-
-    Raises:
-        _Rejected: a check failed.
-    """
+    """The verified motion of a variation; raises _Rejected if a check fails."""
     plan = planned(made, source, model)
-    if clearance.first_collision(_postures(plan)):
+    every = round(CLEARANCE_STEP_S * RATE_HZ)
+    postures = np.concatenate([phase.profile[::every, 0] for phase in plan.phases]).astype(float)
+    if clearance.first_collision(postures):
         raise _Rejected("collision")
     allowed_c = asked.cool_c - asked.margin_k
     if asked.peak_c(plan).max() > allowed_c:
         raise _Rejected("heat")
-    cold_c = np.full(NODES, asked.ambient_c)
-    done = perform(arm, plan, start_c=cold_c, ambient_c=asked.ambient_c)
+    done = perform(arm, plan, start_c=np.full(NODES, asked.ambient_c), ambient_c=asked.ambient_c)
     if done.clipped:
         raise _Rejected("torque clip")
     if done.error_rad > asked.tracking_rad:
@@ -199,7 +194,6 @@ def _verified(
         source=source,
         distance_rad=made.distance_rad,
         distance_z=made.distance_z,
-        slowed=made.slowed,
         predicted_c=predicted_c,
         peak_c=peak_of(measured, arm.motors, arm.thermal, asked.ambient_c, asked.horizon_s),
         error_rad=done.error_rad,
@@ -207,13 +201,9 @@ def _verified(
 
 
 def planned(made: Variation, source: Plan, model: ArmModel) -> Plan:
-    """The plan of a variation, with the torque of inverse dynamics and the payload of its source.
-
-    Raises:
-        _Rejected: it passes a joint stop or a torque limit.
-    """
+    """The plan of a variation with the torque of inverse dynamics; raises _Rejected beyond a joint or torque limit."""
     phases = []
-    for part in made.stretches:
+    for part in made.phases:
         tau = model.inverse_dynamics(part.q, part.qd, part.qdd, part.payload_kg)
         if broken := limit_violation(part.q, part.qd, part.qdd, tau, model.position_range):
             raise _Rejected(broken[1].split(":")[0])
@@ -226,8 +216,3 @@ def planned(made: Variation, source: Plan, model: ArmModel) -> Plan:
 def peak_of(plan: Plan, motors: Motors, thermal: ThermalModel, ambient_c: float, horizon_s: float) -> Array:
     """Hottest winding temperatures when a plan's cycle repeats over the horizon from a cold start, °C, [joint]."""
     return cold_peaks([plan], motors, thermal, ambient_c=ambient_c, horizon_s=horizon_s)[0]
-
-
-def _postures(plan: Plan) -> Array:
-    every = max(1, round(LOOK_S * RATE_HZ))
-    return np.concatenate([phase.profile[::every, 0] for phase in plan.phases]).astype(float)

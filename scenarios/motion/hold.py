@@ -1,4 +1,4 @@
-"""How long an arm may hold a payload still: torque, current, steady temperature and minutes to the limits.
+"""Thermal endurance of a static hold: torque, current, steady temperature and minutes to the limits.
 
 Gravity torque comes from MuJoCo, temperatures from the thermal network. The arm starts cold (everything at ambient
 temperature) or idle-warm (powered for hours without load).
@@ -6,8 +6,9 @@ temperature) or idle-warm (powered for hours without load).
 
 import json
 from dataclasses import dataclass
-from typing import Annotated, get_args
+from typing import Annotated, cast, get_args
 
+import msgspec
 import numpy as np
 import typer
 from rich.console import Console
@@ -46,7 +47,7 @@ BURNT_C = 250.0
 
 
 class HoldError(FleetError):
-    """A hold that cannot be calculated; says what is allowed."""
+    """A hold that cannot be computed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +109,9 @@ def hold(
     low_c, high_c = AMBIENT_RANGE_C
     if not low_c <= ambient_c <= high_c:
         raise HoldError(f"The ambient temperature must lie in {low_c:g} … {high_c:g} °C (got {ambient_c}).")
-    strategy = _cooling(cooling)
+    if cooling not in get_args(Cooling):
+        raise HoldError(f"Unknown cooling '{cooling}'{nearest(cooling, get_args(Cooling))}")
+    strategy = cast("Cooling", cooling)
     arm = ArmModel(Robot(name="arm", tool_kg=tool_kg))
     q = parse_posture(posture, arm.position_range)
     tau = arm.gravity_torque(q, payload_kg)
@@ -161,9 +164,7 @@ def passing_times(
     """
     limits_c = np.array(LIMITS_C)[:, None]  # [limit, joint]
     times_s = np.where(start_c[:, None, WINDING] >= limits_c, 0.0, np.inf)
-    to_come = (
-        np.ones(times_s.shape, bool) if end_c is None else np.broadcast_to(end_c[WINDING] > limits_c, times_s.shape)
-    )
+    to_come = np.broadcast_to(np.inf if end_c is None else end_c[WINDING], times_s.shape) > limits_c
     no_friction_w = np.zeros(JOINTS)
     half, full = model.step_matrices(STEP_S / 2), model.step_matrices(STEP_S)
     temp_c = start_c
@@ -185,17 +186,8 @@ def passing_times(
 
 def as_json(result: HoldResult) -> dict[str, object]:
     """The result as plain values: lists of 7 (joint 1 first), null for never."""
-    return {
-        "payload": result.payload_kg,
-        "posture": result.posture,
-        "q_deg": list(result.q_deg),
-        "ambient_c": result.ambient_c,
-        "cooling": result.cooling,
-        "tool_kg": result.tool_kg,
-        "cold": {name: list(values) for name, values in vars(result.cold).items()},
-        "idle_warm": {name: list(values) for name, values in vars(result.idle_warm).items()},
-        "note": result.note,
-    }
+    plain = msgspec.json.decode(msgspec.json.encode(result))
+    return {"payload": plain.pop("payload_kg"), **plain}
 
 
 def as_table(result: HoldResult) -> Table:
@@ -243,13 +235,6 @@ def hold_command(
         typer.echo(json.dumps(as_json(result), indent=2, allow_nan=False, ensure_ascii=False))
     else:
         Console().print(as_table(result))
-
-
-def _cooling(name: str) -> Cooling:
-    for known in get_args(Cooling):
-        if name == known:
-            return known
-    raise HoldError(f"Unknown cooling '{name}'{nearest(name, get_args(Cooling))}")
 
 
 def _check_torque(tau: Array, payload_kg: float, posture: str) -> None:

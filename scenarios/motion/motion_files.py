@@ -14,6 +14,7 @@ from fleet.robot import JOINTS
 from scenarios.motion.generate import Generated
 from scenarios.motion.recover import Recovery
 from scenarios.result_folder import ResultKind, new_folder
+from twin.vae.window import PHASES
 
 Array = np.ndarray
 Format = Literal["parquet", "csv"]
@@ -26,7 +27,6 @@ RECOVERY = ResultKind(
     name="recovery", card="recovery.json", files=("recovery.json", "recovery.parquet", "recovery.csv")
 )
 """Temperatures with and without recovery, and a card with the postures."""
-PHASES = ("approach", "cycle", "retreat")
 
 
 def save_generated(made: Generated, out: Path, *, format: Format = "parquet", overwrite: bool = False) -> None:
@@ -41,39 +41,42 @@ def save_generated(made: Generated, out: Path, *, format: Format = "parquet", ov
         _write_card(generated_summary(made, format), folder / GENERATED.card)
 
 
-def save_recovery(found: Recovery, out: Path, *, format: Format = "parquet", overwrite: bool = False) -> None:
+def save_recovery(recovery: Recovery, out: Path, *, format: Format = "parquet", overwrite: bool = False) -> None:
     """Write `recovery.parquet` (or .csv) and `recovery.json`.
 
     Raises:
         FleetError: `out` cannot be written, or holds something that is not ours to replace.
     """
     with new_folder(out, RECOVERY, overwrite=overwrite) as folder:
-        _write(recovery_table(found), folder / f"recovery.{format}")
-        _write_card(recovery_summary(found), folder / RECOVERY.card)
+        _write(recovery_table(recovery), folder / f"recovery.{format}")
+        _write_card(recovery_summary(recovery), folder / RECOVERY.card)
 
 
 def motion_table(plan: Plan) -> pa.Table:
     """A plan as one row per sample: time_s, phase, payload_kg, q_1_rad …, qd_1_rad_s …, tau_1_nm …"""
     profile = np.concatenate([phase.profile for phase in plan.phases])
     lengths = [len(phase.profile) for phase in plan.phases]
-    columns: dict[str, Array] = {
-        "time_s": np.arange(len(profile)) / RATE_HZ,
-        "phase": np.repeat(PHASES, lengths),
-        "payload_kg": np.concatenate([phase.payload_kg for phase in plan.phases]),
-    }
-    for channel, (name, unit) in enumerate((("q", "rad"), ("qd", "rad_s"), ("tau", "nm"))):
-        for j in range(JOINTS):
-            columns[f"{name}_{j + 1}_{unit}"] = profile[:, channel, j]
-    return pa.table(columns)
+    return pa.table(
+        {
+            "time_s": np.arange(len(profile)) / RATE_HZ,
+            "phase": np.repeat(PHASES, lengths),
+            "payload_kg": np.concatenate([phase.payload_kg for phase in plan.phases]),
+            **_by_joint("q", "_rad", profile[:, 0]),
+            **_by_joint("qd", "_rad_s", profile[:, 1]),
+            **_by_joint("tau", "_nm", profile[:, 2]),
+        }
+    )
 
 
-def recovery_table(found: Recovery) -> pa.Table:
+def recovery_table(recovery: Recovery) -> pa.Table:
     """Winding temperatures as one row per moment: time_s, without_1_c …, with_1_c …"""
-    columns: dict[str, Array] = {"time_s": found.time_s}
-    for name, temp_c in (("without", found.without_c), ("with", found.with_c)):
-        for j in range(JOINTS):
-            columns[f"{name}_{j + 1}_c"] = temp_c[:, j]
-    return pa.table(columns)
+    temperatures = {**_by_joint("without", "_c", recovery.without_c), **_by_joint("with", "_c", recovery.with_c)}
+    return pa.table({"time_s": recovery.time_s, **temperatures})
+
+
+def _by_joint(name: str, unit: str, values: Array) -> dict[str, Array]:
+    """Columns `name_1unit` … of values [row, joint]."""
+    return {f"{name}_{j + 1}{unit}": values[:, j] for j in range(JOINTS)}
 
 
 def generated_summary(made: Generated, format: Format = "parquet") -> dict[str, Any]:
@@ -88,10 +91,7 @@ def generated_summary(made: Generated, format: Format = "parquet") -> dict[str, 
         "handed_out": len(made.motions),
         "rejected": dict(made.rejected),
         "truly_cool": made.truly_cool,
-        "cool_c": made.verification.cool_c,
-        "margin_k": made.verification.margin_k,
-        "horizon_s": made.verification.horizon_s,
-        "ambient_c": made.verification.ambient_c,
+        **{name: getattr(made.verification, name) for name in ("cool_c", "margin_k", "horizon_s", "ambient_c")},
         "rate_hz": RATE_HZ,
         "motions": [
             {
@@ -115,29 +115,29 @@ def generated_summary(made: Generated, format: Format = "parquet") -> dict[str, 
     }
 
 
-def recovery_summary(found: Recovery) -> dict[str, Any]:
+def recovery_summary(recovery: Recovery) -> dict[str, Any]:
     """The recovery as plain values; joints are counted from one."""
     return {
         "status": "finished",
-        "arm": found.arm,
-        "twin": found.twin_version,
-        "payload_kg": found.payload_kg,
-        "hottest_joint": found.hottest + 1,
-        "q_before_rad": found.q_before.tolist(),
-        "q_after_rad": found.q_after.tolist(),
-        "origin": found.origin,
-        "most_moved_rad": float(np.abs(found.moved_rad).max()),
-        "tool_moved_m": found.tool_m,
-        "difficulty_before": found.difficulty_before.tolist(),
-        "difficulty_after": found.difficulty_after.tolist(),
-        "best_error": found.best_error,
-        "passed_over": found.passed_over,
-        "start_c": float(found.with_c[0, found.hottest]),
-        "end_with_c": float(found.with_c[-1, found.hottest]),
-        "end_without_c": float(found.without_c[-1, found.hottest]),
-        "cooled_k": found.cooled_k,
-        "spared_k": found.spared_k,
-        "tracking_error_rad": found.error_rad,
+        "arm": recovery.arm,
+        "twin": recovery.twin_version,
+        "payload_kg": recovery.payload_kg,
+        "hottest_joint": recovery.hottest + 1,
+        "q_before_rad": recovery.q_before.tolist(),
+        "q_after_rad": recovery.q_after.tolist(),
+        "origin": recovery.origin,
+        "most_moved_rad": float(np.abs(recovery.moved_rad).max()),
+        "tool_moved_m": recovery.tool_m,
+        "difficulty_before": recovery.difficulty_before.tolist(),
+        "difficulty_after": recovery.difficulty_after.tolist(),
+        "best_error": recovery.best_error,
+        "passed_over": recovery.passed_over,
+        "start_c": float(recovery.with_c[0, recovery.hottest]),
+        "end_with_c": float(recovery.with_c[-1, recovery.hottest]),
+        "end_without_c": float(recovery.without_c[-1, recovery.hottest]),
+        "cooled_k": recovery.cooled_k,
+        "spared_k": recovery.spared_k,
+        "tracking_error_rad": recovery.error_rad,
     }
 
 

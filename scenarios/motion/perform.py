@@ -20,7 +20,7 @@ from fleet.thermal import WINDING, ThermalModel
 Array = np.ndarray
 
 NEVER_C = 1e6
-"""Warning and error limit that no motor reaches, so that nothing stops the arm."""
+"""Warning limit above any motor temperature, so that the arm is never stopped."""
 CLIPPED = 0.999
 """Share of the torque clip from which a servo counts as clipped."""
 
@@ -54,9 +54,9 @@ class Performance:
 
         The first sample, home at rest, is as planned.
         """
-        whole = np.concatenate([self.planned[:0], _first(self.plan)[None], self.profile]).astype(np.float32)
-        ends = np.cumsum([len(phase.profile) for phase in self.plan.phases])
-        parts = np.split(whole[: ends[-1]], ends[:-1])
+        first = next(phase.profile[:1] for phase in self.plan.phases if len(phase.profile))
+        whole = np.concatenate([first, self.profile]).astype(np.float32)
+        parts = np.split(whole, np.cumsum([len(phase.profile) for phase in self.plan.phases])[:-1])
         approach, cycle, retreat = (
             Phase(part, phase.payload_kg) for part, phase in zip(parts, self.plan.phases, strict=True)
         )
@@ -112,7 +112,3 @@ def perform(arm: Arm, plan: Plan, *, start_c: Array, ambient_c: float, tick_s: f
         time_s=np.arange(ticks + 1) * world.dt_s,
         temp_c=np.stack(temps),
     )
-
-
-def _first(plan: Plan) -> Array:
-    return next(phase.profile[0] for phase in plan.phases if len(phase.profile))

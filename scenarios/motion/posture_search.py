@@ -10,17 +10,16 @@ ten holds of two arms:
 - the paper's d, the sum over all joints, −.34 to .52: most of it is novelty of the posture,
 - the largest torque over nominal 1.00: this baseline without a twin is better than every score of the twin.
 
-The twin proposes, and the thermal model decides: a posture is accepted only if the hottest motor is predicted to cool,
-and no motor to become as warm as it was. The prediction needs housing temperatures, which have no sensor. If they equal
-the winding temperatures (`twin.thermal.thermal_twin.RcTwin.likely_start`), every posture is rejected. If all heat of a
-winding flows into its housing, they are 3 to 5 K too low, and some recoveries end warmer. Therefore the arm first
-measures for half a minute how fast its windings warm, which determines that heat flow.
+The thermal model then accepts a posture only if the hottest motor is predicted to cool, and no motor to become as warm
+as it was. The prediction needs housing temperatures, which have no sensor. If they equal the winding temperatures
+(`twin.thermal.thermal_twin.RcTwin.likely_start`), every posture is rejected. If all heat of a winding flows into its
+housing, they are 3 to 5 K too low, and some recoveries end warmer. Therefore the arm first measures for half a minute
+how fast its windings warm, which determines that heat flow.
 """
 
 from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import repeat
 
 import numpy as np
 
@@ -30,7 +29,7 @@ from fleet.motor import Motors
 from fleet.physics.models import ArmModel
 from fleet.planning.random_motions import plan_motion
 from fleet.robot import JOINTS
-from fleet.thermal import HOUSING, STEP_S, WINDING, ThermalModel, drive_heat, temperature_steps
+from fleet.thermal import HOUSING, WINDING, ThermalModel, drive_heat, simulate_temperatures
 from scenarios.motion.generate import Verification
 from twin.vae.measures import Features
 from twin.vae.twin import Twin
@@ -38,7 +37,7 @@ from twin.vae.twin import Twin
 Array = np.ndarray
 
 INSTANT_S = 0.02
-"""The payload is grasped at the end of the first stop, so that lasts one sample; the observation follows."""
+"""Duration of the first stop, one sample: the payload is grasped at its end, then the observation begins."""
 BEST = 10
 """Number of candidates with a second search around them."""
 ROUNDS = 3
@@ -48,7 +47,7 @@ CLOSER = 0.3
 
 
 class RecoveryError(FleetError):
-    """A posture recovery that is out of range or finds no better posture; says why."""
+    """A posture recovery that is out of range or has no better posture."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,8 +65,8 @@ class Nearby:
     cooling_k: float = 2.0
     """Least predicted cooling of the hottest motor, because the prediction is not exact."""
     watch_s: float = 30.0
-    """Time in which the arm watches its motors before it moves. Twice as long heats them longer; half as long doubles
-    the housing error of 0.2 K that 0.05 K of noise causes."""
+    """Observation time before the arm moves. Twice as long heats the motors longer; half as long doubles the housing
+    error of 0.2 K that 0.05 K of noise causes."""
     speed: float = 0.5
     """Share of the joint limits at which the arm moves."""
 
@@ -94,7 +93,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class SearchResult:
     """Result of a search."""
 
     candidate: Candidate
@@ -130,30 +129,32 @@ class Search:
         """The hottest motor, index 0..6."""
         return int(np.argmax(self.winding_c))
 
-    def best(self, rng: np.random.Generator) -> Found:
+    def best(self, rng: np.random.Generator) -> SearchResult:
         """The easiest candidate that passes every check.
 
         Raises:
             RecoveryError: no candidate passes.
         """
         now = float(holding(self.twin, self.model, self.q[None], self.payload_kg).one_sided[0, self.hottest])
-        first = self._near(self._latent(rng), "latent") + self._near(self._around(rng), "joint space")
+        first = self._candidates(self._decoded(rng), "latent")
+        around = self.q + self.near.joint_rad * rng.uniform(-1.0, 1.0, (self.near.candidates, JOINTS))
+        first += self._candidates(around, "joint space")
         leaders = sorted(first, key=lambda candidate: candidate.error)[:BEST]
-        ranked = sorted(first + self._again(leaders, rng), key=lambda candidate: candidate.error)
+        ranked = sorted(first + self._refined(leaders, rng), key=lambda candidate: candidate.error)
         passed_over = Counter[str]()
         for candidate in ranked:
             if candidate.error >= now:
                 break
-            plan = self._plan_or_why(candidate.q)
+            plan = self._plan_or_reason(candidate.q)
             if isinstance(plan, Plan):
-                return Found(candidate, plan, dict(passed_over), _best_by_origin(first))
+                return SearchResult(candidate, plan, dict(passed_over), _best_by_origin(first))
             passed_over[plan] += 1
-        raise RecoveryError(self._nothing(len(ranked), passed_over))
+        raise RecoveryError(self._failure(len(ranked), passed_over))
 
-    def _plan_or_why(self, posture: Array) -> Plan | str:
+    def _plan_or_reason(self, posture: Array) -> Plan | str:
         """The plan of moving there and holding, or the reason of a rejection."""
-        if why := self._too_warm(posture):
-            return why
+        if reason := self._thermal_objection(posture):
+            return reason
         try:
             return plan_motion(
                 self.model,
@@ -166,7 +167,7 @@ class Search:
         except InfeasibleJob as error:
             return error.reason.split(":")[0]
 
-    def _nothing(self, count: int, passed_over: Counter[str]) -> str:
+    def _failure(self, count: int, passed_over: Counter[str]) -> str:
         reasons = ", ".join(f"{reason} {times}" for reason, times in passed_over.most_common())
         return (
             f"No better posture near: of {count} within {self.near.joint_rad:g} rad per joint and "
@@ -175,10 +176,9 @@ class Search:
             + ". Allow more displacement, or put the payload down."
         )
 
-    def _latent(self, rng: np.random.Generator) -> Array:
+    def _decoded(self, rng: np.random.Generator) -> Array:
         """Postures decoded around the latent of this hold, or between the hold and those."""
-        tau = self.model.gravity_torque(self.q, self.payload_kg)
-        mu, sigma = self.twin.posterior(_windows(self.twin, self.q[None], tau[None]))
+        mu, sigma = self.twin.posterior(_windows(self.twin, self.model, self.q[None], self.payload_kg))
         count = self.near.candidates
         scale = rng.uniform(0.0, self.near.latent_scale, (count, 1, 1))
         latent = mu + scale * rng.standard_normal((count, *mu.shape[1:])) * sigma
@@ -188,19 +188,16 @@ class Search:
         away -= np.where(endless, 2 * np.pi * np.round(away / (2 * np.pi)), 0.0)
         return self.q + rng.uniform(0.0, 1.0, (count, 1)) * away
 
-    def _around(self, rng: np.random.Generator) -> Array:
-        return self.q + self.near.joint_rad * rng.uniform(-1.0, 1.0, (self.near.candidates, JOINTS))
-
-    def _again(self, leaders: list[Candidate], rng: np.random.Generator) -> list[Candidate]:
+    def _refined(self, leaders: list[Candidate], rng: np.random.Generator) -> list[Candidate]:
         """Candidates near the easiest ones, including the border of the allowed range."""
-        found: list[Candidate] = []
+        refined: list[Candidate] = []
         for leader in leaders:
             step = CLOSER * self.near.joint_rad * rng.standard_normal((self.near.candidates // BEST + 1, JOINTS))
             away = np.clip(leader.q + step - self.q, -self.near.joint_rad, self.near.joint_rad)
-            found += self._near(self.q + away, leader.origin)
-        return found
+            refined += self._candidates(self.q + away, leader.origin)
+        return refined
 
-    def _near(self, postures: Array, origin: str) -> list[Candidate]:
+    def _candidates(self, postures: Array, origin: str) -> list[Candidate]:
         """Postures within the limits and joint stops, with the twin's score."""
         low, high = self.model.position_range.T
         here = self.model.tool_pose(self.q)[0]
@@ -214,13 +211,25 @@ class Search:
         rows = zip(postures[kept], tool_m[kept].tolist(), error.tolist(), strict=True)
         return [Candidate(q, origin, far, e) for q, far, e in rows]
 
-    def _too_warm(self, posture: Array) -> str | None:
-        """Why the predicted temperatures exclude a posture; None if they do not."""
-        known, tau = self.known, self.model.gravity_torque(posture, self.payload_kg)
-        end_c = course(self._start_c, tau, known.motors, known.thermal, known.ambient_c, self.hold_s)[-1]
+    def _thermal_objection(self, posture: Array) -> str | None:
+        """Reason why the predicted temperatures exclude a posture, or None."""
+        end_c = self._end_temperatures(posture)
         if end_c[self.hottest] > self.before_c[self.hottest] - self.near.cooling_k:
             return "would not cool"
         return "another motor as hot" if end_c.max() >= self.before_c.max() else None
+
+    def _end_temperatures(self, posture: Array) -> Array:
+        """Predicted winding temperatures after the rest of the hold in this posture, °C, [joint]."""
+        known, tau = self.known, self.model.gravity_torque(posture, self.payload_kg)
+        simulated = simulate_temperatures(
+            static_drive(tau, known.motors),
+            [self.hold_s],
+            motors=known.motors,
+            thermal=known.thermal,
+            start_c=self._start_c,
+            ambient_c=known.ambient_c,
+        )
+        return simulated.end_c[0, WINDING]
 
     @cached_property
     def _start_c(self) -> Array:
@@ -233,22 +242,19 @@ class Search:
 
 
 def _best_by_origin(candidates: list[Candidate]) -> dict[str, float]:
-    best: dict[str, float] = {}
-    for candidate in candidates:
-        best[candidate.origin] = min(candidate.error, best.get(candidate.origin, np.inf))
-    return best
+    origins = dict.fromkeys(candidate.origin for candidate in candidates)
+    return {origin: min(c.error for c in candidates if c.origin == origin) for origin in origins}
 
 
 def holding(twin: Twin, model: ArmModel, q: Array, payload_kg: float) -> Features:
     """Twin features of standing in postures [posture, joint] with a payload, [posture, joint, part]."""
-    tau = np.stack([model.gravity_torque(posture, payload_kg) for posture in q])
-    return twin.window_features(_windows(twin, q, tau))
+    return twin.window_features(_windows(twin, model, q, payload_kg))
 
 
-def _windows(twin: Twin, q: Array, tau: Array) -> Array:
+def _windows(twin: Twin, model: ArmModel, q: Array, payload_kg: float) -> Array:
     """Windows of standing still, [posture, time, joint, channel]."""
-    still = np.stack([q, np.zeros_like(q), tau], axis=-1)[:, None]
-    return np.repeat(still, twin.config.window, axis=1)
+    tau = np.stack([model.gravity_torque(posture, payload_kg) for posture in q])
+    return np.repeat(np.stack([q, np.zeros_like(q), tau], axis=-1)[:, None], twin.config.window, axis=1)
 
 
 def housing_estimate(
@@ -278,11 +284,3 @@ def housing_estimate(
         loss_w = drive_heat(np.concatenate([mean_c, housing_c]), load.current_sq, load.friction_w, motors)[WINDING]
         housing_c = np.maximum(mean_c - (loss_w - kept_w) / conductance, ambient_c)
     return housing_c
-
-
-def course(start_c: Array, tau: Array, motors: Motors, thermal: ThermalModel, ambient_c: float, hold_s: float) -> Array:
-    """Winding temperatures of holding `tau` N·m, [joint], about every ten seconds, °C, [time, joint]."""
-    steps = max(1, int(np.ceil(hold_s / STEP_S)))
-    load, start_c = static_drive(tau, motors), np.asarray(start_c, dtype=float)
-    alike = {"motors": motors, "thermal": thermal, "start_c": start_c, "ambient_c": ambient_c}
-    return np.stack(list(temperature_steps(repeat(load, steps), hold_s / steps, **alike)))[:, WINDING]

@@ -12,7 +12,7 @@ import numpy as np
 
 from fleet.engine.world import Arm
 from fleet.errors import InfeasibleJob
-from fleet.motion import Plan, static_drive
+from fleet.motion import static_drive
 from fleet.physics.models import ArmModel
 from fleet.planning.random_motions import plan_motion
 from fleet.robot import JOINTS
@@ -102,18 +102,21 @@ def recover(
         hold_s: Remaining time of the hold.
 
     Raises:
-        RecoveryError: the payload, the posture or the time is out of range, the hold itself cannot be done, or
-            nothing near is better; says which.
+        RecoveryError: the payload, the posture or the time is out of range, the hold is infeasible, or no near posture
+            is better.
     """
     near = nearby or Nearby()
     model = ArmModel(arm.robot)
     check_hold(model, q, payload_kg)
     if not hold_s > near.watch_s:
         raise RecoveryError(
-            f"The arm watches its motors for {near.watch_s:g} s before it moves, so the hold must be longer (got "
+            f"The arm observes its motors for {near.watch_s:g} s before it moves, so the hold must be longer (got "
             f"{hold_s:g} s)."
         )
-    stay = _exercise(model, [q], [hold_s], payload_kg, near.speed)
+    try:
+        stay = plan_motion(model, np.stack([q]), dwell_s=[hold_s], payload_kg=payload_kg, speed=near.speed, name="hold")
+    except InfeasibleJob as error:
+        raise RecoveryError(f"Arm '{arm.robot.name}' cannot hold {payload_kg:g} kg there: {error.reason}.") from error
     on = partial(perform, arm, start_c=start_c, ambient_c=verification.ambient_c, tick_s=TICK_S)
     time_s = np.arange(0.0, hold_s + 1e-9, TICK_S)
     stayed = on(stay)
@@ -121,21 +124,21 @@ def recover(
     search = Search(
         twin, model, verification, near, np.asarray(q, dtype=float), payload_kg, before_c, now_c, hold_s - near.watch_s
     )
-    found = search.best(np.random.default_rng(np.random.SeedSequence(seed)))
-    recovered = on(found.plan)
+    result = search.best(np.random.default_rng(np.random.SeedSequence(seed)))
+    recovered = on(result.plan)
     return Recovery(
         arm=arm.robot.name,
         twin_version=twin.version,
         payload_kg=payload_kg,
         q_before=search.q,
-        q_after=found.candidate.q,
-        origin=found.candidate.origin,
+        q_after=result.candidate.q,
+        origin=result.candidate.origin,
         hottest=search.hottest,
         difficulty_before=holding(twin, model, search.q[None], payload_kg).load[0],
-        difficulty_after=holding(twin, model, found.candidate.q[None], payload_kg).load[0],
-        tool_m=found.candidate.tool_m,
-        passed_over=found.passed_over,
-        best_error=found.best_error,
+        difficulty_after=holding(twin, model, result.candidate.q[None], payload_kg).load[0],
+        tool_m=result.candidate.tool_m,
+        passed_over=result.passed_over,
+        best_error=result.best_error,
         time_s=time_s,
         without_c=_held(stayed, time_s),
         with_c=_held(recovered, time_s),
@@ -150,11 +153,7 @@ def _held(run: Performance, time_s: Array) -> Array:
 
 
 def check_hold(model: ArmModel, q: Array, payload_kg: float) -> None:
-    """Check the range of a hold.
-
-    Raises:
-        RecoveryError: says what is allowed.
-    """
+    """Raise RecoveryError if the payload or the posture is out of range."""
     if not 0 <= payload_kg <= MOST_PAYLOAD_KG:
         raise RecoveryError(f"A Gen3 is rated for a payload of 0 … {MOST_PAYLOAD_KG:g} kg (got {payload_kg:g}).")
     posture = np.asarray(q, dtype=float)
@@ -173,7 +172,7 @@ def hold_until(
     """True temperatures when the hottest motor reaches `until_c` in a hold from a cold start, °C, [node].
 
     Raises:
-        RecoveryError: it does not get so warm, or the hold is out of range.
+        RecoveryError: it stays cooler, or the hold is out of range.
     """
     model, temp_c = ArmModel(arm.robot), np.full(NODES, float(ambient_c))
     check_hold(model, q, payload_kg)
@@ -186,10 +185,3 @@ def hold_until(
         f"Arm '{arm.robot.name}' does not get warm: holding {payload_kg:g} kg there for {most_s / 60:g} min heats its "
         f"hottest motor to {temp_c[WINDING].max():.1f} °C, less than {until_c:g} °C. There is nothing to recover from."
     )
-
-
-def _exercise(model: ArmModel, stops: list[Array], dwell_s: list[float], payload_kg: float, speed: float) -> Plan:
-    try:
-        return plan_motion(model, np.stack(stops), dwell_s=dwell_s, payload_kg=payload_kg, speed=speed, name="hold")
-    except InfeasibleJob as error:
-        raise RecoveryError(f"Arm '{model.robot.name}' cannot hold {payload_kg:g} kg there: {error.reason}.") from error

@@ -79,7 +79,7 @@ def train_twin(
     *,
     scenario: Scenario,
     arm: PlannedArm,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> Twin:
     """The twin of an arm: trained on its own cool motion and its exploration, and calibrated.
 

@@ -1,4 +1,4 @@
-"""Train a policy on a scenario: iterations, checkpoints, a validation on seeds of its own, and the curves."""
+"""Train a policy on a scenario: iterations, checkpoints, validation on separate seeds, and learning curves."""
 
 import json
 import time
@@ -28,39 +28,38 @@ from scenarios.schema import Scenario
 Array = np.ndarray
 
 VALIDATION_SEED = 2_000_000
-"""First of the seeds on which the best network is chosen: far from those that people compare on."""
+"""First validation seed; far from the seeds of comparisons."""
 STATE, LOG, CURVE = "training.pt", "progress.jsonl", "curve.png"
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingPlan:
-    """How long to train, and how often to look."""
+    """Length of a training, and its validation."""
 
     minutes: float = 30.0
     iterations: int | None = None
-    """Ends it earlier; counts those before a resume."""
+    """Most iterations, those before a resume included."""
     validate_every: int = 20
-    """Iterations."""
+    """Iterations from one validation to the next."""
     validation_envs: int = 32
 
     def __post_init__(self) -> None:
         if not self.minutes > 0:
             raise FleetError(f"minutes must be > 0 (got {self.minutes}).")
-        for name in ("validate_every", "validation_envs"):
-            if getattr(self, name) < 1:
-                raise FleetError(f"{name} must be >= 1 (got {getattr(self, name)}).")
-        if self.iterations is not None and self.iterations < 1:
-            raise FleetError(f"iterations must be >= 1 (got {self.iterations}).")
+        for name in ("iterations", "validate_every", "validation_envs"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise FleetError(f"{name} must be >= 1 (got {value}).")
 
 
 @dataclass(frozen=True)
 class Trained:
-    """What came out."""
+    """Result of a training."""
 
     iterations: int
     env_steps: int
     best: float
-    """Mean reward of a shift on the validation seeds, of the network that is kept."""
+    """Mean reward of a shift on the validation seeds, of the saved network."""
     seconds: float
     interrupted: bool
 
@@ -77,16 +76,16 @@ def train(
     progress: Progress = quiet,
     tell: Callable[[str], None] = lambda sentence: None,
 ) -> Trained:
-    """Train into a folder: the best network as a policy, the last one to resume from, and the curves.
+    """Write into a folder the best network as a policy, the last state for a resume, and the curves.
 
-    Ctrl-C ends it early, with what there is.
+    Ctrl-C ends the training early and keeps its result.
 
     Args:
-        resume: Go on from the folder's training; else the folder must not hold one.
-        tell: Takes a sentence at every validation.
+        resume: Continue the training in the folder; without it the folder must not hold one.
+        tell: Called with a sentence after every validation.
 
     Raises:
-        FleetError: the folder holds a training and is not to be resumed, or the other way round, or one of another
+        FleetError: a training in the folder without `resume`, `resume` without a training, or a training of another
             scenario or configuration.
     """
     card = {
@@ -105,86 +104,86 @@ def train(
     judge = BatchEnv(library, plan.validation_envs, weights=scenario.reward)
     trainer = Trainer(make_env, judge.layout, config)
     best = -np.inf
-    rng = np.random.default_rng(np.random.SeedSequence([config.seed, 4]))
-    if not resume and config.warm_start:
-        teacher = BatchEnv(library, 16, seed=int(rng.integers(2**31)), weights=scenario.reward, stagger=True)
-        imitate(trainer.actor, judge.layout, _shown(teacher, config.warm_start, progress), rng)
     if resume:
         best = trainer.load(out / STATE)["best"]
         if plan.iterations is not None and trainer.done >= plan.iterations:
             raise FleetError(f"The training in '{out}' has {trainer.done} iterations: --iterations must be more.")
+    elif config.warm_start:
+        rng = np.random.default_rng(np.random.SeedSequence([config.seed, 4]))
+        teacher = BatchEnv(library, 16, seed=int(rng.integers(2**31)), weights=scenario.reward, stagger=True)
+        imitate(trainer.actor, judge.layout, _demonstrations(teacher, config.warm_start, progress), rng)
     out.mkdir(parents=True, exist_ok=True)
     (out / "training.json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
     began_s, interrupted = time.monotonic(), False
     seeds = [VALIDATION_SEED + i for i in range(plan.validation_envs)]
 
-    def look(told: Iteration) -> None:
+    def validate(iteration: Iteration) -> None:
         nonlocal best
-        rng = np.random.default_rng(np.random.SeedSequence([VALIDATION_SEED, told.number]))
+        rng = np.random.default_rng(np.random.SeedSequence([VALIDATION_SEED, iteration.number]))
         act = partial(trainer.act, rng=rng)
         reward = float(returns(judge, lambda obs: act(obs["observation"], obs["action_mask"]), seeds).mean())
         if reward > best:
             best = reward
-            more = {"algorithm": config.algorithm, "iterations": told.number, "env_steps": told.env_steps}
-            save_policy(trainer.actor, config.size, out, **card, **more, validation_reward=reward)
+            details = {"algorithm": config.algorithm, "iterations": iteration.number, "env_steps": iteration.env_steps}
+            save_policy(trainer.actor, config.size, out, **card, **details, validation_reward=reward)
         trainer.save(out / STATE, best=best)
-        _append(out / LOG, {"iteration": told.number, "validation_reward": reward})
-        tell(f"Iteration {told.number}: {reward:.1f} a shift on the validation seeds, {best:.1f} the best so far.")
+        _append(out / LOG, {"iteration": iteration.number, "validation_reward": reward})
+        tell(f"Iteration {iteration.number}: {reward:.1f} per shift on the validation seeds, best {best:.1f}.")
 
-    told, looked = None, 0
+    iteration, validated = None, 0
     try:
-        for told in trainer.iterate():
-            _append(out / LOG, asdict(told))
+        for iteration in trainer.iterate():
+            _append(out / LOG, asdict(iteration))
             spent_s = time.monotonic() - began_s
-            share = max(spent_s / (60.0 * plan.minutes), told.number / (plan.iterations or np.inf))
-            progress(f"iteration {told.number}, best {best:.1f}", min(share, 1.0))
-            if told.number % plan.validate_every == 0 or share >= 1.0:
-                look(told)
-                looked = told.number
+            share = max(spent_s / (60.0 * plan.minutes), iteration.number / (plan.iterations or np.inf))
+            progress(f"iteration {iteration.number}, best {best:.1f}", min(share, 1.0))
+            if iteration.number % plan.validate_every == 0 or share >= 1.0:
+                validate(iteration)
+                validated = iteration.number
             if share >= 1.0:
                 break
     except KeyboardInterrupt:
         interrupted = True
-        if told is None:
+        if iteration is None:
             raise
-        if looked < told.number:
-            look(told)
+        if validated < iteration.number:
+            validate(iteration)
     draw_curves(out)
     return Trained(trainer.done, trainer.env_steps, best, time.monotonic() - began_s, interrupted)
 
 
-IMITATED = 60
-"""Batches of decisions of a rule that the actor is shown for a warm start."""
-DECISIONS = 128
-"""In each, of every env."""
+DEMONSTRATIONS = 60
+"""Batches of a rule's decisions for a warm start."""
+STEPS = 128
+"""Steps of every env in a batch."""
 
 
-def _shown(env: BatchEnv, rule: str, progress: Progress) -> Iterator[tuple[Array, Array, Array]]:
-    """What a rule does in a batch: vectors, masks and actions, [row, …], rows of all arms at all moments."""
+def _demonstrations(env: BatchEnv, rule: str, progress: Progress) -> Iterator[tuple[Array, Array, Array]]:
+    """Batches of a rule's decisions: vectors, masks and actions, [row, …], one row per step, env and arm."""
     policies = [policy_of(rule) for _ in range(env.num_envs)]
     for policy, child in zip(policies, np.random.SeedSequence(0).spawn(env.num_envs), strict=True):
         policy.reset(np.random.default_rng(child))
     obs, _ = env.reset()
-    for number in range(IMITATED):
-        progress(f"imitating {rule}", number / IMITATED)
+    for number in range(DEMONSTRATIONS):
+        progress(f"imitating {rule}", number / DEMONSTRATIONS)
         rows: list[tuple[Array, Array, Array]] = []
-        for _ in range(DECISIONS):
-            actions = np.array([_asked(env, obs, policy, e) for e, policy in enumerate(policies)])
+        for _ in range(STEPS):
+            actions = np.array([_actions_of(policy, env, obs, e) for e, policy in enumerate(policies)])
             rows.append((obs["observation"], obs["action_mask"], actions))
             obs, *_ = env.step(actions)
         vectors, masks, actions = (np.concatenate(part) for part in zip(*rows, strict=True))
         yield vectors.reshape(-1, vectors.shape[-1]), masks.reshape(-1, masks.shape[-1]), actions.reshape(-1)
 
 
-def _asked(env: BatchEnv, obs: Obs, policy: Policy, e: int) -> list[int]:
-    """What a policy does in one env, int [arm]."""
+def _actions_of(policy: Policy, env: BatchEnv, obs: Obs, e: int) -> list[int]:
+    """Actions of a policy in one env, int [arm]."""
     vectors, masks, read = obs["observation"][e], obs["action_mask"][e], env.layout.read
     actions = policy.act({arm: read(vectors[a], masks[a]) for a, arm in enumerate(env.agents)})
     return [actions[arm] for arm in env.agents]
 
 
 def returns(env: BatchEnv, act: Callable[[Obs], Array], seeds: Sequence[int]) -> Array:
-    """Reward of the shift of each seed from beginning to end, [env]."""
+    """Total reward of the shift of each seed, [env]."""
     obs, _ = env.reset(seed=list(seeds))
     total, over = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=bool)
     while not over.all():
@@ -195,19 +194,19 @@ def returns(env: BatchEnv, act: Callable[[Obs], Array], seeds: Sequence[int]) ->
 
 
 def draw_curves(folder: Path) -> None:
-    """The curves of a training as a picture: reward of training and validation, entropy, clipped share."""
-    from matplotlib.figure import Figure  # no display is looked for
+    """Plot validation reward, entropy, clipped share and value loss against the iteration."""
+    from matplotlib.figure import Figure  # without a display
 
     rows = [json.loads(line) for line in (folder / LOG).read_text(encoding="utf-8").splitlines()]
-    seen = [row for row in rows if "env_steps" in row]
-    judged = [row for row in rows if "validation_reward" in row]
+    iterations = [row for row in rows if "env_steps" in row]
+    validations = [row for row in rows if "validation_reward" in row]
     figure = Figure(figsize=(9, 6), layout="constrained")
     top, bottom = figure.subplots(2, 1, sharex=True)
-    top.plot([r["iteration"] for r in judged], [r["validation_reward"] for r in judged], "o-", ms=3)
+    top.plot([r["iteration"] for r in validations], [r["validation_reward"] for r in validations], "o-", ms=3)
     top.set_ylabel("reward of a shift, validation seeds")
-    bottom.plot([r["number"] for r in seen], [r["entropy"] for r in seen], label="entropy of choices, nat")
-    bottom.plot([r["number"] for r in seen], [r["clipped"] for r in seen], label="share of clipped ratios")
-    bottom.plot([r["number"] for r in seen], [r["value_loss"] for r in seen], label="value loss")
+    labels = {"entropy": "entropy of choices, nat", "clipped": "share of clipped ratios", "value_loss": "value loss"}
+    for name, label in labels.items():
+        bottom.plot([r["number"] for r in iterations], [r[name] for r in iterations], label=label)
     bottom.set_xlabel("iteration")
     bottom.legend(frameon=False)
     for axes in (top, bottom):
@@ -217,21 +216,21 @@ def draw_curves(folder: Path) -> None:
 
 
 def _check_folder(out: Path, card: dict[str, Any], *, resume: bool) -> None:
-    there = out / "training.json"
+    path = out / "training.json"
     if not resume:
-        if there.exists() or (out / CARD).exists():
-            raise FleetError(f"'{out}' holds a training already: give --resume to go on with it, or another --out.")
+        if path.exists() or (out / CARD).exists():
+            raise FleetError(f"'{out}' holds a training already. Continue it with --resume, or choose another --out.")
         return
     try:
-        before = json.loads(there.read_text(encoding="utf-8"))
+        before = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise FleetError(f"'{out}' holds no training to resume.") from None
     if not (out / STATE).is_file():
-        raise FleetError(f"The training in '{out}' ended before its first checkpoint: begin anew in another --out.")
+        raise FleetError(f"The training in '{out}' ended before its first checkpoint. Start again in another --out.")
     was, now = (each | each.get("config", {}) | {"config": None} for each in (before, json.loads(json.dumps(card))))
     for name, value in now.items():
         if was.get(name) != value:
-            raise FleetError(f"The training in '{out}' was of another {name} ({was.get(name)}, now {value}).")
+            raise FleetError(f"The training in '{out}' has {name} = {was.get(name)} (got {value}).")
 
 
 def _append(path: Path, row: dict[str, Any]) -> None:

@@ -88,7 +88,7 @@ def forecasts(study: LogStudy, recordings: dict[str, Recording], twin: RcTwin) -
         # Measured currents tell the past; a plan has torques only.
         logs = [heat_logs(recordings[name], twin.motors, kind, step_s=STEP_S) for kind in ("current", "torque")]
         for past, coming in zip(*logs, strict=True):
-            states = filter_log(twin, past).temp_c
+            states = filter_log(twin, past)
             edge = np.searchsorted(past.time_s, study.end_s[mine], side="right") - 1
             here = (edge >= 0) & (study.end_s[mine] <= past.time_s[-1] + STEP_S)
             for out, peaks in (

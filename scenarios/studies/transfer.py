@@ -55,7 +55,9 @@ def job_inputs(twin: Twin, jobs: Jobs) -> dict[str, Array]:
     for first in range(0, len(jobs.plans), _CHUNK):
         some = slice(first, first + _CHUNK)
         reading = cut_jobs(jobs.plans[some], jobs.repetitions[some], twin.config)
-        parts.append((over_time(reading, twin.latent(reading.windows)), over_time(reading, moments(reading.windows))))
+        parts.append(
+            (over_time(reading, twin.posterior(reading.windows)[0]), over_time(reading, moments(reading.windows)))
+        )
     latent, raw = (np.concatenate(kind) for kind in zip(*parts, strict=True))
     return {"latent": latent, "raw": raw, "both": np.concatenate([latent, raw], axis=1)}
 
@@ -68,9 +70,9 @@ def moments(windows: Array) -> Array:
 
 def over_time(reading: JobWindows, values: Array) -> Array:
     """Mean and standard deviation over each job's time of one vector per window [batch, ...], [job, 2 · size]."""
-    flat = values.reshape(len(values), -1).astype(float)
-    mean = reading.mean_of_windows(flat)
-    variance = reading.mean_of_windows((flat - mean[reading.job]) ** 2)
+    flat = values.reshape(len(values), 1, -1).astype(float)
+    mean = reading.mean(flat)
+    variance = reading.mean((flat - mean[reading.job][:, None]) ** 2)
     return np.concatenate([mean, np.sqrt(variance)], axis=1)
 
 

@@ -139,11 +139,12 @@ def test_the_same_seed_learns_the_same_and_another_does_not(small) -> None:
     assert not all(torch.equal(one[name], other[name]) for name in one)
 
 
-def test_a_training_goes_on_where_it_was(small) -> None:
+def test_a_training_goes_on_where_it_was(small, tmp_path) -> None:
     first = trainer(small)
     list(islice(first.iterate(), 2))
     later = trainer(small)
-    later.resume(first.state())
+    first.save(tmp_path / "state", best=2.5)
+    assert later.load(tmp_path / "state") == {"best": 2.5}
     assert later.done == 2
     assert all(torch.equal(weights(first)[name], value) for name, value in weights(later).items())
     assert next(later.iterate()).number == 3

@@ -86,9 +86,9 @@ def test_what_fails_is_rejected_with_its_reason(subject, asked, changes, reason)
 def test_motion_beyond_a_stop_or_through_the_floor_is_rejected(subject, asked, monkeypatch, joint, offset, reason):
     def astray(*args):
         good = vary(*args)
-        cycle = replace(good.stretches[1], q=good.stretches[1].q.copy())
+        cycle = replace(good.phases[1], q=good.phases[1].q.copy())
         cycle.q[:, joint] += offset - (cycle.q[:, joint].max() if reason == "collision" else 0.0)
-        return replace(good, stretches=(good.stretches[0], cycle, good.stretches[2]))
+        return replace(good, phases=(good.phases[0], cycle, good.phases[2]))
 
     monkeypatch.setattr(module, "vary", astray)
     with pytest.raises(GenerationError, match=rf"passed \({reason} 20\)"):

@@ -6,22 +6,38 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import spearmanr
 
+from fleet.motion import static_drive
 from fleet.motor import gen3_motors, reference_current
 from fleet.physics.models import ArmModel
-from fleet.thermal import HOUSING, WINDING, advance, drive_heat, gen3_network, steady_state, thermal_model
-from scenarios.motion.posture_search import Nearby, course, holding, housing_estimate
+from fleet.thermal import (
+    HOUSING,
+    WINDING,
+    advance,
+    drive_heat,
+    gen3_network,
+    simulate_temperatures,
+    steady_state,
+    thermal_model,
+)
+from scenarios.motion.posture_search import Nearby, holding, housing_estimate
 
 MOTORS, THERMAL = gen3_motors(), thermal_model(gen3_network())
 Q = np.deg2rad([0.0, 60.0, 180.0, -60.0, 0.0, 55.0, 90.0])
 
 
+def simulated(start_c, tau, motors, thermal, seconds):
+    """Winding temperatures after holding a torque in 23 °C."""
+    drive = static_drive(tau, motors)
+    done = simulate_temperatures(drive, [seconds], motors=motors, thermal=thermal, start_c=start_c, ambient_c=23.0)
+    return done.end_c[0, WINDING]
+
+
 def test_a_long_hold_ends_where_it_settles():
     tau = np.array([0.0, -30.0, 0.0, 15.0, 0.0, 5.0, 0.0])
-    temps = course(np.full(14, 23.0), tau, MOTORS, THERMAL, 23.0, 40 * 3600.0)
+    temps = simulated(np.full(14, 23.0), tau, MOTORS, THERMAL, 40 * 3600.0)
     end_c = steady_state(THERMAL, reference_current(tau, np.zeros(7), MOTORS) ** 2, np.zeros(7), MOTORS, 23.0)
     assert end_c is not None
-    np.testing.assert_allclose(temps[-1], end_c[WINDING], atol=0.05)
-    np.testing.assert_array_equal(temps[0], np.full(7, 23.0))
+    np.testing.assert_allclose(temps, end_c[WINDING], atol=0.05)
 
 
 def held(temp_c, tau, seconds):
@@ -70,7 +86,7 @@ def test_the_hottest_motors_torque_error_ranks_postures_as_their_heat_does(subje
     error = holding(subject.twin, model, near, 3.0).one_sided[:, 1]
     start_c = np.full(14, 50.0)
     arm = subject.arm
-    end_c = [course(start_c, model.gravity_torque(q, 3.0), arm.motors, arm.thermal, 23.0, 600.0)[-1, 1] for q in near]
+    end_c = [simulated(start_c, model.gravity_torque(q, 3.0), arm.motors, arm.thermal, 600.0)[1] for q in near]
     assert spearmanr(error, end_c).statistic > 0.9
 
 

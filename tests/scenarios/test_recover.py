@@ -61,7 +61,7 @@ def test_nothing_better_near_is_said(subject, asked):
 
 def test_a_hold_that_is_over_before_the_arm_has_watched_is_refused(subject, asked):
     q = np.deg2rad(HOLDS["reaching"][0])
-    with pytest.raises(RecoveryError, match=r"watches its motors for 30 s .* \(got 20 s\)"):
+    with pytest.raises(RecoveryError, match=r"observes its motors for 30 s .* \(got 20 s\)"):
         recover(subject.twin, subject.arm, q, 3.0, start_c=np.full(14, 50.0), verification=asked, hold_s=20.0)
 
 

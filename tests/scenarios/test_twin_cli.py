@@ -187,9 +187,9 @@ def test_a_log_of_a_hot_arm_teaches_nothing(thermofleet, logs, tmp_path):
     said = thermofleet("twin", "train", "--log", logs / "hot.csv", *TINY, "--out", tmp_path / "twins")
     assert said.code == 2
     assert said.err == (
-        "Error: No moment of one recording is followed by a rest of the recording in which none of motors 1, 2, 3, 4 "
-        "reaches 40 °C. Of all samples the coolest of joint 2 (55.0 °C) is over its limit. "
-        "Raise --cool, or log lighter work.\n"
+        "Error: At no moment of 1 recording(s) do the motors 1, 2, 3, 4 stay below 40 °C for the rest of its "
+        "recording. Always above: 2 (55.0 °C), the coolest sample. Raise the limit (--cool; it may differ by joint, "
+        "idle wrists of a Gen3 are at 40 to 43 °C), count fewer joints, shorten the horizon, or record light work.\n"
     )
 
 
@@ -199,8 +199,8 @@ def test_a_log_shorter_than_a_window_is_told_so(thermofleet, tmp_path):
     said = thermofleet(*train)
     assert said.code == 2
     assert said.err == (
-        "Error: What was recorded is shorter than one window: 25 s are needed, the longest stretch has 20 s. Log for "
-        "longer, or choose a smaller --window.\n"
+        "Error: The recording is shorter than one window: 25 s are needed, the longest stretch has 20 s. Record for "
+        "longer, or choose a smaller window (--window).\n"
     )
     assert thermofleet(*train, "--window", 20).code == 0
 

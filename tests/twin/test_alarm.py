@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import binom
 
+from twin.conformal import p_value
 from twin.saturation.alarm import ConformalAlarm, TooFewJobs
 
 
@@ -34,7 +35,7 @@ def test_the_alarm_is_a_small_p_value(scores, alpha, asked) -> None:
     alarm = ConformalAlarm.fit(scores, alpha)
     new = np.array([*asked, *scores])
     counted = np.array([(1 + sum(s >= x for s in scores)) / (len(scores) + 1) for x in new])
-    np.testing.assert_allclose(alarm.p_value(new), counted)
+    np.testing.assert_allclose(p_value(np.array(alarm.scores), new), counted)
     np.testing.assert_array_equal(alarm(new), counted <= alpha + 1e-9 / (len(scores) + 1))
 
 
@@ -49,7 +50,7 @@ def test_the_spread_holds_nine_calibrations_of_ten() -> None:
 
 def test_too_few_jobs_promise_nothing() -> None:
     assert ConformalAlarm.fit(np.arange(19), 0.05).threshold == 18
-    with pytest.raises(TooFewJobs, match=r"0\.05 can be guaranteed from 19 jobs without the event on \(got 18\)"):
+    with pytest.raises(TooFewJobs, match=r"0\.05 needs 19 or more jobs without the event \(got 18\)"):
         ConformalAlarm.fit(np.arange(18), 0.05)
 
 

@@ -80,7 +80,7 @@ def test_a_missing_tensor_is_named(folder):
     tensors = load_file(folder / WEIGHTS)
     del tensors["joint_3.mu.weight"]
     save_file(tensors, folder / WEIGHTS)
-    with pytest.raises(CheckpointError, match=r"missing tensors \['joint_3.mu.weight'\]"):
+    with pytest.raises(CheckpointError, match=r'Missing key.*"joint_3\.mu\.weight"'):
         load(folder)
 
 
@@ -88,7 +88,7 @@ def test_a_tensor_of_another_shape_is_named(folder):
     tensors = load_file(folder / WEIGHTS)
     tensors["joint_3.mu.weight"] = tensors["joint_3.mu.weight"][:1].clone()
     save_file(tensors, folder / WEIGHTS)
-    with pytest.raises(CheckpointError, match=r"tensor joint_3.mu.weight is torch.float32 \(1, 16\)"):
+    with pytest.raises(CheckpointError, match=r"size mismatch for joint_3\.mu\.weight"):
         load(folder)
 
 
@@ -106,12 +106,12 @@ def test_a_changed_weight_is_noticed(folder):
         (lambda card: card["mean"][2].__setitem__(1, 0.5), "changed since it was saved"),
         (lambda card: card.update(arm="arm_9"), "changed since it was saved"),
         (lambda card: card["config"].update(score_stride=25), "changed since it was saved"),
-        (lambda card: card["config"].update(hidden=8), "the configuration needs"),
+        (lambda card: card["config"].update(hidden=8), "size mismatch for joint_1"),
         (lambda card: card["config"].update(hidden=-8), "hidden must be >= 1"),
         (lambda card: card["std"].pop(), "must each have 7 joints"),
-        (lambda card: card["fits"].pop(), "fits must have 7 entries, one per network"),
-        (lambda card: card["config"].update(scope="arm"), "fits must have 1 entries"),
-        (lambda card: card["config"].update(kind="ae"), "unknown tensors"),
+        (lambda card: card["fits"].pop(), r"needs 7 network\(s\) and fits \(got 7 and 6\)"),
+        (lambda card: card["config"].update(scope="arm"), "Missing key"),
+        (lambda card: card["config"].update(kind="ae"), "Unexpected key"),
         (lambda card: card["std"][0].pop(), "Expected `array` of length 3"),
         (lambda card: card.pop("seed"), "seed"),
         (lambda card: card.update(more=1), "more"),

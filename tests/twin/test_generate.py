@@ -109,13 +109,13 @@ def test_what_a_twin_knows_exactly_comes_back_nearly_as_it_was(source):
     made = vary(exact_twin(), source, 0.0, np.random.default_rng(0))
     assert made.distance_rad < 0.02
     assert made.distance_z == pytest.approx(made.distance_rad / 0.5)
-    for stretch, phase in zip(made.stretches, source.phases, strict=True):
-        assert len(stretch) == pytest.approx(len(phase.profile), rel=0.15)
+    for stretch, phase in zip(made.phases, source.phases, strict=True):
+        assert len(stretch.q) == pytest.approx(len(phase.profile), rel=0.15)
 
 
 def test_a_joint_decoded_a_whole_turn_away_comes_back(source):
     straight, turned = (vary(exact_twin(turn=turn), source, 0.0, np.random.default_rng(0)) for turn in (0, -2 * np.pi))
-    np.testing.assert_allclose(turned.stretches[1].q, straight.stretches[1].q, atol=1e-5)
+    np.testing.assert_allclose(turned.phases[1].q, straight.phases[1].q, atol=1e-5)
 
 
 def test_windows_share_noise_as_they_share_time(source, make_plan, motion):
@@ -142,14 +142,14 @@ def test_motion_can_be_executed_from_home_to_home(twin, records, make_plan, s, s
     plan = replace(make_plan(*records[:3]), speed=0.8, approach=approach, cycle=cycle, retreat=retreat)
     made = vary(twin, plan, s, np.random.default_rng(seed))
     home = plan.approach.profile[0, 0]
-    approach, cycle, retreat = made.stretches
+    approach, cycle, retreat = made.phases
     np.testing.assert_allclose(approach.q[0], home, atol=1e-6)
     np.testing.assert_allclose(cycle.q[0], retreat.q[0], atol=1e-9)
     for part, then in ((approach, cycle), (cycle, cycle), (cycle, retreat)):
         # One more sample, and the next begins.
         np.testing.assert_allclose(part.q[-1], then.q[0], atol=2e-3)
         assert np.abs(part.qd[-1]).max() < 0.05
-    for part in made.stretches:
+    for part in made.phases:
         assert np.all(np.abs(part.qd) <= LIMITS[0] * plan.speed * (1 + 1e-6))
         assert np.all(np.abs(part.qdd) <= LIMITS[1] * plan.speed * (1 + 1e-6))
         np.testing.assert_allclose(np.diff(part.q, axis=0) * RATE_HZ, (part.qd[1:] + part.qd[:-1]) / 2, atol=0.02)
@@ -166,15 +166,15 @@ def test_the_farther_the_noise_the_farther_the_motion(twin, plan):
     assert far[1] < 1.1 * far[0]
     # Without noise every seed reconstructs alike.
     assert len({made[0.0, seed].distance_rad for seed in seeds}) == 1
-    still = made[0.0, 0].stretches[1].q
-    apart = [np.abs(np.mean(made[s, 0].stretches[1].q, axis=0) - still.mean(axis=0)).max() for s in scales]
+    still = made[0.0, 0].phases[1].q
+    apart = [np.abs(np.mean(made[s, 0].phases[1].q, axis=0) - still.mean(axis=0)).max() for s in scales]
     assert apart[0] == 0.0
     assert apart[1] < apart[-1]
 
 
 def test_the_same_seed_makes_the_same_motion(twin, plan):
     one, same, other = (vary(twin, plan, 1.0, np.random.default_rng(seed)) for seed in (3, 3, 4))
-    np.testing.assert_array_equal(one.stretches[1].q, same.stretches[1].q)
+    np.testing.assert_array_equal(one.phases[1].q, same.phases[1].q)
     assert one.distance_rad != other.distance_rad
 
 

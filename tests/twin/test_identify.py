@@ -174,7 +174,7 @@ def test_intervals_shrink_with_data_and_what_the_log_is_silent_about_is_said(rng
     few, many = (identify(part, ambient_sd_k=0.0) for part in (recordings[:1], recordings))
     narrower = [m.sd < f.sd for f, m in zip(few.parameters, many.parameters, strict=True)]
     assert np.mean(narrower) > 0.95
-    # Joint 5 carries nothing here: its copper loss cannot be told, its idle heat can.
+    # Joint 5 carries nothing here: its copper loss stays unknown, its idle heat does not.
     quiet = [replace(r, current_a=r.current_a * (np.arange(JOINTS) != 4)) for r in recordings[:1]]
     assert few.parameter("copper_w_per_a2", 5).informed
     silent = identify(quiet, ambient_sd_k=0.0)
@@ -230,11 +230,11 @@ def still(recording: Recording, **changed) -> Recording:
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        (lambda r: [], "no recording"),
+        (lambda r: [], "at least one recording"),
         (lambda r: [r, r], "Names of recordings must differ"),
         (lambda r: [still(r, temp_c=None)], "no motor temperatures. Record"),
         (lambda r: [still(r, temp_c=np.full_like(r.temp_c, 30.0))], "No motor warms or cools"),
-        (lambda r: [still(r, current_a=0.0 * r.current_a)], "copper loss cannot be told"),
+        (lambda r: [still(r, current_a=0.0 * r.current_a)], "copper loss is unknown"),
         (lambda r: [Recording(name="s", **{n: getattr(r, n)[:60] for n in CHANNELS})], "at least 300 s are needed"),
         (
             lambda r: [Recording(name="s", time_s=r.time_s, **{n: getattr(r, n)[:, :6] for n in CHANNELS[1:]})],
@@ -258,7 +258,7 @@ def test_arguments_that_make_no_sense_are_refused(rng):
     with pytest.raises(ValueError, match="Free parameters must be some of"):
         identify([recording], free=("copper",))
     without = replace(gen3_motors(), idle_w=np.zeros(JOINTS))
-    with pytest.raises(ValueError, match="nominal value > 0; not so: idle_w"):
+    with pytest.raises(ValueError, match=r"nominal values > 0 \(got 0 for idle_w"):
         identify([recording], nominal=HeatModel(without, gen3_network()))
 
 

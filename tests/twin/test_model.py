@@ -83,4 +83,3 @@ def test_an_autoencoder_is_certain_whatever_the_noise():
 def test_a_scope_says_how_many_networks_read_how_much(scope, networks, channels):
     config = TwinConfig(scope=scope)
     assert (config.networks(7), config.channels(7)) == (networks, channels)
-    assert TwinConfig.whole_arm().networks(7) == 1

@@ -1,4 +1,3 @@
-import pickle
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
@@ -125,7 +124,7 @@ def test_a_joint_that_stood_still_may_have_nothing_to_say(records, small):
 
 
 def test_diverged_training_is_an_error(records, tiny):
-    with pytest.raises(Diverged, match="Lower learning_rate"):
+    with pytest.raises(Diverged, match="training of joint 1 of 'a' ended without finite weights"):
         train(records, replace(tiny, learning_rate=1e30, clip=1e30, epochs=5), SEED, arm="a")
 
 
@@ -181,14 +180,6 @@ def test_an_autoencoder_that_learned_nothing_is_collapsed(records, small):
             SEED,
             arm="a",
         )
-
-
-def test_errors_of_training_travel_between_processes():
-    for error in (CollapsedPosterior("arm_1", "joint_2", 0.1, 0), Diverged("arm_1", "arm")):
-        back = pickle.loads(pickle.dumps(error))
-        assert (type(back), str(back)) == (type(error), str(error))
-    assert "joint 2" in str(CollapsedPosterior("arm_1", "joint_2", 0.1, 0))
-    assert "the whole arm" in str(Diverged("arm_1", "arm"))
 
 
 @pytest.mark.parametrize(

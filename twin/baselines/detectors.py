@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from typing import Any
 
 import numpy as np
 from sklearn.covariance import LedoitWolf
@@ -19,9 +19,6 @@ NEIGHBOURS = 5
 STATISTICS = ("mean", "std", "rms", "min", "max", "step")
 """Per channel over the window's time; `step` is the mean absolute difference from one sample to the next."""
 FEATURES = tuple(f"{statistic}_{channel}" for statistic in STATISTICS for channel in CHANNELS)
-
-Distance = Callable[[Array], Array]
-"""Standardised features [batch, feature] to the distance from training data, [batch]."""
 
 
 def window_statistics(windows: Array) -> Array:
@@ -60,47 +57,41 @@ def nearest_neighbours(cool: CoolWindows, count: int = NEIGHBOURS) -> WindowScor
     """
     if len(cool.z) < count:
         raise ValueError(f"{count} nearest neighbours need as many training windows (got {len(cool.z)}).")
-
-    def fit(features: Array, _: int) -> Distance:
-        return partial(neighbour_distance, NearestNeighbors(n_neighbors=count).fit(features))
-
-    return _detector(f"kNN-{count}", cool, fit)
+    return _detector(f"kNN-{count}", cool, lambda _: NearestNeighbors(n_neighbors=count), neighbour_distance)
 
 
 def mahalanobis(cool: CoolWindows) -> WindowScorer:
     """Mahalanobis distance from the training windows."""
-    return _detector("Mahalanobis", cool, lambda x, _: partial(mahalanobis_distance, LedoitWolf().fit(x)))
+    return _detector("Mahalanobis", cool, lambda _: LedoitWolf(), mahalanobis_distance)
 
 
 def isolation_forest(cool: CoolWindows, seed: np.random.SeedSequence) -> WindowScorer:
     """Isolation forest; trees drawn by the seed."""
     seeds = seed.generate_state(cool.scaler.joints).tolist()
-
-    def fit(features: Array, joint: int) -> Distance:
-        return partial(isolation_score, IsolationForest(random_state=seeds[joint]).fit(features))
-
-    return _detector("isolation forest", cool, fit)
+    return _detector("isolation forest", cool, lambda j: IsolationForest(random_state=seeds[j]), isolation_score)
 
 
 @dataclass(frozen=True, eq=False)
 class _WindowDistance:
     """A distance per joint on the window's standardised statistics, the same for all samples of the window."""
 
-    scales: tuple[StandardScaler, ...]
-    distances: tuple[Distance, ...]
+    fitted: tuple[tuple[StandardScaler, Any], ...]  # Any: an estimator of scikit-learn
+    distance: Callable[[Any, Array], Array]
 
     def __call__(self, z: Array) -> Array:
         """Windows in z-scores [batch, time, joint, channel] to [batch, time, joint]."""
-        features = window_statistics(z)
-        pairs = enumerate(zip(self.scales, self.distances, strict=True))
-        columns = [distance(np.asarray(scale.transform(features[:, j]))) for j, (scale, distance) in pairs]
+        features = np.moveaxis(window_statistics(z), 1, 0)
+        pairs = zip(self.fitted, features, strict=True)
+        columns = [self.distance(model, np.asarray(scale.transform(x))) for (scale, model), x in pairs]
         return np.broadcast_to(np.stack(columns, axis=1)[:, None], z.shape[:3])
 
 
-def _detector(name: str, cool: CoolWindows, fit: Callable[[Array, int], Distance]) -> WindowScorer:
-    """A scorer from `fit`, which returns the distance of one joint given its features [batch, feature] and index."""
-    features = window_statistics(cool.z)
-    joints = range(cool.scaler.joints)
-    scales = tuple(StandardScaler().fit(features[:, j]) for j in joints)
-    distances = tuple(fit(np.asarray(scales[j].transform(features[:, j])), j) for j in joints)
-    return WindowScorer(name, cool.config, cool.scaler, _WindowDistance(scales, distances))
+def _detector(
+    name: str, cool: CoolWindows, make: Callable[[int], Any], distance: Callable[[Any, Array], Array]
+) -> WindowScorer:
+    """A scorer from an unfitted estimator per joint index and its distance of features [batch, feature], [batch]."""
+    fitted = []
+    for j, x in enumerate(np.moveaxis(window_statistics(cool.z), 1, 0)):
+        scale = StandardScaler().fit(x)
+        fitted.append((scale, make(j).fit(np.asarray(scale.transform(x)))))
+    return WindowScorer(name, cool.config, cool.scaler, _WindowDistance(tuple(fitted), distance))

@@ -1,6 +1,6 @@
-"""Scorers to compare a twin with: a linear autoencoder, and any difficulty model.
+"""Baselines for a twin: a linear autoencoder, and any difficulty model.
 
-Every scorer gives one score per joint and one per job, as a mean over the job's time with its phases weighted as in the
+Every scorer gives one score per joint and one per job: means over the job's time, with its phases weighted as in the
 twin's own score. Novelty detectors are in `twin.baselines.detectors`, torque rules in `twin.baselines.torque`.
 """
 
@@ -44,7 +44,7 @@ class Scorer(Protocol):
         ...
 
     def scores(self, plans: Sequence[Plan], repetitions: Sequence[int]) -> Scores:
-        """Score of each job, a plan done so many times.
+        """Score of each job, a repeated plan.
 
         Raises:
             ValueError: no jobs, repetitions < 1, or a plan without motion, not finite or of other joints.
@@ -85,7 +85,7 @@ class WindowScorer:
     """Report 1 − exp(−mean), as the difficulty does, instead of the mean."""
 
     def scores(self, plans: Sequence[Plan], repetitions: Sequence[int]) -> Scores:
-        """Score of each job, a plan done so many times; raises as `Scorer` does."""
+        """Score of each job; raises as `Scorer` does."""
         check_jobs(plans, repetitions)
         firsts = range(0, len(plans), _CHUNK)
         mean = np.concatenate([self._mean(plans[i : i + _CHUNK], repetitions[i : i + _CHUNK]) for i in firsts])
@@ -95,7 +95,9 @@ class WindowScorer:
     def _mean(self, plans: Sequence[Plan], repetitions: Sequence[int]) -> Array:
         jobs = cut_jobs(plans, repetitions, self.config)
         if jobs.windows.shape[2] != self.scaler.joints:
-            raise ValueError(f"'{self.name}' knows {self.scaler.joints} joints, a plan has {jobs.windows.shape[2]}.")
+            raise ValueError(
+                f"'{self.name}' was trained on {self.scaler.joints} joints, a plan has {jobs.windows.shape[2]}."
+            )
         return jobs.mean(self.error(self.scaler.to_z(jobs.windows)))
 
 
@@ -143,7 +145,7 @@ class ModelScorer:
     """The total is the worst joint instead of the sum over joints."""
 
     def scores(self, plans: Sequence[Plan], repetitions: Sequence[int]) -> Scores:
-        """Score of each job, a plan done so many times; raises as `Scorer` does, and where the model gives none."""
+        """Score of each job; raises as `Scorer` does, and ValueError if the model has no score for a job."""
         check_jobs(plans, repetitions)
         difficulties = [self.model.score(plan, times) for plan, times in zip(plans, repetitions, strict=True)]
         if None in difficulties:

@@ -1,4 +1,4 @@
-"""Torque over a nominal torque: the motor designer's rule, without learning."""
+"""RMS torque relative to a nominal torque: the usual rule for sizing a motor, without learning."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,11 +29,11 @@ class TorqueRms:
             raise ValueError(f"TorqueRms.nominal_nm must be one torque > 0 per joint (got {self.nominal_nm}).")
 
     def scores(self, plans: Sequence[Plan], repetitions: Sequence[int]) -> Scores:
-        """Score of each job, a plan done so many times; raises as `Scorer` does."""
+        """Score of each job; raises as `Scorer` does."""
         check_jobs(plans, repetitions)
         rms = np.stack([_rms_torque(plan, times) for plan, times in zip(plans, repetitions, strict=True)])
         if rms.shape[1] != len(self.nominal_nm):
-            raise ValueError(f"'{self.name}' knows {len(self.nominal_nm)} joints, a plan has {rms.shape[1]}.")
+            raise ValueError(f"'{self.name}' has torques of {len(self.nominal_nm)} joints, a plan has {rms.shape[1]}.")
         per_joint = rms / self.nominal_nm
         return Scores(per_joint, per_joint.max(axis=1))
 
@@ -51,7 +51,7 @@ def _rms_torque(plan: Plan, repetitions: int) -> Array:
 def torque_over_known(records: Sequence[Array]) -> TorqueRms:
     """RMS torque over that of the training motion [time, 3, joint]; needs no motor data."""
     if not records:
-        raise ValueError("The known torque needs at least one record (got none).")
+        raise ValueError("The torque of the training motion needs at least one record (got none).")
     squares = np.concatenate([np.square(record[:, TAU], dtype=float) for record in records])
     # A joint without load in training has no torque to divide by.
     return TorqueRms("RMS torque / known", np.maximum(np.sqrt(squares.mean(axis=0)), STD_FLOOR[TAU]))
@@ -77,17 +77,10 @@ def continuous_torque(motors: Motors, thermal: ThermalModel, *, limit_c: float, 
     low, high = still.copy(), motors.current_max_a * motors.torque_per_amp * motors.eta
     for _ in range(40):
         middle = 0.5 * (low + high)
-        hot = np.array([_exceeds(j, middle[j], motors, thermal, limit_c, ambient_c) for j in range(joints)])
+        hot = np.zeros(joints, dtype=bool)
+        for j in range(joints):
+            tau = np.where(np.arange(joints) == j, middle, 0.0)
+            temp_c = steady_state(thermal, reference_current(tau, still, motors) ** 2, still, motors, ambient_c)
+            hot[j] = temp_c is None or temp_c[WINDING][j] > limit_c  # None: a thermal runaway
         low, high = np.where(hot, low, middle), np.where(hot, middle, high)
     return 0.5 * (low + high)
-
-
-def _exceeds(
-    joint: int, torque_nm: float, motors: Motors, thermal: ThermalModel, limit_c: float, ambient_c: float
-) -> bool:
-    """Whether holding this torque at one joint has a steady state above the limit, or none."""
-    none = np.zeros(len(motors.eta))
-    tau = none.copy()
-    tau[joint] = torque_nm
-    temp_c = steady_state(thermal, reference_current(tau, none, motors) ** 2, none, motors, ambient_c)
-    return temp_c is None or bool(temp_c[WINDING][joint] > limit_c)

@@ -13,8 +13,6 @@ Array = np.ndarray
 
 TEMP_RANGE_C = (-40.0, 200.0)
 """Range of a motor's temperature sensor; values outside are faults or kelvin."""
-LIMITED = tuple(j for j in range(JOINTS) if j not in CONTINUOUS)
-"""Joints with end stops, index 0..6, all within half a turn."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,14 +60,14 @@ PLAIN = Format(
 
 
 def format_of(names: Sequence[str]) -> Format:
-    """The format, recognised by its time column.
+    """The format with this time column.
 
     Raises:
-        ValueError: neither time column is there.
+        ValueError: there is no time column of a known format.
     """
-    for known in (GEN3, PLAIN):
-        if known.time in names:
-            return known
+    for layout in (GEN3, PLAIN):
+        if layout.time in names:
+            return layout
     hint = " Columns are separated by commas, numbers have a decimal point." if any(";" in n for n in names) else ""
     raise ValueError(
         f"is not a log: its first line begins with '{','.join(names)[:40]}', where a Gen3 log has '{GEN3.time}' "
@@ -77,43 +75,39 @@ def format_of(names: Sequence[str]) -> Format:
     )
 
 
-def check_columns(known: Format, names: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The groups found, and the columns that belong to none.
+def check_columns(layout: Format, names: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The groups of a format that a log has, and its columns that belong to no group.
 
     Raises:
         ValueError: columns are missing, or the arm has another number of joints.
     """
-    counts = {group: sum(_is_of(group, name) for name in names) for group in known.groups}
-    groups = [g for i, g in enumerate(known.groups) if i < known.required or counts[g]]
-    joints = {counts[g] if set(known.columns(g, counts[g])) <= set(names) else 0 for g in groups}
+    of_group = [name.rpartition("_")[0] for name in names if name.rpartition("_")[2].isdigit()]
+    counts = {group: of_group.count(group) for group in layout.groups}
+    groups = [g for i, g in enumerate(layout.groups) if i < layout.required or counts[g]]
+    joints = {counts[g] if set(layout.columns(g, counts[g])) <= set(names) else 0 for g in groups}
     if len(joints) == 1 and joints not in ({JOINTS}, {0}):
-        raise ValueError(
-            f"is of an arm with {joints.pop()} joints; a Gen3 has {JOINTS}, and only its logs can be read."
-        )
-    wanted = [known.time, *(column for g in groups for column in known.columns(g))]
+        raise ValueError(f"has {joints.pop()} joints; only logs of a Gen3, which has {JOINTS}, can be read.")
+    wanted = [layout.time, *(column for g in groups for column in layout.columns(g))]
     missing = [column for column in wanted if column not in names]
     if missing:
-        raise ValueError(f"lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)} of a {known.name}.")
+        raise ValueError(f"lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)} of a {layout.name}.")
     return groups, [name for name in names if name not in wanted]
 
 
-def _is_of(group: str, name: str) -> bool:
-    start, _, joint = name.rpartition("_")
-    return start == group and joint.isdigit()
-
-
-def channels(known: Format, groups: Sequence[str], table: Table) -> dict[str, Array]:
+def channels(layout: Format, groups: Sequence[str], table: Table) -> dict[str, Array]:
     """The groups of a table in SI with our signs, each [row, joint]; a Gen3's angles within half a turn of zero."""
     readings: dict[str, Array] = {}
-    for channel, group, factor in zip(READINGS, known.groups, known.factors, strict=True):
+    for channel, group, factor in zip(READINGS, layout.groups, layout.factors, strict=True):
         if group in groups:
-            readings[channel] = table.values[:, [table.names.index(column) for column in known.columns(group)]] * factor
-    if known.turns:
+            readings[channel] = (
+                table.values[:, [table.names.index(column) for column in layout.columns(group)]] * factor
+            )
+    if layout.turns:
         readings["q"] = (readings["q"] + np.pi) % (2 * np.pi) - np.pi
     return readings
 
 
-def implausible_readings(known: Format, readings: dict[str, Array], where: Array) -> list[Damage]:
+def implausible_readings(layout: Format, readings: dict[str, Array], where: Array) -> list[Damage]:
     """Rows with readings that no Gen3 can have, mostly because of another unit.
 
     Args:
@@ -121,14 +115,12 @@ def implausible_readings(known: Format, readings: dict[str, Array], where: Array
         where: Line of each row, [row].
     """
     damage: list[Damage] = []
-    if not known.turns:
+    if not layout.turns:
         # Beyond half a turn a joint with end stops has passed them.
-        q = np.where(np.isin(np.arange(JOINTS), LIMITED), readings["q"], 0.0)
-        damage += out_of_range(
-            q, where, (-np.pi, np.pi), "joint {joint} at {value:.5g} is beyond its stops; q is in rad"
-        )
+        q = np.where(np.isin(np.arange(JOINTS), CONTINUOUS), 0.0, readings["q"])
+        reason = "joint {joint} at {value:.5g} is beyond its stops; q is in rad"
+        damage += out_of_range(q, where, (-np.pi, np.pi), reason)
     if "temp_c" in readings:
-        damage += out_of_range(
-            readings["temp_c"], where, TEMP_RANGE_C, "motor {joint} at {value:.5g} is not a motor temperature in °C"
-        )
+        reason = "motor {joint} at {value:.5g} is not a motor temperature in °C"
+        damage += out_of_range(readings["temp_c"], where, TEMP_RANGE_C, reason)
     return damage

@@ -118,9 +118,9 @@ def _means(values: Array, dt_s: Array, edges: Array) -> Array:
     return total / np.add.reduceat(used, edges[:-1]).reshape(shape)
 
 
-def _unit(motors: Motors, coulomb: float, viscous: float) -> Motors:
-    shape = np.ones_like(motors.coulomb_nm)
-    return replace(motors, coulomb_nm=coulomb * shape, viscous_nms_per_rad=viscous * shape)
+def _with_friction(motors: Motors, coulomb: float, viscous: float) -> Motors:
+    ones = np.ones_like(motors.coulomb_nm)
+    return replace(motors, coulomb_nm=coulomb * ones, viscous_nms_per_rad=viscous * ones)
 
 
 def _current_terms(recording: Recording, motors: Motors, source: CurrentSource) -> Array:
@@ -129,7 +129,7 @@ def _current_terms(recording: Recording, motors: Motors, source: CurrentSource) 
         measured = interval_current_sq(recording)
         return np.concatenate([measured[..., None], np.zeros((*measured.shape, 5))], axis=-1)
     # The law is affine in the friction coefficients: i = i_0 + c·i_c + b·i_b.
-    none, coulomb, viscous = _unit(motors, 0.0, 0.0), _unit(motors, 1.0, 0.0), _unit(motors, 0.0, 1.0)
+    none, coulomb, viscous = (_with_friction(motors, *friction) for friction in ((0, 0), (1, 0), (0, 1)))
     ends = []
     for end in (slice(None, -1), slice(1, None)):
         tau, qd = recording.tau[end], _signed_speed(recording, recording.qd[end])
@@ -151,6 +151,4 @@ def _signed_speed(recording: Recording, qd: Array) -> Array:
 def _friction_terms(recording: Recording, motors: Motors) -> Array:
     """Over each interval between samples, [interval, joint, 2]."""
     speed = interval_speed(recording)
-    return np.stack(
-        [friction_heat(speed, _unit(motors, 1.0, 0.0)), friction_heat(speed, _unit(motors, 0.0, 1.0))], axis=-1
-    )
+    return np.stack([friction_heat(speed, _with_friction(motors, *unit)) for unit in ((1, 0), (0, 1))], axis=-1)

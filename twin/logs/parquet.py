@@ -33,10 +33,17 @@ def read_arms(path: Path) -> dict[str, Table]:
     names = tuple(name for name in table.column_names if name not in (ARM, MODE))
     values = np.column_stack([_numbers(path, name, table[name]) for name in names])
     arms = np.array(table[ARM].cast(pa.string()).to_pylist(), dtype=object)
-    without_arm = [row for row, arm in enumerate(arms.tolist()) if arm is None]
-    if without_arm:
-        raise LogError(str(path), without_arm[0] + 1, "names no arm.")
-    return {str(arm): _of_rows(names, values, np.flatnonzero(arms == arm)) for arm in dict.fromkeys(arms.tolist())}
+    if None in arms:
+        raise LogError(str(path), arms.tolist().index(None) + 1, "names no arm.")
+    finite = np.isfinite(values)
+    good = finite.all(axis=1)
+
+    def of_arm(arm: str) -> Table:
+        rows, bad = np.flatnonzero((arms == arm) & good), np.flatnonzero((arms == arm) & ~good)
+        damage = [Damage(int(i) + 1, f"{names[finite[i].argmin()]} is missing or not a finite number") for i in bad]
+        return Table(names, values[rows], rows + 1, tuple(damage))
+
+    return {arm: of_arm(arm) for arm in dict.fromkeys(arms.tolist())}
 
 
 def _numbers(path: Path, name: str, column: pa.ChunkedArray) -> Array:
@@ -44,14 +51,3 @@ def _numbers(path: Path, name: str, column: pa.ChunkedArray) -> Array:
         return column.cast(pa.float64()).to_numpy()
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
         raise LogError(str(path), None, f"the column {name} holds {column.type}, not numbers.") from error
-
-
-def _of_rows(names: tuple[str, ...], values: Array, rows: Array) -> Table:
-    finite = np.isfinite(values[rows])
-    good = finite.all(axis=1)
-    first = finite[~good].argmin(axis=1)
-    damage = tuple(
-        Damage(int(row) + 1, f"{names[column]} is missing or not a finite number")
-        for row, column in zip(rows[~good], first, strict=True)
-    )
-    return Table(names, values[rows[good]], rows[good] + 1, damage)

@@ -1,21 +1,20 @@
 """Read logs of real and simulated arms: Gen3 CSV, plain CSV (both plain or gzip), telemetry.parquet."""
 
 import logging
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 
 from fleet.errors import LogError
-from twin.logs.formats import PLAIN, Format, channels, check_columns, format_of, implausible_readings
-from twin.logs.lines import read_lines
+from twin.logs.csv_table import read_csv
+from twin.logs.formats import PLAIN, channels, check_columns, format_of, implausible_readings
 from twin.logs.parquet import read_arms
 from twin.logs.recording import Recording
-from twin.logs.table import Damage, Table, damage_summary, table_of, time_damage
+from twin.logs.table import Damage, Table, damage_summary, time_damage
 
 Damaged = Literal["refuse", "skip"]
-"""What to do with a file that has unusable lines."""
+"""Treatment of a file that has unusable lines."""
 SUFFIXES = (".csv.gz", ".csv", ".parquet")
 NOT_LOGS = ("events.parquet",)
 """Other parquet files of a run folder."""
@@ -41,14 +40,8 @@ def read(path: str | Path, *, damaged: Damaged = "refuse") -> list[Recording]:
     if path.is_dir():
         raise LogError(str(path), None, "is a folder; a log is a file.")
     if path.suffix == ".parquet":
-        return [_recording(path, f"{name}/{arm}", PLAIN, table, (), damaged) for arm, table in read_arms(path).items()]
-    lines = read_lines(path)
-    try:
-        table = table_of(lines)
-        known = format_of(table.names)
-    except ValueError as error:
-        raise LogError(str(path), 1, str(error)) from error
-    return [_recording(path, name, known, table, (lines.broken,) if lines.broken else (), damaged)]
+        return [_recording(path, f"{name}/{arm}", table, damaged) for arm, table in read_arms(path).items()]
+    return [_recording(path, name, read_csv(path), damaged)]
 
 
 def read_folder(path: str | Path, *, damaged: Damaged = "refuse") -> list[Recording]:
@@ -86,26 +79,31 @@ def _name(path: Path) -> str:
     return next((path.name[: -len(s)] for s in SUFFIXES if path.name.lower().endswith(s)), path.name)
 
 
-def _recording(
-    path: Path, name: str, known: Format, table: Table, broken: Sequence[str], damaged: Damaged
-) -> Recording:
-    """A recording from the good rows of a table; `broken` lists damage of the whole file."""
+def _recording(path: Path, name: str, table: Table, damaged: Damaged) -> Recording:
+    """A recording from the good rows of a table."""
+    is_csv = path.suffix != ".parquet"
     try:
-        groups, unknown = check_columns(known, table.names)
+        layout = format_of(table.names) if is_csv else PLAIN
+        groups, unknown = check_columns(layout, table.names)
     except ValueError as error:
-        raise LogError(str(path), None if path.suffix == ".parquet" else 1, str(error)) from error
-    readings = channels(known, groups, table)
-    damage = [*table.damage, *implausible_readings(known, readings, table.where)]
+        raise LogError(str(path), 1 if is_csv else None, str(error)) from error
+    readings = channels(layout, groups, table)
+    damage = [*table.damage, *implausible_readings(layout, readings, table.where)]
     good = ~np.isin(table.where, [d.line for d in damage])
-    time_s = table.values[:, table.names.index(known.time)]
+    time_s = table.values[:, table.names.index(layout.time)]
     try:
         damage += time_damage(time_s[good], table.where[good])
     except ValueError as error:
         raise LogError(str(path), None, str(error)) from error
+    broken = table.broken
     if unknown:
-        broken = (*broken, f"its columns {', '.join(unknown)} are unknown to a {known.name}")
-    if damaged == "refuse":
-        _refuse(path, broken, damage)
+        broken = (*broken, f"its columns {', '.join(unknown)} are unknown to a {layout.name}")
+    if damaged == "refuse" and (broken or damage):
+        others = len(broken) + len(damage) - 1
+        more = f", and {others} more damaged place{'s' * (others > 1)}" if others else ""
+        first = min(damage, key=lambda d: d.line, default=Damage(0, ""))
+        line, reason = (None, broken[0]) if broken else (first.line, first.reason)
+        raise LogError(str(path), line, f'{reason}{more}. Use damaged="skip" to read the undamaged lines.')
     keep = ~np.isin(table.where, [d.line for d in damage])
     dropped = (*broken, *damage_summary(damage))
     for sentence in dropped:
@@ -114,16 +112,3 @@ def _recording(
         raise LogError(str(path), None, f"holds no good line of numbers{': ' if dropped else '.'}{'; '.join(dropped)}")
     kept = {channel: np.ascontiguousarray(values[keep]) for channel, values in readings.items()}
     return Recording(name=name, time_s=time_s[keep], **kept, dropped=dropped)
-
-
-def _refuse(path: Path, broken: Sequence[str], damage: Sequence[Damage]) -> None:
-    """Raise the first damage, if any."""
-    others = len(broken) + len(damage) - 1
-    if others < 0:
-        return
-    more = f", and {others} more damaged place{'s' * (others > 1)}" if others else ""
-    ask = f'{more}. Use damaged="skip" to read the good rest.'
-    if broken:
-        raise LogError(str(path), None, f"{broken[0]}{ask}")
-    first = min(damage, key=lambda d: d.line)
-    raise LogError(str(path), first.line, f"{first.reason}{ask}")

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
 
 from twin.logs.recording import CONTINUOUS, Recording
 
@@ -49,21 +50,16 @@ def stretches(recording: Recording, rate_hz: float, *, gap_s: float = GAP_S) -> 
             "all of it; give a larger gap_s."
         )
     pieces = np.split(np.arange(len(recording.time_s)), np.flatnonzero(steps > gap_s) + 1)
-    return [
-        stretch for piece in pieces if len(piece) > 1 and (stretch := _stretch(recording, piece, rate_hz)) is not None
-    ]
+    resampled = [_stretch(recording.part(piece), rate_hz) for piece in pieces if len(piece) > 1]
+    return [stretch for stretch in resampled if len(stretch.time_s)]
 
 
-def _stretch(recording: Recording, piece: Array, rate_hz: float) -> Stretch | None:
-    time_s = recording.time_s[piece]
-    q = unwrap(recording.q[piece], recording.qd[piece], time_s)
-    channels = [q, recording.qd[piece], recording.tau[piece]]
+def _stretch(recording: Recording, rate_hz: float) -> Stretch:
+    channels = [unwrap(recording.q, recording.qd, recording.time_s), recording.qd, recording.tau]
     if recording.temp_c is not None:
-        channels.append(recording.temp_c[piece])
-    moments, values = at_rate(time_s, np.stack(channels, axis=1), rate_hz)
-    if not len(moments):
-        return None
-    return Stretch(recording.name, moments, values[:, :3], values[:, 3] if recording.temp_c is not None else None)
+        channels.append(recording.temp_c)
+    time_s, values = at_rate(recording.time_s, np.stack(channels, axis=1), rate_hz)
+    return Stretch(recording.name, time_s, values[:, :3], None if recording.temp_c is None else values[:, 3])
 
 
 def unwrap(q: Array, qd: Array, time_s: Array) -> Array:
@@ -74,7 +70,7 @@ def unwrap(q: Array, qd: Array, time_s: Array) -> Array:
     step = np.diff(q, axis=0)
     expected = (qd[1:] + qd[:-1]) / 2.0 * np.diff(time_s)[:, None]
     turns = np.round((expected - step) / (2 * np.pi))
-    turns[:, [j for j in range(q.shape[1]) if j not in CONTINUOUS]] = 0.0
+    turns[:, ~np.isin(np.arange(q.shape[1]), CONTINUOUS)] = 0.0
     return q + 2 * np.pi * np.concatenate([np.zeros((1, q.shape[1])), np.cumsum(turns, axis=0)])
 
 
@@ -89,32 +85,10 @@ def at_rate(time_s: Array, values: Array, rate_hz: float) -> tuple[Array, Array]
         Times of the new samples, s, [sample], and their values, [sample, ...]; see `stretches`.
     """
     since_s = time_s - time_s[0]
-    samples = since_s[-1] * rate_hz + _SAME_RATE * len(time_s)
+    line = make_interp_spline(since_s, values, k=1)
+    samples = int(since_s[-1] * rate_hz + _SAME_RATE * len(time_s))
+    at_s = np.minimum(np.arange(samples + 1) / rate_hz, since_s[-1])
     if rate_hz * np.median(np.diff(time_s)) >= 1 - _SAME_RATE:
-        at_s = np.minimum(np.arange(int(samples) + 1) / rate_hz, since_s[-1])
-        return time_s[0] + at_s, line_at(since_s, values, at_s)
-    edges_s = np.minimum(np.arange(int(samples) + 1) / rate_hz, since_s[-1])
-    at_edges = integral_at(since_s, values, edges_s)
-    means = np.diff(at_edges, axis=0) / _column(np.diff(edges_s), values)
-    return time_s[0] + (edges_s[1:] + edges_s[:-1]) / 2.0, means
-
-
-def line_at(time_s: Array, values: Array, at_s: Array) -> Array:
-    """Linear interpolation of readings at some times."""
-    before = np.clip(np.searchsorted(time_s, at_s, side="right") - 1, 0, len(time_s) - 2)
-    share = _column((at_s - time_s[before]) / (time_s[before + 1] - time_s[before]), values)
-    return (1 - share) * values[before] + share * values[before + 1]
-
-
-def integral_at(time_s: Array, values: Array, at_s: Array) -> Array:
-    """Integral of the linear interpolation from the first reading to some times."""
-    areas = (values[1:] + values[:-1]) / 2.0 * _column(np.diff(time_s), values)
-    to_reading = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(areas, axis=0)])
-    before = np.clip(np.searchsorted(time_s, at_s, side="right") - 1, 0, len(time_s) - 2)
-    rest = (values[before] + line_at(time_s, values, at_s)) / 2.0 * _column(at_s - time_s[before], values)
-    return to_reading[before] + rest
-
-
-def _column(factor: Array, values: Array) -> Array:
-    """[time] reshaped to multiply [time, ...]."""
-    return factor.reshape(-1, *(1,) * (values.ndim - 1))
+        return time_s[0] + at_s, line(at_s)
+    width_s = np.diff(at_s).reshape(-1, *(1,) * (values.ndim - 1))
+    return time_s[0] + (at_s[1:] + at_s[:-1]) / 2.0, np.diff(line.antiderivative()(at_s), axis=0) / width_s

@@ -1,26 +1,23 @@
-"""The numbers of a log as a table, and the lines that cannot be used."""
+"""The numbers of a log as a table, and its damaged lines."""
 
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from math import isfinite
 
 import numpy as np
-
-from twin.logs.lines import Lines
 
 Array = np.ndarray
 
 MOST_SENTENCES = 20
-"""Most sentences about one file; the rest is counted."""
+"""Most sentences about one file; further ones are counted."""
 STRAY_ROWS = 3
 """Longest run of rows with wrong times; a longer one is a clock that was reset."""
 
 
 @dataclass(frozen=True)
 class Damage:
-    """A line, or row, that cannot be used."""
+    """An unusable line, or row of a parquet file."""
 
     line: int
     """From 1."""
@@ -38,68 +35,9 @@ class Table:
     where: Array
     """Line in the file of each row, from 1, [row]."""
     damage: tuple[Damage, ...]
-    """Lines that cannot be used."""
-
-
-def header_of(lines: Lines) -> list[str]:
-    """The column names of the first line.
-
-    Raises:
-        ValueError: the line is no text in UTF-8, or names a column twice.
-    """
-    try:
-        names = [name.strip().strip('"') for name in lines.lines[0].decode("utf-8-sig").split(",")]
-    except UnicodeDecodeError as error:
-        raise ValueError(f"is not text in UTF-8 (byte {error.start}); save it as CSV in UTF-8.") from error
-    double = sorted({name for name in names if names.count(name) > 1})
-    if double:
-        raise ValueError(f"names the column '{double[0]}' twice.")
-    return names
-
-
-def table_of(lines: Lines) -> Table:
-    """The numbers of all good lines after the header; blank lines are ignored.
-
-    Raises:
-        ValueError: the first line is no header.
-    """
-    names = header_of(lines)
-    rows: list[list[float]] = []
-    where: list[int] = []
-    damage: list[Damage] = []
-    for line, raw in enumerate(lines.lines[1:], start=2):
-        if not raw.strip():
-            continue
-        if lines.cut and line == len(lines.lines):
-            # The last number may have lost digits even if all fields are there.
-            damage.append(Damage(line, lines.cut))
-            continue
-        try:
-            rows.append(_numbers(raw, len(names)))
-        except ValueError as error:
-            damage.append(Damage(line, str(error)))
-        else:
-            where.append(line)
-    values = np.array(rows, dtype=float).reshape(-1, len(names))
-    return Table(tuple(names), values, np.array(where, dtype=int), tuple(damage))
-
-
-def _numbers(raw: bytes, columns: int) -> list[float]:
-    try:
-        cells = raw.decode("utf-8").split(",")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"is not text in UTF-8 (byte {error.start} of the line)") from error
-    if len(cells) != columns:
-        raise ValueError(f"{len(cells)} fields where the header has {columns}")
-    numbers: list[float] = []
-    for column, cell in enumerate(cells, start=1):
-        try:
-            numbers.append(float(cell))
-        except ValueError:
-            raise ValueError(f"field {column}, '{cell.strip()[:24]}', is not a number") from None
-        if not isfinite(numbers[-1]):
-            raise ValueError(f"field {column} is {cell.strip()}, not a finite number")
-    return numbers
+    """Unusable lines."""
+    broken: tuple[str, ...] = ()
+    """Damage of the whole file."""
 
 
 def time_damage(time_s: Array, where: Array) -> list[Damage]:

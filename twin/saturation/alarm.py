@@ -1,7 +1,7 @@
 """An alarm with a bounded rate of false alarms: split conformal prediction over whole jobs.
 
-The bound holds on average over calibrations, for jobs exchangeable with the calibration jobs. Motion of another kind is
-not, whatever alpha. Whole jobs, because windows of one job are not exchangeable.
+The bound holds on average over calibrations, for jobs exchangeable with the calibration jobs, not for motion of another
+kind. It rates whole jobs, because windows of one job are not exchangeable.
 Source: Vovk, Gammerman & Shafer, Algorithmic Learning in a Random World, 2005, ch. 4; Laxhammar & Falkman 2010.
 """
 
@@ -12,18 +12,17 @@ import numpy as np
 from scipy.stats import beta
 
 from fleet.errors import FleetError
-from twin.conformal import p_value
 
 Array = np.ndarray
 
 
 class TooFewJobs(FleetError):
-    """Too few jobs for the false-alarm rate; the message says how many are needed."""
+    """Too few jobs for the false-alarm rate."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ConformalAlarm:
-    """Warns of jobs that score higher than almost all jobs without the event."""
+    """Warns of jobs with a score above almost all jobs without the event."""
 
     alpha: float
     """Bound on the rate of false alarms, (0, 1)."""
@@ -40,8 +39,8 @@ class ConformalAlarm:
         if self._allowed() < 1:
             least = int(np.ceil(1 / self.alpha - 1 - 1e-9))
             raise TooFewJobs(
-                f"A false-alarm rate of {self.alpha:g} can be guaranteed from {least} jobs without the event on "
-                f"(got {len(self.scores)}). Collect more of them, or ask for a larger alpha."
+                f"A false-alarm rate of {self.alpha:g} needs {least} or more jobs without the event "
+                f"(got {len(self.scores)}). Collect more jobs, or choose a larger alpha."
             )
 
     @classmethod
@@ -60,12 +59,8 @@ class ConformalAlarm:
         return self.scores[-self._allowed()]
 
     def __call__(self, score: Array) -> Array:
-        """Whether to warn, bool of the same shape as the scores; warns of NaN."""
+        """Whether to warn, bool of the same shape as the scores; true for NaN."""
         return ~(np.asarray(score, dtype=float) <= self.threshold)
-
-    def p_value(self, score: Array) -> Array:
-        """Share of jobs without the event that score as high, (0, 1]; the alarm is p <= alpha."""
-        return p_value(np.array(self.scores), np.asarray(score, dtype=float))
 
     def spread(self, confidence: float = 0.9) -> tuple[float, float]:
         """Interval of the rate of false alarms of this one calibration, for scores without ties.

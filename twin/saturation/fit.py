@@ -36,7 +36,7 @@ STRENGTHS = tuple(float(c) for c in np.logspace(-2, 2, 9))
 
 
 class NotEnoughExperience(FleetError):
-    """Too few past jobs to fit P(saturation); the message names what is missing."""
+    """Too few past jobs to fit P(saturation)."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -56,10 +56,9 @@ class Experience:
 
     def __post_init__(self) -> None:
         packed = self.features.packed
-        wanted = {"duration_s": packed.shape[:1], "temp_c": packed.shape[:2], "passed": packed.shape[:1]}
-        for name, shape in wanted.items():
-            if getattr(self, name).shape != shape:
-                raise ValueError(f"Experience.{name} must be {shape} (got {getattr(self, name).shape}).")
+        for name, axes in (("duration_s", 1), ("temp_c", 2), ("passed", 1)):
+            if getattr(self, name).shape != packed.shape[:axes]:
+                raise ValueError(f"Experience.{name} must be {packed.shape[:axes]} (got {getattr(self, name).shape}).")
         if self.passed.dtype != bool:
             raise ValueError(f"Experience.passed must be bool (got {self.passed.dtype}).")
         for name, values in (("features", packed), ("duration_s", self.duration_s), ("temp_c", self.temp_c)):
@@ -77,7 +76,7 @@ class Experience:
     def of_jobs(
         cls, twin: Twin, plans: Sequence[Plan], repetitions: Sequence[int], *, temp_c: Array, passed: Array
     ) -> "Experience":
-        """The experience of jobs, each a plan repeated so many times, [job]."""
+        """The experience of jobs, each a repeated plan, [job]."""
         duration = [plan.duration_s(times) for plan, times in zip(plans, repetitions, strict=True)]
         return cls(
             twin=twin.version,
@@ -89,13 +88,8 @@ class Experience:
 
     def part(self, rows: Array) -> "Experience":
         """Some of the jobs, by index or mask."""
-        return Experience(
-            twin=self.twin,
-            features=Features(self.features.packed[rows]),
-            duration_s=self.duration_s[rows],
-            temp_c=self.temp_c[rows],
-            passed=self.passed[rows],
-        )
+        arrays = {name: getattr(self, name)[rows] for name in ("duration_s", "temp_c", "passed")}
+        return Experience(twin=self.twin, features=Features(self.features.packed[rows]), **arrays)
 
     @cached_property
     def data_hash(self) -> str:
@@ -128,7 +122,7 @@ def fit_saturation(
     """
     if method not in METHODS:
         raise ValueError(f"No method '{method}'. Allowed: {', '.join(METHODS)}.")
-    check(past)
+    check_outcomes(past.passed)
     x, rising = _design(past, evidence, horizon_s)
     mean, std = x.mean(axis=0), x.std(axis=0)
     std = np.where(std > 1e-9 * np.maximum(np.abs(mean), 1e-9), std, np.inf)  # constant columns get no slope
@@ -170,23 +164,14 @@ def _floats(values: Array) -> tuple[float, ...]:
     return tuple(values.tolist())
 
 
-def check(past: Experience) -> None:
-    """Raise NotEnoughExperience if there are too few jobs, or too few of one outcome."""
-    count, passed = len(past), int(past.passed.sum())
-    if count < LEAST_JOBS:
+def check_outcomes(passed: Array) -> None:
+    """Raise NotEnoughExperience if there are too few past jobs, or too few of one outcome; bool [job]."""
+    count, some = len(passed), int(passed.sum())
+    if count < LEAST_JOBS or min(some, count - some) < LEAST_OF_EACH:
         raise NotEnoughExperience(
-            f"P(saturation) needs {LEAST_JOBS} past jobs, better 200 (got {count}). Let the arm work first, or "
-            "simulate past jobs."
-        )
-    if passed < LEAST_OF_EACH:
-        raise NotEnoughExperience(
-            f"In {passed} of {count} past jobs a motor passed the limit; {LEAST_OF_EACH} are needed. Simulate "
-            "heavier or longer work, or label the jobs by a lower limit."
-        )
-    if count - passed < LEAST_OF_EACH:
-        raise NotEnoughExperience(
-            f"In all but {count - passed} of {count} past jobs a motor passed the limit; {LEAST_OF_EACH} that did not "
-            "are needed. Add lighter or shorter work, or label the jobs by a higher limit."
+            f"P(saturation) needs {LEAST_JOBS} past jobs, better 200, {LEAST_OF_EACH} in which a motor passed the "
+            f"limit and {LEAST_OF_EACH} in which none did (got {count}; passed in {some}). Let the arm work first, "
+            "simulate past jobs, or label the jobs by another limit."
         )
 
 
@@ -209,7 +194,7 @@ def logistic(
 ) -> tuple[Array, float]:
     """Slopes [column] and offset that minimise ½ |slope|² + strength · Σ log loss, slopes of `rising` columns >= 0.
 
-    Without bounds this is scikit-learn's LogisticRegression, which has none to offer.
+    scikit-learn's LogisticRegression has no such bounds; without them the result is the same.
     """
     sign = np.where(passed, 1.0, -1.0)
 
@@ -234,7 +219,7 @@ def nats(score: Array, passed: Array) -> Array:
 def monotone_curve(score: Array, passed: Array) -> tuple[tuple[float, float], ...]:
     """Isotonic regression of the outcome on held-out scores, as knots of a curve.
 
-    Its ends stay 1/(n + 2) from 0 and 1, as n jobs of one outcome justify (Laplace's rule of succession).
+    It keeps a distance of 1/(n + 2) from 0 and 1 (Laplace's rule of succession for n jobs of one outcome).
     """
     fitted = IsotonicRegression(y_min=0.0, y_max=1.0, out_of_bounds="clip").fit(score, passed.astype(float))
     least = 1.0 / (len(score) + 2.0)

@@ -1,14 +1,13 @@
-"""P(saturation): the probability that a motor passes the warning limit during a job started at the temperatures of now.
+"""P(saturation): the probability that a motor passes the warning limit during a job that starts now.
 
 A logistic regression on the twin's features of the job, its duration, and the motor temperatures at its start, fitted
-on the arm's past jobs by `twin.saturation.fit`. Affine in the temperatures, so that the engine can update it each step.
-Saved beside its twin as `saturation.json`.
+on the arm's past jobs by `twin.saturation.fit`. Its score is affine in the temperatures, so that the engine can update
+it each step. Saved beside its twin as `saturation.json`.
 """
 
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -107,13 +106,8 @@ class SaturationModel:
 
     @property
     def version(self) -> str:
-        """Hash of this model."""
-        return self._content_hash
-
-    @cached_property
-    def _content_hash(self) -> str:
-        content = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        return hashlib.sha256(msgspec.json.encode(content)).hexdigest()[:16]
+        """Hash of this model; not cached, because msgspec would write a cached value into the file."""
+        return hashlib.sha256(msgspec.json.encode(self)).hexdigest()[:16]
 
     def risk(self, features: Features, duration_s: Array | float) -> Risk:
         """P as a function of the motor temperatures at the start.
@@ -188,7 +182,7 @@ class CalibratedTwin:
         return f"{self.twin.version}+{self.saturation.version}"
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty:
-        """Difficulty by the twin, with the risk of doing the plan so many times."""
+        """Difficulty by the twin, with the risk of the repeated plan."""
         features = self.twin.features([plan], [repetitions])
         risk = self.saturation.risk(features, np.array([plan.duration_s(repetitions)]))[0]
         return Difficulty(features.difficulty[0], risk=risk)
@@ -204,7 +198,6 @@ class _Card(msgspec.Struct, forbid_unknown_fields=True):
 
 def save_saturation(model: SaturationModel, folder: Path) -> None:
     """Write the model atomically into the folder of its twin, made if need be."""
-    folder.mkdir(parents=True, exist_ok=True)
     write_card(_Card(FORMAT, model.version, model), folder / FILE)
 
 

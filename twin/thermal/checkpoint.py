@@ -1,6 +1,7 @@
 """An identified arm in one file, `rc.json`: readable numbers with their intervals and their origin."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -34,7 +35,7 @@ class _Card(msgspec.Struct, forbid_unknown_fields=True):
     ambient_sd_k: float
     source: CurrentSource
     seconds: float
-    parameters: list[Parameter]
+    parameters: tuple[Parameter, ...]
     rms_k: dict[str, tuple[float, ...]]
     memory_s: tuple[float, ...]
     motors: dict[str, float | list[float]]
@@ -43,18 +44,16 @@ class _Card(msgspec.Struct, forbid_unknown_fields=True):
     saturation: MarginHead | None = None
 
 
-_SHARED = ("arm", "data_hash", "ambient_c", "ambient_sd_k", "source", "seconds", "rms_k", "memory_s")
+_SHARED = ("arm", "data_hash", "ambient_c", "ambient_sd_k", "source", "seconds", "parameters", "rms_k", "memory_s")
 
 
 def save(identified: Identified, folder: Path, *, saturation: MarginHead | None = None) -> None:
     """Write an identified arm, with its P(saturation) if given, atomically into a folder, made if need be."""
-    folder.mkdir(parents=True, exist_ok=True)
-    motors, network = identified.heat_model.motors, identified.heat_model.network
+    network = identified.heat_model.network
     card = _Card(
         format=FORMAT,
         version=identified.version,
-        parameters=list(identified.parameters),
-        motors={name: np.asarray(value).tolist() for name, value in vars(motors).items()},
+        motors={name: np.asarray(value).tolist() for name, value in vars(identified.heat_model.motors).items()},
         capacity_j_per_k={name: node["capacity_j_per_k"] for name, node in network.nodes.items() if node},
         conductance_w_per_k=list(network.edges(data="conductance_w_per_k")),
         saturation=saturation,
@@ -70,29 +69,25 @@ def load(folder: Path) -> Identified:
         CheckpointError: the file is missing, damaged, of another format or for another number of joints, or its
             numbers are not those that were saved.
     """
-    return _identified(_read(folder / CARD), folder / CARD)
+    return _load(folder / CARD)[0]
 
 
 def load_twin(folder: Path) -> RcTwin:
     """The physical twin of what `save` wrote, with P(saturation) if it was saved; raises as `load`."""
-    card = _read(folder / CARD)
-    return RcTwin.of(_identified(card, folder / CARD)).with_head(card.saturation)
+    identified, head = _load(folder / CARD)
+    return replace(RcTwin.of(identified), head=head)
 
 
-def _read(path: Path) -> _Card:
-    return read_card(path, _Card, format_=FORMAT, what="identified arm")
-
-
-def _identified(card: _Card, path: Path) -> Identified:
+def _load(path: Path) -> tuple[Identified, MarginHead | None]:
+    card = read_card(path, _Card, format_=FORMAT, what="identified arm")
     widths = {name: len(value) for name, value in card.motors.items() if isinstance(value, list)}
     if wrong := {name: width for name, width in widths.items() if width != JOINTS}:
-        raise CheckpointError(f"{path}: motors must have {JOINTS} joints, not so: {wrong}.")
+        raise CheckpointError(f"{path}: motors must have {JOINTS} joints (got {wrong}).")
     graph = nx.Graph()
     graph.add_node("ambient")
     for name, value in card.capacity_j_per_k.items():
         graph.add_node(name, capacity_j_per_k=value)
-    for one, other, value in card.conductance_w_per_k:
-        graph.add_edge(one, other, conductance_w_per_k=value)
+    graph.add_weighted_edges_from(card.conductance_w_per_k, weight="conductance_w_per_k")
     values = {name: np.array(value) if isinstance(value, list) else value for name, value in card.motors.items()}
     try:
         thermal_model(graph)
@@ -100,6 +95,6 @@ def _identified(card: _Card, path: Path) -> Identified:
     except (TypeError, ValueError) as error:
         raise CheckpointError(f"{path}: {error}") from error
     shared = {name: getattr(card, name) for name in _SHARED}
-    identified = Identified(heat_model=HeatModel(motors, graph), parameters=tuple(card.parameters), **shared)
+    identified = Identified(heat_model=HeatModel(motors, graph), **shared)
     check_version(path, card.version, identified.version)
-    return identified
+    return identified, card.saturation

@@ -13,9 +13,9 @@ Array = np.ndarray
 
 
 def planned_peaks(twin: RcTwin, log: HeatLog, states_c: Array, ahead_s: float) -> Array:
-    """Peaks from each edge of the log's steps to so long after it, with the load of the log's coming steps.
+    """Peaks within `ahead_s` after each edge of the log's steps, with the load of the log's coming steps.
 
-    A planned motion is known before it happens, so its load is too.
+    The load of a planned motion is known in advance.
 
     Args:
         states_c: Estimated temperatures at each edge, °C, [step + 1, node].
@@ -38,10 +38,10 @@ def planned_peaks(twin: RcTwin, log: HeatLog, states_c: Array, ahead_s: float) -
 
 
 def continued_peaks(twin: RcTwin, log: HeatLog, states_c: Array, ahead_s: float, *, past_s: float) -> Array:
-    """The same if the mean load of the last `past_s` continues, so that nothing of the future need be known.
+    """The same if the mean load of the last `past_s` continues, without knowledge of the future.
 
     Returns:
-        °C, [step + 1, joint]; nan at edges with less past than that.
+        °C, [step + 1, joint]; nan at edges with less past than `past_s`.
     """
     load = _drive(twin, log)
     step_s = float(np.median(log.dt_s))
@@ -68,6 +68,6 @@ def _drive(twin: RcTwin, log: HeatLog) -> Drive:
 
 
 def _trailing_mean(values: Array, steps: int) -> Array:
-    """Mean over the `steps` steps before each edge that has so many, [edge, joint]."""
+    """Mean over the `steps` steps before each edge after them, [edge, joint]."""
     total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
     return (total[steps:] - total[:-steps]) / steps

@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 from fleet.errors import IdentificationError
 from fleet.motor import thermal_data
 from fleet.robot import JOINTS
-from fleet.thermal import HOUSING, WINDING
+from fleet.thermal import HOUSING
 from twin.logs.heat_log import STEP_S, HeatLog, heat_logs, source_of
 from twin.logs.recording import READINGS, Recording
 from twin.thermal.least_squares import Noise, Problem, noise_of
@@ -27,7 +27,7 @@ Array = np.ndarray
 LEAST_S = 300.0
 """Two time constants of a winding: shorter logs add nothing to the prior."""
 LEAST_CHANGE_K = 0.3
-"""Some motor must warm or cool by this much within one log; idle sensors drift by 0.05."""
+"""Least change of some motor's temperature within one log; idle sensors drift by 0.05."""
 LEAST_CURRENT_A = 0.2
 _SIGMA_95 = 1.96
 _MORE_ROUNDS = 2
@@ -90,9 +90,8 @@ def _fit(
     problem = Problem(logs, ambient_c, sd_k, vector, Noise(np.full(JOINTS, _FIRST_SD_K), np.full(JOINTS, steps)))
     x = _solve(problem, vector.mean)
     for _ in range(_MORE_ROUNDS):
-        temp_c = problem.temperatures(x)
-        left = [temp[:, WINDING] - log.temp_c for temp, log in zip(temp_c, logs, strict=True)]
-        problem = Problem(logs, ambient_c, sd_k, vector, noise_of(left, vector.nominal.motors.sensor_noise_k))
+        temp_c, noise = problem.temperatures(x), noise_of(problem.unexplained(x), vector.nominal.motors.sensor_noise_k)
+        problem = Problem(logs, ambient_c, sd_k, vector, noise)
         problem.housing_c = [(temp[1:, HOUSING] + temp[:-1, HOUSING]) / 2.0 for temp in temp_c]
         x = _solve(problem, x)
     return problem, x, problem.jacobian(x)
@@ -111,26 +110,21 @@ def _step(logs: Sequence[HeatLog]) -> float:
 def _parameters(vector: ParameterVector, x: Array, jacobian: Array) -> tuple[Parameter, ...]:
     sd = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
     value, low, high = (np.exp(x + shift * sd) for shift in (0.0, -_SIGMA_95, _SIGMA_95))
+    prior = np.exp(vector.mean)
+    columns = {"value": value, "low": low, "high": high, "prior": prior, "prior_sd": vector.sd, "sd": sd}
     return tuple(
-        Parameter(
-            name=name,
-            joint=None if joint is None else joint + 1,
-            value=float(value[i]),
-            low=float(low[i]),
-            high=float(high[i]),
-            prior=float(np.exp(vector.mean[i])),
-            prior_sd=float(vector.sd[i]),
-            sd=float(sd[i]),
-        )
+        Parameter(name=name, joint=None if joint is None else joint + 1, **{c: float(v[i]) for c, v in columns.items()})
         for i, (name, joint) in enumerate(vector.names)
     )
 
 
 def _rms(logs: Sequence[HeatLog], unexplained: Sequence[Array]) -> dict[str, tuple[float, ...]]:
-    squares: dict[str, list[Array]] = {}
-    for log, left in zip(logs, unexplained, strict=True):
-        squares.setdefault(log.name, []).append(left**2)
-    return {name: tuple(np.sqrt(np.concatenate(s).mean(axis=0)).tolist()) for name, s in squares.items()}
+    residuals: dict[str, list[Array]] = {}
+    for log, residual in zip(logs, unexplained, strict=True):
+        residuals.setdefault(log.name, []).append(residual)
+    return {
+        name: tuple(np.sqrt(np.mean(np.concatenate(parts) ** 2, axis=0)).tolist()) for name, parts in residuals.items()
+    }
 
 
 def _hash(recordings: Sequence[Recording]) -> str:
@@ -145,7 +139,7 @@ def _hash(recordings: Sequence[Recording]) -> str:
 
 def _check_recordings(recordings: Sequence[Recording]) -> None:
     if not recordings:
-        raise IdentificationError("There is no recording to identify an arm from.")
+        raise IdentificationError("Identification needs at least one recording (got none).")
     names = [r.name for r in recordings]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise IdentificationError(f"Names of recordings must differ; given more than once: {', '.join(twice)}.")
@@ -165,8 +159,8 @@ def _check_logs(logs: Sequence[HeatLog], nominal: HeatModel) -> None:
     seconds = sum(log.time_s[-1] - log.time_s[0] for log in logs)
     if seconds < LEAST_S:
         raise IdentificationError(
-            f"The recordings have {seconds:.0f} s without a gap, at least {LEAST_S:.0f} s are needed; half an hour of "
-            "work and cooling tells most."
+            f"The recordings have {seconds:.0f} s without a gap, at least {LEAST_S:.0f} s are needed. Record half an "
+            "hour of work and cooling."
         )
     change_k = max(float(np.ptp(log.temp_c, axis=0).max()) for log in logs)
     if change_k < LEAST_CHANGE_K:
@@ -178,6 +172,6 @@ def _check_logs(logs: Sequence[HeatLog], nominal: HeatModel) -> None:
     squares = [log.current_sq(motors.coulomb_nm, motors.viscous_nms_per_rad).max() for log in logs]
     if np.sqrt(max(squares)) < LEAST_CURRENT_A:
         raise IdentificationError(
-            f"No motor carries more than {np.sqrt(max(squares)):.2f} A, so copper loss cannot be told. Record the arm "
-            "powered: moving, or holding a posture against gravity."
+            f"No motor carries more than {np.sqrt(max(squares)):.2f} A, so copper loss is unknown. Record the "
+            "powered arm while it moves, or holds a posture against gravity."
         )

@@ -1,13 +1,12 @@
 """Housing temperatures, which have no sensor, from an arm's recent log: a Kalman filter on its thermal network."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from fleet.robot import JOINTS
 from fleet.thermal import NODES, WINDING, drive_heat
-from twin.logs.heat_log import STEP_S, CurrentSource, HeatLog, heat_logs
-from twin.logs.recording import Recording
+from twin.logs.heat_log import HeatLog
 from twin.thermal.thermal_twin import RcTwin
 
 Array = np.ndarray
@@ -20,51 +19,14 @@ HEAT_NOISE_W2S = 10.0
 """Intensity of unmodelled heat, W²·s, at every node: half a watt that lasts 20 s, three watts for one."""
 
 
-@dataclass(frozen=True, eq=False)
-class EstimatedTemperatures:
-    """Estimates of all nodes during a log, each from the log's past alone."""
+def filter_log(twin: RcTwin, log: HeatLog) -> Array:
+    """Temperatures of all nodes at the edges of a log's steps, each from the past alone, °C, [step + 1, node].
 
-    time_s: Array
-    """[time]."""
-    temp_c: Array
-    """[time, node]."""
-    sd_k: Array
-    """[time, node]."""
-
-    def at(self, time_s: float) -> Array:
-        """The latest estimate at or before a moment, °C, [node].
-
-        Raises:
-            ValueError: the moment is before the log.
-        """
-        row = int(np.searchsorted(self.time_s, time_s, side="right")) - 1
-        if row < 0:
-            raise ValueError(f"The log begins at {self.time_s[0]:g} s, after {time_s:g} s.")
-        return self.temp_c[row]
-
-
-def estimate_temperatures(
-    twin: RcTwin, recording: Recording, *, source: CurrentSource = "current", step_s: float = STEP_S
-) -> EstimatedTemperatures:
-    """Temperatures of all nodes during a recording, filtered step by step.
-
-    Starts again after each gap, with housings as warm as their windings.
-
-    Raises:
-        ValueError: a recording without temperatures, without currents where they are the source, or too short.
+    Housings start as warm as their windings.
     """
-    parts = [filter_log(twin, log) for log in heat_logs(recording, twin.motors, source, step_s=step_s)]
-    if not parts:
-        raise ValueError(f"Recording '{recording.name}' is too short: estimates need three steps of {step_s:g} s.")
-    names = ("time_s", "temp_c", "sd_k")
-    return EstimatedTemperatures(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
-
-
-def filter_log(twin: RcTwin, log: HeatLog) -> EstimatedTemperatures:
-    """Temperatures of all nodes at the edges of a log's steps."""
     temp = twin.likely_start(log.temp_c[0])
     spread = np.diag(np.append(np.full(JOINTS, SENSOR_SD_K**2), np.full(JOINTS, HOUSING_SD_K**2)))
-    temps, variances = [temp], [np.diag(spread)]
+    temps = [temp]
     lengths, which = np.unique(np.round(log.dt_s, 2), return_inverse=True)
     steps = [twin.thermal.step_matrices(dt) for dt in lengths]
     # A recorded current does not depend on the magnets.
@@ -79,8 +41,7 @@ def filter_log(twin: RcTwin, log: HeatLog) -> EstimatedTemperatures:
         spread = phi @ spread @ phi.T + gamma @ gamma.T * (HEAT_NOISE_W2S / log.dt_s[k])
         temp, spread = _correct(temp, spread, log.temp_c[k + 1])
         temps.append(temp)
-        variances.append(np.diag(spread))
-    return EstimatedTemperatures(log.time_s, np.array(temps), np.sqrt(np.array(variances)))
+    return np.array(temps)
 
 
 def _correct(temp: Array, spread: Array, measured_c: Array) -> tuple[Array, Array]:

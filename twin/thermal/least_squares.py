@@ -23,7 +23,7 @@ HOUSING_SD_K = 10.0
 FITTED = 6
 """Usual number of parameters per joint."""
 _NUDGE = 1e-4
-"""Change of a logarithm in central differences; the rest is of order 1e-8."""
+"""Change of a logarithm in central differences; their error is of order 1e-8."""
 
 
 def heat(log: HeatLog, values: Mapping[str, Array], motors: Motors, winding_c: Array, housing_c: Array) -> Array:
@@ -116,7 +116,7 @@ def noise_of(unexplained: Sequence[Array], floor_k: Array) -> Noise:
 
 @dataclass(frozen=True, eq=False)
 class _Unknowns:
-    """Least squares for the unknowns of one log: matrix · solution ≈ wanted, with their priors in the last rows."""
+    """Least squares for the unknowns of one log: matrix · solution ≈ wanted; the last rows are their priors."""
 
     matrix: Array
     wanted: Array
@@ -127,7 +127,7 @@ class _Unknowns:
 
 
 class Problem:
-    """Weighted residuals and their Jacobian as `scipy.optimize.least_squares` wants them."""
+    """Weighted residuals and their Jacobian for `scipy.optimize.least_squares`."""
 
     def __init__(
         self, logs: Sequence[HeatLog], ambient_c: float, ambient_sd_k: float, vector: ParameterVector, noise: Noise
@@ -176,8 +176,8 @@ class Problem:
     def _temperatures(self, i: int, model: ThermalModel, values: Mapping[str, Array], start: Array) -> Array:
         log = self.logs[i]
         heat_w = heat(log, values, self.vector.nominal.motors, self.winding_c[i], self.housing_c[i])
-        air_c = self.ambient_c + start[NODES:].sum()
-        return linear_temperatures(log.dt_s, model, heat_w, air_c, start[:NODES])
+        ambient_c = self.ambient_c + start[NODES:].sum()
+        return linear_temperatures(log.dt_s, model, heat_w, ambient_c, start[:NODES])
 
     def _unknowns(self, x: Array) -> list[_Unknowns]:
         model, values = self.vector.models(x[None]), self.vector.values(x[None])
@@ -188,14 +188,14 @@ class Problem:
         effect = start_sensitivity(log.time_s - log.time_s[0], model)
         if self.ambient_sd_k > 0:
             no_heat = np.zeros((1, len(log.dt_s), NODES))
-            air = linear_temperatures(log.dt_s, model, no_heat, 1.0, np.zeros(NODES))[0, :, WINDING]
-            effect = np.concatenate([effect, air[..., None]], axis=-1)
+            warmer = linear_temperatures(log.dt_s, model, no_heat, 1.0, np.zeros(NODES))[0, :, WINDING]
+            effect = np.concatenate([effect, warmer[..., None]], axis=-1)
         unknowns = effect.shape[-1]
-        sure = np.append(np.full(JOINTS, HOUSING_SD_K), [self.ambient_sd_k] * (unknowns - NODES))
-        prior = np.eye(unknowns)[HOUSING.start :] / sure[:, None]
+        prior_sd = np.append(np.full(JOINTS, HOUSING_SD_K), [self.ambient_sd_k] * (unknowns - NODES))
+        prior = np.eye(unknowns)[HOUSING.start :] / prior_sd[:, None]
         forced_c = self._temperatures(i, model, values, np.zeros(NODES))[0, :, WINDING]
         missing = (log.temp_c - forced_c) * self.noise.weight
-        likely = np.append(log.temp_c[0], np.zeros(unknowns - NODES)) / sure
+        likely = np.append(log.temp_c[0], np.zeros(unknowns - NODES)) / prior_sd
         matrix = np.concatenate([(effect * self.noise.weight[:, None]).reshape(-1, unknowns), prior])
         wanted = np.concatenate([missing.reshape(-1), likely])
         basis, upper = np.linalg.qr(matrix)

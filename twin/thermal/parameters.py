@@ -1,6 +1,6 @@
 """Identifiable parameters of an arm's thermal network: names, priors, and conversion to a network."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import networkx as nx
@@ -39,6 +39,13 @@ THERMAL = tuple(name for name in PRIOR_SD if name not in ("coulomb_nm", "viscous
 """Free parameters if an arm's friction is known. Fixed friction watts set the absolute scale of all heat, so an error
 in them, or in the speed between slow samples, enters every parameter and no interval shows it."""
 
+_CAPACITIES: Mapping[str, Callable[[int], str]] = {"winding_j_per_k": winding, "housing_j_per_k": housing}
+_RESISTANCES: Mapping[str, Callable[[int], tuple[str, str]]] = {
+    "winding_housing_k_per_w": lambda j: (winding(j), housing(j)),
+    "housing_ambient_k_per_w": lambda j: (housing(j), "ambient"),
+}
+_NEIGHBOURS = [(housing(j - 1), housing(j)) for j in range(1, JOINTS)]
+
 
 @dataclass(frozen=True, eq=False)
 class HeatModel:
@@ -51,35 +58,30 @@ class HeatModel:
         """A parameter of `PRIOR_SD`, [joint]; [1] for the conductance between neighbours."""
         if hasattr(self.motors, name):
             return np.array(getattr(self.motors, name), dtype=float)
-        nodes, edge = self.network.nodes, self._conductance
-        if name == "winding_j_per_k":
-            return np.array([nodes[winding(j)]["capacity_j_per_k"] for j in range(JOINTS)])
-        if name == "housing_j_per_k":
-            return np.array([nodes[housing(j)]["capacity_j_per_k"] for j in range(JOINTS)])
-        if name == "winding_housing_k_per_w":
-            return np.array([1.0 / edge(winding(j), housing(j)) for j in range(JOINTS)])
-        if name == "housing_ambient_k_per_w":
-            return np.array([1.0 / edge(housing(j), "ambient") for j in range(JOINTS)])
-        return np.array([np.mean([edge(housing(j - 1), housing(j)) for j in range(1, JOINTS)])])
-
-    def _conductance(self, one: str, other: str) -> float:
-        return self.network.edges[one, other]["conductance_w_per_k"]
+        network, joints = self.network, range(JOINTS)
+        if name in _CAPACITIES:
+            return np.array([network.nodes[_CAPACITIES[name](j)]["capacity_j_per_k"] for j in joints])
+        if name in _RESISTANCES:
+            return np.array([1.0 / network.edges[_RESISTANCES[name](j)]["conductance_w_per_k"] for j in joints])
+        return np.array([np.mean([network.edges[edge]["conductance_w_per_k"] for edge in _NEIGHBOURS])])
 
     def with_values(self, values: Mapping[str, Array]) -> "HeatModel":
         """The same arm with some parameters of `PRIOR_SD` replaced, each [joint] or [1] as `value` gives them."""
         graph = self.network.copy()
-        motors = replace(self.motors, **{n: np.array(v) for n, v in values.items() if hasattr(self.motors, n)})
-        for j in range(JOINTS):
-            for name, node in (("winding_j_per_k", winding(j)), ("housing_j_per_k", housing(j))):
-                if name in values:
-                    graph.nodes[node]["capacity_j_per_k"] = float(values[name][j])
-            for name, end in (("winding_housing_k_per_w", winding(j)), ("housing_ambient_k_per_w", "ambient")):
-                if name in values:
-                    graph.edges[end, housing(j)]["conductance_w_per_k"] = 1.0 / float(values[name][j])
-            if j and "neighbour_w_per_k" in values:
-                edge = graph.edges[housing(j - 1), housing(j)]
-                edge["conductance_w_per_k"] = float(values["neighbour_w_per_k"][0])
-        return HeatModel(motors, graph)
+        own = {}
+        for name, value in values.items():
+            if hasattr(self.motors, name):
+                own[name] = np.array(value)
+            elif name in _CAPACITIES:
+                for j in range(JOINTS):
+                    graph.nodes[_CAPACITIES[name](j)]["capacity_j_per_k"] = float(value[j])
+            elif name in _RESISTANCES:
+                for j in range(JOINTS):
+                    graph.edges[_RESISTANCES[name](j)]["conductance_w_per_k"] = 1.0 / float(value[j])
+            else:
+                for edge in _NEIGHBOURS:
+                    graph.edges[edge]["conductance_w_per_k"] = float(value[0])
+        return HeatModel(replace(self.motors, **own), graph)
 
     def thermal(self) -> ThermalModel:
         """The network as matrices."""
@@ -90,7 +92,7 @@ class ParameterVector:
     """Free parameters of one arm as a vector of logarithms, with their Gaussian prior around a nominal arm."""
 
     def __init__(self, nominal: HeatModel, free: Sequence[str] = tuple(PRIOR_SD)) -> None:
-        """Raises ValueError for a name that is none of `PRIOR_SD` or given twice, and for a nominal value of zero."""
+        """Raise ValueError for a name that is not in `PRIOR_SD` or given twice, and for a nominal value of zero."""
         if not free or set(free) - set(PRIOR_SD) or len(set(free)) != len(free):
             raise ValueError(f"Free parameters must be some of {', '.join(PRIOR_SD)}, each once (got {tuple(free)}).")
         self.nominal = nominal
@@ -98,7 +100,7 @@ class ParameterVector:
         self._held = {name: nominal.value(name) for name in PRIOR_SD}
         centre = [nominal.value(name) for name in free]
         if none := [name for name, values in zip(free, centre, strict=True) if not np.all(values > 0)]:
-            raise ValueError(f"A free parameter needs a nominal value > 0; not so: {', '.join(none)}.")
+            raise ValueError(f"Free parameters must have nominal values > 0 (got 0 for {', '.join(none)}).")
         self.mean = np.log(np.concatenate(centre))
         """Prior mean of the logarithms, [parameter]."""
         self.sd = np.concatenate([_sd(name, len(values)) for name, values in zip(free, centre, strict=True)])
@@ -144,16 +146,11 @@ class ParameterVector:
         return ThermalModel(capacity, laplacian, np.concatenate([np.zeros_like(to_air), to_air], -1), rates, modes)
 
 
-def _incidence() -> Array:
-    """Ends of the edges winding–housing, housing–ambient and housing–housing, ±1, [edge, node]; ambient is no node."""
-    rows = np.eye(NODES)
-    inner = rows[WINDING] - rows[HOUSING]
-    return np.concatenate([inner, rows[HOUSING], np.diff(rows[HOUSING], axis=0)])
-
-
-_INCIDENCE = _incidence()
+_ROWS = np.eye(NODES)
+_INCIDENCE = np.concatenate([_ROWS[WINDING] - _ROWS[HOUSING], _ROWS[HOUSING], np.diff(_ROWS[HOUSING], axis=0)])
+"""Ends of the edges winding–housing, housing–ambient and housing–housing, ±1, [edge, node]; ambient is no node."""
 
 
 def _sd(name: str, width: int) -> Array:
     large, small = PRIOR_SD[name]
-    return np.array([large] * LARGE + [small] * (JOINTS - LARGE)) if width > 1 else np.array([large])
+    return np.array([large] * LARGE + [small] * (JOINTS - LARGE))[:width]

@@ -70,9 +70,8 @@ class Identified:
         digest = hashlib.sha256(msgspec.json.encode(sources))
         for value in vars(self.heat_model.motors).values():
             digest.update(np.asarray(value, dtype=float).tobytes())
-        for part in sorted(
-            (*sorted(edge), value) for *edge, value in self.heat_model.network.edges(data="conductance_w_per_k")
-        ):
+        edges = self.heat_model.network.edges(data="conductance_w_per_k")
+        for part in sorted((*sorted(ends), value) for *ends, value in edges):
             digest.update(msgspec.json.encode(part))
         digest.update(msgspec.json.encode(sorted(self.heat_model.network.nodes(data="capacity_j_per_k"))))
         return f"rc-{digest.hexdigest()[:13]}"
@@ -83,9 +82,8 @@ class Identified:
         Raises:
             KeyError: it was not free.
         """
-        for parameter in self.parameters:
-            if (parameter.name, parameter.joint) == (name, joint):
-                return parameter
+        if named := [p for p in self.parameters if (p.name, p.joint) == (name, joint)]:
+            return named[0]
         raise KeyError(f"{name} of joint {joint} was not free. Free: {sorted({p.name for p in self.parameters})}.")
 
 

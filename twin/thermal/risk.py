@@ -14,14 +14,14 @@ from fleet.motion import Drive
 from fleet.motor import Motors, copper_loss, magnet_factor
 from fleet.robot import JOINTS
 from fleet.thermal import NODES, WINDING, ThermalModel, node_heat
-from twin.saturation.fit import LEAST_JOBS, LEAST_OF_EACH, NotEnoughExperience, logistic
+from twin.saturation.fit import check_outcomes, logistic
 
 Array = np.ndarray
 
 MOMENTS = (0.0, 0.25, 0.5, 0.75, 1.0)
 """Shares of a job's time at which margins are computed; under a constant drive a peak is at an end or flat."""
 ROOM_K = 10.0
-"""Prediction errors grow with the predicted rise; this much remains without a rise."""
+"""Scale of a margin without a predicted rise; prediction errors grow with the rise."""
 _STRENGTH = 100.0
 """Inverse regularisation of a single slope: hardly any."""
 
@@ -65,15 +65,13 @@ def fit_head(margin: Array, passed: Array) -> MarginHead:
     Raises:
         NotEnoughExperience: too few jobs, or hardly any of one kind.
     """
-    count, some = len(passed), int(np.sum(passed))
-    if count < LEAST_JOBS or min(some, count - some) < LEAST_OF_EACH:
-        raise NotEnoughExperience(
-            f"P(saturation) needs {LEAST_JOBS} past jobs, {LEAST_OF_EACH} of them passing the limit and "
-            f"{LEAST_OF_EACH} not (got {count}, {some} passing). Let the arm work first, or simulate past jobs."
-        )
+    passed = np.asarray(passed, dtype=bool)
+    check_outcomes(passed)
     spread = max(float(margin.std()), 1e-9)
-    slope, offset = logistic(margin[:, None] / spread, np.asarray(passed, dtype=bool), np.array([True]), _STRENGTH)
-    return MarginHead(intercept=float(offset), slope=float(slope[0] / spread), jobs=count, passed=some)
+    slope, offset = logistic(margin[:, None] / spread, passed, np.array([True]), _STRENGTH)
+    return MarginHead(
+        intercept=float(offset), slope=float(slope[0] / spread), jobs=len(passed), passed=int(passed.sum())
+    )
 
 
 def affine_margins(

@@ -1,6 +1,6 @@
 """The physical twin: an arm's thermal network, nominal or identified, which predicts motor temperatures of a plan.
 
-It implements the same protocol as the learned twin and also gives temperatures, which that one cannot.
+It implements the same protocol as the learned twin, and also predicts temperatures.
 """
 
 from collections.abc import Sequence
@@ -49,16 +49,8 @@ class RcTwin:
     @classmethod
     def of(cls, identified: Identified) -> "RcTwin":
         """The twin of an identified arm."""
-        return cls(
-            arm=identified.arm,
-            heat_model=identified.heat_model,
-            ambient_c=identified.ambient_c,
-            base=identified.version,
-        )
-
-    def with_head(self, head: MarginHead | None) -> "RcTwin":
-        """The same twin with this P(saturation)."""
-        return replace(self, head=head)
+        shared = {name: getattr(identified, name) for name in ("arm", "heat_model", "ambient_c")}
+        return cls(base=identified.version, **shared)
 
     @property
     def version(self) -> str:
@@ -84,12 +76,12 @@ class RcTwin:
         """Node temperatures for measured motor temperatures, °C, [..., joint] to [..., node].
 
         Housings have no sensor and are taken as warm as their windings: true after some minutes of rest, cautious right
-        after work. `twin.thermal.kalman.estimate_temperatures` does better from a log.
+        after work. `twin.thermal.kalman.filter_log` estimates them better from a log.
         """
         return np.concatenate([temp_c, temp_c], axis=-1)
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty:
-        """Difficulty of doing the plan so many times; with a head also how the risk depends on the temperatures now.
+        """Difficulty of the repeated plan; with a head also its risk as a function of the temperatures now.
 
         Raises:
             ValueError: repetitions < 1, or a plan without motion or with other joints.
@@ -178,7 +170,7 @@ class RcTwin:
             NotEnoughExperience: too few jobs, or hardly any of one kind.
         """
         margin = np.array([p.margin(t) for p, t in zip(self.pieces(plans, repetitions), temp_c, strict=True)])
-        return self.with_head(fit_head(margin, passed))
+        return replace(self, head=fit_head(margin, passed))
 
     def risk(self, plan: Plan, repetitions: int) -> Risk:
         """P(saturation) of a job for any measured temperatures at its start.

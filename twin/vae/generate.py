@@ -31,27 +31,22 @@ DENSE_HZ = 200.0
 
 
 @dataclass(frozen=True, eq=False)
-class Stretch:
+class PhaseMotion:
     """Generated motion of one phase, RATE_HZ samples per second as in `fleet.motion.Phase`."""
 
     q: Array
     """rad, [time, joint]."""
     qd: Array
-    """rad/s, [time, joint]."""
     qdd: Array
-    """rad/s², [time, joint]."""
     payload_kg: Array
     """[time]."""
-
-    def __len__(self) -> int:
-        return len(self.q)
 
 
 @dataclass(frozen=True, eq=False)
 class Variation:
     """One motion generated from a known one: from rest at its start through its phases back to rest there."""
 
-    stretches: tuple[Stretch, Stretch, Stretch]
+    phases: tuple[PhaseMotion, ...]
     """Approach, cycle (ends where it begins) and retreat."""
     distance_rad: float
     """RMS distance of the joint positions from the source, at equal shares of its time."""
@@ -85,20 +80,18 @@ def vary(twin: Twin, source: Plan, s: float, rng: np.random.Generator) -> Variat
     check_source(source, s)
     if s > 0 and twin.config.kind == "ae":
         raise ValueError("A plain autoencoder has no posterior to draw from: give s = 0, or a twin of kind vae.")
-    known = [resample(phase.profile, RATE_HZ, twin.config.rate_hz) for phase in source.phases]
-    drawn = [_decoded(twin, samples, s, rng) for samples in known]
-    pins = _phase_ends(source, drawn)
-    stretches, slowed = [], []
-    for phase, path, (begin, end) in zip(source.phases, drawn, pins, strict=True):
-        stretch, factor = _time_phase(phase, path, begin, end, twin.config.rate_hz, source.speed)
-        stretches.append(stretch)
+    phases, slowed, errors = [], [], []
+    paths = [_decoded(twin, resample(phase.profile, RATE_HZ, twin.config.rate_hz), s, rng) for phase in source.phases]
+    for phase, path, (begin, end) in zip(source.phases, paths, _phase_ends(source, paths), strict=True):
+        motion, factor = _time_phase(phase, path, begin, end, twin.config.rate_hz, source.speed)
+        phases.append(motion)
         slowed.append(factor)
-    far = np.concatenate([_position_errors(phase, new) for phase, new in zip(source.phases, stretches, strict=True)])
-    approach, cycle, retreat = stretches
+        errors.append(_position_errors(phase, motion))
+    error_rad = np.concatenate(errors)
     return Variation(
-        stretches=(approach, cycle, retreat),
-        distance_rad=float(np.sqrt(np.mean(far**2))),
-        distance_z=float(np.sqrt(np.mean((far / twin.scaler.std[:, Q]) ** 2))),
+        phases=tuple(phases),
+        distance_rad=float(np.sqrt(np.mean(error_rad**2))),
+        distance_z=float(np.sqrt(np.mean((error_rad / twin.scaler.std[:, Q]) ** 2))),
         slowed=max(slowed),
     )
 
@@ -125,24 +118,21 @@ def _correlated_noise(shape: tuple[int, ...], share: float, rng: np.random.Gener
     return eps
 
 
-def _align_turns(q: Array, known: Array) -> Array:
-    """Decoded angles [window, time, joint] shifted by whole turns to near the known ones."""
-    turns = np.round((known.mean(axis=1) - q.mean(axis=1)) / (2 * np.pi))
-    joints = [j for j in range(q.shape[-1]) if j not in CONTINUOUS]
-    turns[:, joints] = 0.0
-    return q + 2 * np.pi * turns[:, None]
+def _align_turns(q: Array, source_q: Array) -> Array:
+    """Decoded angles [window, time, joint] shifted by whole turns to near the source's."""
+    turns = np.round((source_q.mean(axis=1) - q.mean(axis=1)) / (2 * np.pi))
+    return q + 2 * np.pi * np.where(np.isin(np.arange(q.shape[-1]), CONTINUOUS), turns, 0.0)[:, None]
 
 
 def _crossfade(windows: Array, first: Array, length: int) -> Array:
     """Mean of overlapping windows [window, time, joint], weighted most in their middle, [length, joint]."""
     window = windows.shape[1]
-    ramp = np.minimum(np.arange(1, window + 1), np.arange(window, 0, -1)).astype(float)
+    ramp = np.minimum(np.arange(1.0, window + 1), np.arange(window, 0.0, -1))
     index = first[:, None] + np.arange(window)
     inside = index < length
     total, weight = np.zeros((length, windows.shape[-1])), np.zeros(length)
-    ramps = np.broadcast_to(ramp, index.shape)
     np.add.at(total, index[inside], (windows * ramp[:, None])[inside])
-    np.add.at(weight, index[inside], ramps[inside])
+    np.add.at(weight, index[inside], np.broadcast_to(ramp, index.shape)[inside])
     return total / weight[:, None]
 
 
@@ -156,8 +146,8 @@ def _phase_ends(source: Plan, paths: Sequence[Array]) -> list[tuple[Array, Array
 
 def _time_phase(
     phase: Phase, path: Array, begin: Array, end: Array, rate_hz: float, speed: float
-) -> tuple[Stretch, float]:
-    """A phase of motion along a decoded path, and by how much its slowest piece is slower than the source."""
+) -> tuple[PhaseMotion, float]:
+    """Motion along a decoded path with a rest at each change of payload, and its largest slowdown factor."""
     borders_s = np.array([0.0, *(np.flatnonzero(np.diff(phase.payload_kg)) + 1), len(phase.profile)]) / RATE_HZ
     moments = (np.arange(len(path)) + 0.5) / rate_hz
     joints = phase.profile.shape[-1]
@@ -167,7 +157,7 @@ def _time_phase(
         if to_s == from_s:
             continue
         last = to_s == borders_s[-1]
-        there = end if last else np.array([np.interp(to_s, moments, path[:, j]) for j in range(joints)])
+        there = end if last else np.array([np.interp(to_s, moments, q) for q in path.T])
         own = (moments >= from_s) & (moments <= to_s)
         spline = rest_to_rest(moments[own] - from_s, path[own], here, there, to_s - from_s)
         motion, factor = time_spline(spline, to_s - from_s, speed)
@@ -175,7 +165,7 @@ def _time_phase(
         loads.append(np.full(motion.shape[1], phase.payload_kg[round(from_s * RATE_HZ)]))
         slowed, here = max(slowed, factor), there
     q, qd, qdd = np.concatenate(pieces, axis=1)
-    return Stretch(q, qd, qdd, np.concatenate([np.zeros(0), *loads])), slowed
+    return PhaseMotion(q, qd, qdd, np.concatenate([np.zeros(0), *loads])), slowed
 
 
 def rest_to_rest(moments_s: Array, path: Array, begin: Array, end: Array, duration_s: float) -> BSpline:
@@ -228,10 +218,10 @@ def time_spline(spline: BSpline, duration_s: float, speed: float) -> tuple[Array
     return motion, factor
 
 
-def _position_errors(phase: Phase, new: Stretch) -> Array:
+def _position_errors(phase: Phase, motion: PhaseMotion) -> Array:
     """Generated minus source positions at equal shares of the phase's time, [time, joint]."""
-    known = resample(phase.profile, RATE_HZ, RATE_HZ)[:, Q]
-    if len(known) == 0:
-        return known
-    at = np.linspace(0.0, len(new) - 1.0, len(known))
-    return np.stack([np.interp(at, np.arange(len(new)), new.q[:, j]) for j in range(new.q.shape[1])], axis=-1) - known
+    source_q = resample(phase.profile, RATE_HZ, RATE_HZ)[:, Q]
+    if len(source_q) == 0:
+        return source_q
+    at, samples = np.linspace(0.0, len(motion.q) - 1.0, len(source_q)), np.arange(len(motion.q))
+    return np.stack([np.interp(at, samples, q) for q in motion.q.T], axis=-1) - source_q

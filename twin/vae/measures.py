@@ -5,7 +5,7 @@ numbers cannot encode a window exactly. The calibrated measures start from the m
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -104,14 +104,14 @@ class Calibration:
         beyond = np.maximum(features.errors.sum(axis=-1) - self.floor, 0.0) / self.spread
         return _saturated(np.log(2) * beyond)
 
-    def p_value(self, features: Features, score: str) -> Array:
-        """Share of cool jobs that score as high, [...]; see `twin.conformal.p_value`.
+    def p_value(self, features: Features) -> Array:
+        """Share of cool jobs whose score `load` is as high, [...]; see `twin.conformal.p_value`.
 
         Valid for cool jobs exchangeable with the reference (one-class: Bates et al., Annals of Statistics 51, 2023),
         not for light motion of a new kind.
         """
-        scores = score_of(features, score, self)
-        return p_value(np.sort(score_of(self.reference, score, self)), scores - TIE * np.abs(scores))
+        scores = score_of(features, "load")
+        return p_value(np.sort(score_of(self.reference, "load")), scores - TIE * np.abs(scores))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -143,15 +143,8 @@ class Measures:
         """The measures of one of many jobs."""
         if self.difficulty.ndim < 2:
             raise ValueError("These are the measures of one job.")
-        return Measures(
-            difficulty=self.difficulty[i],
-            calibrated=None if self.calibrated is None else self.calibrated[i],
-            load=self.load[i],
-            shares=self.shares[i],
-            heavier=self.heavier[i],
-            p_value=None if self.p_value is None else self.p_value[i],
-            version=self.version,
-        )
+        changes: dict[str, Array] = {name: v[i] for name, v in vars(self).items() if isinstance(v, np.ndarray)}
+        return replace(self, **changes)
 
     def why(self, most: int = 2) -> str:
         """The largest causes as text, `joint 2: more load (61 %), joint 4: a new place (20 %)`."""
@@ -168,8 +161,8 @@ class Measures:
         return ("a new place", "a new speed")[channel]
 
 
-def measures_of(features: Features, calibration: Calibration | None, *, score: str, version: str) -> Measures:
-    """Measures of features with any leading axes; the p-value ranks jobs by `score`."""
+def measures_of(features: Features, calibration: Calibration | None, *, version: str) -> Measures:
+    """Measures of features with any leading axes."""
     beyond = features.errors
     if calibration is not None:
         beyond = np.maximum(beyond - calibration.usual, 0.0)
@@ -180,41 +173,32 @@ def measures_of(features: Features, calibration: Calibration | None, *, score: s
         load=features.load,
         shares=np.divide(beyond, whole, out=np.zeros_like(beyond), where=whole > 0),
         heavier=features.one_sided > 0.5 * features.errors[..., TAU],
-        p_value=None if calibration is None else calibration.p_value(features, score),
+        p_value=None if calibration is None else calibration.p_value(features),
         version=version,
     )
 
 
-def score_of(features: Features, score: str, calibration: Calibration | None = None) -> Array:
+def score_of(features: Features, score: str) -> Array:
     """One number per job, [...]: any of `SCORES`, or `joint_k` for d of joint k, counted from one.
 
     Raises:
-        ValueError: another name, or `calibrated_…` without a calibration.
+        ValueError: another name.
     """
     if score in SCORES:
         return SCORES[score](features)
-    if score in _CALIBRATED:
-        if calibration is None:
-            raise ValueError(f"The score '{score}' needs a twin with a calibration: Twin.with_calibration.")
-        return _CALIBRATED[score](calibration.difficulty(features))
     joints = {f"joint_{k + 1}": k for k in range(features.packed.shape[-2])}
-    if score in joints:
-        return features.difficulty[..., joints[score]]
-    raise ValueError(f"No score '{score}'{nearest(score, [*SCORES, *_CALIBRATED, *joints])}")
+    if score not in joints:
+        raise ValueError(f"No score '{score}'{nearest(score, [*SCORES, *joints])}")
+    return features.difficulty[..., joints[score]]
 
 
 SCORES: Mapping[str, Callable[[Features], Array]] = {
     "sum": lambda features: features.difficulty.sum(axis=-1),
-    "max": lambda features: features.difficulty.max(axis=-1),
     "load": lambda features: features.load.sum(axis=-1),
     "load_max": lambda features: features.load.max(axis=-1),
     "excess": lambda features: features.excess_sq.sum(axis=-1),
 }
-"""Sum and maximum over joints of the paper's d, and of the one-sided torque difficulty; sum of the excess tau²."""
-_CALIBRATED: Mapping[str, Callable[[Array], Array]] = {
-    "calibrated_sum": lambda difficulty: difficulty.sum(axis=-1),
-    "calibrated_max": lambda difficulty: difficulty.max(axis=-1),
-}
+"""The paper's d; sum and maximum over joints of the one-sided torque difficulty; sum of the excess tau²."""
 
 
 def _saturated(error: Array) -> Array:

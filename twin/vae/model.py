@@ -14,7 +14,9 @@ from torch import Tensor, nn
 from fleet.motion import CHANNELS, RATE_HZ
 
 Scope = Literal["joint", "arm"]
-"""One network per joint with 3 channels, or one for the arm with 3 channels per joint."""
+"""One network per joint with 3 channels, or one for the arm with 3 channels per joint.
+
+The second also learns which postures and loads go together, and trains faster."""
 Kind = Literal["vae", "ae"]
 """Variational, or a plain autoencoder without KL, latent noise and posterior."""
 
@@ -91,11 +93,6 @@ class TwinConfig:
     def quick(cls) -> "TwinConfig":
         """About a quarter of the default's training steps."""
         return cls(max_windows=768, epochs=60, restarts=1)
-
-    @classmethod
-    def whole_arm(cls) -> "TwinConfig":
-        """One network for all joints: it also learns which postures and loads go together, and trains faster."""
-        return cls(scope="arm", hidden=64, latent=8)
 
     def networks(self, joints: int) -> int:
         """Number of networks of an arm."""

@@ -21,6 +21,7 @@ from twin.vae.window import Q
 
 MODEL = "twin.onnx"
 OPSET = 17
+OUTPUTS = ["reconstruction", "errors", "mu"]
 
 
 class ExportError(FleetError):
@@ -49,15 +50,15 @@ def export_onnx(twin: Twin, path: Path) -> Path:
     with atomic_path(file) as draft:
         with warnings.catch_warnings(), torch.inference_mode(False), torch.no_grad():
             # The dynamo exporter needs onnxscript. The warning about LSTMs with a varying batch does not apply: ours
-            # start from zeros of the batch's own size. tests/twin/test_export.py runs other sizes.
+            # start from zeros of the batch's own size. tests/twin/test_onnx.py runs other sizes.
             warnings.simplefilter("ignore")
             torch.onnx.export(
                 _OnnxTwin(twin),
                 (example,),
                 str(draft),
                 input_names=["windows"],
-                output_names=["reconstruction", "errors", "mu"],
-                dynamic_axes={name: {0: "batch"} for name in ("windows", "reconstruction", "errors", "mu")},
+                output_names=OUTPUTS,
+                dynamic_axes={name: {0: "batch"} for name in ("windows", *OUTPUTS)},
                 opset_version=OPSET,
                 dynamo=False,
             )
@@ -85,7 +86,8 @@ class _OnnxTwin(nn.Module):
         turns[[j for j in CONTINUOUS if j < twin.joints], Q] = 2 * np.pi
         home = np.zeros_like(turns)
         home[:, Q] = twin.scaler.turn_q
-        for name, value in (("turn", turns), ("home", home), ("mean", twin.scaler.mean), ("std", twin.scaler.std)):
+        constants = {"turn": turns, "home": home, "mean": twin.scaler.mean, "std": twin.scaler.std}
+        for name, value in constants.items():
             self.register_buffer(name, torch.from_numpy(np.array(value, dtype=float)))
 
     def forward(self, windows: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -9,6 +9,7 @@ gave the same winner over five trainings of joint 2.
 import hashlib
 import math
 from collections.abc import Callable, Sequence
+from itertools import count
 
 import msgspec
 import numpy as np
@@ -25,38 +26,15 @@ from twin.vae.window import Scaler, draw_windows, windows_of
 Array = np.ndarray
 
 RECIPE = 2
-"""Increase it whenever the same records, configuration and seed give other weights."""
+"""Increase it when the same records, configuration and seed give other weights."""
 
 
 class CollapsedPosterior(FleetError):
-    """The decoder of a network ignores the latent and decodes every window alike.
-
-    Attributes:
-        net: Name of the network, `joint_2` or `arm`.
-    """
-
-    def __init__(self, arm: str, net: str, kl_nats: float, active: int) -> None:
-        super().__init__(
-            f"The twin of '{arm}' learned nothing of {_label(net)}: KL {kl_nats:.2f} nat, {active} active latent "
-            "unit(s). Lower beta, train longer (epochs, max_windows), or set allow_collapse to keep it as a baseline."
-        )
-        self.arm, self.net, self.kl_nats, self.active = arm, net, kl_nats, active
-
-    def __reduce__(self) -> tuple[type, tuple[str, str, float, int]]:
-        return type(self), (self.arm, self.net, self.kl_nats, self.active)
+    """The decoder of a network ignores the latent and decodes every window alike."""
 
 
 class Diverged(FleetError):
     """No training of a network ended with finite weights."""
-
-    def __init__(self, arm: str, net: str) -> None:
-        super().__init__(
-            f"The training of {_label(net)} of '{arm}' ended without finite weights. Lower learning_rate or clip."
-        )
-        self.arm, self.net = arm, net
-
-    def __reduce__(self) -> tuple[type, tuple[str, str]]:
-        return type(self), (self.arm, self.net)
 
 
 def hash_records(records: Sequence[Array]) -> str:
@@ -86,7 +64,7 @@ def train(
     *,
     arm: str,
     data_hash: str | None = None,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> Twin:
     """A twin trained on motion of an arm that stayed cool for the whole horizon.
 
@@ -94,8 +72,8 @@ def train(
     processes of their own.
 
     Args:
-        records: Profiles [time, 3, joint] at `config.record_hz`. Those of a plan's phases, one by one, are cut and
-            padded as they will be when scored. Light, cool work makes the sharpest twin: what was trained on is known.
+        records: Profiles [time, 3, joint] at `config.record_hz`. The phases of a plan, given one by one, are cut and
+            padded as they will be when scored.
         data_hash: Name of the data in the checkpoint; by default the hash of the records.
         progress: Called with the share done, 0 to 1, after every epoch.
 
@@ -112,38 +90,51 @@ def train(
     still = [bool(part.all()) for part in np.split(scaler.still, len(names))]
     nets, fits = [], []
     z = torch.from_numpy(scaler.to_z(windows)).flatten(2)
+    epochs = len(names) * (config.epochs + (config.restarts - 1) * _trial_epochs(config))
+    done = count(1)
+
+    def report() -> None:
+        progress(min(next(done) / epochs, 1.0))  # a diverged restart costs more epochs
+
     with one_thread():
         for n, (name, x) in enumerate(zip(names, z.chunk(len(names), dim=2), strict=True)):
-            report = None if progress is None else _part_of(progress, n, len(names))
             seeds = [_child(seed, n, restart) for restart in range(config.restarts)]
             best = _best_of(x.contiguous(), torch.from_numpy(noise[n]), config, seeds, report)
+            label = "the whole arm" if name == "arm" else name.replace("_", " ")
             if best is None:
-                raise Diverged(arm, name)
+                raise Diverged(
+                    f"The training of {label} of '{arm}' ended without finite weights. Lower learning_rate or clip."
+                )
             fit, net = best
             kl_nats = fit.kl if config.kind == "vae" else None
             if collapsed(kl_nats, fit.active_units) and not (config.allow_collapse or still[n]):
-                raise CollapsedPosterior(arm, name, fit.kl, fit.active_units)
+                raise CollapsedPosterior(
+                    f"The twin of '{arm}' learned nothing of {label}: KL {fit.kl:.2f} nat, {fit.active_units} active "
+                    "latent unit(s). Lower beta, train longer (epochs, max_windows), or set allow_collapse to keep it "
+                    "as a baseline."
+                )
             nets.append(net)
             fits.append(fit)
     data = hash_records(records) if data_hash is None else data_hash
-    return Twin(config, scaler, nets, arm=arm, data_hash=data, seed=seed_text(seed), fits=fits)
+    return Twin(config, scaler, nets, arm=arm, data_hash=data, seed=seed_text(seed), fits=tuple(fits))
+
+
+def _trial_epochs(config: TwinConfig) -> int:
+    return max(1, round(config.trial * config.epochs)) if config.restarts > 1 else 0
 
 
 def _best_of(
-    x: Tensor, noise: Tensor, config: TwinConfig, seeds: Sequence[int], progress: Callable[[float], None] | None
+    x: Tensor, noise: Tensor, config: TwinConfig, seeds: Sequence[int], report: Callable[[], None]
 ) -> tuple[Fit, LstmVae] | None:
     """The best restart after the trial, trained to the end; the next one if it diverges, None if all do."""
     runs = [Run(x, noise, config, seed) for seed in seeds]
-    trial = max(1, round(config.trial * config.epochs)) if len(runs) > 1 else 0
-    total = trial * len(runs) + config.epochs - trial
-    for n, run in enumerate(runs):
-        run.train(trial, None if progress is None else _part_of(progress, n * trial, total))
+    trial = _trial_epochs(config)
+    for run in runs:
+        run.train(trial, report)
     elbos = [_elbo(run, seed) for run, seed in zip(runs, seeds, strict=True)]
     finite = tuple(elbo if math.isfinite(elbo) else None for elbo in elbos) if trial else ()
-    order = sorted(range(len(runs)), key=lambda n: -elbos[n] if math.isfinite(elbos[n]) else math.inf)
-    for place, n in enumerate(order):
-        last = progress if place == 0 else None
-        runs[n].train(config.epochs, None if last is None else _part_of(last, trial * (len(runs) - 1), total))
+    for n in sorted(range(len(runs)), key=lambda n: -elbos[n] if math.isfinite(elbos[n]) else math.inf):
+        runs[n].train(config.epochs, report)
         if math.isfinite(_elbo(runs[n], seeds[n])):
             return _assess(runs[n], seeds[n], n, finite), runs[n].net
     return None
@@ -164,13 +155,11 @@ class Run:
         self.kl_by_epoch: list[float] = []
         self._draw = torch.Generator().manual_seed(seed)
         self._optimizer = torch.optim.Adam(self.net.parameters(), lr=config.learning_rate, fused=True)
-        steps = config.epochs * -(-len(x) // config.batch)
-        self._schedule = torch.optim.lr_scheduler.OneCycleLR(
-            self._optimizer, config.learning_rate, total_steps=max(steps, 2)
-        )
+        steps = max(config.epochs * -(-len(x) // config.batch), 2)
+        self._schedule = torch.optim.lr_scheduler.OneCycleLR(self._optimizer, config.learning_rate, total_steps=steps)
 
-    def train(self, until: int, progress: Callable[[float], None] | None = None) -> None:
-        """Train until this number of epochs; `progress` is called with the number done after each."""
+    def train(self, until: int, report: Callable[[], None] = lambda: None) -> None:
+        """Train until this number of epochs; `report` is called after each."""
         while len(self.elbo_by_epoch) < until:
             sums = torch.zeros(2)
             for index in torch.randperm(len(self.x), generator=self._draw).split(self.config.batch):
@@ -178,8 +167,7 @@ class Run:
             elbo, nats = (sums / len(self.x)).tolist()
             self.elbo_by_epoch.append(elbo)
             self.kl_by_epoch.append(nats)
-            if progress is not None:
-                progress(len(self.elbo_by_epoch))
+            report()
 
     def _step(self, batch: Tensor) -> Tensor:
         """One step of the optimiser; ELBO and KL of the batch, nats per window."""
@@ -226,11 +214,3 @@ def _assess(run: Run, seed: int, restart: int, restart_elbos: tuple[float | None
 def _child(seed: np.random.SeedSequence, joint: int, restart: int) -> int:
     """A seed for torch."""
     return int(child(seed, joint, restart).generate_state(1, np.uint64)[0] >> np.uint64(1))
-
-
-def _part_of(progress: Callable[[float], None], done: int, runs: int) -> Callable[[float], None]:
-    return lambda share: progress((done + share) / runs)
-
-
-def _label(net: str) -> str:
-    return "the whole arm" if net == "arm" else net.replace("_", " ")

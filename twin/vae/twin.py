@@ -1,8 +1,8 @@
-"""The twin of one arm: how far motion is from the motion that the arm was trained on, joint by joint."""
+"""The twin of one arm: the distance of motion from the arm's training motion, joint by joint."""
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
 from weakref import WeakKeyDictionary
 
@@ -32,7 +32,7 @@ class Fit:
     kl: float
     """Nats per window; 0 for an autoencoder, which has none."""
     active_units: int
-    """Latent units that tell windows apart."""
+    """Latent units that vary between windows."""
     mean_squared_error: float
     """In z-scores, decoded from the posterior mean."""
     restart: int
@@ -45,66 +45,53 @@ class Fit:
     """The same of the KL, 0 for an autoencoder."""
 
 
+class _PlanCache(WeakKeyDictionary[Plan, Array]):
+    """Features by plan; empty in a copy and in another process."""
+
+    def __reduce__(self) -> tuple[type, tuple[()]]:
+        return _PlanCache, ()
+
+
+@dataclass(frozen=True, eq=False)
 class Twin:
-    """A trained twin; implements `fleet.difficulty.DifficultyModel`. Scores are kept while their plan is alive.
+    """A trained twin; implements `fleet.difficulty.DifficultyModel`. Scores are cached while their plan is alive."""
 
-    Args:
-        nets: One network per joint, or one for the arm.
-        arm: Name of the arm.
-        data_hash: Hash of the training data.
-        seed: Training seed, as text.
-        fits: Quality of each network.
-        calibration: Features of held-out cool jobs; None until `with_calibration`.
-    """
+    config: TwinConfig
+    scaler: Scaler
+    nets: Sequence[LstmVae]
+    """The networks, one per joint or one for the arm."""
+    _: KW_ONLY
+    arm: str
+    data_hash: str
+    """Hash of the training data."""
+    seed: str
+    """Training seed."""
+    fits: Sequence[Fit]
+    """Quality of each network."""
+    calibration: Calibration | None = None
+    """Features of held-out cool jobs; None until `with_calibration`."""
+    _scored: _PlanCache = field(default_factory=_PlanCache, init=False, repr=False)
 
-    def __init__(
-        self,
-        config: TwinConfig,
-        scaler: Scaler,
-        nets: Sequence[LstmVae],
-        *,
-        arm: str,
-        data_hash: str,
-        seed: str,
-        fits: Sequence[Fit],
-        calibration: Calibration | None = None,
-    ) -> None:
-        wanted = config.networks(scaler.joints)
-        if not len(nets) == len(fits) == wanted:
+    def __post_init__(self) -> None:
+        wanted = self.config.networks(self.joints)
+        if not len(self.nets) == len(self.fits) == wanted:
             raise ValueError(
-                f"A twin of scope '{config.scope}' for {scaler.joints} joints needs {wanted} network(s) and fits "
-                f"(got {len(nets)} and {len(fits)})."
+                f"A twin of scope '{self.config.scope}' for {self.joints} joints needs {wanted} network(s) and fits "
+                f"(got {len(self.nets)} and {len(self.fits)})."
             )
-        if calibration is not None and calibration.reference.packed.shape[1] != scaler.joints:
-            raise ValueError(
-                f"The calibration is for {calibration.reference.packed.shape[1]} joints, the twin has {scaler.joints}."
-            )
-        self.config = config
-        self.scaler = scaler
-        self.arm = arm
-        self.data_hash = data_hash
-        self.seed = seed
-        self.fits = tuple(fits)
-        self.calibration = calibration
-        self.networks = inference.Networks(nets)
-        self._scored: WeakKeyDictionary[Plan, Array] = WeakKeyDictionary()
-
-    def __getstate__(self) -> dict[str, object]:
-        return {name: value for name, value in self.__dict__.items() if name != "_scored"}
-
-    def __setstate__(self, state: dict[str, object]) -> None:
-        self.__dict__.update(state)
-        self._scored = WeakKeyDictionary()
+        if self.calibration is not None and self.calibration.reference.packed.shape[1] != self.joints:
+            joints = self.calibration.reference.packed.shape[1]
+            raise ValueError(f"The calibration is for {joints} joints, the twin has {self.joints}.")
 
     @property
     def joints(self) -> int:
         """Number of joints."""
         return self.scaler.joints
 
-    @property
-    def nets(self) -> tuple[LstmVae, ...]:
-        """The networks, one per joint or one for the arm."""
-        return self.networks.nets
+    @cached_property
+    def networks(self) -> inference.Networks:
+        """The networks as one module."""
+        return inference.Networks(self.nets)
 
     @property
     def version(self) -> str:
@@ -115,8 +102,8 @@ class Twin:
     def _content_hash(self) -> str:
         digest = hashlib.sha256()
         digest.update(msgspec.json.encode([self.config, self.arm, self.data_hash, self.seed, self.fits]))
-        for name in ("turn_q", "mean", "std", "still"):
-            digest.update(np.ascontiguousarray(getattr(self.scaler, name)).tobytes())
+        for values in vars(self.scaler).values():
+            digest.update(np.ascontiguousarray(values).tobytes())
         for name, tensor in sorted(self.tensors().items()):
             digest.update(f"{name}{tuple(tensor.shape)}".encode())
             digest.update(tensor.numpy().tobytes())
@@ -134,24 +121,24 @@ class Twin:
         }
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty:
-        """Difficulty of doing the plan so many times: d_k = 1 − exp(−e_k), e_k the mean error over the job's time.
+        """Difficulty of the repeated plan: d_k = 1 − exp(−e_k), e_k the mean error over the job's time.
 
         Raises:
             ValueError: repetitions < 1, an empty plan, or a plan that is not finite or has other joints.
         """
         return Difficulty(self.features([plan], [repetitions]).difficulty[0])
 
-    def measure(self, plan: Plan, repetitions: int, *, score: str = "load") -> Measures:
-        """All measures of one job; `score` is what the p-value ranks jobs by (`measures.score_of`)."""
-        return self.measures([plan], [repetitions], score=score).of_job(0)
+    def measure(self, plan: Plan, repetitions: int) -> Measures:
+        """All measures of one job."""
+        return self.measures([plan], [repetitions]).of_job(0)
 
-    def measures(self, plans: Sequence[Plan], repetitions: Sequence[int], *, score: str = "load") -> Measures:
+    def measures(self, plans: Sequence[Plan], repetitions: Sequence[int]) -> Measures:
         """All measures of many jobs, arrays with a leading axis [job]."""
-        return self.measures_of(self.features(plans, repetitions), score=score)
+        return self.measures_of(self.features(plans, repetitions))
 
-    def measures_of(self, features: Features, *, score: str = "load") -> Measures:
+    def measures_of(self, features: Features) -> Measures:
         """All measures of this twin's features, of jobs or of windows."""
-        return measures_of(features, self.calibration, score=score, version=self.version)
+        return measures_of(features, self.calibration, version=self.version)
 
     def with_calibration(self, jobs: Sequence[tuple[Plan, int]]) -> "Twin":
         """The same twin, calibrated on held-out cool jobs (plan, repetitions).
@@ -159,20 +146,8 @@ class Twin:
         Raises:
             ValueError: fewer than two jobs.
         """
-        return self.with_reference(self.features([plan for plan, _ in jobs], [times for _, times in jobs]))
-
-    def with_reference(self, reference: Features) -> "Twin":
-        """The same twin, calibrated on the features [job, joint, part] of held-out cool jobs."""
-        return Twin(
-            self.config,
-            self.scaler,
-            self.nets,
-            arm=self.arm,
-            data_hash=self.data_hash,
-            seed=self.seed,
-            fits=self.fits,
-            calibration=Calibration(reference),
-        )
+        reference = self.features([plan for plan, _ in jobs], [times for _, times in jobs])
+        return replace(self, calibration=Calibration(reference))
 
     def features(self, plans: Sequence[Plan], repetitions: Sequence[int]) -> Features:
         """Time means over whole jobs, [job, joint]; new plans go through the networks together.
@@ -201,10 +176,6 @@ class Twin:
         """Mean and standard deviation of the latent of windows in SI units, each [batch, net, latent]."""
         return inference.posterior(self.networks, self._to_z(windows))
 
-    def latent(self, windows: Array) -> Array:
-        """Posterior means of windows [batch, time, joint, channel] in SI units, [batch, net, latent]."""
-        return self.posterior(windows)[0]
-
     def decode(self, latent: Array) -> Array:
         """Decoded latents [batch, net, latent], SI units, [batch, time, joint, channel]."""
         wanted = (len(self.nets), self.config.latent)
@@ -225,7 +196,7 @@ class Twin:
         return self.scaler.to_z(windows)
 
     def _score_phases(self, plans: Sequence[Plan]) -> None:
-        """Keep the features of each phase, [phase, joint, part], while the plan lives; zeros for an empty phase."""
+        """Cache the features of each phase, [phase, joint, part]; zeros for an empty phase."""
         for plan in plans:
             for name, phase in zip(PHASES, plan.phases, strict=True):
                 if phase.profile.shape[-1] != self.joints:

@@ -94,14 +94,14 @@ def windows_of(records: Sequence[Array], config: TwinConfig) -> Array:
 
 
 def draw_windows(windows: Array, most: int, seed: np.random.SeedSequence) -> Array:
-    """At most so many of the windows, drawn without replacement and in their order."""
+    """At most `most` of the windows, drawn without replacement and in their order."""
     if len(windows) <= most:
         return windows
     return windows[np.sort(np.random.default_rng(seed).choice(len(windows), most, replace=False))]
 
 
 def check_profile(profile: Array, name: str) -> Array:
-    """The profile itself, if it is finite [time, 3, joint]; `name` is what the error calls it."""
+    """The profile itself if it is finite and [time, 3, joint]; `name` is its name in the error."""
     if profile.ndim != 3 or profile.shape[1] != len(CHANNELS):
         raise ValueError(f"{name} must be [time, 3, joint] (got shape {profile.shape}).")
     if not np.isfinite(profile).all():
@@ -124,12 +124,8 @@ class JobWindows:
     """Number of jobs."""
 
     def mean(self, values: Array) -> Array:
-        """Time mean over each job of values per sample, [batch, time, ...] to [job, ...]."""
+        """Time mean over each job of values per sample, [batch, time, ...] or [batch, 1, ...] to [job, ...]."""
         return self.total(np.einsum("bt,bt...->b...", self.weight, values))
-
-    def mean_of_windows(self, values: Array) -> Array:
-        """Time mean over each job of values per window, [batch, ...] to [job, ...]."""
-        return self.total(np.einsum("b,b...->b...", self.weight.sum(axis=1), values))
 
     def total(self, values: Array) -> Array:
         """Sum over the windows of each job, [batch, ...] to [job, ...]."""
@@ -156,7 +152,7 @@ def cut_phases(plans: Sequence[Plan], config: TwinConfig) -> JobWindows:
 
 
 def cut_jobs(plans: Sequence[Plan], repetitions: Sequence[int], config: TwinConfig) -> JobWindows:
-    """Windows of jobs, each a plan repeated so many times, cut as a twin of this configuration cuts them.
+    """Windows of jobs, each a repeated plan, as a twin of this configuration cuts them.
 
     Raises:
         ValueError: as `check_jobs`, or a profile that is not finite.
@@ -169,7 +165,7 @@ def cut_jobs(plans: Sequence[Plan], repetitions: Sequence[int], config: TwinConf
 
 
 def check_jobs(plans: Sequence[Plan], repetitions: Sequence[int], *, least: int = 1) -> None:
-    """Refuse jobs over which no time mean can be taken.
+    """Refuse jobs that have no time mean.
 
     Raises:
         ValueError: fewer than `least` jobs, unequal numbers of plans and repetitions, repetitions < 1, or a plan

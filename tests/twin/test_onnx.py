@@ -23,8 +23,8 @@ def session(path):
 def assert_parity(twin, path, x):
     reconstruction, errors, mu = session(path).run(None, {"windows": x})
     np.testing.assert_allclose((reconstruction - twin.reconstruct(x)) / twin.scaler.std, 0, atol=1e-5)
-    np.testing.assert_allclose(errors, twin.window_errors(x), atol=1e-5)
-    np.testing.assert_allclose(mu, twin.latent(x), atol=1e-5)
+    np.testing.assert_allclose(errors, twin.window_features(x).errors, atol=1e-5)
+    np.testing.assert_allclose(mu, twin.posterior(x)[0], atol=1e-5)
 
 
 @pytest.fixture(scope="module")

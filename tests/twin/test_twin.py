@@ -7,7 +7,7 @@ import pytest
 
 from fleet.difficulty import DifficultyModel
 from fleet.motion import Phase
-from twin.vae.measures import Features
+from twin.vae.measures import Calibration, Features
 from twin.vae.twin import Twin
 from twin.vae.window import cut, resample
 
@@ -139,7 +139,7 @@ def test_a_plan_of_another_arm_is_refused(twin, plan):
 
 def test_known_motion_fills_the_latent_like_the_prior(twin, records):
     windows = np.concatenate([cut(resample(record, 50.0, 12.5), 50, 50) for record in records])
-    z = twin.latent(windows)
+    z = twin.posterior(windows)[0]
     assert z.shape == (len(windows), 7, 2)
     active = z.var(axis=0) > 0.01
     assert active.any(axis=1).all()
@@ -150,7 +150,7 @@ def test_known_motion_fills_the_latent_like_the_prior(twin, records):
 @pytest.mark.parametrize("bad", [np.zeros((2, 40, 7, 3)), np.full((2, 50, 7, 3), np.nan)])
 def test_windows_that_do_not_fit_are_refused(twin, bad):
     with pytest.raises(ValueError, match="Windows must be"):
-        twin.latent(bad)
+        twin.posterior(bad)[0]
 
 
 def test_many_jobs_score_as_each_alone(twin, make_plan, motion, rng):
@@ -164,7 +164,7 @@ def test_many_jobs_score_as_each_alone(twin, make_plan, motion, rng):
 def test_window_errors_are_the_mean_distance_to_the_reconstruction(twin, plan):
     windows = cut(resample(plan.cycle.profile, 50.0, 12.5), 50, 25)
     away = np.abs(windows - twin.reconstruct(windows)) / twin.scaler.std
-    np.testing.assert_allclose(twin.window_errors(windows), away.mean(axis=1), rtol=1e-4)
+    np.testing.assert_allclose(twin.window_features(windows).errors, away.mean(axis=1), rtol=1e-4)
 
 
 def test_decoding_the_posterior_mean_is_the_reconstruction(twin, plan):
@@ -197,4 +197,4 @@ def test_a_twin_needs_its_networks(twin):
 
 def test_a_calibration_of_another_arm_is_refused(twin):
     with pytest.raises(ValueError, match="calibration is for 6 joints, the twin has 7"):
-        twin.with_reference(Features(np.zeros((4, 6, 5))))
+        replace(twin, calibration=Calibration(Features(np.zeros((4, 6, 5)))))

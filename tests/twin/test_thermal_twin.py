@@ -25,7 +25,7 @@ from twin.saturation.reliability import brier, reliability
 from twin.thermal.checkpoint import load_twin, save
 from twin.thermal.forecast import continued_peaks, planned_peaks
 from twin.thermal.identify import identify
-from twin.thermal.kalman import estimate_temperatures
+from twin.thermal.kalman import filter_log
 from twin.thermal.parameters import HeatModel
 from twin.thermal.result import nominal_heat_model
 from twin.thermal.risk import fit_head
@@ -121,7 +121,7 @@ def test_risk_rises_with_every_temperature_and_needs_past_jobs(holds, rng):
     with pytest.raises(ValueError, match="no P"):
         twin.risk(plan, 100)
     assert twin.score(plan, 100).risk is None
-    taught = twin.with_head(fit_head(rng.normal(0, 1, 100), rng.random(100) < 0.5))
+    taught = replace(twin, head=fit_head(rng.normal(0, 1, 100), rng.random(100) < 0.5))
     assert taught.version != twin.version
     plans = [holds(s * FULL_REACH_NM) for s in rng.uniform(0.2, 1.4, 60)]
     temps = rng.uniform(25, 50, (60, JOINTS))
@@ -175,15 +175,10 @@ def working(twin: RcTwin, minutes: float, rng: np.random.Generator) -> tuple[Rec
 def test_the_observer_finds_the_housings_and_says_how_well(rng):
     twin = RcTwin.nominal()
     recording, truth = working(twin, 40.0, rng)
-    seen = estimate_temperatures(twin, recording)
-    error = np.abs(seen.temp_c[:, HOUSING] - truth[seen.time_s.astype(int), HOUSING])
+    (log,) = heat_logs(recording, twin.motors, "current")
+    error = np.abs(filter_log(twin, log)[:, HOUSING] - truth[log.time_s.astype(int), HOUSING])
     assert (error[0] > 3.5).all()
     assert error[-1].max() < 1.0
-    assert (seen.sd_k[-1, HOUSING] < 0.4 * seen.sd_k[0, HOUSING]).all()
-    assert (error[-1] < 3.0 * seen.sd_k[-1, HOUSING]).all()
-    np.testing.assert_array_equal(seen.at(1e9), seen.temp_c[-1])
-    with pytest.raises(ValueError, match="log begins"):
-        seen.at(-1.0)
 
 
 def test_forecasts_know_the_coming_load_or_take_the_last_one_for_granted(rng):
