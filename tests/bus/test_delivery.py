@@ -18,7 +18,9 @@ DT_S = 10.0
 def carry(delivery: Delivery, now_s: float, *, missing: tuple[int, int] | None = None) -> np.ndarray:
     """The times at which the words that every arm now has were said, [receiver, sender]; −inf for none."""
     arms = len(delivery.conditions)
-    conditions: list[list[Condition | None]] = [[Condition(now_s, 0, 0.0) for _ in range(arms)] for _ in range(arms)]
+    conditions: list[list[Condition | None]] = [
+        [Condition(now_s, "idle", 0.0) for _ in range(arms)] for _ in range(arms)
+    ]
     scores = [[Scores(now_s, (), [], []) for _ in range(arms)] for _ in range(arms)]
     if missing is not None:
         conditions[missing[0]][missing[1]] = None

@@ -1,6 +1,7 @@
 """Replies to one query: messages, refusals and timeouts, by the key of the replier."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -11,6 +12,17 @@ from fleet.bus.protocol.messages import MalformedMessage, Refusal, check_name, d
 
 Message = TypeVar("Message", bound=msgspec.Struct)
 Entry = TypeVar("Entry")
+
+_SENDER: Mapping[str, str] = {"arm": "arm", "auction": "auctioneer"}
+"""The field of a message that names the sender, by the role in its key."""
+
+
+class AnotherReplies(Exception):
+    """Raised by a handler of requests: another participant will reply."""
+
+
+class Refused(Exception):
+    """Raised by a handler of requests: the querier gets this sentence instead of a reply."""
 
 
 @dataclass(eq=False)
@@ -51,10 +63,8 @@ def check_sender(message: Message, sender: keys.Key) -> Message:
     Raises:
         MalformedMessage: it does.
     """
-    for field_name, role in (("arm", "arm"), ("auctioneer", "auction")):
-        if sender.role == role and hasattr(message, field_name):
-            return check_name(message, sender.name, field_name)
-    return message
+    name = _SENDER.get(sender.role, "")
+    return check_name(message, sender.name, name) if hasattr(message, name) else message
 
 
 def _add(table: dict[str, Entry], key: str, entry: Entry) -> None:

@@ -11,11 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.bus.exchange.channel import Channel
-from fleet.bus.exchange.protocol import Array, Condition, Scores
-
-AllConditions = Sequence[Sequence[Condition | None]]
-"""[receiver][sender]; None for a broadcast that did not arrive."""
-AllScores = Sequence[Sequence[Scores | None]]
+from fleet.bus.exchange.protocol import AllConditions, AllScores, Array, Condition, Scores
+from fleet.bus.protocol.messages import DifficultyScores, State
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +57,9 @@ class Delivery:
     def begin(self, rng: np.random.Generator | None = None) -> None:
         """Begin an episode: forget what was received and what is in transit; draw from `rng` from now on."""
         self._rng = rng or self._rng
-        self.conditions: list[list[Condition | None]] = [[None] * self._arms for _ in range(self._arms)]
+        self.conditions: list[list[Condition | State | None]] = [[None] * self._arms for _ in range(self._arms)]
         """The last content that each arm has of each, [receiver][sender]."""
-        self.scores: list[list[Scores | None]] = [[None] * self._arms for _ in range(self._arms)]
+        self.scores: list[list[Scores | DifficultyScores | None]] = [[None] * self._arms for _ in range(self._arms)]
         self._tick = -1
         self._known = np.full((self._arms, self._arms), -1)
         self._in_transit: list[_Batch] = []

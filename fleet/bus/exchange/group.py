@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from typing import Generic, TypeVar
 
 from fleet.bus.client.client import BusClient
-from fleet.bus.exchange.protocol import Array, Broadcast, Condition, Scores
+from fleet.bus.exchange.protocol import Array, Broadcast
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import DifficultyScores, Info, State
 from fleet.telemetry import MODES
 
-Content = TypeVar("Content", Condition, Scores)
+Message = TypeVar("Message", State, DifficultyScores)
 
+_POLL_S = 0.002
 SILENT_AFTER = 3
 """Steps in a row that a peer may miss; then nobody waits for it until something of it arrives again."""
 
@@ -41,8 +42,8 @@ def messages_of(broadcast: Broadcast, arms: tuple[str, ...], tick: int) -> list[
     ]
 
 
-class _Latest(Generic[Content]):
-    """The newest content of one topic from each sender."""
+class _Latest(Generic[Message]):
+    """The newest message of one topic from each sender."""
 
     def __init__(self, arms: int) -> None:
         self.forget(-1, arms)
@@ -50,41 +51,18 @@ class _Latest(Generic[Content]):
     def forget(self, tick: int, arms: int) -> None:
         """Know nothing, and accept nothing of `tick` or before."""
         self.ticks = [tick] * arms
-        self.last: list[Content | None] = [None] * arms
+        self.last: list[Message | None] = [None] * arms
 
-    def keep(self, sender: int, tick: int, content: Content) -> bool:
-        """Keep the content if it is newer than what is known of the sender; whether it was."""
-        if tick <= self.ticks[sender]:
+    def keep(self, sender: int, message: Message) -> bool:
+        """Keep the message if it is newer than the last one of its sender; returns whether it is."""
+        if message.tick <= self.ticks[sender]:
             return False
-        self.ticks[sender], self.last[sender] = tick, content
+        self.ticks[sender], self.last[sender] = message.tick, message
         return True
 
-    def of(self, tick: int) -> list[Content | None]:
-        """The contents of a step, [sender]."""
-        return [content if ours == tick else None for ours, content in zip(self.ticks, self.last, strict=True)]
-
-
-class Contents:
-    """What an exchange keeps of messages; equal messages that several clients received share one content."""
-
-    def __init__(self) -> None:
-        self._states: dict[str, tuple[State, Condition]] = {}
-        self._scores: dict[str, tuple[DifficultyScores, Scores]] = {}
-
-    def condition(self, state: State) -> Condition:
-        known = self._states.get(state.arm)
-        if known is None or known[0] != state:
-            known = state, Condition(state.time_s, MODES.index(state.mode), state.headroom_k)
-            self._states[state.arm] = known
-        return known[1]
-
-    def scores(self, message: DifficultyScores) -> Scores:
-        known = self._scores.get(message.arm)
-        if known is None or known[0] != message:
-            numbers = _numbers(message.difficulty), _numbers(message.p_saturation)
-            known = message, Scores(message.time_s, message.jobs, *numbers)
-            self._scores[message.arm] = known
-        return known[1]
+    def of(self, tick: int) -> list[Message | None]:
+        """The messages of a step, [sender]."""
+        return [message if ours == tick else None for ours, message in zip(self.ticks, self.last, strict=True)]
 
 
 class Group:
@@ -94,22 +72,22 @@ class Group:
         members: Indices of these arms in the fleet.
     """
 
-    def __init__(self, client: BusClient, arms: tuple[str, ...], members: Sequence[int], contents: Contents) -> None:
+    def __init__(self, client: BusClient, arms: tuple[str, ...], members: Sequence[int]) -> None:
         """Declare everything that these arms publish and subscribe to."""
         self.client, self.members = client, tuple(members)
         self._index = {arm: index for index, arm in enumerate(arms)}
-        self._contents = contents
         self._tick, self._now_s = -1, -math.inf
         self._present: set[int] = set()
         self._awaited: set[int] = set()
         """Present when the step began, and not gone since."""
-        self.conditions = _Latest[Condition](len(arms))
-        self.scores = _Latest[Scores](len(arms))
+        self.conditions = _Latest[State](len(arms))
+        self.scores = _Latest[DifficultyScores](len(arms))
         self._misses = [0] * len(arms)
         """Steps in a row in which a peer was not received."""
         # An arm alone knows its own messages without the bus.
         own, fleet = len(self.members) > 1, client.fleet
-        client.subscribe(keys.of_every_arm(fleet, "state"), State, self._receive, own=own)
+        # A state travels ahead of its scores, which wake the reader for both.
+        client.subscribe(keys.of_every_arm(fleet, "state"), State, self._receive, own=own, wake=False)
         client.subscribe(keys.of_every_arm(fleet, "difficulty"), DifficultyScores, self._receive, history=True, own=own)
         client.watch_tokens(keys.of_every_arm(fleet, "alive"), self._token)
         self._publishers = [_Publishers(client, arms[index]) for index in self.members]
@@ -126,8 +104,8 @@ class Group:
         for index, publishers in zip(self.members, self._publishers, strict=True):
             state, difficulty = messages[index]
             if len(self.members) == 1:
-                self.conditions.keep(index, tick, self._contents.condition(state))
-                self.scores.keep(index, tick, self._contents.scores(difficulty))
+                self.conditions.keep(index, state)
+                self.scores.keep(index, difficulty)
             publishers.publish(state, difficulty)
 
     def forget(self, tick: int) -> None:
@@ -143,9 +121,12 @@ class Group:
 
     def await_messages(self, deadline_s: float) -> list[int]:
         """Wait for the messages of this step; returns the peers that were not received, for whatever reason."""
-        while missing := self._missing():
+        while missing := self._missing(self.scores.ticks):
             if not self.client.serve(deadline_s, at_least=missing) and time.monotonic() >= deadline_s:
                 break
+        # Reached only if a state is lost: nothing else of this step will wake the reader.
+        while self._missing(self.conditions.ticks) and time.monotonic() < deadline_s:
+            self.client.serve(min(deadline_s, time.monotonic() + _POLL_S))
         missed = []
         for sender, tick in enumerate(map(min, self.scores.ticks, self.conditions.ticks)):
             self._misses[sender] = self._misses[sender] + 1 if tick < self._tick else 0
@@ -153,13 +134,9 @@ class Group:
                 missed.append(sender)
         return missed
 
-    def _missing(self) -> int:
-        """Messages of this step that are still awaited."""
-        return sum(
-            ticks[sender] < self._tick
-            for ticks in (self.conditions.ticks, self.scores.ticks)
-            for sender in self._awaited
-        )
+    def _missing(self, ticks: list[int]) -> int:
+        """Messages of this step that are still awaited, given the newest step of each sender."""
+        return sum(ticks[sender] < self._tick for sender in self._awaited)
 
     def _receive(self, arm: str, message: State | DifficultyScores) -> None:
         sender = self._index.get(arm)
@@ -171,11 +148,7 @@ class Group:
                 f"{type(message).__name__} of '{arm}' is of step {tick} at {time_s} s, but it is step {self._tick} at "
                 f"{self._now_s} s."
             )
-        elif (
-            self.conditions.keep(sender, tick, self._contents.condition(message))
-            if isinstance(message, State)
-            else self.scores.keep(sender, tick, self._contents.scores(message))
-        ):
+        elif self.conditions.keep(sender, message) if isinstance(message, State) else self.scores.keep(sender, message):
             # A silent peer that is received again gets one more chance to be in time.
             self._misses[sender] = min(self._misses[sender], SILENT_AFTER - 1)
 
@@ -215,7 +188,3 @@ class _Publishers:
 def _nullable(values: Array) -> list[tuple[float | None, ...]]:
     """Rows of an array [arm, job], with None for NaN."""
     return [tuple(None if math.isnan(value) else float(value) for value in row) for row in values.tolist()]
-
-
-def _numbers(values: tuple[float | None, ...]) -> list[float]:
-    return [math.nan if value is None else value for value in values]

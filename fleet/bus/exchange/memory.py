@@ -18,6 +18,7 @@ from fleet.bus.exchange.protocol import (
     checked_arms,
 )
 from fleet.errors import BusError
+from fleet.telemetry import MODES
 
 
 class MemoryExchange:
@@ -93,7 +94,7 @@ def _contents_of(words: Broadcast) -> tuple[list[Condition], list[Scores]]:
     difficulty, p_saturation = np.array(words.difficulty, dtype=float), np.array(words.p_saturation, dtype=float)
     time_s = float(words.time_s)
     conditions = [
-        Condition(time_s, mode, headroom)
+        Condition(time_s, MODES[mode], headroom)
         for mode, headroom in zip(words.mode.tolist(), words.headroom_k.tolist(), strict=True)
     ]
     return conditions, [Scores(time_s, words.jobs, d, p) for d, p in zip(difficulty, p_saturation, strict=True)]

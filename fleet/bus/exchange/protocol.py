@@ -11,7 +11,8 @@ from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 
-from fleet.telemetry import MODES
+from fleet.bus.protocol.messages import DifficultyScores, State
+from fleet.telemetry import MODES, Mode
 
 Array = np.ndarray
 
@@ -92,16 +93,16 @@ class Exchange(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Condition:
-    """State of an arm in its last broadcast."""
+    """State of an arm in its last broadcast: the part of a `State` that peers use."""
 
     time_s: float
-    mode: int
+    mode: Mode
     headroom_k: float
 
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Difficulties of the open jobs in an arm's last broadcast."""
+    """Difficulties of the open jobs in an arm's last broadcast: the part of `DifficultyScores` that peers use."""
 
     time_s: float
     jobs: tuple[str, ...]
@@ -111,43 +112,36 @@ class Scores:
     """[job], NaN where unknown."""
 
 
-Word = TypeVar("Word", Condition, Scores)
+Content = TypeVar("Content")
+AllConditions = Sequence[Sequence[Condition | State | None]]
+"""[receiver][sender]; None for a broadcast that was not received."""
+AllScores = Sequence[Sequence[Scores | DifficultyScores | None]]
 
 
-def assemble(
-    now_s: float,
-    jobs: tuple[str, ...],
-    conditions: Sequence[Sequence[Condition | None]],
-    scores: Sequence[Sequence[Scores | None]],
-) -> PeerView:
+def assemble(now_s: float, jobs: tuple[str, ...], conditions: AllConditions, scores: AllScores) -> PeerView:
     """The view of every arm, from the last content that each receiver has of each sender, [receiver][sender].
 
     Age is that of the older of both contents. One content that several receivers have is laid out once.
     """
-    arms, slots = len(conditions), len(jobs)
-    state_row, states = _interned(conditions)
-    mode = np.array([*(word.mode for word in states), UNHEARD])[state_row]
-    headroom = np.array([*(word.headroom_k for word in states), math.nan])[state_row]
-    state_time = np.array([*(word.time_s for word in states), -math.inf])[state_row]
+    row, states = _distinct(conditions)
+    mode = np.array([*(MODES.index(state.mode) for state in states), UNHEARD])[row]
+    headroom_k = np.array([*(state.headroom_k for state in states), math.nan])[row]
+    state_s = np.array([*(state.time_s for state in states), -math.inf])[row]
 
-    score_row, said = _interned(scores)
-    table = np.full((2, len(said) + 1, slots), np.nan)
-    for row, word in enumerate(said):
-        if word.jobs == jobs:
-            table[0, row] = word.difficulty
-            table[1, row] = word.p_saturation
+    row, contents = _distinct(scores)
+    table = np.full((2, len(contents) + 1, len(jobs)), np.nan)
+    for index, content in enumerate(contents):
+        values = np.array((content.difficulty, content.p_saturation), dtype=float)  # None becomes NaN
+        if content.jobs == jobs:
+            table[:, index] = values
             continue
-        columns = {name: column for column, name in enumerate(word.jobs)}
-        for slot, name in enumerate(jobs):
-            if name in columns:
-                table[0, row, slot] = word.difficulty[columns[name]]
-                table[1, row, slot] = word.p_saturation[columns[name]]
-    empty = [slot for slot, name in enumerate(jobs) if not name]
-    table[:, :, empty] = np.nan
-    score_time = np.array([*(word.time_s for word in said), -math.inf])[score_row]
-    known = table[:, score_row]
-    assert known.shape == (2, arms, arms, slots)
-    return PeerView(mode, headroom, known[0], known[1], now_s - np.minimum(state_time, score_time))
+        columns = {name: column for column, name in enumerate(content.jobs)}
+        slots = [slot for slot, name in enumerate(jobs) if name in columns]
+        table[:, index, slots] = values[:, [columns[jobs[slot]] for slot in slots]]
+    table[:, :, [slot for slot, name in enumerate(jobs) if not name]] = np.nan
+    scores_s = np.array([*(content.time_s for content in contents), -math.inf])[row]
+    difficulty, p_saturation = table[:, row]
+    return PeerView(mode, headroom_k, difficulty, p_saturation, now_s - np.minimum(state_s, scores_s))
 
 
 def checked_arms(arms: Sequence[str]) -> tuple[str, ...]:
@@ -205,22 +199,17 @@ def check_order(time_s: float, last_s: float) -> None:
         raise ValueError(f"Broadcast of {time_s:g} s come after those of {last_s:g} s: begin() starts a new episode.")
 
 
-def _interned(known: Sequence[Sequence[Word | None]]) -> tuple[Array, list[Word]]:
-    """[receiver, sender] index of each content in the list of different ones; -1 (its end) for none."""
-    place: dict[int, int] = {id(None): -1}
-    different: list[Word] = []
-    rows: list[list[int]] = []
-    last: object = None
-    for row in known:
-        if row is last:  # the same row for several receivers
-            rows.append(rows[-1])
+def _distinct(contents: Sequence[Sequence[Content | None]]) -> tuple[Array, list[Content]]:
+    """[receiver, sender] index of each content in the list of distinct ones; -1 (its end) for None."""
+    index: dict[int, int] = {id(None): -1}
+    distinct: list[Content] = []
+    rows: dict[int, list[int]] = {}  # arms that share a client share one list
+    for row in contents:
+        if id(row) in rows:
             continue
-        last = row
-        rows.append([])
-        for word in row:
-            index = place.get(id(word))
-            if index is None and word is not None:
-                index = place[id(word)] = len(different)
-                different.append(word)
-            rows[-1].append(-1 if index is None else index)
-    return np.array(rows, dtype=int), different
+        for content in row:
+            if content is not None and id(content) not in index:
+                index[id(content)] = len(distinct)
+                distinct.append(content)
+        rows[id(row)] = [index[id(content)] for content in row]
+    return np.array([rows[id(row)] for row in contents], dtype=int), distinct

@@ -13,8 +13,9 @@ import time
 import weakref
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
+from functools import lru_cache
 from pathlib import Path
-from typing import Self
+from typing import Self, TypeVar
 
 import numpy as np
 import zenoh
@@ -23,7 +24,7 @@ from fleet.bus.client.client import BACKLOG, BusClient
 from fleet.bus.client.router import Router, reachable
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.bus.exchange.delivery import Delivery
-from fleet.bus.exchange.group import Content, Contents, Group, messages_of
+from fleet.bus.exchange.group import Group, messages_of
 from fleet.bus.exchange.protocol import (
     Broadcast,
     PeerView,
@@ -33,10 +34,13 @@ from fleet.bus.exchange.protocol import (
     checked_arms,
 )
 from fleet.bus.protocol import keys
+from fleet.bus.protocol.messages import decode_as
 from fleet.bus.security.tls import Tls
 from fleet.errors import BusError
 
 _LOG = logging.getLogger(__name__)
+
+Message = TypeVar("Message")
 
 MOST_OWN_SESSIONS, SHARED_SESSIONS = 8, 4
 """Up to so many arms have a session each; more of them share so many sessions."""
@@ -102,6 +106,8 @@ class ZenohExchange:
         self._timeout_s = timeout_s
         self._delivery = None if channel.perfect else Delivery(self.arms, channel)
         self._groups: list[Group] = []
+        # Every client receives the messages of every arm; the first one decodes each.
+        self._decode = lru_cache(4 * count)(decode_as)
         self._tick = -1
         self._now_s = -math.inf
         self._missed: set[tuple[int, int]] = set()
@@ -131,10 +137,7 @@ class ZenohExchange:
             clients = [self._resources.enter_context(self._client(arm)) for arm in self.arms[: self._sessions]]
             self._refuse_namesakes(clients[0])
             everybody = range(len(self.arms))
-            contents = Contents()
-            self._groups = [
-                Group(client, self.arms, everybody[i :: len(clients)], contents) for i, client in enumerate(clients)
-            ]
+            self._groups = [Group(client, self.arms, everybody[i :: len(clients)]) for i, client in enumerate(clients)]
             deadline_s = time.monotonic() + _OPEN_TIMEOUT_S
             for group in self._groups:
                 if missing := group.await_peers(deadline_s):
@@ -233,7 +236,8 @@ class ZenohExchange:
         assert self._endpoint is not None
         tls = self._tls[arm]
         endpoint = self._endpoint if tls is None else tls.endpoint(self._endpoint)
-        return BusClient(endpoint, self._fleet, timeout_s=self._timeout_s, backlog=max(BACKLOG, 16 * len(self.arms)))
+        backlog = max(BACKLOG, 16 * len(self.arms))
+        return BusClient(endpoint, self._fleet, timeout_s=self._timeout_s, backlog=backlog, decode=self._decode)
 
     def _give_up(self) -> None:
         """Close while another exception is raised, which must not be hidden."""
@@ -242,7 +246,7 @@ class ZenohExchange:
         except BusError:
             _LOG.exception("While closing after another error:")
 
-    def _by_receiver(self, of_groups: list[list[Content | None]]) -> list[list[Content | None]]:
+    def _by_receiver(self, of_groups: list[list[Message | None]]) -> list[list[Message | None]]:
         """[receiver][sender], from what each group received."""
         return [of_groups[i % len(of_groups)] for i in range(len(self.arms))]
 
