@@ -212,7 +212,7 @@ def test_one_is_added_by_the_same_authority_once(tmp_path):
     assert {name for name in after if after[name] != before.get(name)} == {"gateway.pem", "gateway.key", ROSTER}
     with pytest.raises(BusError, match="'gateway' has a certificate"):
         add(place, Participant("gateway", "submitter"), days=3)
-    with pytest.raises(BusError, match=r"of the role submitter in .* not monitor"):
+    with pytest.raises(BusError, match=r"has the role submitter in .* not monitor"):
         add(place, Participant("gateway", "monitor"), days=3, overwrite=True)
     with pytest.raises(BusError, match="'GATEWAY' is taken"):
         add(place, Participant("GATEWAY", "monitor"), days=3)

@@ -5,7 +5,6 @@ import queue
 import re
 import socket
 import time
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -26,26 +25,6 @@ from fleet.errors import BusError
 ARMS = ("arm_0", "arm_1")
 PATIENT_S = 20.0
 SHORT_S = 0.3
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The keys of the fleet f."""
-    place = tmp_path_factory.mktemp("keys") / "f"
-    make(place, of_arms("f", ARMS), days=30)
-    return place
-
-
-@pytest.fixture(scope="module")
-def guarded(folder: Path) -> Iterator[Router]:
-    with Router(tls=Tls(folder, "router")) as router:
-        yield router
-
-
-@pytest.fixture(scope="module")
-def open_router() -> Iterator[Router]:
-    with Router() as router:
-        yield router
 
 
 def rogue_folder(place: Path, true: Path, how: str) -> Path:

@@ -24,7 +24,7 @@ import zenoh
 from zenoh import ext as advanced
 
 from fleet.bus.client.queue import Mailbox
-from fleet.bus.client.replies import AnotherReplies, Refused, Replies, check_sender
+from fleet.bus.client.replies import AnotherReplies, Refused, Replies, read_message
 from fleet.bus.client.router import open_client, plain_reason
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import MalformedMessage, Refusal, check_name, decode_as, encode, encoding
@@ -60,14 +60,14 @@ class BusClient:
         *,
         timeout_s: float = 5.0,
         backlog: int = BACKLOG,
-        decode: Callable[[type[Any], str, bytes], Any] = decode_as,
+        read: Callable[[type[Any], str, str, bytes], tuple[str, Any]] = read_message,
     ) -> None:
         """Prepare a client of the router at `endpoint`.
 
         Args:
             timeout_s: How long the router may take to accept the connection.
             backlog: Most messages in the queue; when it is full, the oldest is dropped.
-            decode: Decodes publications; clients of one process may share a cached `decode_as`.
+            read: Reads publications; clients of one process may share a cached `read_message`.
         """
         self.fleet = fleet
         self.malformed = 0
@@ -76,7 +76,7 @@ class BusClient:
         self._endpoint, self._timeout_s = endpoint, timeout_s
         self._waiting: Mailbox[tuple[Callable[..., None], tuple[Any, ...]]] = Mailbox()
         self._backlog = backlog
-        self._decode = decode
+        self._read = read
         self._polled: list[tuple[Callable[[], zenoh.Sample | None], Callable[[zenoh.Sample], None]]] = []
         self._overrunning = Lock()
         self._session: zenoh.Session | None = None
@@ -272,13 +272,12 @@ class BusClient:
 
         def take(sample: zenoh.Sample) -> None:
             try:
-                sender = keys.parse(str(sample.key_expr))
-                message = self._decode(kind, str(sample.encoding), sample.payload.to_bytes())
-                check_sender(message, sender)
-            except (ValueError, MalformedMessage) as error:
+                payload = sample.payload.to_bytes()
+                name, message = self._read(kind, str(sample.key_expr), str(sample.encoding), payload)
+            except ValueError as error:
                 self.reject(f"under '{sample.key_expr}': {error}")
             else:
-                handle(sender.name, message)
+                handle(name, message)
 
         receive = _direct(partial(self.post, take)) if wake else zenoh.handlers.RingChannel(self._backlog)
         subscriber = (

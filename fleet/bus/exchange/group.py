@@ -1,4 +1,4 @@
-"""Arms that share one client of the bus: what they publish, and what they have received, in a simulated shift."""
+"""Arms of a simulated shift that share one client: their publications and the messages they received."""
 
 import math
 import time
@@ -15,7 +15,7 @@ Message = TypeVar("Message", State, DifficultyScores)
 
 _POLL_S = 0.002
 SILENT_AFTER = 3
-"""Steps in a row that a peer may miss; then nobody waits for it until something of it arrives again."""
+"""A peer that missed this many steps in a row is not waited for until one of its messages arrives."""
 
 
 def messages_of(broadcast: Broadcast, arms: tuple[str, ...], tick: int) -> list[tuple[State, DifficultyScores]]:
@@ -49,12 +49,12 @@ class _Latest(Generic[Message]):
         self.forget(-1, arms)
 
     def forget(self, tick: int, arms: int) -> None:
-        """Know nothing, and accept nothing of `tick` or before."""
+        """Remove all messages, and accept none of `tick` or before."""
         self.ticks = [tick] * arms
         self.last: list[Message | None] = [None] * arms
 
     def keep(self, sender: int, message: Message) -> bool:
-        """Keep the message if it is newer than the last one of its sender; returns whether it is."""
+        """Keep the message if it is newer than the last one of its sender, and return whether it is."""
         if message.tick <= self.ticks[sender]:
             return False
         self.ticks[sender], self.last[sender] = message.tick, message
@@ -66,25 +66,25 @@ class _Latest(Generic[Message]):
 
 
 class Group:
-    """The arms that share one client, and what they have received; as a rule one arm.
+    """The arms that share one client, and the messages they received; in small fleets one arm.
 
     Attributes:
         members: Indices of these arms in the fleet.
     """
 
     def __init__(self, client: BusClient, arms: tuple[str, ...], members: Sequence[int]) -> None:
-        """Declare everything that these arms publish and subscribe to."""
+        """Declare the publishers, subscribers and tokens of these arms."""
         self.client, self.members = client, tuple(members)
         self._index = {arm: index for index, arm in enumerate(arms)}
         self._tick, self._now_s = -1, -math.inf
         self._present: set[int] = set()
         self._awaited: set[int] = set()
-        """Present when the step began, and not gone since."""
+        """Present since the step began."""
         self.conditions = _Latest[State](len(arms))
         self.scores = _Latest[DifficultyScores](len(arms))
         self._misses = [0] * len(arms)
         """Steps in a row in which a peer was not received."""
-        # An arm alone knows its own messages without the bus.
+        # A single arm has its own messages without the bus.
         own, fleet = len(self.members) > 1, client.fleet
         # A state travels ahead of its scores, which wake the reader for both.
         client.subscribe(keys.of_every_arm(fleet, "state"), State, self._receive, own=own, wake=False)
@@ -93,13 +93,13 @@ class Group:
         self._publishers = [_Publishers(client, arms[index]) for index in self.members]
 
     def begin_step(self, tick: int, now_s: float) -> None:
-        """Handle what arrived since `tick`, the last one, and decide whom to wait for in the next step."""
+        """Handle the messages that arrived since the last step, `tick`, and choose the peers to wait for."""
         self._tick, self._now_s = tick, now_s
         self.client.serve()
         self._awaited = {sender for sender in self._present if self._misses[sender] < SILENT_AFTER}
 
     def publish(self, tick: int, now_s: float, messages: Sequence[tuple[State, DifficultyScores]]) -> None:
-        """Publish the messages of these arms of one step, given those of the fleet, [arm]."""
+        """Publish these arms' messages of one step, given those of the whole fleet, [arm]."""
         self._tick, self._now_s = tick, now_s
         for index, publishers in zip(self.members, self._publishers, strict=True):
             state, difficulty = messages[index]
@@ -109,22 +109,22 @@ class Group:
             publishers.publish(state, difficulty)
 
     def forget(self, tick: int) -> None:
-        """A new episode after `tick`: nothing is known, and what was published until then is ignored."""
+        """Begin a new episode after `tick`: remove all messages, and ignore those published until then."""
         self.conditions.forget(tick, len(self._misses))
         self.scores.forget(tick, len(self._misses))
 
     def await_peers(self, deadline_s: float) -> list[int]:
-        """Wait for the token of every arm; returns the arms whose token did not appear before the deadline."""
+        """Wait for the token of every arm, and return the arms without one at the deadline."""
         while (missing := len(self._misses) - len(self._present)) and time.monotonic() < deadline_s:
             self.client.serve(deadline_s, at_least=missing)
         return [index for index in range(len(self._misses)) if index not in self._present]
 
     def await_messages(self, deadline_s: float) -> list[int]:
-        """Wait for the messages of this step; returns the peers that were not received, for whatever reason."""
+        """Wait for the messages of this step, and return the peers of which one is missing."""
         while missing := self._missing(self.scores.ticks):
             if not self.client.serve(deadline_s, at_least=missing) and time.monotonic() >= deadline_s:
                 break
-        # Reached only if a state is lost: nothing else of this step will wake the reader.
+        # Only if a state is lost: no other message of this step will wake the reader.
         while self._missing(self.conditions.ticks) and time.monotonic() < deadline_s:
             self.client.serve(min(deadline_s, time.monotonic() + _POLL_S))
         missed = []
@@ -135,7 +135,7 @@ class Group:
         return missed
 
     def _missing(self, ticks: list[int]) -> int:
-        """Messages of this step that are still awaited, given the newest step of each sender."""
+        """Number of peers whose message of this step is awaited, given the last step received of each sender."""
         return sum(ticks[sender] < self._tick for sender in self._awaited)
 
     def _receive(self, arm: str, message: State | DifficultyScores) -> None:
@@ -152,11 +152,11 @@ class Group:
             # A silent peer that is received again gets one more chance to be in time.
             self._misses[sender] = min(self._misses[sender], SILENT_AFTER - 1)
 
-    def _token(self, arm: str, there: bool) -> None:
+    def _token(self, arm: str, present: bool) -> None:
         sender = self._index.get(arm)
         if sender is None:
             return
-        if there:
+        if present:
             self._present.add(sender)
         else:
             self._present.discard(sender)
@@ -164,23 +164,22 @@ class Group:
 
 
 class _Publishers:
-    """What one arm publishes with."""
+    """Publishers and token of one arm."""
 
     def __init__(self, client: BusClient, arm: str) -> None:
-        self._arm = arm
-        self._last_info: Info | None = None
+        self._constants: tuple[int, str] | None = None
         self._state = client.publisher(keys.of_arm(client.fleet, arm, "state"), State)
         self._difficulty = client.publisher(keys.of_arm(client.fleet, arm, "difficulty"), DifficultyScores)
         self._info = client.publisher(keys.of_arm(client.fleet, arm, "info"), Info)
-        # Declared last: who sees the token knows that the router has the rest.
+        # Declared last: whoever sees the token can be sure that the router has the publishers.
         client.declare_token(keys.of_arm(client.fleet, arm, "alive"))
 
     def publish(self, state: State, difficulty: DifficultyScores) -> None:
         """Publish the messages of one step, and the arm's constants when they have changed."""
-        info = Info(arm=self._arm, joints=len(state.temp_c), twin=difficulty.twin)
-        if info != self._last_info:
-            self._info(info)
-            self._last_info = info
+        constants = len(state.temp_c), difficulty.twin
+        if constants != self._constants:
+            self._info(Info(state.arm, *constants))
+            self._constants = constants
         self._state(state)
         self._difficulty(difficulty)
 
