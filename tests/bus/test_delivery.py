@@ -55,8 +55,8 @@ def test_what_is_known_never_grows_older_by_a_word_and_never_comes_before_its_ti
         assert (later >= earlier).all()
     assert ((now_s - known)[:, others] >= channel.delay_s).all()
     assert (known[:, ~others] == now_s[:, 0]).all()  # one's own word is known at once
-    assert np.isneginf(known[:, ~channel.hears(ARMS) & others]).all()
-    assert delivery.delivered + delivery.late <= 15 * channel.hears(ARMS).sum()
+    assert np.isneginf(known[:, ~channel.links(ARMS) & others]).all()
+    assert delivery.delivered + delivery.late <= 15 * channel.links(ARMS).sum()
 
 
 @given(st.sampled_from([0.0, 3.0, 10.0, 25.0]), st.sampled_from([1.0, 10.0, 35.0]), st.integers(0, 100))

@@ -39,7 +39,7 @@ def test_options_make_a_channel(small_toml):
         (("--topology-seed", -1), "Error: --topology-seed must be >= 0 (got -1)."),
         (("--loss", 2), "Error: --loss must be a probability, from 0 to 1 (got 2.0)."),
         (("--partition", "soon"), "Error: --partition needs FROM_S:TO_S:ARM,ARM|ARM,ARM"),
-        (("--partition", "0:9:lefft"), "Error: No arm 'lefft' to be in a group of a partition; did you mean 'left'?"),
+        (("--partition", "0:9:lefft"), "Error: A partition names an unknown arm 'lefft'; did you mean 'left'?"),
     ],
 )
 @pytest.mark.parametrize("command", ["run", "compare"])
