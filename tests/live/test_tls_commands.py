@@ -175,7 +175,7 @@ MINUTE = r"20\d\d-\d\d-\d\d \d\d:\d\d UTC"
 
 
 WRONG = {
-    "none": r"^Endpoint '\S+' needs a certificate: name it, as tls/\S+#FOLDER/NAME\.$",
+    "none": r"^Endpoint '\S+' needs a certificate; name it, as tls/\S+#FOLDER/NAME\.$",
     "plain": r"^No router answered at tcp/\S+ within 5\.0 s \(the server expects TLS: .* are needed\)\.$",
     "missing": r"^There is no '\S+/nobody\.pem'; thermofleet keys makes it\.$",
     "wrong role": r"^'\S+/router\.pem' is the certificate of 'router:router'; only the router may use it\.$",

@@ -80,5 +80,5 @@ def test_a_comparison_says_what_lay_between(thermofleet, small_toml):
 def test_an_exchange_of_strangers_is_an_error_of_the_user(small_toml):
     from scenarios.prepare.fleet import open_exchange
 
-    with pytest.raises(FleetError, match="No arm 'z'"):
+    with pytest.raises(FleetError, match="unknown arm 'z'"):
         open_exchange("memory", ("a", "b"), "f", channel=Channel(partitions=(Partition(0.0, 1.0, (("z",),)),)))
