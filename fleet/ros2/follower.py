@@ -8,12 +8,12 @@ import math
 import time
 from collections.abc import Mapping
 
-from fleet.bus.client.client import BusClient, Refused
+from fleet.bus.client.client import BusClient
 from fleet.bus.client.replies import Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Ack, Award, Clock, ClockRequest, JobEstimate, Quote, QuoteRequest
 from fleet.bus.protocol.messages import Info, MalformedMessage, State
-from fleet.errors import BusError
+from fleet.errors import BusError, Refused
 from fleet.live.clock import FleetClock
 from fleet.robot import ThermalLimits
 from fleet.ros2.cdr import DIAGNOSTICS, JOINT_STATE, read_diagnostics, read_joints, type_hash

@@ -44,7 +44,7 @@ def keys_command(
     """Make, extend and show keys and certificates for mutual TLS."""
     from fleet.bus.security.certificates import HERE
     from fleet.bus.security.keyring import add as add_to
-    from fleet.bus.security.keyring import make, spans_of
+    from fleet.bus.security.keyring import lifetimes, make
 
     if add and (scenario or extra):
         raise FleetError("--add extends the present keys; leave SCENARIO and --extra out.")
@@ -63,7 +63,7 @@ def keys_command(
     for text in add or ():
         add_to(folder, participant_of(text), days=days, hosts=host or HERE, overwrite=overwrite)
     roster = read_roster(folder)
-    spans = spans_of(folder, roster)
+    spans = lifetimes(folder, roster)
     if as_json:
         print_json(_plain(roster, {name: end for name, (_, end) in spans.items()}))
         return
@@ -91,14 +91,14 @@ def participant_of(text: str) -> Participant:
 
 
 def _table(roster: Roster, spans: dict[str, tuple[datetime, datetime]]) -> Table:
-    from fleet.bus.security.certificates import CA, told
+    from fleet.bus.security.certificates import CA, format_time
 
     table = plain_table("participant", "role", "certificate ends", numbers=False)
     now = datetime.now(UTC)
     rows = [("(authority)", "", spans[CA]), *((one.name, one.role, spans[one.name]) for one in roster.participants)]
     for name, role, (begin, end) in rows:
         not_now = ", expired" if end < now else ", not yet valid" if begin > now else ""
-        table.add_row(name, role, told(end) + not_now)
+        table.add_row(name, role, format_time(end) + not_now)
     return table
 
 
@@ -107,7 +107,7 @@ def _plain(roster: Roster, ends: dict[str, datetime]) -> dict[str, object]:
 
     def row(one: Participant) -> dict[str, object]:
         who = {"name": one.name, "role": one.role, "common_name": one.common_name, "ends": ends[one.name].isoformat()}
-        return {**who, **asdict(rights(roster.fleet, one, alone=roster.alone))}
+        return {**who, **asdict(rights(roster.fleet, one, by_consensus=roster.by_consensus))}
 
     return {
         "fleet": roster.fleet,

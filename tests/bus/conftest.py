@@ -1,13 +1,23 @@
-"""Broadcasts for every test of an exchange."""
+"""Broadcasts for the tests of exchanges; routers and keys for those of security."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
+from pathlib import Path
 
 import numpy as np
 import pytest
 import zenoh
 
+from fleet.bus.client.router import Router, open_client
 from fleet.bus.exchange.protocol import Broadcast, PeerView
+from fleet.bus.security.access_control import of_arms
+from fleet.bus.security.keyring import make
+from fleet.bus.security.tls import Tls
+
+ARMS = ("arm_0", "arm_1", "arm 2/*@")
+PATIENT_S = 20.0
+Connect = Callable[[str], zenoh.Session]
 
 
 def random_words(rng: np.random.Generator, arms: int, time_s: float, slots: int = 4) -> Broadcast:
@@ -61,3 +71,56 @@ def stranger(endpoint: str, tls: Mapping[str, object] | None = None, mode: str =
 @pytest.fixture
 def open_stranger() -> Callable[..., zenoh.Session]:
     return stranger
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The keys of the fleet f."""
+    place = tmp_path_factory.mktemp("keys") / "f"
+    make(place, of_arms("f", ARMS), days=30)
+    return place
+
+
+@pytest.fixture(scope="module")
+def guarded(folder: Path) -> Iterator[Router]:
+    with Router(tls=Tls(folder, "router")) as router:
+        yield router
+
+
+@pytest.fixture(scope="module")
+def open_router() -> Iterator[Router]:
+    with Router() as router:
+        yield router
+
+
+@pytest.fixture(params=["guarded", "open"])
+def side(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture
+def router(side: str, guarded: Router, open_router: Router) -> Router:
+    return guarded if side == "guarded" else open_router
+
+
+@pytest.fixture
+def connect(router: Router, side: str, folder: Path) -> Iterator[Connect]:
+    """Sessions of participants by name, on the guarded and on the open router."""
+    with ExitStack() as stack:
+
+        def session(name: str) -> zenoh.Session:
+            tls = Tls(folder, name) if side == "guarded" else None
+            return stack.enter_context(open_client(router.endpoint, timeout_s=PATIENT_S, tls=tls))
+
+        yield session
+
+
+@pytest.fixture
+def inside() -> Callable[[Router], zenoh.Session]:
+    """The router's own session, which receives everything that the router accepts, whatever its key."""
+
+    def session(router: Router) -> zenoh.Session:
+        assert router._session is not None
+        return router._session
+
+    return session

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from fleet.bus.security import certificates
 from fleet.bus.security.access_control import ROSTER, Participant, Roster, of_arms, read_roster
 from fleet.bus.security.certificates import LONGEST_DAYS, check, issue, new_authority, read
-from fleet.bus.security.keyring import add, make, spans_of
+from fleet.bus.security.keyring import add, lifetimes, make
 from fleet.errors import BusError
 
 ARMS = ("arm_0", "arm 2/*@")
@@ -123,7 +123,7 @@ def test_everybody_has_a_pair_and_the_roster_names_them(folder):
     assert roster == of_arms("f", ARMS)
     files = {participant.file for participant in roster.participants} | {"ca"}
     assert {p.name for p in folder.iterdir()} == {f"{f}.{end}" for f in files for end in ("pem", "key")} | {ROSTER}
-    assert set(spans_of(folder, roster)) == {*ARMS, "ca", "router", "auctioneer", "submitter", "monitor", "recorder"}
+    assert set(lifetimes(folder, roster)) == {*ARMS, "ca", "router", "auctioneer", "submitter", "monitor", "recorder"}
     for participant in roster.participants:
         assert certificates.common_name(check(folder, participant.file)) == participant.common_name
 
@@ -151,7 +151,7 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path, what):
     place.mkdir()
     (place / what).write_text("mine")
     for overwrite in (False, True):
-        with pytest.raises(BusError, match="holds something else"):
+        with pytest.raises(BusError, match="is not a folder of keys"):
             make(place, of_arms("f", ["a"]), days=3, overwrite=overwrite)
     assert contents(place) == {what: b"mine"}
 
@@ -212,7 +212,7 @@ def test_one_is_added_by_the_same_authority_once(tmp_path):
     assert {name for name in after if after[name] != before.get(name)} == {"gateway.pem", "gateway.key", ROSTER}
     with pytest.raises(BusError, match="'gateway' has a certificate"):
         add(place, Participant("gateway", "submitter"), days=3)
-    with pytest.raises(BusError, match=r"of the role submitter in .* not monitor"):
+    with pytest.raises(BusError, match=r"has the role submitter in .* not monitor"):
         add(place, Participant("gateway", "monitor"), days=3, overwrite=True)
     with pytest.raises(BusError, match="'GATEWAY' is taken"):
         add(place, Participant("GATEWAY", "monitor"), days=3)
@@ -239,14 +239,14 @@ def test_an_expired_authority_signs_nothing_and_vouches_for_nobody(tmp_path):
 @pytest.mark.parametrize(
     ("damage", "complaint"),
     [
-        ({"a.pem": b"-----BEGIN"}, r"a\.pem' is no certificate"),
-        ({"a.key": b""}, r"a\.key' is no private key"),
-        ({"ca.pem": b"\xff"}, r"ca\.pem' is no certificate"),
+        ({"a.pem": b"-----BEGIN"}, r"a\.pem' is not a certificate"),
+        ({"a.key": b""}, r"a\.key' is not a private key"),
+        ({"ca.pem": b"\xff"}, r"ca\.pem' is not a certificate"),
         ({"a.pem": None}, r"There is no '.*a\.pem'; thermofleet keys"),
-        ({ROSTER: b"{"}, "is no roster"),
-        ({ROSTER: b'{"fleet":"f","participants":[{"name":"a","role":"king"}]}'}, "is no roster: .*king"),
-        ({ROSTER: b'{"fleet":"","participants":[]}'}, "is no roster: .*empty"),
-        ({ROSTER: None}, "no folder of keys"),
+        ({ROSTER: b"{"}, "is not a roster"),
+        ({ROSTER: b'{"fleet":"f","participants":[{"name":"a","role":"king"}]}'}, "is not a roster: .*king"),
+        ({ROSTER: b'{"fleet":"","participants":[]}'}, "is not a roster: .*empty"),
+        ({ROSTER: None}, "not a folder of keys"),
     ],
 )
 def test_what_is_damaged_is_named(tmp_path, damage, complaint):
@@ -261,7 +261,7 @@ def test_what_is_damaged_is_named(tmp_path, damage, complaint):
 
 
 def test_hosts_that_cannot_be_are_refused(tmp_path):
-    with pytest.raises(BusError, match="no host name"):
+    with pytest.raises(BusError, match="not a host name"):
         make(tmp_path / "k", of_arms("f", ["a"]), days=3, hosts=["münchen.example"])
     assert list(tmp_path.iterdir()) == []
 
@@ -287,7 +287,7 @@ def test_files_stay_in_the_folder_and_differ(arms, fleet):
     [
         (["a", "A"], "taken"),
         (["router"], "taken"),
-        (["ca"], "may be named"),
+        (["ca"], "cannot be named"),
         (["x" * 61], "64 are allowed"),
         ([""], "empty"),
     ],

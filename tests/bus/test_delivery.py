@@ -18,7 +18,9 @@ DT_S = 10.0
 def carry(delivery: Delivery, now_s: float, *, missing: tuple[int, int] | None = None) -> np.ndarray:
     """The times at which the words that every arm now has were said, [receiver, sender]; −inf for none."""
     arms = len(delivery.conditions)
-    conditions: list[list[Condition | None]] = [[Condition(now_s, 0, 0.0) for _ in range(arms)] for _ in range(arms)]
+    conditions: list[list[Condition | None]] = [
+        [Condition(now_s, "idle", 0.0) for _ in range(arms)] for _ in range(arms)
+    ]
     scores = [[Scores(now_s, (), [], []) for _ in range(arms)] for _ in range(arms)]
     if missing is not None:
         conditions[missing[0]][missing[1]] = None
@@ -53,8 +55,8 @@ def test_what_is_known_never_grows_older_by_a_word_and_never_comes_before_its_ti
         assert (later >= earlier).all()
     assert ((now_s - known)[:, others] >= channel.delay_s).all()
     assert (known[:, ~others] == now_s[:, 0]).all()  # one's own word is known at once
-    assert np.isneginf(known[:, ~channel.hears(ARMS) & others]).all()
-    assert delivery.delivered + delivery.late <= 15 * channel.hears(ARMS).sum()
+    assert np.isneginf(known[:, ~channel.links(ARMS) & others]).all()
+    assert delivery.delivered + delivery.late <= 15 * channel.links(ARMS).sum()
 
 
 @given(st.sampled_from([0.0, 3.0, 10.0, 25.0]), st.sampled_from([1.0, 10.0, 35.0]), st.integers(0, 100))

@@ -67,8 +67,8 @@ def test_every_key_has_the_speakers_that_it_should_have(message):
 
 def test_arms_without_an_auctioneer_answer_outsiders_and_nobody_else_does():
     roster = of_arms("f", ARMS, auctioneer=False)
-    assert roster.alone
-    assert not of_arms("f", ARMS).alone
+    assert roster.by_consensus
+    assert not of_arms("f", ARMS).by_consensus
     rules = access_control(roster)
     for key, participant in product(EVERY_KEY, roster.participants):
         place = keys.parse(key)
@@ -118,5 +118,5 @@ def test_no_name_of_an_arm_reaches_into_another(arms):
 
 
 def test_a_name_that_is_not_there_is_told_with_those_that_are():
-    with pytest.raises(BusError, match=r"No 'arm_3' takes part in the fleet 'f'; did you mean 'arm_\d'\? Allowed: "):
+    with pytest.raises(BusError, match=r"The fleet 'f' has no participant 'arm_3'; did you mean 'arm_\d'\? Allowed: "):
         of_arms("f", ["arm_0", "arm_1"]).named("arm_3")

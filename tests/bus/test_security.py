@@ -9,20 +9,14 @@ import itertools
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
-from pathlib import Path
+from collections.abc import Callable
 
-import numpy as np
 import pytest
 import zenoh
 from zenoh import ext
 
 from fleet.bus.client.client import BusClient, Refused
 from fleet.bus.client.replies import Replies
-from fleet.bus.client.router import Router, open_client
-from fleet.bus.exchange.memory import MemoryExchange
-from fleet.bus.exchange.zenoh import ZenohExchange
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Ack,
@@ -36,63 +30,12 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, GrantedEntry
 from fleet.bus.protocol.messages import encode, encoding
-from fleet.bus.security.access_control import Participant, of_arms
-from fleet.bus.security.certificates import issue
-from fleet.bus.security.keyring import add, make
 from fleet.bus.security.tls import Tls
 
 ARMS = ("arm_0", "arm_1", "arm 2/*@")
 PATIENT_S = 20.0
 HERE = "thermofleet/v2/f"
 Connect = Callable[[str], zenoh.Session]
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The keys of the fleet f."""
-    place = tmp_path_factory.mktemp("keys") / "f"
-    make(place, of_arms("f", ARMS), days=30)
-    return place
-
-
-@pytest.fixture(scope="module")
-def guarded(folder: Path) -> Iterator[Router]:
-    with Router(tls=Tls(folder, "router")) as router:
-        yield router
-
-
-@pytest.fixture(scope="module")
-def open_router() -> Iterator[Router]:
-    with Router() as router:
-        yield router
-
-
-@pytest.fixture(params=["guarded", "open"])
-def side(request: pytest.FixtureRequest) -> str:
-    return request.param
-
-
-@pytest.fixture
-def router(side: str, guarded: Router, open_router: Router) -> Router:
-    return guarded if side == "guarded" else open_router
-
-
-@pytest.fixture
-def connect(router: Router, side: str, folder: Path) -> Iterator[Connect]:
-    """Sessions of participants by name, on the guarded and on the open router."""
-    with ExitStack() as stack:
-
-        def session(name: str) -> zenoh.Session:
-            tls = Tls(folder, name) if side == "guarded" else None
-            return stack.enter_context(open_client(router.endpoint, timeout_s=PATIENT_S, tls=tls))
-
-        yield session
-
-
-def inside(router: Router) -> zenoh.Session:
-    """The router's own session, which hears all that it lets in, whatever the key."""
-    assert router._session is not None
-    return router._session
 
 
 def settled(session: zenoh.Session) -> None:
@@ -150,7 +93,7 @@ NOBODYS = [("delete", keys.of_arm("f", "arm_1", "difficulty"))]
 
 
 @pytest.mark.parametrize(("what", "key"), [*itertools.product(["put", "delete"], OF_OTHERS), *NOBODYS])
-def test_an_arm_says_nothing_under_the_key_of_another(router, side, connect, what, key):
+def test_an_arm_says_nothing_under_the_key_of_another(router, side, connect, what, key, inside):
     heard: queue.Queue[str] = queue.Queue()
     # On the receiving thread itself: threads of two subscribers between would mix the order up.
     note = zenoh.handlers.Callback(lambda sample: heard.put(str(sample.key_expr)), indirect=False)
@@ -173,7 +116,7 @@ def test_an_arm_says_nothing_under_the_key_of_another(router, side, connect, wha
         ("auctioneer", keys.of_auction("f", "other", "result"), keys.of_jobs("f", "status")),
     ],
 )
-def test_every_role_says_what_is_its_own_and_nothing_else(router, side, connect, name, key, own):
+def test_every_role_says_what_is_its_own_and_nothing_else(router, side, connect, name, key, own, inside):
     heard: queue.Queue[str] = queue.Queue()
     ear = inside(router).declare_subscriber("**", lambda sample: heard.put(str(sample.key_expr)))
     session = connect(name)
@@ -413,88 +356,5 @@ def test_a_late_joiner_gets_the_last_words_and_gaps_are_noticed(connect):
         entity.undeclare()
 
 
-def test_a_whole_exchange_is_the_same_with_every_rule_on(guarded, folder, make_words, assert_same):
-    rng = np.random.default_rng(0)
-    with (
-        ZenohExchange(ARMS, "f", guarded.endpoint, tls=folder, timeout_s=PATIENT_S) as bus,
-        ZenohExchange(ARMS, "f", tls=folder, timeout_s=PATIENT_S) as own,
-        MemoryExchange(ARMS) as memory,
-    ):
-        for tick in range(10):
-            words = make_words(rng, 3, 10.0 * tick, slots=3 + tick % 3)
-            known = memory.share(words)
-            assert_same(bus.share(words), known)
-            assert_same(own.share(words), known)
-        assert (bus.late, bus.malformed, own.late, own.malformed) == (0, 0, 0, 0)
-        assert (own.endpoint or "").startswith("tls/127.0.0.1:")
-
-
-@pytest.mark.parametrize("mode", ["client", "peer", "router"])
-def test_a_certificate_gives_no_more_rights_in_another_mode(open_stranger, guarded, folder, mode):
-    heard: queue.Queue[str] = queue.Queue()
-    with (
-        open_client(guarded.endpoint, timeout_s=PATIENT_S, tls=Tls(folder, "monitor")) as monitor,
-        open_stranger(guarded.endpoint, Tls(folder, "arm_1").link(serves=False), mode) as rogue,
-    ):
-        ears = [
-            session.declare_subscriber(f"{HERE}/**", lambda sample: heard.put(str(sample.key_expr)))
-            for session in (monitor, inside(guarded))
-        ]
-        got: list[str] = []
-        end_s = time.monotonic() + PATIENT_S
-        # A peer or a router sends nothing before it has learnt who listens.
-        while len(got) < 2 and time.monotonic() < end_s:
-            rogue.put(keys.of_arm("f", "arm_0", "state"), b"not mine")
-            rogue.put(keys.of_arm("f", "arm_1", "state"), b"mine")
-            with suppress(queue.Empty):
-                got.append(heard.get(timeout=0.1))
-        assert got == [keys.of_arm("f", "arm_1", "state")] * 2
-        for ear in ears:
-            ear.undeclare()
-
-
-def test_somebody_whom_the_authority_knows_and_the_roster_does_not_may_do_nothing(guarded, folder, tmp_path):
-    """Such as one that was added after the router started."""
-    stranger = tmp_path / "copy"
-    stranger.mkdir()
-    for name in ("ca.pem", "ca.key"):
-        (stranger / name).write_bytes((folder / name).read_bytes())
-    issue(stranger, Participant("arm_9", "arm"), days=1)
-    heard: queue.Queue[str] = queue.Queue()
-    ear = inside(guarded).declare_subscriber("**", lambda sample: heard.put(str(sample.key_expr)))
-    with (
-        open_client(guarded.endpoint, timeout_s=PATIENT_S, tls=Tls(stranger, "arm_9")) as rogue,
-        open_client(guarded.endpoint, timeout_s=PATIENT_S, tls=Tls(folder, "arm_0")) as arm,
-    ):
-        deaf: list[zenoh.Sample] = []
-        subscriber = rogue.declare_subscriber(f"{HERE}/**", deaf.append, allowed_origin=zenoh.Locality.REMOTE)
-        rogue.put(keys.of_arm("f", "arm_9", "state"), b"not in the roster")
-        assert list(rogue.get(f"{HERE}/**", timeout=PATIENT_S)) == []
-        arm.put(keys.of_arm("f", "arm_0", "state"), b"mine")
-        assert heard.get(timeout=PATIENT_S) == keys.of_arm("f", "arm_0", "state")
-        assert list(rogue.get(f"{HERE}/**", timeout=PATIENT_S)) == []
-        assert deaf == []
-        subscriber.undeclare()
-    ear.undeclare()
-
-
 def test_the_router_tells_a_guest_nothing_of_itself(side, connect):
     assert bool(ask(connect("monitor"), "@/*/router")) == (side == "open")
-
-
-def test_one_that_is_added_may_speak_when_the_router_starts_again(tmp_path):
-    place = tmp_path / "k"
-    make(place, of_arms("f", ["arm_0"]), days=30)
-    new, key = Participant("arm_7", "arm"), keys.of_arm("f", "arm_7", "state")
-    add(place, new, days=30)
-    heard: queue.Queue[str] = queue.Queue()
-    for _ in range(2):  # the second time with a new certificate of the same authority
-        with (
-            Router(tls=Tls(place, "router")) as router,
-            open_client(router.endpoint, timeout_s=PATIENT_S, tls=Tls(place, "arm_7")) as arm,
-        ):
-            ear = inside(router).declare_subscriber("**", lambda sample: heard.put(str(sample.key_expr)))
-            arm.put(key, b"mine")
-            assert heard.get(timeout=PATIENT_S) == key
-            ear.undeclare()
-        add(place, new, days=60, overwrite=True)

@@ -91,7 +91,7 @@ def test_an_exchange_is_an_exchange(make: Callable[[], Exchange], make_words):
     with make() as exchange:
         exchange.begin(np.random.default_rng(0))
         heard = exchange.share(make_words(np.random.default_rng(0), 3, 0.0))
-        with pytest.raises(ValueError, match=r"-1 s come after those of 0 s: begin\(\)"):
+        with pytest.raises(ValueError, match=r"-1 s after that of 0 s; begin\(\)"):
             exchange.share(make_words(np.random.default_rng(0), 3, -1.0))
         assert exchange.arms == ARMS
         assert (exchange.delivered, exchange.malformed, exchange.late) == (6, 0, 0)

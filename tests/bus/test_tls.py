@@ -5,7 +5,6 @@ import queue
 import re
 import socket
 import time
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -26,26 +25,6 @@ from fleet.errors import BusError
 ARMS = ("arm_0", "arm_1")
 PATIENT_S = 20.0
 SHORT_S = 0.3
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The keys of the fleet f."""
-    place = tmp_path_factory.mktemp("keys") / "f"
-    make(place, of_arms("f", ARMS), days=30)
-    return place
-
-
-@pytest.fixture(scope="module")
-def guarded(folder: Path) -> Iterator[Router]:
-    with Router(tls=Tls(folder, "router")) as router:
-        yield router
-
-
-@pytest.fixture(scope="module")
-def open_router() -> Iterator[Router]:
-    with Router() as router:
-        yield router
 
 
 def rogue_folder(place: Path, true: Path, how: str) -> Path:
@@ -87,7 +66,7 @@ def test_an_endpoint_that_says_who_connects_is_enough_for_every_command(guarded,
         )  # not its own key: dropped
         assert not link.query_and_wait(keys.of_clock("f"), ClockRequest(), Clock, timeout_s=PATIENT_S).messages
     assert fleets_at(endpoint) == ("f",)
-    with pytest.raises(BusError, match="say whose, as tls/"):
+    with pytest.raises(BusError, match="name it, as tls/"):
         open_client(guarded.endpoint, timeout_s=PATIENT_S)
 
 
@@ -103,10 +82,10 @@ def test_nobody_gets_in_without_a_certificate(open_stranger, guarded, folder):
 
 def test_plain_tcp_and_tls_do_not_meet(guarded, open_router, folder):
     plain = guarded.endpoint.replace("tls/", "tcp/")
-    with pytest.raises(BusError, match=r"No router answered .*speaks TLS"):
+    with pytest.raises(BusError, match=r"No router answered .*expects TLS"):
         open_client(plain, timeout_s=SHORT_S)
     secure = open_router.endpoint.replace("tcp/", "tls/")
-    with pytest.raises(BusError, match=r"No router answered .*speaks no TLS"):
+    with pytest.raises(BusError, match=r"No router answered .*does not use TLS"):
         open_client(secure, timeout_s=SHORT_S, tls=Tls(folder, "arm_0"))
     with pytest.raises(BusError, match="Expected tls/"):
         open_client(open_router.endpoint, timeout_s=SHORT_S, tls=Tls(folder, "arm_0"))
@@ -114,7 +93,7 @@ def test_plain_tcp_and_tls_do_not_meet(guarded, open_router, folder):
 
 def test_keys_of_another_fleet_open_no_line_and_the_reason_is_told(guarded, tmp_path):
     make(tmp_path / "other", of_arms("f", ARMS), days=30)
-    with pytest.raises(BusError, match=r"the certificate of what listens there is refused: .*issuer"):
+    with pytest.raises(BusError, match=r"the server's certificate is not valid: .*issuer"):
         open_client(guarded.endpoint, timeout_s=SHORT_S, tls=Tls(tmp_path / "other", "arm_0"))
 
 
@@ -143,7 +122,7 @@ def test_no_participant_can_play_the_router(folder):
     config = {**listening, "scouting": quiet, "transport": {"link": {"tls": tls}}}
     with (
         zenoh.open(zenoh.Config.from_json5(json.dumps(config))),
-        pytest.raises(BusError, match="the certificate of what listens there is refused"),
+        pytest.raises(BusError, match="the server's certificate is not valid"),
     ):
         open_client(f"tls/127.0.0.1:{port}", timeout_s=SHORT_S, tls=Tls(folder, "arm_1"))
 
@@ -184,7 +163,7 @@ def test_a_router_with_tls_may_listen_elsewhere_and_without_it_not(folder):
     with Router(host="0.0.0.0", tls=Tls(folder, "router")) as router:
         assert router.endpoint.startswith("tls/127.0.0.1:")
         open_client(router.endpoint, timeout_s=PATIENT_S, tls=Tls(folder, "arm_0")).close()
-    with pytest.raises(BusError, match="Without TLS the bus has no authentication"):
+    with pytest.raises(BusError, match="Plain TCP does not authenticate"):
         Router(host="0.0.0.0")
     with pytest.raises(BusError, match="no address to listen on"):
         Router(host="a b/c", tls=Tls(folder, "router"))

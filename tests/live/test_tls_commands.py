@@ -175,11 +175,11 @@ MINUTE = r"20\d\d-\d\d-\d\d \d\d:\d\d UTC"
 
 
 WRONG = {
-    "none": r"^Endpoint '\S+' needs a certificate: say whose, as tls/\S+#FOLDER/NAME\.$",
-    "plain": r"^No router answered at tcp/\S+ within 5\.0 s \(what listens there speaks TLS: .* are needed\)\.$",
+    "none": r"^Endpoint '\S+' needs a certificate; name it, as tls/\S+#FOLDER/NAME\.$",
+    "plain": r"^No router answered at tcp/\S+ within 5\.0 s \(the server expects TLS: .* are needed\)\.$",
     "missing": r"^There is no '\S+/nobody\.pem'; thermofleet keys makes it\.$",
     "wrong role": r"^'\S+/router\.pem' is the certificate of 'router:router'; only the router may use it\.$",
-    "another authority": r"^No router answered .* is refused: .*; are the keys in '\S+' those of another fleet\?\)\.$",
+    "another authority": r"^No router answered .* is not valid: .*; are the keys in '\S+' those of another ",
     "expired": rf"^The certificate '/\S+/k/monitor\.pem' expired on {MINUTE}, and it is {MINUTE} now; issue a new ",
     "not yet": rf"^The certificate '/\S+/k/monitor\.pem' is valid only from {MINUTE} to {MINUTE}, and it is {MINUTE} ",
 }

@@ -39,7 +39,7 @@ def test_options_make_a_channel(small_toml):
         (("--topology-seed", -1), "Error: --topology-seed must be >= 0 (got -1)."),
         (("--loss", 2), "Error: --loss must be a probability, from 0 to 1 (got 2.0)."),
         (("--partition", "soon"), "Error: --partition needs FROM_S:TO_S:ARM,ARM|ARM,ARM"),
-        (("--partition", "0:9:lefft"), "Error: No arm 'lefft' to be in a group of a partition; did you mean 'left'?"),
+        (("--partition", "0:9:lefft"), "Error: A partition names an unknown arm 'lefft'; did you mean 'left'?"),
     ],
 )
 @pytest.mark.parametrize("command", ["run", "compare"])
@@ -80,5 +80,5 @@ def test_a_comparison_says_what_lay_between(thermofleet, small_toml):
 def test_an_exchange_of_strangers_is_an_error_of_the_user(small_toml):
     from scenarios.prepare.fleet import open_exchange
 
-    with pytest.raises(FleetError, match="No arm 'z'"):
+    with pytest.raises(FleetError, match="unknown arm 'z'"):
         open_exchange("memory", ("a", "b"), "f", channel=Channel(partitions=(Partition(0.0, 1.0, (("z",),)),)))

@@ -106,7 +106,7 @@ def test_a_port_in_use_is_one_sentence(capsys):
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (("--host", "0.0.0.0"), "Without TLS the bus has no authentication"),
+        (("--host", "0.0.0.0"), "Plain TCP does not authenticate"),
         (("--host", "192.0.2.1"), "is not on loopback"),
         (("--port", "70000"), "--port must be 0 to 65535"),
         (("--state-hz", "-1"), "--state-hz must be 0 or more"),

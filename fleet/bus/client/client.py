@@ -1,9 +1,9 @@
-"""The one client of the bus: publishes, subscribes, queries and replies, and handles all that arrives on one thread.
+"""The client of the bus: publishes, subscribes, queries and replies, and calls all handlers on one thread.
 
 What each key carries, and with which history, priority and congestion control, is in `fleet.bus.protocol.registry`.
-Zenoh's threads only put what arrives into a queue; `serve` takes it out and calls the handlers. So a participant needs
-no locks, and a handler may publish and query. `query` does not wait: its replies come to a handler too. A malformed
-message is counted, logged and, where it was a request, refused with the reason; it never raises.
+Zenoh's threads only queue what arrives; `serve` calls the handlers. So a participant needs no locks, and a handler may
+publish and query. `query` does not wait: its replies go to a handler, too. A malformed message is counted and logged,
+and never raises; a malformed request is refused with the reason.
 """
 
 import logging
@@ -14,20 +14,21 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from functools import partial
+from itertools import islice
 from queue import Empty
 from threading import Lock
-from typing import Any, Self, TypeVar
+from typing import Any, Self, TypeVar, TypeVarTuple
 
 import msgspec
 import zenoh
 from zenoh import ext as advanced
 
 from fleet.bus.client.queue import Mailbox
-from fleet.bus.client.replies import Replies, check_sender
+from fleet.bus.client.replies import AnotherReplies, Replies, read_message
 from fleet.bus.client.router import open_client, plain_reason
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import MalformedMessage, Refusal, check_name, decode_as, encode, encoding
-from fleet.bus.protocol.registry import channel_for
+from fleet.bus.protocol.registry import Channel, channel_for
 from fleet.bus.security.access_control import Participant, rights_by_role
 from fleet.bus.security.tls import participant_at
 from fleet.errors import BusError, Refused
@@ -37,38 +38,49 @@ _LOG = logging.getLogger(__name__)
 Message = TypeVar("Message", bound=msgspec.Struct)
 Request = TypeVar("Request", bound=msgspec.Struct)
 Reply = TypeVar("Reply", bound=msgspec.Struct)
+Arguments = TypeVarTuple("Arguments")
 
 BACKLOG = 4096
-"""Messages that wait to be handled, at most; the oldest is dropped first."""
-_CONGESTION = {"DROP": zenoh.CongestionControl.DROP, "BLOCK": zenoh.CongestionControl.BLOCK}
-
-
-class AnotherReplies(Exception):
-    """Raised by a handler of requests: another participant will reply."""
 
 
 class BusClient:
-    """`with BusClient(endpoint, fleet) as client:` is connected until the end of the block. One thread uses it.
+    """A participant's connection to the router, for one thread: `with BusClient(endpoint, fleet) as client:`.
 
     Attributes:
         fleet: Name of the fleet, part of every key.
-        malformed: Messages that were not as the contract says.
-        rejections: What was wrong with the last of them.
+        malformed: Number of messages that violate the contract.
+        rejections: The reasons, for the last of them.
         overrun: Messages dropped because `serve` was not called for too long.
     """
 
-    def __init__(self, endpoint: str, fleet: str, *, timeout_s: float = 5.0, backlog: int = BACKLOG) -> None:
-        """Prepare a client of the router at `endpoint`, which has `timeout_s` to accept the connection."""
+    def __init__(
+        self,
+        endpoint: str,
+        fleet: str,
+        *,
+        timeout_s: float = 5.0,
+        backlog: int = BACKLOG,
+        read: Callable[[type[Any], str, str, bytes], tuple[str, Any]] = read_message,
+    ) -> None:
+        """Prepare a client of the router at `endpoint`.
+
+        Args:
+            timeout_s: How long the router may take to accept the connection.
+            backlog: Most messages in the queue; when it is full, the oldest is dropped.
+            read: Reads publications; clients of one process may share a cached `read_message`.
+        """
         self.fleet = fleet
         self.malformed = 0
         self.rejections: deque[str] = deque(maxlen=8)
         self.overrun = 0
         self._endpoint, self._timeout_s = endpoint, timeout_s
-        self._waiting: Mailbox[Callable[[], None]] = Mailbox()
+        self._waiting: Mailbox[tuple[Callable[..., None], tuple[Any, ...]]] = Mailbox()
         self._backlog = backlog
+        self._read = read
+        self._polled: list[tuple[Callable[[], zenoh.Sample | None], Callable[[zenoh.Sample], None]]] = []
         self._overrunning = Lock()
         self._session: zenoh.Session | None = None
-        self._self: Participant | None = None
+        self._participant: Participant | None = None
         self._resources = ExitStack()
         # A process that exits without closing its session would hang.
         self._at_exit = weakref.finalize(self, self._resources.close)
@@ -82,7 +94,7 @@ class BusClient:
         if self._session is None:
             self._session = open_client(self._endpoint, timeout_s=self._timeout_s)
             self._resources.callback(self._session.close)
-            self._self = participant_at(self._endpoint)
+            self._participant = participant_at(self._endpoint)
         return self
 
     def close(self) -> None:
@@ -93,7 +105,7 @@ class BusClient:
         except zenoh.ZError as error:
             raise BusError(f"The session at {self._endpoint} did not close cleanly: {plain_reason(error)}.") from error
         finally:
-            self._waiting = Mailbox()
+            self._waiting, self._polled = Mailbox(), []
 
     def __enter__(self) -> Self:
         return self.open()
@@ -104,43 +116,40 @@ class BusClient:
     # Handling what arrives
 
     def serve(self, until_s: float = -math.inf, *, at_least: int = 1) -> int:
-        """Handle what has arrived, and what arrives until `time.monotonic()` is `until_s`; returns how much it was.
+        """Wait until `time.monotonic()` is `until_s` or `at_least` messages are queued, and handle all that are.
 
-        Waits until `at_least` so many messages are there, or time is up. To be woken once for many messages costs
-        much less than once for each.
+        Returns how many it handled. Waking once for many messages costs much less than once for each.
         """
         self._waiting.wait(at_least, until_s)
         handled = 0
-        for _ in range(len(self._waiting)):
-            try:
-                handle = self._waiting.get()
-            except Empty:  # the oldest was dropped meanwhile
-                break
-            handle()
+        for handle, arguments in self._waiting.drain():
+            handle(*arguments)
             handled += 1
+        for try_recv, take in self._polled:
+            for sample in islice(iter(try_recv, None), self._backlog):
+                take(sample)
+                handled += 1
         return handled
 
-    def post(self, handle: Callable[[], None], *, urgent: bool = False) -> None:
-        """Have something called by `serve`, which an urgent call wakes at once; any thread may post."""
+    def post(self, handle: Callable[[*Arguments], None], *arguments: *Arguments, urgent: bool = False) -> None:
+        """Queue a call of `handle` for `serve`, which an urgent one wakes at once; any thread may post."""
         if len(self._waiting) >= self._backlog:
             with self._overrunning, suppress(Empty):
                 self._waiting.get()
                 self.overrun += 1
                 if self.overrun == 1 or self.overrun % 1000 == 0:
                     _LOG.warning("Dropped %d message(s): they arrive faster than they are handled.", self.overrun)
-        self._waiting.put(handle, urgent=urgent)
+        self._waiting.put((handle, arguments), urgent=urgent)
 
     # Publishing
 
     def publisher(self, key: str, kind: type[Message]) -> Callable[[Message], None]:
-        """A function that publishes messages under one key; late subscribers get as many as the registry says."""
+        """A function that publishes messages under one key; late subscribers get the history that the registry sets."""
         channel = channel_for(key, "publish", kind)
         publisher = advanced.declare_advanced_publisher(
             self._open(),
             key,
-            encoding=encoding(kind),
-            congestion_control=_CONGESTION[channel.congestion],
-            priority=getattr(zenoh.Priority, channel.priority),
+            **_settings(channel, kind),
             cache=advanced.CacheConfig(channel.history),
             publisher_detection=True,
             # Sporadic: the sequence number is repeated only after a publication, so silence costs nothing.
@@ -149,15 +158,9 @@ class BusClient:
         return lambda message: publisher.put(encode(message))
 
     def publish(self, key: str, message: msgspec.Struct) -> None:
-        """Publish a message once to present subscribers; nobody else gets it."""
+        """Publish one message to the present subscribers, without history."""
         channel = channel_for(key, "publish", type(message))
-        self._open().put(
-            key,
-            encode(message),
-            encoding=encoding(type(message)),
-            congestion_control=_CONGESTION[channel.congestion],
-            priority=getattr(zenoh.Priority, channel.priority),
-        )
+        self._open().put(key, encode(message), **_settings(channel, type(message)))
 
     def declare_token(self, key: str) -> None:
         """Show a liveliness token until this client is closed or loses its connection."""
@@ -176,11 +179,11 @@ class BusClient:
         timeout_s: float,
         each: Callable[[Reply], None] = lambda reply: None,
     ) -> None:
-        """Query all that reply under a key or key expression; `done` gets the replies when all are there or time is up.
+        """Query all that reply under a key or key expression; `done` gets the replies, complete or after the timeout.
 
         Args:
             kind: Message type of the replies; one that names another sender than its key is malformed.
-            timeout_s: Real seconds. A stopped process costs this long, unless `each` finds enough replies before.
+            timeout_s: Real seconds. A stopped process costs this long, unless `each` has enough replies before.
             each: Called with every reply as it arrives.
 
         Raises:
@@ -191,32 +194,35 @@ class BusClient:
             raise ValueError(f"'{key}' is answered with {channel.reply}, not with {kind}.")
         self._check_may_query(key)
         replies: Replies[Reply] = Replies()
-        begun_s = time.monotonic()
+        start_s = time.monotonic()
 
-        def receive(reply: zenoh.Reply) -> None:
-            self.post(partial(self._take, reply, kind, replies, each))
+        def take(reply: zenoh.Reply) -> None:
+            if reply.ok is None:
+                replies.miss("" if reply.err is None else reply.err.payload.to_bytes().decode(errors="replace"))
+                return
+            replier = str(reply.ok.key_expr)
+            try:
+                message = replies.take(replier, str(reply.ok.encoding), reply.ok.payload.to_bytes(), kind)
+            except MalformedMessage as error:
+                self.reject(f"reply under '{replier}': {error}")
+            else:
+                if message is not None:
+                    each(message)
 
         def finish() -> None:
-            replies.took_s = time.monotonic() - begun_s
+            replies.took_s = time.monotonic() - start_s
             done(replies)
 
-        # The stub of zenoh types handlers by their internals.
-        handler: Any = zenoh.handlers.Callback(
-            receive,
-            drop=lambda: self.post(finish),
-            indirect=False,
-        )
+        handler = _direct(partial(self.post, take), partial(self.post, finish))
         try:
             self._open().get(
                 key,
                 handler,
                 payload=encode(request),
-                encoding=encoding(type(request)),
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,
-                congestion_control=_CONGESTION[channel.congestion],
-                priority=getattr(zenoh.Priority, channel.priority),
                 timeout=timeout_s,
+                **_settings(channel, type(request)),
             )
         except zenoh.ZError as error:
             raise BusError(f"The query of '{key}' failed: {error}") from error
@@ -224,7 +230,7 @@ class BusClient:
     def query_and_wait(
         self, key: str, request: msgspec.Struct, kind: type[Reply], *, timeout_s: float
     ) -> Replies[Reply]:
-        """As `query`, serving until the replies are there: for participants that do nothing else meanwhile."""
+        """As `query`, and serve until the replies are complete."""
         complete: list[Replies[Reply]] = []
         self.query(key, request, kind, complete.append, timeout_s=timeout_s)
         deadline_s = time.monotonic() + timeout_s + 1.0
@@ -237,15 +243,12 @@ class BusClient:
     def reply_to(self, key: str, kind: type[Request], handle: Callable[[Request], msgspec.Struct]) -> None:
         """Reply to queries of a concrete key; `handle` may raise `Refused` or `AnotherReplies`.
 
-        Where the key ends in `*`, the place of the querier (`keys.asked_by_every_arm`), replies go under the key of
-        the query. A request that names another arm than that key is malformed.
+        A key may end in `*` for the querier (`keys.asked_by_every_arm`); replies then go under the key of the query. A
+        request that names another arm than that key is malformed.
         """
         channel_for(key, "query", kind)
-        self._keep(
-            self._open().declare_queryable(
-                key, _direct(lambda query: self.post(partial(self._reply, key, query, kind, handle))), complete=True
-            )
-        )
+        receive = _direct(lambda query: self.post(self._reply, key, query, kind, handle))
+        self._keep(self._open().declare_queryable(key, receive, complete=True))
 
     def subscribe(
         self,
@@ -255,17 +258,30 @@ class BusClient:
         *,
         history: bool = False,
         own: bool = True,
+        wake: bool = True,
     ) -> None:
         """Receive all messages of one key expression; `handle` gets the name in the key and the message.
 
         Args:
-            history: Also get what publishers have cached, now and after a break, and have lost messages resent.
-            own: Also get what this client publishes.
+            history: Also receive what publishers have cached, now and after a break, and messages lost in transit.
+            own: Also receive what this client publishes.
+            wake: Wake `serve` for a message. Otherwise it waits in Zenoh, without Python's global lock, until `serve`
+                handles another one.
         """
         channel = channel_for(expression, "publish", kind)
         origin = zenoh.Locality.ANY if own else zenoh.Locality.REMOTE
-        receive = _direct(lambda sample: self.post(partial(self._receive, sample, kind, handle)))
-        self._keep(
+
+        def take(sample: zenoh.Sample) -> None:
+            try:
+                payload = sample.payload.to_bytes()
+                name, message = self._read(kind, str(sample.key_expr), str(sample.encoding), payload)
+            except ValueError as error:
+                self.reject(f"under '{sample.key_expr}': {error}")
+            else:
+                handle(name, message)
+
+        receive = _direct(partial(self.post, take)) if wake else zenoh.handlers.RingChannel(self._backlog)
+        subscriber = (
             advanced.declare_advanced_subscriber(
                 self._open(),
                 expression,
@@ -277,22 +293,25 @@ class BusClient:
             if history
             else self._open().declare_subscriber(expression, receive, allowed_origin=origin)
         )
+        self._keep(subscriber)
+        if not wake:
+            self._polled.append((subscriber.try_recv, take))
 
     def watch_tokens(self, expression: str, handle: Callable[[str, bool], None]) -> None:
-        """Follow liveliness tokens: `handle` gets the name in the key, and whether the token is there.
+        """Follow liveliness tokens: `handle` gets the name in the key, and whether the token is present.
 
         The same change may be reported twice.
         """
         channel_for(expression, "token")
 
         def receive(sample: zenoh.Sample) -> None:
-            there = sample.kind == zenoh.SampleKind.PUT
-            self.post(partial(self._token, str(sample.key_expr), there, handle), urgent=True)
+            present = sample.kind == zenoh.SampleKind.PUT
+            self.post(self._token, str(sample.key_expr), present, handle, urgent=True)
 
         self._keep(self._open().liveliness().declare_subscriber(expression, _direct(receive), history=True))
 
     def tokens(self, expression: str, *, timeout_s: float) -> frozenset[str]:
-        """Names in the keys of the liveliness tokens that are there now; waits for the router's reply."""
+        """Names in the keys of the present liveliness tokens; waits for the router's reply."""
         names: set[str] = set()
         for reply in self._open().liveliness().get(expression, timeout=timeout_s):
             if reply.ok is not None:
@@ -309,17 +328,17 @@ class BusClient:
     # Inside
 
     def _check_may_query(self, key: str) -> None:
-        if self._self is None:
+        if self._participant is None:
             return
         queried = zenoh.KeyExpr(key)
         allowed = [
             role
-            for role, rights in rights_by_role(self.fleet, self._self.name).items()
+            for role, rights in rights_by_role(self.fleet, self._participant.name).items()
             if any(zenoh.KeyExpr(expression).includes(queried) for expression in rights.queries)
         ]
-        if self._self.role not in allowed:
+        if self._participant.role not in allowed:
             needed = f"; that takes a certificate of the role {' or '.join(allowed)}" if allowed else ""
-            raise BusError(f"'{self._self.common_name}' may not query '{key}'{needed}.")
+            raise BusError(f"'{self._participant.common_name}' may not query '{key}'{needed}.")
 
     def _open(self) -> zenoh.Session:
         if self._session is None:
@@ -330,41 +349,13 @@ class BusClient:
         """Keep a declared entity until the client is closed: Zenoh undeclares what is garbage-collected."""
         self._resources.callback(lambda: entity)
 
-    def _token(self, key: str, there: bool, handle: Callable[[str, bool], None]) -> None:
+    def _token(self, key: str, present: bool, handle: Callable[[str, bool], None]) -> None:
         try:
             name = keys.parse(key).name
         except ValueError as error:
             self.reject(str(error))
         else:
-            handle(name, there)
-
-    def _receive(self, sample: zenoh.Sample, kind: type[Message], handle: Callable[[str, Message], None]) -> None:
-        try:
-            sender = keys.parse(str(sample.key_expr))
-            message = check_sender(decode_as(kind, str(sample.encoding), sample.payload.to_bytes()), sender)
-        except (ValueError, MalformedMessage) as error:
-            self.reject(f"under '{sample.key_expr}': {error}")
-        else:
-            handle(sender.name, message)
-
-    def _take(
-        self,
-        reply: zenoh.Reply,
-        kind: type[Reply],
-        replies: Replies[Reply],
-        each: Callable[[Reply], None],
-    ) -> None:
-        if reply.ok is None:
-            replies.miss("" if reply.err is None else reply.err.payload.to_bytes().decode(errors="replace"))
-            return
-        key = str(reply.ok.key_expr)
-        try:
-            message = replies.take(key, str(reply.ok.encoding), reply.ok.payload.to_bytes(), kind)
-        except MalformedMessage as error:
-            self.reject(f"reply under '{key}': {error}")
-        else:
-            if message is not None:
-                each(message)
+            handle(name, present)
 
     def _reply(
         self, key: str, query: zenoh.Query, kind: type[Request], handle: Callable[[Request], msgspec.Struct]
@@ -391,6 +382,18 @@ class BusClient:
             query.reply(own_key, encode(reply), encoding=encoding(type(reply)))
 
 
-def _direct(handle: Callable[[Any], None]) -> Any:  # as above
-    """A handler on Zenoh's receiving thread itself: it only enqueues, so a Python thread between would only cost."""
-    return zenoh.handlers.Callback(handle, indirect=False)
+# Any in both: Zenoh's stubs have no types for settings, and type handlers by their internals.
+
+
+def _settings(channel: Channel, kind: type[msgspec.Struct]) -> dict[str, Any]:
+    """How Zenoh transports a message of this type."""
+    return {
+        "encoding": encoding(kind),
+        "congestion_control": getattr(zenoh.CongestionControl, channel.congestion),
+        "priority": getattr(zenoh.Priority, channel.priority),
+    }
+
+
+def _direct(handle: Callable[[Any], None], drop: Callable[[], None] | None = None) -> Any:
+    """A handler on Zenoh's receiving thread: it only queues, so a Python thread in between would only cost time."""
+    return zenoh.handlers.Callback(handle, drop, indirect=False)

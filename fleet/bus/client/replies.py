@@ -1,16 +1,24 @@
 """Replies to one query: messages, refusals and timeouts, by the key of the replier."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 import msgspec
 
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.messages import MalformedMessage, Refusal, check_name, decode, decode_as, encoding
+from fleet.bus.protocol.messages import MalformedMessage, Refusal, check_name, decode_as, encoding
 
 Message = TypeVar("Message", bound=msgspec.Struct)
 Entry = TypeVar("Entry")
+
+_SENDER: Mapping[str, str] = {"arm": "arm", "auction": "auctioneer"}
+"""The field of a message that names the sender, by the role in its key."""
+
+
+class AnotherReplies(Exception):
+    """Raised by a handler of requests: another participant will reply."""
 
 
 @dataclass(eq=False)
@@ -31,11 +39,10 @@ class Replies(Generic[Message]):
             MalformedMessage: it is neither, or names another sender than its key; added to `refused`.
         """
         try:
-            sender = keys.parse(key)
             if sent_encoding == encoding(Refusal):
-                _add(self.refused, key, decode(Refusal, payload).reason)
+                _add(self.refused, key, read_message(Refusal, key, sent_encoding, payload)[1].reason)
                 return None
-            message = check_sender(decode_as(kind, sent_encoding, payload), sender)
+            message = read_message(kind, key, sent_encoding, payload)[1]
         except ValueError as error:
             _add(self.refused, key, str(error))
             raise MalformedMessage(str(error)) from error
@@ -47,16 +54,17 @@ class Replies(Generic[Message]):
         _add(self.refused, "?", "" if reason == "Timeout" else reason)
 
 
-def check_sender(message: Message, sender: keys.Key) -> Message:
-    """The message, if it names no other sender than its key does.
+def read_message(kind: type[Message], key: str, sent_encoding: str, payload: bytes) -> tuple[str, Message]:
+    """The name in the key and the message of this type in the payload.
 
     Raises:
-        MalformedMessage: it does.
+        ValueError: not a key of this bus.
+        MalformedMessage: another encoding, not of this type, or the message names another sender than its key.
     """
-    for field_name, role in (("arm", "arm"), ("auctioneer", "auction")):
-        if sender.role == role and hasattr(message, field_name):
-            return check_name(message, sender.name, field_name)
-    return message
+    sender = keys.parse(key)
+    message = decode_as(kind, sent_encoding, payload)
+    name = _SENDER.get(sender.role, "")
+    return sender.name, check_name(message, sender.name, name) if hasattr(message, name) else message
 
 
 def _add(table: dict[str, Entry], key: str, entry: Entry) -> None:

@@ -1,7 +1,7 @@
-"""The router of a fleet, and the transport settings of every session on the bus.
+"""The router of a fleet, and the transport settings of all sessions.
 
-Without TLS no participant proves its identity, so the bus is limited to loopback. With TLS both ends of every
-connection are authenticated, and the router enforces the access control of its roster.
+Plain TCP does not authenticate, so it is limited to loopback. With TLS both ends of every connection are authenticated,
+and the router enforces the access control of its roster.
 """
 
 import ipaddress
@@ -22,9 +22,9 @@ from fleet.errors import BusError
 _LOG = logging.getLogger(__name__)
 
 _ATTEMPTS = 3
-_ENDPOINT = re.compile(r"(?P<how>tcp|tls)/(?:\[(?P<v6>[0-9A-Fa-f:.]+)\]|(?P<host>[^:\[\]/?#]+)):(?P<port>\d{1,5})")
+_ENDPOINT = re.compile(r"(?P<protocol>tcp|tls)/(?:\[(?P<v6>[0-9A-Fa-f:.]+)\]|(?P<host>[^:\[\]/?#]+)):(?P<port>\d{1,5})")
 _ANY_ADDRESS = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}
-"""Addresses that stand for all addresses of this machine, and how this machine itself reaches them."""
+"""Wildcard addresses of a listener, and the address at which this machine reaches it."""
 
 _SCOUTING: Mapping[str, Any] = {
     # Otherwise a router waits half a second to discover others.
@@ -36,27 +36,27 @@ _ACCEPTING: Mapping[str, Any] = {
     # Too many half-open connections keep new ones out (by default 100, 10 s).
     "accept_pending": 1000,
     "accept_timeout": 3000,
-    # A session that closes waits this long for a connection that it is opening to a stopped router.
+    # A closing session waits this long for a connection to a stopped router.
     "open_timeout": 3000,
 }
 _SENDING: Mapping[str, Any] = {
     "lease": round(1000 * SESSION_LEASE_S),
     "queue": {
         "size": {"data": 16},
-        # Microseconds: long enough for a burst of a whole fleet on a busy machine, too short for a stuck peer.
+        # Microseconds: enough for a burst of a whole fleet on a busy machine; a stuck peer is not waited for.
         "congestion_control": {"drop": {"wait_before_drop": 20_000}, "block": {"wait_before_close": 1_000_000}},
     },
 }
 
 
 def loopback(endpoint: str) -> str:
-    """The endpoint, when it is `tcp/<address>:<port>` on this machine's loopback.
+    """The endpoint, if it is `tcp/<address>:<port>` on loopback.
 
     Raises:
-        BusError: anything else, with the reason.
+        BusError: it is not, with the reason.
     """
     match = _ENDPOINT.fullmatch(endpoint)
-    if match is None or match["how"] != "tcp" or not 0 <= int(match["port"]) <= 65535:
+    if match is None or match["protocol"] != "tcp" or not 0 <= int(match["port"]) <= 65535:
         raise BusError(
             f"'{endpoint}' is no endpoint of this bus. Expected tcp/<address>:<port>, as tcp/127.0.0.1:7447."
         )
@@ -67,32 +67,32 @@ def loopback(endpoint: str) -> str:
         address = ipaddress.ip_address(host)
     except ValueError as error:
         raise BusError(
-            f"Endpoint '{endpoint}': the name '{host}' may lead anywhere. Allowed: 127.0.0.1, [::1], localhost."
+            f"Endpoint '{endpoint}': the name '{host}' may be of any host. Allowed: 127.0.0.1, [::1], localhost."
         ) from error
     if not address.is_loopback:
         raise BusError(
-            f"Endpoint '{endpoint}' is not on loopback. Without TLS the bus has no authentication, so whoever reaches "
-            "it could speak for any arm; it stays on 127.0.0.1, [::1] or localhost. With the certificates of "
-            "thermofleet keys, tls/ may lead elsewhere."
+            f"Endpoint '{endpoint}' is not on loopback. Plain TCP does not authenticate, so any process that reaches "
+            "it could act as any arm. Allowed: 127.0.0.1, [::1], localhost; other hosts need tls/ and certificates "
+            "of thermofleet keys."
         )
     return endpoint
 
 
 def reachable(endpoint: str, tls: Tls | None = None) -> str:
-    """The endpoint, when a session may connect to it: on loopback without TLS, anywhere with it.
+    """The endpoint, if a session may connect to it: on loopback without TLS, on any host with it.
 
     Raises:
-        BusError: anything else, with the reason.
+        BusError: it may not, with the reason.
     """
     match = _ENDPOINT.fullmatch(endpoint)
-    if tls is None and match is not None and match["how"] == "tls":
-        raise BusError(f"Endpoint '{endpoint}' needs a certificate: say whose, as {endpoint}#FOLDER/NAME.")
+    if tls is None and match is not None and match["protocol"] == "tls":
+        raise BusError(f"Endpoint '{endpoint}' needs a certificate; name it, as {endpoint}#FOLDER/NAME.")
     if tls is None:
         return loopback(endpoint)
-    if match is None or match["how"] != "tls" or not 0 < int(match["port"]) <= 65535:
+    if match is None or match["protocol"] != "tls" or not 0 < int(match["port"]) <= 65535:
         raise BusError(
-            f"'{endpoint}' is no endpoint to show the certificate of '{tls.name}' at. Expected tls/<address>:<port>, "
-            "as tls/127.0.0.1:7447."
+            f"'{endpoint}' is no endpoint for the certificate of '{tls.name}'. Expected tls/<address>:<port>, as "
+            "tls/127.0.0.1:7447."
         )
     return endpoint
 
@@ -101,11 +101,11 @@ def open_client(endpoint: str, *, timeout_s: float, tls: Tls | None = None) -> z
     """A client session on the router at `endpoint`.
 
     Args:
-        endpoint: As `tcp/127.0.0.1:7447`, or with who connects as `tls/127.0.0.1:7447#FOLDER/NAME`.
-        tls: Who connects, for an endpoint that begins with `tls/` and does not say so itself.
+        endpoint: As `tcp/127.0.0.1:7447`, or with the participant as `tls/127.0.0.1:7447#FOLDER/NAME`.
+        tls: The participant, for an endpoint that begins with `tls/` and does not name one.
 
     Raises:
-        BusError: the endpoint is not on loopback and has no TLS, the certificate is not good, or no router answered
+        BusError: the endpoint is not on loopback and has no TLS, the certificate is not valid, or no router answered
             within `timeout_s`.
     """
     if tls is None:
@@ -140,7 +140,7 @@ class Router:
         Args:
             port: TCP port; 0 lets the system choose a free one.
             host: Address to listen on; without TLS one of loopback.
-            tls: The router's own certificate; the folder's roster gives the rules. None for plain TCP.
+            tls: The router's certificate; the roster of its folder sets the access control. None for plain TCP.
 
         Raises:
             BusError: plain TCP beyond loopback.
@@ -161,7 +161,7 @@ class Router:
 
     @property
     def endpoint(self) -> str:
-        """Where sessions connect, for example `tcp/127.0.0.1:7447`.
+        """Where sessions connect, as `tcp/127.0.0.1:7447`.
 
         Raises:
             BusError: the router is not open.
@@ -174,7 +174,7 @@ class Router:
         """Listen.
 
         Raises:
-            BusError: the port is taken, the system gives none, or the router's certificate is not good.
+            BusError: the port is in use, none is free, or the router's certificate is not valid.
         """
         if self._session is not None:
             return self
@@ -205,10 +205,10 @@ class Router:
         raise problem
 
     def close(self) -> None:
-        """Stop listening and drop every link; twice is fine.
+        """Stop listening and close all connections; may be called twice.
 
         Raises:
-            BusError: the router could not be closed in order.
+            BusError: the router did not close cleanly.
         """
         session, self._session, self._endpoint = self._session, None, None
         if session is None:
@@ -216,7 +216,7 @@ class Router:
         try:
             session.close()
         except zenoh.ZError as error:
-            raise BusError(f"The router did not close in order ({plain_reason(error)}).") from error
+            raise BusError(f"The router did not close cleanly ({plain_reason(error)}).") from error
 
     def __enter__(self) -> Self:
         return self.open()
@@ -228,7 +228,7 @@ class Router:
         own = {
             "mode": "router",
             "listen": {"endpoints": [self._listen]},
-            # Only the router's own description contains the port that the system chose.
+            # The admin space holds the port that the system chose.
             "adminspace": {"enabled": True, "permissions": {"read": True, "write": False}},
             **self._limits.settings(),
         }
@@ -240,7 +240,7 @@ class Router:
         return _config(own, link)
 
     def _where(self, session: zenoh.Session) -> str:
-        """The endpoint that a router session listens on, from its own description."""
+        """The endpoint that a router session listens on, from its admin space."""
         for reply in session.get(f"@/{session.zid()}/router", timeout=5.0):
             if reply.ok is None:
                 continue
@@ -249,7 +249,7 @@ class Router:
             if len(ports) == 1:
                 host = _ANY_ADDRESS.get(self._host.strip("[]"), self._host)
                 return f"{self._listen[:3]}/{host}:{ports.pop()}"
-        raise BusError("The router opened, but does not tell on which port it listens.")
+        raise BusError("The router opened, but its port is unknown.")
 
 
 def _config(own: Mapping[str, Any], link: Mapping[str, Any]) -> zenoh.Config:

@@ -1,6 +1,6 @@
 """Communication channels between arms: topology, delay, loss and partitions.
 
-A channel is a plain value; `fleet.bus.exchange.delivery` applies it, the same in memory and over Zenoh.
+A channel is a plain value; `fleet.bus.exchange.delivery` applies it, in memory and over Zenoh alike.
 """
 
 import math
@@ -44,13 +44,13 @@ class Partition:
         """Which links it cuts, bool, [receiver, sender].
 
         Raises:
-            ValueError: a group names an arm that is not there.
+            ValueError: a group names an unknown arm.
         """
         group = np.full(len(arms), -1)
         for number, members in enumerate(self.groups):
             for arm in members:
                 if arm not in arms:
-                    raise ValueError(f"No arm '{arm}' to be in a group of a partition{nearest(arm, arms)}")
+                    raise ValueError(f"A partition names an unknown arm '{arm}'{nearest(arm, arms)}")
                 group[list(arms).index(arm)] = number
         return group[:, None] != group[None, :]
 
@@ -60,21 +60,21 @@ class Channel:
     """How broadcasts reach peers. The default is perfect: every arm receives every broadcast at once."""
 
     topology: TopologyName | nx.Graph = "complete"
-    """Which arms receive from which; broadcasts are not forwarded. A star has the first arm in the middle; ring and
-    line have the arms in the fleet's order. In a networkx graph of names of arms an edge connects both directions, a
-    directed one carries from tail to head, and an arm that is no node is alone."""
+    """Which arms receive from which; broadcasts are not forwarded. A star has the first arm in the middle; a ring and a
+    line have the fleet's order. A networkx graph has names of arms as nodes: an edge connects both ways, a directed one
+    from tail to head, and an arm without a node has no link."""
     radius: float = 0.5
-    """Of `random_geometric`: arms are at random places in the unit square and receive from those within this radius."""
+    """For `random_geometric`: arms at random places in the unit square receive from those within this radius."""
     topology_seed: int = 0
-    """Of `random_geometric`: seed of the places."""
+    """For `random_geometric`: seed of the places."""
     delay_s: float = 0.0
     """Minimum delay of a broadcast, simulation seconds."""
     jitter_s: float = 0.0
-    """Additional delay: drawn for each broadcast on each link, uniform from 0 to this."""
+    """Additional delay of each broadcast on each link, uniform from 0 to this."""
     loss: float = 0.0
-    """Probability that a broadcast is lost on a link, drawn for each."""
+    """Probability that a broadcast is lost on a link, independent for each."""
     partitions: tuple[Partition, ...] = ()
-    """A broadcast that is in transit on a link while a partition cuts it is lost."""
+    """A broadcast in transit on a link is lost when a partition cuts the link."""
 
     def __post_init__(self) -> None:
         if isinstance(self.topology, str) and self.topology not in TOPOLOGIES:
@@ -110,7 +110,7 @@ class Channel:
         if not isinstance(self.topology, str):
             for node in self.topology:
                 if node not in arms:
-                    raise ValueError(f"No arm '{node}' to be a node of the graph{nearest(str(node), arms)}")
+                    raise ValueError(f"The graph has an unknown arm '{node}'{nearest(str(node), arms)}")
             return self.topology
         graph = nx.Graph()
         graph.add_nodes_from(arms)
@@ -131,23 +131,18 @@ class Channel:
         graph.remove_edges_from(list(nx.selfloop_edges(graph)))
         return graph
 
-    def hears(self, arms: Sequence[str]) -> Array:
+    def links(self, arms: Sequence[str]) -> Array:
         """Which arms receive from which, bool, [receiver, sender], False on the diagonal; raises as `graph`."""
         graph = self.graph(arms)
-        place = {arm: index for index, arm in enumerate(arms)}
-        found = np.zeros((len(arms), len(arms)), dtype=bool)
-        for tail, head in graph.edges():
-            found[place[head], place[tail]] = True
-            if not graph.is_directed():
-                found[place[tail], place[head]] = True
-        np.fill_diagonal(found, False)
-        return found
+        links = np.array([[graph.has_edge(sender, receiver) for sender in arms] for receiver in arms])
+        np.fill_diagonal(links, False)
+        return links
 
     def check(self, arms: Sequence[str]) -> None:
         """Refuse a channel that names unknown arms.
 
         Raises:
-            ValueError: names the arm, and those that are there.
+            ValueError: names the arm, and the known ones.
         """
         self.graph(arms)
         for partition in self.partitions:

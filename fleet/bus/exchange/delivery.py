@@ -1,8 +1,7 @@
-"""Applies a channel to broadcasts: delays them, loses some, and keeps what every arm has received.
+"""Applies a channel to broadcasts: delays them, drops some, and keeps what every arm has received.
 
-Both exchanges pass broadcasts through a `Delivery`. What is lost or delayed depends on the channel, the time and the
-random generator of the episode, never on the content or the exchange, so one seed loses and delays the same broadcasts
-in memory and over Zenoh.
+Both exchanges use it. Delay and loss depend on the channel, the time and the episode's random generator, never on the
+content or the exchange. So a seed delays and loses the same broadcasts in memory and over Zenoh.
 """
 
 from collections.abc import Sequence
@@ -11,11 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.bus.exchange.channel import Channel
-from fleet.bus.exchange.protocol import Array, Condition, Scores
-
-AllConditions = Sequence[Sequence[Condition | None]]
-"""[receiver][sender]; None for a broadcast that did not arrive."""
-AllScores = Sequence[Sequence[Scores | None]]
+from fleet.bus.exchange.protocol import AllConditions, AllScores, Array, Condition, Scores
+from fleet.bus.protocol.messages import DifficultyScores, State
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,10 +26,10 @@ class _Batch:
 
 
 class Delivery:
-    """What every arm has received of every other through a channel; one episode after the other.
+    """The broadcasts that every arm has received through a channel, in one episode after the other.
 
-    A lost broadcast is not sent again: its receiver keeps the last one it had. A broadcast that another one overtook is
-    ignored. Times are those of the broadcasts; there is no clock.
+    A lost broadcast is not sent again: its receiver keeps the last one. A broadcast that arrives after a later one is
+    ignored. The time is that of the broadcasts.
     """
 
     def __init__(self, arms: Sequence[str], channel: Channel, rng: np.random.Generator | None = None) -> None:
@@ -50,31 +46,31 @@ class Delivery:
         self.late = 0
         """Broadcasts that were lost, or that the bus itself did not deliver in their step, over all episodes."""
         self._channel = channel
-        self._hears = channel.hears(arms)
-        self._links = int(self._hears.sum())
+        self._linked = channel.links(arms)
+        self._links = int(self._linked.sum())
         self._cuts = [(p.from_s, p.to_s, p.cuts(arms)) for p in channel.partitions]
         self._arms = len(arms)
         self._rng = rng
         self.begin(rng)
 
     def begin(self, rng: np.random.Generator | None = None) -> None:
-        """Begin an episode: forget what was received and what is in transit; draw from `rng` from now on."""
+        """Begin an episode without broadcasts received or in transit; `rng` is for loss and jitter."""
         self._rng = rng or self._rng
-        self.conditions: list[list[Condition | None]] = [[None] * self._arms for _ in range(self._arms)]
-        """The last content that each arm has of each, [receiver][sender]."""
-        self.scores: list[list[Scores | None]] = [[None] * self._arms for _ in range(self._arms)]
+        self.conditions: list[list[Condition | State | None]] = [[None] * self._arms for _ in range(self._arms)]
+        """Last content received, [receiver][sender]."""
+        self.scores: list[list[Scores | DifficultyScores | None]] = [[None] * self._arms for _ in range(self._arms)]
         self._tick = -1
-        self._known = np.full((self._arms, self._arms), -1)
+        self._newest = np.full((self._arms, self._arms), -1)
         self._in_transit: list[_Batch] = []
 
     def carry(self, now_s: float, conditions: AllConditions, scores: AllScores) -> None:
-        """Take the broadcasts of one step, and put everything that is due by now into `conditions` and `scores`.
+        """Send the broadcasts of one step, and put everything that is due by now into `conditions` and `scores`.
 
         Args:
-            conditions: As each receiver would have them without delay, [receiver][sender]; the same for scores.
+            conditions: As each receiver would have them without delay, [receiver][sender]; scores likewise.
 
         Raises:
-            ValueError: the channel draws by chance, and no `rng` was given.
+            ValueError: the channel has loss or jitter, and no `rng` was given.
         """
         self._tick += 1
         self._in_transit.append(_Batch(self._tick, self._due_s(now_s), conditions, scores))
@@ -89,12 +85,12 @@ class Delivery:
 
     def _due_s(self, now_s: float) -> Array:
         """When each broadcast of this step arrives, [receiver, sender]; inf for lost ones."""
-        channel, shape = self._channel, self._hears.shape
-        due_s = np.where(self._hears, now_s + channel.delay_s, np.inf)
+        channel, shape = self._channel, self._linked.shape
+        due_s = np.where(self._linked, now_s + channel.delay_s, np.inf)
         if channel.by_chance:
             if self._rng is None:
-                raise ValueError("A channel with loss or jitter needs an rng to draw from: begin(rng) gives it one.")
-            # Both are always drawn, so that more jitter does not lose other broadcasts.
+                raise ValueError("A channel with loss or jitter needs an rng; pass one to begin().")
+            # Always draws both, so that a change of jitter does not change which broadcasts are lost.
             lost, longer = self._rng.random((2, *shape))
             due_s += channel.jitter_s * longer
             due_s[lost < channel.loss] = np.inf
@@ -105,8 +101,8 @@ class Delivery:
         return due_s
 
     def _deliver(self, batch: _Batch, due: Array) -> None:
-        """Deliver what is due of a batch; everything is counted, but only newer broadcasts are kept."""
-        news = due & (self._known < batch.tick)
+        """Deliver the due broadcasts of a batch: count all, keep those newer than the last."""
+        news = due & (self._newest < batch.tick)
         batch.due_s[due] = np.inf
         for receiver in np.flatnonzero(due.any(axis=1)).tolist():
             conditions, scores = batch.conditions[receiver], batch.scores[receiver]
@@ -118,4 +114,4 @@ class Delivery:
             for sender in np.flatnonzero(news[receiver]).tolist():
                 self.conditions[receiver][sender] = conditions[sender]
                 self.scores[receiver][sender] = scores[sender]
-        self._known[news] = batch.tick
+        self._newest[news] = batch.tick

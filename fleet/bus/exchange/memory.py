@@ -1,4 +1,4 @@
-"""The exchange without a bus: for training and sweeps, and to judge a policy on a channel that is not perfect."""
+"""The exchange without a bus: for training, for sweeps, and for tests of a policy on a channel that is not perfect."""
 
 from collections.abc import Sequence
 from typing import Self
@@ -18,10 +18,11 @@ from fleet.bus.exchange.protocol import (
     checked_arms,
 )
 from fleet.errors import BusError
+from fleet.telemetry import MODES
 
 
 class MemoryExchange:
-    """Shares broadcasts in memory through a channel. Times are those of the broadcasts; the exchange has no clock."""
+    """Shares broadcasts in memory through a channel, on the time of the broadcasts."""
 
     def __init__(
         self, arms: Sequence[str], channel: Channel = PERFECT, *, rng: np.random.Generator | None = None
@@ -48,33 +49,33 @@ class MemoryExchange:
         return self._delivery is None
 
     def begin(self, rng: np.random.Generator | None = None) -> None:
-        """Begin an episode: forget what was received and what is in transit; draw from `rng` from now on."""
+        """Begin an episode without messages received or in transit; `rng` is for channels with loss or jitter."""
         self._now_s = -float("inf")
         if self._delivery is not None:
             self._delivery.begin(rng)
 
-    def share(self, words: Broadcast) -> PeerView:
-        """Broadcast one step, and return what every arm knows thereafter.
+    def share(self, broadcast: Broadcast) -> PeerView:
+        """Broadcast one step, and return what every arm knows after it.
 
         Raises:
-            ValueError: the broadcast does not fit the arms or holds infinite numbers; or the channel draws by chance,
-                and there is no rng.
+            ValueError: the broadcast does not fit the arms or holds infinite numbers; or the channel has loss or
+                jitter, and there is no rng.
             BusError: the exchange is closed.
         """
         if self._closed:
             raise BusError("This exchange is closed.")
-        check(words, self.arms)
-        check_order(words.time_s, self._now_s)
-        self._now_s = now_s = float(words.time_s)
-        conditions, scores = _contents_of(words)
+        check(broadcast, self.arms)
+        check_order(broadcast.time_s, self._now_s)
+        self._now_s = now_s = float(broadcast.time_s)
+        conditions, scores = _contents_of(broadcast)
         arms = len(self.arms)
         to_all, all_scores = [conditions] * arms, [scores] * arms
         if self._delivery is None:
             self.delivered += arms * (arms - 1)
-            return assemble(now_s, words.jobs, to_all, all_scores)
+            return assemble(now_s, broadcast.jobs, to_all, all_scores)
         self._delivery.carry(now_s, to_all, all_scores)
         self.delivered, self.late = self._delivery.delivered, self._delivery.late
-        return assemble(now_s, words.jobs, self._delivery.conditions, self._delivery.scores)
+        return assemble(now_s, broadcast.jobs, self._delivery.conditions, self._delivery.scores)
 
     def close(self) -> None:
         """Release all resources; may be called twice."""
@@ -88,12 +89,15 @@ class MemoryExchange:
         self.close()
 
 
-def _contents_of(words: Broadcast) -> tuple[list[Condition], list[Scores]]:
+def _contents_of(broadcast: Broadcast) -> tuple[list[Condition], list[Scores]]:
     """Contents of a broadcast, [arm]; copies, as the caller may reuse its arrays at the next step."""
-    difficulty, p_saturation = np.array(words.difficulty, dtype=float), np.array(words.p_saturation, dtype=float)
-    time_s = float(words.time_s)
+    difficulty, p_saturation = (
+        np.array(broadcast.difficulty, dtype=float),
+        np.array(broadcast.p_saturation, dtype=float),
+    )
+    time_s = float(broadcast.time_s)
     conditions = [
-        Condition(time_s, mode, headroom)
-        for mode, headroom in zip(words.mode.tolist(), words.headroom_k.tolist(), strict=True)
+        Condition(time_s, MODES[mode], headroom)
+        for mode, headroom in zip(broadcast.mode.tolist(), broadcast.headroom_k.tolist(), strict=True)
     ]
-    return conditions, [Scores(time_s, words.jobs, d, p) for d, p in zip(difficulty, p_saturation, strict=True)]
+    return conditions, [Scores(time_s, broadcast.jobs, d, p) for d, p in zip(difficulty, p_saturation, strict=True)]

@@ -1,7 +1,7 @@
-"""The exchange: what every arm broadcasts at a step, and what every arm then knows of every other.
+"""The exchange: broadcasts of every arm at a step, and what every arm then knows of every other.
 
-There are two: `MemoryExchange` without a bus, and `ZenohExchange` over one. With the same channel and random generator
-they return the same arrays. `begin` starts a new episode and forgets everything received.
+`MemoryExchange` works without a bus, `ZenohExchange` over one. With the same channel and random generator they return
+the same arrays.
 """
 
 import math
@@ -11,17 +11,18 @@ from typing import Protocol, Self, TypeVar
 
 import numpy as np
 
-from fleet.telemetry import MODES
+from fleet.bus.protocol.messages import DifficultyScores, State
+from fleet.telemetry import MODES, Mode
 
 Array = np.ndarray
 
 UNHEARD = -1
-"""The mode of an arm of which nothing was received."""
+"""Mode of an arm without a received broadcast."""
 
 
 @dataclass(frozen=True, eq=False)
 class Broadcast:
-    """What every arm broadcasts at one step."""
+    """Broadcasts of every arm at one step."""
 
     time_s: float
     mode: Array
@@ -42,7 +43,7 @@ class Broadcast:
 
 @dataclass(frozen=True, eq=False)
 class PeerView:
-    """What every arm knows of every arm after a step: [receiver, sender, ...]; of itself, its own broadcast."""
+    """What every arm knows of every arm after a step, [receiver, sender, ...]; of itself, its own broadcast."""
 
     mode: Array
     """int, [receiver, sender]; UNHEARD if nothing was received."""
@@ -63,16 +64,16 @@ class Exchange(Protocol):
     delivered: int
     """Broadcasts delivered to a peer in time, over all steps; one per receiver and sender."""
     malformed: int
-    """Messages that were malformed: counted, logged and dropped."""
+    """Malformed messages, which are logged and dropped."""
     late: int
     """Broadcasts that did not reach a peer in their step, over all steps."""
 
     def begin(self, rng: np.random.Generator | None = None) -> None:
-        """Begin an episode: forget what was received; a channel with chance draws from `rng` from now on."""
+        """Begin an episode without any received broadcasts; `rng` is for channels with loss or jitter."""
         ...
 
-    def share(self, words: Broadcast) -> PeerView:
-        """Broadcast one step, and return what every arm knows thereafter.
+    def share(self, broadcast: Broadcast) -> PeerView:
+        """Broadcast one step, and return what every arm knows after it.
 
         Raises:
             ValueError: the broadcast does not fit the arms, holds infinite numbers, or is older than the last one
@@ -92,16 +93,16 @@ class Exchange(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Condition:
-    """State of an arm in its last broadcast."""
+    """State of an arm in its last broadcast: the part of a `State` that peers use."""
 
     time_s: float
-    mode: int
+    mode: Mode
     headroom_k: float
 
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Difficulties of the open jobs in an arm's last broadcast."""
+    """Difficulties of the open jobs in an arm's last broadcast: the part of `DifficultyScores` that peers use."""
 
     time_s: float
     jobs: tuple[str, ...]
@@ -111,43 +112,36 @@ class Scores:
     """[job], NaN where unknown."""
 
 
-Word = TypeVar("Word", Condition, Scores)
+Content = TypeVar("Content")
+AllConditions = Sequence[Sequence[Condition | State | None]]
+"""[receiver][sender]; None for a broadcast that was not received."""
+AllScores = Sequence[Sequence[Scores | DifficultyScores | None]]
 
 
-def assemble(
-    now_s: float,
-    jobs: tuple[str, ...],
-    conditions: Sequence[Sequence[Condition | None]],
-    scores: Sequence[Sequence[Scores | None]],
-) -> PeerView:
-    """The view of every arm, from the last content that each receiver has of each sender, [receiver][sender].
+def assemble(now_s: float, jobs: tuple[str, ...], conditions: AllConditions, scores: AllScores) -> PeerView:
+    """The view of every arm, from the last contents that each receiver has of each sender, [receiver][sender].
 
-    Age is that of the older of both contents. One content that several receivers have is laid out once.
+    The age is that of the older of both contents.
     """
-    arms, slots = len(conditions), len(jobs)
-    state_row, states = _interned(conditions)
-    mode = np.array([*(word.mode for word in states), UNHEARD])[state_row]
-    headroom = np.array([*(word.headroom_k for word in states), math.nan])[state_row]
-    state_time = np.array([*(word.time_s for word in states), -math.inf])[state_row]
+    row, states = _distinct(conditions)
+    mode = np.array([*(MODES.index(state.mode) for state in states), UNHEARD])[row]
+    headroom_k = np.array([*(state.headroom_k for state in states), math.nan])[row]
+    state_s = np.array([*(state.time_s for state in states), -math.inf])[row]
 
-    score_row, said = _interned(scores)
-    table = np.full((2, len(said) + 1, slots), np.nan)
-    for row, word in enumerate(said):
-        if word.jobs == jobs:
-            table[0, row] = word.difficulty
-            table[1, row] = word.p_saturation
+    row, contents = _distinct(scores)
+    table = np.full((2, len(contents) + 1, len(jobs)), np.nan)
+    for index, content in enumerate(contents):
+        values = np.array((content.difficulty, content.p_saturation), dtype=float)  # None becomes NaN
+        if content.jobs == jobs:
+            table[:, index] = values
             continue
-        columns = {name: column for column, name in enumerate(word.jobs)}
-        for slot, name in enumerate(jobs):
-            if name in columns:
-                table[0, row, slot] = word.difficulty[columns[name]]
-                table[1, row, slot] = word.p_saturation[columns[name]]
-    empty = [slot for slot, name in enumerate(jobs) if not name]
-    table[:, :, empty] = np.nan
-    score_time = np.array([*(word.time_s for word in said), -math.inf])[score_row]
-    known = table[:, score_row]
-    assert known.shape == (2, arms, arms, slots)
-    return PeerView(mode, headroom, known[0], known[1], now_s - np.minimum(state_time, score_time))
+        columns = {name: column for column, name in enumerate(content.jobs)}
+        slots = [slot for slot, name in enumerate(jobs) if name in columns]
+        table[:, index, slots] = values[:, [columns[jobs[slot]] for slot in slots]]
+    table[:, :, [slot for slot, name in enumerate(jobs) if not name]] = np.nan
+    scores_s = np.array([*(content.time_s for content in contents), -math.inf])[row]
+    difficulty, p_saturation = table[:, row]
+    return PeerView(mode, headroom_k, difficulty, p_saturation, now_s - np.minimum(state_s, scores_s))
 
 
 def checked_arms(arms: Sequence[str]) -> tuple[str, ...]:
@@ -162,13 +156,13 @@ def checked_arms(arms: Sequence[str]) -> tuple[str, ...]:
     return names
 
 
-def check(words: Broadcast, arms: tuple[str, ...]) -> None:
-    """Refuse a broadcast that does not fit the arms or that no bus could carry.
+def check(broadcast: Broadcast, arms: tuple[str, ...]) -> None:
+    """Refuse a broadcast that does not fit the arms or cannot be encoded.
 
     Raises:
         ValueError: names the field, what it is and what it should be.
     """
-    slots = len(words.jobs)
+    slots = len(broadcast.jobs)
     shapes = {
         "mode": (len(arms),),
         "headroom_k": (len(arms),),
@@ -176,51 +170,50 @@ def check(words: Broadcast, arms: tuple[str, ...]) -> None:
         "p_saturation": (len(arms), slots),
     }
     for name, shape in shapes.items():
-        if np.shape(getattr(words, name)) != shape:
-            raise ValueError(f"Broadcast.{name} must have the shape {shape} (got {np.shape(getattr(words, name))}).")
-    if words.temp_c.ndim != 2 or len(words.temp_c) != len(arms) or not words.temp_c.shape[1]:
+        if np.shape(getattr(broadcast, name)) != shape:
+            raise ValueError(
+                f"Broadcast.{name} must have the shape {shape} (got {np.shape(getattr(broadcast, name))})."
+            )
+    if broadcast.temp_c.ndim != 2 or len(broadcast.temp_c) != len(arms) or not broadcast.temp_c.shape[1]:
         raise ValueError(
-            f"Broadcast.temp_c must be [arm, joint] with {len(arms)} arms (got shape {words.temp_c.shape})."
+            f"Broadcast.temp_c must be [arm, joint] with {len(arms)} arms (got shape {broadcast.temp_c.shape})."
         )
-    if len(words.twin) != len(arms):
-        raise ValueError(f"Broadcast.twin needs one version per arm ({len(arms)}, got {len(words.twin)}).")
-    named = [job for job in words.jobs if job]
+    if len(broadcast.twin) != len(arms):
+        raise ValueError(f"Broadcast.twin needs one version per arm ({len(arms)}, got {len(broadcast.twin)}).")
+    named = [job for job in broadcast.jobs if job]
     if len(set(named)) != len(named):
-        raise ValueError(f"Broadcast.jobs names a job twice (got {words.jobs}).")
-    if not math.isfinite(words.time_s):
-        raise ValueError(f"Broadcast.time_s must be finite (got {words.time_s}).")
+        raise ValueError(f"Broadcast.jobs names a job twice (got {broadcast.jobs}).")
+    if not math.isfinite(broadcast.time_s):
+        raise ValueError(f"Broadcast.time_s must be finite (got {broadcast.time_s}).")
     for name in ("temp_c", "headroom_k"):
-        if not np.isfinite(getattr(words, name)).all():
-            raise ValueError(f"Broadcast.{name} must be finite (got {getattr(words, name)}).")
+        if not np.isfinite(getattr(broadcast, name)).all():
+            raise ValueError(f"Broadcast.{name} must be finite (got {getattr(broadcast, name)}).")
     for name in ("difficulty", "p_saturation"):
-        if np.isinf(getattr(words, name)).any():
-            raise ValueError(f"Broadcast.{name} must be finite, or NaN where not known (got {getattr(words, name)}).")
-    if not np.isin(words.mode, range(len(MODES))).all():
-        raise ValueError(f"Broadcast.mode must be one of 0..{len(MODES) - 1} (got {words.mode}).")
+        if np.isinf(getattr(broadcast, name)).any():
+            raise ValueError(
+                f"Broadcast.{name} must be finite, or NaN where not known (got {getattr(broadcast, name)})."
+            )
+    if not np.isin(broadcast.mode, range(len(MODES))).all():
+        raise ValueError(f"Broadcast.mode must be one of 0..{len(MODES) - 1} (got {broadcast.mode}).")
 
 
 def check_order(time_s: float, last_s: float) -> None:
     """Refuse a broadcast that is older than the last one."""
     if time_s < last_s:
-        raise ValueError(f"Broadcast of {time_s:g} s come after those of {last_s:g} s: begin() starts a new episode.")
+        raise ValueError(f"Broadcast of {time_s:g} s after that of {last_s:g} s; begin() starts a new episode.")
 
 
-def _interned(known: Sequence[Sequence[Word | None]]) -> tuple[Array, list[Word]]:
-    """[receiver, sender] index of each content in the list of different ones; -1 (its end) for none."""
-    place: dict[int, int] = {id(None): -1}
-    different: list[Word] = []
-    rows: list[list[int]] = []
-    last: object = None
-    for row in known:
-        if row is last:  # the same row for several receivers
-            rows.append(rows[-1])
+def _distinct(contents: Sequence[Sequence[Content | None]]) -> tuple[Array, list[Content]]:
+    """[receiver, sender] index of each content in the list of distinct ones; -1 (its end) for None."""
+    index: dict[int, int] = {id(None): -1}
+    distinct: list[Content] = []
+    rows: dict[int, list[int]] = {}  # arms that share a client share one list
+    for row in contents:
+        if id(row) in rows:
             continue
-        last = row
-        rows.append([])
-        for word in row:
-            index = place.get(id(word))
-            if index is None and word is not None:
-                index = place[id(word)] = len(different)
-                different.append(word)
-            rows[-1].append(-1 if index is None else index)
-    return np.array(rows, dtype=int), different
+        for content in row:
+            if content is not None and id(content) not in index:
+                index[id(content)] = len(distinct)
+                distinct.append(content)
+        rows[id(row)] = [index[id(content)] for content in row]
+    return np.array([rows[id(row)] for row in contents], dtype=int), distinct

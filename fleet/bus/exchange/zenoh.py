@@ -1,10 +1,10 @@
-"""The exchange over Zenoh: every arm knows of its peers only what came over the bus.
+"""The exchange over Zenoh: what an arm knows of its peers arrived over the bus.
 
-A few arms have a client each, many share some: what n sessions receive of n arms grows with n², and with it the time
-to discover each other and the memory.
+In small fleets every arm has its own client. In large ones arms share a few, as the messages that n sessions receive
+from n arms grow with n², and with them memory and the time for discovery.
 
-At each step an arm publishes its `state` and then its `difficulty`. Both travel the same connection in this order.
-`info` is published when it changes, and a liveliness token shows that the arm is present.
+At each step an arm publishes its `state` and then its `difficulty`, over the same connection. It publishes `info` when
+it changes, and a liveliness token shows that the arm is present.
 """
 
 import logging
@@ -13,17 +13,19 @@ import time
 import weakref
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
+from functools import lru_cache
 from pathlib import Path
-from typing import Self
+from typing import Self, TypeVar
 
 import numpy as np
 import zenoh
 
 from fleet.bus.client.client import BACKLOG, BusClient
+from fleet.bus.client.replies import read_message
 from fleet.bus.client.router import Router, reachable
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.bus.exchange.delivery import Delivery
-from fleet.bus.exchange.group import Content, Contents, Group, messages_of
+from fleet.bus.exchange.group import Group, messages_of
 from fleet.bus.exchange.protocol import (
     Broadcast,
     PeerView,
@@ -38,15 +40,17 @@ from fleet.errors import BusError
 
 _LOG = logging.getLogger(__name__)
 
+Message = TypeVar("Message")
+
 MOST_OWN_SESSIONS, SHARED_SESSIONS = 8, 4
-"""Up to so many arms have a session each; more of them share so many sessions."""
+"""Largest fleet whose arms have a session each, and the number of sessions that a larger one shares."""
 MOST_NAMED = 8
 """Arms listed in one message."""
 _OPEN_TIMEOUT_S = 20.0
 
 
 def sessions_for(arms: int) -> int:
-    """Sessions of so many arms, unless each has to show a certificate of its own."""
+    """Number of sessions of a fleet without certificates."""
     return arms if arms <= MOST_OWN_SESSIONS else SHARED_SESSIONS
 
 
@@ -55,8 +59,8 @@ class ZenohExchange:
 
     Nothing is opened before the first `share` or the `with` block. One thread at a time may use an exchange.
 
-    A channel that is not perfect is applied by the receivers: the bus carries every message to every arm, and each
-    delays and drops what the channel says, so that the fleet knows the same as with a `MemoryExchange`.
+    The receivers apply a channel that is not perfect: the bus carries every message to every arm, and each receiver
+    delays and drops messages as the channel says. So the result is that of a `MemoryExchange`.
     """
 
     def __init__(
@@ -74,11 +78,11 @@ class ZenohExchange:
 
         Args:
             fleet: Name of the fleet, part of every key.
-            endpoint: Of a router on loopback, as `tcp/127.0.0.1:7447`; None for a router of its own on a free port.
-            tls: Folder with a certificate of every arm (and of `router`, for a router of its own); the endpoint then
-                begins with `tls/`, and may be on any host.
-            timeout_s: How long `share` waits for messages that do not arrive.
-            sessions: That the arms share, at most; None for `sessions_for` them. With `tls` every arm has its own.
+            endpoint: Of a router on loopback, as `tcp/127.0.0.1:7447`; None to start one on a free port.
+            tls: Folder with a certificate of every arm, and of `router` to start one. The endpoint then begins with
+                `tls/`, and may be on any host.
+            timeout_s: Longest wait of `share` for missing messages.
+            sessions: Most sessions that the arms share; by default `sessions_for` them. With `tls` each has its own.
 
         Raises:
             BusError: the endpoint is not on loopback.
@@ -102,6 +106,8 @@ class ZenohExchange:
         self._timeout_s = timeout_s
         self._delivery = None if channel.perfect else Delivery(self.arms, channel)
         self._groups: list[Group] = []
+        # Every client receives the messages of every arm; the first one decodes them.
+        self._read = lru_cache(4 * count)(read_message)
         self._tick = -1
         self._now_s = -math.inf
         self._missed: set[tuple[int, int]] = set()
@@ -116,10 +122,10 @@ class ZenohExchange:
         return self._endpoint
 
     def open(self) -> Self:
-        """Start the router when none was given, connect every arm, and wait until all see each other.
+        """Start a router if no endpoint was given, connect every arm, and wait until all see each other.
 
         Raises:
-            BusError: no router, an arm of this name is already there, the arms do not find each other, or closed.
+            BusError: no router, an arm of this name is already present, an arm does not see another, or closed.
         """
         if self._closed:
             raise BusError("This exchange is closed.")
@@ -131,10 +137,7 @@ class ZenohExchange:
             clients = [self._resources.enter_context(self._client(arm)) for arm in self.arms[: self._sessions]]
             self._refuse_namesakes(clients[0])
             everybody = range(len(self.arms))
-            contents = Contents()
-            self._groups = [
-                Group(client, self.arms, everybody[i :: len(clients)], contents) for i, client in enumerate(clients)
-            ]
+            self._groups = [Group(client, self.arms, everybody[i :: len(clients)]) for i, client in enumerate(clients)]
             deadline_s = time.monotonic() + _OPEN_TIMEOUT_S
             for group in self._groups:
                 if missing := group.await_peers(deadline_s):
@@ -151,34 +154,34 @@ class ZenohExchange:
         return self
 
     def begin(self, rng: np.random.Generator | None = None) -> None:
-        """Begin an episode: forget what was received; a channel with chance draws from `rng` from now on."""
+        """Begin an episode without any received messages; `rng` is for channels with loss or jitter."""
         if self._delivery is not None:
             self._delivery.begin(rng)
         for group in self._groups:
-            group.begin_step(self._tick, self._now_s)  # what is in the queue belongs to the last episode
+            group.begin_step(self._tick, self._now_s)  # queued messages belong to the last episode
             group.forget(self._tick)
         self._now_s = -math.inf
 
-    def share(self, words: Broadcast) -> PeerView:
-        """Publish the broadcast of one step, and return what every arm knows thereafter.
+    def share(self, broadcast: Broadcast) -> PeerView:
+        """Publish the broadcast of one step, and return what every arm knows after it.
 
-        Waits until every arm has received the messages of every present peer, at most `timeout_s`. A message that
-        did not arrive in time leaves the last one known, with its age, and is counted in `late`.
+        Waits at most `timeout_s` until every arm has received the messages of every present peer. If a message is
+        late, the last one remains with its age, and `late` counts it.
 
         Raises:
-            ValueError: the broadcast does not fit the arms or holds infinite numbers; or the channel draws by chance,
-                and there is no rng.
+            ValueError: the broadcast does not fit the arms or holds infinite numbers; or the channel has loss or
+                jitter, and there is no rng.
             BusError: the bus could not be opened, was lost, or is closed.
         """
-        check(words, self.arms)
-        check_order(words.time_s, self._now_s)
+        check(broadcast, self.arms)
+        check_order(broadcast.time_s, self._now_s)
         self.open()
         for group in self._groups:
             group.begin_step(self._tick, self._now_s)
         self._tick += 1
-        self._now_s = float(words.time_s)
+        self._now_s = float(broadcast.time_s)
         try:
-            messages = messages_of(words, self.arms, self._tick)
+            messages = messages_of(broadcast, self.arms, self._tick)
             for group in self._groups:
                 group.publish(self._tick, self._now_s, messages)
         except zenoh.ZError as error:
@@ -197,19 +200,19 @@ class ZenohExchange:
         if self._delivery is None:
             conditions = self._by_receiver([group.conditions.last for group in self._groups])
             scores = self._by_receiver([group.scores.last for group in self._groups])
-            return assemble(self._now_s, words.jobs, conditions, scores)
-        # To a channel that is not perfect, a message that the bus itself brings a step late is lost.
+            return assemble(self._now_s, broadcast.jobs, conditions, scores)
+        # On a channel that is not perfect, a message that the bus itself delivers a step late is lost.
         conditions = self._by_receiver([group.conditions.of(self._tick) for group in self._groups])
         scores = self._by_receiver([group.scores.of(self._tick) for group in self._groups])
         self._delivery.carry(self._now_s, conditions, scores)
         self.delivered, self.late = self._delivery.delivered, self._delivery.late
-        return assemble(self._now_s, words.jobs, self._delivery.conditions, self._delivery.scores)
+        return assemble(self._now_s, broadcast.jobs, self._delivery.conditions, self._delivery.scores)
 
     def close(self) -> None:
         """Disconnect every arm and stop the router; may be called twice.
 
         Raises:
-            BusError: something did not close cleanly; everything else is closed all the same.
+            BusError: a client or the router did not close cleanly; the others are closed.
         """
         self._closed = True
         self._groups = []
@@ -233,22 +236,23 @@ class ZenohExchange:
         assert self._endpoint is not None
         tls = self._tls[arm]
         endpoint = self._endpoint if tls is None else tls.endpoint(self._endpoint)
-        return BusClient(endpoint, self._fleet, timeout_s=self._timeout_s, backlog=max(BACKLOG, 16 * len(self.arms)))
+        backlog = max(BACKLOG, 16 * len(self.arms))
+        return BusClient(endpoint, self._fleet, timeout_s=self._timeout_s, backlog=backlog, read=self._read)
 
     def _give_up(self) -> None:
-        """Close while another exception is raised, which must not be hidden."""
+        """Close without hiding the exception that is being raised."""
         try:
             self.close()
         except BusError:
             _LOG.exception("While closing after another error:")
 
-    def _by_receiver(self, of_groups: list[list[Content | None]]) -> list[list[Content | None]]:
+    def _by_receiver(self, of_groups: list[list[Message | None]]) -> list[list[Message | None]]:
         """[receiver][sender], from what each group received."""
         return [of_groups[i % len(of_groups)] for i in range(len(self.arms))]
 
     def _refuse_namesakes(self, client: BusClient) -> None:
-        there = client.tokens(keys.of_every_arm(self._fleet, "alive"), timeout_s=self._timeout_s)
-        if taken := sorted(there & set(self.arms)):
+        present = client.tokens(keys.of_every_arm(self._fleet, "alive"), timeout_s=self._timeout_s)
+        if taken := sorted(present & set(self.arms)):
             raise BusError(f"Fleet '{self._fleet}' already has {', '.join(taken)} on the bus at {self._endpoint}.")
 
     def _count(self, missed: set[tuple[int, int]]) -> None:
@@ -261,7 +265,7 @@ class ZenohExchange:
 
 
 def _named(names: Iterable[str]) -> str:
-    """The first names of a list, and how many more there are."""
-    every = list(names)
-    more = f" and {len(every) - MOST_NAMED} more" if len(every) > MOST_NAMED else ""
-    return ", ".join(every[:MOST_NAMED]) + more
+    """The first names of a list, and the number of the others."""
+    names = list(names)
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return ", ".join(names[:MOST_NAMED]) + more

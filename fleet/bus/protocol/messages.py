@@ -51,8 +51,10 @@ class State(msgspec.Struct, frozen=True, omit_defaults=True):
             finite("State", name, (getattr(self, name),))
         for name in ("temp_c", "q", "qd", "tau", "current_a"):
             values = getattr(self, name)
+            if not values:
+                continue
             finite("State", name, values)
-            if values and len(values) != len(self.temp_c):
+            if len(values) != len(self.temp_c):
                 raise ValueError(f"State.{name} needs one value per joint ({len(self.temp_c)}, got {len(values)}).")
 
 

@@ -1,7 +1,7 @@
 """The roster of a fleet, and the access control that a router with TLS enforces.
 
-Everybody in the roster may subscribe to everything in its own fleet, histories included. Beyond that a participant may
-publish, reply and query what its role needs; everything else is denied.
+Every participant may subscribe to everything in its own fleet, histories included. Beyond that it may publish, reply
+and query as its role needs; everything else is denied.
 """
 
 from collections.abc import Iterable, Sequence
@@ -20,24 +20,24 @@ LONGEST_COMMON_NAME = 64
 """Characters (X.520, ub-common-name)."""
 ROSTER = "roster.json"
 """File name of the roster in a folder of keys."""
-_TAKEN = ("ca",)
-"""File names that are not a participant's."""
+_RESERVED = ("ca",)
+"""File names that no participant may have."""
 
-_SAY = ("put", "liveliness_token", "declare_queryable", "reply")
-_LISTEN = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query")
-_HEAR = ("put", "liveliness_token", "declare_subscriber", "declare_queryable", "query", "reply")
+_PUBLISH = ("put", "liveliness_token", "declare_queryable", "reply")
+_SUBSCRIBE = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query")
+_RECEIVE = ("put", "liveliness_token", "declare_subscriber", "declare_queryable", "query", "reply")
 
 
 class Participant(msgspec.Struct, frozen=True):
     """A participant that may connect."""
 
     name: str
-    """Of an arm or an auctioneer: the name in its keys."""
+    """The name in the keys of an arm or an auctioneer."""
     role: Role
 
     def __post_init__(self) -> None:
-        if self.file.casefold() in _TAKEN:
-            raise ValueError(f"No participant may be named '{self.name}': its files are those of something else.")
+        if self.file.casefold() in _RESERVED:
+            raise ValueError(f"A participant cannot be named '{self.name}': that is the file name of the authority.")
         if len(self.common_name) > LONGEST_COMMON_NAME:
             raise ValueError(
                 f"The name '{self.name}' is too long for a certificate: '{self.common_name}' has "
@@ -46,12 +46,12 @@ class Participant(msgspec.Struct, frozen=True):
 
     @property
     def file(self) -> str:
-        """Name of its files, without the ending; no name can leave the folder."""
+        """Name of its files, without the ending; always inside the folder."""
         return file_of(self.name)
 
     @property
     def common_name(self) -> str:
-        """Common name in its certificate: `arm:arm_0`. Access control knows a participant by this alone."""
+        """Common name in its certificate, as `arm:arm_0`; access control identifies a participant by it."""
         return f"{self.role}:{self.file}"
 
 
@@ -66,7 +66,7 @@ class Roster(msgspec.Struct, frozen=True):
         files = [participant.file.casefold() for participant in self.participants]
         for i, participant in enumerate(self.participants):
             if files[i] in files[:i]:
-                raise ValueError(f"The name '{participant.name}' is taken; participants need names that differ.")
+                raise ValueError(f"The name '{participant.name}' is taken; names of participants must be unique.")
 
     def named(self, name: str) -> Participant:
         """The participant of a name.
@@ -77,12 +77,12 @@ class Roster(msgspec.Struct, frozen=True):
         for participant in self.participants:
             if participant.name == name:
                 return participant
-        known = nearest(name, [participant.name for participant in self.participants])
-        raise BusError(f"No '{name}' takes part in the fleet '{self.fleet}'{known}")
+        hint = nearest(name, [participant.name for participant in self.participants])
+        raise BusError(f"The fleet '{self.fleet}' has no participant '{name}'{hint}")
 
     @property
-    def alone(self) -> bool:
-        """Whether the fleet has no auctioneer: its arms allocate jobs themselves and reply to outsiders."""
+    def by_consensus(self) -> bool:
+        """Whether the fleet has no auctioneer: its arms allocate jobs by consensus and reply to outsiders."""
         return not self.of_role("auctioneer")
 
     def of_role(self, role: Role) -> tuple[str, ...]:
@@ -91,13 +91,13 @@ class Roster(msgspec.Struct, frozen=True):
 
 
 def of_arms(fleet: str, arms: Iterable[str], extra: Sequence[Participant] = (), *, auctioneer: bool = True) -> Roster:
-    """The roster of a fleet with these arms: one of every other role, named like it, and the extra ones.
+    """The roster of a fleet: these arms, one participant of every other role, named like the role, and the extra ones.
 
     Args:
-        auctioneer: Whether there is to be one.
+        auctioneer: Whether the fleet has one.
 
     Raises:
-        ValueError: a name twice, empty, or too long.
+        ValueError: a name occurs twice, is empty, or is too long.
     """
     roles = [role for role in get_args(Role) if role != "arm" and (auctioneer or role != "auctioneer")]
     others = tuple(Participant(role, role) for role in roles)
@@ -108,49 +108,51 @@ def read_roster(folder: Path) -> Roster:
     """The roster of a folder of keys.
 
     Raises:
-        BusError: there is none, or it is damaged.
+        BusError: it does not exist, or is damaged.
     """
     path = folder / ROSTER
     try:
         return msgspec.json.decode(path.read_bytes(), type=Roster)
     except FileNotFoundError as error:
-        raise BusError(f"There is no '{path}': it is no folder of keys. thermofleet keys makes one.") from error
+        raise BusError(
+            f"There is no '{path}': '{folder}' is not a folder of keys. thermofleet keys makes one."
+        ) from error
     except OSError as error:
         raise BusError(f"Cannot read '{path}': {error.strerror}.") from error
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise BusError(f"'{path}' is no roster: {error}.") from error
+        raise BusError(f"'{path}' is not a roster: {error}.") from error
 
 
 def file_of(name: str) -> str:
-    """What the files of a participant are called, without their ending: its name as in keys, but never hidden, and
-    never `.` or `..`; `urllib.parse.unquote` is the inverse.
+    """File name of a participant, without the ending: its name as in keys, with a first dot encoded, too.
+
+    `urllib.parse.unquote` is the inverse.
     """
-    written = keys.chunk(name)
-    return f"%2E{written[1:]}" if written.startswith(".") else written
+    encoded = keys.chunk(name)
+    return f"%2E{encoded[1:]}" if encoded.startswith(".") else encoded
 
 
 @dataclass(frozen=True)
 class Rights:
-    """What one participant may do, as key expressions."""
+    """What one participant may do beyond subscribing, as key expressions."""
 
     publishes: tuple[str, ...] = ()
     """May publish (not delete), show tokens, declare queryables and reply under these."""
     queries: tuple[str, ...] = ()
-    """May query these."""
 
 
-def rights(fleet: str, participant: Participant, *, alone: bool = False) -> Rights:
-    """What a participant may do beyond subscribing.
+def rights(fleet: str, participant: Participant, *, by_consensus: bool = False) -> Rights:
+    """The rights of a participant.
 
     Args:
-        alone: The fleet has no auctioneer, so its arms reply to outsiders.
+        by_consensus: The fleet has no auctioneer, so its arms reply to outsiders.
     """
     time, status = keys.of_clock(fleet), keys.of_jobs(fleet, "status")
     quotes, awards = keys.of_every_arm(fleet, "quote"), keys.of_every_arm(fleet, "award")
     if participant.role == "arm":
         # The key names the querier, so only that arm may use it.
         asked = tuple(keys.asked_of_all(fleet, topic, participant.name) for topic in ("lease", "report", "claim"))
-        answers = (keys.all_of(fleet, "jobs"), keys.all_of(fleet, "clock")) if alone else ()
+        answers = (keys.all_of(fleet, "jobs"), keys.all_of(fleet, "clock")) if by_consensus else ()
         return Rights(publishes=(keys.all_of(fleet, "arm", participant.name), *answers), queries=(*asked, time))
     if participant.role == "auctioneer":
         own = keys.all_of(fleet, "auction", participant.name)
@@ -166,7 +168,7 @@ def rights(fleet: str, participant: Participant, *, alone: bool = False) -> Righ
 
 
 def rights_by_role(fleet: str, name: str) -> dict[Role, Rights]:
-    """What a participant of this name could do in each role."""
+    """The rights that a participant of this name would have in each role."""
     return {role: rights(fleet, Participant(name, role)) for role in get_args(Role)}
 
 
@@ -179,23 +181,23 @@ def access_control(roster: Roster) -> dict[str, Any]:
     fleet = roster.fleet
     everything = _with_caches([keys.all_of_fleet(fleet)])
     rules = [
-        _rule("listen", "ingress", _LISTEN, everything),
-        _rule("hear", "egress", _HEAR, everything),
-        _rule("recall", "ingress", ("query",), [keys.caches_of(keys.all_of_fleet(fleet))]),
+        _rule("subscribe", "ingress", _SUBSCRIBE, everything),
+        _rule("receive", "egress", _RECEIVE, everything),
+        _rule("history", "ingress", ("query",), [keys.caches_of(keys.all_of_fleet(fleet))]),
     ]
     subjects, policies = [], []
     for participant in roster.participants:
         if participant.role == "router":
             continue
-        who, granted = participant.common_name, rights(fleet, participant, alone=roster.alone)
+        name, granted = participant.common_name, rights(fleet, participant, by_consensus=roster.by_consensus)
         own = []
         if granted.publishes:
-            own.append(_rule(f"{who} says", "ingress", _SAY, _with_caches(granted.publishes)))
+            own.append(_rule(f"{name} publishes", "ingress", _PUBLISH, _with_caches(granted.publishes)))
         if granted.queries:
-            own.append(_rule(f"{who} asks", "ingress", ("query",), granted.queries))
+            own.append(_rule(f"{name} queries", "ingress", ("query",), granted.queries))
+        policies.append({"subjects": [name], "rules": [rule["id"] for rule in (*rules[:3], *own)]})
         rules += own
-        subjects.append({"id": who, "cert_common_names": [who]})
-        policies.append({"subjects": [who], "rules": ["listen", "hear", "recall", *(rule["id"] for rule in own)]})
+        subjects.append({"id": name, "cert_common_names": [name]})
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -206,8 +208,8 @@ def access_control(roster: Roster) -> dict[str, Any]:
 
 
 def _with_caches(expressions: Iterable[str]) -> list[str]:
-    """The expressions, and what advanced publishers and subscribers need beside them."""
-    return [found for expression in expressions for found in (expression, keys.caches_of(expression))]
+    """The expressions, and those of the caches of advanced publishers."""
+    return [both for expression in expressions for both in (expression, keys.caches_of(expression))]
 
 
 def _rule(name: str, flow: str, messages: Sequence[str], expressions: Sequence[str]) -> dict[str, Any]:

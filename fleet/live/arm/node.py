@@ -13,11 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fleet.bus.client.client import BusClient, Refused
+from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Ack, ArmEvent, Award, JobEstimate, JobSpec, Quote, QuoteRequest
 from fleet.bus.protocol.messages import DifficultyScores, Info, State
 from fleet.bus.protocol.registry import STATE_HZ
+from fleet.errors import Refused
 from fleet.events import Event
 from fleet.live.arm.auctioneer_client import AuctioneerClient, LiveArm, RateLimitedWarnings, WorkSource
 from fleet.live.arm.award_executor import AwardExecutor
