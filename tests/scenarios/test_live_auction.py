@@ -31,7 +31,7 @@ from fleet.bus.protocol.auction import (
 from fleet.errors import FleetError
 from fleet.job import Job, Place, Work
 from scenarios.cli.live import auction as live_auction
-from scenarios.cli.live.auction import own_jobs, word_of
+from scenarios.cli.live.auction import job_spec, own_jobs
 from scenarios.cli.live.consensus import refuse_other_way
 from scenarios.cli.live.submit import batches, read_jobs
 from scenarios.cli.main import main
@@ -161,7 +161,8 @@ def test_a_stream_is_handed_in_as_time_goes_on_until_all_is_done_or_the_shift_is
     monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
     stage, never = Stage(), SimpleNamespace(is_set=lambda: False)
     names = {"a": 0.0, "b": 3700.0, "c": 7000.0, "d": 10000.0}
-    live_auction.work(stage, [(at_s, JobSpec(n, "hold", ("x",))) for n, at_s in names.items()], horizon_s, never)
+    stream = [(at_s, JobSpec(name, "hold", ("x",))) for name, at_s in names.items()]
+    live_auction.submit_stream(stage, stream, horizon_s, never)
     all_of_it = [(3600.0, ["a"]), (7200.0, ["b", "c"]), (10800.0, ["d"])]
     assert stage.handed_in == (all_of_it[:2] if ended else all_of_it)
     assert stage.ended is ended
@@ -171,7 +172,7 @@ def test_nothing_of_a_shift_that_is_over_is_handed_in_again(monkeypatch):
     monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
     stage, never = Stage(), SimpleNamespace(is_set=lambda: False)
     stage.auctioneer.ledger.ended = True
-    live_auction.work(stage, [(0.0, JobSpec("a", "hold", ("x",)))], 1.0, never)
+    live_auction.submit_stream(stage, [(0.0, JobSpec("a", "hold", ("x",)))], 1.0, never)
     assert stage.handed_in == []
 
 
@@ -179,7 +180,7 @@ def test_nothing_is_handed_in_while_there_is_another_auctioneer(monkeypatch):
     monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
     stage, never = Stage(), SimpleNamespace(is_set=lambda: False)
     stage.alone_s = 7200.0
-    live_auction.work(stage, [(0.0, JobSpec("a", "hold", ("x",)))], 1e6, never)
+    live_auction.submit_stream(stage, [(0.0, JobSpec("a", "hold", ("x",)))], 1e6, never)
     assert stage.handed_in == [(7200.0, ["a"])]
 
 
@@ -187,7 +188,7 @@ def test_a_job_travels_whole():
     place = Place(name="rack", position_m=(0.0, 0.0, 0.0))
     work = Work(kind="press", places=(place,), force_n=30.0, dwell_s=20.0)
     job = Job(name="p", work=work, repetitions=6, release_s=1.0, due_s=9.0, value=3.0, after=("q",))
-    assert word_of(job) == JobSpec("p", "press", ("rack",), 6, 0.0, 20.0, 30.0, 1.0, 9.0, 3.0, ("q",))
+    assert job_spec(job) == JobSpec("p", "press", ("rack",), 6, 0.0, 20.0, 30.0, 1.0, 9.0, 3.0, ("q",))
 
 
 # policies
@@ -209,7 +210,7 @@ def test_a_job_travels_whole():
             ("arm", "quickstart", "arm_0", "--policy", "ssi"),
             "'ssi' needs an auctioneer: start it with thermofleet auction",
         ),
-        (("arm", "quickstart", "arm_0", "--policy", "consensus", "--jobs", "all"), "--jobs must be scenario or none"),
+        (("arm", "quickstart", "arm_0", "--jobs", "all"), "'all' is not one of 'scenario', 'none'"),
     ],
 )
 def test_a_policy_that_cannot_be_is_one_sentence(capsys, words, complaint):
@@ -226,9 +227,9 @@ def test_a_policy_that_cannot_be_is_one_sentence(capsys, words, complaint):
             ["arm_2.journal"],
             "it is of a shift with an auctioneer",
         ),
-        (("up", "quickstart", "--out"), ["arm_2.journal", "arm_2.grants"], "arms shared the jobs out themselves"),
-        (("auction", "quickstart", "--journal"), ["arm_2.grants"], "arms shared the jobs out themselves"),
-        (("arm", "quickstart", "arm_2", "--journal"), ["arm_2.grants"], "arms shared the jobs out themselves"),
+        (("up", "quickstart", "--out"), ["arm_2.journal", "arm_2.grants"], "arms allocate jobs without an auctioneer"),
+        (("auction", "quickstart", "--journal"), ["arm_2.grants"], "arms allocate jobs without an auctioneer"),
+        (("arm", "quickstart", "arm_2", "--journal"), ["arm_2.grants"], "arms allocate jobs without an auctioneer"),
         (
             ("arm", "quickstart", "arm_2", "--policy", "consensus", "--journal"),
             ["arm_2.journal"],
@@ -307,7 +308,7 @@ def test_jobs_handed_in_are_kept_over_a_kill(endpoint, tmp_path, capsys):
         out, err = process.communicate(timeout=PATIENT_S)
         assert process.returncode == 0
         assert "0 of 1 jobs finished" in out
-        assert "Going on from" in err
+        assert "Continuing from" in err
 
 
 def test_a_shift_that_ends_tells_what_is_undone(endpoint, tmp_path):

@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fleet.errors import FleetError
+from scenarios.cli.live.options import number
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
 from scenarios.cli.terminal import Interrupted
+from scenarios.extras import require_extra
 
 if TYPE_CHECKING:
     import uvicorn
@@ -30,36 +32,26 @@ _LOG = logging.getLogger(__name__)
 def gateway_command(
     endpoint: EndpointOption = ENDPOINT,
     fleet: FleetOption = "",
-    port: Annotated[int, typer.Option(help="TCP port of the gateway; 0 takes a free one.")] = 8080,
+    port: Annotated[int, number("TCP port of the gateway; 0 takes a free one.", 0, 65535)] = 8080,
     host: Annotated[str, typer.Option(help="Listening address; beyond loopback only with a token.")] = "127.0.0.1",
     token: Annotated[
         str,
-        typer.Option(
-            envvar=TOKEN,
-            help="Token that requests must show; on the command line, other users see it.",
-        ),
+        typer.Option(envvar=TOKEN, help="Token that requests must show; on the command line, other users see it."),
     ] = "",
 ) -> None:
     """Serve the fleet over HTTP until Ctrl-C or SIGTERM."""
-    try:
-        import starlette
-        import uvicorn
-    except ImportError as error:
-        raise FleetError(f"The gateway needs the extra: pip install 'thermofleet[gateway]' ({error.name}).") from error
-    del starlette, uvicorn
-    check(host, port, token)
+    require_extra("gateway")
+    check(host, token)
     if asyncio.run(serve(endpoint, the_fleet(fleet, endpoint), host, port, token)) == signal.SIGINT:
         raise Interrupted("The gateway was interrupted.")
 
 
-def check(host: str, port: int, token: str) -> None:
+def check(host: str, token: str) -> None:
     """Refuse an address that others can reach without a token.
 
     Raises:
         FleetError: an option is wrong or missing.
     """
-    if not 0 <= port <= 65535:
-        raise FleetError(f"--port must be 0 to 65535 (got {port}).")
     if token and (len(token) < MIN_TOKEN or not token.isascii() or not token.isprintable()):
         raise FleetError(f"A token needs {MIN_TOKEN} or more printable ASCII characters (got {len(token)}).")
     try:
