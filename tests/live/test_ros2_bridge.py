@@ -134,18 +134,18 @@ def test_names_that_ros_does_not_allow_are_changed_and_never_mixed_up(make):
     domain.until(under("0/n7_shops/arm_0/joint_states/"), one)
     domain.until(under(DIAGNOSTICS_KEY), other, one)
     deadline_s = time.monotonic() + PATIENCE_S
-    while not domain.bridge.left_out and time.monotonic() < deadline_s:
+    while not domain.bridge.skipped and time.monotonic() < deadline_s:
         domain.say(other)
         domain.bridge.serve(time.monotonic() + 0.05)
     assert domain.bridge.arms == ("arm-0",)
-    assert "is that of 'arm-0'" in domain.bridge.left_out["arm 0"]
+    assert "is that of 'arm-0'" in domain.bridge.skipped["arm 0"]
 
 
 def test_what_ros_cannot_tell_and_too_many_arms_harm_nobody(make, monkeypatch):
-    monkeypatch.setattr(ros2_bridge, "MOST_ARMS", 2)
+    monkeypatch.setattr(ros2_bridge, "MAX_ARMS", 2)
     domain = make()
     said = [state(arm="late", time_s=1e300), *(state(arm=f"arm_{number}") for number in range(5))]
     domain.until(lambda sample: "/arm_1/" in str(sample.key_expr), *said)
     assert domain.bridge.arms == ("arm_0", "arm_1")
-    assert "ROS 2 tells times" in domain.bridge.left_out["late"]
-    assert len(domain.bridge.left_out) == 2
+    assert "A ROS 2 time is" in domain.bridge.skipped["late"]
+    assert len(domain.bridge.skipped) == 2

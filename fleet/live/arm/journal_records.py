@@ -1,8 +1,8 @@
-"""Arm journal records: awards accepted, worked on and closed, and what is known of them after a crash.
+"""Arm journal records, and the awards of an arm after a restart.
 
 An accepted award ends with a report, which is repeated until the auctioneer acknowledges it. Awards that are open when
 the process dies are returned at the next start: the arm is at home again, and only the cycles on disk count. If the arm
-was permitted to commit, nobody knows whether the last cycle was done, and the report says so.
+was permitted to commit, the last cycle may have been done or not, and the report says so.
 """
 
 import math

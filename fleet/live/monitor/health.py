@@ -18,7 +18,7 @@ class Finding(msgspec.Struct, frozen=True):
     """One statement about the fleet."""
 
     level: Literal["fault", "warning"]
-    """fault: the fleet cannot do its work; warning: it can, but somebody should look."""
+    """fault: the fleet cannot do its work; warning: it can, but needs attention."""
     what: str
 
 
@@ -69,7 +69,7 @@ def check_health(
     Args:
         fleet: Snapshot at the real second `now_s`.
         complaints: Reasons why the last malformed messages were dropped.
-        overrun: Messages lost because they came faster than they were handled.
+        overrun: Messages lost because the queue was full.
         auctioneer: Whether the fleet should have one.
         secure: Whether the listener used a certificate; one that the router does not know receives nothing.
         expected: Arms that should be present: one that left earlier leaves no trace.
@@ -95,7 +95,7 @@ def check_health(
     if overrun:
         findings.append(Finding("warning", f"{overrun} message(s) came faster than they were handled, and were lost."))
     if unfinished := fleet.counts.get("unfinished", 0):
-        findings.append(Finding("warning", f"{unfinished} job(s) are unfinished: it is not known if they were done."))
+        findings.append(Finding("warning", f"{unfinished} job(s) are unfinished: they may have been done or not."))
     return HealthReport(
         fleet=fleet.fleet,
         round_trip_s=median(trips_s) if trips_s else None,
@@ -122,7 +122,7 @@ def check_auctioneers(fleet: FleetSnapshot, probes: Sequence[ClockProbe], wanted
     return [
         Finding(
             "fault",
-            "No auctioneer shows a token or answers: nobody awards jobs, and every arm keeps its own time. "
+            "No auctioneer shows a token or answers: jobs are not awarded, and every arm keeps its own time. "
             "If this fleet needs none, give --no-auctioneer.",
         )
     ]
