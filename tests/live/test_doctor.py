@@ -88,7 +88,7 @@ def test_each_illness_of_an_auctioneer_is_named(probe, auctioneers, says):
 def test_a_fleet_without_an_auctioneer_by_intention_is_healthy():
     silence = ClockProbe(100.0, 100.1)
     assert faults(fleet(arm(), auctioneers=()), silence)[0] == [
-        "No auctioneer shows a token or answers: nobody awards jobs, and every arm keeps its own time. "
+        "No auctioneer shows a token or answers: jobs are not awarded, and every arm keeps its own time. "
         "If this fleet needs none, give --no-auctioneer."
     ]
     told, found = faults(fleet(arm(), auctioneers=()), silence, auctioneer=False)

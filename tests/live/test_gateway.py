@@ -35,7 +35,7 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.messages import DifficultyScores, State
 from fleet.errors import FleetError
 from fleet.live.monitor.async_bridge import AsyncBridge
-from scenarios.cli.live.gateway import check, listen, server_of
+from scenarios.cli.live.gateway import Server, check, listen
 from scenarios.live.http_app import MAX_BYTES, Readers, application
 
 ROOT = Path(__file__).parents[2]
@@ -107,7 +107,7 @@ class Served:
         stuck_s = self.options.get("stuck_s", 10.0)
         with listen("127.0.0.1", 0, stuck_s) as bound, BusClient(self.endpoint, "f") as link:
             async with AsyncBridge(link, self.readers.put) as self.gateway:
-                self.server = server_of(application(self.gateway, self.readers, **self.options), self.readers)
+                self.server = Server(application(self.gateway, self.readers, **self.options), self.readers)
                 self.port = bound.getsockname()[1]
                 self.started.set()
                 await self.server.serve(sockets=[bound])

@@ -32,7 +32,7 @@ from fleet.errors import FleetError
 from fleet.job import Job, Place, Work
 from scenarios.cli.live import auction as live_auction
 from scenarios.cli.live.auction import job_spec, own_jobs
-from scenarios.cli.live.consensus import refuse_other_way
+from scenarios.cli.live.journals import refuse_other_way
 from scenarios.cli.live.submit import batches, read_jobs
 from scenarios.cli.main import main
 from scenarios.load import load

@@ -11,13 +11,30 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+import numpy as np
 import typer
 
 from agents.registry import names_of
+from fleet.bus.client.client import BusClient
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import Clock, ClockRequest
 from fleet.bus.protocol.registry import STATE_HZ
-from fleet.errors import BusError, FleetError, InfeasibleJob
+from fleet.difficulty import Blind, DifficultyModel
+from fleet.errors import BusError, FleetError, InfeasibleJob, LogError
+from fleet.files import cache_folder
 from fleet.job import Work
+from fleet.live.arm.auctioneer_client import AuctioneerClient, WorkSource
+from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
+from fleet.live.arm.body import Body
+from fleet.live.arm.estimator import Estimator, NominalPeaks
+from fleet.live.arm.journal_records import ArmHistory, ArmRecord
+from fleet.live.arm.node import ArmConfig, ArmNode
+from fleet.live.arm.replay_body import ReplayBody, SensorLog
+from fleet.live.arm.simulated_body import SimulatedBody
+from fleet.live.clock import FleetClock
+from fleet.live.journal import Journal
 from fleet.motion import Plan
+from scenarios.cli.live.journals import folder_of, refuse_other_way
 from scenarios.cli.live.options import (
     JobsOption,
     JournalOption,
@@ -25,24 +42,18 @@ from scenarios.cli.live.options import (
     RateOption,
     ScenarioFleetOption,
     SeedOption,
-    folder_of,
     number,
 )
 from scenarios.cli.options import ENDPOINT, EndpointOption, ScenarioArg
+from scenarios.cli.signals import until_stopped
+from scenarios.cli.terminal import progress_bar
 from scenarios.load import load
+from scenarios.policy_loader import scope_of
+from scenarios.progress import Progress
 from scenarios.schema import Scenario
 
 if TYPE_CHECKING:
-    from fleet.bus.client.client import BusClient
-    from fleet.difficulty import DifficultyModel
-    from fleet.live.arm.auctioneer_client import LiveArm, WorkSource
-    from fleet.live.arm.body import Body
-    from fleet.live.arm.journal_records import ArmHistory, ArmRecord
-    from fleet.live.arm.node import ArmNode
-    from fleet.live.clock import FleetClock
-    from fleet.live.journal import Journal
     from fleet.planning.plan_cache import CachedPlanner
-    from scenarios.progress import Progress
 
 log = logging.getLogger(__name__)
 
@@ -78,12 +89,7 @@ def arm_command(
     fleet: ScenarioFleetOption = "",
 ) -> None:
     """Run one arm of a fleet: publish its state, quote and execute jobs, and report, until Ctrl-C or SIGTERM."""
-    from fleet.bus.client.client import BusClient
-    from fleet.live.arm.journal_records import ArmRecord
-    from fleet.live.journal import Journal
     from scenarios.cli.live import consensus
-    from scenarios.cli.signals import until_stopped
-    from scenarios.cli.terminal import progress_bar
 
     chosen = load(scenario)
     if (source == "log") != (file is not None):
@@ -91,7 +97,7 @@ def arm_command(
         raise FleetError(f"--source must be sim, or log with a FILE after the arm's name (got {given}).")
     _check_policy(policy, file)
     fleet, folder = folder_of(journal, fleet, chosen)
-    consensus.refuse_other_way(folder, (name,), alone=bool(policy))
+    refuse_other_way(folder, (name,), alone=bool(policy))
     with progress_bar() as progress:
         arm = replayed_arm(name, file) if file else simulated_arm(chosen, name, difficulty, seed, progress)
     with (
@@ -119,8 +125,6 @@ def arm_command(
 
 
 def _check_policy(policy: str, file: Path | None) -> None:
-    from scenarios.policy_loader import scope_of
-
     if policy and scope_of(policy) == "central":
         raise FleetError(
             f"'{policy}' needs an auctioneer: start it with thermofleet auction --policy {policy}, and leave --policy "
@@ -135,10 +139,10 @@ class PreparedArm:
     """An arm before it joins the bus."""
 
     name: str
-    model: "DifficultyModel"
+    model: DifficultyModel
     plan: Callable[[Work], tuple[Plan, ...]]
     """Variants of a work; raises InfeasibleJob."""
-    body: "Callable[[float, float], Body]"
+    body: Callable[[float, float], Body]
     """Makes its body, from the fleet time and the length of its steps, s."""
     works: tuple[Work, ...] = ()
     """Works that are planned already."""
@@ -150,7 +154,7 @@ def simulated_arm(
     name: str,
     difficulty: Literal["twin", "blind"],
     seed: int,
-    progress: "Progress",
+    progress: Progress,
     cache: Path | None = None,
 ) -> PreparedArm:
     """Prepare the scenario's arm: its body, plans and twin are those of the same arm in `thermofleet run`.
@@ -158,10 +162,6 @@ def simulated_arm(
     Raises:
         FleetError: the scenario has no such arm.
     """
-    import numpy as np
-
-    from fleet.files import cache_folder
-    from fleet.live.arm.simulated_body import SimulatedBody
     from scenarios.prepare.fleet import air_offsets, prepare_arm
     from scenarios.prepare.planned_arm import planner_of
 
@@ -170,13 +170,13 @@ def simulated_arm(
     ambient_c, offset_k = ambient_of(scenario), float(air_offsets(scenario)[index])
 
     @lru_cache
-    def planner() -> "CachedPlanner":  # made for the first unplanned work only: it loads the physics
+    def planner() -> CachedPlanner:  # made for the first unplanned work only: it loads the physics
         return planner_of(arm.robot, scenario, cache or cache_folder())
 
     def plan(work: Work) -> tuple[Plan, ...]:
         return arm.plans[work] if work in arm.plans else planner().plan(work)
 
-    def body(time_s: float, dt_s: float) -> "Body":
+    def body(time_s: float, dt_s: float) -> Body:
         return SimulatedBody(
             arm,
             scenario.limits,
@@ -193,8 +193,6 @@ def simulated_arm(
 
 def ambient_of(scenario: Scenario) -> Callable[[float], float]:
     """Ambient temperature of the cell by fleet time, °C."""
-    import numpy as np
-
     return lambda at_s: float(scenario.ambient.at(np.array(at_s)))
 
 
@@ -205,9 +203,6 @@ def replayed_arm(name: str, file: Path) -> PreparedArm:
         LogError: the file cannot be read, or has no temperatures.
         FleetError: the file holds several arms, and none of this name.
     """
-    from fleet.difficulty import Blind
-    from fleet.errors import LogError
-    from fleet.live.arm.replay_body import ReplayBody, SensorLog
     from twin.logs.reader import read
 
     recordings = {each.name.rpartition("/")[2]: each for each in read(file, damaged="skip")}
@@ -227,14 +222,12 @@ def replayed_arm(name: str, file: Path) -> PreparedArm:
     return PreparedArm(name=name, model=model, plan=refuse, body=body, takes_jobs=False)
 
 
-def wait_for_name(link: "BusClient", name: str, *, patience_s: float = TOKEN_S) -> None:
+def wait_for_name(link: BusClient, name: str, *, patience_s: float = TOKEN_S) -> None:
     """Wait until no arm of that name is present; two of one name would publish and work as one.
 
     Raises:
         BusError: one is still present.
     """
-    from fleet.bus.protocol import keys
-
     deadline_s = time.monotonic() + patience_s
     while link.tokens(keys.of_arm(link.fleet, name, "alive"), timeout_s=patience_s):
         if time.monotonic() < deadline_s:
@@ -246,26 +239,21 @@ def wait_for_name(link: "BusClient", name: str, *, patience_s: float = TOKEN_S) 
 
 
 def make_node(
-    link: "BusClient",
-    book: "Journal[ArmRecord]",
+    link: BusClient,
+    book: Journal[ArmRecord],
     arm: PreparedArm,
     scenario: Scenario,
     *,
     speed: float | None = None,
     rate_hz: float = STATE_HZ,
     capacity: int = 1,
-    work_source: "Callable[[LiveArm, int], WorkSource] | None" = None,
-) -> "ArmNode":
+    work_source: Callable[[ArmNode, int], WorkSource] | None = None,
+) -> ArmNode:
     """Join the bus with an arm and the history of its journal; link and journal are open.
 
     Args:
         work_source: Makes its work source, from the arm and the boot number; by default auctioneers.
     """
-    from fleet.live.arm.auctioneer_client import AuctioneerClient
-    from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
-    from fleet.live.arm.estimator import Estimator, NominalPeaks
-    from fleet.live.arm.node import ArmConfig, ArmNode
-
     clock = fleet_clock(link, speed)
     history = restart_history(book, arm.name, clock.now_s(time.monotonic()))
     config = ExecutorConfig(capacity=capacity)
@@ -284,10 +272,8 @@ def make_node(
     return ArmNode(link, body, executor, estimator, clock, arm_config, source)
 
 
-def restart_history(book: "Journal[ArmRecord]", name: str, time_s: float) -> "ArmHistory":
+def restart_history(book: Journal[ArmRecord], name: str, time_s: float) -> ArmHistory:
     """History of the arm at this start, written to its journal."""
-    from fleet.live.arm.journal_records import ArmHistory
-
     before = ArmHistory().replay(book.records())
     for active in before.active.values():
         log.warning("'%s' was not finished when the arm went down; it is returned.", active.job)
@@ -296,12 +282,8 @@ def restart_history(book: "Journal[ArmRecord]", name: str, time_s: float) -> "Ar
     return history
 
 
-def fleet_clock(link: "BusClient", speed: float | None) -> "FleetClock":
+def fleet_clock(link: BusClient, speed: float | None) -> FleetClock:
     """Fleet time, from the auctioneer if there is one."""
-    from fleet.bus.protocol import keys
-    from fleet.bus.protocol.auction import Clock, ClockRequest
-    from fleet.live.clock import FleetClock
-
     asked_s = time.monotonic()
     answers = link.query_and_wait(keys.of_clock(link.fleet), ClockRequest(), Clock, timeout_s=CLOCK_S)
     answered_s = time.monotonic()

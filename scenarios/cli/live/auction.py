@@ -4,27 +4,34 @@ import logging
 import os
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated
+from graphlib import TopologicalSorter
+from typing import Annotated
 
+import numpy as np
 import typer
 
+from fleet.bus.client.client import BusClient
+from fleet.bus.protocol.auction import JobSpec, JobStatus, Submission
+from fleet.errors import JournalFull
 from fleet.job import Job
+from fleet.live.auction.ledger import AuctionRecord
+from fleet.live.auction.node import AuctionNode
+from fleet.live.auction.round import Timing
+from fleet.live.journal import Journal
+from scenarios.cli.live.journals import folder_of, refuse_other_way
 from scenarios.cli.live.options import (
     JobsOption,
     JournalOption,
     ScenarioFleetOption,
     SeedOption,
     SpeedOption,
-    folder_of,
 )
 from scenarios.cli.options import ENDPOINT, EndpointOption, PolicyOption, ScenarioArg
+from scenarios.cli.signals import Stop, until_stopped
+from scenarios.job_stream import draw_jobs
+from scenarios.live.allocation import central_allocation
 from scenarios.load import load
 from scenarios.schema import Scenario
-
-if TYPE_CHECKING:
-    from fleet.bus.protocol.auction import JobSpec, JobStatus
-    from fleet.live.auction.node import AuctionNode
-    from scenarios.cli.signals import Stop
 
 log = logging.getLogger(__name__)
 
@@ -46,15 +53,6 @@ def auction_command(
     fleet: ScenarioFleetOption = "",
 ) -> None:
     """Auction jobs to the arms of a fleet, keep its time, and record awards in a journal."""
-    from fleet.bus.client.client import BusClient
-    from fleet.live.auction.ledger import AuctionRecord
-    from fleet.live.auction.node import AuctionNode
-    from fleet.live.auction.round import Timing
-    from fleet.live.journal import Journal
-    from scenarios.cli.live.consensus import refuse_other_way
-    from scenarios.cli.signals import until_stopped
-    from scenarios.live.allocation import central_allocation
-
     chosen = load(scenario)
     allocate = central_allocation(policy, chosen, seed)
     own = own_jobs(chosen, seed) if jobs == "scenario" else []
@@ -83,13 +81,8 @@ def auction_command(
         stop.leave(f"Interrupted at {node.time_s:.0f} s; the journal is {book.path}, and the same command continues.")
 
 
-def submit_stream(
-    node: "AuctionNode", stream: "Sequence[tuple[float, JobSpec]]", horizon_s: float, stop: "Stop"
-) -> None:
+def submit_stream(node: AuctionNode, stream: Sequence[tuple[float, JobSpec]], horizon_s: float, stop: Stop) -> None:
     """Serve, and submit a stream of jobs as they are released, until all are settled or the shift is over."""
-    from fleet.bus.protocol.auction import Submission
-    from fleet.errors import JournalFull
-
     left = [] if node.auctioneer.ledger.ended else list(stream)
     while not stop.is_set():
         node.serve(time.monotonic() + TURN_S)
@@ -112,17 +105,11 @@ def submit_stream(
         node.serve(time.monotonic() + TURN_S)
 
 
-def own_jobs(scenario: Scenario, seed: int) -> "list[tuple[float, JobSpec]]":
+def own_jobs(scenario: Scenario, seed: int) -> list[tuple[float, JobSpec]]:
     """Job stream of a scenario for one seed, the same as in `thermofleet run`, each job with the time to submit it.
 
     That is when it and all jobs that it waits for are released.
     """
-    from graphlib import TopologicalSorter
-
-    import numpy as np
-
-    from scenarios.job_stream import draw_jobs
-
     # As `ShiftFactory` draws them for the first shift of a seed.
     jobs = {job.name: job for job in draw_jobs(scenario, np.random.SeedSequence(seed, spawn_key=(0,)))}
     at_s: dict[str, float] = {}
@@ -131,10 +118,8 @@ def own_jobs(scenario: Scenario, seed: int) -> "list[tuple[float, JobSpec]]":
     return [(due_s, job_spec(jobs[name])) for name, due_s in sorted(at_s.items(), key=lambda item: item[1])]
 
 
-def job_spec(job: Job) -> "JobSpec":
+def job_spec(job: Job) -> JobSpec:
     """Message that describes a job."""
-    from fleet.bus.protocol.auction import JobSpec
-
     return JobSpec(
         name=job.name,
         kind=job.work.kind,
@@ -150,7 +135,7 @@ def job_spec(job: Job) -> "JobSpec":
     )
 
 
-def summary(statuses: "Sequence[JobStatus]", time_s: float) -> str:
+def summary(statuses: Sequence[JobStatus], time_s: float) -> str:
     """Number of finished jobs, and one line for each other job."""
     others = [status for status in statuses if status.state != "finished"]
     lines = [f"{time_s:.0f} s: {len(statuses) - len(others)} of {len(statuses)} jobs finished."]

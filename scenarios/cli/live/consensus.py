@@ -1,25 +1,25 @@
 """An arm that allocates jobs with its peers, without an auctioneer: `thermofleet arm --policy consensus`."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import typer
 
-from fleet.errors import BusError, FleetError
+from fleet.bus.client.client import BusClient
+from fleet.bus.protocol import keys
+from fleet.errors import BusError
+from fleet.live.arm.node import ArmNode
+from fleet.live.consensus.granter import GrantRecord
+from fleet.live.consensus.node import ConsensusNode, Membership
+from fleet.live.journal import Journal
 from scenarios.cli.live.auction import own_jobs, summary
+from scenarios.cli.signals import Stop
 from scenarios.live.allocation import live_fleet
 from scenarios.policy_loader import arm_policy_of
 from scenarios.schema import Scenario
-
-if TYPE_CHECKING:
-    from fleet.bus.client.client import BusClient
-    from fleet.live.arm.node import ArmNode
-    from fleet.live.consensus.node import ConsensusNode, Membership
-    from scenarios.cli.signals import Stop
 
 TURN_S = 0.25
 """Real seconds between two checks whether all jobs are settled."""
@@ -27,14 +27,12 @@ FAREWELL_S = 2.0
 """Real seconds to serve after that: peers that do not know it yet request the missing outcomes."""
 
 
-def membership_of(scenario: Scenario, name: str, policy: str, *, jobs: str, seed: int) -> "Membership":
+def membership_of(scenario: Scenario, name: str, policy: str, *, jobs: str, seed: int) -> Membership:
     """How the arm `name` of a scenario takes part in the consensus of its fleet, by a policy of scope `arm`.
 
     Raises:
         FleetError: the scenario has no such arm, or there is no such policy.
     """
-    from fleet.live.consensus.node import Membership
-
     place = scenario.index_of(name)
     chosen = arm_policy_of(policy)
     chosen.reset(np.random.default_rng(np.random.SeedSequence([seed, 1, place])))
@@ -49,62 +47,30 @@ def membership_of(scenario: Scenario, name: str, policy: str, *, jobs: str, seed
     )
 
 
-def refuse_auctioneer(link: "BusClient") -> None:
+def refuse_auctioneer(link: BusClient) -> None:
     """Check that the fleet has no auctioneer: it would award jobs that the arms allocate too.
 
     Raises:
         BusError: the fleet has one.
     """
-    from fleet.bus.protocol import keys
-
     if present := link.tokens(keys.of_every_auction(link.fleet, "alive"), timeout_s=2.0):
         names = ", ".join(sorted(present))
         raise BusError(f"Fleet '{link.fleet}' has an auctioneer: '{names}'. Stop it first, or leave --policy out.")
 
 
-def refuse_other_way(folder: Path, arms: Iterable[str], *, alone: bool) -> None:
-    """Check that journals in a folder are not of a shift with the other kind of allocation: jobs would be done twice.
-
-    Args:
-        alone: Whether the arms allocate jobs without an auctioneer.
-
-    Raises:
-        FleetError: a journal is of the other kind.
-    """
-    remedy = "Use the --policy that the shift was started with, or another folder for a new shift."
-    for arm in arms:
-        grants, journal = folder / f"{arm}.grants", folder / f"{arm}.journal"
-        if alone and not grants.exists() and journal.exists() and journal.stat().st_size:
-            raise FleetError(
-                f"{journal} has no {grants.name} beside it: it is of a shift with an auctioneer, or the grants are "
-                f"lost, and jobs would be done twice. {remedy}"
-            )
-        if not alone and grants.exists() and grants.stat().st_size:
-            raise FleetError(
-                f"{grants} is of a shift in which the arms allocate jobs without an auctioneer, and jobs would be done "
-                f"twice. {remedy}"
-            )
-
-
 @contextmanager
-def work_source(path: Path, membership: "Membership") -> "Iterator[Callable[[LiveArm, int], ConsensusNode]]":
+def work_source(path: Path, membership: Membership) -> Iterator[Callable[[ArmNode, int], ConsensusNode]]:
     """Factory of an arm's work source, from the arm and its boot number; the journal of its grants is open meanwhile.
 
     Raises:
         FleetError: the journal cannot be used.
     """
-    from fleet.live.consensus.granter import GrantRecord
-    from fleet.live.consensus.node import ConsensusNode
-    from fleet.live.journal import Journal
-
     with Journal[GrantRecord](path, GrantRecord) as book:
         yield lambda arm, boot: ConsensusNode(arm, membership, book, boot=boot)
 
 
-def serve_until_done(node: "ArmNode", stop: "Stop") -> bool:
+def serve_until_done(node: ArmNode, stop: Stop) -> bool:
     """Serve until all jobs are settled, and print a summary; return False if stopped before that."""
-    from fleet.live.consensus.node import ConsensusNode
-
     source = node.work_source
     assert isinstance(source, ConsensusNode)
     while not stop.is_set() and not source.over:
@@ -112,7 +78,7 @@ def serve_until_done(node: "ArmNode", stop: "Stop") -> bool:
     if stop.is_set():
         return False
     typer.echo(summary(source.statuses(), node.clock.now_s(time.monotonic())))
-    typer.echo(f"As far as this arm knows, after {source.participant.rounds} rounds of allocation.")
+    typer.echo(f"This is the view of one arm, after {source.participant.rounds} rounds of allocation.")
     until_s = time.monotonic() + FAREWELL_S
     while not stop.is_set() and time.monotonic() < until_s:
         node.serve(min(until_s, time.monotonic() + TURN_S))

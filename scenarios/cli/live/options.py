@@ -7,7 +7,6 @@ from typing import Annotated, Any, Literal
 import typer
 
 from fleet.errors import FleetError
-from scenarios.schema import Scenario
 
 
 def number(text: str, low: float = 0.0, high: float = math.inf, *, above: bool = False) -> Any:
@@ -38,9 +37,3 @@ JobsOption = Annotated[
 ]
 JournalOption = Annotated[Path | None, typer.Option(help="Folder of the journals; an existing journal is continued.")]
 ScenarioFleetOption = Annotated[str, typer.Option(help="Name of the fleet. Default: the scenario's name.")]
-
-
-def folder_of(folder: Path | None, fleet: str, scenario: Scenario) -> tuple[str, Path]:
-    """Name of the fleet, and its folder: the given ones or the default ones."""
-    name = fleet or scenario.name
-    return name, folder or Path("runs") / f"live-{name}"

@@ -10,16 +10,17 @@ import typer
 from fleet.bus.security.tls import Tls
 from fleet.errors import FleetError
 from fleet.live.supervisor import Part, Supervisor
+from scenarios.cli.live.journals import folder_of, refuse_other_way
 from scenarios.cli.live.options import (
     JobsOption,
     ModelOption,
     ScenarioFleetOption,
     SeedOption,
     SpeedOption,
-    folder_of,
     number,
 )
 from scenarios.cli.options import PolicyOption, ScenarioArg
+from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import err_console, out_console, progress_bar, say
 from scenarios.load import load
 from scenarios.policy_loader import scope_of
@@ -105,8 +106,6 @@ def up_command(
     A process that exits is restarted with back-off; Ctrl-C stops all in order. The same command with the same --out
     continues from the journals.
     """
-    from scenarios.cli.live.consensus import refuse_other_way
-    from scenarios.cli.signals import until_stopped
     from scenarios.prepare.fleet import prepare
 
     chosen = load(scenario)
