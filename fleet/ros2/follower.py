@@ -13,7 +13,7 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Ack, Award, JobEstimate, Quote, QuoteRequest
 from fleet.bus.protocol.messages import Info, MalformedMessage, State
 from fleet.errors import BusError
-from fleet.live.arm.auctioneer_client import RateLimitedWarnings
+from fleet.live.arm.auctioneer_client import WARNING_S, RateLimitedWarnings
 from fleet.live.arm.clock_sync import ClockSync
 from fleet.live.clock import FleetClock
 from fleet.robot import ThermalLimits
@@ -111,7 +111,7 @@ class Follower:
         self._link, self._arm, self._readings, self._clock = link, arm, readings, clock
         self._warning_c = (limits or ThermalLimits()).warning_c
         self._period_s, self._tick, self._due_s = 1.0 / rate_hz, 0, time.monotonic()
-        self._warn = RateLimitedWarnings(arm)
+        self._warn, self._warn_from_s = RateLimitedWarnings(arm), time.monotonic() + WARNING_S
         self._sync = ClockSync(link, lambda: self._clock, self._set_clock, self._warn)
         self._twin = f"ros2 {topics[0]}"
         self._refusal = f"this arm is a real one that publishes under {topics[0]}, and takes no work"
@@ -158,9 +158,9 @@ class Follower:
     def _send_state(self, now_s: float) -> None:
         self._tick += 1
         state = self._state(now_s)
-        if state is None:
+        if state is None and now_s >= self._warn_from_s:
             self._warn("state", f"publishes no state: there is {self._readings.missing(now_s)}.")
-        else:
+        if state is not None:
             self._publish_state(state)
 
     def _state(self, now_s: float) -> State | None:

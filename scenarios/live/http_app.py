@@ -51,10 +51,9 @@ class AskBody(msgspec.Struct, frozen=True):
 
 
 @dataclass(eq=False)
-class Reader:
+class Reader(ReaderBuffer):
     """One reader of the event stream."""
 
-    buffer: ReaderBuffer = field(default_factory=ReaderBuffer)
     wake: asyncio.Event = field(default_factory=asyncio.Event)
 
 
@@ -68,7 +67,7 @@ class Readers:
     def put(self, entry: Entry) -> None:
         """Pass an entry to every reader."""
         for reader in self.connected:
-            reader.buffer.put(entry)
+            reader.put(entry)
             reader.wake.set()
 
     def close(self) -> None:
@@ -195,15 +194,15 @@ class EventStream(StreamingResponse):
         gap_text = "event: gap\ndata: {}\n\n" if gap and self._last_event else ""
         yield "retry: 1000\n\n" + gap_text + "".join(map(self._event, missed))
         seen = missed[-1].number if missed else 0
-        while not (self._readers.closed or reader.buffer.full):
+        while not (self._readers.closed or reader.full):
             try:
                 await asyncio.wait_for(reader.wake.wait(), self._heartbeat_s)
             except TimeoutError:
                 yield ": heartbeat\n\n"
                 continue
             reader.wake.clear()
-            entries = [entry for entry in reader.buffer.take() if entry.number > seen]
-            if entries and not reader.buffer.full:
+            entries = [entry for entry in reader.take() if entry.number > seen]
+            if entries and not reader.full:
                 yield "".join(map(self._event, entries))
 
     def _event(self, entry: Entry) -> str:

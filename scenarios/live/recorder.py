@@ -105,15 +105,11 @@ class Recorder:
 
     @classmethod
     def open(cls, folder: Path, fleet: str) -> "Recorder":
-        """Start or continue a recording.
+        """Start or continue a recording in an existing folder.
 
         Raises:
             FleetError: the folder cannot be written, holds something else, or a recording of another fleet.
         """
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise FleetError(f"Cannot write to '{folder}': {error.strerror}.") from error
         card = read_card(folder) if (folder / CARD).exists() else None
         if card is None and any(folder.iterdir()):
             raise FleetError(f"'{folder}' holds other files; --out needs a new folder or an earlier recording.")

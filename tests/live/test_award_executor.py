@@ -309,6 +309,21 @@ def test_what_was_in_hand_is_given_back_in_the_next_life_with_the_cycles_on_disk
     assert (report.outcome, report.cycles, report.time_s, report.unsure) == ("returned", 1, 7.0, False)
 
 
+def test_an_arm_that_may_have_finished_a_job_returns_it_as_unsure():
+    executor, disk = shop()
+    award = taken(executor)
+    executor.record_progress(2, 0.0)
+    ((auctioneer, request),) = executor.lease_requests(1.0)
+    assert (auctioneer, request.entries[0].phase, request.entries[0].cycles) == ("x", "finishing", 2)
+    executor.apply_lease(Lease("x", LEASE_S, (award.award,), (), (award.award,)), 1.0)
+    restarted, _ = shop(disk)
+    assert not restarted.active
+    ((_, report),) = restarted.due_reports(0.0)
+    assert (report.outcome, report.cycles, report.unsure) == ("returned", 2, True)
+    assert restarted.answer_award(award, 0.2).accepted  # the same answer after the restart
+    assert not restarted.answer_award(replace(award, award="other"), 0.2).accepted  # on the same quote
+
+
 def test_an_award_is_known_over_many_restarts_and_the_journal_stays_small():
     disk = Disk()
     for life in range(MAX_PAST_AWARDS + 50):

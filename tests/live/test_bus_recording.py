@@ -125,6 +125,7 @@ def test_what_is_no_recording_is_refused(tmp_path):
         Recorder.open(tmp_path, "f")
     with pytest.raises(FleetError, match="neither a run"):
         Replay.of(tmp_path)
+    (tmp_path / "new").mkdir()
     Recorder.open(tmp_path / "new", "f")
     with pytest.raises(FleetError, match="of fleet 'f', not of 'g'"):
         Recorder.open(tmp_path / "new", "g")
@@ -198,6 +199,7 @@ def test_nothing_is_lost_when_the_router_is_started_again(tmp_path):
 
 
 def test_a_replay_says_the_same_again_and_refuses_to_speak_for_those_who_are_there(tmp_path):
+    (tmp_path / "first").mkdir()
     first = Recorder.open(tmp_path / "first", "f")
     for tick in range(20):
         first.add("a", state("a", tick))

@@ -52,9 +52,6 @@ def call(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, 
     return left.value.code, said.out, said.err
 
 
-# jobs from a file
-
-
 def test_jobs_come_one_a_line_or_as_a_list(tmp_path):
     other = {**HOLD, "name": "b"}
     lines, listed = tmp_path / "jobs.jsonl", tmp_path / "jobs.json"
@@ -102,9 +99,6 @@ def test_a_missing_file_is_one_sentence(capsys):
     code, _, err = call(capsys, "submit", "no-such-file", "--fleet", "f")
     assert code == 2
     assert "Cannot read 'no-such-file': No such file or directory." in err
-
-
-# the scenario's own stream
 
 
 def test_the_stream_is_the_one_of_a_run(small_toml, plans):
@@ -191,9 +185,6 @@ def test_a_job_travels_whole():
     assert job_spec(job) == JobSpec("p", "press", ("rack",), 6, 0.0, 20.0, 30.0, 1.0, 9.0, 3.0, ("q",))
 
 
-# policies
-
-
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
@@ -257,9 +248,6 @@ def test_a_shift_goes_on_in_its_own_way_and_from_nothing(tmp_path):
         (tmp_path / file).touch()
     refuse_other_way(tmp_path, ("alone", "new"), alone=True)
     refuse_other_way(tmp_path, ("led", "new"), alone=False)
-
-
-# the commands
 
 
 @contextmanager

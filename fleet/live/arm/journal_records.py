@@ -119,16 +119,8 @@ class ArmHistory(JournalState[ArmRecord]):
         """History at the next start, with a report for every award that was open: it is returned."""
         reports = dict(self.reports)
         for name, active in self.active.items():
-            report = Report(
-                arm=arm,
-                award=name,
-                job=active.job,
-                outcome="returned",
-                cycles=active.cycles,
-                time_s=time_s,
-                reason="the arm was restarted" + (" after it was permitted to commit" if active.may_commit else ""),
-                unsure=active.may_commit,
-            )
+            reason = "the arm was restarted" + (" after it was permitted to commit" if active.may_commit else "")
+            report = Report(arm, name, active.job, "returned", active.cycles, time_s, reason, unsure=active.may_commit)
             reports[name] = active.award, report
         return ArmHistory(self.boot + 1, {}, reports, bounded(self.accepted, reports))
 

@@ -64,7 +64,7 @@ class EventFeed:
         return sorted(entries, key=lambda entry: entry.number), number < self._dropped
 
 
-@dataclass
+@dataclass(eq=False)
 class ReaderBuffer:
     """Entries that wait for one reader."""
 

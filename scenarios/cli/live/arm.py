@@ -170,7 +170,7 @@ def simulated_arm(
     ambient_c, offset_k = ambient_of(scenario), float(air_offsets(scenario)[index])
 
     @lru_cache
-    def planner() -> CachedPlanner:  # made for the first unplanned work only: it loads the physics
+    def planner() -> "CachedPlanner":  # made for the first unplanned work only: it loads the physics
         return planner_of(arm.robot, scenario, cache or cache_folder())
 
     def plan(work: Work) -> tuple[Plan, ...]:
