@@ -190,7 +190,7 @@ def until(condition, make=lambda: None):
     return value
 
 
-def test_the_fleet_is_told_with_ages(gateway, arm):
+def test_the_fleet_is_shown_with_ages(gateway, arm):
     def fleet():
         _, kind, told = gateway.ask("GET", "/v2/fleet")
         assert kind == "application/json"
@@ -204,7 +204,7 @@ def test_the_fleet_is_told_with_ages(gateway, arm):
     assert told["counts"] == {"waiting": 1}
 
 
-def test_jobs_go_in_and_answers_come_out(gateway, arm):
+def test_jobs_are_submitted_and_quoted(gateway, arm):
     status, _, told = gateway.ask("POST", "/v2/jobs", {"jobs": [CRATE_JSON], "by": "me"})
     assert (status, told["jobs"][0]["accepted"]) == (200, True)
     assert arm.asked[-1].jobs[0].name == "crate 1"
@@ -231,14 +231,14 @@ def test_jobs_go_in_and_answers_come_out(gateway, arm):
         ("GET", "/v2/fleet", None, {"Host": "evil.example:80"}, 421, "evil.example"),
     ],
 )
-def test_what_is_wrong_is_told_as_a_problem(gateway, method, path, body, headers, status, says):
+def test_an_error_is_a_problem_document(gateway, method, path, body, headers, status, says):
     got, kind, told = gateway.ask(method, path, body, headers)
     assert (got, kind) == (status, "application/problem+json")
     assert told["status"] == status
     assert says in told["detail"]
 
 
-def test_a_body_of_unknown_length_is_cut_off_too(gateway):
+def test_a_body_of_unknown_length_is_limited_too(gateway):
     line = http.client.HTTPConnection("127.0.0.1", gateway.port, timeout=PATIENCE_S)
     parts = (b" " * 10_000 for _ in range(7))
     line.request("POST", "/v2/jobs", parts, {"Content-Type": "application/json"}, encode_chunked=True)
@@ -246,7 +246,7 @@ def test_a_body_of_unknown_length_is_cut_off_too(gateway):
     line.close()
 
 
-def test_a_body_that_does_not_come_is_not_waited_for(router):
+def test_a_slow_body_is_a_timeout(router):
     with Served(router, body_s=0.2) as served, socket.create_connection(("127.0.0.1", served.port)) as line:
         line.settimeout(PATIENCE_S)
         head = (
@@ -264,7 +264,7 @@ def test_without_an_auctioneer_the_gateway_says_so():
         assert (status, told["arms"]) == (200, [])
 
 
-def test_only_who_shows_the_token_gets_in(router):
+def test_only_requests_with_the_token_are_served(router):
     token = "sixteen-or-more-characters"
     with Served(router, token=token) as served:
         for wrong in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": f"Basic {token}"},
@@ -284,7 +284,7 @@ def test_no_other_origin_is_ever_allowed(gateway):
     line.close()
 
 
-def test_the_stream_tells_all_that_is_said(gateway, arm):
+def test_the_stream_has_all_messages(gateway, arm):
     with gateway.stream() as (_, file):
         arm.state(1)
         arm.difficulty()
@@ -298,7 +298,7 @@ def test_the_stream_tells_all_that_is_said(gateway, arm):
     assert numbers == sorted(set(numbers))
 
 
-def test_who_comes_back_misses_no_event(gateway, arm):
+def test_a_reader_that_reconnects_misses_no_event(gateway, arm):
     with gateway.stream() as (_, file):
         arm.happens(100)
         last = events(file, lambda found: 100 in numbers_of(found))[-1][0]
@@ -312,12 +312,12 @@ def test_who_comes_back_misses_no_event(gateway, arm):
         assert events(file, lambda found: set(numbers_of(found)) >= {100, 101, 102, 103})
 
 
-def test_a_silent_stream_shows_signs_of_life():
+def test_a_silent_stream_sends_heartbeats():
     with Router() as empty, Served(empty.endpoint, heartbeat_s=0.05) as served, served.stream() as (_, file):
         assert any(": heartbeat" in file.readline() for _ in range(30))
 
 
-def test_a_stuck_reader_is_dropped_and_slows_nobody(router, arm):
+def test_a_stuck_reader_is_dropped_and_delays_no_other(router, arm):
     big = "x" * 4000
     with Served(router, stuck_s=0.5) as served, served.stream(receive_bytes=4096), served.stream() as (_, file):
         until(lambda: len(served.readers.connected) == 2)
@@ -335,7 +335,7 @@ def test_a_stuck_reader_is_dropped_and_slows_nobody(router, arm):
         until(lambda: len(served.server.server_state.connections) == 1)  # and so is its connection
 
 
-def test_a_reader_that_vanishes_is_forgotten(gateway, arm):
+def test_a_reader_that_disconnects_is_removed(gateway, arm):
     for _ in range(3):
         with gateway.stream() as (_, file):
             file.readline()
@@ -343,7 +343,7 @@ def test_a_reader_that_vanishes_is_forgotten(gateway, arm):
         until(lambda: not gateway.readers.connected, lambda: arm.state(1))
 
 
-def test_there_are_only_so_many_readers(gateway):
+def test_the_number_of_readers_is_limited(gateway):
     with ExitStack() as stack:
         for _ in range(64):
             stack.enter_context(gateway.stream())
@@ -368,7 +368,7 @@ def process(endpoint, *options):
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
-def test_the_command_ends_in_order_even_while_somebody_reads(router, number, code):
+def test_the_command_exits_on_a_signal_even_while_a_reader_is_connected(router, number, code):
     with process(router) as (started, address):
         port = int(address.split(":")[2].split("/")[0])
         line = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)

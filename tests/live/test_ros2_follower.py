@@ -67,7 +67,7 @@ def state_of(reality, real_s=0.0):
     return reality.state("real", 1, 5.0, real_s, 60.0)
 
 
-def test_nothing_is_said_before_all_is_known():
+def test_no_state_is_published_before_all_readings_are_present():
     reality = ArmReadings(NAMES)
     assert reality.missing(0.0) == "no joint state"
     assert state_of(reality) is None
@@ -79,7 +79,7 @@ def test_nothing_is_said_before_all_is_known():
     assert state_of(reality) is not None
 
 
-def test_what_grew_old_is_not_said_again():
+def test_old_readings_are_not_published_again():
     reality = known()
     assert state_of(reality, 0.99 * FRESH_S) is not None
     assert state_of(reality, 1.01 * FRESH_S) is None
@@ -88,7 +88,7 @@ def test_what_grew_old_is_not_said_again():
     assert "no temperature of joint_1, joint_2" in reality.missing(late_s)
 
 
-def test_what_is_not_measured_is_left_out():
+def test_unmeasured_values_are_empty():
     state = state_of(known())
     assert (state.q, state.qd, state.tau, state.current_a) == (Q, (), (), ())
     assert state.temp_c == TEMP_C
@@ -96,7 +96,7 @@ def test_what_is_not_measured_is_left_out():
 
 
 @pytest.mark.parametrize(("speed", "mode"), [(0.0, "idle"), (0.009, "idle"), (0.011, "working"), (-0.5, "working")])
-def test_an_arm_that_moves_is_at_work(speed, mode):
+def test_a_moving_arm_is_working(speed, mode):
     qd = (0.0, 0.0, speed, 0.0, 0.0, 0.0, 0.0)
     assert state_of(known(qd=qd)).mode == mode
     moved = known()  # without velocities: from two positions, a tenth of a second apart
@@ -115,7 +115,7 @@ def test_the_order_of_joints_changes_no_reading(order, values):
     assert state_of(straight) == state_of(mixed)
 
 
-def test_a_reading_that_is_no_number_changes_nothing():
+def test_a_reading_that_is_not_finite_changes_nothing():
     reality = known()
     with pytest.raises(MalformedMessage, match="nan for position of joint_1"):
         reality.update_joints(Joints(9.0, NAMES, (math.nan, *Q[1:])), 0.5)
@@ -206,7 +206,7 @@ def test_a_real_arm_is_an_arm_of_the_fleet(place, hashes):
     ],
     ids=["bytes", "nan", "another type", "no number", "type of another message"],
 )
-def test_rubbish_is_counted_and_changes_nothing(place, rubbish):
+def test_malformed_messages_are_counted_and_change_nothing(place, rubbish):
     def live():
         place.play(joint_state())
         place.warm(diagnostics())
@@ -217,7 +217,7 @@ def test_rubbish_is_counted_and_changes_nothing(place, rubbish):
     assert {state.temp_c for state in place.states} == {TEMP_C}
 
 
-def test_it_takes_no_work_and_says_why(place):
+def test_a_real_arm_takes_no_work_and_gives_the_reason(place):
     def live():
         place.play(joint_state())
         place.warm(diagnostics())
@@ -237,7 +237,7 @@ def test_it_takes_no_work_and_says_why(place):
     assert not ack.accepted
 
 
-def test_it_takes_the_time_of_the_fleet(place):
+def test_a_real_arm_uses_fleet_time(place):
     place.peer.reply_to(keys.of_clock("shop"), ClockRequest, lambda _: Clock(time_s=1e6, speed=1.0))
 
     def live():
@@ -248,7 +248,7 @@ def test_it_takes_the_time_of_the_fleet(place):
     assert place.states[-1].time_s < 1e6 + PATIENCE_S + 5.0
 
 
-def test_a_fleet_in_quick_motion_is_no_place_for_a_real_arm(place):
+def test_a_real_arm_needs_a_fleet_at_speed_1(place):
     place.peer.reply_to(keys.of_clock("shop"), ClockRequest, lambda _: Clock(time_s=0.0, speed=60.0))
     with pytest.raises(BusError, match="60 times as fast"):
         place.until(lambda: False, lambda: None)

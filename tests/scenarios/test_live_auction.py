@@ -1,4 +1,4 @@
-"""`thermofleet auction`, `submit` and `ask`, called as a person calls them, and what they are made of."""
+"""`thermofleet auction`, `submit` and `ask`, and their parts."""
 
 import json
 import signal
@@ -52,7 +52,7 @@ def call(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, 
     return left.value.code, said.out, said.err
 
 
-def test_jobs_come_one_a_line_or_as_a_list(tmp_path):
+def test_jobs_are_read_from_lines_or_a_list(tmp_path):
     other = {**HOLD, "name": "b"}
     lines, listed = tmp_path / "jobs.jsonl", tmp_path / "jobs.json"
     lines.write_text(f"{json.dumps(HOLD)}\n\n{json.dumps(other)}\n", encoding="utf-8")
@@ -77,7 +77,7 @@ def test_jobs_come_one_a_line_or_as_a_list(tmp_path):
         ("\xff", "line 1: "),
     ],
 )
-def test_what_is_no_job_is_told_by_its_line(tmp_path, text, complaint):
+def test_an_invalid_job_is_reported_with_its_line(tmp_path, text, complaint):
     file = tmp_path / "jobs"
     file.write_bytes(text.encode("latin-1"))
     with pytest.raises(FleetError) as refusal:
@@ -86,7 +86,7 @@ def test_what_is_no_job_is_told_by_its_line(tmp_path, text, complaint):
     assert complaint in str(refusal.value)
 
 
-def test_jobs_in_several_words_come_after_those_they_wait_for():
+def test_jobs_in_several_messages_follow_those_they_wait_for():
     words = [JobSpec(f"j{i:03d}", "hold", ("x",), after=(f"j{i + 1:03d}",) if i < 199 else ()) for i in range(200)]
     handed_in = list(batches(words))
     assert [len(part) for part in handed_in] == [64, 64, 64, 8]
@@ -114,7 +114,7 @@ def test_the_stream_is_the_one_of_a_run(small_toml, plans):
             assert (word.release_s, word.repetitions) == (release_s, repetitions)
 
 
-def test_a_job_is_handed_in_after_what_it_waits_for(small_toml):
+def test_a_job_is_submitted_after_those_it_waits_for(small_toml):
     drawn = own_jobs(load(small_toml), 0)
     assert [at_s for at_s, _ in drawn] == sorted(at_s for at_s, _ in drawn)
     seen: set[str] = set()
@@ -151,7 +151,7 @@ class Stage:
 
 
 @pytest.mark.parametrize(("horizon_s", "ended"), [(1e6, False), (7200.0, True)])
-def test_a_stream_is_handed_in_as_time_goes_on_until_all_is_done_or_the_shift_is_over(monkeypatch, horizon_s, ended):
+def test_a_stream_is_submitted_as_released_until_all_is_done_or_the_shift_is_over(monkeypatch, horizon_s, ended):
     monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
     stage, never = Stage(), SimpleNamespace(is_set=lambda: False)
     names = {"a": 0.0, "b": 3700.0, "c": 7000.0, "d": 10000.0}
@@ -162,7 +162,7 @@ def test_a_stream_is_handed_in_as_time_goes_on_until_all_is_done_or_the_shift_is
     assert stage.ended is ended
 
 
-def test_nothing_of_a_shift_that_is_over_is_handed_in_again(monkeypatch):
+def test_a_finished_shift_submits_no_job_again(monkeypatch):
     monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
     stage, never = Stage(), SimpleNamespace(is_set=lambda: False)
     stage.auctioneer.ledger.ended = True
@@ -170,7 +170,7 @@ def test_nothing_of_a_shift_that_is_over_is_handed_in_again(monkeypatch):
     assert stage.handed_in == []
 
 
-def test_nothing_is_handed_in_while_there_is_another_auctioneer(monkeypatch):
+def test_no_job_is_submitted_while_another_auctioneer_is_present(monkeypatch):
     monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
     stage, never = Stage(), SimpleNamespace(is_set=lambda: False)
     stage.alone_s = 7200.0
@@ -178,7 +178,7 @@ def test_nothing_is_handed_in_while_there_is_another_auctioneer(monkeypatch):
     assert stage.handed_in == [(7200.0, ["a"])]
 
 
-def test_a_job_travels_whole():
+def test_a_job_message_has_all_fields():
     place = Place(name="rack", position_m=(0.0, 0.0, 0.0))
     work = Work(kind="press", places=(place,), force_n=30.0, dwell_s=20.0)
     job = Job(name="p", work=work, repetitions=6, release_s=1.0, due_s=9.0, value=3.0, after=("q",))
@@ -204,7 +204,7 @@ def test_a_job_travels_whole():
         (("arm", "quickstart", "arm_0", "--jobs", "all"), "'all' is not one of 'scenario', 'none'"),
     ],
 )
-def test_a_policy_that_cannot_be_is_one_sentence(capsys, words, complaint):
+def test_an_invalid_policy_is_one_sentence(capsys, words, complaint):
     code, _, err = call(capsys, *words)
     assert code == 2
     assert complaint in " ".join(err.split())
@@ -228,7 +228,7 @@ def test_a_policy_that_cannot_be_is_one_sentence(capsys, words, complaint):
         ),
     ],
 )
-def test_a_shift_does_not_go_on_by_the_other_way(capsys, tmp_path, words, files, complaint):
+def test_a_shift_is_not_continued_with_the_other_kind_of_allocation(capsys, tmp_path, words, files, complaint):
     """Who goes on from the journals of the other way does not know what is done, and would have it done again."""
     folder = tmp_path / "journals" if words[0] == "up" else tmp_path
     folder.mkdir(exist_ok=True)
@@ -239,7 +239,7 @@ def test_a_shift_does_not_go_on_by_the_other_way(capsys, tmp_path, words, files,
     assert complaint in " ".join(err.split())
 
 
-def test_a_shift_goes_on_in_its_own_way_and_from_nothing(tmp_path):
+def test_a_shift_is_continued_with_its_own_kind_of_allocation(tmp_path):
     for alone in (True, False):
         refuse_other_way(tmp_path / "none", ("a",), alone=alone)
     for file in ("alone.journal", "alone.grants", "led.journal"):
@@ -272,7 +272,7 @@ def endpoint() -> Iterator[str]:
         yield router.endpoint
 
 
-def test_jobs_handed_in_are_kept_over_a_kill(endpoint, tmp_path, capsys):
+def test_submitted_jobs_survive_a_kill(endpoint, tmp_path, capsys):
     file = tmp_path / "jobs.jsonl"
     file.write_text("\n".join(json.dumps(HOLD | {"name": n, "places": [p]}) for n, p in (("a", "belt"), ("b", "moon"))))
     at = ("--endpoint", endpoint, "--fleet", "quickstart")
@@ -299,7 +299,7 @@ def test_jobs_handed_in_are_kept_over_a_kill(endpoint, tmp_path, capsys):
         assert "Continuing from" in err
 
 
-def test_a_shift_that_ends_tells_what_is_undone(endpoint, tmp_path):
+def test_the_end_of_a_shift_lists_unfinished_jobs(endpoint, tmp_path):
     short = tmp_path / "short.toml"
     text = (ROOT / "scenarios" / "library" / "quickstart.toml").read_text(encoding="utf-8")
     short.write_text(text.replace("horizon_s = 7200", "horizon_s = 600"), encoding="utf-8")
@@ -309,7 +309,7 @@ def test_a_shift_that_ends_tells_what_is_undone(endpoint, tmp_path):
     assert "unfinished, The shift ended before it was done." in out
 
 
-def test_nobody_to_hand_in_to_is_one_sentence(endpoint, tmp_path, capsys):
+def test_a_missing_auctioneer_is_one_sentence(endpoint, tmp_path, capsys):
     file = tmp_path / "jobs"
     file.write_text(json.dumps(HOLD))
     code, _, err = call(capsys, "submit", file, "--endpoint", endpoint, "--fleet", "f")
@@ -367,7 +367,7 @@ def test_jobs_can_be_followed_to_their_end(endpoint, tmp_path, capsys, end, code
     assert said[:2] == (code, f"a: accepted\na: waiting\na: awarded to arm_0\na: {end} by arm_0\n")
 
 
-def test_ask_shows_what_a_job_would_cost_whom(endpoint, capsys):
+def test_ask_shows_the_cost_of_a_job_for_each_arm(endpoint, capsys):
     job = ("--kind", "hold", "--place", "rack", "--payload", "2")
     with arm(endpoint) as asked:
         code, out, _ = call(capsys, "ask", *job, "--endpoint", endpoint, "--fleet", "f")
@@ -379,7 +379,7 @@ def test_ask_shows_what_a_job_would_cost_whom(endpoint, capsys):
     assert asked[0].jobs[0].payload_kg == 2.0
 
 
-def test_ask_says_what_is_missing(endpoint, capsys):
+def test_ask_reports_missing_arguments(endpoint, capsys):
     at = ("--endpoint", endpoint, "--fleet", "f")
     assert "either a FILE of jobs or one job" in call(capsys, "ask", *at)[2]
     told = call(capsys, "ask", "--kind", "pick_and_place", *at)[2]
