@@ -13,7 +13,8 @@ from fleet.bus.protocol import keys
 from fleet.errors import BusError
 from fleet.live.arm.node import ArmNode
 from fleet.live.consensus.granter import GrantRecord
-from fleet.live.consensus.node import ConsensusNode, Membership
+from fleet.live.consensus.node import ConsensusNode
+from fleet.live.consensus.participant import Membership
 from fleet.live.journal import Journal
 from scenarios.cli.live.auction import own_jobs, summary
 from scenarios.cli.signals import Stop
