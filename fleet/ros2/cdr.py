@@ -1,4 +1,4 @@
-"""ROS 2's messages as bytes: CDR, little endian, behind a header of four bytes. Needs the extra `ros2` (rosbags).
+"""ROS 2 messages as bytes: CDR, little endian, after a header of four bytes. Needs the extra `ros2` (rosbags).
 
 The types used here are the same in every ROS 2 version from Humble on, and so are their hashes.
 """
@@ -15,26 +15,26 @@ from fleet.ros2.conversion import Diagnostic, Joints
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
-MOST = 4096
-"""Items in one list of a message that is read; more are refused before anything is made of them."""
+MAX_ITEMS = 4096
+"""Largest length of a list in a message that is read."""
 _NS = 1_000_000_000
 _SECONDS = range(-(2**31), 2**31)
 
 _STORE = get_typestore(Stores.ROS2_JAZZY)
-_STORE.max_sequence_length = MOST
+_STORE.max_sequence_length = MAX_ITEMS
 _TYPES: dict[str, Any] = dict(_STORE.types)
 
 
 def type_hash(kind: str) -> str:
-    """`RIHS01_…`, by which ROS 2 (Iron and later) tells versions of a type apart (REP 2016)."""
+    """Type hash `RIHS01_…` of ROS 2 Iron and later (REP 2016)."""
     return _STORE.hash_rihs01(kind)
 
 
 def write_joints(joints: Joints) -> bytes:
-    """A JointState.
+    """Encode a JointState.
 
     Raises:
-        ValueError: its time is none that ROS 2 can tell.
+        ValueError: ROS 2 cannot represent its time.
     """
     arrays = [np.array(values, dtype=np.float64) for values in (joints.q, joints.qd, joints.tau)]
     message = _TYPES[JOINT_STATE](_header(joints.time_s), [_text(name) for name in joints.names], *arrays)
@@ -42,27 +42,27 @@ def write_joints(joints: Joints) -> bytes:
 
 
 def read_joints(payload: bytes) -> Joints:
-    """What a JointState says.
+    """Decode a JointState.
 
     Raises:
-        MalformedMessage: no JointState, or one whose lists do not fit each other.
+        MalformedMessage: it is no JointState, or its lists are of different lengths.
     """
     message = _read(payload, JOINT_STATE)
     stamp = message.header.stamp
     names = tuple(message.name)
-    found = {"position": message.position, "velocity": message.velocity, "effort": message.effort}
-    for field, values in found.items():
+    lists = {"position": message.position, "velocity": message.velocity, "effort": message.effort}
+    for field, values in lists.items():
         if len(values) not in (0, len(names)):
             raise MalformedMessage(f"A JointState of {len(names)} name(s) has {len(values)} value(s) of {field}.")
-    q, qd, tau = (tuple(values.tolist()) for values in found.values())
+    q, qd, tau = (tuple(values.tolist()) for values in lists.values())
     return Joints(stamp.sec + stamp.nanosec / _NS, names, q, qd, tau)
 
 
 def write_diagnostics(time_s: float, diagnostics: Sequence[Diagnostic]) -> bytes:
-    """A DiagnosticArray.
+    """Encode a DiagnosticArray.
 
     Raises:
-        ValueError: its time is none that ROS 2 can tell.
+        ValueError: ROS 2 cannot represent its time.
     """
     status, pair = _TYPES["diagnostic_msgs/msg/DiagnosticStatus"], _TYPES["diagnostic_msgs/msg/KeyValue"]
     statuses = [
@@ -79,10 +79,10 @@ def write_diagnostics(time_s: float, diagnostics: Sequence[Diagnostic]) -> bytes
 
 
 def read_diagnostics(payload: bytes) -> tuple[Diagnostic, ...]:
-    """What a DiagnosticArray says.
+    """Decode a DiagnosticArray.
 
     Raises:
-        MalformedMessage: no DiagnosticArray.
+        MalformedMessage: it is no DiagnosticArray.
     """
     return tuple(
         Diagnostic(
@@ -106,11 +106,11 @@ def _read(payload: bytes, kind: str) -> Any:  # rosbags makes its classes at run
 def _header(time_s: float) -> Any:  # see _read
     sec, nanosec = divmod(round(time_s * _NS), _NS) if abs(time_s) < 2**32 else (_SECONDS.stop, 0)
     if sec not in _SECONDS:
-        raise ValueError(f"ROS 2 tells times from {_SECONDS[0]} s to {_SECONDS[-1]} s (got {time_s:g}).")
+        raise ValueError(f"A ROS 2 time is {_SECONDS[0]} to {_SECONDS[-1]} s (got {time_s:g}).")
     stamp = _TYPES["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
     return _TYPES["std_msgs/msg/Header"](stamp=stamp, frame_id="")
 
 
 def _text(text: str) -> str:
-    """Strings of CDR end with a zero, so none may be inside."""
+    """Text without zeros: a string of CDR ends with one."""
     return text.replace("\0", "\N{REPLACEMENT CHARACTER}")

@@ -1,7 +1,7 @@
-"""Between the words of this bus and what ROS 2 says of an arm: joint states and diagnostics. No bytes here.
+"""Convert between messages of this bus and those of ROS 2: joint states and diagnostics.
 
-A JointState has no temperature, so those travel as diagnostics: a status whose `hardware_id` ends with the name of the
-joint, with the value `temperature_c`. What is written so is also how it is read.
+A JointState has no temperatures. Those are diagnostics, written and read in one way: a status whose `hardware_id` ends
+with the name of the joint, with the value `temperature_c`.
 """
 
 from collections.abc import Iterable, Mapping
@@ -14,19 +14,19 @@ from fleet.robot import ThermalLimits
 OK, WARN, ERROR, STALE = range(4)
 """Levels of a diagnostic_msgs/DiagnosticStatus."""
 TEMPERATURE = "temperature_c"
-"""Key under which a motor's temperature stands, °C."""
-MOST_JOBS = 256
-"""In one status."""
+"""Key of a motor's temperature, °C."""
+MAX_JOBS = 256
+"""Jobs in one status."""
 
 
 @dataclass(frozen=True)
 class Joints:
-    """What a sensor_msgs/JointState says; lists are empty where nothing is measured."""
+    """Content of a sensor_msgs/JointState; lists are empty where nothing is measured."""
 
     time_s: float
     names: tuple[str, ...]
     q: tuple[float, ...] = ()
-    """rad, [joint]; the order is that of the names."""
+    """rad, [joint], in the order of the names."""
     qd: tuple[float, ...] = ()
     """rad/s, [joint]."""
     tau: tuple[float, ...] = ()
@@ -35,7 +35,7 @@ class Joints:
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """A diagnostic_msgs/DiagnosticStatus."""
+    """Content of a diagnostic_msgs/DiagnosticStatus."""
 
     level: int
     name: str
@@ -45,22 +45,22 @@ class Diagnostic:
 
 
 def joint_names(joints: int) -> tuple[str, ...]:
-    """`joint_1` … as Kinova calls them."""
+    """Joint names of Kinova: `joint_1` …"""
     return tuple(f"joint_{number}" for number in range(1, joints + 1))
 
 
 def joints_of(state: State) -> Joints:
-    """The joint state of an arm of ours."""
+    """Joint state of an arm of the fleet."""
     return Joints(state.time_s, joint_names(len(state.temp_c)), state.q, state.qd, state.tau)
 
 
 def in_order(joints: Joints, names: tuple[str, ...]) -> Joints | None:
-    """The joints named, in that order; None where there is none of them: others speak under the same topic.
+    """Select the named joints, in that order; None without any of them: a topic may have other publishers.
 
-    A velocity or effort that is NaN for every joint named counts as not measured: ros2_control writes so.
+    A velocity or effort that is NaN for every named joint counts as not measured: ros2_control writes so.
 
     Raises:
-        MalformedMessage: one of the joints is missing or named twice, or a value of theirs is not finite.
+        MalformedMessage: a joint is missing or named twice, or one of its values is not finite.
     """
     at = {name: index for index, name in enumerate(joints.names)}
     missing = [name for name in names if name not in at]
@@ -68,19 +68,18 @@ def in_order(joints: Joints, names: tuple[str, ...]) -> Joints | None:
         return None
     if missing:
         raise MalformedMessage(f"A JointState has {', '.join(sorted(at))}, but not {', '.join(missing)}.")
-    twice = [name for name in names if joints.names.count(name) > 1]
-    if twice:
+    if twice := [name for name in names if joints.names.count(name) > 1]:
         raise MalformedMessage(f"A JointState names {', '.join(twice)} twice.")
-    taken: dict[str, tuple[float, ...]] = {}
-    for field in ("q", "qd", "tau"):
+    selected: dict[str, tuple[float, ...]] = {}
+    for field, ros_field in _FIELDS.items():
         values = getattr(joints, field)
-        taken[field] = tuple(values[at[name]] for name in names) if values else ()
-        if field != "q" and all(isnan(value) for value in taken[field]):
-            taken[field] = ()
-        for name, value in zip(names, taken[field], strict=False):
+        selected[field] = tuple(values[at[name]] for name in names) if values else ()
+        if field != "q" and all(map(isnan, selected[field])):
+            selected[field] = ()
+        for name, value in zip(names, selected[field], strict=False):
             if not isfinite(value):
-                raise MalformedMessage(f"A JointState says {value} for {_FIELDS[field]} of {name}.")
-    return Joints(joints.time_s, names, **taken)
+                raise MalformedMessage(f"A JointState has {value} for {ros_field} of {name}.")
+    return Joints(joints.time_s, names, **selected)
 
 
 _FIELDS = {"q": "position", "qd": "velocity", "tau": "effort"}
@@ -89,13 +88,13 @@ _FIELDS = {"q": "position", "qd": "velocity", "tau": "effort"}
 def diagnostics_of(
     fleet: str, state: State, difficulty: DifficultyScores | None, limits: ThermalLimits, age_s: float, stale_s: float
 ) -> tuple[Diagnostic, ...]:
-    """How an arm of ours is: one status for it, one per motor, one for what it finds difficult.
+    """Diagnostics of an arm: one status of the arm, one of each motor, and one of its difficulties.
 
     Args:
-        age_s: Of the state, real seconds; older than `stale_s` is stale.
+        age_s: Age of the state, real seconds; above `stale_s` it is stale.
     """
     arm = f"{fleet}/{state.arm}"
-    stale = f"nothing heard for {age_s:.1f} s" if age_s > stale_s else ""
+    stale = f"no state for {age_s:.1f} s" if age_s > stale_s else ""
     whole = Diagnostic(
         STALE if stale else ERROR if state.mode == "faulted" else OK,
         f"{arm}: arm",
@@ -110,24 +109,24 @@ def diagnostics_of(
 
 def _motor(arm: str, name: str, temp_c: float, limits: ThermalLimits, stale: str) -> Diagnostic:
     if temp_c >= limits.error_c:
-        level, words = ERROR, f"above the error limit of {limits.error_c:g} °C"
+        level, text = ERROR, f"above the error limit of {limits.error_c:g} °C"
     elif temp_c >= limits.warning_c:
-        level, words = WARN, f"above the warning limit of {limits.warning_c:g} °C"
+        level, text = WARN, f"above the warning limit of {limits.warning_c:g} °C"
     else:
-        level, words = OK, f"{limits.warning_c - temp_c:.1f} K below the warning limit"
+        level, text = OK, f"{limits.warning_c - temp_c:.1f} K below the warning limit"
     values = ((TEMPERATURE, repr(temp_c)), ("headroom_k", repr(limits.warning_c - temp_c)))
-    message = stale or f"{temp_c:.1f} °C, {words}"
+    message = stale or f"{temp_c:.1f} °C, {text}"
     return Diagnostic(STALE if stale else level, f"{arm}: {name}", message, f"{arm}/{name}", values)
 
 
-def _difficulty(arm: str, word: DifficultyScores, stale: str) -> Diagnostic:
-    scored = list(zip(word.jobs, word.difficulty, word.p_saturation, strict=True))[:MOST_JOBS]
-    values = [("twin", word.twin), ("time_s", repr(word.time_s))]
+def _difficulty(arm: str, scores: DifficultyScores, stale: str) -> Diagnostic:
+    scored = list(zip(scores.jobs, scores.difficulty, scores.p_saturation, strict=True))[:MAX_JOBS]
+    values = [("twin", scores.twin), ("time_s", repr(scores.time_s))]
     for job, difficulty, p_saturation in scored:
         values += [(f"d {job}", _number(difficulty)), (f"p_saturation {job}", _number(p_saturation))]
     known = [(difficulty, job) for job, difficulty, _ in scored if difficulty is not None]
     easiest = f", the easiest {min(known)[1]}" if known else ""
-    message = stale or f"{len(word.jobs)} job(s) on offer{easiest}"
+    message = stale or f"{len(scores.jobs)} job(s) on offer{easiest}"
     return Diagnostic(STALE if stale else OK, f"{arm}: difficulty", message, arm, tuple(values))
 
 
@@ -136,25 +135,25 @@ def _number(value: float | None) -> str:
 
 
 def temperatures(diagnostics: Iterable[Diagnostic], names: tuple[str, ...], hardware: str) -> Mapping[str, float]:
-    """Motor temperatures by joint, °C, as far as the diagnostics tell them.
+    """Motor temperatures by joint, °C, as far as the diagnostics have them.
 
     Args:
-        hardware: What stands before the joint's name in `hardware_id`, without the `/`; "" for nothing.
+        hardware: Text before the joint's name in `hardware_id`, without the `/`; "" for none.
 
     Raises:
-        MalformedMessage: a temperature is no finite number.
+        MalformedMessage: a temperature is not a finite number.
     """
     wanted = {f"{hardware}/{name}" if hardware else name: name for name in names}
-    found: dict[str, float] = {}
+    temp_c: dict[str, float] = {}
     for status in diagnostics:
         name = wanted.get(status.hardware)
-        said = dict(status.values).get(TEMPERATURE)
-        if name is None or said is None or status.level == STALE:
+        text = dict(status.values).get(TEMPERATURE)
+        if name is None or text is None or status.level == STALE:
             continue
         try:
-            found[name] = float(said)
+            temp_c[name] = float(text)
         except ValueError as error:
-            raise MalformedMessage(f"The {TEMPERATURE} of {status.hardware} is no number: '{said[:40]}'.") from error
-        if not isfinite(found[name]):
-            raise MalformedMessage(f"The {TEMPERATURE} of {status.hardware} is {said}.")
-    return found
+            raise MalformedMessage(f"The {TEMPERATURE} of {status.hardware} is no number: '{text[:40]}'.") from error
+        if not isfinite(temp_c[name]):
+            raise MalformedMessage(f"The {TEMPERATURE} of {status.hardware} is {text}.")
+    return temp_c

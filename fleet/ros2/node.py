@@ -1,6 +1,6 @@
-"""A ROS 2 node over Zenoh, as rmw_zenoh makes one: seen by `ros2 node list`, heard by subscribers, hearing publishers.
+"""A ROS 2 node over Zenoh, compatible with rmw_zenoh: `ros2 node list` shows it, and it publishes and subscribes.
 
-It is a client of one router: rmw_zenoh's own (`rmw_zenohd`), or one of ours. There are no services and no parameters.
+It is a client of one router: rmw_zenoh's (`rmw_zenohd`) or the fleet's. It has no services and no parameters.
 """
 
 import time
@@ -20,7 +20,6 @@ class Publisher:
     """Sends messages of one topic until it is closed."""
 
     def __init__(self, session: zenoh.Session, topic: Topic, node: str, entity: int, now_ns: Callable[[], int]) -> None:
-        """Declare it, and show it to the others."""
         token = publisher_token(topic, str(session.zid()), node, entity)
         self._sender, self._now_ns, self._sent = gid(token), now_ns, 0
         self._publisher = session.declare_publisher(topic.key, congestion_control=zenoh.CongestionControl.DROP)
@@ -32,13 +31,19 @@ class Publisher:
         self._publisher.put(payload, attachment=attachment(self._sent, self._now_ns(), self._sender))
 
     def close(self) -> None:
-        """Be seen no more."""
+        """Withdraw the publisher and its token."""
         self._token.undeclare()
         self._publisher.undeclare()
 
 
 class Node:
-    """`with Node(endpoint, "name") as node:` is part of a ROS 2 domain until the end of the block."""
+    """`with Node(endpoint, "name") as node:` is part of a ROS 2 domain until the end of the block.
+
+    Args:
+        endpoint: The router, which has `timeout_s` to reply.
+        name: Characters that ROS 2 does not allow in it become `_`.
+        now_ns: Wall clock for the time stamps of messages, ns since 1970.
+    """
 
     def __init__(
         self,
@@ -49,25 +54,19 @@ class Node:
         timeout_s: float = 5.0,
         now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """Prepare a node at the router at `endpoint`, which has `timeout_s` to answer.
-
-        Args:
-            name: What ROS 2 does not allow in it becomes `_`.
-            now_ns: ROS 2 stamps what is sent with the wall clock, ns since 1970.
-        """
         self.name, self.domain = plain_name(name), domain
         self._endpoint, self._timeout_s, self._now_ns = endpoint, timeout_s, now_ns
         self._session: zenoh.Session | None = None
         self._entities = 0
         self._resources = ExitStack()
-        # A process that ends without closing its session would hang.
+        # A process that exits without closing its session would hang.
         self._at_exit = weakref.finalize(self, self._resources.close)
 
     def open(self) -> Self:
-        """Connect, and be seen.
+        """Connect, and show the node in ROS 2.
 
         Raises:
-            BusError: no router answered.
+            BusError: no router replied.
         """
         if self._session is None:
             self._session = open_client(self._endpoint, timeout_s=self._timeout_s)
@@ -75,16 +74,16 @@ class Node:
             token = self._session.liveliness().declare_token(
                 node_token(self.domain, str(self._session.zid()), self.name)
             )
-            self._resources.callback(lambda: token)  # kept: a forgotten token is undeclared
+            self._resources.callback(lambda: token)  # kept: a token without a reference is undeclared
         return self
 
     def close(self) -> None:
-        """Leave; twice is fine."""
+        """Leave the domain; does nothing if not open."""
         self._session = None
         try:
             self._resources.close()
         except zenoh.ZError as error:
-            raise BusError(f"The ROS 2 node at {self._endpoint} did not close in order: {error}") from error
+            raise BusError(f"The ROS 2 node at {self._endpoint} did not close: {error}") from error
 
     def __enter__(self) -> Self:
         return self.open()
@@ -93,24 +92,24 @@ class Node:
         self.close()
 
     def publisher(self, topic: Topic) -> Publisher:
-        """What sends messages of a topic."""
+        """Publisher of a topic."""
         self._entities += 1
         return Publisher(self._open(), topic, self.name, self._entities, self._now_ns)
 
     def listen(self, topic: Topic, handle: Callable[[str, bytes], None]) -> None:
-        """Hear all messages of a topic, from every ROS 2 version.
+        """Subscribe to a topic, for publishers of every ROS 2 version.
 
         Args:
-            handle: Gets the type's hash, as the sender knows it, and the message; called on Zenoh's own thread, so it
-                only hands over.
+            handle: Called with the sender's hash of the type, and the message; on a thread of Zenoh, so it must be
+                fast.
         """
 
-        def came(sample: zenoh.Sample) -> None:
+        def receive(sample: zenoh.Sample) -> None:
             if sample.kind == zenoh.SampleKind.PUT:
                 handle(str(sample.key_expr).rpartition("/")[2], sample.payload.to_bytes())
 
         # The stub of zenoh types handlers by their internals.
-        direct: Any = zenoh.handlers.Callback(came, indirect=False)
+        direct: Any = zenoh.handlers.Callback(receive, indirect=False)
         subscriber = self._open().declare_subscriber(topic.any_hash, direct)
         self._resources.callback(lambda: subscriber)
 

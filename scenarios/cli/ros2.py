@@ -88,14 +88,14 @@ def listen_command(
     node = node_at(where, f"thermofleet_{arm}", domain)
     from fleet.bus.client.client import BusClient
     from fleet.live.clock import FleetClock
-    from fleet.ros2.follower import Follower, Reality
+    from fleet.ros2.follower import ArmReadings, Follower
     from scenarios.cli.signals import until_stopped
 
     with until_stopped() as stop, BusClient(endpoint, the_fleet(fleet, endpoint)) as link, node:
         clock = FleetClock(1.0, time.monotonic())
         limits = limits_of(warning_c, max(warning_c + 1.0, DEFAULTS.error_c))
-        reality, topics = Reality(names, hardware), (topic, temperatures)
-        follower = Follower(link, node, arm, reality, topics, clock, limits=limits, rate_hz=rate_hz)
+        readings, topics = ArmReadings(names, hardware), (topic, temperatures)
+        follower = Follower(link, node, arm, readings, topics, clock, limits=limits, rate_hz=rate_hz)
         typer.echo(f"ready {arm} {topic} {os.getpid()}")
         while not stop.is_set():
             follower.serve(time.monotonic() + TURN_S)

@@ -1,4 +1,4 @@
-"""Policies in a live fleet: a central one allocates the jobs of each round of the auctioneer."""
+"""Central policies in a live fleet: they allocate the jobs of each round of the auctioneer."""
 
 from agents.policy import Policy
 from fleet.env.validation import actions_of
@@ -28,7 +28,7 @@ class CentralAllocation:
 
 
 def live_fleet(scenario: Scenario) -> LiveFleet:
-    """What policies are told of a scenario."""
+    """Parameters of a scenario that live policies see."""
     return LiveFleet(
         arms=tuple(arm.name for arm in scenario.arms),
         warning_c=scenario.limits.warning_c,
@@ -37,7 +37,7 @@ def live_fleet(scenario: Scenario) -> LiveFleet:
 
 
 def central_allocation(policy: str, scenario: Scenario, seed: int) -> Allocate:
-    """How the auctioneer of a scenario allocates jobs.
+    """Allocation rule of the auctioneer of a scenario.
 
     Args:
         policy: As `scenarios.policy_loader` takes it.

@@ -7,7 +7,7 @@ event loop only. Errors are problem details (RFC 9457).
 import asyncio
 import hmac
 import secrets
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from typing import TypeVar
@@ -17,14 +17,14 @@ from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.requests import ClientDisconnect, Request
-from starlette.responses import Response
+from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from fleet.bus.protocol.auction import JobSpec, QuoteRequest, StatusRequest, Submission
 from fleet.bus.protocol.messages import MalformedMessage, decode, encode
 from fleet.live.monitor.async_bridge import AsyncBridge, NoReply
-from fleet.live.monitor.event_feed import Entry, ReaderBuffer
+from fleet.live.monitor.event_feed import Entry, EventFeed, ReaderBuffer
 
 MAX_BYTES = 60_000
 """Of a body: what the router passes, less the overhead of a message."""
@@ -51,10 +51,9 @@ class AskBody(msgspec.Struct, frozen=True):
 
 
 @dataclass(eq=False)
-class Reader:
+class Reader(ReaderBuffer):
     """One reader of the event stream."""
 
-    buffer: ReaderBuffer = field(default_factory=ReaderBuffer)
     wake: asyncio.Event = field(default_factory=asyncio.Event)
 
 
@@ -68,7 +67,7 @@ class Readers:
     def put(self, entry: Entry) -> None:
         """Pass an entry to every reader."""
         for reader in self.connected:
-            reader.buffer.put(entry)
+            reader.put(entry)
             reader.wake.set()
 
     def close(self) -> None:
@@ -120,10 +119,8 @@ def application(
         if readers.closed or len(readers.connected) >= MAX_READERS:
             detail = f"{len(readers.connected)} readers are connected; try again later."
             raise Problem(HTTPStatus.SERVICE_UNAVAILABLE, detail)
-        last = request.headers.get("last-event-id", "")
-        last_boot, _, number = last.partition("-")
-        seen = int(number) if last_boot == boot and number.isdecimal() and len(number) < 20 else 0
-        return EventStream(bridge, readers, boot, seen, bool(last), heartbeat_s, stuck_s)
+        last_event = request.headers.get("last-event-id", "")
+        return EventStream(bridge.feed, readers, boot, last_event, heartbeat_s, stuck_s)
 
     routes = [
         Route("/v2/fleet", fleet),
@@ -165,68 +162,53 @@ class AccessCheck:
         return problem_response(HTTPStatus.UNAUTHORIZED, detail, {"WWW-Authenticate": "Bearer"})
 
 
-class EventStream(Response):
+class EventStream(StreamingResponse):
     """Server-sent events until the reader disconnects or falls behind, or the gateway stops."""
 
     def __init__(
-        self,
-        bridge: AsyncBridge,
-        readers: Readers,
-        boot: str,
-        seen: int,
-        reconnected: bool,
-        heartbeat_s: float,
-        stuck_s: float,
+        self, feed: EventFeed, readers: Readers, boot: str, last_event: str, heartbeat_s: float, stuck_s: float
     ) -> None:
-        super().__init__(media_type="text/event-stream", headers={"Cache-Control": "no-store"})
-        del self.headers["content-length"]
-        self._bridge, self._readers, self._boot, self._seen = bridge, readers, boot, seen
-        self._reconnected, self._heartbeat_s, self._stuck_s = reconnected, heartbeat_s, stuck_s
+        super().__init__(self._text(), media_type="text/event-stream", headers={"Cache-Control": "no-store"})
+        self._feed, self._readers, self._boot, self._last_event = feed, readers, boot, last_event
+        self._heartbeat_s, self._stuck_s, self._reader = heartbeat_s, stuck_s, Reader()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Write the stream."""
-        reader = Reader()
-        self._readers.connected.add(reader)
-        gone = asyncio.ensure_future(wait_for_disconnect(receive, reader))
+
+        async def send_in_time(message: Message) -> None:
+            await asyncio.wait_for(send(message), self._stuck_s)
+
+        self._readers.connected.add(self._reader)
         try:
-            await send({"type": "http.response.start", "status": 200, "headers": self.raw_headers})
-            missed, gap = self._bridge.feed.since(self._seen)
-            text = "retry: 1000\n\n" + ("event: gap\ndata: {}\n\n" if gap and self._reconnected else "")
-            await self._send(send, text + "".join(map(self._event, missed)))
-            seen = missed[-1].number if missed else 0
-            while not (gone.done() or self._readers.closed or reader.buffer.full):
-                try:
-                    await asyncio.wait_for(reader.wake.wait(), self._heartbeat_s)
-                except TimeoutError:
-                    await self._send(send, ": heartbeat\n\n")
-                    continue
-                reader.wake.clear()
-                entries = [entry for entry in reader.buffer.take() if entry.number > seen]
-                if entries and not reader.buffer.full:
-                    await self._send(send, "".join(map(self._event, entries)))
-            if not gone.done():
-                await self._send(send, "", more=False)
+            await super().__call__(scope, receive, send_in_time)
         except TimeoutError:
             pass  # the reader is stuck: the server closes the connection of an unfinished stream
         finally:
-            self._readers.connected.discard(reader)
-            gone.cancel()
+            self._readers.connected.discard(self._reader)
+
+    async def _text(self) -> AsyncIterator[str]:
+        reader = self._reader
+        last_boot, _, number = self._last_event.partition("-")
+        seen = int(number) if last_boot == self._boot and number.isdecimal() and len(number) < 20 else 0
+        missed, gap = self._feed.since(seen)
+        gap_text = "event: gap\ndata: {}\n\n" if gap and self._last_event else ""
+        yield "retry: 1000\n\n" + gap_text + "".join(map(self._event, missed))
+        seen = missed[-1].number if missed else 0
+        while not (self._readers.closed or reader.full):
+            try:
+                await asyncio.wait_for(reader.wake.wait(), self._heartbeat_s)
+            except TimeoutError:
+                yield ": heartbeat\n\n"
+                continue
+            reader.wake.clear()
+            entries = [entry for entry in reader.take() if entry.number > seen]
+            if entries and not reader.full:
+                yield "".join(map(self._event, entries))
 
     def _event(self, entry: Entry) -> str:
         name = msgspec.json.encode(entry.name).decode()
         data = f'{{"name":{name},"message":{entry.data}}}'
         return f"id: {self._boot}-{entry.number}\nevent: {entry.topic}\ndata: {data}\n\n"
-
-    async def _send(self, send: Send, text: str, more: bool = True) -> None:
-        message = {"type": "http.response.body", "body": text.encode(), "more_body": more}
-        await asyncio.wait_for(send(message), self._stuck_s)
-
-
-async def wait_for_disconnect(receive: Receive, reader: Reader) -> None:
-    """Return when the reader has disconnected, and wake its stream."""
-    while (await receive())["type"] != "http.disconnect":
-        pass
-    reader.wake.set()
 
 
 async def read_body(request: Request, kind: type[Body], body_s: float) -> Body:

@@ -1,4 +1,4 @@
-"""Record the messages of arms and auctioneers in Parquet parts, readable while the recording goes on.
+"""Record the messages of arms and auctioneers in Parquet parts, readable while the recording continues.
 
 `recording.json` describes the recording; `telemetry-000001.parquet`, `events-…` and `results-…` are its parts, each
 written atomically. Columns are the fields of the messages `State`, `ArmEvent` and `Result`. Every message is kept once
@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 import msgspec
 import pyarrow as pa
@@ -105,15 +105,11 @@ class Recorder:
 
     @classmethod
     def open(cls, folder: Path, fleet: str) -> "Recorder":
-        """Start or continue a recording.
+        """Start or continue a recording in an existing folder.
 
         Raises:
             FleetError: the folder cannot be written, holds something else, or a recording of another fleet.
         """
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise FleetError(f"Cannot write to '{folder}': {error.strerror}.") from error
         card = read_card(folder) if (folder / CARD).exists() else None
         if card is None and any(folder.iterdir()):
             raise FleetError(f"'{folder}' holds other files; --out needs a new folder or an earlier recording.")
@@ -241,5 +237,4 @@ def states(table: pa.Table, *, warning_c: float = 60.0) -> Iterator[State]:
 def _joints(row: dict[str, float | None], name: str) -> tuple[float, ...]:
     """Values of a sensor, [joint]; empty if one is missing."""
     values = [row.get(f"{name}_{joint + 1}") for joint in range(JOINTS)]
-    known = tuple(value for value in values if value is not None)
-    return known if len(known) == len(values) else ()
+    return () if None in values else cast(tuple[float, ...], tuple(values))

@@ -17,8 +17,8 @@ from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
 from fleet.errors import FleetError
 from scenarios.live.recorder import CARD, KINDS, Message, read_card, read_parts, states
 
-TURN_S = 0.2
-"""Real seconds between two checks whether to stop."""
+TURN_S, TOKENS_S = 0.2, 2.0
+"""Real seconds between two checks whether to stop; for the router to name the arms that are present."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,10 +122,6 @@ def _results(table: pa.Table) -> Iterator[Result]:
 
 
 def _refuse_present(link: BusClient, arms: list[str]) -> None:
-    present: set[str] = set()
-    link.watch_tokens(keys.of_every_arm(link.fleet, "alive"), lambda arm, here: present.add(arm) if here else None)
-    deadline_s = time.monotonic() + TURN_S
-    while time.monotonic() < deadline_s:
-        link.serve(deadline_s)
+    present = link.tokens(keys.of_every_arm(link.fleet, "alive"), timeout_s=TOKENS_S)
     if taken := sorted(present & set(arms)):
         raise FleetError(f"Arm '{taken[0]}' of fleet '{link.fleet}' is on the bus already; give another --fleet.")

@@ -131,7 +131,7 @@ def test_a_good_name_stays(name):
     assert plain_name(name) == name
 
 
-def test_what_a_node_says_arrives_with_what_rmw_zenoh_wants_attached(domain):
+def test_a_message_arrives_with_the_attachment_of_rmw_zenoh(domain):
     node, other = domain
     ear = other()
     ear.hear(CHATTER_KEY)
@@ -157,7 +157,7 @@ def test_what_a_node_says_arrives_with_what_rmw_zenoh_wants_attached(domain):
 
 
 @pytest.mark.parametrize("type_hash", [STRING_HASH, NO_HASH])
-def test_publishers_of_every_version_are_heard(domain, type_hash):
+def test_messages_of_every_ros_version_arrive(domain, type_hash):
     node, other = domain
     listener, heard = node("listener"), queue.SimpleQueue()
     listener.listen(CHATTER, lambda *said: heard.put(said))
@@ -174,7 +174,7 @@ def test_publishers_of_every_version_are_heard(domain, type_hash):
     pytest.fail("nothing was heard")
 
 
-def test_another_domain_is_not_heard(domain):
+def test_messages_of_another_domain_do_not_arrive(domain):
     node, _ = domain
     listener, talker, heard = node("listener"), node("talker"), queue.SimpleQueue()
     listener.listen(CHATTER, lambda *said: heard.put(said))
@@ -186,7 +186,7 @@ def test_another_domain_is_not_heard(domain):
     assert heard.get(timeout=PATIENCE_S) == (STRING_HASH, b"0")
 
 
-def test_a_closed_node_says_so(domain):
+def test_a_closed_node_raises(domain):
     node, _ = domain
     talker = node("talker")
     talker.close()

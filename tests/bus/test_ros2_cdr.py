@@ -17,7 +17,7 @@ from fleet.bus.protocol.messages import MalformedMessage
 from fleet.ros2.cdr import (
     DIAGNOSTICS,
     JOINT_STATE,
-    MOST,
+    MAX_ITEMS,
     read_diagnostics,
     read_joints,
     type_hash,
@@ -111,7 +111,7 @@ def test_the_types_are_the_same_in_every_version(kind):
 
 @UNHURRIED
 @given(joint_states(), st.integers(0, 2**22), st.integers(0, 1023))
-def test_rosbags_and_pycdr2_read_a_joint_state_as_it_was_said(state, sec, fraction):
+def test_rosbags_and_pycdr2_decode_our_joint_state(state, sec, fraction):
     names, (q, qd, tau) = state
     payload = write_joints(Joints(sec + fraction / 1024, tuple(names), tuple(q), tuple(qd), tuple(tau)))
     assert payload[:4] == HEADER
@@ -126,7 +126,7 @@ def test_rosbags_and_pycdr2_read_a_joint_state_as_it_was_said(state, sec, fracti
 
 @UNHURRIED
 @given(joint_states(), times, texts)
-def test_what_pycdr2_writes_is_read_and_written_again_byte_for_byte(state, stamp, frame):
+def test_a_joint_state_of_pycdr2_is_decoded_and_encoded_byte_for_byte(state, stamp, frame):
     names, lists = state
     payload = JointState(Header(Time(*stamp), frame), names, *lists).serialize()
     joints = read_joints(payload)
@@ -141,7 +141,7 @@ def test_what_pycdr2_writes_is_read_and_written_again_byte_for_byte(state, stamp
 @UNHURRIED
 @given(st.lists(st.tuples(st.integers(0, 3), texts, texts, texts, st.lists(st.tuples(texts, texts), max_size=4)),
                 max_size=5))  # fmt: skip
-def test_diagnostics_are_read_as_they_were_said(said):
+def test_diagnostics_are_decoded_as_encoded(said):
     statuses = tuple(Diagnostic(*rest, values=tuple(values)) for *rest, values in said)
     payload = write_diagnostics(12.5, statuses)
     assert read_diagnostics(payload) == statuses
@@ -155,14 +155,14 @@ def test_diagnostics_are_read_as_they_were_said(said):
     assert DiagnosticArray(Header(Time(12, 500_000_000), ""), again).serialize() == payload
 
 
-def test_a_zero_in_a_name_ends_no_string():
+def test_a_zero_in_a_name_is_replaced():
     (status,) = read_diagnostics(write_diagnostics(0.0, [Diagnostic(0, "a\0b", "", "")]))
     assert status.name == "a\N{REPLACEMENT CHARACTER}b"
 
 
 @pytest.mark.parametrize("time_s", [math.inf, math.nan, 1e300, -math.inf, 2.0**31, -(2.0**31) - 1])
-def test_a_time_that_ros_cannot_tell_is_refused(time_s):
-    with pytest.raises(ValueError, match="ROS 2 tells times"):
+def test_a_time_out_of_range_is_refused(time_s):
+    with pytest.raises(ValueError, match="A ROS 2 time is"):
         write_joints(Joints(time_s, ()))
 
 
@@ -177,16 +177,16 @@ def test_lists_that_do_not_fit_the_names_are_refused(lengths, field):
 
 @UNHURRIED
 @given(st.binary(max_size=200) | st.binary(max_size=200).map(lambda rest: HEADER + rest))
-def test_rubbish_raises_nothing_else(payload):
+def test_random_bytes_raise_nothing_else(payload):
     for read in (read_joints, read_diagnostics):
         with suppress(MalformedMessage):
             read(payload)
 
 
-@pytest.mark.parametrize("count", [MOST, MOST + 1])
+@pytest.mark.parametrize("count", [MAX_ITEMS, MAX_ITEMS + 1])
 def test_a_list_that_is_too_long_is_refused(count):
     payload = JointState(Header(Time(0, 0), ""), ["j"] * count, [], [], []).serialize()
-    if count <= MOST:
+    if count <= MAX_ITEMS:
         assert len(read_joints(payload).names) == count
     else:
         with pytest.raises(MalformedMessage, match="Not a sensor_msgs/msg/JointState"):

@@ -1,4 +1,4 @@
-"""What an arm's words become in ROS 2, and back: no order matters, and what is not measured is not made up."""
+"""Messages of an arm to ROS 2 and back."""
 
 import math
 import random
@@ -42,7 +42,7 @@ def told(word=None, age_s=0.0, **change):
 
 @UNHURRIED
 @given(q=seven, qd=st.just(()) | seven, tau=st.just(()) | seven, time_s=st.floats(0, 1e6))
-def test_an_arm_comes_back_from_ros_as_it_went(q, qd, tau, time_s):
+def test_joint_states_survive_a_round_trip(q, qd, tau, time_s):
     said = joints_of(state(q=q, qd=qd, tau=tau, time_s=time_s))
     assert said.names == NAMES
     back = in_order(read_joints(write_joints(said)), NAMES)
@@ -53,7 +53,7 @@ def test_an_arm_comes_back_from_ros_as_it_went(q, qd, tau, time_s):
 
 @UNHURRIED
 @given(q=seven, qd=st.just(()) | seven, tau=st.just(()) | seven, seed=st.integers(0, 999), more=st.integers(0, 4))
-def test_no_order_and_no_other_joint_matters(q, qd, tau, seed, more):
+def test_order_and_other_joints_do_not_matter(q, qd, tau, seed, more):
     """Arms with grippers name those too, and joint_state_broadcaster sorts as it likes."""
     rng = random.Random(seed)
     columns = dict(zip(NAMES, range(7), strict=True)) | {f"finger_{number}": -1 for number in range(more)}
@@ -66,7 +66,7 @@ def test_no_order_and_no_other_joint_matters(q, qd, tau, seed, more):
     assert in_order(read_joints(write_joints(mixed)), NAMES) == Joints(1.0, NAMES, q, qd, tau)
 
 
-def test_joints_of_others_are_passed_over():
+def test_joints_of_other_devices_are_ignored():
     assert in_order(Joints(0.0, ("finger",), (math.nan,)), NAMES) is None
 
 
@@ -81,7 +81,7 @@ def test_joints_of_others_are_passed_over():
         (Joints(0.0, ("joint_1", "joint_2"), (1.0, 1.0), (), (math.inf, 0.0)), "inf for effort of joint_1"),
     ],
 )
-def test_what_is_no_reading_is_refused(joints, complaint):
+def test_an_incomplete_reading_is_refused(joints, complaint):
     with pytest.raises(MalformedMessage, match=complaint):
         in_order(joints, ("joint_1", "joint_2"))
 
@@ -107,7 +107,7 @@ def test_a_fault_is_an_error_of_the_arm():
     assert told(mode="faulted")[0].level == ERROR
 
 
-def test_what_was_not_heard_of_for_long_is_stale():
+def test_an_old_state_is_stale():
     assert {status.level for status in told(age_s=3.5, word=WORD)} == {STALE}
     assert {status.level for status in told(age_s=2.5, word=WORD)} == {OK}
 
@@ -115,7 +115,7 @@ def test_what_was_not_heard_of_for_long_is_stale():
 WORD = DifficultyScores("arm_0", 1, 12.0, "twin-1", ("j", "k", "l"), (0.5, None, 0.25), (0.1, None, None))
 
 
-def test_the_difficulty_of_every_job_on_offer_is_told():
+def test_the_difficulty_of_every_open_job_is_published():
     status = told(WORD)[-1]
     assert status.name == "f/arm_0: difficulty"
     assert status.message == "3 job(s) on offer, the easiest l"
@@ -127,13 +127,13 @@ def test_the_difficulty_of_every_job_on_offer_is_told():
 
 @UNHURRIED
 @given(st.tuples(*[st.floats(-50, 200)] * 7))
-def test_temperatures_come_back_from_ros_as_they_went(temp_c):
+def test_temperatures_survive_a_round_trip(temp_c):
     statuses = read_diagnostics(write_diagnostics(1.0, told(temp_c=temp_c)))
     assert temperatures(statuses, NAMES, "f/arm_0") == dict(zip(NAMES, temp_c, strict=True))
     assert temperatures(statuses, NAMES, "f/arm_1") == {}
 
 
-def test_temperatures_of_a_silent_arm_are_not_taken():
+def test_stale_temperatures_are_ignored():
     assert temperatures(told(age_s=9.0), NAMES, "f/arm_0") == {}
 
 

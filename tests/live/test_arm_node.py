@@ -1,4 +1,4 @@
-"""An arm on a real bus: it says how it is, offers, works with leave, reports, and goes on after a crash."""
+"""An arm on a real bus: state, quotes, leased work, reports, restart after a crash."""
 
 import time
 from contextlib import ExitStack
@@ -130,7 +130,7 @@ def award(quote, job=JOB, name="w"):
     return Award(award=name, auction="r", auctioneer="x", quote=quote, job=job, lease_s=2.0)
 
 
-def test_it_says_what_it_is_and_how_it_is(bus):
+def test_an_arm_publishes_info_and_state(bus):
     watcher, heard = bus.link(), {}
     for topic, kind, history in (("state", State, False), ("info", Info, True)):
         watcher.subscribe(
@@ -151,7 +151,7 @@ def test_it_says_what_it_is_and_how_it_is(bus):
     assert state.time_s >= 100.0
 
 
-def test_who_comes_late_still_learns_what_it_is(bus):
+def test_a_late_subscriber_receives_the_info(bus):
     bus.arm()
     late, heard = bus.link(), []
     late.subscribe(keys.of_every_arm("f", "info"), Info, lambda _, word: heard.append(word), history=True)
@@ -199,7 +199,7 @@ def test_a_dry_run_changes_nothing(bus):
     assert list(arm.book.records()) == before
 
 
-def test_without_leave_nothing_is_finished_and_without_a_lease_nothing_goes_on(bus):
+def test_without_permission_no_job_is_finished_and_without_a_lease_work_stops(bus):
     auctioneer, line = Auctioneer(bus.link()), bus.link()
     auctioneer.grants = False
     arm = bus.arm()
@@ -214,7 +214,7 @@ def test_without_leave_nothing_is_finished_and_without_a_lease_nothing_goes_on(b
     assert auctioneer.reports[0].outcome == "finished"
 
 
-def test_after_a_crash_the_job_is_given_back_and_the_arm_works_again(bus):
+def test_after_a_crash_the_job_is_returned_and_the_arm_works_again(bus):
     auctioneer, line = Auctioneer(bus.link()), bus.link()
     arm = bus.arm()
     quote = bus.ask(line, "quote", request(), Quote)
@@ -231,7 +231,7 @@ def test_after_a_crash_the_job_is_given_back_and_the_arm_works_again(bus):
     assert [(r.award, r.outcome) for r in auctioneer.reports] == [("w", "returned"), ("w2", "finished")]
 
 
-def test_an_arm_that_is_stopped_gives_back_its_job_and_is_sure(bus):
+def test_a_stopped_arm_returns_its_job_as_sure(bus):
     auctioneer, line = Auctioneer(bus.link()), bus.link()
     arm = bus.arm(speed=1.0)
     quote = bus.ask(line, "quote", request(), Quote)
@@ -246,7 +246,7 @@ def test_an_arm_that_is_stopped_gives_back_its_job_and_is_sure(bus):
     assert not bus.ask(line, "award", award(again.quote, name="w2"), Ack).accepted
 
 
-def test_an_arm_that_faults_gives_back_its_job_with_the_cycles(bus):
+def test_a_faulted_arm_returns_its_job_with_the_cycles(bus):
     auctioneer, line, events = Auctioneer(bus.link()), bus.link(), []
     line.subscribe(keys.of_every_arm("f", "event"), ArmEvent, lambda _, e: events.append(e), history=True)
     limits = ThermalLimits(warning_c=33.0, error_c=34.0, restart_c=30.0)
@@ -265,7 +265,7 @@ def test_an_arm_that_faults_gives_back_its_job_with_the_cycles(bus):
     assert bus.ask(line, "quote", request(), Quote).capacity == 0
 
 
-def test_an_arm_that_is_hot_offers_but_takes_nothing(bus):
+def test_a_hot_arm_quotes_but_accepts_no_award(bus):
     line = bus.link()
     bus.arm(warning_c=20.0)
     quote = bus.ask(line, "quote", request(), Quote)
@@ -275,7 +275,7 @@ def test_an_arm_that_is_hot_offers_but_takes_nothing(bus):
     assert "too hot" in ack.reason
 
 
-def test_the_time_is_the_auctioneers_from_the_first_word_on(bus):
+def test_fleet_time_is_the_auctioneers_from_the_first_message(bus):
     line = bus.link()
     start_s = time.monotonic()
     line.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(5000.0 + 30.0 * (time.monotonic() - start_s), 30.0))
@@ -287,7 +287,7 @@ def test_the_time_is_the_auctioneers_from_the_first_word_on(bus):
     assert arm.body.truth.tick[0] < 1000  # set, not lived through
 
 
-def test_planning_never_keeps_an_arm_from_its_words_for_longer_than_one_plan(bus):
+def test_planning_delays_state_messages_by_one_plan_at_most(bus):
     """Twenty motions of 50 ms each: the answer comes within its time, states go on, and the rest is planned after."""
     planned = []
     own = bus.small.arm(0, [bus.small.work("bench")])
@@ -319,7 +319,7 @@ def test_planning_never_keeps_an_arm_from_its_words_for_longer_than_one_plan(bus
     assert [o.feasible for o in quote.estimates] == [True] * 19 + [False]
 
 
-def test_a_log_lives_as_an_arm_and_takes_no_work(bus):
+def test_a_replayed_log_is_an_arm_that_takes_no_work(bus):
     time_s = np.linspace(0.0, 20.0, 201)
     ramp = np.tile(time_s[:, None], (1, 7))
     readings = SensorLog(

@@ -1,4 +1,4 @@
-"""What one arm promises: which awards it takes, what it may do with them, and what its journal makes of a crash."""
+"""Award executor: accepted awards, allowed cycles, reports, and its history after a crash."""
 
 import pytest
 from hypothesis import given
@@ -52,7 +52,7 @@ def taken(executor, now_s=0.0, **changes):
     return award
 
 
-def test_an_award_on_a_good_quote_is_taken_and_on_disk():
+def test_an_award_on_a_valid_quote_is_accepted_and_on_disk():
     executor, disk = shop()
     award = taken(executor)
     assert [held.award for held in executor.active] == [award]
@@ -71,7 +71,7 @@ def test_an_award_on_a_good_quote_is_taken_and_on_disk():
         ({"lease_s": 2.0}, 2.0 * (1 - CLOCK_DRIFT), "lease has expired"),
     ],
 )
-def test_an_award_that_does_not_fit_is_refused_with_the_reason(change, now_s, reason):
+def test_an_award_that_does_not_match_is_refused_with_the_reason(change, now_s, reason):
     executor, disk = shop()
     award = replace(award_on(quoted(executor)), **change)
     before = list(disk)
@@ -82,7 +82,7 @@ def test_an_award_that_does_not_fit_is_refused_with_the_reason(change, now_s, re
     assert not executor.active
 
 
-def test_the_last_moment_of_a_quote_is_good():
+def test_a_quote_is_valid_until_its_end():
     executor, _ = shop()
     assert executor.answer_award(award_on(quoted(executor), lease_s=60.0), VALID_S).accepted
 
@@ -96,7 +96,7 @@ def test_an_arm_that_is_unfit_full_or_unable_refuses():
     assert "I have 1 job(s)" in full.reason
 
 
-def test_a_refusal_is_final_although_the_reason_has_gone():
+def test_a_refusal_is_final_although_the_reason_has_ended():
     executor, _ = shop()
     award = award_on(quoted(executor))
     refused = executor.answer_award(award, 0.0, "I am too hot")
@@ -122,7 +122,7 @@ def test_one_award_for_each_job_of_a_quote():
     assert "by 'w-j'" in executor.answer_award(award_on(quote, award="w2"), 0.0).reason
 
 
-def test_a_later_award_for_a_job_in_hand_takes_the_place_of_the_earlier():
+def test_a_later_award_of_the_current_job_replaces_the_earlier():
     executor, disk = shop()
     taken(executor)
     executor.record_progress(1, 9.0)
@@ -132,7 +132,7 @@ def test_a_later_award_for_a_job_in_hand_takes_the_place_of_the_earlier():
     assert list(ArmHistory().replay(disk).active) == ["w2"]
 
 
-def test_names_of_quotes_are_never_used_again():
+def test_names_of_quotes_are_unique():
     names, disk = [], Disk()
     for life in range(3):
         executor, _ = shop(disk, boot_nonce=f"n{life}")
@@ -142,7 +142,7 @@ def test_names_of_quotes_are_never_used_again():
     assert len(set(names)) == 400
 
 
-def test_only_so_many_quotes_are_remembered():
+def test_the_number_of_quotes_is_limited():
     executor, _ = shop(quotes=4)
     names = [quoted(executor) for _ in range(6)]
     assert "no quote" in executor.answer_award(award_on(names[1]), 0.0).reason
@@ -152,7 +152,7 @@ def test_only_so_many_quotes_are_remembered():
 # Leases and leave
 
 
-def test_a_lease_lasts_from_the_quote_and_then_from_the_question():
+def test_a_lease_runs_from_the_quote_and_then_from_the_request():
     executor, _ = shop()
     award = taken(executor, now_s=10.0)
     end_s = 10.0 + LEASE_S * (1 - CLOCK_DRIFT)
@@ -165,7 +165,7 @@ def test_a_lease_lasts_from_the_quote_and_then_from_the_question():
     assert executor.allowed_cycles(18.0) == 2
 
 
-def test_a_lease_of_another_auctioneer_counts_for_nothing():
+def test_a_lease_of_another_auctioneer_is_ignored():
     executor, _ = shop()
     award = taken(executor)
     executor.apply_lease(Lease("y", 100.0, (award.award,), (), (award.award,)), 0.0)
@@ -173,7 +173,7 @@ def test_a_lease_of_another_auctioneer_counts_for_nothing():
     assert executor.allowed_cycles(50.0) == 0
 
 
-def test_leases_are_asked_for_three_times_in_each_and_leave_at_once():
+def test_leases_are_requested_three_times_in_each_and_permission_at_once():
     executor, _ = shop()
     taken(executor)
     asked = [s / 100 for s in range(600) if executor.lease_requests(s / 100)]
@@ -185,7 +185,7 @@ def test_leases_are_asked_for_three_times_in_each_and_leave_at_once():
     assert executor.lease_requests(4.32)
 
 
-def test_the_last_cycle_needs_leave_which_is_on_disk_and_for_good():
+def test_the_last_cycle_needs_permission_which_is_on_disk_and_final():
     executor, disk = shop()
     award = taken(executor)
     executor.record_progress(2, 0.0)
@@ -202,7 +202,7 @@ def test_the_last_cycle_needs_leave_which_is_on_disk_and_for_good():
     assert ArmHistory().replay(disk).active[award.award].may_commit
 
 
-def test_what_is_lost_is_let_go_of_without_a_report():
+def test_a_revoked_award_is_released_without_a_report():
     executor, disk = shop()
     award = taken(executor)
     executor.apply_lease(Lease("x", 4.0, (), (award.award,)), 2.0)
@@ -211,7 +211,7 @@ def test_what_is_lost_is_let_go_of_without_a_report():
     assert not ArmHistory().replay(disk).active
 
 
-def test_without_a_lease_for_long_the_job_is_given_back():
+def test_a_job_without_a_lease_for_long_is_returned():
     executor, _ = shop(return_after_s=20.0)
     taken(executor)
     executor.return_expired(1.0, 25.9)
@@ -221,7 +221,7 @@ def test_without_a_lease_for_long_the_job_is_given_back():
     assert (report.outcome, report.time_s, report.reason) == ("returned", 2.0, "no lease for 20 s")
 
 
-def test_no_more_cycles_are_told_than_are_on_disk():
+def test_a_lease_request_has_no_more_cycles_than_are_on_disk():
     executor, disk = shop()
     taken(executor)
     executor.record_progress(1, 9.0)
@@ -240,7 +240,7 @@ def finished(executor, award, now_s=1.0):
     executor.finish(33.0, now_s)
 
 
-def test_a_report_is_said_again_ever_more_seldom_until_its_receipt():
+def test_a_report_is_repeated_with_back_off_until_its_receipt():
     executor, _ = shop()
     award = taken(executor)
     finished(executor, award, 1.0)
@@ -252,7 +252,7 @@ def test_a_report_is_said_again_ever_more_seldom_until_its_receipt():
     assert not executor.due_reports(200.0)
 
 
-def test_a_finished_job_for_which_there_is_no_room_is_reported_once_there_is():
+def test_a_finished_job_is_reported_once_the_disk_has_space():
     executor, disk = shop()
     award = taken(executor)
     executor.apply_lease(Lease("x", LEASE_S, (award.award,), (), (award.award,)), 1.0)
@@ -268,7 +268,7 @@ def test_a_finished_job_for_which_there_is_no_room_is_reported_once_there_is():
     assert (report.outcome, report.cycles, report.time_s) == ("finished", 3, 33.0)
 
 
-def test_a_full_disk_takes_no_work():
+def test_an_arm_with_a_full_disk_takes_no_work():
     executor, disk = shop()
     award = award_on(quoted(executor))
     disk.full = True
@@ -278,7 +278,7 @@ def test_a_full_disk_takes_no_work():
     assert executor.answer_award(award, 0.0) == ack
 
 
-def test_a_faulted_arm_gives_back_all_it_has():
+def test_a_faulted_arm_returns_all_awards():
     executor, _ = shop(capacity=2)
     quote = quoted(executor, JOB, OTHER)
     for job in (JOB, OTHER):
@@ -291,7 +291,7 @@ def test_a_faulted_arm_gives_back_all_it_has():
 # After a crash
 
 
-def test_what_was_finished_is_reported_again_in_the_next_life():
+def test_a_finished_job_is_reported_again_after_a_restart():
     executor, disk = shop()
     finished(executor, taken(executor))
     next_life, _ = shop(disk)
@@ -301,7 +301,7 @@ def test_what_was_finished_is_reported_again_in_the_next_life():
     assert not shop(disk)[0].due_reports(0.0)
 
 
-def test_what_was_in_hand_is_given_back_in_the_next_life_with_the_cycles_on_disk():
+def test_an_active_job_is_returned_after_a_restart_with_the_cycles_on_disk():
     executor, disk = shop()
     taken(executor, cycles=1)
     executor.record_progress(2, 9.0)  # not on disk yet
@@ -309,7 +309,22 @@ def test_what_was_in_hand_is_given_back_in_the_next_life_with_the_cycles_on_disk
     assert (report.outcome, report.cycles, report.time_s, report.unsure) == ("returned", 1, 7.0, False)
 
 
-def test_an_award_is_known_over_many_restarts_and_the_journal_stays_small():
+def test_an_arm_that_may_have_finished_a_job_returns_it_as_unsure():
+    executor, disk = shop()
+    award = taken(executor)
+    executor.record_progress(2, 0.0)
+    ((auctioneer, request),) = executor.lease_requests(1.0)
+    assert (auctioneer, request.entries[0].phase, request.entries[0].cycles) == ("x", "finishing", 2)
+    executor.apply_lease(Lease("x", LEASE_S, (award.award,), (), (award.award,)), 1.0)
+    restarted, _ = shop(disk)
+    assert not restarted.active
+    ((_, report),) = restarted.due_reports(0.0)
+    assert (report.outcome, report.cycles, report.unsure) == ("returned", 2, True)
+    assert restarted.answer_award(award, 0.2).accepted  # the same answer after the restart
+    assert not restarted.answer_award(replace(award, award="other"), 0.2).accepted  # on the same quote
+
+
+def test_an_award_is_kept_over_many_restarts_and_the_journal_stays_small():
     disk = Disk()
     for life in range(MAX_PAST_AWARDS + 50):
         executor, _ = shop(disk, boot_nonce=str(life))
@@ -323,7 +338,7 @@ def test_an_award_is_known_over_many_restarts_and_the_journal_stays_small():
 
 
 @given(st.integers(0, 5), st.booleans(), st.booleans())
-def test_a_memory_retold_is_the_same_memory(cycles, leave, closed):
+def test_a_compacted_history_is_the_same_history(cycles, leave, closed):
     executor, disk = shop(capacity=3)
     award = taken(executor)
     executor.record_progress(min(cycles, 2), 0.0)
@@ -340,7 +355,7 @@ def test_a_memory_retold_is_the_same_memory(cycles, leave, closed):
     }
 
 
-def test_a_real_journal_keeps_the_promises(tmp_path):
+def test_a_journal_on_disk_restores_the_history(tmp_path):
     with Journal(tmp_path / "a.jsonl", ArmRecord) as journal:
         history = ArmHistory().replay(journal.records()).after_restart("a", 0.0)
         journal.rewrite(*history.compact())
@@ -360,7 +375,7 @@ def test_a_first_start_is_the_first_boot():
 @pytest.mark.parametrize(
     ("repetitions", "done", "phase"), [(1, 0, "finishing"), (3, 2, "finishing"), (3, 1, "working")]
 )
-def test_an_arm_that_has_only_the_last_cycle_left_asks_for_leave_from_afar(repetitions, done, phase):
+def test_an_arm_with_only_the_last_cycle_left_requests_permission_early(repetitions, done, phase):
     """It may not set out without: waiting until the last cycle is near, it would wait for ever."""
     executor, _ = shop()
     job = replace(JOB, repetitions=repetitions)
@@ -371,6 +386,6 @@ def test_an_arm_that_has_only_the_last_cycle_left_asks_for_leave_from_afar(repet
 
 
 @pytest.mark.parametrize("name", ["capacity", "valid_s", "quotes", "return_after_s", "commit_lead_s"])
-def test_terms_must_be_positive(name):
+def test_config_values_must_be_positive(name):
     with pytest.raises(ValueError, match=rf"ExecutorConfig\.{name}"):
         ExecutorConfig(**{name: 0})

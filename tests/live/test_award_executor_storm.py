@@ -1,9 +1,8 @@
-"""Arms and an auctioneer in a storm: messages lost, doubled and late, crashes at any moment, clocks of unlike rates.
+"""Arms and an auctioneer under faults: lost, repeated and late messages, crashes at any moment, clocks that drift.
 
-The auctioneer here is a small model that keeps the rules of `fleet.bus.protocol.auction` on its side and never
-forgets. Whatever
-happens, no last cycle is done twice, no two arms hold a lease of one job, and once the storm is over every job is
-finished, or reported unfinished because of a crash with leave to finish.
+The auctioneer is a small model that obeys `fleet.bus.protocol.auction` and never crashes. No last cycle is done twice,
+no two arms hold a lease of one job, and after the faults every job is finished, or reported unfinished because of a
+crash with permission to commit.
 """
 
 import random
@@ -17,7 +16,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from fleet.bus.protocol.auction import Award, JobSpec, Lease, LeaseRequest, Receipt, Report
 from fleet.errors import JournalFull
 from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
-from fleet.live.arm.journal_records import ArmHistory, AwardAccepted
+from fleet.live.arm.journal_records import ArmHistory
 from fleet.live.journal_records import CommitPermitted
 
 LEASE_S, VALID_S = 6.0, 3.0
@@ -25,12 +24,12 @@ ARMS = ("a", "b")
 
 
 class Crash(Exception):
-    """The arm's process is gone in the middle of a call."""
+    """The arm's process crashes in the middle of a call."""
 
 
 @dataclass
 class Order:
-    """A job as the auctioneer knows it."""
+    """A job of the auctioneer."""
 
     job: JobSpec
     state: str = "waiting"
@@ -42,7 +41,7 @@ class Order:
 
 @dataclass
 class Arm:
-    """An arm's process, its disk, its clock, and what may go wrong with it next."""
+    """An arm's process, its disk and its clock, and the next fault."""
 
     name: str
     rate: float
@@ -71,21 +70,23 @@ class Arm:
 
 
 class Storm(RuleBasedStateMachine):
-    """The bus is a list of calls that have not been made yet."""
+    """The bus is a list of calls that are not delivered yet."""
 
     def __init__(self) -> None:
         super().__init__()
         self.time_s = 100.0
         self.bus: list = []
         self.rounds = 0
+        self.arms: dict[str, Arm] = {}
+        self.orders: dict[str, Order] = {}
         self.last_cycles: dict[str, int] = {}
-        self.crashed_with_leave: set[str] = set()
+        self.crashed_in_commit: set[str] = set()
 
     @initialize(
         rates=st.tuples(*[st.floats(0.9951, 1.0049)] * 3),
         repetitions=st.lists(st.integers(1, 4), min_size=1, max_size=3),
     )
-    def open_shop(self, rates, repetitions) -> None:
+    def start(self, rates, repetitions) -> None:
         self.rate = rates[0]
         self.arms = {name: Arm(name, rate) for name, rate in zip(ARMS, rates[1:], strict=True)}
         for arm in self.arms.values():
@@ -94,7 +95,7 @@ class Storm(RuleBasedStateMachine):
         self.orders = {job.name: Order(job) for job in jobs}
 
     def send(self, arm: str, call, *words) -> None:
-        """Put something on its way to or from an arm."""
+        """Send a message to or from an arm."""
         self.bus.append((arm, partial(call, *words)))
 
     # The auctioneer
@@ -122,36 +123,25 @@ class Storm(RuleBasedStateMachine):
             if order.state != "waiting":
                 continue
             self.rounds += 1
-            order.award = Award(
-                award=f"w{self.rounds}",
-                auction="r",
-                auctioneer="x",
-                quote=quote,
-                job=order.job,
-                cycles=order.cycles,
-                lease_s=LEASE_S,
-            )
+            order.award = Award(f"w{self.rounds}", "r", "x", quote, order.job, order.cycles, LEASE_S)
             order.state, order.arm, order.lease_end_s = "awarded", arm, self.now_s + LEASE_S
             self.send(arm, self.award, arm, order.award)
 
-    @rule(data=st.data())
-    def award_again(self, data) -> None:
-        self.repeat_award(data.draw(st.randoms(use_true_random=False)))
-
-    def repeat_award(self, chance) -> None:
+    @rule(rng=st.randoms(use_true_random=False))
+    def repeat_award(self, rng) -> None:
         awarded = [o for o in self.orders.values() if o.state == "awarded"]
         if awarded:
-            order = chance.choice(awarded)
+            order = rng.choice(awarded)
             self.send(order.arm, self.award, order.arm, order.award)
 
-    def acknowledged(self, ack) -> None:
+    def apply_ack(self, ack) -> None:
         for order in self.orders.values():
             if order.state == "awarded" and order.award.award == ack.award and not ack.accepted:
                 order.state = "waiting"
 
     def lease(self, arm: str, life: int, request: LeaseRequest, asked_s: float) -> None:
         self.expire()
-        granted, lost, leave = [], [], []
+        granted, revoked, may_commit = [], [], []
         for hold in request.entries:
             order = self.orders[hold.job]
             mine = order.award is not None and order.award.award == hold.award
@@ -161,11 +151,11 @@ class Storm(RuleBasedStateMachine):
                 granted.append(hold.award)
                 if hold.phase == "finishing":
                     order.state = "finishing"
-                    leave.append(hold.award)
+                    may_commit.append(hold.award)
             else:
-                lost.append(hold.award)
-        answer = Lease("x", LEASE_S, tuple(granted), tuple(lost), tuple(leave))
-        self.send(arm, self.leased, arm, life, answer, asked_s)
+                revoked.append(hold.award)
+        answer = Lease("x", LEASE_S, tuple(granted), tuple(revoked), tuple(may_commit))
+        self.send(arm, self.apply_lease, arm, life, answer, asked_s)
 
     def report(self, arm: str, report: Report) -> None:
         self.expire()
@@ -175,8 +165,9 @@ class Storm(RuleBasedStateMachine):
             ended = "unfinished" if report.unsure else "waiting"
             order.state = "finished" if report.outcome == "finished" else ended
         elif report.outcome == "finished":
-            assert order.state == "finished", "finished by one that the auctioneer had not given leave"
-        self.send(arm, self.receipt, arm, Receipt("x", report.award))
+            assert order.state == "finished", "finished without permission to commit"
+        receipt = Receipt("x", report.award)
+        self.send(arm, self.at, arm, lambda _, executor: executor.apply_receipt(receipt))
 
     # The arms
 
@@ -184,7 +175,7 @@ class Storm(RuleBasedStateMachine):
         return self.time_s * arm.rate
 
     def at(self, name: str, call) -> None:
-        """Have an arm do something; it may crash in the middle."""
+        """Call an arm, which may crash in the middle."""
         arm = self.arms[name]
         try:
             call(arm, arm.executor)
@@ -192,10 +183,10 @@ class Storm(RuleBasedStateMachine):
             self.restart(arm)
 
     def restart(self, arm: Arm) -> None:
-        """Down and up again; what its journal says of leave is noted before."""
+        """Restart a crashed arm; note the jobs that it was permitted to commit."""
         left = {r.award for r in arm.disk if isinstance(r, CommitPermitted)}
         held = ArmHistory().replay(arm.disk).active
-        self.crashed_with_leave |= {held[name].award.job.name for name in left if name in held}
+        self.crashed_in_commit |= {held[name].award.job.name for name in left if name in held}
         arm.crash = ""
         arm.start()
 
@@ -214,20 +205,17 @@ class Storm(RuleBasedStateMachine):
             if ack.accepted:
                 known = [*ArmHistory().replay(arm.disk).accepted]
                 assert award.award in known, "accepted, but not on disk"
-            self.send(name, self.acknowledged, ack)
+            self.send(name, self.apply_ack, ack)
 
         self.at(name, call)
 
-    def leased(self, name: str, life: int, lease: Lease, asked_s: float) -> None:
-        if self.arms[name].lives == life:  # Replies reach only the life that asked.
+    def apply_lease(self, name: str, life: int, lease: Lease, asked_s: float) -> None:
+        if self.arms[name].lives == life:  # replies reach only the process that asked
             self.at(name, lambda arm, executor: executor.apply_lease(lease, asked_s))
 
-    def receipt(self, name: str, receipt: Receipt) -> None:
-        self.at(name, lambda arm, executor: executor.apply_receipt(receipt))
-
     @rule(name=st.sampled_from(ARMS))
-    def speak(self, name) -> None:
-        """Ask for leases, report, give up what has no lease."""
+    def communicate(self, name) -> None:
+        """Request leases, report, return awards without a lease."""
 
         def call(arm, executor) -> None:
             now_s = self.clock_s(arm)
@@ -243,7 +231,7 @@ class Storm(RuleBasedStateMachine):
 
     @rule(name=st.sampled_from(ARMS))
     def work(self, name) -> None:
-        """One cycle of the first job in hand, if it may be begun."""
+        """Do one cycle of the current job, if it is allowed."""
 
         def call(arm, executor) -> None:
             if not executor.active:
@@ -265,7 +253,7 @@ class Storm(RuleBasedStateMachine):
     def fault(self, name) -> None:
         self.at(name, lambda arm, executor: executor.return_all(0.0, self.clock_s(arm), "too hot"))
 
-    # What goes wrong
+    # Faults
 
     @rule(name=st.sampled_from(ARMS))
     def crash_now(self, name) -> None:
@@ -294,12 +282,12 @@ class Storm(RuleBasedStateMachine):
 
     @rule(seed=st.integers(0, 2**32), steps=st.integers(1, 300))
     def gale(self, seed, steps) -> None:
-        """Many things at random, cuts between an arm and the auctioneer among them, and new jobs meanwhile."""
+        """Many random actions, with new jobs, and with cuts between an arm and the auctioneer."""
         chance, cut = random.Random(seed), set()
-        deeds = {
+        actions = {
             lambda: self.arrive(chance, cut): 40,
             lambda: self.work(chance.choice(ARMS)): 6,
-            lambda: self.speak(chance.choice(ARMS)): 6,
+            lambda: self.communicate(chance.choice(ARMS)): 6,
             self.ask_for_quotes: 1.5,
             self.one_more_job: 1,
             lambda: self.repeat_award(chance): 1,
@@ -311,12 +299,12 @@ class Storm(RuleBasedStateMachine):
             lambda: self.disk(chance.choice(ARMS), chance.random() < 0.2): 0.2,
             lambda: self.fault(chance.choice(ARMS)): 0.1,
         }
-        for deed in chance.choices(list(deeds), list(deeds.values()), k=steps):
-            deed()
+        for action in chance.choices(list(actions), list(actions.values()), k=steps):
+            action()
             self.no_two_arms_hold_a_lease_of_one_job()
 
     def arrive(self, chance, cut) -> None:
-        """The oldest message, or any, arrives; or twice, or never."""
+        """Deliver the oldest message or any other: once, twice or never."""
         if not self.bus:
             return
         index = chance.choice((0, 0, chance.randrange(len(self.bus))))
@@ -331,7 +319,7 @@ class Storm(RuleBasedStateMachine):
             self.orders[name] = Order(JobSpec(name=name, kind="hold", places=("p",), repetitions=len(name) + 1))
 
     def to_the_edge(self) -> None:
-        """The moment at which the auctioneer sees a lease end: the first at which another may get the job."""
+        """Advance to the first end of a lease on the auctioneer's clock: then another arm may get the job."""
         ends = [o.lease_end_s for o in self.orders.values() if o.state == "awarded"]
         if ends:
             self.time_s = max(self.time_s, min(ends) / self.rate + 1e-3)
@@ -339,11 +327,11 @@ class Storm(RuleBasedStateMachine):
 
     @rule(turns=st.integers(1, 6))
     def fair_weather(self, turns) -> None:
-        """All that is on the bus arrives, and all do what they should."""
         for _ in range(turns):
             self.turn()
 
     def turn(self) -> None:
+        """Deliver all messages, and let every participant work."""
         for _ in range(4):
             now, self.bus = self.bus, []
             for _, message in now:
@@ -352,27 +340,22 @@ class Storm(RuleBasedStateMachine):
         self.ask_for_quotes()
         for name in ARMS:
             self.work(name)
-            self.speak(name)
+            self.communicate(name)
         self.time_s += 0.2
 
-    # What must hold
+    # Invariants
 
     @invariant()
     def no_two_arms_hold_a_lease_of_one_job(self) -> None:
-        if not hasattr(self, "arms"):
-            return
         working = [
             (held.award.job.name, arm.name)
             for arm in self.arms.values()
             for held in arm.executor.active
             if self.clock_s(arm) < held.lease_end_s or held.may_commit
         ]
-        jobs = [job for job, _ in working]
-        assert len(jobs) == len(set(jobs)), working
+        assert len(working) == len({job for job, _ in working}), working
 
     def teardown(self) -> None:
-        if not hasattr(self, "arms"):
-            return
         for arm in self.arms.values():
             arm.full, arm.crash = False, ""
         for _ in range(1500):
@@ -381,10 +364,7 @@ class Storm(RuleBasedStateMachine):
             self.turn()
         for name, order in self.orders.items():
             assert order.state in ("finished", "unfinished"), (name, order)
-            if order.state == "finished":
-                assert self.last_cycles.get(name) == 1
-            else:
-                assert name in self.crashed_with_leave
+            assert self.last_cycles.get(name) == 1 if order.state == "finished" else name in self.crashed_in_commit
 
 
 Storm.TestCase.settings = settings(stateful_step_count=20)
@@ -392,47 +372,20 @@ TestStorm = Storm.TestCase
 
 
 @given(seed=st.integers(0, 2**32))
-def test_a_long_gale_does_no_harm(seed):
+def test_no_job_is_lost_or_done_twice_in_a_long_gale(seed):
     storm, chance = Storm(), random.Random(seed)
-    storm.open_shop(tuple(chance.uniform(0.9951, 1.0049) for _ in range(3)), [1, 2, 3])
+    storm.start(tuple(chance.uniform(0.9951, 1.0049) for _ in range(3)), [1, 2, 3])
     storm.gale(seed, 4000)
     storm.teardown()
-    assert sum(storm.last_cycles.values()) > 5  # there was work
+    assert sum(storm.last_cycles.values()) > 5  # jobs were done
 
 
-def test_a_calm_shop_finishes_every_job_in_good_time():
-    """The model itself works: without a storm three jobs on two arms need some twenty turns."""
+def test_without_faults_every_job_is_finished_soon():
+    """The model itself: three jobs on two arms need about twenty turns."""
     storm = Storm()
-    storm.open_shop((1.0, 1.0, 1.0), [3, 1, 4])
+    storm.start((1.0, 1.0, 1.0), [3, 1, 4])
     for _ in range(25):
         storm.turn()
     assert [o.state for o in storm.orders.values()] == ["finished"] * 3
     assert storm.last_cycles == {"j0": 1, "j1": 1, "j2": 1}
     assert not any(arm.executor.active for arm in storm.arms.values())
-
-
-def test_a_crash_forgets_nothing_that_was_promised():
-    """Accepted, worked and given leave: the next life gives it back, and says that it is unsure."""
-    disk: list = []
-    arm = Arm("a", 1.0, disk=disk)
-    arm.start()
-    job = JobSpec(name="j", kind="hold", places=("p",), repetitions=3)
-    quote = arm.executor.add_quote({"j": (job, True)}, 0.0)
-    award = Award(award="w", auction="r", auctioneer="x", quote=quote, job=job, lease_s=LEASE_S)
-    assert arm.executor.answer_award(award, 0.1).accepted
-    assert [r for r in disk if isinstance(r, AwardAccepted)]
-    arm.executor.record_progress(2, 0.0)
-    ((auctioneer, request),) = arm.executor.lease_requests(1.0)
-    assert (auctioneer, request.entries[0].phase, request.entries[0].cycles) == ("x", "finishing", 2)
-    arm.executor.apply_lease(Lease("x", LEASE_S, ("w",), (), ("w",)), 1.0)
-    arm.start()
-    assert not arm.executor.active
-    ((_, report),) = arm.executor.due_reports(0.0)
-    assert (report.outcome, report.cycles, report.unsure) == ("returned", 2, True)
-    assert arm.executor.answer_award(award, 0.2).accepted  # the same answer, also in the next life
-    assert not arm.executor.answer_award(replace_award(award), 0.2).accepted
-
-
-def replace_award(award: Award) -> Award:
-    """Another award on the same quote."""
-    return Award(**{**{f: getattr(award, f) for f in award.__struct_fields__}, "award": "other"})

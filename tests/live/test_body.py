@@ -1,4 +1,4 @@
-"""The live body is the arm of a shift: the same heat, the same moments; and it does no cycle that it may not do."""
+"""The live body equals the arm of a simulated shift, and does only allowed cycles."""
 
 from dataclasses import replace
 
@@ -30,7 +30,7 @@ def one_job(small, *, repetitions=3, payload=None, times=None):
 
 @settings(max_examples=15, deadline=None)
 @given(st.data())
-def test_it_lives_through_the_same_shift_as_the_simulator(small, data):
+def test_a_body_passes_the_same_shift_as_the_simulator(small, data):
     """One arm, the same jobs in the same order: temperatures at every tick and every event agree."""
     draw = data.draw
     loads = [small.LIGHT, small.WARM, small.HOT]
@@ -85,7 +85,7 @@ def test_it_lives_through_the_same_shift_as_the_simulator(small, data):
     }
 
 
-def test_a_job_ends_at_its_planned_moment_whatever_the_step(small):
+def test_a_job_ends_at_its_planned_time_for_any_step(small):
     arm, job, plan = one_job(small)
     for dt_s in (0.3, 0.7, 6.0):
         body = body_of(arm, dt_s=dt_s)
@@ -99,7 +99,7 @@ def test_a_job_ends_at_its_planned_moment_whatever_the_step(small):
         assert body.is_free
 
 
-def test_without_leave_it_stops_before_the_last_cycle_and_comes_home(small):
+def test_without_permission_it_returns_home_before_the_last_cycle(small):
     arm, job, plan = one_job(small)
     body = body_of(arm, dt_s=1.0)
     body.start(job, plan, 0)
@@ -117,7 +117,7 @@ def test_without_leave_it_stops_before_the_last_cycle_and_comes_home(small):
     assert body.is_free
 
 
-def test_leave_in_time_makes_it_one_stint(small):
+def test_early_permission_makes_it_one_stint(small):
     arm, job, plan = one_job(small)
     body = body_of(arm, dt_s=1.0)
     body.start(job, plan, 0)
@@ -131,7 +131,7 @@ def test_leave_in_time_makes_it_one_stint(small):
 @pytest.mark.parametrize(
     ("when", "cycles", "home_s"), [(2.0, 0, 5.0), (3.5, 1, 15.0), (13.0, 1, 15.0), (14.0, 2, 25.0)]
 )
-def test_paused_it_ends_the_cycle_it_began_and_goes_home(small, when, cycles, home_s):
+def test_a_paused_arm_finishes_its_cycle_and_returns_home(small, when, cycles, home_s):
     arm, job, plan = one_job(small)
     body = body_of(arm, dt_s=0.5)
     body.start(job, plan, 0)
@@ -143,7 +143,7 @@ def test_paused_it_ends_the_cycle_it_began_and_goes_home(small, when, cycles, ho
     assert (body.job, body.cycles) == ("a", cycles)
 
 
-def test_a_pause_that_is_over_before_it_takes_effect_is_none(small):
+def test_a_pause_within_a_cycle_has_no_effect(small):
     arm, job, plan = one_job(small)
     body = body_of(arm, dt_s=0.5)
     body.start(job, plan, 0)
@@ -155,7 +155,7 @@ def test_a_pause_that_is_over_before_it_takes_effect_is_none(small):
     assert [e.time_s for e in body.advance(60.0) if e.kind == "finish"] == pytest.approx([33.0])
 
 
-def test_nothing_moves_before_it_may(small):
+def test_nothing_moves_before_cycles_are_allowed(small):
     arm, job, plan = one_job(small, repetitions=1)
     body = body_of(arm)
     body.start(job, plan, 0)
@@ -164,7 +164,7 @@ def test_nothing_moves_before_it_may(small):
     assert body.last_cycle_in_s() == pytest.approx(3.0)
 
 
-def test_what_it_lets_go_of_is_forgotten_when_it_is_home(small):
+def test_a_released_job_is_dropped_at_home(small):
     arm, job, plan = one_job(small)
     body = body_of(arm, dt_s=1.0)
     body.start(job, plan, 0)
@@ -179,7 +179,7 @@ def test_what_it_lets_go_of_is_forgotten_when_it_is_home(small):
     assert body.is_free
 
 
-def test_letting_go_in_the_last_cycle_finishes_nothing(small):
+def test_release_in_the_last_cycle_finishes_no_job(small):
     arm, job, plan = one_job(small)
     body = body_of(arm, dt_s=1.0)
     body.start(job, plan, 2)
@@ -189,7 +189,7 @@ def test_letting_go_in_the_last_cycle_finishes_nothing(small):
     assert [e.kind for e in body.advance(60.0)] == ["home"]
 
 
-def test_a_fault_gives_the_job_back_with_its_cycles_and_the_arm_recovers(small):
+def test_a_fault_returns_the_job_with_its_cycles_and_the_arm_recovers(small):
     arm, job, plan = one_job(small, repetitions=5000, payload=small.HOT)
     limits = ThermalLimits(warning_c=60.0, error_c=75.0, restart_c=50.0)
     body = body_of(arm, limits=limits)
@@ -208,7 +208,7 @@ def test_a_fault_gives_the_job_back_with_its_cycles_and_the_arm_recovers(small):
     assert 75.0 <= peak < 76.0
 
 
-def test_a_faulted_body_is_not_free_and_says_when_not(small):
+def test_a_faulted_body_is_not_free(small):
     arm, job, plan = one_job(small, repetitions=5000, payload=small.HOT)
     body = body_of(arm)
     body.start(job, plan, 0)
@@ -224,7 +224,7 @@ def test_a_faulted_body_is_not_free_and_says_when_not(small):
         body.start(job, plan, 0)
 
 
-def test_what_it_reads_is_what_it_does(small):
+def test_sensors_read_the_motion(small):
     arm, job, plan = one_job(small, payload=small.WARM)
     body = body_of(arm, dt_s=1.0, warm=True)
     rest = body.read_sensors()
@@ -257,7 +257,7 @@ def test_its_time_can_be_set_and_it_catches_up_in_bounded_steps(small):
     assert body.time_s == pytest.approx(5060.0 + MAX_STEPS)
 
 
-def test_a_change_of_pace_changes_nothing_else(small):
+def test_a_change_of_step_changes_no_event(small):
     """A faulted arm cools, recovers and works at the same moments, whatever the steps; heat is exact at rest."""
     arm, job, plan = one_job(small, repetitions=5000, payload=small.HOT)
     bodies = [body_of(arm, dt_s=5.0), body_of(arm, dt_s=5.0)]
@@ -280,7 +280,7 @@ def test_a_change_of_pace_changes_nothing_else(small):
     np.testing.assert_allclose(steady.truth.temp_c, changed.truth.temp_c, atol=0.01)
 
 
-def test_no_step_is_longer_than_it_may_be(small):
+def test_no_step_is_longer_than_the_limit(small):
     arm, _, _ = one_job(small)
     body = SimulatedBody(
         arm, LIMITS, lambda time_s: 25.0, dt_s=60.0, max_dt_s=10.0, rng=np.random.default_rng(0), warm=False

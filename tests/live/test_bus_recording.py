@@ -1,4 +1,4 @@
-"""The bus on disk: every word once, in order, whatever comes twice or breaks, and back on the bus as it was."""
+"""Recording and replay: every message once and in order, despite repeated messages and failures."""
 
 import threading
 import time
@@ -47,7 +47,7 @@ def result(number):
     return Result(auctioneer="boss", number=number, time_s=number / 2, status=status, difficulty=0.5)
 
 
-def test_what_was_said_is_what_is_read(tmp_path):
+def test_recorded_messages_are_read_back(tmp_path):
     recorder = Recorder.open(tmp_path, "f")
     said = [state(arm, tick) for tick in range(5) for arm in ("a", "b")]
     for word in said:
@@ -66,7 +66,7 @@ def test_what_was_said_is_what_is_read(tmp_path):
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.integers(0, 30), min_size=1, max_size=60))
-def test_every_word_is_kept_once_and_gaps_are_counted(tmp_path_factory, ticks):
+def test_every_message_is_kept_once_and_gaps_are_counted(tmp_path_factory, ticks):
     recorder = Recorder.open(tmp_path_factory.mktemp("r"), "f")
     kept = []
     for tick in ticks:  # a word is new if it is later than all before
@@ -79,14 +79,14 @@ def test_every_word_is_kept_once_and_gaps_are_counted(tmp_path_factory, ticks):
     assert count.missed == kept[-1] - kept[0] + 1 - len(kept)
 
 
-def test_an_arm_that_began_anew_is_heard_again(tmp_path):
+def test_messages_of_a_restarted_arm_are_kept(tmp_path):
     recorder = Recorder.open(tmp_path, "f")
     for word in (state("a", 7, 70.0), state("a", 0, 80.0), state("a", 1, 81.0), state("a", 0, 80.0)):
         recorder.add("a", word)
     assert (recorder.counts["state of a"].kept, recorder.counts["state of a"].missed) == (3, 0)
 
 
-def test_it_is_readable_while_it_goes_on_and_goes_on_where_it_stopped(tmp_path):
+def test_a_recording_is_readable_meanwhile_and_can_be_continued(tmp_path):
     first = Recorder.open(tmp_path, "f")
     first.add("a", state("a", 0))
     first.write()
@@ -119,12 +119,13 @@ def test_a_full_disk_loses_nothing(tmp_path, monkeypatch):
     assert read_parts(tmp_path, "telemetry").num_rows == 1
 
 
-def test_what_is_no_recording_is_refused(tmp_path):
+def test_a_folder_without_a_recording_is_refused(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(FleetError, match="holds other files"):
         Recorder.open(tmp_path, "f")
     with pytest.raises(FleetError, match="neither a run"):
         Replay.of(tmp_path)
+    (tmp_path / "new").mkdir()
     Recorder.open(tmp_path / "new", "f")
     with pytest.raises(FleetError, match="of fleet 'f', not of 'g'"):
         Recorder.open(tmp_path / "new", "g")
@@ -168,7 +169,7 @@ def rows(folder, kind="telemetry"):
     return read_parts(folder, kind).num_rows if folder.exists() else 0
 
 
-def test_nothing_is_lost_when_the_router_is_started_again(tmp_path):
+def test_no_message_is_lost_when_the_router_restarts(tmp_path):
     with ExitStack() as stack:
         router = Router().open()
         port = int(router.endpoint.rpartition(":")[2])
@@ -197,7 +198,8 @@ def test_nothing_is_lost_when_the_router_is_started_again(tmp_path):
     assert recording.recorder.counts["state of a"].missed == 0
 
 
-def test_a_replay_says_the_same_again_and_refuses_to_speak_for_those_who_are_there(tmp_path):
+def test_a_replay_publishes_the_same_messages_and_refuses_names_of_present_arms(tmp_path):
+    (tmp_path / "first").mkdir()
     first = Recorder.open(tmp_path / "first", "f")
     for tick in range(20):
         first.add("a", state("a", tick))
@@ -215,7 +217,7 @@ def test_a_replay_says_the_same_again_and_refuses_to_speak_for_those_who_are_the
         assert read_parts(tmp_path / "second", kind).equals(read_parts(tmp_path / "first", kind)), kind
 
 
-def test_two_do_not_record_in_one_folder(tmp_path):
+def test_two_recorders_cannot_share_a_folder(tmp_path):
     rec = tmp_path / "rec"
     with lock_folder(rec), pytest.raises(FleetError, match="Another process records"), lock_folder(rec):
         pass

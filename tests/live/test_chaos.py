@@ -23,14 +23,14 @@ def strike(*faults, jobs, env=None):
     )
 
 
-def test_a_fleet_survives_the_death_of_its_auctioneer():
+def test_a_fleet_survives_a_kill_of_its_auctioneer():
     told = strike("kill-auctioneer", jobs=8)
     assert told.returncode == 0, told.stdout + told.stderr
     (row,) = [line.split() for line in told.stdout.splitlines() if line.split()[0] == "kill-auctioneer"]
     assert row[1:3] == ["8", "8"]  # all of them, and none twice, says the exit code
 
 
-def test_a_fleet_with_certificates_lets_no_trespasser_in():
+def test_a_fleet_with_certificates_refuses_intruders():
     told = strike("trespass", jobs=12)
     assert told.returncode == 0, told.stdout + told.stderr
     tried, opened = map(int, re.search(r"(\d+) attempts, (\d+) successful", told.stdout).groups())
@@ -38,7 +38,7 @@ def test_a_fleet_with_certificates_lets_no_trespasser_in():
     assert opened == 0
 
 
-def test_a_fault_that_cannot_be_made_here_is_not_run_and_has_not_passed():
+def test_a_fault_that_this_machine_cannot_inject_is_skipped_and_not_passed():
     told = strike("clock-jump", jobs=12, env=os.environ | {"PATH": ""})
     assert told.returncode == 2, told.stdout + told.stderr
     *_, row, end = told.stdout.splitlines()
@@ -55,7 +55,7 @@ def test_a_jump_of_the_wall_clock_harms_nothing():
 
 
 @pytest.mark.slow
-def test_arms_without_an_auctioneer_survive_a_death_and_cuts():
+def test_arms_without_an_auctioneer_survive_a_kill_and_network_cuts():
     told = strike("alone-kill-arm", "alone-cut-one", "alone-halves", jobs=24)
     assert told.returncode == 0, told.stdout + told.stderr
 

@@ -1,4 +1,4 @@
-"""The doctor finds each illness by its signs, and calls a healthy fleet healthy."""
+"""The doctor reports each fault of a fleet, and no fault of a healthy one."""
 
 import json
 import socket
@@ -41,7 +41,7 @@ def faults(now, *probes, **more):
     return [finding.what for finding in found.findings if finding.level == "fault"], found
 
 
-def test_a_healthy_fleet_is_called_healthy():
+def test_a_healthy_fleet_has_no_findings():
     told, found = faults(fleet(arm()))
     assert told == []
     assert found.healthy
@@ -64,7 +64,7 @@ def test_a_healthy_fleet_is_called_healthy():
         (fleet(arm(), arm(arm="b", time_s=5060.0 - 60.0 * 3)), "3.0 s behind"),
     ],
 )
-def test_each_illness_of_an_arm_is_named_alone(now, says):
+def test_each_fault_of_an_arm_is_one_finding(now, says):
     told, found = faults(now)
     assert len(told) == 1
     assert says in told[0]
@@ -79,16 +79,16 @@ def test_each_illness_of_an_arm_is_named_alone(now, says):
         (ASKED, (AuctioneerSnapshot("x", True), AuctioneerSnapshot("y", True)), "2 auctioneers"),
     ],
 )
-def test_each_illness_of_an_auctioneer_is_named(probe, auctioneers, says):
+def test_each_fault_of_an_auctioneer_is_one_finding(probe, auctioneers, says):
     told, _ = faults(fleet(arm(), auctioneers=auctioneers), probe)
     assert len(told) == 1
     assert says in told[0]
 
 
-def test_a_fleet_without_an_auctioneer_by_intention_is_healthy():
+def test_a_fleet_that_needs_no_auctioneer_is_healthy_without_one():
     silence = ClockProbe(100.0, 100.1)
     assert faults(fleet(arm(), auctioneers=()), silence)[0] == [
-        "No auctioneer shows a token or answers: nobody awards jobs, and every arm keeps its own time. "
+        "No auctioneer shows a token or answers: jobs are not awarded, and every arm keeps its own time. "
         "If this fleet needs none, give --no-auctioneer."
     ]
     told, found = faults(fleet(arm(), auctioneers=()), silence, auctioneer=False)
@@ -99,24 +99,24 @@ def test_a_fleet_without_an_auctioneer_by_intention_is_healthy():
     assert "2 auctioneers" in faults(fleet(arm(), auctioneers=(*ALONE, *ALONE)), auctioneer=False)[0][0]
 
 
-def test_malformed_words_are_a_fault_with_their_reason():
+def test_malformed_messages_are_a_fault_with_their_reason():
     told, _ = faults(fleet(arm()), malformed=3, complaints=("under 'k': not JSON",))
     assert told == ["3 malformed message(s), the last: under 'k': not JSON"]
 
 
-def test_what_is_wrong_again_and_again_is_said_once():
+def test_a_repeated_reason_is_reported_once():
     told, _ = faults(fleet(arm()), malformed=3, complaints=["no JSON.", "no State.", "no JSON."])
     assert told == ["3 malformed message(s), the last: no JSON.; no State."]
 
 
-def test_an_arm_that_went_before_anybody_listened_is_missed_only_by_name():
+def test_an_arm_that_left_earlier_is_missing_only_if_expected():
     assert faults(fleet(arm()))[0] == []
     assert faults(fleet(arm()), expected=("a", "b", "c"))[0] == ["Not present: b, c."]
     left = arm(arm="b", token=False, present=False, state_age_s=None, time_s=None)
     assert faults(fleet(arm(), left), expected=("a", "b"))[0] == ["Not present: b."]
 
 
-def test_what_somebody_should_look_at_is_no_fault():
+def test_a_warning_is_no_fault():
     hot = arm(mode="faulted", hottest_c=76.0, joint=2)
     told, found = faults(fleet(hot, counts={"unfinished": 1}), ClockProbe(100.0, 100.4, 5000.0, 60.0), overrun=5)
     assert told == []
@@ -195,7 +195,7 @@ def test_a_healthy_fleet_gives_exit_code_0():
     assert abs(found["offsets_s"]["a"]) < 1.0
 
 
-def test_a_sick_fleet_gives_exit_code_1_and_all_reasons():
+def test_an_unhealthy_fleet_gives_exit_code_1_and_all_reasons():
     with Router() as router, participants(router.endpoint, states=False, clocks=2) as line:
         stop = threading.Event()
 
@@ -213,7 +213,7 @@ def test_a_sick_fleet_gives_exit_code_1_and_all_reasons():
         assert says in told
 
 
-def test_the_doctor_is_told_that_no_auctioneer_is_meant():
+def test_the_option_no_auctioneer_expects_none():
     with Router() as router, participants(router.endpoint, clocks=0):
         code, told = doctor(router.endpoint)
         assert (code, "give --no-auctioneer" in told) == (1, True)
@@ -221,14 +221,14 @@ def test_the_doctor_is_told_that_no_auctioneer_is_meant():
     assert (code, "The fleet is healthy." in told, "time unknown" in told) == (0, True, True), told
 
 
-def test_nobody_at_the_router_is_not_healthy():
+def test_a_router_without_a_fleet_is_not_healthy():
     with Router() as router:
         code, told = doctor(router.endpoint)
     assert code == 1
     assert "answers. There is no fleet" in told
 
 
-def test_a_router_that_is_not_there_gives_exit_code_2_and_says_how_to_start_one():
+def test_a_missing_router_gives_exit_code_2_and_the_command_to_start_one():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -237,7 +237,7 @@ def test_a_router_that_is_not_there_gives_exit_code_2_and_says_how_to_start_one(
     assert f"thermofleet router --port {port}" in told
 
 
-def test_something_else_at_the_port_is_recognised():
+def test_another_server_at_the_port_is_recognised():
     with socket.create_server(("127.0.0.1", 0)) as other:
         code, told = doctor(f"tcp/127.0.0.1:{other.getsockname()[1]}")
     assert code == 2
@@ -245,7 +245,7 @@ def test_something_else_at_the_port_is_recognised():
 
 
 @pytest.mark.parametrize("wrong", [["--endpoint", "http://x"], ["--seconds", "0"]])
-def test_what_cannot_be_asked_gives_exit_code_2(wrong):
+def test_invalid_options_give_exit_code_2(wrong):
     code, told = doctor("tcp/127.0.0.1:1", *wrong)
     assert code == 2
     assert "Error:" in told

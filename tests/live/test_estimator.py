@@ -1,4 +1,4 @@
-"""What an arm offers: its best variant, the reason where it has none, and a peak that a fine integration confirms."""
+"""Estimates of an arm: best variant, reason of an infeasible job, and a peak that scipy confirms."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def estimator_of(arm, *, model=None, peaks=None):
 
 
 @pytest.mark.parametrize("minutes", [1, 20, 90])
-def test_the_foreseen_peak_is_that_of_the_nominal_network(arm, minutes):
+def test_the_predicted_peak_is_that_of_the_nominal_network(arm, minutes):
     """Second method: scipy integrates the same heat law finely."""
     ((plan,),) = arm.plans.values()
     repetitions = 6 * minutes
@@ -62,7 +62,7 @@ def test_the_foreseen_peak_is_that_of_the_nominal_network(arm, minutes):
     assert peak == pytest.approx(expected, abs=0.02 * (expected - 31.0) + 0.01)
 
 
-def test_an_offer_says_what_is_known(arm):
+def test_an_estimate_has_all_fields(arm):
     estimator, _ = estimator_of(arm)
     estimator.prepare(spec(payload_kg=4.0))
     ((plan,),) = arm.plans.values()
@@ -77,7 +77,7 @@ def test_an_offer_says_what_is_known(arm):
     assert estimate.peak_c > 31.0
 
 
-def test_a_blind_arm_offers_without_a_score(arm):
+def test_a_blind_arm_estimates_without_a_score(arm):
     estimator, _ = estimator_of(arm, model=Blind())
     estimator.prepare(spec())
     (estimate,) = estimator.estimate([spec()], WARM_C, 25.0, np.inf)
@@ -97,7 +97,7 @@ def test_a_blind_arm_offers_without_a_score(arm):
         ({"force_n": 3.0}, "Only a press"),
     ],
 )
-def test_what_cannot_be_done_says_why(arm, changes, reason):
+def test_an_infeasible_job_has_a_reason(arm, changes, reason):
     estimator, _ = estimator_of(arm)
     estimator.prepare(spec(**changes))
     (estimate,) = estimator.estimate([spec(**changes)], WARM_C, 25.0, 0.0)
@@ -106,7 +106,7 @@ def test_what_cannot_be_done_says_why(arm, changes, reason):
     assert estimator.best_plan(spec(**changes)) is None
 
 
-def test_what_is_not_planned_yet_says_so_and_every_work_is_planned_once(arm):
+def test_an_unplanned_job_is_reported_and_every_work_is_planned_once(arm):
     estimator, asked = estimator_of(arm)
     one, other = spec(), spec(name="k", payload_kg=1.0)
     assert not estimator.is_prepared(one)

@@ -1,4 +1,4 @@
-"""What a fleet says reaches ROS 2 over a real router; rosbags and Zenoh decode it, none of our own code."""
+"""A fleet in ROS 2 over a real router; rosbags and Zenoh decode the messages, not our code."""
 
 import queue
 import time
@@ -109,7 +109,7 @@ def test_a_state_becomes_diagnostics(make):
     assert [float(values[f"shop/arm_0/joint_{number}"]["temperature_c"]) for number in range(1, 8)] == [*TEMP_C]
 
 
-def test_node_and_publishers_are_seen_and_go_with_their_arm(make, monkeypatch):
+def test_node_and_publishers_are_visible_until_their_arm_leaves(make, monkeypatch):
     domain = make()
     domain.until(under(JOINTS_KEY), state())
     node, *publishers = sorted(domain.tokens(), key=lambda token: "/NN/" not in token)
@@ -128,24 +128,24 @@ def test_keys_for_humble_have_no_hash(make):
     assert str(sample.key_expr) == JOINTS_KEY + "TypeHashNotSupported"
 
 
-def test_names_that_ros_does_not_allow_are_changed_and_never_mixed_up(make):
+def test_invalid_names_are_changed_and_stay_unique(make):
     domain = make(fleet="7 shops/ä")
     one, other = state(arm="arm-0"), state(arm="arm 0", time_s=99.0)
     domain.until(under("0/n7_shops/arm_0/joint_states/"), one)
     domain.until(under(DIAGNOSTICS_KEY), other, one)
     deadline_s = time.monotonic() + PATIENCE_S
-    while not domain.bridge.left_out and time.monotonic() < deadline_s:
+    while not domain.bridge.skipped and time.monotonic() < deadline_s:
         domain.say(other)
         domain.bridge.serve(time.monotonic() + 0.05)
     assert domain.bridge.arms == ("arm-0",)
-    assert "is that of 'arm-0'" in domain.bridge.left_out["arm 0"]
+    assert "is that of 'arm-0'" in domain.bridge.skipped["arm 0"]
 
 
-def test_what_ros_cannot_tell_and_too_many_arms_harm_nobody(make, monkeypatch):
-    monkeypatch.setattr(ros2_bridge, "MOST_ARMS", 2)
+def test_arms_that_cannot_be_published_do_not_affect_the_others(make, monkeypatch):
+    monkeypatch.setattr(ros2_bridge, "MAX_ARMS", 2)
     domain = make()
     said = [state(arm="late", time_s=1e300), *(state(arm=f"arm_{number}") for number in range(5))]
     domain.until(lambda sample: "/arm_1/" in str(sample.key_expr), *said)
     assert domain.bridge.arms == ("arm_0", "arm_1")
-    assert "ROS 2 tells times" in domain.bridge.left_out["late"]
-    assert len(domain.bridge.left_out) == 2
+    assert "A ROS 2 time is" in domain.bridge.skipped["late"]
+    assert len(domain.bridge.skipped) == 2

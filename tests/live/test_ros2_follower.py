@@ -1,17 +1,16 @@
-"""A real arm that speaks ROS 2, played by messages that pycdr2 writes, is an arm of the fleet; nothing is made up."""
+"""A real arm with a ROS 2 driver, whose messages rosbags writes, is an arm of the fleet."""
 
 import math
 import random
 import struct
 import time
 from contextlib import ExitStack
-from dataclasses import dataclass
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pycdr2 import IdlStruct
-from pycdr2.types import float64, int32, sequence, uint8, uint32
+from rosbags.typesys import Stores, get_typestore
 
 from fleet.bus.client.client import BusClient
 from fleet.bus.client.router import Router, open_client
@@ -21,10 +20,12 @@ from fleet.bus.protocol.messages import Info, MalformedMessage, State
 from fleet.errors import BusError
 from fleet.live.clock import FleetClock
 from fleet.ros2.conversion import Joints, joint_names
-from fleet.ros2.follower import FRESH_S, WARM_S, Follower, Reality
+from fleet.ros2.follower import FRESH_S, WARM_S, ArmReadings, Follower
 from fleet.ros2.node import Node
 
 PATIENCE_S = 15.0
+JAZZY = get_typestore(Stores.ROS2_JAZZY)
+TYPES = JAZZY.types
 NAMES = joint_names(7)
 HASH = "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"
 """Of sensor_msgs/JointState; origin: `ros2 topic info --verbose` in users' reports."""
@@ -34,65 +35,31 @@ TEMP_C = (30.0, 45.5, 33.0, 38.25, 31.0, 30.0, 29.0)
 Q = tuple(0.1 * joint for joint in range(7))
 
 
-@dataclass
-class Time(IdlStruct):
-    sec: int32
-    nanosec: uint32
-
-
-@dataclass
-class Header(IdlStruct):
-    stamp: Time
-    frame_id: str
-
-
-@dataclass
-class JointState(IdlStruct):
-    header: Header
-    name: sequence[str]
-    position: sequence[float64]
-    velocity: sequence[float64]
-    effort: sequence[float64]
-
-
-@dataclass
-class KeyValue(IdlStruct):
-    key: str
-    value: str
-
-
-@dataclass
-class DiagnosticStatus(IdlStruct):
-    level: uint8
-    name: str
-    message: str
-    hardware_id: str
-    values: sequence[KeyValue]
-
-
-@dataclass
-class DiagnosticArray(IdlStruct):
-    header: Header
-    status: sequence[DiagnosticStatus]
+def header(sec):
+    return TYPES["std_msgs/msg/Header"](TYPES["builtin_interfaces/msg/Time"](sec, 0), "base")
 
 
 def joint_state(names=NAMES, q=Q, qd=(), tau=(), sec=1):
-    return JointState(Header(Time(sec, 0), "base"), list(names), list(q), list(qd), list(tau)).serialize()
+    kind = "sensor_msgs/msg/JointState"
+    arrays = (np.array(values, float) for values in (q, qd, tau))
+    return bytes(JAZZY.serialize_cdr(TYPES[kind](header(sec), list(names), *arrays), kind))
 
 
-def warmth(hardware="gen3", temp_c=TEMP_C):
+def diagnostics(hardware="gen3", temp_c=TEMP_C):
+    kind = "diagnostic_msgs/msg/DiagnosticArray"
+    pair, status = TYPES["diagnostic_msgs/msg/KeyValue"], TYPES["diagnostic_msgs/msg/DiagnosticStatus"]
     statuses = [
-        DiagnosticStatus(0, name, "", f"{hardware}/{name}", [KeyValue("temperature_c", str(value))])
+        status(0, name, "", f"{hardware}/{name}", [pair("temperature_c", str(value))])
         for name, value in zip(NAMES, temp_c, strict=True)
     ]
-    return DiagnosticArray(Header(Time(1, 0), ""), statuses).serialize()
+    return bytes(JAZZY.serialize_cdr(TYPES[kind](header(1), statuses), kind))
 
 
 def known(**said):
     """What is known of an arm at the real second 0."""
-    reality = Reality(NAMES, "gen3")
-    reality.joints(Joints(1.0, NAMES, Q, **said), 0.0)
-    reality.warmth(dict(zip(NAMES, TEMP_C, strict=True)), 0.0)
+    reality = ArmReadings(NAMES, "gen3")
+    reality.update_joints(Joints(1.0, NAMES, Q, **said), 0.0)
+    reality.update_temperatures(dict(zip(NAMES, TEMP_C, strict=True)), 0.0)
     return reality
 
 
@@ -100,28 +67,28 @@ def state_of(reality, real_s=0.0):
     return reality.state("real", 1, 5.0, real_s, 60.0)
 
 
-def test_nothing_is_said_before_all_is_known():
-    reality = Reality(NAMES)
-    assert reality.missing(0.0) == "no joint state of it"
+def test_no_state_is_published_before_all_readings_are_present():
+    reality = ArmReadings(NAMES)
+    assert reality.missing(0.0) == "no joint state"
     assert state_of(reality) is None
-    reality.joints(Joints(1.0, NAMES, Q), 0.0)
-    reality.warmth({name: 30.0 for name in NAMES if name != "joint_4"}, 0.0)
+    reality.update_joints(Joints(1.0, NAMES, Q), 0.0)
+    reality.update_temperatures({name: 30.0 for name in NAMES if name != "joint_4"}, 0.0)
     assert reality.missing(0.0) == "no temperature of joint_4"
     assert state_of(reality) is None
-    reality.warmth({"joint_4": 30.0}, 0.0)
+    reality.update_temperatures({"joint_4": 30.0}, 0.0)
     assert state_of(reality) is not None
 
 
-def test_what_grew_old_is_not_said_again():
+def test_old_readings_are_not_published_again():
     reality = known()
     assert state_of(reality, 0.99 * FRESH_S) is not None
     assert state_of(reality, 1.01 * FRESH_S) is None
     late_s = 1.01 * WARM_S
-    reality.joints(Joints(2.0, NAMES, Q), late_s)
+    reality.update_joints(Joints(2.0, NAMES, Q), late_s)
     assert "no temperature of joint_1, joint_2" in reality.missing(late_s)
 
 
-def test_what_is_not_measured_is_left_out():
+def test_unmeasured_values_are_empty():
     state = state_of(known())
     assert (state.q, state.qd, state.tau, state.current_a) == (Q, (), (), ())
     assert state.temp_c == TEMP_C
@@ -129,11 +96,11 @@ def test_what_is_not_measured_is_left_out():
 
 
 @pytest.mark.parametrize(("speed", "mode"), [(0.0, "idle"), (0.009, "idle"), (0.011, "working"), (-0.5, "working")])
-def test_an_arm_that_moves_is_at_work(speed, mode):
+def test_a_moving_arm_is_working(speed, mode):
     qd = (0.0, 0.0, speed, 0.0, 0.0, 0.0, 0.0)
     assert state_of(known(qd=qd)).mode == mode
     moved = known()  # without velocities: from two positions, a tenth of a second apart
-    moved.joints(Joints(1.1, NAMES, tuple(q + 0.1 * v for q, v in zip(Q, qd, strict=True))), 0.1)
+    moved.update_joints(Joints(1.1, NAMES, tuple(q + 0.1 * v for q, v in zip(Q, qd, strict=True))), 0.1)
     assert state_of(moved).mode == mode
 
 
@@ -141,24 +108,24 @@ def test_an_arm_that_moves_is_at_work(speed, mode):
 @given(st.permutations(NAMES), st.lists(st.tuples(*[st.floats(-6, 6)] * 3), min_size=7, max_size=7))
 def test_the_order_of_joints_changes_no_reading(order, values):
     of = dict(zip(NAMES, values, strict=True))
-    straight, mixed = (Reality(NAMES), Reality(NAMES))
+    straight, mixed = (ArmReadings(NAMES), ArmReadings(NAMES))
     for reality, names in ((straight, NAMES), (mixed, tuple(order))):
-        reality.joints(Joints(1.0, names, *zip(*(of[name] for name in names), strict=True)), 0.0)
-        reality.warmth(dict.fromkeys(names, 30.0), 0.0)
+        reality.update_joints(Joints(1.0, names, *zip(*(of[name] for name in names), strict=True)), 0.0)
+        reality.update_temperatures(dict.fromkeys(names, 30.0), 0.0)
     assert state_of(straight) == state_of(mixed)
 
 
-def test_a_reading_that_is_no_number_changes_nothing():
+def test_a_reading_that_is_not_finite_changes_nothing():
     reality = known()
     with pytest.raises(MalformedMessage, match="nan for position of joint_1"):
-        reality.joints(Joints(9.0, NAMES, (math.nan, *Q[1:])), 0.5)
+        reality.update_joints(Joints(9.0, NAMES, (math.nan, *Q[1:])), 0.5)
     assert state_of(reality).q == Q
 
 
 def test_a_gripper_on_the_same_topic_changes_nothing():
     reality = known()
     before = state_of(reality)
-    reality.joints(Joints(1.5, ("finger",), (0.5,), (9.0,)), 0.5)
+    reality.update_joints(Joints(1.5, ("finger",), (0.5,), (9.0,)), 0.5)
     assert state_of(reality) == before
 
 
@@ -177,7 +144,7 @@ class Place:
         self.peer.watch_tokens(keys.of_every_arm("shop", "alive"), lambda _, there: self.present.append(there))
         node = stack.enter_context(Node(router.endpoint, "follower", domain=3))
         clock = FleetClock(1.0, time.monotonic())
-        reality = Reality(NAMES, "gen3")
+        reality = ArmReadings(NAMES, "gen3")
         topics = ("/gen3/joint_states", "/diagnostics")
         self.follower = Follower(self.link, node, "real", reality, topics, clock, rate_hz=50.0)
 
@@ -214,8 +181,8 @@ def test_a_real_arm_is_an_arm_of_the_fleet(place, hashes):
     def live():
         place.play(gripper, hashes[0])
         place.play(joint_state(names, *mixed), hashes[0])
-        place.warm(warmth("someone_else", (99.0,) * 7), hashes[1])
-        place.warm(warmth(), hashes[1])
+        place.warm(diagnostics("someone_else", (99.0,) * 7), hashes[1])
+        place.warm(diagnostics(), hashes[1])
 
     place.until(lambda: place.states and place.infos and place.present, live)
     said = place.states[-1]
@@ -234,15 +201,15 @@ def test_a_real_arm_is_an_arm_of_the_fleet(place, hashes):
         lambda place: place.play(b"\x00\x01\x00\x00rubbish"),
         lambda place: place.play(joint_state(q=(math.nan,) * 7)),
         lambda place: place.play(joint_state(q=(9.0,) * 7), "RIHS01_another"),
-        lambda place: place.warm(warmth(temp_c=("warm",) * 7)),
-        lambda place: place.warm(warmth(temp_c=(99.0,) * 7), HASH),
+        lambda place: place.warm(diagnostics(temp_c=("warm",) * 7)),
+        lambda place: place.warm(diagnostics(temp_c=(99.0,) * 7), HASH),
     ],
     ids=["bytes", "nan", "another type", "no number", "type of another message"],
 )
-def test_rubbish_is_counted_and_changes_nothing(place, rubbish):
+def test_malformed_messages_are_counted_and_change_nothing(place, rubbish):
     def live():
         place.play(joint_state())
-        place.warm(warmth())
+        place.warm(diagnostics())
         rubbish(place)
 
     place.until(lambda: place.states and place.follower.malformed >= 2, live)
@@ -250,10 +217,10 @@ def test_rubbish_is_counted_and_changes_nothing(place, rubbish):
     assert {state.temp_c for state in place.states} == {TEMP_C}
 
 
-def test_it_takes_no_work_and_says_why(place):
+def test_a_real_arm_takes_no_work_and_gives_the_reason(place):
     def live():
         place.play(joint_state())
-        place.warm(warmth())
+        place.warm(diagnostics())
 
     place.until(lambda: place.states, live)
     job = JobSpec(name="j", kind="hold", places=("rack",))
@@ -270,18 +237,18 @@ def test_it_takes_no_work_and_says_why(place):
     assert not ack.accepted
 
 
-def test_it_takes_the_time_of_the_fleet(place):
+def test_a_real_arm_uses_fleet_time(place):
     place.peer.reply_to(keys.of_clock("shop"), ClockRequest, lambda _: Clock(time_s=1e6, speed=1.0))
 
     def live():
         place.play(joint_state())
-        place.warm(warmth())
+        place.warm(diagnostics())
 
     place.until(lambda: place.states and place.states[-1].time_s >= 1e6, live)
     assert place.states[-1].time_s < 1e6 + PATIENCE_S + 5.0
 
 
-def test_a_fleet_in_quick_motion_is_no_place_for_a_real_arm(place):
+def test_a_real_arm_needs_a_fleet_at_speed_1(place):
     place.peer.reply_to(keys.of_clock("shop"), ClockRequest, lambda _: Clock(time_s=0.0, speed=60.0))
     with pytest.raises(BusError, match="60 times as fast"):
         place.until(lambda: False, lambda: None)

@@ -1,4 +1,4 @@
-"""Who looks at a fleet over TLS sees it with a certificate, and is told in a sentence what is wrong with another."""
+"""Commands over TLS work with a valid certificate, and report an invalid one in one sentence."""
 
 import http.client
 import json
@@ -93,7 +93,7 @@ def run(command, endpoint):
     return CliRunner().invoke(app, [*COMMANDS[command], "--endpoint", endpoint])
 
 
-def test_a_monitor_watches(fleet):
+def test_a_monitor_can_watch(fleet):
     done = run("watch", Tls(fleet.keys, "monitor").endpoint(fleet.endpoint))
     assert done.exit_code == 0, done.exception
     now = json.loads(done.stdout)
@@ -101,7 +101,7 @@ def test_a_monitor_watches(fleet):
     assert (now["auctioneers"][0]["auctioneer"], now["counts"]) == ("auctioneer", {"waiting": 1})
 
 
-def test_the_doctor_finds_a_fleet_with_rules_well(fleet):
+def test_the_doctor_finds_a_fleet_with_access_control_healthy(fleet):
     done = run("doctor", Tls(fleet.keys, "monitor").endpoint(fleet.endpoint))
     assert (done.exit_code, "The fleet is healthy." in done.stdout) == (0, True), done.stdout
 
@@ -136,7 +136,7 @@ def asked(port, method, path, body=None):
 JOBS = {"jobs": [{"name": "crate", "kind": "hold", "places": ["rack"]}]}
 
 
-def test_the_gateway_hands_in_with_the_certificate_of_a_submitter(fleet):
+def test_the_gateway_submits_with_the_certificate_of_a_submitter(fleet):
     with gateway(fleet, "gateway") as port:
         code, told = asked(port, "POST", "/v2/jobs", JOBS)
         assert (code, told["jobs"][0]["accepted"]) == (200, True), told
@@ -146,7 +146,7 @@ def test_the_gateway_hands_in_with_the_certificate_of_a_submitter(fleet):
         assert (code, [arm["arm"] for arm in told["arms"]]) == (200, [ARM])
 
 
-def test_the_gateway_says_that_a_monitor_may_only_look(fleet):
+def test_the_gateway_reports_that_a_monitor_may_not_submit(fleet):
     with gateway(fleet, "monitor") as port:
         assert asked(port, "GET", "/v2/jobs?job=j")[0] == 200
         for path in ("/v2/jobs", "/v2/ask"):
@@ -193,7 +193,7 @@ SLOW = ("plain", "another authority")
     ("command", "how"),
     [(command, how) for command in COMMANDS for how in WRONG if how not in SLOW or command == "doctor"],
 )
-def test_what_is_wrong_is_said_in_one_sentence(fleet, tmp_path, command, how):
+def test_a_tls_error_is_one_sentence(fleet, tmp_path, command, how):
     here = tmp_path / "k"
     if how in ("another authority", "expired", "not yet"):
         {"expired": expired, "not yet": not_yet}.get(how, of_another_authority)(here, fleet.keys)
@@ -209,7 +209,7 @@ def test_what_is_wrong_is_said_in_one_sentence(fleet, tmp_path, command, how):
         raise done.exception
 
 
-def test_the_doctor_thinks_of_a_certificate_that_the_router_does_not_know(fleet, tmp_path):
+def test_the_doctor_mentions_a_certificate_unknown_to_the_router(fleet, tmp_path):
     expired(tmp_path / "k", fleet.keys)
     issue(tmp_path / "k", Participant("spy", "monitor"), days=20)
     done = run("doctor", f"{fleet.endpoint}#{tmp_path}/k/spy")

@@ -1,4 +1,4 @@
-"""`thermofleet arm`: the same arm as in a run, as a process of its own; and a log that lives as one."""
+"""`thermofleet arm`: the arm of a run as its own process, and a replayed log."""
 
 import os
 import signal
@@ -95,24 +95,27 @@ def heard_from(link, fleet, enough):
         (["ghost"], "No arm 'ghost'"),
         (["left", "--source", "log"], "log with a FILE"),
         (["left", "some.csv"], "log with a FILE"),
-        (["left", "--source", "video"], "--source must be"),
-        (["left", "--difficulty", "oracle"], "twin or blind"),
+        (["left", "--source", "video"], "'video' is not one of 'sim', 'log'"),
+        (["left", "--difficulty", "oracle"], "'oracle' is not one of 'twin', 'blind'"),
         (["left", "--speed", "0"], "--speed must be > 0"),
-        (["left", "--rate-hz", "1000"], "--rate-hz"),
-        (["left", "--capacity", "0"], "--capacity"),
-        (["left", "--seed", "-1"], "--seed"),
+        (["left", "--rate-hz", "1000"], "--rate-hz must be > 0 and at most 100 (got 1000)."),
+        (["left", "--capacity", "0"], "--capacity must be 1 to 256 (got 0)."),
+        (["left", "--seed", "-1"], "--seed must be 0 or more (got -1)."),
+        (["left", "--speed", "inf"], "--speed must be > 0 (got inf)."),
         (["left", "none.csv", "--source", "log"], "none.csv"),
         (["left", "--difficulty", "blind", "--endpoint", "tcp/127.0.0.1:1"], "No router answered"),
     ],
 )
-def test_what_cannot_be_is_one_sentence(thermofleet, small_toml, tmp_path, monkeypatch, options, complaint):
+def test_an_error_of_the_arm_command_is_one_sentence(
+    thermofleet, small_toml, tmp_path, monkeypatch, options, complaint
+):
     monkeypatch.chdir(tmp_path)
     said = thermofleet("arm", small_toml, *options)
     assert said.code == 2
     assert complaint in said.err.replace("\n", " ")
 
 
-def test_one_arm_alone_is_the_arm_of_the_fleet(small_toml, plans):
+def test_a_single_arm_equals_the_arm_of_the_fleet(small_toml, plans):
     scenario = load(small_toml)
     fleet = prepare(scenario, difficulty="blind", cache=plans)
     alone, same = prepare_arm(scenario, "right", difficulty="blind", cache=plans), fleet.arms[1]
@@ -128,7 +131,7 @@ def test_one_arm_alone_is_the_arm_of_the_fleet(small_toml, plans):
 
 
 @pytest.mark.slow
-def test_one_arm_alone_has_the_twin_that_it_has_in_the_fleet(small_toml, tmp_path):
+def test_a_single_arm_has_the_twin_of_the_arm_of_the_fleet(small_toml, tmp_path):
     text = small_toml.read_text(encoding="utf-8") + '\n[twin]\nsize = "quick"\nexploration = 0\n'
     small_toml.write_text(text, encoding="utf-8")
     scenario = load(small_toml)
@@ -137,7 +140,7 @@ def test_one_arm_alone_has_the_twin_that_it_has_in_the_fleet(small_toml, tmp_pat
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
-def test_an_arm_lives_as_a_process_and_ends_when_told(small_toml, plans, tmp_path, number, code):
+def test_an_arm_runs_as_a_process_and_exits_on_a_signal(small_toml, plans, tmp_path, number, code):
     with Router() as router, BusClient(router.endpoint, "heat") as link:
         options = ["--endpoint", router.endpoint, "--difficulty", "blind", "--rate-hz", 20]
         with Process(small_toml, "left", *options, cache=plans, cwd=tmp_path) as arm:
@@ -152,7 +155,7 @@ def test_an_arm_lives_as_a_process_and_ends_when_told(small_toml, plans, tmp_pat
         assert "the same command continues" in said.replace("\n", " ")
 
 
-def test_a_log_lives_as_an_arm(small_toml, plans, log, tmp_path):
+def test_a_log_is_replayed_as_an_arm(small_toml, plans, log, tmp_path):
     with Router() as router, BusClient(router.endpoint, "heat") as link:
         options = ["--source", "log", "--endpoint", router.endpoint, "--speed", 4, "--rate-hz", 20]
         with Process(small_toml, "museum", log, *options, cache=plans, cwd=tmp_path) as arm:
@@ -182,7 +185,7 @@ def test_a_log_lives_as_an_arm(small_toml, plans, log, tmp_path):
             assert state.time_s - began_s == pytest.approx(into_s, abs=0.1 + 1e-6)
 
 
-def test_no_second_arm_lives_under_a_name(token_reaches):
+def test_no_second_arm_of_a_name_starts(token_reaches):
     with Router(0) as router, BusClient(router.endpoint, "f") as first, BusClient(router.endpoint, "f") as second:
         first.declare_token(keys.of_arm("f", "a", "alive"))
         token_reaches(second, keys.of_arm("f", "a", "alive"))
@@ -191,7 +194,7 @@ def test_no_second_arm_lives_under_a_name(token_reaches):
             wait_for_name(second, "a", patience_s=0.3)
 
 
-def test_an_arm_waits_for_the_token_of_its_last_life_to_go(token_reaches):
+def test_an_arm_waits_until_the_token_of_its_last_process_expires(token_reaches):
     with Router(0) as router, BusClient(router.endpoint, "f") as second:
         with BusClient(router.endpoint, "f") as first:
             first.declare_token(keys.of_arm("f", "a", "alive"))
@@ -203,7 +206,7 @@ def test_an_arm_waits_for_the_token_of_its_last_life_to_go(token_reaches):
         assert not second.tokens(keys.of_arm("f", "a", "alive"), timeout_s=PATIENCE_S)
 
 
-def test_a_log_without_temperatures_or_of_others_is_refused(log, tmp_path):
+def test_a_log_without_temperatures_is_refused(log, tmp_path):
     bare = tmp_path / "bare.csv"
     lines = log.read_text().splitlines()
     bare.write_text("\n".join(",".join(line.split(",")[:22]) for line in lines))
@@ -211,7 +214,7 @@ def test_a_log_without_temperatures_or_of_others_is_refused(log, tmp_path):
         replayed_arm("arm", bare)
 
 
-def test_a_name_that_the_scenario_does_not_have_is_refused(small_toml, plans):
+def test_an_arm_that_the_scenario_lacks_is_refused(small_toml, plans):
     with pytest.raises(FleetError, match="No arm 'museum'"):
         simulated_arm(load(small_toml), "museum", "blind", 0, quiet, plans)
 
@@ -230,7 +233,7 @@ def test_a_real_arm_is_replayed_as_it_was_logged():
 
 
 @pytest.mark.parametrize("points", [((0.0, 28.0),), ((0.0, 28.0), (600.0, 28.0)), ((0.0, 20.0), (600.0, 40.0))])
-def test_the_air_is_that_of_the_scenario_at_any_time(points):
+def test_the_ambient_temperature_is_that_of_the_scenario(points):
     scenario = replace(load("quickstart"), ambient=Ambient(points=points))
     for time_s in (-1.0, 0.0, 150.0, 600.0, 1e6):
         assert ambient_of(scenario)(time_s) == np.interp(time_s, *zip(*points, strict=True))
@@ -254,7 +257,7 @@ print(*sys.modules)
     assert set(said.stdout.split()) & heavy == set()
 
 
-def test_what_an_arm_needs_to_stand_at_home_is_the_same_from_the_cache(tmp_path):
+def test_the_torque_at_home_is_the_same_from_the_cache(tmp_path):
     fresh, kept = (prepare_arm(load("quickstart"), "arm_2", difficulty="blind", cache=tmp_path) for _ in range(2))
     assert fresh.rest_tau.tolist() == kept.rest_tau.tolist()
     assert fresh.rest_tau.tolist() == ArmModel(fresh.robot).gravity_torque(fresh.robot.home_q()).tolist()

@@ -1,4 +1,4 @@
-"""`thermofleet auction`, `submit` and `ask`, called as a person calls them, and what they are made of."""
+"""`thermofleet auction`, `submit` and `ask`, and their parts."""
 
 import json
 import signal
@@ -31,8 +31,8 @@ from fleet.bus.protocol.auction import (
 from fleet.errors import FleetError
 from fleet.job import Job, Place, Work
 from scenarios.cli.live import auction as live_auction
-from scenarios.cli.live.auction import own_jobs, word_of
-from scenarios.cli.live.consensus import refuse_other_way
+from scenarios.cli.live.auction import job_spec, own_jobs
+from scenarios.cli.live.journals import refuse_other_way
 from scenarios.cli.live.submit import batches, read_jobs
 from scenarios.cli.main import main
 from scenarios.load import load
@@ -52,10 +52,7 @@ def call(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, 
     return left.value.code, said.out, said.err
 
 
-# jobs from a file
-
-
-def test_jobs_come_one_a_line_or_as_a_list(tmp_path):
+def test_jobs_are_read_from_lines_or_a_list(tmp_path):
     other = {**HOLD, "name": "b"}
     lines, listed = tmp_path / "jobs.jsonl", tmp_path / "jobs.json"
     lines.write_text(f"{json.dumps(HOLD)}\n\n{json.dumps(other)}\n", encoding="utf-8")
@@ -80,7 +77,7 @@ def test_jobs_come_one_a_line_or_as_a_list(tmp_path):
         ("\xff", "line 1: "),
     ],
 )
-def test_what_is_no_job_is_told_by_its_line(tmp_path, text, complaint):
+def test_an_invalid_job_is_reported_with_its_line(tmp_path, text, complaint):
     file = tmp_path / "jobs"
     file.write_bytes(text.encode("latin-1"))
     with pytest.raises(FleetError) as refusal:
@@ -89,7 +86,7 @@ def test_what_is_no_job_is_told_by_its_line(tmp_path, text, complaint):
     assert complaint in str(refusal.value)
 
 
-def test_jobs_in_several_words_come_after_those_they_wait_for():
+def test_jobs_in_several_messages_follow_those_they_wait_for():
     words = [JobSpec(f"j{i:03d}", "hold", ("x",), after=(f"j{i + 1:03d}",) if i < 199 else ()) for i in range(200)]
     handed_in = list(batches(words))
     assert [len(part) for part in handed_in] == [64, 64, 64, 8]
@@ -102,9 +99,6 @@ def test_a_missing_file_is_one_sentence(capsys):
     code, _, err = call(capsys, "submit", "no-such-file", "--fleet", "f")
     assert code == 2
     assert "Cannot read 'no-such-file': No such file or directory." in err
-
-
-# the scenario's own stream
 
 
 def test_the_stream_is_the_one_of_a_run(small_toml, plans):
@@ -120,7 +114,7 @@ def test_the_stream_is_the_one_of_a_run(small_toml, plans):
             assert (word.release_s, word.repetitions) == (release_s, repetitions)
 
 
-def test_a_job_is_handed_in_after_what_it_waits_for(small_toml):
+def test_a_job_is_submitted_after_those_it_waits_for(small_toml):
     drawn = own_jobs(load(small_toml), 0)
     assert [at_s for at_s, _ in drawn] == sorted(at_s for at_s, _ in drawn)
     seen: set[str] = set()
@@ -157,40 +151,38 @@ class Stage:
 
 
 @pytest.mark.parametrize(("horizon_s", "ended"), [(1e6, False), (7200.0, True)])
-def test_a_stream_is_handed_in_as_time_goes_on_until_all_is_done_or_the_shift_is_over(monkeypatch, horizon_s, ended):
+def test_a_stream_is_submitted_as_released_until_all_is_done_or_the_shift_is_over(monkeypatch, horizon_s, ended):
     monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
     stage, never = Stage(), SimpleNamespace(is_set=lambda: False)
     names = {"a": 0.0, "b": 3700.0, "c": 7000.0, "d": 10000.0}
-    live_auction.work(stage, [(at_s, JobSpec(n, "hold", ("x",))) for n, at_s in names.items()], horizon_s, never)
+    stream = [(at_s, JobSpec(name, "hold", ("x",))) for name, at_s in names.items()]
+    live_auction.submit_stream(stage, stream, horizon_s, never)
     all_of_it = [(3600.0, ["a"]), (7200.0, ["b", "c"]), (10800.0, ["d"])]
     assert stage.handed_in == (all_of_it[:2] if ended else all_of_it)
     assert stage.ended is ended
 
 
-def test_nothing_of_a_shift_that_is_over_is_handed_in_again(monkeypatch):
+def test_a_finished_shift_submits_no_job_again(monkeypatch):
     monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
     stage, never = Stage(), SimpleNamespace(is_set=lambda: False)
     stage.auctioneer.ledger.ended = True
-    live_auction.work(stage, [(0.0, JobSpec("a", "hold", ("x",)))], 1.0, never)
+    live_auction.submit_stream(stage, [(0.0, JobSpec("a", "hold", ("x",)))], 1.0, never)
     assert stage.handed_in == []
 
 
-def test_nothing_is_handed_in_while_there_is_another_auctioneer(monkeypatch):
+def test_no_job_is_submitted_while_another_auctioneer_is_present(monkeypatch):
     monkeypatch.setattr(live_auction, "FAREWELL_S", (0.0, 0.0))
     stage, never = Stage(), SimpleNamespace(is_set=lambda: False)
     stage.alone_s = 7200.0
-    live_auction.work(stage, [(0.0, JobSpec("a", "hold", ("x",)))], 1e6, never)
+    live_auction.submit_stream(stage, [(0.0, JobSpec("a", "hold", ("x",)))], 1e6, never)
     assert stage.handed_in == [(7200.0, ["a"])]
 
 
-def test_a_job_travels_whole():
+def test_a_job_message_has_all_fields():
     place = Place(name="rack", position_m=(0.0, 0.0, 0.0))
     work = Work(kind="press", places=(place,), force_n=30.0, dwell_s=20.0)
     job = Job(name="p", work=work, repetitions=6, release_s=1.0, due_s=9.0, value=3.0, after=("q",))
-    assert word_of(job) == JobSpec("p", "press", ("rack",), 6, 0.0, 20.0, 30.0, 1.0, 9.0, 3.0, ("q",))
-
-
-# policies
+    assert job_spec(job) == JobSpec("p", "press", ("rack",), 6, 0.0, 20.0, 30.0, 1.0, 9.0, 3.0, ("q",))
 
 
 @pytest.mark.parametrize(
@@ -209,10 +201,10 @@ def test_a_job_travels_whole():
             ("arm", "quickstart", "arm_0", "--policy", "ssi"),
             "'ssi' needs an auctioneer: start it with thermofleet auction",
         ),
-        (("arm", "quickstart", "arm_0", "--policy", "consensus", "--jobs", "all"), "--jobs must be scenario or none"),
+        (("arm", "quickstart", "arm_0", "--jobs", "all"), "'all' is not one of 'scenario', 'none'"),
     ],
 )
-def test_a_policy_that_cannot_be_is_one_sentence(capsys, words, complaint):
+def test_an_invalid_policy_is_one_sentence(capsys, words, complaint):
     code, _, err = call(capsys, *words)
     assert code == 2
     assert complaint in " ".join(err.split())
@@ -226,9 +218,9 @@ def test_a_policy_that_cannot_be_is_one_sentence(capsys, words, complaint):
             ["arm_2.journal"],
             "it is of a shift with an auctioneer",
         ),
-        (("up", "quickstart", "--out"), ["arm_2.journal", "arm_2.grants"], "arms shared the jobs out themselves"),
-        (("auction", "quickstart", "--journal"), ["arm_2.grants"], "arms shared the jobs out themselves"),
-        (("arm", "quickstart", "arm_2", "--journal"), ["arm_2.grants"], "arms shared the jobs out themselves"),
+        (("up", "quickstart", "--out"), ["arm_2.journal", "arm_2.grants"], "arms allocate jobs without an auctioneer"),
+        (("auction", "quickstart", "--journal"), ["arm_2.grants"], "arms allocate jobs without an auctioneer"),
+        (("arm", "quickstart", "arm_2", "--journal"), ["arm_2.grants"], "arms allocate jobs without an auctioneer"),
         (
             ("arm", "quickstart", "arm_2", "--policy", "consensus", "--journal"),
             ["arm_2.journal"],
@@ -236,7 +228,7 @@ def test_a_policy_that_cannot_be_is_one_sentence(capsys, words, complaint):
         ),
     ],
 )
-def test_a_shift_does_not_go_on_by_the_other_way(capsys, tmp_path, words, files, complaint):
+def test_a_shift_is_not_continued_with_the_other_kind_of_allocation(capsys, tmp_path, words, files, complaint):
     """Who goes on from the journals of the other way does not know what is done, and would have it done again."""
     folder = tmp_path / "journals" if words[0] == "up" else tmp_path
     folder.mkdir(exist_ok=True)
@@ -247,7 +239,7 @@ def test_a_shift_does_not_go_on_by_the_other_way(capsys, tmp_path, words, files,
     assert complaint in " ".join(err.split())
 
 
-def test_a_shift_goes_on_in_its_own_way_and_from_nothing(tmp_path):
+def test_a_shift_is_continued_with_its_own_kind_of_allocation(tmp_path):
     for alone in (True, False):
         refuse_other_way(tmp_path / "none", ("a",), alone=alone)
     for file in ("alone.journal", "alone.grants", "led.journal"):
@@ -256,9 +248,6 @@ def test_a_shift_goes_on_in_its_own_way_and_from_nothing(tmp_path):
         (tmp_path / file).touch()
     refuse_other_way(tmp_path, ("alone", "new"), alone=True)
     refuse_other_way(tmp_path, ("led", "new"), alone=False)
-
-
-# the commands
 
 
 @contextmanager
@@ -283,7 +272,7 @@ def endpoint() -> Iterator[str]:
         yield router.endpoint
 
 
-def test_jobs_handed_in_are_kept_over_a_kill(endpoint, tmp_path, capsys):
+def test_submitted_jobs_survive_a_kill(endpoint, tmp_path, capsys):
     file = tmp_path / "jobs.jsonl"
     file.write_text("\n".join(json.dumps(HOLD | {"name": n, "places": [p]}) for n, p in (("a", "belt"), ("b", "moon"))))
     at = ("--endpoint", endpoint, "--fleet", "quickstart")
@@ -307,10 +296,10 @@ def test_jobs_handed_in_are_kept_over_a_kill(endpoint, tmp_path, capsys):
         out, err = process.communicate(timeout=PATIENT_S)
         assert process.returncode == 0
         assert "0 of 1 jobs finished" in out
-        assert "Going on from" in err
+        assert "Continuing from" in err
 
 
-def test_a_shift_that_ends_tells_what_is_undone(endpoint, tmp_path):
+def test_the_end_of_a_shift_lists_unfinished_jobs(endpoint, tmp_path):
     short = tmp_path / "short.toml"
     text = (ROOT / "scenarios" / "library" / "quickstart.toml").read_text(encoding="utf-8")
     short.write_text(text.replace("horizon_s = 7200", "horizon_s = 600"), encoding="utf-8")
@@ -320,7 +309,7 @@ def test_a_shift_that_ends_tells_what_is_undone(endpoint, tmp_path):
     assert "unfinished, The shift ended before it was done." in out
 
 
-def test_nobody_to_hand_in_to_is_one_sentence(endpoint, tmp_path, capsys):
+def test_a_missing_auctioneer_is_one_sentence(endpoint, tmp_path, capsys):
     file = tmp_path / "jobs"
     file.write_text(json.dumps(HOLD))
     code, _, err = call(capsys, "submit", file, "--endpoint", endpoint, "--fleet", "f")
@@ -378,7 +367,7 @@ def test_jobs_can_be_followed_to_their_end(endpoint, tmp_path, capsys, end, code
     assert said[:2] == (code, f"a: accepted\na: waiting\na: awarded to arm_0\na: {end} by arm_0\n")
 
 
-def test_ask_shows_what_a_job_would_cost_whom(endpoint, capsys):
+def test_ask_shows_the_cost_of_a_job_for_each_arm(endpoint, capsys):
     job = ("--kind", "hold", "--place", "rack", "--payload", "2")
     with arm(endpoint) as asked:
         code, out, _ = call(capsys, "ask", *job, "--endpoint", endpoint, "--fleet", "f")
@@ -390,7 +379,7 @@ def test_ask_shows_what_a_job_would_cost_whom(endpoint, capsys):
     assert asked[0].jobs[0].payload_kg == 2.0
 
 
-def test_ask_says_what_is_missing(endpoint, capsys):
+def test_ask_reports_missing_arguments(endpoint, capsys):
     at = ("--endpoint", endpoint, "--fleet", "f")
     assert "either a FILE of jobs or one job" in call(capsys, "ask", *at)[2]
     told = call(capsys, "ask", "--kind", "pick_and_place", *at)[2]

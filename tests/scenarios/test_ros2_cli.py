@@ -1,4 +1,4 @@
-"""`thermofleet ros2` as its user meets it: an arm goes out to ROS 2 and comes back, and mistakes get one sentence."""
+"""`thermofleet ros2`: an arm to ROS 2 and back, and errors in one sentence."""
 
 import os
 import signal
@@ -43,7 +43,7 @@ def ended(process, number):
     return process.returncode, said
 
 
-def test_an_arm_goes_out_to_ros_and_comes_back():
+def test_an_arm_is_published_in_ros_and_followed_again():
     with ExitStack() as stack:
         router = stack.enter_context(Router())
         link = stack.enter_context(BusClient(router.endpoint, "shop"))
@@ -79,7 +79,7 @@ def test_an_arm_goes_out_to_ros_and_comes_back():
         (["bridge", "--endpoint", "tls/127.0.0.1:7447#keys/arm_0"], "name the router of ROS 2 with --router"),
     ],
 )
-def test_a_mistake_gets_one_sentence(words, sentence, capsys, monkeypatch):
+def test_an_error_of_the_ros2_command_is_one_sentence(words, sentence, capsys, monkeypatch):
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
     with pytest.raises(SystemExit) as end:
         main(["ros2", *words])
@@ -89,7 +89,7 @@ def test_a_mistake_gets_one_sentence(words, sentence, capsys, monkeypatch):
     assert sentence in told
 
 
-def test_without_the_extra_it_says_what_to_install(capsys, monkeypatch):
+def test_a_missing_extra_is_named(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags", None)
     with pytest.raises(SystemExit) as end:
         main(["ros2", "bridge", "--fleet", "f", "--domain", "0"])

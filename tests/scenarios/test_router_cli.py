@@ -1,4 +1,4 @@
-"""`thermofleet keys` and `thermofleet router`, called as a person and as a supervisor call them."""
+"""`thermofleet keys` and `thermofleet router`, in this process and as processes."""
 
 import json
 import os
@@ -58,7 +58,7 @@ def folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
-def test_a_router_says_where_it_listens_and_ends_when_asked(number, code):
+def test_a_router_prints_its_endpoint_and_exits_on_a_signal(number, code):
     with started("--port", 0) as (process, endpoint):
         assert endpoint.startswith("tcp/127.0.0.1:")
         with open_client(endpoint, timeout_s=PATIENT_S):
@@ -70,7 +70,7 @@ def test_a_router_says_where_it_listens_and_ends_when_asked(number, code):
         assert "Traceback" not in err
 
 
-def test_a_router_with_tls_knows_the_fleet_and_thins_its_telemetry(folder):
+def test_a_router_with_tls_enforces_access_and_the_state_rate(folder):
     with started("--port", 0, "--tls", folder, "--scenario", "quickstart", "--state-hz", 5) as (process, endpoint):
         assert endpoint.startswith("tls/127.0.0.1:")
         with (
@@ -116,7 +116,7 @@ def test_a_port_in_use_is_one_sentence(capsys):
         (("--tls", "{keys}", "--name", "arm_0"), "a router needs that of a router"),
     ],
 )
-def test_what_a_router_cannot_do_is_one_sentence(capsys, folder, words, complaint):
+def test_an_error_of_the_router_command_is_one_sentence(capsys, folder, words, complaint):
     code, out, err = call(capsys, "router", *(word.format(keys=folder) for word in words))
     assert (code, out) == (2, "")
     assert complaint in " ".join(err.split())
@@ -132,7 +132,7 @@ def test_an_arm_without_a_certificate_is_named_before_the_router_starts(capsys, 
     assert "--add arm_1:arm." in " ".join(err.split())
 
 
-def test_keys_are_made_shown_and_added_to(capsys, folder):
+def test_keys_are_made_shown_and_extended(capsys, folder):
     code, out, err = call(capsys, "keys", folder, "--json")
     assert (code, err) == (0, "")
     told = json.loads(out)
@@ -181,7 +181,7 @@ def test_up_gives_every_process_its_own_certificate(folder):
         (("nowhere",), "No scenario 'nowhere'"),
     ],
 )
-def test_keys_that_cannot_be_made_are_one_sentence(capsys, folder, words, complaint):
+def test_an_error_of_the_keys_command_is_one_sentence(capsys, folder, words, complaint):
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     code, out, err = call(capsys, "keys", folder, *words)
     assert (code, out) == (2, "")
@@ -199,7 +199,7 @@ def reports(folder):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("policy", ["matching", "consensus"])
-def test_a_whole_fleet_works_with_every_rule_on(capsys, small_toml, plans, tmp_path, policy):
+def test_a_whole_fleet_works_with_tls_and_access_control(capsys, small_toml, plans, tmp_path, policy):
     """Processes of their own for router, arms, auctioneer and recorder: what they need of each other is allowed."""
     place, out = tmp_path / "keys", tmp_path / "live"
     assert call(capsys, "keys", place, small_toml, *(["--no-auctioneer"] if policy == "consensus" else []))[0] == 0
@@ -228,7 +228,7 @@ def test_a_whole_fleet_works_with_every_rule_on(capsys, small_toml, plans, tmp_p
     assert not [name for name, said in logs.items() if "Traceback" in said or "No router answered" in said]
 
 
-def test_the_list_of_keys_tells_which_are_not_good_now(tmp_path, capsys):
+def test_the_list_of_keys_shows_which_are_invalid_now(tmp_path, capsys):
     place, now = tmp_path / "keys", datetime.now(UTC)
     assert call(capsys, "keys", place, "quickstart")[0] == 0
     issue(place, Participant("arm_0", "arm"), days=1, now=now - timedelta(days=3))
@@ -239,7 +239,7 @@ def test_the_list_of_keys_tells_which_are_not_good_now(tmp_path, capsys):
     assert rows["arm_2"].rstrip().endswith("UTC")
 
 
-def test_the_port_that_everybody_knows_is_taken_where_it_is_free():
+def test_the_default_port_is_used_if_it_is_free():
     with socket.socket() as held:
         held.bind(("127.0.0.1", 0))
         held.listen()

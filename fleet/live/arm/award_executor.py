@@ -1,7 +1,7 @@
-"""Award executor: which awards an arm accepts, how far it may work on them, and what it reports.
+"""Award executor: accepts awards, limits the work on them by leases, and reports their end.
 
 A state machine without a clock and without I/O: real time is an argument; records go to `keep`, which returns once
-they are on disk. Why no job is done twice is explained in `fleet.bus.protocol.auction`; the arm's part of it:
+they are on disk. The rules by which no job is done twice are in `fleet.bus.protocol.auction`; those of the arm:
 
 - an award counts only on a quote of this start of the arm that is still valid, once per job of that quote, and the
   answer is on disk before it is sent;
@@ -157,17 +157,17 @@ class AwardExecutor:
         name = award.job.name
         job = self._accepted.get(award.award)
         if job is not None:
-            return self._accept(award) if job == name else self._refuse(award, f"this award was for the job '{job}'")
+            return self._ack(award, "" if job == name else f"this award was for the job '{job}'")
         quote = self._quotes.get(award.quote)
         if quote is None:
-            return self._refuse(award, f"no quote '{award.quote}' of mine is still valid")
+            return self._ack(award, f"no quote '{award.quote}' of mine is still valid")
         if name not in quote.jobs:
-            return self._refuse(award, f"the quote is not for a job '{name}'")
+            return self._ack(award, f"the quote is not for a job '{name}'")
         earlier = quote.answers.get(name)
         if earlier is None:
             earlier = quote.answers[name] = self._first_answer(award, quote, now_s, unfit)
         elif earlier.award != award.award:
-            return self._refuse(award, f"that job was awarded on this quote by '{earlier.award}'")
+            return self._ack(award, f"that job was awarded on this quote by '{earlier.award}'")
         return earlier
 
     def _first_answer(self, award: Award, quote: _Quote, now_s: float, unfit: str) -> Ack:
@@ -179,17 +179,18 @@ class AwardExecutor:
             reason = "its lease has expired"
         elif not reason and earlier is not None and earlier.may_commit:
             reason = "I am finishing that job already"
+        elif not reason and earlier is None and len(self._reports) >= MAX_REPORTS:
+            reason = f"{len(self._reports)} of my reports are not acknowledged"
         elif not reason and earlier is None and not self.spare_capacity:
-            reason = self._why_no_capacity()
+            reason = f"I have {len(self._active)} job(s) and accept no more at a time"
         if reason:
-            return self._refuse(award, reason)
-        records: list[ArmRecord] = [AwardAccepted(award)]
-        if earlier is not None:  # A new award for the job means that the earlier one has ended.
-            records.insert(0, self._release(earlier))
+            return self._ack(award, reason)
+        # A new award for the job means that the earlier one has ended.
+        records = [AwardAccepted(award)] if earlier is None else [self._released(earlier), AwardAccepted(award)]
         try:
             self._keep(*records)
         except JournalError as error:
-            return self._refuse(award, f"my journal cannot be written: {error}")
+            return self._ack(award, f"my journal cannot be written: {error}")
         if earlier is not None:
             del self._active[earlier.award.award]
         self._active[award.award] = ActiveAward(
@@ -198,34 +199,25 @@ class AwardExecutor:
         self._accepted[award.award] = award.job.name
         self._accepted = bounded(self._accepted, [*self._active, *self._reports])
         self._asked_s.setdefault(award.auctioneer, quote.made_s)
-        return self._accept(award)
+        return self._ack(award)
 
     def _objection(self, award: Award, quote: _Quote, now_s: float) -> str:
+        """Why the award itself cannot be accepted; "" if it can."""
         job, feasible = quote.jobs[award.job.name]
-        if self.unwritten:
-            return "my journal has no space left"
-        if job != award.job:
-            return "the job is not the one that the quote was for"
-        if not feasible:
-            return "the quote says that I cannot do it"
-        if now_s > quote.made_s + self.config.valid_s:
-            return f"the quote was valid for {self.config.valid_s:g} s"
-        if award.cycles >= award.job.repetitions:
-            return f"{award.cycles} of {award.job.repetitions} cycles are done: none is left"
-        if any(p.report.job == award.job.name and p.report.outcome == "finished" for p in self._reports.values()):
-            return "I have finished that job"
-        return ""
+        reports = [pending.report for pending in self._reports.values()]
+        checks = (
+            (self.unwritten, "my journal has no space left"),
+            (job != award.job, "the job is not the one that the quote was for"),
+            (not feasible, "the quote says that I cannot do it"),
+            (now_s > quote.made_s + self.config.valid_s, f"the quote was valid for {self.config.valid_s:g} s"),
+            (award.cycles >= job.repetitions, f"{award.cycles} of {job.repetitions} cycles are done: none is left"),
+            (any(r.job == job.name and r.outcome == "finished" for r in reports), "I have finished that job"),
+        )
+        return next((reason for wrong, reason in checks if wrong), "")
 
-    def _why_no_capacity(self) -> str:
-        if len(self._reports) >= MAX_REPORTS:
-            return f"{len(self._reports)} of my reports are not acknowledged"
-        return f"I have {len(self._active)} job(s) and accept no more at a time"
-
-    def _accept(self, award: Award) -> Ack:
-        return Ack(arm=self.arm, award=award.award, accepted=True)
-
-    def _refuse(self, award: Award, reason: str) -> Ack:
-        return Ack(arm=self.arm, award=award.award, accepted=False, reason=reason)
+    def _ack(self, award: Award, reason: str = "") -> Ack:
+        """Accept an award, or refuse it for a reason."""
+        return Ack(arm=self.arm, award=award.award, accepted=not reason, reason=reason)
 
     # Work
 
@@ -312,19 +304,14 @@ class AwardExecutor:
             if active.award.auctioneer != lease.auctioneer:
                 continue
             if name in lease.may_commit and not active.may_commit:
-                try:
-                    self._keep(CommitPermitted(name))
-                except JournalError as error:
-                    _LOG.warning("Permission to commit '%s' could not be written: %s", active.job, error)
-                else:
-                    active.may_commit = True
+                active.may_commit = self._try_to_keep(CommitPermitted(name))
             if name in lease.revoked and not active.may_commit:  # Permission to commit cannot be withdrawn.
                 del self._active[name]
-                self._write(self._release(active))
+                self._write(self._released(active))
             elif name in lease.granted:
                 active.lease_end_s, active.lease_s = max(active.lease_end_s, lease_end_s), lease.lease_s
 
-    def _release(self, active: ActiveAward) -> Released:
+    def _released(self, active: ActiveAward) -> Released:
         return Released(active.award.award, active.job, self.arm)
 
     def _phase(self, active: ActiveAward) -> Phase:
@@ -337,13 +324,8 @@ class AwardExecutor:
 
     def _lease_entry(self, active: ActiveAward) -> LeaseEntry:
         """Entry of a lease request: it names no more cycles than are on disk."""
-        if active.cycles_on_disk != active.cycles:
-            try:
-                self._keep(Progress(active.job, active.cycles))
-            except JournalError as error:
-                _LOG.warning("The cycles of '%s' could not be written: %s", active.job, error)
-            else:
-                active.cycles_on_disk = active.cycles
+        if active.cycles_on_disk != active.cycles and self._try_to_keep(Progress(active.job, active.cycles)):
+            active.cycles_on_disk = active.cycles
         return LeaseEntry(active.award.award, active.job, active.cycles_on_disk, self._phase(active))
 
     # Reports
@@ -370,7 +352,7 @@ class AwardExecutor:
         return bool(self._reports)
 
     def apply_receipt(self, receipt: Receipt) -> None:
-        """Forget the report that the auctioneer acknowledges."""
+        """Drop the report that the auctioneer acknowledges."""
         pending = self._reports.get(receipt.award)
         if pending is not None and pending.auctioneer == receipt.auctioneer:
             del self._reports[receipt.award]
@@ -388,11 +370,14 @@ class AwardExecutor:
 
     def retry_writes(self) -> None:
         """Write the records for which there was no space."""
-        if not self.unwritten:
-            return
-        try:
-            self._keep(*self.unwritten)
-        except JournalError as error:
-            _LOG.warning("%d record(s) not written yet: %s", len(self.unwritten), error)
-        else:
+        if self.unwritten and self._try_to_keep(*self.unwritten):
             self.unwritten.clear()
+
+    def _try_to_keep(self, *records: ArmRecord) -> bool:
+        """Write records; return whether they are on disk."""
+        try:
+            self._keep(*records)
+        except JournalError as error:
+            _LOG.warning("%d record(s) of '%s' could not be written: %s", len(records), self.arm, error)
+            return False
+        return True

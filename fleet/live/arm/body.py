@@ -1,4 +1,4 @@
-"""The body of an arm, as its node sees it: what moves and warms when the arm works, and its sensors."""
+"""Interface of the body of an arm: motion, heat and sensors, simulated or replayed."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -11,7 +11,7 @@ from fleet.telemetry import Mode
 
 @dataclass(frozen=True)
 class SensorReading:
-    """Sensor values of one arm; what is not known is empty."""
+    """Sensor values of one arm; empty where there is no sensor."""
 
     mode: Mode
     temp_c: tuple[float, ...]

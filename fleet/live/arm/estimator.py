@@ -1,13 +1,13 @@
 """Cost of a job for one arm: its plan, difficulty, peak temperature and duration.
 
-It uses what the arm knows: planned motions, the difficulty model, measured motor temperatures and the thermal network
-of a nominal arm; not the true parameters of its body.
+Inputs are planned motions, the difficulty model, measured motor temperatures and the thermal network of a nominal
+arm; not the true parameters of its body.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from functools import lru_cache
 from itertools import repeat
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,46 +16,39 @@ from fleet.difficulty import Difficulty, DifficultyModel
 from fleet.errors import InfeasibleJob
 from fleet.job import Job, Place, Work
 from fleet.motion import Drive, Plan, drives
-from fleet.motor import Motors, gen3_motors
-from fleet.thermal import WINDING, ThermalModel, gen3_network, temperature_steps, thermal_model
+from fleet.motor import gen3_motors
+from fleet.thermal import WINDING, gen3_network, temperature_steps, thermal_model
 
 Array = np.ndarray
 
-MAX_WORKS = 512
-"""Works whose plans are kept; the least recently used is dropped."""
-MAX_SCORES = 4096
+MAX_WORKS, MAX_SCORES = 512, 4096
+"""Works whose plans are kept, and jobs whose best plan is kept."""
 STEPS = 24
 """Time steps of a job when its temperatures are predicted."""
 NOT_PLANNED = "not planned yet; ask again"
 
 
-class PeakPredictor(Protocol):
-    """Predicts the peak temperatures of an arm."""
-
-    def peaks_c(self, plans: Sequence[Plan], repetitions: Sequence[int], temp_c: Array, ambient_c: float) -> Array:
-        """Hottest motor during each job, °C, [job], from motor temperatures measured now, [joint]."""
-        ...
-
-
 class NominalPeaks:
-    """Predicts by the thermal network of a nominal Gen3, with housings as warm as the measured windings."""
+    """Predicts peak temperatures by the thermal network of a nominal Gen3 in still air."""
 
-    def __init__(self, motors: Motors | None = None, thermal: ThermalModel | None = None) -> None:
-        """Prepare; the default is a nominal Gen3 in still air."""
-        self._motors = motors or gen3_motors()
-        self._thermal = thermal or thermal_model(gen3_network())
-        self._drives: dict[int, tuple[Plan, Drive]] = {}
+    def __init__(self) -> None:
+        self._motors, self._thermal = gen3_motors(), thermal_model(gen3_network())
+        self._drive = lru_cache(MAX_SCORES)(self._mean_drive)
 
     def peaks_c(self, plans: Sequence[Plan], repetitions: Sequence[int], temp_c: Array, ambient_c: float) -> Array:
-        """Hottest motor during each job, °C, [job], in `STEPS` steps of constant heat each."""
+        """Hottest motor during each job, °C, [job], in `STEPS` steps of constant heat each.
+
+        Args:
+            temp_c: Motor temperatures measured now, [joint]; the housings are assumed to be as warm.
+        """
         if not plans:
             return np.zeros(0)
         jobs = list(zip(plans, repetitions, strict=True))
-        weights = [plan.weights(times) for plan, times in jobs]
+        shares = [plan.weights(times) for plan, times in jobs]
         loads = [self._drive(plan) for plan in plans]
         mean = Drive(
-            np.stack([share @ load.current_sq for share, load in zip(weights, loads, strict=True)]),
-            np.stack([share @ load.friction_w for share, load in zip(weights, loads, strict=True)]),
+            np.stack([share @ load.current_sq for share, load in zip(shares, loads, strict=True)]),
+            np.stack([share @ load.friction_w for share, load in zip(shares, loads, strict=True)]),
         )
         steps = temperature_steps(
             repeat(mean, STEPS),
@@ -67,18 +60,12 @@ class NominalPeaks:
         )
         return np.max([step[:, WINDING].max(axis=1) for step in steps], axis=0)
 
-    def _drive(self, plan: Plan) -> Drive:
+    def _mean_drive(self, plan: Plan) -> Drive:
         """Mean drive of each phase, [phase, joint]."""
-        if id(plan) not in self._drives:
-            if len(self._drives) >= MAX_SCORES:
-                del self._drives[next(iter(self._drives))]
-            # The plan is kept with its drive: another could otherwise get the same id.
-            self._drives[id(plan)] = plan, drives([phase.profile for phase in plan.phases], self._motors)
-        return self._drives[id(plan)][1]
+        return drives([phase.profile for phase in plan.phases], self._motors)
 
 
-@dataclass(frozen=True, eq=False)
-class ScoredPlan:
+class ScoredPlan(NamedTuple):
     """How an arm would do a job: the variant with the least difficulty."""
 
     plan: Plan
@@ -86,39 +73,50 @@ class ScoredPlan:
 
 
 class Estimator:
-    """Chooses how one arm would do a job, and estimates its cost."""
+    """Chooses how one arm would do a job, and estimates its cost.
+
+    Args:
+        plan: Returns all variants of a work, maybe slowly; raises `InfeasibleJob`.
+        places: Places of the cell by name.
+    """
 
     def __init__(
         self,
         model: DifficultyModel,
         plan: Callable[[Work], tuple[Plan, ...]],
         places: Mapping[str, Place],
-        peaks: PeakPredictor,
+        peaks: NominalPeaks,
     ) -> None:
-        """Start without any plan.
-
-        Args:
-            plan: Returns all variants of a work, maybe slowly; raises `InfeasibleJob`.
-            places: Of the cell, by name.
-        """
         self.model = model
         self._plan, self._places, self._peaks = plan, places, peaks
-        self._variants: dict[Work, tuple[Plan, ...] | str] = {}
-        self._scored: dict[tuple[Work, int], ScoredPlan] = {}
+        self._variants = lru_cache(MAX_WORKS)(self._variants_or_reason)
+        self._best: dict[tuple[Work, int], ScoredPlan | str] = {}
+        """Best plan of a work and a number of repetitions, or why there is none."""
 
     def plan_ahead(self, works: Iterable[Work]) -> None:
-        """Plan some works before they are asked for."""
+        """Plan some works before they are requested."""
         for work in works:
-            self._variants[work] = self._plan_or_reason(work)
+            self._variants(work)
 
     def is_prepared(self, job: JobSpec) -> bool:
         """Whether an estimate of the job needs neither planning nor scoring."""
-        work = self._work(job)
-        return isinstance(work, str) or self._is_scored(work, job.repetitions)
+        return self._best_or_reason(job) != NOT_PLANNED
 
     def prepare(self, job: JobSpec) -> None:
         """Plan and score the job, maybe slowly; never raises."""
-        self.best_plan(job)
+        if self.is_prepared(job):
+            return
+        work = self._work(job)
+        assert isinstance(work, Work)
+        if len(self._best) >= MAX_SCORES:
+            del self._best[next(iter(self._best))]
+        variants = self._variants(work)
+        if isinstance(variants, str):
+            self._best[work, job.repetitions] = variants
+            return
+        scored = [ScoredPlan(plan, self.model.score(plan, job.repetitions)) for plan in variants]
+        best = min(scored, key=lambda each: each.difficulty.total if each.difficulty else 0.0)
+        self._best[work, job.repetitions] = best
 
     def job(self, job: JobSpec) -> Job | None:
         """Return the job with its work; None if it is not possible in this cell."""
@@ -137,8 +135,8 @@ class Estimator:
 
     def best_plan(self, job: JobSpec) -> ScoredPlan | None:
         """Return how the arm would do the job, planned if needed; None if it cannot."""
-        work = self._work(job)
-        best = work if isinstance(work, str) else self._best(work, job.repetitions)
+        self.prepare(job)
+        best = self._best_or_reason(job)
         return None if isinstance(best, str) else best
 
     def estimate(
@@ -150,29 +148,21 @@ class Estimator:
             temp_c: Motor temperatures as measured now, [joint].
             busy_s: Seconds until the arm is free; inf if unknown.
         """
-        best = [self._best_if_scored(job) for job in jobs]
-        feasible = [
-            (scored.plan, job.repetitions)
-            for job, scored in zip(jobs, best, strict=True)
-            if isinstance(scored, ScoredPlan)
-        ]
-        peaks_c = self._peaks.peaks_c([plan for plan, _ in feasible], [n for _, n in feasible], temp_c, ambient_c)
-        peaks = iter(peaks_c.tolist())
+        best = [(job, self._best_or_reason(job)) for job in jobs]
+        feasible = [(job, scored) for job, scored in best if isinstance(scored, ScoredPlan)]
+        plans, repetitions = [scored.plan for _, scored in feasible], [job.repetitions for job, _ in feasible]
+        peaks = iter(self._peaks.peaks_c(plans, repetitions, temp_c, ambient_c).tolist())
         return tuple(
             JobEstimate(job=job.name, feasible=False, reason=scored)
             if isinstance(scored, str)
             else _estimate(job, scored, temp_c, next(peaks), busy_s)
-            for job, scored in zip(jobs, best, strict=True)
+            for job, scored in best
         )
 
-    def _best_if_scored(self, job: JobSpec) -> ScoredPlan | str:
+    def _best_or_reason(self, job: JobSpec) -> ScoredPlan | str:
+        """Best plan of a prepared job, or why there is none."""
         work = self._work(job)
-        if isinstance(work, str):
-            return work
-        return self._best(work, job.repetitions) if self._is_scored(work, job.repetitions) else NOT_PLANNED
-
-    def _is_scored(self, work: Work, repetitions: int) -> bool:
-        return (work, repetitions) in self._scored or isinstance(self._variants.get(work), str)
+        return work if isinstance(work, str) else self._best.get((work, job.repetitions), NOT_PLANNED)
 
     def _work(self, job: JobSpec) -> Work | str:
         """Return the work, or why it is not possible."""
@@ -190,27 +180,7 @@ class Estimator:
         except ValueError as error:
             return str(error)
 
-    def _best(self, work: Work, repetitions: int) -> ScoredPlan | str:
-        """Return the easiest variant, or why there is none."""
-        scored = self._scored.get((work, repetitions))
-        if scored is not None:
-            return scored
-        variants = self._variants.pop(work, None)
-        if variants is None:
-            variants = self._plan_or_reason(work)
-        self._variants[work] = variants  # the most recently used is last
-        if len(self._variants) > MAX_WORKS:
-            del self._variants[next(iter(self._variants))]
-        if isinstance(variants, str):
-            return variants
-        if len(self._scored) >= MAX_SCORES:
-            del self._scored[next(iter(self._scored))]
-        every = [ScoredPlan(plan, self.model.score(plan, repetitions)) for plan in variants]
-        best = min(every, key=lambda each: each.difficulty.total if each.difficulty else 0.0)
-        self._scored[work, repetitions] = best
-        return best
-
-    def _plan_or_reason(self, work: Work) -> tuple[Plan, ...] | str:
+    def _variants_or_reason(self, work: Work) -> tuple[Plan, ...] | str:
         try:
             return self._plan(work)
         except InfeasibleJob as infeasible:

@@ -1,8 +1,8 @@
-"""Arm journal records: awards accepted, worked on and closed, and what is known of them after a crash.
+"""Arm journal records, and the awards of an arm after a restart.
 
 An accepted award ends with a report, which is repeated until the auctioneer acknowledges it. Awards that are open when
 the process dies are returned at the next start: the arm is at home again, and only the cycles on disk count. If the arm
-was permitted to commit, nobody knows whether the last cycle was done, and the report says so.
+was permitted to commit, the last cycle may have been done or not, and the report says so.
 """
 
 import math
@@ -119,16 +119,8 @@ class ArmHistory(JournalState[ArmRecord]):
         """History at the next start, with a report for every award that was open: it is returned."""
         reports = dict(self.reports)
         for name, active in self.active.items():
-            report = Report(
-                arm=arm,
-                award=name,
-                job=active.job,
-                outcome="returned",
-                cycles=active.cycles,
-                time_s=time_s,
-                reason="the arm was restarted" + (" after it was permitted to commit" if active.may_commit else ""),
-                unsure=active.may_commit,
-            )
+            reason = "the arm was restarted" + (" after it was permitted to commit" if active.may_commit else "")
+            report = Report(arm, name, active.job, "returned", active.cycles, time_s, reason, unsure=active.may_commit)
             reports[name] = active.award, report
         return ArmHistory(self.boot + 1, {}, reports, bounded(self.accepted, reports))
 

@@ -20,7 +20,7 @@ from fleet.bus.protocol.messages import DifficultyScores, Info, State
 from fleet.bus.protocol.registry import STATE_HZ
 from fleet.errors import Refused
 from fleet.events import Event
-from fleet.live.arm.auctioneer_client import AuctioneerClient, LiveArm, RateLimitedWarnings, WorkSource
+from fleet.live.arm.auctioneer_client import AuctioneerClient, RateLimitedWarnings, WorkSource
 from fleet.live.arm.award_executor import AwardExecutor
 from fleet.live.arm.body import Body
 from fleet.live.arm.estimator import Estimator
@@ -61,7 +61,6 @@ class ArmNode:
 
     Attributes:
         clock: Fleet time, as the arm keeps it.
-        lag_s: Fleet seconds by which the body was behind at the last step.
         executor: The awards of the arm.
         link: Its connection to the bus.
         work_source: Where its work comes from.
@@ -75,10 +74,10 @@ class ArmNode:
         estimator: Estimator,
         clock: FleetClock,
         config: ArmConfig,
-        work_source: Callable[[LiveArm], WorkSource] = AuctioneerClient,
+        work_source: "Callable[[ArmNode], WorkSource]" = AuctioneerClient,
     ) -> None:
         """Join the fleet; `link` is open."""
-        self.link, self.clock, self.executor, self.lag_s = link, clock, executor, 0.0
+        self.link, self.clock, self.executor = link, clock, executor
         self._body, self._estimator, self._config = body, estimator, config
         self._name = executor.arm
         self._body_award = ""
@@ -124,9 +123,8 @@ class ArmNode:
         jobs = {job.name: job for job in request.jobs}
         if len(jobs) != len(request.jobs):
             raise Refused("The request names a job twice.")
-        estimates = self.estimate(request.jobs)
+        estimates, name = self.estimate(request.jobs), ""
         real_s = time.monotonic()
-        name = ""
         if not request.dry_run:
             feasible = {estimate.job: (jobs[estimate.job], estimate.feasible) for estimate in estimates}
             name = self.executor.add_quote(feasible, real_s)
@@ -183,8 +181,8 @@ class ArmNode:
         ack = self.executor.answer_award(award, real_s, self.unfit())
         if ack.accepted and len(self.executor.active) > before:
             scored = self._estimator.best_plan(award.job)
-            score = None if scored is None or scored.difficulty is None else scored.difficulty.total
-            self._report_event(Event(time_s=self._body.time_s, kind="award", job=award.job.name), score)
+            score = math.nan if scored is None or scored.difficulty is None else scored.difficulty.total
+            self._report_event(Event(time_s=self._body.time_s, kind="award", job=award.job.name, value=score))
         return ack
 
     def unfit(self) -> str:
@@ -229,12 +227,11 @@ class ArmNode:
             self._advance(self.clock.now_s(lease_end_s), current, lease_end_s, real_s)
             current = self._current
         self._advance(now_s, current, real_s, real_s)
-        self.lag_s = now_s - self._body.time_s
-        if self.lag_s > 2.0 * self.clock.speed:
-            self._warn("lag", f"is {self.lag_s:.1f} s of fleet time behind.")
+        if (lag_s := now_s - self._body.time_s) > 2.0 * self.clock.speed:
+            self._warn("lag", f"is {lag_s:.1f} s of fleet time behind.")
 
     def _assign(self, current: ActiveAward | None) -> None:
-        """Have the body release a job that is no longer the arm's own, and start the current one."""
+        """Make the body release a job whose award has ended, and start the current one."""
         name = "" if current is None else current.award.award
         if self._body_award not in ("", name):
             self._body.release()
@@ -242,7 +239,7 @@ class ArmNode:
         if current is None or not self._body.is_free:
             return
         job, scored = self._estimator.job(current.award.job), self._estimator.best_plan(current.award.job)
-        assert job is not None, "an award of an infeasible job is refused"
+        assert job is not None
         assert scored is not None, "an award of an infeasible job is refused"
         self._body.start(job, scored.plan, current.cycles)
         self._body_award = name
@@ -287,7 +284,7 @@ class ArmNode:
             self._body_award = ""
             self.executor.record_progress(int(event.value), math.inf)
             self.executor.return_all(event.time_s, real_s, f"the arm faulted; {event.reason}")
-            self._reading = self._body.read_sensors()  # estimates from now on know of the fault
+            self._reading = self._body.read_sensors()  # the next estimates take the fault into account
         self._report_event(event)
 
     def _busy_s(self) -> float:
@@ -306,26 +303,21 @@ class ArmNode:
     # Publishing
 
     def _send_state(self) -> None:
-        self._reading = reading = self._body.read_sensors()
+        self._reading = self._body.read_sensors()
         self._tick += 1
-        state = State(
-            arm=self._name,
-            tick=self._tick,
-            time_s=self._body.time_s,
-            mode=reading.mode,
-            temp_c=reading.temp_c,
-            headroom_k=self._headroom_k,
-            job=next((active.job for active in self.executor.active), ""),
-            q=reading.q,
-            qd=reading.qd,
-            tau=reading.tau,
-            current_a=reading.current_a,
+        self._publish_state(
+            State(
+                arm=self._name,
+                tick=self._tick,
+                time_s=self._body.time_s,
+                headroom_k=self._headroom_k,
+                job="" if self._current is None else self._current.job,
+                **vars(self._reading),
+            )
         )
-        self._publish_state(state)
 
-    def _report_event(self, event: Event, value: float | None = None) -> None:
+    def _report_event(self, event: Event) -> None:
         self._events += 1
-        value = event.value if value is None and math.isfinite(event.value) else value
         self._publish_event(
             ArmEvent(
                 arm=self._name,
@@ -334,7 +326,7 @@ class ArmNode:
                 kind=event.kind,
                 job=event.job,
                 joint=event.joint,
-                value=value,
+                value=event.value if math.isfinite(event.value) else None,
                 reason=event.reason,
             )
         )
@@ -342,6 +334,7 @@ class ArmNode:
     def set_clock(self, clock: FleetClock, *, jump: bool = False) -> None:
         """Use another clock; with `jump` it reads another time now, and the body is set to that time."""
         if clock.speed != self.clock.speed:
+            self._warn("speed", f"runs at the fleet's speed of {clock.speed:g}, not at {self.clock.speed:g}.")
             self._body.set_step(clock.speed / self._config.rate_hz)
         self.clock = clock
         if jump:

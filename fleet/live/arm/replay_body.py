@@ -29,14 +29,13 @@ class SensorLog:
 
 
 class ReplayBody:
-    """Replays a log once, from its first sample on, in fleet time; then it keeps its last sample."""
+    """Body that replays a log once, in fleet time; then it keeps the last sample. See `fleet.live.arm.body.Body`.
+
+    Args:
+        time_s: Fleet time of the first sample.
+    """
 
     def __init__(self, log: SensorLog, *, time_s: float = 0.0) -> None:
-        """Start at the first sample.
-
-        Args:
-            time_s: Fleet time of the first sample.
-        """
         if not len(log.time_s):
             raise ValueError("A log needs at least one sample.")
         self._log = log
@@ -44,7 +43,6 @@ class ReplayBody:
 
     @property
     def time_s(self) -> float:
-        """Simulated up to this fleet time."""
         return self._now_s
 
     @property
@@ -52,41 +50,39 @@ class ReplayBody:
         """Whether its last sample has passed."""
         return self._row == len(self._log.time_s) - 1
 
+    # It takes no jobs.
+
     job, is_free, cycles = "", False, 0
 
     def last_cycle_in_s(self) -> float:
-        """Infinite: it begins no cycle."""
         return np.inf
 
     def free_in_s(self) -> float:
-        """Infinite: it is never free."""
         return np.inf
 
     def start(self, job: Job, plan: Plan, cycles: int) -> None:
-        """Unsupported: replayed logs take no jobs."""
         raise ValueError(f"A replayed log takes no jobs (got '{job.name}').")
 
     def allow_cycles(self, cycles: int) -> None:
-        """Do nothing: it has no job."""
+        pass
 
     def release(self) -> None:
-        """Do nothing: it has no job."""
+        pass
+
+    # Its log
 
     def advance(self, until_s: float) -> list[Event]:
-        """Advance to a fleet time; a log has no events."""
         self._now_s = max(self._now_s, until_s)
         return []
 
     def set_time(self, time_s: float) -> None:
-        """Set the fleet time without advancing."""
         self._start_s += time_s - self._now_s
         self._now_s = time_s
 
     def set_step(self, dt_s: float) -> None:
-        """Do nothing: samples are read at any time."""
+        pass  # samples are read at any time
 
     def read_sensors(self) -> SensorReading:
-        """Return the last sample taken by now."""
         log, row = self._log, self._row
         qd = np.zeros_like(log.qd[row]) if self.over else log.qd[row]
         current_a = () if log.current_a is None else tuple(log.current_a[row].tolist())

@@ -63,7 +63,7 @@ class _Current:
 
 
 class SimulatedBody:
-    """One arm of the simulator in real time.
+    """One arm of the simulator in real time, as `fleet.live.arm.body.Body` describes.
 
     Args:
         arm: True parameters of the arm; its plans and its model are not used.
@@ -100,22 +100,18 @@ class SimulatedBody:
 
     @property
     def time_s(self) -> float:
-        """Simulated up to this fleet time."""
         return self._start_s + float(self._state.tick[0]) * self._dt_s
 
     @property
     def job(self) -> str:
-        """Name of the current job; "" for none."""
         return "" if self._task is None or self._task.released else self._task.job.name
 
     @property
     def is_free(self) -> bool:
-        """Whether it is at home, not faulted, and without a job."""
         return self._task is None and self._state.mode[0, 0] not in (WORKING, FAULTED)
 
     @property
     def cycles(self) -> int:
-        """Cycles of the current job that are done, by any arm."""
         assert self._task is not None, "no current job"
         return self._task.before + self._begun(done=True)
 
@@ -125,7 +121,6 @@ class SimulatedBody:
         return self._state
 
     def last_cycle_in_s(self) -> float:
-        """Seconds until the last cycle of the current job could begin; inf without a job."""
         task = self._task
         if task is None or task.released or self._faulted:
             return np.inf
@@ -136,7 +131,6 @@ class SimulatedBody:
         return self._home_in_s + task.plan.approach.duration_s + (last - self.cycles) * task.plan.cycle.duration_s
 
     def free_in_s(self) -> float:
-        """Seconds until it could be free if it may do all of the current job; inf while it is faulted."""
         if self._faulted:
             return np.inf
         last_s = self.last_cycle_in_s()
@@ -145,7 +139,6 @@ class SimulatedBody:
         return last_s + self._task.plan.cycle.duration_s + self._task.plan.retreat.duration_s
 
     def read_sensors(self) -> SensorReading:
-        """Return the present sensor values."""
         if self._last is None:
             still = np.zeros_like(self._arm.rest_tau)
             temp_c, motors, tau = self._state.temp_c[0, 0], self._arm.motors, self._arm.rest_tau
@@ -155,14 +148,13 @@ class SimulatedBody:
         world, record = self._last
         end_s = np.array([world.dt_s])
         motion = self._plant.motion(world, record, end_s)
-        said = telemetry_of(world, record, end_s, motion, self._rng.standard_normal((1, 1, 1, motion.shape[-1])))
-        values = (said.temp_c, said.q, said.qd, said.tau, said.current_a)
+        sample = telemetry_of(world, record, end_s, motion, self._rng.standard_normal((1, 1, 1, motion.shape[-1])))
+        values = (sample.temp_c, sample.q, sample.qd, sample.tau, sample.current_a)
         return SensorReading(MODES[self._state.mode[0, 0]], *(tuple(value[0, 0].tolist()) for value in values))
 
     # Commands
 
     def start(self, job: Job, plan: Plan, cycles: int) -> None:
-        """Take a job of which `cycles` are done; it must be free. Nothing moves before `allow_cycles`."""
         if not self.is_free:
             raise ValueError(f"Arm '{self._arm.robot.name}' is not free and cannot start '{job.name}'.")
         if not 0 <= cycles < job.repetitions:
@@ -172,23 +164,19 @@ class SimulatedBody:
         self._state = self._carried(self._world)
 
     def allow_cycles(self, cycles: int) -> None:
-        """Limit the cycles of the current job that may be begun, including those done; one in progress is finished."""
         if self._task is not None and not self._task.released:
             self._task.allowed = min(cycles, self._task.job.repetitions)
 
     def release(self) -> None:
-        """Finish the cycle, return home, release the job."""
         if self._task is not None:
             self._task.allowed, self._task.released = 0, True
             if not self._working:
                 self._task = None
 
     def set_time(self, time_s: float) -> None:
-        """Set the fleet time without advancing."""
         self._start_s += time_s - self.time_s
 
     def set_step(self, dt_s: float) -> None:
-        """Set the length of a step, fleet seconds, up to `max_dt_s`."""
         time_s, ticks, dt_s = self.time_s, float(self._state.tick[0]), min(dt_s, self._max_dt_s)
         phi, gamma = self._world.thermal.step_matrices(dt_s)
         # The engine counts its time in ticks of the new length.
@@ -199,7 +187,7 @@ class SimulatedBody:
         self.set_time(time_s)
 
     def advance(self, until_s: float) -> list[Event]:
-        """Simulate up to a fleet time, at most `MAX_STEPS` steps; the events `finish` and `return` end the job."""
+        """Simulate up to a fleet time, at most `MAX_STEPS` steps."""
         events: list[Event] = []
         steps = int((until_s - self.time_s) / self._dt_s + 1e-6)
         for _ in range(min(max(steps, 0), MAX_STEPS)):
@@ -244,32 +232,29 @@ class SimulatedBody:
             done: Cycles of the stint, if it ended.
         """
         events: list[Event] = []
+        total = task.job.repetitions
+
+        def report(kind: Literal["finish", "return"], at_s: float, value: float, reason: str) -> None:
+            arm, job = self._arm.robot.name, task.job.name
+            if not task.released:
+                events.append(Event(time_s=at_s, kind=kind, arm=arm, job=job, value=value, reason=reason))
+
         for each in log:
             at_s = each.time_s + shift_s
             if each.kind == "finish":
                 task.before += done
-                if task.before == task.job.repetitions and not task.released:
+                if task.before == total:
                     late_s = max(0.0, at_s - task.job.due_s)
-                    text = f"late by {late_s:.0f} s" if late_s else "on time"
-                    events.append(self._event(task, at_s, "finish", late_s, text))
+                    report("finish", at_s, late_s, f"late by {late_s:.0f} s" if late_s else "on time")
                     task.released = True
-            elif each.kind == "home":
-                if task.released:
-                    self._task = None
+            elif each.kind == "home" and task.released:
+                self._task = None
             elif each.kind == "fault":
                 kept = next((int(e.value) for e in log if e.kind == "return"), 0)
-                if not task.released:
-                    cycles = task.before + kept
-                    text = f"{cycles} of {task.job.repetitions} cycles kept"
-                    events.append(self._event(task, at_s, "return", float(cycles), text))
+                cycles = task.before + kept
+                report("return", at_s, float(cycles), f"{cycles} of {total} cycles kept")
                 self._task = None
         return events
-
-    def _event(
-        self, task: _Current, at_s: float, kind: Literal["finish", "return"], value: float, reason: str
-    ) -> Event:
-        name = self._arm.robot.name
-        return Event(time_s=at_s, kind=kind, arm=name, job=task.job.name, value=value, reason=reason)
 
     # Arrays of the engine
 
@@ -312,8 +297,7 @@ class SimulatedBody:
     @property
     def _times_s(self) -> tuple[float, float, float]:
         """Durations of approach, cycle and retreat."""
-        approach, cycle, retreat = self._world.plans.times_s[0].tolist()
-        return approach, cycle, retreat
+        return tuple(self._world.plans.times_s[0].tolist())
 
     def _begun(self, *, done: bool = False) -> int:
         """Cycles of this stint that were begun, or with `done` those that are complete."""

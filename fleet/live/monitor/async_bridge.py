@@ -69,27 +69,15 @@ class AsyncBridge:
         return await self._on_bus(lambda done: done(self._listener.view.snapshot(time.monotonic())))
 
     async def submit(self, submission: Submission) -> SubmissionReply:
-        """Submit jobs.
-
-        Raises:
-            NoReply: no auctioneer replied, or it refused.
-        """
+        """Submit jobs. Raises NoReply if no auctioneer replied, or it refused."""
         return await self._ask_auctioneer(keys.of_jobs(self._link.fleet, "submit"), submission, SubmissionReply)
 
     async def status(self, request: StatusRequest) -> Status:
-        """Request the status of jobs.
-
-        Raises:
-            NoReply: no auctioneer replied, or it refused.
-        """
+        """Request the status of jobs. Raises NoReply if no auctioneer replied, or it refused."""
         return await self._ask_auctioneer(keys.of_jobs(self._link.fleet, "status"), request, Status)
 
     async def quotes(self, request: QuoteRequest) -> Quotes:
-        """Request quotes of every arm.
-
-        Raises:
-            NoReply: the gateway's certificate does not permit the request.
-        """
+        """Request quotes of every arm. Raises NoReply if the gateway's certificate does not permit it."""
         answers = await self._ask(keys.of_every_arm(self._link.fleet, "quote"), request, Quote, QUOTE_S)
         return Quotes(tuple(answers.messages.values()), tuple(answers.refused.values()))
 

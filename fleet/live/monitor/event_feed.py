@@ -4,8 +4,10 @@ A slow reader misses telemetry (the newest message of each arm replaces the one 
 reader that falls so far behind that events would be lost is dropped; it reconnects with the last number it has seen.
 """
 
-from collections import OrderedDict, deque
+from collections import deque
 from dataclasses import dataclass, field
+
+from fleet.live.monitor.recent import Recent
 
 HISTORY = 1024
 """Events and results that a reader can still get after it reconnects."""
@@ -29,19 +31,9 @@ class Entry:
     """JSON on one line."""
 
 
-@dataclass
-class _Newest:
+def _newest() -> "Recent[tuple[str, str], Entry]":
     """The newest entry of each topic and name."""
-
-    entries: "OrderedDict[tuple[str, str], Entry]" = field(default_factory=OrderedDict[tuple[str, str], Entry])
-
-    def add(self, entry: Entry) -> None:
-        """Replace the entry of the same topic and name; with too many names, drop the oldest."""
-        key = (entry.topic, entry.name)
-        self.entries[key] = entry
-        self.entries.move_to_end(key)
-        if len(self.entries) > MAX_NAMES:
-            self.entries.popitem(last=False)
+    return Recent(MAX_NAMES)
 
 
 @dataclass
@@ -49,7 +41,7 @@ class EventFeed:
     """The newest message of each name and topic, and the last events and results."""
 
     number: int = 0
-    _newest: _Newest = field(default_factory=_Newest)
+    _newest: "Recent[tuple[str, str], Entry]" = field(default_factory=_newest)
     _events: "deque[Entry]" = field(default_factory=lambda: deque[Entry](maxlen=HISTORY))
     _dropped: int = 0
     """Number of the last event or result that is no longer kept."""
@@ -59,7 +51,7 @@ class EventFeed:
         self.number += 1
         entry = Entry(self.number, topic, name, data)
         if topic in NEWEST_ONLY:
-            self._newest.add(entry)
+            self._newest[topic, name] = entry
         else:
             if len(self._events) == HISTORY:
                 self._dropped = self._events[0].number
@@ -68,17 +60,17 @@ class EventFeed:
 
     def since(self, number: int) -> tuple[list[Entry], bool]:
         """Return the entries after a number, in order, and whether events between them were dropped."""
-        entries = [entry for entry in (*self._newest.entries.values(), *self._events) if entry.number > number]
+        entries = [entry for entry in (*self._newest.values(), *self._events) if entry.number > number]
         return sorted(entries, key=lambda entry: entry.number), number < self._dropped
 
 
-@dataclass
+@dataclass(eq=False)
 class ReaderBuffer:
     """Entries that wait for one reader."""
 
     full: bool = False
     """Events were lost: the reader is to be dropped."""
-    _newest: _Newest = field(default_factory=_Newest)
+    _newest: "Recent[tuple[str, str], Entry]" = field(default_factory=_newest)
     _events: list[Entry] = field(default_factory=list[Entry])
 
     def put(self, entry: Entry) -> None:
@@ -86,7 +78,7 @@ class ReaderBuffer:
         if self.full:
             return
         if entry.topic in NEWEST_ONLY:
-            self._newest.add(entry)
+            self._newest[entry.topic, entry.name] = entry
         elif len(self._events) < MAX_WAITING:
             self._events.append(entry)
         else:
@@ -95,7 +87,7 @@ class ReaderBuffer:
 
     def take(self) -> list[Entry]:
         """Remove and return all waiting entries, in order."""
-        entries = sorted((*self._newest.entries.values(), *self._events), key=lambda entry: entry.number)
-        self._newest.entries.clear()
+        entries = sorted((*self._newest.values(), *self._events), key=lambda entry: entry.number)
+        self._newest.clear()
         self._events.clear()
         return entries

@@ -18,7 +18,7 @@ class Finding(msgspec.Struct, frozen=True):
     """One statement about the fleet."""
 
     level: Literal["fault", "warning"]
-    """fault: the fleet cannot do its work; warning: it can, but somebody should look."""
+    """fault: the fleet cannot do its work; warning: it can, but needs attention."""
     what: str
 
 
@@ -69,7 +69,7 @@ def check_health(
     Args:
         fleet: Snapshot at the real second `now_s`.
         complaints: Reasons why the last malformed messages were dropped.
-        overrun: Messages lost because they came faster than they were handled.
+        overrun: Messages lost because the queue was full.
         auctioneer: Whether the fleet should have one.
         secure: Whether the listener used a certificate; one that the router does not know receives nothing.
         expected: Arms that should be present: one that left earlier leaves no trace.
@@ -95,7 +95,7 @@ def check_health(
     if overrun:
         findings.append(Finding("warning", f"{overrun} message(s) came faster than they were handled, and were lost."))
     if unfinished := fleet.counts.get("unfinished", 0):
-        findings.append(Finding("warning", f"{unfinished} job(s) are unfinished: it is not known if they were done."))
+        findings.append(Finding("warning", f"{unfinished} job(s) are unfinished: they may have been done or not."))
     return HealthReport(
         fleet=fleet.fleet,
         round_trip_s=median(trips_s) if trips_s else None,
@@ -107,49 +107,44 @@ def check_health(
 
 
 def check_auctioneers(fleet: FleetSnapshot, probes: Sequence[ClockProbe], wanted: bool = True) -> list[Finding]:
-    """Check that exactly one auctioneer answers; or, where none is wanted, that there is none."""
+    """Check that exactly one auctioneer replies; or, where none is wanted, that none is present."""
     names = [auctioneer.auctioneer for auctioneer in fleet.auctioneers if auctioneer.token]
+    listed = ", ".join(names)
     if len(names) > 1:
-        count = f"{len(names)} auctioneers are present ({', '.join(names)})"
-        return [Finding("fault", f"{count}, but a fleet has one: stop all but one.")]
-    if not wanted:
-        unwanted = f"Auctioneer {', '.join(names)} is present, though the fleet should have none."
+        problem = f"{len(names)} auctioneers are present ({listed}), but a fleet has one: stop all but one."
+    elif not wanted:
+        unwanted = f"Auctioneer {listed} is present, though the fleet should have none."
         return [Finding("warning", unwanted)] if names else []
-    if any(probe.time_s is not None for probe in probes):
+    elif any(probe.time_s is not None for probe in probes):
         return []
-    if names:
-        return [Finding("fault", f"Auctioneer {names[0]} shows its token but does not answer: its process may hang.")]
-    return [
-        Finding(
-            "fault",
-            "No auctioneer shows a token or answers: nobody awards jobs, and every arm keeps its own time. "
-            "If this fleet needs none, give --no-auctioneer.",
+    elif names:
+        problem = f"Auctioneer {listed} shows its token but does not answer: its process may hang."
+    else:
+        problem = (
+            "No auctioneer shows a token or answers: jobs are not awarded, and every arm keeps its own time. "
+            "If this fleet needs none, give --no-auctioneer."
         )
-    ]
+    return [Finding("fault", problem)]
 
 
 def check_arm(arm: ArmSnapshot, offset_s: float | None) -> list[Finding]:
     """Check the token, state, mode and clock of one arm."""
-    findings: list[Finding] = []
     age_s = arm.state_age_s
     if not arm.token and age_s is None:
         return [Finding("warning", f"{arm.arm} has left: some of its messages are kept, but it shows no token.")]
+    problem = ""
     if not arm.token:
         problem = "publishes its state but shows no token: it left, or another process uses its name."
-        findings.append(Finding("fault", f"{arm.arm} {problem}"))
     elif age_s is None:
-        findings.append(Finding("fault", f"{arm.arm} shows its token but publishes no state: its process may hang."))
+        problem = "shows its token but publishes no state: its process may hang."
     elif age_s > FRESH_S:
-        findings.append(
-            Finding("fault", f"{arm.arm} is stale: its last state is {age_s:.1f} s old. Its process may hang.")
-        )
+        problem = f"is stale: its last state is {age_s:.1f} s old. Its process may hang."
+    findings = [Finding("fault", f"{arm.arm} {problem}")] if problem else []
     if arm.mode == "faulted":
         findings.append(Finding("warning", f"{arm.arm} is faulted: joint {arm.joint} is at {arm.hottest_c:.1f} °C."))
     if offset_s is not None and abs(offset_s) > OFFSET_S:
-        side = "ahead of" if offset_s > 0 else "behind"
-        findings.append(
-            Finding("fault", f"{arm.arm} is {abs(offset_s):.1f} s {side} fleet time: its machine may be overloaded.")
-        )
+        offset = f"{abs(offset_s):.1f} s {'ahead of' if offset_s > 0 else 'behind'} fleet time"
+        findings.append(Finding("fault", f"{arm.arm} is {offset}: its machine may be overloaded."))
     return findings
 
 

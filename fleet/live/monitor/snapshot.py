@@ -1,12 +1,12 @@
 """Snapshot of a fleet: who is present, the last message of each participant and its age, and the state of every job.
 
-`FleetView` is fed with messages and real time, and has no clock and no I/O. Its memory is bounded, however many names
-are published: those not heard of for longest are dropped first.
+`FleetView` takes messages and real time, and has no clock and no I/O. Its memory is bounded, however many names are
+published: the least recent are dropped.
 """
 
 import math
-from collections import Counter, OrderedDict
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal, TypeVar
 
@@ -15,6 +15,7 @@ import msgspec
 from fleet.bus.protocol import auction
 from fleet.bus.protocol.auction import Announcement, ArmEvent, JobStatus, Result, Status
 from fleet.bus.protocol.messages import DifficultyScores, Info, State, encode
+from fleet.live.monitor.recent import Recent
 from fleet.telemetry import Mode
 
 FRESH_S = 3.0
@@ -24,7 +25,6 @@ COMPLETE_BYTES = 32_000
 """A status reply that is smaller, and has fewer jobs than one message may have, names all jobs."""
 
 Role = Literal["arm", "auction"]
-Value = TypeVar("Value")
 Message = TypeVar("Message", bound=msgspec.Struct)
 
 
@@ -94,17 +94,22 @@ class _Auctioneer:
 
 
 @dataclass
+class _Job:
+    status: JobStatus
+    heard_s: float
+    """Real second at which it was last named."""
+    number: int = 0
+    """Number of its last result: an older one changes nothing."""
+
+
+@dataclass
 class FleetView:
-    """What the messages heard so far say about a fleet."""
+    """State of a fleet, as its messages show it."""
 
     fleet: str
-    _arms: "OrderedDict[str, _Arm]" = field(default_factory=OrderedDict[str, _Arm])
-    _auctioneers: "OrderedDict[str, _Auctioneer]" = field(default_factory=OrderedDict[str, _Auctioneer])
-    _jobs: "OrderedDict[str, JobStatus]" = field(default_factory=OrderedDict[str, JobStatus])
-    _numbers: dict[str, int] = field(default_factory=dict[str, int])
-    """Number of the last result of each job: an older one changes nothing."""
-    _heard_s: dict[str, float] = field(default_factory=dict[str, float])
-    """Real second at which a job was last named."""
+    _arms: "Recent[str, _Arm]" = field(default_factory=lambda: Recent(MAX_NAMES))
+    _auctioneers: "Recent[str, _Auctioneer]" = field(default_factory=lambda: Recent(MAX_NAMES))
+    _jobs: "Recent[str, _Job]" = field(default_factory=lambda: Recent(MAX_JOBS))
 
     def set_token(self, role: Role, name: str, present: bool) -> bool:
         """Note that a token appeared or disappeared; return whether that is a change."""
@@ -113,22 +118,22 @@ class FleetView:
         return changed
 
     def update(self, name: str, message: msgspec.Struct, now_s: float) -> None:
-        """Take in a message that came at the real second `now_s`; other types are ignored."""
+        """Apply a message that arrived at the real second `now_s`; other types are ignored."""
         if isinstance(message, Announcement | Result):
             self._auctioneer(name).heard_s = now_s
-            if isinstance(message, Result) and message.number >= self._numbers.get(message.status.job, 0):
-                self._numbers[message.status.job] = message.number
-                self._set_status(message.status, now_s)
+            if isinstance(message, Result):
+                self._set_status(message.status, now_s, message.number)
         elif isinstance(message, State | DifficultyScores | Info | ArmEvent):
             self._arm(name).messages[type(message)] = message, now_s
 
     def update_jobs(self, reply: Status, now_s: float) -> None:
-        """Take in the auctioneer's reply to a status request."""
+        """Apply the auctioneer's reply to a status request."""
         auctioneer = self._auctioneer(reply.auctioneer)
         if reply.time_s < auctioneer.time_s:  # another fleet, or one that was restarted with new result numbers
-            self._numbers.clear()
             if not _complete(reply):
                 self._jobs.clear()
+            for job in self._jobs.values():
+                job.number = 0
         auctioneer.heard_s, auctioneer.time_s = now_s, reply.time_s
         for status in reply.jobs:
             self._set_status(status, now_s)
@@ -141,12 +146,13 @@ class FleetView:
         if not replies or not all(map(_complete, replies)):
             return
         named = {status.job for reply in replies for status in reply.jobs}
-        for name in [name for name in self._jobs if name not in named and self._heard_s[name] < asked_s]:
-            del self._jobs[name], self._heard_s[name]
-            self._numbers.pop(name, None)
+        for name, job in list(self._jobs.items()):
+            if name not in named and job.heard_s < asked_s:
+                del self._jobs[name]
 
     def snapshot(self, now_s: float, jobs: int = MAX_JOBS) -> FleetSnapshot:
         """The fleet at the real second `now_s`, with at most `jobs` of the jobs that changed last."""
+        statuses = [job.status for job in self._jobs.values()]
         return FleetSnapshot(
             fleet=self.fleet,
             arms=tuple(_arm_snapshot(name, self._arms[name], now_s) for name in sorted(self._arms)),
@@ -154,30 +160,27 @@ class FleetView:
                 AuctioneerSnapshot(name, known.token, None if known.heard_s is None else now_s - known.heard_s)
                 for name, known in sorted(self._auctioneers.items())
             ),
-            counts=count_states(self._jobs.values()),
-            jobs=tuple(self._jobs.values())[-jobs:] if jobs > 0 else (),
+            counts=dict(Counter(status.state for status in statuses)),
+            jobs=tuple(statuses[-jobs:]) if jobs > 0 else (),
         )
 
     def _arm(self, name: str) -> _Arm:
-        return _most_recent(self._arms, name, _Arm(), MAX_NAMES)
+        arm = self._arms[name] = self._arms.get(name) or _Arm()
+        return arm
 
     def _auctioneer(self, name: str) -> _Auctioneer:
-        return _most_recent(self._auctioneers, name, _Auctioneer(), MAX_NAMES)
+        auctioneer = self._auctioneers[name] = self._auctioneers.get(name) or _Auctioneer()
+        return auctioneer
 
-    def _set_status(self, status: JobStatus, now_s: float) -> None:
-        self._heard_s[status.job] = now_s
-        if self._jobs.get(status.job) != status:
-            _most_recent(self._jobs, status.job, status, MAX_JOBS)
-            self._jobs[status.job] = status
-        for by_job in (self._numbers, self._heard_s):
-            if len(by_job) > 2 * MAX_JOBS:
-                for name in [name for name in by_job if name not in self._jobs]:
-                    del by_job[name]
-
-
-def count_states(jobs: Iterable[JobStatus]) -> dict[str, int]:
-    """Number of jobs by state, for example {'waiting': 3, 'finished': 12}."""
-    return dict(Counter(job.state for job in jobs))
+    def _set_status(self, status: JobStatus, now_s: float, number: int | None = None) -> None:
+        """Set the status of a job; `number` is that of the result that has it."""
+        job = self._jobs.get(status.job)
+        last = 0 if job is None else job.number
+        if number is not None and number < last:
+            return
+        if job is None or job.status != status:
+            job = self._jobs[status.job] = _Job(status, now_s)
+        job.heard_s, job.number = now_s, max(last, number or 0)
 
 
 def describe_event(event: ArmEvent) -> str:
@@ -227,12 +230,3 @@ def _arm_snapshot(name: str, arm: _Arm, now_s: float) -> ArmSnapshot:
         state_age_s=age_s,
         difficulty_age_s=now_s - scores_s if scores else None,
     )
-
-
-def _most_recent(values: "OrderedDict[str, Value]", name: str, new: Value, most: int) -> Value:
-    """Return the value of a name, `new` if it has none, and mark the name as the most recent of at most `most`."""
-    value = values.setdefault(name, new)
-    values.move_to_end(name)
-    if len(values) > most:
-        values.popitem(last=False)
-    return value

@@ -3,60 +3,80 @@
 import logging
 import os
 import secrets
-import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Literal
 
+import numpy as np
 import typer
 
 from agents.registry import names_of
+from fleet.bus.client.client import BusClient
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import Clock, ClockRequest
 from fleet.bus.protocol.registry import STATE_HZ
-from fleet.errors import BusError, FleetError, InfeasibleJob
+from fleet.difficulty import Blind, DifficultyModel
+from fleet.errors import BusError, FleetError, InfeasibleJob, LogError
+from fleet.files import cache_folder
 from fleet.job import Work
+from fleet.live.arm.auctioneer_client import AuctioneerClient, WorkSource
+from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
+from fleet.live.arm.body import Body
+from fleet.live.arm.estimator import Estimator, NominalPeaks
+from fleet.live.arm.journal_records import ArmHistory, ArmRecord
+from fleet.live.arm.node import ArmConfig, ArmNode
+from fleet.live.arm.replay_body import ReplayBody, SensorLog
+from fleet.live.arm.simulated_body import SimulatedBody
+from fleet.live.clock import FleetClock
+from fleet.live.journal import Journal
 from fleet.motion import Plan
-from scenarios.cli.options import ENDPOINT, EndpointOption
+from scenarios.cli.live.journals import folder_of, refuse_other_way
+from scenarios.cli.live.options import (
+    JobsOption,
+    JournalOption,
+    ModelOption,
+    RateOption,
+    ScenarioFleetOption,
+    SeedOption,
+    number,
+)
+from scenarios.cli.options import ENDPOINT, EndpointOption, ScenarioArg
+from scenarios.cli.signals import until_stopped
+from scenarios.cli.terminal import progress_bar
 from scenarios.load import load
+from scenarios.policy_loader import scope_of
+from scenarios.progress import Progress
 from scenarios.schema import Scenario
 
 if TYPE_CHECKING:
-    from fleet.bus.client.client import BusClient
-    from fleet.difficulty import DifficultyModel
-    from fleet.live.arm.auctioneer_client import LiveArm, WorkSource
-    from fleet.live.arm.body import Body
-    from fleet.live.arm.journal_records import ArmHistory, ArmRecord
-    from fleet.live.arm.node import ArmNode
-    from fleet.live.clock import FleetClock
-    from fleet.live.journal import Journal
     from fleet.planning.plan_cache import CachedPlanner
-    from scenarios.progress import Progress
 
 log = logging.getLogger(__name__)
 
 TURN_S, CLOCK_S, RETIRE_S = 0.25, 2.0, 1.0
 """Real seconds: between two checks for a signal; for the auctioneer's clock reply; to return awards at the end."""
-TOKEN_S = 4.0
-"""Real seconds for which the token of an exited process may remain: its session's lease, with a margin."""
+TOKEN_S, POLL_S = 4.0, 0.1
+"""Real seconds for which the token of an exited process may remain, its session's lease with a margin; and between
+two requests for it."""
 
 
 def arm_command(
-    scenario: Annotated[str, typer.Argument(help="A library name (see `thermofleet list`) or a .toml file.")],
+    scenario: ScenarioArg,
     name: Annotated[str, typer.Argument(help="Arm of the scenario; with --source log any name.")],
     file: Annotated[Path | None, typer.Argument(help="--source log: a Gen3 log, a plain log, or a recording.")] = None,
-    source: Annotated[str, typer.Option(help="sim (the scenario's arm), or log FILE.")] = "sim",
-    difficulty: Annotated[str, typer.Option(help="Difficulty model: twin or blind.")] = "twin",
+    source: Annotated[Literal["sim", "log"], typer.Option(help="sim (the scenario's arm), or log FILE.")] = "sim",
+    difficulty: ModelOption = "twin",
     speed: Annotated[
-        float | None, typer.Option(help="Fleet seconds per real second. Default: the auctioneer's, else 1.")
+        float | None, number("Fleet seconds per real second. Default: the auctioneer's, else 1.", above=True)
     ] = None,
-    rate_hz: Annotated[float, typer.Option(help="State messages per real second.")] = STATE_HZ,
-    capacity: Annotated[int, typer.Option(help="Maximum concurrent jobs.")] = 1,
-    journal: Annotated[
-        Path | None, typer.Option(help="Folder of its journal; an existing journal is continued.")
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Random seed of the sensor noise, and with --policy of the jobs.")] = 0,
+    rate_hz: RateOption = STATE_HZ,
+    capacity: Annotated[int, number("Maximum concurrent jobs.", 1, 256)] = 1,
+    journal: JournalOption = None,
+    seed: SeedOption = 0,
     policy: Annotated[
         str,
         typer.Option(
@@ -64,26 +84,20 @@ def arm_command(
             "FILE.py:CLASS, or a folder of train. Default: an auctioneer awards them."
         ),
     ] = "",
-    jobs: Annotated[
-        str, typer.Option(help="With --policy: scenario (its own job stream, the same in every arm), or none.")
-    ] = "scenario",
+    jobs: JobsOption = "scenario",
     endpoint: EndpointOption = ENDPOINT,
-    fleet: Annotated[str, typer.Option(help="Name of the fleet. Default: the scenario's name.")] = "",
+    fleet: ScenarioFleetOption = "",
 ) -> None:
     """Run one arm of a fleet: publish its state, quote and execute jobs, and report, until Ctrl-C or SIGTERM."""
-    from fleet.bus.client.client import BusClient
-    from fleet.live.arm.journal_records import ArmRecord
-    from fleet.live.journal import Journal
     from scenarios.cli.live import consensus
-    from scenarios.cli.signals import until_stopped
-    from scenarios.cli.terminal import progress_bar
 
     chosen = load(scenario)
-    _check(source, difficulty, file, speed, rate_hz, capacity, seed)
-    _check_policy(policy, jobs, file)
-    fleet = fleet or chosen.name
-    folder = journal or Path("runs") / f"live-{fleet}"
-    consensus.refuse_other_way(folder, (name,), alone=bool(policy))
+    if (source == "log") != (file is not None):
+        given = f"{source} {file or ''}".strip()
+        raise FleetError(f"--source must be sim, or log with a FILE after the arm's name (got {given}).")
+    _check_policy(policy, file)
+    fleet, folder = folder_of(journal, fleet, chosen)
+    refuse_other_way(folder, (name,), alone=bool(policy))
     with progress_bar() as progress:
         arm = replayed_arm(name, file) if file else simulated_arm(chosen, name, difficulty, seed, progress)
     with (
@@ -97,17 +111,27 @@ def arm_command(
         if policy:
             consensus.refuse_auctioneer(link)
             membership = consensus.membership_of(chosen, name, policy, jobs=jobs, seed=seed)
-            work_source = resources.enter_context(consensus.seat(folder / f"{name}.grants", membership))
+            work_source = resources.enter_context(consensus.work_source(folder / f"{name}.grants", membership))
         node = make_node(
             link, book, arm, chosen, speed=speed, rate_hz=rate_hz, capacity=capacity, work_source=work_source
         )
         typer.echo(f"ready {name} {endpoint} {os.getpid()}")
+        if policy and consensus.serve_until_done(node, stop):
+            return
         while not stop.is_set():
-            if policy and consensus.work(node, stop):
-                return
             node.serve(time.monotonic() + TURN_S)
         node.retire(time.monotonic() + RETIRE_S)
         stop.leave(f"Interrupted; the journal is {book.path}, and the same command continues.")
+
+
+def _check_policy(policy: str, file: Path | None) -> None:
+    if policy and scope_of(policy) == "central":
+        raise FleetError(
+            f"'{policy}' needs an auctioneer: start it with thermofleet auction --policy {policy}, and leave --policy "
+            "out for the arms."
+        )
+    if policy and file is not None:
+        raise FleetError("An arm that replays a log takes no jobs: leave --policy out.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,10 +139,10 @@ class PreparedArm:
     """An arm before it joins the bus."""
 
     name: str
-    model: "DifficultyModel"
+    model: DifficultyModel
     plan: Callable[[Work], tuple[Plan, ...]]
     """Variants of a work; raises InfeasibleJob."""
-    body: "Callable[[float, float], Body]"
+    body: Callable[[float, float], Body]
     """Makes its body, from the fleet time and the length of its steps, s."""
     works: tuple[Work, ...] = ()
     """Works that are planned already."""
@@ -126,34 +150,33 @@ class PreparedArm:
 
 
 def simulated_arm(
-    scenario: Scenario, name: str, difficulty: str, seed: int, progress: "Progress", cache: Path | None = None
+    scenario: Scenario,
+    name: str,
+    difficulty: Literal["twin", "blind"],
+    seed: int,
+    progress: Progress,
+    cache: Path | None = None,
 ) -> PreparedArm:
     """Prepare the scenario's arm: its body, plans and twin are those of the same arm in `thermofleet run`.
 
     Raises:
         FleetError: the scenario has no such arm.
     """
-    import numpy as np
-
-    from fleet.files import cache_folder
-    from fleet.live.arm.simulated_body import SimulatedBody
     from scenarios.prepare.fleet import air_offsets, prepare_arm
     from scenarios.prepare.planned_arm import planner_of
 
-    model = cast(Literal["twin", "blind"], difficulty)
-    arm = prepare_arm(scenario, name, difficulty=model, cache=cache, progress=progress)
+    arm = prepare_arm(scenario, name, difficulty=difficulty, cache=cache, progress=progress)
     index = scenario.index_of(name)
     ambient_c, offset_k = ambient_of(scenario), float(air_offsets(scenario)[index])
-    planners: list[CachedPlanner] = []
+
+    @lru_cache
+    def planner() -> "CachedPlanner":  # made for the first unplanned work only: it loads the physics
+        return planner_of(arm.robot, scenario, cache or cache_folder())
 
     def plan(work: Work) -> tuple[Plan, ...]:
-        if work in arm.plans:
-            return arm.plans[work]
-        if not planners:
-            planners.append(planner_of(arm.robot, scenario, cache or cache_folder()))
-        return planners[0].plan(work)
+        return arm.plans[work] if work in arm.plans else planner().plan(work)
 
-    def body(time_s: float, dt_s: float) -> "Body":
+    def body(time_s: float, dt_s: float) -> Body:
         return SimulatedBody(
             arm,
             scenario.limits,
@@ -169,12 +192,7 @@ def simulated_arm(
 
 
 def ambient_of(scenario: Scenario) -> Callable[[float], float]:
-    """Ambient temperature of the cell by fleet time, °C; a constant one is not interpolated at every call."""
-    import numpy as np
-
-    if len({temp_c for _, temp_c in scenario.ambient.points}) == 1:
-        constant_c = float(scenario.ambient.points[0][1])
-        return lambda at_s: constant_c
+    """Ambient temperature of the cell by fleet time, °C."""
     return lambda at_s: float(scenario.ambient.at(np.array(at_s)))
 
 
@@ -185,9 +203,6 @@ def replayed_arm(name: str, file: Path) -> PreparedArm:
         LogError: the file cannot be read, or has no temperatures.
         FleetError: the file holds several arms, and none of this name.
     """
-    from fleet.difficulty import Blind
-    from fleet.errors import LogError
-    from fleet.live.arm.replay_body import ReplayBody, SensorLog
     from twin.logs.reader import read
 
     recordings = {each.name.rpartition("/")[2]: each for each in read(file, damaged="skip")}
@@ -197,12 +212,7 @@ def replayed_arm(name: str, file: Path) -> PreparedArm:
     if recording.temp_c is None:
         raise LogError(str(file), None, "has no motor temperatures; a live arm needs them.")
     sensors = SensorLog(
-        time_s=recording.time_s,
-        temp_c=recording.temp_c,
-        q=recording.q,
-        qd=recording.qd,
-        tau=recording.tau,
-        current_a=recording.current_a,
+        recording.time_s, recording.temp_c, recording.q, recording.qd, recording.tau, recording.current_a
     )
 
     def refuse(work: Work) -> tuple[Plan, ...]:
@@ -212,59 +222,42 @@ def replayed_arm(name: str, file: Path) -> PreparedArm:
     return PreparedArm(name=name, model=model, plan=refuse, body=body, takes_jobs=False)
 
 
-def wait_for_name(link: "BusClient", name: str, *, patience_s: float = TOKEN_S) -> None:
+def wait_for_name(link: BusClient, name: str, *, patience_s: float = TOKEN_S) -> None:
     """Wait until no arm of that name is present; two of one name would publish and work as one.
 
     Raises:
         BusError: one is still present.
     """
-    from fleet.bus.protocol import keys
-
-    gone = threading.Event()
-
-    def update(_: str, present: bool) -> None:
-        (gone.clear if present else gone.set)()
-
-    key = keys.of_arm(link.fleet, name, "alive")
-    if not link.tokens(key, timeout_s=patience_s):
-        return
-    link.watch_tokens(key, update)
     deadline_s = time.monotonic() + patience_s
-    while not gone.is_set() and time.monotonic() < deadline_s:
-        link.serve(deadline_s)
-    if not gone.is_set():
+    while link.tokens(keys.of_arm(link.fleet, name, "alive"), timeout_s=patience_s):
+        if time.monotonic() < deadline_s:
+            time.sleep(POLL_S)
+            continue
         raise BusError(
             f"Arm '{name}' of fleet '{link.fleet}' is already running. Stop it first, or give this one another name."
         )
 
 
 def make_node(
-    link: "BusClient",
-    book: "Journal[ArmRecord]",
+    link: BusClient,
+    book: Journal[ArmRecord],
     arm: PreparedArm,
     scenario: Scenario,
     *,
     speed: float | None = None,
     rate_hz: float = STATE_HZ,
     capacity: int = 1,
-    nonce: str | None = None,
-    work_source: "Callable[[LiveArm, int], WorkSource] | None" = None,
-) -> "ArmNode":
+    work_source: Callable[[ArmNode, int], WorkSource] | None = None,
+) -> ArmNode:
     """Join the bus with an arm and the history of its journal; link and journal are open.
 
     Args:
-        nonce: Different at every start; random by default.
         work_source: Makes its work source, from the arm and the boot number; by default auctioneers.
     """
-    from fleet.live.arm.auctioneer_client import AuctioneerClient
-    from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
-    from fleet.live.arm.estimator import Estimator, NominalPeaks
-    from fleet.live.arm.node import ArmConfig, ArmNode
-
     clock = fleet_clock(link, speed)
     history = restart_history(book, arm.name, clock.now_s(time.monotonic()))
     config = ExecutorConfig(capacity=capacity)
-    executor = AwardExecutor(arm.name, book.append, history, nonce=nonce or secrets.token_hex(4), config=config)
+    executor = AwardExecutor(arm.name, book.append, history, nonce=secrets.token_hex(4), config=config)
     estimator = Estimator(arm.model, arm.plan, {place.name: place for place in scenario.places}, NominalPeaks())
     estimator.plan_ahead(arm.works)
     arm_config = ArmConfig(
@@ -279,10 +272,8 @@ def make_node(
     return ArmNode(link, body, executor, estimator, clock, arm_config, source)
 
 
-def restart_history(book: "Journal[ArmRecord]", name: str, time_s: float) -> "ArmHistory":
+def restart_history(book: Journal[ArmRecord], name: str, time_s: float) -> ArmHistory:
     """History of the arm at this start, written to its journal."""
-    from fleet.live.arm.journal_records import ArmHistory
-
     before = ArmHistory().replay(book.records())
     for active in before.active.values():
         log.warning("'%s' was not finished when the arm went down; it is returned.", active.job)
@@ -291,12 +282,8 @@ def restart_history(book: "Journal[ArmRecord]", name: str, time_s: float) -> "Ar
     return history
 
 
-def fleet_clock(link: "BusClient", speed: float | None) -> "FleetClock":
+def fleet_clock(link: BusClient, speed: float | None) -> FleetClock:
     """Fleet time, from the auctioneer if there is one."""
-    from fleet.bus.protocol import keys
-    from fleet.bus.protocol.auction import Clock, ClockRequest
-    from fleet.live.clock import FleetClock
-
     asked_s = time.monotonic()
     answers = link.query_and_wait(keys.of_clock(link.fleet), ClockRequest(), Clock, timeout_s=CLOCK_S)
     answered_s = time.monotonic()
@@ -305,35 +292,3 @@ def fleet_clock(link: "BusClient", speed: float | None) -> "FleetClock":
             log.warning("The fleet's speed is %g, not %g.", reply.speed, speed)
         return FleetClock(reply.speed).set_to(asked_s, answered_s, reply.time_s)
     return FleetClock(speed or 1.0, answered_s)
-
-
-def _check(
-    source: str, difficulty: str, file: Path | None, speed: float | None, rate_hz: float, capacity: int, seed: int
-) -> None:
-    if source not in ("sim", "log") or (source == "log") != (file is not None):
-        given = f"{source} {file or ''}".strip()
-        raise FleetError(f"--source must be sim, or log with a FILE after the arm's name (got {given}).")
-    if difficulty not in ("twin", "blind"):
-        raise FleetError(f"--difficulty must be twin or blind (got {difficulty}).")
-    if speed is not None and not 0 < speed < float("inf"):
-        raise FleetError(f"--speed must be > 0 (got {speed:g}).")
-    if not 0 < rate_hz <= 100:
-        raise FleetError(f"--rate-hz must be > 0 and at most 100 (got {rate_hz:g}).")
-    if not 1 <= capacity <= 256:
-        raise FleetError(f"--capacity must be 1 to 256 (got {capacity}).")
-    if seed < 0:
-        raise FleetError(f"--seed must be 0 or more (got {seed}).")
-
-
-def _check_policy(policy: str, jobs: str, file: Path | None) -> None:
-    from scenarios.policy_loader import scope_of
-
-    if policy and scope_of(policy) == "central":
-        raise FleetError(
-            f"'{policy}' needs an auctioneer: start it with thermofleet auction --policy {policy}, and leave --policy "
-            "out for the arms."
-        )
-    if policy and file is not None:
-        raise FleetError("An arm that replays a log takes no jobs: leave --policy out.")
-    if jobs not in ("scenario", "none"):
-        raise FleetError(f"--jobs must be scenario or none (got {jobs}).")

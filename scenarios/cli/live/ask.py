@@ -1,20 +1,19 @@
 """`thermofleet ask`: request quotes of all arms without submitting anything."""
 
-from typing import TYPE_CHECKING, Annotated
+from collections.abc import Mapping, Sequence
+from typing import Annotated
 
 import msgspec
 import typer
 from rich.table import Table
 
+from fleet.bus.client.client import BusClient
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import MOST_JOBS, JobEstimate, JobSpec, Quote, QuoteRequest
 from fleet.errors import BusError, FleetError
 from scenarios.cli.live.submit import JOBS_HELP, explain, read_jobs
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
 from scenarios.cli.terminal import out_console, say
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from fleet.bus.protocol.auction import JobEstimate, JobSpec, Quote
 
 REPLY_S = 5.0
 """Real seconds to wait for arms: planning a new motion takes a while."""
@@ -38,10 +37,6 @@ def ask_command(
     The duration of a job includes the ways to its place and home. It is finished after its last cycle, once the arm's
     present jobs are done.
     """
-    from fleet.bus.client.client import BusClient
-    from fleet.bus.protocol import keys
-    from fleet.bus.protocol.auction import MOST_JOBS, Quote, QuoteRequest
-
     if bool(file) == bool(kind):
         raise FleetError("Give either a FILE of jobs or one job by --kind and --place.")
     jobs = read_jobs(file) if file else [one_job(kind, place or [], payload, repetitions, dwell, force)]
@@ -63,15 +58,13 @@ def ask_command(
 
 
 def one_job(
-    kind: str, places: "Sequence[str]", payload_kg: float, repetitions: int, dwell_s: float, force_n: float
-) -> "JobSpec":
+    kind: str, places: Sequence[str], payload_kg: float, repetitions: int, dwell_s: float, force_n: float
+) -> JobSpec:
     """Make the job that the options describe.
 
     Raises:
         FleetError: there is no such job.
     """
-    from fleet.bus.protocol.auction import JobSpec
-
     fields = {
         "name": kind,
         "kind": kind,
@@ -87,7 +80,7 @@ def one_job(
         raise FleetError(f"No such job: {explain(error)}") from error
 
 
-def quote_table(jobs: "Sequence[JobSpec]", quotes: "Mapping[str, Quote]") -> Table:
+def quote_table(jobs: Sequence[JobSpec], quotes: Mapping[str, Quote]) -> Table:
     """All estimates: jobs in the given order, and under each job the arms."""
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("job")
@@ -103,7 +96,7 @@ def quote_table(jobs: "Sequence[JobSpec]", quotes: "Mapping[str, Quote]") -> Tab
     return table
 
 
-def cells(estimate: "JobEstimate | None") -> list[str]:
+def cells(estimate: JobEstimate | None) -> list[str]:
     """Cells of an estimate; a dash for what the arm does not know."""
     if estimate is None:
         return ["–"] * 5 + ["no reply"]

@@ -1,46 +1,39 @@
-"""An arm that shares the jobs out with its peers, as `thermofleet arm --policy consensus` runs it."""
+"""An arm that allocates jobs with its peers, without an auctioneer: `thermofleet arm --policy consensus`."""
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import typer
 
-from fleet.errors import BusError, FleetError
+from fleet.bus.client.client import BusClient
+from fleet.bus.protocol import keys
+from fleet.errors import BusError
+from fleet.live.arm.node import ArmNode
+from fleet.live.consensus.granter import GrantRecord
+from fleet.live.consensus.node import ConsensusNode
+from fleet.live.consensus.participant import Membership
+from fleet.live.journal import Journal
+from scenarios.cli.live.auction import own_jobs, summary
+from scenarios.cli.signals import Stop
 from scenarios.live.allocation import live_fleet
 from scenarios.policy_loader import arm_policy_of
 from scenarios.schema import Scenario
 
-if TYPE_CHECKING:
-    from fleet.bus.client.client import BusClient
-    from fleet.live.arm.node import ArmNode
-    from fleet.live.consensus.node import ConsensusNode, Membership
-    from scenarios.cli.signals import Stop
-
 TURN_S = 0.25
-"""Real seconds between two looks at what else is to be done."""
+"""Real seconds between two checks whether all jobs are settled."""
 FAREWELL_S = 2.0
-"""Real seconds for the last words: peers that do not know yet that all is done ask for it."""
+"""Real seconds to serve after that: peers that do not know it yet request the missing outcomes."""
 
 
-def membership_of(scenario: Scenario, name: str, policy: str, *, jobs: str, seed: int) -> "Membership":
-    """What an arm of a scenario needs to share out jobs with its peers.
-
-    Args:
-        name: Of the arm.
-        policy: Of scope `arm`.
-        jobs: scenario or none.
-        seed: Of the scenario's jobs and the policy.
+def membership_of(scenario: Scenario, name: str, policy: str, *, jobs: str, seed: int) -> Membership:
+    """How the arm `name` of a scenario takes part in the consensus of its fleet, by a policy of scope `arm`.
 
     Raises:
         FleetError: the scenario has no such arm, or there is no such policy.
     """
-    from fleet.live.consensus.node import Membership
-    from scenarios.cli.live.auction import own_jobs
-
     place = scenario.index_of(name)
     chosen = arm_policy_of(policy)
     chosen.reset(np.random.default_rng(np.random.SeedSequence([seed, 1, place])))
@@ -55,96 +48,39 @@ def membership_of(scenario: Scenario, name: str, policy: str, *, jobs: str, seed
     )
 
 
-def refuse_auctioneer(link: "BusClient") -> None:
-    """Two ways to share the same jobs out would have them done twice.
+def refuse_auctioneer(link: BusClient) -> None:
+    """Check that the fleet has no auctioneer: it would award jobs that the arms allocate too.
 
     Raises:
-        BusError: the fleet has an auctioneer.
+        BusError: the fleet has one.
     """
-    from fleet.bus.protocol import keys
-
-    if there := link.tokens(keys.of_every_auction(link.fleet, "alive"), timeout_s=2.0):
-        names = ", ".join(sorted(there))
+    if present := link.tokens(keys.of_every_auction(link.fleet, "alive"), timeout_s=2.0):
+        names = ", ".join(sorted(present))
         raise BusError(f"Fleet '{link.fleet}' has an auctioneer: '{names}'. Stop it first, or leave --policy out.")
 
 
-def refuse_other_way(folder: Path, arms: Iterable[str], *, alone: bool) -> None:
-    """A shift that was begun in one way does not go on in the other, which would not know what is done.
-
-    Args:
-        folder: Of the journals.
-        arms: Whose journals are looked at.
-        alone: Whether they are to share the jobs out themselves.
-
-    Raises:
-        FleetError: a journal is of the other way.
-    """
-    for arm in arms:
-        grants, journal = folder / f"{arm}.grants", folder / f"{arm}.journal"
-        if alone and not grants.exists() and journal.exists() and journal.stat().st_size:
-            raise FleetError(
-                f"{journal} has no {grants.name} beside it: it is of a shift with an auctioneer, or the grants are "
-                "lost, and jobs would be done twice. Take the --policy that it was begun with, or another folder for a "
-                "new shift."
-            )
-        if not alone and grants.exists() and grants.stat().st_size:
-            raise FleetError(
-                f"{grants} is of a shift in which the arms shared the jobs out themselves, and jobs would be done "
-                "twice. Take the --policy that it was begun with, or another folder for a new shift."
-            )
-
-
 @contextmanager
-def seat(path: Path, membership: "Membership") -> Iterator[Any]:
-    """What gives an arm its seat among its peers, with the journal of its grants at `path` held open.
+def work_source(path: Path, membership: Membership) -> Iterator[Callable[[ArmNode, int], ConsensusNode]]:
+    """Factory of an arm's work source, from the arm and its boot number; the journal of its grants is open meanwhile.
 
     Raises:
         FleetError: the journal cannot be used.
     """
-    from fleet.live.consensus.granter import GrantRecord
-    from fleet.live.consensus.node import ConsensusNode
-    from fleet.live.journal import Journal
-
     with Journal[GrantRecord](path, GrantRecord) as book:
-
-        def take_seat(worker: "ArmNode", life: int) -> "ConsensusNode":
-            return ConsensusNode(worker, membership, book, boot=life)
-
-        yield take_seat
+        yield lambda arm, boot: ConsensusNode(arm, membership, book, boot=boot)
 
 
-def work(node: "ArmNode", stop: "Stop") -> bool:
-    """Live until all is done, and tell how it stands, or until told to stop; says which it was."""
-    from fleet.live.consensus.node import ConsensusNode
-
-    orders = node.work_source
-    assert isinstance(orders, ConsensusNode)
-    while not stop.is_set() and not orders.over:
+def serve_until_done(node: ArmNode, stop: Stop) -> bool:
+    """Serve until all jobs are settled, and print a summary; return False if stopped before that."""
+    source = node.work_source
+    assert isinstance(source, ConsensusNode)
+    while not stop.is_set() and not source.over:
         node.serve(time.monotonic() + TURN_S)
-    done = not stop.is_set()
-    if done:
-        typer.echo(told(node))
+    if stop.is_set():
+        return False
+    typer.echo(summary(source.statuses(), node.clock.now_s(time.monotonic())))
+    typer.echo(f"This is the view of one arm, after {source.participant.rounds} rounds of allocation.")
     until_s = time.monotonic() + FAREWELL_S
-    while done and not stop.is_set() and time.monotonic() < until_s:
+    while not stop.is_set() and time.monotonic() < until_s:
         node.serve(min(until_s, time.monotonic() + TURN_S))
-    return done
-
-
-def told(node: "ArmNode") -> str:
-    """How it stands, in a line or more."""
-    from fleet.live.consensus.node import ConsensusNode
-
-    orders = node.work_source
-    assert isinstance(orders, ConsensusNode)
-    statuses = orders.statuses()
-    finished = sum(said.state == "finished" for said in statuses)
-    lines = [
-        f"{node.clock.now_s(time.monotonic()):.0f} s: {finished} of {len(statuses)} jobs finished, as this arm knows; "
-        f"it worked out {orders.participant.rounds} times who gets what."
-    ]
-    lines += [
-        f"  {said.job}: {said.state}{f' at {said.arm}' if said.arm else ''}{f', {said.reason}' if said.reason else ''}"
-        for said in statuses
-        if said.state != "finished"
-    ]
-    return "\n".join(lines)
+    return True

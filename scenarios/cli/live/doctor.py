@@ -4,22 +4,26 @@ import re
 import socket
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import msgspec
 import typer
 
-from fleet.errors import BusError, FleetError
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.discover import fleets_at
+from fleet.bus.client.replies import Replies
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import Clock, ClockRequest
+from fleet.bus.security.tls import identified, why_not
+from fleet.errors import BusError
+from fleet.live.monitor.health import ClockProbe, HealthReport, check_health
+from fleet.live.monitor.listener import FleetListener
+from fleet.live.monitor.snapshot import FleetSnapshot
+from scenarios.cli.live.options import number
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption
 from scenarios.cli.terminal import out_console, say
+from scenarios.live.dashboard import arm_table, format_time, jobs_line
 from scenarios.load import load
-
-if TYPE_CHECKING:
-    from fleet.bus.client.client import BusClient
-    from fleet.bus.client.replies import Replies
-    from fleet.bus.protocol.auction import Clock
-    from fleet.live.monitor.health import HealthReport
-    from fleet.live.monitor.snapshot import FleetSnapshot
 
 UNHEALTHY = 1
 """Exit code; 0 is a healthy fleet, and 2, as for every error of use, one that cannot be reached."""
@@ -30,19 +34,14 @@ _COLORS = {"fault": "red", "warning": "yellow"}
 def doctor_command(
     endpoint: EndpointOption = ENDPOINT,
     fleet: FleetOption = "",
-    seconds: Annotated[float, typer.Option(help="Real seconds to listen.")] = 3.0,
+    seconds: Annotated[float, number("Real seconds to listen.", high=600, above=True)] = 3.0,
     auctioneer: Annotated[bool, typer.Option(help="Whether the fleet should have an auctioneer.")] = True,
     scenario: Annotated[
-        str,
-        typer.Option(help="Expect every arm of this scenario. Default: only arms that are heard."),
+        str, typer.Option(help="Expect every arm of this scenario. Default: only arms that publish anything.")
     ] = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
     """Check the health of a fleet: exit code 0 healthy, 1 unhealthy, 2 unreachable."""
-    from fleet.bus.client.discover import fleets_at
-
-    if not 0 < seconds <= 600:
-        raise FleetError(f"--seconds must be more than 0 and at most 600 (got {seconds:g}).")
     expected = tuple(arm.name for arm in load(scenario).arms) if scenario else ()
     try:
         fleets = fleets_at(endpoint)
@@ -66,7 +65,7 @@ def doctor_command(
 
 def examine(
     endpoint: str, fleet: str, seconds: float, *, auctioneer: bool = True, expected: tuple[str, ...] = ()
-) -> "tuple[FleetSnapshot, HealthReport]":
+) -> tuple[FleetSnapshot, HealthReport]:
     """Listen to a fleet for some real seconds; return its last snapshot and its health.
 
     Args:
@@ -76,19 +75,12 @@ def examine(
     Raises:
         BusError: no router answered.
     """
-    from fleet.bus.client.client import BusClient
-    from fleet.bus.protocol import keys
-    from fleet.bus.protocol.auction import Clock, ClockRequest
-    from fleet.bus.security.tls import identified
-    from fleet.live.monitor.health import ClockProbe, check_health
-    from fleet.live.monitor.listener import FleetListener
-
     probes: list[ClockProbe] = []
 
-    def probe_clock(link: "BusClient") -> None:
+    def probe_clock(link: BusClient) -> None:
         asked_s = time.monotonic()
 
-        def done(answers: "Replies[Clock]") -> None:
+        def done(answers: Replies[Clock]) -> None:
             reply = next(iter(answers.messages.values()), None)
             probe = ClockProbe(asked_s, asked_s + answers.took_s)
             probes.append(replace(probe, time_s=reply.time_s, speed=reply.speed) if reply else probe)
@@ -109,10 +101,8 @@ def examine(
     return snapshot, report
 
 
-def show(endpoint: str, fleet: "FleetSnapshot", report: "HealthReport") -> None:
+def show(endpoint: str, fleet: FleetSnapshot, report: HealthReport) -> None:
     """Print the report on the terminal."""
-    from scenarios.live.dashboard import arm_table, format_time, jobs_line
-
     trip = "no answer" if report.round_trip_s is None else f"{1000 * report.round_trip_s:.1f} ms"
     out_console.print(f"router      {endpoint}, round trip {trip}", highlight=False)
     fleet_time = "unknown" if report.time_s is None else format_time(report.time_s)
@@ -137,7 +127,6 @@ def why_unreachable(endpoint: str) -> str:
     match = re.fullmatch(r"tcp/\[?([^\]/]+?)\]?:(\d{1,5})", endpoint)
     if match is None or int(match[2]) > 65535:
         return ""
-    from fleet.bus.security.tls import why_not
 
     host, port = match[1], int(match[2])
     try:

@@ -8,19 +8,19 @@ import signal
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
+import uvicorn
+from starlette.applications import Starlette
 
+from fleet.bus.client.client import BusClient
 from fleet.errors import FleetError
+from fleet.live.monitor.async_bridge import AsyncBridge
+from scenarios.cli.live.options import number
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
 from scenarios.cli.terminal import Interrupted
-
-if TYPE_CHECKING:
-    import uvicorn
-    from starlette.applications import Starlette
-
-    from scenarios.live.http_app import Readers
+from scenarios.live.http_app import STUCK_S, Readers, application
 
 TOKEN = "THERMOFLEET_TOKEN"
 MIN_TOKEN = 16
@@ -30,36 +30,25 @@ _LOG = logging.getLogger(__name__)
 def gateway_command(
     endpoint: EndpointOption = ENDPOINT,
     fleet: FleetOption = "",
-    port: Annotated[int, typer.Option(help="TCP port of the gateway; 0 takes a free one.")] = 8080,
+    port: Annotated[int, number("TCP port of the gateway; 0 takes a free one.", 0, 65535)] = 8080,
     host: Annotated[str, typer.Option(help="Listening address; beyond loopback only with a token.")] = "127.0.0.1",
     token: Annotated[
         str,
-        typer.Option(
-            envvar=TOKEN,
-            help="Token that requests must show; on the command line, other users see it.",
-        ),
+        typer.Option(envvar=TOKEN, help="Token that requests must show; on the command line, other users see it."),
     ] = "",
 ) -> None:
     """Serve the fleet over HTTP until Ctrl-C or SIGTERM."""
-    try:
-        import starlette
-        import uvicorn
-    except ImportError as error:
-        raise FleetError(f"The gateway needs the extra: pip install 'thermofleet[gateway]' ({error.name}).") from error
-    del starlette, uvicorn
-    check(host, port, token)
+    check(host, token)
     if asyncio.run(serve(endpoint, the_fleet(fleet, endpoint), host, port, token)) == signal.SIGINT:
         raise Interrupted("The gateway was interrupted.")
 
 
-def check(host: str, port: int, token: str) -> None:
+def check(host: str, token: str) -> None:
     """Refuse an address that others can reach without a token.
 
     Raises:
         FleetError: an option is wrong or missing.
     """
-    if not 0 <= port <= 65535:
-        raise FleetError(f"--port must be 0 to 65535 (got {port}).")
     if token and (len(token) < MIN_TOKEN or not token.isascii() or not token.isprintable()):
         raise FleetError(f"A token needs {MIN_TOKEN} or more printable ASCII characters (got {len(token)}).")
     try:
@@ -95,21 +84,11 @@ def listen(host: str, port: int, stuck_s: float) -> socket.socket:
     return bound
 
 
-def server_of(app: "Starlette", readers: "Readers") -> "uvicorn.Server":
+class Server(uvicorn.Server):
     """Server that leaves signals to its caller, and ends the event streams when it stops."""
-    import uvicorn
 
-    class Server(uvicorn.Server):
-        @contextmanager
-        def capture_signals(self) -> Iterator[None]:
-            yield  # uvicorn would raise SIGTERM again when it stops
-
-        async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-            readers.close()  # streams have no end of their own
-            await super().shutdown(sockets)
-
-    return Server(
-        uvicorn.Config(
+    def __init__(self, app: Starlette, readers: Readers) -> None:
+        config = uvicorn.Config(
             app,
             log_config=None,
             access_log=False,
@@ -119,19 +98,26 @@ def server_of(app: "Starlette", readers: "Readers") -> "uvicorn.Server":
             timeout_keep_alive=5,
             timeout_graceful_shutdown=2,
         )
-    )
+        super().__init__(config)
+        self._readers = readers
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Do nothing: uvicorn would raise SIGTERM again when it stops."""
+        yield
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End the event streams, which have no end of their own, and shut down."""
+        self._readers.close()
+        await super().shutdown(sockets)
 
 
 async def serve(endpoint: str, fleet: str, host: str, port: int, token: str) -> int:
     """Serve until a signal arrives; return its number."""
-    from fleet.bus.client.client import BusClient
-    from fleet.live.monitor.async_bridge import AsyncBridge
-    from scenarios.live.http_app import STUCK_S, Readers, application
-
     readers, received = Readers(), [0]
     with listen(host, port, STUCK_S) as bound, BusClient(endpoint, fleet) as link:
         async with AsyncBridge(link, readers.put) as bridge:
-            server = server_of(application(bridge, readers, token=token), readers)
+            server = Server(application(bridge, readers, token=token), readers)
 
             def stop(number: int) -> None:
                 received[0], server.should_exit = number, True

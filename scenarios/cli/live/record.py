@@ -6,17 +6,21 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from fleet.bus.client.client import BusClient
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import ArmEvent, Result
+from fleet.bus.protocol.messages import State
 from fleet.errors import FleetError
+from scenarios.cli.live.options import number
 from scenarios.cli.options import ENDPOINT, EndpointOption
+from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import out_console, say
-
-if TYPE_CHECKING:
-    from fleet.bus.client.client import BusClient
-    from scenarios.live.recorder import Recorder
+from scenarios.live.recorder import Recorder
+from scenarios.live.replayer import Replay
 
 BACKLOG = 200_000
 """Messages that may wait: joining a fleet of a hundred arms brings a hundred thousand at once."""
@@ -24,13 +28,8 @@ TURN_S = 0.5
 """Real seconds between two checks whether to stop."""
 
 
-def record(link: "BusClient", folder: Path, *, rotate_s: float, stopped: Callable[[], bool]) -> "Recorder":
+def record(link: BusClient, folder: Path, *, rotate_s: float, stopped: Callable[[], bool]) -> Recorder:
     """Record until stopped; return the recorder, everything written."""
-    from fleet.bus.protocol import keys
-    from fleet.bus.protocol.auction import ArmEvent, Result
-    from fleet.bus.protocol.messages import State
-    from scenarios.live.recorder import Recorder
-
     with lock_folder(folder):
         recorder = Recorder.open(folder, link.fleet)
         link.subscribe(keys.of_every_arm(link.fleet, "state"), State, recorder.add, history=True)
@@ -72,14 +71,9 @@ def record_command(
     fleet: Annotated[str, typer.Argument(help="Name of the fleet, by default that of its scenario.")],
     out: Annotated[Path, typer.Option(help="Folder of the recording; an interrupted one is continued.")],
     endpoint: EndpointOption = ENDPOINT,
-    rotate: Annotated[float, typer.Option(help="Real seconds between two parts.")] = 60.0,
+    rotate: Annotated[float, number("Real seconds between two parts.", above=True)] = 60.0,
 ) -> None:
     """Record what arms and auctioneer publish, as Parquet parts that are readable at once."""
-    from fleet.bus.client.client import BusClient
-    from scenarios.cli.signals import until_stopped
-
-    if not rotate > 0:
-        raise FleetError(f"--rotate must be > 0 s (got {rotate:g}).")
     with until_stopped() as stop, BusClient(endpoint, fleet, backlog=BACKLOG) as link:
         typer.echo(f"ready record {endpoint}")
         recorder = record(link, out, rotate_s=rotate, stopped=stop.is_set)
@@ -93,15 +87,9 @@ def replay_command(
     path: Annotated[Path, typer.Argument(help="Folder of a run or of a recording.")],
     endpoint: EndpointOption = ENDPOINT,
     fleet: Annotated[str | None, typer.Option(help="Name of the fleet. Default: that of the recording.")] = None,
-    speed: Annotated[float, typer.Option(help="Recorded seconds per real second.")] = 1.0,
+    speed: Annotated[float, number("Recorded seconds per real second.", above=True)] = 1.0,
 ) -> None:
     """Publish a run or a recording on the bus again, at its own pace."""
-    from fleet.bus.client.client import BusClient
-    from scenarios.cli.signals import until_stopped
-    from scenarios.live.replayer import Replay
-
-    if not speed > 0:
-        raise FleetError(f"--speed must be > 0 (got {speed:g}).")
     replay = Replay.of(path)
     if not len(replay):
         raise FleetError(f"'{path}' holds no messages yet; parts are written every --rotate seconds and at the end.")

@@ -3,22 +3,22 @@
 import re
 import sys
 import time
+from collections.abc import Iterator, Sequence
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import Annotated, TypeVar
 
 import msgspec
 import typer
 
+from fleet.bus.client.client import BusClient
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import Admission, JobSpec, JobStatus, Status, StatusRequest, Submission, SubmissionReply
 from fleet.errors import BusError, FleetError, nearest
 from fleet.job import KINDS
+from fleet.live.monitor.snapshot import describe_status
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from fleet.bus.client.client import BusClient
-    from fleet.bus.protocol.auction import Admission, JobSpec, JobStatus
-    from scenarios.cli.signals import Stop
+from scenarios.cli.signals import Stop, until_stopped
 
 REPLY_S, ATTEMPTS = 5.0, 3
 """Real seconds to wait for a reply, and number of attempts: a job that is submitted twice is one job."""
@@ -44,9 +44,6 @@ def submit_command(
     fleet: FleetOption = "",
 ) -> None:
     """Submit jobs to the fleet's auctioneer; accepted jobs are on its disk."""
-    from fleet.bus.client.client import BusClient
-    from scenarios.cli.signals import until_stopped
-
     jobs = read_jobs(file)
     with until_stopped() as stop, BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
         admissions = [admission for batch in batches(jobs) for admission in submit(link, batch, by)]
@@ -59,14 +56,12 @@ def submit_command(
         raise typer.Exit(1)
 
 
-def read_jobs(file: str) -> "list[JobSpec]":
+def read_jobs(file: str) -> list[JobSpec]:
     """Read the jobs of a file, or of standard input for `-`.
 
     Raises:
         FleetError: names the line (or the place in the list) and what is wrong there.
     """
-    from fleet.bus.protocol.auction import JobSpec
-
     name = "standard input" if file == "-" else file
     try:
         raw = sys.stdin.buffer.read() if file == "-" else Path(file).read_bytes()
@@ -98,17 +93,15 @@ def explain(error: Exception) -> str:
     return f"{problem}{f' (at {path})' if path else ''}."
 
 
-def batches(jobs: "Sequence[JobSpec]") -> "Iterator[tuple[JobSpec, ...]]":
+def batches(jobs: Sequence[JobSpec]) -> Iterator[tuple[JobSpec, ...]]:
     """Split jobs into messages, each job after those that it waits for."""
     ordered = in_order(jobs)
     for start in range(0, len(ordered), JOBS_PER_MESSAGE):
         yield tuple(ordered[start : start + JOBS_PER_MESSAGE])
 
 
-def in_order(jobs: "Sequence[JobSpec]") -> "Sequence[JobSpec]":
+def in_order(jobs: Sequence[JobSpec]) -> Sequence[JobSpec]:
     """Sort jobs so that each comes after those that it waits for; leave them as they are if that is impossible."""
-    from graphlib import CycleError, TopologicalSorter
-
     try:
         order = list(TopologicalSorter({job.name: job.after for job in jobs}).static_order())
     except CycleError:
@@ -117,15 +110,12 @@ def in_order(jobs: "Sequence[JobSpec]") -> "Sequence[JobSpec]":
     return sorted(jobs, key=lambda job: place[job.name])
 
 
-def submit(link: "BusClient", jobs: "tuple[JobSpec, ...]", by: str) -> "tuple[Admission, ...]":
+def submit(link: BusClient, jobs: tuple[JobSpec, ...], by: str) -> tuple[Admission, ...]:
     """Submit jobs and return the auctioneer's decision on each.
 
     Raises:
         FleetError: it refused, or there is none.
     """
-    from fleet.bus.protocol import keys
-    from fleet.bus.protocol.auction import Submission, SubmissionReply
-
     key = keys.of_jobs(link.fleet, "submit")
     for _ in range(ATTEMPTS):
         answers = link.query_and_wait(key, Submission(jobs, by), SubmissionReply, timeout_s=REPLY_S)
@@ -139,14 +129,12 @@ def submit(link: "BusClient", jobs: "tuple[JobSpec, ...]", by: str) -> "tuple[Ad
     )
 
 
-def follow(link: "BusClient", names: "Sequence[str]", stop: "Stop") -> "list[str]":
+def follow(link: BusClient, names: Sequence[str], stop: Stop) -> list[str]:
     """Print every change until all jobs have ended, or until stopped; return the names of those not finished.
 
     Raises:
         BusError: the auctioneer is gone, and does not come back.
     """
-    from fleet.live.monitor.snapshot import describe_status
-
     states: dict[str, str] = {}
     heard_s = time.monotonic()
     while not stop.is_set():
@@ -163,11 +151,8 @@ def follow(link: "BusClient", names: "Sequence[str]", stop: "Stop") -> "list[str
     return [name for name in names if states.get(name) != "finished"]
 
 
-def request_status(link: "BusClient", names: "Sequence[str]") -> "list[JobStatus]":
+def request_status(link: BusClient, names: Sequence[str]) -> list[JobStatus]:
     """Request the status of jobs; empty without a reply."""
-    from fleet.bus.protocol import keys
-    from fleet.bus.protocol.auction import Status, StatusRequest
-
     key = keys.of_jobs(link.fleet, "status")
     statuses: list[JobStatus] = []
     for start in range(0, len(names), JOBS_PER_MESSAGE):

@@ -3,16 +3,20 @@
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import msgspec
 import typer
+from rich.live import Live
 
+from fleet.bus.client.client import BusClient
+from fleet.bus.protocol.auction import ArmEvent, Result
+from fleet.live.monitor.listener import FleetListener
+from fleet.live.monitor.snapshot import describe_event, describe_status
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
+from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import out_console
-
-if TYPE_CHECKING:
-    from fleet.live.monitor.listener import FleetListener
+from scenarios.live.dashboard import arm_line, format_time, jobs_line, screen
 
 FRAME_S, LINE_S, SNAPSHOT_S = 0.25, 5.0, 1.0
 """Real seconds: between two frames; between two lines about every arm; of listening for one snapshot."""
@@ -24,10 +28,6 @@ def watch_command(
     as_json: Annotated[bool, typer.Option("--json", help="Print one snapshot as JSON.")] = False,
 ) -> None:
     """Watch a fleet until Ctrl-C: temperatures, difficulty, jobs, and the age of every message."""
-    from fleet.bus.client.client import BusClient
-    from fleet.live.monitor.listener import FleetListener
-    from scenarios.cli.signals import until_stopped
-
     news: deque[str] = deque(maxlen=100)
 
     def on_message(_: str, name: str, message: msgspec.Struct) -> None:
@@ -49,12 +49,8 @@ def watch_command(
         stop.leave("Stopped watching.")
 
 
-def draw(listener: "FleetListener", news: "deque[str]", stopped: Callable[[], bool]) -> None:
+def draw(listener: FleetListener, news: deque[str], stopped: Callable[[], bool]) -> None:
     """Draw a screen that fills the terminal, again and again until stopped."""
-    from rich.live import Live
-
-    from scenarios.live.dashboard import screen
-
     with Live(console=out_console, screen=True, auto_refresh=False) as live:
         while not stopped():
             listener.serve(time.monotonic() + FRAME_S)
@@ -62,10 +58,8 @@ def draw(listener: "FleetListener", news: "deque[str]", stopped: Callable[[], bo
             live.update(screen(fleet, list(news), out_console.height), refresh=True)
 
 
-def print_lines(listener: "FleetListener", news: "deque[str]", stopped: Callable[[], bool]) -> None:
+def print_lines(listener: FleetListener, news: deque[str], stopped: Callable[[], bool]) -> None:
     """Print news as they come, and a line about every arm from time to time, until stopped."""
-    from scenarios.live.dashboard import arm_line, jobs_line
-
     due_s = time.monotonic() + SNAPSHOT_S
     while not stopped():
         listener.serve(time.monotonic() + FRAME_S)
@@ -81,10 +75,6 @@ def print_lines(listener: "FleetListener", news: "deque[str]", stopped: Callable
 
 def describe(name: str, message: msgspec.Struct) -> str:
     """Line about an event or a result; "" for other messages."""
-    from fleet.bus.protocol.auction import ArmEvent, Result
-    from fleet.live.monitor.snapshot import describe_event, describe_status
-    from scenarios.live.dashboard import format_time
-
     if isinstance(message, ArmEvent):
         return f"{format_time(message.time_s)}  {name}: {describe_event(message)}"
     if isinstance(message, Result):

@@ -1,0 +1,37 @@
+"""Folder with the journals of a fleet."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from fleet.errors import FleetError
+from scenarios.schema import Scenario
+
+
+def folder_of(folder: Path | None, fleet: str, scenario: Scenario) -> tuple[str, Path]:
+    """Name of the fleet, and its folder: the given ones or the default ones."""
+    name = fleet or scenario.name
+    return name, folder or Path("runs") / f"live-{name}"
+
+
+def refuse_other_way(folder: Path, arms: Iterable[str], *, alone: bool) -> None:
+    """Check that journals in a folder are not of a shift with the other kind of allocation: jobs would be done twice.
+
+    Args:
+        alone: Whether the arms allocate jobs without an auctioneer.
+
+    Raises:
+        FleetError: a journal is of the other kind.
+    """
+    remedy = "Use the --policy that the shift was started with, or another folder for a new shift."
+    for arm in arms:
+        grants, journal = folder / f"{arm}.grants", folder / f"{arm}.journal"
+        if alone and not grants.exists() and journal.exists() and journal.stat().st_size:
+            raise FleetError(
+                f"{journal} has no {grants.name} beside it: it is of a shift with an auctioneer, or the grants are "
+                f"lost, and jobs would be done twice. {remedy}"
+            )
+        if not alone and grants.exists() and grants.stat().st_size:
+            raise FleetError(
+                f"{grants} is of a shift in which the arms allocate jobs without an auctioneer, and jobs would be done "
+                f"twice. {remedy}"
+            )
