@@ -11,6 +11,8 @@ from fleet.errors import check_nonnegative, check_positive
 
 Kind = Literal["pick_place", "hold", "press", "sort"]
 KINDS: tuple[str, ...] = get_args(Kind)
+DWELL_S = 0.5
+"""Default of `dwell_s` in scenarios and on the bus: time to close or open the hand."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +43,7 @@ class Work:
     """pick_place, sort: from, to. hold, press: one place."""
     payload_kg: float = 0.0
     """Carried from grasp to release; a hold grasps and releases at its place."""
-    dwell_s: float = 0.5
+    dwell_s: float = DWELL_S
     """pick_place, sort: time to close or open the hand. hold, press: duration of one repetition."""
     force_n: float = 0.0
     """press: contact force along the tool's z axis, N."""

@@ -8,7 +8,7 @@ import numpy as np
 from fleet.arrivals import Arrivals, Batch, Poisson, Trace
 from fleet.engine.reward import RewardWeights
 from fleet.errors import FleetError, check_nonnegative, check_positive, nearest
-from fleet.job import Kind, Place
+from fleet.job import DWELL_S, Kind, Place
 from fleet.robot import Cooling, Mount, Robot, ThermalLimits
 
 LONGEST_DWELL_S = 3600.0
@@ -98,7 +98,7 @@ class JobStream:
     payload_kg: tuple[float, ...] = (0.0,)
     repetitions: tuple[int, int] = (1, 1)
     """Fewest and most."""
-    dwell_s: float = 0.5
+    dwell_s: float = DWELL_S
     """See `fleet.job.Work`: duration of one repetition of a hold or press."""
     force_n: float = 0.0
     value: float = 1.0

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fleet.env.render.floor_plan import LARGEST, NORMAL, FloorPlan, Pixel, floor_plan, shortened, text_width
@@ -226,6 +226,7 @@ def test_pictures_have_the_requested_size_and_repeat(arms, size) -> None:
 words = st.text(max_size=60)
 
 
+@example("\U000e0000", "press", "crate", "")  # a name without any outline
 @given(words, words, words, words)
 def test_any_name_can_be_drawn(arm, station, job, title) -> None:
     cell = replace(row(1), arms=(arm,), stations=((station, (0.0, 1.0, 0.0)),))

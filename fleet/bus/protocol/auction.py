@@ -18,7 +18,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from fleet.bus.protocol.messages import Name, finite
-from fleet.job import Kind
+from fleet.job import DWELL_S, Kind
 from fleet.telemetry import Mode
 
 Count = Annotated[int, msgspec.Meta(ge=0)]
@@ -41,7 +41,7 @@ class JobSpec(msgspec.Struct, frozen=True, omit_defaults=True):
     """Places of the cell: from and to for pick_place and sort; one for hold and press."""
     repetitions: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 1
     payload_kg: NotNegative = 0.0
-    dwell_s: Positive = 0.5
+    dwell_s: Positive = DWELL_S
     force_n: NotNegative = 0.0
     release_s: NotNegative = 0.0
     """Not before this."""

@@ -26,11 +26,18 @@ ROUNDS = 150
 """Iterations of moving overlapping arms apart."""
 
 
+def drawable(text: str) -> str:
+    """The text with □ for every character that the font does not have, and a space for one that cannot be printed."""
+    glyphs = get_font(findfont(FontProperties(family=FONT))).get_charmap()
+    return "".join((c if ord(c) in glyphs else "□") if c.isprintable() else " " for c in text)
+
+
 @lru_cache(maxsize=4096)
 def text_path(text: str, size_px: int, bold: bool = False) -> Path:
     """Outline of a line of text that begins at the origin, px, y up."""
     font = FontProperties(family=FONT, weight="bold" if bold else "normal")
-    return TextPath((0, 0), text, size_px, prop=font, usetex=False) if text.strip() else Path(np.empty((0, 2)))
+    line = drawable(text)
+    return TextPath((0, 0), line, size_px, prop=font, usetex=False) if line.strip() else Path(np.empty((0, 2)))
 
 
 @lru_cache(maxsize=4096)
@@ -43,8 +50,7 @@ def text_width(text: str, size_px: int, bold: bool = False) -> int:
 @lru_cache(maxsize=4096)
 def shortened(text: str, size_px: int, room_px: float, bold: bool = False) -> str:
     """The text on one line, its middle replaced by … where it is too wide; empty if nothing fits."""
-    glyphs = get_font(findfont(FontProperties(family=FONT))).get_charmap()
-    line = "".join((c if ord(c) in glyphs else "□") if c.isprintable() else " " for c in text)
+    line = drawable(text)
     if text_width(line, size_px, bold) <= room_px:
         return line
     cuts = (line[: n // 2] + "…" + line[len(line) - (n - n // 2) :] for n in range(min(len(line) - 1, 200), 1, -1))
