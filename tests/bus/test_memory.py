@@ -204,7 +204,7 @@ def test_words_that_cannot_be_said_are_refused(make_words, changes, named):
 
 
 def test_an_exchange_that_cannot_be_is_refused(make_words):
-    with pytest.raises(ValueError, match="No arm 'z'"):
+    with pytest.raises(ValueError, match="unknown arm 'z'"):
         MemoryExchange(ARMS, Channel(topology=nx.path_graph(["a", "z"])))
     with pytest.raises(ValueError, match="names"):
         MemoryExchange(["a", "a"])

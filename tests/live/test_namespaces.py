@@ -21,7 +21,7 @@ CALL = "import socket, sys; s = socket.create_connection(sys.argv[1].split(':'))
 def namespaces(monkeypatch):
     monkeypatch.syspath_prepend(CHAOS)
     module = importlib.import_module("namespaces")
-    if reason := module.why_not():
+    if reason := module.unavailable_reason():
         pytest.skip(reason)
     return module
 
@@ -78,6 +78,6 @@ def test_only_the_namespaces_of_killed_campaigns_are_removed(namespaces):
 
 def test_without_root_the_reason_is_given(namespaces, monkeypatch):
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    assert namespaces.why_not() == "network namespaces need root"
+    assert namespaces.unavailable_reason() == "network namespaces need root"
     monkeypatch.setenv("PATH", "")
-    assert namespaces.why_not() == "network namespaces need Linux and its command ip"
+    assert namespaces.unavailable_reason() == "network namespaces need Linux and its command ip"

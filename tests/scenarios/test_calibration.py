@@ -73,5 +73,5 @@ def test_an_arm_that_nothing_heats_keeps_its_twin_and_says_why(scenario, tmp_pat
     lax = replace(scenario, limits=ThermalLimits(warning_c=500.0, error_c=600.0))
     assert calibrate_twins(lax, [PlannedArm(0, hardware, {})], [twin], tmp_path, quiet, jobs=40) == [twin]
     assert f"quickstart: arm '{hardware.robot.name}' gets no probability of saturation" in caplog.text
-    assert "In 0 of 40 past jobs" in caplog.text
+    assert "(got 40; passed in 0)" in caplog.text
     assert not (tmp_path / "saturation").exists()

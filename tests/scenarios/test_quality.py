@@ -33,7 +33,7 @@ def test_without_both_kinds_there_is_no_quality(peak_c):
 
 def test_what_cannot_be_measured_says_so():
     peak_c = np.array([30.0, 70.0])
-    with pytest.raises(FleetError, match=r"from 19 jobs without the event on \(got 5\)"):
+    with pytest.raises(FleetError, match=r"needs 19 or more jobs without the event \(got 5\)"):
         detection(np.arange(2.0), peak_c, reference=np.arange(5.0), novel=REFERENCE)
     with pytest.raises(ValueError, match="finite"):
         detection(np.array([0.0, np.nan]), peak_c, reference=REFERENCE, novel=REFERENCE)

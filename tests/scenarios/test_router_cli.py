@@ -172,7 +172,7 @@ def test_up_gives_every_process_its_own_certificate(folder):
         (("--add", "x:king"), "no role 'king'. Allowed: arm"),
         (("--add", "x:submiter"), "did you mean 'submitter'?"),
         (("--add", "x"), "is not NAME:ROLE"),
-        (("--add", "ca:monitor"), "may be named 'ca'"),
+        (("--add", "ca:monitor"), "cannot be named 'ca'"),
         (("--add", "y:arm", "--days", "0"), "lasts 1 to 3650 days"),
         (("--extra", "y:arm"), "SCENARIO is needed"),
         (("--no-auctioneer",), "SCENARIO is needed"),

@@ -134,7 +134,7 @@ def test_risk_rises_with_every_temperature_and_needs_past_jobs(holds, rng):
     assert p[0] < p[1] < p[2] < p[3]
     with pytest.raises(NotEnoughExperience, match="needs 30 past jobs"):
         twin.with_past_jobs(plans[:10], repeats[:10], temp_c=temps[:10], passed=passed[:10])
-    with pytest.raises(NotEnoughExperience, match="0 passing"):
+    with pytest.raises(NotEnoughExperience, match="passed in 0"):
         twin.with_past_jobs(plans, repeats, temp_c=temps, passed=np.zeros(60, dtype=bool))
 
 
