@@ -71,7 +71,7 @@ def test_only_the_namespaces_of_killed_campaigns_are_removed(namespaces):
     subprocess.run(f"ip link add {left} type veth peer name eth0 netns {left}".split(), check=True)
     with namespaces.Namespaces(["a"], 1):
         assert leftovers(ended.pid) == []
-        namespaces.clear_away()
+        namespaces.remove_stale()
         assert leftovers(os.getpid())
     assert leftovers(os.getpid()) == []
 
