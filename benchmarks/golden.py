@@ -17,6 +17,7 @@ import tempfile
 import tomllib
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -36,9 +37,9 @@ def thermofleet(*argv: str) -> str:
     module, _, name = entry.partition(":")
     main = getattr(importlib.import_module(module), name)
     printed = io.StringIO()
-    with contextlib.redirect_stdout(printed):
+    with contextlib.redirect_stdout(printed), patch.object(sys, "argv", ["thermofleet", *argv]):
         try:
-            main(list(argv))
+            main()
         except SystemExit as stop:
             if stop.code not in (0, None):
                 raise RuntimeError(f"thermofleet {' '.join(argv)} exited with {stop.code}.") from stop
