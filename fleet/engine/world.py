@@ -95,7 +95,9 @@ def warm_start(arm: Arm, ambient_c: float) -> Array:
         rest = arm.rest_drive()
         known = steady_state(arm.thermal, rest.current_sq, rest.friction_w, arm.motors, ambient_c)
     if known is None:
-        raise ValueError(f"Arm '{arm.robot.name}' never settles while standing at home in air of {ambient_c:g} °C.")
+        raise ValueError(
+            f"Arm '{arm.robot.name}' has no steady state when idle at home at {ambient_c:g} °C ambient temperature."
+        )
     arm.warm_c[ambient_c] = known
     return known.copy()
 

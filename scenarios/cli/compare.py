@@ -15,10 +15,10 @@ from scenarios.schema_errors import choose
 def compare_command(
     scenario: options.ScenarioArg,
     policies: Annotated[
-        str, typer.Option(help="Comma-separated; an own policy as FILE.py:CLASS, a trained one as its folder.")
+        str, typer.Option(help="Policies, separated by commas: names, FILE.py:CLASS, or folders of trained policies.")
     ] = ",".join(RULES),
     seeds: Annotated[int, typer.Option(help="Number of seeds; 2 or more.")] = 10,
-    first_seed: Annotated[int, typer.Option(help="First seed; keep some seeds apart from those you tune on.")] = 0,
+    first_seed: Annotated[int, typer.Option(help="First seed. Compare on seeds that you did not tune on.")] = 0,
     baseline: Annotated[
         str | None,
         typer.Option(

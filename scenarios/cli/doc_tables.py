@@ -44,7 +44,7 @@ def _key_table() -> str:
         (f"`{_short(channel)}`", channel.sender, channel.receiver, channel.pattern, _links(channel))
         for channel in CHANNELS
     ]
-    return table(("key", "from", "to", "pattern", "message"), rows)
+    return table(("key", "declared by", "used by", "pattern", "message"), rows)
 
 
 def _transport_table() -> str:
@@ -86,7 +86,7 @@ def _message(name: str, part: Schema, message: MessageType | None) -> str:
             default = f"`{json.dumps(kind['default'])}`" if "default" in kind else ""
             if_absent = "required" if field in required else default
             rows.append((f"`{field}`", _type(kind), if_absent, kind.get("description", "")))
-        parts.append(table(("field", "type", "if left out", "meaning"), rows))
+        parts.append(table(("field", "type", "default", "meaning"), rows))
     else:
         parts.append("No fields: the payload is `{}`.")
     if message is not None:
@@ -149,27 +149,39 @@ def _time_table() -> str:
     short_s, margin_s, attempts = timing.lease_s * (1 - CLOCK_DRIFT), timing.margin_s, timing.attempts
     state = CHANNEL["arm", "state"]
     rows = [
-        (f"{SESSION_LEASE_S:g}", "all", "without a sign of life Zenoh closes a session and withdraws its token"),
-        (f"{FRESH_S:g}", "all", "an arm whose state is older is not present, whatever its token says"),
+        (
+            f"{SESSION_LEASE_S:g}",
+            "all",
+            "session lease: without messages for this long, Zenoh closes the session and withdraws its token",
+        ),
+        (f"{FRESH_S:g}", "all", "an arm whose last state is older is absent, even with a token"),
         (f"{1.0 / (state.rate_hz or 1.0):g}", "arm", "between two `state` messages"),
-        (f"{state.heartbeat_s:g}", "all", "after a publication its number is repeated, so that a loss is noticed"),
-        (f"{timing.window_s:g}", "auctioneer", "a round closes, unless every present arm has replied before"),
-        (f"{terms.valid_s:g}", "arm", "`valid_s`: it accepts an award on its quote"),
-        (f"{timing.ack_s:g}", "auctioneer", f"without an `Ack` the same award is sent again, {attempts} times in all"),
+        (f"{state.heartbeat_s:g}", "all", "heartbeat: the last sequence number is repeated within this time"),
+        (
+            f"{timing.window_s:g}",
+            "auctioneer",
+            "quote timeout; a round closes earlier if all present arms have replied",
+        ),
+        (f"{terms.valid_s:g}", "arm", "`valid_s`: how long it accepts an award on its quote"),
+        (f"{timing.ack_s:g}", "auctioneer", f"retry period of an award without an `Ack`, {attempts} attempts in all"),
         (f"{timing.lease_s:g}", "auctioneer", "`lease_s`: length of a lease"),
-        (f"{short_s:.2f}", "arm", f"how it counts that lease: {CLOCK_DRIFT:.0%} shorter, as clocks differ in rate"),
+        (
+            f"{short_s:.2f}",
+            "arm",
+            f"the same lease as measured by the arm: {CLOCK_DRIFT:.0%} shorter, to allow for clock drift",
+        ),
         (
             f"{timing.counted_lease_s:.2f}",
             "auctioneer",
-            f"how it counts it: {CLOCK_DRIFT:.0%} and {margin_s:g} s longer",
+            f"the same lease as measured by the auctioneer: {CLOCK_DRIFT:.0%} and {margin_s:g} s longer",
         ),
         (f"{timing.lease_s / RENEWALS:g}", "arm", "between two requests to renew the lease"),
-        (f"{terms.commit_lead_s:g}", "arm", "before its last cycle could begin it requests permission to commit"),
-        (f"{COMMIT_RETRY_S:g}", "arm", "until it requests that permission again"),
-        (f"{again_s:g} to {most_s:g}", "arm", "between two reports of one outcome, longer each time"),
-        (f"{terms.return_after_s:g}", "arm", "after the end of a lease it returns the job by itself"),
+        (f"{terms.commit_lead_s:g}", "arm", "lead time of its request for permission to commit, before the last cycle"),
+        (f"{COMMIT_RETRY_S:g}", "arm", "retry period of that request"),
+        (f"{again_s:g} to {most_s:g}", "arm", "retry period of a report, with back-off"),
+        (f"{terms.return_after_s:g}", "arm", "time from the end of a lease until it returns the job"),
     ]
-    return table(("real s", "of", "what"), rows)
+    return table(("real s", "participant", "meaning"), rows)
 
 
 def _limit_table() -> str:
@@ -178,11 +190,11 @@ def _limit_table() -> str:
     rows = [
         (f"{Limits().message_bytes:,} bytes", "any message with its attachment; the router silently drops larger ones"),
         (f"{state.limit_hz:g} a second", "`state` messages of one session; the router drops more (`--state-hz`)"),
-        (f"{MOST_JOBS}", "jobs in one message; of more, a `Status` holds those that may still change first"),
+        (f"{MOST_JOBS}", "jobs in one message; a `Status` lists open jobs before closed ones"),
         (f"{MAX_KEPT_JOBS:,}", "jobs that one auctioneer keeps, finished ones included"),
         (f"{longest}", "characters of a job's name"),
     ]
-    return table(("limit", "of"), rows)
+    return table(("limit", "applies to"), rows)
 
 
 _SHAPES = {(): "1", ("joint",): "7", ("slot",): "K", ("peer",): "n − 1", ("peer", "slot"): "(n − 1) × K"}
@@ -196,7 +208,7 @@ def _observation_table() -> str:
         place = str(start) if last == start else f"{start}–{last}"
         span = f"{_number(field.low)} … {_number(field.high)}"
         rows.append((f"`{field.name}`", place, _SHAPES[field.axes], field.unit, span, field.text))
-    return table(("field", "of 4 arms, 8 slots", "shape", "unit", "range", "meaning"), rows)
+    return table(("field", "columns (4 arms, 8 slots)", "shape", "unit", "range", "meaning"), rows)
 
 
 def _reward_table() -> str:

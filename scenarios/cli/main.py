@@ -57,9 +57,7 @@ COMMANDS = {
     "keys": LazyCommand(_LIVE, "keys:keys_command", "Make and show TLS keys and certificates."),
     "twin": LazyCommand(_TWIN, "twin:twin_app", "Train, score and use the digital twin of an arm."),
     "hold": LazyCommand(_TWIN, "scenarios.motion.hold:hold_command", "Compute how long an arm can hold a payload."),
-    "contract": LazyCommand(
-        _TOOLS, "contract:contract_command", "Write the schemas of the bus and the tables of docs."
-    ),
+    "contract": LazyCommand(_TOOLS, "contract:contract_command", "Generate the bus schemas and the tables in docs."),
 }
 
 
@@ -96,7 +94,7 @@ def load_command(name: str) -> Any:
 
 app = typer.Typer(
     cls=LazyGroup,
-    help="Simulate and run fleets of robot arms that share jobs by how hard each job is on their motors.",
+    help="Simulate and run fleets of robot arms that allocate jobs by thermal difficulty.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
@@ -136,7 +134,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         say(f"Error: {missing_extra(error)}")
         sys.exit(USAGE)
     except typer.TyperException as error:
-        message = error.format_message()
+        message = error.format_message().replace("Value error, ", "")  # typer's own word before "'x' is not one of"
         if message:  # empty if the help was shown instead
             say(f"Error: {message.rstrip('.')}{'' if message.endswith('?') else '.'} See thermofleet --help.")
         sys.exit(USAGE)

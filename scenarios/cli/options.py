@@ -15,7 +15,9 @@ if TYPE_CHECKING:  # slow to import
 
 ScenarioArg = Annotated[str, typer.Argument(help="A library name (see `thermofleet list`) or a .toml file.")]
 SeedOption = Annotated[int, typer.Option(help="Random seed of jobs, sensor noise and policy; 0 or more.")]
-DifficultyOption = Annotated[str, typer.Option(help="What scores the plans: twin, blind or oracle.")]
+DifficultyOption = Annotated[
+    str, typer.Option(help="Source of the difficulty scores: twin, oracle (simulator) or blind (none).")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result in --out.")]
 
@@ -34,9 +36,12 @@ RadiusOption = Annotated[
 TopologySeedOption = Annotated[
     int, typer.Option(help="random_geometric: seed of the arms' positions.", rich_help_panel=_CHANNEL)
 ]
-DelayOption = Annotated[float, typer.Option(help="Least delay of a message, simulated s.", rich_help_panel=_CHANNEL)]
+DelayOption = Annotated[
+    float, typer.Option(help="Minimum delay of a message, s of simulated time.", rich_help_panel=_CHANNEL)
+]
 JitterOption = Annotated[
-    float, typer.Option(help="Largest extra delay, drawn for each message, simulated s.", rich_help_panel=_CHANNEL)
+    float,
+    typer.Option(help="Maximum additional delay per message and link, s of simulated time.", rich_help_panel=_CHANNEL),
 ]
 LossOption = Annotated[
     float, typer.Option(help="Probability that a message is lost on a link.", rich_help_panel=_CHANNEL)
@@ -55,8 +60,8 @@ EndpointOption = Annotated[str, typer.Option(envvar="THERMOFLEET_ENDPOINT", help
 PolicyOption = Annotated[
     str,
     typer.Option(
-        help=f"Who gets which job. In the auctioneer: {names_of('central')}. In each arm, without an auctioneer: "
-        f"{names_of('arm')}, or a folder of train. Your own as FILE.py:CLASS runs where its scope says."
+        help=f"Allocation policy. Run by the auctioneer: {names_of('central')}. Run by each arm, without an "
+        f"auctioneer: {names_of('arm')}, or a folder of train. Your own: FILE.py:CLASS, run according to its scope."
     ),
 ]
 FleetOption = Annotated[
@@ -70,12 +75,12 @@ ScenarioOrLog = Annotated[
 LogOption = Annotated[
     Path | None, typer.Option("--log", help="A log of a real arm, or a folder of logs: .csv, .csv.gz, .parquet.")
 ]
-DamagedOption = Annotated[
-    bool, typer.Option("--skip-damaged", help="Skip the lines of a log that cannot be read, instead of stopping.")
-]
+DamagedOption = Annotated[bool, typer.Option("--skip-damaged", help="Skip damaged lines of a log.")]
 ArmOption = Annotated[str | None, typer.Option(help="Train only this arm; default: every arm of the scenario.")]
 TwinsArg = Annotated[Path, typer.Argument(help="A folder that `thermofleet twin train` wrote.")]
-WhichOption = Annotated[str | None, typer.Option("--arm", help="The arm of the twin, if the folder holds several.")]
+WhichOption = Annotated[
+    str | None, typer.Option("--arm", help="Name of the arm, if the folder contains several twins.")
+]
 
 
 def check_least(least: float, **options: float | None) -> None:

@@ -42,7 +42,10 @@ def run_command(
     difficulty: options.DifficultyOption = "twin",
     overwrite: options.OverwriteOption = False,
     listen: Annotated[
-        int, typer.Option(help="Loopback port of the Zenoh router, for others to subscribe; 0 is any free port.")
+        int,
+        typer.Option(
+            help="Loopback port of the router, so that others can subscribe. Default: a private router on a free port."
+        ),
     ] = 0,
     as_json: options.JsonOption = False,
     topology: options.TopologyOption = "complete",
@@ -64,7 +67,7 @@ def run_command(
     )  # fmt: skip
     spec = _spec(policy, seed, plant, bus, difficulty, channel)
     if not 0 <= listen <= 65535 or (listen and bus == "memory"):
-        raise FleetError(f"--listen needs a port from 1 to 65535 and --bus zenoh (got {listen}, {bus}).")
+        raise FleetError(f"--listen must be a port from 1 to 65535, with --bus zenoh (got {listen} and {bus}).")
     where = out or Path("runs") / f"{chosen.name}-{label(policy)}-{seed}"
     check_free(where, RUN, overwrite=overwrite)
     with ExitStack() as open_until_end:

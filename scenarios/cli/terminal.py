@@ -17,7 +17,7 @@ err_console = Console(stderr=True)
 
 LONG_STAGES = {
     "training": "Training the twins that are not in the cache: up to a minute per arm and core, full size minutes …",
-    "learning the log": "Training the twin of the log: up to a minute, at full size some minutes …",
+    "learning the log": "Training the twin of the log: up to a minute, several minutes at full size …",
     "teaching": "Training the networks that the report compares and the cache lacks: the longest part …",
     "comparing": "Comparing the policies …",
 }

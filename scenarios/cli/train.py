@@ -19,7 +19,7 @@ def train_command(
     algo: Annotated[
         str, typer.Option(help="mappo (one critic for the whole fleet) or ippo (one critic per arm).")
     ] = "mappo",
-    minutes: Annotated[float, typer.Option(help="Training time without that of the twins, min.")] = 30.0,
+    minutes: Annotated[float, typer.Option(help="Training time excluding the twins, min.")] = 30.0,
     iterations: Annotated[int | None, typer.Option(help="Stop earlier, after this many iterations in total.")] = None,
     warm_start: Annotated[
         str, typer.Option(help="Rule that the network imitates first, for example wspt; default: none.")

@@ -33,7 +33,9 @@ def train_command(
     out: Annotated[Path, typer.Option(help="Folder of the twins.")] = Path("runs/twins"),
     arm: options.ArmOption = None,
     size: Annotated[str | None, typer.Option(help="quick or full; default: as the scenario says.")] = None,
-    scope: Annotated[str | None, typer.Option(help="joint (a network per joint) or arm (one of 21 channels).")] = None,
+    scope: Annotated[
+        str | None, typer.Option(help="joint (one network per joint) or arm (one network of 21 channels).")
+    ] = None,
     kind: Annotated[str | None, typer.Option(help="vae or ae (a plain autoencoder, as a baseline).")] = None,
     latent: Annotated[int | None, typer.Option(help="Dimensions of the latent space.")] = None,
     hidden: Annotated[int | None, typer.Option(help="Units of each LSTM.")] = None,
@@ -46,7 +48,7 @@ def train_command(
     max_windows: Annotated[int | None, typer.Option(help="Largest number of training windows.")] = None,
     cool: Annotated[
         float,
-        typer.Option(help="--log: motion is normal if motors 1 to 4 stay below this, °C; wrists do not count."),
+        typer.Option(help="--log: temperature limit of motors 1 to 4 for training data, °C."),
     ] = 40.0,
     allow_collapse: Annotated[
         bool, typer.Option("--allow-collapse", help="Keep a twin whose latent space collapsed, as a baseline.")

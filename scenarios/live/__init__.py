@@ -1,1 +1,1 @@
-"""Live fleets: allocation, recording, replay, dashboard, HTTP."""
+"""Live fleets: allocation, recording, replay, watch screen, HTTP."""

@@ -47,6 +47,7 @@ def central_allocation(policy: str, scenario: Scenario, seed: int) -> Allocate:
     """
     if scope_of(policy) == "arm":
         raise FleetError(
-            f"'{policy}' takes no auctioneer: thermofleet arm SCENARIO NAME --policy {policy}, for each arm."
+            f"Policy '{policy}' of scope arm runs without an auctioneer. "
+            f"Start each arm with: thermofleet arm SCENARIO NAME --policy {policy}"
         )
     return CentralAllocation(policy_at(policy, seed), live_fleet(scenario))

@@ -225,7 +225,7 @@ def hold_command(
     cooling: Annotated[str, typer.Option(help=f"{', '.join(get_args(Cooling))}.")] = "still_air",
     tool_kg: Annotated[float, typer.Option(help="Mass of the gripper at the flange, kg.")] = 0.0,
 ) -> None:
-    """How long an arm may hold a payload still before its motors warn and fault."""
+    """Compute how long an arm can hold a payload until its motors reach the warning and error limits."""
     try:
         result = hold(payload, posture, ambient, cooling=cooling, tool_kg=tool_kg)
     except FleetError as error:

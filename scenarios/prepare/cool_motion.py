@@ -55,7 +55,7 @@ def require_cool_plans(plans: Sequence[Plan], hardware: ArmHardware, scenario: S
     if not cool:
         raise FleetError(
             f"{scenario.name}: arm '{hardware.robot.name}' has no motion that stays below {spec.cool_c:g} °C for "
-            f"{spec.horizon_s:g} s, so its twin has nothing to learn from. Raise twin.cool_c, or give twin.payload_kg "
+            f"{spec.horizon_s:g} s, so its twin has no training data. Raise twin.cool_c, or give twin.payload_kg "
             "lighter loads."
         )
     return cool

@@ -29,7 +29,7 @@ def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | Tex
     head = (
         f"{scenario.name}: {scenario.description}\n{scenario.horizon_s / 3600:g} h, a decision every "
         f"{scenario.decision_interval_s:g} s, {scenario.slots} slots, ambient {ambient}\n"
-        f"thermal load factor {thermal:.2f} under the best assignment, {blind:.2f} under a blind one, "
+        f"thermal load factor {thermal:.2f} for the best assignment, {blind:.2f} for an equal split, "
         f"time load {time:.2f} (mean of {SEEDS} seeds): {max(set(regimes), key=regimes.count)}"
     )
     refused = [

@@ -140,7 +140,7 @@ def test_who_asks_as_nobody_is_not_answered(asked):
 
 
 def test_only_what_an_arm_asks_as_itself_ends_in_a_name():
-    with pytest.raises(ValueError, match=r"Nobody's name ends the keys of 'result' \(got 'x'\)"):
+    with pytest.raises(ValueError, match=r"Keys of 'result' do not end in a querier's name \(got 'x'\)"):
         str(Key("f", "auction", "a", "result", "x"))
     with pytest.raises(ValueError, match="must not be empty"):
         str(Key("f", "auction", "a", "lease"))

@@ -120,7 +120,7 @@ def test_arms_begin_at_ambient_or_idle_warm(small) -> None:
 
 def test_an_arm_that_overheats_standing_at_home_is_refused(small) -> None:
     arm = replace(small.arm(0, [small.work()]), rest_tau=np.full(7, 500.0))
-    with pytest.raises(ValueError, match="Arm 'arm_0' never settles while standing at home in air of 25 °C"):
+    with pytest.raises(ValueError, match="Arm 'arm_0' has no steady state when idle at home at 25 °C"):
         small.shop([[small.job("a")]], arms=[arm], start_warm=True)
 
 

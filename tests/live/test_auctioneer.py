@@ -117,7 +117,7 @@ def test_an_allocation_against_the_bids_is_not_awarded(fleet_of, caplog):
     fleet.auctioneer._allocate = lambda bidding: {"a": "unknown", "b": "arm_0", "c": "arm_0", "x": "arm_0"}
     bid(fleet, hold("a"), hold("b", "bin"), hold("c", "belt"))
     assert [award.job.name for award in in_transit(fleet, Award)] == ["b"]
-    assert caplog.text.count("The allocation rule gives") == 3
+    assert caplog.text.count("The policy gives") == 3
 
 
 def test_a_report_on_the_award_of_another_arm_is_refused(fleet_of):
@@ -125,7 +125,7 @@ def test_a_report_on_the_award_of_another_arm_is_refused(fleet_of):
     bid(fleet, hold("a"))
     (award,) = in_transit(fleet, Award)
     report = Report("arm_1", award.award, "a", "finished", 3, 1.0)
-    with pytest.raises(Refused, match="is of 'a' to 'arm_0', not of 'a' to 'arm_1'"):
+    with pytest.raises(Refused, match="gives 'a' to 'arm_0', not 'a' to 'arm_1'"):
         fleet.auctioneer.apply_report(report, fleet.real_s, fleet.true_s)
     assert fleet.auctioneer.status()[0].state == "awarded"
 

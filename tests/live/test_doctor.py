@@ -225,7 +225,7 @@ def test_a_router_without_a_fleet_is_not_healthy():
     with Router() as router:
         code, told = doctor(router.endpoint)
     assert code == 1
-    assert "answers. There is no fleet" in told
+    assert "replies. No fleet found" in told
 
 
 def test_a_missing_router_gives_exit_code_2_and_the_command_to_start_one():
@@ -241,7 +241,7 @@ def test_another_server_at_the_port_is_recognised():
     with socket.create_server(("127.0.0.1", 0)) as other:
         code, told = doctor(f"tcp/127.0.0.1:{other.getsockname()[1]}")
     assert code == 2
-    assert "not a router of ours" in told
+    assert "no thermofleet router listens on it" in told
 
 
 @pytest.mark.parametrize("wrong", [["--endpoint", "http://x"], ["--seconds", "0"]])

@@ -24,7 +24,7 @@ from fleet.live.monitor import snapshot as snapshot_module
 from fleet.live.monitor.event_feed import HISTORY, MAX_WAITING, NEWEST_ONLY, EventFeed, ReaderBuffer
 from fleet.live.monitor.listener import FleetListener
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetSnapshot, FleetView
-from scenarios.live.dashboard import arm_line, format_age, format_scores, format_time, screen
+from scenarios.live.watch_screen import arm_line, format_age, format_scores, format_time, screen
 
 PATIENCE_S = 20.0
 

@@ -12,7 +12,7 @@ from scenarios.cli.live.gateway import check
     ("host", "token", "says"),
     [
         ("0.0.0.0", "", "THERMOFLEET_TOKEN"),
-        ("192.0.2.1", "", "not this machine alone"),
+        ("192.0.2.1", "", "reachable from other machines"),
         ("0.0.0.0", "short", "16"),
         ("localhost", "", "IP address"),
     ],

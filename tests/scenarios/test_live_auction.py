@@ -72,8 +72,8 @@ def test_jobs_are_read_from_lines_or_a_list(tmp_path):
         ),
         (json.dumps(HOLD | {"places": ["a", "b"]}), "line 1: A hold needs 1 place(s), got 2."),
         ("{", "line 1: Input data was truncated."),
-        ("\n", "there are no jobs in it."),
-        ("[]", "there are no jobs in it."),
+        ("\n", "contains no jobs."),
+        ("[]", "contains no jobs."),
         ("\xff", "line 1: "),
     ],
 )
@@ -190,8 +190,14 @@ def test_a_job_message_has_all_fields():
     [
         (("auction", "quickstart", "--policy", "match"), "No policy 'match'; did you mean 'matching'?"),
         (("up", "quickstart", "--policy", "sssi"), "did you mean 'ssi'?"),
-        (("auction", "quickstart", "--policy", "consensus"), "'consensus' takes no auctioneer: thermofleet arm"),
-        (("auction", "quickstart", "--policy", "random"), "'random' takes no auctioneer: thermofleet arm"),
+        (
+            ("auction", "quickstart", "--policy", "consensus"),
+            "Policy 'consensus' of scope arm runs without an auctioneer. Start",
+        ),
+        (
+            ("auction", "quickstart", "--policy", "random"),
+            "Policy 'random' of scope arm runs without an auctioneer. Start",
+        ),
         (
             ("arm", "quickstart", "arm_0", "--policy", "wspt"),
             "'wspt' needs an auctioneer: start it with thermofleet auction",
@@ -216,15 +222,15 @@ def test_an_invalid_policy_is_one_sentence(capsys, words, complaint):
         (
             ("up", "quickstart", "--policy", "consensus", "--out"),
             ["arm_2.journal"],
-            "it is of a shift with an auctioneer",
+            "the shift had an auctioneer",
         ),
-        (("up", "quickstart", "--out"), ["arm_2.journal", "arm_2.grants"], "arms allocate jobs without an auctioneer"),
-        (("auction", "quickstart", "--journal"), ["arm_2.grants"], "arms allocate jobs without an auctioneer"),
-        (("arm", "quickstart", "arm_2", "--journal"), ["arm_2.grants"], "arms allocate jobs without an auctioneer"),
+        (("up", "quickstart", "--out"), ["arm_2.journal", "arm_2.grants"], "belongs to a shift without an auctioneer"),
+        (("auction", "quickstart", "--journal"), ["arm_2.grants"], "belongs to a shift without an auctioneer"),
+        (("arm", "quickstart", "arm_2", "--journal"), ["arm_2.grants"], "belongs to a shift without an auctioneer"),
         (
             ("arm", "quickstart", "arm_2", "--policy", "consensus", "--journal"),
             ["arm_2.journal"],
-            "has no arm_2.grants",
+            "has no 'arm_2.grants'",
         ),
     ],
 )
@@ -372,7 +378,7 @@ def test_ask_shows_the_cost_of_a_job_for_each_arm(endpoint, capsys):
     with arm(endpoint) as asked:
         code, out, _ = call(capsys, "ask", *job, "--endpoint", endpoint, "--fleet", "f")
         assert code == 0
-        assert "hold  arm_0  3.50     0.12     52.3      100        160" in out
+        assert "hold  arm_0  3.50           0.12     52.3         100          160" in out
         code, out, _ = call(capsys, "ask", *job, "--endpoint", endpoint, "--fleet", "f", "--json")
         assert json.loads(out)[0]["estimates"][0]["difficulty"] == 3.5
     assert [request.dry_run for request in asked] == [True, True]
@@ -384,7 +390,7 @@ def test_ask_reports_missing_arguments(endpoint, capsys):
     assert "either a FILE of jobs or one job" in call(capsys, "ask", *at)[2]
     told = call(capsys, "ask", "--kind", "pick_and_place", *at)[2]
     told_kinds = "did you mean 'pick_place'? Allowed: hold, pick_place, press, sort (at kind)."
-    assert f"No such job: No kind of job 'pick_and_place'; {told_kinds}" in " ".join(told.split())
+    assert f"Invalid job: No kind of job 'pick_and_place'; {told_kinds}" in " ".join(told.split())
     code, _, err = call(capsys, "ask", "--kind", "hold", "--place", "rack", *at)
     assert code == 2
     assert "No arm of fleet 'f' replied" in err

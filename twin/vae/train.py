@@ -109,9 +109,9 @@ def train(
             kl_nats = fit.kl if config.kind == "vae" else None
             if collapsed(kl_nats, fit.active_units) and not (config.allow_collapse or still[n]):
                 raise CollapsedPosterior(
-                    f"The twin of '{arm}' learned nothing of {label}: KL {fit.kl:.2f} nat, {fit.active_units} active "
-                    "latent unit(s). Lower beta, train longer (epochs, max_windows), or set allow_collapse to keep it "
-                    "as a baseline."
+                    f"Posterior collapse of {label} in the twin of '{arm}': KL {fit.kl:.2f} nat, {fit.active_units} "
+                    "active latent unit(s). Lower beta, train longer (epochs, max_windows), or set allow_collapse to "
+                    "keep it as a baseline."
                 )
             nets.append(net)
             fits.append(fit)

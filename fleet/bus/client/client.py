@@ -272,6 +272,8 @@ class BusClient:
         origin = zenoh.Locality.ANY if own else zenoh.Locality.REMOTE
 
         def take(sample: zenoh.Sample) -> None:
+            if sample.kind != zenoh.SampleKind.PUT:
+                return
             try:
                 payload = sample.payload.to_bytes()
                 name, message = self._read(kind, str(sample.key_expr), str(sample.encoding), payload)
@@ -305,8 +307,7 @@ class BusClient:
         channel_for(expression, "token")
 
         def receive(sample: zenoh.Sample) -> None:
-            present = sample.kind == zenoh.SampleKind.PUT
-            self.post(self._token, str(sample.key_expr), present, handle, urgent=True)
+            self.post(self._token, str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT, handle, urgent=True)
 
         self._keep(self._open().liveliness().declare_subscriber(expression, _direct(receive), history=True))
 
@@ -342,7 +343,7 @@ class BusClient:
 
     def _open(self) -> zenoh.Session:
         if self._session is None:
-            raise BusError("This client of the bus is not open.")
+            raise BusError("The BusClient is not open. Use it as a context manager.")
         return self._session
 
     def _keep(self, entity: object) -> None:

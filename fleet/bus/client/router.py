@@ -67,7 +67,8 @@ def loopback(endpoint: str) -> str:
         address = ipaddress.ip_address(host)
     except ValueError as error:
         raise BusError(
-            f"Endpoint '{endpoint}': the name '{host}' may be of any host. Allowed: 127.0.0.1, [::1], localhost."
+            f"Endpoint '{endpoint}': '{host}' may resolve to another machine. "
+            "Without TLS, allowed: 127.0.0.1, [::1], localhost."
         ) from error
     if not address.is_loopback:
         raise BusError(

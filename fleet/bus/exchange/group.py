@@ -121,9 +121,8 @@ class Group:
 
     def await_messages(self, deadline_s: float) -> list[int]:
         """Wait for the messages of this step, and return the peers of which one is missing."""
-        while missing := self._missing(self.scores.ticks):
-            if not self.client.serve(deadline_s, at_least=missing) and time.monotonic() >= deadline_s:
-                break
+        while (missing := self._missing(self.scores.ticks)) and time.monotonic() < deadline_s:
+            self.client.serve(deadline_s, at_least=missing)
         # Only if a state is lost: no other message of this step will wake the reader.
         while self._missing(self.conditions.ticks) and time.monotonic() < deadline_s:
             self.client.serve(min(deadline_s, time.monotonic() + _POLL_S))

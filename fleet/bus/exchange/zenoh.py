@@ -142,8 +142,8 @@ class ZenohExchange:
             for group in self._groups:
                 if missing := group.await_peers(deadline_s):
                     raise BusError(
-                        f"Arm '{self.arms[group.members[0]]}' did not see {_named(self.arms[i] for i in missing)} on "
-                        f"the bus within {_OPEN_TIMEOUT_S} s."
+                        f"Arm '{self.arms[group.members[0]]}' did not discover "
+                        f"{_named(self.arms[i] for i in missing)} on the bus within {_OPEN_TIMEOUT_S} s."
                     )
         except zenoh.ZError as error:
             self._give_up()

@@ -44,7 +44,7 @@ class JobSpec(msgspec.Struct, frozen=True, omit_defaults=True):
     dwell_s: Positive = DWELL_S
     force_n: NotNegative = 0.0
     release_s: NotNegative = 0.0
-    """Not before this."""
+    """Earliest start."""
     due_s: float | None = None
     """Soft deadline; null for none."""
     value: float = 1.0
@@ -116,7 +116,7 @@ class JobEstimate(msgspec.Struct, frozen=True):
     duration_s: float | None = None
     """Duration of the job alone."""
     finish_in_s: float | None = None
-    """From now until it would be finished, after the current jobs of the arm."""
+    """Time until it would be finished, including the arm's current jobs."""
 
     def __post_init__(self) -> None:
         finite("JobEstimate", "joint_difficulty", self.joint_difficulty or ())

@@ -29,11 +29,11 @@ class Bid(msgspec.Struct, frozen=True):
     capacity: Count
     """How many more jobs it would accept now."""
     estimates: Annotated[tuple[JobEstimate, ...], msgspec.Meta(max_length=MOST_JOBS)]
-    """Of jobs that could begin now, as far as this arm knows; none without capacity."""
+    """Estimates of jobs that could begin now, to this arm's knowledge; empty without capacity."""
     open_count: Count
     """Number of jobs without an outcome, as far as this arm knows."""
     closed_count: Count = 0
-    """Number of jobs with an outcome, as far as this arm knows. A peer that knows more for a while sends them."""
+    """Number of jobs with an outcome known to this arm. A peer with a higher count sends the missing outcomes."""
     open_jobs: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
     """The first jobs without an outcome, by release and name. A peer that knows an outcome, or a missing job, sends
     it."""
@@ -94,7 +94,7 @@ class GrantedEntry(msgspec.Struct, frozen=True):
 
     award: Name
     cycles: Count
-    """Of the job: known to be done."""
+    """Cycles of the job known to be done."""
     may_commit: bool = False
     """Permission to commit, by this granter: the last cycle may begin, and it grants the job to no other arm."""
 
@@ -113,7 +113,7 @@ class ClaimReply(msgspec.Struct, frozen=True):
 
     arm: Name
     number: Count
-    """Of the claim."""
+    """Number of the claim that this answers."""
     lease_s: Positive
     """Real seconds, counted by the claimer from the moment it sent the claim."""
     granted: tuple[GrantedEntry, ...] = ()

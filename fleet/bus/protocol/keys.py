@@ -65,11 +65,11 @@ class Key:
         if self.topic in ASKED:
             return f"{start}/{chunk(self.name)}/{self.topic}/{chunk(self.asker)}"
         if self.asker:
-            raise ValueError(f"Nobody's name ends the keys of '{self.topic}' (got {self.asker!r}).")
+            raise ValueError(f"Keys of '{self.topic}' do not end in a querier's name (got {self.asker!r}).")
         if self.role not in NAMELESS:
             return f"{start}/{chunk(self.name)}/{self.topic}"
         if self.name:
-            raise ValueError(f"The keys under {self.role} belong to nobody (got the name {self.name!r}).")
+            raise ValueError(f"Keys under '{self.role}' contain no participant's name (got {self.name!r}).")
         return f"{start}/{self.topic}"
 
 
@@ -173,7 +173,7 @@ def _parse(key: str) -> Key:
     role = _ROLES.get(parts[3])
     if role is None or named == (role in NAMELESS):
         raise ValueError(
-            f"'{key}' has no such place: expected arm/{{arm}}/…, auction/{{auctioneer}}/…, jobs/… or clock/now."
+            f"'{key}' is not a key of this bus: expected arm/{{arm}}/…, auction/{{auctioneer}}/…, jobs/… or clock/now."
         )
     try:
         chunks = (parts[2], parts[4] if named else "", parts[6] if asked else "")

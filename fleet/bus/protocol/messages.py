@@ -24,7 +24,7 @@ class MalformedMessage(BusError, ValueError):
 
 
 class State(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Telemetry of an arm; the newest one counts. Quantities that nobody measures are left out."""
+    """Telemetry of an arm; only the newest is valid. Quantities that are not measured are omitted."""
 
     arm: Name
     tick: Tick
@@ -98,8 +98,8 @@ class Info(msgspec.Struct, frozen=True):
 class Refusal(msgspec.Struct, frozen=True):
     """Instead of any other reply, under the key of the replier: the reason why there is none.
 
-    It is a reply like others. An error reply of Zenoh travels under the key of the query: if that has a wildcard it is
-    nobody's own key, and a router that enforces access control drops it.
+    An ordinary reply. Zenoh's error replies have the key of the query; if it has a wildcard, a router with access
+    control drops them.
     """
 
     reason: str

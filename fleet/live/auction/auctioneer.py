@@ -159,7 +159,7 @@ class Auctioneer:
             return receipt
         if (award.record.arm, award.record.job) != (report.arm, report.job):
             raise Refused(
-                f"Award '{report.award}' is of '{award.record.job}' to '{award.record.arm}', not of '{report.job}' to "
+                f"Award '{report.award}' gives '{award.record.job}' to '{award.record.arm}', not '{report.job}' to "
                 f"'{report.arm}'."
             )
         if award.outcome not in ("finished", "returned"):
@@ -274,7 +274,7 @@ class Auctioneer:
                     self._record(ContactLost(name, time_s))
                     lease.until_s = math.inf
             except JournalFull as error:
-                _LOG.error("'%s' stays with '%s': %s", award.record.job, award.record.arm, error)
+                _LOG.error("Cannot take back '%s' from '%s': %s", award.record.job, award.record.arm, error)
                 return
 
     # Rounds

@@ -103,9 +103,11 @@ def drop_invalid(bidding: Bidding, allocation: Mapping[str, str]) -> dict[str, s
     valid = _without_conflicts(bidding, [pair for pair in pairs if bidding.offer(pair[1], pair[0]) is not None])
     for job, arm in pairs:
         if bidding.offer(arm, job) is None:
-            _LOG.error("The allocation rule gives '%s' to '%s', which did not bid for it: not awarded.", job, arm)
+            _LOG.error("The policy gives '%s' to '%s', which did not bid for it: not awarded.", job, arm)
         elif job not in valid:
-            _LOG.error("The allocation rule gives '%s' to '%s' against a job of the same arm or station.", job, arm)
+            _LOG.error(
+                "The policy gives '%s' to '%s', which conflicts with another job of that arm or station.", job, arm
+            )
     return valid
 
 

@@ -93,7 +93,9 @@ def check_health(
         reasons = "; ".join(dict.fromkeys(complaints))  # each reason once
         findings.append(Finding("fault", f"{malformed} malformed message(s), the last: {reasons}"))
     if overrun:
-        findings.append(Finding("warning", f"{overrun} message(s) came faster than they were handled, and were lost."))
+        findings.append(
+            Finding("warning", f"{overrun} message(s) dropped: they arrived faster than they were processed.")
+        )
     if unfinished := fleet.counts.get("unfinished", 0):
         findings.append(Finding("warning", f"{unfinished} job(s) are unfinished: they may have been done or not."))
     return HealthReport(
@@ -131,7 +133,7 @@ def check_arm(arm: ArmSnapshot, offset_s: float | None) -> list[Finding]:
     """Check the token, state, mode and clock of one arm."""
     age_s = arm.state_age_s
     if not arm.token and age_s is None:
-        return [Finding("warning", f"{arm.arm} has left: some of its messages are kept, but it shows no token.")]
+        return [Finding("warning", f"{arm.arm} has left: it has no token, but some of its messages are still cached.")]
     problem = ""
     if not arm.token:
         problem = "publishes its state but shows no token: it left, or another process uses its name."

@@ -80,7 +80,7 @@ def arm_command(
     policy: Annotated[
         str,
         typer.Option(
-            help=f"Share out the jobs with the other arms by a policy of scope arm: {names_of('arm')}, your own as "
+            help=f"Allocate jobs without an auctioneer, by a policy of scope arm: {names_of('arm')}, your own as "
             "FILE.py:CLASS, or a folder of train. Default: an auctioneer awards them."
         ),
     ] = "",
@@ -276,7 +276,7 @@ def restart_history(book: Journal[ArmRecord], name: str, time_s: float) -> ArmHi
     """History of the arm at this start, written to its journal."""
     before = ArmHistory().replay(book.records())
     for active in before.active.values():
-        log.warning("'%s' was not finished when the arm went down; it is returned.", active.job)
+        log.warning("'%s' was unfinished at the last exit of the arm: returned.", active.job)
     history = before.after_restart(name, time_s)
     book.rewrite(*history.compact())
     return history

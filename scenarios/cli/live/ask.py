@@ -11,6 +11,7 @@ from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import MOST_JOBS, JobEstimate, JobSpec, Quote, QuoteRequest
 from fleet.errors import BusError, FleetError
+from fleet.job import DWELL_S
 from scenarios.cli.live.submit import JOBS_HELP, explain, read_jobs
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
 from scenarios.cli.terminal import out_console, say
@@ -25,14 +26,14 @@ def ask_command(
     place: Annotated[list[str] | None, typer.Option(help="Place of the cell; twice for pick_place and sort.")] = None,
     payload: Annotated[float, typer.Option(help="Payload, kg.")] = 0.0,
     repetitions: Annotated[int, typer.Option(help="Number of cycles.")] = 1,
-    dwell: Annotated[float, typer.Option(help="Duration of one repetition of a hold or press, s.")] = 0.5,
+    dwell: Annotated[float, typer.Option(help="Duration of one repetition of a hold or press, s.")] = DWELL_S,
     force: Annotated[float, typer.Option(help="Force of a press, N.")] = 0.0,
     timeout: Annotated[float, typer.Option(help="Real seconds to wait for arms.")] = REPLY_S,
     as_json: Annotated[bool, typer.Option("--json", help="Print the quotes as JSON.")] = False,
     endpoint: EndpointOption = ENDPOINT,
     fleet: FleetOption = "",
 ) -> None:
-    """Ask every arm what jobs would cost: difficulty, risk, peak temperature, finish, or why it cannot do them.
+    """Request quotes of all arms: difficulty, P(saturation), peak temperature, finish, or the reason of infeasibility.
 
     The duration of a job includes the ways to its place and home. It is finished after its last cycle, once the arm's
     present jobs are done.
@@ -77,7 +78,7 @@ def one_job(
     try:
         return msgspec.convert(fields, JobSpec)
     except msgspec.ValidationError as error:
-        raise FleetError(f"No such job: {explain(error)}") from error
+        raise FleetError(f"Invalid job: {explain(error)}") from error
 
 
 def quote_table(jobs: Sequence[JobSpec], quotes: Mapping[str, Quote]) -> Table:
@@ -85,7 +86,7 @@ def quote_table(jobs: Sequence[JobSpec], quotes: Mapping[str, Quote]) -> Table:
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("job")
     table.add_column("arm")
-    for column in ("d", "P(warm)", "peak °C", "takes s", "done in s"):
+    for column in ("d", "P(saturation)", "peak °C", "duration s", "finish in s"):
         table.add_column(column, justify="right")
     table.add_column("")
     for index, job in enumerate(jobs):

@@ -94,7 +94,7 @@ def submit_stream(node: AuctionNode, stream: Sequence[tuple[float, JobSpec]], ho
                         log.warning("'%s' was refused: %s", admission.job, admission.reason)
                 del left[: len(due)]
             except JournalFull as error:
-                log.error("The scenario's jobs have to wait: %s", error)
+                log.error("Could not submit the scenario's jobs; retrying: %s", error)
         over = node.time_s >= horizon_s and not node.auctioneer.ledger.ended
         if over:
             node.end()

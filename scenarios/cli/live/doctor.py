@@ -22,7 +22,7 @@ from fleet.live.monitor.snapshot import FleetSnapshot
 from scenarios.cli.live.options import number
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption
 from scenarios.cli.terminal import out_console, say
-from scenarios.live.dashboard import arm_table, format_time, jobs_line
+from scenarios.live.watch_screen import arm_table, format_time, jobs_line
 from scenarios.load import load
 
 UNHEALTHY = 1
@@ -49,8 +49,8 @@ def doctor_command(
         raise BusError(f"{error} {why_unreachable(endpoint)}".strip()) from error
     if not fleet and len(fleets) != 1:
         several = f"There are several fleets: {', '.join(fleets)}. Choose one with --fleet."
-        none = "There is no fleet: no arm and no auctioneer shows a token."
-        say(f"The router at {endpoint} answers. {several if fleets else none}")
+        none = "No fleet found: no arm or auctioneer has a liveliness token."
+        say(f"The router at {endpoint} replies. {several if fleets else none}")
         raise typer.Exit(UNHEALTHY)
     snapshot, report = examine(endpoint, fleet or fleets[0], seconds, auctioneer=auctioneer, expected=expected)
     if as_json:
@@ -132,7 +132,7 @@ def why_unreachable(endpoint: str) -> str:
     try:
         with socket.create_connection((host, port), timeout=REPLY_S):
             known = why_not(host, port, None)  # the error says it already
-            return "" if known else f"Port {port} is open, but it is not a router of ours."
+            return "" if known else f"Port {port} is open, but no thermofleet router listens on it."
     except ConnectionRefusedError:
         return f"Nothing listens at port {port} of {host}; start it with: thermofleet router --port {port}"
     except OSError as error:

@@ -34,7 +34,9 @@ def gateway_command(
     host: Annotated[str, typer.Option(help="Listening address; beyond loopback only with a token.")] = "127.0.0.1",
     token: Annotated[
         str,
-        typer.Option(envvar=TOKEN, help="Token that requests must show; on the command line, other users see it."),
+        typer.Option(
+            envvar=TOKEN, help="Bearer token of requests. Prefer the variable: other users can read command lines."
+        ),
     ] = "",
 ) -> None:
     """Serve the fleet over HTTP until Ctrl-C or SIGTERM."""
@@ -59,7 +61,7 @@ def check(host: str, token: str) -> None:
         return
     if not token:
         raise FleetError(
-            f"--host {host} is not this machine alone: others could submit jobs. Set {TOKEN} (or --token) to "
+            f"--host {host} is reachable from other machines, which could submit jobs. Set {TOKEN} (or --token) to "
             f"{MIN_TOKEN} or more random characters, or use 127.0.0.1."
         )
     _LOG.warning("Listening on %s: HTTP is not encrypted and shows the token; put TLS in front.", host)

@@ -27,11 +27,10 @@ def refuse_other_way(folder: Path, arms: Iterable[str], *, alone: bool) -> None:
         grants, journal = folder / f"{arm}.grants", folder / f"{arm}.journal"
         if alone and not grants.exists() and journal.exists() and journal.stat().st_size:
             raise FleetError(
-                f"{journal} has no {grants.name} beside it: it is of a shift with an auctioneer, or the grants are "
+                f"'{journal}' has no '{grants.name}' in its folder: the shift had an auctioneer, or the grants are "
                 f"lost, and jobs would be done twice. {remedy}"
             )
         if not alone and grants.exists() and grants.stat().st_size:
             raise FleetError(
-                f"{grants} is of a shift in which the arms allocate jobs without an auctioneer, and jobs would be done "
-                f"twice. {remedy}"
+                f"'{grants}' belongs to a shift without an auctioneer, so jobs could be done twice. {remedy}"
             )

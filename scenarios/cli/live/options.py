@@ -33,7 +33,7 @@ SeedOption = Annotated[int, number("Random seed of the scenario's jobs, the sens
 ModelOption = Annotated[Literal["twin", "blind"], typer.Option(help="Difficulty model.")]
 JobsOption = Annotated[
     Literal["scenario", "none"],
-    typer.Option(help="scenario: its own job stream, until it is done; none: jobs that others submit."),
+    typer.Option(help="scenario: the scenario's job stream; none: submitted jobs only."),
 ]
 JournalOption = Annotated[Path | None, typer.Option(help="Folder of the journals; an existing journal is continued.")]
 ScenarioFleetOption = Annotated[str, typer.Option(help="Name of the fleet. Default: the scenario's name.")]

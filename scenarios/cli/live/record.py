@@ -68,7 +68,7 @@ def lock_folder(folder: Path) -> Iterator[None]:
 
 
 def record_command(
-    fleet: Annotated[str, typer.Argument(help="Name of the fleet, by default that of its scenario.")],
+    fleet: Annotated[str, typer.Argument(help="Name of the fleet; `up` uses the name of the scenario.")],
     out: Annotated[Path, typer.Option(help="Folder of the recording; an interrupted one is continued.")],
     endpoint: EndpointOption = ENDPOINT,
     rotate: Annotated[float, number("Real seconds between two parts.", above=True)] = 60.0,
@@ -89,7 +89,7 @@ def replay_command(
     fleet: Annotated[str | None, typer.Option(help="Name of the fleet. Default: that of the recording.")] = None,
     speed: Annotated[float, number("Recorded seconds per real second.", above=True)] = 1.0,
 ) -> None:
-    """Publish a run or a recording on the bus again, at its own pace."""
+    """Publish a run or a recording on the bus, in real time or at --speed."""
     replay = Replay.of(path)
     if not len(replay):
         raise FleetError(f"'{path}' holds no messages yet; parts are written every --rotate seconds and at the end.")

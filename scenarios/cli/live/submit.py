@@ -73,7 +73,7 @@ def read_jobs(file: str) -> list[JobSpec]:
         lines = enumerate(raw.splitlines(), start=1)
         jobs = [_decode(line, JobSpec, f"{name}, line {number}") for number, line in lines if line.strip()]
     if not jobs:
-        raise FleetError(f"{name}: there are no jobs in it.")
+        raise FleetError(f"{name} contains no jobs.")
     return jobs
 
 
@@ -122,7 +122,7 @@ def submit(link: BusClient, jobs: tuple[JobSpec, ...], by: str) -> tuple[Admissi
         for reply in answers.messages.values():
             return reply.jobs
         for reason in filter(None, answers.refused.values()):
-            raise FleetError(f"The auctioneer takes no jobs: {reason}")
+            raise FleetError(f"The auctioneer refused the submission: {reason}")
     raise BusError(
         f"No auctioneer of fleet '{link.fleet}' replied. Is `thermofleet auction` running? Arms that allocate by "
         "consensus reply once all are present, or a majority has been for 20 s."
@@ -146,7 +146,10 @@ def follow(link: BusClient, names: Sequence[str], stop: Stop) -> list[str]:
         if all(states.get(name) in ("finished", "unfinished") for name in names):
             break
         if time.monotonic() > heard_s + PATIENCE_S:
-            raise BusError(f"No auctioneer of fleet '{link.fleet}' for {PATIENCE_S:.0f} s; the jobs are on its disk.")
+            raise BusError(
+                f"No reply from an auctioneer of fleet '{link.fleet}' for {PATIENCE_S:.0f} s; "
+                "accepted jobs are on its disk."
+            )
         stop.wait(POLL_S)
     return [name for name in names if states.get(name) != "finished"]
 

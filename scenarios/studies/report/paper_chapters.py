@@ -166,7 +166,7 @@ def difficulty_chapter(lab: Lab) -> Section:
         f"critical, {study.warning_c:g} °C and more": d[critical],
     }
     if not all(len(values) for values in groups.values()):
-        raise FleetError("The test jobs lack a kind (cool, between or critical), so there is nothing to compare.")
+        raise FleetError("The test jobs must include cool, medium and critical ones; at least one group is empty.")
     medians = {name: np.median(values, axis=0) for name, values in groups.items()}
     of_cool, _, of_critical = medians.values()
     auroc = [float(roc_auc_score(critical, d[:, j])) for j in range(d.shape[1])]
