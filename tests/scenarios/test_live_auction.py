@@ -192,11 +192,11 @@ def test_a_job_message_has_all_fields():
         (("up", "quickstart", "--policy", "sssi"), "did you mean 'ssi'?"),
         (
             ("auction", "quickstart", "--policy", "consensus"),
-            "Policy 'consensus' of scope arm runs without an auctioneer. Start",
+            "'consensus' of scope arm runs without an auctioneer. Start",
         ),
         (
             ("auction", "quickstart", "--policy", "random"),
-            "Policy 'random' of scope arm runs without an auctioneer. Start",
+            "'random' of scope arm runs without an auctioneer. Start",
         ),
         (
             ("arm", "quickstart", "arm_0", "--policy", "wspt"),
