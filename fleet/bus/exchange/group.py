@@ -121,7 +121,9 @@ class Group:
 
     def await_messages(self, deadline_s: float) -> list[int]:
         """Wait for the messages of this step, and return the peers of which one is missing."""
-        while (missing := self._missing(self.scores.ticks)) and time.monotonic() < deadline_s:
+        late = False
+        while (missing := self._missing(self.scores.ticks)) and not late:
+            late = time.monotonic() >= deadline_s  # what has arrived by then is handled once more
             self.client.serve(deadline_s, at_least=missing)
         # Only if a state is lost: no other message of this step will wake the reader.
         while self._missing(self.conditions.ticks) and time.monotonic() < deadline_s:
