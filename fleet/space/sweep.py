@@ -1,0 +1,132 @@
+"""Space that an arm takes along a plan: its links as capsules at postures close together."""
+
+# MuJoCo is compiled and ships no type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import mujoco
+import numpy as np
+
+from fleet.motion import Plan
+from fleet.physics.models import ArmModel
+
+Array = np.ndarray
+
+STEP_RAD = 0.02
+"""Largest joint step between two postures of a sweep: 18 mm at the end of an outstretched arm."""
+LEAF = 8
+"""Postures under one leaf of the tree of boxes."""
+PAYLOAD_KG_PER_M3 = 2700.0
+"""A payload counts as a ball of this density, aluminium's, that hangs from the flange."""
+MOST_PAYLOAD_M = 0.1
+"""Largest radius of such a ball."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """Capsules of one arm along a path."""
+
+    links: tuple[str, ...]
+    """Name of each capsule."""
+    ends_m: Array
+    """Ends of the capsules' axes in the world, float32 [capsule, posture, end, 3]."""
+    radius_m: Array
+    """[capsule]; with half the farthest that the capsule moves between two postures."""
+
+    @cached_property
+    def boxes_m(self) -> Array:
+        """Bounding boxes as one binary tree for each capsule, float32 [capsule, node, (low, high), 3].
+
+        Node 1 is the root, 2 n and 2 n + 1 are the children of n, and the last half of the nodes are the leaves, each
+        of `LEAF` postures.
+        """
+        capsules, postures = self.ends_m.shape[:2]
+        leaves = 1 << max(0, int(np.ceil(np.log2(postures / LEAF))))
+        ends = np.pad(self.ends_m, ((0, 0), (0, leaves * LEAF - postures), (0, 0), (0, 0)), mode="edge")
+        ends = ends.reshape(capsules, leaves, 2 * LEAF, 3)
+        boxes = np.empty((capsules, 2 * leaves, 2, 3), np.float32)
+        radius = self.radius_m[:, None, None]
+        boxes[:, leaves:, 0], boxes[:, leaves:, 1] = ends.min(axis=2) - radius, ends.max(axis=2) + radius
+        while leaves > 1:
+            leaves //= 2
+            children = boxes[:, 2 * leaves : 4 * leaves].reshape(capsules, leaves, 2, 2, 3)
+            boxes[:, leaves : 2 * leaves, 0] = children[:, :, :, 0].min(axis=2)
+            boxes[:, leaves : 2 * leaves, 1] = children[:, :, :, 1].max(axis=2)
+        return boxes
+
+
+class Capsules:
+    """The links of one arm as capsules.
+
+    Cylinders become capsules of the same axis and radius, boxes capsules around their longest axis.
+    """
+
+    def __init__(self, arm: ArmModel) -> None:
+        self._arm = arm
+        model = arm.model
+        geoms = [g for g in range(model.ngeom) if model.geom(g).name.startswith(f"{arm.robot.name}/")]
+        self.links = (*(model.geom(g).name.split("/", 1)[1] for g in geoms), "payload")
+        self._geoms = np.array(geoms)
+        axis, half_m, radius_m = zip(*(_capsule_of(model, g) for g in geoms), strict=True)
+        self._axis, self._half_m, self._radius_m = np.array(axis), np.array(half_m), np.array(radius_m)
+        self._tool = model.site(f"{arm.robot.name}/tool").id
+
+    def at(self, q: Array) -> Array:
+        """Ends of the capsules' axes, those of the links and that of a payload, m, [capsule, posture, end, 3].
+
+        Args:
+            q: rad, [posture, joint].
+        """
+        model, data = self._arm.model, self._arm.data
+        ends = np.empty((len(q), len(self._geoms) + 1, 2, 3))
+        for posture, joints in enumerate(q):
+            data.qpos[:] = joints
+            mujoco.mj_kinematics(model, data)
+            frames = data.geom_xmat[self._geoms].reshape(-1, 3, 3)
+            along = self._half_m[:, None] * np.take_along_axis(frames, self._axis[:, None, None], axis=2)[..., 0]
+            centre = data.geom_xpos[self._geoms]
+            ends[posture, :-1, 0], ends[posture, :-1, 1] = centre - along, centre + along
+            ends[posture, -1, 0] = data.site_xpos[self._tool]
+            ends[posture, -1, 1] = data.site_xmat[self._tool].reshape(3, 3)[:, 2]
+        return ends.swapaxes(0, 1)
+
+    def sweep(self, q: Array, payload_kg: float = 0.0) -> Sweep:
+        """Space that the arm takes along a path.
+
+        Args:
+            q: rad, [posture, joint]; between two postures every joint moves less than `STEP_RAD`, or the arm stands.
+            payload_kg: Heaviest payload on the path; it counts on all of it.
+        """
+        ends = self.at(q)
+        ball_m = payload_radius_m(payload_kg)
+        tool, direction = ends[-1, :, 0].copy(), ends[-1, :, 1].copy()
+        ends[-1] = (tool + ball_m * direction)[:, None]
+        moved_m = np.linalg.norm(np.diff(ends, axis=1), axis=-1).max(axis=(1, 2), initial=0.0)
+        radius_m = np.append(self._radius_m, ball_m) + moved_m / 2
+        kept = len(radius_m) - (payload_kg <= 0)
+        return Sweep(self.links[:kept], ends[:kept].astype(np.float32), radius_m[:kept])
+
+    def of_plan(self, plan: Plan) -> Sweep:
+        """Space that the arm takes from leaving home to being home again."""
+        q = np.concatenate([phase.profile[:, 0] for phase in plan.phases]).astype(float)
+        travelled = np.concatenate([[0.0], np.abs(np.diff(q, axis=0)).max(axis=1).cumsum()])
+        # The last sample before each step is left, so no joint moves more than a step (and a sample's share) at once.
+        wanted = np.arange(0.0, travelled[-1] + STEP_RAD, STEP_RAD)
+        rows = np.unique(np.append(np.searchsorted(travelled, wanted, side="right") - 1, len(q) - 1))
+        return self.sweep(q[rows], float(max(phase.payload_kg.max(initial=0.0) for phase in plan.phases)))
+
+
+def payload_radius_m(payload_kg: float) -> float:
+    """Radius of the ball that a payload counts as, m."""
+    return min(MOST_PAYLOAD_M, (3.0 * max(payload_kg, 0.0) / (4.0 * np.pi * PAYLOAD_KG_PER_M3)) ** (1 / 3))
+
+
+def _capsule_of(model: mujoco.MjModel, geom: int) -> tuple[int, float, float]:
+    """Axis (0 to 2 of the geom's frame), half length and radius of a capsule around a geom, m."""
+    size = model.geom_size[geom]
+    if int(model.geom_type[geom]) in map(int, (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER)):
+        return 2, float(size[1]), float(size[0])
+    axis = int(np.argmax(size))
+    return axis, float(size[axis]), float(np.hypot(*np.delete(size, axis)))
