@@ -87,12 +87,19 @@ def _cache_of_this_code() -> str:
     import numba
 
     digest = hashlib.sha256(numba.__version__.encode())
-    names = ("jit", "arrivals", "seeding", "motor", "difficulty", "robot", "telemetry", "thermal", "observation")
-    for path in (
-        *(_PACKAGE / f"{name}.py" for name in names),
-        *sorted((_PACKAGE / "engine").glob("*.py")),
-        *sorted((_PACKAGE / "space").glob("*.py")),
-    ):
+    names = (
+        "jit",
+        "arrivals",
+        "seeding",
+        "motor",
+        "difficulty",
+        "robot",
+        "telemetry",
+        "thermal",
+        "observation",
+        "planning/clearance",
+    )
+    for path in (*(_PACKAGE / f"{name}.py" for name in names), *sorted((_PACKAGE / "engine").glob("*.py"))):
         digest.update(path.read_bytes())
     folder = user_cache_folder() / "compiled" / digest.hexdigest()[:16]
     if not folder.exists():

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from fleet.physics.models import ArmModel, build_cell
+from fleet.planning.clearance import clearance, conflict, segment_distance
+from fleet.planning.sweep import Capsules
 from fleet.robot import Mount, Robot
-from fleet.space.clearance import clearance, conflict, segment_distance
-from fleet.space.sweep import Capsules
 
 ROUND = ("shoulder", "half_arm_1", "half_arm_2", "forearm", "wrist_1", "wrist_2")
 """Links that are capsules in the MuJoCo model, too."""

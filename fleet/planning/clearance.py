@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.jit import jit_inline, kernel
-from fleet.space.sweep import LEAF, Sweep
+from fleet.planning.sweep import LEAF, Sweep
 
 Array = np.ndarray
 
