@@ -14,12 +14,15 @@ EventKind = Literal[
     "warning",
     "fault",
     "return",
+    "give_up",
     "recover",
+    "moved",
 ]
 EVENT_KINDS: tuple[str, ...] = get_args(EventKind)
 """release: job may be claimed; award: claim won; lost: claim lost; illegal: claim not allowed, counted as a wait;
 torque_warning: the awarded plan exceeds the torque warning; finish: last cycle done; home: arm free again;
-warning, fault: motor limit passed; return: job back in the queue; recover: fault cleared."""
+warning, fault: motor limit passed; return: job back in the queue; give_up: job that faulted too often; recover: fault
+cleared; moved: a person moved the faulted arm home."""
 
 
 @dataclass(frozen=True, kw_only=True)

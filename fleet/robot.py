@@ -58,6 +58,8 @@ class ThermalLimits:
     """A fault may be cleared once every motor is below this."""
     clear_s: float = 60.0
     """Time to clear the fault once the arm is cool."""
+    move_home_s: float = 900.0
+    """Time after a fault in which a person moves the arm home, if it has not gone there before."""
     power_off_on_fault: bool = True
     """Switch the drives off while faulted: no idle heat, so the arm cools to ambient temperature."""
 
@@ -67,7 +69,7 @@ class ThermalLimits:
                 "ThermalLimits need restart_c < warning_c < error_c "
                 f"(got {self.restart_c}, {self.warning_c}, {self.error_c})."
             )
-        check_nonnegative(self, "clear_s")
+        check_nonnegative(self, "clear_s", "move_home_s")
 
 
 def rotation(roll_pitch_yaw_deg: tuple[float, float, float]) -> np.ndarray:

@@ -8,9 +8,9 @@ from typing import Literal
 from fleet.errors import nearest
 from fleet.events import Event
 
-Outcome = Literal["finished", "returned", "running"]
+Outcome = Literal["finished", "returned", "given_up", "running"]
 
-_ORDER = ("recover", "finish", "home", "award", "fault", "return")
+_ORDER = ("recover", "finish", "home", "award", "fault", "return", "give_up")
 """The event kinds that determine a schedule, in the order in which they can occur at the same time."""
 
 SAME_MOMENT_DIGITS = 6
@@ -29,11 +29,12 @@ class Assignment:
     finished_s: float | None = None
     """End of the last cycle; None if it was not reached."""
     outcome: Outcome
-    """finished: all cycles done, even if the arm was not home yet; returned: a fault put the job back in the queue."""
+    """finished: all cycles done, even if the arm was not home yet; returned: a fault put the job back in the queue;
+    given_up: the job faulted too often."""
     late_s: float | None = None
     """Tardiness of a finished job; 0 if on time."""
     cycles_kept: int | None = None
-    """Cycles of a returned job that this arm has done and that count."""
+    """Cycles of a returned or given-up job that this arm has done and that count."""
     difficulty: float = float("nan")
     """Score of the award."""
 
@@ -93,24 +94,26 @@ def _assignments(arm: str, log: Sequence[Event], horizon_s: float) -> list[Assig
     out: list[Assignment] = []
     award: Event | None = None
     finish: Event | None = None
+    stopped = False  # by a fault, away from home
     for i, event in enumerate(log):
         if event.kind == "award":
             if award is not None:
                 raise ValueError(f"{_at(event)}: '{arm}' is awarded '{event.job}' while at '{award.job}'.")
-            award, finish = event, None
+            award, finish, stopped = event, None, False
         elif event.kind == "finish":
             if award is None or award.job != event.job:
                 raise ValueError(f"{_at(event)}: '{arm}' finishes '{event.job}', which it was not awarded.")
             finish = event
-        elif event.kind == "home":
+        elif event.kind == "home" and not stopped:
             if award is None or finish is None:
                 raise ValueError(f"{_at(event)}: '{arm}' is home from '{event.job}', which it did not finish.")
             out.append(_assignment(award, finish, event.time_s, "finished"))
             award = None
         elif event.kind == "fault" and award is not None:
-            returned = next((e for e in log[i + 1 :] if e.kind == "return" and e.job == award.job), None)
-            out.append(_assignment(award, finish, event.time_s, "returned", returned))
-            award = None
+            after = next((e for e in log[i + 1 :] if e.kind in ("return", "give_up") and e.job == award.job), None)
+            outcome = "given_up" if after and after.kind == "give_up" else "returned"
+            out.append(_assignment(award, finish, event.time_s, outcome, after))
+            award, stopped = None, True
     if award is not None:
         out.append(_assignment(award, finish, max(horizon_s, award.time_s), "running"))
     return out

@@ -12,7 +12,7 @@ from fleet.engine.event_log import PER_ARM, event_buffer
 from fleet.engine.observe import observe
 from fleet.engine.reset import reset_rows
 from fleet.engine.reward import TERMS, RewardWeights, weights_per_unit
-from fleet.engine.state import DONE, WAITING, State
+from fleet.engine.state import DONE, MOST_FAULTS, WAITING, State
 from fleet.engine.step import step_arms
 from fleet.engine.tables import LANES, Jobs, MeasuredDrive, OpenJobs, Simulation, Tables, Trace, form_of
 from fleet.jit import kernel
@@ -115,6 +115,7 @@ class Engine:
             queue=np.zeros((envs, jobs), np.int32),
             head=np.zeros(envs, int),
             current_kind=np.full((envs, arms), tables.feasible.shape[1]),
+            taken=np.zeros((envs, tables.own_space.shape[1]), np.uint64),
             pending=np.zeros((envs, arms), bool),
         )
         offers.mask[:, :, 0] = 1
@@ -279,9 +280,9 @@ class Engine:
             count, n = int(jobs.number[e]), int(waiting[e].sum())
             offers.queue[e, count - n : count] = order[e, room - n :]
             offers.head[e] = count - n
-        offers.unfinished[:] = (exists & (state.status != DONE)).sum(axis=1)
+        offers.unfinished[:] = (exists & (state.status < DONE)).sum(axis=1)
         env = np.arange(self.envs)[:, None]
-        working = state.mode == WORKING
+        working = (state.mode == WORKING) & (state.job >= 0)
         offers.current_kind[:] = np.where(working, jobs.kind[env, state.job], self.tables.feasible.shape[1])
         offers.pending[:] = working & (state.status[env, state.job] != DONE)
 
@@ -345,17 +346,17 @@ def _arrays(envs: int, arms: int, jobs: int, waits: int) -> tuple[Jobs, State]:
         after=np.full((envs, jobs, waits), -1),
         **{name: job[name] for name in ("kind", "release_s", "due_s", "repetitions")},
     )
-    per_arm = {
-        name: np.zeros((envs, arms))
-        for name in ("progress_s", "clear_at_s", "peak_c", "above_warning_s", "busy_s", "lost_s", "energy_j")
-    }
-    counts = {name: np.zeros((envs, arms), int) for name in ("mode", "job", "todo", "last_award", "faults", "illegal")}
+    seconds = ("progress_s", "clear_at_s", "moved_at_s", "above_warning_s", "busy_s", "lost_s")
+    per_arm = {name: np.zeros((envs, arms)) for name in (*seconds, "peak_c", "energy_j")}
+    whole = ("mode", "job", "plan", "todo", "last_award", "faults", "illegal")
+    counts = {name: np.zeros((envs, arms), int) for name in whole}
     state = State(
         tick=np.zeros(envs, int),
         temp_c=np.zeros((envs, arms, NODES)),
         **per_arm,
         **counts,
         finished_s=np.zeros((envs, jobs)),
+        failed_arm=np.zeros((envs, jobs, MOST_FAULTS - 1), int),
         **{name: job[name] for name in ("status", "queued_s", "cycles", "returns")},
     )
     return drawn, state

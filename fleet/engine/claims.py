@@ -1,14 +1,16 @@
-"""Claims on jobs: what may be claimed, and one winner per job and station.
+"""Claims on jobs: what may be claimed, and one winner per job, station and space.
 
 A job can be claimed once it is released, all jobs before it are done, and nobody works on it. Waiting jobs queue by
 release; a job that a fault returned queues again at the end, so it does not block the others. Of two claims for one
-job or station the lower shared difficulty wins, then the lower arm index.
+job or station, or by two arms whose plans would touch, the lower shared difficulty wins, then the lower arm index.
+
+An arm takes the space of its whole plan from the award until it is home again, all at once: so nothing can deadlock.
 """
 
 import numpy as np
 
 from fleet.engine.event_log import AWARD, ILLEGAL, LOST, record_event
-from fleet.engine.state import DONE, RUNNING, WAITING, State
+from fleet.engine.state import DONE, GIVEN_UP, RUNNING, WAITING, State
 from fleet.engine.tables import Jobs, OpenJobs, Simulation, Tables
 from fleet.jit import jit, jit_inline, nonnegative
 from fleet.telemetry import IDLE, WORKING
@@ -29,7 +31,7 @@ def update_offers(t: Tables, d: Jobs, s: State, o: OpenJobs, rows: Array) -> Non
     fleets, kinds, count, release_s, after = d.fleet, d.kind, d.number, d.release_s, d.after
     tick, modes, status = s.tick, s.mode, s.status
     slot_job, mask, queue, head, current = o.slot_job, o.mask, o.queue, o.head, o.current_kind
-    stations, feasible = t.stations, t.feasible
+    stations, plans, excluded, taken = t.stations, t.plan, t.excluded, o.taken
     arms, slots = nonnegative(modes.shape[1]), nonnegative(slot_job.shape[1])
     waits, words = nonnegative(after.shape[2]), nonnegative(stations.shape[2])
     busy = np.empty(words, np.uint64)
@@ -37,6 +39,7 @@ def update_offers(t: Tables, d: Jobs, s: State, o: OpenJobs, rows: Array) -> Non
         e = nonnegative(row)
         fleet, now_s, filled = nonnegative(fleets[e]), tick[e] * t.dt_s, 0
         mark_busy_stations(fleet, e, current, stations, busy)
+        mark_taken_space(t, s, o, e)
         for place in range(nonnegative(head[e]), count[e]):
             j = nonnegative(queue[e, place])
             if filled == slots or release_s[e, j] > now_s:
@@ -54,7 +57,10 @@ def update_offers(t: Tables, d: Jobs, s: State, o: OpenJobs, rows: Array) -> Non
             slot_job[e, filled] = j
             filled += 1
             for a in range(arms):
-                mask[e, a, filled] = free & (modes[e, a] == IDLE) & feasible[fleet, kind, a]
+                plan = plans[fleet, a, kind]
+                mask[e, a, filled] = (
+                    free and modes[e, a] == IDLE and plan >= 0 and is_free(excluded, nonnegative(plan), taken, e)
+                )
         while filled < slots and slot_job[e, filled] >= 0:  # slots of the step before
             slot_job[e, filled] = -1
             filled += 1
@@ -72,6 +78,28 @@ def mark_busy_stations(fleet: int, e: int, current: Array, stations: Array, busy
 
 
 @jit_inline
+def mark_taken_space(t: Tables, s: State, o: OpenJobs, e: int) -> None:
+    """Put the volumes that the arms of an env take into `taken`."""
+    plans, own, taken = s.plan, t.own_space, o.taken
+    for w in range(taken.shape[1]):
+        taken[e, w] = 0
+    for a in range(plans.shape[1]):
+        plan = plans[e, a]
+        if plan >= 0:
+            for w in range(taken.shape[1]):
+                taken[e, w] |= own[plan, w]
+
+
+@jit_inline
+def is_free(excluded: Array, plan: int, taken: Array, e: int) -> bool:
+    """Whether no arm of an env takes space that a plan needs."""
+    touched = np.uint64(0)
+    for w in range(taken.shape[1]):
+        touched |= excluded[plan, w] & taken[e, w]
+    return touched == 0
+
+
+@jit_inline
 def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
     """Award every claimed job to one arm; an action outside the mask is counted and waits.
 
@@ -85,6 +113,7 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
     progress_s, todo, cycles = s.progress_s, s.todo, s.cycles
     slot_job, mask, queue, head, current, pending = o.slot_job, o.mask, o.queue, o.head, o.current_kind, o.pending
     stations, work, recording = t.stations, t.work, len(events.what) > 0
+    plans, plan_of, own, excluded, taken = s.plan, t.plan, t.own_space, t.excluded, o.taken
     arms, slots, words = (
         nonnegative(modes.shape[1]),
         nonnegative(slot_job.shape[1]),
@@ -120,6 +149,8 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
             a = order[rank]
             j = nonnegative(slot_job[e, actions[e, a] - 1])
             kind, free = nonnegative(kinds[e, j]), status[e, j] == WAITING
+            plan = nonnegative(plan_of[fleet, a, kind])
+            free = free and is_free(excluded, plan, taken, e)
             for w in range(words):
                 free = free and (stations[fleet, kind, w] & busy[w]) == 0
             if not free:
@@ -131,7 +162,9 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
                 busy[w] |= stations[fleet, kind, w]
             remove_from_queue(queue, head, e, j)
             last[e, a], status[e, j] = 1, RUNNING
-            modes[e, a], jobs[e, a], progress_s[e, a] = WORKING, j, 0.0
+            modes[e, a], jobs[e, a], plans[e, a], progress_s[e, a] = WORKING, j, plan, 0.0
+            for w in range(taken.shape[1]):
+                taken[e, w] |= own[plan, w]
             current[e, a], pending[e, a] = kind, True
             todo[e, a] = repetitions[e, j] - cycles[e, j]
             if recording:
@@ -167,3 +200,21 @@ def return_to_queue(d: Jobs, s: State, o: OpenJobs, e: int, j: int, until_s: flo
         queue[e, place] = ahead
         place += 1
     queue[e, place] = j
+
+
+@jit
+def give_up(d: Jobs, s: State, o: OpenJobs, e: int, j: int) -> None:
+    """Give a running job up, and with it all that wait for it."""
+    status, after = s.status, d.after
+    status[e, j] = GIVEN_UP
+    o.unfinished[e] -= 1
+    found = after.shape[2] > 0
+    while found:
+        found = False
+        for i in range(d.number[e]):
+            for n in range(after.shape[2]):
+                before = after[e, i, n]
+                if status[e, i] == WAITING and before >= 0 and status[e, before] == GIVEN_UP:
+                    status[e, i], found = GIVEN_UP, True
+                    remove_from_queue(o.queue, o.head, e, i)
+                    o.unfinished[e] -= 1

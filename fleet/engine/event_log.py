@@ -12,9 +12,9 @@ from fleet.jit import jit
 
 Array = np.ndarray
 
-AWARD, LOST, ILLEGAL, WARNING, FINISH, HOME, FAULT, RETURN, RECOVER = range(9)
+AWARD, LOST, ILLEGAL, WARNING, FINISH, HOME, FAULT, RETURN, GIVE_UP, RECOVER, MOVED = range(11)
 """Kinds of recorded events, in the order in which those of one step are reported."""
-PER_ARM = 9
+PER_ARM = 10
 """Most events of one arm in one step."""
 
 
@@ -44,7 +44,8 @@ def events_of(world: World, state: State, buffer: EventBuffer) -> Iterator[Event
     count = int(buffer.used[0])
     what, numbers = buffer.what[:count], buffer.numbers[:count]
     began_s = (state.tick - 1) * world.dt_s
-    phase = what[:, 0] - (what[:, 0] == RETURN)  # a return follows the fault of its arm
+    # What becomes of the job follows the fault of its arm.
+    phase = np.where((what[:, 0] == RETURN) | (what[:, 0] == GIVE_UP), FAULT, what[:, 0])
     for row in np.lexsort((what[:, 2], what[:, 1], phase)).tolist():
         kind, e, a, j, joint = what[row].tolist()
         offset_s, value = numbers[row].tolist()
@@ -71,7 +72,7 @@ def _described(
         case 0:
             return "award", value, ""
         case 1:
-            return "lost", math.nan, "another arm claimed it or its station"
+            return "lost", math.nan, "another arm claimed it, its station or the space"
         case 2:
             return "illegal", math.nan, "action outside the mask: a wait"
         case 3:
@@ -85,6 +86,10 @@ def _described(
             return "fault", limits.error_c, f"motor {joint + 1} passed {limits.error_c:g} °C"
         case 7:
             return "return", value, f"{state.cycles[e, j]} of {world.jobs.repetitions[e, j]} cycles kept"
+        case 8:
+            return "give_up", value, f"{state.returns[e, j]} faults; {state.cycles[e, j]} cycles done"
+        case 10:
+            return "moved", math.nan, "moved home by a person"
         case _:
             return "recover", math.nan, f"every motor below {limits.restart_c:g} °C and the fault cleared"
 

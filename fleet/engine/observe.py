@@ -32,7 +32,7 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
     fleets, kinds, keys, repetitions, due_s = d.fleet, d.kind, d.noise_key, d.repetitions, d.due_s
     ticks, temp_c, modes, progress_s, todo = s.tick, s.temp_c, s.mode, s.progress_s, s.todo
     last, queued_s, cycles, returns = s.last_award, s.queued_s, s.cycles, s.returns
-    slot_job, current = o.slot_job, o.current_kind
+    slot_job, plans, times_s = o.slot_job, s.plan, t.times_s
     noise_k, payload_kg, values, work = t.sensor_noise_k, t.payload_kg, t.value, t.work
     risk_offset, risk_weight, risk_curve = t.risk_offset, t.risk_weight, t.risk_curve
     arms, slots = nonnegative(modes.shape[1]), nonnegative(slot_job.shape[1])
@@ -98,8 +98,8 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
             mode = nonnegative(modes[e, a])
             out[e, a, at.idle + mode] = 1.0
             if mode == WORKING:
-                own = work[fleet, a, nonnegative(current[e, a])]
-                busy_s = own["travel_s"] + todo[e, a] * own["cycle_s"] - progress_s[e, a]
+                plan = nonnegative(plans[e, a])
+                busy_s = times_s[plan, 0] + times_s[plan, 2] + todo[e, a] * times_s[plan, 1] - progress_s[e, a]
                 out[e, a, at.busy_s] = min(max(busy_s, 0.0), LONG_S)
             out[e, a, at.last_award] = last[e, a]
             for k in range(JOINTS):

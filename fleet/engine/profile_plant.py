@@ -31,8 +31,6 @@ class ProfilePlant:
 
     def __init__(self, plans: Sequence[Plan], rest_q: Array, rest_tau: Array) -> None:
         self._rest = np.stack([rest_q, np.zeros_like(rest_q), rest_tau], axis=1)  # [arm, channel, joint]
-        self._stopped = self._rest.copy()
-        """Where the brakes stopped each arm last."""
         self._phases = [phase for plan in plans for phase in plan.phases]
 
     @cached_property
@@ -56,31 +54,22 @@ class ProfilePlant:
         raise NotImplementedError("ProfilePlant follows plans: the engine computes the drive.")
 
     def motion(self, world: World, record: StepRecord, offsets_s: Array) -> Array:
-        """Joint motion at moments of steps, [step, sample, arm, channel, joint]; each step once, in order."""
+        """Joint motion at moments of steps, [step, sample, arm, channel, joint]."""
         return np.stack([self._motion(world, record, a, offsets_s) for a in range(len(world.arms))], axis=2)
 
     def _motion(self, world: World, record: StepRecord, a: int, offsets_s: Array) -> Array:
         """Motion of one arm, [step, sample, channel, joint]."""
-        mode, cut_s, steps = record.mode[:, a], record.cut_s[:, a], len(record.tick)
-        # One sample more: where a fault stops the arm.
-        moments = np.concatenate([np.broadcast_to(offsets_s, (steps, len(offsets_s))), cut_s[:, None]], axis=1)
-        away = (mode == WORKING)[:, None] & (moments < record.home_s[:, a, None])
-        out = np.broadcast_to(self._rest[a], (*moments.shape, *self._rest[a].shape)).copy()
+        mode, cut_s = record.mode[:, a, None], record.cut_s[:, a, None]
+        moved_s = np.where(mode == FAULTED, 0.0, np.minimum(offsets_s, cut_s))  # [step, sample]
+        away = (record.plan[:, a, None] >= 0) & (moved_s < record.home_s[:, a, None])
+        out = np.broadcast_to(self._rest[a], (*moved_s.shape, *self._rest[a].shape)).copy()
         step = np.nonzero(away)[0]
         plan = record.plan[step, a]
-        row = sample_row(self._lengths[plan], record.progress_s[step, a] + moments[away], record.todo[step, a])
+        row = sample_row(self._lengths[plan], record.progress_s[step, a] + moved_s[away], record.todo[step, a])
         out[away] = self._samples[self._first[plan] + row]
-        stopped, faults = out[:, -1], cut_s < world.dt_s
-        stopped[:, 1:] = 0.0
-        out[(moments >= cut_s[:, None]) & faults[:, None]] = np.repeat(
-            stopped[faults], (moments >= cut_s[:, None])[faults].sum(axis=1), axis=0
-        )
-        latest = np.maximum.accumulate(np.where(faults, np.arange(steps), -1))
-        where = np.concatenate([stopped, self._stopped[a][None]])  # row −1: before these steps
-        faulted = mode == FAULTED
-        out[faulted] = where[latest[faulted]][:, None]
-        self._stopped[a] = where[latest[-1]]
-        return out[:, :-1]
+        braked = (mode == FAULTED) | ((cut_s < world.dt_s) & (offsets_s >= cut_s))
+        out[braked, 1:] = 0.0
+        return out
 
 
 def sample_row(lengths: Array, time_s: Array, repetitions: Array | int) -> Array:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from fleet.engine.crossings import hottest
-from fleet.engine.state import WAITING
+from fleet.engine.state import MOST_FAULTS, WAITING
 from fleet.engine.tables import Simulation
 from fleet.jit import kernel, nonnegative
 from fleet.telemetry import IDLE
@@ -66,10 +66,13 @@ def reset_rows(
             d.release_s[e, j] = d.due_s[e, j] = s.queued_s[e, j] = np.inf
         for j in range(room):
             s.status[e, j], s.cycles[e, j], s.returns[e, j], s.finished_s[e, j] = WAITING, 0, 0, np.nan
+            for w in range(MOST_FAULTS - 1):
+                s.failed_arm[e, j, w] = -1
             for w in range(waits):
                 d.after[e, j, w] = after[at + j, w] if j < count and w < own else -1
         for a in range(arms):
-            s.mode[e, a], s.job[e, a], s.clear_at_s[e, a] = IDLE, -1, np.inf
+            s.mode[e, a], s.job[e, a], s.plan[e, a] = IDLE, -1, -1
+            s.clear_at_s[e, a] = s.moved_at_s[e, a] = np.inf
             o.current_kind[e, a], o.pending[e, a] = t.feasible.shape[1], False
             s.todo[e, a] = s.last_award[e, a] = s.faults[e, a] = s.illegal[e, a] = 0
             s.progress_s[e, a] = s.above_warning_s[e, a] = s.busy_s[e, a] = s.lost_s[e, a] = s.energy_j[e, a] = 0.0

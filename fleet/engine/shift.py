@@ -32,7 +32,7 @@ class StepRecord:
     mode: Array
     """At the beginning, with the awards made, int [step, arm]."""
     plan: Array
-    """Row of the plan table, int [step, arm]; 0 where there is no job."""
+    """Row of the plan table, int [step, arm]; −1 at home."""
     progress_s: Array
     """Time since leaving home, at the beginning, [step, arm]."""
     todo: Array
@@ -213,7 +213,7 @@ def _stepped(engine: Engine, world: World, plant: Plant, actions: Array, out: Ar
 def _without_room(state: State, world: World) -> State:
     """Views of the state with as many jobs as the world has; an engine may have room for more."""
     jobs = world.jobs.exists.shape[1]
-    per_job = ("status", "queued_s", "cycles", "returns", "finished_s")
+    per_job = ("status", "queued_s", "cycles", "returns", "failed_arm", "finished_s")
     return state._replace(**{name: getattr(state, name)[:, :jobs] for name in per_job})
 
 

@@ -17,8 +17,10 @@ from fleet.thermal import NODES, ThermalModel
 
 Array = np.ndarray
 
-WAITING, RUNNING, DONE = 0, 1, 2
+WAITING, RUNNING, DONE, GIVEN_UP = range(4)
 """Status of a job."""
+MOST_FAULTS = 3
+"""A job is given up at its third fault, or at the second of one arm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +55,8 @@ class PlanTable:
     """Mean friction heat, W, [plan, phase, joint]."""
     peak_tau: Array
     """Largest torque magnitude, N·m, [plan, joint]."""
+    volume: Array
+    """Index of the space that the arm takes, int [plan]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +101,8 @@ class World:
     plans: PlanTable
     jobs: JobTable
     offers: Offers
+    conflicts: Array
+    """Whether two arms cannot take two volumes at a time, bool [volume, volume]."""
     start_c: Array
     """Temperatures at the start of the shift, [arm, node]."""
     phi: Array
@@ -125,12 +131,16 @@ class State(NamedTuple):
     """IDLE, WORKING or FAULTED, int [env, arm]."""
     job: Array
     """Index of the current job, int [env, arm], −1 for none."""
+    plan: Array
+    """Row of the `PlanTable` along which the arm is away from home, int [env, arm]; −1 at home."""
     progress_s: Array
-    """Time since the arm left home for its current job, [env, arm]."""
+    """How far along it, in its time since leaving home, [env, arm]; a fault stops it."""
     todo: Array
     """Cycles the arm set out to do, int [env, arm]."""
     clear_at_s: Array
     """When the fault will be cleared, inf while too hot or not faulted, [env, arm]."""
+    moved_at_s: Array
+    """When a person will move the faulted arm home, inf if it is there or not faulted, [env, arm]."""
     last_award: Array
     """1 the last claim was won, −1 lost, 0 none was made, int [env, arm]."""
     faults: Array
@@ -148,13 +158,15 @@ class State(NamedTuple):
     energy_j: Array
     """Electrical energy turned to heat, [env, arm]. Over closed cycles mechanical work sums to zero."""
     status: Array
-    """WAITING, RUNNING or DONE, int [env, job]."""
+    """WAITING, RUNNING, DONE or GIVEN_UP, int [env, job]."""
     queued_s: Array
     """When the job was released or last returned, [env, job]."""
     cycles: Array
     """Cycles finished and kept, int [env, job]."""
     returns: Array
     """How many times a fault returned it to the queue, int [env, job]."""
+    failed_arm: Array
+    """Arms that it faulted so far, int [env, job, MOST_FAULTS - 1], −1 for none."""
     finished_s: Array
     """NaN until done, [env, job]."""
 
@@ -177,9 +189,11 @@ def initial(world: World) -> State:
         temp_c=temp,
         mode=per_arm(IDLE, int),
         job=per_arm(-1, int),
+        plan=per_arm(-1, int),
         progress_s=per_arm(0.0),
         todo=per_arm(0, int),
         clear_at_s=per_arm(np.inf),
+        moved_at_s=per_arm(np.inf),
         last_award=per_arm(0, int),
         faults=per_arm(0, int),
         illegal=per_arm(0, int),
@@ -192,5 +206,6 @@ def initial(world: World) -> State:
         queued_s=world.jobs.release_s.copy(),
         cycles=np.zeros((envs, jobs), dtype=int),
         returns=np.zeros((envs, jobs), dtype=int),
+        failed_arm=np.full((envs, jobs, MOST_FAULTS - 1), -1),
         finished_s=np.full((envs, jobs), np.nan),
     )

@@ -7,10 +7,10 @@ depend on how many rows there are.
 
 import numpy as np
 
-from fleet.engine.claims import return_to_queue
+from fleet.engine.claims import give_up, return_to_queue
 from fleet.engine.crossings import hottest, step_with_crossing
-from fleet.engine.event_log import FAULT, FINISH, HOME, RECOVER, RETURN, WARNING, record_event
-from fleet.engine.state import DONE, WAITING
+from fleet.engine.event_log import FAULT, FINISH, GIVE_UP, HOME, MOVED, RECOVER, RETURN, WARNING, record_event
+from fleet.engine.state import DONE, MOST_FAULTS, WAITING
 from fleet.engine.tables import LANES, WIDE, Simulation
 from fleet.jit import jit_inline, nonnegative
 from fleet.motor import magnet_factor, winding_heat
@@ -43,7 +43,8 @@ def step_arms(sim: Simulation, weights: Array, terms: Array, rows: Array) -> Non
     unfinished, current, pending = o.unfinished, o.current_kind, o.pending
     ambient, thermal_step, to_ambient = t.ambient_c, t.thermal_step, t.to_ambient
     copper, idle_w, rest_sq, rest_w = t.copper_w_per_a2, t.idle_w, t.rest_current_sq, t.rest_friction_w
-    plan_sq, plan_w, times_s, plans, values = t.current_sq, t.friction_w, t.times_s, t.plan, t.value
+    plan_sq, plan_w, times_s, values = t.current_sq, t.friction_w, t.times_s, t.value
+    plans, moved_at_s, failed_arm = s.plan, s.moved_at_s, s.failed_arm
     dt_s, warning_c, error_c, restart_c = t.dt_s, t.warning_c, t.error_c, t.restart_c
     recording, tracing, driven = len(events.what) > 0, len(trace.plan) > 0, len(measured.current_sq) > 0
     copper_w, other_w, fold = np.empty(LANES), np.empty(LANES), np.empty(4)
@@ -59,7 +60,7 @@ def step_arms(sim: Simulation, weights: Array, terms: Array, rows: Array) -> Non
             plan, spent_s, done_s, home_s = 0, 0.0, np.inf, np.inf
             first_s = cycle_s = share_0 = share_1 = share_2 = 0.0
             if mode == WORKING:
-                plan = nonnegative(plans[fleet, a, nonnegative(current[e, a])])
+                plan = nonnegative(plans[e, a])
                 begin_s = progress_s[e, a]
                 until_s = begin_s + dt_s
                 first_s, cycle_s = times_s[plan, 0], times_s[plan, 1]
@@ -106,7 +107,7 @@ def step_arms(sim: Simulation, weights: Array, terms: Array, rows: Array) -> Non
             cut_s, here_s, here_j, top_c, cool_s = dt_s, 0.0, heat_w * dt_s, last_c, np.inf
             fault_joint = -1
             if tracing:
-                trace.mode[e, a], trace.plan[e, a], trace.progress_s[e, a] = mode, plan, progress_s[e, a]
+                trace.mode[e, a], trace.plan[e, a], trace.progress_s[e, a] = mode, plans[e, a], progress_s[e, a]
                 trace.todo[e, a], trace.home_s[e, a] = todo[e, a], home_s
                 for n in range(NODES):
                     trace.start_c[e, a, n] = begin[n]
@@ -147,7 +148,7 @@ def step_arms(sim: Simulation, weights: Array, terms: Array, rows: Array) -> Non
                 if home_s <= cut_s:
                     if recording:
                         record_event(events, HOME, e, a, jobs[e, a], -1, home_s, 0.0)
-                    modes[e, a], jobs[e, a], progress_s[e, a], todo[e, a] = IDLE, -1, 0.0, 0
+                    modes[e, a], jobs[e, a], plans[e, a], progress_s[e, a], todo[e, a] = IDLE, -1, -1, 0.0, 0
                     current[e, a] = no_kind
             if mode == FAULTED:
                 lost_s[e, a] += dt_s
@@ -159,26 +160,44 @@ def step_arms(sim: Simulation, weights: Array, terms: Array, rows: Array) -> Non
                     kept = int((progress_s[e, a] - first_s) // cycle_s)
                     kept = min(max(kept, 0), todo[e, a])
                     cycles[e, j] += kept
-                    status[e, j], queued_s[e, j] = WAITING, now_s + cut_s
+                    # Once it may move again the arm ends the cycle in which it stopped, which does not count.
+                    todo[e, a] = min(kept + 1, todo[e, a]) if progress_s[e, a] > first_s else 0
+                    before, again = nonnegative(returns[e, j]), False
+                    for n in range(before):
+                        again = again or failed_arm[e, j, n] == a
                     returns[e, j] += 1
-                    return_to_queue(d, s, o, e, j, now_s + dt_s)
+                    again = again or before + 1 == MOST_FAULTS
+                    if again:
+                        give_up(d, s, o, e, j)
+                    else:
+                        failed_arm[e, j, before] = a
+                        status[e, j], queued_s[e, j] = WAITING, now_s + cut_s
+                        return_to_queue(d, s, o, e, j, now_s + dt_s)
                     pending[e, a] = False
                     if recording:
-                        record_event(events, RETURN, e, a, j, -1, cut_s, kept)
+                        record_event(events, GIVE_UP if again else RETURN, e, a, j, -1, cut_s, kept)
                 count += 1.0
                 faults[e, a] += 1
                 lost_s[e, a] += dt_s - cut_s
-                modes[e, a], jobs[e, a], progress_s[e, a], todo[e, a] = FAULTED, -1, 0.0, 0
-                current[e, a] = no_kind
+                modes[e, a], jobs[e, a], current[e, a] = FAULTED, -1, no_kind
+                if plans[e, a] >= 0:
+                    moved_at_s[e, a] = now_s + cut_s + t.move_home_s
             if modes[e, a] == FAULTED:
                 if clear_at_s[e, a] == np.inf and cool_s < np.inf:
                     clear_at_s[e, a] = now_s + cool_s + t.clear_s
                 if clear_at_s[e, a] <= (tick + 1) * dt_s:
                     recovered_s = clear_at_s[e, a] - now_s
                     lost_s[e, a] -= dt_s - recovered_s
-                    modes[e, a], clear_at_s[e, a] = IDLE, np.inf
+                    modes[e, a], clear_at_s[e, a] = IDLE if plans[e, a] < 0 else WORKING, np.inf
+                    if moved_at_s[e, a] > now_s + recovered_s:
+                        moved_at_s[e, a] = np.inf
                     if recording:
                         record_event(events, RECOVER, e, a, -1, -1, recovered_s, restart_c)
+                if moved_at_s[e, a] <= (tick + 1) * dt_s:
+                    if recording:
+                        record_event(events, MOVED, e, a, -1, -1, moved_at_s[e, a] - now_s, 0.0)
+                    plans[e, a], progress_s[e, a], todo[e, a], moved_at_s[e, a] = -1, 0.0, 0, np.inf
+                    modes[e, a] = IDLE if modes[e, a] == WORKING else FAULTED
         terms[e, 0], terms[e, 1], terms[e, 2] = value * weights[0], late * weights[1], above_s * weights[2]
         terms[e, 3], terms[e, 4] = count * weights[3], energy * weights[4]
         terms[e, 5] = terms[e, 0] + terms[e, 1] + terms[e, 2] + terms[e, 3] + terms[e, 4]

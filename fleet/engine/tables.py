@@ -43,6 +43,7 @@ class Tables(NamedTuple):
     error_c: float
     restart_c: float
     clear_s: float
+    move_home_s: float
     power_off: bool
     alpha_cu_per_k: float
     alpha_kt_per_k: float
@@ -77,6 +78,10 @@ class Tables(NamedTuple):
     """[plan, phase, lane]."""
     friction_w: Array
     """[plan, phase, lane]."""
+    own_space: Array
+    """Volume that a plan takes, one bit, uint64 [plan, word]; volumes are counted for each fleet."""
+    excluded: Array
+    """Volumes that must be free for a plan, one bit each, uint64 [plan, word]."""
     plan: Array
     """Row of the plan tables, −1 where the arm cannot do it, int [fleet, arm, kind]."""
     work: Array
@@ -135,6 +140,8 @@ class OpenJobs(NamedTuple):
     """Where in its row the queue begins, int [env]."""
     current_kind: Array
     """Kind of an arm's current job, int [env, arm]; the number of kinds if it has none."""
+    taken: Array
+    """Volumes that arms take which are away from home, one bit each, uint64 [env, word]."""
     pending: Array
     """Whether the current job is still to be finished, bool [env, arm]; False on the way home."""
 
@@ -156,7 +163,7 @@ class Trace(NamedTuple):
     mode: Array
     """At the beginning, with the awards made, int [env, arm]."""
     plan: Array
-    """Row of the plan tables, int [env, arm]; 0 where there is no job."""
+    """Row of the plan tables, int [env, arm]; −1 at home."""
     progress_s: Array
     """At the beginning, [env, arm]."""
     todo: Array
@@ -231,6 +238,7 @@ def tables_of(world: World) -> tuple[Tables, Jobs]:
 
     limits, motors, offers, rest = world.limits, world.motors, world.offers, world.rest
     can = offers.plan >= 0
+    volumes = np.eye(len(world.conflicts), dtype=bool)
     times_s = np.where(can[..., None], world.plans.times_s[offers.plan], 0.0)
     work = np.zeros(can.shape, WORK)
     work["travel_s"], work["cycle_s"] = times_s[..., 0] + times_s[..., 2], times_s[..., 1]
@@ -244,6 +252,7 @@ def tables_of(world: World) -> tuple[Tables, Jobs]:
         error_c=float(limits.error_c),
         restart_c=float(limits.restart_c),
         clear_s=float(limits.clear_s),
+        move_home_s=float(limits.move_home_s),
         power_off=bool(limits.power_off_on_fault),
         alpha_cu_per_k=float(motors.alpha_cu_per_k),
         alpha_kt_per_k=float(motors.alpha_kt_per_k),
@@ -263,13 +272,15 @@ def tables_of(world: World) -> tuple[Tables, Jobs]:
         times_s=world.plans.times_s,
         current_sq=pad(world.plans.current_sq),
         friction_w=pad(world.plans.friction_w),
+        own_space=bits(volumes[world.plans.volume]),
+        excluded=bits(world.conflicts[world.plans.volume]),
         plan=offers.plan,
         work=work,
         risk_offset=risk_offset,
         risk_weight=risk_weight,
         risk_curve=risk_curve,
         feasible=can.swapaxes(-1, -2),
-        stations=_station_bits(jobs.stations, len(world.stations)),
+        stations=bits(_one_hot(jobs.stations, len(world.stations))),
         payload_kg=jobs.payload_kg,
         value=jobs.value,
     )
@@ -296,15 +307,21 @@ def pad(values: Array, axis: int = -1, size: int = LANES, fill: float = 0.0) -> 
     return padded
 
 
-def _station_bits(stations: Array, count: int) -> Array:
-    """Bits of stations given as int [fleet, kind, n], −1 for none."""
-    fleets, kinds, most = stations.shape
-    bits = np.zeros((fleets, kinds + 1, max(1, -(-count // 64))), np.uint64)
-    for n in range(most):
-        fleet, kind = np.nonzero(stations[..., n] >= 0)
-        station = stations[fleet, kind, n]
-        bits[fleet, kind, station // 64] |= np.uint64(1) << (station % 64).astype(np.uint64)
-    return bits
+def bits(flags: Array) -> Array:
+    """Flags as bits, uint64 [..., word], of bool [..., n]."""
+    words = max(1, -(-flags.shape[-1] // 64))
+    packed = np.packbits(pad(flags, size=64 * words, fill=False), axis=-1, bitorder="little")
+    return np.ascontiguousarray(packed).view("<u8").astype(np.uint64)
+
+
+def _one_hot(stations: Array, count: int) -> Array:
+    """Which stations each kind of job occupies, bool [fleet, kind + 1, station], of int [fleet, kind, n], −1 for none;
+    the last row, no job, has none."""
+    fleets, kinds, _ = stations.shape
+    flags = np.zeros((fleets, kinds + 1, count), bool)
+    fleet, kind, n = np.nonzero(stations >= 0)
+    flags[fleet, kind, stations[fleet, kind, n]] = True
+    return flags
 
 
 def _risk_tables(risks: Risk | None) -> tuple[Array, Array, Array]:
@@ -326,7 +343,7 @@ def owned(arrays: Arrays) -> Arrays:
 
 
 _SCALARS = tuple(name for name, kind in Tables.__annotations__.items() if kind is not Array)
-_RENUMBERED = ("plan", "risk_offset", "risk_weight", "risk_curve", "stations")
+_RENUMBERED = ("plan", "risk_offset", "risk_weight", "risk_curve", "stations", "own_space", "excluded")
 
 
 def stack_tables(fleets: Sequence[Tables]) -> Tables:
@@ -349,7 +366,6 @@ def stack_tables(fleets: Sequence[Tables]) -> Tables:
     risks = np.cumsum([0, *(len(each.risk_offset) for each in fleets)])
     pieces = max(each.risk_offset.shape[1] for each in fleets)
     knots = max(each.risk_curve.shape[1] for each in fleets)
-    words = max(each.stations.shape[2] for each in fleets)
 
     def shifted(each: Iterable[Array], by: Array) -> Array:
         return np.concatenate([np.where(v >= 0, v + n, -1) for v, n in zip(each, by, strict=False)])
@@ -367,9 +383,17 @@ def stack_tables(fleets: Sequence[Tables]) -> Tables:
             risk_offset=np.concatenate([pad(t.risk_offset, 1, pieces, -np.inf) for t in fleets]),
             risk_weight=np.concatenate([pad(t.risk_weight, 1, pieces) for t in fleets]),
             risk_curve=np.concatenate([_extend_curve(t.risk_curve, knots) for t in fleets]),
-            stations=np.concatenate([pad(t.stations, 2, words) for t in fleets]),
+            stations=_same_words([t.stations for t in fleets]),
+            own_space=_same_words([t.own_space for t in fleets]),
+            excluded=_same_words([t.excluded for t in fleets]),
         )
     )
+
+
+def _same_words(fleets: Sequence[Array]) -> Array:
+    """Bits of several fleets, [fleet or plan, ..., word], one after the other."""
+    words = max(each.shape[-1] for each in fleets)
+    return np.concatenate([pad(each, size=words) for each in fleets])
 
 
 def _extend_curve(curve: Array, knots: int) -> Array:

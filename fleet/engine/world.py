@@ -15,6 +15,8 @@ from fleet.robot import GEN3, Robot, ThermalLimits
 from fleet.thermal import ThermalModel, stack_models, steady_state
 
 Array = np.ndarray
+Space = Callable[[Sequence[Plan]], tuple[Array, Array]]
+"""Volume of each plan, int [plan], and which volumes two arms cannot take at a time, bool [volume, volume]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +114,7 @@ def build_world(
     slots: int,
     ambient_c: Array,
     start_warm: bool,
+    space: Space | None = None,
 ) -> tuple[World, tuple[Plan, ...]]:
     """The world of one or more parallel shifts, and the plans behind the rows of its plan table.
 
@@ -119,9 +122,11 @@ def build_world(
         shifts: The jobs of each env.
         ambient_c: Air at each arm during each tick, [tick, arm].
         start_warm: Arms begin at their idle equilibrium rather than at ambient.
+        space: Which plans of two arms would touch; none if not given.
     """
     motors, thermal, rest, phi, gamma = _laws(tuple(arms), dt_s)
     plans, offers = _offers(arms, shifts)
+    volume, conflicts = space(plans) if space and plans else (np.zeros(max(1, len(plans)), int), np.zeros((1, 1), bool))
     start = np.repeat(ambient_c[0][:, None], thermal.capacity.shape[-1], axis=1)
     if start_warm:
         start = np.stack([warm_start(a, c) for a, c in zip(arms, ambient_c[0].tolist(), strict=True)])
@@ -138,9 +143,10 @@ def build_world(
         limits=limits,
         torque_warning=np.array(GEN3.torque_warning),
         rest=rest,
-        plans=_plan_table(plans, {arm.robot.name: arm for arm in arms}),
+        plans=_plan_table(plans, {arm.robot.name: arm for arm in arms}, volume),
         jobs=_job_table(shifts, stations),
         offers=offers,
+        conflicts=conflicts,
         start_c=start,
         phi=phi,
         gamma=gamma,
@@ -186,12 +192,12 @@ def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]]) -> tuple[tuple
     return tuple(plans), Offers(plan=plan, difficulty=total, p_saturation=p_saturation, risk=risk, risks=stack)
 
 
-def _plan_table(plans: Sequence[Plan], arms: Mapping[str, Arm]) -> PlanTable:
+def _plan_table(plans: Sequence[Plan], arms: Mapping[str, Arm], volume: Array) -> PlanTable:
     if not plans:
         joints = len(GEN3.velocity)
         empty = np.zeros((1, 3, joints))
-        return PlanTable(np.zeros((1, 3)), empty, empty, np.zeros((1, joints)))
-    return PlanTable(*map(np.array, zip(*(arms[plan.arm].driven(plan) for plan in plans), strict=True)))
+        return PlanTable(np.zeros((1, 3)), empty, empty, np.zeros((1, joints)), volume)
+    return PlanTable(*map(np.array, zip(*(arms[plan.arm].driven(plan) for plan in plans), strict=True)), volume)
 
 
 def _job_table(shifts: Sequence[Sequence[Job]], stations: Sequence[str]) -> JobTable:

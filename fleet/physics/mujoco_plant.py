@@ -144,7 +144,7 @@ class MujocoPlant:
         return samples
 
     def _follow(self, world: World, state: State, samples: int) -> None:
-        """Apply the faults and recoveries of the tick before: brake arms, or place them at home."""
+        """Apply the faults and recoveries of the tick before: brake arms, or place at home those that were moved."""
         tick = int(state.tick[0])
         if tick == 0:
             self._reset()
@@ -156,9 +156,12 @@ class MujocoPlant:
             q = self._motion[self._sample_of(np.array(at_s)), a, 0]
             self._place(a, q)
             self._held[a] = still(q, self._gravity(a), samples)
-        for a in [a for a in self._held if state.mode[0, a] != FAULTED]:
-            self._place(a, self._home_q[a])
-            del self._held[a]
+        for a in list(self._held):
+            if state.plan[0, a] < 0:  # moved there
+                self._place(a, self._home_q[a])
+                self._held[a] = still(self._home_q[a], self._home_tau[a], samples)
+            if state.mode[0, a] != FAULTED:
+                del self._held[a]
         self._tick = tick
         self._faults, self._lost_s = state.faults[0].copy(), state.lost_s[0].copy()
 
@@ -168,7 +171,7 @@ class MujocoPlant:
         home = still(self._home_q[a], self._home_tau[a], samples)
         if state.mode[0, a] != WORKING:
             return home
-        plan = self._plans[world.offers.plan[0, a, state.job[0, a]]]
+        plan = self._plans[state.plan[0, a]]
         return reference(plan, int(state.todo[0, a]), float(state.progress_s[0, a]), samples, home)
 
     def _simulate(self, references: list[Reference]) -> None:

@@ -24,8 +24,17 @@ def with_difficulty(world: World, difficulty) -> World:
     return replace(world, offers=replace(offers, difficulty=np.broadcast_to(difficulty, offers.difficulty.shape)))
 
 
-def referee(slot_job, mask, stations, actions, difficulty, occupied):
-    """Award claims in order of (difficulty, arm); return jobs, losers, illegal."""
+def with_conflicts(world: World, conflicts) -> World:
+    """Return the world in which each plan has its own volume; conflicts are bool [plan, plan]."""
+    return replace(world, plans=replace(world.plans, volume=np.arange(len(conflicts))), conflicts=conflicts)
+
+
+def referee(slot_job, mask, stations, actions, difficulty, occupied, touches, away):
+    """Award claims in order of (difficulty, arm); return jobs, losers, illegal.
+
+    `touches(arm, job, plan)` tells whether the arm's plan for a job touches a plan; `away` are the plans of arms that
+    are away from home.
+    """
     arms = len(actions)
     legal = [0 <= a < mask.shape[1] and bool(mask[i, a]) for i, a in enumerate(actions)]
     claims = []
@@ -33,11 +42,12 @@ def referee(slot_job, mask, stations, actions, difficulty, occupied):
         if legal[i] and action > 0:
             job = slot_job[action - 1]
             claims.append((np.inf if np.isnan(difficulty[i, job]) else difficulty[i, job], i, job))
-    won, taken, busy = [-1] * arms, set(), set(occupied)
+    won, taken, busy, away = [-1] * arms, set(), set(occupied), list(away)
     for _, i, job in sorted(claims):
-        if job not in taken and not stations[job] & busy:
+        if job not in taken and not stations[job] & busy and not any(touches(i, job, plan) for plan in away):
             won[i] = job
             taken.add(job)
+            away.append((i, job))
             busy |= stations[job]
     return won, [won[i] < 0 and i in {c[1] for c in claims} for i in range(arms)], [not ok for ok in legal]
 
@@ -54,6 +64,17 @@ def test_awards_equal_the_reference(small, data) -> None:
     pairs = [(p[0], 0.0, p[1]) if isinstance(p, tuple) else (p,) for p in places]
     world, plant = world_of(small, pairs, arms=arms)
     state, count = initial(world), len(places)
+    plan = world.offers.plan[0]
+    size = int(plan.max()) + 1
+    pairs = st.lists(st.tuples(st.integers(0, size - 1), st.integers(0, size - 1)), max_size=8)
+    conflicts = np.zeros((size, size), bool)
+    for one, other in data.draw(pairs):
+        conflicts[one, other] = conflicts[other, one] = True
+    world = with_conflicts(world, conflicts)
+
+    def touches(arm, job, other):
+        return conflicts[plan[arm, job], plan[other]]
+
     value = st.sampled_from([0.1, 0.5, 0.5, 2.0, float("nan")])
     for _ in range(3):
         actions = np.array(data.draw(st.lists(st.integers(-2, 6), min_size=arms, max_size=arms)))
@@ -63,11 +84,13 @@ def test_awards_equal_the_reference(small, data) -> None:
         slot_job, mask = open_jobs(world, state, compiled=False)
         held = [j for j in state.job[0].tolist() if j >= 0]
         busy = set().union(*(stations[j] for j in held))
+        away = [(a, j) for a, j in enumerate(state.job[0].tolist()) if j >= 0]
         for slot, j in enumerate(slot_job[0].tolist()):
             for a in range(arms):
                 may = j >= 0 and state.mode[0, a] == IDLE and not stations[j] & busy
+                may = may and not any(touches(a, j, other) for other in away)
                 assert mask[0, a, slot + 1] == may
-        won, lost, illegal = referee(slot_job[0], mask[0], stations, actions, difficulty, busy)
+        won, lost, illegal = referee(slot_job[0], mask[0], stations, actions, difficulty, busy, touches, away)
         after = step(world, state, actions[None], plant, compiled=False).state
         assert (after.illegal - state.illegal)[0].tolist() == illegal
         assert (after.last_award[0] == -1).tolist() == lost

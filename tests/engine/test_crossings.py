@@ -153,7 +153,8 @@ def test_an_arm_switched_off_cools_faster(small) -> None:
     for off in (True, False):
         world, plant = hot_shop(small, limits=ThermalLimits(power_off_on_fault=off), ticks=80)
         log: list[Event] = []
-        last = work_on(world, plant, log)[-1]
+        steps = work_on(world, plant, log)
+        last = steps[int(one(log, "fault").time_s // DT_S) + 5]
         assert last.state.mode[0, 0] == FAULTED
         ends[off] = last.state.temp_c[0, 0]
     # Both had the same heat up to the fault; the difference is the idle heat only.
@@ -173,19 +174,19 @@ def test_a_faulted_arm_may_only_wait(small) -> None:
 
 
 def test_a_returned_job_keeps_its_complete_cycles(small) -> None:
-    world, plant = hot_shop(small, repetitions=40, ticks=600)
+    world, plant = hot_shop(small, repetitions=22, limits=ThermalLimits(restart_c=28.0), ticks=1200)
     log: list[Event] = []
     steps = work_on(world, plant, log)
     fault, back, awards = one(log, "fault"), one(log, "return"), [e for e in log if e.kind == "award"]
     kept = math.floor((fault.time_s - awards[0].time_s - 3.0) / 10.0)
-    assert 0 < kept < 40
+    assert 0 < kept < 22
     assert (back.time_s, back.value) == (fault.time_s, kept)
     finishes = [e for e in log if e.kind == "finish"]
     returns = [e for e in log if e.kind == "return"]
-    left = 40 - sum(e.value for e in returns)
+    left = 22 - sum(e.value for e in returns)
     assert len(finishes) == 1
     assert finishes[0].time_s == pytest.approx(awards[-1].time_s + 3.0 + left * 10.0)
-    assert steps[-1].state.cycles[0, 0] == 40
+    assert steps[-1].state.cycles[0, 0] == 22
     assert steps[-1].state.returns[0, 0] == len(returns)
 
 
@@ -211,7 +212,8 @@ def test_a_fault_on_the_way_home_returns_nothing(small) -> None:
     world, plant = small.shop([[small.job("a", content, repetitions=1)]], arms=arms, ticks=90)
     log: list[Event] = []
     last = work_on(world, plant, log)[-1].state
-    assert [e.kind for e in log if e.kind in ("finish", "fault", "return", "home")] == ["finish", "fault"]
+    assert [e.kind for e in log if e.kind in ("finish", "fault", "return", "home")][:2] == ["finish", "fault"]
+    assert not [e for e in log if e.kind in ("return", "give_up")]
     assert last.status[0, 0] == DONE
 
 

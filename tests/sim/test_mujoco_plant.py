@@ -109,7 +109,7 @@ def test_torque_is_what_changes_the_momentum(cell, clips):
     rest_tau = ArmModel(cell.robots[0]).gravity_torque(cell.robots[0].home_q())
     plant = MujocoPlant(cell.robots[:1], [plan], rest_tau[None])
     state = initial(world)
-    state.mode[:], state.job[:], state.todo[:] = WORKING, 0, 5
+    state.mode[:], state.job[:], state.plan[:], state.todo[:] = WORKING, 0, 0, 5
     states = [state]
     for _ in range(2):  # The second tick is looked at: the press begins in it.
         done = step(world, states[-1], np.zeros((1, 1), int), plant)

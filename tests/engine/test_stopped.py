@@ -1,0 +1,106 @@
+"""An arm that a fault stops away from home: it keeps its space, goes home or is moved; jobs that fault too often."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fleet.engine.shift import open_jobs, step
+from fleet.engine.state import GIVEN_UP, WAITING, initial
+from fleet.robot import ThermalLimits
+from fleet.telemetry import FAULTED, IDLE, WORKING
+
+DT_S = 10.0
+
+
+def crossing(small, *, limits, ticks=400, repetitions=200):
+    """Two arms whose plans touch: arm 0 overheats at the press, arm 1 could use the rack."""
+    hot, light = small.work("press", 8.0), small.work("rack", small.LIGHT)
+    jobs = [small.job("hot", hot, repetitions=repetitions), small.job("light", light, repetitions=2)]
+    fleet = [small.arm(0, [hot]), small.arm(1, [light])]
+    world, plant = small.shop([jobs], arms=fleet, limits=limits, ticks=ticks, slots=2)
+    touching = np.ones((2, 2), bool) ^ np.eye(2, dtype=bool)
+    return replace(world, plans=replace(world.plans, volume=np.arange(2)), conflicts=touching), plant
+
+
+def until_the_fault(world, plant, log):
+    """Play until arm 0 faults, and return the states before and after that step."""
+    state, action = initial(world), np.array([[1, 0]])
+    for _ in range(world.ticks):
+        before, state = state, step(world, state, action, plant, log).state
+        action = np.zeros((1, 2), int)
+        if state.mode[0, 0] == FAULTED:
+            return before, state
+    raise AssertionError("no fault")
+
+
+def test_a_stopped_arm_keeps_its_space_until_it_is_home(small) -> None:
+    """It ends the cycle in which it stopped and goes home; spans are 3 s, 10 s a cycle and 2 s."""
+    world, plant = crossing(small, limits=ThermalLimits(move_home_s=1e6))
+    log = []
+    _, state = until_the_fault(world, plant, log)
+    fault = next(e for e in log if e.kind == "fault")
+    cycles = math.floor((fault.time_s - 3.0) / 10.0)
+    left_s = 3.0 + 10.0 * (cycles + 1) + 2.0 - fault.time_s
+    wait = np.zeros((1, 2), int)
+    while not any(e.kind == "home" for e in log):
+        assert state.plan[0, 0] >= 0
+        slot_job, mask = open_jobs(world, state)
+        assert slot_job[0].tolist() == [1, 0]  # the hot one came back, and queues behind
+        assert not mask[0, 1, 1:].any()
+        state = step(world, state, wait, plant, log).state
+    recover, home = (next(e for e in log if e.kind == kind) for kind in ("recover", "home"))
+    begin_s = math.ceil(recover.time_s / DT_S) * DT_S
+    assert home.time_s == pytest.approx(begin_s + left_s, abs=1e-6)
+    assert (state.mode[0, 0], state.plan[0, 0], state.job[0, 0]) == (IDLE, -1, -1)
+    assert open_jobs(world, state)[1][0, 1].tolist() == [1, 1, 0]
+    assert state.cycles[0, 0] == cycles
+
+
+@pytest.mark.parametrize("move_home_s", [0.0, 33.0, 250.0])
+def test_a_person_moves_a_stopped_arm_home(small, move_home_s) -> None:
+    world, plant = crossing(small, limits=ThermalLimits(move_home_s=move_home_s, clear_s=600.0))
+    log = []
+    _, state = until_the_fault(world, plant, log)
+    while not any(e.kind == "moved" for e in log):
+        assert not open_jobs(world, state)[1][0, 1, 1:].any()
+        state = step(world, state, np.zeros((1, 2), int), plant, log).state
+    fault, moved = (next(e for e in log if e.kind == kind) for kind in ("fault", "moved"))
+    assert moved.time_s == pytest.approx(fault.time_s + move_home_s)
+    assert (state.mode[0, 0], state.plan[0, 0]) == (FAULTED, -1)
+    assert open_jobs(world, state)[1][0, 1, 1]
+    while not any(e.kind == "recover" for e in log):
+        state = step(world, state, np.zeros((1, 2), int), plant, log).state
+    assert state.mode[0, 0] == IDLE
+    assert not any(e.kind == "home" for e in log)
+
+
+def test_a_job_that_faults_an_arm_twice_is_given_up_with_all_that_wait_for_it(small) -> None:
+    hot = small.work("press", 8.0)
+    jobs = [small.job("hot", hot, repetitions=400)]
+    jobs += [small.job("next", hot, after=("hot",)), small.job("last", hot, after=("next",)), small.job("other", hot)]
+    world, plant = small.shop([jobs], arms=1, ticks=600, slots=2)
+    log, state = [], initial(world)
+    while not any(e.kind == "give_up" for e in log):
+        slot_job, mask = open_jobs(world, state)
+        claim = [k + 1 for k, j in enumerate(slot_job[0].tolist()) if j == 0 and mask[0, 0, k + 1]]
+        state = step(world, state, np.array([claim or [0]]), plant, log).state
+    assert [e.kind for e in log if e.kind in ("fault", "return", "give_up")] == ["fault", "return", "fault", "give_up"]
+    assert state.status[0].tolist() == [GIVEN_UP, GIVEN_UP, GIVEN_UP, WAITING]
+    assert open_jobs(world, state)[0][0].tolist() == [3, -1]
+
+
+def test_a_job_that_faults_three_arms_is_given_up(small) -> None:
+    hot = small.work("press", 8.0)
+    world, plant = small.shop([[small.job("hot", hot, repetitions=400)]], arms=4, ticks=600)
+    log, state, tried = [], initial(world), 0
+    while not any(e.kind == "give_up" for e in log):
+        action = np.zeros((1, 4), int)
+        if open_jobs(world, state)[1][0, tried, 1]:
+            action[0, tried], tried = 1, tried + 1
+        state = step(world, state, action, plant, log).state
+    assert tried == 3
+    assert [e.arm for e in log if e.kind == "fault"] == list(world.arms[:3])
+    assert state.status[0, 0] == GIVEN_UP
+    assert WORKING not in state.mode[0]
