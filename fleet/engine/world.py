@@ -197,7 +197,9 @@ def _plan_table(plans: Sequence[Plan], arms: Mapping[str, Arm], volume: Array) -
         joints = len(GEN3.velocity)
         empty = np.zeros((1, 3, joints))
         return PlanTable(np.zeros((1, 3)), empty, empty, np.zeros((1, joints)), volume)
-    return PlanTable(*map(np.array, zip(*(arms[plan.arm].driven(plan) for plan in plans), strict=True)), volume)
+    driven = zip(*(arms[plan.arm].driven(plan) for plan in plans), strict=True)
+    times_s, current_sq, friction_w, peak_tau = map(np.array, driven)
+    return PlanTable(times_s, current_sq, friction_w, peak_tau, volume)
 
 
 def _job_table(shifts: Sequence[Sequence[Job]], stations: Sequence[str]) -> JobTable:
