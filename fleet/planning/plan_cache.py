@@ -79,14 +79,25 @@ class CachedPlanner:
 
 def rest_torque(robot: Robot, cache_dir: Path) -> Array:
     """Torque that holds an arm at home, N·m, [joint]."""
-    path = _path(cache_dir, {"what": "torque at home", **_torque_key(robot)})
-    tau = _read(path, lambda arrays: arrays["rest_tau"])
-    if tau is None:
+
+    def compute() -> dict[str, Array]:
         from fleet.physics.models import ArmModel
 
-        tau = ArmModel(robot).gravity_torque(robot.home_q())
-        _write(path, {"rest_tau": tau})
-    return tau
+        return {"rest_tau": ArmModel(robot).gravity_torque(robot.home_q())}
+
+    return cached_arrays(cache_dir, {"what": "torque at home", **_torque_key(robot)}, compute)["rest_tau"]
+
+
+def cached_arrays(
+    folder: Path, key: dict[str, object], compute: Callable[[], Mapping[str, Array]]
+) -> Mapping[str, Array]:
+    """The arrays that are stored under a key; computed and stored if there are none."""
+    path = _path(folder, key)
+    arrays = _read(path, dict)
+    if arrays is None:
+        arrays = compute()
+        _write(path, arrays)
+    return arrays
 
 
 def _torque_key(robot: Robot) -> dict[str, object]:

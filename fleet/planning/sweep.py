@@ -108,14 +108,18 @@ class Capsules:
         kept = len(radius_m) - (payload_kg <= 0)
         return Sweep(self.links[:kept], ends[:kept].astype(np.float32), radius_m[:kept])
 
-    def of_plan(self, plan: Plan) -> Sweep:
-        """Space that the arm takes from leaving home to being home again."""
+    def of_plan(self, plan: Plan, payload_kg: float | None = None) -> Sweep:
+        """Space that the arm takes from leaving home to being home again.
+
+        Args:
+            payload_kg: Instead of the plan's own.
+        """
         q = np.concatenate([phase.profile[:, 0] for phase in plan.phases]).astype(float)
         travelled = np.concatenate([[0.0], np.abs(np.diff(q, axis=0)).max(axis=1).cumsum()])
         # The last sample before each step is left, so no joint moves more than a step (and a sample's share) at once.
         wanted = np.arange(0.0, travelled[-1] + STEP_RAD, STEP_RAD)
         rows = np.unique(np.append(np.searchsorted(travelled, wanted, side="right") - 1, len(q) - 1))
-        return self.sweep(q[rows], float(max(phase.payload_kg.max(initial=0.0) for phase in plan.phases)))
+        return self.sweep(q[rows], plan.work.payload_kg if payload_kg is None else payload_kg)
 
 
 def payload_radius_m(payload_kg: float) -> float:

@@ -1,0 +1,239 @@
+"""Space of a cell: which plans of two arms exclude each other, and which plans come too close to an arm at home.
+
+The space of a plan is the path of its links and its payload from leaving home to being home again. Plans of one arm
+through the same postures share one volume, that of their heaviest payload, whatever their speed and dwell.
+"""
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import combinations
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fleet.job import Work
+from fleet.motion import Plan
+from fleet.physics.gen3 import gen3_xml
+from fleet.planning.plan_cache import cached_arrays
+from fleet.robot import Robot
+
+if TYPE_CHECKING:  # both load MuJoCo
+    from fleet.planning.clearance import Clearance
+    from fleet.planning.sweep import Capsules, Sweep
+
+Array = np.ndarray
+PlanKey = tuple[str, Work, int, float]
+"""Arm, work, elbow and speed of a plan: equal in all processes."""
+
+SPACE_VERSION = 1
+"""Increment it whenever the space of the same plans changes."""
+FARTHEST_M = 1.5
+"""No part of an arm or of its payload is ever farther from its base: 0.29 m to joint 2, 0.91 m to the flange, a payload
+of 0.2 m, and the radius of a link."""
+
+
+@dataclass(frozen=True, eq=False)
+class SpaceTable:
+    """Volumes of the plans of a cell, and which of them exclude each other."""
+
+    volume: Mapping[PlanKey, int]
+    """Volume of each plan."""
+    conflicts: Array
+    """Whether two volumes come closer than the margin, bool [volume, volume]; True for any two of one arm."""
+
+    def rows(self, plans: Sequence[Plan]) -> tuple[Array, Array]:
+        """Volume of each plan, int [plan], and `conflicts`.
+
+        Raises:
+            ValueError: a plan is not in the table.
+        """
+        missing = [plan for plan in plans if plan_key(plan) not in self.volume]
+        if missing:
+            raise ValueError(
+                f"No space is known for a {missing[0].work.kind} of arm '{missing[0].arm}' at "
+                f"'{missing[0].work.places[0].name}'; compute the table with all plans of the cell."
+            )
+        return np.array([self.volume[plan_key(plan)] for plan in plans], dtype=int), self.conflicts
+
+
+def plan_key(plan: Plan) -> PlanKey:
+    """Key of a plan in a `SpaceTable`."""
+    return plan.arm, plan.work, plan.elbow, plan.speed
+
+
+def space_table(robots: Sequence[Robot], plans: Sequence[Plan], margin_m: float, cache_dir: Path) -> SpaceTable:
+    """The volumes of the plans of a cell and their conflicts; cached for each pair of arms.
+
+    Args:
+        robots: The arms of the cell.
+        plans: Of these arms, all that will be asked for.
+        margin_m: Two arms that come closer than this exclude each other.
+    """
+    paths = [_Paths(robot, plans) for robot in robots]
+    ends = np.cumsum([0, *(len(own.heaviest) for own in paths)])
+    conflicts = np.zeros((ends[-1], ends[-1]), dtype=bool)
+    volume: dict[PlanKey, int] = {}
+    for i, own in enumerate(paths):
+        conflicts[ends[i] : ends[i + 1], ends[i] : ends[i + 1]] = True
+        volume.update({key: int(ends[i] + row) for key, row in own.row.items()})
+    for (i, one), (j, other) in combinations(enumerate(paths), 2):
+        if not _in_reach(one.robot, other.robot, margin_m):
+            continue
+        key = {"what": "conflicts", "margin_m": margin_m, "arms": [one.content(), other.content()]}
+        block = cached_arrays(cache_dir, key, _comparison(one, other, margin_m))["conflicts"]
+        conflicts[ends[i] : ends[i + 1], ends[j] : ends[j + 1]] = block
+        conflicts[ends[j] : ends[j + 1], ends[i] : ends[i + 1]] = block.T
+    return SpaceTable(volume, conflicts)
+
+
+def conflicts_with_homes(
+    robot: Robot, others: Sequence[Robot], plans: Sequence[Plan], margin_m: float, cache_dir: Path
+) -> list[str | None]:
+    """Why a plan of an arm cannot be done beside the other arms at home; None for a plan that is clear of all.
+
+    Args:
+        plans: Of `robot`; the result for one does not depend on which others are given.
+    """
+    paths = _Paths(robot, plans)
+    near = [other for other in others if _in_reach(robot, other, margin_m)]
+
+    def compute() -> dict[str, Array]:
+        homes = [(other.name, _home(other)) for other in near]
+        reasons = [_home_reason(sweep, homes, margin_m) for sweep in paths.sweeps()]
+        lighter = [
+            _home_reason(paths.sweep(row, payload_kg), homes, margin_m) if reasons[row] else ""
+            for row, payload_kg in paths.loads
+        ]
+        return {"reasons": np.array(lighter, dtype=str)}
+
+    if not near or not paths.loads:
+        return [None] * len(plans)
+    arms = [(other.name, _geometry(other)) for other in near]
+    key = {"what": "homes", "margin_m": margin_m, "arms": arms, "plans": paths.content(), "loads": paths.loads}
+    reasons = dict(zip(paths.loads, cached_arrays(cache_dir, key, compute)["reasons"].tolist(), strict=True))
+    return [reasons[paths.row[plan_key(plan)], plan.work.payload_kg] or None for plan in plans]
+
+
+def collisions_of_homes(robots: Sequence[Robot], margin_m: float) -> list[str]:
+    """Sentences on every two arms that come closer to each other than a margin while both are at home."""
+    from fleet.planning.clearance import clearance
+
+    sentences = []
+    for one, other in combinations(robots, 2):
+        if _in_reach(one, other, margin_m) and (near := clearance(_home(one), _home(other), margin_m)):
+            sentences.append(
+                f"at home '{one.name}' ({near.link}) {_distance(near, margin_m)} '{other.name}' ({near.other_link})"
+            )
+    return sentences
+
+
+class _Paths:
+    """The different paths of one arm's plans."""
+
+    def __init__(self, robot: Robot, plans: Sequence[Plan]) -> None:
+        self.robot = robot
+        self.row: dict[PlanKey, int] = {}
+        """Path of each plan."""
+        rows: dict[bytes, int] = {}
+        self.plan: list[Plan] = []
+        """A plan of each path."""
+        self.heaviest: list[float] = []
+        """Heaviest payload on each path, kg."""
+        for plan in plans:
+            if plan.arm != robot.name:
+                continue
+            row = rows.setdefault(_stops(plan).tobytes(), len(rows))
+            if row == len(self.plan):
+                self.plan.append(plan)
+                self.heaviest.append(0.0)
+            self.row[plan_key(plan)] = row
+            self.heaviest[row] = max(self.heaviest[row], plan.work.payload_kg)
+        self.loads = sorted({(row, work.payload_kg) for (_, work, _, _), row in self.row.items()})
+        """Every path with every payload on it."""
+        self.sweeps: Callable[[], list[Sweep]] = cache(
+            lambda: [self.sweep(row, payload_kg) for row, payload_kg in enumerate(self.heaviest)]
+        )
+        """Space of each path with its heaviest payload."""
+        self._capsules: Callable[[], Capsules] = cache(lambda: _capsules(robot))
+
+    def sweep(self, row: int, payload_kg: float) -> "Sweep":
+        """Space of a path with a payload."""
+        return self._capsules().of_plan(self.plan[row], payload_kg)
+
+    def content(self) -> dict[str, object]:
+        """Everything that determines the space of the paths, for cache keys."""
+        paths = hashlib.sha256(b"".join(_stops(plan).tobytes() for plan in self.plan)).hexdigest()
+        return {**_geometry(self.robot), "paths": paths, "payload_kg": self.heaviest}
+
+
+def _stops(plan: Plan) -> Array:
+    """Postures at which the arm stands along a plan, float32 [stop, joint]; it moves straight from one to the next."""
+    profile = np.concatenate([phase.profile for phase in plan.phases])
+    stops = profile[(profile[:, 1] == 0).all(axis=1), 0]
+    return stops[np.append(True, (np.diff(stops, axis=0) != 0).any(axis=1))]
+
+
+def _geometry(robot: Robot) -> dict[str, object]:
+    """Everything that determines the space of an arm in a posture, and its home."""
+    return {
+        "space": SPACE_VERSION,
+        "model": hashlib.sha256(gen3_xml()).hexdigest(),
+        "position_m": robot.mount.position_m,
+        "tilt_deg": robot.mount.tilt_deg,
+        "home": robot.home_q().tolist(),
+    }
+
+
+def _in_reach(one: Robot, other: Robot, margin_m: float) -> bool:
+    apart_m = np.linalg.norm(np.subtract(one.mount.position_m, other.mount.position_m))
+    return bool(apart_m < 2 * FARTHEST_M + margin_m)
+
+
+def _comparison(one: _Paths, other: _Paths, margin_m: float) -> Callable[[], dict[str, Array]]:
+    def compute() -> dict[str, Array]:
+        from fleet.planning.clearance import conflict
+
+        boxes, others = _boxes(one.sweeps()), _boxes(other.sweeps())
+        gap_m = np.maximum(boxes[:, None, 0] - others[None, :, 1], others[None, :, 0] - boxes[:, None, 1])
+        block = np.linalg.norm(np.maximum(gap_m, 0.0), axis=-1) < margin_m
+        for i, j in np.argwhere(block):
+            block[i, j] = conflict(one.sweeps()[i], other.sweeps()[j], margin_m)
+        return {"conflicts": block}
+
+    return compute
+
+
+def _boxes(sweeps: Sequence["Sweep"]) -> Array:
+    """Bounding box of each sweep, m, [sweep, (low, high), 3]."""
+    roots = [sweep.boxes_m[:, 1] for sweep in sweeps]
+    return np.array([(root[:, 0].min(axis=0), root[:, 1].max(axis=0)) for root in roots]).reshape(-1, 2, 3)
+
+
+def _capsules(robot: Robot) -> "Capsules":
+    from fleet.physics.models import ArmModel
+    from fleet.planning.sweep import Capsules
+
+    return Capsules(ArmModel(robot))
+
+
+def _home(robot: Robot) -> "Sweep":
+    return _capsules(robot).sweep(robot.home_q()[None])
+
+
+def _home_reason(sweep: "Sweep", homes: Sequence[tuple[str, "Sweep"]], margin_m: float) -> str:
+    """Which arms at home a sweep comes too close to; empty if none."""
+    from fleet.planning.clearance import clearance
+
+    near = [(name, clearance(sweep, home, margin_m)) for name, home in homes]
+    return " and ".join(
+        f"{found.link} {_distance(found, margin_m)} {name} ({found.other_link}) at home"
+        for name, found in near
+        if found
+    )
+
+
+def _distance(near: "Clearance", margin_m: float) -> str:
+    return "collides with" if near.distance_m <= 0 else f"comes within {margin_m * 1e3:g} mm of"
