@@ -12,10 +12,10 @@ from fleet.engine.event_log import PER_ARM, event_buffer
 from fleet.engine.observe import observe
 from fleet.engine.reset import reset_rows
 from fleet.engine.reward import TERMS, RewardWeights, weights_per_unit
-from fleet.engine.state import DONE, MOST_FAULTS, WAITING, State
+from fleet.engine.state import DONE, GIVEN_UP, MOST_FAULTS, WAITING, State
 from fleet.engine.step import step_arms
 from fleet.engine.tables import LANES, Jobs, MeasuredDrive, OpenJobs, Simulation, Tables, Trace, form_of
-from fleet.jit import kernel
+from fleet.jit import jit, kernel, nonnegative
 from fleet.motion import Drive
 from fleet.observation import Layout
 from fleet.robot import JOINTS
@@ -34,7 +34,7 @@ CLAIM, MOVE, OBSERVE = 1, 2, 4
 
 @kernel
 def step_rows(
-    sim: Simulation, parts: int, actions: Array, weights: Array, terms: Array, rows: Array, out: Array
+    sim: Simulation, parts: int, actions: Array, weights: Array, terms: Array, until: Array, rows: Array, out: Array
 ) -> None:
     """Take some envs through parts of a step.
 
@@ -43,6 +43,7 @@ def step_rows(
         actions: int64 [env, arm].
         weights: Reward per unit of each term, [term].
         terms: Receives the reward terms and their sum, [env, term + 1].
+        until: Tick until which each env goes on while no arm may claim a job, int [env]; not at all if empty.
         rows: int [row].
         out: Receives the observation vectors, float32 [env, arm, size].
     """
@@ -54,7 +55,28 @@ def step_rows(
             step_arms(sim, weights, terms, some)
         if parts & OBSERVE:
             update_offers(sim.tables, sim.jobs, sim.state, sim.offers, some)
+            if len(until) > 0:
+                go_on(sim, weights, terms, until, some)
             observe(sim, some, out)
+
+
+@jit
+def go_on(sim: Simulation, weights: Array, terms: Array, until: Array, rows: Array) -> None:
+    """Step some envs until an arm may claim a job, all jobs are done, or their last tick; adds to the reward terms."""
+    one, earned = np.empty(1, np.int64), np.empty(terms.shape[1])
+    for row in rows:
+        e = nonnegative(row)
+        one[0] = e
+        earned[:] = terms[e]
+        while (
+            sim.state.tick[e] < until[e]
+            and (sim.offers.unfinished[e] > 0 or sim.jobs.number[e] == 0)
+            and not sim.offers.mask[e, :, 1:].any()
+        ):
+            step_arms(sim, weights, terms, one)
+            update_offers(sim.tables, sim.jobs, sim.state, sim.offers, one)
+            earned += terms[e]
+        terms[e] = earned
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +134,7 @@ class Engine:
             slot_job=np.full((envs, slots), -1),
             mask=np.zeros((envs, arms, slots + 1), np.int8),
             unfinished=np.zeros(envs, int),
+            given_up=np.zeros(envs, int),
             queue=np.zeros((envs, jobs), np.int32),
             head=np.zeros(envs, int),
             current_kind=np.full((envs, arms), tables.feasible.shape[1]),
@@ -172,8 +195,13 @@ class Engine:
 
     @property
     def unfinished(self) -> Array:
-        """Jobs not done, int [env]."""
+        """Jobs neither done nor given up, int [env]."""
         return self._simulation.offers.unfinished
+
+    @property
+    def done(self) -> Array:
+        """Jobs done, int [env]."""
+        return self.jobs.number - self.unfinished - self._simulation.offers.given_up
 
     @property
     def events(self) -> Any:  # numba's where the loops are compiled
@@ -210,17 +238,19 @@ class Engine:
         """Put what the arms of some envs know now into `out`, float32 [env, arm, size]."""
         self._run(OBSERVE, _NO_ACTIONS, _NO_TERMS, envs, out)
 
-    def step(self, actions: Array, out: Array) -> tuple[Array, Array, Array]:
-        """One decision interval of every env.
+    def step(self, actions: Array, out: Array, until: Array | None = None) -> tuple[Array, Array, Array]:
+        """One decision interval of every env, or more.
 
         Args:
             actions: int64 [env, arm]; anything outside the mask is a wait, and counted.
             out: Receives what the arms know afterwards, float32 [env, arm, size].
+            until: Go on while no arm may claim a job, to this tick at most, int64 [env]. The events and the trace are
+                then those of the last interval alone.
 
         Returns:
             Weighted reward terms [env, term], their sum [env], and which envs have done all their jobs, bool [env].
         """
-        return self._stepped(CLAIM + MOVE + OBSERVE, actions, out)
+        return self._stepped(CLAIM + MOVE + OBSERVE, actions, out, until)
 
     def claim(self, actions: Array) -> None:
         """The first part of `step` alone: award jobs. `move` must follow."""
@@ -242,16 +272,18 @@ class Engine:
         measured.current_sq[..., :JOINTS], measured.friction_w[..., :JOINTS] = drive.current_sq, drive.friction_w
         return self._stepped(MOVE + OBSERVE, _NO_ACTIONS, out)
 
-    def _stepped(self, parts: int, actions: Array, out: Array) -> tuple[Array, Array, Array]:
+    def _stepped(
+        self, parts: int, actions: Array, out: Array, until: Array | None = None
+    ) -> tuple[Array, Array, Array]:
         terms = np.empty((self.envs, len(TERMS) + 1))
         if parts & CLAIM:
             self._clear_events()
         if self._pool is None:
-            self._run(parts, actions, terms, self._all, out)
+            self._run(parts, actions, terms, self._all, out, until)
         else:
             own, *others = self._shares
-            done = [self._pool.submit(self._run, parts, actions, terms, share, out) for share in others]
-            self._run(parts, actions, terms, own, out)
+            done = [self._pool.submit(self._run, parts, actions, terms, share, out, until) for share in others]
+            self._run(parts, actions, terms, own, out, until)
             for each in done:
                 each.result()
         return terms[:, :-1], terms[:, -1], (self.unfinished == 0) & (self.jobs.number > 0)
@@ -259,8 +291,11 @@ class Engine:
     def _clear_events(self) -> None:
         self._simulation.events.used[0] = 0
 
-    def _run(self, parts: int, actions: Array, terms: Array, rows: Array, out: Array) -> None:
-        self._step(self._bundle, parts, actions, self._weights, terms, rows, out)
+    def _run(
+        self, parts: int, actions: Array, terms: Array, rows: Array, out: Array, until: Array | None = None
+    ) -> None:
+        until = _ONE_INTERVAL if until is None else until
+        self._step(self._bundle, parts, actions, self._weights, terms, until, rows, out)
 
     def load(self, state: State) -> None:
         """Take over a state with at most as many jobs, and what follows from it."""
@@ -281,6 +316,7 @@ class Engine:
             offers.queue[e, count - n : count] = order[e, room - n :]
             offers.head[e] = count - n
         offers.unfinished[:] = (exists & (state.status < DONE)).sum(axis=1)
+        offers.given_up[:] = (exists & (state.status == GIVEN_UP)).sum(axis=1)
         env = np.arange(self.envs)[:, None]
         working = (state.mode == WORKING) & (state.job >= 0)
         offers.current_kind[:] = np.where(working, jobs.kind[env, state.job], self.tables.feasible.shape[1])
@@ -309,7 +345,7 @@ class Engine:
 
 
 _NO_ACTIONS, _NO_TERMS = np.zeros((0, 0), np.int64), np.zeros((0, 0))
-_NO_VECTORS = np.zeros((0, 0, 0), np.float32)
+_NO_VECTORS, _ONE_INTERVAL = np.zeros((0, 0, 0), np.float32), np.zeros(0, np.int64)
 
 
 def _widen(after: Array, waits: int) -> Array:

@@ -208,6 +208,7 @@ def give_up(d: Jobs, s: State, o: OpenJobs, e: int, j: int) -> None:
     status, after = s.status, d.after
     status[e, j] = GIVEN_UP
     o.unfinished[e] -= 1
+    o.given_up[e] += 1
     found = after.shape[2] > 0
     while found:
         found = False
@@ -218,3 +219,4 @@ def give_up(d: Jobs, s: State, o: OpenJobs, e: int, j: int) -> None:
                     status[e, i], found = GIVEN_UP, True
                     remove_from_queue(o.queue, o.head, e, i)
                     o.unfinished[e] -= 1
+                    o.given_up[e] += 1

@@ -51,7 +51,7 @@ def reset_rows(
             noise_key[n],
             count,
         )
-        s.tick[e], o.unfinished[e], o.head[e] = 0, count, 0
+        s.tick[e], o.unfinished[e], o.given_up[e], o.head[e] = 0, count, 0, 0
         for j in range(count):
             i = at + j
             d.kind[e, j], d.repetitions[e, j] = kind[i], repetitions[i]

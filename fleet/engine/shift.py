@@ -171,7 +171,7 @@ class ShiftRunner:
     @property
     def jobs_done(self) -> int:
         """Finished so far."""
-        return int(self._engine.jobs.number[0] - self._engine.unfinished[0])
+        return int(self._engine.done[0])
 
     @property
     def tick(self) -> int:

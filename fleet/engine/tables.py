@@ -133,7 +133,9 @@ class OpenJobs(NamedTuple):
     mask: Array
     """Legal actions, int8 [env, arm, slot + 1]."""
     unfinished: Array
-    """Jobs not done, int [env]."""
+    """Jobs neither done nor given up, int [env]."""
+    given_up: Array
+    """Jobs given up, int [env]."""
     queue: Array
     """Waiting jobs, released or not, by queueing time, int32 [env, job], at the end of each row."""
     head: Array

@@ -23,7 +23,7 @@ from fleet.engine.state import State, World
 from fleet.env.render.renderer import Renderer
 from fleet.env.render.scene import Cell
 from fleet.env.spaces import arm_spaces
-from fleet.env.validation import actions_of, agent_of, at_least_one, seed_of
+from fleet.env.validation import Decisions, actions_of, agent_of, at_least_one, decisions_of, seed_of
 from fleet.events import Event
 from fleet.observation import Layout, Observation
 from fleet.telemetry import MODES
@@ -54,6 +54,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         mask_in: Where the mask of legal actions is: in the observation, in the info, or both. In the info alone, the
             observation is the vector by itself.
         near: The peers each arm has in its vector; see `fleet.observation.Layout`.
+        decisions: Length of a step: one decision "interval", or until an arm may claim a job ("events").
     """
 
     metadata = {  # noqa: RUF012  # PettingZoo's
@@ -76,6 +77,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         cell: Cell | None = None,
         mask_in: MaskPlace = "obs",
         near: tuple[tuple[int, ...], ...] | None = None,
+        decisions: Decisions = "interval",
     ) -> None:
         if render_mode is not None and render_mode not in RENDER_MODES:
             allowed = ", ".join(map(repr, RENDER_MODES))
@@ -91,6 +93,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         self._watch = watch
         self._renderer = Renderer(cell)
         self._mask_in = mask_in
+        self._until_choice = decisions_of(decisions) == "events"
         self._seeds = np.random.SeedSequence()
         self._episode = make_episode(np.random.SeedSequence(0))
         world = self._episode.world
@@ -168,12 +171,12 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         )
         self.events = self._shift.events
         observations, masks = self._observations()
-        return observations, self._infos(np.zeros(len(TERMS)), masks)
+        return observations, self._infos(np.zeros(len(TERMS)), masks, 0.0)
 
     def step(
         self, actions: dict[str, Any]
     ) -> tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
-        """One decision interval; a missing or illegal action is a wait.
+        """One step; a missing or illegal action is a wait.
 
         Raises:
             RuntimeError: before reset, or after the end.
@@ -183,11 +186,14 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         if not self.agents:
             raise RuntimeError("The episode is over: call reset() before step().")
         arms, chosen = self.possible_agents, actions_of(self.possible_agents, actions)
+        last_tick, before = min(self.world.ticks, self._max_cycles or self.world.ticks), shift.tick
         parts, reward, finished = shift.step(chosen)
-        last_tick = min(self.world.ticks, self._max_cycles or self.world.ticks)
+        while self._until_choice and not finished and shift.tick < last_tick and not shift.mask[:, 1:].any():
+            more, earned, finished = shift.step(np.zeros_like(chosen))
+            parts, reward = parts + more, reward + earned
         over = not finished and shift.tick >= last_tick
         observations, masks = self._observations()
-        infos = self._infos(parts, masks)
+        infos = self._infos(parts, masks, (shift.tick - before) * self.world.dt_s)
         if finished or over:
             self.agents = []
         return (
@@ -244,10 +250,14 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
             return {arm: vectors[a] for a, arm in enumerate(arms)}, masks
         return {arm: {"observation": vectors[a], "action_mask": masks[a]} for a, arm in enumerate(arms)}, masks
 
-    def _infos(self, parts: Array, masks: Array) -> dict[str, dict[str, Any]]:
+    def _infos(self, parts: Array, masks: Array, elapsed_s: float) -> dict[str, dict[str, Any]]:
         shift = self._begun("infos")
         state = shift.state
-        named = {"jobs_done": float(shift.jobs_done), **dict(zip(_REWARDS, parts.tolist(), strict=True))}
+        named = {
+            "jobs_done": float(shift.jobs_done),
+            "elapsed_s": elapsed_s,
+            **dict(zip(_REWARDS, parts.tolist(), strict=True)),
+        }
         infos = {
             arm: {
                 "faults": float(faults),

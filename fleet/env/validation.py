@@ -1,9 +1,12 @@
 """Seeds, counts and actions as callers give them, checked alike wherever they are given."""
 
 from collections.abc import Mapping, Sequence
-from typing import TypeGuard
+from typing import Literal, TypeGuard, get_args
 
 import numpy as np
+
+Decisions = Literal["interval", "events"]
+"""Length of a step: one decision interval, or until an arm may claim a job."""
 
 _LARGEST = 2**62
 _INT64 = np.iinfo(np.int64)
@@ -55,6 +58,18 @@ def switch(name: str, value: object) -> bool:
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} must be True or False (got {value!r}).")
     return bool(value)
+
+
+def decisions_of(value: object) -> Decisions:
+    """The length of a step.
+
+    Raises:
+        ValueError: none of the allowed ones.
+    """
+    for each in get_args(Decisions):
+        if value == each:
+            return each
+    raise ValueError(f"decisions must be one of {', '.join(map(repr, get_args(Decisions)))} (got {value!r}).")
 
 
 def actions_of(agents: Sequence[str], actions: object) -> np.ndarray:

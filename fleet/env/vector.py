@@ -19,7 +19,7 @@ from fleet.engine.tables import Tables
 from fleet.env.buffers import Shelf
 from fleet.env.random_actions import random_legal as random_legal
 from fleet.env.spaces import arm_spaces
-from fleet.env.validation import at_least_one, seeds_of, switch
+from fleet.env.validation import Decisions, at_least_one, decisions_of, seeds_of, switch
 from fleet.observation import Layout, Observation
 from fleet.seeding import exchange_seed, shift_seeds
 
@@ -57,6 +57,8 @@ class BatchEnv:
             spread over the hours of a shift, as a learner wants them that sees a few hours at a time.
         threads: Step the envs on this many threads; results do not depend on it. Pays from a few hundred envs on.
         exchanges: What carries the messages of the arms of each env; perfect and immediate if not given.
+        decisions: Length of a step: one decision "interval", or until an arm may claim a job ("events"), which takes no
+            exchanges.
     """
 
     def __init__(
@@ -71,6 +73,7 @@ class BatchEnv:
         stagger: bool = False,
         threads: int = 1,
         exchanges: Sequence[Exchange] | None = None,
+        decisions: Decisions = "interval",
     ) -> None:
         self.num_envs = num_envs = at_least_one("num_envs", num_envs)
         autoreset, stagger = switch("autoreset", autoreset), switch("stagger", stagger)
@@ -98,6 +101,11 @@ class BatchEnv:
         self._begun = False
         if exchanges is not None and len(exchanges) != num_envs:
             raise ValueError(f"exchanges must be one per env ({num_envs}, got {len(exchanges)}).")
+        self._events = decisions_of(decisions) == "events"
+        if self._events and exchanges is not None:
+            raise ValueError("decisions='events' takes no exchanges: messages are exchanged once per interval.")
+        self._elapsed_s = np.zeros(num_envs)
+        """Length of the last step of each env."""
         self._exchanges = exchanges
         self._delivered = None if exchanges is None else self._no_vectors()
         """What the arms know with the messages that reached them; only with exchanges."""
@@ -135,18 +143,18 @@ class BatchEnv:
         if len(chosen) < self.num_envs:
             self._observe(np.setdiff1d(np.arange(self.num_envs), chosen), self._vectors)
         self._begun = True
-        raw = np.zeros((self.num_envs, len(TERMS)))
+        raw, self._elapsed_s = np.zeros((self.num_envs, len(TERMS))), np.zeros(self.num_envs)
         return self._obs(), self._info(raw, np.zeros(0, dtype=int), None)
 
     def step(self, actions: object) -> tuple[Obs, Array, Array, Array, dict[str, Any]]:
-        """One decision interval of every env.
+        """One step of every env.
 
         Args:
             actions: int [env, arm]: 0 waits or goes on, k claims slot k; what is outside the mask is a wait.
 
         Returns:
             What the arms know; the reward, float64 [env]; terminated and truncated, bool [env]; and infos of the step
-            that was made: `faults`, `illegal`, `peak_c`, `above_warning_s` [env, arm], `jobs_done` [env],
+            that was made: `faults`, `illegal`, `peak_c`, `above_warning_s` [env, arm], `jobs_done`, `elapsed_s` [env],
             `reward_…` for each term [env], `final_envs`, int [n], the envs whose shift ended, and `final_obs`, what
             their arms knew at its end, [n, arm, …].
 
@@ -162,7 +170,10 @@ class BatchEnv:
             )
         chosen = self._checked(actions)
         vectors = self._no_vectors()
-        terms, reward, finished = self._engine.step(chosen, vectors)
+        before = self._engine.state.tick.copy()
+        until = self._last_tick.astype(np.int64) if self._events else None
+        terms, reward, finished = self._engine.step(chosen, vectors, until)
+        self._elapsed_s = (self._engine.state.tick - before) * self._engine.tables.dt_s
         self._deliver(np.arange(self.num_envs), vectors)
         truncated = ~finished & (self._engine.state.tick >= self._last_tick)
         self._vectors, self._over = vectors, finished | truncated
@@ -230,7 +241,8 @@ class BatchEnv:
             "illegal": state.illegal.copy(),
             "peak_c": state.peak_c.copy(),
             "above_warning_s": state.above_warning_s.copy(),
-            "jobs_done": self._engine.jobs.number - self._engine.unfinished,
+            "jobs_done": self._engine.done,
+            "elapsed_s": self._elapsed_s,
             **{f"reward_{name}": terms[:, n] for n, name in enumerate(TERMS)},
             "final_envs": ended,
             "final_obs": last,
