@@ -15,6 +15,8 @@ class Metrics:
     value: float
     """Of the finished jobs."""
     value_offered: float
+    given_up: int
+    """Jobs that faulted too often, and those that waited for them."""
     on_time: int
     """Finished by their due time."""
     tardiness_min: float
@@ -25,6 +27,8 @@ class Metrics:
     """Time at which the last job was finished."""
     jobs_per_hour: float
     faults: int
+    moved_home: int
+    """How often a person moved a faulted arm home."""
     above_warning_min: float
     """Sum over arms of the time with a motor above the warning limit."""
     peak_c: dict[str, float]

@@ -7,6 +7,7 @@ import numpy as np
 
 from fleet.arrivals import Arrivals, Batch, Poisson, Trace
 from fleet.engine.reward import RewardWeights
+from fleet.env.validation import Decisions
 from fleet.errors import FleetError, check_nonnegative, check_positive, nearest
 from fleet.job import DWELL_S, Kind, Place
 from fleet.robot import Cooling, Mount, Robot, ThermalLimits
@@ -215,6 +216,8 @@ class Scenario:
     places: tuple[Place, ...]
     jobs: tuple[JobStream, ...]
     decision_interval_s: float = 10.0
+    decisions: Decisions = "interval"
+    """Length of a step of the environment: one decision interval, or until an arm may claim a job."""
     clearance_m: float = 0.02
     """Smallest distance that two arms keep from each other."""
     slots: int = 8

@@ -183,6 +183,7 @@ def metrics_table(results: dict[str, Metrics]) -> Table:
         ("on time", lambda m: str(m.on_time)),
         ("tardiness, min", lambda m: f"{m.tardiness_min:.1f}"),
         ("faults", lambda m: str(m.faults)),
+        ("given up", lambda m: str(m.given_up)),
         ("min above warning", lambda m: f"{m.above_warning_min:.1f}"),
         ("availability", lambda m: f"{m.availability:.1%}"),
         ("energy, Wh", lambda m: f"{m.energy_wh:.0f}"),

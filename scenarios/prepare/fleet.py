@@ -200,6 +200,7 @@ def world_of(fleet: Fleet, jobs: Sequence[Job]) -> tuple[World, tuple[Plan, ...]
         slots=scenario.slots,
         ambient_c=scenario.ambient.at(times)[:, None] + air_offsets(scenario),
         start_warm=scenario.start == "idle_warm",
+        space=fleet.space.rows,
     )
 
 
@@ -343,4 +344,5 @@ def env_of(
     names = tuple(arm.robot.name for arm in fleet.arms)
     exchange = open_exchange(bus, names, fleet.scenario.name, endpoint, channel)
     options = {"weights": fleet.scenario.reward, "cell": cell_of(fleet.scenario), **options}
+    options.setdefault("decisions", fleet.scenario.decisions)
     return parallel_env(ShiftFactory(fleet, plant), exchange=exchange, **options)

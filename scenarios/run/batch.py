@@ -103,7 +103,7 @@ def make_batch(
     ]
     library = replace(library_of(fleets, randomise), near=near)
     options = {"max_cycles": max_cycles, "autoreset": autoreset, "stagger": stagger, "threads": threads}
-    return BatchEnv(library, num_envs, seed=seed, weights=chosen.reward, **options)
+    return BatchEnv(library, num_envs, seed=seed, weights=chosen.reward, decisions=chosen.decisions, **options)
 
 
 def _check_ambient(scenario: Scenario, randomise: Randomisation) -> None:

@@ -47,9 +47,17 @@ def outcomes(fleet: Fleet, policy: str, seeds: Sequence[int], channel: Channel =
     library = _library(fleet)
     exchanges = None if channel.perfect else [MemoryExchange(library.arms, channel) for _ in seeds]
     weights = fleet.scenario.reward
-    env = BatchEnv(library, len(seeds), seed=list(seeds), weights=weights, autoreset=False, exchanges=exchanges)
     policies = [policy_at(policy, seed) for seed in seeds]
     only_when_asked = only_choices(policies[0])
+    env = BatchEnv(
+        library,
+        len(seeds),
+        seed=list(seeds),
+        weights=weights,
+        autoreset=False,
+        exchanges=exchanges,
+        decisions="events" if only_when_asked and exchanges is None else "interval",
+    )
     obs, _ = env.reset()
     reward, running = np.zeros(len(seeds)), np.ones(len(seeds), dtype=bool)
     results: dict[int, Outcome] = {}

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet.engine.state import DONE, State, World
+from fleet.engine.state import DONE, GIVEN_UP, State, World
 from fleet.events import Event
 from fleet.metrics import Metrics, gini
 
@@ -30,6 +30,8 @@ def metrics_of(world: World, state: State, events: Sequence[Event], messages: in
     return Metrics(
         **common_figures(state, 0, value, due_s, world.dt_s),
         jobs=int(released.sum()),
+        given_up=int((state.status[0, jobs] == GIVEN_UP).sum()),
+        moved_home=sum(event.kind == "moved" for event in events),
         value_offered=float(value[released].sum()),
         tardiness_min=float(late_s.sum() / 60.0),
         mean_wait_s=math.fsum(waits) / len(waits) if waits else 0.0,
