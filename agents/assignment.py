@@ -1,7 +1,7 @@
-"""Central policies that assign jobs by a cost matrix [arm, slot] of `agents.costs`.
+"""Central policies that assign jobs by a cost matrix [arm, option] of `agents.costs`.
 
-They may assign two jobs that share a station. As with any claims, the arm with the lower difficulty then gets its job,
-and the other arm chooses again.
+They may assign two jobs that share a station, or two plans that exclude each other. As with any claims, the arm with
+the lower difficulty then gets its job, and the other arm chooses again.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from agents.costs import quickest, thermal
-from agents.policy import WAIT
+from agents.policy import WAIT, plans_of
 from agents.rules import Stateless, cheapest_pairs, claims_of
 from fleet.observation import Observation
 
@@ -30,15 +30,16 @@ class Ssi(Stateless):
         """The claims of the pairs of arm and job."""
         if not any(seen.action_mask[1:].any() for seen in observations.values()):
             return dict.fromkeys(observations, WAIT)
-        return claims_of(observations, self.pairs(self.cost(list(observations.values()))))
+        seen = list(observations.values())
+        return claims_of(observations, self.pairs(self.cost(seen), plans_of(seen[0])))
 
     def cost(self, observations: Sequence[Observation]) -> Array:
-        """[arm, slot] of the observations of all arms."""
+        """[arm, option] of the observations of all arms."""
         return thermal(observations)
 
-    def pairs(self, cost: Array) -> list[tuple[int, int]]:
-        """Pairs (arm, slot) of a cost matrix [arm, slot]."""
-        return cheapest_pairs(cost)
+    def pairs(self, cost: Array, plans: int) -> list[tuple[int, int]]:
+        """Pairs (arm, option) of a cost matrix [arm, option]."""
+        return cheapest_pairs(cost, plans)
 
 
 class Matching(Ssi):
@@ -49,9 +50,11 @@ class Matching(Ssi):
 
     only_choices = True
 
-    def pairs(self, cost: Array) -> list[tuple[int, int]]:
-        """Pairs (arm, slot) of a cost matrix [arm, slot]."""
-        return matching(cost)
+    def pairs(self, cost: Array, plans: int) -> list[tuple[int, int]]:
+        """Pairs (arm, option) of a cost matrix [arm, option]: each arm has the cheapest plan for its job."""
+        by_slot = cost.reshape(len(cost), -1, plans)
+        best = by_slot.argmin(axis=2)
+        return [(arm, slot * plans + int(best[arm, slot])) for arm, slot in matching(by_slot.min(axis=2))]
 
 
 class QuickestSsi(Ssi):
@@ -60,7 +63,7 @@ class QuickestSsi(Ssi):
     only_choices = True
 
     def cost(self, observations: Sequence[Observation]) -> Array:
-        """[arm, slot] of the observations of all arms."""
+        """[arm, option] of the observations of all arms."""
         return quickest(observations)
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.policy import WAIT
-from agents.rules import LeastDifficulty
+from agents.rules import LeastDifficulty, least_difficult
 from agents.staleness import advantage
 from fleet.observation import Observation
 from fleet.robot import JOINTS
@@ -121,11 +121,14 @@ class Consensus(LeastDifficulty):
         online = [(obs.peer_heard > 0) & (obs.peer_age_s <= 0) for obs in seen]
         links = np.array([np.insert(row, place, False) for place, row in enumerate(online)], dtype=bool)
         claims = agree(cost, links).claims.tolist()
-        return {arm: WAIT if claim == NOBODY else claim + 1 for arm, claim in zip(observations, claims, strict=True)}
+        return {
+            arm: WAIT if claim == NOBODY else least_difficult(observations[arm], claim) + 1
+            for arm, claim in zip(observations, claims, strict=True)
+        }
 
     def _bids(self, observation: Observation, place: int) -> Array:
         """Cost of each slot to this arm, [slot]; inf for those that it may not claim."""
-        legal = observation.action_mask[1:] > 0
+        legal = observation.action_mask[1:].reshape(len(observation.offered), -1).any(axis=1)
         if not legal.any():
             return np.full(len(legal), np.inf)
         relative = advantage(observation, place, legal, self._trust)[place]

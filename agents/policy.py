@@ -27,21 +27,21 @@ class _Resettable(Protocol):
 
 
 class Policy(_Resettable, Protocol):
-    """Chooses one slot (or WAIT) for every arm.
+    """Chooses one option (or WAIT) for every arm: a plan for the job of a slot, see `fleet.observation.Observation`.
 
     `EveryArm` makes one from a policy of scope `arm` without an `act` of its own.
     """
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
-        """One action per arm: WAIT, or k to claim the job in slot k (k = 1 is `observation.difficulty[0]`)."""
+        """One action per arm: WAIT, or k to claim option k - 1 (k = 1 is `observation.difficulty[0]`)."""
         ...
 
 
 class ArmPolicy(_Resettable, Protocol):
-    """Chooses one slot (or WAIT) for one arm; every arm has an instance of its own."""
+    """Chooses one option (or WAIT) for one arm; every arm has an instance of its own."""
 
     def choose(self, observation: Observation, place: int) -> int:
-        """WAIT, or k to claim the job in slot k; `place` is the arm's index in the fleet, for example to break ties."""
+        """WAIT, or k to claim option k - 1; `place` is the arm's index in the fleet, for example to break ties."""
         ...
 
 
@@ -87,6 +87,16 @@ def only_choices(policy: Policy) -> bool:
     return vars(kind).get("only_choices") is True
 
 
-def legal_slots(observation: Observation) -> list[int]:
-    """Slots (from 0) that this arm may claim now, oldest job first."""
+def legal_options(observation: Observation) -> list[int]:
+    """Options (from 0) that this arm may claim now, oldest job first, then the fastest plan."""
     return np.flatnonzero(observation.action_mask[1:]).tolist()
+
+
+def plans_of(observation: Observation) -> int:
+    """Number of options of a slot."""
+    return observation.difficulty.shape[-1] // observation.offered.shape[-1]
+
+
+def per_option(observation: Observation, per_slot: np.ndarray) -> np.ndarray:
+    """Values of slots, [..., slot], for each option, [..., option]."""
+    return np.repeat(per_slot, plans_of(observation), axis=-1)

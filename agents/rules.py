@@ -5,8 +5,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from agents.policy import WAIT, legal_slots
-from agents.staleness import Trust, advantage
+from agents.policy import WAIT, legal_options, per_option, plans_of
+from agents.staleness import Trust, advantage, known_difficulty
 from fleet.observation import Observation
 
 Array = np.ndarray
@@ -34,7 +34,7 @@ class RandomLegal:
 
     def choose(self, observation: Observation, place: int) -> int:
         """A uniform choice among the legal claims; WAIT without one."""
-        choices = legal_slots(observation)
+        choices = legal_options(observation)
         return int(self._rng.choice(choices)) + 1 if choices else WAIT
 
 
@@ -57,9 +57,9 @@ class RoundRobin:
         actions = dict.fromkeys(arms, WAIT)
         for slot in range(_slots(observations)):
             in_turn = [arms[(self._turn + step) % len(arms)] for step in range(len(arms))]
-            arm = _first_able(in_turn, slot, observations, actions)
+            arm, option = _first_able(in_turn, slot, observations, actions)
             if arm is not None:
-                actions[arm] = slot + 1
+                actions[arm] = option + 1
                 self._turn = (arms.index(arm) + 1) % len(arms)
         return actions
 
@@ -75,9 +75,9 @@ class CoolestFirst(Stateless):
         coolest = sorted(observations, key=lambda arm: -float(observations[arm].headroom_k))
         actions = dict.fromkeys(observations, WAIT)
         for slot in range(_slots(observations)):
-            arm = _first_able(coolest, slot, observations, actions)
+            arm, option = _first_able(coolest, slot, observations, actions)
             if arm is not None:
-                actions[arm] = slot + 1
+                actions[arm] = option + 1
         return actions
 
 
@@ -97,19 +97,21 @@ class LeastDifficulty(Stateless):
 
     def choose(self, observation: Observation, place: int) -> int:
         """This arm's claim under the assumption that its peers follow the same rule."""
-        mine = legal_slots(observation)
+        mine = legal_options(observation)
         if not mine:
             return WAIT
-        relative = advantage(observation, place, _open(observation, mine), self._trust)
+        plans = plans_of(observation)
+        slots = list(dict.fromkeys(option // plans for option in mine))
+        relative = advantage(observation, place, _open(observation, slots), self._trust)
         free = self._trust.free(observation)
         able = ~np.isnan(relative) & np.insert(free, place, True)[:, None]
         for arm, slot in cheapest_pairs(np.where(able, relative, np.inf).round(9)):
             if arm == place:
-                return slot + 1
+                return least_difficult(observation, slot) + 1
         if observation.known[mine].any():
             return WAIT
         before = int(free[:place].sum())  # free arms that choose first
-        return mine[min(before, len(mine) - 1)] + 1
+        return least_difficult(observation, slots[min(before, len(slots) - 1)]) + 1
 
 
 class Wspt(Stateless):
@@ -126,13 +128,14 @@ class Wspt(Stateless):
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
         """The claims; ties go to the older job, then to the first arm."""
-        cost = np.stack([-self._rate(seen) for seen in observations.values()])  # [arm, slot]
-        return claims_of(observations, cheapest_pairs(cost))
+        cost = np.stack([-self._rate(seen) for seen in observations.values()])  # [arm, option]
+        return claims_of(observations, cheapest_pairs(cost, _plans(observations)))
 
     def _rate(self, seen: Observation) -> Array:
-        """Value per second of every slot, [slot]; −inf for those that must not be claimed."""
+        """Value per second of every option, [option]; −inf for those that must not be claimed."""
         allowed = seen.action_mask[1:].astype(bool) & (seen.p_saturation <= self.most_p)
-        return np.where(allowed, seen.value / np.maximum(seen.duration_s, 1.0), -np.inf).astype(float)
+        rate = per_option(seen, seen.value) / np.maximum(seen.duration_s, 1.0)
+        return np.where(allowed, rate, -np.inf).astype(float)
 
 
 class WsptCool(Wspt):
@@ -145,45 +148,63 @@ class WsptCool(Wspt):
     most_p = 0.5
 
 
-def cheapest_pairs(cost: Array) -> list[tuple[int, int]]:
-    """Pairs (arm, slot) of a cost matrix [arm, slot], chosen greedily, the cheapest first.
+def cheapest_pairs(cost: Array, plans: int = 1) -> list[tuple[int, int]]:
+    """Pairs (arm, option) of a cost matrix [arm, option], chosen greedily, the cheapest first.
 
-    Each arm and each slot is in at most one pair; inf is never paired. Ties go to the first slot, then to the first
-    arm. This is the outcome of a sequential single-item auction with one job per arm (Lagoudakis et al. 2005, Robotics:
-    Science and Systems; Koenig et al. 2006, AAAI).
+    Each arm and each slot, which has `plans` options, is in at most one pair; inf is never paired. Ties go to the first
+    option, then to the first arm. This is the outcome of a sequential single-item auction with one job per arm
+    (Lagoudakis et al. 2005, Robotics: Science and Systems; Koenig et al. 2006, AAAI).
     """
-    slots, pairs = cost.T, list[tuple[int, int]]()
-    arms_left, slots_left = set(range(len(cost))), set(range(len(slots)))
-    # By slot, then by arm: a stable sort leaves ties in that order.
-    for place in np.argsort(slots, axis=None, kind="stable").tolist():
-        slot, arm = divmod(place, len(cost))
-        if not arms_left or not slots_left or np.isinf(slots[slot, arm]):
+    options, pairs = cost.T, list[tuple[int, int]]()
+    arms_left, slots_left = set(range(len(cost))), set(range(len(options) // plans))
+    # By option, then by arm: a stable sort leaves ties in that order.
+    for place in np.argsort(options, axis=None, kind="stable").tolist():
+        option, arm = divmod(place, len(cost))
+        if not arms_left or not slots_left or np.isinf(options[option, arm]):
             break
-        if arm in arms_left and slot in slots_left:
+        if arm in arms_left and option // plans in slots_left:
             arms_left.remove(arm)
-            slots_left.remove(slot)
-            pairs.append((arm, slot))
+            slots_left.remove(option // plans)
+            pairs.append((arm, option))
     return pairs
 
 
 def claims_of(observations: Mapping[str, Observation], pairs: list[tuple[int, int]]) -> dict[str, int]:
-    """The actions of pairs of arm and slot, each by its index; arms in no pair wait."""
+    """The actions of pairs of arm and option, each by its index; arms in no pair wait."""
     arms = list(observations)
-    return dict.fromkeys(arms, WAIT) | {arms[arm]: slot + 1 for arm, slot in pairs}
+    return dict.fromkeys(arms, WAIT) | {arms[arm]: option + 1 for arm, option in pairs}
+
+
+def least_difficult(observation: Observation, slot: int) -> int:
+    """The legal option of a slot with the least difficulty; the fastest one if none is known."""
+    plans, difficulty = plans_of(observation), np.nan_to_num(known_difficulty(observation), nan=np.inf)
+    here = [option for option in legal_options(observation) if option // plans == slot]
+    return min(here, key=lambda option: float(difficulty[option]))
 
 
 def _open(observation: Observation, mine: list[int]) -> Array:
     """Slots that some arm may claim now, bool, [slot]: not empty, and not closed only by a busy station."""
-    may = np.isin(np.arange(len(observation.offered)), mine)
-    return (observation.offered > 0) & (may | (observation.feasible == 0))
+    slots = len(observation.offered)
+    may, able = np.isin(np.arange(slots), mine), observation.feasible.reshape(slots, -1).any(axis=1)
+    return (observation.offered > 0) & (may | ~able)
 
 
 def _slots(observations: Mapping[str, Observation]) -> int:
     return len(next(iter(observations.values())).offered)
 
 
+def _plans(observations: Mapping[str, Observation]) -> int:
+    return plans_of(next(iter(observations.values())))
+
+
 def _first_able(
     arms: list[str], slot: int, observations: Mapping[str, Observation], actions: Mapping[str, int]
-) -> str | None:
-    """The first of the arms that may claim the slot and has no claim yet."""
-    return next((a for a in arms if actions[a] == WAIT and observations[a].action_mask[slot + 1]), None)
+) -> tuple[str | None, int]:
+    """The first of the arms that may claim the slot and has no claim yet, and its fastest legal option."""
+    plans = _plans(observations)
+    for arm in arms:
+        if actions[arm] == WAIT:
+            for option in range(slot * plans, (slot + 1) * plans):
+                if observations[arm].action_mask[option + 1]:
+                    return arm, option
+    return None, -1

@@ -38,14 +38,19 @@ class Trust:
         return current & (observation.peer_working == 0) & (observation.peer_faulted == 0)
 
 
+def known_difficulty(observation: Observation) -> Array:
+    """This arm's difficulty of each option, [option]; NaN where unknown."""
+    return np.where(observation.known > 0, observation.difficulty, np.nan)
+
+
 def advantage(observation: Observation, place: int, open_slots: Array, trust: Trust) -> Array:
-    """Difficulty of each job for each arm relative to the fleet's average, as this arm knows it, [arm, slot].
+    """Least difficulty of each job for each arm relative to the fleet's average, as this arm knows it, [arm, slot].
 
     Args:
         place: Index of this arm in the fleet.
         open_slots: Slots to compare, bool, [slot]; others are NaN, as are unknown difficulties.
     """
-    own = np.where(observation.known > 0, observation.difficulty, np.nan)
+    own = np.fmin.reduce(known_difficulty(observation).reshape(len(observation.offered), -1), axis=1)
     peers = np.where(observation.peer_known > 0, observation.peer_difficulty, np.nan)
     shared = np.insert(peers.astype(float), place, own, axis=0)  # [arm, slot], in the fleet's order
     shared[:, ~open_slots] = np.nan

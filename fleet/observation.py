@@ -15,7 +15,7 @@ import numpy as np
 from fleet.robot import JOINTS
 
 Array = np.ndarray
-Axis = Literal["joint", "slot", "peer"]
+Axis = Literal["joint", "slot", "option", "peer"]
 
 LONG_S = 1e5
 """Times are clipped to this, s: a little over a day."""
@@ -36,13 +36,18 @@ class Field:
 
 _JOINT: tuple[Axis, ...] = ("joint",)
 _SLOT: tuple[Axis, ...] = ("slot",)
+_OPTION: tuple[Axis, ...] = ("option",)
 _PEER: tuple[Axis, ...] = ("peer",)
 _PEER_SLOT: tuple[Axis, ...] = ("peer", "slot")
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What arms know, by name; leading axes [...] are free. Each `Field` gives axes, unit, lowest and highest value."""
+    """What arms know, by name; leading axes [...] are free. Each `Field` gives axes, unit, lowest and highest value.
+
+    An option is one plan for the job of one slot: option = slot · plans + plan, and action = option + 1 claims it. The
+    first plan of a job is the fastest.
+    """
 
     clock: Annotated[Array, Field((), "1", 0, 1, "share of the shift that has passed")]
     idle: Annotated[Array, Field((), "1", 0, 1, "1 when this arm is free")]
@@ -53,12 +58,14 @@ class Observation:
     temp_c: Annotated[Array, Field(_JOINT, "°C", -60, 200, "own motor temperatures as measured")]
     headroom_k: Annotated[Array, Field((), "K", -150, 150, "warning limit minus hottest motor")]
     offered: Annotated[Array, Field(_SLOT, "1", 0, 1, "1 when the slot holds a job")]
-    feasible: Annotated[Array, Field(_SLOT, "1", 0, 1, "1 when this arm can do it")]
-    known: Annotated[Array, Field(_SLOT, "1", 0, 1, "1 when this arm has a difficulty for it")]
-    difficulty: Annotated[Array, Field(_SLOT, "1", 0, JOINTS, "own thermal difficulty d of its plan, 0 if unknown")]
-    p_saturation: Annotated[Array, Field(_SLOT, "1", 0, 1, "probability to pass the warning limit, 0.5 if unknown")]
-    duration_s: Annotated[Array, Field(_SLOT, "s", 0, LONG_S, "time this arm needs for the rest of it")]
-    slack_s: Annotated[Array, Field(_SLOT, "s", -LONG_S, LONG_S, "due date minus now minus duration")]
+    station_free: Annotated[Array, Field(_SLOT, "1", 0, 1, "1 when no arm occupies its stations")]
+    feasible: Annotated[Array, Field(_OPTION, "1", 0, 1, "1 when this arm has such a plan")]
+    space_free: Annotated[Array, Field(_OPTION, "1", 0, 1, "1 when no other arm takes the space of the plan")]
+    known: Annotated[Array, Field(_OPTION, "1", 0, 1, "1 when this arm has a difficulty for the plan")]
+    difficulty: Annotated[Array, Field(_OPTION, "1", 0, JOINTS, "own thermal difficulty d of the plan, 0 if unknown")]
+    p_saturation: Annotated[Array, Field(_OPTION, "1", 0, 1, "probability to pass the warning limit, 0.5 if unknown")]
+    duration_s: Annotated[Array, Field(_OPTION, "s", 0, LONG_S, "time this arm needs for the rest of the job")]
+    slack_s: Annotated[Array, Field(_OPTION, "s", -LONG_S, LONG_S, "due date minus now minus duration")]
     age_s: Annotated[Array, Field(_SLOT, "s", 0, LONG_S, "time since it was released or came back")]
     payload_kg: Annotated[Array, Field(_SLOT, "kg", 0, 100, "carried mass")]
     value: Annotated[Array, Field(_SLOT, "1", 0, 1e6, "value of finishing it")]
@@ -69,9 +76,11 @@ class Observation:
     peer_faulted: Annotated[Array, Field(_PEER, "1", 0, 1, "1 when the peer was faulted then")]
     peer_headroom_k: Annotated[Array, Field(_PEER, "K", -150, 150, "headroom the peer shared, 0 if none")]
     peer_known: Annotated[Array, Field(_PEER_SLOT, "1", 0, 1, "1 when the peer shared a difficulty for the slot's job")]
-    peer_difficulty: Annotated[Array, Field(_PEER_SLOT, "1", 0, JOINTS, "difficulty the peer shared, 0 if none")]
+    peer_difficulty: Annotated[
+        Array, Field(_PEER_SLOT, "1", 0, JOINTS, "least d of its plans the peer shared, 0 if none")
+    ]
     action_mask: Array
-    """Legal actions, int8 [..., slot + 1]."""
+    """Legal actions, int8 [..., option + 1]."""
 
 
 def _fields() -> Iterator[Field]:
@@ -88,12 +97,14 @@ Offsets = namedtuple("Offsets", [field.name for field in FIELDS])  # pyright: ig
 
 @dataclass(frozen=True)
 class Layout:
-    """Where each field lies in the vector, for a number of arms and slots."""
+    """Where each field lies in the vector, for a number of arms, slots and plans."""
 
     arms: int
     slots: int
     near: tuple[tuple[int, ...], ...] | None = None
     """The peers in each arm's vector, in that order; all others in the fleet's order if not given."""
+    plans: int = 1
+    """Plans for the job of a slot."""
 
     @cached_property
     def who(self) -> Array:
@@ -107,9 +118,14 @@ class Layout:
         """Number of peers in an arm's vector."""
         return self.arms - 1 if self.near is None else len(self.near[0])
 
+    @property
+    def actions(self) -> int:
+        """Number of actions: wait, and one for each option."""
+        return 1 + self.slots * self.plans
+
     def shape(self, field: Field) -> tuple[int, ...]:
         """Axes of a field as numbers."""
-        sizes = {"joint": JOINTS, "slot": self.slots, "peer": self.peers}
+        sizes = {"joint": JOINTS, "slot": self.slots, "option": self.slots * self.plans, "peer": self.peers}
         return tuple(sizes[axis] for axis in field.axes)
 
     @cached_property

@@ -25,7 +25,7 @@ def imitate(
     """Learn the actions of a rule by cross-entropy.
 
     Args:
-        batches: Vectors float32 [row, size], masks [row, slot + 1] and actions int [row]; rows without a choice are
+        batches: Vectors float32 [row, size], masks [row, option + 1] and actions int [row]; rows without a choice are
             ignored.
 
     Returns:

@@ -1,7 +1,7 @@
 """The shared network: one actor for every arm of every fleet, and the critics that train it.
 
-Deep sets (Zaheer et al., NeurIPS 2017): small shared networks encode slots and peers, and their outputs are pooled. So
-the logits are equivariant in the slots, and invariant to the order and number of peers.
+Deep sets (Zaheer et al., NeurIPS 2017): small shared networks encode options and peers, and their outputs are pooled.
+So the logits are equivariant in the options, and invariant to the order and number of peers.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from agents.learned.features import OWN, PAIR, PEER, SLOT, sets_of
+from agents.learned.features import OPTION, OWN, PAIR, PEER, sets_of
 from fleet.observation import Layout
 
 WAIT_BIAS = -3.0
@@ -23,7 +23,7 @@ class NetworkSize:
     """Widths of the hidden layers."""
 
     arm: int = 48
-    slot: int = 48
+    option: int = 48
     pair: int = 16
 
     def __post_init__(self) -> None:
@@ -33,37 +33,37 @@ class NetworkSize:
 
 
 class Actor(nn.Module):
-    """Logits over waiting and the slots."""
+    """Logits over waiting and the options."""
 
     def __init__(self, size: NetworkSize | None = None) -> None:
         super().__init__()
         size = size or NetworkSize()
         self.own = _mlp([OWN, size.arm, size.arm])
-        self.pair = _mlp([PAIR + PEER + SLOT, size.pair, size.pair])
-        self.slot = _mlp([SLOT + 2 * size.pair + size.arm, size.slot, size.slot])
-        self.claim = _mlp([2 * size.slot + size.arm, size.slot, 1], last=False)
-        self.wait = _mlp([size.slot + size.arm, size.slot, 1], last=False)
+        self.pair = _mlp([PAIR + PEER + OPTION, size.pair, size.pair])
+        self.option = _mlp([OPTION + 2 * size.pair + size.arm, size.option, size.option])
+        self.claim = _mlp([2 * size.option + size.arm, size.option, 1], last=False)
+        self.wait = _mlp([size.option + size.arm, size.option, 1], last=False)
         self._pair = size.pair
         nn.init.constant_(_last_linear(self.wait).bias, WAIT_BIAS)
 
     def forward(self, layout: Layout, vectors: Tensor) -> Tensor:
-        """Logits before the mask, [row, slot + 1], of vectors [row, size]."""
-        own_in, slot_in, peer_in, pair_in = sets_of(layout, vectors)
-        slots, peers = slot_in.shape[-2], peer_in.shape[-2]
+        """Logits before the mask, [row, option + 1], of vectors [row, size]."""
+        own_in, option_in, peer_in, pair_in = sets_of(layout, vectors)
+        options, peers = option_in.shape[-2], peer_in.shape[-2]
         own = self.own(own_in)
         if peers:
             of_peer = peer_in[..., :, None, :].expand(*pair_in.shape[:-1], PEER)
-            of_slot = slot_in[..., None, :, :].expand(*pair_in.shape[:-1], SLOT)
-            pairs = self.pair(torch.cat([pair_in, of_peer, of_slot], dim=-1))
+            of_option = option_in[..., None, :, :].expand(*pair_in.shape[:-1], OPTION)
+            pairs = self.pair(torch.cat([pair_in, of_peer, of_option], dim=-1))
             pooled = torch.cat([pairs.mean(dim=-3), pairs.amax(dim=-3)], dim=-1)
         else:
-            pooled = slot_in.new_zeros(*slot_in.shape[:-1], 2 * self._pair)
-        mine = own[..., None, :].expand(*slot_in.shape[:-1], own.shape[-1])
-        slot = self.slot(torch.cat([slot_in, pooled, mine], dim=-1))
-        offered = slot_in[..., :1]
-        queue = (offered * slot).sum(dim=-2) / offered.sum(dim=-2).clamp(min=1.0)
-        waiting = queue[..., None, :].expand(*queue.shape[:-1], slots, queue.shape[-1])
-        claim = self.claim(torch.cat([slot, waiting, mine], dim=-1))[..., 0]
+            pooled = option_in.new_zeros(*option_in.shape[:-1], 2 * self._pair)
+        mine = own[..., None, :].expand(*option_in.shape[:-1], own.shape[-1])
+        option = self.option(torch.cat([option_in, pooled, mine], dim=-1))
+        offered = option_in[..., :1]
+        queue = (offered * option).sum(dim=-2) / offered.sum(dim=-2).clamp(min=1.0)
+        waiting = queue[..., None, :].expand(*queue.shape[:-1], options, queue.shape[-1])
+        claim = self.claim(torch.cat([option, waiting, mine], dim=-1))[..., 0]
         return torch.cat([self.wait(torch.cat([queue, own], dim=-1)), claim], dim=-1)
 
 
@@ -75,16 +75,16 @@ class Critic(nn.Module):
         size = size or NetworkSize()
         self.central = central
         self.own = _mlp([OWN, size.arm, size.arm])
-        self.slot = _mlp([SLOT, size.pair, size.pair])
+        self.option = _mlp([OPTION, size.pair, size.pair])
         self.worth = _mlp([2 * size.arm + 2 * size.pair, size.arm, 1], last=False)
 
     def forward(self, layout: Layout, vectors: Tensor) -> Tensor:
         """Values [..., arm] of vectors [..., arm, size]; a central critic gives all arms the same."""
         sets = sets_of(layout, vectors)
         own = self.own(sets.own)
-        offered = sets.slot[..., :1]
-        slot = offered * self.slot(sets.slot)
-        queue = torch.cat([slot.sum(dim=-2) / 8.0, slot.amax(dim=-2)], dim=-1)
+        offered = sets.option[..., :1]
+        option = offered * self.option(sets.option)
+        queue = torch.cat([option.sum(dim=-2) / 8.0, option.amax(dim=-2)], dim=-1)
         if not self.central:
             return self.worth(torch.cat([own, torch.zeros_like(own), queue], dim=-1))[..., 0]
         state = torch.cat([own.mean(dim=-2), own.amax(dim=-2), queue.mean(dim=-2)], dim=-1)

@@ -12,12 +12,12 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 
 from agents.learned.network import Actor, NetworkSize, masked
-from agents.policy import WAIT
+from agents.policy import WAIT, plans_of
 from fleet.errors import CheckpointError
 from fleet.files import atomic_path
 from fleet.observation import Layout, Observation
 
-FORMAT = 2
+FORMAT = 3
 """Increase it when the network or its inputs change."""
 WEIGHTS, CARD = "policy.safetensors", "policy.json"
 
@@ -54,7 +54,7 @@ class LearnedPolicy:
         if not choosing:
             return actions
         first = observations[choosing[0]]
-        layout = Layout(len(first.peer_heard) + 1, len(first.offered))
+        layout = Layout(len(first.peer_heard) + 1, len(first.offered), plans=plans_of(first))
         vectors = torch.from_numpy(np.stack([layout.pack(observations[arm]) for arm in choosing]))
         mask = torch.from_numpy(np.stack([observations[arm].action_mask for arm in choosing]))
         with torch.inference_mode():

@@ -111,7 +111,7 @@ class Chooser(nn.Module):
         self.actor, self.layout = actor, layout
 
     def forward(self, vectors: Tensor, mask: Tensor) -> Tensor:
-        """[..., slot + 1] of vectors [..., size] and masks."""
+        """[..., option + 1] of vectors [..., size] and masks."""
         choice = mask.sum(dim=-1) > 1
         logits = vectors.new_zeros(mask.shape)
         if bool(choice.any()):

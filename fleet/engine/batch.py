@@ -132,7 +132,8 @@ class Engine:
         self._all = np.arange(envs)
         offers = OpenJobs(
             slot_job=np.full((envs, slots), -1),
-            mask=np.zeros((envs, arms, slots + 1), np.int8),
+            mask=np.zeros((envs, arms, layout.actions), np.int8),
+            station_free=np.zeros((envs, slots), bool),
             unfinished=np.zeros(envs, int),
             given_up=np.zeros(envs, int),
             queue=np.zeros((envs, jobs), np.int32),
@@ -180,7 +181,7 @@ class Engine:
 
     @property
     def mask(self) -> Array:
-        """Legal actions now, int8 [env, arm, slot + 1]; a view that the next step overwrites."""
+        """Legal actions now, int8 [env, arm, option + 1]; a view that the next step overwrites."""
         return self._simulation.offers.mask
 
     @property

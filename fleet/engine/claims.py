@@ -31,7 +31,7 @@ def update_offers(t: Tables, d: Jobs, s: State, o: OpenJobs, rows: Array) -> Non
     fleets, kinds, count, release_s, after = d.fleet, d.kind, d.number, d.release_s, d.after
     tick, modes, status = s.tick, s.mode, s.status
     slot_job, mask, queue, head, current = o.slot_job, o.mask, o.queue, o.head, o.current_kind
-    stations, plans, excluded, taken = t.stations, t.plan, t.excluded, o.taken
+    stations, plans, excluded, taken, options = t.stations, t.plan, t.excluded, o.taken, nonnegative(t.plan.shape[3])
     arms, slots = nonnegative(modes.shape[1]), nonnegative(slot_job.shape[1])
     waits, words = nonnegative(after.shape[2]), nonnegative(stations.shape[2])
     busy = np.empty(words, np.uint64)
@@ -54,18 +54,21 @@ def update_offers(t: Tables, d: Jobs, s: State, o: OpenJobs, rows: Array) -> Non
             kind, free = nonnegative(kinds[e, j]), True
             for w in range(words):
                 free = free and (stations[fleet, kind, w] & busy[w]) == 0
-            slot_job[e, filled] = j
-            filled += 1
+            slot_job[e, filled], o.station_free[e, filled] = j, free
             for a in range(arms):
-                plan = plans[fleet, a, kind]
-                mask[e, a, filled] = (
-                    free and modes[e, a] == IDLE and plan >= 0 and is_free(excluded, nonnegative(plan), taken, e)
-                )
+                open_here = free and modes[e, a] == IDLE
+                for n in range(options):
+                    plan = plans[fleet, a, kind, n]
+                    mask[e, a, 1 + filled * options + n] = (
+                        open_here and plan >= 0 and is_free(excluded, nonnegative(plan), taken, e)
+                    )
+            filled += 1
         while filled < slots and slot_job[e, filled] >= 0:  # slots of the step before
-            slot_job[e, filled] = -1
-            filled += 1
+            slot_job[e, filled], o.station_free[e, filled] = -1, False
             for a in range(arms):
-                mask[e, a, filled] = 0
+                for n in range(options):
+                    mask[e, a, 1 + filled * options + n] = 0
+            filled += 1
 
 
 @jit_inline
@@ -114,9 +117,9 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
     slot_job, mask, queue, head, current, pending = o.slot_job, o.mask, o.queue, o.head, o.current_kind, o.pending
     stations, work, recording = t.stations, t.work, len(events.what) > 0
     plans, plan_of, own, excluded, taken = s.plan, t.plan, t.own_space, t.excluded, o.taken
-    arms, slots, words = (
+    arms, options, words = (
         nonnegative(modes.shape[1]),
-        nonnegative(slot_job.shape[1]),
+        nonnegative(plan_of.shape[3]),
         nonnegative(stations.shape[2]),
     )
     busy, key, order = np.empty(words, np.uint64), np.empty(arms), np.empty(arms, np.int64)
@@ -128,12 +131,13 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
             last[e, a] = 0
             if action == 0:
                 continue
-            if action < 0 or action > slots or mask[e, a, action] == 0:
+            if action < 0 or action >= mask.shape[2] or mask[e, a, action] == 0:
                 illegal[e, a] += 1
                 if recording:
                     record_event(events, ILLEGAL, e, a, -1, -1, 0.0, 0.0)
                 continue
-            score = work[fleet, a, kinds[e, slot_job[e, action - 1]]]["difficulty"]
+            slot, option = divmod(action - 1, options)
+            score = work[fleet, a, kinds[e, slot_job[e, slot]], option]["difficulty"]
             if not score < np.inf:
                 score = LARGEST
             place = claims
@@ -147,9 +151,10 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
         mark_busy_stations(fleet, e, current, stations, busy)
         for rank in range(claims):
             a = order[rank]
-            j = nonnegative(slot_job[e, actions[e, a] - 1])
+            slot, option = divmod(actions[e, a] - 1, options)
+            j, option = nonnegative(slot_job[e, slot]), nonnegative(option)
             kind, free = nonnegative(kinds[e, j]), status[e, j] == WAITING
-            plan = nonnegative(plan_of[fleet, a, kind])
+            plan = nonnegative(plan_of[fleet, a, kind, option])
             free = free and is_free(excluded, plan, taken, e)
             for w in range(words):
                 free = free and (stations[fleet, kind, w] & busy[w]) == 0
@@ -168,7 +173,7 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
             current[e, a], pending[e, a] = kind, True
             todo[e, a] = repetitions[e, j] - cycles[e, j]
             if recording:
-                record_event(events, AWARD, e, a, j, -1, 0.0, float(work[fleet, a, kind]["difficulty"]))
+                record_event(events, AWARD, e, a, j, plan, 0.0, float(work[fleet, a, kind, option]["difficulty"]))
 
 
 @jit_inline

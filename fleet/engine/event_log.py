@@ -27,7 +27,7 @@ def event_buffer(rows: int) -> EventBuffer:
 def record_event(
     events: EventBuffer, kind: int, e: int, a: int, job: int, joint: int, offset_s: float, value: float
 ) -> None:
-    """Append an event of the present step."""
+    """Append an event of the present step; an award has the row of its plan in place of a joint."""
     row = events.used[0]
     events.what[row, 0], events.what[row, 1], events.what[row, 2] = kind, e, a
     events.what[row, 3], events.what[row, 4] = job, joint
@@ -49,12 +49,13 @@ def events_of(world: World, state: State, buffer: EventBuffer) -> Iterator[Event
     for row in np.lexsort((what[:, 2], what[:, 1], phase)).tolist():
         kind, e, a, j, joint = what[row].tolist()
         offset_s, value = numbers[row].tolist()
+        plan, joint = (joint, -1) if kind == AWARD else (-1, joint)
         name, measured, reason = _described(world, state, kind, e, j, joint, value)
         common = {"time_s": float(began_s[e] + offset_s), "env": e, "arm": world.arms[a]}
         common["job"] = world.jobs.names[e][j] if j >= 0 else ""
         yield Event(kind=name, joint=joint + 1, value=measured, reason=reason, **common)
         if kind == AWARD:
-            peak = world.plans.peak_tau[world.offers.plan[e, a, j]]
+            peak = world.plans.peak_tau[plan]
             over = peak - world.torque_warning
             if (over > 0).any():
                 k = int(over.argmax())

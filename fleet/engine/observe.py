@@ -32,10 +32,11 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
     fleets, kinds, keys, repetitions, due_s = d.fleet, d.kind, d.noise_key, d.repetitions, d.due_s
     ticks, temp_c, modes, progress_s, todo = s.tick, s.temp_c, s.mode, s.progress_s, s.todo
     last, queued_s, cycles, returns = s.last_award, s.queued_s, s.cycles, s.returns
-    slot_job, plans, times_s = o.slot_job, s.plan, t.times_s
+    slot_job, station_free, plans, times_s = o.slot_job, o.station_free, s.plan, t.times_s
+    plan_of, own_space, excluded, taken = t.plan, t.own_space, t.excluded, o.taken
     noise_k, payload_kg, values, work = t.sensor_noise_k, t.payload_kg, t.value, t.work
     risk_offset, risk_weight, risk_curve = t.risk_offset, t.risk_weight, t.risk_curve
-    arms, slots = nonnegative(modes.shape[1]), nonnegative(slot_job.shape[1])
+    arms, slots, options = nonnegative(modes.shape[1]), nonnegative(slot_job.shape[1]), nonnegative(plan_of.shape[3])
     at, low, high, first, change = form.offsets, form.low, form.high, form.first_change, form.change
     size = nonnegative(out.shape[2])
     peers = nonnegative((size - at.peer_heard) // (5 + 2 * slots))
@@ -44,9 +45,10 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
     true_c, measured_c, headroom_k = np.empty(LANES), np.empty((arms, LANES)), np.empty(arms, np.float32)
     left, slack_s, slot_kind = np.empty(slots), np.empty(slots), np.empty(slots, np.int64)
     known, shared = np.zeros((arms, slots), np.float32), np.zeros((arms, slots), np.float32)
+    away = np.zeros(taken.shape[1], np.uint64)  # space that other arms take
     # The vector of an arm but for its own fields: filled slots and peers.
     frame = np.zeros(size, np.float32)
-    for k in range(slots):
+    for k in range(slots * options):
         frame[at.p_saturation + k] = 0.5
     for peer in range(peers):
         frame[at.peer_heard + peer] = 1.0
@@ -62,7 +64,7 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
             kind = nonnegative(kinds[e, j])
             slot_kind[filled] = kind
             left[filled], slack_s[filled] = repetitions[e, j] - cycles[e, j], due_s[e, j] - now_s
-            frame[at.offered + filled] = 1.0
+            frame[at.offered + filled], frame[at.station_free + filled] = 1.0, station_free[e, filled]
             frame[at.age_s + filled] = min(max(now_s - queued_s[e, j], 0.0), LONG_S)
             frame[at.payload_kg + filled] = min(payload_kg[fleet, kind], most_kg)
             frame[at.value + filled] = min(max(values[fleet, kind], 0.0), most_value)
@@ -70,7 +72,7 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
             filled += 1
         for k in range(filled, filled_before):
             frame[at.offered + k] = frame[at.age_s + k] = frame[at.payload_kg + k] = 0.0
-            frame[at.value + k] = frame[at.returns + k] = 0.0
+            frame[at.value + k] = frame[at.returns + k] = frame[at.station_free + k] = 0.0
             for peer in range(peers):
                 frame[at.peer_known + peer * slots + k] = frame[at.peer_difficulty + peer * slots + k] = 0.0
         filled_before = filled
@@ -81,9 +83,11 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
             count += np.uint64(JOINTS)
             headroom_k[a] = min(max(t.warning_c - hottest(true_c), low_k), high_k)
             for k in range(filled):
-                score = work[fleet, a, slot_kind[k]]["difficulty"]
-                known[a, k] = not np.isnan(score)
-                shared[a, k] = 0.0 if np.isnan(score) else score
+                known[a, k] = shared[a, k] = 0.0
+                for n in range(options):
+                    score = work[fleet, a, slot_kind[k], n]["difficulty"]
+                    if not np.isnan(score) and (known[a, k] == 0.0 or score < shared[a, k]):
+                        known[a, k], shared[a, k] = 1.0, score
         for a in range(arms):
             for n in range(first[a], first[a + 1]):
                 peer, b = nonnegative(change[n, 0]), nonnegative(change[n, 1])
@@ -105,15 +109,26 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
             for k in range(JOINTS):
                 out[e, a, at.temp_c + k] = min(max(measured_c[a, k], low_c), high_c)
             out[e, a, at.headroom_k] = headroom_k[a]
+            for w in range(len(away)):
+                away[w] = taken[e, w] & ~own_space[plans[e, a], w] if plans[e, a] >= 0 else taken[e, w]
             for k in range(filled):
-                own = work[fleet, a, nonnegative(slot_kind[k])]
-                duration_s = own["travel_s"] + left[k] * own["cycle_s"]
-                out[e, a, at.feasible + k] = duration_s > 0
-                out[e, a, at.duration_s + k] = min(duration_s, LONG_S)
-                out[e, a, at.slack_s + k] = min(max(slack_s[k] - duration_s, -LONG_S), LONG_S)
-                out[e, a, at.known + k], out[e, a, at.difficulty + k] = known[a, k], shared[a, k]
-                p, r = own["p_saturation"], own["risk"]
-                if r >= 0:
-                    p = passing_probability(risk_offset[r], risk_weight[r], risk_curve[r], measured_c[a])
-                if not np.isnan(p):
-                    out[e, a, at.p_saturation + k] = p
+                kind = nonnegative(slot_kind[k])
+                for n in range(options):
+                    plan, option = plan_of[fleet, a, kind, n], k * options + n
+                    if plan < 0:
+                        continue
+                    touched = np.uint64(0)
+                    for w in range(len(away)):
+                        touched |= excluded[plan, w] & away[w]
+                    own = work[fleet, a, kind, n]
+                    duration_s, score = own["travel_s"] + left[k] * own["cycle_s"], own["difficulty"]
+                    out[e, a, at.feasible + option], out[e, a, at.space_free + option] = 1.0, touched == 0
+                    out[e, a, at.duration_s + option] = min(duration_s, LONG_S)
+                    out[e, a, at.slack_s + option] = min(max(slack_s[k] - duration_s, -LONG_S), LONG_S)
+                    if not np.isnan(score):
+                        out[e, a, at.known + option], out[e, a, at.difficulty + option] = 1.0, score
+                    p, r = own["p_saturation"], own["risk"]
+                    if r >= 0:
+                        p = passing_probability(risk_offset[r], risk_weight[r], risk_curve[r], measured_c[a])
+                    if not np.isnan(p):
+                        out[e, a, at.p_saturation + option] = p

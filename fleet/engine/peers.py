@@ -31,16 +31,17 @@ def broadcast(engine: Engine, vectors: Array, names: Sequence[str], twins: tuple
     known, slots = engine.layout.read(vectors, engine.mask[env]), engine.offers.slot_job[env]
     tables, fleet = engine.tables, engine.jobs.fleet[env]
     kinds = np.where(slots >= 0, engine.jobs.kind[env, slots], 0)
-    work = tables.work[fleet][:, kinds]
+    work, filled = tables.work[fleet][:, kinds], slots[:, None] >= 0  # [arm, slot, plan]
     unknown = (work["risk"] < 0) & np.isnan(work["p_saturation"])
+    p_saturation = known.p_saturation.reshape(unknown.shape)
     return Broadcast(
         time_s=float(engine.state.tick[env] * tables.dt_s),
         mode=engine.state.mode[env].copy(),
         temp_c=known.temp_c.astype(float),
         headroom_k=known.headroom_k.astype(float),
         jobs=tuple(names[j] if j >= 0 else "" for j in map(int, slots)),
-        difficulty=np.where(slots >= 0, work["difficulty"], np.nan),
-        p_saturation=np.where((slots >= 0) & ~unknown, known.p_saturation, np.nan),
+        difficulty=np.fmin.reduce(np.where(filled, work["difficulty"], np.nan), axis=-1),
+        p_saturation=np.fmin.reduce(np.where(filled & ~unknown, p_saturation, np.nan), axis=-1),
         twin=twins,
     )
 

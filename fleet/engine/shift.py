@@ -120,7 +120,7 @@ class ShiftRunner:
     ) -> None:
         world = episode.world
         self._episode, self._watch = episode, watch
-        self._layout = layout or Layout(len(world.arms), world.slots)
+        self._layout = layout or Layout(len(world.arms), world.slots, plans=world.plans_per_job)
         at_once = exchange is None or (isinstance(exchange, MemoryExchange) and exchange.perfect)
         self._exchange = None if at_once else exchange
         self._delivered_before = 0
@@ -153,7 +153,7 @@ class ShiftRunner:
 
     @property
     def mask(self) -> Array:
-        """Legal actions, int8 [arm, slot + 1]; the next step overwrites it."""
+        """Legal actions, int8 [arm, option + 1]; the next step overwrites it."""
         return self._engine.mask[0]
 
     @property
@@ -251,7 +251,7 @@ def step(
     """One decision interval from a given state, which is left untouched.
 
     Args:
-        actions: 0 waits or goes on, k claims slot k, int [env, arm].
+        actions: 0 waits or goes on, k claims option k - 1, int [env, arm].
         log: Receives the events, if given.
         compiled: As in `Engine`; a single arm in real time runs uncompiled.
     """
@@ -267,7 +267,7 @@ def step(
 
 
 def open_jobs(world: World, state: State, *, compiled: bool | None = None) -> tuple[Array, Array]:
-    """Jobs in the slots, int [env, slot], and legal actions, int8 [env, arm, slot + 1], in a state."""
+    """Jobs in the slots, int [env, slot], and legal actions, int8 [env, arm, option + 1], in a state."""
     engine, out = _engine_of(world, compiled)
     engine.load(state)
     engine.observe(np.arange(world.envs), out)
@@ -278,7 +278,7 @@ def open_jobs(world: World, state: State, *, compiled: bool | None = None) -> tu
 def _engine_of(world: World, compiled: bool | None) -> tuple[Engine, Array]:
     """An engine for a world, and room for its observations."""
     tables, drawn = tables_of(world)
-    layout = Layout(len(world.arms), world.slots)
+    layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job)
     room = world.jobs.exists.shape[1]
     engine = Engine(tables, world.envs, layout, RewardWeights(), jobs=room, events=True, trace=True, compiled=compiled)
     engine.reset(np.arange(world.envs), shifts_of(drawn, [0] * world.envs))

@@ -61,16 +61,16 @@ class PlanTable:
 
 @dataclass(frozen=True, eq=False)
 class Offers:
-    """The plan of each arm for each job, and its scores."""
+    """The plans of each arm for each job, the fastest first, and their scores."""
 
     plan: Array
-    """Row of the `PlanTable`, int [env, arm, job]; −1 where the arm cannot do the job."""
+    """Row of the `PlanTable`, int [env, arm, job, plan]; −1 where the arm has none."""
     difficulty: Array
-    """d, [env, arm, job]; NaN where there is no score."""
+    """d, [env, arm, job, plan]; NaN where there is no score."""
     p_saturation: Array
-    """Probability from models that ignore the start temperature, [env, arm, job]; NaN where unknown."""
+    """Probability from models that ignore the start temperature, [env, arm, job, plan]; NaN where unknown."""
     risk: Array
-    """Row of `risks` for the whole job, int [env, arm, job]; −1 where the model has none."""
+    """Row of `risks` for the whole job, int [env, arm, job, plan]; −1 where the model has none."""
     risks: Risk | None
     """[risk, ...]; None where no model of the fleet has any."""
 
@@ -113,6 +113,11 @@ class World:
     def horizon_s(self) -> float:
         """Length of the shift, s."""
         return self.ticks * self.dt_s
+
+    @property
+    def plans_per_job(self) -> int:
+        """Plans that an arm may have for a job."""
+        return self.offers.plan.shape[-1]
 
     @property
     def envs(self) -> int:

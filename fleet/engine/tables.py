@@ -29,9 +29,9 @@ WORK = np.dtype(
         "itemsize": 64,  # one cache line
     }
 )
-"""What an arm knows of a kind of job: seconds of approach and retreat, and of one repetition, both 0 where it cannot do
-it; difficulty; P(saturation) from models that ignore the start temperature, both NaN where not known; row of the risk
-tables, −1 for none."""
+"""What an arm knows of a plan for a kind of job: seconds of approach and retreat, and of one repetition, both 0 where
+it has none; difficulty; P(saturation) from models that ignore the start temperature, both NaN where not known; row of
+the risk tables, −1 for none."""
 
 
 class Tables(NamedTuple):
@@ -83,9 +83,9 @@ class Tables(NamedTuple):
     excluded: Array
     """Volumes that must be free for a plan, one bit each, uint64 [plan, word]."""
     plan: Array
-    """Row of the plan tables, −1 where the arm cannot do it, int [fleet, arm, kind]."""
+    """Row of the plan tables, −1 where the arm has none, int [fleet, arm, kind, plan]; the fastest first."""
     work: Array
-    """What an arm knows of a kind of job, `WORK` [fleet, arm, kind]."""
+    """What an arm knows of its plans for a kind of job, `WORK` [fleet, arm, kind, plan]."""
     risk_offset: Array
     """[risk, piece]; see `fleet.difficulty.Risk`."""
     risk_weight: Array
@@ -131,7 +131,9 @@ class OpenJobs(NamedTuple):
     slot_job: Array
     """int [env, slot], −1 for an empty slot."""
     mask: Array
-    """Legal actions, int8 [env, arm, slot + 1]."""
+    """Legal actions, int8 [env, arm, option + 1]."""
+    station_free: Array
+    """Whether no arm occupies the stations of a slot's job, bool [env, slot]."""
     unfinished: Array
     """Jobs neither done nor given up, int [env]."""
     given_up: Array
@@ -281,7 +283,7 @@ def tables_of(world: World) -> tuple[Tables, Jobs]:
         risk_offset=risk_offset,
         risk_weight=risk_weight,
         risk_curve=risk_curve,
-        feasible=can.swapaxes(-1, -2),
+        feasible=can.any(axis=-1).swapaxes(-1, -2),
         stations=bits(_one_hot(jobs.stations, len(world.stations))),
         payload_kg=jobs.payload_kg,
         value=jobs.value,

@@ -9,7 +9,7 @@ import numpy as np
 from fleet.difficulty import Difficulty, DifficultyModel, Risk, stack_risks
 from fleet.engine.state import JobTable, Offers, PlanTable, World
 from fleet.job import Job, Work, check_precedence
-from fleet.motion import Drive, Plan, drive
+from fleet.motion import PLANS, Drive, Plan, drive, offered_plans
 from fleet.motor import Motors, stack_motors
 from fleet.robot import GEN3, Robot, ThermalLimits
 from fleet.thermal import ThermalModel, stack_models, steady_state
@@ -35,7 +35,7 @@ class Arm:
     """Variants per work it can do; a work it cannot do is missing."""
 
     @cached_property
-    def _offered(self) -> dict[Work, "ScoredVariants"]:
+    def _offered(self) -> dict[Work, "ScoredPlans"]:
         return {}
 
     @cached_property
@@ -47,10 +47,10 @@ class Arm:
     def _driven(self) -> dict[int, tuple[Plan, tuple[Array, Array, Array, Array]]]:
         return {}
 
-    def offers(self, work: Work) -> "ScoredVariants":
-        """Its best variant of a work by number of repetitions; kept, because shift after shift asks for the same."""
+    def offers(self, work: Work) -> "ScoredPlans":
+        """Its plans for a work, by number of repetitions; kept, because shift after shift asks for the same."""
         if work not in self._offered:
-            self._offered[work] = ScoredVariants(self.model, self.plans.get(work, ()))
+            self._offered[work] = ScoredPlans(self.model, self.plans.get(work, ()))
         return self._offered[work]
 
     def driven(self, plan: Plan) -> tuple[Array, Array, Array, Array]:
@@ -70,19 +70,16 @@ class Arm:
         return drive(still, self.motors)
 
 
-class ScoredVariants(dict[int, tuple[Plan, Difficulty | None] | None]):
-    """The variant with the least difficulty, and that, by number of repetitions; without scores the first variant.
-
-    None where there is no variant. Scored when first asked for.
-    """
+class ScoredPlans(dict[int, list[tuple[Plan, Difficulty | None]]]):
+    """The plans on offer for a work by number of repetitions, with their scores; scored when first asked for."""
 
     def __init__(self, model: DifficultyModel, variants: Sequence[Plan]) -> None:
         super().__init__()
         self._model, self._variants = model, variants
 
-    def __missing__(self, repetitions: int) -> tuple[Plan, Difficulty | None] | None:
-        scored = [(plan, self._model.score(plan, repetitions)) for plan in self._variants]
-        self[repetitions] = min(scored, key=lambda pair: pair[1].total if pair[1] is not None else 0.0, default=None)
+    def __missing__(self, repetitions: int) -> list[tuple[Plan, Difficulty | None]]:
+        offered = offered_plans(self._variants, repetitions)
+        self[repetitions] = [(plan, self._model.score(plan, repetitions)) for plan in offered]
         return self[repetitions]
 
 
@@ -163,31 +160,28 @@ def _laws(arms: tuple[Arm, ...], dt_s: float) -> tuple[Motors, ThermalModel, Dri
 
 
 def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]]) -> tuple[tuple[Plan, ...], Offers]:
-    shape = (len(shifts), len(arms), max(1, *map(len, shifts)))
+    shape = (len(shifts), len(arms), max(1, *map(len, shifts)), PLANS)
     plan, total, p_saturation = np.full(shape, -1), np.full(shape, np.nan), np.full(shape, np.nan)
     risk = np.full(shape, -1)
     rows: dict[int, int] = {}
     plans: list[Plan] = []
     risks: dict[int, tuple[int, Risk]] = {}
-    offered: dict[int, list[ScoredVariants]] = {}  # by id: hashing a work takes longer than the rest
+    offered: dict[int, list[ScoredPlans]] = {}  # by id: hashing a work takes longer than the rest
     for e, jobs in enumerate(shifts):
         for j, job in enumerate(jobs):
             if id(job.work) not in offered:
                 offered[id(job.work)] = [arm.offers(job.work) for arm in arms]
             for a, offers in enumerate(offered[id(job.work)]):
-                offer = offers[job.repetitions]
-                if offer is None:
-                    continue
-                best, score = offer
-                if id(best) not in rows:
-                    rows[id(best)] = len(plans)
-                    plans.append(best)
-                plan[e, a, j] = rows[id(best)]
-                if score is not None:
-                    total[e, a, j] = score.total
-                    p_saturation[e, a, j] = np.nan if score.p_saturation is None else score.p_saturation
-                    if score.risk is not None:
-                        risk[e, a, j] = risks.setdefault(id(score.risk), (len(risks), score.risk))[0]
+                for n, (offer, score) in enumerate(offers[job.repetitions]):
+                    if id(offer) not in rows:
+                        rows[id(offer)] = len(plans)
+                        plans.append(offer)
+                    plan[e, a, j, n] = rows[id(offer)]
+                    if score is not None:
+                        total[e, a, j, n] = score.total
+                        p_saturation[e, a, j, n] = np.nan if score.p_saturation is None else score.p_saturation
+                        if score.risk is not None:
+                            risk[e, a, j, n] = risks.setdefault(id(score.risk), (len(risks), score.risk))[0]
     stack = stack_risks([r for _, r in risks.values()]) if risks else None
     return tuple(plans), Offers(plan=plan, difficulty=total, p_saturation=p_saturation, risk=risk, risks=stack)
 

@@ -1,8 +1,9 @@
 """Thermal job allocation, version 0: arms claim jobs, heat up, and must not fault.
 
 A PettingZoo `ParallelEnv` as a thin view of the one engine `fleet.engine.step`. Agents are the arms, fixed for the
-whole episode. Every decision interval each answers Discrete(slots + 1): 0 waits or goes on and is always legal, k
-claims the job in slot k. Two claims for one job or station: the lower shared difficulty wins, then the lower index.
+whole episode. At every step each answers Discrete(slots · plans + 1): 0 waits or goes on and is always legal,
+1 + slot · plans + plan claims the job in a slot by one of the arm's plans for it. Of two claims for one job, station or
+space the lower difficulty wins, then the lower index.
 """
 
 from typing import Any, Literal, get_args
@@ -100,7 +101,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         self.possible_agents = list(world.arms)
         self.agents: list[str] = []
         self._exchange = exchange or MemoryExchange(world.arms)
-        self.layout = Layout(len(world.arms), world.slots, near)
+        self.layout = Layout(len(world.arms), world.slots, near, world.plans_per_job)
         per_arm = [arm_spaces(self.layout) for _ in world.arms]
         self.observation_spaces: dict[str, spaces.Space[Any]] = {
             arm: own["observation"] if mask_in == "info" else own
@@ -242,7 +243,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         return agent_of(self.possible_agents, agent)
 
     def _observations(self) -> tuple[dict[str, Any], Array]:
-        """Observations by agent, and the masks [arm, slot + 1]; all in arrays of their own."""
+        """Observations by agent, and the masks [arm, option + 1]; all in arrays of their own."""
         shift = self._begun("observing")
         vectors, masks = shift.vectors.copy(), shift.mask.copy()
         arms = self.possible_agents

@@ -12,7 +12,7 @@ def arm_spaces(layout: Layout) -> tuple[spaces.Dict, spaces.Discrete]:
     observation = spaces.Dict(
         {
             "observation": spaces.Box(low, high, dtype=np.float32),
-            "action_mask": spaces.Box(0, 1, (layout.slots + 1,), dtype=np.int8),
+            "action_mask": spaces.Box(0, 1, (layout.actions,), dtype=np.int8),
         }
     )
-    return observation, spaces.Discrete(layout.slots + 1)
+    return observation, spaces.Discrete(layout.actions)

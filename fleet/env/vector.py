@@ -25,7 +25,7 @@ from fleet.seeding import exchange_seed, shift_seeds
 
 Array = np.ndarray
 Obs = dict[str, Array]
-"""{"observation": float32 [env, arm, size], "action_mask": int8 [env, arm, slot + 1]}."""
+"""{"observation": float32 [env, arm, size], "action_mask": int8 [env, arm, option + 1]}."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ class BatchEnv:
         """Of the present shift of each env."""
         self.agents = library.arms
         """Names of the arms, in the order of the arm axis."""
-        self.layout = Layout(len(library.arms), library.slots, library.near)
+        self.layout = Layout(len(library.arms), library.slots, library.near, library.tables.plan.shape[3])
         self.single_observation_space, self.single_action_space = arm_spaces(self.layout)
         """Of one arm."""
         self.autoreset = autoreset
@@ -150,7 +150,7 @@ class BatchEnv:
         """One step of every env.
 
         Args:
-            actions: int [env, arm]: 0 waits or goes on, k claims slot k; what is outside the mask is a wait.
+            actions: int [env, arm]: 0 waits or goes on, k claims option k - 1; what is outside the mask is a wait.
 
         Returns:
             What the arms know; the reward, float64 [env]; terminated and truncated, bool [env]; and infos of the step
@@ -231,10 +231,10 @@ class BatchEnv:
     def _info(self, terms: Array, ended: Array, last: Obs | None) -> dict[str, Any]:
         state = self._engine.state
         if last is None:
-            arms, slots = self.layout.arms, self.layout.slots
+            arms = self.layout.arms
             last = {
                 "observation": np.zeros((0, arms, self.layout.size), np.float32),
-                "action_mask": np.zeros((0, arms, slots + 1), np.int8),
+                "action_mask": np.zeros((0, arms, self.layout.actions), np.int8),
             }
         return {
             "faults": state.faults.copy(),

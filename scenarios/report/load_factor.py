@@ -44,8 +44,8 @@ class LoadFactor:
 
 def load_factor(world: World) -> LoadFactor:
     """Thermal, blind and time load of the jobs of env 0."""
-    jobs = np.flatnonzero(world.jobs.exists[0] & (world.offers.plan[0] >= 0).any(axis=0))
-    plan = world.offers.plan[0][:, jobs]
+    jobs = np.flatnonzero(world.jobs.exists[0] & (world.offers.plan[0] >= 0).any(axis=(0, 2)))
+    plan = world.offers.plan[0][:, jobs, 0]
     possible = plan >= 0
     if not possible.any():
         return LoadFactor(0.0, 0.0, 0.0)

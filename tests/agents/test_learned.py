@@ -47,7 +47,7 @@ def reordered(layout: Layout, vectors: np.ndarray, slots: np.ndarray, peers: np.
     named = {}
     for field in FIELDS:
         part = getattr(seen, field.name)
-        for axis, order in (("slot", slots), ("peer", peers)):
+        for axis, order in (("slot", slots), ("option", slots), ("peer", peers)):
             if axis in field.axes:
                 part = np.take(part, order, axis=1 + field.axes.index(axis))
         named[field.name] = part
@@ -152,7 +152,7 @@ def test_a_training_goes_on_where_it_was(small, tmp_path) -> None:
 
 def test_a_policy_is_kept_whole(tmp_path) -> None:
     torch.manual_seed(3)
-    size, layout = NetworkSize(arm=8, slot=8, pair=4), Layout(3, 5)
+    size, layout = NetworkSize(arm=8, option=8, pair=4), Layout(3, 5)
     actor = Actor(size)
     save_policy(actor, size, tmp_path / "p", scenario="x")
     vectors = random_observation(layout, np.random.default_rng(1), 3)
@@ -175,7 +175,7 @@ def test_a_policy_is_kept_whole(tmp_path) -> None:
 def test_what_is_no_policy_is_said(tmp_path) -> None:
     with pytest.raises(CheckpointError, match="There is no trained policy in"):
         load_policy(tmp_path)
-    size = NetworkSize(arm=8, slot=8, pair=4)
+    size = NetworkSize(arm=8, option=8, pair=4)
     save_policy(Actor(size), size, tmp_path)
     (tmp_path / WEIGHTS).write_bytes(b"rubbish")
     with pytest.raises(CheckpointError, match=WEIGHTS):
@@ -183,7 +183,7 @@ def test_what_is_no_policy_is_said(tmp_path) -> None:
     save_policy(Actor(), size, tmp_path)
     with pytest.raises(CheckpointError, match="size mismatch"):
         load_policy(tmp_path)
-    for text, reason in (("{", "not the card"), ('{"format": 9, "size": {}}', "format 9 is not 2"), ("[]", "not the")):
+    for text, reason in (("{", "not the card"), ('{"format": 9, "size": {}}', "format 9 is not 3"), ("[]", "not the")):
         (tmp_path / CARD).write_text(text)
         with pytest.raises(CheckpointError, match=reason):
             load_policy(tmp_path)

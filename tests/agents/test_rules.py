@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from agents.policy import WAIT, EveryArm, for_all_arms, legal_slots, only_choices
+from agents.policy import WAIT, EveryArm, for_all_arms, legal_options, only_choices
 from agents.registry import RULES, make_policy
 from agents.rules import LeastDifficulty, RandomLegal
 from fleet.env.allocation_v0 import parallel_env
@@ -237,7 +237,7 @@ def test_two_arms_never_claim_the_same_job_in_a_shift(small) -> None:
             actions = policy.act(seen)
             claims = [action for action in actions.values() if action]
             assert len(claims) == len(set(claims))
-            assert all(action == WAIT or action - 1 in legal_slots(seen[arm]) for arm, action in actions.items())
+            assert all(action == WAIT or action - 1 in legal_options(seen[arm]) for arm, action in actions.items())
             env.step(actions)
 
 

@@ -19,9 +19,20 @@ def world_of(small, places, arms=3, slots=4, **more):
 
 
 def with_difficulty(world: World, difficulty) -> World:
-    """Return the world with other difficulties, broadcast to [env, arm, job], which decide between claims."""
+    """Return the world with other difficulties, broadcast to [env, arm, job, plan], which decide between claims."""
     offers = world.offers
     return replace(world, offers=replace(offers, difficulty=np.broadcast_to(difficulty, offers.difficulty.shape)))
+
+
+def with_two_plans(world: World) -> World:
+    """Return the world in which each arm has a second plan for each job, with rows of its own."""
+    plans, offers, count = world.plans, world.offers, len(world.plans.volume)
+    twice = {name: np.concatenate([values, values]) for name, values in vars(plans).items()}
+    more = {
+        name: np.concatenate([getattr(offers, name)] * 2, axis=-1) for name in ("difficulty", "p_saturation", "risk")
+    }
+    rows = np.concatenate([offers.plan, offers.plan + count], axis=-1)
+    return replace(world, plans=replace(plans, **twice), offers=replace(offers, plan=rows, **more))
 
 
 def with_conflicts(world: World, conflicts) -> World:
@@ -32,24 +43,25 @@ def with_conflicts(world: World, conflicts) -> World:
 def referee(slot_job, mask, stations, actions, difficulty, occupied, touches, away):
     """Award claims in order of (difficulty, arm); return jobs, losers, illegal.
 
-    `touches(arm, job, plan)` tells whether the arm's plan for a job touches a plan; `away` are the plans of arms that
-    are away from home.
+    Every job has two options. `difficulty` is [arm, job, option]. `touches(arm, job, option, other)` tells whether a
+    plan touches that of another (arm, job, option); `away` are those of arms that are away from home.
     """
     arms = len(actions)
     legal = [0 <= a < mask.shape[1] and bool(mask[i, a]) for i, a in enumerate(actions)]
     claims = []
     for i, action in enumerate(actions):
         if legal[i] and action > 0:
-            job = slot_job[action - 1]
-            claims.append((np.inf if np.isnan(difficulty[i, job]) else difficulty[i, job], i, job))
+            slot, option = divmod(action - 1, 2)
+            score = difficulty[i, slot_job[slot], option]
+            claims.append((np.inf if np.isnan(score) else score, i, slot_job[slot], option))
     won, taken, busy, away = [-1] * arms, set(), set(occupied), list(away)
-    for _, i, job in sorted(claims):
-        if job not in taken and not stations[job] & busy and not any(touches(i, job, plan) for plan in away):
-            won[i] = job
+    for _, i, job, option in sorted(claims):
+        if job not in taken and not stations[job] & busy and not any(touches(i, job, option, other) for other in away):
+            won[i] = (job, option)
             taken.add(job)
-            away.append((i, job))
+            away.append((i, job, option))
             busy |= stations[job]
-    return won, [won[i] < 0 and i in {c[1] for c in claims} for i in range(arms)], [not ok for ok in legal]
+    return won, [won[i] == -1 and i in {c[1] for c in claims} for i in range(arms)], [not ok for ok in legal]
 
 
 PLACES = ["bench", "rack", ("bench", "rack"), ("rack", "press"), "press", "shelf"]
@@ -63,6 +75,7 @@ def test_awards_equal_the_reference(small, data) -> None:
     stations = {j: set(p if isinstance(p, tuple) else (p,)) for j, p in enumerate(places)}
     pairs = [(p[0], 0.0, p[1]) if isinstance(p, tuple) else (p,) for p in places]
     world, plant = world_of(small, pairs, arms=arms)
+    world = with_two_plans(world)
     state, count = initial(world), len(places)
     plan = world.offers.plan[0]
     size = int(plan.max()) + 1
@@ -72,31 +85,36 @@ def test_awards_equal_the_reference(small, data) -> None:
         conflicts[one, other] = conflicts[other, one] = True
     world = with_conflicts(world, conflicts)
 
-    def touches(arm, job, other):
-        return conflicts[plan[arm, job], plan[other]]
+    def touches(arm, job, option, other):
+        return conflicts[plan[arm, job, option], plan[other]]
+
+    chosen = [0] * arms  # option of each arm's job
 
     value = st.sampled_from([0.1, 0.5, 0.5, 2.0, float("nan")])
     for _ in range(3):
-        actions = np.array(data.draw(st.lists(st.integers(-2, 6), min_size=arms, max_size=arms)))
-        row = st.lists(value, min_size=count, max_size=count)
-        difficulty = np.array(data.draw(st.lists(row, min_size=arms, max_size=arms)))
+        actions = np.array(data.draw(st.lists(st.integers(-2, 10), min_size=arms, max_size=arms)))
+        row = st.lists(value, min_size=2 * count, max_size=2 * count)
+        difficulty = np.array(data.draw(st.lists(row, min_size=arms, max_size=arms))).reshape(arms, count, 2)
         world = with_difficulty(world, difficulty)
         slot_job, mask = open_jobs(world, state, compiled=False)
         held = [j for j in state.job[0].tolist() if j >= 0]
         busy = set().union(*(stations[j] for j in held))
-        away = [(a, j) for a, j in enumerate(state.job[0].tolist()) if j >= 0]
+        away = [(a, j, chosen[a]) for a, j in enumerate(state.job[0].tolist()) if j >= 0]
         for slot, j in enumerate(slot_job[0].tolist()):
             for a in range(arms):
                 may = j >= 0 and state.mode[0, a] == IDLE and not stations[j] & busy
-                may = may and not any(touches(a, j, other) for other in away)
-                assert mask[0, a, slot + 1] == may
+                for option in (0, 1):
+                    clear = may and not any(touches(a, j, option, other) for other in away)
+                    assert mask[0, a, 1 + 2 * slot + option] == clear
         won, lost, illegal = referee(slot_job[0], mask[0], stations, actions, difficulty, busy, touches, away)
         after = step(world, state, actions[None], plant, compiled=False).state
         assert (after.illegal - state.illegal)[0].tolist() == illegal
         assert (after.last_award[0] == -1).tolist() == lost
-        assert (after.last_award[0] == 1).tolist() == [job >= 0 for job in won]
+        assert (after.last_award[0] == 1).tolist() == [job != -1 for job in won]
+        chosen = [chosen[a] if w == -1 else w[1] for a, w in enumerate(won)]
         # After three steps no arm is home again.
-        expected = [h if h >= 0 else w for h, w in zip(state.job[0].tolist(), won, strict=True)]
+        expected = [h if h >= 0 else w if w == -1 else w[0] for h, w in zip(state.job[0].tolist(), won, strict=True)]
+        assert after.plan[0].tolist() == [-1 if j < 0 else plan[a, j, chosen[a]] for a, j in enumerate(expected)]
         assert after.job[0].tolist() == expected
         state = after
 
@@ -104,7 +122,7 @@ def test_awards_equal_the_reference(small, data) -> None:
 def test_a_score_beats_no_score_and_the_lower_index_wins_a_tie(small) -> None:
     world, plant = world_of(small, ["bench"])
     for scores, winner in (([np.nan, 3.0, 3.0], 1), ([0.5, 0.2, 0.2], 1), ([np.nan] * 3, 0), ([6.9, np.nan, 7.0], 0)):
-        world = with_difficulty(world, np.array(scores)[None, :, None])
+        world = with_difficulty(world, np.array(scores)[None, :, None, None])
         state = step(world, initial(world), np.ones((1, 3), int), plant).state
         assert (state.mode[0] == WORKING).nonzero()[0].tolist() == [winner]
         expected = [-1, -1, -1]
@@ -114,7 +132,7 @@ def test_a_score_beats_no_score_and_the_lower_index_wins_a_tie(small) -> None:
 
 def test_one_station_serves_one_job_at_a_time(small) -> None:
     world, plant = world_of(small, ["bench", "bench", "rack"], arms=2)
-    world = with_difficulty(world, np.array([2.0, 1.0])[None, :, None])
+    world = with_difficulty(world, np.array([2.0, 1.0])[None, :, None, None])
     both = step(world, initial(world), np.array([[1, 2]]), plant).state
     assert both.job[0].tolist() == [-1, 1]
     assert open_jobs(world, both)[1][0, 0].tolist() == [1, 0, 1, 0, 0]

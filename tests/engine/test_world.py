@@ -32,14 +32,17 @@ def with_variants(small, by_elbow):
     return replace(arm, model=Scripted(by_elbow), plans={content: tuple(replace(plan, elbow=k) for k in by_elbow)})
 
 
-def test_an_arm_offers_its_plan_of_lowest_difficulty(small) -> None:
+def test_an_arm_offers_its_fastest_plan_whatever_the_scores(small) -> None:
     arm = with_variants(small, {0: 3.0, 1: 1.0, 2: 2.0})
-    offer = arm.offers(small.work())[3]
-    assert offer is not None
-    assert offer[0].elbow == 1
+    content = small.work()
+    slow, fast, middle = arm.plans[content]
+    fast = replace(fast, approach=small.phase(2.5, fast.approach.profile[0, 2]))
+    arm = replace(arm, plans={content: (slow, middle, fast)})
+    (offer,) = arm.offers(content)[3]
+    assert offer[0] is fast
     world, _ = small.shop([[small.job("a")]], arms=[arm])
-    assert world.offers.difficulty[0, 0, 0] == pytest.approx(1.0)
-    assert world.offers.p_saturation[0, 0, 0] == 0.25
+    assert world.offers.difficulty[0, 0, 0, 0] == pytest.approx(1.0)
+    assert world.offers.p_saturation[0, 0, 0, 0] == 0.25
     assert len(world.plans.times_s) == 1
 
 
@@ -48,8 +51,7 @@ def test_without_a_score_it_offers_the_first_plan(small) -> None:
         with_variants(small, {0: None, 1: None}),
         replace(with_variants(small, {0: 1.0, 1: 0.5}), model=Blind()),
     ):
-        offer = arm.offers(small.work())[3]
-        assert offer is not None
+        (offer,) = arm.offers(small.work())[3]
         assert (offer[0].elbow, offer[1]) == (0, None)
         world, _ = small.shop([[small.job("a")]], arms=[arm])
         assert np.isnan(world.offers.difficulty).all()
@@ -66,15 +68,15 @@ def test_each_number_of_repetitions_has_its_own_score(small) -> None:
     content = small.work()
     jobs = [small.job("a", content, repetitions=5), small.job("b", content, repetitions=9)]
     world, _ = small.shop([jobs], arms=[small.arm(0, [content], model=ByLength())])
-    assert world.offers.difficulty[0, 0] == pytest.approx([0.35, 0.63])
-    assert world.offers.plan[0, 0].tolist() == [0, 0]
+    assert world.offers.difficulty[0, 0, :, 0] == pytest.approx([0.35, 0.63])
+    assert world.offers.plan[0, 0, :, 0].tolist() == [0, 0]
 
 
 def test_unplanned_work_is_not_offered(small) -> None:
     arm = small.arm(0, [small.work("rack")])
-    assert arm.offers(small.work())[3] is None
+    assert arm.offers(small.work())[3] == []
     world, _ = small.shop([[small.job("a")]], arms=[arm])
-    assert world.offers.plan.tolist() == [[[-1]]]
+    assert world.offers.plan.tolist() == [[[[-1]]]]
 
 
 def test_the_plan_table_holds_times_mean_heat_and_peaks(small) -> None:
@@ -137,7 +139,7 @@ def test_offers_index_rows_of_the_risk_table(small) -> None:
     jobs = [small.job("a", content, repetitions=2), small.job("b", content, repetitions=3), small.job("c", content)]
     arms = [small.arm(0, [content], model=ByLength()), small.arm(1, [content])]
     offers = small.shop([jobs, jobs[:1]], arms=arms)[0].offers
-    assert offers.risk.tolist() == [[[0, 1, 1], [-1, -1, -1]], [[0, -1, -1], [-1, -1, -1]]]
+    assert offers.risk[..., 0].tolist() == [[[0, 1, 1], [-1, -1, -1]], [[0, -1, -1], [-1, -1, -1]]]
     assert offers.risks is not None
     assert offers.risks.offset.tolist() == [[-2.0, -2.0, -np.inf], [-3.0] * 3]
     assert np.isnan(offers.p_saturation[:, 0]).all()

@@ -101,7 +101,7 @@ class DispatcherVectorEnv(VectorEnv[Observation, Array, Array]):
         self.single_action_space = spaces.MultiDiscrete([int(batch.single_action_space.n)] * arms)
         self.observation_space = batch_space(self.single_observation_space, batch.num_envs)
         self.action_space = batch_space(self.single_action_space, batch.num_envs)
-        self._mask = np.zeros((batch.num_envs, arms, batch.layout.slots + 1), np.int8)
+        self._mask = np.zeros((batch.num_envs, arms, batch.layout.actions), np.int8)
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: Infos | None = None

@@ -50,7 +50,7 @@ class ArmsVecEnv(VecEnv):
         space = batch.single_observation_space
         rows = batch.num_envs * self.arms
         super().__init__(rows, space if observation == "dict" else space["observation"], batch.single_action_space)
-        self._mask = np.ones((rows, batch.layout.slots + 1), dtype=bool)
+        self._mask = np.ones((rows, batch.layout.actions), dtype=bool)
         self._next: int | None = None
         self._actions = np.zeros((batch.num_envs, self.arms), dtype=np.int64)
         self._returns, self._lengths = np.zeros(batch.num_envs), np.zeros(batch.num_envs, dtype=int)

@@ -65,7 +65,7 @@ class TorchRLEnv(EnvBase):
         self._ended = self._done
         """Envs of the batch whose episode is over; other done envs have started a new one that nobody sees."""
         envs, arms, size = batch.num_envs, len(batch.agents), batch.layout.size
-        actions = batch.layout.slots + 1
+        actions = batch.layout.actions
         low, high = (torch.from_numpy(bound.copy()).expand(envs, arms, size) for bound in batch.layout.bounds)
         seen = Composite(
             observation=Bounded(low, high, dtype=torch.float32),

@@ -135,7 +135,7 @@ def scene_of(world: World, state: State, cell: Cell | None = None, *, env: int =
     jobs, mode = world.jobs, state.mode[env]
     time_s = float(state.tick[env] * world.dt_s)
     current = np.where(mode == WORKING, state.job[env], -1).tolist()
-    on_offer = slot_job[env].tolist()
+    on_offer, options = slot_job[env].tolist(), world.plans_per_job
     return Scene(
         cell=cell,
         time_s=time_s,
@@ -154,8 +154,8 @@ def scene_of(world: World, state: State, cell: Cell | None = None, *, env: int =
                 job=jobs.names[env][j],
                 payload_kg=float(jobs.payload_kg[env, j]),
                 due_in_s=float(jobs.due_s[env, j]) - time_s,
-                able=tuple((world.offers.plan[env, :, j] >= 0).tolist()),
-                free=tuple(mask[env, :, slot + 1].astype(bool).tolist()),
+                able=tuple((world.offers.plan[env, :, j] >= 0).any(axis=-1).tolist()),
+                free=tuple(mask[env, :, 1 + slot * options :][:, :options].any(axis=-1).tolist()),
             )
             for slot, j in enumerate(on_offer)
             if j >= 0
@@ -171,6 +171,6 @@ def _progress(world: World, state: State, env: int, arm: int, job: int) -> float
     """Finished share of the job of an arm; 0 for no job, -1."""
     if job < 0:
         return 0.0
-    approach, cycle, retreat = world.plans.times_s[world.offers.plan[env, arm, job]].tolist()
+    approach, cycle, retreat = world.plans.times_s[state.plan[env, arm]].tolist()
     whole_s = approach + int(state.todo[env, arm]) * cycle + retreat
     return min(1.0, float(state.progress_s[env, arm]) / whole_s) if whole_s > 0 else 0.0

@@ -15,7 +15,7 @@ from fleet.bus.protocol.auction import JobEstimate, JobSpec
 from fleet.difficulty import Difficulty, DifficultyModel
 from fleet.errors import InfeasibleJob
 from fleet.job import Job, Place, Work
-from fleet.motion import Drive, Plan, drives
+from fleet.motion import Drive, Plan, drives, offered_plans
 from fleet.motor import gen3_motors
 from fleet.thermal import WINDING, gen3_network, temperature_steps, thermal_model
 
@@ -114,9 +114,8 @@ class Estimator:
         if isinstance(variants, str):
             self._best[work, job.repetitions] = variants
             return
-        scored = [ScoredPlan(plan, self.model.score(plan, job.repetitions)) for plan in variants]
-        best = min(scored, key=lambda each: each.difficulty.total if each.difficulty else 0.0)
-        self._best[work, job.repetitions] = best
+        best = offered_plans(variants, job.repetitions)[0]
+        self._best[work, job.repetitions] = ScoredPlan(best, self.model.score(best, job.repetitions))
 
     def job(self, job: JobSpec) -> Job | None:
         """Return the job with its work; None if it is not possible in this cell."""
