@@ -7,6 +7,7 @@ import typer
 
 from fleet.bus.protocol.registry import CHANNEL
 from fleet.errors import FleetError
+from scenarios.cli.options import number
 from scenarios.cli.signals import until_stopped
 from scenarios.load import load
 
@@ -14,7 +15,7 @@ PORT = 7447
 
 
 def router_command(
-    port: Annotated[int, typer.Option(help="TCP port; 0 is any free one.")] = PORT,
+    port: Annotated[int, number("TCP port; 0 is any free one.", 0, 65535)] = PORT,
     host: Annotated[str, typer.Option(help="Address to listen on; beyond loopback only with --tls.")] = "127.0.0.1",
     tls: Annotated[
         Path | None,
@@ -25,7 +26,7 @@ def router_command(
         str | None, typer.Option(help="--tls: refuse to start unless every arm of this scenario has a certificate.")
     ] = None,
     state_hz: Annotated[
-        float, typer.Option(help="Telemetry messages forwarded per second and session; 0 is unlimited.")
+        float, number("Telemetry messages forwarded per second and session; 0 is unlimited.", 0, 1_000_000)
     ] = CHANNEL["arm", "state"].limit_hz or 0.0,
 ) -> None:
     """Run the Zenoh router of a fleet until Ctrl-C or SIGTERM; it prints its endpoint once it listens."""
@@ -33,10 +34,6 @@ def router_command(
     from fleet.bus.client.router import Router
     from fleet.bus.security.tls import Tls
 
-    if not 0 <= port <= 65535:
-        raise FleetError(f"--port must be 0 to 65535 (got {port}).")
-    if not 0 <= state_hz < 1e6:
-        raise FleetError(f"--state-hz must be 0 or more (got {state_hz:g}).")
     if scenario is not None:
         _check_roster(tls, scenario)
     limits = Limits(state_hz=state_hz or None)

@@ -19,8 +19,7 @@ from fleet.errors import BusError
 from fleet.live.monitor.health import ClockProbe, HealthReport, check_health
 from fleet.live.monitor.listener import FleetListener
 from fleet.live.monitor.snapshot import FleetSnapshot
-from scenarios.cli.live.options import number
-from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption
+from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, number
 from scenarios.cli.terminal import out_console, say
 from scenarios.live.watch_screen import arm_table, format_time, jobs_line
 from scenarios.load import load
@@ -34,7 +33,7 @@ _COLORS = {"fault": "red", "warning": "yellow"}
 def doctor_command(
     endpoint: EndpointOption = ENDPOINT,
     fleet: FleetOption = "",
-    seconds: Annotated[float, number("Real seconds to listen.", high=600, above=True)] = 3.0,
+    seconds: Annotated[float, number("Real seconds to listen.", 0, 600, above=True)] = 3.0,
     auctioneer: Annotated[bool, typer.Option(help="Whether the fleet should have an auctioneer.")] = True,
     scenario: Annotated[
         str, typer.Option(help="Expect every arm of this scenario. Default: only arms that publish anything.")

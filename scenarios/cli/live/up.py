@@ -17,9 +17,8 @@ from scenarios.cli.live.options import (
     ScenarioFleetOption,
     SeedOption,
     SpeedOption,
-    number,
 )
-from scenarios.cli.options import PolicyOption, ScenarioArg
+from scenarios.cli.options import PolicyOption, ScenarioArg, number
 from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import err_console, out_console, progress_bar, say
 from scenarios.load import load
