@@ -36,7 +36,7 @@ def ask_command(
     """Request quotes of all arms: difficulty, P(saturation), peak temperature, finish, or the reason of infeasibility.
 
     The duration of a job includes the ways to its place and home. It is finished after its last cycle, once the arm's
-    present jobs are done.
+    present jobs are done. Exit code 1: there is a job that no arm can do.
     """
     if bool(file) == bool(kind):
         raise FleetError("Give either a FILE of jobs or one job by --kind and --place.")
@@ -56,6 +56,9 @@ def ask_command(
         out_console.print(quote_table(jobs, quotes))
     for reason in answers.refused.values():
         say(f"Refused: {reason}" if reason else f"An arm did not reply within {timeout:g} s.")
+    feasible = {estimate.job for quote in quotes.values() for estimate in quote.estimates if estimate.feasible}
+    if not feasible.issuperset(job.name for job in jobs):
+        raise typer.Exit(1)
 
 
 def one_job(
