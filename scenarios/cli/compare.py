@@ -14,7 +14,12 @@ from scenarios.schema_errors import choose
 def compare_command(
     scenario: options.ScenarioArg,
     policies: Annotated[
-        str, typer.Option(help="Policies, separated by commas: names, FILE.py:CLASS, or folders of trained policies.")
+        str,
+        typer.Option(
+            help="Policies, separated by commas: names, FILE.py:CLASS, or folders of trained policies; default: "
+            f"{', '.join(RULES)}.",
+            show_default=False,
+        ),
     ] = ",".join(RULES),
     seeds: Annotated[int, options.number("Number of seeds; intervals need several shifts.", 2, 10_000)] = 10,
     first_seed: Annotated[
