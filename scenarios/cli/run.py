@@ -86,6 +86,8 @@ def run_command(
     else:
         say(f"{chosen.name}, seed {seed}", out_console)
         out_console.print(metrics_table({label(policy): result.metrics}))
+        if result.metrics.illegal_actions:
+            say(f"The policy chose {result.metrics.illegal_actions} illegal actions; each counted as a wait.")
         if result.finished:
             say(f"Recorded in {where}; open {where / 'report.html'} in a browser.", out_console)
     if not result.finished:
