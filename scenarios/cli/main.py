@@ -21,7 +21,7 @@ USAGE = 2
 """Exit code of an error that the user can correct."""
 _DISK = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS),
-    *(errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP),
+    *(errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOENT),
 )
 """Errors of a path that the user gave, or of its disk."""
 

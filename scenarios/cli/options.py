@@ -36,12 +36,15 @@ def number(text: str, low: float, high: float, *names: str, above: bool = False,
 
 
 def check_name(option: typer.CallbackParam, value: str) -> str:
-    """Callback of a parameter that names a participant, which becomes part of keys and of a file name.
+    """Callback of a parameter that names a fleet or a participant, which becomes part of keys and of a file name.
+
+    Its default needs no check: "" for none.
 
     Raises:
         FleetError: it is empty or too long, or has a slash or characters that cannot be printed.
     """
-    if not 0 < len(value) <= MAX_NAME or "/" in value or not value.isprintable():
+    valid = 0 < len(value) <= MAX_NAME and "/" not in value and value.isprintable()
+    if not valid and value != option.default:
         name = option.opts[0] if option.param_type_name == "option" else option.opts[0].upper()
         raise FleetError(
             f"{name} must have 1 to {MAX_NAME} printable characters and no '/' (got {value[:MAX_NAME]!r})."
@@ -102,7 +105,10 @@ PolicyOption = Annotated[
     ),
 ]
 FleetOption = Annotated[
-    str, typer.Option(envvar="THERMOFLEET_FLEET", help="Name of the fleet; not needed if there is only one.")
+    str,
+    typer.Option(
+        envvar="THERMOFLEET_FLEET", help="Name of the fleet; not needed if there is only one.", callback=check_name
+    ),
 ]
 
 # Twins.

@@ -7,7 +7,7 @@ import typer
 
 from fleet.bus.protocol.registry import CHANNEL
 from fleet.errors import FleetError
-from scenarios.cli.options import number
+from scenarios.cli.options import check_name, number
 from scenarios.cli.signals import until_stopped
 from scenarios.load import load
 
@@ -21,7 +21,9 @@ def router_command(
         Path | None,
         typer.Option(help="Folder that `thermofleet keys` made: mutual TLS, and access by role."),
     ] = None,
-    name: Annotated[str, typer.Option(help="--tls: participant whose certificate the router presents.")] = "router",
+    name: Annotated[
+        str, typer.Option(help="--tls: participant whose certificate the router presents.", callback=check_name)
+    ] = "router",
     scenario: Annotated[
         str | None, typer.Option(help="--tls: refuse to start unless every arm of this scenario has a certificate.")
     ] = None,
@@ -35,7 +37,7 @@ def router_command(
     from fleet.bus.security.tls import Tls
 
     if scenario is not None:
-        _check_roster(tls, scenario)
+        check_roster(tls, scenario)
     limits = Limits(state_hz=state_hz or None)
     with until_stopped() as stop, Router(port, host=host, tls=Tls(tls, name) if tls else None, limits=limits) as router:
         typer.echo(router.endpoint)  # flushed: a supervisor reads this line
@@ -43,7 +45,12 @@ def router_command(
         stop.leave("The router was interrupted; its clients keep trying to reconnect.")
 
 
-def _check_roster(folder: Path | None, scenario: str) -> None:
+def check_roster(folder: Path | None, scenario: str) -> None:
+    """Check that a folder of keys has a certificate for every arm of a scenario.
+
+    Raises:
+        FleetError: it has not, or it is not a folder of keys of this scenario.
+    """
     from fleet.bus.security.access_control import read_roster
 
     if folder is None:

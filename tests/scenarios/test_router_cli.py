@@ -168,6 +168,8 @@ def test_up_gives_every_process_its_own_certificate(folder):
     [
         (("quickstart",), "holds the keys of a fleet"),
         (("--add", "gateway:submitter"), "has a certificate"),
+        (("--add", "x:router", "--host", ""), "is not a host name or address"),
+        (("--add", "x:router", "--host", "a b"), "is not a host name or address"),
         (("--add", "x:king"), "no role 'king'. Allowed: arm"),
         (("--add", "x:submiter"), "did you mean 'submitter'?"),
         (("--add", "x"), "is not NAME:ROLE"),

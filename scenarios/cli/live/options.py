@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from scenarios.cli.options import MAX_SEED, number
+from scenarios.cli.options import MAX_SEED, check_name, number
 
 MAX_SPEED = 10_000.0
 SpeedOption = Annotated[float, number("Fleet seconds per real second.", 0, MAX_SPEED, above=True)]
@@ -17,4 +17,6 @@ JobsOption = Annotated[
     typer.Option(help="scenario: the scenario's job stream; none: submitted jobs only."),
 ]
 JournalOption = Annotated[Path | None, typer.Option(help="Folder of the journals; an existing journal is continued.")]
-ScenarioFleetOption = Annotated[str, typer.Option(help="Name of the fleet. Default: the scenario's name.")]
+ScenarioFleetOption = Annotated[
+    str, typer.Option(help="Name of the fleet. Default: the scenario's name.", callback=check_name)
+]
