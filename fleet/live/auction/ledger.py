@@ -69,7 +69,7 @@ class Change(msgspec.Struct, frozen=True):
 class JobEntry(msgspec.Struct):
     """State of one job."""
 
-    spec: JobSpec = msgspec.field(name="word")
+    spec: JobSpec
     by: str
     state: JobState = "waiting"
     award: str = ""
@@ -86,7 +86,7 @@ class JobEntry(msgspec.Struct):
 class AwardState(msgspec.Struct):
     """State of one award."""
 
-    record: Awarded = msgspec.field(name="made")
+    record: Awarded
     may_commit: bool = False
     silent: bool = False
     """The arm has permission to commit, and has not renewed its lease."""
