@@ -30,7 +30,6 @@ from fleet.live.arm.estimator import Estimator, NominalPeaks
 from fleet.live.arm.journal_records import ArmHistory, ArmRecord
 from fleet.live.arm.node import ArmConfig, ArmNode
 from fleet.live.arm.replay_body import ReplayBody, SensorLog
-from fleet.live.arm.simulated_body import SimulatedBody
 from fleet.live.clock import FleetClock
 from fleet.live.journal import Journal
 from fleet.motion import Plan
@@ -163,6 +162,7 @@ def simulated_arm(
     Raises:
         FleetError: the scenario has no such arm.
     """
+    from fleet.live.arm.simulated_body import SimulatedBody  # loads the engine
     from scenarios.prepare.fleet import air_offsets, prepare_arm
     from scenarios.prepare.planned_arm import planner_of
 
