@@ -7,7 +7,7 @@ only for listening and every other one only for connecting, so no participant ca
 import ipaddress
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -152,7 +152,7 @@ def format_time(moment: datetime) -> str:
 
 
 @contextmanager
-def written_atomically(path: Path, content: bytes, mode: int = _ALL_READ) -> Iterator[None]:
+def written_atomically(path: Path, content: bytes, mode: int = _ALL_READ) -> Generator[None]:
     """Write a file to a temporary name; it gets its own name when the block ends without an error.
 
     Raises:

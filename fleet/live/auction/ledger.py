@@ -118,16 +118,16 @@ class Ledger(TimedState[AuctionRecord]):
 
     places: frozenset[str] | None = None
     """Places of the cell; None allows any name."""
-    jobs: dict[str, JobEntry] = field(default_factory=dict)
+    jobs: dict[str, JobEntry] = field(default_factory=dict[str, JobEntry])
     """By release and name."""
-    awards: dict[str, AwardState] = field(default_factory=dict)
+    awards: dict[str, AwardState] = field(default_factory=dict[str, AwardState])
     time_s: float = 0.0
     """Latest time of all records."""
     number: int = 0
     """Of the next change."""
     ended: bool = False
     recent: deque[Change] = field(default_factory=lambda: deque(maxlen=MAX_RECENT))
-    open: dict[str, AwardState] = field(default_factory=dict)
+    open: dict[str, AwardState] = field(default_factory=dict[str, AwardState])
     """Awards that are not closed, by name."""
 
     def admit(self, jobs: Sequence[JobSpec]) -> tuple[Admission, ...]:

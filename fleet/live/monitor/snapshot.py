@@ -79,7 +79,7 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
 @dataclass
 class _Arm:
     token: bool = False
-    messages: dict[type, tuple[msgspec.Struct, float]] = field(default_factory=dict)
+    messages: dict[type, tuple[msgspec.Struct, float]] = field(default_factory=dict[type, tuple[msgspec.Struct, float]])
     """The last message of each type, and the real second it came."""
 
     def last(self, kind: type[Message]) -> tuple[Message | None, float]:
