@@ -129,13 +129,13 @@ class Stopwatch:
                 self._open, self._sent = self._open + 1, self._sent + 1
             ask(key, word, *rest, **more)
 
-        def answered(*told: Any) -> None:
-            acknowledged(*told)
+        def answered(*acknowledgement: Any) -> None:
+            acknowledged(*acknowledgement)
             self._open -= 1
             if not self._open:
                 self.batches_s.append((self._sent, time.perf_counter() - self._asked_s))
 
-        link.query, node.auctioneer.apply_ack = asked, answered
+        vars(link)["query"], vars(node.auctioneer)["apply_ack"] = asked, answered
 
 
 def words(jobs: int) -> list[JobSpec]:

@@ -109,9 +109,9 @@ class Dealer:
             self.refused += answers.refused.values()
             for quote in answers.messages.values():
                 award = Award(f"a-{arm}", f"q-{arm}", DEALER, quote.quote, job, 0, LEASE_S)
-                self._link.query(keys.of_arm(FLEET, arm, "award"), award, Ack, told, timeout_s=START_S)
+                self._link.query(keys.of_arm(FLEET, arm, "award"), award, Ack, acknowledged, timeout_s=START_S)
 
-        def told(answers: Replies[Ack]) -> None:
+        def acknowledged(answers: Replies[Ack]) -> None:
             self.refused += [ack.reason for ack in answers.messages.values() if not ack.accepted]
 
         request = QuoteRequest(f"q-{arm}", (job,))
@@ -187,7 +187,7 @@ def main() -> None:
     parser.add_argument("--speed", type=float, default=1.0, help="fleet seconds per real second")
     options = parser.parse_args()
     names = [f"arm_{i:02d}" for i in range(options.arms)]
-    size = len(encode(State("arm_00", 1000, 123.456789, "working", *[(12.345678901234567,) * JOINTS] * 1, 12.3456789)))
+    size = len(encode(State("arm_00", 1000, 123.456789, "working", (12.345678901234567,) * JOINTS, 12.3456789)))
     size += 4 * JOINTS * 20  # joint positions, speeds, torques and currents, as published by a simulated arm
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -198,7 +198,7 @@ def main() -> None:
         supervisor.await_ready("router", START_S)
         bare = (sys.executable, "-c", BARE, endpoint, str(size), str(options.rate))
         supervisor.start(Part(name="bare", argv=bare, ready="ready"), ready_s=START_S)
-        dealer = Dealer(stack.enter_context(BusClient(endpoint, FLEET)), options.speed, 0 if options.plain else 1)
+        dealer = Dealer(stack.enter_context(BusClient(endpoint, FLEET)), options.speed, not options.plain)
         parts = arms_of(folder, names, endpoint, options)
         began_s = time.monotonic()
         for part in parts:

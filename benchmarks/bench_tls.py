@@ -42,7 +42,11 @@ class PingPong:
         self._came: queue.SimpleQueue[None] = queue.SimpleQueue()
         answer = other.declare_publisher(back)
         self._ask = one.declare_publisher(there)
-        heard = zenoh.handlers.Callback(lambda sample: answer.put(sample.payload), indirect=False)
+
+        def send_back(sample: zenoh.Sample) -> None:
+            answer.put(sample.payload)
+
+        heard = zenoh.handlers.Callback(send_back, indirect=False)
         ended = zenoh.handlers.Callback(lambda _: self._came.put(None), indirect=False)
         self._kept = (other.declare_subscriber(there, heard), one.declare_subscriber(back, ended))
         for session in (one, other):  # replies come in order, so the router knows the declarations

@@ -27,7 +27,7 @@ from fleet.env.buffers import keep_pages
 from fleet.env.random_actions import random_legal
 from fleet.env.vector import BatchEnv, Library
 from scenarios.load import load
-from scenarios.prepare.fleet import env_of, prepare
+from scenarios.prepare.fleet import DifficultyName, env_of, prepare
 from scenarios.run.batch import Randomisation, library_of
 
 WINDOWS, SHIFT = 3, 720
@@ -44,7 +44,7 @@ def median_rate(window: Callable[[], int]) -> float:
     return statistics.median(rates[1:])
 
 
-def single(difficulty: str) -> float:
+def single(difficulty: DifficultyName) -> float:
     """Measure the `ParallelEnv`."""
     env = env_of(prepare(load("quickstart"), difficulty=difficulty))
     rng, seen = np.random.default_rng(0), {}
@@ -68,7 +68,7 @@ def single(difficulty: str) -> float:
     return median_rate(window)
 
 
-def library(difficulty: str, arms: int = 4, peers: int | None = None) -> Library:
+def library(difficulty: DifficultyName, arms: int = 4, peers: int | None = None) -> Library:
     """Return quickstart with its four arms repeated, and arrival rates multiplied accordingly.
 
     Args:
@@ -90,7 +90,7 @@ def library(difficulty: str, arms: int = 4, peers: int | None = None) -> Library
     return Library(tuple(f"arm_{a}" for a in range(arms)), one.slots, tables, one.draw, near)
 
 
-def batch(difficulty: str, envs: int, arms: int = 4, peers: int | None = None) -> float:
+def batch(difficulty: DifficultyName, envs: int, arms: int = 4, peers: int | None = None) -> float:
     """Measure a batch."""
     env, rng = BatchEnv(library(difficulty, arms, peers), envs, seed=0), np.random.default_rng(0)
     seen, _ = env.reset()

@@ -15,17 +15,21 @@ import json
 import sys
 import tempfile
 import tomllib
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
 import numpy as np
 import pyarrow.parquet as pq
 
+if TYPE_CHECKING:  # imported from the code under test when it runs
+    from scenarios.prepare.fleet import DifficultyName
+
 SCENARIOS = ("quickstart", "active_waiting", "heat_wave")
 POLICIES = ("random", "round_robin", "coolest_first", "least_difficulty", "consensus", "wspt", "wspt_cool")
 SEEDS = (0, 1, 2, 3, 4, 10000, 10001)
-DIFFICULTIES = ("blind", "twin")
+DIFFICULTIES: tuple["DifficultyName", ...] = ("blind", "twin")
 STEPS = 200
 EVERY_S = 60.0
 TOLERANCE = 1e-6
@@ -51,8 +55,8 @@ def record(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for scenario in SCENARIOS:
         for difficulty in DIFFICULTIES:
-            _once(folder / f"rollout-{scenario}-{difficulty}.npz", lambda s=scenario, d=difficulty: _rollouts(s, d))
-            _once(folder / f"compare-{scenario}-{difficulty}.npz", lambda s=scenario, d=difficulty: _comparison(s, d))
+            _once(folder / f"rollout-{scenario}-{difficulty}.npz", partial(_rollouts, scenario, difficulty))
+            _once(folder / f"compare-{scenario}-{difficulty}.npz", partial(_comparison, scenario, difficulty))
             for policy in POLICIES:
                 for seed in SEEDS:
                     name = f"run-{scenario}-{difficulty}-{policy}-{seed}"
@@ -116,7 +120,7 @@ def _flat(values: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
     return rows
 
 
-def _rollouts(scenario: str, difficulty: str) -> dict[str, Any]:
+def _rollouts(scenario: str, difficulty: "DifficultyName") -> dict[str, Any]:
     """Return observations, masks, rewards and infos of the single env and of a batch under random legal actions."""
     import scenarios
 

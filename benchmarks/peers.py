@@ -36,7 +36,7 @@ def rate(step: Callable[[], None], envs: int) -> float:
 
 def mpe() -> Callable[[], None]:
     """PettingZoo's MPE simple_spread, parallel, with defaults: three agents, 25 cycles."""
-    from mpe2 import simple_spread_v3
+    from mpe2 import simple_spread_v3  # pyright: ignore[reportMissingImports]  # of the extra bench
 
     env, rng = simple_spread_v3.parallel_env(), np.random.default_rng(0)
     env.reset(seed=0)
@@ -53,7 +53,7 @@ def mpe() -> Callable[[], None]:
 def rware() -> Callable[[], None]:
     """The robotic warehouse, tiny, four agents."""
     import gymnasium
-    import rware  # noqa: F401  # registers itself
+    import rware  # noqa: F401  # registers itself  # pyright: ignore[reportMissingImports]
 
     env, rng = gymnasium.make("rware-tiny-4ag-v2"), np.random.default_rng(0)
     env.reset(seed=0)
@@ -69,7 +69,7 @@ def rware() -> Callable[[], None]:
 def vmas(envs: int) -> Callable[[], None]:
     """VMAS simple_spread with its own random actions, reset every 100 steps."""
     import torch
-    from vmas import make_env
+    from vmas import make_env  # pyright: ignore[reportMissingImports]
 
     torch.set_num_threads(1)
     env = make_env(scenario="simple_spread", num_envs=envs, device="cpu", seed=0)

@@ -81,26 +81,22 @@ def kernel(function: Callable[..., Any]) -> Kernel:
     return Kernel(function)
 
 
+def compiled_sources() -> tuple[Path, ...]:
+    """Files whose functions are compiled, or whose constants are compiled into functions."""
+    names = (
+        *("jit", "arrivals", "seeding", "motor", "difficulty", "robot", "telemetry", "thermal", "observation"),
+        *("planning/clearance", "planning/sweep"),
+    )
+    return (*(_PACKAGE / f"{name}.py" for name in names), *sorted((_PACKAGE / "engine").glob("*.py")))
+
+
 @cache
 def _cache_of_this_code() -> str:
     """Cache folder for the present source of all that is compiled together: numba itself looks at one file only."""
     import numba
 
     digest = hashlib.sha256(numba.__version__.encode())
-    names = (
-        "jit",
-        "arrivals",
-        "seeding",
-        "motor",
-        "difficulty",
-        "robot",
-        "telemetry",
-        "thermal",
-        "observation",
-        "planning/clearance",
-        "planning/sweep",  # its constant LEAF is compiled into the search
-    )
-    for path in (*(_PACKAGE / f"{name}.py" for name in names), *sorted((_PACKAGE / "engine").glob("*.py"))):
+    for path in compiled_sources():
         digest.update(path.read_bytes())
     folder = user_cache_folder() / "compiled" / digest.hexdigest()[:16]
     if not folder.exists():

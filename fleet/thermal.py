@@ -74,7 +74,7 @@ def gen3_network(
     cooling_factor: float = 1.0,
     spread: ThermalSpread | None = None,
     rng: np.random.Generator | None = None,
-) -> nx.Graph:
+) -> "nx.Graph[str]":
     """Thermal network of one Gen3: nodes with `capacity_j_per_k`, edges with `conductance_w_per_k`.
 
     Args:
@@ -86,7 +86,7 @@ def gen3_network(
         raise ValueError(f"Unknown cooling '{cooling}'. Allowed: {', '.join(AMBIENT_FACTOR)}.")
     data = thermal_data()
     draw = _factors(spread, rng)
-    graph = nx.Graph()
+    graph: nx.Graph[str] = nx.Graph()
     graph.add_node("ambient")
     for j in range(JOINTS):
         graph.add_node(winding(j), capacity_j_per_k=data["winding_j_per_k"][j] * draw["capacity"][0, j])
@@ -174,7 +174,7 @@ def advance(
     return (phi @ temp_c[..., None] + gamma @ load[..., None])[..., 0]
 
 
-def thermal_model(network: nx.Graph) -> ThermalModel:
+def thermal_model(network: "nx.Graph[str]") -> ThermalModel:
     """Matrices of a network with the nodes of `gen3_network`.
 
     Raises:
@@ -191,7 +191,7 @@ def thermal_model(network: nx.Graph) -> ThermalModel:
     return ThermalModel(capacity, laplacian, conductance[:NODES, NODES], rates, modes)
 
 
-def _check(network: nx.Graph, names: list[str]) -> None:
+def _check(network: "nx.Graph[str]", names: list[str]) -> None:
     expected = {*names, "ambient"}
     if missing := sorted(expected - set(network)):
         raise ValueError(f"The thermal network lacks the nodes {', '.join(missing)}.")

@@ -5,7 +5,9 @@ import importlib
 import importlib.util
 import os
 from collections.abc import Callable
+from inspect import signature
 from pathlib import Path
+from traceback import extract_tb
 from types import ModuleType
 
 import numpy as np
@@ -99,6 +101,10 @@ def _class_of(name: str) -> type[Policy] | type[ArmPolicy]:
     if missing:
         needed = " and ".join(f"{method}({arguments})" for method, arguments in METHODS[scope].items())
         raise FleetError(f"'{name}' is no policy: of scope {scope} it needs the methods {needed}.")
+    try:
+        signature(found).bind()
+    except TypeError as error:
+        raise FleetError(f"'{name}' must be a class that is created without arguments ({error}).") from error
     return found
 
 
@@ -114,5 +120,14 @@ def _module(where: str, name: str) -> ModuleType:
     if spec is None or spec.loader is None or not path.is_file():
         raise FleetError(f"Policy '{name}': there is no file '{where}'.")
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:  # whatever the file raises
+        syntax = isinstance(error, SyntaxError)
+        frames = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == where]
+        line = error.lineno if syntax else frames[-1] if frames else None
+        raise FleetError(
+            f"Policy '{name}': '{where}' cannot be loaded: {type(error).__name__}{f' in line {line}' if line else ''}: "
+            f"{error.msg if syntax else error}."
+        ) from error
     return module

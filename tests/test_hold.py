@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from io import StringIO
 
 import numpy as np
@@ -11,10 +12,11 @@ from rich.console import Console
 from scipy.integrate import solve_ivp
 from typer.testing import CliRunner
 
+from fleet.errors import FleetError
 from fleet.motor import gen3_motors, reference_current
 from fleet.robot import JOINTS, POSTURES
 from fleet.thermal import NODES, drive_heat, gen3_network, thermal_model
-from scenarios.motion.hold import LIMITS_C, as_json, as_table, courses, hold, hold_command
+from scenarios.motion.hold import LIMITS_C, HoldError, as_json, as_table, courses, hold, hold_command
 from scenarios.motion.posture import PostureError
 
 J2, J4 = 1, 3
@@ -188,12 +190,6 @@ def test_table_fits_a_terminal():
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--payload", "-1"], "0 kg or more (got -1.0)"),
-        (["--payload", "nan"], "0 kg or more (got nan)"),
-        (["--payload", "inf"], "0 kg or more (got inf)"),
-        (["--tool-kg", "-0.1"], "tool mass"),
-        (["--ambient", "nan"], "-40 … 60 °C (got nan)"),
-        (["--ambient", "300"], "-40 … 60 °C (got 300.0)"),
         (["--posture", "outstreched"], "did you mean 'outstretched'?"),
         (["--posture", ""], "Allowed: home"),
         (["--posture", "1,2,3"], "7 comma-separated angles"),
@@ -203,12 +199,27 @@ def test_table_fits_a_terminal():
         (["--cooling", "forced"], "did you mean 'forced_air'?"),
     ],
 )
-def test_bad_input_is_one_sentence_and_exit_code_2(arguments, says):
+def test_a_hold_that_cannot_be_is_refused(arguments, says):
     answer = run(*arguments)
-    assert answer.exit_code == 2
+    assert isinstance(answer.exception, FleetError)
+    assert says in str(answer.exception)
     assert answer.stdout == ""
-    assert says in answer.stderr
-    assert answer.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"payload_kg": -1.0}, "0 kg or more (got -1.0)"),
+        ({"payload_kg": math.nan}, "0 kg or more (got nan)"),
+        ({"payload_kg": math.inf}, "0 kg or more (got inf)"),
+        ({"payload_kg": 1.0, "tool_kg": -0.1}, "tool mass"),
+        ({"payload_kg": 1.0, "ambient_c": math.nan}, "-40 … 60 °C (got nan)"),
+        ({"payload_kg": 1.0, "ambient_c": 300.0}, "-40 … 60 °C (got 300.0)"),
+    ],
+)
+def test_a_value_out_of_range_is_refused(values, says):
+    with pytest.raises(HoldError, match=re.escape(says)):
+        hold(**values)
 
 
 def test_a_word_for_a_number_is_refused():

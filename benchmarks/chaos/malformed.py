@@ -86,7 +86,8 @@ def awards_of(fleet: Fleet, arm: str) -> list[Award]:
 
 
 def _every_key(fleet: str, arms: tuple[str, ...]) -> list[keys.Key]:
-    owners = [("arm", arm) for arm in (*arms, "nobody")] + [("auction", "auctioneer")]
+    owners: list[tuple[keys.Role, str]] = [("arm", arm) for arm in (*arms, "nobody")]
+    owners.append(("auction", "auctioneer"))
     named = [
         keys.Key(fleet, role, name, topic, arms[0] if topic in keys.ASKED else "")
         for role, name in owners

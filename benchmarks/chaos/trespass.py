@@ -10,7 +10,7 @@ import math
 import queue
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -84,12 +84,12 @@ def publications(fleet: Fleet, rogue: zenoh.Session) -> Iterator[Attempt]:
     fleet_name, arm = fleet.client.fleet, fleet.arms[0]
     forged = State(arm, 10**9, 0.0, "idle", (0.0,) * 7, 60.0)
     received: queue.Queue[tuple[str, bool]] = queue.Queue()
+
+    def receive(sample: zenoh.Sample) -> None:
+        received.put((str(sample.key_expr), sample.payload.to_bytes() == encode(forged)))
+
     subscriber = fleet.session.declare_subscriber(
-        keys.all_of_fleet(fleet_name),
-        zenoh.handlers.Callback(
-            lambda sample: received.put((str(sample.key_expr), sample.payload.to_bytes() == encode(forged))),
-            indirect=False,
-        ),
+        keys.all_of_fleet(fleet_name), zenoh.handlers.Callback(receive, indirect=False)
     )
     targets = [
         keys.of_arm(fleet_name, arm, "state"),
@@ -185,7 +185,8 @@ def queries(fleet: Fleet, rogue: zenoh.Session) -> Iterator[Attempt]:
         entry = LeaseEntry(status.award, status.job, 0, "finishing")
         lease = LeaseRequest(status.arm, (entry,))
         report = Report(status.arm, status.award, status.job, "finished", 1, 0.0)
-        for message, topic in ((lease, "lease"), (report, "report")):
+        messages: tuple[tuple[msgspec.Struct, keys.AskedTopic], ...] = ((lease, "lease"), (report, "report"))
+        for message, topic in messages:
             for querier in (status.arm, ROGUE):
                 key = keys.asked_by(fleet_name, "auctioneer", topic, querier)
                 yield f"a {topic} of {status.arm} under the key of {querier}", _gets_reply(rogue, key, message)
@@ -224,7 +225,7 @@ def _gets_reply(session: zenoh.Session, key: str, message: msgspec.Struct) -> bo
     return bool(good)
 
 
-def _opens(endpoint: str, tls: dict[str, object]) -> bool:
+def _opens(endpoint: str, tls: Mapping[str, object]) -> bool:
     """Whether a session opens, without the checks of our own client."""
     config = {
         "mode": "client",

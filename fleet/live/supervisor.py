@@ -50,7 +50,7 @@ class Part:
     """The fleet ends when it exits with code 0."""
     ready: str = READY
     """Start of the line that it prints once it has started."""
-    env: Mapping[str, str] = field(default_factory=dict)
+    env: Mapping[str, str] = field(default_factory=dict[str, str])
     rank: int = 0
     """Parts of a higher rank are stopped first, parts of one rank together."""
 

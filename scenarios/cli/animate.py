@@ -12,7 +12,7 @@ import typer
 from agents.registry import NAMES_HELP
 from fleet.errors import FleetError
 from fleet.files import atomic_path
-from scenarios.cli.options import DifficultyOption, ScenarioArg, check_least
+from scenarios.cli.options import MAX_SEED, DifficultyOption, ScenarioArg, number
 from scenarios.cli.terminal import out_console, progress_bar, say
 from scenarios.load import load
 from scenarios.policy_loader import label, policy_at, policy_of
@@ -37,23 +37,20 @@ MOST_PIXELS = 600_000_000
 def animate_command(
     scenario: ScenarioArg,
     policy: Annotated[str, typer.Option(help=NAMES_HELP)] = "least_difficulty",
-    seed: Annotated[int, typer.Option(help="Random seed, 0 or more; same shift as in `thermofleet run`.")] = 0,
+    seed: Annotated[int, number("Random seed; same shift as in `thermofleet run`.", 0, MAX_SEED)] = 0,
     out: Annotated[Path | None, typer.Option(help="Output file; default runs/SCENARIO-POLICY-SEED.gif.")] = None,
     every: Annotated[
-        int | None, typer.Option(help=f"Decisions between frames; by default chosen for about {FRAMES} frames.")
+        int | None, number(f"Decisions between frames; by default chosen for about {FRAMES} frames.", 1, 1_000_000)
     ] = None,
     size: Annotated[str, typer.Option(help="Width x height, px.")] = SIZE,
     seconds: Annotated[
-        float, typer.Option(help="Length of the animation, s; the last frame is held 1 s longer.")
+        float, number("Length of the animation, s; the last frame is held 1 s longer.", 1, 3600)
     ] = SECONDS,
     difficulty: DifficultyOption = "twin",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace --out if it exists.")] = False,
 ) -> None:
     """Simulate one shift and draw it as a GIF: the cell from above, motors coloured by temperature."""
     chosen = load(scenario)
-    check_least(0, seed=seed)
-    if not 1.0 <= seconds <= 3600.0:
-        raise FleetError(f"--seconds must be from 1 to 3600 (got {seconds:g}).")
     pixels = _size(size)
     stride = _stride(chosen.ticks, every, pixels, seconds)
     policy_of(policy)

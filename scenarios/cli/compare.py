@@ -5,7 +5,6 @@ from typing import Annotated
 import typer
 
 from agents.registry import RULES
-from fleet.errors import FleetError
 from scenarios.cli import options
 from scenarios.cli.terminal import out_console, print_json, progress_bar
 from scenarios.load import load
@@ -15,10 +14,17 @@ from scenarios.schema_errors import choose
 def compare_command(
     scenario: options.ScenarioArg,
     policies: Annotated[
-        str, typer.Option(help="Policies, separated by commas: names, FILE.py:CLASS, or folders of trained policies.")
+        str,
+        typer.Option(
+            help="Policies, separated by commas: names, FILE.py:CLASS, or folders of trained policies; default: "
+            f"{', '.join(RULES)}.",
+            show_default=False,
+        ),
     ] = ",".join(RULES),
-    seeds: Annotated[int, typer.Option(help="Number of seeds; 2 or more.")] = 10,
-    first_seed: Annotated[int, typer.Option(help="First seed. Compare on seeds that you did not tune on.")] = 0,
+    seeds: Annotated[int, options.number("Number of seeds; intervals need several shifts.", 2, 10_000)] = 10,
+    first_seed: Annotated[
+        int, options.number("First seed. Compare on seeds that you did not tune on.", 0, options.MAX_SEED)
+    ] = 0,
     baseline: Annotated[
         str | None,
         typer.Option(
@@ -41,9 +47,6 @@ def compare_command(
     from scenarios.run.compare import compare, comparison_table
 
     chosen = load(scenario)
-    if seeds < 2:
-        raise FleetError(f"--seeds must be 2 or more, because intervals need several shifts (got {seeds}).")
-    options.check_least(0, first_seed=first_seed)
     channel = options.channel_of(
         chosen, partition, topology=topology, radius=radius, topology_seed=topology_seed, delay_s=delay_s,
         jitter_s=jitter_s, loss=loss,

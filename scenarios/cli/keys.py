@@ -10,11 +10,11 @@ from rich.table import Table
 
 from fleet.bus.security.access_control import ROLES, Participant, Role, Roster, of_arms, read_roster, rights
 from fleet.errors import FleetError, nearest
-from scenarios.cli.options import JsonOption
+from scenarios.cli.options import JsonOption, number
 from scenarios.cli.terminal import out_console, plain_table, print_json, say
 from scenarios.load import load
 
-DAYS = 365
+DAYS, MAX_DAYS = 365, 3650
 
 
 def keys_command(
@@ -28,7 +28,7 @@ def keys_command(
     add: Annotated[
         list[str] | None, typer.Option(help="NAME:ROLE, a new certificate from the present authority.")
     ] = None,
-    days: Annotated[int, typer.Option(help="Lifetime of the participants' certificates, days.")] = DAYS,
+    days: Annotated[int, number("Lifetime of the participants' certificates, days.", 1, MAX_DAYS)] = DAYS,
     host: Annotated[
         list[str] | None,
         typer.Option(help="Another name or address of the router than localhost, 127.0.0.1 and ::1."),

@@ -6,7 +6,7 @@ The module of a command is imported when the command runs, so `--help` is fast.
 import errno
 import logging
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Annotated, Any, NamedTuple
 
@@ -19,7 +19,11 @@ from scenarios.extras import missing_extra
 
 USAGE = 2
 """Exit code of an error that the user can correct."""
-_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS)
+_DISK = (
+    *(errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS),
+    *(errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOENT),
+)
+"""Errors of a path that the user gave, or of its disk."""
 
 
 class LazyCommand(NamedTuple):
@@ -78,11 +82,16 @@ class LazyGroup(TyperGroup):
         return name, listed and load_command(str(name)), rest
 
 
-def load_command(name: str) -> Any:
-    """Import a command (Any: typer keeps the class of commands private)."""
+def target_of(name: str) -> Callable[..., None] | typer.Typer:
+    """Import the function of a command, or its group of commands."""
     module, _, attribute = COMMANDS[name].target.partition(":")
     prefix = "" if module.startswith("scenarios.") else "scenarios.cli."
-    target = getattr(import_module(prefix + module), attribute)
+    return getattr(import_module(prefix + module), attribute)
+
+
+def load_command(name: str) -> Any:
+    """Import a command (Any: typer keeps the class of commands private)."""
+    target = target_of(name)
     if not isinstance(target, typer.Typer):
         alone = typer.Typer(add_completion=False)
         alone.command(name)(target)

@@ -1,7 +1,7 @@
 """Options that several commands share."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -13,8 +13,47 @@ if TYPE_CHECKING:  # slow to import
     from scenarios.schema import Scenario
     from twin.logs.recording import Recording
 
+Number = TypeVar("Number", int, float, None)
+MAX_SEED = 2**32 - 1
+MAX_NAME = 128
+"""Characters; a file name with it and an ending has at most 255 bytes."""
+
+
+def number(text: str, low: float, high: float, *names: str, above: bool = False, **more: Any) -> Any:
+    """Option whose number must be from `low` to `high`, or with `above` more than `low`; without a value, it is None.
+
+    Any: typer keeps the class of options private, and `more` goes to `typer.Option`.
+    """
+
+    limits = f"> {low:.10g} and at most {high:.10g}" if above else f"{low:.10g} to {high:.10g}"
+
+    def check(option: typer.CallbackParam, value: Number) -> Number:
+        if value is None or ((low < value if above else low <= value) and value <= high):  # NaN fails
+            return value
+        raise FleetError(f"{option.opts[0]} must be {limits} (got {value:g}).")
+
+    return typer.Option(*names, help=text, callback=check, **more)
+
+
+def check_name(option: typer.CallbackParam, value: str) -> str:
+    """Callback of a parameter that names a fleet or a participant, which becomes part of keys and of a file name.
+
+    Its default needs no check: "" for none.
+
+    Raises:
+        FleetError: it is empty or too long, or has a slash or characters that cannot be printed.
+    """
+    valid = 0 < len(value) <= MAX_NAME and "/" not in value and value.isprintable()
+    if not valid and value != option.default:
+        name = option.opts[0] if option.param_type_name == "option" else option.opts[0].upper()
+        raise FleetError(
+            f"{name} must have 1 to {MAX_NAME} printable characters and no '/' (got {value[:MAX_NAME]!r})."
+        )
+    return value
+
+
 ScenarioArg = Annotated[str, typer.Argument(help="A library name (see `thermofleet list`) or a .toml file.")]
-SeedOption = Annotated[int, typer.Option(help="Random seed of jobs, sensor noise and policy; 0 or more.")]
+SeedOption = Annotated[int, number("Random seed of jobs, sensor noise and policy.", 0, MAX_SEED)]
 DifficultyOption = Annotated[
     str, typer.Option(help="Source of the difficulty scores: twin, oracle (simulator) or blind (none).")
 ]
@@ -23,6 +62,7 @@ OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an e
 
 # Communication between the arms of a simulated shift.
 _CHANNEL = "Communication between arms"
+MAX_DELAY_S = 86_400.0
 TopologyOption = Annotated[
     str,
     typer.Option(
@@ -31,21 +71,21 @@ TopologyOption = Annotated[
     ),
 ]
 RadiusOption = Annotated[
-    float, typer.Option(help="random_geometric: range of an arm in a unit square.", rich_help_panel=_CHANNEL)
+    float, number("random_geometric: range of an arm in a unit square.", 0, 2, rich_help_panel=_CHANNEL)
 ]
 TopologySeedOption = Annotated[
-    int, typer.Option(help="random_geometric: seed of the arms' positions.", rich_help_panel=_CHANNEL)
+    int, number("random_geometric: seed of the arms' positions.", 0, MAX_SEED, rich_help_panel=_CHANNEL)
 ]
 DelayOption = Annotated[
-    float, typer.Option(help="Minimum delay of a message, s of simulated time.", rich_help_panel=_CHANNEL)
+    float, number("Minimum delay of a message, s of simulated time.", 0, MAX_DELAY_S, rich_help_panel=_CHANNEL)
 ]
 JitterOption = Annotated[
     float,
-    typer.Option(help="Maximum additional delay per message and link, s of simulated time.", rich_help_panel=_CHANNEL),
+    number(
+        "Maximum additional delay per message and link, s of simulated time.", 0, MAX_DELAY_S, rich_help_panel=_CHANNEL
+    ),
 ]
-LossOption = Annotated[
-    float, typer.Option(help="Probability that a message is lost on a link.", rich_help_panel=_CHANNEL)
-]
+LossOption = Annotated[float, number("Probability that a message is lost on a link.", 0, 1, rich_help_panel=_CHANNEL)]
 PartitionOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -65,7 +105,10 @@ PolicyOption = Annotated[
     ),
 ]
 FleetOption = Annotated[
-    str, typer.Option(envvar="THERMOFLEET_FLEET", help="Name of the fleet; not needed if there is only one.")
+    str,
+    typer.Option(
+        envvar="THERMOFLEET_FLEET", help="Name of the fleet; not needed if there is only one.", callback=check_name
+    ),
 ]
 
 # Twins.
@@ -83,18 +126,11 @@ WhichOption = Annotated[
 ]
 
 
-def check_least(least: float, **options: float | None) -> None:
-    """Raise a FleetError if an option is below the least allowed value; None is an option that was left out."""
-    for name, value in options.items():
-        if value is not None and not value >= least:
-            raise FleetError(f"--{name.replace('_', '-')} must be {least:g} or more (got {value:g}).")
-
-
 def channel_of(scenario: "Scenario", partition: list[str] | None = None, **fields: Any) -> "Channel":
     """The channel that the command line describes; `fields` are those of `Channel`, which checks them (hence Any).
 
     Raises:
-        FleetError: names the option, what was given and what is allowed.
+        FleetError: says what was given and what is allowed.
     """
     from fleet.bus.exchange.channel import Channel
 
@@ -102,8 +138,7 @@ def channel_of(scenario: "Scenario", partition: list[str] | None = None, **field
         channel = Channel(partitions=tuple(parse_partition(text) for text in partition or ()), **fields)
         channel.check([arm.name for arm in scenario.arms])
     except ValueError as error:
-        field, space, rest = str(error).partition(" ")
-        raise FleetError(f"--{field.replace('_', '-')}{space}{rest}" if field in fields else str(error)) from error
+        raise FleetError(str(error)) from error
     return channel
 
 

@@ -8,7 +8,7 @@ import typer
 
 from fleet.errors import FleetError
 from fleet.robot import ThermalLimits
-from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
+from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, check_name, number, the_fleet
 from scenarios.extras import require_extra
 
 if TYPE_CHECKING:
@@ -23,11 +23,11 @@ TURN_S = 0.25
 """Real seconds between two checks for a stop request."""
 DEFAULTS = ThermalLimits()
 
-DomainOption = Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", help="The ROS 2 domain.")]
+DomainOption = Annotated[int, number("The ROS 2 domain.", 0, 232, envvar="ROS_DOMAIN_ID")]
 RouterOption = Annotated[
     str, typer.Option(help="Router of ROS 2 (rmw_zenohd), as tcp/127.0.0.1:7447; default: the fleet's router.")
 ]
-WarningOption = Annotated[float, typer.Option(help="Motor temperature at which a warning begins, °C.")]
+WarningOption = Annotated[float, number("Motor temperature at which a warning begins, °C.", 0, 200)]
 
 
 @ros2_app.command("bridge")
@@ -38,7 +38,7 @@ def bridge_command(
     router: RouterOption = "",
     humble: Annotated[bool, typer.Option("--humble", help="For ROS 2 Humble, whose keys have no type hash.")] = False,
     warning_c: WarningOption = DEFAULTS.warning_c,
-    error_c: Annotated[float, typer.Option(help="Motor temperature at which an error begins, °C.")] = DEFAULTS.error_c,
+    error_c: Annotated[float, number("Motor temperature at which an error begins, °C.", 0, 200)] = DEFAULTS.error_c,
 ) -> None:
     """Publish every arm of a fleet as JointState and DiagnosticArray, until Ctrl-C or SIGTERM."""
     where = ros2_router(router, endpoint)
@@ -59,7 +59,7 @@ def bridge_command(
 @ros2_app.command("listen")
 def listen_command(
     topic: Annotated[str, typer.Argument(help="Topic of the arm's sensor_msgs/JointState, as /joint_states.")],
-    arm: Annotated[str, typer.Option(help="Name of the arm in the fleet.")] = "real",
+    arm: Annotated[str, typer.Option(help="Name of the arm in the fleet.", callback=check_name)] = "real",
     temperatures: Annotated[
         str, typer.Option(help="Topic of the diagnostic_msgs/DiagnosticArray with its motor temperatures.")
     ] = "",
@@ -71,7 +71,7 @@ def listen_command(
     fleet: FleetOption = "",
     domain: DomainOption = 0,
     router: RouterOption = "",
-    rate_hz: Annotated[float, typer.Option(help="State messages per real second.")] = 10.0,
+    rate_hz: Annotated[float, number("State messages per real second.", 0, 100, above=True)] = 10.0,
     warning_c: WarningOption = DEFAULTS.warning_c,
 ) -> None:
     """Show a real arm with a ROS 2 driver as an arm of the fleet that takes no jobs, until Ctrl-C or SIGTERM."""
@@ -80,10 +80,6 @@ def listen_command(
             "A JointState has no motor temperatures, and a fleet needs them: name the topic of a DiagnosticArray that "
             "has them with --temperatures. docs/ros2.md describes its content."
         )
-    if not 0 < rate_hz <= 100:
-        raise FleetError(f"--rate-hz must be > 0 and at most 100 (got {rate_hz:g}).")
-    if not arm:
-        raise FleetError("--arm needs a name.")
     names, where = names_of(joints), ros2_router(router, endpoint)
     node = node_at(where, f"thermofleet_{arm}", domain)
     from fleet.bus.client.client import BusClient

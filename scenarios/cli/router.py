@@ -7,6 +7,7 @@ import typer
 
 from fleet.bus.protocol.registry import CHANNEL
 from fleet.errors import FleetError
+from scenarios.cli.options import check_name, number
 from scenarios.cli.signals import until_stopped
 from scenarios.load import load
 
@@ -14,18 +15,20 @@ PORT = 7447
 
 
 def router_command(
-    port: Annotated[int, typer.Option(help="TCP port; 0 is any free one.")] = PORT,
+    port: Annotated[int, number("TCP port; 0 is any free one.", 0, 65535)] = PORT,
     host: Annotated[str, typer.Option(help="Address to listen on; beyond loopback only with --tls.")] = "127.0.0.1",
     tls: Annotated[
         Path | None,
         typer.Option(help="Folder that `thermofleet keys` made: mutual TLS, and access by role."),
     ] = None,
-    name: Annotated[str, typer.Option(help="--tls: participant whose certificate the router presents.")] = "router",
+    name: Annotated[
+        str, typer.Option(help="--tls: participant whose certificate the router presents.", callback=check_name)
+    ] = "router",
     scenario: Annotated[
         str | None, typer.Option(help="--tls: refuse to start unless every arm of this scenario has a certificate.")
     ] = None,
     state_hz: Annotated[
-        float, typer.Option(help="Telemetry messages forwarded per second and session; 0 is unlimited.")
+        float, number("Telemetry messages forwarded per second and session; 0 is unlimited.", 0, 1_000_000)
     ] = CHANNEL["arm", "state"].limit_hz or 0.0,
 ) -> None:
     """Run the Zenoh router of a fleet until Ctrl-C or SIGTERM; it prints its endpoint once it listens."""
@@ -33,12 +36,8 @@ def router_command(
     from fleet.bus.client.router import Router
     from fleet.bus.security.tls import Tls
 
-    if not 0 <= port <= 65535:
-        raise FleetError(f"--port must be 0 to 65535 (got {port}).")
-    if not 0 <= state_hz < 1e6:
-        raise FleetError(f"--state-hz must be 0 or more (got {state_hz:g}).")
     if scenario is not None:
-        _check_roster(tls, scenario)
+        check_roster(tls, scenario)
     limits = Limits(state_hz=state_hz or None)
     with until_stopped() as stop, Router(port, host=host, tls=Tls(tls, name) if tls else None, limits=limits) as router:
         typer.echo(router.endpoint)  # flushed: a supervisor reads this line
@@ -46,7 +45,12 @@ def router_command(
         stop.leave("The router was interrupted; its clients keep trying to reconnect.")
 
 
-def _check_roster(folder: Path | None, scenario: str) -> None:
+def check_roster(folder: Path | None, scenario: str) -> None:
+    """Check that a folder of keys has a certificate for every arm of a scenario.
+
+    Raises:
+        FleetError: it has not, or it is not a folder of keys of this scenario.
+    """
     from fleet.bus.security.access_control import read_roster
 
     if folder is None:

@@ -43,8 +43,10 @@ def run_command(
     overwrite: options.OverwriteOption = False,
     listen: Annotated[
         int,
-        typer.Option(
-            help="Loopback port of the router, so that others can subscribe. Default: a private router on a free port."
+        options.number(
+            "Loopback port of the router, so that others can subscribe. Default: a private router on a free port.",
+            0,
+            65535,
         ),
     ] = 0,
     as_json: options.JsonOption = False,
@@ -66,8 +68,8 @@ def run_command(
         jitter_s=jitter_s, loss=loss,
     )  # fmt: skip
     spec = _spec(policy, seed, plant, bus, difficulty, channel)
-    if not 0 <= listen <= 65535 or (listen and bus == "memory"):
-        raise FleetError(f"--listen must be a port from 1 to 65535, with --bus zenoh (got {listen} and {bus}).")
+    if listen and bus == "memory":
+        raise FleetError(f"--listen needs --bus zenoh (got {listen} and {bus}).")
     where = out or Path("runs") / f"{chosen.name}-{label(policy)}-{seed}"
     check_free(where, RUN, overwrite=overwrite)
     with ExitStack() as open_until_end:
@@ -84,6 +86,8 @@ def run_command(
     else:
         say(f"{chosen.name}, seed {seed}", out_console)
         out_console.print(metrics_table({label(policy): result.metrics}))
+        if result.metrics.illegal_actions:
+            say(f"The policy chose {result.metrics.illegal_actions} illegal actions; each counted as a wait.")
         if result.finished:
             say(f"Recorded in {where}; open {where / 'report.html'} in a browser.", out_console)
     if not result.finished:
@@ -119,7 +123,6 @@ def _spec(policy: str, seed: int, plant: str, bus: str, difficulty: str, channel
     from scenarios.run.shift import RunSpec
 
     policy_of(policy)
-    options.check_least(0, seed=seed)
     return RunSpec(
         policy=policy,
         seed=seed,

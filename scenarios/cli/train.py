@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from fleet.errors import FleetError
-from scenarios.cli.options import DifficultyOption, ScenarioArg, check_least
+from scenarios.cli.options import MAX_SEED, DifficultyOption, ScenarioArg, number
 from scenarios.cli.terminal import out_console, progress_bar, say
 from scenarios.extras import require_extra
 from scenarios.load import load
@@ -19,16 +19,18 @@ def train_command(
     algo: Annotated[
         str, typer.Option(help="mappo (one critic for the whole fleet) or ippo (one critic per arm).")
     ] = "mappo",
-    minutes: Annotated[float, typer.Option(help="Training time excluding the twins, min.")] = 30.0,
-    iterations: Annotated[int | None, typer.Option(help="Stop earlier, after this many iterations in total.")] = None,
+    minutes: Annotated[float, number("Training time excluding the twins, min.", 0, 100_000, above=True)] = 30.0,
+    iterations: Annotated[
+        int | None, number("Stop earlier, after this many iterations in total.", 1, 1_000_000)
+    ] = None,
     warm_start: Annotated[
         str, typer.Option(help="Rule that the network imitates first, for example wspt; default: none.")
     ] = "",
-    envs: Annotated[int, typer.Option(help="Shifts simulated in parallel.")] = 64,
-    seed: Annotated[int, typer.Option(help="Seed for shifts, initialisation and minibatches.")] = 0,
+    envs: Annotated[int, number("Shifts simulated in parallel.", 1, 65_536)] = 64,
+    seed: Annotated[int, number("Seed for shifts, initialisation and minibatches.", 0, MAX_SEED)] = 0,
     out: Annotated[Path | None, typer.Option(help="Folder of the policy; default: runs/SCENARIO-ALGO-SEED.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the training in --out.")] = False,
-    threads: Annotated[int, typer.Option(help="Threads of the network's computations.")] = 1,
+    threads: Annotated[int, number("Threads of the network's computations.", 1, 1024)] = 1,
     difficulty: DifficultyOption = "twin",
 ) -> None:
     """Train a policy by reinforcement learning, with checkpoints and learning curves; Ctrl-C keeps the result so far.
@@ -36,8 +38,6 @@ def train_command(
     The folder can be used as a policy: `thermofleet compare SCENARIO --policies random,FOLDER`.
     """
     chosen = load(scenario)
-    check_least(1, threads=threads)
-    check_least(0, seed=seed)
     if warm_start:
         policy_of(warm_start)
     where = out or Path("runs") / f"{chosen.name}-{algo}-{seed}"

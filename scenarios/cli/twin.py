@@ -37,24 +37,27 @@ def train_command(
         str | None, typer.Option(help="joint (one network per joint) or arm (one network of 21 channels).")
     ] = None,
     kind: Annotated[str | None, typer.Option(help="vae or ae (a plain autoencoder, as a baseline).")] = None,
-    latent: Annotated[int | None, typer.Option(help="Dimensions of the latent space.")] = None,
-    hidden: Annotated[int | None, typer.Option(help="Units of each LSTM.")] = None,
-    layers: Annotated[int | None, typer.Option(help="Layers of each LSTM.")] = None,
-    window: Annotated[int | None, typer.Option(help="Samples per window.")] = None,
-    rate_hz: Annotated[float | None, typer.Option("--rate", help="Samples per second inside a window.")] = None,
-    epochs: Annotated[int | None, typer.Option(help="Passes over the training windows.")] = None,
-    restarts: Annotated[int | None, typer.Option(help="Trainings per network; the best ELBO is kept.")] = None,
-    beta: Annotated[float | None, typer.Option(help="Weight of the KL term.")] = None,
-    max_windows: Annotated[int | None, typer.Option(help="Largest number of training windows.")] = None,
+    latent: Annotated[int | None, options.number("Dimensions of the latent space.", 1, 64)] = None,
+    hidden: Annotated[int | None, options.number("Units of each LSTM.", 1, 1024)] = None,
+    layers: Annotated[int | None, options.number("Layers of each LSTM.", 1, 8)] = None,
+    window: Annotated[int | None, options.number("Samples per window.", 2, 10_000)] = None,
+    rate_hz: Annotated[
+        float | None, options.number("Samples per second inside a window.", 0, 1000, "--rate", above=True)
+    ] = None,
+    epochs: Annotated[int | None, options.number("Passes over the training windows.", 1, 100_000)] = None,
+    restarts: Annotated[int | None, options.number("Trainings per network; the best ELBO is kept.", 1, 100)] = None,
+    beta: Annotated[float | None, options.number("Weight of the KL term.", 0, 1000)] = None,
+    max_windows: Annotated[int | None, options.number("Largest number of training windows.", 1, 1_000_000)] = None,
     cool: Annotated[
         float,
-        typer.Option(help="--log: temperature limit of motors 1 to 4 for training data, °C."),
+        options.number("--log: temperature limit of motors 1 to 4 for training data, °C.", 0, 200),
     ] = 40.0,
     allow_collapse: Annotated[
         bool, typer.Option("--allow-collapse", help="Keep a twin whose latent space collapsed, as a baseline.")
     ] = False,
     seed: Annotated[
-        int | None, typer.Option(help="Seed of weights and training; 0 or more. Default: the scenario's, for logs 0.")
+        int | None,
+        options.number("Seed of weights and training. Default: the scenario's, for logs 0.", 0, options.MAX_SEED),
     ] = None,
     skip_damaged: options.DamagedOption = False,
     overwrite: options.OverwriteOption = False,
@@ -66,7 +69,6 @@ def train_command(
     Cached twins take seconds. A twin of logs is kept in --out only.
     """
     check_source(scenario, log, arm)
-    options.check_least(0, seed=seed)
     if size is not None:
         choose("size", size, Literal["quick", "full"])
     fields = dict(
@@ -167,7 +169,7 @@ def report_command(
         "runs/twin_report"
     ),
     arm: Annotated[str | None, typer.Option(help="Arm of the scenario; default: the first.")] = None,
-    seeds: Annotated[int, typer.Option(help="Number of seeds; figures with a spread are repeated for each.")] = 3,
+    seeds: Annotated[int, options.number("Number of seeds; figures with a spread are repeated for each.", 1, 100)] = 3,
     quick: Annotated[
         bool, typer.Option("--quick", help="Fewer jobs, smaller trainings: about 20 min on two cores.")
     ] = False,
@@ -183,7 +185,6 @@ def report_command(
     A section that fails gives its reason in the page, and the exit code is 1.
     """
     check_source(scenario, log, arm)
-    options.check_least(1, seeds=seeds)
     from scenarios.result_folder import check_free, new_folder
     from scenarios.studies.report.build import REPORT, report_logs, report_scenario, write
     from scenarios.studies.report.context import QUICK, Size

@@ -25,15 +25,15 @@ TwinsOption = Annotated[
     Path | None, typer.Option("--twins", help="A folder of twins; default: the scenario's own, from the cache.")
 ]
 FormatOption = Annotated[str, typer.Option("--format", help="parquet or csv.")]
-SeedOption = Annotated[int, typer.Option(help="Random seed; 0 or more.")]
+SeedOption = Annotated[int, options.number("Random seed.", 0, options.MAX_SEED)]
 
 
 def identify_command(
     log: Annotated[Path, typer.Option("--log", help="A log with motor temperatures, or a folder of logs of one arm.")],
     out: Annotated[Path | None, typer.Option(help="Folder of the result, rc.json.")] = None,
-    arm: Annotated[str, typer.Option(help="Name of the arm.")] = "arm",
+    arm: Annotated[str, typer.Option(help="Name of the arm.", callback=options.check_name)] = "arm",
     ambient: Annotated[
-        float | None, typer.Option(help=f"Ambient temperature, °C; default: {AMBIENT_C:g} is assumed.")
+        float | None, options.number(f"Ambient temperature, °C; default: {AMBIENT_C:g} is assumed.", -40, 60)
     ] = None,
     skip_damaged: options.DamagedOption = False,
     overwrite: options.OverwriteOption = False,
@@ -87,9 +87,9 @@ def generate_command(
     out: Annotated[Path, typer.Option(help="Folder of the motions and generated.json.")] = Path("runs/generated"),
     arm: ArmOfScenario = None,
     twins: TwinsOption = None,
-    count: Annotated[int, typer.Option(help="Number of motions.")] = 20,
+    count: Annotated[int, options.number("Number of motions.", 1, 10_000)] = 20,
     strength: Annotated[
-        float, typer.Option("--s", help="Perturbation in posterior standard deviations; 0 reconstructs.")
+        float, options.number("Perturbation in posterior standard deviations; 0 reconstructs.", 0, 100, "--s")
     ] = 1.0,
     seed: SeedOption = 0,
     format_: FormatOption = "parquet",
@@ -100,8 +100,6 @@ def generate_command(
 
     Takes about 20 s once the arm's twin is in the cache.
     """
-    options.check_least(0, seed=seed, s=strength)
-    options.check_least(1, count=count)
     from scenarios.motion.generate import generate
     from scenarios.motion.known_arm import known_arm
     from scenarios.motion.motion_files import GENERATED, Format, generated_summary, save_generated
@@ -129,10 +127,10 @@ def recover_command(
     out: Annotated[Path, typer.Option(help="Folder of the temperatures and recovery.json.")] = Path("runs/recovery"),
     arm: ArmOfScenario = None,
     twins: TwinsOption = None,
-    payload: Annotated[float, typer.Option(help="Payload held, kg.")] = 2.0,
+    payload: Annotated[float, options.number("Payload held, kg.", 0, 100)] = 2.0,
     posture: Annotated[str, typer.Option(help=f"{', '.join(POSTURES)}, or seven angles in degrees.")] = "raised",
-    warm: Annotated[float, typer.Option(help="Temperature of the hottest motor at the start, °C.")] = 50.0,
-    hold_s: Annotated[float, typer.Option("--hold", help="Remaining time to hold, s.")] = 600.0,
+    warm: Annotated[float, options.number("Temperature of the hottest motor at the start, °C.", -40, 200)] = 50.0,
+    hold_s: Annotated[float, options.number("Remaining time to hold, s.", 0, 86_400, "--hold", above=True)] = 600.0,
     seed: SeedOption = 0,
     format_: FormatOption = "parquet",
     overwrite: options.OverwriteOption = False,
@@ -142,9 +140,6 @@ def recover_command(
 
     Takes about 20 s once the arm's twin is in the cache.
     """
-    options.check_least(0, seed=seed)
-    if not hold_s > 0:
-        raise FleetError(f"--hold must be > 0 (got {hold_s:g}).")
     from fleet.physics.models import ArmModel
     from scenarios.motion.known_arm import known_arm
     from scenarios.motion.motion_files import RECOVERY, Format, recovery_summary, save_recovery

@@ -30,6 +30,7 @@ from fleet.thermal import (
     steady_state,
     thermal_model,
 )
+from scenarios.cli.options import number
 from scenarios.motion.posture import parse_posture
 
 Array = np.ndarray
@@ -216,21 +217,17 @@ def as_table(result: HoldResult) -> Table:
 
 
 def hold_command(
-    payload: Annotated[float, typer.Option(help="Payload at the flange, kg.")] = 0.0,
+    payload: Annotated[float, number("Payload at the flange, kg.", 0, 100)] = 0.0,
     posture: Annotated[
         str, typer.Option(help=f"{', '.join(POSTURES)}, or seven comma-separated angles in degrees.")
     ] = "outstretched",
-    ambient: Annotated[float, typer.Option(help="Ambient temperature, °C.")] = 25.0,
+    ambient: Annotated[float, number("Ambient temperature, °C.", *AMBIENT_RANGE_C)] = 25.0,
     json_: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
     cooling: Annotated[str, typer.Option(help=f"{', '.join(get_args(Cooling))}.")] = "still_air",
-    tool_kg: Annotated[float, typer.Option(help="Mass of the gripper at the flange, kg.")] = 0.0,
+    tool_kg: Annotated[float, number("Mass of the gripper at the flange, kg.", 0, 100)] = 0.0,
 ) -> None:
     """Compute how long an arm can hold a payload until its motors reach the warning and error limits."""
-    try:
-        result = hold(payload, posture, ambient, cooling=cooling, tool_kg=tool_kg)
-    except FleetError as error:
-        typer.echo(str(error), err=True)
-        raise typer.Exit(2) from None
+    result = hold(payload, posture, ambient, cooling=cooling, tool_kg=tool_kg)
     if json_:
         typer.echo(json.dumps(as_json(result), indent=2, allow_nan=False, ensure_ascii=False))
     else:

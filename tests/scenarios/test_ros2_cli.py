@@ -72,7 +72,6 @@ def test_an_arm_is_published_in_ros_and_followed_again():
     [
         (["listen", "/joint_states"], "has no motor temperatures"),
         (["listen", "/j", "--temperatures", "/d", "--joints", "a,a"], "different names"),
-        (["listen", "/j", "--temperatures", "/d", "--arm", ""], "--arm needs a name"),
         (["listen", "/j", "--temperatures", "/d", "--rate-hz", "0"], "--rate-hz must be"),
         (["bridge", "--domain", "233"], "--domain must be 0 to 232"),
         (["bridge", "--fleet", "f", "--warning-c", "80"], "--warning-c must be less than --error-c"),

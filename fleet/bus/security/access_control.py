@@ -185,12 +185,13 @@ def access_control(roster: Roster) -> dict[str, Any]:
         _rule("receive", "egress", _RECEIVE, everything),
         _rule("history", "ingress", ("query",), [keys.caches_of(keys.all_of_fleet(fleet))]),
     ]
-    subjects, policies = [], []
+    subjects: list[dict[str, Any]] = []
+    policies: list[dict[str, Any]] = []
     for participant in roster.participants:
         if participant.role == "router":
             continue
         name, granted = participant.common_name, rights(fleet, participant, by_consensus=roster.by_consensus)
-        own = []
+        own: list[dict[str, Any]] = []
         if granted.publishes:
             own.append(_rule(f"{name} publishes", "ingress", _PUBLISH, _with_caches(granted.publishes)))
         if granted.queries:

@@ -6,7 +6,8 @@ only for listening and every other one only for connecting, so no participant ca
 
 import ipaddress
 import os
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -28,6 +29,7 @@ LONGEST_DAYS = 3650
 SKEW = timedelta(minutes=5)
 """Certificates are valid from this long before their issue, as the clocks of machines differ."""
 HERE = ("localhost", "127.0.0.1", "::1")
+_HOST_NAME = re.compile(r"(?=.{1,253}$)[A-Za-z0-9_]([A-Za-z0-9_.-]*[A-Za-z0-9_])?", re.ASCII)
 _OWNER_ONLY, _ALL_READ = 0o600, 0o644
 
 
@@ -150,7 +152,7 @@ def format_time(moment: datetime) -> str:
 
 
 @contextmanager
-def written_atomically(path: Path, content: bytes, mode: int = _ALL_READ) -> Iterator[None]:
+def written_atomically(path: Path, content: bytes, mode: int = _ALL_READ) -> Generator[None]:
     """Write a file to a temporary name; it gets its own name when the block ends without an error.
 
     Raises:
@@ -234,7 +236,6 @@ def _host_name(host: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:
         pass
-    try:
-        return x509.DNSName(host)
-    except ValueError as error:
-        raise BusError(f"'{host}' is not a host name or address; other alphabets need their punycode.") from error
+    if not _HOST_NAME.fullmatch(host):
+        raise BusError(f"'{host[:255]}' is not a host name or address; other alphabets need their punycode.")
+    return x509.DNSName(host)

@@ -72,7 +72,7 @@ class _Quote:
     made_s: float
     jobs: dict[str, tuple[JobSpec, bool]]
     """Jobs that were asked for, and whether the arm can do each."""
-    answers: dict[str, Ack] = field(default_factory=dict)
+    answers: dict[str, Ack] = field(default_factory=dict[str, Ack])
     """Answer to the first award of each job."""
 
 

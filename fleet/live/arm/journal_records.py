@@ -72,11 +72,11 @@ class ArmHistory(JournalState[ArmRecord]):
 
     boot: int = 0
     """Number of the last start; 0 before the first."""
-    active: dict[str, ActiveAward] = field(default_factory=dict)
+    active: dict[str, ActiveAward] = field(default_factory=dict[str, ActiveAward])
     """By award."""
-    reports: dict[str, tuple[Award, Report]] = field(default_factory=dict)
+    reports: dict[str, tuple[Award, Report]] = field(default_factory=dict[str, tuple[Award, Report]])
     """Not acknowledged yet, by award."""
-    accepted: dict[str, str] = field(default_factory=dict)
+    accepted: dict[str, str] = field(default_factory=dict[str, str])
     """Job of every accepted award, oldest first: the last `MAX_PAST_AWARDS` closed ones and all others."""
 
     def apply(self, record: ArmRecord) -> None:

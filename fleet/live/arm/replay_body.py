@@ -93,4 +93,5 @@ class ReplayBody:
     @property
     def _row(self) -> int:
         into_s = self._log.time_s[0] + self._now_s - self._start_s
-        return max(0, int(np.searchsorted(self._log.time_s, into_s + 1e-9, side="right")) - 1)
+        after = np.searchsorted(self._log.time_s, into_s + 1e-9, side="right")  # pyright: ignore[reportUnknownVariableType]
+        return max(0, int(after) - 1)  # pyright: ignore[reportUnknownArgumentType]

@@ -150,7 +150,9 @@ class SimulatedBody:
         motion = self._plant.motion(world, record, end_s)
         sample = telemetry_of(world, record, end_s, motion, self._rng.standard_normal((1, 1, 1, motion.shape[-1])))
         values = (sample.temp_c, sample.q, sample.qd, sample.tau, sample.current_a)
-        return SensorReading(MODES[self._state.mode[0, 0]], *(tuple(value[0, 0].tolist()) for value in values))
+        return SensorReading(
+            MODES[int(self._state.mode.item(0, 0))], *(tuple(value[0, 0].tolist()) for value in values)
+        )
 
     # Commands
 

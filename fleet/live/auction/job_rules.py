@@ -1,5 +1,8 @@
 """Which jobs are accepted, which can begin, and which statuses fit in a reply: the same with and without auctioneer."""
 
+# The stubs of networkx leave the results of its functions unknown.
+# pyright: standard
+
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import accumulate, islice
 

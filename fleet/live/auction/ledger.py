@@ -69,7 +69,7 @@ class Change(msgspec.Struct, frozen=True):
 class JobEntry(msgspec.Struct):
     """State of one job."""
 
-    spec: JobSpec = msgspec.field(name="word")
+    spec: JobSpec
     by: str
     state: JobState = "waiting"
     award: str = ""
@@ -86,7 +86,7 @@ class JobEntry(msgspec.Struct):
 class AwardState(msgspec.Struct):
     """State of one award."""
 
-    record: Awarded = msgspec.field(name="made")
+    record: Awarded
     may_commit: bool = False
     silent: bool = False
     """The arm has permission to commit, and has not renewed its lease."""
@@ -118,16 +118,16 @@ class Ledger(TimedState[AuctionRecord]):
 
     places: frozenset[str] | None = None
     """Places of the cell; None allows any name."""
-    jobs: dict[str, JobEntry] = field(default_factory=dict)
+    jobs: dict[str, JobEntry] = field(default_factory=dict[str, JobEntry])
     """By release and name."""
-    awards: dict[str, AwardState] = field(default_factory=dict)
+    awards: dict[str, AwardState] = field(default_factory=dict[str, AwardState])
     time_s: float = 0.0
     """Latest time of all records."""
     number: int = 0
     """Of the next change."""
     ended: bool = False
     recent: deque[Change] = field(default_factory=lambda: deque(maxlen=MAX_RECENT))
-    open: dict[str, AwardState] = field(default_factory=dict)
+    open: dict[str, AwardState] = field(default_factory=dict[str, AwardState])
     """Awards that are not closed, by name."""
 
     def admit(self, jobs: Sequence[JobSpec]) -> tuple[Admission, ...]:

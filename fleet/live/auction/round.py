@@ -58,13 +58,13 @@ class Bidding:
     jobs: tuple[JobSpec, ...]
     quotes: Mapping[str, Quote]
     """Quotes of the arms with capacity for a job."""
-    full: Mapping[str, Quote] = field(default_factory=dict)
+    full: Mapping[str, Quote] = field(default_factory=dict[str, Quote])
     """Quotes of the arms without."""
-    states: Mapping[str, State] = field(default_factory=dict)
+    states: Mapping[str, State] = field(default_factory=dict[str, State])
     """Latest published state of each arm."""
-    ages_s: Mapping[str, float] = field(default_factory=dict)
+    ages_s: Mapping[str, float] = field(default_factory=dict[str, float])
     """Age of a quote, fleet seconds; 0 where none is given."""
-    returned: Mapping[str, tuple[int, float]] = field(default_factory=dict)
+    returned: Mapping[str, tuple[int, float]] = field(default_factory=dict[str, tuple[int, float]])
     """Number of returns of a job, and fleet time of the last one; only of jobs that were ever returned."""
 
     def offer(self, arm: str, job: str) -> JobEstimate | None:
@@ -148,7 +148,7 @@ class Round:
     """Arms whose quotes it waits for."""
     until_s: float
     """Real second at which it closes in any case."""
-    quotes: dict[str, Quote] = field(default_factory=dict)
+    quotes: dict[str, Quote] = field(default_factory=dict[str, Quote])
 
     def complete(self, present: frozenset[str]) -> bool:
         """Return whether every arm that was asked and is still present has answered."""

@@ -36,10 +36,10 @@ NUMBERS_PER_BOOT = 1_000_000_000
 class Vote:
     """Replies of the fleet about one award."""
 
-    granted_s: dict[str, float] = field(default_factory=dict)
+    granted_s: dict[str, float] = field(default_factory=dict[str, float])
     """Real second of the last query that each arm granted."""
-    denied: set[str] = field(default_factory=set)
-    may_commit: set[str] = field(default_factory=set)
+    denied: set[str] = field(default_factory=set[str])
+    may_commit: set[str] = field(default_factory=set[str])
     cycles: int = 0
 
     def since_s(self, majority: int) -> float:

@@ -70,15 +70,15 @@ class Grant:
 class Register(TimedState[GrantRecord]):
     """The state that follows from the records; only `apply` changes it."""
 
-    grants: dict[str, Grant] = field(default_factory=dict)
+    grants: dict[str, Grant] = field(default_factory=dict[str, Grant])
     """By job."""
-    settled: dict[str, JobOutcome] = field(default_factory=dict)
+    settled: dict[str, JobOutcome] = field(default_factory=dict[str, JobOutcome])
     """By job; finished or unfinished for good."""
-    cycles: dict[str, int] = field(default_factory=dict)
+    cycles: dict[str, int] = field(default_factory=dict[str, int])
     """Cycles known to be done, by job."""
-    numbers: dict[str, int] = field(default_factory=dict)
+    numbers: dict[str, int] = field(default_factory=dict[str, int])
     """Number of the last claim, by arm."""
-    jobs: dict[str, JobSpec] = field(default_factory=dict)
+    jobs: dict[str, JobSpec] = field(default_factory=dict[str, JobSpec])
     """Submitted ones, by name."""
     time_s: float = 0.0
 

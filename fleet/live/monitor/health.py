@@ -146,7 +146,7 @@ def check_arm(arm: ArmSnapshot, offset_s: float | None) -> list[Finding]:
         findings.append(Finding("warning", f"{arm.arm} is faulted: joint {arm.joint} is at {arm.hottest_c:.1f} °C."))
     if offset_s is not None and abs(offset_s) > OFFSET_S:
         offset = f"{abs(offset_s):.1f} s {'ahead of' if offset_s > 0 else 'behind'} fleet time"
-        findings.append(Finding("fault", f"{arm.arm} is {offset}: its machine may be overloaded."))
+        findings.append(Finding("fault", f"{arm.arm} is {offset}: its machine may be overloaded, or its process hang."))
     return findings
 
 

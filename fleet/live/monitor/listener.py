@@ -10,7 +10,7 @@ import msgspec
 from fleet.bus.client.client import BusClient
 from fleet.bus.client.replies import Replies
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import Status, StatusRequest
+from fleet.bus.protocol.auction import Clock, ClockRequest, Status, StatusRequest
 from fleet.bus.protocol.registry import PUBLISHED
 from fleet.errors import BusError
 from fleet.live.monitor.snapshot import FleetView, Role
@@ -18,7 +18,7 @@ from fleet.live.monitor.snapshot import FleetView, Role
 _LOG = logging.getLogger(__name__)
 
 STATUS_EVERY_S = 5.0
-"""Real seconds between two status requests: for results that were published before the listener started."""
+"""Real seconds between two requests of the clock and of all jobs, whose results may be older than the listener."""
 OnMessage = Callable[[str, str, msgspec.Struct], None]
 """Called with the topic, the name in the key, and the message."""
 OnPresence = Callable[[Role, str, bool], None]
@@ -55,13 +55,14 @@ class FleetListener:
         link.watch_tokens(keys.of_every_auction(link.fleet, "alive"), partial(self._token, "auction"))
 
     def serve(self, until_s: float) -> None:
-        """Handle messages until the real second `until_s`; request the status of all jobs when that is due."""
+        """Handle messages until the real second `until_s`; request the fleet's clock and all jobs when that is due."""
         asked_s = time.monotonic()
         if asked_s >= self._status_due_s:
             self._status_due_s = asked_s + STATUS_EVERY_S
-            key, done = keys.of_jobs(self._link.fleet, "status"), partial(self._statuses, asked_s)
+            fleet, done = self._link.fleet, partial(self._statuses, asked_s)
             try:
-                self._link.query(key, StatusRequest(), Status, done, timeout_s=STATUS_EVERY_S)
+                self._link.query(keys.of_clock(fleet), ClockRequest(), Clock, self._clocks, timeout_s=STATUS_EVERY_S)
+                self._link.query(keys.of_jobs(fleet, "status"), StatusRequest(), Status, done, timeout_s=STATUS_EVERY_S)
             except BusError as error:
                 _LOG.warning("%s", error)
         while time.monotonic() < until_s:
@@ -74,6 +75,10 @@ class FleetListener:
     def _token(self, role: Role, name: str, present: bool) -> None:
         if self.view.set_token(role, name, present):
             self._on_presence(role, name, present)
+
+    def _clocks(self, answers: Replies[Clock]) -> None:
+        for reply in answers.messages.values():
+            self.view.speed = reply.speed
 
     def _statuses(self, asked_s: float, answers: Replies[Status]) -> None:
         replies = list(answers.messages.values())

@@ -6,7 +6,7 @@ published: the least recent are dropped.
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, TypeVar
 
@@ -44,13 +44,15 @@ class ArmSnapshot(msgspec.Struct, frozen=True):
     headroom_k: float | None = None
     job: str = ""
     difficulty: dict[str, float | None] = {}
-    """Difficulty of the open jobs; None without a score."""
+    """Difficulty of the jobs that have not ended; None without a score."""
     joints: int | None = None
     twin: str = ""
     event: str = ""
     """Its last event."""
     state_age_s: float | None = None
+    """Since it arrived."""
     difficulty_age_s: float | None = None
+    """Since it was sent, by the arm's clock; since it arrived while the fleet's speed is unknown."""
 
 
 class AuctioneerSnapshot(msgspec.Struct, frozen=True):
@@ -77,7 +79,7 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
 @dataclass
 class _Arm:
     token: bool = False
-    messages: dict[type, tuple[msgspec.Struct, float]] = field(default_factory=dict)
+    messages: dict[type, tuple[msgspec.Struct, float]] = field(default_factory=dict[type, tuple[msgspec.Struct, float]])
     """The last message of each type, and the real second it came."""
 
     def last(self, kind: type[Message]) -> tuple[Message | None, float]:
@@ -107,6 +109,8 @@ class FleetView:
     """State of a fleet, as its messages show it."""
 
     fleet: str
+    speed: float | None = None
+    """Fleet seconds per real second; None while unknown."""
     _arms: "Recent[str, _Arm]" = field(default_factory=lambda: Recent(MAX_NAMES))
     _auctioneers: "Recent[str, _Auctioneer]" = field(default_factory=lambda: Recent(MAX_NAMES))
     _jobs: "Recent[str, _Job]" = field(default_factory=lambda: Recent(MAX_JOBS))
@@ -153,9 +157,10 @@ class FleetView:
     def snapshot(self, now_s: float, jobs: int = MAX_JOBS) -> FleetSnapshot:
         """The fleet at the real second `now_s`, with at most `jobs` of the jobs that changed last."""
         statuses = [job.status for job in self._jobs.values()]
+        ended = {status.job for status in statuses if status.state in ("finished", "unfinished")}
         return FleetSnapshot(
             fleet=self.fleet,
-            arms=tuple(_arm_snapshot(name, self._arms[name], now_s) for name in sorted(self._arms)),
+            arms=tuple(_arm_snapshot(name, self._arms[name], now_s, self.speed, ended) for name in sorted(self._arms)),
             auctioneers=tuple(
                 AuctioneerSnapshot(name, known.token, None if known.heard_s is None else now_s - known.heard_s)
                 for name, known in sorted(self._auctioneers.items())
@@ -207,10 +212,14 @@ def _complete(reply: Status) -> bool:
     return len(reply.jobs) < auction.MOST_JOBS and len(encode(reply)) < COMPLETE_BYTES
 
 
-def _arm_snapshot(name: str, arm: _Arm, now_s: float) -> ArmSnapshot:
+def _arm_snapshot(name: str, arm: _Arm, now_s: float, speed: float | None, ended: Container[str]) -> ArmSnapshot:
     (state, state_s), (scores, scores_s) = arm.last(State), arm.last(DifficultyScores)
     (info, _), (event, _) = arm.last(Info), arm.last(ArmEvent)
     age_s = now_s - state_s if state else None
+    difficulty = zip(scores.jobs, scores.difficulty, strict=True) if scores else ()
+    difficulty_age_s = now_s - scores_s if scores else None
+    if scores and state and speed:  # from a cache it may arrive long after it was sent
+        difficulty_age_s = max(now_s - scores_s, now_s - state_s + (state.time_s - scores.time_s) / speed)
     temps_c = state.temp_c if state else ()
     hottest_c = max(temps_c, default=None)
     return ArmSnapshot(
@@ -223,10 +232,10 @@ def _arm_snapshot(name: str, arm: _Arm, now_s: float) -> ArmSnapshot:
         joint=None if hottest_c is None else temps_c.index(hottest_c) + 1,
         headroom_k=state.headroom_k if state else None,
         job=state.job if state else "",
-        difficulty=dict(zip(scores.jobs, scores.difficulty, strict=True)) if scores else {},
+        difficulty={job: score for job, score in difficulty if job not in ended},
         joints=info.joints if info else None,
         twin=info.twin if info else "",
         event=describe_event(event) if event else "",
         state_age_s=age_s,
-        difficulty_age_s=now_s - scores_s if scores else None,
+        difficulty_age_s=difficulty_age_s,
     )

@@ -30,21 +30,20 @@ from fleet.live.arm.estimator import Estimator, NominalPeaks
 from fleet.live.arm.journal_records import ArmHistory, ArmRecord
 from fleet.live.arm.node import ArmConfig, ArmNode
 from fleet.live.arm.replay_body import ReplayBody, SensorLog
-from fleet.live.arm.simulated_body import SimulatedBody
 from fleet.live.clock import FleetClock
 from fleet.live.journal import Journal
 from fleet.motion import Plan
 from scenarios.cli.live.journals import folder_of, refuse_other_way
 from scenarios.cli.live.options import (
+    MAX_SPEED,
     JobsOption,
     JournalOption,
     ModelOption,
     RateOption,
     ScenarioFleetOption,
     SeedOption,
-    number,
 )
-from scenarios.cli.options import ENDPOINT, EndpointOption, ScenarioArg
+from scenarios.cli.options import ENDPOINT, EndpointOption, ScenarioArg, check_name, number
 from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import progress_bar
 from scenarios.load import load
@@ -63,12 +62,13 @@ two requests for it."""
 
 def arm_command(
     scenario: ScenarioArg,
-    name: Annotated[str, typer.Argument(help="Arm of the scenario; with --source log any name.")],
+    name: Annotated[str, typer.Argument(help="Arm of the scenario; with --source log any name.", callback=check_name)],
     file: Annotated[Path | None, typer.Argument(help="--source log: a Gen3 log, a plain log, or a recording.")] = None,
     source: Annotated[Literal["sim", "log"], typer.Option(help="sim (the scenario's arm), or log FILE.")] = "sim",
     difficulty: ModelOption = "twin",
     speed: Annotated[
-        float | None, number("Fleet seconds per real second. Default: the auctioneer's, else 1.", above=True)
+        float | None,
+        number("Fleet seconds per real second. Default: the auctioneer's, else 1.", 0, MAX_SPEED, above=True),
     ] = None,
     rate_hz: RateOption = STATE_HZ,
     capacity: Annotated[int, number("Maximum concurrent jobs.", 1, 256)] = 1,
@@ -159,6 +159,7 @@ def simulated_arm(
     Raises:
         FleetError: the scenario has no such arm.
     """
+    from fleet.live.arm.simulated_body import SimulatedBody  # loads the engine
     from scenarios.prepare.fleet import air_offsets, prepare_arm
     from scenarios.prepare.planned_arm import CellPlanner
 

@@ -13,7 +13,7 @@ from fleet.bus.protocol.auction import MOST_JOBS, JobEstimate, JobSpec, Quote, Q
 from fleet.errors import BusError, FleetError
 from fleet.job import DWELL_S
 from scenarios.cli.live.submit import JOBS_HELP, explain, read_jobs
-from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
+from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, number, the_fleet
 from scenarios.cli.terminal import out_console, say
 
 REPLY_S = 5.0
@@ -24,11 +24,11 @@ def ask_command(
     file: Annotated[str, typer.Argument(help=JOBS_HELP)] = "",
     kind: Annotated[str, typer.Option(help="One job instead of a file: pick_place, hold, press, sort.")] = "",
     place: Annotated[list[str] | None, typer.Option(help="Place of the cell; twice for pick_place and sort.")] = None,
-    payload: Annotated[float, typer.Option(help="Payload, kg.")] = 0.0,
-    repetitions: Annotated[int, typer.Option(help="Number of cycles.")] = 1,
-    dwell: Annotated[float, typer.Option(help="Duration of one repetition of a hold or press, s.")] = DWELL_S,
-    force: Annotated[float, typer.Option(help="Force of a press, N.")] = 0.0,
-    timeout: Annotated[float, typer.Option(help="Real seconds to wait for arms.")] = REPLY_S,
+    payload: Annotated[float, number("Payload, kg.", 0, 100)] = 0.0,
+    repetitions: Annotated[int, number("Number of cycles.", 1, 1_000_000)] = 1,
+    dwell: Annotated[float, number("Duration of one repetition of a hold or press, s.", 0, 86_400)] = DWELL_S,
+    force: Annotated[float, number("Force of a press, N.", 0, 1000)] = 0.0,
+    timeout: Annotated[float, number("Real seconds to wait for arms.", 0, 600, above=True)] = REPLY_S,
     as_json: Annotated[bool, typer.Option("--json", help="Print the quotes as JSON.")] = False,
     endpoint: EndpointOption = ENDPOINT,
     fleet: FleetOption = "",
@@ -36,7 +36,7 @@ def ask_command(
     """Request quotes of all arms: difficulty, P(saturation), peak temperature, finish, or the reason of infeasibility.
 
     The duration of a job includes the ways to its place and home. It is finished after its last cycle, once the arm's
-    present jobs are done.
+    present jobs are done. Exit code 1: there is a job that no arm can do.
     """
     if bool(file) == bool(kind):
         raise FleetError("Give either a FILE of jobs or one job by --kind and --place.")
@@ -56,6 +56,9 @@ def ask_command(
         out_console.print(quote_table(jobs, quotes))
     for reason in answers.refused.values():
         say(f"Refused: {reason}" if reason else f"An arm did not reply within {timeout:g} s.")
+    feasible = {estimate.job for quote in quotes.values() for estimate in quote.estimates if estimate.feasible}
+    if not feasible.issuperset(job.name for job in jobs):
+        raise typer.Exit(1)
 
 
 def one_job(

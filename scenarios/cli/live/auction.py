@@ -26,7 +26,7 @@ from scenarios.cli.live.options import (
     SeedOption,
     SpeedOption,
 )
-from scenarios.cli.options import ENDPOINT, EndpointOption, PolicyOption, ScenarioArg
+from scenarios.cli.options import ENDPOINT, EndpointOption, PolicyOption, ScenarioArg, check_name
 from scenarios.cli.signals import Stop, until_stopped
 from scenarios.job_stream import draw_jobs
 from scenarios.live.allocation import central_allocation
@@ -43,7 +43,9 @@ FAREWELL_S = (1.0, 10.0)
 
 def auction_command(
     scenario: ScenarioArg,
-    name: Annotated[str, typer.Option(help="Name of the auctioneer; part of its keys.")] = "auctioneer",
+    name: Annotated[
+        str, typer.Option(help="Name of the auctioneer; part of its keys.", callback=check_name)
+    ] = "auctioneer",
     policy: PolicyOption = "matching",
     speed: SpeedOption = 1.0,
     journal: JournalOption = None,

@@ -19,8 +19,7 @@ from fleet.errors import BusError
 from fleet.live.monitor.health import ClockProbe, HealthReport, check_health
 from fleet.live.monitor.listener import FleetListener
 from fleet.live.monitor.snapshot import FleetSnapshot
-from scenarios.cli.live.options import number
-from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption
+from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, number
 from scenarios.cli.terminal import out_console, say
 from scenarios.live.watch_screen import arm_table, format_time, jobs_line
 from scenarios.load import load
@@ -34,14 +33,22 @@ _COLORS = {"fault": "red", "warning": "yellow"}
 def doctor_command(
     endpoint: EndpointOption = ENDPOINT,
     fleet: FleetOption = "",
-    seconds: Annotated[float, number("Real seconds to listen.", high=600, above=True)] = 3.0,
-    auctioneer: Annotated[bool, typer.Option(help="Whether the fleet should have an auctioneer.")] = True,
+    seconds: Annotated[float, number("Real seconds to listen.", 0, 600, above=True)] = 3.0,
+    auctioneer: Annotated[
+        bool, typer.Option(help="The fleet should have one; --no-auctioneer: it should have none.")
+    ] = True,
     scenario: Annotated[
-        str, typer.Option(help="Expect every arm of this scenario. Default: only arms that publish anything.")
+        str,
+        typer.Option(
+            help="Every arm of this scenario should be present. Default: only the arms that are found are checked."
+        ),
     ] = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
-    """Check the health of a fleet: exit code 0 healthy, 1 unhealthy, 2 unreachable."""
+    """Check the health of a fleet: whether its arms and its auctioneer are present, and their clocks agree.
+
+    Exit code 0: healthy; 1: a fault was found, or no fleet; 2: the router cannot be reached.
+    """
     expected = tuple(arm.name for arm in load(scenario).arms) if scenario else ()
     try:
         fleets = fleets_at(endpoint)

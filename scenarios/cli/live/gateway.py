@@ -17,8 +17,7 @@ from starlette.applications import Starlette
 from fleet.bus.client.client import BusClient
 from fleet.errors import FleetError
 from fleet.live.monitor.async_bridge import AsyncBridge
-from scenarios.cli.live.options import number
-from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
+from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, number, the_fleet
 from scenarios.cli.terminal import Interrupted
 from scenarios.live.http_app import STUCK_S, Readers, application
 

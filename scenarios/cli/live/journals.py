@@ -4,13 +4,21 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from fleet.errors import FleetError
+from scenarios.result_folder import disk_errors
 from scenarios.schema import Scenario
 
 
 def folder_of(folder: Path | None, fleet: str, scenario: Scenario) -> tuple[str, Path]:
-    """Name of the fleet, and its folder: the given ones or the default ones."""
+    """Name of the fleet, and its folder, which is created: the given ones or the default ones.
+
+    Raises:
+        FleetError: the folder cannot be created.
+    """
     name = fleet or scenario.name
-    return name, folder or Path("runs") / f"live-{name}"
+    where = folder or Path("runs") / f"live-{name}"
+    with disk_errors(where):
+        where.mkdir(parents=True, exist_ok=True)
+    return name, where
 
 
 def refuse_other_way(folder: Path, arms: Iterable[str], *, alone: bool) -> None:

@@ -15,8 +15,8 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, Result
 from fleet.bus.protocol.messages import State
 from fleet.errors import FleetError
-from scenarios.cli.live.options import number
-from scenarios.cli.options import ENDPOINT, EndpointOption
+from scenarios.cli.live.options import MAX_SPEED
+from scenarios.cli.options import ENDPOINT, EndpointOption, check_name, number
 from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import out_console, say
 from scenarios.live.recorder import Recorder
@@ -68,10 +68,12 @@ def lock_folder(folder: Path) -> Iterator[None]:
 
 
 def record_command(
-    fleet: Annotated[str, typer.Argument(help="Name of the fleet; `up` uses the name of the scenario.")],
+    fleet: Annotated[
+        str, typer.Argument(help="Name of the fleet; `up` uses the name of the scenario.", callback=check_name)
+    ],
     out: Annotated[Path, typer.Option(help="Folder of the recording; an interrupted one is continued.")],
     endpoint: EndpointOption = ENDPOINT,
-    rotate: Annotated[float, number("Real seconds between two parts.", above=True)] = 60.0,
+    rotate: Annotated[float, number("Real seconds between two parts.", 0.1, 86_400)] = 60.0,
 ) -> None:
     """Record what arms and auctioneer publish, as Parquet parts that are readable at once."""
     with until_stopped() as stop, BusClient(endpoint, fleet, backlog=BACKLOG) as link:
@@ -87,7 +89,7 @@ def replay_command(
     path: Annotated[Path, typer.Argument(help="Folder of a run or of a recording.")],
     endpoint: EndpointOption = ENDPOINT,
     fleet: Annotated[str | None, typer.Option(help="Name of the fleet. Default: that of the recording.")] = None,
-    speed: Annotated[float, number("Recorded seconds per real second.", above=True)] = 1.0,
+    speed: Annotated[float, number("Recorded seconds per real second.", 0, MAX_SPEED, above=True)] = 1.0,
 ) -> None:
     """Publish a run or a recording on the bus, in real time or at --speed."""
     replay = Replay.of(path)

@@ -17,9 +17,9 @@ from scenarios.cli.live.options import (
     ScenarioFleetOption,
     SeedOption,
     SpeedOption,
-    number,
 )
-from scenarios.cli.options import PolicyOption, ScenarioArg
+from scenarios.cli.options import PolicyOption, ScenarioArg, number
+from scenarios.cli.router import PORT, check_roster
 from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import err_console, out_console, progress_bar, say
 from scenarios.load import load
@@ -27,8 +27,6 @@ from scenarios.policy_loader import scope_of
 
 START_S = 60.0
 """Real seconds until a participant must be ready: an arm loads its twin."""
-PORT = 7447
-"""Default port of the router in all commands."""
 PROGRAM = (sys.executable, "-c", "from scenarios.cli.main import main; main()")
 
 
@@ -113,6 +111,8 @@ def up_command(
     if tls is not None and fleet != chosen.name:
         raise FleetError(f"The keys of --tls are for the fleet of their scenario; leave --fleet out (got '{fleet}').")
     names = tuple(arm.name for arm in chosen.arms)
+    if tls is not None:
+        check_roster(tls, scenario)
     refuse_other_way(folder / "journals", names, alone=scope_of(policy) == "arm")
     with progress_bar() as progress:  # once, so that no arm has to plan or train by itself
         prepare(chosen, difficulty=difficulty, progress=progress)
