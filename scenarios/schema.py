@@ -8,7 +8,7 @@ import numpy as np
 from fleet.arrivals import Arrivals, Batch, Poisson, Trace
 from fleet.engine.reward import RewardWeights
 from fleet.errors import FleetError, check_nonnegative, check_positive, nearest
-from fleet.job import DWELL_S, Kind, Place
+from fleet.job import DWELL_S, Fixture, Kind, Place
 from fleet.robot import Cooling, Mount, Robot, ThermalLimits
 
 LONGEST_DWELL_S = 3600.0
@@ -17,6 +17,7 @@ MOST_REPETITIONS = 100_000
 MOST_SAMPLES = 1_000_000
 """Telemetry samples of an arm in a shift: eleven days at one per second."""
 MOST_SLOTS = 256
+MOST_FIXTURES = 64
 MOST_EXPLORATION = 10_000
 
 
@@ -213,6 +214,7 @@ class Scenario:
     arms: tuple[ArmSpec, ...]
     places: tuple[Place, ...]
     jobs: tuple[JobStream, ...]
+    fixtures: tuple[Fixture, ...] = ()
     decision_interval_s: float = 10.0
     slots: int = 8
     start: Literal["idle_warm", "cold"] = "idle_warm"
@@ -233,6 +235,8 @@ class Scenario:
             )
         if not 1 <= self.slots <= MOST_SLOTS:
             raise ValueError(f"Scenario.slots must be between 1 and {MOST_SLOTS} (got {self.slots})")
+        if len(self.fixtures) > MOST_FIXTURES:
+            raise ValueError(f"Scenario.fixtures must be at most {MOST_FIXTURES} (got {len(self.fixtures)})")
         if self.horizon_s / self.telemetry_interval_s > MOST_SAMPLES:
             raise ValueError(
                 f"Scenario.horizon_s must be at most {MOST_SAMPLES} times telemetry_interval_s "

@@ -28,7 +28,7 @@ from scenarios.cell_layout import cell_of, near_of
 from scenarios.extras import require_extra
 from scenarios.job_stream import JobSampler, all_works, rehearsal_works, works_of
 from scenarios.load import load, override
-from scenarios.prepare.planned_arm import PlannedArm, plan_arms
+from scenarios.prepare.planned_arm import PlannedArm, check_homes, plan_arms
 from scenarios.progress import Progress, quiet
 from scenarios.schema import Scenario
 from scenarios.schema_errors import choose
@@ -104,6 +104,7 @@ def _arms(
         require_extra("twin")
     if not isinstance(cache, str | Path | None):
         raise ScenarioError(f"cache must be the path of a folder (got {cache!r}).")
+    check_homes(scenario)
     folder = Path(cache) if cache else cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)

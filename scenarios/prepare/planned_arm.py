@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleet.errors import InfeasibleJob
+from fleet.errors import InfeasibleJob, ScenarioError
 from fleet.job import Work
 from fleet.motion import Plan
 from fleet.motor import Motors, gen3_motors
@@ -64,7 +64,32 @@ def hardware_of(scenario: Scenario, index: int) -> ArmHardware:
 def planner_of(robot: Robot, scenario: Scenario, folder: Path) -> CachedPlanner:
     """A planner with the scenario's settings; it caches plans in `folder`."""
     spec = scenario.planning
-    return CachedPlanner(robot, elbows=spec.elbows, speeds=spec.speeds, cache_dir=folder / "plans")
+    return CachedPlanner(
+        robot, scenario.fixtures, elbows=spec.elbows, speeds=spec.speeds, cache_dir=folder / "plans"
+    )
+
+
+def check_homes(scenario: Scenario) -> None:
+    """Check that no arm stands or waits inside a fixture.
+
+    Raises:
+        ScenarioError: names all arms that do, with fixture and depth.
+    """
+    if not scenario.fixtures:
+        return
+    from fleet.physics.models import ArmModel  # both import MuJoCo
+    from fleet.planning.collision import CollisionChecker
+
+    inside = []
+    for i, spec in enumerate(scenario.arms):
+        robot = spec.robot()
+        collision = CollisionChecker(ArmModel(robot, scenario.fixtures)).first_collision(robot.home_q()[None])
+        if collision:
+            inside.append(f"arms[{i}] '{robot.name}': {collision}")
+    if inside:
+        raise ScenarioError(
+            f"{scenario.name}.toml: at home {'; '.join(inside)}. Move the arm or the fixture, or choose another home."
+        )
 
 
 def plan_arms(
