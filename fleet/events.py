@@ -15,11 +15,13 @@ EventKind = Literal[
     "fault",
     "return",
     "recover",
+    "contact",
 ]
 EVENT_KINDS: tuple[str, ...] = get_args(EventKind)
 """release: job may be claimed; award: claim won; lost: claim lost; illegal: claim not allowed, counted as a wait;
 torque_warning: the awarded plan exceeds the torque warning; finish: last cycle done; home: arm free again;
-warning, fault: motor limit passed; return: job back in the queue; recover: fault cleared."""
+warning, fault: motor limit passed; return: job back in the queue; recover: fault cleared; contact: a link or payload
+of an arm is inside another arm, the floor or a fixture (the plant `mujoco` looks for it)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,5 +36,6 @@ class Event:
     joint: int = 0
     """Motor 1..7; 0 if the event has none."""
     value: float = float("nan")
-    """Quantity of the kind: temperature °C, torque N·m, difficulty of an award, cycles kept of a return."""
+    """Quantity of the kind: temperature °C, torque N·m, difficulty of an award, cycles kept of a return, depth of a
+    contact in mm."""
     reason: str = ""

@@ -47,26 +47,27 @@ class CollisionChecker:
             self._pairs += [(label, g, "base", geoms["base"], -ALLOWED_DEPTH_M)] * bool(own)
         self._ball = payload_bodies(model, [arm.robot])
 
-    def first_collision(self, q: Array, payload_kg: float = 0.0) -> str | None:
-        """Description of the first collision among the postures [posture, joint]; None if there is none."""
+    def deepest_collision(self, q: Array, payload_kg: float = 0.0) -> str | None:
+        """Description of the deepest collision among the postures [posture, joint]; None if there is none."""
         model, data = self._arm.model, self._arm.data
         set_payload_balls(model, self._ball, np.array([payload_kg]))
         pairs = [pair for pair in self._pairs if pair[2] != "payload" or payload_kg > 0]
+        missing_m, deepest = 0.0, None
         for posture in q:
             data.qpos[:] = posture
             mujoco.mj_kinematics(model, data)
             for obstacle, a, link, b, least_m in pairs:
                 distance_m = mujoco.mj_geomDistance(model, data, a, b, FAR_M, None)
-                if distance_m < min(least_m, 0.0):
-                    return f"{link} would be {-distance_m * 1e3:.0f} mm inside the {obstacle}"
-                if distance_m < least_m:
-                    return (
-                        f"{link} would be {distance_m * 1e3:.1f} mm from the {obstacle}; at least {least_m * 1e3:g} mm "
-                        "are needed"
+                if least_m - distance_m > missing_m:
+                    missing_m = least_m - distance_m
+                    deepest = (
+                        f"{link} would be {-distance_m * 1e3:.0f} mm inside the {obstacle}"
+                        if distance_m < -5e-4
+                        else f"{link} would be {distance_m * 1e3:.1f} mm from the {obstacle}, less than {least_m * 1e3:g}"
                     )
-        return None
+        return deepest
 
     def on_path(self, start: Array, end: Array, payload_kg: float = 0.0) -> str | None:
         """Reason why the straight path in joint space between two postures collides; None if it is clear."""
-        collision = self.first_collision(straight_line(start, end, CHECK_STEP_RAD), payload_kg)
+        collision = self.deepest_collision(straight_line(start, end, CHECK_STEP_RAD), payload_kg)
         return collision and f"collision: {collision} on the way"

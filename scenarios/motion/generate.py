@@ -175,7 +175,7 @@ def _verified(
     plan = planned(made, source, model)
     every = round(CLEARANCE_STEP_S * RATE_HZ)
     postures = np.concatenate([phase.profile[::every, 0] for phase in plan.phases]).astype(float)
-    if clearance.first_collision(postures):
+    if clearance.deepest_collision(postures):
         raise _Rejected("collision")
     allowed_c = asked.cool_c - asked.margin_k
     if asked.peak_c(plan).max() > allowed_c:

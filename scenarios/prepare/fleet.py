@@ -200,7 +200,7 @@ class ShiftFactory:
         if self.plant == "mujoco":
             from fleet.physics.mujoco_plant import MujocoPlant
 
-            plant = MujocoPlant(robots, plans, rest_tau, scenario.places)
+            plant = MujocoPlant(robots, plans, rest_tau, scenario.places, scenario.fixtures)
         else:
             plant = ProfilePlant(plans, np.stack([robot.home_q() for robot in robots]), rest_tau)
         twins = tuple(arm.model.version for arm in arms)

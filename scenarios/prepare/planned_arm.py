@@ -64,9 +64,7 @@ def hardware_of(scenario: Scenario, index: int) -> ArmHardware:
 def planner_of(robot: Robot, scenario: Scenario, folder: Path) -> CachedPlanner:
     """A planner with the scenario's settings; it caches plans in `folder`."""
     spec = scenario.planning
-    return CachedPlanner(
-        robot, scenario.fixtures, elbows=spec.elbows, speeds=spec.speeds, cache_dir=folder / "plans"
-    )
+    return CachedPlanner(robot, scenario.fixtures, elbows=spec.elbows, speeds=spec.speeds, cache_dir=folder / "plans")
 
 
 def check_homes(scenario: Scenario) -> None:
@@ -83,7 +81,7 @@ def check_homes(scenario: Scenario) -> None:
     inside = []
     for i, spec in enumerate(scenario.arms):
         robot = spec.robot()
-        collision = CollisionChecker(ArmModel(robot, scenario.fixtures)).first_collision(robot.home_q()[None])
+        collision = CollisionChecker(ArmModel(robot, scenario.fixtures)).deepest_collision(robot.home_q()[None])
         if collision:
             inside.append(f"arms[{i}] '{robot.name}': {collision}")
     if inside:
