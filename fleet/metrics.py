@@ -25,6 +25,8 @@ class Metrics:
     """Time at which the last job was finished."""
     jobs_per_hour: float
     faults: int
+    contacts: int | None
+    """Of arms and payloads with other arms, the floor or fixtures; None if the plant does not look for them."""
     above_warning_min: float
     """Sum over arms of the time with a motor above the warning limit."""
     peak_c: dict[str, float]

@@ -18,6 +18,7 @@ GAP_M = 0.002
 checked postures."""
 CHECK_STEP_RAD = 0.02
 """Largest joint step between two checked postures of a path: 18 mm at the end of an outstretched arm."""
+HALF_MM = 5e-4
 FAR_M = 0.5
 """Largest distance that is measured."""
 _BASE_LINKS = ("forearm", "wrist_1", "wrist_2", "bracelet")
@@ -60,11 +61,11 @@ class CollisionChecker:
                 distance_m = mujoco.mj_geomDistance(model, data, a, b, FAR_M, None)
                 if least_m - distance_m > missing_m:
                     missing_m = least_m - distance_m
-                    deepest = (
-                        f"{link} would be {-distance_m * 1e3:.0f} mm inside the {obstacle}"
-                        if distance_m < -5e-4
-                        else f"{link} would be {distance_m * 1e3:.1f} mm from the {obstacle}, less than {least_m * 1e3:g}"
-                    )
+                    if distance_m < -HALF_MM:
+                        deepest = f"{link} would be {-distance_m * 1e3:.0f} mm inside the {obstacle}"
+                    else:
+                        close = f"{max(0.0, distance_m) * 1e3:.1f} mm from the {obstacle}"
+                        deepest = f"{link} would be {close}, less than {least_m * 1e3:g}"
         return deepest
 
     def on_path(self, start: Array, end: Array, payload_kg: float = 0.0) -> str | None:

@@ -59,8 +59,7 @@ class TaskPhases:
         paths: dict[tuple[Stop | None, Stop | None], bool] = {}
         here: Stop | None = None
         for segment in (*self.approach, *self.cycle, *self.retreat):
-            path = (here, segment.to)
-            path = path[::-1] if path[::-1] in paths else path
+            path = (segment.to, here) if (segment.to, here) in paths else (here, segment.to)
             if segment.carries or segment.to != here:
                 paths[path] = paths.get(path, False) or segment.carries
             here = segment.to

@@ -8,6 +8,7 @@ import numpy as np
 
 from fleet.engine.shift import open_jobs
 from fleet.engine.state import DONE, WAITING, State, World
+from fleet.job import Fixture
 from fleet.robot import Mount
 from fleet.telemetry import WORKING
 from fleet.thermal import WINDING
@@ -23,7 +24,7 @@ LEVEL_DEG = 10.0
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """Positions of arms and stations; hashable."""
+    """Positions of arms, stations and fixtures; hashable."""
 
     arms: tuple[str, ...]
     mounts_m: tuple[Point, ...]
@@ -32,6 +33,7 @@ class Cell:
     """What each arm is fixed to."""
     stations: tuple[tuple[str, Point], ...]
     """Name and tool point of each station."""
+    fixtures: tuple[Fixture, ...] = ()
 
     def __post_init__(self) -> None:
         if not len(self.arms) == len(self.mounts_m) == len(self.kinds):
