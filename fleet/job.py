@@ -18,8 +18,8 @@ PAYLOAD_KG_PER_M3 = 2700.0
 """A payload counts as a ball of this density, aluminium's, that hangs from the flange."""
 MOST_PAYLOAD_M = 0.1
 """Largest radius of such a ball."""
-MOST_FIXTURE_M = 10.0
-"""Largest length of a fixture."""
+LEAST_FIXTURE_M, MOST_FIXTURE_M = 0.001, 10.0
+"""Smallest and largest length of a fixture."""
 FARTHEST_M = 100.0
 """Largest coordinate of a fixture."""
 
@@ -62,9 +62,10 @@ class Fixture:
     def __post_init__(self) -> None:
         if not self.name:
             raise ValueError("Fixture.name must not be empty.")
-        if not all(0 < length <= MOST_FIXTURE_M for length in self.size_m):
+        if not all(LEAST_FIXTURE_M <= length <= MOST_FIXTURE_M for length in self.size_m):
             raise ValueError(
-                f"Fixture.size_m must be three lengths > 0 and at most {MOST_FIXTURE_M:g} m (got {list(self.size_m)})."
+                f"Fixture.size_m must be three lengths between {LEAST_FIXTURE_M:g} and {MOST_FIXTURE_M:g} m "
+                f"(got {list(self.size_m)})."
             )
         if not all(abs(x) <= FARTHEST_M for x in self.position_m):
             raise ValueError(

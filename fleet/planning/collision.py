@@ -65,7 +65,7 @@ class CollisionChecker:
                         deepest = f"{link} would be {-distance_m * 1e3:.0f} mm inside the {obstacle}"
                     else:
                         close = f"{max(0.0, distance_m) * 1e3:.1f} mm from the {obstacle}"
-                        deepest = f"{link} would be {close}, less than {least_m * 1e3:g}"
+                        deepest = f"{link} would be {close}, less than {least_m * 1e3:g} mm"
         return deepest
 
     def on_path(self, start: Array, end: Array, payload_kg: float = 0.0) -> str | None:
