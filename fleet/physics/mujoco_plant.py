@@ -149,7 +149,8 @@ class MujocoPlant:
         """
         offsets_s = np.arange(1, len(self._motion) + 1) * (STRIDE * self.model.opt.timestep)
         q = self.motion(world, record, offsets_s)[0, :, :, 0]
-        dropped = (record.mode[0] == FAULTED) | (offsets_s[:, None] >= record.cut_s[0])
+        cut_s = record.cut_s[0]
+        dropped = (record.mode[0] == FAULTED) | ((offsets_s[:, None] >= cut_s) & (cut_s < world.dt_s))
         time_s = self._tick * world.dt_s + offsets_s
         return self._contacts.events(time_s, q, np.where(dropped, 0.0, self._carried_kg))
 
