@@ -4,7 +4,8 @@
 
 The plant is driven through ticks of the quickstart scenario in which its arms work: references, control, payload
 changes, simulation and heat. Bare is MuJoCo's own loop (`mj_step(model, data, nstep)`) with the same model and number
-of steps and the arms held at home; contacts are disabled in both. The two alternate on one core; speeds are medians.
+of steps and the arms held at home. `no contacts` is the plant with contacts disabled; `reported` is the plant that also
+reports contacts. All alternate on one core; speeds are medians.
 """
 
 # MuJoCo is compiled and ships no type stubs.
@@ -23,6 +24,7 @@ import mujoco
 import numpy as np
 
 from agents.registry import make_policy
+from fleet.engine.shift import StepRecord
 from fleet.engine.state import State
 from fleet.physics.mujoco_plant import MujocoPlant
 from scenarios.load import load
@@ -32,18 +34,18 @@ TICKS = 20
 RUNS = 9
 
 
-def at_work(factory: ShiftFactory) -> list[State]:
-    """States in the first steps of a shift with the profile plant."""
-    states: list[State] = []
+def at_work(factory: ShiftFactory) -> tuple[list[State], list[StepRecord]]:
+    """States and records of the first steps of a shift with the profile plant."""
+    states, records = list[State](), list[StepRecord]()
     policy = make_policy("round_robin")
     policy.reset(np.random.default_rng(0))
-    env = env_of(factory.fleet, max_cycles=TICKS)
+    env = env_of(factory.fleet, max_cycles=TICKS, watch=records.append)
     env.reset(seed=0)
     while env.agents:
         states.append(env.truth)
         env.step(policy.act(env.knowledge()))
     env.close()
-    return states
+    return states, records
 
 
 def seconds(call: Callable[[], object]) -> float:
@@ -62,7 +64,7 @@ def measure(arms: int) -> str:
         for s in base.jobs
     )
     fleet = prepare(replace(base, arms=base.arms[:arms], jobs=jobs, horizon_s=TICKS * 10.0), difficulty="blind")
-    states = at_work(ShiftFactory(fleet))
+    states, records = at_work(ShiftFactory(fleet))
     episode = ShiftFactory(fleet, "mujoco")(np.random.SeedSequence(0))
     plant, world = episode.plant, episode.world
     assert isinstance(plant, MujocoPlant)
@@ -73,21 +75,31 @@ def measure(arms: int) -> str:
         for state in states:
             plant.drive(world, state)
 
-    speeds = [
-        (count / seconds(lambda: mujoco.mj_step(plant.model, held, count)), count / seconds(driven))
-        for _ in range(RUNS)
-    ]
-    bare, ours = (statistics.median(column) for column in zip(*speeds, strict=True))
-    ratio = statistics.median(b / a for a, b in speeds)
+    def reported() -> None:
+        for state, record in zip(states, records, strict=True):
+            plant.drive(world, state)
+            plant.contacts(world, record)
+
+    def without() -> None:
+        plant.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        driven()
+        plant.model.opt.disableflags ^= mujoco.mjtDisableBit.mjDSBL_CONTACT
+
+    calls = (lambda: mujoco.mj_step(plant.model, held, count), without, driven, reported)
+    speeds = [[count / seconds(call) for call in calls] for _ in range(RUNS)]
+    bare, no_contacts, ours, with_report = (statistics.median(column) for column in zip(*speeds, strict=True))
+    ratio = statistics.median(row[2] / row[0] for row in speeds)
     busy = np.mean([state.mode[0] == 1 for state in states])
     real_time = ours * plant.model.opt.timestep
-    return f"{arms:>5}{busy:>8.0%}{bare:>16,.0f}{ours:>16,.0f}{ratio:>9.2f}{real_time:>13,.0f} x"
+    speeds_text = "".join(f"{speed:>16,.0f}" for speed in (bare, no_contacts, ours, with_report))
+    return f"{arms:>5}{busy:>8.0%}{speeds_text}{ratio:>9.2f}{real_time:>13,.0f} x"
 
 
 def main() -> None:
     """Print the table."""
-    print(f"{RUNS} runs of {TICKS} ticks; median steps/s of CPU time")
-    print(f"{'arms':>5}{'busy':>8}{'bare mj_step/s':>16}{'plant steps/s':>16}{'ratio':>9}{'real time':>15}")
+    print(f"{RUNS} runs of {TICKS} ticks; median steps/s of CPU time; ratio: plant over bare")
+    heads = "".join(f"{head:>16}" for head in ("bare mj_step", "no contacts", "plant", "reported"))
+    print(f"{'arms':>5}{'busy':>8}{heads}{'ratio':>9}{'real time':>15}")
     for arms in (2, 4):
         print(measure(arms), flush=True)
 

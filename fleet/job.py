@@ -1,8 +1,9 @@
-"""Places of the cell, works that arms do at them, and jobs that request works."""
+"""Places and fixtures of the cell, works that arms do at the places, and jobs that request works."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import pi
 from typing import Literal, get_args
 
 import networkx as nx
@@ -13,6 +14,14 @@ Kind = Literal["pick_place", "hold", "press", "sort"]
 KINDS: tuple[str, ...] = get_args(Kind)
 DWELL_S = 0.5
 """Default of `dwell_s` in scenarios and on the bus: time to close or open the hand."""
+PAYLOAD_KG_PER_M3 = 2700.0
+"""A payload counts as a ball of this density, aluminium's, that hangs from the flange."""
+MOST_PAYLOAD_M = 0.1
+"""Largest radius of such a ball."""
+LEAST_FIXTURE_M, MOST_FIXTURE_M = 0.001, 10.0
+"""Smallest and largest length of a fixture."""
+FARTHEST_M = 100.0
+"""Largest coordinate of a fixture."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +41,44 @@ class Place:
         if not self.name:
             raise ValueError("Place.name must not be empty.")
         check_nonnegative(self, "retreat_m")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fixture:
+    """A solid box that stands in the cell, for example a table, an oven or a conveyor.
+
+    No link of an arm and no payload may touch it. At a place above a table the tool point must therefore be higher
+    than the table by the diameter of the heaviest payload, see `payload_radius_m`.
+    """
+
+    name: str
+    position_m: tuple[float, float, float]
+    """Centre in the world, m."""
+    size_m: tuple[float, float, float]
+    """Full lengths along the box's own x, y and z axes, m."""
+    tilt_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Roll, pitch, yaw about the fixed world axes x, y, z, deg."""
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise ValueError("Fixture.name must not be empty.")
+        if not all(LEAST_FIXTURE_M <= length <= MOST_FIXTURE_M for length in self.size_m):
+            raise ValueError(
+                f"Fixture.size_m must be three lengths between {LEAST_FIXTURE_M:g} and {MOST_FIXTURE_M:g} m "
+                f"(got {list(self.size_m)})."
+            )
+        if not all(abs(x) <= FARTHEST_M for x in self.position_m):
+            raise ValueError(
+                f"Fixture.position_m must be between -{FARTHEST_M:g} and {FARTHEST_M:g} m "
+                f"(got {list(self.position_m)})."
+            )
+        if not all(abs(angle) <= 360 for angle in self.tilt_deg):
+            raise ValueError(f"Fixture.tilt_deg must be between -360 and 360 (got {list(self.tilt_deg)}).")
+
+
+def payload_radius_m(payload_kg: float) -> float:
+    """Radius of the ball that a payload counts as, m."""
+    return min(MOST_PAYLOAD_M, (3.0 * max(payload_kg, 0.0) / (4.0 * pi * PAYLOAD_KG_PER_M3)) ** (1 / 3))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -29,6 +29,8 @@ class Metrics:
     faults: int
     moved_home: int
     """How often a person moved a faulted arm home."""
+    contacts: int | None
+    """Of arms and payloads with other arms, the floor or fixtures; None if the plant does not look for them."""
     above_warning_min: float
     """Sum over arms of the time with a motor above the warning limit."""
     peak_c: dict[str, float]

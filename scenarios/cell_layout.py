@@ -1,4 +1,4 @@
-"""Positions of a scenario's arms and stations."""
+"""Positions of a scenario's arms, stations and fixtures."""
 
 import numpy as np
 
@@ -8,13 +8,14 @@ from scenarios.schema import Scenario
 
 
 def cell_of(scenario: Scenario) -> Cell:
-    """The cell of a scenario, with arms and places in the order of the scenario."""
+    """The cell of a scenario, with arms, places and fixtures in the order of the scenario."""
     robots = [arm.robot() for arm in scenario.arms]
     return Cell(
         arms=tuple(robot.name for robot in robots),
         mounts_m=tuple(robot.mount.position_m for robot in robots),
         kinds=tuple(mount_kind(robot.mount) for robot in robots),
         stations=tuple((place.name, place.position_m) for place in scenario.places),
+        fixtures=scenario.fixtures,
     )
 
 

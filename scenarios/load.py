@@ -101,7 +101,7 @@ def _check(scenario: Scenario, path: Path) -> None:
         raise ScenarioError(f"{file}: arms: there are no arms; give at least one [[arms]].")
     if not scenario.jobs:
         raise ScenarioError(f"{file}: jobs: there are no jobs; give at least one [[jobs]].")
-    for kind in ("arms", "places", "jobs"):
+    for kind in ("arms", "places", "jobs", "fixtures"):
         names = [item.name for item in getattr(scenario, kind)]
         for i, name in enumerate(names):
             if name in names[:i]:

@@ -9,7 +9,7 @@ from fleet.arrivals import Arrivals, Batch, Poisson, Trace
 from fleet.engine.reward import RewardWeights
 from fleet.env.validation import Decisions
 from fleet.errors import FleetError, check_nonnegative, check_positive, nearest
-from fleet.job import DWELL_S, Kind, Place
+from fleet.job import DWELL_S, Fixture, Kind, Place
 from fleet.robot import Cooling, Mount, Robot, ThermalLimits
 
 LONGEST_DWELL_S = 3600.0
@@ -19,6 +19,7 @@ MOST_SAMPLES = 1_000_000
 """Telemetry samples of an arm in a shift: eleven days at one per second."""
 MOST_SLOTS = 256
 MOST_CLEARANCE_M = 0.2
+MOST_FIXTURES = 64
 MOST_EXPLORATION = 10_000
 
 
@@ -215,6 +216,7 @@ class Scenario:
     arms: tuple[ArmSpec, ...]
     places: tuple[Place, ...]
     jobs: tuple[JobStream, ...]
+    fixtures: tuple[Fixture, ...] = ()
     decision_interval_s: float = 10.0
     decisions: Decisions = "interval"
     """Length of a step of the environment: one decision interval, or until an arm may claim a job."""
@@ -243,6 +245,8 @@ class Scenario:
             )
         if not 1 <= self.slots <= MOST_SLOTS:
             raise ValueError(f"Scenario.slots must be between 1 and {MOST_SLOTS} (got {self.slots})")
+        if len(self.fixtures) > MOST_FIXTURES:
+            raise ValueError(f"Scenario.fixtures must be at most {MOST_FIXTURES} (got {len(self.fixtures)})")
         if self.horizon_s / self.telemetry_interval_s > MOST_SAMPLES:
             raise ValueError(
                 f"Scenario.horizon_s must be at most {MOST_SAMPLES} times telemetry_interval_s "

@@ -217,6 +217,17 @@ def test_figures_at_the_head_come_from_the_metrics() -> None:
     assert "tardiness" not in words
 
 
+def test_contacts_are_shown_only_where_there_are_some() -> None:
+    reason = "forearm of arm_0 and the floor, 3.0 mm deep"
+    touch = Event(time_s=5.0, kind="contact", arm="arm_0", value=3.0, reason=reason)
+    hit, clear = (RUN | {"metrics": RUN["metrics"] | {"contacts": count}} for count in (2, 0))
+    text = own(page(hit, (*EVENTS, touch)))
+    assert '<div class="bad"><dt>contacts</dt><dd>2' in text
+    assert '<tr class="contact">' in text
+    assert reason in text
+    assert "<dt>contacts" not in own(page(clear))
+
+
 def test_a_long_log_is_cut_from_the_least_serious_end_and_says_by_how_much() -> None:
     lost = tuple(Event(time_s=float(t), kind="lost", arm="arm_1", job="hold-001") for t in range(1000))
     text = own(page(events=(*lost, *EVENTS)))

@@ -7,6 +7,7 @@ import numpy as np
 
 from fleet.engine.shift import StepRecord
 from fleet.engine.state import State, World
+from fleet.events import Event
 from fleet.motion import RATE_HZ, Drive, Plan
 from fleet.motor import current
 from fleet.robot import JOINTS
@@ -56,6 +57,10 @@ class ProfilePlant:
     def motion(self, world: World, record: StepRecord, offsets_s: Array) -> Array:
         """Joint motion at moments of steps, [step, sample, arm, channel, joint]."""
         return np.stack([self._motion(world, record, a, offsets_s) for a in range(len(world.arms))], axis=2)
+
+    def contacts(self, world: World, record: StepRecord) -> Sequence[Event]:
+        """None: the plans' motion is not checked for contacts."""
+        return ()
 
     def _motion(self, world: World, record: StepRecord, a: int, offsets_s: Array) -> Array:
         """Motion of one arm, [step, sample, channel, joint]."""

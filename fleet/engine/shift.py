@@ -1,6 +1,6 @@
 """One shift, step by step: the engine with one row, a plant, an exchange, an event log and a watcher."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Protocol
@@ -73,6 +73,10 @@ class Plant(Protocol):
         """
         ...
 
+    def contacts(self, world: World, record: StepRecord) -> Sequence[Event]:
+        """Contacts that began in a step; called for each step once, in order, and only if events are kept."""
+        ...
+
 
 @dataclass(frozen=True, eq=False)
 class Episode:
@@ -121,6 +125,7 @@ class ShiftRunner:
         world = episode.world
         self._episode, self._watch = episode, watch
         self._layout = layout or Layout(len(world.arms), world.slots, plans=world.plans_per_job)
+        self._reports_contacts = keep_events and not episode.plant.follows_plans
         at_once = exchange is None or (isinstance(exchange, MemoryExchange) and exchange.perfect)
         self._exchange = None if at_once else exchange
         self._delivered_before = 0
@@ -130,8 +135,9 @@ class ShiftRunner:
         self.events: list[Event] = []
         tables, drawn = tables_of(world)
         room = world.jobs.exists.shape[1]
+        trace = watch is not None or self._reports_contacts
         self._engine = Engine(
-            tables, 1, self._layout, weights, jobs=room, events=keep_events, trace=watch is not None, compiled=compiled
+            tables, 1, self._layout, weights, jobs=room, events=keep_events, trace=trace, compiled=compiled
         )
         self._engine.reset(_FIRST, shifts_of(drawn, [episode.noise_key]))
         self._vectors = np.empty((1, self._layout.arms, self._layout.size), np.float32)
@@ -188,6 +194,8 @@ class ShiftRunner:
         terms, reward, finished = _stepped(engine, world, plant, actions[None], self._vectors)
         if len(engine.events.what):
             self.events += events_of(world, engine.state, engine.events)
+        if self._reports_contacts:
+            self.events += plant.contacts(world, record_of(engine))
         if self._watch is not None:
             self._watch(record_of(engine))
         self._deliver()

@@ -283,7 +283,7 @@ def tables_of(world: World) -> tuple[Tables, Jobs]:
         risk_offset=risk_offset,
         risk_weight=risk_weight,
         risk_curve=risk_curve,
-        feasible=can.any(axis=-1).swapaxes(-1, -2),
+        feasible=np.any(can, axis=-1).swapaxes(-1, -2),
         stations=bits(_one_hot(jobs.stations, len(world.stations))),
         payload_kg=jobs.payload_kg,
         value=jobs.value,

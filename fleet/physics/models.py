@@ -9,7 +9,7 @@ from itertools import combinations
 import mujoco
 import numpy as np
 
-from fleet.job import Place
+from fleet.job import MOST_PAYLOAD_M, Fixture, Place, payload_radius_m
 from fleet.physics.gen3 import GRAVITY_M_S2, gen3_xml
 from fleet.physics.meshes import use_meshes
 from fleet.robot import GEN3, JOINTS, Robot, rotation
@@ -18,25 +18,35 @@ Array = np.ndarray
 
 SAME_PLACE_M = 0.01
 """Bases closer than this count as the same place."""
+BELOW_FLOOR_M = 0.005
+"""A base deeper than this below z = 0 means that the height of the cell's floor is unknown; nothing touches it then."""
 
 
 def build_cell(
-    robots: Sequence[Robot], places: Sequence[Place] = (), *, timestep_s: float = 0.002, meshes: bool = False
+    robots: Sequence[Robot],
+    places: Sequence[Place] = (),
+    fixtures: Sequence[Fixture] = (),
+    *,
+    timestep_s: float = 0.002,
+    meshes: bool = False,
 ) -> mujoco.MjModel:
-    """Model of all arms on their mounts above one floor, with the places as sites.
+    """Model of all arms on their mounts above one floor, with the places as sites and the fixtures as boxes.
 
     Names: all elements of an arm have the prefix `{robot.name}/` (`joint_1`..`joint_7` for joints and their
     position servos, sites `motor_1`..`motor_7` and `tool`, bodies `hand` and `payload`, camera `wrist`); a place is
-    the site `station/{place.name}`. Servos clip at `GEN3.torque_clip`. Collisions are disabled.
+    the site `station/{place.name}`, a fixture the geom `fixture/{fixture.name}`. Servos clip at `GEN3.torque_clip`.
+
+    Links and payloads collide with those of other arms, the floor and the fixtures, not within an arm. All hands are
+    empty; `set_payload_balls` gives them payloads.
 
     Args:
         meshes: Render Kinova's shells instead of primitives (optional package `mujoco-menagerie`).
 
     Raises:
-        ValueError: no arms, two arms or two places with one name, or two arms at the same place.
+        ValueError: no arms, two arms, places or fixtures with one name, or two arms at the same place.
         FleetError: the meshes are not available.
     """
-    _check(robots, places)
+    _check(robots, places, fixtures)
     spec = mujoco.MjSpec()
     spec.modelname = "cell"
     spec.option.timestep = timestep_s
@@ -50,9 +60,9 @@ def build_cell(
         type=mujoco.mjtGeom.mjGEOM_PLANE,
         size=(5.0, 5.0, 0.1),
         rgba=(0.30, 0.33, 0.36, 1.0),
-        contype=0,
-        conaffinity=0,
     )
+    if min(robot.mount.position_m[2] for robot in robots) < -BELOW_FLOOR_M:
+        spec.geom("floor").contype = spec.geom("floor").conaffinity = 0
     world.add_light(name="sun", pos=(0.0, 0.0, 4.0), dir=(0.0, 0.0, -1.0), type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     for robot in robots:
         mount = world.add_frame(pos=robot.mount.position_m, quat=_quat(robot.mount.rotation()))
@@ -65,15 +75,57 @@ def build_cell(
             size=(0.015, 0.015, 0.015),
             rgba=(0.95, 0.55, 0.10, 1.0),
         )
-    return spec.compile()
+    for fixture in fixtures:
+        world.add_geom(
+            name=f"fixture/{fixture.name}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=fixture.position_m,
+            quat=_quat(rotation(fixture.tilt_deg)),
+            size=[length / 2 for length in fixture.size_m],
+            rgba=(0.55, 0.50, 0.43, 1.0),
+        )
+    model = spec.compile()
+    set_payload_balls(model, payload_bodies(model, robots), np.zeros(len(robots)))
+    return model
+
+
+def payload_bodies(model: mujoco.MjModel, robots: Sequence[Robot]) -> Array:
+    """Ids of the payload bodies, int [arm]."""
+    return np.array([model.body(f"{robot.name}/payload").id for robot in robots])
+
+
+def links_of(model: mujoco.MjModel, arm: str) -> tuple[str, ...]:
+    """Names of the geoms of an arm's links, from base to camera; the payload is none of them."""
+    names = [model.geom(g).name for g in range(model.ngeom)]
+    own = [name.removeprefix(f"{arm}/") for name in names if name.startswith(f"{arm}/")]
+    return tuple(link for link in own if link != "payload" and not link.endswith("_mesh"))
+
+
+def set_payload_balls(model: mujoco.MjModel, bodies: Array, payload_kg: Array) -> None:
+    """Give the payloads in some hands the size of their mass; without mass there is none. Masses stay as they are.
+
+    Args:
+        bodies: Ids of payload bodies, int [arm].
+        payload_kg: [arm].
+    """
+    balls = model.body_geomadr[bodies]
+    radius_m = np.array([payload_radius_m(kg) for kg in payload_kg])
+    # Bounding boxes stay those of the largest ball; it has all smaller ones inside, as all touch the flange.
+    model.geom_size[balls, 0] = model.geom_rbound[balls] = np.maximum(radius_m, 1e-6)
+    model.geom_pos[balls, 2] = radius_m
+    model.geom_contype[balls] = model.geom_conaffinity[balls] = np.asarray(payload_kg) > 0
 
 
 class ArmModel:
-    """Rigid-body kinematics and dynamics of a single arm on its mount; torques include the reflected rotor inertia."""
+    """Rigid-body kinematics and dynamics of a single arm on its mount; torques include the reflected rotor inertia.
 
-    def __init__(self, robot: Robot) -> None:
+    Args:
+        fixtures: Boxes that stand in the cell; they matter for distances alone.
+    """
+
+    def __init__(self, robot: Robot, fixtures: Sequence[Fixture] = ()) -> None:
         self.robot = robot
-        self.model = build_cell([robot])
+        self.model = build_cell([robot], fixtures=fixtures)
         # Exclude motors, joint stops and contacts from the torque that a motion needs.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_ACTUATION
         self.data = mujoco.MjData(self.model)
@@ -133,10 +185,11 @@ class ArmModel:
         return tau
 
 
-def _check(robots: Sequence[Robot], places: Sequence[Place]) -> None:
+def _check(robots: Sequence[Robot], places: Sequence[Place], fixtures: Sequence[Fixture]) -> None:
     if not robots:
         raise ValueError("A cell needs at least one arm.")
-    for what, names in (("arms", [r.name for r in robots]), ("places", [p.name for p in places])):
+    for what, items in (("arms", robots), ("places", places), ("fixtures", fixtures)):
+        names = [item.name for item in items]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"Names of {what} must be unique; given more than once: {', '.join(twice)}.")
     for a, b in combinations(robots, 2):
@@ -151,6 +204,20 @@ def _arm_spec(robot: Robot, *, meshes: bool) -> mujoco.MjSpec:
     for actuator, clip in zip(spec.actuators, GEN3.torque_clip, strict=True):
         actuator.forcerange = (-clip, clip)
         actuator.forcelimited = True
+    for geom in spec.geoms:
+        geom.contype = geom.conaffinity = 1
+    spec.body("payload").add_geom(
+        name="payload",
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        size=(MOST_PAYLOAD_M, 0.0, 0.0),
+        pos=(0.0, 0.0, MOST_PAYLOAD_M),
+        rgba=(0.36, 0.52, 0.70, 1.0),
+        contype=1,
+        conaffinity=1,
+        mass=0.0,
+    )
+    for one, other in combinations([body.name for body in spec.bodies if body.name != "world"], 2):
+        spec.add_exclude(bodyname1=one, bodyname2=other)
     if meshes:
         use_meshes(spec)
     return spec

@@ -13,10 +13,12 @@ from mujoco import rollout
 from fleet.engine.shift import StepRecord
 from fleet.engine.state import State, World
 from fleet.errors import FleetError
-from fleet.job import Place
+from fleet.events import Event
+from fleet.job import Fixture, Place
 from fleet.motion import RATE_HZ, Drive, Plan
 from fleet.motor import friction_heat, reference_current
-from fleet.physics.models import build_cell
+from fleet.physics.contacts import ContactFinder
+from fleet.physics.models import build_cell, payload_bodies, set_payload_balls
 from fleet.physics.servo_control import Reference, control, reference, still
 from fleet.robot import JOINTS, Robot
 from fleet.telemetry import FAULTED, WORKING
@@ -41,6 +43,9 @@ class MujocoPlant:
     is braked in its posture, without current and with an empty hand, since its job returned to the queue. It recovers
     at home, where the operator who cleared the fault has jogged it.
 
+    Arms, payloads, floor and fixtures that meet push each other. Finish times do not change by it; `contacts` reports
+    it.
+
     Ticks must be driven in order, from tick 0.
 
     Args:
@@ -48,6 +53,7 @@ class MujocoPlant:
         plans: The plans of the rows of the world's plan table.
         rest_tau: Torque that holds the home postures, N·m, [arm, joint].
         places: Stations to show.
+        fixtures: Boxes in the cell.
         timestep_s: Simulation step; a whole multiple of `STRIDE` steps must make up a planned sample.
     """
 
@@ -60,6 +66,7 @@ class MujocoPlant:
         plans: Sequence[Plan],
         rest_tau: Array,
         places: Sequence[Place] = (),
+        fixtures: Sequence[Fixture] = (),
         *,
         timestep_s: float = TIMESTEP_S,
     ) -> None:
@@ -68,15 +75,14 @@ class MujocoPlant:
         if self._steps < STRIDE or self._steps % STRIDE or not np.isclose(self._steps * timestep_s * RATE_HZ, 1.0):
             allowed = ", ".join(f"{1e3 / RATE_HZ / n:g}" for n in (STRIDE, 2 * STRIDE, 4 * STRIDE))
             raise ValueError(f"MujocoPlant.timestep_s must be {allowed}, ... ms (got {timestep_s * 1e3:g} ms).")
-        self.model = build_cell(robots, places, timestep_s=timestep_s)
-        # No geom collides; without the search for contacts a step takes a tenth less.
-        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        self.model = build_cell(robots, places, fixtures, timestep_s=timestep_s)
         self.data = mujoco.MjData(self.model)
         self._scratch = mujoco.MjData(self.model)
         self._plans = tuple(plans)
         self._home_q = np.stack([robot.home_q() for robot in robots])
         self._home_tau = np.array(rest_tau, dtype=float)
-        self._payload = np.array([self.model.body(f"{robot.name}/payload").id for robot in robots])
+        self._payload = payload_bodies(self.model, robots)
+        self._contacts = ContactFinder(self.model, robots)
         self._kp: Array = self.model.actuator_gainprm[:, 0].copy()
         self._kv: Array = -self.model.actuator_biasprm[:, 2]
         self._clip: Array = self.model.actuator_forcerange[:, 1].copy()
@@ -94,6 +100,9 @@ class MujocoPlant:
         self._lost_s = np.zeros(arms)
         self._motion = np.zeros((0, arms, 3, JOINTS))
         """Motion in the last tick, [sample, arm, channel, joint]."""
+        self._carried_kg = np.zeros((0, arms))
+        """Payloads in the last tick, [sample, arm]."""
+        self._contacts.reset()
 
     def drive(self, world: World, state: State) -> Drive:
         """Simulate the coming step; return its mean heat drive from the servos' true torque, each [env, arm, joint].
@@ -131,6 +140,19 @@ class MujocoPlant:
         motion = self._motion[moments, np.arange(len(cut_s))]
         motion[braked, 1:] = 0.0
         return motion[None]
+
+    def contacts(self, world: World, record: StepRecord) -> list[Event]:
+        """Contacts that began in the step last driven; called for each step once, in order.
+
+        Raises:
+            ValueError: another step.
+        """
+        offsets_s = np.arange(1, len(self._motion) + 1) * (STRIDE * self.model.opt.timestep)
+        q = self.motion(world, record, offsets_s)[0, :, :, 0]
+        cut_s = record.cut_s[0]
+        dropped = (record.mode[0] == FAULTED) | ((offsets_s[:, None] >= cut_s) & (cut_s < world.dt_s))
+        time_s = self._tick * world.dt_s + offsets_s
+        return self._contacts.events(time_s, q, np.where(dropped, 0.0, self._carried_kg))
 
     def _samples(self, world: World) -> int:
         """Planned samples in a step."""
@@ -185,6 +207,7 @@ class MujocoPlant:
             part = slice(first * self._steps, last * self._steps)
             self._load(payload_kg[first])
             self._roll(ctrl[part], force_n[first], path[:, part])
+        self._carried_kg = np.repeat(payload_kg, self._steps // STRIDE, axis=0)
         self._motion = self._motion_of(ctrl, path[0])
 
     def _roll(self, ctrl: Array, force_n: Array, path: Array) -> None:
@@ -224,8 +247,9 @@ class MujocoPlant:
         return np.clip(row, 0, len(self._motion) - 1)
 
     def _load(self, payload_kg: Array) -> None:
-        """Set the payload masses, [arm]."""
+        """Set the payloads' masses and the sizes of their balls, [arm]."""
         if not np.array_equal(self.model.body_mass[self._payload], payload_kg):
+            set_payload_balls(self.model, self._payload, payload_kg)
             load_hands(self.model, self._scratch, self._payload, payload_kg)
 
     def _place(self, a: int, q: Array) -> None:

@@ -4,7 +4,7 @@ import hashlib
 import json
 import logging
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -13,7 +13,7 @@ import numpy as np
 
 from fleet.errors import InfeasibleJob
 from fleet.files import atomic_path
-from fleet.job import Work
+from fleet.job import Fixture, Work
 from fleet.motion import RATE_HZ, Phase, Plan
 from fleet.physics.gen3 import ELBOW_ANGLES_DEG, GRAVITY_M_S2, gen3_xml
 from fleet.planning.task_phases import GRASP_S
@@ -26,7 +26,7 @@ Array = np.ndarray
 T = TypeVar("T")
 log = logging.getLogger(__name__)
 
-PLANNER_VERSION = 1
+PLANNER_VERSION = 2
 """Increment it whenever the plans of the same work change."""
 
 
@@ -34,9 +34,15 @@ class CachedPlanner:
     """A `fleet.planning.planner.Planner` with the same arguments that computes each set of plans once."""
 
     def __init__(
-        self, robot: Robot, *, elbows: int = 3, speeds: tuple[float, ...] = (1.0, 0.6), cache_dir: Path
+        self,
+        robot: Robot,
+        fixtures: Sequence[Fixture] = (),
+        *,
+        elbows: int = 3,
+        speeds: tuple[float, ...] = (1.0, 0.6),
+        cache_dir: Path,
     ) -> None:
-        self._robot, self._elbows, self._folder = robot, elbows, cache_dir
+        self._robot, self._fixtures, self._elbows, self._folder = robot, tuple(fixtures), elbows, cache_dir
         self._speeds = tuple(sorted(set(speeds), reverse=True))
         self._planner: Planner | None = None
 
@@ -57,6 +63,8 @@ class CachedPlanner:
             "elbows": self._elbows,
             "speeds": self._speeds,
         }
+        if self._fixtures:
+            key["fixtures"] = [asdict(fixture) for fixture in self._fixtures]
         path = _path(self._folder, key)
         plans = _read(path, lambda arrays: _unpack(arrays, self._robot.name, work))
         if plans is None:
@@ -70,7 +78,7 @@ class CachedPlanner:
         if self._planner is None:
             from fleet.planning.planner import Planner
 
-            self._planner = Planner(self._robot, elbows=self._elbows, speeds=self._speeds)
+            self._planner = Planner(self._robot, self._fixtures, elbows=self._elbows, speeds=self._speeds)
         try:
             return self._planner.plan(work)
         except InfeasibleJob as error:

@@ -1,12 +1,13 @@
 """Plans of one arm for a work: several elbow postures and speeds, as sampled motion with torque."""
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from fleet.errors import InfeasibleJob
-from fleet.job import Work
+from fleet.job import Fixture, Work
 from fleet.motion import Plan
 from fleet.physics.gen3 import ELBOW_ANGLES_DEG
 from fleet.physics.models import ArmModel
@@ -28,10 +29,18 @@ _LIMIT_STAGE = 101
 class Planner:
     """Plans the work of one arm: a few elbow postures, each at a few speeds."""
 
-    def __init__(self, robot: Robot, *, elbows: int = 3, speeds: tuple[float, ...] = (1.0, 0.6)) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        fixtures: Sequence[Fixture] = (),
+        *,
+        elbows: int = 3,
+        speeds: tuple[float, ...] = (1.0, 0.6),
+    ) -> None:
         """Load the models of the arm.
 
         Args:
+            fixtures: Boxes that neither the arm nor its payload may touch.
             elbows: Maximum number of elbow postures.
             speeds: Shares of the joint limits, each in (0, 1].
         """
@@ -42,7 +51,7 @@ class Planner:
         self.robot = robot
         self.elbows = elbows
         self.speeds = tuple(sorted(set(speeds), reverse=True))
-        self._arm = ArmModel(robot)
+        self._arm = ArmModel(robot, fixtures)
         self._inverse = InverseKinematics(self._arm)
         self._collisions = CollisionChecker(self._arm)
 
@@ -68,7 +77,7 @@ class Planner:
             if any(self._same_elbow(postures, other) for other, _ in variants):
                 continue
             try:
-                self._check_collisions(phases, postures)
+                self._check_collisions(phases, postures, work.payload_kg)
             except InfeasibleJob as failure:
                 failures.append((_COLLISION_STAGE, failure))
                 continue
@@ -102,10 +111,12 @@ class Planner:
             for stop, q in postures.items()
         )
 
-    def _check_collisions(self, phases: TaskPhases, postures: dict[Stop, Array]) -> None:
-        for stop, previous in phases.previous_stops().items():
-            start = self.robot.home_q() if previous is None else postures[previous]
-            if collision := self._collisions.on_path(start, postures[stop]):
+    def _check_collisions(self, phases: TaskPhases, postures: dict[Stop, Array], payload_kg: float) -> None:
+        for ends, carries in phases.paths().items():
+            start, end = (self.robot.home_q() if stop is None else postures[stop] for stop in ends)
+            if collision := self._collisions.on_path(start, end, payload_kg if carries else 0.0):
+                stop = ends[1] or ends[0]
+                assert stop is not None, "no path leads from home to home"
                 raise InfeasibleJob(self.robot.name, stop.place.name, collision)
 
     def _plan(self, work: Work, phases: TaskPhases, postures: dict[Stop, Array], speed: float) -> Plan:

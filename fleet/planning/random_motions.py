@@ -22,7 +22,7 @@ from fleet.robot import JOINTS, POSTURES, Robot, angles_deg
 Array = np.ndarray
 log = logging.getLogger(__name__)
 
-RANDOM_MOTIONS_VERSION = 1
+RANDOM_MOTIONS_VERSION = 2
 """Raised whenever the same seed gives other motions."""
 MAX_DRAWS = 50
 """Draws per requested job; where more fail, the arm hardly has room to move."""

@@ -9,8 +9,9 @@ from functools import cached_property
 import mujoco
 import numpy as np
 
+from fleet.job import payload_radius_m
 from fleet.motion import Plan
-from fleet.physics.models import ArmModel
+from fleet.physics.models import ArmModel, links_of
 
 Array = np.ndarray
 
@@ -18,10 +19,6 @@ STEP_RAD = 0.02
 """Largest joint step between two postures of a sweep: 18 mm at the end of an outstretched arm."""
 LEAF = 8
 """Postures under one leaf of the tree of boxes."""
-PAYLOAD_KG_PER_M3 = 2700.0
-"""A payload counts as a ball of this density, aluminium's, that hangs from the flange."""
-MOST_PAYLOAD_M = 0.1
-"""Largest radius of such a ball."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +63,8 @@ class Capsules:
     def __init__(self, arm: ArmModel) -> None:
         self._arm = arm
         model = arm.model
-        geoms = [g for g in range(model.ngeom) if model.geom(g).name.startswith(f"{arm.robot.name}/")]
-        self.links = (*(model.geom(g).name.split("/", 1)[1] for g in geoms), "payload")
+        self.links = (*links_of(model, arm.robot.name), "payload")
+        geoms = [model.geom(f"{arm.robot.name}/{link}").id for link in self.links[:-1]]
         self._geoms = np.array(geoms)
         axis, half_m, radius_m = zip(*(_capsule_of(model, g) for g in geoms), strict=True)
         self._axis, self._half_m, self._radius_m = np.array(axis), np.array(half_m), np.array(radius_m)
@@ -120,11 +117,6 @@ class Capsules:
         wanted = np.arange(0.0, travelled[-1] + STEP_RAD, STEP_RAD)
         rows = np.unique(np.append(np.searchsorted(travelled, wanted, side="right") - 1, len(q) - 1))
         return self.sweep(q[rows], plan.work.payload_kg if payload_kg is None else payload_kg)
-
-
-def payload_radius_m(payload_kg: float) -> float:
-    """Radius of the ball that a payload counts as, m."""
-    return min(MOST_PAYLOAD_M, (3.0 * max(payload_kg, 0.0) / (4.0 * np.pi * PAYLOAD_KG_PER_M3)) ** (1 / 3))
 
 
 def _capsule_of(model: mujoco.MjModel, geom: int) -> tuple[int, float, float]:

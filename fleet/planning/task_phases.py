@@ -53,6 +53,18 @@ class TaskPhases:
             here = segment.to
         return previous
 
+    def paths(self) -> dict[tuple[Stop | None, Stop | None], bool]:
+        """Stops (None is home) between which the arm moves, in the order of the first time, and whether it ever
+        carries between them; a stop with itself where the arm carries in a pause."""
+        paths: dict[tuple[Stop | None, Stop | None], bool] = {}
+        here: Stop | None = None
+        for segment in (*self.approach, *self.cycle, *self.retreat):
+            path = (segment.to, here) if (segment.to, here) in paths else (here, segment.to)
+            if segment.carries or segment.to != here:
+                paths[path] = paths.get(path, False) or segment.carries
+            here = segment.to
+        return paths
+
 
 def task_phases(work: Work) -> TaskPhases:
     """Moves and pauses of a work. The hand carries the payload from the end of the grasp to the end of the release.

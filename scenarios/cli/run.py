@@ -191,6 +191,8 @@ def metrics_table(results: dict[str, Metrics]) -> Table:
         ("availability", lambda m: f"{m.availability:.1%}"),
         ("energy, Wh", lambda m: f"{m.energy_wh:.0f}"),
     ]
+    if any(m.contacts for m in results.values()):
+        rows.append(("contacts", lambda m: "-" if m.contacts is None else str(m.contacts)))
     for figure, text in rows:
         table.add_row(figure, *(text(m) for m in results.values()))
     for arm in next(iter(results.values())).peak_c:

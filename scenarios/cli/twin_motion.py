@@ -109,7 +109,13 @@ def generate_command(
     check_free(out, GENERATED, overwrite=overwrite)
     with progress_bar() as progress:
         known = known_arm(chosen, arm, twin=twin_of(twins, arm or chosen.arms[0].name), progress=progress)
-        how = {"s": strength, "count": count, "seed": seed, "verification": known.verification}
+        how = {
+            "s": strength,
+            "count": count,
+            "seed": seed,
+            "verification": known.verification,
+            "fixtures": chosen.fixtures,
+        }
         made = generate(known.twin, known.arm, known.sources, **how, progress=partial(progress, "generating"))
     save_generated(made, out, format=format_name, overwrite=overwrite)
     if as_json:

@@ -15,6 +15,7 @@ import numpy as np
 
 from fleet.engine.world import Arm
 from fleet.errors import FleetError
+from fleet.job import Fixture
 from fleet.motion import RATE_HZ, Phase, Plan
 from fleet.motor import Motors, gen3_motors
 from fleet.physics.models import ArmModel
@@ -126,6 +127,7 @@ def generate(
     count: int = 20,
     seed: int = 0,
     verification: Verification,
+    fixtures: Sequence[Fixture] = (),
     progress: Callable[[float], None] = lambda share: None,
 ) -> Generated:
     """`count` verified motions near known ones, or fewer if most are rejected.
@@ -136,6 +138,7 @@ def generate(
         arm: The true arm, which performs the motions.
         sources: Known, cool motion of this arm. Presses are ignored, because their motion needs the contact.
         s: Perturbation in posterior standard deviations; 0 reconstructs.
+        fixtures: Boxes that neither the arm nor its payload may touch.
 
     Raises:
         ValueError: s < 0, count < 1, or no source motion.
@@ -149,7 +152,7 @@ def generate(
     for plan in usable:
         check_source(plan, s)
     rng = np.random.default_rng(np.random.SeedSequence(seed))
-    model, rejected = ArmModel(arm.robot), Counter[str]()
+    model, rejected = ArmModel(arm.robot, fixtures), Counter[str]()
     clearance, motions, order = CollisionChecker(model), list[Motion](), list[int]()
     while len(motions) < count and len(motions) + rejected.total() < MOST_DRAWS * count:
         order = order or rng.permutation(len(usable)).tolist()
@@ -175,7 +178,8 @@ def _verified(
     plan = planned(made, source, model)
     every = round(CLEARANCE_STEP_S * RATE_HZ)
     postures = np.concatenate([phase.profile[::every, 0] for phase in plan.phases]).astype(float)
-    if clearance.first_collision(postures):
+    payload_kg = np.concatenate([phase.payload_kg[::every] for phase in plan.phases])
+    if any(clearance.deepest_collision(postures[payload_kg == kg], float(kg)) for kg in np.unique(payload_kg)):
         raise _Rejected("collision")
     allowed_c = asked.cool_c - asked.margin_k
     if asked.peak_c(plan).max() > allowed_c:

@@ -29,7 +29,7 @@ from scenarios.cell_layout import cell_of, near_of
 from scenarios.extras import require_extra
 from scenarios.job_stream import JobSampler, all_works, rehearsal_works, works_of
 from scenarios.load import load, override
-from scenarios.prepare.planned_arm import PlannedArm, plan_arms
+from scenarios.prepare.planned_arm import PlannedArm, homes_in_fixtures, plan_arms
 from scenarios.progress import Progress, quiet
 from scenarios.schema import Scenario
 from scenarios.schema_errors import choose
@@ -149,12 +149,13 @@ def _folder(cache: str | Path | None) -> Path:
 
 
 def _check_homes(scenario: Scenario, folder: Path) -> None:
-    """Raise a ScenarioError that names all arms that are too close to each other at home."""
+    """Raise a ScenarioError that names all arms that are too close to each other or inside a fixture at home."""
     robots = [spec.robot() for spec in scenario.arms]
-    if sentences := collisions_of_homes(robots, scenario.clearance_m, folder / "plans"):
+    close = collisions_of_homes(robots, scenario.clearance_m, folder / "plans")
+    if sentences := [*close, *homes_in_fixtures(scenario)]:
         raise ScenarioError(
-            f"{scenario.name}.toml: arms: {'; '.join(sentences)}; move or turn the arms, give them another `home`, "
-            "or lower clearance_m."
+            f"{scenario.name}.toml: arms: {'; '.join(sentences)}; move or turn the arms or fixtures, give the "
+            "arms another `home`, or lower clearance_m."
         )
 
 
@@ -227,7 +228,7 @@ class ShiftFactory:
         if self.plant == "mujoco":
             from fleet.physics.mujoco_plant import MujocoPlant
 
-            plant = MujocoPlant(robots, plans, rest_tau, scenario.places)
+            plant = MujocoPlant(robots, plans, rest_tau, scenario.places, scenario.fixtures)
         else:
             plant = ProfilePlant(plans, np.stack([robot.home_q() for robot in robots]), rest_tau)
         twins = tuple(arm.model.version for arm in arms)

@@ -69,7 +69,9 @@ class CellPlanner:
         spec = scenario.planning
         self._robot, self._folder, self._clearance_m = robot, folder / "plans", scenario.clearance_m
         self._others = [arm.robot() for arm in scenario.arms if arm.name != robot.name]
-        self._planner = CachedPlanner(robot, elbows=spec.elbows, speeds=spec.speeds, cache_dir=self._folder)
+        self._planner = CachedPlanner(
+            robot, scenario.fixtures, elbows=spec.elbows, speeds=spec.speeds, cache_dir=self._folder
+        )
 
     def plan(self, work: Work) -> tuple[Plan, ...]:
         """All variants, as `fleet.planning.planner.Planner.plan`, that come too close to no other arm at home.
@@ -83,6 +85,22 @@ class CellPlanner:
         if not clear:
             raise InfeasibleJob(self._robot.name, work.places[0].name, str(reasons[0]))
         return clear
+
+
+def homes_in_fixtures(scenario: Scenario) -> list[str]:
+    """A sentence for each arm that stands or waits inside a fixture, with depth."""
+    if not scenario.fixtures:
+        return []
+    from fleet.physics.models import ArmModel  # both import MuJoCo
+    from fleet.planning.collision import CollisionChecker
+
+    inside = []
+    for i, spec in enumerate(scenario.arms):
+        robot = spec.robot()
+        collision = CollisionChecker(ArmModel(robot, scenario.fixtures)).deepest_collision(robot.home_q()[None])
+        if collision:
+            inside.append(f"arms[{i}] '{robot.name}' at home: {collision}")
+    return inside
 
 
 def plan_arms(

@@ -48,7 +48,7 @@ table.numbers th:not(:first-child), table.numbers td:not(:first-child) { text-al
 table.events { width: 100%; }
 th { color: #555; font-weight: 600; }
 #lost:not(:checked) ~ div tr.lost { display: none; }
-tr.fault td { color: #b51d1d; font-weight: 600; }
+tr.fault td, tr.contact td { color: #b51d1d; font-weight: 600; }
 tr.warning td { color: #8a5600; }
 .wide { overflow-x: auto; }
 nav a { margin-right: 14px; white-space: nowrap; }

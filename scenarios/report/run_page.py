@@ -15,7 +15,7 @@ from scenarios.report.timeline import figure
 ROWS = 300
 """Most rows of the event table."""
 
-NOTABLE = ("fault", "recover", "return", "warning", "torque_warning", "lost")
+NOTABLE = ("fault", "contact", "recover", "return", "warning", "torque_warning", "lost")
 """Event kinds of the event table, most important first; the least important are dropped first."""
 
 
@@ -81,6 +81,7 @@ KEY_FIGURES = (
     ("tardiness", "tardiness_min", ",.1f", " min", ""),
     ("jobs per hour", "jobs_per_hour", ".1f", "", ""),
     ("faults", "faults", ".0f", "", ""),
+    ("contacts", "contacts", ",.0f", "", ""),
     ("above warning", "above_warning_min", ",.1f", " min", ""),
     ("hottest motor", "hottest_c", ".1f", " °C", ""),
     ("availability", "availability", ".1%", "", ""),
@@ -100,9 +101,9 @@ def _key_figures(metrics: Mapping[str, Any]) -> str:
         values["hottest_c"] = peaks[hottest]
     tiles = []
     for label, name, form, unit, whole in KEY_FIGURES:
-        if name in values:
+        if name in values and (name != "contacts" or values[name] > 0):
             small = f" of {values[whole]:{form}}" if whole in values else f"{unit} {hottest * (name == 'hottest_c')}"
-            style = ' class="bad"' if name == "faults" and values[name] > 0 else ""
+            style = ' class="bad"' if name in ("faults", "contacts") and values[name] > 0 else ""
             number = f"<dd>{values[name]:{form}}<small>{escape(small.rstrip())}</small></dd>"
             tiles.append(f"<div{style}><dt>{label}</dt>{number}</div>")
     return f'<dl class="figures">{"".join(tiles)}</dl>'

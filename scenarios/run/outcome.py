@@ -13,8 +13,14 @@ from fleet.metrics import Metrics, gini
 Array = np.ndarray
 
 
-def metrics_of(world: World, state: State, events: Sequence[Event], messages: int) -> Metrics:
-    """Metrics of env 0 at the time of `state`."""
+def metrics_of(
+    world: World, state: State, events: Sequence[Event], messages: int, *, finds_contacts: bool = False
+) -> Metrics:
+    """Metrics of env 0 at the time of `state`.
+
+    Args:
+        finds_contacts: Whether the plant looks for contacts.
+    """
     time_s = float(state.tick[0] * world.dt_s)
     jobs = slice(int(world.jobs.exists[0].sum()))
     release_s, due_s, value = (column[0, jobs] for column in (world.jobs.release_s, world.jobs.due_s, world.jobs.value))
@@ -42,6 +48,7 @@ def metrics_of(world: World, state: State, events: Sequence[Event], messages: in
         energy_wh=float(state.energy_j[0].sum() / 3600.0),
         heat_gini=gini(state.energy_j[0]),
         messages=messages,
+        contacts=sum(event.kind == "contact" for event in events) if finds_contacts else None,
         lost_claims=sum(event.kind == "lost" for event in events),
         illegal_actions=int(state.illegal[0].sum()),
     )

@@ -24,7 +24,7 @@ from scenarios.run.outcome import metrics_of
 from scenarios.run.provenance import provenance
 from scenarios.schema import Scenario
 
-RUN_FORMAT = 3
+RUN_FORMAT = 4
 """Raised when run.json or the columns of the recordings change."""
 _LIBRARIES = ("thermofleet", "numpy", "mujoco", "torch", "pettingzoo", "eclipse-zenoh", "pyarrow")
 
@@ -104,7 +104,7 @@ def run(
     return RunResult(
         spec=spec,
         scenario=fleet.scenario,
-        metrics=metrics_of(world, state, events, env.messages),
+        metrics=metrics_of(world, state, events, env.messages, finds_contacts=not env.episode.plant.follows_plans),
         telemetry=recorder.telemetry() if recorder is not None else None,
         events=events,
         twins={arm.robot.name: provenance(arm.model) for arm in fleet.arms},

@@ -76,7 +76,7 @@ def test_compiled_and_uncompiled_agree_with_a_plant_that_measures_its_drive(smal
 
     class Measured:
         follows_plans, most_steps = False, 1
-        motion = plant.motion
+        motion, contacts = plant.motion, plant.contacts
 
         def drive(self, world, state) -> Drive:
             shape, working = (1, 2, 7), state.mode[..., None] == 1

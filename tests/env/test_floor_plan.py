@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from fleet.env.render.floor_plan import SMALLEST, floor_plan, text_width
 from fleet.env.render.scene import Cell, MountKind, grid_cell
-from fleet.robot import JOINTS
+from fleet.job import Fixture
+from fleet.robot import JOINTS, rotation
 
 metres = st.floats(-50, 50)
 points = st.tuples(metres, metres, metres)
@@ -48,6 +49,26 @@ def test_every_arm_and_station_is_on_the_floor(cell, size) -> None:
         assert len(np.unique(plan.motors[a], axis=0)) == JOINTS
         assert all(inside(u, v, floor, plan.motor) for u, v in plan.motors[a])
     assert all(inside(x, y, floor, plan.station) for x, y in (*plan.stations, *plan.bases))
+
+
+@given(
+    st.tuples(*[st.floats(-5, 5)] * 3), st.tuples(*[st.floats(0.001, 10)] * 3), st.tuples(*[st.floats(-180, 180)] * 3)
+)
+def test_a_fixture_is_drawn_around_its_centre_and_as_large_as_its_shadow(position_m, size_m, tilt_deg) -> None:
+    """By Cauchy, the shadow of a box is the sum of its faces' areas times the cosines of their tilts."""
+    box = Fixture(name="box", position_m=position_m, size_m=size_m, tilt_deg=tilt_deg)
+    cell = Cell(
+        arms=("a",), mounts_m=((0.0, 0.0, 0.0),), kinds=("floor",), stations=(("s", (2.0, 1.0, 0.0)),), fixtures=(box,)
+    )
+    plan = floor_plan(cell)
+    (outline,) = plan.fixtures
+    px_per_m = (plan.stations[0, 0] - plan.bases[0, 0]) / 2.0
+    centre = (outline.min(axis=0) + outline.max(axis=0)) / 2
+    np.testing.assert_allclose((centre - plan.bases[0]) / px_per_m, [position_m[0], -position_m[1]], atol=0.05)
+    x, y = outline.T
+    area = abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1))) / 2
+    faces = np.array([size_m[1] * size_m[2], size_m[0] * size_m[2], size_m[0] * size_m[1]])
+    assert area / px_per_m**2 == pytest.approx(faces @ np.abs(rotation(tilt_deg)[2]), rel=0.02, abs=1e-6)
 
 
 @given(st.lists(points, min_size=1, max_size=6))

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from fleet.env.render.floor_plan import LARGEST, NORMAL, FloorPlan, Pixel, floor_plan, shortened, text_width
 from fleet.env.render.picture import Picture, heat_colour, legend_ends, legend_row, time_left
 from fleet.env.render.scene import Cell, QueuedJob, Scene, grid_cell
+from fleet.job import Fixture
 from fleet.robot import JOINTS
 from fleet.telemetry import FAULTED, IDLE, WORKING
 
@@ -157,7 +158,7 @@ def test_the_arc_shows_the_progress_of_a_job() -> None:
 
 
 def test_every_field_of_a_scene_changes_the_picture() -> None:
-    cell = row(2)
+    cell, oven = row(2), Fixture(name="oven", position_m=(0.5, 0.25, 0.3), size_m=(0.3, 0.3, 0.6))
     offer = QueuedJob(job="sort-001", payload_kg=0.5, due_in_s=300.0, able=(True, True), free=(True, False))
     base = scene(cell, queue=(offer,), waiting=1, title="one")
     others = [
@@ -173,6 +174,9 @@ def test_every_field_of_a_scene_changes_the_picture() -> None:
         replace(base, queue=(replace(offer, due_in_s=-300.0),)),
         replace(base, queue=(replace(offer, able=(True, False)),)),
         replace(base, queue=(replace(offer, free=(True, True)),)),
+        replace(base, cell=replace(cell, fixtures=(oven,))),
+        replace(base, cell=replace(cell, fixtures=(replace(oven, name="table"),))),
+        replace(base, cell=replace(cell, fixtures=(replace(oven, tilt_deg=(0.0, 0.0, 20.0)),))),
     ]
     frames = [picture(each, (480, 320)).tobytes() for each in (base, *others)]
     assert len(set(frames)) == len(frames)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fleet.errors import InfeasibleJob
-from fleet.job import KINDS, Place, Work
+from fleet.job import KINDS, Fixture, Place, Work
 from fleet.motion import Plan
 from fleet.planning.plan_cache import CachedPlanner
 from fleet.planning.planner import Planner
@@ -50,6 +50,15 @@ def test_cached_plans_equal_computed_ones(kind, tmp_path, no_planning):
     cached = CachedPlanner(replace(ROBOT, name="other"), elbows=2, cache_dir=folder).plan(WORKS[kind])
     assert {plan.arm for plan in cached} == {"other"}
     assert_same(tuple(replace(plan, arm="floor") for plan in cached), fresh)
+
+
+def test_other_fixtures_are_another_file(tmp_path, no_planning):
+    far, farther = (Fixture(name="oven", position_m=(x, 0.0, 0.5), size_m=(0.5, 0.5, 1.0)) for x in (3.0, 4.0))
+    for fixtures in ((), (far,), (farther,), (far, replace(farther, name="table"))):
+        CachedPlanner(ROBOT, fixtures, elbows=1, cache_dir=tmp_path).plan(WORKS["hold"])
+    assert len(list(tmp_path.iterdir())) == 4
+    no_planning()
+    CachedPlanner(ROBOT, (far,), elbows=1, cache_dir=tmp_path).plan(WORKS["hold"])
 
 
 @pytest.mark.parametrize(

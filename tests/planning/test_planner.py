@@ -281,9 +281,9 @@ def test_the_nearest_turn_is_within_half_a_turn(q, near):
 
 def test_named_postures_are_clear_and_a_folded_arm_is_not():
     checker = CollisionChecker(ARMS["floor"])
-    assert checker.first_collision(np.array(list(POSTURES.values()))) is None
-    assert "inside the floor" in str(checker.first_collision(np.array([[0.0, 2.2, 0.0, 0.0, 0.0, 0.0, 0.0]])))
-    assert "inside the base" in str(checker.first_collision(np.array([[0.0, 2.1, 0.0, 2.5, 0.0, 0.0, 0.0]])))
+    assert checker.deepest_collision(np.array(list(POSTURES.values()))) is None
+    assert "inside the floor" in str(checker.deepest_collision(np.array([[0.0, 2.2, 0.0, 0.0, 0.0, 0.0, 0.0]])))
+    assert "inside the base" in str(checker.deepest_collision(np.array([[0.0, 2.1, 0.0, 2.5, 0.0, 0.0, 0.0]])))
 
 
 @pytest.mark.parametrize("wrong", [{"elbows": 0}, {"speeds": ()}, {"speeds": (1.2,)}, {"speeds": (0.0,)}])

@@ -15,7 +15,7 @@ from fleet.errors import FleetError
 from fleet.job import KINDS
 from fleet.motion import RATE_HZ, Phase, Plan
 from fleet.physics.gen3 import gen3_xml
-from fleet.physics.models import ArmModel, build_cell
+from fleet.physics.models import ArmModel, build_cell, set_payload_balls
 from fleet.physics.mujoco_plant import STRIDE, TIMESTEP_S, MujocoPlant, load_hands
 from fleet.physics.servo_control import control, reference, still
 from fleet.robot import GEN3
@@ -125,6 +125,7 @@ def test_torque_is_what_changes_the_momentum(cell, clips):
         home = still(cell.robots[0].home_q(), rest_tau, 100)
         told = reference(plan, 5, 2.0 * tick, 100, home)
         for i, ctrl in enumerate(control([told], 10, kp, kv)):
+            set_payload_balls(model, body, told.payload_kg[[i // 10]])
             load_hands(model, scratch, body, told.payload_kg[[i // 10]])
             data.ctrl[:] = ctrl
             data.xfrc_applied[body, :3] = told.force_n[i // 10]

@@ -134,7 +134,7 @@ def test_a_scenario_chooses_its_plant(cell, tmp_path):
         name="two",
         description="",
         horizon_s=60.0,
-        arms=(ArmSpec(name="one"), ArmSpec(name="two", position_m=(0.9, 0.0, 0.0), tilt_deg=(0.0, 0.0, 180.0))),
+        arms=(ArmSpec(name="one"), ArmSpec(name="two", position_m=(2.0, 0.0, 0.0))),
         places=cell.places,
         jobs=(
             JobStream(

@@ -9,9 +9,11 @@ import numpy as np
 from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.path import Path
 from matplotlib.textpath import TextPath
+from scipy.spatial import ConvexHull
 
 from fleet.env.render.scene import Cell
-from fleet.robot import JOINTS
+from fleet.job import Fixture
+from fleet.robot import JOINTS, rotation
 
 Array = np.ndarray
 Pixel = tuple[int, int]
@@ -77,6 +79,8 @@ class FloorPlan:
     """Width of the text below each arm, [arm]."""
     stations: Array
     """[station, 2]."""
+    fixtures: tuple[Array, ...]
+    """Outline of each fixture from above, [corner, 2]; it may reach beyond the floor."""
     labels: tuple[tuple[str, Pixel, Pixel], ...]
     """Station names that have room: text, left end of its middle line, position of the station."""
 
@@ -119,7 +123,11 @@ def floor_plan(cell: Cell, size: Pixel = NORMAL) -> FloorPlan:
     corner = np.array([floor[0] + reach + 8, floor[1] + reach + 8])
     other = np.array([floor[2] - reach - 8, floor[3] - reach - 8 - below])
     px_per_m = np.min(np.maximum(other - corner, 1) / np.maximum(high - low, 0.2))
-    at = np.rint((corner + other) / 2 + (points - (low + high) / 2) * px_per_m * [1.0, -1.0]).astype(int)
+
+    def on_floor(points_m: Array) -> Array:
+        return (corner + other) / 2 + (points_m - (low + high) / 2) * px_per_m * [1.0, -1.0]
+
+    at = np.rint(on_floor(points)).astype(int)
     bases, stations = at[:arms], at[arms:]
     centres = _apart(bases, stations, (corner - 6, np.maximum(corner - 6, other + 6)), reach, below)
     x, y = centres.T
@@ -140,8 +148,16 @@ def floor_plan(cell: Cell, size: Pixel = NORMAL) -> FloorPlan:
         centres=centres,
         room=np.maximum(2 * text, room),
         stations=stations,
+        fixtures=tuple(on_floor(_outline(fixture)) for fixture in cell.fixtures),
         labels=_labels([name for name, _ in cell.stations], centres, stations, floor, reach, below, text),
     )
+
+
+def _outline(fixture: Fixture) -> Array:
+    """Corners of a fixture's shadow on the floor, m, [corner, 2]."""
+    corners = np.array(list(product((-0.5, 0.5), repeat=3))) * fixture.size_m @ rotation(fixture.tilt_deg).T
+    shadow = (corners + fixture.position_m)[:, :2]
+    return shadow[ConvexHull(shadow).vertices]
 
 
 def _apart(bases: Array, stations: Array, corners: tuple[Array, Array], reach: int, below: int) -> Array:

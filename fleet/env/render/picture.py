@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection, LineCollection, PathCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Polygon, Rectangle
 from matplotlib.path import Path
 from matplotlib.transforms import IdentityTransform
 from numpy.typing import ArrayLike
@@ -22,7 +22,7 @@ from fleet.telemetry import FAULTED, WORKING
 
 Array = np.ndarray
 
-INK, FAINT, LINE, PAPER, GROUND = "#222222", "#666666", "#c9c9c9", "#ffffff", "#f6f6f4"
+INK, FAINT, LINE, PAPER, GROUND, BOX = "#222222", "#666666", "#c9c9c9", "#ffffff", "#f6f6f4", "#e4e0d8"
 WORK, FAULT = "#4477aa", "#cc2222"
 PLATES = ("#ffffff", "#dfe9f3", "#f9d9d9")
 """Background of an idle, a working and a faulted arm."""
@@ -101,6 +101,7 @@ class Picture:
     def _draw_background(self, scene: Scene) -> None:
         plan, text = self.plan, self.plan.text
         self._box(plan.floor, GROUND)
+        self._draw_fixtures(scene)
         away = [(at, station) for _, at, station in plan.labels if abs(at[1] - station[1]) > 2 * text]
         self._draw_lines(away, "#9a9a9a", 1)
         for at in plan.stations:
@@ -121,6 +122,19 @@ class Picture:
             hint = shortened("1–7: base to tool; inside: hottest, °C", text, right - left)
             self._write((left, y + round(1.5 * text)), hint, FAINT)
         self._draw_texts()
+
+    def _draw_fixtures(self, scene: Scene) -> None:
+        """Outlines and names of the fixtures, as far as they are on the floor."""
+        plan, text = self.plan, self.plan.text
+        left, top, right, bottom = plan.floor
+        for fixture, outline in zip(scene.cell.fixtures, plan.fixtures, strict=True):
+            box = self.axes.add_patch(Polygon(outline, facecolor=BOX, edgecolor=FAINT))
+            box.set_clip_path(Rectangle((left, top), right - left, bottom - top, transform=self.axes.transData))
+            self.axes.draw_artist(box)
+            low, high = (np.clip(end, (left, top), (right, bottom)) for end in (outline.min(0), outline.max(0)))
+            name = shortened(fixture.name, text, high[0] - low[0] - text)
+            if high[1] - low[1] > 2 * text:
+                self._write((low + high) / 2, name, FAINT, ha="center")
 
     def _draw_work(self, scene: Scene) -> None:
         """Lines from the arms to the stations they occupy, and the names of all stations over them."""

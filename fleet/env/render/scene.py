@@ -8,6 +8,7 @@ import numpy as np
 
 from fleet.engine.shift import open_jobs
 from fleet.engine.state import DONE, WAITING, State, World
+from fleet.job import Fixture
 from fleet.robot import Mount
 from fleet.telemetry import WORKING
 from fleet.thermal import WINDING
@@ -23,7 +24,7 @@ LEVEL_DEG = 10.0
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """Positions of arms and stations; hashable."""
+    """Positions of arms, stations and fixtures; hashable."""
 
     arms: tuple[str, ...]
     mounts_m: tuple[Point, ...]
@@ -32,6 +33,7 @@ class Cell:
     """What each arm is fixed to."""
     stations: tuple[tuple[str, Point], ...]
     """Name and tool point of each station."""
+    fixtures: tuple[Fixture, ...] = ()
 
     def __post_init__(self) -> None:
         if not len(self.arms) == len(self.mounts_m) == len(self.kinds):
@@ -154,8 +156,8 @@ def scene_of(world: World, state: State, cell: Cell | None = None, *, env: int =
                 job=jobs.names[env][j],
                 payload_kg=float(jobs.payload_kg[env, j]),
                 due_in_s=float(jobs.due_s[env, j]) - time_s,
-                able=tuple((world.offers.plan[env, :, j] >= 0).any(axis=-1).tolist()),
-                free=tuple(mask[env, :, 1 + slot * options :][:, :options].any(axis=-1).tolist()),
+                able=tuple(np.any(world.offers.plan[env, :, j] >= 0, axis=-1).tolist()),
+                free=tuple(np.any(mask[env, :, 1 + slot * options :][:, :options], axis=-1).tolist()),
             )
             for slot, j in enumerate(on_offer)
             if j >= 0
