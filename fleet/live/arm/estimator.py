@@ -14,7 +14,7 @@ import numpy as np
 from fleet.bus.protocol.auction import JobEstimate, JobSpec
 from fleet.difficulty import Difficulty, DifficultyModel
 from fleet.errors import InfeasibleJob
-from fleet.job import Job, Place, Work
+from fleet.job import LONGEST_JOB_S, Job, Place, Work
 from fleet.motion import Drive, Plan, drives
 from fleet.motor import gen3_motors
 from fleet.thermal import WINDING, gen3_network, temperature_steps, thermal_model
@@ -113,6 +113,10 @@ class Estimator:
         variants = self._variants(work)
         if isinstance(variants, str):
             self._best[work, job.repetitions] = variants
+            return
+        if (shortest_s := min(plan.duration_s(job.repetitions) for plan in variants)) > LONGEST_JOB_S:
+            days = f"it would take {shortest_s / 86400:.1f} days; at most {LONGEST_JOB_S / 86400:g} are allowed"
+            self._best[work, job.repetitions] = f"{days}: use fewer repetitions"
             return
         scored = [ScoredPlan(plan, self.model.score(plan, job.repetitions)) for plan in variants]
         best = min(scored, key=lambda each: each.difficulty.total if each.difficulty else 0.0)

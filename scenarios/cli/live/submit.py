@@ -15,7 +15,7 @@ from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Admission, JobSpec, JobStatus, Status, StatusRequest, Submission, SubmissionReply
 from fleet.errors import BusError, FleetError, nearest
-from fleet.job import KINDS
+from fleet.job import BOUNDS, KINDS
 from fleet.live.monitor.snapshot import describe_status
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
 from scenarios.cli.signals import Stop, until_stopped
@@ -90,6 +90,9 @@ def explain(error: Exception) -> str:
     if unknown := _UNKNOWN_KIND.fullmatch(problem):
         problem = f"No kind of job '{unknown[1]}'{nearest(unknown[1], KINDS)}".rstrip(".")
     path = path.rstrip("`").lstrip(".")
+    bounds = BOUNDS.get(path.rpartition(".")[2])
+    if problem == "Number out of range" and bounds is not None:
+        problem = f"The number is too large; it must be {bounds}"
     return f"{problem}{f' (at {path})' if path else ''}."
 
 
