@@ -74,7 +74,7 @@ def test_both_starts_settle_at_the_same_temperature():
     [("outstretched", 4.0, "idle_warm"), ("raised", 3.0, "cold"), ("outstretched", 9.0, "idle_warm")],
 )
 def test_times_agree_with_a_general_ode_solver_to_a_thousandth(posture, kg, start):
-    result = hold(kg, posture, 25.0)
+    result = hold(kg, posture, 25.0, beyond_rating=True)
     model, motors, rest = thermal_model(gen3_network()), gen3_motors(), np.zeros(JOINTS)
     current_sq = reference_current(np.array(result.cold.torque_nm), rest, motors) ** 2
     idle = np.concatenate([rest, motors.idle_w])
@@ -100,7 +100,8 @@ def test_times_agree_with_a_general_ode_solver_to_a_thousandth(posture, kg, star
 
 
 def test_more_payload_is_never_slower_to_warn():
-    times = [hold(kg, "outstretched").cold.t60_min[J2] for kg in (0.8, 1.0, 1.2, 2.0, 4.0, 6.0, 8.0)]
+    loads_kg = (0.8, 1.0, 1.2, 2.0, 4.0, 6.0, 8.0)
+    times = [hold(kg, "outstretched", beyond_rating=True).cold.t60_min[J2] for kg in loads_kg]
     minutes = [math.inf if t is None else t for t in times]
     assert minutes == sorted(minutes, reverse=True)
     assert minutes[0] == math.inf
@@ -118,7 +119,7 @@ def test_a_limit_is_passed_exactly_when_the_arm_settles_above_it():
 
 
 def test_runaway_has_no_settling_temperature_but_has_times():
-    result = hold(7.0, "outstretched")
+    result = hold(7.0, "outstretched", beyond_rating=True)
     assert result.cold.steady_c == (None,) * JOINTS
     assert result.cold.t75_min[J2] is not None
     assert "has no steady temperature" in result.note
@@ -127,7 +128,7 @@ def test_runaway_has_no_settling_temperature_but_has_times():
 
 def test_nothing_is_said_of_the_time_after_a_motor_burnt():
     # Joint 2 melts within minutes here; what its heat would do to joint 1 half an hour later is no prediction.
-    result = hold(7.0, "raised", 60.0)
+    result = hold(7.0, "raised", 60.0, beyond_rating=True)
     assert result.idle_warm.t75_min[J2] is not None
     assert result.idle_warm.t75_min[0] is None
 
@@ -188,10 +189,11 @@ def test_table_fits_a_terminal():
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--payload", "-1"], "0 kg or more (got -1.0)"),
-        (["--payload", "nan"], "0 kg or more (got nan)"),
-        (["--payload", "inf"], "0 kg or more (got inf)"),
+        (["--payload", "-1"], "a mass between 0 and 10 kg (got -1.0)"),
+        (["--payload", "nan"], "a mass between 0 and 10 kg (got nan)"),
+        (["--payload", "inf"], "a mass between 0 and 10 kg (got inf)"),
         (["--tool-kg", "-0.1"], "tool mass"),
+        (["--tool-kg", "5"], "between 0 and 4.5 kg (got 5.0)"),
         (["--ambient", "nan"], "-40 … 60 °C (got nan)"),
         (["--ambient", "300"], "-40 … 60 °C (got 300.0)"),
         (["--posture", "outstreched"], "did you mean 'outstretched'?"),
@@ -199,7 +201,9 @@ def test_table_fits_a_terminal():
         (["--posture", "1,2,3"], "7 comma-separated angles"),
         (["--posture", "0,nan,0,0,0,0,0"], "7 comma-separated angles"),
         (["--posture", "0,130,0,0,0,0,0"], "Joint 2 turns from"),
-        (["--payload", "14"], "at most 104 N·m"),
+        (["--payload", "9", "--tool-kg", "4"], "at most 104 N·m"),
+        (["--payload", "4.6"], "4.6 kg is beyond the rating of the Gen3: 4.5 kg for a short time, 1.1 kg continuously"),
+        (["--payload", "4", "--tool-kg", "1"], "add --beyond-rating"),
         (["--cooling", "forced"], "did you mean 'forced_air'?"),
     ],
 )
@@ -209,6 +213,12 @@ def test_bad_input_is_one_sentence_and_exit_code_2(arguments, says):
     assert answer.stdout == ""
     assert says in answer.stderr
     assert answer.stderr.count("\n") == 1
+
+
+def test_a_load_beyond_the_rating_is_computed_on_request():
+    assert run("--payload", "4.6", "--beyond-rating").exit_code == 0
+    assert "4.6 kg at 0.90 m reach is above the continuous rating of 1.1 kg" in hold(4.6, beyond_rating=True).note
+    assert "rating" not in hold(1.0).note
 
 
 def test_a_word_for_a_number_is_refused():
