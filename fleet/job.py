@@ -1,6 +1,7 @@
 """Places of the cell, works that arms do at them, and jobs that request works."""
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import inf
@@ -16,6 +17,24 @@ DWELL_S = 0.5
 """Default of `dwell_s` in scenarios and on the bus: time to close or open the hand."""
 LONGEST_JOB_S = 7 * 24 * 3600.0
 """Longest planned duration of a job."""
+
+
+MOST_FAULTS_OF_ONE_ARM = 2
+MOST_FAULTS = 3
+"""A job in which one arm, or all arms together, have faulted this often is given up."""
+
+
+def reason_to_give_up(arms: Iterable[str]) -> str:
+    """Why a job is given up; "" if it is not.
+
+    Args:
+        arms: The arm of each fault in this job.
+    """
+    faults = Counter(arms)
+    if max(faults.values(), default=0) < MOST_FAULTS_OF_ONE_ARM and faults.total() < MOST_FAULTS:
+        return ""
+    by = ", ".join(f"'{arm}' {times} time{'s' if times > 1 else ''}" for arm, times in sorted(faults.items()))
+    return f"Given up, because arms faulted in it: {by}."
 
 
 class Bounds(NamedTuple):

@@ -226,6 +226,9 @@ class Report(msgspec.Struct, frozen=True):
     unsure: bool = False
     """With `returned`: the arm crashed after it got permission to commit, so it is unknown whether the last cycle was
     done. The job becomes unfinished; another arm might do that cycle a second time."""
+    faulted: bool = False
+    """With `returned`: the arm faulted in this job. After two faults of one arm, or three of all arms, it is given
+    up."""
 
     def __post_init__(self) -> None:
         finite("Report", "time_s", (self.time_s,))
@@ -238,9 +241,12 @@ class Receipt(msgspec.Struct, frozen=True):
     award: Name
 
 
-JobState = Literal["waiting", "awarded", "finishing", "finished", "unfinished"]
+JobState = Literal["waiting", "awarded", "finishing", "finished", "unfinished", "given_up"]
 """waiting: for its release, its predecessors or an arm; finishing: in its last cycle; unfinished: the arm had
-permission to commit and is silent since, or the shift ended before the job was done."""
+permission to commit and is silent since, or the shift ended before the job was done; given_up: arms faulted in it too
+often."""
+SETTLED: tuple[JobState, ...] = ("finished", "unfinished", "given_up")
+"""States that need nothing more; only a late report that the job is finished may change the other two."""
 
 
 class JobStatus(msgspec.Struct, frozen=True):

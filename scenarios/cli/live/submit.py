@@ -13,7 +13,16 @@ import typer
 
 from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import Admission, JobSpec, JobStatus, Status, StatusRequest, Submission, SubmissionReply
+from fleet.bus.protocol.auction import (
+    SETTLED,
+    Admission,
+    JobSpec,
+    JobStatus,
+    Status,
+    StatusRequest,
+    Submission,
+    SubmissionReply,
+)
 from fleet.errors import BusError, FleetError, nearest
 from fleet.job import BOUNDS, KINDS
 from fleet.live.monitor.snapshot import describe_status
@@ -146,7 +155,7 @@ def follow(link: BusClient, names: Sequence[str], stop: Stop) -> list[str]:
             if states.get(status.job) != status.state:
                 states[status.job] = status.state
                 typer.echo(describe_status(status))
-        if all(states.get(name) in ("finished", "unfinished") for name in names):
+        if all(states.get(name) in SETTLED for name in names):
             break
         if time.monotonic() > heard_s + PATIENCE_S:
             raise BusError(
