@@ -95,7 +95,8 @@ def _decode(raw: bytes, kind: type[Decoded], where: str) -> Decoded:
 
 def explain(error: Exception) -> str:
     """Sentence for an error of msgspec, with the field as the file names it."""
-    problem, _, path = str(error).rstrip(".").partition(" - at `$")
+    problem, _, path = str(error).partition(" - at `$")
+    problem = problem.rstrip(".")
     if unknown := _UNKNOWN_KIND.fullmatch(problem):
         problem = f"No kind of job '{unknown[1]}'{nearest(unknown[1], KINDS)}".rstrip(".")
     path = path.rstrip("`").lstrip(".")
