@@ -19,6 +19,8 @@ MAX_JOBS = 100
 """Jobs in one message; the limits of the bus are 128 jobs and 64 KiB."""
 WAIT_S = 10.0
 """Longest wait for an auctioneer, or for arms that allocate jobs without one."""
+ENDED = ("finished", "unfinished", "given_up")
+"""States of jobs that no arm will work on any more."""
 JOBS = [
     {"name": "outside 1", "kind": "hold", "places": ["fixture"], "payload_kg": 1.0, "dwell_s": 5.0},
     {"name": "outside 2", "kind": "hold", "places": ["fixture"], "payload_kg": 0.5, "dwell_s": 5.0, "repetitions": 2},
@@ -54,7 +56,7 @@ def wait_for_results(session, root, names, seconds):
         try:
             while True:  # until there is no result for two seconds
                 for status in statuses:
-                    if status["job"] in names - final.keys() and status["state"] in ("finished", "unfinished"):
+                    if status["job"] in names - final.keys() and status["state"] in ENDED:
                         final[status["job"]] = status["state"]
                         details = filter(None, (status["state"], status.get("arm"), status.get("reason")))
                         print(f"{status['job']}: {' '.join(details)}", flush=True)

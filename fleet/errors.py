@@ -22,7 +22,8 @@ class InfeasibleJob(FleetError):
     place: str
     """Name of the place that the arm cannot serve."""
     reason: str
-    """`reach`, `joint limit`, `torque`, `collision`, `no IK solution` with its numbers, or an arm at home."""
+    """`reach`, `joint limit`, `torque`, `collision`, `no IK solution`, the payload rating, or an arm at home, with its
+    numbers."""
 
     def __str__(self) -> str:
         return f"Arm '{self.arm}' cannot work at '{self.place}': {self.reason}."
@@ -77,6 +78,21 @@ def check_nonnegative(value: object, *fields: str) -> None:
     for name in fields:
         if not 0 <= getattr(value, name) < inf:
             raise ValueError(f"{type(value).__name__}.{name} must be >= 0 and finite (got {getattr(value, name)}).")
+
+
+MOST_M = 10.0
+"""Largest coordinate of anything in a cell."""
+
+
+def check_coordinates(value: object, *fields: str) -> None:
+    """Raise a ValueError unless these fields of a dataclass are points within `MOST_M` of the origin on every axis."""
+    for name in fields:
+        point = getattr(value, name)
+        if not all(abs(coordinate) <= MOST_M for coordinate in point):
+            raise ValueError(
+                f"{type(value).__name__}.{name} must be coordinates between -{MOST_M:g} and {MOST_M:g} m "
+                f"(got {', '.join(map(str, point))}); were millimetres meant?"
+            )
 
 
 def nearest(name: str, allowed: Iterable[str]) -> str:

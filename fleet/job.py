@@ -1,14 +1,15 @@
 """Places and fixtures of the cell, works that arms do at the places, and jobs that request works."""
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import pi
-from typing import Literal, get_args
+from math import inf, pi
+from typing import Literal, NamedTuple, get_args
 
 import networkx as nx
 
-from fleet.errors import check_nonnegative, check_positive
+from fleet.errors import check_coordinates
 
 Kind = Literal["pick_place", "hold", "press", "sort"]
 KINDS: tuple[str, ...] = get_args(Kind)
@@ -20,8 +21,89 @@ MOST_PAYLOAD_M = 0.1
 """Largest radius of such a ball."""
 LEAST_FIXTURE_M, MOST_FIXTURE_M = 0.001, 10.0
 """Smallest and largest length of a fixture."""
-FARTHEST_M = 100.0
-"""Largest coordinate of a fixture."""
+LONGEST_JOB_S = 7 * 24 * 3600.0
+"""Longest planned duration of a job."""
+
+
+MOST_FAULTS_OF_ONE_ARM = 2
+MOST_FAULTS = 3
+"""A job in which one arm, or all arms together, have faulted this often is given up."""
+
+
+def reason_to_give_up(arms: Iterable[str]) -> str:
+    """Why a job is given up; "" if it is not.
+
+    Args:
+        arms: The arm of each fault in this job.
+    """
+    faults = Counter(arms)
+    if max(faults.values(), default=0) < MOST_FAULTS_OF_ONE_ARM and faults.total() < MOST_FAULTS:
+        return ""
+    by = ", ".join(f"'{arm}' {times} time{'s' if times > 1 else ''}" for arm, times in sorted(faults.items()))
+    return f"Given up, because arms faulted in it: {by}."
+
+
+class Bounds(NamedTuple):
+    """Smallest and largest value of a number, both allowed."""
+
+    low: float
+    high: float
+    unit: str = ""
+
+    def __str__(self) -> str:
+        return f"between {self.low:.15g} and {self.high:.15g} {self.unit}".rstrip()
+
+
+BOUNDS: Mapping[str, Bounds] = {
+    "payload_kg": Bounds(0.0, 10.0, "kg"),
+    "force_n": Bounds(0.0, 200.0, "N"),
+    "dwell_s": Bounds(0.02, 3600.0, "s"),  # one sample of a plan; every motion is stored sample by sample
+    "repetitions": Bounds(1, 100_000),
+    "release_s": Bounds(0.0, 1e9, "s"),
+    "due_s": Bounds(0.0, 1e9, "s"),
+    "value": Bounds(0.0, 1e6),
+    "retreat_m": Bounds(0.0, 1.0, "m"),
+    "tool_deg": Bounds(-360.0, 360.0, "deg"),
+}
+"""Of every number of a job and a place, in scenarios, on the bus and in Python."""
+
+
+def check_bounds(owner: object, *fields: str) -> None:
+    """Check that these fields, or all elements of a tuple, are within `BOUNDS`; None is allowed.
+
+    Raises:
+        ValueError: names the field, the value and the bounds.
+    """
+    for name in fields:
+        given, bounds = getattr(owner, name), BOUNDS[name]
+        for value in given if isinstance(given, tuple) else (given,):
+            if value is not None and not bounds.low <= value <= bounds.high:
+                raise ValueError(f"{type(owner).__name__}.{name} must be {bounds} (got {value}).")
+
+
+def check_places(owner: object, kind: str, names: Sequence[str]) -> None:
+    """Check that a kind of work gets as many places as it needs, all different.
+
+    Raises:
+        ValueError: names the places.
+    """
+    two = kind in ("pick_place", "sort")
+    if len(names) != 1 + two or len(set(names)) != len(names):
+        wanted = "two different places, from and to," if two else "one place"
+        raise ValueError(f"{type(owner).__name__}.places must be {wanted} for a {kind} (got {', '.join(names)}).")
+
+
+def check_duration(owner: object, dwell_s: float, repetitions: int) -> None:
+    """Check that the dwell times of a job alone do not exceed the longest duration.
+
+    Raises:
+        ValueError: names both numbers.
+    """
+    if dwell_s * repetitions > LONGEST_JOB_S:
+        raise ValueError(
+            f"{type(owner).__name__}.repetitions times dwell_s must be at most {LONGEST_JOB_S:g} s, 7 days "
+            f"(got {repetitions} times {dwell_s:g} s)."
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +122,8 @@ class Place:
     def __post_init__(self) -> None:
         if not self.name:
             raise ValueError("Place.name must not be empty.")
-        check_nonnegative(self, "retreat_m")
+        check_coordinates(self, "position_m")
+        check_bounds(self, "tool_deg", "retreat_m")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,11 +150,7 @@ class Fixture:
                 f"Fixture.size_m must be three lengths between {LEAST_FIXTURE_M:g} and {MOST_FIXTURE_M:g} m "
                 f"(got {list(self.size_m)})."
             )
-        if not all(abs(x) <= FARTHEST_M for x in self.position_m):
-            raise ValueError(
-                f"Fixture.position_m must be between -{FARTHEST_M:g} and {FARTHEST_M:g} m "
-                f"(got {list(self.position_m)})."
-            )
+        check_coordinates(self, "position_m")
         if not all(abs(angle) <= 360 for angle in self.tilt_deg):
             raise ValueError(f"Fixture.tilt_deg must be between -360 and 360 (got {list(self.tilt_deg)}).")
 
@@ -98,11 +177,8 @@ class Work:
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise ValueError(f"Work.kind '{self.kind}' is unknown. Allowed: {', '.join(KINDS)}.")
-        wanted = 2 if self.kind in ("pick_place", "sort") else 1
-        if len(self.places) != wanted:
-            raise ValueError(f"A {self.kind} needs {wanted} place(s), got {len(self.places)}.")
-        check_nonnegative(self, "payload_kg", "force_n")
-        check_positive(self, "dwell_s")
+        check_places(self, self.kind, [place.name for place in self.places])
+        check_bounds(self, "payload_kg", "force_n", "dwell_s")
         if self.force_n and self.kind != "press":
             raise ValueError(f"Only a press has a contact force; this is a {self.kind} with {self.force_n} N.")
 
@@ -121,16 +197,18 @@ class Job:
     repetitions: int
     release_s: float
     due_s: float
-    """Soft: a later finish is tardiness, not failure."""
+    """Soft: a later finish is tardiness, not failure; inf for none."""
     value: float
     after: tuple[str, ...] = ()
     """Names of the jobs that must finish first."""
 
     def __post_init__(self) -> None:
-        if self.repetitions < 1:
-            raise ValueError(f"Job '{self.name}': repetitions must be >= 1 (got {self.repetitions}).")
-        if self.release_s < 0 or self.due_s < self.release_s:
-            raise ValueError(f"Job '{self.name}': needs 0 <= release_s <= due_s (got {self.release_s}, {self.due_s}).")
+        check_bounds(self, "repetitions", "release_s", "value")
+        check_duration(self, self.work.dwell_s, self.repetitions)
+        if self.due_s != inf:
+            check_bounds(self, "due_s")
+        if self.due_s < self.release_s:
+            raise ValueError(f"Job '{self.name}': needs release_s <= due_s (got {self.release_s}, {self.due_s}).")
 
 
 def check_precedence(jobs: Sequence[Job]) -> None:

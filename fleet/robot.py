@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from fleet.errors import check_nonnegative, check_positive, nearest
+from fleet.errors import check_coordinates, check_nonnegative, check_positive, nearest
 
 JOINTS = 7
 """Number of joints of a Gen3; length of the last axis of every joint array."""
@@ -43,6 +43,36 @@ class JointLimits:
 
 
 GEN3 = JointLimits()
+
+
+@dataclass(frozen=True, kw_only=True)
+class PayloadRating:
+    """Mass that a Gen3 may carry at its flange, gripper included, by reach and by time.
+
+    Reach is the distance from joint 2 to the tool point. The continuous rating falls linearly from mid-range to full
+    reach. A load that the arm can put down again in time has the temporary rating at any reach.
+
+    Source: Kinova Gen3 user guide, p. 16 (the three masses) and p. 56 (less with reach and with time, less the
+    gripper). It gives neither the mid-range nor the time: here half the reach, and the time within which the temporary
+    mass at full reach heats joint 2 of an idle-warm nominal arm at 25 °C at most to the warning limit (130 s).
+    """
+
+    mid_range_m: float = 0.451
+    full_reach_m: float = 0.902
+    mid_range_kg: float = 4.0
+    full_reach_kg: float = 1.1
+    temporary_kg: float = 4.5
+    temporary_s: float = 120.0
+
+    def allowed_kg(self, reach_m: float, carried_s: float) -> float:
+        """Largest mass at a reach, carried for a time without putting it down, kg."""
+        if carried_s <= self.temporary_s:
+            return self.temporary_kg
+        ends_m, ends_kg = (self.mid_range_m, self.full_reach_m), (self.mid_range_kg, self.full_reach_kg)
+        return float(np.interp(reach_m, ends_m, ends_kg))
+
+
+RATING = PayloadRating()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,6 +131,9 @@ class Mount:
     tilt_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Roll, pitch, yaw about the fixed world axes x, y, z, deg. (0,0,0) floor, (180,0,0) ceiling, (0,90,0) wall."""
 
+    def __post_init__(self) -> None:
+        check_coordinates(self, "position_m")
+
     def rotation(self) -> np.ndarray:
         """Rotation from base frame to world, [3, 3]."""
         return rotation(self.tilt_deg)
@@ -115,7 +148,9 @@ class Robot:
     home: str = "home"
     """Name of the posture in which it waits and in which all its jobs start and end."""
     tool_kg: float = 0.0
-    """Mass of the gripper at the flange."""
+    """Mass of the gripper at the flange; it counts against the payload rating."""
+    payload_limit_kg: float | None = None
+    """Own limit of the payload at any reach; None: only the rating of the Gen3 holds."""
     cooling: Cooling = "still_air"
     cooling_factor: float = 1.0
     """Scales the conductance from housings to ambient; for example 0.7 for a dusty, badly ventilated arm."""
@@ -131,6 +166,26 @@ class Robot:
             raise ValueError(f"Robot.home '{self.home}' is no posture{nearest(self.home, POSTURES)}")
         check_nonnegative(self, "tool_kg", "wear")
         check_positive(self, "cooling_factor")
+        if self.tool_kg > RATING.temporary_kg:
+            raise ValueError(
+                f"Robot.tool_kg must be at most {RATING.temporary_kg:g}, the rating of the Gen3 (got {self.tool_kg})."
+            )
+        if self.payload_limit_kg is not None:
+            check_nonnegative(self, "payload_limit_kg")
+
+    def overload(self, payload_kg: float, reach_m: float, carried_s: float) -> str:
+        """Why the arm may not carry a payload at a reach for a time; "" if it may. No payload is never an overload."""
+        limit_kg = self.payload_limit_kg
+        if limit_kg is not None and payload_kg > limit_kg:
+            return f"{payload_kg:g} kg is beyond this arm's limit of {limit_kg:g} kg"
+        rated_kg = max(0.0, RATING.allowed_kg(reach_m, carried_s) - self.tool_kg)
+        if not payload_kg or payload_kg <= rated_kg:
+            return ""
+        tool = f" beside a tool of {self.tool_kg:g} kg" if self.tool_kg else ""
+        reason = f"{payload_kg:g} kg at {reach_m:.2f} m reach is beyond the rating of {rated_kg:.1f} kg{tool}"
+        if carried_s <= RATING.temporary_s:
+            return reason
+        return f"{reason} for a load that is carried for more than {RATING.temporary_s:g} s at a time"
 
     def home_q(self) -> np.ndarray:
         """Joint positions at home, rad, [joint]."""

@@ -116,16 +116,9 @@ def _check(scenario: Scenario, path: Path) -> None:
     places = [place.name for place in scenario.places]
     streams = [stream.name for stream in scenario.jobs]
     for i, stream in enumerate(scenario.jobs):
-        wanted = 2 if stream.kind in ("pick_place", "sort") else 1
-        if len(stream.places) != wanted:
-            raise ScenarioError(f"{file}: jobs[{i}].places: a {stream.kind} needs {wanted} (got {len(stream.places)}).")
         for name in stream.places:
             if name not in places:
                 raise ScenarioError(f"{file}: jobs[{i}].places: no place '{name}'{nearest(name, places)}")
-        if stream.force_n and stream.kind != "press":
-            raise ScenarioError(
-                f"{file}: jobs[{i}].force_n: only a press has a contact force (got {stream.force_n} N)."
-            )
         for name in stream.after:
             if name not in streams[:i]:
                 known = nearest(name, streams[:i]) if i else "."

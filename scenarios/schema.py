@@ -9,12 +9,9 @@ from fleet.arrivals import Arrivals, Batch, Poisson, Trace
 from fleet.engine.reward import RewardWeights
 from fleet.env.validation import Decisions
 from fleet.errors import FleetError, check_nonnegative, check_positive, nearest
-from fleet.job import DWELL_S, Fixture, Kind, Place
+from fleet.job import DWELL_S, Fixture, Kind, Place, check_bounds, check_duration, check_places
 from fleet.robot import Cooling, Mount, Robot, ThermalLimits
 
-LONGEST_DWELL_S = 3600.0
-"""Of one repetition, because every motion is stored sample by sample."""
-MOST_REPETITIONS = 100_000
 MOST_SAMPLES = 1_000_000
 """Telemetry samples of an arm in a shift: eleven days at one per second."""
 MOST_SLOTS = 256
@@ -32,6 +29,7 @@ class ArmSpec:
     tilt_deg: tuple[float, float, float] = Mount.tilt_deg
     home: str = Robot.home
     tool_kg: float = Robot.tool_kg
+    payload_limit_kg: float | None = Robot.payload_limit_kg
     cooling: Cooling = Robot.cooling
     cooling_factor: float = Robot.cooling_factor
     ambient_offset_k: float = Robot.ambient_offset_k
@@ -113,21 +111,16 @@ class JobStream:
     def __post_init__(self) -> None:
         if not self.name:
             raise ValueError("JobStream.name must not be empty")
-        if not self.payload_kg or min(self.payload_kg) < 0:
-            given = list(self.payload_kg)
-            raise ValueError(f"JobStream.payload_kg must be a non-empty list of masses >= 0 (got {given})")
+        if not self.payload_kg:
+            raise ValueError("JobStream.payload_kg must not be an empty list")
+        check_places(self, self.kind, self.places)
+        check_bounds(self, "payload_kg", "repetitions", "dwell_s", "force_n", "value", "due_s")
         low, high = self.repetitions
-        if not 1 <= low <= high <= MOST_REPETITIONS:
-            raise ValueError(
-                f"JobStream.repetitions must be [fewest, most] with 1 <= fewest <= most <= {MOST_REPETITIONS} "
-                f"(got {low}, {high})"
-            )
-        check_positive(self, "dwell_s", "due_s")
-        check_nonnegative(self, "value", "force_n")
-        if self.dwell_s > LONGEST_DWELL_S:
-            raise ValueError(
-                f"JobStream.dwell_s must be at most {LONGEST_DWELL_S:g} s (got {self.dwell_s}); use repetitions"
-            )
+        if low > high:
+            raise ValueError(f"JobStream.repetitions must be [fewest, most] (got {low}, {high})")
+        check_duration(self, self.dwell_s, high)
+        if self.force_n and self.kind != "press":
+            raise ValueError(f"JobStream.force_n: only a press has a contact force (got {self.force_n} N)")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -76,7 +76,7 @@ def test_both_starts_settle_at_the_same_temperature():
     [("outstretched", 4.0, "idle_warm"), ("raised", 3.0, "cold"), ("outstretched", 9.0, "idle_warm")],
 )
 def test_times_agree_with_a_general_ode_solver_to_a_thousandth(posture, kg, start):
-    result = hold(kg, posture, 25.0)
+    result = hold(kg, posture, 25.0, beyond_rating=True)
     model, motors, rest = thermal_model(gen3_network()), gen3_motors(), np.zeros(JOINTS)
     current_sq = reference_current(np.array(result.cold.torque_nm), rest, motors) ** 2
     idle = np.concatenate([rest, motors.idle_w])
@@ -102,7 +102,8 @@ def test_times_agree_with_a_general_ode_solver_to_a_thousandth(posture, kg, star
 
 
 def test_more_payload_is_never_slower_to_warn():
-    times = [hold(kg, "outstretched").cold.t60_min[J2] for kg in (0.8, 1.0, 1.2, 2.0, 4.0, 6.0, 8.0)]
+    loads_kg = (0.8, 1.0, 1.2, 2.0, 4.0, 6.0, 8.0)
+    times = [hold(kg, "outstretched", beyond_rating=True).cold.t60_min[J2] for kg in loads_kg]
     minutes = [math.inf if t is None else t for t in times]
     assert minutes == sorted(minutes, reverse=True)
     assert minutes[0] == math.inf
@@ -120,7 +121,7 @@ def test_a_limit_is_passed_exactly_when_the_arm_settles_above_it():
 
 
 def test_runaway_has_no_settling_temperature_but_has_times():
-    result = hold(7.0, "outstretched")
+    result = hold(7.0, "outstretched", beyond_rating=True)
     assert result.cold.steady_c == (None,) * JOINTS
     assert result.cold.t75_min[J2] is not None
     assert "has no steady temperature" in result.note
@@ -129,7 +130,7 @@ def test_runaway_has_no_settling_temperature_but_has_times():
 
 def test_nothing_is_said_of_the_time_after_a_motor_burnt():
     # Joint 2 melts within minutes here; what its heat would do to joint 1 half an hour later is no prediction.
-    result = hold(7.0, "raised", 60.0)
+    result = hold(7.0, "raised", 60.0, beyond_rating=True)
     assert result.idle_warm.t75_min[J2] is not None
     assert result.idle_warm.t75_min[0] is None
 
@@ -195,7 +196,9 @@ def test_table_fits_a_terminal():
         (["--posture", "1,2,3"], "7 comma-separated angles"),
         (["--posture", "0,nan,0,0,0,0,0"], "7 comma-separated angles"),
         (["--posture", "0,130,0,0,0,0,0"], "Joint 2 turns from"),
-        (["--payload", "14"], "at most 104 N·m"),
+        (["--payload", "9", "--tool-kg", "4"], "at most 104 N·m"),
+        (["--payload", "4.6"], "4.6 kg is beyond the rating of the Gen3: 4.5 kg for a short time, 1.1 kg continuously"),
+        (["--payload", "4", "--tool-kg", "1"], "add --beyond-rating"),
         (["--cooling", "forced"], "did you mean 'forced_air'?"),
     ],
 )
@@ -209,9 +212,9 @@ def test_a_hold_that_cannot_be_is_refused(arguments, says):
 @pytest.mark.parametrize(
     ("values", "says"),
     [
-        ({"payload_kg": -1.0}, "0 kg or more (got -1.0)"),
-        ({"payload_kg": math.nan}, "0 kg or more (got nan)"),
-        ({"payload_kg": math.inf}, "0 kg or more (got inf)"),
+        ({"payload_kg": -1.0}, "a mass between 0 and 10 kg (got -1.0)"),
+        ({"payload_kg": math.nan}, "a mass between 0 and 10 kg (got nan)"),
+        ({"payload_kg": math.inf}, "a mass between 0 and 10 kg (got inf)"),
         ({"payload_kg": 1.0, "tool_kg": -0.1}, "tool mass"),
         ({"payload_kg": 1.0, "ambient_c": math.nan}, "-40 … 60 °C (got nan)"),
         ({"payload_kg": 1.0, "ambient_c": 300.0}, "-40 … 60 °C (got 300.0)"),
@@ -220,6 +223,12 @@ def test_a_hold_that_cannot_be_is_refused(arguments, says):
 def test_a_value_out_of_range_is_refused(values, says):
     with pytest.raises(HoldError, match=re.escape(says)):
         hold(**values)
+
+
+def test_a_load_beyond_the_rating_is_computed_on_request():
+    assert run("--payload", "4.6", "--beyond-rating").exit_code == 0
+    assert "4.6 kg at 0.90 m reach is above the continuous rating of 1.1 kg" in hold(4.6, beyond_rating=True).note
+    assert "rating" not in hold(1.0).note
 
 
 def test_a_word_for_a_number_is_refused():

@@ -14,7 +14,7 @@ from wall_clock import WallClocks
 from fleet.bus.client.client import BusClient
 from fleet.bus.client.router import open_client
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import Clock, ClockRequest, JobSpec, Submission, SubmissionReply
+from fleet.bus.protocol.auction import SETTLED, Clock, ClockRequest, JobSpec, Submission, SubmissionReply
 from fleet.bus.security.access_control import Participant, of_arms
 from fleet.bus.security.certificates import HERE
 from fleet.bus.security.keyring import make
@@ -141,13 +141,10 @@ def _is_healthy(fleet: Fleet) -> bool:
     return there and not any(fleet.is_absent(arm) for arm in fleet.arms) and bool(fleet.status())
 
 
-_SETTLED = ("finished", "unfinished")
-
-
 def _all_settled(fleet: Fleet, accepted: set[str]) -> bool:
     fleet.client.serve(time.monotonic() + 0.2)
     status = fleet.status()
-    return accepted <= set(status) and all(job.state in _SETTLED for job in status.values())
+    return accepted <= set(status) and all(job.state in SETTLED for job in status.values())
 
 
 def _any_unfinished(fleet: Fleet) -> bool:
@@ -159,7 +156,7 @@ def _any_unfinished(fleet: Fleet) -> bool:
 def _outcome(fleet: Fleet, accepted: set[str]) -> Outcome:
     status, done = fleet.status(), fleet.count_finished()
     finished = {name for name, job in status.items() if job.state == "finished"}
-    unfinished = {name for name, job in status.items() if job.state == "unfinished"}
+    unfinished = {name for name, job in status.items() if job.state in ("unfinished", "given_up")}
     restarts = fleet.supervisor.restarts()
     return Outcome(
         finished=len(finished),

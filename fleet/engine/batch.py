@@ -12,10 +12,11 @@ from fleet.engine.event_log import PER_ARM, event_buffer
 from fleet.engine.observe import observe
 from fleet.engine.reset import reset_rows
 from fleet.engine.reward import TERMS, RewardWeights, weights_per_unit
-from fleet.engine.state import DONE, GIVEN_UP, MOST_FAULTS, WAITING, State
+from fleet.engine.state import DONE, GIVEN_UP, WAITING, State
 from fleet.engine.step import step_arms
 from fleet.engine.tables import LANES, Jobs, MeasuredDrive, OpenJobs, Simulation, Tables, Trace, form_of
 from fleet.jit import jit, kernel, nonnegative
+from fleet.job import MOST_FAULTS
 from fleet.motion import Drive
 from fleet.observation import Layout
 from fleet.robot import JOINTS

@@ -3,9 +3,10 @@
 import numpy as np
 
 from fleet.engine.crossings import hottest
-from fleet.engine.state import MOST_FAULTS, WAITING
+from fleet.engine.state import WAITING
 from fleet.engine.tables import Simulation
 from fleet.jit import kernel, nonnegative
+from fleet.job import MOST_FAULTS
 from fleet.telemetry import IDLE
 from fleet.thermal import NODES
 

@@ -9,6 +9,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from fleet.difficulty import Risk
+from fleet.job import MOST_FAULTS
 from fleet.motion import Drive
 from fleet.motor import Motors
 from fleet.robot import ThermalLimits
@@ -19,8 +20,6 @@ Array = np.ndarray
 
 WAITING, RUNNING, DONE, GIVEN_UP = range(4)
 """Status of a job."""
-MOST_FAULTS = 3
-"""A job is given up at its third fault, or at the second of one arm."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,9 +10,10 @@ import numpy as np
 from fleet.engine.claims import give_up, return_to_queue
 from fleet.engine.crossings import hottest, step_with_crossing
 from fleet.engine.event_log import FAULT, FINISH, GIVE_UP, HOME, MOVED, RECOVER, RETURN, WARNING, record_event
-from fleet.engine.state import DONE, MOST_FAULTS, WAITING
+from fleet.engine.state import DONE, WAITING
 from fleet.engine.tables import LANES, WIDE, Simulation
 from fleet.jit import jit_inline, nonnegative
+from fleet.job import MOST_FAULTS
 from fleet.motor import magnet_factor, winding_heat
 from fleet.robot import JOINTS
 from fleet.telemetry import FAULTED, IDLE, WORKING

@@ -72,3 +72,5 @@ class Closed(msgspec.Struct, frozen=True, tag="closed"):
     """As in `fleet.bus.protocol.auction.Report`."""
     job: str = ""
     arm: str = ""
+    faulted: bool = False
+    """As in `fleet.bus.protocol.auction.Report`."""

@@ -143,6 +143,12 @@ class ArmModel:
         mujoco.mj_kinematics(self.model, self.data)
         return self.data.site_xpos[self._tool].copy(), self.data.site_xmat[self._tool].reshape(3, 3).copy()
 
+    def reach_m(self, q: Array) -> float:
+        """Distance from joint 2 to the tool point, m."""
+        self.data.qpos[:] = q
+        mujoco.mj_kinematics(self.model, self.data)
+        return float(np.linalg.norm(self.data.site_xpos[self._tool] - self.data.xanchor[1]))
+
     def elbow_position(self, q: Array) -> Array:
         """Position of joint 4 in the world, m, [3]."""
         self.data.qpos[:] = q

@@ -17,7 +17,7 @@ from fleet.job import Fixture, Work
 from fleet.motion import RATE_HZ, Phase, Plan
 from fleet.physics.gen3 import ELBOW_ANGLES_DEG, GRAVITY_M_S2, gen3_xml
 from fleet.planning.task_phases import GRASP_S
-from fleet.robot import GEN3, Robot
+from fleet.robot import GEN3, RATING, Robot
 
 if TYPE_CHECKING:
     from fleet.planning.planner import Planner
@@ -56,6 +56,8 @@ class CachedPlanner:
             "planner": PLANNER_VERSION,
             "rate_hz": RATE_HZ,
             "limits": asdict(GEN3),
+            "rating": asdict(RATING),
+            "payload_limit_kg": self._robot.payload_limit_kg,
             **_torque_key(self._robot),
             "work": asdict(work),
             "grasp_s": GRASP_S,

@@ -8,7 +8,7 @@ import numpy as np
 
 from fleet.errors import InfeasibleJob
 from fleet.job import Fixture, Work
-from fleet.motion import Plan
+from fleet.motion import RATE_HZ, Plan
 from fleet.physics.gen3 import ELBOW_ANGLES_DEG
 from fleet.physics.models import ArmModel
 from fleet.planning.collision import CollisionChecker
@@ -126,8 +126,24 @@ class Planner:
             for segment in segments:
                 start, here = here, self.robot.home_q() if segment.to is None else postures[segment.to]
                 parts.append(_loaded_motion(work, segment, start, here, speed))
+            self._check_rating(parts)
             built.append(build_phase(self._arm, parts))
         return Plan(self.robot.name, work, 0, speed, *built)
+
+    def _check_rating(self, parts: list[LoadedMotion]) -> None:
+        """Check the load of one phase, in which it is carried without a break, at its farthest posture.
+
+        Raises:
+            InfeasibleJob: the load exceeds the arm's rating.
+        """
+        carried = [part for part in parts if part.payload_kg]
+        carried_s = sum(len(part.motion) for part in carried) / RATE_HZ
+        postures = [(part, part.motion.q if part.motion.qd.any() else part.motion.q[:1]) for part in carried]
+        reaches_m = [(self._arm.reach_m(q), part) for part, path in postures for q in path]
+        if reaches_m:
+            reach_m, farthest = max(reaches_m, key=lambda each: each[0])
+            if overload := self.robot.overload(farthest.payload_kg, reach_m, carried_s):
+                raise InfeasibleJob(self.robot.name, farthest.place, overload)
 
 
 def _loaded_motion(work: Work, segment: Segment, start: Array, end: Array, speed: float) -> LoadedMotion:

@@ -15,9 +15,10 @@ from rich.console import Console
 from rich.table import Table
 
 from fleet.errors import FleetError, nearest
+from fleet.job import BOUNDS
 from fleet.motion import static_drive
 from fleet.motor import Motors, current, gen3_motors, thermal_data
-from fleet.robot import GEN3, JOINTS, POSTURES, Cooling, Robot, ThermalLimits
+from fleet.robot import GEN3, JOINTS, POSTURES, RATING, Cooling, Robot, ThermalLimits
 from fleet.thermal import (
     HOUSING,
     NODES,
@@ -90,6 +91,7 @@ def hold(
     *,
     cooling: str = "still_air",
     tool_kg: float = 0.0,
+    beyond_rating: bool = False,
 ) -> HoldResult:
     """Torque, current and temperatures of a nominal Gen3 on the floor that holds a payload still.
 
@@ -97,16 +99,19 @@ def hold(
         payload_kg: A point mass at the flange.
         posture: A name from `fleet.robot.POSTURES`, or seven comma-separated joint angles in degrees.
         tool_kg: Mass of the gripper, at the flange.
+        beyond_rating: Compute also what the Gen3 is not rated for, not even for a short time.
 
     Raises:
-        HoldError: an argument is out of range, or the hold needs more torque than a motor has.
+        HoldError: an argument is out of range, the load is beyond the rating, or the hold needs more torque than a
+            motor has.
         PostureError: the posture is unknown, or beyond a joint stop.
     """
     from fleet.physics.models import ArmModel  # loads MuJoCo
 
-    for name, value in (("payload", payload_kg), ("tool mass", tool_kg)):
-        if not 0 <= value < np.inf:
-            raise HoldError(f"The {name} must be a mass of 0 kg or more (got {value}).")
+    masses = (("payload", payload_kg, BOUNDS["payload_kg"].high), ("tool mass", tool_kg, RATING.temporary_kg))
+    for name, value, most_kg in masses:
+        if not 0 <= value <= most_kg:
+            raise HoldError(f"The {name} must be a mass between 0 and {most_kg:g} kg (got {value}).")
     low_c, high_c = AMBIENT_RANGE_C
     if not low_c <= ambient_c <= high_c:
         raise HoldError(f"The ambient temperature must lie in {low_c:g} … {high_c:g} °C (got {ambient_c}).")
@@ -117,6 +122,13 @@ def hold(
     q = parse_posture(posture, arm.position_range)
     tau = arm.gravity_torque(q, payload_kg)
     _check_torque(tau, payload_kg, posture)
+    reach_m, load_kg = arm.reach_m(q), payload_kg + tool_kg
+    if load_kg > RATING.temporary_kg and not beyond_rating:
+        raise HoldError(
+            f"{load_kg:g} kg is beyond the rating of the Gen3: {RATING.temporary_kg:g} kg for a short time, "
+            f"{RATING.allowed_kg(reach_m, np.inf):.1f} kg continuously at this reach of {reach_m:.2f} m, gripper "
+            "included. Make it lighter, or add --beyond-rating."
+        )
     cold, idle_warm = courses(tau, ambient_c, thermal_model(gen3_network(cooling=strategy)), gen3_motors())
     return HoldResult(
         payload_kg=payload_kg,
@@ -127,7 +139,7 @@ def hold(
         tool_kg=tool_kg,
         cold=cold,
         idle_warm=idle_warm,
-        note=_note(tau, cold),
+        note=_note(tau, cold, load_kg, reach_m),
     )
 
 
@@ -217,17 +229,20 @@ def as_table(result: HoldResult) -> Table:
 
 
 def hold_command(
-    payload: Annotated[float, number("Payload at the flange, kg.", 0, 100)] = 0.0,
+    payload: Annotated[float, number("Payload at the flange, kg.", *BOUNDS["payload_kg"][:2])] = 0.0,
     posture: Annotated[
         str, typer.Option(help=f"{', '.join(POSTURES)}, or seven comma-separated angles in degrees.")
     ] = "outstretched",
     ambient: Annotated[float, number("Ambient temperature, °C.", *AMBIENT_RANGE_C)] = 25.0,
     json_: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
     cooling: Annotated[str, typer.Option(help=f"{', '.join(get_args(Cooling))}.")] = "still_air",
-    tool_kg: Annotated[float, number("Mass of the gripper at the flange, kg.", 0, 100)] = 0.0,
+    tool_kg: Annotated[float, number("Mass of the gripper at the flange, kg.", 0, RATING.temporary_kg)] = 0.0,
+    beyond_rating: Annotated[
+        bool, typer.Option("--beyond-rating", help="Compute also a load that the arm is not rated for.")
+    ] = False,
 ) -> None:
     """Compute how long an arm can hold a payload until its motors reach the warning and error limits."""
-    result = hold(payload, posture, ambient, cooling=cooling, tool_kg=tool_kg)
+    result = hold(payload, posture, ambient, cooling=cooling, tool_kg=tool_kg, beyond_rating=beyond_rating)
     if json_:
         typer.echo(json.dumps(as_json(result), indent=2, allow_nan=False, ensure_ascii=False))
     else:
@@ -243,11 +258,16 @@ def _check_torque(tau: Array, payload_kg: float, posture: str) -> None:
         )
 
 
-def _note(tau: Array, course: Course) -> str:
+def _note(tau: Array, course: Course, load_kg: float, reach_m: float) -> str:
     limit_c = thermal_data()["identified_below_c"]
     sentences = [
         f"Above {limit_c:g} °C the model extrapolates: it was identified on logs of a real arm that stayed below."
     ]
+    continuous_kg = RATING.allowed_kg(reach_m, np.inf)
+    if load_kg > continuous_kg:
+        sentences.append(
+            f"{load_kg:g} kg at {reach_m:.2f} m reach is above the continuous rating of {continuous_kg:.1f} kg."
+        )
     warning = np.array(GEN3.torque_warning)
     sentences += [
         f"Joint {j + 1} needs {abs(tau[j]):.1f} N·m, above the arm's torque warning of {warning[j]:g} N·m."

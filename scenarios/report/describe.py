@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import astuple
-from itertools import groupby
 
 import numpy as np
 from rich.table import Table
@@ -15,10 +14,12 @@ from scenarios.schema import ArmSpec, JobStream, Scenario
 
 SEEDS = 5
 """Shifts over which the load factor is averaged."""
+MOST_REASONS = 20
+"""Reasons that are shown why an arm cannot do a job."""
 
 
 def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | Text]:
-    """Heading, arms, jobs, unreachable places, and the load. Plans the scenario's work (cached)."""
+    """Heading, arms, jobs, the load, and what single arms cannot do. Plans the scenario's work (cached)."""
     fleet = prepare(scenario, difficulty="blind", progress=progress)
     factory = ShiftFactory(fleet)
     factors = [load_factor(factory(np.random.SeedSequence(seed)).world) for seed in range(SEEDS)]
@@ -32,10 +33,9 @@ def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | Tex
         f"thermal load factor {thermal:.2f} for the best assignment, {blind:.2f} for an equal split, "
         f"time load {time:.2f} (mean of {SEEDS} seeds): {max(set(regimes), key=regimes.count)}"
     )
-    refused = [
-        f"{arm}: {', '.join(sorted({e.place for e in es}))}" for arm, es in groupby(fleet.infeasible, lambda e: e.arm)
-    ]
-    tail = Text("Out of reach: " + "; ".join(refused) if refused else "Every arm reaches every place.")
+    refused = list(dict.fromkeys(map(str, fleet.infeasible)))
+    more = [f"… and {len(refused) - MOST_REASONS} more."] if len(refused) > MOST_REASONS else []
+    tail = Text("\n".join([*refused[:MOST_REASONS], *more]) or "Every arm can do every job.")
     return [Text(head), Text(""), _arms(scenario), Text(""), _jobs(scenario), Text(""), tail]
 
 
@@ -45,6 +45,7 @@ def _arms(scenario: Scenario) -> Table:
     columns: list[tuple[str, Callable[[ArmSpec], str]]] = [
         ("home", lambda a: a.home),
         ("tool, kg", lambda a: f"{a.tool_kg:g}"),
+        ("payload limit, kg", lambda a: "–" if a.payload_limit_kg is None else f"{a.payload_limit_kg:g}"),
         ("cooling", lambda a: a.cooling if a.cooling_factor == 1 else f"{a.cooling} × {a.cooling_factor:g}"),
         ("ambient, K", lambda a: f"{a.ambient_offset_k:+g}"),
         ("wear", lambda a: f"{a.wear:g}"),

@@ -40,12 +40,12 @@ def example(word):
 
 
 def refused(word, value) -> str:
-    """Why the struct refuses a value: "" if it does not, "schema" for its types, "rule" for what it says beyond."""
+    """Why the struct refuses a value: "" if it does not, "schema" for its types and bounds, "rule" for any other."""
     try:
         messages.decode(word, json.dumps(value).encode())
     except MalformedMessage as error:
         by_rule = isinstance(error.__cause__, BaseException) and isinstance(error.__cause__.__cause__, ValueError)
-        return "rule" if by_rule else "schema"
+        return "rule" if by_rule and " must be between " not in str(error) else "schema"
     return ""
 
 

@@ -118,10 +118,11 @@ def test_an_arm_that_left_earlier_is_missing_only_if_expected():
 
 def test_a_warning_is_no_fault():
     hot = arm(mode="faulted", hottest_c=76.0, joint=2)
-    told, found = faults(fleet(hot, counts={"unfinished": 1}), ClockProbe(100.0, 100.4, 5000.0, 60.0), overrun=5)
+    counts = {"unfinished": 1, "given_up": 2}
+    told, found = faults(fleet(hot, counts=counts), ClockProbe(100.0, 100.4, 5000.0, 60.0), overrun=5)
     assert told == []
     warned = " ".join(finding.what for finding in found.findings)
-    for word in ("joint 2 is at 76.0", "400 ms", "5 message(s)", "1 job(s) are unfinished"):
+    for word in ("joint 2 is at 76.0", "400 ms", "5 message(s)", "1 job(s) are unfinished", "2 job(s) are given up"):
         assert word in warned
 
 

@@ -62,7 +62,7 @@ def works(draw):
     wanted = 2 if kind in ("pick_place", "sort") else 1
     return Work(
         kind=kind,
-        places=tuple(draw(places()) for _ in range(wanted)),
+        places=tuple(draw(st.lists(places(), min_size=wanted, max_size=wanted, unique_by=lambda p: p.name))),
         payload_kg=draw(st.floats(0.0, 4.0)),
         dwell_s=draw(st.floats(0.1, 2.0)),
         force_n=draw(st.floats(0.0, 60.0)) if kind == "press" else 0.0,
@@ -208,7 +208,12 @@ def test_plans_repeat(kind):
     ("what", "place", "reason"),
     [
         (work("pick_place", places=(NEAR, replace(FAR, position_m=(1.5, 0.0, 0.3)))), "far", r"^reach: 1\.\d+ m"),
-        (work("hold", payload_kg=40.0), "face", r"^torque: joint_\d needs \d+\.\d N·m, allowed 104\.0 N·m, with 40 kg"),
+        (
+            work("press", places=(replace(FACE, position_m=(0.6, 0.0, 0.3), tool_deg=(0.0, 0.0, 0.0)),), force_n=200.0),
+            "face",
+            r"^torque: joint_\d needs \d+\.\d N·m, allowed \d+\.0 N·m, with 0 kg pressing 200 N",
+        ),
+        (work("hold", payload_kg=5.0), "face", r"^5 kg at 0\.\d\d m reach is beyond the rating of 4\.5 kg$"),
         (
             work("hold", places=(replace(FACE, position_m=(0.167, 0.0, 0.4)),)),
             "face",

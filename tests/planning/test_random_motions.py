@@ -147,8 +147,8 @@ def test_what_goes_beyond_a_joint_stop_is_refused(arm):
 
 
 def test_what_no_motor_could_lift_is_refused(arm):
-    with pytest.raises(InfeasibleJob, match=r"torque: joint_2 needs .* with 30 kg"):
-        plan_motion(arm, FAR[None], dwell_s=5.0, payload_kg=30.0, speed=1.0)
+    with pytest.raises(InfeasibleJob, match=r"torque: joint_2 needs .* with 10 kg"):
+        plan_motion(arm, FAR[None], dwell_s=5.0, payload_kg=10.0, speed=1.0)
 
 
 @pytest.mark.parametrize(

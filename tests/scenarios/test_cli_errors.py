@@ -12,7 +12,7 @@ def unreachable(text: str) -> str:
 
 
 def too_heavy(text: str) -> str:
-    return text.replace("payload_kg = [2.0]", "payload_kg = [40.0]")
+    return text.replace("payload_kg = [2.0]", "payload_kg = [9.0]")
 
 
 BAD_INPUT: list[tuple[str, Callable[[str], str] | None, list[str], str]] = [
@@ -22,7 +22,7 @@ BAD_INPUT: list[tuple[str, Callable[[str], str] | None, list[str], str]] = [
         "negative mass",
         lambda t: t.replace("[2.0]", "[-2.0]"),
         [],
-        "jobs[0].payload_kg must be a non-empty list of masses",
+        "jobs[0].payload_kg must be between 0 and 10 kg (got -2.0).",
     ),
     ("one place", lambda t: t.replace("[0.45, 0", "[-0.45, 0"), [], "'right' is 0.00 m from 'left' (arms[0]);"),
     ("not a number", lambda t: t.replace("= 180", "= nan"), [], "heat.toml: horizon_s: expected a finite number,"),
@@ -44,7 +44,7 @@ BAD_INPUT: list[tuple[str, Callable[[str], str] | None, list[str], str]] = [
         "too heavy",
         too_heavy,
         [],
-        "jobs[0].places: no arm can do 'hold' with 40 kg (left at 'bench': torque:",
+        "jobs[0].places: no arm can do 'hold' with 9 kg (left at 'bench': 9 kg at 0.",
     ),
     ("policy", None, ["--policy", "raundom"], "No policy 'raundom'; did you mean 'random'? Allowed: "),
     ("plant", None, ["--plant", "mojoco"], "No plant 'mojoco'; did you mean 'mujoco'? Allowed: mujoco, profile."),

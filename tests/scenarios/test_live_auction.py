@@ -65,12 +65,12 @@ def test_jobs_are_read_from_lines_or_a_list(tmp_path):
     ("text", "complaint"),
     [
         (f"{json.dumps(HOLD)}\n{{}}", "line 2: Object missing required field `name`."),
-        (json.dumps(HOLD | {"repetitions": 0}), "line 1: Expected `int` >= 1 (at repetitions)."),
+        (json.dumps(HOLD | {"repetitions": 0}), "line 1: JobSpec.repetitions must be between 1 and 100000 (got 0)."),
         (
             json.dumps([HOLD, HOLD | {"kind": "dance"}]),
             "No kind of job 'dance'. Allowed: hold, pick_place, press, sort (at [1].kind).",
         ),
-        (json.dumps(HOLD | {"places": ["a", "b"]}), "line 1: A hold needs 1 place(s), got 2."),
+        (json.dumps(HOLD | {"places": ["a", "b"]}), "line 1: JobSpec.places must be one place for a hold (got a, b)."),
         ("{", "line 1: Input data was truncated."),
         ("\n", "contains no jobs."),
         ("[]", "contains no jobs."),

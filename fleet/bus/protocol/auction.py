@@ -18,17 +18,21 @@ from typing import Annotated, Literal
 import msgspec
 
 from fleet.bus.protocol.messages import Name, finite
-from fleet.job import DWELL_S, Kind
+from fleet.job import BOUNDS, DWELL_S, Kind, check_bounds, check_duration, check_places
 from fleet.telemetry import Mode
 
 Count = Annotated[int, msgspec.Meta(ge=0)]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
-NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 LEASE_S = 6.0
 """Real seconds that an arm may work on a job without renewing its lease."""
 MOST_JOBS = 128
 """In one message; more are sent as several messages, so that none exceeds the router's size limit."""
+
+
+def _bounds(name: str) -> msgspec.Meta:
+    """Bounds of a number in the JSON schema; `JobSpec` itself checks them, as its error also names the value."""
+    return msgspec.Meta(extra_json_schema={"minimum": BOUNDS[name].low, "maximum": BOUNDS[name].high})
 
 
 class JobSpec(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -39,26 +43,24 @@ class JobSpec(msgspec.Struct, frozen=True, omit_defaults=True):
     kind: Kind
     places: Annotated[tuple[Name, ...], msgspec.Meta(min_length=1, max_length=2)]
     """Places of the cell: from and to for pick_place and sort; one for hold and press."""
-    repetitions: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 1
-    payload_kg: NotNegative = 0.0
-    dwell_s: Positive = DWELL_S
-    force_n: NotNegative = 0.0
-    release_s: NotNegative = 0.0
+    repetitions: Annotated[int, _bounds("repetitions")] = 1
+    payload_kg: Annotated[float, _bounds("payload_kg")] = 0.0
+    dwell_s: Annotated[float, _bounds("dwell_s")] = DWELL_S
+    force_n: Annotated[float, _bounds("force_n")] = 0.0
+    release_s: Annotated[float, _bounds("release_s")] = 0.0
     """Earliest start."""
-    due_s: float | None = None
+    due_s: Annotated[float, _bounds("due_s")] | None = None
     """Soft deadline; null for none."""
-    value: float = 1.0
+    value: Annotated[float, _bounds("value")] = 1.0
     after: tuple[Name, ...] = ()
     """Jobs that must be finished before."""
 
     def __post_init__(self) -> None:
-        wanted = 2 if self.kind in ("pick_place", "sort") else 1
-        if len(self.places) != wanted:
-            raise ValueError(f"A {self.kind} needs {wanted} place(s), got {len(self.places)}.")
+        check_places(self, self.kind, self.places)
+        check_bounds(self, "repetitions", "payload_kg", "dwell_s", "force_n", "release_s", "due_s", "value")
+        check_duration(self, self.dwell_s, self.repetitions)
         if self.due_s is not None and self.due_s < self.release_s:
             raise ValueError(f"JobSpec.due_s must be >= release_s = {self.release_s:g} (got {self.due_s:g}).")
-        for name in ("payload_kg", "dwell_s", "force_n", "release_s", "due_s", "value"):
-            finite("JobSpec", name, (getattr(self, name),))
 
 
 Jobs = Annotated[tuple[JobSpec, ...], msgspec.Meta(min_length=1, max_length=MOST_JOBS)]
@@ -224,6 +226,9 @@ class Report(msgspec.Struct, frozen=True):
     unsure: bool = False
     """With `returned`: the arm crashed after it got permission to commit, so it is unknown whether the last cycle was
     done. The job becomes unfinished; another arm might do that cycle a second time."""
+    faulted: bool = False
+    """With `returned`: the arm faulted in this job. After two faults of one arm, or three of all arms, it is given
+    up."""
 
     def __post_init__(self) -> None:
         finite("Report", "time_s", (self.time_s,))
@@ -236,9 +241,12 @@ class Receipt(msgspec.Struct, frozen=True):
     award: Name
 
 
-JobState = Literal["waiting", "awarded", "finishing", "finished", "unfinished"]
+JobState = Literal["waiting", "awarded", "finishing", "finished", "unfinished", "given_up"]
 """waiting: for its release, its predecessors or an arm; finishing: in its last cycle; unfinished: the arm had
-permission to commit and is silent since, or the shift ended before the job was done."""
+permission to commit and is silent since, or the shift ended before the job was done; given_up: arms faulted in it too
+often."""
+SETTLED: tuple[JobState, ...] = ("finished", "unfinished", "given_up")
+"""States that need nothing more; only a late report that the job is finished may change the other two."""
 
 
 class JobStatus(msgspec.Struct, frozen=True):

@@ -33,7 +33,8 @@ class Bid(msgspec.Struct, frozen=True):
     open_count: Count
     """Number of jobs without an outcome, as far as this arm knows."""
     closed_count: Count = 0
-    """Number of jobs with an outcome known to this arm. A peer with a higher count sends the missing outcomes."""
+    """Number of jobs that this arm knows to be finished or unfinished. A peer with a higher count sends the missing
+    outcomes."""
     open_jobs: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
     """The first jobs without an outcome, by release and name. A peer that knows an outcome, or a missing job, sends
     it."""
@@ -58,6 +59,10 @@ class ClaimEntry(msgspec.Struct, frozen=True):
     """requested: not granted yet; finishing: requests permission to commit (to begin the last cycle), or has it."""
 
 
+Faults = Annotated[dict[Name, Name], msgspec.Meta(max_length=16)]
+"""Faults of arms in a job, as far as the sender knows: the arm, by award."""
+
+
 class JobOutcome(msgspec.Struct, frozen=True):
     """Outcome of a job, or of one attempt at it."""
 
@@ -65,12 +70,13 @@ class JobOutcome(msgspec.Struct, frozen=True):
     award: Name
     arm: Name
     """The arm that had the job."""
-    outcome: Literal["finished", "unfinished", "returned"]
-    """unfinished: the arm crashed after it got permission to commit, and no arm does the job again; returned: the job
-    is open again."""
+    outcome: Literal["finished", "unfinished", "given_up", "returned"]
+    """unfinished: the arm crashed after it got permission to commit, and no arm does the job again; given_up: arms
+    faulted in it too often; returned: the job is open again."""
     cycles: Count
     time_s: float
     reason: str = ""
+    faults: Faults = {}
 
     def __post_init__(self) -> None:
         finite("JobOutcome", "time_s", (self.time_s,))
@@ -97,6 +103,7 @@ class GrantedEntry(msgspec.Struct, frozen=True):
     """Cycles of the job known to be done."""
     may_commit: bool = False
     """Permission to commit, by this granter: the last cycle may begin, and it grants the job to no other arm."""
+    faults: Faults = {}
 
 
 class DeniedEntry(msgspec.Struct, frozen=True):

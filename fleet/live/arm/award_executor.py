@@ -253,10 +253,14 @@ class AwardExecutor:
         current.cycles = current.award.job.repetitions
         self._close(current, "finished", time_s, now_s, "")
 
-    def return_all(self, time_s: float, now_s: float, reason: str) -> None:
-        """Return every active award: the arm cannot continue."""
-        for active in self.active:
-            self._close(active, "returned", time_s, now_s, reason)
+    def return_all(self, time_s: float, now_s: float, reason: str, *, faulted: bool = False) -> None:
+        """Return every active award: the arm cannot continue.
+
+        Args:
+            faulted: Whether the arm faulted in the current job.
+        """
+        for number, active in enumerate(self.active):
+            self._close(active, "returned", time_s, now_s, reason, faulted=faulted and number == 0)
 
     def return_expired(self, time_s: float, now_s: float) -> None:
         """Return the awards whose lease expired more than `return_after_s` ago."""
@@ -265,10 +269,17 @@ class AwardExecutor:
                 self._close(active, "returned", time_s, now_s, f"no lease for {now_s - active.lease_end_s:.0f} s")
 
     def _close(
-        self, active: ActiveAward, outcome: Literal["finished", "returned"], time_s: float, now_s: float, reason: str
+        self,
+        active: ActiveAward,
+        outcome: Literal["finished", "returned"],
+        time_s: float,
+        now_s: float,
+        reason: str,
+        *,
+        faulted: bool = False,
     ) -> None:
         name = active.award.award
-        report = Report(self.arm, name, active.job, outcome, active.cycles, time_s, reason)
+        report = Report(self.arm, name, active.job, outcome, active.cycles, time_s, reason, faulted=faulted)
         del self._active[name]
         self._reports[name] = _PendingReport(active.award.auctioneer, report, now_s)
         self._write(closed(report))

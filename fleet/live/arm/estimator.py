@@ -14,7 +14,7 @@ import numpy as np
 from fleet.bus.protocol.auction import JobEstimate, JobSpec
 from fleet.difficulty import Difficulty, DifficultyModel
 from fleet.errors import InfeasibleJob
-from fleet.job import Job, Place, Work
+from fleet.job import LONGEST_JOB_S, Job, Place, Work
 from fleet.motion import Drive, Plan, drives, offered_plans
 from fleet.motor import gen3_motors
 from fleet.thermal import WINDING, gen3_network, temperature_steps, thermal_model
@@ -115,6 +115,10 @@ class Estimator:
             self._best[work, job.repetitions] = variants
             return
         best = offered_plans(variants, job.repetitions)[0]
+        if (takes_s := best.duration_s(job.repetitions)) > LONGEST_JOB_S:
+            days = f"it would take {takes_s / 86400:.1f} days; at most {LONGEST_JOB_S / 86400:g} are allowed"
+            self._best[work, job.repetitions] = f"{days}: use fewer repetitions"
+            return
         self._best[work, job.repetitions] = ScoredPlan(best, self.model.score(best, job.repetitions))
 
     def job(self, job: JobSpec) -> Job | None:

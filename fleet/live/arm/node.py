@@ -283,7 +283,7 @@ class ArmNode:
         elif event.kind == "return":
             self._body_award = ""
             self.executor.record_progress(int(event.value), math.inf)
-            self.executor.return_all(event.time_s, real_s, f"the arm faulted; {event.reason}")
+            self.executor.return_all(event.time_s, real_s, f"the arm faulted; {event.reason}", faulted=True)
             self._reading = self._body.read_sensors()  # the next estimates take the fault into account
         self._report_event(event)
 

@@ -166,7 +166,8 @@ class Auctioneer:
             if report.outcome == "finished" and not award.may_commit:
                 _LOG.error("'%s' finished '%s' without permission to commit.", report.arm, report.job)
             done_s, reason = min(report.time_s, time_s), report.reason[:MAX_REASON]
-            self._record(Closed(report.award, report.outcome, report.cycles, done_s, reason, report.unsure))
+            outcome = (report.award, report.outcome, report.cycles, done_s, reason, report.unsure)
+            self._record(Closed(*outcome, faulted=report.faulted))
             if report.outcome == "finished":
                 self._retry_now()
             else:

@@ -8,7 +8,7 @@ from itertools import accumulate, islice
 
 import networkx as nx
 
-from fleet.bus.protocol.auction import MOST_JOBS, Admission, JobSpec, JobStatus
+from fleet.bus.protocol.auction import MOST_JOBS, SETTLED, Admission, JobSpec, JobStatus
 from fleet.bus.protocol.messages import encode
 
 MAX_KEPT_JOBS = 10_000
@@ -106,6 +106,6 @@ def statuses_that_fit(statuses: Iterable[JobStatus]) -> tuple[JobStatus, ...]:
     """Return as many statuses as one message may contain; of more, those that may still change come first."""
     kept = list(statuses)
     if len(kept) > MOST_JOBS:
-        kept = sorted(kept, key=lambda status: status.state in ("finished", "unfinished"))[:MOST_JOBS]
+        kept = sorted(kept, key=lambda status: status.state in SETTLED)[:MOST_JOBS]
     sizes = accumulate(len(encode(status)) + 1 for status in kept)
     return tuple(status for status, size in zip(kept, sizes, strict=True) if size <= MAX_BYTES)

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 import msgspec
 from msgspec.structs import asdict, replace
 
-from fleet.bus.protocol.auction import Admission, JobSpec, JobState, JobStatus
+from fleet.bus.protocol.auction import SETTLED, Admission, JobSpec, JobState, JobStatus
+from fleet.job import reason_to_give_up
 from fleet.live.auction.job_rules import SHIFT_ENDED, admit, job_order, ready_jobs, reason_for_silence
 from fleet.live.journal import TimedState
 from fleet.live.journal_records import ClockTick, Closed, CommitPermitted, JobsAccepted, Started
@@ -81,6 +82,8 @@ class JobEntry(msgspec.Struct):
     """How many times an arm returned it."""
     returned_s: float = 0.0
     """Fleet time of the last return."""
+    faults: tuple[str, ...] = ()
+    """The arm of each fault in this job."""
 
 
 class AwardState(msgspec.Struct):
@@ -150,8 +153,8 @@ class Ledger(TimedState[AuctionRecord]):
         return frozenset(place for job in active for place in self.jobs[job].spec.places)
 
     def unsettled(self) -> list[str]:
-        """Return the names of jobs that are neither finished nor unfinished for good."""
-        return [name for name, entry in self.jobs.items() if entry.state not in ("finished", "unfinished")]
+        """Return the names of jobs that still need an arm or a report."""
+        return [name for name, entry in self.jobs.items() if entry.state not in SETTLED]
 
     def status(self, names: Iterable[str] = ()) -> list[JobStatus]:
         """Return the status of these jobs, without unknown ones; of all jobs if none is named."""
@@ -221,12 +224,14 @@ class Ledger(TimedState[AuctionRecord]):
         entry = self.jobs[award.record.job]
         if entry.state == "finished":
             return []
+        if record.faulted:
+            entry.faults += (award.record.arm,)
         entry.cycles = max(entry.cycles, min(record.cycles, entry.spec.repetitions))
         if record.outcome == "finished":
             self.open.pop(entry.award, None)  # a later award of the same job has no purpose any more
             entry.state, entry.award, entry.reason, entry.finished_s = "finished", record.award, "", record.time_s
-        elif entry.award != record.award:
-            return []  # the job was awarded again since
+        elif entry.award != record.award:  # the job was awarded again since
+            return [entry] if self._give_up(entry) else []
         elif record.unsure or self.ended:
             entry.state, entry.reason = "unfinished", record.reason or "It is unknown whether its last cycle was done."
         else:
@@ -234,7 +239,17 @@ class Ledger(TimedState[AuctionRecord]):
             if record.outcome == "returned":
                 entry.returns, entry.returned_s = entry.returns + 1, record.time_s
             entry.cycles = min(entry.cycles, entry.spec.repetitions - 1)  # the last cycle is never assumed done
+            self._give_up(entry)
         return [entry]
+
+    @staticmethod
+    def _give_up(entry: JobEntry) -> bool:
+        """Give a waiting job up if arms have faulted in it too often; return whether it is given up now."""
+        reason = reason_to_give_up(entry.faults)
+        if entry.state != "waiting" or not reason:
+            return False
+        entry.state, entry.reason = "given_up", reason
+        return True
 
     def _restore(self, snapshot: LedgerSnapshot) -> None:
         self.number, self.ended = snapshot.number, snapshot.ended

@@ -12,8 +12,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from fleet.bus.protocol.auction import MOST_JOBS, Ack, Award, JobSpec, Lease, Receipt, Report
-from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, JobOutcome
+from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, Faults, JobOutcome
 from fleet.errors import JournalError, Refused
+from fleet.job import reason_to_give_up
 from fleet.live.arm.award_executor import AwardExecutor
 from fleet.live.auction.round import Timing
 from fleet.live.consensus.granter import Granter
@@ -158,12 +159,14 @@ class Claimant:
         if sent is None or reply.arm not in self.granter.roster:
             return
         claim, asked_s, version = sent
+        jobs = {entry.award: entry.job for entry in claim.entries}
         self._answered[reply.arm] = max(version, self._answered.get(reply.arm, 0))
         for granted in reply.granted:
             if vote := self._votes.get(granted.award):
                 vote.granted_s[reply.arm] = max(asked_s, vote.granted_s.get(reply.arm, -math.inf))
                 vote.denied.discard(reply.arm)
                 vote.cycles = max(vote.cycles, granted.cycles)
+                self._add_faults(jobs[granted.award], granted.faults)
                 if granted.may_commit:
                     vote.may_commit.add(reply.arm)
         for denied in reply.denied:
@@ -196,7 +199,8 @@ class Claimant:
         outcomes: list[JobOutcome] = []
         for report, on_disk in self.executor.pending_reports():
             if on_disk:
-                outcomes.append(_outcome_of(report))
+                faults = self.granter.register.faults.get(report.job, {})
+                outcomes.append(_outcome_of(report, faults | ({report.award: self.arm} if report.faulted else {})))
                 self._receipts.setdefault(report.award, set())
             elif last := self._last_entries.get(report.award):
                 phase = "finishing" if last.phase == "finishing" else "working"
@@ -208,7 +212,9 @@ class Claimant:
         """Act on the replies of a majority."""
         for award, pending in list(self.pending.items()):
             vote = self._votes[award]
-            if len(vote.granted_s) >= self.majority:
+            if reason_to_give_up(self.granter.register.faults.get(pending.job.name, {}).values()):
+                self._reject(award)
+            elif len(vote.granted_s) >= self.majority:
                 self._accept(award, pending, vote, real_s)
             elif self._is_denied(vote):
                 self._reject(award)
@@ -261,6 +267,12 @@ class Claimant:
         if reports - self._receipts.keys():
             self._change()
 
+    def _add_faults(self, job: str, faults: Faults) -> None:
+        try:
+            self.granter.add_faults(job, faults)
+        except JournalError as error:
+            _LOG.error("Could not persist faults in '%s': %s", job, error)
+
     def _apply_outcome(self, outcome: JobOutcome) -> None:
         try:
             self.granter.apply_outcome(outcome)
@@ -268,7 +280,8 @@ class Claimant:
             _LOG.error("Could not persist outcome of '%s': %s", outcome.job, error)
 
 
-def _outcome_of(report: Report) -> JobOutcome:
-    """Return a report as a job outcome for peers."""
+def _outcome_of(report: Report, faults: Faults) -> JobOutcome:
+    """Return a report as a job outcome for peers; one that leaves the job open names all known faults in it."""
     outcome = "finished" if report.outcome == "finished" else "unfinished" if report.unsure else "returned"
-    return JobOutcome(report.job, report.award, report.arm, outcome, report.cycles, report.time_s, report.reason)
+    named = faults if outcome == "returned" else {}
+    return JobOutcome(report.job, report.award, report.arm, outcome, report.cycles, report.time_s, report.reason, named)

@@ -17,8 +17,17 @@ from dataclasses import dataclass, field
 import msgspec
 
 from fleet.bus.protocol.auction import Count, JobSpec, JobStatus, Name
-from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, DeniedEntry, GrantedEntry, JobOutcome
+from fleet.bus.protocol.consensus import (
+    Claim,
+    ClaimEntry,
+    ClaimReply,
+    DeniedEntry,
+    Faults,
+    GrantedEntry,
+    JobOutcome,
+)
 from fleet.errors import JournalFull, Refused
+from fleet.job import reason_to_give_up
 from fleet.live.auction.job_rules import reason_for_silence
 from fleet.live.auction.round import Timing
 from fleet.live.journal import TimedState
@@ -44,6 +53,13 @@ class JobSettled(msgspec.Struct, frozen=True, tag="job_settled"):
     settled: JobOutcome
 
 
+class Faulted(msgspec.Struct, frozen=True, tag="faulted"):
+    """Arms have faulted in a job."""
+
+    job: Name
+    faults: Faults
+
+
 class ClaimNumbered(msgspec.Struct, frozen=True, tag="claim_numbered"):
     """The last claim of an arm had this number."""
 
@@ -51,7 +67,7 @@ class ClaimNumbered(msgspec.Struct, frozen=True, tag="claim_numbered"):
     number: Count
 
 
-GrantRecord = JobGranted | Released | JobSettled | JobsAccepted | ClockTick | ClaimNumbered | Progress
+GrantRecord = JobGranted | Released | JobSettled | Faulted | JobsAccepted | ClockTick | ClaimNumbered | Progress
 
 
 @dataclass(eq=False)
@@ -73,7 +89,9 @@ class Register(TimedState[GrantRecord]):
     grants: dict[str, Grant] = field(default_factory=dict[str, Grant])
     """By job."""
     settled: dict[str, JobOutcome] = field(default_factory=dict[str, JobOutcome])
-    """By job; finished or unfinished for good."""
+    """By job; finished, unfinished for good, or given up."""
+    faults: dict[str, Faults] = field(default_factory=dict[str, Faults])
+    """Faults of arms, by job."""
     cycles: dict[str, int] = field(default_factory=dict[str, int])
     """Cycles known to be done, by job."""
     numbers: dict[str, int] = field(default_factory=dict[str, int])
@@ -97,9 +115,12 @@ class Register(TimedState[GrantRecord]):
             case JobSettled(outcome):
                 self._count(outcome.job, outcome.cycles)
                 self.time_s = max(self.time_s, outcome.time_s)
+                self._add_faults(outcome.job, outcome.faults)
                 if outcome.outcome != "returned":
                     self.settled[outcome.job] = outcome
                     self.grants.pop(outcome.job, None)
+            case Faulted(job, faults):
+                self._add_faults(job, faults)
             case JobsAccepted(jobs):
                 self.jobs |= {job.name: job for job in jobs}
             case ClockTick(time_s):
@@ -118,8 +139,22 @@ class Register(TimedState[GrantRecord]):
         for job, grant in self.grants.items():
             number, cycles = self.numbers.get(grant.arm, 0), self.cycles.get(job, 0)
             records.append(JobGranted(grant.arm, number, grant.award, job, grant.places, cycles, grant.may_commit))
+        records += [Faulted(job, faults) for job, faults in self.faults.items() if job not in self.settled]
         records += [JobSettled(outcome) for outcome in self.settled.values()]
         return tuple(records)
+
+    @property
+    def closed_count(self) -> int:
+        """Number of outcomes that nothing changes; a job that is given up may be finished after all."""
+        return sum(outcome.outcome != "given_up" for outcome in self.settled.values())
+
+    def knows(self, job: str, faults: Faults) -> bool:
+        """Return whether these faults in a job are known."""
+        return faults.keys() <= self.faults.get(job, {}).keys()
+
+    def _add_faults(self, job: str, faults: Faults) -> None:
+        if faults:
+            self.faults[job] = self.faults.get(job, {}) | faults
 
     def _count(self, job: str, cycles: int) -> None:
         self.cycles[job] = max(cycles, self.cycles.get(job, 0))
@@ -172,6 +207,7 @@ class Granter:
         self.add_jobs(claim.jobs)
         self._record([JobSettled(outcome) for outcome in claim.outcomes if self._is_new(outcome)])
         self._record(self._released(claim))
+        self._record(self._given_up(real_s))
         register.numbers[claim.arm] = claim.number
         granted: list[GrantedEntry] = []
         denied: list[DeniedEntry] = []
@@ -181,7 +217,8 @@ class Granter:
                 denied.append(DeniedEntry(entry.award, reason, register.settled.get(entry.job)))
             else:
                 may_commit = register.grants[entry.job].may_commit
-                granted.append(GrantedEntry(entry.award, register.cycles.get(entry.job, 0), may_commit))
+                cycles, faults = register.cycles.get(entry.job, 0), register.faults.get(entry.job, {})
+                granted.append(GrantedEntry(entry.award, cycles, may_commit, faults))
         return ClaimReply(self.arm, claim.number, self._timing.lease_s, tuple(granted), tuple(denied))
 
     def apply_outcome(self, outcome: JobOutcome) -> None:
@@ -192,6 +229,15 @@ class Granter:
         """
         if self._is_new(outcome):
             self._record([JobSettled(outcome)])
+
+    def add_faults(self, job: str, faults: Faults) -> None:
+        """Record faults in a job that a peer knows.
+
+        Raises:
+            JournalError: they are not on disk, and nothing has changed.
+        """
+        if not self.register.knows(job, faults):
+            self._record([Faulted(job, faults)])
 
     def add_jobs(self, jobs: tuple[JobSpec, ...], by: str = "") -> None:
         """Add submitted jobs.
@@ -223,6 +269,8 @@ class Granter:
         cycles = self.register.cycles.get(job, 0)
         if outcome is not None and outcome.outcome == "finished":
             return JobStatus(job, "finished", outcome.arm, outcome.award, cycles, outcome.time_s)
+        if outcome is not None and outcome.outcome == "given_up":
+            return JobStatus(job, "given_up", cycles=cycles, reason=outcome.reason)
         if outcome is not None:
             return JobStatus(job, "unfinished", outcome.arm, outcome.award, cycles, None, outcome.reason)
         if grant is None or not self.is_granted(job, real_s):
@@ -235,8 +283,22 @@ class Granter:
 
     def _is_new(self, outcome: JobOutcome) -> bool:
         if outcome.outcome == "returned":
-            return outcome.cycles > self.register.cycles.get(outcome.job, 0)
-        return outcome.job not in self.register.settled
+            more = outcome.cycles > self.register.cycles.get(outcome.job, 0)
+            return more or not self.register.knows(outcome.job, outcome.faults)
+        known = self.register.settled.get(outcome.job)
+        return known is None or (known.outcome, outcome.outcome) == ("given_up", "finished")
+
+    def _given_up(self, real_s: float) -> list[GrantRecord]:
+        """Outcomes of jobs that no arm has, and in which arms have faulted too often."""
+        register = self.register
+        outcomes: list[GrantRecord] = []
+        for job, faults in register.faults.items():
+            reason = reason_to_give_up(faults.values())
+            if reason and job not in register.settled and not self.is_granted(job, real_s):
+                award, cycles = max(faults), register.cycles.get(job, 0)
+                outcome = JobOutcome(job, award, faults[award], "given_up", cycles, register.time_s, reason)
+                outcomes.append(JobSettled(outcome))
+        return outcomes
 
     def _released(self, claim: Claim) -> list[GrantRecord]:
         kept = {entry.award for entry in claim.entries}

@@ -140,7 +140,7 @@ class Participant:
         for job in bid.open_jobs:
             if job in register.settled:
                 self.claimant.send_outcome(register.settled[job])
-        if bid.closed_count >= len(register.settled):
+        if bid.closed_count >= register.closed_count:
             self._behind_s.pop(bid.arm, None)
         elif real_s >= self._behind_s.setdefault(bid.arm, real_s) + 2 * BID_S:
             outcomes = list(register.settled.values())
@@ -242,7 +242,7 @@ class Participant:
             capacity=capacity,
             estimates=self._arm.estimate(tuple(ready)) if ready else (),
             open_count=len(open_jobs),
-            closed_count=len(self.granter.register.settled),
+            closed_count=self.granter.register.closed_count,
             open_jobs=tuple(open_jobs[:MAX_OPEN_JOBS]),
             choice=self._choice,
         )

@@ -13,9 +13,18 @@ import typer
 
 from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import Admission, JobSpec, JobStatus, Status, StatusRequest, Submission, SubmissionReply
+from fleet.bus.protocol.auction import (
+    SETTLED,
+    Admission,
+    JobSpec,
+    JobStatus,
+    Status,
+    StatusRequest,
+    Submission,
+    SubmissionReply,
+)
 from fleet.errors import BusError, FleetError, nearest
-from fleet.job import KINDS
+from fleet.job import BOUNDS, KINDS
 from fleet.live.monitor.snapshot import describe_status
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
 from scenarios.cli.signals import Stop, until_stopped
@@ -86,10 +95,14 @@ def _decode(raw: bytes, kind: type[Decoded], where: str) -> Decoded:
 
 def explain(error: Exception) -> str:
     """Sentence for an error of msgspec, with the field as the file names it."""
-    problem, _, path = str(error).rstrip(".").partition(" - at `$")
+    problem, _, path = str(error).partition(" - at `$")
+    problem = problem.rstrip(".")
     if unknown := _UNKNOWN_KIND.fullmatch(problem):
         problem = f"No kind of job '{unknown[1]}'{nearest(unknown[1], KINDS)}".rstrip(".")
     path = path.rstrip("`").lstrip(".")
+    bounds = BOUNDS.get(path.rpartition(".")[2])
+    if problem == "Number out of range" and bounds is not None:
+        problem = f"The number is too large; it must be {bounds}"
     return f"{problem}{f' (at {path})' if path else ''}."
 
 
@@ -143,7 +156,7 @@ def follow(link: BusClient, names: Sequence[str], stop: Stop) -> list[str]:
             if states.get(status.job) != status.state:
                 states[status.job] = status.state
                 typer.echo(describe_status(status))
-        if all(states.get(name) in ("finished", "unfinished") for name in names):
+        if all(states.get(name) in SETTLED for name in names):
             break
         if time.monotonic() > heard_s + PATIENCE_S:
             raise BusError(

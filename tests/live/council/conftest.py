@@ -140,12 +140,14 @@ class Arm:
 
     def fault(self) -> None:
         """Stop during a cycle, which then does not count."""
+        if self.executor.active:
+            self.fleet.faults.setdefault(self.executor.active[0].job, []).append(self.name)
         if self.cycle_ends_s is not None:
             first = self.executor.active[0].award.job
             if self.executor.active[0].cycles + 1 == first.repetitions:
                 self.fleet.last_cycles[first.name] -= 1
             self.cycle_ends_s = None
-        self.executor.return_all(0.0, self.real_s, "hot")
+        self.executor.return_all(0.0, self.real_s, "hot", faulted=True)
 
 
 class Fleet:
@@ -159,6 +161,8 @@ class Fleet:
         self.cut: set[str] = set()
         self.last_cycles: dict[str, int] = {}
         self.unsure_jobs: set[str] = set()
+        self.faults: dict[str, list[str]] = {}
+        """Arm of each fault, by job."""
         self.arms = {name: Arm(self, name, rate) for name, rate in zip(self.names, rates, strict=True)}
 
     def offer(self, arm: str, job: JobSpec) -> JobEstimate:
@@ -244,11 +248,13 @@ class Fleet:
         return None
 
     def settled(self) -> dict[str, str]:
-        """Return the outcomes that the arms know; they never differ."""
+        """Return the outcomes that the arms know; they never differ, but a job that is given up may be finished yet."""
         outcomes: dict[str, str] = {}
         for arm in self.arms.values():
             for job, outcome in arm.participant.granter.register.settled.items():
-                assert outcomes.setdefault(job, outcome.outcome) == outcome.outcome, job
+                if outcomes.setdefault(job, outcome.outcome) == "given_up":
+                    outcomes[job] = outcome.outcome
+                assert outcome.outcome in ("given_up", outcomes[job]), job
         return outcomes
 
 

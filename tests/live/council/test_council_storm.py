@@ -1,7 +1,8 @@
 """Arms without an auctioneer under faults: messages lost, repeated and late, crashes, network cuts, full disks.
 
 At any moment no two arms have a lease of one job or of one station, and no last cycle is done twice. After the faults
-every job is finished, or reported unfinished because of a crash after permission to commit.
+every job is finished, reported unfinished because of a crash after permission to commit, or given up because arms
+faulted in it.
 """
 
 import random
@@ -185,8 +186,10 @@ def storm(council, rates, seed: int, actions) -> None:
     for job in all_jobs:
         if outcomes.get(job.name) == "unfinished":
             assert job.name in fleet.unsure_jobs
+        elif outcomes.get(job.name) == "given_up":
+            assert len(fleet.faults[job.name]) >= 3 or len(set(fleet.faults[job.name])) < len(fleet.faults[job.name])
         elif job.name not in outcomes:
-            lost = {name for name, outcome in outcomes.items() if outcome == "unfinished"}
+            lost = {name for name, outcome in outcomes.items() if outcome != "finished"}
             assert waits_for(all_jobs, job, lost), f"{job.name} is neither finished nor lost"
         else:
             assert fleet.last_cycles[job.name] == 1

@@ -285,3 +285,34 @@ def test_a_request_without_replies_is_withdrawn():
     one.send_claim(0.0)
     assert one.send_claim(0.6).entries, "repeated for peers that have not replied"
     assert not one.send_claim(2.1).entries
+
+
+def receive_faults(one: One, **faults: dict[str, str]) -> None:
+    """Grant the request of an arm; each peer names the faults in the job that it knows."""
+    claimed = one.send_claim(0.0)
+    for peer, known in faults.items():
+        grants = tuple(GrantedEntry(each.award, 0, faults=known) for each in claimed.entries)
+        one.claimant.apply_reply(ClaimReply(peer, claimed.number, TIMING.lease_s, grants), 0.1)
+
+
+def test_an_arm_that_faults_names_the_faults_that_its_granters_know():
+    """Also after a restart; so every granter learns of all faults, and not each of its own only."""
+    one = One()
+    one.claimant.request(JOB, 0.0)
+    receive_faults(one, b={"b-1": "b"}, c={"c-1": "c"})
+    (active,) = one.executor.active
+    one.executor.return_all(1.0, 0.5, "hot", faulted=True)
+    for each in (one, One(disk=one.disk, grants=one.grants)):
+        (outcome,) = each.send_claim(0.6).outcomes
+        assert outcome.faults == {"b-1": "b", "c-1": "c", active.award.award: "a"}
+        assert each.granter.status("j", 0.6).state == "given_up"
+
+
+def test_a_request_is_withdrawn_if_the_granters_together_know_too_many_faults():
+    one = One()
+    one.claimant.request(JOB, 0.0)
+    receive_faults(one, b={"b-1": "b"}, c={"b-2": "b"})
+    assert not one.executor.active
+    assert one.claimant.rejected == ["j"]
+    assert not one.send_claim(0.2).entries
+    assert one.granter.status("j", 0.2).state == "given_up"

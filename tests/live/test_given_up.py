@@ -1,0 +1,195 @@
+"""A job in which arms fault too often is given up: by an auctioneer, and by arms that allocate without one."""
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet.bus.protocol.auction import JobSpec, Report, Submission
+from fleet.bus.protocol.consensus import Claim, ClaimEntry, JobOutcome
+from fleet.job import reason_to_give_up
+from fleet.live.arm.award_executor import AwardExecutor
+from fleet.live.arm.journal_records import ArmHistory
+from fleet.live.auction.auctioneer import Auctioneer
+from fleet.live.auction.ledger import AuctionRecord, Awarded, Ledger
+from fleet.live.consensus.granter import Granter, GrantRecord, Register
+from fleet.live.journal_records import Closed, JobsAccepted
+
+JOB = JobSpec(name="j", kind="hold", places=("x",), repetitions=9)
+NEXT = JobSpec(name="k", kind="hold", places=("x",), after=("j",))
+ROSTER = ("a", "b", "c", "d")
+attempts = st.lists(st.tuples(st.sampled_from("abcd"), st.sampled_from(["faulted", "returned", "refused", "dropped"])))
+
+
+def too_often(arms: list[str]) -> bool:
+    """The rule, counted in another way: an arm occurs twice, or there are three."""
+    return len(arms) > len(set(arms)) or len(arms) > 2
+
+
+@given(st.lists(st.sampled_from("abcd")))
+def test_two_faults_of_one_arm_or_three_of_all_are_too_many(arms):
+    reason = reason_to_give_up(arms)
+    assert bool(reason) == too_often(arms)
+    assert all(f"'{arm}' {arms.count(arm)} time" in reason for arm in arms) or not reason
+
+
+def awarded(number: int, arm: str) -> Awarded:
+    return Awarded(f"w{number}", "r", "j", arm, "q", 0, float(number))
+
+
+@settings(deadline=None)
+@given(attempts)
+def test_the_auctioneer_gives_a_job_up_at_that_fault_and_no_other_event(attempts):
+    """Against a list of faults; a replay of the journal, and of its snapshot, gives the same."""
+    written: list[AuctionRecord] = [JobsAccepted((JOB, NEXT), "test", 0.0)]
+    book, faults = Ledger().replay(written), list[str]()
+    for number, (arm, end) in enumerate(attempts, start=1):
+        if too_often(faults):
+            break
+        assert [job.name for job in book.ready(99.0, 9)] == ["j"]
+        outcome = "returned" if end == "faulted" else end
+        records = [
+            awarded(number, arm),
+            Closed(f"w{number}", outcome, 1, float(number), "hot", faulted=end == "faulted"),
+        ]
+        written += records
+        for record in records:
+            book.apply(record)
+        faults += [arm] if end == "faulted" else []
+    for ledger in (book, Ledger().replay(written), Ledger().replay(book.compact())):
+        (status,) = ledger.status(["j"])
+        assert status.state == ("given_up" if too_often(faults) else "waiting")
+        if too_often(faults):
+            assert status.reason == reason_to_give_up(faults)
+            assert (status.arm, status.award) == ("", "")
+            assert not ledger.ready(99.0, 9), "nor can its successor begin"
+            assert ledger.unsettled() == ["k"]
+
+
+def test_faults_of_lost_arms_count_when_they_are_reported_late():
+    book = Ledger().replay([JobsAccepted((JOB,), "test", 0.0)])
+    for number in (1, 2):
+        book.apply(awarded(number, "a"))
+        book.apply(Closed(f"w{number}", "dropped", 0, float(number)))
+    book.apply(Closed("w1", "returned", 0, 3.0, faulted=True))
+    assert book.status()[0].state == "waiting"
+    (change,) = book.apply(Closed("w2", "returned", 0, 4.0, faulted=True))
+    assert change.status.state == "given_up"
+    (change,) = book.apply(Closed("w2", "finished", 9, 5.0))
+    assert change.status.state == "finished", "it was done after all"
+
+
+def test_a_late_fault_does_not_take_the_job_from_another_arm():
+    book = Ledger().replay([JobsAccepted((JOB,), "test", 0.0)])
+    for number, arm in enumerate("ab", start=1):
+        book.apply(awarded(number, arm))
+        book.apply(Closed(f"w{number}", "dropped", 0, 1.0))
+    book.apply(awarded(3, "c"))
+    for number in (1, 2):
+        assert not book.apply(Closed(f"w{number}", "returned", 0, 3.0, faulted=True))
+    assert book.status()[0].state == "awarded"
+    book.apply(Closed("w3", "returned", 0, 4.0, faulted=True))
+    assert book.status()[0].state == "given_up"
+
+
+def test_reports_of_faults_give_a_job_up_with_a_result_and_on_disk():
+    disk: list[AuctionRecord] = []
+    auctioneer = Auctioneer(
+        "x", Ledger(), allocate=lambda _: {}, keep=lambda *records: disk.extend(records), boot="1", real_s=0.0
+    )
+    auctioneer.submit(Submission((JOB,)), 0.0, 0.0)
+    for number in (1, 2):
+        disk.append(awarded(number, "a"))
+        auctioneer.ledger.apply(disk[-1])
+        report = Report("a", f"w{number}", "j", "returned", number, float(number), "joint 2 at 75 °C", faulted=True)
+        for _ in range(2):  # a repeated report counts once
+            auctioneer.apply_report(report, 0.0, float(number))
+        assert auctioneer.status()[0].state == ("waiting" if number == 1 else "given_up")
+    assert auctioneer.out[-1].status.reason == "Given up, because arms faulted in it: 'a' 2 times."
+    content = msgspec.json.decode(msgspec.json.encode(disk), type=list[AuctionRecord])
+    assert Ledger().replay(content).status() == list(auctioneer.status())
+
+
+def test_only_the_current_job_of_a_faulted_arm_counts_and_a_restart_keeps_it(live_awards):
+    executor, disk = live_awards
+    executor.return_all(5.0, 1.0, "too hot", faulted=True)
+    again = AwardExecutor("a", disk.extend, ArmHistory().replay(disk).after_restart("a", 9.0), nonce="m")
+    for reports in (executor.due_reports(2.0), again.due_reports(2.0)):
+        assert [(report.job, report.faulted) for _, report in reports] == [("j", True), ("k", False)]
+
+
+@pytest.fixture
+def live_awards():
+    """An arm with two awards, and its disk."""
+    from fleet.bus.protocol.auction import Award
+    from fleet.live.arm.award_executor import ExecutorConfig
+
+    disk: list = []
+    executor = AwardExecutor(
+        "a", lambda *records: disk.extend(records), ArmHistory(), nonce="n", config=ExecutorConfig(capacity=2)
+    )
+    for job in (JOB, NEXT):
+        quote = executor.add_quote({job.name: (job, True)}, 0.0)
+        assert executor.answer_award(Award(f"w:{job.name}", "r", "x", quote, job), 0.0).accepted
+    return executor, disk
+
+
+# without an auctioneer
+
+
+def granter_of(disk: list[GrantRecord]) -> Granter:
+    register = Register().replay(disk)
+    return Granter("d", ROSTER, register, lambda *records: disk.extend(records), real_s=0.0)
+
+
+def attempt(granter: Granter, arm: str, number: int, faults: dict[str, str]) -> str:
+    """An arm gets the job, faults, and names all faults that it knows then; return the state of the job."""
+    award = f"{arm}-{number}"
+    asked = granter.answer_claim(Claim(arm, 2 * number, (ClaimEntry(award, "j", ("x",), 0, "requested"),)), 0.0)
+    assert [each.award for each in asked.granted] == [award]
+    returned = JobOutcome("j", award, arm, "returned", 0, 1.0, "hot", faults | {award: arm})
+    granter.answer_claim(Claim(arm, 2 * number + 1, (), (returned,)), 0.0)
+    return granter.status("j", 0.0).state
+
+
+@given(st.lists(st.sampled_from("abc"), min_size=1))
+def test_an_arm_grants_a_job_until_arms_have_faulted_in_it_too_often(arms):
+    disk: list[GrantRecord] = []
+    granter, done = granter_of(disk), list[str]()
+    for number, arm in enumerate(arms):
+        done.append(arm)
+        state = attempt(granter, arm, number, {})
+        assert state == ("given_up" if too_often(done) else "waiting")
+        if state == "given_up":
+            break
+    for each in (granter, granter_of(disk), granter_of(list(granter.register.compact()))):
+        assert each.status("j", 99.0).state == ("given_up" if too_often(done) else "waiting")
+        reply = each.answer_claim(Claim("a", 999, (ClaimEntry("a-999", "j", ("x",), 0, "requested"),)), 99.0)
+        if too_often(done):
+            assert not reply.granted
+            assert reply.denied[0].outcome.outcome == "given_up"
+            assert reply.denied[0].outcome.reason == reason_to_give_up(done)
+        else:
+            assert reply.granted[0].faults == {f"{arm}-{number}": arm for number, arm in enumerate(arms)}
+
+
+def test_faults_known_to_different_arms_are_added_up():
+    granter = granter_of([])
+    assert attempt(granter, "a", 0, {}) == "waiting"
+    assert attempt(granter, "b", 1, {"c-7": "c"}) == "given_up", "b has heard of a fault of c"
+
+
+def test_a_job_that_an_arm_has_is_not_given_up_and_finishing_it_counts_more():
+    granter = granter_of([])
+    assert attempt(granter, "a", 0, {}) == "waiting"
+    have = ClaimEntry("b-1", "j", ("x",), 0, "working")
+    granter.answer_claim(Claim("b", 1, (have,)), 0.0)
+    granter.add_faults("j", {"a-9": "a"})  # heard late
+    assert granter.answer_claim(Claim("b", 2, (have,)), 0.1).granted
+    assert granter.status("j", 0.1).state == "awarded"
+    granter.answer_claim(Claim("b", 3, ()), 0.2)  # b releases it
+    assert granter.status("j", 0.2).state == "given_up"
+    granter.apply_outcome(JobOutcome("j", "b-1", "b", "finished", 9, 3.0))
+    assert granter.status("j", 0.3).state == "finished"
+    granter.apply_outcome(JobOutcome("j", "b-1", "b", "given_up", 9, 3.0))
+    assert granter.status("j", 0.3).state == "finished"
