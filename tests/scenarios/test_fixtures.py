@@ -5,7 +5,9 @@ from dataclasses import replace
 import pytest
 
 from fleet.errors import ScenarioError
+from fleet.events import Event
 from fleet.job import Fixture
+from fleet.physics.contacts import ContactFinder
 from scenarios.cell_layout import cell_of
 from scenarios.cli.run import metrics_table
 from scenarios.load import load, override
@@ -43,14 +45,14 @@ def test_work_that_no_arm_can_do_for_a_fixture_is_refused_with_the_reason(small,
 
 
 @pytest.mark.parametrize("plant", ["profile", "mujoco"])
-def test_contacts_are_counted_by_the_plant_that_finds_them(small, plans, plant):
-    """The arms of the small cell reach for the same bench, so their hands meet."""
-    scenario = override(small, horizon_s=60.0)
-    fleet = prepare(scenario, difficulty="blind", cache=plans)
+def test_contacts_are_counted_by_the_plant_that_finds_them(small, plans, plant, monkeypatch):
+    """One contact in every step, made up."""
+    touch = Event(time_s=1.0, kind="contact", arm="left", value=3.0)
+    monkeypatch.setattr(ContactFinder, "events", lambda *_: [touch])
+    fleet = prepare(override(small, horizon_s=60.0), difficulty="blind", cache=plans)
     result = run(fleet, RunSpec(policy="round_robin", plant=plant, bus="memory", difficulty="blind"), record=False)
-    events = [event for event in result.events if event.kind == "contact"]
-    assert result.metrics.contacts == (len(events) if plant == "mujoco" else None)
-    assert bool(events) == (plant == "mujoco")
-    assert all(event.arm in ("left", "right") and event.value > 0 for event in events)
+    steps = 6 if plant == "mujoco" else 0
+    assert result.metrics.contacts == (steps or None)
+    assert result.events.count(touch) == steps
     figures = list(metrics_table({"round_robin": result.metrics}).columns[0].cells)
     assert ("contacts" in figures) == (plant == "mujoco")
