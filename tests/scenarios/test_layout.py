@@ -154,3 +154,13 @@ def test_every_work_of_the_library_has_a_volume(cache):
     scenario = load("heat_wave")
     fleet = prepare(scenario, difficulty="blind", cache=cache)
     assert {work for _, work, _, _ in fleet.space.volume} == set(all_works(scenario))
+
+
+def test_stations_side_by_side_are_for_one_arm_at_a_time(cache):
+    close = {"middle": (0.0, 0.0, 0.25), "beside": (0.0, 0.12, 0.25)}
+    report = layout_report(cell(*APART, places=close))
+    assert len(report.at_once) == 1
+    (pair, *_) = [pair for pair in report.exclusions if not pair.same_place]
+    assert (set(pair.jobs), pair.share) == ({"hold_middle", "hold_beside"}, 1.0)
+    apart = layout_report(cell(*APART, places={"left": (-0.9, 0.3, 0.25), "right": (0.9, 0.3, 0.25)}))
+    assert (len(apart.at_once), apart.excluded_share, apart.exclusions) == (2, 0.0, ())
