@@ -1,8 +1,16 @@
-"""`thermofleet list` and `thermofleet show`."""
+"""`thermofleet list`, `thermofleet show` and `thermofleet layout`."""
 
-from scenarios.cli.options import JsonOption, ScenarioArg
-from scenarios.cli.terminal import out_console, plain_table, print_json, progress_bar
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fleet.errors import FleetError
+from fleet.files import atomic_path
+from scenarios.cli.options import JsonOption, OverwriteOption, ScenarioArg
+from scenarios.cli.terminal import out_console, plain_table, print_json, progress_bar, say
 from scenarios.load import library, load
+from scenarios.result_folder import check_overwrite, disk_errors
 
 
 def list_command(as_json: JsonOption = False) -> None:
@@ -29,3 +37,46 @@ def show_command(scenario: ScenarioArg, as_json: JsonOption = False) -> None:
         parts = describe(chosen, progress)
     for part in parts:
         out_console.print(part)
+
+
+def layout_command(
+    scenario: ScenarioArg,
+    out: Annotated[Path | None, typer.Option(help="Draw the cell from above as this PNG file.")] = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Show what each arm reaches, which jobs exclude each other in space, and how many arms can work at once.
+
+    Exits with 2 if the cell has a problem, for example arms at home that are too close; lists all problems.
+    """
+    from scenarios.report.layout import layout_report, layout_scene
+    from scenarios.report.layout_tables import layout_tables
+
+    chosen = load(scenario)
+    if out is not None:
+        if out.suffix.lower() != ".png":
+            raise FleetError(f"--out must end in .png (got '{out}').")
+        if out.is_dir():
+            raise FleetError(f"Cannot write to '{out}': it is a folder.")
+        check_overwrite(out, overwrite)
+    with progress_bar() as progress:
+        report = layout_report(chosen, progress)
+    if as_json:
+        print_json(report)
+    else:
+        for part in layout_tables(chosen, report):
+            out_console.print(part)
+    if out is not None:
+        from matplotlib.image import imsave
+
+        from fleet.env.render.picture import Picture
+
+        with disk_errors(out):
+            out.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_path(out) as file:
+                imsave(file, Picture().frame(layout_scene(chosen, report)), format="png")
+        say(f"Drew the cell: {out}.")
+    for problem in report.problems:
+        say(f"Error: {problem}")
+    if report.problems:
+        raise typer.Exit(2)

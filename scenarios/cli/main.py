@@ -43,6 +43,7 @@ COMMANDS = {
     "run": LazyCommand(_LOOK, "run:run_command", "Run one shift of a scenario and record it."),
     "list": LazyCommand(_LOOK, "library:list_command", "List the scenarios that come with thermofleet."),
     "show": LazyCommand(_LOOK, "library:show_command", "Show a scenario: arms, jobs, thermal load factor."),
+    "layout": LazyCommand(_LOOK, "library:layout_command", "Show reach, space and problems of a cell."),
     "animate": LazyCommand(_LOOK, "animate:animate_command", "Draw one shift as a GIF."),
     "compare": LazyCommand(_POLICIES, "compare:compare_command", "Compare policies on the same seeds."),
     "train": LazyCommand(_POLICIES, "train:train_command", "Train a policy by reinforcement learning."),

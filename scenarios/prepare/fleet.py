@@ -24,6 +24,7 @@ from fleet.motion import Plan
 from fleet.motor import thermal_data
 from fleet.planning.plan_cache import rest_torque
 from fleet.planning.space import SpaceTable, collisions_of_homes, space_table
+from fleet.robot import Robot
 from fleet.seeding import shift_seeds
 from scenarios.cell_layout import cell_of, near_of
 from scenarios.extras import require_extra
@@ -69,13 +70,13 @@ def prepare(
         MissingExtra: twins are wanted, and their libraries are not installed.
     """
     arms, refused = _arms(scenario, range(len(scenario.arms)), difficulty, cache, progress, every_work=True)
-    return Fleet(scenario, tuple(arms), tuple(refused), space_of(scenario, arms, _folder(cache)))
-
-
-def space_of(scenario: Scenario, arms: Sequence[Arm], folder: Path) -> SpaceTable:
-    """Space of the plans of a scenario's arms; cached in `folder`."""
-    robots = [arm.robot for arm in arms]
     plans = [plan for arm in arms for variants in arm.plans.values() for plan in variants]
+    space = space_of(scenario, [arm.robot for arm in arms], plans, _folder(cache))
+    return Fleet(scenario, tuple(arms), tuple(refused), space)
+
+
+def space_of(scenario: Scenario, robots: Sequence[Robot], plans: Sequence[Plan], folder: Path) -> SpaceTable:
+    """Space of the plans of a scenario's arms; cached in `folder`."""
     return space_table(robots, plans, scenario.clearance_m, folder / "plans")
 
 
@@ -113,12 +114,11 @@ def _arms(
     if choose("difficulty", difficulty, DifficultyName) == "twin":
         require_extra("twin")
     folder = _folder(cache)
-    _check_homes(scenario, folder)
     asked = all_works(scenario)
     works = rehearsal_works(scenario) if difficulty == "twin" else asked
     planned = plan_arms(scenario, indices, works, folder, progress)
-    if every_work:
-        _check_feasible(scenario, planned)
+    if problems := problems_of(scenario, planned if every_work else (), folder):
+        raise ScenarioError("\n".join(problems))
     working = [replace(arm, plans={w: arm.plans[w] for w in asked if w in arm.plans}) for arm in planned]
     models: Sequence[DifficultyModel] = [Blind()] * len(planned)
     if difficulty == "twin":
@@ -148,35 +148,45 @@ def _folder(cache: str | Path | None) -> Path:
     return folder
 
 
-def _check_homes(scenario: Scenario, folder: Path) -> None:
-    """Raise a ScenarioError that names all arms that are too close to each other or inside a fixture at home."""
-    robots = [spec.robot() for spec in scenario.arms]
-    close = collisions_of_homes(robots, scenario.clearance_m, folder / "plans")
-    if sentences := [*close, *homes_in_fixtures(scenario)]:
-        raise ScenarioError(
-            f"{scenario.name}.toml: arms: {'; '.join(sentences)}; move or turn the arms or fixtures, give the "
-            "arms another `home`, or lower clearance_m."
-        )
-
-
 REASONS = 4
 """Maximum number of reasons in one error message."""
 
 
-def _check_feasible(scenario: Scenario, arms: Sequence[PlannedArm]) -> None:
-    """Raise a ScenarioError if no arm can do the work of some job stream; names the reason for each arm."""
+def problems_of(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) -> list[str]:
+    """Everything in a scenario that cannot work, one sentence each.
+
+    Args:
+        arms: With plans for all works; the work of a stream that none can do is a problem. If there are none, only
+            the arms at home are compared.
+        folder: Of the cache.
+    """
+    file = f"{scenario.name}.toml"
+    robots = [spec.robot() for spec in scenario.arms]
+    near = collisions_of_homes(robots, scenario.clearance_m, folder / "plans")
+    problems = [
+        f"{file}: arms: {sentence}; move or turn an arm, give it another `home`, or lower clearance_m."
+        for sentence in near
+    ]
+    problems += [
+        f"{file}: {sentence}; move the arm or the fixture, or give the arm another `home`."
+        for sentence in homes_in_fixtures(scenario)
+    ]
     infeasible = [error for arm in arms for error in arm.infeasible]
-    for i, stream in enumerate(scenario.jobs):
+    for i, stream in enumerate(scenario.jobs if arms else ()):
         here = [error for error in infeasible if error.place in stream.places]
         reasons = list(dict.fromkeys(f"{error.arm} at '{error.place}': {error.reason}" for error in here))
-        for work in works_of(scenario, stream):
-            if any(work in arm.plans for arm in arms):
-                continue
+        if near and any(reason.endswith("at home") for reason in reasons):
+            continue  # it may be possible once the homes are apart
+        loads = [
+            f"{work.payload_kg:g}" for work in works_of(scenario, stream) if not any(work in arm.plans for arm in arms)
+        ]
+        if loads:
             more = f"; and {len(reasons) - REASONS} more" if len(reasons) > REASONS else ""
-            raise ScenarioError(
-                f"{scenario.name}.toml: jobs[{i}].places: no arm can do '{stream.name}' with {work.payload_kg:g} kg "
+            problems.append(
+                f"{file}: jobs[{i}].places: no arm can do '{stream.name}' with {' or '.join(loads)} kg "
                 f"({'; '.join(reasons[:REASONS])}{more}); move the places or an arm, or make the load lighter."
             )
+    return problems
 
 
 def _with_oracle(scenario: Scenario, arm: Arm) -> Arm:

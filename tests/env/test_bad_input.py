@@ -300,7 +300,10 @@ def test_options_of_wrong_type_are_refused_with_the_valid_type(cell, folder) -> 
 
 
 def test_variants_with_other_arms_are_refused(cell, folder) -> None:
-    arms = [{"name": a.name, "position_m": list(a.position_m), "tilt_deg": list(a.tilt_deg)} for a in cell.arms]
+    arms = [
+        {"name": a.name, "position_m": list(a.position_m), "tilt_deg": list(a.tilt_deg), "home": a.home}
+        for a in cell.arms
+    ]
     other = [dict(arms[0], name="west"), *arms[1:]]
     stream = {"name": "x", "kind": "hold", "places": ["bench"], "arrivals": {"kind": "batch", "count": 1}}
     refused = {

@@ -1,0 +1,192 @@
+"""Layout of a cell: what each arm reaches, which works exclude each other, how many arms can work at once."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.optimize import Bounds, LinearConstraint, milp
+from scipy.sparse import csr_array
+
+from fleet.files import cache_folder
+from fleet.motion import Plan
+from fleet.planning.space import SpaceTable
+from scenarios.cell_layout import cell_of
+from scenarios.job_stream import all_works, works_of
+from scenarios.prepare.fleet import problems_of, space_of
+from scenarios.prepare.planned_arm import PlannedArm, plan_arms
+from scenarios.progress import Progress, quiet
+from scenarios.schema import Scenario
+
+if TYPE_CHECKING:
+    from fleet.env.render.scene import Scene
+
+Array = np.ndarray
+SEARCH_S = 20.0
+"""Time limit of the search for the most arms at work at once."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reach:
+    """What one arm can do at one place."""
+
+    arm: str
+    place: str
+    payload_kg: float | None
+    """Heaviest payload of the scenario's jobs at this place that the arm can carry; None if it can do none."""
+    reason: str = ""
+    """Why it cannot do some of them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exclusion:
+    """How much the jobs of two streams exclude each other when two arms do them."""
+
+    jobs: tuple[str, str]
+    """Names of the streams."""
+    arms: tuple[str, str]
+    share: float
+    """Share of the pairs of plans that come too close to each other."""
+    same_place: bool
+    """Whether both need one station, which one arm at a time may use."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Assignment:
+    """One work of one arm among those done at the same time."""
+
+    arm: str
+    job: str
+    places: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LayoutReport:
+    """What `thermofleet layout` shows."""
+
+    scenario: str
+    clearance_m: float
+    reach: tuple[Reach, ...]
+    exclusions: tuple[Exclusion, ...]
+    excluded_share: float
+    """Share of the pairs of plans of two arms that exclude each other."""
+    at_once: tuple[Assignment, ...]
+    """A largest set of works that different arms can do at the same time, each at its own stations."""
+    problems: tuple[str, ...]
+
+
+def layout_report(scenario: Scenario, progress: Progress = quiet) -> LayoutReport:
+    """The layout of a scenario's cell. Plans the scenario's work (cached); problems are part of the result."""
+    folder = cache_folder()
+    arms = plan_arms(scenario, range(len(scenario.arms)), all_works(scenario), folder, progress)
+    problems = problems_of(scenario, arms, folder)
+    plans = [plan for arm in arms for plan in arm.all_plans]
+    space = space_of(scenario, [arm.hardware.robot for arm in arms], plans, folder)
+    exclusions = _exclusions(scenario, plans, space)
+    pairs = _pairs_of_arms(plans)
+    volumes, conflicts = space.rows(plans)
+    close = conflicts[np.ix_(volumes, volumes)][pairs]
+    return LayoutReport(
+        scenario=scenario.name,
+        clearance_m=scenario.clearance_m,
+        reach=tuple(_reach(scenario, arm, place.name) for place in scenario.places for arm in arms),
+        exclusions=exclusions,
+        excluded_share=float(close.mean()) if close.size else 0.0,
+        at_once=_most_at_once(scenario, plans, space),
+        problems=tuple(problems),
+    )
+
+
+def layout_scene(scenario: Scenario, report: LayoutReport) -> "Scene":
+    """The cell with the arms that can work at once at their stations, for `fleet.env.render.picture.Picture`."""
+    from fleet.env.render.scene import Scene
+    from fleet.telemetry import IDLE, WORKING
+
+    cell = cell_of(scenario)
+    busy = {work.arm: work for work in report.at_once}
+    start_c = float(scenario.ambient.at(np.zeros(1))[0])
+    return Scene(
+        cell=cell,
+        time_s=0.0,
+        horizon_s=scenario.horizon_s,
+        temp_c=np.full((len(cell.arms), 7), start_c),
+        warning_c=scenario.limits.warning_c,
+        error_c=scenario.limits.error_c,
+        mode=tuple(WORKING if arm in busy else IDLE for arm in cell.arms),
+        job=tuple(busy[arm].job if arm in busy else "" for arm in cell.arms),
+        progress=(0.0,) * len(cell.arms),
+        at=tuple(busy[arm].places if arm in busy else () for arm in cell.arms),
+        queue=(),
+        waiting=0,
+        finished=0,
+        faults=0,
+        title=f"{scenario.name}: {len(busy)} arms at work at once",
+    )
+
+
+def _reach(scenario: Scenario, arm: PlannedArm, place: str) -> Reach:
+    name = arm.hardware.robot.name
+    works = [work for work in all_works(scenario) if place in work.stations]
+    able = [work.payload_kg for work in works if work in arm.plans]
+    reasons = dict.fromkeys(error.reason for error in arm.infeasible if error.place == place)
+    return Reach(arm=name, place=place, payload_kg=max(able, default=None), reason="; ".join(reasons))
+
+
+def _pairs_of_arms(plans: Sequence[Plan]) -> Array:
+    """Which pairs of plans are of two arms, each pair once, bool [plan, plan]."""
+    arms = np.array([plan.arm for plan in plans])
+    return np.triu(arms[:, None] != arms)
+
+
+def _streams(scenario: Scenario, plans: Sequence[Plan]) -> list[str]:
+    """Name of the first stream that each plan serves."""
+    streams = {work: s.name for s in reversed(scenario.jobs) for work in works_of(scenario, s)}
+    return [streams[plan.work] for plan in plans]
+
+
+def _exclusions(scenario: Scenario, plans: Sequence[Plan], space: SpaceTable) -> tuple[Exclusion, ...]:
+    """Every two streams of two arms with plans that exclude each other, the most excluding first."""
+    volumes, conflicts = space.rows(plans)
+    groups: dict[tuple[str, str], list[int]] = {}
+    for row, (plan, stream) in enumerate(zip(plans, _streams(scenario, plans), strict=True)):
+        groups.setdefault((plan.arm, stream), []).append(row)
+    exclusions = []
+    for (one, rows), (other, others) in combinations(groups.items(), 2):
+        share = float(conflicts[np.ix_(volumes[rows], volumes[others])].mean())
+        if one[0] == other[0] or not share:
+            continue
+        same = not set(plans[rows[0]].work.stations).isdisjoint(plans[others[0]].work.stations)
+        exclusions.append(Exclusion(jobs=(one[1], other[1]), arms=(one[0], other[0]), share=share, same_place=same))
+    return tuple(sorted(exclusions, key=lambda pair: (-pair.share, pair.same_place, pair.jobs, pair.arms)))
+
+
+def _most_at_once(scenario: Scenario, plans: Sequence[Plan], space: SpaceTable) -> tuple[Assignment, ...]:
+    """A largest set of volumes without conflicts and with different stations; an integer program."""
+    volumes, conflicts = space.rows(plans)
+    used, first = np.unique(volumes, return_index=True)
+    if not len(used):
+        return ()
+    stations = [set(plans[row].work.stations) for row in first]
+    rows = []  # groups of volumes of which at most one is chosen
+    arms = np.array([plans[row].arm for row in first])
+    for arm in dict.fromkeys(arms.tolist()):
+        rows.append(np.flatnonzero(arms == arm))
+    for station in dict.fromkeys(name for own in stations for name in own):
+        rows.append(np.flatnonzero([station in own for own in stations]))
+    rows += [
+        np.array(pair) for pair in np.argwhere(np.triu(conflicts[np.ix_(used, used)], 1)) if len({*arms[pair]}) > 1
+    ]
+    columns = np.concatenate(rows)
+    lengths = np.repeat(np.arange(len(rows)), [len(row) for row in rows])
+    matrix = csr_array((np.ones(len(columns)), (lengths, columns)), shape=(len(rows), len(used)))
+    result = milp(
+        -np.ones(len(used)),
+        integrality=np.ones(len(used)),
+        bounds=Bounds(0, 1),
+        constraints=LinearConstraint(matrix, ub=1.0),
+        options={"time_limit": SEARCH_S},
+    )
+    chosen = [] if result.x is None else first[result.x > 0.5].tolist()
+    streams = _streams(scenario, plans)
+    return tuple(Assignment(arm=plans[i].arm, job=streams[i], places=plans[i].work.stations) for i in chosen)
