@@ -1,0 +1,109 @@
+"""Whether arms ever touch, and what it costs to know before: contacts in shifts, and time to compare all plans.
+
+    python benchmarks/bench_space.py [--seeds 5] [--policies all] [--scenarios all] [--mujoco-s 1800]
+
+Every shift is played on the profile plant and its recorded postures, one each second, are given to MuJoCo, which finds
+contacts of arms, floor and fixtures; the plant `mujoco` is played for `--mujoco-s` seconds of each and looks at 100
+postures a second. The time to compare the plans is that of one core with nothing cached but the plans.
+"""
+
+import argparse
+import shutil
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from agents.registry import RULES
+from fleet.files import cache_folder
+from fleet.physics.contacts import ContactFinder
+from fleet.physics.models import build_cell
+from fleet.robot import Mount, Robot
+from scenarios.load import library, load
+from scenarios.prepare.fleet import Fleet, prepare, space_of
+from scenarios.run.shift import RunSpec, run
+
+SIXTEEN = 4
+"""Cells of four arms that stand beside each other, for the larger table."""
+APART_M = 2.0
+
+
+def shifts(fleet: Fleet, policies: list[str], seeds: range, mujoco_s: float) -> None:
+    """Print the contacts of the shifts of one scenario."""
+    scenario, robots = fleet.scenario, [arm.robot for arm in fleet.arms]
+    model = build_cell(robots, scenario.places, scenario.fixtures)
+    short = Fleet(replace(scenario, horizon_s=min(mujoco_s, scenario.horizon_s)), fleet.arms, (), fleet.space)
+    instants = touching = contacts = 0
+    for policy in policies:
+        for seed in seeds:
+            spec = RunSpec(policy=policy, seed=seed, bus="memory", difficulty="blind")
+            told = run(fleet, spec).telemetry
+            assert told is not None
+            finder = ContactFinder(model, robots)
+            found = finder.events(told.time_s, told.q, np.zeros(told.q.shape[:2]))
+            instants, touching = instants + len(told.time_s), touching + len(found)
+            contacts += run(short, replace(spec, plant="mujoco"), record=False).metrics.contacts or 0
+    print(f"{scenario.name:<16}{len(policies) * len(seeds):>8}{instants:>12}{touching:>10}{contacts:>10}", flush=True)
+
+
+def tables(names: list[str]) -> None:
+    """Print the time that the comparison of all plans takes."""
+    for name in names:
+        fleet = prepare(load(name), difficulty="blind")
+        for cells in (1, SIXTEEN):
+            arms = [_beside(arm.robot, n) for n in range(cells) for arm in fleet.arms]
+            plans = [
+                replace(plan, arm=robot.name)
+                for n in range(cells)
+                for arm, robot in zip(fleet.arms, arms[n * len(fleet.arms) :], strict=False)
+                for variants in arm.plans.values()
+                for plan in variants
+            ]
+            folder = Path(tempfile.mkdtemp())
+            try:
+                from fleet.planning.space import space_table
+
+                began = time.process_time()
+                table = space_table(arms, plans, fleet.scenario.clearance_m, folder)
+                took_s = time.process_time() - began
+            finally:
+                shutil.rmtree(folder)
+            share = table.conflicts[~_same_arm(table, arms)].mean() if len(arms) > 1 else 0.0
+            print(f"{name:<16}{len(arms):>8}{len(plans):>12}{share:>10.1%}{took_s:>9.1f} s", flush=True)
+
+
+def _beside(robot: Robot, cell: int) -> Robot:
+    x, y, z = robot.mount.position_m
+    place = (x + APART_M * (cell % 2), y + APART_M * (cell // 2), z)
+    return replace(robot, name=f"{robot.name}_{cell}", mount=Mount(position_m=place, tilt_deg=robot.mount.tilt_deg))
+
+
+def _same_arm(table, arms: list[Robot]) -> np.ndarray:
+    owner = np.empty(len(table.conflicts), dtype=int)
+    names = [robot.name for robot in arms]
+    for (arm, *_), row in table.volume.items():
+        owner[row] = names.index(arm)
+    return owner[:, None] == owner
+
+
+def main() -> None:
+    """Print both tables."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--policies", default=",".join(RULES))
+    parser.add_argument("--scenarios", default=",".join(library()))
+    parser.add_argument("--mujoco-s", type=float, default=1800.0)
+    given = parser.parse_args()
+    names = given.scenarios.split(",")
+    cache_folder().mkdir(parents=True, exist_ok=True)
+    print("scenario            arms       plans  conflict  one core")
+    tables(names)
+    print("\nscenario          shifts    instants  touching  contacts")
+    for name in names:
+        shifts(prepare(load(name), difficulty="blind"), given.policies.split(","), range(given.seeds), given.mujoco_s)
+
+
+if __name__ == "__main__":
+    main()
