@@ -174,9 +174,7 @@ def _most_at_once(scenario: Scenario, plans: Sequence[Plan], space: SpaceTable) 
         rows.append(np.flatnonzero(arms == arm))
     for station in dict.fromkeys(name for own in stations for name in own):
         rows.append(np.flatnonzero([station in own for own in stations]))
-    rows += [
-        np.array(pair) for pair in np.argwhere(np.triu(conflicts[np.ix_(used, used)], 1)) if len({*arms[pair]}) > 1
-    ]
+    rows += list(np.argwhere(np.triu(conflicts[np.ix_(used, used)] & (arms[:, None] != arms))))
     columns = np.concatenate(rows)
     lengths = np.repeat(np.arange(len(rows)), [len(row) for row in rows])
     matrix = csr_array((np.ones(len(columns)), (lengths, columns)), shape=(len(rows), len(used)))
