@@ -7,15 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from fleet.engine.claims import resolve_claims, update_offers
 from fleet.engine.event_log import PER_ARM, event_buffer
-from fleet.engine.observe import observe
 from fleet.engine.reset import reset_rows
 from fleet.engine.reward import TERMS, RewardWeights, weights_per_unit
 from fleet.engine.state import DONE, GIVEN_UP, WAITING, State
-from fleet.engine.step import step_arms
+from fleet.engine.step import BLOCK, CLAIM, MOVE, OBSERVE, step_rows
 from fleet.engine.tables import LANES, Jobs, MeasuredDrive, OpenJobs, Simulation, Tables, Trace, form_of
-from fleet.jit import jit, kernel, nonnegative
 from fleet.job import MOST_FAULTS
 from fleet.motion import Drive
 from fleet.observation import Layout
@@ -27,57 +24,6 @@ Array = np.ndarray
 
 FEWEST_JOBS = 2
 """Arrays of one job would count as contiguous, which the kernels would be compiled for once more."""
-BLOCK = 128
-"""Envs that go through a whole step together, few enough to stay in the processor's cache."""
-CLAIM, MOVE, OBSERVE = 1, 2, 4
-"""Parts of a step, to be added up."""
-
-
-@kernel
-def step_rows(
-    sim: Simulation, parts: int, actions: Array, weights: Array, terms: Array, until: Array, rows: Array, out: Array
-) -> None:
-    """Take some envs through parts of a step.
-
-    Args:
-        parts: CLAIM resolves claims, MOVE steps the arms, OBSERVE updates the offers and fills `out`.
-        actions: int64 [env, arm].
-        weights: Reward per unit of each term, [term].
-        terms: Receives the reward terms and their sum, [env, term + 1].
-        until: Tick until which each env goes on while no arm may claim a job, int [env]; not at all if empty.
-        rows: int [row].
-        out: Receives the observation vectors, float32 [env, arm, size].
-    """
-    for first in range(0, len(rows), BLOCK):
-        some = rows[first : first + BLOCK]
-        if parts & CLAIM:
-            resolve_claims(sim, actions, some)
-        if parts & MOVE:
-            step_arms(sim, weights, terms, some)
-        if parts & OBSERVE:
-            update_offers(sim.tables, sim.jobs, sim.state, sim.offers, some)
-            if len(until) > 0:
-                go_on(sim, weights, terms, until, some)
-            observe(sim, some, out)
-
-
-@jit
-def go_on(sim: Simulation, weights: Array, terms: Array, until: Array, rows: Array) -> None:
-    """Step some envs until an arm may claim a job, all jobs are done, or their last tick; adds to the reward terms."""
-    one, earned = np.empty(1, np.int64), np.empty(terms.shape[1])
-    for row in rows:
-        e = nonnegative(row)
-        one[0] = e
-        earned[:] = terms[e]
-        while (
-            sim.state.tick[e] < until[e]
-            and (sim.offers.unfinished[e] > 0 or sim.jobs.number[e] == 0)
-            and not sim.offers.mask[e, :, 1:].any()
-        ):
-            step_arms(sim, weights, terms, one)
-            update_offers(sim.tables, sim.jobs, sim.state, sim.offers, one)
-            earned += terms[e]
-        terms[e] = earned
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
 from fleet.engine.state import State, World
-from fleet.engine.tables import EventBuffer
 from fleet.events import Event, EventKind
 from fleet.jit import jit
 
@@ -16,6 +16,17 @@ AWARD, LOST, ILLEGAL, WARNING, FINISH, HOME, FAULT, RETURN, GIVE_UP, RECOVER, MO
 """Kinds of recorded events, in the order in which those of one step are reported."""
 PER_ARM = 10
 """Most events of one arm in one step."""
+
+
+class EventBuffer(NamedTuple):
+    """Events of one step; a buffer without rows records nothing."""
+
+    used: Array
+    """Rows in use, int [1]."""
+    what: Array
+    """Kind (see `fleet.engine.event_log`), env, arm, job, joint, int [row, 5]; −1 for none."""
+    numbers: Array
+    """Seconds into the step, value, [row, 2]."""
 
 
 def event_buffer(rows: int) -> EventBuffer:

@@ -1,4 +1,4 @@
-"""One step of the arms of many envs: motion, heat, limits, the end of jobs.
+"""One step of many envs: claims, then motion, heat, limits and the end of jobs of their arms, then what they observe.
 
 Heat is constant over a step (the mean of what the motors do in it, with losses from the temperatures at its start) and
 the thermal step is exact for it, so the moments at which a limit is crossed are exact too. A row's result does not
@@ -7,12 +7,13 @@ depend on how many rows there are.
 
 import numpy as np
 
-from fleet.engine.claims import give_up, return_to_queue
+from fleet.engine.claims import give_up, resolve_claims, return_to_queue, update_offers
 from fleet.engine.crossings import hottest, step_with_crossing
 from fleet.engine.event_log import FAULT, FINISH, GIVE_UP, HOME, MOVED, RECOVER, RETURN, WARNING, record_event
+from fleet.engine.observe import observe
 from fleet.engine.state import DONE, WAITING
 from fleet.engine.tables import LANES, WIDE, Simulation
-from fleet.jit import jit_inline, nonnegative
+from fleet.jit import jit, jit_inline, kernel, nonnegative
 from fleet.job import MOST_FAULTS
 from fleet.motor import magnet_factor, winding_heat
 from fleet.robot import JOINTS
@@ -203,3 +204,56 @@ def step_arms(sim: Simulation, weights: Array, terms: Array, rows: Array) -> Non
         terms[e, 3], terms[e, 4] = count * weights[3], energy * weights[4]
         terms[e, 5] = terms[e, 0] + terms[e, 1] + terms[e, 2] + terms[e, 3] + terms[e, 4]
         ticks[e] += 1
+
+
+BLOCK = 128
+"""Envs that go through a whole step together, few enough to stay in the processor's cache."""
+CLAIM, MOVE, OBSERVE = 1, 2, 4
+"""Parts of a step, to be added up."""
+
+
+@kernel
+def step_rows(
+    sim: Simulation, parts: int, actions: Array, weights: Array, terms: Array, until: Array, rows: Array, out: Array
+) -> None:
+    """Take some envs through parts of a step.
+
+    Args:
+        parts: CLAIM resolves claims, MOVE steps the arms, OBSERVE updates the offers and fills `out`.
+        actions: int64 [env, arm].
+        weights: Reward per unit of each term, [term].
+        terms: Receives the reward terms and their sum, [env, term + 1].
+        until: Tick until which each env goes on while no arm may claim a job, int [env]; not at all if empty.
+        rows: int [row].
+        out: Receives the observation vectors, float32 [env, arm, size].
+    """
+    for first in range(0, len(rows), BLOCK):
+        some = rows[first : first + BLOCK]
+        if parts & CLAIM:
+            resolve_claims(sim, actions, some)
+        if parts & MOVE:
+            step_arms(sim, weights, terms, some)
+        if parts & OBSERVE:
+            update_offers(sim.tables, sim.jobs, sim.state, sim.offers, some)
+            if len(until) > 0:
+                go_on(sim, weights, terms, until, some)
+            observe(sim, some, out)
+
+
+@jit
+def go_on(sim: Simulation, weights: Array, terms: Array, until: Array, rows: Array) -> None:
+    """Step some envs until an arm may claim a job, all jobs are done, or their last tick; adds to the reward terms."""
+    one, earned = np.empty(1, np.int64), np.empty(terms.shape[1])
+    for row in rows:
+        e = nonnegative(row)
+        one[0] = e
+        earned[:] = terms[e]
+        while (
+            sim.state.tick[e] < until[e]
+            and (sim.offers.unfinished[e] > 0 or sim.jobs.number[e] == 0)
+            and not sim.offers.mask[e, :, 1:].any()
+        ):
+            step_arms(sim, weights, terms, one)
+            update_offers(sim.tables, sim.jobs, sim.state, sim.offers, one)
+            earned += terms[e]
+        terms[e] = earned

@@ -1,8 +1,8 @@
 """The arrays that the engine's kernels read and write, by name.
 
-Axis `fleet`: one fleet as it is built; all envs of one fleet have the same arms. Axis `kind`: one kind of job, that is
-its work and its number of repetitions. Last axes `lane` and `wide` are joints and nodes padded with zeros to what a
-processor takes at once. Every array is contiguous and owned, so one compilation serves all scenarios.
+Axis `fleet`: one fleet as it is built; all envs of one fleet have the same arms. Axis `kind`: one kind of job, its work
+and its number of repetitions. Last axes `lane` and `wide` are joints and nodes padded with zeros to what a processor
+takes at once. Every array is contiguous and owned, so one compilation serves all scenarios.
 """
 
 from collections.abc import Iterable, Sequence
@@ -11,6 +11,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from fleet.difficulty import Risk
+from fleet.engine.event_log import EventBuffer
 from fleet.engine.state import State, World
 from fleet.observation import Layout, Offsets
 from fleet.robot import JOINTS
@@ -20,7 +21,6 @@ Array = np.ndarray
 LANES, WIDE = 8, 16
 """Padded lengths of the joint and the node axis."""
 assert JOINTS == LANES - 1
-
 
 WORK = np.dtype(
     {
@@ -148,17 +148,6 @@ class OpenJobs(NamedTuple):
     """Volumes that arms take which are away from home, one bit each, uint64 [env, word]."""
     pending: Array
     """Whether the current job is still to be finished, bool [env, arm]; False on the way home."""
-
-
-class EventBuffer(NamedTuple):
-    """Events of one step; a buffer without rows records nothing."""
-
-    used: Array
-    """Rows in use, int [1]."""
-    what: Array
-    """Kind (see `fleet.engine.event_log`), env, arm, job, joint, int [row, 5]; −1 for none."""
-    numbers: Array
-    """Seconds into the step, value, [row, 2]."""
 
 
 class Trace(NamedTuple):
@@ -319,10 +308,8 @@ def bits(flags: Array) -> Array:
 
 
 def _one_hot(stations: Array, count: int) -> Array:
-    """Which stations each kind of job occupies, bool [fleet, kind + 1, station], of int [fleet, kind, n], −1 for none;
-    the last row, no job, has none."""
-    fleets, kinds, _ = stations.shape
-    flags = np.zeros((fleets, kinds + 1, count), bool)
+    """Which stations each kind of job occupies, bool [fleet, kind + 1, station]; the last row, no job, has none."""
+    flags = np.zeros((stations.shape[0], stations.shape[1] + 1, count), bool)
     fleet, kind, n = np.nonzero(stations >= 0)
     flags[fleet, kind, stations[fleet, kind, n]] = True
     return flags

@@ -108,7 +108,7 @@ def test_compare_prints_a_table_or_json(thermofleet, small_toml, monkeypatch):
     some = ("compare", small_toml, "--seeds", 2, "--policies", "random, round_robin", "--difficulty", "blind")
     told = json.loads(thermofleet(*some, "--json").out)
     assert set(told["figures"]) == {"random", "round_robin"}
-    assert "above_warning_min" in thermofleet(*some).out
+    assert "min above warning" in thermofleet(*some).out
 
 
 def test_without_round_robin_the_first_policy_is_the_baseline(thermofleet, small_toml, monkeypatch):

@@ -143,20 +143,21 @@ WRONG = [
     ),
     (
         put("fixtures", [{"name": "oven", "position_m": [0, 0, 1e9], "size_m": [1, 1, 1]}]),
-        "heat.toml: fixtures[0].position_m must be between -100 and 100 m (got [0.0, 0.0, 1000000000.0]).",
+        "heat.toml: fixtures[0].position_m must be coordinates between -10 and 10 m (got 0.0, 0.0, 1000000000.0); were "
+        "millimetres meant?",
     ),
     (
         put("fixtures", [{"name": "oven", "position_m": [0, 0, 1], "size_m": [1, 1, 1], "tilt_deg": [0, 400, 0]}]),
         "heat.toml: fixtures[0].tilt_deg must be between -360 and 360 (got [0.0, 400.0, 0.0]).",
     ),
     (
-        put("fixtures", [{"name": "oven", "position_m": [0, 0, i], "size_m": [1, 1, 1]} for i in (1, 3)]),
+        put("fixtures", [{"name": "oven", "position_m": [0, 0, i / 10], "size_m": [1, 1, 1]} for i in (1, 3)]),
         "heat.toml: fixtures[1].name: 'oven' is given twice; names must be unique.",
     ),
     (put("fixtures", [{"name": "", "position_m": [0, 0, 1], "size_m": [1, 1, 1]}]), "fixtures[0].name must not be"),
     (put("fixtures", [{"name": "x", "size": 1}]), "heat.toml: fixtures[0]: unknown key 'size'; did you mean 'size_m'?"),
     (
-        put("fixtures", [{"name": f"f{i}", "position_m": [0, 0, i], "size_m": [1, 1, 1]} for i in range(65)]),
+        put("fixtures", [{"name": f"f{i}", "position_m": [0, 0, i / 10], "size_m": [1, 1, 1]} for i in range(65)]),
         "heat.toml: fixtures must be at most 64 (got 65).",
     ),
     (put("spread", "seed", 1.5), "heat.toml: spread.seed: expected a whole number, got a number (1.5)."),
