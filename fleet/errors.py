@@ -22,7 +22,7 @@ class InfeasibleJob(FleetError):
     place: str
     """Name of the place that the arm cannot serve."""
     reason: str
-    """One of `reach`, `joint limit`, `torque`, `collision`, `no IK solution`, with its numbers."""
+    """`reach`, `joint limit`, `torque`, `collision`, `no IK solution` with its numbers, or an arm at home."""
 
     def __str__(self) -> str:
         return f"Arm '{self.arm}' cannot work at '{self.place}': {self.reason}."

@@ -17,6 +17,7 @@ MOST_REPETITIONS = 100_000
 MOST_SAMPLES = 1_000_000
 """Telemetry samples of an arm in a shift: eleven days at one per second."""
 MOST_SLOTS = 256
+MOST_CLEARANCE_M = 0.2
 MOST_EXPLORATION = 10_000
 
 
@@ -214,6 +215,8 @@ class Scenario:
     places: tuple[Place, ...]
     jobs: tuple[JobStream, ...]
     decision_interval_s: float = 10.0
+    clearance_m: float = 0.02
+    """Smallest distance that two arms keep from each other."""
     slots: int = 8
     start: Literal["idle_warm", "cold"] = "idle_warm"
     telemetry_interval_s: float = 1.0
@@ -230,6 +233,10 @@ class Scenario:
             raise ValueError(
                 "Scenario.telemetry_interval_s must not exceed decision_interval_s "
                 f"(got {self.telemetry_interval_s}, {self.decision_interval_s})"
+            )
+        if not 0 <= self.clearance_m <= MOST_CLEARANCE_M:
+            raise ValueError(
+                f"Scenario.clearance_m must be between 0 and {MOST_CLEARANCE_M} m (got {self.clearance_m})"
             )
         if not 1 <= self.slots <= MOST_SLOTS:
             raise ValueError(f"Scenario.slots must be between 1 and {MOST_SLOTS} (got {self.slots})")

@@ -253,6 +253,7 @@ def small() -> SimpleNamespace:
 @pytest.fixture(scope="session")
 def three_arms() -> dict[str, Any]:
     """A parsed scenario of three different arms, planned in a second and hot enough to fault; add a name and jobs."""
+    home = {"home": "retract"}
     return {
         "description": "Three different arms over their limits.",
         "horizon_s": 900.0,
@@ -261,9 +262,9 @@ def three_arms() -> dict[str, Any]:
         "limits": {"warning_c": 34.5, "error_c": 35.0, "restart_c": 34.0, "clear_s": 15.0},
         "start": "cold",
         "arms": [
-            {"name": "left", "position_m": [-0.45, 0.0, 0.0]},
-            {"name": "right", "position_m": [0.45, 0.0, 0.0], "tilt_deg": [0.0, 0.0, 180.0], "wear": 0.3},
-            {"name": "far", "position_m": [0.0, 0.9, 0.55], "tilt_deg": [90.0, 0.0, 0.0]},
+            {"name": "left", "position_m": [-0.45, 0.0, 0.0], **home},
+            {"name": "right", "position_m": [0.45, 0.0, 0.0], "tilt_deg": [0.0, 0.0, 180.0], "wear": 0.3, **home},
+            {"name": "far", "position_m": [0.0, 1.0, 0.6], "tilt_deg": [90.0, 0.0, 0.0], **home},
         ],
         "places": [
             {"name": "bench", "position_m": [0.0, 0.2, 0.25]},

@@ -7,7 +7,7 @@ through the same postures share one volume, that of their heaviest payload, what
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -102,32 +102,38 @@ def conflicts_with_homes(
 
     def compute() -> dict[str, Array]:
         homes = [(other.name, _home(other)) for other in near]
-        reasons = [_home_reason(sweep, homes, margin_m) for sweep in paths.sweeps()]
-        lighter = [
-            _home_reason(paths.sweep(row, payload_kg), homes, margin_m) if reasons[row] else ""
-            for row, payload_kg in paths.loads
-        ]
-        return {"reasons": np.array(lighter, dtype=str)}
+        reasons = [_home_reason(paths.sweep(*load), homes, margin_m) for load in paths.loads]
+        return {"reasons": np.array(reasons, dtype=str)}
 
     if not near or not paths.loads:
         return [None] * len(plans)
     arms = [(other.name, _geometry(other)) for other in near]
-    key = {"what": "homes", "margin_m": margin_m, "arms": arms, "plans": paths.content(), "loads": paths.loads}
+    key = {
+        "what": "homes beside plans",
+        "margin_m": margin_m,
+        "arms": arms,
+        "plans": paths.content(),
+        "loads": paths.loads,
+    }
     reasons = dict(zip(paths.loads, cached_arrays(cache_dir, key, compute)["reasons"].tolist(), strict=True))
     return [reasons[paths.row[plan_key(plan)], plan.work.payload_kg] or None for plan in plans]
 
 
-def collisions_of_homes(robots: Sequence[Robot], margin_m: float) -> list[str]:
+def collisions_of_homes(robots: Sequence[Robot], margin_m: float, cache_dir: Path) -> list[str]:
     """Sentences on every two arms that come closer to each other than a margin while both are at home."""
-    from fleet.planning.clearance import clearance
 
-    sentences = []
-    for one, other in combinations(robots, 2):
-        if _in_reach(one, other, margin_m) and (near := clearance(_home(one), _home(other), margin_m)):
-            sentences.append(
-                f"at home '{one.name}' ({near.link}) {_distance(near, margin_m)} '{other.name}' ({near.other_link})"
-            )
-    return sentences
+    def compute() -> dict[str, Array]:
+        from fleet.planning.clearance import clearance
+
+        sentences = []
+        for one, other in combinations(robots, 2):
+            if _in_reach(one, other, margin_m) and (near := clearance(_home(one), _home(other), margin_m)):
+                where = f"{_distance(near, margin_m)} '{other.name}' ({near.other_link})"
+                sentences.append(f"at home '{one.name}' ({near.link}) {where}")
+        return {"sentences": np.array(sentences, dtype=str)}
+
+    key = {"what": "homes", "margin_m": margin_m, "arms": [(robot.name, _geometry(robot)) for robot in robots]}
+    return cached_arrays(cache_dir, key, compute)["sentences"].tolist()
 
 
 class _Paths:
@@ -171,8 +177,8 @@ class _Paths:
 
 def _stops(plan: Plan) -> Array:
     """Postures at which the arm stands along a plan, float32 [stop, joint]; it moves straight from one to the next."""
-    profile = np.concatenate([phase.profile for phase in plan.phases])
-    stops = profile[(profile[:, 1] == 0).all(axis=1), 0]
+    profiles = [phase.profile for phase in plan.phases]
+    stops = np.concatenate([profile[(profile[:, 1] == 0).all(axis=1), 0] for profile in profiles])
     return stops[np.append(True, (np.diff(stops, axis=0) != 0).any(axis=1))]
 
 
@@ -219,6 +225,7 @@ def _capsules(robot: Robot) -> "Capsules":
     return Capsules(ArmModel(robot))
 
 
+@lru_cache(maxsize=256)
 def _home(robot: Robot) -> "Sweep":
     return _capsules(robot).sweep(robot.home_q()[None])
 

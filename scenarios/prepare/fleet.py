@@ -23,6 +23,7 @@ from fleet.job import Job
 from fleet.motion import Plan
 from fleet.motor import thermal_data
 from fleet.planning.plan_cache import rest_torque
+from fleet.planning.space import SpaceTable, collisions_of_homes, space_table
 from fleet.seeding import shift_seeds
 from scenarios.cell_layout import cell_of, near_of
 from scenarios.extras import require_extra
@@ -50,6 +51,8 @@ class Fleet:
     arms: tuple[Arm, ...]
     infeasible: tuple[InfeasibleJob, ...]
     """Work that single arms cannot do, with reasons."""
+    space: SpaceTable
+    """Which plans of two arms exclude each other."""
 
 
 def prepare(
@@ -62,11 +65,18 @@ def prepare(
     """Plan every work for every arm, and give each arm its difficulty model; both are cached by content.
 
     Raises:
-        ScenarioError: no arm can do some work.
+        ScenarioError: no arm can do some work, or arms at home are too close to each other.
         MissingExtra: twins are wanted, and their libraries are not installed.
     """
     arms, refused = _arms(scenario, range(len(scenario.arms)), difficulty, cache, progress, every_work=True)
-    return Fleet(scenario, tuple(arms), tuple(refused))
+    return Fleet(scenario, tuple(arms), tuple(refused), space_of(scenario, arms, _folder(cache)))
+
+
+def space_of(scenario: Scenario, arms: Sequence[Arm], folder: Path) -> SpaceTable:
+    """Space of the plans of a scenario's arms; cached in `folder`."""
+    robots = [arm.robot for arm in arms]
+    plans = [plan for arm in arms for variants in arm.plans.values() for plan in variants]
+    return space_table(robots, plans, scenario.clearance_m, folder / "plans")
 
 
 def prepare_arm(
@@ -102,13 +112,8 @@ def _arms(
     """
     if choose("difficulty", difficulty, DifficultyName) == "twin":
         require_extra("twin")
-    if not isinstance(cache, str | Path | None):
-        raise ScenarioError(f"cache must be the path of a folder (got {cache!r}).")
-    folder = Path(cache) if cache else cache_folder()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FleetError(f"Cannot keep plans and twins in '{folder}': {error.strerror}.") from error
+    folder = _folder(cache)
+    _check_homes(scenario, folder)
     asked = all_works(scenario)
     works = rehearsal_works(scenario) if difficulty == "twin" else asked
     planned = plan_arms(scenario, indices, works, folder, progress)
@@ -129,6 +134,28 @@ def _arms(
         arm = Arm(robot=robot, motors=motors, thermal=thermal, rest_tau=rest_tau, model=model, plans=each.plans)
         arms.append(_with_oracle(scenario, arm) if difficulty == "oracle" else arm)
     return arms, [error for arm in planned for error in arm.infeasible]
+
+
+def _folder(cache: str | Path | None) -> Path:
+    """Folder of plans and twins; made if it does not exist."""
+    if not isinstance(cache, str | Path | None):
+        raise ScenarioError(f"cache must be the path of a folder (got {cache!r}).")
+    folder = Path(cache) if cache else cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FleetError(f"Cannot keep plans and twins in '{folder}': {error.strerror}.") from error
+    return folder
+
+
+def _check_homes(scenario: Scenario, folder: Path) -> None:
+    """Raise a ScenarioError that names all arms that are too close to each other at home."""
+    robots = [spec.robot() for spec in scenario.arms]
+    if sentences := collisions_of_homes(robots, scenario.clearance_m, folder / "plans"):
+        raise ScenarioError(
+            f"{scenario.name}.toml: arms: {'; '.join(sentences)}; move or turn the arms, give them another `home`, "
+            "or lower clearance_m."
+        )
 
 
 REASONS = 4

@@ -13,6 +13,7 @@ from fleet.job import Work
 from fleet.motion import Plan
 from fleet.motor import Motors, gen3_motors
 from fleet.planning.plan_cache import CachedPlanner
+from fleet.planning.space import conflicts_with_homes
 from fleet.robot import Robot
 from fleet.thermal import ThermalModel, ThermalSpread, gen3_network, spread_motors, thermal_model
 from scenarios.progress import Progress
@@ -61,10 +62,27 @@ def hardware_of(scenario: Scenario, index: int) -> ArmHardware:
     return ArmHardware(spec.robot(), motors, thermal_model(network))
 
 
-def planner_of(robot: Robot, scenario: Scenario, folder: Path) -> CachedPlanner:
-    """A planner with the scenario's settings; it caches plans in `folder`."""
-    spec = scenario.planning
-    return CachedPlanner(robot, elbows=spec.elbows, speeds=spec.speeds, cache_dir=folder / "plans")
+class CellPlanner:
+    """Plans of one arm of a scenario that keep clear of the other arms at home; cached in a folder."""
+
+    def __init__(self, robot: Robot, scenario: Scenario, folder: Path) -> None:
+        spec = scenario.planning
+        self._robot, self._folder, self._clearance_m = robot, folder / "plans", scenario.clearance_m
+        self._others = [arm.robot() for arm in scenario.arms if arm.name != robot.name]
+        self._planner = CachedPlanner(robot, elbows=spec.elbows, speeds=spec.speeds, cache_dir=self._folder)
+
+    def plan(self, work: Work) -> tuple[Plan, ...]:
+        """All variants, as `fleet.planning.planner.Planner.plan`, that come too close to no other arm at home.
+
+        Raises:
+            InfeasibleJob: there is none.
+        """
+        plans = self._planner.plan(work)
+        reasons = conflicts_with_homes(self._robot, self._others, plans, self._clearance_m, self._folder)
+        clear = tuple(plan for plan, reason in zip(plans, reasons, strict=True) if reason is None)
+        if not clear:
+            raise InfeasibleJob(self._robot.name, work.places[0].name, str(reasons[0]))
+        return clear
 
 
 def plan_arms(
@@ -74,7 +92,7 @@ def plan_arms(
     planned = []
     for done, index in enumerate(indices):
         hardware = hardware_of(scenario, index)
-        planner = planner_of(hardware.robot, scenario, folder)
+        planner = CellPlanner(hardware.robot, scenario, folder)
         plans: dict[Work, tuple[Plan, ...]] = {}
         infeasible: list[InfeasibleJob] = []
         for i, work in enumerate(works):

@@ -149,9 +149,10 @@ def test_the_result_for_a_plan_does_not_depend_on_the_other_plans(plans, tmp_pat
         assert conflicts_with_homes(WEST, [EAST], [plan], distance_m, tmp_path) == [reason]
 
 
-def test_colliding_homes_are_all_named():
+def test_colliding_homes_are_all_named(tmp_path):
     near = replace(EAST, name="near", mount=Mount(position_m=(-0.1, -0.3, 0.0), tilt_deg=(0.0, 0.0, 180.0)))
-    assert collisions_of_homes([WEST, EAST, FAR], MARGIN_M) == []
-    (sentence,) = collisions_of_homes([WEST, EAST, FAR, near], MARGIN_M)
-    assert sentence.startswith("at home 'west' (")
-    assert "'near' (" in sentence
+    assert collisions_of_homes([WEST, EAST, FAR], MARGIN_M, tmp_path) == []
+    for _ in range(2):  # computed, cached
+        (sentence,) = collisions_of_homes([WEST, EAST, FAR, near], MARGIN_M, tmp_path)
+        assert sentence.startswith("at home 'west' (")
+        assert "'near' (" in sentence

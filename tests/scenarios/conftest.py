@@ -26,11 +26,13 @@ horizon_s = 180
 [[arms]]
 name = "left"
 position_m = [-0.45, 0.0, 0.0]
+home = "retract"
 
 [[arms]]
 name = "right"
 position_m = [0.45, 0.0, 0.0]
 tilt_deg = [0, 0, 180]
+home = "retract"
 
 [[places]]
 name = "bench"

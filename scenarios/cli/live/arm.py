@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import typer
@@ -51,9 +51,6 @@ from scenarios.load import load
 from scenarios.policy_loader import scope_of
 from scenarios.progress import Progress
 from scenarios.schema import Scenario
-
-if TYPE_CHECKING:
-    from fleet.planning.plan_cache import CachedPlanner
 
 log = logging.getLogger(__name__)
 
@@ -163,15 +160,15 @@ def simulated_arm(
         FleetError: the scenario has no such arm.
     """
     from scenarios.prepare.fleet import air_offsets, prepare_arm
-    from scenarios.prepare.planned_arm import planner_of
+    from scenarios.prepare.planned_arm import CellPlanner
 
     arm = prepare_arm(scenario, name, difficulty=difficulty, cache=cache, progress=progress)
     index = scenario.index_of(name)
     ambient_c, offset_k = ambient_of(scenario), float(air_offsets(scenario)[index])
 
     @lru_cache
-    def planner() -> "CachedPlanner":  # made for the first unplanned work only: it loads the physics
-        return planner_of(arm.robot, scenario, cache or cache_folder())
+    def planner() -> CellPlanner:  # made for the first unplanned work only: it loads the physics
+        return CellPlanner(arm.robot, scenario, cache or cache_folder())
 
     def plan(work: Work) -> tuple[Plan, ...]:
         return arm.plans[work] if work in arm.plans else planner().plan(work)
