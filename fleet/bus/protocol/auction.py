@@ -145,8 +145,8 @@ class Quote(msgspec.Struct, frozen=True):
     estimates: tuple[JobEstimate, ...]
     """One per requested job, in that order."""
     space: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST_JOBS)] | None = None
-    """Names of the spaces that the arm takes now and those of its jobs; empty at home without jobs. null if the arm does
-    not say: then it is at home if its mode is idle, and may be anywhere within reach if not."""
+    """Names of the spaces that the arm takes now and those of its jobs; empty at home without jobs. null if the arm
+    does not say: then it is at home if its mode is idle, and may be anywhere within reach if not."""
 
     def __post_init__(self) -> None:
         for name in ("valid_s", "time_s", "headroom_k"):

@@ -17,7 +17,6 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 
 from msgspec.structs import asdict, replace
 
@@ -41,6 +40,7 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.messages import State
 from fleet.errors import JournalFull, Refused
+from fleet.live.auction.leases import CountedLease, SendAward
 from fleet.live.auction.ledger import AuctionRecord, Awarded, Change, ContactLost, ContactRegained, Ledger, ShiftEnded
 from fleet.live.auction.round import MAX_REASON, Allocate, Bidding, Round, Timing, drop_invalid, infeasible_jobs
 from fleet.live.auction.space_rules import drop_taken, is_to_clear, stated_spaces
@@ -53,29 +53,7 @@ SCAN_S = 0.05
 """Real seconds between two checks for jobs that have become ready."""
 
 
-@dataclass(frozen=True)
-class SendAward:
-    """Send this award to its arm."""
-
-    arm: str
-    award: Award
-
-
 Out = QuoteRequest | SendAward | Announcement | Result
-
-
-@dataclass(eq=False)
-class _Lease:
-    """Lease of an open award, as the auctioneer counts it."""
-
-    until_s: float
-    """Real second at which it ends."""
-    cycles: int = 0
-    """Last reported progress."""
-    unanswered: SendAward | None = None
-    """The award, until its arm answers."""
-    sent_s: float = -math.inf
-    attempts: int = 1
 
 
 class Auctioneer:
@@ -110,7 +88,7 @@ class Auctioneer:
         self.states: dict[str, State] = {}
         self._allocate, self._keep, self._boot = allocate, keep, boot
         self._timing, self._excludes = timing or Timing(), excludes
-        self._leases = {award: _Lease(real_s + self._timing.counted_lease_s) for award in ledger.open}
+        self._leases = {award: CountedLease(real_s + self._timing.counted_lease_s) for award in ledger.open}
         self._round: Round | None = None
         self._rounds = 0
         self._present: frozenset[str] = frozenset()
@@ -258,7 +236,7 @@ class Auctioneer:
 
     # Leases
 
-    def _unanswered(self) -> list[tuple[_Lease, SendAward]]:
+    def _unanswered(self) -> list[tuple[CountedLease, SendAward]]:
         return [(lease, lease.unanswered) for lease in self._leases.values() if lease.unanswered is not None]
 
     def _with_progress(self, status: JobStatus) -> JobStatus:
@@ -390,7 +368,7 @@ class Auctioneer:
             award = Award(record.award, auction, self.name, record.quote, spec, record.cycles, self._timing.lease_s)
             message = SendAward(record.arm, award)
             until_s = real_s + self._timing.counted_lease_s
-            self._leases[record.award] = _Lease(until_s, unanswered=message, sent_s=real_s)
+            self._leases[record.award] = CountedLease(until_s, unanswered=message, sent_s=real_s)
             self.out.append(message)
 
     # Records

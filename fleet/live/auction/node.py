@@ -31,8 +31,9 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.registry import SESSION_LEASE_S
 from fleet.errors import BusError, JournalFull, Refused
-from fleet.live.auction.auctioneer import SCAN_S, Auctioneer, SendAward
+from fleet.live.auction.auctioneer import SCAN_S, Auctioneer
 from fleet.live.auction.job_rules import statuses_that_fit
+from fleet.live.auction.leases import SendAward
 from fleet.live.auction.ledger import AuctionRecord, Ledger
 from fleet.live.auction.round import Allocate, Timing
 from fleet.live.clock import FleetClock
