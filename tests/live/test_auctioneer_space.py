@@ -2,7 +2,7 @@
 
 import pytest
 
-from fleet.bus.protocol.auction import Award, ClearRequest, JobSpec, Quote, Report
+from fleet.bus.protocol.auction import Award, ClearRequest, JobSpec, QuoteRequest
 from fleet.errors import Refused
 from fleet.live.space import ANYWHERE
 
@@ -121,9 +121,8 @@ def test_a_quote_says_nothing_about_an_award_that_was_closed_after_the_request(f
     fleet.step(0.6)  # the other arm is asked, while the award is under way
     first, other = fleet.arms[award.to], next(arm for arm in fleet.arms.values() if arm.name != award.to)
     assert fleet.auctioneer.ledger.space[first.name] == frozenset()
-    request = fleet.packets[0].message
+    request = next(packet.message for packet in fleet.packets if isinstance(packet.message, QuoteRequest))
     quote, other_quote = first.quote(request, fleet.true_s), other.quote(request, fleet.true_s)
-    assert isinstance(quote, Quote)
     assert quote.space == ()
     first.quotes[award.message.quote] = first.own_s(fleet.true_s)
     assert first.answer_award(award.message, fleet.true_s).accepted
@@ -132,6 +131,5 @@ def test_a_quote_says_nothing_about_an_award_that_was_closed_after_the_request(f
     assert first.out
     for message in (*first.reports.values(), quote, other_quote):
         fleet.attempt(lambda message=message: fleet.answer(message))
-    assert isinstance(next(iter(first.reports.values())), Report)
     assert fleet.auctioneer.ledger.space[first.name] == {f"{first.name}: job 0"}
     assert not fleet.auctioneer.ledger.open
