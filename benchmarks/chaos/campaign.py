@@ -125,7 +125,7 @@ def _job(number: int) -> JobSpec:
     if number % 3 == 0:
         return JobSpec(name=name, kind="sort", places=("belt", "bin"), payload_kg=0.1, repetitions=repetitions)
     if number % 3 == 1:
-        trays = ("tray_left", "tray_right")
+        trays = ("rack_left", "tray_left")
         return JobSpec(name=name, kind="pick_place", places=trays, payload_kg=0.5, repetitions=repetitions)
     return JobSpec(name=name, kind="hold", places=("clamp",), payload_kg=3.0, dwell_s=60.0, repetitions=2)
 
