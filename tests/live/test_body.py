@@ -263,7 +263,7 @@ def test_its_time_can_be_set_and_it_catches_up_in_bounded_steps(small):
 
 
 def test_a_change_of_step_changes_no_event(small):
-    """A faulted arm is moved home, cools and recovers at the same moments, whatever the steps; heat is exact at rest."""
+    """A faulted arm is moved home and recovers at the same moments, whatever the steps; heat is exact at rest."""
     arm, job, plan = one_job(small, repetitions=5000, payload=small.HOT)
     bodies = [body_of(arm, dt_s=5.0, limits=ThermalLimits(move_home_s=60.0)) for _ in range(2)]
     for body in bodies:

@@ -3,7 +3,8 @@
 It steps the engine of the simulator, `fleet.engine.step`, in a world of one arm and its current job. A job is done in
 stints: the arm leaves home, does the cycles that it is allowed, and returns home. The allowed cycles can grow during a
 stint, so a job that is allowed to its end is one stint, as in a simulated shift. After a fault the arm stands where it
-stopped; once it has recovered it ends that cycle and goes home, or a person moves it home (`ThermalLimits.move_home_s`).
+stopped. Once it has recovered it ends that cycle and goes home, if no person has moved it home before
+(`ThermalLimits.move_home_s`).
 """
 
 from collections.abc import Callable
