@@ -4,6 +4,7 @@ import pytest
 
 from fleet.bus.protocol.auction import Award, ClearRequest, JobSpec, QuoteRequest
 from fleet.errors import Refused
+from fleet.live.journal_records import SpaceTaken
 from fleet.live.space import ANYWHERE
 
 
@@ -108,8 +109,13 @@ def test_only_space_that_is_taken_can_be_cleared(fleet_of):
         clear(fleet_of(2), "arm_7")
 
 
-def test_a_quote_says_nothing_about_an_award_that_was_closed_after_the_request(fleet_of):
-    """The arm quotes before the award arrives, leaves home for it, and faults, all within one round."""
+@pytest.mark.parametrize("before", [False, True])
+def test_a_quote_says_nothing_about_an_award_that_was_closed_after_the_request(fleet_of, before):
+    """The arm quotes before the award arrives, leaves home for it, and faults, all within one round.
+
+    Args:
+        before: It took the same space for an earlier award, which was closed before that round.
+    """
     fleet = fleet_of(2)
     fleet.submit(*jobs(1, repetitions=1000))
     fleet.step(0.1)
@@ -117,11 +123,12 @@ def test_a_quote_says_nothing_about_an_award_that_was_closed_after_the_request(f
     fleet.deliver_all()
     (award,) = [packet for packet in fleet.packets if isinstance(packet.message, Award)]
     fleet.packets.clear()
+    if before:
+        fleet.auctioneer.ledger.apply(SpaceTaken(award.to, (f"{award.to}: job 0",)))
     fleet.submit(*jobs(2)[1:])
     for _ in range(3):
         fleet.step(0.6)  # the arms are asked, while the award is under way
     first, other = fleet.arms[award.to], next(arm for arm in fleet.arms.values() if arm.name != award.to)
-    assert fleet.auctioneer.ledger.space[first.name] == frozenset()
     request = next(packet.message for packet in fleet.packets if isinstance(packet.message, QuoteRequest))
     quote, other_quote = first.quote(request, fleet.true_s), other.quote(request, fleet.true_s)
     assert quote.space == ()

@@ -305,7 +305,7 @@ class Auctioneer:
             return
         self._rounds += 1
         auction = f"{self.name}-{self._boot}-{self._rounds}"
-        self._round = Round(auction, jobs, bidders, real_s + self._timing.window_s, dict(self.ledger.space))
+        self._round = Round(auction, jobs, bidders, real_s + self._timing.window_s, self.ledger.closed_space())
         self.out.append(Announcement(self.name, auction, time_s, tuple(job.name for job in jobs)))
         self.out.append(QuoteRequest(auction, jobs))
 

@@ -183,6 +183,13 @@ class Ledger(TimedState[AuctionRecord]):
                 taken[arm] = taken.get(arm, frozenset()) | {award.record.space}
         return taken
 
+    def closed_space(self) -> Mapping[str, frozenset[str]]:
+        """Return the names of the spaces that each arm may take for closed awards alone."""
+        still_open: dict[str, set[str]] = {}
+        for award in self.open.values():
+            still_open.setdefault(award.record.arm, set()).add(award.record.space)
+        return {arm: names - still_open.get(arm, set()) for arm, names in self.space.items()}
+
     def unsettled(self) -> list[str]:
         """Return the names of jobs that are neither finished nor unfinished for good."""
         return [name for name, entry in self.jobs.items() if entry.state not in ("finished", "unfinished")]

@@ -158,7 +158,8 @@ class Round:
     until_s: float
     """Real second at which it closes in any case."""
     space: Mapping[str, frozenset[str]] = field(default_factory=dict)
-    """Space of closed awards that each arm might still take when the round was opened: its quote says if it does."""
+    """Space that each arm might still take for closed awards alone when the round was opened: its quote says if it
+    does."""
     quotes: dict[str, Quote] = field(default_factory=dict)
 
     def complete(self, present: frozenset[str]) -> bool:
