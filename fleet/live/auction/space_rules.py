@@ -54,7 +54,8 @@ def stated_spaces(ledger: Ledger, closing: Round, time_s: float) -> list[SpaceTa
     records: list[SpaceTaken] = []
     for arm, quote in sorted(closing.quotes.items()):
         before = ledger.space.get(arm, frozenset())
-        open_space = {award.record.space for award in ledger.open.values() if award.record.arm == arm}
+        leased = (award for award in ledger.open.values() if award.record.arm == arm and not award.cleared)
+        open_space = {award.record.space for award in leased}
         after = (before - closing.space.get(arm, frozenset())) | (_stated_space(quote) - open_space)
         if after != before:
             records.append(SpaceTaken(arm, tuple(sorted(after)), time_s))
