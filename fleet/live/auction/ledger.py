@@ -263,7 +263,9 @@ class Ledger(TimedState[AuctionRecord]):
         self.jobs = {entry.spec.name: entry for entry in sorted(entries, key=lambda entry: job_order(entry.spec))}
 
     def _close(self, record: Closed) -> list[JobEntry]:
-        award = self.awards[record.award]
+        award = self.awards.get(record.award)
+        if award is None:  # left out by `compact`: the report changed nothing
+            return []
         award.silent, award.outcome = False, record.outcome
         self._end(record.award, moved=record.outcome != "refused")
         entry = self.jobs[award.record.job]
