@@ -18,9 +18,8 @@ from fleet.robot import JOINTS
 
 Array = np.ndarray
 
-LANES, WIDE = 8, 16
+LANES, WIDE = JOINTS + 1, 16
 """Padded lengths of the joint and the node axis."""
-assert JOINTS == LANES - 1
 
 WORK = np.dtype(
     {

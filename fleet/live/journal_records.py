@@ -74,3 +74,22 @@ class Closed(msgspec.Struct, frozen=True, tag="closed"):
     arm: str = ""
     faulted: bool = False
     """As in `fleet.bus.protocol.auction.Report`."""
+
+
+class SpaceTaken(msgspec.Struct, frozen=True, tag="space_taken"):
+    """An arm says which spaces it takes; empty at home."""
+
+    arm: Name
+    space: tuple[Name, ...] = ()
+    """Names, without those of its open awards."""
+    time_s: float = 0.0
+    number: Count = 0
+    """Of the claim that says it, where arms allocate by consensus."""
+
+
+class SpaceCleared(msgspec.Struct, frozen=True, tag="space_cleared"):
+    """A person has freed all space of an arm that is not heard."""
+
+    arm: Name
+    by: str = ""
+    time_s: float = 0.0

@@ -5,6 +5,7 @@ through the same postures share one volume, that of their heaviest payload, what
 """
 
 import hashlib
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -62,6 +63,21 @@ class SpaceTable:
 def plan_key(plan: Plan) -> PlanKey:
     """Key of a plan in a `SpaceTable`."""
     return plan.arm, plan.work, plan.elbow, plan.speed
+
+
+def space_name(key: PlanKey) -> str:
+    """Name of the space of a plan on the bus: equal in all processes, as it follows from the content of the plan."""
+    arm, work, elbow, speed = key
+    places = [[place.name, *map(float, (*place.position_m, *place.tool_deg, place.retreat_m))] for place in work.places]
+    numbers = [float(value) for value in (work.payload_kg, work.dwell_s, work.force_n, elbow, speed)]
+    content = json.dumps([arm, work.kind, places, numbers])
+    return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+
+def arms_in_reach(robots: Sequence[Robot], margin_m: float) -> frozenset[frozenset[str]]:
+    """Every two arms whose parts could come closer to each other than a margin in some posture, by name."""
+    pairs = combinations(robots, 2)
+    return frozenset(frozenset((one.name, other.name)) for one, other in pairs if _in_reach(one, other, margin_m))
 
 
 def space_table(robots: Sequence[Robot], plans: Sequence[Plan], margin_m: float, cache_dir: Path) -> SpaceTable:

@@ -114,7 +114,7 @@ def test_no_name_of_an_arm_reaches_into_another(arms):
         return
     owned = [zenoh.KeyExpr(key) for arm in arms for key in rights("f", roster.named(arm)).publishes]
     assert not [1 for one, other in product(owned, owned) if one is not other and one.intersects(other)]
-    assert len(access_control(roster)["subjects"]) == len(arms) + 4
+    assert len(access_control(roster)["subjects"]) == len(arms) + 5
 
 
 def test_a_name_that_is_not_there_is_told_with_those_that_are():

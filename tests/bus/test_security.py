@@ -188,14 +188,15 @@ def test_nobody_pretends_that_another_is_there(side, connect, fake):
 
 
 ASKERS = {
-    keys.of_arm("f", "arm_0", "quote"): {"auctioneer", "submitter"},
+    keys.of_arm("f", "arm_0", "quote"): {"auctioneer", "submitter", "operator"},
     keys.of_arm("f", "arm_0", "award"): {"auctioneer"},
     keys.asked_by("f", "auctioneer", "lease", "arm_0"): {"arm_0"},
     keys.asked_by("f", "auctioneer", "report", "arm_1"): {"arm_1"},
     keys.asked_by("f", "arm_0", "claim", "arm_1"): {"arm_1"},
-    keys.of_jobs("f", "submit"): {"submitter"},
-    keys.of_jobs("f", "status"): {"submitter", "monitor", "recorder", "auctioneer"},
-    keys.of_clock("f"): {"arm_0", "arm_1", "submitter", "monitor", "recorder", "auctioneer"},
+    keys.of_jobs("f", "submit"): {"submitter", "operator"},
+    keys.of_jobs("f", "clear"): {"operator"},
+    keys.of_jobs("f", "status"): {"submitter", "operator", "monitor", "recorder", "auctioneer"},
+    keys.of_clock("f"): {"arm_0", "arm_1", "submitter", "operator", "monitor", "recorder", "auctioneer"},
 }
 
 
@@ -205,7 +206,7 @@ def test_each_asks_what_its_role_needs(side, connect, key):
     kept, asked = answer(answerer, key, (key, "answer"))
     settled(answerer)
     wild = key.replace("/arm/arm_0/", "/arm/*/").replace("/auctioneer/", "/*/")
-    everybody = ("arm_0", "arm_1", "submitter", "monitor", "recorder", "auctioneer")
+    everybody = ("arm_0", "arm_1", "submitter", "operator", "monitor", "recorder", "auctioneer")
     answered = {name: [ask(connect(name), question) for question in {key, wild}] for name in everybody}
     for name, said in answered.items():
         may = side == "open" or name in ASKERS[key]

@@ -6,7 +6,9 @@ Time is a number, every clock runs at its own rate, and a journal is a list.
 import math
 import random
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import combinations
 from types import SimpleNamespace
 
 import pytest
@@ -15,6 +17,7 @@ from fleet.bus.protocol.auction import (
     Ack,
     Announcement,
     Award,
+    ClearRequest,
     JobEstimate,
     JobSpec,
     Lease,
@@ -28,11 +31,13 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
-from fleet.errors import JournalFull
-from fleet.live.auction.auctioneer import Auctioneer, SendAward
+from fleet.errors import JournalFull, Refused
+from fleet.live.auction.auctioneer import Auctioneer
+from fleet.live.auction.leases import SendAward
 from fleet.live.auction.ledger import AuctionRecord, Ledger
 from fleet.live.auction.round import Allocate, Timing
 from fleet.live.journal_records import Closed, Started
+from fleet.live.space import Excludes, no_conflicts
 
 VALID_S = 2.0
 TIMING = Timing(lease_s=3.0, margin_s=0.05, window_s=0.5, ack_s=0.5, max_jobs=8)
@@ -78,6 +83,10 @@ class ModelArm:
     reports: dict[str, Report] = field(default_factory=dict)
     done: list[str] = field(default_factory=list)
     """Jobs whose last cycle it has done."""
+    out: str = ""
+    """Job for which it is away from home; "" at home."""
+    steps_home: int = 0
+    """Steps of `work` that it has been on its way home."""
 
     def own_s(self, true_s: float) -> float:
         return self.offset_s + self.rate * true_s
@@ -85,9 +94,22 @@ class ModelArm:
     def quote(self, request: QuoteRequest, true_s: float) -> Quote:
         name = f"{self.name}.{self.boots}.{len(self.quotes)}"
         self.quotes[name] = self.own_s(true_s)
-        offers = tuple(JobEstimate(job.name, True, finish_in_s=1.0) for job in request.jobs)
+        offers = tuple(
+            JobEstimate(job.name, True, finish_in_s=1.0, space=f"{self.name}: {job.name}") for job in request.jobs
+        )
+        jobs = {work.award.job.name for work in self.current.values()} | ({self.out} - {""})
         return Quote(
-            self.name, request.auction, name, VALID_S, "model", 0.0, "idle", 10.0, max(0, 1 - len(self.current)), offers
+            self.name,
+            request.auction,
+            name,
+            VALID_S,
+            "model",
+            0.0,
+            "idle",
+            10.0,
+            max(0, 1 - len(self.current)),
+            offers,
+            tuple(f"{self.name}: {job}" for job in sorted(jobs)),
         )
 
     def answer_award(self, award: Award, true_s: float) -> Ack:
@@ -105,9 +127,16 @@ class ModelArm:
         return [w for w in self.current.values() if self.up and (self.own_s(true_s) < w.until_s or w.in_last_cycle)]
 
     def work(self, true_s: float) -> None:
+        able = self.may_work(true_s)
+        if self.out and self.out not in {work.award.job.name for work in able}:
+            self.steps_home += 1
+            if self.steps_home >= 3:  # the way home takes some time
+                self.out, self.steps_home = "", 0
+            return
         for name, work in list(self.current.items()):
-            if work not in self.may_work(true_s):
+            if work not in able:
                 continue
+            self.out, self.steps_home = work.award.job.name, 0
             if work.cycles < work.award.job.repetitions - 1:
                 work.cycles += 1
             elif work.may_commit and not work.in_last_cycle:
@@ -145,7 +174,11 @@ class ModelArm:
                 del self.current[name]
 
     def crash(self, true_s: float) -> None:
-        """Lose everything but the journal, and return the current jobs; unsure of one in its last cycle."""
+        """Lose everything but the journal, and return the current jobs; unsure of one in its last cycle.
+
+        A person moves the arm home before it is started again.
+        """
+        self.out, self.steps_home = "", 0
         self.boots += 1
         self.quotes = {}
         for work in self.current.values():
@@ -182,10 +215,15 @@ class ModelFleet:
     """The auctioneer, its arms and the messages in transit."""
 
     def __init__(
-        self, arms: list[ModelArm], rate: float = 1.0, timing: Timing = TIMING, allocate: Allocate = first_come
+        self,
+        arms: list[ModelArm],
+        rate: float = 1.0,
+        timing: Timing = TIMING,
+        allocate: Allocate = first_come,
+        excludes: Excludes = no_conflicts,
     ) -> None:
         self.true_s, self.allocate = 0.0, allocate
-        self.rate, self.timing = rate, timing
+        self.rate, self.timing, self.excludes = rate, timing, excludes
         self.arms = {arm.name: arm for arm in arms}
         self.journal: list[AuctionRecord] = []
         self.packets: list[Packet] = []
@@ -205,7 +243,7 @@ class ModelFleet:
     def restart(self) -> Auctioneer:
         """Start the auctioneer from its journal, which it compacts at every second start."""
         self.boots += 1
-        ledger = Ledger().replay(self.journal)
+        ledger = Ledger(arms=tuple(self.arms)).replay(self.journal)
         if self.boots % 2:
             self.journal[:] = ledger.compact()
         self.journal.append(Started("auctioneer", self.true_s))
@@ -217,7 +255,16 @@ class ModelFleet:
             boot=str(self.boots),
             real_s=self.real_s,
             timing=self.timing,
+            excludes=self.excludes,
         )
+
+    def clear(self, name: str) -> None:
+        """Have a person stop an arm, move it home and free its space; it is started again."""
+        arm = self.arms[name]
+        arm.crash(self.true_s)
+        request = ClearRequest(name, "a person")
+        with suppress(Refused):
+            self.attempt(lambda: self.auctioneer.clear(request, frozenset(self.arms) - {name}, self.true_s))
 
     def keep(self, *records: AuctionRecord) -> None:
         if self.full:
@@ -349,6 +396,9 @@ class ModelFleet:
         for job, arms in self.at_work().items():
             assert len(arms) == 1, f"{arms} may all work on '{job}'"
             assert job not in finished, f"{arms} may work on '{job}', which is done"
+        away = {arm.name: f"{arm.name}: {arm.out}" for arm in self.arms.values() if arm.out}
+        for one, other in combinations(away, 2):
+            assert not self.excludes(one, away[one], other, away[other]), f"{away} exclude each other"
         statuses = {status.job: status for status in self.auctioneer.status()}
         assert self.accepted.keys() <= statuses.keys(), "a job is lost"
         for status in statuses.values():

@@ -164,12 +164,15 @@ def test_a_job_goes_from_quote_to_receipt(bus):
     line = bus.link()
     line.subscribe(keys.of_every_arm("f", "event"), ArmEvent, lambda _, e: events.append(e), history=True)
     line.subscribe(keys.of_every_arm("f", "difficulty"), DifficultyScores, lambda _, w: words.append(w), history=True)
+    states = []
+    line.subscribe(keys.of_every_arm("f", "state"), State, lambda _, state: states.append(state))
     arm = bus.arm()
     quote = bus.ask(line, "quote", request(), Quote)
-    assert (quote.capacity, quote.valid_s, quote.twin) == (1, 3.0, "by payload")
+    assert (quote.capacity, quote.valid_s, quote.twin, quote.space) == (1, 3.0, "by payload", ())
     (offer,) = quote.estimates
     assert offer.duration_s == pytest.approx(35.0)
     assert bus.ask(line, "award", award(quote.quote), Ack).accepted
+    assert bus.ask(line, "quote", request(dry_run=True), Quote).space == (offer.space,)
     bus.serve(lambda: auctioneer.reports)
     (report,) = auctioneer.reports
     assert (report.outcome, report.cycles, report.job) == ("finished", 3, "j")
@@ -182,7 +185,10 @@ def test_a_job_goes_from_quote_to_receipt(bus):
     assert [e.number - events[0].number for e in events] == [0, 1, 2]
     assert words[-1].jobs == ("j",)
     bus.serve(lambda: not ArmHistory().replay(arm.book.records()).reports)
-    assert bus.ask(line, "quote", request(), Quote).capacity == 1
+    last = bus.ask(line, "quote", request(), Quote)
+    assert (last.capacity, last.space) == (1, ())
+    bus.serve(lambda: states[-1].mode == "idle")
+    assert {(state.mode, state.space) for state in states} == {("idle", ""), ("working", offer.space)}
 
 
 def test_a_dry_run_changes_nothing(bus):

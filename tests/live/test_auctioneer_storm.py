@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.bus.protocol.auction import JobSpec
+from fleet.live.space import ANYWHERE
 
 
 def lossy_network(fleet, rng: random.Random) -> None:
@@ -69,19 +70,56 @@ def fill_disk(fleet, rng: random.Random) -> None:
     fleet.full = rng.random() < 0.5
 
 
+def clear(fleet, rng: random.Random) -> None:
+    fleet.clear(f"arm_{rng.randrange(3)}")
+
+
+def stop_on_the_way(fleet, rng: random.Random) -> None:
+    """An arm stops away from home while the others go on; nobody hears it."""
+    for _ in range(40):
+        away = [arm for arm in fleet.arms.values() if arm.out]
+        if away:
+            break
+        fleet.run_without_faults(0.1, 0.1)
+        fleet.check()
+    for _ in range(rng.randrange(5, 80) if away else 0):
+        fleet.run_without_faults(0.1, 0.1, absent=away[0].name)
+        fleet.check()
+
+
 def no_faults(fleet, rng: random.Random) -> None:
     fleet.run_without_faults(rng.choice([0.25, 0.5, 1.0, 2.0]))
 
 
-ACTIONS = (lossy_network, submit, wait, cut_off, kill_arm, give_back, kill_auctioneer, fill_disk, no_faults)
+ACTIONS = (
+    *(lossy_network, submit, wait, cut_off, stop_on_the_way, kill_arm, give_back),
+    *(clear, kill_auctioneer, fill_disk, no_faults),
+)
 rates = st.tuples(*[st.floats(1 - 1e-3, 1 + 1e-3)] * 4)
 
 
-@given(rates, st.integers(1, 5), st.lists(st.sampled_from(ACTIONS), min_size=4, max_size=16), st.integers(0, 2**32))
-def test_no_job_is_done_twice_or_lost_and_all_are_done_after_the_faults(live, rates, jobs, actions, seed):
+def random_conflicts(seed: int, share: float):
+    """Return a symmetric relation in which this share of all plans exclude each other, and unknown ones all others."""
+
+    def excludes(arm: str, space: str, other: str, other_space: str) -> bool:
+        if ANYWHERE in (space, other_space):
+            return True
+        return random.Random(f"{seed} {sorted([space, other_space])}").random() < share
+
+    return excludes
+
+
+@given(
+    rates,
+    st.integers(1, 5),
+    st.lists(st.sampled_from(ACTIONS), min_size=4, max_size=16),
+    st.integers(0, 2**32),
+    st.sampled_from([0.0, 0.5, 1.0]),
+)
+def test_no_job_is_done_twice_or_lost_and_all_are_done_after_the_faults(live, rates, jobs, actions, seed, share):
     rng = random.Random(seed)
     arms = [live.Arm(f"arm_{i}", rate, offset_s=100.0 * i) for i, rate in enumerate(rates[1:])]
-    fleet = live.Fleet(arms, rates[0])
+    fleet = live.Fleet(arms, rates[0], excludes=random_conflicts(seed, share))
     for _ in range(jobs):
         submit(fleet, rng)
     for action in actions:

@@ -12,7 +12,8 @@ from fleet.live.arm.award_executor import AwardExecutor
 from fleet.live.arm.journal_records import ArmHistory
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.ledger import AuctionRecord, Awarded, Ledger
-from fleet.live.consensus.granter import Granter, GrantRecord, Register
+from fleet.live.consensus.granter import Granter, Register
+from fleet.live.consensus.records import GrantRecord
 from fleet.live.journal_records import Closed, JobsAccepted
 
 JOB = JobSpec(name="j", kind="hold", places=("x",), repetitions=9)

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from fleet.errors import FleetError, JournalError, JournalFull
 from fleet.live import journal
-from fleet.live.consensus.granter import GrantRecord, Register
+from fleet.live.consensus.granter import Register
+from fleet.live.consensus.records import GrantRecord
 from fleet.live.journal import Journal, TimeRecorder
 
 ROOT = Path(__file__).parents[2]

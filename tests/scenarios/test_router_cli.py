@@ -138,7 +138,7 @@ def test_keys_are_made_shown_and_extended(capsys, folder):
     assert told["fleet"] == "quickstart"
     roles = {one["name"]: one["role"] for one in told["participants"]}
     assert roles == {
-        **{role: role for role in ("router", "auctioneer", "submitter", "monitor", "recorder")},
+        **{role: role for role in ("router", "auctioneer", "submitter", "operator", "monitor", "recorder")},
         **{f"arm_{i}": "arm" for i in range(4)},
         "gateway": "submitter",
     }

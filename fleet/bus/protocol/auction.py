@@ -119,6 +119,8 @@ class JobEstimate(msgspec.Struct, frozen=True):
     """Duration of the job alone."""
     finish_in_s: float | None = None
     """Time until it would be finished, including the arm's current jobs."""
+    space: Name | None = None
+    """Name of the space of its plan, from home to home; null for unknown: anywhere within reach."""
 
     def __post_init__(self) -> None:
         finite("JobEstimate", "joint_difficulty", self.joint_difficulty or ())
@@ -144,6 +146,9 @@ class Quote(msgspec.Struct, frozen=True):
     """How many more jobs the arm would accept now."""
     estimates: tuple[JobEstimate, ...]
     """One per requested job, in that order."""
+    space: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST_JOBS)] | None = None
+    """Names of the spaces that the arm takes now and those of its jobs; empty at home without jobs. null if the arm
+    does not say: then it is at home if its mode is idle, and may be anywhere within reach if not."""
 
     def __post_init__(self) -> None:
         for name in ("valid_s", "time_s", "headroom_k"):
@@ -297,6 +302,24 @@ class Result(msgspec.Struct, frozen=True):
     difficulty: float | None = None
     """Quoted by the arm."""
     p_saturation: float | None = None
+
+
+class ClearRequest(msgspec.Struct, frozen=True):
+    """Request to `jobs/clear`: free the space of an arm that is not present. The same request again changes nothing.
+
+    Only a person who has seen that the arm is at home or removed, and switched off, may request it.
+    """
+
+    arm: Name
+    by: str = ""
+    """Who requests it, for the records."""
+
+
+class Cleared(msgspec.Struct, frozen=True):
+    """Reply to a `ClearRequest`, which is on the auctioneer's disk: the arm takes no space until it is heard again."""
+
+    auctioneer: Name
+    arm: Name
 
 
 class ArmEvent(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -7,6 +7,9 @@ scenario names it, has granted the job in a `ClaimReply`.
 Why no job is done twice: two majorities have an arm in common, and an arm grants a job to one peer at a time. A grant
 is a lease: the claimer counts it from the moment it sent the claim, the granter from the moment it replied. Permission
 to commit is granted once and for good. The granter has all of it on disk before it replies.
+
+Why no two arms are away from home on plans that exclude each other: an arm grants the space of a plan to one peer at a
+time, and takes it for free only when a later claim of that peer says so, never because a lease has ended.
 (Leases: Gray & Cheriton 1989, SOSP. Majorities: Thomas 1979, ACM TODS 4.)
 """
 
@@ -57,6 +60,8 @@ class ClaimEntry(msgspec.Struct, frozen=True):
     """Done so far, including those of others."""
     phase: Literal["requested", "queued", "working", "finishing"]
     """requested: not granted yet; finishing: requests permission to commit (to begin the last cycle), or has it."""
+    space: Name | None = None
+    """Name of the space of its plan, from home to home; null for unknown: anywhere within reach."""
 
 
 Faults = Annotated[dict[Name, Name], msgspec.Meta(max_length=16)]
@@ -93,6 +98,9 @@ class Claim(msgspec.Struct, frozen=True):
     outcomes: Annotated[tuple[JobOutcome, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
     jobs: Annotated[tuple[JobSpec, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
     """Jobs that outsiders submitted and that a peer does not seem to know."""
+    space: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST_JOBS)] | None = None
+    """Names of the spaces that the arm takes now; empty at home. All other space that was granted to it before and is
+    not of its entries is free. null if the arm does not say: it may be anywhere within reach."""
 
 
 class GrantedEntry(msgspec.Struct, frozen=True):

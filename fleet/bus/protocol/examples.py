@@ -10,6 +10,8 @@ from fleet.bus.protocol.auction import (
     Announcement,
     ArmEvent,
     Award,
+    Cleared,
+    ClearRequest,
     Clock,
     ClockRequest,
     JobEstimate,
@@ -42,7 +44,7 @@ CRATE = JobSpec(
 )
 _ARM, _AUCTIONEER = "arm_0", "auctioneer"
 _ROUND, _QUOTE, _AWARD = "auctioneer-17", "arm_0-2-41", "auctioneer-17-crate_1"
-_CLAIMED = f"{_QUOTE}:crate_1"
+_CLAIMED, _SPACE = f"{_QUOTE}:crate_1", "5d1c0f7e92ab3486"
 _OFFER = JobEstimate(
     job="crate_1",
     feasible=True,
@@ -52,6 +54,7 @@ _OFFER = JobEstimate(
     peak_c=51.5,
     duration_s=212.0,
     finish_in_s=240.5,
+    space=_SPACE,
 )
 _DONE = JobStatus(job="crate_1", state="finished", arm=_ARM, award=_AWARD, cycles=20, finished_s=842.5)
 
@@ -64,6 +67,7 @@ _ALL: tuple[msgspec.Struct, ...] = (
         temp_c=(31.2, 48.9, 35.0, 40.1, 30.2, 29.8, 30.0),
         headroom_k=11.1,
         job="crate_1",
+        space=_SPACE,
     ),
     Info(arm=_ARM, joints=7, twin="lstm-vae-3f9a"),
     DifficultyScores(
@@ -88,6 +92,7 @@ _ALL: tuple[msgspec.Struct, ...] = (
         headroom_k=14.2,
         capacity=1,
         estimates=(_OFFER,),
+        space=(),
     ),
     Award(award=_AWARD, auction=_ROUND, auctioneer=_AUCTIONEER, quote=_QUOTE, job=CRATE, cycles=0, lease_s=6.0),
     Ack(arm=_ARM, award=_AWARD, accepted=True),
@@ -103,10 +108,11 @@ _ALL: tuple[msgspec.Struct, ...] = (
     Claim(
         arm=_ARM,
         number=2_000_000_042,
-        entries=(ClaimEntry(award=_CLAIMED, job="crate_1", places=CRATE.places, cycles=19, phase="finishing"),),
+        entries=(ClaimEntry(_CLAIMED, "crate_1", CRATE.places, cycles=19, phase="finishing", space=_SPACE),),
         outcomes=(
             JobOutcome(job="crate_0", award="arm_0-2-40:crate_0", arm=_ARM, outcome="finished", cycles=8, time_s=590.5),
         ),
+        space=(_SPACE,),
     ),
     ClaimReply(
         arm="arm_1",
@@ -134,6 +140,8 @@ _ALL: tuple[msgspec.Struct, ...] = (
     SubmissionReply(auctioneer=_AUCTIONEER, jobs=(Admission(job="crate_1", accepted=True),)),
     StatusRequest(jobs=("crate_1",)),
     Status(auctioneer=_AUCTIONEER, time_s=900.0, jobs=(_DONE,)),
+    ClearRequest(arm="arm_2", by="shop floor"),
+    Cleared(auctioneer=_AUCTIONEER, arm="arm_2"),
     ClockRequest(),
     Clock(time_s=600.0, speed=60.0),
 )

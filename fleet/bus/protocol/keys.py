@@ -17,7 +17,7 @@ Role = Literal["arm", "auction", "jobs", "clock"]
 ArmTopic = Literal["alive", "state", "info", "difficulty", "event", "bid", "quote", "award"]
 AuctionTopic = Literal["alive", "announce", "result"]
 AskedTopic = Literal["lease", "report", "claim"]
-JobsTopic = Literal["submit", "status"]
+JobsTopic = Literal["submit", "status", "clear"]
 
 PREFIX = "thermofleet/v2"
 STATES = f"{PREFIX}/*/arm/*/state"
@@ -126,7 +126,7 @@ def answered(expression: str, asked: str) -> str:
 
 
 def of_jobs(fleet: str, topic: JobsTopic) -> str:
-    """Key at which outsiders submit jobs, or query their status: `thermofleet/v2/{fleet}/jobs/{topic}`."""
+    """Key at which outsiders submit jobs, query their status or free space: `thermofleet/v2/{fleet}/jobs/{topic}`."""
     return str(Key(fleet, "jobs", "", topic))
 
 

@@ -37,6 +37,8 @@ class State(msgspec.Struct, frozen=True, omit_defaults=True):
     """Warning limit minus hottest motor."""
     job: str = ""
     """The current job; "" for none."""
+    space: str = ""
+    """Name of the space that the arm takes while it is away from home; "" at home, or if the arm does not say."""
     q: tuple[float, ...] = ()
     """rad, [joint]."""
     qd: tuple[float, ...] = ()

@@ -104,6 +104,7 @@ CHANNELS: tuple[Channel, ...] = (
     Channel("auction", "report", "query", auction.Report, auction.Receipt, receiver="arm"),
     Channel("jobs", "submit", "query", auction.Submission, auction.SubmissionReply),
     Channel("jobs", "status", "query", auction.StatusRequest, auction.Status),
+    Channel("jobs", "clear", "query", auction.ClearRequest, auction.Cleared, receiver="operator"),
     Channel("clock", "now", "query", auction.ClockRequest, auction.Clock),
 )
 CHANNEL: Mapping[tuple[str, str], Channel] = {(channel.role, channel.topic): channel for channel in CHANNELS}

@@ -14,7 +14,7 @@ import msgspec
 from fleet.bus.protocol import keys
 from fleet.errors import BusError, nearest
 
-Role = Literal["router", "arm", "auctioneer", "submitter", "monitor", "recorder"]
+Role = Literal["router", "arm", "auctioneer", "submitter", "operator", "monitor", "recorder"]
 ROLES: tuple[str, ...] = get_args(Role)
 LONGEST_COMMON_NAME = 64
 """Characters (X.520, ub-common-name)."""
@@ -160,8 +160,9 @@ def rights(fleet: str, participant: Participant, *, by_consensus: bool = False) 
             publishes=(own, keys.all_of(fleet, "jobs"), keys.all_of(fleet, "clock")),
             queries=(quotes, awards, time, status),
         )
-    if participant.role == "submitter":
-        return Rights(queries=(keys.of_jobs(fleet, "submit"), status, quotes, time))
+    if participant.role in ("submitter", "operator"):
+        clear = (keys.of_jobs(fleet, "clear"),) if participant.role == "operator" else ()
+        return Rights(queries=(keys.of_jobs(fleet, "submit"), *clear, status, quotes, time))
     if participant.role in ("monitor", "recorder"):
         return Rights(queries=(status, time))
     return Rights()

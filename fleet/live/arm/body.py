@@ -45,6 +45,11 @@ class Body(Protocol):
         ...
 
     @property
+    def away(self) -> Plan | None:
+        """Plan along which it is away from home, also where a fault stopped it; None at home."""
+        ...
+
+    @property
     def cycles(self) -> int:
         """Cycles of the current job that are done, by any arm."""
         ...

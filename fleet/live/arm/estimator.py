@@ -17,6 +17,7 @@ from fleet.errors import InfeasibleJob
 from fleet.job import LONGEST_JOB_S, Job, Place, Work
 from fleet.motion import Drive, Plan, drives, offered_plans
 from fleet.motor import gen3_motors
+from fleet.planning.space import plan_key, space_name
 from fleet.thermal import WINDING, gen3_network, temperature_steps, thermal_model
 
 Array = np.ndarray
@@ -142,6 +143,11 @@ class Estimator:
         best = self._best_or_reason(job)
         return None if isinstance(best, str) else best
 
+    def space_of(self, job: JobSpec) -> str | None:
+        """Return the name of the space that the arm takes for the job; None if it cannot do it."""
+        scored = self.best_plan(job)
+        return None if scored is None else space_name(plan_key(scored.plan))
+
     def estimate(
         self, jobs: Sequence[JobSpec], temp_c: Array, ambient_c: float, busy_s: float
     ) -> tuple[JobEstimate, ...]:
@@ -202,4 +208,5 @@ def _estimate(job: JobSpec, scored: ScoredPlan, temp_c: Array, peak_c: float, bu
         peak_c=peak_c,
         duration_s=plan.duration_s(job.repetitions),
         finish_in_s=finish_s if np.isfinite(finish_s) else None,
+        space=space_name(plan_key(plan)),
     )

@@ -26,6 +26,8 @@ from fleet.live.arm.body import Body
 from fleet.live.arm.estimator import Estimator
 from fleet.live.arm.journal_records import ActiveAward
 from fleet.live.clock import FleetClock, next_due_s
+from fleet.live.space import ANYWHERE
+from fleet.planning.space import plan_key, space_name
 
 PLANNING_S = 0.3
 """Real seconds that one reply may spend on planning."""
@@ -140,7 +142,23 @@ class ArmNode:
             headroom_k=self._headroom_k,
             capacity=0 if self.unfit() or self.work_source.objection else self.executor.spare_capacity,
             estimates=estimates,
+            space=self._possible_space(),
         )
+
+    @property
+    def space(self) -> tuple[str, ...]:
+        """Name of the space that the arm takes; empty at home."""
+        plan = self._body.away
+        return () if plan is None else (space_name(plan_key(plan)),)
+
+    def space_of(self, job: JobSpec) -> str | None:
+        """Return the name of the space that the arm takes for a job; None if it cannot do it."""
+        return self._estimator.space_of(job)
+
+    def _possible_space(self) -> tuple[str, ...]:
+        """Names of the spaces that the arm takes, and of those for which it may leave home at any moment."""
+        jobs = {self.space_of(active.award.job) or ANYWHERE for active in self.executor.active}
+        return tuple(sorted(jobs.union(self.space)))
 
     def estimate(self, jobs: tuple[JobSpec, ...]) -> tuple[JobEstimate, ...]:
         """Estimate what jobs would cost the arm now; those that cannot be planned in time are called `NOT_PLANNED`."""
@@ -312,6 +330,7 @@ class ArmNode:
                 time_s=self._body.time_s,
                 headroom_k=self._headroom_k,
                 job="" if self._current is None else self._current.job,
+                space="".join(self.space),
                 **vars(self._reading),
             )
         )

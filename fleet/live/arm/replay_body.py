@@ -52,7 +52,7 @@ class ReplayBody:
 
     # It takes no jobs.
 
-    job, is_free, cycles = "", False, 0
+    job, is_free, cycles, away = "", False, 0, None
 
     def last_cycle_in_s(self) -> float:
         return np.inf

@@ -2,7 +2,9 @@
 
 It steps the engine of the simulator, `fleet.engine.step`, in a world of one arm and its current job. A job is done in
 stints: the arm leaves home, does the cycles that it is allowed, and returns home. The allowed cycles can grow during a
-stint, so a job that is allowed to its end is one stint, as in a simulated shift.
+stint, so a job that is allowed to its end is one stint, as in a simulated shift. After a fault the arm stands where it
+stopped. Once it has recovered it ends that cycle and goes home, if no person has moved it home before
+(`ThermalLimits.move_home_s`).
 """
 
 from collections.abc import Callable
@@ -31,7 +33,7 @@ Array = np.ndarray
 
 MAX_STEPS = 200
 """Steps per call: a body that is far behind catches up gradually."""
-_REPORTED = ("torque_warning", "home", "warning", "fault", "recover")
+_REPORTED = ("torque_warning", "home", "warning", "fault", "recover", "moved")
 """Events of the engine that a live arm reports unchanged."""
 _CARRIED = (
     "tick",
@@ -92,6 +94,8 @@ class SimulatedBody:
         self._dt_s, self._max_dt_s = min(dt_s, max_dt_s), max_dt_s
         self._start_s = time_s
         self._task: _Current | None = None
+        self._plan: Plan | None = None
+        """Plan of the current or last job."""
         self._world, self._plant = self._build_world(None, warm=warm)
         self._state = initial(self._world)
         self._last: tuple[World, StepRecord] | None = None
@@ -109,6 +113,10 @@ class SimulatedBody:
     @property
     def is_free(self) -> bool:
         return self._task is None and self._state.mode[0, 0] not in (WORKING, FAULTED)
+
+    @property
+    def away(self) -> Plan | None:
+        return self._plan if self._state.plan[0, 0] >= 0 else None
 
     @property
     def cycles(self) -> int:
@@ -161,7 +169,7 @@ class SimulatedBody:
             raise ValueError(f"Arm '{self._arm.robot.name}' is not free and cannot start '{job.name}'.")
         if not 0 <= cycles < job.repetitions:
             raise ValueError(f"cycles must be 0 to {job.repetitions - 1} for '{job.name}' (got {cycles}).")
-        self._task = _Current(job, plan, cycles, allowed=cycles)
+        self._task, self._plan = _Current(job, plan, cycles, allowed=cycles), plan
         self._world, self._plant = self._build_world(self._task)
         self._state = self._carried(self._world)
 
@@ -182,9 +190,10 @@ class SimulatedBody:
         time_s, ticks, dt_s = self.time_s, float(self._state.tick[0]), min(dt_s, self._max_dt_s)
         phi, gamma = self._world.thermal.step_matrices(dt_s)
         # The engine counts its time in ticks of the new length.
-        clear_at_s = self._state.clear_at_s + ticks * (dt_s - self._dt_s)
+        later_s = ticks * (dt_s - self._dt_s)
+        clear_at_s, moved_at_s = self._state.clear_at_s + later_s, self._state.moved_at_s + later_s
         self._world = replace(self._world, dt_s=dt_s, phi=phi, gamma=gamma)
-        self._state = self._state._replace(clear_at_s=clear_at_s)
+        self._state = self._state._replace(clear_at_s=clear_at_s, moved_at_s=moved_at_s)
         self._dt_s = dt_s
         self.set_time(time_s)
 

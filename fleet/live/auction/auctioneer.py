@@ -9,13 +9,14 @@ make it safe (`fleet.bus.protocol.auction` says why):
 - A job is offered again only after its lease has ended here, or its arm has refused or returned it.
 - Permission to commit, that is to begin the last cycle, is on disk before it is given; no other arm gets the job then.
 - After a crash every open award counts as leased from the restart.
+- An arm takes the space of an award from then on until its quote in a later round says that it does not take it any
+  more; an award is given only if its space is free. The space of an arm without a quote stays taken.
 """
 
 import logging
 import math
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 
 from msgspec.structs import asdict, replace
 
@@ -23,6 +24,8 @@ from fleet.bus.protocol.auction import (
     Ack,
     Announcement,
     Award,
+    Cleared,
+    ClearRequest,
     JobStatus,
     Lease,
     LeaseEntry,
@@ -37,9 +40,12 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.messages import State
 from fleet.errors import JournalFull, Refused
+from fleet.live.auction.leases import CountedLease, SendAward
 from fleet.live.auction.ledger import AuctionRecord, Awarded, Change, ContactLost, ContactRegained, Ledger, ShiftEnded
 from fleet.live.auction.round import MAX_REASON, Allocate, Bidding, Round, Timing, drop_invalid, infeasible_jobs
-from fleet.live.journal_records import Closed, CommitPermitted, JobsAccepted
+from fleet.live.auction.space_rules import drop_taken, is_to_clear, stated_spaces
+from fleet.live.journal_records import Closed, CommitPermitted, JobsAccepted, SpaceCleared
+from fleet.live.space import ANYWHERE, Excludes, no_conflicts
 
 _LOG = logging.getLogger(__name__)
 
@@ -47,29 +53,7 @@ SCAN_S = 0.05
 """Real seconds between two checks for jobs that have become ready."""
 
 
-@dataclass(frozen=True)
-class SendAward:
-    """Send this award to its arm."""
-
-    arm: str
-    award: Award
-
-
 Out = QuoteRequest | SendAward | Announcement | Result
-
-
-@dataclass(eq=False)
-class _Lease:
-    """Lease of an open award, as the auctioneer counts it."""
-
-    until_s: float
-    """Real second at which it ends."""
-    cycles: int = 0
-    """Last reported progress."""
-    unanswered: SendAward | None = None
-    """The award, until its arm answers."""
-    sent_s: float = -math.inf
-    attempts: int = 1
 
 
 class Auctioneer:
@@ -78,7 +62,7 @@ class Auctioneer:
     Attributes:
         ledger: Its jobs and awards.
         out: Messages to send, oldest first; the driver takes them out.
-        states: The last state of each arm; the driver puts them in.
+        states: The last state of each arm.
     """
 
     def __init__(
@@ -91,6 +75,7 @@ class Auctioneer:
         boot: str,
         real_s: float,
         timing: Timing | None = None,
+        excludes: Excludes = no_conflicts,
     ) -> None:
         """Start with the jobs and awards of a ledger.
 
@@ -102,8 +87,8 @@ class Auctioneer:
         self.out: deque[Out] = deque(self._result(change) for change in ledger.recent)
         self.states: dict[str, State] = {}
         self._allocate, self._keep, self._boot = allocate, keep, boot
-        self._timing = timing or Timing()
-        self._leases = {award: _Lease(real_s + self._timing.counted_lease_s) for award in ledger.open}
+        self._timing, self._excludes = timing or Timing(), excludes
+        self._leases = {award: CountedLease(real_s + self._timing.counted_lease_s) for award in ledger.open}
         self._round: Round | None = None
         self._rounds = 0
         self._present: frozenset[str] = frozenset()
@@ -197,6 +182,25 @@ class Auctioneer:
         if not any(self._unanswered()):
             self._scan_s = -math.inf  # the next round can begin
 
+    def apply_state(self, arm: str, state: State) -> None:
+        """Apply the state of an arm; one that has come home may have freed space."""
+        before = self.states.get(arm)
+        if before is not None and before.space and not state.space:
+            self._retry_now()
+        self.states[arm] = state
+
+    def clear(self, request: ClearRequest, present: frozenset[str], time_s: float) -> Cleared:
+        """Free the space of an arm that is not heard: a person has seen that it is at home, or removed.
+
+        Raises:
+            Refused: the arm is unknown, or present, or may have a lease.
+        """
+        if is_to_clear(self.ledger, request.arm, present, self._timing.lease_s):
+            self._record(SpaceCleared(request.arm, request.by, time_s))
+            _LOG.warning("The space of '%s' was cleared by '%s'.", request.arm, request.by)
+            self._retry_now()
+        return Cleared(self.name, request.arm)
+
     def set_present(self, present: frozenset[str]) -> None:
         """Set which arms are present."""
         if present - self._present:
@@ -233,7 +237,7 @@ class Auctioneer:
 
     # Leases
 
-    def _unanswered(self) -> list[tuple[_Lease, SendAward]]:
+    def _unanswered(self) -> list[tuple[CountedLease, SendAward]]:
         return [(lease, lease.unanswered) for lease in self._leases.values() if lease.unanswered is not None]
 
     def _with_progress(self, status: JobStatus) -> JobStatus:
@@ -302,17 +306,25 @@ class Auctioneer:
             return
         self._rounds += 1
         auction = f"{self.name}-{self._boot}-{self._rounds}"
-        self._round = Round(auction, jobs, bidders, real_s + self._timing.window_s)
+        self._round = Round(auction, jobs, bidders, real_s + self._timing.window_s, self.ledger.closed_space())
         self.out.append(Announcement(self.name, auction, time_s, tuple(job.name for job in jobs)))
         self.out.append(QuoteRequest(auction, jobs))
 
     def _close_round(self, closing: Round, real_s: float, time_s: float) -> None:
         self._round = None
+        try:
+            self._record(*stated_spaces(self.ledger, closing, time_s))
+        except JournalFull as error:
+            _LOG.error("Nothing is awarded: %s", error)
+            self._delay(real_s, (job.name for job in closing.jobs))
+            return
         busy = self.ledger.busy_stations()
         entries = [self.ledger.jobs[job.name] for job in closing.jobs]
         entries = [entry for entry in entries if entry.state == "waiting" and not busy & frozenset(entry.spec.places)]
         jobs = tuple(entry.spec for entry in entries)
         quotes = {arm: quote for arm, quote in closing.quotes.items() if arm in closing.asked & self._present}
+        infeasible = infeasible_jobs(quotes)
+        quotes, waits = drop_taken(quotes, self.ledger.taken_space(), self._excludes)
         bidding = Bidding(
             closing.auction,
             time_s,
@@ -321,8 +333,11 @@ class Auctioneer:
             {arm: quote for arm, quote in quotes.items() if not quote.capacity},
             states=self.states,
             returned={entry.spec.name: (entry.returns, entry.returned_s) for entry in entries if entry.returns},
+            excludes=self._excludes,
         )
-        self._notes |= infeasible_jobs(bidding)
+        for job in closing.jobs if quotes else ():
+            self._notes.pop(job.name, None)
+        self._notes |= infeasible | waits
         allocation = drop_invalid(bidding, self._allocate(bidding)) if bidding.quotes and jobs else {}
         try:
             self._award(bidding, allocation, real_s, time_s)
@@ -343,9 +358,9 @@ class Auctioneer:
             offer = bidding.offer(arm, job)
             assert offer is not None, "drop_invalid keeps jobs with a bid"
             quote, cycles = bidding.quotes[arm].quote, self.ledger.jobs[job].cycles
-            award = f"{auction}:{job}"
+            award, space = f"{auction}:{job}", offer.space or ANYWHERE
             records.append(
-                Awarded(award, auction, job, arm, quote, cycles, time_s, offer.difficulty, offer.p_saturation)
+                Awarded(award, auction, job, arm, quote, cycles, time_s, offer.difficulty, offer.p_saturation, space)
             )
         self._record(*records)
         for record in records:
@@ -354,7 +369,7 @@ class Auctioneer:
             award = Award(record.award, auction, self.name, record.quote, spec, record.cycles, self._timing.lease_s)
             message = SendAward(record.arm, award)
             until_s = real_s + self._timing.counted_lease_s
-            self._leases[record.award] = _Lease(until_s, unanswered=message, sent_s=real_s)
+            self._leases[record.award] = CountedLease(until_s, unanswered=message, sent_s=real_s)
             self.out.append(message)
 
     # Records

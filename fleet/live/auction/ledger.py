@@ -5,7 +5,7 @@ ends of leases are not recorded: after a restart every open award counts as leas
 """
 
 from collections import deque
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import msgspec
@@ -15,7 +15,16 @@ from fleet.bus.protocol.auction import SETTLED, Admission, JobSpec, JobState, Jo
 from fleet.job import reason_to_give_up
 from fleet.live.auction.job_rules import SHIFT_ENDED, admit, job_order, ready_jobs, reason_for_silence
 from fleet.live.journal import TimedState
-from fleet.live.journal_records import ClockTick, Closed, CommitPermitted, JobsAccepted, Started
+from fleet.live.journal_records import (
+    ClockTick,
+    Closed,
+    CommitPermitted,
+    JobsAccepted,
+    SpaceCleared,
+    SpaceTaken,
+    Started,
+)
+from fleet.live.space import ANYWHERE
 
 MAX_RECENT = 64
 """Latest changes, published again after a restart for those who missed them."""
@@ -34,6 +43,8 @@ class Awarded(msgspec.Struct, frozen=True, tag="awarded"):
     time_s: float
     difficulty: float | None = None
     p_saturation: float | None = None
+    space: str = ANYWHERE
+    """Name of the space of its plan."""
 
 
 class ContactLost(msgspec.Struct, frozen=True, tag="contact_lost"):
@@ -94,6 +105,8 @@ class AwardState(msgspec.Struct):
     silent: bool = False
     """The arm has permission to commit, and has not renewed its lease."""
     outcome: str = ""
+    cleared: bool = False
+    """A person freed its space while the arm was silent."""
 
 
 class LedgerSnapshot(msgspec.Struct, frozen=True, tag="ledger_snapshot"):
@@ -109,10 +122,14 @@ class LedgerSnapshot(msgspec.Struct, frozen=True, tag="ledger_snapshot"):
     open: tuple[str, ...]
     """Names of open awards."""
     recent: tuple[Change, ...]
+    space: dict[str, tuple[str, ...]] = {}
+    """As in `Ledger`."""
 
 
 AwardRecord = Awarded | CommitPermitted | ContactLost | ContactRegained | Closed
-AuctionRecord = Started | ClockTick | JobsAccepted | AwardRecord | ShiftEnded | LedgerSnapshot
+AuctionRecord = (
+    Started | ClockTick | JobsAccepted | AwardRecord | SpaceTaken | SpaceCleared | ShiftEnded | LedgerSnapshot
+)
 
 
 @dataclass
@@ -121,6 +138,8 @@ class Ledger(TimedState[AuctionRecord]):
 
     places: frozenset[str] | None = None
     """Places of the cell; None allows any name."""
+    arms: tuple[str, ...] = ()
+    """Arms of the cell: each may be anywhere until it says where it is."""
     jobs: dict[str, JobEntry] = field(default_factory=dict[str, JobEntry])
     """By release and name."""
     awards: dict[str, AwardState] = field(default_factory=dict[str, AwardState])
@@ -132,6 +151,12 @@ class Ledger(TimedState[AuctionRecord]):
     recent: deque[Change] = field(default_factory=lambda: deque(maxlen=MAX_RECENT))
     open: dict[str, AwardState] = field(default_factory=dict[str, AwardState])
     """Awards that are not closed, by name."""
+    space: dict[str, frozenset[str]] = field(default_factory=dict[str, frozenset[str]])
+    """Names of the spaces that an arm may take besides those of its open awards, by arm: closed awards leave theirs
+    here until the arm says that it is at home."""
+
+    def __post_init__(self) -> None:
+        self.space |= {arm: frozenset([ANYWHERE]) for arm in self.arms}
 
     def admit(self, jobs: Sequence[JobSpec]) -> tuple[Admission, ...]:
         """Return which submitted jobs can be accepted; changes nothing."""
@@ -151,6 +176,22 @@ class Ledger(TimedState[AuctionRecord]):
         """Return the stations at which an arm may be at work; a silent arm does not block its station."""
         active = (award.record.job for award in self.open.values() if not award.silent)
         return frozenset(place for job in active for place in self.jobs[job].spec.places)
+
+    def taken_space(self) -> Mapping[str, frozenset[str]]:
+        """Return the names of the spaces that each arm may take."""
+        taken = dict(self.space)
+        for award in self.open.values():
+            if not award.cleared:
+                arm = award.record.arm
+                taken[arm] = taken.get(arm, frozenset()) | {award.record.space}
+        return taken
+
+    def closed_space(self) -> Mapping[str, frozenset[str]]:
+        """Return the names of the spaces that each arm may take for closed awards alone."""
+        still_open: dict[str, set[str]] = {}
+        for award in self.open.values():
+            still_open.setdefault(award.record.arm, set()).add(award.record.space)
+        return {arm: names - still_open.get(arm, set()) for arm, names in self.space.items()}
 
     def unsettled(self) -> list[str]:
         """Return the names of jobs that still need an arm or a report."""
@@ -176,6 +217,7 @@ class Ledger(TimedState[AuctionRecord]):
             awards=tuple(map(replace, kept)),
             open=tuple(self.open),
             recent=tuple(self.recent),
+            space={arm: tuple(sorted(spaces)) for arm, spaces in self.space.items()},
         )
         return (snapshot,)
 
@@ -193,13 +235,19 @@ class Ledger(TimedState[AuctionRecord]):
                 changed = [entry]
             case CommitPermitted() | ContactLost() | ContactRegained():
                 award, entry = self.awards[record.award], self._entry(record.award)
-                award.may_commit, award.silent = True, isinstance(record, ContactLost)
+                award.may_commit, award.silent, award.cleared = True, isinstance(record, ContactLost), False
                 entry.state, entry.reason = "finishing", ""
                 if award.silent:
                     entry.state, entry.reason = "unfinished", reason_for_silence(award.record.arm)
                 changed = [entry]
             case Closed():
                 changed = self._close(record)
+            case SpaceTaken():
+                self.space[record.arm] = frozenset(record.space)
+            case SpaceCleared():
+                self.space[record.arm] = frozenset()
+                for award in self.open.values():
+                    award.cleared |= award.record.arm == record.arm
             case ShiftEnded():
                 self.ended = True
                 changed = [self.jobs[name] for name in self.unsettled()]
@@ -218,9 +266,11 @@ class Ledger(TimedState[AuctionRecord]):
         self.jobs = {entry.spec.name: entry for entry in sorted(entries, key=lambda entry: job_order(entry.spec))}
 
     def _close(self, record: Closed) -> list[JobEntry]:
-        award = self.awards[record.award]
+        award = self.awards.get(record.award)
+        if award is None:  # left out by `compact`: the report changed nothing
+            return []
         award.silent, award.outcome = False, record.outcome
-        self.open.pop(record.award, None)
+        self._end(record.award, moved=record.outcome != "refused")
         entry = self.jobs[award.record.job]
         if entry.state == "finished":
             return []
@@ -228,7 +278,7 @@ class Ledger(TimedState[AuctionRecord]):
             entry.faults += (award.record.arm,)
         entry.cycles = max(entry.cycles, min(record.cycles, entry.spec.repetitions))
         if record.outcome == "finished":
-            self.open.pop(entry.award, None)  # a later award of the same job has no purpose any more
+            self._end(entry.award)  # a later award of the same job has no purpose any more
             entry.state, entry.award, entry.reason, entry.finished_s = "finished", record.award, "", record.time_s
         elif entry.award != record.award:  # the job was awarded again since
             return [entry] if self._give_up(entry) else []
@@ -251,12 +301,20 @@ class Ledger(TimedState[AuctionRecord]):
         entry.state, entry.reason = "given_up", reason
         return True
 
+    def _end(self, name: str, *, moved: bool = True) -> None:
+        """Close an award; an arm that may have moved for it takes its space until it says that it is at home."""
+        award = self.open.pop(name, None)
+        if award is not None and moved and not award.cleared:
+            arm = award.record.arm
+            self.space[arm] = self.space.get(arm, frozenset()) | {award.record.space}
+
     def _restore(self, snapshot: LedgerSnapshot) -> None:
         self.number, self.ended = snapshot.number, snapshot.ended
         self._set_jobs(map(replace, snapshot.jobs))
         self.awards = {award.record.award: replace(award) for award in snapshot.awards}
         self.open = {name: self.awards[name] for name in snapshot.open}
         self.recent = deque(snapshot.recent, maxlen=MAX_RECENT)
+        self.space |= {arm: frozenset(spaces) for arm, spaces in snapshot.space.items()}
 
     def _may_count(self, award: AwardState) -> bool:
         """Whether a report on a closed award could change the state of its job."""

@@ -16,6 +16,8 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Ack,
     Announcement,
+    Cleared,
+    ClearRequest,
     Clock,
     ClockRequest,
     LeaseRequest,
@@ -31,14 +33,16 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.registry import SESSION_LEASE_S
 from fleet.errors import BusError, JournalFull, Refused
-from fleet.live.auction.auctioneer import SCAN_S, Auctioneer, SendAward
+from fleet.live.auction.auctioneer import SCAN_S, Auctioneer
 from fleet.live.auction.job_rules import statuses_that_fit
+from fleet.live.auction.leases import SendAward
 from fleet.live.auction.ledger import AuctionRecord, Ledger
 from fleet.live.auction.round import Allocate, Timing
 from fleet.live.clock import FleetClock
 from fleet.live.journal import Journal, TimeRecorder
 from fleet.live.journal_records import Started
 from fleet.live.monitor.snapshot import FRESH_S
+from fleet.live.space import Excludes, no_conflicts
 
 _LOG = logging.getLogger(__name__)
 
@@ -71,6 +75,8 @@ class AuctionNode:
         speed: float,
         places: frozenset[str] | None = None,
         timing: Timing | None = None,
+        arms: tuple[str, ...] = (),
+        excludes: Excludes = no_conflicts,
     ) -> None:
         """Continue from a journal.
 
@@ -79,6 +85,8 @@ class AuctionNode:
             journal: Open journal.
             speed: Fleet seconds per real second.
             places: Names of the cell's places; None allows any name.
+            arms: Arms of the cell; each may be anywhere until it is heard.
+            excludes: Which plans of two arms exclude each other.
 
         Raises:
             BusError: the fleet has an auctioneer already.
@@ -87,7 +95,7 @@ class AuctionNode:
         self._link, self._name, self.journal = link, name, journal
         self._timing = timing or Timing()
         self._check_no_auctioneer()
-        ledger = Ledger(places).replay(journal.records())
+        ledger = Ledger(places, arms).replay(journal.records())
         real_s = time.monotonic()
         self._recorder = TimeRecorder(journal, ledger, real_s)
         start_s = self._recorder.start_s(speed)
@@ -101,6 +109,7 @@ class AuctionNode:
             boot=secrets.token_hex(4),
             real_s=real_s,
             timing=self._timing,
+            excludes=excludes,
         )
         self.rivals: set[str] = set()
         self._check_s = self._alone_s = -math.inf
@@ -168,6 +177,7 @@ class AuctionNode:
         renew_leases, apply_report = self._logged(auctioneer.renew_leases), self._logged(auctioneer.apply_report)
         link.reply_to(keys.of_jobs(fleet, "submit"), Submission, self._logged(self._submit))
         link.reply_to(keys.of_jobs(fleet, "status"), StatusRequest, self._status)
+        link.reply_to(keys.of_jobs(fleet, "clear"), ClearRequest, self._logged(self._clear))
         link.reply_to(keys.asked_by_every_arm(fleet, name, "lease"), LeaseRequest, renew_leases)
         link.reply_to(keys.asked_by_every_arm(fleet, name, "report"), Report, apply_report)
         link.reply_to(keys.of_clock(fleet), ClockRequest, lambda _: Clock(self.time_s, self._clock.speed))
@@ -193,12 +203,17 @@ class AuctionNode:
             raise Refused(f"{self._name_rivals()}: no jobs are accepted until one is stopped.")
         return self.auctioneer.submit(submission, real_s, time_s)
 
+    def _clear(self, request: ClearRequest, real_s: float, time_s: float) -> Cleared:
+        if self.rivals:
+            raise Refused(f"{self._name_rivals()}: no space is cleared until one is stopped.")
+        return self.auctioneer.clear(request, self.present, time_s)
+
     def _status(self, request: StatusRequest) -> Status:
         return Status(self._name, self.time_s, statuses_that_fit(self.auctioneer.status(request.jobs)))
 
     def _apply_state(self, arm: str, state: State) -> None:
         self._state_s[arm] = time.monotonic()
-        self.auctioneer.states[arm] = state
+        self.auctioneer.apply_state(arm, state)
 
     def _apply_token(self, arm: str, present: bool) -> None:
         (self._tokens.add if present else self._tokens.discard)(arm)

@@ -9,6 +9,7 @@ from functools import cached_property
 from fleet.bus.protocol.auction import LEASE_S, JobEstimate, JobSpec, Quote
 from fleet.bus.protocol.messages import State
 from fleet.live.clock import CLOCK_DRIFT
+from fleet.live.space import ANYWHERE, Excludes, arms_in_the_way, no_conflicts
 
 _LOG = logging.getLogger(__name__)
 
@@ -66,6 +67,7 @@ class Bidding:
     """Age of a quote, fleet seconds; 0 where none is given."""
     returned: Mapping[str, tuple[int, float]] = field(default_factory=dict[str, tuple[int, float]])
     """Number of returns of a job, and fleet time of the last one; only of jobs that were ever returned."""
+    excludes: Excludes = no_conflicts
 
     def offer(self, arm: str, job: str) -> JobEstimate | None:
         """Return an arm's estimate for a job of the round; None if the arm did not bid for it, or cannot do it."""
@@ -85,7 +87,8 @@ Allocate = Callable[[Bidding], Mapping[str, str]]
 def resolve_claims(bidding: Bidding, claims: Mapping[str, str], order: Sequence[str]) -> dict[str, str]:
     """Return the arm of each job: the lower quoted difficulty wins, then the arm that comes first in `order`.
 
-    As in simulation, a job goes to one arm, a station serves one job, and an unknown difficulty loses.
+    As in simulation, a job goes to one arm, a station serves one job, plans that exclude each other are not done at a
+    time, and an unknown difficulty loses.
 
     Args:
         claims: The job that each arm claims; a claim without a feasible offer is ignored.
@@ -98,7 +101,7 @@ def resolve_claims(bidding: Bidding, claims: Mapping[str, str], order: Sequence[
 
 
 def drop_invalid(bidding: Bidding, allocation: Mapping[str, str]) -> dict[str, str]:
-    """Return the valid part of an allocation: jobs with a bid, one job per arm and per station. Log the rest."""
+    """Return the valid part of an allocation: jobs with a bid, one job per arm, station and space. Log the rest."""
     pairs = sorted(allocation.items())
     valid = _without_conflicts(bidding, [pair for pair in pairs if bidding.offer(pair[1], pair[0]) is not None])
     for job, arm in pairs:
@@ -106,26 +109,32 @@ def drop_invalid(bidding: Bidding, allocation: Mapping[str, str]) -> dict[str, s
             _LOG.error("The policy gives '%s' to '%s', which did not bid for it: not awarded.", job, arm)
         elif job not in valid:
             _LOG.error(
-                "The policy gives '%s' to '%s', which conflicts with another job of that arm or station.", job, arm
+                "The policy gives '%s' to '%s', which conflicts with another job of that arm, station or space.",
+                job,
+                arm,
             )
     return valid
 
 
 def _without_conflicts(bidding: Bidding, pairs: Iterable[tuple[str, str]]) -> dict[str, str]:
-    """Return the arm of each job; of pairs with the same job, arm or station the first is kept."""
+    """Return the arm of each job; of pairs with the same job, arm, station or space the first is kept."""
     places = {job.name: frozenset(job.places) for job in bidding.jobs}
     arms: dict[str, str] = {}
     busy: set[str] = set()
+    taken: dict[str, list[str]] = {}
     for job, arm in pairs:
-        if job not in arms and arm not in arms.values() and not busy & places[job]:
+        offer = bidding.offer(arm, job)
+        if offer is None or job in arms or arm in taken or busy & places[job]:
+            continue
+        if not arms_in_the_way(arm, offer.space, taken, bidding.excludes):
             arms[job] = arm
             busy |= places[job]
+            taken[arm] = [offer.space or ANYWHERE]
     return arms
 
 
-def infeasible_jobs(bidding: Bidding) -> dict[str, str]:
+def infeasible_jobs(quotes: Mapping[str, Quote]) -> dict[str, str]:
     """Return the jobs that every arm with a quote calls infeasible, with the reasons of the arms."""
-    quotes = {**bidding.quotes, **bidding.full}
     reasons: dict[str, dict[str, str]] = {}
     for arm, quote in sorted(quotes.items()):
         for offer in quote.estimates:
@@ -148,6 +157,9 @@ class Round:
     """Arms whose quotes it waits for."""
     until_s: float
     """Real second at which it closes in any case."""
+    space: Mapping[str, frozenset[str]] = field(default_factory=dict[str, frozenset[str]])
+    """Space that each arm might still take for closed awards alone when the round was opened: its quote says if it
+    does."""
     quotes: dict[str, Quote] = field(default_factory=dict[str, Quote])
 
     def complete(self, present: frozenset[str]) -> bool:

@@ -11,6 +11,8 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from msgspec.structs import replace
+
 from fleet.bus.protocol.auction import MOST_JOBS, Ack, Award, JobSpec, Lease, Receipt, Report
 from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, Faults, JobOutcome
 from fleet.errors import JournalError, Refused
@@ -72,6 +74,7 @@ class Claimant:
         executor: AwardExecutor,
         granter: Granter,
         answer_award: Callable[[Award, float], Ack],
+        space_of: Callable[[JobSpec], str | None],
         *,
         boot: int,
         timing: Timing | None = None,
@@ -80,13 +83,15 @@ class Claimant:
 
         Args:
             answer_award: Accepts or refuses an award for the arm.
+            space_of: Name of the space of the arm's plan for a job.
             boot: Number of this start of the arm.
         """
         self.arm, self.executor, self.granter = executor.arm, executor, granter
         self.majority = len(granter.roster) // 2 + 1
         self.pending: dict[str, PendingClaim] = {}
         self.rejected: list[str] = []
-        self._answer_award, self._timing = answer_award, timing or Timing()
+        self._answer_award, self._space_of, self._timing = answer_award, space_of, timing or Timing()
+        self._space: tuple[str, ...] = ()
         self._number = boot * NUMBERS_PER_BOOT
         self._votes: dict[str, Vote] = {}
         self._receipts: dict[str, set[str]] = {}
@@ -129,9 +134,16 @@ class Claimant:
         """Claim with the next tick: a lease, a permission to commit or a receipt is due."""
         self._due = True
 
-    def claim(self, present: frozenset[str], real_s: float) -> Claim | None:
-        """Return the claim to send now, if it has changed, a lease is due, or a present arm has not replied."""
+    def claim(self, present: frozenset[str], space: tuple[str, ...], real_s: float) -> Claim | None:
+        """Return the claim to send now, if it has changed, a lease is due, or a present arm has not replied.
+
+        Args:
+            space: Names of the spaces that the arm takes; empty at home.
+        """
         self._expire(real_s)
+        if space != self._space:
+            self._space = space
+            self._change()
         unanswered = any(self._answered.get(arm, 0) < self._version for arm in present)
         if not self._due and not (unanswered and real_s >= self._claimed_s + CLAIM_S):
             return None
@@ -139,7 +151,7 @@ class Claimant:
         corrections = list(self._corrections.values())[: min(MAX_CORRECTIONS, MOST_JOBS - len(outcomes))]
         self._number += 1
         jobs = tuple(self._new_jobs.values())[:MAX_CORRECTIONS]
-        claim = Claim(self.arm, self._number, tuple(entries), (*outcomes, *corrections), jobs)
+        claim = Claim(self.arm, self._number, tuple(entries), (*outcomes, *corrections), jobs, space)
         self._claimed_s, self._due = real_s, False
         try:
             own_reply = self.granter.answer_claim(claim, real_s)
@@ -189,13 +201,16 @@ class Claimant:
 
     def _entries(self) -> tuple[list[ClaimEntry], list[JobOutcome]]:
         """Return the jobs that it has and requests, and outcomes; a job is claimed until its report is on disk."""
-        places = {active.award.award: active.award.job.places for active in self.executor.active}
+        jobs = {active.award.award: active.award.job for active in self.executor.active}
         entries: list[ClaimEntry] = []
         for lease in self.executor.lease_entries(self.arm):
-            entries.append(ClaimEntry(lease.award, lease.job, places[lease.award], lease.cycles, lease.phase))
+            job = jobs[lease.award]
+            entry = ClaimEntry(lease.award, job.name, job.places, lease.cycles, lease.phase, self._space_of(job))
+            entries.append(entry)
             self._votes.setdefault(lease.award, Vote())
         for award, pending in self.pending.items():
-            entries.append(ClaimEntry(award, pending.job.name, pending.job.places, 0, "requested"))
+            job = pending.job
+            entries.append(ClaimEntry(award, job.name, job.places, 0, "requested", self._space_of(job)))
         outcomes: list[JobOutcome] = []
         for report, on_disk in self.executor.pending_reports():
             if on_disk:
@@ -204,7 +219,7 @@ class Claimant:
                 self._receipts.setdefault(report.award, set())
             elif last := self._last_entries.get(report.award):
                 phase = "finishing" if last.phase == "finishing" else "working"
-                entries.append(ClaimEntry(report.award, report.job, last.places, report.cycles, phase))
+                entries.append(replace(last, cycles=report.cycles, phase=phase))
         self._last_entries = {entry.award: entry for entry in entries}
         return entries, outcomes
 

@@ -8,15 +8,15 @@ are on disk, and are applied only then. The rules that make it safe (`fleet.bus.
 - While a job is granted, no other job at one of its stations is.
 - Permission to commit, that is to begin the last cycle, is granted once and stays, unless its arm releases the job.
 - A settled job is granted to no arm.
+- Of two plans that exclude each other one is granted. Its arm takes the space until a later claim of the arm says that
+  it does not take it any more, or a person frees it. An arm without a claim may be anywhere.
 - After a crash every grant counts as leased from the restart.
 """
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
-import msgspec
-
-from fleet.bus.protocol.auction import Count, JobSpec, JobStatus, Name
+from fleet.bus.protocol.auction import JobSpec, JobStatus
 from fleet.bus.protocol.consensus import (
     Claim,
     ClaimEntry,
@@ -30,44 +30,10 @@ from fleet.errors import JournalFull, Refused
 from fleet.job import reason_to_give_up
 from fleet.live.auction.job_rules import reason_for_silence
 from fleet.live.auction.round import Timing
+from fleet.live.consensus.records import ClaimNumbered, Faulted, GrantRecord, JobGranted, JobSettled
 from fleet.live.journal import TimedState
-from fleet.live.journal_records import ClockTick, JobsAccepted, Progress, Released
-
-
-class JobGranted(msgspec.Struct, frozen=True, tag="job_granted"):
-    """A job is granted to an arm, or its grant is updated with more cycles done."""
-
-    arm: Name
-    number: Count
-    """Of the claim."""
-    award: Name
-    job: Name
-    places: tuple[Name, ...]
-    cycles: Count
-    may_commit: bool = False
-
-
-class JobSettled(msgspec.Struct, frozen=True, tag="job_settled"):
-    """A job, or an attempt at one, has ended."""
-
-    settled: JobOutcome
-
-
-class Faulted(msgspec.Struct, frozen=True, tag="faulted"):
-    """Arms have faulted in a job."""
-
-    job: Name
-    faults: Faults
-
-
-class ClaimNumbered(msgspec.Struct, frozen=True, tag="claim_numbered"):
-    """The last claim of an arm had this number."""
-
-    arm: Name
-    number: Count
-
-
-GrantRecord = JobGranted | Released | JobSettled | Faulted | JobsAccepted | ClockTick | ClaimNumbered | Progress
+from fleet.live.journal_records import ClockTick, JobsAccepted, Progress, Released, SpaceCleared, SpaceTaken
+from fleet.live.space import ANYWHERE, Excludes, arms_in_the_way, no_conflicts
 
 
 @dataclass(eq=False)
@@ -99,6 +65,8 @@ class Register(TimedState[GrantRecord]):
     jobs: dict[str, JobSpec] = field(default_factory=dict[str, JobSpec])
     """Submitted ones, by name."""
     time_s: float = 0.0
+    space: dict[str, frozenset[str]] = field(default_factory=dict[str, frozenset[str]])
+    """Names of the spaces that an arm may take, by arm."""
 
     def apply(self, record: GrantRecord) -> None:
         """Apply a record that is on disk."""
@@ -129,6 +97,11 @@ class Register(TimedState[GrantRecord]):
                 self._number(arm, number)
             case Progress(job, cycles):
                 self._count(job, cycles)
+            case SpaceTaken():
+                self._number(record.arm, record.number)
+                self.space[record.arm] = frozenset(record.space)
+            case SpaceCleared(arm):
+                self.space[arm] = frozenset()
 
     def compact(self) -> tuple[GrantRecord, ...]:
         """Return the fewest records that give the same register."""
@@ -141,6 +114,8 @@ class Register(TimedState[GrantRecord]):
             records.append(JobGranted(grant.arm, number, grant.award, job, grant.places, cycles, grant.may_commit))
         records += [Faulted(job, faults) for job, faults in self.faults.items() if job not in self.settled]
         records += [JobSettled(outcome) for outcome in self.settled.values()]
+        known = {arm: names for arm, names in self.space.items() if ANYWHERE not in names}
+        records += [SpaceTaken(arm, tuple(sorted(names))) for arm, names in known.items()]
         return tuple(records)
 
     @property
@@ -179,6 +154,7 @@ class Granter:
         *,
         real_s: float,
         timing: Timing | None = None,
+        excludes: Excludes = no_conflicts,
     ) -> None:
         """Start with the grants of a register.
 
@@ -188,7 +164,9 @@ class Granter:
         """
         self.arm, self.roster = arm, frozenset(roster)
         self.register = register
-        self._keep, self._timing = keep, timing or Timing()
+        self._keep, self._timing, self._excludes = keep, timing or Timing(), excludes
+        for each in self.roster:
+            register.space.setdefault(each, frozenset([ANYWHERE]))
         for grant in register.grants.values():
             grant.until_s = real_s + self._timing.counted_lease_s
 
@@ -208,6 +186,7 @@ class Granter:
         self._record([JobSettled(outcome) for outcome in claim.outcomes if self._is_new(outcome)])
         self._record(self._released(claim))
         self._record(self._given_up(real_s))
+        self._set_space(claim)
         register.numbers[claim.arm] = claim.number
         granted: list[GrantedEntry] = []
         denied: list[DeniedEntry] = []
@@ -220,6 +199,27 @@ class Granter:
                 cycles, faults = register.cycles.get(entry.job, 0), register.faults.get(entry.job, {})
                 granted.append(GrantedEntry(entry.award, cycles, may_commit, faults))
         return ClaimReply(self.arm, claim.number, self._timing.lease_s, tuple(granted), tuple(denied))
+
+    def clear(self, arm: str, by: str, present: frozenset[str], real_s: float, time_s: float) -> None:
+        """Free the space of an arm that is not heard: a person has seen that it is at home, or removed.
+
+        Raises:
+            Refused: the arm is unknown, or present, or may have a lease.
+            JournalError: it is not on disk, and nothing has changed.
+        """
+        grants = self.register.grants.values()
+        if arm not in self.roster:
+            raise Refused(f"'{arm}' is no arm of this fleet. Arms: {', '.join(sorted(self.roster))}.")
+        if arm in present:
+            raise Refused(f"'{arm}' is present and says itself which space it takes. Stop it first, or move it home.")
+        if any(grant.arm == arm and real_s < grant.until_s for grant in grants):
+            raise Refused(f"The lease of '{arm}' has not ended; try again in {self._timing.lease_s:g} s.")
+        if self.register.space[arm]:
+            self._record([SpaceCleared(arm, by, time_s)])
+
+    def in_the_way(self, arm: str, space: str | None) -> tuple[str, ...]:
+        """Return the arms that take a space which excludes this one of an arm."""
+        return arms_in_the_way(arm, space, self.register.space, self._excludes)
 
     def apply_outcome(self, outcome: JobOutcome) -> None:
         """Record the outcome of a job that a peer knows.
@@ -308,13 +308,24 @@ class Granter:
             if grant.arm == claim.arm and grant.award not in kept
         ]
 
+    def _set_space(self, claim: Claim) -> None:
+        """Record which space an arm takes by its claim, without that of its entries that is not granted yet."""
+        before = self.register.space[claim.arm]
+        stated = frozenset([ANYWHERE] if claim.space is None else claim.space)
+        after = before & {entry.space or ANYWHERE for entry in claim.entries} | stated
+        if after != before:
+            self._record([SpaceTaken(claim.arm, tuple(sorted(after)), number=claim.number)])
+
     def _objection(self, arm: str, entry: ClaimEntry, real_s: float) -> str:
         """Return why a job cannot be granted now, or ""."""
         if entry.job in self.register.settled:
             return f"'{entry.job}' is settled"
         grant = self.register.grants.get(entry.job)
+        same = grant is not None and (grant.arm, grant.award) == (arm, entry.award)
+        has_space = same and (entry.space or ANYWHERE) in self.register.space[arm]
+        if not has_space and (in_way := self.in_the_way(arm, entry.space)):
+            return f"'{in_way[0]}' is in the way"
         if grant is not None and self.is_granted(entry.job, real_s):
-            same = (grant.arm, grant.award) == (arm, entry.award)
             return "" if same else f"'{grant.arm}' has '{entry.job}'"
         for job, other in self.register.grants.items():
             if job != entry.job and real_s < other.until_s and set(other.places) & set(entry.places):
@@ -328,12 +339,18 @@ class Granter:
         grant = self.register.grants.get(entry.job)
         permitted = grant.may_commit if grant is not None and grant.award == entry.award else None
         may_commit = entry.phase == "finishing" or bool(permitted)
+        records: list[GrantRecord] = []
         if permitted != may_commit or cycles > done:
-            record = JobGranted(claim.arm, claim.number, entry.award, entry.job, entry.places, cycles, may_commit)
-            try:
-                self._record([record])
-            except JournalFull as error:
-                return str(error)
+            records.append(
+                JobGranted(claim.arm, claim.number, entry.award, entry.job, entry.places, cycles, may_commit)
+            )
+        taken, space = self.register.space[claim.arm], entry.space or ANYWHERE
+        if space not in taken:
+            records.append(SpaceTaken(claim.arm, tuple(sorted(taken | {space})), number=claim.number))
+        try:
+            self._record(records)
+        except JournalFull as error:
+            return str(error)
         self.register.grants[entry.job].until_s = real_s + self._timing.counted_lease_s
         return ""
 

@@ -15,6 +15,8 @@ from fleet.bus.client.client import AnotherReplies
 from fleet.bus.client.replies import Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
+    Cleared,
+    ClearRequest,
     Clock,
     ClockRequest,
     JobStatus,
@@ -32,8 +34,9 @@ from fleet.live.arm.auctioneer_client import RateLimitedWarnings
 from fleet.live.arm.node import ArmNode
 from fleet.live.auction.job_rules import admit, statuses_that_fit
 from fleet.live.clock import FleetClock
-from fleet.live.consensus.granter import Granter, GrantRecord, Register
+from fleet.live.consensus.granter import Granter, Register
 from fleet.live.consensus.participant import QUIET_S, Membership, Participant
+from fleet.live.consensus.records import GrantRecord
 from fleet.live.journal import Journal, TimeRecorder
 
 LISTEN_S = 0.5
@@ -68,7 +71,8 @@ class ConsensusNode:
         real_s = time.monotonic()
         self._recorder = TimeRecorder(journal, register, real_s)
         roster = membership.fleet.arms
-        granter = Granter(self._name, roster, register, journal.append, real_s=real_s, timing=membership.timing)
+        timing, excludes = membership.timing, membership.excludes
+        granter = Granter(self._name, roster, register, journal.append, real_s=real_s, timing=timing, excludes=excludes)
         self.participant = Participant(arm, granter, membership, boot=boot, rng=Random(f"{self._name} {boot}"))
         self.participant.add_jobs(register.jobs.values())
         self._stream = deque(membership.stream)
@@ -166,6 +170,7 @@ class ConsensusNode:
         link.reply_to(keys.asked_by_every_arm(fleet, name, "claim"), Claim, self._answer_claim)
         link.reply_to(keys.of_jobs(fleet, "submit"), Submission, self._submit)
         link.reply_to(keys.of_jobs(fleet, "status"), StatusRequest, self._status)
+        link.reply_to(keys.of_jobs(fleet, "clear"), ClearRequest, self._clear)
         link.reply_to(keys.of_clock(fleet), ClockRequest, self._clock)
         link.subscribe(keys.of_every_arm(fleet, "bid"), Bid, self._apply_bid, history=True)
         link.subscribe(keys.of_every_arm(fleet, "state"), State, self.participant.states.__setitem__)
@@ -212,6 +217,15 @@ class ConsensusNode:
         self._check_first()
         statuses = [status for status in self.statuses() if not request.jobs or status.job in request.jobs]
         return Status(self._name, self._arm.clock.now_s(time.monotonic()), statuses_that_fit(statuses))
+
+    def _clear(self, request: ClearRequest) -> Cleared:
+        real_s = time.monotonic()
+        present = frozenset(self._tokens) | {self._name}
+        try:
+            self.participant.granter.clear(request.arm, request.by, present, real_s, self._arm.clock.now_s(real_s))
+        finally:
+            self._check_first()
+        return Cleared(self._name, request.arm)
 
     def _clock(self, _: ClockRequest) -> Clock:
         self._check_first()

@@ -20,7 +20,7 @@ from random import Random
 
 from msgspec.structs import replace
 
-from fleet.bus.protocol.auction import JobSpec, JobStatus, Quote
+from fleet.bus.protocol.auction import JobEstimate, JobSpec, JobStatus, Quote
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply
 from fleet.bus.protocol.messages import State
 from fleet.live.arm.node import ArmNode
@@ -30,6 +30,7 @@ from fleet.live.auction.round import Bidding, Timing, resolve_claims
 from fleet.live.consensus.claimant import NUMBERS_PER_BOOT, Claimant
 from fleet.live.consensus.granter import Granter
 from fleet.live.monitor.snapshot import FRESH_S
+from fleet.live.space import Excludes, no_conflicts
 from fleet.observation import Observation
 
 QUIET_S = 0.05
@@ -59,6 +60,8 @@ class Membership:
     """Jobs that all arms know, each with the fleet time from which on it is offered."""
     horizon_s: float = math.inf
     """Fleet time at which the shift is over."""
+    excludes: Excludes = no_conflicts
+    """Which plans of two arms exclude each other."""
     timing: Timing = field(default_factory=Timing)
 
 
@@ -85,12 +88,13 @@ class Participant:
         """
         self.name, self.executor, self.granter = arm.executor.arm, arm.executor, granter
         self._timing = membership.timing
-        self.claimant = Claimant(arm.executor, granter, arm.answer_award, boot=boot, timing=self._timing)
+        self.claimant = Claimant(arm.executor, granter, arm.answer_award, arm.space_of, boot=boot, timing=self._timing)
         self.jobs: dict[str, JobSpec] = {}
         self.states: dict[str, State] = {}
         self.out: deque[Bid | Claim] = deque()
         self.ended, self.rounds = False, 0
         self._arm, self._fleet, self._policy = arm, membership.fleet, membership.choose
+        self._excludes = membership.excludes
         self._slots, self._rng = min(membership.slots, MAX_OPEN_JOBS), rng
         self._number = boot * NUMBERS_PER_BOOT
         self._bids: dict[str, tuple[Bid, float]] = {}
@@ -176,7 +180,7 @@ class Participant:
             self._claim_choice(real_s)
         else:
             self._choose(real_s, time_s)
-        if claim := self.claimant.claim(self._present, real_s):
+        if claim := self.claimant.claim(self._present, self._arm.space, real_s):
             self.out.append(claim)
 
     def open_jobs(self, real_s: float) -> list[str]:
@@ -230,7 +234,7 @@ class Participant:
         if self._choice not in names or self.claimant.pending:
             self._choice = ""
         open_jobs = self.open_jobs(real_s)
-        content = (capacity, names, len(open_jobs), self._choice)
+        content = (capacity, names, len(open_jobs), self._choice, dict(self.granter.register.space))
         if content == self._last_bid and real_s < self._bid_s + BID_S:
             return
         self._last_bid, self._bid_s = content, real_s
@@ -240,7 +244,7 @@ class Participant:
             number=self._number,
             time_s=time_s,
             capacity=capacity,
-            estimates=self._arm.estimate(tuple(ready)) if ready else (),
+            estimates=self._estimates(ready),
             open_count=len(open_jobs),
             closed_count=self.granter.register.closed_count,
             open_jobs=tuple(open_jobs[:MAX_OPEN_JOBS]),
@@ -248,6 +252,11 @@ class Participant:
         )
         self.apply_bid(bid, real_s)
         self.out.append(bid)
+
+    def _estimates(self, jobs: list[JobSpec]) -> tuple[JobEstimate, ...]:
+        """Return the estimates of these jobs, without those whose space another arm takes."""
+        estimates = self._arm.estimate(tuple(jobs)) if jobs else ()
+        return tuple(each for each in estimates if not self.granter.in_the_way(self.name, each.space))
 
     def _choose(self, real_s: float, time_s: float) -> None:
         """Let the policy choose a job, once the bids of all present arms have arrived."""
@@ -300,6 +309,7 @@ class Participant:
             quotes={arm: quote for arm, quote in quotes.items() if quote.capacity and quote.estimates},
             full={arm: quote for arm, quote in quotes.items() if not (quote.capacity and quote.estimates)},
             states=self.states,
+            excludes=self._excludes,
         )
 
     def _pause(self, job: str, real_s: float) -> None:

@@ -28,8 +28,10 @@ from scenarios.cli.live.options import (
 )
 from scenarios.cli.options import ENDPOINT, EndpointOption, PolicyOption, ScenarioArg, check_name
 from scenarios.cli.signals import Stop, until_stopped
+from scenarios.cli.terminal import progress_bar
 from scenarios.job_stream import draw_jobs
 from scenarios.live.allocation import central_allocation
+from scenarios.live.space import cell_space
 from scenarios.load import load
 from scenarios.schema import Scenario
 
@@ -60,6 +62,8 @@ def auction_command(
     own = own_jobs(chosen, seed) if jobs == "scenario" else []
     fleet, folder = folder_of(journal, fleet, chosen)
     refuse_other_way(folder, (arm.name for arm in chosen.arms), alone=False)
+    with progress_bar() as progress:
+        excludes = cell_space(chosen, progress=progress)
     with (
         until_stopped() as stop,
         BusClient(endpoint, fleet) as link,
@@ -67,7 +71,17 @@ def auction_command(
     ):
         places = frozenset(place.name for place in chosen.places)
         timing = Timing(max_jobs=chosen.slots)
-        node = AuctionNode(link, name, book, allocate=allocate, speed=speed, places=places, timing=timing)
+        node = AuctionNode(
+            link,
+            name,
+            book,
+            allocate=allocate,
+            speed=speed,
+            places=places,
+            timing=timing,
+            arms=tuple(arm.name for arm in chosen.arms),
+            excludes=excludes,
+        )
         typer.echo(f"ready {name} {endpoint} {os.getpid()}")
         if node.auctioneer.ledger.jobs:
             so_far = summary(node.auctioneer.status(), node.time_s).partition("\n")[0]

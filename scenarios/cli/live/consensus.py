@@ -12,13 +12,14 @@ from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.errors import BusError
 from fleet.live.arm.node import ArmNode
-from fleet.live.consensus.granter import GrantRecord
 from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
+from fleet.live.consensus.records import GrantRecord
 from fleet.live.journal import Journal
 from scenarios.cli.live.auction import own_jobs, summary
 from scenarios.cli.signals import Stop
 from scenarios.live.allocation import live_fleet
+from scenarios.live.space import cell_space
 from scenarios.policy_loader import arm_policy_of
 from scenarios.schema import Scenario
 
@@ -45,6 +46,7 @@ def membership_of(scenario: Scenario, name: str, policy: str, *, jobs: str, seed
         places=frozenset(place.name for place in scenario.places),
         stream=tuple(own_jobs(scenario, seed)) if stream else (),
         horizon_s=scenario.horizon_s if stream else float("inf"),
+        excludes=cell_space(scenario),
     )
 
 

@@ -6,6 +6,7 @@ Every arm is real except for its body: time is a number, every clock runs at its
 import random
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import combinations
 from types import SimpleNamespace
 
 import pytest
@@ -19,9 +20,12 @@ from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.round import Timing
 from fleet.live.consensus.granter import Granter, Register
 from fleet.live.consensus.participant import Membership, Participant
+from fleet.live.space import no_conflicts
 
 TIMING = Timing(lease_s=3.0, margin_s=0.05, window_s=0.3, pause_s=(0.2, 1.0))
 CYCLE_S = 0.2
+HOME_S = 0.5
+"""Duration of the way home."""
 
 
 class Crash(Exception):
@@ -54,7 +58,13 @@ class Arm:
         self.fleet, self.name, self.rate, self.boots = fleet, name, rate, 0
         self.journal, self.grants = Disk(), Disk()
         self.hot, self.cycle_ends_s = False, None
+        self.out, self.home_s = "", None
         self.start()
+
+    @property
+    def space(self) -> tuple[str, ...]:
+        """Space that it takes."""
+        return (f"{self.name}: {self.out}",) if self.out else ()
 
     @property
     def real_s(self) -> float:
@@ -63,31 +73,47 @@ class Arm:
     def start(self) -> None:
         self.boots += 1
         self.cycle_ends_s = None
+        self.out, self.home_s = "", None  # a person moves it home before it is started again
         history = ArmHistory().replay(self.journal.records).after_restart(self.name, 0.0)
         self.journal.records[:] = history.compact()
         register = Register().replay(self.grants.records)
         self.grants.records[:] = register.compact()
         config = ExecutorConfig(return_after_s=8.0)
         self.executor = AwardExecutor(self.name, self.journal.keep, history, nonce="n", config=config)
-        granter = Granter(self.name, self.fleet.names, register, self.grants.keep, real_s=self.real_s, timing=TIMING)
-        arm = SimpleNamespace(
-            executor=self.executor,
-            estimate=lambda jobs: tuple(self.fleet.offer(self.name, job) for job in jobs),
-            unfit=lambda: "hot" if self.hot else "",
-            answer_award=self.executor.answer_award,
+        granter = Granter(
+            self.name,
+            self.fleet.names,
+            register,
+            self.grants.keep,
+            real_s=self.real_s,
+            timing=TIMING,
+            excludes=self.fleet.excludes,
         )
         self.participant = Participant(
-            arm,
+            self,
             granter,
             Membership(
                 fleet=LiveFleet(arms=self.fleet.names, warning_c=60.0),
                 choose=self.fleet.policy().choose,
                 timing=TIMING,
+                excludes=self.fleet.excludes,
             ),
             boot=history.boot,
             rng=random.Random(f"{self.name} {self.boots}"),
         )
         self.participant.add_jobs([*self.fleet.jobs, *register.jobs.values()])
+
+    def estimate(self, jobs):
+        return tuple(self.fleet.offer(self.name, job) for job in jobs)
+
+    def space_of(self, job: JobSpec) -> str:
+        return f"{self.name}: {job.name}"
+
+    def unfit(self) -> str:
+        return "hot" if self.hot else ""
+
+    def answer_award(self, award, real_s: float):
+        return self.executor.answer_award(award, real_s)
 
     def step(self) -> None:
         """Do what is due; it may crash at any moment."""
@@ -118,6 +144,21 @@ class Arm:
             self.fleet.send(self.name, self.participant.out.popleft())
 
     def _work(self) -> None:
+        """Work, and go home when there is nothing to do; a hot arm stands where it stopped."""
+        if self.hot:
+            return
+        if not self.out or (self.executor.active and self.executor.active[0].job == self.out):
+            self._work_at_place()
+        else:
+            self.cycle_ends_s = None
+        if self.cycle_ends_s is not None:
+            self.out, self.home_s = self.cycle_ends_s[0], None
+        elif self.out and self.home_s is None:
+            self.home_s = self.real_s + HOME_S
+        elif self.out and self.real_s >= self.home_s:
+            self.out = ""
+
+    def _work_at_place(self) -> None:
         """Work cycle after cycle; a cycle that has begun is completed."""
         if not self.executor.active:
             self.cycle_ends_s = None
@@ -153,9 +194,9 @@ class Arm:
 class Fleet:
     """Arms, and the messages in transit between them."""
 
-    def __init__(self, rates, jobs, policy=Consensus) -> None:
+    def __init__(self, rates, jobs, policy=Consensus, excludes=no_conflicts) -> None:
         self.names = tuple(f"arm_{i}" for i in range(len(rates)))
-        self.true_s, self.jobs, self.policy = 100.0, list(jobs), policy
+        self.true_s, self.jobs, self.policy, self.excludes = 100.0, list(jobs), policy, excludes
         self.packets: list = []
         self.old: list = []
         self.cut: set[str] = set()
@@ -168,7 +209,13 @@ class Fleet:
     def offer(self, arm: str, job: JobSpec) -> JobEstimate:
         """Return an estimate that depends on the names of arm and job only; some pairs are infeasible."""
         d = random.Random(f"{arm} {job.name}").random()
-        return JobEstimate(job=job.name, feasible=d > 0.1 or arm == self.names[0], difficulty=d, finish_in_s=10.0)
+        return JobEstimate(
+            job=job.name,
+            feasible=d > 0.1 or arm == self.names[0],
+            difficulty=d,
+            finish_in_s=10.0,
+            space=f"{arm}: {job.name}",
+        )
 
     def last_cycle(self, job: str) -> None:
         self.last_cycles[job] = self.last_cycles.get(job, 0) + 1
@@ -234,6 +281,9 @@ class Fleet:
         ]
         jobs = [job.name for job, _, _ in at_work]
         assert len(jobs) == len(set(jobs)), at_work
+        away = {arm.name: arm.space[0] for arm in self.arms.values() if arm.out}
+        for one, other in combinations(away, 2):
+            assert not self.excludes(one, away[one], other, away[other]), f"{away} exclude each other"
         stations = [place for job, arm, may_commit in at_work if not may_commit for place in job.places]
         assert len(stations) == len(set(stations)), at_work
 

@@ -24,8 +24,8 @@ from fleet.live.arm.simulated_body import SimulatedBody
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.round import Timing
 from fleet.live.clock import FleetClock
-from fleet.live.consensus.granter import GrantRecord
 from fleet.live.consensus.node import ConsensusNode, Membership
+from fleet.live.consensus.records import GrantRecord
 from fleet.live.journal import Journal
 from fleet.robot import ThermalLimits
 from scenarios.cli.live.consensus import refuse_auctioneer

@@ -1,6 +1,7 @@
 """Arms without an auctioneer under faults: messages lost, repeated and late, crashes, network cuts, full disks.
 
-At any moment no two arms have a lease of one job or of one station, and no last cycle is done twice. After the faults
+At any moment no two arms have a lease of one job or of one station, no last cycle is done twice, and no two arms are
+away from home on plans that exclude each other. After the faults
 every job is finished, reported unfinished because of a crash after permission to commit, or given up because arms
 faulted in it.
 """
@@ -12,6 +13,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from fleet.bus.protocol.auction import JobSpec
+from fleet.live.space import ANYWHERE
 
 
 def jobs_of(rng: random.Random, count: int) -> list[JobSpec]:
@@ -159,11 +161,23 @@ ACTIONS = (
 rates = st.lists(st.floats(1 - 1e-3, 1 + 1e-3), min_size=1, max_size=5)
 
 
+def random_conflicts(seed: int, share: float):
+    """Return a symmetric relation in which this share of all plans exclude each other, and unknown ones all others."""
+
+    def excludes(arm: str, space: str, other: str, other_space: str) -> bool:
+        if ANYWHERE in (space, other_space):
+            return True
+        return random.Random(f"{seed} {sorted([space, other_space])}").random() < share
+
+    return excludes
+
+
 def storm(council, rates, seed: int, actions) -> None:
     rng = random.Random(seed)
     all_jobs = jobs_of(rng, rng.randrange(3, 14))
     submitted = [job for job in all_jobs if rng.random() < 0.4]
-    fleet = council.Fleet(rates, [job for job in all_jobs if job not in submitted])
+    excludes = random_conflicts(seed, rng.choice([0.0, 0.5, 1.0]))
+    fleet = council.Fleet(rates, [job for job in all_jobs if job not in submitted], excludes=excludes)
     for job in submitted:  # to one arm, which has to send them to the others
         one = fleet.arms[rng.choice(fleet.names)].participant
         one.granter.add_jobs((job,))

@@ -167,11 +167,11 @@ class One:
             "a", roster, Register().replay(self.grants.records), self.grants.keep, real_s=0.0, timing=TIMING
         )
         self.claimant = Claimant(
-            self.executor, self.granter, self.executor.answer_award, boot=history.boot, timing=TIMING
+            self.executor, self.granter, self.executor.answer_award, str, boot=history.boot, timing=TIMING
         )
 
     def send_claim(self, real_s) -> Claim:
-        claimed = self.claimant.claim(frozenset("bcd"), real_s)
+        claimed = self.claimant.claim(frozenset("bcd"), (), real_s)
         assert claimed is not None
         return claimed
 

@@ -1,0 +1,80 @@
+"""Space in an auction: what quotes say about it, which estimates it closes, and whose space a person may free."""
+
+from collections.abc import Iterable, Mapping
+
+from msgspec.structs import replace
+
+from fleet.bus.protocol.auction import Quote
+from fleet.errors import Refused
+from fleet.live.auction.ledger import Ledger
+from fleet.live.auction.round import MAX_REASON, Round
+from fleet.live.journal_records import SpaceTaken
+from fleet.live.space import ANYWHERE, Excludes, arms_in_the_way
+
+
+def _stated_space(quote: Quote) -> frozenset[str]:
+    """Return the names of the spaces that an arm takes, and of those of its jobs, by its quote."""
+    if quote.space is None:
+        return frozenset() if quote.mode == "idle" else frozenset([ANYWHERE])
+    return frozenset(quote.space)
+
+
+def drop_taken(
+    quotes: Mapping[str, Quote], taken: Mapping[str, Iterable[str]], excludes: Excludes
+) -> tuple[dict[str, Quote], dict[str, str]]:
+    """Return the quotes without estimates whose space another arm takes; and why a job is in no quote any more.
+
+    Args:
+        taken: Names of the spaces that each arm may take.
+    """
+    kept: dict[str, Quote] = {}
+    waits: dict[str, set[str]] = {}
+    for arm, quote in quotes.items():
+        spaces = {offer.space for offer in quote.estimates if offer.feasible}
+        in_way = {space: arms_in_the_way(arm, space, taken, excludes) for space in spaces}
+        closed = {offer.job for offer in quote.estimates if offer.feasible and in_way[offer.space]}
+        for offer in quote.estimates:
+            if offer.job in closed:
+                waits.setdefault(offer.job, set()).update(in_way[offer.space])
+        kept[arm] = replace(quote, estimates=tuple(offer for offer in quote.estimates if offer.job not in closed))
+    open_jobs = {offer.job for quote in kept.values() for offer in quote.estimates if offer.feasible}
+    reasons = {
+        job: f"It waits until {', '.join(sorted(arms))} is out of the way."[:MAX_REASON]
+        for job, arms in waits.items()
+        if job not in open_jobs
+    }
+    return kept, reasons
+
+
+def stated_spaces(ledger: Ledger, closing: Round, time_s: float) -> list[SpaceTaken]:
+    """Return what the quotes of a round change in the space that arms take.
+
+    A quote says nothing about awards that were closed after the round was opened: these keep their space.
+    """
+    records: list[SpaceTaken] = []
+    for arm, quote in sorted(closing.quotes.items()):
+        before = ledger.space.get(arm, frozenset())
+        leased = (award for award in ledger.open.values() if award.record.arm == arm and not award.cleared)
+        open_space = {award.record.space for award in leased}
+        after = (before - closing.space.get(arm, frozenset())) | (_stated_space(quote) - open_space)
+        if after != before:
+            records.append(SpaceTaken(arm, tuple(sorted(after)), time_s))
+    return records
+
+
+def is_to_clear(ledger: Ledger, arm: str, present: frozenset[str], lease_s: float) -> bool:
+    """Return whether an arm takes space that a person may free.
+
+    Raises:
+        Refused: the arm is unknown, or present, or may have a lease.
+    """
+    awards = [award for award in ledger.open.values() if award.record.arm == arm]
+    taken = ledger.taken_space()
+    if arm in present:
+        raise Refused(f"'{arm}' is present and says itself which space it takes. Stop it first, or move it home.")
+    if arm not in ledger.space and not awards:
+        arms = ", ".join(sorted(name for name, spaces in taken.items() if spaces))
+        raise Refused(f"'{arm}' takes no space. Arms that do: {arms or 'none'}.")
+    if not all(award.silent for award in awards):
+        raise Refused(f"The lease of '{arm}' has not ended; try again in {lease_s:g} s.")
+    return bool(taken.get(arm))

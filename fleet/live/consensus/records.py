@@ -1,0 +1,54 @@
+"""Records that an arm without an auctioneer keeps of what it has granted, in the order in which they happened."""
+
+import msgspec
+
+from fleet.bus.protocol.auction import Count, Name
+from fleet.bus.protocol.consensus import Faults, JobOutcome
+from fleet.live.journal_records import ClockTick, JobsAccepted, Progress, Released, SpaceCleared, SpaceTaken
+
+
+class JobGranted(msgspec.Struct, frozen=True, tag="job_granted"):
+    """A job is granted to an arm, or its grant is updated with more cycles done."""
+
+    arm: Name
+    number: Count
+    """Of the claim."""
+    award: Name
+    job: Name
+    places: tuple[Name, ...]
+    cycles: Count
+    may_commit: bool = False
+
+
+class JobSettled(msgspec.Struct, frozen=True, tag="job_settled"):
+    """A job, or an attempt at one, has ended."""
+
+    settled: JobOutcome
+
+
+class Faulted(msgspec.Struct, frozen=True, tag="faulted"):
+    """Arms have faulted in a job."""
+
+    job: Name
+    faults: Faults
+
+
+class ClaimNumbered(msgspec.Struct, frozen=True, tag="claim_numbered"):
+    """The last claim of an arm had this number."""
+
+    arm: Name
+    number: Count
+
+
+GrantRecord = (
+    JobGranted
+    | Released
+    | JobSettled
+    | Faulted
+    | JobsAccepted
+    | ClockTick
+    | ClaimNumbered
+    | Progress
+    | SpaceTaken
+    | SpaceCleared
+)

@@ -1,0 +1,41 @@
+"""`thermofleet clear`: free the space of an arm that is not heard."""
+
+import getpass
+from typing import Annotated
+
+import typer
+
+from fleet.bus.client.client import BusClient
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import Cleared, ClearRequest
+from fleet.errors import BusError
+from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
+
+REPLY_S = 5.0
+"""Real seconds to wait for a reply."""
+
+
+def clear_command(
+    arm: Annotated[str, typer.Argument(help="Name of the arm.")],
+    by: Annotated[str, typer.Option(help="Who frees it, for the records. Default: the user's name.")] = "",
+    endpoint: EndpointOption = ENDPOINT,
+    fleet: FleetOption = "",
+) -> None:
+    """Free the space of an arm that is not present, so that other arms may pass where it could stand.
+
+    First see to it that the arm is at home or removed, and switched off. An arm that is present is refused: it says
+    itself which space it takes.
+    """
+    with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
+        request = ClearRequest(arm, by or getpass.getuser())
+        replies = link.query_and_wait(keys.of_jobs(link.fleet, "clear"), request, Cleared, timeout_s=REPLY_S)
+        name = link.fleet
+    if not replies.messages:
+        reasons = [reason for reason in replies.refused.values() if reason]
+        raise BusError(
+            f"The space of '{arm}' was not freed: {reasons[0]}"
+            if reasons
+            else f"Neither an auctioneer nor arms of fleet '{name}' replied within {REPLY_S:g} s; with TLS, the role "
+            "operator is needed."
+        )
+    typer.echo(f"{arm}: its space is free until it is heard again.")
