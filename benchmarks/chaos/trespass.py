@@ -26,6 +26,7 @@ from fleet.bus.protocol.auction import (
     Clock,
     ClockRequest,
     JobSpec,
+    JobStatus,
     LeaseEntry,
     LeaseRequest,
     QuoteRequest,
@@ -178,7 +179,13 @@ def queries(fleet: Fleet, rogue: zenoh.Session) -> Iterator[Attempt]:
     own = keys.asked_by(fleet_name, "auctioneer", "lease", ROGUE)
     if not _gets_reply(rogue, own, LeaseRequest(ROGUE, ())):
         raise RuntimeError("Control failed: no reply to the rogue's own lease request.")
-    awarded = [status for status in fleet.status().values() if status.state in ("awarded", "finishing")]
+    awarded: list[JobStatus] = []
+
+    def working() -> bool:
+        awarded[:] = [status for status in fleet.status().values() if status.state in ("awarded", "finishing")]
+        return bool(awarded)
+
+    fleet.wait_until(working, TIMEOUT_S)
     if not awarded:
         raise RuntimeError("No arm has a job; give the fleet more jobs.")
     for status in awarded:
