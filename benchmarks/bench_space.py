@@ -22,7 +22,7 @@ from fleet.physics.contacts import ContactFinder
 from fleet.physics.models import build_cell
 from fleet.robot import Mount, Robot
 from scenarios.load import library, load
-from scenarios.prepare.fleet import Fleet, prepare, space_of
+from scenarios.prepare.fleet import Fleet, prepare
 from scenarios.run.shift import RunSpec, run
 
 SIXTEEN = 4

@@ -201,9 +201,9 @@ _SHAPES = {
     (): "1",
     ("joint",): "7",
     ("slot",): "K",
-    ("option",): "K × P",
+    ("option",): "K P",
     ("peer",): "n − 1",
-    ("peer", "slot"): "(n − 1) × K",
+    ("peer", "slot"): "(n − 1) K",
 }
 _EXAMPLE = Layout(arms=4, slots=8)
 

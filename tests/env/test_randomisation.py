@@ -34,7 +34,7 @@ def actions_of(play, mask: np.ndarray, step: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("difficulty", ["blind", "oracle"])
-@pytest.mark.parametrize("e", [0, 4])
+@pytest.mark.parametrize("e", [0, 5])
 def test_a_row_equals_make_env_with_the_same_seed(cell, folder, play, e, difficulty) -> None:
     options: dict[str, Any] = {"difficulty": difficulty, "cache": folder}
     batch, env = make_batch(cell, 6, SEED, **options), make_env(cell, **options)
