@@ -170,7 +170,8 @@ class Shifts:
     slots: int = 4
     ambient_c: float = 30.0
     limits: ThermalLimits = field(default_factory=ThermalLimits)
-    space: Space | None = None
+    crowding: float = 0.0
+    """Share of the pairs of plans of two arms that exclude each other."""
 
     def __call__(self, seed: np.random.SeedSequence) -> Episode:
         """The episode of a seed."""
@@ -204,7 +205,7 @@ class Shifts:
         arms = [arm(i, WORKS, times=Times(cycle=10.0 + 2.0 * i)) for i in range(self.arms)]
         return shop(
             [jobs], arms=arms, limits=self.limits, ticks=self.ticks, slots=self.slots, ambient_c=self.ambient_c,
-            space=self.space,
+            space=crowded(self.crowding) if self.crowding else None,
         )  # fmt: skip
 
     def library(self) -> Library:

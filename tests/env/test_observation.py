@@ -226,9 +226,7 @@ def test_vectors_equal_the_reference(
     small, play, seed, arms, jobs, slots, ambient_c, power_off, share, two_plans
 ) -> None:
     limits = ThermalLimits(warning_c=56.0, error_c=60.0, restart_c=54.0, clear_s=25.0, power_off_on_fault=power_off)
-    make = small.Shifts(
-        arms=arms, jobs=jobs, slots=slots, ticks=60, ambient_c=ambient_c, limits=limits, space=small.crowded(share)
-    )
+    make = small.Shifts(arms=arms, jobs=jobs, slots=slots, ticks=60, ambient_c=ambient_c, limits=limits, crowding=share)
     episode = make(np.random.SeedSequence(seed))
     if two_plans:
         episode = replace(episode, world=with_second_plans(episode.world, np.random.default_rng(seed)))
@@ -237,7 +235,7 @@ def test_vectors_equal_the_reference(
 
 def test_shifts_of_the_comparison_include_faults_returned_jobs_and_closed_space(small, play) -> None:
     limits = ThermalLimits(warning_c=56.0, error_c=60.0, restart_c=54.0, clear_s=25.0)
-    make = small.Shifts(arms=3, jobs=9, ticks=80, ambient_c=45.0, limits=limits, space=small.crowded(0.3))
+    make = small.Shifts(arms=3, jobs=9, ticks=80, ambient_c=45.0, limits=limits, crowding=0.3)
     played = [compare_with_reference(play, make(np.random.SeedSequence(seed)), seed) for seed in range(4)]
     last = [state for state, _ in played]
     assert sum(closed for _, closed in played) > 0

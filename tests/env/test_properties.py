@@ -133,7 +133,7 @@ def test_invariants_of_a_shift(small, play, draft) -> None:
 def test_arms_of_a_crowded_cell_do_not_touch(small, play, seed) -> None:
     """Many claims at once for plans that exclude each other, and arms that stop in the space of others."""
     limits = ThermalLimits(warning_c=46.0, error_c=50.0, restart_c=44.0, clear_s=25.0, move_home_s=200.0)
-    env = parallel_env(small.Shifts(arms=4, jobs=30, ticks=80, limits=limits, space=small.crowded(0.5)))
+    env = parallel_env(small.Shifts(arms=4, jobs=30, ticks=80, limits=limits, crowding=0.5))
     observed, _ = env.reset(seed=seed)
     rng, before, stopped, kept_apart = np.random.default_rng(seed), env.truth, 0, 0
     while env.agents:
