@@ -51,9 +51,9 @@ class Observation:
 
     clock: Annotated[Array, Field((), "1", 0, 1, "share of the shift that has passed")]
     idle: Annotated[Array, Field((), "1", 0, 1, "1 when this arm is free")]
-    working: Annotated[Array, Field((), "1", 0, 1, "1 when it has a current job")]
+    working: Annotated[Array, Field((), "1", 0, 1, "1 when it works or goes home")]
     faulted: Annotated[Array, Field((), "1", 0, 1, "1 when it is faulted by heat")]
-    busy_s: Annotated[Array, Field((), "s", 0, LONG_S, "time until the current job is done and the arm at home")]
+    busy_s: Annotated[Array, Field((), "s", 0, LONG_S, "time until it is home, with the current job done")]
     last_award: Annotated[Array, Field((), "1", -1, 1, "1 last claim won, -1 lost, 0 none made")]
     temp_c: Annotated[Array, Field(_JOINT, "°C", -60, 200, "own motor temperatures as measured")]
     headroom_k: Annotated[Array, Field((), "K", -150, 150, "warning limit minus hottest motor")]

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from fleet.engine.batch import Shift
 from fleet.engine.profile_plant import ProfilePlant
 from fleet.engine.state import World
 from fleet.engine.tables import tables_of
-from fleet.engine.world import Arm, build_world
+from fleet.engine.world import Arm, Space, build_world
 from fleet.env.allocation_v0 import Episode
 from fleet.env.vector import Library
 from fleet.job import Job, Place, Work
@@ -111,6 +112,20 @@ def job(name: str, content: Work | None = None, **changes) -> Job:
     return replace(base, **changes)
 
 
+def crowded(share: float) -> Space:
+    """Space in which this share of the pairs of plans of two arms exclude each other; the same pairs at every call."""
+
+    def space(plans: Sequence[Plan]) -> tuple[np.ndarray, np.ndarray]:
+        names = [f"{plan.arm} {plan.work} {plan.duration_s(1)}" for plan in plans]
+        conflicts = np.zeros((len(plans), len(plans)), bool)
+        for i, j in zip(*np.triu_indices(len(plans), 1), strict=True):
+            drawn = crc32("".join(sorted((names[i], names[j]))).encode()) / 2**32
+            conflicts[i, j] = conflicts[j, i] = plans[i].arm != plans[j].arm and drawn < share
+        return np.arange(len(plans)), conflicts
+
+    return space
+
+
 def shop(
     shifts: Sequence[Sequence[Job]],
     *,
@@ -121,6 +136,7 @@ def shop(
     slots: int = 4,
     ambient_c: float = 25.0,
     start_warm: bool = False,
+    space: Space | None = None,
 ) -> tuple[World, ProfilePlant]:
     """A world in which every arm can do every job (unless arms are given), and the plant that moves it."""
     if isinstance(arms, int):
@@ -135,6 +151,7 @@ def shop(
         slots=slots,
         ambient_c=np.full((ticks, len(arms)), ambient_c),
         start_warm=start_warm,
+        space=space,
     )
     rest_q = np.stack([a.robot.home_q() for a in arms])
     return world, ProfilePlant(plans, rest_q, np.stack([a.rest_tau for a in arms]))
@@ -153,6 +170,8 @@ class Shifts:
     slots: int = 4
     ambient_c: float = 30.0
     limits: ThermalLimits = field(default_factory=ThermalLimits)
+    crowding: float = 0.0
+    """Share of the pairs of plans of two arms that exclude each other."""
 
     def __call__(self, seed: np.random.SeedSequence) -> Episode:
         """The episode of a seed."""
@@ -184,7 +203,10 @@ class Shifts:
     def shop(self, jobs: Sequence[Job]) -> tuple[World, ProfilePlant]:
         """A world with these jobs."""
         arms = [arm(i, WORKS, times=Times(cycle=10.0 + 2.0 * i)) for i in range(self.arms)]
-        return shop([jobs], arms=arms, limits=self.limits, ticks=self.ticks, slots=self.slots, ambient_c=self.ambient_c)
+        return shop(
+            [jobs], arms=arms, limits=self.limits, ticks=self.ticks, slots=self.slots, ambient_c=self.ambient_c,
+            space=crowded(self.crowding) if self.crowding else None,
+        )  # fmt: skip
 
     def library(self) -> Library:
         """The same shifts for a batch."""
@@ -237,6 +259,7 @@ def small() -> SimpleNamespace:
         arm=arm,
         job=job,
         shop=shop,
+        crowded=crowded,
         work=work,
         torque=torque,
         phase=phase,

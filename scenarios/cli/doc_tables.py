@@ -197,7 +197,14 @@ def _limit_table() -> str:
     return table(("limit", "applies to"), rows)
 
 
-_SHAPES = {(): "1", ("joint",): "7", ("slot",): "K", ("peer",): "n − 1", ("peer", "slot"): "(n − 1) × K"}
+_SHAPES = {
+    (): "1",
+    ("joint",): "7",
+    ("slot",): "K",
+    ("option",): "K P",
+    ("peer",): "n − 1",
+    ("peer", "slot"): "(n − 1) K",
+}
 _EXAMPLE = Layout(arms=4, slots=8)
 
 
@@ -208,7 +215,7 @@ def _observation_table() -> str:
         place = str(start) if last == start else f"{start}–{last}"
         span = f"{_number(field.low)} … {_number(field.high)}"
         rows.append((f"`{field.name}`", place, _SHAPES[field.axes], field.unit, span, field.text))
-    return table(("field", "columns (4 arms, 8 slots)", "shape", "unit", "range", "meaning"), rows)
+    return table(("field", "columns (4 arms, 8 slots, 1 plan)", "shape", "unit", "range", "meaning"), rows)
 
 
 def _reward_table() -> str:

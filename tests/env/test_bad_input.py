@@ -240,7 +240,7 @@ def beyond(cell) -> dict[str, Any]:
 
 
 def test_jobs_that_no_arm_can_do_are_refused_with_a_remedy(cell, folder) -> None:
-    message = r"jobs\[1\]\.places: no arm can do 'sort' with 0\.2 kg \(left at 'shelf': .+\); move the places or an arm"
+    message = r"jobs\[1\]\.places: no arm can do 'sort' with 0\.2 or 0\.5 kg \(left at 'shelf': .+\); move the places"
     for make in (make_env, lambda scenario, **options: make_batch(scenario, 2, **options)):
         with pytest.raises(ScenarioError, match=message):
             make(cell, difficulty="blind", cache=folder, **beyond(cell))

@@ -154,6 +154,7 @@ def test_results_of_a_batch_are_in_its_spaces(batch, play) -> None:
             **{name: ("i", (9, 3)) for name in ("faults", "illegal")},
             **{name: ("f", (9, 3)) for name in ("peak_c", "above_warning_s")},
             "jobs_done": ("i", (9,)),
+            "elapsed_s": ("f", (9,)),
             **{f"reward_{name}": ("f", (9,)) for name in TERMS},
         }
         actions = play.chosen(obs["action_mask"], rng.random((9, 3, 2)))

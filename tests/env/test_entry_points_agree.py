@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleet.engine.state import DONE, State
+from fleet.engine.state import DONE, State, World
+from fleet.engine.tables import Tables
 from fleet.env.vector import BatchEnv
-from fleet.robot import ThermalLimits
+from fleet.robot import JOINTS, ThermalLimits
 from fleet.thermal import WINDING
 from scenarios.policy_loader import policy_of
 from scenarios.prepare.fleet import Fleet, env_of, prepare
@@ -36,17 +37,25 @@ def actions_of(result: RunResult, offered: list[str], arms: list[str], now_s: fl
 
 
 def check_equal(actual: State, expected: State, jobs: int) -> None:
-    """Assert that the states of one env are equal, apart from unused job entries."""
-    for name, values in expected._asdict().items():
-        own = getattr(actual, name)
-        if name in ("status", "queued_s", "cycles", "returns", "finished_s"):
+    """Assert that the states of one env are equal, apart from unused job entries and the rows of plans."""
+    for name, values in expected._replace(plan=expected.plan >= 0)._asdict().items():
+        own = actual.plan >= 0 if name == "plan" else getattr(actual, name)
+        if name in ("status", "queued_s", "cycles", "returns", "failed_arm", "finished_s"):
             own, values = own[:, :jobs], values[:, :jobs]
         np.testing.assert_array_equal(own, values, err_msg=name)
 
 
+def check_plans(tables: Tables, actual: np.ndarray, world: World, expected: np.ndarray) -> None:
+    """Assert that arms away from home follow equal plans, int [arm]; each table has rows of its own."""
+    one, other = actual[actual >= 0], expected[expected >= 0]
+    np.testing.assert_array_equal(tables.times_s[one], world.plans.times_s[other])
+    np.testing.assert_array_equal(tables.current_sq[one, :, :JOINTS], world.plans.current_sq[other])
+
+
 def test_every_entry_point_repeats_a_recorded_run(fleet, recorded, play) -> None:
     logged, single = env_of(fleet, keep_events=True), env_of(fleet)
-    batch = BatchEnv(library_of([fleet]), 3, seed=[SEED - 1, SEED, SEED + 1], weights=fleet.scenario.reward)
+    library = library_of([fleet])
+    batch = BatchEnv(library, 3, seed=[SEED - 1, SEED, SEED + 1], weights=fleet.scenario.reward)
     logged.reset(seed=SEED)
     single.reset(seed=SEED)
     obs, _ = batch.reset()
@@ -57,7 +66,9 @@ def test_every_entry_point_repeats_a_recorded_run(fleet, recorded, play) -> None
         names = [logged.world.jobs.names[0][j] if j >= 0 else "" for j in slots]
         actions = actions_of(recorded, names, arms, float(logged.truth.tick[0] * logged.world.dt_s))
         check_equal(single.truth, logged.truth, jobs)
+        np.testing.assert_array_equal(single.truth.plan, logged.truth.plan)
         check_equal(batch.state.copy(slice(1, 2)), logged.truth, jobs)
+        check_plans(library.tables, batch.state.plan[1], logged.world, logged.truth.plan[0])
         for a, arm in enumerate(arms):
             np.testing.assert_array_equal(obs["observation"][1, a], logged.state().reshape(3, -1)[a])
             np.testing.assert_array_equal(obs["action_mask"][1, a], logged.knowledge()[arm].action_mask)

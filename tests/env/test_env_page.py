@@ -38,13 +38,14 @@ def test_offsets_of_the_table_are_correct() -> None:
     assert list(rows) == [field.name for field in FIELDS]
     ends = [int(place.split("–")[-1]) for place in rows.values()]
     assert [int(place.split("–")[0]) for place in rows.values()] == [0, *(end + 1 for end in ends[:-1])]
-    assert ends[-1] == layout.size - 1 == 164
+    assert ends[-1] == layout.size - 1 == 180
 
 
-@pytest.mark.parametrize(("n", "slots"), [(1, 1), (4, 8), (7, 3)])
-def test_the_size_in_the_page_is_correct(n, slots) -> None:
-    a, b, c, d = map(int, re.findall(r"size = (\d+) \+ (\d+) K \+ \(n − 1\)\((\d+) \+ (\d+) K\)", TEXT)[0])
-    assert Layout(n, slots).size == a + b * slots + (n - 1) * (c + d * slots)
+@pytest.mark.parametrize(("n", "slots", "plans"), [(1, 1, 1), (4, 8, 1), (7, 3, 2)])
+def test_the_size_in_the_page_is_correct(n, slots, plans) -> None:
+    formula = r"size = (\d+) \+ (\d+) K \+ (\d+) K P \+ \(n − 1\)\((\d+) \+ (\d+) K\)"
+    a, b, c, d, e = map(int, re.findall(formula, TEXT)[0])
+    assert Layout(n, slots, plans=plans).size == a + (b + c * plans) * slots + (n - 1) * (d + e * slots)
 
 
 def test_every_info_is_in_the_page(make, batch) -> None:

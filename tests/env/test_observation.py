@@ -8,62 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import expit
 
-from fleet.bus.exchange.channel import Channel
-from fleet.bus.exchange.memory import MemoryExchange
-from fleet.bus.exchange.protocol import UNHEARD, PeerView
-from fleet.difficulty import Difficulty, Risk
-from fleet.engine.batch import Engine, shifts_of
-from fleet.engine.peers import broadcast, write_peers
 from fleet.engine.profile_plant import sensor_noise
 from fleet.engine.reward import RewardWeights
 from fleet.engine.shift import Episode, ShiftRunner
-from fleet.engine.state import State, World, initial
-from fleet.engine.tables import tables_of
-from fleet.env.allocation_v0 import parallel_env
-from fleet.motion import Plan
-from fleet.motor import gen3_motors
-from fleet.observation import FIELDS, LONG_S, Layout, Observation
+from fleet.engine.state import State, World
+from fleet.observation import FIELDS, Layout, Observation
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, IDLE, WORKING
-
-NO_NOISE = replace(gen3_motors(), sensor_noise_k=np.zeros(7))
-
-
-def received(arms: int, slots: int, **changes: np.ndarray) -> PeerView:
-    """Return a view in which a message of every peer has just arrived: idle, no difficulties."""
-    base = {
-        "mode": np.zeros((arms, arms), int),
-        "headroom_k": np.full((arms, arms), 30.0),
-        "difficulty": np.full((arms, arms, slots), np.nan),
-        "p_saturation": np.full((arms, arms, slots), np.nan),
-        "age_s": np.zeros((arms, arms)),
-    }
-    return PeerView(**(base | changes))
-
-
-def peers_of(layout: Layout, view: PeerView) -> Observation:
-    """Return the peer fields of the vectors, leading axis [arm]."""
-    vectors = np.zeros((layout.arms, layout.size), np.float32)
-    write_peers(layout, view, vectors)
-    return layout.read(vectors, np.ones((layout.arms, layout.slots + 1), np.int8))
-
-
-def engine_at(world: World, state: State) -> tuple[Engine, np.ndarray]:
-    """Return an engine in this state, and the vectors of its arms, [env, arm, size]."""
-    tables, drawn = tables_of(world)
-    layout, rows = Layout(len(world.arms), world.slots), np.arange(world.envs)
-    engine = Engine(tables, world.envs, layout, RewardWeights(), jobs=state.status.shape[1], compiled=False)
-    engine.reset(rows, shifts_of(drawn, [0] * world.envs))
-    engine.load(state)
-    vectors = np.empty((world.envs, layout.arms, layout.size), np.float32)
-    engine.observe(rows, vectors)
-    return engine, vectors
-
-
-def observe(world: World, state: State) -> Observation:
-    """Return the observations in a state, leading axes [env, arm]."""
-    engine, vectors = engine_at(world, state)
-    return engine.layout.read(vectors, engine.mask)
 
 
 def test_fields_and_attributes_are_the_same_in_the_same_order() -> None:
@@ -72,12 +23,13 @@ def test_fields_and_attributes_are_the_same_in_the_same_order() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(
-    arms=st.integers(1, 6), slots=st.integers(1, 9), lead=st.sampled_from([(), (2,), (3, 2)]), seed=st.integers(0, 99)
-)
-def test_a_packed_observation_is_read_back(arms, slots, lead, seed) -> None:
-    layout, rng = Layout(arms, slots), np.random.default_rng(seed)
+    arms=st.integers(1, 6), slots=st.integers(1, 9), plans=st.integers(1, 3),
+    lead=st.sampled_from([(), (2,), (3, 2)]), seed=st.integers(0, 99),
+)  # fmt: skip
+def test_a_packed_observation_is_read_back(arms, slots, plans, lead, seed) -> None:
+    layout, rng = Layout(arms, slots, plans=plans), np.random.default_rng(seed)
     named = {f.name: rng.uniform(f.low, f.high, (*lead, *layout.shape(f))).astype(np.float32) for f in FIELDS}
-    mask = rng.integers(0, 2, (*lead, slots + 1)).astype(np.int8)
+    mask = rng.integers(0, 2, (*lead, layout.actions)).astype(np.int8)
     vector = layout.pack(Observation(**named, action_mask=mask))
     assert vector.shape == (*lead, layout.size)
     assert vector.dtype == np.float32
@@ -107,47 +59,79 @@ def test_vectors_of_wrong_size_are_refused() -> None:
 # The reference
 
 
+def with_second_plans(world: World, rng: np.random.Generator) -> World:
+    """Return the world in which arms have a second, slower plan for some jobs, with its own space and scores."""
+    table, offers, count = world.plans, world.offers, len(world.plans.volume)
+    twice = {name: np.concatenate([values, values]) for name, values in vars(table).items()}
+    twice["times_s"][count:] *= 1.5
+    twice["volume"][count:] += len(world.conflicts)
+    new = np.triu(rng.random((2 * len(world.conflicts),) * 2) < 0.2)
+    conflicts = np.tile(world.conflicts, (2, 2)) ^ (new | new.T)
+    second = (offers.plan >= 0) & (rng.random(offers.plan.shape) < 0.7)
+    scored = second & (rng.random(offers.plan.shape) < 0.7)
+    more = {
+        "plan": np.where(second, offers.plan + count, -1),
+        "difficulty": np.where(scored, rng.uniform(0.0, 2.0, offers.plan.shape), np.nan),
+        "p_saturation": np.where(scored, rng.random(offers.plan.shape), np.nan),
+        "risk": np.full(offers.plan.shape, -1),
+    }
+    both = {name: np.concatenate([getattr(offers, name), values], axis=-1) for name, values in more.items()}
+    return replace(world, plans=replace(table, **twice), conflicts=conflicts, offers=replace(offers, **both))
+
+
 def reference(world: World, state: State, slots: list[int], key: int) -> dict[str, np.ndarray]:
     """Compute the fields of all arms of env 0, [arm, ...], one by one; peers as of this moment."""
     arms, now_s, jobs, offers = len(world.arms), state.tick[0] * world.dt_s, world.jobs, world.offers
     measured_c = state.temp_c[0, :, :7] + world.motors.sensor_noise_k * sensor_noise(key, state.tick[0], arms, 7)
+    volume, times_s, away = world.plans.volume, world.plans.times_s, state.plan[0]
+    occupied = {s for j in state.job[0].tolist() if j >= 0 for s in jobs.stations[0, j].tolist() if s >= 0}
     own: list[dict[str, object]] = []
     for a in range(arms):
-        mode, current = state.mode[0, a], state.job[0, a]
-
-        def lasts_s(j: int, cycles: int, a: int = a) -> float:
-            plan = offers.plan[0, a, j]
-            return 0.0 if plan < 0 else float(world.plans.times_s[plan] @ [1, cycles, 1])
-
-        known = {
+        mode = state.mode[0, a]
+        mine = {
             "clock": now_s / world.horizon_s, "idle": mode == IDLE, "working": mode == WORKING,
             "faulted": mode == FAULTED, "last_award": state.last_award[0, a], "temp_c": measured_c[a],
-            "busy_s": lasts_s(current, state.todo[0, a]) - state.progress_s[0, a] if current >= 0 else 0.0,
+            "busy_s": times_s[away[a]] @ [1, state.todo[0, a], 1] - state.progress_s[0, a] if mode == WORKING else 0.0,
             "headroom_k": world.limits.warning_c - measured_c[a].max(),
         }  # fmt: skip
-        rows = []
+        rows, options = [], []
         for j in slots:
             if j < 0:
-                rows.append([0, 0, 0, 0, 0.5, 0, 0, 0, 0, 0, 0])
+                rows.append([0] * 6)
+                options += [[0, 0, 0, 0, 0.5, 0, 0]] * world.plans_per_job
                 continue
-            left_s = lasts_s(j, jobs.repetitions[0, j] - state.cycles[0, j])
-            d, p, r = offers.difficulty[0, a, j], offers.p_saturation[0, a, j], offers.risk[0, a, j]
-            if r >= 0:
-                assert offers.risks is not None
-                score = (offers.risks.offset[r] + offers.risks.weight[r] @ measured_c[a]).max()
-                curve = np.zeros((0, 2)) if offers.risks.curve is None else offers.risks.curve[r]
-                curve = curve[np.isfinite(curve[:, 0])]
-                p = np.interp(score, *curve.T) if len(curve) else expit(score)
-            slack_s, age_s = jobs.due_s[0, j] - now_s - left_s, now_s - state.queued_s[0, j]
-            rows.append([
-                1, offers.plan[0, a, j] >= 0, not np.isnan(d), np.nan_to_num(d), 0.5 if np.isnan(p) else p, left_s,
-                slack_s, age_s, jobs.payload_kg[0, j], jobs.value[0, j], state.returns[0, j],
-            ])  # fmt: skip
-        names = ("offered", "feasible", "known", "difficulty", "p_saturation", "duration_s", "slack_s", "age_s")
-        columns = np.array(rows, dtype=float).T
-        own.append(known | dict(zip((*names, "payload_kg", "value", "returns"), columns, strict=True)))
+            free = not occupied & set(jobs.stations[0, j].tolist())
+            age_s = now_s - state.queued_s[0, j]
+            rows.append([1, free, age_s, jobs.payload_kg[0, j], jobs.value[0, j], state.returns[0, j]])
+            for n, plan in enumerate(offers.plan[0, a, j].tolist()):
+                if plan < 0:
+                    options.append([0, 0, 0, 0, 0.5, 0, 0])
+                    continue
+                others = [away[b] for b in range(arms) if b != a and away[b] >= 0]
+                clear = not any(world.conflicts[volume[plan], volume[other]] for other in others)
+                left_s = times_s[plan] @ [1, jobs.repetitions[0, j] - state.cycles[0, j], 1]
+                d, p, r = (getattr(offers, name)[0, a, j, n] for name in ("difficulty", "p_saturation", "risk"))
+                if r >= 0:
+                    assert offers.risks is not None
+                    score = (offers.risks.offset[r] + offers.risks.weight[r] @ measured_c[a]).max()
+                    curve = np.zeros((0, 2)) if offers.risks.curve is None else offers.risks.curve[r]
+                    curve = curve[np.isfinite(curve[:, 0])]
+                    p = np.interp(score, *curve.T) if len(curve) else expit(score)
+                slack_s = jobs.due_s[0, j] - now_s - left_s
+                options.append(
+                    [1, clear, not np.isnan(d), np.nan_to_num(d), 0.5 if np.isnan(p) else p, left_s, slack_s]
+                )
+        names = ("offered", "station_free", "age_s", "payload_kg", "value", "returns")
+        mine |= dict(zip(names, np.array(rows, dtype=float).T, strict=True))
+        names = ("feasible", "space_free", "known", "difficulty", "p_saturation", "duration_s", "slack_s")
+        own.append(mine | dict(zip(names, np.array(options, dtype=float).T, strict=True)))
+    shared = []
+    for mine in own:
+        known, d = (np.reshape(mine[name], (len(slots), -1)) for name in ("known", "difficulty"))
+        least = np.where(known > 0, d, np.inf).min(axis=1)
+        shared.append({"known": known.any(axis=1), "difficulty": np.where(np.isinf(least), 0.0, least)})
     for a, mine in enumerate(own):
-        others = [own[b] for b in range(arms) if b != a]
+        others = [{**own[b], **shared[b]} for b in range(arms) if b != a]
         mine |= {
             f"peer_{n}": [o[n] for o in others] for n in ("working", "faulted", "headroom_k", "known", "difficulty")
         }
@@ -155,11 +139,18 @@ def reference(world: World, state: State, slots: list[int], key: int) -> dict[st
     return {name: np.array([each[name] for each in own], dtype=float) for name in own[0]}
 
 
-def compare_with_reference(play, episode: Episode, seed: int) -> State:
-    """Play a shift and compare every vector; return the last state."""
+def reference_mask(expected: dict[str, np.ndarray], plans: int) -> np.ndarray:
+    """Legal actions by the fields: wait, and every plan of an idle arm whose stations and space are free."""
+    legal = expected["idle"][:, None] * expected["feasible"] * expected["space_free"]
+    legal *= np.repeat(expected["station_free"], plans, axis=1)
+    return np.concatenate([np.ones((len(legal), 1)), legal], axis=1)
+
+
+def compare_with_reference(play, episode: Episode, seed: int) -> tuple[State, int]:
+    """Play a shift and compare every vector; return the last state, and the number of plans without free space."""
     world, rng = episode.world, np.random.default_rng(seed)
-    runner = ShiftRunner(episode, RewardWeights())
-    layout = Layout(len(world.arms), world.slots)
+    runner, closed = ShiftRunner(episode, RewardWeights()), 0
+    layout = Layout(len(world.arms), world.slots, plans=world.plans_per_job)
     while True:
         slots = play.slots_of(world, runner.state)
         assert runner.slot_job.tolist() == slots
@@ -169,26 +160,36 @@ def compare_with_reference(play, episode: Episode, seed: int) -> State:
         for name, values in expected.items():
             observed = getattr(actual, name)
             np.testing.assert_allclose(observed, values.reshape(observed.shape), rtol=1e-6, atol=2e-5, err_msg=name)
+        np.testing.assert_array_equal(runner.mask, reference_mask(expected, layout.plans))
+        closed += int((expected["feasible"] > expected["space_free"]).sum())
         if runner.tick == world.ticks:
-            return runner.state.copy()
+            return runner.state.copy(), closed
         runner.step(play.chosen(runner.mask, rng.random((len(world.arms), 2))))
 
 
 @settings(max_examples=25)
 @given(
     seed=st.integers(0, 2**31), arms=st.integers(1, 4), jobs=st.integers(0, 9), slots=st.integers(1, 5),
-    ambient_c=st.sampled_from([20.0, 45.0, 58.0]), power_off=st.booleans(),
+    ambient_c=st.sampled_from([20.0, 45.0, 58.0]), power_off=st.booleans(), share=st.sampled_from([0.0, 0.2, 1.0]),
+    two_plans=st.booleans(),
 )  # fmt: skip
-def test_vectors_equal_the_reference(small, play, seed, arms, jobs, slots, ambient_c, power_off) -> None:
+def test_vectors_equal_the_reference(
+    small, play, seed, arms, jobs, slots, ambient_c, power_off, share, two_plans
+) -> None:
     limits = ThermalLimits(warning_c=56.0, error_c=60.0, restart_c=54.0, clear_s=25.0, power_off_on_fault=power_off)
-    make = small.Shifts(arms=arms, jobs=jobs, slots=slots, ticks=60, ambient_c=ambient_c, limits=limits)
-    compare_with_reference(play, make(np.random.SeedSequence(seed)), seed)
+    make = small.Shifts(arms=arms, jobs=jobs, slots=slots, ticks=60, ambient_c=ambient_c, limits=limits, crowding=share)
+    episode = make(np.random.SeedSequence(seed))
+    if two_plans:
+        episode = replace(episode, world=with_second_plans(episode.world, np.random.default_rng(seed)))
+    compare_with_reference(play, episode, seed)
 
 
-def test_shifts_of_the_comparison_include_faults_and_returned_jobs(small, play) -> None:
+def test_shifts_of_the_comparison_include_faults_returned_jobs_and_closed_space(small, play) -> None:
     limits = ThermalLimits(warning_c=56.0, error_c=60.0, restart_c=54.0, clear_s=25.0)
-    make = small.Shifts(arms=3, jobs=9, ticks=80, ambient_c=45.0, limits=limits)
-    last = [compare_with_reference(play, make(np.random.SeedSequence(seed)), seed) for seed in range(4)]
+    make = small.Shifts(arms=3, jobs=9, ticks=80, ambient_c=45.0, limits=limits, crowding=0.3)
+    played = [compare_with_reference(play, make(np.random.SeedSequence(seed)), seed) for seed in range(4)]
+    last = [state for state, _ in played]
+    assert sum(closed for _, closed in played) > 0
     assert sum(int(state.faults.sum()) for state in last) > 0
     assert sum(int(state.returns.sum()) for state in last) > 0
     assert sum(int(((state.faults > 0) & (state.mode != FAULTED)).sum()) for state in last) > 0
@@ -205,209 +206,3 @@ def test_risks_equal_the_reference(small, play, pieces, curve) -> None:
     jobs = [small.job(f"j{i}", content[i % 4], release_s=50.0 * (i % 3)) for i in range(6)]
     world, plant = small.shop([jobs], arms=arms, ticks=60)
     compare_with_reference(play, Episode(world, plant, ("t",) * 3, np.random.SeedSequence(1)), 3)
-
-
-# Single fields
-
-
-def test_peers_are_the_others_in_order() -> None:
-    receiver, sender = np.indices((4, 4))
-    view = received(
-        4, 2,
-        headroom_k=10.0 * receiver + sender,
-        age_s=100.0 * receiver + sender,
-        difficulty=np.stack([receiver + sender / 10, np.full((4, 4), np.nan)], axis=-1),
-        mode=np.where(sender == 3, FAULTED, np.where(sender == 1, WORKING, IDLE)),
-    )  # fmt: skip
-    observed = peers_of(Layout(4, 2), view)
-    for me in range(4):
-        others = [a for a in range(4) if a != me]
-        assert observed.peer_headroom_k[me].tolist() == [10.0 * me + a for a in others]
-        assert observed.peer_age_s[me].tolist() == [100.0 * me + a for a in others]
-        assert observed.peer_difficulty[me, :, 0].tolist() == pytest.approx([me + a / 10 for a in others])
-        assert observed.peer_known[me].tolist() == [[1, 0]] * 3
-        assert (observed.peer_difficulty[me, :, 1] == 0).all()
-        assert observed.peer_working[me].tolist() == [a == 1 for a in others]
-        assert observed.peer_faulted[me].tolist() == [a == 3 for a in others]
-        assert observed.peer_heard[me].all()
-
-
-def test_nearest_peers_are_in_the_order_of_the_layout() -> None:
-    near = ((2, 1), (3, 0), (3, 1), (0, 2))
-    _, sender = np.indices((4, 4))
-    observed = peers_of(Layout(4, 2, near), received(4, 2, headroom_k=1.0 * sender))
-    assert observed.peer_headroom_k.tolist() == [list(map(float, peers)) for peers in near]
-
-
-def test_a_peer_whose_messages_never_arrived_is_unknown() -> None:
-    silent = np.array([[0, 1, 0]] * 3, bool)
-    view = received(
-        3, 2,
-        mode=np.where(silent, UNHEARD, WORKING),
-        headroom_k=np.where(silent, np.nan, 5.0),
-        age_s=np.where(silent, np.inf, 7.0),
-    )  # fmt: skip
-    observed = peers_of(Layout(3, 2), view)
-    assert observed.peer_heard[0].tolist() == [0, 1]
-    assert observed.peer_age_s[0].tolist() == [LONG_S, 7.0]
-    assert observed.peer_headroom_k[0].tolist() == [0.0, 5.0]
-    assert observed.peer_working[0].tolist() == [0, 1]
-    assert observed.peer_faulted[0].tolist() == [0, 0]
-    assert all(np.isfinite(values).all() for values in vars(observed).values())
-
-
-def test_slots_hold_each_arm_s_own_view_of_the_jobs(small) -> None:
-    bench, rack = small.work("bench", 4.0), small.work("rack", 1.0)
-    arms = [small.arm(0, [bench, rack]), small.arm(1, [bench], times=small.Times(1.0, 20.0, 4.0))]
-    jobs = [
-        small.job("a", bench, repetitions=5, due_s=100.0, value=3.0),
-        small.job("b", rack, repetitions=2, release_s=15.0, due_s=50.0, value=2.0),
-    ]
-    world, _ = small.shop([jobs], arms=arms, slots=3)
-    state = initial(world)
-    state.tick[:] = 2
-    observed = observe(world, state)
-    assert observed.offered[0].tolist() == [[1, 1, 0]] * 2
-    assert observed.feasible[0].tolist() == [[1, 1, 0], [1, 0, 0]]
-    assert observed.known[0].tolist() == [[1, 1, 0], [1, 0, 0]]
-    # 3 + 5 · 10 + 2, 3 + 2 · 10 + 2, and 1 + 5 · 20 + 4 s; now is 20 s.
-    assert observed.duration_s[0].tolist() == [[55.0, 25.0, 0.0], [105.0, 0.0, 0.0]]
-    assert observed.slack_s[0].tolist() == [[25.0, 5.0, 0.0], [-25.0, 30.0, 0.0]]
-    assert observed.age_s[0].tolist() == [[20.0, 5.0, 0.0]] * 2
-    assert observed.payload_kg[0].tolist() == [[4.0, 1.0, 0.0]] * 2
-    assert observed.value[0].tolist() == [[3.0, 2.0, 0.0]] * 2
-    expected = arms[1].model.score(arms[1].plans[bench][0], 5)
-    assert expected is not None
-    assert observed.difficulty[0, 1].tolist() == pytest.approx([expected.total, 0.0, 0.0])
-    assert observed.p_saturation[0, 1].tolist() == pytest.approx([expected.p_saturation, 0.5, 0.5])
-    assert observed.clock[0].tolist() == pytest.approx([20.0 / world.horizon_s] * 2)
-    assert observed.action_mask[0].tolist() == [[1, 1, 1, 0], [1, 1, 0, 0]]
-
-
-def test_busy_time_counts_down_to_home(small) -> None:
-    world, plant = small.shop([[small.job("a")]], arms=2)
-    env, left = parallel_env(lambda seed: Episode(world, plant, ("t",) * 2, seed)), []
-    env.reset(seed=0)
-    for tick in range(4):
-        terminated = env.step({"arm_0": int(tick == 0)})[2]["arm_0"]
-        observed = env.knowledge()
-        left.append(float(observed["arm_0"].busy_s))
-        assert observed["arm_1"].busy_s == 0.0
-        assert (observed["arm_0"].working, observed["arm_1"].idle) == (left[-1] > 0, True)
-    assert left == [25.0, 15.0, 5.0, 0.0]  # 3 + 3 · 10 + 2 s
-    assert terminated
-
-
-def test_a_returned_job_takes_only_its_remaining_time(small) -> None:
-    world, _ = small.shop([[small.job("a", repetitions=10)]], arms=1, slots=2)
-    state = initial(world)
-    state.cycles[0, 0] = 7
-    assert observe(world, state).duration_s.tolist() == [[[3.0 + 3 * 10.0 + 2.0, 0.0]]]
-
-
-def test_an_arm_broadcasts_what_it_measures_and_its_scores(small) -> None:
-    content = small.work()
-    arms = [small.arm(i, [content], motors=NO_NOISE) for i in range(2)]
-    world, _ = small.shop([[small.job("a"), small.job("b", release_s=99.0)]], arms=arms, slots=3)
-    state = initial(world)
-    measured = np.arange(14.0).reshape(1, 2, 7) + 40.0
-    state.temp_c[..., :7] = measured
-    engine, vectors = engine_at(world, state)
-    message = broadcast(engine, vectors[0], world.jobs.names[0], ("x", "y"))
-    assert message.time_s == 0.0
-    assert message.twin == ("x", "y")
-    assert message.jobs == ("a", "", "")
-    assert message.headroom_k.tolist() == [60.0 - 46.0, 60.0 - 53.0]
-    assert message.temp_c.tolist() == measured[0].tolist()
-    np.testing.assert_array_equal(message.difficulty[:, 0], world.offers.difficulty[0, :, 0])
-    assert message.p_saturation[:, 0] == pytest.approx(world.offers.p_saturation[0, :, 0])
-    assert np.isnan(message.difficulty[:, 1:]).all()
-    assert np.isnan(message.p_saturation[:, 1:]).all()
-
-
-class SecondJointDecides:
-    """P is one half if joint 2 is at 50 °C minus 0.5 K per repetition."""
-
-    version = "second joint decides"
-
-    def score(self, plan: Plan, repetitions: int) -> Difficulty:
-        risk = Risk(np.array([0.2 * (0.5 * repetitions - 50.0)]), 0.2 * np.eye(7)[1:2])
-        return Difficulty(np.full(7, 0.1), risk=risk)
-
-
-def test_p_saturation_follows_the_present_temperatures(small) -> None:
-    bench, rack = small.work("bench"), small.work("rack")
-    arms = [
-        small.arm(0, [bench], motors=NO_NOISE),
-        small.arm(1, [bench, rack], model=SecondJointDecides(), motors=NO_NOISE),
-    ]
-    jobs = [
-        [small.job("a", bench, repetitions=4), small.job("b", rack, repetitions=8)],
-        [small.job("a", bench, repetitions=20)],
-    ]
-    world, _ = small.shop(jobs, arms=arms, slots=3)
-    state = initial(world)
-    state.temp_c[..., :7] = 25.0
-    state.temp_c[0, 1, 1], state.temp_c[1, 1, 1] = 46.0, 35.0
-    p = observe(world, state).p_saturation
-    # Joint 2 at 46 and 35 °C. P is 0.5 at 48 °C (4 repetitions), 46 °C (8) and 40 °C (20), and where it is unknown.
-    assert p[0, 1] == pytest.approx([1 / (1 + np.exp(0.4)), 0.5, 0.5])
-    assert p[1, 1] == pytest.approx([1 / (1 + np.exp(1.0)), 0.5, 0.5])
-    # The model of the other arm ignores the temperatures, and it cannot do the second job.
-    fixed = arms[0].model.score(arms[0].plans[bench][0], 4)
-    assert fixed is not None
-    assert p[0, 0] == pytest.approx([fixed.p_saturation, 0.5, 0.5])
-    engine, vectors = engine_at(world, state)
-    message = broadcast(engine, vectors[0], world.jobs.names[0], ("x", "y"))
-    assert message.p_saturation[1] == pytest.approx([1 / (1 + np.exp(0.4)), 0.5, np.nan], nan_ok=True)
-    assert message.p_saturation[0] == pytest.approx([fixed.p_saturation, np.nan, np.nan], nan_ok=True)
-    state.temp_c[..., :7] += 1.0
-    assert (observe(world, state).p_saturation[0, 1, :2] > p[0, 1, :2]).all()
-
-
-# Peers and sensors in an episode
-
-
-def test_peers_observe_what_the_arm_observes_of_itself(small) -> None:
-    env = parallel_env(small.Shifts(arms=3, jobs=10))
-    env.reset(seed=3)
-    rng = np.random.default_rng(0)
-    while env.agents:
-        observed = env.knowledge()
-        for me, arm in enumerate(env.possible_agents):
-            peers = [p for p in range(3) if p != me]
-            for row, peer in enumerate(peers):
-                other = observed[env.possible_agents[peer]]
-                assert observed[arm].peer_age_s[row] == 0.0
-                assert observed[arm].peer_headroom_k[row] == other.headroom_k
-                assert observed[arm].peer_working[row] == other.working
-                assert observed[arm].peer_faulted[row] == other.faulted
-                np.testing.assert_array_equal(observed[arm].peer_difficulty[row], other.difficulty)
-                np.testing.assert_array_equal(observed[arm].peer_known[row], other.known)
-        env.step({a: int(rng.choice(np.flatnonzero(o.action_mask))) for a, o in observed.items()})
-
-
-def test_a_delayed_message_is_as_old_as_its_delay(small) -> None:
-    exchange = MemoryExchange(("arm_0", "arm_1"), Channel(delay_s=20.0))
-    env = parallel_env(small.Shifts(arms=2), exchange=exchange)
-    env.reset(seed=1)
-    ages = []
-    for _ in range(5):
-        observed = env.knowledge()["arm_0"]
-        ages.append((float(observed.peer_heard[0]), float(observed.peer_age_s[0])))
-        env.step({})
-    assert ages == [(0.0, LONG_S), (0.0, LONG_S), (1.0, 20.0), (1.0, 20.0), (1.0, 20.0)]
-    env.close()
-
-
-def test_temperatures_are_measured_with_the_noise_of_the_sensors(small) -> None:
-    env = parallel_env(small.Shifts(arms=2, jobs=0, ticks=400))
-    env.reset(seed=1)
-    errors = []
-    while env.agents:
-        truth = env.truth.temp_c[0, :, :7]
-        errors.append([env.knowledge()[arm].temp_c - truth[a] for a, arm in enumerate(env.possible_agents)])
-        env.step({})
-    actual = np.array(errors).std(axis=0)
-    # The relative error of a standard deviation from n readings is 1/√(2n); four times that, for 14 sensors.
-    assert actual == pytest.approx(env.world.motors.sensor_noise_k, rel=4 / np.sqrt(800))

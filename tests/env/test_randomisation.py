@@ -1,5 +1,6 @@
 """Batches of a scenario: equal to `make_env`, and randomised."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,7 +11,9 @@ from hypothesis import strategies as st
 
 from fleet.engine.batch import shifts_of
 from fleet.engine.tables import stack_tables, tables_of
+from fleet.engine.world import Space
 from fleet.env.vector import BatchEnv, Library
+from fleet.motion import Plan
 from scenarios import make_batch, make_env
 from scenarios.job_stream import draw_jobs
 from scenarios.prepare.fleet import Fleet, prepare
@@ -34,7 +37,7 @@ def actions_of(play, mask: np.ndarray, step: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("difficulty", ["blind", "oracle"])
-@pytest.mark.parametrize("e", [0, 4])
+@pytest.mark.parametrize("e", [0, 5])
 def test_a_row_equals_make_env_with_the_same_seed(cell, folder, play, e, difficulty) -> None:
     options: dict[str, Any] = {"difficulty": difficulty, "cache": folder}
     batch, env = make_batch(cell, 6, SEED, **options), make_env(cell, **options)
@@ -158,8 +161,19 @@ def test_rows_of_two_variants_equal_batches_of_each(cell, folder, play) -> None:
     assert 0 < fleet.sum() < 12
 
 
+def sparse(space: Space) -> Space:
+    """Return a space with the same conflicts and 20 times as many volumes."""
+
+    def numbered(plans: Sequence[Plan]) -> tuple[np.ndarray, np.ndarray]:
+        volume, conflicts = space(plans)
+        return 20 * volume, np.kron(conflicts, np.ones((20, 20), bool)).astype(bool)
+
+    return numbered
+
+
 def test_variants_with_different_risk_models_do_not_mix(small, play) -> None:
-    """Variants without risks, with risks of one piece, of three pieces and a curve; with one and two stations."""
+    """Variants without risks, with risks of one piece, of three pieces and a curve; with one and two stations; with no
+    shared space, and with volumes in one word of bits and in several."""
     models = [
         [small.ByPayload(1.0 + 0.1 * i) for i in range(3)],
         [play.Learned(1, curve=False) for _ in range(3)],
@@ -172,11 +186,14 @@ def test_variants_with_different_risk_models_do_not_mix(small, play) -> None:
         content = flat if fleet == 1 else works
         arms = [small.arm(i, content, model=model, times=small.Times(cycle=8.0 + fleet)) for i, model in enumerate(own)]
         jobs = [small.job(f"j{j}", content[j % 3], release_s=30.0 * (j // 2), repetitions=2 + j % 2) for j in range(9)]
-        world, _ = small.shop([jobs], arms=arms, ticks=40, ambient_c=30.0 + fleet)
+        space = (None, small.crowded(0.4), sparse(small.crowded(0.4)))[fleet]
+        world, _ = small.shop([jobs], arms=arms, ticks=40, ambient_c=30.0 + fleet, space=space)
         own_tables, drawn = tables_of(world)
         tables.append(own_tables)
         shifts += shifts_of(drawn, [77])
     assert len({table.risk_offset.shape for table in tables}) == 3
+    assert [table.excluded.shape[1] for table in tables] == [1, 1, 3]
+    assert [bool(table.excluded.any()) for table in tables] == [False, True, True]
     assert len({int(np.bitwise_count(table.stations).max()) for table in tables}) == 2
     names, together = ("arm_0", "arm_1", "arm_2"), stack_tables(tables)
     for fleet, own_tables in enumerate(tables):

@@ -79,7 +79,8 @@ def test_the_rewards_of_an_episode_add_up_to_the_event_log(small, seed) -> None:
 
 
 def test_a_returned_job_is_rewarded_once(small) -> None:
-    jobs = [small.job("a", small.work(payload_kg=small.HOT), value=4.0, repetitions=40)]
+    """The arm faults in the twelfth cycle; the rest is short enough for a second try."""
+    jobs = [small.job("a", small.work(payload_kg=small.HOT), value=4.0, repetitions=16)]
     env, terms = played(small, jobs, RewardWeights(faults=-7.0, above_warning=-10.0), ticks=600)
     faults = [event.time_s for event in env.events if event.kind == "fault"]
     assert len(faults) == env.truth.returns[0, 0] > 0
@@ -87,3 +88,14 @@ def test_a_returned_job_is_rewarded_once(small) -> None:
     assert np.flatnonzero(terms["faults"]).tolist() == [int(time_s // 10.0) for time_s in faults]
     assert terms["faults"].sum() == -7.0 * len(faults)
     assert terms["above_warning"].sum() == pytest.approx(-10.0 * env.truth.above_warning_s.sum() / 60.0)
+
+
+def test_a_job_that_is_given_up_is_not_rewarded(small) -> None:
+    """The episode ends with the second fault of the only arm."""
+    jobs = [small.job("a", small.work(payload_kg=small.HOT), value=4.0, repetitions=40)]
+    env, terms = played(small, jobs, RewardWeights(faults=-7.0), ticks=600)
+    assert env.truth.returns[0, 0] == 2
+    assert env.events[-1].kind == "give_up"
+    assert terms["finished_value"].sum() == 0.0
+    assert terms["faults"].sum() == -14.0
+    assert len(terms["faults"]) == int(env.events[-1].time_s // 10.0) + 1 < 600

@@ -13,7 +13,7 @@ from fleet.bus.exchange.memory import MemoryExchange
 from fleet.engine.batch import BLOCK
 from fleet.env.vector import BatchEnv, Library
 
-SHIFT: dict[str, Any] = {"arms": 3, "jobs": 4, "ticks": 22, "ambient_c": 20.0}
+SHIFT: dict[str, Any] = {"arms": 3, "jobs": 4, "ticks": 22, "ambient_c": 20.0, "crowding": 0.2}
 """Some of these shifts end when all jobs are finished, some at the horizon, at different times."""
 STEPS = 110
 SEED = 100
