@@ -66,8 +66,8 @@ def test_what_cannot_be_is_refused(tmp_path, capsys) -> None:
     for words, reason in (
         (["--algo", "dqn"], "No algorithm 'dqn'. Allowed: ippo, mappo."),
         (["--minutes", "0"], "minutes must be > 0"),
-        (["--envs", "0"], "envs must be >= 1"),
-        (["--threads", "0"], "--threads must be 1 or more"),
+        (["--envs", "0"], "--envs must be 1 to 65536 (got 0)."),
+        (["--threads", "0"], "--threads must be 1 to 1024 (got 0)."),
         (["--resume"], "holds no training to resume"),
     ):
         with pytest.raises(SystemExit) as stop:
