@@ -75,6 +75,10 @@ class PayloadRating:
 RATING = PayloadRating()
 
 
+MOST_MOVE_HOME_S = 7 * 24 * 3600.0
+"""Longest time until a person moves a faulted arm home."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class ThermalLimits:
     """Motor temperatures at which an arm warns, faults and may restart.
@@ -100,6 +104,10 @@ class ThermalLimits:
                 f"(got {self.restart_c}, {self.warning_c}, {self.error_c})."
             )
         check_nonnegative(self, "clear_s", "move_home_s")
+        if self.move_home_s > MOST_MOVE_HOME_S:
+            raise ValueError(
+                f"ThermalLimits.move_home_s must be at most {MOST_MOVE_HOME_S:g} (got {self.move_home_s})."
+            )
 
 
 def rotation(roll_pitch_yaw_deg: tuple[float, float, float]) -> np.ndarray:

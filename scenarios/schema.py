@@ -250,6 +250,12 @@ class Scenario:
                 f"Scenario.name must be non-empty, without a leading dot and without slashes (got '{self.name}')"
             )
 
+        named = (("arms", self.arms), ("places", self.places), ("fixtures", self.fixtures), ("jobs", self.jobs))
+        for what, those in named:
+            for each in those:
+                if "[" in each.name or "]" in each.name:
+                    raise ValueError(f"Scenario.{what}: a name must not contain [ or ] (got '{each.name}')")
+
     @property
     def ticks(self) -> int:
         """Decision intervals in the shift."""

@@ -128,6 +128,7 @@ def library_of(fleets: Sequence[Fleet], randomise: Randomisation | None = None) 
         other = fleet.scenario
         for what, one, two in (
             ("slots", scenario.slots, other.slots),
+            ("decisions", scenario.decisions, other.decisions),
             ("jobs", scenario.jobs, other.jobs),
             ("names of arms", [arm.name for arm in scenario.arms], [arm.name for arm in other.arms]),
         ):

@@ -37,7 +37,7 @@ def until_the_fault(world, plant, log):
 
 def test_a_stopped_arm_keeps_its_space_until_it_is_home(small) -> None:
     """It ends the cycle in which it stopped and goes home; spans are 3 s, 10 s a cycle and 2 s."""
-    world, plant = crossing(small, limits=ThermalLimits(move_home_s=1e6))
+    world, plant = crossing(small, limits=ThermalLimits(move_home_s=6e5))
     log = []
     _, state = until_the_fault(world, plant, log)
     fault = next(e for e in log if e.kind == "fault")

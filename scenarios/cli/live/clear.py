@@ -8,34 +8,47 @@ import typer
 from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Cleared, ClearRequest
-from fleet.errors import BusError
-from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
+from fleet.errors import BusError, FleetError
+from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, check_name, the_fleet
 
+MOST_CHARACTERS = 128
+"""Longest name of a person."""
 REPLY_S = 5.0
 """Real seconds to wait for a reply."""
 
 
 def clear_command(
-    arm: Annotated[str, typer.Argument(help="Name of the arm.")],
+    arm: Annotated[str, typer.Argument(help="Name of the arm.", callback=check_name)],
     by: Annotated[str, typer.Option(help="Who frees it, for the records. Default: the user's name.")] = "",
     endpoint: EndpointOption = ENDPOINT,
     fleet: FleetOption = "",
 ) -> None:
     """Free the space of an arm that is not present, so that other arms may pass where it could stand.
 
-    First see to it that the arm is at home or removed, and switched off. An arm that is present is refused: it says
-    itself which space it takes.
+    First end the process of the arm, and see to it that the arm is at home or removed; start the process again only
+    then. An arm that is present is refused: it says itself which space it takes.
     """
+    if len(by) > MOST_CHARACTERS:
+        raise FleetError(f"--by must have at most {MOST_CHARACTERS} characters (got {len(by)}).")
     with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
-        request = ClearRequest(arm, by or getpass.getuser())
+        request = ClearRequest(arm, by or _user())
         replies = link.query_and_wait(keys.of_jobs(link.fleet, "clear"), request, Cleared, timeout_s=REPLY_S)
         name = link.fleet
+    reasons = [reason for reason in replies.refused.values() if reason]
+    if reasons:
+        where = "by all arms" if replies.messages else ""
+        raise BusError(f"The space of '{arm}' was not freed {where}: {reasons[0]}".replace(" :", ":"))
     if not replies.messages:
-        reasons = [reason for reason in replies.refused.values() if reason]
         raise BusError(
-            f"The space of '{arm}' was not freed: {reasons[0]}"
-            if reasons
-            else f"Neither an auctioneer nor arms of fleet '{name}' replied within {REPLY_S:g} s; with TLS, the role "
+            f"Neither an auctioneer nor arms of fleet '{name}' replied within {REPLY_S:g} s; with TLS, the role "
             "operator is needed."
         )
     typer.echo(f"{arm}: its space is free until it is heard again.")
+
+
+def _user() -> str:
+    """Name of the user of this process; "" if it has none."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):
+        return ""
