@@ -1,4 +1,4 @@
-"""`thermofleet clear`: free the space of an arm that is not heard."""
+"""`thermofleet clear`: free the space of an absent arm."""
 
 import getpass
 from typing import Annotated
@@ -17,14 +17,14 @@ REPLY_S = 5.0
 
 def clear_command(
     arm: Annotated[str, typer.Argument(help="Name of the arm.")],
-    by: Annotated[str, typer.Option(help="Who frees it, for the records. Default: the user's name.")] = "",
+    by: Annotated[str, typer.Option(help="Who frees it, for the journal. Default: the name of the user.")] = "",
     endpoint: EndpointOption = ENDPOINT,
     fleet: FleetOption = "",
 ) -> None:
-    """Free the space of an arm that is not present, so that other arms may pass where it could stand.
+    """Free the space that a fleet keeps for an absent arm, so that other arms can use it.
 
-    First see to it that the arm is at home or removed, and switched off. An arm that is present is refused: it says
-    itself which space it takes.
+    First make sure that the arm is at home or removed, and switched off. The request is refused for an arm that is
+    present: it reports itself which space it takes.
     """
     with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
         request = ClearRequest(arm, by or getpass.getuser())
@@ -38,4 +38,4 @@ def clear_command(
             else f"Neither an auctioneer nor arms of fleet '{name}' replied within {REPLY_S:g} s; with TLS, the role "
             "operator is needed."
         )
-    typer.echo(f"{arm}: its space is free until it is heard again.")
+    typer.echo(f"{arm}: its space is free until the arm reports its space again.")
