@@ -60,7 +60,7 @@ class Observation:
     offered: Annotated[Array, Field(_SLOT, "1", 0, 1, "1 when the slot holds a job")]
     station_free: Annotated[Array, Field(_SLOT, "1", 0, 1, "1 when no arm occupies its stations")]
     feasible: Annotated[Array, Field(_OPTION, "1", 0, 1, "1 when this arm has such a plan")]
-    space_free: Annotated[Array, Field(_OPTION, "1", 0, 1, "1 when no other arm takes the space of the plan")]
+    space_free: Annotated[Array, Field(_OPTION, "1", 0, 1, "1 when no other arm takes space that excludes the plan")]
     known: Annotated[Array, Field(_OPTION, "1", 0, 1, "1 when this arm has a difficulty for the plan")]
     difficulty: Annotated[Array, Field(_OPTION, "1", 0, JOINTS, "own thermal difficulty d of the plan, 0 if unknown")]
     p_saturation: Annotated[Array, Field(_OPTION, "1", 0, 1, "probability to pass the warning limit, 0.5 if unknown")]

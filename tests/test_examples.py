@@ -345,7 +345,7 @@ def test_own_arm_and_the_submitter_work_with_the_real_auctioneer(bus, tmp_path):
         for arm in range(4):  # those of the scenario are not there; until then each may be anywhere
             clear = [*COMMAND, "clear", f"arm_{arm}", "--fleet", "f", "--endpoint", f"tcp/127.0.0.1:{port}"]
             cleared = subprocess.run(clear, capture_output=True, text=True, timeout=60, check=True)
-            assert cleared.stdout == f"arm_{arm}: its space is free until it is heard again.\n"
+            assert cleared.stdout == f"arm_{arm}: its space is free until the arm reports its space again.\n"
         with running("own_arm", port, "f", "a"), running("own_arm", port, "f", "b"):
             command = [sys.executable, str(ROOT / "examples" / "submit_jobs.py"), str(port), "f"]
             done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)

@@ -88,7 +88,7 @@ class SpaceTaken(msgspec.Struct, frozen=True, tag="space_taken"):
 
 
 class SpaceCleared(msgspec.Struct, frozen=True, tag="space_cleared"):
-    """A person has freed all space of an arm that is not heard."""
+    """A person has freed all space of an absent arm."""
 
     arm: Name
     by: str = ""

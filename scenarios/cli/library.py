@@ -47,7 +47,7 @@ def layout_command(
 ) -> None:
     """Show what each arm reaches, which jobs exclude each other in space, and how many arms can work at once.
 
-    Exits with 2 if the cell has a problem, for example arms at home that are too close; lists all problems.
+    Lists all problems of the cell, for example two arms that are too close at home, and then exits with 2.
     """
     from scenarios.report.layout import layout_report, layout_scene
     from scenarios.report.layout_tables import layout_tables

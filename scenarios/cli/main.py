@@ -53,7 +53,7 @@ COMMANDS = {
     "auction": LazyCommand(_LIVE, "live.auction:auction_command", "Run the auctioneer of a fleet."),
     "submit": LazyCommand(_LIVE, "live.submit:submit_command", "Submit jobs to a fleet."),
     "ask": LazyCommand(_LIVE, "live.ask:ask_command", "Ask every arm for a quote."),
-    "clear": LazyCommand(_LIVE, "live.clear:clear_command", "Free the space of an arm that is not heard."),
+    "clear": LazyCommand(_LIVE, "live.clear:clear_command", "Free the space of an absent arm."),
     "watch": LazyCommand(_LIVE, "live.watch:watch_command", "Watch a fleet in the terminal."),
     "doctor": LazyCommand(_LIVE, "live.doctor:doctor_command", "Check the health of a fleet."),
     "gateway": LazyCommand(_LIVE, "live.gateway:gateway_command", "Serve a fleet over HTTP."),

@@ -99,7 +99,7 @@ def hold(
         payload_kg: A point mass at the flange.
         posture: A name from `fleet.robot.POSTURES`, or seven comma-separated joint angles in degrees.
         tool_kg: Mass of the gripper, at the flange.
-        beyond_rating: Compute also what the Gen3 is not rated for, not even for a short time.
+        beyond_rating: Accept a load beyond the rating of the Gen3 for a short time.
 
     Raises:
         HoldError: an argument is out of range, the load is beyond the rating, or the hold needs more torque than a
@@ -235,10 +235,10 @@ def hold_command(
     ] = "outstretched",
     ambient: Annotated[float, number("Ambient temperature, °C.", *AMBIENT_RANGE_C)] = 25.0,
     json_: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
-    cooling: Annotated[str, typer.Option(help=f"{', '.join(get_args(Cooling))}.")] = "still_air",
+    cooling: Annotated[str, typer.Option(help=f"Cooling of the arm: {', '.join(get_args(Cooling))}.")] = "still_air",
     tool_kg: Annotated[float, number("Mass of the gripper at the flange, kg.", 0, RATING.temporary_kg)] = 0.0,
     beyond_rating: Annotated[
-        bool, typer.Option("--beyond-rating", help="Compute also a load that the arm is not rated for.")
+        bool, typer.Option("--beyond-rating", help="Accept a load beyond the rating of the arm.")
     ] = False,
 ) -> None:
     """Compute how long an arm can hold a payload until its motors reach the warning and error limits."""

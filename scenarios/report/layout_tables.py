@@ -22,26 +22,30 @@ def layout_tables(scenario: Scenario, report: LayoutReport) -> list[Table | Text
         if entry.reason:
             reasons.add_row(f"{entry.arm} at {entry.place}", entry.reason)
     shared = [pair for pair in report.exclusions if not pair.same_place]
-    pairs = _table("job", "beside", "excluded")
+    pairs = _table("job", "excludes", "share of plans")
     for pair in shared[:WORST]:
         one, other = (f"{job}, {arm}" for job, arm in zip(pair.jobs, pair.arms, strict=True))
         pairs.add_row(one, other, f"{pair.share:.0%}")
     most = ", ".join(f"{work.arm} {work.job}" for work in report.at_once)
     always = sum(pair.share == 1 for pair in shared)
     return [
-        Text(f"{scenario.name}: heaviest payload, kg, of the jobs at a place that an arm can carry; –: none"),
+        Text(f"{scenario.name}: heaviest payload (kg) of the jobs that an arm can do at a place; –: it can do none"),
         matrix,
         Text(""),
         reasons,
         Text(""),
         Text(
             f"{report.excluded_share:.0%} of the pairs of plans of two arms come closer than "
-            f"{report.clearance_m * 1e3:g} mm and exclude each other. Of works at different stations, {always} pairs "
-            f"always do and {len(shared) - always} for some plans" + (":" if shared else ".")
+            f"{report.clearance_m * 1e3:g} mm and exclude each other. Pairs of jobs at different "
+            f"stations: {always} exclude each other always, {len(shared) - always} for some plans"
+            + (f". The first {WORST}:" if len(shared) > WORST else ":" if shared else ".")
         ),
         *([pairs] if shared else []),
         Text(""),
-        Text(f"At work at once: at most {len(report.at_once)} of {len(arms)} arms" + (f" ({most})." if most else ".")),
+        Text(
+            f"At most {len(report.at_once)} of {len(arms)} arms can work at once"
+            + (f", for example {most}." if most else ".")
+        ),
     ]
 
 

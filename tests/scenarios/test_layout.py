@@ -133,7 +133,7 @@ def test_the_command_shows_the_cell_and_fails_if_there_are_problems(cache, tmp_p
     picture = tmp_path / "new" / "cell.png"
     code, out, _ = call("quickstart", "--out", picture)
     assert code == 0
-    assert "At work at once: at most 4 of 4 arms" in out
+    assert "At most 4 of 4 arms can work at once" in out
     assert picture.read_bytes().startswith(b"\x89PNG")
     code, _, err = call("quickstart", "--out", picture)
     assert (code, "exists" in err or "overwrite" in err) == (2, True)

@@ -305,7 +305,7 @@ class Result(msgspec.Struct, frozen=True):
 
 
 class ClearRequest(msgspec.Struct, frozen=True):
-    """Request to `jobs/clear`: free the space of an arm that is not present. The same request again changes nothing.
+    """Request to `jobs/clear`: free the space of an absent arm. The same request again changes nothing.
 
     Only a person who has seen that the arm is at home or removed, and switched off, may request it.
     """
@@ -316,7 +316,7 @@ class ClearRequest(msgspec.Struct, frozen=True):
 
 
 class Cleared(msgspec.Struct, frozen=True):
-    """Reply to a `ClearRequest`, which is on the auctioneer's disk: the arm takes no space until it is heard again."""
+    """Reply to a `ClearRequest`: it is on disk, and the arm takes no space until it reports its space again."""
 
     auctioneer: Name
     arm: Name

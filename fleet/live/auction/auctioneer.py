@@ -190,7 +190,7 @@ class Auctioneer:
         self.states[arm] = state
 
     def clear(self, request: ClearRequest, present: frozenset[str], time_s: float) -> Cleared:
-        """Free the space of an arm that is not heard: a person has seen that it is at home, or removed.
+        """Free the space of an absent arm: a person has seen that it is at home, or removed.
 
         Raises:
             Refused: the arm is unknown, or present, or may have a lease.

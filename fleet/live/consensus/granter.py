@@ -201,7 +201,7 @@ class Granter:
         return ClaimReply(self.arm, claim.number, self._timing.lease_s, tuple(granted), tuple(denied))
 
     def clear(self, arm: str, by: str, present: frozenset[str], real_s: float, time_s: float) -> None:
-        """Free the space of an arm that is not heard: a person has seen that it is at home, or removed.
+        """Free the space of an absent arm: a person has seen that it is at home, or removed.
 
         Raises:
             Refused: the arm is unknown, or present, or may have a lease.

@@ -1,4 +1,4 @@
-"""`thermofleet clear`: free the space of an arm that is not heard."""
+"""`thermofleet clear`: free the space of an absent arm."""
 
 import getpass
 from typing import Annotated
@@ -19,14 +19,14 @@ REPLY_S = 5.0
 
 def clear_command(
     arm: Annotated[str, typer.Argument(help="Name of the arm.", callback=check_name)],
-    by: Annotated[str, typer.Option(help="Who frees it, for the records. Default: the user's name.")] = "",
+    by: Annotated[str, typer.Option(help="Who frees it, for the journal. Default: the name of the user.")] = "",
     endpoint: EndpointOption = ENDPOINT,
     fleet: FleetOption = "",
 ) -> None:
-    """Free the space of an arm that is not present, so that other arms may pass where it could stand.
+    """Free the space that a fleet keeps for an absent arm, so that other arms can use it.
 
-    First end the process of the arm, and see to it that the arm is at home or removed; start the process again only
-    then. An arm that is present is refused: it says itself which space it takes.
+    First end the process of the arm, and make sure that the arm is at home or removed; start the process again only
+    then. The request is refused for an arm that is present: it reports itself which space it takes.
     """
     if len(by) > MOST_CHARACTERS:
         raise FleetError(f"--by must have at most {MOST_CHARACTERS} characters (got {len(by)}).")
@@ -43,7 +43,7 @@ def clear_command(
             f"Neither an auctioneer nor arms of fleet '{name}' replied within {REPLY_S:g} s; with TLS, the role "
             "operator is needed."
         )
-    typer.echo(f"{arm}: its space is free until it is heard again.")
+    typer.echo(f"{arm}: its space is free until the arm reports its space again.")
 
 
 def _user() -> str:
