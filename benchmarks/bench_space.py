@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from agents.registry import RULES
-from fleet.files import cache_folder
 from fleet.physics.contacts import ContactFinder
 from fleet.physics.models import build_cell
+from fleet.planning.space import space_table
 from fleet.robot import Mount, Robot
 from scenarios.load import library, load
 from scenarios.prepare.fleet import Fleet, prepare
@@ -44,11 +44,11 @@ def shifts(fleet: Fleet, policies: list[str], seeds: range, mujoco_s: float) -> 
     for policy in policies:
         for seed in seeds:
             spec = RunSpec(policy=policy, seed=seed, bus="memory", difficulty="blind")
-            told = run(fleet, spec).telemetry
-            assert told is not None
+            recorded = run(fleet, spec).telemetry
+            assert recorded is not None
             finder = ContactFinder(model, robots)
-            found = finder.events(told.time_s, told.q, np.zeros(told.q.shape[:2]))
-            instants, touching = instants + len(told.time_s), touching + len(found)
+            found = finder.events(recorded.time_s, recorded.q, np.zeros(recorded.q.shape[:2]))
+            instants, touching = instants + len(recorded.time_s), touching + len(found)
             contacts += run(short, replace(spec, plant="mujoco"), record=False).metrics.contacts or 0
     print(f"{scenario.name:<16}{len(policies) * len(seeds):>8}{instants:>12}{touching:>10}{contacts:>10}", flush=True)
 
@@ -68,8 +68,6 @@ def tables(names: list[str]) -> None:
             ]
             folder = Path(tempfile.mkdtemp())
             try:
-                from fleet.planning.space import space_table
-
                 began = time.process_time()
                 table = space_table(arms, plans, fleet.scenario.clearance_m, folder)
                 took_s = time.process_time() - began
@@ -114,7 +112,6 @@ def main() -> None:
     parser.add_argument("--value-seeds", type=int, default=20)
     given = parser.parse_args()
     names = given.scenarios.split(",")
-    cache_folder().mkdir(parents=True, exist_ok=True)
     print("scenario            arms       plans  conflict  one core")
     tables(names)
     print("\nvalue                                  solid  ghosts    lost")

@@ -60,7 +60,7 @@ def update_offers(t: Tables, d: Jobs, s: State, o: OpenJobs, rows: Array) -> Non
                 for n in range(options):
                     plan = plans[fleet, a, kind, n]
                     mask[e, a, 1 + filled * options + n] = (
-                        open_here and plan >= 0 and is_free(excluded, nonnegative(plan), taken, e)
+                        open_here and plan >= 0 and is_free(excluded, nonnegative(plan), taken[e])
                     )
             filled += 1
         while filled < slots and slot_job[e, filled] >= 0:  # slots of the step before
@@ -94,11 +94,11 @@ def mark_taken_space(t: Tables, s: State, o: OpenJobs, e: int) -> None:
 
 
 @jit_inline
-def is_free(excluded: Array, plan: int, taken: Array, e: int) -> bool:
-    """Whether no arm of an env takes space that a plan needs."""
+def is_free(excluded: Array, plan: int, taken: Array) -> bool:
+    """Whether a plan needs none of the space that is taken, uint64 [word]."""
     touched = np.uint64(0)
-    for w in range(taken.shape[1]):
-        touched |= excluded[plan, w] & taken[e, w]
+    for w in range(len(taken)):
+        touched |= excluded[plan, w] & taken[w]
     return touched == 0
 
 
@@ -155,7 +155,7 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
             j, option = nonnegative(slot_job[e, slot]), nonnegative(option)
             kind, free = nonnegative(kinds[e, j]), status[e, j] == WAITING
             plan = nonnegative(plan_of[fleet, a, kind, option])
-            free = free and is_free(excluded, plan, taken, e)
+            free = free and is_free(excluded, plan, taken[e])
             for w in range(words):
                 free = free and (stations[fleet, kind, w] & busy[w]) == 0
             if not free:

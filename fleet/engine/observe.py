@@ -7,6 +7,7 @@
 import numpy as np
 
 from fleet.difficulty import passing_probability
+from fleet.engine.claims import is_free
 from fleet.engine.crossings import hottest
 from fleet.engine.tables import LANES, Simulation
 from fleet.jit import jit_inline, nonnegative
@@ -117,12 +118,12 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
                     plan, option = plan_of[fleet, a, kind, n], k * options + n
                     if plan < 0:
                         continue
-                    touched = np.uint64(0)
-                    for w in range(len(away)):
-                        touched |= excluded[plan, w] & away[w]
                     own = work[fleet, a, kind, n]
                     duration_s, score = own["travel_s"] + left[k] * own["cycle_s"], own["difficulty"]
-                    out[e, a, at.feasible + option], out[e, a, at.space_free + option] = 1.0, touched == 0
+                    out[e, a, at.feasible + option], out[e, a, at.space_free + option] = (
+                        1.0,
+                        is_free(excluded, plan, away),
+                    )
                     out[e, a, at.duration_s + option] = min(duration_s, LONG_S)
                     out[e, a, at.slack_s + option] = min(max(slack_s[k] - duration_s, -LONG_S), LONG_S)
                     if not np.isnan(score):

@@ -36,8 +36,8 @@ def clear_command(
         name = link.fleet
     reasons = [reason for reason in replies.refused.values() if reason]
     if reasons:
-        where = "by all arms" if replies.messages else ""
-        raise BusError(f"The space of '{arm}' was not freed {where}: {reasons[0]}".replace(" :", ":"))
+        where = " by all arms" if replies.messages else ""
+        raise BusError(f"The space of '{arm}' was not freed{where}: {reasons[0]}")
     if not replies.messages:
         raise BusError(
             f"Neither an auctioneer nor arms of fleet '{name}' replied within {REPLY_S:g} s; with TLS, the role "
