@@ -19,7 +19,7 @@ from fleet.engine.profile_plant import ProfilePlant
 from fleet.engine.state import World
 from fleet.engine.tables import tables_of
 from fleet.engine.world import Arm, Space, build_world
-from fleet.env.allocation_v0 import Episode
+from fleet.env.allocation_v1 import Episode
 from fleet.env.vector import Library
 from fleet.job import Job, Place, Work
 from fleet.motion import RATE_HZ, Phase, Plan

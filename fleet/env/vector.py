@@ -1,6 +1,6 @@
 """Many shifts at once: the batched environment, as trainers want it.
 
-The same engine as the single environment, `fleet.env.allocation_v0`, with a leading env axis: a row is that env, bit
+The same engine as the single environment, `fleet.env.allocation_v1`, with a leading env axis: a row is that env, bit
 for bit, whatever the number of rows.
 """
 

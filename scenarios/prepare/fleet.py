@@ -37,7 +37,7 @@ from scenarios.schema_errors import choose
 
 if TYPE_CHECKING:  # a single arm needs neither the environment nor MuJoCo
     from fleet.engine.shift import Episode, Plant
-    from fleet.env.allocation_v0 import AllocationEnv, MaskPlace
+    from fleet.env.allocation_v1 import AllocationEnv, MaskPlace
 
 DifficultyName = Literal["twin", "blind", "oracle"]
 PlantName = Literal["profile", "mujoco"]
@@ -322,7 +322,7 @@ def make_env(
         bus: What carries the messages between arms.
         channel: Topology, delay, loss and partitions of the messages.
         cache: Folder of plans and twins.
-        max_cycles, render_mode, mask_in: As in `fleet.env.allocation_v0.AllocationEnv`.
+        max_cycles, render_mode, mask_in: As in `fleet.env.allocation_v1.AllocationEnv`.
         peers: Number of peers in an arm's observation, the nearest ones; default: all.
         overrides: Top-level fields of the scenario to change, for example `horizon_s=600`; Any, as fields differ.
 
@@ -349,7 +349,7 @@ def env_of(
     **options: Any,  # passed on
 ) -> "AllocationEnv":
     """The `ParallelEnv` of a prepared fleet; arguments as in `open_exchange`, options (Any) as in `AllocationEnv`."""
-    from fleet.env.allocation_v0 import parallel_env
+    from fleet.env.allocation_v1 import parallel_env
 
     choose("plant", plant, PlantName)
     names = tuple(arm.robot.name for arm in fleet.arms)

@@ -13,7 +13,7 @@ import numpy as np
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.engine.profile_plant import recorded_noise, telemetry_of
 from fleet.engine.shift import StepRecord, stack_records
-from fleet.env.allocation_v0 import AllocationEnv
+from fleet.env.allocation_v1 import AllocationEnv
 from fleet.events import Event
 from fleet.metrics import Metrics
 from fleet.telemetry import Telemetry, join

@@ -14,7 +14,7 @@ import pytest
 from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
-from fleet.env.allocation_v0 import parallel_env
+from fleet.env.allocation_v1 import parallel_env
 from fleet.env.vector import BatchEnv
 
 PAGE = Path(__file__).parents[2] / "docs" / "trainers.md"

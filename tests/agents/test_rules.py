@@ -13,7 +13,7 @@ from scipy import stats
 from agents.policy import WAIT, EveryArm, for_all_arms, legal_options, only_choices
 from agents.registry import RULES, make_policy
 from agents.rules import LeastDifficulty, RandomLegal
-from fleet.env.allocation_v0 import parallel_env
+from fleet.env.allocation_v1 import parallel_env
 from fleet.observation import LONG_S, Layout, Observation
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from agents.policy import EveryArm
 from agents.rules import LeastDifficulty
 from agents.staleness import Trust, advantage
-from fleet.env.allocation_v0 import parallel_env
+from fleet.env.allocation_v1 import parallel_env
 from fleet.observation import LONG_S, Layout, Observation
 
 

@@ -8,7 +8,7 @@ from agents.registry import make_policy
 from fleet.bus.exchange.channel import Channel, Partition
 from fleet.bus.exchange.memory import MemoryExchange
 from fleet.bus.exchange.zenoh import ZenohExchange
-from fleet.env.allocation_v0 import parallel_env
+from fleet.env.allocation_v1 import parallel_env
 
 ARMS = ("arm_0", "arm_1", "arm_2", "arm_3")
 PATIENT_S = 30.0

@@ -11,7 +11,7 @@ import pytest
 
 from fleet.difficulty import Difficulty, Risk
 from fleet.engine.state import DONE, WAITING, State, World
-from fleet.env.allocation_v0 import AllocationEnv, parallel_env
+from fleet.env.allocation_v1 import AllocationEnv, parallel_env
 from fleet.env.vector import BatchEnv
 from fleet.robot import JOINTS
 from scenarios.load import parse_scenario

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleet.env import allocation_v0
+from fleet.env import allocation_v1
 from fleet.errors import ScenarioError
 from scenarios import make_batch, make_env
 from scenarios.run.batch import Randomisation
@@ -103,7 +103,7 @@ def test_invalid_options_are_refused(make, options, message) -> None:
 
 
 def test_the_aec_env_refuses_wrong_actions(small) -> None:
-    env = allocation_v0.env(small.Shifts())
+    env = allocation_v1.env(small.Shifts())
     with pytest.raises(AssertionError, match=r"reset\(\) needs to be called before step"):
         env.step(1)
     env.reset(seed=0)

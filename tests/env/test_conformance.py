@@ -19,7 +19,7 @@ from pettingzoo.test import (
 )
 
 from fleet.engine.reward import TERMS
-from fleet.env import allocation_v0
+from fleet.env import allocation_v1
 
 HOT = {"arms": 3, "ambient_c": 38.0}
 
@@ -41,9 +41,9 @@ def module(small) -> SimpleNamespace:
     """Return an environment of small shifts with the entry points of a PettingZoo module."""
     shifts = small.Shifts()
     return SimpleNamespace(
-        env=lambda **options: allocation_v0.env(shifts, **options),
-        raw_env=lambda **options: allocation_v0.raw_env(shifts, **options),
-        parallel_env=lambda **options: allocation_v0.parallel_env(shifts, **options),
+        env=lambda **options: allocation_v1.env(shifts, **options),
+        raw_env=lambda **options: allocation_v1.raw_env(shifts, **options),
+        parallel_env=lambda **options: allocation_v1.parallel_env(shifts, **options),
     )
 
 
@@ -59,7 +59,7 @@ def test_pettingzoo_parallel_test_passes(make, arms) -> None:
 def test_pettingzoo_aec_test_passes(module, quiet, door) -> None:
     env = getattr(module, door)()
     api_test(env, num_cycles=120)
-    assert env.metadata["name"] == "allocation_v0"
+    assert env.metadata["name"] == "allocation_v1"
 
 
 @pytest.mark.parametrize("keep_events", [False, True])

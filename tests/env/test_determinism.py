@@ -13,7 +13,7 @@ import pytest
 
 from fleet.bus.exchange.channel import Channel
 from fleet.bus.exchange.memory import MemoryExchange
-from fleet.env.allocation_v0 import Episode, parallel_env
+from fleet.env.allocation_v1 import Episode, parallel_env
 from fleet.motor import gen3_motors
 from fleet.robot import ThermalLimits
 
@@ -28,7 +28,7 @@ for name, path in zip(("small_worlds", "playing"), sys.argv[1:]):
     spec.loader.exec_module(module)
     loaded.append(module)
 worlds, playing = loaded
-from fleet.env.allocation_v0 import env as aec_env, parallel_env
+from fleet.env.allocation_v1 import env as aec_env, parallel_env
 from fleet.env.vector import BatchEnv
 
 def results():

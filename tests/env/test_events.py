@@ -5,7 +5,7 @@ import pytest
 
 from fleet.bus.exchange.memory import MemoryExchange
 from fleet.engine.state import State
-from fleet.env.allocation_v0 import parallel_env
+from fleet.env.allocation_v1 import parallel_env
 from fleet.env.vector import BatchEnv
 
 SEED = 7

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleet.env.allocation_v0 import Episode, parallel_env
+from fleet.env.allocation_v1 import Episode, parallel_env
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, IDLE, WORKING
 

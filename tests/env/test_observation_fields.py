@@ -15,7 +15,7 @@ from fleet.engine.reward import RewardWeights
 from fleet.engine.shift import Episode
 from fleet.engine.state import State, World, initial
 from fleet.engine.tables import tables_of
-from fleet.env.allocation_v0 import parallel_env
+from fleet.env.allocation_v1 import parallel_env
 from fleet.motion import Plan
 from fleet.motor import gen3_motors
 from fleet.observation import LONG_S, Layout, Observation

@@ -9,7 +9,7 @@ from hypothesis import event, given, settings
 from hypothesis import strategies as st
 
 from fleet.engine.state import DONE, GIVEN_UP, RUNNING, WAITING, State
-from fleet.env.allocation_v0 import AllocationEnv, Episode, parallel_env
+from fleet.env.allocation_v1 import AllocationEnv, Episode, parallel_env
 from fleet.job import MOST_FAULTS, Job
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, IDLE, WORKING

@@ -9,10 +9,10 @@ import pytest
 from pettingzoo import AECEnv, ParallelEnv
 
 import scenarios
-from fleet.env.allocation_v0 import AllocationEnv
+from fleet.env.allocation_v1 import AllocationEnv
 from fleet.env.vector import BatchEnv
 
-NAME = "thermofleet/allocation_v0"
+NAME = "thermofleet/allocation_v1"
 
 
 def test_pettingzoo_makes_the_env_by_name(cell, folder, play) -> None:

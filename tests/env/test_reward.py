@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fleet.engine.reward import TERMS, RewardWeights
-from fleet.env.allocation_v0 import AllocationEnv, Episode, parallel_env
+from fleet.env.allocation_v1 import AllocationEnv, Episode, parallel_env
 from fleet.robot import ThermalLimits
 
 

@@ -12,7 +12,7 @@ from agents.registry import RULES, make_policy
 from fleet.bus.protocol.auction import JobEstimate as Estimate
 from fleet.bus.protocol.auction import JobSpec, Quote
 from fleet.bus.protocol.messages import State
-from fleet.env.allocation_v0 import parallel_env
+from fleet.env.allocation_v1 import parallel_env
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.round import Bidding, resolve_claims
 from fleet.observation import FIELDS, LONG_S, Observation

@@ -1,4 +1,4 @@
-"""Thermal job allocation, version 0: arms claim jobs, heat up, and must not fault.
+"""Thermal job allocation, version 1: arms claim jobs, heat up, and must not fault.
 
 A PettingZoo `ParallelEnv` as a thin view of the one engine `fleet.engine.step`. Agents are the arms, fixed for the
 whole episode. At every step each answers Discrete(slots · plans + 1): 0 waits or goes on and is always legal,
@@ -32,7 +32,7 @@ from fleet.thermal import WINDING
 
 Array = np.ndarray
 
-VERSION = "allocation_v0"
+VERSION = "allocation_v1"
 MaskPlace = Literal["obs", "info", "both"]
 RENDER_MODES = ("ansi", "rgb_array", "human")
 FRAMES_PER_S = 10
