@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from fleet.arrivals import ArrivalTable, arrival_table, sample_arrivals, scale_rate
+from scenarios.arrivals import ArrivalTable, arrival_table, sample_arrivals, scale_rate
 from fleet.jit import kernel
 from fleet.job import Job, Work
 from fleet.seeding import random_uniform, random_word

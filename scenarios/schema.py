@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from fleet.arrivals import Arrivals, Batch, Poisson, Trace
+from scenarios.arrivals import Arrivals, Batch, Poisson, Trace
 from fleet.engine.reward import RewardWeights
 from fleet.env.validation import Decisions
 from fleet.errors import FleetError, check_nonnegative, check_positive, nearest

@@ -36,7 +36,7 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
     slot_job, station_free, plans, times_s = o.slot_job, o.station_free, s.plan, t.times_s
     plan_of, own_space, excluded, taken = t.plan, t.own_space, t.excluded, o.taken
     noise_k, payload_kg, values, work = t.sensor_noise_k, t.payload_kg, t.value, t.work
-    risk_offset, risk_weight, risk_curve = t.risk_offset, t.risk_weight, t.risk_curve
+    forecast_offset, forecast_weight, forecast_curve = t.forecast_offset, t.forecast_weight, t.forecast_curve
     arms, slots, options = nonnegative(modes.shape[1]), nonnegative(slot_job.shape[1]), nonnegative(plan_of.shape[3])
     at, low, high, first, change = form.offsets, form.low, form.high, form.first_change, form.change
     size = nonnegative(out.shape[2])
@@ -130,6 +130,6 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
                         out[e, a, at.known + option], out[e, a, at.difficulty + option] = 1.0, score
                     p, r = own["p_saturation"], own["risk"]
                     if r >= 0:
-                        p = passing_probability(risk_offset[r], risk_weight[r], risk_curve[r], measured_c[a])
+                        p = passing_probability(forecast_offset[r], forecast_weight[r], forecast_curve[r], measured_c[a])
                     if not np.isnan(p):
                         out[e, a, at.p_saturation + option] = p

@@ -85,11 +85,11 @@ class Tables(NamedTuple):
     """Row of the plan tables, −1 where the arm has none, int [fleet, arm, kind, plan]; the fastest first."""
     work: Array
     """What an arm knows of its plans for a kind of job, `WORK` [fleet, arm, kind, plan]."""
-    risk_offset: Array
+    forecast_offset: Array
     """[risk, piece]; see `fleet.difficulty.Risk`."""
-    risk_weight: Array
+    forecast_weight: Array
     """[risk, piece, joint]."""
-    risk_curve: Array
+    forecast_curve: Array
     """[risk, knot, 2]; no knots where no risk has a curve."""
     feasible: Array
     """Whether an arm can do a kind of job at all, bool [fleet, kind, arm]."""
@@ -235,7 +235,7 @@ def tables_of(world: World) -> tuple[Tables, Jobs]:
     work = np.zeros(can.shape, WORK)
     work["travel_s"], work["cycle_s"] = times_s[..., 0] + times_s[..., 2], times_s[..., 1]
     work["difficulty"], work["p_saturation"], work["risk"] = offers.difficulty, offers.p_saturation, offers.risk
-    risk_offset, risk_weight, risk_curve = _risk_tables(offers.risks)
+    forecast_offset, forecast_weight, forecast_curve = _risk_tables(offers.risks)
     thermal_step = np.concatenate([world.phi, world.gamma], axis=-1).swapaxes(-1, -2)
     tables = Tables(
         dt_s=float(world.dt_s),
@@ -268,9 +268,9 @@ def tables_of(world: World) -> tuple[Tables, Jobs]:
         excluded=bits(world.conflicts[world.plans.volume]),
         plan=offers.plan,
         work=work,
-        risk_offset=risk_offset,
-        risk_weight=risk_weight,
-        risk_curve=risk_curve,
+        forecast_offset=forecast_offset,
+        forecast_weight=forecast_weight,
+        forecast_curve=forecast_curve,
         feasible=np.any(can, axis=-1).swapaxes(-1, -2),
         stations=bits(_one_hot(jobs.stations, len(world.stations))),
         payload_kg=jobs.payload_kg,
@@ -333,7 +333,7 @@ def owned(arrays: Arrays) -> Arrays:
 
 
 _SCALARS = tuple(name for name, kind in Tables.__annotations__.items() if kind is not Array)
-_RENUMBERED = ("plan", "risk_offset", "risk_weight", "risk_curve", "stations", "own_space", "excluded")
+_RENUMBERED = ("plan", "forecast_offset", "forecast_weight", "forecast_curve", "stations", "own_space", "excluded")
 
 
 def stack_tables(fleets: Sequence[Tables]) -> Tables:
@@ -353,9 +353,9 @@ def stack_tables(fleets: Sequence[Tables]) -> Tables:
             if getattr(other, name).shape != getattr(first, name).shape:
                 raise ValueError(f"Fleets of one batch must have as many arms and kinds of jobs as the first ({name}).")
     plans = np.cumsum([0, *(len(each.times_s) for each in fleets)])
-    risks = np.cumsum([0, *(len(each.risk_offset) for each in fleets)])
-    pieces = max(each.risk_offset.shape[1] for each in fleets)
-    knots = max(each.risk_curve.shape[1] for each in fleets)
+    risks = np.cumsum([0, *(len(each.forecast_offset) for each in fleets)])
+    pieces = max(each.forecast_offset.shape[1] for each in fleets)
+    knots = max(each.forecast_curve.shape[1] for each in fleets)
 
     def shifted(each: Iterable[Array], by: Array) -> Array:
         return np.concatenate([np.where(v >= 0, v + n, -1) for v, n in zip(each, by, strict=False)])
@@ -370,9 +370,9 @@ def stack_tables(fleets: Sequence[Tables]) -> Tables:
         first._replace(
             **joined,
             plan=shifted((t.plan for t in fleets), plans),
-            risk_offset=np.concatenate([pad(t.risk_offset, 1, pieces, -np.inf) for t in fleets]),
-            risk_weight=np.concatenate([pad(t.risk_weight, 1, pieces) for t in fleets]),
-            risk_curve=np.concatenate([_extend_curve(t.risk_curve, knots) for t in fleets]),
+            forecast_offset=np.concatenate([pad(t.forecast_offset, 1, pieces, -np.inf) for t in fleets]),
+            forecast_weight=np.concatenate([pad(t.forecast_weight, 1, pieces) for t in fleets]),
+            forecast_curve=np.concatenate([_extend_curve(t.forecast_curve, knots) for t in fleets]),
             stations=_same_words([t.stations for t in fleets]),
             own_space=_same_words([t.own_space for t in fleets]),
             excluded=_same_words([t.excluded for t in fleets]),
