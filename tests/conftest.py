@@ -137,6 +137,7 @@ def shop(
     ambient_c: float = 25.0,
     start_warm: bool = False,
     space: Space | None = None,
+    plans_per_job: int = 1,
 ) -> tuple[World, ProfilePlant]:
     """A world in which every arm can do every job (unless arms are given), and the plant that moves it."""
     if isinstance(arms, int):
@@ -152,6 +153,7 @@ def shop(
         ambient_c=np.full((ticks, len(arms)), ambient_c),
         start_warm=start_warm,
         space=space,
+        plans_per_job=plans_per_job,
     )
     rest_q = np.stack([a.robot.home_q() for a in arms])
     return world, ProfilePlant(plans, rest_q, np.stack([a.rest_tau for a in arms]))
@@ -172,6 +174,8 @@ class Shifts:
     limits: ThermalLimits = field(default_factory=ThermalLimits)
     crowding: float = 0.0
     """Share of the pairs of plans of two arms that exclude each other."""
+    hard_due: float = 0.2
+    """Share of the jobs that expire."""
 
     def __call__(self, seed: np.random.SeedSequence) -> Episode:
         """The episode of a seed."""
@@ -196,6 +200,7 @@ class Shifts:
                     due_s=release_s + 100.0,
                     value=float(draw.integers(1, 5)),
                     after=before,
+                    expires=bool(draw.random() < self.hard_due),
                 )
             )
         return jobs, sensors
@@ -235,6 +240,7 @@ class AsArrays:
             due_s=np.array([each.due_s for each in jobs]),
             repetitions=np.array([each.repetitions for each in jobs], dtype=int),
             after=np.array([[index[name] for name in each.after] or [-1] for each in jobs], dtype=int).reshape(-1, 1),
+            expires=np.array([each.expires for each in jobs]),
             noise_key=key_of(sensors),
         )
 

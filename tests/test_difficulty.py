@@ -5,35 +5,35 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.difficulty import Difficulty, Risk, stack_risks
+from fleet.difficulty import KNOWN, Difficulty, Forecast, known_temperatures, stack_forecasts
 
 CURVE = np.array([[-4.0, 0.05], [0.0, 0.2], [0.0, 0.4], [3.0, 1.0]])
 
 risks = st.builds(
-    lambda seed, pieces, curved: Risk(
+    lambda seed, pieces, curved: Forecast(
         np.random.default_rng(seed).normal(-3.0, 2.0, pieces),
-        np.random.default_rng(seed).exponential(0.05, (pieces, 7)),
+        np.random.default_rng(seed).exponential(0.05, (pieces, KNOWN)),
         CURVE[: 2 + seed % 3] if curved else None,
     ),
     st.integers(0, 10_000),
     st.integers(1, 4),
     st.booleans(),
 )
-temps = st.integers(0, 10_000).map(lambda seed: np.random.default_rng(seed).uniform(10.0, 80.0, 7))
+temps = st.integers(0, 10_000).map(lambda seed: np.random.default_rng(seed).uniform(10.0, 80.0, KNOWN))
 
 
 def test_the_worst_piece_decides_through_the_logistic_function() -> None:
-    weight = np.zeros((2, 7))
+    weight = np.zeros((2, KNOWN))
     weight[0, 1], weight[1, 3] = 0.2, 0.1
-    risk = Risk(np.array([-10.0, -5.0]), weight)
-    temp_c = np.full(7, 30.0)
+    risk = Forecast(np.array([-10.0, -5.0]), weight)
+    temp_c = np.full(KNOWN, 30.0)
     # Pieces −10 + 0.2 · 30 = −4 and −5 + 0.1 · 30 = −2.
     assert risk.at(temp_c) == pytest.approx(1 / (1 + np.exp(2.0)))
     temp_c[1] = 50.0
     assert risk.at(temp_c) == pytest.approx(0.5)  # the first piece is now at 0
 
 
-@given(risk=risks, temp_c=temps, joint=st.integers(0, 6), more_k=st.floats(0.0, 50.0))
+@given(risk=risks, temp_c=temps, joint=st.integers(0, KNOWN - 1), more_k=st.floats(0.0, 50.0))
 def test_warmer_is_never_less_risky_where_no_weight_is_negative(risk, temp_c, joint, more_k) -> None:
     warmer = temp_c.copy()
     warmer[joint] += more_k
@@ -42,16 +42,16 @@ def test_warmer_is_never_less_risky_where_no_weight_is_negative(risk, temp_c, jo
 
 @given(score=st.floats(-10, 10))
 def test_a_curve_reads_as_numpy_interpolates(score) -> None:
-    risk = Risk(np.array([score]), np.zeros((1, 7)), CURVE)
+    risk = Forecast(np.array([score]), np.zeros((1, KNOWN)), CURVE)
     if score == 0.0:
-        assert risk.at(np.zeros(7)) == 0.4  # at a jump: its upper end
+        assert risk.at(np.zeros(KNOWN)) == 0.4  # at a jump: its upper end
     else:
-        assert risk.at(np.zeros(7)) == pytest.approx(np.interp(score, *CURVE.T))
+        assert risk.at(np.zeros(KNOWN)) == pytest.approx(np.interp(score, *CURVE.T))
 
 
 @given(several=st.lists(risks, min_size=1, max_size=5), temp_c=temps)
 def test_stacked_risks_say_what_each_said(several, temp_c) -> None:
-    stack = stack_risks(several)
+    stack = stack_forecasts(several)
     assert stack.at(temp_c) == pytest.approx([float(r.at(temp_c)) for r in several])
     order = np.arange(len(several))[::-1]
     assert stack[order].at(np.tile(temp_c, (len(several), 1))) == pytest.approx(stack.at(temp_c)[::-1])
@@ -65,23 +65,38 @@ def test_one_risk_serves_many_temperatures(risk, temp_c) -> None:
 @pytest.mark.parametrize(
     ("offset", "weight", "curve", "says"),
     [
-        (np.zeros(0), np.zeros((0, 7)), None, "at least one piece"),
-        (np.zeros(2), np.zeros((3, 7)), None, "at least one piece"),
-        (np.array([np.nan]), np.zeros((1, 7)), None, "must not be NaN"),
-        (np.zeros(1), np.full((1, 7), np.inf), None, "must be finite"),
-        (np.zeros(1), np.zeros((1, 7)), np.zeros((4, 3)), "knot, 2"),
+        (np.zeros(0), np.zeros((0, KNOWN)), None, "at least one piece"),
+        (np.zeros(2), np.zeros((3, KNOWN)), None, "at least one piece"),
+        (np.array([np.nan]), np.zeros((1, KNOWN)), None, "must not be NaN"),
+        (np.zeros(1), np.full((1, KNOWN), np.inf), None, "must be finite"),
+        (np.zeros(1), np.zeros((1, 7)), None, "at least one piece"),
+        (np.zeros(1), np.zeros((1, KNOWN)), np.zeros((4, 3)), "knot, 2"),
     ],
 )
 def test_a_risk_that_makes_no_sense_is_refused(offset, weight, curve, says) -> None:
     with pytest.raises(ValueError, match=says):
-        Risk(offset, weight, curve)
+        Forecast(offset, weight, curve)
 
 
 def test_a_probability_has_one_home() -> None:
-    risk = Risk(np.array([-1.0]), np.full((1, 7), 0.01))
+    risk = Forecast(np.array([-1.0]), np.full((1, KNOWN), 0.01))
     d = np.full(7, 0.1)
-    assert Difficulty(d, risk=risk).p_at(np.full(7, 20.0)) == float(risk.at(np.full(7, 20.0)))
-    assert Difficulty(d, 0.3).p_at(np.full(7, 20.0)) == 0.3
-    assert Difficulty(d).p_at(np.full(7, 20.0)) is None
+    assert Difficulty(d, risk=risk).p_at(np.full(KNOWN, 20.0)) == float(risk.at(np.full(KNOWN, 20.0)))
+    assert Difficulty(d, 0.3).p_at(np.full(KNOWN, 20.0)) == 0.3
+    assert Difficulty(d).p_at(np.full(KNOWN, 20.0)) is None
     with pytest.raises(ValueError, match="not both"):
         Difficulty(d, 0.3, risk)
+
+
+def test_the_peak_is_the_hottest_piece_and_its_curve_gives_the_probability() -> None:
+    weight = np.zeros((2, KNOWN))
+    weight[0, 0] = weight[1, 7] = 1.0  # motor 1 and housing 1
+    peak = Forecast(np.array([20.0, 5.0]), weight, np.array([[50.0, 0.0], [70.0, 1.0]]))
+    known_c = known_temperatures(np.full(7, 35.0), np.full(7, 52.0), 25.0)
+    told = Difficulty(np.full(7, 0.1), peak=peak)
+    assert known_c.shape == (KNOWN,)
+    assert known_c[-1] == 25.0
+    assert told.peak_at(known_c) == 57.0
+    assert told.p_at(known_c) == pytest.approx(0.35)
+    assert Difficulty(np.full(7, 0.1), 0.2, peak=peak).p_at(known_c) == 0.2
+    assert Difficulty(np.full(7, 0.1)).peak_at(known_c) is None

@@ -130,6 +130,7 @@ def build_world(
     ambient_c: Array,
     start_warm: bool,
     space: Space | None = None,
+    plans_per_job: int = PLANS,
 ) -> tuple[World, tuple[Plan, ...]]:
     """The world of one or more parallel shifts, and the plans behind the rows of its plan table.
 
@@ -138,9 +139,10 @@ def build_world(
         ambient_c: Air at each arm during each tick, [tick, arm].
         start_warm: Arms begin at their idle equilibrium rather than at ambient.
         space: Which plans of two arms would touch; none if not given.
+        plans_per_job: Most plans that an arm offers for a job.
     """
     motors, thermal, rest, phi, gamma, observer = _laws(tuple(arms), dt_s)
-    plans, offers = _offers(arms, shifts)
+    plans, offers = _offers(arms, shifts, plans_per_job)
     volume, conflicts = space(plans) if space and plans else (np.zeros(max(1, len(plans)), int), np.zeros((1, 1), bool))
     start = np.repeat(ambient_c[0][:, None], thermal.capacity.shape[-1], axis=1)
     housing_c = np.repeat(ambient_c[0][:, None], len(GEN3.velocity), axis=1)
@@ -184,8 +186,8 @@ def _laws(arms: tuple[Arm, ...], dt_s: float) -> tuple[Motors, ThermalModel, Dri
     return stack_motors([arm.motors for arm in arms]), thermal, rest, *thermal.step_matrices(dt_s), observer
 
 
-def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]]) -> tuple[tuple[Plan, ...], Offers]:
-    shape = (len(shifts), len(arms), max(1, *map(len, shifts)), PLANS)
+def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]], most: int) -> tuple[tuple[Plan, ...], Offers]:
+    shape = (len(shifts), len(arms), max(1, *map(len, shifts)), most)
     plan, total, p_saturation = np.full(shape, -1), np.full(shape, np.nan), np.full(shape, np.nan)
     risk, peak = np.full(shape, -1), np.full(shape, -1)
     too_heavy = np.zeros(shape[:3], bool)
@@ -203,7 +205,7 @@ def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]]) -> tuple[tuple
                 offered[id(job.work)] = [arm.offers(job.work) for arm in arms]
             for a, offers in enumerate(offered[id(job.work)]):
                 too_heavy[e, a, j] = job.work in arms[a].too_heavy
-                for n, (offer, score) in enumerate(offers[job.repetitions]):
+                for n, (offer, score) in enumerate(offers[job.repetitions][:most]):
                     if id(offer) not in rows:
                         rows[id(offer)] = len(plans)
                         plans.append(offer)

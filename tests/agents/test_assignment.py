@@ -97,7 +97,7 @@ def fleet(difficulty, **other) -> list[Observation]:
     """What the arms know that find the jobs so difficult, [arm][slot], NaN unknown; every arm may claim every job."""
     d = np.array(difficulty, dtype=float)
     layout = Layout(*d.shape)
-    blank = layout.read(np.zeros(layout.size, np.float32), np.ones(layout.slots + 1, np.int8))
+    blank = layout.read(np.zeros(layout.size, np.float32), np.array([1] * (layout.slots + 1) + [0], np.int8))
     base = {
         "known": ~np.isnan(d),
         "difficulty": np.nan_to_num(d),
@@ -156,7 +156,10 @@ def test_every_cost_is_infinite_exactly_where_an_arm_may_not_claim(cost, data):
         slack_s=table(st.floats(-1e4, 1e4)),
     )
     legal = table(st.integers(0, 1))
-    some = [replace(seen, action_mask=np.append(1, row).astype(np.int8)) for seen, row in zip(some, legal, strict=True)]
+    some = [
+        replace(seen, action_mask=np.pad(row, 1, constant_values=(1, 0)).astype(np.int8))
+        for seen, row in zip(some, legal, strict=True)
+    ]
     matrix = cost(some)
     assert not np.isnan(matrix).any()
     assert (np.isposinf(matrix) == (legal == 0)).all()

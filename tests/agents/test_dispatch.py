@@ -13,14 +13,14 @@ from fleet.observation import Layout, Observation
 def seen(value, duration_s, p, mask) -> dict[str, Observation]:
     arms, slots = np.shape(value)
     layout = Layout(arms, slots)
-    blank = layout.read(np.zeros(layout.size, np.float32), np.zeros(slots + 1, np.int8))
+    blank = layout.read(np.zeros(layout.size, np.float32), np.zeros(slots + 2, np.int8))
     return {
         f"arm_{a}": replace(
             blank,
             value=np.array(value[a], dtype=float),
             duration_s=np.array(duration_s[a], dtype=float),
             p_saturation=np.array(p[a], dtype=float),
-            action_mask=np.append(1, mask[a]).astype(np.int8),
+            action_mask=np.pad(mask[a], 1, constant_values=(1, 0)).astype(np.int8),
         )
         for a in range(arms)
     }

@@ -42,7 +42,9 @@ def fleet(
     out = {}
     for me in range(arms):
         peers = [p for p in range(arms) if p != me]
-        blank = layout.read(np.zeros(layout.size, np.float32), np.append(1, legal[me]).astype(np.int8))
+        blank = layout.read(
+            np.zeros(layout.size, np.float32), np.pad(legal[me], 1, constant_values=(1, 0)).astype(np.int8)
+        )
         out[f"arm_{me}"] = replace(
             blank,
             idle=idle[me],

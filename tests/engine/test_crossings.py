@@ -27,7 +27,7 @@ def work_on(world: World, plant, log: list[Event]) -> list[Stepped]:
     state, steps = initial(world), []
     for _ in range(world.ticks):
         actions = np.zeros((1, len(world.arms)), dtype=int)
-        legal = np.flatnonzero(open_jobs(world, state)[1][0, 0, 1:])
+        legal = np.flatnonzero(open_jobs(world, state)[1][0, 0, 1:-1])
         actions[0, 0] = legal[0] + 1 if len(legal) else 0
         steps.append(step(world, state, actions, plant, log))
         state = steps[-1].state

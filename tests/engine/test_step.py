@@ -279,7 +279,7 @@ def test_jobs_and_time_are_conserved(small, shift) -> None:
         after = step(world, state, actions, plant, log).state
         for name, value in before._asdict().items():
             np.testing.assert_array_equal(getattr(state, name), value, err_msg=f"{name} of the state before")
-        inside = (actions >= 0) & (actions <= 3)
+        inside = (actions >= 0) & (actions <= 4)
         chosen = np.take_along_axis(mask, np.where(inside, actions, 0)[..., None], axis=2)[..., 0]
         allowed = inside & (chosen == 1)
         np.testing.assert_array_equal(after.illegal - state.illegal, ~allowed)
@@ -292,7 +292,8 @@ def test_jobs_and_time_are_conserved(small, shift) -> None:
         running = np.flatnonzero(state.status[0] == RUNNING).tolist()
         assert len(held) == len(set(held))
         assert set(running) <= set(held)
-        assert all(state.status[0, j] in (RUNNING, DONE) for j in held)
+        given_back = {e.job for e in log if e.kind == "give_back"}
+        assert all(state.status[0, j] in (RUNNING, DONE) or f"j{j}" in given_back for j in held)
         assert (state.mode[0][state.job[0] >= 0] == WORKING).all()
         assert (state.plan[0][state.mode[0] == WORKING] >= 0).all()
         assert (state.plan[0][state.mode[0] == IDLE] < 0).all()
@@ -310,8 +311,11 @@ def test_jobs_and_time_are_conserved(small, shift) -> None:
         assert (state.lost_s >= -1e-9).all()
         assert (state.busy_s + state.lost_s <= time_s + 1e-6).all()
         assert (state.above_warning_s <= time_s + 1e-6).all()
-    counts = {kind: len(times(log, kind)) for kind in ("award", "finish", "return", "give_up", "fault", "recover")}
-    ended = counts["finish"] + counts["return"] + counts["give_up"]
+    counts = {
+        kind: len(times(log, kind))
+        for kind in ("award", "finish", "return", "give_up", "fault", "recover", "give_back")
+    }
+    ended = counts["finish"] + counts["return"] + counts["give_up"] + counts["give_back"]
     assert counts["award"] == ended + int((state.status == RUNNING).sum())
     assert counts["fault"] == int(state.faults.sum())
     assert counts["return"] + counts["give_up"] == int(state.returns.sum())

@@ -54,7 +54,7 @@ def test_a_stopped_arm_keeps_its_space_until_it_is_home(small) -> None:
     begin_s = math.ceil(recover.time_s / DT_S) * DT_S
     assert home.time_s == pytest.approx(begin_s + left_s, abs=1e-6)
     assert (state.mode[0, 0], state.plan[0, 0], state.job[0, 0]) == (IDLE, -1, -1)
-    assert open_jobs(world, state)[1][0, 1].tolist() == [1, 1, 0]
+    assert open_jobs(world, state)[1][0, 1].tolist() == [1, 1, 0, 0]
     assert state.cycles[0, 0] == cycles
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleet.difficulty import Blind, Difficulty, Risk
+from fleet.difficulty import KNOWN, Blind, Difficulty, Forecast
 from fleet.engine.state import initial
 from fleet.engine.world import warm_start
 from fleet.motion import Plan
@@ -132,7 +132,7 @@ def test_offers_index_rows_of_the_risk_table(small) -> None:
 
         def score(self, plan: Plan, repetitions: int) -> Difficulty:
             return Difficulty(
-                np.zeros(7), risk=Risk(np.full(repetitions, -1.0 * repetitions), np.zeros((repetitions, 7)))
+                np.zeros(7), risk=Forecast(np.full(repetitions, -1.0 * repetitions), np.zeros((repetitions, KNOWN)))
             )
 
     content = small.work()
@@ -140,7 +140,7 @@ def test_offers_index_rows_of_the_risk_table(small) -> None:
     arms = [small.arm(0, [content], model=ByLength()), small.arm(1, [content])]
     offers = small.shop([jobs, jobs[:1]], arms=arms)[0].offers
     assert offers.risk[..., 0].tolist() == [[[0, 1, 1], [-1, -1, -1]], [[0, -1, -1], [-1, -1, -1]]]
-    assert offers.risks is not None
-    assert offers.risks.offset.tolist() == [[-2.0, -2.0, -np.inf], [-3.0] * 3]
+    assert offers.forecasts is not None
+    assert offers.forecasts.offset.tolist() == [[-2.0, -2.0, -np.inf], [-3.0] * 3]
     assert np.isnan(offers.p_saturation[:, 0]).all()
-    assert small.shop([jobs], arms=[arms[1]])[0].offers.risks is None
+    assert small.shop([jobs], arms=[arms[1]])[0].offers.forecasts is None

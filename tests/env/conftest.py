@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleet.difficulty import Difficulty, Risk
+from fleet.difficulty import KNOWN, Difficulty, Forecast
 from fleet.engine.state import DONE, WAITING, State, World
 from fleet.env.allocation_v1 import AllocationEnv, parallel_env
 from fleet.env.vector import BatchEnv
@@ -134,10 +134,11 @@ class Learned:
         self._pieces, self._curve = pieces, curve
 
     def score(self, plan, repetitions: int) -> Difficulty:
-        slope = np.linspace(0.01, 0.05, self._pieces)[:, None] * np.arange(1, JOINTS + 1)
+        slope = np.linspace(0.01, 0.05, self._pieces)[:, None] * np.arange(1, KNOWN + 1) / 2.0
         curve = np.array([[-3.0, 0.1], [0.0, 0.4], [0.0, 0.5], [4.0, 0.9]]) if self._curve else None
-        risk = Risk(-np.linspace(4.0, 7.0, self._pieces) - plan.work.payload_kg, slope, curve)
-        return Difficulty(np.full(JOINTS, 0.1 + 0.05 * plan.work.payload_kg), risk=risk)
+        peak = Forecast(np.linspace(20.0, 30.0, 3), np.full((3, KNOWN), 0.1), time_s=np.array([0.0, 30.0, 90.0]))
+        risk = Forecast(-np.linspace(4.0, 7.0, self._pieces) - plan.work.payload_kg, slope, curve)
+        return Difficulty(np.full(JOINTS, 0.1 + 0.05 * plan.work.payload_kg), risk=risk, peak=peak)
 
 
 @pytest.fixture(scope="session")

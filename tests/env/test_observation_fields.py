@@ -8,7 +8,7 @@ import pytest
 from fleet.bus.exchange.channel import Channel
 from fleet.bus.exchange.memory import MemoryExchange
 from fleet.bus.exchange.protocol import UNHEARD, PeerView
-from fleet.difficulty import Difficulty, Risk
+from fleet.difficulty import KNOWN, Difficulty, Forecast
 from fleet.engine.batch import Engine, shifts_of
 from fleet.engine.peers import broadcast, write_peers
 from fleet.engine.reward import RewardWeights
@@ -29,6 +29,7 @@ def received(arms: int, slots: int, **changes: np.ndarray) -> PeerView:
     base = {
         "mode": np.zeros((arms, arms), int),
         "headroom_k": np.full((arms, arms), 30.0),
+        "busy_s": np.zeros((arms, arms)),
         "difficulty": np.full((arms, arms, slots), np.nan),
         "p_saturation": np.full((arms, arms, slots), np.nan),
         "age_s": np.zeros((arms, arms)),
@@ -135,7 +136,7 @@ def test_slots_hold_each_arm_s_own_view_of_the_jobs(small) -> None:
     assert observed.difficulty[0, 1].tolist() == pytest.approx([expected.total, 0.0, 0.0])
     assert observed.p_saturation[0, 1].tolist() == pytest.approx([expected.p_saturation, 0.5, 0.5])
     assert observed.clock[0].tolist() == pytest.approx([20.0 / world.horizon_s] * 2)
-    assert observed.action_mask[0].tolist() == [[1, 1, 1, 0], [1, 1, 0, 0]]
+    assert observed.action_mask[0].tolist() == [[1, 1, 1, 0, 0], [1, 1, 0, 0, 0]]
 
 
 def test_busy_time_counts_down_to_home(small) -> None:
@@ -185,7 +186,7 @@ class SecondJointDecides:
     version = "second joint decides"
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty:
-        risk = Risk(np.array([0.2 * (0.5 * repetitions - 50.0)]), 0.2 * np.eye(7)[1:2])
+        risk = Forecast(np.array([0.2 * (0.5 * repetitions - 50.0)]), 0.2 * np.eye(KNOWN)[1:2])
         return Difficulty(np.full(7, 0.1), risk=risk)
 
 
@@ -234,6 +235,7 @@ def test_peers_observe_what_the_arm_observes_of_itself(small) -> None:
                 other = observed[env.possible_agents[peer]]
                 assert observed[arm].peer_age_s[row] == 0.0
                 assert observed[arm].peer_headroom_k[row] == other.headroom_k
+                assert observed[arm].peer_busy_s[row] == other.busy_s
                 assert observed[arm].peer_working[row] == other.working
                 assert observed[arm].peer_faulted[row] == other.faulted
                 np.testing.assert_array_equal(observed[arm].peer_difficulty[row], other.difficulty)
