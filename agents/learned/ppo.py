@@ -2,7 +2,10 @@
 
 Clipped surrogate (Schulman et al., arXiv 1707.06347) with generalised advantages (arXiv 1506.02438); the critic sees
 the whole fleet (MAPPO, Yu et al., NeurIPS 2022) or one arm (IPPO, de Witt et al., arXiv 2011.09533). The actor trains
-only on steps at which an arm has a choice; a working arm has none.
+only on steps at which an arm has a choice.
+
+Steps may differ in length, so the process is a semi-Markov one: discounts go by the time that a step took (Bradtke &
+Duff, NeurIPS 1994; Sutton, Precup & Singh, Artificial Intelligence 1999).
 """
 
 import pickle
@@ -21,16 +24,19 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.modules import MaskedCategorical, ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
-from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
+from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from agents.learned.network import Actor, Critic, NetworkSize, masked
 from agents.learned.policy import draw
+from fleet.env.validation import Decisions, decisions_of
 from fleet.errors import CheckpointError
 from fleet.files import atomic_path
 from fleet.observation import Layout
 
 Algorithm = Literal["mappo", "ippo"]
 SEEN, MASK, ACTION, LIKELIHOOD = ("arms", "observation"), ("arms", "action_mask"), ("arms", "action"), "log_prob"
+LONGEST_S = 1e7
+"""Longest horizon of a discount, 116 days."""
 _STATE = ("actor", "critic", "optimizer")
 EnvFactory = Callable[[int, int], EnvBase]
 """From a number of envs and a seed to a batched environment with the keys of `fleet.env.adapters.torchrl`."""
@@ -50,9 +56,13 @@ class PpoConfig:
     minibatch: int = 512
     """Choices in one optimiser step of the actor."""
     learning_rate: float = 3e-4
-    gamma: float = 0.99
-    lmbda: float = 0.98
-    """Near 1: the value of the current job is not in the observation, so the return must contain its reward."""
+    decisions: Decisions = "events"
+    """Length of a step; see `fleet.env.allocation_v1`."""
+    discount_s: float = 7200.0
+    """Horizon of the discount: gamma of a step is exp(-elapsed_s / discount_s)."""
+    trace_s: float = 900.0
+    """Horizon of the trace: lambda of a step is exp(-elapsed_s / trace_s). Longer than most jobs: the value of the
+    current job is not in the observation, so the return must contain its reward."""
     clip: float = 0.2
     entropy: float = 0.002
     """Weight of the entropy bonus."""
@@ -65,6 +75,7 @@ class PpoConfig:
     def __post_init__(self) -> None:
         if self.algorithm not in get_args(Algorithm):
             raise ValueError(f"algorithm must be one of {', '.join(get_args(Algorithm))} (got {self.algorithm!r}).")
+        decisions_of(self.decisions)
         whole, positive = (
             ("envs", "steps", "epochs", "minibatch"),
             ("learning_rate", "clip", "max_gradient", "reward_scale"),
@@ -72,7 +83,7 @@ class PpoConfig:
         for names, allowed, valid in (
             (whole, ">= 1", lambda value: value >= 1),
             (positive, "> 0", lambda value: value > 0),
-            (("gamma", "lmbda"), "in (0, 1]", lambda value: 0 < value <= 1),
+            (("discount_s", "trace_s"), f"1 to {LONGEST_S:g}", lambda value: 1 <= value <= LONGEST_S),
         ):
             for name in names:
                 if not valid(getattr(self, name)):
@@ -117,6 +128,29 @@ class Chooser(nn.Module):
         if bool(choice.any()):
             logits[choice] = self.actor(self.layout, vectors[choice])
         return logits
+
+
+def advantages(
+    elapsed_s: Tensor,
+    reward: Tensor,
+    values: Tensor,
+    next_values: Tensor,
+    done: Tensor,
+    *,
+    discount_s: float,
+    trace_s: float,
+) -> tuple[Tensor, Tensor]:
+    """Generalised advantages and value targets of steps of unequal length, each [env, time, arm] like the arguments.
+
+    δ = r + γ v' - v, A = δ + γ λ A' with γ = exp(-elapsed_s / discount_s) and λ = exp(-elapsed_s / trace_s); v' and A'
+    are 0 after the last step of an episode. The reward of a step counts as of its start.
+
+    Source: arXiv 1506.02438, eq. 16; γ by time as in Sutton, Precup & Singh, Artificial Intelligence 112, 1999, sec. 3.
+    """
+    gamma, lmbda = torch.exp(-elapsed_s / discount_s), torch.exp(-elapsed_s / trace_s)
+    # Annotated float, but calculates with tensors; the vectorised form would need memory for time².
+    estimate: Any = generalized_advantage_estimate
+    return estimate(gamma, lmbda, values, next_values, reward, done, done)
 
 
 class Trainer:
@@ -222,8 +256,9 @@ class Trainer:
         next_values = torch.cat([values[:, 1:], self.critic(self.layout, next_seen[:, -1:])], dim=1)  # ignored at ends
         done = rollout["next", "done"].expand(*values.shape)
         reward = rollout["next", "arms", "reward"][..., 0] * self.config.reward_scale
-        return vec_generalized_advantage_estimate(
-            self.config.gamma, self.config.lmbda, values, next_values, reward, done, done
+        elapsed_s = rollout["next", "arms", "elapsed_s"][..., 0]
+        return advantages(
+            elapsed_s, reward, values, next_values, done, discount_s=self.config.discount_s, trace_s=self.config.trace_s
         )
 
     def act(self, vectors: np.ndarray, mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -99,9 +99,10 @@ def train(
     library = library_of([fleet])
 
     def make_env(envs: int, seed: int) -> TorchRLEnv:
-        return TorchRLEnv(BatchEnv(library, envs, seed=seed, weights=scenario.reward, autoreset=False, stagger=True))
+        options = {"weights": scenario.reward, "decisions": config.decisions, "stagger": True}
+        return TorchRLEnv(BatchEnv(library, envs, seed=seed, autoreset=False, **options))
 
-    judge = BatchEnv(library, plan.validation_envs, weights=scenario.reward)
+    judge = BatchEnv(library, plan.validation_envs, weights=scenario.reward, decisions="events")
     trainer = Trainer(make_env, judge.layout, config)
     best = -np.inf
     if resume:
