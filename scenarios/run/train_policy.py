@@ -111,7 +111,9 @@ def train(
             raise FleetError(f"The training in '{out}' has {trainer.done} iterations: --iterations must be more.")
     elif config.warm_start:
         rng = np.random.default_rng(np.random.SeedSequence([config.seed, 4]))
-        teacher = BatchEnv(library, 16, seed=int(rng.integers(2**31)), weights=scenario.reward, stagger=True)
+        teacher = BatchEnv(
+            library, 16, seed=int(rng.integers(2**31)), weights=scenario.reward, stagger=True, decisions="events"
+        )
         imitate(trainer.actor, judge.layout, _demonstrations(teacher, config.warm_start, progress), rng)
     out.mkdir(parents=True, exist_ok=True)
     (out / "training.json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
@@ -155,7 +157,7 @@ def train(
 
 DEMONSTRATIONS = 60
 """Batches of a rule's decisions for a warm start."""
-STEPS = 128
+STEPS = 16
 """Steps of every env in a batch."""
 
 

@@ -2,16 +2,18 @@
 
 import json
 from itertools import islice
+from math import exp
 
 import numpy as np
 import pytest
 import torch
+from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
 from agents.learned.features import sets_of
 from agents.learned.imitation import imitate
 from agents.learned.network import Actor, Critic, NetworkSize, masked
 from agents.learned.policy import CARD, WEIGHTS, LearnedPolicy, draw, load_policy, save_policy
-from agents.learned.ppo import PpoConfig, Trainer
+from agents.learned.ppo import PpoConfig, Trainer, advantages
 from agents.policy import only_choices
 from fleet.engine.batch import Shift, shifts_of
 from fleet.engine.tables import tables_of
@@ -119,6 +121,34 @@ def trainer(small, **changes) -> Trainer:
     return Trainer(make_env, Layout(2, 4), PpoConfig(**{"envs": 8, "steps": 30, "minibatch": 128, **changes}))
 
 
+def test_advantages_of_unequal_steps_in_closed_form() -> None:
+    """Three steps of 60, 3600 and 10 s; the second one ends an episode, the rollout is cut after the third."""
+    elapsed_s = torch.tensor([60.0, 3600.0, 10.0], dtype=torch.float64)
+    reward, value, after = (
+        torch.tensor(v, dtype=torch.float64) for v in ([1.0, -2.0, 4.0], [3.0, 5.0, 7.0], [5.0, 9.0, 2.0])
+    )
+    done = torch.tensor([False, True, False])
+    steps = [each[None, :, None] for each in (elapsed_s, reward, value, after, done)]
+    advantage, target = (a[0, :, 0].tolist() for a in advantages(*steps, discount_s=7200.0, trace_s=600.0))
+    last = 4.0 + exp(-10 / 7200) * 2.0 - 7.0
+    second = -2.0 - 5.0  # no value after the end
+    first = 1.0 + exp(-60 / 7200) * 5.0 - 3.0 + exp(-60 / 7200 - 60 / 600) * second
+    assert advantage == pytest.approx([first, second, last], rel=1e-12)
+    assert target == pytest.approx([first + 3.0, second + 5.0, last + 7.0], rel=1e-12)
+
+
+def test_advantages_of_equal_steps_are_those_of_constant_discounts() -> None:
+    torch.manual_seed(1)
+    shape = (5, 40, 3)
+    reward, value, after = (torch.randn(shape, dtype=torch.float64) for _ in range(3))
+    done = (torch.rand(shape[:2]) < 0.1)[..., None].expand(shape)
+    own = advantages(
+        torch.full(shape, 10.0, dtype=torch.float64), reward, value, after, done, discount_s=1000.0, trace_s=500.0
+    )
+    plain = vec_generalized_advantage_estimate(exp(-0.01), exp(-0.02), value, after, reward, done, done)
+    torch.testing.assert_close(own, plain)
+
+
 def weights(of: Trainer) -> dict[str, torch.Tensor]:
     return {name: value.clone() for name, value in of.actor.state_dict().items()}
 
@@ -195,7 +225,9 @@ def test_what_is_no_policy_is_said(tmp_path) -> None:
         ({"algorithm": "dqn"}, "algorithm must be one of mappo, ippo"),
         ({"envs": 0}, "envs must be >= 1"),
         ({"learning_rate": 0.0}, "learning_rate must be > 0"),
-        ({"gamma": 1.5}, r"gamma must be in \(0, 1\]"),
+        ({"discount_s": 0.5}, r"discount_s must be 1 to 1e\+07 \(got 0\.5\)"),
+        ({"trace_s": float("nan")}, "trace_s must be 1 to"),
+        ({"decisions": "event"}, "decisions must be one of 'interval', 'events'"),
     ],
 )
 def test_a_wrong_configuration_is_refused(changes, message) -> None:
