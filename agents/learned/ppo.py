@@ -98,8 +98,10 @@ class Iteration:
     """From 1."""
     env_steps: int
     """In all iterations."""
+    hours: float
+    """Simulated time, summed over the envs."""
     reward: float
-    """Mean per env step, not scaled."""
+    """Mean per simulated hour of an env, not scaled."""
     choices: int
     """Number of steps at which an arm had a choice."""
     entropy: float
@@ -231,8 +233,9 @@ class Trainer:
                 statistics.append(self._step(chosen[torch.from_numpy(row)], vectors[at], target[at]))
         self.done += 1
         entropy, clipped, value_loss = np.mean(statistics, axis=0).tolist()
-        reward = float(rollout["next", "arms", "reward"].mean())
-        return Iteration(self.done, self.env_steps, reward, count, entropy, clipped, value_loss)
+        hours = float(rollout["next", "arms", "elapsed_s"][:, :, 0].double().sum()) / 3600.0
+        reward = float(rollout["next", "arms", "reward"][:, :, 0].double().sum()) / hours
+        return Iteration(self.done, self.env_steps, hours, reward, count, entropy, clipped, value_loss)
 
     def _step(self, choices: TensorDictBase, vectors: Tensor, target: Tensor) -> tuple[float, float, float]:
         """One step of the optimiser; entropy, clipped share and value loss."""

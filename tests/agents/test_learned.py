@@ -116,9 +116,10 @@ def trainer(small, **changes) -> Trainer:
     library = unequal(small)
 
     def make_env(envs: int, seed: int) -> TorchRLEnv:
-        return TorchRLEnv(BatchEnv(library, envs, seed=seed, autoreset=False))
+        return TorchRLEnv(BatchEnv(library, envs, seed=seed, autoreset=False, decisions=config.decisions))
 
-    return Trainer(make_env, Layout(2, 4), PpoConfig(**{"envs": 8, "steps": 30, "minibatch": 128, **changes}))
+    config = PpoConfig(**{"envs": 8, "steps": 30, "minibatch": 128, **changes})
+    return Trainer(make_env, Layout(2, 4), config)
 
 
 def test_advantages_of_unequal_steps_in_closed_form() -> None:
@@ -153,10 +154,14 @@ def weights(of: Trainer) -> dict[str, torch.Tensor]:
     return {name: value.clone() for name, value in of.actor.state_dict().items()}
 
 
+@pytest.mark.parametrize("decisions", ["interval", "events"])
 @pytest.mark.parametrize("algorithm", ["mappo", "ippo"])
-def test_it_learns_what_is_worth_more(small, algorithm) -> None:
-    learner = trainer(small, algorithm=algorithm, learning_rate=3e-3)
-    rewards = [told.reward for told in islice(learner.iterate(), 25)]
+def test_it_learns_what_is_worth_more(small, algorithm, decisions) -> None:
+    learner = trainer(small, algorithm=algorithm, decisions=decisions, learning_rate=3e-3)
+    told = list(islice(learner.iterate(), 25))
+    rewards = [each.reward for each in told]
+    if decisions == "interval":
+        assert {each.hours for each in told} == {8 * 30 * 10 / 3600}
     assert np.mean(rewards[-3:]) > 1.1 * np.mean(rewards[:3])
 
 
