@@ -80,7 +80,7 @@ def steps_of(fleet: Fleet, policy: str, seed: int, decisions: Decisions) -> Step
     choices, reward = [], 0.0
     while env.agents:
         seen = env.knowledge()
-        choices.append([each.action_mask[1:].any() for each in seen.values()])
+        choices.append([each.action_mask[1:-1].any() for each in seen.values()])
         _, rewards, *_ = env.step(chooser.act(seen))
         reward += next(iter(rewards.values()))
     may = np.array(choices)

@@ -26,8 +26,10 @@ from torchrl.modules import MaskedCategorical, ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
+from agents.learned.features import has_choice
 from agents.learned.network import Actor, Critic, NetworkSize, masked
 from agents.learned.policy import draw
+from agents.policy import WAIT
 from fleet.env.validation import Decisions, decisions_of
 from fleet.errors import CheckpointError
 from fleet.files import atomic_path
@@ -35,6 +37,8 @@ from fleet.observation import Layout
 
 Algorithm = Literal["mappo", "ippo"]
 SEEN, MASK, ACTION, LIKELIHOOD = ("arms", "observation"), ("arms", "action_mask"), ("arms", "action"), "log_prob"
+CERTAIN = 1e3
+"""A logit beside zeros."""
 LONGEST_S = 1e7
 """Longest horizon of a discount, 116 days."""
 _STATE = ("actor", "critic", "optimizer")
@@ -116,17 +120,24 @@ def use_threads(count: int) -> None:
     torch.set_num_threads(count)
 
 
+def choices(layout: Layout, vectors: Tensor, mask: Any) -> Tensor:
+    """Whether each arm has a choice, bool [...], of vectors [..., size] and masks [..., action]."""
+    as_array: Any = vectors
+    return has_choice(mask, layout.read(as_array, as_array[..., :0]).headroom_k)
+
+
 class Chooser(nn.Module):
-    """Logits of every arm; zeros where an arm has no choice."""
+    """Logits of every arm; an arm without a choice waits."""
 
     def __init__(self, actor: Actor, layout: Layout) -> None:
         super().__init__()
         self.actor, self.layout = actor, layout
 
     def forward(self, vectors: Tensor, mask: Tensor) -> Tensor:
-        """[..., option + 1] of vectors [..., size] and masks."""
-        choice = mask.sum(dim=-1) > 1
+        """[..., action] of vectors [..., size] and masks."""
+        choice = choices(self.layout, vectors, mask)
         logits = vectors.new_zeros(mask.shape)
+        logits[..., WAIT] = CERTAIN
         if bool(choice.any()):
             logits[choice] = self.actor(self.layout, vectors[choice])
         return logits
@@ -214,15 +225,15 @@ class Trainer:
     def _learn(self, rollout: TensorDictBase) -> Iteration:
         config = self.config
         advantage, target = self._advantages(rollout)
-        choice = rollout[MASK].sum(dim=-1) > 1
+        seen: Any = rollout[SEEN]  # a tensor; the stub allows any entry
+        choice = choices(self.layout, seen, rollout[MASK])
         at_choices = advantage[choice]
         advantage = (advantage - at_choices.mean()) / (at_choices.std() + 1e-6)
         count = int(choice.sum())
         kept = (SEEN, MASK, ACTION, ("arms", LIKELIHOOD))
         chosen = TensorDict({key: rollout[key][choice] for key in kept}, batch_size=[count])
         chosen["advantage"] = advantage[choice][..., None]
-        everything: Any = rollout[SEEN]  # a tensor; the stub allows any entry
-        vectors, target = everything.flatten(0, 1), target.flatten(0, 1)
+        vectors, target = seen.flatten(0, 1), target.flatten(0, 1)
         batches = max(1, -(-count // config.minibatch))
         statistics: list[tuple[float, float, float]] = []
         for _ in range(config.epochs):

@@ -102,7 +102,8 @@ def train(
         options = {"weights": scenario.reward, "decisions": config.decisions, "stagger": True}
         return TorchRLEnv(BatchEnv(library, envs, seed=seed, autoreset=False, **options))
 
-    judge = BatchEnv(library, plan.validation_envs, weights=scenario.reward, decisions="events")
+    # In intervals, as in `run` and in a live fleet, where an arm above its limit is asked more often than in training.
+    judge = BatchEnv(library, plan.validation_envs, weights=scenario.reward)
     trainer = Trainer(make_env, judge.layout, config)
     best = -np.inf
     if resume:

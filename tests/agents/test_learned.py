@@ -13,8 +13,7 @@ from agents.learned.features import sets_of
 from agents.learned.imitation import imitate
 from agents.learned.network import Actor, Critic, NetworkSize, masked
 from agents.learned.policy import CARD, WEIGHTS, LearnedPolicy, draw, load_policy, save_policy
-from agents.learned.ppo import PpoConfig, Trainer, advantages
-from agents.policy import only_choices
+from agents.learned.ppo import Chooser, PpoConfig, Trainer, advantages
 from fleet.engine.batch import Shift, shifts_of
 from fleet.engine.tables import tables_of
 from fleet.env.adapters.torchrl import TorchRLEnv
@@ -65,9 +64,9 @@ def test_logits_move_with_the_slots_and_do_not_know_the_order_of_peers(arms, slo
     slot_order, peer_order = rng.permutation(slots), rng.permutation(arms - 1)
     other = reordered(layout, vectors, slot_order, peer_order)
     one, two = (actor(layout, torch.from_numpy(v).double()) for v in (vectors, other))
-    torch.testing.assert_close(two[:, 0], one[:, 0])
-    torch.testing.assert_close(two[:, 1:], one[:, 1:][:, slot_order.copy()])
-    assert slots == 1 or one[:, 1:].std() > 0
+    torch.testing.assert_close(two[:, [0, -1]], one[:, [0, -1]])
+    torch.testing.assert_close(two[:, 1:-1], one[:, 1:-1][:, slot_order.copy()])
+    assert slots == 1 or one[:, 1:-1].std() > 0
     fleet = torch.from_numpy(vectors).double()[None]
     torch.testing.assert_close(critic(layout, fleet.flip(1)), critic(layout, fleet).flip(1))
 
@@ -119,7 +118,7 @@ def trainer(small, **changes) -> Trainer:
         return TorchRLEnv(BatchEnv(library, envs, seed=seed, autoreset=False, decisions=config.decisions))
 
     config = PpoConfig(**{"envs": 8, "steps": 30, "minibatch": 128, **changes})
-    return Trainer(make_env, Layout(2, 4), config)
+    return Trainer(make_env, Layout(2, 4, plans=library.tables.plan.shape[3]), config)
 
 
 def test_advantages_of_unequal_steps_in_closed_form() -> None:
@@ -185,26 +184,42 @@ def test_a_training_goes_on_where_it_was(small, tmp_path) -> None:
     assert next(later.iterate()).number == 3
 
 
+def observations(layout: Layout, headroom_k: list[float], masks: list[list[int]]) -> dict[str, Observation]:
+    vectors = random_observation(layout, np.random.default_rng(1), len(masks))
+    layout.read(vectors, vectors[:, :0]).headroom_k[:] = headroom_k
+    return {f"arm_{a}": layout.read(vectors[a], np.array(mask, np.int8)) for a, mask in enumerate(masks)}
+
+
 def test_a_policy_is_kept_whole(tmp_path) -> None:
     torch.manual_seed(3)
     size, layout = NetworkSize(arm=8, option=8, pair=4), Layout(3, 5)
     actor = Actor(size)
     save_policy(actor, size, tmp_path / "p", scenario="x")
-    vectors = random_observation(layout, np.random.default_rng(1), 3)
-    mask = np.ones((3, 6), np.int8)
-    mask[1, 1:] = 0
-    seen = {f"arm_{a}": layout.read(vectors[a], mask[a]) for a in range(3)}
+    seen = observations(layout, [9.0] * 3, [[1] * 6 + [0], [1] + [0] * 6, [1] * 6 + [0]])
     kept, fresh = load_policy(tmp_path / "p"), LearnedPolicy(actor)
     for policy in (kept, fresh):
         policy.reset(np.random.default_rng(0))
     assert [kept.act(seen) for _ in range(20)] == [fresh.act(seen) for _ in range(20)]
     assert kept.act(seen)["arm_1"] == 0
-    assert only_choices(kept)
     before = kept._rng.bit_generator.state
     assert kept.act({"arm_1": seen["arm_1"]}) == {"arm_1": 0}
     assert kept._rng.bit_generator.state == before
     assert json.loads((tmp_path / "p" / CARD).read_text())["scenario"] == "x"
     assert len({path.stat().st_mode for path in (tmp_path / "p").iterdir()}) == 1  # who may read one may read all
+
+
+def test_an_arm_gives_a_job_back_only_above_its_warning_limit() -> None:
+    torch.manual_seed(0)
+    actor, layout, back = Actor(), Layout(3, 2), 3
+    with torch.no_grad():
+        actor.other[-1].bias.copy_(torch.tensor([0.0, 50.0]))  # prefers to give back
+    at_work = [1, 0, 0, 1]
+    seen = observations(layout, [-0.1, 0.1, -0.1], [at_work, at_work, [1, 0, 0, 0]])
+    assert LearnedPolicy(actor).act(seen) == {"arm_0": back, "arm_1": 0, "arm_2": 0}
+    vectors = np.stack([layout.pack(each) for each in seen.values()])
+    mask = torch.from_numpy(np.stack([each.action_mask for each in seen.values()]))
+    chance = torch.softmax(masked(Chooser(actor, layout)(torch.from_numpy(vectors), mask), mask), dim=-1)
+    np.testing.assert_allclose(chance[:, back].detach(), [1.0, 0.0, 0.0], atol=1e-6)
 
 
 def test_what_is_no_policy_is_said(tmp_path) -> None:
@@ -218,7 +233,7 @@ def test_what_is_no_policy_is_said(tmp_path) -> None:
     save_policy(Actor(), size, tmp_path)
     with pytest.raises(CheckpointError, match="size mismatch"):
         load_policy(tmp_path)
-    for text, reason in (("{", "not the card"), ('{"format": 9, "size": {}}', "format 9 is not 3"), ("[]", "not the")):
+    for text, reason in (("{", "not the card"), ('{"format": 9, "size": {}}', "format 9 is not 4"), ("[]", "not the")):
         (tmp_path / CARD).write_text(text)
         with pytest.raises(CheckpointError, match=reason):
             load_policy(tmp_path)
@@ -245,7 +260,8 @@ def test_a_warm_start_learns_the_rule_it_is_shown() -> None:
 
     def shown(rows: int):
         vectors = random_observation(layout, rng, rows)
-        mask = np.ones((rows, 5), np.int8)
+        mask = np.ones((rows, 6), np.int8)
+        mask[:, -1] = 0
         mask[::7, 1:] = 0  # no choice: not to be learned from
         payload = layout.read(vectors, mask).payload_kg
         return vectors, mask, np.where(mask[:, 1], payload.argmax(axis=-1) + 1, 0)

@@ -5,7 +5,7 @@ Example, installation and tested versions: docs/trainers.md.
 | key | value |
 |---|---|
 | ("arms", "observation") | float32 [env, arm, size], raw units: scale by `layout.bounds` or in the network |
-| ("arms", "action_mask") | bool [env, arm, option + 1] |
+| ("arms", "action_mask") | bool [env, arm, action] |
 | ("arms", "action") | int64 [env, arm] |
 | ("arms", "reward") | float32 [env, arm, 1], the team's reward of the whole step for every arm |
 | ("arms", "elapsed_s") | float32 [env, arm, 1], length of the step that led here, 0 after a reset |
