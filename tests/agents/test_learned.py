@@ -211,8 +211,9 @@ def test_a_policy_is_kept_whole(tmp_path) -> None:
 def test_an_arm_gives_a_job_back_only_above_its_warning_limit() -> None:
     torch.manual_seed(0)
     actor, layout, back = Actor(), Layout(3, 2), 3
-    with torch.no_grad():
-        actor.other[-1].bias.copy_(torch.tensor([0.0, 50.0]))  # prefers to give back
+    actor.other[-1].load_state_dict(
+        {"weight": torch.zeros(2, NetworkSize().option), "bias": torch.tensor([0.0, 50.0])}  # prefers to give back
+    )
     at_work = [1, 0, 0, 1]
     seen = observations(layout, [-0.1, 0.1, -0.1], [at_work, at_work, [1, 0, 0, 0]])
     assert LearnedPolicy(actor).act(seen) == {"arm_0": back, "arm_1": 0, "arm_2": 0}
