@@ -53,8 +53,8 @@ class PpoConfig:
     algorithm: Algorithm = "mappo"
     size: NetworkSize = field(default_factory=NetworkSize)
     envs: int = 64
-    steps: int = 128
-    """Steps of every env in an iteration."""
+    steps: int | None = None
+    """Steps of every env in an iteration; by default 16 with events, 128 with intervals."""
     epochs: int = 4
     """Passes of the actor over an iteration's choices; the critic makes one over all steps."""
     minibatch: int = 512
@@ -65,8 +65,8 @@ class PpoConfig:
     discount_s: float = 7200.0
     """Horizon of the discount: gamma of a step is exp(-elapsed_s / discount_s)."""
     trace_s: float = 900.0
-    """Horizon of the trace: lambda of a step is exp(-elapsed_s / trace_s). Longer than most jobs: the value of the
-    current job is not in the observation, so the return must contain its reward."""
+    """Horizon of the trace: lambda of a step is exp(-elapsed_s / trace_s). Longer than most jobs, so that the return of
+    a claim contains the reward of its job."""
     clip: float = 0.2
     entropy: float = 0.002
     """Weight of the entropy bonus."""
@@ -84,14 +84,22 @@ class PpoConfig:
             ("envs", "steps", "epochs", "minibatch"),
             ("learning_rate", "clip", "max_gradient", "reward_scale"),
         )
+        values = vars(self) | {"steps": self.length}
         for names, allowed, valid in (
             (whole, ">= 1", lambda value: value >= 1),
             (positive, "> 0", lambda value: value > 0),
             (("discount_s", "trace_s"), f"1 to {LONGEST_S:g}", lambda value: 1 <= value <= LONGEST_S),
         ):
             for name in names:
-                if not valid(getattr(self, name)):
-                    raise ValueError(f"{name} must be {allowed} (got {getattr(self, name)}).")
+                if not valid(values[name]):
+                    raise ValueError(f"{name} must be {allowed} (got {values[name]}).")
+
+    @property
+    def length(self) -> int:
+        """Steps of every env in an iteration."""
+        if self.steps is not None:
+            return self.steps
+        return 16 if self.decisions == "events" else 128
 
 
 @dataclass(frozen=True)
@@ -196,11 +204,11 @@ class Trainer:
     @property
     def env_steps(self) -> int:
         """Env steps in all finished iterations."""
-        return self.done * self.config.envs * self.config.steps
+        return self.done * self.config.envs * self.config.length
 
     def iterate(self) -> Iterator[Iteration]:
         """Endless iterations of collecting and learning; random draws depend on the number of finished iterations."""
-        frames = self.config.envs * self.config.steps
+        frames = self.config.envs * self.config.length
         torch.manual_seed(self._seed_of(1))
         self._order = np.random.default_rng(self._seed_of(2))
         collector = Collector(
