@@ -28,7 +28,7 @@ def train_command(
     ] = "",
     envs: Annotated[int, number("Shifts simulated in parallel.", 1, 65_536)] = 64,
     decisions: Annotated[
-        str, typer.Option(help="Length of a training step: events (until an arm may claim a job) or interval.")
+        str, typer.Option(help="Length of a training step: events (until an arm has a choice) or interval.")
     ] = "events",
     discount_hours: Annotated[
         float, number("Horizon of the discount: a reward this much later counts 1/e.", 0.01, 1000)
