@@ -52,12 +52,12 @@ class PpoConfig:
 
     algorithm: Algorithm = "mappo"
     size: NetworkSize = field(default_factory=NetworkSize)
-    envs: int = 64
+    envs: int = 32
     steps: int | None = None
     """Steps of every env in an iteration; by default 16 with events, 128 with intervals."""
     epochs: int = 4
     """Passes of the actor over an iteration's choices; the critic makes one over all steps."""
-    minibatch: int = 512
+    minibatch: int = 128
     """Choices in one optimiser step of the actor."""
     learning_rate: float = 3e-4
     decisions: Decisions = "events"

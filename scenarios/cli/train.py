@@ -26,7 +26,7 @@ def train_command(
     warm_start: Annotated[
         str, typer.Option(help="Rule that the network imitates first, for example wspt; default: none.")
     ] = "",
-    envs: Annotated[int, number("Shifts simulated in parallel.", 1, 65_536)] = 64,
+    envs: Annotated[int, number("Shifts simulated in parallel.", 1, 65_536)] = 32,
     decisions: Annotated[
         str, typer.Option(help="Length of a training step: events (until an arm has a choice) or interval.")
     ] = "events",
