@@ -116,7 +116,9 @@ def test_what_is_sent_against_the_mask_waits_and_is_counted(make) -> None:
     env = make(2, infos=True)
     seen = env.reset()
     seen["arms", "action_mask"][..., 1:] = True
-    seen["arms", "action"] = torch.full((2, ARMS), env.layout.actions - 2)  # only the first two slots can hold a job so early
+    seen["arms", "action"] = torch.full(
+        (2, ARMS), env.layout.actions - 2
+    )  # only the first two slots can hold a job so early
     assert (env.step(seen)["next", "arms", "info", "illegal"] == 1).all()
 
 
