@@ -30,12 +30,13 @@ from agents.learned.features import has_choice
 from agents.learned.network import Actor, Critic, NetworkSize, masked
 from agents.learned.policy import draw
 from agents.policy import WAIT
-from fleet.env.validation import Decisions, decisions_of
 from fleet.errors import CheckpointError
 from fleet.files import atomic_path
 from fleet.observation import Layout
 
 Algorithm = Literal["mappo", "ippo"]
+Decisions = Literal["interval", "events"]
+"""As in `fleet.env.validation`, which agents do not import."""
 SEEN, MASK, ACTION, LIKELIHOOD = ("arms", "observation"), ("arms", "action_mask"), ("arms", "action"), "log_prob"
 CERTAIN = 1e3
 """A logit beside zeros."""
@@ -79,7 +80,8 @@ class PpoConfig:
     def __post_init__(self) -> None:
         if self.algorithm not in get_args(Algorithm):
             raise ValueError(f"algorithm must be one of {', '.join(get_args(Algorithm))} (got {self.algorithm!r}).")
-        decisions_of(self.decisions)
+        if self.decisions not in get_args(Decisions):
+            raise ValueError(f"decisions must be one of 'interval', 'events' (got {self.decisions!r}).")
         whole, positive = (
             ("envs", "steps", "epochs", "minibatch"),
             ("learning_rate", "clip", "max_gradient", "reward_scale"),
