@@ -2,9 +2,14 @@
 
     python benchmarks/bench_policies.py [quickstart] [--speed 240] [--seed 0] [--policies a,b]
     python benchmarks/bench_policies.py --list
+    python benchmarks/bench_policies.py --steps [--difficulty oracle]
 
 Prints Markdown for docs/policies.md. A live shift is `thermofleet up` with a process for every participant; a shift of
 2 h at speed 240 takes 30 s. Policies are blind: no twin is trained.
+
+With --steps: the number of steps of a shift with `decisions="interval"` and `"events"`, and the share of them with a
+choice, for every scenario of the library and every policy, for docs/learning.md. Exits with an error if the two kinds
+of steps give different results.
 """
 
 import argparse
@@ -13,13 +18,16 @@ import sys
 import tempfile
 from collections import Counter
 from pathlib import Path
+from typing import NamedTuple, get_args
 
+import numpy as np
 import pyarrow.parquet as pq
 
 from agents.registry import RULES
-from scenarios.load import load
-from scenarios.policy_loader import label, scope_of
-from scenarios.prepare.fleet import Fleet, prepare
+from fleet.env.validation import Decisions
+from scenarios.load import library, load
+from scenarios.policy_loader import label, policy_at, scope_of
+from scenarios.prepare.fleet import DifficultyName, Fleet, env_of, prepare
 from scenarios.run.shift import RunSpec, run
 
 PROGRAM = (sys.executable, "-c", "from scenarios.cli.main import main; main()")
@@ -51,24 +59,83 @@ def listed() -> str:
     return "\n".join(["| policy | scope | minimises | source |", "|---|---|---|---|", *rows])
 
 
+class Steps(NamedTuple):
+    """Steps of a shift, and its result."""
+
+    env: int
+    env_choices: int
+    """Env steps in which an arm may claim a job."""
+    arm: int
+    arm_choices: int
+    """Arm steps in which the arm may claim a job."""
+    reward: float
+    finished_s: bytes
+    """Finish of every job, for comparison."""
+
+
+def steps_of(fleet: Fleet, policy: str, seed: int, decisions: Decisions) -> Steps:
+    """Play a shift with one length of steps."""
+    env, chooser = env_of(fleet, decisions=decisions), policy_at(policy, seed)
+    env.reset(seed=seed)
+    choices, reward = [], 0.0
+    while env.agents:
+        seen = env.knowledge()
+        choices.append([each.action_mask[1:-1].any() for each in seen.values()])
+        _, rewards, *_ = env.step(chooser.act(seen))
+        reward += next(iter(rewards.values()))
+    may = np.array(choices)
+    counts = len(may), int(may.any(axis=1).sum()), may.size, int(may.sum())
+    return Steps(*counts, reward, env.truth.finished_s.tobytes())
+
+
+def print_steps(scenarios: list[str], policies: list[str], seed: int, difficulty: DifficultyName) -> None:
+    """Print the steps of a shift as a Markdown table.
+
+    Raises:
+        SystemExit: the two kinds of steps give different results.
+    """
+    print("| scenario | policy | steps: interval | events | ratio | env steps with a choice: interval | events |"
+          " arm steps with a choice: interval | events |\n|---|---|---|---|---|---|---|---|---|")  # fmt: skip
+    for name in scenarios:
+        fleet = prepare(load(name), difficulty=difficulty)
+        for policy in policies:
+            every, some = (steps_of(fleet, policy, seed, decisions) for decisions in ("interval", "events"))
+            if every.finished_s != some.finished_s or not np.isclose(every.reward, some.reward, rtol=1e-9):
+                raise SystemExit(f"{name}, {policy}: events and interval give different results.")
+            shares = [
+                each
+                for part, whole in (("env_choices", "env"), ("arm_choices", "arm"))
+                for each in (f"{getattr(steps, part) / getattr(steps, whole):.1%}" for steps in (every, some))
+            ]
+            row = (name, f"`{label(policy)}`", every.env, some.env, f"{every.env / some.env:.1f}", *shares)
+            print(f"| {' | '.join(map(str, row))} |", flush=True)
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("scenario", nargs="?", default="quickstart")
+    parser.add_argument("scenario", nargs="?", help="default: quickstart, with --steps all of the library")
     parser.add_argument("--speed", type=float, default=240.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--policies", default=",".join(RULES))
     parser.add_argument("--list", action="store_true")
+    parser.add_argument("--steps", action="store_true")
+    parser.add_argument("--difficulty", choices=get_args(DifficultyName), default="blind", help="with --steps")
     options = parser.parse_args()
+    policies = options.policies.split(",")
     if options.list:
         print(listed())
         return
-    scenario = load(options.scenario)
+    if options.steps:
+        scenarios = [options.scenario] if options.scenario else list(library())
+        print_steps(scenarios, policies, options.seed, options.difficulty)
+        return
+    scenario = load(options.scenario or "quickstart")
     fleet = prepare(scenario, difficulty="blind")
     print("| policy | scope | simulated: finished | faults | live: finished | faults |\n|---|---|---|---|---|---|")
-    for policy in options.policies.split(","):
+    for policy in policies:
         finished, faults = simulated(fleet, policy, options.seed)
-        done, lost = live(options.scenario, policy, options.seed, options.speed, scenario.horizon_s)
+        done, lost = live(options.scenario or "quickstart", policy, options.seed, options.speed, scenario.horizon_s)
         row = (f"`{label(policy)}`", scope_of(policy), finished, faults, done, lost)
         print(f"| {' | '.join(map(str, row))} |", flush=True)
 

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from agents.learned.features import has_choice
 from agents.learned.network import Actor, masked
 from fleet.observation import Layout
 
@@ -25,7 +26,7 @@ def imitate(
     """Learn the actions of a rule by cross-entropy.
 
     Args:
-        batches: Vectors float32 [row, size], masks [row, option + 1] and actions int [row]; rows without a choice are
+        batches: Vectors float32 [row, size], masks [row, action] and actions int [row]; rows without a choice are
             ignored.
 
     Returns:
@@ -34,7 +35,7 @@ def imitate(
     optimizer = torch.optim.Adam(actor.parameters(), lr=learning_rate)
     batch_means: list[float] = []
     for vectors, masks, actions in batches:
-        choice = masks.sum(axis=-1) > 1
+        choice = has_choice(masks, layout.read(vectors, masks).headroom_k)
         if not choice.any():
             continue
         seen, legal, chosen = (torch.from_numpy(np.ascontiguousarray(a[choice])) for a in (vectors, masks, actions))

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from agents.learned.features import OPTION, OWN, PAIR, PEER, sets_of
 from fleet.observation import Layout
 
-WAIT_BIAS = -3.0
-"""Initial bias of the logit of waiting, so that an untrained actor claims jobs."""
+BIASES = (-3.0, -6.0)
+"""Initial biases of the logits of waiting and giving back, so that an untrained actor claims jobs and ends them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +33,7 @@ class NetworkSize:
 
 
 class Actor(nn.Module):
-    """Logits over waiting and the options."""
+    """Logits over waiting, the options, and giving the job back."""
 
     def __init__(self, size: NetworkSize | None = None) -> None:
         super().__init__()
@@ -42,12 +42,13 @@ class Actor(nn.Module):
         self.pair = _mlp([PAIR + PEER + OPTION, size.pair, size.pair])
         self.option = _mlp([OPTION + 2 * size.pair + size.arm, size.option, size.option])
         self.claim = _mlp([2 * size.option + size.arm, size.option, 1], last=False)
-        self.wait = _mlp([size.option + size.arm, size.option, 1], last=False)
+        self.other = _mlp([size.option + size.arm, size.option, len(BIASES)], last=False)
         self._pair = size.pair
-        nn.init.constant_(_last_linear(self.wait).bias, WAIT_BIAS)
+        with torch.no_grad():
+            _last_linear(self.other).bias.copy_(torch.tensor(BIASES))
 
     def forward(self, layout: Layout, vectors: Tensor) -> Tensor:
-        """Logits before the mask, [row, option + 1], of vectors [row, size]."""
+        """Logits before the mask, [row, action], of vectors [row, size]."""
         own_in, option_in, peer_in, pair_in = sets_of(layout, vectors)
         options, peers = option_in.shape[-2], peer_in.shape[-2]
         own = self.own(own_in)
@@ -64,7 +65,8 @@ class Actor(nn.Module):
         queue = (offered * option).sum(dim=-2) / offered.sum(dim=-2).clamp(min=1.0)
         waiting = queue[..., None, :].expand(*queue.shape[:-1], options, queue.shape[-1])
         claim = self.claim(torch.cat([option, waiting, mine], dim=-1))[..., 0]
-        return torch.cat([self.wait(torch.cat([queue, own], dim=-1)), claim], dim=-1)
+        other = self.other(torch.cat([queue, own], dim=-1))
+        return torch.cat([other[..., :1], claim, other[..., 1:]], dim=-1)
 
 
 class Critic(nn.Module):

@@ -11,13 +11,14 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 
+from agents.learned.features import has_choice
 from agents.learned.network import Actor, NetworkSize, masked
 from agents.policy import WAIT, plans_of
 from fleet.errors import CheckpointError
 from fleet.files import atomic_path
 from fleet.observation import Layout, Observation
 
-FORMAT = 3
+FORMAT = 4
 """Increase it when the network or its inputs change."""
 WEIGHTS, CARD = "policy.safetensors", "policy.json"
 
@@ -33,7 +34,6 @@ class LearnedPolicy:
     """
 
     scope: ClassVar = "arm"
-    only_choices = True
 
     def __init__(self, actor: Actor) -> None:
         self._actor = actor.eval()
@@ -50,7 +50,7 @@ class LearnedPolicy:
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
         """The actions of all arms, from one call of the network."""
         actions = dict.fromkeys(observations, WAIT)
-        choosing = [arm for arm, seen in observations.items() if seen.action_mask[1:].any()]
+        choosing = [arm for arm, seen in observations.items() if has_choice(seen.action_mask, seen.headroom_k)]
         if not choosing:
             return actions
         first = observations[choosing[0]]

@@ -2,7 +2,10 @@
 
 Clipped surrogate (Schulman et al., arXiv 1707.06347) with generalised advantages (arXiv 1506.02438); the critic sees
 the whole fleet (MAPPO, Yu et al., NeurIPS 2022) or one arm (IPPO, de Witt et al., arXiv 2011.09533). The actor trains
-only on steps at which an arm has a choice; a working arm has none.
+only on steps at which an arm has a choice.
+
+Steps may differ in length, so the process is a semi-Markov one: discounts go by the time that a step took (Bradtke &
+Duff, NeurIPS 1994; Sutton, Precup & Singh, Artificial Intelligence 1999).
 """
 
 import pickle
@@ -21,16 +24,24 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.modules import MaskedCategorical, ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
-from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
+from torchrl.objectives.value.functional import generalized_advantage_estimate
 
+from agents.learned.features import has_choice
 from agents.learned.network import Actor, Critic, NetworkSize, masked
 from agents.learned.policy import draw
+from agents.policy import WAIT
 from fleet.errors import CheckpointError
 from fleet.files import atomic_path
 from fleet.observation import Layout
 
 Algorithm = Literal["mappo", "ippo"]
+Decisions = Literal["interval", "events"]
+"""As in `fleet.env.validation`, which agents do not import."""
 SEEN, MASK, ACTION, LIKELIHOOD = ("arms", "observation"), ("arms", "action_mask"), ("arms", "action"), "log_prob"
+CERTAIN = 1e3
+"""A logit beside zeros."""
+LONGEST_S = 1e7
+"""Longest horizon of a discount, 116 days."""
 _STATE = ("actor", "critic", "optimizer")
 EnvFactory = Callable[[int, int], EnvBase]
 """From a number of envs and a seed to a batched environment with the keys of `fleet.env.adapters.torchrl`."""
@@ -42,17 +53,21 @@ class PpoConfig:
 
     algorithm: Algorithm = "mappo"
     size: NetworkSize = field(default_factory=NetworkSize)
-    envs: int = 64
-    steps: int = 128
-    """Steps of every env in an iteration."""
+    envs: int = 32
+    steps: int | None = None
+    """Steps of every env in an iteration; by default 16 with events, 128 with intervals."""
     epochs: int = 4
     """Passes of the actor over an iteration's choices; the critic makes one over all steps."""
-    minibatch: int = 512
+    minibatch: int = 128
     """Choices in one optimiser step of the actor."""
     learning_rate: float = 3e-4
-    gamma: float = 0.99
-    lmbda: float = 0.98
-    """Near 1: the value of the current job is not in the observation, so the return must contain its reward."""
+    decisions: Decisions = "events"
+    """Length of a step; see `fleet.env.allocation_v1`."""
+    discount_s: float = 7200.0
+    """Horizon of the discount: gamma of a step is exp(-elapsed_s / discount_s)."""
+    trace_s: float = 900.0
+    """Horizon of the trace: lambda of a step is exp(-elapsed_s / trace_s). Longer than most jobs, so that the return of
+    a claim contains the reward of its job."""
     clip: float = 0.2
     entropy: float = 0.002
     """Weight of the entropy bonus."""
@@ -65,18 +80,28 @@ class PpoConfig:
     def __post_init__(self) -> None:
         if self.algorithm not in get_args(Algorithm):
             raise ValueError(f"algorithm must be one of {', '.join(get_args(Algorithm))} (got {self.algorithm!r}).")
+        if self.decisions not in get_args(Decisions):
+            raise ValueError(f"decisions must be one of 'interval', 'events' (got {self.decisions!r}).")
         whole, positive = (
             ("envs", "steps", "epochs", "minibatch"),
             ("learning_rate", "clip", "max_gradient", "reward_scale"),
         )
+        values = vars(self) | {"steps": self.length}
         for names, allowed, valid in (
             (whole, ">= 1", lambda value: value >= 1),
             (positive, "> 0", lambda value: value > 0),
-            (("gamma", "lmbda"), "in (0, 1]", lambda value: 0 < value <= 1),
+            (("discount_s", "trace_s"), f"1 to {LONGEST_S:g}", lambda value: 1 <= value <= LONGEST_S),
         ):
             for name in names:
-                if not valid(getattr(self, name)):
-                    raise ValueError(f"{name} must be {allowed} (got {getattr(self, name)}).")
+                if not valid(values[name]):
+                    raise ValueError(f"{name} must be {allowed} (got {values[name]}).")
+
+    @property
+    def length(self) -> int:
+        """Steps of every env in an iteration."""
+        if self.steps is not None:
+            return self.steps
+        return 16 if self.decisions == "events" else 128
 
 
 @dataclass(frozen=True)
@@ -87,8 +112,10 @@ class Iteration:
     """From 1."""
     env_steps: int
     """In all iterations."""
+    hours: float
+    """Simulated time, summed over the envs."""
     reward: float
-    """Mean per env step, not scaled."""
+    """Mean per simulated hour of an env, not scaled."""
     choices: int
     """Number of steps at which an arm had a choice."""
     entropy: float
@@ -103,20 +130,50 @@ def use_threads(count: int) -> None:
     torch.set_num_threads(count)
 
 
+def choices(layout: Layout, vectors: Tensor, mask: Any) -> Tensor:
+    """Whether each arm has a choice, bool [...], of vectors [..., size] and masks [..., action]."""
+    as_array: Any = vectors
+    return has_choice(mask, layout.read(as_array, as_array[..., :0]).headroom_k)
+
+
 class Chooser(nn.Module):
-    """Logits of every arm; zeros where an arm has no choice."""
+    """Logits of every arm; an arm without a choice waits."""
 
     def __init__(self, actor: Actor, layout: Layout) -> None:
         super().__init__()
         self.actor, self.layout = actor, layout
 
     def forward(self, vectors: Tensor, mask: Tensor) -> Tensor:
-        """[..., option + 1] of vectors [..., size] and masks."""
-        choice = mask.sum(dim=-1) > 1
+        """[..., action] of vectors [..., size] and masks."""
+        choice = choices(self.layout, vectors, mask)
         logits = vectors.new_zeros(mask.shape)
+        logits[..., WAIT] = CERTAIN
         if bool(choice.any()):
             logits[choice] = self.actor(self.layout, vectors[choice])
         return logits
+
+
+def advantages(
+    elapsed_s: Tensor,
+    reward: Tensor,
+    values: Tensor,
+    next_values: Tensor,
+    done: Tensor,
+    *,
+    discount_s: float,
+    trace_s: float,
+) -> tuple[Tensor, Tensor]:
+    """Generalised advantages and value targets of steps of unequal length, each [env, time, arm] like the arguments.
+
+    δ = r + γ v' - v, A = δ + γ λ A' with γ = exp(-elapsed_s / discount_s) and λ = exp(-elapsed_s / trace_s); v' and A'
+    are 0 after the last step of an episode. The reward of a step counts as of its start.
+
+    Source: arXiv 1506.02438, eq. 16; γ by time as in Sutton, Precup & Singh, Artificial Intelligence 112, 1999, sec. 3.
+    """
+    gamma, lmbda = torch.exp(-elapsed_s / discount_s), torch.exp(-elapsed_s / trace_s)
+    # Annotated float, but calculates with tensors; the vectorised form would need memory for time².
+    estimate: Any = generalized_advantage_estimate
+    return estimate(gamma, lmbda, values, next_values, reward, done, done)
 
 
 class Trainer:
@@ -149,11 +206,11 @@ class Trainer:
     @property
     def env_steps(self) -> int:
         """Env steps in all finished iterations."""
-        return self.done * self.config.envs * self.config.steps
+        return self.done * self.config.envs * self.config.length
 
     def iterate(self) -> Iterator[Iteration]:
         """Endless iterations of collecting and learning; random draws depend on the number of finished iterations."""
-        frames = self.config.envs * self.config.steps
+        frames = self.config.envs * self.config.length
         torch.manual_seed(self._seed_of(1))
         self._order = np.random.default_rng(self._seed_of(2))
         collector = Collector(
@@ -178,15 +235,15 @@ class Trainer:
     def _learn(self, rollout: TensorDictBase) -> Iteration:
         config = self.config
         advantage, target = self._advantages(rollout)
-        choice = rollout[MASK].sum(dim=-1) > 1
+        seen: Any = rollout[SEEN]  # a tensor; the stub allows any entry
+        choice = choices(self.layout, seen, rollout[MASK])
         at_choices = advantage[choice]
         advantage = (advantage - at_choices.mean()) / (at_choices.std() + 1e-6)
         count = int(choice.sum())
         kept = (SEEN, MASK, ACTION, ("arms", LIKELIHOOD))
         chosen = TensorDict({key: rollout[key][choice] for key in kept}, batch_size=[count])
         chosen["advantage"] = advantage[choice][..., None]
-        everything: Any = rollout[SEEN]  # a tensor; the stub allows any entry
-        vectors, target = everything.flatten(0, 1), target.flatten(0, 1)
+        vectors, target = seen.flatten(0, 1), target.flatten(0, 1)
         batches = max(1, -(-count // config.minibatch))
         statistics: list[tuple[float, float, float]] = []
         for _ in range(config.epochs):
@@ -197,8 +254,9 @@ class Trainer:
                 statistics.append(self._step(chosen[torch.from_numpy(row)], vectors[at], target[at]))
         self.done += 1
         entropy, clipped, value_loss = np.mean(statistics, axis=0).tolist()
-        reward = float(rollout["next", "arms", "reward"].mean())
-        return Iteration(self.done, self.env_steps, reward, count, entropy, clipped, value_loss)
+        hours = float(rollout["next", "arms", "elapsed_s"][:, :, 0].double().sum()) / 3600.0
+        reward = float(rollout["next", "arms", "reward"][:, :, 0].double().sum()) / hours
+        return Iteration(self.done, self.env_steps, hours, reward, count, entropy, clipped, value_loss)
 
     def _step(self, choices: TensorDictBase, vectors: Tensor, target: Tensor) -> tuple[float, float, float]:
         """One step of the optimiser; entropy, clipped share and value loss."""
@@ -222,8 +280,9 @@ class Trainer:
         next_values = torch.cat([values[:, 1:], self.critic(self.layout, next_seen[:, -1:])], dim=1)  # ignored at ends
         done = rollout["next", "done"].expand(*values.shape)
         reward = rollout["next", "arms", "reward"][..., 0] * self.config.reward_scale
-        return vec_generalized_advantage_estimate(
-            self.config.gamma, self.config.lmbda, values, next_values, reward, done, done
+        elapsed_s = rollout["next", "arms", "elapsed_s"][..., 0]
+        return advantages(
+            elapsed_s, reward, values, next_values, done, discount_s=self.config.discount_s, trace_s=self.config.trace_s
         )
 
     def act(self, vectors: np.ndarray, mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:

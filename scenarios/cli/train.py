@@ -26,7 +26,13 @@ def train_command(
     warm_start: Annotated[
         str, typer.Option(help="Rule that the network imitates first, for example wspt; default: none.")
     ] = "",
-    envs: Annotated[int, number("Shifts simulated in parallel.", 1, 65_536)] = 64,
+    envs: Annotated[int, number("Shifts simulated in parallel.", 1, 65_536)] = 32,
+    decisions: Annotated[
+        str, typer.Option(help="Length of a training step: events (until an arm has a choice) or interval.")
+    ] = "events",
+    discount_hours: Annotated[
+        float, number("Horizon of the discount: a reward this much later counts 1/e.", 0.01, 1000)
+    ] = 2.0,
     seed: Annotated[int, number("Seed for shifts, initialisation and minibatches.", 0, MAX_SEED)] = 0,
     out: Annotated[Path | None, typer.Option(help="Folder of the policy; default: runs/SCENARIO-ALGO-SEED.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the training in --out.")] = False,
@@ -43,13 +49,21 @@ def train_command(
     where = out or Path("runs") / f"{chosen.name}-{algo}-{seed}"
     require_extra("learn")
     from agents.learned.ppo import Algorithm, PpoConfig, use_threads
+    from fleet.env.validation import Decisions
     from scenarios.prepare.fleet import DifficultyName
     from scenarios.run.train_policy import CURVE, TrainingPlan, train
 
     use_threads(threads)
     algorithm = choose("algorithm", algo, Algorithm)
     try:
-        config = PpoConfig(algorithm=algorithm, envs=envs, seed=seed, warm_start=warm_start)
+        config = PpoConfig(
+            algorithm=algorithm,
+            envs=envs,
+            decisions=choose("kind of step", decisions, Decisions),
+            discount_s=3600.0 * discount_hours,
+            seed=seed,
+            warm_start=warm_start,
+        )
     except ValueError as error:
         raise FleetError(str(error)) from error
     plan = TrainingPlan(minutes=minutes, iterations=iterations)

@@ -99,8 +99,10 @@ def train(
     library = library_of([fleet])
 
     def make_env(envs: int, seed: int) -> TorchRLEnv:
-        return TorchRLEnv(BatchEnv(library, envs, seed=seed, weights=scenario.reward, autoreset=False, stagger=True))
+        options = {"weights": scenario.reward, "decisions": config.decisions, "stagger": True}
+        return TorchRLEnv(BatchEnv(library, envs, seed=seed, autoreset=False, **options))
 
+    # In intervals, as in `run` and in a live fleet, where an arm above its limit is asked more often than in training.
     judge = BatchEnv(library, plan.validation_envs, weights=scenario.reward)
     trainer = Trainer(make_env, judge.layout, config)
     best = -np.inf
@@ -110,7 +112,9 @@ def train(
             raise FleetError(f"The training in '{out}' has {trainer.done} iterations: --iterations must be more.")
     elif config.warm_start:
         rng = np.random.default_rng(np.random.SeedSequence([config.seed, 4]))
-        teacher = BatchEnv(library, 16, seed=int(rng.integers(2**31)), weights=scenario.reward, stagger=True)
+        teacher = BatchEnv(
+            library, 16, seed=int(rng.integers(2**31)), weights=scenario.reward, stagger=True, decisions="events"
+        )
         imitate(trainer.actor, judge.layout, _demonstrations(teacher, config.warm_start, progress), rng)
     out.mkdir(parents=True, exist_ok=True)
     (out / "training.json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
@@ -154,7 +158,7 @@ def train(
 
 DEMONSTRATIONS = 60
 """Batches of a rule's decisions for a warm start."""
-STEPS = 128
+STEPS = 16
 """Steps of every env in a batch."""
 
 

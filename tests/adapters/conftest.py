@@ -15,6 +15,7 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
 from fleet.env.allocation_v1 import parallel_env
+from fleet.env.validation import Decisions
 from fleet.env.vector import BatchEnv
 
 PAGE = Path(__file__).parents[2] / "docs" / "trainers.md"
@@ -187,11 +188,12 @@ def small_batch(small) -> Callable[..., BatchEnv]:
     """Makes batches of the same shifts, as `make_batch` does: scenario (any), number of envs, seed."""
 
     def make(
-        scenario: str = "", num_envs: int = 4, seed: int | None = None, *, autoreset: bool = True, **shift: Any
-    ) -> BatchEnv:
+        scenario: str = "", num_envs: int = 4, seed: int | None = None, *,
+        autoreset: bool = True, decisions: Decisions = "interval", **shift: Any,
+    ) -> BatchEnv:  # fmt: skip
         known = {key: value for key, value in shift.items() if key not in ("difficulty", "horizon_s")}
         shifts = small.Shifts(**({"arms": 3, "jobs": 8, "ticks": 15} | known))
-        return BatchEnv(shifts.library(), num_envs, seed=seed, autoreset=autoreset)
+        return BatchEnv(shifts.library(), num_envs, seed=seed, autoreset=autoreset, decisions=decisions)
 
     return make
 

@@ -79,7 +79,7 @@ def test_an_action_of_another_shape_says_what_is_wanted(alone, action) -> None:
 def test_wrappers_of_gymnasium_take_it(alone) -> None:
     env = FlattenObservation(alone())
     seen, _ = env.reset(seed=0)
-    assert seen.shape == env.observation_space.shape == (ARMS * (92 + SLOTS + 1),)
+    assert seen.shape == env.observation_space.shape == (ARMS * (158 + 2 * SLOTS + 2),)
 
 
 @pytest.mark.parametrize("shift", [{}, BRIEF], ids=["cut", "finished"])

@@ -12,7 +12,7 @@ from fleet.engine.reward import TERMS
 from fleet.env.adapters.torchrl import TorchRLEnv
 from fleet.env.vector import BatchEnv
 
-ARMS, SLOTS, TICKS = 3, 4, 15
+ARMS, TICKS = 3, 15
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +94,10 @@ def test_infos_are_those_of_the_batch(make) -> None:
         told, team = frames["next", "arms", "info"][:, at], frames["next", "info"][:, at]
         for name in ("faults", "illegal", "peak_c", "above_warning_s"):
             np.testing.assert_array_equal(told[name][..., 0], np.float32(info[name]))
-        np.testing.assert_array_equal(team["jobs_done"][:, 0], info["jobs_done"])
+        for name in ("jobs_done", "elapsed_s"):
+            np.testing.assert_array_equal(team[name][:, 0], info[name])
+        each = np.repeat(info["elapsed_s"][:, None], ARMS, axis=1)
+        np.testing.assert_array_equal(frames["next", "arms", "elapsed_s"][:, at, :, 0], each)
     terms = sum(frames["next", "info", f"reward_{term}"] for term in TERMS)
     np.testing.assert_allclose(terms, frames["next", "arms", "reward"][:, :, 0], rtol=1e-5, atol=1e-5)
     assert frames["next", "info", "jobs_done"].max() > 0
@@ -113,7 +116,9 @@ def test_what_is_sent_against_the_mask_waits_and_is_counted(make) -> None:
     env = make(2, infos=True)
     seen = env.reset()
     seen["arms", "action_mask"][..., 1:] = True
-    seen["arms", "action"] = torch.full((2, ARMS), SLOTS)  # no slot but the first two can hold a job so early
+    seen["arms", "action"] = torch.full(
+        (2, ARMS), env.layout.actions - 2
+    )  # only the first two slots can hold a job so early
     assert (env.step(seen)["next", "arms", "info", "illegal"] == 1).all()
 
 
@@ -258,6 +263,19 @@ def test_it_closes_once(make) -> None:
     assert env.is_closed
 
 
-def test_the_example_of_the_page_runs(example) -> None:
-    frames = example("TorchRL")["frames"]
+def test_the_example_of_the_page_discounts_by_elapsed_time(example) -> None:
+    """The second way: the advantages by hand, from the last step to the first."""
+    told = example("TorchRL")
+    frames, each = told["frames"], told["frames"]["next", "arms"]
     assert frames["arms", "action_mask"].gather(-1, frames["arms", "action"][..., None]).all()
+    assert len(each["elapsed_s"].unique()) > 3
+    gamma = torch.exp(-each["elapsed_s"].double() / 7200)
+    critic = told["critic"]
+    value, after = (critic(part.clone())["arms", "state_value"].detach() for part in (frames, frames["next"]))
+    terminated, done = (frames["next", end][..., None].double() for end in ("terminated", "done"))
+    advantage = torch.zeros(16, ARMS, 1, dtype=torch.float64)
+    for at in reversed(range(frames.shape[1])):
+        now = (slice(None), at)
+        td = each["reward"][now] + gamma[now] * (1 - terminated[now]) * after[now] - value[now]
+        advantage = td + 0.95 * gamma[now] * (1 - done[now]) * advantage
+        torch.testing.assert_close(frames["advantage"][now].double(), advantage, rtol=1e-3, atol=1e-2)

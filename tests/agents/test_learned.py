@@ -2,17 +2,18 @@
 
 import json
 from itertools import islice
+from math import exp
 
 import numpy as np
 import pytest
 import torch
+from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
 from agents.learned.features import sets_of
 from agents.learned.imitation import imitate
 from agents.learned.network import Actor, Critic, NetworkSize, masked
 from agents.learned.policy import CARD, WEIGHTS, LearnedPolicy, draw, load_policy, save_policy
-from agents.learned.ppo import PpoConfig, Trainer
-from agents.policy import only_choices
+from agents.learned.ppo import Chooser, PpoConfig, Trainer, advantages
 from fleet.engine.batch import Shift, shifts_of
 from fleet.engine.tables import tables_of
 from fleet.env.adapters.torchrl import TorchRLEnv
@@ -63,9 +64,9 @@ def test_logits_move_with_the_slots_and_do_not_know_the_order_of_peers(arms, slo
     slot_order, peer_order = rng.permutation(slots), rng.permutation(arms - 1)
     other = reordered(layout, vectors, slot_order, peer_order)
     one, two = (actor(layout, torch.from_numpy(v).double()) for v in (vectors, other))
-    torch.testing.assert_close(two[:, 0], one[:, 0])
-    torch.testing.assert_close(two[:, 1:], one[:, 1:][:, slot_order.copy()])
-    assert slots == 1 or one[:, 1:].std() > 0
+    torch.testing.assert_close(two[:, [0, -1]], one[:, [0, -1]])
+    torch.testing.assert_close(two[:, 1:-1], one[:, 1:-1][:, slot_order.copy()])
+    assert slots == 1 or one[:, 1:-1].std() > 0
     fleet = torch.from_numpy(vectors).double()[None]
     torch.testing.assert_close(critic(layout, fleet.flip(1)), critic(layout, fleet).flip(1))
 
@@ -114,19 +115,52 @@ def trainer(small, **changes) -> Trainer:
     library = unequal(small)
 
     def make_env(envs: int, seed: int) -> TorchRLEnv:
-        return TorchRLEnv(BatchEnv(library, envs, seed=seed, autoreset=False))
+        return TorchRLEnv(BatchEnv(library, envs, seed=seed, autoreset=False, decisions=config.decisions))
 
-    return Trainer(make_env, Layout(2, 4), PpoConfig(**{"envs": 8, "steps": 30, "minibatch": 128, **changes}))
+    config = PpoConfig(**{"envs": 8, "steps": 30, "minibatch": 128, **changes})
+    return Trainer(make_env, Layout(2, 4, plans=library.tables.plan.shape[3]), config)
+
+
+def test_advantages_of_unequal_steps_in_closed_form() -> None:
+    """Three steps of 60, 3600 and 10 s; the second one ends an episode, the rollout is cut after the third."""
+    elapsed_s = torch.tensor([60.0, 3600.0, 10.0], dtype=torch.float64)
+    reward, value, after = (
+        torch.tensor(v, dtype=torch.float64) for v in ([1.0, -2.0, 4.0], [3.0, 5.0, 7.0], [5.0, 9.0, 2.0])
+    )
+    done = torch.tensor([False, True, False])
+    steps = [each[None, :, None] for each in (elapsed_s, reward, value, after, done)]
+    advantage, target = (a[0, :, 0].tolist() for a in advantages(*steps, discount_s=7200.0, trace_s=600.0))
+    last = 4.0 + exp(-10 / 7200) * 2.0 - 7.0
+    second = -2.0 - 5.0  # no value after the end
+    first = 1.0 + exp(-60 / 7200) * 5.0 - 3.0 + exp(-60 / 7200 - 60 / 600) * second
+    assert advantage == pytest.approx([first, second, last], rel=1e-12)
+    assert target == pytest.approx([first + 3.0, second + 5.0, last + 7.0], rel=1e-12)
+
+
+def test_advantages_of_equal_steps_are_those_of_constant_discounts() -> None:
+    torch.manual_seed(1)
+    shape = (5, 40, 3)
+    reward, value, after = (torch.randn(shape, dtype=torch.float64) for _ in range(3))
+    done = (torch.rand(shape[:2]) < 0.1)[..., None].expand(shape)
+    own = advantages(
+        torch.full(shape, 10.0, dtype=torch.float64), reward, value, after, done, discount_s=1000.0, trace_s=500.0
+    )
+    plain = vec_generalized_advantage_estimate(exp(-0.01), exp(-0.02), value, after, reward, done, done)
+    torch.testing.assert_close(own, plain)
 
 
 def weights(of: Trainer) -> dict[str, torch.Tensor]:
     return {name: value.clone() for name, value in of.actor.state_dict().items()}
 
 
+@pytest.mark.parametrize("decisions", ["interval", "events"])
 @pytest.mark.parametrize("algorithm", ["mappo", "ippo"])
-def test_it_learns_what_is_worth_more(small, algorithm) -> None:
-    learner = trainer(small, algorithm=algorithm, learning_rate=3e-3)
-    rewards = [told.reward for told in islice(learner.iterate(), 25)]
+def test_it_learns_what_is_worth_more(small, algorithm, decisions) -> None:
+    learner = trainer(small, algorithm=algorithm, decisions=decisions, learning_rate=3e-3)
+    told = list(islice(learner.iterate(), 25))
+    rewards = [each.reward for each in told]
+    if decisions == "interval":
+        assert {each.hours for each in told} == {8 * 30 * 10 / 3600}
     assert np.mean(rewards[-3:]) > 1.1 * np.mean(rewards[:3])
 
 
@@ -150,26 +184,43 @@ def test_a_training_goes_on_where_it_was(small, tmp_path) -> None:
     assert next(later.iterate()).number == 3
 
 
+def observations(layout: Layout, headroom_k: list[float], masks: list[list[int]]) -> dict[str, Observation]:
+    vectors = random_observation(layout, np.random.default_rng(1), len(masks))
+    layout.read(vectors, vectors[:, :0]).headroom_k[:] = headroom_k
+    return {f"arm_{a}": layout.read(vectors[a], np.array(mask, np.int8)) for a, mask in enumerate(masks)}
+
+
 def test_a_policy_is_kept_whole(tmp_path) -> None:
     torch.manual_seed(3)
     size, layout = NetworkSize(arm=8, option=8, pair=4), Layout(3, 5)
     actor = Actor(size)
     save_policy(actor, size, tmp_path / "p", scenario="x")
-    vectors = random_observation(layout, np.random.default_rng(1), 3)
-    mask = np.ones((3, 6), np.int8)
-    mask[1, 1:] = 0
-    seen = {f"arm_{a}": layout.read(vectors[a], mask[a]) for a in range(3)}
+    seen = observations(layout, [9.0] * 3, [[1] * 6 + [0], [1] + [0] * 6, [1] * 6 + [0]])
     kept, fresh = load_policy(tmp_path / "p"), LearnedPolicy(actor)
     for policy in (kept, fresh):
         policy.reset(np.random.default_rng(0))
     assert [kept.act(seen) for _ in range(20)] == [fresh.act(seen) for _ in range(20)]
     assert kept.act(seen)["arm_1"] == 0
-    assert only_choices(kept)
     before = kept._rng.bit_generator.state
     assert kept.act({"arm_1": seen["arm_1"]}) == {"arm_1": 0}
     assert kept._rng.bit_generator.state == before
     assert json.loads((tmp_path / "p" / CARD).read_text())["scenario"] == "x"
     assert len({path.stat().st_mode for path in (tmp_path / "p").iterdir()}) == 1  # who may read one may read all
+
+
+def test_an_arm_gives_a_job_back_only_above_its_warning_limit() -> None:
+    torch.manual_seed(0)
+    actor, layout, back = Actor(), Layout(3, 2), 3
+    actor.other[-1].load_state_dict(
+        {"weight": torch.zeros(2, NetworkSize().option), "bias": torch.tensor([0.0, 50.0])}  # prefers to give back
+    )
+    at_work = [1, 0, 0, 1]
+    seen = observations(layout, [-0.1, 0.1, -0.1], [at_work, at_work, [1, 0, 0, 0]])
+    assert LearnedPolicy(actor).act(seen) == {"arm_0": back, "arm_1": 0, "arm_2": 0}
+    vectors = np.stack([layout.pack(each) for each in seen.values()])
+    mask = torch.from_numpy(np.stack([each.action_mask for each in seen.values()]))
+    chance = torch.softmax(masked(Chooser(actor, layout)(torch.from_numpy(vectors), mask), mask), dim=-1)
+    np.testing.assert_allclose(chance[:, back].detach(), [1.0, 0.0, 0.0], atol=1e-6)
 
 
 def test_what_is_no_policy_is_said(tmp_path) -> None:
@@ -183,7 +234,7 @@ def test_what_is_no_policy_is_said(tmp_path) -> None:
     save_policy(Actor(), size, tmp_path)
     with pytest.raises(CheckpointError, match="size mismatch"):
         load_policy(tmp_path)
-    for text, reason in (("{", "not the card"), ('{"format": 9, "size": {}}', "format 9 is not 3"), ("[]", "not the")):
+    for text, reason in (("{", "not the card"), ('{"format": 9, "size": {}}', "format 9 is not 4"), ("[]", "not the")):
         (tmp_path / CARD).write_text(text)
         with pytest.raises(CheckpointError, match=reason):
             load_policy(tmp_path)
@@ -195,7 +246,9 @@ def test_what_is_no_policy_is_said(tmp_path) -> None:
         ({"algorithm": "dqn"}, "algorithm must be one of mappo, ippo"),
         ({"envs": 0}, "envs must be >= 1"),
         ({"learning_rate": 0.0}, "learning_rate must be > 0"),
-        ({"gamma": 1.5}, r"gamma must be in \(0, 1\]"),
+        ({"discount_s": 0.5}, r"discount_s must be 1 to 1e\+07 \(got 0\.5\)"),
+        ({"trace_s": float("nan")}, "trace_s must be 1 to"),
+        ({"decisions": "event"}, "decisions must be one of 'interval', 'events'"),
     ],
 )
 def test_a_wrong_configuration_is_refused(changes, message) -> None:
@@ -208,7 +261,8 @@ def test_a_warm_start_learns_the_rule_it_is_shown() -> None:
 
     def shown(rows: int):
         vectors = random_observation(layout, rng, rows)
-        mask = np.ones((rows, 5), np.int8)
+        mask = np.ones((rows, 6), np.int8)
+        mask[:, -1] = 0
         mask[::7, 1:] = 0  # no choice: not to be learned from
         payload = layout.read(vectors, mask).payload_kg
         return vectors, mask, np.where(mask[:, 1], payload.argmax(axis=-1) + 1, 0)

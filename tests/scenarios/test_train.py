@@ -51,8 +51,8 @@ def test_a_training_leaves_a_policy_its_log_and_its_curves(tmp_path, cache) -> N
     done, _ = trained(out, cache, iterations=3, resume=True)
     assert done.iterations == 3
     assert done.best >= max(judged)
-    with pytest.raises(FleetError, match=r"has gamma = 0\.99 \(got 0\.9\)"):
-        trained(out, cache, iterations=4, resume=True, gamma=0.9)
+    with pytest.raises(FleetError, match=r"has discount_s = 7200\.0 \(got 3600\.0\)"):
+        trained(out, cache, iterations=4, resume=True, discount_s=3600.0)
     (out / STATE).write_bytes(b"rubbish")
     with pytest.raises(FleetError, match="the training cannot be resumed"):
         trained(out, cache, iterations=4, resume=True)
@@ -68,6 +68,8 @@ def test_what_cannot_be_is_refused(tmp_path, capsys) -> None:
         (["--minutes", "0"], "minutes must be > 0"),
         (["--envs", "0"], "--envs must be 1 to 65536 (got 0)."),
         (["--threads", "0"], "--threads must be 1 to 1024 (got 0)."),
+        (["--decisions", "event"], "No kind of step 'event'; did you mean 'events'? Allowed: events, interval."),
+        (["--discount-hours", "0"], "--discount-hours must be 0.01 to 1000 (got 0)."),
         (["--resume"], "holds no training to resume"),
     ):
         with pytest.raises(SystemExit) as stop:

@@ -15,7 +15,7 @@ ByArm = dict[str, Any]
 Infos = dict[str, Any]
 
 ARM_INFOS = ("faults", "illegal", "peak_c", "above_warning_s")
-TEAM_INFOS = ("jobs_done", *(f"reward_{term}" for term in TERMS))
+TEAM_INFOS = ("jobs_done", "elapsed_s", *(f"reward_{term}" for term in TERMS))
 """Infos of `BatchEnv.step` that are numbers, per arm and per team."""
 
 

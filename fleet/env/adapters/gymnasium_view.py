@@ -2,7 +2,7 @@
 
 Example, installation and tested versions: docs/trainers.md.
 
-Observations are Dict {"observation": float32 [arm, size], "action_mask": int8 [arm, slot + 1]}, actions are
+Observations are Dict {"observation": float32 [arm, size], "action_mask": int8 [arm, action]}, actions are
 MultiDiscrete [arm], the reward is the team's.
 
 Traps:
@@ -34,7 +34,7 @@ Observation = dict[str, Array]
 class DispatcherEnv(gymnasium.Env[Observation, Array]):
     """A `ParallelEnv` with Dict observations as a Gymnasium `Env` with one agent for all arms.
 
-    Infos are `action_mask`, a tuple of int8 [slot + 1] for each arm, and each number of the arms' infos, as float64
+    Infos are `action_mask`, a tuple of int8 [action] for each arm, and each number of the arms' infos, as float64
     [arm].
     """
 
@@ -56,7 +56,7 @@ class DispatcherEnv(gymnasium.Env[Observation, Array]):
         return self._stacked(*self.env.reset(seed=seed, options=options))
 
     def step(self, action: Array) -> tuple[Observation, float, bool, bool, Infos]:
-        """One decision for all arms, int [arm]: 0 waits or continues, k claims slot k. Returns the team's reward."""
+        """One decision for all arms, int [arm], with the actions of `AllocationEnv`. Returns the team's reward."""
         values = np.asarray(action)
         if values.shape != (len(self.arms),):
             raise ValueError(f"action must be one integer for each of {len(self.arms)} arms (got {action!r}).")
@@ -66,7 +66,7 @@ class DispatcherEnv(gymnasium.Env[Observation, Array]):
         return observation, float(rewards[arm]), terminated[arm], truncated[arm], info
 
     def action_masks(self) -> Array:
-        """The masks of all arms one after the other, bool [arm * (slot + 1)], as sb3-contrib reads them."""
+        """The masks of all arms one after the other, bool [arm * action], as sb3-contrib reads them."""
         return self._mask.reshape(-1) == 1
 
     def render(self) -> Any:  # as Gymnasium has it

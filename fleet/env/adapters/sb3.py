@@ -95,7 +95,7 @@ class ArmsVecEnv(VecEnv):
         return self._rows(obs), np.repeat(reward.astype(np.float32), self.arms), done, infos
 
     def action_masks(self) -> Array:
-        """Legal actions now, bool [row, slot + 1]."""
+        """Legal actions now, bool [row, action]."""
         return self._mask
 
     def close(self) -> None:

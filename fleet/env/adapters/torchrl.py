@@ -5,9 +5,10 @@ Example, installation and tested versions: docs/trainers.md.
 | key | value |
 |---|---|
 | ("arms", "observation") | float32 [env, arm, size], raw units: scale by `layout.bounds` or in the network |
-| ("arms", "action_mask") | bool [env, arm, slot + 1] |
+| ("arms", "action_mask") | bool [env, arm, action] |
 | ("arms", "action") | int64 [env, arm] |
-| ("arms", "reward") | float32 [env, arm, 1], the team's reward for every arm |
+| ("arms", "reward") | float32 [env, arm, 1], the team's reward of the whole step for every arm |
+| ("arms", "elapsed_s") | float32 [env, arm, 1], length of the step that led here, 0 after a reset |
 | "done", "terminated", "truncated" | bool [env, 1] |
 | "state" | float32 [env, arm * size], with `state=True`, for central critics |
 | ("arms", "info", …), ("info", …) | float32 [env, arm, 1] and [env, 1], with `infos=True`, see `BatchEnv.step` |
@@ -18,6 +19,8 @@ Traps:
   follow from it. Random actions are drawn by torch: call `torch.manual_seed` too, or nothing repeats.
 - The action spec has the current mask, so `env.rand_action` is always legal; a policy must read the key.
 - An illegal action is a wait, counted in ("arms", "info", "illegal"), never an error.
+- With `decisions="events"` steps differ in length. Value estimators raise gamma to the power of the entry that
+  `set_keys(steps_to_next_obs=("next", "arms", "elapsed_s"))` names: make gamma the discount of one second.
 - Use one thread (`OMP_NUM_THREADS=1`): the arrays are too small for more threads to help.
 - `rollout` stacks its frames into new tensors. `fleet.env.buffers.keep_pages()`, called once, keeps the system from
   clearing their memory for every rollout, which gives half as many steps per second again.
@@ -70,6 +73,7 @@ class TorchRLEnv(EnvBase):
         seen = Composite(
             observation=Bounded(low, high, dtype=torch.float32),
             action_mask=Binary(actions, shape=Size((envs, arms, actions)), dtype=torch.bool),
+            elapsed_s=Unbounded(Size((envs, arms, 1))),
             shape=(envs, arms),
         )
         observed: dict[str, Any] = {GROUP: seen}
@@ -151,7 +155,10 @@ class TorchRLEnv(EnvBase):
         mask = torch.from_numpy(obs["action_mask"]).view(torch.bool)
         self._action.update_mask(mask)
         self._mask = mask
-        group = {"observation": vectors, "action_mask": mask}
+        elapsed_s = np.repeat(info["elapsed_s"].astype(np.float32), arms).reshape(envs, arms, 1)
+        group: dict[str, Any] = {
+            "observation": vectors, "action_mask": mask, "elapsed_s": torch.from_numpy(elapsed_s)
+        }  # fmt: skip
         source: dict[str, Any] = dict(ends)
         if self._infos:
             group["info"] = _leaves(info, ARM_INFOS, (envs, arms))
