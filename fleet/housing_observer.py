@@ -1,8 +1,9 @@
 """An observer of the housing temperatures, which have no sensor, from the measured motor temperatures.
 
-The housings' part of the thermal network is driven by the measured windings, the ambient and the friction of the motion:
-C_h Th' = −L_hh Th + G_wh Tw + g Ta + P_h, stepped exactly for constant inputs. It is a reduced-order observer (Luenberger,
-IEEE Trans. Automatic Control 16, 1971) without correction: an initial error decays with the housings' time constants.
+The housings' part of the thermal network is driven by the measured windings, the ambient and the friction of the
+motion: C_h Th' = −L_hh Th + G_wh Tw + g Ta + P_h, stepped exactly for constant inputs. It is a reduced-order observer
+(Luenberger, IEEE Trans. Automatic Control 16, 1971) without correction: an initial error decays with the housings' time
+constants.
 """
 
 from typing import NamedTuple

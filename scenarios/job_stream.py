@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from scenarios.arrivals import ArrivalTable, arrival_table, sample_arrivals, scale_rate
+from fleet.arrivals import ArrivalTable, arrival_table, sample_arrivals, scale_rate
 from fleet.jit import kernel
 from fleet.job import Job, Work
 from fleet.seeding import random_uniform, random_word
@@ -162,6 +162,7 @@ class JobSampler:
                 due_s=release_s[j] + streams[i].due_s,
                 value=streams[i].value,
                 after=tuple(names[k] for k in after if k >= 0),
+                expires=streams[i].due == "hard",
             )
             for j, (i, after) in enumerate(zip(stream, sampled.after.tolist(), strict=True))
         )

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from scenarios.arrivals import Arrivals, Batch, Poisson, Trace, arrival_table, sample_arrivals, scale_rate
+from fleet.arrivals import Arrivals, Batch, Poisson, Trace, arrival_table, sample_arrivals, scale_rate
 from fleet.jit import kernel
 from fleet.seeding import key_of
 
