@@ -1,4 +1,4 @@
-"""Give a scenario's twins a predicted peak and a probability of saturation, fitted on simulated past jobs of their arms.
+"""Give a scenario's twins a predicted peak and a probability of saturation, from simulated past jobs of their arms.
 
 An arm that has worked for weeks has such jobs in its records. Here they are simulated: the arm's own work and random
 work with heavy payloads, in every ambient temperature of its hall, from cold, idle and hot starts.
@@ -77,9 +77,8 @@ def calibrate_twins(
     heats = [replace(heat, warning_c=scenario.limits.warning_c) for heat in heats]
     inputs = list(zip(arms, twins, heats, strict=True))
     if risk in ("rc", "rc-nominal"):
-        curves = load_or_make(
-            [_curve(scenario, a, heat, folder, jobs) for a, _, heat in inputs], "calibrating", progress
-        )
+        makers = [_curve(scenario, arm, heat, folder, jobs) for arm, _, heat in inputs]
+        curves = load_or_make(makers, "calibrating", progress)
         return [CalibratedTwin(t, replace(heat, curve=c)) for (_, t, heat), c in zip(inputs, curves, strict=True)]
     models = [_saturation(scenario, a, t, heat, risk, folder, jobs) for a, t, heat in inputs]
     fitted = load_or_make(models, "calibrating", progress)

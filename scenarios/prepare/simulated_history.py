@@ -50,7 +50,7 @@ class PastJobs:
     start_c: Array
     """True temperatures at the start, [job, node]; hidden from the arm."""
     known_c: Array
-    """Measured motor temperatures, estimated housing temperatures and ambient temperature at the start, [job, KNOWN]."""
+    """Measured motors, estimated housings and ambient temperature at the start, [job, KNOWN]."""
     peak_c: Array
     """Hottest winding temperature during the job, counted as in `fleet.difficulty.SETTLING_S`, [job, joint]."""
     warning_c: float
@@ -201,7 +201,8 @@ class _Simulator:
             if name == "cycle":
                 duration_s = duration_s * repetitions
             load, friction_w = drives(profiles, self.hardware.motors), drives(profiles, self.known_motors).friction_w
-            for time_s, arms in self._course(load, friction_w, duration_s, arms, ambient):
+            for time_s, warmer in self._course(load, friction_w, duration_s, arms, ambient):
+                arms = warmer
                 yield begun_s + time_s, arms
             begun_s = begun_s + duration_s
 
