@@ -68,12 +68,11 @@ def calibrate_twins(
     Args:
         arms: With their plans for all motion of the scenario, light loads included.
     """
-    spec, cooling = scenario.twin, [arm.hardware.robot.cooling for arm in arms]
-    names = [arm.hardware.robot.name for arm in arms]
+    robots, ambient_c = [arm.hardware.robot for arm in arms], scenario.twin.ambient_c
     if risk == "rc":
         heats = [RcTwin.of(found) for found in identify_arms(scenario, arms, folder, progress)]
     else:
-        heats = [RcTwin.nominal(n, ambient_c=spec.ambient_c, cooling=c) for n, c in zip(names, cooling, strict=True)]
+        heats = [RcTwin.nominal(robot.name, ambient_c=ambient_c, cooling=robot.cooling) for robot in robots]
     heats = [replace(heat, warning_c=scenario.limits.warning_c) for heat in heats]
     inputs = list(zip(arms, twins, heats, strict=True))
     if risk in ("rc", "rc-nominal"):
