@@ -29,6 +29,11 @@ class Seer:
         return Features(np.repeat(heat[..., None], PARTS, axis=-1))
 
 
+def calibrate(scenario, hardware, twin, folder: Path, *, risk="excess", jobs=60, index=0):
+    arms = [PlannedArm(index, hardware, {})]
+    return calibrate_twins(scenario, arms, [twin], folder, quiet, risk=risk, jobs=jobs)
+
+
 @pytest.fixture(scope="module")
 def scenario():
     return load("quickstart")
@@ -70,7 +75,7 @@ def test_a_calibrated_twin_is_kept_for_the_same_arm_only(scenario, tmp_path: Pat
     assert again[0].saturation == first[0].saturation
     assert (home / "saturation.json").stat().st_mtime_ns == stamp
     other = hardware_of(scenario, 1)
-    calibrate_twins(scenario, [PlannedArm(0, other, {})], [Seer(other.motors)], tmp_path, quiet, risk="excess", jobs=60)
+    calibrate(scenario, other, Seer(other.motors), tmp_path, jobs=60)
     assert len(list((tmp_path / "saturation").iterdir())) == 2
     (home / "saturation.json").write_text("{")
     mended = calibrate_twins(
@@ -83,7 +88,7 @@ def test_a_calibrated_twin_is_kept_for_the_same_arm_only(scenario, tmp_path: Pat
 def test_an_arm_that_nothing_heats_keeps_its_twin_and_says_why(scenario, tmp_path: Path, caplog) -> None:
     hardware, twin = hardware_of(scenario, 0), Seer(hardware_of(scenario, 0).motors)
     lax = replace(scenario, limits=ThermalLimits(warning_c=500.0, error_c=600.0))
-    (kept,) = calibrate_twins(lax, [PlannedArm(0, hardware, {})], [twin], tmp_path, quiet, risk="excess", jobs=40)
+    (kept,) = calibrate(lax, hardware, twin, tmp_path, jobs=40)
     assert kept.twin is twin
     assert kept.saturation is None
     assert f"quickstart: arm '{hardware.robot.name}' gets no probability of saturation" in caplog.text
@@ -92,14 +97,14 @@ def test_an_arm_that_nothing_heats_keeps_its_twin_and_says_why(scenario, tmp_pat
 
 
 def test_a_curve_is_kept_for_the_same_arm_only(scenario, tmp_path: Path) -> None:
-    def calibrate(index: int):
+    def curve_of(index: int):
         hardware = hardware_of(scenario, index)
-        arms, seers = [PlannedArm(index, hardware, {})], [Seer(hardware.motors)]
-        return calibrate_twins(scenario, arms, seers, tmp_path, quiet, risk="rc-nominal", jobs=60)[0]
+        seer = Seer(hardware.motors)
+        return calibrate(scenario, hardware, seer, tmp_path, risk="rc-nominal", index=index)[0]
 
-    first = calibrate(0)
+    first = curve_of(0)
     assert first.saturation is None
     assert first.heat.curve is not None
-    assert calibrate(0).version == first.version
-    assert calibrate(1).version != first.version
+    assert curve_of(0).version == first.version
+    assert curve_of(1).version != first.version
     assert len(list((tmp_path / "saturation").iterdir())) == 2
