@@ -139,7 +139,7 @@ def test_past_jobs_last_from_three_to_forty_five_minutes_and_some_begin_hot(past
     assert hottest_c.max() < 80.0  # a fault ended the work before
     cycles = np.array([plan.duration_s(int(n)) for plan, n in zip(past.plans, past.repetitions, strict=True)])
     assert np.array_equal(past.duration_s, cycles)
-    assert 0.1 < past.passed.mean() < 0.5
+    assert 0.1 < past.passed.mean() < 0.65
     assert (past.known_c[:, -1] >= 19.0).all()
     assert (past.known_c[:, -1] <= 27.0).all()
 
