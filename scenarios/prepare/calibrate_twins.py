@@ -23,9 +23,9 @@ from scenarios.prepare.planned_arm import PlannedArm, air_offsets
 from scenarios.prepare.simulated_history import PastJobs, experience, past_jobs, repetitions_for
 from scenarios.progress import Progress
 from scenarios.schema import Scenario
-from twin.calibrated import CalibratedTwin
 from twin.saturation.fit import NotEnoughExperience, fit_saturation
 from twin.saturation.model import Evidence, SaturationModel, load_saturation, save_saturation
+from twin.thermal.calibrated import CalibratedTwin
 from twin.thermal.checkpoint import load_curve, save_curve
 from twin.thermal.parameters import HeatModel
 from twin.thermal.risk import PeakCurve

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from fleet.difficulty import KNOWN
 from fleet.errors import CheckpointError
-from twin.calibrated import CalibratedTwin
 from twin.saturation.model import (
     FILE,
     SaturationModel,
@@ -19,6 +18,7 @@ from twin.saturation.model import (
     load_saturation,
     save_saturation,
 )
+from twin.thermal.calibrated import CalibratedTwin
 from twin.thermal.risk import PeakCurve
 from twin.thermal.thermal_twin import RcTwin
 from twin.vae.measures import PARTS, Features
