@@ -14,11 +14,12 @@ from pathlib import Path
 import numpy as np
 from sklearn.metrics import roc_auc_score
 
+from fleet.robot import ThermalLimits
 from scenarios.prepare.simulated_history import PastJobs, experience, past_jobs
+from scenarios.prepare.simulated_logs import LOGS, identify_from_work
 from scenarios.progress import Progress, quiet
 from scenarios.studies.ranking import spread
 from scenarios.studies.setup import Bench, Study, make_study
-from scenarios.studies.simulated_logs import LOGS, identify_from_work
 from twin.saturation.alarm import ConformalAlarm
 from twin.saturation.fit import Experience, fit_saturation
 from twin.saturation.model import EVIDENCE, METHODS
@@ -102,7 +103,7 @@ def past_work(study: Study, *, seed: int, labelled: int = LABELLED, watched: int
         raise ValueError(f"Past work needs more than {labelled} + {watched} test jobs (got {natural}).")
     # In one call, so that novel motions too begin as warm as natural work before them leaves the arm.
     plans = (*study.test.plans, *study.novel.plans)
-    jobs = past_jobs(study.hardware, plans, np.random.default_rng([seed, 7]), warning_c=study.warning_c)
+    jobs = past_jobs(study.hardware, plans, np.random.default_rng([seed, 7]), limits=ThermalLimits())
     order = np.random.default_rng([seed, 8]).permutation(natural)
     fit, setting, rest = np.split(order, (labelled, labelled + watched))
     novel = np.arange(natural, len(jobs))
@@ -117,10 +118,10 @@ def judge_twin(work: PastWork, twin: Twin) -> tuple[list[Prediction], list[Alarm
     for evidence in EVIDENCE:
         for method in METHODS:
             model = fit_saturation(fit, evidence=evidence, method=method)
-            p = model.risk(rest.features, rest.duration_s).at(rest.temp_c)
+            p = model.risk(rest.features, rest.duration_s).at(rest.known_c)
             predictions.append(_judged(f"{evidence}, {method}", p, rest.passed))
         model = fit_saturation(fit, evidence=evidence)
-        scores[f"p_{evidence}"] = lambda e, m=model: m.score(e.features, e.duration_s, e.temp_c)
+        scores[f"p_{evidence}"] = lambda e, m=model: m.score(e.features, e.duration_s, e.known_c)
     scores |= {name: lambda e, n=name: score_of(e.features, n) for name in UNLABELLED}
     calm, critical, calm_novel = rest.part(~rest.passed), rest.part(rest.passed), novel.part(~novel.passed)
     alarms = []
@@ -132,24 +133,22 @@ def judge_twin(work: PastWork, twin: Twin) -> tuple[list[Prediction], list[Alarm
 
 
 def judge_networks(work: PastWork) -> tuple[Prediction, Prediction]:
-    """Prediction of the nominal thermal network, and of one identified from logs of some of the labelled jobs.
-
-    Both use the ambient temperature of the study; that of each job is unknown.
-    """
-    study, jobs = work.study, work.jobs
-    arm = identify_from_work(study, [jobs.plans[i] for i in work.fit[:LOGS]], np.random.default_rng([work.seed, 9]))
+    """Prediction of the nominal thermal network, and of one identified from logs of some of the labelled jobs."""
+    study, rng = work.study, np.random.default_rng([work.seed, 9])
+    logged = [work.jobs.plans[i] for i in work.fit[:LOGS]]
+    arm = identify_from_work(study.hardware, logged, rng, ambient_c=study.ambient_c)
     nominal = RcTwin.nominal(study.robot.name, ambient_c=study.ambient_c)
     return _network("rc nominal", nominal, work), _network("rc identified", RcTwin.of(arm), work)
 
 
 def _network(name: str, twin: RcTwin, work: PastWork) -> Prediction:
     jobs, fit, rest = work.jobs, work.fit, work.held_out
-    plans, times, temp_c = [jobs.plans[i] for i in fit], jobs.repetitions[fit].tolist(), jobs.measured_c[fit]
-    fitted = twin.with_past_jobs(plans, times, temp_c=temp_c, passed=jobs.passed[fit])
-    plans, times, temp_c = [jobs.plans[i] for i in rest], jobs.repetitions[rest].tolist(), jobs.measured_c[rest]
-    p = np.array([float(fitted.risk(*job).at(t)) for *job, t in zip(plans, times, temp_c, strict=True)])
-    peak_c = twin.peaks(plans, times, start_c=twin.likely_start(temp_c)).max(axis=1)
-    error_k = float(np.sqrt(np.mean((peak_c - jobs.peak_c[rest].max(axis=1)) ** 2)))
+    plans, times = [jobs.plans[i] for i in fit], jobs.repetitions[fit].tolist()
+    fitted = twin.with_past_jobs(plans, times, known_c=jobs.known_c[fit], peak_c=jobs.hottest_c[fit])
+    forecasts = [fitted.peak(jobs.plans[i], int(jobs.repetitions[i])) for i in rest]
+    p = np.array([float(each.at(known)) for each, known in zip(forecasts, jobs.known_c[rest], strict=True)])
+    peak_c = np.array([float(each.value(known)) for each, known in zip(forecasts, jobs.known_c[rest], strict=True)])
+    error_k = float(np.sqrt(np.mean((peak_c - jobs.hottest_c[rest]) ** 2)))
     return _judged(name, p, jobs.passed[rest], error_k)
 
 
