@@ -18,6 +18,7 @@ from fleet.env.adapters.torchrl import TorchRLEnv
 from fleet.env.vector import BatchEnv, Obs
 from fleet.errors import FleetError
 from fleet.files import atomic_path
+from scenarios.fault_price import weights_of
 from scenarios.policy_loader import policy_of
 from scenarios.prepare.fleet import DifficultyName, prepare
 from scenarios.progress import Progress, quiet
@@ -96,12 +97,12 @@ def train(
     }
     _check_folder(out, card, resume=resume)
     fleet = prepare(scenario, difficulty=difficulty, cache=cache, progress=progress)
-    library = library_of([fleet])
+    library, weights = library_of([fleet]), weights_of(scenario)
 
     def make_env(envs: int, seed: int) -> TorchRLEnv:
-        return TorchRLEnv(BatchEnv(library, envs, seed=seed, weights=scenario.reward, autoreset=False, stagger=True))
+        return TorchRLEnv(BatchEnv(library, envs, seed=seed, weights=weights, autoreset=False, stagger=True))
 
-    judge = BatchEnv(library, plan.validation_envs, weights=scenario.reward)
+    judge = BatchEnv(library, plan.validation_envs, weights=weights)
     trainer = Trainer(make_env, judge.layout, config)
     best = -np.inf
     if resume:
@@ -110,7 +111,7 @@ def train(
             raise FleetError(f"The training in '{out}' has {trainer.done} iterations: --iterations must be more.")
     elif config.warm_start:
         rng = np.random.default_rng(np.random.SeedSequence([config.seed, 4]))
-        teacher = BatchEnv(library, 16, seed=int(rng.integers(2**31)), weights=scenario.reward, stagger=True)
+        teacher = BatchEnv(library, 16, seed=int(rng.integers(2**31)), weights=weights, stagger=True)
         imitate(trainer.actor, judge.layout, _demonstrations(teacher, config.warm_start, progress), rng)
     out.mkdir(parents=True, exist_ok=True)
     (out / "training.json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
