@@ -9,41 +9,55 @@ An arm takes the space of its whole plan from the award until it is home again, 
 
 import numpy as np
 
-from fleet.engine.event_log import AWARD, ILLEGAL, LOST, record_event
-from fleet.engine.state import DONE, GIVEN_UP, RUNNING, WAITING, State
+from fleet.engine.event_log import AWARD, EXPIRE, ILLEGAL, LOST, EventBuffer, record_event
+from fleet.engine.state import DONE, EXPIRED, GIVEN_UP, RUNNING, WAITING, State
 from fleet.engine.tables import Jobs, OpenJobs, Simulation, Tables
 from fleet.jit import jit, jit_inline, nonnegative
 from fleet.telemetry import IDLE, WORKING
 
 Array = np.ndarray
 
+ROUNDING = 1e-9
+"""A cycle counts as begun when more than this share of it is over."""
 LARGEST = float(np.finfo(float).max)
 """Claims without a difficulty are ordered behind all others."""
 
 
 @jit_inline
-def update_offers(t: Tables, d: Jobs, s: State, o: OpenJobs, rows: Array) -> None:
-    """Fill the slots of some envs, oldest job in the queue first, and their action masks.
+def update_offers(t: Tables, d: Jobs, s: State, o: OpenJobs, events: EventBuffer, rows: Array) -> None:
+    """Fill the slots of some envs, oldest job in the queue first, and their action masks; late jobs expire.
 
     Args:
         rows: Envs, int [row].
     """
     fleets, kinds, count, release_s, after = d.fleet, d.kind, d.number, d.release_s, d.after
+    due_s, expires = d.due_s, d.expires
     tick, modes, status = s.tick, s.mode, s.status
     slot_job, mask, queue, head, current = o.slot_job, o.mask, o.queue, o.head, o.current_kind
     stations, plans, excluded, taken, options = t.stations, t.plan, t.excluded, o.taken, nonnegative(t.plan.shape[3])
     arms, slots = nonnegative(modes.shape[1]), nonnegative(slot_job.shape[1])
-    waits, words = nonnegative(after.shape[2]), nonnegative(stations.shape[2])
+    waits, words, last = nonnegative(after.shape[2]), nonnegative(stations.shape[2]), nonnegative(mask.shape[2] - 1)
     busy = np.empty(words, np.uint64)
     for row in rows:
         e = nonnegative(row)
-        fleet, now_s, filled = nonnegative(fleets[e]), tick[e] * t.dt_s, 0
+        fleet, now_s, filled, here = nonnegative(fleets[e]), tick[e] * t.dt_s, 0, taken[e]
         mark_busy_stations(fleet, e, current, stations, busy)
         mark_taken_space(t, s, o, e)
-        for place in range(nonnegative(head[e]), count[e]):
+        for a in range(arms):
+            mask[e, a, last] = modes[e, a] == WORKING and o.pending[e, a] and cycles_begun(t, s, e, a) < s.todo[e, a]
+        place = nonnegative(head[e])
+        while place < count[e]:
             j = nonnegative(queue[e, place])
+            place += 1
             if filled == slots or release_s[e, j] > now_s:
                 break
+            if expires[e, j] and due_s[e, j] < now_s:
+                remove_from_queue(queue, head, e, j)
+                give_up(d, s, o, e, j, EXPIRED)
+                if len(events.what) > 0:
+                    record_event(events, EXPIRE, e, -1, j, -1, 0.0, 0.0)
+                place, filled = nonnegative(head[e]), 0  # jobs in the queue have moved
+                continue
             ready = True
             for n in range(waits):
                 before = after[e, j, n]
@@ -60,7 +74,7 @@ def update_offers(t: Tables, d: Jobs, s: State, o: OpenJobs, rows: Array) -> Non
                 for n in range(options):
                     plan = plans[fleet, a, kind, n]
                     mask[e, a, 1 + filled * options + n] = (
-                        open_here and plan >= 0 and is_free(excluded, nonnegative(plan), taken[e])
+                        open_here and plan >= 0 and is_free(excluded, nonnegative(plan), here)
                     )
             filled += 1
         while filled < slots and slot_job[e, filled] >= 0:  # slots of the step before
@@ -94,6 +108,14 @@ def mark_taken_space(t: Tables, s: State, o: OpenJobs, e: int) -> None:
 
 
 @jit_inline
+def cycles_begun(t: Tables, s: State, e: int, a: int) -> int:
+    """Cycles of its plan that an arm at work has begun."""
+    plan = nonnegative(s.plan[e, a])
+    into_s = s.progress_s[e, a] - t.times_s[plan, 0]
+    return 0 if into_s <= 0.0 else min(int(np.ceil(into_s / t.times_s[plan, 1] - ROUNDING)), s.todo[e, a])
+
+
+@jit_inline
 def is_free(excluded: Array, plan: int, taken: Array) -> bool:
     """Whether a plan needs none of the space that is taken, uint64 [word]."""
     touched = np.uint64(0)
@@ -104,7 +126,7 @@ def is_free(excluded: Array, plan: int, taken: Array) -> bool:
 
 @jit_inline
 def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
-    """Award every claimed job to one arm; an action outside the mask is counted and waits.
+    """Award every claimed job to one arm, and note who gives a job back; an illegal action is counted and waits.
 
     Args:
         actions: int [env, arm].
@@ -122,19 +144,23 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
         nonnegative(plan_of.shape[3]),
         nonnegative(stations.shape[2]),
     )
+    give_back = mask.shape[2] - 1
     busy, key, order = np.empty(words, np.uint64), np.empty(arms), np.empty(arms, np.int64)
     for row in rows:
         e = nonnegative(row)
-        fleet, claims = nonnegative(fleets[e]), 0
+        fleet, claims, here = nonnegative(fleets[e]), 0, taken[e]
         for a in range(arms):
             action = actions[e, a]
             last[e, a] = 0
             if action == 0:
                 continue
-            if action < 0 or action >= mask.shape[2] or mask[e, a, action] == 0:
+            if action < 0 or action > give_back or mask[e, a, action] == 0:
                 illegal[e, a] += 1
                 if recording:
                     record_event(events, ILLEGAL, e, a, -1, -1, 0.0, 0.0)
+                continue
+            if action == give_back:
+                s.todo[e, a] = cycles_begun(t, s, e, a)
                 continue
             slot, option = divmod(action - 1, options)
             score = work[fleet, a, kinds[e, slot_job[e, slot]], option]["difficulty"]
@@ -155,7 +181,7 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
             j, option = nonnegative(slot_job[e, slot]), nonnegative(option)
             kind, free = nonnegative(kinds[e, j]), status[e, j] == WAITING
             plan = nonnegative(plan_of[fleet, a, kind, option])
-            free = free and is_free(excluded, plan, taken[e])
+            free = free and is_free(excluded, plan, here)
             for w in range(words):
                 free = free and (stations[fleet, kind, w] & busy[w]) == 0
             if not free:
@@ -168,8 +194,8 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
             remove_from_queue(queue, head, e, j)
             last[e, a], status[e, j] = 1, RUNNING
             modes[e, a], jobs[e, a], plans[e, a], progress_s[e, a] = WORKING, j, plan, 0.0
-            for w in range(taken.shape[1]):
-                taken[e, w] |= own[plan, w]
+            for w in range(len(here)):
+                here[w] |= own[plan, w]
             current[e, a], pending[e, a] = kind, True
             todo[e, a] = repetitions[e, j] - cycles[e, j]
             if recording:
@@ -208,10 +234,14 @@ def return_to_queue(d: Jobs, s: State, o: OpenJobs, e: int, j: int, until_s: flo
 
 
 @jit
-def give_up(d: Jobs, s: State, o: OpenJobs, e: int, j: int) -> None:
-    """Give a running job up, and with it all that wait for it."""
+def give_up(d: Jobs, s: State, o: OpenJobs, e: int, j: int, why: int) -> None:
+    """Give a job up that is not in the queue, and with it all that wait for it.
+
+    Args:
+        why: Its status from now on, GIVEN_UP or EXPIRED.
+    """
     status, after = s.status, d.after
-    status[e, j] = GIVEN_UP
+    status[e, j] = why
     o.unfinished[e] -= 1
     o.given_up[e] += 1
     found = after.shape[2] > 0
@@ -220,7 +250,7 @@ def give_up(d: Jobs, s: State, o: OpenJobs, e: int, j: int) -> None:
         for i in range(d.number[e]):
             for n in range(after.shape[2]):
                 before = after[e, i, n]
-                if status[e, i] == WAITING and before >= 0 and status[e, before] == GIVEN_UP:
+                if status[e, i] == WAITING and before >= 0 and status[e, before] > DONE:
                     status[e, i], found = GIVEN_UP, True
                     remove_from_queue(o.queue, o.head, e, i)
                     o.unfinished[e] -= 1
