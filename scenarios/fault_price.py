@@ -2,7 +2,7 @@
 
 The two factors of `fleet.engine.reward.FaultPrice` follow from the scenario alone. The value rate is the expected value
 of arriving jobs per second, over all streams. The downtime is that of a nominal arm whose joint 2 has carried a load
-for so long that all its temperatures are steady, the winding of that joint at `limits.error_c`: the time in which all its
+until all its temperatures are steady, with the winding of that joint at `limits.error_c`: the time in which all its
 motors cool below `limits.restart_c`, at the mean ambient temperature of the shift, plus `limits.clear_s`.
 """
 
