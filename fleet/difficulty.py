@@ -24,6 +24,12 @@ def difficulty_of_error(error: Array) -> Array:
     return -np.expm1(-error)
 
 
+SETTLING_S = 120.0
+"""A plan saturates if a motor is at or above the warning limit at any moment from this time after its start until its
+end, or at the end of a shorter plan; also if a fault ends it. Until then the arm may still be as warm as work before it
+left it, so a plan that lets a warm motor cool at once is not held responsible. Predicted and true peaks count from the
+same time."""
+
 KNOWN = 2 * JOINTS + 1
 """Length of what a forecast starts from: measured motor temperatures [joint], estimated housing temperatures [joint]
 and the ambient temperature, all °C."""
@@ -137,8 +143,8 @@ class Difficulty:
     risk: Forecast | None = None
     """The probability as a function of the temperatures at the start."""
     peak: Forecast | None = None
-    """Hottest motor temperature during the plan, °C, from the temperatures at the start; with a curve, also the
-    probability where there is no `risk`."""
+    """Hottest motor temperature during the plan (see `SETTLING_S`), °C, from the temperatures at the start; with a
+    curve, also the probability where there is no `risk`."""
 
     def __post_init__(self) -> None:
         if self.p_saturation is not None and self.risk is not None:

@@ -45,14 +45,15 @@ class HousingObserver(NamedTuple):
         return (self.keep @ housing_c[..., None] + self.gain @ load[..., None])[..., 0]
 
 
-def housing_observer(thermal: ThermalModel, motors: Motors, dt_s: float) -> HousingObserver:
-    """The observer that follows from what is known of an arm, for steps of `dt_s`."""
+def housing_observer(thermal: ThermalModel, motors: Motors, dt_s: Array | float) -> HousingObserver:
+    """The observer that follows from what is known of an arm, for steps of `dt_s`: one, or one per leading index."""
+    dt = np.asarray(dt_s, dtype=float)[..., None, None]
     inner = thermal.laplacian[HOUSING, HOUSING]
     root = np.sqrt(thermal.capacity[HOUSING])
     rates, modes = np.linalg.eigh(inner / np.outer(root, root))
     left, right = modes / root[:, None], modes.T
-    keep = (left * np.exp(-rates * dt_s)) @ (right * root)
-    gain = (left * (-np.expm1(-rates * dt_s) / rates)) @ (right / root)
+    keep = (left * np.exp(-rates * dt)) @ (right * root)
+    gain = (left * (-np.expm1(-rates * dt) / rates)) @ (right / root)
     from_winding = -np.diagonal(thermal.laplacian[WINDING, HOUSING])
     return HousingObserver(keep, gain, from_winding.copy(), thermal.to_ambient[HOUSING], motors.idle_w)
 

@@ -1,40 +1,46 @@
 """Simulated past jobs of an arm, with the records that a real arm would have of them.
 
-Each job begins at the temperature that earlier work left, at an ambient temperature that is not measured. The records
-hold the duration, the motor temperatures before the job, and the hottest temperatures during it.
+Each job begins as warm as earlier work left the arm, in any of the ambient temperatures of its hall. The records hold
+what is known before the job (measured motors, estimated housings, ambient temperature), and the hottest temperatures
+during it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from fleet.difficulty import SETTLING_S, known_temperatures
+from fleet.housing_observer import housing_observer
 from fleet.motion import Drive, Plan, drives, static_drive
+from fleet.motor import Motors
 from fleet.physics.models import ArmModel
-from fleet.thermal import NODES, WINDING, SimulatedTemperatures, simulate_temperatures
+from fleet.robot import JOINTS, ThermalLimits
+from fleet.thermal import NODES, STEP_S, WINDING, ThermalModel, drive_heat, temperature_steps
 from scenarios.prepare.planned_arm import ArmHardware
 from twin.saturation.fit import Experience
+from twin.thermal.parameters import HeatModel
+from twin.thermal.result import nominal_heat_model
 from twin.vae.twin import Twin
 
 Array = np.ndarray
 
 AMBIENT_C = (19.0, 27.0)
-"""Range of the ambient temperature, which no model receives."""
+"""Default range of the ambient temperature."""
 DURATION_S = (180.0, 2700.0)
 EARLIER_S = (300.0, 3600.0)
-"""Range of the duration of the job before."""
-REST_S = (0.0, 1800.0)
-"""Range of the powered rest between the job before and this one."""
-COOLING_STEP_S = 300.0
-COOLING_STEPS = 12
-"""An arm above the limit rests on in such steps until it is below, for at most an hour."""
-BEFORE = {"cold": 0.15, "idle": 0.25, "work": 0.6}
-"""Shares of the jobs that begin just after power-on, after a long idle time, and after a job and a rest."""
+"""Range of the duration of the work before."""
+REST_S = (120.0, 1800.0)
+"""Largest powered rest between the work before and this job, for one half of the jobs and for the other."""
+BEFORE = {"cold": 0.1, "idle": 0.2, "work": 0.7}
+"""Shares of the jobs that begin just after power-on, after a long idle time, and after work and a rest."""
+LONG_S = 1e9
 
 
 @dataclass(frozen=True, eq=False)
 class PastJobs:
-    """Jobs that one arm has done, with the measurements before and the outcome."""
+    """Jobs that one arm has done, with what was known before and the outcome."""
 
     plans: tuple[Plan, ...]
     repetitions: Array
@@ -43,42 +49,58 @@ class PastJobs:
     """From leaving home to being home again, [job]."""
     start_c: Array
     """True temperatures at the start, [job, node]; hidden from the arm."""
-    measured_c: Array
-    """Measured motor temperatures at the start, [job, joint]."""
-    ambient_c: Array
-    """True ambient temperature, [job]; hidden from the arm."""
+    known_c: Array
+    """Measured motor temperatures, estimated housing temperatures and ambient temperature at the start, [job, KNOWN]."""
     peak_c: Array
-    """Hottest winding temperature during the job, [job, joint]."""
+    """Hottest winding temperature during the job, counted as in `fleet.difficulty.SETTLING_S`, [job, joint]."""
     warning_c: float
 
     def __len__(self) -> int:
         return len(self.plans)
 
     @property
+    def hottest_c(self) -> Array:
+        """Temperature of the hottest winding, [job]."""
+        return self.peak_c.max(axis=1, initial=-np.inf)
+
+    @property
     def passed(self) -> Array:
         """Whether any motor reached the warning limit, bool [job]."""
-        return self.peak_c.max(axis=1, initial=-np.inf) >= self.warning_c
+        return self.hottest_c >= self.warning_c
 
 
-def past_jobs(hardware: ArmHardware, plans: Sequence[Plan], rng: np.random.Generator, *, warning_c: float) -> PastJobs:
-    """One past job of an arm for each plan, repeated for 3 to 45 minutes; every job begins below the limit.
+def past_jobs(
+    hardware: ArmHardware,
+    plans: Sequence[Plan],
+    rng: np.random.Generator,
+    *,
+    warning_c: float,
+    ambient_c: tuple[float, float] = AMBIENT_C,
+    repetitions: Array | None = None,
+    known: HeatModel | None = None,
+) -> PastJobs:
+    """One past job of an arm for each plan. The earlier jobs are drawn from the same plans.
 
-    The earlier jobs are drawn from the same plans.
+    Args:
+        ambient_c: Range of the ambient temperature.
+        repetitions: int [plan]; by default such that the jobs last from 3 to 45 minutes.
+        known: The heat model by which the arm estimates its housings; default: nominal in the arm's cooling.
     """
-    history = _Simulator(hardware, warning_c)
+    known = known or nominal_heat_model(hardware.robot.cooling)
+    history = _Simulator(hardware, known.motors, known.thermal())
     count, noise_k = len(plans), hardware.motors.sensor_noise_k
-    wanted_s = rng.uniform(*DURATION_S, count)
-    repetitions = _repetitions(plans, wanted_s)
-    ambient = rng.uniform(*AMBIENT_C, count)
+    if repetitions is None:
+        repetitions = _repetitions(plans, rng.uniform(*DURATION_S, count))
+    ambient = rng.uniform(*ambient_c, count)
     start = history.start(plans, ambient, rng)
+    measured_c = start.temp_c[:, WINDING] + noise_k * rng.standard_normal((count, noise_k.size))
     return PastJobs(
         plans=tuple(plans),
         repetitions=repetitions,
         duration_s=np.array([p.duration_s(int(n)) for p, n in zip(plans, repetitions, strict=True)]),
-        start_c=start,
-        measured_c=start[:, WINDING] + noise_k * rng.standard_normal((count, noise_k.size)),
-        ambient_c=ambient,
-        peak_c=history.work(plans, repetitions, start, ambient).highest_c,
+        start_c=start.temp_c,
+        known_c=known_temperatures(measured_c, start.housing_c, ambient),
+        peak_c=history.peaks(plans, repetitions, start, ambient),
         warning_c=warning_c,
     )
 
@@ -86,7 +108,7 @@ def past_jobs(hardware: ArmHardware, plans: Sequence[Plan], rng: np.random.Gener
 def experience(twin: Twin, jobs: PastJobs) -> Experience:
     """The past jobs with the features that the arm's twin computes for them."""
     repetitions = jobs.repetitions.tolist()
-    return Experience.of_jobs(twin, jobs.plans, repetitions, temp_c=jobs.measured_c, passed=jobs.passed)
+    return Experience.of_jobs(twin, jobs.plans, repetitions, known_c=jobs.known_c, passed=jobs.passed)
 
 
 def _repetitions(plans: Sequence[Plan], duration_s: Array) -> Array:
@@ -98,53 +120,108 @@ def _repetitions(plans: Sequence[Plan], duration_s: Array) -> Array:
     )
 
 
+class _Arms(NamedTuple):
+    """Temperatures of one arm in each job."""
+
+    temp_c: Array
+    """True, [job, node]."""
+    housing_c: Array
+    """The arm's estimate of its housings, [job, joint]."""
+
+
 @dataclass(frozen=True, eq=False)
 class _Simulator:
-    """True temperatures of one arm through work and rest; temperatures are °C, [job, node]."""
+    """True temperatures of one arm through work and rest, and what it believes of its housings."""
 
     hardware: ArmHardware
-    warning_c: float
+    known_motors: Motors
+    known_thermal: ThermalModel
 
-    def start(self, plans: Sequence[Plan], ambient: Array, rng: np.random.Generator) -> Array:
+    def start(self, plans: Sequence[Plan], ambient: Array, rng: np.random.Generator) -> _Arms:
         """Temperatures at which the jobs begin."""
         count = len(plans)
         before = rng.choice(list(BEFORE), size=count, p=list(BEFORE.values()))
-        cold = np.broadcast_to(ambient[:, None], (count, NODES)).copy()
-        long_idle = self.rest(cold, np.full(count, 4 * 3600.0), ambient)
+        cold = _Arms(np.repeat(ambient[:, None], NODES, axis=1), np.repeat(ambient[:, None], JOINTS, axis=1))
+        idle = self.idle(ambient)
         # Somewhere between power-on and a long idle time: shifts begin at any time.
-        warm_up = cold + rng.uniform(0.0, 1.0, (count, 1)) * (long_idle - cold)
+        share = rng.uniform(0.0, 1.0, (count, 1))
+        arms = _Arms(*(one + share * (other - one) for one, other in zip(cold, idle, strict=True)))
         earlier = [plans[i] for i in rng.integers(count, size=count)] if count else []
         repetitions = _repetitions(earlier, rng.uniform(*EARLIER_S, count))
-        after = self.work(earlier, repetitions, warm_up, ambient).end_c
-        after = self.rest(after, rng.uniform(*REST_S, count), ambient)
-        start = np.select([(before == "cold")[:, None], (before == "idle")[:, None]], [cold, long_idle], after)
-        for _ in range(COOLING_STEPS):
-            start = self.rest(start, self._hot(start) * COOLING_STEP_S, ambient)
-        # An arm that idles above the limit, in warm air with a badly cooled wrist, must be powered off first.
-        return np.where(self._hot(start)[:, None], cold, start)
+        error_c, faulted = ThermalLimits().error_c, np.zeros((count, 1), bool)
+        for _, warmer in self._work(earlier, repetitions, arms, ambient):
+            arms = _choose(faulted, arms, warmer)  # a fault ends the work
+            faulted |= arms.temp_c[:, WINDING].max(axis=1, keepdims=True, initial=-np.inf) >= error_c
+        rest_s = rng.uniform(0.0, np.where(rng.random(count) < 0.5, *REST_S))
+        for _, cooler in self._course(self._at_home(), np.zeros(JOINTS), rest_s, arms, ambient):
+            arms = cooler
+        worked = _choose(before[:, None] == "idle", idle, arms)
+        return _choose(before[:, None] == "cold", cold, worked)
 
-    def work(self, plans: Sequence[Plan], repetitions: Array, start: Array, ambient: Array) -> SimulatedTemperatures:
-        """Temperatures after approach, repeated cycle and retreat."""
-        highest, temp = start[:, WINDING], start
+    def peaks(self, plans: Sequence[Plan], repetitions: Array, start: _Arms, ambient: Array) -> Array:
+        """Hottest windings during jobs, counted as in `SETTLING_S`, [job, joint]."""
+        duration_s = np.array([plan.duration_s(int(n)) for plan, n in zip(plans, repetitions, strict=True)])
+        from_s = np.minimum(SETTLING_S, duration_s) - 1e-6
+        highest = np.full((len(plans), JOINTS), -np.inf)
+        for time_s, arms in self._work(plans, repetitions, start, ambient):
+            counts = (time_s >= from_s)[:, None]
+            highest = np.where(counts, np.maximum(highest, arms.temp_c[:, WINDING]), highest)
+        return highest
+
+    def idle(self, ambient: Array) -> _Arms:
+        """Temperatures after hours at home."""
+        _, motors, thermal = self.hardware
+        load, temp = self._at_home(), np.repeat(ambient[:, None], NODES, axis=1)
+        for _ in range(6):  # heat changes by a few percent with temperature
+            temp = thermal.steady(drive_heat(temp, load.current_sq, load.friction_w, motors), ambient)
+        observer = housing_observer(self.known_thermal, self.known_motors, LONG_S)
+        estimate = np.zeros((len(ambient), JOINTS))
+        return _Arms(temp, observer.step(estimate, temp[:, WINDING], ambient, 0.0))
+
+    def _at_home(self) -> Drive:
+        robot, motors, _ = self.hardware
+        return static_drive(ArmModel(robot).gravity_torque(robot.home_q()), motors)
+
+    def _work(
+        self, plans: Sequence[Plan], repetitions: Array, start: _Arms, ambient: Array
+    ) -> Iterator[tuple[Array, _Arms]]:
+        """Time since the start, s, [job], and temperatures after each step of approach, repeated cycle and retreat."""
+        arms, begun_s = start, np.zeros(len(plans))
         for name in ("approach", "cycle", "retreat"):
-            phases = [getattr(plan, name) for plan in plans]
-            duration_s = np.array([phase.duration_s for phase in phases])
+            profiles = [getattr(plan, name).profile for plan in plans]
+            duration_s = np.array([getattr(plan, name).duration_s for plan in plans])
             if name == "cycle":
                 duration_s = duration_s * repetitions
-            load = drives([phase.profile for phase in phases], self.hardware.motors)
-            after = self._simulate(load, duration_s, temp, ambient)
-            temp, highest = after.end_c, np.maximum(highest, after.highest_c)
-        return SimulatedTemperatures(temp, highest)
+            load, friction_w = drives(profiles, self.hardware.motors), drives(profiles, self.known_motors).friction_w
+            for time_s, arms in self._course(load, friction_w, duration_s, arms, ambient):
+                yield begun_s + time_s, arms
+            begun_s = begun_s + duration_s
 
-    def rest(self, start: Array, duration_s: Array, ambient: Array) -> Array:
-        """Temperatures after standing at home, powered."""
-        robot, motors, _ = self.hardware
-        idle = static_drive(ArmModel(robot).gravity_torque(robot.home_q()), motors)
-        return self._simulate(idle, duration_s, start, ambient).end_c
+    def _course(
+        self, load: Drive, friction_w: Array, duration_s: Array, start: _Arms, ambient: Array
+    ) -> Iterator[tuple[Array, _Arms]]:
+        """Time since the start, s, [job], and temperatures after each step under constant drives.
 
-    def _hot(self, temp: Array) -> Array:
-        return temp[:, WINDING].max(axis=1, initial=-np.inf) >= self.warning_c
-
-    def _simulate(self, load: Drive, duration_s: Array, start: Array, ambient: Array) -> SimulatedTemperatures:
+        Args:
+            friction_w: As the arm believes, [job, joint].
+        """
         _, motors, thermal = self.hardware
-        return simulate_temperatures(load, duration_s, motors=motors, thermal=thermal, start_c=start, ambient_c=ambient)
+        steps = np.ceil(duration_s / STEP_S)
+        dt_s = duration_s / np.maximum(steps, 1)
+        observer = housing_observer(self.known_thermal, self.known_motors, dt_s)
+        most = int(steps.max(initial=0.0))
+        course = temperature_steps(
+            [load] * most, dt_s, motors=motors, thermal=thermal, start_c=start.temp_c, ambient_c=ambient, steps=steps
+        )
+        temp_c, housing_c = next(course), start.housing_c
+        for step, next_c in enumerate(course, start=1):
+            mean_c = (temp_c + next_c)[:, WINDING] / 2.0
+            estimate = observer.step(housing_c, mean_c, ambient, friction_w)
+            housing_c = np.where((step <= steps)[:, None], estimate, housing_c)
+            temp_c = next_c
+            yield np.minimum(step, steps) * dt_s, _Arms(temp_c, housing_c)
+
+
+def _choose(first: Array, one: _Arms, other: _Arms) -> _Arms:
+    """The first where so, else the other; bool [job, 1]."""
+    return _Arms(*(np.where(first, a, b) for a, b in zip(one, other, strict=True)))

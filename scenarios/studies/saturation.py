@@ -117,10 +117,10 @@ def judge_twin(work: PastWork, twin: Twin) -> tuple[list[Prediction], list[Alarm
     for evidence in EVIDENCE:
         for method in METHODS:
             model = fit_saturation(fit, evidence=evidence, method=method)
-            p = model.risk(rest.features, rest.duration_s).at(rest.temp_c)
+            p = model.risk(rest.features, rest.duration_s).at(rest.known_c)
             predictions.append(_judged(f"{evidence}, {method}", p, rest.passed))
         model = fit_saturation(fit, evidence=evidence)
-        scores[f"p_{evidence}"] = lambda e, m=model: m.score(e.features, e.duration_s, e.temp_c)
+        scores[f"p_{evidence}"] = lambda e, m=model: m.score(e.features, e.duration_s, e.known_c)
     scores |= {name: lambda e, n=name: score_of(e.features, n) for name in UNLABELLED}
     calm, critical, calm_novel = rest.part(~rest.passed), rest.part(rest.passed), novel.part(~novel.passed)
     alarms = []
@@ -144,12 +144,12 @@ def judge_networks(work: PastWork) -> tuple[Prediction, Prediction]:
 
 def _network(name: str, twin: RcTwin, work: PastWork) -> Prediction:
     jobs, fit, rest = work.jobs, work.fit, work.held_out
-    plans, times, temp_c = [jobs.plans[i] for i in fit], jobs.repetitions[fit].tolist(), jobs.measured_c[fit]
-    fitted = twin.with_past_jobs(plans, times, temp_c=temp_c, passed=jobs.passed[fit])
-    plans, times, temp_c = [jobs.plans[i] for i in rest], jobs.repetitions[rest].tolist(), jobs.measured_c[rest]
-    p = np.array([float(fitted.risk(*job).at(t)) for *job, t in zip(plans, times, temp_c, strict=True)])
-    peak_c = twin.peaks(plans, times, start_c=twin.likely_start(temp_c)).max(axis=1)
-    error_k = float(np.sqrt(np.mean((peak_c - jobs.peak_c[rest].max(axis=1)) ** 2)))
+    plans, times = [jobs.plans[i] for i in fit], jobs.repetitions[fit].tolist()
+    fitted = twin.with_past_jobs(plans, times, known_c=jobs.known_c[fit], peak_c=jobs.hottest_c[fit])
+    forecasts = [fitted.peak(jobs.plans[i], int(jobs.repetitions[i])) for i in rest]
+    p = np.array([float(each.at(known)) for each, known in zip(forecasts, jobs.known_c[rest], strict=True)])
+    peak_c = np.array([float(each.value(known)) for each, known in zip(forecasts, jobs.known_c[rest], strict=True)])
+    error_k = float(np.sqrt(np.mean((peak_c - jobs.hottest_c[rest]) ** 2)))
     return _judged(name, p, jobs.passed[rest], error_k)
 
 

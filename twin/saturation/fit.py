@@ -10,6 +10,7 @@ from scipy.optimize import minimize
 from sklearn.isotonic import IsotonicRegression
 from sklearn.model_selection import StratifiedKFold
 
+from fleet.difficulty import KNOWN
 from fleet.errors import FleetError
 from fleet.motion import Plan
 from twin.saturation.model import (
@@ -49,19 +50,20 @@ class Experience:
     """[job, joint, part]."""
     duration_s: Array
     """[job]."""
-    temp_c: Array
-    """Motor temperatures as measured at the start, [job, joint]."""
+    known_c: Array
+    """Temperatures known at the start, [job, KNOWN]; see `fleet.difficulty.known_temperatures`."""
     passed: Array
     """bool [job]."""
 
     def __post_init__(self) -> None:
         packed = self.features.packed
-        for name, axes in (("duration_s", 1), ("temp_c", 2), ("passed", 1)):
-            if getattr(self, name).shape != packed.shape[:axes]:
-                raise ValueError(f"Experience.{name} must be {packed.shape[:axes]} (got {getattr(self, name).shape}).")
+        jobs = (len(packed),)
+        for name, shape in (("duration_s", jobs), ("known_c", (*jobs, KNOWN)), ("passed", jobs)):
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"Experience.{name} must be {shape} (got {getattr(self, name).shape}).")
         if self.passed.dtype != bool:
             raise ValueError(f"Experience.passed must be bool (got {self.passed.dtype}).")
-        for name, values in (("features", packed), ("duration_s", self.duration_s), ("temp_c", self.temp_c)):
+        for name, values in (("features", packed), ("duration_s", self.duration_s), ("known_c", self.known_c)):
             broken = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
             if len(broken):
                 raise ValueError(
@@ -74,7 +76,7 @@ class Experience:
 
     @classmethod
     def of_jobs(
-        cls, twin: Twin, plans: Sequence[Plan], repetitions: Sequence[int], *, temp_c: Array, passed: Array
+        cls, twin: Twin, plans: Sequence[Plan], repetitions: Sequence[int], *, known_c: Array, passed: Array
     ) -> "Experience":
         """The experience of jobs, each a repeated plan, [job]."""
         duration = [plan.duration_s(times) for plan, times in zip(plans, repetitions, strict=True)]
@@ -82,20 +84,20 @@ class Experience:
             twin=twin.version,
             features=twin.features(plans, repetitions),
             duration_s=np.array(duration),
-            temp_c=np.asarray(temp_c, dtype=float),
+            known_c=np.asarray(known_c, dtype=float),
             passed=np.asarray(passed),
         )
 
     def part(self, rows: Array) -> "Experience":
         """Some of the jobs, by index or mask."""
-        arrays = {name: getattr(self, name)[rows] for name in ("duration_s", "temp_c", "passed")}
+        arrays = {name: getattr(self, name)[rows] for name in ("duration_s", "known_c", "passed")}
         return Experience(twin=self.twin, features=Features(self.features.packed[rows]), **arrays)
 
     @cached_property
     def data_hash(self) -> str:
         """Hash of the jobs."""
         digest = hashlib.sha256(self.twin.encode())
-        for values in (self.features.packed, self.duration_s, self.temp_c, self.passed):
+        for values in (self.features.packed, self.duration_s, self.known_c, self.passed):
             digest.update(f"{values.dtype}{values.shape}".encode())
             digest.update(np.ascontiguousarray(values).tobytes())
         return digest.hexdigest()[:32]
@@ -130,18 +132,19 @@ def fit_saturation(
     strength, held_out = choose_strength(z, past.passed, rising)
     slope, offset = logistic(z, past.passed, rising, strength)
     slope = slope / std
-    joints = past.temp_c.shape[1]
-    at_once, later = (tuple(map(_floats, block)) for block in np.split(slope[: -joints - 1].reshape(2 * joints, -1), 2))
+    of_evidence, of_log_duration, *of_known = np.split(slope, [-2 * KNOWN - 1, -2 * KNOWN, -KNOWN])
+    at_once, later = np.split(of_evidence.reshape(2 * past.features.packed.shape[1], -1), 2)
     return SaturationModel(
         twin=past.twin,
         evidence=evidence,
         method=method,
         horizon_s=horizon_s,
         offset=float(offset - slope @ mean),
-        at_once=at_once,
-        later=later,
-        of_log_duration=float(slope[-joints - 1]),
-        of_temp=_floats(slope[-joints:]),
+        at_once=tuple(map(_floats, at_once)),
+        later=tuple(map(_floats, later)),
+        of_log_duration=float(of_log_duration[0]),
+        of_start=_floats(of_known[0]),
+        of_start_later=_floats(of_known[1]),
         curve=None if method == "logistic" else monotone_curve(held_out, past.passed),
         data_hash=past.data_hash,
         jobs=len(past),
@@ -153,10 +156,12 @@ def fit_saturation(
 
 def _design(past: Experience, evidence: Evidence, horizon_s: float | None) -> tuple[Array, Array]:
     """Columns [job, column] and whether their slope must be >= 0, bool [column]: the evidence, the evidence times the
-    heating share, ln(duration), temperatures."""
+    heating share, ln(duration), temperatures times the cooling share, and times the heating share."""
     columns = evidence_of(past.features, evidence).reshape(len(past), -1)
     heating_s = heating_time(past.duration_s, horizon_s)
-    x = np.column_stack([columns, columns * heating_share(heating_s)[:, None], np.log(heating_s), past.temp_c])
+    share = heating_share(heating_s)[:, None]
+    known_c = past.known_c
+    x = np.column_stack([columns, columns * share, np.log(heating_s), (1.0 - share) * known_c, share * known_c])
     return x, np.arange(x.shape[1]) >= (0 if evidence in ONE_SIDED else 2 * columns.shape[1])
 
 

@@ -1,8 +1,8 @@
 """P(saturation): the probability that a motor passes the warning limit during a job that starts now.
 
-A logistic regression on the twin's features of the job, its duration, and the motor temperatures at its start, fitted
+A logistic regression on the twin's features of the job, its duration, and the temperatures known at its start, fitted
 on the arm's past jobs by `twin.saturation.fit`. Its score is affine in the temperatures, so that the engine can update
-it each step. Saved beside its twin as `saturation.json`.
+it each step. Saved as `saturation.json`.
 """
 
 import hashlib
@@ -23,10 +23,10 @@ from twin.vae.twin import Twin
 
 Array = np.ndarray
 
-FORMAT = 1
+FORMAT = 2
 FILE = "saturation.json"
 
-Evidence = Literal["errors", "load", "excess"]
+Evidence = Literal["errors", "load", "excess", "torque"]
 Method = Literal["logistic", "isotonic"]
 EVIDENCE: tuple[Evidence, ...] = get_args(Evidence)
 METHODS: tuple[Method, ...] = get_args(Method)
@@ -35,9 +35,10 @@ _COLUMNS: Mapping[str, Callable[[Features], Array]] = {
     "errors": lambda features: features.errors,
     "load": lambda features: features.one_sided[..., None],
     "excess": lambda features: features.excess_sq[..., None],
+    "torque": lambda features: features.torque_sq[..., None],
 }
-ONE_SIDED: tuple[Evidence, ...] = ("load", "excess")
-"""Evidence that counts only load above the reconstruction: more of it never makes a job safer."""
+ONE_SIDED: tuple[Evidence, ...] = ("load", "excess", "torque")
+"""Evidence that counts load: more of it never makes a job safer."""
 
 WARMING_S = 1500.0
 """Time constant of heating: between those of a Gen3's windings (150 to 290 s) and housings (1700 to 2700 s)."""
@@ -46,7 +47,8 @@ WARMING_S = 1500.0
 def evidence_of(features: Features, evidence: Evidence) -> Array:
     """Inputs of a model per joint, [..., joint, column].
 
-    `errors`: the error of each channel; `load`: the one-sided torque error; `excess`: the excess tau².
+    `errors`: the error of each channel; `load`: the one-sided torque error; `excess`: the excess tau²;
+    `torque`: the mean tau², without any reconstruction.
     """
     if evidence not in _COLUMNS:
         raise ValueError(f"No evidence '{evidence}'{nearest(evidence, _COLUMNS)}")
@@ -55,7 +57,8 @@ def evidence_of(features: Features, evidence: Evidence) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class SaturationModel:
-    """P = link(offset + evidence · (at_once + share · later) + ln(duration) · of_log_duration + temp_c · of_temp).
+    """P = link(offset + evidence · (at_once + share · later) + ln(duration) · of_log_duration
+    + known_c · ((1 − share) · of_start + share · of_start_later)).
 
     share = 1 − exp(−duration / WARMING_S) is the share of its final heat that a load reaches in the job.
     """
@@ -73,8 +76,10 @@ class SaturationModel:
     """Additional slope of the evidence in an endless job, [joint][column]."""
     of_log_duration: float
     """Slope of ln(duration in s), >= 0."""
-    of_temp: tuple[float, ...]
-    """Slope of the temperatures, 1/K, >= 0, [joint]."""
+    of_start: tuple[float, ...]
+    """Slope of the temperatures known at the start at zero duration, 1/K, >= 0, [KNOWN]."""
+    of_start_later: tuple[float, ...]
+    """The same in an endless job."""
     curve: tuple[tuple[float, float], ...] | None
     """Score and probability, as in `fleet.difficulty.Forecast`; None for the logistic function."""
     data_hash: str
@@ -94,14 +99,15 @@ class SaturationModel:
                 f"SaturationModel needs evidence of {', '.join(_COLUMNS)} and method of {', '.join(METHODS)} "
                 f"(got {self.evidence}, {self.method})."
             )
-        joints = [len(self.at_once), len(self.later), len(self.of_temp)]
-        if len(set(joints)) != 1 or not self.of_temp:
-            raise ValueError(
-                f"SaturationModel.at_once, later and of_temp must have one entry per joint (got {joints})."
-            )
+        if len(self.at_once) != len(self.later) or not self.later:
+            joints = [len(self.at_once), len(self.later)]
+            raise ValueError(f"SaturationModel.at_once and later must have one entry per joint (got {joints}).")
+        if not len(self.of_start) == len(self.of_start_later) == KNOWN:
+            known = [len(self.of_start), len(self.of_start_later)]
+            raise ValueError(f"SaturationModel.of_start and of_start_later must have {KNOWN} entries (got {known}).")
         slopes = [w for row in self.at_once + self.later for w in row]
-        numbers = [self.offset, self.of_log_duration, *self.of_temp, *slopes]
-        if not np.isfinite(numbers).all() or min(self.of_log_duration, *self.of_temp) < 0:
+        rising = [self.of_log_duration, *self.of_start, *self.of_start_later]
+        if not np.isfinite([self.offset, *rising, *slopes]).all() or min(rising) < 0:
             raise ValueError("SaturationModel needs finite numbers, and no slope of temperature or duration below 0.")
 
     @property
@@ -110,7 +116,7 @@ class SaturationModel:
         return hashlib.sha256(msgspec.json.encode(self)).hexdigest()[:16]
 
     def risk(self, features: Features, duration_s: Array | float) -> Forecast:
-        """P as a function of the motor temperatures at the start.
+        """P as a function of the temperatures known at the start.
 
         Args:
             features: Of whole jobs, [..., joint, part].
@@ -120,20 +126,23 @@ class SaturationModel:
             ValueError: another number of joints, or a duration that is not > 0.
         """
         base = self._base(features, duration_s)
-        weight = np.zeros((*base.shape, 1, KNOWN))
-        weight[..., : len(self.of_temp)] = self.of_temp
         curve = None if self.curve is None else np.broadcast_to(self.curve, (*base.shape, len(self.curve), 2))
-        return Forecast(base[..., None], weight, curve)
+        return Forecast(base[..., None], self._of_known(duration_s)[..., None, :], curve)
 
-    def score(self, features: Features, duration_s: Array | float, temp_c: Array) -> Array:
+    def score(self, features: Features, duration_s: Array | float, known_c: Array) -> Array:
         """The argument of the link, [...]: ranks jobs also where P rounds to 0 or 1.
 
         Args:
             features: Of whole jobs, [..., joint, part].
             duration_s: [...].
-            temp_c: Motor temperatures as measured at the start, °C, [..., joint].
+            known_c: Temperatures known at the start, °C, [..., KNOWN].
         """
-        return self._base(features, duration_s) + np.asarray(temp_c, dtype=float) @ np.array(self.of_temp)
+        return self._base(features, duration_s) + (np.asarray(known_c) * self._of_known(duration_s)).sum(axis=-1)
+
+    def _of_known(self, duration_s: Array | float) -> Array:
+        """Slope of the temperatures known at the start, 1/K, [..., KNOWN]."""
+        share = heating_share(heating_time(duration_s, self.horizon_s))[..., None]
+        return (1.0 - share) * np.array(self.of_start) + share * np.array(self.of_start_later)
 
     def _base(self, features: Features, duration_s: Array | float) -> Array:
         """The score at 0 °C, [...]."""
@@ -226,7 +235,7 @@ def load_calibrated(twin: Twin, folder: Path, *, data_hash: str | None = None) -
     for what, value, wanted in (
         ("twin", model.twin, twin.version),
         ("data_hash", model.data_hash, data_hash or model.data_hash),
-        ("joints", len(model.of_temp), twin.joints),
+        ("joints", len(model.at_once), twin.joints),
     ):
         if value != wanted:
             raise CheckpointError(f"{folder / FILE}: {what} is {value}, wanted {wanted}. Fit the model again.")

@@ -17,10 +17,10 @@ from twin.json_file import check_version, read_card, write_card
 from twin.logs.heat_log import CurrentSource
 from twin.thermal.parameters import HeatModel
 from twin.thermal.result import Identified, Parameter
-from twin.thermal.risk import MarginHead
+from twin.thermal.risk import PeakCurve
 from twin.thermal.thermal_twin import RcTwin
 
-FORMAT = 1
+FORMAT = 2
 CARD = "rc.json"
 
 
@@ -41,13 +41,13 @@ class _Card(msgspec.Struct, forbid_unknown_fields=True):
     motors: dict[str, float | list[float]]
     capacity_j_per_k: dict[str, float]
     conductance_w_per_k: list[tuple[str, str, float]]
-    saturation: MarginHead | None = None
+    saturation: PeakCurve | None = None
 
 
 _SHARED = ("arm", "data_hash", "ambient_c", "ambient_sd_k", "source", "seconds", "parameters", "rms_k", "memory_s")
 
 
-def save(identified: Identified, folder: Path, *, saturation: MarginHead | None = None) -> None:
+def save(identified: Identified, folder: Path, *, saturation: PeakCurve | None = None) -> None:
     """Write an identified arm, with its P(saturation) if given, atomically into a folder, made if need be."""
     network = identified.heat_model.network
     card = _Card(
@@ -74,11 +74,11 @@ def load(folder: Path) -> Identified:
 
 def load_twin(folder: Path) -> RcTwin:
     """The physical twin of what `save` wrote, with P(saturation) if it was saved; raises as `load`."""
-    identified, head = _load(folder / CARD)
-    return replace(RcTwin.of(identified), head=head)
+    identified, curve = _load(folder / CARD)
+    return replace(RcTwin.of(identified), curve=curve)
 
 
-def _load(path: Path) -> tuple[Identified, MarginHead | None]:
+def _load(path: Path) -> tuple[Identified, PeakCurve | None]:
     card = read_card(path, _Card, format_=FORMAT, what="identified arm")
     widths = {name: len(value) for name, value in card.motors.items() if isinstance(value, list)}
     if wrong := {name: width for name, width in widths.items() if width != JOINTS}:

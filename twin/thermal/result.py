@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 
 from fleet.motor import gen3_motors
+from fleet.robot import Cooling
 from fleet.thermal import gen3_network
 from twin.logs.heat_log import CurrentSource
 from twin.thermal.parameters import HeatModel
@@ -87,6 +88,6 @@ class Identified:
         raise KeyError(f"{name} of joint {joint} was not free. Free: {sorted({p.name for p in self.parameters})}.")
 
 
-def nominal_heat_model() -> HeatModel:
-    """A Gen3 by the project's defaults, in still air."""
-    return HeatModel(gen3_motors(), gen3_network())
+def nominal_heat_model(cooling: Cooling = "still_air") -> HeatModel:
+    """A Gen3 by the project's defaults."""
+    return HeatModel(gen3_motors(), gen3_network(cooling=cooling))

@@ -1,125 +1,164 @@
-"""P(saturation) from the thermal network: margins that are affine in the temperatures at the start, and one slope.
+"""The predicted peak of a plan, and P(saturation) from it, by the thermal network of an arm.
 
-During a job the drive is that of its plan. Copper loss rises linearly with the winding's temperature; the magnets
-(a percent per ten kelvin) are taken at their temperature halfway. So the temperature of each motor at each time is
-affine in the motor temperatures at the start, and the worst margin is a maximum of affine pieces.
+In each phase of a plan the drive is constant. Heat is linearised about a warm motor: copper loss is linear in the
+winding's temperature anyway, and that of the magnets changes it by a percent per five kelvin. So the temperature of
+each motor at each moment is affine in the temperatures known at the start, and the peak is a maximum of affine pieces.
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
+from scipy.special import ndtr
 
-from fleet.difficulty import KNOWN, Forecast
+from fleet.difficulty import KNOWN, SETTLING_S, Forecast
 from fleet.motion import Drive
 from fleet.motor import Motors, copper_loss, magnet_factor
 from fleet.robot import JOINTS
 from fleet.thermal import NODES, WINDING, ThermalModel, node_heat
-from twin.saturation.fit import check_outcomes, logistic
+from twin.saturation.fit import LEAST_JOBS, NotEnoughExperience
 
 Array = np.ndarray
 
-MOMENTS = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""Shares of a job's time at which margins are computed; under a constant drive a peak is at an end or flat."""
-ROOM_K = 10.0
-"""Scale of a margin without a predicted rise; prediction errors grow with the rise."""
-_STRENGTH = 100.0
-"""Inverse regularisation of a single slope: hardly any."""
+MOMENTS_S = (SETTLING_S, 480.0)
+"""Moments of a plan at which its motors are predicted, besides its end: they warm or cool steadily in between."""
+AROUND_C = 50.0, 42.0
+"""Temperatures of winding and housing about which heat is linearised: those of a motor that comes near its limit."""
+ROUNDING_K = 0.5
+"""Error of a peak that is accepted for fewer pieces."""
+_STARTS = 512
+"""Number of realistic starts by which pieces that never decide are found."""
+_LEVELS = np.array([0.003, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 0.997])
+"""Probabilities at the knots of a curve."""
+BAND_K = 12.0
+"""Past jobs whose predicted peak is this close to the limit show how far off a prediction is there."""
 
 
 @dataclass(frozen=True, eq=False)
-class Pieces:
-    """Scaled margins (predicted temperature − limit) / scale of one job: offset + weight @ measured temp_c."""
+class LinearHeat:
+    """Temperatures under constant drives as T' = V diag(rates) V⁻¹ T + B [ambient, 1], arrays [phase, ...]."""
 
-    offset: Array
-    """[piece]."""
-    weight: Array
-    """1/K, [piece, joint]."""
+    rates: Array
+    """1/s, [phase, mode]; positive beyond thermal runaway."""
+    modes: Array
+    """[phase, node, mode]."""
+    inverse: Array
+    """[phase, mode, node]."""
+    forcing: Array
+    """By 1 °C of ambient temperature, and by the heat at 0 °C, K/s, [phase, node, 2]."""
 
-    def margin(self, temp_c: Array) -> float:
-        """The worst margin at motor temperatures [joint]."""
-        return float((self.offset + self.weight @ temp_c).max())
+    @classmethod
+    def of(cls, load: Drive, motors: Motors, thermal: ThermalModel) -> "LinearHeat":
+        """From drives [phase, joint]."""
+        winding_c, housing_c = AROUND_C
+        factor = magnet_factor(np.full(JOINTS, housing_c), motors)
+        warm_sq = load.current_sq / factor**2
+        loss_w = copper_loss(warm_sq, np.full(JOINTS, winding_c), motors)
+        by_winding = loss_w - copper_loss(warm_sq, np.full(JOINTS, winding_c - 1.0), motors)  # W/K
+        by_housing = -2.0 * motors.alpha_kt_per_k / factor * loss_w  # W/K
+        at_zero = loss_w - by_winding * winding_c - by_housing * housing_c
+        joints, slope = np.arange(JOINTS), np.zeros((len(loss_w), NODES, NODES))
+        slope[:, joints, joints], slope[:, joints, joints + JOINTS] = by_winding, by_housing
+        rates, modes = np.linalg.eig((slope - thermal.laplacian) / thermal.capacity[:, None])
+        heat = node_heat(at_zero, motors.idle_w + load.friction_w)
+        forcing = np.stack(np.broadcast_arrays(thermal.to_ambient, heat), axis=-1) / thermal.capacity[:, None]
+        # A tree of nodes: the matrix is similar to a symmetric one, so its modes are real.
+        return cls(rates.real, modes.real, np.linalg.inv(modes.real), forcing)
+
+    def courses(self, elapsed_s: Array) -> Array:
+        """Temperatures as affine functions of the start: [moment, node, NODES + 2] for nodes, ambient and 1.
+
+        Args:
+            elapsed_s: Time spent in each phase until each moment, [moment, phase].
+        """
+        course = np.broadcast_to(np.eye(NODES, NODES + 2), (len(elapsed_s), NODES, NODES + 2))
+        for phase, rates in enumerate(self.rates):
+            exponent = np.multiply.outer(elapsed_s[:, phase], rates)  # [moment, mode]
+            safe = np.where(np.abs(rates) > 1e-12, rates, 1.0)
+            gain = np.where(np.abs(rates) > 1e-12, np.expm1(exponent) / safe, elapsed_s[:, phase, None])
+            inner = self.inverse[phase] @ course * np.exp(exponent)[..., None]
+            inner[..., NODES:] += gain[..., None] * (self.inverse[phase] @ self.forcing[phase])
+            course = self.modes[phase] @ inner
+        return course
+
+
+def peak_forecast(heat: LinearHeat, lasts_s: Array, curve: Array | None = None) -> Forecast:
+    """Hottest motor from `SETTLING_S` after the start of a plan, or its earlier end, until its end, °C.
+
+    Args:
+        lasts_s: Time of the phases, s, [phase].
+        curve: From the predicted peak to P(saturation), [knot, 2].
+    """
+    total_s = float(lasts_s.sum())
+    # The cycles end hotter than the retreat, which is short and without load.
+    working_s = max(float(lasts_s[:-1].sum()), min(SETTLING_S, total_s))
+    moments_s = np.array([*(t for t in MOMENTS_S if t < working_s), working_s])
+    until = np.cumsum(lasts_s)
+    elapsed_s = np.clip(moments_s[:, None] - (until - lasts_s), 0.0, lasts_s)
+    pieces = heat.courses(elapsed_s)[:, WINDING]  # [moment, joint, ...]
+    values = pieces @ _starts().T  # [moment, joint, start]
+    # A piece stays if it decides somewhere, by more than rounding against earlier moments: later ones may not come.
+    of_moment = values.max(axis=1)
+    before = np.maximum.accumulate(np.vstack([np.full_like(of_moment[:1], -np.inf), of_moment[:-1]]))
+    decides = (of_moment >= before + ROUNDING_K)[:, None]
+    stays = ((values == of_moment[:, None]) & decides).any(axis=-1)
+    time_s = np.broadcast_to(np.append(0.0, moments_s[1:])[:, None], stays.shape)
+    kept = pieces[stays]
+    return Forecast(kept[:, KNOWN].copy(), kept[:, :KNOWN].copy(), curve, time_s[stays])
+
+
+@cache
+def _starts() -> Array:
+    """Realistic temperatures at the start of a plan, with a 1, [start, KNOWN + 1].
+
+    From an arm at ambient temperature, over idle arms, to arms with some or all joints hot.
+    """
+    rng = np.random.default_rng(0)
+    ambient = rng.uniform(10.0, 42.0, (_STARTS, 1))
+    most_k = 30.0 * rng.uniform(0.0, 1.0, (2, _STARTS, 1)) ** 2
+    rise_k = most_k * rng.uniform(0.0, 1.0, (2, _STARTS, JOINTS))
+    housing = ambient + rise_k[0]
+    winding = np.minimum(housing - 1.0 + rise_k[1], 90.0)
+    return np.concatenate([winding, housing, ambient, np.ones((_STARTS, 1))], axis=1)
 
 
 @dataclass(frozen=True, kw_only=True)
-class MarginHead:
-    """P = logistic(intercept + slope · margin), fitted on past jobs."""
+class PeakCurve:
+    """From the predicted peak of a plan to the probability that its motors pass the warning limit."""
 
-    intercept: float
-    slope: float
+    knots: tuple[tuple[float, float], ...]
+    """Predicted peak, °C, and probability."""
     jobs: int
-    passed: int
+    """Past jobs whose errors it is made of."""
 
     @property
     def name(self) -> str:
-        """Part of the twin's version."""
-        return f"{self.intercept:.4g}+{self.slope:.4g}m"
-
-    def risk(self, of_job: Pieces) -> Forecast:
-        """The probability for any temperatures at the start."""
-        weight = np.zeros((len(of_job.offset), KNOWN))
-        weight[:, :JOINTS] = self.slope * of_job.weight
-        return Forecast(self.intercept + self.slope * of_job.offset, weight)
+        """Part of the twin's version: where the probability is a half, and how far it is from .1 to .9."""
+        at, p = np.array(self.knots).T
+        low, half, high = np.interp((0.1, 0.5, 0.9), p, at)
+        return f"{half:.2f}~{high - low:.2f}"
 
 
-def fit_head(margin: Array, passed: Array) -> MarginHead:
-    """Logistic regression of the outcome of past jobs on their predicted margin, [job], with a slope >= 0.
+def fit_curve(predicted_c: Array, peak_c: Array, limit_c: float) -> PeakCurve:
+    """The curve from past jobs: the chance that a prediction's error takes the true peak over the limit.
 
-    Raises:
-        NotEnoughExperience: too few jobs, or hardly any of one kind.
-    """
-    passed = np.asarray(passed, dtype=bool)
-    check_outcomes(passed)
-    spread = max(float(margin.std()), 1e-9)
-    slope, offset = logistic(margin[:, None] / spread, passed, np.array([True]), _STRENGTH)
-    return MarginHead(
-        intercept=float(offset), slope=float(slope[0] / spread), jobs=len(passed), passed=int(passed.sum())
-    )
-
-
-def affine_margins(
-    load: Drive,
-    duration_s: Array,
-    *,
-    magnets_c: Array,
-    motors: Motors,
-    thermal: ThermalModel,
-    ambient_c: float,
-    idle_c: Array,
-    limit_c: float,
-    start_of_windings: Array,
-) -> list[Pieces]:
-    """Margins of jobs with constant drives as affine functions of the motor temperatures at their start.
+    The errors are those of jobs that come near the limit, smoothed by a Gaussian kernel (Silverman's width).
 
     Args:
-        load: [job, joint].
-        magnets_c: Housing temperature at which the magnets are taken, [job, joint].
-        idle_c: Motor temperatures after long idling, [joint].
-        start_of_windings: From measured motor temperatures to those of all nodes, [node, joint].
+        predicted_c: Predicted peak of each job, [job].
+        peak_c: Its true peak, [job].
+
+    Raises:
+        NotEnoughExperience: too few jobs.
     """
-    warm_sq = load.current_sq / magnet_factor(magnets_c, motors) ** 2
-    at_zero = copper_loss(warm_sq, np.zeros_like(warm_sq), motors)
-    slope = copper_loss(warm_sq, np.ones_like(warm_sq), motors) - at_zero  # W/K
-    heat_w = node_heat(at_zero, motors.idle_w + load.friction_w) + thermal.to_ambient * ambient_c
-    laplacian = thermal.laplacian - np.eye(NODES) * node_heat(slope, np.zeros(JOINTS))[:, None, :]
-    root = np.sqrt(thermal.capacity)
-    rates, modes = np.linalg.eigh(laplacian / np.outer(root, root))
-    margins = []
-    for job in range(len(duration_s)):
-        phi, gamma = _affine(rates[job], modes[job], root, duration_s[job] * np.array(MOMENTS))
-        forced = gamma @ heat_w[job]  # [moment, joint]
-        by_start = phi @ start_of_windings
-        # Errors of a prediction grow with the rise that the job itself adds to the idle temperature.
-        scale = ROOM_K + np.maximum(forced + by_start @ idle_c - idle_c, 0.0)
-        weight = (by_start / scale[..., None]).reshape(-1, JOINTS)
-        margins.append(Pieces(((forced - limit_c) / scale).reshape(-1), weight))
-    return margins
-
-
-def _affine(rates: Array, modes: Array, root: Array, elapsed_s: Array) -> tuple[Array, Array]:
-    """Windings after these times by start and by constant heat, each [time, joint, node]; rates may be negative."""
-    exponent = -np.multiply.outer(elapsed_s, rates)
-    decay = np.exp(exponent)
-    safe = np.where(np.abs(rates) > 1e-12, rates, 1.0)
-    gain = np.where(np.abs(rates) > 1e-12, -np.expm1(exponent) / safe, elapsed_s[:, None])
-    left = (modes / root[:, None])[WINDING]
-    return (left * decay[:, None]) @ (modes.T * root), (left * gain[:, None]) @ (modes.T / root)
+    if len(peak_c) < LEAST_JOBS:
+        raise NotEnoughExperience(f"P(saturation) needs {LEAST_JOBS} past jobs, better 200 (got {len(peak_c)}).")
+    distance_k = np.abs(predicted_c - limit_c)
+    near = distance_k <= max(BAND_K, float(np.sort(distance_k)[LEAST_JOBS - 1]))
+    error_k = (peak_c - predicted_c)[near]
+    width = 1.06 * max(float(error_k.std()), 0.05) * len(error_k) ** -0.2
+    grid = np.linspace(error_k.min() - 4 * width, error_k.max() + 4 * width, 400)
+    below = ndtr((grid[:, None] - error_k) / width).mean(axis=1)  # P(error < grid)
+    at = limit_c - np.interp(1.0 - _LEVELS, below, grid)
+    knots = tuple((float(x), float(p)) for x, p in zip(at, _LEVELS, strict=True))
+    return PeakCurve(knots=knots, jobs=len(error_k))

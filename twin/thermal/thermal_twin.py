@@ -4,7 +4,7 @@ It implements the same protocol as the learned twin, and also predicts temperatu
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import repeat
 
@@ -13,11 +13,12 @@ import numpy as np
 from fleet.difficulty import Difficulty, Forecast, difficulty_of_error
 from fleet.motion import Drive, Plan, drives
 from fleet.motor import Motors
-from fleet.robot import JOINTS, ThermalLimits
+from fleet.robot import JOINTS, Cooling, ThermalLimits
 from fleet.thermal import HOUSING, NODES, STEP_S, WINDING, ThermalModel, node_heat, temperature_steps
+from twin.plan_cache import PlanCache
 from twin.thermal.parameters import HeatModel
 from twin.thermal.result import AMBIENT_C, Identified, nominal_heat_model
-from twin.thermal.risk import MarginHead, Pieces, affine_margins, fit_head
+from twin.thermal.risk import LinearHeat, PeakCurve, fit_curve, peak_forecast
 from twin.vae.window import check_jobs
 
 Array = np.ndarray
@@ -38,13 +39,14 @@ class RcTwin:
     base: str
     """Version of the nominal or identified network."""
     warning_c: float = ThermalLimits().warning_c
-    head: MarginHead | None = None
-    """From predicted margins to P(saturation); None without past jobs."""
+    curve: PeakCurve | None = None
+    """From predicted peaks to P(saturation); None without past jobs."""
+    _heat: PlanCache[LinearHeat] = field(default_factory=PlanCache, init=False, repr=False)
 
     @classmethod
-    def nominal(cls, arm: str = "arm", *, ambient_c: float = AMBIENT_C) -> "RcTwin":
-        """A Gen3 by the project's defaults, in still air."""
-        return cls(arm=arm, heat_model=nominal_heat_model(), ambient_c=ambient_c, base="rc-nominal")
+    def nominal(cls, arm: str = "arm", *, ambient_c: float = AMBIENT_C, cooling: Cooling = "still_air") -> "RcTwin":
+        """A Gen3 by the project's defaults."""
+        return cls(arm=arm, heat_model=nominal_heat_model(cooling), ambient_c=ambient_c, base="rc-nominal")
 
     @classmethod
     def of(cls, identified: Identified) -> "RcTwin":
@@ -54,8 +56,8 @@ class RcTwin:
 
     @property
     def version(self) -> str:
-        """Names parameters, ambient temperature and limit, and the head if there is one."""
-        return f"{self.base}-{self.ambient_c:g}-{self.warning_c:g}" + (f"-{self.head.name}" if self.head else "")
+        """Names parameters, ambient temperature and limit, and the curve if there is one."""
+        return f"{self.base}-{self.ambient_c:g}-{self.warning_c:g}" + (f"-{self.curve.name}" if self.curve else "")
 
     @property
     def motors(self) -> Motors:
@@ -81,7 +83,7 @@ class RcTwin:
         return np.concatenate([temp_c, temp_c], axis=-1)
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty:
-        """Difficulty of the repeated plan; with a head also its risk as a function of the temperatures now.
+        """Difficulty of the repeated plan, and its peak as a function of the temperatures at the start.
 
         Raises:
             ValueError: repetitions < 1, or a plan without motion or with other joints.
@@ -91,7 +93,7 @@ class RcTwin:
         rise = np.maximum(peak - idle, 0.0) / np.maximum(self.warning_c - idle, 1.0)
         # Beyond this 1 − exp(−e) rounds to one; d_k stays below it.
         per_joint = difficulty_of_error(np.minimum(rise, 30.0))
-        return Difficulty(per_joint, risk=self.risk(plan, repetitions) if self.head else None)
+        return Difficulty(per_joint, peak=self.peak(plan, repetitions))
 
     def peaks(self, plans: Sequence[Plan], repetitions: Sequence[int], *, start_c: Array) -> Array:
         """Hottest temperature of each motor during each job, °C, [plan, joint].
@@ -142,45 +144,34 @@ class RcTwin:
             now_s += lasts_s
         return np.concatenate(times), np.concatenate(temps)[:, WINDING]
 
-    def pieces(self, plans: Sequence[Plan], repetitions: Sequence[int]) -> list[Pieces]:
-        """Margins of each job as affine functions of the motor temperatures at its start, one per plan."""
-        load, duration_s = self._mean_drive(plans, repetitions)
-        return affine_margins(
-            load,
-            duration_s,
-            magnets_c=self.simulate(load, duration_s / 2.0, self.idle_c)[-1][:, HOUSING],
-            motors=self.motors,
-            thermal=self.thermal,
-            ambient_c=self.ambient_c,
-            idle_c=self.idle_c[WINDING],
-            limit_c=self.warning_c,
-            start_of_windings=self.likely_start(np.eye(JOINTS)).T,
-        )
+    def peak(self, plan: Plan, repetitions: int) -> Forecast:
+        """Hottest motor during a job, °C, from the temperatures at its start; with the curve to P(saturation)."""
+        if plan not in self._heat:
+            self._check([plan], [repetitions])
+            load = drives([phase.profile for phase in plan.phases], self.motors)
+            self._heat[plan] = LinearHeat.of(load, self.motors, self.thermal)
+        lasts_s = plan.duration_s(repetitions) * plan.weights(repetitions)
+        return peak_forecast(self._heat[plan], lasts_s, self.curve and np.array(self.curve.knots))
+
+    def peaks_from(self, plans: Sequence[Plan], repetitions: Sequence[int], known_c: Array) -> Array:
+        """Hottest motor during each job, °C, [plan], by `peak` from known temperatures [plan, KNOWN]."""
+        jobs = zip(plans, repetitions, known_c, strict=True)
+        return np.array([float(self.peak(plan, int(times)).value(known)) for plan, times, known in jobs])
 
     def with_past_jobs(
-        self, plans: Sequence[Plan], repetitions: Sequence[int], *, temp_c: Array, passed: Array
+        self, plans: Sequence[Plan], repetitions: Sequence[int], *, known_c: Array, peak_c: Array
     ) -> "RcTwin":
-        """The same twin with P(saturation) fitted on past jobs.
+        """The same twin with P(saturation) from the errors of its predictions for past jobs.
 
         Args:
-            temp_c: Motor temperatures measured at the start, [job, joint].
-            passed: Whether some motor passed the limit, bool [job].
+            known_c: Temperatures known at the start, [job, KNOWN].
+            peak_c: Hottest motor during the job, counted as in `fleet.difficulty.SETTLING_S`, [job].
 
         Raises:
-            NotEnoughExperience: too few jobs, or hardly any of one kind.
+            NotEnoughExperience: too few jobs.
         """
-        margin = np.array([p.margin(t) for p, t in zip(self.pieces(plans, repetitions), temp_c, strict=True)])
-        return replace(self, head=fit_head(margin, passed))
-
-    def risk(self, plan: Plan, repetitions: int) -> Forecast:
-        """P(saturation) of a job for any measured temperatures at its start.
-
-        Raises:
-            ValueError: the twin was fitted on no past jobs.
-        """
-        if self.head is None:
-            raise ValueError(f"The rc twin of '{self.arm}' has no P(saturation) yet; call RcTwin.with_past_jobs first.")
-        return self.head.risk(self.pieces([plan], [repetitions])[0])
+        predicted_c = self.peaks_from(plans, repetitions, known_c)
+        return replace(self, curve=fit_curve(predicted_c, peak_c, self.warning_c))
 
     def _mean_drive(self, plans: Sequence[Plan], repetitions: Sequence[int]) -> tuple[Drive, Array]:
         """Mean drive of each job over its whole time, [job, joint], and its duration, s, [job]."""

@@ -19,7 +19,7 @@ from twin.vae.model import TwinConfig, build
 from twin.vae.twin import Fit, Twin, net_names
 from twin.vae.window import Scaler
 
-FORMAT = 2
+FORMAT = 3
 WEIGHTS = "weights.safetensors"
 CARD = "twin.json"
 REFERENCE = "calibration.reference"

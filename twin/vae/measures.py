@@ -22,8 +22,8 @@ ERROR_CAP = 30.0
 LEAST_SPREAD = 0.01
 """Least p95 − median of a joint's error, z units: below it, held-out jobs differ by rounding and sensor noise."""
 TAU = CHANNELS.index("tau")
-PARTS = len(CHANNELS) + 2
-"""Numbers per joint in packed features: error of each channel, one-sided torque error, excess tau²."""
+PARTS = len(CHANNELS) + 3
+"""Numbers per joint in packed features: error of each channel, one-sided torque error, excess tau², tau²."""
 TIE = 1e-5
 """Scores closer than this relative difference are equal: the last digits of float32 depend on the batch, and counting
 a tie as higher keeps the p-value valid."""
@@ -54,6 +54,11 @@ class Features:
     def excess_sq(self) -> Array:
         """max(0, tau² − tau_hat²), (N·m)², [..., joint]: torque that heats beyond the reconstruction."""
         return self.packed[..., len(CHANNELS) + 1]
+
+    @property
+    def torque_sq(self) -> Array:
+        """tau², (N·m)², [..., joint]; owes nothing to the reconstruction."""
+        return self.packed[..., len(CHANNELS) + 2]
 
     @property
     def difficulty(self) -> Array:

@@ -4,7 +4,6 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
-from weakref import WeakKeyDictionary
 
 import msgspec
 import numpy as np
@@ -12,6 +11,7 @@ import torch
 
 from fleet.difficulty import Difficulty
 from fleet.motion import CHANNELS, Plan
+from twin.plan_cache import PlanCache
 from twin.vae import inference
 from twin.vae.measures import PARTS, TAU, Calibration, Features, Measures, measures_of
 from twin.vae.model import LstmVae, TwinConfig
@@ -45,13 +45,6 @@ class Fit:
     """The same of the KL, 0 for an autoencoder."""
 
 
-class _PlanCache(WeakKeyDictionary[Plan, Array]):
-    """Features by plan; empty in a copy and in another process."""
-
-    def __reduce__(self) -> tuple[type, tuple[()]]:
-        return _PlanCache, ()
-
-
 @dataclass(frozen=True, eq=False)
 class Twin:
     """A trained twin; implements `fleet.difficulty.DifficultyModel`. Scores are cached while their plan is alive."""
@@ -70,7 +63,7 @@ class Twin:
     """Quality of each network."""
     calibration: Calibration | None = None
     """Features of held-out cool jobs; None until `with_calibration`."""
-    _scored: _PlanCache = field(default_factory=_PlanCache, init=False, repr=False)
+    _scored: PlanCache[Array] = field(default_factory=PlanCache, init=False, repr=False)
 
     def __post_init__(self) -> None:
         wanted = self.config.networks(self.joints)
@@ -216,8 +209,9 @@ class Twin:
         size, size_hat = np.abs(z[..., TAU] + offset), np.abs(z_hat[..., TAU] + offset)
         packed = np.empty((len(z), self.joints, PARTS))
         packed[..., : len(CHANNELS)] = np.einsum("bt,btjc->bjc", weights, np.abs(z - z_hat))
-        packed[..., -2] = np.einsum("bt,btj->bj", weights, np.maximum(size - size_hat, 0.0))
-        packed[..., -1] = np.einsum("bt,btj->bj", weights, np.maximum(size**2 - size_hat**2, 0.0)) * std**2
+        packed[..., -3] = np.einsum("bt,btj->bj", weights, np.maximum(size - size_hat, 0.0))
+        packed[..., -2] = np.einsum("bt,btj->bj", weights, np.maximum(size**2 - size_hat**2, 0.0)) * std**2
+        packed[..., -1] = np.einsum("bt,btj->bj", weights, size**2) * std**2
         return packed
 
 
