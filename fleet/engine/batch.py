@@ -89,7 +89,7 @@ class Engine:
             queue=np.zeros((envs, jobs), np.int32),
             head=np.zeros(envs, int),
             current_kind=np.full((envs, arms), tables.feasible.shape[1]),
-            taken=np.zeros((envs, tables.own_space.shape[1]), np.uint64),
+            closed=np.zeros((envs, tables.excluded.shape[1]), np.uint64),
             pending=np.zeros((envs, arms), bool),
         )
         offers.mask[:, :, 0] = 1

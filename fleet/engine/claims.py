@@ -32,19 +32,25 @@ def update_offers(t: Tables, d: Jobs, s: State, o: OpenJobs, events: EventBuffer
     """
     fleets, kinds, count, release_s, after = d.fleet, d.kind, d.number, d.release_s, d.after
     due_s, expires = d.due_s, d.expires
+    pending, times_s, away, progress_s, todo = o.pending, t.times_s, s.plan, s.progress_s, s.todo
     tick, modes, status = s.tick, s.mode, s.status
     slot_job, mask, queue, head, current = o.slot_job, o.mask, o.queue, o.head, o.current_kind
-    stations, plans, excluded, taken, options = t.stations, t.plan, t.excluded, o.taken, nonnegative(t.plan.shape[3])
+    stations, plans, volume, closed, options = t.stations, t.plan, t.volume, o.closed, nonnegative(t.plan.shape[3])
+    excluded = t.excluded
     arms, slots = nonnegative(modes.shape[1]), nonnegative(slot_job.shape[1])
     waits, words, last = nonnegative(after.shape[2]), nonnegative(stations.shape[2]), nonnegative(mask.shape[2] - 1)
     busy = np.empty(words, np.uint64)
     for row in rows:
         e = nonnegative(row)
-        fleet, now_s, filled, here = nonnegative(fleets[e]), tick[e] * t.dt_s, 0, taken[e]
+        fleet, now_s, filled = nonnegative(fleets[e]), tick[e] * t.dt_s, 0
         mark_busy_stations(fleet, e, current, stations, busy)
-        mark_taken_space(t, s, o, e)
+        mark_closed_space(away, excluded, closed, e)
         for a in range(arms):
-            mask[e, a, last] = modes[e, a] == WORKING and o.pending[e, a] and cycles_begun(t, s, e, a) < s.todo[e, a]
+            mask[e, a, last] = (
+                modes[e, a] == WORKING
+                and pending[e, a]
+                and cycles_begun(times_s, away, progress_s, todo, e, a) < todo[e, a]
+            )
         place = nonnegative(head[e])
         while place < count[e]:
             j = nonnegative(queue[e, place])
@@ -74,7 +80,7 @@ def update_offers(t: Tables, d: Jobs, s: State, o: OpenJobs, events: EventBuffer
                 for n in range(options):
                     plan = plans[fleet, a, kind, n]
                     mask[e, a, 1 + filled * options + n] = (
-                        open_here and plan >= 0 and is_free(excluded, nonnegative(plan), here)
+                        open_here and plan >= 0 and not is_closed(closed, e, volume[nonnegative(plan)])
                     )
             filled += 1
         while filled < slots and slot_job[e, filled] >= 0:  # slots of the step before
@@ -95,33 +101,29 @@ def mark_busy_stations(fleet: int, e: int, current: Array, stations: Array, busy
 
 
 @jit_inline
-def mark_taken_space(t: Tables, s: State, o: OpenJobs, e: int) -> None:
-    """Put the volumes that the arms of an env take into `taken`."""
-    plans, own, taken = s.plan, t.own_space, o.taken
-    for w in range(taken.shape[1]):
-        taken[e, w] = 0
+def mark_closed_space(plans: Array, excluded: Array, closed: Array, e: int) -> None:
+    """Put the volumes that the arms of an env exclude into `closed`; none excludes a volume of the same arm."""
+    for w in range(closed.shape[1]):
+        closed[e, w] = 0
     for a in range(plans.shape[1]):
         plan = plans[e, a]
         if plan >= 0:
-            for w in range(taken.shape[1]):
-                taken[e, w] |= own[plan, w]
+            for w in range(closed.shape[1]):
+                closed[e, w] |= excluded[plan, w]
 
 
 @jit_inline
-def cycles_begun(t: Tables, s: State, e: int, a: int) -> int:
+def cycles_begun(times_s: Array, plans: Array, progress_s: Array, todo: Array, e: int, a: int) -> int:
     """Cycles of its plan that an arm at work has begun."""
-    plan = nonnegative(s.plan[e, a])
-    into_s = s.progress_s[e, a] - t.times_s[plan, 0]
-    return 0 if into_s <= 0.0 else min(int(np.ceil(into_s / t.times_s[plan, 1] - ROUNDING)), s.todo[e, a])
+    plan = nonnegative(plans[e, a])
+    into_s = progress_s[e, a] - times_s[plan, 0]
+    return 0 if into_s <= 0.0 else min(int(np.ceil(into_s / times_s[plan, 1] - ROUNDING)), todo[e, a])
 
 
 @jit_inline
-def is_free(excluded: Array, plan: int, taken: Array) -> bool:
-    """Whether a plan needs none of the space that is taken, uint64 [word]."""
-    touched = np.uint64(0)
-    for w in range(len(taken)):
-        touched |= excluded[plan, w] & taken[w]
-    return touched == 0
+def is_closed(bits: Array, row: int, volume: int) -> bool:
+    """Whether a volume is among the bits, uint64 [row, word]."""
+    return (bits[row, volume >> 6] >> np.uint64(volume & 63)) & np.uint64(1) != 0
 
 
 @jit_inline
@@ -138,7 +140,7 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
     progress_s, todo, cycles = s.progress_s, s.todo, s.cycles
     slot_job, mask, queue, head, current, pending = o.slot_job, o.mask, o.queue, o.head, o.current_kind, o.pending
     stations, work, recording = t.stations, t.work, len(events.what) > 0
-    plans, plan_of, own, excluded, taken = s.plan, t.plan, t.own_space, t.excluded, o.taken
+    plans, plan_of, volume, excluded, closed = s.plan, t.plan, t.volume, t.excluded, o.closed
     arms, options, words = (
         nonnegative(modes.shape[1]),
         nonnegative(plan_of.shape[3]),
@@ -148,7 +150,7 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
     busy, key, order = np.empty(words, np.uint64), np.empty(arms), np.empty(arms, np.int64)
     for row in rows:
         e = nonnegative(row)
-        fleet, claims, here = nonnegative(fleets[e]), 0, taken[e]
+        fleet, claims = nonnegative(fleets[e]), 0
         for a in range(arms):
             action = actions[e, a]
             last[e, a] = 0
@@ -160,7 +162,7 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
                     record_event(events, ILLEGAL, e, a, -1, -1, 0.0, 0.0)
                 continue
             if action == give_back:
-                s.todo[e, a] = cycles_begun(t, s, e, a)
+                todo[e, a] = cycles_begun(t.times_s, plans, progress_s, todo, e, a)
                 continue
             slot, option = divmod(action - 1, options)
             score = work[fleet, a, kinds[e, slot_job[e, slot]], option]["difficulty"]
@@ -181,7 +183,7 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
             j, option = nonnegative(slot_job[e, slot]), nonnegative(option)
             kind, free = nonnegative(kinds[e, j]), status[e, j] == WAITING
             plan = nonnegative(plan_of[fleet, a, kind, option])
-            free = free and is_free(excluded, plan, here)
+            free = free and not is_closed(closed, e, volume[plan])
             for w in range(words):
                 free = free and (stations[fleet, kind, w] & busy[w]) == 0
             if not free:
@@ -194,8 +196,8 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
             remove_from_queue(queue, head, e, j)
             last[e, a], status[e, j] = 1, RUNNING
             modes[e, a], jobs[e, a], plans[e, a], progress_s[e, a] = WORKING, j, plan, 0.0
-            for w in range(len(here)):
-                here[w] |= own[plan, w]
+            for w in range(closed.shape[1]):
+                closed[e, w] |= excluded[plan, w]
             current[e, a], pending[e, a] = kind, True
             todo[e, a] = repetitions[e, j] - cycles[e, j]
             if recording:

@@ -4,14 +4,14 @@
 `fleet.engine.peers` replaces the peers' fields by what was delivered.
 """
 
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
 from fleet.difficulty import KNOWN, probability_of
-from fleet.engine.claims import is_free
+from fleet.engine.claims import is_closed
 from fleet.engine.crossings import hottest
-from fleet.engine.tables import LANES, Simulation, Tables
+from fleet.engine.tables import LANES, Simulation
 from fleet.jit import jit_inline, nonnegative
 from fleet.observation import LONG_S
 from fleet.robot import JOINTS
@@ -19,6 +19,16 @@ from fleet.seeding import random_normal
 from fleet.telemetry import FAULTED, IDLE, WORKING
 
 Array = np.ndarray
+
+
+class ForecastTables(NamedTuple):
+    """The forecasts of the tables by themselves: passing all tables to a function takes longer than the function."""
+
+    offset: Array
+    weight: Array
+    time_s: Array
+    curve: Array
+
 
 PEAK_LOW_C, PEAK_HIGH_C = -60.0, 300.0
 """Bounds of predicted temperatures in the vector."""
@@ -39,7 +49,7 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
     ticks, temp_c, modes, progress_s, todo = s.tick, s.temp_c, s.mode, s.progress_s, s.todo
     last, queued_s, cycles, returns = s.last_award, s.queued_s, s.cycles, s.returns
     slot_job, station_free, plans, times_s = o.slot_job, o.station_free, s.plan, t.times_s
-    plan_of, own_space, excluded, taken = t.plan, t.own_space, t.excluded, o.taken
+    plan_of, volume, excluded, closed = t.plan, t.volume, t.excluded, o.closed
     noise_k, payload_kg, values, work = t.sensor_noise_k, t.payload_kg, t.value, t.work
     arms, slots, options = nonnegative(modes.shape[1]), nonnegative(slot_job.shape[1]), nonnegative(plan_of.shape[3])
     at, low, high, first, change = form.offsets, form.low, form.high, form.first_change, form.change
@@ -51,7 +61,8 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
     true_c, measured_c, headroom_k = np.empty(LANES), np.empty((arms, LANES)), np.empty(arms, np.float32)
     left, slack_s, slot_kind = np.empty(slots), np.empty(slots), np.empty(slots, np.int64)
     known, shared = np.zeros((arms, slots), np.float32), np.zeros((arms, slots), np.float32)
-    away = np.zeros(taken.shape[1], np.uint64)  # space that other arms take
+    tables = ForecastTables(t.forecast_offset, t.forecast_weight, t.forecast_time_s, t.forecast_curve)
+    warning_c = t.warning_c
     known_c, values_c, left_s = np.zeros(KNOWN), np.empty(t.forecast_offset.shape[1]), np.zeros(arms)
     housing_c, ambient, offsets_k = s.housing_c, t.ambient_c, d.ambient_offset_k
     too_heavy, expires = t.too_heavy, d.expires
@@ -133,10 +144,14 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
                 out[e, a, at.job_cycles] = min(repetitions[e, j] - cycles[e, j] - cycles_over, LONG_S)
                 for n in range(options):
                     if plan_of[fleet, a, kind, n] == plan:
-                        p, peak_c = predict(t, work[fleet, a, kind, n], known_c, left_s[a], values_c)
-                        out[e, a, at.job_p], out[e, a, at.job_peak_c] = p, max(peak_c, t.warning_c - headroom_k[a])
-            for w in range(len(away)):
-                away[w] = taken[e, w] & ~own_space[plans[e, a], w] if plans[e, a] >= 0 else taken[e, w]
+                        own = work[fleet, a, kind, n]
+                        p, risk, peak, peak_c = own["p_saturation"], own["risk"], own["peak"], 0.0
+                        if risk >= 0 or peak >= 0:
+                            p, peak_c = predict(p, risk, peak, tables, known_c, left_s[a], values_c)
+                            if peak >= 0:
+                                peak_c = max(peak_c, warning_c - headroom_k[a])
+                        out[e, a, at.job_p] = 0.5 if np.isnan(p) else p
+                        out[e, a, at.job_peak_c] = min(max(peak_c, PEAK_LOW_C), PEAK_HIGH_C)
             for k in range(filled):
                 kind = nonnegative(slot_kind[k])
                 out[e, a, at.too_heavy + k] = too_heavy[fleet, kind, a]
@@ -146,53 +161,59 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
                         continue
                     own = work[fleet, a, kind, n]
                     duration_s, score = own["travel_s"] + left[k] * own["cycle_s"], own["difficulty"]
-                    space_free = is_free(excluded, plan, away)
+                    space_free = not is_closed(closed, e, volume[plan])
                     out[e, a, at.feasible + option], out[e, a, at.space_free + option] = 1.0, space_free
                     if n == 0 and not space_free:
                         for peer in range(peers):
                             other = plans[e, who[a, peer]]
-                            if other >= 0 and not is_free(excluded, plan, own_space[other]):
+                            if other >= 0 and is_closed(excluded, nonnegative(other), volume[plan]):
                                 out[e, a, at.peer_blocks + peer * slots + k] = 1.0
                     out[e, a, at.duration_s + option] = min(duration_s, LONG_S)
                     out[e, a, at.slack_s + option] = min(max(slack_s[k] - duration_s, -LONG_S), LONG_S)
                     if not np.isnan(score):
                         out[e, a, at.known + option], out[e, a, at.difficulty + option] = 1.0, score
-                    p, peak_c = predict(t, own, known_c, np.inf, values_c)
-                    out[e, a, at.p_saturation + option], out[e, a, at.peak_c + option] = p, peak_c
+                    p, risk, peak = own["p_saturation"], own["risk"], own["peak"]
+                    if risk >= 0 or peak >= 0:
+                        p, peak_c = predict(p, risk, peak, tables, known_c, np.inf, values_c)
+                        out[e, a, at.peak_c + option] = min(max(peak_c, PEAK_LOW_C), PEAK_HIGH_C)
+                    if not np.isnan(p):
+                        out[e, a, at.p_saturation + option] = p
 
 
 @jit_inline
-def predict(t: Tables, work: Any, known_c: Array, left_s: float, values: Array) -> tuple[float, float]:
-    """P(saturation), 0.5 if unknown, and predicted peak temperature, °C, 0 if unknown, of a plan.
+def predict(
+    p: float, risk: int, peak: int, tables: ForecastTables, known_c: Array, left_s: float, values: Array
+) -> tuple[float, float]:
+    """P(saturation), NaN if unknown, and predicted peak temperature, °C, 0 if unknown, of a plan.
 
     Args:
-        work: Record of `WORK` (Any: numba's and numpy's records differ).
+        p: From a model that ignores the temperatures; NaN if there is none.
+        risk: Row of the forecast of P, −1 for none.
+        peak: Row of the forecast of the peak temperature, −1 for none.
         known_c: [KNOWN].
         left_s: Pieces of later moments do not count.
         values: Room for the values of the pieces, [piece].
     """
-    p, peak_c, risk, peak = work["p_saturation"], 0.0, work["risk"], work["peak"]
+    curve, peak_c = tables.curve, 0.0
     if peak >= 0:
-        peak_c = largest_piece(t, nonnegative(peak), known_c, left_s, values)
-        curve = t.forecast_curve[nonnegative(peak)]
-        if risk < 0 and np.isnan(p) and len(curve) > 0 and not np.isnan(curve[0, 0]):
-            p = probability_of(peak_c, curve)
+        peak_c = largest_piece(tables, peak, known_c, left_s, values)
+        if curve.shape[1] > 0 and risk < 0 and np.isnan(p) and not np.isnan(curve[peak, 0, 0]):
+            p = probability_of(peak_c, curve[peak])
     if risk >= 0:
-        value = largest_piece(t, nonnegative(risk), known_c, left_s, values)
-        p = probability_of(value, t.forecast_curve[nonnegative(risk)])
-    return 0.5 if np.isnan(p) else p, min(max(peak_c, PEAK_LOW_C), PEAK_HIGH_C)
+        p = probability_of(largest_piece(tables, risk, known_c, left_s, values), curve[risk])
+    return p, peak_c
 
 
 @jit_inline
-def largest_piece(t: Tables, row: int, known_c: Array, left_s: float, values: Array) -> float:
+def largest_piece(tables: ForecastTables, row: int, known_c: Array, left_s: float, values: Array) -> float:
     """Value of a forecast without the pieces of moments later than `left_s`, −inf if none is left."""
+    offset, weight, time_s, most = tables.offset, tables.weight, tables.time_s, -np.inf
     for piece in range(len(values)):
-        values[piece] = t.forecast_offset[row, piece]
+        values[piece] = offset[row, piece]
     for i in range(KNOWN):
         for piece in range(len(values)):
-            values[piece] += t.forecast_weight[row, i, piece] * known_c[i]
-    most = -np.inf
+            values[piece] += weight[row, i, piece] * known_c[i]
     for piece in range(len(values)):
-        if t.forecast_time_s[row, piece] <= left_s:
+        if time_s[row, piece] <= left_s:
             most = max(most, values[piece])
     return most

@@ -77,10 +77,10 @@ class Tables(NamedTuple):
     """[plan, phase, lane]."""
     friction_w: Array
     """[plan, phase, lane]."""
-    own_space: Array
-    """Volume that a plan takes, one bit, uint64 [plan, word]; volumes are counted for each fleet."""
+    volume: Array
+    """Volume that a plan takes, int [plan]; volumes are counted for each fleet."""
     excluded: Array
-    """Volumes that must be free for a plan, one bit each, uint64 [plan, word]."""
+    """Volumes that no other arm can take meanwhile, one bit each, uint64 [plan, word]."""
     plan: Array
     """Row of the plan tables, −1 where the arm has none, int [fleet, arm, kind, plan]; the fastest first."""
     work: Array
@@ -163,8 +163,8 @@ class OpenJobs(NamedTuple):
     """Where in its row the queue begins, int [env]."""
     current_kind: Array
     """Kind of an arm's current job, int [env, arm]; the number of kinds if it has none."""
-    taken: Array
-    """Volumes that arms take which are away from home, one bit each, uint64 [env, word]."""
+    closed: Array
+    """Volumes that arms away from home exclude, one bit each, uint64 [env, word]."""
     pending: Array
     """Whether the current job is still to be finished, bool [env, arm]; False on the way home."""
 
@@ -252,7 +252,6 @@ def tables_of(world: World) -> tuple[Tables, Jobs]:
 
     limits, motors, offers, rest = world.limits, world.motors, world.offers, world.rest
     can = offers.plan >= 0
-    volumes = np.eye(len(world.conflicts), dtype=bool)
     times_s = np.where(can[..., None], world.plans.times_s[offers.plan], 0.0)
     work = np.zeros(can.shape, WORK)
     work["travel_s"], work["cycle_s"] = times_s[..., 0] + times_s[..., 2], times_s[..., 1]
@@ -287,7 +286,7 @@ def tables_of(world: World) -> tuple[Tables, Jobs]:
         times_s=world.plans.times_s,
         current_sq=pad(world.plans.current_sq),
         friction_w=pad(world.plans.friction_w),
-        own_space=bits(volumes[world.plans.volume]),
+        volume=world.plans.volume,
         excluded=bits(world.conflicts[world.plans.volume]),
         plan=offers.plan,
         work=work,
@@ -375,7 +374,7 @@ def owned(arrays: Arrays) -> Arrays:
 
 
 _SCALARS = tuple(name for name, kind in Tables.__annotations__.items() if kind is not Array)
-_RENUMBERED = ("plan", "stations", "own_space", "excluded", *_FORECAST)
+_RENUMBERED = ("plan", "stations", "excluded", *_FORECAST)
 
 
 def stack_tables(fleets: Sequence[Tables]) -> Tables:
@@ -418,7 +417,6 @@ def stack_tables(fleets: Sequence[Tables]) -> Tables:
             forecast_time_s=np.concatenate([pad(t.forecast_time_s, 1, pieces) for t in fleets]),
             forecast_curve=np.concatenate([_extend_curve(t.forecast_curve, knots) for t in fleets]),
             stations=_same_words([t.stations for t in fleets]),
-            own_space=_same_words([t.own_space for t in fleets]),
             excluded=_same_words([t.excluded for t in fleets]),
         )
     )

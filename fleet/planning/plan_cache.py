@@ -26,7 +26,7 @@ Array = np.ndarray
 T = TypeVar("T")
 log = logging.getLogger(__name__)
 
-PLANNER_VERSION = 2
+PLANNER_VERSION = 3
 """Increment it whenever the plans of the same work change."""
 
 

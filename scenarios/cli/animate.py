@@ -12,7 +12,7 @@ import typer
 from agents.registry import NAMES_HELP
 from fleet.errors import FleetError
 from fleet.files import atomic_path
-from scenarios.cli.options import MAX_SEED, DifficultyOption, ScenarioArg, number
+from scenarios.cli.options import MAX_SEED, DifficultyOption, RiskOption, ScenarioArg, number
 from scenarios.cli.terminal import out_console, progress_bar, say
 from scenarios.load import load
 from scenarios.policy_loader import label, policy_at, policy_of
@@ -47,6 +47,7 @@ def animate_command(
         float, number("Length of the animation, s; the last frame is held 1 s longer.", 1, 3600)
     ] = SECONDS,
     difficulty: DifficultyOption = "twin",
+    risk: RiskOption = "rc",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace --out if it exists.")] = False,
 ) -> None:
     """Simulate one shift and draw it as a GIF: the cell from above, motors coloured by temperature."""
@@ -61,7 +62,7 @@ def animate_command(
     with disk_errors(where):
         where.parent.mkdir(parents=True, exist_ok=True)
     with progress_bar() as progress, disk_errors(where), atomic_path(where) as file:
-        frames = _frames(chosen, policy, seed, difficulty, stride, pixels, progress)
+        frames = _frames(chosen, policy, seed, (difficulty, risk), stride, pixels, progress)
         images, length_s = write_gif(file, frames, seconds)
     say(f"Drew {images} frames, {length_s:.1f} s, {where.stat().st_size / 1e6:.1f} MB: {where}.", out_console)
 
@@ -103,15 +104,26 @@ def _stride(ticks: int, every: int | None, size: "Pixel", seconds: float) -> int
 
 
 def _frames(
-    scenario: "Scenario", policy: str, seed: int, difficulty: str, stride: int, size: "Pixel", progress: Progress
+    scenario: "Scenario",
+    policy: str,
+    seed: int,
+    models: tuple[str, str],
+    stride: int,
+    size: "Pixel",
+    progress: Progress,
 ) -> "Iterator[np.ndarray]":
-    """Frames of the shift of `thermofleet run` with this seed: its start, every `stride` decisions, its end."""
+    """Frames of the shift of `thermofleet run` with this seed: its start, every `stride` decisions, its end.
+
+    Args:
+        models: What difficulty and risk follow from.
+    """
     from fleet.env.render.picture import Picture
     from fleet.env.render.scene import scene_of
     from scenarios.cell_layout import cell_of
-    from scenarios.prepare.fleet import DifficultyName, env_of, prepare
+    from scenarios.prepare.fleet import DifficultyName, RiskName, env_of, prepare
 
-    fleet = prepare(scenario, difficulty=choose("difficulty", difficulty, DifficultyName), progress=progress)
+    difficulty, risk = choose("difficulty", models[0], DifficultyName), choose("risk", models[1], RiskName)
+    fleet = prepare(scenario, difficulty=difficulty, risk=risk, progress=progress)
     cell, picture, chosen = cell_of(scenario), Picture(size), policy_at(policy, seed)
     title = f"{scenario.name} · {label(policy)} · seed {seed}"
     env = env_of(fleet)

@@ -33,6 +33,7 @@ def compare_command(
         ),
     ] = None,
     difficulty: options.DifficultyOption = "twin",
+    risk: options.RiskOption = "rc",
     as_json: options.JsonOption = False,
     topology: options.TopologyOption = "complete",
     radius: options.RadiusOption = 0.5,
@@ -43,7 +44,7 @@ def compare_command(
     partition: options.PartitionOption = None,
 ) -> None:
     """Compare policies on the same seeds, with confidence intervals."""
-    from scenarios.prepare.fleet import DifficultyName
+    from scenarios.prepare.fleet import DifficultyName, RiskName
     from scenarios.run.compare import compare, comparison_table
 
     chosen = load(scenario)
@@ -59,6 +60,7 @@ def compare_command(
             seeds=range(first_seed, first_seed + seeds),
             baseline=baseline or ("round_robin" if "round_robin" in names else names[0]),
             difficulty=choose("difficulty", difficulty, DifficultyName),
+            risk=choose("risk", risk, RiskName),
             channel=channel,
             progress=progress,
         )

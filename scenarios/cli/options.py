@@ -57,6 +57,14 @@ SeedOption = Annotated[int, number("Random seed of jobs, sensor noise and policy
 DifficultyOption = Annotated[
     str, typer.Option(help="Source of the difficulty scores: twin, oracle (simulator) or blind (none).")
 ]
+RiskOption = Annotated[
+    str,
+    typer.Option(
+        help="With --difficulty twin, what P(saturation) follows from: rc (the peak predicted by the arm's thermal "
+        "network, identified from its logs), rc-nominal (by that of a nominal arm), or excess, load, errors (of the "
+        "learned twin), torque (mean squared torque)."
+    ),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result in --out.")]
 

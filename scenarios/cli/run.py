@@ -40,6 +40,7 @@ def run_command(
     ] = "profile",
     bus: Annotated[str, typer.Option(help="zenoh (in-process router) or memory.")] = "zenoh",
     difficulty: options.DifficultyOption = "twin",
+    risk: options.RiskOption = "rc",
     overwrite: options.OverwriteOption = False,
     listen: Annotated[
         int,
@@ -67,7 +68,7 @@ def run_command(
         chosen, partition, topology=topology, radius=radius, topology_seed=topology_seed, delay_s=delay_s,
         jitter_s=jitter_s, loss=loss,
     )  # fmt: skip
-    spec = _spec(policy, seed, plant, bus, difficulty, channel)
+    spec = _spec(policy, seed, plant, bus, difficulty, risk, channel)
     if listen and bus == "memory":
         raise FleetError(f"--listen needs --bus zenoh (got {listen} and {bus}).")
     where = out or Path("runs") / f"{chosen.name}-{label(policy)}-{seed}"
@@ -118,8 +119,8 @@ def demo_command(
     say(f"Open {out / 'least_difficulty' / 'report.html'} in a browser to see what happened.", out_console)
 
 
-def _spec(policy: str, seed: int, plant: str, bus: str, difficulty: str, channel: Channel) -> "RunSpec":
-    from scenarios.prepare.fleet import BusName, DifficultyName, PlantName
+def _spec(policy: str, seed: int, plant: str, bus: str, difficulty: str, risk: str, channel: Channel) -> "RunSpec":
+    from scenarios.prepare.fleet import BusName, DifficultyName, PlantName, RiskName
     from scenarios.run.shift import RunSpec
 
     policy_of(policy)
@@ -129,6 +130,7 @@ def _spec(policy: str, seed: int, plant: str, bus: str, difficulty: str, channel
         plant=choose("plant", plant, PlantName),
         bus=choose("bus", bus, BusName),
         difficulty=choose("difficulty", difficulty, DifficultyName),
+        risk=choose("risk", risk, RiskName),
         channel=channel,
     )
 
@@ -149,7 +151,7 @@ def _run_into(
     from scenarios.run.shift import run
 
     with new_folder(out, RUN, overwrite=overwrite) as folder:
-        fleet = fleet or prepare(scenario, difficulty=spec.difficulty, progress=progress)
+        fleet = fleet or prepare(scenario, difficulty=spec.difficulty, risk=spec.risk, progress=progress)
         with stop_on_interrupt() as stopped:
             result = run(fleet, spec, progress=progress, stopped=stopped, endpoint=endpoint)
             progress("writing", 0.0)

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from fleet.errors import FleetError
-from scenarios.cli.options import MAX_SEED, DifficultyOption, ScenarioArg, number
+from scenarios.cli.options import MAX_SEED, DifficultyOption, RiskOption, ScenarioArg, number
 from scenarios.cli.terminal import out_console, progress_bar, say
 from scenarios.extras import require_extra
 from scenarios.load import load
@@ -32,6 +32,7 @@ def train_command(
     resume: Annotated[bool, typer.Option("--resume", help="Continue the training in --out.")] = False,
     threads: Annotated[int, number("Threads of the network's computations.", 1, 1024)] = 1,
     difficulty: DifficultyOption = "twin",
+    risk: RiskOption = "rc",
 ) -> None:
     """Train a policy by reinforcement learning, with checkpoints and learning curves; Ctrl-C keeps the result so far.
 
@@ -43,7 +44,7 @@ def train_command(
     where = out or Path("runs") / f"{chosen.name}-{algo}-{seed}"
     require_extra("learn")
     from agents.learned.ppo import Algorithm, PpoConfig, use_threads
-    from scenarios.prepare.fleet import DifficultyName
+    from scenarios.prepare.fleet import DifficultyName, RiskName
     from scenarios.run.train_policy import CURVE, TrainingPlan, train
 
     use_threads(threads)
@@ -53,9 +54,9 @@ def train_command(
     except ValueError as error:
         raise FleetError(str(error)) from error
     plan = TrainingPlan(minutes=minutes, iterations=iterations)
-    scorer = choose("difficulty", difficulty, DifficultyName)
+    models = {"difficulty": choose("difficulty", difficulty, DifficultyName), "risk": choose("risk", risk, RiskName)}
     with progress_bar() as progress:
-        done = train(chosen, config, where, plan, difficulty=scorer, resume=resume, progress=progress, tell=say)
+        done = train(chosen, config, where, plan, **models, resume=resume, progress=progress, tell=say)
     stopped = "Interrupted after" if done.interrupted else "Trained"
     say(
         f"{stopped} {done.iterations} iterations, {done.env_steps} env steps, {done.seconds:.0f} s; the best network "

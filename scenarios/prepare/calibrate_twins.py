@@ -1,36 +1,54 @@
-"""Give a scenario's twins a probability of saturation, fitted on simulated past jobs of their arms.
+"""Give a scenario's twins a predicted peak and a probability of saturation, from simulated past jobs of their arms.
 
 An arm that has worked for weeks has such jobs in its records. Here they are simulated: the arm's own work and random
-work with heavy payloads, for different durations and from different temperatures, critical jobs included.
+work with heavy payloads, in every ambient temperature of its hall, from cold, idle and hot starts.
 """
 
 import hashlib
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
 
+from fleet.motion import Plan
+from fleet.planning.options import offered_plans
 from fleet.planning.random_motions import RANDOM_MOTIONS_VERSION, random_jobs
+from scenarios.job_stream import works_of
+from scenarios.prepare.identify_arms import identify_arms
 from scenarios.prepare.model_cache import CachedModel, load_or_make
-from scenarios.prepare.planned_arm import PlannedArm
-from scenarios.prepare.simulated_history import experience, past_jobs
+from scenarios.prepare.planned_arm import PlannedArm, air_offsets
+from scenarios.prepare.simulated_history import PastJobs, experience, past_jobs, repetitions_for
 from scenarios.progress import Progress
 from scenarios.schema import Scenario
-from twin.saturation.fit import Experience, NotEnoughExperience, fit_saturation
-from twin.saturation.model import CalibratedTwin, load_calibrated, save_saturation
+from twin.calibrated import CalibratedTwin
+from twin.saturation.fit import NotEnoughExperience, fit_saturation
+from twin.saturation.model import Evidence, SaturationModel, load_saturation, save_saturation
+from twin.thermal.checkpoint import load_curve, save_curve
+from twin.thermal.parameters import HeatModel
+from twin.thermal.risk import PeakCurve
+from twin.thermal.thermal_twin import RcTwin
 from twin.vae.twin import Twin
 
-RECIPE = 2
+if TYPE_CHECKING:
+    from scenarios.prepare.fleet import RiskName
+
+Array = np.ndarray
+
+RECIPE = 3
 """Raise it whenever the same twin and scenario would give other past jobs or another fit."""
 PAST = 4
 """Spawn key, different from those of `scenarios.prepare.train_twins` for the same arm."""
-PAST_JOBS = 300
+PAST_JOBS = 400
 """Past jobs of each arm: enough that even a well-cooled arm has some in which a motor passed the limit."""
-OWN = 0.5
+OWN = 0.6
 """Share of the past jobs that are the scenario's own work."""
 HEAVY_KG = (2.0, 4.0)
 """Payloads of the other jobs: lighter ones say little about saturation."""
+AIR_MARGIN_K = 3.0
+"""By how much the ambient temperature of past jobs exceeds the scenario's range at either end."""
 
 
 def calibrate_twins(
@@ -40,50 +58,110 @@ def calibrate_twins(
     folder: Path,
     progress: Progress,
     *,
+    risk: "RiskName" = "rc",
     jobs: int = PAST_JOBS,
-) -> list[CalibratedTwin | Twin]:
-    """Every arm's twin with its probability of saturation, from the folder where possible.
+) -> list[CalibratedTwin]:
+    """Every arm's twin with its predicted peak and probability of saturation, from the folder where possible.
 
-    A twin whose past jobs say too little about saturation is returned without that probability; a warning says why.
+    A twin whose past jobs say too little about saturation gets no probability; a warning says why.
+
+    Args:
+        arms: With their plans for all motion of the scenario, light loads included.
     """
-    models = [_model(scenario, arm, twin, folder, jobs) for arm, twin in zip(arms, twins, strict=True)]
-    return load_or_make(models, "calibrating", progress)
+    spec, cooling = scenario.twin, [arm.hardware.robot.cooling for arm in arms]
+    names = [arm.hardware.robot.name for arm in arms]
+    if risk == "rc":
+        heats = [RcTwin.of(found) for found in identify_arms(scenario, arms, folder, progress)]
+    else:
+        heats = [RcTwin.nominal(n, ambient_c=spec.ambient_c, cooling=c) for n, c in zip(names, cooling, strict=True)]
+    heats = [replace(heat, warning_c=scenario.limits.warning_c) for heat in heats]
+    inputs = list(zip(arms, twins, heats, strict=True))
+    if risk in ("rc", "rc-nominal"):
+        makers = [_curve(scenario, arm, heat, folder, jobs) for arm, _, heat in inputs]
+        curves = load_or_make(makers, "calibrating", progress)
+        return [CalibratedTwin(t, replace(heat, curve=c)) for (_, t, heat), c in zip(inputs, curves, strict=True)]
+    models = [_saturation(scenario, a, t, heat, risk, folder, jobs) for a, t, heat in inputs]
+    fitted = load_or_make(models, "calibrating", progress)
+    return [CalibratedTwin(t, heat, model) for (_, t, heat), model in zip(inputs, fitted, strict=True)]
 
 
-def _model(
-    scenario: Scenario, arm: PlannedArm, twin: Twin, folder: Path, jobs: int
-) -> CachedModel[CalibratedTwin | Twin]:
-    def load(home: Path) -> CalibratedTwin | Twin:
-        return load_calibrated(twin, home) if home.is_dir() else twin
+def _curve(scenario: Scenario, arm: PlannedArm, heat: RcTwin, folder: Path, jobs: int) -> CachedModel[PeakCurve]:
+    def make(home: Path, _report: Callable[[float], None]) -> None:
+        past = simulate_past(scenario, arm, heat.heat_model, jobs=jobs)
+        fitted = heat.with_past_jobs(past.plans, past.repetitions, known_c=past.known_c, peak_c=past.hottest_c)
+        assert fitted.curve is not None
+        save_curve(fitted.curve, home)
+
+    return CachedModel(folder / "saturation" / _key(scenario, arm, heat.version, jobs), load_curve, make)
+
+
+def _saturation(
+    scenario: Scenario, arm: PlannedArm, twin: Twin, heat: RcTwin, evidence: Evidence, folder: Path, jobs: int
+) -> CachedModel[SaturationModel | None]:
+    def load(home: Path) -> SaturationModel | None:
+        return load_saturation(home) if home.is_dir() else None
 
     def make(home: Path, _report: Callable[[float], None]) -> str | None:
+        past = simulate_past(scenario, arm, heat.heat_model, jobs=jobs)
         try:
-            save_saturation(fit_saturation(simulate_experience(scenario, arm, twin, jobs=jobs)), home)
+            save_saturation(fit_saturation(experience(twin, past), evidence=evidence), home)
         except NotEnoughExperience as error:
             return f"{scenario.name}: arm '{arm.hardware.robot.name}' gets no probability of saturation. {error}"
         return None
 
-    return CachedModel(folder / "saturation" / _key(scenario, arm, twin, jobs), load, make)
+    version = f"{evidence}-{twin.version}-{heat.version}"
+    return CachedModel(folder / "saturation" / _key(scenario, arm, version, jobs), load, make)
 
 
-def simulate_experience(scenario: Scenario, arm: PlannedArm, twin: Twin, *, jobs: int = PAST_JOBS) -> Experience:
-    """Simulated past jobs of an arm with its twin's features; the same for every seed of a run.
+def simulate_past(scenario: Scenario, arm: PlannedArm, known: HeatModel, *, jobs: int = PAST_JOBS) -> PastJobs:
+    """Simulated past jobs of an arm that knows this of its heat; the same for every seed of a run.
 
-    A share `OWN` of the jobs is drawn from the arm's plans.
+    A share `OWN` of the jobs is drawn from the scenario's streams.
     """
     rng = np.random.default_rng(np.random.SeedSequence([scenario.spread.seed, arm.index], spawn_key=(PAST,)))
-    plans = arm.all_plans
-    count = round(OWN * jobs) if plans else 0
-    own = [plans[i] for i in rng.integers(max(len(plans), 1), size=count)]
-    mixed = (*own, *random_jobs(arm.hardware.robot, jobs - count, rng, payload_kg=HEAVY_KG))
-    return experience(twin, past_jobs(arm.hardware, mixed, rng, warning_c=scenario.limits.warning_c))
+    own = _own_jobs(scenario, arm, round(OWN * jobs), rng)
+    other = random_jobs(arm.hardware.robot, jobs - len(own), rng, payload_kg=HEAVY_KG)
+    repetitions = [times for _, times in own] + repetitions_for(other, rng).tolist()
+    return past_jobs(
+        arm.hardware,
+        [*(plan for plan, _ in own), *other],
+        rng,
+        limits=scenario.limits,
+        ambient_c=_ambient_range(scenario, arm.index),
+        repetitions=np.array(repetitions, dtype=int),
+        known=known,
+    )
 
 
-def _key(scenario: Scenario, arm: PlannedArm, twin: Twin, jobs: int) -> str:
-    """Cache key of a model: its twin, the arm's hardware and plans, and the recipe of the past jobs."""
-    robot = arm.hardware.robot
-    parts = [RECIPE, RANDOM_MOTIONS_VERSION, jobs, twin.version, scenario.spread.seed, scenario.limits.warning_c, robot]
-    digest = hashlib.sha256(msgspec.json.encode(parts))
+def _own_jobs(scenario: Scenario, arm: PlannedArm, count: int, rng: np.random.Generator) -> list[tuple[Plan, int]]:
+    """Plans that the arm offers for jobs of the scenario, with repetitions; none if it can do no work."""
+    possible = [
+        (stream, works)
+        for stream in scenario.jobs
+        if (works := [work for work in works_of(scenario, stream) if arm.plans.get(work)])
+    ]
+    jobs = []
+    for _ in range(count if possible else 0):
+        stream, works = possible[rng.integers(len(possible))]
+        fewest, most = stream.repetitions
+        repetitions = int(rng.integers(fewest, most + 1))
+        offered = offered_plans(arm.plans[works[rng.integers(len(works))]], repetitions)
+        jobs.append((offered[rng.integers(len(offered))], repetitions))
+    return jobs
+
+
+def _ambient_range(scenario: Scenario, index: int) -> tuple[float, float]:
+    """Ambient temperatures of past jobs at one arm: those of the scenario and a margin."""
+    offset_k = float(air_offsets(scenario)[index])
+    temps = [temp_c + offset_k for _, temp_c in scenario.ambient.points]
+    return min(temps) - AIR_MARGIN_K, max(temps) + AIR_MARGIN_K
+
+
+def _key(scenario: Scenario, arm: PlannedArm, version: str, jobs: int) -> str:
+    """Cache key of a model: the version of what it calibrates, the arm's hardware and plans, and the past jobs."""
+    robot, air_c = arm.hardware.robot, _ambient_range(scenario, arm.index)
+    parts = [RECIPE, RANDOM_MOTIONS_VERSION, jobs, version, scenario.spread.seed, scenario.limits, robot, air_c]
+    digest = hashlib.sha256(msgspec.json.encode([*parts, scenario.jobs]))
     digest.update(arm.hardware.content())
     for phase in (phase for plan in arm.all_plans for phase in plan.phases):
         digest.update(f"{phase.profile.shape}".encode())

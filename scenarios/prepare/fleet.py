@@ -21,17 +21,18 @@ from fleet.errors import FleetError, InfeasibleJob, ScenarioError, nearest
 from fleet.files import cache_folder
 from fleet.job import Job
 from fleet.motion import Plan
-from fleet.motor import thermal_data
+from fleet.motor import Motors
 from fleet.planning.plan_cache import rest_torque
 from fleet.planning.space import SpaceTable, collisions_of_homes, space_table
 from fleet.robot import Robot
 from fleet.seeding import shift_seeds
+from fleet.thermal import ThermalModel
 from scenarios.cell_layout import cell_of, near_of
 from scenarios.extras import require_extra
 from scenarios.fault_price import weights_of
 from scenarios.job_stream import JobSampler, all_works, rehearsal_works, works_of
 from scenarios.load import load, override
-from scenarios.prepare.planned_arm import PlannedArm, homes_in_fixtures, plan_arms
+from scenarios.prepare.planned_arm import PlannedArm, air_offsets, homes_in_fixtures, plan_arms
 from scenarios.progress import Progress, quiet
 from scenarios.schema import Scenario
 from scenarios.schema_errors import choose
@@ -41,6 +42,10 @@ if TYPE_CHECKING:  # a single arm needs neither the environment nor MuJoCo
     from fleet.env.allocation_v1 import AllocationEnv, MaskPlace
 
 DifficultyName = Literal["twin", "blind", "oracle"]
+RiskName = Literal["rc", "rc-nominal", "excess", "load", "errors", "torque"]
+"""What the twins' P(saturation) follows from: the peak predicted by the arm's identified or by the nominal thermal
+network, or evidence of the learned twin (`twin.saturation.model.evidence_of`)."""
+RISK: RiskName = "rc"
 PlantName = Literal["profile", "mujoco"]
 BusName = Literal["zenoh", "memory"]
 
@@ -61,6 +66,7 @@ def prepare(
     scenario: Scenario,
     *,
     difficulty: DifficultyName = "twin",
+    risk: RiskName = RISK,
     cache: str | Path | None = None,
     progress: Progress = quiet,
 ) -> Fleet:
@@ -70,7 +76,7 @@ def prepare(
         ScenarioError: no arm can do some work, or arms at home are too close to each other.
         MissingExtra: twins are wanted, and their libraries are not installed.
     """
-    arms, refused = _arms(scenario, range(len(scenario.arms)), difficulty, cache, progress, every_work=True)
+    arms, refused = _arms(scenario, range(len(scenario.arms)), difficulty, risk, cache, progress, every_work=True)
     plans = [plan for arm in arms for variants in arm.plans.values() for plan in variants]
     space = space_of(scenario, [arm.robot for arm in arms], plans, _folder(cache))
     return Fleet(scenario, tuple(arms), tuple(refused), space)
@@ -86,6 +92,7 @@ def prepare_arm(
     name: str,
     *,
     difficulty: DifficultyName = "twin",
+    risk: RiskName = RISK,
     cache: str | Path | None = None,
     progress: Progress = quiet,
 ) -> Arm:
@@ -94,7 +101,7 @@ def prepare_arm(
     Raises:
         FleetError: the scenario has no such arm.
     """
-    (arm,), _ = _arms(scenario, [scenario.index_of(name)], difficulty, cache, progress, every_work=False)
+    (arm,), _ = _arms(scenario, [scenario.index_of(name)], difficulty, risk, cache, progress, every_work=False)
     return arm
 
 
@@ -102,6 +109,7 @@ def _arms(
     scenario: Scenario,
     indices: Sequence[int],
     difficulty: DifficultyName,
+    risk: RiskName,
     cache: str | Path | None,
     progress: Progress,
     *,
@@ -114,6 +122,7 @@ def _arms(
     """
     if choose("difficulty", difficulty, DifficultyName) == "twin":
         require_extra("twin")
+    choose("risk", risk, RiskName)
     folder = _folder(cache)
     asked = all_works(scenario)
     works = rehearsal_works(scenario) if difficulty == "twin" else asked
@@ -122,18 +131,20 @@ def _arms(
         raise ScenarioError("\n".join(problems))
     working = [replace(arm, plans={w: arm.plans[w] for w in asked if w in arm.plans}) for arm in planned]
     models: Sequence[DifficultyModel] = [Blind()] * len(planned)
+    known: list[tuple[ThermalModel, Motors] | None] = [None] * len(planned)
     if difficulty == "twin":
         from scenarios.prepare.calibrate_twins import calibrate_twins  # both import torch
         from scenarios.prepare.train_twins import train_twins
 
         twins = train_twins(scenario, planned, folder, progress)
-        models = calibrate_twins(scenario, working, twins, folder, progress)
+        models = calibrated = calibrate_twins(scenario, planned, twins, folder, progress, risk=risk)
+        known = [(model.heat.thermal, model.heat.motors) for model in calibrated]
     arms = []
-    for each, model in zip(working, models, strict=True):
+    for each, model, beliefs in zip(working, models, known, strict=True):
         robot, motors, thermal = each.hardware
         rest_tau = rest_torque(robot, folder / "plans")
         own = {"rest_tau": rest_tau, "plans": each.plans, "too_heavy": each.too_heavy}
-        arm = Arm(robot=robot, motors=motors, thermal=thermal, model=model, **own)
+        arm = Arm(robot=robot, motors=motors, thermal=thermal, model=model, known=beliefs, **own)
         arms.append(_with_oracle(scenario, arm) if difficulty == "oracle" else arm)
     return arms, [error for arm in planned for error in arm.infeasible]
 
@@ -247,14 +258,6 @@ class ShiftFactory:
         return Episode(world=world, plant=plant, twins=twins, sensors=sensor_seed)
 
 
-def air_offsets(scenario: Scenario) -> np.ndarray:
-    """Ambient temperature at each arm minus that of the cell, K, [arm]: given by the scenario, plus a random part."""
-    sd = scenario.spread.scale * thermal_data()["spread"]["ambient_k"]
-    rng = np.random.default_rng(np.random.SeedSequence([scenario.spread.seed, len(scenario.arms), 1]))
-    drawn = sd * rng.standard_normal(len(scenario.arms))
-    return drawn + np.array([arm.ambient_offset_k for arm in scenario.arms])
-
-
 def open_exchange(
     bus: BusName, arms: tuple[str, ...], fleet: str, endpoint: str | None = None, channel: Channel = PERFECT
 ) -> Exchange:
@@ -304,6 +307,7 @@ def make_env(
     scenario: str | Path | Scenario,
     *,
     difficulty: DifficultyName = "twin",
+    risk: RiskName = RISK,
     plant: PlantName = "profile",
     bus: BusName = "memory",
     channel: Channel = PERFECT,
@@ -320,6 +324,7 @@ def make_env(
     Args:
         scenario: A library name, a .toml file, or a `Scenario`.
         difficulty: What scores the plans: the arms' twins (from the cache, or trained), `blind` or `oracle`.
+        risk: What the twins' P(saturation) follows from; see `RiskName`.
         plant: What moves the arms.
         bus: What carries the messages between arms.
         channel: Topology, delay, loss and partitions of the messages.
@@ -336,7 +341,7 @@ def make_env(
         raise ScenarioError(f"channel must be a fleet.bus.exchange.channel.Channel (got {channel!r}).")
     chosen = scenario_with(scenario, overrides, make_env)
     near = near_of(chosen, peers)
-    fleet = prepare(chosen, difficulty=difficulty, cache=cache, progress=progress)
+    fleet = prepare(chosen, difficulty=difficulty, risk=risk, cache=cache, progress=progress)
     options = {"max_cycles": max_cycles, "render_mode": render_mode, "mask_in": mask_in, "near": near}
     return env_of(fleet, plant=plant, bus=bus, channel=channel, **options)
 

@@ -11,7 +11,7 @@ import numpy as np
 from fleet.errors import InfeasibleJob
 from fleet.job import Work
 from fleet.motion import Plan
-from fleet.motor import Motors, gen3_motors
+from fleet.motor import Motors, gen3_motors, thermal_data
 from fleet.planning.plan_cache import CachedPlanner
 from fleet.planning.space import conflicts_with_homes
 from fleet.robot import Robot
@@ -62,6 +62,14 @@ def hardware_of(scenario: Scenario, index: int) -> ArmHardware:
     motors = spread_motors(gen3_motors(wear=spec.wear), spread, rng)
     network = gen3_network(cooling=spec.cooling, cooling_factor=spec.cooling_factor, spread=spread, rng=rng)
     return ArmHardware(spec.robot(), motors, thermal_model(network))
+
+
+def air_offsets(scenario: Scenario) -> np.ndarray:
+    """Ambient temperature at each arm minus that of the cell, K, [arm]: given by the scenario, plus a random part."""
+    sd = scenario.spread.scale * thermal_data()["spread"]["ambient_k"]
+    rng = np.random.default_rng(np.random.SeedSequence([scenario.spread.seed, len(scenario.arms), 1]))
+    drawn = sd * rng.standard_normal(len(scenario.arms))
+    return drawn + np.array([arm.ambient_offset_k for arm in scenario.arms])
 
 
 class CellPlanner:

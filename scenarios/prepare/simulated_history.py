@@ -50,7 +50,7 @@ class PastJobs:
     start_c: Array
     """True temperatures at the start, [job, node]; hidden from the arm."""
     known_c: Array
-    """Measured motor temperatures, estimated housing temperatures and ambient temperature at the start, [job, KNOWN]."""
+    """Measured motors, estimated housings and ambient temperature at the start, [job, KNOWN]."""
     peak_c: Array
     """Hottest winding temperature during the job, counted as in `fleet.difficulty.SETTLING_S`, [job, joint]."""
     warning_c: float
@@ -74,7 +74,7 @@ def past_jobs(
     plans: Sequence[Plan],
     rng: np.random.Generator,
     *,
-    warning_c: float,
+    limits: ThermalLimits,
     ambient_c: tuple[float, float] = AMBIENT_C,
     repetitions: Array | None = None,
     known: HeatModel | None = None,
@@ -87,10 +87,10 @@ def past_jobs(
         known: The heat model by which the arm estimates its housings; default: nominal in the arm's cooling.
     """
     known = known or nominal_heat_model(hardware.robot.cooling)
-    history = _Simulator(hardware, known.motors, known.thermal())
+    history = _Simulator(hardware, known.motors, known.thermal(), limits.error_c)
     count, noise_k = len(plans), hardware.motors.sensor_noise_k
     if repetitions is None:
-        repetitions = _repetitions(plans, rng.uniform(*DURATION_S, count))
+        repetitions = repetitions_for(plans, rng)
     ambient = rng.uniform(*ambient_c, count)
     start = history.start(plans, ambient, rng)
     measured_c = start.temp_c[:, WINDING] + noise_k * rng.standard_normal((count, noise_k.size))
@@ -101,7 +101,7 @@ def past_jobs(
         start_c=start.temp_c,
         known_c=known_temperatures(measured_c, start.housing_c, ambient),
         peak_c=history.peaks(plans, repetitions, start, ambient),
-        warning_c=warning_c,
+        warning_c=limits.warning_c,
     )
 
 
@@ -109,6 +109,13 @@ def experience(twin: Twin, jobs: PastJobs) -> Experience:
     """The past jobs with the features that the arm's twin computes for them."""
     repetitions = jobs.repetitions.tolist()
     return Experience.of_jobs(twin, jobs.plans, repetitions, known_c=jobs.known_c, passed=jobs.passed)
+
+
+def repetitions_for(
+    plans: Sequence[Plan], rng: np.random.Generator, lasts_s: tuple[float, float] = DURATION_S
+) -> Array:
+    """Repetitions such that the jobs last from 3 to 45 minutes, or in another range, int [job]."""
+    return _repetitions(plans, rng.uniform(*lasts_s, len(plans)))
 
 
 def _repetitions(plans: Sequence[Plan], duration_s: Array) -> Array:
@@ -136,6 +143,7 @@ class _Simulator:
     hardware: ArmHardware
     known_motors: Motors
     known_thermal: ThermalModel
+    error_c: float
 
     def start(self, plans: Sequence[Plan], ambient: Array, rng: np.random.Generator) -> _Arms:
         """Temperatures at which the jobs begin."""
@@ -147,11 +155,11 @@ class _Simulator:
         share = rng.uniform(0.0, 1.0, (count, 1))
         arms = _Arms(*(one + share * (other - one) for one, other in zip(cold, idle, strict=True)))
         earlier = [plans[i] for i in rng.integers(count, size=count)] if count else []
-        repetitions = _repetitions(earlier, rng.uniform(*EARLIER_S, count))
-        error_c, faulted = ThermalLimits().error_c, np.zeros((count, 1), bool)
+        repetitions = repetitions_for(earlier, rng, EARLIER_S)
+        faulted = np.zeros((count, 1), bool)
         for _, warmer in self._work(earlier, repetitions, arms, ambient):
             arms = _choose(faulted, arms, warmer)  # a fault ends the work
-            faulted |= arms.temp_c[:, WINDING].max(axis=1, keepdims=True, initial=-np.inf) >= error_c
+            faulted |= arms.temp_c[:, WINDING].max(axis=1, keepdims=True, initial=-np.inf) >= self.error_c
         rest_s = rng.uniform(0.0, np.where(rng.random(count) < 0.5, *REST_S))
         for _, cooler in self._course(self._at_home(), np.zeros(JOINTS), rest_s, arms, ambient):
             arms = cooler
@@ -193,7 +201,8 @@ class _Simulator:
             if name == "cycle":
                 duration_s = duration_s * repetitions
             load, friction_w = drives(profiles, self.hardware.motors), drives(profiles, self.known_motors).friction_w
-            for time_s, arms in self._course(load, friction_w, duration_s, arms, ambient):
+            for time_s, warmer in self._course(load, friction_w, duration_s, arms, ambient):
+                arms = warmer
                 yield begun_s + time_s, arms
             begun_s = begun_s + duration_s
 

@@ -19,7 +19,7 @@ from scenarios.cell_layout import near_of
 from scenarios.fault_price import weights_of
 from scenarios.job_stream import JobSampler, works_of
 from scenarios.load import override
-from scenarios.prepare.fleet import DifficultyName, Fleet, prepare, scenario_with, world_of
+from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, RiskName, prepare, scenario_with, world_of
 from scenarios.progress import Progress, quiet
 from scenarios.schema import Ambient, Scenario
 
@@ -66,6 +66,7 @@ def make_batch(
     seed: int | Sequence[int] | None = None,
     *,
     difficulty: DifficultyName = "twin",
+    risk: RiskName = RISK,
     randomise: Randomisation | None = None,
     cache: str | Path | None = None,
     max_cycles: int | None = None,
@@ -79,7 +80,7 @@ def make_batch(
     """The batched environment of a scenario: `num_envs` shifts side by side in one process.
 
     Args:
-        scenario, difficulty, cache, peers, overrides: As in `make_env`.
+        scenario, difficulty, risk, cache, peers, overrides: As in `make_env`.
         seed: Env e begins the shift of `seed + e` (or of `seed[e]`): that of `make_env(…).reset(seed=…)`.
         randomise: Beyond what a scenario draws: ambient temperature, arrivals, fleets.
         max_cycles, autoreset, stagger, threads: As in `fleet.env.vector.BatchEnv`.
@@ -98,7 +99,11 @@ def make_batch(
         _check_ambient(spec, randomise)
     fleets = [
         prepare(
-            spec, difficulty=difficulty, cache=cache, progress=lambda what, s, i=i: progress(what, (i + s) / len(specs))
+            spec,
+            difficulty=difficulty,
+            risk=risk,
+            cache=cache,
+            progress=lambda what, s, i=i: progress(what, (i + s) / len(specs)),
         )
         for i, spec in enumerate(specs)
     ]

@@ -18,12 +18,13 @@ from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError
 from fleet.files import cache_folder
 from scenarios.policy_loader import label, policy_of, scope_of
-from scenarios.prepare.fleet import DifficultyName, Fleet, prepare
+from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, RiskName, prepare
 from scenarios.progress import Progress, quiet
 from scenarios.run.evaluate import FIGURES, Outcome, outcomes
 from scenarios.schema import Scenario
 
 Array = np.ndarray
+Models = tuple[DifficultyName, RiskName]
 Part = tuple[str, Sequence[int]]
 """A policy, and some of the seeds."""
 
@@ -90,6 +91,7 @@ def compare(
     seeds: Sequence[int],
     baseline: str,
     difficulty: DifficultyName = "twin",
+    risk: RiskName = RISK,
     channel: Channel = PERFECT,
     cache_dir: Path | None = None,
     workers: int = -1,
@@ -112,11 +114,11 @@ def compare(
     if baseline not in policies:
         raise FleetError(f"The baseline '{baseline}' is not among the policies compared: {', '.join(policies)}.")
     folder = cache_dir or cache_folder()  # here: a worker may have started with another one
-    fleet = prepare(scenario, difficulty=difficulty, cache=folder, progress=progress)
+    fleet = prepare(scenario, difficulty=difficulty, risk=risk, cache=folder, progress=progress)
     together = TOGETHER if channel.perfect else 1
     parts = [(policy, seeds[i : i + together]) for policy in policies for i in range(0, len(seeds), together)]
     by_policy: dict[str, list[Outcome]] = {policy: [] for policy in policies}
-    results = _run_parts(fleet, difficulty, channel, folder, parts, workers)
+    results = _run_parts(fleet, (difficulty, risk), channel, folder, parts, workers)
     for n, ((policy, _), result) in enumerate(zip(parts, results, strict=True)):
         by_policy[policy] += result
         progress("comparing", (n + 1) / len(parts))
@@ -129,7 +131,7 @@ def compare(
 
 
 def _run_parts(
-    fleet: Fleet, difficulty: DifficultyName, channel: Channel, folder: Path, parts: Sequence[Part], workers: int
+    fleet: Fleet, models: Models, channel: Channel, folder: Path, parts: Sequence[Part], workers: int
 ) -> Iterator[list[Outcome]]:
     """The outcomes of each part in order, from this process in the first seconds, then from workers."""
     began_s, todo = time.monotonic(), list(parts)
@@ -138,22 +140,21 @@ def _run_parts(
     if not todo:
         return
     with Parallel(n_jobs=workers, return_as="generator") as pool:
-        for result in pool(
-            delayed(_run_in_worker)(fleet.scenario, difficulty, folder, *part, channel) for part in todo
-        ):
+        for result in pool(delayed(_run_in_worker)(fleet.scenario, models, folder, *part, channel) for part in todo):
             assert result is not None
             yield result
 
 
 @cache
-def _fleet(scenario: Scenario, difficulty: DifficultyName, folder: Path) -> Fleet:
-    return prepare(scenario, difficulty=difficulty, cache=folder)
+def _fleet(scenario: Scenario, models: Models, folder: Path) -> Fleet:
+    difficulty, risk = models
+    return prepare(scenario, difficulty=difficulty, risk=risk, cache=folder)
 
 
 def _run_in_worker(
-    scenario: Scenario, difficulty: DifficultyName, folder: Path, policy: str, seeds: Sequence[int], channel: Channel
+    scenario: Scenario, models: Models, folder: Path, policy: str, seeds: Sequence[int], channel: Channel
 ) -> list[Outcome]:
-    return outcomes(_fleet(scenario, difficulty, folder), policy, seeds, channel)
+    return outcomes(_fleet(scenario, models, folder), policy, seeds, channel)
 
 
 def _figure(name: str, rows: Sequence[Outcome], base: Sequence[Outcome], rng: np.random.Generator) -> Figure:

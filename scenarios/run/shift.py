@@ -17,7 +17,7 @@ from fleet.env.allocation_v1 import AllocationEnv
 from fleet.events import Event
 from fleet.telemetry import Telemetry, join
 from scenarios.policy_loader import policy_at
-from scenarios.prepare.fleet import BusName, DifficultyName, Fleet, PlantName, env_of
+from scenarios.prepare.fleet import RISK, BusName, DifficultyName, Fleet, PlantName, RiskName, env_of
 from scenarios.progress import Progress, quiet
 from scenarios.run.metrics import Metrics
 from scenarios.run.outcome import metrics_of
@@ -38,6 +38,7 @@ class RunSpec:
     plant: PlantName = "profile"
     bus: BusName = "zenoh"
     difficulty: DifficultyName = "twin"
+    risk: RiskName = RISK
     channel: Channel = PERFECT
     """Topology, delay and loss of the arms' messages."""
 

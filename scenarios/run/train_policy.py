@@ -20,7 +20,7 @@ from fleet.errors import FleetError
 from fleet.files import atomic_path
 from scenarios.fault_price import weights_of
 from scenarios.policy_loader import policy_of
-from scenarios.prepare.fleet import DifficultyName, prepare
+from scenarios.prepare.fleet import RISK, DifficultyName, RiskName, prepare
 from scenarios.progress import Progress, quiet
 from scenarios.run.batch import library_of
 from scenarios.run.shift import scenario_hash
@@ -72,6 +72,7 @@ def train(
     plan: TrainingPlan,
     *,
     difficulty: DifficultyName = "twin",
+    risk: RiskName = RISK,
     resume: bool = False,
     cache: Path | None = None,
     progress: Progress = quiet,
@@ -93,10 +94,11 @@ def train(
         "scenario": scenario.name,
         "scenario_hash": scenario_hash(scenario),
         "difficulty": difficulty,
+        "risk": risk,
         "config": asdict(config),
     }
     _check_folder(out, card, resume=resume)
-    fleet = prepare(scenario, difficulty=difficulty, cache=cache, progress=progress)
+    fleet = prepare(scenario, difficulty=difficulty, risk=risk, cache=cache, progress=progress)
     library, weights = library_of([fleet]), weights_of(scenario)
 
     def make_env(envs: int, seed: int) -> TorchRLEnv:

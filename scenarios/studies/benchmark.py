@@ -10,9 +10,9 @@ from fleet.difficulty import difficulty_of_error
 from fleet.motion import CHANNELS, Plan
 from fleet.motor import gen3_motors
 from fleet.thermal import gen3_network, thermal_model
+from scenarios.prepare.simulated_logs import LOGS, identify_from_work
 from scenarios.studies.ranking import Jobs, Judged, Quality, judge, side_by_side
 from scenarios.studies.setup import Bench, Sample, Study
-from scenarios.studies.simulated_logs import LOGS, identify_from_work
 from twin.baselines.detectors import isolation_forest, mahalanobis, nearest_neighbours
 from twin.baselines.reconstruction import (
     ModelScorer,
@@ -118,7 +118,11 @@ def baseline_scorers(study: Study, config: TwinConfig, seed: np.random.SeedSeque
     motors, thermal = gen3_motors(), thermal_model(gen3_network())
     networks = {
         "rc nominal": RcTwin.nominal(study.robot.name, ambient_c=study.ambient_c),
-        "rc identified": RcTwin.of(identify_from_work(study, study.train.plans[:LOGS], np.random.default_rng(seed))),
+        "rc identified": RcTwin.of(
+            identify_from_work(
+                study.hardware, study.train.plans[:LOGS], np.random.default_rng(seed), ambient_c=study.ambient_c
+            )
+        ),
     }
     return [
         pca(cool, 2),

@@ -14,11 +14,12 @@ from pathlib import Path
 import numpy as np
 from sklearn.metrics import roc_auc_score
 
+from fleet.robot import ThermalLimits
 from scenarios.prepare.simulated_history import PastJobs, experience, past_jobs
+from scenarios.prepare.simulated_logs import LOGS, identify_from_work
 from scenarios.progress import Progress, quiet
 from scenarios.studies.ranking import spread
 from scenarios.studies.setup import Bench, Study, make_study
-from scenarios.studies.simulated_logs import LOGS, identify_from_work
 from twin.saturation.alarm import ConformalAlarm
 from twin.saturation.fit import Experience, fit_saturation
 from twin.saturation.model import EVIDENCE, METHODS
@@ -102,7 +103,7 @@ def past_work(study: Study, *, seed: int, labelled: int = LABELLED, watched: int
         raise ValueError(f"Past work needs more than {labelled} + {watched} test jobs (got {natural}).")
     # In one call, so that novel motions too begin as warm as natural work before them leaves the arm.
     plans = (*study.test.plans, *study.novel.plans)
-    jobs = past_jobs(study.hardware, plans, np.random.default_rng([seed, 7]), warning_c=study.warning_c)
+    jobs = past_jobs(study.hardware, plans, np.random.default_rng([seed, 7]), limits=ThermalLimits())
     order = np.random.default_rng([seed, 8]).permutation(natural)
     fit, setting, rest = np.split(order, (labelled, labelled + watched))
     novel = np.arange(natural, len(jobs))
@@ -132,12 +133,10 @@ def judge_twin(work: PastWork, twin: Twin) -> tuple[list[Prediction], list[Alarm
 
 
 def judge_networks(work: PastWork) -> tuple[Prediction, Prediction]:
-    """Prediction of the nominal thermal network, and of one identified from logs of some of the labelled jobs.
-
-    Both use the ambient temperature of the study; that of each job is unknown.
-    """
-    study, jobs = work.study, work.jobs
-    arm = identify_from_work(study, [jobs.plans[i] for i in work.fit[:LOGS]], np.random.default_rng([work.seed, 9]))
+    """Prediction of the nominal thermal network, and of one identified from logs of some of the labelled jobs."""
+    study, rng = work.study, np.random.default_rng([work.seed, 9])
+    logged = [work.jobs.plans[i] for i in work.fit[:LOGS]]
+    arm = identify_from_work(study.hardware, logged, rng, ambient_c=study.ambient_c)
     nominal = RcTwin.nominal(study.robot.name, ambient_c=study.ambient_c)
     return _network("rc nominal", nominal, work), _network("rc identified", RcTwin.of(arm), work)
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from fleet.thermal import NODES
+from scenarios.prepare.simulated_logs import identify_from_work
 from scenarios.prepare.train_twins import train_or_load
 from scenarios.studies.benchmark import (
     BASELINES,
@@ -20,7 +21,6 @@ from scenarios.studies.benchmark import (
 )
 from scenarios.studies.ranking import CARRIER, MEASURES, verdicts
 from scenarios.studies.setup import Bench, make_study
-from scenarios.studies.simulated_logs import identify_from_work
 from twin.baselines.reconstruction import ModelScorer, untrained_config
 from twin.thermal.thermal_twin import RcTwin
 from twin.vae.model import TwinConfig
@@ -111,7 +111,9 @@ def test_logs_of_cool_jobs_identify_the_arm(study):
     jobs = jobs_of(study.test, study.horizon_s)
     start_c = np.full(NODES, study.ambient_c)
     nominal = RcTwin.nominal(ambient_c=study.ambient_c)
-    own = identify_from_work(study, study.train.plans[:2], np.random.default_rng(SEED))
+    own = identify_from_work(
+        study.hardware, study.train.plans[:2], np.random.default_rng(SEED), ambient_c=study.ambient_c
+    )
     wrong_k = [
         rc.peaks(jobs.plans, jobs.repetitions, start_c=start_c)[:, CARRIER] - jobs.peak_c[:, CARRIER]
         for rc in (nominal, RcTwin.of(own))

@@ -10,11 +10,11 @@ import pytest
 from fleet.errors import FleetError
 from fleet.robot import JOINTS
 from fleet.thermal import WINDING
+from scenarios.prepare.simulated_logs import AIR_SD_K, own_logs
 from scenarios.studies.real_logs import CONFIG, LogStudy, log_study
 from scenarios.studies.real_logs_forecast import log_rc
 from scenarios.studies.saturation import judge_networks, past_work
 from scenarios.studies.setup import Study, make_study
-from scenarios.studies.simulated_logs import AIR_SD_K, own_logs
 from twin.logs.heat_log import heat_logs
 from twin.logs.reader import read_folder
 from twin.logs.recording import Recording
@@ -37,7 +37,7 @@ def test_intervals_hold_the_truth_on_brisk_work_logged_at_2_hz():
     inside = []
     for seed in (1, 2, 3):
         brisk = make_study(np.random.SeedSequence(seed), train=6, reference=0, test=0, novel=0)
-        logs = own_logs(brisk, brisk.train.plans, np.random.default_rng(seed))
+        logs = own_logs(brisk.hardware, brisk.train.plans, np.random.default_rng(seed), ambient_c=brisk.ambient_c)
         found = identify(logs, ambient_c=brisk.ambient_c, ambient_sd_k=AIR_SD_K)
         truth = HeatModel(brisk.motors, brisk.network)
         for p in found.parameters:
@@ -47,7 +47,14 @@ def test_intervals_hold_the_truth_on_brisk_work_logged_at_2_hz():
 
 
 def test_own_logs_are_what_the_network_simulates(study: Study):
-    (log,) = own_logs(study, study.test.plans[:1], np.random.default_rng(0), work_s=300.0, rest_s=100.0)
+    (log,) = own_logs(
+        study.hardware,
+        study.test.plans[:1],
+        np.random.default_rng(0),
+        ambient_c=study.ambient_c,
+        work_s=300.0,
+        rest_s=100.0,
+    )
     assert log.time_s[-1] == 400.0
     assert log.temp_c is not None
     # Idle-warm, in the study's air, at the start.

@@ -14,12 +14,10 @@ from typing import Literal, get_args
 import msgspec
 import numpy as np
 
-from fleet.difficulty import KNOWN, Difficulty, Forecast
-from fleet.errors import CheckpointError, nearest
-from fleet.motion import Plan
+from fleet.difficulty import KNOWN, Forecast
+from fleet.errors import nearest
 from twin.json_file import check_version, read_card, write_card
 from twin.vae.measures import Features
-from twin.vae.twin import Twin
 
 Array = np.ndarray
 
@@ -172,32 +170,6 @@ def heating_time(duration_s: Array | float, horizon_s: float | None) -> Array:
     return duration if horizon_s is None else np.minimum(duration, horizon_s)
 
 
-@dataclass(frozen=True, eq=False)
-class CalibratedTwin:
-    """A twin with P(saturation); implements `fleet.difficulty.DifficultyModel`."""
-
-    twin: Twin
-    saturation: SaturationModel
-
-    def __post_init__(self) -> None:
-        if self.saturation.twin != self.twin.version:
-            raise ValueError(
-                f"The saturation model was fitted on twin {self.saturation.twin}, this is {self.twin.version}; "
-                "fit it again on this twin's features."
-            )
-
-    @property
-    def version(self) -> str:
-        """Version of the twin and of the saturation model."""
-        return f"{self.twin.version}+{self.saturation.version}"
-
-    def score(self, plan: Plan, repetitions: int) -> Difficulty:
-        """Difficulty by the twin, with the risk of the repeated plan."""
-        features = self.twin.features([plan], [repetitions])
-        risk = self.saturation.risk(features, np.array([plan.duration_s(repetitions)]))[0]
-        return Difficulty(features.difficulty[0], risk=risk)
-
-
 class _Card(msgspec.Struct, forbid_unknown_fields=True):
     """The content of `saturation.json`."""
 
@@ -220,23 +192,3 @@ def load_saturation(folder: Path) -> SaturationModel:
     card = read_card(folder / FILE, _Card, format_=FORMAT, what="saturation model")
     check_version(folder / FILE, card.version, card.model.version)
     return card.model
-
-
-def load_calibrated(twin: Twin, folder: Path, *, data_hash: str | None = None) -> CalibratedTwin:
-    """The twin with the model that was saved in the folder.
-
-    Args:
-        data_hash: `Experience.data_hash` of the past jobs that the model must come from; None takes any.
-
-    Raises:
-        CheckpointError: as `load_saturation`, or the model is of another twin or of other past jobs.
-    """
-    model = load_saturation(folder)
-    for what, value, wanted in (
-        ("twin", model.twin, twin.version),
-        ("data_hash", model.data_hash, data_hash or model.data_hash),
-        ("joints", len(model.at_once), twin.joints),
-    ):
-        if value != wanted:
-            raise CheckpointError(f"{folder / FILE}: {what} is {value}, wanted {wanted}. Fit the model again.")
-    return CalibratedTwin(twin, model)

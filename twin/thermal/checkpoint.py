@@ -21,7 +21,7 @@ from twin.thermal.risk import PeakCurve
 from twin.thermal.thermal_twin import RcTwin
 
 FORMAT = 2
-CARD = "rc.json"
+CARD, CURVE = "rc.json", "saturation_curve.json"
 
 
 class _Card(msgspec.Struct, forbid_unknown_fields=True):
@@ -76,6 +76,23 @@ def load_twin(folder: Path) -> RcTwin:
     """The physical twin of what `save` wrote, with P(saturation) if it was saved; raises as `load`."""
     identified, curve = _load(folder / CARD)
     return replace(RcTwin.of(identified), curve=curve)
+
+
+def save_curve(curve: PeakCurve, folder: Path) -> None:
+    """Write the curve of a thermal twin atomically into a folder, made if need be."""
+    write_card(_CurveCard(FORMAT, curve), folder / CURVE)
+
+
+def load_curve(folder: Path) -> PeakCurve:
+    """The curve that `save_curve` wrote; raises as `load`."""
+    return read_card(folder / CURVE, _CurveCard, format_=FORMAT, what="curve of P(saturation)").curve
+
+
+class _CurveCard(msgspec.Struct, forbid_unknown_fields=True):
+    """The content of `saturation_curve.json`."""
+
+    format: int
+    curve: PeakCurve
 
 
 def _load(path: Path) -> tuple[Identified, PeakCurve | None]:

@@ -14,7 +14,7 @@ from fleet.difficulty import Difficulty, Forecast, difficulty_of_error
 from fleet.motion import Drive, Plan, drives
 from fleet.motor import Motors
 from fleet.robot import JOINTS, Cooling, ThermalLimits
-from fleet.thermal import HOUSING, NODES, STEP_S, WINDING, ThermalModel, node_heat, temperature_steps
+from fleet.thermal import NODES, STEP_S, WINDING, ThermalModel, node_heat, temperature_steps
 from twin.plan_cache import PlanCache
 from twin.thermal.parameters import HeatModel
 from twin.thermal.result import AMBIENT_C, Identified, nominal_heat_model

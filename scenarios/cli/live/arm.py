@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -43,13 +43,14 @@ from scenarios.cli.live.options import (
     ScenarioFleetOption,
     SeedOption,
 )
-from scenarios.cli.options import ENDPOINT, EndpointOption, ScenarioArg, check_name, number
+from scenarios.cli.options import ENDPOINT, EndpointOption, RiskOption, ScenarioArg, check_name, number
 from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import progress_bar
 from scenarios.load import load
 from scenarios.policy_loader import scope_of
 from scenarios.progress import Progress
 from scenarios.schema import Scenario
+from scenarios.schema_errors import choose
 
 log = logging.getLogger(__name__)
 
@@ -66,6 +67,7 @@ def arm_command(
     file: Annotated[Path | None, typer.Argument(help="--source log: a Gen3 log, a plain log, or a recording.")] = None,
     source: Annotated[Literal["sim", "log"], typer.Option(help="sim (the scenario's arm), or log FILE.")] = "sim",
     difficulty: ModelOption = "twin",
+    risk: RiskOption = "rc",
     speed: Annotated[
         float | None,
         number("Fleet seconds per real second. Default: the auctioneer's, else 1.", 0, MAX_SPEED, above=True),
@@ -96,7 +98,8 @@ def arm_command(
     fleet, folder = folder_of(journal, fleet, chosen)
     refuse_other_way(folder, (name,), alone=bool(policy))
     with progress_bar() as progress:
-        arm = replayed_arm(name, file) if file else simulated_arm(chosen, name, difficulty, seed, progress)
+        simulated = partial(simulated_arm, chosen, name, difficulty, seed, progress, risk=risk)
+        arm = replayed_arm(name, file) if file else simulated()
     with (
         until_stopped() as stop,
         BusClient(endpoint, fleet) as link,
@@ -153,6 +156,8 @@ def simulated_arm(
     seed: int,
     progress: Progress,
     cache: Path | None = None,
+    *,
+    risk: str = "rc",
 ) -> PreparedArm:
     """Prepare the scenario's arm: its body, plans and twin are those of the same arm in `thermofleet run`.
 
@@ -160,10 +165,11 @@ def simulated_arm(
         FleetError: the scenario has no such arm.
     """
     from fleet.live.arm.simulated_body import SimulatedBody  # loads the engine
-    from scenarios.prepare.fleet import air_offsets, prepare_arm
-    from scenarios.prepare.planned_arm import CellPlanner
+    from scenarios.prepare.fleet import RiskName, prepare_arm
+    from scenarios.prepare.planned_arm import CellPlanner, air_offsets
 
-    arm = prepare_arm(scenario, name, difficulty=difficulty, cache=cache, progress=progress)
+    kind = choose("risk", risk, RiskName)
+    arm = prepare_arm(scenario, name, difficulty=difficulty, risk=kind, cache=cache, progress=progress)
     index = scenario.index_of(name)
     ambient_c, offset_k = ambient_of(scenario), float(air_offsets(scenario)[index])
 

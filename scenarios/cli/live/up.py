@@ -18,12 +18,13 @@ from scenarios.cli.live.options import (
     SeedOption,
     SpeedOption,
 )
-from scenarios.cli.options import PolicyOption, ScenarioArg, number
+from scenarios.cli.options import PolicyOption, RiskOption, ScenarioArg, number
 from scenarios.cli.router import PORT, check_roster
 from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import err_console, out_console, progress_bar, say
 from scenarios.load import load
 from scenarios.policy_loader import scope_of
+from scenarios.schema_errors import choose
 
 START_S = 60.0
 """Real seconds until a participant must be ready: an arm loads its twin."""
@@ -40,6 +41,7 @@ def parts_of(
     speed: float,
     policy: str,
     difficulty: str,
+    risk: str = "rc",
     jobs: str,
     seed: int,
     tls: Path | None = None,
@@ -65,7 +67,7 @@ def parts_of(
     shared = ("--fleet", fleet, "--speed", f"{speed:g}", "--journal", str(folder / "journals"), "--seed", str(seed))
     allocation = ("--policy", policy, "--jobs", jobs)
     without_auctioneer, ends = scope_of(policy) == "arm", jobs == "scenario"
-    options = (*shared, "--difficulty", difficulty, *(allocation if without_auctioneer else ()))
+    options = (*shared, "--difficulty", difficulty, "--risk", risk, *(allocation if without_auctioneer else ()))
     secure = () if tls is None else ("--tls", str(tls), "--scenario", scenario)
     router = Part(name="router", argv=(*PROGRAM, "router", "--port", str(port), *secure), ready=address)
     arms = [
@@ -84,6 +86,7 @@ def up_command(
     speed: SpeedOption = 60.0,
     policy: PolicyOption = "matching",
     difficulty: ModelOption = "twin",
+    risk: RiskOption = "rc",
     jobs: JobsOption = "scenario",
     seed: SeedOption = 0,
     out: Annotated[
@@ -104,7 +107,7 @@ def up_command(
     A process that exits is restarted with back-off; Ctrl-C stops all in order. The same command with the same --out
     continues from the journals.
     """
-    from scenarios.prepare.fleet import prepare
+    from scenarios.prepare.fleet import RiskName, prepare
 
     chosen = load(scenario)
     fleet, folder = folder_of(out, fleet, chosen)
@@ -115,7 +118,7 @@ def up_command(
         check_roster(tls, scenario)
     refuse_other_way(folder / "journals", names, alone=scope_of(policy) == "arm")
     with progress_bar() as progress:  # once, so that no arm has to plan or train by itself
-        prepare(chosen, difficulty=difficulty, progress=progress)
+        prepare(chosen, difficulty=difficulty, risk=choose("risk", risk, RiskName), progress=progress)
     router, arms, record, auction = parts_of(
         scenario,
         names,
@@ -125,6 +128,7 @@ def up_command(
         speed=speed,
         policy=policy,
         difficulty=difficulty,
+        risk=risk,
         jobs=jobs,
         seed=seed,
         tls=tls,

@@ -4,13 +4,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from scenarios.prepare.simulated_logs import LOGS, identify_from_work
 from scenarios.report.page import Section, Table
 from scenarios.studies.ranking import spread
 from scenarios.studies.report.claims import HEAD_TARGETS, RC_TARGETS, against_targets
 from scenarios.studies.report.context import Lab
 from scenarios.studies.report.figures import picture, reliability_figure
 from scenarios.studies.saturation import ALARM_MEASURES, LABELLED, measured, saturation_study
-from scenarios.studies.simulated_logs import LOGS, identify_from_work
 from twin.thermal.parameters import HeatModel
 
 HELD_OUT = 200
@@ -80,7 +80,9 @@ def identification_chapter(lab: Lab) -> Section:
     """The thermal network of the studied arm from its own logs, against the simulator's truth."""
     lab.progress("identifying", 0.0)
     study = lab.study
-    result = identify_from_work(study, study.train.plans[:LOGS], np.random.default_rng(lab.bench.seeds[0]))
+    result = identify_from_work(
+        study.hardware, study.train.plans[:LOGS], np.random.default_rng(lab.bench.seeds[0]), ambient_c=study.ambient_c
+    )
     model, parameters = HeatModel(study.motors, study.network), result.parameters
     truth = np.array([model.value(p.name)[0 if p.joint is None else p.joint - 1] for p in parameters])
     inside = sum(p.low <= true <= p.high for p, true in zip(parameters, truth, strict=True))

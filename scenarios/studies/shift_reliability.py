@@ -1,0 +1,186 @@
+"""Whether P(saturation) and predicted peaks come true in the shift: stated at each award, compared with the outcome."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from sklearn.metrics import roc_auc_score
+
+from agents.policy import WAIT
+from fleet.difficulty import SETTLING_S
+from fleet.engine.shift import StepRecord
+from fleet.events import Event
+from fleet.thermal import WINDING
+from scenarios.load import override
+from scenarios.policy_loader import policy_at
+from scenarios.prepare.fleet import RISK, Fleet, RiskName, env_of, prepare
+from scenarios.progress import Progress, quiet
+from scenarios.schema import Scenario
+from twin.saturation.reliability import Reliability, brier, reliability
+
+Array = np.ndarray
+
+POLICIES = ("wspt", "wspt_cool", "least_difficulty")
+FIRST_SEED = 10_000
+"""Nothing was tuned on seeds from here on."""
+WARM_K = 5.0
+"""An arm is warm at an award if a motor is this close to the warning limit, or beyond it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Awards:
+    """Awards of shifts whose outcome is known, arrays [award]."""
+
+    p: Array
+    """Stated P(saturation)."""
+    predicted_c: Array
+    """Stated peak."""
+    peak_c: Array
+    """True peak, counted as in `fleet.difficulty.SETTLING_S`; NaN if a fault ended the plan."""
+    passed: Array
+    """Whether a motor passed the warning limit, bool."""
+    warm: Array
+    """Whether the arm was warm at the award, bool; see `WARM_K`."""
+    censored: int = 0
+    """Further awards without a known outcome: the shift ended or the arm gave the job back before."""
+
+    def __len__(self) -> int:
+        return len(self.p)
+
+    def part(self, rows: Array) -> "Awards":
+        """Some of the awards, by index or mask."""
+        return Awards(*(getattr(self, field.name)[rows] for field in fields(self)[:-1]))
+
+
+def join(parts: Sequence[Awards]) -> Awards:
+    """The awards of several shifts."""
+    names = [field.name for field in fields(Awards)[:-1]]
+    arrays = [np.concatenate([getattr(part, name) for part in parts]) for name in names]
+    return Awards(*arrays, censored=sum(part.censored for part in parts))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Verdict:
+    """How true the stated numbers were."""
+
+    awards: int
+    passed: int
+    ece: float
+    brier: float
+    auroc: float
+    """NaN if all awards had the same outcome."""
+    peak_rms_k: float
+    """Root mean square of predicted minus true peak, of plans that no fault ended."""
+    peak_bias_k: float
+    table: Reliability
+
+    def as_json(self) -> dict[str, Any]:
+        """Every number, NaN as None."""
+        numbers = {name: value for name, value in vars(self).items() if name != "table"}
+        numbers = {name: None if value != value else value for name, value in numbers.items()}
+        return numbers | {"reliability": {name: values.tolist() for name, values in vars(self.table).items()}}
+
+
+def verdict(awards: Awards) -> Verdict | None:
+    """How true the numbers stated at these awards were; None without awards."""
+    if not len(awards):
+        return None
+    table, error_k = reliability(awards.p, awards.passed), (awards.predicted_c - awards.peak_c)
+    error_k = error_k[np.isfinite(error_k)]
+    both = 0 < awards.passed.sum() < len(awards)
+    return Verdict(
+        awards=len(awards),
+        passed=int(awards.passed.sum()),
+        ece=table.error,
+        brier=brier(awards.p, awards.passed),
+        auroc=float(roc_auc_score(awards.passed, awards.p)) if both else np.nan,
+        peak_rms_k=float(np.sqrt(np.mean(error_k**2))) if len(error_k) else np.nan,
+        peak_bias_k=float(error_k.mean()) if len(error_k) else np.nan,
+        table=table,
+    )
+
+
+def shift_reliability(
+    scenario: Scenario,
+    *,
+    policies: Sequence[str] = POLICIES,
+    seeds: Sequence[int] = tuple(range(FIRST_SEED, FIRST_SEED + 4)),
+    fleets: int = 3,
+    risk: RiskName = RISK,
+    progress: Progress = quiet,
+    make: Callable[..., Fleet] = prepare,
+) -> dict[str, Awards]:
+    """The awards of every policy, over all seeds and over several draws of the arms.
+
+    Args:
+        fleets: Number of draws: `spread.seed` of the scenario and the numbers after it.
+        make: Prepares the fleet of a scenario.
+    """
+    found: dict[str, list[Awards]] = {policy: [] for policy in policies}
+    runs = len(seeds) * len(policies)
+    for draw in range(fleets):
+        spread = {"scale": scenario.spread.scale, "seed": scenario.spread.seed + draw}
+        fleet = make(override(scenario, spread=spread), risk=risk, progress=progress)
+        for i, (policy, seed) in enumerate((policy, seed) for policy in policies for seed in seeds):
+            progress("working", (draw + i / runs) / fleets)
+            found[policy].append(awards_of_shift(fleet, policy, seed))
+    return {policy: join(parts) for policy, parts in found.items()}
+
+
+def awards_of_shift(fleet: Fleet, policy: str, seed: int) -> Awards:
+    """The awards of one shift, with what was stated at each and what came of it."""
+    records: list[StepRecord] = []
+    env = env_of(fleet, bus="memory", keep_events=True, watch=records.append, decisions="interval")
+    chooser, stated = policy_at(policy, seed), dict[tuple[str, int], tuple[float, float, bool]]()
+    warm_c = fleet.scenario.limits.warning_c - WARM_K
+    try:
+        env.reset(seed=seed)
+        while env.agents:
+            known, tick = env.knowledge(), env.tick
+            actions = chooser.act(known)
+            for arm, action in actions.items():
+                own = known[arm]
+                if WAIT < action < env.layout.actions - 1:
+                    option, warm = int(action) - 1, bool(own.temp_c.max() >= warm_c)
+                    stated[arm, tick] = float(own.p_saturation[option]), float(own.peak_c[option]), warm
+            env.step(actions)
+    finally:
+        env.close()
+    ends_c = np.concatenate([record.end_c for record in records])[..., WINDING]  # [step, arm, joint]
+    rows, censored = [], 0
+    for arm, begin_s, end_s, faulted in _plans(env.events):
+        tick = round(begin_s / env.world.dt_s)
+        if end_s is None:
+            censored += 1
+            continue
+        own_c = ends_c[:, env.possible_agents.index(arm)]
+        peak_c = np.nan if faulted else _true_peak(own_c, env.world.dt_s, begin_s, end_s)
+        rows.append((*stated[arm, tick], peak_c, faulted or peak_c >= fleet.scenario.limits.warning_c))
+    p, predicted_c, warm, peak_c, passed = np.array(rows, dtype=float).reshape(-1, 5).T
+    return Awards(p, predicted_c, peak_c, passed.astype(bool), warm.astype(bool), censored)
+
+
+def _plans(events: Sequence[Event]) -> Iterator[tuple[str, float, float | None, bool]]:
+    """Arm, begin, end and whether a fault ended it, of every awarded plan; no end if its outcome is unknown."""
+    ends = ("home", "fault", "give_back", "award")
+    own: dict[str, list[Event]] = {}
+    for event in sorted(events, key=lambda event: event.time_s):
+        if event.kind in ends:
+            own.setdefault(event.arm, []).append(event)
+    for arm, log in own.items():
+        for event, after in zip(log, [*log[1:], None], strict=True):
+            if event.kind == "award":
+                known = after is not None and after.kind in ("home", "fault")
+                yield arm, event.time_s, after.time_s if known else None, known and after.kind == "fault"
+
+
+def _true_peak(ends_c: Array, dt_s: float, begin_s: float, end_s: float) -> float:
+    """Hottest winding at the ends of the steps that count, °C.
+
+    Args:
+        ends_c: Windings of the arm at the end of each step, [step, joint].
+    """
+    first = round(min(begin_s + SETTLING_S, end_s) / dt_s - 1e-9)
+    last = int(np.ceil(end_s / dt_s - 1e-9))
+    return float(ends_c[max(first, 1) - 1 : max(last, 1)].max())
