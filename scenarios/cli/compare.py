@@ -79,8 +79,8 @@ def ablate_command(
     scores: Annotated[
         str | None,
         typer.Option(
-            help="Sources, separated by commas: trained, untrained, torque, rc-nominal, rc, random, inverted, constant, "
-            "blind, oracle. Differences refer to the first one. Default: all.",
+            help="Sources, separated by commas: trained, untrained, torque, rc-nominal, rc, random, inverted, "
+            "constant, blind, oracle. Differences refer to the first one. Default: all.",
             show_default=False,
         ),
     ] = None,

@@ -16,7 +16,7 @@ from fleet.difficulty import Difficulty, DifficultyModel, difficulty_of_error
 from fleet.motion import Plan
 from fleet.robot import JOINTS
 from scenarios.job_stream import rehearsal_works
-from scenarios.prepare.calibrate_twins import calibrate_twins
+from scenarios.prepare.calibrate_twins import calibrate_networks, calibrate_twins
 from scenarios.prepare.cool_motion import records, require_cool_plans
 from scenarios.prepare.fleet import Fleet, RiskName, prepare
 from scenarios.prepare.planned_arm import PlannedArm, plan_arms
@@ -180,7 +180,7 @@ def _training_records(scenario: Scenario, arm: PlannedArm) -> list[Array]:
 
 
 def _network(drawn: DrawnFleet, risk: RiskName) -> Fleet:
-    heats = [twin.heat for twin in drawn.calibrated(0, risk)]
+    heats = calibrate_networks(drawn.scenario, drawn.planned, drawn.folder, drawn.progress, risk=risk)
     fleet = drawn.scored(heats)
     if risk == "rc-nominal":
         return fleet
