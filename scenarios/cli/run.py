@@ -109,7 +109,7 @@ def demo_command(
     fleet = None
     with progress_bar() as progress:
         for policy in ("round_robin", "least_difficulty"):
-            spec = _spec(policy, seed, "profile", "zenoh", "twin", PERFECT)
+            spec = _spec(policy, seed, "profile", "zenoh", "twin", "rc", PERFECT)
             fleet, result = _run_into(chosen, spec, out / policy, True, progress, fleet=fleet)
             if not result.finished:
                 raise Interrupted(f"Interrupted while working; recordings are in {out}.")

@@ -42,7 +42,7 @@ class Awards:
     """Whether a motor passed the warning limit, bool."""
     warm: Array
     """Whether the arm was warm at the award, bool; see `WARM_K`."""
-    censored: int = 0
+    unknown: int = 0
     """Further awards without a known outcome: the shift ended or the arm gave the job back before."""
 
     def __len__(self) -> int:
@@ -53,11 +53,22 @@ class Awards:
         return Awards(*(getattr(self, field.name)[rows] for field in fields(self)[:-1]))
 
 
+def groups(awards: Awards) -> dict[str, Awards]:
+    """All awards, and apart those of warm and of cool arms."""
+    return {"all": awards, "warm": awards.part(awards.warm), "cool": awards.part(~awards.warm)}
+
+
+def awards_as_json(awards: Awards) -> dict[str, Any]:  # JSON
+    """Verdicts on all awards and on those of warm and of cool arms, and the number of unknown outcomes."""
+    verdicts = {name: verdict(part) for name, part in groups(awards).items()}
+    return {"unknown": awards.unknown} | {name: v and v.as_json() for name, v in verdicts.items()}
+
+
 def join(parts: Sequence[Awards]) -> Awards:
     """The awards of several shifts."""
     names = [field.name for field in fields(Awards)[:-1]]
     arrays = [np.concatenate([getattr(part, name) for part in parts]) for name in names]
-    return Awards(*arrays, censored=sum(part.censored for part in parts))
+    return Awards(*arrays, unknown=sum(part.unknown for part in parts))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -148,17 +159,17 @@ def awards_of_shift(fleet: Fleet, policy: str, seed: int) -> Awards:
     finally:
         env.close()
     ends_c = np.concatenate([record.end_c for record in records])[..., WINDING]  # [step, arm, joint]
-    rows, censored = [], 0
+    rows, unknown = [], 0
     for arm, begin_s, end_s, faulted in _plans(env.events):
         tick = round(begin_s / env.world.dt_s)
         if end_s is None:
-            censored += 1
+            unknown += 1
             continue
         own_c = ends_c[:, env.possible_agents.index(arm)]
         peak_c = np.nan if faulted else _true_peak(own_c, env.world.dt_s, begin_s, end_s)
         rows.append((*stated[arm, tick], peak_c, faulted or peak_c >= fleet.scenario.limits.warning_c))
     p, predicted_c, warm, peak_c, passed = np.array(rows, dtype=float).reshape(-1, 5).T
-    return Awards(p, predicted_c, peak_c, passed.astype(bool), warm.astype(bool), censored)
+    return Awards(p, predicted_c, peak_c, passed.astype(bool), warm.astype(bool), unknown)
 
 
 def _plans(events: Sequence[Event]) -> Iterator[tuple[str, float, float | None, bool]]:
@@ -171,8 +182,8 @@ def _plans(events: Sequence[Event]) -> Iterator[tuple[str, float, float | None, 
     for arm, log in own.items():
         for event, after in zip(log, [*log[1:], None], strict=True):
             if event.kind == "award":
-                known = after is not None and after.kind in ("home", "fault")
-                yield arm, event.time_s, after.time_s if known else None, known and after.kind == "fault"
+                end = after if after is not None and after.kind in ("home", "fault") else None
+                yield arm, event.time_s, end and end.time_s, end is not None and end.kind == "fault"
 
 
 def _true_peak(ends_c: Array, dt_s: float, begin_s: float, end_s: float) -> float:

@@ -9,10 +9,11 @@ import pytest
 from fleet.motion import drive
 from fleet.robot import ThermalLimits
 from scenarios.load import load
-from scenarios.prepare.calibrate_twins import calibrate_twins, simulate_experience
-from scenarios.prepare.planned_arm import PlannedArm, hardware_of
+from scenarios.prepare.calibrate_twins import calibrate_twins, simulate_past
+from scenarios.prepare.planned_arm import PlannedArm, air_offsets, hardware_of
 from scenarios.progress import quiet
-from twin.vae.measures import Features
+from twin.thermal.result import nominal_heat_model
+from twin.vae.measures import PARTS, Features
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class Seer:
 
     def features(self, plans, repetitions) -> Features:
         heat = np.array([drive(plan.cycle.profile, self.motors).current_sq for plan in plans])
-        return Features(np.repeat(heat[..., None], 5, axis=-1))
+        return Features(np.repeat(heat[..., None], PARTS, axis=-1))
 
 
 @pytest.fixture(scope="module")
@@ -34,36 +35,47 @@ def scenario():
 
 
 def test_a_rehearsal_holds_both_outcomes_and_repeats(scenario) -> None:
-    hardware = hardware_of(scenario, 0)
-    past = simulate_experience(scenario, PlannedArm(0, hardware, {}), Seer(hardware.motors), jobs=60)
+    def rehearse(index: int):
+        arm = PlannedArm(index, hardware_of(scenario, index), {})
+        return simulate_past(scenario, arm, nominal_heat_model(), jobs=60)
+
+    past = rehearse(0)
     assert 5 <= past.passed.sum() <= 40
     assert len(past) == 60
-    assert past.temp_c.min() > 15.0
-    assert past.temp_c.max() < 60.5
-    assert (
-        simulate_experience(scenario, PlannedArm(0, hardware, {}), Seer(hardware.motors), jobs=60).data_hash
-        == past.data_hash
-    )
-    assert (
-        simulate_experience(scenario, PlannedArm(1, hardware, {}), Seer(hardware.motors), jobs=60).data_hash
-        != past.data_hash
-    )
+    assert past.known_c.min() > 10.0
+    assert past.known_c.max() < 80.0
+    np.testing.assert_array_equal(rehearse(0).known_c, past.known_c)
+    assert not np.array_equal(rehearse(1).known_c, past.known_c)
+
+
+def test_a_rehearsal_has_the_air_of_the_hall() -> None:
+    heat_wave = load("heat_wave")
+    arm = PlannedArm(0, hardware_of(heat_wave, 0), {})
+    air_c = simulate_past(heat_wave, arm, nominal_heat_model(), jobs=60).known_c[:, -1]
+    offset_k = float(air_offsets(heat_wave)[0])
+    assert 17.0 < air_c.min() - offset_k < 22.0 < 36.0 < air_c.max() - offset_k < 41.0
 
 
 def test_a_calibrated_twin_is_kept_for_the_same_arm_only(scenario, tmp_path: Path, caplog) -> None:
     hardware = hardware_of(scenario, 0)
-    first = calibrate_twins(scenario, [PlannedArm(0, hardware, {})], [Seer(hardware.motors)], tmp_path, quiet, jobs=60)
+    first = calibrate_twins(
+        scenario, [PlannedArm(0, hardware, {})], [Seer(hardware.motors)], tmp_path, quiet, risk="excess", jobs=60
+    )
     (home,) = (tmp_path / "saturation").iterdir()
     (home / "saturation.json").touch()
     stamp = (home / "saturation.json").stat().st_mtime_ns
-    again = calibrate_twins(scenario, [PlannedArm(0, hardware, {})], [Seer(hardware.motors)], tmp_path, quiet, jobs=60)
+    again = calibrate_twins(
+        scenario, [PlannedArm(0, hardware, {})], [Seer(hardware.motors)], tmp_path, quiet, risk="excess", jobs=60
+    )
     assert again[0].saturation == first[0].saturation
     assert (home / "saturation.json").stat().st_mtime_ns == stamp
     other = hardware_of(scenario, 1)
-    calibrate_twins(scenario, [PlannedArm(0, other, {})], [Seer(other.motors)], tmp_path, quiet, jobs=60)
+    calibrate_twins(scenario, [PlannedArm(0, other, {})], [Seer(other.motors)], tmp_path, quiet, risk="excess", jobs=60)
     assert len(list((tmp_path / "saturation").iterdir())) == 2
     (home / "saturation.json").write_text("{")
-    mended = calibrate_twins(scenario, [PlannedArm(0, hardware, {})], [Seer(hardware.motors)], tmp_path, quiet, jobs=60)
+    mended = calibrate_twins(
+        scenario, [PlannedArm(0, hardware, {})], [Seer(hardware.motors)], tmp_path, quiet, risk="excess", jobs=60
+    )
     assert mended[0].saturation == first[0].saturation
     assert "making it again" in caplog.text
 
@@ -71,7 +83,23 @@ def test_a_calibrated_twin_is_kept_for_the_same_arm_only(scenario, tmp_path: Pat
 def test_an_arm_that_nothing_heats_keeps_its_twin_and_says_why(scenario, tmp_path: Path, caplog) -> None:
     hardware, twin = hardware_of(scenario, 0), Seer(hardware_of(scenario, 0).motors)
     lax = replace(scenario, limits=ThermalLimits(warning_c=500.0, error_c=600.0))
-    assert calibrate_twins(lax, [PlannedArm(0, hardware, {})], [twin], tmp_path, quiet, jobs=40) == [twin]
+    (kept,) = calibrate_twins(lax, [PlannedArm(0, hardware, {})], [twin], tmp_path, quiet, risk="excess", jobs=40)
+    assert kept.twin is twin
+    assert kept.saturation is None
     assert f"quickstart: arm '{hardware.robot.name}' gets no probability of saturation" in caplog.text
     assert "(got 40; passed in 0)" in caplog.text
     assert not (tmp_path / "saturation").exists()
+
+
+def test_a_curve_is_kept_for_the_same_arm_only(scenario, tmp_path: Path) -> None:
+    def calibrate(index: int):
+        hardware = hardware_of(scenario, index)
+        arms, seers = [PlannedArm(index, hardware, {})], [Seer(hardware.motors)]
+        return calibrate_twins(scenario, arms, seers, tmp_path, quiet, risk="rc-nominal", jobs=60)[0]
+
+    first = calibrate(0)
+    assert first.saturation is None
+    assert first.heat.curve is not None
+    assert calibrate(0).version == first.version
+    assert calibrate(1).version != first.version
+    assert len(list((tmp_path / "saturation").iterdir())) == 2

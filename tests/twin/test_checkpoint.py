@@ -67,7 +67,7 @@ def test_a_file_cut_short_is_named(folder, name):
 
 def test_another_format_is_refused(folder):
     edit(folder, lambda card: card.update(format=99, surprise=1))
-    with pytest.raises(CheckpointError, match="format 99 is not supported, only 2"):
+    with pytest.raises(CheckpointError, match="format 99 is not supported, only 3"):
         load(folder)
 
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import roc_auc_score
 
+from fleet.difficulty import KNOWN
 from twin.saturation.fit import (
     LEAST_JOBS,
     LEAST_OF_EACH,
@@ -19,7 +20,7 @@ from twin.saturation.fit import (
     monotone_curve,
 )
 from twin.saturation.reliability import brier, reliability
-from twin.vae.measures import Features
+from twin.vae.measures import PARTS, Features
 
 
 def true_score(packed: np.ndarray, duration_s: np.ndarray, temp_c: np.ndarray) -> np.ndarray:
@@ -38,19 +39,19 @@ def true_score(packed: np.ndarray, duration_s: np.ndarray, temp_c: np.ndarray) -
 def world(jobs: int, seed: int, link=lambda score: 1 / (1 + np.exp(-score))) -> tuple[Experience, np.ndarray]:
     """Past jobs, and the probability with which each passed the limit."""
     rng = np.random.default_rng(seed)
-    packed = rng.exponential(0.8, (jobs, 7, 5))
+    packed = rng.exponential(0.8, (jobs, 7, PARTS))
     packed[..., 2] += packed[..., 3]
     packed[..., 4] = np.square(packed[..., 3])
-    duration, temp = np.exp(rng.uniform(np.log(180), np.log(2700), jobs)), rng.uniform(20, 50, (jobs, 7))
+    duration, temp = np.exp(rng.uniform(np.log(180), np.log(2700), jobs)), rng.uniform(20, 50, (jobs, KNOWN))
     p = link(true_score(packed, duration, temp))
     past = Experience(
-        twin="t", features=Features(packed), duration_s=duration, temp_c=temp, passed=rng.random(jobs) < p
+        twin="t", features=Features(packed), duration_s=duration, known_c=temp, passed=rng.random(jobs) < p
     )
     return past, p
 
 
 def told(model, past: Experience) -> np.ndarray:
-    return model.risk(past.features, past.duration_s).at(past.temp_c)
+    return model.risk(past.features, past.duration_s).at(past.known_c)
 
 
 @settings(max_examples=25, deadline=None)
@@ -86,7 +87,8 @@ def test_many_jobs_teach_the_true_law() -> None:
     model = fit_saturation(past, evidence="load")
     assert np.array(model.at_once)[:, 0] == pytest.approx([0, 1, 0, 1, 0, 0, 0], abs=0.25)
     assert np.array(model.later)[:, 0] == pytest.approx([0, 3, 0, 0, 0, 0, 0], abs=0.4)
-    assert model.of_temp == pytest.approx([0, 0.2, 0, 0.05, 0, 0, 0], abs=0.012)
+    for slopes in (model.of_start, model.of_start_later):
+        assert slopes == pytest.approx([0, 0.2, 0, 0.05] + [0] * (KNOWN - 4), abs=0.025)
     assert model.of_log_duration == pytest.approx(1.2, abs=0.12)
     new, p = world(5_000, 2)
     assert np.abs(told(model, new) - p).mean() < 0.01
@@ -122,8 +124,8 @@ def test_a_curve_mends_a_link_that_is_not_logistic() -> None:
     assert np.abs(told(curved, new) - p).mean() < 0.7 * np.abs(told(straight, new) - p).mean()
     assert reliability(told(curved, new), new.passed).error < 0.03
     # The ranking is that of the logistic scores.
-    assert curved.score(new.features, new.duration_s, new.temp_c) == pytest.approx(
-        straight.score(new.features, new.duration_s, new.temp_c)
+    assert curved.score(new.features, new.duration_s, new.known_c) == pytest.approx(
+        straight.score(new.features, new.duration_s, new.known_c)
     )
 
 
@@ -140,16 +142,15 @@ def test_a_curve_never_falls_and_never_promises(seed, jobs) -> None:
 
 @settings(max_examples=5, deadline=None)
 @given(seed=st.integers(0, 99), joint=st.integers(0, 6), more=st.floats(0.1, 20))
-def test_neither_warmth_nor_time_nor_load_makes_a_job_safer(seed, joint, more) -> None:
+def test_neither_warmth_nor_load_makes_a_job_safer(seed, joint, more) -> None:
     past, _ = world(60, seed)
     model = fit_saturation(past, evidence="load")
     p = told(model, past)
-    warmer, heavier = past.temp_c.copy(), past.features.packed.copy()
+    warmer, heavier = past.known_c.copy(), past.features.packed.copy()
     warmer[:, joint] += more
     heavier[:, joint, 3] += more
     for other in (
-        replace(past, temp_c=warmer),
-        replace(past, duration_s=past.duration_s * (1 + more)),
+        replace(past, known_c=warmer),
         replace(past, features=Features(heavier)),
     ):
         assert (told(model, other) >= p - 1e-12).all()
@@ -199,15 +200,15 @@ def test_as_few_jobs_as_may_be_are_enough() -> None:
 
 def test_what_is_not_finite_or_misshapen_is_refused_by_job() -> None:
     past, _ = world(50, 11)
-    for name in ("duration_s", "temp_c"):
+    for name in ("duration_s", "known_c"):
         values = getattr(past, name).copy()
         values[7] = np.nan
         with pytest.raises(ValueError, match=f"{name} must be finite; it is not for 1 of 50 jobs, first job 7"):
             replace(past, **{name: values})
     with pytest.raises(ValueError, match="passed must be bool"):
         replace(past, passed=past.passed.astype(int))
-    with pytest.raises(ValueError, match=r"temp_c must be \(50, 7\) \(got \(50, 6\)\)"):
-        replace(past, temp_c=past.temp_c[:, :6])
+    with pytest.raises(ValueError, match=r"known_c must be \(50, 15\) \(got \(50, 7\)\)"):
+        replace(past, known_c=past.known_c[:, :7])
     with pytest.raises(ValueError, match="No method 'isotone'"):
         fit_saturation(past, method="isotone")
     with pytest.raises(ValueError, match="lasts > 0 s"):
@@ -216,7 +217,7 @@ def test_what_is_not_finite_or_misshapen_is_refused_by_job() -> None:
 
 def test_past_jobs_are_seen_through_the_twin(twin, make_plan, motion, rng) -> None:
     plans = [make_plan(motion(rng, 2.0), motion(rng, 5.0, load), motion(rng, 2.0)) for load in (1.0, 3.0)]
-    past = Experience.of_jobs(twin, plans, [3, 40], temp_c=np.full((2, 7), 25.0), passed=np.array([False, True]))
+    past = Experience.of_jobs(twin, plans, [3, 40], known_c=np.full((2, KNOWN), 25.0), passed=np.array([False, True]))
     assert past.twin == twin.version
     assert past.duration_s.tolist() == [plans[0].duration_s(3), plans[1].duration_s(40)]
     np.testing.assert_array_equal(past.features.packed, twin.features(plans, [3, 40]).packed)

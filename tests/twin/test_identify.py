@@ -272,7 +272,7 @@ def test_a_round_trip_keeps_every_number_and_a_change_is_noticed(rng, tmp_path):
     assert load_twin(tmp_path).version == RcTwin.of(got).version
     text = (tmp_path / CARD).read_text()
     for old, new, says in (
-        ('"format": 1', '"format": 9', "format 9 is not supported, only 1"),
+        ('"format": 2', '"format": 9', "format 9 is not supported, only 2"),
         ('"winding_3":', '"winding_x":', "unknown nodes: winding_x"),
         ('"seconds":', '"secs":', "secs"),
         (f'"arm": "{got.arm}"', '"arm": "right"', "has changed since it was saved"),

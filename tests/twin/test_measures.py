@@ -10,14 +10,14 @@ from hypothesis.extra.numpy import arrays
 from fleet.errors import CheckpointError
 from fleet.motion import Phase
 from twin.vae.checkpoint import CARD, load, save
-from twin.vae.measures import TIE, Calibration, Features, measures_of, score_of
+from twin.vae.measures import PARTS, TIE, Calibration, Features, measures_of, score_of
 from twin.vae.window import cut, resample
 
 errors = st.floats(0.0, 20.0)
 
 
 def packed(count, rng):
-    return Features(rng.gamma(3.0, 0.2, (count, 7, 5)))
+    return Features(rng.gamma(3.0, 0.2, (count, 7, PARTS)))
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def heavier(plan, joint, factor):
     return replace(plan, **{name: load_of(getattr(plan, name)) for name in ("approach", "cycle", "retreat")})
 
 
-@given(arrays(float, (4, 7, 5), elements=errors))
+@given(arrays(float, (4, 7, PARTS), elements=errors))
 def test_difficulty_is_one_minus_exp_of_the_summed_error(values):
     features = Features(values)
     want = 1 - np.exp(-values[..., :3].sum(axis=-1))
@@ -57,22 +57,22 @@ def test_difficulty_is_one_minus_exp_of_the_summed_error(values):
 def test_calibrated_difficulty_is_zero_at_the_median_half_at_the_95th_percentile_and_rises_to_one(calibration):
     usual = calibration.reference.errors.sum(axis=-1)
     for level, want in ((0.0, 0.0), (50.0, 0.0), (95.0, 0.5), (100.0, None)):
-        values = np.zeros((7, 5))
+        values = np.zeros((7, PARTS))
         values[:, 0] = np.percentile(usual, level, axis=0)
         got = calibration.difficulty(Features(values))
         if want is None:
             assert np.all(got > 0.5)
         else:
             np.testing.assert_allclose(got, want, atol=1e-12)
-    far = np.zeros((7, 5))
+    far = np.zeros((7, PARTS))
     far[:, 2] = 20.0
     assert np.all(calibration.difficulty(Features(far)) > 0.99)
 
 
 def test_joints_that_never_differ_have_a_least_spread():
-    calibration = Calibration(Features(np.full((5, 7, 5), 0.2)))
+    calibration = Calibration(Features(np.full((5, 7, PARTS), 0.2)))
     np.testing.assert_allclose(calibration.spread, 0.01)
-    assert np.all(np.isfinite(calibration.difficulty(Features(np.full((7, 5), 0.3)))))
+    assert np.all(np.isfinite(calibration.difficulty(Features(np.full((7, PARTS), 0.3)))))
 
 
 @given(st.integers(2, 60), st.integers(0, 2**32 - 1))
@@ -108,7 +108,7 @@ def test_a_score_may_be_one_joint_and_must_exist(calibration, rng):
         score_of(features, "joint_8")
 
 
-@pytest.mark.parametrize("shape", [(1, 7, 5), (7, 5)])
+@pytest.mark.parametrize("shape", [(1, 7, PARTS), (7, PARTS)])
 def test_a_calibration_needs_some_jobs(shape):
     with pytest.raises(ValueError, match="two or more held-out cool jobs"):
         Calibration(Features(np.zeros(shape)))
@@ -121,7 +121,7 @@ def test_a_calibration_needs_some_jobs(shape):
     [(0, 0.0, "a new place"), (1, 0.0, "a new speed"), (2, 1.0, "more load"), (2, 0.1, "another load")],
 )
 def test_the_reason_is_named_in_words(calibration, channel, one_sided, word):
-    values = np.zeros((7, 5))
+    values = np.zeros((7, PARTS))
     values[:, :3] = calibration.usual
     values[3, channel] += 2.0
     values[3, 3] = one_sided * values[3, 2]
@@ -131,7 +131,7 @@ def test_the_reason_is_named_in_words(calibration, channel, one_sided, word):
 
 
 def test_nothing_beyond_the_usual_says_so(calibration):
-    values = np.zeros((7, 5))
+    values = np.zeros((7, PARTS))
     measures = measures_of(Features(values), calibration, version="v")
     assert measures.why() == "nothing beyond the usual"
     assert measures.shares.sum() == 0

@@ -9,17 +9,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fleet.difficulty import KNOWN
 from fleet.errors import CheckpointError
+from twin.calibrated import CalibratedTwin
 from twin.saturation.model import (
     FILE,
-    CalibratedTwin,
     SaturationModel,
     evidence_of,
-    load_calibrated,
     load_saturation,
     save_saturation,
 )
-from twin.vae.measures import Features
+from twin.thermal.risk import PeakCurve
+from twin.thermal.thermal_twin import RcTwin
+from twin.vae.measures import PARTS, Features
 
 MODEL = SaturationModel(
     twin="t",
@@ -30,7 +32,8 @@ MODEL = SaturationModel(
     at_once=((0.0,), (1.5,), (0.0,), (1.0,), (0.0,), (0.0,), (0.0,)),
     later=((0.0,), (1.0,), (0.0,), (0.0,), (0.0,), (0.0,), (0.0,)),
     of_log_duration=0.5,
-    of_temp=(0.0, 0.1, 0.0, 0.05, 0.0, 0.0, 0.0),
+    of_start=tuple(0.2 if k == 1 else 0.0 for k in range(KNOWN)),
+    of_start_later=tuple({3: 0.1, 14: 0.2}.get(k, 0.0) for k in range(KNOWN)),
     curve=None,
     data_hash="d",
     jobs=200,
@@ -42,32 +45,37 @@ MODEL = SaturationModel(
 
 def features(**load: float) -> Features:
     """One-sided torque errors by joint, all else 9."""
-    packed = np.full((7, 5), 9.0)
+    packed = np.full((7, PARTS), 9.0)
     packed[:, 3] = [load.get(f"joint_{k + 1}", 0.0) for k in range(7)]
     return Features(packed)
 
 
 def test_a_probability_by_hand() -> None:
-    temp_c = np.array([99.0, 40.0, 99.0, 20.0, 99.0, 99.0, 99.0])
-    # Half warmed: −10 + (1.5 + 0.5) · 1.5 + 1 · 0.5 + 0.1 · 40 + 0.05 · 20 + 0.5 · ln t
+    known_c = np.full(KNOWN, 99.0)
+    known_c[[1, 3, 14]] = 40.0, 20.0, 10.0
+    # Half warmed: −10 + (1.5 + 0.5) · 1.5 + 1 · 0.5 + ½ (0.2 · 40 + 0.1 · 20 + 0.2 · 10) + 0.5 · ln t
     half_s = 1500.0 * np.log(2.0)
-    expected = -1.5 + 0.5 * np.log(half_s)
+    expected = -0.5 + 0.5 * np.log(half_s)
     risk = MODEL.risk(features(joint_2=1.5, joint_4=0.5), half_s)
-    assert risk.at(temp_c) == pytest.approx(1 / (1 + np.exp(-expected)))
-    assert MODEL.score(features(joint_2=1.5, joint_4=0.5), half_s, temp_c) == pytest.approx(expected)
+    assert risk.at(known_c) == pytest.approx(1 / (1 + np.exp(-expected)))
+    assert MODEL.score(features(joint_2=1.5, joint_4=0.5), half_s, known_c) == pytest.approx(expected)
 
 
 def test_what_comes_after_the_horizon_does_not_count() -> None:
-    temp_c = np.full(7, 30.0)
+    known_c = np.full(KNOWN, 30.0)
     near = replace(MODEL, horizon_s=600.0)
-    assert near.score(features(), 3000.0, temp_c) == MODEL.score(features(), 600.0, temp_c)
-    assert near.score(features(), 300.0, temp_c) == MODEL.score(features(), 300.0, temp_c)
+    assert near.score(features(), 3000.0, known_c) == MODEL.score(features(), 600.0, known_c)
+    assert near.score(features(), 300.0, known_c) == MODEL.score(features(), 300.0, known_c)
 
 
 @given(seed=st.integers(0, 999), count=st.integers(1, 5))
 def test_many_jobs_are_each_job(seed, count) -> None:
     rng = np.random.default_rng(seed)
-    packed, duration, temp = rng.random((count, 7, 5)), rng.uniform(1, 1e4, count), rng.uniform(10, 70, (count, 7))
+    packed, duration, temp = (
+        rng.random((count, 7, PARTS)),
+        rng.uniform(1, 1e4, count),
+        rng.uniform(10, 70, (count, KNOWN)),
+    )
     curve = ((-5.0, 0.01), (0.0, 0.3), (4.0, 0.99))
     for model in (MODEL, replace(MODEL, curve=curve)):
         p = model.risk(Features(packed), duration).at(temp)
@@ -79,10 +87,11 @@ def test_many_jobs_are_each_job(seed, count) -> None:
 
 
 def test_evidence_names_what_is_read() -> None:
-    packed = np.arange(35.0).reshape(7, 5)
+    packed = np.arange(7.0 * PARTS).reshape(7, PARTS)
     assert evidence_of(Features(packed), "errors").tolist() == packed[:, :3].tolist()
     assert evidence_of(Features(packed), "load").tolist() == packed[:, 3:4].tolist()
-    assert evidence_of(Features(packed), "excess").tolist() == packed[:, 4:].tolist()
+    assert evidence_of(Features(packed), "excess").tolist() == packed[:, 4:5].tolist()
+    assert evidence_of(Features(packed), "torque").tolist() == packed[:, 5:].tolist()
     with pytest.raises(ValueError, match="No evidence 'lod'; did you mean 'load'"):
         evidence_of(Features(packed), "lod")
 
@@ -95,7 +104,7 @@ def test_a_job_without_duration_is_refused(duration_s) -> None:
 
 def test_a_job_of_another_arm_is_refused() -> None:
     with pytest.raises(ValueError, match=r"needs \(7, 1\) numbers \[joint, column\] of a job \(got \(6, 1\)\)"):
-        MODEL.risk(Features(np.zeros((6, 5))), 10.0)
+        MODEL.risk(Features(np.zeros((6, PARTS))), 10.0)
 
 
 @pytest.mark.parametrize(
@@ -103,8 +112,8 @@ def test_a_job_of_another_arm_is_refused() -> None:
     [
         {"offset": np.nan},
         {"of_log_duration": -0.1},
-        {"of_temp": (-0.1,) * 7},
-        {"of_temp": (0.1,) * 6},
+        {"of_start": (-0.1,) * KNOWN},
+        {"of_start_later": (0.1,) * 7},
         {"evidence": "x"},
     ],
 )
@@ -113,18 +122,20 @@ def test_a_model_that_makes_no_sense_is_refused(changes) -> None:
         replace(MODEL, **changes)
 
 
-def test_a_calibrated_twin_scores_with_its_risk(twin, plan) -> None:
-    model = replace(MODEL, twin=twin.version)
-    known = CalibratedTwin(twin, model)
+def test_a_calibrated_twin_says_what_each_model_says(twin, plan) -> None:
+    model, heat = replace(MODEL, twin=twin.version), RcTwin.nominal()
+    known = CalibratedTwin(twin, heat, model)
     told = known.score(plan, 40)
     np.testing.assert_array_equal(told.per_joint, twin.score(plan, 40).per_joint)
-    found = twin.features([plan], [40])
-    temp_c = np.linspace(20.0, 50.0, 7)
-    expected = model.risk(found, np.array([plan.duration_s(40)])).at(temp_c)[0]
-    assert told.p_at(temp_c) == pytest.approx(expected)
-    assert known.version == f"{twin.version}+{model.version}"
+    known_c = np.linspace(20.0, 50.0, KNOWN)
+    expected = model.risk(twin.features([plan], [40]), np.array([plan.duration_s(40)])).at(known_c)[0]
+    assert told.p_at(known_c) == pytest.approx(expected)
+    assert told.peak_at(known_c) == heat.peak(plan, 40).value(known_c)
+    assert known.version == f"d:{twin.version}+peak:{heat.version}+p:load-{model.version}"
+    by_peak = CalibratedTwin(twin, replace(heat, curve=PeakCurve(knots=((0.0, 0.25), (200.0, 0.25)), jobs=30)))
+    assert by_peak.score(plan, 40).p_at(known_c) == 0.25
     with pytest.raises(ValueError, match="fitted on twin t, this is"):
-        CalibratedTwin(twin, MODEL)
+        CalibratedTwin(twin, heat, MODEL)
 
 
 def test_a_saved_model_is_the_same_model(tmp_path: Path, twin) -> None:
@@ -132,7 +143,6 @@ def test_a_saved_model_is_the_same_model(tmp_path: Path, twin) -> None:
     save_saturation(model, tmp_path)
     assert load_saturation(tmp_path) == model
     assert load_saturation(tmp_path).version == model.version
-    assert load_calibrated(twin, tmp_path, data_hash="d").saturation == model
 
 
 def test_another_version_means_another_content() -> None:
@@ -140,26 +150,13 @@ def test_another_version_means_another_content() -> None:
     assert replace(MODEL, data_hash="e").version != MODEL.version
 
 
-def test_a_model_of_other_data_or_another_twin_is_refused_by_name(tmp_path: Path, twin) -> None:
-    save_saturation(MODEL, tmp_path)
-    with pytest.raises(CheckpointError, match=f"twin is t, wanted {twin.version}"):
-        load_calibrated(twin, tmp_path)
-    save_saturation(replace(MODEL, twin=twin.version), tmp_path)
-    with pytest.raises(CheckpointError, match="data_hash is d, wanted other"):
-        load_calibrated(twin, tmp_path, data_hash="other")
-    few = replace(MODEL, twin=twin.version, of_temp=(0.1,), at_once=((1.0,),), later=((1.0,),))
-    save_saturation(few, tmp_path)
-    with pytest.raises(CheckpointError, match="joints is 1, wanted 7"):
-        load_calibrated(twin, tmp_path)
-
-
 @pytest.mark.parametrize(
     ("change", "says"),
     [
         (lambda card: b"{", "truncated"),
-        (lambda card: card | {"format": 2}, "format 2 is not supported, only 1"),
+        (lambda card: card | {"format": 1}, "format 1 is not supported, only 2"),
         (lambda card: card | {"model": card["model"] | {"offset": -9.0}}, "content has changed"),
-        (lambda card: card | {"model": card["model"] | {"of_temp": "warm"}}, "of_temp"),
+        (lambda card: card | {"model": card["model"] | {"of_start": "warm"}}, "of_start"),
         (lambda card: card | {"model": card["model"] | {"of_log_duration": -1.0}}, "slope"),
         (lambda card: card | {"extra": 1}, "extra"),
     ],

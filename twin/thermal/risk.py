@@ -63,7 +63,8 @@ class LinearHeat:
         heat = node_heat(at_zero, motors.idle_w + load.friction_w)
         forcing = np.stack(np.broadcast_arrays(thermal.to_ambient, heat), axis=-1) / thermal.capacity[:, None]
         # A tree of nodes: the matrix is similar to a symmetric one, so its modes are real.
-        return cls(rates.real, modes.real, np.linalg.inv(modes.real), forcing)
+        rates, modes = np.real(rates), np.real(modes)
+        return cls(rates, modes, np.linalg.inv(modes), forcing)
 
     def courses(self, elapsed_s: Array) -> Array:
         """Temperatures as affine functions of the start: [moment, node, NODES + 2] for nodes, ambient and 1.

@@ -3,7 +3,7 @@
 It implements the same protocol as the learned twin, and also predicts temperatures.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import repeat
@@ -153,13 +153,13 @@ class RcTwin:
         lasts_s = plan.duration_s(repetitions) * plan.weights(repetitions)
         return peak_forecast(self._heat[plan], lasts_s, self.curve and np.array(self.curve.knots))
 
-    def peaks_from(self, plans: Sequence[Plan], repetitions: Sequence[int], known_c: Array) -> Array:
+    def peaks_from(self, plans: Sequence[Plan], repetitions: Iterable[int], known_c: Array) -> Array:
         """Hottest motor during each job, °C, [plan], by `peak` from known temperatures [plan, KNOWN]."""
         jobs = zip(plans, repetitions, known_c, strict=True)
         return np.array([float(self.peak(plan, int(times)).value(known)) for plan, times, known in jobs])
 
     def with_past_jobs(
-        self, plans: Sequence[Plan], repetitions: Sequence[int], *, known_c: Array, peak_c: Array
+        self, plans: Sequence[Plan], repetitions: Iterable[int], *, known_c: Array, peak_c: Array
     ) -> "RcTwin":
         """The same twin with P(saturation) from the errors of its predictions for past jobs.
 
