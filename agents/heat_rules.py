@@ -12,7 +12,6 @@ from scipy.special import logit, ndtr
 
 from agents.assignment import Matching
 from agents.policy import per_option
-from fleet.engine.reward import RewardWeights
 from fleet.observation import Observation
 from fleet.robot import ThermalLimits
 
@@ -52,7 +51,7 @@ class Wsept(Thermometer):
 
     The worth of a claim is the value of the job, less what heat is expected to cost. The predicted peak of the plan has
     a normal error; the share of it above the error limit is the probability of a fault, which costs the job and
-    `fault_price`. Minutes above the warning limit cost what they cost in the reward. Of the plans of a job the one with
+    `fault_price`. Minutes above the warning limit cost `minute_price` each. Of the plans of a job the one with
     the most worth per time is taken; a claim whose worth is not positive waits until the arm has cooled.
 
     Without predicted peaks, P(saturation) stands for them; without either, heat is ignored. Scope central: it compares
@@ -66,7 +65,8 @@ class Wsept(Thermometer):
     """In units of value; `scenarios.fault_price` gives 14 to 27 in the scenarios of the library."""
     peak_sd_k: ClassVar = 5.0
     """Standard deviation of predicted peaks near the error limit, wide enough for a nominal thermal network."""
-    minute_price: ClassVar = -RewardWeights.above_warning
+    minute_price: ClassVar = 0.05
+    """Of a minute above the warning limit, as in the default reward."""
 
     def _rate(self, seen: Observation) -> Array:
         """Expected worth per second of every option, [option]; −inf for those that must not be claimed."""
