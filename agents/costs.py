@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from agents.policy import plans_of
+from agents.policy import per_option, plans_of
 from fleet.observation import Observation
 
 Array = np.ndarray
@@ -29,15 +29,15 @@ def thermal(observations: Sequence[Observation]) -> Array:
     average of the arms that may claim the job, and an unknown difficulty equals that average. If no arm has a
     difficulty, the risk decides, then the time until the finish.
     """
-    able, plans = _able(observations), plans_of(observations[0])
+    able, one = _able(observations), observations[0]
     difficulty, known = _stack(observations, "difficulty"), _stack(observations, "known") > 0
-    difficulty = np.where(known, difficulty, _mean(difficulty, known & able, plans, otherwise=1.0))
+    difficulty = np.where(known, difficulty, _mean(difficulty, known & able, one, otherwise=1.0))
     tardiness_s = np.maximum(0.0, _busy_s(observations) - _stack(observations, "slack_s"))
-    late = LATE_PER_H * np.repeat(_stack(observations, "value"), plans, axis=1) * tardiness_s / 3600.0
+    late = LATE_PER_H * per_option(one, _stack(observations, "value")) * tardiness_s / 3600.0
     time = TIME_PER_H * _finish_s(observations) / 3600.0
     cost = difficulty * (1.0 + RISK * _stack(observations, "p_saturation")) + late + time
     # Waiting makes a job late for every arm: the average lateness decides between jobs, not between arms.
-    return np.where(able, cost - _mean(cost, able, plans) - _mean(late, able, plans), np.inf).round(DIGITS)
+    return np.where(able, cost - _mean(cost, able, one) - _mean(late, able, one), np.inf).round(DIGITS)
 
 
 def quickest(observations: Sequence[Observation]) -> Array:
@@ -63,8 +63,13 @@ def _stack(observations: Sequence[Observation], field: str) -> Array:
     return np.stack([np.asarray(getattr(seen, field), dtype=float) for seen in observations])
 
 
-def _mean(values: Array, where: Array, plans: int, otherwise: float = 0.0) -> Array:
-    """Average over some of the arms and the plans of a job, [option]; the same for all plans of a job."""
+def _mean(values: Array, where: Array, one: Observation, otherwise: float = 0.0) -> Array:
+    """Average over some of the arms and the plans of a job, [option]; the same for all plans of a job.
+
+    Args:
+        one: Any observation of the fleet.
+    """
+    plans = plans_of(one)
     total = np.where(where, values, 0.0).sum(axis=0).reshape(-1, plans).sum(axis=1)
     count = where.sum(axis=0).reshape(-1, plans).sum(axis=1)
-    return np.repeat(np.where(count > 0, total / np.maximum(count, 1), otherwise), plans)
+    return per_option(one, np.where(count > 0, total / np.maximum(count, 1), otherwise))

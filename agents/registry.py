@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from agents.assignment import Matching, QuickestMatching, QuickestSsi, Ssi
 from agents.consensus import Consensus
+from agents.heat_rules import Thermometer, Wsept
 from agents.policy import ArmPolicy, Policy, for_all_arms
 from agents.rules import CoolestFirst, LeastDifficulty, RandomLegal, RoundRobin, Wspt, WsptCool
 from fleet.errors import nearest
@@ -35,6 +36,8 @@ RULES: dict[str, Rule] = {
     "consensus": Rule(Consensus, _RELATIVE, "Choi, Brunet & How 2009"),
     "wspt": Rule(Wspt, "time per value", "Smith 1956"),
     "wspt_cool": Rule(WsptCool, "time per value, P(saturation) ≤ 0.5", "Smith 1956"),
+    "thermometer": Rule(Thermometer, "time per value, headroom suits the load", _KUHN),
+    "wsept": Rule(Wsept, "time per expected worth", "Rothkopf 1966"),
     "ssi": Rule(Ssi, _THERMAL, _SSI),
     "matching": Rule(Matching, _THERMAL, _KUHN),
     "quickest_ssi": Rule(QuickestSsi, _TIME, _SSI),

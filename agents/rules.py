@@ -1,4 +1,4 @@
-"""Dispatching rules. Except `wspt_cool` they are non-idling: an arm that may claim a job does so."""
+"""Dispatching rules. Except `wspt_cool` they are non-idling: a free arm that may claim a job does so."""
 
 from collections.abc import Mapping
 from typing import ClassVar

@@ -12,7 +12,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 import msgspec
 
 from fleet.errors import ScenarioError, nearest
-from scenarios.schema import JobStream, Scenario
+from scenarios.schema import Scenario
 from scenarios.schema_errors import check_finite, plain_kind, readable_error
 
 MOST_JOBS = 100_000
@@ -123,17 +123,11 @@ def _check(scenario: Scenario, path: Path) -> None:
             if name not in streams[:i]:
                 known = nearest(name, streams[:i]) if i else "."
                 raise ScenarioError(f"{file}: jobs[{i}].after: there is no stream '{name}' above this one{known}")
-    total = sum(_expected_jobs(stream, scenario.horizon_s) for stream in scenario.jobs)
+    total = sum(stream.arrivals.expected(scenario.horizon_s) for stream in scenario.jobs)
     if total > MOST_JOBS:
         raise ScenarioError(
             f"{file}: jobs: about {total:.3g} jobs would arrive in a shift; at most {MOST_JOBS} are allowed."
         )
-
-
-def _expected_jobs(stream: JobStream, horizon_s: float) -> float:
-    spec = stream.arrivals
-    gap_s = spec.every_s or horizon_s
-    return horizon_s / gap_s * (spec.count or 1) if spec.kind != "trace" else len(spec.times_s or ())
 
 
 def _with_traces(scenario: Scenario, path: Path) -> Scenario:

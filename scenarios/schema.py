@@ -1,6 +1,7 @@
 """The schema of scenario files, with the defaults that `fleet` does not define."""
 
 from dataclasses import dataclass, field
+from math import ceil
 from typing import Literal
 
 import numpy as np
@@ -85,6 +86,18 @@ class ArrivalSpec:
             assert self.count is not None
             return Batch(count=self.count, start_s=self.start_s, every_s=self.every_s)
         return Trace(times_s=tuple(t + self.start_s for t in (self.times_s or from_file)))
+
+    def expected(self, horizon_s: float) -> float:
+        """Expected number of arrivals before the horizon; 0 for a trace whose file is not read yet."""
+        if self.kind == "trace":
+            return float(sum(t + self.start_s < horizon_s for t in self.times_s or ()))
+        left_s = max(0.0, min(self.stop_s or horizon_s, horizon_s) - self.start_s)
+        if self.kind == "poisson":
+            assert self.every_s is not None
+            return left_s / self.every_s
+        assert self.count is not None
+        batches = ceil(left_s / self.every_s) if self.every_s else float(left_s > 0)
+        return self.count * batches
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,6 +215,18 @@ class Spread:
 
 
 @dataclass(frozen=True, kw_only=True)
+class RewardSpec:
+    """Weights of the reward terms; `fleet.engine.reward.RewardWeights` defines the fields."""
+
+    finished_value: float = RewardWeights.finished_value
+    tardiness: float = RewardWeights.tardiness
+    above_warning: float = RewardWeights.above_warning
+    faults: float | None = None
+    """None: minus the price of a fault, see `scenarios.fault_price`."""
+    energy: float = RewardWeights.energy
+
+
+@dataclass(frozen=True, kw_only=True)
 class Scenario:
     """One shift of one fleet in one cell."""
 
@@ -222,7 +247,7 @@ class Scenario:
     telemetry_interval_s: float = 1.0
     ambient: Ambient = field(default_factory=Ambient)
     limits: ThermalLimits = field(default_factory=ThermalLimits)
-    reward: RewardWeights = field(default_factory=RewardWeights)
+    reward: RewardSpec = field(default_factory=RewardSpec)
     planning: Planning = field(default_factory=Planning)
     twin: TwinSpec = field(default_factory=TwinSpec)
     spread: Spread = field(default_factory=Spread)

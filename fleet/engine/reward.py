@@ -16,9 +16,24 @@ class RewardWeights:
     above_warning: float = -0.05
     """Per minute an arm has a motor above the warning limit."""
     faults: float = -5.0
-    """Per fault."""
+    """Per fault; a scenario without `reward.faults` takes the price of a fault, see `FaultPrice`."""
     energy: float = -0.001
     """Per W·h turned to heat."""
+
+
+@dataclass(frozen=True)
+class FaultPrice:
+    """What a fault costs a fleet: the value of the jobs that arrive while the arm is expected to be lost."""
+
+    value_per_s: float
+    """Expected value of arriving jobs, 1/s."""
+    downtime_s: float
+    """Expected time from a fault until the arm works again."""
+
+    @property
+    def price(self) -> float:
+        """The product of both, in units of value."""
+        return self.value_per_s * self.downtime_s
 
 
 TERMS = tuple(f.name for f in fields(RewardWeights))

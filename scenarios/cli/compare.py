@@ -1,12 +1,13 @@
-"""`thermofleet compare`."""
+"""`thermofleet compare` and `thermofleet ablate`."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from agents.registry import RULES
 from scenarios.cli import options
-from scenarios.cli.terminal import out_console, print_json, progress_bar
+from scenarios.cli.terminal import out_console, print_json, progress_bar, say
 from scenarios.load import load
 from scenarios.schema_errors import choose
 
@@ -68,3 +69,50 @@ def compare_command(
         print_json(result)
     else:
         out_console.print(comparison_table(result))
+
+
+def ablate_command(
+    scenario: options.ScenarioArg,
+    policy: Annotated[
+        str, typer.Option(help="Policy that runs with each source: a name, FILE.py:CLASS, or a folder of train.")
+    ] = "least_difficulty",
+    scores: Annotated[
+        str | None,
+        typer.Option(
+            help="Sources, separated by commas: trained, untrained, torque, rc-nominal, rc, random, inverted, "
+            "constant, blind, oracle. Differences refer to the first one. Default: all.",
+            show_default=False,
+        ),
+    ] = None,
+    fleets: Annotated[int, options.number("Number of draws of the arms' deviations.", 2, 100)] = 3,
+    trainings: Annotated[int, options.number("Number of trainings of each fleet's networks.", 1, 20)] = 2,
+    seeds: Annotated[int, options.number("Number of seeds.", 2, 10_000)] = 20,
+    first_seed: Annotated[int, options.number("First seed.", 0, options.MAX_SEED)] = 10_000,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the results; default: runs/ablate-SCENARIO-POLICY.", show_default=False),
+    ] = None,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Run one policy with difficulty and P(saturation) from different sources, and compare the results.
+
+    Writes every shift to ablation.csv and the intervals to ablation.json. The same command continues an interrupted
+    comparison. Each training takes up to a minute per arm and core.
+    """
+    from scenarios.extras import require_extra
+
+    require_extra("twin")
+    from scenarios.policy_loader import label
+    from scenarios.studies.ablation import AblationPlan, ablate, ablation_table
+
+    chosen = load(scenario)
+    given = {} if scores is None else {"scores": tuple(name.strip() for name in scores.split(","))}
+    plan = AblationPlan(policy=policy, fleets=fleets, trainings=trainings, seeds=seeds, first_seed=first_seed, **given)
+    folder = out or Path(f"runs/ablate-{chosen.name}-{label(policy)}")
+    with progress_bar(kept="Finished shifts, plans and twins are") as progress:
+        result = ablate(chosen, plan, folder, progress=progress)
+    if as_json:
+        print_json(result)
+    else:
+        out_console.print(ablation_table(result))
+        say(f"Written to {folder}.")

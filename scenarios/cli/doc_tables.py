@@ -3,7 +3,6 @@
 import json
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import fields
 from math import prod
 
 from fleet.bus.client.rate_limits import Limits
@@ -20,6 +19,7 @@ from fleet.live.auction.round import Timing
 from fleet.live.clock import CLOCK_DRIFT
 from fleet.live.monitor.snapshot import FRESH_S
 from fleet.observation import FIELDS, Layout
+from scenarios.schema import RewardSpec
 
 _PART = re.compile(r"(<!-- made by thermofleet contract: (?P<name>\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -220,9 +220,10 @@ def _observation_table() -> str:
 
 def _reward_table() -> str:
     text = descriptions(RewardWeights)
-    rows = (
-        (f"`reward_{f.name}`", _number(getattr(RewardWeights, f.name)), text[f.name]) for f in fields(RewardWeights)
-    )
+    rows: list[tuple[str, ...]] = []
+    for name, weight in vars(RewardSpec()).items():
+        shown = "−price of a fault" if weight is None else _number(weight)
+        rows.append((f"`reward_{name}`", shown, text[name]))
     return table(("info", "weight", "what for"), rows)
 
 

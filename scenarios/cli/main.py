@@ -46,6 +46,7 @@ COMMANDS = {
     "layout": LazyCommand(_LOOK, "library:layout_command", "Show reach, space and problems of a cell."),
     "animate": LazyCommand(_LOOK, "animate:animate_command", "Draw one shift as a GIF."),
     "compare": LazyCommand(_POLICIES, "compare:compare_command", "Compare policies on the same seeds."),
+    "ablate": LazyCommand(_POLICIES, "compare:ablate_command", "Compare sources of scores under one policy."),
     "train": LazyCommand(_POLICIES, "train:train_command", "Train a policy by reinforcement learning."),
     "up": LazyCommand(_LIVE, "live.up:up_command", "Start a whole fleet, one process per participant."),
     "router": LazyCommand(_LIVE, "router:router_command", "Run the Zenoh router of a fleet."),

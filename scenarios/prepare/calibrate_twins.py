@@ -68,20 +68,39 @@ def calibrate_twins(
     Args:
         arms: With their plans for all motion of the scenario, light loads included.
     """
+    heats = calibrate_networks(scenario, arms, folder, progress, risk=risk, jobs=jobs)
+    inputs = list(zip(arms, twins, heats, strict=True))
+    if risk in ("rc", "rc-nominal"):
+        return [CalibratedTwin(twin, heat) for _, twin, heat in inputs]
+    models = [_saturation(scenario, a, t, heat, risk, folder, jobs) for a, t, heat in inputs]
+    fitted = load_or_make(models, "calibrating", progress)
+    return [CalibratedTwin(t, heat, model) for (_, t, heat), model in zip(inputs, fitted, strict=True)]
+
+
+def calibrate_networks(
+    scenario: Scenario,
+    arms: Sequence[PlannedArm],
+    folder: Path,
+    progress: Progress,
+    *,
+    risk: "RiskName" = "rc",
+    jobs: int = PAST_JOBS,
+) -> list[RcTwin]:
+    """Every arm's thermal network, identified for `rc`, else nominal; for `rc` and `rc-nominal` with its P(saturation).
+
+    Arguments as in `calibrate_twins`.
+    """
     robots, ambient_c = [arm.hardware.robot for arm in arms], scenario.twin.ambient_c
     if risk == "rc":
         heats = [RcTwin.of(found) for found in identify_arms(scenario, arms, folder, progress)]
     else:
         heats = [RcTwin.nominal(robot.name, ambient_c=ambient_c, cooling=robot.cooling) for robot in robots]
     heats = [replace(heat, warning_c=scenario.limits.warning_c) for heat in heats]
-    inputs = list(zip(arms, twins, heats, strict=True))
-    if risk in ("rc", "rc-nominal"):
-        makers = [_curve(scenario, arm, heat, folder, jobs) for arm, _, heat in inputs]
-        curves = load_or_make(makers, "calibrating", progress)
-        return [CalibratedTwin(t, replace(heat, curve=c)) for (_, t, heat), c in zip(inputs, curves, strict=True)]
-    models = [_saturation(scenario, a, t, heat, risk, folder, jobs) for a, t, heat in inputs]
-    fitted = load_or_make(models, "calibrating", progress)
-    return [CalibratedTwin(t, heat, model) for (_, t, heat), model in zip(inputs, fitted, strict=True)]
+    if risk not in ("rc", "rc-nominal"):
+        return heats
+    makers = [_curve(scenario, arm, heat, folder, jobs) for arm, heat in zip(arms, heats, strict=True)]
+    curves = load_or_make(makers, "calibrating", progress)
+    return [replace(heat, curve=curve) for heat, curve in zip(heats, curves, strict=True)]
 
 
 def _curve(scenario: Scenario, arm: PlannedArm, heat: RcTwin, folder: Path, jobs: int) -> CachedModel[PeakCurve]:

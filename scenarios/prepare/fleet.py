@@ -29,6 +29,7 @@ from fleet.seeding import shift_seeds
 from fleet.thermal import ThermalModel
 from scenarios.cell_layout import cell_of, near_of
 from scenarios.extras import require_extra
+from scenarios.fault_price import weights_of
 from scenarios.job_stream import JobSampler, all_works, rehearsal_works, works_of
 from scenarios.load import load, override
 from scenarios.prepare.planned_arm import PlannedArm, air_offsets, homes_in_fixtures, plan_arms
@@ -360,6 +361,6 @@ def env_of(
     choose("plant", plant, PlantName)
     names = tuple(arm.robot.name for arm in fleet.arms)
     exchange = open_exchange(bus, names, fleet.scenario.name, endpoint, channel)
-    options = {"weights": fleet.scenario.reward, "cell": cell_of(fleet.scenario), **options}
+    options = {"weights": weights_of(fleet.scenario), "cell": cell_of(fleet.scenario), **options}
     options.setdefault("decisions", fleet.scenario.decisions)
     return parallel_env(ShiftFactory(fleet, plant), exchange=exchange, **options)

@@ -7,6 +7,7 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
+from scenarios.fault_price import fault_price
 from scenarios.prepare.fleet import ShiftFactory, prepare
 from scenarios.progress import Progress, quiet
 from scenarios.report.load_factor import load_factor
@@ -31,12 +32,22 @@ def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | Tex
         f"{scenario.name}: {scenario.description}\n{scenario.horizon_s / 3600:g} h, a decision every "
         f"{scenario.decision_interval_s:g} s, {scenario.slots} slots, ambient {ambient}\n"
         f"thermal load factor {thermal:.2f} for the best assignment, {blind:.2f} for an equal split, "
-        f"time load {time:.2f} (mean of {SEEDS} seeds): {max(set(regimes), key=regimes.count)}"
+        f"time load {time:.2f} (mean of {SEEDS} seeds): {max(set(regimes), key=regimes.count)}\n"
+        f"{_fault_cost(scenario)}"
     )
     refused = list(dict.fromkeys(map(str, fleet.infeasible)))
     more = [f"… and {len(refused) - MOST_REASONS} more."] if len(refused) > MOST_REASONS else []
     tail = Text("\n".join([*refused[:MOST_REASONS], *more]) or "Every arm can do every job.")
     return [Text(head), Text(""), _arms(scenario), Text(""), _jobs(scenario), Text(""), tail]
+
+
+def _fault_cost(scenario: Scenario) -> str:
+    of = fault_price(scenario)
+    hourly, minutes = 3600.0 * of.value_per_s, of.downtime_s / 60.0
+    factors = f"jobs worth {hourly:.1f} arrive per hour, times {minutes:.0f} min until the arm works again"
+    if scenario.reward.faults is None:
+        return f"a fault costs {of.price:.1f}: {factors}"
+    return f"a fault costs {-scenario.reward.faults:g} (reward.faults); its price would be {of.price:.1f}: {factors}"
 
 
 def _arms(scenario: Scenario) -> Table:

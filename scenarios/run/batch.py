@@ -16,6 +16,7 @@ from fleet.errors import ScenarioError
 from fleet.job import Job
 from fleet.seeding import child, key_of, shift_seeds
 from scenarios.cell_layout import near_of
+from scenarios.fault_price import weights_of
 from scenarios.job_stream import JobSampler, works_of
 from scenarios.load import override
 from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, RiskName, prepare, scenario_with, world_of
@@ -108,7 +109,7 @@ def make_batch(
     ]
     library = replace(library_of(fleets, randomise), near=near)
     options = {"max_cycles": max_cycles, "autoreset": autoreset, "stagger": stagger, "threads": threads}
-    return BatchEnv(library, num_envs, seed=seed, weights=chosen.reward, decisions=chosen.decisions, **options)
+    return BatchEnv(library, num_envs, seed=seed, weights=weights_of(chosen), decisions=chosen.decisions, **options)
 
 
 def _check_ambient(scenario: Scenario, randomise: Randomisation) -> None:

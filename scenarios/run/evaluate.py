@@ -11,6 +11,7 @@ from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.bus.exchange.memory import MemoryExchange
 from fleet.env.validation import actions_of
 from fleet.env.vector import BatchEnv, Library
+from scenarios.fault_price import weights_of
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.fleet import Fleet
 from scenarios.run.batch import library_of
@@ -46,7 +47,7 @@ def outcomes(fleet: Fleet, policy: str, seeds: Sequence[int], channel: Channel =
     """
     library = _library(fleet)
     exchanges = None if channel.perfect else [MemoryExchange(library.arms, channel) for _ in seeds]
-    weights = fleet.scenario.reward
+    weights = weights_of(fleet.scenario)
     policies = [policy_at(policy, seed) for seed in seeds]
     only_when_asked = only_choices(policies[0])
     env = BatchEnv(

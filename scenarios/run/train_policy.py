@@ -18,6 +18,7 @@ from fleet.env.adapters.torchrl import TorchRLEnv
 from fleet.env.vector import BatchEnv, Obs
 from fleet.errors import FleetError
 from fleet.files import atomic_path
+from scenarios.fault_price import weights_of
 from scenarios.policy_loader import policy_of
 from scenarios.prepare.fleet import RISK, DifficultyName, RiskName, prepare
 from scenarios.progress import Progress, quiet
@@ -98,14 +99,14 @@ def train(
     }
     _check_folder(out, card, resume=resume)
     fleet = prepare(scenario, difficulty=difficulty, risk=risk, cache=cache, progress=progress)
-    library = library_of([fleet])
+    library, weights = library_of([fleet]), weights_of(scenario)
 
     def make_env(envs: int, seed: int) -> TorchRLEnv:
-        options = {"weights": scenario.reward, "decisions": config.decisions, "stagger": True}
+        options = {"weights": weights, "decisions": config.decisions, "stagger": True}
         return TorchRLEnv(BatchEnv(library, envs, seed=seed, autoreset=False, **options))
 
     # In intervals, as in `run` and in a live fleet, where an arm above its limit is asked more often than in training.
-    judge = BatchEnv(library, plan.validation_envs, weights=scenario.reward)
+    judge = BatchEnv(library, plan.validation_envs, weights=weights)
     trainer = Trainer(make_env, judge.layout, config)
     best = -np.inf
     if resume:
@@ -115,7 +116,7 @@ def train(
     elif config.warm_start:
         rng = np.random.default_rng(np.random.SeedSequence([config.seed, 4]))
         teacher = BatchEnv(
-            library, 16, seed=int(rng.integers(2**31)), weights=scenario.reward, stagger=True, decisions="events"
+            library, 16, seed=int(rng.integers(2**31)), weights=weights, stagger=True, decisions="events"
         )
         imitate(trainer.actor, judge.layout, _demonstrations(teacher, config.warm_start, progress), rng)
     out.mkdir(parents=True, exist_ok=True)

@@ -10,6 +10,7 @@ from fleet.engine.tables import Tables
 from fleet.env.vector import BatchEnv
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.thermal import WINDING
+from scenarios.fault_price import weights_of
 from scenarios.policy_loader import policy_of
 from scenarios.prepare.fleet import Fleet, env_of, prepare
 from scenarios.run.batch import library_of
@@ -55,7 +56,7 @@ def check_plans(tables: Tables, actual: np.ndarray, world: World, expected: np.n
 def test_every_entry_point_repeats_a_recorded_run(fleet, recorded, play) -> None:
     logged, single = env_of(fleet, keep_events=True), env_of(fleet)
     library = library_of([fleet])
-    batch = BatchEnv(library, 3, seed=[SEED - 1, SEED, SEED + 1], weights=fleet.scenario.reward)
+    batch = BatchEnv(library, 3, seed=[SEED - 1, SEED, SEED + 1], weights=weights_of(fleet.scenario))
     logged.reset(seed=SEED)
     single.reset(seed=SEED)
     obs, _ = batch.reset()

@@ -7,12 +7,13 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from fleet.engine.reward import TERMS, RewardWeights
+from fleet.engine.reward import TERMS
 from fleet.observation import FIELDS, Layout
 from scenarios import make_batch, make_env
 from scenarios.cli.doc_tables import fill_tables
 from scenarios.cli.main import app
 from scenarios.load import override
+from scenarios.schema import RewardSpec
 
 PAGE = Path(__file__).parents[2] / "docs" / "env.md"
 TEXT = PAGE.read_text(encoding="utf-8")
@@ -52,9 +53,10 @@ def test_every_info_is_in_the_page(make, batch) -> None:
     infos = make().reset(seed=0)[1]["arm_0"]
     named = set(re.findall(r"`(?:info\[\")?(\w+)(?:\"\])?`", TEXT))
     assert {name for name in (*infos, *batch(1).reset()[1]) if name not in named} == set()
-    weights = RewardWeights()
+    weights = RewardSpec()
     for name in TERMS:
-        weight = f"{getattr(weights, name):g}".replace("-", "−")
+        given = getattr(weights, name)
+        weight = "−price of a fault" if given is None else f"{given:g}".replace("-", "−")
         assert f"| `reward_{name}` | {weight} |" in TEXT
 
 

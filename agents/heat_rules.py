@@ -1,0 +1,96 @@
+"""Central rules that weigh heat against value: by the thermometers alone, and by predicted peak temperatures.
+
+Both match arms and jobs by value per time. The limits are those of a Gen3: the observation gives the warning limit as
+headroom, and the error limit lies as far above it as in `fleet.robot.ThermalLimits`.
+"""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+from scipy.special import logit, ndtr
+
+from agents.assignment import Matching
+from agents.policy import per_option
+from fleet.observation import Observation
+from fleet.robot import ThermalLimits
+
+Array = np.ndarray
+
+ERROR_ABOVE_WARNING_K = ThermalLimits.error_c - ThermalLimits.warning_c
+
+
+class Thermometer(Matching):
+    """Matching by value per time, of claims whose load suits the arm's temperature. It needs no twin.
+
+    An arm claims a job if the headroom of joints 1 to 4, K, is at least the payload, kg, times the duration in quarters
+    of an hour, at most one. Scope central: it compares the arms' times.
+    """
+
+    scope: ClassVar = "central"
+    only_choices = True
+
+    def cost(self, observations: Sequence[Observation]) -> Array:
+        """Minus value per second, [arm, option]; inf for claims that are not allowed."""
+        return np.stack([-self._rate(seen) for seen in observations])
+
+    def _rate(self, seen: Observation) -> Array:
+        """Value per second of every option, [option]; −inf for those that must not be claimed."""
+        needed_k = per_option(seen, seen.payload_kg) * np.minimum(seen.duration_s, QUARTER_S) / QUARTER_S
+        cool = _warning_c(seen) - seen.temp_c[:LARGE].max() >= needed_k
+        return _per_second(seen, per_option(seen, seen.value), cool)
+
+
+QUARTER_S = 900.0
+LARGE = 4
+"""Joints 1 to 4 have the large motors, which carry payloads."""
+
+
+class Wsept(Thermometer):
+    """Matching by expected worth per time: weighted shortest expected processing time, with the cost of heat.
+
+    The worth of a claim is the value of the job, less what heat is expected to cost. The predicted peak of the plan has
+    a normal error; the share of it above the error limit is the probability of a fault, which costs the job and
+    `fault_price`. Minutes above the warning limit cost `minute_price` each. Of the plans of a job the one with
+    the most worth per time is taken; a claim whose worth is not positive waits until the arm has cooled.
+
+    Without predicted peaks, P(saturation) stands for them; without either, heat is ignored. Scope central: it compares
+    the arms' worths.
+
+    Source: Rothkopf, Management Science 12, 1966 (weighted expected processing times).
+    """
+
+    only_choices = True
+    fault_price: ClassVar = 20.0
+    """In units of value; `scenarios.fault_price` gives 14 to 27 in the scenarios of the library."""
+    peak_sd_k: ClassVar = 5.0
+    """Standard deviation of predicted peaks near the error limit, wide enough for a nominal thermal network."""
+    minute_price: ClassVar = 0.05
+    """Of a minute above the warning limit, as in the default reward."""
+
+    def _rate(self, seen: Observation) -> Array:
+        """Expected worth per second of every option, [option]; −inf for those that must not be claimed."""
+        warning_c, hottest_c = _warning_c(seen), float(seen.temp_c.max())
+        # An unknown peak is placed so far from the limit that its error gives P(saturation).
+        margin_k = self.peak_sd_k * logit(np.clip(seen.p_saturation, LEAST_P, 1.0 - LEAST_P))
+        peak_c = np.where(seen.peak_c > 0, seen.peak_c, warning_c + margin_k)
+        p_fault = ndtr((peak_c - warning_c - ERROR_ABOVE_WARNING_K) / self.peak_sd_k)
+        # As if the temperature rose linearly up to its peak.
+        above_share = np.clip((peak_c - warning_c) / np.maximum(peak_c - hottest_c, 1.0), 0.0, 1.0)
+        heat = p_fault * self.fault_price + self.minute_price * above_share * seen.duration_s / 60.0
+        worth = (1.0 - p_fault) * per_option(seen, seen.value) - heat
+        return _per_second(seen, worth, worth > 0)
+
+
+LEAST_P = 1e-3
+
+
+def _warning_c(seen: Observation) -> float:
+    """The warning limit, °C."""
+    return float(seen.headroom_k) + float(seen.temp_c.max())
+
+
+def _per_second(seen: Observation, worth: Array, allowed: Array) -> Array:
+    """Worth over duration, [option]; −inf where it is not allowed or not legal."""
+    rate = worth / np.maximum(seen.duration_s, 1.0)
+    return np.where(seen.action_mask[1:-1].astype(bool) & allowed, rate, -np.inf).astype(float)

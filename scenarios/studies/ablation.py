@@ -1,0 +1,253 @@
+"""What a score is worth: one policy with difficulty and P(saturation) from different sources.
+
+Every source runs on the same draws of the fleet, trainings and seeds. A fleet is a cluster of all its trainings and
+shifts; a seed, which draws the same jobs for every fleet, is a cluster of all its fleets. So the variance of a mean is
+clustered both ways, V = V_fleet + V_seed − V_fleet×seed, with t quantiles of the smaller number of clusters minus one
+(Cameron, Gelbach & Miller, Journal of Business & Economic Statistics 29, 2011). Trainings differ within fleets, so
+V_fleet counts them too.
+"""
+
+import csv
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+from scipy import stats
+
+from fleet.errors import FleetError, nearest
+from fleet.files import atomic_path, cache_folder
+from scenarios.policy_loader import label, policy_of
+from scenarios.progress import COUNTED, Progress, quiet
+from scenarios.result_folder import disk_errors
+from scenarios.run.evaluate import outcomes
+from scenarios.run.shift import scenario_hash
+from scenarios.schema import Scenario
+from scenarios.studies.score_sources import SOURCES, DrawnFleet
+
+Array = np.ndarray
+
+FIGURES = ("faults", "value", "reward")
+ROWS, CARD = "ablation.csv", "ablation.json"
+FIRST_SEED = 10_000
+"""Nothing was tuned on seeds from here on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AblationPlan:
+    """What is compared."""
+
+    policy: str = "least_difficulty"
+    scores: tuple[str, ...] = tuple(SOURCES)
+    """Differences refer to the first one."""
+    fleets: int = 3
+    """Draws of the arms: `spread.seed` of the scenario, and the following ones."""
+    trainings: int = 2
+    seeds: int = 20
+    first_seed: int = FIRST_SEED
+
+    def __post_init__(self) -> None:
+        for i, name in enumerate(self.scores):
+            if name not in SOURCES:
+                raise FleetError(f"No scores '{name}'{nearest(name, SOURCES)}")
+            if name in self.scores[:i]:
+                raise FleetError(f"The scores '{name}' are given twice; names must be unique.")
+        policy_of(self.policy)
+
+
+class Row(NamedTuple):
+    """The figures of one shift."""
+
+    scores: str
+    fleet: int
+    training: int
+    seed: int
+    faults: float
+    value: float
+    reward: float
+
+
+@dataclass(frozen=True)
+class Effect:
+    """A mean over fleets, trainings and seeds, and its difference to the first source, with 95 % intervals."""
+
+    mean: float
+    low: float
+    high: float
+    difference: float
+    difference_low: float
+    difference_high: float
+
+
+@dataclass(frozen=True)
+class Ablation:
+    """The result of a comparison."""
+
+    scenario: str
+    plan: AblationPlan
+    effects: dict[str, dict[str, Effect]]
+    """[scores][figure]."""
+
+
+def ablate(scenario: Scenario, plan: AblationPlan, out: Path, *, progress: Progress = quiet) -> Ablation:
+    """Run the policy with every source, and write `ROWS` and `CARD` into a folder; shifts that are there are kept.
+
+    Raises:
+        FleetError: the folder holds another comparison, or cannot be written.
+    """
+    card = {"scenario": scenario.name, "scenario_hash": scenario_hash(scenario), "policy": plan.policy}
+    rows = _earlier_rows(out, card)
+    draws = [
+        (name, fleet, training)
+        for fleet in range(plan.fleets)
+        for name in plan.scores
+        for training in range(plan.trainings if SOURCES[name].trained else 1)
+    ]
+    seeds, drawn, drawn_index = range(plan.first_seed, plan.first_seed + plan.seeds), None, -1
+    for n, (name, fleet, training) in enumerate(draws):
+        missing = [seed for seed in seeds if (name, fleet, training, seed) not in rows]
+        if not missing:
+            continue
+        source = SOURCES[name]
+        progress(f"{COUNTED}fleet {fleet + 1}, training {training + 1}: {source.label}", n / len(draws))
+        if drawn is None or drawn_index != fleet:
+            spread = replace(scenario.spread, seed=scenario.spread.seed + fleet)
+            drawn, drawn_index = DrawnFleet(replace(scenario, spread=spread), cache_folder(), quiet), fleet
+        results = outcomes(source.make(drawn, training), plan.policy, missing)
+        made = [
+            Row(name, fleet, training, seed, *(float(getattr(result, figure)) for figure in FIGURES))
+            for seed, result in zip(missing, results, strict=True)
+        ]
+        rows |= {row[:4]: row for row in made}
+        _append(out, made)
+    result = Ablation(scenario.name, plan, _effects(plan, rows))
+    _write_card(
+        out, {**card, "status": "finished", "plan": asdict(plan), "effects": msgspec.to_builtins(result.effects)}
+    )
+    return result
+
+
+def _earlier_rows(out: Path, card: dict[str, str]) -> dict[tuple[str, int, int, int], Row]:
+    """The shifts that the folder holds; a new folder is made.
+
+    Raises:
+        FleetError: it is the folder of something else.
+    """
+    with disk_errors(out):
+        if not out.exists() or not any(out.iterdir()):
+            out.mkdir(parents=True, exist_ok=True)
+            _write_card(out, {**card, "status": "interrupted"})
+            return {}
+        try:
+            known = json.loads((out / CARD).read_text(encoding="utf-8"))
+        except (FileNotFoundError, ValueError) as error:
+            raise FleetError(f"'{out}' holds other files; --out needs a new folder, or that of an ablation.") from error
+        for name, value in card.items():
+            if known.get(name) != value:
+                raise FleetError(
+                    f"'{out}' holds an ablation with {name} {known.get(name)!r}, not {value!r}; give another --out."
+                )
+        if not (out / ROWS).exists():
+            return {}
+        with (out / ROWS).open(newline="", encoding="utf-8") as file:
+            kept = [row for row in csv.DictReader(file) if None not in row.values()]  # the last may be cut off
+    try:
+        rows = [Row(r["scores"], *(int(r[n]) for n in Row._fields[1:4]), *(float(r[n]) for n in FIGURES)) for r in kept]
+    except (KeyError, ValueError) as error:
+        raise FleetError(f"'{out / ROWS}' is damaged ({error}); give another --out.") from error
+    return {row[:4]: row for row in rows}
+
+
+def _append(out: Path, rows: Sequence[Row]) -> None:
+    with disk_errors(out), (out / ROWS).open("a", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        if not file.tell():
+            writer.writerow(Row._fields)
+        writer.writerows(rows)
+
+
+def _write_card(out: Path, card: object) -> None:
+    with disk_errors(out), atomic_path(out / CARD) as file:
+        file.write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+
+
+def _effects(plan: AblationPlan, rows: dict[tuple[str, int, int, int], Row]) -> dict[str, dict[str, Effect]]:
+    base = {figure: _values(plan, rows, plan.scores[0], figure) for figure in FIGURES}
+    effects: dict[str, dict[str, Effect]] = {}
+    for name in plan.scores:
+        effects[name] = {}
+        for figure in FIGURES:
+            values = _values(plan, rows, name, figure)
+            parts = (values, values - base[figure])
+            effects[name][figure] = Effect(*(x for part in parts for x in (float(part.mean()), *interval(part))))
+    return effects
+
+
+def _values(plan: AblationPlan, rows: dict[tuple[str, int, int, int], Row], name: str, figure: str) -> Array:
+    """A figure of one source, [fleet, training, seed]; a source without training has the same for each."""
+    trained = SOURCES[name].trained
+    return np.array(
+        [
+            [
+                [
+                    getattr(rows[name, fleet, training * trained, plan.first_seed + seed], figure)
+                    for seed in range(plan.seeds)
+                ]
+                for training in range(plan.trainings)
+            ]
+            for fleet in range(plan.fleets)
+        ]
+    )
+
+
+def interval(values: Array, level: float = 0.95) -> tuple[float, float]:
+    """Interval of the mean of [fleet, training, seed], clustered by fleet and by seed; see the module.
+
+    A single fleet or seed is taken as given.
+    """
+    cells = values.mean(axis=1)  # trainings are within fleets
+    fleets, seeds = cells.shape
+    mean = float(cells.mean())
+    by_fleet, by_seed, by_cell = (_variance_of_mean(x) for x in (cells.mean(axis=1), cells.mean(axis=0), cells.ravel()))
+    # The difference can be negative in small samples; then one of the two ways dominates.
+    variance = max(by_fleet + by_seed - by_cell, by_fleet, by_seed)
+    clusters = min(count for count in (fleets, seeds, cells.size) if count > 1) if cells.size > 1 else 1
+    if clusters == 1 or variance == 0:
+        return mean, mean
+    half = float(stats.t.ppf(0.5 + level / 2.0, clusters - 1)) * variance**0.5
+    return mean - half, mean + half
+
+
+def _variance_of_mean(values: Array) -> float:
+    return float(values.var(ddof=1) / len(values)) if len(values) > 1 else 0.0
+
+
+def ablation_table(result: Ablation) -> Group:
+    """A block per figure: mean, and difference to the first source, each with its interval."""
+    plan = result.plan
+    count = f"{plan.fleets} fleets × {plan.trainings} trainings × {plan.seeds} seeds"
+    title = (
+        f"{result.scenario}, {label(plan.policy)}, {count}: mean, paired difference to "
+        f"{SOURCES[plan.scores[0]].label}, 95 % intervals over fleets, trainings and seeds; * excludes 0"
+    )
+    table = Table(box=None, pad_edge=False)
+    table.add_column("")
+    for head in ("mean", "interval", "difference", "interval", ""):
+        table.add_column(head, justify="right")
+    for figure in FIGURES:
+        table.add_row(f"[bold]{figure}[/bold]")
+        for name in plan.scores:
+            e = result.effects[name][figure]
+            cells = [f"  {SOURCES[name].label}", f"{e.mean:.2f}", f"{e.low:.2f} … {e.high:.2f}"]
+            if name != plan.scores[0]:
+                star = "*" if e.difference_low > 0 or e.difference_high < 0 else ""
+                between = f"{e.difference_low:+z.2f} … {e.difference_high:+z.2f}"
+                cells += [f"{e.difference:+z.2f}", between, star]
+            table.add_row(*cells)
+    return Group(Text(title), table)
