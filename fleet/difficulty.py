@@ -107,6 +107,46 @@ def stack_forecasts(forecasts: Sequence[Forecast]) -> Forecast:
     return Forecast(offset, weight, curve if knots else None, time_s)
 
 
+def forecast_arrays(forecasts: Forecast | None, lanes: int) -> dict[str, Array]:
+    """Stacked forecasts as tables of the engine: pieces last and padded to whole lanes; empty axes for none.
+
+    Returns:
+        forecast_offset [forecast, piece], forecast_weight [forecast, KNOWN, piece], forecast_time_s [forecast, piece]
+        and forecast_curve [forecast, knot, 2].
+    """
+    count, pieces, knots = 0, lanes, 0
+    if forecasts is not None:
+        count, pieces = forecasts.offset.shape[0], -(-forecasts.offset.shape[1] // lanes) * lanes
+        knots = 0 if forecasts.curve is None else forecasts.curve.shape[1]
+    tables = {
+        "forecast_offset": np.full((count, pieces), -np.inf),
+        "forecast_weight": np.zeros((count, KNOWN, pieces)),
+        "forecast_time_s": np.zeros((count, pieces)),
+        "forecast_curve": np.zeros((count, knots, 2)),
+    }
+    if forecasts is not None:
+        used = forecasts.offset.shape[1]
+        tables["forecast_offset"][:, :used] = forecasts.offset
+        tables["forecast_weight"][..., :used] = forecasts.weight.swapaxes(1, 2)
+        tables["forecast_time_s"][:, :used] = 0.0 if forecasts.time_s is None else forecasts.time_s
+        tables["forecast_curve"][:] = 0.0 if forecasts.curve is None else forecasts.curve
+    return tables
+
+
+def extend_curve(curve: Array, knots: int) -> Array:
+    """Curves [forecast, knot, 2] with more knots: constant beyond the last; NaN where there is no curve."""
+    more = knots - curve.shape[1]
+    if not len(curve):
+        return np.zeros((0, knots, 2))
+    if not more:
+        return curve
+    if not curve.shape[1]:
+        return np.full((len(curve), knots, 2), np.nan)
+    beyond = np.repeat(curve[:, -1:], more, axis=1)
+    beyond[..., 0] = np.where(np.isnan(curve[:, :1, 0]), np.nan, np.inf)
+    return np.concatenate([curve, beyond], axis=1)
+
+
 @jit_inline
 def probability_of(value: float, curve: Array) -> float:
     """Probability that follows from a forecast's value; see `Forecast`.

@@ -148,7 +148,7 @@ def test_each_library_stays_in_its_place(path):
         ("agents.rules", "fleet.env.allocation_v1"),
         ("agents.rules", "twin.vae.twin"),
         ("twin.vae.twin", "agents.rules"),
-        ("twin.vae.twin", "fleet.engine.oracle"),
+        ("twin.vae.twin", "scenarios.prepare.oracle"),
         ("twin.vae.twin", "scenarios.prepare.fleet"),
     ],
 )

@@ -17,10 +17,10 @@ from hypothesis.extra.numpy import arrays
 from plotly.offline import get_plotlyjs
 
 from fleet.events import Event
-from fleet.schedule import schedule
 from fleet.telemetry import Telemetry
 from scenarios.report.gantt import stream_of
 from scenarios.report.run_page import ROWS, report_html
+from scenarios.report.schedule import schedule
 from scenarios.report.timeline import decimate, figure
 
 ARMS = ("arm_0", "arm_1")

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.events import Event
-from fleet.schedule import schedule
+from scenarios.report.schedule import schedule
 
 ARMS = ("arm_0", "arm_1")
 HORIZON_S = 1000.0

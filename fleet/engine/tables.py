@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from fleet.difficulty import KNOWN, Forecast
+from fleet.difficulty import extend_curve, forecast_arrays
 from fleet.engine.event_log import EventBuffer
 from fleet.engine.state import State, World
 from fleet.observation import Layout, Offsets
@@ -60,15 +60,11 @@ class Tables(NamedTuple):
     modes: Array
     """[fleet, arm, node, mode]."""
     sensor_noise_k: Array
-    """[fleet, arm, lane]."""
     copper_w_per_a2: Array
-    """[fleet, arm, lane]."""
     idle_w: Array
-    """[fleet, arm, lane]."""
     rest_current_sq: Array
-    """[fleet, arm, lane]."""
     rest_friction_w: Array
-    """[fleet, arm, lane]."""
+    """[fleet, arm, lane], as are the four before."""
     start_c: Array
     """[fleet, arm, node]."""
     times_s: Array
@@ -90,9 +86,8 @@ class Tables(NamedTuple):
     housing_gain: Array
     """[fleet, arm, from, lane]."""
     housing_winding: Array
-    """W/K, [fleet, arm, lane]."""
     housing_ambient: Array
-    """W/K, [fleet, arm, lane]."""
+    """W/K, [fleet, arm, lane], as is the one before."""
     housing_idle_w: Array
     """[fleet, arm, lane]."""
     start_housing_c: Array
@@ -257,7 +252,7 @@ def tables_of(world: World) -> tuple[Tables, Jobs]:
     work["travel_s"], work["cycle_s"] = times_s[..., 0] + times_s[..., 2], times_s[..., 1]
     work["difficulty"], work["p_saturation"] = offers.difficulty, offers.p_saturation
     work["risk"], work["peak"] = offers.risk, offers.peak
-    forecasts, observer = _forecast_tables(offers.forecasts), world.observer
+    forecasts, observer = forecast_arrays(offers.forecasts, LANES), world.observer
     thermal_step = np.concatenate([world.phi, world.gamma], axis=-1).swapaxes(-1, -2)
     tables = Tables(
         dt_s=float(world.dt_s),
@@ -342,27 +337,7 @@ def _one_hot(stations: Array, count: int) -> Array:
     return flags
 
 
-def _forecast_tables(forecasts: Forecast | None) -> dict[str, Array]:
-    """The tables of stacked forecasts; empty axes for what is not there."""
-    if forecasts is None:
-        none = np.empty((0, LANES))
-        tables = (none, np.empty((0, KNOWN, LANES)), none, np.empty((0, 0, 2)))
-    else:
-        offset, curve = forecasts.offset, forecasts.curve
-        pieces = -(-offset.shape[1] // LANES) * LANES
-        time_s = np.zeros_like(offset) if forecasts.time_s is None else forecasts.time_s
-        tables = (
-            pad(offset, 1, pieces, -np.inf),
-            pad(forecasts.weight.swapaxes(1, 2), 2, pieces),
-            pad(time_s, 1, pieces),
-            np.empty((len(offset), 0, 2)) if curve is None else curve,
-        )
-    return dict(zip(_FORECAST, tables, strict=True))
-
-
-_FORECAST = ("forecast_offset", "forecast_weight", "forecast_time_s", "forecast_curve")
-
-
+_FORECAST = tuple(forecast_arrays(None, LANES))
 Arrays = TypeVar("Arrays", Tables, Jobs)
 
 
@@ -415,7 +390,7 @@ def stack_tables(fleets: Sequence[Tables]) -> Tables:
             forecast_offset=np.concatenate([pad(t.forecast_offset, 1, pieces, -np.inf) for t in fleets]),
             forecast_weight=np.concatenate([pad(t.forecast_weight, 2, pieces) for t in fleets]),
             forecast_time_s=np.concatenate([pad(t.forecast_time_s, 1, pieces) for t in fleets]),
-            forecast_curve=np.concatenate([_extend_curve(t.forecast_curve, knots) for t in fleets]),
+            forecast_curve=np.concatenate([extend_curve(t.forecast_curve, knots) for t in fleets]),
             stations=_same_words([t.stations for t in fleets]),
             excluded=_same_words([t.excluded for t in fleets]),
         )
@@ -426,17 +401,3 @@ def _same_words(fleets: Sequence[Array]) -> Array:
     """Bits of several fleets, [fleet or plan, ..., word], one after the other."""
     words = max(each.shape[-1] for each in fleets)
     return np.concatenate([pad(each, size=words) for each in fleets])
-
-
-def _extend_curve(curve: Array, knots: int) -> Array:
-    """Curves [forecast, knot, 2] with more knots: constant beyond the last; NaN where there is no curve."""
-    more = knots - curve.shape[1]
-    if not len(curve):
-        return np.zeros((0, knots, 2))
-    if not more:
-        return curve
-    if not curve.shape[1]:
-        return np.full((len(curve), knots, 2), np.nan)
-    beyond = np.repeat(curve[:, -1:], more, axis=1)
-    beyond[..., 0] = np.where(np.isnan(curve[:, :1, 0]), np.nan, np.inf)
-    return np.concatenate([curve, beyond], axis=1)

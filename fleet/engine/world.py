@@ -12,7 +12,7 @@ from fleet.housing_observer import HousingObserver, housing_observer
 from fleet.job import Job, Work, check_precedence
 from fleet.motion import Drive, Plan, drive
 from fleet.motor import Motors, gen3_motors, stack_motors
-from fleet.planning.options import PLANS, offered_plans
+from fleet.offered_plans import PLANS, offered_plans
 from fleet.robot import GEN3, Robot, ThermalLimits
 from fleet.thermal import HOUSING, ThermalModel, gen3_network, stack_models, steady_state, thermal_model
 

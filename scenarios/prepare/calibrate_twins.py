@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from fleet.motion import Plan
-from fleet.planning.options import offered_plans
+from fleet.offered_plans import offered_plans
 from fleet.planning.random_motions import RANDOM_MOTIONS_VERSION, random_jobs
 from scenarios.job_stream import works_of
 from scenarios.prepare.identify_arms import identify_arms

@@ -8,11 +8,11 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from fleet.engine.oracle import peaks
 from fleet.errors import FleetError
 from fleet.motion import RATE_HZ, Plan
 from fleet.motor import Motors
 from fleet.thermal import NODES, ThermalModel
+from scenarios.prepare.oracle import peaks
 from scenarios.prepare.planned_arm import ArmHardware
 from scenarios.schema import Scenario, TwinSpec
 

@@ -203,12 +203,12 @@ def problems_of(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) ->
 
 
 def _with_oracle(scenario: Scenario, arm: Arm) -> Arm:
-    from fleet.engine.oracle import Oracle
+    from scenarios.prepare.oracle import Oracle
 
     cell_c = float(np.mean(scenario.ambient.at(np.linspace(0, scenario.horizon_s, 100))))
     ambient_c = cell_c + arm.robot.ambient_offset_k
     model = Oracle(arm.motors, arm.thermal, warm_start(arm, ambient_c), ambient_c, scenario.limits.warning_c)
-    return replace(arm, model=model)
+    return replace(arm, model=model, known=(arm.thermal, arm.motors))
 
 
 def world_of(fleet: Fleet, jobs: Sequence[Job]) -> tuple[World, tuple[Plan, ...]]:

@@ -7,7 +7,7 @@ from typing import Any, TypeVar  # Any: values of Plotly's schema
 import numpy as np
 
 from fleet.events import Event
-from fleet.schedule import Assignment, Outage, Schedule
+from scenarios.report.schedule import Assignment, Outage, Schedule
 
 Trace = dict[str, Any]
 Span = TypeVar("Span", Assignment, Outage)

@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any  # values of run.json
 
 from fleet.events import Event
-from fleet.schedule import schedule
 from fleet.telemetry import Telemetry
 from scenarios.report.gantt import clock
 from scenarios.report.page import escape, figure_place, html_page, paragraph, table
+from scenarios.report.schedule import schedule
 from scenarios.report.timeline import figure
 
 ROWS = 300

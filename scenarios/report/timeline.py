@@ -11,9 +11,9 @@ import numpy as np
 
 from fleet.events import Event
 from fleet.robot import JOINTS
-from fleet.schedule import Schedule
 from fleet.telemetry import Telemetry
 from scenarios.report.gantt import FAULT, INK, WARNING, Trace, gantt, plain
+from scenarios.report.schedule import Schedule
 
 Array = np.ndarray
 

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fleet.engine.oracle import peaks
 from fleet.motor import gen3_motors
 from fleet.planning.random_motions import random_jobs
 from fleet.robot import Robot
@@ -16,6 +15,7 @@ from fleet.thermal import NODES, ThermalSpread, gen3_network, spread_motors, the
 from scenarios.cli.main import main
 from scenarios.motion.perform import bare_arm
 from scenarios.prepare.cool_motion import records
+from scenarios.prepare.oracle import peaks
 from twin.vae.model import TwinConfig
 from twin.vae.train import train
 

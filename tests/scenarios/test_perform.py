@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleet.engine.oracle import peaks
 from fleet.motion import RATE_HZ, Phase
 from fleet.motor import gen3_motors
 from fleet.physics.models import ArmModel
@@ -13,6 +12,7 @@ from fleet.planning.random_motions import plan_motion, random_jobs
 from fleet.robot import Robot
 from fleet.thermal import NODES, gen3_network, thermal_model
 from scenarios.motion.perform import bare_arm, perform
+from scenarios.prepare.oracle import peaks
 
 ROBOT = Robot(name="arm", tool_kg=0.9)
 ARM = bare_arm(ROBOT, gen3_motors(), thermal_model(gen3_network()))

@@ -5,7 +5,6 @@ import pytest
 from scipy.stats import norm
 
 from fleet.difficulty import SETTLING_S, known_temperatures
-from fleet.engine.oracle import peaks
 from fleet.motion import RATE_HZ, drive, drives
 from fleet.motor import friction_heat, reference_current
 from fleet.robot import JOINTS
@@ -20,6 +19,7 @@ from fleet.thermal import (
     spread_motors,
     steady_state,
 )
+from scenarios.prepare.oracle import peaks
 from twin.logs.heat_log import heat_logs
 from twin.logs.recording import Recording
 from twin.saturation.fit import NotEnoughExperience

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from fleet.engine.oracle import Oracle, peaks
+from fleet.difficulty import KNOWN
 from fleet.engine.shift import step
 from fleet.engine.state import initial
 from fleet.engine.world import warm_start
@@ -14,6 +14,7 @@ from fleet.motion import Plan, drive
 from fleet.motor import gen3_motors
 from fleet.robot import ThermalLimits
 from fleet.thermal import WINDING, drive_heat, gen3_network, steady_state, thermal_model
+from scenarios.prepare.oracle import Oracle, peaks
 
 MOTORS, THERMAL = gen3_motors(), thermal_model(gen3_network())
 FEARLESS = ThermalLimits(warning_c=900.0, error_c=1000.0)
@@ -72,9 +73,29 @@ def test_more_payload_or_more_repetitions_is_never_easier(small) -> None:
     assert len(set(by_payload)) == len(plans)
     by_length = [oracle().score(plans[3], n).total for n in (1, 5, 50, 500)]
     assert by_length == sorted(by_length)
-    risk = [oracle().score(p, 200).p_saturation for p in plans]
+    risk = [oracle().score(p, 200).p_at(np.full(KNOWN, 25.0)) for p in plans]
     assert risk[0] == 0.0
     assert risk[-1] == 1.0
+
+
+def test_p_is_that_of_the_true_motors_from_any_state(small) -> None:
+    """Against the simulation of the same plan from random states that the arm knows exactly."""
+    plan, rng = plan_of(small, 6.0), np.random.default_rng(0)
+    score, sure = oracle().score(plan, 60), 0
+    for _ in range(60):
+        ambient_c = rng.uniform(15.0, 40.0)
+        housing_c = ambient_c + rng.uniform(0.0, 22.0, 7)
+        start_c = np.concatenate([housing_c + rng.uniform(0.0, 4.0, 7), housing_c])
+        (peak,) = peaks(
+            [plan], [plan.duration_s(60)], motors=MOTORS, thermal=THERMAL, start_c=start_c, ambient_c=ambient_c
+        )
+        known_c = np.append(start_c, ambient_c)
+        if start_c[:7].max() < peak.max():
+            assert score.peak_at(known_c) == pytest.approx(peak.max(), abs=0.6)  # here with the mean of all phases
+        if abs(peak.max() - 60.0) > 1.0:
+            assert score.p_at(known_c) == float(peak.max() > 60.0)
+            sure += 1
+    assert sure > 30
 
 
 def test_difficulty_follows_its_formula(small) -> None:

@@ -12,6 +12,7 @@ from fleet.difficulty import Difficulty, difficulty_of_error
 from fleet.motion import Plan, drives
 from fleet.motor import Motors
 from fleet.thermal import WINDING, ThermalModel, simulate_temperatures
+from twin.thermal.risk import LinearHeat, peak_forecast
 
 Array = np.ndarray
 
@@ -37,11 +38,16 @@ def peaks(
     ).highest_c
 
 
+SURE_K = 0.15
+"""P rises from 0 to 1 within this distance of the warning limit: twice the RMS error of the linearised heat."""
+
+
 @dataclass(frozen=True, eq=False)
 class Oracle:
-    """Scores a plan by the share of the way to the warning limit that the true motors go, from idle-warm.
+    """Scores a plan by the true motors: the peak that they reach from the present state.
 
-    d_k = 1 − exp(−rise_k / (warning − start_k)), and P(saturation) is 0 or 1.
+    With the true parameters the arm's estimate of its housings is true too, see `Arm.known`. P(saturation) is 0 or 1
+    but for `SURE_K`. d_k = 1 − exp(−rise_k / (warning − start_k)) of a job from idle-warm.
     """
 
     motors: Motors
@@ -49,11 +55,12 @@ class Oracle:
     start_c: Array
     """Idle equilibrium, [node]."""
     ambient_c: float
+    """Of the idle equilibrium; the peak follows the present ambient temperature."""
     warning_c: float
     version: str = "oracle"
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty:
-        """Difficulty of doing the plan so many times from idle-warm."""
+        """Difficulty of doing the plan so many times from idle-warm, and its peak from any state."""
         peak = peaks(
             [plan],
             [plan.duration_s(repetitions)],
@@ -64,7 +71,9 @@ class Oracle:
         )[0]
         start = self.start_c[WINDING]
         room = np.maximum(self.warning_c - start, 1.0)
+        heat = LinearHeat.of(drives([phase.profile for phase in plan.phases], self.motors), self.motors, self.thermal)
+        step = np.array([[self.warning_c - SURE_K, 0.0], [self.warning_c + SURE_K, 1.0]])
         return Difficulty(
             per_joint=difficulty_of_error(np.maximum(peak - start, 0.0) / room),
-            p_saturation=float(peak.max() >= self.warning_c),
+            peak=peak_forecast(heat, plan.duration_s(repetitions) * plan.weights(repetitions), step),
         )
