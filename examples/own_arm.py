@@ -164,10 +164,10 @@ class Arm:
         return self.acks[name]
 
     def work(self):
-        """Do a cycle if it is time and the lease is valid; the last one only with permission to commit."""
+        """Do a cycle if it is time and the lease is valid; the last one only with permission to commit too."""
         self.temp_c += 0.01 * (AMBIENT_C - self.temp_c)
         job, now = self.job, time.monotonic()
-        if job is None or now < job["ready_s"] or (now > job["lease_end_s"] and not job["may_commit"]):
+        if job is None or now < job["ready_s"] or now > job["lease_end_s"]:
             return
         if job["cycles"] >= job["repetitions"] - 1 and not job["may_commit"]:
             return
@@ -175,17 +175,15 @@ class Arm:
         job["ready_s"] = now + CYCLE_S
         self.temp_c += 0.1
         if job["cycles"] >= job["repetitions"]:
-            self.job = None
-            report = {
-                "arm": self.name,
-                "award": job["award"],
-                "job": job["job"],
-                "outcome": "finished",
-                "cycles": job["cycles"],
-                "time_s": self.now_s(),
-            }
-            self.reports[job["award"]] = (job["auctioneer"], report)
-            self.send(job["auctioneer"], "report", "Report", report, self.apply_receipt)
+            self.report("finished")
+
+    def report(self, outcome):
+        """Report the outcome of the current job: "finished" or "returned"."""
+        job, self.job = self.job, None
+        report = {name: job[name] for name in ("award", "job", "cycles")}
+        report |= {"arm": self.name, "outcome": outcome, "time_s": self.now_s()}
+        self.reports[job["award"]] = (job["auctioneer"], report)
+        self.send(job["auctioneer"], "report", "Report", report, self.apply_receipt)
 
     def renew_lease(self):
         """Request the lease of the current job again, and repeat reports without receipt."""
@@ -201,7 +199,7 @@ class Arm:
             )
 
     def apply_lease(self, lease, sent_s):
-        """Extend the lease, measured from when the request was sent. Permission to commit is never withdrawn."""
+        """Extend the lease, measured from when the request was sent. Return a revoked job: no cycle is in progress."""
         job = self.job
         if job is None:
             return
@@ -209,13 +207,13 @@ class Arm:
             job["may_commit"] = True
         if job["award"] in lease["granted"]:
             job["lease_end_s"] = sent_s + (1 - DRIFT) * lease["lease_s"]
-        elif job["award"] in lease["revoked"] and not job["may_commit"]:
-            self.job = None
+        elif job["award"] in lease["revoked"]:
+            self.report("returned")
 
     def apply_receipt(self, receipt):
         """Stop repeating a report: it is on the auctioneer's disk."""
         if self.reports.pop(receipt["award"], None):
-            print(f"finished {receipt['award']}", flush=True)
+            print(f"reported {receipt['award']}", flush=True)
 
     def send(self, auctioneer, topic, name, request, apply):
         """Query the auctioneer without waiting; call `apply` with the reply, if there is one."""

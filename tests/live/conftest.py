@@ -171,7 +171,7 @@ class ModelArm:
                 self.current[name].may_commit |= name in lease.may_commit
         for name in lease.revoked:
             if name in self.current and not self.current[name].in_last_cycle:
-                del self.current[name]
+                self._report(self.current.pop(name), "returned", asked_s, 0)
 
     def crash(self, true_s: float) -> None:
         """Lose everything but the journal, and return the current jobs; unsure of one in its last cycle.
@@ -184,6 +184,12 @@ class ModelArm:
         for work in self.current.values():
             self._report(work, "returned", true_s, work.cycles, unsure=work.in_last_cycle)
         self.current = {}
+
+    def move_home(self) -> None:
+        """Have a person break its cycle off and move it home; its process lives on."""
+        self.out, self.steps_home = "", 0
+        for work in self.current.values():
+            work.in_last_cycle = False
 
     def _report(self, work: Work, outcome, true_s: float, cycles: int, unsure: bool = False) -> None:
         award = work.award
@@ -258,10 +264,13 @@ class ModelFleet:
             excludes=self.excludes,
         )
 
-    def clear(self, name: str) -> None:
-        """Have a person stop an arm, move it home and free its space; it is started again."""
+    def clear(self, name: str, *, restart: bool = True) -> None:
+        """Have a person move an arm home and free its space; its process is started again, or lives on."""
         arm = self.arms[name]
-        arm.crash(self.true_s)
+        if restart:
+            arm.crash(self.true_s)
+        else:
+            arm.move_home()
         request = ClearRequest(name, "a person")
         with suppress(Refused):
             self.attempt(lambda: self.auctioneer.clear(request, frozenset(self.arms) - {name}, self.true_s))

@@ -5,7 +5,7 @@ to one, which replies with an `Ack`. While the arm has the job it renews its lea
 last cycle it requests permission to commit. Then it repeats a `Report` until there is a `Receipt`.
 
 Why no job is done twice: an arm accepts an award only within `Quote.valid_s` of its own quote, works only under a lease
-that it counts from the moment it sent the request, and begins the last cycle only with permission to commit. The
+that it counts from the moment it sent the request, and begins the last cycle only with permission to commit too. The
 auctioneer counts the same lease from the moment it replied, so at the auctioneer it always ends later. Only after that
 does another arm get the job, and never once permission to commit was given. Durations are real seconds on each one's
 own monotonic clock; wall clocks do not matter. (Leases: Gray & Cheriton 1989, SOSP.)
@@ -211,9 +211,10 @@ class Lease(msgspec.Struct, frozen=True):
     granted: tuple[str, ...]
     """Awards whose lease is renewed."""
     revoked: tuple[str, ...]
-    """Awards that the arm has lost: it must release those jobs, unless it has permission to commit."""
+    """Awards that the arm has lost: it begins no cycle of them any more, goes home and reports them."""
     may_commit: tuple[str, ...] = ()
-    """Awards with permission to commit: the last cycle may begin, and no other arm gets these jobs any more."""
+    """Awards with permission to commit: the last cycle may begin under a lease, and no other arm gets these jobs any
+    more."""
 
 
 class Report(msgspec.Struct, frozen=True):
@@ -305,7 +306,8 @@ class Result(msgspec.Struct, frozen=True):
 
 
 class ClearRequest(msgspec.Struct, frozen=True):
-    """Request to `jobs/clear`: free the space of an absent arm. The same request again changes nothing.
+    """Request to `jobs/clear`: free the space of an absent arm, and end its awards. The same request again changes
+    nothing.
 
     Only a person who has seen that the arm is at home or removed, and switched off, may request it.
     """
@@ -316,7 +318,7 @@ class ClearRequest(msgspec.Struct, frozen=True):
 
 
 class Cleared(msgspec.Struct, frozen=True):
-    """Reply to a `ClearRequest`: it is on disk, and the arm takes no space until it reports its space again."""
+    """Reply to a `ClearRequest`: it is on disk, and the arm takes no space until it is heard again."""
 
     auctioneer: Name
     arm: Name

@@ -239,7 +239,7 @@ class ArmNode:
         """Advance the body to the present, as far as leases allow."""
         now_s, current = self.clock.now_s(real_s), self._current
         self._assign(current)
-        if current is not None and not current.may_commit and current.lease_end_s < real_s:
+        if current is not None and current.lease_end_s < real_s:
             # Work done within the lease counts, even if this process was stopped since.
             lease_end_s = math.nextafter(current.lease_end_s, -math.inf)
             self._advance(self.clock.now_s(lease_end_s), current, lease_end_s, real_s)
@@ -273,6 +273,7 @@ class ArmNode:
         if self._reading.mode == "faulted" and self.executor.active:
             self.executor.return_all(self._body.time_s, real_s, "the arm is faulted")
             self._body_award = ""
+        self.executor.return_revoked(self._body.time_s, real_s, at_home=self._body.away is None)
         if current := self._current:
             at_work = self._body_award == current.award.award and self._body.job
             cycles = self._body.cycles if at_work else current.cycles

@@ -105,8 +105,6 @@ class AwardState(msgspec.Struct):
     silent: bool = False
     """The arm has permission to commit, and has not renewed its lease."""
     outcome: str = ""
-    cleared: bool = False
-    """A person freed its space while the arm was silent."""
 
 
 class LedgerSnapshot(msgspec.Struct, frozen=True, tag="ledger_snapshot"):
@@ -181,10 +179,14 @@ class Ledger(TimedState[AuctionRecord]):
         """Return the names of the spaces that each arm may take."""
         taken = dict(self.space)
         for award in self.open.values():
-            if not award.cleared:
-                arm = award.record.arm
-                taken[arm] = taken.get(arm, frozenset()) | {award.record.space}
+            arm = award.record.arm
+            taken[arm] = taken.get(arm, frozenset()) | {award.record.space}
         return taken
+
+    def space_of(self, awards: Iterable[str], arm: str) -> set[str]:
+        """Return the names of the spaces of an arm's awards; unknown awards have none."""
+        records = (self.awards[name].record for name in awards if name in self.awards)
+        return {record.space for record in records if record.arm == arm}
 
     def closed_space(self) -> Mapping[str, frozenset[str]]:
         """Return the names of the spaces that each arm may take for closed awards alone."""
@@ -235,7 +237,7 @@ class Ledger(TimedState[AuctionRecord]):
                 changed = [entry]
             case CommitPermitted() | ContactLost() | ContactRegained():
                 award, entry = self.awards[record.award], self._entry(record.award)
-                award.may_commit, award.silent, award.cleared = True, isinstance(record, ContactLost), False
+                award.may_commit, award.silent = True, isinstance(record, ContactLost)
                 entry.state, entry.reason = "finishing", ""
                 if award.silent:
                     entry.state, entry.reason = "unfinished", reason_for_silence(award.record.arm)
@@ -246,8 +248,6 @@ class Ledger(TimedState[AuctionRecord]):
                 self.space[record.arm] = frozenset(record.space)
             case SpaceCleared():
                 self.space[record.arm] = frozenset()
-                for award in self.open.values():
-                    award.cleared |= award.record.arm == record.arm
             case ShiftEnded():
                 self.ended = True
                 changed = [self.jobs[name] for name in self.unsettled()]
@@ -269,8 +269,9 @@ class Ledger(TimedState[AuctionRecord]):
         award = self.awards.get(record.award)
         if award is None:  # left out by `compact`: the report changed nothing
             return []
+        reopened = record.award in self.open
         award.silent, award.outcome = False, record.outcome
-        self._end(record.award, moved=record.outcome != "refused")
+        self._end(award, moved=record.outcome != "refused")
         entry = self.jobs[award.record.job]
         if entry.state == "finished":
             return []
@@ -278,7 +279,8 @@ class Ledger(TimedState[AuctionRecord]):
             entry.faults += (award.record.arm,)
         entry.cycles = max(entry.cycles, min(record.cycles, entry.spec.repetitions))
         if record.outcome == "finished":
-            self._end(entry.award)  # a later award of the same job has no purpose any more
+            if entry.award in self.open:  # a later award of the same job has no purpose any more
+                self._end(self.open[entry.award])
             entry.state, entry.award, entry.reason, entry.finished_s = "finished", record.award, "", record.time_s
         elif entry.award != record.award:  # the job was awarded again since
             return [entry] if self._give_up(entry) else []
@@ -286,7 +288,7 @@ class Ledger(TimedState[AuctionRecord]):
             entry.state, entry.reason = "unfinished", record.reason or "It is unknown whether its last cycle was done."
         else:
             entry.state, entry.reason = "waiting", record.reason
-            if record.outcome == "returned":
+            if record.outcome == "returned" and reopened:
                 entry.returns, entry.returned_s = entry.returns + 1, record.time_s
             entry.cycles = min(entry.cycles, entry.spec.repetitions - 1)  # the last cycle is never assumed done
             self._give_up(entry)
@@ -301,10 +303,13 @@ class Ledger(TimedState[AuctionRecord]):
         entry.state, entry.reason = "given_up", reason
         return True
 
-    def _end(self, name: str, *, moved: bool = True) -> None:
-        """Close an award; an arm that may have moved for it takes its space until it says that it is at home."""
-        award = self.open.pop(name, None)
-        if award is not None and moved and not award.cleared:
+    def _end(self, award: AwardState, *, moved: bool = True) -> None:
+        """Close an award; an arm that may have moved for it takes its space until it says that it is at home.
+
+        So does an arm that reports on an award which was closed before: its space may have been freed since.
+        """
+        self.open.pop(award.record.award, None)
+        if moved:
             arm = award.record.arm
             self.space[arm] = self.space.get(arm, frozenset()) | {award.record.space}
 

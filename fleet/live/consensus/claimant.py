@@ -18,6 +18,7 @@ from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, Faults, 
 from fleet.errors import JournalError, Refused
 from fleet.job import reason_to_give_up
 from fleet.live.arm.award_executor import AwardExecutor
+from fleet.live.arm.journal_records import ActiveAward
 from fleet.live.auction.round import Timing
 from fleet.live.consensus.granter import Granter
 
@@ -235,19 +236,19 @@ class Claimant:
                 self._reject(award)
         for active in self.executor.active:
             if vote := self._votes.get(active.award.award):
-                self._renew(active.award.award, vote, active.may_commit, real_s)
+                self._renew(active, vote, real_s)
         for report, _ in self.executor.pending_reports():
             if len(self._receipts.get(report.award, ())) >= self.majority:
                 del self._receipts[report.award]
                 self.executor.apply_receipt(Receipt(self.arm, report.award))
 
-    def _renew(self, award: str, vote: Vote, may_commit: bool, real_s: float) -> None:
+    def _renew(self, active: ActiveAward, vote: Vote, real_s: float) -> None:
         """Apply the votes on an active award as a lease."""
+        award = active.award.award
         lease_s, asked_s = self._timing.lease_s, vote.since_s(self.majority)
         permitted = (award,) if len(vote.may_commit) >= self.majority else ()
-        if self._is_denied(vote) and not may_commit and not permitted:
+        if self._is_denied(vote):
             self.executor.apply_lease(Lease(self.arm, lease_s, (), (award,)), real_s)
-            self._change()
         elif asked_s > -math.inf:
             self.executor.apply_lease(Lease(self.arm, lease_s, (award,), (), permitted), asked_s)
         elif permitted:

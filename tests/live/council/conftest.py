@@ -4,6 +4,7 @@ Every arm is real except for its body: time is a number, every clock runs at its
 """
 
 import random
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import combinations
@@ -135,6 +136,7 @@ class Arm:
     def _step(self) -> None:
         self.executor.retry_writes()
         self._work()
+        self.executor.return_revoked(0.0, self.real_s, at_home=not self.out)
         self.executor.return_expired(0.0, self.real_s)
         if self.executor.lease_requests(self.real_s) or self.executor.due_reports(self.real_s):
             self.participant.claimant.claim_soon()
@@ -179,15 +181,31 @@ class Arm:
             self.executor.record_progress(first.cycles + 1, 0.0)
         self.executor.record_progress(first.cycles, (repetitions - 1 - first.cycles) * CYCLE_S)
 
-    def fault(self) -> None:
+    def break_off(self) -> None:
         """Stop during a cycle, which then does not count."""
-        if self.executor.active:
-            self.fleet.faults.setdefault(self.executor.active[0].job, []).append(self.name)
         if self.cycle_ends_s is not None:
             first = self.executor.active[0].award.job
             if self.executor.active[0].cycles + 1 == first.repetitions:
                 self.fleet.last_cycles[first.name] -= 1
             self.cycle_ends_s = None
+
+    def move_home(self) -> None:
+        """Have a person move the arm home; its process lives on."""
+        self.break_off()
+        self.out, self.home_s = "", None
+
+    def clear(self, absent: str) -> None:
+        """Free the space of another arm, unless that is refused."""
+        present = self.fleet.alive_for(self.name)
+        with suppress(Refused, JournalFull):
+            self.run_until_crash(
+                lambda: self.participant.granter.clear(absent, "", present, self.real_s, self.fleet.true_s)
+            )
+
+    def fault(self) -> None:
+        if self.executor.active:
+            self.fleet.faults.setdefault(self.executor.active[0].job, []).append(self.name)
+        self.break_off()
         self.executor.return_all(0.0, self.real_s, "hot", faulted=True)
 
 
