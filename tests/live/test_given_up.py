@@ -18,6 +18,7 @@ from fleet.live.journal_records import Closed, JobsAccepted
 
 JOB = JobSpec(name="j", kind="hold", places=("x",), repetitions=9)
 NEXT = JobSpec(name="k", kind="hold", places=("x",), after=("j",))
+LOST = "Given up, because it waits for 'j', which is given up."
 ROSTER = ("a", "b", "c", "d")
 attempts = st.lists(st.tuples(st.sampled_from("abcd"), st.sampled_from(["faulted", "returned", "refused", "dropped"])))
 
@@ -63,8 +64,9 @@ def test_the_auctioneer_gives_a_job_up_at_that_fault_and_no_other_event(attempts
         if too_often(faults):
             assert status.reason == reason_to_give_up(faults)
             assert (status.arm, status.award) == ("", "")
-            assert not ledger.ready(99.0, 9), "nor can its successor begin"
-            assert ledger.unsettled() == ["k"]
+            assert not ledger.unsettled()
+            (successor,) = ledger.status(["k"])
+            assert (successor.state, successor.reason) == ("given_up", LOST)
 
 
 def test_faults_of_lost_arms_count_when_they_are_reported_late():
@@ -78,6 +80,28 @@ def test_faults_of_lost_arms_count_when_they_are_reported_late():
     assert change.status.state == "given_up"
     (change,) = book.apply(Closed("w2", "finished", 9, 5.0))
     assert change.status.state == "finished", "it was done after all"
+
+
+def test_jobs_that_wait_for_a_job_that_is_given_up_are_given_up_until_that_one_is_finished():
+    last = JobSpec(name="a", kind="hold", places=("x",), after=("k",))  # sorted before the others
+    book = Ledger().replay([JobsAccepted((JOB, NEXT), "test", 0.0)])
+    for number in (1, 2):
+        book.apply(awarded(number, "a"))
+        changes = book.apply(Closed(f"w{number}", "returned", 0, float(number), faulted=True))
+    assert [(change.status.job, change.status.state) for change in changes] == [("j", "given_up"), ("k", "given_up")]
+    (admission,) = book.admit((last,))
+    assert (admission.accepted, admission.reason) == (True, LOST.replace("'j'", "'k'"))
+    (change,) = book.apply(JobsAccepted((last,), "test", 3.0))
+    assert (change.status.state, change.status.reason) == ("given_up", admission.reason)
+    for ledger in (book, Ledger().replay(book.compact())):
+        assert not ledger.unsettled()
+        changes = ledger.apply(Closed("w2", "finished", 9, 5.0))
+        assert {change.status.job: change.status.state for change in changes} == {
+            "j": "finished",
+            "k": "waiting",
+            "a": "waiting",
+        }
+        assert [job.name for job in ledger.ready(9.0, 9)] == ["k"]
 
 
 def test_a_late_fault_does_not_take_the_job_from_another_arm():

@@ -81,6 +81,7 @@ class Admission(msgspec.Struct, frozen=True):
     accepted: bool
     """Also true for an identical job that is already known."""
     reason: str = ""
+    """Why it is not accepted, or is given up at once."""
 
 
 class SubmissionReply(msgspec.Struct, frozen=True):
@@ -250,7 +251,7 @@ class Receipt(msgspec.Struct, frozen=True):
 JobState = Literal["waiting", "awarded", "finishing", "finished", "unfinished", "given_up"]
 """waiting: for its release, its predecessors or an arm; finishing: in its last cycle; unfinished: the arm had
 permission to commit and is silent since, or the shift ended before the job was done; given_up: arms faulted in it too
-often."""
+often, or in a job that it waits for."""
 SETTLED: tuple[JobState, ...] = ("finished", "unfinished", "given_up")
 """States that need nothing more; only a late report that the job is finished may change the other two."""
 

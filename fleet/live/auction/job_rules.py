@@ -3,7 +3,7 @@
 # The stubs of networkx leave the results of its functions unknown.
 # pyright: standard
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from itertools import accumulate, islice
 
 import networkx as nx
@@ -30,6 +30,7 @@ def admit(
     places: frozenset[str] | None = None,
     limit: int = MAX_KEPT_JOBS,
     ended: bool = False,
+    given_up: Container[str] = (),
 ) -> tuple[Admission, ...]:
     """Return which jobs of one submission can be accepted; they may name one another as predecessors in any order.
 
@@ -37,6 +38,7 @@ def admit(
         known: Jobs that were accepted before. An identical job is accepted again and changes nothing.
         places: Places of the cell; None allows any name.
         ended: Whether the shift is over.
+        given_up: Known jobs that are given up: a job that waits for one is accepted, and given up too.
     """
     rejected: dict[int, str] = {}
     new: dict[str, JobSpec] = {}
@@ -57,7 +59,25 @@ def admit(
             new[job.name] = job
     never = _never_ready(new, known)
     reasons = [rejected.get(index) or never.get(job.name, "") for index, job in enumerate(jobs)]
-    return tuple(Admission(job.name, not reason, reason) for job, reason in zip(jobs, reasons, strict=True))
+    lost = lost_jobs(new.values(), given_up)
+    return tuple(
+        Admission(job.name, not reason, reason or lost.get(job.name, ""))
+        for job, reason in zip(jobs, reasons, strict=True)
+    )
+
+
+def lost_jobs(jobs: Collection[JobSpec], given_up: Container[str]) -> dict[str, str]:
+    """Return why jobs are given up that wait for one that is, directly or not, by name."""
+    reasons: dict[str, str] = {}
+    before = -1
+    while len(reasons) > before:
+        before = len(reasons)
+        for job in jobs:
+            if job.name not in reasons and job.name not in given_up:
+                lost = next((name for name in job.after if name in given_up or name in reasons), None)
+                if lost is not None:
+                    reasons[job.name] = f"Given up, because it waits for '{lost}', which is given up."
+    return reasons
 
 
 def _never_ready(new: Mapping[str, JobSpec], known: Mapping[str, JobSpec]) -> dict[str, str]:

@@ -13,7 +13,7 @@ from msgspec.structs import asdict, replace
 
 from fleet.bus.protocol.auction import SETTLED, Admission, JobSpec, JobState, JobStatus
 from fleet.job import reason_to_give_up
-from fleet.live.auction.job_rules import SHIFT_ENDED, admit, job_order, ready_jobs, reason_for_silence
+from fleet.live.auction.job_rules import SHIFT_ENDED, admit, job_order, lost_jobs, ready_jobs, reason_for_silence
 from fleet.live.journal import TimedState
 from fleet.live.journal_records import (
     ClockTick,
@@ -159,7 +159,8 @@ class Ledger(TimedState[AuctionRecord]):
     def admit(self, jobs: Sequence[JobSpec]) -> tuple[Admission, ...]:
         """Return which submitted jobs can be accepted; changes nothing."""
         known = {name: entry.spec for name, entry in self.jobs.items()}
-        return admit(jobs, known, places=self.places, ended=self.ended)
+        given_up = {name for name, entry in self.jobs.items() if entry.state == "given_up"}
+        return admit(jobs, known, places=self.places, ended=self.ended, given_up=given_up)
 
     def ready(self, time_s: float, limit: int, *, excluded: Container[str] = ()) -> list[JobSpec]:
         """Return the first jobs that can begin now: released, predecessors finished, stations free."""
@@ -230,6 +231,7 @@ class Ledger(TimedState[AuctionRecord]):
             case JobsAccepted():
                 changed = [JobEntry(job, record.by) for job in record.jobs if job.name not in self.jobs]
                 self._set_jobs([*self.jobs.values(), *changed])
+                self._follow_given_up()
             case Awarded():
                 entry = self.jobs[record.job]
                 self.awards[record.award] = self.open[record.award] = AwardState(record)
@@ -244,6 +246,7 @@ class Ledger(TimedState[AuctionRecord]):
                 changed = [entry]
             case Closed():
                 changed = self._close(record)
+                changed += [entry for entry in self._follow_given_up() if entry not in changed]
             case SpaceTaken():
                 self.space[record.arm] = frozenset(record.space)
             case SpaceCleared():
@@ -302,6 +305,24 @@ class Ledger(TimedState[AuctionRecord]):
             return False
         entry.state, entry.reason = "given_up", reason
         return True
+
+    def _follow_given_up(self) -> list[JobEntry]:
+        """Give up jobs that wait for one that is given up; return what has changed.
+
+        They wait again if that one was finished after all.
+        """
+        given_up = [entry for entry in self.jobs.values() if entry.state == "given_up"]
+        if not given_up:
+            return []
+        causes = {entry.spec.name for entry in given_up if reason_to_give_up(entry.faults)}
+        lost = lost_jobs([entry.spec for entry in self.jobs.values()], causes)
+        changed: list[JobEntry] = []
+        for name, entry in self.jobs.items():
+            state = "given_up" if name in causes or name in lost else "waiting"
+            if entry.state in ("waiting", "given_up") and entry.state != state:
+                entry.state, entry.reason = state, lost.get(name, "")
+                changed.append(entry)
+        return changed
 
     def _end(self, award: AwardState, *, moved: bool = True) -> None:
         """Close an award; an arm that may have moved for it takes its space until it says that it is at home.

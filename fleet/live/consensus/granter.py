@@ -128,9 +128,14 @@ class Register(TimedState[GrantRecord]):
         return tuple(records)
 
     @property
+    def given_up(self) -> frozenset[str]:
+        """Jobs in which arms have faulted too often."""
+        return frozenset(job for job, outcome in self.settled.items() if outcome.outcome == "given_up")
+
+    @property
     def closed_count(self) -> int:
         """Number of outcomes that nothing changes; a job that is given up may be finished after all."""
-        return sum(outcome.outcome != "given_up" for outcome in self.settled.values())
+        return len(self.settled) - len(self.given_up)
 
     def knows(self, job: str, faults: Faults) -> bool:
         """Return whether these faults in a job are known."""

@@ -206,7 +206,8 @@ class ConsensusNode:
     def _submit(self, submission: Submission) -> SubmissionReply:
         known = {job.name: job for _, job in self._stream} | self.participant.jobs
         ended = self.participant.ended
-        admissions = admit(submission.jobs, known, places=self._membership.places, ended=ended)
+        given_up = {status.job for status in self.statuses() if status.state == "given_up"}
+        admissions = admit(submission.jobs, known, places=self._membership.places, ended=ended, given_up=given_up)
         accepted = tuple(job for job, reply in zip(submission.jobs, admissions, strict=True) if reply.accepted)
         self.participant.granter.add_jobs(tuple(job for job in accepted if job.name not in known), submission.by)
         self.participant.add_jobs(accepted)

@@ -24,7 +24,7 @@ from fleet.bus.protocol.auction import JobEstimate, JobSpec, JobStatus, Quote
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply
 from fleet.bus.protocol.messages import State
 from fleet.live.arm.node import ArmNode
-from fleet.live.auction.job_rules import SHIFT_ENDED, job_order, ready_jobs
+from fleet.live.auction.job_rules import SHIFT_ENDED, job_order, lost_jobs, ready_jobs
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.round import Bidding, Timing, resolve_claims
 from fleet.live.consensus.claimant import NUMBERS_PER_BOOT, Claimant
@@ -184,10 +184,11 @@ class Participant:
             self.out.append(claim)
 
     def open_jobs(self, real_s: float) -> list[str]:
-        """Return the jobs that are not settled, without those of absent arms that had permission to commit."""
+        """Return the jobs that can still be done, without those of absent arms that had permission to commit."""
         register = self.granter.register
         gone = {job for job in self.granter.out_of_contact(real_s) if register.grants[job].arm not in self._present}
-        return [job for job in self.jobs if job not in register.settled and job not in gone]
+        gone.update(register.settled, lost_jobs(self.jobs.values(), register.given_up))
+        return [job for job in self.jobs if job not in gone]
 
     def all_settled(self, real_s: float) -> bool:
         """Return whether every present arm, a majority at least, knows that every job is settled."""
@@ -199,8 +200,16 @@ class Participant:
 
     def status(self, later: Iterable[JobSpec], real_s: float) -> list[JobStatus]:
         """Return the status of all known jobs, and of `later` ones that are not offered yet."""
-        names = dict.fromkeys([*self.jobs, *(job.name for job in later), *self.granter.register.settled])
+        jobs = self.jobs | {job.name: job for job in later}
+        lost = lost_jobs(jobs.values(), self.granter.register.given_up)
+        names = dict.fromkeys([*jobs, *self.granter.register.settled])
         statuses = [self.granter.status(name, real_s) for name in names]
+        statuses = [
+            replace(status, state="given_up", reason=lost[status.job])
+            if status.state == "waiting" and status.job in lost
+            else status
+            for status in statuses
+        ]
         if not self.ended:
             return statuses
         return [

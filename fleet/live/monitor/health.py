@@ -99,7 +99,7 @@ def check_health(
     if unfinished := fleet.counts.get("unfinished", 0):
         findings.append(Finding("warning", f"{unfinished} job(s) are unfinished: they may have been done or not."))
     if given_up := fleet.counts.get("given_up", 0):
-        findings.append(Finding("warning", f"{given_up} job(s) are given up: arms faulted in them too often."))
+        findings.append(Finding("warning", f"{given_up} job(s) are given up; their status names the reason."))
     return HealthReport(
         fleet=fleet.fleet,
         round_trip_s=median(trips_s) if trips_s else None,
