@@ -9,10 +9,11 @@ from rich.text import Text
 
 from fleet.bus.protocol.auction import JobState
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetSnapshot
+from fleet.live.space import ANYWHERE
 
 HOT_K, WARM_K = 5.0, 10.0
 """Headroom below which an arm is shown in red, in yellow."""
-FRAME, EVENTS = 6, 6
+FRAME, EVENTS = 7, 6
 """Lines of the screen that are neither arms nor events; events shown."""
 _MODE_STYLES = {"faulted": "bold red", "working": "green"}
 
@@ -28,7 +29,7 @@ def screen(fleet: FleetSnapshot, events: Sequence[str], height: int) -> Group:
     parts: list[Table | Text] = [heading(fleet), arm_table(arms)]
     if len(arms) < len(fleet.arms):
         parts.append(Text(f"… and {len(fleet.arms) - len(arms)} more with more headroom", style="dim"))
-    parts.append(jobs_line(fleet))
+    parts += [jobs_line(fleet), space_line(fleet)]
     parts += [Text(event, style="dim", no_wrap=True, overflow="ellipsis") for event in events[-EVENTS:]]
     return Group(*parts)
 
@@ -77,6 +78,17 @@ def jobs_line(fleet: FleetSnapshot) -> Text:
     """Number of jobs in each state."""
     counts = ", ".join(f"{fleet.counts[state]} {state}" for state in get_args(JobState) if fleet.counts.get(state))
     return Text(f"jobs: {counts or 'none'}", no_wrap=True, overflow="ellipsis")
+
+
+def space_line(fleet: FleetSnapshot) -> Text:
+    """The arms whose space is closed to others, and why."""
+    arms = {arm.arm: arm for arm in fleet.arms}
+    parts: list[str] = []
+    for name, spaces in fleet.space.items():
+        arm = arms.get(name)
+        where = "not present" if arm is None or not arm.present else "away from home" if arm.away else "has a job"
+        parts.append(f"{name} ({where}{', may be anywhere' if ANYWHERE in spaces else ''})")
+    return Text(f"space closed by: {', '.join(parts) or 'none'}", no_wrap=True, overflow="ellipsis")
 
 
 def arm_line(arm: ArmSnapshot) -> str:

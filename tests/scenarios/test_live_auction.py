@@ -396,6 +396,9 @@ def test_ask_exits_with_1_where_no_arm_can_do_a_job(endpoint, capsys):
 def test_ask_reports_missing_arguments(endpoint, capsys):
     at = ("--endpoint", endpoint, "--fleet", "f")
     assert "either a FILE of jobs or one job" in call(capsys, "ask", *at)[2]
+    assert r"must be UTF-8 text (got '\udcff')" in call(capsys, "ask", "--kind", "\udcff", *at)[2]
+    heavy = call(capsys, "ask", "--kind", "hold", "--place", "rack", "--payload", "11", *at)
+    assert "--payload must be 0 to 10 (got 11)" in heavy[2]
     told = call(capsys, "ask", "--kind", "pick_and_place", *at)[2]
     told_kinds = "did you mean 'pick_place'? Allowed: hold, pick_place, press, sort (at kind)."
     assert f"Invalid job: No kind of job 'pick_and_place'; {told_kinds}" in " ".join(told.split())

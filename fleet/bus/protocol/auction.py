@@ -281,6 +281,9 @@ class Status(msgspec.Struct, frozen=True):
     auctioneer: Name
     time_s: float
     jobs: tuple[JobStatus, ...]
+    space: dict[Name, tuple[Name, ...]] = {}
+    """Names of the spaces that are closed to others, by the arm that takes them or may take them; "*" is all space
+    within its reach."""
 
 
 class Announcement(msgspec.Struct, frozen=True):

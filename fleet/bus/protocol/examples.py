@@ -139,7 +139,7 @@ _ALL: tuple[msgspec.Struct, ...] = (
     Submission(jobs=(CRATE,), by="shop floor"),
     SubmissionReply(auctioneer=_AUCTIONEER, jobs=(Admission(job="crate_1", accepted=True),)),
     StatusRequest(jobs=("crate_1",)),
-    Status(auctioneer=_AUCTIONEER, time_s=900.0, jobs=(_DONE,)),
+    Status(auctioneer=_AUCTIONEER, time_s=900.0, jobs=(_DONE,), space={"arm_2": ("5d1c0f7e92ab3486",)}),
     ClearRequest(arm="arm_2", by="shop floor"),
     Cleared(auctioneer=_AUCTIONEER, arm="arm_2"),
     ClockRequest(),

@@ -1,4 +1,4 @@
-"""Which jobs are accepted, which can begin, and which statuses fit in a reply: the same with and without auctioneer."""
+"""Which jobs are accepted, which can begin, and the reply to a status request: the same with and without auctioneer."""
 
 # The stubs of networkx leave the results of its functions unknown.
 # pyright: standard
@@ -7,8 +7,9 @@ from collections.abc import Callable, Collection, Container, Iterable, Mapping, 
 from itertools import accumulate, islice
 
 import networkx as nx
+from msgspec.structs import replace
 
-from fleet.bus.protocol.auction import MOST_JOBS, SETTLED, Admission, JobSpec, JobStatus
+from fleet.bus.protocol.auction import MOST_JOBS, SETTLED, Admission, JobSpec, JobStatus, Status
 from fleet.bus.protocol.messages import encode
 
 MAX_KEPT_JOBS = 10_000
@@ -122,10 +123,19 @@ def ready_jobs(
     return list(islice(ready, limit))
 
 
-def statuses_that_fit(statuses: Iterable[JobStatus]) -> tuple[JobStatus, ...]:
-    """Return as many statuses as one message may contain; of more, those that may still change come first."""
-    kept = list(statuses)
+def status_reply(name: str, time_s: float, statuses: Iterable[JobStatus], taken: Mapping[str, Iterable[str]]) -> Status:
+    """Return the reply to a status request.
+
+    It has as many statuses as one message may contain; of more, those that may still change come first.
+
+    Args:
+        name: Name of the replier.
+        taken: Names of the spaces that each arm may take.
+    """
+    kept, space = list(statuses), {arm: tuple(sorted(names)) for arm, names in sorted(taken.items()) if names}
+    reply = Status(name, time_s, (), space)
     if len(kept) > MOST_JOBS:
         kept = sorted(kept, key=lambda status: status.state in SETTLED)[:MOST_JOBS]
-    sizes = accumulate(len(encode(status)) + 1 for status in kept)
-    return tuple(status for status, size in zip(kept, sizes, strict=True) if size <= MAX_BYTES)
+    sizes = accumulate((len(encode(status)) + 1 for status in kept), initial=len(encode(reply)))
+    next(sizes)
+    return replace(reply, jobs=tuple(status for status, size in zip(kept, sizes, strict=True) if size <= MAX_BYTES))

@@ -32,7 +32,7 @@ from fleet.bus.protocol.messages import State
 from fleet.errors import BusError
 from fleet.live.arm.auctioneer_client import RateLimitedWarnings
 from fleet.live.arm.node import ArmNode
-from fleet.live.auction.job_rules import admit, statuses_that_fit
+from fleet.live.auction.job_rules import admit, status_reply
 from fleet.live.clock import FleetClock
 from fleet.live.consensus.granter import Granter, Register
 from fleet.live.consensus.participant import QUIET_S, Membership, Participant
@@ -217,7 +217,8 @@ class ConsensusNode:
     def _status(self, request: StatusRequest) -> Status:
         self._check_first()
         statuses = [status for status in self.statuses() if not request.jobs or status.job in request.jobs]
-        return Status(self._name, self._arm.clock.now_s(time.monotonic()), statuses_that_fit(statuses))
+        time_s, register = self._arm.clock.now_s(time.monotonic()), self.participant.granter.register
+        return status_reply(self._name, time_s, statuses, register.space)
 
     def _clear(self, request: ClearRequest) -> Cleared:
         real_s = time.monotonic()

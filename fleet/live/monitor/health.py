@@ -100,6 +100,15 @@ def check_health(
         findings.append(Finding("warning", f"{unfinished} job(s) are unfinished: they may have been done or not."))
     if given_up := fleet.counts.get("given_up", 0):
         findings.append(Finding("warning", f"{given_up} job(s) are given up; their status names the reason."))
+    present = {arm.arm for arm in fleet.arms if arm.present}
+    findings += [
+        Finding(
+            "warning",
+            f"The space of {arm} stays closed to other arms, as {arm} is not present. If you have seen that it is at "
+            f"home or removed, and is switched off: thermofleet clear {arm}",
+        )
+        for arm in fleet.space.keys() - present
+    ]
     return HealthReport(
         fleet=fleet.fleet,
         round_trip_s=median(trips_s) if trips_s else None,

@@ -43,6 +43,8 @@ class ArmSnapshot(msgspec.Struct, frozen=True):
     """The hottest motor, 1..7."""
     headroom_k: float | None = None
     job: str = ""
+    away: bool = False
+    """It says that it is away from home."""
     difficulty: dict[str, float | None] = {}
     """Difficulty of the jobs that have not ended; None without a score."""
     joints: int | None = None
@@ -74,6 +76,8 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
     """Number of jobs by state."""
     jobs: tuple[JobStatus, ...]
     """The most recently changed last."""
+    space: dict[str, tuple[str, ...]] = {}
+    """Names of the spaces that are closed to others, by arm, as the last status reply has them."""
 
 
 @dataclass
@@ -113,6 +117,7 @@ class FleetView:
     """Fleet seconds per real second; None while unknown."""
     _arms: "Recent[str, _Arm]" = field(default_factory=lambda: Recent(MAX_NAMES))
     _auctioneers: "Recent[str, _Auctioneer]" = field(default_factory=lambda: Recent(MAX_NAMES))
+    _space: dict[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
     _jobs: "Recent[str, _Job]" = field(default_factory=lambda: Recent(MAX_JOBS))
 
     def set_token(self, role: Role, name: str, present: bool) -> bool:
@@ -138,7 +143,7 @@ class FleetView:
                 self._jobs.clear()
             for job in self._jobs.values():
                 job.number = 0
-        auctioneer.heard_s, auctioneer.time_s = now_s, reply.time_s
+        auctioneer.heard_s, auctioneer.time_s, self._space = now_s, reply.time_s, dict(reply.space)
         for status in reply.jobs:
             self._set_status(status, now_s)
 
@@ -167,6 +172,7 @@ class FleetView:
             ),
             counts=dict(Counter(status.state for status in statuses)),
             jobs=tuple(statuses[-jobs:]) if jobs > 0 else (),
+            space=self._space,
         )
 
     def _arm(self, name: str) -> _Arm:
@@ -232,6 +238,7 @@ def _arm_snapshot(name: str, arm: _Arm, now_s: float, speed: float | None, ended
         joint=None if hottest_c is None else temps_c.index(hottest_c) + 1,
         headroom_k=state.headroom_k if state else None,
         job=state.job if state else "",
+        away=bool(state and state.space),
         difficulty={job: score for job, score in difficulty if job not in ended},
         joints=info.joints if info else None,
         twin=info.twin if info else "",

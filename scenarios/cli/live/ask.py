@@ -11,23 +11,24 @@ from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import MOST_JOBS, JobEstimate, JobSpec, Quote, QuoteRequest
 from fleet.errors import BusError, FleetError
-from fleet.job import DWELL_S
+from fleet.job import BOUNDS, DWELL_S
 from scenarios.cli.live.submit import JOBS_HELP, explain, read_jobs
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, number, the_fleet
 from scenarios.cli.terminal import out_console, say
 
 REPLY_S = 5.0
 """Real seconds to wait for arms: planning a new motion takes a while."""
+_RANGES = {name: (bounds.low, bounds.high) for name, bounds in BOUNDS.items()}
 
 
 def ask_command(
     file: Annotated[str, typer.Argument(help=JOBS_HELP)] = "",
     kind: Annotated[str, typer.Option(help="One job instead of a file: pick_place, hold, press, sort.")] = "",
     place: Annotated[list[str] | None, typer.Option(help="Place of the cell; twice for pick_place and sort.")] = None,
-    payload: Annotated[float, number("Payload, kg.", 0, 100)] = 0.0,
-    repetitions: Annotated[int, number("Number of cycles.", 1, 1_000_000)] = 1,
-    dwell: Annotated[float, number("Duration of one repetition of a hold or press, s.", 0, 86_400)] = DWELL_S,
-    force: Annotated[float, number("Force of a press, N.", 0, 1000)] = 0.0,
+    payload: Annotated[float, number("Payload, kg.", *_RANGES["payload_kg"])] = 0.0,
+    repetitions: Annotated[int, number("Number of cycles.", *_RANGES["repetitions"])] = 1,
+    dwell: Annotated[float, number("Duration of one repetition of a hold or press, s.", *_RANGES["dwell_s"])] = DWELL_S,
+    force: Annotated[float, number("Force of a press, N.", *_RANGES["force_n"])] = 0.0,
     timeout: Annotated[float, number("Real seconds to wait for arms.", 0, 600, above=True)] = REPLY_S,
     as_json: Annotated[bool, typer.Option("--json", help="Print the quotes as JSON.")] = False,
     endpoint: EndpointOption = ENDPOINT,
@@ -79,9 +80,12 @@ def one_job(
         "force_n": force_n,
     }
     try:
+        msgspec.json.encode(fields)
         return msgspec.convert(fields, JobSpec)
     except msgspec.ValidationError as error:
         raise FleetError(f"Invalid job: {explain(error)}") from error
+    except UnicodeEncodeError as error:
+        raise FleetError(f"--kind and --place must be UTF-8 text (got {error.object!a}).") from error
 
 
 def quote_table(jobs: Sequence[JobSpec], quotes: Mapping[str, Quote]) -> Table:

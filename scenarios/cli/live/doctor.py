@@ -21,7 +21,7 @@ from fleet.live.monitor.listener import FleetListener
 from fleet.live.monitor.snapshot import FleetSnapshot
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, number
 from scenarios.cli.terminal import out_console, say
-from scenarios.live.watch_screen import arm_table, format_time, jobs_line
+from scenarios.live.watch_screen import arm_table, format_time, jobs_line, space_line
 from scenarios.load import load
 
 UNHEALTHY = 1
@@ -122,6 +122,7 @@ def show(endpoint: str, fleet: FleetSnapshot, report: HealthReport) -> None:
     if fleet.arms:
         out_console.print(arm_table(fleet.arms))
     out_console.print(jobs_line(fleet))
+    out_console.print(space_line(fleet))
     for finding in report.findings:
         out_console.print(
             f"{finding.level}: {finding.what}", style=_COLORS.get(finding.level, ""), highlight=False, markup=False

@@ -20,7 +20,7 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.messages import encode
 from fleet.errors import JournalFull
 from fleet.live import journal
-from fleet.live.auction.job_rules import statuses_that_fit
+from fleet.live.auction.job_rules import status_reply
 from fleet.live.journal import Journal
 
 
@@ -156,4 +156,7 @@ def test_the_status_of_1500_jobs_fits_into_one_message_with_open_jobs_first(bus)
     assert 100 < len(status.jobs) <= 256
     assert len(encode(status)) < 65_536
     first = JobStatus("done", "finished")
-    assert statuses_that_fit((first, *status.jobs * 2))[0].state == "waiting"
+    taken = {f"arm_{number}": frozenset("*") for number in range(1000)}
+    reply = status_reply("x", 0.0, (first, *status.jobs * 2), taken)
+    assert (len(reply.jobs) > 0, reply.jobs[0].state, len(reply.space)) == (True, "waiting", 1000)
+    assert len(encode(reply)) < 65_536
