@@ -28,7 +28,7 @@ class Ssi(Stateless):
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
         """The claims of the pairs of arm and job."""
-        if not any(seen.action_mask[1:].any() for seen in observations.values()):
+        if not any(seen.action_mask[1:-1].any() for seen in observations.values()):
             return dict.fromkeys(observations, WAIT)
         seen = list(observations.values())
         return claims_of(observations, self.pairs(self.cost(seen), plans_of(seen[0])))

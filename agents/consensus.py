@@ -128,7 +128,7 @@ class Consensus(LeastDifficulty):
 
     def _bids(self, observation: Observation, place: int) -> Array:
         """Cost of each slot to this arm, [slot]; inf for those that it may not claim."""
-        legal = np.any(observation.action_mask[1:].reshape(len(observation.offered), -1), axis=1)
+        legal = np.any(observation.action_mask[1:-1].reshape(len(observation.offered), -1), axis=1)
         if not legal.any():
             return np.full(len(legal), np.inf)
         relative = advantage(observation, place, legal, self._trust)[place]

@@ -47,7 +47,7 @@ def quickest(observations: Sequence[Observation]) -> Array:
 
 def _able(observations: Sequence[Observation]) -> Array:
     """Whether the arm may claim the job now, bool, [arm, option]."""
-    return np.stack([seen.action_mask[1:] for seen in observations]) > 0
+    return np.stack([seen.action_mask[1:-1] for seen in observations]) > 0
 
 
 def _finish_s(observations: Sequence[Observation]) -> Array:

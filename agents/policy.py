@@ -33,7 +33,8 @@ class Policy(_Resettable, Protocol):
     """
 
     def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
-        """One action per arm: WAIT, or k to claim option k - 1 (k = 1 is `observation.difficulty[0]`)."""
+        """One action per arm: WAIT, k to claim option k - 1 (k = 1 is `observation.difficulty[0]`), or the last action
+        to give the current job back after the present cycle."""
         ...
 
 
@@ -41,7 +42,11 @@ class ArmPolicy(_Resettable, Protocol):
     """Chooses one option (or WAIT) for one arm; every arm has an instance of its own."""
 
     def choose(self, observation: Observation, place: int) -> int:
-        """WAIT, or k to claim option k - 1; `place` is the arm's index in the fleet, for example to break ties."""
+        """WAIT, k to claim option k - 1, or the last action to give the job back.
+
+        Args:
+            place: The arm's index in the fleet, for example to break ties.
+        """
         ...
 
 
@@ -89,7 +94,7 @@ def only_choices(policy: Policy) -> bool:
 
 def legal_options(observation: Observation) -> list[int]:
     """Options (from 0) that this arm may claim now, oldest job first, then the fastest plan."""
-    return np.flatnonzero(observation.action_mask[1:]).tolist()
+    return np.flatnonzero(observation.action_mask[1:-1]).tolist()
 
 
 def plans_of(observation: Observation) -> int:

@@ -133,7 +133,7 @@ class Wspt(Stateless):
 
     def _rate(self, seen: Observation) -> Array:
         """Value per second of every option, [option]; −inf for those that must not be claimed."""
-        allowed = seen.action_mask[1:].astype(bool) & (seen.p_saturation <= self.most_p)
+        allowed = seen.action_mask[1:-1].astype(bool) & (seen.p_saturation <= self.most_p)
         rate = per_option(seen, seen.value) / np.maximum(seen.duration_s, 1.0)
         return np.where(allowed, rate, -np.inf).astype(float)
 

@@ -24,91 +24,105 @@ def difficulty_of_error(error: Array) -> Array:
     return -np.expm1(-error)
 
 
-@dataclass(frozen=True, eq=False)
-class Risk:
-    """Probability that a motor passes the warning limit, as a function of the motor temperatures at the start.
+KNOWN = 2 * JOINTS + 1
+"""Length of what a forecast starts from: measured motor temperatures [joint], estimated housing temperatures [joint]
+and the ambient temperature, all °C."""
 
-    P = link(max over pieces of offset + weight @ temp_c). One piece is a logistic regression; one piece per joint and
-    time is a thermal network that is linear in its start. Leading axes [...] for several plans.
+
+def known_temperatures(motor_c: Array, housing_c: Array, ambient_c: Array | float) -> Array:
+    """What a forecast starts from, °C, [..., KNOWN]; motors and housings are [..., joint], the ambient [...]."""
+    ambient = np.broadcast_to(np.asarray(ambient_c, dtype=float)[..., None], (*np.shape(motor_c)[:-1], 1))
+    return np.concatenate([motor_c, housing_c, ambient], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """Largest of affine functions of the temperatures known at the start of a plan, and a probability from it.
+
+    value = max over pieces of offset + weight @ known_c, P = link(value). One piece is a logistic regression; one piece
+    per joint and moment is a thermal network that is linear in its start. Leading axes [...] for several plans.
     """
 
     offset: Array
-    """Score of each piece at 0 °C, [..., piece]; −inf for an unused piece."""
+    """Value of each piece at 0 °C, [..., piece]; −inf for an unused piece."""
     weight: Array
-    """Slope of each piece, 1/K, [..., piece, joint]."""
+    """Slope of each piece, 1/K, [..., piece, KNOWN]."""
     curve: Array | None = None
-    """Link function as score and probability [..., knot, 2], both non-decreasing, linear between the knots and constant
-    beyond. None, or NaN as first score: the logistic function."""
+    """Link function as value and probability [..., knot, 2], both non-decreasing, linear between the knots and constant
+    beyond. None, or NaN as first value: the logistic function."""
+    time_s: Array | None = None
+    """Moment of each piece after the start, s, [..., piece]; 0 for a piece that counts at any time. None: all 0."""
 
     def __post_init__(self) -> None:
-        if self.offset.shape[-1:] in ((), (0,)) or self.weight.shape[:-1] != self.offset.shape:
+        if self.offset.shape[-1:] in ((), (0,)) or self.weight.shape != (*self.offset.shape, KNOWN):
             raise ValueError(
-                "Risk needs offset [..., piece] and weight [..., piece, joint] with at least one piece "
+                f"Forecast needs offset [..., piece] and weight [..., piece, {KNOWN}] with at least one piece "
                 f"(got {self.offset.shape} and {self.weight.shape})."
             )
         if np.isnan(self.offset).any() or not np.isfinite(self.weight).all():
-            raise ValueError("Risk.offset must not be NaN, and Risk.weight must be finite.")
+            raise ValueError("Forecast.offset must not be NaN, and Forecast.weight must be finite.")
         if self.curve is not None and (
             self.curve.shape[-1:] != (2,) or self.curve.shape[:-2] != self.offset.shape[:-1]
         ):
-            raise ValueError(f"Risk.curve must be [..., knot, 2] (got {self.curve.shape}).")
+            raise ValueError(f"Forecast.curve must be [..., knot, 2] (got {self.curve.shape}).")
+        if self.time_s is not None and (self.time_s.shape != self.offset.shape or not (self.time_s >= 0).all()):
+            raise ValueError(f"Forecast.time_s must be >= 0, one per piece (got shape {np.shape(self.time_s)}).")
 
-    def at(self, temp_c: Array) -> Array:
-        """Probability [...] at measured motor temperatures [..., joint], °C."""
+    def value(self, known_c: Array) -> Array:
+        """The value [...] from known temperatures [..., KNOWN]."""
+        return (self.offset + (self.weight @ np.asarray(known_c, dtype=float)[..., None])[..., 0]).max(axis=-1)
+
+    def at(self, known_c: Array) -> Array:
+        """The probability [...] from known temperatures [..., KNOWN]."""
         curve = np.zeros((0, 2)) if self.curve is None else self.curve
-        return _PROBABILITIES(self.offset, self.weight, curve, np.asarray(temp_c, dtype=float))
+        return _LINKS(self.value(known_c), curve)
 
-    def __getitem__(self, row: Array | int) -> "Risk":
+    def __getitem__(self, row: Array | int) -> "Forecast":
         """Rows of the first axis."""
-        return Risk(self.offset[row], self.weight[row], None if self.curve is None else self.curve[row])
+        curve, time_s = (None if part is None else part[row] for part in (self.curve, self.time_s))
+        return Forecast(self.offset[row], self.weight[row], curve, time_s)
 
 
-def stack_risks(risks: Sequence[Risk]) -> Risk:
-    """Risks of single plans as one with a leading axis [risk, ...]; numbers of pieces and knots may differ."""
-    pieces = max(len(risk.offset) for risk in risks)
-    knots = max(0 if risk.curve is None else len(risk.curve) for risk in risks)
-    offset = np.full((len(risks), pieces), -np.inf)
-    weight = np.zeros((len(risks), pieces, risks[0].weight.shape[-1]))
-    curve = np.full((len(risks), knots, 2), np.nan)
-    for row, risk in enumerate(risks):
-        offset[row, : len(risk.offset)], weight[row, : len(risk.offset)] = risk.offset, risk.weight
-        if risk.curve is not None:
-            curve[row, : len(risk.curve)] = risk.curve
-            curve[row, len(risk.curve) :] = np.inf, risk.curve[-1, 1]
-    return Risk(offset, weight, curve if knots else None)
+def stack_forecasts(forecasts: Sequence[Forecast]) -> Forecast:
+    """Forecasts of single plans as one with a leading axis [forecast, ...]; pieces and knots may differ in number."""
+    pieces = max(len(each.offset) for each in forecasts)
+    knots = max(0 if each.curve is None else len(each.curve) for each in forecasts)
+    offset, time_s = np.full((len(forecasts), pieces), -np.inf), np.zeros((len(forecasts), pieces))
+    weight = np.zeros((len(forecasts), pieces, KNOWN))
+    curve = np.full((len(forecasts), knots, 2), np.nan)
+    for row, each in enumerate(forecasts):
+        count = len(each.offset)
+        offset[row, :count], weight[row, :count] = each.offset, each.weight
+        if each.time_s is not None:
+            time_s[row, :count] = each.time_s
+        if each.curve is not None:
+            curve[row, : len(each.curve)] = each.curve
+            curve[row, len(each.curve) :] = np.inf, each.curve[-1, 1]
+    return Forecast(offset, weight, curve if knots else None, time_s)
 
 
 @jit_inline
-def passing_probability(offset: Array, weight: Array, curve: Array, temp_c: Array) -> float:
-    """Probability that a motor passes the warning limit; see `Risk`.
+def probability_of(value: float, curve: Array) -> float:
+    """Probability that follows from a forecast's value; see `Forecast`.
 
     Args:
-        offset: [piece].
-        weight: [piece, joint].
-        curve: [knot, 2]; without knots, and where the first score is NaN, the link is the logistic function.
-        temp_c: Motor temperatures, °C, [joint].
+        curve: [knot, 2]; without knots, and where the first value is NaN, the link is the logistic function.
     """
-    score = -np.inf
-    for piece in range(len(offset)):
-        linear = offset[piece]
-        for k in range(JOINTS):
-            linear += weight[piece, k] * temp_c[k]
-        score = max(score, linear)
     knots = len(curve)
     if knots == 0 or math.isnan(curve[0, 0]):
-        return 0.5 * (1.0 + math.tanh(0.5 * score))  # the logistic function, without overflow
+        return 0.5 * (1.0 + math.tanh(0.5 * value))  # the logistic function, without overflow
     right = 0
-    while right < knots and score >= curve[right, 0]:
+    while right < knots and value >= curve[right, 0]:
         right += 1
     below, above = max(right - 1, 0), min(right, knots - 1)
     x0, p0 = curve[below, 0], curve[below, 1]
     x1, p1 = curve[above, 0], curve[above, 1]
     if not (math.isfinite(x1) and x1 > x0):
         return p0
-    return p0 + min(max((score - x0) / (x1 - x0), 0.0), 1.0) * (p1 - p0)
+    return p0 + min(max((value - x0) / (x1 - x0), 0.0), 1.0) * (p1 - p0)
 
 
-_PROBABILITIES = np.vectorize(passing_probability, otypes=[float], signature="(p),(p,j),(k,c),(j)->()")
+_LINKS = np.vectorize(probability_of, otypes=[float], signature="(),(k,c)->()")
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,22 +133,33 @@ class Difficulty:
     """d_k, [joint], each in [0, 1)."""
     p_saturation: float | None = None
     """Probability that a motor passes the warning limit, by a model that assumes the start temperatures; None if the
-    model has none, or gives `risk`."""
-    risk: Risk | None = None
-    """The probability as a function of the motor temperatures at the start."""
+    model has none, or forecasts it."""
+    risk: Forecast | None = None
+    """The probability as a function of the temperatures at the start."""
+    peak: Forecast | None = None
+    """Hottest motor temperature during the plan, °C, from the temperatures at the start; with a curve, also the
+    probability where there is no `risk`."""
 
     def __post_init__(self) -> None:
         if self.p_saturation is not None and self.risk is not None:
-            raise ValueError("A Difficulty has p_saturation or risk, not both: risk.at(temp_c) is the probability.")
+            raise ValueError("A Difficulty has p_saturation or risk, not both: risk.at(known_c) is the probability.")
 
     @cached_property
     def total(self) -> float:
         """d = Σ_k d_k, in [0, joints)."""
         return float(np.sum(self.per_joint))
 
-    def p_at(self, temp_c: Array) -> float | None:
-        """Probability that a motor passes the warning limit from motor temperatures [joint]; None if unknown."""
-        return self.p_saturation if self.risk is None else float(self.risk.at(temp_c))
+    def p_at(self, known_c: Array) -> float | None:
+        """Probability that a motor passes the warning limit, from known temperatures [KNOWN]; None if unknown."""
+        if self.risk is not None:
+            return float(self.risk.at(known_c))
+        if self.p_saturation is None and self.peak is not None and self.peak.curve is not None:
+            return float(self.peak.at(known_c))
+        return self.p_saturation
+
+    def peak_at(self, known_c: Array) -> float | None:
+        """Predicted hottest motor temperature during the plan, °C, from known temperatures [KNOWN]; None if unknown."""
+        return None if self.peak is None else float(self.peak.value(known_c))
 
 
 class DifficultyModel(Protocol):

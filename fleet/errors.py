@@ -25,6 +25,9 @@ class InfeasibleJob(FleetError):
     """`reach`, `joint limit`, `torque`, `collision`, `no IK solution`, the payload rating, or an arm at home, with its
     numbers."""
 
+    too_heavy: bool = False
+    """Whether the load exceeds the rating."""
+
     def __str__(self) -> str:
         return f"Arm '{self.arm}' cannot work at '{self.place}': {self.reason}."
 

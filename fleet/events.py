@@ -15,6 +15,8 @@ EventKind = Literal[
     "fault",
     "return",
     "give_up",
+    "give_back",
+    "expire",
     "recover",
     "moved",
     "contact",
@@ -22,7 +24,8 @@ EventKind = Literal[
 EVENT_KINDS: tuple[str, ...] = get_args(EventKind)
 """release: job may be claimed; award: claim won; lost: claim lost; illegal: claim not allowed, counted as a wait;
 torque_warning: the awarded plan exceeds the torque warning; finish: last cycle done; home: arm free again;
-warning, fault: motor limit passed; return: job back in the queue; give_up: job that faulted too often; recover: fault
+warning, fault: motor limit passed; return: job back in the queue; give_up: job that faulted too often; give_back: an
+arm returned its job after a cycle; expire: due date passed before an arm began the job; recover: fault
 cleared; moved: a person moved the faulted arm home; contact: a link or payload of an arm is inside another arm, the
 floor or a fixture (the plant `mujoco` looks for it)."""
 
@@ -39,6 +42,6 @@ class Event:
     joint: int = 0
     """Motor 1..7; 0 if the event has none."""
     value: float = float("nan")
-    """Quantity of the kind: temperature °C, torque N·m, difficulty of an award, cycles kept of a return, depth of a
-    contact in mm."""
+    """Quantity of the kind: temperature °C, torque N·m, difficulty of an award, cycles kept of a return or a
+    give_back, depth of a contact in mm."""
     reason: str = ""

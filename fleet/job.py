@@ -201,6 +201,8 @@ class Job:
     value: float
     after: tuple[str, ...] = ()
     """Names of the jobs that must finish first."""
+    expires: bool = False
+    """A hard due date: the job is given up if no arm has begun it by then."""
 
     def __post_init__(self) -> None:
         check_bounds(self, "repetitions", "release_s", "value")

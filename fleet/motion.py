@@ -69,15 +69,6 @@ class Plan:
         return times / times.sum()
 
 
-PLANS = 1
-"""Plans that an arm offers for a job."""
-
-
-def offered_plans(variants: Sequence[Plan], repetitions: int) -> list[Plan]:
-    """The plans of a work that an arm offers for so many repetitions: the fastest; none without a variant."""
-    return sorted(variants, key=lambda plan: plan.duration_s(repetitions))[:PLANS]
-
-
 @dataclass(frozen=True, eq=False)
 class Drive:
     """Causes of motor heat during a motion, averaged over its time."""

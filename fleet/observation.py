@@ -45,8 +45,9 @@ _PEER_SLOT: tuple[Axis, ...] = ("peer", "slot")
 class Observation:
     """What arms know, by name; leading axes [...] are free. Each `Field` gives axes, unit, lowest and highest value.
 
-    An option is one plan for the job of one slot: option = slot · plans + plan, and action = option + 1 claims it. The
-    first plan of a job is the fastest.
+    An option is one plan for the job of one slot: option = slot · plans + plan. Action 0 waits or goes on, action
+    option + 1 claims the option, and the last action gives the current job back after the present cycle. The first plan
+    of a job is the fastest.
     """
 
     clock: Annotated[Array, Field((), "1", 0, 1, "share of the shift that has passed")]
@@ -56,13 +57,21 @@ class Observation:
     busy_s: Annotated[Array, Field((), "s", 0, LONG_S, "time until it is home, with the current job done")]
     last_award: Annotated[Array, Field((), "1", -1, 1, "1 last claim won, -1 lost, 0 none made")]
     temp_c: Annotated[Array, Field(_JOINT, "°C", -60, 200, "own motor temperatures as measured")]
+    housing_c: Annotated[Array, Field(_JOINT, "°C", -60, 200, "own estimate of the housing temperatures")]
+    ambient_c: Annotated[Array, Field((), "°C", -60, 200, "ambient temperature at this arm")]
     headroom_k: Annotated[Array, Field((), "K", -150, 150, "warning limit minus hottest motor")]
+    job_value: Annotated[Array, Field((), "1", 0, 1e6, "value of the current job, 0 without one")]
+    job_cycles: Annotated[Array, Field((), "1", 0, 1e5, "cycles of it that are not finished")]
+    job_peak_c: Annotated[Array, Field((), "°C", -60, 300, "predicted hottest motor in the rest of it, 0 if unknown")]
+    job_p: Annotated[Array, Field((), "1", 0, 1, "probability to pass the warning limit in it, 0 without one")]
     offered: Annotated[Array, Field(_SLOT, "1", 0, 1, "1 when the slot holds a job")]
     station_free: Annotated[Array, Field(_SLOT, "1", 0, 1, "1 when no arm occupies its stations")]
+    too_heavy: Annotated[Array, Field(_SLOT, "1", 0, 1, "1 when the load exceeds this arm's rating")]
     feasible: Annotated[Array, Field(_OPTION, "1", 0, 1, "1 when this arm has such a plan")]
     space_free: Annotated[Array, Field(_OPTION, "1", 0, 1, "1 when no other arm takes space that excludes the plan")]
     known: Annotated[Array, Field(_OPTION, "1", 0, 1, "1 when this arm has a difficulty for the plan")]
     difficulty: Annotated[Array, Field(_OPTION, "1", 0, JOINTS, "own thermal difficulty d of the plan, 0 if unknown")]
+    peak_c: Annotated[Array, Field(_OPTION, "°C", -60, 300, "predicted hottest motor during the plan, 0 if unknown")]
     p_saturation: Annotated[Array, Field(_OPTION, "1", 0, 1, "probability to pass the warning limit, 0.5 if unknown")]
     duration_s: Annotated[Array, Field(_OPTION, "s", 0, LONG_S, "time this arm needs for the rest of the job")]
     slack_s: Annotated[Array, Field(_OPTION, "s", -LONG_S, LONG_S, "due date minus now minus duration")]
@@ -70,17 +79,22 @@ class Observation:
     payload_kg: Annotated[Array, Field(_SLOT, "kg", 0, 100, "carried mass")]
     value: Annotated[Array, Field(_SLOT, "1", 0, 1e6, "value of finishing it")]
     returns: Annotated[Array, Field(_SLOT, "1", 0, 1e3, "number of faults that returned it")]
+    expires: Annotated[Array, Field(_SLOT, "1", 0, 1, "1 when it expires at its due date if nobody has begun it")]
     peer_heard: Annotated[Array, Field(_PEER, "1", 0, 1, "1 when a message of the peer has arrived")]
     peer_age_s: Annotated[Array, Field(_PEER, "s", 0, LONG_S, "age of the peer's last message")]
     peer_working: Annotated[Array, Field(_PEER, "1", 0, 1, "1 when the peer was working then")]
     peer_faulted: Annotated[Array, Field(_PEER, "1", 0, 1, "1 when the peer was faulted then")]
     peer_headroom_k: Annotated[Array, Field(_PEER, "K", -150, 150, "headroom the peer shared, 0 if none")]
+    peer_busy_s: Annotated[Array, Field(_PEER, "s", 0, LONG_S, "time until the peer is home as it shared, 0 if free")]
     peer_known: Annotated[Array, Field(_PEER_SLOT, "1", 0, 1, "1 when the peer shared a difficulty for the slot's job")]
     peer_difficulty: Annotated[
         Array, Field(_PEER_SLOT, "1", 0, JOINTS, "least d of its plans the peer shared, 0 if none")
     ]
+    peer_blocks: Annotated[
+        Array, Field(_PEER_SLOT, "1", 0, 1, "1 when space that the peer takes excludes this arm's fastest plan")
+    ]
     action_mask: Array
-    """Legal actions, int8 [..., option + 1]."""
+    """Legal actions, int8 [..., option + 2]."""
 
 
 def _fields() -> Iterator[Field]:
@@ -120,8 +134,8 @@ class Layout:
 
     @property
     def actions(self) -> int:
-        """Number of actions: wait, and one for each option."""
-        return 1 + self.slots * self.plans
+        """Number of actions: wait, one for each option, and give back."""
+        return 2 + self.slots * self.plans
 
     def shape(self, field: Field) -> tuple[int, ...]:
         """Axes of a field as numbers."""

@@ -162,6 +162,7 @@ class JobSampler:
                 due_s=release_s[j] + streams[i].due_s,
                 value=streams[i].value,
                 after=tuple(names[k] for k in after if k >= 0),
+                expires=streams[i].due == "hard",
             )
             for j, (i, after) in enumerate(zip(stream, sampled.after.tolist(), strict=True))
         )

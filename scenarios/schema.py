@@ -105,6 +105,8 @@ class JobStream:
     value: float = 1.0
     due_s: float = 1800.0
     """Time from release to due date."""
+    due: Literal["soft", "hard"] = "soft"
+    """soft: a later finish is tardy. hard: a job that no arm has begun by then expires."""
     after: tuple[str, ...] = ()
     """Streams whose job of the same number must finish first."""
 
@@ -212,10 +214,10 @@ class Scenario:
     fixtures: tuple[Fixture, ...] = ()
     decision_interval_s: float = 10.0
     decisions: Decisions = "interval"
-    """Length of a step of the environment: one decision interval, or until an arm may claim a job."""
+    """Length of a step of the environment: one decision interval, or until an arm has a choice."""
     clearance_m: float = 0.02
     """Smallest distance that two arms keep from each other."""
-    slots: int = 8
+    slots: int = 16
     start: Literal["idle_warm", "cold"] = "idle_warm"
     telemetry_interval_s: float = 1.0
     ambient: Ambient = field(default_factory=Ambient)

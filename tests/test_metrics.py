@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.metrics import gini
+from scenarios.run.metrics import gini
 
 shares = st.lists(st.floats(0.0, 1e6), min_size=1, max_size=12)
 

@@ -10,8 +10,8 @@ import numpy as np
 from fleet.engine.event_log import PER_ARM, event_buffer
 from fleet.engine.reset import reset_rows
 from fleet.engine.reward import TERMS, RewardWeights, weights_per_unit
-from fleet.engine.state import DONE, GIVEN_UP, WAITING, State
-from fleet.engine.step import BLOCK, CLAIM, MOVE, OBSERVE, step_rows
+from fleet.engine.state import DONE, RUNNING, WAITING, State
+from fleet.engine.step import BLOCK, CLAIM, MOVE, OBSERVE, ROUNDING_S, step_rows
 from fleet.engine.tables import LANES, Jobs, MeasuredDrive, OpenJobs, Simulation, Tables, Trace, form_of
 from fleet.job import MOST_FAULTS
 from fleet.motion import Drive
@@ -38,6 +38,8 @@ class Shift:
     release_s: Array
     due_s: Array
     repetitions: Array
+    expires: Array
+    """bool [job]."""
     after: Array
     """int [job, n], −1 for none."""
     noise_key: int
@@ -80,13 +82,14 @@ class Engine:
         offers = OpenJobs(
             slot_job=np.full((envs, slots), -1),
             mask=np.zeros((envs, arms, layout.actions), np.int8),
+            alarm=np.zeros(envs, bool),
             station_free=np.zeros((envs, slots), bool),
             unfinished=np.zeros(envs, int),
             given_up=np.zeros(envs, int),
             queue=np.zeros((envs, jobs), np.int32),
             head=np.zeros(envs, int),
             current_kind=np.full((envs, arms), tables.feasible.shape[1]),
-            taken=np.zeros((envs, tables.own_space.shape[1]), np.uint64),
+            closed=np.zeros((envs, tables.excluded.shape[1]), np.uint64),
             pending=np.zeros((envs, arms), bool),
         )
         offers.mask[:, :, 0] = 1
@@ -97,7 +100,7 @@ class Engine:
             drawn,
             state,
             offers,
-            event_buffer(envs * arms * PER_ARM if events else 0),
+            event_buffer(envs * (arms * PER_ARM + jobs) if events else 0),
             _trace(traced, arms),
             MeasuredDrive(*(np.zeros((0, arms, LANES)) for _ in range(2))),
             form_of(layout),
@@ -128,8 +131,14 @@ class Engine:
 
     @property
     def mask(self) -> Array:
-        """Legal actions now, int8 [env, arm, option + 1]; a view that the next step overwrites."""
+        """Legal actions now, int8 [env, arm, option + 2]; a view that the next step overwrites."""
         return self._simulation.offers.mask
+
+    @property
+    def choice(self) -> Array:
+        """Whether an arm may claim a job, or one at work has just passed the warning limit, bool [env]."""
+        offers = self._simulation.offers
+        return offers.mask[:, :, 1:-1].any(axis=(1, 2)) | offers.alarm
 
     @property
     def state(self) -> State:
@@ -179,7 +188,7 @@ class Engine:
             self._bundle, envs,
             np.array([shift.fleet for shift in shifts]), np.array([shift.ambient_offset_k for shift in shifts]),
             np.array([shift.noise_key for shift in shifts], np.uint64), first,
-            of_all("kind"), of_all("release_s"), of_all("due_s"), of_all("repetitions"), after,
+            of_all("kind"), of_all("release_s"), of_all("due_s"), of_all("repetitions"), of_all("expires"), after,
         )  # fmt: skip
 
     def observe(self, envs: Array, out: Array) -> None:
@@ -192,7 +201,7 @@ class Engine:
         Args:
             actions: int64 [env, arm]; anything outside the mask is a wait, and counted.
             out: Receives what the arms know afterwards, float32 [env, arm, size].
-            until: Go on while no arm may claim a job, to this tick at most, int64 [env]. The events and the trace are
+            until: Go on while no arm has a `choice`, to this tick at most, int64 [env]. The events and the trace are
                 then those of the last interval alone.
 
         Returns:
@@ -264,11 +273,16 @@ class Engine:
             offers.queue[e, count - n : count] = order[e, room - n :]
             offers.head[e] = count - n
         offers.unfinished[:] = (exists & (state.status < DONE)).sum(axis=1)
-        offers.given_up[:] = (exists & (state.status == GIVEN_UP)).sum(axis=1)
+        offers.given_up[:] = (exists & (state.status > DONE)).sum(axis=1)
         env = np.arange(self.envs)[:, None]
         working = (state.mode == WORKING) & (state.job >= 0)
         offers.current_kind[:] = np.where(working, jobs.kind[env, state.job], self.tables.feasible.shape[1])
-        offers.pending[:] = working & (state.status[env, state.job] != DONE)
+        times_s = self.tables.times_s[state.plan]
+        ends_s = times_s[..., 0] + state.todo * times_s[..., 1]
+        # An arm on its way home may still have the number of a job that it finished or gave back.
+        offers.pending[:] = (
+            working & (state.status[env, state.job] == RUNNING) & (state.progress_s < ends_s - ROUNDING_S)
+        )
 
     def _make_room(self, jobs: int, waits: int) -> None:
         """For more jobs a shift, a tenth more than asked for, keeping what is there."""
@@ -281,7 +295,11 @@ class Engine:
         before = self._simulation
         for new, old in zip((*drawn, *state, queue), (*before.jobs, *before.state, before.offers.queue), strict=True):
             new[tuple(slice(0, n) for n in old.shape)] = old
-        self._simulation = before._replace(jobs=drawn, state=state, offers=before.offers._replace(queue=queue))
+        events = event_buffer(envs * (arms * PER_ARM + jobs) if len(before.events.what) else 0)
+        for new, old in zip(events, before.events, strict=True):
+            new[: len(old)] = old
+        offers = before.offers._replace(queue=queue)
+        self._simulation = before._replace(jobs=drawn, state=state, offers=offers, events=events)
         self._prepare()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -327,6 +345,7 @@ def _arrays(envs: int, arms: int, jobs: int, waits: int) -> tuple[Jobs, State]:
         ambient_offset_k=np.zeros(envs),
         noise_key=np.zeros(envs, np.uint64),
         number=np.zeros(envs, int),
+        expires=np.zeros((envs, jobs), bool),
         after=np.full((envs, jobs, waits), -1),
         **{name: job[name] for name in ("kind", "release_s", "due_s", "repetitions")},
     )
@@ -337,6 +356,7 @@ def _arrays(envs: int, arms: int, jobs: int, waits: int) -> tuple[Jobs, State]:
     state = State(
         tick=np.zeros(envs, int),
         temp_c=np.zeros((envs, arms, NODES)),
+        housing_c=np.zeros((envs, arms, JOINTS)),
         **per_arm,
         **counts,
         finished_s=np.zeros((envs, jobs)),
@@ -356,6 +376,7 @@ def shifts_of(drawn: Jobs, noise_keys: Sequence[int]) -> list[Shift]:
             release_s=drawn.release_s[e, :count],
             due_s=drawn.due_s[e, :count],
             repetitions=drawn.repetitions[e, :count],
+            expires=drawn.expires[e, :count],
             after=drawn.after[e, :count],
             noise_key=key,
         )

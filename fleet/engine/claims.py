@@ -9,41 +9,61 @@ An arm takes the space of its whole plan from the award until it is home again, 
 
 import numpy as np
 
-from fleet.engine.event_log import AWARD, ILLEGAL, LOST, record_event
-from fleet.engine.state import DONE, GIVEN_UP, RUNNING, WAITING, State
+from fleet.engine.event_log import AWARD, EXPIRE, ILLEGAL, LOST, EventBuffer, record_event
+from fleet.engine.state import DONE, EXPIRED, GIVEN_UP, RUNNING, WAITING, State
 from fleet.engine.tables import Jobs, OpenJobs, Simulation, Tables
 from fleet.jit import jit, jit_inline, nonnegative
 from fleet.telemetry import IDLE, WORKING
 
 Array = np.ndarray
 
+ROUNDING = 1e-9
+"""A cycle counts as begun when more than this share of it is over."""
 LARGEST = float(np.finfo(float).max)
 """Claims without a difficulty are ordered behind all others."""
 
 
 @jit_inline
-def update_offers(t: Tables, d: Jobs, s: State, o: OpenJobs, rows: Array) -> None:
-    """Fill the slots of some envs, oldest job in the queue first, and their action masks.
+def update_offers(t: Tables, d: Jobs, s: State, o: OpenJobs, events: EventBuffer, rows: Array) -> None:
+    """Fill the slots of some envs, oldest job in the queue first, and their action masks; late jobs expire.
 
     Args:
         rows: Envs, int [row].
     """
     fleets, kinds, count, release_s, after = d.fleet, d.kind, d.number, d.release_s, d.after
+    due_s, expires = d.due_s, d.expires
+    pending, times_s, away, progress_s, todo = o.pending, t.times_s, s.plan, s.progress_s, s.todo
     tick, modes, status = s.tick, s.mode, s.status
     slot_job, mask, queue, head, current = o.slot_job, o.mask, o.queue, o.head, o.current_kind
-    stations, plans, excluded, taken, options = t.stations, t.plan, t.excluded, o.taken, nonnegative(t.plan.shape[3])
+    stations, plans, volume, closed, options = t.stations, t.plan, t.volume, o.closed, nonnegative(t.plan.shape[3])
+    excluded = t.excluded
     arms, slots = nonnegative(modes.shape[1]), nonnegative(slot_job.shape[1])
-    waits, words = nonnegative(after.shape[2]), nonnegative(stations.shape[2])
+    waits, words, last = nonnegative(after.shape[2]), nonnegative(stations.shape[2]), nonnegative(mask.shape[2] - 1)
     busy = np.empty(words, np.uint64)
     for row in rows:
         e = nonnegative(row)
         fleet, now_s, filled = nonnegative(fleets[e]), tick[e] * t.dt_s, 0
         mark_busy_stations(fleet, e, current, stations, busy)
-        mark_taken_space(t, s, o, e)
-        for place in range(nonnegative(head[e]), count[e]):
+        mark_closed_space(away, excluded, closed, e)
+        for a in range(arms):
+            mask[e, a, last] = (
+                modes[e, a] == WORKING
+                and pending[e, a]
+                and cycles_begun(times_s, away, progress_s, todo, e, a) < todo[e, a]
+            )
+        place = nonnegative(head[e])
+        while place < count[e]:
             j = nonnegative(queue[e, place])
+            place += 1
             if filled == slots or release_s[e, j] > now_s:
                 break
+            if expires[e, j] and due_s[e, j] < now_s:
+                remove_from_queue(queue, head, e, j)
+                give_up(d, s, o, e, j, EXPIRED)
+                if len(events.what) > 0:
+                    record_event(events, EXPIRE, e, -1, j, -1, 0.0, 0.0)
+                place, filled = nonnegative(head[e]), 0  # jobs in the queue have moved
+                continue
             ready = True
             for n in range(waits):
                 before = after[e, j, n]
@@ -60,7 +80,7 @@ def update_offers(t: Tables, d: Jobs, s: State, o: OpenJobs, rows: Array) -> Non
                 for n in range(options):
                     plan = plans[fleet, a, kind, n]
                     mask[e, a, 1 + filled * options + n] = (
-                        open_here and plan >= 0 and is_free(excluded, nonnegative(plan), taken[e])
+                        open_here and plan >= 0 and not is_closed(closed, e, volume[nonnegative(plan)])
                     )
             filled += 1
         while filled < slots and slot_job[e, filled] >= 0:  # slots of the step before
@@ -81,30 +101,34 @@ def mark_busy_stations(fleet: int, e: int, current: Array, stations: Array, busy
 
 
 @jit_inline
-def mark_taken_space(t: Tables, s: State, o: OpenJobs, e: int) -> None:
-    """Put the volumes that the arms of an env take into `taken`."""
-    plans, own, taken = s.plan, t.own_space, o.taken
-    for w in range(taken.shape[1]):
-        taken[e, w] = 0
+def mark_closed_space(plans: Array, excluded: Array, closed: Array, e: int) -> None:
+    """Put the volumes that the arms of an env exclude into `closed`; none excludes a volume of the same arm."""
+    for w in range(closed.shape[1]):
+        closed[e, w] = 0
     for a in range(plans.shape[1]):
         plan = plans[e, a]
         if plan >= 0:
-            for w in range(taken.shape[1]):
-                taken[e, w] |= own[plan, w]
+            for w in range(closed.shape[1]):
+                closed[e, w] |= excluded[plan, w]
 
 
 @jit_inline
-def is_free(excluded: Array, plan: int, taken: Array) -> bool:
-    """Whether a plan needs none of the space that is taken, uint64 [word]."""
-    touched = np.uint64(0)
-    for w in range(len(taken)):
-        touched |= excluded[plan, w] & taken[w]
-    return touched == 0
+def cycles_begun(times_s: Array, plans: Array, progress_s: Array, todo: Array, e: int, a: int) -> int:
+    """Cycles of its plan that an arm at work has begun."""
+    plan = nonnegative(plans[e, a])
+    into_s = progress_s[e, a] - times_s[plan, 0]
+    return 0 if into_s <= 0.0 else min(int(np.ceil(into_s / times_s[plan, 1] - ROUNDING)), todo[e, a])
+
+
+@jit_inline
+def is_closed(bits: Array, row: int, volume: int) -> bool:
+    """Whether a volume is among the bits, uint64 [row, word]."""
+    return (bits[row, volume >> 6] >> np.uint64(volume & 63)) & np.uint64(1) != 0
 
 
 @jit_inline
 def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
-    """Award every claimed job to one arm; an action outside the mask is counted and waits.
+    """Award every claimed job to one arm, and note who gives a job back; an illegal action is counted and waits.
 
     Args:
         actions: int [env, arm].
@@ -116,12 +140,13 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
     progress_s, todo, cycles = s.progress_s, s.todo, s.cycles
     slot_job, mask, queue, head, current, pending = o.slot_job, o.mask, o.queue, o.head, o.current_kind, o.pending
     stations, work, recording = t.stations, t.work, len(events.what) > 0
-    plans, plan_of, own, excluded, taken = s.plan, t.plan, t.own_space, t.excluded, o.taken
+    plans, plan_of, volume, excluded, closed = s.plan, t.plan, t.volume, t.excluded, o.closed
     arms, options, words = (
         nonnegative(modes.shape[1]),
         nonnegative(plan_of.shape[3]),
         nonnegative(stations.shape[2]),
     )
+    give_back = mask.shape[2] - 1
     busy, key, order = np.empty(words, np.uint64), np.empty(arms), np.empty(arms, np.int64)
     for row in rows:
         e = nonnegative(row)
@@ -131,10 +156,13 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
             last[e, a] = 0
             if action == 0:
                 continue
-            if action < 0 or action >= mask.shape[2] or mask[e, a, action] == 0:
+            if action < 0 or action > give_back or mask[e, a, action] == 0:
                 illegal[e, a] += 1
                 if recording:
                     record_event(events, ILLEGAL, e, a, -1, -1, 0.0, 0.0)
+                continue
+            if action == give_back:
+                todo[e, a] = cycles_begun(t.times_s, plans, progress_s, todo, e, a)
                 continue
             slot, option = divmod(action - 1, options)
             score = work[fleet, a, kinds[e, slot_job[e, slot]], option]["difficulty"]
@@ -155,7 +183,7 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
             j, option = nonnegative(slot_job[e, slot]), nonnegative(option)
             kind, free = nonnegative(kinds[e, j]), status[e, j] == WAITING
             plan = nonnegative(plan_of[fleet, a, kind, option])
-            free = free and is_free(excluded, plan, taken[e])
+            free = free and not is_closed(closed, e, volume[plan])
             for w in range(words):
                 free = free and (stations[fleet, kind, w] & busy[w]) == 0
             if not free:
@@ -168,8 +196,8 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
             remove_from_queue(queue, head, e, j)
             last[e, a], status[e, j] = 1, RUNNING
             modes[e, a], jobs[e, a], plans[e, a], progress_s[e, a] = WORKING, j, plan, 0.0
-            for w in range(taken.shape[1]):
-                taken[e, w] |= own[plan, w]
+            for w in range(closed.shape[1]):
+                closed[e, w] |= excluded[plan, w]
             current[e, a], pending[e, a] = kind, True
             todo[e, a] = repetitions[e, j] - cycles[e, j]
             if recording:
@@ -208,10 +236,14 @@ def return_to_queue(d: Jobs, s: State, o: OpenJobs, e: int, j: int, until_s: flo
 
 
 @jit
-def give_up(d: Jobs, s: State, o: OpenJobs, e: int, j: int) -> None:
-    """Give a running job up, and with it all that wait for it."""
+def give_up(d: Jobs, s: State, o: OpenJobs, e: int, j: int, why: int) -> None:
+    """Give a job up that is not in the queue, and with it all that wait for it.
+
+    Args:
+        why: Its status from now on, GIVEN_UP or EXPIRED.
+    """
     status, after = s.status, d.after
-    status[e, j] = GIVEN_UP
+    status[e, j] = why
     o.unfinished[e] -= 1
     o.given_up[e] += 1
     found = after.shape[2] > 0
@@ -220,7 +252,7 @@ def give_up(d: Jobs, s: State, o: OpenJobs, e: int, j: int) -> None:
         for i in range(d.number[e]):
             for n in range(after.shape[2]):
                 before = after[e, i, n]
-                if status[e, i] == WAITING and before >= 0 and status[e, before] == GIVEN_UP:
+                if status[e, i] == WAITING and before >= 0 and status[e, before] > DONE:
                     status[e, i], found = GIVEN_UP, True
                     remove_from_queue(o.queue, o.head, e, i)
                     o.unfinished[e] -= 1

@@ -12,10 +12,10 @@ from fleet.jit import jit
 
 Array = np.ndarray
 
-AWARD, LOST, ILLEGAL, WARNING, FINISH, HOME, FAULT, RETURN, GIVE_UP, RECOVER, MOVED = range(11)
+AWARD, LOST, ILLEGAL, WARNING, FINISH, HOME, FAULT, RETURN, GIVE_UP, RECOVER, MOVED, GIVE_BACK, EXPIRE = range(13)
 """Kinds of recorded events, in the order in which those of one step are reported."""
 PER_ARM = 10
-"""Most events of one arm in one step."""
+"""Most events of one arm in one step; besides, every job may expire."""
 
 
 class EventBuffer(NamedTuple):
@@ -62,7 +62,7 @@ def events_of(world: World, state: State, buffer: EventBuffer) -> Iterator[Event
         offset_s, value = numbers[row].tolist()
         plan, joint = (joint, -1) if kind == AWARD else (-1, joint)
         name, measured, reason = _described(world, state, kind, e, j, joint, value)
-        common = {"time_s": float(began_s[e] + offset_s), "env": e, "arm": world.arms[a]}
+        common = {"time_s": float(began_s[e] + offset_s), "env": e, "arm": world.arms[a] if a >= 0 else ""}
         common["job"] = world.jobs.names[e][j] if j >= 0 else ""
         yield Event(kind=name, joint=joint + 1, value=measured, reason=reason, **common)
         if kind == AWARD:
@@ -102,6 +102,10 @@ def _described(
             return "give_up", value, f"{state.returns[e, j]} faults; {state.cycles[e, j]} cycles done"
         case 10:
             return "moved", math.nan, "moved home by a person"
+        case 11:
+            return "give_back", value, f"{state.cycles[e, j]} of {world.jobs.repetitions[e, j]} cycles kept"
+        case 12:
+            return "expire", math.nan, "its due date passed before an arm began it"
         case _:
             return "recover", math.nan, f"every motor below {limits.restart_c:g} °C and the fault cleared"
 

@@ -32,11 +32,12 @@ def broadcast(engine: Engine, vectors: Array, names: Sequence[str], twins: tuple
     tables, fleet = engine.tables, engine.jobs.fleet[env]
     kinds = np.where(slots >= 0, engine.jobs.kind[env, slots], 0)
     work, filled = tables.work[fleet][:, kinds], slots[:, None] >= 0  # [arm, slot, plan]
-    unknown = (work["risk"] < 0) & np.isnan(work["p_saturation"])
+    unknown = (work["risk"] < 0) & (work["peak"] < 0) & np.isnan(work["p_saturation"])
     p_saturation = known.p_saturation.reshape(unknown.shape)
     return Broadcast(
         time_s=float(engine.state.tick[env] * tables.dt_s),
         mode=engine.state.mode[env].copy(),
+        busy_s=known.busy_s.astype(float),
         temp_c=known.temp_c.astype(float),
         headroom_k=known.headroom_k.astype(float),
         jobs=tuple(names[j] if j >= 0 else "" for j in map(int, slots)),
@@ -54,13 +55,14 @@ def write_peers(layout: Layout, view: PeerView, vectors: Array) -> None:
         return values[rows, layout.who]  # [arm, peer, ...]
 
     age_s, mode = received(view.age_s), received(view.mode)
-    headroom_k, difficulty = received(view.headroom_k), received(view.difficulty)
+    headroom_k, busy_s, difficulty = received(view.headroom_k), received(view.busy_s), received(view.difficulty)
     never, known = np.isinf(age_s), ~np.isnan(difficulty)
     fields = {
         "peer_heard": ~never,
         "peer_age_s": np.where(never, LONG_S, age_s),
         "peer_working": ~never & (mode == WORKING),
         "peer_faulted": ~never & (mode == FAULTED),
+        "peer_busy_s": np.where(np.isnan(busy_s), 0.0, busy_s),
         "peer_headroom_k": np.where(np.isnan(headroom_k), 0.0, headroom_k),
         "peer_known": known,
         "peer_difficulty": np.where(known, difficulty, 0.0),

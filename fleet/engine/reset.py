@@ -7,6 +7,7 @@ from fleet.engine.state import WAITING
 from fleet.engine.tables import Simulation
 from fleet.jit import kernel, nonnegative
 from fleet.job import MOST_FAULTS
+from fleet.robot import JOINTS
 from fleet.telemetry import IDLE
 from fleet.thermal import NODES
 
@@ -25,6 +26,7 @@ def reset_rows(
     release_s: Array,
     due_s: Array,
     repetitions: Array,
+    expires: Array,
     after: Array,
 ) -> None:
     """Put new shifts into some envs.
@@ -39,6 +41,7 @@ def reset_rows(
         release_s: [job].
         due_s: [job].
         repetitions: int [job].
+        expires: bool [job].
         after: int [job, n], −1 for none.
     """
     t, d, s, o = sim.tables, sim.jobs, sim.state, sim.offers
@@ -52,10 +55,11 @@ def reset_rows(
             noise_key[n],
             count,
         )
+        o.alarm[e] = False
         s.tick[e], o.unfinished[e], o.given_up[e], o.head[e] = 0, count, 0, 0
         for j in range(count):
             i = at + j
-            d.kind[e, j], d.repetitions[e, j] = kind[i], repetitions[i]
+            d.kind[e, j], d.repetitions[e, j], d.expires[e, j] = kind[i], repetitions[i], expires[i]
             d.release_s[e, j], d.due_s[e, j], s.queued_s[e, j] = release_s[i], due_s[i], release_s[i]
             place = j
             while place > 0 and release_s[at + o.queue[e, place - 1]] > release_s[i]:
@@ -63,7 +67,7 @@ def reset_rows(
                 place -= 1
             o.queue[e, place] = j
         for j in range(count, room):
-            d.kind[e, j], d.repetitions[e, j] = 0, 1
+            d.kind[e, j], d.repetitions[e, j], d.expires[e, j] = 0, 1, False
             d.release_s[e, j] = d.due_s[e, j] = s.queued_s[e, j] = np.inf
         for j in range(room):
             s.status[e, j], s.cycles[e, j], s.returns[e, j], s.finished_s[e, j] = WAITING, 0, 0, np.nan
@@ -79,4 +83,6 @@ def reset_rows(
             s.progress_s[e, a] = s.above_warning_s[e, a] = s.busy_s[e, a] = s.lost_s[e, a] = s.energy_j[e, a] = 0.0
             for node in range(NODES):
                 s.temp_c[e, a, node] = t.start_c[fleet[n], a, node] + ambient_offset_k[n]
+            for k in range(JOINTS):
+                s.housing_c[e, a, k] = t.start_housing_c[fleet[n], a, k] + ambient_offset_k[n]
             s.peak_c[e, a] = hottest(s.temp_c[e, a])

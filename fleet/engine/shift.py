@@ -159,8 +159,13 @@ class ShiftRunner:
 
     @property
     def mask(self) -> Array:
-        """Legal actions, int8 [arm, option + 1]; the next step overwrites it."""
+        """Legal actions, int8 [arm, option + 2]; the next step overwrites it."""
         return self._engine.mask[0]
+
+    @property
+    def choice(self) -> bool:
+        """Whether an arm may claim a job, or one at work has just passed the warning limit."""
+        return bool(self._engine.choice[0])
 
     @property
     def slot_job(self) -> Array:
@@ -259,7 +264,7 @@ def step(
     """One decision interval from a given state, which is left untouched.
 
     Args:
-        actions: 0 waits or goes on, k claims option k - 1, int [env, arm].
+        actions: 0 waits or goes on, k claims option k - 1, the last action gives the job back, int [env, arm].
         log: Receives the events, if given.
         compiled: As in `Engine`; a single arm in real time runs uncompiled.
     """
@@ -275,7 +280,7 @@ def step(
 
 
 def open_jobs(world: World, state: State, *, compiled: bool | None = None) -> tuple[Array, Array]:
-    """Jobs in the slots, int [env, slot], and legal actions, int8 [env, arm, option + 1], in a state."""
+    """Jobs in the slots, int [env, slot], and legal actions, int8 [env, arm, option + 2], in a state."""
     engine, out = _engine_of(world, compiled)
     engine.load(state)
     engine.observe(np.arange(world.envs), out)

@@ -8,17 +8,18 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from fleet.difficulty import Risk
+from fleet.difficulty import Forecast
+from fleet.housing_observer import HousingObserver
 from fleet.job import MOST_FAULTS
 from fleet.motion import Drive
 from fleet.motor import Motors
-from fleet.robot import ThermalLimits
+from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import IDLE
 from fleet.thermal import NODES, ThermalModel
 
 Array = np.ndarray
 
-WAITING, RUNNING, DONE, GIVEN_UP = range(4)
+WAITING, RUNNING, DONE, GIVEN_UP, EXPIRED = range(5)
 """Status of a job."""
 
 
@@ -38,6 +39,8 @@ class JobTable:
     """int [env, job]."""
     after: Array
     """Indices of the jobs that must be done first, int [env, job, n], −1 for none."""
+    expires: Array
+    """Whether the job expires at its due date if no arm has begun it, bool [env, job]."""
     stations: Array
     """Indices of the stations it occupies, int [env, job, n], −1 for none."""
 
@@ -69,9 +72,13 @@ class Offers:
     p_saturation: Array
     """Probability from models that ignore the start temperature, [env, arm, job, plan]; NaN where unknown."""
     risk: Array
-    """Row of `risks` for the whole job, int [env, arm, job, plan]; −1 where the model has none."""
-    risks: Risk | None
-    """[risk, ...]; None where no model of the fleet has any."""
+    """Row of `forecasts` for P, int [env, arm, job, plan]; −1 where the model has none."""
+    peak: Array
+    """Row of `forecasts` for the peak temperature, int [env, arm, job, plan]; −1 where the model has none."""
+    forecasts: Forecast | None
+    """[forecast, ...]; None where no model of the fleet has any."""
+    too_heavy: Array
+    """Whether the load exceeds the arm's rating, bool [env, arm, job]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +109,12 @@ class World:
     offers: Offers
     conflicts: Array
     """Whether two arms cannot take two volumes at a time, bool [volume, volume]."""
+    observer: HousingObserver
+    """How each arm estimates its housing temperatures, [arm, ...]."""
     start_c: Array
     """Temperatures at the start of the shift, [arm, node]."""
+    start_housing_c: Array
+    """Estimates of the housing temperatures at the start, [arm, joint]."""
     phi: Array
     gamma: Array
     """Step matrices for `dt_s`, [arm, node, node]."""
@@ -131,6 +142,8 @@ class State(NamedTuple):
     """int [env]."""
     temp_c: Array
     """[env, arm, node]."""
+    housing_c: Array
+    """What each arm estimates its housing temperatures to be, [env, arm, joint]."""
     mode: Array
     """IDLE, WORKING or FAULTED, int [env, arm]."""
     job: Array
@@ -162,7 +175,7 @@ class State(NamedTuple):
     energy_j: Array
     """Electrical energy turned to heat, [env, arm]. Over closed cycles mechanical work sums to zero."""
     status: Array
-    """WAITING, RUNNING, DONE or GIVEN_UP, int [env, job]."""
+    """WAITING, RUNNING, DONE, GIVEN_UP or EXPIRED, int [env, job]."""
     queued_s: Array
     """When the job was released or last returned, [env, job]."""
     cycles: Array
@@ -191,6 +204,7 @@ def initial(world: World) -> State:
     return State(
         tick=np.zeros(envs, dtype=int),
         temp_c=temp,
+        housing_c=np.broadcast_to(world.start_housing_c, (envs, arms, JOINTS)).copy(),
         mode=per_arm(IDLE, int),
         job=per_arm(-1, int),
         plan=per_arm(-1, int),

@@ -9,9 +9,20 @@ import numpy as np
 
 from fleet.engine.claims import give_up, resolve_claims, return_to_queue, update_offers
 from fleet.engine.crossings import hottest, step_with_crossing
-from fleet.engine.event_log import FAULT, FINISH, GIVE_UP, HOME, MOVED, RECOVER, RETURN, WARNING, record_event
+from fleet.engine.event_log import (
+    FAULT,
+    FINISH,
+    GIVE_BACK,
+    GIVE_UP,
+    HOME,
+    MOVED,
+    RECOVER,
+    RETURN,
+    WARNING,
+    record_event,
+)
 from fleet.engine.observe import observe
-from fleet.engine.state import DONE, WAITING
+from fleet.engine.state import DONE, GIVEN_UP, WAITING
 from fleet.engine.tables import LANES, WIDE, Simulation
 from fleet.jit import jit, jit_inline, kernel, nonnegative
 from fleet.job import MOST_FAULTS
@@ -42,6 +53,9 @@ def step_arms(sim: Simulation, weights: Array, terms: Array, rows: Array) -> Non
     clear_at_s, faults, peak_c, above_warning_s = s.clear_at_s, s.faults, s.peak_c, s.above_warning_s
     busy_s, lost_s, energy_j, status, queued_s = s.busy_s, s.lost_s, s.energy_j, s.status, s.queued_s
     cycles, returns, finished_s = s.cycles, s.returns, s.finished_s
+    housing_c, alarm = s.housing_c, o.alarm
+    keep, gain, from_winding = t.housing_keep, t.housing_gain, t.housing_winding
+    from_ambient, known_idle_w = t.housing_ambient, t.housing_idle_w
     unfinished, current, pending = o.unfinished, o.current_kind, o.pending
     ambient, thermal_step, to_ambient = t.ambient_c, t.thermal_step, t.to_ambient
     copper, idle_w, rest_sq, rest_w = t.copper_w_per_a2, t.idle_w, t.rest_current_sq, t.rest_friction_w
@@ -51,12 +65,14 @@ def step_arms(sim: Simulation, weights: Array, terms: Array, rows: Array) -> Non
     recording, tracing, driven = len(events.what) > 0, len(trace.plan) > 0, len(measured.current_sq) > 0
     copper_w, other_w, fold = np.empty(LANES), np.empty(LANES), np.empty(4)
     begin, end = np.zeros(2 * NODES + LANES), np.empty(WIDE)  # temperatures, loads, padding
+    friction_w, estimate_c = np.empty(LANES), np.empty(LANES)
     arms, no_kind = nonnegative(modes.shape[1]), nonnegative(t.feasible.shape[1])
     for row in rows:
         e = nonnegative(row)
         fleet, tick = nonnegative(fleets[e]), nonnegative(ticks[e])
         now_s, moment = tick * dt_s, min(tick, t.ticks - 1)
         value = late = above_s = count = energy = 0.0
+        alarm[e] = False
         for a in range(arms):
             mode = modes[e, a]
             plan, spent_s, done_s, home_s = 0, 0.0, np.inf, np.inf
@@ -85,12 +101,13 @@ def step_arms(sim: Simulation, weights: Array, terms: Array, rows: Array) -> Non
             for k in range(LANES):
                 amps_sq = share_0 * plan_sq[plan, 0, k] + share_1 * plan_sq[plan, 1, k]
                 copper_w[k] = amps_sq + (share_2 * plan_sq[plan, 2, k] + rest * rest_sq[fleet, a, k])
-                friction_w = share_0 * plan_w[plan, 0, k] + share_1 * plan_w[plan, 1, k]
-                other_w[k] = friction_w + (share_2 * plan_w[plan, 2, k] + rest * rest_w[fleet, a, k])
+                moving_w = share_0 * plan_w[plan, 0, k] + share_1 * plan_w[plan, 1, k]
+                other_w[k] = moving_w + (share_2 * plan_w[plan, 2, k] + rest * rest_w[fleet, a, k])
             if driven:
                 for k in range(LANES):
                     copper_w[k], other_w[k] = measured.current_sq[e, a, k], measured.friction_w[e, a, k]
             for k in range(LANES):
+                friction_w[k] = other_w[k]
                 factor = magnet_factor(begin[JOINTS + k], t)
                 copper_w[k] = winding_heat(copper[fleet, a, k], copper_w[k] / (factor * factor), begin[k], t)
                 other_w[k] += powered * idle_w[fleet, a, k]
@@ -136,16 +153,36 @@ def step_arms(sim: Simulation, weights: Array, terms: Array, rows: Array) -> Non
             energy += here_j
             for n in range(NODES):
                 temp_c[e, a, n] = end[n]
+            # The arm's own estimate of its housings, from its motor temperatures. Their noise is left out: over the
+            # time constants of housings it averages out to a tenth.
+            for m in range(LANES):
+                estimate_c[m] = 0.0
+            for k in range(JOINTS):
+                load_w = 0.5 * from_winding[fleet, a, k] * (begin[k] + end[k]) + from_ambient[fleet, a, k] * ambient_c
+                load_w += friction_w[k] + powered * known_idle_w[fleet, a, k]
+                before_c = housing_c[e, a, k]
+                for m in range(LANES):
+                    estimate_c[m] += keep[fleet, a, k, m] * before_c + gain[fleet, a, k, m] * load_w
+            for k in range(JOINTS):
+                housing_c[e, a, k] = estimate_c[k]
             if mode == WORKING:
+                alarm[e] = alarm[e] or (first_c < warning_c and last_c >= warning_c)
                 if done_s <= cut_s:
                     j, pending[e, a] = nonnegative(jobs[e, a]), False
-                    status[e, j], cycles[e, j], finished_s[e, j] = DONE, repetitions[e, j], now_s + done_s
-                    unfinished[e] -= 1
-                    gained = values[fleet, nonnegative(current[e, a])]
-                    value += gained
-                    late += gained * (max(finished_s[e, j] - due_s[e, j], 0.0) / 60.0)
-                    if recording:
-                        record_event(events, FINISH, e, a, j, -1, done_s, 0.0)
+                    if cycles[e, j] + todo[e, a] < repetitions[e, j]:
+                        cycles[e, j] += todo[e, a]
+                        status[e, j], queued_s[e, j] = WAITING, now_s + done_s
+                        return_to_queue(d, s, o, e, j, now_s + dt_s)
+                        if recording:
+                            record_event(events, GIVE_BACK, e, a, j, -1, done_s, todo[e, a])
+                    else:
+                        status[e, j], cycles[e, j], finished_s[e, j] = DONE, repetitions[e, j], now_s + done_s
+                        unfinished[e] -= 1
+                        gained = values[fleet, nonnegative(current[e, a])]
+                        value += gained
+                        late += gained * (max(finished_s[e, j] - due_s[e, j], 0.0) / 60.0)
+                        if recording:
+                            record_event(events, FINISH, e, a, j, -1, done_s, 0.0)
                 progress_s[e, a] += cut_s
                 if home_s <= cut_s:
                     if recording:
@@ -170,7 +207,7 @@ def step_arms(sim: Simulation, weights: Array, terms: Array, rows: Array) -> Non
                     returns[e, j] += 1
                     again = again or before + 1 == MOST_FAULTS
                     if again:
-                        give_up(d, s, o, e, j)
+                        give_up(d, s, o, e, j, GIVEN_UP)
                     else:
                         failed_arm[e, j, before] = a
                         status[e, j], queued_s[e, j] = WAITING, now_s + cut_s
@@ -223,7 +260,7 @@ def step_rows(
         actions: int64 [env, arm].
         weights: Reward per unit of each term, [term].
         terms: Receives the reward terms and their sum, [env, term + 1].
-        until: Tick until which each env goes on while no arm may claim a job, int [env]; not at all if empty.
+        until: Tick until which each env goes on while no arm has a choice, int [env]; not at all if empty.
         rows: int [row].
         out: Receives the observation vectors, float32 [env, arm, size].
     """
@@ -234,7 +271,7 @@ def step_rows(
         if parts & MOVE:
             step_arms(sim, weights, terms, some)
         if parts & OBSERVE:
-            update_offers(sim.tables, sim.jobs, sim.state, sim.offers, some)
+            update_offers(sim.tables, sim.jobs, sim.state, sim.offers, sim.events, some)
             if len(until) > 0:
                 go_on(sim, weights, terms, until, some)
             observe(sim, some, out)
@@ -242,7 +279,7 @@ def step_rows(
 
 @jit
 def go_on(sim: Simulation, weights: Array, terms: Array, until: Array, rows: Array) -> None:
-    """Step some envs until an arm may claim a job, all jobs are done, or their last tick; adds to the reward terms."""
+    """Step some envs until an arm has a choice, all jobs are done, or their last tick; adds to the reward terms."""
     one, earned = np.empty(1, np.int64), np.empty(terms.shape[1])
     for row in rows:
         e = nonnegative(row)
@@ -251,9 +288,10 @@ def go_on(sim: Simulation, weights: Array, terms: Array, until: Array, rows: Arr
         while (
             sim.state.tick[e] < until[e]
             and (sim.offers.unfinished[e] > 0 or sim.jobs.number[e] == 0)
-            and not sim.offers.mask[e, :, 1:].any()
+            and not sim.offers.alarm[e]
+            and not sim.offers.mask[e, :, 1:-1].any()
         ):
             step_arms(sim, weights, terms, one)
-            update_offers(sim.tables, sim.jobs, sim.state, sim.offers, one)
+            update_offers(sim.tables, sim.jobs, sim.state, sim.offers, sim.events, one)
             earned += terms[e]
         terms[e] = earned

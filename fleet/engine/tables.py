@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from fleet.difficulty import Risk
+from fleet.difficulty import KNOWN, Forecast
 from fleet.engine.event_log import EventBuffer
 from fleet.engine.state import State, World
 from fleet.observation import Layout, Offsets
@@ -23,14 +23,14 @@ LANES, WIDE = JOINTS + 1, 16
 
 WORK = np.dtype(
     {
-        "names": ["travel_s", "cycle_s", "difficulty", "p_saturation", "risk"],
-        "formats": ["f8", "f8", "f8", "f8", "i8"],
+        "names": ["travel_s", "cycle_s", "difficulty", "p_saturation", "risk", "peak"],
+        "formats": ["f8", "f8", "f8", "f8", "i8", "i8"],
         "itemsize": 64,  # one cache line
     }
 )
 """What an arm knows of a plan for a kind of job: seconds of approach and retreat, and of one repetition, both 0 where
-it has none; difficulty; P(saturation) from models that ignore the start temperature, both NaN where not known; row of
-the risk tables, −1 for none."""
+it has none; difficulty; P(saturation) from models that ignore the start temperature, both NaN where not known; rows of
+the forecasts of P and of the peak temperature, −1 for none."""
 
 
 class Tables(NamedTuple):
@@ -77,20 +77,36 @@ class Tables(NamedTuple):
     """[plan, phase, lane]."""
     friction_w: Array
     """[plan, phase, lane]."""
-    own_space: Array
-    """Volume that a plan takes, one bit, uint64 [plan, word]; volumes are counted for each fleet."""
+    volume: Array
+    """Volume that a plan takes, int [plan]; volumes are counted for each fleet."""
     excluded: Array
-    """Volumes that must be free for a plan, one bit each, uint64 [plan, word]."""
+    """Volumes that no other arm can take meanwhile, one bit each, uint64 [plan, word]."""
     plan: Array
     """Row of the plan tables, −1 where the arm has none, int [fleet, arm, kind, plan]; the fastest first."""
     work: Array
     """What an arm knows of its plans for a kind of job, `WORK` [fleet, arm, kind, plan]."""
-    risk_offset: Array
-    """[risk, piece]; see `fleet.difficulty.Risk`."""
-    risk_weight: Array
-    """[risk, piece, joint]."""
-    risk_curve: Array
-    """[risk, knot, 2]; no knots where no risk has a curve."""
+    housing_keep: Array
+    """The arms' observers of their housings, see `fleet.housing_observer`; [fleet, arm, from, lane]."""
+    housing_gain: Array
+    """[fleet, arm, from, lane]."""
+    housing_winding: Array
+    """W/K, [fleet, arm, lane]."""
+    housing_ambient: Array
+    """W/K, [fleet, arm, lane]."""
+    housing_idle_w: Array
+    """[fleet, arm, lane]."""
+    start_housing_c: Array
+    """[fleet, arm, joint]."""
+    forecast_offset: Array
+    """[forecast, piece]; see `fleet.difficulty.Forecast`. Pieces are padded to whole lanes with −inf."""
+    forecast_weight: Array
+    """[forecast, known, piece]."""
+    forecast_time_s: Array
+    """[forecast, piece]."""
+    forecast_curve: Array
+    """[forecast, knot, 2]; no knots where no forecast has a curve."""
+    too_heavy: Array
+    """Whether the load of a kind of job exceeds an arm's rating, bool [fleet, kind, arm]."""
     feasible: Array
     """Whether an arm can do a kind of job at all, bool [fleet, kind, arm]."""
     stations: Array
@@ -120,6 +136,8 @@ class Jobs(NamedTuple):
     """[env, job]."""
     repetitions: Array
     """int [env, job]."""
+    expires: Array
+    """Whether a job expires at its due date if no arm has begun it, bool [env, job]."""
     after: Array
     """Jobs that must be done first, int [env, job, n], −1 for none."""
 
@@ -130,7 +148,9 @@ class OpenJobs(NamedTuple):
     slot_job: Array
     """int [env, slot], −1 for an empty slot."""
     mask: Array
-    """Legal actions, int8 [env, arm, option + 1]."""
+    """Legal actions, int8 [env, arm, option + 2]."""
+    alarm: Array
+    """Whether an arm at work has passed the warning limit in the last step, bool [env]."""
     station_free: Array
     """Whether no arm occupies the stations of a slot's job, bool [env, slot]."""
     unfinished: Array
@@ -143,8 +163,8 @@ class OpenJobs(NamedTuple):
     """Where in its row the queue begins, int [env]."""
     current_kind: Array
     """Kind of an arm's current job, int [env, arm]; the number of kinds if it has none."""
-    taken: Array
-    """Volumes that arms take which are away from home, one bit each, uint64 [env, word]."""
+    closed: Array
+    """Volumes that arms away from home exclude, one bit each, uint64 [env, word]."""
     pending: Array
     """Whether the current job is still to be finished, bool [env, arm]; False on the way home."""
 
@@ -189,6 +209,8 @@ class Form(NamedTuple):
     high: Array
     first_change: Array
     """Where the rows of an arm begin in `change`, int [arm + 1]."""
+    who: Array
+    """The peers of each arm, int [arm, peer]."""
     change: Array
     """Place among the peers and peer, where an arm's peers differ from those of the arm before, int [change, 2]."""
 
@@ -215,7 +237,7 @@ def form_of(layout: Layout) -> Form:
         first.append(len(changes))
         shown = peers
     low, high = layout.bounds
-    return Form(layout.offsets, low, high, np.array(first), np.array(changes, dtype=int).reshape(-1, 2))
+    return Form(layout.offsets, low, high, np.array(first), layout.who, np.array(changes, dtype=int).reshape(-1, 2))
 
 
 def tables_of(world: World) -> tuple[Tables, Jobs]:
@@ -230,12 +252,12 @@ def tables_of(world: World) -> tuple[Tables, Jobs]:
 
     limits, motors, offers, rest = world.limits, world.motors, world.offers, world.rest
     can = offers.plan >= 0
-    volumes = np.eye(len(world.conflicts), dtype=bool)
     times_s = np.where(can[..., None], world.plans.times_s[offers.plan], 0.0)
     work = np.zeros(can.shape, WORK)
     work["travel_s"], work["cycle_s"] = times_s[..., 0] + times_s[..., 2], times_s[..., 1]
-    work["difficulty"], work["p_saturation"], work["risk"] = offers.difficulty, offers.p_saturation, offers.risk
-    risk_offset, risk_weight, risk_curve = _risk_tables(offers.risks)
+    work["difficulty"], work["p_saturation"] = offers.difficulty, offers.p_saturation
+    work["risk"], work["peak"] = offers.risk, offers.peak
+    forecasts, observer = _forecast_tables(offers.forecasts), world.observer
     thermal_step = np.concatenate([world.phi, world.gamma], axis=-1).swapaxes(-1, -2)
     tables = Tables(
         dt_s=float(world.dt_s),
@@ -264,13 +286,18 @@ def tables_of(world: World) -> tuple[Tables, Jobs]:
         times_s=world.plans.times_s,
         current_sq=pad(world.plans.current_sq),
         friction_w=pad(world.plans.friction_w),
-        own_space=bits(volumes[world.plans.volume]),
+        volume=world.plans.volume,
         excluded=bits(world.conflicts[world.plans.volume]),
         plan=offers.plan,
         work=work,
-        risk_offset=risk_offset,
-        risk_weight=risk_weight,
-        risk_curve=risk_curve,
+        housing_keep=per_fleet(pad(observer.keep.swapaxes(-1, -2))),
+        housing_gain=per_fleet(pad(observer.gain.swapaxes(-1, -2))),
+        housing_winding=per_fleet(pad(observer.from_winding)),
+        housing_ambient=per_fleet(pad(observer.from_ambient)),
+        housing_idle_w=per_fleet(pad(observer.idle_w)),
+        start_housing_c=per_fleet(world.start_housing_c),
+        too_heavy=offers.too_heavy.swapaxes(-1, -2),
+        **forecasts,
         feasible=np.any(can, axis=-1).swapaxes(-1, -2),
         stations=bits(_one_hot(jobs.stations, len(world.stations))),
         payload_kg=jobs.payload_kg,
@@ -285,6 +312,7 @@ def tables_of(world: World) -> tuple[Tables, Jobs]:
         release_s=jobs.release_s,
         due_s=jobs.due_s,
         repetitions=jobs.repetitions,
+        expires=jobs.expires,
         after=jobs.after,
     )
     return owned(tables), owned(drawn)
@@ -314,12 +342,25 @@ def _one_hot(stations: Array, count: int) -> Array:
     return flags
 
 
-def _risk_tables(risks: Risk | None) -> tuple[Array, Array, Array]:
-    """Offsets, weights and curves of stacked risks; empty axes for what is not there."""
-    if risks is None:
-        return np.empty((0, 1)), np.empty((0, 1, JOINTS)), np.empty((0, 0, 2))
-    curve = np.empty((len(risks.offset), 0, 2)) if risks.curve is None else risks.curve
-    return risks.offset, risks.weight, curve
+def _forecast_tables(forecasts: Forecast | None) -> dict[str, Array]:
+    """The tables of stacked forecasts; empty axes for what is not there."""
+    if forecasts is None:
+        none = np.empty((0, LANES))
+        tables = (none, np.empty((0, KNOWN, LANES)), none, np.empty((0, 0, 2)))
+    else:
+        offset, curve = forecasts.offset, forecasts.curve
+        pieces = -(-offset.shape[1] // LANES) * LANES
+        time_s = np.zeros_like(offset) if forecasts.time_s is None else forecasts.time_s
+        tables = (
+            pad(offset, 1, pieces, -np.inf),
+            pad(forecasts.weight.swapaxes(1, 2), 2, pieces),
+            pad(time_s, 1, pieces),
+            np.empty((len(offset), 0, 2)) if curve is None else curve,
+        )
+    return dict(zip(_FORECAST, tables, strict=True))
+
+
+_FORECAST = ("forecast_offset", "forecast_weight", "forecast_time_s", "forecast_curve")
 
 
 Arrays = TypeVar("Arrays", Tables, Jobs)
@@ -333,7 +374,7 @@ def owned(arrays: Arrays) -> Arrays:
 
 
 _SCALARS = tuple(name for name, kind in Tables.__annotations__.items() if kind is not Array)
-_RENUMBERED = ("plan", "risk_offset", "risk_weight", "risk_curve", "stations", "own_space", "excluded")
+_RENUMBERED = ("plan", "stations", "excluded", *_FORECAST)
 
 
 def stack_tables(fleets: Sequence[Tables]) -> Tables:
@@ -353,9 +394,9 @@ def stack_tables(fleets: Sequence[Tables]) -> Tables:
             if getattr(other, name).shape != getattr(first, name).shape:
                 raise ValueError(f"Fleets of one batch must have as many arms and kinds of jobs as the first ({name}).")
     plans = np.cumsum([0, *(len(each.times_s) for each in fleets)])
-    risks = np.cumsum([0, *(len(each.risk_offset) for each in fleets)])
-    pieces = max(each.risk_offset.shape[1] for each in fleets)
-    knots = max(each.risk_curve.shape[1] for each in fleets)
+    forecasts = np.cumsum([0, *(len(each.forecast_offset) for each in fleets)])
+    pieces = max(each.forecast_offset.shape[1] for each in fleets)
+    knots = max(each.forecast_curve.shape[1] for each in fleets)
 
     def shifted(each: Iterable[Array], by: Array) -> Array:
         return np.concatenate([np.where(v >= 0, v + n, -1) for v, n in zip(each, by, strict=False)])
@@ -365,16 +406,17 @@ def stack_tables(fleets: Sequence[Tables]) -> Tables:
         for name in Tables._fields
         if name not in (*_SCALARS, *_RENUMBERED)
     }
-    joined["work"]["risk"] = shifted((t.work["risk"] for t in fleets), risks)
+    for name in ("risk", "peak"):
+        joined["work"][name] = shifted((t.work[name] for t in fleets), forecasts)
     return owned(
         first._replace(
             **joined,
             plan=shifted((t.plan for t in fleets), plans),
-            risk_offset=np.concatenate([pad(t.risk_offset, 1, pieces, -np.inf) for t in fleets]),
-            risk_weight=np.concatenate([pad(t.risk_weight, 1, pieces) for t in fleets]),
-            risk_curve=np.concatenate([_extend_curve(t.risk_curve, knots) for t in fleets]),
+            forecast_offset=np.concatenate([pad(t.forecast_offset, 1, pieces, -np.inf) for t in fleets]),
+            forecast_weight=np.concatenate([pad(t.forecast_weight, 2, pieces) for t in fleets]),
+            forecast_time_s=np.concatenate([pad(t.forecast_time_s, 1, pieces) for t in fleets]),
+            forecast_curve=np.concatenate([_extend_curve(t.forecast_curve, knots) for t in fleets]),
             stations=_same_words([t.stations for t in fleets]),
-            own_space=_same_words([t.own_space for t in fleets]),
             excluded=_same_words([t.excluded for t in fleets]),
         )
     )
@@ -387,7 +429,7 @@ def _same_words(fleets: Sequence[Array]) -> Array:
 
 
 def _extend_curve(curve: Array, knots: int) -> Array:
-    """Curves [risk, knot, 2] with more knots: constant beyond the last; NaN where there is no curve."""
+    """Curves [forecast, knot, 2] with more knots: constant beyond the last; NaN where there is no curve."""
     more = knots - curve.shape[1]
     if not len(curve):
         return np.zeros((0, knots, 2))

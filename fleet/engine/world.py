@@ -6,13 +6,15 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from fleet.difficulty import Difficulty, DifficultyModel, Risk, stack_risks
+from fleet.difficulty import Difficulty, DifficultyModel, Forecast, stack_forecasts
 from fleet.engine.state import JobTable, Offers, PlanTable, World
+from fleet.housing_observer import HousingObserver, housing_observer
 from fleet.job import Job, Work, check_precedence
-from fleet.motion import PLANS, Drive, Plan, drive, offered_plans
-from fleet.motor import Motors, stack_motors
+from fleet.motion import Drive, Plan, drive
+from fleet.motor import Motors, gen3_motors, stack_motors
+from fleet.planning.options import PLANS, offered_plans
 from fleet.robot import GEN3, Robot, ThermalLimits
-from fleet.thermal import ThermalModel, stack_models, steady_state
+from fleet.thermal import HOUSING, ThermalModel, gen3_network, stack_models, steady_state, thermal_model
 
 Array = np.ndarray
 Space = Callable[[Sequence[Plan]], tuple[Array, Array]]
@@ -33,6 +35,10 @@ class Arm:
     """Its twin, or what stands in for it."""
     plans: Mapping[Work, tuple[Plan, ...]]
     """Variants per work it can do; a work it cannot do is missing."""
+    too_heavy: frozenset[Work] = frozenset()
+    """Works whose load exceeds its rating."""
+    known: tuple[ThermalModel, Motors] | None = None
+    """What the arm knows of its own heat, for its estimate of the housings; None: a nominal arm with its cooling."""
 
     @cached_property
     def _offered(self) -> dict[Work, "ScoredPlans"]:
@@ -64,10 +70,22 @@ class Arm:
             self._driven[id(plan)] = plan, (times_s, current_sq, friction_w, peak)
         return self._driven[id(plan)][1]
 
-    def rest_drive(self) -> Drive:
-        """Mean heat drive of standing at home, each [joint]."""
+    def rest_drive(self, motors: Motors | None = None) -> Drive:
+        """Mean heat drive of standing at home, each [joint]; of other motors if given."""
         still = np.stack([self.robot.home_q(), np.zeros_like(self.rest_tau), self.rest_tau])[None]
-        return drive(still, self.motors)
+        return drive(still, motors or self.motors)
+
+    @cached_property
+    def beliefs(self) -> tuple[ThermalModel, Motors]:
+        """`known`, or a nominal arm with this arm's cooling."""
+        return self.known or (thermal_model(gen3_network(cooling=self.robot.cooling)), gen3_motors())
+
+    def believed_housings(self, ambient_c: float) -> Array:
+        """Housing temperatures that the arm expects after hours at home, °C, [joint]; the ambient if none settle."""
+        thermal, motors = self.beliefs
+        rest = self.rest_drive(motors)
+        settled = steady_state(thermal, rest.current_sq, rest.friction_w, motors, ambient_c)
+        return np.full(len(self.rest_tau), ambient_c) if settled is None else settled[HOUSING]
 
 
 class ScoredPlans(dict[int, list[tuple[Plan, Difficulty | None]]]):
@@ -121,11 +139,13 @@ def build_world(
         start_warm: Arms begin at their idle equilibrium rather than at ambient.
         space: Which plans of two arms would touch; none if not given.
     """
-    motors, thermal, rest, phi, gamma = _laws(tuple(arms), dt_s)
+    motors, thermal, rest, phi, gamma, observer = _laws(tuple(arms), dt_s)
     plans, offers = _offers(arms, shifts)
     volume, conflicts = space(plans) if space and plans else (np.zeros(max(1, len(plans)), int), np.zeros((1, 1), bool))
     start = np.repeat(ambient_c[0][:, None], thermal.capacity.shape[-1], axis=1)
+    housing_c = np.repeat(ambient_c[0][:, None], len(GEN3.velocity), axis=1)
     if start_warm:
+        housing_c = np.stack([a.believed_housings(c) for a, c in zip(arms, ambient_c[0].tolist(), strict=True)])
         start = np.stack([warm_start(a, c) for a, c in zip(arms, ambient_c[0].tolist(), strict=True)])
     stations = tuple(dict.fromkeys(name for jobs in shifts for job in jobs for name in job.work.stations))
     world = World(
@@ -144,7 +164,9 @@ def build_world(
         jobs=_job_table(shifts, stations),
         offers=offers,
         conflicts=conflicts,
+        observer=observer,
         start_c=start,
+        start_housing_c=housing_c,
         phi=phi,
         gamma=gamma,
     )
@@ -152,26 +174,35 @@ def build_world(
 
 
 @lru_cache(maxsize=8)
-def _laws(arms: tuple[Arm, ...], dt_s: float) -> tuple[Motors, ThermalModel, Drive, Array, Array]:
-    """Motors, thermal models and rest of a fleet, [arm, ...], and the matrices of a step: the same in every shift."""
+def _laws(arms: tuple[Arm, ...], dt_s: float) -> tuple[Motors, ThermalModel, Drive, Array, Array, HousingObserver]:
+    """Motors, thermal models and rest of a fleet, [arm, ...], the matrices of a step, and the observers of the arms'
+    housings: the same in every shift."""
     thermal, drives = stack_models([arm.thermal for arm in arms]), [arm.rest_drive() for arm in arms]
     rest = Drive(np.stack([d.current_sq for d in drives]), np.stack([d.friction_w for d in drives]))
-    return stack_motors([arm.motors for arm in arms]), thermal, rest, *thermal.step_matrices(dt_s)
+    observers = [housing_observer(*arm.beliefs, dt_s) for arm in arms]
+    observer = HousingObserver(*(np.stack(parts) for parts in zip(*observers, strict=True)))
+    return stack_motors([arm.motors for arm in arms]), thermal, rest, *thermal.step_matrices(dt_s), observer
 
 
 def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]]) -> tuple[tuple[Plan, ...], Offers]:
     shape = (len(shifts), len(arms), max(1, *map(len, shifts)), PLANS)
     plan, total, p_saturation = np.full(shape, -1), np.full(shape, np.nan), np.full(shape, np.nan)
-    risk = np.full(shape, -1)
+    risk, peak = np.full(shape, -1), np.full(shape, -1)
+    too_heavy = np.zeros(shape[:3], bool)
     rows: dict[int, int] = {}
     plans: list[Plan] = []
-    risks: dict[int, tuple[int, Risk]] = {}
+    forecasts: dict[int, tuple[int, Forecast]] = {}
+
+    def row_of(forecast: Forecast | None) -> int:
+        return -1 if forecast is None else forecasts.setdefault(id(forecast), (len(forecasts), forecast))[0]
+
     offered: dict[int, list[ScoredPlans]] = {}  # by id: hashing a work takes longer than the rest
     for e, jobs in enumerate(shifts):
         for j, job in enumerate(jobs):
             if id(job.work) not in offered:
                 offered[id(job.work)] = [arm.offers(job.work) for arm in arms]
             for a, offers in enumerate(offered[id(job.work)]):
+                too_heavy[e, a, j] = job.work in arms[a].too_heavy
                 for n, (offer, score) in enumerate(offers[job.repetitions]):
                     if id(offer) not in rows:
                         rows[id(offer)] = len(plans)
@@ -180,10 +211,10 @@ def _offers(arms: Sequence[Arm], shifts: Sequence[Sequence[Job]]) -> tuple[tuple
                     if score is not None:
                         total[e, a, j, n] = score.total
                         p_saturation[e, a, j, n] = np.nan if score.p_saturation is None else score.p_saturation
-                        if score.risk is not None:
-                            risk[e, a, j, n] = risks.setdefault(id(score.risk), (len(risks), score.risk))[0]
-    stack = stack_risks([r for _, r in risks.values()]) if risks else None
-    return tuple(plans), Offers(plan=plan, difficulty=total, p_saturation=p_saturation, risk=risk, risks=stack)
+                        risk[e, a, j, n], peak[e, a, j, n] = row_of(score.risk), row_of(score.peak)
+    stack = stack_forecasts([forecast for _, forecast in forecasts.values()]) if forecasts else None
+    scores = {"difficulty": total, "p_saturation": p_saturation, "risk": risk, "peak": peak, "forecasts": stack}
+    return tuple(plans), Offers(plan=plan, too_heavy=too_heavy, **scores)
 
 
 def _plan_table(plans: Sequence[Plan], arms: Mapping[str, Arm], volume: Array) -> PlanTable:
@@ -223,5 +254,6 @@ def _job_table(shifts: Sequence[Sequence[Job]], stations: Sequence[str]) -> JobT
         payload_kg=table(lambda job: job.work.payload_kg, 0.0),
         repetitions=table(lambda job: job.repetitions, 1, int),
         after=lists(after),
+        expires=table(lambda job: job.expires, False, bool),
         stations=lists([[[station[name] for name in job.work.stations] for job in jobs] for jobs in shifts]),
     )

@@ -1,9 +1,10 @@
 """Thermal job allocation, version 1: arms claim jobs, heat up, and must not fault.
 
 A PettingZoo `ParallelEnv` as a thin view of the one engine `fleet.engine.step`. Agents are the arms, fixed for the
-whole episode. At every step each answers Discrete(slots · plans + 1): 0 waits or goes on and is always legal,
-1 + slot · plans + plan claims the job in a slot by one of the arm's plans for it. Of two claims for one job, station or
-space the lower difficulty wins, then the lower index.
+whole episode. At every step each answers Discrete(slots · plans + 2): 0 waits or goes on and is always legal,
+1 + slot · plans + plan claims the job in a slot by one of the arm's plans for it, the last action gives the current job
+back after the present cycle. Of two claims for one job, station or space the lower difficulty wins, then the lower
+index.
 """
 
 from typing import Any, Literal, get_args
@@ -55,7 +56,8 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         mask_in: Where the mask of legal actions is: in the observation, in the info, or both. In the info alone, the
             observation is the vector by itself.
         near: The peers each arm has in its vector; see `fleet.observation.Layout`.
-        decisions: Length of a step: one decision "interval", or until an arm may claim a job ("events").
+        decisions: Length of a step: one decision "interval", or until an arm may claim a job or one at work passes its
+            warning limit ("events").
     """
 
     metadata = {  # noqa: RUF012  # PettingZoo's
@@ -189,7 +191,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         arms, chosen = self.possible_agents, actions_of(self.possible_agents, actions)
         last_tick, before = min(self.world.ticks, self._max_cycles or self.world.ticks), shift.tick
         parts, reward, finished = shift.step(chosen)
-        while self._until_choice and not finished and shift.tick < last_tick and not shift.mask[:, 1:].any():
+        while self._until_choice and not finished and shift.tick < last_tick and not shift.choice:
             more, earned, finished = shift.step(np.zeros_like(chosen))
             parts, reward = parts + more, reward + earned
         over = not finished and shift.tick >= last_tick
@@ -243,7 +245,7 @@ class AllocationEnv(ParallelEnv[str, Any, Any]):
         return agent_of(self.possible_agents, agent)
 
     def _observations(self) -> tuple[dict[str, Any], Array]:
-        """Observations by agent, and the masks [arm, option + 1]; all in arrays of their own."""
+        """Observations by agent, and the masks [arm, option + 2]; all in arrays of their own."""
         shift = self._begun("observing")
         vectors, masks = shift.vectors.copy(), shift.mask.copy()
         arms = self.possible_agents

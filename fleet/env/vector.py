@@ -25,7 +25,7 @@ from fleet.seeding import exchange_seed, shift_seeds
 
 Array = np.ndarray
 Obs = dict[str, Array]
-"""{"observation": float32 [env, arm, size], "action_mask": int8 [env, arm, option + 1]}."""
+"""{"observation": float32 [env, arm, size], "action_mask": int8 [env, arm, option + 2]}."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +150,8 @@ class BatchEnv:
         """One step of every env.
 
         Args:
-            actions: int [env, arm]: 0 waits or goes on, k claims option k - 1; what is outside the mask is a wait.
+            actions: int [env, arm]: 0 waits or goes on, k claims option k - 1, the last action
+                gives the job back; what is outside the mask is a wait.
 
         Returns:
             What the arms know; the reward, float64 [env]; terminated and truncated, bool [env]; and infos of the step

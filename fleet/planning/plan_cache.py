@@ -26,7 +26,7 @@ Array = np.ndarray
 T = TypeVar("T")
 log = logging.getLogger(__name__)
 
-PLANNER_VERSION = 2
+PLANNER_VERSION = 3
 """Increment it whenever the plans of the same work change."""
 
 
@@ -145,7 +145,7 @@ def _write(path: Path, arrays: Mapping[str, Array]) -> None:
 
 def _pack(plans: tuple[Plan, ...] | InfeasibleJob) -> dict[str, Array]:
     if isinstance(plans, InfeasibleJob):
-        return {"infeasible": np.array([plans.place, plans.reason])}
+        return {"infeasible": np.array([plans.place, plans.reason, "too heavy" if plans.too_heavy else ""])}
     phases = [phase for plan in plans for phase in plan.phases]
     return {
         "profile": np.concatenate([phase.profile for phase in phases]),
@@ -158,8 +158,8 @@ def _pack(plans: tuple[Plan, ...] | InfeasibleJob) -> dict[str, Array]:
 def _unpack(arrays: Mapping[str, Array], arm: str, work: Work) -> tuple[Plan, ...] | InfeasibleJob:
     """The inverse of `_pack`, for an arm and work of these names."""
     if "infeasible" in arrays:
-        place, reason = arrays["infeasible"].tolist()
-        return InfeasibleJob(arm, place, reason)
+        place, reason, load = arrays["infeasible"].tolist()
+        return InfeasibleJob(arm, place, reason, too_heavy=bool(load))
     profile, lengths, variants = arrays["profile"], arrays["lengths"], arrays["variants"]
     if lengths.sum() != len(profile) or len(lengths) != len(variants):
         raise ValueError(f"its {len(lengths)} plans have {lengths.sum()} samples in all, but {len(profile)} are stored")

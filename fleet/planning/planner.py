@@ -143,7 +143,7 @@ class Planner:
         if reaches_m:
             reach_m, farthest = max(reaches_m, key=lambda each: each[0])
             if overload := self.robot.overload(farthest.payload_kg, reach_m, carried_s):
-                raise InfeasibleJob(self.robot.name, farthest.place, overload)
+                raise InfeasibleJob(self.robot.name, farthest.place, overload, too_heavy=True)
 
 
 def _loaded_motion(work: Work, segment: Segment, start: Array, end: Array, speed: float) -> LoadedMotion:

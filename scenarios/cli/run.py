@@ -13,13 +13,13 @@ from rich.table import Table
 from agents.registry import NAMES_HELP
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.errors import FleetError
-from fleet.metrics import Metrics
 from scenarios.cli import options
 from scenarios.cli.terminal import INTERRUPTED, Interrupted, out_console, plain_table, print_json, progress_bar, say
 from scenarios.load import load
 from scenarios.policy_loader import label, policy_of
 from scenarios.progress import Progress
 from scenarios.result_folder import check_free, new_folder
+from scenarios.run.metrics import Metrics
 from scenarios.schema import Scenario
 from scenarios.schema_errors import choose
 
@@ -187,6 +187,7 @@ def metrics_table(results: dict[str, Metrics]) -> Table:
         ("tardiness, min", lambda m: f"{m.tardiness_min:.1f}"),
         ("faults", lambda m: str(m.faults)),
         ("given up", lambda m: str(m.given_up)),
+        ("expired", lambda m: str(m.expired)),
         ("min above warning", lambda m: f"{m.above_warning_min:.1f}"),
         ("availability", lambda m: f"{m.availability:.1%}"),
         ("energy, Wh", lambda m: f"{m.energy_wh:.0f}"),

@@ -131,7 +131,8 @@ def _arms(
     for each, model in zip(working, models, strict=True):
         robot, motors, thermal = each.hardware
         rest_tau = rest_torque(robot, folder / "plans")
-        arm = Arm(robot=robot, motors=motors, thermal=thermal, rest_tau=rest_tau, model=model, plans=each.plans)
+        own = {"rest_tau": rest_tau, "plans": each.plans, "too_heavy": each.too_heavy}
+        arm = Arm(robot=robot, motors=motors, thermal=thermal, model=model, **own)
         arms.append(_with_oracle(scenario, arm) if difficulty == "oracle" else arm)
     return arms, [error for arm in planned for error in arm.infeasible]
 

@@ -45,6 +45,8 @@ class PlannedArm:
     plans: Mapping[Work, tuple[Plan, ...]]
     infeasible: tuple[InfeasibleJob, ...] = ()
     """Work that the arm cannot do, with reasons."""
+    too_heavy: frozenset[Work] = frozenset()
+    """Work whose load exceeds the arm's rating."""
 
     @property
     def all_plans(self) -> list[Plan]:
@@ -113,12 +115,15 @@ def plan_arms(
         planner = CellPlanner(hardware.robot, scenario, folder)
         plans: dict[Work, tuple[Plan, ...]] = {}
         infeasible: list[InfeasibleJob] = []
+        too_heavy: set[Work] = set()
         for i, work in enumerate(works):
             progress("planning", (done + i / len(works)) / len(indices))
             try:
                 plans[work] = planner.plan(work)
             except InfeasibleJob as error:
                 infeasible.append(error)
+                if error.too_heavy:
+                    too_heavy.add(work)
                 log.info("%s", error)
-        planned.append(PlannedArm(index, hardware, plans, tuple(infeasible)))
+        planned.append(PlannedArm(index, hardware, plans, tuple(infeasible), frozenset(too_heavy)))
     return planned

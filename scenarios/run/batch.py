@@ -164,6 +164,7 @@ class _ShiftSampler:
         self._jobs = JobSampler(scenario)
         self._first_kind = np.cumsum([0, *self._jobs.choices.prod(axis=1)])[:-1]
         """Where the kinds of each stream begin; see `_kinds`."""
+        self._expires = np.array([stream.due == "hard" for stream in scenario.jobs])
         self._due_s = np.array([stream.due_s for stream in scenario.jobs], dtype=float)
 
     def __call__(self, seed: np.random.SeedSequence) -> Shift:
@@ -178,6 +179,7 @@ class _ShiftSampler:
             release_s=jobs.release_s,
             due_s=jobs.release_s + self._due_s[stream],
             repetitions=sampler.fewest[stream] + jobs.extra,
+            expires=self._expires[stream],
             after=jobs.after,
             noise_key=key_of(sensor_seed),
         )

@@ -21,7 +21,7 @@ Array = np.ndarray
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """Figures of a shift that are compared; see `fleet.metrics.Metrics`."""
+    """Figures of a shift that are compared; see `scenarios.run.metrics.Metrics`."""
 
     reward: float
     """Summed over the shift."""
@@ -63,7 +63,7 @@ def outcomes(fleet: Fleet, policy: str, seeds: Sequence[int], channel: Channel =
     results: dict[int, Outcome] = {}
     while running.any():
         vectors, mask = obs["observation"], obs["action_mask"]
-        asked = running & mask[..., 1:].any(axis=(1, 2)) if only_when_asked else running
+        asked = running & mask[..., 1:-1].any(axis=(1, 2)) if only_when_asked else running
         actions = np.full(mask.shape[:2], WAIT)
         for e in np.flatnonzero(asked).tolist():
             known = {arm: env.layout.read(vectors[e, a], mask[e, a]) for a, arm in enumerate(env.agents)}

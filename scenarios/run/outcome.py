@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from fleet.engine.state import DONE, GIVEN_UP, State, World
+from fleet.engine.state import DONE, EXPIRED, GIVEN_UP, State, World
 from fleet.events import Event
-from fleet.metrics import Metrics, gini
+from scenarios.run.metrics import Metrics, gini
 
 Array = np.ndarray
 
@@ -37,6 +37,7 @@ def metrics_of(
         **common_figures(state, 0, value, due_s, world.dt_s),
         jobs=int(released.sum()),
         given_up=int((state.status[0, jobs] == GIVEN_UP).sum()),
+        expired=int((state.status[0, jobs] == EXPIRED).sum()),
         moved_home=sum(event.kind == "moved" for event in events),
         value_offered=float(value[released].sum()),
         tardiness_min=float(late_s.sum() / 60.0),

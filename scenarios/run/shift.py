@@ -15,11 +15,11 @@ from fleet.engine.profile_plant import recorded_noise, telemetry_of
 from fleet.engine.shift import StepRecord, stack_records
 from fleet.env.allocation_v1 import AllocationEnv
 from fleet.events import Event
-from fleet.metrics import Metrics
 from fleet.telemetry import Telemetry, join
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.fleet import BusName, DifficultyName, Fleet, PlantName, env_of
 from scenarios.progress import Progress, quiet
+from scenarios.run.metrics import Metrics
 from scenarios.run.outcome import metrics_of
 from scenarios.run.provenance import provenance
 from scenarios.schema import Scenario

@@ -14,7 +14,7 @@ from typing import Literal, get_args
 import msgspec
 import numpy as np
 
-from fleet.difficulty import Difficulty, Risk
+from fleet.difficulty import KNOWN, Difficulty, Forecast
 from fleet.errors import CheckpointError, nearest
 from fleet.motion import Plan
 from twin.json_file import check_version, read_card, write_card
@@ -76,7 +76,7 @@ class SaturationModel:
     of_temp: tuple[float, ...]
     """Slope of the temperatures, 1/K, >= 0, [joint]."""
     curve: tuple[tuple[float, float], ...] | None
-    """Score and probability, as in `fleet.difficulty.Risk`; None for the logistic function."""
+    """Score and probability, as in `fleet.difficulty.Forecast`; None for the logistic function."""
     data_hash: str
     """Hash of the past jobs."""
     jobs: int
@@ -109,7 +109,7 @@ class SaturationModel:
         """Hash of this model; not cached, because msgspec would write a cached value into the file."""
         return hashlib.sha256(msgspec.json.encode(self)).hexdigest()[:16]
 
-    def risk(self, features: Features, duration_s: Array | float) -> Risk:
+    def risk(self, features: Features, duration_s: Array | float) -> Forecast:
         """P as a function of the motor temperatures at the start.
 
         Args:
@@ -120,9 +120,10 @@ class SaturationModel:
             ValueError: another number of joints, or a duration that is not > 0.
         """
         base = self._base(features, duration_s)
-        weight = np.broadcast_to(self.of_temp, (*base.shape, 1, len(self.of_temp)))
+        weight = np.zeros((*base.shape, 1, KNOWN))
+        weight[..., : len(self.of_temp)] = self.of_temp
         curve = None if self.curve is None else np.broadcast_to(self.curve, (*base.shape, len(self.curve), 2))
-        return Risk(base[..., None], weight, curve)
+        return Forecast(base[..., None], weight, curve)
 
     def score(self, features: Features, duration_s: Array | float, temp_c: Array) -> Array:
         """The argument of the link, [...]: ranks jobs also where P rounds to 0 or 1.

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet.difficulty import Risk
+from fleet.difficulty import KNOWN, Forecast
 from fleet.motion import Drive
 from fleet.motor import Motors, copper_loss, magnet_factor
 from fleet.robot import JOINTS
@@ -54,9 +54,11 @@ class MarginHead:
         """Part of the twin's version."""
         return f"{self.intercept:.4g}+{self.slope:.4g}m"
 
-    def risk(self, of_job: Pieces) -> Risk:
+    def risk(self, of_job: Pieces) -> Forecast:
         """The probability for any temperatures at the start."""
-        return Risk(self.intercept + self.slope * of_job.offset, self.slope * of_job.weight)
+        weight = np.zeros((len(of_job.offset), KNOWN))
+        weight[:, :JOINTS] = self.slope * of_job.weight
+        return Forecast(self.intercept + self.slope * of_job.offset, weight)
 
 
 def fit_head(margin: Array, passed: Array) -> MarginHead:

@@ -10,7 +10,7 @@ from itertools import repeat
 
 import numpy as np
 
-from fleet.difficulty import Difficulty, Risk, difficulty_of_error
+from fleet.difficulty import Difficulty, Forecast, difficulty_of_error
 from fleet.motion import Drive, Plan, drives
 from fleet.motor import Motors
 from fleet.robot import JOINTS, ThermalLimits
@@ -172,7 +172,7 @@ class RcTwin:
         margin = np.array([p.margin(t) for p, t in zip(self.pieces(plans, repetitions), temp_c, strict=True)])
         return replace(self, head=fit_head(margin, passed))
 
-    def risk(self, plan: Plan, repetitions: int) -> Risk:
+    def risk(self, plan: Plan, repetitions: int) -> Forecast:
         """P(saturation) of a job for any measured temperatures at its start.
 
         Raises:

@@ -28,6 +28,7 @@ def messages_of(broadcast: Broadcast, arms: tuple[str, ...], tick: int) -> list[
         broadcast.mode.tolist(),
         broadcast.temp_c.tolist(),
         broadcast.headroom_k.tolist(),
+        broadcast.busy_s.tolist(),
         broadcast.twin,
         _nullable(broadcast.difficulty[:, slots]),
         _nullable(broadcast.p_saturation[:, slots]),
@@ -35,10 +36,10 @@ def messages_of(broadcast: Broadcast, arms: tuple[str, ...], tick: int) -> list[
     )
     return [
         (
-            State(arm, tick, time_s, MODES[mode], tuple(temp_c), headroom_k),
+            State(arm, tick, time_s, MODES[mode], tuple(temp_c), headroom_k, busy_s=busy_s),
             DifficultyScores(arm, tick, time_s, twin, jobs, difficulty, p_saturation),
         )
-        for arm, mode, temp_c, headroom_k, twin, difficulty, p_saturation in columns
+        for arm, mode, temp_c, headroom_k, busy_s, twin, difficulty, p_saturation in columns
     ]
 
 

@@ -97,7 +97,9 @@ def _contents_of(broadcast: Broadcast) -> tuple[list[Condition], list[Scores]]:
     )
     time_s = float(broadcast.time_s)
     conditions = [
-        Condition(time_s, MODES[mode], headroom)
-        for mode, headroom in zip(broadcast.mode.tolist(), broadcast.headroom_k.tolist(), strict=True)
+        Condition(time_s, MODES[mode], headroom_k, busy_s)
+        for mode, headroom_k, busy_s in zip(
+            broadcast.mode.tolist(), broadcast.headroom_k.tolist(), broadcast.busy_s.tolist(), strict=True
+        )
     ]
     return conditions, [Scores(time_s, broadcast.jobs, d, p) for d, p in zip(difficulty, p_saturation, strict=True)]

@@ -31,6 +31,8 @@ class Broadcast:
     """Measured motor temperatures, [arm, joint]."""
     headroom_k: Array
     """Warning limit minus hottest motor, [arm]."""
+    busy_s: Array
+    """Time until home with the current job done, [arm]."""
     jobs: tuple[str, ...]
     """Names of the open jobs, [slot]; "" for an empty slot, which is not broadcast."""
     difficulty: Array
@@ -48,6 +50,8 @@ class PeerView:
     mode: Array
     """int, [receiver, sender]; UNHEARD if nothing was received."""
     headroom_k: Array
+    """[receiver, sender], NaN if nothing was received."""
+    busy_s: Array
     """[receiver, sender], NaN if nothing was received."""
     difficulty: Array
     """[receiver, sender, slot] for the present slots (matched by job name), NaN where not broadcast."""
@@ -98,6 +102,7 @@ class Condition:
     time_s: float
     mode: Mode
     headroom_k: float
+    busy_s: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +131,7 @@ def assemble(now_s: float, jobs: tuple[str, ...], conditions: AllConditions, sco
     row, states = _distinct(conditions)
     mode = np.array([*(MODES.index(state.mode) for state in states), UNHEARD])[row]
     headroom_k = np.array([*(state.headroom_k for state in states), math.nan])[row]
+    busy_s = np.array([*(state.busy_s for state in states), math.nan])[row]
     state_s = np.array([*(state.time_s for state in states), -math.inf])[row]
 
     row, contents = _distinct(scores)
@@ -141,7 +147,7 @@ def assemble(now_s: float, jobs: tuple[str, ...], conditions: AllConditions, sco
     table[:, :, [slot for slot, name in enumerate(jobs) if not name]] = np.nan
     scores_s = np.array([*(content.time_s for content in contents), -math.inf])[row]
     difficulty, p_saturation = table[:, row]
-    return PeerView(mode, headroom_k, difficulty, p_saturation, now_s - np.minimum(state_s, scores_s))
+    return PeerView(mode, headroom_k, busy_s, difficulty, p_saturation, now_s - np.minimum(state_s, scores_s))
 
 
 def checked_arms(arms: Sequence[str]) -> tuple[str, ...]:
@@ -166,6 +172,7 @@ def check(broadcast: Broadcast, arms: tuple[str, ...]) -> None:
     shapes = {
         "mode": (len(arms),),
         "headroom_k": (len(arms),),
+        "busy_s": (len(arms),),
         "difficulty": (len(arms), slots),
         "p_saturation": (len(arms), slots),
     }
@@ -185,7 +192,7 @@ def check(broadcast: Broadcast, arms: tuple[str, ...]) -> None:
         raise ValueError(f"Broadcast.jobs names a job twice (got {broadcast.jobs}).")
     if not math.isfinite(broadcast.time_s):
         raise ValueError(f"Broadcast.time_s must be finite (got {broadcast.time_s}).")
-    for name in ("temp_c", "headroom_k"):
+    for name in ("temp_c", "headroom_k", "busy_s"):
         if not np.isfinite(getattr(broadcast, name)).all():
             raise ValueError(f"Broadcast.{name} must be finite (got {getattr(broadcast, name)}).")
     for name in ("difficulty", "p_saturation"):

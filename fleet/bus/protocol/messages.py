@@ -39,6 +39,8 @@ class State(msgspec.Struct, frozen=True, omit_defaults=True):
     """The current job; "" for none."""
     space: str = ""
     """Name of the space that the arm takes while it is away from home; "" at home, or if the arm does not say."""
+    busy_s: float = 0.0
+    """Time until it is home with its current job done."""
     q: tuple[float, ...] = ()
     """rad, [joint]."""
     qd: tuple[float, ...] = ()
@@ -49,7 +51,7 @@ class State(msgspec.Struct, frozen=True, omit_defaults=True):
     """[joint]."""
 
     def __post_init__(self) -> None:
-        for name in ("time_s", "headroom_k"):
+        for name in ("time_s", "headroom_k", "busy_s"):
             finite("State", name, (getattr(self, name),))
         for name in ("temp_c", "q", "qd", "tau", "current_a"):
             values = getattr(self, name)

@@ -73,6 +73,9 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, lost: Container[str] = ()) ->
     headroom_k = each(lambda quote: quote.headroom_k)
     difficulty = np.where(known, difficulty, 0.0)
     working = quoted * (1.0 - faulted) * (1.0 - room)
+    peak_c = table(lambda offer: offer.peak_c)
+    temp_c = np.array([_temp_c(arm, k, bidding, fleet) for arm, k in zip(arms, headroom_k, strict=True)])
+    nothing, no_slots = np.zeros(len(arms)), np.zeros((len(arms), layout.slots))
     fields = Observation(
         clock=np.full(len(arms), time_s / fleet.horizon_s),
         idle=room,
@@ -80,31 +83,43 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, lost: Container[str] = ()) ->
         faulted=faulted,
         busy_s=busy_s,
         last_award=np.array([-1.0 if arm in lost else 0.0 for arm in arms]),
-        temp_c=np.array([_temp_c(arm, k, bidding, fleet) for arm, k in zip(arms, headroom_k, strict=True)]),
+        temp_c=temp_c,
+        housing_c=temp_c,
+        ambient_c=np.zeros(len(arms)),
         headroom_k=headroom_k,
+        job_value=nothing,
+        job_cycles=nothing,
+        job_peak_c=nothing,
+        job_p=nothing,
         offered=per_job([1.0] * layout.slots),
         station_free=per_job([1.0] * layout.slots),
+        too_heavy=no_slots,
         feasible=feasible,
         space_free=feasible,
         known=known,
         difficulty=difficulty,
-        p_saturation=_risk(table(lambda offer: offer.p_saturation), table(lambda offer: offer.peak_c), fleet.warning_c),
+        peak_c=np.nan_to_num(peak_c),
+        p_saturation=_risk(table(lambda offer: offer.p_saturation), peak_c, fleet.warning_c),
         duration_s=duration_s,
         slack_s=due_s - time_s - duration_s,
         age_s=time_s - per_job(queued_s),
         payload_kg=per_job([job.payload_kg for job in bidding.jobs]),
         value=per_job([job.value for job in bidding.jobs]),
         returns=per_job([bidding.returned.get(job.name, (0, 0.0))[0] for job in bidding.jobs]),
+        expires=no_slots,
         peer_heard=quoted[peers],
         peer_age_s=np.where(quoted > 0, [bidding.ages_s.get(arm, 0.0) for arm in arms], LONG_S)[peers],
         peer_working=working[peers],
         peer_faulted=faulted[peers],
         peer_headroom_k=headroom_k[peers],
+        peer_busy_s=busy_s[peers],
         peer_known=known[peers],
         peer_difficulty=difficulty[peers],
+        peer_blocks=no_slots[peers],
         action_mask=np.zeros(0),
     )
-    mask = np.insert(feasible & (room > 0)[:, None], 0, True, axis=1).astype(np.int8)
+    # Waiting is always legal; a live fleet has no action to give a job back.
+    mask = np.pad((feasible & (room > 0)[:, None]).astype(np.int8), ((0, 0), (1, 1)), constant_values=((0, 0), (1, 0)))
     vectors = layout.pack(fields)
     return {arm: layout.read(vectors[a], mask[a]) for a, arm in enumerate(arms)}
 
