@@ -27,7 +27,7 @@ class Arm:
 
     def __init__(self, session, fleet, name):
         self.session, self.name, self.inbox = session, name, queue.SimpleQueue()
-        self.root = f"thermofleet/v2/{quote(fleet, safe='')}"
+        self.root = f"thermofleet/v3/{quote(fleet, safe='')}"
         self.own_key = f"{self.root}/arm/{quote(name, safe='')}"
         self.temp_c, self.tick = AMBIENT_C, 0
         self.zero_s, self.speed = self.query_clock()
@@ -123,19 +123,19 @@ class Arm:
         }
 
     def estimate(self, job):
-        """Return a JobEstimate; unknown values are left out."""
+        """Return a JobEstimate, with one plan; unknown values are left out."""
         if job["kind"] == "press":
-            return {"job": job["name"], "feasible": False, "reason": "This arm cannot press."}
+            return {"job": job["name"], "reason": "This arm cannot press."}
         cycles, d = job.get("repetitions", 1), 0.1 * job.get("payload_kg", 0.0)
-        return {
-            "job": job["name"],
-            "feasible": True,
+        plan = {
+            "peak_c": self.temp_c + 0.1 * cycles,
+            "gained_k": 0.1 * cycles,
             "joint_difficulty": [d],
             "difficulty": d,
-            "peak_c": self.temp_c + 0.1 * cycles,
             "duration_s": CYCLE_S * cycles,
             "finish_in_s": CYCLE_S * cycles,
         }
+        return {"job": job["name"], "plans": [plan]}
 
     def accept(self, award):
         """Accept or reject an award. The same award gets the same reply; a quote is valid once and for VALID_S."""
@@ -145,6 +145,8 @@ class Arm:
             reason = ""
             if quoted_s is None or time.monotonic() > quoted_s + VALID_S:
                 reason = "The quote is unknown or too old."
+            elif award.get("plan", 0) != 0:
+                reason = "The quote has no such plan."
             elif self.job:
                 reason = "This arm has a job."
             else:
@@ -229,14 +231,16 @@ class Arm:
 
     def publish_difficulty(self, estimates):
         """Publish the difficulty of the open jobs."""
+        plans = [next(iter(estimate.get("plans", ())), {}) for estimate in estimates]
         message = {
             "arm": self.name,
             "tick": self.tick,
             "time_s": self.now_s(),
             "twin": "mock",
             "jobs": [estimate["job"] for estimate in estimates],
-            "difficulty": [estimate.get("difficulty") for estimate in estimates],
-            "p_saturation": [None for _ in estimates],
+            "difficulty": [plan.get("difficulty") for plan in plans],
+            "p_saturation": [None for _ in plans],
+            "peak_c": [plan.get("peak_c") for plan in plans],
         }
         self.difficulty.put(json.dumps(message))
 
@@ -262,7 +266,7 @@ class Arm:
 
 def encoding(name):
     """Return the Zenoh encoding of a message type; messages with another one are malformed."""
-    return f"application/json;thermofleet.{name}.v2"
+    return f"application/json;thermofleet.{name}.v3"
 
 
 def connect(port):

@@ -13,6 +13,7 @@ own monotonic clock; wall clocks do not matter. (Leases: Gray & Cheriton 1989, S
 Units: fields that end in `_s` are seconds of fleet time, unless they say *real*.
 """
 
+from math import inf
 from typing import Annotated, Literal
 
 import msgspec
@@ -26,6 +27,10 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 LEASE_S = 6.0
 """Real seconds that an arm may work on a job without renewing its lease."""
+MOST_PLANS = 8
+"""Of one arm for one job."""
+MOST_QUOTED = 64
+"""Jobs in one quote, so that it does not exceed the router's size limit."""
 MOST_JOBS = 128
 """In one message; more are sent as several messages, so that none exceeds the router's size limit."""
 
@@ -96,26 +101,26 @@ class QuoteRequest(msgspec.Struct, frozen=True):
 
     auction: Name
     """Name of this round; any text for a dry run."""
-    jobs: Jobs
+    jobs: Annotated[tuple[JobSpec, ...], msgspec.Meta(min_length=1, max_length=MOST_QUOTED)]
     dry_run: bool = False
     """Only an estimate: the quote cannot be awarded, and nothing changes at the arm."""
 
 
-class JobEstimate(msgspec.Struct, frozen=True):
-    """Cost of one job for one arm; unknown values are null."""
+class PlanQuote(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Cost of one job for one arm by one of its plans; unknown values are null or left out."""
 
-    job: Name
-    feasible: bool
-    reason: str = ""
-    """Why the job is not feasible."""
+    plan: Count = 0
+    """Number of the plan: an `Award` names it. Different for each plan of a job."""
+    peak_c: float | None = None
+    """Predicted temperature of the hottest motor during the job."""
+    gained_k: float | None = None
+    """`peak_c` above the hottest motor now."""
+    p_saturation: Share | None = None
+    """Probability that a motor passes the warning limit, starting from the present temperatures."""
     joint_difficulty: tuple[float, ...] | None = None
     """d_k, [joint]."""
     difficulty: float | None = None
     """Sum of `joint_difficulty`."""
-    p_saturation: Share | None = None
-    """Probability that a motor passes the warning limit, starting from the present temperatures."""
-    peak_c: float | None = None
-    """Predicted temperature of the hottest motor during the job."""
     duration_s: float | None = None
     """Duration of the job alone."""
     finish_in_s: float | None = None
@@ -124,9 +129,35 @@ class JobEstimate(msgspec.Struct, frozen=True):
     """Name of the space of its plan, from home to home; null for unknown: anywhere within reach."""
 
     def __post_init__(self) -> None:
-        finite("JobEstimate", "joint_difficulty", self.joint_difficulty or ())
-        for name in ("difficulty", "p_saturation", "peak_c", "duration_s", "finish_in_s"):
-            finite("JobEstimate", name, (getattr(self, name),))
+        finite("PlanQuote", "joint_difficulty", self.joint_difficulty or ())
+        for name in ("peak_c", "gained_k", "p_saturation", "difficulty", "duration_s", "finish_in_s"):
+            finite("PlanQuote", name, (getattr(self, name),))
+
+
+class JobEstimate(msgspec.Struct, frozen=True, omit_defaults=True):
+    """The plans by which an arm can do a job, the fastest first, and what each costs."""
+
+    job: Name
+    plans: Annotated[tuple[PlanQuote, ...], msgspec.Meta(max_length=MOST_PLANS)] = ()
+    """Empty if the job is not feasible for the arm."""
+    reason: str = ""
+    """Why it is not."""
+
+    def __post_init__(self) -> None:
+        if len({plan.plan for plan in self.plans}) < len(self.plans):
+            raise ValueError(f"JobEstimate.plans of '{self.job}' must have different numbers.")
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the arm can do the job."""
+        return bool(self.plans)
+
+    @property
+    def least(self) -> PlanQuote:
+        """The plan with the least difficulty; without plans, one of which nothing is known."""
+        return min(
+            self.plans, key=lambda plan: inf if plan.difficulty is None else plan.difficulty, default=PlanQuote()
+        )
 
 
 class Quote(msgspec.Struct, frozen=True):
@@ -169,6 +200,8 @@ class Award(msgspec.Struct, frozen=True):
     quote: Name
     """The quote that it refers to."""
     job: JobSpec
+    plan: Count = 0
+    """Number of the quoted plan by which to do it."""
     cycles: Count = 0
     """Cycles of the job that others have done already."""
     lease_s: Positive = LEASE_S
@@ -305,8 +338,9 @@ class Result(msgspec.Struct, frozen=True):
     status: JobStatus
     auction: str = ""
     difficulty: float | None = None
-    """Quoted by the arm."""
+    """Quoted by the arm, as are the next two."""
     p_saturation: float | None = None
+    peak_c: float | None = None
 
 
 class ClearRequest(msgspec.Struct, frozen=True):

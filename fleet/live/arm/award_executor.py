@@ -70,8 +70,8 @@ class _Quote:
     """A quote on which an award may come."""
 
     made_s: float
-    jobs: dict[str, tuple[JobSpec, bool]]
-    """Jobs that were asked for, and whether the arm can do each."""
+    jobs: dict[str, tuple[JobSpec, int]]
+    """Jobs that were asked for, and the number of plans that were offered for each."""
     answers: dict[str, Ack] = field(default_factory=dict[str, Ack])
     """Answer to the first award of each job."""
 
@@ -134,11 +134,11 @@ class AwardExecutor:
         blocked = self.unwritten or len(self._reports) >= MAX_REPORTS
         return 0 if blocked else max(0, self.config.capacity - len(self._active))
 
-    def add_quote(self, jobs: dict[str, tuple[JobSpec, bool]], now_s: float) -> str:
+    def add_quote(self, jobs: dict[str, tuple[JobSpec, int]], now_s: float) -> str:
         """Register a quote and return its name.
 
         Args:
-            jobs: By name, each with whether the arm can do it.
+            jobs: By name, each with the number of plans that are offered for it; 0 if the arm cannot do it.
         """
         self._count += 1
         name = f"{self._quote_prefix}-{self._count}"
@@ -205,12 +205,13 @@ class AwardExecutor:
 
     def _objection(self, award: Award, quote: _Quote, now_s: float) -> str:
         """Why the award itself cannot be accepted; "" if it can."""
-        job, feasible = quote.jobs[award.job.name]
+        job, plans = quote.jobs[award.job.name]
         reports = [pending.report for pending in self._reports.values()]
         checks = (
             (self.unwritten, "my journal has no space left"),
             (job != award.job, "the job is not the one that the quote was for"),
-            (not feasible, "the quote says that I cannot do it"),
+            (not plans, "the quote says that I cannot do it"),
+            (award.plan >= plans, f"the quote has {plans} plan(s) for it, and none of number {award.plan}"),
             (now_s > quote.made_s + self.config.valid_s, f"the quote was valid for {self.config.valid_s:g} s"),
             (award.cycles >= job.repetitions, f"{award.cycles} of {job.repetitions} cycles are done: none is left"),
             (any(r.job == job.name and r.outcome == "finished" for r in reports), "I have finished that job"),

@@ -41,12 +41,21 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.messages import State
 from fleet.errors import JournalFull, Refused
-from fleet.live.auction.leases import CountedLease, SendAward, send_again, unanswered
-from fleet.live.auction.ledger import AuctionRecord, Awarded, Change, ContactLost, ContactRegained, Ledger, ShiftEnded
-from fleet.live.auction.round import MAX_REASON, Allocate, Bidding, Round, Timing, drop_invalid, infeasible_jobs
+from fleet.live.auction.leases import CountedLease, SendAward, new_awards, send_again, unanswered
+from fleet.live.auction.ledger import AuctionRecord, Change, ContactLost, ContactRegained, Ledger, ShiftEnded
+from fleet.live.auction.round import (
+    MAX_REASON,
+    Allocate,
+    Assignment,
+    Bidding,
+    Round,
+    Timing,
+    drop_invalid,
+    infeasible_jobs,
+)
 from fleet.live.auction.space_rules import cleared_space, drop_taken, retaken_space, stated_spaces
 from fleet.live.journal_records import Closed, CommitPermitted, JobsAccepted
-from fleet.live.space import ANYWHERE, Excludes, no_conflicts
+from fleet.live.space import Excludes, no_conflicts
 
 _LOG = logging.getLogger(__name__)
 
@@ -351,22 +360,13 @@ class Auctioneer:
                 self._scan_s = real_s + self._pause_s
             self._delay(real_s, (job.name for job in closing.jobs))
 
-    def _award(self, bidding: Bidding, allocation: dict[str, str], real_s: float, time_s: float) -> None:
-        auction = bidding.auction
-        records: list[Awarded] = []
-        for job, arm in allocation.items():
-            offer = bidding.offer(arm, job)
-            assert offer is not None, "drop_invalid keeps jobs with a bid"
-            quote, cycles = bidding.quotes[arm].quote, self.ledger.jobs[job].cycles
-            award, space = f"{auction}:{job}", offer.space or ANYWHERE
-            records.append(
-                Awarded(award, auction, job, arm, quote, cycles, time_s, offer.difficulty, offer.p_saturation, space)
-            )
-        self._record(*records)
+    def _award(self, bidding: Bidding, allocation: dict[str, Assignment], real_s: float, time_s: float) -> None:
+        self._record(*(records := new_awards(self.ledger, bidding, allocation, time_s)))
         for record in records:
             self._notes.pop(record.job, None)
             spec = self.ledger.jobs[record.job].spec
-            award = Award(record.award, auction, self.name, record.quote, spec, record.cycles, self._timing.lease_s)
+            terms = (record.quote, spec, record.plan, record.cycles, self._timing.lease_s)
+            award = Award(record.award, bidding.auction, self.name, *terms)
             message = SendAward(record.arm, award)
             until_s = real_s + self._timing.counted_lease_s
             self._leases[record.award] = CountedLease(until_s, unanswered=message, sent_s=real_s)

@@ -1,11 +1,13 @@
-"""Leases of open awards, as the auctioneer counts them."""
+"""New awards, and leases of open ones as the auctioneer counts them."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from fleet.bus.protocol.auction import Award
-from fleet.live.auction.round import Timing
+from fleet.live.auction.ledger import Awarded, Ledger
+from fleet.live.auction.round import Assignment, Bidding, Timing
+from fleet.live.space import ANYWHERE
 
 
 @dataclass(frozen=True)
@@ -43,3 +45,15 @@ def send_again(leases: Mapping[str, CountedLease], real_s: float, timing: Timing
             lease.sent_s, lease.attempts = real_s, lease.attempts + 1
             due.append(message)
     return due
+
+
+def new_awards(ledger: Ledger, bidding: Bidding, allocation: Mapping[str, Assignment], time_s: float) -> list[Awarded]:
+    """Return the records of the awards of a round."""
+    records: list[Awarded] = []
+    for job, (arm, plan) in allocation.items():
+        offer = bidding.offer(arm, job, plan)
+        assert offer is not None, "drop_invalid keeps jobs with a bid"
+        names = (f"{bidding.auction}:{job}", bidding.auction, job, arm, bidding.quotes[arm].quote)
+        heat = (offer.difficulty, offer.p_saturation, offer.peak_c)
+        records.append(Awarded(*names, ledger.jobs[job].cycles, time_s, *heat, offer.space or ANYWHERE, plan))
+    return records

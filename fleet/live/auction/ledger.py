@@ -43,8 +43,11 @@ class Awarded(msgspec.Struct, frozen=True, tag="awarded"):
     time_s: float
     difficulty: float | None = None
     p_saturation: float | None = None
+    peak_c: float | None = None
     space: str = ANYWHERE
     """Name of the space of its plan."""
+    plan: int = 0
+    """Number of the plan in the quote."""
 
 
 class ContactLost(msgspec.Struct, frozen=True, tag="contact_lost"):
@@ -76,6 +79,7 @@ class Change(msgspec.Struct, frozen=True):
     auction: str = ""
     difficulty: float | None = None
     p_saturation: float | None = None
+    peak_c: float | None = None
 
 
 class JobEntry(msgspec.Struct):
@@ -361,7 +365,9 @@ class Ledger(TimedState[AuctionRecord]):
         change = Change(self.number, time_s, self._status(entry))
         if entry.award:
             award = asdict(self.awards[entry.award].record)
-            change = replace(change, **{name: award[name] for name in ("auction", "difficulty", "p_saturation")})
+            change = replace(
+                change, **{name: award[name] for name in ("auction", "difficulty", "p_saturation", "peak_c")}
+            )
         self.number += 1
         self.recent.append(change)
         return change

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Set
 
 from msgspec.structs import replace
 
-from fleet.bus.protocol.auction import ClearRequest, Quote
+from fleet.bus.protocol.auction import ClearRequest, JobEstimate, Quote
 from fleet.errors import Refused
 from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.round import MAX_REASON, Round
@@ -22,7 +22,7 @@ def _stated_space(quote: Quote) -> frozenset[str]:
 def drop_taken(
     quotes: Mapping[str, Quote], taken: Mapping[str, Iterable[str]], excludes: Excludes
 ) -> tuple[dict[str, Quote], dict[str, str]]:
-    """Return the quotes without estimates whose space another arm takes; and why a job is in no quote any more.
+    """Return the quotes without plans whose space another arm takes; and why a job is in no quote any more.
 
     Args:
         taken: Names of the spaces that each arm may take.
@@ -30,18 +30,21 @@ def drop_taken(
     kept: dict[str, Quote] = {}
     waits: dict[str, set[str]] = {}
     for arm, quote in quotes.items():
-        spaces = {offer.space for offer in quote.estimates if offer.feasible}
+        spaces = {plan.space for offer in quote.estimates for plan in offer.plans}
         in_way = {space: arms_in_the_way(arm, space, taken, excludes) for space in spaces}
-        closed = {offer.job for offer in quote.estimates if offer.feasible and in_way[offer.space]}
+        estimates: list[JobEstimate] = []
         for offer in quote.estimates:
-            if offer.job in closed:
-                waits.setdefault(offer.job, set()).update(in_way[offer.space])
-        kept[arm] = replace(quote, estimates=tuple(offer for offer in quote.estimates if offer.job not in closed))
+            open_plans = tuple(plan for plan in offer.plans if not in_way[plan.space])
+            for plan in offer.plans:
+                waits.setdefault(offer.job, set()).update(in_way[plan.space])
+            if open_plans or not offer.feasible:
+                estimates.append(replace(offer, plans=open_plans))
+        kept[arm] = replace(quote, estimates=tuple(estimates))
     open_jobs = {offer.job for quote in kept.values() for offer in quote.estimates if offer.feasible}
     reasons = {
         job: f"It waits until {', '.join(sorted(arms))} is out of the way."[:MAX_REASON]
         for job, arms in waits.items()
-        if job not in open_jobs
+        if arms and job not in open_jobs
     }
     return kept, reasons
 

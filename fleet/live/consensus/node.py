@@ -242,7 +242,10 @@ class ConsensusNode:
                 case Bid() as bid:
                     if bid.estimates:  # the difficulty of each joint is published under its own key
                         self._arm.publish_difficulty(bid.estimates, time.monotonic())
-                    estimates = tuple(replace(estimate, joint_difficulty=None) for estimate in bid.estimates)
+                    estimates = tuple(
+                        replace(each, plans=tuple(replace(plan, joint_difficulty=None) for plan in each.plans))
+                        for each in bid.estimates
+                    )
                     self._publish_bid(replace(bid, estimates=estimates))
                 case Claim() as claim:
                     self._query_claim(claim)

@@ -26,7 +26,7 @@ from fleet.bus.protocol.messages import State
 from fleet.live.arm.node import ArmNode
 from fleet.live.auction.job_rules import SHIFT_ENDED, job_order, lost_jobs, ready_jobs
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
-from fleet.live.auction.round import Bidding, Timing, resolve_claims
+from fleet.live.auction.round import Bidding, Choice, Timing, resolve_claims
 from fleet.live.consensus.claimant import NUMBERS_PER_BOOT, Claimant
 from fleet.live.consensus.granter import Granter
 from fleet.live.monitor.snapshot import FRESH_S
@@ -37,11 +37,12 @@ QUIET_S = 0.05
 """Real seconds without a new bid or choice, after which all arms most likely have the same bids."""
 BID_S = 1.0
 """Real seconds between two bids in which only the costs differ."""
+NO_CHOICE = Choice("")
 MAX_OPEN_JOBS = 32
 """Jobs in one bid."""
 
 Choose = Callable[[Observation, int], int]
-"""The action of an arm by its observation and its index in the fleet: 0 waits, k claims slot k."""
+"""The action of an arm by its observation and its index in the fleet: 0 waits, 1 + option claims."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,8 +104,8 @@ class Participant:
         self._bid_s = self._chosen_s = self.changed_s = -math.inf
         self._last_bid: object = None
         """Content of the last bid, without the costs."""
-        self._choice = ""
-        """The job that its policy chose, until it is claimed or another arm has it."""
+        self._choice = NO_CHOICE
+        """What its policy chose, until it is claimed or another arm has the job."""
         self._lost = self._new_bids = False
         self._later_s: dict[str, float] = {}
         """Real second from which it bids for a job again."""
@@ -133,7 +134,7 @@ class Participant:
         self._bids[bid.arm] = bid, real_s
         if before is None or _offered(before[0]) != _offered(bid):
             self.changed_s, self._new_bids = real_s, True
-        elif before[0].choice != bid.choice:
+        elif (before[0].choice, before[0].choice_plan) != (bid.choice, bid.choice_plan):
             self.changed_s = real_s
         if bid.arm != self.name:
             self._send_corrections(bid, real_s)
@@ -176,7 +177,7 @@ class Participant:
             self._pause(job, real_s)
         self.claimant.rejected.clear()
         self._bid(real_s, time_s)
-        if self._choice:
+        if self._choice.job:
             self._claim_choice(real_s)
         else:
             self._choose(real_s, time_s)
@@ -240,8 +241,8 @@ class Participant:
         capacity = 0 if self.ended or self._arm.unfit() else max(0, self.claimant.capacity)
         ready = self._ready(real_s, time_s) if capacity else []
         names = [job.name for job in ready]
-        if self._choice not in names or self.claimant.pending:
-            self._choice = ""
+        if self._choice.job not in names or self.claimant.pending:
+            self._choice = NO_CHOICE
         open_jobs = self.open_jobs(real_s)
         content = (capacity, names, len(open_jobs), self._choice, dict(self.granter.register.space))
         if content == self._last_bid and real_s < self._bid_s + BID_S:
@@ -257,15 +258,21 @@ class Participant:
             open_count=len(open_jobs),
             closed_count=self.granter.register.closed_count,
             open_jobs=tuple(open_jobs[:MAX_OPEN_JOBS]),
-            choice=self._choice,
+            choice=self._choice.job,
+            choice_plan=self._choice.plan,
         )
         self.apply_bid(bid, real_s)
         self.out.append(bid)
 
     def _estimates(self, jobs: list[JobSpec]) -> tuple[JobEstimate, ...]:
-        """Return the estimates of these jobs, without those whose space another arm takes."""
+        """Return the estimates of these jobs, without plans whose space another arm takes."""
         estimates = self._arm.estimate(tuple(jobs)) if jobs else ()
-        return tuple(each for each in estimates if not self.granter.in_the_way(self.name, each.space))
+        open_plans = [
+            tuple(plan for plan in each.plans if not self.granter.in_the_way(self.name, plan.space))
+            for each in estimates
+        ]
+        pairs = zip(estimates, open_plans, strict=True)
+        return tuple(replace(each, plans=plans) for each, plans in pairs if plans or not each.feasible)
 
     def _choose(self, real_s: float, time_s: float) -> None:
         """Let the policy choose a job, once the bids of all present arms have arrived."""
@@ -284,12 +291,12 @@ class Participant:
         bidding = self._bidding(bids, [offer.job for offer in own.estimates])
         observations = observe(bidding, self._fleet, lost={self.name} if self._lost else ())
         action = self._policy(observations[self.name], self._fleet.arms.index(self.name))
-        self._choice = claimed_jobs(bidding, observations, {self.name: action}).get(self.name, "")
+        self._choice = claimed_jobs(bidding, observations, {self.name: action}).get(self.name, NO_CHOICE)
         self._lost = False
         for job in bidding.jobs:
-            if all(bidding.offer(arm, job.name) is None for arm in bidding.quotes):
+            if not any(bidding.plans(arm, job.name) for arm in bidding.quotes):
                 self._pause(job.name, real_s)  # no arm can do it: its slot is free for another job
-        if self._choice:
+        if self._choice.job:
             self._bid(real_s, time_s)
 
     def _claim_choice(self, real_s: float) -> None:
@@ -297,11 +304,11 @@ class Participant:
         if real_s < self.changed_s + QUIET_S and real_s < self._chosen_s + self._timing.window_s:
             return
         bids = self._fresh_bids(real_s)
-        choices = {arm: bid.choice for arm, bid in bids.items() if bid.choice}
-        bidding = self._bidding(bids, choices.values())
-        job, self._choice = self._choice, ""
-        if resolve_claims(bidding, choices, self._fleet.arms).get(job) == self.name:
-            self.claimant.request(self.jobs[job], real_s)
+        choices = {arm: Choice(bid.choice, bid.choice_plan) for arm, bid in bids.items() if bid.choice}
+        bidding = self._bidding(bids, [choice.job for choice in choices.values()])
+        (job, plan), self._choice = self._choice, NO_CHOICE
+        if resolve_claims(bidding, choices, self._fleet.arms).get(job) == (self.name, plan):
+            self.claimant.request(self.jobs[job], plan, real_s)
         else:
             self._lost = True
 

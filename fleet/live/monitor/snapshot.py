@@ -8,6 +8,7 @@ import math
 from collections import Counter
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
+from itertools import repeat
 from typing import Literal, TypeVar
 
 import msgspec
@@ -28,6 +29,15 @@ Role = Literal["arm", "auction"]
 Message = TypeVar("Message", bound=msgspec.Struct)
 
 
+class JobScore(msgspec.Struct, frozen=True):
+    """What an arm says about a job; None where it knows nothing."""
+
+    peak_c: float | None = None
+    """Predicted temperature of the hottest motor during the job."""
+    p_saturation: float | None = None
+    difficulty: float | None = None
+
+
 class ArmSnapshot(msgspec.Struct, frozen=True):
     """An arm as its messages show it; ages are real seconds, None without a message."""
 
@@ -45,8 +55,8 @@ class ArmSnapshot(msgspec.Struct, frozen=True):
     job: str = ""
     away: bool = False
     """It says that it is away from home."""
-    difficulty: dict[str, float | None] = {}
-    """Difficulty of the jobs that have not ended; None without a score."""
+    scores: dict[str, JobScore] = {}
+    """Of the jobs that have not ended."""
     joints: int | None = None
     twin: str = ""
     event: str = ""
@@ -222,7 +232,8 @@ def _arm_snapshot(name: str, arm: _Arm, now_s: float, speed: float | None, ended
     (state, state_s), (scores, scores_s) = arm.last(State), arm.last(DifficultyScores)
     (info, _), (event, _) = arm.last(Info), arm.last(ArmEvent)
     age_s = now_s - state_s if state else None
-    difficulty = zip(scores.jobs, scores.difficulty, strict=True) if scores else ()
+    columns = (scores.peak_c or repeat(None), scores.p_saturation, scores.difficulty) if scores else ()
+    by_job = zip(scores.jobs, map(JobScore, *columns), strict=True) if scores else ()
     difficulty_age_s = now_s - scores_s if scores else None
     if scores and state and speed:  # from a cache it may arrive long after it was sent
         difficulty_age_s = max(now_s - scores_s, now_s - state_s + (state.time_s - scores.time_s) / speed)
@@ -239,7 +250,7 @@ def _arm_snapshot(name: str, arm: _Arm, now_s: float, speed: float | None, ended
         headroom_k=state.headroom_k if state else None,
         job=state.job if state else "",
         away=bool(state and state.space),
-        difficulty={job: score for job, score in difficulty if job not in ended},
+        scores={job: score for job, score in by_job if job not in ended},
         joints=info.joints if info else None,
         twin=info.twin if info else "",
         event=describe_event(event) if event else "",

@@ -10,7 +10,7 @@ import msgspec
 import typer
 
 from fleet.bus.client.client import BusClient
-from fleet.bus.client.discover import fleets_at
+from fleet.bus.client.discover import fleets_at, other_versions
 from fleet.bus.client.replies import Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Clock, ClockRequest
@@ -104,7 +104,17 @@ def examine(
         snapshot = listener.view.snapshot(now_s)
         problems = {"malformed": link.malformed, "complaints": tuple(link.rejections), "overrun": link.overrun}
     secure = identified(endpoint)[1] is not None
-    report = check_health(snapshot, now_s, probes, auctioneer=auctioneer, secure=secure, expected=expected, **problems)
+    others = other_versions(endpoint, fleet)
+    report = check_health(
+        snapshot,
+        now_s,
+        probes,
+        auctioneer=auctioneer,
+        secure=secure,
+        expected=expected,
+        other_versions=others,
+        **problems,
+    )
     return snapshot, report
 
 

@@ -5,6 +5,8 @@ import os
 
 import pytest
 
+from fleet.bus.client.discover import other_versions
+from fleet.bus.client.router import open_client
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Announcement,
@@ -160,3 +162,12 @@ def test_the_status_of_1500_jobs_fits_into_one_message_with_open_jobs_first(bus)
     reply = status_reply("x", 0.0, (first, *status.jobs * 2), taken)
     assert (len(reply.jobs) > 0, reply.jobs[0].state, len(reply.space)) == (True, "waiting", 1000)
     assert len(encode(reply)) < 65_536
+
+
+def test_an_arm_of_an_older_version_is_named_with_its_version(bus):
+    bus.arm("arm 2")
+    with open_client(bus.endpoint, timeout_s=5.0) as session:
+        token = session.liveliness().declare_token("thermofleet/v2/f/arm/arm%201/alive")
+        (sentence,) = other_versions(bus.endpoint, "f")
+        token.undeclare()
+    assert sentence.startswith("'arm 1' uses version v2 of the bus, and this program v3")

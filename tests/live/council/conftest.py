@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from agents.consensus import Consensus
-from fleet.bus.protocol.auction import JobEstimate, JobSpec
+from fleet.bus.protocol.auction import JobEstimate, JobSpec, PlanQuote
 from fleet.errors import JournalFull, Refused
 from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
 from fleet.live.arm.journal_records import ArmHistory
@@ -107,7 +107,7 @@ class Arm:
     def estimate(self, jobs):
         return tuple(self.fleet.offer(self.name, job) for job in jobs)
 
-    def space_of(self, job: JobSpec) -> str:
+    def space_of(self, job: JobSpec, plan: int) -> str:
         return f"{self.name}: {job.name}"
 
     def unfit(self) -> str:
@@ -227,13 +227,8 @@ class Fleet:
     def offer(self, arm: str, job: JobSpec) -> JobEstimate:
         """Return an estimate that depends on the names of arm and job only; some pairs are infeasible."""
         d = random.Random(f"{arm} {job.name}").random()
-        return JobEstimate(
-            job=job.name,
-            feasible=d > 0.1 or arm == self.names[0],
-            difficulty=d,
-            finish_in_s=10.0,
-            space=f"{arm}: {job.name}",
-        )
+        plan = PlanQuote(difficulty=d, finish_in_s=10.0, space=f"{arm}: {job.name}")
+        return JobEstimate(job.name, (plan,) if d > 0.1 or arm == self.names[0] else ())
 
     def last_cycle(self, job: str) -> None:
         self.last_cycles[job] = self.last_cycles.get(job, 0) + 1
