@@ -218,3 +218,24 @@ def test_a_job_that_an_arm_has_is_not_given_up_and_finishing_it_counts_more():
     assert granter.status("j", 0.3).state == "finished"
     granter.apply_outcome(JobOutcome("j", "b-1", "b", "given_up", 9, 3.0))
     assert granter.status("j", 0.3).state == "finished"
+
+
+def test_a_job_that_still_waits_at_its_hard_due_date_is_given_up_with_its_successors(live):
+    spec = {"kind": "hold", "places": ("x",), "repetitions": 2, "due_s": 5.0, "expires": True}
+    begun, late = JobSpec(name="begun", **spec), JobSpec(name="late", **(spec | {"repetitions": 90}))
+    after, soft = (
+        JobSpec(name="z", kind="hold", places=("y",), after=("late",)),
+        JobSpec(name="soft", **spec, value=0.0),
+    )
+    soft = msgspec.structs.replace(soft, expires=False)
+    fleet = live.Fleet([live.Arm("arm_0")])
+    fleet.submit(begun, late, after, soft)
+    fleet.step(4.9)
+    fleet.run_without_faults(3.0, 0.1)
+    fleet.auctioneer = fleet.restart()
+    fleet.run_without_faults(30.0)
+    told = {status.job: (status.state, status.reason) for status in fleet.auctioneer.status()}
+    assert told["begun"] == ("finished", "")
+    assert told["soft"] == ("finished", "")
+    assert told["late"] == ("given_up", "expired: its due date passed before an arm had begun it.")
+    assert told["z"] == ("given_up", "Given up, because it waits for 'late', which is given up.")

@@ -129,7 +129,10 @@ def test_the_same_observation_gives_the_same_choice_simulated_and_live(small, na
 
 
 def test_quotes_become_observations() -> None:
-    jobs = (JobSpec("a", "hold", ("x",), due_s=150.0, value=2.0, release_s=40.0), JobSpec("b", "hold", ("y",)))
+    jobs = (
+        JobSpec("a", "hold", ("x",), due_s=150.0, value=2.0, release_s=40.0),
+        JobSpec("b", "hold", ("y",), due_s=9e3, expires=True),
+    )
     fast = PlanQuote(0, 55.0, 9.0, 0.25, None, 1.5, 60.0, 100.0)
     cool = PlanQuote(1, 50.0, 4.0, 0.125, None, 1.25, 55.0, 95.0)
     quotes = {
@@ -158,7 +161,8 @@ def test_quotes_become_observations() -> None:
     assert two.p_saturation.tolist() == [0.5, 0.5, 1.0, 0.5]  # by its peak
     assert one.duration_s.tolist() == [60.0, 55.0, 0, 0]
     assert two.duration_s.tolist() == [0, 0, 60.0, 0]  # missing: as the longest
-    assert one.slack_s.tolist() == [-10.0, -5.0, LONG_S, LONG_S]
+    assert one.slack_s.tolist() == [-10.0, -5.0, 0.0, 0.0]
+    assert one.expires.tolist() == [0, 1]
     assert one.age_s.tolist() == [10.0, 100.0]
     assert one.returns.tolist() == [2, 0]
     assert two.temp_c.tolist() == [30.0] * 6 + [55.0]

@@ -55,10 +55,12 @@ class JobSpec(msgspec.Struct, frozen=True, omit_defaults=True):
     release_s: Annotated[float, _bounds("release_s")] = 0.0
     """Earliest start."""
     due_s: Annotated[float, _bounds("due_s")] | None = None
-    """Soft deadline; null for none."""
+    """Due date; null for none."""
     value: Annotated[float, _bounds("value")] = 1.0
     after: tuple[Name, ...] = ()
     """Jobs that must be finished before."""
+    expires: bool = False
+    """The due date is hard: the job is given up if it still waits then."""
 
     def __post_init__(self) -> None:
         check_places(self, self.kind, self.places)

@@ -138,6 +138,7 @@ class Estimator:
             due_s=np.inf if job.due_s is None else job.due_s,
             value=job.value,
             after=job.after,
+            expires=job.expires,
         )
 
     def plans(self, job: JobSpec) -> tuple[ScoredPlan, ...]:

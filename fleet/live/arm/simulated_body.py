@@ -233,15 +233,22 @@ class SimulatedBody:
         if not self._working:
             if task.allowed <= task.before:
                 return False
-            table = replace(self._world.jobs, repetitions=np.array([[task.allowed - task.before]]))
-            self._world = replace(self._world, jobs=table)
+            self._set_repetitions(task.allowed - task.before)
             self._state = self._carried(self._world)
             return True
         if self._in_stint:
             todo = max(task.allowed - task.before, self._begun())
             if todo != state.todo[0, 0]:
-                self._state = state._replace(todo=np.array([[todo]]))
+                self._set_repetitions(todo)  # otherwise the engine takes the job for given back
+                approach_s, cycle_s, _ = self._times_s
+                # A job that ends at this very moment has not ended for the engine yet.
+                progress_s = min(self._progress_s, approach_s + todo * cycle_s - 2 * ROUNDING_S)
+                self._state = state._replace(todo=np.array([[todo]]), progress_s=np.array([[progress_s]]))
         return False
+
+    def _set_repetitions(self, count: int) -> None:
+        table = replace(self._world.jobs, repetitions=np.array([[count]]))
+        self._world = replace(self._world, jobs=table)
 
     def _job_events(self, task: _Current, done: int, log: list[Event], shift_s: float) -> list[Event]:
         """Return the events of the current job in a step; drop the job where it ended.

@@ -227,6 +227,7 @@ class Auctioneer:
     def tick(self, real_s: float, time_s: float) -> None:
         """Do what is due."""
         self._expire(real_s, time_s)
+        self._try_to_record("Late jobs are not given up", *self.ledger.expired(time_s))
         self.out.extend(send_again(self._leases, real_s, self._timing))
         if self._round is None:
             if real_s >= self._scan_s:
@@ -371,8 +372,6 @@ class Auctioneer:
             until_s = real_s + self._timing.counted_lease_s
             self._leases[record.award] = CountedLease(until_s, unanswered=message, sent_s=real_s)
             self.out.append(message)
-
-    # Records
 
     def _record(self, *records: AuctionRecord) -> None:
         """Write records, then apply them.

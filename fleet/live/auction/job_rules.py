@@ -67,6 +67,14 @@ def admit(
     )
 
 
+EXPIRED = "expired: its due date passed before an arm had begun it."
+
+
+def is_late(job: JobSpec, time_s: float) -> bool:
+    """Return whether a job that still waits has expired at a fleet time."""
+    return job.expires and job.due_s is not None and job.due_s < time_s
+
+
 def lost_jobs(jobs: Collection[JobSpec], given_up: Container[str]) -> dict[str, str]:
     """Return why jobs are given up that wait for one that is, directly or not, by name."""
     reasons: dict[str, str] = {}

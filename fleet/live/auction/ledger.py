@@ -13,7 +13,16 @@ from msgspec.structs import asdict, replace
 
 from fleet.bus.protocol.auction import SETTLED, Admission, JobSpec, JobState, JobStatus
 from fleet.job import reason_to_give_up
-from fleet.live.auction.job_rules import SHIFT_ENDED, admit, job_order, lost_jobs, ready_jobs, reason_for_silence
+from fleet.live.auction.job_rules import (
+    EXPIRED,
+    SHIFT_ENDED,
+    admit,
+    is_late,
+    job_order,
+    lost_jobs,
+    ready_jobs,
+    reason_for_silence,
+)
 from fleet.live.journal import TimedState
 from fleet.live.journal_records import (
     ClockTick,
@@ -64,6 +73,13 @@ class ContactRegained(msgspec.Struct, frozen=True, tag="contact_regained"):
     time_s: float
 
 
+class Expired(msgspec.Struct, frozen=True, tag="expired"):
+    """A waiting job is given up: its hard due date has passed."""
+
+    job: str
+    time_s: float
+
+
 class ShiftEnded(msgspec.Struct, frozen=True, tag="shift_ended"):
     """The fleet's shift is over; open jobs stay unfinished."""
 
@@ -99,6 +115,8 @@ class JobEntry(msgspec.Struct):
     """Fleet time of the last return."""
     faults: tuple[str, ...] = ()
     """The arm of each fault in this job."""
+    expired: bool = False
+    """It waited when its hard due date passed."""
 
 
 class AwardState(msgspec.Struct):
@@ -130,7 +148,7 @@ class LedgerSnapshot(msgspec.Struct, frozen=True, tag="ledger_snapshot"):
 
 AwardRecord = Awarded | CommitPermitted | ContactLost | ContactRegained | Closed
 AuctionRecord = (
-    Started | ClockTick | JobsAccepted | AwardRecord | SpaceTaken | SpaceCleared | ShiftEnded | LedgerSnapshot
+    Started | ClockTick | JobsAccepted | AwardRecord | SpaceTaken | SpaceCleared | Expired | ShiftEnded | LedgerSnapshot
 )
 
 
@@ -174,6 +192,12 @@ class Ledger(TimedState[AuctionRecord]):
         waiting = (entry.spec for entry in entries if entry.state == "waiting")
         busy = self.busy_stations()
         return ready_jobs(waiting, time_s, limit, busy, lambda name: self.jobs[name].state == "finished")
+
+    def expired(self, time_s: float) -> list[Expired]:
+        """Return the waiting jobs whose hard due date has passed."""
+        entries = () if self.ended else self.jobs.values()
+        late = (entry.spec.name for entry in entries if entry.state == "waiting" and is_late(entry.spec, time_s))
+        return [Expired(name, time_s) for name in late]
 
     def busy_stations(self) -> frozenset[str]:
         """Return the stations at which an arm may be at work; a silent arm does not block its station."""
@@ -251,6 +275,10 @@ class Ledger(TimedState[AuctionRecord]):
             case Closed():
                 changed = self._close(record)
                 changed += [entry for entry in self._follow_given_up() if entry not in changed]
+            case Expired():
+                entry = self.jobs[record.job]
+                entry.state, entry.reason, entry.expired = "given_up", EXPIRED, True
+                changed = [entry, *self._follow_given_up()]
             case SpaceTaken():
                 self.space[record.arm] = frozenset(record.space)
             case SpaceCleared():
@@ -315,12 +343,11 @@ class Ledger(TimedState[AuctionRecord]):
 
         They wait again if that one was finished after all.
         """
-        given_up = [entry for entry in self.jobs.values() if entry.state == "given_up"]
-        if not given_up:
+        if not (given_up := [entry for entry in self.jobs.values() if entry.state == "given_up"]):
             return []
-        causes = {entry.spec.name for entry in given_up if reason_to_give_up(entry.faults)}
+        causes = {entry.spec.name for entry in given_up if entry.expired or reason_to_give_up(entry.faults)}
         lost = lost_jobs([entry.spec for entry in self.jobs.values()], causes)
-        changed: list[JobEntry] = []
+        changed = list[JobEntry]()
         for name, entry in self.jobs.items():
             state = "given_up" if name in causes or name in lost else "waiting"
             if entry.state in ("waiting", "given_up") and entry.state != state:

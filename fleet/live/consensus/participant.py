@@ -14,7 +14,7 @@ job: where messages are lost two arms may claim one, and the one without a major
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from random import Random
 
@@ -24,7 +24,7 @@ from fleet.bus.protocol.auction import JobEstimate, JobSpec, JobStatus, Quote
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply
 from fleet.bus.protocol.messages import State
 from fleet.live.arm.node import ArmNode
-from fleet.live.auction.job_rules import SHIFT_ENDED, job_order, lost_jobs, ready_jobs
+from fleet.live.auction.job_rules import EXPIRED, SHIFT_ENDED, is_late, job_order, lost_jobs, ready_jobs
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.round import Bidding, Choice, Timing, resolve_claims
 from fleet.live.consensus.claimant import NUMBERS_PER_BOOT, Claimant
@@ -112,7 +112,7 @@ class Participant:
         self._pauses: dict[str, int] = {}
         self._behind_s: dict[str, float] = {}
         """Real second since which a peer knows fewer outcomes."""
-        self._corrected = 0
+        self._corrected, self._time_s = 0, 0.0
 
     # Messages
 
@@ -172,6 +172,7 @@ class Participant:
 
     def tick(self, real_s: float, time_s: float) -> None:
         """Do what is due."""
+        self._time_s = time_s
         for job in self.claimant.rejected:
             self._lost = True
             self._pause(job, real_s)
@@ -188,8 +189,16 @@ class Participant:
         """Return the jobs that can still be done, without those of absent arms that had permission to commit."""
         register = self.granter.register
         gone = {job for job in self.granter.out_of_contact(real_s) if register.grants[job].arm not in self._present}
-        gone.update(register.settled, lost_jobs(self.jobs.values(), register.given_up))
+        gone.update(register.settled, self._given_up(self.jobs, real_s))
         return [job for job in self.jobs if job not in gone]
+
+    def _given_up(self, jobs: Mapping[str, JobSpec], real_s: float) -> dict[str, str]:
+        """Return why jobs are given up in which no arm has faulted too often: they expired, or wait for one that is."""
+        late = (job.name for job in jobs.values() if is_late(job, self._time_s))
+        settled = self.granter.register.settled
+        expired = {name for name in late if name not in settled and not self.granter.is_granted(name, real_s)}
+        causes = self.granter.register.given_up | expired
+        return dict.fromkeys(expired, EXPIRED) | lost_jobs(jobs.values(), causes)
 
     def all_settled(self, real_s: float) -> bool:
         """Return whether every present arm, a majority at least, knows that every job is settled."""
@@ -202,7 +211,7 @@ class Participant:
     def status(self, later: Iterable[JobSpec], real_s: float) -> list[JobStatus]:
         """Return the status of all known jobs, and of `later` ones that are not offered yet."""
         jobs = self.jobs | {job.name: job for job in later}
-        lost = lost_jobs(jobs.values(), self.granter.register.given_up)
+        lost = self._given_up(jobs, real_s)
         names = dict.fromkeys([*jobs, *self.granter.register.settled])
         statuses = [self.granter.status(name, real_s) for name in names]
         statuses = [
@@ -228,6 +237,7 @@ class Participant:
             for name, job in self.jobs.items()
             if name not in settled
             and not self.granter.is_granted(name, real_s)
+            and not is_late(job, time_s)
             and self._later_s.get(name, -math.inf) <= real_s
         )
 

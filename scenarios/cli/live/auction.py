@@ -151,6 +151,7 @@ def job_spec(job: Job) -> JobSpec:
         due_s=job.due_s,
         value=job.value,
         after=job.after,
+        expires=job.expires,
     )
 
 
