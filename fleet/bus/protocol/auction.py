@@ -202,12 +202,12 @@ class Award(msgspec.Struct, frozen=True):
     quote: Name
     """The quote that it refers to."""
     job: JobSpec
-    plan: Count = 0
-    """Number of the quoted plan by which to do it."""
     cycles: Count = 0
     """Cycles of the job that others have done already."""
     lease_s: Positive = LEASE_S
     """Real seconds that the arm may work on it without renewing the lease, counted from its quote."""
+    plan: Count = 0
+    """Number of the quoted plan by which to do it."""
 
 
 class Ack(msgspec.Struct, frozen=True):

@@ -366,7 +366,7 @@ class Auctioneer:
         for record in records:
             self._notes.pop(record.job, None)
             spec = self.ledger.jobs[record.job].spec
-            terms = (record.quote, spec, record.plan, record.cycles, self._timing.lease_s)
+            terms = (record.quote, spec, record.cycles, self._timing.lease_s, record.plan)
             award = Award(record.award, bidding.auction, self.name, *terms)
             message = SendAward(record.arm, award)
             until_s = real_s + self._timing.counted_lease_s

@@ -259,7 +259,7 @@ class Claimant:
 
     def _accept(self, award: str, pending: PendingClaim, vote: Vote, real_s: float) -> None:
         cycles = min(vote.cycles, pending.job.repetitions - 1)  # the last cycle is never assumed done
-        terms = (pending.quote, pending.job, pending.plan, cycles, self._timing.lease_s)
+        terms = (pending.quote, pending.job, cycles, self._timing.lease_s, pending.plan)
         granted = Award(award, award, self.arm, *terms)
         ack = self._answer_award(granted, real_s)
         if ack.accepted:
