@@ -26,7 +26,7 @@ import zenoh
 from fleet.bus.client.client import BusClient
 from fleet.bus.client.router import Router, open_client
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import Ack, Award, JobEstimate, JobSpec, Quote, QuoteRequest, Submission
+from fleet.bus.protocol.auction import Ack, Award, JobEstimate, JobSpec, PlanQuote, Quote, QuoteRequest, Submission
 from fleet.bus.protocol.messages import State, encode
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.ledger import AuctionRecord, Awarded
@@ -53,7 +53,8 @@ def route(port: Any, stop: Any) -> None:
 def offer(word: JobSpec, number: int) -> JobEstimate:
     """Offer with numbers of typical length, different for every arm."""
     d = tuple(0.123456789 * (1 + joint + number) for joint in range(JOINTS))
-    return JobEstimate(word.name, True, "", d, sum(d), 0.0123456789 * number, 51.23456789, 123.456789, 234.56789)
+    heat = (51.23456789, 9.123456789, 0.0123456789 * number, d, sum(d))
+    return JobEstimate(word.name, tuple(PlanQuote(plan, *heat, 123.456789, 234.56789) for plan in range(2)))
 
 
 def arm(endpoint: str, number: int, quote_size: int, ready: Any, stop: Any) -> None:

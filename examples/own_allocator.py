@@ -25,7 +25,7 @@ class Allocator:
     """Jobs, their status and their awards. All methods run on one thread; queries of arms block it."""
 
     def __init__(self, session, fleet):
-        self.session, self.root = session, f"thermofleet/v2/{quote(fleet, safe='')}"
+        self.session, self.root = session, f"thermofleet/v3/{quote(fleet, safe='')}"
         self.own_key = f"{self.root}/auction/{NAME}"
         self.inbox, self.started_s = queue.SimpleQueue(), time.monotonic()
         self.jobs = {}  # name -> job as submitted
@@ -113,7 +113,7 @@ class Allocator:
     # Rounds
 
     def auction(self):
-        """Run one round: query all arms, award each waiting job to the arm with the lowest difficulty."""
+        """Run one round: query all arms, award each waiting job to the arm and plan with the lowest difficulty."""
         busy = {place for job in self.jobs.values() if self.is_awarded(job) for place in job["places"]}
         finished = {name for name, status in self.status.items() if status["state"] == "finished"}
         waiting = [
@@ -131,18 +131,22 @@ class Allocator:
         capacity = {arm: quote["capacity"] for arm, quote in quotes.items()}
         for index, job in enumerate(waiting):
             estimates = {arm: quote["estimates"][index] for arm, quote in quotes.items() if capacity[arm] > 0}
-            feasible = [(e.get("difficulty") or 0.0, arm) for arm, e in estimates.items() if e["feasible"]]
-            if feasible and busy.isdisjoint(job["places"]):  # one arm at a station
-                _, arm = min(feasible)
+            offers = [
+                (plan.get("difficulty") or 0.0, arm, plan.get("plan", 0))
+                for arm, estimate in estimates.items()
+                for plan in estimate.get("plans", ())
+            ]
+            if offers and busy.isdisjoint(job["places"]):  # one arm at a station
+                _, arm, plan = min(offers)
                 capacity[arm] -= 1
                 busy.update(job["places"])
-                self.award(job, arm, name, quotes[arm]["quote"])
+                self.award(job, arm, plan, name, quotes[arm]["quote"])
 
     def is_awarded(self, job):
         """Whether an arm has the job."""
         return self.status[job["name"]]["state"] in ("awarded", "finishing")
 
-    def award(self, job, arm, auction, quote_name):
+    def award(self, job, arm, plan, auction, quote_name):
         """Award a job; without a reply, send the same award again, which an arm accepts only once.
 
         Without any reply it is unknown whether the arm has the job, so it counts as awarded until its lease has ended.
@@ -154,6 +158,7 @@ class Allocator:
             "auctioneer": NAME,
             "quote": quote_name,
             "job": job,
+            "plan": plan,
             "cycles": status["cycles"],
             "lease_s": LEASE_S,
         }
@@ -249,7 +254,7 @@ class Allocator:
 
 def encoding(name):
     """Return the Zenoh encoding of a message type; messages with another one are malformed."""
-    return f"application/json;thermofleet.{name}.v2"
+    return f"application/json;thermofleet.{name}.v3"
 
 
 def main(port, fleet, seconds=float("inf")):

@@ -27,7 +27,7 @@ class Arm:
 
     def __init__(self, session, fleet, name):
         self.session, self.name, self.inbox = session, name, queue.SimpleQueue()
-        self.root = f"thermofleet/v2/{quote(fleet, safe='')}"
+        self.root = f"thermofleet/v3/{quote(fleet, safe='')}"
         self.own_key = f"{self.root}/arm/{quote(name, safe='')}"
         self.temp_c, self.tick = AMBIENT_C, 0
         self.zero_s, self.speed = self.query_clock()
@@ -123,19 +123,19 @@ class Arm:
         }
 
     def estimate(self, job):
-        """Return a JobEstimate; unknown values are left out."""
+        """Return a JobEstimate, with one plan; unknown values are left out."""
         if job["kind"] == "press":
-            return {"job": job["name"], "feasible": False, "reason": "This arm cannot press."}
+            return {"job": job["name"], "reason": "This arm cannot press."}
         cycles, d = job.get("repetitions", 1), 0.1 * job.get("payload_kg", 0.0)
-        return {
-            "job": job["name"],
-            "feasible": True,
+        plan = {
+            "peak_c": self.temp_c + 0.1 * cycles,
+            "gained_k": 0.1 * cycles,
             "joint_difficulty": [d],
             "difficulty": d,
-            "peak_c": self.temp_c + 0.1 * cycles,
             "duration_s": CYCLE_S * cycles,
             "finish_in_s": CYCLE_S * cycles,
         }
+        return {"job": job["name"], "plans": [plan]}
 
     def accept(self, award):
         """Accept or reject an award. The same award gets the same reply; a quote is valid once and for VALID_S."""
@@ -145,6 +145,8 @@ class Arm:
             reason = ""
             if quoted_s is None or time.monotonic() > quoted_s + VALID_S:
                 reason = "The quote is unknown or too old."
+            elif award.get("plan", 0) != 0:
+                reason = "The quote has no such plan."
             elif self.job:
                 reason = "This arm has a job."
             else:
@@ -164,10 +166,10 @@ class Arm:
         return self.acks[name]
 
     def work(self):
-        """Do a cycle if it is time and the lease is valid; the last one only with permission to commit."""
+        """Do a cycle if it is time and the lease is valid; the last one only with permission to commit too."""
         self.temp_c += 0.01 * (AMBIENT_C - self.temp_c)
         job, now = self.job, time.monotonic()
-        if job is None or now < job["ready_s"] or (now > job["lease_end_s"] and not job["may_commit"]):
+        if job is None or now < job["ready_s"] or now > job["lease_end_s"]:
             return
         if job["cycles"] >= job["repetitions"] - 1 and not job["may_commit"]:
             return
@@ -175,17 +177,15 @@ class Arm:
         job["ready_s"] = now + CYCLE_S
         self.temp_c += 0.1
         if job["cycles"] >= job["repetitions"]:
-            self.job = None
-            report = {
-                "arm": self.name,
-                "award": job["award"],
-                "job": job["job"],
-                "outcome": "finished",
-                "cycles": job["cycles"],
-                "time_s": self.now_s(),
-            }
-            self.reports[job["award"]] = (job["auctioneer"], report)
-            self.send(job["auctioneer"], "report", "Report", report, self.apply_receipt)
+            self.report("finished")
+
+    def report(self, outcome):
+        """Report the outcome of the current job: "finished" or "returned"."""
+        job, self.job = self.job, None
+        report = {name: job[name] for name in ("award", "job", "cycles")}
+        report |= {"arm": self.name, "outcome": outcome, "time_s": self.now_s()}
+        self.reports[job["award"]] = (job["auctioneer"], report)
+        self.send(job["auctioneer"], "report", "Report", report, self.apply_receipt)
 
     def renew_lease(self):
         """Request the lease of the current job again, and repeat reports without receipt."""
@@ -201,7 +201,7 @@ class Arm:
             )
 
     def apply_lease(self, lease, sent_s):
-        """Extend the lease, measured from when the request was sent. Permission to commit is never withdrawn."""
+        """Extend the lease, measured from when the request was sent. Return a revoked job: no cycle is in progress."""
         job = self.job
         if job is None:
             return
@@ -209,13 +209,13 @@ class Arm:
             job["may_commit"] = True
         if job["award"] in lease["granted"]:
             job["lease_end_s"] = sent_s + (1 - DRIFT) * lease["lease_s"]
-        elif job["award"] in lease["revoked"] and not job["may_commit"]:
-            self.job = None
+        elif job["award"] in lease["revoked"]:
+            self.report("returned")
 
     def apply_receipt(self, receipt):
         """Stop repeating a report: it is on the auctioneer's disk."""
         if self.reports.pop(receipt["award"], None):
-            print(f"finished {receipt['award']}", flush=True)
+            print(f"reported {receipt['award']}", flush=True)
 
     def send(self, auctioneer, topic, name, request, apply):
         """Query the auctioneer without waiting; call `apply` with the reply, if there is one."""
@@ -231,14 +231,16 @@ class Arm:
 
     def publish_difficulty(self, estimates):
         """Publish the difficulty of the open jobs."""
+        plans = [next(iter(estimate.get("plans", ())), {}) for estimate in estimates]
         message = {
             "arm": self.name,
             "tick": self.tick,
             "time_s": self.now_s(),
             "twin": "mock",
             "jobs": [estimate["job"] for estimate in estimates],
-            "difficulty": [estimate.get("difficulty") for estimate in estimates],
-            "p_saturation": [None for _ in estimates],
+            "difficulty": [plan.get("difficulty") for plan in plans],
+            "p_saturation": [None for _ in plans],
+            "peak_c": [plan.get("peak_c") for plan in plans],
         }
         self.difficulty.put(json.dumps(message))
 
@@ -264,7 +266,7 @@ class Arm:
 
 def encoding(name):
     """Return the Zenoh encoding of a message type; messages with another one are malformed."""
-    return f"application/json;thermofleet.{name}.v2"
+    return f"application/json;thermofleet.{name}.v3"
 
 
 def connect(port):

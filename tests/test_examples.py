@@ -27,6 +27,7 @@ from fleet.bus.protocol.auction import (
     Lease,
     LeaseEntry,
     LeaseRequest,
+    PlanQuote,
     Quote,
     QuoteRequest,
     Receipt,
@@ -166,7 +167,7 @@ def test_own_arm_keeps_the_rules_towards_a_strict_auctioneer(bus):
         quote = question("quote", QuoteRequest(auction="r", jobs=(JOB,)), Quote)
         assert quote.estimates[0].feasible
         serve(lambda: scores, auctioneer)
-        assert scores[0].difficulty == (quote.estimates[0].difficulty,)
+        assert scores[0].difficulty == (quote.estimates[0].plans[0].difficulty,)
         award = Award(award="r-crate", auction="r", auctioneer="a", quote=quote.quote, job=JOB)
         first, again = (question("award", award, Ack) for _ in range(2))
         assert first == again
@@ -197,7 +198,7 @@ def test_own_allocator_keeps_the_rules_towards_a_strict_arm(bus):
     leases, receipts = [], []
 
     def offer(job):
-        return JobEstimate(job=job.name, feasible=True, difficulty=0.5)
+        return JobEstimate(job.name, (PlanQuote(difficulty=0.5),))
 
     def quote(request):
         return Quote(
@@ -285,9 +286,9 @@ def rubbish_at():
 
         def ask(example, topic, payload, said):
             key = keys.of_arm("f", "x", topic) if example == "own_arm" else keys.asked_by("f", "own", topic, "x")
-            encoding = said or f"application/json;thermofleet.{words[topic]}.v2"
+            encoding = said or f"application/json;thermofleet.{words[topic]}.v3"
             (reply,) = list(line._session.get(key, payload=payload, encoding=encoding, timeout=PATIENCE_S))
-            assert str(reply.ok.encoding) == "application/json;thermofleet.Refusal.v2"
+            assert str(reply.ok.encoding) == "application/json;thermofleet.Refusal.v3"
             return json.loads(reply.ok.payload.to_string())["reason"]
 
         yield ask

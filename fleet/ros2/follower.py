@@ -171,7 +171,7 @@ class Follower:
         state = self._state(now_s)
         if state is None:
             raise Refused(f"There is {self._readings.missing(now_s)}.")
-        estimates = tuple(JobEstimate(job.name, feasible=False, reason=self._refusal) for job in request.jobs)
+        estimates = tuple(JobEstimate(job.name, reason=self._refusal) for job in request.jobs)
         return Quote(
             arm=self._arm,
             auction=request.auction,

@@ -4,7 +4,7 @@ from agents.policy import Policy
 from fleet.env.validation import actions_of
 from fleet.errors import FleetError
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
-from fleet.live.auction.round import Allocate, Bidding, resolve_claims
+from fleet.live.auction.round import Allocate, Assignment, Bidding, resolve_claims
 from scenarios.policy_loader import policy_at, scope_of
 from scenarios.schema import Scenario
 
@@ -17,13 +17,13 @@ class CentralAllocation:
         self._policy, self._fleet = policy, fleet
         self._lost: set[str] = set()
 
-    def __call__(self, bidding: Bidding) -> dict[str, str]:
-        """Arm of each job that is assigned: the claims of the policy, resolved as in simulation."""
+    def __call__(self, bidding: Bidding) -> dict[str, Assignment]:
+        """Arm and plan of each job that is assigned: the claims of the policy, resolved as in simulation."""
         seen = observe(bidding, self._fleet, lost=self._lost)
         actions = actions_of(list(seen), self._policy.act(seen)).tolist()
         claims = claimed_jobs(bidding, seen, dict(zip(seen, actions, strict=True)))
         awarded = resolve_claims(bidding, claims, self._fleet.order(bidding.quotes))
-        self._lost = set(claims) - set(awarded.values())
+        self._lost = set(claims) - {assignment.arm for assignment in awarded.values()}
         return awarded
 
 

@@ -1,6 +1,7 @@
 """A fleet as a table on the terminal, and as plain lines without a terminal."""
 
 from collections.abc import Iterable, Sequence
+from math import inf
 from typing import get_args
 
 from rich.console import Group
@@ -8,11 +9,12 @@ from rich.table import Table
 from rich.text import Text
 
 from fleet.bus.protocol.auction import JobState
-from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetSnapshot
+from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetSnapshot, JobScore
+from fleet.live.space import ANYWHERE
 
 HOT_K, WARM_K = 5.0, 10.0
 """Headroom below which an arm is shown in red, in yellow."""
-FRAME, EVENTS = 6, 6
+FRAME, EVENTS = 7, 6
 """Lines of the screen that are neither arms nor events; events shown."""
 _MODE_STYLES = {"faulted": "bold red", "working": "green"}
 
@@ -28,7 +30,7 @@ def screen(fleet: FleetSnapshot, events: Sequence[str], height: int) -> Group:
     parts: list[Table | Text] = [heading(fleet), arm_table(arms)]
     if len(arms) < len(fleet.arms):
         parts.append(Text(f"… and {len(fleet.arms) - len(arms)} more with more headroom", style="dim"))
-    parts.append(jobs_line(fleet))
+    parts += [jobs_line(fleet), space_line(fleet)]
     parts += [Text(event, style="dim", no_wrap=True, overflow="ellipsis") for event in events[-EVENTS:]]
     return Group(*parts)
 
@@ -54,7 +56,7 @@ def arm_table(arms: Iterable[ArmSnapshot]) -> Table:
     table.add_column("hot °C", min_width=7, no_wrap=True, justify="right")
     table.add_column("room K", min_width=6, no_wrap=True, justify="right")
     table.add_column("current job", no_wrap=True, overflow="ellipsis", ratio=2)
-    table.add_column("difficulty of open jobs", no_wrap=True, overflow="ellipsis", ratio=4)
+    table.add_column("open jobs: predicted peak, P, d", no_wrap=True, overflow="ellipsis", ratio=4)
     for name in ("state", "diff.", "token"):
         table.add_column(name, justify="right", min_width=5, no_wrap=True)
     for arm in arms:
@@ -79,6 +81,17 @@ def jobs_line(fleet: FleetSnapshot) -> Text:
     return Text(f"jobs: {counts or 'none'}", no_wrap=True, overflow="ellipsis")
 
 
+def space_line(fleet: FleetSnapshot) -> Text:
+    """The arms whose space is closed to others, and why."""
+    arms = {arm.arm: arm for arm in fleet.arms}
+    parts: list[str] = []
+    for name, spaces in fleet.space.items():
+        arm = arms.get(name)
+        where = "not present" if arm is None or not arm.present else "away from home" if arm.away else "has a job"
+        parts.append(f"{name} ({where}{', may be anywhere' if ANYWHERE in spaces else ''})")
+    return Text(f"space closed by: {', '.join(parts) or 'none'}", no_wrap=True, overflow="ellipsis")
+
+
 def arm_line(arm: ArmSnapshot) -> str:
     """An arm on one line."""
     scores = format_scores(arm)
@@ -88,7 +101,7 @@ def arm_line(arm: ArmSnapshot) -> str:
         "" if arm.hottest_c is None else f"{arm.hottest_c:.1f} °C J{arm.joint}",
         "" if arm.headroom_k is None else f"headroom {arm.headroom_k:.1f} K",
         f"job {arm.job}" if arm.job else "",
-        f"difficulty {scores}" if scores else "",
+        f"open jobs: {scores}" if scores else "",
         f"state {format_age(arm.state_age_s)}",
         "" if arm.token else "no token",
     ]
@@ -96,10 +109,21 @@ def arm_line(arm: ArmSnapshot) -> str:
 
 
 def format_scores(arm: ArmSnapshot) -> str:
-    """Difficulties of the open jobs, easiest first; a dash where the arm has no score."""
-    scored = sorted((difficulty, job) for job, difficulty in arm.difficulty.items() if difficulty is not None)
-    unscored = sorted(job for job, difficulty in arm.difficulty.items() if difficulty is None)
-    return ", ".join([*(f"{job} {difficulty:.2f}" for difficulty, job in scored), *(f"{job} —" for job in unscored)])
+    """Predicted peak, P and difficulty of the open jobs, coolest first; a dash for what the arm does not know."""
+
+    def figure(value: float | None, form: str) -> str:
+        return "—" if value is None else format(value, form)
+
+    def heat(item: tuple[str, JobScore]) -> tuple[float, float, str]:
+        name, score = item
+        peak_c, difficulty = (inf if each is None else each for each in (score.peak_c, score.difficulty))
+        return peak_c, difficulty, name
+
+    parts: list[str] = []
+    for job, score in sorted(arm.scores.items(), key=heat):
+        p, d = figure(score.p_saturation, ".2f"), figure(score.difficulty, ".2f")
+        parts.append(f"{job} {figure(score.peak_c, '.0f')} °C, P {p} (d {d})")
+    return "; ".join(parts)
 
 
 def format_age(seconds: float | None) -> str:

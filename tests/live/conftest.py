@@ -23,6 +23,7 @@ from fleet.bus.protocol.auction import (
     Lease,
     LeaseEntry,
     LeaseRequest,
+    PlanQuote,
     Quote,
     QuoteRequest,
     Receipt,
@@ -35,7 +36,7 @@ from fleet.errors import JournalFull, Refused
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.leases import SendAward
 from fleet.live.auction.ledger import AuctionRecord, Ledger
-from fleet.live.auction.round import Allocate, Timing
+from fleet.live.auction.round import Allocate, Assignment, Timing
 from fleet.live.journal_records import Closed, Started
 from fleet.live.space import Excludes, no_conflicts
 
@@ -43,14 +44,15 @@ VALID_S = 2.0
 TIMING = Timing(lease_s=3.0, margin_s=0.05, window_s=0.5, ack_s=0.5, max_jobs=8)
 
 
-def first_come(bidding) -> Mapping[str, str]:
+def first_come(bidding) -> Mapping[str, Assignment]:
     """Give each job to the first free arm that bids for it; one job per station."""
-    out: dict[str, str] = {}
+    out: dict[str, Assignment] = {}
     taken: set[str] = set()
     for job in bidding.jobs:
         for arm in sorted(bidding.quotes):
-            if arm not in out.values() and bidding.offer(arm, job.name) and not taken & set(job.places):
-                out[job.name] = arm
+            free = (arm, 0) not in out.values() and not taken & set(job.places)
+            if free and bidding.offer(arm, job.name):
+                out[job.name] = Assignment(arm)
                 taken |= set(job.places)
                 break
     return out
@@ -95,7 +97,8 @@ class ModelArm:
         name = f"{self.name}.{self.boots}.{len(self.quotes)}"
         self.quotes[name] = self.own_s(true_s)
         offers = tuple(
-            JobEstimate(job.name, True, finish_in_s=1.0, space=f"{self.name}: {job.name}") for job in request.jobs
+            JobEstimate(job.name, (PlanQuote(finish_in_s=1.0, space=f"{self.name}: {job.name}"),))
+            for job in request.jobs
         )
         jobs = {work.award.job.name for work in self.current.values()} | ({self.out} - {""})
         return Quote(
@@ -171,7 +174,7 @@ class ModelArm:
                 self.current[name].may_commit |= name in lease.may_commit
         for name in lease.revoked:
             if name in self.current and not self.current[name].in_last_cycle:
-                del self.current[name]
+                self._report(self.current.pop(name), "returned", asked_s, 0)
 
     def crash(self, true_s: float) -> None:
         """Lose everything but the journal, and return the current jobs; unsure of one in its last cycle.
@@ -184,6 +187,12 @@ class ModelArm:
         for work in self.current.values():
             self._report(work, "returned", true_s, work.cycles, unsure=work.in_last_cycle)
         self.current = {}
+
+    def move_home(self) -> None:
+        """Have a person break its cycle off and move it home; its process lives on."""
+        self.out, self.steps_home = "", 0
+        for work in self.current.values():
+            work.in_last_cycle = False
 
     def _report(self, work: Work, outcome, true_s: float, cycles: int, unsure: bool = False) -> None:
         award = work.award
@@ -258,10 +267,13 @@ class ModelFleet:
             excludes=self.excludes,
         )
 
-    def clear(self, name: str) -> None:
-        """Have a person stop an arm, move it home and free its space; it is started again."""
+    def clear(self, name: str, *, restart: bool = True) -> None:
+        """Have a person move an arm home and free its space; its process is started again, or lives on."""
         arm = self.arms[name]
-        arm.crash(self.true_s)
+        if restart:
+            arm.crash(self.true_s)
+        else:
+            arm.move_home()
         request = ClearRequest(name, "a person")
         with suppress(Refused):
             self.attempt(lambda: self.auctioneer.clear(request, frozenset(self.arms) - {name}, self.true_s))

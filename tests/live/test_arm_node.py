@@ -169,7 +169,7 @@ def test_a_job_goes_from_quote_to_receipt(bus):
     arm = bus.arm()
     quote = bus.ask(line, "quote", request(), Quote)
     assert (quote.capacity, quote.valid_s, quote.twin, quote.space) == (1, 3.0, "by payload", ())
-    (offer,) = quote.estimates
+    ((offer,),) = (estimate.plans for estimate in quote.estimates)
     assert offer.duration_s == pytest.approx(35.0)
     assert bus.ask(line, "award", award(quote.quote), Ack).accepted
     assert bus.ask(line, "quote", request(dry_run=True), Quote).space == (offer.space,)

@@ -15,6 +15,7 @@ from fleet.bus.protocol.auction import (
     Submission,
 )
 from fleet.errors import JournalFull, Refused
+from fleet.live.auction.round import Assignment
 
 
 @pytest.fixture
@@ -114,7 +115,8 @@ def test_a_station_gets_one_job_at_a_time(fleet_of):
 
 def test_an_allocation_against_the_bids_is_not_awarded(fleet_of, caplog):
     fleet = fleet_of(1)
-    fleet.auctioneer._allocate = lambda bidding: {"a": "unknown", "b": "arm_0", "c": "arm_0", "x": "arm_0"}
+    arms = {"a": "unknown", "b": "arm_0", "c": "arm_0", "x": "arm_0"}
+    fleet.auctioneer._allocate = lambda bidding: {job: Assignment(arm) for job, arm in arms.items()}
     bid(fleet, hold("a"), hold("b", "bin"), hold("c", "belt"))
     assert [award.job.name for award in in_transit(fleet, Award)] == ["b"]
     assert caplog.text.count("The policy gives") == 3
@@ -177,7 +179,7 @@ def test_the_status_of_an_infeasible_job_gives_the_reason(fleet_of):
     fleet.submit(hold("a"))
     fleet.step(0.1)
     (request,) = in_transit(fleet, QuoteRequest)
-    offers = (JobEstimate("a", False, "reach: 1.2 m"),)
+    offers = (JobEstimate("a", reason="reach: 1.2 m"),)
     quote = Quote("arm_0", request.auction, "q", 1.0, "model", 0.0, "idle", 10.0, 1, offers)
     fleet.auctioneer.add_quote(quote)
     fleet.step(0.0)

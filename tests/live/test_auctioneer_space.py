@@ -2,7 +2,8 @@
 
 import pytest
 
-from fleet.bus.protocol.auction import Award, ClearRequest, JobSpec, QuoteRequest
+from fleet.bus.protocol.auction import Award, ClearRequest, JobSpec, Lease, QuoteRequest, Report
+from fleet.bus.protocol.messages import State
 from fleet.errors import Refused
 from fleet.live.journal_records import SpaceTaken
 from fleet.live.space import ANYWHERE
@@ -99,9 +100,37 @@ def test_the_space_of_an_arm_lost_in_its_last_cycle_stays_taken(fleet_of):
         fleet.run_without_faults(0.1, 0.1, absent=name)
         fleet.check()
     assert states(fleet) == ["unfinished", "waiting"]
-    fleet.arms[name].out = ""  # a person moves it home
+    fleet.arms[name].move_home()
     clear(fleet, name)
     run_until(fleet, lambda: states(fleet) == ["unfinished", "finished"], absent=name)
+    run_until(fleet, lambda: states(fleet) == ["finished", "finished"])  # it returns the job, as it was not done
+
+
+@pytest.mark.parametrize("heard", [Lease, State, Report])
+def test_an_arm_that_is_heard_after_it_was_cleared_takes_its_space_until_it_is_home(fleet_of, heard):
+    """The person was wrong: the arm is still in its last cycle."""
+    fleet = fleet_of(2)
+    fleet.submit(*jobs(1, repetitions=2))
+    run_until(fleet, lambda: any(work.in_last_cycle for arm in fleet.arms.values() for work in arm.current.values()))
+    arm = next(arm for arm in fleet.arms.values() if arm.out)
+    (name,) = arm.current
+    for _ in range(50):
+        fleet.run_without_faults(0.1, 0.1, absent=arm.name)
+    clear(fleet, arm.name)
+    if heard is State:
+        state = State(arm.name, 1, 0.0, "working", (40.0,), 20.0, space=f"{arm.name}: job 0")
+        fleet.attempt(lambda: fleet.auctioneer.apply_state(arm.name, state))
+    elif heard is Lease:
+        assert fleet.answer(arm.request()).revoked == (name,)
+    else:
+        arm.work(fleet.true_s)
+        fleet.answer(arm.reports[name])
+        assert states(fleet) == ["finished"]
+    fleet.submit(*jobs(2)[1:])
+    for _ in range(20):
+        fleet.run_without_faults(0.1, 0.1, absent=arm.name)
+        assert states(fleet)[1] == "waiting"
+    run_until(fleet, lambda: states(fleet) == ["finished", "finished"])
 
 
 def test_only_space_that_is_taken_can_be_cleared(fleet_of):

@@ -3,7 +3,7 @@ no job is done twice, none is lost, and all are done after the faults."""
 
 import random
 
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fleet.bus.protocol.auction import JobSpec
@@ -74,6 +74,30 @@ def clear(fleet, rng: random.Random) -> None:
     fleet.clear(f"arm_{rng.randrange(3)}")
 
 
+def clear_one_that_lives_on(fleet, rng: random.Random) -> None:
+    """A person moves an arm home that is about to finish a job, and frees its space; its process lives on."""
+    for _ in range(60):
+        finishing = [arm for arm in fleet.arms.values() if any(work.may_commit for work in arm.current.values())]
+        if finishing:
+            break
+        fleet.run_without_faults(0.1, 0.1)
+        fleet.check()
+    else:
+        return
+    name = finishing[0].name
+    for _ in range(rng.randrange(20, 60)):
+        fleet.run_without_faults(0.1, 0.1, absent=name)
+        fleet.check()
+    fleet.clear(name, restart=False)
+    for _ in range(rng.randrange(60)):
+        finishing[0].work(fleet.true_s)
+        fleet.run_without_faults(0.1, 0.1, absent=name)
+        fleet.check()
+    for _ in range(20):
+        fleet.run_without_faults(0.1, 0.1)
+        fleet.check()
+
+
 def stop_on_the_way(fleet, rng: random.Random) -> None:
     """An arm stops away from home while the others go on; nobody hears it."""
     for _ in range(40):
@@ -93,7 +117,7 @@ def no_faults(fleet, rng: random.Random) -> None:
 
 ACTIONS = (
     *(lossy_network, submit, wait, cut_off, stop_on_the_way, kill_arm, give_back),
-    *(clear, kill_auctioneer, fill_disk, no_faults),
+    *(clear, clear_one_that_lives_on, kill_auctioneer, fill_disk, no_faults),
 )
 rates = st.tuples(*[st.floats(1 - 1e-3, 1 + 1e-3)] * 4)
 
@@ -109,6 +133,7 @@ def random_conflicts(seed: int, share: float):
     return excludes
 
 
+@example((1.0, 1.0, 1.0, 1.0), 3, [clear_one_that_lives_on, clear_one_that_lives_on], 0, 1.0)
 @given(
     rates,
     st.integers(1, 5),

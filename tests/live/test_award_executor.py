@@ -185,7 +185,7 @@ def test_leases_are_requested_three_times_in_each_and_permission_at_once():
     assert executor.lease_requests(4.32)
 
 
-def test_the_last_cycle_needs_permission_which_is_on_disk_and_final():
+def test_the_last_cycle_needs_permission_which_is_on_disk_and_a_lease():
     executor, disk = shop()
     award = taken(executor)
     executor.record_progress(2, 0.0)
@@ -195,19 +195,39 @@ def test_the_last_cycle_needs_permission_which_is_on_disk_and_final():
     assert executor.allowed_cycles(1.0) == 2
     disk.full = False
     executor.apply_lease(leave, 1.0)
-    assert executor.allowed_cycles(1000.0) == 3
-    executor.apply_lease(Lease("x", 4.0, (), (award.award,)), 2.0)
+    assert (executor.allowed_cycles(5.9), executor.allowed_cycles(6.0)) == (3, 2)
     executor.return_expired(0.0, 1000.0)
-    assert executor.allowed_cycles(1000.0) == 3
     assert ArmHistory().replay(disk).active[award.award].may_commit
+    executor.apply_lease(leave, 1000.0)
+    assert executor.allowed_cycles(1001.0) == 3
 
 
-def test_a_revoked_award_is_released_without_a_report():
+@pytest.mark.parametrize("in_last_cycle", [False, True])
+def test_after_permission_to_commit_a_revoked_award_is_reported_from_home(in_last_cycle):
+    executor, _ = shop()
+    award = taken(executor)
+    executor.record_progress(2, 0.0)
+    executor.apply_lease(Lease("x", 4.0, (award.award,), (), (award.award,)), 1.0)
+    executor.apply_lease(Lease("x", 4.0, (), (award.award,)), 2.0)
+    executor.apply_lease(Lease("x", 4.0, (award.award,), (), (award.award,)), 1.5)  # it was late
+    assert executor.allowed_cycles(2.0) == 2
+    executor.return_revoked(9.0, 3.0, at_home=False)
+    assert executor.active
+    if in_last_cycle:
+        executor.finish(10.0, 4.0)
+    else:
+        executor.return_revoked(10.0, 4.0, at_home=True)
+    ((_, report),) = executor.due_reports(4.0)
+    assert (report.cycles, report.unsure, report.outcome == "finished") == (2 + in_last_cycle, False, in_last_cycle)
+
+
+def test_a_revoked_award_is_returned():
     executor, disk = shop()
     award = taken(executor)
     executor.apply_lease(Lease("x", 4.0, (), (award.award,)), 2.0)
-    assert not executor.active
-    assert not executor.due_reports(2.0)
+    assert executor.allowed_cycles(2.0) == 0
+    executor.return_revoked(1.0, 2.0, at_home=False)
+    assert [report.outcome for _, report in executor.due_reports(2.0)] == ["returned"]
     assert not ArmHistory().replay(disk).active
 
 

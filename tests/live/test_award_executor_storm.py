@@ -110,6 +110,15 @@ class Storm(RuleBasedStateMachine):
         """On the auctioneer's clock."""
         return self.time_s * self.rate
 
+    @rule(name=st.sampled_from(ARMS))
+    def clear(self, name) -> None:
+        """A person sees an arm at home that has lost its lease, and frees its space; its process lives on."""
+        current = [o for o in self.orders.values() if o.arm == name and o.state in ("awarded", "finishing")]
+        if not self.arms[name].out and all(o.state == "finishing" and self.now_s > o.lease_end_s for o in current):
+            for order in current:
+                order.state = "unfinished"
+            self.closed[name] = {}
+
     def expire(self) -> None:
         for order in self.orders.values():
             if order.state == "awarded" and self.now_s > order.lease_end_s:
@@ -188,7 +197,8 @@ class Storm(RuleBasedStateMachine):
     def report(self, arm: str, report: Report) -> None:
         self.expire()
         order = self.orders[report.job]
-        if order.award is not None and order.award.award == report.award and order.state in ("awarded", "finishing"):
+        has_job = order.state in ("awarded", "finishing", "unfinished")
+        if order.award is not None and order.award.award == report.award and has_job:
             order.cycles = max(order.cycles, report.cycles)
             ended = "unfinished" if report.unsure else "waiting"
             self.close(order, "finished" if report.outcome == "finished" else ended)
@@ -267,6 +277,8 @@ class Storm(RuleBasedStateMachine):
             allowed = first is not None and executor.allowed_cycles(now_s) > first.cycles
             if arm.out and not (allowed and first.job == arm.out):
                 arm.out = ""
+            executor.return_revoked(0.0, now_s, at_home=not arm.out)
+            first = next(iter(executor.active), None)
             if first is None:
                 return
             job = first.award.job
@@ -326,6 +338,7 @@ class Storm(RuleBasedStateMachine):
             lambda: self.repeat_award(chance): 1,
             lambda: self.wait(chance.choice((0.01, 0.1, 0.7))): 6,
             self.to_the_edge: 0.5,
+            lambda: self.stop_and_clear(chance): 0.5,
             lambda: cut.symmetric_difference_update({chance.choice(ARMS)}): 0.5,
             lambda: self.crash_now(chance.choice(ARMS)): 0.1,
             lambda: self.crash_while_writing(chance.choice(ARMS), chance.choice(("before", "after"))): 0.1,
@@ -357,6 +370,15 @@ class Storm(RuleBasedStateMachine):
         if ends:
             self.time_s = max(self.time_s, min(ends) / self.rate + 1e-3)
             self.expire()
+
+    def stop_and_clear(self, chance) -> None:
+        """Stop an arm that has permission to commit until its lease has ended; then a person frees its space."""
+        finishing = [o for o in self.orders.values() if o.state == "finishing"]
+        if finishing:
+            order = chance.choice(finishing)
+            self.time_s = max(self.time_s, order.lease_end_s / self.rate + 1e-3)
+            self.expire()
+            self.clear(order.arm)
 
     @rule(turns=st.integers(1, 6))
     def fair_weather(self, turns) -> None:
@@ -394,7 +416,8 @@ class Storm(RuleBasedStateMachine):
         for arm in self.arms.values():
             arm.full, arm.crash = False, ""
         for _ in range(1500):
-            if all(o.state in ("finished", "unfinished") for o in self.orders.values()):
+            idle = not any(arm.executor.active or arm.executor.has_pending_reports for arm in self.arms.values())
+            if idle and all(o.state in ("finished", "unfinished") for o in self.orders.values()):
                 break
             self.turn()
         for name, order in self.orders.items():

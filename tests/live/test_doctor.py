@@ -8,6 +8,7 @@ import threading
 import time
 from contextlib import ExitStack, contextmanager
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,6 +20,7 @@ from fleet.bus.protocol.auction import Clock, ClockRequest
 from fleet.bus.protocol.messages import State
 from fleet.live.monitor.health import OFFSET_S, ClockProbe, check_health
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, AuctioneerSnapshot, FleetSnapshot
+from scenarios.live.watch_screen import space_line
 
 PATIENCE_S = 30.0
 ASKED = ClockProbe(asked_s=100.0, answered_s=100.01, time_s=5000.0, speed=60.0)
@@ -34,6 +36,16 @@ def arm(**change):
 
 def fleet(*arms, auctioneers=ALONE, counts=None):
     return FleetSnapshot("f", arms, auctioneers, counts or {}, ())
+
+
+def test_an_absent_arm_that_keeps_its_space_is_a_warning():
+    now = fleet(arm(away=True))
+    now = msgspec.structs.replace(now, space={"a": ("s",), "b": ("*",)})
+    (finding,) = check_health(now, 101.505, [ASKED]).findings
+    assert finding.level == "warning"
+    assert "The space of b stays closed" in finding.what
+    assert "thermofleet clear b" in finding.what
+    assert space_line(now).plain == "space closed by: a (away from home), b (not present, may be anywhere)"
 
 
 def faults(now, *probes, **more):

@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from fleet.bus.protocol.auction import JobSpec
-from fleet.difficulty import Blind
+from fleet.difficulty import Blind, known_temperatures
 from fleet.errors import InfeasibleJob
 from fleet.job import Place
 from fleet.live.arm.estimator import NOT_PLANNED, Estimator, NominalPeaks
@@ -15,6 +15,7 @@ from fleet.thermal import WINDING, drive_heat, gen3_network, thermal_model
 
 PLACES = {"bench": Place(name="bench", position_m=(0.5, 0.0, 0.2))}
 WARM_C = np.full(7, 31.0)
+KNOWN_C = known_temperatures(WARM_C, WARM_C, 25.0)
 
 
 def spec(**changes):
@@ -57,7 +58,7 @@ def test_the_predicted_peak_is_that_of_the_nominal_network(arm, minutes):
 
     start = np.tile(WARM_C, 2)
     fine = solve_ivp(slope, (0.0, plan.duration_s(repetitions)), start, rtol=1e-8, atol=1e-8, method="BDF")
-    (peak,) = NominalPeaks().peaks_c([plan], [repetitions], WARM_C, 25.0)
+    (peak,) = NominalPeaks().peaks_c([plan], [repetitions], KNOWN_C)
     expected = fine.y[WINDING].max()
     assert peak == pytest.approx(expected, abs=0.02 * (expected - 31.0) + 0.01)
 
@@ -66,27 +67,25 @@ def test_an_estimate_has_all_fields(arm):
     estimator, _ = estimator_of(arm)
     estimator.prepare(spec(payload_kg=4.0))
     ((plan,),) = arm.plans.values()
-    (estimate,) = estimator.estimate([spec(payload_kg=4.0)], WARM_C, 25.0, 100.0)
+    (estimate,) = estimator.estimate([spec(payload_kg=4.0)], KNOWN_C, 100.0)
     score = arm.model.score(plan, 3)
     assert estimate.feasible
-    assert estimate.difficulty == pytest.approx(score.total)
-    assert estimate.joint_difficulty == pytest.approx(tuple(score.per_joint))
-    assert estimate.p_saturation == score.p_saturation
-    assert estimate.duration_s == pytest.approx(3.0 + 30.0 + 2.0)
-    assert estimate.finish_in_s == pytest.approx(100.0 + 33.0)
-    assert estimate.peak_c > 31.0
+    (quote,) = estimate.plans
+    assert quote.difficulty == pytest.approx(score.total)
+    assert quote.joint_difficulty == pytest.approx(tuple(score.per_joint))
+    assert quote.p_saturation == score.p_saturation
+    assert quote.duration_s == pytest.approx(3.0 + 30.0 + 2.0)
+    assert quote.finish_in_s == pytest.approx(100.0 + 33.0)
+    assert quote.peak_c > 31.0
+    assert quote.gained_k == pytest.approx(quote.peak_c - 31.0)
 
 
 def test_a_blind_arm_estimates_without_a_score(arm):
     estimator, _ = estimator_of(arm, model=Blind())
     estimator.prepare(spec())
-    (estimate,) = estimator.estimate([spec()], WARM_C, 25.0, np.inf)
-    assert (estimate.feasible, estimate.difficulty, estimate.p_saturation, estimate.finish_in_s) == (
-        True,
-        None,
-        None,
-        None,
-    )
+    (estimate,) = estimator.estimate([spec()], KNOWN_C, np.inf)
+    (quote,) = estimate.plans
+    assert (quote.difficulty, quote.p_saturation, quote.finish_in_s) == (None, None, None)
 
 
 @pytest.mark.parametrize(
@@ -100,21 +99,21 @@ def test_a_blind_arm_estimates_without_a_score(arm):
 def test_an_infeasible_job_has_a_reason(arm, changes, reason):
     estimator, _ = estimator_of(arm)
     estimator.prepare(spec(**changes))
-    (estimate,) = estimator.estimate([spec(**changes)], WARM_C, 25.0, 0.0)
+    (estimate,) = estimator.estimate([spec(**changes)], KNOWN_C, 0.0)
     assert not estimate.feasible
     assert reason in estimate.reason
-    assert estimator.best_plan(spec(**changes)) is None
+    assert not estimator.plans(spec(**changes))
 
 
 def test_an_unplanned_job_is_reported_and_every_work_is_planned_once(arm):
     estimator, asked = estimator_of(arm)
     one, other = spec(), spec(name="k", payload_kg=1.0)
     assert not estimator.is_prepared(one)
-    assert [o.reason for o in estimator.estimate([one, other], WARM_C, 25.0, 0.0)] == [NOT_PLANNED, NOT_PLANNED]
+    assert [o.reason for o in estimator.estimate([one, other], KNOWN_C, 0.0)] == [NOT_PLANNED, NOT_PLANNED]
     assert not asked
     for _ in range(3):
         estimator.prepare(one)
         estimator.prepare(spec(name="l", repetitions=9))
     assert len(asked) == 1
-    assert [o.feasible for o in estimator.estimate([one, other], WARM_C, 25.0, 0.0)] == [True, False]
+    assert [o.feasible for o in estimator.estimate([one, other], KNOWN_C, 0.0)] == [True, False]
     assert not asked[1:]

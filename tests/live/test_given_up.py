@@ -18,6 +18,7 @@ from fleet.live.journal_records import Closed, JobsAccepted
 
 JOB = JobSpec(name="j", kind="hold", places=("x",), repetitions=9)
 NEXT = JobSpec(name="k", kind="hold", places=("x",), after=("j",))
+LOST = "Given up, because it waits for 'j', which is given up."
 ROSTER = ("a", "b", "c", "d")
 attempts = st.lists(st.tuples(st.sampled_from("abcd"), st.sampled_from(["faulted", "returned", "refused", "dropped"])))
 
@@ -63,8 +64,9 @@ def test_the_auctioneer_gives_a_job_up_at_that_fault_and_no_other_event(attempts
         if too_often(faults):
             assert status.reason == reason_to_give_up(faults)
             assert (status.arm, status.award) == ("", "")
-            assert not ledger.ready(99.0, 9), "nor can its successor begin"
-            assert ledger.unsettled() == ["k"]
+            assert not ledger.unsettled()
+            (successor,) = ledger.status(["k"])
+            assert (successor.state, successor.reason) == ("given_up", LOST)
 
 
 def test_faults_of_lost_arms_count_when_they_are_reported_late():
@@ -78,6 +80,28 @@ def test_faults_of_lost_arms_count_when_they_are_reported_late():
     assert change.status.state == "given_up"
     (change,) = book.apply(Closed("w2", "finished", 9, 5.0))
     assert change.status.state == "finished", "it was done after all"
+
+
+def test_jobs_that_wait_for_a_job_that_is_given_up_are_given_up_until_that_one_is_finished():
+    last = JobSpec(name="a", kind="hold", places=("x",), after=("k",))  # sorted before the others
+    book = Ledger().replay([JobsAccepted((JOB, NEXT), "test", 0.0)])
+    for number in (1, 2):
+        book.apply(awarded(number, "a"))
+        changes = book.apply(Closed(f"w{number}", "returned", 0, float(number), faulted=True))
+    assert [(change.status.job, change.status.state) for change in changes] == [("j", "given_up"), ("k", "given_up")]
+    (admission,) = book.admit((last,))
+    assert (admission.accepted, admission.reason) == (True, LOST.replace("'j'", "'k'"))
+    (change,) = book.apply(JobsAccepted((last,), "test", 3.0))
+    assert (change.status.state, change.status.reason) == ("given_up", admission.reason)
+    for ledger in (book, Ledger().replay(book.compact())):
+        assert not ledger.unsettled()
+        changes = ledger.apply(Closed("w2", "finished", 9, 5.0))
+        assert {change.status.job: change.status.state for change in changes} == {
+            "j": "finished",
+            "k": "waiting",
+            "a": "waiting",
+        }
+        assert [job.name for job in ledger.ready(9.0, 9)] == ["k"]
 
 
 def test_a_late_fault_does_not_take_the_job_from_another_arm():
@@ -194,3 +218,24 @@ def test_a_job_that_an_arm_has_is_not_given_up_and_finishing_it_counts_more():
     assert granter.status("j", 0.3).state == "finished"
     granter.apply_outcome(JobOutcome("j", "b-1", "b", "given_up", 9, 3.0))
     assert granter.status("j", 0.3).state == "finished"
+
+
+def test_a_job_that_still_waits_at_its_hard_due_date_is_given_up_with_its_successors(live):
+    spec = {"kind": "hold", "places": ("x",), "repetitions": 2, "due_s": 5.0, "expires": True}
+    begun, late = JobSpec(name="begun", **spec), JobSpec(name="late", **(spec | {"repetitions": 90}))
+    after, soft = (
+        JobSpec(name="z", kind="hold", places=("y",), after=("late",)),
+        JobSpec(name="soft", **spec, value=0.0),
+    )
+    soft = msgspec.structs.replace(soft, expires=False)
+    fleet = live.Fleet([live.Arm("arm_0")])
+    fleet.submit(begun, late, after, soft)
+    fleet.step(4.9)
+    fleet.run_without_faults(3.0, 0.1)
+    fleet.auctioneer = fleet.restart()
+    fleet.run_without_faults(30.0)
+    told = {status.job: (status.state, status.reason) for status in fleet.auctioneer.status()}
+    assert told["begun"] == ("finished", "")
+    assert told["soft"] == ("finished", "")
+    assert told["late"] == ("given_up", "expired: its due date passed before an arm had begun it.")
+    assert told["z"] == ("given_up", "Given up, because it waits for 'late', which is given up.")

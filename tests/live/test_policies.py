@@ -1,5 +1,6 @@
 """Every policy live: the same choice from the same observation as in simulation, and a shift that is completed."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -10,16 +11,20 @@ from hypothesis import strategies as st
 from agents.policy import EveryArm, Policy, for_all_arms
 from agents.registry import RULES, make_policy
 from fleet.bus.protocol.auction import JobEstimate as Estimate
-from fleet.bus.protocol.auction import JobSpec, Quote
+from fleet.bus.protocol.auction import JobSpec, PlanQuote, Quote
 from fleet.bus.protocol.messages import State
 from fleet.env.allocation_v1 import parallel_env
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
-from fleet.live.auction.round import Bidding, resolve_claims
+from fleet.live.auction.round import Assignment, Bidding, Choice, resolve_claims
 from fleet.observation import FIELDS, LONG_S, Observation
+from fleet.planning.options import PLANS
 from scenarios.live.allocation import CentralAllocation
 
 CENTRAL = [name for name, rule in RULES.items() if rule.scope == "central"]
-SIMULATED_ONLY = {"last_award", "clock", "busy_s", "station_free", "space_free"}
+SIMULATED_ONLY = {
+    *("last_award", "clock", "busy_s", "station_free", "space_free", "housing_c", "ambient_c", "too_heavy"),
+    *("job_value", "job_cycles", "job_peak_c", "job_p", "peer_busy_s", "peer_blocks"),
+}
 """Fields that quotes of a working arm do not contain, and that no rule reads."""
 
 
@@ -28,13 +33,32 @@ def quote(arm: str, *offers: Estimate, **changes) -> Quote:
     return Quote(arm=arm, auction="r", quote="q", valid_s=5.0, twin="t", time_s=0.0, estimates=offers, **facts)
 
 
+def plans_of(o: Observation, slot: int) -> Iterator[PlanQuote]:
+    """Return the feasible plans of a slot as an arm quotes them."""
+    for option in range(slot * PLANS, (slot + 1) * PLANS):
+        if o.feasible[option]:
+            yield PlanQuote(
+                plan=option - slot * PLANS,
+                peak_c=float(o.peak_c[option]) or None,
+                p_saturation=float(o.p_saturation[option]),
+                difficulty=float(o.difficulty[option]) if o.known[option] else None,
+                duration_s=float(o.duration_s[option]),
+                finish_in_s=float(o.busy_s + o.duration_s[option]),
+            )
+
+
+def one_plan(job: str, **figures) -> Estimate:
+    return Estimate(job, (PlanQuote(**figures),))
+
+
 def quoted(seen: dict[str, Observation], time_s: float) -> Bidding:
     """Return observations as quotes to an auctioneer; every job has a separate station."""
     first = next(iter(seen.values()))
     slots = [slot for slot in range(len(first.offered)) if first.offered[slot]]
     jobs, quotes, states = [], {}, {}
     for slot in slots:
-        due_s = {float(o.slack_s[slot]) + float(o.duration_s[slot]) + time_s for o in seen.values()}
+        fastest = slot * PLANS
+        due_s = {float(o.slack_s[fastest]) + float(o.duration_s[fastest]) + time_s for o in seen.values()}
         jobs.append(
             JobSpec(
                 name=f"j{slot}",
@@ -47,17 +71,7 @@ def quoted(seen: dict[str, Observation], time_s: float) -> Bidding:
             )
         )
     for arm, o in seen.items():
-        offers = [
-            Estimate(
-                job=f"j{slot}",
-                feasible=bool(o.feasible[slot]),
-                difficulty=float(o.difficulty[slot]) if o.known[slot] else None,
-                p_saturation=float(o.p_saturation[slot]),
-                duration_s=float(o.duration_s[slot]),
-                finish_in_s=float(o.busy_s + o.duration_s[slot]),
-            )
-            for slot in slots
-        ]
+        offers = [Estimate(f"j{slot}", tuple(plans_of(o, slot))) for slot in slots]
         mode = "idle" if o.idle else "working" if o.working else "faulted"
         facts = {"mode": mode, "headroom_k": float(o.headroom_k), "capacity": int(bool(o.idle))}
         quotes[arm] = quote(arm, *offers, **facts)
@@ -90,17 +104,19 @@ def test_the_same_observation_gives_the_same_choice_simulated_and_live(small, na
         seen = env.knowledge()
         actions = simulated.act(seen)
         open_slots = [slot for slot in range(len(seen["arm_0"].offered)) if seen["arm_0"].offered[slot]]
-        if any(o.action_mask[1:].any() for o in seen.values()):
+        if any(o.action_mask[1:-1].any() for o in seen.values()):
             time_s = float(env.truth.tick[0] * env.world.dt_s)
             fleet = LiveFleet(arms=tuple(seen), warning_c=env.world.limits.warning_c, horizon_s=env.world.horizon_s)
             live_seen = observe(quoted(seen, time_s), fleet)
             for arm, o in seen.items():
-                # A quote does not contain busy stations.
-                live_seen[arm] = replace(live_seen[arm], action_mask=o.action_mask[: len(open_slots) + 1])
+                # A quote does not contain busy stations, and no job is given back.
+                mask = np.append(o.action_mask[: len(open_slots) * PLANS + 1], 0)
+                live_seen[arm] = replace(live_seen[arm], action_mask=mask)
                 for field in FIELDS:
                     if field.name not in SIMULATED_ONLY:
                         expected = getattr(o, field.name)
-                        expected = expected[..., : len(open_slots)] if {"slot", "option"} & {*field.axes} else expected
+                        shown = {"slot": len(open_slots), "option": len(open_slots) * PLANS}
+                        expected = expected[..., : shown[field.axes[-1]]] if shown.keys() & {*field.axes} else expected
                         np.testing.assert_allclose(
                             getattr(live_seen[arm], field.name), expected, atol=0.02, err_msg=field.name
                         )
@@ -113,28 +129,40 @@ def test_the_same_observation_gives_the_same_choice_simulated_and_live(small, na
 
 
 def test_quotes_become_observations() -> None:
-    jobs = (JobSpec("a", "hold", ("x",), due_s=150.0, value=2.0, release_s=40.0), JobSpec("b", "hold", ("y",)))
+    jobs = (
+        JobSpec("a", "hold", ("x",), due_s=150.0, value=2.0, release_s=40.0),
+        JobSpec("b", "hold", ("y",), due_s=9e3, expires=True),
+    )
+    fast = PlanQuote(0, 55.0, 9.0, 0.25, None, 1.5, 60.0, 100.0)
+    cool = PlanQuote(1, 50.0, 4.0, 0.125, None, 1.25, 55.0, 95.0)
     quotes = {
-        "one": quote("one", Estimate("a", True, "", None, 1.5, 0.25, 55.0, 60.0, 100.0), Estimate("b", False, "reach")),
-        "two": quote("two", Estimate("b", True, peak_c=61.0), headroom_k=5.0),
+        "one": quote("one", Estimate("a", (fast, cool)), Estimate("b", reason="reach")),
+        "two": quote("two", one_plan("b", peak_c=61.0), headroom_k=5.0),
     }
-    full = {"three": quote("three", Estimate("a", True, duration_s=50.0), capacity=0, mode="working")}
+    full = {"three": quote("three", one_plan("a", duration_s=50.0), capacity=0, mode="working")}
     states = {"two": State("two", 0, 0.0, "idle", (30.0,) * 6 + (55.0,), 5.0)}
     bidding = Bidding("r", 100.0, jobs, quotes, full, states, {"two": 7.0}, {"a": (2, 90.0)})
     seen = observe(bidding, LiveFleet(arms=("two", "one", "four"), warning_c=60.0, horizon_s=400.0), lost={"one"})
     assert list(seen) == ["two", "one", "four", "three"]
     one, two, three, four = (seen[name] for name in ("one", "two", "three", "four"))
-    assert [o.action_mask.tolist() for o in (one, two, three, four)] == [[1, 1, 0], [1, 0, 1], [1, 0, 0], [1, 0, 0]]
+    assert [o.action_mask.tolist() for o in (one, two, three, four)] == [  # wait; a; b; give back
+        [1, 1, 1, 0, 0, 0],
+        [1, 0, 0, 1, 0, 0],
+        [1, 0, 0, 0, 0, 0],
+        [1, 0, 0, 0, 0, 0],
+    ]
     assert (one.clock, one.busy_s, one.last_award, two.last_award) == (0.25, 40.0, -1.0, 0.0)
     assert [float(o.idle) for o in (one, two, three, four)] == [1, 1, 0, 0]
     assert [float(o.working) for o in (one, two, three, four)] == [0, 0, 1, 0]
-    assert one.known.tolist() == [1, 0]
-    assert one.difficulty.tolist() == [1.5, 0]
-    assert one.p_saturation.tolist() == [0.25, 0.5]
-    assert two.p_saturation.tolist() == [0.5, 1.0]  # by its peak
-    assert one.duration_s.tolist() == [60.0, 0.0]
-    assert two.duration_s.tolist() == [0.0, 60.0]  # missing: as the longest
-    assert one.slack_s.tolist() == [-10.0, LONG_S]
+    assert one.known.tolist() == [1, 1, 0, 0]
+    assert one.difficulty.tolist() == [1.5, 1.25, 0, 0]
+    assert one.peak_c.tolist() == [55.0, 50.0, 0, 0]
+    assert one.p_saturation.tolist() == [0.25, 0.125, 0.5, 0.5]
+    assert two.p_saturation.tolist() == [0.5, 0.5, 1.0, 0.5]  # by its peak
+    assert one.duration_s.tolist() == [60.0, 55.0, 0, 0]
+    assert two.duration_s.tolist() == [0, 0, 60.0, 0]  # missing: as the longest
+    assert one.slack_s.tolist() == [-10.0, -5.0, 0.0, 0.0]
+    assert one.expires.tolist() == [0, 1]
     assert one.age_s.tolist() == [10.0, 100.0]
     assert one.returns.tolist() == [2, 0]
     assert two.temp_c.tolist() == [30.0] * 6 + [55.0]
@@ -143,7 +171,7 @@ def test_quotes_become_observations() -> None:
     assert one.peer_age_s.tolist() == [7.0, LONG_S, 0.0]
     assert one.peer_working.tolist() == [0, 0, 1]
     assert two.peer_known.tolist() == [[1, 0], [0, 0], [0, 0]]
-    assert two.peer_difficulty.tolist() == [[1.5, 0], [0, 0], [0, 0]]
+    assert two.peer_difficulty.tolist() == [[1.25, 0], [0, 0], [0, 0]]
 
 
 @pytest.mark.parametrize("name", CENTRAL)
@@ -155,14 +183,20 @@ def test_every_central_policy_awards_jobs_with_a_bid_once(name, seed) -> None:
     quotes = {
         arm: quote(
             arm,
-            *(Estimate(job.name, bool(rng.integers(2)), difficulty=rng.random(), duration_s=60.0) for job in jobs),
+            *(
+                Estimate(
+                    job.name,
+                    tuple(PlanQuote(n, difficulty=rng.random(), duration_s=60.0) for n in range(rng.integers(3))),
+                )
+                for job in jobs
+            ),
         )
         for arm in ("a", "b", "c")[: rng.integers(1, 4)]
     }
     bidding = Bidding("r", 0.0, jobs, quotes)
     awarded = CentralAllocation(fresh(name), LiveFleet(arms=("a", "b", "c"), warning_c=60.0))(bidding)
-    assert all(bidding.offer(arm, job) for job, arm in awarded.items())
-    assert len(set(awarded.values())) == len(awarded)
+    assert all(bidding.offer(arm, job, plan) for job, (arm, plan) in awarded.items())
+    assert len({arm for arm, _ in awarded.values()}) == len(awarded)
     taken = [job.places[0] for job in jobs if job.name in awarded]
     assert len(set(taken)) == len(taken)
     cool = name != "wspt_cool"
@@ -184,21 +218,37 @@ def test_the_lower_difficulty_wins_a_job_or_station_then_the_first_arm() -> None
     jobs = (JobSpec("j", "hold", ("x",)), JobSpec("k", "hold", ("x",)), JobSpec("l", "hold", ("y",)))
 
     def bidding(**scores):
-        quotes = {arm: quote(arm, *(Estimate(w.name, True, difficulty=d) for w in jobs)) for arm, d in scores.items()}
+        quotes = {arm: quote(arm, *(one_plan(w.name, difficulty=d) for w in jobs)) for arm, d in scores.items()}
         return Bidding("r", 0.0, jobs, quotes)
 
-    order = ("a", "b", "c")
-    assert resolve_claims(bidding(a=2.0, b=1.0), {"a": "j", "b": "j"}, order) == {"j": "b"}
-    assert resolve_claims(bidding(a=1.0, b=1.0), {"a": "j", "b": "j"}, order) == {"j": "a"}
-    assert resolve_claims(bidding(a=None, b=9.0), {"a": "j", "b": "j"}, order) == {"j": "b"}
-    assert resolve_claims(bidding(a=2.0, b=1.0, c=5.0), {"a": "j", "b": "k", "c": "l"}, order) == {"k": "b", "l": "c"}
-    assert resolve_claims(bidding(a=1.0), {"a": "unknown"}, order) == {}
+    def winners(scores, claims):
+        chosen = {arm: Choice(job) for arm, job in claims.items()}
+        awarded = resolve_claims(bidding(**scores), chosen, ("a", "b", "c"))
+        return {job: arm for job, (arm, _) in awarded.items()}
+
+    assert winners({"a": 2.0, "b": 1.0}, {"a": "j", "b": "j"}) == {"j": "b"}
+    assert winners({"a": 1.0, "b": 1.0}, {"a": "j", "b": "j"}) == {"j": "a"}
+    assert winners({"a": None, "b": 9.0}, {"a": "j", "b": "j"}) == {"j": "b"}
+    assert winners({"a": 2.0, "b": 1.0, "c": 5.0}, {"a": "j", "b": "k", "c": "l"}) == {"k": "b", "l": "c"}
+    assert winners({"a": 1.0}, {"a": "unknown"}) == {}
+
+
+def test_the_difficulty_of_the_claimed_plan_counts() -> None:
+    jobs = (JobSpec("j", "hold", ("x",)),)
+    plans = (PlanQuote(0, difficulty=3.0), PlanQuote(1, difficulty=1.0))
+    quotes = {"a": quote("a", Estimate("j", plans)), "b": quote("b", one_plan("j", difficulty=2.0))}
+    bidding = Bidding("r", 0.0, jobs, quotes)
+    for plan, winner in ((0, Assignment("b")), (1, Assignment("a", 1)), (2, Assignment("b"))):
+        assert resolve_claims(bidding, {"a": Choice("j", plan), "b": Choice("j")}, ("a", "b")) == {"j": winner}
 
 
 def test_an_illegal_action_is_logged_and_waits(caplog) -> None:
-    bidding = Bidding("r", 0.0, (JobSpec("j", "hold", ("x",)),), {"a": quote("a", Estimate("j", True))})
+    bidding = Bidding(
+        "r", 0.0, (JobSpec("j", "hold", ("x",)),), {"a": quote("a", Estimate("j", (PlanQuote(), PlanQuote(1))))}
+    )
     seen = observe(bidding, LiveFleet(arms=("a",), warning_c=60.0))
-    assert [claimed_jobs(bidding, seen, {"a": action}) for action in (0, 1, 2, -1)] == [{}, {"a": "j"}, {}, {}]
+    claims = [claimed_jobs(bidding, seen, {"a": action}) for action in (0, 1, 2, 3, -1)]
+    assert claims == [{}, {"a": Choice("j")}, {"a": Choice("j", 1)}, {}, {}]
     assert caplog.text.count("The policy chose the illegal action") == 2
 
 

@@ -22,6 +22,7 @@ from fleet.bus.protocol.auction import (
     ClockRequest,
     JobEstimate,
     JobStatus,
+    PlanQuote,
     Quote,
     QuoteRequest,
     Status,
@@ -61,7 +62,7 @@ def fleet(tmp_path_factory):
         arm, auctioneer, began_s = line(ARM), line("auctioneer"), time.monotonic()
 
         def quote(request):
-            offers = tuple(JobEstimate(job=job.name, feasible=True, difficulty=0.25) for job in request.jobs)
+            offers = tuple(JobEstimate(job.name, (PlanQuote(difficulty=0.25),)) for job in request.jobs)
             return Quote(ARM, request.auction, "", 3.0, "t", 1.0, "idle", 20.0, 1, offers)
 
         def now_s():
@@ -138,18 +139,18 @@ JOBS = {"jobs": [{"name": "crate", "kind": "hold", "places": ["rack"]}]}
 
 def test_the_gateway_submits_with_the_certificate_of_a_submitter(fleet):
     with gateway(fleet, "gateway") as port:
-        code, told = asked(port, "POST", "/v2/jobs", JOBS)
+        code, told = asked(port, "POST", "/v3/jobs", JOBS)
         assert (code, told["jobs"][0]["accepted"]) == (200, True), told
-        code, told = asked(port, "POST", "/v2/ask", JOBS)
+        code, told = asked(port, "POST", "/v3/ask", JOBS)
         assert (code, [quote["arm"] for quote in told["quotes"]]) == (200, [ARM]), told
-        code, told = asked(port, "GET", "/v2/fleet")
+        code, told = asked(port, "GET", "/v3/fleet")
         assert (code, [arm["arm"] for arm in told["arms"]]) == (200, [ARM])
 
 
 def test_the_gateway_reports_that_a_monitor_may_not_submit(fleet):
     with gateway(fleet, "monitor") as port:
-        assert asked(port, "GET", "/v2/jobs?job=j")[0] == 200
-        for path in ("/v2/jobs", "/v2/ask"):
+        assert asked(port, "GET", "/v3/jobs?job=j")[0] == 200
+        for path in ("/v3/jobs", "/v3/ask"):
             code, told = asked(port, "POST", path, JOBS)
             assert code == 503
             assert "'monitor:monitor' may not query" in told["detail"]

@@ -23,7 +23,7 @@ from fleet.live.monitor import listener as listener_module
 from fleet.live.monitor import snapshot as snapshot_module
 from fleet.live.monitor.event_feed import HISTORY, MAX_WAITING, NEWEST_ONLY, EventFeed, ReaderBuffer
 from fleet.live.monitor.listener import FleetListener
-from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetSnapshot, FleetView
+from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetSnapshot, FleetView, JobScore
 from scenarios.live.watch_screen import arm_line, format_age, format_scores, format_time, screen
 
 PATIENCE_S = 20.0
@@ -74,7 +74,7 @@ def test_scores_of_jobs_that_have_ended_are_not_shown():
     seen = FleetView("f")
     seen.update("a", scores(1.0, x=0.5, y=None, z=0.2), 0.0)
     seen.update_jobs(stands(1.0, "x"), 0.0)
-    assert seen.snapshot(0.0).arms[0].difficulty == {"y": None, "z": 0.2}
+    assert seen.snapshot(0.0).arms[0].scores == {"y": JobScore(), "z": JobScore(difficulty=0.2)}
 
 
 def test_a_token_change_is_reported_once():
@@ -236,17 +236,21 @@ def fleet_of(arms):
     return FleetSnapshot("f", tuple(arms), (), {"waiting": 2, "finished": 1}, ())
 
 
+SCORES = {"x": JobScore(52.0, 0.02), "y": JobScore(), "z": JobScore(41.0, 0.25, 0.5)}
+
+
 def arm_now(name="a", **change):
     known = {
         "token": True, "present": True, "mode": "working", "time_s": 3661.0, "hottest_c": 52.5, "joint": 2,
-        "headroom_k": 7.5, "job": "crate 1", "difficulty": {"x": 0.5, "y": None, "z": 0.25}, "state_age_s": 0.1,
+        "headroom_k": 7.5, "job": "crate 1", "scores": SCORES, "state_age_s": 0.1,
     }  # fmt: skip
     return ArmSnapshot(arm=name, **{**known, **change})
 
 
 def test_the_screen_shows_the_fleet():
-    told = shown(fleet_of([arm_now()]), width=120, events=["a came"])
-    assert re.search(r"a +working +52\.5 J2 +7\.5 +crate 1 +z 0\.25, x 0\.50, y — +0\.1 s +— +yes", told)
+    told = shown(fleet_of([arm_now()]), width=160, events=["a came"])
+    jobs = r"z 41 °C, P 0\.25 \(d 0\.50\); x 52 °C, P 0\.02 \(d —\); y — °C, P — \(d —\)"
+    assert re.search(rf"a +working +52\.5 J2 +7\.5 +crate 1 +{jobs} +0\.1 s +— +yes", told)
     assert "1:01:01" in told
     assert "1 of 1 arms present" in told
     assert "jobs: 2 waiting, 1 finished" in told
@@ -290,7 +294,7 @@ def test_ages_and_times_are_short():
         "1:00:00",
         "24:01:01",
     ]
-    assert format_scores(SimpleNamespace(difficulty={})) == ""
+    assert format_scores(SimpleNamespace(scores={})) == ""
     assert "headroom 7.5 K  job crate 1" in arm_line(arm_now())
     assert "no token" in arm_line(arm_now(token=False))
 
@@ -343,7 +347,7 @@ def test_without_a_terminal_lines_are_printed_until_stopped(fleet):
             fleet.say()
             while "52.5 °C J2" not in (told := process.stdout.readline()):
                 assert told
-            assert "difficulty j 0.50" in told
+            assert "j — °C, P — (d 0.50)" in told
             process.send_signal(number)
             assert process.wait(PATIENCE_S) == code
         finally:

@@ -21,6 +21,7 @@ from fleet.bus.protocol.auction import (
     JobEstimate,
     JobSpec,
     JobStatus,
+    PlanQuote,
     Quote,
     QuoteRequest,
     Status,
@@ -350,7 +351,8 @@ def arm(endpoint: str, *, feasible: bool = True) -> Iterator[list[QuoteRequest]]
 
     def answer(request: QuoteRequest) -> Quote:
         asked.append(request)
-        offers = (JobEstimate(request.jobs[0].name, feasible, "", (0.5,) * 7, 3.5, 0.125, 52.34, 100.0, 160.0),)
+        fastest = PlanQuote(0, 52.34, 12.34, 0.125, (0.5,) * 7, 3.5, 100.0, 160.0)
+        offers = (JobEstimate(request.jobs[0].name, (fastest, PlanQuote(1, 49.5)) if feasible else ()),)
         return Quote("arm_0", request.auction, "", 5.0, "t", 0.0, "idle", 20.0, 1, offers)
 
     with served(endpoint, lambda link: link.reply_to(keys.of_arm("f", "arm_0", "quote"), QuoteRequest, answer)):
@@ -378,9 +380,10 @@ def test_ask_shows_the_cost_of_a_job_for_each_arm(endpoint, capsys):
     with arm(endpoint) as asked:
         code, out, _ = call(capsys, "ask", *job, "--endpoint", endpoint, "--fleet", "f")
         assert code == 0
-        assert "hold  arm_0  3.50           0.12     52.3         100          160" in out
+        assert "hold  arm_0     0     52.3     +12.3  0.12  3.50         100          160" in out
+        assert "1     49.5         –     –     –           –            –" in out
         code, out, _ = call(capsys, "ask", *job, "--endpoint", endpoint, "--fleet", "f", "--json")
-        assert json.loads(out)[0]["estimates"][0]["difficulty"] == 3.5
+        assert json.loads(out)[0]["estimates"][0]["plans"][0]["difficulty"] == 3.5
     assert [request.dry_run for request in asked] == [True, True]
     assert asked[0].jobs[0].payload_kg == 2.0
 
@@ -396,6 +399,9 @@ def test_ask_exits_with_1_where_no_arm_can_do_a_job(endpoint, capsys):
 def test_ask_reports_missing_arguments(endpoint, capsys):
     at = ("--endpoint", endpoint, "--fleet", "f")
     assert "either a FILE of jobs or one job" in call(capsys, "ask", *at)[2]
+    assert r"must be UTF-8 text (got '\udcff')" in call(capsys, "ask", "--kind", "\udcff", *at)[2]
+    heavy = call(capsys, "ask", "--kind", "hold", "--place", "rack", "--payload", "11", *at)
+    assert "--payload must be 0 to 10 (got 11)" in heavy[2]
     told = call(capsys, "ask", "--kind", "pick_and_place", *at)[2]
     told_kinds = "did you mean 'pick_place'? Allowed: hold, pick_place, press, sort (at kind)."
     assert f"Invalid job: No kind of job 'pick_and_place'; {told_kinds}" in " ".join(told.split())

@@ -5,7 +5,7 @@ to one, which replies with an `Ack`. While the arm has the job it renews its lea
 last cycle it requests permission to commit. Then it repeats a `Report` until there is a `Receipt`.
 
 Why no job is done twice: an arm accepts an award only within `Quote.valid_s` of its own quote, works only under a lease
-that it counts from the moment it sent the request, and begins the last cycle only with permission to commit. The
+that it counts from the moment it sent the request, and begins the last cycle only with permission to commit too. The
 auctioneer counts the same lease from the moment it replied, so at the auctioneer it always ends later. Only after that
 does another arm get the job, and never once permission to commit was given. Durations are real seconds on each one's
 own monotonic clock; wall clocks do not matter. (Leases: Gray & Cheriton 1989, SOSP.)
@@ -13,6 +13,7 @@ own monotonic clock; wall clocks do not matter. (Leases: Gray & Cheriton 1989, S
 Units: fields that end in `_s` are seconds of fleet time, unless they say *real*.
 """
 
+from math import inf
 from typing import Annotated, Literal
 
 import msgspec
@@ -26,6 +27,10 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 LEASE_S = 6.0
 """Real seconds that an arm may work on a job without renewing its lease."""
+MOST_PLANS = 8
+"""Of one arm for one job."""
+MOST_QUOTED = 64
+"""Jobs in one quote, so that it does not exceed the router's size limit."""
 MOST_JOBS = 128
 """In one message; more are sent as several messages, so that none exceeds the router's size limit."""
 
@@ -50,10 +55,12 @@ class JobSpec(msgspec.Struct, frozen=True, omit_defaults=True):
     release_s: Annotated[float, _bounds("release_s")] = 0.0
     """Earliest start."""
     due_s: Annotated[float, _bounds("due_s")] | None = None
-    """Soft deadline; null for none."""
+    """Due date; null for none."""
     value: Annotated[float, _bounds("value")] = 1.0
     after: tuple[Name, ...] = ()
     """Jobs that must be finished before."""
+    expires: bool = False
+    """The due date is hard: the job is given up if it still waits then."""
 
     def __post_init__(self) -> None:
         check_places(self, self.kind, self.places)
@@ -81,6 +88,7 @@ class Admission(msgspec.Struct, frozen=True):
     accepted: bool
     """Also true for an identical job that is already known."""
     reason: str = ""
+    """Why it is not accepted, or is given up at once."""
 
 
 class SubmissionReply(msgspec.Struct, frozen=True):
@@ -95,26 +103,26 @@ class QuoteRequest(msgspec.Struct, frozen=True):
 
     auction: Name
     """Name of this round; any text for a dry run."""
-    jobs: Jobs
+    jobs: Annotated[tuple[JobSpec, ...], msgspec.Meta(min_length=1, max_length=MOST_QUOTED)]
     dry_run: bool = False
     """Only an estimate: the quote cannot be awarded, and nothing changes at the arm."""
 
 
-class JobEstimate(msgspec.Struct, frozen=True):
-    """Cost of one job for one arm; unknown values are null."""
+class PlanQuote(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Cost of one job for one arm by one of its plans; unknown values are null or left out."""
 
-    job: Name
-    feasible: bool
-    reason: str = ""
-    """Why the job is not feasible."""
+    plan: Count = 0
+    """Number of the plan: an `Award` names it. Different for each plan of a job."""
+    peak_c: float | None = None
+    """Predicted temperature of the hottest motor during the job."""
+    gained_k: float | None = None
+    """`peak_c` above the hottest motor now."""
+    p_saturation: Share | None = None
+    """Probability that a motor passes the warning limit, starting from the present temperatures."""
     joint_difficulty: tuple[float, ...] | None = None
     """d_k, [joint]."""
     difficulty: float | None = None
     """Sum of `joint_difficulty`."""
-    p_saturation: Share | None = None
-    """Probability that a motor passes the warning limit, starting from the present temperatures."""
-    peak_c: float | None = None
-    """Predicted temperature of the hottest motor during the job."""
     duration_s: float | None = None
     """Duration of the job alone."""
     finish_in_s: float | None = None
@@ -123,9 +131,35 @@ class JobEstimate(msgspec.Struct, frozen=True):
     """Name of the space of its plan, from home to home; null for unknown: anywhere within reach."""
 
     def __post_init__(self) -> None:
-        finite("JobEstimate", "joint_difficulty", self.joint_difficulty or ())
-        for name in ("difficulty", "p_saturation", "peak_c", "duration_s", "finish_in_s"):
-            finite("JobEstimate", name, (getattr(self, name),))
+        finite("PlanQuote", "joint_difficulty", self.joint_difficulty or ())
+        for name in ("peak_c", "gained_k", "p_saturation", "difficulty", "duration_s", "finish_in_s"):
+            finite("PlanQuote", name, (getattr(self, name),))
+
+
+class JobEstimate(msgspec.Struct, frozen=True, omit_defaults=True):
+    """The plans by which an arm can do a job, the fastest first, and what each costs."""
+
+    job: Name
+    plans: Annotated[tuple[PlanQuote, ...], msgspec.Meta(max_length=MOST_PLANS)] = ()
+    """Empty if the job is not feasible for the arm."""
+    reason: str = ""
+    """Why it is not."""
+
+    def __post_init__(self) -> None:
+        if len({plan.plan for plan in self.plans}) < len(self.plans):
+            raise ValueError(f"JobEstimate.plans of '{self.job}' must have different numbers.")
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the arm can do the job."""
+        return bool(self.plans)
+
+    @property
+    def least(self) -> PlanQuote:
+        """The plan with the least difficulty; without plans, one of which nothing is known."""
+        return min(
+            self.plans, key=lambda plan: inf if plan.difficulty is None else plan.difficulty, default=PlanQuote()
+        )
 
 
 class Quote(msgspec.Struct, frozen=True):
@@ -172,6 +206,8 @@ class Award(msgspec.Struct, frozen=True):
     """Cycles of the job that others have done already."""
     lease_s: Positive = LEASE_S
     """Real seconds that the arm may work on it without renewing the lease, counted from its quote."""
+    plan: Count = 0
+    """Number of the quoted plan by which to do it."""
 
 
 class Ack(msgspec.Struct, frozen=True):
@@ -211,9 +247,10 @@ class Lease(msgspec.Struct, frozen=True):
     granted: tuple[str, ...]
     """Awards whose lease is renewed."""
     revoked: tuple[str, ...]
-    """Awards that the arm has lost: it must release those jobs, unless it has permission to commit."""
+    """Awards that the arm has lost: it begins no cycle of them any more, goes home and reports them."""
     may_commit: tuple[str, ...] = ()
-    """Awards with permission to commit: the last cycle may begin, and no other arm gets these jobs any more."""
+    """Awards with permission to commit: the last cycle may begin under a lease, and no other arm gets these jobs any
+    more."""
 
 
 class Report(msgspec.Struct, frozen=True):
@@ -249,7 +286,7 @@ class Receipt(msgspec.Struct, frozen=True):
 JobState = Literal["waiting", "awarded", "finishing", "finished", "unfinished", "given_up"]
 """waiting: for its release, its predecessors or an arm; finishing: in its last cycle; unfinished: the arm had
 permission to commit and is silent since, or the shift ended before the job was done; given_up: arms faulted in it too
-often."""
+often, or in a job that it waits for."""
 SETTLED: tuple[JobState, ...] = ("finished", "unfinished", "given_up")
 """States that need nothing more; only a late report that the job is finished may change the other two."""
 
@@ -279,6 +316,9 @@ class Status(msgspec.Struct, frozen=True):
     auctioneer: Name
     time_s: float
     jobs: tuple[JobStatus, ...]
+    space: dict[Name, tuple[Name, ...]] = {}
+    """Names of the spaces that are closed to others, by the arm that takes them or may take them; "*" is all space
+    within its reach."""
 
 
 class Announcement(msgspec.Struct, frozen=True):
@@ -300,12 +340,14 @@ class Result(msgspec.Struct, frozen=True):
     status: JobStatus
     auction: str = ""
     difficulty: float | None = None
-    """Quoted by the arm."""
+    """Quoted by the arm, as are the next two."""
     p_saturation: float | None = None
+    peak_c: float | None = None
 
 
 class ClearRequest(msgspec.Struct, frozen=True):
-    """Request to `jobs/clear`: free the space of an absent arm. The same request again changes nothing.
+    """Request to `jobs/clear`: free the space of an absent arm, and end its awards. The same request again changes
+    nothing.
 
     Only a person who has seen that the arm is at home or removed, and switched off, may request it.
     """
@@ -316,7 +358,7 @@ class ClearRequest(msgspec.Struct, frozen=True):
 
 
 class Cleared(msgspec.Struct, frozen=True):
-    """Reply to a `ClearRequest`: it is on disk, and the arm takes no space until it reports its space again."""
+    """Reply to a `ClearRequest`: it is on disk, and the arm takes no space until it is heard again."""
 
     auctioneer: Name
     arm: Name

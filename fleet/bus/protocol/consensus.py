@@ -43,6 +43,8 @@ class Bid(msgspec.Struct, frozen=True):
     it."""
     choice: str = ""
     """The job among the estimates that this arm's policy chose; "" for none yet."""
+    choice_plan: Count = 0
+    """Number of the plan that it chose."""
 
     def __post_init__(self) -> None:
         finite("Bid", "time_s", (self.time_s,))

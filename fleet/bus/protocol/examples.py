@@ -20,6 +20,7 @@ from fleet.bus.protocol.auction import (
     Lease,
     LeaseEntry,
     LeaseRequest,
+    PlanQuote,
     Quote,
     QuoteRequest,
     Receipt,
@@ -45,17 +46,18 @@ CRATE = JobSpec(
 _ARM, _AUCTIONEER = "arm_0", "auctioneer"
 _ROUND, _QUOTE, _AWARD = "auctioneer-17", "arm_0-2-41", "auctioneer-17-crate_1"
 _CLAIMED, _SPACE = f"{_QUOTE}:crate_1", "5d1c0f7e92ab3486"
-_OFFER = JobEstimate(
-    job="crate_1",
-    feasible=True,
+_FASTEST = PlanQuote(
+    peak_c=51.5,
+    gained_k=8.5,
+    p_saturation=0.04,
     joint_difficulty=(0.02, 0.31, 0.05, 0.12, 0.01, 0.0, 0.02),
     difficulty=0.53,
-    p_saturation=0.04,
-    peak_c=51.5,
     duration_s=212.0,
     finish_in_s=240.5,
     space=_SPACE,
 )
+_COOLEST = PlanQuote(plan=1, peak_c=48.25, gained_k=5.25, p_saturation=0.01, duration_s=252.0, finish_in_s=280.5)
+_OFFER = JobEstimate(job="crate_1", plans=(_FASTEST, _COOLEST))
 _DONE = JobStatus(job="crate_1", state="finished", arm=_ARM, award=_AWARD, cycles=20, finished_s=842.5)
 
 _ALL: tuple[msgspec.Struct, ...] = (
@@ -139,7 +141,7 @@ _ALL: tuple[msgspec.Struct, ...] = (
     Submission(jobs=(CRATE,), by="shop floor"),
     SubmissionReply(auctioneer=_AUCTIONEER, jobs=(Admission(job="crate_1", accepted=True),)),
     StatusRequest(jobs=("crate_1",)),
-    Status(auctioneer=_AUCTIONEER, time_s=900.0, jobs=(_DONE,)),
+    Status(auctioneer=_AUCTIONEER, time_s=900.0, jobs=(_DONE,), space={"arm_2": ("5d1c0f7e92ab3486",)}),
     ClearRequest(arm="arm_2", by="shop floor"),
     Cleared(auctioneer=_AUCTIONEER, arm="arm_2"),
     ClockRequest(),

@@ -14,7 +14,7 @@ import msgspec
 from fleet.errors import BusError
 from fleet.telemetry import Mode
 
-VERSION = 2
+VERSION = 3
 Name = Annotated[str, msgspec.Meta(min_length=1)]
 Tick = Annotated[int, msgspec.Meta(ge=0)]
 
@@ -77,11 +77,14 @@ class DifficultyScores(msgspec.Struct, frozen=True):
     """d, [job]; null where the arm has no score or cannot do the job."""
     p_saturation: tuple[float | None, ...]
     """Probability that a motor passes the warning limit, [job]; null where unknown."""
+    peak_c: tuple[float | None, ...] = ()
+    """Predicted temperature of the hottest motor during the job, [job]; null where unknown; empty if none is known."""
 
     def __post_init__(self) -> None:
         finite("DifficultyScores", "time_s", (self.time_s,))
-        for name, values in (("difficulty", self.difficulty), ("p_saturation", self.p_saturation)):
-            if len(values) != len(self.jobs):
+        for name in ("difficulty", "p_saturation", "peak_c"):
+            values = getattr(self, name)
+            if len(values) != len(self.jobs) and (values or name != "peak_c"):
                 raise ValueError(
                     f"DifficultyScores.{name} needs one value per job ({len(self.jobs)}, got {len(values)})."
                 )
@@ -121,13 +124,13 @@ def _decoder(kind: type[Message]) -> msgspec.json.Decoder[Message]:
 
 
 def schema(kind: type[msgspec.Struct]) -> str:
-    """Name and version of a message's schema, for example `thermofleet.State.v2`."""
+    """Name and version of a message's schema, for example `thermofleet.State.v3`."""
     return f"thermofleet.{kind.__name__}.v{VERSION}"
 
 
 @cache
 def encoding(kind: type[msgspec.Struct]) -> str:
-    """The encoding that travels with every message, for example `application/json;thermofleet.State.v2`."""
+    """The encoding that travels with every message, for example `application/json;thermofleet.State.v3`."""
     return f"application/json;{schema(kind)}"
 
 

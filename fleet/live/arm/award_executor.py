@@ -5,8 +5,8 @@ they are on disk. The rules by which no job is done twice are in `fleet.bus.prot
 
 - an award counts only on a quote of this start of the arm that is still valid, once per job of that quote, and the
   answer is on disk before it is sent;
-- the arm works on a job up to `allowed_cycles`: to the last cycle while the lease is valid, and through the last one
-  only with permission to commit, which is on disk before the cycle begins;
+- the arm begins cycles up to `allowed_cycles`: only under a valid lease, the last one only with permission to commit,
+  which is on disk before; it ends what it has begun, and begins nothing of a revoked award;
 - the end of a job is on disk before it is reported, and the report is repeated until it is acknowledged.
 """
 
@@ -70,8 +70,8 @@ class _Quote:
     """A quote on which an award may come."""
 
     made_s: float
-    jobs: dict[str, tuple[JobSpec, bool]]
-    """Jobs that were asked for, and whether the arm can do each."""
+    jobs: dict[str, tuple[JobSpec, int]]
+    """Jobs that were asked for, and the number of plans that were offered for each."""
     answers: dict[str, Ack] = field(default_factory=dict[str, Ack])
     """Answer to the first award of each job."""
 
@@ -134,11 +134,11 @@ class AwardExecutor:
         blocked = self.unwritten or len(self._reports) >= MAX_REPORTS
         return 0 if blocked else max(0, self.config.capacity - len(self._active))
 
-    def add_quote(self, jobs: dict[str, tuple[JobSpec, bool]], now_s: float) -> str:
+    def add_quote(self, jobs: dict[str, tuple[JobSpec, int]], now_s: float) -> str:
         """Register a quote and return its name.
 
         Args:
-            jobs: By name, each with whether the arm can do it.
+            jobs: By name, each with the number of plans that are offered for it; 0 if the arm cannot do it.
         """
         self._count += 1
         name = f"{self._quote_prefix}-{self._count}"
@@ -186,7 +186,9 @@ class AwardExecutor:
         if reason:
             return self._ack(award, reason)
         # A new award for the job means that the earlier one has ended.
-        records = [AwardAccepted(award)] if earlier is None else [self._released(earlier), AwardAccepted(award)]
+        records: list[ArmRecord] = [AwardAccepted(award)]
+        if earlier is not None:
+            records.insert(0, Released(earlier.award.award, earlier.job, self.arm))
         try:
             self._keep(*records)
         except JournalError as error:
@@ -203,12 +205,13 @@ class AwardExecutor:
 
     def _objection(self, award: Award, quote: _Quote, now_s: float) -> str:
         """Why the award itself cannot be accepted; "" if it can."""
-        job, feasible = quote.jobs[award.job.name]
+        job, plans = quote.jobs[award.job.name]
         reports = [pending.report for pending in self._reports.values()]
         checks = (
             (self.unwritten, "my journal has no space left"),
             (job != award.job, "the job is not the one that the quote was for"),
-            (not feasible, "the quote says that I cannot do it"),
+            (not plans, "the quote says that I cannot do it"),
+            (award.plan >= plans, f"the quote has {plans} plan(s) for it, and none of number {award.plan}"),
             (now_s > quote.made_s + self.config.valid_s, f"the quote was valid for {self.config.valid_s:g} s"),
             (award.cycles >= job.repetitions, f"{award.cycles} of {job.repetitions} cycles are done: none is left"),
             (any(r.job == job.name and r.outcome == "finished" for r in reports), "I have finished that job"),
@@ -233,9 +236,9 @@ class AwardExecutor:
     def allowed_cycles(self, now_s: float) -> int:
         """Number of cycles of the current job that may be begun, including those done."""
         current = self._current
-        if current.may_commit:
-            return current.award.job.repetitions
-        return current.award.job.repetitions - 1 if now_s < current.lease_end_s else current.cycles
+        if current.revoked or now_s >= current.lease_end_s:
+            return current.cycles
+        return current.award.job.repetitions - (not current.may_commit)
 
     def record_progress(self, cycles: int, last_cycle_in_s: float) -> None:
         """Update the current job.
@@ -261,6 +264,12 @@ class AwardExecutor:
         """
         for number, active in enumerate(self.active):
             self._close(active, "returned", time_s, now_s, reason, faulted=faulted and number == 0)
+
+    def return_revoked(self, time_s: float, now_s: float, *, at_home: bool) -> None:
+        """Return the revoked awards; one with permission to commit at home only: there no last cycle is in progress."""
+        for active in self.active:
+            if active.revoked and (at_home or not active.may_commit):
+                self._close(active, "returned", time_s, now_s, "the award was revoked")
 
     def return_expired(self, time_s: float, now_s: float) -> None:
         """Return the awards whose lease expired more than `return_after_s` ago."""
@@ -316,14 +325,10 @@ class AwardExecutor:
                 continue
             if name in lease.may_commit and not active.may_commit:
                 active.may_commit = self._try_to_keep(CommitPermitted(name))
-            if name in lease.revoked and not active.may_commit:  # Permission to commit cannot be withdrawn.
-                del self._active[name]
-                self._write(self._released(active))
+            if name in lease.revoked:
+                active.revoked = True
             elif name in lease.granted:
                 active.lease_end_s, active.lease_s = max(active.lease_end_s, lease_end_s), lease.lease_s
-
-    def _released(self, active: ActiveAward) -> Released:
-        return Released(active.award.award, active.job, self.arm)
 
     def _phase(self, active: ActiveAward) -> Phase:
         if active is not self._current:

@@ -3,10 +3,14 @@
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from fleet.events import Event
 from fleet.job import Job
 from fleet.motion import Plan
 from fleet.telemetry import Mode
+
+Array = np.ndarray
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,11 @@ class Body(Protocol):
     @property
     def away(self) -> Plan | None:
         """Plan along which it is away from home, also where a fault stopped it; None at home."""
+        ...
+
+    @property
+    def housing_c(self) -> Array:
+        """Estimated housing temperatures, which have no sensor, °C, [joint]."""
         ...
 
     @property

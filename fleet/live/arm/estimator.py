@@ -11,19 +11,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleet.bus.protocol.auction import JobEstimate, JobSpec
+from fleet.bus.protocol.auction import JobEstimate, JobSpec, PlanQuote
 from fleet.difficulty import Difficulty, DifficultyModel
 from fleet.errors import InfeasibleJob
 from fleet.job import LONGEST_JOB_S, Job, Place, Work
-from fleet.motion import Drive, Plan, drives, offered_plans
+from fleet.motion import Drive, Plan, drives
 from fleet.motor import gen3_motors
+from fleet.planning.options import offered_plans
 from fleet.planning.space import plan_key, space_name
-from fleet.thermal import WINDING, gen3_network, temperature_steps, thermal_model
+from fleet.robot import JOINTS
+from fleet.thermal import NODES, WINDING, gen3_network, temperature_steps, thermal_model
 
 Array = np.ndarray
 
 MAX_WORKS, MAX_SCORES = 512, 4096
-"""Works whose plans are kept, and jobs whose best plan is kept."""
+"""Works whose plans are kept, and jobs whose plans are kept."""
 STEPS = 24
 """Time steps of a job when its temperatures are predicted."""
 NOT_PLANNED = "not planned yet; ask again"
@@ -36,11 +38,11 @@ class NominalPeaks:
         self._motors, self._thermal = gen3_motors(), thermal_model(gen3_network())
         self._drive = lru_cache(MAX_SCORES)(self._mean_drive)
 
-    def peaks_c(self, plans: Sequence[Plan], repetitions: Sequence[int], temp_c: Array, ambient_c: float) -> Array:
-        """Hottest motor during each job, °C, [job], in `STEPS` steps of constant heat each.
+    def peaks_c(self, plans: Sequence[Plan], repetitions: Sequence[int], known_c: Array) -> Array:
+        """Hottest motor during each plan, °C, [plan], in `STEPS` steps of constant heat each.
 
         Args:
-            temp_c: Motor temperatures measured now, [joint]; the housings are assumed to be as warm.
+            known_c: Known temperatures, [KNOWN].
         """
         if not plans:
             return np.zeros(0)
@@ -56,8 +58,8 @@ class NominalPeaks:
             np.array([plan.duration_s(times) for plan, times in jobs]) / STEPS,
             motors=self._motors,
             thermal=self._thermal,
-            start_c=np.tile(np.asarray(temp_c, dtype=float), (len(plans), 2)),  # [job, node]: windings, housings
-            ambient_c=ambient_c,
+            start_c=np.tile(known_c[:NODES], (len(plans), 1)),  # [plan, node]: windings, then housings
+            ambient_c=float(known_c[NODES]),
         )
         return np.max([step[:, WINDING].max(axis=1) for step in steps], axis=0)
 
@@ -67,14 +69,14 @@ class NominalPeaks:
 
 
 class ScoredPlan(NamedTuple):
-    """How an arm would do a job: the variant with the least difficulty."""
+    """A plan on offer for a job."""
 
     plan: Plan
     difficulty: Difficulty | None
 
 
 class Estimator:
-    """Chooses how one arm would do a job, and estimates its cost.
+    """Plans the jobs of one arm, and estimates what each plan costs.
 
     Args:
         plan: Returns all variants of a work, maybe slowly; raises `InfeasibleJob`.
@@ -91,8 +93,8 @@ class Estimator:
         self.model = model
         self._plan, self._places, self._peaks = plan, places, peaks
         self._variants = lru_cache(MAX_WORKS)(self._variants_or_reason)
-        self._best: dict[tuple[Work, int], ScoredPlan | str] = {}
-        """Best plan of a work and a number of repetitions, or why there is none."""
+        self._offers: dict[tuple[Work, int], tuple[ScoredPlan, ...] | str] = {}
+        """Plans of a work and a number of repetitions, the fastest first, or why there is none."""
 
     def plan_ahead(self, works: Iterable[Work]) -> None:
         """Plan some works before they are requested."""
@@ -101,7 +103,7 @@ class Estimator:
 
     def is_prepared(self, job: JobSpec) -> bool:
         """Whether an estimate of the job needs neither planning nor scoring."""
-        return self._best_or_reason(job) != NOT_PLANNED
+        return self._offers_or_reason(job) != NOT_PLANNED
 
     def prepare(self, job: JobSpec) -> None:
         """Plan and score the job, maybe slowly; never raises."""
@@ -109,18 +111,19 @@ class Estimator:
             return
         work = self._work(job)
         assert isinstance(work, Work)
-        if len(self._best) >= MAX_SCORES:
-            del self._best[next(iter(self._best))]
+        if len(self._offers) >= MAX_SCORES:
+            del self._offers[next(iter(self._offers))]
+        self._offers[work, job.repetitions] = self._scored_or_reason(work, job.repetitions)
+
+    def _scored_or_reason(self, work: Work, repetitions: int) -> tuple[ScoredPlan, ...] | str:
         variants = self._variants(work)
         if isinstance(variants, str):
-            self._best[work, job.repetitions] = variants
-            return
-        best = offered_plans(variants, job.repetitions)[0]
-        if (takes_s := best.duration_s(job.repetitions)) > LONGEST_JOB_S:
+            return variants
+        offered = offered_plans(variants, repetitions)
+        if (takes_s := offered[0].duration_s(repetitions)) > LONGEST_JOB_S:
             days = f"it would take {takes_s / 86400:.1f} days; at most {LONGEST_JOB_S / 86400:g} are allowed"
-            self._best[work, job.repetitions] = f"{days}: use fewer repetitions"
-            return
-        self._best[work, job.repetitions] = ScoredPlan(best, self.model.score(best, job.repetitions))
+            return f"{days}: use fewer repetitions"
+        return tuple(ScoredPlan(plan, self.model.score(plan, repetitions)) for plan in offered)
 
     def job(self, job: JobSpec) -> Job | None:
         """Return the job with its work; None if it is not possible in this cell."""
@@ -135,43 +138,46 @@ class Estimator:
             due_s=np.inf if job.due_s is None else job.due_s,
             value=job.value,
             after=job.after,
+            expires=job.expires,
         )
 
-    def best_plan(self, job: JobSpec) -> ScoredPlan | None:
-        """Return how the arm would do the job, planned if needed; None if it cannot."""
+    def plans(self, job: JobSpec) -> tuple[ScoredPlan, ...]:
+        """Return the plans on offer for the job, planned if needed, the fastest first; none if the arm cannot do it."""
         self.prepare(job)
-        best = self._best_or_reason(job)
-        return None if isinstance(best, str) else best
+        offers = self._offers_or_reason(job)
+        return () if isinstance(offers, str) else offers
 
-    def space_of(self, job: JobSpec) -> str | None:
-        """Return the name of the space that the arm takes for the job; None if it cannot do it."""
-        scored = self.best_plan(job)
-        return None if scored is None else space_name(plan_key(scored.plan))
+    def space_of(self, job: JobSpec, plan: int) -> str | None:
+        """Return the name of the space that the arm takes by a plan on offer; None if there is no such plan."""
+        offers = self.plans(job)
+        return space_name(plan_key(offers[plan].plan)) if plan < len(offers) else None
 
-    def estimate(
-        self, jobs: Sequence[JobSpec], temp_c: Array, ambient_c: float, busy_s: float
-    ) -> tuple[JobEstimate, ...]:
+    def estimate(self, jobs: Sequence[JobSpec], known_c: Array, busy_s: float) -> tuple[JobEstimate, ...]:
         """Estimate each job from what is planned already.
 
         Args:
-            temp_c: Motor temperatures as measured now, [joint].
+            known_c: Measured motor temperatures, estimated housing temperatures and ambient temperature, [KNOWN].
             busy_s: Seconds until the arm is free; inf if unknown.
         """
-        best = [(job, self._best_or_reason(job)) for job in jobs]
-        feasible = [(job, scored) for job, scored in best if isinstance(scored, ScoredPlan)]
-        plans, repetitions = [scored.plan for _, scored in feasible], [job.repetitions for job, _ in feasible]
-        peaks = iter(self._peaks.peaks_c(plans, repetitions, temp_c, ambient_c).tolist())
+        offers = [(job, self._offers_or_reason(job)) for job in jobs]
+        pairs = [
+            (scored.plan, job.repetitions) for job, plans in offers if not isinstance(plans, str) for scored in plans
+        ]
+        nominal_c = iter(self._peaks.peaks_c([p for p, _ in pairs], [times for _, times in pairs], known_c).tolist())
         return tuple(
-            JobEstimate(job=job.name, feasible=False, reason=scored)
-            if isinstance(scored, str)
-            else _estimate(job, scored, temp_c, next(peaks), busy_s)
-            for job, scored in best
+            JobEstimate(job=job.name, reason=plans)
+            if isinstance(plans, str)
+            else JobEstimate(
+                job=job.name,
+                plans=tuple(_quote(n, job, scored, known_c, next(nominal_c), busy_s) for n, scored in enumerate(plans)),
+            )
+            for job, plans in offers
         )
 
-    def _best_or_reason(self, job: JobSpec) -> ScoredPlan | str:
-        """Best plan of a prepared job, or why there is none."""
+    def _offers_or_reason(self, job: JobSpec) -> tuple[ScoredPlan, ...] | str:
+        """Plans of a prepared job, or why there is none."""
         work = self._work(job)
-        return work if isinstance(work, str) else self._best.get((work, job.repetitions), NOT_PLANNED)
+        return work if isinstance(work, str) else self._offers.get((work, job.repetitions), NOT_PLANNED)
 
     def _work(self, job: JobSpec) -> Work | str:
         """Return the work, or why it is not possible."""
@@ -196,16 +202,19 @@ class Estimator:
             return f"at '{infeasible.place}': {infeasible.reason}"
 
 
-def _estimate(job: JobSpec, scored: ScoredPlan, temp_c: Array, peak_c: float, busy_s: float) -> JobEstimate:
-    score, plan = scored.difficulty, scored.plan
+def _quote(number: int, job: JobSpec, scored: ScoredPlan, known_c: Array, nominal_c: float, busy_s: float) -> PlanQuote:
+    """Return what a plan costs; its peak is that of the arm's model, or else that of a nominal arm."""
+    plan, score = scored
+    own_c = None if score is None else score.peak_at(known_c)
+    peak_c, hottest_c = nominal_c if own_c is None else own_c, float(known_c[:JOINTS].max())
     finish_s = busy_s + plan.approach.duration_s + job.repetitions * plan.cycle.duration_s
-    return JobEstimate(
-        job=job.name,
-        feasible=True,
+    return PlanQuote(
+        plan=number,
+        peak_c=peak_c,
+        gained_k=peak_c - hottest_c,
+        p_saturation=None if score is None else score.p_at(known_c),
         joint_difficulty=None if score is None else tuple(score.per_joint.tolist()),
         difficulty=None if score is None else score.total,
-        p_saturation=None if score is None else score.p_at(temp_c),
-        peak_c=peak_c,
         duration_s=plan.duration_s(job.repetitions),
         finish_in_s=finish_s if np.isfinite(finish_s) else None,
         space=space_name(plan_key(plan)),

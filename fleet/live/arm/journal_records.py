@@ -51,7 +51,9 @@ class ActiveAward:
     lease_end_s: float = 0.0
     """Real second at which its lease expires."""
     may_commit: bool = False
-    """Whether the last cycle may begin."""
+    """Whether the last cycle may begin, under a lease."""
+    revoked: bool = False
+    """No cycle may begin any more."""
     cycles_on_disk: int = 0
     lease_s: float = 0.0
     """Length of its leases, real seconds."""

@@ -18,12 +18,13 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Ack, ArmEvent, Award, JobEstimate, JobSpec, Quote, QuoteRequest
 from fleet.bus.protocol.messages import DifficultyScores, Info, State
 from fleet.bus.protocol.registry import STATE_HZ
+from fleet.difficulty import known_temperatures
 from fleet.errors import Refused
 from fleet.events import Event
 from fleet.live.arm.auctioneer_client import AuctioneerClient, RateLimitedWarnings, WorkSource
 from fleet.live.arm.award_executor import AwardExecutor
 from fleet.live.arm.body import Body
-from fleet.live.arm.estimator import Estimator
+from fleet.live.arm.estimator import Estimator, ScoredPlan
 from fleet.live.arm.journal_records import ActiveAward
 from fleet.live.clock import FleetClock, next_due_s
 from fleet.live.space import ANYWHERE
@@ -128,8 +129,8 @@ class ArmNode:
         estimates, name = self.estimate(request.jobs), ""
         real_s = time.monotonic()
         if not request.dry_run:
-            feasible = {estimate.job: (jobs[estimate.job], estimate.feasible) for estimate in estimates}
-            name = self.executor.add_quote(feasible, real_s)
+            offers = {estimate.job: (jobs[estimate.job], len(estimate.plans)) for estimate in estimates}
+            name = self.executor.add_quote(offers, real_s)
             self.publish_difficulty(estimates, real_s)
         return Quote(
             arm=self._name,
@@ -151,13 +152,14 @@ class ArmNode:
         plan = self._body.away
         return () if plan is None else (space_name(plan_key(plan)),)
 
-    def space_of(self, job: JobSpec) -> str | None:
-        """Return the name of the space that the arm takes for a job; None if it cannot do it."""
-        return self._estimator.space_of(job)
+    def space_of(self, job: JobSpec, plan: int) -> str | None:
+        """Return the name of the space that the arm takes for a job by a plan; None if it has no such plan."""
+        return self._estimator.space_of(job, plan)
 
     def _possible_space(self) -> tuple[str, ...]:
         """Names of the spaces that the arm takes, and of those for which it may leave home at any moment."""
-        jobs = {self.space_of(active.award.job) or ANYWHERE for active in self.executor.active}
+        awards = [active.award for active in self.executor.active]
+        jobs = {self.space_of(award.job, award.plan) or ANYWHERE for award in awards}
         return tuple(sorted(jobs.union(self.space)))
 
     def estimate(self, jobs: tuple[JobSpec, ...]) -> tuple[JobEstimate, ...]:
@@ -172,10 +174,12 @@ class ArmNode:
             else:
                 self._unplanned.append(job)
         ambient_c = self._config.ambient_c(self.clock.now_s(time.monotonic()))
-        return self._estimator.estimate(jobs, np.array(self._reading.temp_c), ambient_c, self._busy_s())
+        known_c = known_temperatures(np.array(self._reading.temp_c), self._body.housing_c, ambient_c)
+        return self._estimator.estimate(jobs, known_c, self._busy_s())
 
     def publish_difficulty(self, estimates: tuple[JobEstimate, ...], real_s: float) -> None:
-        """Publish how difficult jobs are for the arm."""
+        """Publish how difficult jobs are for the arm, by the plan with the least difficulty."""
+        plans = [estimate.least for estimate in estimates]
         self._publish_difficulty(
             DifficultyScores(
                 arm=self._name,
@@ -183,8 +187,9 @@ class ArmNode:
                 time_s=self.clock.now_s(real_s),
                 twin=self._estimator.model.version,
                 jobs=tuple(estimate.job for estimate in estimates),
-                difficulty=tuple(estimate.difficulty for estimate in estimates),
-                p_saturation=tuple(estimate.p_saturation for estimate in estimates),
+                difficulty=tuple(plan.difficulty for plan in plans),
+                p_saturation=tuple(plan.p_saturation for plan in plans),
+                peak_c=tuple(plan.peak_c for plan in plans),
             )
         )
 
@@ -198,8 +203,8 @@ class ArmNode:
         before = len(self.executor.active)
         ack = self.executor.answer_award(award, real_s, self.unfit())
         if ack.accepted and len(self.executor.active) > before:
-            scored = self._estimator.best_plan(award.job)
-            score = math.nan if scored is None or scored.difficulty is None else scored.difficulty.total
+            difficulty = self._scored(award).difficulty
+            score = math.nan if difficulty is None else difficulty.total
             self._report_event(Event(time_s=self._body.time_s, kind="award", job=award.job.name, value=score))
         return ack
 
@@ -239,7 +244,7 @@ class ArmNode:
         """Advance the body to the present, as far as leases allow."""
         now_s, current = self.clock.now_s(real_s), self._current
         self._assign(current)
-        if current is not None and not current.may_commit and current.lease_end_s < real_s:
+        if current is not None and current.lease_end_s < real_s:
             # Work done within the lease counts, even if this process was stopped since.
             lease_end_s = math.nextafter(current.lease_end_s, -math.inf)
             self._advance(self.clock.now_s(lease_end_s), current, lease_end_s, real_s)
@@ -256,11 +261,14 @@ class ArmNode:
             self._body_award = ""
         if current is None or not self._body.is_free:
             return
-        job, scored = self._estimator.job(current.award.job), self._estimator.best_plan(current.award.job)
+        job = self._estimator.job(current.award.job)
         assert job is not None
-        assert scored is not None, "an award of an infeasible job is refused"
-        self._body.start(job, scored.plan, current.cycles)
+        self._body.start(job, self._scored(current.award).plan, current.cycles)
         self._body_award = name
+
+    def _scored(self, award: Award) -> ScoredPlan:
+        """Return the plan of an award; one without a quoted plan is refused."""
+        return self._estimator.plans(award.job)[award.plan]
 
     def _advance(self, until_s: float, current: ActiveAward | None, leased_s: float, real_s: float) -> None:
         if current is not None and self._body_award == current.award.award:
@@ -273,6 +281,7 @@ class ArmNode:
         if self._reading.mode == "faulted" and self.executor.active:
             self.executor.return_all(self._body.time_s, real_s, "the arm is faulted")
             self._body_award = ""
+        self.executor.return_revoked(self._body.time_s, real_s, at_home=self._body.away is None)
         if current := self._current:
             at_work = self._body_award == current.award.award and self._body.job
             cycles = self._body.cycles if at_work else current.cycles
@@ -287,10 +296,7 @@ class ArmNode:
         """Fleet seconds until the last cycle of the current job could begin."""
         if self._body_award == current.award.award:
             return self._body.last_cycle_in_s()
-        scored = self._estimator.best_plan(current.award.job)
-        if scored is None:
-            return math.inf
-        left, plan = current.award.job.repetitions - 1 - current.cycles, scored.plan
+        left, plan = current.award.job.repetitions - 1 - current.cycles, self._scored(current.award).plan
         return self._body.free_in_s() + plan.approach.duration_s + left * plan.cycle.duration_s
 
     def _handle_event(self, event: Event, real_s: float) -> None:
@@ -309,9 +315,8 @@ class ArmNode:
         """Fleet seconds until the arm has finished all its jobs."""
         busy_s = self._body.free_in_s()
         for active in self.executor.active:
-            scored = self._estimator.best_plan(active.award.job)
-            if active.award.award != self._body_award and scored is not None:
-                busy_s += scored.plan.duration_s(active.award.job.repetitions - active.cycles)
+            if active.award.award != self._body_award:
+                busy_s += self._scored(active.award).plan.duration_s(active.award.job.repetitions - active.cycles)
         return busy_s
 
     @property
@@ -331,6 +336,7 @@ class ArmNode:
                 headroom_k=self._headroom_k,
                 job="" if self._current is None else self._current.job,
                 space="".join(self.space),
+                busy_s=busy_s if math.isfinite(busy_s := self._busy_s()) else 0.0,
                 **vars(self._reading),
             )
         )

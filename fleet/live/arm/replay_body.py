@@ -50,6 +50,10 @@ class ReplayBody:
         """Whether its last sample has passed."""
         return self._row == len(self._log.time_s) - 1
 
+    @property
+    def housing_c(self) -> np.ndarray:
+        return self._log.temp_c[self._row]  # as warm as the motors: no job is quoted
+
     # It takes no jobs.
 
     job, is_free, cycles, away = "", False, 0, None

@@ -21,6 +21,7 @@ from fleet.engine.state import DONE, State, World, initial
 from fleet.engine.step import ROUNDING_S
 from fleet.engine.world import Arm, build_world
 from fleet.events import Event
+from fleet.housing_observer import HousingObserver, housing_observer
 from fleet.job import Job
 from fleet.live.arm.body import SensorReading
 from fleet.motion import Plan
@@ -38,6 +39,7 @@ _REPORTED = ("torque_warning", "home", "warning", "fault", "recover", "moved")
 _CARRIED = (
     "tick",
     "temp_c",
+    "housing_c",
     "mode",
     "clear_at_s",
     "faults",
@@ -119,6 +121,10 @@ class SimulatedBody:
         return self._plan if self._state.plan[0, 0] >= 0 else None
 
     @property
+    def housing_c(self) -> Array:
+        return self._state.housing_c[0, 0]  # the estimate of the arm's observer, not the true temperatures
+
+    @property
     def cycles(self) -> int:
         assert self._task is not None, "no current job"
         return self._task.before + self._begun(done=True)
@@ -192,7 +198,8 @@ class SimulatedBody:
         # The engine counts its time in ticks of the new length.
         later_s = ticks * (dt_s - self._dt_s)
         clear_at_s, moved_at_s = self._state.clear_at_s + later_s, self._state.moved_at_s + later_s
-        self._world = replace(self._world, dt_s=dt_s, phi=phi, gamma=gamma)
+        observer = HousingObserver(*(part[None] for part in housing_observer(*self._arm.beliefs, dt_s)))
+        self._world = replace(self._world, dt_s=dt_s, phi=phi, gamma=gamma, observer=observer)
         self._state = self._state._replace(clear_at_s=clear_at_s, moved_at_s=moved_at_s)
         self._dt_s = dt_s
         self.set_time(time_s)
@@ -226,15 +233,22 @@ class SimulatedBody:
         if not self._working:
             if task.allowed <= task.before:
                 return False
-            table = replace(self._world.jobs, repetitions=np.array([[task.allowed - task.before]]))
-            self._world = replace(self._world, jobs=table)
+            self._set_repetitions(task.allowed - task.before)
             self._state = self._carried(self._world)
             return True
         if self._in_stint:
             todo = max(task.allowed - task.before, self._begun())
             if todo != state.todo[0, 0]:
-                self._state = state._replace(todo=np.array([[todo]]))
+                self._set_repetitions(todo)  # otherwise the engine takes the job for given back
+                approach_s, cycle_s, _ = self._times_s
+                # A job that ends at this very moment has not ended for the engine yet.
+                progress_s = min(self._progress_s, approach_s + todo * cycle_s - 2 * ROUNDING_S)
+                self._state = state._replace(todo=np.array([[todo]]), progress_s=np.array([[progress_s]]))
         return False
+
+    def _set_repetitions(self, count: int) -> None:
+        table = replace(self._world.jobs, repetitions=np.array([[count]]))
+        self._world = replace(self._world, jobs=table)
 
     def _job_events(self, task: _Current, done: int, log: list[Event], shift_s: float) -> list[Event]:
         """Return the events of the current job in a step; drop the job where it ended.

@@ -11,6 +11,7 @@ make it safe (`fleet.bus.protocol.auction` says why):
 - After a crash every open award counts as leased from the restart.
 - An arm takes the space of an award from then on until its quote in a later round says that it does not take it any
   more; an award is given only if its space is free. The space of an arm without a quote stays taken.
+- Whoever frees the space of an arm also ends its awards; if the arm is heard again, it takes its space again.
 """
 
 import logging
@@ -40,12 +41,21 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.messages import State
 from fleet.errors import JournalFull, Refused
-from fleet.live.auction.leases import CountedLease, SendAward
-from fleet.live.auction.ledger import AuctionRecord, Awarded, Change, ContactLost, ContactRegained, Ledger, ShiftEnded
-from fleet.live.auction.round import MAX_REASON, Allocate, Bidding, Round, Timing, drop_invalid, infeasible_jobs
-from fleet.live.auction.space_rules import drop_taken, is_to_clear, stated_spaces
-from fleet.live.journal_records import Closed, CommitPermitted, JobsAccepted, SpaceCleared
-from fleet.live.space import ANYWHERE, Excludes, no_conflicts
+from fleet.live.auction.leases import CountedLease, SendAward, new_awards, send_again, unanswered
+from fleet.live.auction.ledger import AuctionRecord, Change, ContactLost, ContactRegained, Ledger, ShiftEnded
+from fleet.live.auction.round import (
+    MAX_REASON,
+    Allocate,
+    Assignment,
+    Bidding,
+    Round,
+    Timing,
+    drop_invalid,
+    infeasible_jobs,
+)
+from fleet.live.auction.space_rules import cleared_space, drop_taken, retaken_space, stated_spaces
+from fleet.live.journal_records import Closed, CommitPermitted, JobsAccepted
+from fleet.live.space import Excludes, no_conflicts
 
 _LOG = logging.getLogger(__name__)
 
@@ -117,16 +127,19 @@ class Auctioneer:
         An arm that asks after the end of its lease, but before its award was closed, keeps it: no other arm has it.
         """
         leased = {entry.award: entry for entry in request.entries if self._is_leased(entry, request.arm)}
+        revoked = tuple(entry.award for entry in request.entries if entry.award not in leased)
+        self._take_space(request.arm, self.ledger.space_of(revoked, request.arm))
+        if not self._permit_commits(leased, time_s):
+            leased = {award: entry for award, entry in leased.items() if not self.ledger.open[award].silent}
         for award, entry in leased.items():
             lease = self._leases[award]
             lease.unanswered, lease.cycles = None, max(entry.cycles, lease.cycles)
             lease.until_s = real_s + self._timing.counted_lease_s
-        self._permit_commits(leased, time_s)
         return Lease(
             auctioneer=self.name,
             lease_s=self._timing.lease_s,
             granted=tuple(leased),
-            revoked=tuple(entry.award for entry in request.entries if entry.award not in leased),
+            revoked=revoked,
             may_commit=tuple(award for award in leased if self.ledger.open[award].may_commit),
         )
 
@@ -179,24 +192,28 @@ class Auctioneer:
             self._record(Closed(ack.award, "refused", 0, time_s, reason))
             self._delay(real_s, (lease.unanswered.award.job.name,))
         lease.unanswered = None
-        if not any(self._unanswered()):
+        if not unanswered(self._leases):
             self._scan_s = -math.inf  # the next round can begin
 
     def apply_state(self, arm: str, state: State) -> None:
         """Apply the state of an arm; one that has come home may have freed space."""
         before = self.states.get(arm)
+        self._take_space(arm, {state.space} - {""})
         if before is not None and before.space and not state.space:
             self._retry_now()
         self.states[arm] = state
 
     def clear(self, request: ClearRequest, present: frozenset[str], time_s: float) -> Cleared:
-        """Free the space of an absent arm: a person has seen that it is at home, or removed.
+        """Free the space of an absent arm and end its awards: a person has seen that it is at home, or removed.
+
+        It is unknown whether its last cycle was done; if the arm is heard again, it reports that.
 
         Raises:
             Refused: the arm is unknown, or present, or may have a lease.
         """
-        if is_to_clear(self.ledger, request.arm, present, self._timing.lease_s):
-            self._record(SpaceCleared(request.arm, request.by, time_s))
+        cycles = {name: lease.cycles for name, lease in self._leases.items()}
+        if records := cleared_space(self.ledger, request, present, cycles, self._timing.lease_s, time_s):
+            self._record(*records)
             _LOG.warning("The space of '%s' was cleared by '%s'.", request.arm, request.by)
             self._retry_now()
         return Cleared(self.name, request.arm)
@@ -210,10 +227,8 @@ class Auctioneer:
     def tick(self, real_s: float, time_s: float) -> None:
         """Do what is due."""
         self._expire(real_s, time_s)
-        for lease, message in self._unanswered():
-            if real_s >= lease.sent_s + self._timing.ack_s and lease.attempts < self._timing.attempts:
-                lease.sent_s, lease.attempts = real_s, lease.attempts + 1
-                self.out.append(message)
+        self._try_to_record("Late jobs are not given up", *self.ledger.expired(time_s))
+        self.out.extend(send_again(self._leases, real_s, self._timing))
         if self._round is None:
             if real_s >= self._scan_s:
                 self._scan_s = real_s + SCAN_S
@@ -237,9 +252,6 @@ class Auctioneer:
 
     # Leases
 
-    def _unanswered(self) -> list[tuple[CountedLease, SendAward]]:
-        return [(lease, lease.unanswered) for lease in self._leases.values() if lease.unanswered is not None]
-
     def _with_progress(self, status: JobStatus) -> JobStatus:
         lease = self._leases.get(status.award)
         cycles = status.cycles if lease is None else max(status.cycles, lease.cycles)
@@ -252,7 +264,8 @@ class Auctioneer:
             return False
         return award.may_commit or not self.ledger.ended
 
-    def _permit_commits(self, leased: dict[str, LeaseEntry], time_s: float) -> None:
+    def _permit_commits(self, leased: dict[str, LeaseEntry], time_s: float) -> bool:
+        """Record permissions to commit, and contact with silent arms; return whether that is on disk."""
         records: list[AuctionRecord] = []
         for name, entry in leased.items():
             award = self.ledger.open[name]
@@ -260,27 +273,27 @@ class Auctioneer:
                 records.append(CommitPermitted(name, time_s))
             elif award.silent and not self.ledger.ended:
                 records.append(ContactRegained(name, time_s))
-        try:
-            self._record(*records)
-        except JournalFull as error:
-            _LOG.error("No permission to commit is given: %s", error)
+        return self._try_to_record("No permission to commit is given", *records)
+
+    def _take_space(self, arm: str, space: set[str]) -> None:
+        """Record that an arm that is heard takes this space; on a full disk nothing is awarded, and it is repeated."""
+        self._try_to_record(f"The space of '{arm}' is not recorded", *retaken_space(self.ledger, arm, space))
 
     def _expire(self, real_s: float, time_s: float) -> None:
         """Close awards whose lease has ended; one with permission to commit stays open."""
         for name, lease in [(name, lease) for name, lease in self._leases.items() if real_s >= lease.until_s]:
             award = self.ledger.open[name]
             missing = "renew its lease" if lease.unanswered is None else "answer the award"
-            try:
-                if not award.may_commit:
-                    reason = f"'{award.record.arm}' did not {missing}."
-                    self._record(Closed(name, "dropped", lease.cycles, time_s, reason))
-                    self._retry_now()
-                elif not award.silent and not self.ledger.ended:
-                    self._record(ContactLost(name, time_s))
-                    lease.until_s = math.inf
-            except JournalFull as error:
-                _LOG.error("Cannot take back '%s' from '%s': %s", award.record.job, award.record.arm, error)
-                return
+            vain = f"'{award.record.job}' is not taken back from '{award.record.arm}'"
+            if not award.may_commit:
+                reason = f"'{award.record.arm}' did not {missing}."
+                if not self._try_to_record(vain, Closed(name, "dropped", lease.cycles, time_s, reason)):
+                    return
+                self._retry_now()
+            elif not award.silent and not self.ledger.ended:
+                if not self._try_to_record(vain, ContactLost(name, time_s)):
+                    return
+                lease.until_s = math.inf
 
     # Rounds
 
@@ -296,9 +309,9 @@ class Auctioneer:
         self._pause_s = min(2 * self._pause_s, self._timing.pause_s[1])
 
     def _open_round(self, real_s: float, time_s: float) -> None:
-        unanswered = self._unanswered()
-        bidders = self._present - {message.arm for _, message in unanswered}
-        if not bidders or any(real_s < lease.sent_s + self._timing.window_s for lease, _ in unanswered):
+        waiting = unanswered(self._leases)
+        bidders = self._present - {message.arm for _, message in waiting}
+        if not bidders or any(real_s < lease.sent_s + self._timing.window_s for lease, _ in waiting):
             return
         delayed = {job for job, at_s in self._later_s.items() if at_s > real_s}
         jobs = tuple(self.ledger.ready(time_s, self._timing.max_jobs, excluded=delayed))
@@ -312,10 +325,7 @@ class Auctioneer:
 
     def _close_round(self, closing: Round, real_s: float, time_s: float) -> None:
         self._round = None
-        try:
-            self._record(*stated_spaces(self.ledger, closing, time_s))
-        except JournalFull as error:
-            _LOG.error("Nothing is awarded: %s", error)
+        if not self._try_to_record("Nothing is awarded", *stated_spaces(self.ledger, closing, time_s)):
             self._delay(real_s, (job.name for job in closing.jobs))
             return
         busy = self.ledger.busy_stations()
@@ -351,28 +361,17 @@ class Auctioneer:
                 self._scan_s = real_s + self._pause_s
             self._delay(real_s, (job.name for job in closing.jobs))
 
-    def _award(self, bidding: Bidding, allocation: dict[str, str], real_s: float, time_s: float) -> None:
-        auction = bidding.auction
-        records: list[Awarded] = []
-        for job, arm in allocation.items():
-            offer = bidding.offer(arm, job)
-            assert offer is not None, "drop_invalid keeps jobs with a bid"
-            quote, cycles = bidding.quotes[arm].quote, self.ledger.jobs[job].cycles
-            award, space = f"{auction}:{job}", offer.space or ANYWHERE
-            records.append(
-                Awarded(award, auction, job, arm, quote, cycles, time_s, offer.difficulty, offer.p_saturation, space)
-            )
-        self._record(*records)
+    def _award(self, bidding: Bidding, allocation: dict[str, Assignment], real_s: float, time_s: float) -> None:
+        self._record(*(records := new_awards(self.ledger, bidding, allocation, time_s)))
         for record in records:
             self._notes.pop(record.job, None)
             spec = self.ledger.jobs[record.job].spec
-            award = Award(record.award, auction, self.name, record.quote, spec, record.cycles, self._timing.lease_s)
+            terms = (record.quote, spec, record.cycles, self._timing.lease_s, record.plan)
+            award = Award(record.award, bidding.auction, self.name, *terms)
             message = SendAward(record.arm, award)
             until_s = real_s + self._timing.counted_lease_s
             self._leases[record.award] = CountedLease(until_s, unanswered=message, sent_s=real_s)
             self.out.append(message)
-
-    # Records
 
     def _record(self, *records: AuctionRecord) -> None:
         """Write records, then apply them.
@@ -386,6 +385,15 @@ class Auctioneer:
         for record in records:
             self.out.extend(map(self._result, self.ledger.apply(record)))
         self._leases = {award: lease for award, lease in self._leases.items() if award in self.ledger.open}
+
+    def _try_to_record(self, failure: str, *records: AuctionRecord) -> bool:
+        """Record; return whether that is on disk, and log the failure if not."""
+        try:
+            self._record(*records)
+        except JournalFull as error:
+            _LOG.error("%s: %s", failure, error)
+            return False
+        return True
 
     def _result(self, change: Change) -> Result:
         return Result(self.name, **asdict(change))

@@ -1,14 +1,15 @@
-"""Which jobs are accepted, which can begin, and which statuses fit in a reply: the same with and without auctioneer."""
+"""Which jobs are accepted, which can begin, and the reply to a status request: the same with and without auctioneer."""
 
 # The stubs of networkx leave the results of its functions unknown.
 # pyright: standard
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from itertools import accumulate, islice
 
 import networkx as nx
+from msgspec.structs import replace
 
-from fleet.bus.protocol.auction import MOST_JOBS, SETTLED, Admission, JobSpec, JobStatus
+from fleet.bus.protocol.auction import MOST_JOBS, SETTLED, Admission, JobSpec, JobStatus, Status
 from fleet.bus.protocol.messages import encode
 
 MAX_KEPT_JOBS = 10_000
@@ -30,6 +31,7 @@ def admit(
     places: frozenset[str] | None = None,
     limit: int = MAX_KEPT_JOBS,
     ended: bool = False,
+    given_up: Container[str] = (),
 ) -> tuple[Admission, ...]:
     """Return which jobs of one submission can be accepted; they may name one another as predecessors in any order.
 
@@ -37,6 +39,7 @@ def admit(
         known: Jobs that were accepted before. An identical job is accepted again and changes nothing.
         places: Places of the cell; None allows any name.
         ended: Whether the shift is over.
+        given_up: Known jobs that are given up: a job that waits for one is accepted, and given up too.
     """
     rejected: dict[int, str] = {}
     new: dict[str, JobSpec] = {}
@@ -57,7 +60,33 @@ def admit(
             new[job.name] = job
     never = _never_ready(new, known)
     reasons = [rejected.get(index) or never.get(job.name, "") for index, job in enumerate(jobs)]
-    return tuple(Admission(job.name, not reason, reason) for job, reason in zip(jobs, reasons, strict=True))
+    lost = lost_jobs(new.values(), given_up)
+    return tuple(
+        Admission(job.name, not reason, reason or lost.get(job.name, ""))
+        for job, reason in zip(jobs, reasons, strict=True)
+    )
+
+
+EXPIRED = "expired: its due date passed before an arm had begun it."
+
+
+def is_late(job: JobSpec, time_s: float) -> bool:
+    """Return whether a job that still waits has expired at a fleet time."""
+    return job.expires and job.due_s is not None and job.due_s < time_s
+
+
+def lost_jobs(jobs: Collection[JobSpec], given_up: Container[str]) -> dict[str, str]:
+    """Return why jobs are given up that wait for one that is, directly or not, by name."""
+    reasons: dict[str, str] = {}
+    before = -1
+    while len(reasons) > before:
+        before = len(reasons)
+        for job in jobs:
+            if job.name not in reasons and job.name not in given_up:
+                lost = next((name for name in job.after if name in given_up or name in reasons), None)
+                if lost is not None:
+                    reasons[job.name] = f"Given up, because it waits for '{lost}', which is given up."
+    return reasons
 
 
 def _never_ready(new: Mapping[str, JobSpec], known: Mapping[str, JobSpec]) -> dict[str, str]:
@@ -102,10 +131,19 @@ def ready_jobs(
     return list(islice(ready, limit))
 
 
-def statuses_that_fit(statuses: Iterable[JobStatus]) -> tuple[JobStatus, ...]:
-    """Return as many statuses as one message may contain; of more, those that may still change come first."""
-    kept = list(statuses)
+def status_reply(name: str, time_s: float, statuses: Iterable[JobStatus], taken: Mapping[str, Iterable[str]]) -> Status:
+    """Return the reply to a status request.
+
+    It has as many statuses as one message may contain; of more, those that may still change come first.
+
+    Args:
+        name: Name of the replier.
+        taken: Names of the spaces that each arm may take.
+    """
+    kept, space = list(statuses), {arm: tuple(sorted(names)) for arm, names in sorted(taken.items()) if names}
+    reply = Status(name, time_s, (), space)
     if len(kept) > MOST_JOBS:
         kept = sorted(kept, key=lambda status: status.state in SETTLED)[:MOST_JOBS]
-    sizes = accumulate(len(encode(status)) + 1 for status in kept)
-    return tuple(status for status, size in zip(kept, sizes, strict=True) if size <= MAX_BYTES)
+    sizes = accumulate((len(encode(status)) + 1 for status in kept), initial=len(encode(reply)))
+    next(sizes)
+    return replace(reply, jobs=tuple(status for status, size in zip(kept, sizes, strict=True) if size <= MAX_BYTES))

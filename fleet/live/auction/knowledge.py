@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet.bus.protocol.auction import JobEstimate, Quote
-from fleet.live.auction.round import Bidding
+from fleet.bus.protocol.auction import PlanQuote, Quote
+from fleet.live.auction.round import Bidding, Choice
 from fleet.observation import LONG_S, Layout, Observation, all_peers
+from fleet.planning.options import PLANS
 from fleet.robot import JOINTS
 
 _LOG = logging.getLogger(__name__)
@@ -35,6 +36,8 @@ class LiveFleet:
 def observe(bidding: Bidding, fleet: LiveFleet, *, lost: Container[str] = ()) -> dict[str, Observation]:
     """Return the observation of every arm, by name; the jobs of the round are in the slots, in their order.
 
+    An option is a quoted plan, by its number; plans of a number from `PLANS` on are left out.
+
     An arm without capacity counts as working and can claim nothing; an arm without a quote has an unknown state. The
     probability to pass the warning limit is the quoted one; without it, 1 or 0 by the quoted peak; without either, 0.5.
     A missing duration counts as the longest of the round.
@@ -44,16 +47,19 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, lost: Container[str] = ()) ->
     """
     by_arm = {**bidding.full, **bidding.quotes}
     arms, time_s = fleet.order(by_arm), bidding.time_s
-    layout, peers = Layout(len(arms), len(bidding.jobs)), all_peers(len(arms))
+    layout, peers = Layout(len(arms), len(bidding.jobs), plans=PLANS), all_peers(len(arms))
     quotes = [by_arm.get(arm) for arm in arms]
-    offers = [_offers_of(quote, bidding) for quote in quotes]
+    offers = [_plans_of(quote, bidding) for quote in quotes]
 
     def each(value: Callable[[Quote], float]) -> Array:
         return np.array([0.0 if quote is None else value(quote) for quote in quotes])
 
-    def table(value: Callable[[JobEstimate], float | None]) -> Array:
-        rows = [[None if offer is None else value(offer) for offer in row] for row in offers]
-        return np.array(rows, float).reshape(len(arms), -1)  # None becomes NaN
+    def table(value: Callable[[PlanQuote], float | None]) -> Array:
+        rows = [[None if plan is None else value(plan) for plan in row] for row in offers]
+        return np.array(rows, float).reshape(len(arms), -1)  # [arm, option]; None becomes NaN
+
+    def per_option(per_slot: Array) -> Array:
+        return np.repeat(per_slot, PLANS, axis=-1)
 
     def per_job(values: list[float]) -> Array:
         return np.broadcast_to(np.array(values, dtype=float), (len(arms), layout.slots))
@@ -73,6 +79,7 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, lost: Container[str] = ()) ->
     headroom_k = each(lambda quote: quote.headroom_k)
     difficulty = np.where(known, difficulty, 0.0)
     working = quoted * (1.0 - faulted) * (1.0 - room)
+    least = np.where(known, difficulty, np.inf).reshape(len(arms), -1, PLANS).min(axis=-1)  # [arm, slot]
     peak_c = table(lambda offer: offer.peak_c)
     temp_c = np.array([_temp_c(arm, k, bidding, fleet) for arm, k in zip(arms, headroom_k, strict=True)])
     nothing, no_slots = np.zeros(len(arms)), np.zeros((len(arms), layout.slots))
@@ -101,20 +108,20 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, lost: Container[str] = ()) ->
         peak_c=np.nan_to_num(peak_c),
         p_saturation=_risk(table(lambda offer: offer.p_saturation), peak_c, fleet.warning_c),
         duration_s=duration_s,
-        slack_s=due_s - time_s - duration_s,
+        slack_s=np.where(feasible, per_option(due_s) - time_s - duration_s, 0.0),
         age_s=time_s - per_job(queued_s),
         payload_kg=per_job([job.payload_kg for job in bidding.jobs]),
         value=per_job([job.value for job in bidding.jobs]),
         returns=per_job([bidding.returned.get(job.name, (0, 0.0))[0] for job in bidding.jobs]),
-        expires=no_slots,
+        expires=per_job([float(job.expires) for job in bidding.jobs]),
         peer_heard=quoted[peers],
         peer_age_s=np.where(quoted > 0, [bidding.ages_s.get(arm, 0.0) for arm in arms], LONG_S)[peers],
         peer_working=working[peers],
         peer_faulted=faulted[peers],
         peer_headroom_k=headroom_k[peers],
         peer_busy_s=busy_s[peers],
-        peer_known=known[peers],
-        peer_difficulty=difficulty[peers],
+        peer_known=np.isfinite(least)[peers],
+        peer_difficulty=np.where(np.isfinite(least), least, 0.0)[peers],
         peer_blocks=no_slots[peers],
         action_mask=np.zeros(0),
     )
@@ -126,22 +133,25 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, lost: Container[str] = ()) ->
 
 def claimed_jobs(
     bidding: Bidding, observations: Mapping[str, Observation], actions: Mapping[str, int]
-) -> dict[str, str]:
-    """Return the job that each arm claims: action 0 waits, k claims slot k; an illegal action is logged and waits."""
-    claims: dict[str, str] = {}
+) -> dict[str, Choice]:
+    """Return what each arm claims: action 0 waits, 1 + option claims; an illegal action is logged and waits."""
+    claims: dict[str, Choice] = {}
     for arm, action in actions.items():
         mask = observations[arm].action_mask
         if not (0 <= action < len(mask) and mask[action]):
             _LOG.error("The policy chose the illegal action %d for '%s': it counts as waiting.", action, arm)
         elif action:
-            claims[arm] = bidding.jobs[action - 1].name
+            slot, plan = divmod(action - 1, PLANS)
+            claims[arm] = Choice(bidding.jobs[slot].name, plan)
     return claims
 
 
-def _offers_of(quote: Quote | None, bidding: Bidding) -> list[JobEstimate | None]:
-    """Return the feasible offer for each job of the round."""
-    by_job = {} if quote is None else {offer.job: offer for offer in quote.estimates if offer.feasible}
-    return [by_job.get(job.name) for job in bidding.jobs]
+def _plans_of(quote: Quote | None, bidding: Bidding) -> list[PlanQuote | None]:
+    """Return the quoted plan of each option of the round."""
+    by_job = (
+        {} if quote is None else {offer.job: {plan.plan: plan for plan in offer.plans} for offer in quote.estimates}
+    )
+    return [by_job.get(job.name, {}).get(plan) for job in bidding.jobs for plan in range(PLANS)]
 
 
 def _temp_c(arm: str, headroom_k: float, bidding: Bidding, fleet: LiveFleet) -> Array:

@@ -1,9 +1,13 @@
-"""Leases of open awards, as the auctioneer counts them."""
+"""New awards, and leases of open ones as the auctioneer counts them."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from fleet.bus.protocol.auction import Award
+from fleet.live.auction.ledger import Awarded, Ledger
+from fleet.live.auction.round import Assignment, Bidding, Timing
+from fleet.live.space import ANYWHERE
 
 
 @dataclass(frozen=True)
@@ -26,3 +30,30 @@ class CountedLease:
     """The award, until its arm answers."""
     sent_s: float = -math.inf
     attempts: int = 1
+
+
+def unanswered(leases: Mapping[str, CountedLease]) -> list[tuple[CountedLease, SendAward]]:
+    """Return the leases of awards that their arms have not answered, and these awards."""
+    return [(lease, lease.unanswered) for lease in leases.values() if lease.unanswered is not None]
+
+
+def send_again(leases: Mapping[str, CountedLease], real_s: float, timing: Timing) -> list[SendAward]:
+    """Return the unanswered awards that are due to be sent again; they count as sent."""
+    due: list[SendAward] = []
+    for lease, message in unanswered(leases):
+        if real_s >= lease.sent_s + timing.ack_s and lease.attempts < timing.attempts:
+            lease.sent_s, lease.attempts = real_s, lease.attempts + 1
+            due.append(message)
+    return due
+
+
+def new_awards(ledger: Ledger, bidding: Bidding, allocation: Mapping[str, Assignment], time_s: float) -> list[Awarded]:
+    """Return the records of the awards of a round."""
+    records: list[Awarded] = []
+    for job, (arm, plan) in allocation.items():
+        offer = bidding.offer(arm, job, plan)
+        assert offer is not None, "drop_invalid keeps jobs with a bid"
+        names = (f"{bidding.auction}:{job}", bidding.auction, job, arm, bidding.quotes[arm].quote)
+        heat = (offer.difficulty, offer.p_saturation, offer.peak_c)
+        records.append(Awarded(*names, ledger.jobs[job].cycles, time_s, *heat, offer.space or ANYWHERE, plan))
+    return records

@@ -13,7 +13,16 @@ from msgspec.structs import asdict, replace
 
 from fleet.bus.protocol.auction import SETTLED, Admission, JobSpec, JobState, JobStatus
 from fleet.job import reason_to_give_up
-from fleet.live.auction.job_rules import SHIFT_ENDED, admit, job_order, ready_jobs, reason_for_silence
+from fleet.live.auction.job_rules import (
+    EXPIRED,
+    SHIFT_ENDED,
+    admit,
+    is_late,
+    job_order,
+    lost_jobs,
+    ready_jobs,
+    reason_for_silence,
+)
 from fleet.live.journal import TimedState
 from fleet.live.journal_records import (
     ClockTick,
@@ -43,8 +52,11 @@ class Awarded(msgspec.Struct, frozen=True, tag="awarded"):
     time_s: float
     difficulty: float | None = None
     p_saturation: float | None = None
+    peak_c: float | None = None
     space: str = ANYWHERE
     """Name of the space of its plan."""
+    plan: int = 0
+    """Number of the plan in the quote."""
 
 
 class ContactLost(msgspec.Struct, frozen=True, tag="contact_lost"):
@@ -58,6 +70,13 @@ class ContactRegained(msgspec.Struct, frozen=True, tag="contact_regained"):
     """The arm renews its lease again, and still has the job."""
 
     award: str
+    time_s: float
+
+
+class Expired(msgspec.Struct, frozen=True, tag="expired"):
+    """A waiting job is given up: its hard due date has passed."""
+
+    job: str
     time_s: float
 
 
@@ -76,6 +95,7 @@ class Change(msgspec.Struct, frozen=True):
     auction: str = ""
     difficulty: float | None = None
     p_saturation: float | None = None
+    peak_c: float | None = None
 
 
 class JobEntry(msgspec.Struct):
@@ -95,6 +115,8 @@ class JobEntry(msgspec.Struct):
     """Fleet time of the last return."""
     faults: tuple[str, ...] = ()
     """The arm of each fault in this job."""
+    expired: bool = False
+    """It waited when its hard due date passed."""
 
 
 class AwardState(msgspec.Struct):
@@ -105,8 +127,6 @@ class AwardState(msgspec.Struct):
     silent: bool = False
     """The arm has permission to commit, and has not renewed its lease."""
     outcome: str = ""
-    cleared: bool = False
-    """A person freed its space while the arm was silent."""
 
 
 class LedgerSnapshot(msgspec.Struct, frozen=True, tag="ledger_snapshot"):
@@ -128,7 +148,7 @@ class LedgerSnapshot(msgspec.Struct, frozen=True, tag="ledger_snapshot"):
 
 AwardRecord = Awarded | CommitPermitted | ContactLost | ContactRegained | Closed
 AuctionRecord = (
-    Started | ClockTick | JobsAccepted | AwardRecord | SpaceTaken | SpaceCleared | ShiftEnded | LedgerSnapshot
+    Started | ClockTick | JobsAccepted | AwardRecord | SpaceTaken | SpaceCleared | Expired | ShiftEnded | LedgerSnapshot
 )
 
 
@@ -161,7 +181,8 @@ class Ledger(TimedState[AuctionRecord]):
     def admit(self, jobs: Sequence[JobSpec]) -> tuple[Admission, ...]:
         """Return which submitted jobs can be accepted; changes nothing."""
         known = {name: entry.spec for name, entry in self.jobs.items()}
-        return admit(jobs, known, places=self.places, ended=self.ended)
+        given_up = {name for name, entry in self.jobs.items() if entry.state == "given_up"}
+        return admit(jobs, known, places=self.places, ended=self.ended, given_up=given_up)
 
     def ready(self, time_s: float, limit: int, *, excluded: Container[str] = ()) -> list[JobSpec]:
         """Return the first jobs that can begin now: released, predecessors finished, stations free."""
@@ -172,6 +193,12 @@ class Ledger(TimedState[AuctionRecord]):
         busy = self.busy_stations()
         return ready_jobs(waiting, time_s, limit, busy, lambda name: self.jobs[name].state == "finished")
 
+    def expired(self, time_s: float) -> list[Expired]:
+        """Return the waiting jobs whose hard due date has passed."""
+        entries = () if self.ended else self.jobs.values()
+        late = (entry.spec.name for entry in entries if entry.state == "waiting" and is_late(entry.spec, time_s))
+        return [Expired(name, time_s) for name in late]
+
     def busy_stations(self) -> frozenset[str]:
         """Return the stations at which an arm may be at work; a silent arm does not block its station."""
         active = (award.record.job for award in self.open.values() if not award.silent)
@@ -181,10 +208,14 @@ class Ledger(TimedState[AuctionRecord]):
         """Return the names of the spaces that each arm may take."""
         taken = dict(self.space)
         for award in self.open.values():
-            if not award.cleared:
-                arm = award.record.arm
-                taken[arm] = taken.get(arm, frozenset()) | {award.record.space}
+            arm = award.record.arm
+            taken[arm] = taken.get(arm, frozenset()) | {award.record.space}
         return taken
+
+    def space_of(self, awards: Iterable[str], arm: str) -> set[str]:
+        """Return the names of the spaces of an arm's awards; unknown awards have none."""
+        records = (self.awards[name].record for name in awards if name in self.awards)
+        return {record.space for record in records if record.arm == arm}
 
     def closed_space(self) -> Mapping[str, frozenset[str]]:
         """Return the names of the spaces that each arm may take for closed awards alone."""
@@ -228,6 +259,7 @@ class Ledger(TimedState[AuctionRecord]):
             case JobsAccepted():
                 changed = [JobEntry(job, record.by) for job in record.jobs if job.name not in self.jobs]
                 self._set_jobs([*self.jobs.values(), *changed])
+                self._follow_given_up()
             case Awarded():
                 entry = self.jobs[record.job]
                 self.awards[record.award] = self.open[record.award] = AwardState(record)
@@ -235,19 +267,22 @@ class Ledger(TimedState[AuctionRecord]):
                 changed = [entry]
             case CommitPermitted() | ContactLost() | ContactRegained():
                 award, entry = self.awards[record.award], self._entry(record.award)
-                award.may_commit, award.silent, award.cleared = True, isinstance(record, ContactLost), False
+                award.may_commit, award.silent = True, isinstance(record, ContactLost)
                 entry.state, entry.reason = "finishing", ""
                 if award.silent:
                     entry.state, entry.reason = "unfinished", reason_for_silence(award.record.arm)
                 changed = [entry]
             case Closed():
                 changed = self._close(record)
+                changed += [entry for entry in self._follow_given_up() if entry not in changed]
+            case Expired():
+                entry = self.jobs[record.job]
+                entry.state, entry.reason, entry.expired = "given_up", EXPIRED, True
+                changed = [entry, *self._follow_given_up()]
             case SpaceTaken():
                 self.space[record.arm] = frozenset(record.space)
             case SpaceCleared():
                 self.space[record.arm] = frozenset()
-                for award in self.open.values():
-                    award.cleared |= award.record.arm == record.arm
             case ShiftEnded():
                 self.ended = True
                 changed = [self.jobs[name] for name in self.unsettled()]
@@ -269,8 +304,9 @@ class Ledger(TimedState[AuctionRecord]):
         award = self.awards.get(record.award)
         if award is None:  # left out by `compact`: the report changed nothing
             return []
+        reopened = record.award in self.open
         award.silent, award.outcome = False, record.outcome
-        self._end(record.award, moved=record.outcome != "refused")
+        self._end(award, moved=record.outcome != "refused")
         entry = self.jobs[award.record.job]
         if entry.state == "finished":
             return []
@@ -278,7 +314,8 @@ class Ledger(TimedState[AuctionRecord]):
             entry.faults += (award.record.arm,)
         entry.cycles = max(entry.cycles, min(record.cycles, entry.spec.repetitions))
         if record.outcome == "finished":
-            self._end(entry.award)  # a later award of the same job has no purpose any more
+            if entry.award in self.open:  # a later award of the same job has no purpose any more
+                self._end(self.open[entry.award])
             entry.state, entry.award, entry.reason, entry.finished_s = "finished", record.award, "", record.time_s
         elif entry.award != record.award:  # the job was awarded again since
             return [entry] if self._give_up(entry) else []
@@ -286,7 +323,7 @@ class Ledger(TimedState[AuctionRecord]):
             entry.state, entry.reason = "unfinished", record.reason or "It is unknown whether its last cycle was done."
         else:
             entry.state, entry.reason = "waiting", record.reason
-            if record.outcome == "returned":
+            if record.outcome == "returned" and reopened:
                 entry.returns, entry.returned_s = entry.returns + 1, record.time_s
             entry.cycles = min(entry.cycles, entry.spec.repetitions - 1)  # the last cycle is never assumed done
             self._give_up(entry)
@@ -301,10 +338,30 @@ class Ledger(TimedState[AuctionRecord]):
         entry.state, entry.reason = "given_up", reason
         return True
 
-    def _end(self, name: str, *, moved: bool = True) -> None:
-        """Close an award; an arm that may have moved for it takes its space until it says that it is at home."""
-        award = self.open.pop(name, None)
-        if award is not None and moved and not award.cleared:
+    def _follow_given_up(self) -> list[JobEntry]:
+        """Give up jobs that wait for one that is given up; return what has changed.
+
+        They wait again if that one was finished after all.
+        """
+        if not (given_up := [entry for entry in self.jobs.values() if entry.state == "given_up"]):
+            return []
+        causes = {entry.spec.name for entry in given_up if entry.expired or reason_to_give_up(entry.faults)}
+        lost = lost_jobs([entry.spec for entry in self.jobs.values()], causes)
+        changed = list[JobEntry]()
+        for name, entry in self.jobs.items():
+            state = "given_up" if name in causes or name in lost else "waiting"
+            if entry.state in ("waiting", "given_up") and entry.state != state:
+                entry.state, entry.reason = state, lost.get(name, "")
+                changed.append(entry)
+        return changed
+
+    def _end(self, award: AwardState, *, moved: bool = True) -> None:
+        """Close an award; an arm that may have moved for it takes its space until it says that it is at home.
+
+        So does an arm that reports on an award which was closed before: its space may have been freed since.
+        """
+        self.open.pop(award.record.award, None)
+        if moved:
             arm = award.record.arm
             self.space[arm] = self.space.get(arm, frozenset()) | {award.record.space}
 
@@ -335,7 +392,9 @@ class Ledger(TimedState[AuctionRecord]):
         change = Change(self.number, time_s, self._status(entry))
         if entry.award:
             award = asdict(self.awards[entry.award].record)
-            change = replace(change, **{name: award[name] for name in ("auction", "difficulty", "p_saturation")})
+            change = replace(
+                change, **{name: award[name] for name in ("auction", "difficulty", "p_saturation", "peak_c")}
+            )
         self.number += 1
         self.recent.append(change)
         return change

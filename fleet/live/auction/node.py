@@ -34,7 +34,7 @@ from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.registry import SESSION_LEASE_S
 from fleet.errors import BusError, JournalFull, Refused
 from fleet.live.auction.auctioneer import SCAN_S, Auctioneer
-from fleet.live.auction.job_rules import statuses_that_fit
+from fleet.live.auction.job_rules import status_reply
 from fleet.live.auction.leases import SendAward
 from fleet.live.auction.ledger import AuctionRecord, Ledger
 from fleet.live.auction.round import Allocate, Timing
@@ -209,7 +209,8 @@ class AuctionNode:
         return self.auctioneer.clear(request, self.present, time_s)
 
     def _status(self, request: StatusRequest) -> Status:
-        return Status(self._name, self.time_s, statuses_that_fit(self.auctioneer.status(request.jobs)))
+        auctioneer = self.auctioneer
+        return status_reply(self._name, self.time_s, auctioneer.status(request.jobs), auctioneer.ledger.taken_space())
 
     def _apply_state(self, arm: str, state: State) -> None:
         self._state_s[arm] = time.monotonic()

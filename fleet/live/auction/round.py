@@ -5,8 +5,9 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
-from fleet.bus.protocol.auction import LEASE_S, JobEstimate, JobSpec, Quote
+from fleet.bus.protocol.auction import LEASE_S, JobSpec, PlanQuote, Quote
 from fleet.bus.protocol.messages import State
 from fleet.live.clock import CLOCK_DRIFT
 from fleet.live.space import ANYWHERE, Excludes, arms_in_the_way, no_conflicts
@@ -69,43 +70,66 @@ class Bidding:
     """Number of returns of a job, and fleet time of the last one; only of jobs that were ever returned."""
     excludes: Excludes = no_conflicts
 
-    def offer(self, arm: str, job: str) -> JobEstimate | None:
-        """Return an arm's estimate for a job of the round; None if the arm did not bid for it, or cannot do it."""
-        return self._offers.get((arm, job))
+    def offer(self, arm: str, job: str, plan: int = 0) -> PlanQuote | None:
+        """Return what an arm quotes for a plan of a job of the round; None if it has not quoted that plan."""
+        return self.plans(arm, job).get(plan)
+
+    def plans(self, arm: str, job: str) -> Mapping[int, PlanQuote]:
+        """Return an arm's plans for a job of the round, by number; none if it did not bid for it, or cannot do it."""
+        return self._plans.get((arm, job), {})
 
     @cached_property
-    def _offers(self) -> dict[tuple[str, str], JobEstimate]:
+    def _plans(self) -> dict[tuple[str, str], dict[int, PlanQuote]]:
         names = {job.name for job in self.jobs}
         pairs = ((arm, offer) for arm, quote in self.quotes.items() for offer in quote.estimates)
-        return {(arm, offer.job): offer for arm, offer in pairs if offer.feasible and offer.job in names}
+        return {
+            (arm, offer.job): {plan.plan: plan for plan in offer.plans} for arm, offer in pairs if offer.job in names
+        }
 
 
-Allocate = Callable[[Bidding], Mapping[str, str]]
-"""Arm of each assigned job. An arm gets one job a round, since its other bids no longer hold after that."""
+class Choice(NamedTuple):
+    """What an arm claims."""
+
+    job: str
+    plan: int = 0
+    """Number of the plan that it quotes."""
 
 
-def resolve_claims(bidding: Bidding, claims: Mapping[str, str], order: Sequence[str]) -> dict[str, str]:
-    """Return the arm of each job: the lower quoted difficulty wins, then the arm that comes first in `order`.
+class Assignment(NamedTuple):
+    """Who does a job."""
+
+    arm: str
+    plan: int = 0
+    """Number of the plan that it quotes."""
+
+
+Allocate = Callable[[Bidding], Mapping[str, Assignment]]
+"""Arm and plan of each assigned job. An arm gets one job a round, since its other bids no longer hold after that."""
+
+
+def resolve_claims(bidding: Bidding, claims: Mapping[str, Choice], order: Sequence[str]) -> dict[str, Assignment]:
+    """Return the arm and plan of each job: the lower quoted difficulty wins, then the arm that comes first in `order`.
 
     As in simulation, a job goes to one arm, a station serves one job, plans that exclude each other are not done at a
     time, and an unknown difficulty loses.
 
     Args:
-        claims: The job that each arm claims; a claim without a feasible offer is ignored.
+        claims: What each arm claims; a claim without such an offer is ignored.
     """
-    ranked: list[tuple[float, int, str, str]] = []
-    for arm, job in claims.items():
-        if (offer := bidding.offer(arm, job)) is not None:
-            ranked.append((math.inf if offer.difficulty is None else offer.difficulty, order.index(arm), job, arm))
-    return _without_conflicts(bidding, [(job, arm) for _, _, job, arm in sorted(ranked)])
+    ranked: list[tuple[float, int, str, Assignment]] = []
+    for arm, (job, plan) in claims.items():
+        if (offer := bidding.offer(arm, job, plan)) is not None:
+            difficulty = math.inf if offer.difficulty is None else offer.difficulty
+            ranked.append((difficulty, order.index(arm), job, Assignment(arm, plan)))
+    return _without_conflicts(bidding, [(job, assignment) for _, _, job, assignment in sorted(ranked)])
 
 
-def drop_invalid(bidding: Bidding, allocation: Mapping[str, str]) -> dict[str, str]:
+def drop_invalid(bidding: Bidding, allocation: Mapping[str, Assignment]) -> dict[str, Assignment]:
     """Return the valid part of an allocation: jobs with a bid, one job per arm, station and space. Log the rest."""
     pairs = sorted(allocation.items())
-    valid = _without_conflicts(bidding, [pair for pair in pairs if bidding.offer(pair[1], pair[0]) is not None])
-    for job, arm in pairs:
-        if bidding.offer(arm, job) is None:
+    valid = _without_conflicts(bidding, pairs)
+    for job, (arm, plan) in pairs:
+        if bidding.offer(arm, job, plan) is None:
             _LOG.error("The policy gives '%s' to '%s', which did not bid for it: not awarded.", job, arm)
         elif job not in valid:
             _LOG.error(
@@ -116,21 +140,22 @@ def drop_invalid(bidding: Bidding, allocation: Mapping[str, str]) -> dict[str, s
     return valid
 
 
-def _without_conflicts(bidding: Bidding, pairs: Iterable[tuple[str, str]]) -> dict[str, str]:
-    """Return the arm of each job; of pairs with the same job, arm, station or space the first is kept."""
+def _without_conflicts(bidding: Bidding, pairs: Iterable[tuple[str, Assignment]]) -> dict[str, Assignment]:
+    """Return the assignment of each job with an offer; of two with one job, arm, station or space the first is kept."""
     places = {job.name: frozenset(job.places) for job in bidding.jobs}
-    arms: dict[str, str] = {}
+    kept: dict[str, Assignment] = {}
     busy: set[str] = set()
     taken: dict[str, list[str]] = {}
-    for job, arm in pairs:
-        offer = bidding.offer(arm, job)
-        if offer is None or job in arms or arm in taken or busy & places[job]:
+    for job, assignment in pairs:
+        arm, plan = assignment
+        offer = bidding.offer(arm, job, plan)
+        if offer is None or job in kept or arm in taken or busy & places[job]:
             continue
         if not arms_in_the_way(arm, offer.space, taken, bidding.excludes):
-            arms[job] = arm
+            kept[job] = assignment
             busy |= places[job]
             taken[arm] = [offer.space or ANYWHERE]
-    return arms
+    return kept
 
 
 def infeasible_jobs(quotes: Mapping[str, Quote]) -> dict[str, str]:

@@ -1,14 +1,14 @@
 """Space in an auction: what quotes say about it, which estimates it closes, and whose space a person may free."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 
 from msgspec.structs import replace
 
-from fleet.bus.protocol.auction import Quote
+from fleet.bus.protocol.auction import ClearRequest, JobEstimate, Quote
 from fleet.errors import Refused
 from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.round import MAX_REASON, Round
-from fleet.live.journal_records import SpaceTaken
+from fleet.live.journal_records import Closed, SpaceCleared, SpaceTaken
 from fleet.live.space import ANYWHERE, Excludes, arms_in_the_way
 
 
@@ -22,7 +22,7 @@ def _stated_space(quote: Quote) -> frozenset[str]:
 def drop_taken(
     quotes: Mapping[str, Quote], taken: Mapping[str, Iterable[str]], excludes: Excludes
 ) -> tuple[dict[str, Quote], dict[str, str]]:
-    """Return the quotes without estimates whose space another arm takes; and why a job is in no quote any more.
+    """Return the quotes without plans whose space another arm takes; and why a job is in no quote any more.
 
     Args:
         taken: Names of the spaces that each arm may take.
@@ -30,18 +30,21 @@ def drop_taken(
     kept: dict[str, Quote] = {}
     waits: dict[str, set[str]] = {}
     for arm, quote in quotes.items():
-        spaces = {offer.space for offer in quote.estimates if offer.feasible}
+        spaces = {plan.space for offer in quote.estimates for plan in offer.plans}
         in_way = {space: arms_in_the_way(arm, space, taken, excludes) for space in spaces}
-        closed = {offer.job for offer in quote.estimates if offer.feasible and in_way[offer.space]}
+        estimates: list[JobEstimate] = []
         for offer in quote.estimates:
-            if offer.job in closed:
-                waits.setdefault(offer.job, set()).update(in_way[offer.space])
-        kept[arm] = replace(quote, estimates=tuple(offer for offer in quote.estimates if offer.job not in closed))
+            open_plans = tuple(plan for plan in offer.plans if not in_way[plan.space])
+            for plan in offer.plans:
+                waits.setdefault(offer.job, set()).update(in_way[plan.space])
+            if open_plans or not offer.feasible:
+                estimates.append(replace(offer, plans=open_plans))
+        kept[arm] = replace(quote, estimates=tuple(estimates))
     open_jobs = {offer.job for quote in kept.values() for offer in quote.estimates if offer.feasible}
     reasons = {
         job: f"It waits until {', '.join(sorted(arms))} is out of the way."[:MAX_REASON]
         for job, arms in waits.items()
-        if job not in open_jobs
+        if arms and job not in open_jobs
     }
     return kept, reasons
 
@@ -54,27 +57,52 @@ def stated_spaces(ledger: Ledger, closing: Round, time_s: float) -> list[SpaceTa
     records: list[SpaceTaken] = []
     for arm, quote in sorted(closing.quotes.items()):
         before = ledger.space.get(arm, frozenset())
-        leased = (award for award in ledger.open.values() if award.record.arm == arm and not award.cleared)
-        open_space = {award.record.space for award in leased}
+        open_space = {award.record.space for award in ledger.open.values() if award.record.arm == arm}
         after = (before - closing.space.get(arm, frozenset())) | (_stated_space(quote) - open_space)
         if after != before:
             records.append(SpaceTaken(arm, tuple(sorted(after)), time_s))
     return records
 
 
-def is_to_clear(ledger: Ledger, arm: str, present: frozenset[str], lease_s: float) -> bool:
-    """Return whether an arm takes space that a person may free.
+def retaken_space(ledger: Ledger, arm: str, space: Set[str]) -> list[SpaceTaken]:
+    """Return what changes when an arm takes this space; it counts as free after a person has freed it.
+
+    Args:
+        space: Names of spaces that the arm takes, or for which it has an award.
+    """
+    taken = ledger.taken_space().get(arm, frozenset())
+    if ANYWHERE in taken or space <= taken:
+        return []
+    return [SpaceTaken(arm, tuple(sorted(ledger.space.get(arm, frozenset()) | space)), ledger.time_s)]
+
+
+def cleared_space(
+    ledger: Ledger,
+    request: ClearRequest,
+    present: frozenset[str],
+    cycles: Mapping[str, int],
+    lease_s: float,
+    time_s: float,
+) -> list[Closed | SpaceCleared]:
+    """Return what changes when a person frees the space of an arm: its awards end, each may be done or not.
+
+    Args:
+        cycles: Reported progress, by award.
 
     Raises:
         Refused: the arm is unknown, or present, or may have a lease.
     """
-    awards = [award for award in ledger.open.values() if award.record.arm == arm]
-    taken = ledger.taken_space()
+    arm, taken = request.arm, ledger.taken_space()
+    awards = {name: award for name, award in ledger.open.items() if award.record.arm == arm}
     if arm in present:
         raise Refused(f"'{arm}' is present and says itself which space it takes. Stop it first, or move it home.")
     if arm not in ledger.space and not awards:
         arms = ", ".join(sorted(name for name, spaces in taken.items() if spaces))
         raise Refused(f"'{arm}' takes no space. Arms that do: {arms or 'none'}.")
-    if not all(award.silent for award in awards):
+    if not all(award.silent for award in awards.values()):
         raise Refused(f"The lease of '{arm}' has not ended; try again in {lease_s:g} s.")
-    return bool(taken.get(arm))
+    if not taken.get(arm):
+        return []
+    reason = f"The space of '{arm}' was cleared; it was about to finish it."[:MAX_REASON]
+    ends = [Closed(name, "dropped", cycles.get(name, 0), time_s, reason, unsure=True) for name in awards]
+    return [*ends, SpaceCleared(arm, request.by, time_s)]

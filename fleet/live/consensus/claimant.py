@@ -18,6 +18,7 @@ from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, Faults, 
 from fleet.errors import JournalError, Refused
 from fleet.job import reason_to_give_up
 from fleet.live.arm.award_executor import AwardExecutor
+from fleet.live.arm.journal_records import ActiveAward
 from fleet.live.auction.round import Timing
 from fleet.live.consensus.granter import Granter
 
@@ -56,6 +57,7 @@ class PendingClaim:
     """A job that the arm requests and does not have yet."""
 
     job: JobSpec
+    plan: int
     quote: str
     made_s: float
 
@@ -74,7 +76,7 @@ class Claimant:
         executor: AwardExecutor,
         granter: Granter,
         answer_award: Callable[[Award, float], Ack],
-        space_of: Callable[[JobSpec], str | None],
+        space_of: Callable[[JobSpec, int], str | None],
         *,
         boot: int,
         timing: Timing | None = None,
@@ -83,7 +85,7 @@ class Claimant:
 
         Args:
             answer_award: Accepts or refuses an award for the arm.
-            space_of: Name of the space of the arm's plan for a job.
+            space_of: Name of the space of one of the arm's plans for a job.
             boot: Number of this start of the arm.
         """
         self.arm, self.executor, self.granter = executor.arm, executor, granter
@@ -112,11 +114,11 @@ class Claimant:
         in_message = MOST_JOBS - len(self.executor.active) - len(self.executor.pending_reports())
         return min(self.executor.spare_capacity, in_message) - len(self.pending)
 
-    def request(self, job: JobSpec, real_s: float) -> None:
-        """Request a job."""
-        quote = self.executor.add_quote({job.name: (job, True)}, real_s)
+    def request(self, job: JobSpec, plan: int, real_s: float) -> None:
+        """Request a job, to do it by one of the arm's plans."""
+        quote = self.executor.add_quote({job.name: (job, plan + 1)}, real_s)
         award = f"{self.arm}-{quote}:{job.name}"
-        self.pending[award] = PendingClaim(job, quote, real_s)
+        self.pending[award] = PendingClaim(job, plan, quote, real_s)
         self._votes[award] = Vote()
         self._change()
 
@@ -201,16 +203,15 @@ class Claimant:
 
     def _entries(self) -> tuple[list[ClaimEntry], list[JobOutcome]]:
         """Return the jobs that it has and requests, and outcomes; a job is claimed until its report is on disk."""
-        jobs = {active.award.award: active.award.job for active in self.executor.active}
+        awards = {active.award.award: active.award for active in self.executor.active}
         entries: list[ClaimEntry] = []
         for lease in self.executor.lease_entries(self.arm):
-            job = jobs[lease.award]
-            entry = ClaimEntry(lease.award, job.name, job.places, lease.cycles, lease.phase, self._space_of(job))
-            entries.append(entry)
+            job, space = awards[lease.award].job, self._space_of(awards[lease.award].job, awards[lease.award].plan)
+            entries.append(ClaimEntry(lease.award, job.name, job.places, lease.cycles, lease.phase, space))
             self._votes.setdefault(lease.award, Vote())
         for award, pending in self.pending.items():
-            job = pending.job
-            entries.append(ClaimEntry(award, job.name, job.places, 0, "requested", self._space_of(job)))
+            job, space = pending.job, self._space_of(pending.job, pending.plan)
+            entries.append(ClaimEntry(award, job.name, job.places, 0, "requested", space))
         outcomes: list[JobOutcome] = []
         for report, on_disk in self.executor.pending_reports():
             if on_disk:
@@ -235,19 +236,19 @@ class Claimant:
                 self._reject(award)
         for active in self.executor.active:
             if vote := self._votes.get(active.award.award):
-                self._renew(active.award.award, vote, active.may_commit, real_s)
+                self._renew(active, vote, real_s)
         for report, _ in self.executor.pending_reports():
             if len(self._receipts.get(report.award, ())) >= self.majority:
                 del self._receipts[report.award]
                 self.executor.apply_receipt(Receipt(self.arm, report.award))
 
-    def _renew(self, award: str, vote: Vote, may_commit: bool, real_s: float) -> None:
+    def _renew(self, active: ActiveAward, vote: Vote, real_s: float) -> None:
         """Apply the votes on an active award as a lease."""
+        award = active.award.award
         lease_s, asked_s = self._timing.lease_s, vote.since_s(self.majority)
         permitted = (award,) if len(vote.may_commit) >= self.majority else ()
-        if self._is_denied(vote) and not may_commit and not permitted:
+        if self._is_denied(vote):
             self.executor.apply_lease(Lease(self.arm, lease_s, (), (award,)), real_s)
-            self._change()
         elif asked_s > -math.inf:
             self.executor.apply_lease(Lease(self.arm, lease_s, (award,), (), permitted), asked_s)
         elif permitted:
@@ -258,7 +259,8 @@ class Claimant:
 
     def _accept(self, award: str, pending: PendingClaim, vote: Vote, real_s: float) -> None:
         cycles = min(vote.cycles, pending.job.repetitions - 1)  # the last cycle is never assumed done
-        granted = Award(award, award, self.arm, pending.quote, pending.job, cycles, self._timing.lease_s)
+        terms = (pending.quote, pending.job, cycles, self._timing.lease_s, pending.plan)
+        granted = Award(award, award, self.arm, *terms)
         ack = self._answer_award(granted, real_s)
         if ack.accepted:
             del self.pending[award]

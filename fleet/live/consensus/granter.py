@@ -10,6 +10,7 @@ are on disk, and are applied only then. The rules that make it safe (`fleet.bus.
 - A settled job is granted to no arm.
 - Of two plans that exclude each other one is granted. Its arm takes the space until a later claim of the arm says that
   it does not take it any more, or a person frees it. An arm without a claim may be anywhere.
+- Whoever frees the space of an arm also revokes its grants: the arm gets no lease on them any more, and returns them.
 - After a crash every grant counts as leased from the restart.
 """
 
@@ -44,6 +45,8 @@ class Grant:
     award: str
     places: tuple[str, ...]
     may_commit: bool = False
+    revoked: bool = False
+    """A person has freed the space of the arm, which may begin no cycle any more."""
     until_s: float = 0.0
     """Real second at which its lease ends."""
 
@@ -74,7 +77,9 @@ class Register(TimedState[GrantRecord]):
             case JobGranted():
                 self._count(record.job, record.cycles)
                 self._number(record.arm, record.number)
-                self.grants[record.job] = Grant(record.arm, record.award, record.places, record.may_commit)
+                self.grants[record.job] = Grant(
+                    record.arm, record.award, record.places, record.may_commit, record.revoked
+                )
             case Released():
                 self._number(record.arm, record.number)
                 grant = self.grants.get(record.job)
@@ -102,6 +107,8 @@ class Register(TimedState[GrantRecord]):
                 self.space[record.arm] = frozenset(record.space)
             case SpaceCleared(arm):
                 self.space[arm] = frozenset()
+                for grant in self.grants.values():
+                    grant.revoked |= grant.arm == arm
 
     def compact(self) -> tuple[GrantRecord, ...]:
         """Return the fewest records that give the same register."""
@@ -111,7 +118,9 @@ class Register(TimedState[GrantRecord]):
         records += [JobsAccepted((job,)) for job in self.jobs.values()]
         for job, grant in self.grants.items():
             number, cycles = self.numbers.get(grant.arm, 0), self.cycles.get(job, 0)
-            records.append(JobGranted(grant.arm, number, grant.award, job, grant.places, cycles, grant.may_commit))
+            records.append(
+                JobGranted(grant.arm, number, grant.award, job, grant.places, cycles, grant.may_commit, grant.revoked)
+            )
         records += [Faulted(job, faults) for job, faults in self.faults.items() if job not in self.settled]
         records += [JobSettled(outcome) for outcome in self.settled.values()]
         known = {arm: names for arm, names in self.space.items() if ANYWHERE not in names}
@@ -119,9 +128,14 @@ class Register(TimedState[GrantRecord]):
         return tuple(records)
 
     @property
+    def given_up(self) -> frozenset[str]:
+        """Jobs in which arms have faulted too often."""
+        return frozenset(job for job, outcome in self.settled.items() if outcome.outcome == "given_up")
+
+    @property
     def closed_count(self) -> int:
         """Number of outcomes that nothing changes; a job that is given up may be finished after all."""
-        return sum(outcome.outcome != "given_up" for outcome in self.settled.values())
+        return len(self.settled) - len(self.given_up)
 
     def knows(self, job: str, faults: Faults) -> bool:
         """Return whether these faults in a job are known."""
@@ -201,7 +215,7 @@ class Granter:
         return ClaimReply(self.arm, claim.number, self._timing.lease_s, tuple(granted), tuple(denied))
 
     def clear(self, arm: str, by: str, present: frozenset[str], real_s: float, time_s: float) -> None:
-        """Free the space of an absent arm: a person has seen that it is at home, or removed.
+        """Free the space of an absent arm and revoke its grants: a person has seen that it is at home, or removed.
 
         Raises:
             Refused: the arm is unknown, or present, or may have a lease.
@@ -322,6 +336,8 @@ class Granter:
             return f"'{entry.job}' is settled"
         grant = self.register.grants.get(entry.job)
         same = grant is not None and (grant.arm, grant.award) == (arm, entry.award)
+        if grant is not None and same and grant.revoked:
+            return f"the space of '{arm}' was cleared"
         has_space = same and (entry.space or ANYWHERE) in self.register.space[arm]
         if not has_space and (in_way := self.in_the_way(arm, entry.space)):
             return f"'{in_way[0]}' is in the way"

@@ -32,7 +32,7 @@ from fleet.bus.protocol.messages import State
 from fleet.errors import BusError
 from fleet.live.arm.auctioneer_client import RateLimitedWarnings
 from fleet.live.arm.node import ArmNode
-from fleet.live.auction.job_rules import admit, statuses_that_fit
+from fleet.live.auction.job_rules import admit, status_reply
 from fleet.live.clock import FleetClock
 from fleet.live.consensus.granter import Granter, Register
 from fleet.live.consensus.participant import QUIET_S, Membership, Participant
@@ -206,7 +206,8 @@ class ConsensusNode:
     def _submit(self, submission: Submission) -> SubmissionReply:
         known = {job.name: job for _, job in self._stream} | self.participant.jobs
         ended = self.participant.ended
-        admissions = admit(submission.jobs, known, places=self._membership.places, ended=ended)
+        given_up = {status.job for status in self.statuses() if status.state == "given_up"}
+        admissions = admit(submission.jobs, known, places=self._membership.places, ended=ended, given_up=given_up)
         accepted = tuple(job for job, reply in zip(submission.jobs, admissions, strict=True) if reply.accepted)
         self.participant.granter.add_jobs(tuple(job for job in accepted if job.name not in known), submission.by)
         self.participant.add_jobs(accepted)
@@ -216,7 +217,8 @@ class ConsensusNode:
     def _status(self, request: StatusRequest) -> Status:
         self._check_first()
         statuses = [status for status in self.statuses() if not request.jobs or status.job in request.jobs]
-        return Status(self._name, self._arm.clock.now_s(time.monotonic()), statuses_that_fit(statuses))
+        time_s, register = self._arm.clock.now_s(time.monotonic()), self.participant.granter.register
+        return status_reply(self._name, time_s, statuses, register.space)
 
     def _clear(self, request: ClearRequest) -> Cleared:
         real_s = time.monotonic()
@@ -240,7 +242,10 @@ class ConsensusNode:
                 case Bid() as bid:
                     if bid.estimates:  # the difficulty of each joint is published under its own key
                         self._arm.publish_difficulty(bid.estimates, time.monotonic())
-                    estimates = tuple(replace(estimate, joint_difficulty=None) for estimate in bid.estimates)
+                    estimates = tuple(
+                        replace(each, plans=tuple(replace(plan, joint_difficulty=None) for plan in each.plans))
+                        for each in bid.estimates
+                    )
                     self._publish_bid(replace(bid, estimates=estimates))
                 case Claim() as claim:
                     self._query_claim(claim)

@@ -14,7 +14,7 @@ job: where messages are lost two arms may claim one, and the one without a major
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from random import Random
 
@@ -24,9 +24,9 @@ from fleet.bus.protocol.auction import JobEstimate, JobSpec, JobStatus, Quote
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply
 from fleet.bus.protocol.messages import State
 from fleet.live.arm.node import ArmNode
-from fleet.live.auction.job_rules import SHIFT_ENDED, job_order, ready_jobs
+from fleet.live.auction.job_rules import EXPIRED, SHIFT_ENDED, is_late, job_order, lost_jobs, ready_jobs
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
-from fleet.live.auction.round import Bidding, Timing, resolve_claims
+from fleet.live.auction.round import Bidding, Choice, Timing, resolve_claims
 from fleet.live.consensus.claimant import NUMBERS_PER_BOOT, Claimant
 from fleet.live.consensus.granter import Granter
 from fleet.live.monitor.snapshot import FRESH_S
@@ -37,11 +37,12 @@ QUIET_S = 0.05
 """Real seconds without a new bid or choice, after which all arms most likely have the same bids."""
 BID_S = 1.0
 """Real seconds between two bids in which only the costs differ."""
+NO_CHOICE = Choice("")
 MAX_OPEN_JOBS = 32
 """Jobs in one bid."""
 
 Choose = Callable[[Observation, int], int]
-"""The action of an arm by its observation and its index in the fleet: 0 waits, k claims slot k."""
+"""The action of an arm by its observation and its index in the fleet: 0 waits, 1 + option claims."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,15 +104,15 @@ class Participant:
         self._bid_s = self._chosen_s = self.changed_s = -math.inf
         self._last_bid: object = None
         """Content of the last bid, without the costs."""
-        self._choice = ""
-        """The job that its policy chose, until it is claimed or another arm has it."""
+        self._choice = NO_CHOICE
+        """What its policy chose, until it is claimed or another arm has the job."""
         self._lost = self._new_bids = False
         self._later_s: dict[str, float] = {}
         """Real second from which it bids for a job again."""
         self._pauses: dict[str, int] = {}
         self._behind_s: dict[str, float] = {}
         """Real second since which a peer knows fewer outcomes."""
-        self._corrected = 0
+        self._corrected, self._time_s = 0, 0.0
 
     # Messages
 
@@ -133,7 +134,7 @@ class Participant:
         self._bids[bid.arm] = bid, real_s
         if before is None or _offered(before[0]) != _offered(bid):
             self.changed_s, self._new_bids = real_s, True
-        elif before[0].choice != bid.choice:
+        elif (before[0].choice, before[0].choice_plan) != (bid.choice, bid.choice_plan):
             self.changed_s = real_s
         if bid.arm != self.name:
             self._send_corrections(bid, real_s)
@@ -171,12 +172,13 @@ class Participant:
 
     def tick(self, real_s: float, time_s: float) -> None:
         """Do what is due."""
+        self._time_s = time_s
         for job in self.claimant.rejected:
             self._lost = True
             self._pause(job, real_s)
         self.claimant.rejected.clear()
         self._bid(real_s, time_s)
-        if self._choice:
+        if self._choice.job:
             self._claim_choice(real_s)
         else:
             self._choose(real_s, time_s)
@@ -184,10 +186,19 @@ class Participant:
             self.out.append(claim)
 
     def open_jobs(self, real_s: float) -> list[str]:
-        """Return the jobs that are not settled, without those of absent arms that had permission to commit."""
+        """Return the jobs that can still be done, without those of absent arms that had permission to commit."""
         register = self.granter.register
         gone = {job for job in self.granter.out_of_contact(real_s) if register.grants[job].arm not in self._present}
-        return [job for job in self.jobs if job not in register.settled and job not in gone]
+        gone.update(register.settled, self._given_up(self.jobs, real_s))
+        return [job for job in self.jobs if job not in gone]
+
+    def _given_up(self, jobs: Mapping[str, JobSpec], real_s: float) -> dict[str, str]:
+        """Return why jobs are given up in which no arm has faulted too often: they expired, or wait for one that is."""
+        late = (job.name for job in jobs.values() if is_late(job, self._time_s))
+        settled = self.granter.register.settled
+        expired = {name for name in late if name not in settled and not self.granter.is_granted(name, real_s)}
+        causes = self.granter.register.given_up | expired
+        return dict.fromkeys(expired, EXPIRED) | lost_jobs(jobs.values(), causes)
 
     def all_settled(self, real_s: float) -> bool:
         """Return whether every present arm, a majority at least, knows that every job is settled."""
@@ -199,8 +210,16 @@ class Participant:
 
     def status(self, later: Iterable[JobSpec], real_s: float) -> list[JobStatus]:
         """Return the status of all known jobs, and of `later` ones that are not offered yet."""
-        names = dict.fromkeys([*self.jobs, *(job.name for job in later), *self.granter.register.settled])
+        jobs = self.jobs | {job.name: job for job in later}
+        lost = self._given_up(jobs, real_s)
+        names = dict.fromkeys([*jobs, *self.granter.register.settled])
         statuses = [self.granter.status(name, real_s) for name in names]
+        statuses = [
+            replace(status, state="given_up", reason=lost[status.job])
+            if status.state == "waiting" and status.job in lost
+            else status
+            for status in statuses
+        ]
         if not self.ended:
             return statuses
         return [
@@ -218,6 +237,7 @@ class Participant:
             for name, job in self.jobs.items()
             if name not in settled
             and not self.granter.is_granted(name, real_s)
+            and not is_late(job, time_s)
             and self._later_s.get(name, -math.inf) <= real_s
         )
 
@@ -231,8 +251,8 @@ class Participant:
         capacity = 0 if self.ended or self._arm.unfit() else max(0, self.claimant.capacity)
         ready = self._ready(real_s, time_s) if capacity else []
         names = [job.name for job in ready]
-        if self._choice not in names or self.claimant.pending:
-            self._choice = ""
+        if self._choice.job not in names or self.claimant.pending:
+            self._choice = NO_CHOICE
         open_jobs = self.open_jobs(real_s)
         content = (capacity, names, len(open_jobs), self._choice, dict(self.granter.register.space))
         if content == self._last_bid and real_s < self._bid_s + BID_S:
@@ -248,15 +268,21 @@ class Participant:
             open_count=len(open_jobs),
             closed_count=self.granter.register.closed_count,
             open_jobs=tuple(open_jobs[:MAX_OPEN_JOBS]),
-            choice=self._choice,
+            choice=self._choice.job,
+            choice_plan=self._choice.plan,
         )
         self.apply_bid(bid, real_s)
         self.out.append(bid)
 
     def _estimates(self, jobs: list[JobSpec]) -> tuple[JobEstimate, ...]:
-        """Return the estimates of these jobs, without those whose space another arm takes."""
+        """Return the estimates of these jobs, without plans whose space another arm takes."""
         estimates = self._arm.estimate(tuple(jobs)) if jobs else ()
-        return tuple(each for each in estimates if not self.granter.in_the_way(self.name, each.space))
+        open_plans = [
+            tuple(plan for plan in each.plans if not self.granter.in_the_way(self.name, plan.space))
+            for each in estimates
+        ]
+        pairs = zip(estimates, open_plans, strict=True)
+        return tuple(replace(each, plans=plans) for each, plans in pairs if plans or not each.feasible)
 
     def _choose(self, real_s: float, time_s: float) -> None:
         """Let the policy choose a job, once the bids of all present arms have arrived."""
@@ -275,12 +301,12 @@ class Participant:
         bidding = self._bidding(bids, [offer.job for offer in own.estimates])
         observations = observe(bidding, self._fleet, lost={self.name} if self._lost else ())
         action = self._policy(observations[self.name], self._fleet.arms.index(self.name))
-        self._choice = claimed_jobs(bidding, observations, {self.name: action}).get(self.name, "")
+        self._choice = claimed_jobs(bidding, observations, {self.name: action}).get(self.name, NO_CHOICE)
         self._lost = False
         for job in bidding.jobs:
-            if all(bidding.offer(arm, job.name) is None for arm in bidding.quotes):
+            if not any(bidding.plans(arm, job.name) for arm in bidding.quotes):
                 self._pause(job.name, real_s)  # no arm can do it: its slot is free for another job
-        if self._choice:
+        if self._choice.job:
             self._bid(real_s, time_s)
 
     def _claim_choice(self, real_s: float) -> None:
@@ -288,11 +314,11 @@ class Participant:
         if real_s < self.changed_s + QUIET_S and real_s < self._chosen_s + self._timing.window_s:
             return
         bids = self._fresh_bids(real_s)
-        choices = {arm: bid.choice for arm, bid in bids.items() if bid.choice}
-        bidding = self._bidding(bids, choices.values())
-        job, self._choice = self._choice, ""
-        if resolve_claims(bidding, choices, self._fleet.arms).get(job) == self.name:
-            self.claimant.request(self.jobs[job], real_s)
+        choices = {arm: Choice(bid.choice, bid.choice_plan) for arm, bid in bids.items() if bid.choice}
+        bidding = self._bidding(bids, [choice.job for choice in choices.values()])
+        (job, plan), self._choice = self._choice, NO_CHOICE
+        if resolve_claims(bidding, choices, self._fleet.arms).get(job) == (self.name, plan):
+            self.claimant.request(self.jobs[job], plan, real_s)
         else:
             self._lost = True
 

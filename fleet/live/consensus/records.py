@@ -18,6 +18,8 @@ class JobGranted(msgspec.Struct, frozen=True, tag="job_granted"):
     places: tuple[Name, ...]
     cycles: Count
     may_commit: bool = False
+    revoked: bool = False
+    """As in `Grant`."""
 
 
 class JobSettled(msgspec.Struct, frozen=True, tag="job_settled"):

@@ -63,6 +63,7 @@ def check_health(
     auctioneer: bool = True,
     secure: bool = False,
     expected: Sequence[str] = (),
+    other_versions: Sequence[str] = (),
 ) -> HealthReport:
     """Check a fleet that was listened to for a while.
 
@@ -73,6 +74,7 @@ def check_health(
         auctioneer: Whether the fleet should have one.
         secure: Whether the listener used a certificate; one that the router does not know receives nothing.
         expected: Arms that should be present: one that left earlier leaves no trace.
+        other_versions: A sentence on each participant that uses another version of the bus.
     """
     trips_s = [probe.answered_s - probe.asked_s for probe in probes]
     clock = best_clock(probes)
@@ -99,7 +101,17 @@ def check_health(
     if unfinished := fleet.counts.get("unfinished", 0):
         findings.append(Finding("warning", f"{unfinished} job(s) are unfinished: they may have been done or not."))
     if given_up := fleet.counts.get("given_up", 0):
-        findings.append(Finding("warning", f"{given_up} job(s) are given up: arms faulted in them too often."))
+        findings.append(Finding("warning", f"{given_up} job(s) are given up; their status names the reason."))
+    findings += [Finding("fault", sentence) for sentence in other_versions]
+    present = {arm.arm for arm in fleet.arms if arm.present}
+    findings += [
+        Finding(
+            "warning",
+            f"The space of {arm} stays closed to other arms, as {arm} is not present. If you have seen that it is at "
+            f"home or removed, and is switched off: thermofleet clear {arm}",
+        )
+        for arm in sorted(fleet.space.keys() - present)
+    ]
     return HealthReport(
         fleet=fleet.fleet,
         round_trip_s=median(trips_s) if trips_s else None,

@@ -8,6 +8,7 @@ import math
 from collections import Counter
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
+from itertools import repeat
 from typing import Literal, TypeVar
 
 import msgspec
@@ -28,6 +29,15 @@ Role = Literal["arm", "auction"]
 Message = TypeVar("Message", bound=msgspec.Struct)
 
 
+class JobScore(msgspec.Struct, frozen=True):
+    """What an arm says about a job; None where it knows nothing."""
+
+    peak_c: float | None = None
+    """Predicted temperature of the hottest motor during the job."""
+    p_saturation: float | None = None
+    difficulty: float | None = None
+
+
 class ArmSnapshot(msgspec.Struct, frozen=True):
     """An arm as its messages show it; ages are real seconds, None without a message."""
 
@@ -43,8 +53,10 @@ class ArmSnapshot(msgspec.Struct, frozen=True):
     """The hottest motor, 1..7."""
     headroom_k: float | None = None
     job: str = ""
-    difficulty: dict[str, float | None] = {}
-    """Difficulty of the jobs that have not ended; None without a score."""
+    away: bool = False
+    """It says that it is away from home."""
+    scores: dict[str, JobScore] = {}
+    """Of the jobs that have not ended."""
     joints: int | None = None
     twin: str = ""
     event: str = ""
@@ -74,6 +86,8 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
     """Number of jobs by state."""
     jobs: tuple[JobStatus, ...]
     """The most recently changed last."""
+    space: dict[str, tuple[str, ...]] = {}
+    """Names of the spaces that are closed to others, by arm, as the last status reply has them."""
 
 
 @dataclass
@@ -113,6 +127,7 @@ class FleetView:
     """Fleet seconds per real second; None while unknown."""
     _arms: "Recent[str, _Arm]" = field(default_factory=lambda: Recent(MAX_NAMES))
     _auctioneers: "Recent[str, _Auctioneer]" = field(default_factory=lambda: Recent(MAX_NAMES))
+    _space: dict[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
     _jobs: "Recent[str, _Job]" = field(default_factory=lambda: Recent(MAX_JOBS))
 
     def set_token(self, role: Role, name: str, present: bool) -> bool:
@@ -138,7 +153,7 @@ class FleetView:
                 self._jobs.clear()
             for job in self._jobs.values():
                 job.number = 0
-        auctioneer.heard_s, auctioneer.time_s = now_s, reply.time_s
+        auctioneer.heard_s, auctioneer.time_s, self._space = now_s, reply.time_s, dict(reply.space)
         for status in reply.jobs:
             self._set_status(status, now_s)
 
@@ -167,6 +182,7 @@ class FleetView:
             ),
             counts=dict(Counter(status.state for status in statuses)),
             jobs=tuple(statuses[-jobs:]) if jobs > 0 else (),
+            space=self._space,
         )
 
     def _arm(self, name: str) -> _Arm:
@@ -216,7 +232,8 @@ def _arm_snapshot(name: str, arm: _Arm, now_s: float, speed: float | None, ended
     (state, state_s), (scores, scores_s) = arm.last(State), arm.last(DifficultyScores)
     (info, _), (event, _) = arm.last(Info), arm.last(ArmEvent)
     age_s = now_s - state_s if state else None
-    difficulty = zip(scores.jobs, scores.difficulty, strict=True) if scores else ()
+    columns = (scores.peak_c or repeat(None), scores.p_saturation, scores.difficulty) if scores else ()
+    by_job = zip(scores.jobs, map(JobScore, *columns), strict=True) if scores else ()
     difficulty_age_s = now_s - scores_s if scores else None
     if scores and state and speed:  # from a cache it may arrive long after it was sent
         difficulty_age_s = max(now_s - scores_s, now_s - state_s + (state.time_s - scores.time_s) / speed)
@@ -232,7 +249,8 @@ def _arm_snapshot(name: str, arm: _Arm, now_s: float, speed: float | None, ended
         joint=None if hottest_c is None else temps_c.index(hottest_c) + 1,
         headroom_k=state.headroom_k if state else None,
         job=state.job if state else "",
-        difficulty={job: score for job, score in difficulty if job not in ended},
+        away=bool(state and state.space),
+        scores={job: score for job, score in by_job if job not in ended},
         joints=info.joints if info else None,
         twin=info.twin if info else "",
         event=describe_event(event) if event else "",

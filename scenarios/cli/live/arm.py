@@ -144,6 +144,8 @@ class PreparedArm:
     """Variants of a work; raises InfeasibleJob."""
     body: Callable[[float, float], Body]
     """Makes its body, from the fleet time and the length of its steps, s."""
+    ambient_c: Callable[[float], float] | None = None
+    """Ambient temperature at the arm by fleet time, °C; None: that of the cell."""
     works: tuple[Work, ...] = ()
     """Works that are planned already."""
     takes_jobs: bool = True
@@ -171,7 +173,10 @@ def simulated_arm(
     kind = choose("risk", risk, RiskName)
     arm = prepare_arm(scenario, name, difficulty=difficulty, risk=kind, cache=cache, progress=progress)
     index = scenario.index_of(name)
-    ambient_c, offset_k = ambient_of(scenario), float(air_offsets(scenario)[index])
+    cell_c, offset_k = ambient_of(scenario), float(air_offsets(scenario)[index])
+
+    def ambient_c(time_s: float) -> float:
+        return cell_c(time_s) + offset_k
 
     @lru_cache
     def planner() -> CellPlanner:  # made for the first unplanned work only: it loads the physics
@@ -184,7 +189,7 @@ def simulated_arm(
         return SimulatedBody(
             arm,
             scenario.limits,
-            lambda at_s: ambient_c(at_s) + offset_k,
+            ambient_c,
             dt_s=dt_s,
             max_dt_s=scenario.decision_interval_s,
             rng=np.random.default_rng(np.random.SeedSequence([seed, index])),
@@ -192,7 +197,8 @@ def simulated_arm(
             warm=scenario.start == "idle_warm",
         )
 
-    return PreparedArm(name=name, model=arm.model, plan=plan, body=body, works=tuple(arm.plans))
+    works = tuple(arm.plans)
+    return PreparedArm(name=name, model=arm.model, plan=plan, body=body, ambient_c=ambient_c, works=works)
 
 
 def ambient_of(scenario: Scenario) -> Callable[[float], float]:
@@ -268,7 +274,7 @@ def make_node(
         warning_c=scenario.limits.warning_c,
         rate_hz=rate_hz,
         boot=history.boot,
-        ambient_c=ambient_of(scenario),
+        ambient_c=arm.ambient_c or ambient_of(scenario),
         takes_jobs=arm.takes_jobs,
     )
     body = arm.body(clock.now_s(time.monotonic()), clock.speed / rate_hz)

@@ -9,40 +9,43 @@ from rich.table import Table
 
 from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import MOST_JOBS, JobEstimate, JobSpec, Quote, QuoteRequest
+from fleet.bus.protocol.auction import MOST_QUOTED, JobEstimate, JobSpec, PlanQuote, Quote, QuoteRequest
 from fleet.errors import BusError, FleetError
-from fleet.job import DWELL_S
+from fleet.job import BOUNDS, DWELL_S
 from scenarios.cli.live.submit import JOBS_HELP, explain, read_jobs
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, number, the_fleet
 from scenarios.cli.terminal import out_console, say
 
 REPLY_S = 5.0
 """Real seconds to wait for arms: planning a new motion takes a while."""
+_RANGES = {name: (bounds.low, bounds.high) for name, bounds in BOUNDS.items()}
 
 
 def ask_command(
     file: Annotated[str, typer.Argument(help=JOBS_HELP)] = "",
     kind: Annotated[str, typer.Option(help="One job instead of a file: pick_place, hold, press, sort.")] = "",
     place: Annotated[list[str] | None, typer.Option(help="Place of the cell; twice for pick_place and sort.")] = None,
-    payload: Annotated[float, number("Payload, kg.", 0, 100)] = 0.0,
-    repetitions: Annotated[int, number("Number of cycles.", 1, 1_000_000)] = 1,
-    dwell: Annotated[float, number("Duration of one repetition of a hold or press, s.", 0, 86_400)] = DWELL_S,
-    force: Annotated[float, number("Force of a press, N.", 0, 1000)] = 0.0,
+    payload: Annotated[float, number("Payload, kg.", *_RANGES["payload_kg"])] = 0.0,
+    repetitions: Annotated[int, number("Number of cycles.", *_RANGES["repetitions"])] = 1,
+    dwell: Annotated[float, number("Duration of one repetition of a hold or press, s.", *_RANGES["dwell_s"])] = DWELL_S,
+    force: Annotated[float, number("Force of a press, N.", *_RANGES["force_n"])] = 0.0,
     timeout: Annotated[float, number("Real seconds to wait for arms.", 0, 600, above=True)] = REPLY_S,
     as_json: Annotated[bool, typer.Option("--json", help="Print the quotes as JSON.")] = False,
     endpoint: EndpointOption = ENDPOINT,
     fleet: FleetOption = "",
 ) -> None:
-    """Request quotes of all arms: difficulty, P(saturation), peak temperature, finish, or the reason of infeasibility.
+    """Request quotes of all arms: what every plan costs, or why the job is infeasible for the arm.
 
-    The duration of a job includes the ways to its place and home. It is finished after its last cycle, once the arm's
+    peak: predicted temperature of the hottest motor, and how much warmer that is than now. P: probability that a motor
+    passes the warning limit. d: thermal difficulty, to compare arms on one job. The fastest plan comes first. The
+    duration of a job includes the ways to its place and home. It is finished after its last cycle, once the arm's
     present jobs are done. Exit code 1: there is a job that no arm can do.
     """
     if bool(file) == bool(kind):
         raise FleetError("Give either a FILE of jobs or one job by --kind and --place.")
     jobs = read_jobs(file) if file else [one_job(kind, place or [], payload, repetitions, dwell, force)]
-    if len(jobs) > MOST_JOBS:
-        raise FleetError(f"A request can name at most {MOST_JOBS} jobs (got {len(jobs)}).")
+    if len(jobs) > MOST_QUOTED:
+        raise FleetError(f"A request can name at most {MOST_QUOTED} jobs (got {len(jobs)}).")
     with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
         request = QuoteRequest("dry run", tuple(jobs), dry_run=True)
         answers = link.query_and_wait(keys.of_every_arm(link.fleet, "quote"), request, Quote, timeout_s=timeout)
@@ -79,9 +82,12 @@ def one_job(
         "force_n": force_n,
     }
     try:
+        msgspec.json.encode(fields)
         return msgspec.convert(fields, JobSpec)
     except msgspec.ValidationError as error:
         raise FleetError(f"Invalid job: {explain(error)}") from error
+    except UnicodeEncodeError as error:
+        raise FleetError(f"--kind and --place must be UTF-8 text (got {error.object!a}).") from error
 
 
 def quote_table(jobs: Sequence[JobSpec], quotes: Mapping[str, Quote]) -> Table:
@@ -89,27 +95,33 @@ def quote_table(jobs: Sequence[JobSpec], quotes: Mapping[str, Quote]) -> Table:
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("job")
     table.add_column("arm")
-    for column in ("d", "P(saturation)", "peak °C", "duration s", "finish in s"):
+    for column in ("plan", "peak °C", "gained K", "P", "d", "duration s", "finish in s"):
         table.add_column(column, justify="right")
     table.add_column("")
     for index, job in enumerate(jobs):
-        for row, (arm, quote) in enumerate(quotes.items()):
-            estimate = next((each for each in quote.estimates if each.job == job.name), None)
-            last = row == len(quotes) - 1 and index > 0
-            table.add_row("" if row else job.name, arm, *cells(estimate), end_section=last)
+        estimates = [(arm, each) for arm, quote in quotes.items() for each in quote.estimates if each.job == job.name]
+        rows = [(arm, row) for arm, estimate in estimates for row in rows_of(estimate)]
+        for line, (arm, row) in enumerate(rows):
+            again = line > 0 and rows[line - 1][0] == arm
+            last = line == len(rows) - 1 and index > 0
+            table.add_row("" if line else job.name, "" if again else arm, *row, end_section=last)
     return table
 
 
-def cells(estimate: JobEstimate | None) -> list[str]:
-    """Cells of an estimate; a dash for what the arm does not know."""
-    if estimate is None:
-        return ["–"] * 5 + ["no reply"]
+def rows_of(estimate: JobEstimate) -> list[list[str]]:
+    """Cells of each plan of an estimate; a dash for what the arm does not know."""
+    if not estimate.feasible:
+        return [["–"] * 7 + [f"cannot: {estimate.reason}"]]
+    return [_cells(plan) for plan in estimate.plans]
+
+
+def _cells(plan: PlanQuote) -> list[str]:
     figures = (
-        (estimate.difficulty, ".2f"),
-        (estimate.p_saturation, ".2f"),
-        (estimate.peak_c, ".1f"),
-        (estimate.duration_s, ".0f"),
-        (estimate.finish_in_s, ".0f"),
+        (plan.peak_c, ".1f"),
+        (plan.gained_k, "+.1f"),
+        (plan.p_saturation, ".2f"),
+        (plan.difficulty, ".2f"),
+        (plan.duration_s, ".0f"),
+        (plan.finish_in_s, ".0f"),
     )
-    values = ["–" if value is None else format(value, form) for value, form in figures]
-    return [*values, "" if estimate.feasible else f"cannot: {estimate.reason}"]
+    return [str(plan.plan), *("–" if value is None else format(value, form) for value, form in figures), ""]

@@ -11,6 +11,7 @@ import numpy as np
 import typer
 
 from fleet.bus.client.client import BusClient
+from fleet.bus.client.discover import other_versions
 from fleet.bus.protocol.auction import JobSpec, JobStatus, Submission
 from fleet.errors import JournalFull
 from fleet.job import Job
@@ -82,6 +83,8 @@ def auction_command(
             arms=tuple(arm.name for arm in chosen.arms),
             excludes=excludes,
         )
+        for sentence in other_versions(endpoint, fleet):
+            log.error("Refused: %s", sentence)
         typer.echo(f"ready {name} {endpoint} {os.getpid()}")
         if node.auctioneer.ledger.jobs:
             so_far = summary(node.auctioneer.status(), node.time_s).partition("\n")[0]
@@ -148,6 +151,7 @@ def job_spec(job: Job) -> JobSpec:
         due_s=job.due_s,
         value=job.value,
         after=job.after,
+        expires=job.expires,
     )
 
 

@@ -10,7 +10,7 @@ import msgspec
 import typer
 
 from fleet.bus.client.client import BusClient
-from fleet.bus.client.discover import fleets_at
+from fleet.bus.client.discover import fleets_at, other_versions
 from fleet.bus.client.replies import Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Clock, ClockRequest
@@ -21,7 +21,7 @@ from fleet.live.monitor.listener import FleetListener
 from fleet.live.monitor.snapshot import FleetSnapshot
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, number
 from scenarios.cli.terminal import out_console, say
-from scenarios.live.watch_screen import arm_table, format_time, jobs_line
+from scenarios.live.watch_screen import arm_table, format_time, jobs_line, space_line
 from scenarios.load import load
 
 UNHEALTHY = 1
@@ -104,7 +104,17 @@ def examine(
         snapshot = listener.view.snapshot(now_s)
         problems = {"malformed": link.malformed, "complaints": tuple(link.rejections), "overrun": link.overrun}
     secure = identified(endpoint)[1] is not None
-    report = check_health(snapshot, now_s, probes, auctioneer=auctioneer, secure=secure, expected=expected, **problems)
+    others = other_versions(endpoint, fleet)
+    report = check_health(
+        snapshot,
+        now_s,
+        probes,
+        auctioneer=auctioneer,
+        secure=secure,
+        expected=expected,
+        other_versions=others,
+        **problems,
+    )
     return snapshot, report
 
 
@@ -122,6 +132,7 @@ def show(endpoint: str, fleet: FleetSnapshot, report: HealthReport) -> None:
     if fleet.arms:
         out_console.print(arm_table(fleet.arms))
     out_console.print(jobs_line(fleet))
+    out_console.print(space_line(fleet))
     for finding in report.findings:
         out_console.print(
             f"{finding.level}: {finding.what}", style=_COLORS.get(finding.level, ""), highlight=False, markup=False

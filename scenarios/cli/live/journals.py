@@ -16,6 +16,8 @@ def folder_of(folder: Path | None, fleet: str, scenario: Scenario) -> tuple[str,
     """
     name = fleet or scenario.name
     where = folder or Path("runs") / f"live-{name}"
+    if where.is_file():
+        raise FleetError(f"The journals need a folder, and '{where}' is a file. Give the path of a folder.")
     with disk_errors(where):
         where.mkdir(parents=True, exist_ok=True)
     return name, where

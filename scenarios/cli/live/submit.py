@@ -57,7 +57,8 @@ def submit_command(
     with until_stopped() as stop, BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
         admissions = [admission for batch in batches(jobs) for admission in submit(link, batch, by)]
         for admission in admissions:
-            typer.echo(f"{admission.job}: {'accepted' if admission.accepted else f'refused: {admission.reason}'}")
+            decision = "accepted" if admission.accepted else "refused"
+            typer.echo(f"{admission.job}: {decision}{f': {admission.reason}' if admission.reason else ''}")
         accepted = [admission.job for admission in admissions if admission.accepted]
         unfinished = follow(link, accepted, stop) if wait and accepted else []
         stop.leave("Stopped following; the auctioneer has the jobs.")

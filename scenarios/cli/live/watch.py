@@ -16,7 +16,7 @@ from fleet.live.monitor.snapshot import describe_event, describe_status
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
 from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import out_console
-from scenarios.live.watch_screen import arm_line, format_time, jobs_line, screen
+from scenarios.live.watch_screen import arm_line, format_time, jobs_line, screen, space_line
 
 FRAME_S, LINE_S, SNAPSHOT_S = 0.25, 5.0, 1.0
 """Real seconds: between two frames; between two lines about every arm; of listening for one snapshot."""
@@ -71,6 +71,7 @@ def print_lines(listener: FleetListener, news: deque[str], stopped: Callable[[],
             for arm in fleet.arms:
                 typer.echo(arm_line(arm))
             typer.echo(jobs_line(fleet).plain)
+            typer.echo(space_line(fleet).plain)
 
 
 def describe(name: str, message: msgspec.Struct) -> str:

@@ -17,6 +17,7 @@ from fleet.bus.protocol.auction import (
     Lease,
     LeaseEntry,
     LeaseRequest,
+    PlanQuote,
     Quote,
     QuoteRequest,
     Receipt,
@@ -25,6 +26,7 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.messages import State
 from fleet.live.auction.ledger import AuctionRecord
 from fleet.live.auction.node import AuctionNode
+from fleet.live.auction.round import Assignment
 from fleet.live.journal import Journal
 
 PATIENCE_S = 15.0
@@ -32,7 +34,7 @@ PATIENCE_S = 15.0
 
 def first_come(bidding):
     """Return one job per arm, in the order of jobs and arms."""
-    return dict(zip((job.name for job in bidding.jobs), sorted(bidding.quotes), strict=False))
+    return dict(zip((job.name for job in bidding.jobs), map(Assignment, sorted(bidding.quotes)), strict=False))
 
 
 class Arm:
@@ -49,7 +51,7 @@ class Arm:
         link.declare_token(keys.of_arm(fleet, name, "alive"))
 
     def quote(self, request):
-        estimates = tuple(JobEstimate(job.name, True, finish_in_s=1.0) for job in request.jobs)
+        estimates = tuple(JobEstimate(job.name, (PlanQuote(finish_in_s=1.0),)) for job in request.jobs)
         quote, capacity = f"{self.name}-{next(self._numbers)}", int(self._current is None)
         return Quote(self.name, request.auction, quote, 5.0, "none", 0.0, "idle", 20.0, capacity, estimates)
 

@@ -5,6 +5,8 @@ import os
 
 import pytest
 
+from fleet.bus.client.discover import other_versions
+from fleet.bus.client.router import open_client
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Announcement,
@@ -20,7 +22,7 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.messages import encode
 from fleet.errors import JournalFull
 from fleet.live import journal
-from fleet.live.auction.job_rules import statuses_that_fit
+from fleet.live.auction.job_rules import status_reply
 from fleet.live.journal import Journal
 
 
@@ -156,4 +158,16 @@ def test_the_status_of_1500_jobs_fits_into_one_message_with_open_jobs_first(bus)
     assert 100 < len(status.jobs) <= 256
     assert len(encode(status)) < 65_536
     first = JobStatus("done", "finished")
-    assert statuses_that_fit((first, *status.jobs * 2))[0].state == "waiting"
+    taken = {f"arm_{number}": frozenset("*") for number in range(1000)}
+    reply = status_reply("x", 0.0, (first, *status.jobs * 2), taken)
+    assert (len(reply.jobs) > 0, reply.jobs[0].state, len(reply.space)) == (True, "waiting", 1000)
+    assert len(encode(reply)) < 65_536
+
+
+def test_an_arm_of_an_older_version_is_named_with_its_version(bus):
+    bus.arm("arm 2")
+    with open_client(bus.endpoint, timeout_s=5.0) as session:
+        token = session.liveliness().declare_token("thermofleet/v2/f/arm/arm%201/alive")
+        (sentence,) = other_versions(bus.endpoint, "f")
+        token.undeclare()
+    assert sentence.startswith("'arm 1' uses version v2 of the bus, and this program v3")

@@ -4,6 +4,7 @@ Every arm is real except for its body: time is a number, every clock runs at its
 """
 
 import random
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import combinations
@@ -12,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from agents.consensus import Consensus
-from fleet.bus.protocol.auction import JobEstimate, JobSpec
+from fleet.bus.protocol.auction import JobEstimate, JobSpec, PlanQuote
 from fleet.errors import JournalFull, Refused
 from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
 from fleet.live.arm.journal_records import ArmHistory
@@ -106,7 +107,7 @@ class Arm:
     def estimate(self, jobs):
         return tuple(self.fleet.offer(self.name, job) for job in jobs)
 
-    def space_of(self, job: JobSpec) -> str:
+    def space_of(self, job: JobSpec, plan: int) -> str:
         return f"{self.name}: {job.name}"
 
     def unfit(self) -> str:
@@ -135,6 +136,7 @@ class Arm:
     def _step(self) -> None:
         self.executor.retry_writes()
         self._work()
+        self.executor.return_revoked(0.0, self.real_s, at_home=not self.out)
         self.executor.return_expired(0.0, self.real_s)
         if self.executor.lease_requests(self.real_s) or self.executor.due_reports(self.real_s):
             self.participant.claimant.claim_soon()
@@ -179,15 +181,31 @@ class Arm:
             self.executor.record_progress(first.cycles + 1, 0.0)
         self.executor.record_progress(first.cycles, (repetitions - 1 - first.cycles) * CYCLE_S)
 
-    def fault(self) -> None:
+    def break_off(self) -> None:
         """Stop during a cycle, which then does not count."""
-        if self.executor.active:
-            self.fleet.faults.setdefault(self.executor.active[0].job, []).append(self.name)
         if self.cycle_ends_s is not None:
             first = self.executor.active[0].award.job
             if self.executor.active[0].cycles + 1 == first.repetitions:
                 self.fleet.last_cycles[first.name] -= 1
             self.cycle_ends_s = None
+
+    def move_home(self) -> None:
+        """Have a person move the arm home; its process lives on."""
+        self.break_off()
+        self.out, self.home_s = "", None
+
+    def clear(self, absent: str) -> None:
+        """Free the space of another arm, unless that is refused."""
+        present = self.fleet.alive_for(self.name)
+        with suppress(Refused, JournalFull):
+            self.run_until_crash(
+                lambda: self.participant.granter.clear(absent, "", present, self.real_s, self.fleet.true_s)
+            )
+
+    def fault(self) -> None:
+        if self.executor.active:
+            self.fleet.faults.setdefault(self.executor.active[0].job, []).append(self.name)
+        self.break_off()
         self.executor.return_all(0.0, self.real_s, "hot", faulted=True)
 
 
@@ -209,13 +227,8 @@ class Fleet:
     def offer(self, arm: str, job: JobSpec) -> JobEstimate:
         """Return an estimate that depends on the names of arm and job only; some pairs are infeasible."""
         d = random.Random(f"{arm} {job.name}").random()
-        return JobEstimate(
-            job=job.name,
-            feasible=d > 0.1 or arm == self.names[0],
-            difficulty=d,
-            finish_in_s=10.0,
-            space=f"{arm}: {job.name}",
-        )
+        plan = PlanQuote(difficulty=d, finish_in_s=10.0, space=f"{arm}: {job.name}")
+        return JobEstimate(job.name, (plan,) if d > 0.1 or arm == self.names[0] else ())
 
     def last_cycle(self, job: str) -> None:
         self.last_cycles[job] = self.last_cycles.get(job, 0) + 1

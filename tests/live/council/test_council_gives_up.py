@@ -41,7 +41,8 @@ def test_a_job_that_always_faults_is_given_up_by_all_and_others_go_on(council, a
 
 @pytest.mark.parametrize("lost", [0, 1])
 def test_an_arm_that_was_away_learns_that_a_job_is_given_up(council, lost):
-    fleet = council.Fleet([1.0] * 4, [JOB])
+    successor = JobSpec(name="k", kind="hold", places=("y",), after=("j",))
+    fleet = council.Fleet([1.0] * 4, [JOB, successor])
     away = fleet.names[lost]
     fleet.cut = {away}
     for _ in range(200):
@@ -54,4 +55,9 @@ def test_an_arm_that_was_away_learns_that_a_job_is_given_up(council, lost):
     assert "j" not in fleet.arms[away].participant.granter.register.settled
     fleet.cut = set()
     fleet.run(5.0)
-    assert fleet.arms[away].participant.granter.register.settled["j"].outcome == "given_up"
+    for arm in fleet.arms.values():
+        assert {status.job: status.state for status in arm.participant.status([], arm.real_s)} == {
+            "j": "given_up",
+            "k": "given_up",
+        }
+        assert arm.participant.all_settled(arm.real_s)

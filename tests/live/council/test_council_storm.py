@@ -94,6 +94,22 @@ def cut_off_at_work(fleet, rng: random.Random) -> None:
     fleet.cut = set()
 
 
+def clear_one_that_lives_on(fleet, rng: random.Random) -> None:
+    """A person moves an arm home that its peers do not hear, and frees its space; its process lives on."""
+    arm = fleet.busy_arm(rng, may_commit=True)
+    if arm is None:
+        return
+    fleet.cut = {arm.name}
+    fleet.run(rng.choice([0.5, 3.2, 4.0]), stopped=arm.name)
+    arm.move_home()
+    for peer in fleet.arms.values():
+        if peer is not arm and rng.random() < 0.9:
+            peer.clear(arm.name)
+    fleet.run(rng.choice([0.0, 1.0, 3.0]), stopped=rng.choice(["", arm.name]))
+    fleet.cut = set()
+    fleet.run(1.0)
+
+
 def fill_disk_at_work(fleet, rng: random.Random) -> None:
     """Fill the disk of an arm before it records the end of a job."""
     arm = fleet.busy_arm(rng, may_commit=True)
@@ -156,7 +172,14 @@ ACTIONS = (
         repeat_old_messages,
         late_answers,
     ),
-    *(cut_off_at_work, cut_off_at_work, fill_disk_at_work, kill_at_work),
+    *(
+        clear_one_that_lives_on,
+        clear_one_that_lives_on,
+        cut_off_at_work,
+        cut_off_at_work,
+        fill_disk_at_work,
+        kill_at_work,
+    ),
 )
 rates = st.lists(st.floats(1 - 1e-3, 1 + 1e-3), min_size=1, max_size=5)
 

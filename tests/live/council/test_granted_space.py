@@ -105,5 +105,10 @@ def test_a_person_frees_the_space_of_an_arm_that_is_not_heard(granting):
     assert len(granting.records) == count  # the same request again changes nothing
     granting.start(LATER_S)
     assert granting.claim("b", "p2", at_s=LATER_S + TIMING.lease_s + 1) == []
-    granting.claim("a", space=("p1",), at_s=LATER_S + TIMING.lease_s + 1)  # it is heard again
+    granting.claim("b", at_s=LATER_S + TIMING.lease_s + 1)
+    for restart in (False, True):  # it is heard again, away from home
+        if restart:
+            granting.start(LATER_S)
+        again = granting.claim("a", "p1", space=("p1",), at_s=2 * LATER_S, phase="finishing")
+        assert again == ["the space of 'a' was cleared"]
     assert granting.claim("c", "p3", at_s=2 * LATER_S) == ["'a' is in the way"]

@@ -167,7 +167,12 @@ class One:
             "a", roster, Register().replay(self.grants.records), self.grants.keep, real_s=0.0, timing=TIMING
         )
         self.claimant = Claimant(
-            self.executor, self.granter, self.executor.answer_award, str, boot=history.boot, timing=TIMING
+            self.executor,
+            self.granter,
+            self.executor.answer_award,
+            lambda job, plan: f"{job.name} {plan}",
+            boot=history.boot,
+            timing=TIMING,
         )
 
     def send_claim(self, real_s) -> Claim:
@@ -183,7 +188,7 @@ class One:
 
 def test_only_a_majority_of_the_roster_grants_a_job():
     one = One()
-    one.claimant.request(JOB, 0.0)
+    one.claimant.request(JOB, 0, 0.0)
     claimed = one.send_claim(0.0)
     one.receive(claimed, 0.1, "b")
     assert not one.executor.active, "two of four are no majority"
@@ -195,7 +200,7 @@ def test_only_a_majority_of_the_roster_grants_a_job():
 
 def test_a_lease_counts_from_the_query_to_the_last_arm_of_a_majority():
     one = One()
-    one.claimant.request(JOB, 0.0)
+    one.claimant.request(JOB, 0, 0.0)
     claimed = one.send_claim(0.0)
     one.receive(claimed, 0.9, "b", "c")
     assert one.executor.allowed_cycles(2.96) == 2
@@ -210,7 +215,7 @@ def test_a_lease_counts_from_the_query_to_the_last_arm_of_a_majority():
 
 
 def obtain_permission(one: One) -> None:
-    one.claimant.request(JOB, 0.0)
+    one.claimant.request(JOB, 0, 0.0)
     one.receive(one.send_claim(0.0), 0.1, "b", "c")
     one.executor.record_progress(2, 0.0)
     one.claimant.claim_soon()
@@ -264,7 +269,7 @@ def test_a_finished_job_is_claimed_until_its_report_is_on_disk_without_an_own_gr
 
 def test_a_request_that_a_majority_denies_is_withdrawn():
     one = One()
-    one.claimant.request(JOB, 0.0)
+    one.claimant.request(JOB, 0, 0.0)
     claimed = one.send_claim(0.0)
     for peer in ("b", "c"):
         denied = ClaimReply(peer, claimed.number, 3.0, (), (denial(claimed),))
@@ -281,7 +286,7 @@ def denial(claimed: Claim) -> DeniedEntry:
 
 def test_a_request_without_replies_is_withdrawn():
     one = One()
-    one.claimant.request(JOB, 0.0)
+    one.claimant.request(JOB, 0, 0.0)
     one.send_claim(0.0)
     assert one.send_claim(0.6).entries, "repeated for peers that have not replied"
     assert not one.send_claim(2.1).entries
@@ -298,7 +303,7 @@ def receive_faults(one: One, **faults: dict[str, str]) -> None:
 def test_an_arm_that_faults_names_the_faults_that_its_granters_know():
     """Also after a restart; so every granter learns of all faults, and not each of its own only."""
     one = One()
-    one.claimant.request(JOB, 0.0)
+    one.claimant.request(JOB, 0, 0.0)
     receive_faults(one, b={"b-1": "b"}, c={"c-1": "c"})
     (active,) = one.executor.active
     one.executor.return_all(1.0, 0.5, "hot", faulted=True)
@@ -310,7 +315,7 @@ def test_an_arm_that_faults_names_the_faults_that_its_granters_know():
 
 def test_a_request_is_withdrawn_if_the_granters_together_know_too_many_faults():
     one = One()
-    one.claimant.request(JOB, 0.0)
+    one.claimant.request(JOB, 0, 0.0)
     receive_faults(one, b={"b-1": "b"}, c={"b-2": "b"})
     assert not one.executor.active
     assert one.claimant.rejected == ["j"]
