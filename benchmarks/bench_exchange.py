@@ -42,6 +42,7 @@ def words_at(tick: int, arms: int, rng: np.random.Generator) -> Broadcast:
         mode=rng.integers(0, 3, arms),
         temp_c=rng.normal(40.0, 10.0, (arms, 7)),
         headroom_k=rng.normal(20.0, 5.0, arms),
+        busy_s=rng.uniform(0.0, 600.0, arms),
         jobs=tuple(f"job_{tick + slot}" for slot in range(SLOTS)),
         difficulty=difficulty,
         p_saturation=p_saturation,

@@ -80,7 +80,7 @@ def update_offers(t: Tables, d: Jobs, s: State, o: OpenJobs, events: EventBuffer
                 for n in range(options):
                     plan = plans[fleet, a, kind, n]
                     mask[e, a, 1 + filled * options + n] = (
-                        open_here and plan >= 0 and not is_closed(closed, e, volume[nonnegative(plan)])
+                        open_here and plan >= 0 and not is_closed(closed, e, nonnegative(volume[nonnegative(plan)]))
                     )
             filled += 1
         while filled < slots and slot_job[e, filled] >= 0:  # slots of the step before
@@ -183,7 +183,7 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
             j, option = nonnegative(slot_job[e, slot]), nonnegative(option)
             kind, free = nonnegative(kinds[e, j]), status[e, j] == WAITING
             plan = nonnegative(plan_of[fleet, a, kind, option])
-            free = free and not is_closed(closed, e, volume[plan])
+            free = free and not is_closed(closed, e, nonnegative(volume[plan]))
             for w in range(words):
                 free = free and (stations[fleet, kind, w] & busy[w]) == 0
             if not free:

@@ -161,12 +161,12 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
                         continue
                     own = work[fleet, a, kind, n]
                     duration_s, score = own["travel_s"] + left[k] * own["cycle_s"], own["difficulty"]
-                    space_free = not is_closed(closed, e, volume[plan])
+                    space_free = not is_closed(closed, e, nonnegative(volume[plan]))
                     out[e, a, at.feasible + option], out[e, a, at.space_free + option] = 1.0, space_free
                     if n == 0 and not space_free:
                         for peer in range(peers):
                             other = plans[e, who[a, peer]]
-                            if other >= 0 and is_closed(excluded, nonnegative(other), volume[plan]):
+                            if other >= 0 and is_closed(excluded, nonnegative(other), nonnegative(volume[plan])):
                                 out[e, a, at.peer_blocks + peer * slots + k] = 1.0
                     out[e, a, at.duration_s + option] = min(duration_s, LONG_S)
                     out[e, a, at.slack_s + option] = min(max(slack_s[k] - duration_s, -LONG_S), LONG_S)

@@ -70,9 +70,8 @@ class Tables(NamedTuple):
     times_s: Array
     """[plan, phase]."""
     current_sq: Array
-    """[plan, phase, lane]."""
     friction_w: Array
-    """[plan, phase, lane]."""
+    """[plan, phase, lane], as is the one before."""
     volume: Array
     """Volume that a plan takes, int [plan]; volumes are counted for each fleet."""
     excluded: Array
@@ -107,9 +106,8 @@ class Tables(NamedTuple):
     stations: Array
     """Stations of a kind of job, one bit each, uint64 [fleet, kind + 1, word]; the last row, no job, has none."""
     payload_kg: Array
-    """[fleet, kind]."""
     value: Array
-    """[fleet, kind]."""
+    """[fleet, kind], as is the one before."""
 
 
 class Jobs(NamedTuple):
@@ -126,9 +124,8 @@ class Jobs(NamedTuple):
     kind: Array
     """int [env, job]."""
     release_s: Array
-    """[env, job]."""
     due_s: Array
-    """[env, job]."""
+    """[env, job], as is the one before."""
     repetitions: Array
     """int [env, job]."""
     expires: Array

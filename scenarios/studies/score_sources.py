@@ -25,7 +25,7 @@ from scenarios.progress import Progress
 from scenarios.schema import Scenario
 from twin.baselines.reconstruction import untrained_config
 from twin.baselines.torque import TorqueRms, torque_over_known
-from twin.calibrated import CalibratedTwin
+from twin.thermal.calibrated import CalibratedTwin
 from twin.vae.model import TwinConfig
 
 Array = np.ndarray

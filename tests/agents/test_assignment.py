@@ -188,7 +188,7 @@ def test_the_arm_that_would_get_hot_does_not_get_the_job():
 @given(seed=st.integers(0, 2**32))
 def test_a_central_policy_reads_no_messages(name, seed):
     rng, layout = np.random.default_rng(seed), Layout(3, 4)
-    mask = np.insert(rng.integers(0, 2, (3, 4)), 0, 1, axis=1).astype(np.int8)
+    mask = np.pad(rng.integers(0, 2, (3, 4)), ((0, 0), (1, 1)), constant_values=((0, 0), (1, 0))).astype(np.int8)
     low, high = layout.bounds
     vectors = rng.uniform(np.maximum(low, -100.0), np.minimum(high, 100.0), (2, 3, layout.size)).astype(np.float32)
     first = [layout.read(vectors[0, arm], mask[arm]) for arm in range(3)]

@@ -49,6 +49,7 @@ def fleet(
             blank,
             idle=idle[me],
             offered=np.ones(slots),
+            value=np.ones(slots),
             feasible=able[me],
             known=known[me].astype(float),
             difficulty=values[me],

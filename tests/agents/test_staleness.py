@@ -22,7 +22,7 @@ def heard(own: list[float], peers: list[list[float]], ages_s: list[float]) -> Ob
     layout = Layout(1 + len(ages_s), slots)
     known = ~np.isnan(told)
     return replace(
-        layout.read(np.zeros(layout.size, np.float32), np.ones(slots + 1, np.int8)),
+        layout.read(np.zeros(layout.size, np.float32), np.append(np.ones(slots + 1, np.int8), np.int8(0))),
         idle=1.0,
         offered=np.ones(slots),
         feasible=np.ones(slots),

@@ -33,6 +33,7 @@ def random_words(rng: np.random.Generator, arms: int, time_s: float, slots: int 
         mode=rng.integers(0, 3, arms),
         temp_c=rng.normal(40.0, 10.0, (arms, 7)),
         headroom_k=rng.normal(10.0, 20.0, arms),
+        busy_s=rng.uniform(0.0, 900.0, arms),
         jobs=tuple(jobs),
         difficulty=difficulty,
         p_saturation=p_saturation,
@@ -42,7 +43,7 @@ def random_words(rng: np.random.Generator, arms: int, time_s: float, slots: int 
 
 def assert_equal(one: PeerView, other: PeerView) -> None:
     """The same arrays to the last bit; NaN equals NaN."""
-    for name in ("mode", "headroom_k", "difficulty", "p_saturation", "age_s"):
+    for name in ("mode", "headroom_k", "busy_s", "difficulty", "p_saturation", "age_s"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name, strict=True)
 
 

@@ -262,7 +262,7 @@ from fleet.bus.exchange.protocol import Broadcast
 from fleet.bus.exchange.zenoh import ZenohExchange
 bus = ZenohExchange(["a", "b"], "f", timeout_s=30.0)
 one = np.ones((2, 1))
-heard = bus.share(Broadcast(0.0, np.zeros(2, int), one, one[:, 0], ("j",), one, one, ("", "")))
+heard = bus.share(Broadcast(0.0, np.zeros(2, int), one, one[:, 0], one[:, 0], ("j",), one, one, ("", "")))
 print(heard.difficulty.sum(), flush=True)
 {ending}
 """

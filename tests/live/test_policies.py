@@ -17,7 +17,7 @@ from fleet.env.allocation_v1 import parallel_env
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.round import Assignment, Bidding, Choice, resolve_claims
 from fleet.observation import FIELDS, LONG_S, Observation
-from fleet.planning.options import PLANS
+from fleet.offered_plans import PLANS
 from scenarios.live.allocation import CentralAllocation
 
 CENTRAL = [name for name, rule in RULES.items() if rule.scope == "central"]

@@ -91,7 +91,7 @@ def test_p_is_that_of_the_true_motors_from_any_state(small) -> None:
         )
         known_c = np.append(start_c, ambient_c)
         if start_c[:7].max() < peak.max():
-            assert score.peak_at(known_c) == pytest.approx(peak.max(), abs=0.6)  # here with the mean of all phases
+            assert score.peak_at(known_c) == pytest.approx(peak.max(), abs=1.5)  # linearised near the limit
         if abs(peak.max() - 60.0) > 1.0:
             assert score.p_at(known_c) == float(peak.max() > 60.0)
             sure += 1

@@ -17,7 +17,7 @@ from fleet.errors import InfeasibleJob
 from fleet.job import LONGEST_JOB_S, Job, Place, Work
 from fleet.motion import Drive, Plan, drives
 from fleet.motor import gen3_motors
-from fleet.planning.options import offered_plans
+from fleet.offered_plans import offered_plans
 from fleet.planning.space import plan_key, space_name
 from fleet.robot import JOINTS
 from fleet.thermal import NODES, WINDING, gen3_network, temperature_steps, thermal_model

@@ -9,7 +9,7 @@ import numpy as np
 from fleet.bus.protocol.auction import PlanQuote, Quote
 from fleet.live.auction.round import Bidding, Choice
 from fleet.observation import LONG_S, Layout, Observation, all_peers
-from fleet.planning.options import PLANS
+from fleet.offered_plans import PLANS
 from fleet.robot import JOINTS
 
 _LOG = logging.getLogger(__name__)
