@@ -205,7 +205,7 @@ _SHAPES = {
     ("peer",): "n − 1",
     ("peer", "slot"): "(n − 1) K",
 }
-_EXAMPLE = Layout(arms=4, slots=8)
+_EXAMPLE = Layout(arms=4, slots=16, plans=2)
 
 
 def _observation_table() -> str:
@@ -215,7 +215,7 @@ def _observation_table() -> str:
         place = str(start) if last == start else f"{start}–{last}"
         span = f"{_number(field.low)} … {_number(field.high)}"
         rows.append((f"`{field.name}`", place, _SHAPES[field.axes], field.unit, span, field.text))
-    return table(("field", "columns (4 arms, 8 slots, 1 plan)", "shape", "unit", "range", "meaning"), rows)
+    return table(("field", "columns (4 arms, 16 slots, 2 plans)", "shape", "unit", "range", "meaning"), rows)
 
 
 def _reward_table() -> str:

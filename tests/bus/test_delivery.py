@@ -19,7 +19,7 @@ def carry(delivery: Delivery, now_s: float, *, missing: tuple[int, int] | None =
     """The times at which the words that every arm now has were said, [receiver, sender]; −inf for none."""
     arms = len(delivery.conditions)
     conditions: list[list[Condition | None]] = [
-        [Condition(now_s, "idle", 0.0) for _ in range(arms)] for _ in range(arms)
+        [Condition(now_s, "idle", 0.0, 0.0) for _ in range(arms)] for _ in range(arms)
     ]
     scores = [[Scores(now_s, (), [], []) for _ in range(arms)] for _ in range(arms)]
     if missing is not None:

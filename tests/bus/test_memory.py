@@ -122,7 +122,7 @@ def test_relabelling_the_arms_relabels_what_is_heard(make_words, assert_same):
     plain, turned = MemoryExchange(ARMS, channel), MemoryExchange([ARMS[i] for i in order], channel)
     for tick in range(5):
         words = make_words(rng, 4, 10.0 * tick)
-        per_arm = ("mode", "temp_c", "headroom_k", "difficulty", "p_saturation")
+        per_arm = ("mode", "temp_c", "headroom_k", "busy_s", "difficulty", "p_saturation")
         moved = replace(
             words, **{f: getattr(words, f)[order] for f in per_arm}, twin=tuple(words.twin[i] for i in order)
         )

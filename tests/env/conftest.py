@@ -24,8 +24,8 @@ def wild(env: AllocationEnv, rng: np.random.Generator) -> dict[str, int]:
     """Mostly legal actions, some not."""
     actions = {}
     for arm, seen in env.knowledge().items():
-        legal = np.flatnonzero(seen.action_mask)
-        actions[arm] = int(rng.choice(legal)) if rng.random() < 0.9 else int(rng.integers(env.world.slots + 1))
+        legal = np.flatnonzero(seen.action_mask[:-1] if rng.random() < 0.95 else seen.action_mask)
+        actions[arm] = int(rng.choice(legal)) if rng.random() < 0.9 else int(rng.integers(env.layout.actions))
     return actions
 
 
@@ -38,11 +38,15 @@ def go_on(env: AllocationEnv, rng: np.random.Generator, steps: int = 10_000) -> 
 
 
 def chosen(mask: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-    """Mostly legal actions, some not, [...], of a mask [..., slot + 1]; by numbers from 0 to 1, [..., 2]."""
-    slots = mask.shape[-1]
+    """Mostly legal actions, some not, [...], of a mask [..., action]; by numbers from 0 to 1, [..., 2].
+
+    Arms seldom give their jobs back, so that motors get hot.
+    """
+    actions, mask = mask.shape[-1], mask.copy()
+    mask[..., -1] *= numbers[..., 1] < 0.05
     rank = np.floor(numbers[..., 0] * mask.sum(axis=-1)).astype(int)
     legal = np.argmax(np.cumsum(mask, axis=-1) > rank[..., None], axis=-1)
-    return np.where(numbers[..., 1] < 0.9, legal, np.floor(numbers[..., 0] * slots).astype(int))
+    return np.where(numbers[..., 1] < 0.9, legal, np.floor(numbers[..., 0] * actions).astype(int))
 
 
 def slots_of(world: World, state: State) -> list[int]:

@@ -8,6 +8,7 @@ import pytest
 from fleet.engine.state import DONE, State, World
 from fleet.engine.tables import Tables
 from fleet.env.vector import BatchEnv
+from fleet.offered_plans import PLANS
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.thermal import WINDING
 from scenarios.fault_price import weights_of
@@ -32,9 +33,9 @@ def recorded(request, fleet) -> RunResult:
 
 
 def actions_of(result: RunResult, offered: list[str], arms: list[str], now_s: float) -> dict[str, int]:
-    """Return the claims of the arms at a step, won and lost ones, from the record."""
+    """Return the claims of the arms at a step, won and lost ones, from the record; each arm has one plan a job."""
     claims = [e for e in result.events if e.time_s == now_s and e.kind in ("award", "lost")]
-    return {arm: next((offered.index(e.job) + 1 for e in claims if e.arm == arm), 0) for arm in arms}
+    return {arm: next((1 + PLANS * offered.index(e.job) for e in claims if e.arm == arm), 0) for arm in arms}
 
 
 def check_equal(actual: State, expected: State, jobs: int) -> None:

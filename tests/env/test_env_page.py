@@ -34,15 +34,15 @@ def test_the_command_reports_an_outdated_table(tmp_path) -> None:
 
 
 def test_offsets_of_the_table_are_correct() -> None:
-    layout = Layout(4, 8)
+    layout = Layout(4, 16, plans=2)
     rows = dict(re.findall(r"^\| `(\w+)` \| ([\d–]+) \| [^|]+ \| [^|]+ \| [^|]+ …", TEXT, re.MULTILINE))
     assert list(rows) == [field.name for field in FIELDS]
     ends = [int(place.split("–")[-1]) for place in rows.values()]
     assert [int(place.split("–")[0]) for place in rows.values()] == [0, *(end + 1 for end in ends[:-1])]
-    assert ends[-1] == layout.size - 1 == 180
+    assert ends[-1] == layout.size - 1 == 571
 
 
-@pytest.mark.parametrize(("n", "slots", "plans"), [(1, 1, 1), (4, 8, 1), (7, 3, 2)])
+@pytest.mark.parametrize(("n", "slots", "plans"), [(1, 1, 1), (4, 16, 2), (7, 3, 2)])
 def test_the_size_in_the_page_is_correct(n, slots, plans) -> None:
     formula = r"size = (\d+) \+ (\d+) K \+ (\d+) K P \+ \(n − 1\)\((\d+) \+ (\d+) K\)"
     a, b, c, d, e = map(int, re.findall(formula, TEXT)[0])

@@ -20,10 +20,10 @@ WARM: dict[str, Any] = {
 def test_a_legal_claim_made_alone_is_won_and_an_illegal_one_is_only_counted(batch, play) -> None:
     """Try every action of every arm at many steps, each in its own row, beside a row in which all wait."""
     slots, arms = 4, 3
-    tries = [(a, action) for a in range(arms) for action in range(-1, slots + 2)]
+    tries = [(a, action) for a in range(arms) for action in range(-1, slots + 3)]
     envs = len(tries) + 1
     rows, (arm, action) = np.arange(len(tries)), np.array(tries).T
-    counts = dict.fromkeys(("legal", "illegal", "at work", "faulted", "taken"), 0)
+    counts = dict.fromkeys(("legal", "illegal", "given back", "at work", "faulted", "taken"), 0)
     for seed, stop in product(range(3), range(2, 32, 3)):
         env, rng = batch(envs, WARM, seed=[seed] * envs, autoreset=False), np.random.default_rng(seed)
         obs, _ = env.reset()
@@ -36,7 +36,11 @@ def test_a_legal_claim_made_alone_is_won_and_an_illegal_one_is_only_counted(batc
         given = env.step(actions)
         now, idle = env.state, play.rows(given, len(tries))
         for e, a, k in zip(rows.tolist(), arm.tolist(), action.tolist(), strict=True):
-            legal = 0 <= k <= slots and bool(mask[a, k])
+            legal = 0 <= k <= slots + 1 and bool(mask[a, k])
+            if legal and k == slots + 1:
+                assert now.todo[e, a] < before.todo[e, a] or now.mode[e, a] == FAULTED
+                counts["given back"] += 1
+                continue
             here = play.rows(given, e)
             assert now.illegal[e, a] - before.illegal[e, a] == (not legal)
             if k == 0 or not legal:

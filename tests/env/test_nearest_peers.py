@@ -32,7 +32,7 @@ def test_fields_of_the_nearest_peers_equal_those_of_all_peers(folder) -> None:
     alone, _ = single.reset(seed=5)
     near = near_of(load("quickstart"), 2)
     assert near is not None
-    assert few.layout.size == all_.layout.size - (5 + 2 * few.layout.slots)
+    assert few.layout.size == all_.layout.size - (6 + 3 * few.layout.slots)
     rng = np.random.default_rng(0)
     for _ in range(40):
         whole, part = all_.knowledge(), few.knowledge()

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
 
-from fleet.engine.state import DONE, GIVEN_UP, RUNNING, WAITING, State
+from fleet.engine.state import DONE, EXPIRED, RUNNING, WAITING, State
 from fleet.env.allocation_v1 import AllocationEnv, Episode, parallel_env
 from fleet.job import MOST_FAULTS, Job
 from fleet.robot import ThermalLimits
@@ -118,7 +118,8 @@ def test_invariants_of_a_shift(small, play, draft) -> None:
         value += infos["arm_0"]["reward_finished_value"]
         before = now
     jobs = env.world.jobs
-    done, given_up = (before.status[0][jobs.exists[0]] == status for status in (DONE, GIVEN_UP))
+    status = before.status[0][jobs.exists[0]]
+    done, given_up = status == DONE, status > DONE
     assert terminated["arm_0"] == (len(done) > 0 and bool((done | given_up).all()))
     assert truncated["arm_0"] == (not terminated["arm_0"])
     assert infos["arm_0"]["jobs_done"] == done.sum()
@@ -160,7 +161,10 @@ def check_state(env: AllocationEnv, now: State) -> None:
     current = job[job >= 0]
     assert len(set(current.tolist())) == len(current)
     assert (job[mode != WORKING] == -1).all()
-    assert (status[current] != WAITING).all()
+    # But for one that it gave back, on its way home.
+    times_s = world.plans.times_s[now.plan[0]]
+    over = now.progress_s[0] >= times_s[:, 0] + now.todo[0] * times_s[:, 1] - 1e-6
+    assert over[(job >= 0) & (status[job] == WAITING)].all()
     assert set(np.flatnonzero(status == RUNNING).tolist()) <= set(current.tolist())
     places = [s for j in current.tolist() for s in set(jobs.stations[0, j].tolist()) if s >= 0]
     assert len(set(places)) == len(places)
@@ -176,8 +180,10 @@ def check_state(env: AllocationEnv, now: State) -> None:
         last = now.returns[0, j] - len(arms)  # the fault that gives it up adds no arm
         assert len(set(arms)) == len(arms) < MOST_FAULTS
         assert last in (0, 1)
-        lost = any(status[k] == GIVEN_UP for k in jobs.after[0, j].tolist() if k >= 0)
-        assert (status[j] == GIVEN_UP) == (lost or last == 1)
+        lost = any(status[k] > DONE for k in jobs.after[0, j].tolist() if k >= 0)
+        expired = status[j] == EXPIRED
+        assert expired <= (jobs.expires[0, j] and jobs.due_s[0, j] < elapsed_s)
+        assert (status[j] > DONE) == (lost or last == 1 or expired)
     # Cycles and completions.
     cycles, repetitions = now.cycles[0][exists], jobs.repetitions[0][exists]
     done = status[exists] == DONE
@@ -209,7 +215,7 @@ def check_progress(env: AllocationEnv, before: State, now: State) -> None:
     assert now.tick[0] == before.tick[0] + 1
     for name in ("faults", "illegal", "peak_c", "above_warning_s", "busy_s", "lost_s", "energy_j", "cycles", "returns"):
         assert (getattr(now, name) >= getattr(before, name) - 1e-9).all(), name
-    was = np.isin(before.status[0], (DONE, GIVEN_UP))
+    was = before.status[0] >= DONE
     np.testing.assert_array_equal(now.status[0][was], before.status[0][was])
     np.testing.assert_array_equal(now.finished_s[0][was], before.finished_s[0][was])
     # A job changes arms only through its end or a fault.

@@ -11,6 +11,7 @@ from pettingzoo import AECEnv, ParallelEnv
 import scenarios
 from fleet.env.allocation_v1 import AllocationEnv
 from fleet.env.vector import BatchEnv
+from fleet.offered_plans import PLANS
 
 NAME = "thermofleet/allocation_v1"
 
@@ -36,7 +37,7 @@ def test_pettingzoo_makes_the_env_by_name(cell, folder, play) -> None:
 def test_overrides_are_fields_of_the_scenario_or_options_of_the_env(cell, folder) -> None:
     env = pettingzoo.make("parallel", NAME, scenario=cell, difficulty="blind", cache=folder, horizon_s=100, slots=2)
     env.reset(seed=0)
-    assert env.action_space("left").n == 3
+    assert env.action_space("left").n == 1 + 2 * PLANS + 1
     assert env.unwrapped.world.ticks == 10
 
 
@@ -51,7 +52,7 @@ def test_make_batch_takes_a_scenario(cell, folder) -> None:
     assert isinstance(batch, BatchEnv)
     obs, info = batch.reset()
     assert obs["observation"].shape == (3, 3, batch.layout.size)
-    assert obs["action_mask"].shape == (3, 3, 3)
+    assert obs["action_mask"].shape == (3, 3, 1 + 2 * PLANS + 1)
     assert batch.agents == ("left", "right", "far")
     given = [batch.step(np.zeros((3, 3), int)) for _ in range(4)]
     assert [step[3].all() for step in given] == [False] * 3 + [True]

@@ -9,6 +9,7 @@ import pytest
 from fleet.engine.shift import step
 from fleet.engine.state import initial
 from fleet.job import Fixture, Place, Work, payload_radius_m
+from fleet.offered_plans import PLANS
 from fleet.physics.contacts import APART_S, ContactFinder
 from fleet.physics.models import build_cell, links_of
 from fleet.physics.mujoco_plant import STRIDE, TIMESTEP_S, MujocoPlant
@@ -131,7 +132,7 @@ def driven(cell, robots, *, contacts):
         plant.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     state, motion, events = initial(world), [], []
     for tick in range(world.ticks):
-        done = step(world, state, np.array([[1, 2]]) * (tick == 0), plant)
+        done = step(world, state, np.array([[1, 1 + PLANS]]) * (tick == 0), plant)
         motion.append(plant.motion(world, done.record, np.arange(1, round(world.dt_s / SAMPLE_S) + 1) * SAMPLE_S)[0])
         events += plant.contacts(world, done.record)
         state = done.state
