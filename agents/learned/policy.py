@@ -91,7 +91,10 @@ def load_policy(folder: Path) -> LearnedPolicy:
     try:
         card = json.loads((folder / CARD).read_text(encoding="utf-8"))
         if card["format"] != FORMAT:
-            raise CheckpointError(f"{folder / CARD}: format {card['format']} is not {FORMAT}. Train the policy again.")
+            raise CheckpointError(
+                f"{folder / CARD}: format {card['format']} is not {FORMAT}, and those below 4 are of allocation_v0. "
+                "Train the policy again."
+            )
         size = NetworkSize(**card["size"])
     except FileNotFoundError as error:
         raise CheckpointError(f"There is no trained policy in '{folder}': no {CARD}.") from error

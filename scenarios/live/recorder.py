@@ -27,7 +27,7 @@ from fleet.robot import JOINTS
 Message = State | ArmEvent | Result
 Kind = Literal["telemetry", "events", "results"]
 KINDS: tuple[Kind, ...] = ("telemetry", "events", "results")
-RECORDING_FORMAT = 2
+RECORDING_FORMAT = 3
 CARD = "recording.json"
 SENSORS = ("q", "qd", "tau", "current_a", "temp_c")
 MAX_ROWS = 200_000
@@ -200,7 +200,10 @@ def read_card(folder: Path) -> Card:
     except (OSError, msgspec.DecodeError, UnicodeDecodeError) as error:
         raise FleetError(f"'{folder}' is no recording of the bus: {CARD} is missing or damaged.") from error
     if card.format != RECORDING_FORMAT:
-        raise FleetError(f"'{folder}' is a recording of format {card.format}; this version reads {RECORDING_FORMAT}.")
+        raise FleetError(
+            f"'{folder}' is a recording of format {card.format}, of an earlier bus (and allocation_v0); this "
+            f"version reads {RECORDING_FORMAT}. Record it again."
+        )
     return card
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.engine.profile_plant import recorded_noise, telemetry_of
 from fleet.engine.shift import StepRecord, stack_records
-from fleet.env.allocation_v1 import AllocationEnv
+from fleet.env.allocation_v1 import VERSION, AllocationEnv
 from fleet.events import Event
 from fleet.telemetry import Telemetry, join
 from scenarios.policy_loader import policy_at
@@ -24,7 +24,7 @@ from scenarios.run.outcome import metrics_of
 from scenarios.run.provenance import provenance
 from scenarios.schema import Scenario
 
-RUN_FORMAT = 4
+RUN_FORMAT = 5
 """Raised when run.json or the columns of the recordings change."""
 _LIBRARIES = ("thermofleet", "numpy", "mujoco", "torch", "pettingzoo", "eclipse-zenoh", "pyarrow")
 
@@ -159,6 +159,7 @@ def summary(result: RunResult) -> dict[str, Any]:
     """The content of run.json. It holds no clock time, so the same seed gives the same file."""
     return {
         "format": RUN_FORMAT,
+        "environment": VERSION,
         "status": "finished" if result.finished else "interrupted",
         "time_s": result.time_s,
         "scenario": msgspec.to_builtins(result.scenario),
