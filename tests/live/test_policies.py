@@ -68,6 +68,7 @@ def quoted(seen: dict[str, Observation], time_s: float) -> Bidding:
                 value=float(first.value[slot]),
                 release_s=max(0.0, min(time_s - float(first.age_s[slot]), *due_s)),
                 due_s=None if max(due_s) > LONG_S / 2 else max(due_s),
+                expires=bool(first.expires[slot]),
             )
         )
     for arm, o in seen.items():
