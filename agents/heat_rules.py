@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
-from scipy.special import logit, ndtr
 
 from agents.assignment import Matching
 from agents.policy import per_option
@@ -70,6 +69,8 @@ class Wsept(Thermometer):
 
     def _rate(self, seen: Observation) -> Array:
         """Expected worth per second of every option, [option]; −inf for those that must not be claimed."""
+        from scipy.special import logit, ndtr  # slow import that few processes need
+
         warning_c, hottest_c = _warning_c(seen), float(seen.temp_c.max())
         # An unknown peak is placed so far from the limit that its error gives P(saturation).
         margin_k = self.peak_sd_k * logit(np.clip(seen.p_saturation, LEAST_P, 1.0 - LEAST_P))

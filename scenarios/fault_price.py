@@ -7,7 +7,6 @@ motors cool below `limits.restart_c`, at the mean ambient temperature of the shi
 """
 
 import numpy as np
-from scipy.optimize import brentq
 
 from fleet.engine.reward import FaultPrice, RewardWeights
 from fleet.motor import gen3_motors
@@ -41,6 +40,8 @@ def downtime_s(limits: ThermalLimits, ambient_c: float, *, most_s: float) -> flo
     Args:
         ambient_c: Mean ambient temperature.
     """
+    from scipy.optimize import brentq  # slow import that an arm does not need
+
     motors, thermal = gen3_motors(), thermal_model(gen3_network())
     idle_w = node_heat(np.zeros(JOINTS), motors.idle_w)
     rise_k = thermal.steady(np.eye(NODES)[CARRIER], 0.0)  # per W into the winding

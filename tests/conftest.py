@@ -176,6 +176,7 @@ class Shifts:
     """Share of the pairs of plans of two arms that exclude each other."""
     hard_due: float = 0.2
     """Share of the jobs that expire."""
+    plans_per_job: int = 1
 
     def __call__(self, seed: np.random.SeedSequence) -> Episode:
         """The episode of a seed."""
@@ -210,7 +211,7 @@ class Shifts:
         arms = [arm(i, WORKS, times=Times(cycle=10.0 + 2.0 * i)) for i in range(self.arms)]
         return shop(
             [jobs], arms=arms, limits=self.limits, ticks=self.ticks, slots=self.slots, ambient_c=self.ambient_c,
-            space=crowded(self.crowding) if self.crowding else None,
+            space=crowded(self.crowding) if self.crowding else None, plans_per_job=self.plans_per_job,
         )  # fmt: skip
 
     def library(self) -> Library:

@@ -9,6 +9,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from fleet.env import allocation_v1
 from fleet.env.adapters.gymnasium_view import DispatcherEnv, DispatcherVectorEnv
+from fleet.observation import Layout
 
 ARMS, SLOTS, TICKS = 3, 4, 15
 BRIEF = {"jobs": 1, "ambient_c": 20.0, "ticks": 30}
@@ -79,7 +80,8 @@ def test_an_action_of_another_shape_says_what_is_wanted(alone, action) -> None:
 def test_wrappers_of_gymnasium_take_it(alone) -> None:
     env = FlattenObservation(alone())
     seen, _ = env.reset(seed=0)
-    assert seen.shape == env.observation_space.shape == (ARMS * (158 + 2 * SLOTS + 2),)
+    layout = Layout(ARMS, SLOTS)
+    assert seen.shape == env.observation_space.shape == (ARMS * (layout.size + layout.actions),)
 
 
 @pytest.mark.parametrize("shift", [{}, BRIEF], ids=["cut", "finished"])

@@ -68,6 +68,7 @@ def quoted(seen: dict[str, Observation], time_s: float) -> Bidding:
                 value=float(first.value[slot]),
                 release_s=max(0.0, min(time_s - float(first.age_s[slot]), *due_s)),
                 due_s=None if max(due_s) > LONG_S / 2 else max(due_s),
+                expires=bool(first.expires[slot]),
             )
         )
     for arm, o in seen.items():
@@ -97,7 +98,7 @@ def fresh(name: str) -> Policy:
 @pytest.mark.parametrize("name", RULES)
 def test_the_same_observation_gives_the_same_choice_simulated_and_live(small, name) -> None:
     """Each step of a shift at which an arm may choose, converted to quotes and back."""
-    env = parallel_env(small.Shifts(arms=3, jobs=16, ticks=80, ambient_c=36.0))
+    env = parallel_env(small.Shifts(arms=3, jobs=16, ticks=80, ambient_c=36.0, plans_per_job=PLANS))
     env.reset(seed=4)
     simulated, live, compared = fresh(name), fresh(name), 0
     while env.agents:

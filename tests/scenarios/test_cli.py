@@ -121,16 +121,16 @@ def test_without_round_robin_the_first_policy_is_the_baseline(thermofleet, small
 def test_the_demo_sets_two_policies_side_by_side(thermofleet, tmp_path, monkeypatch, plans):
     from scenarios.prepare.fleet import prepare
 
-    def without_twins(scenario, *, difficulty, progress):
+    def without_twins(scenario, *, difficulty, risk, progress):
         return prepare(scenario, difficulty="blind", cache=plans, progress=progress)
 
     monkeypatch.setattr("scenarios.prepare.fleet.prepare", without_twins)
     said = thermofleet("demo", "--out", tmp_path / "demo")
     assert said.code == 0
     head = said.out.splitlines()[1].split()
-    assert head == ["round_robin", "least_difficulty"]
+    assert head == ["round_robin", "wsept"]
     for policy in head:
         told = run_json(tmp_path / "demo" / policy)
         assert (told["policy"], told["status"], told["scenario"]["name"]) == (policy, "finished", "quickstart")
         assert f"{told['metrics']['energy_wh']:.0f}" in said.out
-    assert str(tmp_path / "demo" / "least_difficulty" / "report.html") in said.out
+    assert str(tmp_path / "demo" / "wsept" / "report.html") in said.out

@@ -11,7 +11,7 @@ from fleet.robot import JOINTS, Robot
 from fleet.thermal import gen3_network
 from scenarios.studies.exploration import SCORES, coverage
 from scenarios.studies.setup import Bench, Sample, Study
-from twin.vae.measures import Features
+from twin.vae.measures import PARTS, Features
 from twin.vae.model import TwinConfig
 
 SEEDS = [np.random.SeedSequence(seed) for seed in (5, 6)]
@@ -34,7 +34,7 @@ class ByExcess:
         for plan, times in zip(plans, repetitions, strict=True):
             assert (times - 1) * plan.cycle.duration_s < HORIZON_S <= times * plan.cycle.duration_s
         payloads = np.array([plan.work.payload_kg for plan in plans])
-        packed = np.zeros((len(plans), JOINTS, 5))
+        packed = np.zeros((len(plans), JOINTS, PARTS))
         packed[:, 1, 4] = np.where(self.explored & (payloads > 4.0), 0.1, payloads)
         packed[:, 1, :4] = 1.0 - payloads[:, None] / 10.0
         return Features(packed)

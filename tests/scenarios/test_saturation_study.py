@@ -9,7 +9,7 @@ from scipy.stats import binom
 from fleet.motion import drive
 from scenarios.studies.saturation import PastWork, judge_twin, past_work
 from scenarios.studies.setup import Study, make_study
-from twin.vae.measures import Features
+from twin.vae.measures import PARTS, Features
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Seer:
         heat = np.array([drive(plan.cycle.profile, self.study.motors).current_sq for plan in plans])
         if not self.sees:
             heat = np.random.default_rng(0).exponential(1.0, heat.shape)
-        return Features(np.repeat(heat[..., None], 5, axis=-1))
+        return Features(np.repeat(heat[..., None], PARTS, axis=-1))
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pytest
 
 from fleet.difficulty import DifficultyModel
 from fleet.motion import Phase
-from twin.vae.measures import Calibration, Features
+from twin.vae.measures import PARTS, Calibration, Features
 from twin.vae.twin import Twin
 from twin.vae.window import cut, resample
 
@@ -197,4 +197,4 @@ def test_a_twin_needs_its_networks(twin):
 
 def test_a_calibration_of_another_arm_is_refused(twin):
     with pytest.raises(ValueError, match="calibration is for 6 joints, the twin has 7"):
-        replace(twin, calibration=Calibration(Features(np.zeros((4, 6, 5)))))
+        replace(twin, calibration=Calibration(Features(np.zeros((4, 6, PARTS)))))

@@ -38,6 +38,10 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, lost: Container[str] = ()) ->
 
     An option is a quoted plan, by its number; plans of a number from `PLANS` on are left out.
 
+    Some fields are on no message: `ambient_c`, `job_value`, `job_cycles`, `job_peak_c`, `job_p`, `too_heavy` and
+    `peer_blocks` are 0, `station_free` is 1, `space_free` equals `feasible`, `housing_c` equals `temp_c`, and
+    `last_award` is never 1. `busy_s` and `peer_busy_s` follow from the quotes of the round.
+
     An arm without capacity counts as working and can claim nothing; an arm without a quote has an unknown state. The
     probability to pass the warning limit is the quoted one; without it, 1 or 0 by the quoted peak; without either, 0.5.
     A missing duration counts as the longest of the round.
