@@ -70,7 +70,11 @@ def _work_bars(plan: Schedule, events: Sequence[Event], arms: Sequence[str], uni
     streams = sorted({stream_of(event.job) for event in events if event.job})
     traces = []
     for i, stream in enumerate(streams):
-        own = [a for a in plan.assignments if stream_of(a.job) == stream]
+        # The legend shows the look of the first one: not that of a late or unfinished job.
+        own = sorted(
+            (a for a in plan.assignments if stream_of(a.job) == stream),
+            key=lambda a: (bool(a.late_s), a.outcome != "finished"),
+        )
         if not own:
             continue
         look = {
