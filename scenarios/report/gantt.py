@@ -127,8 +127,10 @@ def _assignment_text(a: Assignment) -> str:
         end = f"returned to the queue after a fault{kept}"
     else:
         end = "still running at the end"
-    score = f"<br>difficulty {a.difficulty:.3g}" if np.isfinite(a.difficulty) else ""
-    return f"<b>{plain(a.job)}</b> on {plain(a.arm)}<br>{clock(a.start_s)} – {clock(a.end_s)}<br>{end}{score}"
+    scores = [a.prediction] if a.prediction else []
+    scores += [f"difficulty {a.difficulty:.3g}"] if np.isfinite(a.difficulty) else []
+    lines = [f"<b>{plain(a.job)}</b> on {plain(a.arm)}", f"{clock(a.start_s)} – {clock(a.end_s)}", end, *scores]
+    return "<br>".join(lines)
 
 
 def _outage_text(o: Outage) -> str:
