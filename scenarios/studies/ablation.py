@@ -55,9 +55,9 @@ class AblationPlan:
     def __post_init__(self) -> None:
         for i, name in enumerate(self.scores):
             if name not in SOURCES:
-                raise FleetError(f"No scores '{name}'{nearest(name, SOURCES)}")
+                raise FleetError(f"No source of scores '{name}'{nearest(name, SOURCES)}")
             if name in self.scores[:i]:
-                raise FleetError(f"The scores '{name}' are given twice; names must be unique.")
+                raise FleetError(f"The source '{name}' is given twice; names must be unique.")
         policy_of(self.policy)
 
 
@@ -147,7 +147,9 @@ def _earlier_rows(out: Path, card: dict[str, str]) -> dict[tuple[str, int, int, 
         try:
             known = json.loads((out / CARD).read_text(encoding="utf-8"))
         except (FileNotFoundError, ValueError) as error:
-            raise FleetError(f"'{out}' holds other files; --out needs a new folder, or that of an ablation.") from error
+            raise FleetError(
+                f"'{out}' holds other files; --out needs a new folder or that of an earlier ablation."
+            ) from error
         for name, value in card.items():
             if known.get(name) != value:
                 raise FleetError(
