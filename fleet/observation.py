@@ -50,7 +50,7 @@ class Observation:
     The first plan of a job is the fastest.
     """
 
-    clock: Annotated[Array, Field((), "1", 0, 1, "share of the shift that has passed")]
+    clock: Annotated[Array, Field((), "1", 0, 1, "share of the episode that has passed")]
     idle: Annotated[Array, Field((), "1", 0, 1, "1 when this arm is free")]
     working: Annotated[Array, Field((), "1", 0, 1, "1 when it works or goes home")]
     faulted: Annotated[Array, Field((), "1", 0, 1, "1 from a fault until it recovers")]
