@@ -26,7 +26,11 @@ def list_command(as_json: JsonOption = False) -> None:
 
 
 def show_command(scenario: ScenarioArg, as_json: JsonOption = False) -> None:
-    """Show a scenario: its arms, its jobs and its thermal load factor."""
+    """Show a scenario: its arms, its jobs and its thermal load factor.
+
+    The thermal load factor is the heat of all jobs relative to the capacity of
+    the fleet. Above 1.2 no policy keeps all motors below the warning limit.
+    """
     from scenarios.report.describe import describe
 
     chosen = load(scenario)
