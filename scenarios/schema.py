@@ -121,7 +121,7 @@ class JobStream:
     due_s: float = 1800.0
     """Time from release to due date."""
     due: Literal["soft", "hard"] = "soft"
-    """soft: a later finish is tardy. hard: a job that no arm has begun by then expires."""
+    """soft: a later finish is tardy. hard: a job that waits then expires, begun before or not."""
     after: tuple[str, ...] = ()
     """Streams whose job of the same number must finish first."""
 
