@@ -49,7 +49,7 @@ def update_offers(t: Tables, d: Jobs, s: State, o: OpenJobs, events: EventBuffer
         while place < count[e]:
             j = nonnegative(queue[e, place])
             place += 1
-            if filled == slots or release_s[e, j] > now_s:
+            if release_s[e, j] > now_s:
                 break
             if expires[e, j] and due_s[e, j] < now_s:
                 remove_from_queue(queue, head, e, j)
@@ -57,6 +57,8 @@ def update_offers(t: Tables, d: Jobs, s: State, o: OpenJobs, events: EventBuffer
                 if len(events.what) > 0:
                     record_event(events, EXPIRE, e, -1, j, -1, 0.0, 0.0)
                 place, filled = nonnegative(head[e]), 0  # jobs in the queue have moved
+                continue
+            if filled == slots:  # of the jobs behind, only the late ones matter
                 continue
             ready = True
             for n in range(waits):

@@ -80,3 +80,14 @@ def test_a_job_expires_at_a_hard_due_date_with_all_that_wait_for_it(small) -> No
     state = step(world, state, np.array([[0]]), plant, log).state
     assert state.status[0].tolist() == [WAITING, EXPIRED, GIVEN_UP, DONE]
     assert [(e.kind, e.job, e.arm) for e in log if e.kind == "expire"] == [("expire", "hard", "")]
+
+
+def test_a_job_behind_a_full_window_expires_too(small) -> None:
+    jobs = [small.job("soft", due_s=15.0), small.job("hard", due_s=15.0, expires=True), small.job("last", due_s=15.0)]
+    world, plant = small.shop([jobs], arms=1, slots=1)
+    state = initial(world)
+    for _ in range(2):
+        state = step(world, state, np.array([[0]]), plant).state
+    assert open_jobs(world, state)[0][0].tolist() == [0]
+    state = step(world, state, np.array([[0]]), plant).state
+    assert state.status[0].tolist() == [WAITING, EXPIRED, WAITING]
