@@ -164,8 +164,8 @@ class _Recorder:
 
 
 def scenario_hash(scenario: Scenario) -> str:
-    """Hash of a scenario's content."""
-    return hashlib.sha256(msgspec.json.encode(scenario)).hexdigest()[:16]
+    """Hash of a scenario's content, values left to their default included."""
+    return hashlib.sha256(msgspec.json.encode(asdict(scenario))).hexdigest()[:16]
 
 
 def summary(result: RunResult) -> dict[str, Any]:
