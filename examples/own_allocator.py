@@ -25,7 +25,7 @@ class Allocator:
     """Jobs, their status and their awards. All methods run on one thread; queries of arms block it."""
 
     def __init__(self, session, fleet):
-        self.session, self.root = session, f"thermofleet/v3/{quote(fleet, safe='')}"
+        self.session, self.root = session, f"thermofleet/v4/{quote(fleet, safe='')}"
         self.own_key = f"{self.root}/auction/{NAME}"
         self.inbox, self.started_s = queue.SimpleQueue(), time.monotonic()
         self.jobs = {}  # name -> job as submitted
@@ -254,7 +254,7 @@ class Allocator:
 
 def encoding(name):
     """Return the Zenoh encoding of a message type; messages with another one are malformed."""
-    return f"application/json;thermofleet.{name}.v3"
+    return f"application/json;thermofleet.{name}.v4"
 
 
 def main(port, fleet, seconds=float("inf")):

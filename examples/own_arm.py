@@ -27,7 +27,7 @@ class Arm:
 
     def __init__(self, session, fleet, name):
         self.session, self.name, self.inbox = session, name, queue.SimpleQueue()
-        self.root = f"thermofleet/v3/{quote(fleet, safe='')}"
+        self.root = f"thermofleet/v4/{quote(fleet, safe='')}"
         self.own_key = f"{self.root}/arm/{quote(name, safe='')}"
         self.temp_c, self.tick = AMBIENT_C, 0
         self.zero_s, self.speed = self.query_clock()
@@ -266,7 +266,7 @@ class Arm:
 
 def encoding(name):
     """Return the Zenoh encoding of a message type; messages with another one are malformed."""
-    return f"application/json;thermofleet.{name}.v3"
+    return f"application/json;thermofleet.{name}.v4"
 
 
 def connect(port):

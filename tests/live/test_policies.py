@@ -141,9 +141,9 @@ def test_quotes_become_observations() -> None:
         "two": quote("two", one_plan("b", peak_c=61.0), headroom_k=5.0),
     }
     full = {"three": quote("three", one_plan("a", duration_s=50.0), capacity=0, mode="working")}
-    states = {"two": State("two", 0, 0.0, "idle", (30.0,) * 6 + (55.0,), 5.0)}
-    bidding = Bidding("r", 100.0, jobs, quotes, full, states, {"two": 7.0}, {"a": (2, 90.0)})
-    seen = observe(bidding, LiveFleet(arms=("two", "one", "four"), warning_c=60.0, horizon_s=400.0), lost={"one"})
+    states = {"two": State("two", 0, 93.0, "idle", (30.0,) * 6 + (55.0,), 5.0)}
+    bidding = Bidding("r", 100.0, jobs, quotes, full, states, {"a": (2, 90.0)})
+    seen = observe(bidding, LiveFleet(arms=("two", "one", "four"), warning_c=60.0, horizon_s=400.0), last={"one": -1})
     assert list(seen) == ["two", "one", "four", "three"]
     one, two, three, four = (seen[name] for name in ("one", "two", "three", "four"))
     assert [o.action_mask.tolist() for o in (one, two, three, four)] == [  # wait; a; b; give back
@@ -159,7 +159,7 @@ def test_quotes_become_observations() -> None:
     assert one.difficulty.tolist() == [1.5, 1.25, 0, 0]
     assert one.peak_c.tolist() == [55.0, 50.0, 0, 0]
     assert one.p_saturation.tolist() == [0.25, 0.125, 0.5, 0.5]
-    assert two.p_saturation.tolist() == [0.5, 0.5, 1.0, 0.5]  # by its peak
+    assert two.p_saturation.tolist() == [0.5, 0.5, 0.5, 0.5]  # unknown without a model
     assert one.duration_s.tolist() == [60.0, 55.0, 0, 0]
     assert two.duration_s.tolist() == [0, 0, 60.0, 0]  # missing: as the longest
     assert one.slack_s.tolist() == [-10.0, -5.0, 0.0, 0.0]

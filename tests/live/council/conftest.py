@@ -104,7 +104,7 @@ class Arm:
         )
         self.participant.add_jobs([*self.fleet.jobs, *register.jobs.values()])
 
-    def estimate(self, jobs):
+    def estimate(self, jobs, cycles):
         return tuple(self.fleet.offer(self.name, job) for job in jobs)
 
     def space_of(self, job: JobSpec, plan: int) -> str:
