@@ -42,7 +42,7 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
     An option is a quoted plan, by its number; plans of a number from `PLANS` on are left out. What an arm knows of
     itself is in its quote and its last state, as is what its peers know of it; a peer without either is not heard.
 
-    An arm without capacity can claim nothing. It counts as working, unless it is faulted or too hot. A plan without
+    An arm without capacity counts as working and can claim nothing. A plan without
     difficulty and without P(saturation) has an unknown P and peak, as in simulation. A missing duration counts as the
     longest of the round.
 
@@ -78,8 +78,7 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
     modes = np.array([each.mode if each else "" for each in heard])
     headroom_k = np.array([each.headroom_k if each else 0.0 for each in heard])
     room = np.array([quote is not None and quote.capacity > 0 for quote in quotes]) & (modes != "faulted")
-    idle = room | ((modes == "idle") & (headroom_k <= 0.0))
-    working = np.isin(modes, ["idle", "working"]) & ~idle
+    working = np.isin(modes, ["idle", "working"]) & ~room
     feasible = table(lambda offer: 1.0) > 0
     free = np.array([[not in_way for in_way in row] for row in in_the_way]).reshape(feasible.shape)
     blocks = [
@@ -101,7 +100,7 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
     temp_c = _per_joint(states, "temp_c", np.repeat(fleet.warning_c - headroom_k[:, None], JOINTS, axis=1))
     fields = Observation(
         clock=np.full(len(arms), time_s / fleet.horizon_s),
-        idle=idle,
+        idle=room,
         working=working,
         faulted=modes == "faulted",
         busy_s=busy_s,
@@ -116,7 +115,7 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
         job_p=stated(_risk_of_job),
         offered=per_job([1.0] * layout.slots),
         station_free=per_job(stations),
-        too_heavy=np.array(too_heavy).reshape(len(arms), -1),
+        too_heavy=np.array(too_heavy).reshape(len(arms), layout.slots),
         feasible=feasible,
         space_free=feasible & free,
         known=known,
@@ -138,7 +137,7 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
         peer_busy_s=busy_s[peers],
         peer_known=np.isfinite(least)[peers],
         peer_difficulty=np.where(np.isfinite(least), least, 0.0)[peers],
-        peer_blocks=np.array(blocks).reshape(len(arms), len(arms) - 1, -1),
+        peer_blocks=np.array(blocks).reshape(*peers.shape, layout.slots),
         action_mask=np.zeros(0),
     )
     # Waiting is always legal; a live fleet has no action to give a job back.
