@@ -229,6 +229,8 @@ class ArmNode:
             return "I am faulted"
         if self._headroom_k <= 0:
             return f"I am too hot: a motor is {-self._headroom_k:.1f} K above the warning limit"
+        if self._body.away is not None and not self.executor.active:
+            return "I am on my way home"
         return ""
 
     # One step
