@@ -5,7 +5,6 @@ Every arm is real except for its body: time is a number, every clock runs at its
 
 import random
 from contextlib import suppress
-from dataclasses import dataclass, field
 from functools import partial
 from itertools import combinations
 from types import SimpleNamespace
@@ -22,34 +21,12 @@ from fleet.live.auction.round import Timing
 from fleet.live.consensus.granter import Granter, Register
 from fleet.live.consensus.participant import Membership, Participant
 from fleet.live.space import no_conflicts
+from tests.live.disk import Crash, Disk
 
 TIMING = Timing(lease_s=3.0, margin_s=0.05, window_s=0.3, pause_s=(0.2, 1.0))
 CYCLE_S = 0.2
 HOME_S = 0.5
 """Duration of the way home."""
-
-
-class Crash(Exception):
-    """The arm's process is killed during a call."""
-
-
-@dataclass(eq=False)
-class Disk:
-    """A journal in memory, and its faults."""
-
-    records: list = field(default_factory=list)
-    full: bool = False
-    crash: str = ""
-
-    def keep(self, *records) -> None:
-        crash, self.crash = self.crash, ""
-        if crash == "before":
-            raise Crash
-        if self.full:
-            raise JournalFull("no room")
-        self.records.extend(records)
-        if crash == "after":
-            raise Crash
 
 
 class Arm:
