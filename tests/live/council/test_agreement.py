@@ -79,7 +79,7 @@ def test_of_two_that_choose_one_job_the_one_with_the_lower_difficulty_gets_it(co
     fleet.run(0.8)
     (holder,) = [arm.name for arm in fleet.arms.values() if arm.executor.active]
     offers = {name: fleet.offer(name, fleet.jobs[0]) for name in fleet.names}
-    assert holder == min((offer.least.difficulty, name) for name, offer in offers.items() if offer.feasible)[1]
+    assert holder == min((offer.plans[0].difficulty, name) for name, offer in offers.items() if offer.feasible)[1]
 
 
 def test_an_isolated_arm_does_not_report_that_all_jobs_are_settled(council):

@@ -123,7 +123,7 @@ def test_an_arm_of_another_fleet_is_granted_nothing(granter):
 def test_nothing_is_granted_without_space_on_the_disk(granter, disk):
     disk.full = True
     assert granter.answer_claim(claim("a", 1, entry()), 0.0).denied[0].reason == "no room"
-    with pytest.raises(Refused, match="no space"):
+    with pytest.raises(Refused, match="no room"):
         granter.answer_claim(claim("a", 2, settled=[finished()]), 0.0)
     assert not granter.register.settled
 
