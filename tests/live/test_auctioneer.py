@@ -107,6 +107,28 @@ def test_a_refused_job_is_auctioned_again_after_a_pause(fleet_of):
     assert fleet.auctioneer.status()[0].state == "finished"
 
 
+def test_quotes_are_requested_for_the_cycles_that_are_left(fleet_of):
+    """The jobs at a busy station are named too, since policies observe them."""
+    fleet = fleet_of(1)
+    fleet.submit(hold("j", repetitions=50))
+    for _ in range(12):
+        fleet.run_without_faults(0.1, 0.1)
+    (arm,) = fleet.arms.values()
+    arm.return_jobs(fleet.true_s)
+    (done,) = [report.cycles for report in arm.reports.values()]
+    fleet.submit(hold("k"))
+    fleet.packets.clear()
+    asked = []
+    for _ in range(40):
+        fleet.step(0.1)
+        asked += in_transit(fleet, QuoteRequest)
+        fleet.step_arm(arm.name)
+        for _ in range(3):
+            fleet.deliver_all()
+    assert done > 3
+    assert any(request.cycles == {"j": done} and {job.name for job in request.jobs} == {"j", "k"} for request in asked)
+
+
 def test_a_station_gets_one_job_at_a_time(fleet_of):
     fleet = fleet_of(2)
     bid(fleet, hold("a"), hold("b"))
