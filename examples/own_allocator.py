@@ -127,7 +127,9 @@ class Allocator:
             return
         self.rounds += 1
         name = f"{NAME}-{time.time_ns()}-{self.rounds}"  # unique, also after a restart
-        quotes = self.query(f"{self.root}/arm/*/quote", "QuoteRequest", {"auction": name, "jobs": waiting}, WINDOW_S)
+        done = {job["name"]: self.status[job["name"]]["cycles"] for job in waiting}
+        request = {"auction": name, "jobs": waiting, "cycles": done}
+        quotes = self.query(f"{self.root}/arm/*/quote", "QuoteRequest", request, WINDOW_S)
         capacity = {arm: quote["capacity"] for arm, quote in quotes.items()}
         for index, job in enumerate(waiting):
             estimates = {arm: quote["estimates"][index] for arm, quote in quotes.items() if capacity[arm] > 0}
