@@ -4,12 +4,15 @@ import time
 from collections import Counter
 from dataclasses import replace
 from functools import partial
+from itertools import product
+from random import Random
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from fleet.bus.protocol.auction import Award, JobSpec, QuoteRequest, Submission
+from fleet.bus.protocol.consensus import Bid, JobOutcome
 from fleet.bus.protocol.messages import State
 from fleet.difficulty import KNOWN, Difficulty, Forecast
 from fleet.env.allocation_v1 import Episode, parallel_env
@@ -24,6 +27,8 @@ from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.leases import SendAward
 from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.round import Timing
+from fleet.live.consensus.granter import Grant, Granter, Register
+from fleet.live.consensus.participant import QUIET_S, Membership, Participant
 from fleet.live.space import CellSpace
 from fleet.motor import gen3_motors
 from fleet.observation import FIELDS, Observation
@@ -88,18 +93,18 @@ class Wire:
 class LiveShift:
     """The arms of a simulated shift as live arms, and an auctioneer; fleet time is a number."""
 
-    def __init__(self, env, arms, jobs, conflicts, allocate) -> None:
+    def __init__(self, env, arms, jobs, conflicts, allocate, fleet) -> None:
         self.time_s = self.real_s = 0.0
         world, (plans, table) = env.world, conflicts
         volume = {space_name(plan_key(plan)): row for row, plan in enumerate(plans)}
         reach = frozenset(frozenset((a, b)) for a in NAMES for b in NAMES if a != b)
-        excludes = CellSpace(volume=volume, conflicts=table, reach=reach, arms=frozenset(NAMES))
+        self.jobs, self.fleet = tuple(map(spec_of, jobs)), fleet
+        self.excludes = CellSpace(volume=volume, conflicts=table, reach=reach, arms=frozenset(NAMES))
         timing = Timing(lease_s=HOUR_S, pause_s=(0.1, 0.2))
+        rules = {"allocate": allocate, "timing": timing, "excludes": self.excludes}
         ledger = Ledger(arms=NAMES)
-        self.auctioneer = Auctioneer(
-            "x", ledger, allocate=allocate, keep=lambda *_: None, boot="1", real_s=0.0, timing=timing, excludes=excludes
-        )
-        self.auctioneer.submit(Submission(tuple(map(spec_of, jobs))), 0.0, 0.0)
+        self.auctioneer = Auctioneer("x", ledger, keep=lambda *_: None, boot="1", real_s=0.0, **rules)
+        self.auctioneer.submit(Submission(self.jobs), 0.0, 0.0)
         self.wires = {name: Wire() for name in NAMES}
         self.nodes = {name: self.node(arm, world) for name, arm in zip(NAMES, arms, strict=True)}
 
@@ -157,6 +162,50 @@ class LiveShift:
     def advance(self, dt_s: float) -> None:
         self.time_s += dt_s
         self.publish()
+
+
+def observed_without_auctioneer(shift: LiveShift) -> dict[str, Observation]:
+    """Return what the policy of each free arm would observe now if the arms allocated the jobs themselves."""
+    ledger, observed = shift.auctioneer.ledger, dict[str, Observation]()
+
+    def wait(observation: Observation, place: int) -> int:
+        observed[NAMES[place]] = observation
+        return 0
+
+    participants = {}
+    for name, node in shift.nodes.items():
+        granter = Granter(name, NAMES, Register(), lambda *_: None, real_s=0.0, excludes=shift.excludes)
+        fill(granter.register, ledger, shift.auctioneer.states)
+        membership = Membership(fleet=shift.fleet, choose=wait, slots=24, excludes=shift.excludes)
+        participants[name] = Participant(node, granter, membership, boot=1, rng=Random(0))
+        participants[name].add_jobs(shift.jobs)
+        participants[name].states.update(shift.auctioneer.states)
+        participants[name].set_present(frozenset(NAMES))
+    for real_s in (0.0, 0.1):
+        for participant in participants.values():
+            participant.tick(real_s, shift.time_s)
+            bids = [message for message in participant.out if isinstance(message, Bid)]
+            for bid, peer in product(bids, participants.values()):
+                peer.apply_bid(bid, real_s - QUIET_S)
+            participant.out.clear()
+    return observed
+
+
+def fill(register: Register, ledger: Ledger, states: dict[str, State]) -> None:
+    """Put what an auctioneer knows into the register of an arm."""
+    for name in NAMES:
+        awards = {award.record.space for award in ledger.open.values() if award.record.arm == name}
+        register.space[name] = frozenset(awards | {states[name].space} - {""})
+    for name, entry in ledger.jobs.items():
+        register.cycles[name] = entry.cycles
+        if entry.returns:
+            register.returned_s[name] = entry.returned_s
+            register.faults[name] = {str(number): arm for number, arm in enumerate(entry.faults)}
+        if entry.state in ("finished", "given_up"):
+            register.settled[name] = JobOutcome(name, "a", NAMES[0], entry.state, entry.cycles, 0.0)
+        elif entry.state in ("awarded", "finishing"):
+            arm = ledger.open[entry.award].record.arm
+            register.grants[name] = Grant(arm, entry.award, entry.spec.places, until_s=np.inf)
 
 
 class Leases:
@@ -253,14 +302,21 @@ def test_a_live_policy_observes_what_it_observes_in_simulation(small, error_c, c
     env.reset(seed=0)
     policy = Comparing(env)
     live = LiveFleet(arms=NAMES, warning_c=limits.warning_c, horizon_s=env.world.horizon_s)
-    shift = LiveShift(env, arms, jobs, (all_plans, space(all_plans)[1]), CentralAllocation(policy, live))
+    shift = LiveShift(env, arms, jobs, (all_plans, space(all_plans)[1]), CentralAllocation(policy, live), live)
+    by_arms = 0
     while env.agents:
         policy.prepare(draw)
+        shift.publish()
+        every_third = shift.time_s % 30.0 == 0.0  # to save time
+        for arm, observation in observed_without_auctioneer(shift).items() if every_third else ():
+            policy.compare(arm, observation)
+            by_arms += 1
         shift.decide()
         assert policy.compared or not any(policy.actions.values()), "a claim without a round"
         env.step(policy.actions)
         shift.advance(env.world.dt_s)
     assert policy.rounds > 25
+    assert by_arms > 25
     assert policy.constant == CONSTANT
 
 
@@ -292,24 +348,28 @@ class Comparing:
             self.actions[arm] = int(draw.choice(legal)) if draw.random() < 0.6 else 0
 
     def act(self, observations):
-        first = self.expected[NAMES[0]]
-        slots = int(first.offered.sum())
-        shown = {"slot": slots, "option": slots * 2}
+        """Compare what the auctioneer observes, and make the claims."""
         for arm, live in observations.items():
-            o = self.expected[arm]
-            returned = np.repeat(o.returns[:slots] > 0, 2)
-            for field in FIELDS:
-                expected, got = getattr(o, field.name), getattr(live, field.name)
-                if field.axes and field.axes[-1] in shown:
-                    expected = expected[..., : shown[field.axes[-1]]]
-                self.values[field.name].update(np.unique(np.round(got, 3)).tolist())
-                if field.name in MAY_DIFFER:
-                    continue
-                if field.name in ("peak_c", "p_saturation"):
-                    expected, got = expected[~returned], got[~returned]
-                where = f"{field.name} of {arm} at {self.env.truth.tick[0] * self.env.world.dt_s:g} s"
-                np.testing.assert_allclose(got, expected, atol=2e-3, rtol=1e-5, err_msg=where)
-            expected = np.append(o.action_mask[: slots * 2 + 1], 0) * (o.headroom_k > 0)
-            np.testing.assert_array_equal(live.action_mask[1:], expected[1:])
+            self.compare(arm, live)
         self.rounds, self.compared = self.rounds + 1, True
         return self.actions
+
+    def compare(self, arm: str, live: Observation) -> None:
+        """Compare what is observed live with what is observed in simulation."""
+        o = self.expected[arm]
+        slots = int(o.offered.sum())
+        shown = {"slot": slots, "option": slots * 2}
+        returned = np.repeat(o.returns[:slots] > 0, 2)
+        for field in FIELDS:
+            expected, got = getattr(o, field.name), getattr(live, field.name)
+            if field.axes and field.axes[-1] in shown:
+                expected = expected[..., : shown[field.axes[-1]]]
+            self.values[field.name].update(np.unique(np.round(got, 3)).tolist())
+            if field.name in MAY_DIFFER:
+                continue
+            if field.name in ("peak_c", "p_saturation"):
+                expected, got = expected[~returned], got[~returned]
+            where = f"{field.name} of {arm} at {self.env.truth.tick[0] * self.env.world.dt_s:g} s"
+            np.testing.assert_allclose(got, expected, atol=2e-3, rtol=1e-5, err_msg=where)
+        expected = np.append(o.action_mask[: slots * 2 + 1], 0) * (o.headroom_k > 0)
+        np.testing.assert_array_equal(live.action_mask[1:], expected[1:])
