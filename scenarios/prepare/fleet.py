@@ -176,10 +176,10 @@ def problems_of(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) ->
     file = f"{scenario.name}.toml"
     robots = [spec.robot() for spec in scenario.arms]
     near = collisions_of_homes(robots, scenario.clearance_m, folder / "plans")
-    problems = [
-        f"{file}: arms: {sentence}; move or turn an arm, give it another `home`, or lower clearance_m."
-        for sentence in near
-    ]
+    advice = "move or turn an arm, or give it another `home`"
+    if scenario.clearance_m:
+        advice = "move or turn an arm, give it another `home`, or lower clearance_m"
+    problems = [f"{file}: arms: {sentence}; {advice}." for sentence in near]
     problems += [
         f"{file}: {sentence}; move the arm or the fixture, or give the arm another `home`."
         for sentence in homes_in_fixtures(scenario)
