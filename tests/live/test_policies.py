@@ -173,6 +173,7 @@ def test_quotes_become_observations() -> None:
     assert two.temp_c.tolist() == [30.0] * 6 + [55.0]
     assert one.temp_c.tolist() == one.housing_c.tolist() == [40.0] * 7  # without a state
     assert (two.housing_c.tolist(), two.ambient_c) == ([29.0] * 7, 21.0)
+    assert (one.ambient_c, three.ambient_c) == (40.0, 40.0)  # unknown
     assert (three.job_value, three.job_cycles, three.job_peak_c, three.job_p) == (3.0, 4.0, 57.0, 0.25)
     assert (two.job_value, two.job_cycles, two.job_peak_c, two.job_p) == (0.0, 0.0, 0.0, 0.0)
     assert one.peer_busy_s.tolist() == [0.0, 0.0, 80.0]

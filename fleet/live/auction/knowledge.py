@@ -42,9 +42,9 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
     An option is a quoted plan, by its number; plans of a number from `PLANS` on are left out. What an arm knows of
     itself is in its quote and its last state, as is what its peers know of it; a peer without either is not heard.
 
-    An arm without capacity counts as working and can claim nothing. A plan without
-    difficulty and without P(saturation) has an unknown P and peak, as in simulation. A missing duration counts as the
-    longest of the round.
+    An arm without capacity counts as working and can claim nothing. A plan without difficulty and without P(saturation)
+    has an unknown P and peak, as in simulation. A missing duration counts as the longest of the round, a missing
+    housing temperature as that of the motor, and a missing ambient temperature as that of the coolest motor.
 
     Args:
         last: Outcome of the last claim of each arm: 1 won, -1 lost.
@@ -97,6 +97,7 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
     queued_s = [max(job.release_s, bidding.returned.get(job.name, (0, 0.0))[1]) for job in bidding.jobs]
     due_s = per_job([LONG_S + time_s if job.due_s is None else job.due_s for job in bidding.jobs])
     busy_s = stated(lambda state: state.busy_s)
+    ambient_c = np.array([each.ambient_c if each else None for each in states], float)  # None becomes NaN
     temp_c = _per_joint(states, "temp_c", np.repeat(fleet.warning_c - headroom_k[:, None], JOINTS, axis=1))
     fields = Observation(
         clock=np.full(len(arms), time_s / fleet.horizon_s),
@@ -107,7 +108,7 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_
         last_award=np.array([last.get(arm, 0) for arm in arms]),
         temp_c=temp_c,
         housing_c=_per_joint(states, "housing_c", temp_c),
-        ambient_c=stated(lambda state: state.ambient_c),
+        ambient_c=np.where(np.isnan(ambient_c), temp_c.min(axis=1), ambient_c),
         headroom_k=headroom_k,
         job_value=stated(lambda state: state.job_value),
         job_cycles=stated(lambda state: state.job_cycles_left),
