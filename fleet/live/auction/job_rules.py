@@ -135,11 +135,15 @@ def ready_jobs(
         busy: Stations at which an arm may be at work.
         returned_s: Fleet time of the last return, by job.
     """
+
+    def queued_s(job: JobSpec) -> float:
+        return max(job.release_s, returned_s.get(job.name, 0.0))
+
     ready = [job for job in jobs if job.release_s <= time_s and all(map(finished, job.after))]
-    ready.sort(key=lambda job: max(job.release_s, returned_s.get(job.name, 0.0)))
+    ready.sort(key=queued_s)
     if len(ready) > limit:
-        free = [job for job in ready if busy.isdisjoint(job.places)][:limit]
-        return free or ready[:limit]
+        ready = sorted(ready, key=lambda job: not busy.isdisjoint(job.places))[:limit]
+        ready.sort(key=queued_s)
     return ready
 
 

@@ -246,7 +246,7 @@ class Participant:
             return name in settled and settled[name].outcome == "finished"
 
         busy, returned_s = self.granter.busy_stations(real_s), self.granter.register.returned_s
-        return ready_jobs(free, time_s, self._slots, busy, finished, returned_s)[: self._slots]
+        return ready_jobs(free, time_s, self._slots, busy, finished, returned_s)
 
     def _bid(self, real_s: float, time_s: float) -> None:
         """Publish a bid when its content has changed, and every `BID_S`."""
