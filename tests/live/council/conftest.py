@@ -57,6 +57,8 @@ class Arm:
         self.journal.records[:] = history.compact()
         register = Register().replay(self.grants.records)
         self.grants.records[:] = register.compact()
+        again = Register().replay(self.grants.records)
+        assert (again.returned_s, again.cycles) == (register.returned_s, register.cycles)
         config = ExecutorConfig(return_after_s=8.0)
         self.executor = AwardExecutor(self.name, self.journal.keep, history, nonce="n", config=config)
         granter = Granter(
