@@ -43,8 +43,8 @@ if TYPE_CHECKING:  # a single arm needs neither the environment nor MuJoCo
 
 DifficultyName = Literal["twin", "blind", "oracle"]
 RiskName = Literal["rc", "rc-nominal", "excess", "load", "errors", "torque"]
-"""What the twins' P(saturation) follows from: the peak predicted by the arm's identified or by the nominal thermal
-network, or evidence of the learned twin (`twin.saturation.model.evidence_of`)."""
+"""Model of P(saturation): from the peak predicted by the identified or by the nominal thermal network of the arm, or
+a regression on features of the learned twin (`twin.saturation.model.evidence_of`)."""
 RISK: RiskName = "rc"
 PlantName = Literal["profile", "mujoco"]
 BusName = Literal["zenoh", "memory"]
@@ -323,10 +323,10 @@ def make_env(
 
     Args:
         scenario: A library name, a .toml file, or a `Scenario`.
-        difficulty: What scores the plans: the arms' twins (from the cache, or trained), `blind` or `oracle`.
-        risk: What the twins' P(saturation) follows from; see `RiskName`.
-        plant: What moves the arms.
-        bus: What carries the messages between arms.
+        difficulty: Source of the scores: `twin` (from the cache, or trained), `blind` (none) or `oracle` (true values).
+        risk: Model of the twins' P(saturation); see `RiskName`.
+        plant: Motion of the arms: `profile` (exactly as planned) or `mujoco` (closed loop).
+        bus: Transport of the messages between arms.
         channel: Topology, delay, loss and partitions of the messages.
         cache: Folder of plans and twins.
         max_cycles, render_mode, mask_in: As in `fleet.env.allocation_v1.AllocationEnv`.

@@ -97,7 +97,7 @@ def test_the_command_resumes_and_shows_every_source(thermofleet, small_toml, tmp
 def test_bad_sources_are_named(thermofleet, small_toml, tmp_path) -> None:
     said = thermofleet("ablate", small_toml, "--scores", "trained,oracel", "--out", tmp_path / "x")
     assert said.code == 2
-    assert "No scores 'oracel'; did you mean 'oracle'?" in said.err
+    assert "No source of scores 'oracel'; did you mean 'oracle'?" in said.err
     assert not (tmp_path / "x").exists()
     full = tmp_path / "full"
     full.mkdir()
