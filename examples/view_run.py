@@ -23,8 +23,10 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from fleet.env.render.picture import heat_colour
+from fleet.errors import FleetError
 from fleet.physics.models import build_cell
 from fleet.robot import JOINTS
+from scenarios.run.run_folder import check_format
 from scenarios.schema import Scenario
 
 FRAME_S = 1 / 30
@@ -36,6 +38,7 @@ class Player:
 
     def __init__(self, run):
         card = json.loads((run / "run.json").read_text(encoding="utf-8"))
+        check_format(card, run)
         self.scenario = msgspec.convert(card["scenario"], Scenario)
         robots = [arm.robot() for arm in self.scenario.arms]
         self.model = build_cell(robots, self.scenario.places, self.scenario.fixtures)
@@ -71,7 +74,10 @@ def main():
     parser.add_argument("--at", type=float, default=0.0, help="first second of the shift to show")
     parser.add_argument("--png", type=Path, help="write one picture instead")
     given = parser.parse_args()
-    player = Player(given.run)
+    try:
+        player = Player(given.run)
+    except (OSError, ValueError, KeyError, TypeError, FleetError) as error:
+        parser.error(f"cannot play '{given.run}': {error}")
     if given.png:
         from PIL import Image
 

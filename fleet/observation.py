@@ -79,7 +79,7 @@ class Observation:
     payload_kg: Annotated[Array, Field(_SLOT, "kg", 0, 100, "carried mass")]
     value: Annotated[Array, Field(_SLOT, "1", 0, 1e6, "value of finishing it")]
     returns: Annotated[Array, Field(_SLOT, "1", 0, 1e3, "number of faults that returned it")]
-    expires: Annotated[Array, Field(_SLOT, "1", 0, 1, "1 when it expires at its due date unless begun")]
+    expires: Annotated[Array, Field(_SLOT, "1", 0, 1, "1 when it expires if it still waits at its due date")]
     peer_heard: Annotated[Array, Field(_PEER, "1", 0, 1, "1 when a message of the peer has arrived")]
     peer_age_s: Annotated[Array, Field(_PEER, "s", 0, LONG_S, "age of the peer's last message")]
     peer_working: Annotated[Array, Field(_PEER, "1", 0, 1, "1 when the peer was working then")]

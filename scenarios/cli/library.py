@@ -1,5 +1,6 @@
 """`thermofleet list`, `thermofleet show` and `thermofleet layout`."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -35,7 +36,7 @@ def show_command(scenario: ScenarioArg, as_json: JsonOption = False) -> None:
 
     chosen = load(scenario)
     if as_json:
-        print_json(chosen)
+        print_json(asdict(chosen))
         return
     with progress_bar() as progress:
         parts = describe(chosen, progress)

@@ -184,6 +184,10 @@ def problems_of(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) ->
         f"{file}: {sentence}; move the arm or the fixture, or give the arm another `home`."
         for sentence in homes_in_fixtures(scenario)
     ]
+    problems += [
+        f'{file}: {sentence}; give it more cooling or cooler air, or begin with start = "cold".'
+        for sentence in _overheated_at_home(scenario, arms, folder)
+    ]
     infeasible = [error for arm in arms for error in arm.infeasible]
     for i, stream in enumerate(scenario.jobs if arms else ()):
         here = [error for error in infeasible if error.place in stream.places]
@@ -200,6 +204,21 @@ def problems_of(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) ->
                 f"({'; '.join(reasons[:REASONS])}{more}); move the places or an arm, or make the load lighter."
             )
     return problems
+
+
+def _overheated_at_home(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) -> list[str]:
+    """A sentence for each arm that never settles at home, though the shift begins with settled arms."""
+    cell_c, offsets_k = float(scenario.ambient.at(np.zeros(1))[0]), air_offsets(scenario)
+    found = []
+    for arm in arms if scenario.start == "idle_warm" else ():
+        robot, motors, thermal = arm.hardware
+        rest_tau = rest_torque(robot, folder / "plans")
+        still = Arm(robot=robot, motors=motors, thermal=thermal, rest_tau=rest_tau, model=Blind(), plans={})
+        try:
+            warm_start(still, cell_c + float(offsets_k[arm.index]))
+        except ValueError as error:
+            found.append(f"arms[{arm.index}]: {str(error).rstrip('.')}")
+    return found
 
 
 def _with_oracle(scenario: Scenario, arm: Arm) -> Arm:

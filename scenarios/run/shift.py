@@ -175,7 +175,7 @@ def summary(result: RunResult) -> dict[str, Any]:
         "environment": VERSION,
         "status": "finished" if result.finished else "interrupted",
         "time_s": result.time_s,
-        "scenario": msgspec.to_builtins(result.scenario),
+        "scenario": asdict(result.scenario),
         "scenario_hash": scenario_hash(result.scenario),
         **asdict(replace(result.spec, channel=PERFECT)),
         "channel": result.spec.channel.described(),

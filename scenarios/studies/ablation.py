@@ -8,6 +8,7 @@ V_fleet includes them.
 """
 
 import csv
+import io
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -151,17 +152,20 @@ def _earlier_rows(out: Path, card: dict[str, str]) -> dict[tuple[str, int, int, 
                 f"'{out}' holds other files; --out needs a new folder or that of an earlier ablation."
             ) from error
         for name, value in card.items():
-            if known.get(name) != value:
-                raise FleetError(
-                    f"'{out}' holds an ablation with {name} {known.get(name)!r}, not {value!r}; give another --out."
-                )
+            held = known.get(name) if isinstance(known, dict) else None
+            if held != value:
+                raise FleetError(f"'{out}' holds an ablation with {name} {held!r}, not {value!r}; give another --out.")
         if not (out / ROWS).exists():
             return {}
-        with (out / ROWS).open(newline="", encoding="utf-8") as file:
-            kept = [row for row in csv.DictReader(file) if None not in row.values()]  # the last may be cut off
+        written = (out / ROWS).read_bytes()
+        whole = written[: written.rfind(b"\n") + 1]  # a row without its end may have a shorter number
+        if whole != written:
+            with atomic_path(out / ROWS) as file:
+                file.write_bytes(whole)
     try:
+        kept = list(csv.DictReader(io.StringIO(whole.decode("utf-8"), newline="")))
         rows = [Row(r["scores"], *(int(r[n]) for n in Row._fields[1:4]), *(float(r[n]) for n in FIGURES)) for r in kept]
-    except (KeyError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise FleetError(f"'{out / ROWS}' is damaged ({error}); give another --out.") from error
     return {row[:4]: row for row in rows}
 

@@ -89,6 +89,10 @@ def test_the_command_resumes_and_shows_every_source(thermofleet, small_toml, tmp
     )
     assert thermofleet(*call, "--seeds", 3).code == 0
     assert asked == [[10_002]] * 10
+    before = (out / "ablation.csv").read_bytes()
+    (out / "ablation.csv").write_bytes(before[:-9])  # killed within a row
+    assert thermofleet(*call, "--seeds", 3).code == 0
+    assert (out / "ablation.csv").read_bytes() == before
     refused = thermofleet(*call[:-1], "random", "--seeds", 3)
     assert refused.code == 2
     assert "holds an ablation with policy 'wspt', not 'random'; give another --out" in refused.err
