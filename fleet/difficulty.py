@@ -116,29 +116,32 @@ def stack_forecasts(forecasts: Sequence[Forecast]) -> Forecast:
 
 
 def forecast_arrays(forecasts: Forecast | None, lanes: int) -> dict[str, Array]:
-    """Convert stacked forecasts to arrays of the engine: pieces last, padded to a multiple of `lanes`; empty for None.
+    """Convert stacked forecasts to arrays of the engine, without pieces that never count; empty for None.
 
     Returns:
-        forecast_offset [forecast, piece], forecast_weight [forecast, KNOWN, piece], forecast_time_s [forecast, piece]
+        forecast_first, first block of each forecast, and the number of all blocks, int [forecast + 1];
+        forecast_block [block, 2 + KNOWN, lane], offset, moment and slopes of each piece, padded with offsets of −inf;
         and forecast_curve [forecast, knot, 2].
     """
-    count, pieces, knots = 0, lanes, 0
-    if forecasts is not None:
-        count, pieces = forecasts.offset.shape[0], -(-forecasts.offset.shape[1] // lanes) * lanes
-        knots = 0 if forecasts.curve is None else forecasts.curve.shape[1]
-    tables = {
-        "forecast_offset": np.full((count, pieces), -np.inf),
-        "forecast_weight": np.zeros((count, KNOWN, pieces)),
-        "forecast_time_s": np.zeros((count, pieces)),
-        "forecast_curve": np.zeros((count, knots, 2)),
-    }
-    if forecasts is not None:
-        used = forecasts.offset.shape[1]
-        tables["forecast_offset"][:, :used] = forecasts.offset
-        tables["forecast_weight"][..., :used] = forecasts.weight.swapaxes(1, 2)
-        tables["forecast_time_s"][:, :used] = 0.0 if forecasts.time_s is None else forecasts.time_s
-        tables["forecast_curve"][:] = 0.0 if forecasts.curve is None else forecasts.curve
-    return tables
+    if forecasts is None:
+        empty = np.zeros((0, 2 + KNOWN, lanes)), np.zeros((0, 0, 2))
+        return dict(zip(_FORECAST_TABLES, (np.zeros(1, int), *empty), strict=True))
+    count = len(forecasts.offset)
+    size = -(-forecasts.offset.shape[1] // lanes)
+    pieces = np.zeros((count, 2 + KNOWN, size * lanes))
+    pieces[:, 0] = -np.inf
+    used = slice(0, forecasts.offset.shape[1])
+    pieces[:, 0, used], pieces[:, 2:, used] = forecasts.offset, forecasts.weight.swapaxes(1, 2)
+    if forecasts.time_s is not None:
+        pieces[:, 1, used] = forecasts.time_s
+    blocks = pieces.reshape(count, 2 + KNOWN, size, lanes).swapaxes(1, 2)
+    counts = (blocks[:, :, 0] > -np.inf).any(axis=-1)
+    curve = np.zeros((count, 0, 2)) if forecasts.curve is None else forecasts.curve
+    first = np.cumsum([0, *counts.sum(axis=1)])
+    return dict(zip(_FORECAST_TABLES, (first, blocks[counts], curve), strict=True))
+
+
+_FORECAST_TABLES = ("forecast_first", "forecast_block", "forecast_curve")
 
 
 def extend_curve(curve: Array, knots: int) -> Array:
