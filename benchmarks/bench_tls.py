@@ -50,7 +50,7 @@ class PingPong:
         ended = zenoh.handlers.Callback(lambda _: self._came.put(None), indirect=False)
         self._kept = (other.declare_subscriber(there, heard), one.declare_subscriber(back, ended))
         for session in (one, other):  # replies come in order, so the router knows the declarations
-            list(session.get(keys.caches_of("thermofleet/v3/bench/arm/nobody"), timeout=PATIENT_S))
+            list(session.get(keys.caches_of("thermofleet/v4/bench/arm/nobody"), timeout=PATIENT_S))
 
     def round_s(self) -> float:
         """Seconds of one round trip."""

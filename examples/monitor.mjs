@@ -1,11 +1,11 @@
 // Monitor a fleet through `thermofleet gateway`, with Node 18 or newer and no packages.
 //
-//     node examples/monitor.mjs http://127.0.0.1:8080/v3 [seconds]
+//     node examples/monitor.mjs http://127.0.0.1:8080/v4 [seconds]
 //
 // Reads the stream of server-sent events and prints a table every second. If the stream ends, it connects again with the
 // number of the last message, so that no event is missed. Set THERMOFLEET_TOKEN if the gateway requires a token.
 
-const [base = "http://127.0.0.1:8080/v3", seconds = "0"] = process.argv.slice(2);
+const [base = "http://127.0.0.1:8080/v4", seconds = "0"] = process.argv.slice(2);
 const arms = new Map(); // name -> row of the table
 const jobs = new Map(); // name -> state
 let last = ""; // number of the last message

@@ -12,7 +12,7 @@ import sys
 
 import zenoh
 
-ARM_KEY, AUCTION_KEY = "thermofleet/v3/*/arm/*/{}", "thermofleet/v3/*/auction/*/{}"
+ARM_KEY, AUCTION_KEY = "thermofleet/v4/*/arm/*/{}", "thermofleet/v4/*/auction/*/{}"
 WAIT_S = 600.0
 """Longest wait for the first message: a fleet may train its twins first."""
 QUIET_S = 5.0

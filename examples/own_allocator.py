@@ -25,7 +25,7 @@ class Allocator:
     """Jobs, their status and their awards. All methods run on one thread; queries of arms block it."""
 
     def __init__(self, session, fleet):
-        self.session, self.root = session, f"thermofleet/v3/{quote(fleet, safe='')}"
+        self.session, self.root = session, f"thermofleet/v4/{quote(fleet, safe='')}"
         self.own_key = f"{self.root}/auction/{NAME}"
         self.inbox, self.started_s = queue.SimpleQueue(), time.monotonic()
         self.jobs = {}  # name -> job as submitted
@@ -127,7 +127,9 @@ class Allocator:
             return
         self.rounds += 1
         name = f"{NAME}-{time.time_ns()}-{self.rounds}"  # unique, also after a restart
-        quotes = self.query(f"{self.root}/arm/*/quote", "QuoteRequest", {"auction": name, "jobs": waiting}, WINDOW_S)
+        done = {job["name"]: self.status[job["name"]]["cycles"] for job in waiting}
+        request = {"auction": name, "jobs": waiting, "cycles": done}
+        quotes = self.query(f"{self.root}/arm/*/quote", "QuoteRequest", request, WINDOW_S)
         capacity = {arm: quote["capacity"] for arm, quote in quotes.items()}
         for index, job in enumerate(waiting):
             estimates = {arm: quote["estimates"][index] for arm, quote in quotes.items() if capacity[arm] > 0}
@@ -254,7 +256,7 @@ class Allocator:
 
 def encoding(name):
     """Return the Zenoh encoding of a message type; messages with another one are malformed."""
-    return f"application/json;thermofleet.{name}.v3"
+    return f"application/json;thermofleet.{name}.v4"
 
 
 def main(port, fleet, seconds=float("inf")):

@@ -27,7 +27,7 @@ class Arm:
 
     def __init__(self, session, fleet, name):
         self.session, self.name, self.inbox = session, name, queue.SimpleQueue()
-        self.root = f"thermofleet/v3/{quote(fleet, safe='')}"
+        self.root = f"thermofleet/v4/{quote(fleet, safe='')}"
         self.own_key = f"{self.root}/arm/{quote(name, safe='')}"
         self.temp_c, self.tick = AMBIENT_C, 0
         self.zero_s, self.speed = self.query_clock()
@@ -104,7 +104,8 @@ class Arm:
     def make_quote(self, request):
         """Estimate the cost of each job. The quote of a dry run is not stored."""
         name = "" if request.get("dry_run") else f"{self.name}-{uuid.uuid4().hex}"  # unique, also after a restart
-        estimates = [self.estimate(job) for job in request["jobs"]]
+        done = request.get("cycles", {})
+        estimates = [self.estimate(job, done.get(job["name"], 0)) for job in request["jobs"]]
         if name:
             now = time.monotonic()
             self.quotes = {old: made_s for old, made_s in self.quotes.items() if now < made_s + VALID_S} | {name: now}
@@ -122,11 +123,11 @@ class Arm:
             "estimates": estimates,
         }
 
-    def estimate(self, job):
-        """Return a JobEstimate, with one plan; unknown values are left out."""
+    def estimate(self, job, done):
+        """Return a JobEstimate of the cycles that are not done, with one plan; unknown values are left out."""
         if job["kind"] == "press":
             return {"job": job["name"], "reason": "This arm cannot press."}
-        cycles, d = job.get("repetitions", 1), 0.1 * job.get("payload_kg", 0.0)
+        cycles, d = max(1, job.get("repetitions", 1) - done), 0.1 * job.get("payload_kg", 0.0)
         plan = {
             "peak_c": self.temp_c + 0.1 * cycles,
             "gained_k": 0.1 * cycles,
@@ -266,7 +267,7 @@ class Arm:
 
 def encoding(name):
     """Return the Zenoh encoding of a message type; messages with another one are malformed."""
-    return f"application/json;thermofleet.{name}.v3"
+    return f"application/json;thermofleet.{name}.v4"
 
 
 def connect(port):

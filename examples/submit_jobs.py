@@ -74,7 +74,7 @@ def query(session, key, name, request):
     replies = session.get(
         key,
         payload=json.dumps(request),
-        encoding=f"application/json;thermofleet.{name}.v3",
+        encoding=f"application/json;thermofleet.{name}.v4",
         target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE,
         timeout=5.0,
@@ -83,7 +83,7 @@ def query(session, key, name, request):
     for reply in replies:
         if reply.ok is None:  # from Zenoh itself: no reply in time
             print(f"no reply: {reply.err.payload.to_bytes().decode()}", flush=True)
-        elif str(reply.ok.encoding) == "application/json;thermofleet.Refusal.v3":
+        elif str(reply.ok.encoding) == "application/json;thermofleet.Refusal.v4":
             print(f"refused: {json.loads(reply.ok.payload.to_bytes())['reason']}", flush=True)
         else:
             messages.append(json.loads(reply.ok.payload.to_bytes()))
@@ -97,7 +97,7 @@ def main(port, fleet, jobs, seconds=600.0):
         "connect": {"endpoints": [f"tcp/127.0.0.1:{port}"], "timeout_ms": 10_000},
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
     }
-    root = f"thermofleet/v3/{quote(fleet, safe='')}"
+    root = f"thermofleet/v4/{quote(fleet, safe='')}"
     try:
         opened = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
     except zenoh.ZError:

@@ -79,14 +79,17 @@ class Forecast:
         if self.time_s is not None and (self.time_s.shape != self.offset.shape or not (self.time_s >= 0).all()):
             raise ValueError(f"Forecast.time_s must be >= 0, one per piece (got shape {np.shape(self.time_s)}).")
 
-    def value(self, known_c: Array) -> Array:
-        """The value [...] from known temperatures [..., KNOWN]."""
-        return (self.offset + (self.weight @ np.asarray(known_c, dtype=float)[..., None])[..., 0]).max(axis=-1)
+    def value(self, known_c: Array, left_s: float = np.inf) -> Array:
+        """The value [...] from known temperatures [..., KNOWN], without the pieces of moments later than `left_s`."""
+        values = self.offset + (self.weight @ np.asarray(known_c, dtype=float)[..., None])[..., 0]
+        if self.time_s is not None:
+            values = np.where(self.time_s <= left_s, values, -np.inf)
+        return values.max(axis=-1)
 
-    def at(self, known_c: Array) -> Array:
-        """The probability [...] from known temperatures [..., KNOWN]."""
+    def at(self, known_c: Array, left_s: float = np.inf) -> Array:
+        """The probability [...]; arguments as in `value`."""
         curve = np.zeros((0, 2)) if self.curve is None else self.curve
-        return _LINKS(self.value(known_c), curve)
+        return _LINKS(self.value(known_c, left_s), curve)
 
     def __getitem__(self, row: Array | int) -> "Forecast":
         """Rows of the first axis."""
@@ -206,17 +209,27 @@ class Difficulty:
         """d = Σ_k d_k, in [0, joints)."""
         return float(np.sum(self.per_joint))
 
-    def p_at(self, known_c: Array) -> float | None:
-        """P(saturation) from known temperatures [KNOWN]; None if unknown."""
+    def p_at(self, known_c: Array, left_s: float = np.inf) -> float | None:
+        """P(saturation) from known temperatures [KNOWN]; None if unknown.
+
+        Args:
+            left_s: Time until the plan ends, if it has begun.
+        """
         if self.risk is not None:
-            return float(self.risk.at(known_c))
+            return float(self.risk.at(known_c, left_s))
         if self.p_saturation is None and self.peak is not None and self.peak.curve is not None:
-            return float(self.peak.at(known_c))
+            return float(self.peak.at(known_c, left_s))
         return self.p_saturation
 
-    def peak_at(self, known_c: Array) -> float | None:
-        """Predicted hottest motor temperature during the plan, °C, from known temperatures [KNOWN]; None if unknown."""
-        return None if self.peak is None else float(self.peak.value(known_c))
+    def peak_at(self, known_c: Array, left_s: float = np.inf) -> float | None:
+        """Predicted hottest motor temperature during the plan, °C; None if unknown; arguments as in `p_at`.
+
+        Of a plan that has begun, it is at least the hottest motor now.
+        """
+        if self.peak is None:
+            return None
+        peak_c = float(self.peak.value(known_c, left_s))
+        return peak_c if left_s == np.inf else max(peak_c, float(known_c[:JOINTS].max()))
 
 
 class DifficultyModel(Protocol):

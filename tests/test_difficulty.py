@@ -100,3 +100,10 @@ def test_the_peak_is_the_hottest_piece_and_its_curve_gives_the_probability() -> 
     assert told.p_at(known_c) == pytest.approx(0.35)
     assert Difficulty(np.full(7, 0.1), 0.2, peak=peak).p_at(known_c) == 0.2
     assert Difficulty(np.full(7, 0.1)).peak_at(known_c) is None
+
+
+def test_later_moments_do_not_count_when_a_plan_ends_before() -> None:
+    peak = Forecast(np.array([50.0, 55.0, 65.0]), np.zeros((3, KNOWN)), time_s=np.array([0.0, 60.0, 120.0]))
+    known_c = known_temperatures(np.full(7, 52.0), np.full(7, 40.0), 25.0)
+    told = Difficulty(np.full(7, 0.1), peak=peak)
+    assert [told.peak_at(known_c, left_s) for left_s in (0.0, 60.0, 119.0, 120.0, np.inf)] == [52, 55, 55, 65, 65]

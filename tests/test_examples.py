@@ -300,9 +300,9 @@ def rubbish_at():
 
         def ask(example, topic, payload, said):
             key = keys.of_arm("f", "x", topic) if example == "own_arm" else keys.asked_by("f", "own", topic, "x")
-            encoding = said or f"application/json;thermofleet.{words[topic]}.v3"
+            encoding = said or f"application/json;thermofleet.{words[topic]}.v4"
             (reply,) = list(line._session.get(key, payload=payload, encoding=encoding, timeout=PATIENCE_S))
-            assert str(reply.ok.encoding) == "application/json;thermofleet.Refusal.v3"
+            assert str(reply.ok.encoding) == "application/json;thermofleet.Refusal.v4"
             return json.loads(reply.ok.payload.to_string())["reason"]
 
         yield ask

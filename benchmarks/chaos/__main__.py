@@ -26,7 +26,7 @@ from pathlib import Path
 from campaign import SCENARIO, campaign
 from consensus import cut_off_half, cut_off_one
 from fleet_under_test import CannotInject, Fault
-from malformed import replayed_awards, rubbish
+from malformed import malformed, replayed_awards
 from namespaces import unavailable_reason
 from partition import partition
 from processes import full_disk, kill_arm, kill_auctioneer, kill_router, stop_arm, stuck_subscriber
@@ -43,7 +43,7 @@ FAULTS = {
     "kill-router": Fault(kill_router),
     "stuck-subscriber": Fault(stuck_subscriber),
     "full-disk": Fault(full_disk),
-    "rubbish": Fault(rubbish),
+    "malformed": Fault(malformed),
     "replayed-awards": Fault(replayed_awards),
     "trespass": Fault(trespass, tls=True),
     "partition": Fault(partition, cut=True),
@@ -51,7 +51,7 @@ FAULTS = {
     "alone-kill-arm": Fault(kill_arm, no_auctioneer=True),
     "alone-stop-arm": Fault(stop_arm, no_auctioneer=True),
     "alone-kill-router": Fault(kill_router, no_auctioneer=True),
-    "alone-rubbish": Fault(rubbish, no_auctioneer=True),
+    "alone-malformed": Fault(malformed, no_auctioneer=True),
     "alone-cut-one": Fault(cut_off_one, no_auctioneer=True, cut=True, cut_arms=1),
     "alone-halves": Fault(cut_off_half, no_auctioneer=True, cut=True),
 }

@@ -15,7 +15,7 @@ from fleet.bus.protocol.messages import State, encode, encoding
 MESSAGES = 100_000
 
 
-def rubbish(fleet: Fleet) -> float:
+def malformed(fleet: Fleet) -> float:
     """Send 100 000 malformed, oversized and extreme messages on all keys."""
     rng = random.Random(0)
     fleet_name, session = fleet.client.fleet, fleet.session

@@ -49,7 +49,7 @@ def stuck_subscriber(fleet: Fleet) -> float:
         "config = zenoh.Config.from_json5(json.dumps({'mode': 'client', 'connect': {'endpoints': [sys.argv[1]]},"
         " 'scouting': {'multicast': {'enabled': False}}}))\n"
         "with zenoh.open(config) as z:\n"
-        "    sub = z.declare_subscriber('thermofleet/v3/**', lambda s: time.sleep(0.05))\n"
+        "    sub = z.declare_subscriber('thermofleet/v4/**', lambda s: time.sleep(0.05))\n"
         "    print('ready', flush=True)\n"
         "    time.sleep(120)\n"
     )

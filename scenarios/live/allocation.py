@@ -15,15 +15,16 @@ class CentralAllocation:
     def __init__(self, policy: Policy, fleet: LiveFleet) -> None:
         """Take a policy that was reset."""
         self._policy, self._fleet = policy, fleet
-        self._lost: set[str] = set()
+        self._last: dict[str, int] = {}
 
     def __call__(self, bidding: Bidding) -> dict[str, Assignment]:
         """Arm and plan of each job that is assigned: the claims of the policy, resolved as in simulation."""
-        seen = observe(bidding, self._fleet, lost=self._lost)
+        seen = observe(bidding, self._fleet, last=self._last)
         actions = actions_of(list(seen), self._policy.act(seen)).tolist()
         claims = claimed_jobs(bidding, seen, dict(zip(seen, actions, strict=True)))
         awarded = resolve_claims(bidding, claims, self._fleet.order(bidding.quotes))
-        self._lost = set(claims) - {assignment.arm for assignment in awarded.values()}
+        winners = {assignment.arm for assignment in awarded.values()}
+        self._last = {arm: 1 if arm in winners else -1 for arm in claims}
         return awarded
 
 

@@ -45,7 +45,7 @@ class Problem(Exception):
 
 
 class AskBody(msgspec.Struct, frozen=True):
-    """Body of /v3/ask: jobs to be quoted, not done."""
+    """Body of /v4/ask: jobs to be quoted, not done."""
 
     jobs: tuple[JobSpec, ...]
 
@@ -123,11 +123,11 @@ def application(
         return EventStream(bridge.feed, readers, boot, last_event, heartbeat_s, stuck_s)
 
     routes = [
-        Route("/v3/fleet", fleet),
-        Route("/v3/events", events),
-        Route("/v3/jobs", get_jobs),
-        Route("/v3/jobs", post_jobs, methods=["POST"]),
-        Route("/v3/ask", post_ask, methods=["POST"]),
+        Route("/v4/fleet", fleet),
+        Route("/v4/events", events),
+        Route("/v4/jobs", get_jobs),
+        Route("/v4/jobs", post_jobs, methods=["POST"]),
+        Route("/v4/ask", post_ask, methods=["POST"]),
     ]
     handlers = dict.fromkeys((Problem, NoReply, HTTPException, Exception), error_response)
     return Starlette(routes=routes, exception_handlers=handlers, middleware=[Middleware(AccessCheck, token=token)])

@@ -27,9 +27,9 @@ from fleet.robot import JOINTS
 Message = State | ArmEvent | Result
 Kind = Literal["telemetry", "events", "results"]
 KINDS: tuple[Kind, ...] = ("telemetry", "events", "results")
-RECORDING_FORMAT = 3
+RECORDING_FORMAT = 4
 CARD = "recording.json"
-SENSORS = ("q", "qd", "tau", "current_a", "temp_c")
+SENSORS = ("q", "qd", "tau", "current_a", "temp_c", "housing_c")
 MAX_ROWS = 200_000
 """Kept in memory; with more, a part is written before it is due."""
 _COLUMNS = {inspect.IntType: pa.int64(), inspect.FloatType: pa.float64()}
@@ -50,16 +50,12 @@ def _columns(message: type[msgspec.Struct]) -> dict[str, pa.DataType]:
     return columns
 
 
+_STATE = _columns(State)
+"""Columns of a state; those of `SENSORS` have one for each joint."""
 SCHEMAS: dict[Kind, pa.Schema] = {
     "telemetry": pa.schema(
-        [
-            ("time_s", pa.float64()),
-            ("arm", pa.string()),
-            ("mode", pa.string()),
-            ("tick", pa.int64()),
-            ("headroom_k", pa.float32()),
-            *[(f"{name}_{joint + 1}", pa.float32()) for name in SENSORS for joint in range(JOINTS)],
-        ]
+        {"time_s": pa.float64(), **{name: kind for name, kind in _STATE.items() if name not in SENSORS}}
+        | {f"{name}_{joint + 1}": pa.float32() for name in SENSORS for joint in range(JOINTS)}
     ),
     "events": pa.schema({"time_s": pa.float64(), **_columns(ArmEvent), "joint": pa.int8()}),
     "results": pa.schema({"time_s": pa.float64(), **_columns(Result), **_columns(JobStatus)}),
@@ -183,7 +179,7 @@ def _row(message: Message) -> tuple[Kind, dict[str, object]]:
     if isinstance(message, Result):
         fields = structs.asdict(message)
         return "results", fields | structs.asdict(fields.pop("status"))
-    row: dict[str, object] = {name: getattr(message, name) for name in ("time_s", "arm", "mode", "tick", "headroom_k")}
+    row: dict[str, object] = {name: getattr(message, name) for name in _STATE if name not in SENSORS}
     for name in SENSORS:
         row |= {f"{name}_{joint + 1}": value for joint, value in enumerate(getattr(message, name)[:JOINTS])}
     return "telemetry", row
@@ -233,8 +229,8 @@ def states(table: pa.Table, *, warning_c: float = 60.0) -> Iterator[State]:
             sensors = {name: _joints(row, name) for name in SENSORS}
             temps_c = sensors["temp_c"]
             headroom_k = row.get("headroom_k", warning_c - max(temps_c) if temps_c else 0.0)
-            fields = {"arm": arm, "tick": tick, "time_s": row["time_s"], "mode": row["mode"], "headroom_k": headroom_k}
-            yield msgspec.convert(fields | sensors, State)
+            fields = {name: row[name] for name in _STATE if row.get(name) is not None}
+            yield msgspec.convert(fields | {"tick": tick, "headroom_k": headroom_k} | sensors, State)
 
 
 def _joints(row: dict[str, float | None], name: str) -> tuple[float, ...]:

@@ -65,7 +65,7 @@ def sizes(connect: Connect, key: str, say_all: Callable[[zenoh.Session], object]
 
 def settled(session: zenoh.Session) -> None:
     """Wait until the router has taken all that the session said or declared before."""
-    assert list(session.get(keys.caches_of("thermofleet/v3/f/arm/nobody"), timeout=PATIENT_S)) == []
+    assert list(session.get(keys.caches_of("thermofleet/v4/f/arm/nobody"), timeout=PATIENT_S)) == []
 
 
 EVENT = keys.of_arm("f", "arm_0", "event")
@@ -152,7 +152,7 @@ def test_telemetry_too_often_is_thinned_to_the_limit(connect):
 def test_a_flood_of_telemetry_takes_nothing_from_other_words_and_other_arms(connect):
     heard: queue.Queue[str] = queue.Queue()
     listener = connect("monitor").declare_subscriber(
-        "thermofleet/v3/f/**", lambda sample: heard.put(str(sample.key_expr))
+        "thermofleet/v4/f/**", lambda sample: heard.put(str(sample.key_expr))
     )
     settled(connect("monitor"))
     settled(connect("arm_1"))

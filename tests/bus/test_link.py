@@ -102,8 +102,8 @@ def test_two_that_ask_each_other_do_not_block(bus):
 @pytest.mark.parametrize(
     ("payload", "said", "complaint"),
     [
-        (b"{", encoding(ClockRequest), "Not a thermofleet.ClockRequest.v3"),
-        (b"\xff\xfe", encoding(ClockRequest), "Not a thermofleet.ClockRequest.v3"),
+        (b"{", encoding(ClockRequest), "Not a thermofleet.ClockRequest.v4"),
+        (b"\xff\xfe", encoding(ClockRequest), "Not a thermofleet.ClockRequest.v4"),
         (b"{}", "application/json;thermofleet.ClockRequest.v9", "encoded as"),
         (b"{}", "text/plain", "encoded as"),
     ],
@@ -140,7 +140,7 @@ def test_words_that_speak_for_another_are_left_out(bus):
     lie = ArmEvent(arm="arm_1", number=0, time_s=1.0, kind="finish")
     truth = ArmEvent(arm="arm_2", number=0, time_s=1.0, kind="finish")
     stranger.publish(keys.of_arm("f", "arm_0", "event"), lie)
-    raw(stranger).put("thermofleet/v3/f/arm/*/event", json.dumps({"arm": "arm_0"}), encoding=encoding(ArmEvent))
+    raw(stranger).put("thermofleet/v4/f/arm/*/event", json.dumps({"arm": "arm_0"}), encoding=encoding(ArmEvent))
     stranger.publish(keys.of_arm("f", "arm_2", "event"), truth)
     serve(lambda: heard, listener)
     assert heard == ["arm_2"]

@@ -111,7 +111,7 @@ def changed(message, **changes):
     ],
 )
 def test_a_malformed_state_is_refused_with_words(payload):
-    with pytest.raises(MalformedMessage, match=r"thermofleet\.State\.v3"):
+    with pytest.raises(MalformedMessage, match=r"thermofleet\.State\.v4"):
         received(State, payload, "arm_0")
 
 
@@ -150,5 +150,5 @@ def test_an_integer_is_a_number():
 
 
 def test_a_schema_has_a_version():
-    assert schema(Info) == "thermofleet.Info.v3"
-    assert encoding(State) == "application/json;thermofleet.State.v3"
+    assert schema(Info) == "thermofleet.Info.v4"
+    assert encoding(State) == "application/json;thermofleet.State.v4"

@@ -95,7 +95,7 @@ def test_nobody_deletes_and_everybody_but_the_router_hears_its_own_fleet_alone()
     rules = access_control(roster)
     assert rules["default_permission"] == "deny"
     assert not [rule for rule in rules["rules"] if "delete" in rule["messages"] or rule["permission"] != "allow"]
-    elsewhere = [keys.of_arm("g", "arm_0", "state"), "**", "thermofleet/v3/**", "@/*/router", "other"]
+    elsewhere = [keys.of_arm("g", "arm_0", "state"), "**", "thermofleet/v4/**", "@/*/router", "other"]
     for one in roster.participants:
         who, hears = one.common_name, one.role != "router"
         for key in EVERY_KEY:

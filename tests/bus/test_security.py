@@ -34,7 +34,7 @@ from fleet.bus.security.tls import Tls
 
 ARMS = ("arm_0", "arm_1", "arm 2/*@")
 PATIENT_S = 20.0
-HERE = "thermofleet/v3/f"
+HERE = "thermofleet/v4/f"
 Connect = Callable[[str], zenoh.Session]
 
 

@@ -19,7 +19,7 @@ from fleet.bus.security.tls import Tls
 
 ARMS = ("arm_0", "arm_1", "arm 2/*@")
 PATIENT_S = 20.0
-HERE = "thermofleet/v3/f"
+HERE = "thermofleet/v4/f"
 
 
 def test_a_whole_exchange_is_the_same_with_every_rule_on(guarded, folder, make_words, assert_same):

@@ -175,7 +175,7 @@ def test_what_a_stranger_says_is_counted_and_never_believed(make_words, assert_s
 
 def barrier(stranger: zenoh.Session) -> None:
     """Wait until the router has taken all that the stranger said: it answers in order."""
-    assert list(stranger.liveliness().get("thermofleet/v3/f/arm/*/alive", timeout=PATIENT_S))
+    assert list(stranger.liveliness().get("thermofleet/v4/f/arm/*/alive", timeout=PATIENT_S))
 
 
 def test_a_flood_passes_and_leaves_no_trace(make_words, assert_same):

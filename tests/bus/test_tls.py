@@ -172,7 +172,7 @@ def test_a_router_with_tls_may_listen_elsewhere_and_without_it_not(folder):
 def test_rubbish_at_the_door_harms_no_line_that_is_open_and_delays_new_ones_alone(guarded, folder):
     """Zenoh waits 0.1 s after every handshake that fails."""
     host, port = guarded.endpoint.removeprefix("tls/").split(":")
-    cache = keys.caches_of("thermofleet/v3/f/arm/nobody")
+    cache = keys.caches_of("thermofleet/v4/f/arm/nobody")
     with open_client(guarded.endpoint, timeout_s=PATIENT_S, tls=Tls(folder, "arm_0")) as arm:
         for number in range(10):
             with socket.create_connection((host, int(port)), timeout=PATIENT_S) as line:
@@ -190,4 +190,4 @@ def test_the_documented_configuration_opens_a_line(guarded, folder):
     config = block.replace("ENDPOINT", guarded.endpoint).replace("DIR", str(folder)).replace("NAME", "monitor")
     with zenoh.open(zenoh.Config.from_json5(config)) as client:
         assert len(client.info.routers_zid()) == 1
-        assert list(client.get(keys.caches_of("thermofleet/v3/f/arm/nobody"), timeout=PATIENT_S)) == []
+        assert list(client.get(keys.caches_of("thermofleet/v4/f/arm/nobody"), timeout=PATIENT_S)) == []

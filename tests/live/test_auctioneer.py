@@ -107,6 +107,41 @@ def test_a_refused_job_is_auctioned_again_after_a_pause(fleet_of):
     assert fleet.auctioneer.status()[0].state == "finished"
 
 
+def requests(fleet, steps: int) -> list[QuoteRequest]:
+    """Run without faults, and return the requests for quotes."""
+    asked: list[QuoteRequest] = []
+    for _ in range(steps):
+        fleet.step(0.1)
+        asked += in_transit(fleet, QuoteRequest)
+        for name in fleet.arms:
+            fleet.step_arm(name)
+        for _ in range(3):
+            fleet.deliver_all()
+    return asked
+
+
+def test_quotes_are_requested_for_the_cycles_that_are_left(fleet_of):
+    fleet = fleet_of(1)
+    fleet.submit(hold("j", repetitions=50))
+    assert [request.cycles for request in requests(fleet, 12)] == [{}]
+    (arm,) = fleet.arms.values()
+    arm.return_jobs(fleet.true_s)
+    (done,) = [report.cycles for report in arm.reports.values()]
+    assert done > 3
+    assert [request.cycles for request in requests(fleet, 12)] == [{"j": done}]
+
+
+def test_jobs_at_busy_stations_are_named_when_another_job_can_begin(fleet_of):
+    """Policies observe them, as in simulation."""
+    fleet = fleet_of(2)
+    fleet.submit(hold("j", repetitions=500))
+    requests(fleet, 12)
+    fleet.submit(hold("k"))
+    assert requests(fleet, 12) == []
+    fleet.submit(hold("l", "bin"))
+    assert [job.name for job in requests(fleet, 1)[0].jobs] == ["k", "l"]
+
+
 def test_a_station_gets_one_job_at_a_time(fleet_of):
     fleet = fleet_of(2)
     bid(fleet, hold("a"), hold("b"))

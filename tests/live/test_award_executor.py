@@ -6,32 +6,21 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import Award, JobSpec, Lease, Receipt
-from fleet.errors import JournalFull
 from fleet.live.arm.award_executor import CLOCK_DRIFT, AwardExecutor, ExecutorConfig
 from fleet.live.arm.journal_records import MAX_PAST_AWARDS, ArmHistory, ArmRecord, Started
 from fleet.live.journal import Journal
+from tests.live.disk import Disk
 
 JOB = JobSpec(name="j", kind="hold", places=("p",), repetitions=3)
 OTHER = JobSpec(name="k", kind="hold", places=("p",))
 VALID_S, LEASE_S = 5.0, 6.0
 
 
-class Disk(list):
-    """A journal that may be full."""
-
-    full = False
-
-    def keep(self, *records) -> None:
-        if self.full:
-            raise JournalFull("there is no room")
-        self.extend(records)
-
-
 def shop(disk=None, boot_nonce="n", **config):
     """A executor at its start, and its disk."""
     disk = Disk() if disk is None else disk
-    history = ArmHistory().replay(disk).after_restart("a", 7.0)
-    disk[:] = history.compact()
+    history = ArmHistory().replay(disk.records).after_restart("a", 7.0)
+    disk.records[:] = history.compact()
     config = ExecutorConfig(**{"valid_s": VALID_S, **config})
     return AwardExecutor("a", disk.keep, history, nonce=boot_nonce, config=config), disk
 
@@ -56,7 +45,7 @@ def test_an_award_on_a_valid_quote_is_accepted_and_on_disk():
     executor, disk = shop()
     award = taken(executor)
     assert [held.award for held in executor.active] == [award]
-    assert list(ArmHistory().replay(disk).active) == [award.award]
+    assert list(ArmHistory().replay(disk.records).active) == [award.award]
     assert executor.spare_capacity == 0
 
 
@@ -74,11 +63,11 @@ def test_an_award_on_a_valid_quote_is_accepted_and_on_disk():
 def test_an_award_that_does_not_match_is_refused_with_the_reason(change, now_s, reason):
     executor, disk = shop()
     award = replace(award_on(quoted(executor)), **change)
-    before = list(disk)
+    before = list(disk.records)
     ack = executor.answer_award(award, now_s)
     assert not ack.accepted
     assert reason in ack.reason
-    assert disk == before
+    assert disk.records == before
     assert not executor.active
 
 
@@ -107,9 +96,9 @@ def test_a_refusal_is_final_although_the_reason_has_ended():
 def test_the_same_award_gets_the_same_answer_and_changes_nothing():
     executor, disk = shop(capacity=3)
     award = taken(executor)
-    before = list(disk)
+    before = list(disk.records)
     assert executor.answer_award(award, 100.0, "I am too hot") == executor.answer_award(award, 0.0)
-    assert disk == before
+    assert disk.records == before
     assert len(executor.active) == 1
     assert "was for the job 'j'" in executor.answer_award(replace(award, job=OTHER), 0.0).reason
 
@@ -129,7 +118,7 @@ def test_a_later_award_of_the_current_job_replaces_the_earlier():
     again = award_on(quoted(executor, now_s=10.0), award="w2", cycles=1)
     assert executor.answer_award(again, 10.0).accepted
     assert [held.award for held in executor.active] == [again]
-    assert list(ArmHistory().replay(disk).active) == ["w2"]
+    assert list(ArmHistory().replay(disk.records).active) == ["w2"]
 
 
 def test_names_of_quotes_are_unique():
@@ -197,7 +186,7 @@ def test_the_last_cycle_needs_permission_which_is_on_disk_and_a_lease():
     executor.apply_lease(leave, 1.0)
     assert (executor.allowed_cycles(5.9), executor.allowed_cycles(6.0)) == (3, 2)
     executor.return_expired(0.0, 1000.0)
-    assert ArmHistory().replay(disk).active[award.award].may_commit
+    assert ArmHistory().replay(disk.records).active[award.award].may_commit
     executor.apply_lease(leave, 1000.0)
     assert executor.allowed_cycles(1001.0) == 3
 
@@ -228,7 +217,7 @@ def test_a_revoked_award_is_returned():
     assert executor.allowed_cycles(2.0) == 0
     executor.return_revoked(1.0, 2.0, at_home=False)
     assert [report.outcome for _, report in executor.due_reports(2.0)] == ["returned"]
-    assert not ArmHistory().replay(disk).active
+    assert not ArmHistory().replay(disk.records).active
 
 
 def test_a_job_without_a_lease_for_long_is_returned():
@@ -249,7 +238,7 @@ def test_a_lease_request_has_no_more_cycles_than_are_on_disk():
     assert executor.lease_requests(2.0)[0][1].entries[0].cycles == 0
     disk.full = False
     assert executor.lease_requests(4.0)[0][1].entries[0].cycles == 1
-    assert next(iter(ArmHistory().replay(disk).active.values())).cycles == 1
+    assert next(iter(ArmHistory().replay(disk.records).active.values())).cycles == 1
 
 
 # Reports
@@ -293,7 +282,7 @@ def test_an_arm_with_a_full_disk_takes_no_work():
     award = award_on(quoted(executor))
     disk.full = True
     ack = executor.answer_award(award, 0.0)
-    assert "journal cannot be written: there is no room" in ack.reason
+    assert "journal cannot be written: no room" in ack.reason
     disk.full = False
     assert executor.answer_award(award, 0.0) == ack
 
@@ -353,8 +342,8 @@ def test_an_award_is_kept_over_many_restarts_and_the_journal_stays_small():
         executor.apply_receipt(Receipt("x", award.award))
     executor, _ = shop(disk)
     assert executor.answer_award(award, 99.0).accepted
-    assert len(disk) <= MAX_PAST_AWARDS + 2
-    assert ArmHistory().replay(disk).boot == MAX_PAST_AWARDS + 51
+    assert len(disk.records) <= MAX_PAST_AWARDS + 2
+    assert ArmHistory().replay(disk.records).boot == MAX_PAST_AWARDS + 51
 
 
 @given(st.integers(0, 5), st.booleans(), st.booleans())
@@ -367,7 +356,7 @@ def test_a_compacted_history_is_the_same_history(cycles, leave, closed):
         executor.apply_lease(Lease("x", 4.0, (), (), (award.award,)), 1.0)
     if closed:
         executor.return_all(5.0, 1.0, "too hot")
-    history = ArmHistory().replay(disk)
+    history = ArmHistory().replay(disk.records)
     told = ArmHistory().replay(history.compact())
     assert (told.boot, told.accepted, told.reports) == (history.boot, history.accepted, history.reports)
     assert {n: (h.award, h.cycles, h.may_commit) for n, h in told.active.items()} == {

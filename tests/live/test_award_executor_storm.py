@@ -14,17 +14,13 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from fleet.bus.protocol.auction import Award, JobSpec, Lease, LeaseRequest, Receipt, Report
-from fleet.errors import JournalFull
 from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
 from fleet.live.arm.journal_records import ArmHistory
 from fleet.live.journal_records import CommitPermitted
+from tests.live.disk import Crash, Disk
 
 LEASE_S, VALID_S = 6.0, 3.0
 ARMS = ("a", "b")
-
-
-class Crash(Exception):
-    """The arm's process crashes in the middle of a call."""
 
 
 @dataclass
@@ -45,30 +41,18 @@ class Arm:
 
     name: str
     rate: float
-    disk: list = field(default_factory=list)
+    disk: Disk = field(default_factory=Disk)
     executor: AwardExecutor | None = None
     lives: int = 0
-    full: bool = False
-    crash: str = ""
     out: str = ""
     """Job for which it is away from home; "" at home."""
 
-    def keep(self, *records) -> None:
-        crash, self.crash = self.crash, ""
-        if crash == "before":
-            raise Crash
-        if self.full:
-            raise JournalFull("no room")
-        self.disk.extend(records)
-        if crash == "after":
-            raise Crash
-
     def start(self) -> None:
-        history = ArmHistory().replay(self.disk).after_restart(self.name, 0.0)
-        self.disk[:] = history.compact()
+        history = ArmHistory().replay(self.disk.records).after_restart(self.name, 0.0)
+        self.disk.records[:] = history.compact()
         self.lives += 1
         config = ExecutorConfig(valid_s=VALID_S, capacity=2, return_after_s=15.0)
-        self.executor = AwardExecutor(self.name, self.keep, history, nonce=f"n{self.lives}", config=config)
+        self.executor = AwardExecutor(self.name, self.disk.keep, history, nonce=f"n{self.lives}", config=config)
 
 
 class Storm(RuleBasedStateMachine):
@@ -222,10 +206,10 @@ class Storm(RuleBasedStateMachine):
 
     def restart(self, arm: Arm) -> None:
         """Restart a crashed arm; note the jobs that it was permitted to commit."""
-        left = {r.award for r in arm.disk if isinstance(r, CommitPermitted)}
-        held = ArmHistory().replay(arm.disk).active
+        left = {r.award for r in arm.disk.records if isinstance(r, CommitPermitted)}
+        held = ArmHistory().replay(arm.disk.records).active
         self.crashed_in_commit |= {held[name].award.job.name for name in left if name in held}
-        arm.crash = arm.out = ""  # a person moves it home before it is started again
+        arm.disk.crash = arm.out = ""  # a person moves it home before it is started again
         arm.start()
 
     def quote(self, name: str, jobs, asked: set[str]) -> None:
@@ -242,7 +226,7 @@ class Storm(RuleBasedStateMachine):
             ack = executor.answer_award(award, self.clock_s(arm))
             assert executor.answer_award(award, self.clock_s(arm)) == ack, "the same award, another answer"
             if ack.accepted:
-                known = [*ArmHistory().replay(arm.disk).accepted]
+                known = [*ArmHistory().replay(arm.disk.records).accepted]
                 assert award.award in known, "accepted, but not on disk"
             self.send(name, self.apply_ack, ack)
 
@@ -263,7 +247,7 @@ class Storm(RuleBasedStateMachine):
             for _, request in executor.lease_requests(now_s):
                 self.send(name, self.lease, name, arm.lives, request, now_s)
             for _, report in executor.due_reports(now_s):
-                assert report.award not in ArmHistory().replay(arm.disk).active, "reported, but not on disk"
+                assert report.award not in ArmHistory().replay(arm.disk.records).active, "reported, but not on disk"
                 self.send(name, self.report, name, report)
 
         self.at(name, call)
@@ -306,11 +290,11 @@ class Storm(RuleBasedStateMachine):
 
     @rule(name=st.sampled_from(ARMS), when=st.sampled_from(["before", "after"]))
     def crash_while_writing(self, name, when) -> None:
-        self.arms[name].crash = when
+        self.arms[name].disk.crash = when
 
     @rule(name=st.sampled_from(ARMS), full=st.booleans())
     def disk(self, name, full) -> None:
-        self.arms[name].full = full
+        self.arms[name].disk.full = full
 
     @rule(seconds=st.sampled_from([0.01, 0.3, 1.0, 2.9, 6.1, 40.0]))
     def wait(self, seconds) -> None:
@@ -414,7 +398,7 @@ class Storm(RuleBasedStateMachine):
 
     def teardown(self) -> None:
         for arm in self.arms.values():
-            arm.full, arm.crash = False, ""
+            arm.disk.full, arm.disk.crash = False, ""
         for _ in range(1500):
             idle = not any(arm.executor.active or arm.executor.has_pending_reports for arm in self.arms.values())
             if idle and all(o.state in ("finished", "unfinished") for o in self.orders.values()):

@@ -63,5 +63,5 @@ def test_arms_without_an_auctioneer_survive_a_kill_and_network_cuts():
 @pytest.mark.slow
 def test_a_fleet_survives_every_fault():
     processes = ("kill-arm", "stop-arm", "kill-router", "stuck-subscriber", "full-disk", "partition")
-    told = strike(*processes, "rubbish", "replayed-awards", jobs=24)
+    told = strike(*processes, "malformed", "replayed-awards", jobs=24)
     assert told.returncode == 0, told.stdout + told.stderr

@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from fleet.bus.protocol.auction import JobSpec
-from fleet.difficulty import Blind, known_temperatures
+from fleet.difficulty import Blind, Difficulty, known_temperatures
 from fleet.errors import InfeasibleJob
 from fleet.job import Place
 from fleet.live.arm.estimator import NOT_PLANNED, Estimator, NominalPeaks
@@ -117,3 +117,35 @@ def test_an_unplanned_job_is_reported_and_every_work_is_planned_once(arm):
     assert len(asked) == 1
     assert [o.feasible for o in estimator.estimate([one, other], KNOWN_C, 0.0)] == [True, False]
     assert not asked[1:]
+
+
+def test_cycles_that_are_done_cost_nothing(arm):
+    """The estimate is that of a job with as many cycles as are left."""
+    estimator, _ = estimator_of(arm, model=ByRepetitions())
+    begun, short = spec(repetitions=9), spec(name="k", repetitions=4)
+    assert not estimator.is_prepared(begun, 5)
+    estimator.prepare(begun, 5)
+    estimator.prepare(short)
+    rest, whole = estimator.estimate([begun, short], KNOWN_C, 10.0, {"j": 5})
+    assert rest.plans == whole.plans
+    assert rest.plans[0].p_saturation == pytest.approx(0.04)
+
+
+class ByRepetitions:
+    """A model whose P grows with the number of cycles."""
+
+    version = "by repetitions"
+
+    def score(self, plan, repetitions):
+        return Difficulty(np.full(7, 0.1), p_saturation=repetitions / 100.0)
+
+
+def test_an_estimate_says_whether_a_load_is_too_heavy(arm):
+    def plan(work):
+        raise InfeasibleJob(arm.robot.name, "bench", "4.6 kg is too much", too_heavy=work.payload_kg > 4.5)
+
+    estimator = Estimator(arm.model, plan, PLACES, NominalPeaks())
+    jobs = [spec(name=f"{kg} kg", payload_kg=kg) for kg in (1.0, 5.0)]
+    for job in jobs:
+        estimator.prepare(job)
+    assert [each.too_heavy for each in estimator.estimate(jobs, KNOWN_C, 0.0)] == [False, True]

@@ -130,7 +130,7 @@ class Served:
             line.settimeout(PATIENCE_S)
             line.connect(("127.0.0.1", self.port))
             head = "".join(f"{name}: {value}\r\n" for name, value in dict(headers).items())
-            line.sendall(f"GET /v3/events HTTP/1.1\r\nHost: localhost:{self.port}\r\n{head}\r\n".encode())
+            line.sendall(f"GET /v4/events HTTP/1.1\r\nHost: localhost:{self.port}\r\n{head}\r\n".encode())
             with line.makefile("r", encoding="utf-8", newline="\n") as file:
                 yield line, file
 
@@ -192,7 +192,7 @@ def until(condition, make=lambda: None):
 
 def test_the_fleet_is_shown_with_ages(gateway, arm):
     def fleet():
-        _, kind, told = gateway.ask("GET", "/v3/fleet")
+        _, kind, told = gateway.ask("GET", "/v4/fleet")
         assert kind == "application/json"
         return told if told["arms"] and told["arms"][0]["present"] and told["jobs"] else None
 
@@ -205,30 +205,30 @@ def test_the_fleet_is_shown_with_ages(gateway, arm):
 
 
 def test_jobs_are_submitted_and_quoted(gateway, arm):
-    status, _, told = gateway.ask("POST", "/v3/jobs", {"jobs": [CRATE_JSON], "by": "me"})
+    status, _, told = gateway.ask("POST", "/v4/jobs", {"jobs": [CRATE_JSON], "by": "me"})
     assert (status, told["jobs"][0]["accepted"]) == (200, True)
     assert arm.asked[-1].jobs[0].name == "crate 1"
-    status, _, told = gateway.ask("GET", "/v3/jobs?job=crate%201")
+    status, _, told = gateway.ask("GET", "/v4/jobs?job=crate%201")
     assert (status, told["jobs"][0]["state"]) == (200, "waiting")
-    status, _, told = gateway.ask("POST", "/v3/ask", {"jobs": [CRATE_JSON]})
+    status, _, told = gateway.ask("POST", "/v4/ask", {"jobs": [CRATE_JSON]})
     assert (status, told["quotes"][0]["estimates"][0]["plans"][0]["difficulty"]) == (200, 0.25)
 
 
 @pytest.mark.parametrize(
     ("method", "path", "body", "headers", "status", "says"),
     [
-        ("POST", "/v3/jobs", "{", {}, 422, "Not a thermofleet.Submission"),
-        ("POST", "/v3/jobs", {"jobs": []}, {}, 422, "length >= 1"),
-        ("POST", "/v3/jobs", {"jobs": [{**CRATE_JSON, "places": ["a", "b"]}]}, {}, 422, "place"),
-        ("POST", "/v3/jobs", b"\xff", {}, 422, "Not a"),
-        ("POST", "/v3/jobs", {"jobs": [CRATE_JSON]}, {"Content-Type": "text/plain"}, 415, "application/json"),
-        ("POST", "/v3/jobs", {"jobs": [CRATE_JSON], "by": "disk full"}, {}, 503, "no room"),
-        ("POST", "/v3/ask", {"jobs": []}, {}, 422, "length >= 1"),
-        ("POST", "/v3/jobs", b" " * (MAX_BYTES + 1), {}, 413, "at most"),
-        ("GET", "/v3/nothing", None, {}, 404, "Not Found"),
-        ("DELETE", "/v3/jobs", None, {}, 405, "Not Allowed"),
-        ("GET", "/v3/fleet", None, {"Host": "evil.example"}, 421, "evil.example"),
-        ("GET", "/v3/fleet", None, {"Host": "evil.example:80"}, 421, "evil.example"),
+        ("POST", "/v4/jobs", "{", {}, 422, "Not a thermofleet.Submission"),
+        ("POST", "/v4/jobs", {"jobs": []}, {}, 422, "length >= 1"),
+        ("POST", "/v4/jobs", {"jobs": [{**CRATE_JSON, "places": ["a", "b"]}]}, {}, 422, "place"),
+        ("POST", "/v4/jobs", b"\xff", {}, 422, "Not a"),
+        ("POST", "/v4/jobs", {"jobs": [CRATE_JSON]}, {"Content-Type": "text/plain"}, 415, "application/json"),
+        ("POST", "/v4/jobs", {"jobs": [CRATE_JSON], "by": "disk full"}, {}, 503, "no room"),
+        ("POST", "/v4/ask", {"jobs": []}, {}, 422, "length >= 1"),
+        ("POST", "/v4/jobs", b" " * (MAX_BYTES + 1), {}, 413, "at most"),
+        ("GET", "/v4/nothing", None, {}, 404, "Not Found"),
+        ("DELETE", "/v4/jobs", None, {}, 405, "Not Allowed"),
+        ("GET", "/v4/fleet", None, {"Host": "evil.example"}, 421, "evil.example"),
+        ("GET", "/v4/fleet", None, {"Host": "evil.example:80"}, 421, "evil.example"),
     ],
 )
 def test_an_error_is_a_problem_document(gateway, method, path, body, headers, status, says):
@@ -241,7 +241,7 @@ def test_an_error_is_a_problem_document(gateway, method, path, body, headers, st
 def test_a_body_of_unknown_length_is_limited_too(gateway):
     line = http.client.HTTPConnection("127.0.0.1", gateway.port, timeout=PATIENCE_S)
     parts = (b" " * 10_000 for _ in range(7))
-    line.request("POST", "/v3/jobs", parts, {"Content-Type": "application/json"}, encode_chunked=True)
+    line.request("POST", "/v4/jobs", parts, {"Content-Type": "application/json"}, encode_chunked=True)
     assert line.getresponse().status == 413
     line.close()
 
@@ -250,7 +250,7 @@ def test_a_slow_body_is_a_timeout(router):
     with Served(router, body_s=0.2) as served, socket.create_connection(("127.0.0.1", served.port)) as line:
         line.settimeout(PATIENCE_S)
         head = (
-            "POST /v3/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n"
+            "POST /v4/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n"
         )
         line.sendall(f"{head}{{".encode())
         assert b" 408 " in line.recv(1000)
@@ -258,9 +258,9 @@ def test_a_slow_body_is_a_timeout(router):
 
 def test_without_an_auctioneer_the_gateway_says_so():
     with Router() as empty, Served(empty.endpoint) as served:
-        status, _, told = served.ask("POST", "/v3/jobs", {"jobs": [CRATE_JSON]})
+        status, _, told = served.ask("POST", "/v4/jobs", {"jobs": [CRATE_JSON]})
         assert (status, told["detail"]) == (503, "There is no auctioneer in this fleet.")
-        status, _, told = served.ask("GET", "/v3/fleet")
+        status, _, told = served.ask("GET", "/v4/fleet")
         assert (status, told["arms"]) == (200, [])
 
 
@@ -269,17 +269,17 @@ def test_only_requests_with_the_token_are_served(router):
     with Served(router, token=token) as served:
         for wrong in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": f"Basic {token}"},
                       {"Authorization": f"Bearer {token}x"}, {"Authorization": f"Bearer {token[:-1]}"}):  # fmt: skip
-            status, kind, _ = served.ask("GET", "/v3/fleet", headers=wrong)
+            status, kind, _ = served.ask("GET", "/v4/fleet", headers=wrong)
             assert (status, kind) == (401, "application/problem+json")
         with served.stream() as (_, file):
             assert " 401 " in file.readline()
-        status, _, _ = served.ask("GET", "/v3/fleet", headers={"Authorization": f"bearer {token}", "Host": "any"})
+        status, _, _ = served.ask("GET", "/v4/fleet", headers={"Authorization": f"bearer {token}", "Host": "any"})
         assert status == 200
 
 
 def test_no_other_origin_is_ever_allowed(gateway):
     line = http.client.HTTPConnection("127.0.0.1", gateway.port, timeout=PATIENCE_S)
-    line.request("GET", "/v3/fleet", headers={"Origin": "http://evil.example"})
+    line.request("GET", "/v4/fleet", headers={"Origin": "http://evil.example"})
     assert not [name for name in line.getresponse().headers if name.lower().startswith("access-control")]
     line.close()
 
@@ -348,8 +348,8 @@ def test_the_number_of_readers_is_limited(gateway):
         for _ in range(64):
             stack.enter_context(gateway.stream())
         until(lambda: len(gateway.readers.connected) == 64)
-        assert gateway.ask("GET", "/v3/events")[0] == 503
-        assert gateway.ask("GET", "/v3/fleet")[0] == 200
+        assert gateway.ask("GET", "/v4/events")[0] == 503
+        assert gateway.ask("GET", "/v4/fleet")[0] == 200
 
 
 @contextmanager
@@ -372,7 +372,7 @@ def test_the_command_exits_on_a_signal_even_while_a_reader_is_connected(router, 
     with process(router) as (started, address):
         port = int(address.split(":")[2].split("/")[0])
         line = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
-        line.request("GET", "/v3/events")
+        line.request("GET", "/v4/events")
         assert line.getresponse().status == 200
         started.send_signal(number)
         assert started.wait(PATIENCE_S) == code

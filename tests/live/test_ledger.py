@@ -86,7 +86,7 @@ def test_accepted_jobs_can_be_ordered_and_rejected_ones_cannot(graph):
 # readiness
 
 
-def test_a_ready_job_is_released_after_its_predecessors_and_at_a_free_station():
+def test_a_ready_job_is_released_and_after_its_predecessors_and_a_free_station_counts_if_not_all_fit():
     book = ledger(
         spec("late", release_s=9.0, place="a"),
         spec("first", place="b"),
@@ -95,18 +95,19 @@ def test_a_ready_job_is_released_after_its_predecessors_and_at_a_free_station():
     )
     assert names(book.ready(0.0, 9)) == ["also at b", "first"]
     book.apply(award("first"))
-    assert names(book.ready(9.0, 9)) == ["late"]
+    assert names(book.ready(9.0, 9)) == ["also at b", "late"]
+    assert names(book.ready(9.0, 1)) == ["late"]
     book.apply(Closed("0:first", "finished", 4, 5.0))
     assert names(book.ready(9.0, 9)) == ["also at b", "next", "late"]
     assert names(book.ready(9.0, 1)) == ["also at b"]
 
 
-def test_the_oldest_jobs_are_offered_first():
+def test_the_oldest_jobs_are_offered_first_and_a_returned_one_counts_from_its_return():
     book = ledger(spec("b", release_s=1.0, place="x"), spec("a", release_s=2.0), spec("c", place="y"))
     assert names(book.ready(5.0, 2)) == ["c", "b"]
     book.apply(award("c"))
     book.apply(Closed("0:c", "returned", 1, 5.0, "too hot"))
-    assert names(book.ready(5.0, 2)) == ["c", "b"]
+    assert names(book.ready(5.0, 3)) == ["b", "a", "c"]
 
 
 # states of a job

@@ -137,13 +137,17 @@ def test_quotes_become_observations() -> None:
     fast = PlanQuote(0, 55.0, 9.0, 0.25, None, 1.5, 60.0, 100.0)
     cool = PlanQuote(1, 50.0, 4.0, 0.125, None, 1.25, 55.0, 95.0)
     quotes = {
-        "one": quote("one", Estimate("a", (fast, cool)), Estimate("b", reason="reach")),
+        "one": quote("one", Estimate("a", (fast, cool)), Estimate("b", reason="4.6 kg", too_heavy=True)),
         "two": quote("two", one_plan("b", peak_c=61.0), headroom_k=5.0),
     }
     full = {"three": quote("three", one_plan("a", duration_s=50.0), capacity=0, mode="working")}
-    states = {"two": State("two", 0, 0.0, "idle", (30.0,) * 6 + (55.0,), 5.0)}
-    bidding = Bidding("r", 100.0, jobs, quotes, full, states, {"two": 7.0}, {"a": (2, 90.0)})
-    seen = observe(bidding, LiveFleet(arms=("two", "one", "four"), warning_c=60.0, horizon_s=400.0), lost={"one"})
+    begun = {"job_value": 3.0, "job_cycles_left": 4, "job_peak_c": 57.0, "job_p_saturation": 0.25, "busy_s": 80.0}
+    states = {
+        "two": State("two", 0, 93.0, "idle", (30.0,) * 6 + (55.0,), 5.0, housing_c=(29.0,) * 7, ambient_c=21.0),
+        "three": State("three", 0, 98.0, "working", (40.0,) * 7, 20.0, **begun),
+    }
+    bidding = Bidding("r", 100.0, jobs, quotes, full, states, {"a": (2, 90.0)})
+    seen = observe(bidding, LiveFleet(arms=("two", "one", "four"), warning_c=60.0, horizon_s=400.0), last={"one": -1})
     assert list(seen) == ["two", "one", "four", "three"]
     one, two, three, four = (seen[name] for name in ("one", "two", "three", "four"))
     assert [o.action_mask.tolist() for o in (one, two, three, four)] == [  # wait; a; b; give back
@@ -152,14 +156,14 @@ def test_quotes_become_observations() -> None:
         [1, 0, 0, 0, 0, 0],
         [1, 0, 0, 0, 0, 0],
     ]
-    assert (one.clock, one.busy_s, one.last_award, two.last_award) == (0.25, 40.0, -1.0, 0.0)
+    assert (one.clock, one.busy_s, one.last_award, two.last_award) == (0.25, 0.0, -1.0, 0.0)
     assert [float(o.idle) for o in (one, two, three, four)] == [1, 1, 0, 0]
     assert [float(o.working) for o in (one, two, three, four)] == [0, 0, 1, 0]
     assert one.known.tolist() == [1, 1, 0, 0]
     assert one.difficulty.tolist() == [1.5, 1.25, 0, 0]
     assert one.peak_c.tolist() == [55.0, 50.0, 0, 0]
     assert one.p_saturation.tolist() == [0.25, 0.125, 0.5, 0.5]
-    assert two.p_saturation.tolist() == [0.5, 0.5, 1.0, 0.5]  # by its peak
+    assert two.p_saturation.tolist() == [0.5, 0.5, 0.5, 0.5]  # unknown without a model
     assert one.duration_s.tolist() == [60.0, 55.0, 0, 0]
     assert two.duration_s.tolist() == [0, 0, 60.0, 0]  # missing: as the longest
     assert one.slack_s.tolist() == [-10.0, -5.0, 0.0, 0.0]
@@ -167,9 +171,15 @@ def test_quotes_become_observations() -> None:
     assert one.age_s.tolist() == [10.0, 100.0]
     assert one.returns.tolist() == [2, 0]
     assert two.temp_c.tolist() == [30.0] * 6 + [55.0]
-    assert one.temp_c.tolist() == [40.0] * 7
+    assert one.temp_c.tolist() == one.housing_c.tolist() == [40.0] * 7  # without a state
+    assert (two.housing_c.tolist(), two.ambient_c) == ([29.0] * 7, 21.0)
+    assert (one.ambient_c, three.ambient_c) == (40.0, 40.0)  # unknown
+    assert (three.job_value, three.job_cycles, three.job_peak_c, three.job_p) == (3.0, 4.0, 57.0, 0.25)
+    assert (two.job_value, two.job_cycles, two.job_peak_c, two.job_p) == (0.0, 0.0, 0.0, 0.0)
+    assert one.peer_busy_s.tolist() == [0.0, 0.0, 80.0]
+    assert one.too_heavy.tolist() == [0, 1]
     assert one.peer_heard.tolist() == [1, 0, 1]  # two, four, three
-    assert one.peer_age_s.tolist() == [7.0, LONG_S, 0.0]
+    assert one.peer_age_s.tolist() == [7.0, LONG_S, 2.0]
     assert one.peer_working.tolist() == [0, 0, 1]
     assert two.peer_known.tolist() == [[1, 0], [0, 0], [0, 0]]
     assert two.peer_difficulty.tolist() == [[1.25, 0], [0, 0], [0, 0]]

@@ -139,18 +139,18 @@ JOBS = {"jobs": [{"name": "crate", "kind": "hold", "places": ["rack"]}]}
 
 def test_the_gateway_submits_with_the_certificate_of_a_submitter(fleet):
     with gateway(fleet, "gateway") as port:
-        code, told = asked(port, "POST", "/v3/jobs", JOBS)
+        code, told = asked(port, "POST", "/v4/jobs", JOBS)
         assert (code, told["jobs"][0]["accepted"]) == (200, True), told
-        code, told = asked(port, "POST", "/v3/ask", JOBS)
+        code, told = asked(port, "POST", "/v4/ask", JOBS)
         assert (code, [quote["arm"] for quote in told["quotes"]]) == (200, [ARM]), told
-        code, told = asked(port, "GET", "/v3/fleet")
+        code, told = asked(port, "GET", "/v4/fleet")
         assert (code, [arm["arm"] for arm in told["arms"]]) == (200, [ARM])
 
 
 def test_the_gateway_reports_that_a_monitor_may_not_submit(fleet):
     with gateway(fleet, "monitor") as port:
-        assert asked(port, "GET", "/v3/jobs?job=j")[0] == 200
-        for path in ("/v3/jobs", "/v3/ask"):
+        assert asked(port, "GET", "/v4/jobs?job=j")[0] == 200
+        for path in ("/v4/jobs", "/v4/ask"):
             code, told = asked(port, "POST", path, JOBS)
             assert code == 503
             assert "'monitor:monitor' may not query" in told["detail"]

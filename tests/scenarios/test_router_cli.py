@@ -79,9 +79,9 @@ def test_a_router_with_tls_enforces_access_and_the_state_rate(folder):
         ):
             heard: list[str] = []
             listener = monitor.declare_subscriber(
-                "thermofleet/v3/quickstart/**", lambda s: heard.append(str(s.key_expr))
+                "thermofleet/v4/quickstart/**", lambda s: heard.append(str(s.key_expr))
             )
-            cache = keys.caches_of("thermofleet/v3/quickstart/arm/nobody")
+            cache = keys.caches_of("thermofleet/v4/quickstart/arm/nobody")
             assert list(monitor.get(cache, timeout=PATIENT_S)) == []
             for _ in range(100):
                 arm.put(keys.of_arm("quickstart", "arm_0", "state"), b"")

@@ -18,13 +18,11 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from fleet.bus.protocol.messages import Name, finite
+from fleet.bus.protocol.messages import Count, Name, Share, finite
 from fleet.job import BOUNDS, DWELL_S, Kind, check_bounds, check_duration, check_places
 from fleet.telemetry import Mode
 
-Count = Annotated[int, msgspec.Meta(ge=0)]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
-Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 LEASE_S = 6.0
 """Real seconds that an arm may work on a job without renewing its lease."""
 MOST_PLANS = 8
@@ -106,6 +104,8 @@ class QuoteRequest(msgspec.Struct, frozen=True):
     jobs: Annotated[tuple[JobSpec, ...], msgspec.Meta(min_length=1, max_length=MOST_QUOTED)]
     dry_run: bool = False
     """Only an estimate: the quote cannot be awarded, and nothing changes at the arm."""
+    cycles: Annotated[dict[Name, Count], msgspec.Meta(max_length=MOST_QUOTED)] = {}
+    """Cycles that are done, by job; 0 if not named. The estimate is for the other cycles."""
 
 
 class PlanQuote(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -144,10 +144,14 @@ class JobEstimate(msgspec.Struct, frozen=True, omit_defaults=True):
     """Empty if the job is not feasible for the arm."""
     reason: str = ""
     """Why it is not."""
+    too_heavy: bool = False
+    """Whether the reason is that the load exceeds the arm's rating."""
 
     def __post_init__(self) -> None:
         if len({plan.plan for plan in self.plans}) < len(self.plans):
             raise ValueError(f"JobEstimate.plans of '{self.job}' must have different numbers.")
+        if self.too_heavy and self.plans:
+            raise ValueError(f"JobEstimate.too_heavy of '{self.job}' must be false, as it has plans.")
 
     @property
     def feasible(self) -> bool:

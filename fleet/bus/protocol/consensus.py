@@ -32,7 +32,7 @@ class Bid(msgspec.Struct, frozen=True):
     capacity: Count
     """How many more jobs it would accept now."""
     estimates: Annotated[tuple[JobEstimate, ...], msgspec.Meta(max_length=MOST_JOBS)]
-    """Estimates of jobs that could begin now, to this arm's knowledge; empty without capacity."""
+    """Estimates of jobs that wait for an arm, to this arm's knowledge."""
     open_count: Count
     """Number of jobs without an outcome, as far as this arm knows."""
     closed_count: Count = 0

@@ -70,6 +70,13 @@ _ALL: tuple[msgspec.Struct, ...] = (
         headroom_k=11.1,
         job="crate_1",
         space=_SPACE,
+        busy_s=52.5,
+        housing_c=(29.5, 41.0, 32.4, 36.2, 28.8, 28.6, 28.7),
+        ambient_c=24.5,
+        job_value=2.0,
+        job_cycles_left=4,
+        job_peak_c=51.0,
+        job_p_saturation=0.03,
     ),
     Info(arm=_ARM, joints=7, twin="lstm-vae-3f9a"),
     DifficultyScores(
@@ -82,7 +89,7 @@ _ALL: tuple[msgspec.Struct, ...] = (
         p_saturation=(0.07, None),
     ),
     ArmEvent(arm=_ARM, number=58, time_s=611.3, kind="warning", job="crate_1", joint=2, value=60.0),
-    QuoteRequest(auction=_ROUND, jobs=(CRATE,)),
+    QuoteRequest(auction=_ROUND, jobs=(CRATE,), cycles={"crate_1": 3}),
     Quote(
         arm=_ARM,
         auction=_ROUND,

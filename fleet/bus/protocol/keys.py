@@ -1,6 +1,6 @@
 """Keys of the bus: built and parsed here, and nowhere else.
 
-`thermofleet/v3/{fleet}/…` with `arm/{arm}/{topic}`, `auction/{auctioneer}/{topic}`, `jobs/{topic}` and `clock/now`.
+`thermofleet/v4/{fleet}/…` with `arm/{arm}/{topic}`, `auction/{auctioneer}/{topic}`, `jobs/{topic}` and `clock/now`.
 An arm queries an auctioneer under `auction/{auctioneer}/{topic}/{arm}`, and another arm under
 `arm/{other}/{topic}/{arm}`: access control sees only keys, so the querier must be part of the key.
 
@@ -19,7 +19,7 @@ AuctionTopic = Literal["alive", "announce", "result"]
 AskedTopic = Literal["lease", "report", "claim"]
 JobsTopic = Literal["submit", "status", "clear"]
 
-PREFIX = "thermofleet/v3"
+PREFIX = "thermofleet/v4"
 STATES = f"{PREFIX}/*/arm/*/state"
 """Key expression of the telemetry of every arm of every fleet; for router rules, not for publications."""
 TOPICS: dict[Role, tuple[str, ...]] = {
@@ -74,7 +74,7 @@ class Key:
 
 
 def of_arm(fleet: str, arm: str, topic: ArmTopic) -> str:
-    """Key of one arm: `thermofleet/v3/{fleet}/arm/{arm}/{topic}`."""
+    """Key of one arm: `thermofleet/v4/{fleet}/arm/{arm}/{topic}`."""
     return str(Key(fleet, "arm", arm, topic))
 
 
@@ -84,7 +84,7 @@ def of_every_arm(fleet: str, topic: ArmTopic) -> str:
 
 
 def of_auction(fleet: str, auctioneer: str, topic: AuctionTopic) -> str:
-    """Key of one auctioneer: `thermofleet/v3/{fleet}/auction/{auctioneer}/{topic}`."""
+    """Key of one auctioneer: `thermofleet/v4/{fleet}/auction/{auctioneer}/{topic}`."""
     return str(Key(fleet, "auction", auctioneer, topic))
 
 
@@ -94,7 +94,7 @@ def of_every_auction(fleet: str, topic: AuctionTopic) -> str:
 
 
 def asked_by(fleet: str, asked: str, topic: AskedTopic, arm: str) -> str:
-    """Key under which an arm queries another participant: `thermofleet/v3/{fleet}/auction/{asked}/{topic}/{arm}`
+    """Key under which an arm queries another participant: `thermofleet/v4/{fleet}/auction/{asked}/{topic}/{arm}`
     for an auctioneer, `…/arm/{asked}/…` for an arm.
     """
     return str(Key(fleet, _ASKED[topic], asked, topic, arm))
@@ -126,12 +126,12 @@ def answered(expression: str, asked: str) -> str:
 
 
 def of_jobs(fleet: str, topic: JobsTopic) -> str:
-    """Key at which outsiders submit jobs, query their status or free space: `thermofleet/v3/{fleet}/jobs/{topic}`."""
+    """Key at which outsiders submit jobs, query their status or free space: `thermofleet/v4/{fleet}/jobs/{topic}`."""
     return str(Key(fleet, "jobs", "", topic))
 
 
 def of_clock(fleet: str) -> str:
-    """Key at which fleet time is queried: `thermofleet/v3/{fleet}/clock/now`."""
+    """Key at which fleet time is queried: `thermofleet/v4/{fleet}/clock/now`."""
     return str(Key(fleet, "clock", "", "now"))
 
 

@@ -14,9 +14,11 @@ import msgspec
 from fleet.errors import BusError
 from fleet.telemetry import Mode
 
-VERSION = 3
+VERSION = 4
 Name = Annotated[str, msgspec.Meta(min_length=1)]
-Tick = Annotated[int, msgspec.Meta(ge=0)]
+Count = Annotated[int, msgspec.Meta(ge=0)]
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
+Celsius = Annotated[float, msgspec.Meta(ge=-273.15, le=1000)]
 
 
 class MalformedMessage(BusError, ValueError):
@@ -27,7 +29,7 @@ class State(msgspec.Struct, frozen=True, omit_defaults=True):
     """Telemetry of an arm; only the newest is valid. Quantities that are not measured are omitted."""
 
     arm: Name
-    tick: Tick
+    tick: Count
     """Counts the states of this arm; in a simulated shift, state and difficulty of one step have the same tick."""
     time_s: float
     mode: Mode
@@ -41,6 +43,18 @@ class State(msgspec.Struct, frozen=True, omit_defaults=True):
     """Name of the space that the arm takes while it is away from home; "" at home, or if the arm does not say."""
     busy_s: float = 0.0
     """Time until it is home with its current job done."""
+    housing_c: tuple[Celsius, ...] = ()
+    """Its estimate of the housing temperatures, which have no sensor, [joint]."""
+    ambient_c: Celsius | None = None
+    """Measured ambient temperature at the arm."""
+    job_value: Annotated[float, msgspec.Meta(ge=0, le=1e6)] = 0.0
+    """Value of the current job."""
+    job_cycles_left: Count = 0
+    """Cycles of the current job that are not done."""
+    job_peak_c: Celsius | None = None
+    """Predicted temperature of the hottest motor in the rest of the current job."""
+    job_p_saturation: Share | None = None
+    """Probability that a motor passes the warning limit in the rest of the current job."""
     q: tuple[float, ...] = ()
     """rad, [joint]."""
     qd: tuple[float, ...] = ()
@@ -51,9 +65,9 @@ class State(msgspec.Struct, frozen=True, omit_defaults=True):
     """[joint]."""
 
     def __post_init__(self) -> None:
-        for name in ("time_s", "headroom_k", "busy_s"):
+        for name in ("time_s", "headroom_k", "busy_s", "ambient_c", "job_value", "job_peak_c", "job_p_saturation"):
             finite("State", name, (getattr(self, name),))
-        for name in ("temp_c", "q", "qd", "tau", "current_a"):
+        for name in ("temp_c", "housing_c", "q", "qd", "tau", "current_a"):
             values = getattr(self, name)
             if not values:
                 continue
@@ -66,7 +80,7 @@ class DifficultyScores(msgspec.Struct, frozen=True):
     """How difficult the open jobs are for an arm, by its twin."""
 
     arm: Name
-    tick: Tick
+    tick: Count
     """Counts the scores of this arm; in a simulated shift, state and difficulty of one step have the same tick."""
     time_s: float
     twin: str
@@ -124,13 +138,13 @@ def _decoder(kind: type[Message]) -> msgspec.json.Decoder[Message]:
 
 
 def schema(kind: type[msgspec.Struct]) -> str:
-    """Name and version of a message's schema, for example `thermofleet.State.v3`."""
+    """Name and version of a message's schema, for example `thermofleet.State.v4`."""
     return f"thermofleet.{kind.__name__}.v{VERSION}"
 
 
 @cache
 def encoding(kind: type[msgspec.Struct]) -> str:
-    """The encoding that travels with every message, for example `application/json;thermofleet.State.v3`."""
+    """The encoding that travels with every message, for example `application/json;thermofleet.State.v4`."""
     return f"application/json;{schema(kind)}"
 
 

@@ -5,6 +5,7 @@ arm; not the true parameters of its body.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import repeat
 from typing import NamedTuple
@@ -28,6 +29,7 @@ MAX_WORKS, MAX_SCORES = 512, 4096
 """Works whose plans are kept, and jobs whose plans are kept."""
 STEPS = 24
 """Time steps of a job when its temperatures are predicted."""
+NO_CYCLES: Mapping[str, int] = {}
 NOT_PLANNED = "not planned yet; ask again"
 
 
@@ -75,6 +77,18 @@ class ScoredPlan(NamedTuple):
     difficulty: Difficulty | None
 
 
+@dataclass(frozen=True)
+class NoPlan:
+    """Why an arm cannot do a job."""
+
+    reason: str
+    too_heavy: bool = False
+
+
+Offers = tuple[ScoredPlan, ...] | NoPlan
+"""Plans on offer for a job, the fastest first, or why there is none."""
+
+
 class Estimator:
     """Plans the jobs of one arm, and estimates what each plan costs.
 
@@ -93,42 +107,46 @@ class Estimator:
         self.model = model
         self._plan, self._places, self._peaks = plan, places, peaks
         self._variants = lru_cache(MAX_WORKS)(self._variants_or_reason)
-        self._offers: dict[tuple[Work, int], tuple[ScoredPlan, ...] | str] = {}
-        """Plans of a work and a number of repetitions, the fastest first, or why there is none."""
+        self._offers: dict[tuple[Work, int, int], Offers] = {}
+        """By work, number of repetitions and how many of them are done."""
 
     def plan_ahead(self, works: Iterable[Work]) -> None:
         """Plan some works before they are requested."""
         for work in works:
             self._variants(work)
 
-    def is_prepared(self, job: JobSpec) -> bool:
-        """Whether an estimate of the job needs neither planning nor scoring."""
-        return self._offers_or_reason(job) != NOT_PLANNED
+    def is_prepared(self, job: JobSpec, done: int = 0) -> bool:
+        """Whether an estimate of the job needs neither planning nor scoring.
 
-    def prepare(self, job: JobSpec) -> None:
-        """Plan and score the job, maybe slowly; never raises."""
-        if self.is_prepared(job):
+        Args:
+            done: Cycles that are done.
+        """
+        return self._offers_or_reason(job, done) != NoPlan(NOT_PLANNED)
+
+    def prepare(self, job: JobSpec, done: int = 0) -> None:
+        """Plan and score the job, maybe slowly; never raises. Arguments as in `is_prepared`."""
+        if self.is_prepared(job, done):
             return
         work = self._work(job)
         assert isinstance(work, Work)
         if len(self._offers) >= MAX_SCORES:
             del self._offers[next(iter(self._offers))]
-        self._offers[work, job.repetitions] = self._scored_or_reason(work, job.repetitions)
+        self._offers[work, job.repetitions, done] = self._scored_or_reason(work, job.repetitions, done)
 
-    def _scored_or_reason(self, work: Work, repetitions: int) -> tuple[ScoredPlan, ...] | str:
+    def _scored_or_reason(self, work: Work, repetitions: int, done: int) -> Offers:
         variants = self._variants(work)
-        if isinstance(variants, str):
+        if isinstance(variants, NoPlan):
             return variants
-        offered = offered_plans(variants, repetitions)
+        offered = offered_plans(variants, repetitions)  # the plans and their numbers stay the same when cycles are done
         if (takes_s := offered[0].duration_s(repetitions)) > LONGEST_JOB_S:
             days = f"it would take {takes_s / 86400:.1f} days; at most {LONGEST_JOB_S / 86400:g} are allowed"
-            return f"{days}: use fewer repetitions"
-        return tuple(ScoredPlan(plan, self.model.score(plan, repetitions)) for plan in offered)
+            return NoPlan(f"{days}: use fewer repetitions")
+        return tuple(ScoredPlan(plan, self.model.score(plan, _left(repetitions, done))) for plan in offered)
 
     def job(self, job: JobSpec) -> Job | None:
         """Return the job with its work; None if it is not possible in this cell."""
         work = self._work(job)
-        if isinstance(work, str):
+        if isinstance(work, NoPlan):
             return None
         return Job(
             name=job.name,
@@ -145,45 +163,56 @@ class Estimator:
         """Return the plans on offer for the job, planned if needed, the fastest first; none if the arm cannot do it."""
         self.prepare(job)
         offers = self._offers_or_reason(job)
-        return () if isinstance(offers, str) else offers
+        return () if isinstance(offers, NoPlan) else offers
 
     def space_of(self, job: JobSpec, plan: int) -> str | None:
         """Return the name of the space that the arm takes by a plan on offer; None if there is no such plan."""
         offers = self.plans(job)
         return space_name(plan_key(offers[plan].plan)) if plan < len(offers) else None
 
-    def estimate(self, jobs: Sequence[JobSpec], known_c: Array, busy_s: float) -> tuple[JobEstimate, ...]:
-        """Estimate each job from what is planned already.
+    def estimate(
+        self, jobs: Sequence[JobSpec], known_c: Array, busy_s: float, cycles: Mapping[str, int] = NO_CYCLES
+    ) -> tuple[JobEstimate, ...]:
+        """Estimate the cycles of each job that are not done, from what is planned already.
 
         Args:
             known_c: Measured motor temperatures, estimated housing temperatures and ambient temperature, [KNOWN].
             busy_s: Seconds until the arm is free; inf if unknown.
+            cycles: Cycles that are done, by job; 0 if not named.
         """
-        offers = [(job, self._offers_or_reason(job)) for job in jobs]
+        offers = [(job, self._offers_or_reason(job, cycles.get(job.name, 0))) for job in jobs]
+        left = [_left(job.repetitions, cycles.get(job.name, 0)) for job in jobs]
         pairs = [
-            (scored.plan, job.repetitions) for job, plans in offers if not isinstance(plans, str) for scored in plans
+            (scored.plan, times)
+            for (_, plans), times in zip(offers, left, strict=True)
+            if not isinstance(plans, NoPlan)
+            for scored in plans
         ]
         nominal_c = iter(self._peaks.peaks_c([p for p, _ in pairs], [times for _, times in pairs], known_c).tolist())
         return tuple(
-            JobEstimate(job=job.name, reason=plans)
-            if isinstance(plans, str)
+            JobEstimate(job=job.name, reason=plans.reason, too_heavy=plans.too_heavy)
+            if isinstance(plans, NoPlan)
             else JobEstimate(
                 job=job.name,
-                plans=tuple(_quote(n, job, scored, known_c, next(nominal_c), busy_s) for n, scored in enumerate(plans)),
+                plans=tuple(
+                    _quote(n, times, scored, known_c, next(nominal_c), busy_s) for n, scored in enumerate(plans)
+                ),
             )
-            for job, plans in offers
+            for (job, plans), times in zip(offers, left, strict=True)
         )
 
-    def _offers_or_reason(self, job: JobSpec) -> tuple[ScoredPlan, ...] | str:
+    def _offers_or_reason(self, job: JobSpec, done: int = 0) -> Offers:
         """Plans of a prepared job, or why there is none."""
         work = self._work(job)
-        return work if isinstance(work, str) else self._offers.get((work, job.repetitions), NOT_PLANNED)
+        return (
+            work if isinstance(work, NoPlan) else self._offers.get((work, job.repetitions, done), NoPlan(NOT_PLANNED))
+        )
 
-    def _work(self, job: JobSpec) -> Work | str:
+    def _work(self, job: JobSpec) -> Work | NoPlan:
         """Return the work, or why it is not possible."""
         unknown = [name for name in job.places if name not in self._places]
         if unknown:
-            return f"there is no place '{unknown[0]}' in this cell; places: {', '.join(self._places)}"
+            return NoPlan(f"there is no place '{unknown[0]}' in this cell; places: {', '.join(self._places)}")
         try:
             return Work(
                 kind=job.kind,
@@ -193,21 +222,30 @@ class Estimator:
                 force_n=job.force_n,
             )
         except ValueError as error:
-            return str(error)
+            return NoPlan(str(error))
 
-    def _variants_or_reason(self, work: Work) -> tuple[Plan, ...] | str:
+    def _variants_or_reason(self, work: Work) -> tuple[Plan, ...] | NoPlan:
         try:
             return self._plan(work)
         except InfeasibleJob as infeasible:
-            return f"at '{infeasible.place}': {infeasible.reason}"
+            return NoPlan(f"at '{infeasible.place}': {infeasible.reason}", infeasible.too_heavy)
 
 
-def _quote(number: int, job: JobSpec, scored: ScoredPlan, known_c: Array, nominal_c: float, busy_s: float) -> PlanQuote:
-    """Return what a plan costs; its peak is that of the arm's model, or else that of a nominal arm."""
+def _left(repetitions: int, done: int) -> int:
+    """Return how many cycles are left; the last one is never assumed done."""
+    return max(1, repetitions - done)
+
+
+def _quote(number: int, left: int, scored: ScoredPlan, known_c: Array, nominal_c: float, busy_s: float) -> PlanQuote:
+    """Return what a plan costs; its peak is that of the arm's model, or else that of a nominal arm.
+
+    Args:
+        left: Cycles that are not done.
+    """
     plan, score = scored
     own_c = None if score is None else score.peak_at(known_c)
     peak_c, hottest_c = nominal_c if own_c is None else own_c, float(known_c[:JOINTS].max())
-    finish_s = busy_s + plan.approach.duration_s + job.repetitions * plan.cycle.duration_s
+    finish_s = busy_s + plan.approach.duration_s + left * plan.cycle.duration_s
     return PlanQuote(
         plan=number,
         peak_c=peak_c,
@@ -215,7 +253,7 @@ def _quote(number: int, job: JobSpec, scored: ScoredPlan, known_c: Array, nomina
         p_saturation=None if score is None else score.p_at(known_c),
         joint_difficulty=None if score is None else tuple(score.per_joint.tolist()),
         difficulty=None if score is None else score.total,
-        duration_s=plan.duration_s(job.repetitions),
+        duration_s=plan.duration_s(left),
         finish_in_s=finish_s if np.isfinite(finish_s) else None,
         space=space_name(plan_key(plan)),
     )

@@ -8,7 +8,7 @@ planned later, one motion per step, so that the next request finds them planned.
 import math
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,11 +24,13 @@ from fleet.events import Event
 from fleet.live.arm.auctioneer_client import AuctioneerClient, RateLimitedWarnings, WorkSource
 from fleet.live.arm.award_executor import AwardExecutor
 from fleet.live.arm.body import Body
-from fleet.live.arm.estimator import Estimator, ScoredPlan
+from fleet.live.arm.estimator import NO_CYCLES, Estimator, ScoredPlan
 from fleet.live.arm.journal_records import ActiveAward
 from fleet.live.clock import FleetClock, next_due_s
 from fleet.live.space import ANYWHERE
 from fleet.planning.space import plan_key, space_name
+
+Array = np.ndarray
 
 PLANNING_S = 0.3
 """Real seconds that one reply may spend on planning."""
@@ -85,7 +87,8 @@ class ArmNode:
         self._name = executor.arm
         self._body_award = ""
         """Award that the body works on."""
-        self._unplanned: deque[JobSpec] = deque(maxlen=MAX_UNPLANNED)
+        self._unplanned: deque[tuple[JobSpec, int]] = deque(maxlen=MAX_UNPLANNED)
+        """Jobs, and how many of their cycles are done."""
         self._reading = body.read_sensors()
         self._tick = self._events = 0
         self._state_due_s = self._retry_s = -math.inf
@@ -99,7 +102,7 @@ class ArmNode:
         self.link.serve(-math.inf if self._unplanned else min(until_s, self._state_due_s, self.work_source.wake_s))
         self._step()
         if self._unplanned:
-            self._estimator.prepare(self._unplanned.popleft())
+            self._estimator.prepare(*self._unplanned.popleft())
 
     def retire(self, until_s: float) -> None:
         """Return all awards, and report them until they are acknowledged or `time.monotonic()` is `until_s`."""
@@ -126,7 +129,7 @@ class ArmNode:
         jobs = {job.name: job for job in request.jobs}
         if len(jobs) != len(request.jobs):
             raise Refused("The request names a job twice.")
-        estimates, name = self.estimate(request.jobs), ""
+        estimates, name = self.estimate(request.jobs, request.cycles), ""
         real_s = time.monotonic()
         if not request.dry_run:
             offers = {estimate.job: (jobs[estimate.job], len(estimate.plans)) for estimate in estimates}
@@ -162,20 +165,30 @@ class ArmNode:
         jobs = {self.space_of(award.job, award.plan) or ANYWHERE for award in awards}
         return tuple(sorted(jobs.union(self.space)))
 
-    def estimate(self, jobs: tuple[JobSpec, ...]) -> tuple[JobEstimate, ...]:
-        """Estimate what jobs would cost the arm now; those that cannot be planned in time are called `NOT_PLANNED`."""
+    def estimate(self, jobs: tuple[JobSpec, ...], cycles: Mapping[str, int] = NO_CYCLES) -> tuple[JobEstimate, ...]:
+        """Estimate what jobs would cost the arm now; those that cannot be planned in time are called `NOT_PLANNED`.
+
+        Args:
+            cycles: Cycles that are done, by job; 0 if not named.
+        """
         until_s = time.monotonic() + PLANNING_S
         for job in jobs:
-            if self._estimator.is_prepared(job):
+            done = cycles.get(job.name, 0)
+            if self._estimator.is_prepared(job, done):
                 continue
             if time.monotonic() < until_s:
-                self._estimator.prepare(job)
+                self._estimator.prepare(job, done)
                 self._step()
             else:
-                self._unplanned.append(job)
-        ambient_c = self._config.ambient_c(self.clock.now_s(time.monotonic()))
-        known_c = known_temperatures(np.array(self._reading.temp_c), self._body.housing_c, ambient_c)
-        return self._estimator.estimate(jobs, known_c, self._busy_s())
+                self._unplanned.append((job, done))
+        return self._estimator.estimate(jobs, self._known_c(), self._busy_s(), cycles)
+
+    @property
+    def _ambient_c(self) -> float:
+        return self._config.ambient_c(self.clock.now_s(time.monotonic()))
+
+    def _known_c(self) -> Array:
+        return known_temperatures(np.array(self._reading.temp_c), self._body.housing_c, self._ambient_c)
 
     def publish_difficulty(self, estimates: tuple[JobEstimate, ...], real_s: float) -> None:
         """Publish how difficult jobs are for the arm, by the plan with the least difficulty."""
@@ -216,6 +229,8 @@ class ArmNode:
             return "I am faulted"
         if self._headroom_k <= 0:
             return f"I am too hot: a motor is {-self._headroom_k:.1f} K above the warning limit"
+        if self._body.away is not None and not self.executor.active:
+            return "I am on my way home"
         return ""
 
     # One step
@@ -337,9 +352,26 @@ class ArmNode:
                 job="" if self._current is None else self._current.job,
                 space="".join(self.space),
                 busy_s=busy_s if math.isfinite(busy_s := self._busy_s()) else 0.0,
+                housing_c=tuple(self._body.housing_c.tolist()),
+                ambient_c=self._ambient_c,
+                **self._describe_job(),
                 **vars(self._reading),
             )
         )
+
+    def _describe_job(self) -> dict[str, float | None]:
+        """Fields of the state about the current job, which the body has begun."""
+        current = self._current
+        if current is None or self._body_award != current.award.award:
+            return {}
+        job, score, left_s = current.award.job, self._scored(current.award).difficulty, self._body.free_in_s()
+        known_c = self._known_c()
+        return {
+            "job_value": job.value,
+            "job_cycles_left": job.repetitions - self._body.cycles,
+            "job_peak_c": None if score is None else score.peak_at(known_c, left_s),
+            "job_p_saturation": None if score is None else score.p_at(known_c, left_s),
+        }
 
     def _report_event(self, event: Event) -> None:
         self._events += 1

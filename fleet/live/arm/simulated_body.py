@@ -147,10 +147,13 @@ class SimulatedBody:
     def free_in_s(self) -> float:
         if self._faulted:
             return np.inf
-        last_s = self.last_cycle_in_s()
-        if self._task is None or not np.isfinite(last_s):
+        task = self._task
+        if task is None or task.released:
             return self._home_in_s
-        return last_s + self._task.plan.cycle.duration_s + self._task.plan.retreat.duration_s
+        if self._in_stint:  # all of the job, not only the cycles that are allowed now
+            more = task.job.repetitions - task.before - int(self._state.todo[0, 0])
+            return self._home_in_s + more * task.plan.cycle.duration_s
+        return self.last_cycle_in_s() + task.plan.cycle.duration_s + task.plan.retreat.duration_s
 
     def read_sensors(self) -> SensorReading:
         if self._last is None:

@@ -53,7 +53,7 @@ from fleet.live.auction.round import (
     drop_invalid,
     infeasible_jobs,
 )
-from fleet.live.auction.space_rules import cleared_space, drop_taken, retaken_space, stated_spaces
+from fleet.live.auction.space_rules import cleared_space, retaken_space, stated_spaces, waits_for_space
 from fleet.live.journal_records import Closed, CommitPermitted, JobsAccepted
 from fleet.live.space import Excludes, no_conflicts
 
@@ -315,26 +315,25 @@ class Auctioneer:
             return
         delayed = {job for job, at_s in self._later_s.items() if at_s > real_s}
         jobs = tuple(self.ledger.ready(time_s, self._timing.max_jobs, excluded=delayed))
-        if not jobs:
+        busy = self.ledger.busy_stations()
+        if not any(busy.isdisjoint(job.places) for job in jobs):
             return
         self._rounds += 1
         auction = f"{self.name}-{self._boot}-{self._rounds}"
         self._round = Round(auction, jobs, bidders, real_s + self._timing.window_s, self.ledger.closed_space())
         self.out.append(Announcement(self.name, auction, time_s, tuple(job.name for job in jobs)))
-        self.out.append(QuoteRequest(auction, jobs))
+        cycles = {job.name: done for job in jobs if (done := self.ledger.jobs[job.name].cycles)}
+        self.out.append(QuoteRequest(auction, jobs, cycles=cycles))
 
     def _close_round(self, closing: Round, real_s: float, time_s: float) -> None:
         self._round = None
         if not self._try_to_record("Nothing is awarded", *stated_spaces(self.ledger, closing, time_s)):
             self._delay(real_s, (job.name for job in closing.jobs))
             return
-        busy = self.ledger.busy_stations()
         entries = [self.ledger.jobs[job.name] for job in closing.jobs]
-        entries = [entry for entry in entries if entry.state == "waiting" and not busy & frozenset(entry.spec.places)]
+        entries = [entry for entry in entries if entry.state == "waiting"]
         jobs = tuple(entry.spec for entry in entries)
         quotes = {arm: quote for arm, quote in closing.quotes.items() if arm in closing.asked & self._present}
-        infeasible = infeasible_jobs(quotes)
-        quotes, waits = drop_taken(quotes, self.ledger.taken_space(), self._excludes)
         bidding = Bidding(
             closing.auction,
             time_s,
@@ -342,12 +341,14 @@ class Auctioneer:
             {arm: quote for arm, quote in quotes.items() if quote.capacity},
             {arm: quote for arm, quote in quotes.items() if not quote.capacity},
             states=self.states,
-            returned={entry.spec.name: (entry.returns, entry.returned_s) for entry in entries if entry.returns},
+            returned={entry.spec.name: (len(entry.faults), entry.returned_s) for entry in entries if entry.returns},
+            busy=self.ledger.busy_stations(),
+            taken=self.ledger.taken_space(),
             excludes=self._excludes,
         )
         for job in closing.jobs if quotes else ():
             self._notes.pop(job.name, None)
-        self._notes |= infeasible | waits
+        self._notes |= infeasible_jobs(quotes) | waits_for_space(bidding)
         allocation = drop_invalid(bidding, self._allocate(bidding)) if bidding.quotes and jobs else {}
         try:
             self._award(bidding, allocation, real_s, time_s)

@@ -4,7 +4,7 @@
 # pyright: standard
 
 from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
-from itertools import accumulate, islice
+from itertools import accumulate
 
 import networkx as nx
 from msgspec.structs import replace
@@ -120,15 +120,31 @@ def job_order(job: JobSpec) -> tuple[float, str]:
 
 
 def ready_jobs(
-    jobs: Iterable[JobSpec], time_s: float, limit: int, busy: frozenset[str], finished: Callable[[str], bool]
+    jobs: Iterable[JobSpec],
+    time_s: float,
+    limit: int,
+    busy: frozenset[str],
+    finished: Callable[[str], bool],
+    returned_s: Mapping[str, float],
 ) -> list[JobSpec]:
-    """Return the first jobs that can begin at a fleet time: released, predecessors finished, no station busy."""
-    ready = (
-        job
-        for job in jobs
-        if job.release_s <= time_s and not busy & frozenset(job.places) and all(map(finished, job.after))
-    )
-    return list(islice(ready, limit))
+    """Return the jobs that wait for an arm, as they queue: released, predecessors finished.
+
+    A job queues by its release, or by its last return. Of more than `limit` jobs, those with free stations come first.
+
+    Args:
+        busy: Stations at which an arm may be at work.
+        returned_s: Fleet time of the last return, by job.
+    """
+
+    def queued_s(job: JobSpec) -> float:
+        return max(job.release_s, returned_s.get(job.name, 0.0))
+
+    ready = [job for job in jobs if job.release_s <= time_s and all(map(finished, job.after))]
+    ready.sort(key=queued_s)
+    if len(ready) > limit:
+        ready = sorted(ready, key=lambda job: not busy.isdisjoint(job.places))[:limit]
+        ready.sort(key=queued_s)
+    return ready
 
 
 def status_reply(name: str, time_s: float, statuses: Iterable[JobStatus], taken: Mapping[str, Iterable[str]]) -> Status:

@@ -1,12 +1,13 @@
 """Observations of a live fleet: quotes and states in the fields that a policy reads in simulation too."""
 
 import logging
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from fleet.bus.protocol.auction import PlanQuote, Quote
+from fleet.bus.protocol.auction import JobEstimate, PlanQuote, Quote
+from fleet.bus.protocol.messages import State
 from fleet.live.auction.round import Bidding, Choice
 from fleet.observation import LONG_S, Layout, Observation, all_peers
 from fleet.offered_plans import PLANS
@@ -15,6 +16,8 @@ from fleet.robot import JOINTS
 _LOG = logging.getLogger(__name__)
 
 Array = np.ndarray
+
+NO_CLAIMS: Mapping[str, int] = {}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,84 +36,93 @@ class LiveFleet:
         return (*self.arms, *sorted(quotes.keys() - set(self.arms)))
 
 
-def observe(bidding: Bidding, fleet: LiveFleet, *, lost: Container[str] = ()) -> dict[str, Observation]:
+def observe(bidding: Bidding, fleet: LiveFleet, *, last: Mapping[str, int] = NO_CLAIMS) -> dict[str, Observation]:
     """Return the observation of every arm, by name; the jobs of the round are in the slots, in their order.
 
-    An option is a quoted plan, by its number; plans of a number from `PLANS` on are left out.
+    An option is a quoted plan, by its number; plans of a number from `PLANS` on are left out. What an arm knows of
+    itself is in its quote and its last state, as is what its peers know of it; a peer without either is not heard.
 
-    Some fields are on no message: `ambient_c`, `job_value`, `job_cycles`, `job_peak_c`, `job_p`, `too_heavy` and
-    `peer_blocks` are 0, `station_free` is 1, `space_free` equals `feasible`, `housing_c` equals `temp_c`, and
-    `last_award` is never 1. `busy_s` and `peer_busy_s` follow from the quotes of the round.
-
-    An arm without capacity counts as working and can claim nothing; an arm without a quote has an unknown state. The
-    probability to pass the warning limit is the quoted one; without it, 1 or 0 by the quoted peak; without either, 0.5.
-    A missing duration counts as the longest of the round.
+    An arm without capacity counts as working and can claim nothing. A plan without difficulty and without P(saturation)
+    has an unknown P and peak, as in simulation. A missing duration counts as the longest of the round, a missing
+    housing temperature as that of the motor, and a missing ambient temperature as that of the coolest motor.
 
     Args:
-        lost: Arms whose last claim was lost to another arm.
+        last: Outcome of the last claim of each arm: 1 won, -1 lost.
     """
     by_arm = {**bidding.full, **bidding.quotes}
     arms, time_s = fleet.order(by_arm), bidding.time_s
     layout, peers = Layout(len(arms), len(bidding.jobs), plans=PLANS), all_peers(len(arms))
-    quotes = [by_arm.get(arm) for arm in arms]
-    offers = [_plans_of(quote, bidding) for quote in quotes]
-
-    def each(value: Callable[[Quote], float]) -> Array:
-        return np.array([0.0 if quote is None else value(quote) for quote in quotes])
+    quotes, states = [by_arm.get(arm) for arm in arms], [bidding.states.get(arm) for arm in arms]
+    estimates = [{} if quote is None else {offer.job: offer for offer in quote.estimates} for quote in quotes]
+    offers = [_plans_of(by_job, bidding) for by_job in estimates]
+    in_the_way = [
+        [bidding.in_the_way(arm, plan.space) if plan else () for plan in row]
+        for arm, row in zip(arms, offers, strict=True)
+    ]
+    names = [job.name for job in bidding.jobs]
 
     def table(value: Callable[[PlanQuote], float | None]) -> Array:
         rows = [[None if plan is None else value(plan) for plan in row] for row in offers]
         return np.array(rows, float).reshape(len(arms), -1)  # [arm, option]; None becomes NaN
 
+    def stated(value: Callable[[State], float | None]) -> Array:
+        return np.array([(0.0 if state is None else value(state)) or 0.0 for state in states])
+
     def per_option(per_slot: Array) -> Array:
         return np.repeat(per_slot, PLANS, axis=-1)
 
-    def per_job(values: list[float]) -> Array:
+    def per_job(values: Sequence[float]) -> Array:
         return np.broadcast_to(np.array(values, dtype=float), (len(arms), layout.slots))
 
-    quoted = each(lambda quote: 1.0)
-    faulted = each(lambda quote: quote.mode == "faulted")
-    room = each(lambda quote: quote.capacity > 0) * (1.0 - faulted)
+    heard = [quote or state for quote, state in zip(quotes, states, strict=True)]
+    modes = np.array([each.mode if each else "" for each in heard])
+    headroom_k = np.array([each.headroom_k if each else 0.0 for each in heard])
+    room = np.array([quote is not None and quote.capacity > 0 for quote in quotes]) & (modes != "faulted")
+    working = np.isin(modes, ["idle", "working"]) & ~room
     feasible = table(lambda offer: 1.0) > 0
-    difficulty = table(lambda offer: offer.difficulty)
+    free = np.array([[not in_way for in_way in row] for row in in_the_way]).reshape(feasible.shape)
+    blocks = [
+        [[peer in in_way for in_way in row[::PLANS]] for peer in arms if peer != arm]
+        for arm, row in zip(arms, in_the_way, strict=True)
+    ]
+    too_heavy = [[name in row and row[name].too_heavy for name in names] for row in estimates]
+    stations = [bidding.has_free_stations(job) for job in bidding.jobs]
+    difficulty, p_saturation = table(lambda offer: offer.difficulty), table(lambda offer: offer.p_saturation)
     known = ~np.isnan(difficulty)
+    least = np.where(known, difficulty, np.inf).reshape(len(arms), -1, PLANS).min(axis=-1)  # [arm, slot]
+    scored = known | ~np.isnan(p_saturation)
     quoted_s = table(lambda offer: offer.duration_s)
     longest_s = np.nan_to_num(quoted_s).max(initial=0.0)
     duration_s = np.where(feasible, np.where(np.isnan(quoted_s), longest_s, quoted_s), 0.0)
-    busy_s = np.nan_to_num(table(lambda offer: offer.finish_in_s) - quoted_s).max(axis=1, initial=0.0)
     queued_s = [max(job.release_s, bidding.returned.get(job.name, (0, 0.0))[1]) for job in bidding.jobs]
     due_s = per_job([LONG_S + time_s if job.due_s is None else job.due_s for job in bidding.jobs])
-    headroom_k = each(lambda quote: quote.headroom_k)
-    difficulty = np.where(known, difficulty, 0.0)
-    working = quoted * (1.0 - faulted) * (1.0 - room)
-    least = np.where(known, difficulty, np.inf).reshape(len(arms), -1, PLANS).min(axis=-1)  # [arm, slot]
-    peak_c = table(lambda offer: offer.peak_c)
-    temp_c = np.array([_temp_c(arm, k, bidding, fleet) for arm, k in zip(arms, headroom_k, strict=True)])
-    nothing, no_slots = np.zeros(len(arms)), np.zeros((len(arms), layout.slots))
+    busy_s = stated(lambda state: state.busy_s)
+    ambient_c = np.array([each.ambient_c if each else None for each in states], float)  # None becomes NaN
+    temp_c = _per_joint(states, "temp_c", np.repeat(fleet.warning_c - headroom_k[:, None], JOINTS, axis=1))
     fields = Observation(
         clock=np.full(len(arms), time_s / fleet.horizon_s),
         idle=room,
         working=working,
-        faulted=faulted,
+        faulted=modes == "faulted",
         busy_s=busy_s,
-        last_award=np.array([-1.0 if arm in lost else 0.0 for arm in arms]),
+        last_award=np.array([last.get(arm, 0) for arm in arms]),
         temp_c=temp_c,
-        housing_c=temp_c,
-        ambient_c=np.zeros(len(arms)),
+        housing_c=_per_joint(states, "housing_c", temp_c),
+        ambient_c=np.where(np.isnan(ambient_c), temp_c.min(axis=1), ambient_c),
         headroom_k=headroom_k,
-        job_value=nothing,
-        job_cycles=nothing,
-        job_peak_c=nothing,
-        job_p=nothing,
+        job_value=stated(lambda state: state.job_value),
+        job_cycles=stated(lambda state: state.job_cycles_left),
+        job_peak_c=stated(lambda state: state.job_peak_c),
+        job_p=stated(_risk_of_job),
         offered=per_job([1.0] * layout.slots),
-        station_free=per_job([1.0] * layout.slots),
-        too_heavy=no_slots,
+        station_free=per_job(stations),
+        too_heavy=np.array(too_heavy).reshape(len(arms), layout.slots),
         feasible=feasible,
-        space_free=feasible,
+        space_free=feasible & free,
         known=known,
-        difficulty=difficulty,
-        peak_c=np.nan_to_num(peak_c),
-        p_saturation=_risk(table(lambda offer: offer.p_saturation), peak_c, fleet.warning_c),
+        difficulty=np.where(known, difficulty, 0.0),
+        peak_c=np.where(scored, np.nan_to_num(table(lambda offer: offer.peak_c)), 0.0),
+        p_saturation=np.where(np.isnan(p_saturation), 0.5, p_saturation),
         duration_s=duration_s,
         slack_s=np.where(feasible, per_option(due_s) - time_s - duration_s, 0.0),
         age_s=time_s - per_job(queued_s),
@@ -118,19 +130,20 @@ def observe(bidding: Bidding, fleet: LiveFleet, *, lost: Container[str] = ()) ->
         value=per_job([job.value for job in bidding.jobs]),
         returns=per_job([bidding.returned.get(job.name, (0, 0.0))[0] for job in bidding.jobs]),
         expires=per_job([float(job.expires) for job in bidding.jobs]),
-        peer_heard=quoted[peers],
-        peer_age_s=np.where(quoted > 0, [bidding.ages_s.get(arm, 0.0) for arm in arms], LONG_S)[peers],
+        peer_heard=np.array([each is not None for each in heard])[peers],
+        peer_age_s=np.array([_age_s(arm, bidding) for arm in arms])[peers],
         peer_working=working[peers],
-        peer_faulted=faulted[peers],
+        peer_faulted=(modes == "faulted")[peers],
         peer_headroom_k=headroom_k[peers],
         peer_busy_s=busy_s[peers],
         peer_known=np.isfinite(least)[peers],
         peer_difficulty=np.where(np.isfinite(least), least, 0.0)[peers],
-        peer_blocks=no_slots[peers],
+        peer_blocks=np.array(blocks).reshape(*peers.shape, layout.slots),
         action_mask=np.zeros(0),
     )
     # Waiting is always legal; a live fleet has no action to give a job back.
-    mask = np.pad((feasible & (room > 0)[:, None]).astype(np.int8), ((0, 0), (1, 1)), constant_values=((0, 0), (1, 0)))
+    legal = feasible & free & per_option(per_job(stations) > 0) & room[:, None]
+    mask = np.pad(legal.astype(np.int8), ((0, 0), (1, 1)), constant_values=((0, 0), (1, 0)))
     vectors = layout.pack(fields)
     return {arm: layout.read(vectors[a], mask[a]) for a, arm in enumerate(arms)}
 
@@ -150,22 +163,27 @@ def claimed_jobs(
     return claims
 
 
-def _plans_of(quote: Quote | None, bidding: Bidding) -> list[PlanQuote | None]:
+def _plans_of(by_job: Mapping[str, JobEstimate], bidding: Bidding) -> list[PlanQuote | None]:
     """Return the quoted plan of each option of the round."""
-    by_job = (
-        {} if quote is None else {offer.job: {plan.plan: plan for plan in offer.plans} for offer in quote.estimates}
-    )
-    return [by_job.get(job.name, {}).get(plan) for job in bidding.jobs for plan in range(PLANS)]
+    quoted = {name: {plan.plan: plan for plan in offer.plans} for name, offer in by_job.items()}
+    return [quoted.get(job.name, {}).get(plan) for job in bidding.jobs for plan in range(PLANS)]
 
 
-def _temp_c(arm: str, headroom_k: float, bidding: Bidding, fleet: LiveFleet) -> Array:
-    """Return the published motor temperatures, [joint]; without any, the hottest one for all."""
-    state = bidding.states.get(arm)
-    if state is None or len(state.temp_c) != JOINTS:
-        return np.full(JOINTS, fleet.warning_c - headroom_k)
-    return np.array(state.temp_c)
+def _per_joint(states: Sequence[State | None], name: str, otherwise_c: Array) -> Array:
+    """Return temperatures of the joints by the states, [arm, joint]; `otherwise_c` where a state has none."""
+    rows = [() if state is None else getattr(state, name) for state in states]
+    return np.array([row if len(row) == JOINTS else other for row, other in zip(rows, otherwise_c, strict=True)])
 
 
-def _risk(p_saturation: Array, peak_c: Array, warning_c: float) -> Array:
-    by_peak = np.where(np.isnan(peak_c), 0.5, peak_c > warning_c)
-    return np.where(np.isnan(p_saturation), by_peak, p_saturation)
+def _risk_of_job(state: State) -> float:
+    """Return P(saturation) of the rest of the current job, 0.5 if unknown, and 0 without one."""
+    if not state.job_cycles_left:
+        return 0.0
+    return 0.5 if state.job_p_saturation is None else state.job_p_saturation
+
+
+def _age_s(arm: str, bidding: Bidding) -> float:
+    """Return the age of the newest message of an arm."""
+    quote, state = bidding.quotes.get(arm) or bidding.full.get(arm), bidding.states.get(arm)
+    sent_s = [message.time_s for message in (quote, state) if message is not None]
+    return max(0.0, bidding.time_s - max(sent_s)) if sent_s else LONG_S

@@ -185,13 +185,13 @@ class Ledger(TimedState[AuctionRecord]):
         return admit(jobs, known, places=self.places, ended=self.ended, given_up=given_up)
 
     def ready(self, time_s: float, limit: int, *, excluded: Container[str] = ()) -> list[JobSpec]:
-        """Return the first jobs that can begin now: released, predecessors finished, stations free."""
+        """Return the jobs that wait for an arm, as `ready_jobs` does."""
         if self.ended:
             return []
-        entries = (entry for name, entry in self.jobs.items() if name not in excluded)
-        waiting = (entry.spec for entry in entries if entry.state == "waiting")
-        busy = self.busy_stations()
-        return ready_jobs(waiting, time_s, limit, busy, lambda name: self.jobs[name].state == "finished")
+        waiting = [e for name, e in self.jobs.items() if name not in excluded and e.state == "waiting"]
+        returned_s = {entry.spec.name: entry.returned_s for entry in waiting}
+        specs, busy = (entry.spec for entry in waiting), self.busy_stations()
+        return ready_jobs(specs, time_s, limit, busy, lambda name: self.jobs[name].state == "finished", returned_s)
 
     def expired(self, time_s: float) -> list[Expired]:
         """Return the waiting jobs whose hard due date has passed."""

@@ -64,27 +64,49 @@ class Bidding:
     """Quotes of the arms without."""
     states: Mapping[str, State] = field(default_factory=dict[str, State])
     """Latest published state of each arm."""
-    ages_s: Mapping[str, float] = field(default_factory=dict[str, float])
-    """Age of a quote, fleet seconds; 0 where none is given."""
     returned: Mapping[str, tuple[int, float]] = field(default_factory=dict[str, tuple[int, float]])
-    """Number of returns of a job, and fleet time of the last one; only of jobs that were ever returned."""
+    """Number of faults in a job, and fleet time at which it last returned; only of jobs that were ever returned."""
+    busy: frozenset[str] = frozenset()
+    """Stations at which an arm may be at work."""
+    taken: Mapping[str, frozenset[str]] = field(default_factory=dict[str, frozenset[str]])
+    """Names of the spaces that each arm may take."""
     excludes: Excludes = no_conflicts
 
     def offer(self, arm: str, job: str, plan: int = 0) -> PlanQuote | None:
-        """Return what an arm quotes for a plan of a job of the round; None if it has not quoted that plan."""
+        """Return what an arm quotes for a plan of a job of the round; None if it is not open."""
         return self.plans(arm, job).get(plan)
 
     def plans(self, arm: str, job: str) -> Mapping[int, PlanQuote]:
-        """Return an arm's plans for a job of the round, by number; none if it did not bid for it, or cannot do it."""
+        """Return an arm's open plans for a job of the round, by number.
+
+        A plan is open if the arm has capacity and quotes the plan, and its stations and its space are free.
+        """
         return self._plans.get((arm, job), {})
 
     @cached_property
     def _plans(self) -> dict[tuple[str, str], dict[int, PlanQuote]]:
-        names = {job.name for job in self.jobs}
+        names = {job.name for job in self.jobs if self.has_free_stations(job)}
         pairs = ((arm, offer) for arm, quote in self.quotes.items() for offer in quote.estimates)
         return {
-            (arm, offer.job): {plan.plan: plan for plan in offer.plans} for arm, offer in pairs if offer.job in names
+            (arm, offer.job): {plan.plan: plan for plan in offer.plans if not self.in_the_way(arm, plan.space)}
+            for arm, offer in pairs
+            if offer.job in names
         }
+
+    def has_free_stations(self, job: JobSpec) -> bool:
+        """Return whether no arm is at work at the stations of a job."""
+        return self.busy.isdisjoint(job.places)
+
+    def in_the_way(self, arm: str, space: str | None) -> tuple[str, ...]:
+        """Return the arms that take a space which excludes this one of an arm."""
+        key = arm, space
+        if key not in self._in_the_way:
+            self._in_the_way[key] = arms_in_the_way(arm, space, self.taken, self.excludes)
+        return self._in_the_way[key]
+
+    @cached_property
+    def _in_the_way(self) -> dict[tuple[str, str | None], tuple[str, ...]]:
+        return {}
 
 
 class Choice(NamedTuple):

@@ -1,15 +1,13 @@
 """Space in an auction: what quotes say about it, which estimates it closes, and whose space a person may free."""
 
-from collections.abc import Iterable, Mapping, Set
+from collections.abc import Mapping, Set
 
-from msgspec.structs import replace
-
-from fleet.bus.protocol.auction import ClearRequest, JobEstimate, Quote
+from fleet.bus.protocol.auction import ClearRequest, Quote
 from fleet.errors import Refused
 from fleet.live.auction.ledger import Ledger
-from fleet.live.auction.round import MAX_REASON, Round
+from fleet.live.auction.round import MAX_REASON, Bidding, Round
 from fleet.live.journal_records import Closed, SpaceCleared, SpaceTaken
-from fleet.live.space import ANYWHERE, Excludes, arms_in_the_way
+from fleet.live.space import ANYWHERE
 
 
 def _stated_space(quote: Quote) -> frozenset[str]:
@@ -19,34 +17,22 @@ def _stated_space(quote: Quote) -> frozenset[str]:
     return frozenset(quote.space)
 
 
-def drop_taken(
-    quotes: Mapping[str, Quote], taken: Mapping[str, Iterable[str]], excludes: Excludes
-) -> tuple[dict[str, Quote], dict[str, str]]:
-    """Return the quotes without plans whose space another arm takes; and why a job is in no quote any more.
-
-    Args:
-        taken: Names of the spaces that each arm may take.
-    """
-    kept: dict[str, Quote] = {}
+def waits_for_space(bidding: Bidding) -> dict[str, str]:
+    """Return why no plan for a job has free space, by job."""
     waits: dict[str, set[str]] = {}
-    for arm, quote in quotes.items():
-        spaces = {plan.space for offer in quote.estimates for plan in offer.plans}
-        in_way = {space: arms_in_the_way(arm, space, taken, excludes) for space in spaces}
-        estimates: list[JobEstimate] = []
+    open_jobs: set[str] = set()
+    for arm, quote in {**bidding.quotes, **bidding.full}.items():
         for offer in quote.estimates:
-            open_plans = tuple(plan for plan in offer.plans if not in_way[plan.space])
             for plan in offer.plans:
-                waits.setdefault(offer.job, set()).update(in_way[plan.space])
-            if open_plans or not offer.feasible:
-                estimates.append(replace(offer, plans=open_plans))
-        kept[arm] = replace(quote, estimates=tuple(estimates))
-    open_jobs = {offer.job for quote in kept.values() for offer in quote.estimates if offer.feasible}
-    reasons = {
+                in_way = bidding.in_the_way(arm, plan.space)
+                waits.setdefault(offer.job, set()).update(in_way)
+                if not in_way:
+                    open_jobs.add(offer.job)
+    return {
         job: f"It waits until {', '.join(sorted(arms))} is out of the way."[:MAX_REASON]
         for job, arms in waits.items()
         if arms and job not in open_jobs
     }
-    return kept, reasons
 
 
 def stated_spaces(ledger: Ledger, closing: Round, time_s: float) -> list[SpaceTaken]:

@@ -31,7 +31,7 @@ from fleet.errors import JournalFull, Refused
 from fleet.job import reason_to_give_up
 from fleet.live.auction.job_rules import reason_for_silence
 from fleet.live.auction.round import Timing
-from fleet.live.consensus.records import ClaimNumbered, Faulted, GrantRecord, JobGranted, JobSettled
+from fleet.live.consensus.records import ClaimNumbered, Faulted, GrantRecord, JobGranted, JobReturned, JobSettled
 from fleet.live.journal import TimedState
 from fleet.live.journal_records import ClockTick, JobsAccepted, Progress, Released, SpaceCleared, SpaceTaken
 from fleet.live.space import ANYWHERE, Excludes, arms_in_the_way, no_conflicts
@@ -61,6 +61,8 @@ class Register(TimedState[GrantRecord]):
     """By job; finished, unfinished for good, or given up."""
     faults: dict[str, Faults] = field(default_factory=dict[str, Faults])
     """Faults of arms, by job."""
+    returned_s: dict[str, float] = field(default_factory=dict[str, float])
+    """Fleet time at which an arm last returned a job, by job."""
     cycles: dict[str, int] = field(default_factory=dict[str, int])
     """Cycles known to be done, by job."""
     numbers: dict[str, int] = field(default_factory=dict[str, int])
@@ -89,11 +91,16 @@ class Register(TimedState[GrantRecord]):
                 self._count(outcome.job, outcome.cycles)
                 self.time_s = max(self.time_s, outcome.time_s)
                 self._add_faults(outcome.job, outcome.faults)
-                if outcome.outcome != "returned":
+                if outcome.outcome == "returned":
+                    self._return(outcome.job, outcome.time_s)
+                else:
                     self.settled[outcome.job] = outcome
                     self.grants.pop(outcome.job, None)
+                    self.returned_s.pop(outcome.job, None)
             case Faulted(job, faults):
                 self._add_faults(job, faults)
+            case JobReturned(job, time_s):
+                self._return(job, time_s)
             case JobsAccepted(jobs):
                 self.jobs |= {job.name: job for job in jobs}
             case ClockTick(time_s):
@@ -122,6 +129,7 @@ class Register(TimedState[GrantRecord]):
                 JobGranted(grant.arm, number, grant.award, job, grant.places, cycles, grant.may_commit, grant.revoked)
             )
         records += [Faulted(job, faults) for job, faults in self.faults.items() if job not in self.settled]
+        records += [JobReturned(job, time_s) for job, time_s in self.returned_s.items()]
         records += [JobSettled(outcome) for outcome in self.settled.values()]
         known = {arm: names for arm, names in self.space.items() if ANYWHERE not in names}
         records += [SpaceTaken(arm, tuple(sorted(names))) for arm, names in known.items()]
@@ -144,6 +152,10 @@ class Register(TimedState[GrantRecord]):
     def _add_faults(self, job: str, faults: Faults) -> None:
         if faults:
             self.faults[job] = self.faults.get(job, {}) | faults
+
+    def _return(self, job: str, time_s: float) -> None:
+        if job not in self.settled:
+            self.returned_s[job] = max(time_s, self.returned_s.get(job, 0.0))
 
     def _count(self, job: str, cycles: int) -> None:
         self.cycles[job] = max(cycles, self.cycles.get(job, 0))

@@ -3,7 +3,8 @@
 A state machine without a clock and without I/O. Real seconds (`real_s`, monotonic) and fleet time (`time_s`) are
 arguments; messages to send are in `out`. The steps of an arm with capacity for a job:
 
-1. It publishes a bid with an estimate for every job that can begin now.
+1. It publishes a bid with an estimate for every job that waits for an arm. Arms without capacity bid too, as their
+   peers know by it how well a job suits them.
 2. When the bids of its peers have arrived, its policy chooses a job, and the next bid names it.
 3. When the choices of its peers have arrived, of two that exclude each other the one with the lower difficulty remains.
 4. It claims the job that remains (`fleet.live.consensus.claimant`); a majority has to grant it.
@@ -20,7 +21,7 @@ from random import Random
 
 from msgspec.structs import replace
 
-from fleet.bus.protocol.auction import JobEstimate, JobSpec, JobStatus, Quote
+from fleet.bus.protocol.auction import JobSpec, JobStatus, Quote
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply
 from fleet.bus.protocol.messages import State
 from fleet.live.arm.node import ArmNode
@@ -230,7 +231,7 @@ class Participant:
     # Bids and choices
 
     def _ready(self, real_s: float, time_s: float) -> list[JobSpec]:
-        """Return the first jobs that can begin now and that no arm has, without recently rejected ones."""
+        """Return the jobs that wait for an arm, as they queue, without recently rejected ones."""
         settled = self.granter.register.settled
         free = (
             job
@@ -244,19 +245,22 @@ class Participant:
         def finished(name: str) -> bool:
             return name in settled and settled[name].outcome == "finished"
 
-        return ready_jobs(free, time_s, self._slots, self.granter.busy_stations(real_s), finished)
+        busy, returned_s = self.granter.busy_stations(real_s), self.granter.register.returned_s
+        return ready_jobs(free, time_s, self._slots, busy, finished, returned_s)
 
     def _bid(self, real_s: float, time_s: float) -> None:
         """Publish a bid when its content has changed, and every `BID_S`."""
         capacity = 0 if self.ended or self._arm.unfit() else max(0, self.claimant.capacity)
-        ready = self._ready(real_s, time_s) if capacity else []
+        ready = [] if self.ended else self._ready(real_s, time_s)
         names = [job.name for job in ready]
         if self._choice.job not in names or self.claimant.pending:
             self._choice = NO_CHOICE
         open_jobs = self.open_jobs(real_s)
-        content = (capacity, names, len(open_jobs), self._choice, dict(self.granter.register.space))
+        register, busy = self.granter.register, self.granter.busy_stations(real_s)
+        content = (capacity, names, len(open_jobs), self._choice, busy, dict(register.space))
         if content == self._last_bid and real_s < self._bid_s + BID_S:
             return
+        self._new_bids |= content != self._last_bid
         self._last_bid, self._bid_s = content, real_s
         self._number += 1
         bid = Bid(
@@ -264,9 +268,9 @@ class Participant:
             number=self._number,
             time_s=time_s,
             capacity=capacity,
-            estimates=self._estimates(ready),
+            estimates=self._arm.estimate(tuple(ready), register.cycles) if ready else (),
             open_count=len(open_jobs),
-            closed_count=self.granter.register.closed_count,
+            closed_count=register.closed_count,
             open_jobs=tuple(open_jobs[:MAX_OPEN_JOBS]),
             choice=self._choice.job,
             choice_plan=self._choice.plan,
@@ -274,21 +278,11 @@ class Participant:
         self.apply_bid(bid, real_s)
         self.out.append(bid)
 
-    def _estimates(self, jobs: list[JobSpec]) -> tuple[JobEstimate, ...]:
-        """Return the estimates of these jobs, without plans whose space another arm takes."""
-        estimates = self._arm.estimate(tuple(jobs)) if jobs else ()
-        open_plans = [
-            tuple(plan for plan in each.plans if not self.granter.in_the_way(self.name, plan.space))
-            for each in estimates
-        ]
-        pairs = zip(estimates, open_plans, strict=True)
-        return tuple(replace(each, plans=plans) for each, plans in pairs if plans or not each.feasible)
-
     def _choose(self, real_s: float, time_s: float) -> None:
         """Let the policy choose a job, once the bids of all present arms have arrived."""
         own = self._bids[self.name][0]
         due = self._new_bids or real_s >= self._chosen_s + BID_S
-        if not (own.estimates and due) or self.claimant.pending or self.claimant.capacity < 1:
+        if not (own.capacity and own.estimates and due) or self.claimant.pending or self.claimant.capacity < 1:
             return
         bids = self._fresh_bids(real_s)
         if len(bids) < self.claimant.majority:
@@ -298,13 +292,14 @@ class Participant:
             return
         self._new_bids, self._chosen_s = False, real_s
         self.rounds += 1
-        bidding = self._bidding(bids, [offer.job for offer in own.estimates])
-        observations = observe(bidding, self._fleet, lost={self.name} if self._lost else ())
+        bidding = self._bidding(bids, [offer.job for offer in own.estimates], real_s)
+        observations = observe(bidding, self._fleet, last={self.name: -1} if self._lost else {})
         action = self._policy(observations[self.name], self._fleet.arms.index(self.name))
         self._choice = claimed_jobs(bidding, observations, {self.name: action}).get(self.name, NO_CHOICE)
         self._lost = False
+        feasible = {offer.job for bid in bids.values() for offer in bid.estimates if offer.feasible}
         for job in bidding.jobs:
-            if not any(bidding.plans(arm, job.name) for arm in bidding.quotes):
+            if job.name not in feasible:
                 self._pause(job.name, real_s)  # no arm can do it: its slot is free for another job
         if self._choice.job:
             self._bid(real_s, time_s)
@@ -315,7 +310,7 @@ class Participant:
             return
         bids = self._fresh_bids(real_s)
         choices = {arm: Choice(bid.choice, bid.choice_plan) for arm, bid in bids.items() if bid.choice}
-        bidding = self._bidding(bids, [choice.job for choice in choices.values()])
+        bidding = self._bidding(bids, [choice.job for choice in choices.values()], real_s)
         (job, plan), self._choice = self._choice, NO_CHOICE
         if resolve_claims(bidding, choices, self._fleet.arms).get(job) == (self.name, plan):
             self.claimant.request(self.jobs[job], plan, real_s)
@@ -325,9 +320,10 @@ class Participant:
     def _fresh_bids(self, real_s: float) -> dict[str, Bid]:
         return {arm: bid for arm, (bid, at_s) in sorted(self._bids.items()) if real_s < at_s + FRESH_S}
 
-    def _bidding(self, bids: dict[str, Bid], names: Iterable[str]) -> Bidding:
+    def _bidding(self, bids: dict[str, Bid], names: Iterable[str], real_s: float) -> Bidding:
         """Return the bids for some jobs as in a round of an auctioneer."""
         quotes = {arm: _quote(bid, self.states.get(arm)) for arm, bid in bids.items()}
+        register = self.granter.register
         return Bidding(
             auction="consensus",
             time_s=max(bid.time_s for bid in bids.values()),
@@ -335,6 +331,9 @@ class Participant:
             quotes={arm: quote for arm, quote in quotes.items() if quote.capacity and quote.estimates},
             full={arm: quote for arm, quote in quotes.items() if not (quote.capacity and quote.estimates)},
             states=self.states,
+            returned={job: (len(register.faults.get(job, ())), at_s) for job, at_s in register.returned_s.items()},
+            busy=self.granter.busy_stations(real_s),
+            taken=register.space,
             excludes=self._excludes,
         )
 

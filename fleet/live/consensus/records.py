@@ -35,6 +35,13 @@ class Faulted(msgspec.Struct, frozen=True, tag="faulted"):
     faults: Faults
 
 
+class JobReturned(msgspec.Struct, frozen=True, tag="job_returned"):
+    """An arm returned a job at this fleet time."""
+
+    job: Name
+    time_s: float
+
+
 class ClaimNumbered(msgspec.Struct, frozen=True, tag="claim_numbered"):
     """The last claim of an arm had this number."""
 
@@ -47,6 +54,7 @@ GrantRecord = (
     | Released
     | JobSettled
     | Faulted
+    | JobReturned
     | JobsAccepted
     | ClockTick
     | ClaimNumbered

@@ -127,6 +127,6 @@ async def serve(endpoint: str, fleet: str, host: str, port: int, token: str) -> 
                 asyncio.get_running_loop().add_signal_handler(number, stop, number)
             address, bound_port, *_ = bound.getsockname()
             shown = f"[{address}]" if ":" in address else address
-            typer.echo(f"ready gateway http://{shown}:{bound_port}/v3 {os.getpid()}")
+            typer.echo(f"ready gateway http://{shown}:{bound_port}/v4 {os.getpid()}")
             await server.serve(sockets=[bound])
     return received[0]

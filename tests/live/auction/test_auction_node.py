@@ -170,4 +170,4 @@ def test_an_arm_of_an_older_version_is_named_with_its_version(bus):
         token = session.liveliness().declare_token("thermofleet/v2/f/arm/arm%201/alive")
         (sentence,) = other_versions(bus.endpoint, "f")
         token.undeclare()
-    assert sentence.startswith("'arm 1' uses version v2 of the bus, and this program v3")
+    assert sentence.startswith("'arm 1' uses version v2 of the bus, and this program v4")

@@ -5,7 +5,6 @@ Every arm is real except for its body: time is a number, every clock runs at its
 
 import random
 from contextlib import suppress
-from dataclasses import dataclass, field
 from functools import partial
 from itertools import combinations
 from types import SimpleNamespace
@@ -22,34 +21,12 @@ from fleet.live.auction.round import Timing
 from fleet.live.consensus.granter import Granter, Register
 from fleet.live.consensus.participant import Membership, Participant
 from fleet.live.space import no_conflicts
+from tests.live.disk import Crash, Disk
 
 TIMING = Timing(lease_s=3.0, margin_s=0.05, window_s=0.3, pause_s=(0.2, 1.0))
 CYCLE_S = 0.2
 HOME_S = 0.5
 """Duration of the way home."""
-
-
-class Crash(Exception):
-    """The arm's process is killed during a call."""
-
-
-@dataclass(eq=False)
-class Disk:
-    """A journal in memory, and its faults."""
-
-    records: list = field(default_factory=list)
-    full: bool = False
-    crash: str = ""
-
-    def keep(self, *records) -> None:
-        crash, self.crash = self.crash, ""
-        if crash == "before":
-            raise Crash
-        if self.full:
-            raise JournalFull("no room")
-        self.records.extend(records)
-        if crash == "after":
-            raise Crash
 
 
 class Arm:
@@ -59,13 +36,14 @@ class Arm:
         self.fleet, self.name, self.rate, self.boots = fleet, name, rate, 0
         self.journal, self.grants = Disk(), Disk()
         self.hot, self.cycle_ends_s = False, None
-        self.out, self.home_s = "", None
+        self.out, self.home_s = None, None
+        """Award for which it is away from home, and the real second at which it is home again."""
         self.start()
 
     @property
     def space(self) -> tuple[str, ...]:
         """Space that it takes."""
-        return (f"{self.name}: {self.out}",) if self.out else ()
+        return (self.space_of(self.out.job, self.out.plan),) if self.out else ()
 
     @property
     def real_s(self) -> float:
@@ -74,11 +52,13 @@ class Arm:
     def start(self) -> None:
         self.boots += 1
         self.cycle_ends_s = None
-        self.out, self.home_s = "", None  # a person moves it home before it is started again
+        self.out, self.home_s = None, None  # a person moves it home before it is started again
         history = ArmHistory().replay(self.journal.records).after_restart(self.name, 0.0)
         self.journal.records[:] = history.compact()
         register = Register().replay(self.grants.records)
         self.grants.records[:] = register.compact()
+        again = Register().replay(self.grants.records)
+        assert (again.returned_s, again.cycles) == (register.returned_s, register.cycles)
         config = ExecutorConfig(return_after_s=8.0)
         self.executor = AwardExecutor(self.name, self.journal.keep, history, nonce="n", config=config)
         granter = Granter(
@@ -104,11 +84,11 @@ class Arm:
         )
         self.participant.add_jobs([*self.fleet.jobs, *register.jobs.values()])
 
-    def estimate(self, jobs):
+    def estimate(self, jobs, cycles):
         return tuple(self.fleet.offer(self.name, job) for job in jobs)
 
     def space_of(self, job: JobSpec, plan: int) -> str:
-        return f"{self.name}: {job.name}"
+        return f"{self.name}: {job.name} by {plan}"
 
     def unfit(self) -> str:
         return "hot" if self.hot else ""
@@ -149,16 +129,16 @@ class Arm:
         """Work, and go home when there is nothing to do; a hot arm stands where it stopped."""
         if self.hot:
             return
-        if not self.out or (self.executor.active and self.executor.active[0].job == self.out):
+        if not self.out or (self.executor.active and self.executor.active[0].award == self.out):
             self._work_at_place()
         else:
             self.cycle_ends_s = None
         if self.cycle_ends_s is not None:
-            self.out, self.home_s = self.cycle_ends_s[0], None
+            self.out, self.home_s = self.executor.active[0].award, None
         elif self.out and self.home_s is None:
             self.home_s = self.real_s + HOME_S
         elif self.out and self.real_s >= self.home_s:
-            self.out = ""
+            self.out = None
 
     def _work_at_place(self) -> None:
         """Work cycle after cycle; a cycle that has begun is completed."""
@@ -192,7 +172,7 @@ class Arm:
     def move_home(self) -> None:
         """Have a person move the arm home; its process lives on."""
         self.break_off()
-        self.out, self.home_s = "", None
+        self.out, self.home_s = None, None
 
     def clear(self, absent: str) -> None:
         """Free the space of another arm, unless that is refused."""
@@ -225,10 +205,17 @@ class Fleet:
         self.arms = {name: Arm(self, name, rate) for name, rate in zip(self.names, rates, strict=True)}
 
     def offer(self, arm: str, job: JobSpec) -> JobEstimate:
-        """Return an estimate that depends on the names of arm and job only; some pairs are infeasible."""
-        d = random.Random(f"{arm} {job.name}").random()
-        plan = PlanQuote(difficulty=d, finish_in_s=10.0, space=f"{arm}: {job.name}")
-        return JobEstimate(job.name, (plan,) if d > 0.1 or arm == self.names[0] else ())
+        """Return an estimate that depends on the names of arm and job only; some pairs are infeasible.
+
+        Half of the others have two plans.
+        """
+        rng = random.Random(f"{arm} {job.name}")
+        d = rng.random()
+        plans = tuple(
+            PlanQuote(plan=n, difficulty=d if n == 0 else rng.random(), space=self.arms[arm].space_of(job, n))
+            for n in range(rng.choice([1, 2]))
+        )
+        return JobEstimate(job.name, plans if d > 0.1 or arm == self.names[0] else ())
 
     def last_cycle(self, job: str) -> None:
         self.last_cycles[job] = self.last_cycles.get(job, 0) + 1

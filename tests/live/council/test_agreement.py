@@ -12,19 +12,19 @@ from fleet.bus.protocol.auction import JobSpec
 ARM_POLICIES = [name for name, rule in RULES.items() if rule.scope == "arm"]
 
 
-def greedy(difficulty: dict[str, dict[str, float]]) -> dict[str, str | None]:
-    """Assign the pair with the least difficulty relative to the average of the job first."""
+def greedy(difficulty: dict[str, dict[str, float]], cool: list[str]) -> dict[str, str | None]:
+    """Assign the pair with the least difficulty relative to the average of the job first, to cool arms only."""
     jobs = sorted({job for row in difficulty.values() for job in row})
     pairs = []
     for job in jobs:
         scores = {arm: row[job] for arm, row in difficulty.items() if job in row}
         average = sum(scores.values()) / len(scores)
-        pairs += [(score - average, job, arm) for arm, score in scores.items()]
+        pairs += [(score - average, job, arm) for arm, score in scores.items() if arm in cool]
     out: dict[str, str | None] = {}
     for _, job, arm in sorted(pairs):
         if arm not in out and job not in out.values():
             out[arm] = job
-    return {arm: out.get(arm) for arm in difficulty}
+    return {arm: out.get(arm) for arm in cool}
 
 
 @given(st.integers(0, 2**32), st.integers(1, 5), st.integers(1, 7))
@@ -37,9 +37,10 @@ def test_without_message_loss_the_allocation_is_that_of_a_central_policy(council
         fleet.arms[name].hot = True
     fleet.run(0.8)
     cool = [name for name, arm in fleet.arms.items() if not arm.hot]
-    offers = {name: [fleet.offer(name, job) for job in jobs] for name in cool}
+    offers = {name: [fleet.offer(name, job) for job in jobs] for name in fleet.names}
     wanted = greedy(
-        {arm: {offer.job: offer.least.difficulty for offer in row if offer.feasible} for arm, row in offers.items()}
+        {arm: {offer.job: offer.least.difficulty for offer in row if offer.feasible} for arm, row in offers.items()},
+        cool,
     )
     has = {name: next((h.award.job.name for h in fleet.arms[name].executor.active), None) for name in cool}
     assert has == wanted
@@ -78,7 +79,7 @@ def test_of_two_that_choose_one_job_the_one_with_the_lower_difficulty_gets_it(co
     fleet.run(0.8)
     (holder,) = [arm.name for arm in fleet.arms.values() if arm.executor.active]
     offers = {name: fleet.offer(name, fleet.jobs[0]) for name in fleet.names}
-    assert holder == min((offer.least.difficulty, name) for name, offer in offers.items() if offer.feasible)[1]
+    assert holder == min((offer.plans[0].difficulty, name) for name, offer in offers.items() if offer.feasible)[1]
 
 
 def test_an_isolated_arm_does_not_report_that_all_jobs_are_settled(council):

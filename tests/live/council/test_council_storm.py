@@ -2,8 +2,8 @@
 
 At any moment no two arms have a lease of one job or of one station, no last cycle is done twice, and no two arms are
 away from home on plans that exclude each other. After the faults
-every job is finished, reported unfinished because of a crash after permission to commit, or given up because arms
-faulted in it.
+every job is finished, reported unfinished because of a crash after permission to commit, given up because arms faulted
+in it, or expired. Arms have one or two plans for a job, each with a space of its own.
 """
 
 import random
@@ -15,13 +15,17 @@ from hypothesis import strategies as st
 from fleet.bus.protocol.auction import JobSpec
 from fleet.live.space import ANYWHERE
 
+START_S = 100.0
+"""Fleet time at the start."""
+
 
 def jobs_of(rng: random.Random, count: int) -> list[JobSpec]:
     jobs: list[JobSpec] = []
     for number in range(count):
         after = (rng.choice(jobs).name,) if jobs and rng.random() < 0.2 else ()
         place, n = rng.choice("xyzuvw"), rng.choice([1, 2, 3, 12])
-        jobs.append(JobSpec(name=f"job {number}", kind="hold", places=(place,), repetitions=n, after=after))
+        due = {"due_s": START_S + rng.uniform(0.0, 20.0), "expires": True} if rng.random() < 0.3 else {}
+        jobs.append(JobSpec(name=f"job {number}", kind="hold", places=(place,), repetitions=n, after=after, **due))
     return jobs
 
 
@@ -220,14 +224,18 @@ def storm(council, rates, seed: int, actions) -> None:
     outcomes = fleet.settled()
     for arm in fleet.arms.values():
         assert arm.participant.granter.register.settled.keys() == outcomes.keys(), f"{arm.name} misses an outcome"
+    expired = {job.name for job in all_jobs if job.expires and job.due_s < fleet.true_s} - outcomes.keys()
+    for arm in fleet.arms.values():
+        states = {status.job: status.state for status in arm.participant.status([], arm.real_s)}
+        assert {states.get(job, "given_up") for job in expired} <= {"given_up"}, f"{arm.name} still offers a late job"
     for job in all_jobs:
         if outcomes.get(job.name) == "unfinished":
             assert job.name in fleet.unsure_jobs
         elif outcomes.get(job.name) == "given_up":
             assert len(fleet.faults[job.name]) >= 3 or len(set(fleet.faults[job.name])) < len(fleet.faults[job.name])
         elif job.name not in outcomes:
-            lost = {name for name, outcome in outcomes.items() if outcome != "finished"}
-            assert waits_for(all_jobs, job, lost), f"{job.name} is neither finished nor lost"
+            lost = expired | {name for name, outcome in outcomes.items() if outcome != "finished"}
+            assert job.name in expired or waits_for(all_jobs, job, lost), f"{job.name} is neither finished nor lost"
         else:
             assert fleet.last_cycles[job.name] == 1
 

@@ -2,7 +2,8 @@
 
 import pytest
 
-from fleet.bus.protocol.consensus import Claim, ClaimEntry, JobOutcome
+from fleet.bus.protocol.auction import JobEstimate, JobSpec, PlanQuote
+from fleet.bus.protocol.consensus import Bid, Claim, ClaimEntry, JobOutcome
 from fleet.errors import Refused
 from fleet.live.auction.round import Timing
 from fleet.live.consensus.granter import Granter, Register
@@ -112,3 +113,42 @@ def test_a_person_frees_the_space_of_an_arm_that_is_not_heard(granting):
         again = granting.claim("a", "p1", space=("p1",), at_s=2 * LATER_S, phase="finishing")
         assert again == ["the space of 'a' was cleared"]
     assert granting.claim("c", "p3", at_s=2 * LATER_S) == ["'a' is in the way"]
+
+
+class Second:
+    """Every arm chooses the second plan for the job of the slot with its own number."""
+
+    scope = "arm"
+
+    def reset(self, rng):
+        """Nothing to reset."""
+
+    def choose(self, observation, place):
+        option = 2 * place + 1
+        legal = observation.action_mask[1:-1]
+        return option + 1 if option < len(legal) and legal[option] else 0
+
+
+def test_a_claim_covers_the_space_of_the_plan_that_was_chosen(council):
+    """No arm receives the choice of another: the grants alone keep two second plans apart, which exclude each other."""
+    jobs = [JobSpec(name=f"job {i}", kind="hold", places=(f"p{i}",), repetitions=3) for i in range(3)]
+    fleet = council.Fleet([1.0] * 3, jobs, Second, lambda a, one, b, other: one.endswith("1") and other.endswith("1"))
+
+    def offer(arm, job):
+        return JobEstimate(job.name, tuple(PlanQuote(n, space=fleet.arms[arm].space_of(job, n)) for n in range(2)))
+
+    fleet.offer, most = offer, 0
+    for _ in range(200):
+        for arm in fleet.arms.values():
+            arm.step()
+        while fleet.packets:
+            call = fleet.packets[0][2]
+            if isinstance(call.args[2], Bid) and call.args[2].choice:
+                del fleet.packets[0]
+            else:
+                fleet.deliver(0)
+        fleet.true_s += 0.1
+        fleet.check()
+        most = max(most, sum(bool(arm.out) for arm in fleet.arms.values()))
+    assert most == 1
+    assert fleet.settled()

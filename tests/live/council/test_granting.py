@@ -4,28 +4,17 @@ import pytest
 
 from fleet.bus.protocol.auction import Award, JobSpec
 from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, DeniedEntry, GrantedEntry, JobOutcome
-from fleet.errors import JournalFull, Refused
+from fleet.errors import Refused
 from fleet.live.arm.award_executor import AwardExecutor
 from fleet.live.arm.journal_records import ArmHistory
 from fleet.live.auction.round import Timing
 from fleet.live.consensus.claimant import Claimant
 from fleet.live.consensus.granter import Granter, Register
+from tests.live.disk import Disk
 
 TIMING = Timing(lease_s=3.0, margin_s=0.05)
 ROSTER = ("a", "b", "c", "d")
 JOB = JobSpec(name="j", kind="hold", places=("x",), repetitions=3)
-
-
-class Disk:
-    """A journal in memory."""
-
-    def __init__(self):
-        self.records, self.full = [], False
-
-    def keep(self, *records):
-        if self.full:
-            raise JournalFull("no space")
-        self.records.extend(records)
 
 
 @pytest.fixture
@@ -133,8 +122,8 @@ def test_an_arm_of_another_fleet_is_granted_nothing(granter):
 
 def test_nothing_is_granted_without_space_on_the_disk(granter, disk):
     disk.full = True
-    assert granter.answer_claim(claim("a", 1, entry()), 0.0).denied[0].reason == "no space"
-    with pytest.raises(Refused, match="no space"):
+    assert granter.answer_claim(claim("a", 1, entry()), 0.0).denied[0].reason == "no room"
+    with pytest.raises(Refused, match="no room"):
         granter.answer_claim(claim("a", 2, settled=[finished()]), 0.0)
     assert not granter.register.settled
 
