@@ -100,7 +100,7 @@ def _cache_of_this_code() -> str:
         digest.update(path.read_bytes())
     folder = user_cache_folder() / "compiled" / digest.hexdigest()[:16]
     if not folder.exists():
-        log.warning("Compiling the simulation engine (about 30 s of one core, once); cached in %s.", folder)
+        log.warning("Compiling the simulation engine (about a minute of one core, once); cached in %s.", folder)
     return str(folder)
 
 
