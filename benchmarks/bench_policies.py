@@ -8,8 +8,8 @@ Prints Markdown for docs/policies.md. A live shift is `thermofleet up` with a pr
 2 h at speed 240 takes 30 s. Policies are blind: no twin is trained.
 
 With --steps: the number of steps of a shift with `decisions="interval"` and `"events"`, and the share of them with a
-choice, for every scenario of the library and every policy, for docs/learning.md. Exits with an error if the two kinds
-of steps give different results.
+choice, for every scenario of the library and every policy, for docs/learning.md; also the share of the interval steps
+with a job in every slot. Exits with an error if the two kinds of steps give different results.
 """
 
 import argparse
@@ -68,6 +68,8 @@ class Steps(NamedTuple):
     arm: int
     arm_choices: int
     """Arm steps in which the arm may claim a job."""
+    full: int
+    """Env steps with a job in every slot."""
     reward: float
     finished_s: bytes
     """Finish of every job, for comparison."""
@@ -77,15 +79,16 @@ def steps_of(fleet: Fleet, policy: str, seed: int, decisions: Decisions) -> Step
     """Play a shift with one length of steps."""
     env, chooser = env_of(fleet, decisions=decisions), policy_at(policy, seed)
     env.reset(seed=seed)
-    choices, reward = [], 0.0
+    choices, full, reward = [], 0, 0.0
     while env.agents:
         seen = env.knowledge()
         choices.append([each.action_mask[1:-1].any() for each in seen.values()])
+        full += bool(next(iter(seen.values())).offered.all())
         _, rewards, *_ = env.step(chooser.act(seen))
         reward += next(iter(rewards.values()))
     may = np.array(choices)
     counts = len(may), int(may.any(axis=1).sum()), may.size, int(may.sum())
-    return Steps(*counts, reward, env.truth.finished_s.tobytes())
+    return Steps(*counts, full, reward, env.truth.finished_s.tobytes())
 
 
 def print_steps(scenarios: list[str], policies: list[str], seed: int, difficulty: DifficultyName) -> None:
@@ -94,8 +97,9 @@ def print_steps(scenarios: list[str], policies: list[str], seed: int, difficulty
     Raises:
         SystemExit: the two kinds of steps give different results.
     """
-    print("| scenario | policy | steps: interval | events | ratio | env steps with a choice: interval | events |"
-          " arm steps with a choice: interval | events |\n|---|---|---|---|---|---|---|---|---|")  # fmt: skip
+    titles = ["scenario", "policy", "steps: interval", "events", "ratio", "env steps with a choice: interval", "events"]
+    titles += ["arm steps with a choice: interval", "events", "all slots filled"]
+    print(f"| {' | '.join(titles)} |\n|{'---|' * len(titles)}")
     for name in scenarios:
         fleet = prepare(load(name), difficulty=difficulty)
         for policy in policies:
@@ -107,7 +111,15 @@ def print_steps(scenarios: list[str], policies: list[str], seed: int, difficulty
                 for part, whole in (("env_choices", "env"), ("arm_choices", "arm"))
                 for each in (f"{getattr(steps, part) / getattr(steps, whole):.1%}" for steps in (every, some))
             ]
-            row = (name, f"`{label(policy)}`", every.env, some.env, f"{every.env / some.env:.1f}", *shares)
+            row = (
+                name,
+                f"`{label(policy)}`",
+                every.env,
+                some.env,
+                f"{every.env / some.env:.1f}",
+                *shares,
+                f"{every.full / every.env:.1%}",
+            )
             print(f"| {' | '.join(map(str, row))} |", flush=True)
 
 
