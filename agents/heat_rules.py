@@ -1,7 +1,7 @@
-"""Central rules that weigh heat against value: by the thermometers alone, and by predicted peak temperatures.
+"""Central rules that consider heat and value: one by measured temperatures, one by predicted peak temperatures.
 
-Both match arms and jobs by value per time. The limits are those of a Gen3: the observation gives the warning limit as
-headroom, and the error limit lies as far above it as in `fleet.robot.ThermalLimits`.
+Both match arms and jobs by value per time. The warning limit follows from the observed headroom. The error limit is
+assumed to be as far above it as in the default `fleet.robot.ThermalLimits`.
 """
 
 from collections.abc import Sequence
@@ -20,10 +20,10 @@ ERROR_ABOVE_WARNING_K = ThermalLimits.error_c - ThermalLimits.warning_c
 
 
 class Thermometer(Matching):
-    """Matching by value per time, of claims whose load suits the arm's temperature. It needs no twin.
+    """Matching by value per time, among claims for which the arm is cool enough. It needs no twin.
 
-    An arm claims a job if the headroom of joints 1 to 4, K, is at least the payload, kg, times the duration in quarters
-    of an hour, at most one. Scope central: it compares the arms' times.
+    An arm may claim a job if the headroom of joints 1 to 4, in K, is at least the payload in kg times
+    min(duration / 15 min, 1). Scope central: it compares the arms' times.
     """
 
     scope: ClassVar = "central"
@@ -48,24 +48,24 @@ LARGE = 4
 class Wsept(Thermometer):
     """Matching by expected worth per time: weighted shortest expected processing time, with the cost of heat.
 
-    The worth of a claim is the value of the job, less what heat is expected to cost. The predicted peak of the plan has
-    a normal error; the share of it above the error limit is the probability of a fault, which costs the job and
-    `fault_price`. Minutes above the warning limit cost `minute_price` each. Of the plans of a job the one with
-    the most worth per time is taken; a claim whose worth is not positive waits until the arm has cooled.
+    The worth of a claim is the expected value of the job, less the expected cost of heat. The true peak is assumed to
+    be normally distributed around the predicted one. The probability of a fault is that of a true peak above the error
+    limit. A fault costs the value of the job and `fault_price`, each minute above the warning limit `minute_price`. An
+    arm takes the plan of a job with the most worth per time, and makes no claim without a positive worth.
 
-    Without predicted peaks, P(saturation) stands for them; without either, heat is ignored. Scope central: it compares
-    the arms' worths.
+    Without a predicted peak, P(saturation) gives one; with neither, heat costs almost nothing. Scope central: it
+    compares the arms' worths.
 
     Source: Rothkopf, Management Science 12, 1966 (weighted expected processing times).
     """
 
     only_choices = True
     fault_price: ClassVar = 20.0
-    """In units of value; `scenarios.fault_price` gives 14 to 27 in the scenarios of the library."""
+    """In units of value; `thermofleet show` prints 14 to 27 for the scenarios of the library."""
     peak_sd_k: ClassVar = 5.0
-    """Standard deviation of predicted peaks near the error limit, wide enough for a nominal thermal network."""
+    """Standard deviation of true peaks around predicted ones near the error limit, for a nominal thermal network."""
     minute_price: ClassVar = 0.05
-    """Of a minute above the warning limit, as in the default reward."""
+    """Price of a minute above the warning limit, as in the default reward."""
 
     def _rate(self, seen: Observation) -> Array:
         """Expected worth per second of every option, [option]; −inf for those that must not be claimed."""
@@ -76,7 +76,7 @@ class Wsept(Thermometer):
         margin_k = self.peak_sd_k * logit(np.clip(seen.p_saturation, LEAST_P, 1.0 - LEAST_P))
         peak_c = np.where(seen.peak_c > 0, seen.peak_c, warning_c + margin_k)
         p_fault = ndtr((peak_c - warning_c - ERROR_ABOVE_WARNING_K) / self.peak_sd_k)
-        # As if the temperature rose linearly up to its peak.
+        # Approximation: the temperature rises linearly to its peak.
         above_share = np.clip((peak_c - warning_c) / np.maximum(peak_c - hottest_c, 1.0), 0.0, 1.0)
         heat = p_fault * self.fault_price + self.minute_price * above_share * seen.duration_s / 60.0
         worth = (1.0 - p_fault) * per_option(seen, seen.value) - heat

@@ -51,7 +51,7 @@ def names_of(scope: str) -> str:
     return ", ".join(name for name, rule in RULES.items() if rule.scope == scope)
 
 
-NAMES_HELP = f"{', '.join(RULES)}, your own as FILE.py:CLASS, or a folder of train."
+NAMES_HELP = f"{', '.join(RULES)}, your own as FILE.py:CLASS, or a folder of `thermofleet train`."
 """Allowed names of a policy, for `--help`."""
 
 

@@ -79,7 +79,7 @@ def library(difficulty: DifficultyName, arms: int = 4, peers: int | None = None)
     one = library_of(fleet, Randomisation(arrivals=(times, times)))
     per_arm = (
         "thermal_step", "to_ambient", "root_capacity", "rates", "modes", "sensor_noise_k", "copper_w_per_a2", "idle_w",
-        "rest_current_sq", "rest_friction_w", "start_c", "plan", "work",
+        "rest_current_sq", "rest_friction_w", "start_c", "work",
     )  # fmt: skip
     tables = one.tables._replace(
         ambient_c=np.tile(one.tables.ambient_c, (1, 1, times)),

@@ -1,7 +1,7 @@
 """Thermal difficulty of a planned motion for one arm's motors, and the protocol of models that score it.
 
-d = Σ_k d_k, d_k = 1 − exp(−e_k) with e_k the time mean of the absolute reconstruction error of joint k, summed
-over the channels (E. Guiffo Kaigom, arXiv 2509.12740; read so that d_k → 1 for unknown motion).
+d = Σ_k d_k, d_k = 1 − exp(−e_k). e_k is the time mean of the absolute reconstruction error of joint k, summed over the
+channels (E. Guiffo Kaigom, arXiv 2509.12740; the sign is chosen so that d_k → 1 for unknown motion).
 """
 
 import math
@@ -26,27 +26,32 @@ def difficulty_of_error(error: Array) -> Array:
 
 SETTLING_S = 120.0
 """A plan saturates if a motor is at or above the warning limit at any moment from this time after its start until its
-end, or at the end of a shorter plan; also if a fault ends it. Until then the arm may still be as warm as work before it
-left it, so a plan that lets a warm motor cool at once is not held responsible. Predicted and true peaks count from the
-same time."""
+end (for a shorter plan: at its end), or if a fault ends it. Earlier temperatures may come from previous work, so a plan
+that lets a warm motor cool at once does not saturate. Predicted and true peaks count from the same time."""
 
 KNOWN = 2 * JOINTS + 1
-"""Length of what a forecast starts from: measured motor temperatures [joint], estimated housing temperatures [joint]
-and the ambient temperature, all °C."""
+"""Number of known temperatures at the start of a plan, °C: measured motors, estimated housings, ambient."""
 
 
 def known_temperatures(motor_c: Array, housing_c: Array, ambient_c: Array | float) -> Array:
-    """What a forecast starts from, °C, [..., KNOWN]; motors and housings are [..., joint], the ambient [...]."""
+    """Known temperatures as one array, °C, [..., KNOWN].
+
+    Args:
+        motor_c: Measured motor temperatures, [..., joint].
+        housing_c: Estimated housing temperatures, [..., joint].
+        ambient_c: Ambient temperature, [...].
+    """
     ambient = np.broadcast_to(np.asarray(ambient_c, dtype=float)[..., None], (*np.shape(motor_c)[:-1], 1))
     return np.concatenate([motor_c, housing_c, ambient], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """Largest of affine functions of the temperatures known at the start of a plan, and a probability from it.
+    """Maximum of affine functions of the known temperatures at the start of a plan, and a probability from it.
 
-    value = max over pieces of offset + weight @ known_c, P = link(value). One piece is a logistic regression; one piece
-    per joint and moment is a thermal network that is linear in its start. Leading axes [...] for several plans.
+    value = max over pieces of offset + weight @ known_c, P = link(value). A logistic regression has one piece. A
+    thermal network that is linear in its initial temperatures has one per joint and moment. Leading axes [...] are for
+    several plans.
     """
 
     offset: Array
@@ -54,10 +59,10 @@ class Forecast:
     weight: Array
     """Slope of each piece, 1/K, [..., piece, KNOWN]."""
     curve: Array | None = None
-    """Link function as value and probability [..., knot, 2], both non-decreasing, linear between the knots and constant
+    """Link function, [..., knot, (value, probability)]: both non-decreasing, linear between the knots and constant
     beyond. None, or NaN as first value: the logistic function."""
     time_s: Array | None = None
-    """Moment of each piece after the start, s, [..., piece]; 0 for a piece that counts at any time. None: all 0."""
+    """Moment of each piece after the start, s, [..., piece]; 0: it counts at any time. None: all 0."""
 
     def __post_init__(self) -> None:
         if self.offset.shape[-1:] in ((), (0,)) or self.weight.shape != (*self.offset.shape, KNOWN):
@@ -90,7 +95,7 @@ class Forecast:
 
 
 def stack_forecasts(forecasts: Sequence[Forecast]) -> Forecast:
-    """Forecasts of single plans as one with a leading axis [forecast, ...]; pieces and knots may differ in number."""
+    """Stack forecasts of single plans along a leading axis; their numbers of pieces and knots may differ."""
     pieces = max(len(each.offset) for each in forecasts)
     knots = max(0 if each.curve is None else len(each.curve) for each in forecasts)
     offset, time_s = np.full((len(forecasts), pieces), -np.inf), np.zeros((len(forecasts), pieces))
@@ -108,33 +113,40 @@ def stack_forecasts(forecasts: Sequence[Forecast]) -> Forecast:
 
 
 def forecast_arrays(forecasts: Forecast | None, lanes: int) -> dict[str, Array]:
-    """Stacked forecasts as tables of the engine: pieces last and padded to whole lanes; empty axes for none.
+    """Convert stacked forecasts to arrays of the engine, without pieces that never count; empty for None.
 
     Returns:
-        forecast_offset [forecast, piece], forecast_weight [forecast, KNOWN, piece], forecast_time_s [forecast, piece]
+        forecast_first, first block of each forecast, and the number of all blocks, int [forecast + 1];
+        forecast_block [block, 2 + KNOWN, lane], offset, moment and slopes of each piece, padded with offsets of −inf;
         and forecast_curve [forecast, knot, 2].
     """
-    count, pieces, knots = 0, lanes, 0
-    if forecasts is not None:
-        count, pieces = forecasts.offset.shape[0], -(-forecasts.offset.shape[1] // lanes) * lanes
-        knots = 0 if forecasts.curve is None else forecasts.curve.shape[1]
-    tables = {
-        "forecast_offset": np.full((count, pieces), -np.inf),
-        "forecast_weight": np.zeros((count, KNOWN, pieces)),
-        "forecast_time_s": np.zeros((count, pieces)),
-        "forecast_curve": np.zeros((count, knots, 2)),
-    }
-    if forecasts is not None:
-        used = forecasts.offset.shape[1]
-        tables["forecast_offset"][:, :used] = forecasts.offset
-        tables["forecast_weight"][..., :used] = forecasts.weight.swapaxes(1, 2)
-        tables["forecast_time_s"][:, :used] = 0.0 if forecasts.time_s is None else forecasts.time_s
-        tables["forecast_curve"][:] = 0.0 if forecasts.curve is None else forecasts.curve
-    return tables
+    if forecasts is None:
+        empty = np.zeros((0, 2 + KNOWN, lanes)), np.zeros((0, 0, 2))
+        return dict(zip(_FORECAST_TABLES, (np.zeros(1, int), *empty), strict=True))
+    count = len(forecasts.offset)
+    size = -(-forecasts.offset.shape[1] // lanes)
+    pieces = np.zeros((count, 2 + KNOWN, size * lanes))
+    pieces[:, 0] = -np.inf
+    used = slice(0, forecasts.offset.shape[1])
+    pieces[:, 0, used], pieces[:, 2:, used] = forecasts.offset, forecasts.weight.swapaxes(1, 2)
+    if forecasts.time_s is not None:
+        pieces[:, 1, used] = forecasts.time_s
+    blocks = pieces.reshape(count, 2 + KNOWN, size, lanes).swapaxes(1, 2)
+    counts = (blocks[:, :, 0] > -np.inf).any(axis=-1)
+    curve = np.zeros((count, 0, 2)) if forecasts.curve is None else forecasts.curve
+    first = np.cumsum([0, *counts.sum(axis=1)])
+    return dict(zip(_FORECAST_TABLES, (first, blocks[counts], curve), strict=True))
+
+
+_FORECAST_TABLES = ("forecast_first", "forecast_block", "forecast_curve")
 
 
 def extend_curve(curve: Array, knots: int) -> Array:
-    """Curves [forecast, knot, 2] with more knots: constant beyond the last; NaN where there is no curve."""
+    """Pad curves [forecast, knot, 2] to more knots: constant beyond the last; NaN where there is no curve.
+
+    Args:
+        knots: Number of knots of the result.
+    """
     more = knots - curve.shape[1]
     if not len(curve):
         return np.zeros((0, knots, 2))
@@ -149,7 +161,7 @@ def extend_curve(curve: Array, knots: int) -> Array:
 
 @jit_inline
 def probability_of(value: float, curve: Array) -> float:
-    """Probability that follows from a forecast's value; see `Forecast`.
+    """Probability for a forecast's value; see `Forecast`.
 
     Args:
         curve: [knot, 2]; without knots, and where the first value is NaN, the link is the logistic function.
@@ -178,13 +190,12 @@ class Difficulty:
     per_joint: Array
     """d_k, [joint], each in [0, 1)."""
     p_saturation: float | None = None
-    """Probability that a motor passes the warning limit, by a model that assumes the start temperatures; None if the
-    model has none, or forecasts it."""
+    """P(saturation) by a model with fixed start temperatures; None if the model has no P, or gives `risk`."""
     risk: Forecast | None = None
-    """The probability as a function of the temperatures at the start."""
+    """P(saturation) as a function of the known temperatures at the start."""
     peak: Forecast | None = None
-    """Hottest motor temperature during the plan (see `SETTLING_S`), °C, from the temperatures at the start; with a
-    curve, also the probability where there is no `risk`."""
+    """Hottest motor temperature during the plan (see `SETTLING_S`), °C, as a function of the known temperatures at the
+    start. With a curve it also gives P(saturation), unless there is a `risk`."""
 
     def __post_init__(self) -> None:
         if self.p_saturation is not None and self.risk is not None:
@@ -196,7 +207,7 @@ class Difficulty:
         return float(np.sum(self.per_joint))
 
     def p_at(self, known_c: Array) -> float | None:
-        """Probability that a motor passes the warning limit, from known temperatures [KNOWN]; None if unknown."""
+        """P(saturation) from known temperatures [KNOWN]; None if unknown."""
         if self.risk is not None:
             return float(self.risk.at(known_c))
         if self.p_saturation is None and self.peak is not None and self.peak.curve is not None:

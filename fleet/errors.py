@@ -83,6 +83,15 @@ def check_nonnegative(value: object, *fields: str) -> None:
             raise ValueError(f"{type(value).__name__}.{name} must be >= 0 and finite (got {getattr(value, name)}).")
 
 
+def check_between(value: object, low: float, high: float, *fields: str) -> None:
+    """Raise a ValueError unless these fields of a dataclass, or all elements of a tuple, are from `low` to `high`."""
+    for name in fields:
+        given = getattr(value, name)
+        if not all(low <= number <= high for number in (given if isinstance(given, tuple) else (given,))):
+            shown = list(given) if isinstance(given, tuple) else given
+            raise ValueError(f"{type(value).__name__}.{name} must be between {low:.15g} and {high:.15g} (got {shown}).")
+
+
 MOST_M = 10.0
 """Largest coordinate of anything in a cell."""
 

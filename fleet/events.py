@@ -45,3 +45,4 @@ class Event:
     """Quantity of the kind: temperature °C, torque N·m, difficulty of an award, cycles kept of a return or a
     give_back, depth of a contact in mm."""
     reason: str = ""
+    """Why, in words; of an award in a simulated shift, the predicted peak temperature and P(saturation)."""

@@ -1,9 +1,9 @@
-"""An observer of the housing temperatures, which have no sensor, from the measured motor temperatures.
+"""Estimate the housing temperatures, which have no sensor, from the measured motor temperatures.
 
-The housings' part of the thermal network is driven by the measured windings, the ambient and the friction of the
-motion: C_h Th' = −L_hh Th + G_wh Tw + g Ta + P_h, stepped exactly for constant inputs. It is a reduced-order observer
-(Luenberger, IEEE Trans. Automatic Control 16, 1971) without correction: an initial error decays with the housings' time
-constants.
+The inputs of the housings' part of the thermal network are the measured windings, the ambient temperature, and idle and
+friction heat: C_h Th' = −L_hh Th + G_wh Tw + g Ta + P_h, stepped exactly for constant inputs. It is a reduced-order
+observer (Luenberger, IEEE Trans. Automatic Control 16, 1971) without correction: an initial error decays with the
+housings' time constants.
 """
 
 from typing import NamedTuple
@@ -18,12 +18,12 @@ Array = np.ndarray
 
 
 class HousingObserver(NamedTuple):
-    """Matrices of one step; leading axes for several arms."""
+    """Matrices of one step of the observer; leading axes for several arms."""
 
     keep: Array
-    """Share of each housing's temperature that remains, [..., joint, joint]."""
+    """Transition matrix of the housing temperatures, [..., joint, joint]."""
     gain: Array
-    """Warming by constant heat, K/W, [..., joint, joint]."""
+    """Temperature change per constant heat, K/W, [..., joint, joint]."""
     from_winding: Array
     """Conductance between winding and housing, W/K, [..., joint]."""
     from_ambient: Array
@@ -32,7 +32,7 @@ class HousingObserver(NamedTuple):
     """Heat of the powered motor without load, W, [..., joint]."""
 
     def step(self, housing_c: Array, motor_c: Array, ambient_c: Array | float, friction_w: Array | float) -> Array:
-        """Estimated housing temperatures after the step of a powered arm, °C, [..., joint].
+        """Estimated housing temperatures of a powered arm after the step, °C, [..., joint].
 
         Args:
             housing_c: Estimate before, [..., joint].
@@ -46,7 +46,11 @@ class HousingObserver(NamedTuple):
 
 
 def housing_observer(thermal: ThermalModel, motors: Motors, dt_s: Array | float) -> HousingObserver:
-    """The observer that follows from what is known of an arm, for steps of `dt_s`: one, or one per leading index."""
+    """The observer of an arm with this thermal model and these motors.
+
+    Args:
+        dt_s: Length of the step; [...] for one observer per element.
+    """
     dt = np.asarray(dt_s, dtype=float)[..., None, None]
     inner = thermal.laplacian[HOUSING, HOUSING]
     root = np.sqrt(thermal.capacity[HOUSING])

@@ -202,7 +202,7 @@ class Job:
     after: tuple[str, ...] = ()
     """Names of the jobs that must finish first."""
     expires: bool = False
-    """A hard due date: the job is given up if no arm has begun it by then."""
+    """A hard due date: the job is given up if it waits then, also if an arm has begun and returned it."""
 
     def __post_init__(self) -> None:
         check_bounds(self, "repetitions", "release_s", "value")

@@ -1,7 +1,7 @@
-"""What an arm knows when it decides: named fields in one layout.
+"""The observation of an arm: named fields, and their layout in one vector.
 
-An arm knows its own sensors, its own scores of the open jobs, and its peers' messages with their age. The observation
-holds no true state of the simulation.
+An arm observes its own sensors, its own scores of the open jobs, and its peers' messages with their age. The
+observation contains no true state of the simulation.
 """
 
 from collections import namedtuple
@@ -43,27 +43,27 @@ _PEER_SLOT: tuple[Axis, ...] = ("peer", "slot")
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What arms know, by name; leading axes [...] are free. Each `Field` gives axes, unit, lowest and highest value.
+    """Observations of arms, with any leading axes [...]. Each `Field` gives axes, unit, lowest and highest value.
 
-    An option is one plan for the job of one slot: option = slot · plans + plan. Action 0 waits or goes on, action
-    option + 1 claims the option, and the last action gives the current job back after the present cycle. The first plan
-    of a job is the fastest.
+    An option is one plan for the job of one slot: option = slot · plans + plan. Action 0 waits or continues the current
+    job, action option + 1 claims the option, and the last action gives the current job back after the present cycle.
+    The first plan of a job is the fastest.
     """
 
-    clock: Annotated[Array, Field((), "1", 0, 1, "share of the shift that has passed")]
+    clock: Annotated[Array, Field((), "1", 0, 1, "share of the episode that has passed")]
     idle: Annotated[Array, Field((), "1", 0, 1, "1 when this arm is free")]
     working: Annotated[Array, Field((), "1", 0, 1, "1 when it works or goes home")]
-    faulted: Annotated[Array, Field((), "1", 0, 1, "1 when it is faulted by heat")]
+    faulted: Annotated[Array, Field((), "1", 0, 1, "1 from a fault until it recovers")]
     busy_s: Annotated[Array, Field((), "s", 0, LONG_S, "time until it is home, with the current job done")]
-    last_award: Annotated[Array, Field((), "1", -1, 1, "1 last claim won, -1 lost, 0 none made")]
+    last_award: Annotated[Array, Field((), "1", -1, 1, "last claim: 1 won, -1 lost, 0 none made")]
     temp_c: Annotated[Array, Field(_JOINT, "°C", -60, 200, "own motor temperatures as measured")]
     housing_c: Annotated[Array, Field(_JOINT, "°C", -60, 200, "own estimate of the housing temperatures")]
     ambient_c: Annotated[Array, Field((), "°C", -60, 200, "ambient temperature at this arm")]
     headroom_k: Annotated[Array, Field((), "K", -150, 150, "warning limit minus hottest motor")]
     job_value: Annotated[Array, Field((), "1", 0, 1e6, "value of the current job, 0 without one")]
-    job_cycles: Annotated[Array, Field((), "1", 0, 1e5, "cycles of it that are not finished")]
-    job_peak_c: Annotated[Array, Field((), "°C", -60, 300, "predicted hottest motor in the rest of it, 0 if unknown")]
-    job_p: Annotated[Array, Field((), "1", 0, 1, "probability to pass the warning limit in it, 0 without one")]
+    job_cycles: Annotated[Array, Field((), "1", 0, 1e5, "unfinished cycles of the current job")]
+    job_peak_c: Annotated[Array, Field((), "°C", -60, 300, "predicted peak in the rest of that job, 0 if unknown")]
+    job_p: Annotated[Array, Field((), "1", 0, 1, "P(saturation) in the rest of that job, 0 without one")]
     offered: Annotated[Array, Field(_SLOT, "1", 0, 1, "1 when the slot holds a job")]
     station_free: Annotated[Array, Field(_SLOT, "1", 0, 1, "1 when no arm occupies its stations")]
     too_heavy: Annotated[Array, Field(_SLOT, "1", 0, 1, "1 when the load exceeds this arm's rating")]
@@ -71,15 +71,15 @@ class Observation:
     space_free: Annotated[Array, Field(_OPTION, "1", 0, 1, "1 when no other arm takes space that excludes the plan")]
     known: Annotated[Array, Field(_OPTION, "1", 0, 1, "1 when this arm has a difficulty for the plan")]
     difficulty: Annotated[Array, Field(_OPTION, "1", 0, JOINTS, "own thermal difficulty d of the plan, 0 if unknown")]
-    peak_c: Annotated[Array, Field(_OPTION, "°C", -60, 300, "predicted hottest motor during the plan, 0 if unknown")]
-    p_saturation: Annotated[Array, Field(_OPTION, "1", 0, 1, "probability to pass the warning limit, 0.5 if unknown")]
+    peak_c: Annotated[Array, Field(_OPTION, "°C", -60, 300, "predicted peak: hottest motor in the plan, 0 if unknown")]
+    p_saturation: Annotated[Array, Field(_OPTION, "1", 0, 1, "P(saturation) of the plan, 0.5 if unknown")]
     duration_s: Annotated[Array, Field(_OPTION, "s", 0, LONG_S, "time this arm needs for the rest of the job")]
     slack_s: Annotated[Array, Field(_OPTION, "s", -LONG_S, LONG_S, "due date minus now minus duration")]
-    age_s: Annotated[Array, Field(_SLOT, "s", 0, LONG_S, "time since it was released or came back")]
+    age_s: Annotated[Array, Field(_SLOT, "s", 0, LONG_S, "time since its release or return to the queue")]
     payload_kg: Annotated[Array, Field(_SLOT, "kg", 0, 100, "carried mass")]
     value: Annotated[Array, Field(_SLOT, "1", 0, 1e6, "value of finishing it")]
     returns: Annotated[Array, Field(_SLOT, "1", 0, 1e3, "number of faults that returned it")]
-    expires: Annotated[Array, Field(_SLOT, "1", 0, 1, "1 when it expires at its due date if nobody has begun it")]
+    expires: Annotated[Array, Field(_SLOT, "1", 0, 1, "1 when it expires if it still waits at its due date")]
     peer_heard: Annotated[Array, Field(_PEER, "1", 0, 1, "1 when a message of the peer has arrived")]
     peer_age_s: Annotated[Array, Field(_PEER, "s", 0, LONG_S, "age of the peer's last message")]
     peer_working: Annotated[Array, Field(_PEER, "1", 0, 1, "1 when the peer was working then")]
@@ -106,17 +106,17 @@ def _fields() -> Iterator[Field]:
 FIELDS: tuple[Field, ...] = tuple(_fields())
 """The layout: the order of this tuple is the order in the vector."""
 Offsets = namedtuple("Offsets", [field.name for field in FIELDS])  # pyright: ignore[reportUntypedNamedTuple]
-"""Where each field begins in the vector, by name."""
+"""First column of each field in the vector, by name."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where each field lies in the vector, for a number of arms, slots and plans."""
+    """Place of each field in the vector, for a number of arms, slots and plans."""
 
     arms: int
     slots: int
     near: tuple[tuple[int, ...], ...] | None = None
-    """The peers in each arm's vector, in that order; all others in the fleet's order if not given."""
+    """Indices of the peers in each arm's vector, in order; None: all other arms in the order of the fleet."""
     plans: int = 1
     """Plans for the job of a slot."""
 
@@ -138,7 +138,7 @@ class Layout:
         return 2 + self.slots * self.plans
 
     def shape(self, field: Field) -> tuple[int, ...]:
-        """Axes of a field as numbers."""
+        """Lengths of the axes of a field."""
         sizes = {"joint": JOINTS, "slot": self.slots, "option": self.slots * self.plans, "peer": self.peers}
         return tuple(sizes[axis] for axis in field.axes)
 
@@ -155,7 +155,7 @@ class Layout:
 
     @property
     def offsets(self) -> "Offsets":
-        """Where each field begins in the vector."""
+        """First column of each field in the vector."""
         return Offsets(*(self._spans[field.name][0].start for field in FIELDS))
 
     @cached_property
@@ -173,13 +173,13 @@ class Layout:
         return low, high
 
     def pack(self, observation: Observation) -> Array:
-        """An observation as vectors, float32 [..., size], clipped into `bounds`."""
+        """An observation as vectors, float32 [..., size], clipped to `bounds`."""
         out = np.empty((*np.shape(observation.clock), self.size), np.float32)
         self.write(out, {field.name: np.asarray(getattr(observation, field.name)) for field in FIELDS})
         return out
 
     def write(self, vectors: Array, fields: Mapping[str, Array]) -> None:
-        """Put some fields, [..., *shape], into vectors [..., size], clipped into `bounds`."""
+        """Write fields, [..., *shape], into vectors [..., size], clipped to `bounds`."""
         low, high = self.bounds
         for name, values in fields.items():
             span, shape = self._spans[name]
@@ -187,7 +187,7 @@ class Layout:
             vectors[..., span] = np.clip(np.reshape(values, (*lead, -1)), low[span], high[span])
 
     def read(self, vector: Array, action_mask: Array) -> Observation:
-        """Vectors as fields by name; arrays are views of the vector."""
+        """The observation of vectors [..., size]; its arrays are views of them."""
         if vector.shape[-1] != self.size:
             raise ValueError(
                 f"An observation of {self.slots} slots and {self.peers} peer(s) has {self.size} elements, "

@@ -1,4 +1,4 @@
-"""The plans that an arm offers for a job: the same for every difficulty model."""
+"""Selection of the plans that an arm offers for a job; it does not depend on the difficulty model."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -13,15 +13,20 @@ from fleet.thermal import NODES, WINDING, ThermalModel, advance, drive_heat, gen
 Array = np.ndarray
 
 PLANS = 2
-"""Most plans that an arm offers for a job."""
+"""Maximum number of plans that an arm offers for a job."""
 COOLER_K, COOLER_SHARE = 1.0, 0.1
-"""The coolest plan is offered beside the fastest if its predicted rise is lower by this much, or by this share."""
+"""The coolest plan is offered too if its rise is below that of the fastest by this much, or by this share."""
 AMBIENT_C = 25.0
 """Ambient temperature of the prediction; rises hardly depend on it."""
 
 
 def offered_plans(variants: Sequence[Plan], repetitions: int) -> list[Plan]:
-    """The fastest plan for so many repetitions, then the coolest if it is clearly cooler; none without a variant."""
+    """The fastest plan, then the coolest if it is clearly cooler (`COOLER_K`); empty without variants.
+
+    Args:
+        variants: Plans for the same work.
+        repetitions: Cycles of the job.
+    """
     if not variants:
         return []
     fastest = min(variants, key=lambda plan: plan.duration_s(repetitions))
@@ -34,9 +39,9 @@ def offered_plans(variants: Sequence[Plan], repetitions: int) -> list[Plan]:
 
 
 def predicted_rise(variants: tuple[Plan, ...], repetitions: int) -> Array:
-    """Rise of the hottest motor of a nominal arm above its idle temperature by the end of each plan, K, [plan].
+    """Temperature rise of the hottest motor of a nominal arm at the end of each plan, from idle, K, [plan].
 
-    One exact step with the mean heat of the whole job, with copper and magnets at the temperatures halfway.
+    One exact step with the mean heat of the job. Copper and magnets have the mean of first and last temperature.
     """
     motors, thermal, idle_c = _nominal()
     loads = _loads(variants)
@@ -52,7 +57,7 @@ def predicted_rise(variants: tuple[Plan, ...], repetitions: int) -> Array:
 
 @lru_cache(maxsize=1)
 def _nominal() -> tuple[Motors, ThermalModel, Array]:
-    """A nominal arm, and its temperatures without load, [node]."""
+    """Motors and thermal model of a nominal arm, and its steady temperatures without load, °C, [node]."""
     motors, thermal = gen3_motors(), thermal_model(gen3_network())
     none = np.zeros(JOINTS)
     return motors, thermal, thermal.steady(drive_heat(np.full(NODES, AMBIENT_C), none, none, motors), AMBIENT_C)

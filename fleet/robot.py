@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from fleet.errors import check_coordinates, check_nonnegative, check_positive, nearest
+from fleet.errors import check_between, check_coordinates, check_nonnegative, nearest
 
 JOINTS = 7
 """Number of joints of a Gen3; length of the last axis of every joint array."""
@@ -75,8 +75,12 @@ class PayloadRating:
 RATING = PayloadRating()
 
 
-MOST_MOVE_HOME_S = 7 * 24 * 3600.0
-"""Longest time until a person moves a faulted arm home."""
+LONGEST_S = 7 * 24 * 3600.0
+"""Longest time until a person moves a faulted arm home, or until its fault is cleared."""
+LEAST_LIMIT_C, MOST_LIMIT_C = -60.0, 1000.0
+MOST_OFFSET_K = 50.0
+LEAST_COOLING, MOST_COOLING = 0.01, 100.0
+MOST_WEAR = 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,11 +107,8 @@ class ThermalLimits:
                 "ThermalLimits need restart_c < warning_c < error_c "
                 f"(got {self.restart_c}, {self.warning_c}, {self.error_c})."
             )
-        check_nonnegative(self, "clear_s", "move_home_s")
-        if self.move_home_s > MOST_MOVE_HOME_S:
-            raise ValueError(
-                f"ThermalLimits.move_home_s must be at most {MOST_MOVE_HOME_S:g} (got {self.move_home_s})."
-            )
+        check_between(self, LEAST_LIMIT_C, MOST_LIMIT_C, "restart_c", "error_c")
+        check_between(self, 0.0, LONGEST_S, "clear_s", "move_home_s")
 
 
 def rotation(roll_pitch_yaw_deg: tuple[float, float, float]) -> np.ndarray:
@@ -141,6 +142,7 @@ class Mount:
 
     def __post_init__(self) -> None:
         check_coordinates(self, "position_m")
+        check_between(self, -360.0, 360.0, "tilt_deg")
 
     def rotation(self) -> np.ndarray:
         """Rotation from base frame to world, [3, 3]."""
@@ -172,8 +174,10 @@ class Robot:
             raise ValueError(f"Robot.name must be non-empty, without any of / * $ ? # @ or space (got '{self.name}').")
         if self.home not in POSTURES:
             raise ValueError(f"Robot.home '{self.home}' is no posture{nearest(self.home, POSTURES)}")
-        check_nonnegative(self, "tool_kg", "wear")
-        check_positive(self, "cooling_factor")
+        check_nonnegative(self, "tool_kg")
+        check_between(self, 0.0, MOST_WEAR, "wear")
+        check_between(self, LEAST_COOLING, MOST_COOLING, "cooling_factor")
+        check_between(self, -MOST_OFFSET_K, MOST_OFFSET_K, "ambient_offset_k")
         if self.tool_kg > RATING.temporary_kg:
             raise ValueError(
                 f"Robot.tool_kg must be at most {RATING.temporary_kg:g}, the rating of the Gen3 (got {self.tool_kg})."

@@ -1,9 +1,11 @@
-"""The price of a fault in a scenario, which is the default weight of its faults in the reward.
+"""The price of a fault in a scenario: the default cost of a fault in the reward.
 
-The two factors of `fleet.engine.reward.FaultPrice` follow from the scenario alone. The value rate is the expected value
-of arriving jobs per second, over all streams. The downtime is that of a nominal arm whose joint 2 has carried a load
-until all its temperatures are steady, with the winding of that joint at `limits.error_c`: the time in which all its
-motors cool below `limits.restart_c`, at the mean ambient temperature of the shift, plus `limits.clear_s`.
+The two factors of `fleet.engine.reward.FaultPrice` follow from the scenario alone.
+
+- Value rate: expected value of arriving jobs per second, over all streams.
+- Downtime: time in which all motors of a nominal arm cool below `limits.restart_c`, plus `limits.clear_s`. The arm
+  starts at the steady temperatures of a constant load on joint 2 that brings its winding to `limits.error_c`. The
+  ambient temperature is the mean of the shift.
 """
 
 import numpy as np
@@ -15,19 +17,19 @@ from fleet.thermal import NODES, WINDING, gen3_network, node_heat, thermal_model
 from scenarios.schema import Scenario
 
 CARRIER = 1
-"""Joint 2, from 0: it carries most of a payload at reach."""
+"""Index of joint 2, which carries most of the torque of an outstretched arm."""
 AMBIENT_SAMPLES = 100
 
 
 def weights_of(scenario: Scenario) -> RewardWeights:
-    """The weights of the reward terms; without a weight of faults in the scenario, a fault costs its price."""
+    """Weights of the reward terms; the default of `faults` is minus the price of a fault."""
     given = scenario.reward
     faults = -fault_price(scenario).price if given.faults is None else given.faults
     return RewardWeights(**{**vars(given), "faults": faults})
 
 
 def fault_price(scenario: Scenario) -> FaultPrice:
-    """The price of a fault, whether or not the scenario gives another weight."""
+    """The price of a fault by value rate and downtime; it ignores `reward.faults` of the scenario."""
     value = sum(stream.value * stream.arrivals.expected(scenario.horizon_s) for stream in scenario.jobs)
     shift_s = scenario.horizon_s
     ambient_c = float(np.mean(scenario.ambient.at(np.linspace(0.0, shift_s, AMBIENT_SAMPLES))))
@@ -35,7 +37,7 @@ def fault_price(scenario: Scenario) -> FaultPrice:
 
 
 def downtime_s(limits: ThermalLimits, ambient_c: float, *, most_s: float) -> float:
-    """Time from a fault until the arm described above works again, s, at most `most_s`.
+    """Time from a fault until the arm works again, s, at most `most_s`; see the module docstring.
 
     Args:
         ambient_c: Mean ambient temperature.

@@ -50,7 +50,7 @@ def scope_of(name: str) -> str:
     Raises:
         FleetError: as `policy_of`.
     """
-    return "arm" if Path(name).is_dir() else _class_of(name).scope
+    return "arm" if _is_folder(name) else _class_of(name).scope
 
 
 def policy_at(name: str, seed: int) -> Policy:
@@ -66,13 +66,17 @@ def policy_at(name: str, seed: int) -> Policy:
 
 def label(name: str) -> str:
     """What a table calls a policy: the rule, the class, or the last folder."""
-    if Path(name).is_dir():
+    if _is_folder(name):
         return Path(os.path.abspath(name)).name
     return name.rpartition(":")[2]
 
 
+def _is_folder(name: str) -> bool:
+    return bool(name) and Path(name).is_dir()
+
+
 def _maker(name: str) -> Callable[[], Policy] | Callable[[], ArmPolicy]:
-    if Path(name).is_dir():
+    if _is_folder(name):
         from agents.learned.policy import load_policy  # loads torch
 
         return lambda: load_policy(Path(name))

@@ -9,8 +9,8 @@ import numpy as np
 from fleet.arrivals import Arrivals, Batch, Poisson, Trace
 from fleet.engine.reward import RewardWeights
 from fleet.env.validation import Decisions
-from fleet.errors import FleetError, check_nonnegative, check_positive, nearest
-from fleet.job import DWELL_S, Fixture, Kind, Place, check_bounds, check_duration, check_places
+from fleet.errors import FleetError, check_between, check_nonnegative, check_positive, nearest
+from fleet.job import BOUNDS, DWELL_S, Fixture, Kind, Place, check_bounds, check_duration, check_places
 from fleet.robot import Cooling, Mount, Robot, ThermalLimits
 
 MOST_SAMPLES = 1_000_000
@@ -19,6 +19,8 @@ MOST_SLOTS = 256
 MOST_CLEARANCE_M = 0.2
 MOST_FIXTURES = 64
 MOST_EXPLORATION = 10_000
+MOST_SPREAD = 10.0
+MOST_WEIGHT = 1e9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,7 +121,7 @@ class JobStream:
     due_s: float = 1800.0
     """Time from release to due date."""
     due: Literal["soft", "hard"] = "soft"
-    """soft: a later finish is tardy. hard: a job that no arm has begun by then expires."""
+    """soft: a later finish is tardy. hard: a job that waits then expires, begun before or not."""
     after: tuple[str, ...] = ()
     """Streams whose job of the same number must finish first."""
 
@@ -211,7 +213,8 @@ class Spread:
     """Seed of the deviations."""
 
     def __post_init__(self) -> None:
-        check_nonnegative(self, "scale", "seed")
+        check_between(self, 0.0, MOST_SPREAD, "scale")
+        check_nonnegative(self, "seed")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,6 +227,10 @@ class RewardSpec:
     faults: float | None = None
     """None: minus the price of a fault, see `scenarios.fault_price`."""
     energy: float = RewardWeights.energy
+
+    def __post_init__(self) -> None:
+        given = (name for name in vars(RewardWeights()) if getattr(self, name) is not None)
+        check_between(self, -MOST_WEIGHT, MOST_WEIGHT, *given)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -254,6 +261,11 @@ class Scenario:
 
     def __post_init__(self) -> None:
         check_positive(self, "horizon_s", "decision_interval_s", "telemetry_interval_s")
+        if self.decision_interval_s > self.horizon_s:
+            raise ValueError(
+                "Scenario.decision_interval_s must not exceed horizon_s "
+                f"(got {self.decision_interval_s}, {self.horizon_s})"
+            )
         if self.telemetry_interval_s > self.decision_interval_s:
             raise ValueError(
                 "Scenario.telemetry_interval_s must not exceed decision_interval_s "
@@ -271,6 +283,12 @@ class Scenario:
             raise ValueError(
                 f"Scenario.horizon_s must be at most {MOST_SAMPLES} times telemetry_interval_s "
                 f"(got {self.horizon_s}, {self.telemetry_interval_s})"
+            )
+        latest_s = self.horizon_s + max((stream.due_s for stream in self.jobs), default=0.0)
+        if latest_s > BOUNDS["due_s"].high:
+            raise ValueError(
+                f"Scenario.jobs: horizon_s plus the longest due_s must be at most {BOUNDS['due_s'].high:.15g} s "
+                f"(got {latest_s:.15g})"
             )
         if not self.name.strip() or self.name[0] == "." or any(c in "/\\" or not c.isprintable() for c in self.name):
             raise ValueError(

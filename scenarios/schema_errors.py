@@ -49,7 +49,7 @@ def readable_error(error: msgspec.ValidationError, raw: object, schema: Any) -> 
     place = place.strip("`").lstrip(".")
     text = text.rstrip(".")
     if match := _OWN_FIELD.fullmatch(text):
-        return f"{place}.{match[1]}.".lstrip(".")
+        return f"{place}.{match[1]}{'' if match[1].endswith('?') else '.'}".lstrip(".")
     if match := _OWN.fullmatch(text):
         return f"{place} {match[1]}.".lstrip()
     lead = f"{place}: " if place else ""

@@ -109,6 +109,8 @@ def test_a_scenario_keeps_the_bounds(field, value):
     content = [value] if field == "payload_kg" else value
     error = error_of(lambda: with_stream("press", repetitions=[1, 1], **{field: content}))
     low, high = ALLOWED[field]
+    if field == "due_s":  # of the last job, which is released before the horizon
+        high -= load("quickstart").horizon_s
     assert (error is None) == (low <= value <= high)
     assert error is None or field in error
 

@@ -35,22 +35,16 @@ def update_offers(t: Tables, d: Jobs, s: State, o: OpenJobs, events: EventBuffer
     pending, times_s, away, progress_s, todo = o.pending, t.times_s, s.plan, s.progress_s, s.todo
     tick, modes, status = s.tick, s.mode, s.status
     slot_job, mask, queue, head, current = o.slot_job, o.mask, o.queue, o.head, o.current_kind
-    stations, plans, volume, closed, options = t.stations, t.plan, t.volume, o.closed, nonnegative(t.plan.shape[3])
-    excluded = t.excluded
+    stations, work, closed, excluded, station_free = t.stations, t.work, o.closed, t.excluded, o.station_free
+    options = nonnegative(work.shape[3])
     arms, slots = nonnegative(modes.shape[1]), nonnegative(slot_job.shape[1])
     waits, words, last = nonnegative(after.shape[2]), nonnegative(stations.shape[2]), nonnegative(mask.shape[2] - 1)
-    busy = np.empty(words, np.uint64)
+    busy, slot_kind = np.empty(words, np.uint64), np.empty(slots, np.int64)
     for row in rows:
         e = nonnegative(row)
         fleet, now_s, filled = nonnegative(fleets[e]), tick[e] * t.dt_s, 0
         mark_busy_stations(fleet, e, current, stations, busy)
         mark_closed_space(away, excluded, closed, e)
-        for a in range(arms):
-            mask[e, a, last] = (
-                modes[e, a] == WORKING
-                and pending[e, a]
-                and cycles_begun(times_s, away, progress_s, todo, e, a) < todo[e, a]
-            )
         place = nonnegative(head[e])
         while place < count[e]:
             j = nonnegative(queue[e, place])
@@ -74,21 +68,24 @@ def update_offers(t: Tables, d: Jobs, s: State, o: OpenJobs, events: EventBuffer
             kind, free = nonnegative(kinds[e, j]), True
             for w in range(words):
                 free = free and (stations[fleet, kind, w] & busy[w]) == 0
-            slot_job[e, filled], o.station_free[e, filled] = j, free
-            for a in range(arms):
-                open_here = free and modes[e, a] == IDLE
-                for n in range(options):
-                    plan = plans[fleet, a, kind, n]
-                    mask[e, a, 1 + filled * options + n] = (
-                        open_here and plan >= 0 and not is_closed(closed, e, nonnegative(volume[nonnegative(plan)]))
-                    )
+            slot_job[e, filled], station_free[e, filled], slot_kind[filled] = j, free, kind
             filled += 1
-        while filled < slots and slot_job[e, filled] >= 0:  # slots of the step before
-            slot_job[e, filled], o.station_free[e, filled] = -1, False
-            for a in range(arms):
-                for n in range(options):
-                    mask[e, a, 1 + filled * options + n] = 0
-            filled += 1
+        for k in range(filled, slots):
+            slot_job[e, k], station_free[e, k] = -1, False
+        for a in range(arms):
+            for action in range(1, last):
+                mask[e, a, action] = 0
+            mask[e, a, last] = (
+                modes[e, a] == WORKING
+                and pending[e, a]
+                and cycles_begun(times_s, away, progress_s, todo, e, a) < todo[e, a]
+            )
+            if modes[e, a] == IDLE:
+                for k in range(filled):
+                    for n in range(options):
+                        own = work[fleet, a, slot_kind[k], n]
+                        taken = is_closed(closed, e, nonnegative(own["volume"]))
+                        mask[e, a, 1 + k * options + n] = station_free[e, k] & (own["plan"] >= 0) & (not taken)
 
 
 @jit_inline
@@ -140,12 +137,8 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
     progress_s, todo, cycles = s.progress_s, s.todo, s.cycles
     slot_job, mask, queue, head, current, pending = o.slot_job, o.mask, o.queue, o.head, o.current_kind, o.pending
     stations, work, recording = t.stations, t.work, len(events.what) > 0
-    plans, plan_of, volume, excluded, closed = s.plan, t.plan, t.volume, t.excluded, o.closed
-    arms, options, words = (
-        nonnegative(modes.shape[1]),
-        nonnegative(plan_of.shape[3]),
-        nonnegative(stations.shape[2]),
-    )
+    plans, excluded, closed = s.plan, t.excluded, o.closed
+    arms, options, words = nonnegative(modes.shape[1]), nonnegative(work.shape[3]), nonnegative(stations.shape[2])
     give_back = mask.shape[2] - 1
     busy, key, order = np.empty(words, np.uint64), np.empty(arms), np.empty(arms, np.int64)
     for row in rows:
@@ -182,8 +175,9 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
             slot, option = divmod(actions[e, a] - 1, options)
             j, option = nonnegative(slot_job[e, slot]), nonnegative(option)
             kind, free = nonnegative(kinds[e, j]), status[e, j] == WAITING
-            plan = nonnegative(plan_of[fleet, a, kind, option])
-            free = free and not is_closed(closed, e, nonnegative(volume[plan]))
+            own = work[fleet, a, kind, option]
+            plan = nonnegative(own["plan"])
+            free = free and not is_closed(closed, e, nonnegative(own["volume"]))
             for w in range(words):
                 free = free and (stations[fleet, kind, w] & busy[w]) == 0
             if not free:
@@ -201,7 +195,7 @@ def resolve_claims(sim: Simulation, actions: Array, rows: Array) -> None:
             current[e, a], pending[e, a] = kind, True
             todo[e, a] = repetitions[e, j] - cycles[e, j]
             if recording:
-                record_event(events, AWARD, e, a, j, plan, 0.0, float(work[fleet, a, kind, option]["difficulty"]))
+                record_event(events, AWARD, e, a, j, plan, 0.0, float(own["difficulty"]))
 
 
 @jit_inline

@@ -4,8 +4,6 @@
 `fleet.engine.peers` replaces the peers' fields by what was delivered.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from fleet.difficulty import KNOWN, probability_of
@@ -19,16 +17,6 @@ from fleet.seeding import random_normal
 from fleet.telemetry import FAULTED, IDLE, WORKING
 
 Array = np.ndarray
-
-
-class ForecastTables(NamedTuple):
-    """The forecasts of the tables by themselves: passing all tables to a function takes longer than the function."""
-
-    offset: Array
-    weight: Array
-    time_s: Array
-    curve: Array
-
 
 PEAK_LOW_C, PEAK_HIGH_C = -60.0, 300.0
 """Bounds of predicted temperatures in the vector."""
@@ -49,9 +37,9 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
     ticks, temp_c, modes, progress_s, todo = s.tick, s.temp_c, s.mode, s.progress_s, s.todo
     last, queued_s, cycles, returns = s.last_award, s.queued_s, s.cycles, s.returns
     slot_job, station_free, plans, times_s = o.slot_job, o.station_free, s.plan, t.times_s
-    plan_of, volume, excluded, closed = t.plan, t.volume, t.excluded, o.closed
+    excluded, closed = t.excluded, o.closed
     noise_k, payload_kg, values, work = t.sensor_noise_k, t.payload_kg, t.value, t.work
-    arms, slots, options = nonnegative(modes.shape[1]), nonnegative(slot_job.shape[1]), nonnegative(plan_of.shape[3])
+    arms, slots, options = nonnegative(modes.shape[1]), nonnegative(slot_job.shape[1]), nonnegative(work.shape[3])
     at, low, high, first, change = form.offsets, form.low, form.high, form.first_change, form.change
     size = nonnegative(out.shape[2])
     jobs, pending, who = s.job, o.pending, form.who
@@ -60,10 +48,11 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
     most_kg, most_value, most_returns = high[at.payload_kg], high[at.value], high[at.returns]
     true_c, measured_c, headroom_k = np.empty(LANES), np.empty((arms, LANES)), np.empty(arms, np.float32)
     left, slack_s, slot_kind = np.empty(slots), np.empty(slots), np.empty(slots, np.int64)
+    fast_volume, fast_can = np.empty(slots, np.int64), np.empty(slots, np.bool_)
     known, shared = np.zeros((arms, slots), np.float32), np.zeros((arms, slots), np.float32)
-    tables = ForecastTables(t.forecast_offset, t.forecast_weight, t.forecast_time_s, t.forecast_curve)
-    warning_c = t.warning_c
-    known_c, values_c, left_s = np.zeros(KNOWN), np.empty(t.forecast_offset.shape[1]), np.zeros(arms)
+    first_block, block, curve = t.forecast_first, t.forecast_block, t.forecast_curve
+    warning_c, forecasts = t.warning_c, len(curve) > 0
+    known_c, values_c, left_s = np.zeros(KNOWN), np.empty(LANES), np.zeros(arms)
     housing_c, ambient, offsets_k = s.housing_c, t.ambient_c, d.ambient_offset_k
     too_heavy, expires = t.too_heavy, d.expires
     # The vector of an arm but for its own fields: filled slots and peers.
@@ -143,11 +132,11 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
                 cycles_over = min(int(over_s / max(times_s[plan, 1], 1e-9) + 1e-9), todo[e, a])
                 out[e, a, at.job_cycles] = min(repetitions[e, j] - cycles[e, j] - cycles_over, LONG_S)
                 for n in range(options):
-                    if plan_of[fleet, a, kind, n] == plan:
-                        own = work[fleet, a, kind, n]
+                    own = work[fleet, a, kind, n]
+                    if own["plan"] == plan:
                         p, risk, peak, peak_c = own["p_saturation"], own["risk"], own["peak"], 0.0
                         if risk >= 0 or peak >= 0:
-                            p, peak_c = predict(p, risk, peak, tables, known_c, left_s[a], values_c)
+                            p, peak_c = predict(p, risk, peak, first_block, block, curve, known_c, left_s[a], values_c)
                             if peak >= 0:
                                 peak_c = max(peak_c, warning_c - headroom_k[a])
                         out[e, a, at.job_p] = 0.5 if np.isnan(p) else p
@@ -155,65 +144,82 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
             for k in range(filled):
                 kind = nonnegative(slot_kind[k])
                 out[e, a, at.too_heavy + k] = too_heavy[fleet, kind, a]
-                for n in range(options):
-                    plan, option = plan_of[fleet, a, kind, n], k * options + n
-                    if plan < 0:
-                        continue
-                    own = work[fleet, a, kind, n]
-                    duration_s, score = own["travel_s"] + left[k] * own["cycle_s"], own["difficulty"]
-                    space_free = not is_closed(closed, e, nonnegative(volume[plan]))
-                    out[e, a, at.feasible + option], out[e, a, at.space_free + option] = 1.0, space_free
-                    if n == 0 and not space_free:
-                        for peer in range(peers):
-                            other = plans[e, who[a, peer]]
-                            if other >= 0 and is_closed(excluded, nonnegative(other), nonnegative(volume[plan])):
-                                out[e, a, at.peer_blocks + peer * slots + k] = 1.0
+                for n in range(options):  # without branches: few of these conditions can be guessed
+                    own, option = work[fleet, a, kind, n], k * options + n
+                    can, open_space = own["plan"] >= 0, not is_closed(closed, e, nonnegative(own["volume"]))
+                    duration_s, score, p = (
+                        own["travel_s"] + left[k] * own["cycle_s"],
+                        own["difficulty"],
+                        own["p_saturation"],
+                    )
+                    late_s, is_known = min(max(slack_s[k] - duration_s, -LONG_S), LONG_S), can & (score == score)
+                    out[e, a, at.feasible + option], out[e, a, at.space_free + option] = can, can & open_space
                     out[e, a, at.duration_s + option] = min(duration_s, LONG_S)
-                    out[e, a, at.slack_s + option] = min(max(slack_s[k] - duration_s, -LONG_S), LONG_S)
-                    if not np.isnan(score):
-                        out[e, a, at.known + option], out[e, a, at.difficulty + option] = 1.0, score
-                    p, risk, peak = own["p_saturation"], own["risk"], own["peak"]
-                    if risk >= 0 or peak >= 0:
-                        p, peak_c = predict(p, risk, peak, tables, known_c, np.inf, values_c)
-                        out[e, a, at.peak_c + option] = min(max(peak_c, PEAK_LOW_C), PEAK_HIGH_C)
-                    if not np.isnan(p):
-                        out[e, a, at.p_saturation + option] = p
+                    out[e, a, at.slack_s + option] = late_s if can else 0.0
+                    out[e, a, at.known + option], out[e, a, at.difficulty + option] = (
+                        is_known,
+                        score if is_known else 0.0,
+                    )
+                    out[e, a, at.p_saturation + option] = p if p == p else 0.5
+            for k in range(filled):
+                own = work[fleet, a, slot_kind[k], 0]
+                fast_volume[k], fast_can[k] = nonnegative(own["volume"]), own["plan"] >= 0
+            for peer in range(peers):
+                other = plans[e, who[a, peer]]
+                if other >= 0:
+                    for k in range(filled):
+                        blocked = is_closed(excluded, nonnegative(other), fast_volume[k]) & fast_can[k]
+                        out[e, a, at.peer_blocks + peer * slots + k] = blocked
+            if forecasts:
+                for k in range(filled):
+                    for n in range(options):
+                        own, option = work[fleet, a, slot_kind[k], n], k * options + n
+                        p, risk, peak = own["p_saturation"], own["risk"], own["peak"]
+                        if risk >= 0 or peak >= 0:
+                            p, peak_c = predict(p, risk, peak, first_block, block, curve, known_c, np.inf, values_c)
+                            out[e, a, at.peak_c + option] = min(max(peak_c, PEAK_LOW_C), PEAK_HIGH_C)
+                            if not np.isnan(p):
+                                out[e, a, at.p_saturation + option] = p
 
 
 @jit_inline
 def predict(
-    p: float, risk: int, peak: int, tables: ForecastTables, known_c: Array, left_s: float, values: Array
+    p: float, risk: int, peak: int, first: Array, block: Array, curve: Array, known_c: Array, left_s: float, room: Array
 ) -> tuple[float, float]:
     """P(saturation), NaN if unknown, and predicted peak temperature, °C, 0 if unknown, of a plan.
+
+    Arrays of forecasts are arguments of their own: to pass a tuple of them takes longer than to use it.
 
     Args:
         p: From a model that ignores the temperatures; NaN if there is none.
         risk: Row of the forecast of P, −1 for none.
         peak: Row of the forecast of the peak temperature, −1 for none.
+        first, block, curve: Forecasts; see `fleet.engine.tables.Tables`.
         known_c: [KNOWN].
         left_s: Pieces of later moments do not count.
-        values: Room for the values of the pieces, [piece].
+        room: For the values of some pieces, [lane].
     """
-    curve, peak_c = tables.curve, 0.0
+    peak_c = 0.0
     if peak >= 0:
-        peak_c = largest_piece(tables, peak, known_c, left_s, values)
+        peak_c = largest_piece(first, block, peak, known_c, left_s, room)
         if curve.shape[1] > 0 and risk < 0 and np.isnan(p) and not np.isnan(curve[peak, 0, 0]):
             p = probability_of(peak_c, curve[peak])
     if risk >= 0:
-        p = probability_of(largest_piece(tables, risk, known_c, left_s, values), curve[risk])
+        p = probability_of(largest_piece(first, block, risk, known_c, left_s, room), curve[risk])
     return p, peak_c
 
 
 @jit_inline
-def largest_piece(tables: ForecastTables, row: int, known_c: Array, left_s: float, values: Array) -> float:
+def largest_piece(first: Array, block: Array, row: int, known_c: Array, left_s: float, room: Array) -> float:
     """Value of a forecast without the pieces of moments later than `left_s`, −inf if none is left."""
-    offset, weight, time_s, most = tables.offset, tables.weight, tables.time_s, -np.inf
-    for piece in range(len(values)):
-        values[piece] = offset[row, piece]
-    for i in range(KNOWN):
-        for piece in range(len(values)):
-            values[piece] += weight[row, i, piece] * known_c[i]
-    for piece in range(len(values)):
-        if time_s[row, piece] <= left_s:
-            most = max(most, values[piece])
+    most = -np.inf
+    for b in range(nonnegative(first[row]), nonnegative(first[row + 1])):
+        for lane in range(LANES):
+            total = block[b, 0, lane]
+            for i in range(KNOWN):
+                total += block[b, 2 + i, lane] * known_c[i]
+            room[lane] = total
+        for lane in range(LANES):
+            if block[b, 1, lane] <= left_s:
+                most = max(most, room[lane])
     return most

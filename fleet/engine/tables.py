@@ -22,15 +22,13 @@ LANES, WIDE = JOINTS + 1, 16
 """Padded lengths of the joint and the node axis."""
 
 WORK = np.dtype(
-    {
-        "names": ["travel_s", "cycle_s", "difficulty", "p_saturation", "risk", "peak"],
-        "formats": ["f8", "f8", "f8", "f8", "i8", "i8"],
-        "itemsize": 64,  # one cache line
-    }
+    [(name, "f8") for name in ("travel_s", "cycle_s", "difficulty", "p_saturation")]
+    + [(name, "i8") for name in ("risk", "peak", "plan", "volume")]
 )
-"""What an arm knows of a plan for a kind of job: seconds of approach and retreat, and of one repetition, both 0 where
-it has none; difficulty; P(saturation) from models that ignore the start temperature, both NaN where not known; rows of
-the forecasts of P and of the peak temperature, −1 for none."""
+"""What an arm knows of a plan for a kind of job, one cache line: seconds of approach and retreat, and of one
+repetition, both 0 where it has none; difficulty; P(saturation) from models that ignore the start temperature, both NaN
+where not known; rows of the forecasts of P and of the peak temperature, −1 for none; row of the plan tables, −1 where
+it has none; the volume that the plan takes, counted for each fleet."""
 
 
 class Tables(NamedTuple):
@@ -72,14 +70,10 @@ class Tables(NamedTuple):
     current_sq: Array
     friction_w: Array
     """[plan, phase, lane], as is the one before."""
-    volume: Array
-    """Volume that a plan takes, int [plan]; volumes are counted for each fleet."""
     excluded: Array
     """Volumes that no other arm can take meanwhile, one bit each, uint64 [plan, word]."""
-    plan: Array
-    """Row of the plan tables, −1 where the arm has none, int [fleet, arm, kind, plan]; the fastest first."""
     work: Array
-    """What an arm knows of its plans for a kind of job, `WORK` [fleet, arm, kind, plan]."""
+    """What an arm knows of its plans for a kind of job, the fastest first, `WORK` [fleet, arm, kind, plan]."""
     housing_keep: Array
     """The arms' observers of their housings, see `fleet.housing_observer`; [fleet, arm, from, lane]."""
     housing_gain: Array
@@ -91,12 +85,10 @@ class Tables(NamedTuple):
     """[fleet, arm, lane]."""
     start_housing_c: Array
     """[fleet, arm, joint]."""
-    forecast_offset: Array
-    """[forecast, piece]; see `fleet.difficulty.Forecast`. Pieces are padded to whole lanes with −inf."""
-    forecast_weight: Array
-    """[forecast, known, piece]."""
-    forecast_time_s: Array
-    """[forecast, piece]."""
+    forecast_first: Array
+    """Where the blocks of each forecast begin, int [forecast + 1]; see `fleet.difficulty.forecast_arrays`."""
+    forecast_block: Array
+    """Pieces, [block, 2 + known, lane]."""
     forecast_curve: Array
     """[forecast, knot, 2]; no knots where no forecast has a curve."""
     too_heavy: Array
@@ -195,7 +187,7 @@ class Form(NamedTuple):
     """A `Layout` as the kernels want it."""
 
     offsets: Offsets
-    """Where each field begins in the vector."""
+    """Where each field begins in the vector; unsigned, so that the compiler omits checks for negative indices."""
     low: Array
     """Bounds of the vector, float32 [size]."""
     high: Array
@@ -229,7 +221,8 @@ def form_of(layout: Layout) -> Form:
         first.append(len(changes))
         shown = peers
     low, high = layout.bounds
-    return Form(layout.offsets, low, high, np.array(first), layout.who, np.array(changes, dtype=int).reshape(-1, 2))
+    offsets = Offsets(*map(np.uint32, layout.offsets))
+    return Form(offsets, low, high, np.array(first), layout.who, np.array(changes, dtype=int).reshape(-1, 2))
 
 
 def tables_of(world: World) -> tuple[Tables, Jobs]:
@@ -248,7 +241,8 @@ def tables_of(world: World) -> tuple[Tables, Jobs]:
     work = np.zeros(can.shape, WORK)
     work["travel_s"], work["cycle_s"] = times_s[..., 0] + times_s[..., 2], times_s[..., 1]
     work["difficulty"], work["p_saturation"] = offers.difficulty, offers.p_saturation
-    work["risk"], work["peak"] = offers.risk, offers.peak
+    work["risk"], work["peak"], work["plan"] = offers.risk, offers.peak, offers.plan
+    work["volume"] = np.where(can, world.plans.volume[offers.plan], 0)
     forecasts, observer = forecast_arrays(offers.forecasts, LANES), world.observer
     thermal_step = np.concatenate([world.phi, world.gamma], axis=-1).swapaxes(-1, -2)
     tables = Tables(
@@ -278,9 +272,7 @@ def tables_of(world: World) -> tuple[Tables, Jobs]:
         times_s=world.plans.times_s,
         current_sq=pad(world.plans.current_sq),
         friction_w=pad(world.plans.friction_w),
-        volume=world.plans.volume,
         excluded=bits(world.conflicts[world.plans.volume]),
-        plan=offers.plan,
         work=work,
         housing_keep=per_fleet(pad(observer.keep.swapaxes(-1, -2))),
         housing_gain=per_fleet(pad(observer.gain.swapaxes(-1, -2))),
@@ -346,7 +338,7 @@ def owned(arrays: Arrays) -> Arrays:
 
 
 _SCALARS = tuple(name for name, kind in Tables.__annotations__.items() if kind is not Array)
-_RENUMBERED = ("plan", "stations", "excluded", *_FORECAST)
+_RENUMBERED = ("stations", "excluded", *_FORECAST)
 
 
 def stack_tables(fleets: Sequence[Tables]) -> Tables:
@@ -362,12 +354,12 @@ def stack_tables(fleets: Sequence[Tables]) -> Tables:
                 raise ValueError(
                     f"Fleets of one batch must agree in {name} ({getattr(first, name)}, {getattr(other, name)})."
                 )
-        for name in ("ambient_c", "plan"):
+        for name in ("ambient_c", "work"):
             if getattr(other, name).shape != getattr(first, name).shape:
                 raise ValueError(f"Fleets of one batch must have as many arms and kinds of jobs as the first ({name}).")
     plans = np.cumsum([0, *(len(each.times_s) for each in fleets)])
-    forecasts = np.cumsum([0, *(len(each.forecast_offset) for each in fleets)])
-    pieces = max(each.forecast_offset.shape[1] for each in fleets)
+    forecasts = np.cumsum([0, *(len(each.forecast_curve) for each in fleets)])
+    blocks = np.cumsum([0, *(len(each.forecast_block) for each in fleets)])
     knots = max(each.forecast_curve.shape[1] for each in fleets)
 
     def shifted(each: Iterable[Array], by: Array) -> Array:
@@ -378,15 +370,15 @@ def stack_tables(fleets: Sequence[Tables]) -> Tables:
         for name in Tables._fields
         if name not in (*_SCALARS, *_RENUMBERED)
     }
-    for name in ("risk", "peak"):
-        joined["work"][name] = shifted((t.work[name] for t in fleets), forecasts)
+    for name, rows in (("risk", forecasts), ("peak", forecasts), ("plan", plans)):
+        joined["work"][name] = shifted((t.work[name] for t in fleets), rows)
     return owned(
         first._replace(
             **joined,
-            plan=shifted((t.plan for t in fleets), plans),
-            forecast_offset=np.concatenate([pad(t.forecast_offset, 1, pieces, -np.inf) for t in fleets]),
-            forecast_weight=np.concatenate([pad(t.forecast_weight, 2, pieces) for t in fleets]),
-            forecast_time_s=np.concatenate([pad(t.forecast_time_s, 1, pieces) for t in fleets]),
+            forecast_first=np.concatenate(
+                [[0], *(t.forecast_first[1:] + n for t, n in zip(fleets, blocks, strict=False))]
+            ),
+            forecast_block=np.concatenate([t.forecast_block for t in fleets]),
             forecast_curve=np.concatenate([extend_curve(t.forecast_curve, knots) for t in fleets]),
             stations=_same_words([t.stations for t in fleets]),
             excluded=_same_words([t.excluded for t in fleets]),

@@ -85,7 +85,7 @@ class BatchEnv:
         """Of the present shift of each env."""
         self.agents = library.arms
         """Names of the arms, in the order of the arm axis."""
-        self.layout = Layout(len(library.arms), library.slots, library.near, library.tables.plan.shape[3])
+        self.layout = Layout(len(library.arms), library.slots, library.near, library.tables.work.shape[3])
         self.single_observation_space, self.single_action_space = arm_spaces(self.layout)
         """Of one arm."""
         self.autoreset = autoreset

@@ -1,7 +1,7 @@
-"""Smallest distance between two arms along their paths, whenever each is where on its path.
+"""Smallest distance between two arms over all pairs of positions on their paths.
 
-Capsules are compared along trees of bounding boxes; the distance of two capsules is that of their axes, which are
-segments, less the radii (C. Ericson, Real-Time Collision Detection, 2005, section 5.1.9).
+A search through trees of bounding boxes finds the closest capsules. The distance of two capsules is that of their axes,
+which are segments, minus the radii (C. Ericson, Real-Time Collision Detection, 2005, section 5.1.9).
 """
 
 from dataclasses import dataclass
@@ -19,13 +19,15 @@ class Clearance:
     """Smallest distance between two sweeps."""
 
     distance_m: float
-    """Negative where they are inside each other."""
+    """Negative if they intersect."""
     link: str
+    """Link of the first sweep at the smallest distance, or its payload."""
     other_link: str
+    """The same of the second sweep."""
 
 
 def clearance(one: Sweep, other: Sweep, cutoff_m: float = np.inf) -> Clearance | None:
-    """Smallest distance between two sweeps; None if it is not below the cutoff."""
+    """Smallest distance between two sweeps; None if it is not less than the cutoff."""
     distance_m, i, j = _search(one, other, cutoff_m, -np.inf)
     return None if i < 0 else Clearance(distance_m, one.links[i], other.links[j])
 
@@ -46,10 +48,10 @@ def search(
     ends_a: Array, radius_a: Array, boxes_a: Array, ends_b: Array, radius_b: Array, boxes_b: Array,
     cutoff_m: float, enough_m: float,
 ) -> tuple[float, int, int]:  # fmt: skip
-    """Smallest distance below the cutoff, and the capsules that have it (−1 for none).
+    """Smallest distance below the cutoff, and the indices of its two capsules (−1 for none).
 
     Args:
-        ends_a: As in `Sweep`, like the next two; likewise of the other sweep.
+        ends_a, radius_a, boxes_a: As in `Sweep`; `…_b` are those of the other sweep.
         enough_m: The search ends at the first distance below this.
     """
     best, at_a, at_b = cutoff_m, -1, -1
@@ -87,7 +89,7 @@ def search(
 
 @jit_inline
 def box_distance(a: Array, b: Array) -> float:
-    """Distance of two boxes [(low, high), 3], m."""
+    """Distance of two boxes [(low, high), 3], m; −inf if they touch."""
     square = 0.0
     for k in range(3):
         gap = max(a[0, k] - b[1, k], b[0, k] - a[1, k])
@@ -103,7 +105,7 @@ def segment_distance(a: Array, b: Array) -> float:
     for k in range(3):
         u, v, r = float(a[1, k] - a[0, k]), float(b[1, k] - b[0, k]), float(a[0, k] - b[0, k])
         aa, bb, ab, ar, br = aa + u * u, bb + v * v, ab + u * v, ar + u * r, br + v * r
-    s = t = 0.0  # where on each segment, 0 to 1
+    s = t = 0.0  # nearest point on each segment, 0 to 1
     determinant = aa * bb - ab * ab
     if determinant > 1e-12:
         s = min(max((ab * br - ar * bb) / determinant, 0.0), 1.0)

@@ -1,7 +1,8 @@
 """Space of a cell: which plans of two arms exclude each other, and which plans come too close to an arm at home.
 
-The space of a plan is the path of its links and its payload from leaving home to being home again. Plans of one arm
-through the same postures share one volume, that of their heaviest payload, whatever their speed and dwell.
+The space of a plan is the volume through which the links and the payload move, from home to home. Plans of one arm
+through the same postures share one volume, with the heaviest payload; speed and dwell have no effect. A table numbers
+the volumes of a cell.
 """
 
 import hashlib
@@ -27,26 +28,26 @@ if TYPE_CHECKING:  # both load MuJoCo
 
 Array = np.ndarray
 PlanKey = tuple[str, Work, int, float]
-"""Arm, work, elbow and speed of a plan: equal in all processes."""
+"""Arm, work, elbow and speed of a plan; the same in all processes."""
 
 SPACE_VERSION = 1
 """Increment it whenever the space of the same plans changes."""
 FARTHEST_M = 1.5
-"""No part of an arm or of its payload is ever farther from its base: 0.29 m to joint 2, 0.91 m to the flange, a payload
-of 0.2 m, and the radius of a link."""
+"""Upper bound of the distance from the base to any part of an arm and its payload: 0.29 m to joint 2, 0.91 m to the
+flange, a payload of 0.2 m, and the radius of a link."""
 
 
 @dataclass(frozen=True, eq=False)
 class SpaceTable:
-    """Volumes of the plans of a cell, and which of them exclude each other."""
+    """Volume of each plan of a cell, and which volumes exclude each other."""
 
     volume: Mapping[PlanKey, int]
-    """Volume of each plan."""
+    """Number of the volume of each plan."""
     conflicts: Array
-    """Whether two volumes come closer than the margin, bool [volume, volume]; True for any two of one arm."""
+    """Whether two volumes come closer than the margin, bool [volume, volume]; True for any two volumes of one arm."""
 
     def rows(self, plans: Sequence[Plan]) -> tuple[Array, Array]:
-        """Volume of each plan, int [plan], and `conflicts`.
+        """Number of the volume of each plan, int [plan], and `conflicts`.
 
         Raises:
             ValueError: a plan is not in the table.
@@ -66,7 +67,7 @@ def plan_key(plan: Plan) -> PlanKey:
 
 
 def space_name(key: PlanKey) -> str:
-    """Name of the space of a plan on the bus: equal in all processes, as it follows from the content of the plan."""
+    """Name of the space of a plan on the bus: a hash of the key, so it is the same in all processes."""
     arm, work, elbow, speed = key
     places = [[place.name, *map(float, (*place.position_m, *place.tool_deg, place.retreat_m))] for place in work.places]
     numbers = [float(value) for value in (work.payload_kg, work.dwell_s, work.force_n, elbow, speed)]
@@ -75,7 +76,7 @@ def space_name(key: PlanKey) -> str:
 
 
 def arms_in_reach(robots: Sequence[Robot], margin_m: float) -> frozenset[frozenset[str]]:
-    """Every two arms whose parts could come closer to each other than a margin in some posture, by name."""
+    """Pairs of arms, by name, that could come closer to each other than a margin in some posture."""
     pairs = combinations(robots, 2)
     return frozenset(frozenset((one.name, other.name)) for one, other in pairs if _in_reach(one, other, margin_m))
 
@@ -85,8 +86,8 @@ def space_table(robots: Sequence[Robot], plans: Sequence[Plan], margin_m: float,
 
     Args:
         robots: The arms of the cell.
-        plans: Of these arms, all that will be asked for.
-        margin_m: Two arms that come closer than this exclude each other.
+        plans: All plans of these arms that `SpaceTable.rows` will look up.
+        margin_m: Two volumes that come closer than this exclude each other.
     """
     paths = [_Paths(robot, plans) for robot in robots]
     ends = np.cumsum([0, *(len(own.heaviest) for own in paths)])
@@ -108,10 +109,10 @@ def space_table(robots: Sequence[Robot], plans: Sequence[Plan], margin_m: float,
 def conflicts_with_homes(
     robot: Robot, others: Sequence[Robot], plans: Sequence[Plan], margin_m: float, cache_dir: Path
 ) -> list[str | None]:
-    """Why a plan of an arm cannot be done beside the other arms at home; None for a plan that is clear of all.
+    """Reason why each plan comes too close to other arms at home; None if it does not.
 
     Args:
-        plans: Of `robot`; the result for one does not depend on which others are given.
+        plans: Plans of `robot`; the result for one plan does not depend on the other plans.
     """
     paths = _Paths(robot, plans)
     near = [other for other in others if _in_reach(robot, other, margin_m)]
@@ -136,7 +137,7 @@ def conflicts_with_homes(
 
 
 def collisions_of_homes(robots: Sequence[Robot], margin_m: float, cache_dir: Path) -> list[str]:
-    """Sentences on every two arms that come closer to each other than a margin while both are at home."""
+    """One sentence for each pair of arms that are closer to each other than a margin while both are at home."""
 
     def compute() -> dict[str, Array]:
         from fleet.planning.clearance import clearance
@@ -153,15 +154,15 @@ def collisions_of_homes(robots: Sequence[Robot], margin_m: float, cache_dir: Pat
 
 
 class _Paths:
-    """The different paths of one arm's plans."""
+    """The distinct paths of one arm's plans, numbered."""
 
     def __init__(self, robot: Robot, plans: Sequence[Plan]) -> None:
         self.robot = robot
         self.row: dict[PlanKey, int] = {}
-        """Path of each plan."""
+        """Number of the path of each plan."""
         rows: dict[bytes, int] = {}
         self.plan: list[Plan] = []
-        """A plan of each path."""
+        """One plan for each path."""
         self.heaviest: list[float] = []
         """Heaviest payload on each path, kg."""
         for plan in plans:
@@ -174,7 +175,7 @@ class _Paths:
             self.row[plan_key(plan)] = row
             self.heaviest[row] = max(self.heaviest[row], plan.work.payload_kg)
         self.loads = sorted({(row, work.payload_kg) for (_, work, _, _), row in self.row.items()})
-        """Every path with every payload on it."""
+        """Each path with each payload that is carried along it: (path, kg)."""
         self.sweeps: Callable[[], list[Sweep]] = cache(
             lambda: [self.sweep(row, payload_kg) for row, payload_kg in enumerate(self.heaviest)]
         )
@@ -192,7 +193,7 @@ class _Paths:
 
 
 def _stops(plan: Plan) -> Array:
-    """Postures at which the arm stands along a plan, float32 [stop, joint]; it moves straight from one to the next."""
+    """Postures at which the arm stops along a plan, float32 [stop, joint]; joint paths between them are straight."""
     profiles = [phase.profile for phase in plan.phases]
     stops = np.concatenate([profile[(profile[:, 1] == 0).all(axis=1), 0] for profile in profiles])
     return stops[np.append(True, (np.diff(stops, axis=0) != 0).any(axis=1))]
@@ -247,7 +248,7 @@ def _home(robot: Robot) -> "Sweep":
 
 
 def _home_reason(sweep: "Sweep", homes: Sequence[tuple[str, "Sweep"]], margin_m: float) -> str:
-    """Which arms at home a sweep comes too close to; empty if none."""
+    """Sentence that names the arms at home to which a sweep comes too close; empty if none."""
     from fleet.planning.clearance import clearance
 
     near = [(name, clearance(sweep, home, margin_m)) for name, home in homes]

@@ -1,4 +1,4 @@
-"""Space that an arm takes along a plan: its links as capsules at postures close together."""
+"""Space of an arm along a plan: its links as capsules at closely spaced postures."""
 
 # MuJoCo is compiled and ships no type stubs.
 # pyright: reportAttributeAccessIssue=false
@@ -18,19 +18,20 @@ Array = np.ndarray
 STEP_RAD = 0.02
 """Largest joint step between two postures of a sweep: 18 mm at the end of an outstretched arm."""
 LEAF = 8
-"""Postures under one leaf of the tree of boxes."""
+"""Number of postures in one leaf of the tree of boxes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """Capsules of one arm along a path."""
+    """Capsules of one arm at the postures of a path."""
 
     links: tuple[str, ...]
     """Name of each capsule."""
     ends_m: Array
     """Ends of the capsules' axes in the world, float32 [capsule, posture, end, 3]."""
     radius_m: Array
-    """[capsule]; with half the farthest that the capsule moves between two postures."""
+    """Radius, [capsule]: that of the capsule plus half of its largest displacement between two postures, so that the
+    capsules cover the motion between them."""
 
     @cached_property
     def boxes_m(self) -> Array:
@@ -57,7 +58,7 @@ class Sweep:
 class Capsules:
     """The links of one arm as capsules.
 
-    Cylinders become capsules of the same axis and radius, boxes capsules around their longest axis.
+    A cylinder becomes a capsule with the same axis and radius; a box becomes a capsule along its longest axis.
     """
 
     def __init__(self, arm: ArmModel) -> None:
@@ -71,7 +72,7 @@ class Capsules:
         self._tool = model.site(f"{arm.robot.name}/tool").id
 
     def at(self, q: Array) -> Array:
-        """Ends of the capsules' axes, those of the links and that of a payload, m, [capsule, posture, end, 3].
+        """Ends of the capsules' axes, m, [capsule, posture, end, 3]: the links, then position and axis of the tool.
 
         Args:
             q: rad, [posture, joint].
@@ -90,11 +91,11 @@ class Capsules:
         return ends.swapaxes(0, 1)
 
     def sweep(self, q: Array, payload_kg: float = 0.0) -> Sweep:
-        """Space that the arm takes along a path.
+        """Space of the arm along a path.
 
         Args:
-            q: rad, [posture, joint]; between two postures every joint moves less than `STEP_RAD`, or the arm stands.
-            payload_kg: Heaviest payload on the path; it counts on all of it.
+            q: rad, [posture, joint]; between two postures every joint moves less than `STEP_RAD`.
+            payload_kg: Heaviest payload on the path; the whole path counts as loaded.
         """
         ends = self.at(q)
         ball_m = payload_radius_m(payload_kg)
@@ -106,14 +107,14 @@ class Capsules:
         return Sweep(self.links[:kept], ends[:kept].astype(np.float32), radius_m[:kept])
 
     def of_plan(self, plan: Plan, payload_kg: float | None = None) -> Sweep:
-        """Space that the arm takes from leaving home to being home again.
+        """Space of the arm along a plan, from home to home.
 
         Args:
-            payload_kg: Instead of the plan's own.
+            payload_kg: Payload; default: that of the plan.
         """
         q = np.concatenate([phase.profile[:, 0] for phase in plan.phases]).astype(float)
         travelled = np.concatenate([[0.0], np.abs(np.diff(q, axis=0)).max(axis=1).cumsum()])
-        # The last sample before each step is left, so no joint moves more than a step (and a sample's share) at once.
+        # Takes the last sample before each step, so no joint moves more than a step plus one sample between postures.
         wanted = np.arange(0.0, travelled[-1] + STEP_RAD, STEP_RAD)
         rows = np.unique(np.append(np.searchsorted(travelled, wanted, side="right") - 1, len(q) - 1))
         return self.sweep(q[rows], plan.work.payload_kg if payload_kg is None else payload_kg)

@@ -17,7 +17,7 @@ def compare_command(
     policies: Annotated[
         str,
         typer.Option(
-            help="Policies, separated by commas: names, FILE.py:CLASS, or folders of trained policies; default: "
+            help="Policies, separated by commas: names, FILE.py:CLASS, or folders of `thermofleet train`; default: "
             f"{', '.join(RULES)}.",
             show_default=False,
         ),
@@ -29,7 +29,7 @@ def compare_command(
     baseline: Annotated[
         str | None,
         typer.Option(
-            help="Policy that the paired differences refer to; default: round_robin, or else the first.",
+            help="Policy that the paired differences refer to; default: round_robin if it is compared, else the first.",
             show_default=False,
         ),
     ] = None,
@@ -74,7 +74,10 @@ def compare_command(
 def ablate_command(
     scenario: options.ScenarioArg,
     policy: Annotated[
-        str, typer.Option(help="Policy that runs with each source: a name, FILE.py:CLASS, or a folder of train.")
+        str,
+        typer.Option(
+            help="Policy that runs with each source: a name, FILE.py:CLASS, or a folder of `thermofleet train`."
+        ),
     ] = "least_difficulty",
     scores: Annotated[
         str | None,
@@ -84,8 +87,10 @@ def ablate_command(
             show_default=False,
         ),
     ] = None,
-    fleets: Annotated[int, options.number("Number of draws of the arms' deviations.", 2, 100)] = 3,
-    trainings: Annotated[int, options.number("Number of trainings of each fleet's networks.", 1, 20)] = 2,
+    fleets: Annotated[
+        int, options.number("Number of fleets: draws of the arms' deviations (spread.seed).", 2, 100)
+    ] = 3,
+    trainings: Annotated[int, options.number("Number of trainings of the twins of each fleet.", 1, 20)] = 2,
     seeds: Annotated[int, options.number("Number of seeds.", 2, 10_000)] = 20,
     first_seed: Annotated[int, options.number("First seed.", 0, options.MAX_SEED)] = 10_000,
     out: Annotated[
@@ -94,10 +99,11 @@ def ablate_command(
     ] = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Run one policy with difficulty and P(saturation) from different sources, and compare the results.
+    """Compare the results of one policy with scores from different sources.
 
-    Writes every shift to ablation.csv and the intervals to ablation.json. The same command continues an interrupted
-    comparison. Each training takes up to a minute per arm and core.
+    Scores are difficulty, P(saturation) and predicted peak. Every shift is written
+    to ablation.csv, the intervals to ablation.json. The same command resumes an
+    interrupted comparison. A training takes up to a minute per arm.
     """
     from scenarios.extras import require_extra
 

@@ -1,5 +1,6 @@
 """`thermofleet list`, `thermofleet show` and `thermofleet layout`."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -26,12 +27,16 @@ def list_command(as_json: JsonOption = False) -> None:
 
 
 def show_command(scenario: ScenarioArg, as_json: JsonOption = False) -> None:
-    """Show a scenario: its arms, its jobs and its thermal load factor."""
+    """Show a scenario: its arms, its jobs and its thermal load factor.
+
+    The thermal load factor is the heat of all jobs relative to the capacity of
+    the fleet. Above 1.2 no policy keeps all motors below the warning limit.
+    """
     from scenarios.report.describe import describe
 
     chosen = load(scenario)
     if as_json:
-        print_json(chosen)
+        print_json(asdict(chosen))
         return
     with progress_bar() as progress:
         parts = describe(chosen, progress)
@@ -45,9 +50,10 @@ def layout_command(
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show what each arm reaches, which jobs exclude each other in space, and how many arms can work at once.
+    """Show the reach of each arm, which jobs exclude each other in space, and how many arms can work at once.
 
-    Lists all problems of the cell, for example two arms that are too close at home, and then exits with 2.
+    Lists all problems of the cell, for example two arms that are too close at
+    home. Exit code 2: there are problems.
     """
     from scenarios.report.layout import layout_report, layout_scene
     from scenarios.report.layout_tables import layout_tables

@@ -60,9 +60,9 @@ DifficultyOption = Annotated[
 RiskOption = Annotated[
     str,
     typer.Option(
-        help="With --difficulty twin, what P(saturation) follows from: rc (the peak predicted by the arm's thermal "
-        "network, identified from its logs), rc-nominal (by that of a nominal arm), or excess, load, errors (of the "
-        "learned twin), torque (mean squared torque)."
+        help="With --difficulty twin, model of P(saturation): rc (peak predicted by the arm's own thermal network), "
+        "rc-nominal (peak predicted by that of a nominal arm), excess, load, errors (regression on errors of the "
+        "learned twin), or torque (regression on mean squared torque)."
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -109,7 +109,8 @@ PolicyOption = Annotated[
     str,
     typer.Option(
         help=f"Allocation policy. Run by the auctioneer: {names_of('central')}. Run by each arm, without an "
-        f"auctioneer: {names_of('arm')}, or a folder of train. Your own: FILE.py:CLASS, run according to its scope."
+        f"auctioneer: {names_of('arm')}, or a folder of `thermofleet train`. Your own as FILE.py:CLASS, run "
+        "according to its scope."
     ),
 ]
 FleetOption = Annotated[

@@ -39,16 +39,19 @@ def run_command(
         Path | None, typer.Option(help="Folder of the recording; default: runs/SCENARIO-POLICY-SEED.")
     ] = None,
     plant: Annotated[
-        str, typer.Option(help="profile (heat from the plan) or mujoco (closed loop in one scene).")
+        str,
+        typer.Option(help="profile (arms follow their plans exactly) or mujoco (all arms in closed loop in MuJoCo)."),
     ] = "profile",
-    bus: Annotated[str, typer.Option(help="zenoh (in-process router) or memory.")] = "zenoh",
+    bus: Annotated[
+        str, typer.Option(help="Transport between the arms: zenoh (in-process router) or memory.")
+    ] = "zenoh",
     difficulty: options.DifficultyOption = "twin",
     risk: options.RiskOption = "rc",
     overwrite: options.OverwriteOption = False,
     listen: Annotated[
         int,
         options.number(
-            "Loopback port of the router, so that others can subscribe. Default: a private router on a free port.",
+            "Loopback port of the router, so that other programs can subscribe. 0: a private router on a free port.",
             0,
             65535,
         ),

@@ -147,20 +147,22 @@ def reliability_command(
     policies: Annotated[str, typer.Option(help="Policies, separated by commas.")] = "wspt,wspt_cool,least_difficulty",
     risk: Annotated[
         list[str] | None,
-        typer.Option(help="As in `thermofleet run`; may be repeated. Default: rc.", show_default=False),
+        typer.Option(help="Models of P, as in `thermofleet run`; may be repeated. Default: rc.", show_default=False),
     ] = None,
     seeds: Annotated[int, options.number("Number of seeds.", 1, 1000)] = 4,
     first_seed: Annotated[
-        int, options.number("First seed: one that nothing was tuned on.", 0, options.MAX_SEED)
+        int, options.number("First seed; those from 10000 on were not used for tuning.", 0, options.MAX_SEED)
     ] = 10_000,
-    fleets: Annotated[int, options.number("Number of draws of the arms (spread.seed).", 1, 100)] = 3,
+    fleets: Annotated[
+        int, options.number("Number of fleets: draws of the arms' deviations (spread.seed).", 1, 100)
+    ] = 3,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Check in simulated shifts whether P(saturation) and predicted peaks come true.
+    """Compare P(saturation) and predicted peaks with the outcomes in simulated shifts.
 
-    Each award's P is compared with the outcome of its plan: a motor at or above the
-    warning limit from two minutes after the start until the end, or a fault. A shift
-    takes some seconds, the twins of each draw of the arms up to a minute per arm.
+    P is the probability that a motor is at or above the warning limit from two
+    minutes after the start of a plan until its end, or that a fault ends the plan.
+    A shift takes some seconds, training for each fleet up to a minute per arm.
     """
     from scenarios.prepare.fleet import RISK, RiskName
     from scenarios.studies.shift_reliability import awards_as_json, shift_reliability
@@ -298,7 +300,7 @@ def quality_table(twin: dict[str, Any]) -> Table:  # JSON of twins.json
 
 
 def reliability_table(rows: "dict[str, Awards]", title: str) -> Table:
-    """How true P and peaks were in the shift, one row for each policy and group of arms."""
+    """Accuracy of P and peaks, one row for each policy and group of arms."""
     from scenarios.studies.shift_reliability import WARM_K, groups, verdict
 
     caption = f"warm: a motor within {WARM_K:g} K of the warning limit, or beyond it, at the award"

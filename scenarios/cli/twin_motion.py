@@ -163,7 +163,13 @@ def recover_command(
         known = known_arm(chosen, spec.name, twin=twin_of(twins, spec.name), progress=progress)
         progress("recovering", 0.0)
         start_c = hold_until(known.arm, q, payload, ambient_c=known.verification.ambient_c, until_c=warm)
-        how = {"start_c": start_c, "verification": known.verification, "hold_s": hold_s, "seed": seed}
+        how = {
+            "start_c": start_c,
+            "verification": known.verification,
+            "hold_s": hold_s,
+            "fixtures": chosen.fixtures,
+            "seed": seed,
+        }
         recovery = recover(known.twin, known.arm, q, payload, **how)
     save_recovery(recovery, out, format=format_name, overwrite=overwrite)
     if as_json:

@@ -14,10 +14,9 @@ import pyarrow.parquet as pq
 from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
-from fleet.env.allocation_v1 import VERSION
 from fleet.errors import FleetError
 from scenarios.live.recorder import CARD, KINDS, Message, read_card, read_parts, states
-from scenarios.run.shift import RUN_FORMAT
+from scenarios.run.run_folder import check_format
 
 TURN_S, TOKENS_S = 0.2, 2.0
 """Real seconds between two checks whether to stop; for the router to name the arms that are present."""
@@ -49,11 +48,7 @@ class Replay:
         try:
             run = json.loads((folder / "run.json").read_text(encoding="utf-8"))
             scenario = run["scenario"]
-            if run["format"] != RUN_FORMAT:
-                raise FleetError(
-                    f"'{folder}' is a run of format {run['format']} in {run.get('environment', 'allocation_v0')}; this "
-                    f"version reads {RUN_FORMAT}, {VERSION}. Run the scenario again."
-                )
+            check_format(run, folder)
             return cls(
                 fleet=scenario["name"],
                 telemetry=pq.read_table(folder / "telemetry.parquet"),

@@ -4,6 +4,7 @@
 the same temperatures. In both the arm first observes its motors for `Nearby.watch_s`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import repeat
@@ -12,6 +13,7 @@ import numpy as np
 
 from fleet.engine.world import Arm
 from fleet.errors import InfeasibleJob
+from fleet.job import Fixture
 from fleet.motion import static_drive
 from fleet.physics.models import ArmModel
 from fleet.planning.random_motions import plan_motion
@@ -90,6 +92,7 @@ def recover(
     verification: Verification,
     hold_s: float = 600.0,
     nearby: Nearby | None = None,
+    fixtures: Sequence[Fixture] = (),
     seed: int = 0,
 ) -> Recovery:
     """Find an easier posture near a hold, and perform the hold with and without moving there.
@@ -100,13 +103,14 @@ def recover(
         start_c: True temperatures, °C, [node]; the arm measures those of the windings.
         verification: The arm's thermal parameters and the ambient temperature.
         hold_s: Remaining time of the hold.
+        fixtures: Boxes that neither the arm nor its payload may touch.
 
     Raises:
         RecoveryError: the payload, the posture or the time is out of range, the hold is infeasible, or no near posture
             is better.
     """
     near = nearby or Nearby()
-    model = ArmModel(arm.robot)
+    model = ArmModel(arm.robot, fixtures)
     check_hold(model, q, payload_kg)
     if not hold_s > near.watch_s:
         raise RecoveryError(

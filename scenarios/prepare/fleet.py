@@ -43,8 +43,8 @@ if TYPE_CHECKING:  # a single arm needs neither the environment nor MuJoCo
 
 DifficultyName = Literal["twin", "blind", "oracle"]
 RiskName = Literal["rc", "rc-nominal", "excess", "load", "errors", "torque"]
-"""What the twins' P(saturation) follows from: the peak predicted by the arm's identified or by the nominal thermal
-network, or evidence of the learned twin (`twin.saturation.model.evidence_of`)."""
+"""Model of P(saturation): from the peak predicted by the identified or by the nominal thermal network of the arm, or
+a regression on features of the learned twin (`twin.saturation.model.evidence_of`)."""
 RISK: RiskName = "rc"
 PlantName = Literal["profile", "mujoco"]
 BusName = Literal["zenoh", "memory"]
@@ -176,13 +176,17 @@ def problems_of(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) ->
     file = f"{scenario.name}.toml"
     robots = [spec.robot() for spec in scenario.arms]
     near = collisions_of_homes(robots, scenario.clearance_m, folder / "plans")
-    problems = [
-        f"{file}: arms: {sentence}; move or turn an arm, give it another `home`, or lower clearance_m."
-        for sentence in near
-    ]
+    advice = "move or turn an arm, or give it another `home`"
+    if scenario.clearance_m:
+        advice = "move or turn an arm, give it another `home`, or lower clearance_m"
+    problems = [f"{file}: arms: {sentence}; {advice}." for sentence in near]
     problems += [
         f"{file}: {sentence}; move the arm or the fixture, or give the arm another `home`."
         for sentence in homes_in_fixtures(scenario)
+    ]
+    problems += [
+        f'{file}: {sentence}; give it more cooling or cooler air, or begin with start = "cold".'
+        for sentence in _overheated_at_home(scenario, arms, folder)
     ]
     infeasible = [error for arm in arms for error in arm.infeasible]
     for i, stream in enumerate(scenario.jobs if arms else ()):
@@ -200,6 +204,21 @@ def problems_of(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) ->
                 f"({'; '.join(reasons[:REASONS])}{more}); move the places or an arm, or make the load lighter."
             )
     return problems
+
+
+def _overheated_at_home(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) -> list[str]:
+    """A sentence for each arm that never settles at home, though the shift begins with settled arms."""
+    cell_c, offsets_k = float(scenario.ambient.at(np.zeros(1))[0]), air_offsets(scenario)
+    found = []
+    for arm in arms if scenario.start == "idle_warm" else ():
+        robot, motors, thermal = arm.hardware
+        rest_tau = rest_torque(robot, folder / "plans")
+        still = Arm(robot=robot, motors=motors, thermal=thermal, rest_tau=rest_tau, model=Blind(), plans={})
+        try:
+            warm_start(still, cell_c + float(offsets_k[arm.index]))
+        except ValueError as error:
+            found.append(f"arms[{arm.index}]: {str(error).rstrip('.')}")
+    return found
 
 
 def _with_oracle(scenario: Scenario, arm: Arm) -> Arm:
@@ -323,10 +342,10 @@ def make_env(
 
     Args:
         scenario: A library name, a .toml file, or a `Scenario`.
-        difficulty: What scores the plans: the arms' twins (from the cache, or trained), `blind` or `oracle`.
-        risk: What the twins' P(saturation) follows from; see `RiskName`.
-        plant: What moves the arms.
-        bus: What carries the messages between arms.
+        difficulty: Source of the scores: `twin` (from the cache, or trained), `blind` (none) or `oracle` (true values).
+        risk: Model of the twins' P(saturation); see `RiskName`.
+        plant: Motion of the arms: `profile` (exactly as planned) or `mujoco` (closed loop).
+        bus: Transport of the messages between arms.
         channel: Topology, delay, loss and partitions of the messages.
         cache: Folder of plans and twins.
         max_cycles, render_mode, mask_in: As in `fleet.env.allocation_v1.AllocationEnv`.

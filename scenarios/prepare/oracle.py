@@ -1,6 +1,6 @@
-"""What really happens to the motors under a plan: for rehearsals, and for `oracle`, which measures regret.
+"""True motor temperatures under a plan: for simulated past jobs, and for the model `oracle`, which measures regret.
 
-Both look into the simulator; no arm and no policy may.
+They follow from the parameters of the simulator, which arms and policies must not use.
 """
 
 from collections.abc import Sequence
@@ -26,11 +26,11 @@ def peaks(
     start_c: Array,
     ambient_c: float,
 ) -> Array:
-    """Hottest winding temperature of each joint when one arm repeats each plan's cycle for so long, °C, [plan, joint].
+    """Hottest winding temperature of each joint while one arm repeats the cycle of each plan, °C, [plan, joint].
 
     Args:
-        duration_s: [plan].
-        start_c: Temperatures at the beginning, [node].
+        duration_s: Time during which the cycle repeats, [plan].
+        start_c: Initial temperatures, [node].
     """
     load = drives([plan.cycle.profile for plan in plans], motors)
     return simulate_temperatures(
@@ -39,15 +39,15 @@ def peaks(
 
 
 SURE_K = 0.15
-"""P rises from 0 to 1 within this distance of the warning limit: twice the RMS error of the linearised heat."""
+"""P rises from 0 to 1 between the warning limit minus and plus this: twice the RMS error of the linearised heat."""
 
 
 @dataclass(frozen=True, eq=False)
 class Oracle:
-    """Scores a plan by the true motors: the peak that they reach from the present state.
+    """Scores a plan with the true motor parameters: the peak that follows from the present temperatures.
 
-    With the true parameters the arm's estimate of its housings is true too, see `Arm.known`. P(saturation) is 0 or 1
-    but for `SURE_K`. d_k = 1 − exp(−rise_k / (warning − start_k)) of a job from idle-warm.
+    The arm's housing observer then has the true parameters too (`fleet.engine.world.Arm.known`). P(saturation) is 0 or
+    1, except within `SURE_K` of the warning limit. d_k = 1 − exp(−rise_k / (warning − start_k)), from idle equilibrium.
     """
 
     motors: Motors
@@ -55,12 +55,12 @@ class Oracle:
     start_c: Array
     """Idle equilibrium, [node]."""
     ambient_c: float
-    """Of the idle equilibrium; the peak follows the present ambient temperature."""
+    """Ambient temperature of the idle equilibrium; the peak uses the present one."""
     warning_c: float
     version: str = "oracle"
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty:
-        """Difficulty of doing the plan so many times from idle-warm, and its peak from any state."""
+        """Difficulty of the repeated plan from idle equilibrium, and its peak as a function of known temperatures."""
         peak = peaks(
             [plan],
             [plan.duration_s(repetitions)],

@@ -70,7 +70,11 @@ def _work_bars(plan: Schedule, events: Sequence[Event], arms: Sequence[str], uni
     streams = sorted({stream_of(event.job) for event in events if event.job})
     traces = []
     for i, stream in enumerate(streams):
-        own = [a for a in plan.assignments if stream_of(a.job) == stream]
+        # The legend shows the look of the first one: not that of a late or unfinished job.
+        own = sorted(
+            (a for a in plan.assignments if stream_of(a.job) == stream),
+            key=lambda a: (bool(a.late_s), a.outcome != "finished"),
+        )
         if not own:
             continue
         look = {
@@ -123,8 +127,10 @@ def _assignment_text(a: Assignment) -> str:
         end = f"returned to the queue after a fault{kept}"
     else:
         end = "still running at the end"
-    score = f"<br>difficulty {a.difficulty:.3g}" if np.isfinite(a.difficulty) else ""
-    return f"<b>{plain(a.job)}</b> on {plain(a.arm)}<br>{clock(a.start_s)} – {clock(a.end_s)}<br>{end}{score}"
+    scores = [a.prediction] if a.prediction else []
+    scores += [f"difficulty {a.difficulty:.3g}"] if np.isfinite(a.difficulty) else []
+    lines = [f"<b>{plain(a.job)}</b> on {plain(a.arm)}", f"{clock(a.start_s)} – {clock(a.end_s)}", end, *scores]
+    return "<br>".join(lines)
 
 
 def _outage_text(o: Outage) -> str:

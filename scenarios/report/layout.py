@@ -73,6 +73,8 @@ class LayoutReport:
     """Share of the pairs of plans of two arms that exclude each other."""
     at_once: tuple[Assignment, ...]
     """A largest set of works that different arms can do at the same time, each at its own stations."""
+    largest: bool
+    """Whether no larger set exists; False if the search ended at its time limit."""
     problems: tuple[str, ...]
 
 
@@ -84,6 +86,7 @@ def layout_report(scenario: Scenario, progress: Progress = quiet) -> LayoutRepor
     plans = [plan for arm in arms for plan in arm.all_plans]
     space = space_of(scenario, [arm.hardware.robot for arm in arms], plans, folder)
     exclusions = _exclusions(scenario, plans, space)
+    at_once, largest = _most_at_once(scenario, plans, space)
     pairs = _pairs_of_arms(plans)
     volumes, conflicts = space.rows(plans)
     close = conflicts[np.ix_(volumes, volumes)][pairs]
@@ -93,7 +96,8 @@ def layout_report(scenario: Scenario, progress: Progress = quiet) -> LayoutRepor
         reach=tuple(_reach(scenario, arm, place.name) for place in scenario.places for arm in arms),
         exclusions=exclusions,
         excluded_share=float(close.mean()) if close.size else 0.0,
-        at_once=_most_at_once(scenario, plans, space),
+        at_once=at_once,
+        largest=largest,
         problems=tuple(problems),
     )
 
@@ -161,12 +165,12 @@ def _exclusions(scenario: Scenario, plans: Sequence[Plan], space: SpaceTable) ->
     return tuple(sorted(exclusions, key=lambda pair: (-pair.share, pair.same_place, pair.jobs, pair.arms)))
 
 
-def _most_at_once(scenario: Scenario, plans: Sequence[Plan], space: SpaceTable) -> tuple[Assignment, ...]:
-    """A largest set of volumes without conflicts and with different stations; an integer program."""
+def _most_at_once(scenario: Scenario, plans: Sequence[Plan], space: SpaceTable) -> tuple[tuple[Assignment, ...], bool]:
+    """Volumes without conflicts and with different stations, and whether no set is larger; an integer program."""
     volumes, conflicts = space.rows(plans)
     used, first = np.unique(volumes, return_index=True)
     if not len(used):
-        return ()
+        return (), True
     stations = [set(plans[row].work.stations) for row in first]
     rows = []  # groups of volumes of which at most one is chosen
     arms = np.array([plans[row].arm for row in first])
@@ -187,4 +191,5 @@ def _most_at_once(scenario: Scenario, plans: Sequence[Plan], space: SpaceTable) 
     )
     chosen = [] if result.x is None else first[result.x > 0.5].tolist()
     streams = _streams(scenario, plans)
-    return tuple(Assignment(arm=plans[i].arm, job=streams[i], places=plans[i].work.stations) for i in chosen)
+    works = (Assignment(arm=plans[i].arm, job=streams[i], places=plans[i].work.stations) for i in chosen)
+    return tuple(works), result.status == 0

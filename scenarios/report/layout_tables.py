@@ -3,7 +3,7 @@
 from rich.table import Table
 from rich.text import Text
 
-from scenarios.report.layout import LayoutReport
+from scenarios.report.layout import SEARCH_S, LayoutReport
 from scenarios.schema import Scenario
 
 WORST = 8
@@ -43,8 +43,9 @@ def layout_tables(scenario: Scenario, report: LayoutReport) -> list[Table | Text
         *([pairs] if shared else []),
         Text(""),
         Text(
-            f"At most {len(report.at_once)} of {len(arms)} arms can work at once"
+            f"{'At most' if report.largest else 'At least'} {len(report.at_once)} of {len(arms)} arms can work at once"
             + (f", for example {most}." if most else ".")
+            + ("" if report.largest else f" The search for more ended after {SEARCH_S:g} s.")
         ),
     ]
 

@@ -37,6 +37,8 @@ class Assignment:
     """Cycles of a returned or given-up job that this arm has done and that count."""
     difficulty: float = float("nan")
     """Score of the award."""
+    prediction: str = ""
+    """Predicted peak temperature and P(saturation) at the award, in words."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,6 +134,7 @@ def _assignment(
         late_s=finish.value if finish else None,
         cycles_kept=round(returned.value) if returned and not finish else None,
         difficulty=award.value,
+        prediction=award.reason,
     )
 
 

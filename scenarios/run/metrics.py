@@ -18,7 +18,7 @@ class Metrics:
     given_up: int
     """Jobs that faulted too often, and those that waited for one that was given up or expired."""
     expired: int
-    """Jobs that no arm had begun at their hard due date."""
+    """Jobs that waited at their hard due date."""
     on_time: int
     """Finished by their due time."""
     tardiness_min: float

@@ -1,6 +1,7 @@
 """The files of a recorded run."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -8,12 +9,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from fleet.env.allocation_v1 import VERSION
+from fleet.errors import FleetError
 from fleet.events import Event
 from fleet.robot import JOINTS
 from fleet.telemetry import MODES, Telemetry
 from scenarios.report.run_page import report_html
 from scenarios.result_folder import ResultKind, disk_errors
-from scenarios.run.shift import RunResult, summary
+from scenarios.run.shift import RUN_FORMAT, RunResult, summary
 
 FILES = ("run.json", "telemetry.parquet", "events.parquet", "report.html")
 RUN = ResultKind(name="run", card="run.json", files=FILES)
@@ -36,6 +39,22 @@ def write(result: RunResult, folder: Path) -> None:
         limits = {"warning_c": result.scenario.limits.warning_c, "error_c": result.scenario.limits.error_c}
         html = report_html(run, result.telemetry, result.events, arms, **limits)
         (folder / "report.html").write_text(html, encoding="utf-8")
+
+
+def check_format(run: Mapping[str, Any], folder: Path) -> None:
+    """Check that this version can read a run.
+
+    Args:
+        run: The content of its run.json.
+
+    Raises:
+        FleetError: it is of another format.
+    """
+    if run["format"] != RUN_FORMAT:
+        raise FleetError(
+            f"'{folder}' is a run of format {run['format']} in {run.get('environment', 'allocation_v0')}; this "
+            f"version reads {RUN_FORMAT}, {VERSION}. Run the scenario again."
+        )
 
 
 UNITS = {"q": "rad", "qd": "rad/s", "tau": "N·m", "current_a": "A", "temp_c": "°C"}

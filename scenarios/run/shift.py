@@ -2,7 +2,7 @@
 
 import hashlib
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from typing import Any
@@ -15,6 +15,7 @@ from fleet.engine.profile_plant import recorded_noise, telemetry_of
 from fleet.engine.shift import StepRecord, stack_records
 from fleet.env.allocation_v1 import VERSION, AllocationEnv
 from fleet.events import Event
+from fleet.observation import Observation
 from fleet.telemetry import Telemetry, join
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.fleet import RISK, BusName, DifficultyName, Fleet, PlantName, RiskName, env_of
@@ -94,7 +95,10 @@ def run(
             recorder.env = env
         env.reset(seed=spec.seed)
         while env.agents and not stopped():
-            _, rewards, _, _, _ = env.step(policy.act(env.knowledge()))
+            seen, count = env.knowledge(), len(env.events)
+            actions = policy.act(seen)
+            _, rewards, _, _, _ = env.step(actions)
+            env.events[count:] = [_with_prediction(event, seen, actions) for event in env.events[count:]]
             reward += next(iter(rewards.values()))
             progress("working", env.tick / env.world.ticks)
         finished = not env.agents
@@ -113,6 +117,15 @@ def run(
         time_s=float(state.tick[0] * world.dt_s),
         total_reward=reward,
     )
+
+
+def _with_prediction(event: Event, seen: Mapping[str, Observation], actions: Mapping[str, int]) -> Event:
+    """An award with the predicted peak and P(saturation) of its plan as reason; other events as they are."""
+    if event.kind != "award":
+        return event
+    option = actions[event.arm] - 1
+    peak_c, p = float(seen[event.arm].peak_c[option]), float(seen[event.arm].p_saturation[option])
+    return replace(event, reason=f"predicted peak {peak_c:.1f} °C, P(saturation) {p:.2f}") if peak_c else event
 
 
 class _Recorder:
@@ -162,7 +175,7 @@ def summary(result: RunResult) -> dict[str, Any]:
         "environment": VERSION,
         "status": "finished" if result.finished else "interrupted",
         "time_s": result.time_s,
-        "scenario": msgspec.to_builtins(result.scenario),
+        "scenario": asdict(result.scenario),
         "scenario_hash": scenario_hash(result.scenario),
         **asdict(replace(result.spec, channel=PERFECT)),
         "channel": result.spec.channel.described(),

@@ -1,13 +1,14 @@
-"""What a score is worth: one policy with difficulty and P(saturation) from different sources.
+"""Compare sources of scores: one policy with difficulty, P(saturation) and predicted peak from each source.
 
-Every source runs on the same draws of the fleet, trainings and seeds. A fleet is a cluster of all its trainings and
-shifts; a seed, which draws the same jobs for every fleet, is a cluster of all its fleets. So the variance of a mean is
-clustered both ways, V = V_fleet + V_seed − V_fleet×seed, with t quantiles of the smaller number of clusters minus one
+Every source runs on the same fleets, trainings and seeds. Results of one fleet are correlated, and so are results of
+one seed, which draws the same jobs for every fleet. So the variance of a mean is clustered both ways,
+V = V_fleet + V_seed − V_fleet×seed. The t quantiles have the smaller number of clusters minus one as degrees of freedom
 (Cameron, Gelbach & Miller, Journal of Business & Economic Statistics 29, 2011). Trainings differ within fleets, so
-V_fleet counts them too.
+V_fleet includes them.
 """
 
 import csv
+import io
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -36,16 +37,16 @@ Array = np.ndarray
 FIGURES = ("faults", "value", "reward")
 ROWS, CARD = "ablation.csv", "ablation.json"
 FIRST_SEED = 10_000
-"""Nothing was tuned on seeds from here on."""
+"""Seeds from this one on were not used for tuning."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AblationPlan:
-    """What is compared."""
+    """Policy, sources and numbers of runs of an ablation."""
 
     policy: str = "least_difficulty"
     scores: tuple[str, ...] = tuple(SOURCES)
-    """Differences refer to the first one."""
+    """Names of the sources; differences refer to the first one."""
     fleets: int = 3
     """Draws of the arms: `spread.seed` of the scenario, and the following ones."""
     trainings: int = 2
@@ -55,14 +56,14 @@ class AblationPlan:
     def __post_init__(self) -> None:
         for i, name in enumerate(self.scores):
             if name not in SOURCES:
-                raise FleetError(f"No scores '{name}'{nearest(name, SOURCES)}")
+                raise FleetError(f"No source of scores '{name}'{nearest(name, SOURCES)}")
             if name in self.scores[:i]:
-                raise FleetError(f"The scores '{name}' are given twice; names must be unique.")
+                raise FleetError(f"The source '{name}' is given twice; names must be unique.")
         policy_of(self.policy)
 
 
 class Row(NamedTuple):
-    """The figures of one shift."""
+    """Results of one shift."""
 
     scores: str
     fleet: int
@@ -87,7 +88,7 @@ class Effect:
 
 @dataclass(frozen=True)
 class Ablation:
-    """The result of a comparison."""
+    """Result of an ablation."""
 
     scenario: str
     plan: AblationPlan
@@ -96,10 +97,10 @@ class Ablation:
 
 
 def ablate(scenario: Scenario, plan: AblationPlan, out: Path, *, progress: Progress = quiet) -> Ablation:
-    """Run the policy with every source, and write `ROWS` and `CARD` into a folder; shifts that are there are kept.
+    """Run the policy with every source, and write `ROWS` and `CARD` into a folder; skip shifts that are in it already.
 
     Raises:
-        FleetError: the folder holds another comparison, or cannot be written.
+        FleetError: the folder contains another ablation or other files, or cannot be written.
     """
     card = {"scenario": scenario.name, "scenario_hash": scenario_hash(scenario), "policy": plan.policy}
     rows = _earlier_rows(out, card)
@@ -134,10 +135,10 @@ def ablate(scenario: Scenario, plan: AblationPlan, out: Path, *, progress: Progr
 
 
 def _earlier_rows(out: Path, card: dict[str, str]) -> dict[tuple[str, int, int, int], Row]:
-    """The shifts that the folder holds; a new folder is made.
+    """Finished shifts in the folder, by source, fleet, training and seed; creates the folder if it does not exist.
 
     Raises:
-        FleetError: it is the folder of something else.
+        FleetError: the folder contains something else.
     """
     with disk_errors(out):
         if not out.exists() or not any(out.iterdir()):
@@ -147,19 +148,24 @@ def _earlier_rows(out: Path, card: dict[str, str]) -> dict[tuple[str, int, int, 
         try:
             known = json.loads((out / CARD).read_text(encoding="utf-8"))
         except (FileNotFoundError, ValueError) as error:
-            raise FleetError(f"'{out}' holds other files; --out needs a new folder, or that of an ablation.") from error
+            raise FleetError(
+                f"'{out}' holds other files; --out needs a new folder or that of an earlier ablation."
+            ) from error
         for name, value in card.items():
-            if known.get(name) != value:
-                raise FleetError(
-                    f"'{out}' holds an ablation with {name} {known.get(name)!r}, not {value!r}; give another --out."
-                )
+            held = known.get(name) if isinstance(known, dict) else None
+            if held != value:
+                raise FleetError(f"'{out}' holds an ablation with {name} {held!r}, not {value!r}; give another --out.")
         if not (out / ROWS).exists():
             return {}
-        with (out / ROWS).open(newline="", encoding="utf-8") as file:
-            kept = [row for row in csv.DictReader(file) if None not in row.values()]  # the last may be cut off
+        written = (out / ROWS).read_bytes()
+        whole = written[: written.rfind(b"\n") + 1]  # a row without its end may have a shorter number
+        if whole != written:
+            with atomic_path(out / ROWS) as file:
+                file.write_bytes(whole)
     try:
+        kept = list(csv.DictReader(io.StringIO(whole.decode("utf-8"), newline="")))
         rows = [Row(r["scores"], *(int(r[n]) for n in Row._fields[1:4]), *(float(r[n]) for n in FIGURES)) for r in kept]
-    except (KeyError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise FleetError(f"'{out / ROWS}' is damaged ({error}); give another --out.") from error
     return {row[:4]: row for row in rows}
 
@@ -190,7 +196,7 @@ def _effects(plan: AblationPlan, rows: dict[tuple[str, int, int, int], Row]) -> 
 
 
 def _values(plan: AblationPlan, rows: dict[tuple[str, int, int, int], Row], name: str, figure: str) -> Array:
-    """A figure of one source, [fleet, training, seed]; a source without training has the same for each."""
+    """A figure of one source, [fleet, training, seed]; the same for every training if the source has none."""
     trained = SOURCES[name].trained
     return np.array(
         [
@@ -207,15 +213,15 @@ def _values(plan: AblationPlan, rows: dict[tuple[str, int, int, int], Row], name
 
 
 def interval(values: Array, level: float = 0.95) -> tuple[float, float]:
-    """Interval of the mean of [fleet, training, seed], clustered by fleet and by seed; see the module.
+    """Interval of the mean of [fleet, training, seed], clustered by fleet and by seed; see the module docstring.
 
-    A single fleet or seed is taken as given.
+    A single fleet or a single seed counts as fixed, not as a sample.
     """
     cells = values.mean(axis=1)  # trainings are within fleets
     fleets, seeds = cells.shape
     mean = float(cells.mean())
     by_fleet, by_seed, by_cell = (_variance_of_mean(x) for x in (cells.mean(axis=1), cells.mean(axis=0), cells.ravel()))
-    # The difference can be negative in small samples; then one of the two ways dominates.
+    # The sum can be too small, even negative, in small samples; use the larger of the one-way variances then.
     variance = max(by_fleet + by_seed - by_cell, by_fleet, by_seed)
     clusters = min(count for count in (fleets, seeds, cells.size) if count > 1) if cells.size > 1 else 1
     if clusters == 1 or variance == 0:
@@ -229,7 +235,7 @@ def _variance_of_mean(values: Array) -> float:
 
 
 def ablation_table(result: Ablation) -> Group:
-    """A block per figure: mean, and difference to the first source, each with its interval."""
+    """Table with a block per figure: mean and difference to the first source of each source, with intervals."""
     plan = result.plan
     count = f"{plan.fleets} fleets × {plan.trainings} trainings × {plan.seeds} seeds"
     title = (

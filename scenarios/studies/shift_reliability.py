@@ -1,4 +1,4 @@
-"""Whether P(saturation) and predicted peaks come true in the shift: stated at each award, compared with the outcome."""
+"""Compare P(saturation) and predicted peaks at each award of simulated shifts with the outcome of the plan."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
@@ -23,19 +23,19 @@ Array = np.ndarray
 
 POLICIES = ("wspt", "wspt_cool", "least_difficulty")
 FIRST_SEED = 10_000
-"""Nothing was tuned on seeds from here on."""
+"""Seeds from this one on were not used for tuning."""
 WARM_K = 5.0
-"""An arm is warm at an award if a motor is this close to the warning limit, or beyond it."""
+"""An arm is warm if its hottest motor is at most this far below the warning limit, or above the limit."""
 
 
 @dataclass(frozen=True, eq=False)
 class Awards:
-    """Awards of shifts whose outcome is known, arrays [award]."""
+    """Awards with a known outcome, arrays [award]."""
 
     p: Array
-    """Stated P(saturation)."""
+    """P(saturation) at the award."""
     predicted_c: Array
-    """Stated peak."""
+    """Predicted peak at the award."""
     peak_c: Array
     """True peak, counted as in `fleet.difficulty.SETTLING_S`; NaN if a fault ended the plan."""
     passed: Array
@@ -43,7 +43,7 @@ class Awards:
     warm: Array
     """Whether the arm was warm at the award, bool; see `WARM_K`."""
     unknown: int = 0
-    """Further awards without a known outcome: the shift ended or the arm gave the job back before."""
+    """Number of awards without a known outcome: the shift ended, or the arm gave the job back."""
 
     def __len__(self) -> int:
         return len(self.p)
@@ -54,18 +54,18 @@ class Awards:
 
 
 def groups(awards: Awards) -> dict[str, Awards]:
-    """All awards, and apart those of warm and of cool arms."""
+    """All awards, those of warm arms, and those of cool arms."""
     return {"all": awards, "warm": awards.part(awards.warm), "cool": awards.part(~awards.warm)}
 
 
 def awards_as_json(awards: Awards) -> dict[str, Any]:  # JSON
-    """Verdicts on all awards and on those of warm and of cool arms, and the number of unknown outcomes."""
+    """Verdict on each of the `groups`, and the number of unknown outcomes."""
     verdicts = {name: verdict(part) for name, part in groups(awards).items()}
     return {"unknown": awards.unknown} | {name: v and v.as_json() for name, v in verdicts.items()}
 
 
 def join(parts: Sequence[Awards]) -> Awards:
-    """The awards of several shifts."""
+    """Concatenate the awards of several shifts."""
     names = [field.name for field in fields(Awards)[:-1]]
     arrays = [np.concatenate([getattr(part, name) for part in parts]) for name in names]
     return Awards(*arrays, unknown=sum(part.unknown for part in parts))
@@ -73,7 +73,7 @@ def join(parts: Sequence[Awards]) -> Awards:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Verdict:
-    """How true the stated numbers were."""
+    """Accuracy of P(saturation) and predicted peaks."""
 
     awards: int
     passed: int
@@ -82,19 +82,19 @@ class Verdict:
     auroc: float
     """NaN if all awards had the same outcome."""
     peak_rms_k: float
-    """Root mean square of predicted minus true peak, of plans that no fault ended."""
+    """Root mean square of predicted minus true peak, over plans that no fault ended."""
     peak_bias_k: float
     table: Reliability
 
     def as_json(self) -> dict[str, Any]:
-        """Every number, NaN as None."""
+        """All numbers; NaN becomes None."""
         numbers = {name: value for name, value in vars(self).items() if name != "table"}
         numbers = {name: None if value != value else value for name, value in numbers.items()}
         return numbers | {"reliability": {name: values.tolist() for name, values in vars(self.table).items()}}
 
 
 def verdict(awards: Awards) -> Verdict | None:
-    """How true the numbers stated at these awards were; None without awards."""
+    """Accuracy of the predictions at these awards; None without awards."""
     if not len(awards):
         return None
     table, error_k = reliability(awards.p, awards.passed), (awards.predicted_c - awards.peak_c)
@@ -125,8 +125,8 @@ def shift_reliability(
     """The awards of every policy, over all seeds and over several draws of the arms.
 
     Args:
-        fleets: Number of draws: `spread.seed` of the scenario and the numbers after it.
-        make: Prepares the fleet of a scenario.
+        fleets: Number of draws: with `spread.seed` of the scenario and the following numbers.
+        make: Function that prepares the fleet of a scenario.
     """
     found: dict[str, list[Awards]] = {policy: [] for policy in policies}
     runs = len(seeds) * len(policies)
@@ -140,7 +140,7 @@ def shift_reliability(
 
 
 def awards_of_shift(fleet: Fleet, policy: str, seed: int) -> Awards:
-    """The awards of one shift, with what was stated at each and what came of it."""
+    """The awards of one shift, with the predictions at each award and the outcome of its plan."""
     records: list[StepRecord] = []
     env = env_of(fleet, bus="memory", keep_events=True, watch=records.append, decisions="interval")
     chooser, stated = policy_at(policy, seed), dict[tuple[str, int], tuple[float, float, bool]]()
@@ -173,7 +173,7 @@ def awards_of_shift(fleet: Fleet, policy: str, seed: int) -> Awards:
 
 
 def _plans(events: Sequence[Event]) -> Iterator[tuple[str, float, float | None, bool]]:
-    """Arm, begin, end and whether a fault ended it, of every awarded plan; no end if its outcome is unknown."""
+    """Arm, begin, end, and whether a fault ended it, of every awarded plan; the end is None if it is unknown."""
     ends = ("home", "fault", "give_back", "award")
     own: dict[str, list[Event]] = {}
     for event in sorted(events, key=lambda event: event.time_s):
@@ -187,7 +187,7 @@ def _plans(events: Sequence[Event]) -> Iterator[tuple[str, float, float | None, 
 
 
 def _true_peak(ends_c: Array, dt_s: float, begin_s: float, end_s: float) -> float:
-    """Hottest winding at the ends of the steps that count, °C.
+    """Hottest winding at the ends of the steps between `SETTLING_S` after the begin and the end, °C.
 
     Args:
         ends_c: Windings of the arm at the end of each step, [step, joint].

@@ -191,7 +191,7 @@ def test_variants_with_different_risk_models_do_not_mix(small, play) -> None:
         own_tables, drawn = tables_of(world)
         tables.append(own_tables)
         shifts += shifts_of(drawn, [77])
-    assert len({table.forecast_offset.shape for table in tables}) == 3
+    assert len({(*table.forecast_block.shape, *table.forecast_curve.shape) for table in tables}) == 3
     assert [table.excluded.shape[1] for table in tables] == [1, 1, 3]
     assert [bool(table.excluded.any()) for table in tables] == [False, True, True]
     assert len({int(np.bitwise_count(table.stations).max()) for table in tables}) == 2

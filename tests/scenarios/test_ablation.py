@@ -89,6 +89,10 @@ def test_the_command_resumes_and_shows_every_source(thermofleet, small_toml, tmp
     )
     assert thermofleet(*call, "--seeds", 3).code == 0
     assert asked == [[10_002]] * 10
+    before = (out / "ablation.csv").read_bytes()
+    (out / "ablation.csv").write_bytes(before[:-9])  # killed within a row
+    assert thermofleet(*call, "--seeds", 3).code == 0
+    assert (out / "ablation.csv").read_bytes() == before
     refused = thermofleet(*call[:-1], "random", "--seeds", 3)
     assert refused.code == 2
     assert "holds an ablation with policy 'wspt', not 'random'; give another --out" in refused.err
@@ -97,7 +101,7 @@ def test_the_command_resumes_and_shows_every_source(thermofleet, small_toml, tmp
 def test_bad_sources_are_named(thermofleet, small_toml, tmp_path) -> None:
     said = thermofleet("ablate", small_toml, "--scores", "trained,oracel", "--out", tmp_path / "x")
     assert said.code == 2
-    assert "No scores 'oracel'; did you mean 'oracle'?" in said.err
+    assert "No source of scores 'oracel'; did you mean 'oracle'?" in said.err
     assert not (tmp_path / "x").exists()
     full = tmp_path / "full"
     full.mkdir()

@@ -164,3 +164,10 @@ def test_stations_side_by_side_are_for_one_arm_at_a_time(cache):
     assert (set(pair.jobs), pair.share) == ({"hold_middle", "hold_beside"}, 1.0)
     apart = layout_report(cell(*APART, places={"left": (-0.9, 0.3, 0.25), "right": (0.9, 0.3, 0.25)}))
     assert (len(apart.at_once), apart.excluded_share, apart.exclusions) == (2, 0.0, ())
+
+
+def test_an_arm_that_never_settles_at_home_is_a_problem_of_the_cell(cache):
+    unventilated = cell(APART[0] | {"cooling_factor": 0.01}, APART[1], places={"left": (-0.9, 0.3, 0.25)})
+    (problem,) = layout_report(unventilated).problems
+    assert problem.startswith("cell.toml: arms[0]: Arm 'west' has no steady state when idle at home")
+    assert layout_report(replace(unventilated, start="cold")).problems == ()

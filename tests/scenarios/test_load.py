@@ -83,6 +83,7 @@ WRONG = [
     (put("horizon_s", math.nan), "heat.toml: horizon_s: expected a finite number, got nan."),
     (put("horizon_s", 1e9), "heat.toml: horizon_s must be at most 1000000 times telemetry_interval_s"),
     (put("telemetry_interval_s", 100), "heat.toml: telemetry_interval_s must not exceed decision_interval_s"),
+    (put("decision_interval_s", 1e6), "heat.toml: decision_interval_s must not exceed horizon_s (got 1000000.0, "),
     (put("slots", 2.5), "heat.toml: slots: expected a whole number, got a number (2.5)."),
     (put("slots", 0), "heat.toml: slots must be between 1 and 256 (got 0)."),
     (
@@ -113,6 +114,10 @@ WRONG = [
     (put("jobs", 0, "repetitions", [5, 2]), "jobs[0].repetitions must be [fewest, most] (got 5, 2)."),
     (put("jobs", 0, "repetitions", [1, 10**30]), "jobs[0].repetitions must be between 1 and 100000 (got 1"),
     (put("jobs", 0, "dwell_s", 1e7), "jobs[0].dwell_s must be between 0.02 and 3600 s (got 10000000.0)."),
+    (
+        put("jobs", 0, "due_s", 1e9),
+        "heat.toml: jobs: horizon_s plus the longest due_s must be at most 1000000000 s (got",
+    ),
     (put("jobs", 0, "after", ["hold"]), "jobs[0].after: there is no stream 'hold' above this one."),
     (put("jobs", 1, "after", ["hol"]), "jobs[1].after: there is no stream 'hol' above this one; did you mean 'hold'?"),
     (drop("jobs", 0, "arrivals"), "heat.toml: jobs[0]: 'arrivals' is missing."),
@@ -126,6 +131,20 @@ WRONG = [
     (put("jobs", 1, "arrivals", "count", 3), "arrivals of kind 'poisson' take no 'count'; they take every_s, start_s,"),
     (put("jobs", 0, "arrivals", {"kind": "trace"}), "arrivals of kind 'trace' need either 'times_s' or 'file'."),
     (put("limits", "warning_c", 90), "heat.toml: limits need restart_c < warning_c < error_c (got 50.0, 90.0, 75.0)."),
+    (put("limits", "error_c", 1e308), "heat.toml: limits.error_c must be between -60 and 1000 (got 1e+308)."),
+    (put("limits", "clear_s", 1e308), "heat.toml: limits.clear_s must be between 0 and 604800 (got 1e+308)."),
+    (put("spread", "scale", 1e308), "heat.toml: spread.scale must be between 0 and 10 (got 1e+308)."),
+    (put("arms", 0, "tilt_deg", [0, 0, 1e9]), "arms[0].tilt_deg must be between -360 and 360 (got [0.0, 0.0, 1"),
+    (put("arms", 0, "wear", 1e9), "heat.toml: arms[0].wear must be between 0 and 10 (got 1000000000.0)."),
+    (put("arms", 0, "cooling_factor", 0), "heat.toml: arms[0].cooling_factor must be between 0.01 and 100 (got 0.0)."),
+    (
+        put("arms", 0, "ambient_offset_k", 1e9),
+        "arms[0].ambient_offset_k must be between -50 and 50 (got 1000000000.0).",
+    ),
+    (
+        put("reward", "energy", -1e308),
+        "heat.toml: reward.energy must be between -1000000000 and 1000000000 (got -1e+308).",
+    ),
     (put("ambient", "points", [[0]]), "heat.toml: ambient.points[0]: expected 2 values, got 1."),
     (put("ambient", "points", [[0, 400]]), "heat.toml: ambient.points must be between -40 and 60 °C (got [400.0])."),
     (put("reward", "faullts", 1), "heat.toml: reward: unknown key 'faullts'; did you mean 'faults'?"),
@@ -169,7 +188,8 @@ def test_a_wrong_entry_is_told_by_file_place_value_and_what_is_allowed(edit, sen
     message = told(edit)
     assert message.startswith("heat.toml: ")
     assert sentence in message
-    assert message.endswith(".")
+    assert message[-1] in ".?"
+    assert not message.endswith("?.")
     assert "`" not in message
     assert "\n" not in message
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from fleet.job import Fixture
 from fleet.physics.models import ArmModel
 from scenarios.motion.generate import Verification
 from scenarios.motion.posture_search import Nearby, RecoveryError
@@ -68,6 +69,14 @@ def test_a_hold_that_is_over_before_the_arm_has_watched_is_refused(subject, aske
 def test_a_light_hold_does_not_get_warm(subject):
     with pytest.raises(RecoveryError, match=r"does not get warm: holding 0.5 kg there for 30 min"):
         hold_until(subject.arm, np.zeros(7), 0.5, ambient_c=23.0, until_c=55.0, most_s=1800.0)
+
+
+def test_a_fixture_in_the_way_is_seen(subject, asked):
+    q = np.deg2rad(HOLDS["reaching"][0])
+    at_m = tuple(ArmModel(subject.arm.robot).tool_pose(q)[0])
+    box = Fixture(name="oven", position_m=at_m, size_m=(0.1, 0.1, 0.1))
+    with pytest.raises(RecoveryError, match=r"cannot hold 3 kg there: collision: .* fixture .oven"):
+        recover(subject.twin, subject.arm, q, 3.0, start_c=np.full(14, 50.0), verification=asked, fixtures=[box])
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """A shift from beginning to end: reproducible, complete, and the same over either bus."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -127,6 +128,19 @@ def test_telemetry_at_the_end_of_a_step_is_what_the_policy_observes_next(fleet, 
     ends = telemetry.time_s % fleet.scenario.decision_interval_s == 0
     assert len(seen) > 5
     np.testing.assert_allclose(telemetry.temp_c[ends][: len(seen) - 1], seen[1:], rtol=1e-6, atol=0)
+
+
+def test_awards_state_what_the_chosen_plan_promised(fleet, plans):
+    oracle = prepare(fleet.scenario, difficulty="oracle", cache=plans)
+    events = run(oracle, spec("round_robin", 2)).events
+    ends = {event.job: event for event in events if event.kind == "finish"}
+    stated = [event for event in events if event.kind == "award" and event.job in ends]
+    assert stated
+    for award in stated:
+        match = re.fullmatch(r"predicted peak ([\d.]+) °C, P\(saturation\) ([01]\.\d\d)", award.reason)
+        assert match is not None
+        assert (float(match[1]) > fleet.scenario.limits.warning_c) == (float(match[2]) > 0.5)
+    assert not any(event.reason for event in run(fleet, spec("round_robin", 2)).events if event.kind == "award")
 
 
 def test_the_metrics_agree_with_the_event_log(fleet):

@@ -7,8 +7,6 @@ from functools import cached_property
 
 import numpy as np
 from scipy.optimize import minimize
-from sklearn.isotonic import IsotonicRegression
-from sklearn.model_selection import StratifiedKFold
 
 from fleet.difficulty import KNOWN
 from fleet.errors import FleetError
@@ -182,6 +180,8 @@ def check_outcomes(passed: Array) -> None:
 
 def choose_strength(z: Array, passed: Array, rising: Array) -> tuple[float, Array]:
     """The candidate with the least cross-validated log loss, and its held-out scores, [job]."""
+    from sklearn.model_selection import StratifiedKFold  # slow import that a fleet with fitted models does not need
+
     folds = min(FOLDS, int(passed.sum()), int((~passed).sum()))
     held_out = np.empty((len(STRENGTHS), len(z)))
     for train, test in StratifiedKFold(folds, shuffle=True, random_state=0).split(z, passed):
@@ -226,6 +226,8 @@ def monotone_curve(score: Array, passed: Array) -> tuple[tuple[float, float], ..
 
     It keeps a distance of 1/(n + 2) from 0 and 1 (Laplace's rule of succession for n jobs of one outcome).
     """
+    from sklearn.isotonic import IsotonicRegression  # slow import
+
     fitted = IsotonicRegression(y_min=0.0, y_max=1.0, out_of_bounds="clip").fit(score, passed.astype(float))
     least = 1.0 / (len(score) + 2.0)
     knots = np.column_stack([fitted.X_thresholds_, np.clip(fitted.y_thresholds_, least, 1.0 - least)])

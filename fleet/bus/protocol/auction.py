@@ -358,7 +358,7 @@ class ClearRequest(msgspec.Struct, frozen=True):
 
 
 class Cleared(msgspec.Struct, frozen=True):
-    """Reply to a `ClearRequest`: it is on disk, and the arm takes no space until it is heard again."""
+    """Reply to a `ClearRequest`: it is on disk, and the arm takes no space until it sends messages again."""
 
     auctioneer: Name
     arm: Name

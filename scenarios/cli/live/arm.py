@@ -80,7 +80,7 @@ def arm_command(
         str,
         typer.Option(
             help=f"Allocate jobs without an auctioneer, by a policy of scope arm: {names_of('arm')}, your own as "
-            "FILE.py:CLASS, or a folder of train. Default: an auctioneer awards them."
+            "FILE.py:CLASS, or a folder of `thermofleet train`. Default: an auctioneer awards them."
         ),
     ] = "",
     jobs: JobsOption = "scenario",

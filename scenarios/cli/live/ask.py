@@ -27,19 +27,26 @@ def ask_command(
     place: Annotated[list[str] | None, typer.Option(help="Place of the cell; twice for pick_place and sort.")] = None,
     payload: Annotated[float, number("Payload, kg.", *_RANGES["payload_kg"])] = 0.0,
     repetitions: Annotated[int, number("Number of cycles.", *_RANGES["repetitions"])] = 1,
-    dwell: Annotated[float, number("Duration of one repetition of a hold or press, s.", *_RANGES["dwell_s"])] = DWELL_S,
+    dwell: Annotated[
+        float,
+        number("hold, press: duration of a cycle, s. Others: time to close or open the hand, s.", *_RANGES["dwell_s"]),
+    ] = DWELL_S,
     force: Annotated[float, number("Force of a press, N.", *_RANGES["force_n"])] = 0.0,
     timeout: Annotated[float, number("Real seconds to wait for arms.", 0, 600, above=True)] = REPLY_S,
     as_json: Annotated[bool, typer.Option("--json", help="Print the quotes as JSON.")] = False,
     endpoint: EndpointOption = ENDPOINT,
     fleet: FleetOption = "",
 ) -> None:
-    """Request quotes of all arms: what every plan costs, or why the job is infeasible for the arm.
+    """Request quotes from all arms: the cost of each plan of a job, or why the arm cannot do the job.
 
-    peak: predicted temperature of the hottest motor, and how much warmer that is than now. P: probability that a motor
-    passes the warning limit. d: thermal difficulty, to compare arms on one job. The fastest plan comes first. The
-    duration of a job includes the ways to its place and home. It is finished after its last cycle, once the arm's
-    present jobs are done. Exit code 1: there is a job that no arm can do.
+    This submits no job. The fastest plan comes first. Columns:
+    peak: predicted temperature of the hottest motor
+    gained: peak minus the hottest motor now
+    P: probability that a motor passes the warning limit
+    d: thermal difficulty, to compare arms on one job
+    duration: from home to home
+    finish in: time until the last cycle is done, after the arm's current jobs
+    Exit code 1: there is a job that no arm can do.
     """
     if bool(file) == bool(kind):
         raise FleetError("Give either a FILE of jobs or one job by --kind and --place.")

@@ -19,14 +19,16 @@ REPLY_S = 5.0
 
 def clear_command(
     arm: Annotated[str, typer.Argument(help="Name of the arm.", callback=check_name)],
-    by: Annotated[str, typer.Option(help="Who frees it, for the journal. Default: the name of the user.")] = "",
+    by: Annotated[str, typer.Option(help="Who requests it, for the journal. Default: the name of the user.")] = "",
     endpoint: EndpointOption = ENDPOINT,
     fleet: FleetOption = "",
 ) -> None:
-    """Free the space that a fleet keeps for an absent arm, so that other arms can use it.
+    """Free the space that an absent arm takes, so that other arms can use it.
 
-    First end the process of the arm, and make sure that the arm is at home or removed; start the process again only
-    then. The request is refused for an arm that is present: it reports itself which space it takes.
+    First stop the process of the arm, and make sure that the arm is at home
+    or removed, and switched off. Start the process again only when the arm is
+    at home. The request is refused for an arm that is present, because its own
+    quotes report its space.
     """
     if len(by) > MOST_CHARACTERS:
         raise FleetError(f"--by must have at most {MOST_CHARACTERS} characters (got {len(by)}).")
@@ -40,8 +42,8 @@ def clear_command(
         raise BusError(f"The space of '{arm}' was not freed{where}: {reasons[0]}")
     if not replies.messages:
         raise BusError(
-            f"Neither an auctioneer nor arms of fleet '{name}' replied within {REPLY_S:g} s; with TLS, the role "
-            "operator is needed."
+            f"Neither an auctioneer nor an arm of fleet '{name}' replied within {REPLY_S:g} s. With TLS, use a "
+            "certificate of the role operator."
         )
     typer.echo(f"{arm}: its space is free until the arm reports its space again.")
 
