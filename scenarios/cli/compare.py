@@ -83,7 +83,8 @@ def ablate_command(
         str | None,
         typer.Option(
             help="Sources, separated by commas: trained, untrained, torque, rc-nominal, rc, random, inverted, "
-            "constant, blind, oracle. Differences refer to the first one. Default: all.",
+            "constant, blind, oracle; or POLICY@SOURCE for another policy. Differences refer to the first one. "
+            "Default: all sources.",
             show_default=False,
         ),
     ] = None,

@@ -46,7 +46,7 @@ class AblationPlan:
 
     policy: str = "least_difficulty"
     scores: tuple[str, ...] = tuple(SOURCES)
-    """Names of the sources; differences refer to the first one."""
+    """Names of sources, or POLICY@SOURCE for another policy; differences refer to the first one."""
     fleets: int = 3
     """Draws of the arms: `spread.seed` of the scenario, and the following ones."""
     trainings: int = 2
@@ -55,11 +55,22 @@ class AblationPlan:
 
     def __post_init__(self) -> None:
         for i, name in enumerate(self.scores):
-            if name not in SOURCES:
-                raise FleetError(f"No source of scores '{name}'{nearest(name, SOURCES)}")
+            policy, source = self.parts(name)
+            if source not in SOURCES:
+                raise FleetError(f"No source of scores '{source}'{nearest(source, SOURCES)}")
             if name in self.scores[:i]:
                 raise FleetError(f"The source '{name}' is given twice; names must be unique.")
-        policy_of(self.policy)
+            policy_of(policy)
+
+    def parts(self, name: str) -> tuple[str, str]:
+        """Policy and source of one of `scores`."""
+        policy, _, source = name.rpartition("@")
+        return policy or self.policy, source
+
+    def label(self, name: str) -> str:
+        """Name of one of `scores` in a table."""
+        policy, source = self.parts(name)
+        return ("" if policy == self.policy else f"{label(policy)}, ") + SOURCES[source].label
 
 
 class Row(NamedTuple):
@@ -108,19 +119,19 @@ def ablate(scenario: Scenario, plan: AblationPlan, out: Path, *, progress: Progr
         (name, fleet, training)
         for fleet in range(plan.fleets)
         for name in plan.scores
-        for training in range(plan.trainings if SOURCES[name].trained else 1)
+        for training in range(plan.trainings if SOURCES[plan.parts(name)[1]].trained else 1)
     ]
     seeds, drawn, drawn_index = range(plan.first_seed, plan.first_seed + plan.seeds), None, -1
     for n, (name, fleet, training) in enumerate(draws):
         missing = [seed for seed in seeds if (name, fleet, training, seed) not in rows]
         if not missing:
             continue
-        source = SOURCES[name]
-        progress(f"{COUNTED}fleet {fleet + 1}, training {training + 1}: {source.label}", n / len(draws))
+        policy, source = plan.parts(name)
+        progress(f"{COUNTED}fleet {fleet + 1}, training {training + 1}: {plan.label(name)}", n / len(draws))
         if drawn is None or drawn_index != fleet:
             spread = replace(scenario.spread, seed=scenario.spread.seed + fleet)
             drawn, drawn_index = DrawnFleet(replace(scenario, spread=spread), cache_folder(), quiet), fleet
-        results = outcomes(source.make(drawn, training), plan.policy, missing)
+        results = outcomes(SOURCES[source].make(drawn, training), policy, missing)
         made = [
             Row(name, fleet, training, seed, *(float(getattr(result, figure)) for figure in FIGURES))
             for seed, result in zip(missing, results, strict=True)
@@ -197,7 +208,7 @@ def _effects(plan: AblationPlan, rows: dict[tuple[str, int, int, int], Row]) -> 
 
 def _values(plan: AblationPlan, rows: dict[tuple[str, int, int, int], Row], name: str, figure: str) -> Array:
     """A figure of one source, [fleet, training, seed]; the same for every training if the source has none."""
-    trained = SOURCES[name].trained
+    trained = SOURCES[plan.parts(name)[1]].trained
     return np.array(
         [
             [
@@ -240,7 +251,7 @@ def ablation_table(result: Ablation) -> Group:
     count = f"{plan.fleets} fleets × {plan.trainings} trainings × {plan.seeds} seeds"
     title = (
         f"{result.scenario}, {label(plan.policy)}, {count}: mean, paired difference to "
-        f"{SOURCES[plan.scores[0]].label}, 95 % intervals over fleets, trainings and seeds; * excludes 0"
+        f"{plan.label(plan.scores[0])}, 95 % intervals over fleets, trainings and seeds; * excludes 0"
     )
     table = Table(box=None, pad_edge=False)
     table.add_column("")
@@ -250,7 +261,7 @@ def ablation_table(result: Ablation) -> Group:
         table.add_row(f"[bold]{figure}[/bold]")
         for name in plan.scores:
             e = result.effects[name][figure]
-            cells = [f"  {SOURCES[name].label}", f"{e.mean:.2f}", f"{e.low:.2f} … {e.high:.2f}"]
+            cells = [f"  {plan.label(name)}", f"{e.mean:.2f}", f"{e.low:.2f} … {e.high:.2f}"]
             if name != plan.scores[0]:
                 star = "*" if e.difference_low > 0 or e.difference_high < 0 else ""
                 between = f"{e.difference_low:+z.2f} … {e.difference_high:+z.2f}"

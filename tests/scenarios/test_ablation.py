@@ -69,18 +69,24 @@ def test_the_inverse_has_the_opposite_order_and_probability() -> None:
 
 def test_the_command_resumes_and_shows_every_source(thermofleet, small_toml, tmp_path, monkeypatch) -> None:
     out = tmp_path / "ablation"
-    scores = "blind,random,constant,oracle"
+    scores = "blind,random,constant,oracle,round_robin@blind"
     call = ("ablate", small_toml, "--fleets", 2, "--scores", scores, "--out", out, "--policy", "wspt")
     done = thermofleet(*call, "--seeds", 2)
     assert done.code == 0, done.err
     for name in scores.split(","):
-        assert done.out.count(f"  {SOURCES[name].label} ") == len(FIGURES)
+        policy, _, source = name.rpartition("@")
+        assert done.out.count(f"  {policy and f'{policy}, '}{SOURCES[source].label} ") == len(FIGURES)
     with (out / "ablation.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 2 * 2 * (1 + 2 + 1 + 1)  # random numbers have two trainings
+    assert len(rows) == 2 * 2 * (1 + 2 + 1 + 1 + 1)  # random numbers have two trainings
     card = json.loads((out / "ablation.json").read_text())
     mean = np.mean([float(row["reward"]) for row in rows if row["scores"] == "random"])
     assert card["effects"]["random"]["reward"]["mean"] == pytest.approx(mean)
+    alone = tmp_path / "alone"
+    call_alone = (*call[:4], "--scores", "blind", "--policy", "round_robin", "--out", alone)
+    assert thermofleet(*call_alone, "--seeds", 2).code == 0
+    same = json.loads((alone / "ablation.json").read_text())["effects"]["blind"]["value"]["mean"]
+    assert card["effects"]["round_robin@blind"]["value"]["mean"] == same
 
     asked = []
     real = ablation.outcomes
@@ -88,7 +94,7 @@ def test_the_command_resumes_and_shows_every_source(thermofleet, small_toml, tmp
         ablation, "outcomes", lambda fleet, policy, seeds: asked.append(seeds) or real(fleet, policy, seeds)
     )
     assert thermofleet(*call, "--seeds", 3).code == 0
-    assert asked == [[10_002]] * 10
+    assert asked == [[10_002]] * 12
     before = (out / "ablation.csv").read_bytes()
     (out / "ablation.csv").write_bytes(before[:-9])  # killed within a row
     assert thermofleet(*call, "--seeds", 3).code == 0
