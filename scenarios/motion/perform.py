@@ -19,7 +19,7 @@ from fleet.thermal import WINDING, ThermalModel
 
 Array = np.ndarray
 
-NEVER_C = 1e6
+NEVER_C = 500.0
 """Warning limit above any motor temperature, so that the arm is never stopped."""
 CLIPPED = 0.999
 """Share of the torque clip from which a servo counts as clipped."""
