@@ -176,10 +176,8 @@ def observe(sim: Simulation, rows: Array, out: Array) -> None:
                         own, option = work[fleet, a, slot_kind[k], n], k * options + n
                         p, risk, peak = own["p_saturation"], own["risk"], own["peak"]
                         if risk >= 0 or peak >= 0:
-                            rest_s = np.inf  # of a job that came back, only the cycles that are left count
-                            if cycles[e, slot_job[e, k]] > 0:
-                                rest_s = own["travel_s"] + left[k] * own["cycle_s"]
-                            p, peak_c = predict(p, risk, peak, first_block, block, curve, known_c, rest_s, values_c)
+                            # All cycles, also of a job that came back: moments in between are not predicted.
+                            p, peak_c = predict(p, risk, peak, first_block, block, curve, known_c, np.inf, values_c)
                             out[e, a, at.peak_c + option] = min(max(peak_c, PEAK_LOW_C), PEAK_HIGH_C)
                             if not np.isnan(p):
                                 out[e, a, at.p_saturation + option] = p

@@ -161,8 +161,7 @@ def reference(world: World, state: State, slots: list[int], key: int) -> dict[st
                     blocks[closed, k] = 1.0
                 left_s = times_s[plan] @ [1, jobs.repetitions[0, j] - state.cycles[0, j], 1]
                 d = offers.difficulty[0, a, j, n]
-                rest_s = left_s if state.cycles[0, j] else np.inf  # of a job that came back, the rest counts
-                p, peak_c = prediction(world, (0, a, j, n), known_c, rest_s)
+                p, peak_c = prediction(world, (0, a, j, n), known_c)
                 slack_s = jobs.due_s[0, j] - now_s - left_s
                 options.append([1, not closed, not np.isnan(d), np.nan_to_num(d), p, peak_c, left_s, slack_s])
         names = ("offered", "station_free", "age_s", "payload_kg", "value", "returns", "expires", "too_heavy")
