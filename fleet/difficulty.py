@@ -103,16 +103,15 @@ def stack_forecasts(forecasts: Sequence[Forecast]) -> Forecast:
     knots = max(0 if each.curve is None else len(each.curve) for each in forecasts)
     offset, time_s = np.full((len(forecasts), pieces), -np.inf), np.zeros((len(forecasts), pieces))
     weight = np.zeros((len(forecasts), pieces, KNOWN))
-    curve = np.full((len(forecasts), knots, 2), np.nan)
     for row, each in enumerate(forecasts):
         count = len(each.offset)
         offset[row, :count], weight[row, :count] = each.offset, each.weight
         if each.time_s is not None:
             time_s[row, :count] = each.time_s
-        if each.curve is not None:
-            curve[row, : len(each.curve)] = each.curve
-            curve[row, len(each.curve) :] = np.inf, each.curve[-1, 1]
-    return Forecast(offset, weight, curve if knots else None, time_s)
+    if not knots:
+        return Forecast(offset, weight, None, time_s)
+    curves = [np.zeros((1, 0, 2)) if each.curve is None else each.curve[None] for each in forecasts]
+    return Forecast(offset, weight, np.concatenate([extend_curve(curve, knots) for curve in curves]), time_s)
 
 
 def forecast_arrays(forecasts: Forecast | None, lanes: int) -> dict[str, Array]:
