@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fleet.bus.protocol.auction import Award, JobSpec, QuoteRequest, Submission
+from fleet.bus.protocol.auction import Award, QuoteRequest, Submission
 from fleet.bus.protocol.consensus import Bid, JobOutcome
 from fleet.bus.protocol.messages import State
 from fleet.difficulty import KNOWN, Difficulty, Forecast
@@ -34,6 +34,7 @@ from fleet.motor import gen3_motors
 from fleet.observation import FIELDS, Observation
 from fleet.planning.space import plan_key, space_name
 from fleet.robot import JOINTS, ThermalLimits
+from scenarios.cli.live.auction import job_spec
 from scenarios.live.allocation import CentralAllocation
 
 MAY_DIFFER = {
@@ -98,7 +99,7 @@ class LiveShift:
         world, (plans, table) = env.world, conflicts
         volume = {space_name(plan_key(plan)): row for row, plan in enumerate(plans)}
         reach = frozenset(frozenset((a, b)) for a in NAMES for b in NAMES if a != b)
-        self.jobs, self.fleet = tuple(map(spec_of, jobs)), fleet
+        self.jobs, self.fleet = tuple(map(job_spec, jobs)), fleet
         self.excludes = CellSpace(volume=volume, conflicts=table, reach=reach, arms=frozenset(NAMES))
         timing = Timing(lease_s=HOUR_S, pause_s=(0.1, 0.2))
         rules = {"allocate": allocate, "timing": timing, "excludes": self.excludes}
@@ -226,22 +227,6 @@ class Leases:
 
     def step(self, real_s: float) -> None:
         pass
-
-
-def spec_of(job) -> JobSpec:
-    return JobSpec(
-        name=job.name,
-        kind=job.work.kind,
-        places=tuple(place.name for place in job.work.places),
-        repetitions=job.repetitions,
-        payload_kg=job.work.payload_kg,
-        dwell_s=job.work.dwell_s,
-        release_s=job.release_s,
-        due_s=job.due_s,
-        value=job.value,
-        after=job.after,
-        expires=job.expires,
-    )
 
 
 def arms_of(small, works):
