@@ -1,7 +1,9 @@
 """Thermal difficulty of a planned motion for one arm's motors, and the protocol of models that score it.
 
-d = Σ_k d_k, d_k = 1 − exp(−e_k). e_k is the time mean of the absolute reconstruction error of joint k, summed over the
-channels (E. Guiffo Kaigom, arXiv 2509.12740; the sign is chosen so that d_k → 1 for unknown motion).
+d = Σ_k w_k d_k, d_k = 1 − exp(−e_k). e_k is the time mean of the absolute reconstruction error of joint k, summed over
+the channels (E. Guiffo Kaigom, arXiv 2509.12740; the sign is chosen so that d_k → 1 for unknown motion). In the paper
+all weights are 1. Here w_k is proportional to the heat of joint k in the arm's cool motion (`heat_weights`), so that a
+new posture of a joint without load does not count as much as new load.
 """
 
 import math
@@ -22,6 +24,15 @@ Array = np.ndarray
 def difficulty_of_error(error: Array) -> Array:
     """d_k = 1 − exp(−e_k), in [0, 1), same shape as the errors e_k >= 0."""
     return -np.expm1(-error)
+
+
+def heat_weights(torque_sq: Array) -> Array:
+    """Weights w_k of the joints, [joint], with the sum `joints`: shares in the mean squared torque.
+
+    Args:
+        torque_sq: Mean squared torque of the joints in the arm's cool motion, (N·m)², [joint].
+    """
+    return torque_sq * (len(torque_sq) / torque_sq.sum())
 
 
 SETTLING_S = 120.0
@@ -198,6 +209,8 @@ class Difficulty:
     peak: Forecast | None = None
     """Hottest motor temperature during the plan (see `SETTLING_S`), °C, as a function of the known temperatures at the
     start. With a curve it also gives P(saturation), unless there is a `risk`."""
+    weight: Array | None = None
+    """w_k, [joint], with the sum `joints`; None: all 1."""
 
     def __post_init__(self) -> None:
         if self.p_saturation is not None and self.risk is not None:
@@ -205,8 +218,8 @@ class Difficulty:
 
     @cached_property
     def total(self) -> float:
-        """d = Σ_k d_k, in [0, joints)."""
-        return float(np.sum(self.per_joint))
+        """d = Σ_k w_k d_k, in [0, joints)."""
+        return float(np.sum(self.per_joint if self.weight is None else self.weight * self.per_joint))
 
     def p_at(self, known_c: Array, left_s: float = np.inf) -> float | None:
         """P(saturation) from known temperatures [KNOWN]; None if unknown.

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fleet.difficulty import Difficulty, DifficultyModel, difficulty_of_error
+from fleet.difficulty import Difficulty, DifficultyModel, difficulty_of_error, heat_weights
 from fleet.motion import Plan
 from fleet.robot import JOINTS
 from scenarios.job_stream import rehearsal_works
@@ -97,6 +97,21 @@ class _WithoutPeak:
 
 
 @dataclass(frozen=True)
+class _Unweighted:
+    """The scores of a model with d = Σ_k d_k, as in the paper."""
+
+    model: DifficultyModel
+
+    @property
+    def version(self) -> str:
+        return f"{self.model.version}, unweighted"
+
+    def score(self, plan: Plan, repetitions: int) -> Difficulty | None:
+        score = self.model.score(plan, repetitions)
+        return score and replace(score, weight=None)
+
+
+@dataclass(frozen=True)
 class _Inverted:
     """The opposite of a model: d_k and P of hard work are those of easy work."""
 
@@ -112,7 +127,7 @@ class _Inverted:
             return None
         assert score.risk is None or score.risk.offset.shape[-1] == 1, "the opposite of a maximum is not one"
         risk = score.risk and replace(score.risk, offset=-score.risk.offset, weight=-score.risk.weight)
-        return Difficulty(np.minimum(1.0 - score.per_joint, BELOW_ONE), risk=risk)
+        return Difficulty(np.minimum(1.0 - score.per_joint, BELOW_ONE), risk=risk, weight=score.weight)
 
 
 @dataclass(frozen=True)
@@ -122,11 +137,14 @@ class _Torque:
     torque: TorqueRms
     risk: DifficultyModel
     version: str = "torque"
+    weighted: bool = False
+    """By the mean squared torque of the training motion, as d of the twin."""
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty | None:
         per_joint = difficulty_of_error(self.torque.scores([plan], [repetitions]).per_joint[0])
         score = self.risk.score(plan, repetitions)
-        return Difficulty(np.minimum(per_joint, BELOW_ONE), risk=score and score.risk)
+        weight = heat_weights(self.torque.nominal_nm**2) if self.weighted else None
+        return Difficulty(np.minimum(per_joint, BELOW_ONE), risk=score and score.risk, weight=weight)
 
 
 @dataclass(frozen=True)
@@ -168,10 +186,15 @@ def _vae(drawn: DrawnFleet, training: int, *, trained: bool) -> Fleet:
     return drawn.scored([_WithoutPeak(model) for model in drawn.calibrated(training, "excess", trained=trained)])
 
 
-def _torque(drawn: DrawnFleet, training: int) -> Fleet:
+def _unweighted(drawn: DrawnFleet, training: int) -> Fleet:
+    return drawn.scored([_Unweighted(arm.model) for arm in _vae(drawn, training, trained=True).arms])
+
+
+def _torque(drawn: DrawnFleet, *, weighted: bool) -> Fleet:
     twins = drawn.calibrated(0, "torque")
     rules = [torque_over_known(_training_records(drawn.scenario, arm)) for arm in drawn.planned]
-    return drawn.scored([_Torque(rule, twin) for rule, twin in zip(rules, twins, strict=True)])
+    models = zip(rules, twins, strict=True)
+    return drawn.scored([_Torque(rule, twin, weighted=weighted) for rule, twin in models])
 
 
 def _training_records(scenario: Scenario, arm: PlannedArm) -> list[Array]:
@@ -195,7 +218,9 @@ def _random(drawn: DrawnFleet, training: int) -> Fleet:
 SOURCES: dict[str, Source] = {
     "trained": Source("trained VAE", lambda drawn, training: _vae(drawn, training, trained=True)),
     "untrained": Source("untrained VAE", lambda drawn, training: _vae(drawn, training, trained=False)),
-    "torque": Source("RMS torque", _torque, trained=False),
+    "unweighted": Source("trained VAE, unweighted", _unweighted),
+    "torque": Source("RMS torque", lambda drawn, _: _torque(drawn, weighted=False), trained=False),
+    "weighted-torque": Source("RMS torque, weighted", lambda drawn, _: _torque(drawn, weighted=True), trained=False),
     "rc-nominal": Source("nominal rc", lambda drawn, _: _network(drawn, "rc-nominal"), trained=False),
     "rc": Source("identified rc", lambda drawn, _: _network(drawn, "rc"), trained=False),
     "random": Source("random", _random),

@@ -43,4 +43,5 @@ class CalibratedTwin:
         risk = None
         if self.saturation is not None:
             risk = self.saturation.risk(features, np.array([plan.duration_s(repetitions)]))[0]
-        return Difficulty(features.difficulty[0], risk=risk, peak=self.heat.peak(plan, repetitions))
+        peak = self.heat.peak(plan, repetitions)
+        return Difficulty(features.difficulty[0], risk=risk, peak=peak, weight=self.twin.joint_weight)

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import torch
 
-from fleet.difficulty import Difficulty
+from fleet.difficulty import Difficulty, heat_weights
 from fleet.motion import CHANNELS, Plan
 from twin.plan_cache import PlanCache
 from twin.vae import inference
@@ -82,6 +82,11 @@ class Twin:
         return self.scaler.joints
 
     @cached_property
+    def joint_weight(self) -> Array:
+        """Weights of d_k by the torque of the training motion, [joint]; see `fleet.difficulty.heat_weights`."""
+        return heat_weights(self.scaler.mean[:, TAU] ** 2 + self.scaler.std[:, TAU] ** 2)
+
+    @cached_property
     def networks(self) -> inference.Networks:
         """The networks as one module."""
         return inference.Networks(self.nets)
@@ -119,7 +124,7 @@ class Twin:
         Raises:
             ValueError: repetitions < 1, an empty plan, or a plan that is not finite or has other joints.
         """
-        return Difficulty(self.features([plan], [repetitions]).difficulty[0])
+        return Difficulty(self.features([plan], [repetitions]).difficulty[0], weight=self.joint_weight)
 
     def measure(self, plan: Plan, repetitions: int) -> Measures:
         """All measures of one job."""
