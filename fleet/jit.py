@@ -91,17 +91,14 @@ def compiled_sources() -> tuple[Path, ...]:
 
 
 @cache
-def _cache_of_this_code() -> str:
+def cache_of_this_code() -> Path:
     """Cache folder for the present source of all that is compiled together: numba itself looks at one file only."""
     import numba
 
     digest = hashlib.sha256(numba.__version__.encode())
     for path in compiled_sources():
         digest.update(path.read_bytes())
-    folder = user_cache_folder() / "compiled" / digest.hexdigest()[:16]
-    if not folder.exists():
-        log.warning("Compiling the simulation engine (about a minute of one core, once); cached in %s.", folder)
-    return str(folder)
+    return user_cache_folder() / "compiled" / digest.hexdigest()[:16]
 
 
 def compile_cached(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -114,7 +111,11 @@ def compile_cached(function: Callable[..., Any]) -> Callable[..., Any]:
     while _called:
         register_jitable(**_OPTIONS)(_called.pop())
     options: Any = config  # numba sets its options by name
-    before, options.CACHE_DIR = options.CACHE_DIR, _cache_of_this_code()
+    folder = cache_of_this_code()
+    if not folder.exists():
+        log.warning("Compiling the simulation engine (about a minute of one core, once); cached in %s.", folder)
+        folder.mkdir(parents=True, exist_ok=True)
+    before, options.CACHE_DIR = options.CACHE_DIR, str(folder)
     try:
         return njit(function, cache=True, nogil=True, **_OPTIONS)
     finally:

@@ -6,6 +6,7 @@ from dataclasses import fields as dataclass_fields
 from functools import cached_property
 from inspect import Parameter, signature
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -13,26 +14,26 @@ import numpy as np
 from fleet.bus.exchange.channel import PERFECT, Channel
 from fleet.bus.exchange.memory import MemoryExchange
 from fleet.bus.exchange.protocol import Exchange
-from fleet.difficulty import Blind, DifficultyModel
+from fleet.difficulty import Blind
 from fleet.engine.profile_plant import ProfilePlant
 from fleet.engine.state import World
 from fleet.engine.world import Arm, build_world, warm_start
 from fleet.errors import FleetError, InfeasibleJob, ScenarioError, nearest
 from fleet.files import cache_folder
-from fleet.job import Job
+from fleet.jit import cache_of_this_code
+from fleet.job import Job, Work
 from fleet.motion import Plan
-from fleet.motor import Motors
 from fleet.planning.plan_cache import rest_torque
-from fleet.planning.space import SpaceTable, collisions_of_homes, space_table
+from fleet.planning.space import SpaceTable, space_table
 from fleet.robot import Robot
 from fleet.seeding import shift_seeds
-from fleet.thermal import ThermalModel
 from scenarios.cell_layout import cell_of, near_of
 from scenarios.extras import require_extra
 from scenarios.fault_price import weights_of
-from scenarios.job_stream import JobSampler, all_works, rehearsal_works, works_of
+from scenarios.job_stream import JobSampler, all_works, rehearsal_works
 from scenarios.load import load, override
-from scenarios.prepare.planned_arm import PlannedArm, air_offsets, homes_in_fixtures, plan_arms
+from scenarios.prepare.planned_arm import PlannedArm, air_offsets, plan_arms
+from scenarios.prepare.problems import problems_of
 from scenarios.progress import Progress, quiet
 from scenarios.schema import Scenario
 from scenarios.schema_errors import choose
@@ -77,9 +78,12 @@ def prepare(
         MissingExtra: twins are wanted, and their libraries are not installed.
     """
     arms, refused = _arms(scenario, range(len(scenario.arms)), difficulty, risk, cache, progress, every_work=True)
+    return _fleet(scenario, arms, refused, _folder(cache))
+
+
+def _fleet(scenario: Scenario, arms: Sequence[Arm], refused: Sequence[InfeasibleJob], folder: Path) -> Fleet:
     plans = [plan for arm in arms for variants in arm.plans.values() for plan in variants]
-    space = space_of(scenario, [arm.robot for arm in arms], plans, _folder(cache))
-    return Fleet(scenario, tuple(arms), tuple(refused), space)
+    return Fleet(scenario, tuple(arms), tuple(refused), space_of(scenario, [arm.robot for arm in arms], plans, folder))
 
 
 def space_of(scenario: Scenario, robots: Sequence[Robot], plans: Sequence[Plan], folder: Path) -> SpaceTable:
@@ -129,24 +133,49 @@ def _arms(
     planned = plan_arms(scenario, indices, works, folder, progress)
     if problems := problems_of(scenario, planned if every_work else (), folder):
         raise ScenarioError("\n".join(problems))
-    working = [replace(arm, plans={w: arm.plans[w] for w in asked if w in arm.plans}) for arm in planned]
-    models: Sequence[DifficultyModel] = [Blind()] * len(planned)
-    known: list[tuple[ThermalModel, Motors] | None] = [None] * len(planned)
+    arms = [_blind_arm(arm, asked, folder) for arm in planned]
     if difficulty == "twin":
         from scenarios.prepare.calibrate_twins import calibrate_twins  # both import torch
         from scenarios.prepare.train_twins import train_twins
 
+        if every_work:
+            _compile_meanwhile(scenario, arms, folder)
         twins = train_twins(scenario, planned, folder, progress)
-        models = calibrated = calibrate_twins(scenario, planned, twins, folder, progress, risk=risk)
-        known = [(model.heat.thermal, model.heat.motors) for model in calibrated]
-    arms = []
-    for each, model, beliefs in zip(working, models, known, strict=True):
-        robot, motors, thermal = each.hardware
-        rest_tau = rest_torque(robot, folder / "plans")
-        own = {"rest_tau": rest_tau, "plans": each.plans, "too_heavy": each.too_heavy}
-        arm = Arm(robot=robot, motors=motors, thermal=thermal, model=model, known=beliefs, **own)
-        arms.append(_with_oracle(scenario, arm) if difficulty == "oracle" else arm)
+        models = calibrate_twins(scenario, planned, twins, folder, progress, risk=risk)
+        arms = [
+            replace(arm, model=model, known=(model.heat.thermal, model.heat.motors))
+            for arm, model in zip(arms, models, strict=True)
+        ]
+    elif difficulty == "oracle":
+        arms = [_with_oracle(scenario, arm) for arm in arms]
     return arms, [error for arm in planned for error in arm.infeasible]
+
+
+def _blind_arm(planned: PlannedArm, works: Sequence[Work], folder: Path) -> Arm:
+    """The arm with its plans for these works, without scores."""
+    robot, motors, thermal = planned.hardware
+    return Arm(
+        robot=robot,
+        motors=motors,
+        thermal=thermal,
+        rest_tau=rest_torque(robot, folder / "plans"),
+        model=Blind(),
+        plans={work: planned.plans[work] for work in works if work in planned.plans},
+        too_heavy=planned.too_heavy,
+    )
+
+
+def _compile_meanwhile(scenario: Scenario, arms: Sequence[Arm], folder: Path) -> None:
+    """Compile the engine, unless it was compiled, in a thread, while other processes train."""
+    if cache_of_this_code().exists():
+        return
+    env = env_of(_fleet(scenario, arms, (), folder), bus="memory")
+
+    def compile_it() -> None:
+        env.reset(seed=0)
+        env.step(dict.fromkeys(env.agents, 0))
+
+    Thread(target=compile_it, name="compile the engine").start()
 
 
 def _folder(cache: str | Path | None) -> Path:
@@ -159,66 +188,6 @@ def _folder(cache: str | Path | None) -> Path:
     except OSError as error:
         raise FleetError(f"Cannot keep plans and twins in '{folder}': {error.strerror}.") from error
     return folder
-
-
-REASONS = 4
-"""Maximum number of reasons in one error message."""
-
-
-def problems_of(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) -> list[str]:
-    """Everything in a scenario that cannot work, one sentence each.
-
-    Args:
-        arms: With plans for all works; the work of a stream that none can do is a problem. If there are none, only
-            the arms at home are compared.
-        folder: Of the cache.
-    """
-    file = f"{scenario.name}.toml"
-    robots = [spec.robot() for spec in scenario.arms]
-    near = collisions_of_homes(robots, scenario.clearance_m, folder / "plans")
-    advice = "move or turn an arm, or give it another `home`"
-    if scenario.clearance_m:
-        advice = "move or turn an arm, give it another `home`, or lower clearance_m"
-    problems = [f"{file}: arms: {sentence}; {advice}." for sentence in near]
-    problems += [
-        f"{file}: {sentence}; move the arm or the fixture, or give the arm another `home`."
-        for sentence in homes_in_fixtures(scenario)
-    ]
-    problems += [
-        f'{file}: {sentence}; give it more cooling or cooler air, or begin with start = "cold".'
-        for sentence in _overheated_at_home(scenario, arms, folder)
-    ]
-    infeasible = [error for arm in arms for error in arm.infeasible]
-    for i, stream in enumerate(scenario.jobs if arms else ()):
-        here = [error for error in infeasible if error.place in stream.places]
-        reasons = list(dict.fromkeys(f"{error.arm} at '{error.place}': {error.reason}" for error in here))
-        if near and any(reason.endswith("at home") for reason in reasons):
-            continue  # it may be possible once the homes are apart
-        loads = [
-            f"{work.payload_kg:g}" for work in works_of(scenario, stream) if not any(work in arm.plans for arm in arms)
-        ]
-        if loads:
-            more = f"; and {len(reasons) - REASONS} more" if len(reasons) > REASONS else ""
-            problems.append(
-                f"{file}: jobs[{i}].places: no arm can do '{stream.name}' with {' or '.join(loads)} kg "
-                f"({'; '.join(reasons[:REASONS])}{more}); move the places or an arm, or make the load lighter."
-            )
-    return problems
-
-
-def _overheated_at_home(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) -> list[str]:
-    """A sentence for each arm that never settles at home, though the shift begins with settled arms."""
-    cell_c, offsets_k = float(scenario.ambient.at(np.zeros(1))[0]), air_offsets(scenario)
-    found = []
-    for arm in arms if scenario.start == "idle_warm" else ():
-        robot, motors, thermal = arm.hardware
-        rest_tau = rest_torque(robot, folder / "plans")
-        still = Arm(robot=robot, motors=motors, thermal=thermal, rest_tau=rest_tau, model=Blind(), plans={})
-        try:
-            warm_start(still, cell_c + float(offsets_k[arm.index]))
-        except ValueError as error:
-            found.append(f"arms[{arm.index}]: {str(error).rstrip('.')}")
-    return found
 
 
 def _with_oracle(scenario: Scenario, arm: Arm) -> Arm:

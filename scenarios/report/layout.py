@@ -14,8 +14,9 @@ from fleet.motion import Plan
 from fleet.planning.space import SpaceTable
 from scenarios.cell_layout import cell_of
 from scenarios.job_stream import all_works, works_of
-from scenarios.prepare.fleet import problems_of, space_of
+from scenarios.prepare.fleet import space_of
 from scenarios.prepare.planned_arm import PlannedArm, plan_arms
+from scenarios.prepare.problems import problems_of
 from scenarios.progress import Progress, quiet
 from scenarios.schema import Scenario
 

@@ -55,18 +55,21 @@ THERMAL = ("RMS torque / continuous", "rc nominal", "rc identified")
 
 @dataclass(frozen=True, eq=False)
 class TwinScorer:
-    """One score of a trained twin; the total is the sum over joints."""
+    """One score of a trained twin; the total is the sum over joints, without weights unless `weighted`."""
 
     name: str
     twin: Twin
     of_features: Callable[[Features], Array] = attrgetter("difficulty")
     """Score [job, joint] from features of jobs; by default d_k of the paper."""
+    weighted: bool = False
+    """Whether the weights of d count in the total."""
 
     def scores(self, plans: Sequence[Plan], repetitions: Sequence[int]) -> Scores:
         """Score of each job; raises as `twin.baselines.reconstruction.Scorer` says."""
         check_jobs(plans, repetitions)
         per_joint = self.of_features(self.twin.features(plans, repetitions))
-        return Scores(per_joint, per_joint.sum(axis=1))
+        total = per_joint @ self.twin.joint_weight if self.weighted else per_joint.sum(axis=1)
+        return Scores(per_joint, total)
 
 
 def jobs_of(sample: Sample, horizon_s: float) -> Jobs:
@@ -98,6 +101,7 @@ def twin_scorers(twins: dict[str, Twin], reference: Jobs) -> list[Scorer]:
     calibration = Calibration(vae.features(reference.plans, reference.repetitions))
     scorers: list[Scorer] = [
         TwinScorer(VAE, vae),
+        TwinScorer("VAE weighted", vae, weighted=True),
         TwinScorer("VAE d_cal", vae, calibration.difficulty),
         TwinScorer("VAE torque channel", vae, lambda features: difficulty_of_error(features.errors[..., TAU])),
         TwinScorer("VAE one-sided torque", vae, attrgetter("load")),

@@ -125,14 +125,14 @@ def test_the_reason_is_named_in_words(calibration, channel, one_sided, word):
     values[:, :3] = calibration.usual
     values[3, channel] += 2.0
     values[3, 3] = one_sided * values[3, 2]
-    measures = measures_of(Features(values), calibration, version="v")
+    measures = measures_of(Features(values), calibration, weight=np.ones(7), version="v")
     assert measures.why() == f"joint 4: {word} (100 %)"
     assert measures.shares.sum() == pytest.approx(1.0)
 
 
 def test_nothing_beyond_the_usual_says_so(calibration):
     values = np.zeros((7, PARTS))
-    measures = measures_of(Features(values), calibration, version="v")
+    measures = measures_of(Features(values), calibration, weight=np.ones(7), version="v")
     assert measures.why() == "nothing beyond the usual"
     assert measures.shares.sum() == 0
     assert measures.p_value == 1.0

@@ -124,7 +124,9 @@ class Measures:
     """All measures of one job, or of many with a leading axis [job]."""
 
     difficulty: Array
-    """d_k of the paper, [joint]; their sum is d."""
+    """d_k of the paper, [joint]."""
+    weight: Array
+    """w_k of the joints in d, [joint]; see `fleet.difficulty`."""
     calibrated: Array | None
     """d_k measured from the median of cool jobs, [joint]; None without a calibration."""
     load: Array
@@ -141,15 +143,15 @@ class Measures:
 
     @property
     def total(self) -> Array:
-        """d = Σ_k d_k, scalar."""
-        return self.difficulty.sum(axis=-1)
+        """d = Σ_k w_k d_k, scalar."""
+        return self.difficulty @ self.weight
 
     def of_job(self, i: int) -> "Measures":
         """The measures of one of many jobs."""
         if self.difficulty.ndim < 2:
             raise ValueError("These are the measures of one job.")
         changes: dict[str, Array] = {name: v[i] for name, v in vars(self).items() if isinstance(v, np.ndarray)}
-        return replace(self, **changes)
+        return replace(self, **(changes | {"weight": self.weight}))
 
     def why(self, most: int = 2) -> str:
         """The largest causes as text, `joint 2: more load (61 %), joint 4: a new place (20 %)`."""
@@ -166,14 +168,19 @@ class Measures:
         return ("a new place", "a new speed")[channel]
 
 
-def measures_of(features: Features, calibration: Calibration | None, *, version: str) -> Measures:
-    """Measures of features with any leading axes."""
+def measures_of(features: Features, calibration: Calibration | None, *, weight: Array, version: str) -> Measures:
+    """Measures of features with any leading axes.
+
+    Args:
+        weight: w_k of the joints, [joint].
+    """
     beyond = features.errors
     if calibration is not None:
         beyond = np.maximum(beyond - calibration.usual, 0.0)
     whole = beyond.sum(axis=(-2, -1), keepdims=True)
     return Measures(
         difficulty=features.difficulty,
+        weight=weight,
         calibrated=None if calibration is None else calibration.difficulty(features),
         load=features.load,
         shares=np.divide(beyond, whole, out=np.zeros_like(beyond), where=whole > 0),

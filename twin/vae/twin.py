@@ -136,7 +136,7 @@ class Twin:
 
     def measures_of(self, features: Features) -> Measures:
         """All measures of this twin's features, of jobs or of windows."""
-        return measures_of(features, self.calibration, version=self.version)
+        return measures_of(features, self.calibration, weight=self.joint_weight, version=self.version)
 
     def with_calibration(self, jobs: Sequence[tuple[Plan, int]]) -> "Twin":
         """The same twin, calibrated on held-out cool jobs (plan, repetitions).
