@@ -5,7 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from fleet.bus.protocol.auction import Award
-from fleet.live.auction.ledger import Awarded, Ledger
+from fleet.live.auction.ledger import Ledger
+from fleet.live.auction.records import Awarded
 from fleet.live.auction.round import Assignment, Bidding, Timing
 from fleet.live.space import ANYWHERE
 

@@ -33,11 +33,13 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.registry import SESSION_LEASE_S
 from fleet.errors import BusError, JournalFull, Refused
-from fleet.live.auction.auctioneer import SCAN_S, Auctioneer
+from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.job_rules import status_reply
 from fleet.live.auction.leases import SendAward
-from fleet.live.auction.ledger import AuctionRecord, Ledger
+from fleet.live.auction.ledger import Ledger
+from fleet.live.auction.records import AuctionRecord
 from fleet.live.auction.round import Allocate, Timing
+from fleet.live.auction.rounds import SCAN_S
 from fleet.live.clock import FleetClock
 from fleet.live.journal import Journal, TimeRecorder
 from fleet.live.journal_records import Started

@@ -15,8 +15,8 @@ from fleet.bus.client.discover import other_versions
 from fleet.bus.protocol.auction import JobSpec, JobStatus, Submission
 from fleet.errors import JournalFull
 from fleet.job import Job
-from fleet.live.auction.ledger import AuctionRecord
 from fleet.live.auction.node import AuctionNode
+from fleet.live.auction.records import AuctionRecord
 from fleet.live.auction.round import Timing
 from fleet.live.journal import Journal
 from scenarios.cli.live.journals import folder_of, refuse_other_way

@@ -24,8 +24,8 @@ from fleet.bus.protocol.auction import (
     Report,
 )
 from fleet.bus.protocol.messages import State
-from fleet.live.auction.ledger import AuctionRecord
 from fleet.live.auction.node import AuctionNode
+from fleet.live.auction.records import AuctionRecord
 from fleet.live.auction.round import Assignment
 from fleet.live.journal import Journal
 
