@@ -27,8 +27,9 @@ from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.leases import SendAward
 from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.round import Timing
-from fleet.live.consensus.granter import Grant, Granter, Register
+from fleet.live.consensus.granter import Granter
 from fleet.live.consensus.participant import QUIET_S, Membership, Participant
+from fleet.live.consensus.register import Grant, Register
 from fleet.live.space import CellSpace
 from fleet.motor import gen3_motors
 from fleet.observation import FIELDS, Observation

@@ -34,9 +34,10 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
+from fleet.bus.protocol.history import History
 from fleet.bus.protocol.messages import State
 from fleet.errors import Refused
-from fleet.live.auction.leases import send_again, unanswered
+from fleet.live.auction.leases import CountedLease, adopted, send_again, unanswered
 from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.records import AuctionRecord, ContactLost, ContactRegained, ShiftEnded
 from fleet.live.auction.round import MAX_REASON, Allocate, Timing
@@ -93,7 +94,7 @@ class Auctioneer:
         if new:
             self._writer.record(JobsAccepted(new, submission.by, time_s))
             self.rounds.retry_now()
-        return SubmissionReply(self.name, admissions)
+        return SubmissionReply(self.name, admissions, self.ledger.epoch)
 
     def renew_leases(self, request: LeaseRequest, real_s: float, time_s: float) -> Lease:
         """Renew leases, and permit to commit where an arm asks for it.
@@ -145,6 +146,19 @@ class Auctioneer:
             else:
                 self.rounds.delay(real_s, (report.job,))
         return receipt
+
+    def adopt(self, history: History, real_s: float) -> None:
+        """Take over what an arm has done and has, as far as the journal does not know it.
+
+        Raises:
+            JournalError: it is not on disk.
+        """
+        records = adopted(self.ledger, history, self.name, self.ledger.time_s)
+        if records:
+            _LOG.warning("%d records of what '%s' has done and has are new to the journal.", len(records), history.arm)
+            self._writer.record(*records)
+            for award in self.ledger.open.keys() - self._writer.leases.keys():
+                self._writer.leases[award] = CountedLease(real_s + self._timing.counted_lease_s)
 
     def add_quote(self, quote: Quote) -> None:
         """Add a quote; after the last one that the round waits for, the next tick closes it."""

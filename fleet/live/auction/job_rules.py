@@ -162,7 +162,9 @@ def ready_jobs(
     return ready
 
 
-def status_reply(name: str, time_s: float, statuses: Iterable[JobStatus], taken: Mapping[str, Iterable[str]]) -> Status:
+def status_reply(
+    name: str, time_s: float, statuses: Iterable[JobStatus], taken: Mapping[str, Iterable[str]], epoch: str = ""
+) -> Status:
     """Return the reply to a status request.
 
     It has as many statuses as one message may contain; of more, those that may still change come first.
@@ -172,7 +174,7 @@ def status_reply(name: str, time_s: float, statuses: Iterable[JobStatus], taken:
         taken: Names of the spaces that each arm may take.
     """
     kept, space = list(statuses), {arm: tuple(sorted(names)) for arm, names in sorted(taken.items()) if names}
-    reply = Status(name, time_s, (), space)
+    reply = Status(name, time_s, (), space, epoch)
     if len(kept) > MOST_JOBS:
         kept = sorted(kept, key=lambda status: status.state in SETTLED)[:MOST_JOBS]
     sizes = accumulate((len(encode(status)) + 1 for status in kept), initial=len(encode(reply)))

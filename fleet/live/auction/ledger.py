@@ -21,8 +21,8 @@ from fleet.live.auction.records import (
     Change,
     ContactLost,
     ContactRegained,
-    EpochBegun,
     Expired,
+    HistoryAdopted,
     JobEntry,
     LedgerSnapshot,
     ShiftEnded,
@@ -32,6 +32,7 @@ from fleet.live.journal_records import (
     ClockTick,
     Closed,
     CommitPermitted,
+    EpochBegun,
     JobsAccepted,
     SpaceCleared,
     SpaceTaken,
@@ -68,6 +69,7 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
             past=self.past.packed(),
             left=dict(self.left),
             epoch=self.epoch,
+            succeeds=self.succeeds,
             awards=tuple(map(replace, kept)),
             open=tuple(self.open),
             recent=tuple(self.recent),
@@ -118,9 +120,9 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
                 for entry in changed:
                     self._move(entry, "unfinished", entry.reason or SHIFT_ENDED)
             case EpochBegun():
-                self.epoch = record.epoch
-                for job in record.finished:
-                    self.past.add(job, finished=True)
+                self.epoch, self.succeeds = record.epoch, record.succeeds
+            case HistoryAdopted():
+                changed = self._adopt(record)
             case LedgerSnapshot():
                 self._restore(record)
             case Started() | ClockTick():
@@ -143,6 +145,17 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
             self.waiting[name] = entry
         elif state in ("finished", "given_up"):
             self.settled[name] = None
+
+    def _adopt(self, record: HistoryAdopted) -> list[JobEntry]:
+        """Apply what an arm has finished; return the waiting jobs that need no arm any more."""
+        for job in record.finished:
+            if job.name not in self.jobs:
+                self.past.add(job, finished=True)
+        entries = [self.waiting[job.name] for job in record.finished if job.name in self.waiting]
+        for entry in entries:
+            entry.cycles, entry.finished_s, entry.award = entry.spec.repetitions, record.time_s, ""
+            self._move(entry, "finished", f"'{record.arm}' had finished it; the journal did not know it.")
+        return entries
 
     def _leave(self, name: str) -> None:
         """Forget a settled job, except for its name and outcome."""
@@ -237,6 +250,7 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
         self.settled = dict.fromkeys(snapshot.settled)
         self.settled |= {name: None for name, e in self.jobs.items() if e.state in ("finished", "given_up")}
         self.past, self.left, self.epoch = PastJobs(snapshot.past, self.past.limit), dict(snapshot.left), snapshot.epoch
+        self.succeeds = snapshot.succeeds
         self.awards = {award.record.award: replace(award) for award in snapshot.awards}
         self._awards_of = {}
         for name, award in self.awards.items():

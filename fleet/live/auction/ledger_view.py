@@ -33,6 +33,8 @@ class LedgerView:
     """How many have left, by state."""
     epoch: str = ""
     """Of the journal; another one begins when the journal is lost. "" before the first start."""
+    succeeds: bool = False
+    """A person has requested that the epoch takes the place of another one."""
     awards: dict[str, AwardState] = field(default_factory=dict[str, AwardState])
     time_s: float = 0.0
     """Latest time of all records."""
@@ -67,9 +69,13 @@ class LedgerView:
         return ready_jobs(specs, time_s, limit, self.busy_stations(), self.is_finished, returned_s)
 
     def is_finished(self, name: str) -> bool:
-        """Return whether a job is finished, also one that has left."""
+        """Return whether a job is finished.
+
+        One that has left is, unless it was given up, also if its name is not known any more: followers of a job that is
+        given up do not wait.
+        """
         entry = self.jobs.get(name)
-        return self.past.is_finished(name) if entry is None else entry.state == "finished"
+        return not self.past.is_given_up(name) if entry is None else entry.state == "finished"
 
     def expired(self, time_s: float) -> list[Expired]:
         """Return the waiting jobs whose hard due date has passed."""
@@ -116,5 +122,5 @@ class LedgerView:
             entry.state == "unfinished" and entry.award in self.open
         )
         award = entry.award if assigned else ""
-        arm = self.awards[award].record.arm if assigned else ""
+        arm = self.awards[award].record.arm if award else ""
         return JobStatus(entry.spec.name, entry.state, arm, award, entry.cycles, entry.finished_s, entry.reason)

@@ -7,6 +7,7 @@ from fleet.live.journal_records import (
     ClockTick,
     Closed,
     CommitPermitted,
+    EpochBegun,
     JobsAccepted,
     SpaceCleared,
     SpaceTaken,
@@ -15,13 +16,12 @@ from fleet.live.journal_records import (
 from fleet.live.space import ANYWHERE
 
 
-class EpochBegun(msgspec.Struct, frozen=True, tag="epoch_begun"):
-    """The journal is new. It continues with what the arms know of earlier epochs."""
+class HistoryAdopted(msgspec.Struct, frozen=True, tag="history_adopted"):
+    """An arm has finished jobs that the journal did not know to be finished."""
 
-    epoch: str
+    arm: str
+    finished: tuple[JobSpec, ...]
     time_s: float
-    finished: tuple[JobSpec, ...] = ()
-    """Jobs that arms have finished in earlier epochs."""
 
 
 class Awarded(msgspec.Struct, frozen=True, tag="awarded"):
@@ -133,10 +133,10 @@ class LedgerSnapshot(msgspec.Struct, frozen=True, tag="ledger_snapshot"):
     past: bytes = b""
     left: dict[JobState, int] = {}
     epoch: str = ""
+    succeeds: bool = False
 
 
 AwardRecord = Awarded | CommitPermitted | ContactLost | ContactRegained | Closed
+JobRecord = JobsAccepted | Expired | HistoryAdopted
 SpaceRecord = SpaceTaken | SpaceCleared
-AuctionRecord = (
-    Started | EpochBegun | ClockTick | JobsAccepted | AwardRecord | SpaceRecord | Expired | ShiftEnded | LedgerSnapshot
-)
+AuctionRecord = Started | EpochBegun | ClockTick | JobRecord | AwardRecord | SpaceRecord | ShiftEnded | LedgerSnapshot

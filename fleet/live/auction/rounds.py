@@ -146,7 +146,7 @@ class Rounds:
             self._notes.pop(record.job, None)
             spec = self._writer.ledger.jobs[record.job].spec
             terms = (record.quote, spec, record.cycles, self._timing.lease_s, record.plan)
-            award = Award(record.award, bidding.auction, self._name, *terms)
+            award = Award(record.award, bidding.auction, self._name, *terms, epoch=self._writer.ledger.epoch)
             message = SendAward(record.arm, award)
             until_s = real_s + self._timing.counted_lease_s
             self._writer.leases[record.award] = CountedLease(until_s, unanswered=message, sent_s=real_s)
