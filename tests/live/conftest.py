@@ -17,7 +17,6 @@ from fleet.bus.protocol.auction import (
     Ack,
     Announcement,
     Award,
-    ClearRequest,
     JobEstimate,
     JobSpec,
     Lease,
@@ -32,6 +31,7 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
+from fleet.bus.protocol.operator import ClearRequest
 from fleet.errors import JournalFull, Refused
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.leases import SendAward

@@ -10,8 +10,6 @@ from fleet.bus.protocol.auction import (
     Announcement,
     ArmEvent,
     Award,
-    Cleared,
-    ClearRequest,
     Clock,
     ClockRequest,
     JobEstimate,
@@ -34,6 +32,7 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimEntry, ClaimReply, DeniedEntry, GrantedEntry, JobOutcome
 from fleet.bus.protocol.history import History, HistoryRequest
 from fleet.bus.protocol.messages import DifficultyScores, Info, Refusal, State
+from fleet.bus.protocol.operator import Cleared, ClearRequest
 
 CRATE = JobSpec(
     name="crate_1",

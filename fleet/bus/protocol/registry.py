@@ -10,7 +10,7 @@ from typing import Literal
 
 import msgspec
 
-from fleet.bus.protocol import auction, consensus, history, keys, messages
+from fleet.bus.protocol import auction, consensus, history, keys, messages, operator
 from fleet.bus.protocol.keys import Role
 
 MessageType = type[msgspec.Struct]
@@ -105,7 +105,7 @@ CHANNELS: tuple[Channel, ...] = (
     Channel("auction", "report", "query", auction.Report, auction.Receipt, receiver="arm"),
     Channel("jobs", "submit", "query", auction.Submission, auction.SubmissionReply),
     Channel("jobs", "status", "query", auction.StatusRequest, auction.Status),
-    Channel("jobs", "clear", "query", auction.ClearRequest, auction.Cleared, receiver="operator"),
+    Channel("jobs", "clear", "query", operator.ClearRequest, operator.Cleared, receiver="operator"),
     Channel("clock", "now", "query", auction.ClockRequest, auction.Clock),
 )
 CHANNEL: Mapping[tuple[str, str], Channel] = {(channel.role, channel.topic): channel for channel in CHANNELS}

@@ -22,8 +22,6 @@ from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import (
     Ack,
-    Cleared,
-    ClearRequest,
     JobStatus,
     Lease,
     LeaseEntry,
@@ -36,6 +34,7 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.history import History
 from fleet.bus.protocol.messages import State
+from fleet.bus.protocol.operator import Cleared, ClearRequest
 from fleet.errors import Refused
 from fleet.live.auction.leases import CountedLease, adopted, send_again, unanswered
 from fleet.live.auction.ledger import Ledger

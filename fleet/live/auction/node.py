@@ -16,8 +16,6 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Ack,
     Announcement,
-    Cleared,
-    ClearRequest,
     Clock,
     ClockRequest,
     LeaseRequest,
@@ -31,6 +29,7 @@ from fleet.bus.protocol.auction import (
     SubmissionReply,
 )
 from fleet.bus.protocol.messages import State
+from fleet.bus.protocol.operator import Cleared, ClearRequest
 from fleet.bus.protocol.registry import SESSION_LEASE_S
 from fleet.errors import BusError, JournalFull, Refused
 from fleet.live.auction.auctioneer import Auctioneer

@@ -17,8 +17,6 @@ from fleet.bus.client.client import AnotherReplies
 from fleet.bus.client.replies import Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
-    Cleared,
-    ClearRequest,
     Clock,
     ClockRequest,
     JobStatus,
@@ -32,6 +30,7 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply
 from fleet.bus.protocol.history import History, HistoryRequest
 from fleet.bus.protocol.messages import State
+from fleet.bus.protocol.operator import Cleared, ClearRequest
 from fleet.errors import BusError, Refused
 from fleet.live.arm.auctioneer_client import RateLimitedWarnings
 from fleet.live.arm.node import ArmNode
