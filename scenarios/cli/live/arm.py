@@ -103,7 +103,7 @@ def arm_command(
         arm = replayed_arm(name, file) if file else simulated()
     with (
         until_stopped() as stop,
-        BusClient(endpoint, fleet) as link,
+        BusClient(endpoint, fleet, stopped=stop.is_set) as link,
         Journal[ArmRecord](folder / f"{name}.journal", ArmRecord) as book,
         ExitStack() as resources,
     ):

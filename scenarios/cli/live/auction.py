@@ -69,7 +69,7 @@ def auction_command(
         excludes = cell_space(chosen, progress=progress)
     with (
         until_stopped() as stop,
-        BusClient(endpoint, fleet) as link,
+        BusClient(endpoint, fleet, stopped=stop.is_set) as link,
         Journal[AuctionRecord](folder / f"{name}.journal", AuctionRecord) as book,
     ):
         places = frozenset(place.name for place in chosen.places)
