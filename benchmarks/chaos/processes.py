@@ -83,16 +83,18 @@ def full_disk(fleet: Fleet) -> float:
 
 
 def full_log_disk(fleet: Fleet) -> float:
-    """Leave no space for the logs of all participants for ten seconds, in which an arm is killed."""
+    """Leave no space for the logs of all participants for ten seconds, in which they log; then kill an arm."""
     with _without_space([os.getpid()]):
-        return _kill_and_wait(fleet)
+        _make_them_log(fleet)
+    return kill_arm(fleet)
 
 
 def full_disks(fleet: Fleet) -> float:
-    """Leave no space for any journal, log or recording for ten seconds, in which an arm is killed and started again."""
+    """Leave no space for any journal, log or recording for ten seconds; then kill an arm."""
     names = [*(f"arm-{arm}" for arm in fleet.arms), fleet.auction, "record"]
     with _without_space([os.getpid(), *_pids(fleet, *names)]):
-        return _kill_and_wait(fleet)
+        _make_them_log(fleet)
+    return kill_arm(fleet)
 
 
 def kill_router_often(fleet: Fleet) -> float:
@@ -114,12 +116,13 @@ def kill_router_often(fleet: Fleet) -> float:
     return math.nan
 
 
-def _kill_and_wait(fleet: Fleet) -> float:
-    arm = fleet.working_arm() or fleet.arms[0]
-    fleet.send_signal(f"arm-{arm}")
-    seen_s = fleet.wait_until(lambda: fleet.is_absent(arm), DISK_S)
-    fleet.wait_until(lambda: False, DISK_S)
-    return seen_s
+def _make_them_log(fleet: Fleet) -> None:
+    """Send invalid messages, which every receiver logs, for as long as a disk is full."""
+    end_s = time.monotonic() + DISK_S
+    while time.monotonic() < end_s:
+        for arm in fleet.arms:
+            fleet.session.put(keys.of_arm(fleet.client.fleet, arm, "state"), b"{}")
+        fleet.wait_until(lambda: False, 0.5)
 
 
 def _pids(fleet: Fleet, *names: str) -> list[int]:

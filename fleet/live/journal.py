@@ -109,7 +109,8 @@ class Journal(Generic[Record]):
                 self._sync(self._file)
         except OSError as error:
             self.close()
-            raise JournalError(f"Journal '{self.path}' cannot be opened: {error.strerror}.") from error
+            kind = JournalFull if error.errno in _FULL else JournalError
+            raise kind(f"Journal '{self.path}' cannot be opened: {error.strerror}.") from error
         except JournalError:
             self.close()
             raise
