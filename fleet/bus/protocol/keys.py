@@ -15,9 +15,9 @@ from urllib.parse import quote, unquote
 
 Role = Literal["arm", "auction", "jobs", "clock"]
 ArmTopic = Literal["alive", "state", "info", "difficulty", "event", "bid", "quote", "award", "history"]
-AuctionTopic = Literal["alive", "announce", "result"]
+AuctionTopic = Literal["alive", "announce", "result", "operation"]
 AskedTopic = Literal["lease", "report", "claim"]
-JobsTopic = Literal["submit", "status", "clear"]
+JobsTopic = Literal["submit", "status", "clear", "control"]
 
 PREFIX = "thermofleet/v4"
 STATES = f"{PREFIX}/*/arm/*/state"

@@ -101,11 +101,13 @@ CHANNELS: tuple[Channel, ...] = (
     Channel("auction", "alive", "token", lease_s=SESSION_LEASE_S),
     Channel("auction", "announce", "publish", auction.Announcement, history=HISTORY),
     Channel("auction", "result", "publish", auction.Result, history=HISTORY),
+    Channel("auction", "operation", "publish", operator.Operation, history=HISTORY),
     Channel("auction", "lease", "query", auction.LeaseRequest, auction.Lease, receiver="arm", lease_s=auction.LEASE_S),
     Channel("auction", "report", "query", auction.Report, auction.Receipt, receiver="arm"),
     Channel("jobs", "submit", "query", auction.Submission, auction.SubmissionReply),
     Channel("jobs", "status", "query", auction.StatusRequest, auction.Status),
     Channel("jobs", "clear", "query", operator.ClearRequest, operator.Cleared, receiver="operator"),
+    Channel("jobs", "control", "query", operator.ControlRequest, operator.Controlled, receiver="operator"),
     Channel("clock", "now", "query", auction.ClockRequest, auction.Clock),
 )
 CHANNEL: Mapping[tuple[str, str], Channel] = {(channel.role, channel.topic): channel for channel in CHANNELS}

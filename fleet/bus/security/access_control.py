@@ -165,8 +165,9 @@ def rights(fleet: str, participant: Participant, *, by_consensus: bool = False) 
             queries=(quotes, awards, history, time, status),
         )
     if participant.role in ("submitter", "operator"):
-        clear = (keys.of_jobs(fleet, "clear"),) if participant.role == "operator" else ()
-        return Rights(queries=(keys.of_jobs(fleet, "submit"), *clear, status, quotes, time))
+        steer = (keys.of_jobs(fleet, "clear"), keys.of_jobs(fleet, "control"))
+        operator = steer if participant.role == "operator" else ()
+        return Rights(queries=(keys.of_jobs(fleet, "submit"), *operator, status, quotes, time))
     if participant.role in ("monitor", "recorder"):
         return Rights(queries=(status, time))
     return Rights()

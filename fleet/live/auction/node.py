@@ -29,7 +29,7 @@ from fleet.bus.protocol.auction import (
     SubmissionReply,
 )
 from fleet.bus.protocol.messages import State
-from fleet.bus.protocol.operator import Cleared, ClearRequest
+from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
 from fleet.bus.protocol.registry import SESSION_LEASE_S
 from fleet.errors import BusError, JournalFull, Refused
 from fleet.live.auction.auctioneer import Auctioneer
@@ -189,10 +189,12 @@ class AuctionNode:
         link, fleet, name, auctioneer = self._link, self._link.fleet, self._name, self.auctioneer
         self._announce = link.publisher(keys.of_auction(fleet, name, "announce"), Announcement)
         self._result = link.publisher(keys.of_auction(fleet, name, "result"), Result)
+        self._operation = link.publisher(keys.of_auction(fleet, name, "operation"), Operation)
         renew_leases, apply_report = self._logged(auctioneer.renew_leases), self._logged(auctioneer.apply_report)
         link.reply_to(keys.of_jobs(fleet, "submit"), Submission, self._logged(self._submit))
         link.reply_to(keys.of_jobs(fleet, "status"), StatusRequest, self._status)
         link.reply_to(keys.of_jobs(fleet, "clear"), ClearRequest, self._logged(self._clear))
+        link.reply_to(keys.of_jobs(fleet, "control"), ControlRequest, self._logged(self._control))
         link.reply_to(keys.asked_by_every_arm(fleet, name, "lease"), LeaseRequest, renew_leases)
         link.reply_to(keys.asked_by_every_arm(fleet, name, "report"), Report, apply_report)
         link.reply_to(keys.of_clock(fleet), ClockRequest, lambda _: Clock(self.time_s, self._clock.speed, self.epoch))
@@ -225,10 +227,16 @@ class AuctionNode:
             raise Refused(f"{self._name_rivals()}: no space is cleared until one is stopped.")
         return self.auctioneer.clear(request, self.present, time_s)
 
+    def _control(self, request: ControlRequest, real_s: float, time_s: float) -> Controlled:
+        if self.rivals:
+            raise Refused(f"{self._name_rivals()}: nothing is changed until one is stopped.")
+        return self.auctioneer.control(request, time_s)
+
     def _status(self, request: StatusRequest) -> Status:
         auctioneer = self.auctioneer
         taken = auctioneer.ledger.taken_space()
-        return status_reply(self._name, self.time_s, auctioneer.status(request.jobs), taken, self.epoch)
+        paused = auctioneer.ledger.paused
+        return status_reply(self._name, self.time_s, auctioneer.status(request.jobs), taken, self.epoch, paused)
 
     def _apply_state(self, arm: str, state: State) -> None:
         self._state_s[arm] = time.monotonic()
@@ -321,6 +329,8 @@ class AuctionNode:
                     self._announce(announcement)
                 case Result() as result:
                     self._result(result)
+                case Operation() as operation:
+                    self._operation(operation)
 
     def _end_quotes(self, auction: str, replies: Replies[Quote]) -> None:
         for reason in filter(None, replies.refused.values()):
