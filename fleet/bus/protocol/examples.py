@@ -32,7 +32,7 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimEntry, ClaimReply, DeniedEntry, GrantedEntry, JobOutcome
 from fleet.bus.protocol.history import History, HistoryRequest
 from fleet.bus.protocol.messages import DifficultyScores, Info, Refusal, State
-from fleet.bus.protocol.operator import Cleared, ClearRequest
+from fleet.bus.protocol.operator import Cancel, Cleared, ClearRequest, Controlled, ControlRequest, Operation
 
 CRATE = JobSpec(
     name="crate_1",
@@ -59,7 +59,8 @@ _FASTEST = PlanQuote(
 )
 _COOLEST = PlanQuote(plan=1, peak_c=48.25, gained_k=5.25, p_saturation=0.01, duration_s=252.0, finish_in_s=280.5)
 _OFFER = JobEstimate(job="crate_1", plans=(_FASTEST, _COOLEST))
-_DONE = JobStatus(job="crate_1", state="finished", arm=_ARM, award=_AWARD, cycles=20, finished_s=842.5)
+_DONE = JobStatus(job="crate_1", state="finished", arm=_ARM, award=_AWARD, cycles=20, finished_s=842.5, repetitions=20)
+_CANCEL = ControlRequest(request="5f0c2b1e", action=Cancel(job="crate_1"), by="shop floor")
 
 _ALL: tuple[msgspec.Struct, ...] = (
     State(
@@ -163,6 +164,15 @@ _ALL: tuple[msgspec.Struct, ...] = (
     Status(auctioneer=_AUCTIONEER, time_s=900.0, jobs=(_DONE,), space={"arm_2": ("5d1c0f7e92ab3486",)}, epoch=_EPOCH),
     ClearRequest(arm="arm_2", by="shop floor"),
     Cleared(auctioneer=_AUCTIONEER, arm="arm_2"),
+    _CANCEL,
+    Controlled(
+        auctioneer=_AUCTIONEER,
+        request=_CANCEL.request,
+        changed=True,
+        note="The arm ends the cycle in progress and returns it.",
+        job=JobStatus(job="crate_1", state="awarded", arm=_ARM, award=_AWARD, cycles=3, repetitions=20, finish_s=842.0),
+    ),
+    Operation(auctioneer=_AUCTIONEER, time_s=650.0, request=_CANCEL),
     ClockRequest(),
     Clock(time_s=600.0, speed=60.0, epoch=_EPOCH),
 )
