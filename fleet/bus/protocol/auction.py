@@ -19,7 +19,8 @@ from typing import Annotated, Literal
 import msgspec
 
 from fleet.bus.protocol.messages import Count, Name, Share, finite
-from fleet.job import BOUNDS, DWELL_S, Kind, check_bounds, check_duration, check_places
+from fleet.job import BOUNDS, DWELL_S, Kind, check_bounds, check_duration, check_dwell, check_places
+from fleet.names import check_names
 from fleet.telemetry import Mode
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -61,8 +62,10 @@ class JobSpec(msgspec.Struct, frozen=True, omit_defaults=True):
     """The due date is hard: the job is given up if it still waits then."""
 
     def __post_init__(self) -> None:
+        check_names(self, "name", "places", "after")
         check_places(self, self.kind, self.places)
         check_bounds(self, "repetitions", "payload_kg", "dwell_s", "force_n", "release_s", "due_s", "value")
+        check_dwell(self, self.kind, self.dwell_s)
         check_duration(self, self.dwell_s, self.repetitions)
         if self.due_s is not None and self.due_s < self.release_s:
             raise ValueError(f"JobSpec.due_s must be >= release_s = {self.release_s:g} (got {self.due_s:g}).")

@@ -5,16 +5,20 @@ the process dies are returned at the next start: the arm is at home again, and o
 was permitted to commit, the last cycle may have been done or not, and the report says so.
 """
 
+import logging
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import msgspec
 
 from fleet.bus.protocol.auction import Award, Name, Report
 from fleet.live.journal import JournalState
 from fleet.live.journal_records import Closed, CommitPermitted, Progress, Released, Started
+from fleet.names import printable
 
+_LOG = logging.getLogger(__name__)
 MAX_PAST_AWARDS = 256
 """Closed awards whose answer is kept; their quotes expired long ago."""
 
@@ -125,6 +129,27 @@ class ArmHistory(JournalState[ArmRecord]):
             report = Report(arm, name, active.job, "returned", active.cycles, time_s, reason, unsure=active.may_commit)
             reports[name] = active.award, report
         return ArmHistory(self.boot + 1, {}, reports, bounded(self.accepted, reports))
+
+
+def put_aside(path: Path, arm: str) -> Callable[[bytes, str], None]:
+    """Return what to do with a record of an arm's journal that cannot be read: append it to a file, and report it.
+
+    An award that is put aside is not executed again. Its lease expires at the auctioneer, which awards the job anew or,
+    if it had permitted the last cycle, calls it unfinished.
+    """
+
+    def put(record: bytes, reason: str) -> None:
+        _LOG.error(
+            "Arm '%s': put a journal record aside in '%s': %s. The record begins %s.",
+            *(arm, path, reason, printable(record[:200].decode(errors="replace"))),
+        )
+        try:
+            with path.open("ab") as file:
+                file.write(record + b"\n")
+        except OSError as error:
+            _LOG.error("The record could not be written to '%s': %s.", path, error.strerror)
+
+    return put
 
 
 def bounded(accepted: dict[str, str], needed: Iterable[str]) -> dict[str, str]:

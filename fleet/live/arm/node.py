@@ -1,13 +1,12 @@
 """An arm on the bus: publishes its state, quotes jobs, accepts awards and executes them in fleet time.
 
-One thread runs it. Planning a new motion takes some 50 ms, which must not delay its state messages: a reply plans for
-at most `PLANNING_S`, publishes the state between two plans, and calls the remaining jobs `NOT_PLANNED`; these are
-planned later, one motion per step, so that the next request finds them planned.
+One thread runs it, and another one plans (`fleet.live.arm.planning`), as a new motion takes 50 ms and more. A reply
+waits for plans for at most `PLANNING_S`, publishes the state meanwhile, and calls the remaining jobs `NOT_PLANNED`; the
+next request finds them planned.
 """
 
 import math
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
@@ -26,16 +25,17 @@ from fleet.live.arm.award_executor import AwardExecutor
 from fleet.live.arm.body import Body
 from fleet.live.arm.estimator import NO_CYCLES, Estimator, ScoredPlan
 from fleet.live.arm.journal_records import ActiveAward
+from fleet.live.arm.planning import PlanningThread
 from fleet.live.clock import FleetClock, next_due_s
 from fleet.live.space import ANYWHERE
+from fleet.names import printable
 from fleet.planning.space import plan_key, space_name
 
 Array = np.ndarray
 
-PLANNING_S = 0.3
-"""Real seconds that one reply may spend on planning."""
-MAX_UNPLANNED = 256
-"""Jobs that wait to be planned."""
+PLANNING_S, POLL_S = 0.3, 0.05
+"""Real seconds that one reply may wait for plans, as long as waiting takes less than half of all time; and between two
+looks at what else is due."""
 WRITE_RETRY_S = 1.0
 """Real seconds between two attempts to write records for which the disk had no space."""
 EVENTS_PER_BOOT = 1_000_000_000
@@ -87,8 +87,11 @@ class ArmNode:
         self._name = executor.arm
         self._body_award = ""
         """Award that the body works on."""
-        self._unplanned: deque[tuple[JobSpec, int]] = deque(maxlen=MAX_UNPLANNED)
-        """Jobs, and how many of their cycles are done."""
+        self._planning = PlanningThread(estimator)
+        self._waits_from_s = -math.inf
+        """Real second from which a reply may wait for plans again."""
+        self._plans: dict[str, ScoredPlan] = {}
+        """Plan of each active award: it stays even if the estimator drops it."""
         self._reading = body.read_sensors()
         self._tick = self._events = 0
         self._state_due_s = self._retry_s = -math.inf
@@ -99,10 +102,8 @@ class ArmNode:
 
     def serve(self, until_s: float) -> None:
         """Handle messages and run the arm until `time.monotonic()` is `until_s`, or slightly less."""
-        self.link.serve(-math.inf if self._unplanned else min(until_s, self._state_due_s, self.work_source.wake_s))
+        self.link.serve(min(until_s, self._state_due_s, self.work_source.wake_s))
         self._step()
-        if self._unplanned:
-            self._estimator.prepare(*self._unplanned.popleft())
 
     def retire(self, until_s: float) -> None:
         """Return all awards, and report them until they are acknowledged or `time.monotonic()` is `until_s`."""
@@ -129,7 +130,7 @@ class ArmNode:
         jobs = {job.name: job for job in request.jobs}
         if len(jobs) != len(request.jobs):
             raise Refused("The request names a job twice.")
-        estimates, name = self.estimate(request.jobs, request.cycles), ""
+        estimates, name = self.estimate(request.jobs, request.cycles, dry_run=request.dry_run), ""
         real_s = time.monotonic()
         if not request.dry_run:
             offers = {estimate.job: (jobs[estimate.job], len(estimate.plans)) for estimate in estimates}
@@ -156,7 +157,10 @@ class ArmNode:
         return () if plan is None else (space_name(plan_key(plan)),)
 
     def space_of(self, job: JobSpec, plan: int) -> str | None:
-        """Return the name of the space that the arm takes for a job by a plan; None if it has no such plan."""
+        """Return the name of the space that the arm takes for a job by a plan; None if it has no such plan now."""
+        for active in self.executor.active:
+            if (active.award.job, active.award.plan) == (job, plan):
+                return space_name(plan_key(self._scored(active.award).plan))
         return self._estimator.space_of(job, plan)
 
     def _possible_space(self) -> tuple[str, ...]:
@@ -165,22 +169,26 @@ class ArmNode:
         jobs = {self.space_of(award.job, award.plan) or ANYWHERE for award in awards}
         return tuple(sorted(jobs.union(self.space)))
 
-    def estimate(self, jobs: tuple[JobSpec, ...], cycles: Mapping[str, int] = NO_CYCLES) -> tuple[JobEstimate, ...]:
+    def estimate(
+        self, jobs: tuple[JobSpec, ...], cycles: Mapping[str, int] = NO_CYCLES, *, dry_run: bool = False
+    ) -> tuple[JobEstimate, ...]:
         """Estimate what jobs would cost the arm now; those that cannot be planned in time are called `NOT_PLANNED`.
 
         Args:
             cycles: Cycles that are done, by job; 0 if not named.
+            dry_run: Whether they may be planned after the jobs of others.
         """
-        until_s = time.monotonic() + PLANNING_S
-        for job in jobs:
-            done = cycles.get(job.name, 0)
-            if self._estimator.is_prepared(job, done):
-                continue
-            if time.monotonic() < until_s:
-                self._estimator.prepare(job, done)
+        missing = [(job, cycles.get(job.name, 0)) for job in jobs]
+        missing = [each for each in missing if not self._estimator.is_prepared(*each)]
+        if missing:
+            self._planning.request(missing, dry_run=dry_run)
+            start_s = time.monotonic()
+            until_s = start_s + PLANNING_S if start_s >= self._waits_from_s else start_s
+            self._waits_from_s = max(self._waits_from_s, until_s)
+            while (real_s := time.monotonic()) < until_s and not all(self._estimator.is_prepared(*m) for m in missing):
+                self._planning.wait(min(until_s, real_s + POLL_S))
                 self._step()
-            else:
-                self._unplanned.append((job, done))
+            self._waits_from_s = max(self._waits_from_s, 2.0 * time.monotonic() - start_s)
         return self._estimator.estimate(jobs, self._known_c(), self._busy_s(), cycles)
 
     @property
@@ -213,9 +221,14 @@ class ArmNode:
 
     def answer_award(self, award: Award, real_s: float) -> Ack:
         """Accept or refuse an award."""
-        before = len(self.executor.active)
-        ack = self.executor.answer_award(award, real_s, self.unfit())
-        if ack.accepted and len(self.executor.active) > before:
+        before = {active.award.award for active in self.executor.active}
+        plans = self._estimator.plans(award.job)
+        unplanned = "" if award.plan < len(plans) else "its plan is not kept any more: request another quote"
+        ack = self.executor.answer_award(award, real_s, self.unfit() or unplanned)
+        active = {active.award.award for active in self.executor.active}
+        if award.award in active - before:
+            self._plans = {name: plan for name, plan in self._plans.items() if name in active}
+            self._plans[award.award] = plans[award.plan]
             difficulty = self._scored(award).difficulty
             score = math.nan if difficulty is None else difficulty.total
             self._report_event(Event(time_s=self._body.time_s, kind="award", job=award.job.name, value=score))
@@ -276,14 +289,17 @@ class ArmNode:
             self._body_award = ""
         if current is None or not self._body.is_free:
             return
-        job = self._estimator.job(current.award.job)
-        assert job is not None
-        self._body.start(job, self._scored(current.award).plan, current.cycles)
-        self._body_award = name
+        try:
+            self._body.start(self._estimator.job(current.award.job), self._scored(current.award).plan, current.cycles)
+        except ValueError as error:
+            self._warn("start", f"returns '{printable(current.job)}', which it cannot start: {error}")
+            self.executor.return_all(self._body.time_s, time.monotonic(), f"it cannot be started: {error}")
+        else:
+            self._body_award = name
 
     def _scored(self, award: Award) -> ScoredPlan:
-        """Return the plan of an award; one without a quoted plan is refused."""
-        return self._estimator.plans(award.job)[award.plan]
+        """Return the plan of an active award."""
+        return self._plans[award.award]
 
     def _advance(self, until_s: float, current: ActiveAward | None, leased_s: float, real_s: float) -> None:
         if current is not None and self._body_award == current.award.award:

@@ -27,7 +27,7 @@ from fleet.live.arm.auctioneer_client import AuctioneerClient, WorkSource
 from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
 from fleet.live.arm.body import Body
 from fleet.live.arm.estimator import Estimator, NominalPeaks
-from fleet.live.arm.journal_records import ArmHistory, ArmRecord
+from fleet.live.arm.journal_records import ArmHistory, ArmRecord, put_aside
 from fleet.live.arm.node import ArmConfig, ArmNode
 from fleet.live.arm.replay_body import ReplayBody, SensorLog
 from fleet.live.clock import FleetClock
@@ -103,7 +103,9 @@ def arm_command(
     with (
         until_stopped() as stop,
         BusClient(endpoint, fleet) as link,
-        Journal[ArmRecord](folder / f"{name}.journal", ArmRecord) as book,
+        Journal[ArmRecord](
+            folder / f"{name}.journal", ArmRecord, put_aside=put_aside(folder / f"{name}.aside", name)
+        ) as book,
         ExitStack() as resources,
     ):
         wait_for_name(link, name)
