@@ -36,6 +36,7 @@ from fleet.motion import Plan
 from scenarios.cli.live.journals import folder_of, refuse_other_way
 from scenarios.cli.live.options import (
     MAX_SPEED,
+    MIN_SPEED,
     JobsOption,
     JournalOption,
     ModelOption,
@@ -70,7 +71,7 @@ def arm_command(
     risk: RiskOption = "rc",
     speed: Annotated[
         float | None,
-        number("Fleet seconds per real second. Default: the auctioneer's, else 1.", 0, MAX_SPEED, above=True),
+        number("Fleet seconds per real second. Default: the auctioneer's, else 1.", MIN_SPEED, MAX_SPEED),
     ] = None,
     rate_hz: RateOption = STATE_HZ,
     capacity: Annotated[int, number("Maximum concurrent jobs.", 1, 256)] = 1,
