@@ -21,7 +21,7 @@ MOST_PAYLOAD_M = 0.1
 """Largest radius of such a ball."""
 LEAST_FIXTURE_M, MOST_FIXTURE_M = 0.001, 10.0
 """Smallest and largest length of a fixture."""
-LONGEST_GRASP_S = 60.0
+LONGEST_GRASP_S = 180.0
 """Largest `dwell_s` of a pick_place or sort, whose standstills are planned sample by sample."""
 LONGEST_JOB_S = 7 * 24 * 3600.0
 """Longest planned duration of a job."""

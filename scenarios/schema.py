@@ -9,9 +9,8 @@ import numpy as np
 from fleet.arrivals import Arrivals, Batch, Poisson, Trace
 from fleet.engine.reward import RewardWeights
 from fleet.env.validation import Decisions
-from fleet.errors import FleetError, check_between, check_nonnegative, check_positive, nearest
+from fleet.errors import MAX_NAME, FleetError, check_between, check_names, check_nonnegative, check_positive, nearest
 from fleet.job import BOUNDS, DWELL_S, Fixture, Kind, Place, check_bounds, check_duration, check_dwell, check_places
-from fleet.names import MAX_NAME, check_names
 from fleet.robot import Cooling, Mount, Robot, ThermalLimits
 
 MOST_SAMPLES = 1_000_000

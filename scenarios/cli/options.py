@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 
 from agents.registry import names_of
-from fleet.errors import FleetError, LogError
-from fleet.names import NAME_RULE, is_name, printable
+from fleet.errors import NAME_RULE, FleetError, LogError, is_name, printable
 
 if TYPE_CHECKING:  # slow to import
     from fleet.bus.exchange.channel import Channel, Partition

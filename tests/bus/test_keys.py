@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.keys import ASKED, NAMELESS, TOPICS, Key
-from fleet.names import is_name
+from fleet.errors import is_name
 
 names = st.text(st.characters(exclude_categories=["Cs", "Cc", "Cf"]), min_size=1, max_size=30).filter(is_name)
 wild = st.sampled_from(["*", "**", "@", "@v1", "a b", "$*", "?", "#", "%", "%2F", "ä", "机", "a.b", "a.."])

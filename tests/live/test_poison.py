@@ -38,9 +38,10 @@ from fleet.bus.protocol.messages import MalformedMessage, State, decode, encode
 from fleet.errors import Refused
 from fleet.job import Place
 from fleet.live.arm.award_executor import AwardExecutor
+from fleet.live.arm.config import ArmConfig
 from fleet.live.arm.estimator import MAX_BYTES, Estimator, NominalPeaks, _size
 from fleet.live.arm.journal_records import ArmHistory, ArmRecord, AwardAccepted, put_aside
-from fleet.live.arm.node import ArmConfig, ArmNode
+from fleet.live.arm.node import ArmNode
 from fleet.live.arm.simulated_body import SimulatedBody
 from fleet.live.auction.ledger import AuctionRecord
 from fleet.live.auction.node import AuctionNode

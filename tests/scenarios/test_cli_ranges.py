@@ -6,7 +6,7 @@ from typing import Annotated, get_args, get_origin, get_type_hints
 import pytest
 import typer
 
-from fleet.names import MAX_NAME
+from fleet.errors import MAX_NAME
 from scenarios.cli.main import COMMANDS, target_of
 
 HUGE = "9" * 30

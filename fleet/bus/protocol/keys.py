@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import Literal, get_args
 from urllib.parse import quote, unquote
 
-from fleet.names import NAME_RULE, is_name, printable
+from fleet.errors import NAME_RULE, is_name, printable
 
 Role = Literal["arm", "auction", "jobs", "clock"]
 ArmTopic = Literal["alive", "state", "info", "difficulty", "event", "bid", "quote", "award"]

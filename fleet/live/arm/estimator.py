@@ -14,11 +14,10 @@ import numpy as np
 
 from fleet.bus.protocol.auction import JobEstimate, JobSpec, PlanQuote
 from fleet.difficulty import Difficulty, DifficultyModel
-from fleet.errors import InfeasibleJob
+from fleet.errors import InfeasibleJob, printable
 from fleet.job import LONGEST_JOB_S, Job, Place, Work
 from fleet.motion import Drive, Plan, distinct
 from fleet.motor import gen3_motors
-from fleet.names import printable
 from fleet.offered_plans import nominal_drive, offered_plans
 from fleet.planning.space import plan_key, space_name
 from fleet.robot import JOINTS

@@ -14,9 +14,9 @@ from pathlib import Path
 import msgspec
 
 from fleet.bus.protocol.auction import Award, Name, Report
+from fleet.errors import printable
 from fleet.live.journal import JournalState
 from fleet.live.journal_records import Closed, CommitPermitted, Progress, Released, Started
-from fleet.names import printable
 
 _LOG = logging.getLogger(__name__)
 MAX_PAST_AWARDS = 256

@@ -8,57 +8,33 @@ next request finds them planned.
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import Ack, ArmEvent, Award, JobEstimate, JobSpec, Quote, QuoteRequest
-from fleet.bus.protocol.messages import DifficultyScores, Info, State
-from fleet.bus.protocol.registry import STATE_HZ
+from fleet.bus.protocol.auction import Ack, Award, JobEstimate, JobSpec, Quote, QuoteRequest
+from fleet.bus.protocol.messages import State
 from fleet.difficulty import known_temperatures
-from fleet.errors import Refused
+from fleet.errors import Refused, printable
 from fleet.events import Event
 from fleet.live.arm.auctioneer_client import AuctioneerClient, RateLimitedWarnings, WorkSource
 from fleet.live.arm.award_executor import AwardExecutor
 from fleet.live.arm.body import Body
+from fleet.live.arm.config import ArmConfig
 from fleet.live.arm.estimator import NO_CYCLES, Estimator, ScoredPlan
 from fleet.live.arm.journal_records import ActiveAward
 from fleet.live.arm.planning import PlanningThread
+from fleet.live.arm.publications import Publications
 from fleet.live.clock import FleetClock, next_due_s
 from fleet.live.space import ANYWHERE
-from fleet.names import printable
 from fleet.planning.space import plan_key, space_name
 
 Array = np.ndarray
 
-PLANNING_S, POLL_S = 0.3, 0.05
-"""Real seconds that one reply may wait for plans, as long as waiting takes less than half of all time; and between two
-looks at what else is due."""
 WRITE_RETRY_S = 1.0
 """Real seconds between two attempts to write records for which the disk had no space."""
-EVENTS_PER_BOOT = 1_000_000_000
-"""The number of an event is the boot number times this, plus a count."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ArmConfig:
-    """How an arm takes part in the fleet."""
-
-    warning_c: float
-    """Motor temperature above which it accepts no work."""
-    rate_hz: float = STATE_HZ
-    """State messages per real second."""
-    boot: int = 1
-    """Number of this start."""
-    ambient_c: Callable[[float], float] = lambda time_s: 25.0
-    """Measured ambient temperature of the cell by fleet time."""
-    takes_jobs: bool = True
-
-    def __post_init__(self) -> None:
-        if not 0 < self.rate_hz <= 1000:
-            raise ValueError(f"ArmConfig.rate_hz must be > 0 and <= 1000 (got {self.rate_hz:g}).")
 
 
 class ArmNode:
@@ -88,12 +64,9 @@ class ArmNode:
         self._body_award = ""
         """Award that the body works on."""
         self._planning = PlanningThread(estimator)
-        self._waits_from_s = -math.inf
-        """Real second from which a reply may wait for plans again."""
         self._plans: dict[str, ScoredPlan] = {}
         """Plan of each active award: it stays even if the estimator drops it."""
         self._reading = body.read_sensors()
-        self._tick = self._events = 0
         self._state_due_s = self._retry_s = -math.inf
         """Real seconds at which the next state message and the next attempt to write are due."""
         self._warn = RateLimitedWarnings(self._name)
@@ -116,11 +89,8 @@ class ArmNode:
 
     def _declare(self) -> None:
         link, fleet, name = self.link, self.link.fleet, self._name
-        self._publish_state = link.publisher(keys.of_arm(fleet, name, "state"), State)
-        self._publish_difficulty = link.publisher(keys.of_arm(fleet, name, "difficulty"), DifficultyScores)
-        self._publish_event = link.publisher(keys.of_arm(fleet, name, "event"), ArmEvent)
-        self._publish_info = link.publisher(keys.of_arm(fleet, name, "info"), Info)  # holds the last one
-        self._publish_info(Info(name, len(self._reading.temp_c), self._estimator.model.version))
+        self._publish = Publications(link, name, self._config.boot)
+        self._publish.info(len(self._reading.temp_c), self._estimator.model.version)
         link.reply_to(keys.of_arm(fleet, name, "quote"), QuoteRequest, self._quote)
         link.reply_to(keys.of_arm(fleet, name, "award"), Award, self._award)
         link.declare_token(keys.of_arm(fleet, name, "alive"))
@@ -178,17 +148,10 @@ class ArmNode:
             cycles: Cycles that are done, by job; 0 if not named.
             dry_run: Whether they may be planned after the jobs of others.
         """
-        missing = [(job, cycles.get(job.name, 0)) for job in jobs]
-        missing = [each for each in missing if not self._estimator.is_prepared(*each)]
+        begun = [(job, cycles.get(job.name, 0)) for job in jobs]
+        missing = [each for each in begun if not self._estimator.is_prepared(*each)]
         if missing:
-            self._planning.request(missing, dry_run=dry_run)
-            start_s = time.monotonic()
-            until_s = start_s + PLANNING_S if start_s >= self._waits_from_s else start_s
-            self._waits_from_s = max(self._waits_from_s, until_s)
-            while (real_s := time.monotonic()) < until_s and not all(self._estimator.is_prepared(*m) for m in missing):
-                self._planning.wait(min(until_s, real_s + POLL_S))
-                self._step()
-            self._waits_from_s = max(self._waits_from_s, 2.0 * time.monotonic() - start_s)
+            self._planning.plan(missing, self._step, dry_run=dry_run)
         return self._estimator.estimate(jobs, self._known_c(), self._busy_s(), cycles)
 
     @property
@@ -200,19 +163,7 @@ class ArmNode:
 
     def publish_difficulty(self, estimates: tuple[JobEstimate, ...], real_s: float) -> None:
         """Publish how difficult jobs are for the arm, by the plan with the least difficulty."""
-        plans = [estimate.least for estimate in estimates]
-        self._publish_difficulty(
-            DifficultyScores(
-                arm=self._name,
-                tick=self._tick,
-                time_s=self.clock.now_s(real_s),
-                twin=self._estimator.model.version,
-                jobs=tuple(estimate.job for estimate in estimates),
-                difficulty=tuple(plan.difficulty for plan in plans),
-                p_saturation=tuple(plan.p_saturation for plan in plans),
-                peak_c=tuple(plan.peak_c for plan in plans),
-            )
-        )
+        self._publish.difficulty(estimates, self._estimator.model.version, self.clock.now_s(real_s))
 
     def _award(self, award: Award) -> Ack:
         if self.work_source.objection:
@@ -231,7 +182,7 @@ class ArmNode:
             self._plans[award.award] = plans[award.plan]
             difficulty = self._scored(award).difficulty
             score = math.nan if difficulty is None else difficulty.total
-            self._report_event(Event(time_s=self._body.time_s, kind="award", job=award.job.name, value=score))
+            self._publish.event(Event(time_s=self._body.time_s, kind="award", job=award.job.name, value=score))
         return ack
 
     def unfit(self) -> str:
@@ -340,7 +291,7 @@ class ArmNode:
             self.executor.record_progress(int(event.value), math.inf)
             self.executor.return_all(event.time_s, real_s, f"the arm faulted; {event.reason}", faulted=True)
             self._reading = self._body.read_sensors()  # the next estimates take the fault into account
-        self._report_event(event)
+        self._publish.event(event)
 
     def _busy_s(self) -> float:
         """Fleet seconds until the arm has finished all its jobs."""
@@ -358,11 +309,10 @@ class ArmNode:
 
     def _send_state(self) -> None:
         self._reading = self._body.read_sensors()
-        self._tick += 1
-        self._publish_state(
+        self._publish.state(
             State(
                 arm=self._name,
-                tick=self._tick,
+                tick=self._publish.next_tick(),
                 time_s=self._body.time_s,
                 headroom_k=self._headroom_k,
                 job="" if self._current is None else self._current.job,
@@ -388,21 +338,6 @@ class ArmNode:
             "job_peak_c": None if score is None else score.peak_at(known_c, left_s),
             "job_p_saturation": None if score is None else score.p_at(known_c, left_s),
         }
-
-    def _report_event(self, event: Event) -> None:
-        self._events += 1
-        self._publish_event(
-            ArmEvent(
-                arm=self._name,
-                number=self._config.boot * EVENTS_PER_BOOT + self._events,
-                time_s=event.time_s,
-                kind=event.kind,
-                job=event.job,
-                joint=event.joint,
-                value=event.value if math.isfinite(event.value) else None,
-                reason=event.reason,
-            )
-        )
 
     def set_clock(self, clock: FleetClock, *, jump: bool = False) -> None:
         """Use another clock; with `jump` it reads another time now, and the body is set to that time."""

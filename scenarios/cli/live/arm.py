@@ -26,9 +26,10 @@ from fleet.job import Work
 from fleet.live.arm.auctioneer_client import AuctioneerClient, WorkSource
 from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
 from fleet.live.arm.body import Body
+from fleet.live.arm.config import ArmConfig
 from fleet.live.arm.estimator import Estimator, NominalPeaks
 from fleet.live.arm.journal_records import ArmHistory, ArmRecord, put_aside
-from fleet.live.arm.node import ArmConfig, ArmNode
+from fleet.live.arm.node import ArmNode
 from fleet.live.arm.replay_body import ReplayBody, SensorLog
 from fleet.live.clock import FleetClock
 from fleet.live.journal import Journal
