@@ -1,5 +1,6 @@
 """Exceptions that callers may want to catch, checks of numbers and names, and hints for unknown names."""
 
+import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -145,8 +146,16 @@ def check_names(owner: object, *fields: str) -> None:
 
 
 def printable(text: str, longest: int = 4 * MAX_NAME) -> str:
-    """Text from outside as a terminal or a page may show it: control characters and direction marks are escaped."""
-    if text.isprintable() and len(text) <= longest:
+    """A name or sentence from outside as one short line of a message; escaped as by `visible`."""
+    return visible(text[:longest]) + ("…" if len(text) > longest else "")
+
+
+def visible(text: str, keep: str = "") -> str:
+    """Text as a terminal or a page may show it: control characters and direction marks as JSON escapes them.
+
+    Args:
+        keep: Characters that stay as they are, for example line breaks.
+    """
+    if text.isprintable():
         return text
-    shown = "".join(char if char.isprintable() else ascii(char)[1:-1] for char in text[:longest])
-    return shown + ("…" if len(text) > longest else "")
+    return "".join(char if char.isprintable() or char in keep else json.dumps(char)[1:-1] for char in text)

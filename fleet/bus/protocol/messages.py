@@ -16,7 +16,7 @@ from fleet.telemetry import Mode
 
 VERSION = 4
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=512)]
-Count = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
+Count = Annotated[int, msgspec.Meta(ge=0, le=10**15)]
 Number = Annotated[float, msgspec.Meta(ge=-1e12, le=1e12)]
 """Any quantity without bounds of its own: no sum or product of a few of them overflows."""
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]

@@ -119,7 +119,7 @@ def read_roster(folder: Path) -> Roster:
         ) from error
     except OSError as error:
         raise BusError(f"Cannot read '{path}': {error.strerror}.") from error
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise BusError(f"'{path}' is not a roster: {error}.") from error
 
 

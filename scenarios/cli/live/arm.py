@@ -47,7 +47,7 @@ from scenarios.cli.live.options import (
 )
 from scenarios.cli.options import ENDPOINT, EndpointOption, RiskOption, ScenarioArg, check_name, number
 from scenarios.cli.signals import until_stopped
-from scenarios.cli.terminal import progress_bar
+from scenarios.cli.terminal import echo, progress_bar
 from scenarios.load import load
 from scenarios.policy_loader import scope_of
 from scenarios.progress import Progress
@@ -119,7 +119,7 @@ def arm_command(
         node = make_node(
             link, book, arm, chosen, speed=speed, rate_hz=rate_hz, capacity=capacity, work_source=work_source
         )
-        typer.echo(f"ready {name} {endpoint} {os.getpid()}")
+        echo(f"ready {name} {endpoint} {os.getpid()}")
         if policy and consensus.serve_until_done(node, stop):
             return
         while not stop.is_set():

@@ -14,7 +14,7 @@ from fleet.errors import BusError, FleetError
 from fleet.job import BOUNDS, DWELL_S
 from scenarios.cli.live.submit import JOBS_HELP, explain, read_jobs
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, number, the_fleet
-from scenarios.cli.terminal import out_console, say
+from scenarios.cli.terminal import echo, out_console, say
 
 REPLY_S = 5.0
 """Real seconds to wait for arms: planning a new motion takes a while."""
@@ -61,7 +61,7 @@ def ask_command(
     if not quotes and not answers.refused:
         raise BusError(f"No arm of fleet '{name}' replied. Is `thermofleet arm` running?")
     if as_json:
-        typer.echo(msgspec.json.format(msgspec.json.encode(list(quotes.values())), indent=1).decode())
+        echo(msgspec.json.format(msgspec.json.encode(list(quotes.values())), indent=1).decode())
     else:
         out_console.print(quote_table(jobs, quotes))
     for reason in answers.refused.values():

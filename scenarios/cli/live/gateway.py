@@ -20,7 +20,7 @@ from fleet.bus.client.client import BusClient
 from fleet.errors import FleetError
 from fleet.live.monitor.async_bridge import AsyncBridge
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, number, the_fleet
-from scenarios.cli.terminal import Interrupted
+from scenarios.cli.terminal import Interrupted, echo
 from scenarios.live.http_access import MIN_TOKEN, ROLES, Role, check_token, read_tokens
 from scenarios.live.http_app import STUCK_S, Readers, application
 
@@ -176,6 +176,6 @@ async def serve(endpoint: str, fleet: str, host: str, port: int, tokens: Mapping
                 asyncio.get_running_loop().add_signal_handler(number, stop, number)
             address, bound_port, *_ = bound.getsockname()
             shown = f"[{address}]" if ":" in address else address
-            typer.echo(f"ready gateway http://{shown}:{bound_port}/v4 {os.getpid()}")
+            echo(f"ready gateway http://{shown}:{bound_port}/v4 {os.getpid()}")
             await server.serve(sockets=[bound])
     return received[0]

@@ -15,7 +15,7 @@ from fleet.live.monitor.listener import FleetListener
 from fleet.live.monitor.snapshot import describe_event, describe_status
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
 from scenarios.cli.signals import until_stopped
-from scenarios.cli.terminal import out_console
+from scenarios.cli.terminal import echo, out_console
 from scenarios.live.watch_screen import arm_line, format_time, jobs_line, screen, space_line
 
 FRAME_S, LINE_S, SNAPSHOT_S = 0.25, 5.0, 1.0
@@ -41,7 +41,7 @@ def watch_command(
         listener = FleetListener(link, on_message=on_message, on_presence=on_presence)
         if as_json:
             listener.serve(time.monotonic() + SNAPSHOT_S)
-            typer.echo(msgspec.json.encode(listener.view.snapshot(time.monotonic())).decode())
+            echo(msgspec.json.encode(listener.view.snapshot(time.monotonic())).decode())
         elif out_console.is_terminal:
             draw(listener, news, stop.is_set)
         else:
@@ -64,14 +64,14 @@ def print_lines(listener: FleetListener, news: deque[str], stopped: Callable[[],
     while not stopped():
         listener.serve(time.monotonic() + FRAME_S)
         while news:
-            typer.echo(news.popleft())
+            echo(news.popleft())
         if time.monotonic() >= due_s:
             due_s = time.monotonic() + LINE_S
             fleet = listener.view.snapshot(time.monotonic(), jobs=0)
             for arm in fleet.arms:
-                typer.echo(arm_line(arm))
-            typer.echo(jobs_line(fleet).plain)
-            typer.echo(space_line(fleet).plain)
+                echo(arm_line(arm))
+            echo(jobs_line(fleet).plain)
+            echo(space_line(fleet).plain)
 
 
 def describe(name: str, message: msgspec.Struct) -> str:
