@@ -13,7 +13,7 @@ PINNED := $(sort $(basename $(notdir $(wildcard constraints/*.txt))))
 ADAPTERS := $(filter-out bench,$(PINNED))
 ADAPTER_TESTS := $(ADAPTERS:%=test-adapter-%)
 
-.PHONY: demo test test-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos clean install
+.PHONY: demo test test-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos fuzz clean install
 
 demo: $(STAMP)
 	@$(BIN)/thermofleet demo --out $(OUT)/demo
@@ -51,6 +51,15 @@ lint: $(STAMP)
 
 chaos: $(STAMP)
 	@$(BIN)/python benchmarks/chaos
+
+# Coverage-guided fuzzing of every parser. `make fuzz INPUTS=10000000` takes longer, `TARGETS=journal` one parser.
+INPUTS ?= 1000000
+fuzz: $(VENV)/.atheris
+	@$(BIN)/python benchmarks/fuzz --inputs $(INPUTS) $(TARGETS)
+
+$(VENV)/.atheris: $(STAMP)
+	@$(PIP) atheris==3.0.0
+	@touch $@
 
 bench: $(STAMP)
 	@for b in benchmarks/bench_*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done

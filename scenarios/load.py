@@ -40,23 +40,33 @@ def load(name_or_path: str | Path) -> Scenario:
     try:
         if path.stat().st_size > MOST_BYTES:
             raise ScenarioError(f"{path.name}: a scenario has at most {MOST_BYTES} bytes (got {path.stat().st_size}).")
-        raw = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        content = path.read_bytes()
     except (FileNotFoundError, NotADirectoryError, IsADirectoryError) as error:
         if path.suffix == ".toml":
             raise ScenarioError(f"There is no scenario file '{path}'.") from error
         raise ScenarioError(f"No scenario '{name_or_path}'{nearest(str(name_or_path), known)}") from error
     except OSError as error:
         raise ScenarioError(f"Cannot read '{path}': {error.strerror}.") from error
-    except UnicodeDecodeError as error:
-        raise ScenarioError(f"{path.name}: not a UTF-8 text file.") from error
+    return parse_toml(content, path)
+
+
+def parse_toml(content: bytes, path: Path) -> Scenario:
+    """The scenario in the content of a file; `path` names it in errors and locates the files it refers to.
+
+    Raises:
+        ScenarioError: as `load`.
+    """
+    try:
+        try:
+            raw = tomllib.loads(content.decode("utf-8-sig"))
+        except UnicodeDecodeError as error:
+            raise ScenarioError(f"{path.name}: not a UTF-8 text file.") from error
+        except ValueError as error:  # also an integer with too many digits
+            reason = str(error).partition(";")[0]
+            raise ScenarioError(f"{path.name}: not valid TOML: {printable(reason)}.") from error
+        return parse_scenario({"name": path.stem, **raw}, path)
     except RecursionError as error:
-        raise ScenarioError(
-            f"{path.name}: its lists or tables are nested too deeply; a scenario needs 4 levels."
-        ) from error
-    except ValueError as error:  # also an integer with too many digits
-        reason = str(error).partition(";")[0]
-        raise ScenarioError(f"{path.name}: not valid TOML: {printable(reason)}.") from error
-    return parse_scenario({"name": path.stem, **raw}, path)
+        raise ScenarioError(f"{path.name}: its tables are nested too deeply; a scenario needs 4 levels.") from error
 
 
 def parse_scenario(raw: Mapping[str, object], path: Path) -> Scenario:
