@@ -235,11 +235,12 @@ def checkpoint_seeds() -> Iterator[bytes]:
     one = Parameter(name="c", joint=1, value=1.0, low=0.5, high=2.0, prior=1.0, prior_sd=0.2, sd=0.1)
     rest = {"ambient_c": 25.0, "ambient_sd_k": 1.0, "source": "torque", "memory_s": (1.0,) * 7, "seconds": 9.0}
     model = nominal_heat_model()
-    for *ends, value in list(model.network.edges(data="conductance_w_per_k")):
-        model.network.edges[ends]["conductance_w_per_k"] = float(value)
-    for node, value in model.network.nodes(data="capacity_j_per_k"):
-        if value is not None:
-            model.network.nodes[node]["capacity_j_per_k"] = float(value)
+    of_all = [
+        *(values for _, _, values in model.network.edges(data=True)),
+        *dict(model.network.nodes(data=True)).values(),
+    ]
+    for values in of_all:
+        values.update({name: float(value) for name, value in values.items()})
     made = Identified(arm="a", heat_model=model, parameters=(one,), rms_k={"x": (1.0,) * 7}, data_hash="h", **rest)
     thermal.save(made, folder() / "identified")
     yield b"\0" + (folder() / "identified" / thermal.CARD).read_bytes()

@@ -6,6 +6,7 @@ import time
 import zlib
 from collections import defaultdict
 from contextlib import ExitStack, suppress
+from copy import deepcopy
 from pathlib import Path
 
 import msgspec
@@ -167,7 +168,7 @@ def odd(draw, message):
             if isinstance(inner[place], dict | list) and inner[place] and draw(st.booleans()):
                 inner = inner[place]
                 continue
-            inner[place] = draw(ODD)
+            inner[place] = deepcopy(draw(ODD))
             break
     return json.dumps(content).encode()
 
