@@ -41,7 +41,8 @@ CARRY = JobSpec("poison", "pick_place", ("rack_left", "tray_left"), payload_kg=0
 
 def poison(fleet: Fleet) -> float:
     """Ask for quotes of long and odd jobs, then send odd numbers in every field; note silence and memory."""
-    _ask(fleet, *(msgspec.structs.replace(CARRY, dwell_s=179.0, payload_kg=load) for load in (0.31, 0.32)))
+    for job in (HOLD, CARRY):
+        _ask(fleet, *(msgspec.structs.replace(job, dwell_s=179.0, payload_kg=load) for load in (0.31, 0.32)))
     _listen(fleet, 8.0, {})  # the planner and the twin are loaded
     before, silent_s = _memory_mb(fleet), dict.fromkeys(fleet.arms, 0.0)
     for long in (1800.0, 3600.0):

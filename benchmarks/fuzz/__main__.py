@@ -56,8 +56,8 @@ def fuzz(name: str, inputs: int, seed: int) -> None:
         from targets import TARGETS
     target = TARGETS[name]
     corpus, cases = CORPUS / name, CASES / name
-    corpus.mkdir(parents=True, exist_ok=True)
-    cases.mkdir(parents=True, exist_ok=True)
+    for place in (corpus, cases):
+        place.mkdir(parents=True, exist_ok=True)
     for number, data in enumerate(target.seeds()):
         target.parse(data)
         (corpus / f"seed-{number}").write_bytes(data)

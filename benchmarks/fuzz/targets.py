@@ -48,7 +48,8 @@ class Target(NamedTuple):
 @cache
 def folder() -> Path:
     """Folder of the files that parsers read; removed at the end of the process."""
-    holder = tempfile.TemporaryDirectory(prefix="fuzz")
+    memory = Path("/dev/shm")
+    holder = tempfile.TemporaryDirectory(prefix="fuzz", dir=memory if memory.is_dir() else None)
     folder.holder = holder  # type: ignore[attr-defined]
     return Path(holder.name)
 
@@ -267,12 +268,12 @@ def setting_seeds() -> Iterator[bytes]:
 
 
 TARGETS = {
-    "scenario": Target(scenario, scenario_seeds, 0.08),
-    "message": Target(message, message_seeds, 0.5),
-    "key": Target(key, key_seeds, 0.12),
-    "jobs": Target(jobs, job_seeds, 0.1),
-    "journal": Target(journal, journal_seeds, 0.08),
-    "log": Target(log, log_seeds, 0.04),
-    "checkpoint": Target(checkpoint, checkpoint_seeds, 0.02),
-    "settings": Target(settings, setting_seeds, 0.06),
+    "scenario": Target(scenario, scenario_seeds, 0.1),
+    "message": Target(message, message_seeds, 0.6),
+    "key": Target(key, key_seeds, 0.15),
+    "jobs": Target(jobs, job_seeds, 0.05),
+    "journal": Target(journal, journal_seeds, 0.04),
+    "log": Target(log, log_seeds, 0.02),
+    "checkpoint": Target(checkpoint, checkpoint_seeds, 0.01),
+    "settings": Target(settings, setting_seeds, 0.03),
 }
