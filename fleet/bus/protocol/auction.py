@@ -27,6 +27,8 @@ MIN_SPEED, MAX_SPEED = 0.001, 10_000.0
 """Of a fleet, in fleet seconds per real second."""
 LEASE_S = 6.0
 """Real seconds that an arm may work on a job without renewing its lease."""
+NOT_PLANNED = "not planned yet; ask again"
+"""Reason of an estimate that the arm will have soon."""
 MOST_PLANS = 8
 """Of one arm for one job."""
 MOST_QUOTED = 64
@@ -89,7 +91,7 @@ class PlanQuote(msgspec.Struct, frozen=True, omit_defaults=True):
     joint_difficulty: tuple[Number, ...] | None = None
     """d_k, [joint]."""
     difficulty: Number | None = None
-    """Sum of `joint_difficulty`."""
+    """d = Σ_k w_k d_k, with the weights of the arm's twin (`fleet.difficulty`)."""
     duration_s: Number | None = None
     """Duration of the job alone."""
     finish_in_s: Number | None = None

@@ -16,8 +16,9 @@ from fleet.telemetry import Mode
 
 VERSION = 4
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=512)]
-Count = Annotated[int, msgspec.Meta(ge=0, le=10**15)]
-Number = Annotated[float, msgspec.Meta(ge=-1e12, le=1e12)]
+LEAST, MOST, MOST_COUNT = -1e12, 1e12, 10**15
+Count = Annotated[int, msgspec.Meta(ge=0, le=MOST_COUNT)]
+Number = Annotated[float, msgspec.Meta(ge=LEAST, le=MOST)]
 """Any quantity without bounds of its own: no sum or product of a few of them overflows."""
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Celsius = Annotated[float, msgspec.Meta(ge=-273.15, le=1000)]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleet.bus.protocol.auction import JobEstimate, JobSpec, PlanQuote
+from fleet.bus.protocol.auction import NOT_PLANNED, JobEstimate, JobSpec, PlanQuote
 from fleet.difficulty import Difficulty, DifficultyModel
 from fleet.errors import InfeasibleJob, printable
 from fleet.job import LONGEST_JOB_S, Job, Place, Work
@@ -33,7 +33,6 @@ MAX_REASON = 300
 STEPS = 24
 """Time steps of a job when its temperatures are predicted."""
 NO_CYCLES: Mapping[str, int] = {}
-NOT_PLANNED = "not planned yet; ask again"
 
 
 class NominalPeaks:
