@@ -49,7 +49,8 @@ class PlanningThread:
             with self._changed:
                 self._changed.wait(min(until_s - now_s, POLL_S))
             step()
-        self._waits_from_s = max(self._waits_from_s, 2.0 * time.monotonic() - start_s)
+        if until_s > start_s:
+            self._waits_from_s = 2.0 * time.monotonic() - start_s
 
     def _request(self, jobs: Iterable[Key], *, dry_run: bool) -> None:
         with self._changed:
