@@ -3,11 +3,13 @@
 import textwrap
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import typer
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.table import Table
+from rich.text import Text
 
 from fleet.errors import FleetError, visible
 from fleet.files import cache_folder
@@ -21,6 +23,10 @@ class SafeConsole(Console):
         """Return segments whose text is visible; control segments are rich's own."""
         for segment in super().render(renderable, options):
             yield segment if segment.control else Segment(visible(segment.text, "\n"), segment.style)
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Return visible text, so that its width is known (Any: options of rich, passed on)."""
+        return super().render_str(visible(text, "\n"), **options)
 
 
 def echo(text: str, *, nl: bool = True) -> None:
