@@ -20,7 +20,6 @@ from fleet.bus.client.replies import Replies
 from fleet.bus.protocol.auction import (
     Ack,
     Award,
-    ClearRequest,
     Clock,
     ClockRequest,
     JobSpec,
@@ -36,6 +35,7 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.examples import EXAMPLES
 from fleet.bus.protocol.messages import MalformedMessage, State, decode, encode
+from fleet.bus.protocol.operator import ClearRequest
 from fleet.errors import Refused
 from fleet.job import Place
 from fleet.live.arm.award_executor import AwardExecutor
