@@ -60,6 +60,7 @@ COMMANDS = {
     "gateway": LazyCommand(_LIVE, "live.gateway:gateway_command", "Serve a fleet over HTTP."),
     "record": LazyCommand(_LIVE, "live.record:record_command", "Record a fleet to Parquet."),
     "replay": LazyCommand(_LIVE, "live.record:replay_command", "Replay a run or a recording on the bus."),
+    "report": LazyCommand(_LIVE, "live.record:report_command", "Write the report of a recording."),
     "ros2": LazyCommand(_LIVE, "ros2:ros2_app", "Connect a fleet and ROS 2."),
     "keys": LazyCommand(_LIVE, "keys:keys_command", "Make and show TLS keys and certificates."),
     "twin": LazyCommand(_TWIN, "twin:twin_app", "Train, score and use the digital twin of an arm."),

@@ -1,4 +1,4 @@
-"""`thermofleet record` and `thermofleet replay`: from the bus to Parquet, and from Parquet to the bus."""
+"""`thermofleet record`, `replay` and `report`: from the bus to Parquet, back to the bus, and to a page."""
 
 import fcntl
 import logging
@@ -16,6 +16,7 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, Result
 from fleet.bus.protocol.messages import State
 from fleet.errors import FleetError
+from fleet.files import atomic_path
 from scenarios.cli.live.options import MAX_SPEED
 from scenarios.cli.options import ENDPOINT, EndpointOption, check_name, number
 from scenarios.cli.signals import until_stopped
@@ -23,6 +24,7 @@ from scenarios.cli.terminal import out_console, say
 from scenarios.live.gap_fetcher import GapFetcher
 from scenarios.live.recorder import MAX_ROWS, Recorder
 from scenarios.live.replayer import Replay
+from scenarios.result_folder import disk_errors
 
 BACKLOG = 200_000
 """Messages that may wait: joining a fleet of a hundred arms brings a hundred thousand at once."""
@@ -132,3 +134,17 @@ def replay_command(
         count = replay.play(link, speed=speed, stopped=stop.is_set)
     say(f"Published {count} of {len(replay)} messages.", out_console)
     stop.leave("The replay was interrupted.")
+
+
+def report_command(
+    recording: Annotated[Path, typer.Argument(help="Folder of a recording, finished or not.")],
+    out: Annotated[Path | None, typer.Option(help="The HTML file. Default: report.html beside the recording.")] = None,
+) -> None:
+    """Write the report of a live recording, as `run` writes one of a simulated shift."""
+    from scenarios.live.recording_report import recording_html
+
+    path = out or recording.parent / "report.html"
+    html = recording_html(recording)
+    with disk_errors(path), atomic_path(path) as draft:
+        draft.write_text(html, encoding="utf-8")
+    say(f"Open {path} in a browser.", out_console)
