@@ -57,6 +57,7 @@ bench: $(STAMP)
 
 EXTRA := [cli]
 .venv-adapters/bench/.installed: EXTRA := [cli,learn]
+.venv-adapters/ros2/.installed: EXTRA := [cli,ros2]
 bench-env: .venv-adapters/bench/.installed
 	@.venv-adapters/bench/bin/python benchmarks/env.py
 
