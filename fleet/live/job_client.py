@@ -51,15 +51,9 @@ class JobClient:
         self.statuses.setdefault(spec.name, JobStatus(spec.name, "waiting"))
         self._due_s = -math.inf
 
-    def cancel(self, job: str) -> str:
-        """Ask the fleet to cancel a job; return why that is impossible, or "".
-
-        A job that was not submitted yet is cancelled here.
-        """
-        if self._unsubmitted.pop(job, None) is not None:
-            self._set(JobStatus(job, "given_up", reason="cancelled before it was submitted"))
-            return ""
-        return "This version of the bus has no message that cancels a submitted job."
+    def cancel(self, _job: str) -> str:
+        """Ask the fleet to cancel a job; return why that is impossible, or "". The job then ends as any other."""
+        return "This version of the bus has no message that cancels a job."
 
     def pause(self, _paused: bool) -> str:
         """Ask the fleet to begin no further cycle, or to go on; return why that is impossible, or ""."""
