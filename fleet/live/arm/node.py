@@ -20,7 +20,7 @@ from fleet.bus.protocol.messages import DifficultyScores, Info, State
 from fleet.bus.protocol.registry import STATE_HZ
 from fleet.difficulty import known_temperatures
 from fleet.errors import Refused
-from fleet.events import EVENTS_PER_BOOT, Event
+from fleet.events import Event
 from fleet.live.arm.auctioneer_client import AuctioneerClient, RateLimitedWarnings, WorkSource
 from fleet.live.arm.award_executor import AwardExecutor
 from fleet.live.arm.body import Body
@@ -38,6 +38,8 @@ MAX_UNPLANNED = 256
 """Jobs that wait to be planned."""
 WRITE_RETRY_S = 1.0
 """Real seconds between two attempts to write records for which the disk had no space."""
+EVENTS_PER_BOOT = 1_000_000_000
+"""The number of an event is the boot number times this, plus a count."""
 
 
 @dataclass(frozen=True, kw_only=True)
