@@ -17,7 +17,7 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 MAX_ITEMS = 4096
 """Largest length of a list in a message that is read."""
-SPARE_BYTES, _SPARE_STEP = 32, 4
+SPARE_BYTES, _SPARE_STEP = 16, 4
 """Bytes that may follow a message; rosbags ignores up to 3 of them."""
 _NS = 1_000_000_000
 _SECONDS = range(-(2**31), 2**31)
