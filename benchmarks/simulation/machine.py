@@ -65,7 +65,8 @@ class SimulatedEstimator:
     def __init__(self, arm: str, first: str) -> None:
         """Prepare; the arm `first` can do every job."""
         self._arm, self._first = arm, first
-        self._known: dict[tuple[str, str], tuple[Any, ...]] = {}
+        self._known: dict[str, tuple[Any, ...]] = {}
+        self._quoted: dict[str, JobEstimate] = {}
 
     def is_prepared(self, job: JobSpec, done: int = 0) -> bool:
         return True
@@ -77,15 +78,14 @@ class SimulatedEstimator:
         return job
 
     def plans(self, job: JobSpec) -> tuple[Any, ...]:
-        key = job.name, job.places[0]
-        if key not in self._known:
+        if job.name not in self._known:
             rng = Random(f"{self._arm} {job.name}")
             count = rng.choice([1, 1, 2]) if self._arm == self._first or rng.random() > 0.15 else 0
             scored = [
                 SimpleNamespace(plan=plan_of(self._arm, job, n), difficulty=None, d=rng.random()) for n in range(count)
             ]
-            self._known[key] = tuple(scored)
-        return self._known[key]
+            self._known[job.name] = tuple(scored)
+        return self._known[job.name]
 
     def space_of(self, job: JobSpec, plan: int) -> str | None:
         plans = self.plans(job)
@@ -94,16 +94,16 @@ class SimulatedEstimator:
     def estimate(
         self, jobs: tuple[JobSpec, ...], known_c: Any, busy_s: float, cycles: Mapping[str, int]
     ) -> tuple[JobEstimate, ...]:
-        return tuple(
-            JobEstimate(
-                job.name,
-                tuple(
-                    PlanQuote(plan=n, difficulty=scored.d, finish_in_s=1.0, space=scored.plan.space)
-                    for n, scored in enumerate(self.plans(job))
-                ),
+        return tuple(map(self._estimate, jobs))
+
+    def _estimate(self, job: JobSpec) -> JobEstimate:
+        if job.name not in self._quoted:
+            plans = (
+                PlanQuote(plan=n, difficulty=scored.d, finish_in_s=1.0, space=scored.plan.space)
+                for n, scored in enumerate(self.plans(job))
             )
-            for job in jobs
-        )
+            self._quoted[job.name] = JobEstimate(job.name, tuple(plans))
+        return self._quoted[job.name]
 
 
 class SimulatedArm:

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from bus import SimulatedClient
-from disk import DiskCalls, DiskPath
+from disk import Disk, DiskCalls, DiskPath
 from machine import Deeds, SimulatedArm, SimulatedEstimator
 from world import Process, World
 
@@ -206,7 +206,7 @@ class Watch:
     def __init__(self, world: World, names: tuple[str, ...]) -> None:
         self._world, self._names = world, names
         self._supervisor: Supervisor | None = None
-        self.log = world.processes[names[0]].disk
+        self.log = Disk(world.rng)
         self.start()
         self._poll()
 

@@ -21,7 +21,12 @@ from fleet.live.auction.round import Assignment, Timing
 from fleet.live.consensus.participant import Membership
 from fleet.live.space import ANYWHERE, Excludes
 
-SPEEDS = (1.0, 10.0, 60.0, 120.0)
+SPEEDS = (1.0, 10.0, 60.0, 60.0, 120.0, 120.0)
+"""Fleet seconds per real second."""
+MEAN_JOB_S = 60.0
+"""Mean duration of a job, fleet s."""
+MOST_JOBS = 120
+"""In one shift, about."""
 CHECK_S = 2.0
 """True seconds between two checks whether all is settled."""
 SETTLE_S = 240.0
@@ -79,7 +84,8 @@ class Shift:
         self.speed = rng.choice(SPEEDS)
         self.alone = rng.random() < 0.3 and len(self.arms) > 2
         """Without an auctioneer."""
-        self.faulty_s = rng.uniform(60.0, 900.0)
+        self.job_gap_s = rng.choice([1.0, 2.0, 5.0, 20.0]) * MEAN_JOB_S / self.speed / len(self.arms)
+        self.faulty_s = max(60.0, min(rng.uniform(60.0, 900.0), MOST_JOBS * self.job_gap_s))
         self.fault_gap_s = rng.choice([8.0, 20.0, 60.0])
         self.excludes = random_conflicts(seed, rng.choice([0.0, 0.5, 0.5, 1.0]))
         self.begun: dict[str, int] = {}
@@ -89,11 +95,11 @@ class Shift:
         self.unsure: set[str] = set()
         self.work_s = 0.0
         self.jobs: list[JobSpec] = []
-        timing = Timing(lease_s=rng.choice([3.0, 6.0]))
+        timing = Timing(lease_s=rng.choice([3.0, 6.0]), max_jobs=8)
         membership = None
         if self.alone:
             live = LiveFleet(arms=self.arms, warning_c=80.0)
-            membership = Membership(fleet=live, choose=first_legal, excludes=self.excludes, timing=timing)
+            membership = Membership(fleet=live, choose=first_legal, slots=4, excludes=self.excludes, timing=timing)
         world.bus = Bus(world)
         rate_hz, capacity = rng.choice([0.5, 1.0]), rng.choice([1, 1, 2])
         self.builders = {
@@ -119,10 +125,10 @@ class Shift:
             world.log("shift", f"{len(self.arms)} arms, speed {self.speed:g}, {'alone' if self.alone else AUCTIONEER}")
             world.processes[CLIENT].start()
             self.watch = Watch(world, self.names)
-            at_s, load_s = 3.0, rng.choice([3.0, 15.0, 60.0])
+            at_s = 3.0
             while at_s < self.faulty_s:
                 world.at(at_s, self._submit)
-                at_s += rng.expovariate(1.0 / load_s)
+                at_s += rng.expovariate(1.0 / self.job_gap_s)
             at_s = rng.expovariate(1.0 / self.fault_gap_s)
             while at_s < self.faulty_s:
                 world.at(at_s, self._fault)
