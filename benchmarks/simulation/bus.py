@@ -303,13 +303,13 @@ class _Query:
         if reply is not None:
             reply = client._checked(reply)
         if client.world.reach(client.process, self.client.process):
-            client.world.send(client.process, self.client.process, self.take, own_key, reply, refusal)
+            client.world.send(client.process, self.client.process, self.take, client.process.name, own_key, reply, refusal)
 
-    def take(self, key: str, reply: msgspec.Struct | None, refusal: str) -> None:
+    def take(self, replier: str, key: str, reply: msgspec.Struct | None, refusal: str) -> None:
         """Take a reply, as the querying process."""
-        if self.over or key in self.replied or not self.client.open_:
+        if self.over or replier in self.replied or not self.client.open_:
             return
-        self.replied.add(key)
+        self.replied.add(replier)
         self.left -= 1
         if reply is not None:
             self.replies.messages[key] = reply

@@ -239,7 +239,9 @@ class World:
         true_s, _, call, arguments = heapq.heappop(self._heap)
         self.now_s = max(self.now_s, true_s)
         self.events += 1
+        running, self.running = self.running, None  # another process may wait inside a call
         call(*arguments)
+        self.running = running
 
     def run(self, until_s: float, done: Callable[[], bool] = lambda: False) -> bool:
         """Handle events up to a true time; return whether `done` came true before."""
@@ -253,11 +255,7 @@ class World:
     def wait(self, process: Process, until_s: float, done: Callable[[], bool] = lambda: False) -> bool:
         """Let others run while a process waits inside a call, until `until_s` on its clock."""
         boot, deadline_s = process.boot, (until_s - process.offset_s) / process.rate
-        running = self.running
-        try:
-            self.run(deadline_s, lambda: done() or process.boot != boot or not process.up)
-        finally:
-            self.running = running
+        self.run(deadline_s, lambda: done() or process.boot != boot or not process.up)
         if process.boot != boot or not process.up:
             raise Killed
         return done()
