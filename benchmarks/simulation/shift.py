@@ -21,11 +21,11 @@ from fleet.live.auction.round import Assignment, Timing
 from fleet.live.consensus.participant import Membership
 from fleet.live.space import ANYWHERE, Excludes
 
-SPEEDS = (1.0, 10.0, 60.0, 60.0, 120.0, 120.0)
+SPEEDS = (1.0, 10.0, 60.0, 120.0, 120.0, 240.0)
 """Fleet seconds per real second."""
-MEAN_JOB_S = 60.0
+MEAN_JOB_S = 150.0
 """Mean duration of a job, fleet s."""
-MOST_JOBS = 120
+MOST_JOBS = 60
 """In one shift, about."""
 CHECK_S = 2.0
 """True seconds between two checks whether all is settled."""
@@ -82,9 +82,9 @@ class Shift:
         rng = self.rng = world.rng
         self.arms = tuple(f"arm_{i}" for i in range(rng.choice([2, 3, 3, 4])))
         self.speed = rng.choice(SPEEDS)
-        self.alone = rng.random() < 0.3 and len(self.arms) > 2
+        self.alone = rng.random() < 0.4 and len(self.arms) > 2
         """Without an auctioneer."""
-        self.job_gap_s = rng.choice([1.0, 2.0, 5.0, 20.0]) * MEAN_JOB_S / self.speed / len(self.arms)
+        self.job_gap_s = rng.choice([0.8, 2.0, 5.0, 20.0]) * MEAN_JOB_S / self.speed / len(self.arms)
         self.faulty_s = max(60.0, min(rng.uniform(60.0, 900.0), MOST_JOBS * self.job_gap_s))
         self.fault_gap_s = rng.choice([8.0, 20.0, 60.0])
         self.excludes = random_conflicts(seed, rng.choice([0.0, 0.5, 0.5, 1.0]))
@@ -154,7 +154,7 @@ class Shift:
             due = {"due_s": self.node(AUCTIONEER).time_s + rng.uniform(0.0, 30.0) * self.speed, "expires": True}
         spec = JobSpec(
             name=f"job_{len(self.jobs)}", kind="hold", places=(rng.choice("uvwxyz"),), dwell_s=rng.choice([0.5, 5.0, 20.0]),
-            repetitions=rng.choice([1, 1, 2, 3, 8]), after=after, **due,
+            repetitions=rng.choice([1, 1, 2, 4, 12, 40]), after=after, **due,
         )
         self.jobs.append(spec)
         self.work_s += (20.0 + spec.repetitions * (spec.dwell_s + 10.0)) / self.speed

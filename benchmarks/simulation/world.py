@@ -198,7 +198,7 @@ class World:
         self.bus: Any = None
         self.base_s = 10.0 ** self.rng.uniform(-3.5, -1.5)
         """Mean delay of a message, s."""
-        self.late_s = self.rng.choice([0.05, 0.3, 0.6, 1.0])
+        self.late_s = self.rng.choice([0.1, 0.4, 0.8])
         """Largest delay of a timer: of a busy machine."""
         self.loss = self.doubling = 0.0
         self.slow = 1.0
