@@ -14,21 +14,17 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import UnionType
-from typing import Any, Generic, Self, TypeVar, cast
+from typing import Generic, Self, TypeVar, cast
 
 import msgspec
 
 from fleet.errors import JournalError, JournalFull
 from fleet.files import atomic_path
-from fleet.live.journal_records import ClockTick
 
 _LOG = logging.getLogger(__name__)
 
 COMPACT_FACTOR, COMPACT_BYTES = 4, 1_000_000
 """A journal needs compaction once it has grown by this factor since the last one, and to this size."""
-
-TICK_S = 2.0
-"""Real seconds between two records of the fleet's time."""
 
 Record = TypeVar("Record", bound=msgspec.Struct)
 
@@ -283,34 +279,3 @@ class Journal(Generic[Record]):
             self._sync(folder)
         finally:
             os.close(folder)
-
-
-class TimeRecorder:
-    """Records fleet time, so that it continues after a restart and never runs backwards."""
-
-    def __init__(self, journal: Journal[Any], state: TimedState[Any], real_s: float) -> None:
-        """Compact the journal, which gave this state."""
-        self._journal, self._state, self._recorded_s = journal, state, real_s
-        journal.compact(*state.compact())
-
-    def start_s(self, speed: float) -> float:
-        """Return the fleet time to start with: after a restart, one that was certainly not read before."""
-        return self._state.time_s + TICK_S * speed if self._state.time_s else 0.0
-
-    def step(self, real_s: float, time_s: float) -> None:
-        """Record the fleet time every `TICK_S`, and compact the journal when it has grown.
-
-        Raises:
-            JournalError: the journal cannot be relied on any more.
-        """
-        if real_s < self._recorded_s + TICK_S:
-            return
-        self._recorded_s = real_s
-        try:
-            self._journal.append(ClockTick(time_s))
-        except JournalFull as error:
-            _LOG.error("Could not record the fleet's time: %s", error)
-        else:
-            self._state.apply(ClockTick(time_s))
-        if self._journal.needs_compaction:
-            self._journal.compact(*self._state.compact())

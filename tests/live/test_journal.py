@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 
 from fleet.errors import FleetError, JournalError, JournalFull
 from fleet.live import journal
-from fleet.live.consensus.granter import Register
 from fleet.live.consensus.records import GrantRecord
-from fleet.live.journal import Journal, TimeRecorder
+from fleet.live.consensus.register import Register
+from fleet.live.journal import Journal
+from fleet.live.journal_upkeep import TimeRecorder
 
 ROOT = Path(__file__).parents[2]
 

@@ -13,16 +13,17 @@ import typer
 from fleet.bus.client.client import BusClient
 from fleet.bus.client.discover import other_versions
 from fleet.bus.protocol.auction import JobSpec, JobStatus, Submission
-from fleet.errors import JournalFull
+from fleet.errors import Refused
 from fleet.job import Job
-from fleet.live.auction.ledger import AuctionRecord
 from fleet.live.auction.node import AuctionNode
+from fleet.live.auction.records import AuctionRecord
 from fleet.live.auction.round import Timing
 from fleet.live.journal import Journal
 from scenarios.cli.live.journals import folder_of, refuse_other_way
 from scenarios.cli.live.options import (
     JobsOption,
     JournalOption,
+    NewEpochOption,
     ScenarioFleetOption,
     SeedOption,
     SpeedOption,
@@ -56,6 +57,7 @@ def auction_command(
     seed: SeedOption = 0,
     endpoint: EndpointOption = ENDPOINT,
     fleet: ScenarioFleetOption = "",
+    new_epoch: NewEpochOption = False,
 ) -> None:
     """Auction jobs to the arms of a fleet, keep its time, and record awards in a journal."""
     chosen = load(scenario)
@@ -67,7 +69,7 @@ def auction_command(
         excludes = cell_space(chosen, progress=progress)
     with (
         until_stopped() as stop,
-        BusClient(endpoint, fleet) as link,
+        BusClient(endpoint, fleet, stopped=stop.is_set) as link,
         Journal[AuctionRecord](folder / f"{name}.journal", AuctionRecord) as book,
     ):
         places = frozenset(place.name for place in chosen.places)
@@ -82,6 +84,7 @@ def auction_command(
             timing=timing,
             arms=tuple(arm.name for arm in chosen.arms),
             excludes=excludes,
+            new_epoch=new_epoch,
         )
         for sentence in other_versions(endpoint, fleet):
             log.error("Refused: %s", sentence)
@@ -112,7 +115,7 @@ def submit_stream(node: AuctionNode, stream: Sequence[tuple[float, JobSpec]], ho
                     if not admission.accepted:
                         log.warning("'%s' was refused: %s", admission.job, admission.reason)
                 del left[: len(due)]
-            except JournalFull as error:
+            except Refused as error:
                 log.error("Could not submit the scenario's jobs; retrying: %s", error)
         over = node.time_s >= horizon_s and not node.auctioneer.ledger.ended
         if over:
