@@ -181,7 +181,7 @@ class DiskPath:
     def unlink(self, *, missing_ok: bool = False) -> None:
         self.disk.names.pop(self.name, None)
 
-    def open(self, mode: str, encoding: str = "") -> "_Log":
+    def open(self, mode: str, **options: Any) -> "_Log":
         return _Log(self.disk)
 
 
@@ -191,9 +191,10 @@ class _Log:
     def __init__(self, disk: Disk) -> None:
         self._disk = disk
 
-    def write(self, text: str) -> None:
+    def write(self, text: str | bytes) -> int:
         if self._disk.full:
             raise OSError(errno.ENOSPC, "No space left on device")
+        return len(text)
 
     def flush(self) -> None:
         """Do nothing."""

@@ -1,13 +1,12 @@
 """Faults of a simulated fleet, and their end."""
 
-import math
 from typing import TYPE_CHECKING, Any
 
-from participants import AUCTIONEER, CLIENT
+from participants import CLIENT
 from world import Process
 
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import Cleared, ClearRequest
+from fleet.bus.protocol.operator import Cleared, ClearRequest
 
 if TYPE_CHECKING:
     from shift import Shift
@@ -59,6 +58,12 @@ def fill_disk(shift: "Shift") -> None:
     disk = _one(shift).disk
     disk.full = True
     shift.world.after(shift.rng.uniform(0.5, 30.0), setattr, disk, "full", False)
+
+
+def fill_log_disk(shift: "Shift") -> None:
+    """Fill the disk of the logs for some time."""
+    shift.watch.log.full = True
+    shift.world.after(shift.rng.uniform(0.5, 30.0), setattr, shift.watch.log, "full", False)
 
 
 def break_disk(shift: "Shift") -> None:
@@ -161,7 +166,7 @@ def kill_supervisor(shift: "Shift") -> None:
 FAULTS = (
     *(kill, kill_at_work, lose_power, crash_at_write, crash_at_write, fill_disk, break_disk, stop, stop_at_work, cut),
     *(cut_off_at_work, cut_off_at_work, lose_router, lose_messages, lose_messages, overheat, break_machine, move_home),
-    kill_supervisor,
+    *(kill_supervisor, fill_log_disk),
 )
 
 
@@ -169,10 +174,9 @@ def heal(shift: "Shift") -> None:
     """End all faults; the network stays as slow as it is."""
     calm(shift)
     shift.world.split({})
+    shift.watch.log.full = False
     for process in shift.world.processes.values():
         process.disk.full, process.disk.broken, process.disk.crash_in, process.broken = False, 0, 0, False
         process._resume(process.boot)
     shift.world.log("shift", "heals")
 
-
-assert AUCTIONEER and math

@@ -3,6 +3,7 @@
 A patch replaces methods of the product's classes until the end of its `with` block. The simulation must find each one.
 """
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -15,8 +16,10 @@ from fleet.live.arm.award_executor import AwardExecutor
 from fleet.live.arm.journal_records import ArmHistory, AwardAccepted
 from fleet.live.auction import round as round_module
 from fleet.live.auction.auctioneer import Auctioneer
-from fleet.live.auction.ledger import Awarded, Ledger
+from fleet.live.auction.ledger import Ledger
+from fleet.live.auction.records import Awarded
 from fleet.live.auction.round import Timing
+from fleet.live.auction.writer import LedgerWriter
 from fleet.live.consensus.claimant import Claimant
 from fleet.live.consensus.granter import Granter
 from fleet.live.consensus.records import JobGranted
@@ -64,12 +67,7 @@ def _unwritten(kind: type) -> Callable[[Any], Any]:
 def _forgetful(start: Any) -> Any:
     """Start without leases."""
 
-    def patched(self: Any, *arguments: Any, **options: Any) -> None:
-        start(self, *arguments, **options)
-        for lease in self._leases.values():
-            lease.until_s = options["real_s"]
-
-    return patched
+    return lambda self, name, ledger, keep, counted_until_s: start(self, name, ledger, keep, -math.inf)
 
 
 def _forgetful_granter(start: Any) -> Any:
@@ -120,12 +118,11 @@ def _silent(report: Any) -> Any:
     """Send the receipt without a record."""
 
     def patched(self: Any, message: Any, real_s: float, time_s: float) -> Any:
-        keep, self._keep = self._keep, lambda *records: None
-        record, self._record = self._record, lambda *records: None
+        self._writer.record = lambda *records: None
         try:
             return report(self, message, real_s, time_s)
         finally:
-            self._keep, self._record = keep, record
+            del self._writer.record
 
     return patched
 
@@ -134,8 +131,8 @@ def _expires_all(expire: Any) -> Any:
     """Take a job back although its arm was permitted to commit."""
 
     def patched(self: Any, real_s: float, time_s: float) -> None:
-        for name in [name for name, lease in self._leases.items() if real_s >= lease.until_s]:
-            self._record(Closed(name, "dropped", 0, time_s, "mutation"))
+        for name in [name for name, lease in self._writer.leases.items() if real_s >= lease.until_s]:
+            self._writer.record(Closed(name, "dropped", 0, time_s, "mutation"))
 
     return patched
 
@@ -168,7 +165,7 @@ _mutation("grant-unwritten", "a grant is on disk before the reply", (Journal, "a
 _mutation("end-unwritten", "the end of a job is on disk before its report and receipt", (Journal, "append", _unwritten(Closed)))
 _mutation("no-fsync", "a record is written through", (Journal, "_write", lambda _: lambda self, file, line: journal_module.os.write(file, line) and None))
 _mutation("torn-line-read", "an unfinished last line is removed", (Journal, "_lines", _reads_torn_lines))
-_mutation("lease-forgotten", "after a restart open awards count as leased", (Auctioneer, "__init__", _forgetful))
+_mutation("lease-forgotten", "after a restart open awards count as leased", (LedgerWriter, "__init__", _forgetful))
 _mutation("grant-forgotten", "after a restart grants count as leased", (Granter, "__init__", _forgetful_granter))
 _mutation("lease-too-short", "the granting side counts leases longer", (Timing, "counted_lease_s", lambda _: property(lambda self: 0.5 * self.lease_s)))
 _mutation("lease-ignored", "an arm begins cycles under a lease only", (AwardExecutor, "allowed_cycles", lambda _: lambda self, now_s: self._current.award.job.repetitions - (not self._current.may_commit)))

@@ -8,6 +8,7 @@ import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,15 +24,17 @@ from fleet.live import journal as journal_module
 from fleet.live import supervisor as supervisor_module
 from fleet.live.arm import node as arm_module
 from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
-from fleet.live.arm.journal_records import ArmRecord
+from fleet.live.arm.auctioneer_client import AuctioneerClient
+from fleet.live.arm.journal_records import ArmHistory, ArmRecord
 from fleet.live.arm.node import ArmConfig, ArmNode
-from fleet.live.auction.ledger import AuctionRecord
 from fleet.live.auction.node import AuctionNode
+from fleet.live.auction.records import AuctionRecord
 from fleet.live.auction.round import Allocate, Timing
 from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
 from fleet.live.consensus.records import GrantRecord
 from fleet.live.journal import Journal
+from fleet.live.journal_upkeep import CompactingJournal
 from fleet.live.space import Excludes
 from fleet.live.supervisor import Part, Supervisor
 from scenarios.cli.live.arm import fleet_clock, restart_history
@@ -72,14 +75,18 @@ class ArmProcess:
         history = restart_history(journal, name, clock.now_s(process.real_s))
         self.unsure |= {report.job for _, report in history.reports.values() if report.unsure}
         config = ExecutorConfig(capacity=self._capacity)
-        executor = AwardExecutor(name, journal.append, history, nonce=f"{process.boot}", config=config)
+        kept = ArmHistory().replay(history.compact())
+        keep = CompactingJournal(journal, kept).append
+        executor = AwardExecutor(name, keep, history, nonce=f"{process.boot}", config=config)
         self._deeds.is_home(name)  # a person moves it home before it is started
         self.machine = SimulatedArm(name, self._deeds, clock.now_s(process.real_s))
         body: Any = self.machine
         estimator: Any = SimulatedEstimator(name, self._first)
         settings = ArmConfig(warning_c=80.0, rate_hz=self._rate_hz, boot=history.boot)
         if self._membership is None:
-            return ArmNode(link, body, executor, estimator, clock, settings)
+            return ArmNode(
+                link, body, executor, estimator, clock, settings, partial(AuctioneerClient, history=kept)
+            )
         grants, membership = _journal(process, "grants", GrantRecord), self._membership
         return ArmNode(
             link, body, executor, estimator, clock, settings,

@@ -220,8 +220,8 @@ class Shift:
 
     def _check_known(self) -> None:
         ledger = self.node(AUCTIONEER).auctioneer.ledger
-        if len(self.submitter.accepted) > len(ledger.jobs):
-            lost = sorted(self.submitter.accepted.keys() - ledger.jobs.keys())
+        if len(self.submitter.accepted) > len(ledger.jobs) + len(ledger.past):
+            lost = [name for name in self.submitter.accepted if name not in ledger.jobs and name not in ledger.past]
             raise Violation(f"The auctioneer does not know '{lost[0]}', which it accepted.")
 
     def _after_exit(self, process: Process) -> None:
@@ -235,12 +235,13 @@ class Shift:
     def statuses(self) -> dict[str, str]:
         """State of every job, as the participants know it."""
         if not self.alone:
-            node = self.node(AUCTIONEER)
-            return {} if node is None else {each.job: each.state for each in node.auctioneer.status()}
-        states: dict[str, str] = {}
+            ledger, auctioneer = self.node(AUCTIONEER).auctioneer.ledger, self.node(AUCTIONEER).auctioneer
+            past = [name for name in self.submitter.accepted if name in ledger.past]
+            states = {name: "finished" if ledger.past.is_finished(name) else "given_up" for name in past}
+            return states | {each.job: each.state for each in auctioneer.status()}
+        states = {}
         for name in self.arms:
-            node = self.node(name)
-            for each in [] if node is None else node.work_source.statuses():
+            for each in self.node(name).work_source.statuses():
                 if states.setdefault(each.job, each.state) in ("waiting", "given_up", "unfinished"):
                     states[each.job] = each.state
         return states

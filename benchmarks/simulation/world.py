@@ -299,9 +299,10 @@ class World:
         before = time.monotonic, time.sleep, secrets.token_hex
         handler = _TraceLog(self)
         logging.disable(logging.NOTSET if self.trace is not None else logging.CRITICAL)
-        root = logging.getLogger("fleet")
-        root.addHandler(handler)
-        propagate, root.propagate = root.propagate, False
+        loggers = [logging.getLogger(name) for name in ("fleet", "scenarios")]
+        for logger in loggers:
+            logger.addHandler(handler)
+            logger.propagate = False
         time.monotonic, time.sleep = self._monotonic_s, self._sleep
         secrets.token_hex = lambda nbytes=None: f"{self.rng.getrandbits(32):08x}"
         try:
@@ -309,8 +310,9 @@ class World:
         finally:
             time.monotonic, time.sleep, secrets.token_hex = before
             logging.disable(logging.NOTSET)
-            root.removeHandler(handler)
-            root.propagate = propagate
+            for logger in loggers:
+                logger.removeHandler(handler)
+                logger.propagate = True
 
     def _monotonic_s(self) -> float:
         return self.now_s if self.running is None else self.running.real_s
