@@ -38,8 +38,8 @@ class Count:
     def __str__(self) -> str:
         hours = self.cpu_s / 3600 or 1e-9
         return (
-            f"{self.shifts} shifts, {self.fleet_s / 3600:.1f} fleet-hours ({self.clock_s / 3600:.2f} h on the clocks of "
-            f"the participants), {self.events} events in {self.cpu_s:.0f} s of one core: "
+            f"{self.shifts} shifts, {self.fleet_s / 3600:.1f} fleet-hours ({self.clock_s / 3600:.2f} h on the "
+            f"participants' clocks), {self.events} events in {self.cpu_s:.0f} s of one core: "
             f"{self.fleet_s / 3600 / hours:,.0f} fleet-hours per core hour ({self.clock_s / 3600 / hours:,.0f} on the "
             "clocks)"
         )
@@ -113,7 +113,8 @@ def main() -> int:
     parser.add_argument("--mutations", nargs="?", const="all", help="break these rules on purpose: NAME,NAME or all")
     parser.add_argument("--mutation", default="", help="with --seed: break this rule")
     given = parser.parse_args()
-    names = [*MUTATIONS] if given.mutations == "all" else (given.mutations or "").split(",")
+    named: str = given.mutations or ""
+    names = [*MUTATIONS] if named == "all" else named.split(",")
     unknown = [name for name in (*names, given.mutation) if name and name not in MUTATIONS]
     if unknown:
         parser.error(f"There is no mutation '{unknown[0]}'. Mutations: {', '.join(MUTATIONS)}.")

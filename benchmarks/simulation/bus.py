@@ -30,9 +30,7 @@ Handle = Callable[..., Any]
 def matches(one: str, other: str) -> bool:
     """Return whether two key expressions have a key in common; `*` stands for one chunk."""
     parts, others = one.split("/"), other.split("/")
-    return len(parts) == len(others) and all(
-        a == b or "*" in (a, b) for a, b in zip(parts, others, strict=True)
-    )
+    return len(parts) == len(others) and all(a == b or "*" in (a, b) for a, b in zip(parts, others, strict=True))
 
 
 class Bus:
@@ -206,8 +204,14 @@ class SimulatedClient:
         ]
 
     def subscribe(
-        self, expression: str, kind: type[msgspec.Struct], handle: Handle, *, history: bool = False,
-        own: bool = True, wake: bool = True,
+        self,
+        expression: str,
+        kind: type[msgspec.Struct],
+        handle: Handle,
+        *,
+        history: bool = False,
+        own: bool = True,
+        wake: bool = True,
     ) -> None:
         channel_for(expression, "publish", kind)
         subscription = Subscription(self, expression, handle, history)
@@ -303,7 +307,9 @@ class _Query:
         if reply is not None:
             reply = client._checked(reply)
         if client.world.reach(client.process, self.client.process):
-            client.world.send(client.process, self.client.process, self.take, client.process.name, own_key, reply, refusal)
+            client.world.send(
+                client.process, self.client.process, self.take, client.process.name, own_key, reply, refusal
+            )
 
     def take(self, replier: str, key: str, reply: msgspec.Struct | None, refusal: str) -> None:
         """Take a reply, as the querying process."""

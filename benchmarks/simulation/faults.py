@@ -147,10 +147,11 @@ def clear(shift: "Shift", arm: str) -> None:
     process = shift.world.processes[arm]
     if process.up and process.group == 0:
         return  # a person sees on the bus that it is there
-    node, machine = process.node, shift.builders[arm].machine
+    node: Any = process.node
+    machine = shift.builders[arm].machine
     shift.world.log("person", f"moves '{arm}' home, and asks to free its space")
-    if process.up and machine is not None:
-        shift.unsure |= {active.job for active in getattr(node, "executor").active if active.may_commit}
+    if node is not None and machine is not None:
+        shift.unsure |= {active.job for active in node.executor.active if active.may_commit}
         machine.move_home()
     shift.is_home(arm)
     link: Any = shift.world.processes[CLIENT].client
@@ -179,4 +180,3 @@ def heal(shift: "Shift") -> None:
         process.disk.full, process.disk.broken, process.disk.crash_in, process.broken = False, 0, 0, False
         process._resume(process.boot)
     shift.world.log("shift", "heals")
-

@@ -243,7 +243,8 @@ class SimulatedArm:
         """Cycles of this stint that were begun, or with `floor` those that are complete."""
         if not self._working:
             return 0
-        assert self._left_s is not None and self._plan is not None
+        assert self._left_s is not None
+        assert self._plan is not None
         count = (self.time_s - self._left_s - self._plan.approach.duration_s) / self._plan.cycle.duration_s
         return min(max(0, whole(count + (ZERO_S if whole is math.floor else -ZERO_S))), self._todo)
 
@@ -253,7 +254,9 @@ class SimulatedArm:
         self._deeds.departs(self.name, self._plan.space)
 
     def _work(self, until_s: float, events: list[Event]) -> None:
-        assert self._task is not None and self._plan is not None and self._left_s is not None
+        assert self._task is not None
+        assert self._plan is not None
+        assert self._left_s is not None
         self._todo = max(self._allowed - self._before, self._begun())
         last_s = self._left_s + self._plan.approach.duration_s + (self._todo - 1) * self._plan.cycle.duration_s
         end_s = last_s + self._plan.cycle.duration_s

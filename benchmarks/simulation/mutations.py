@@ -142,7 +142,6 @@ def _ends_free(end: Any) -> Any:
     return lambda self, award, *, moved=True: end(self, award, moved=False)
 
 
-
 def _reads_torn_lines(lines: Any) -> Any:
     """Take an unfinished last line for a record."""
 
@@ -155,29 +154,88 @@ def _reads_torn_lines(lines: Any) -> Any:
     return patched
 
 
-_nobody_in_the_way = (lambda original: lambda arm, space, taken, excludes: ())
+def _nobody_in_the_way(original: Any) -> Any:
+    return lambda arm, space, taken, excludes: ()
+
 
 _mutation("award-unwritten", "an award is on disk before it is sent", (Journal, "append", _unwritten(Awarded)))
-_mutation("commit-unwritten", "permission to commit is on disk before it is given", (Journal, "append", _unwritten(CommitPermitted)))
+_mutation(
+    "commit-unwritten",
+    "permission to commit is on disk before it is given",
+    (Journal, "append", _unwritten(CommitPermitted)),
+)
 _mutation("accept-unwritten", "an arm accepts an award on disk", (Journal, "append", _unwritten(AwardAccepted)))
 _mutation("submission-unwritten", "an accepted job is on disk", (Journal, "append", _unwritten(JobsAccepted)))
 _mutation("grant-unwritten", "a grant is on disk before the reply", (Journal, "append", _unwritten(JobGranted)))
-_mutation("end-unwritten", "the end of a job is on disk before its report and receipt", (Journal, "append", _unwritten(Closed)))
-_mutation("no-fsync", "a record is written through", (Journal, "_write", lambda _: lambda self, file, line: journal_module.os.write(file, line) and None))
+_mutation(
+    "end-unwritten",
+    "the end of a job is on disk before its report and receipt",
+    (Journal, "append", _unwritten(Closed)),
+)
+_mutation(
+    "no-fsync",
+    "a record is written through",
+    (Journal, "_write", lambda _: lambda self, file, line: journal_module.os.write(file, line) and None),
+)
 _mutation("torn-line-read", "an unfinished last line is removed", (Journal, "_lines", _reads_torn_lines))
 _mutation("lease-forgotten", "after a restart open awards count as leased", (LedgerWriter, "__init__", _forgetful))
 _mutation("grant-forgotten", "after a restart grants count as leased", (Granter, "__init__", _forgetful_granter))
-_mutation("lease-too-short", "the granting side counts leases longer", (Timing, "counted_lease_s", lambda _: property(lambda self: 0.5 * self.lease_s)))
-_mutation("lease-ignored", "an arm begins cycles under a lease only", (AwardExecutor, "allowed_cycles", lambda _: lambda self, now_s: self._current.award.job.repetitions - (not self._current.may_commit)))
-_mutation("commit-ignored", "the last cycle needs permission to commit", (AwardExecutor, "allowed_cycles", lambda _: lambda self, now_s: self._current.award.job.repetitions), (AwardExecutor, "finish", lambda finish: lambda self, time_s, now_s: (setattr(self._current, "may_commit", True), finish(self, time_s, now_s))[1]))
-_mutation("commit-taken-back", "after permission to commit a job goes to no other arm", (Auctioneer, "_expire", _expires_all))
+_mutation(
+    "lease-too-short",
+    "the granting side counts leases longer",
+    (Timing, "counted_lease_s", lambda _: property(lambda self: 0.5 * self.lease_s)),
+)
+_mutation(
+    "lease-ignored",
+    "an arm begins cycles under a lease only",
+    (
+        AwardExecutor,
+        "allowed_cycles",
+        lambda _: lambda self, now_s: self._current.award.job.repetitions - (not self._current.may_commit),
+    ),
+)
+_mutation(
+    "commit-ignored",
+    "the last cycle needs permission to commit",
+    (AwardExecutor, "allowed_cycles", lambda _: lambda self, now_s: self._current.award.job.repetitions),
+    (
+        AwardExecutor,
+        "finish",
+        lambda finish: (
+            lambda self, time_s, now_s: (setattr(self._current, "may_commit", True), finish(self, time_s, now_s))[1]
+        ),
+    ),
+)
+_mutation(
+    "commit-taken-back", "after permission to commit a job goes to no other arm", (Auctioneer, "_expire", _expires_all)
+)
 _mutation("duplicate-accepted", "a repeated award gets the same answer", (AwardExecutor, "answer_award", _duplicate))
 _mutation("report-dropped", "a report is repeated until its receipt", (AwardExecutor, "due_reports", _dropped))
 _mutation("receipt-first", "a report is on disk before its receipt", (Auctioneer, "apply_report", _silent))
 _mutation("crash-is-sure", "after a crash in the last cycle nobody repeats it", (ArmHistory, "after_restart", _sure))
-_mutation("space-ignored", "plans that exclude each other are not awarded at a time", *((module, "arms_in_the_way", _nobody_in_the_way) for module in (round_module,)))
+_mutation(
+    "space-ignored",
+    "plans that exclude each other are not awarded at a time",
+    *((module, "arms_in_the_way", _nobody_in_the_way) for module in (round_module,)),
+)
 _mutation("space-freed-early", "closed awards keep their space until the arm is at home", (Ledger, "_end", _ends_free))
-_mutation("claim-space-ignored", "an arm grants one of two plans that exclude each other", (Granter, "in_the_way", lambda _: lambda self, arm, space: ()))
-_mutation("minority", "a claim needs a majority", (Claimant, "__init__", lambda start: lambda self, *a, **k: (start(self, *a, **k), setattr(self, "majority", 1))[0]))
-_mutation("no-restart", "the supervisor starts ended processes again", (Supervisor, "_handle_exit", lambda _: lambda self, running: False))
-_mutation("no-backstop", "an unanswered award is sent again, or expires", (Auctioneer, "_expire", lambda _: lambda self, real_s, time_s: None))
+_mutation(
+    "claim-space-ignored",
+    "an arm grants one of two plans that exclude each other",
+    (Granter, "in_the_way", lambda _: lambda self, arm, space: ()),
+)
+_mutation(
+    "minority",
+    "a claim needs a majority",
+    (Claimant, "__init__", lambda start: lambda self, *a, **k: (start(self, *a, **k), setattr(self, "majority", 1))[0]),
+)
+_mutation(
+    "no-restart",
+    "the supervisor starts ended processes again",
+    (Supervisor, "_handle_exit", lambda _: lambda self, running: False),
+)
+_mutation(
+    "no-backstop",
+    "an unanswered award is sent again, or expires",
+    (Auctioneer, "_expire", lambda _: lambda self, real_s, time_s: None),
+)

@@ -23,8 +23,8 @@ from fleet.errors import BusError
 from fleet.live import journal as journal_module
 from fleet.live import supervisor as supervisor_module
 from fleet.live.arm import node as arm_module
-from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
 from fleet.live.arm.auctioneer_client import AuctioneerClient
+from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
 from fleet.live.arm.journal_records import ArmHistory, ArmRecord
 from fleet.live.arm.node import ArmConfig, ArmNode
 from fleet.live.auction.node import AuctionNode
@@ -84,12 +84,15 @@ class ArmProcess:
         estimator: Any = SimulatedEstimator(name, self._first)
         settings = ArmConfig(warning_c=80.0, rate_hz=self._rate_hz, boot=history.boot)
         if self._membership is None:
-            return ArmNode(
-                link, body, executor, estimator, clock, settings, partial(AuctioneerClient, history=kept)
-            )
+            return ArmNode(link, body, executor, estimator, clock, settings, partial(AuctioneerClient, history=kept))
         grants, membership = _journal(process, "grants", GrantRecord), self._membership
         return ArmNode(
-            link, body, executor, estimator, clock, settings,
+            link,
+            body,
+            executor,
+            estimator,
+            clock,
+            settings,
             lambda arm: ConsensusNode(arm, membership, grants, boot=history.boot),
         )
 
@@ -256,7 +259,11 @@ def simulated_system(world: World) -> Iterator[None]:
     replace(journal_module, "os", DiskCalls(disk))
     replace(journal_module, "open", lambda handle, mode: nullcontext(disk().read(handle)))
     replace(journal_module, "fcntl", SimpleNamespace(LOCK_EX=0, LOCK_NB=0, flock=lambda h, o: disk().flock(h, o)))
-    replace(supervisor_module, "subprocess", SimpleNamespace(**{**vars(subprocess), "Popen": lambda argv, **_: Popen(world, argv)}))
+    replace(
+        supervisor_module,
+        "subprocess",
+        SimpleNamespace(**{**vars(subprocess), "Popen": lambda argv, **_: Popen(world, argv)}),
+    )
     replace(supervisor_module, "threading", SimpleNamespace(Thread=Thread, Event=threading.Event))
     replace(arm_module, "plan_key", lambda plan: plan.space)
     replace(arm_module, "space_name", str)

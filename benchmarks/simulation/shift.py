@@ -49,8 +49,8 @@ def first_come(bidding: Any) -> Mapping[str, Assignment]:
 
 def first_legal(observation: Any, arm: int) -> int:
     """Claim the first job that the arm may claim."""
-    legal = observation.action_mask[1:-1].nonzero()[0] if len(observation.action_mask) else ()
-    return 1 + int(legal[0]) if len(legal) else 0
+    legal = observation.action_mask[1:-1].nonzero()[0].tolist()
+    return 1 + legal[0] if legal else 0
 
 
 def random_conflicts(seed: int, share: float) -> Excludes:
@@ -96,7 +96,7 @@ class Shift:
         self.work_s = 0.0
         self.jobs: list[JobSpec] = []
         timing = Timing(lease_s=rng.choice([3.0, 6.0]), max_jobs=8)
-        membership = None
+        membership: Membership | None = None
         if self.alone:
             live = LiveFleet(arms=self.arms, warning_c=80.0)
             membership = Membership(fleet=live, choose=first_legal, slots=4, excludes=self.excludes, timing=timing)
@@ -148,13 +148,18 @@ class Shift:
 
     def _submit(self) -> None:
         rng, names = self.rng, [job.name for job in self.jobs]
-        after = (rng.choice(names[-5:]),) if names and rng.random() < 0.15 else ()
+        after = tuple(rng.sample(names[-5:], int(bool(names) and rng.random() < 0.15)))
         due: dict[str, Any] = {}
         if self.alone is False and self.node(AUCTIONEER) is not None and rng.random() < 0.1:
             due = {"due_s": self.node(AUCTIONEER).time_s + rng.uniform(0.0, 30.0) * self.speed, "expires": True}
         spec = JobSpec(
-            name=f"job_{len(self.jobs)}", kind="hold", places=(rng.choice("uvwxyz"),), dwell_s=rng.choice([0.5, 5.0, 20.0]),
-            repetitions=rng.choice([1, 1, 2, 4, 12, 40]), after=after, **due,
+            name=f"job_{len(self.jobs)}",
+            kind="hold",
+            places=(rng.choice("uvwxyz"),),
+            dwell_s=rng.choice([0.5, 5.0, 20.0]),
+            repetitions=rng.choice([1, 1, 2, 4, 12, 40]),
+            after=after,
+            **due,
         )
         self.jobs.append(spec)
         self.work_s += (20.0 + spec.repetitions * (spec.dwell_s + 10.0)) / self.speed
