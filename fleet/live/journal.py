@@ -28,6 +28,10 @@ COMPACT_FACTOR, COMPACT_BYTES = 4, 1_000_000
 
 Record = TypeVar("Record", bound=msgspec.Struct)
 
+_REMEDY = (
+    "Bring back a copy. Without its journal a participant has forgotten jobs, and may do them twice: see Epochs in "
+    "docs/bus.md before you move the file away."
+)
 _HEAD, _MIDDLE, _TAIL = b'{"crc":"', b'","records":', b"}\n"
 _CRC_END = len(_HEAD) + 8
 _START = _CRC_END + len(_MIDDLE)
@@ -105,7 +109,8 @@ class Journal(Generic[Record]):
                 self._sync(self._file)
         except OSError as error:
             self.close()
-            raise JournalError(f"Journal '{self.path}' cannot be opened: {error.strerror}.") from error
+            kind = JournalFull if error.errno in _FULL else JournalError
+            raise kind(f"Journal '{self.path}' cannot be opened: {error.strerror}.") from error
         except JournalError:
             self.close()
             raise
@@ -232,15 +237,13 @@ class Journal(Generic[Record]):
         complete = line.startswith(_HEAD) and line[_CRC_END:_START] == _MIDDLE and line.endswith(_TAIL)
         if not complete or line[len(_HEAD) : _CRC_END] != b"%08x" % zlib.crc32(body):
             raise JournalError(
-                f"{self.path}, line {number}: damaged (wrong checksum), so its records are lost. Move the file away to "
-                "start with an empty journal."
+                f"{self.path}, line {number}: damaged (wrong checksum), so its records are lost. {_REMEDY}"
             )
         try:
             return self._decoder.decode(body)
         except msgspec.DecodeError as error:
             raise JournalError(
-                f"{self.path}, line {number}: not a record of this version ({error}). Move the file away to start with "
-                "an empty journal."
+                f"{self.path}, line {number}: not a record of this version ({error}). {_REMEDY}"
             ) from error
 
     def _write(self, file: int, line: bytes) -> None:
