@@ -46,18 +46,16 @@ class Count:
 
 
 def run(seed: int, count: Count, *, trace: bool = False, mutation: str = "") -> str:
-    """Simulate one seed; return which rule was broken, or ""."""
+    """Simulate one seed, unless the mutation concerns no such fleet; return which rule was broken, or ""."""
     start_s, broken = time.process_time(), ""
     shift = Shift(seed, trace=trace)
+    if mutation and MUTATIONS[mutation].alone not in (None, shift.alone):
+        return ""
     try:
         with applied(mutation):
             shift.run()
     except Violation as violation:
         broken = str(violation)
-    except Exception as error:
-        if not trace and not mutation:
-            raise RuntimeError(f"Seed {seed} ends with an error.") from error
-        broken = f"{type(error).__name__}: {error}"
     if shift.world.trace is not None:
         lines = "\n".join(shift.world.trace)
         print(f"{lines}\ndigest {hashlib.sha256(lines.encode()).hexdigest()[:16]}")
@@ -99,7 +97,7 @@ def find(names: list[str], first: int) -> int:
             seed += 1
         missed += not broken
         what = f"{count.fleet_s / 3600:.1f} | {count.cpu_s:.1f} | {seed - 1} | {broken or 'NOT FOUND'}"
-        print(f"| `{name}` | {MUTATIONS[name][0]} | {what} |", flush=True)
+        print(f"| `{name}` | {MUTATIONS[name].rule} | {what} |", flush=True)
     return 1 if missed else 0
 
 

@@ -47,6 +47,13 @@ def lose_power(shift: "Shift") -> None:
     _one(shift).kill("loses power", power=True)
 
 
+def lose_rack(shift: "Shift") -> None:
+    """Kill some processes at once, some of them by a loss of power."""
+    for name in shift.names:
+        if shift.rng.random() < 0.5:
+            shift.world.processes[name].kill("is killed with others", power=shift.rng.random() < 0.5)
+
+
 def crash_at_write(shift: "Shift") -> None:
     """Let a process crash in one of its next disk calls."""
     disk = _one(shift).disk
@@ -77,8 +84,10 @@ def stop(shift: "Shift") -> None:
 
 
 def stop_at_work(shift: "Shift") -> None:
-    """Stop an arm at work for some time."""
-    _arm(shift, busy=True).pause(shift.rng.choice([0.5, 2.5, 3.0, 6.1, 20.0]) * shift.rng.uniform(0.9, 1.1))
+    """Stop an arm at work for some time, and maybe kill some others."""
+    arm = _arm(shift, busy=True)
+    _kill_others(shift, arm)
+    arm.pause(shift.rng.choice([0.5, 2.5, 3.0, 6.1, 20.0]) * shift.rng.uniform(0.9, 1.1))
 
 
 def cut(shift: "Shift") -> None:
@@ -88,8 +97,17 @@ def cut(shift: "Shift") -> None:
 
 
 def cut_off_at_work(shift: "Shift") -> None:
-    """Cut one arm at work off for some time."""
-    _cut(shift, {_arm(shift, busy=True).name: 1}, shift.rng.choice([3.0, 7.0, 15.0, 40.0]))
+    """Cut one arm at work off for some time, and maybe kill some others."""
+    arm = _arm(shift, busy=True)
+    _cut(shift, {arm.name: 1}, shift.rng.choice([3.0, 7.0, 15.0, 40.0]))
+    _kill_others(shift, arm)
+
+
+def _kill_others(shift: "Shift", arm: Process) -> None:
+    share = shift.rng.choice([0.0, 0.0, 0.5, 1.0])
+    for name in shift.names:
+        if name != arm.name and shift.rng.random() < share:
+            shift.world.processes[name].kill("is killed meanwhile")
 
 
 def lose_router(shift: "Shift") -> None:
@@ -167,7 +185,7 @@ def kill_supervisor(shift: "Shift") -> None:
 FAULTS = (
     *(kill, kill_at_work, lose_power, crash_at_write, crash_at_write, fill_disk, break_disk, stop, stop_at_work, cut),
     *(cut_off_at_work, cut_off_at_work, lose_router, lose_messages, lose_messages, overheat, break_machine, move_home),
-    *(kill_supervisor, fill_log_disk),
+    *(kill_supervisor, fill_log_disk, lose_rack),
 )
 
 

@@ -6,7 +6,7 @@ A patch replaces methods of the product's classes until the end of its `with` bl
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 from msgspec.structs import replace as changed
 
@@ -17,6 +17,7 @@ from fleet.live.arm.journal_records import ArmHistory, AwardAccepted
 from fleet.live.auction import round as round_module
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.ledger import Ledger
+from fleet.live.auction.past_jobs import PastJobs
 from fleet.live.auction.records import Awarded
 from fleet.live.auction.round import Timing
 from fleet.live.auction.writer import LedgerWriter
@@ -29,12 +30,23 @@ from fleet.live.supervisor import Supervisor
 
 Patch = tuple[Any, str, Callable[[Any], Any]]
 """Where, the name, and what makes the replacement of what was there."""
-MUTATIONS: dict[str, tuple[str, tuple[Patch, ...]]] = {}
-"""By name: the broken rule, and its patches."""
 
 
-def _mutation(name: str, rule: str, *patches: Patch) -> None:
-    MUTATIONS[name] = rule, patches
+class Mutation(NamedTuple):
+    """A broken rule."""
+
+    rule: str
+    patches: tuple[Patch, ...]
+    alone: bool | None = None
+    """Whether it concerns fleets without an auctioneer; None: all fleets."""
+
+
+MUTATIONS: dict[str, Mutation] = {}
+"""By name."""
+
+
+def _mutation(name: str, rule: str, *patches: Patch, alone: bool | None = None) -> None:
+    MUTATIONS[name] = Mutation(rule, patches, alone)
 
 
 @contextmanager
@@ -42,7 +54,7 @@ def applied(name: str) -> Iterator[None]:
     """Break one rule until the end of the block; "" breaks none."""
     before: list[tuple[Any, str, Any]] = []
     try:
-        for owner, attribute, make in MUTATIONS[name][1] if name else ():
+        for owner, attribute, make in MUTATIONS[name].patches if name else ():
             original = vars(owner)[attribute]
             before.append((owner, attribute, original))
             setattr(owner, attribute, make(original))
@@ -80,12 +92,14 @@ def _forgetful_granter(start: Any) -> Any:
 
 
 def _duplicate(answer: Any) -> Any:
-    """Take a repeated award for a new one."""
+    """Take a repeated award for a new one, on a new quote."""
 
     def patched(self: Any, award: Any, now_s: float, unfit: str = "") -> Any:
-        self._accepted.pop(award.award, None)
-        for quote in self._quotes.values():
-            quote.answers.pop(award.job.name, None)
+        if all(active.award.award != award.award for active in self.active):
+            self._accepted.pop(award.award, None)
+            for quote in self._quotes.values():
+                if quote.answers.pop(award.job.name, None) is not None:
+                    quote.made_s = now_s
         return answer(self, award, now_s, unfit)
 
     return patched
@@ -158,7 +172,9 @@ def _nobody_in_the_way(original: Any) -> Any:
     return lambda arm, space, taken, excludes: ()
 
 
-_mutation("award-unwritten", "an award is on disk before it is sent", (Journal, "append", _unwritten(Awarded)))
+_mutation(
+    "award-unwritten", "an award is on disk before it is sent", (Journal, "append", _unwritten(Awarded)), alone=False
+)
 _mutation(
     "commit-unwritten",
     "permission to commit is on disk before it is given",
@@ -166,7 +182,9 @@ _mutation(
 )
 _mutation("accept-unwritten", "an arm accepts an award on disk", (Journal, "append", _unwritten(AwardAccepted)))
 _mutation("submission-unwritten", "an accepted job is on disk", (Journal, "append", _unwritten(JobsAccepted)))
-_mutation("grant-unwritten", "a grant is on disk before the reply", (Journal, "append", _unwritten(JobGranted)))
+_mutation(
+    "grant-unwritten", "a grant is on disk before the reply", (Journal, "append", _unwritten(JobGranted)), alone=True
+)
 _mutation(
     "end-unwritten",
     "the end of a job is on disk before its report and receipt",
@@ -175,11 +193,18 @@ _mutation(
 _mutation(
     "no-fsync",
     "a record is written through",
-    (Journal, "_write", lambda _: lambda self, file, line: journal_module.os.write(file, line) and None),
+    (Journal, "__init__", lambda start: lambda self, *a, **k: start(self, *a, **{**k, "sync": lambda file: None})),
 )
 _mutation("torn-line-read", "an unfinished last line is removed", (Journal, "_lines", _reads_torn_lines))
-_mutation("lease-forgotten", "after a restart open awards count as leased", (LedgerWriter, "__init__", _forgetful))
-_mutation("grant-forgotten", "after a restart grants count as leased", (Granter, "__init__", _forgetful_granter))
+_mutation(
+    "lease-forgotten",
+    "after a restart open awards count as leased",
+    (LedgerWriter, "__init__", _forgetful),
+    alone=False,
+)
+_mutation(
+    "grant-forgotten", "after a restart grants count as leased", (Granter, "__init__", _forgetful_granter), alone=True
+)
 _mutation(
     "lease-too-short",
     "the granting side counts leases longer",
@@ -207,27 +232,49 @@ _mutation(
     ),
 )
 _mutation(
-    "commit-taken-back", "after permission to commit a job goes to no other arm", (Auctioneer, "_expire", _expires_all)
+    "commit-taken-back",
+    "after permission to commit a job goes to no other arm",
+    (Auctioneer, "_expire", _expires_all),
+    alone=False,
 )
-_mutation("duplicate-accepted", "a repeated award gets the same answer", (AwardExecutor, "answer_award", _duplicate))
+_mutation(
+    "duplicate-accepted",
+    "a repeated award gets the same answer",
+    (AwardExecutor, "answer_award", _duplicate),
+    alone=False,
+)
+_mutation(
+    "past-forgotten",
+    "the name of a settled job is not used again",
+    (PastJobs, "__contains__", lambda _: lambda self, name: False),
+    alone=False,
+)
 _mutation("report-dropped", "a report is repeated until its receipt", (AwardExecutor, "due_reports", _dropped))
-_mutation("receipt-first", "a report is on disk before its receipt", (Auctioneer, "apply_report", _silent))
+_mutation("receipt-first", "a report is on disk before its receipt", (Auctioneer, "apply_report", _silent), alone=False)
 _mutation("crash-is-sure", "after a crash in the last cycle nobody repeats it", (ArmHistory, "after_restart", _sure))
 _mutation(
     "space-ignored",
     "plans that exclude each other are not awarded at a time",
     *((module, "arms_in_the_way", _nobody_in_the_way) for module in (round_module,)),
+    alone=False,
 )
-_mutation("space-freed-early", "closed awards keep their space until the arm is at home", (Ledger, "_end", _ends_free))
+_mutation(
+    "space-freed-early",
+    "closed awards keep their space until the arm is at home",
+    (Ledger, "_end", _ends_free),
+    alone=False,
+)
 _mutation(
     "claim-space-ignored",
     "an arm grants one of two plans that exclude each other",
     (Granter, "in_the_way", lambda _: lambda self, arm, space: ()),
+    alone=True,
 )
 _mutation(
     "minority",
     "a claim needs a majority",
     (Claimant, "__init__", lambda start: lambda self, *a, **k: (start(self, *a, **k), setattr(self, "majority", 1))[0]),
+    alone=True,
 )
 _mutation(
     "no-restart",
@@ -238,4 +285,5 @@ _mutation(
     "no-backstop",
     "an unanswered award is sent again, or expires",
     (Auctioneer, "_expire", lambda _: lambda self, real_s, time_s: None),
+    alone=False,
 )

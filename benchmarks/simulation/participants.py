@@ -27,6 +27,7 @@ from fleet.live.arm.auctioneer_client import AuctioneerClient
 from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
 from fleet.live.arm.journal_records import ArmHistory, ArmRecord
 from fleet.live.arm.node import ArmConfig, ArmNode
+from fleet.live.auction import ledger as ledger_module
 from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.records import AuctionRecord
 from fleet.live.auction.round import Allocate, Timing
@@ -265,6 +266,8 @@ def simulated_system(world: World) -> Iterator[None]:
         SimpleNamespace(**{**vars(subprocess), "Popen": lambda argv, **_: Popen(world, argv)}),
     )
     replace(supervisor_module, "threading", SimpleNamespace(Thread=Thread, Event=threading.Event))
+    replace(journal_module, "COMPACT_BYTES", 5_000)  # so that both happen in a short shift
+    replace(ledger_module, "MAX_SETTLED", 5)
     replace(arm_module, "plan_key", lambda plan: plan.space)
     replace(arm_module, "space_name", str)
     try:

@@ -86,7 +86,9 @@ class Shift:
         """Without an auctioneer."""
         self.job_gap_s = rng.choice([0.8, 2.0, 5.0, 20.0]) * MEAN_JOB_S / self.speed / len(self.arms)
         self.faulty_s = max(60.0, min(rng.uniform(60.0, 900.0), MOST_JOBS * self.job_gap_s))
-        self.fault_gap_s = rng.choice([8.0, 20.0, 60.0])
+        self.fault_gap_s = rng.choice([4.0, 10.0, 30.0, 60.0])
+        self.possible = tuple(fault for fault in FAULTS if rng.random() < 0.4) or FAULTS
+        """Faults of this shift: few kinds often meet what all kinds together rarely do."""
         self.excludes = random_conflicts(seed, rng.choice([0.0, 0.5, 0.5, 1.0]))
         self.begun: dict[str, int] = {}
         self.finished: dict[str, int] = {}
@@ -167,7 +169,7 @@ class Shift:
         self.world.processes[CLIENT].wake(self.world.now_s)
 
     def _fault(self) -> None:
-        fault = self.rng.choice(FAULTS)
+        fault = self.rng.choice(self.possible)
         self.world.log("fault", fault.__name__)
         fault(self)
 

@@ -136,6 +136,10 @@ class Process:
         except FleetError as error:
             world.log(self.name, f"exits: {error}")
             self.exit(2)
+        except (Violation, Sleep):
+            raise
+        except Exception as error:
+            raise Violation(f"'{self.name}' ends with {type(error).__name__}: {error}") from error
         finally:
             world.running, self._busy = caller, False
         world.after_run(self)
