@@ -107,7 +107,7 @@ def run_command(
 
 def demo_command(
     out: Annotated[Path, typer.Option(help="Folder of the two recordings.")] = Path("out/demo"),
-    seed: options.SeedOption = 11,
+    seed: options.SeedOption = 19,
 ) -> None:
     """Run the quickstart shift under two policies, side by side."""
     chosen = load("quickstart")

@@ -193,7 +193,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Print the figures of the seeds given after the folder, mean ± standard deviation over the seeds."""
     folder, *seeds = sys.argv[1:] if argv is None else argv
     sequences = [np.random.SeedSequence(int(seed)) for seed in seeds]
-    bench = Bench(sequences, TwinConfig.quick(), Path(folder), partial(make_study, novel=NOVEL))
+    bench = Bench(
+        sequences, TwinConfig(max_windows=768, epochs=60, restarts=1), Path(folder), partial(make_study, novel=NOVEL)
+    )
     for exploration in (0, EXPLORATION):
         results = saturation_study(bench, exploration=exploration, test=2 * LABELLED + HELD_OUT)
         for rows, measures in zip(results, (PREDICTION_MEASURES, ALARM_MEASURES), strict=True):

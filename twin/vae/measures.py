@@ -150,8 +150,8 @@ class Measures:
         """The measures of one of many jobs."""
         if self.difficulty.ndim < 2:
             raise ValueError("These are the measures of one job.")
-        changes: dict[str, Array] = {name: v[i] for name, v in vars(self).items() if isinstance(v, np.ndarray)}
-        return replace(self, **(changes | {"weight": self.weight}))
+        per_job = {name: v[i] for name, v in vars(self).items() if isinstance(v, np.ndarray) and name != "weight"}
+        return replace(self, **per_job)
 
     def why(self, most: int = 2) -> str:
         """The largest causes as text, `joint 2: more load (61 %), joint 4: a new place (20 %)`."""

@@ -124,7 +124,7 @@ class PlanQuote(msgspec.Struct, frozen=True, omit_defaults=True):
     joint_difficulty: tuple[float, ...] | None = None
     """d_k, [joint]."""
     difficulty: float | None = None
-    """Sum of `joint_difficulty`."""
+    """d = Σ_k w_k d_k, with the weights of the arm's twin (`fleet.difficulty`)."""
     duration_s: float | None = None
     """Duration of the job alone."""
     finish_in_s: float | None = None

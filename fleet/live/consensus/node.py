@@ -62,7 +62,8 @@ def check_journals(arm: str, boot: int, epoch: str, histories: Iterable[History]
         BusError: they are lost, older copies, or of another epoch: jobs might be done twice.
     """
     for peer in (history for history in histories if history.arm != arm):
-        if peer.claims.get(arm, -1) >= boot * NUMBERS_PER_BOOT:
+        claimed = peer.claims.get(arm, -1)
+        if claimed >= boot * NUMBERS_PER_BOOT or (claimed >= 0 and peer.epoch and not epoch):
             reason = f"'{peer.arm}' knows claims of '{arm}' that its journals do not: they are lost, or older copies"
         elif "" not in (epoch, peer.epoch) and epoch != peer.epoch:
             reason = f"The journals of '{arm}' are of the epoch '{epoch}', those of '{peer.arm}' of '{peer.epoch}'"
@@ -119,8 +120,10 @@ class ConsensusNode:
         """Real second since which a majority has been present."""
         self.wake_s = math.inf
         arm.set_clock(FleetClock(self._speed, real_s + NOT_YET_S))
+        link, fleet, name = self._link, self._link.fleet, self._name
+        link.reply_to(keys.of_arm(fleet, name, "history"), HistoryRequest, self._history)
+        check_journals(name, boot, register.epoch, ask_arms(link))  # before it grants anything
         self._declare()
-        check_journals(self._name, boot, register.epoch, ask_arms(self._link))
 
     # For the arm
 
@@ -190,8 +193,8 @@ class ConsensusNode:
             first = self._name == min(self._tokens & roster | {self._name})
             if not (self._epoch or first):  # the first by name names the epoch; its bid begins the fleet's time here
                 return
-            self._take_epoch(self._epoch or secrets.token_hex(4))
-            self._set_time(self._recorder.start_s(self._speed), real_s)
+            if self._take_epoch(self._epoch or secrets.token_hex(4)):
+                self._set_time(self._recorder.start_s(self._speed), real_s)
 
     def _end(self, real_s: float, time_s: float) -> None:
         """End the shift; only a last cycle continues."""
@@ -208,7 +211,6 @@ class ConsensusNode:
         link, fleet, name = self._link, self._link.fleet, self._name
         self._publish_bid = link.publisher(keys.of_arm(fleet, name, "bid"), Bid)
         link.reply_to(keys.asked_by_every_arm(fleet, name, "claim"), Claim, self._answer_claim)
-        link.reply_to(keys.of_arm(fleet, name, "history"), HistoryRequest, self._history)
         link.reply_to(keys.of_jobs(fleet, "submit"), Submission, self._submit)
         link.reply_to(keys.of_jobs(fleet, "status"), StatusRequest, self._status)
         link.reply_to(keys.of_jobs(fleet, "clear"), ClearRequest, self._clear)
@@ -221,7 +223,8 @@ class ConsensusNode:
         real_s = time.monotonic()
         if arm == self._name or arm not in self.participant.granter.roster:
             return
-        self._take_epoch(bid.epoch)
+        if not self._take_epoch(bid.epoch) and not self._begun:
+            return
         if not self._begun or bid.time_s > self._arm.clock.now_s(real_s):
             self._set_time(bid.time_s, real_s)
         self.participant.apply_bid(bid, real_s)
@@ -230,8 +233,8 @@ class ConsensusNode:
     def _epoch(self) -> str:
         return self.participant.granter.register.epoch
 
-    def _take_epoch(self, epoch: str) -> None:
-        """Take the epoch of the fleet, unless there is one on disk already."""
+    def _take_epoch(self, epoch: str) -> bool:
+        """Take the epoch of the fleet, unless there is one on disk already; return whether it is this one."""
         if epoch and not self._epoch:
             try:
                 self.participant.granter.begin_epoch(epoch)
@@ -239,6 +242,7 @@ class ConsensusNode:
                 self._warn("epoch", f"cannot record the epoch: {error}")
         elif epoch not in ("", self._epoch):
             self._warn("epoch", f"has journals of the epoch '{self._epoch}', and a peer those of '{epoch}'.")
+        return epoch in ("", self._epoch)
 
     def _history(self, _: HistoryRequest) -> History:
         return History(self._name, self._epoch, claims=dict(self.participant.granter.register.numbers))
