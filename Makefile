@@ -57,6 +57,7 @@ chaos: $(STAMP)
 simulate: $(STAMP)
 	@$(BIN)/python benchmarks/simulation $(if $(SEED),--seed $(SEED)) $(if $(SEEDS),--seeds $(SEEDS)) \
 	  $(if $(HOURS),--hours $(HOURS)) $(if $(FIRST),--first $(FIRST)) $(if $(MUTATIONS),--mutations $(MUTATIONS))
+
 # A week of work, a million jobs, through one auctioneer: about 20 minutes.
 soak: $(STAMP)
 	@$(BIN)/python benchmarks/soak.py --jobs 1000000

@@ -23,6 +23,8 @@ from fleet.live.space import ANYWHERE, Excludes
 
 SPEEDS = (1.0, 10.0, 60.0, 120.0, 120.0, 240.0)
 """Fleet seconds per real second."""
+FIRST = "arm_0"
+"""Can do every job."""
 MEAN_JOB_S = 150.0
 """Mean duration of a job, fleet s."""
 MOST_JOBS = 60
@@ -80,7 +82,7 @@ class Shift:
         self.seed = seed
         self.world = world = World(seed, trace=trace)
         rng = self.rng = world.rng
-        self.arms = tuple(f"arm_{i}" for i in range(rng.choice([2, 3, 3, 4])))
+        self.arms = (FIRST, *(f"arm_{i}" for i in range(1, rng.choice([2, 3, 3, 4]))))
         self.speed = rng.choice(SPEEDS)
         self.alone = rng.random() < 0.4 and len(self.arms) > 2
         """Without an auctioneer."""
@@ -105,7 +107,7 @@ class Shift:
         world.bus = Bus(world)
         rate_hz, capacity = rng.choice([0.5, 1.0]), rng.choice([1, 1, 2])
         self.builders = {
-            name: ArmProcess(self, self.arms[0], self.speed, rate_hz, capacity, membership) for name in self.arms
+            name: ArmProcess(self, FIRST, self.speed, rate_hz, capacity, membership) for name in self.arms
         }
         for name in self.arms:
             Process(world, name, self.builders[name])
