@@ -3,7 +3,7 @@
 import logging
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from graphlib import TopologicalSorter
 from typing import Annotated
 
@@ -12,7 +12,7 @@ import typer
 
 from fleet.bus.client.client import BusClient
 from fleet.bus.client.discover import other_versions
-from fleet.bus.protocol.auction import JobSpec, JobStatus, Submission
+from fleet.bus.protocol.auction import JobSpec, JobState, JobStatus, Submission
 from fleet.errors import Refused
 from fleet.job import Job
 from fleet.live.auction.node import AuctionNode
@@ -41,6 +41,7 @@ log = logging.getLogger(__name__)
 
 TURN_S = 0.1
 """Real seconds between two submissions of released jobs."""
+NONE_LEFT: Mapping[JobState, int] = {}
 FAREWELL_S = (1.0, 10.0)
 """Real seconds to serve after the end; and at most, while a job is in its last cycle."""
 
@@ -89,8 +90,9 @@ def auction_command(
         for sentence in other_versions(endpoint, fleet):
             log.error("Refused: %s", sentence)
         typer.echo(f"ready {name} {endpoint} {os.getpid()}")
-        if node.auctioneer.ledger.jobs:
-            so_far = summary(node.auctioneer.status(), node.time_s).partition("\n")[0]
+        ledger = node.auctioneer.ledger
+        if ledger.jobs:
+            so_far = summary(node.auctioneer.status(), node.time_s, ledger.left).partition("\n")[0]
             log.warning("Continuing from %s: %s", book.path, so_far)
         if node.auctioneer.ledger.ended:
             log.warning("That shift is over; another --journal (of thermofleet up: --out) begins a new one.")
@@ -99,7 +101,7 @@ def auction_command(
         else:
             while not stop.is_set():
                 node.serve(time.monotonic() + TURN_S)
-        typer.echo(summary(node.auctioneer.status(), node.time_s))
+        typer.echo(summary(node.auctioneer.status(), node.time_s, ledger.left))
         stop.leave(f"Interrupted at {node.time_s:.0f} s; the journal is {book.path}, and the same command continues.")
 
 
@@ -158,10 +160,15 @@ def job_spec(job: Job) -> JobSpec:
     )
 
 
-def summary(statuses: Sequence[JobStatus], time_s: float) -> str:
-    """Number of finished jobs, and one line for each other job."""
+def summary(statuses: Sequence[JobStatus], time_s: float, left: Mapping[JobState, int] = NONE_LEFT) -> str:
+    """Number of finished jobs, and one line for each other job.
+
+    Args:
+        left: Number of further jobs, by state.
+    """
     others = [status for status in statuses if status.state != "finished"]
-    lines = [f"{time_s:.0f} s: {len(statuses) - len(others)} of {len(statuses)} jobs finished."]
+    finished, total = len(statuses) - len(others) + left.get("finished", 0), len(statuses) + sum(left.values())
+    lines = [f"{time_s:.0f} s: {finished} of {total} jobs finished."]
     for job in others:
         arm, reason = f" at {job.arm}" if job.arm else "", f", {job.reason}" if job.reason else ""
         lines.append(f"  {job.job}: {job.state}{arm}{reason}")
