@@ -110,6 +110,24 @@ def _kill_others(shift: "Shift", arm: Process) -> None:
             shift.world.processes[name].kill("is killed meanwhile")
 
 
+def swizzle(shift: "Shift") -> None:
+    """Cut processes off one after another, and connect them again in another order, as FoundationDB does."""
+    names = [name for name in shift.world.processes if shift.rng.random() < 0.6]
+    after_s = 0.0
+    for group in (1, 0):
+        shift.rng.shuffle(names)
+        for number, name in enumerate(names):
+            shift.world.after(after_s, _isolate, shift, name, group * (number + 1))
+            after_s += shift.rng.uniform(0.0, 4.0)
+
+
+def _isolate(shift: "Shift", name: str, group: int) -> None:
+    if shift.healed:
+        return
+    groups = {process.name: process.group for process in shift.world.processes.values()} | {name: group}
+    shift.world.split({name: group for name, group in groups.items() if group})
+
+
 def lose_router(shift: "Shift") -> None:
     """Let nobody reach anybody for some time."""
     _cut(shift, {name: i for i, name in enumerate(shift.world.processes)}, shift.rng.choice([0.5, 3.0, 10.0]))
@@ -185,13 +203,14 @@ def kill_supervisor(shift: "Shift") -> None:
 FAULTS = (
     *(kill, kill_at_work, lose_power, crash_at_write, crash_at_write, fill_disk, break_disk, stop, stop_at_work, cut),
     *(cut_off_at_work, cut_off_at_work, lose_router, lose_messages, lose_messages, overheat, break_machine, move_home),
-    *(kill_supervisor, fill_log_disk, lose_rack),
+    *(kill_supervisor, fill_log_disk, lose_rack, swizzle),
 )
 
 
 def heal(shift: "Shift") -> None:
     """End all faults; the network stays as slow as it is."""
     calm(shift)
+    shift.healed = True
     shift.world.split({})
     shift.watch.log.full = False
     for process in shift.world.processes.values():

@@ -98,6 +98,7 @@ class Shift:
         self.faults: dict[str, list[str]] = {}
         self.unsure: set[str] = set()
         self.work_s = 0.0
+        self.healed = False
         self.jobs: list[JobSpec] = []
         timing = Timing(lease_s=rng.choice([3.0, 6.0]), max_jobs=8)
         membership: Membership | None = None
@@ -106,9 +107,7 @@ class Shift:
             membership = Membership(fleet=live, choose=first_legal, slots=4, excludes=self.excludes, timing=timing)
         world.bus = Bus(world)
         rate_hz, capacity = rng.choice([0.5, 1.0]), rng.choice([1, 1, 2])
-        self.builders = {
-            name: ArmProcess(self, FIRST, self.speed, rate_hz, capacity, membership) for name in self.arms
-        }
+        self.builders = {name: ArmProcess(self, FIRST, self.speed, rate_hz, capacity, membership) for name in self.arms}
         for name in self.arms:
             Process(world, name, self.builders[name])
         if not self.alone:
