@@ -13,7 +13,8 @@ PINNED := $(sort $(basename $(notdir $(wildcard constraints/*.txt))))
 ADAPTERS := $(filter-out bench,$(PINNED))
 ADAPTER_TESTS := $(ADAPTERS:%=test-adapter-%)
 
-.PHONY: demo test test-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos soak fuzz clean install
+.PHONY: demo test test-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos simulate soak \
+	fuzz clean install
 
 demo: $(STAMP)
 	@$(BIN)/thermofleet demo --out $(OUT)/demo
@@ -51,6 +52,12 @@ lint: $(STAMP)
 
 chaos: $(STAMP)
 	@$(BIN)/python benchmarks/chaos
+
+# Whole fleets in one process under faults, seed after seed until one breaks a rule or Ctrl-C. SEEDS=n or HOURS=n
+# bounds it, FIRST=n is the first seed, SEED=n prints the trace of one, MUTATIONS=all breaks rules on purpose.
+simulate: $(STAMP)
+	@$(BIN)/python benchmarks/simulation $(if $(SEED),--seed $(SEED)) $(if $(SEEDS),--seeds $(SEEDS)) \
+	  $(if $(HOURS),--hours $(HOURS)) $(if $(FIRST),--first $(FIRST)) $(if $(MUTATIONS),--mutations $(MUTATIONS))
 
 # A week of work, a million jobs, through one auctioneer: about 20 minutes.
 soak: $(STAMP)
