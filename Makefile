@@ -13,7 +13,8 @@ PINNED := $(sort $(basename $(notdir $(wildcard constraints/*.txt))))
 ADAPTERS := $(filter-out bench,$(PINNED))
 ADAPTER_TESTS := $(ADAPTERS:%=test-adapter-%)
 
-.PHONY: demo test test-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos soak clean install
+.PHONY: demo test test-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos simulate soak \
+	fuzz clean install
 
 demo: $(STAMP)
 	@$(BIN)/thermofleet demo --out $(OUT)/demo
@@ -52,15 +53,32 @@ lint: $(STAMP)
 chaos: $(STAMP)
 	@$(BIN)/python benchmarks/chaos
 
+# Whole fleets in one process under faults, seed after seed until one breaks a rule or Ctrl-C. SEEDS=n or HOURS=n
+# bounds it, FIRST=n is the first seed, SEED=n prints the trace of one, MUTATIONS=all breaks rules on purpose.
+simulate: $(STAMP)
+	@$(BIN)/python benchmarks/simulation $(if $(SEED),--seed $(SEED)) $(if $(SEEDS),--seeds $(SEEDS)) \
+	  $(if $(HOURS),--hours $(HOURS)) $(if $(FIRST),--first $(FIRST)) $(if $(MUTATIONS),--mutations $(MUTATIONS))
+
 # A week of work, a million jobs, through one auctioneer: about 20 minutes.
 soak: $(STAMP)
 	@$(BIN)/python benchmarks/soak.py --jobs 1000000
+
+# Coverage-guided fuzzing of every parser. `make fuzz INPUTS=10000000` takes longer, `TARGETS=journal` one parser.
+INPUTS ?= 1000000
+fuzz: $(VENV)/.atheris
+	@$(BIN)/python benchmarks/fuzz --inputs $(INPUTS) $(TARGETS)
+
+$(VENV)/.atheris: $(STAMP)
+	@$(PIP) atheris==3.0.0
+	@touch $@
 
 bench: $(STAMP)
 	@for b in benchmarks/bench_*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done
 
 EXTRA := [cli]
 .venv-adapters/bench/.installed: EXTRA := [cli,learn]
+.venv-adapters/ros2/.installed: EXTRA := [bus,ros2]
+.venv-adapters/vda5050/.installed: EXTRA := [bus,vda5050]
 bench-env: .venv-adapters/bench/.installed
 	@.venv-adapters/bench/bin/python benchmarks/env.py
 

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from fleet.bus.protocol.auction import JobStatus
-from fleet.bus.protocol.messages import Name
+from fleet.bus.protocol.messages import Name, Number
 
 JobName = Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
 
@@ -56,9 +56,9 @@ class Change(msgspec.Struct, frozen=True, tag_field="action", tag="change"):
     """Change due date and value of a job that is not settled; what is left out stays as it is."""
 
     job: JobName
-    due_s: float | msgspec.UnsetType | None = msgspec.UNSET
+    due_s: Number | msgspec.UnsetType | None = msgspec.UNSET
     """As in `JobSpec`; null for none."""
-    value: float | msgspec.UnsetType = msgspec.UNSET
+    value: Number | msgspec.UnsetType = msgspec.UNSET
 
 
 class Pause(msgspec.Struct, frozen=True, tag_field="action", tag="pause"):
@@ -108,5 +108,5 @@ class Operation(msgspec.Struct, frozen=True):
     """Published under `auction/{auctioneer}/operation`: a request of a person was carried out."""
 
     auctioneer: Name
-    time_s: float
+    time_s: Number
     request: ControlRequest
