@@ -195,6 +195,7 @@ ASKERS = {
     keys.asked_by("f", "arm_0", "claim", "arm_1"): {"arm_1"},
     keys.of_jobs("f", "submit"): {"submitter", "operator"},
     keys.of_jobs("f", "clear"): {"operator"},
+    keys.of_jobs("f", "cell"): {"submitter", "operator", "monitor", "recorder"},
     keys.of_jobs("f", "control"): {"operator"},
     keys.of_jobs("f", "status"): {"submitter", "operator", "monitor", "recorder", "auctioneer"},
     keys.of_clock("f"): {"arm_0", "arm_1", "submitter", "operator", "monitor", "recorder", "auctioneer"},

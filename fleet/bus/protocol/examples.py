@@ -29,6 +29,7 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
+from fleet.bus.protocol.cell import Cell, CellArm, CellKind, CellPlace, CellRequest, Limit, PlannedWork
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimEntry, ClaimReply, DeniedEntry, GrantedEntry, JobOutcome
 from fleet.bus.protocol.history import History, HistoryRequest
 from fleet.bus.protocol.messages import DifficultyScores, Info, Refusal, State
@@ -60,6 +61,30 @@ _FASTEST = PlanQuote(
 _COOLEST = PlanQuote(plan=1, peak_c=48.25, gained_k=5.25, p_saturation=0.01, duration_s=252.0, finish_in_s=280.5)
 _OFFER = JobEstimate(job="crate_1", plans=(_FASTEST, _COOLEST))
 _DONE = JobStatus(job="crate_1", state="finished", arm=_ARM, award=_AWARD, cycles=20, finished_s=842.5, repetitions=20)
+_CELL = Cell(
+    auctioneer=_AUCTIONEER,
+    scenario="packing",
+    places=(
+        CellPlace("conveyor", (0.4, 0.2, 0.1), (180.0, 0.0, 0.0), 0.08),
+        CellPlace("pallet", (0.4, -0.2, 0.1), (180.0, 0.0, 0.0), 0.08),
+    ),
+    arms=(
+        CellArm(
+            _ARM,
+            (0.0, 0.0, 0.0),
+            (0.0, 0.0, 0.0),
+            payload_kg=3.1,
+            payload_outstretched_kg=0.2,
+            reach_m=0.902,
+            works=(PlannedWork("pick_place", CRATE.places, 1.5, plans=4, cycle_s=9.6),),
+        ),
+    ),
+    kinds=(CellKind("pick_place", 2, "Take the payload from the first place to the second."),),
+    limits={"payload_kg": Limit(0.0, 10.0, "kg")},
+    warning_c=60.0,
+    error_c=75.0,
+    jobs_in_message=128,
+)
 _CANCEL = ControlRequest(request="5f0c2b1e", action=Cancel(job="crate_1"), by="shop floor")
 
 _ALL: tuple[msgspec.Struct, ...] = (
@@ -173,6 +198,8 @@ _ALL: tuple[msgspec.Struct, ...] = (
         job=JobStatus(job="crate_1", state="awarded", arm=_ARM, award=_AWARD, cycles=3, repetitions=20, finish_s=842.0),
     ),
     Operation(auctioneer=_AUCTIONEER, time_s=650.0, request=_CANCEL),
+    CellRequest(),
+    _CELL,
     ClockRequest(),
     Clock(time_s=600.0, speed=60.0, epoch=_EPOCH),
 )

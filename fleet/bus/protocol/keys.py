@@ -19,7 +19,7 @@ Role = Literal["arm", "auction", "jobs", "clock"]
 ArmTopic = Literal["alive", "state", "info", "difficulty", "event", "bid", "quote", "award", "history"]
 AuctionTopic = Literal["alive", "announce", "result", "operation"]
 AskedTopic = Literal["lease", "report", "claim"]
-JobsTopic = Literal["submit", "status", "clear", "control"]
+JobsTopic = Literal["submit", "status", "clear", "control", "cell"]
 
 PREFIX = "thermofleet/v4"
 STATES = f"{PREFIX}/*/arm/*/state"

@@ -10,7 +10,7 @@ from typing import Literal
 
 import msgspec
 
-from fleet.bus.protocol import auction, consensus, history, keys, messages, operator
+from fleet.bus.protocol import auction, cell, consensus, history, keys, messages, operator
 from fleet.bus.protocol.keys import Role
 
 MessageType = type[msgspec.Struct]
@@ -108,6 +108,7 @@ CHANNELS: tuple[Channel, ...] = (
     Channel("jobs", "status", "query", auction.StatusRequest, auction.Status),
     Channel("jobs", "clear", "query", operator.ClearRequest, operator.Cleared, receiver="operator"),
     Channel("jobs", "control", "query", operator.ControlRequest, operator.Controlled, receiver="operator"),
+    Channel("jobs", "cell", "query", cell.CellRequest, cell.Cell),
     Channel("clock", "now", "query", auction.ClockRequest, auction.Clock),
 )
 CHANNEL: Mapping[tuple[str, str], Channel] = {(channel.role, channel.topic): channel for channel in CHANNELS}

@@ -28,6 +28,7 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
+from fleet.bus.protocol.cell import Cell, CellRequest
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
 from fleet.bus.protocol.registry import SESSION_LEASE_S
@@ -81,6 +82,7 @@ class AuctionNode:
         arms: tuple[str, ...] = (),
         excludes: Excludes = no_conflicts,
         new_epoch: bool = False,
+        cell: Cell | None = None,
     ) -> None:
         """Continue from a journal.
 
@@ -91,6 +93,7 @@ class AuctionNode:
             places: Names of the cell's places; None allows any name.
             arms: Arms of the cell; each may be anywhere until it is heard.
             excludes: Which plans of two arms exclude each other.
+            cell: Reply to requests for the cell; None refuses them.
             new_epoch: Begin with an empty journal even if arms know an older one.
 
         Raises:
@@ -99,6 +102,7 @@ class AuctionNode:
         """
         self._link, self._name, self.journal = link, name, journal
         self._timing = timing or Timing()
+        self._cell = cell
         self._check_no_auctioneer()
         ledger = Ledger(places, arms).replay(journal.records())
         if not (ledger.epoch or new_epoch):
@@ -194,6 +198,7 @@ class AuctionNode:
         link.reply_to(keys.of_jobs(fleet, "submit"), Submission, self._logged(self._submit))
         link.reply_to(keys.of_jobs(fleet, "status"), StatusRequest, self._status)
         link.reply_to(keys.of_jobs(fleet, "clear"), ClearRequest, self._logged(self._clear))
+        link.reply_to(keys.of_jobs(fleet, "cell"), CellRequest, self._describe_cell)
         link.reply_to(keys.of_jobs(fleet, "control"), ControlRequest, self._logged(self._control))
         link.reply_to(keys.asked_by_every_arm(fleet, name, "lease"), LeaseRequest, renew_leases)
         link.reply_to(keys.asked_by_every_arm(fleet, name, "report"), Report, apply_report)
@@ -231,6 +236,11 @@ class AuctionNode:
         if self.rivals:
             raise Refused(f"{self._name_rivals()}: nothing is changed until one is stopped.")
         return self.auctioneer.control(request, time_s)
+
+    def _describe_cell(self, _: CellRequest) -> Cell:
+        if self._cell is None:
+            raise Refused("This auctioneer knows no cell.")
+        return self._cell
 
     def _status(self, request: StatusRequest) -> Status:
         auctioneer = self.auctioneer
