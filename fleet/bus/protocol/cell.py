@@ -51,9 +51,9 @@ class PlannedWork(msgspec.Struct, frozen=True):
     places: tuple[Name, ...]
     payload_kg: Number
     plans: Count
-    """How many; 0 if the arm cannot do it."""
+    """How many. Work that the arm cannot do is left out."""
     cycle_s: Number | None = None
-    """Duration of a cycle by the fastest plan; null without plans."""
+    """Duration of a cycle by the fastest plan."""
 
 
 class CellArm(msgspec.Struct, frozen=True):
