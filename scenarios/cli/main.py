@@ -62,6 +62,7 @@ COMMANDS = {
     "change": LazyCommand(_LIVE, "live.control:change_command", "Change due date and value of a job."),
     "pause": LazyCommand(_LIVE, "live.control:pause_command", "Give an arm, or all arms, no more jobs."),
     "resume": LazyCommand(_LIVE, "live.control:resume_command", "End a pause."),
+    "reset": LazyCommand(_LIVE, "live.control:reset_command", "Clear the fault of an arm."),
     "watch": LazyCommand(_LIVE, "live.watch:watch_command", "Watch a fleet in the terminal."),
     "doctor": LazyCommand(_LIVE, "live.doctor:doctor_command", "Check the health of a fleet."),
     "gateway": LazyCommand(_LIVE, "live.gateway:gateway_command", "Serve a fleet over HTTP."),

@@ -190,6 +190,7 @@ def test_nobody_pretends_that_another_is_there(side, connect, fake):
 ASKERS = {
     keys.of_arm("f", "arm_0", "quote"): {"auctioneer", "submitter", "operator"},
     keys.of_arm("f", "arm_0", "award"): {"auctioneer"},
+    keys.of_arm("f", "arm_0", "reset"): {"operator"},
     keys.asked_by("f", "auctioneer", "lease", "arm_0"): {"arm_0"},
     keys.asked_by("f", "auctioneer", "report", "arm_1"): {"arm_1"},
     keys.asked_by("f", "arm_0", "claim", "arm_1"): {"arm_1"},

@@ -33,7 +33,16 @@ from fleet.bus.protocol.cell import Cell, CellArm, CellKind, CellPlace, CellRequ
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimEntry, ClaimReply, DeniedEntry, GrantedEntry, JobOutcome
 from fleet.bus.protocol.history import History, HistoryRequest
 from fleet.bus.protocol.messages import DifficultyScores, Info, Refusal, State
-from fleet.bus.protocol.operator import Cancel, Cleared, ClearRequest, Controlled, ControlRequest, Operation
+from fleet.bus.protocol.operator import (
+    Cancel,
+    Cleared,
+    ClearRequest,
+    Controlled,
+    ControlRequest,
+    Operation,
+    ResetReply,
+    ResetRequest,
+)
 
 CRATE = JobSpec(
     name="crate_1",
@@ -189,6 +198,8 @@ _ALL: tuple[msgspec.Struct, ...] = (
     Status(auctioneer=_AUCTIONEER, time_s=900.0, jobs=(_DONE,), space={"arm_2": ("5d1c0f7e92ab3486",)}, epoch=_EPOCH),
     ClearRequest(arm="arm_2", by="shop floor"),
     Cleared(auctioneer=_AUCTIONEER, arm="arm_2"),
+    ResetRequest(by="shop floor"),
+    ResetReply(arm=_ARM, changed=True),
     _CANCEL,
     Controlled(
         auctioneer=_AUCTIONEER,

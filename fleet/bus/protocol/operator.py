@@ -104,6 +104,23 @@ class Controlled(msgspec.Struct, frozen=True):
     """As in `Status`."""
 
 
+class ResetRequest(msgspec.Struct, frozen=True):
+    """Request to `arm/{arm}/reset`: clear the fault of an arm now, instead of waiting for it to clear. The arm then
+    ends its cycle and goes home by itself, so nobody may be in its way. Without a fault nothing changes."""
+
+    by: Person = ""
+    """Who requests it, for journal and event."""
+
+
+class ResetReply(msgspec.Struct, frozen=True):
+    """Reply to a `ResetRequest`."""
+
+    arm: Name
+    changed: bool
+    """False if the arm has no fault. An arm that is too hot refuses, as does one whose fault only a person at the arm
+    can clear."""
+
+
 class Operation(msgspec.Struct, frozen=True):
     """Published under `auction/{auctioneer}/operation`: a request of a person was carried out."""
 

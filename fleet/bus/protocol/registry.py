@@ -96,6 +96,7 @@ CHANNELS: tuple[Channel, ...] = (
     ),
     Channel("arm", "award", "query", auction.Award, auction.Ack, receiver="auctioneer"),
     Channel("arm", "history", "query", history.HistoryRequest, history.History, receiver="auctioneer, or arm"),
+    Channel("arm", "reset", "query", operator.ResetRequest, operator.ResetReply, receiver="operator"),
     Channel("arm", "bid", "publish", consensus.Bid, receiver="arm", history=1, rate_hz=1.0),
     Channel("arm", "claim", "query", consensus.Claim, consensus.ClaimReply, receiver="arm", lease_s=auction.LEASE_S),
     Channel("auction", "alive", "token", lease_s=SESSION_LEASE_S),

@@ -161,7 +161,8 @@ def rights(fleet: str, participant: Participant, *, by_consensus: bool = False) 
             queries=(quotes, awards, history, time, status),
         )
     if participant.role in ("submitter", "operator"):
-        steer = (keys.of_jobs(fleet, "clear"), keys.of_jobs(fleet, "control"))
+        reset = keys.of_every_arm(fleet, "reset")
+        steer = (keys.of_jobs(fleet, "clear"), keys.of_jobs(fleet, "control"), reset)
         operator = steer if participant.role == "operator" else ()
         return Rights(queries=(keys.of_jobs(fleet, "submit"), *operator, status, cell, quotes, time))
     if participant.role in ("monitor", "recorder"):

@@ -9,12 +9,23 @@ from msgspec import UNSET
 from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobStatus
-from fleet.bus.protocol.operator import ALL_ARMS, Action, Cancel, Change, Controlled, ControlRequest, Pause, Resume
+from fleet.bus.protocol.operator import (
+    ALL_ARMS,
+    Action,
+    Cancel,
+    Change,
+    Controlled,
+    ControlRequest,
+    Pause,
+    ResetReply,
+    ResetRequest,
+    Resume,
+)
 from fleet.bus.protocol.operator import Settle as SettleJob
 from fleet.errors import BusError, FleetError
 from fleet.job import BOUNDS
-from scenarios.cli.live.clear import MOST_CHARACTERS, REPLY_S, user_name
-from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, number, the_fleet
+from scenarios.cli.live.clear import REPLY_S, check_person, user_name
+from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, check_name, number, the_fleet
 from scenarios.cli.terminal import echo
 
 ATTEMPTS = 3
@@ -87,14 +98,36 @@ def resume_command(
     request([Resume(arm)], by, endpoint, fleet)
 
 
+def reset_command(
+    arm: Annotated[str, typer.Argument(help="Name of the arm.", callback=check_name)],
+    by: ByOption = "",
+    endpoint: EndpointOption = ENDPOINT,
+    fleet: FleetOption = "",
+) -> None:
+    """Clear the fault of an arm now.
+
+    The arm ends its cycle and goes home by itself: nobody may be in its way.
+    An arm that is too hot refuses.
+    """
+    check_person(by)
+    with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
+        key, message = keys.of_arm(link.fleet, arm, "reset"), ResetRequest(by or user_name())
+        replies = link.query_and_wait(key, message, ResetReply, timeout_s=REPLY_S)
+    for reason in filter(None, replies.refused.values()):
+        raise BusError(reason)
+    for reply in replies.messages.values():
+        echo(f"{arm}: its fault is cleared." if reply.changed else f"{arm}: it has no fault.")
+        return
+    raise BusError(f"The arm '{arm}' did not reply. With TLS, use a certificate of the role operator.")
+
+
 def request(actions: list[Action], by: str, endpoint: str, fleet: str) -> None:
     """Request actions, one after another, and print what became of them.
 
     Raises:
         BusError: one is refused, or nobody replies.
     """
-    if len(by) > MOST_CHARACTERS:
-        raise FleetError(f"--by must have at most {MOST_CHARACTERS} characters (got {len(by)}).")
+    check_person(by)
     with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
         for action in actions:
             echo(describe(action, _request(link, ControlRequest(secrets.token_hex(8), action, by or user_name()))))
