@@ -151,6 +151,8 @@ class ArmHistory(JournalState[ArmRecord]):
                 self.epoch = epoch or self.epoch
                 for job in jobs:
                     self._finish(job)
+            case FaultCleared():
+                pass
 
     def _finish(self, job: JobSpec) -> None:
         self.finished.pop(job.name, None)
