@@ -14,9 +14,9 @@ from typing import Annotated, Any, NamedTuple
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from fleet.errors import FleetError, JournalFull, NoRouter
+from fleet.errors import FleetError, JournalFull, NoRouter, visible
 from fleet.live.supervisor import SUPERVISED, WAITS
-from scenarios.cli.terminal import INTERRUPTED, Interrupted, err_console, say
+from scenarios.cli.terminal import INTERRUPTED, Interrupted, echo, err_console, say
 from scenarios.extras import missing_extra
 
 USAGE = 2
@@ -62,7 +62,9 @@ COMMANDS = {
     "gateway": LazyCommand(_LIVE, "live.gateway:gateway_command", "Serve a fleet over HTTP."),
     "record": LazyCommand(_LIVE, "live.record:record_command", "Record a fleet to Parquet."),
     "replay": LazyCommand(_LIVE, "live.record:replay_command", "Replay a run or a recording on the bus."),
+    "report": LazyCommand(_LIVE, "live.record:report_command", "Write the report of a recording."),
     "ros2": LazyCommand(_LIVE, "ros2:ros2_app", "Connect a fleet and ROS 2."),
+    "vda5050": LazyCommand(_LIVE, "live.vda5050:vda5050_command", "Take orders by VDA 5050 over MQTT."),
     "keys": LazyCommand(_LIVE, "keys:keys_command", "Make and show TLS keys and certificates."),
     "twin": LazyCommand(_TWIN, "twin:twin_app", "Train, score and use the digital twin of an arm."),
     "hold": LazyCommand(_TWIN, "scenarios.motion.hold:hold_command", "Compute how long an arm can hold a payload."),
@@ -118,7 +120,7 @@ def _print_version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
-        typer.echo(f"thermofleet {version('thermofleet')}")
+        echo(f"thermofleet {version('thermofleet')}")
         raise typer.Exit
 
 
@@ -160,9 +162,19 @@ def main(argv: Sequence[str] | None = None) -> None:
     sys.exit(code or 0)
 
 
+class VisibleFormatter(logging.Formatter):
+    """Formatter that escapes control characters and direction marks."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the record as text."""
+        return visible(super().format(record), "\n")
+
+
 def _log_warnings() -> None:
     if not err_console.is_terminal:  # a file, in which every line is one message
-        logging.basicConfig(level=logging.WARNING, format="%(levelname)-8s %(name)s: %(message)s")
+        plain = logging.StreamHandler()
+        plain.setFormatter(VisibleFormatter("%(levelname)-8s %(name)s: %(message)s"))
+        logging.basicConfig(level=logging.WARNING, handlers=[plain])
         return
     from rich.logging import RichHandler
 

@@ -153,6 +153,10 @@ def test_fields_are_described_by_the_text_under_them():
 def test_asyncapi_has_every_key_and_no_loose_end():
     document = asyncapi()
     assert [channel["address"] for channel in document["channels"].values()] == [c.address for c in CHANNELS]
+    for action in ("send", "receive"):  # both sides of every key with messages
+        done = [each["channel"]["$ref"] for each in document["operations"].values() if each["action"] == action]
+        assert done == [f"#/channels/{c.name}" for c in CHANNELS if c.message is not None]
+    assert "security" in document["servers"]["routerTls"]
 
     def references(value):
         if isinstance(value, dict):
@@ -175,7 +179,10 @@ def test_asyncapi_has_every_key_and_no_loose_end():
 
 @pytest.mark.parametrize(
     ("nodes", "role"),
-    [(("arm/node", "arm/auctioneer_client", "consensus/node"), "arm"), (("auction/node",), "auction")],
+    [
+        (("arm/node", "arm/publications", "arm/auctioneer_client", "consensus/node"), "arm"),
+        (("auction/node",), "auction"),
+    ],
 )
 def test_the_participants_publish_and_answer_as_the_contract_says(nodes, role):
     """Read from their source: `link.publisher(keys.of_…(…, "topic"), Kind)` and `link.reply_to(…)`."""
