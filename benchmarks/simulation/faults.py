@@ -189,6 +189,7 @@ def clear(shift: "Shift", arm: str) -> None:
     if node is not None and machine is not None:
         shift.unsure |= {active.job for active in node.executor.active if active.may_commit}
         machine.move_home()
+        machine.set_time(node.clock.now_s(process.real_s))  # it does nothing in the time before, either
     shift.is_home(arm)
     link: Any = shift.world.processes[CLIENT].client
     link.query(keys.of_jobs("f", "clear"), ClearRequest(arm, "a person"), Cleared, lambda _: None, timeout_s=2.0)

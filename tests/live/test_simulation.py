@@ -23,7 +23,7 @@ def simulate(*arguments, hash_seed="0"):
 
 
 def test_no_rule_is_broken_under_faults():
-    told = simulate("--seeds", "12")
+    told = simulate("--seeds", "6")
     assert told.returncode == 0, told.stdout + told.stderr
 
 
