@@ -40,6 +40,7 @@ from fleet.live.arm.simulated_body import SimulatedBody
 from fleet.live.clock import FleetClock
 from fleet.live.journal import Journal
 from fleet.robot import ThermalLimits
+from fleet.thermal import WINDING
 
 PATIENCE_S = 15.0
 LIMITS = ThermalLimits()
@@ -284,7 +285,7 @@ def test_a_person_clears_the_fault_of_an_arm_and_journal_and_event_name_the_pers
     quote = bus.ask(line, "quote", request(long), Quote)
     assert bus.ask(line, "award", award(quote.quote, long), Ack).accepted
     bus.serve(lambda: auctioneer.reports)
-    bus.serve(lambda: arm.body.truth.temp_c[0, 0, 0].max() < 29.0)
+    bus.serve(lambda: arm.body.truth.temp_c[0, 0, WINDING].max() < 29.0)
     assert bus.ask(line, "reset", ResetRequest("ann"), ResetReply).changed
     bus.serve(lambda: any(e.kind == "recover" for e in events))
     assert next(e for e in events if e.kind == "recover").reason == "cleared by 'ann'"
