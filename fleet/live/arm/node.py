@@ -125,6 +125,7 @@ class ArmNode:
         )
 
     def _reset(self, request: ResetRequest) -> ResetReply:
+        self._reading = self._body.read_sensors()
         if self._reading.mode != "faulted":
             return ResetReply(self._name, changed=False)
         if reason := self._body.clear_fault():
