@@ -237,8 +237,9 @@ class ArmNode:
         """Advance the body to the present, as far as leases allow."""
         now_s, current = self.clock.now_s(real_s), self._current
         self._assign(current)
-        if current is not None and current.lease_end_s < real_s:
-            # Work done within the lease counts, even if this process was stopped since.
+        if current is not None and self.clock.real_s <= current.lease_end_s < real_s:
+            # Work done within the lease counts, even if this process was stopped since. A clock that was set later does
+            # not know the fleet time of the end of the lease: it returns a later one.
             lease_end_s = math.nextafter(current.lease_end_s, -math.inf)
             self._advance(self.clock.now_s(lease_end_s), current, lease_end_s, real_s)
             current = self._current
