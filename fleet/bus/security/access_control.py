@@ -188,8 +188,13 @@ def access_control(roster: Roster) -> dict[str, Any]:
     ]
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
+    # What another router forwards has passed the rules of that router.
+    linked = _rule("link", "ingress", sorted({*_RECEIVE, *_SUBSCRIBE}), everything) | {"flows": ["ingress", "egress"]}
+    rules.append(linked)
     for participant in roster.participants:
         if participant.role == "router":
+            subjects.append({"id": participant.common_name, "cert_common_names": [participant.common_name]})
+            policies.append({"subjects": [participant.common_name], "rules": [linked["id"]]})
             continue
         name, granted = participant.common_name, rights(fleet, participant, by_consensus=roster.by_consensus)
         own: list[dict[str, Any]] = []
