@@ -13,7 +13,7 @@ PINNED := $(sort $(basename $(notdir $(wildcard constraints/*.txt))))
 ADAPTERS := $(filter-out bench,$(PINNED))
 ADAPTER_TESTS := $(ADAPTERS:%=test-adapter-%)
 
-.PHONY: demo test test-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos clean install
+.PHONY: demo test test-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos soak clean install
 
 demo: $(STAMP)
 	@$(BIN)/thermofleet demo --out $(OUT)/demo
@@ -51,6 +51,10 @@ lint: $(STAMP)
 
 chaos: $(STAMP)
 	@$(BIN)/python benchmarks/chaos
+
+# A week of work, a million jobs, through one auctioneer: about 20 minutes.
+soak: $(STAMP)
+	@$(BIN)/python benchmarks/soak.py --jobs 1000000
 
 bench: $(STAMP)
 	@for b in benchmarks/bench_*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done

@@ -29,8 +29,8 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Ack, Award, JobEstimate, JobSpec, PlanQuote, Quote, QuoteRequest, Submission
 from fleet.bus.protocol.messages import State, encode
 from fleet.live.auction.knowledge import LiveFleet
-from fleet.live.auction.ledger import AuctionRecord, Awarded
 from fleet.live.auction.node import AuctionNode
+from fleet.live.auction.records import AuctionRecord, Awarded
 from fleet.live.auction.round import Timing
 from fleet.live.journal import Journal
 from scenarios.live.allocation import CentralAllocation

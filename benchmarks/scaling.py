@@ -1,6 +1,6 @@
 """Fleets of 1 000 and 10 000 arms: the table of loads, and the value that is lost if few arms are asked for a quote.
 
-    python benchmarks/scaling.py [load] [ask] [--seeds 8] [--arms 64] [--difficulty twin]
+    python benchmarks/scaling.py [load] [ask] [--seeds 8] [--arms 64] [--arrivals 1.0] [--difficulty twin]
 
 `load` is a calculation: the sizes of the messages are those of encoded examples, the rates those of the contract, and
 the costs per message those of `COSTS`, which `docs/scaling.md` derives from measurements.
@@ -37,7 +37,7 @@ from scenarios.run.compare import interval
 from scenarios.run.outcome import common_figures
 
 Array = np.ndarray
-ASKED = (1, 2, 3, 4, 6, 8, 16)
+ASKED = (1, 2, 3, 4, 6, 8)
 JOB_S = 360.0
 """Real seconds between two jobs of an arm: quickstart has one job in 90 s for four arms."""
 JOINTS, PLANS = 7, 2
@@ -48,12 +48,12 @@ DAY_S = 86_400.0
 class Costs:
     """CPU-seconds per message, on one core; see docs/scaling.md for the commands that measure them."""
 
-    forward_s: float = 15e-6
+    forward_s: float = 17.5e-6
     """A router, for each message that it receives or sends over one connection."""
-    state_s: float = 45e-6
+    state_s: float = 32e-6
     """The auctioneer's process, for each state that it receives."""
-    request_s: float = 0.4e-3
-    """The auctioneer's process, for a query and its reply, decoded and validated."""
+    request_s: float = 43e-6
+    """The auctioneer's process, for a quote without jobs, decoded and validated, or another reply."""
     estimate_s: float = 12e-6
     """The auctioneer's process, for each job in a quote."""
     award_s: float = 1.2e-3
@@ -247,16 +247,17 @@ _PER_ARM = (
 )  # fmt: skip
 
 
-def large_cell(arms: int, difficulty: DifficultyName) -> Library:
+def large_cell(arms: int, difficulty: DifficultyName, arrivals: float = 1.0) -> Library:
     """Return quickstart with its four arms repeated, arrivals multiplied, and stations and space of its own for each.
 
     Args:
         arms: A multiple of four.
+        arrivals: Jobs per arm, relative to quickstart.
     """
     if arms % 4 or arms < 4:
         raise ValueError(f"The number of arms must be a multiple of four (got {arms}).")
-    times = arms // 4
-    one = library_of([prepare(load("quickstart"), difficulty=difficulty)], Randomisation(arrivals=(times, times)))
+    times, rate = arms // 4, arms / 4 * arrivals
+    one = library_of([prepare(load("quickstart"), difficulty=difficulty)], Randomisation(arrivals=(rate, rate)))
     tables = one.tables._replace(
         ambient_c=np.tile(one.tables.ambient_c, (1, 1, times)),
         feasible=np.tile(one.tables.feasible, (1, 1, times)),
@@ -293,11 +294,11 @@ def shifts(library: Library, seeds: Sequence[int], asked: int | None, by: str) -
         yield at["value"], at["finished"], at["faults"], at["above_warning_min"], quotes
 
 
-def print_asked(arms: int, seeds: int, difficulty: DifficultyName) -> None:
+def print_asked(arms: int, seeds: int, difficulty: DifficultyName, arrivals: float) -> None:
     """Print the table of value against the number of arms that are asked."""
-    library, rng = large_cell(arms, difficulty), np.random.default_rng(np.random.SeedSequence(0))
+    library, rng = large_cell(arms, difficulty, arrivals), np.random.default_rng(np.random.SeedSequence(0))
     full = np.array(list(shifts(library, range(seeds), None, "coolest")))
-    print(f"{arms} arms, {seeds} shifts, {difficulty}; asked: arms for each job; loss of value with 95 % interval")
+    print(f"{arms} arms, {arrivals:g} × arrivals, {seeds} shifts, {difficulty}; asked: arms for each job; loss of value with 95 % interval")
     print(f"{'asked':>14}{'quotes/job':>12}{'finished':>10}{'value':>9}{'loss %':>9}{'interval':>18}{'faults':>8}{'hot min':>9}")
 
     def line(name: str, rows: Array) -> None:
@@ -322,12 +323,13 @@ def main() -> None:
     parser.add_argument("tables", nargs="*", choices=("load", "ask"), default=("load", "ask"))
     parser.add_argument("--seeds", type=int, default=8)
     parser.add_argument("--arms", type=int, default=64)
+    parser.add_argument("--arrivals", type=float, default=1.0, help="jobs per arm, relative to quickstart")
     parser.add_argument("--difficulty", choices=("twin", "blind"), default="twin")
     arguments = parser.parse_args()
     if "load" in arguments.tables:
         print_loads()
     if "ask" in arguments.tables:
-        print_asked(arguments.arms, arguments.seeds, arguments.difficulty)
+        print_asked(arguments.arms, arguments.seeds, arguments.difficulty, arguments.arrivals)
 
 
 if __name__ == "__main__":

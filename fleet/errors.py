@@ -36,6 +36,10 @@ class BusError(FleetError):
     """The bus cannot be opened, or a message was not delivered in time."""
 
 
+class NoRouter(BusError):
+    """No router answers; one may start later."""
+
+
 class IdentificationError(FleetError):
     """Recordings do not determine an arm's thermal parameters; says what to record."""
 

@@ -29,7 +29,17 @@ from fleet_under_test import CannotInject, Fault
 from malformed import malformed, replayed_awards
 from namespaces import unavailable_reason
 from partition import partition
-from processes import full_disk, kill_arm, kill_auctioneer, kill_router, stop_arm, stuck_subscriber
+from processes import (
+    full_disk,
+    full_disks,
+    full_log_disk,
+    kill_arm,
+    kill_auctioneer,
+    kill_router,
+    kill_router_often,
+    stop_arm,
+    stuck_subscriber,
+)
 from trespass import trespass
 from wall_clock import clock_jump
 
@@ -42,7 +52,10 @@ FAULTS = {
     "kill-auctioneer": Fault(kill_auctioneer),
     "kill-router": Fault(kill_router),
     "stuck-subscriber": Fault(stuck_subscriber),
+    "kill-router-often": Fault(kill_router_often),
     "full-disk": Fault(full_disk),
+    "full-log-disk": Fault(full_log_disk),
+    "full-disks": Fault(full_disks),
     "malformed": Fault(malformed),
     "replayed-awards": Fault(replayed_awards),
     "trespass": Fault(trespass, tls=True),

@@ -14,24 +14,24 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import UnionType
-from typing import Any, Generic, Self, TypeVar, cast
+from typing import Generic, Self, TypeVar, cast
 
 import msgspec
 
 from fleet.errors import JournalError, JournalFull
 from fleet.files import atomic_path
-from fleet.live.journal_records import ClockTick
 
 _LOG = logging.getLogger(__name__)
 
 COMPACT_FACTOR, COMPACT_BYTES = 4, 1_000_000
 """A journal needs compaction once it has grown by this factor since the last one, and to this size."""
 
-TICK_S = 2.0
-"""Real seconds between two records of the fleet's time."""
-
 Record = TypeVar("Record", bound=msgspec.Struct)
 
+_REMEDY = (
+    "Bring back a copy. Without its journal a participant has forgotten jobs, and may do them twice: see Epochs in "
+    "docs/bus.md before you move the file away."
+)
 _HEAD, _MIDDLE, _TAIL = b'{"crc":"', b'","records":', b"}\n"
 _CRC_END = len(_HEAD) + 8
 _START = _CRC_END + len(_MIDDLE)
@@ -109,7 +109,8 @@ class Journal(Generic[Record]):
                 self._sync(self._file)
         except OSError as error:
             self.close()
-            raise JournalError(f"Journal '{self.path}' cannot be opened: {error.strerror}.") from error
+            kind = JournalFull if error.errno in _FULL else JournalError
+            raise kind(f"Journal '{self.path}' cannot be opened: {error.strerror}.") from error
         except JournalError:
             self.close()
             raise
@@ -236,15 +237,13 @@ class Journal(Generic[Record]):
         complete = line.startswith(_HEAD) and line[_CRC_END:_START] == _MIDDLE and line.endswith(_TAIL)
         if not complete or line[len(_HEAD) : _CRC_END] != b"%08x" % zlib.crc32(body):
             raise JournalError(
-                f"{self.path}, line {number}: damaged (wrong checksum), so its records are lost. Move the file away to "
-                "start with an empty journal."
+                f"{self.path}, line {number}: damaged (wrong checksum), so its records are lost. {_REMEDY}"
             )
         try:
             return self._decoder.decode(body)
         except msgspec.DecodeError as error:
             raise JournalError(
-                f"{self.path}, line {number}: not a record of this version ({error}). Move the file away to start with "
-                "an empty journal."
+                f"{self.path}, line {number}: not a record of this version ({error}). {_REMEDY}"
             ) from error
 
     def _write(self, file: int, line: bytes) -> None:
@@ -283,34 +282,3 @@ class Journal(Generic[Record]):
             self._sync(folder)
         finally:
             os.close(folder)
-
-
-class TimeRecorder:
-    """Records fleet time, so that it continues after a restart and never runs backwards."""
-
-    def __init__(self, journal: Journal[Any], state: TimedState[Any], real_s: float) -> None:
-        """Compact the journal, which gave this state."""
-        self._journal, self._state, self._recorded_s = journal, state, real_s
-        journal.compact(*state.compact())
-
-    def start_s(self, speed: float) -> float:
-        """Return the fleet time to start with: after a restart, one that was certainly not read before."""
-        return self._state.time_s + TICK_S * speed if self._state.time_s else 0.0
-
-    def step(self, real_s: float, time_s: float) -> None:
-        """Record the fleet time every `TICK_S`, and compact the journal when it has grown.
-
-        Raises:
-            JournalError: the journal cannot be relied on any more.
-        """
-        if real_s < self._recorded_s + TICK_S:
-            return
-        self._recorded_s = real_s
-        try:
-            self._journal.append(ClockTick(time_s))
-        except JournalFull as error:
-            _LOG.error("Could not record the fleet's time: %s", error)
-        else:
-            self._state.apply(ClockTick(time_s))
-        if self._journal.needs_compaction:
-            self._journal.compact(*self._state.compact())

@@ -20,6 +20,15 @@ class Started(msgspec.Struct, frozen=True, tag="started"):
     """Counts the starts of an arm from 1."""
 
 
+class EpochBegun(msgspec.Struct, frozen=True, tag="epoch_begun"):
+    """The journal is new, and has this name; or an arm without an auctioneer has learned it from another."""
+
+    epoch: str
+    time_s: float = 0.0
+    succeeds: bool = False
+    """A person has requested that it takes the place of another one: arms may know older epochs."""
+
+
 class ClockTick(msgspec.Struct, frozen=True, tag="clock_tick"):
     """Fleet time has reached this value."""
 

@@ -21,6 +21,8 @@ READY = "ready "
 """Start of the line that a participant prints once it has started."""
 SUPERVISED = "THERMOFLEET_SUPERVISOR"
 """Environment variable of supervised processes: the process id of the supervisor."""
+WAITS = 75
+"""Exit code of a process that lacks something which comes back, as a router: no failure (EX_TEMPFAIL of sysexits.h)."""
 LOG_S = 1.0
 """Real seconds to wait for the last output of an exited process."""
 
@@ -31,7 +33,7 @@ class Backoff:
 
     first_s: float = 0.5
     factor: float = 2.0
-    max_s: float = 30.0
+    max_s: float = 4.0
     stable_s: float = 30.0
     """A process that ran longer than this starts with the first delay again."""
 
@@ -73,6 +75,25 @@ class _Running:
     @property
     def alive(self) -> bool:
         return self.process is not None and self.process.poll() is None
+
+
+class LogFile:
+    """Appends lines to a file; while the disk refuses them they are dropped and counted."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._lost = path, 0
+
+    def write(self, line: str) -> None:
+        """Append a line, after one that says how many are missing."""
+        missing = f"[{self._lost} line(s) lost: the disk was full]\n" if self._lost else ""
+        try:
+            with self._path.open("ab", buffering=0) as file:
+                file.write(f"{missing}{line}".encode())
+            self._lost = 0
+        except OSError as error:
+            self._lost += 1
+            if self._lost == 1:
+                _LOG.error("Cannot write '%s' (%s); the output is dropped until it can.", self._path, error.strerror)
 
 
 class Supervisor:
@@ -174,8 +195,7 @@ class Supervisor:
         now_s = time.monotonic()
         for running in self._parts.values():
             if running.process is None and not running.over and running.due_s <= now_s:
-                self._launch(running)
-                running.restarts += 1
+                self._launch_again(running)
         try:
             name = self._ended.get(now_s + wait_s)
         except Empty:
@@ -227,12 +247,23 @@ class Supervisor:
         running.copier = threading.Thread(target=self._copy_log, args=(running, process), daemon=True)
         running.copier.start()
 
+    def _launch_again(self, running: _Running) -> None:
+        """Start a process again; if the system cannot, later."""
+        try:
+            self._launch(running)
+            running.restarts += 1
+        except OSError as error:
+            running.due_s = time.monotonic() + self._backoff.max_s
+            _LOG.error(
+                "'%s' cannot be started (%s); next attempt in %g s.", running.part.name, error, self._backoff.max_s
+            )
+
     def _copy_log(self, running: _Running, process: "subprocess.Popen[str]") -> None:
         assert process.stdout is not None
-        with process.stdout as output, self.log(running.part.name).open("a", encoding="utf-8") as log:
+        log = LogFile(self.log(running.part.name))
+        with process.stdout as output:
             for line in output:
                 log.write(line)
-                log.flush()
                 if line.startswith(running.part.ready):
                     running.ready.set()
         process.wait()
@@ -246,6 +277,8 @@ class Supervisor:
         if process.returncode == 0 and running.part.essential:
             running.over = True
             return True
+        if process.returncode == WAITS:
+            running.failures = 0
         running.failures = 1 if now_s - running.began_s > self._backoff.stable_s else running.failures + 1
         wait_s = self._backoff.wait_s(running.failures)
         running.process, running.due_s = None, now_s + wait_s

@@ -14,7 +14,7 @@ from fleet.bus.protocol.schemas import Schema, descriptions, schemas
 from fleet.engine.reward import RewardWeights
 from fleet.errors import FleetError
 from fleet.live.arm.award_executor import COMMIT_RETRY_S, RENEWALS, REPORT_RETRY_S, ExecutorConfig
-from fleet.live.auction.job_rules import MAX_KEPT_JOBS
+from fleet.live.auction.job_rules import MAX_OPEN_JOBS
 from fleet.live.auction.round import Timing
 from fleet.live.clock import CLOCK_DRIFT
 from fleet.live.monitor.snapshot import FRESH_S
@@ -191,7 +191,7 @@ def _limit_table() -> str:
         (f"{Limits().message_bytes:,} bytes", "any message with its attachment; the router silently drops larger ones"),
         (f"{state.limit_hz:g} a second", "`state` messages of one session; the router drops more (`--state-hz`)"),
         (f"{MOST_JOBS}", "jobs in one message; a `Status` lists open jobs before closed ones"),
-        (f"{MAX_KEPT_JOBS:,}", "jobs that one auctioneer keeps, finished ones included"),
+        (f"{MAX_OPEN_JOBS:,}", "open jobs of one auctioneer"),
         (f"{longest}", "characters of a job's name"),
     ]
     return table(("limit", "applies to"), rows)

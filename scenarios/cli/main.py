@@ -5,6 +5,7 @@ The module of a command is imported when the command runs, so `--help` is fast.
 
 import errno
 import logging
+import os
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
@@ -13,7 +14,8 @@ from typing import Annotated, Any, NamedTuple
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from fleet.errors import FleetError
+from fleet.errors import FleetError, JournalFull, NoRouter
+from fleet.live.supervisor import SUPERVISED, WAITS
 from scenarios.cli.terminal import INTERRUPTED, Interrupted, err_console, say
 from scenarios.extras import missing_extra
 
@@ -139,7 +141,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         sys.exit(INTERRUPTED)
     except FleetError as error:
         say(f"Error: {error}")
-        sys.exit(USAGE)
+        sys.exit(WAITS if isinstance(error, NoRouter | JournalFull) and SUPERVISED in os.environ else USAGE)
     except ModuleNotFoundError as error:
         if missing_extra(error) is None:
             raise

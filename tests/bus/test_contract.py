@@ -173,7 +173,10 @@ def test_asyncapi_has_every_key_and_no_loose_end():
         Draft202012Validator(schema).validate(message["examples"][0]["payload"])
 
 
-@pytest.mark.parametrize(("nodes", "role"), [(("arm/node", "consensus/node"), "arm"), (("auction/node",), "auction")])
+@pytest.mark.parametrize(
+    ("nodes", "role"),
+    [(("arm/node", "arm/auctioneer_client", "consensus/node"), "arm"), (("auction/node",), "auction")],
+)
 def test_the_participants_publish_and_answer_as_the_contract_says(nodes, role):
     """Read from their source: `link.publisher(keys.of_…(…, "topic"), Kind)` and `link.reply_to(…)`."""
     source = "\n".join((ROOT / "fleet" / "live" / f"{node}.py").read_text(encoding="utf-8") for node in nodes)

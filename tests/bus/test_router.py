@@ -8,9 +8,10 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from fleet.bus.client.client import BusClient
 from fleet.bus.client.router import Router, loopback, open_client, reachable
 from fleet.bus.security.tls import Tls, identified
-from fleet.errors import BusError
+from fleet.errors import BusError, NoRouter
 
 
 def test_the_router_listens_where_it_says():
@@ -135,3 +136,21 @@ def test_an_endpoint_that_says_nobody_is_left_as_it_is(endpoint):
 def test_a_port_is_a_port(port):
     with pytest.raises(ValueError, match="port"):
         Router(port)
+
+
+def test_a_client_waits_for_a_router_until_it_is_stopped():
+    with Router() as first:
+        endpoint = first.endpoint
+    router, asked = Router(int(endpoint.rpartition(":")[2])), []
+
+    def start_router():
+        asked.append(None)
+        if len(asked) == 2:  # the first attempt has failed
+            router.open()
+        return False
+
+    with BusClient(endpoint, "f", stopped=start_router):
+        assert len(asked) == 2
+    router.close()
+    with pytest.raises(NoRouter, match="Stopped while waiting for a router"):
+        BusClient(endpoint, "f", stopped=lambda: bool(asked.append(None)) or len(asked) > 4).open()

@@ -17,7 +17,6 @@ from fleet.bus.protocol.auction import (
     Ack,
     Announcement,
     Award,
-    ClearRequest,
     JobEstimate,
     JobSpec,
     Lease,
@@ -32,10 +31,12 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
+from fleet.bus.protocol.operator import ClearRequest
 from fleet.errors import JournalFull, Refused
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.leases import SendAward
-from fleet.live.auction.ledger import AuctionRecord, Ledger
+from fleet.live.auction.ledger import Ledger
+from fleet.live.auction.records import AuctionRecord
 from fleet.live.auction.round import Allocate, Assignment, Timing
 from fleet.live.journal_records import Closed, Started
 from fleet.live.space import Excludes, no_conflicts

@@ -151,7 +151,7 @@ def test_a_station_gets_one_job_at_a_time(fleet_of):
 def test_an_allocation_against_the_bids_is_not_awarded(fleet_of, caplog):
     fleet = fleet_of(1)
     arms = {"a": "unknown", "b": "arm_0", "c": "arm_0", "x": "arm_0"}
-    fleet.auctioneer._allocate = lambda bidding: {job: Assignment(arm) for job, arm in arms.items()}
+    fleet.auctioneer.rounds.allocate = lambda bidding: {job: Assignment(arm) for job, arm in arms.items()}
     bid(fleet, hold("a"), hold("b", "bin"), hold("c", "belt"))
     assert [award.job.name for award in in_transit(fleet, Award)] == ["b"]
     assert caplog.text.count("The policy gives") == 3

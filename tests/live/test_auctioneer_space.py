@@ -2,8 +2,9 @@
 
 import pytest
 
-from fleet.bus.protocol.auction import Award, ClearRequest, JobSpec, Lease, QuoteRequest, Report
+from fleet.bus.protocol.auction import Award, JobSpec, Lease, QuoteRequest, Report
 from fleet.bus.protocol.messages import State
+from fleet.bus.protocol.operator import ClearRequest
 from fleet.errors import Refused
 from fleet.live.journal_records import SpaceTaken
 from fleet.live.space import ANYWHERE

@@ -11,9 +11,11 @@ from fleet.job import reason_to_give_up
 from fleet.live.arm.award_executor import AwardExecutor
 from fleet.live.arm.journal_records import ArmHistory
 from fleet.live.auction.auctioneer import Auctioneer
-from fleet.live.auction.ledger import AuctionRecord, Awarded, Ledger
-from fleet.live.consensus.granter import Granter, Register
+from fleet.live.auction.ledger import Ledger
+from fleet.live.auction.records import AuctionRecord, Awarded
+from fleet.live.consensus.granter import Granter
 from fleet.live.consensus.records import GrantRecord
+from fleet.live.consensus.register import Register
 from fleet.live.journal_records import Closed, JobsAccepted
 
 JOB = JobSpec(name="j", kind="hold", places=("x",), repetitions=9)

@@ -11,11 +11,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fleet.bus.protocol.auction import Award, JobSpec
+from fleet.bus.protocol.messages import encode
 from fleet.errors import FleetError, JournalError, JournalFull
 from fleet.live import journal
-from fleet.live.consensus.granter import Register
+from fleet.live.arm.journal_records import ArmHistory, ArmRecord, AwardAccepted, JobsFinished, ReportReceived
 from fleet.live.consensus.records import GrantRecord
-from fleet.live.journal import Journal, TimeRecorder
+from fleet.live.consensus.register import Register
+from fleet.live.journal import Journal
+from fleet.live.journal_records import Closed, CommitPermitted
+from fleet.live.journal_upkeep import CompactingJournal, TimeRecorder
 
 ROOT = Path(__file__).parents[2]
 
@@ -122,6 +127,7 @@ def test_a_journal_is_open_in_one_process_at_a_time(tmp_path):
     program = f"""
 from pathlib import Path
 from fleet.live.journal import Journal
+from fleet.live.journal_records import Closed, CommitPermitted
 from msgspec import Struct
 from fleet.errors import JournalError
 try:
@@ -185,6 +191,7 @@ sys.path.insert(0, {str(Path(__file__).parent)!r})
 from test_journal import KIND, Text
 from fleet.errors import JournalFull
 from fleet.live.journal import Journal
+from fleet.live.journal_records import Closed, CommitPermitted
 with Journal(Path({str(tmp_path / "j")!r}), KIND) as journal:
     journal.append(Text("kept"))
     resource.setrlimit(resource.RLIMIT_FSIZE, (journal.path.stat().st_size + 10,) * 2)
@@ -346,3 +353,37 @@ def test_fleet_time_never_runs_backwards_after_a_restart(tmp_path, monkeypatch):
     with Journal[GrantRecord](tmp_path / "j", GrantRecord) as book:
         again = TimeRecorder(book, Register().replay(book.records()), real_s=0.0)
         assert 29 * 60.0 <= again.start_s(speed=60.0) <= 31 * 60.0
+
+
+def test_the_journal_of_an_arm_stays_short_while_it_is_written(tmp_path, monkeypatch):
+    """2000 jobs, of which it remembers 256: after a restart it tells the same history as without compaction."""
+    monkeypatch.setattr(journal, "COMPACT_BYTES", 20_000)
+    whole, path, sizes = ArmHistory(), tmp_path / "j", []
+    with Journal[ArmRecord](path, ArmRecord, sync=lambda file: None) as book:
+        kept = CompactingJournal(book, ArmHistory())
+        for number in range(2000):
+            job = JobSpec(name=f"job {number}", kind="hold", places=("rack",))
+            award = Award(f"award {number}", "round", "auctioneer", "quote", job, epoch=f"{number // 1500}")
+            records = [AwardAccepted(award), CommitPermitted(award.award)]
+            if number < 1999:
+                records += [Closed(award.award, "finished", 1, 1.0, job=job.name, arm="a"), ReportReceived(award.award)]
+            kept.append(*records)
+            whole.replay(records)
+            sizes.append(path.stat().st_size)
+    assert max(sizes[1000:]) == pytest.approx(max(sizes[:1000]), rel=0.2)
+    with Journal[ArmRecord](path, ArmRecord) as book:
+        again = ArmHistory().replay(book.records())
+    assert again.message("a") == whole.message("a")
+    message = again.after_restart("a", 0.0).message("a")
+    assert (message.epoch, message.awards) == ("1", ())
+    assert [job.name for job in message.finished] == [f"job {number}" for number in range(1743, 1999)]
+    assert [award.award for award in whole.message("a").awards] == list(whole.message("a").may_commit) == ["award 1999"]
+
+
+def test_a_history_of_long_names_fits_into_one_message():
+    jobs = tuple(JobSpec(name=f"{number:0128d}", kind="hold", places=("p" * 900,)) for number in range(256))
+    history = ArmHistory().replay([JobsFinished(jobs, "x")])
+    message = history.message("a")
+    assert 0 < len(message.finished) < 256
+    assert message.finished[-1] == jobs[-1]
+    assert len(encode(message)) < 65_536

@@ -27,8 +27,9 @@ from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.leases import SendAward
 from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.round import Timing
-from fleet.live.consensus.granter import Grant, Granter, Register
+from fleet.live.consensus.granter import Granter
 from fleet.live.consensus.participant import QUIET_S, Membership, Participant
+from fleet.live.consensus.register import Grant, Register
 from fleet.live.space import CellSpace
 from fleet.motor import gen3_motors
 from fleet.observation import FIELDS, Observation
@@ -176,11 +177,11 @@ def observed_without_auctioneer(shift: LiveShift) -> dict[str, Observation]:
     participants = {}
     for name, node in shift.nodes.items():
         granter = Granter(name, NAMES, Register(), lambda *_: None, real_s=0.0, excludes=shift.excludes)
-        fill(granter.register, ledger, shift.auctioneer.states)
+        fill(granter.register, ledger, shift.auctioneer.rounds.states)
         membership = Membership(fleet=shift.fleet, choose=wait, slots=24, excludes=shift.excludes)
         participants[name] = Participant(node, granter, membership, boot=1, rng=Random(0))
         participants[name].add_jobs(shift.jobs)
-        participants[name].states.update(shift.auctioneer.states)
+        participants[name].states.update(shift.auctioneer.rounds.states)
         participants[name].set_present(frozenset(NAMES))
     for real_s in (0.0, 0.1):
         for participant in participants.values():

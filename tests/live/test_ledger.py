@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 
 from fleet.bus.protocol.auction import JobSpec
 from fleet.live.auction.job_rules import admit
-from fleet.live.auction.ledger import AuctionRecord, Awarded, ContactLost, ContactRegained, Ledger, ShiftEnded
+from fleet.live.auction.ledger import Ledger
+from fleet.live.auction.past_jobs import PastJobs
+from fleet.live.auction.records import AuctionRecord, Awarded, ContactLost, ContactRegained, Expired, ShiftEnded
 from fleet.live.journal_records import ClockTick, Closed, CommitPermitted, JobsAccepted
 
 
@@ -68,7 +70,7 @@ def test_a_job_at_an_unknown_place_is_rejected_with_its_successors():
 def test_the_number_of_jobs_is_limited():
     admissions = admit([spec("b"), spec("c"), spec("a")], {"a": spec("a")}, limit=2)
     assert [a.accepted for a in admissions] == [True, False, True]
-    assert admissions[1].reason == "There are 2 jobs already; no more are accepted."
+    assert admissions[1].reason == "There are 2 open jobs already; submit it again when some are finished."
 
 
 @settings(max_examples=200, deadline=None)
@@ -294,8 +296,42 @@ def test_the_snapshot_of_a_week_is_short():
         book.apply(Closed(f"{i}:{job}", "refused" if i < 2700 else "finished", 4, float(i)))
         for _ in range(100):
             book.apply(ClockTick(float(i)))
-    assert len(book.awards) == 3000
-    assert len(book.compact()[0].awards) == 300
+    assert len(book.awards) == len(book.compact()[0].awards) == 300
+
+
+def test_settled_jobs_leave_and_their_names_are_known(monkeypatch):
+    """Of nine settled jobs two stay whole, the names of four more are known, and the first three are forgotten."""
+    monkeypatch.setattr("fleet.live.auction.ledger.MAX_SETTLED", 2)
+    book = Ledger(past=PastJobs(limit=4))
+    for i in range(9):
+        done = award(f"job {i}", i), Closed(f"{i}:job {i}", "finished", 4, float(i))
+        book.replay([JobsAccepted((spec(f"job {i}"),)), *(done if i != 4 else [Expired("job 4", 4.0)])])
+    book.apply(JobsAccepted((spec("next", "job 6"), spec("waits"))))
+    short = Ledger(past=PastJobs(limit=4)).replay(
+        msgspec.json.decode(msgspec.json.encode(book.compact()), type=list[AuctionRecord])
+    )
+    for each in (book, short):
+        assert list(each.jobs) == ["job 7", "job 8", "next", "waits"]
+        assert each.left == {"finished": 6, "given_up": 1}
+        assert names(each.ready(9.0, 9)) == ["next", "waits"]
+        same, other, forgotten = each.admit([spec("job 3"), spec("job 5", value=2.0), spec("job 2")])
+        assert (same.accepted, other.accepted, forgotten.accepted) == (True, False, True)
+        assert same.reason == "It was finished long ago, and is not done again; the recording has its result."
+        assert other.reason == "Another job has the name 'job 5'; names must be unique."
+        assert forgotten.reason == ""
+        late, after = each.admit([spec("late", "job 4"), spec("after", "job 5")])
+        assert (late.reason, after.reason) == ("Given up, because it waits for 'job 4', which is given up.", "")
+        assert each.apply(JobsAccepted((spec("job 3"),))) == []
+    assert short.past == book.past
+    assert len(book.awards) == 2
+
+
+def test_only_open_jobs_count_against_the_limit(monkeypatch):
+    monkeypatch.setattr("fleet.live.auction.ledger.MAX_SETTLED", 2)
+    book = ledger(spec("a"), spec("b"), spec("c"))
+    for name in "ab":
+        book.replay([award(name), Closed(f"0:{name}", "finished", 4, 1.0)])
+    assert (len(book.jobs), len(book.settled), list(book.waiting)) == (3, 2, ["c"])
 
 
 RECORDS = """[

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.errors import FleetError
-from fleet.live.supervisor import Backoff, Part, Supervisor
+from fleet.live.supervisor import WAITS, Backoff, LogFile, Part, Supervisor
 
 PATIENCE_S = 20.0
 WAIT = "import signal; print('ready x', flush=True); signal.pause()"
@@ -86,6 +86,51 @@ def test_a_process_that_always_fails_is_restarted_with_delays(tmp_path):
         supervisor.start(part("a", "raise SystemExit(3)"))
         supervisor.run(until(lambda: supervisor.restarts()["a"] == 3), poll_s=0.02)
     assert time.monotonic() - start_s >= 0.2 + 0.4 + 0.8
+
+
+def test_a_process_without_a_router_is_started_again_after_the_first_delay_each_time(tmp_path):
+    with Supervisor(tmp_path, backoff=Backoff(first_s=0.1, factor=1000.0, max_s=100.0)) as supervisor:
+        supervisor.start(part("a", f"raise SystemExit({WAITS})"))
+        supervisor.run(until(lambda: supervisor.restarts()["a"] == 3), poll_s=0.02)
+
+
+def test_a_full_log_disk_ends_neither_the_process_nor_its_supervision(tmp_path):
+    """A folder in place of the log refuses lines, as a full disk does."""
+    log = tmp_path / "a.log"
+    log.mkdir()
+    with Supervisor(tmp_path, backoff=Backoff(first_s=0.05)) as supervisor:
+        supervisor.start(part("a", WAIT), ready_s=PATIENCE_S)
+        for times in (1, 2):
+            os.kill(supervisor.pid("a"), signal.SIGKILL)
+            supervisor.run(until(lambda n=times: supervisor.restarts()["a"] == n and supervisor.ready("a")))
+            if times == 1:
+                log.rmdir()
+    assert log.read_text() == "ready x\n"
+
+
+def test_lost_lines_of_a_log_are_counted(tmp_path):
+    path = tmp_path / "a.log"
+    log = LogFile(path)
+    path.mkdir()
+    log.write("one\n")
+    log.write("two\n")
+    path.rmdir()
+    log.write("three\n")
+    assert path.read_text() == "[2 line(s) lost: the disk was full]\nthree\n"
+
+
+def test_a_system_that_cannot_start_a_process_does_not_end_supervision(tmp_path, monkeypatch):
+    def refuse(*_arguments, **_options):
+        raise OSError(12, "Cannot allocate memory")
+
+    with Supervisor(tmp_path, backoff=Backoff(first_s=0.01, max_s=0.05)) as supervisor:
+        supervisor.start(part("a", WAIT), ready_s=PATIENCE_S)
+        with monkeypatch.context() as full:
+            full.setattr("subprocess.Popen", refuse)
+            os.kill(supervisor.pid("a"), signal.SIGKILL)
+            for _ in range(20):
+                assert supervisor.poll(0.02) == ""
+        supervisor.run(until(lambda: supervisor.ready("a")), poll_s=0.02)
 
 
 def test_the_fleet_ends_when_an_essential_process_exits_with_code_0(tmp_path):

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from rich.console import Console
 
 from fleet.bus.client.client import BusClient
@@ -24,6 +25,8 @@ from fleet.live.monitor import snapshot as snapshot_module
 from fleet.live.monitor.event_feed import HISTORY, MAX_WAITING, NEWEST_ONLY, EventFeed, ReaderBuffer
 from fleet.live.monitor.listener import FleetListener
 from fleet.live.monitor.snapshot import FRESH_S, ArmSnapshot, FleetSnapshot, FleetView, JobScore
+from scenarios.cli.live.up import free_port
+from scenarios.cli.live.watch import GONE_S, ShiftEnd
 from scenarios.live.watch_screen import arm_line, format_age, format_scores, format_time, screen
 
 PATIENCE_S = 20.0
@@ -364,6 +367,30 @@ def test_a_snapshot_is_json(fleet):
     assert [(arm["arm"], arm["token"], arm["present"]) for arm in told["arms"]] == [("a", True, False)]
 
 
+def test_the_end_of_a_shift_is_told_when_all_have_left():
+    end = ShiftEnd()
+    arm = ArmSnapshot("a", token=True, present=True)
+    at_work = FleetSnapshot("f", (arm,), (), {"finished": 3, "awarded": 1}, ())
+    left = replace(at_work, arms=(replace(arm, token=False),))
+    settled = replace(left, counts={"finished": 3, "given_up": 1})
+    assert end.check(settled, 0.0) == ""  # nobody has been seen
+    assert [end.check(fleet, 1.0) for fleet in (at_work, left)] == ["", ""]
+    assert end.check(left, 99.0) == end.check(at_work, 99.5) == end.check(settled, 100.0) == ""
+    assert end.check(settled, 100.0 + GONE_S) == "The shift has ended: 3 of 4 jobs finished, 1 given up."
+
+
+def test_watch_waits_for_a_router_and_a_fleet():
+    port = free_port()
+    with subprocess.Popen(command("--endpoint", f"tcp/127.0.0.1:{port}"), stdout=subprocess.PIPE, text=True) as process:
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(2.0)
+        with Router(port) as router, BusClient(router.endpoint, "f") as link:
+            link.declare_token(keys.of_arm("f", "arm_0", "alive"))
+            assert "arm_0" in process.stdout.readline()
+            process.terminate()
+            process.communicate(timeout=PATIENCE_S)
+
+
 @pytest.mark.parametrize("fleets", [(), ("f", "g")])
 def test_an_ambiguous_fleet_is_an_error(fleets, token_reaches):
     with Router() as router:
@@ -371,7 +398,9 @@ def test_an_ambiguous_fleet_is_an_error(fleets, token_reaches):
         for link in links:
             link.declare_token(keys.of_arm(link.fleet, "a", "alive"))
             token_reaches(links[0], keys.of_arm(link.fleet, "a", "alive"))
-        done = subprocess.run(command("--endpoint", router.endpoint), capture_output=True, text=True, timeout=60)
+        done = subprocess.run(
+            command("--endpoint", router.endpoint, "--json"), capture_output=True, text=True, timeout=60
+        )
         for link in links:
             link.close()
     assert done.returncode == 2

@@ -103,7 +103,7 @@ def heard_from(link, fleet, enough):
         (["left", "--seed", "-1"], "--seed must be 0 to 4294967295 (got -1)."),
         (["left", "--speed", "inf"], "--speed must be > 0 and at most 10000 (got inf)."),
         (["left", "none.csv", "--source", "log"], "none.csv"),
-        (["left", "--difficulty", "blind", "--endpoint", "tcp/127.0.0.1:1"], "No router answered"),
+        (["left", "--difficulty", "blind", "--endpoint", "udp/127.0.0.1:1"], "is no endpoint of this bus"),
     ],
 )
 def test_an_error_of_the_arm_command_is_one_sentence(

@@ -25,7 +25,7 @@ from zenoh import ext as advanced
 
 from fleet.bus.client.queue import Mailbox
 from fleet.bus.client.replies import AnotherReplies, Replies, read_message
-from fleet.bus.client.router import open_client, plain_reason
+from fleet.bus.client.router import connect, plain_reason
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import MalformedMessage, Refusal, check_name, decode_as, encode, encoding
 from fleet.bus.protocol.registry import Channel, channel_for
@@ -61,6 +61,7 @@ class BusClient:
         timeout_s: float = 5.0,
         backlog: int = BACKLOG,
         read: Callable[[type[Any], str, str, bytes], tuple[str, Any]] = read_message,
+        stopped: Callable[[], bool] | None = None,
     ) -> None:
         """Prepare a client of the router at `endpoint`.
 
@@ -68,12 +69,13 @@ class BusClient:
             timeout_s: How long the router may take to accept the connection.
             backlog: Most messages in the queue; when it is full, the oldest is dropped.
             read: Reads publications; clients of one process may share a cached `read_message`.
+            stopped: Wait for a router until this is true, instead of `timeout_s`.
         """
         self.fleet = fleet
         self.malformed = 0
         self.rejections: deque[str] = deque(maxlen=8)
         self.overrun = 0
-        self._endpoint, self._timeout_s = endpoint, timeout_s
+        self._endpoint, self._timeout_s, self._stopped = endpoint, timeout_s, stopped
         self._waiting: Mailbox[tuple[Callable[..., None], tuple[Any, ...]]] = Mailbox()
         self._backlog = backlog
         self._read = read
@@ -86,13 +88,9 @@ class BusClient:
         self._at_exit = weakref.finalize(self, self._resources.close)
 
     def open(self) -> Self:
-        """Connect.
-
-        Raises:
-            BusError: no router accepted the connection.
-        """
+        """Connect; raises a BusError if no router accepts the connection."""
         if self._session is None:
-            self._session = open_client(self._endpoint, timeout_s=self._timeout_s)
+            self._session = connect(self._endpoint, self._timeout_s, self._stopped)
             self._resources.callback(self._session.close)
             self._participant = participant_at(self._endpoint)
         return self

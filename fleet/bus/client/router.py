@@ -9,6 +9,7 @@ import json
 import logging
 import re
 from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, Self
 
 import zenoh
@@ -17,11 +18,13 @@ from fleet.bus.client.rate_limits import Limits
 from fleet.bus.protocol.registry import SESSION_LEASE_S
 from fleet.bus.security.access_control import access_control, read_roster
 from fleet.bus.security.tls import Tls, identified, why_not
-from fleet.errors import BusError
+from fleet.errors import BusError, NoRouter
 
 _LOG = logging.getLogger(__name__)
 
 _ATTEMPTS = 3
+_TURN_S = 1.0
+"""Real seconds of one attempt while waiting for a router."""
 _ENDPOINT = re.compile(r"(?P<protocol>tcp|tls)/(?:\[(?P<v6>[0-9A-Fa-f:.]+)\]|(?P<host>[^:\[\]/?#]+)):(?P<port>\d{1,5})")
 _ANY_ADDRESS = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}
 """Wildcard addresses of a listener, and the address at which this machine reaches it."""
@@ -99,6 +102,25 @@ def reachable(endpoint: str, tls: Tls | None = None) -> str:
     return endpoint
 
 
+def connect(endpoint: str, timeout_s: float, stopped: Callable[[], bool] | None) -> zenoh.Session:
+    """A client session on the router at `endpoint`: once there is one, if `stopped` is given, instead of `timeout_s`.
+
+    Raises:
+        BusError: as `open_client`, if waiting does not help, or stopped meanwhile.
+    """
+    if stopped is None:
+        return open_client(endpoint, timeout_s=timeout_s)
+    waits = False
+    while not stopped():
+        try:
+            return open_client(endpoint, timeout_s=_TURN_S)
+        except NoRouter as error:
+            if not waits:
+                _LOG.warning("Waiting for a router. %s", error)
+            waits = True
+    raise NoRouter(f"Stopped while waiting for a router at {endpoint}.")
+
+
 def open_client(endpoint: str, *, timeout_s: float, tls: Tls | None = None) -> zenoh.Session:
     """A client session on the router at `endpoint`.
 
@@ -107,8 +129,8 @@ def open_client(endpoint: str, *, timeout_s: float, tls: Tls | None = None) -> z
         tls: The participant, for an endpoint that begins with `tls/` and does not name one.
 
     Raises:
-        BusError: the endpoint is not on loopback and has no TLS, the certificate is not valid, or no router answered
-            within `timeout_s`.
+        BusError: the endpoint is not on loopback and has no TLS, or the certificate is not valid.
+        NoRouter: no router answered within `timeout_s`.
     """
     if tls is None:
         endpoint, tls = identified(endpoint)
@@ -124,8 +146,9 @@ def open_client(endpoint: str, *, timeout_s: float, tls: Tls | None = None) -> z
     try:
         return zenoh.open(_config({"mode": "client", "connect": connect}, link))
     except zenoh.ZError as error:
-        reason = why_not(*_address(endpoint), tls) or plain_reason(error)
-        raise BusError(f"No router answered at {endpoint} within {timeout_s} s ({reason}).") from error
+        reason, stays = why_not(*_address(endpoint), tls)
+        sentence = f"No router answered at {endpoint} within {timeout_s} s ({reason or plain_reason(error)})."
+        raise (BusError if stays else NoRouter)(sentence) from error
 
 
 class Router:

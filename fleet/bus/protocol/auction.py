@@ -94,6 +94,8 @@ class SubmissionReply(msgspec.Struct, frozen=True):
 
     auctioneer: Name
     jobs: tuple[Admission, ...]
+    epoch: str = ""
+    """As in `Clock`. Another one than before means that the fleet has lost its journal: submit open jobs again."""
 
 
 class QuoteRequest(msgspec.Struct, frozen=True):
@@ -212,6 +214,8 @@ class Award(msgspec.Struct, frozen=True):
     """Real seconds that the arm may work on it without renewing the lease, counted from its quote."""
     plan: Count = 0
     """Number of the quoted plan by which to do it."""
+    epoch: str = ""
+    """As in `Clock`; the arm has the last one on disk."""
 
 
 class Ack(msgspec.Struct, frozen=True):
@@ -323,6 +327,8 @@ class Status(msgspec.Struct, frozen=True):
     space: dict[Name, tuple[Name, ...]] = {}
     """Names of the spaces that are closed to others, by the arm that takes them or may take them; "*" is all space
     within its reach."""
+    epoch: str = ""
+    """As in `Clock`."""
 
 
 class Announcement(msgspec.Struct, frozen=True):
@@ -347,25 +353,6 @@ class Result(msgspec.Struct, frozen=True):
     """Quoted by the arm, as are the next two."""
     p_saturation: float | None = None
     peak_c: float | None = None
-
-
-class ClearRequest(msgspec.Struct, frozen=True):
-    """Request to `jobs/clear`: free the space of an absent arm, and end its awards. The same request again changes
-    nothing.
-
-    Only a person who has seen that the arm is at home or removed, and switched off, may request it.
-    """
-
-    arm: Name
-    by: str = ""
-    """Who requests it, for the records."""
-
-
-class Cleared(msgspec.Struct, frozen=True):
-    """Reply to a `ClearRequest`: it is on disk, and the arm takes no space until it sends messages again."""
-
-    auctioneer: Name
-    arm: Name
 
 
 class ArmEvent(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -393,6 +380,8 @@ class Clock(msgspec.Struct, frozen=True):
     """Fleet time of the reply."""
     speed: Positive
     """Fleet seconds per real second."""
+    epoch: str = ""
+    """Name of the journal that the fleet continues; another one if that was lost, or a new shift began."""
 
     def __post_init__(self) -> None:
         finite("Clock", "time_s", (self.time_s,))

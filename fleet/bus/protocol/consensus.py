@@ -45,6 +45,8 @@ class Bid(msgspec.Struct, frozen=True):
     """The job among the estimates that this arm's policy chose; "" for none yet."""
     choice_plan: Count = 0
     """Number of the plan that it chose."""
+    epoch: str = ""
+    """Name of the shift, as in `Clock`; an arm that has none takes that of the first bid."""
 
     def __post_init__(self) -> None:
         finite("Bid", "time_s", (self.time_s,))

@@ -10,8 +10,6 @@ from fleet.bus.protocol.auction import (
     Announcement,
     ArmEvent,
     Award,
-    Cleared,
-    ClearRequest,
     Clock,
     ClockRequest,
     JobEstimate,
@@ -32,7 +30,9 @@ from fleet.bus.protocol.auction import (
     SubmissionReply,
 )
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimEntry, ClaimReply, DeniedEntry, GrantedEntry, JobOutcome
+from fleet.bus.protocol.history import History, HistoryRequest
 from fleet.bus.protocol.messages import DifficultyScores, Info, Refusal, State
+from fleet.bus.protocol.operator import Cleared, ClearRequest
 
 CRATE = JobSpec(
     name="crate_1",
@@ -45,6 +45,7 @@ CRATE = JobSpec(
 )
 _ARM, _AUCTIONEER = "arm_0", "auctioneer"
 _ROUND, _QUOTE, _AWARD = "auctioneer-17", "arm_0-2-41", "auctioneer-17-crate_1"
+_EPOCH = "3f9a0c71"
 _CLAIMED, _SPACE = f"{_QUOTE}:crate_1", "5d1c0f7e92ab3486"
 _FASTEST = PlanQuote(
     peak_c=51.5,
@@ -103,7 +104,18 @@ _ALL: tuple[msgspec.Struct, ...] = (
         estimates=(_OFFER,),
         space=(),
     ),
-    Award(award=_AWARD, auction=_ROUND, auctioneer=_AUCTIONEER, quote=_QUOTE, job=CRATE, cycles=0, lease_s=6.0),
+    Award(
+        award=_AWARD,
+        auction=_ROUND,
+        auctioneer=_AUCTIONEER,
+        quote=_QUOTE,
+        job=CRATE,
+        cycles=0,
+        lease_s=6.0,
+        epoch=_EPOCH,
+    ),
+    HistoryRequest(),
+    History(arm=_ARM, epoch=_EPOCH, finished=(CRATE,), claims={"arm_1": 3000000012}),
     Ack(arm=_ARM, award=_AWARD, accepted=True),
     Bid(
         arm=_ARM,
@@ -146,12 +158,12 @@ _ALL: tuple[msgspec.Struct, ...] = (
     Receipt(auctioneer=_AUCTIONEER, award=_AWARD),
     Refusal(reason="Award 'auctioneer-17-crate_1' is of 'crate_1' to 'arm_1', not of 'crate_1' to 'arm_0'."),
     Submission(jobs=(CRATE,), by="shop floor"),
-    SubmissionReply(auctioneer=_AUCTIONEER, jobs=(Admission(job="crate_1", accepted=True),)),
+    SubmissionReply(auctioneer=_AUCTIONEER, jobs=(Admission(job="crate_1", accepted=True),), epoch=_EPOCH),
     StatusRequest(jobs=("crate_1",)),
-    Status(auctioneer=_AUCTIONEER, time_s=900.0, jobs=(_DONE,), space={"arm_2": ("5d1c0f7e92ab3486",)}),
+    Status(auctioneer=_AUCTIONEER, time_s=900.0, jobs=(_DONE,), space={"arm_2": ("5d1c0f7e92ab3486",)}, epoch=_EPOCH),
     ClearRequest(arm="arm_2", by="shop floor"),
     Cleared(auctioneer=_AUCTIONEER, arm="arm_2"),
     ClockRequest(),
-    Clock(time_s=600.0, speed=60.0),
+    Clock(time_s=600.0, speed=60.0, epoch=_EPOCH),
 )
 EXAMPLES: Mapping[type[msgspec.Struct], msgspec.Struct] = {type(word): word for word in _ALL}

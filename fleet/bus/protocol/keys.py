@@ -14,7 +14,7 @@ from typing import Literal, get_args
 from urllib.parse import quote, unquote
 
 Role = Literal["arm", "auction", "jobs", "clock"]
-ArmTopic = Literal["alive", "state", "info", "difficulty", "event", "bid", "quote", "award"]
+ArmTopic = Literal["alive", "state", "info", "difficulty", "event", "bid", "quote", "award", "history"]
 AuctionTopic = Literal["alive", "announce", "result"]
 AskedTopic = Literal["lease", "report", "claim"]
 JobsTopic = Literal["submit", "status", "clear"]

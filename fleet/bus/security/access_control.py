@@ -149,16 +149,20 @@ def rights(fleet: str, participant: Participant, *, by_consensus: bool = False) 
     """
     time, status = keys.of_clock(fleet), keys.of_jobs(fleet, "status")
     quotes, awards = keys.of_every_arm(fleet, "quote"), keys.of_every_arm(fleet, "award")
+    history = keys.of_every_arm(fleet, "history")
     if participant.role == "arm":
         # The key names the querier, so only that arm may use it.
         asked = tuple(keys.asked_of_all(fleet, topic, participant.name) for topic in ("lease", "report", "claim"))
         answers = (keys.all_of(fleet, "jobs"), keys.all_of(fleet, "clock")) if by_consensus else ()
-        return Rights(publishes=(keys.all_of(fleet, "arm", participant.name), *answers), queries=(*asked, time))
+        return Rights(
+            publishes=(keys.all_of(fleet, "arm", participant.name), *answers),
+            queries=(*asked, time, *((history,) if by_consensus else ())),
+        )
     if participant.role == "auctioneer":
         own = keys.all_of(fleet, "auction", participant.name)
         return Rights(
             publishes=(own, keys.all_of(fleet, "jobs"), keys.all_of(fleet, "clock")),
-            queries=(quotes, awards, time, status),
+            queries=(quotes, awards, history, time, status),
         )
     if participant.role in ("submitter", "operator"):
         clear = (keys.of_jobs(fleet, "clear"),) if participant.role == "operator" else ()

@@ -125,13 +125,20 @@ def participant_at(endpoint: str) -> Participant | None:
     return Participant(unquote(name), cast(Role, role)) if role in ROLES else None
 
 
-def why_not(host: str, port: int, tls: Tls | None) -> str:
-    """Why a connection to a router fails, from a trial handshake; "" if it gives no reason."""
+_NO_REPLY = "the server does not use TLS: no reply to the handshake"
+
+
+def why_not(host: str, port: int, tls: Tls | None) -> tuple[str, bool]:
+    """Why a connection to a router fails, from a trial handshake, and whether it will also fail later.
+
+    The reason is "" if the handshake gives none.
+    """
     try:
         with socket.create_connection((host, port), timeout=_PROBE_S) as line:
-            return _why_not_plain(line) if tls is None else _why_not_tls(line, host, tls)
+            reason = _why_not_plain(line) if tls is None else _why_not_tls(line, host, tls)
     except OSError as error:
-        return error.strerror or str(error)
+        return error.strerror or str(error), False
+    return reason, reason not in ("", _NO_REPLY)
 
 
 def _why_not_plain(line: socket.socket) -> str:
@@ -163,5 +170,5 @@ def _why_not_tls(line: socket.socket, host: str, tls: Tls) -> str:
             return f"the router refuses the certificate of '{tls.name}': {reason.partition('alert ')[2]}"
         return f"the server does not use TLS: {reason}"
     except TimeoutError:
-        return "" if accepted else "the server does not use TLS: no reply to the handshake"
+        return "" if accepted else _NO_REPLY
     return ""

@@ -11,8 +11,10 @@ import msgspec
 from fleet.bus.client.replies import Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Lease, LeaseRequest, Receipt, Report
+from fleet.bus.protocol.history import HistoryRequest
 from fleet.errors import BusError
 from fleet.live.arm.clock_sync import REPLY_S, ClockSync
+from fleet.live.arm.journal_records import ArmHistory
 
 if TYPE_CHECKING:
     from fleet.live.arm.node import ArmNode
@@ -65,8 +67,16 @@ class AuctioneerClient:
     objection = ""
     wake_s = math.inf
 
-    def __init__(self, arm: "ArmNode") -> None:
+    def __init__(self, arm: "ArmNode", history: ArmHistory | None = None) -> None:
+        """Start.
+
+        Args:
+            history: The awards of the arm on its disk, now and later: auctioneers ask for it.
+        """
         self._link, self._executor = arm.link, arm.executor
+        if history is not None:
+            link, fleet, name = arm.link, arm.link.fleet, arm.executor.arm
+            link.reply_to(keys.of_arm(fleet, name, "history"), HistoryRequest, lambda _: history.message(name))
         self._warn = RateLimitedWarnings(arm.executor.arm)
         self._clock = ClockSync(
             arm.link, lambda: arm.clock, lambda clock, jump: arm.set_clock(clock, jump=jump), self._warn

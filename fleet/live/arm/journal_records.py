@@ -10,11 +10,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import msgspec
+from msgspec.structs import replace
 
-from fleet.bus.protocol.auction import Award, Name, Report
+from fleet.bus.protocol.auction import MOST_JOBS, Award, JobSpec, Name, Report
+from fleet.bus.protocol.history import MOST_FINISHED, History
+from fleet.bus.protocol.messages import encode
 from fleet.live.journal import JournalState
 from fleet.live.journal_records import Closed, CommitPermitted, Progress, Released, Started
 
+MAX_BYTES = 60_000
+"""Size of a history: a router may drop larger messages."""
 MAX_PAST_AWARDS = 256
 """Closed awards whose answer is kept; their quotes expired long ago."""
 
@@ -38,7 +43,16 @@ class PastAward(msgspec.Struct, frozen=True, tag="past_award"):
     job: Name
 
 
-ArmRecord = Started | AwardAccepted | Progress | CommitPermitted | Closed | Released | ReportReceived | PastAward
+class JobsFinished(msgspec.Struct, frozen=True, tag="jobs_finished"):
+    """Jobs that the arm finished, and the last epoch that it knows."""
+
+    jobs: tuple[JobSpec, ...]
+    epoch: str = ""
+
+
+ArmRecord = (
+    JobsFinished | Started | AwardAccepted | Progress | CommitPermitted | Closed | Released | ReportReceived | PastAward
+)
 
 
 @dataclass(eq=False)
@@ -80,6 +94,10 @@ class ArmHistory(JournalState[ArmRecord]):
     """Not acknowledged yet, by award."""
     accepted: dict[str, str] = field(default_factory=dict[str, str])
     """Job of every accepted award, oldest first: the last `MAX_PAST_AWARDS` closed ones and all others."""
+    epoch: str = ""
+    """Of the last accepted award that has one."""
+    finished: dict[str, JobSpec] = field(default_factory=dict[str, JobSpec])
+    """The last jobs that the arm finished, oldest first."""
 
     def apply(self, record: ArmRecord) -> None:
         """Change the history as the record says."""
@@ -89,6 +107,7 @@ class ArmHistory(JournalState[ArmRecord]):
             case AwardAccepted(award):
                 self.active[award.award] = ActiveAward(award, award.cycles, cycles_on_disk=award.cycles)
                 self.accepted[award.award] = award.job.name
+                self.epoch = award.epoch or self.epoch
             case Progress(job, cycles):
                 for active in self.active.values():
                     if active.job == job:
@@ -98,17 +117,32 @@ class ArmHistory(JournalState[ArmRecord]):
                     self.active[name].may_commit = True
             case Closed(name):
                 if name in self.active:
-                    self.reports[name] = self.active.pop(name).award, report_of(record)
+                    award = self.active.pop(name).award
+                    self.reports[name] = award, report_of(record)
+                    if record.outcome == "finished":
+                        self._finish(award.job)
             case Released(name):
                 self.active.pop(name, None)
             case ReportReceived(name):
                 self.reports.pop(name, None)
             case PastAward(name, job):
                 self.accepted[name] = job
+            case JobsFinished(jobs, epoch):
+                self.epoch = epoch or self.epoch
+                for job in jobs:
+                    self._finish(job)
+
+    def _finish(self, job: JobSpec) -> None:
+        self.finished.pop(job.name, None)
+        self.finished[job.name] = job
+        if len(self.finished) > MOST_FINISHED:
+            del self.finished[next(iter(self.finished))]
 
     def compact(self) -> tuple[ArmRecord, ...]:
-        """Return the fewest records that give the same history."""
+        """Return the fewest records that give the same history, without closed awards of long ago."""
+        self.accepted = bounded(self.accepted, [*self.reports, *self.active])
         records: list[ArmRecord] = [Started(boot=self.boot)]
+        records += [JobsFinished(tuple(self.finished.values()), self.epoch)] if self.epoch or self.finished else []
         records += [PastAward(name, job) for name, job in self.accepted.items()]
         for award, report in self.reports.values():
             records += [AwardAccepted(award), closed(report)]
@@ -124,7 +158,21 @@ class ArmHistory(JournalState[ArmRecord]):
             reason = "the arm was restarted" + (" after it was permitted to commit" if active.may_commit else "")
             report = Report(arm, name, active.job, "returned", active.cycles, time_s, reason, unsure=active.may_commit)
             reports[name] = active.award, report
-        return ArmHistory(self.boot + 1, {}, reports, bounded(self.accepted, reports))
+        accepted = bounded(self.accepted, reports)
+        return ArmHistory(self.boot + 1, {}, reports, accepted, self.epoch, dict(self.finished))
+
+    def message(self, arm: str) -> History:
+        """Return what the arm has done and has, as much as fits into one message."""
+        active = list(self.active.values())[:MOST_JOBS]
+        awards = tuple(replace(each.award, cycles=each.cycles) for each in active)
+        may_commit = tuple(each.award.award for each in active if each.may_commit)
+        history = History(arm, self.epoch, (), awards, may_commit)
+        size, finished = len(encode(history)), list[JobSpec]()
+        for job in reversed(self.finished.values()):
+            if (size := size + len(encode(job)) + 1) > MAX_BYTES:
+                break
+            finished.append(job)
+        return replace(history, finished=tuple(reversed(finished)))
 
 
 def bounded(accepted: dict[str, str], needed: Iterable[str]) -> dict[str, str]:

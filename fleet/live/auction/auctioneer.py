@@ -16,54 +16,37 @@ make it safe (`fleet.bus.protocol.auction` says why):
 
 import logging
 import math
-from collections import deque
 from collections.abc import Callable, Iterable
 
-from msgspec.structs import asdict, replace
+from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import (
     Ack,
-    Announcement,
-    Award,
-    Cleared,
-    ClearRequest,
     JobStatus,
     Lease,
     LeaseEntry,
     LeaseRequest,
     Quote,
-    QuoteRequest,
     Receipt,
     Report,
-    Result,
     Submission,
     SubmissionReply,
 )
+from fleet.bus.protocol.history import History
 from fleet.bus.protocol.messages import State
-from fleet.errors import JournalFull, Refused
-from fleet.live.auction.leases import CountedLease, SendAward, new_awards, send_again, unanswered
-from fleet.live.auction.ledger import AuctionRecord, Change, ContactLost, ContactRegained, Ledger, ShiftEnded
-from fleet.live.auction.round import (
-    MAX_REASON,
-    Allocate,
-    Assignment,
-    Bidding,
-    Round,
-    Timing,
-    drop_invalid,
-    infeasible_jobs,
-)
-from fleet.live.auction.space_rules import cleared_space, retaken_space, stated_spaces, waits_for_space
+from fleet.bus.protocol.operator import Cleared, ClearRequest
+from fleet.errors import Refused
+from fleet.live.auction.leases import CountedLease, adopted, send_again, unanswered
+from fleet.live.auction.ledger import Ledger
+from fleet.live.auction.records import AuctionRecord, ContactLost, ContactRegained, ShiftEnded
+from fleet.live.auction.round import MAX_REASON, Allocate, Timing
+from fleet.live.auction.rounds import SCAN_S, Rounds
+from fleet.live.auction.space_rules import cleared_space, retaken_space
+from fleet.live.auction.writer import LedgerWriter
 from fleet.live.journal_records import Closed, CommitPermitted, JobsAccepted
 from fleet.live.space import Excludes, no_conflicts
 
 _LOG = logging.getLogger(__name__)
-
-SCAN_S = 0.05
-"""Real seconds between two checks for jobs that have become ready."""
-
-
-Out = QuoteRequest | SendAward | Announcement | Result
 
 
 class Auctioneer:
@@ -72,7 +55,7 @@ class Auctioneer:
     Attributes:
         ledger: Its jobs and awards.
         out: Messages to send, oldest first; the driver takes them out.
-        states: The last state of each arm.
+        rounds: Its rounds.
     """
 
     def __init__(
@@ -94,20 +77,11 @@ class Auctioneer:
             boot: Part of the names of auctions and awards; unique for each start of an auctioneer of this name.
         """
         self.name, self.ledger = name, ledger
-        self.out: deque[Out] = deque(self._result(change) for change in ledger.recent)
-        self.states: dict[str, State] = {}
-        self._allocate, self._keep, self._boot = allocate, keep, boot
-        self._timing, self._excludes = timing or Timing(), excludes
-        self._leases = {award: CountedLease(real_s + self._timing.counted_lease_s) for award in ledger.open}
-        self._round: Round | None = None
-        self._rounds = 0
-        self._present: frozenset[str] = frozenset()
-        self._later_s: dict[str, float] = {}
-        """Real second from which a job may be offered again."""
-        self._notes: dict[str, str] = {}
-        """Why no arm can do a job."""
-        self._scan_s = -math.inf
-        self._pause_s = self._timing.pause_s[0]
+        self._timing = timing or Timing()
+        self._writer = LedgerWriter(name, ledger, keep, real_s + self._timing.counted_lease_s)
+        self.rounds = Rounds(name, self._writer, allocate, self._timing, excludes, boot)
+        self._checked_s = -math.inf
+        self.out = self._writer.out
 
     # Messages
 
@@ -115,11 +89,11 @@ class Auctioneer:
         """Accept jobs; every accepted one is on disk when this returns."""
         admissions = self.ledger.admit(submission.jobs)
         accepted = {job.name: job for job, reply in zip(submission.jobs, admissions, strict=True) if reply.accepted}
-        new = tuple(job for name, job in accepted.items() if name not in self.ledger.jobs)
+        new = tuple(j for name, j in accepted.items() if name not in self.ledger.jobs and name not in self.ledger.past)
         if new:
-            self._record(JobsAccepted(new, submission.by, time_s))
-            self._retry_now()
-        return SubmissionReply(self.name, admissions)
+            self._writer.record(JobsAccepted(new, submission.by, time_s))
+            self.rounds.retry_now()
+        return SubmissionReply(self.name, admissions, self.ledger.epoch)
 
     def renew_leases(self, request: LeaseRequest, real_s: float, time_s: float) -> Lease:
         """Renew leases, and permit to commit where an arm asks for it.
@@ -132,7 +106,7 @@ class Auctioneer:
         if not self._permit_commits(leased, time_s):
             leased = {award: entry for award, entry in leased.items() if not self.ledger.open[award].silent}
         for award, entry in leased.items():
-            lease = self._leases[award]
+            lease = self._writer.leases[award]
             lease.unanswered, lease.cycles = None, max(entry.cycles, lease.cycles)
             lease.until_s = real_s + self._timing.counted_lease_s
         return Lease(
@@ -165,43 +139,56 @@ class Auctioneer:
                 _LOG.error("'%s' finished '%s' without permission to commit.", report.arm, report.job)
             done_s, reason = min(report.time_s, time_s), report.reason[:MAX_REASON]
             outcome = (report.award, report.outcome, report.cycles, done_s, reason, report.unsure)
-            self._record(Closed(*outcome, faulted=report.faulted))
+            self._writer.record(Closed(*outcome, faulted=report.faulted))
             if report.outcome == "finished":
-                self._retry_now()
+                self.rounds.retry_now()
             else:
-                self._delay(real_s, (report.job,))
+                self.rounds.delay(real_s, (report.job,))
         return receipt
+
+    def adopt(self, history: History, real_s: float) -> None:
+        """Take over what an arm has done and has, as far as the journal does not know it.
+
+        Raises:
+            JournalError: it is not on disk.
+        """
+        records = adopted(self.ledger, history, self.name, self.ledger.time_s)
+        if records:
+            _LOG.warning("%d records of what '%s' has done and has are new to the journal.", len(records), history.arm)
+            self._writer.record(*records)
+            for award in self.ledger.open.keys() - self._writer.leases.keys():
+                self._writer.leases[award] = CountedLease(real_s + self._timing.counted_lease_s)
 
     def add_quote(self, quote: Quote) -> None:
         """Add a quote; after the last one that the round waits for, the next tick closes it."""
-        if self._round is not None and quote.auction == self._round.auction:
-            self._round.quotes[quote.arm] = quote
+        if (current := self.rounds.open) is not None and quote.auction == current.auction:
+            current.quotes[quote.arm] = quote
 
     def end_quotes(self, auction: str) -> None:
         """Have the next tick close a round: no more quotes will arrive."""
-        if self._round is not None and self._round.auction == auction:
-            self._round.until_s = -math.inf
+        if (current := self.rounds.open) is not None and current.auction == auction:
+            current.until_s = -math.inf
 
     def apply_ack(self, ack: Ack, real_s: float, time_s: float) -> None:
         """Apply an arm's answer to an award."""
-        lease = self._leases.get(ack.award)
+        lease = self._writer.leases.get(ack.award)
         if lease is None or lease.unanswered is None or lease.unanswered.arm != ack.arm:
             return
         if not ack.accepted:
             reason = f"'{ack.arm}' refused it: {ack.reason}"[:MAX_REASON]
-            self._record(Closed(ack.award, "refused", 0, time_s, reason))
-            self._delay(real_s, (lease.unanswered.award.job.name,))
+            self._writer.record(Closed(ack.award, "refused", 0, time_s, reason))
+            self.rounds.delay(real_s, (lease.unanswered.award.job.name,))
         lease.unanswered = None
-        if not unanswered(self._leases):
-            self._scan_s = -math.inf  # the next round can begin
+        if not unanswered(self._writer.leases):
+            self.rounds.scan_now()
 
     def apply_state(self, arm: str, state: State) -> None:
         """Apply the state of an arm; one that has come home may have freed space."""
-        before = self.states.get(arm)
+        before = self.rounds.states.get(arm)
         self._take_space(arm, {state.space} - {""})
         if before is not None and before.space and not state.space:
-            self._retry_now()
-        self.states[arm] = state
+            self.rounds.retry_now()
+        self.rounds.states[arm] = state
 
     def clear(self, request: ClearRequest, present: frozenset[str], time_s: float) -> Cleared:
         """Free the space of an absent arm and end its awards: a person has seen that it is at home, or removed.
@@ -211,40 +198,37 @@ class Auctioneer:
         Raises:
             Refused: the arm is unknown, or present, or may have a lease.
         """
-        cycles = {name: lease.cycles for name, lease in self._leases.items()}
+        cycles = {name: lease.cycles for name, lease in self._writer.leases.items()}
         if records := cleared_space(self.ledger, request, present, cycles, self._timing.lease_s, time_s):
-            self._record(*records)
+            self._writer.record(*records)
             _LOG.warning("The space of '%s' was cleared by '%s'.", request.arm, request.by)
-            self._retry_now()
+            self.rounds.retry_now()
         return Cleared(self.name, request.arm)
 
     def set_present(self, present: frozenset[str]) -> None:
         """Set which arms are present."""
-        if present - self._present:
-            self._retry_now()
-        self._present = present
+        if present - self.rounds.present:
+            self.rounds.retry_now()
+        self.rounds.present = present
 
     def tick(self, real_s: float, time_s: float) -> None:
         """Do what is due."""
         self._expire(real_s, time_s)
-        self._try_to_record("Late jobs are not given up", *self.ledger.expired(time_s))
-        self.out.extend(send_again(self._leases, real_s, self._timing))
-        if self._round is None:
-            if real_s >= self._scan_s:
-                self._scan_s = real_s + SCAN_S
-                self._open_round(real_s, time_s)
-        elif real_s >= self._round.until_s or self._round.complete(self._present):
-            self._close_round(self._round, real_s, time_s)
+        if real_s >= self._checked_s + SCAN_S:
+            self._checked_s = real_s
+            self._writer.try_to_record("Late jobs are not given up", *self.ledger.expired(time_s))
+        self.out.extend(send_again(self._writer.leases, real_s, self._timing))
+        self.rounds.step(real_s, time_s)
 
     def end(self, time_s: float) -> None:
         """End the shift: nothing more is offered, and open jobs are reported unfinished."""
         if not self.ledger.ended:
-            self._round = None
-            self._record(ShiftEnded(time_s))
+            self.rounds.open = None
+            self._writer.record(ShiftEnded(time_s))
 
     def finishing(self) -> bool:
         """Return whether a present arm may be in the last cycle of a job."""
-        return any(award.may_commit and award.record.arm in self._present for award in self.ledger.open.values())
+        return any(award.may_commit and award.record.arm in self.rounds.present for award in self.ledger.open.values())
 
     def status(self, names: Iterable[str] = ()) -> tuple[JobStatus, ...]:
         """Return the status of jobs, with the last reported progress."""
@@ -253,9 +237,9 @@ class Auctioneer:
     # Leases
 
     def _with_progress(self, status: JobStatus) -> JobStatus:
-        lease = self._leases.get(status.award)
+        lease = self._writer.leases.get(status.award)
         cycles = status.cycles if lease is None else max(status.cycles, lease.cycles)
-        note = self._notes.get(status.job, "") if status.state == "waiting" else ""
+        note = self.rounds.note(status.job) if status.state == "waiting" else ""
         return replace(status, cycles=cycles, reason=status.reason or note)
 
     def _is_leased(self, entry: LeaseEntry, arm: str) -> bool:
@@ -273,128 +257,24 @@ class Auctioneer:
                 records.append(CommitPermitted(name, time_s))
             elif award.silent and not self.ledger.ended:
                 records.append(ContactRegained(name, time_s))
-        return self._try_to_record("No permission to commit is given", *records)
+        return self._writer.try_to_record("No permission to commit is given", *records)
 
     def _take_space(self, arm: str, space: set[str]) -> None:
         """Record that an arm that is heard takes this space; on a full disk nothing is awarded, and it is repeated."""
-        self._try_to_record(f"The space of '{arm}' is not recorded", *retaken_space(self.ledger, arm, space))
+        self._writer.try_to_record(f"The space of '{arm}' is not recorded", *retaken_space(self.ledger, arm, space))
 
     def _expire(self, real_s: float, time_s: float) -> None:
         """Close awards whose lease has ended; one with permission to commit stays open."""
-        for name, lease in [(name, lease) for name, lease in self._leases.items() if real_s >= lease.until_s]:
+        for name, lease in [(name, lease) for name, lease in self._writer.leases.items() if real_s >= lease.until_s]:
             award = self.ledger.open[name]
             missing = "renew its lease" if lease.unanswered is None else "answer the award"
             vain = f"'{award.record.job}' is not taken back from '{award.record.arm}'"
             if not award.may_commit:
                 reason = f"'{award.record.arm}' did not {missing}."
-                if not self._try_to_record(vain, Closed(name, "dropped", lease.cycles, time_s, reason)):
+                if not self._writer.try_to_record(vain, Closed(name, "dropped", lease.cycles, time_s, reason)):
                     return
-                self._retry_now()
+                self.rounds.retry_now()
             elif not award.silent and not self.ledger.ended:
-                if not self._try_to_record(vain, ContactLost(name, time_s)):
+                if not self._writer.try_to_record(vain, ContactLost(name, time_s)):
                     return
                 lease.until_s = math.inf
-
-    # Rounds
-
-    def _retry_now(self) -> None:
-        """Offer delayed jobs again at once: something has changed."""
-        self._later_s.clear()
-        self._scan_s = -math.inf
-        self._pause_s = self._timing.pause_s[0]
-
-    def _delay(self, real_s: float, jobs: Iterable[str]) -> None:
-        """Offer these jobs again after a pause, which is longer each time in a row."""
-        self._later_s |= dict.fromkeys(jobs, real_s + self._pause_s)
-        self._pause_s = min(2 * self._pause_s, self._timing.pause_s[1])
-
-    def _open_round(self, real_s: float, time_s: float) -> None:
-        waiting = unanswered(self._leases)
-        bidders = self._present - {message.arm for _, message in waiting}
-        if not bidders or any(real_s < lease.sent_s + self._timing.window_s for lease, _ in waiting):
-            return
-        delayed = {job for job, at_s in self._later_s.items() if at_s > real_s}
-        jobs = tuple(self.ledger.ready(time_s, self._timing.max_jobs, excluded=delayed))
-        busy = self.ledger.busy_stations()
-        if not any(busy.isdisjoint(job.places) for job in jobs):
-            return
-        self._rounds += 1
-        auction = f"{self.name}-{self._boot}-{self._rounds}"
-        self._round = Round(auction, jobs, bidders, real_s + self._timing.window_s, self.ledger.closed_space())
-        self.out.append(Announcement(self.name, auction, time_s, tuple(job.name for job in jobs)))
-        cycles = {job.name: done for job in jobs if (done := self.ledger.jobs[job.name].cycles)}
-        self.out.append(QuoteRequest(auction, jobs, cycles=cycles))
-
-    def _close_round(self, closing: Round, real_s: float, time_s: float) -> None:
-        self._round = None
-        if not self._try_to_record("Nothing is awarded", *stated_spaces(self.ledger, closing, time_s)):
-            self._delay(real_s, (job.name for job in closing.jobs))
-            return
-        entries = [self.ledger.jobs[job.name] for job in closing.jobs]
-        entries = [entry for entry in entries if entry.state == "waiting"]
-        jobs = tuple(entry.spec for entry in entries)
-        quotes = {arm: quote for arm, quote in closing.quotes.items() if arm in closing.asked & self._present}
-        bidding = Bidding(
-            closing.auction,
-            time_s,
-            jobs,
-            {arm: quote for arm, quote in quotes.items() if quote.capacity},
-            {arm: quote for arm, quote in quotes.items() if not quote.capacity},
-            states=self.states,
-            returned={entry.spec.name: (len(entry.faults), entry.returned_s) for entry in entries if entry.returns},
-            busy=self.ledger.busy_stations(),
-            taken=self.ledger.taken_space(),
-            excludes=self._excludes,
-        )
-        for job in closing.jobs if quotes else ():
-            self._notes.pop(job.name, None)
-        self._notes |= infeasible_jobs(quotes) | waits_for_space(bidding)
-        allocation = drop_invalid(bidding, self._allocate(bidding)) if bidding.quotes and jobs else {}
-        try:
-            self._award(bidding, allocation, real_s, time_s)
-        except JournalFull as error:
-            _LOG.error("Nothing is awarded: %s", error)
-            allocation = {}
-        if allocation:
-            self._scan_s, self._pause_s = -math.inf, self._timing.pause_s[0]
-        else:
-            if not bidding.quotes:  # no arm has capacity for any job
-                self._scan_s = real_s + self._pause_s
-            self._delay(real_s, (job.name for job in closing.jobs))
-
-    def _award(self, bidding: Bidding, allocation: dict[str, Assignment], real_s: float, time_s: float) -> None:
-        self._record(*(records := new_awards(self.ledger, bidding, allocation, time_s)))
-        for record in records:
-            self._notes.pop(record.job, None)
-            spec = self.ledger.jobs[record.job].spec
-            terms = (record.quote, spec, record.cycles, self._timing.lease_s, record.plan)
-            award = Award(record.award, bidding.auction, self.name, *terms)
-            message = SendAward(record.arm, award)
-            until_s = real_s + self._timing.counted_lease_s
-            self._leases[record.award] = CountedLease(until_s, unanswered=message, sent_s=real_s)
-            self.out.append(message)
-
-    def _record(self, *records: AuctionRecord) -> None:
-        """Write records, then apply them.
-
-        Raises:
-            JournalError: nothing was written, and nothing has changed.
-        """
-        if not records:
-            return
-        self._keep(*records)
-        for record in records:
-            self.out.extend(map(self._result, self.ledger.apply(record)))
-        self._leases = {award: lease for award, lease in self._leases.items() if award in self.ledger.open}
-
-    def _try_to_record(self, failure: str, *records: AuctionRecord) -> bool:
-        """Record; return whether that is on disk, and log the failure if not."""
-        try:
-            self._record(*records)
-        except JournalFull as error:
-            _LOG.error("%s: %s", failure, error)
-            return False
-        return True
-
-    def _result(self, change: Change) -> Result:
-        return Result(self.name, **asdict(change))

@@ -11,9 +11,10 @@ from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import MOST_JOBS, SETTLED, Admission, JobSpec, JobStatus, Status
 from fleet.bus.protocol.messages import encode
+from fleet.live.auction.past_jobs import PastJobs
 
-MAX_KEPT_JOBS = 10_000
-"""Jobs that one auctioneer keeps, finished ones included."""
+MAX_OPEN_JOBS = 10_000
+"""Jobs of one auctioneer that are neither finished nor given up; more are refused."""
 MAX_BYTES = 60_000
 """Size of the statuses in one reply: a router may drop larger messages."""
 SHIFT_ENDED = "The shift ended before it was done."
@@ -29,18 +30,25 @@ def admit(
     known: Mapping[str, JobSpec],
     *,
     places: frozenset[str] | None = None,
-    limit: int = MAX_KEPT_JOBS,
+    count: int | None = None,
+    limit: int = MAX_OPEN_JOBS,
     ended: bool = False,
     given_up: Container[str] = (),
+    past: PastJobs | None = None,
 ) -> tuple[Admission, ...]:
     """Return which jobs of one submission can be accepted; they may name one another as predecessors in any order.
 
     Args:
-        known: Jobs that were accepted before. An identical job is accepted again and changes nothing.
+        known: Jobs that were accepted before, at least those that the submission names. An identical job is accepted
+            again and changes nothing.
         places: Places of the cell; None allows any name.
+        count: Open jobs; by default all known ones.
         ended: Whether the shift is over.
         given_up: Known jobs that are given up: a job that waits for one is accepted, and given up too.
+        past: Jobs that were settled long ago; they are known, too.
     """
+    past = past or PastJobs()
+    count = len(known) if count is None else count
     rejected: dict[int, str] = {}
     new: dict[str, JobSpec] = {}
     for index, job in enumerate(jobs):
@@ -48,23 +56,29 @@ def admit(
         unknown = [place for place in job.places if places is not None and place not in places]
         if ended:
             rejected[index] = "The shift is over: no more jobs are accepted."
-        elif same_name == job:
+        elif same_name == job or past.is_same(job):
             continue
-        elif same_name is not None:
+        elif same_name is not None or job.name in past:
             rejected[index] = f"Another job has the name '{job.name}'; names must be unique."
         elif unknown:
             rejected[index] = f"No place '{unknown[0]}' in this cell. Places: {', '.join(sorted(places or ()))}."
-        elif len(known) + len(new) >= limit:
-            rejected[index] = f"There are {limit} jobs already; no more are accepted."
+        elif count + len(new) >= limit:
+            rejected[index] = f"There are {limit} open jobs already; submit it again when some are finished."
         else:
             new[job.name] = job
-    never = _never_ready(new, known)
+    never = _never_ready(new, lambda name: name in known or name in past)
     reasons = [rejected.get(index) or never.get(job.name, "") for index, job in enumerate(jobs)]
-    lost = lost_jobs(new.values(), given_up)
+    notes = lost_jobs(new.values(), given_up)
+    notes |= {job.name: _past_note(job.name, past) for job in jobs if job.name in past}
     return tuple(
-        Admission(job.name, not reason, reason or lost.get(job.name, ""))
+        Admission(job.name, not reason, reason or notes.get(job.name, ""))
         for job, reason in zip(jobs, reasons, strict=True)
     )
+
+
+def _past_note(name: str, past: PastJobs) -> str:
+    how = "finished" if past.is_finished(name) else "given up"
+    return f"It was {how} long ago, and is not done again; the recording has its result."
 
 
 EXPIRED = "expired: its due date passed before an arm had begun it."
@@ -89,9 +103,9 @@ def lost_jobs(jobs: Collection[JobSpec], given_up: Container[str]) -> dict[str, 
     return reasons
 
 
-def _never_ready(new: Mapping[str, JobSpec], known: Mapping[str, JobSpec]) -> dict[str, str]:
+def _never_ready(new: Mapping[str, JobSpec], is_known: Callable[[str], bool]) -> dict[str, str]:
     """Return why jobs can never begin, by name."""
-    waits = nx.DiGraph((job.name, before) for job in new.values() for before in job.after if before not in known)
+    waits = nx.DiGraph((job.name, before) for job in new.values() for before in job.after if not is_known(before))
     rings = {
         name: group
         for group in nx.strongly_connected_components(waits)
@@ -102,7 +116,7 @@ def _never_ready(new: Mapping[str, JobSpec], known: Mapping[str, JobSpec]) -> di
     stuck.update(*(nx.ancestors(waits, name) for name in list(stuck)))
     reasons: dict[str, str] = {}
     for name in new.keys() & stuck:
-        missing = [before for before in new[name].after if before not in known and before not in new]
+        missing = [before for before in new[name].after if not is_known(before) and before not in new]
         if missing:
             reasons[name] = f"It waits for '{missing[0]}', which is unknown or was not accepted."
         elif name in rings:
@@ -129,15 +143,16 @@ def ready_jobs(
 ) -> list[JobSpec]:
     """Return the jobs that wait for an arm, as they queue: released, predecessors finished.
 
-    A job queues by its release, or by its last return. Of more than `limit` jobs, those with free stations come first.
+    A job queues by its release, or by its last return, then by name. Of more than `limit` jobs, those with free
+    stations come first.
 
     Args:
         busy: Stations at which an arm may be at work.
         returned_s: Fleet time of the last return, by job.
     """
 
-    def queued_s(job: JobSpec) -> float:
-        return max(job.release_s, returned_s.get(job.name, 0.0))
+    def queued_s(job: JobSpec) -> tuple[float, float, str]:
+        return max(job.release_s, returned_s.get(job.name, 0.0)), *job_order(job)
 
     ready = [job for job in jobs if job.release_s <= time_s and all(map(finished, job.after))]
     ready.sort(key=queued_s)
@@ -147,7 +162,9 @@ def ready_jobs(
     return ready
 
 
-def status_reply(name: str, time_s: float, statuses: Iterable[JobStatus], taken: Mapping[str, Iterable[str]]) -> Status:
+def status_reply(
+    name: str, time_s: float, statuses: Iterable[JobStatus], taken: Mapping[str, Iterable[str]], epoch: str = ""
+) -> Status:
     """Return the reply to a status request.
 
     It has as many statuses as one message may contain; of more, those that may still change come first.
@@ -157,7 +174,7 @@ def status_reply(name: str, time_s: float, statuses: Iterable[JobStatus], taken:
         taken: Names of the spaces that each arm may take.
     """
     kept, space = list(statuses), {arm: tuple(sorted(names)) for arm, names in sorted(taken.items()) if names}
-    reply = Status(name, time_s, (), space)
+    reply = Status(name, time_s, (), space, epoch)
     if len(kept) > MOST_JOBS:
         kept = sorted(kept, key=lambda status: status.state in SETTLED)[:MOST_JOBS]
     sizes = accumulate((len(encode(status)) + 1 for status in kept), initial=len(encode(reply)))

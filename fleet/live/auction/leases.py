@@ -1,12 +1,15 @@
-"""New awards, and leases of open ones as the auctioneer counts them."""
+"""New and adopted awards, and leases of open ones as the auctioneer counts them."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from fleet.bus.protocol.auction import Award
-from fleet.live.auction.ledger import Awarded, Ledger
+from fleet.bus.protocol.history import History
+from fleet.live.auction.ledger import Ledger
+from fleet.live.auction.records import AuctionRecord, Awarded, HistoryAdopted
 from fleet.live.auction.round import Assignment, Bidding, Timing
+from fleet.live.journal_records import CommitPermitted, JobsAccepted
 from fleet.live.space import ANYWHERE
 
 
@@ -57,3 +60,37 @@ def new_awards(ledger: Ledger, bidding: Bidding, allocation: Mapping[str, Assign
         heat = (offer.difficulty, offer.p_saturation, offer.peak_c)
         records.append(Awarded(*names, ledger.jobs[job].cycles, time_s, *heat, offer.space or ANYWHERE, plan))
     return records
+
+
+def adopted(ledger: Ledger, history: History, name: str, time_s: float) -> list[AuctionRecord]:
+    """Return what an auctioneer takes over from an arm: jobs that it finished, and awards that it has.
+
+    Args:
+        name: Name of the auctioneer; an arm leases the awards of another one there.
+    """
+    records: list[AuctionRecord] = []
+    waiting = {job: entry.spec for job, entry in ledger.waiting.items()}
+    unknown = tuple(
+        job
+        for job in history.finished
+        if waiting.get(job.name) == job or (job.name not in ledger.jobs and job.name not in ledger.past)
+    )
+    if unknown:
+        records.append(HistoryAdopted(history.arm, unknown, time_s))
+    done = {job.name for job in unknown}
+    for award in history.awards:
+        job = award.job
+        fresh = job.name not in ledger.jobs and job.name not in ledger.past and job.name not in done
+        if award.auctioneer != name or award.award in ledger.awards or not (fresh or waiting.get(job.name) == job):
+            continue
+        if fresh:
+            records.append(JobsAccepted((job,), f"adopted from {history.arm}", time_s))
+        records.append(_awarded(award, history.arm, time_s))
+        if award.award in history.may_commit:
+            records.append(CommitPermitted(award.award, time_s))
+    return records
+
+
+def _awarded(award: Award, arm: str, time_s: float) -> Awarded:
+    terms = (award.award, award.auction, award.job.name, arm, award.quote, award.cycles, time_s)
+    return Awarded(*terms, plan=award.plan)

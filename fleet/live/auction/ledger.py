@@ -5,29 +5,34 @@ ends of leases are not recorded: after a restart every open award counts as leas
 """
 
 from collections import deque
-from collections.abc import Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-import msgspec
 from msgspec.structs import asdict, replace
 
-from fleet.bus.protocol.auction import SETTLED, Admission, JobSpec, JobState, JobStatus
+from fleet.bus.protocol.auction import JobState
 from fleet.job import reason_to_give_up
-from fleet.live.auction.job_rules import (
-    EXPIRED,
-    SHIFT_ENDED,
-    admit,
-    is_late,
-    job_order,
-    lost_jobs,
-    ready_jobs,
-    reason_for_silence,
+from fleet.live.auction.job_rules import EXPIRED, SHIFT_ENDED, lost_jobs, reason_for_silence
+from fleet.live.auction.ledger_view import MAX_RECENT, LedgerView
+from fleet.live.auction.past_jobs import PastJobs
+from fleet.live.auction.records import (
+    AuctionRecord,
+    Awarded,
+    AwardState,
+    Change,
+    ContactLost,
+    ContactRegained,
+    Expired,
+    HistoryAdopted,
+    JobEntry,
+    LedgerSnapshot,
+    ShiftEnded,
 )
 from fleet.live.journal import TimedState
 from fleet.live.journal_records import (
     ClockTick,
     Closed,
     CommitPermitted,
+    EpochBegun,
     JobsAccepted,
     SpaceCleared,
     SpaceTaken,
@@ -35,203 +40,18 @@ from fleet.live.journal_records import (
 )
 from fleet.live.space import ANYWHERE
 
-MAX_RECENT = 64
-"""Latest changes, published again after a restart for those who missed them."""
-
-
-class Awarded(msgspec.Struct, frozen=True, tag="awarded"):
-    """A job is awarded to an arm, which may have a lease on it from now on."""
-
-    award: str
-    auction: str
-    job: str
-    arm: str
-    quote: str
-    cycles: int
-    """Done by other arms before."""
-    time_s: float
-    difficulty: float | None = None
-    p_saturation: float | None = None
-    peak_c: float | None = None
-    space: str = ANYWHERE
-    """Name of the space of its plan."""
-    plan: int = 0
-    """Number of the plan in the quote."""
-
-
-class ContactLost(msgspec.Struct, frozen=True, tag="contact_lost"):
-    """The lease of an arm with permission to commit has ended: it is unknown whether the job is done."""
-
-    award: str
-    time_s: float
-
-
-class ContactRegained(msgspec.Struct, frozen=True, tag="contact_regained"):
-    """The arm renews its lease again, and still has the job."""
-
-    award: str
-    time_s: float
-
-
-class Expired(msgspec.Struct, frozen=True, tag="expired"):
-    """A waiting job is given up: its hard due date has passed."""
-
-    job: str
-    time_s: float
-
-
-class ShiftEnded(msgspec.Struct, frozen=True, tag="shift_ended"):
-    """The fleet's shift is over; open jobs stay unfinished."""
-
-    time_s: float
-
-
-class Change(msgspec.Struct, frozen=True):
-    """A job's state has changed; fields as in `fleet.bus.protocol.auction.Result`."""
-
-    number: int
-    time_s: float
-    status: JobStatus
-    auction: str = ""
-    difficulty: float | None = None
-    p_saturation: float | None = None
-    peak_c: float | None = None
-
-
-class JobEntry(msgspec.Struct):
-    """State of one job."""
-
-    spec: JobSpec
-    by: str
-    state: JobState = "waiting"
-    award: str = ""
-    """The open one, or the last one."""
-    cycles: int = 0
-    finished_s: float | None = None
-    reason: str = ""
-    returns: int = 0
-    """How many times an arm returned it."""
-    returned_s: float = 0.0
-    """Fleet time of the last return."""
-    faults: tuple[str, ...] = ()
-    """The arm of each fault in this job."""
-    expired: bool = False
-    """It waited when its hard due date passed."""
-
-
-class AwardState(msgspec.Struct):
-    """State of one award."""
-
-    record: Awarded
-    may_commit: bool = False
-    silent: bool = False
-    """The arm has permission to commit, and has not renewed its lease."""
-    outcome: str = ""
-
-
-class LedgerSnapshot(msgspec.Struct, frozen=True, tag="ledger_snapshot"):
-    """The whole ledger, in place of the records before."""
-
-    time_s: float
-    number: int
-    """Of the next change."""
-    ended: bool
-    jobs: tuple[JobEntry, ...]
-    awards: tuple[AwardState, ...]
-    """Awards on which a report could still change something."""
-    open: tuple[str, ...]
-    """Names of open awards."""
-    recent: tuple[Change, ...]
-    space: dict[str, tuple[str, ...]] = {}
-    """As in `Ledger`."""
-
-
-AwardRecord = Awarded | CommitPermitted | ContactLost | ContactRegained | Closed
-AuctionRecord = (
-    Started | ClockTick | JobsAccepted | AwardRecord | SpaceTaken | SpaceCleared | Expired | ShiftEnded | LedgerSnapshot
-)
+MAX_SETTLED = 2_000
+"""Finished and given-up jobs whose status is kept; older ones leave the ledger, and only `PastJobs` knows them."""
+MAX_AWARDS = 16
+"""Closed awards of one job on which a report is still expected."""
 
 
 @dataclass
-class Ledger(TimedState[AuctionRecord]):
+class Ledger(LedgerView, TimedState[AuctionRecord]):
     """Jobs and awards; only `apply` changes it."""
-
-    places: frozenset[str] | None = None
-    """Places of the cell; None allows any name."""
-    arms: tuple[str, ...] = ()
-    """Arms of the cell: each may be anywhere until it says where it is."""
-    jobs: dict[str, JobEntry] = field(default_factory=dict[str, JobEntry])
-    """By release and name."""
-    awards: dict[str, AwardState] = field(default_factory=dict[str, AwardState])
-    time_s: float = 0.0
-    """Latest time of all records."""
-    number: int = 0
-    """Of the next change."""
-    ended: bool = False
-    recent: deque[Change] = field(default_factory=lambda: deque(maxlen=MAX_RECENT))
-    open: dict[str, AwardState] = field(default_factory=dict[str, AwardState])
-    """Awards that are not closed, by name."""
-    space: dict[str, frozenset[str]] = field(default_factory=dict[str, frozenset[str]])
-    """Names of the spaces that an arm may take besides those of its open awards, by arm: closed awards leave theirs
-    here until the arm says that it is at home."""
 
     def __post_init__(self) -> None:
         self.space |= {arm: frozenset([ANYWHERE]) for arm in self.arms}
-
-    def admit(self, jobs: Sequence[JobSpec]) -> tuple[Admission, ...]:
-        """Return which submitted jobs can be accepted; changes nothing."""
-        known = {name: entry.spec for name, entry in self.jobs.items()}
-        given_up = {name for name, entry in self.jobs.items() if entry.state == "given_up"}
-        return admit(jobs, known, places=self.places, ended=self.ended, given_up=given_up)
-
-    def ready(self, time_s: float, limit: int, *, excluded: Container[str] = ()) -> list[JobSpec]:
-        """Return the jobs that wait for an arm, as `ready_jobs` does."""
-        if self.ended:
-            return []
-        waiting = [e for name, e in self.jobs.items() if name not in excluded and e.state == "waiting"]
-        returned_s = {entry.spec.name: entry.returned_s for entry in waiting}
-        specs, busy = (entry.spec for entry in waiting), self.busy_stations()
-        return ready_jobs(specs, time_s, limit, busy, lambda name: self.jobs[name].state == "finished", returned_s)
-
-    def expired(self, time_s: float) -> list[Expired]:
-        """Return the waiting jobs whose hard due date has passed."""
-        entries = () if self.ended else self.jobs.values()
-        late = (entry.spec.name for entry in entries if entry.state == "waiting" and is_late(entry.spec, time_s))
-        return [Expired(name, time_s) for name in late]
-
-    def busy_stations(self) -> frozenset[str]:
-        """Return the stations at which an arm may be at work; a silent arm does not block its station."""
-        active = (award.record.job for award in self.open.values() if not award.silent)
-        return frozenset(place for job in active for place in self.jobs[job].spec.places)
-
-    def taken_space(self) -> Mapping[str, frozenset[str]]:
-        """Return the names of the spaces that each arm may take."""
-        taken = dict(self.space)
-        for award in self.open.values():
-            arm = award.record.arm
-            taken[arm] = taken.get(arm, frozenset()) | {award.record.space}
-        return taken
-
-    def space_of(self, awards: Iterable[str], arm: str) -> set[str]:
-        """Return the names of the spaces of an arm's awards; unknown awards have none."""
-        records = (self.awards[name].record for name in awards if name in self.awards)
-        return {record.space for record in records if record.arm == arm}
-
-    def closed_space(self) -> Mapping[str, frozenset[str]]:
-        """Return the names of the spaces that each arm may take for closed awards alone."""
-        still_open: dict[str, set[str]] = {}
-        for award in self.open.values():
-            still_open.setdefault(award.record.arm, set()).add(award.record.space)
-        return {arm: names - still_open.get(arm, set()) for arm, names in self.space.items()}
-
-    def unsettled(self) -> list[str]:
-        """Return the names of jobs that still need an arm or a report."""
-        return [name for name, entry in self.jobs.items() if entry.state not in SETTLED]
-
-    def status(self, names: Iterable[str] = ()) -> list[JobStatus]:
-        """Return the status of these jobs, without unknown ones; of all jobs if none is named."""
-        wanted = dict.fromkeys(names) or self.jobs
-        return [self._status(self.jobs[name]) for name in wanted if name in self.jobs]
 
     def compact(self) -> tuple[LedgerSnapshot]:
         """Return one record that gives the same ledger, without awards on which a report would change nothing."""
@@ -245,6 +65,11 @@ class Ledger(TimedState[AuctionRecord]):
             number=self.number,
             ended=self.ended,
             jobs=tuple(map(replace, self.jobs.values())),
+            settled=tuple(self.settled),
+            past=self.past.packed(),
+            left=dict(self.left),
+            epoch=self.epoch,
+            succeeds=self.succeeds,
             awards=tuple(map(replace, kept)),
             open=tuple(self.open),
             recent=tuple(self.recent),
@@ -257,27 +82,33 @@ class Ledger(TimedState[AuctionRecord]):
         changed: list[JobEntry] = []
         match record:
             case JobsAccepted():
-                changed = [JobEntry(job, record.by) for job in record.jobs if job.name not in self.jobs]
-                self._set_jobs([*self.jobs.values(), *changed])
-                self._follow_given_up()
+                new = (job for job in record.jobs if job.name not in self.jobs and job.name not in self.past)
+                changed = [JobEntry(job, record.by) for job in new]
+                for entry in changed:
+                    self.jobs[entry.spec.name] = entry
+                    self._move(entry, "waiting")
+                if any(entry.spec.after for entry in changed):
+                    self._follow_given_up()
             case Awarded():
                 entry = self.jobs[record.job]
+                self._forget_awards(entry)
                 self.awards[record.award] = self.open[record.award] = AwardState(record)
-                entry.state, entry.award, entry.reason = "awarded", record.award, ""
+                self._awards_of.setdefault(record.job, []).append(record.award)
+                entry.award = record.award
+                self._move(entry, "awarded")
                 changed = [entry]
             case CommitPermitted() | ContactLost() | ContactRegained():
                 award, entry = self.awards[record.award], self._entry(record.award)
                 award.may_commit, award.silent = True, isinstance(record, ContactLost)
-                entry.state, entry.reason = "finishing", ""
-                if award.silent:
-                    entry.state, entry.reason = "unfinished", reason_for_silence(award.record.arm)
+                silence = reason_for_silence(award.record.arm) if award.silent else ""
+                self._move(entry, "unfinished" if award.silent else "finishing", silence)
                 changed = [entry]
             case Closed():
                 changed = self._close(record)
-                changed += [entry for entry in self._follow_given_up() if entry not in changed]
             case Expired():
                 entry = self.jobs[record.job]
-                entry.state, entry.reason, entry.expired = "given_up", EXPIRED, True
+                entry.expired = True
+                self._move(entry, "given_up", EXPIRED)
                 changed = [entry, *self._follow_given_up()]
             case SpaceTaken():
                 self.space[record.arm] = frozenset(record.space)
@@ -287,18 +118,63 @@ class Ledger(TimedState[AuctionRecord]):
                 self.ended = True
                 changed = [self.jobs[name] for name in self.unsettled()]
                 for entry in changed:
-                    entry.state, entry.reason = "unfinished", entry.reason or SHIFT_ENDED
+                    self._move(entry, "unfinished", entry.reason or SHIFT_ENDED)
+            case EpochBegun():
+                self.epoch, self.succeeds = record.epoch, record.succeeds
+            case HistoryAdopted():
+                changed = self._adopt(record)
             case LedgerSnapshot():
                 self._restore(record)
             case Started() | ClockTick():
                 pass
         self.time_s = max(self.time_s, record.time_s)
-        return [self._change(entry, record.time_s) for entry in changed]
+        changes = [self._change(entry, record.time_s) for entry in changed]
+        while len(self.settled) > MAX_SETTLED:
+            self._leave(next(iter(self.settled)))
+        return changes
 
     # Inside
 
-    def _set_jobs(self, entries: Iterable[JobEntry]) -> None:
-        self.jobs = {entry.spec.name: entry for entry in sorted(entries, key=lambda entry: job_order(entry.spec))}
+    def _move(self, entry: JobEntry, state: JobState, reason: str = "") -> None:
+        """Change the state of a job."""
+        name = entry.spec.name
+        for index in (self.waiting, self.settled):
+            index.pop(name, None)
+        entry.state, entry.reason = state, reason
+        if state == "waiting":
+            self.waiting[name] = entry
+        elif state in ("finished", "given_up"):
+            self.settled[name] = None
+
+    def _adopt(self, record: HistoryAdopted) -> list[JobEntry]:
+        """Apply what an arm has finished; return the waiting jobs that need no arm any more."""
+        for job in record.finished:
+            if job.name not in self.jobs:
+                self.past.add(job, finished=True)
+        entries = [self.waiting[job.name] for job in record.finished if job.name in self.waiting]
+        for entry in entries:
+            entry.cycles, entry.finished_s, entry.award = entry.spec.repetitions, record.time_s, ""
+            self._move(entry, "finished", f"'{record.arm}' had finished it; the journal did not know it.")
+        return entries
+
+    def _leave(self, name: str) -> None:
+        """Forget a settled job, except for its name and outcome."""
+        entry = self.jobs.pop(name)
+        del self.settled[name]
+        self.past.add(entry.spec, finished=entry.state == "finished")
+        self.left[entry.state] = self.left.get(entry.state, 0) + 1
+        for award in self._awards_of.pop(name, ()):
+            del self.awards[award]
+
+    def _forget_awards(self, entry: JobEntry) -> None:
+        """Forget awards of a job on which no report is expected any more."""
+        names = self._awards_of.get(entry.spec.name, [])
+        kept = [name for name in names if name in self.open or self._may_count(self.awards[name])]
+        old = [name for name in kept if name not in self.open and not self.awards[name].may_commit][:-MAX_AWARDS]
+        kept = [name for name in kept if name not in old]
+        for name in set(names) - set(kept):
+            del self.awards[name]
+        self._awards_of[entry.spec.name] = kept
 
     def _close(self, record: Closed) -> list[JobEntry]:
         award = self.awards.get(record.award)
@@ -316,42 +192,44 @@ class Ledger(TimedState[AuctionRecord]):
         if record.outcome == "finished":
             if entry.award in self.open:  # a later award of the same job has no purpose any more
                 self._end(self.open[entry.award])
-            entry.state, entry.award, entry.reason, entry.finished_s = "finished", record.award, "", record.time_s
-        elif entry.award != record.award:  # the job was awarded again since
-            return [entry] if self._give_up(entry) else []
-        elif record.unsure or self.ended:
-            entry.state, entry.reason = "unfinished", record.reason or "It is unknown whether its last cycle was done."
-        else:
-            entry.state, entry.reason = "waiting", record.reason
-            if record.outcome == "returned" and reopened:
-                entry.returns, entry.returned_s = entry.returns + 1, record.time_s
-            entry.cycles = min(entry.cycles, entry.spec.repetitions - 1)  # the last cycle is never assumed done
-            self._give_up(entry)
-        return [entry]
+            given_up = entry.state == "given_up"
+            entry.award, entry.finished_s = record.award, record.time_s
+            self._move(entry, "finished")
+            return [entry, *(self._follow_given_up() if given_up else ())]
+        if entry.award != record.award:  # the job was awarded again since
+            return self._give_up(entry)
+        if record.unsure or self.ended:
+            self._move(entry, "unfinished", record.reason or "It is unknown whether its last cycle was done.")
+            return [entry]
+        self._move(entry, "waiting", record.reason)
+        if record.outcome == "returned" and reopened:
+            entry.returns, entry.returned_s = entry.returns + 1, record.time_s
+        entry.cycles = min(entry.cycles, entry.spec.repetitions - 1)  # the last cycle is never assumed done
+        return self._give_up(entry) or [entry]
 
-    @staticmethod
-    def _give_up(entry: JobEntry) -> bool:
-        """Give a waiting job up if arms have faulted in it too often; return whether it is given up now."""
+    def _give_up(self, entry: JobEntry) -> list[JobEntry]:
+        """Give a waiting job up if arms have faulted in it too often; return what has changed."""
         reason = reason_to_give_up(entry.faults)
         if entry.state != "waiting" or not reason:
-            return False
-        entry.state, entry.reason = "given_up", reason
-        return True
+            return []
+        self._move(entry, "given_up", reason)
+        return [entry, *self._follow_given_up()]
 
     def _follow_given_up(self) -> list[JobEntry]:
         """Give up jobs that wait for one that is given up; return what has changed.
 
         They wait again if that one was finished after all.
         """
-        if not (given_up := [entry for entry in self.jobs.values() if entry.state == "given_up"]):
-            return []
+        given_up = [self.jobs[name] for name in self.settled if self.jobs[name].state == "given_up"]
         causes = {entry.spec.name for entry in given_up if entry.expired or reason_to_give_up(entry.faults)}
-        lost = lost_jobs([entry.spec for entry in self.jobs.values()], causes)
+        open_jobs = [*self.waiting.values(), *(entry for entry in given_up if entry.spec.name not in causes)]
+        causes |= {name for entry in open_jobs for name in entry.spec.after if self.past.is_given_up(name)}
+        lost = lost_jobs([entry.spec for entry in open_jobs], causes) if causes else {}
         changed = list[JobEntry]()
-        for name, entry in self.jobs.items():
-            state = "given_up" if name in causes or name in lost else "waiting"
-            if entry.state in ("waiting", "given_up") and entry.state != state:
-                entry.state, entry.reason = state, lost.get(name, "")
+        for entry in open_jobs:
+            state = "given_up" if entry.spec.name in lost else "waiting"
+            if entry.state != state:
+                self._move(entry, state, lost.get(entry.spec.name, ""))
                 changed.append(entry)
         return changed
 
@@ -367,8 +245,16 @@ class Ledger(TimedState[AuctionRecord]):
 
     def _restore(self, snapshot: LedgerSnapshot) -> None:
         self.number, self.ended = snapshot.number, snapshot.ended
-        self._set_jobs(map(replace, snapshot.jobs))
+        self.jobs = {entry.spec.name: replace(entry) for entry in snapshot.jobs}
+        self.waiting = {name: entry for name, entry in self.jobs.items() if entry.state == "waiting"}
+        self.settled = dict.fromkeys(snapshot.settled)
+        self.settled |= {name: None for name, e in self.jobs.items() if e.state in ("finished", "given_up")}
+        self.past, self.left, self.epoch = PastJobs(snapshot.past, self.past.limit), dict(snapshot.left), snapshot.epoch
+        self.succeeds = snapshot.succeeds
         self.awards = {award.record.award: replace(award) for award in snapshot.awards}
+        self._awards_of = {}
+        for name, award in self.awards.items():
+            self._awards_of.setdefault(award.record.job, []).append(name)
         self.open = {name: self.awards[name] for name in snapshot.open}
         self.recent = deque(snapshot.recent, maxlen=MAX_RECENT)
         self.space |= {arm: frozenset(spaces) for arm, spaces in snapshot.space.items()}
@@ -380,16 +266,8 @@ class Ledger(TimedState[AuctionRecord]):
     def _entry(self, award: str) -> JobEntry:
         return self.jobs[self.awards[award].record.job]
 
-    def _status(self, entry: JobEntry) -> JobStatus:
-        assigned = entry.state in ("awarded", "finishing", "finished") or (
-            entry.state == "unfinished" and entry.award in self.open
-        )
-        award = entry.award if assigned else ""
-        arm = self.awards[award].record.arm if assigned else ""
-        return JobStatus(entry.spec.name, entry.state, arm, award, entry.cycles, entry.finished_s, entry.reason)
-
     def _change(self, entry: JobEntry, time_s: float) -> Change:
-        change = Change(self.number, time_s, self._status(entry))
+        change = Change(self.number, time_s, self.status_of(entry))
         if entry.award:
             award = asdict(self.awards[entry.award].record)
             change = replace(

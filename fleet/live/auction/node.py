@@ -16,8 +16,6 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Ack,
     Announcement,
-    Cleared,
-    ClearRequest,
     Clock,
     ClockRequest,
     LeaseRequest,
@@ -31,16 +29,21 @@ from fleet.bus.protocol.auction import (
     SubmissionReply,
 )
 from fleet.bus.protocol.messages import State
+from fleet.bus.protocol.operator import Cleared, ClearRequest
 from fleet.bus.protocol.registry import SESSION_LEASE_S
 from fleet.errors import BusError, JournalFull, Refused
-from fleet.live.auction.auctioneer import SCAN_S, Auctioneer
+from fleet.live.auction.auctioneer import Auctioneer
+from fleet.live.auction.epochs import EpochCheck, ask_arms, check_begin
 from fleet.live.auction.job_rules import status_reply
 from fleet.live.auction.leases import SendAward
-from fleet.live.auction.ledger import AuctionRecord, Ledger
+from fleet.live.auction.ledger import Ledger
+from fleet.live.auction.records import AuctionRecord
 from fleet.live.auction.round import Allocate, Timing
+from fleet.live.auction.rounds import SCAN_S
 from fleet.live.clock import FleetClock
-from fleet.live.journal import Journal, TimeRecorder
-from fleet.live.journal_records import Started
+from fleet.live.journal import Journal
+from fleet.live.journal_records import EpochBegun, Started
+from fleet.live.journal_upkeep import TimeRecorder
 from fleet.live.monitor.snapshot import FRESH_S
 from fleet.live.space import Excludes, no_conflicts
 
@@ -77,6 +80,7 @@ class AuctionNode:
         timing: Timing | None = None,
         arms: tuple[str, ...] = (),
         excludes: Excludes = no_conflicts,
+        new_epoch: bool = False,
     ) -> None:
         """Continue from a journal.
 
@@ -87,20 +91,25 @@ class AuctionNode:
             places: Names of the cell's places; None allows any name.
             arms: Arms of the cell; each may be anywhere until it is heard.
             excludes: Which plans of two arms exclude each other.
+            new_epoch: Begin with an empty journal even if arms know an older one.
 
         Raises:
-            BusError: the fleet has an auctioneer already.
+            BusError: the fleet has an auctioneer already, or the journal is empty and arms know an older one.
             JournalError: the journal is damaged, or has no space.
         """
         self._link, self._name, self.journal = link, name, journal
         self._timing = timing or Timing()
         self._check_no_auctioneer()
         ledger = Ledger(places, arms).replay(journal.records())
+        if not (ledger.epoch or new_epoch):
+            check_begin(link.fleet, ask_arms(link))
         real_s = time.monotonic()
         self._recorder = TimeRecorder(journal, ledger, real_s)
         start_s = self._recorder.start_s(speed)
         self._clock = FleetClock(speed, real_s, start_s)
-        journal.append(Started(name, start_s))
+        begun = () if ledger.epoch else (EpochBegun(secrets.token_hex(4), start_s, succeeds=new_epoch),)
+        journal.append(Started(name, start_s), *begun)
+        ledger.replay(begun)
         self.auctioneer = Auctioneer(
             name,
             ledger,
@@ -111,6 +120,7 @@ class AuctionNode:
             timing=self._timing,
             excludes=excludes,
         )
+        self._epochs = EpochCheck(link, self.auctioneer)
         self.rivals: set[str] = set()
         self._check_s = self._alone_s = -math.inf
         self._tokens: set[str] = set()
@@ -129,6 +139,11 @@ class AuctionNode:
         real_s = time.monotonic()
         return frozenset(arm for arm in self._tokens if real_s - self._state_s.get(arm, -math.inf) < FRESH_S)
 
+    @property
+    def epoch(self) -> str:
+        """Name of the journal."""
+        return self.auctioneer.ledger.epoch
+
     def serve(self, until_s: float) -> None:
         """Handle messages and do what is due, until `time.monotonic()` is `until_s` or slightly earlier.
 
@@ -140,7 +155,7 @@ class AuctionNode:
         if real_s >= self._check_s:
             self._check_rivals(real_s)
         alone = not self.rivals and real_s - self._alone_s < ALONE_S
-        self.auctioneer.set_present(self.present if alone else frozenset())
+        self.auctioneer.set_present(self._epochs.admitted(self.present if alone else ()))
         self.auctioneer.tick(real_s, time_s)
         self._recorder.step(real_s, time_s)
         self._send()
@@ -180,7 +195,7 @@ class AuctionNode:
         link.reply_to(keys.of_jobs(fleet, "clear"), ClearRequest, self._logged(self._clear))
         link.reply_to(keys.asked_by_every_arm(fleet, name, "lease"), LeaseRequest, renew_leases)
         link.reply_to(keys.asked_by_every_arm(fleet, name, "report"), Report, apply_report)
-        link.reply_to(keys.of_clock(fleet), ClockRequest, lambda _: Clock(self.time_s, self._clock.speed))
+        link.reply_to(keys.of_clock(fleet), ClockRequest, lambda _: Clock(self.time_s, self._clock.speed, self.epoch))
         link.subscribe(keys.of_every_arm(fleet, "state"), State, self._apply_state)
         link.watch_tokens(keys.of_every_arm(fleet, "alive"), self._apply_token)
         link.watch_tokens(keys.of_every_auction(fleet, "alive"), self._apply_rival_token)
@@ -201,6 +216,8 @@ class AuctionNode:
     def _submit(self, submission: Submission, real_s: float, time_s: float) -> SubmissionReply:
         if self.rivals:
             raise Refused(f"{self._name_rivals()}: no jobs are accepted until one is stopped.")
+        if self._epochs.objection:
+            raise Refused(self._epochs.objection)
         return self.auctioneer.submit(submission, real_s, time_s)
 
     def _clear(self, request: ClearRequest, real_s: float, time_s: float) -> Cleared:
@@ -210,7 +227,8 @@ class AuctionNode:
 
     def _status(self, request: StatusRequest) -> Status:
         auctioneer = self.auctioneer
-        return status_reply(self._name, self.time_s, auctioneer.status(request.jobs), auctioneer.ledger.taken_space())
+        taken = auctioneer.ledger.taken_space()
+        return status_reply(self._name, self.time_s, auctioneer.status(request.jobs), taken, self.epoch)
 
     def _apply_state(self, arm: str, state: State) -> None:
         self._state_s[arm] = time.monotonic()
@@ -220,6 +238,7 @@ class AuctionNode:
         (self._tokens.add if present else self._tokens.discard)(arm)
         if not present:
             self._state_s.pop(arm, None)
+            self._epochs.forget(arm)
 
     # Other auctioneers
 

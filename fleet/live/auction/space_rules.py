@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping, Set
 
-from fleet.bus.protocol.auction import ClearRequest, Quote
+from fleet.bus.protocol.auction import Quote
+from fleet.bus.protocol.operator import ClearRequest
 from fleet.errors import Refused
 from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.round import MAX_REASON, Bidding, Round

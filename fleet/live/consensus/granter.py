@@ -15,7 +15,6 @@ are on disk, and are applied only then. The rules that make it safe (`fleet.bus.
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
 
 from fleet.bus.protocol.auction import JobSpec, JobStatus
 from fleet.bus.protocol.consensus import (
@@ -31,137 +30,10 @@ from fleet.errors import JournalFull, Refused
 from fleet.job import reason_to_give_up
 from fleet.live.auction.job_rules import reason_for_silence
 from fleet.live.auction.round import Timing
-from fleet.live.consensus.records import ClaimNumbered, Faulted, GrantRecord, JobGranted, JobReturned, JobSettled
-from fleet.live.journal import TimedState
-from fleet.live.journal_records import ClockTick, JobsAccepted, Progress, Released, SpaceCleared, SpaceTaken
+from fleet.live.consensus.records import Faulted, GrantRecord, JobGranted, JobSettled
+from fleet.live.consensus.register import Register
+from fleet.live.journal_records import EpochBegun, JobsAccepted, Released, SpaceCleared, SpaceTaken
 from fleet.live.space import ANYWHERE, Excludes, arms_in_the_way, no_conflicts
-
-
-@dataclass(eq=False)
-class Grant:
-    """A job that is granted to an arm."""
-
-    arm: str
-    award: str
-    places: tuple[str, ...]
-    may_commit: bool = False
-    revoked: bool = False
-    """A person has freed the space of the arm, which may begin no cycle any more."""
-    until_s: float = 0.0
-    """Real second at which its lease ends."""
-
-
-@dataclass(eq=False)
-class Register(TimedState[GrantRecord]):
-    """The state that follows from the records; only `apply` changes it."""
-
-    grants: dict[str, Grant] = field(default_factory=dict[str, Grant])
-    """By job."""
-    settled: dict[str, JobOutcome] = field(default_factory=dict[str, JobOutcome])
-    """By job; finished, unfinished for good, or given up."""
-    faults: dict[str, Faults] = field(default_factory=dict[str, Faults])
-    """Faults of arms, by job."""
-    returned_s: dict[str, float] = field(default_factory=dict[str, float])
-    """Fleet time at which an arm last returned a job, by job."""
-    cycles: dict[str, int] = field(default_factory=dict[str, int])
-    """Cycles known to be done, by job."""
-    numbers: dict[str, int] = field(default_factory=dict[str, int])
-    """Number of the last claim, by arm."""
-    jobs: dict[str, JobSpec] = field(default_factory=dict[str, JobSpec])
-    """Submitted ones, by name."""
-    time_s: float = 0.0
-    space: dict[str, frozenset[str]] = field(default_factory=dict[str, frozenset[str]])
-    """Names of the spaces that an arm may take, by arm."""
-
-    def apply(self, record: GrantRecord) -> None:
-        """Apply a record that is on disk."""
-        match record:
-            case JobGranted():
-                self._count(record.job, record.cycles)
-                self._number(record.arm, record.number)
-                self.grants[record.job] = Grant(
-                    record.arm, record.award, record.places, record.may_commit, record.revoked
-                )
-            case Released():
-                self._number(record.arm, record.number)
-                grant = self.grants.get(record.job)
-                if grant is not None and grant.award == record.award:
-                    del self.grants[record.job]
-            case JobSettled(outcome):
-                self._count(outcome.job, outcome.cycles)
-                self.time_s = max(self.time_s, outcome.time_s)
-                self._add_faults(outcome.job, outcome.faults)
-                if outcome.outcome == "returned":
-                    self._return(outcome.job, outcome.time_s)
-                else:
-                    self.settled[outcome.job] = outcome
-                    self.grants.pop(outcome.job, None)
-                    self.returned_s.pop(outcome.job, None)
-            case Faulted(job, faults):
-                self._add_faults(job, faults)
-            case JobReturned(job, time_s):
-                self._return(job, time_s)
-            case JobsAccepted(jobs):
-                self.jobs |= {job.name: job for job in jobs}
-            case ClockTick(time_s):
-                self.time_s = max(self.time_s, time_s)
-            case ClaimNumbered(arm, number):
-                self._number(arm, number)
-            case Progress(job, cycles):
-                self._count(job, cycles)
-            case SpaceTaken():
-                self._number(record.arm, record.number)
-                self.space[record.arm] = frozenset(record.space)
-            case SpaceCleared(arm):
-                self.space[arm] = frozenset()
-                for grant in self.grants.values():
-                    grant.revoked |= grant.arm == arm
-
-    def compact(self) -> tuple[GrantRecord, ...]:
-        """Return the fewest records that give the same register."""
-        records: list[GrantRecord] = [ClockTick(self.time_s)]
-        records += [ClaimNumbered(arm, number) for arm, number in self.numbers.items()]
-        records += [Progress(job, cycles) for job, cycles in self.cycles.items()]
-        records += [JobsAccepted((job,)) for job in self.jobs.values()]
-        for job, grant in self.grants.items():
-            number, cycles = self.numbers.get(grant.arm, 0), self.cycles.get(job, 0)
-            records.append(
-                JobGranted(grant.arm, number, grant.award, job, grant.places, cycles, grant.may_commit, grant.revoked)
-            )
-        records += [Faulted(job, faults) for job, faults in self.faults.items() if job not in self.settled]
-        records += [JobReturned(job, time_s) for job, time_s in self.returned_s.items()]
-        records += [JobSettled(outcome) for outcome in self.settled.values()]
-        known = {arm: names for arm, names in self.space.items() if ANYWHERE not in names}
-        records += [SpaceTaken(arm, tuple(sorted(names))) for arm, names in known.items()]
-        return tuple(records)
-
-    @property
-    def given_up(self) -> frozenset[str]:
-        """Jobs in which arms have faulted too often."""
-        return frozenset(job for job, outcome in self.settled.items() if outcome.outcome == "given_up")
-
-    @property
-    def closed_count(self) -> int:
-        """Number of outcomes that nothing changes; a job that is given up may be finished after all."""
-        return len(self.settled) - len(self.given_up)
-
-    def knows(self, job: str, faults: Faults) -> bool:
-        """Return whether these faults in a job are known."""
-        return faults.keys() <= self.faults.get(job, {}).keys()
-
-    def _add_faults(self, job: str, faults: Faults) -> None:
-        if faults:
-            self.faults[job] = self.faults.get(job, {}) | faults
-
-    def _return(self, job: str, time_s: float) -> None:
-        if job not in self.settled:
-            self.returned_s[job] = max(time_s, self.returned_s.get(job, 0.0))
-
-    def _count(self, job: str, cycles: int) -> None:
-        self.cycles[job] = max(cycles, self.cycles.get(job, 0))
-
-    def _number(self, arm: str, number: int) -> None:
-        self.numbers[arm] = max(number, self.numbers.get(arm, -1))
 
 
 class Granter:
@@ -273,6 +145,14 @@ class Granter:
         """
         new = tuple(job for job in jobs if job.name not in self.register.jobs)
         self._record([JobsAccepted(new, by)] if new else [])
+
+    def begin_epoch(self, epoch: str) -> None:
+        """Record the name of the shift.
+
+        Raises:
+            JournalError: it is not on disk.
+        """
+        self._record([EpochBegun(epoch)])
 
     def is_granted(self, job: str, real_s: float) -> bool:
         """Return whether an arm has a job, or may have it."""

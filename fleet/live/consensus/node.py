@@ -5,8 +5,10 @@ all arms of the roster are present, or a majority has waited long enough for the
 """
 
 import math
+import secrets
 import time
 from collections import deque
+from collections.abc import Iterable
 from random import Random
 
 from msgspec.structs import replace
@@ -15,8 +17,6 @@ from fleet.bus.client.client import AnotherReplies
 from fleet.bus.client.replies import Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
-    Cleared,
-    ClearRequest,
     Clock,
     ClockRequest,
     JobStatus,
@@ -28,16 +28,22 @@ from fleet.bus.protocol.auction import (
     SubmissionReply,
 )
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply
+from fleet.bus.protocol.history import History, HistoryRequest
 from fleet.bus.protocol.messages import State
-from fleet.errors import BusError
+from fleet.bus.protocol.operator import Cleared, ClearRequest
+from fleet.errors import BusError, Refused
 from fleet.live.arm.auctioneer_client import RateLimitedWarnings
 from fleet.live.arm.node import ArmNode
+from fleet.live.auction.epochs import ask_arms
 from fleet.live.auction.job_rules import admit, status_reply
 from fleet.live.clock import FleetClock
-from fleet.live.consensus.granter import Granter, Register
+from fleet.live.consensus.claimant import NUMBERS_PER_BOOT
+from fleet.live.consensus.granter import Granter
 from fleet.live.consensus.participant import QUIET_S, Membership, Participant
 from fleet.live.consensus.records import GrantRecord
-from fleet.live.journal import Journal, TimeRecorder
+from fleet.live.consensus.register import Register
+from fleet.live.journal import Journal
+from fleet.live.journal_upkeep import TimeRecorder
 
 LISTEN_S = 0.5
 """Real seconds that an arm listens before it starts the fleet's time."""
@@ -47,6 +53,26 @@ LAST_S = 10.0
 """Real seconds after the end of the shift that an arm waits at most for last cycles, its own and its peers'."""
 NOT_YET_S = 1e9
 """Real seconds until the fleet's time would begin if no arm started it: never."""
+
+
+def check_journals(arm: str, boot: int, epoch: str, histories: Iterable[History]) -> None:
+    """Check that the journals of an arm are those that its peers know.
+
+    Raises:
+        BusError: they are lost, older copies, or of another epoch: jobs might be done twice.
+    """
+    for peer in (history for history in histories if history.arm != arm):
+        claimed = peer.claims.get(arm, -1)
+        if claimed >= boot * NUMBERS_PER_BOOT or (claimed >= 0 and peer.epoch and not epoch):
+            reason = f"'{peer.arm}' knows claims of '{arm}' that its journals do not: they are lost, or older copies"
+        elif "" not in (epoch, peer.epoch) and epoch != peer.epoch:
+            reason = f"The journals of '{arm}' are of the epoch '{epoch}', those of '{peer.arm}' of '{peer.epoch}'"
+        else:
+            continue
+        raise BusError(
+            f"{reason}. Jobs could be done twice. Bring the journals back, or stop all arms and start them with new "
+            "journals."
+        )
 
 
 class ConsensusNode:
@@ -59,11 +85,21 @@ class ConsensusNode:
 
     objection = "I allocate jobs together with my peers, and accept none from an auctioneer"
 
-    def __init__(self, arm: ArmNode, membership: Membership, journal: Journal[GrantRecord], *, boot: int) -> None:
+    def __init__(
+        self,
+        arm: ArmNode,
+        membership: Membership,
+        journal: Journal[GrantRecord],
+        *,
+        boot: int,
+    ) -> None:
         """Join; the arm's client and the journal are open.
 
         Args:
             boot: Number of this start of the arm.
+
+        Raises:
+            BusError: peers know another epoch, or claims of this arm after those in its journals.
         """
         self._arm, self._link, self._membership = arm, arm.link, membership
         self._name, self._speed = arm.executor.arm, arm.clock.speed
@@ -84,6 +120,9 @@ class ConsensusNode:
         """Real second since which a majority has been present."""
         self.wake_s = math.inf
         arm.set_clock(FleetClock(self._speed, real_s + NOT_YET_S))
+        link, fleet, name = self._link, self._link.fleet, self._name
+        link.reply_to(keys.of_arm(fleet, name, "history"), HistoryRequest, self._history)
+        check_journals(name, boot, register.epoch, ask_arms(link))  # before it grants anything
         self._declare()
 
     # For the arm
@@ -151,7 +190,11 @@ class ConsensusNode:
         if present < self.participant.claimant.majority:
             self._since_s = real_s
         elif real_s - self._since_s >= (LISTEN_S if present == len(roster) else PATIENCE_S):
-            self._set_time(self._recorder.start_s(self._speed), real_s)
+            first = self._name == min(self._tokens & roster | {self._name})
+            if not (self._epoch or first):  # the first by name names the epoch; its bid begins the fleet's time here
+                return
+            if self._take_epoch(self._epoch or secrets.token_hex(4)):
+                self._set_time(self._recorder.start_s(self._speed), real_s)
 
     def _end(self, real_s: float, time_s: float) -> None:
         """End the shift; only a last cycle continues."""
@@ -180,9 +223,29 @@ class ConsensusNode:
         real_s = time.monotonic()
         if arm == self._name or arm not in self.participant.granter.roster:
             return
+        if not self._take_epoch(bid.epoch) and not self._begun:
+            return
         if not self._begun or bid.time_s > self._arm.clock.now_s(real_s):
             self._set_time(bid.time_s, real_s)
         self.participant.apply_bid(bid, real_s)
+
+    @property
+    def _epoch(self) -> str:
+        return self.participant.granter.register.epoch
+
+    def _take_epoch(self, epoch: str) -> bool:
+        """Take the epoch of the fleet, unless there is one on disk already; return whether it is this one."""
+        if epoch and not self._epoch:
+            try:
+                self.participant.granter.begin_epoch(epoch)
+            except Refused as error:
+                self._warn("epoch", f"cannot record the epoch: {error}")
+        elif epoch not in ("", self._epoch):
+            self._warn("epoch", f"has journals of the epoch '{self._epoch}', and a peer those of '{epoch}'.")
+        return epoch in ("", self._epoch)
+
+    def _history(self, _: HistoryRequest) -> History:
+        return History(self._name, self._epoch, claims=dict(self.participant.granter.register.numbers))
 
     def _apply_token(self, arm: str, present: bool) -> None:
         (self._tokens.add if present else self._tokens.discard)(arm)
@@ -212,13 +275,13 @@ class ConsensusNode:
         self.participant.granter.add_jobs(tuple(job for job in accepted if job.name not in known), submission.by)
         self.participant.add_jobs(accepted)
         self._check_first()
-        return SubmissionReply(self._name, admissions)
+        return SubmissionReply(self._name, admissions, self._epoch)
 
     def _status(self, request: StatusRequest) -> Status:
         self._check_first()
         statuses = [status for status in self.statuses() if not request.jobs or status.job in request.jobs]
         time_s, register = self._arm.clock.now_s(time.monotonic()), self.participant.granter.register
-        return status_reply(self._name, time_s, statuses, register.space)
+        return status_reply(self._name, time_s, statuses, register.space, self._epoch)
 
     def _clear(self, request: ClearRequest) -> Cleared:
         real_s = time.monotonic()
@@ -231,7 +294,7 @@ class ConsensusNode:
 
     def _clock(self, _: ClockRequest) -> Clock:
         self._check_first()
-        return Clock(self._arm.clock.now_s(time.monotonic()), self._speed)
+        return Clock(self._arm.clock.now_s(time.monotonic()), self._speed, self._epoch)
 
     # Messages to send
 

@@ -274,6 +274,7 @@ class Participant:
             open_jobs=tuple(open_jobs[:MAX_OPEN_JOBS]),
             choice=self._choice.job,
             choice_plan=self._choice.plan,
+            epoch=register.epoch,
         )
         self.apply_bid(bid, real_s)
         self.out.append(bid)

@@ -4,7 +4,7 @@ import msgspec
 
 from fleet.bus.protocol.auction import Count, Name
 from fleet.bus.protocol.consensus import Faults, JobOutcome
-from fleet.live.journal_records import ClockTick, JobsAccepted, Progress, Released, SpaceCleared, SpaceTaken
+from fleet.live.journal_records import ClockTick, EpochBegun, JobsAccepted, Progress, Released, SpaceCleared, SpaceTaken
 
 
 class JobGranted(msgspec.Struct, frozen=True, tag="job_granted"):
@@ -61,4 +61,5 @@ GrantRecord = (
     | Progress
     | SpaceTaken
     | SpaceCleared
+    | EpochBegun
 )

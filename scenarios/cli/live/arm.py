@@ -32,6 +32,7 @@ from fleet.live.arm.node import ArmConfig, ArmNode
 from fleet.live.arm.replay_body import ReplayBody, SensorLog
 from fleet.live.clock import FleetClock
 from fleet.live.journal import Journal
+from fleet.live.journal_upkeep import CompactingJournal
 from fleet.motion import Plan
 from scenarios.cli.live.journals import folder_of, refuse_other_way
 from scenarios.cli.live.options import (
@@ -102,7 +103,7 @@ def arm_command(
         arm = replayed_arm(name, file) if file else simulated()
     with (
         until_stopped() as stop,
-        BusClient(endpoint, fleet) as link,
+        BusClient(endpoint, fleet, stopped=stop.is_set) as link,
         Journal[ArmRecord](folder / f"{name}.journal", ArmRecord) as book,
         ExitStack() as resources,
     ):
@@ -267,7 +268,9 @@ def make_node(
     clock = fleet_clock(link, speed)
     history = restart_history(book, arm.name, clock.now_s(time.monotonic()))
     config = ExecutorConfig(capacity=capacity)
-    executor = AwardExecutor(arm.name, book.append, history, nonce=secrets.token_hex(4), config=config)
+    kept = ArmHistory().replay(history.compact())
+    keep = CompactingJournal(book, kept).append
+    executor = AwardExecutor(arm.name, keep, history, nonce=secrets.token_hex(4), config=config)
     estimator = Estimator(arm.model, arm.plan, {place.name: place for place in scenario.places}, NominalPeaks())
     estimator.plan_ahead(arm.works)
     arm_config = ArmConfig(
@@ -278,7 +281,8 @@ def make_node(
         takes_jobs=arm.takes_jobs,
     )
     body = arm.body(clock.now_s(time.monotonic()), clock.speed / rate_hz)
-    source = AuctioneerClient if work_source is None else lambda live_arm: work_source(live_arm, history.boot)
+    auctioneers = partial(AuctioneerClient, history=kept)
+    source = auctioneers if work_source is None else lambda live_arm: work_source(live_arm, history.boot)
     return ArmNode(link, body, executor, estimator, clock, arm_config, source)
 
 

@@ -3,7 +3,7 @@
 import logging
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from graphlib import TopologicalSorter
 from typing import Annotated
 
@@ -12,17 +12,18 @@ import typer
 
 from fleet.bus.client.client import BusClient
 from fleet.bus.client.discover import other_versions
-from fleet.bus.protocol.auction import JobSpec, JobStatus, Submission
-from fleet.errors import JournalFull
+from fleet.bus.protocol.auction import JobSpec, JobState, JobStatus, Submission
+from fleet.errors import Refused
 from fleet.job import Job
-from fleet.live.auction.ledger import AuctionRecord
 from fleet.live.auction.node import AuctionNode
+from fleet.live.auction.records import AuctionRecord
 from fleet.live.auction.round import Timing
 from fleet.live.journal import Journal
 from scenarios.cli.live.journals import folder_of, refuse_other_way
 from scenarios.cli.live.options import (
     JobsOption,
     JournalOption,
+    NewEpochOption,
     ScenarioFleetOption,
     SeedOption,
     SpeedOption,
@@ -40,6 +41,7 @@ log = logging.getLogger(__name__)
 
 TURN_S = 0.1
 """Real seconds between two submissions of released jobs."""
+NONE_LEFT: Mapping[JobState, int] = {}
 FAREWELL_S = (1.0, 10.0)
 """Real seconds to serve after the end; and at most, while a job is in its last cycle."""
 
@@ -56,6 +58,7 @@ def auction_command(
     seed: SeedOption = 0,
     endpoint: EndpointOption = ENDPOINT,
     fleet: ScenarioFleetOption = "",
+    new_epoch: NewEpochOption = False,
 ) -> None:
     """Auction jobs to the arms of a fleet, keep its time, and record awards in a journal."""
     chosen = load(scenario)
@@ -67,7 +70,7 @@ def auction_command(
         excludes = cell_space(chosen, progress=progress)
     with (
         until_stopped() as stop,
-        BusClient(endpoint, fleet) as link,
+        BusClient(endpoint, fleet, stopped=stop.is_set) as link,
         Journal[AuctionRecord](folder / f"{name}.journal", AuctionRecord) as book,
     ):
         places = frozenset(place.name for place in chosen.places)
@@ -82,12 +85,14 @@ def auction_command(
             timing=timing,
             arms=tuple(arm.name for arm in chosen.arms),
             excludes=excludes,
+            new_epoch=new_epoch,
         )
         for sentence in other_versions(endpoint, fleet):
             log.error("Refused: %s", sentence)
         typer.echo(f"ready {name} {endpoint} {os.getpid()}")
-        if node.auctioneer.ledger.jobs:
-            so_far = summary(node.auctioneer.status(), node.time_s).partition("\n")[0]
+        ledger = node.auctioneer.ledger
+        if ledger.jobs:
+            so_far = summary(node.auctioneer.status(), node.time_s, ledger.left).partition("\n")[0]
             log.warning("Continuing from %s: %s", book.path, so_far)
         if node.auctioneer.ledger.ended:
             log.warning("That shift is over; another --journal (of thermofleet up: --out) begins a new one.")
@@ -96,7 +101,7 @@ def auction_command(
         else:
             while not stop.is_set():
                 node.serve(time.monotonic() + TURN_S)
-        typer.echo(summary(node.auctioneer.status(), node.time_s))
+        typer.echo(summary(node.auctioneer.status(), node.time_s, ledger.left))
         stop.leave(f"Interrupted at {node.time_s:.0f} s; the journal is {book.path}, and the same command continues.")
 
 
@@ -112,7 +117,7 @@ def submit_stream(node: AuctionNode, stream: Sequence[tuple[float, JobSpec]], ho
                     if not admission.accepted:
                         log.warning("'%s' was refused: %s", admission.job, admission.reason)
                 del left[: len(due)]
-            except JournalFull as error:
+            except Refused as error:
                 log.error("Could not submit the scenario's jobs; retrying: %s", error)
         over = node.time_s >= horizon_s and not node.auctioneer.ledger.ended
         if over:
@@ -155,10 +160,15 @@ def job_spec(job: Job) -> JobSpec:
     )
 
 
-def summary(statuses: Sequence[JobStatus], time_s: float) -> str:
-    """Number of finished jobs, and one line for each other job."""
+def summary(statuses: Sequence[JobStatus], time_s: float, left: Mapping[JobState, int] = NONE_LEFT) -> str:
+    """Number of finished jobs, and one line for each other job.
+
+    Args:
+        left: Number of further jobs, by state.
+    """
     others = [status for status in statuses if status.state != "finished"]
-    lines = [f"{time_s:.0f} s: {len(statuses) - len(others)} of {len(statuses)} jobs finished."]
+    finished, total = len(statuses) - len(others) + left.get("finished", 0), len(statuses) + sum(left.values())
+    lines = [f"{time_s:.0f} s: {finished} of {total} jobs finished."]
     for job in others:
         arm, reason = f" at {job.arm}" if job.arm else "", f", {job.reason}" if job.reason else ""
         lines.append(f"  {job.job}: {job.state}{arm}{reason}")

@@ -7,7 +7,7 @@ import typer
 
 from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import Cleared, ClearRequest
+from fleet.bus.protocol.operator import Cleared, ClearRequest
 from fleet.errors import BusError, FleetError
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, check_name, the_fleet
 

@@ -149,7 +149,7 @@ def why_unreachable(endpoint: str) -> str:
     host, port = match[1], int(match[2])
     try:
         with socket.create_connection((host, port), timeout=REPLY_S):
-            known = why_not(host, port, None)  # the error says it already
+            known, _ = why_not(host, port, None)  # the error says it already
             return "" if known else f"Port {port} is open, but no thermofleet router listens on it."
     except ConnectionRefusedError:
         return f"Nothing listens at port {port} of {host}; start it with: thermofleet router --port {port}"

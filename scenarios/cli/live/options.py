@@ -17,6 +17,9 @@ JobsOption = Annotated[
     typer.Option(help="scenario: the scenario's job stream; none: submitted jobs only."),
 ]
 JournalOption = Annotated[Path | None, typer.Option(help="Folder of the journals; an existing journal is continued.")]
+NewEpochOption = Annotated[
+    bool, typer.Option("--new-epoch", help="Begin with empty journals although other participants know older ones.")
+]
 ScenarioFleetOption = Annotated[
     str, typer.Option(help="Name of the fleet. Default: the scenario's name.", callback=check_name)
 ]

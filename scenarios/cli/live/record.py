@@ -76,7 +76,7 @@ def record_command(
     rotate: Annotated[float, number("Real seconds between two parts.", 0.1, 86_400)] = 60.0,
 ) -> None:
     """Record what arms and auctioneer publish, as Parquet parts that are readable at once."""
-    with until_stopped() as stop, BusClient(endpoint, fleet, backlog=BACKLOG) as link:
+    with until_stopped() as stop, BusClient(endpoint, fleet, backlog=BACKLOG, stopped=stop.is_set) as link:
         typer.echo(f"ready record {endpoint}")
         recorder = record(link, out, rotate_s=rotate, stopped=stop.is_set)
     missed = sum(count.missed for count in recorder.counts.values())

@@ -14,6 +14,7 @@ from scenarios.cli.live.journals import folder_of, refuse_other_way
 from scenarios.cli.live.options import (
     JobsOption,
     ModelOption,
+    NewEpochOption,
     ScenarioFleetOption,
     SeedOption,
     SpeedOption,
@@ -45,6 +46,7 @@ def parts_of(
     jobs: str,
     seed: int,
     tls: Path | None = None,
+    new_epoch: bool = False,
 ) -> tuple[Part, list[Part], Part, Part | None]:
     """Router, arms, recorder and auctioneer of a fleet, as `Supervisor` starts them.
 
@@ -77,7 +79,10 @@ def parts_of(
     record = part("record", "record", fleet, "--out", str(folder / "recording"), user="recorder", rank=1)
     if without_auctioneer:
         return router, arms, record, None
-    auction = part("auction", "auction", scenario, *shared, *allocation, user="auctioneer", rank=3, essential=ends)
+    begins = ("--new-epoch",) if new_epoch else ()
+    auction = part(
+        "auction", "auction", scenario, *shared, *allocation, *begins, user="auctioneer", rank=3, essential=ends
+    )
     return router, arms, record, auction
 
 
@@ -101,6 +106,7 @@ def up_command(
         Path | None,
         typer.Option(help="Folder that thermofleet keys wrote for this scenario: mutual TLS and access control."),
     ] = None,
+    new_epoch: NewEpochOption = False,
 ) -> None:
     """Start a whole fleet, each participant as its own process, and keep it running until its jobs are done.
 
@@ -132,6 +138,7 @@ def up_command(
         jobs=jobs,
         seed=seed,
         tls=tls,
+        new_epoch=new_epoch,
     )
     count = f"{len(arms)} arms, which allocate the jobs" if auction is None else f"{len(arms)} arms and the auctioneer"
     say(f"Starting the router, the recorder, {count} …", err_console)

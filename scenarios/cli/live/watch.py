@@ -1,8 +1,10 @@
 """`thermofleet watch`: show a fleet live on the terminal."""
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import ExitStack
 from typing import Annotated
 
 import msgspec
@@ -10,14 +12,19 @@ import typer
 from rich.live import Live
 
 from fleet.bus.client.client import BusClient
-from fleet.bus.protocol.auction import ArmEvent, Result
+from fleet.bus.client.discover import fleets_at
+from fleet.bus.protocol.auction import SETTLED, ArmEvent, JobState, Result
+from fleet.errors import NoRouter
 from fleet.live.monitor.listener import FleetListener
-from fleet.live.monitor.snapshot import describe_event, describe_status
+from fleet.live.monitor.snapshot import FleetSnapshot, describe_event, describe_status
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
-from scenarios.cli.signals import until_stopped
-from scenarios.cli.terminal import out_console
+from scenarios.cli.signals import Stop, until_stopped
+from scenarios.cli.terminal import err_console, out_console, say
 from scenarios.live.watch_screen import arm_line, format_time, jobs_line, screen, space_line
 
+WAIT_S, GONE_S = 0.5, 3.0
+"""Real seconds: between two looks for a fleet; without any participant, after which a settled shift has ended."""
+OPEN: tuple[JobState, ...] = ("waiting", "awarded", "finishing")
 FRAME_S, LINE_S, SNAPSHOT_S = 0.25, 5.0, 1.0
 """Real seconds: between two frames; between two lines about every arm; of listening for one snapshot."""
 
@@ -27,7 +34,7 @@ def watch_command(
     fleet: FleetOption = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print one snapshot as JSON.")] = False,
 ) -> None:
-    """Watch a fleet until Ctrl-C: temperatures, difficulty, jobs, and the age of every message."""
+    """Watch a fleet until it has ended, or Ctrl-C: temperatures, difficulty, jobs, and the age of every message."""
     news: deque[str] = deque(maxlen=100)
 
     def on_message(_: str, name: str, message: msgspec.Struct) -> None:
@@ -37,37 +44,89 @@ def watch_command(
     def on_presence(role: str, name: str, present: bool) -> None:
         news.append(f"{name if role == 'arm' else f'auctioneer {name}'} {'joined' if present else 'left'}")
 
-    with until_stopped() as stop, BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
+    with until_stopped() as stop, ExitStack() as resources:
+        name = the_fleet(fleet, endpoint) if as_json or fleet else wait_for_fleet(endpoint, stop)
+        link = resources.enter_context(BusClient(endpoint, name, stopped=None if as_json else stop.is_set))
         listener = FleetListener(link, on_message=on_message, on_presence=on_presence)
         if as_json:
             listener.serve(time.monotonic() + SNAPSHOT_S)
             typer.echo(msgspec.json.encode(listener.view.snapshot(time.monotonic())).decode())
-        elif out_console.is_terminal:
-            draw(listener, news, stop.is_set)
         else:
-            print_lines(listener, news, stop.is_set)
+            end = ShiftEnd()
+            (draw if out_console.is_terminal else print_lines)(
+                listener, news, lambda fleet: stop.is_set() or bool(end.check(fleet, time.monotonic()))
+            )
+            if end.sentence:
+                say(end.sentence, out_console)
         stop.leave("Stopped watching.")
 
 
-def draw(listener: FleetListener, news: deque[str], stopped: Callable[[], bool]) -> None:
-    """Draw a screen that fills the terminal, again and again until stopped."""
+def wait_for_fleet(endpoint: str, stop: Stop) -> str:
+    """Name of the only fleet at the router, once there is one.
+
+    Raises:
+        FleetError: there are several, or stopped meanwhile.
+    """
+    waits = False
+    while True:
+        try:
+            fleets = fleets_at(endpoint, timeout_s=1.0)
+        except NoRouter:
+            fleets = ()
+        if len(fleets) == 1:
+            return fleets[0]
+        if fleets:
+            return the_fleet("", endpoint)
+        if not waits:
+            say(f"Waiting for a fleet at {endpoint} …", err_console)
+        waits = True
+        if stop.wait(WAIT_S):
+            stop.leave("Stopped before there was a fleet.")
+            raise NoRouter(f"Stopped while waiting for a fleet at {endpoint}.")
+
+
+class ShiftEnd:
+    """Whether the shift has ended: all participants have left, and every job is settled.
+
+    Attributes:
+        sentence: How it ended; "" before.
+    """
+
+    def __init__(self) -> None:
+        self.sentence = ""
+        self._seen, self._gone_s = False, math.inf
+
+    def check(self, fleet: FleetSnapshot, real_s: float) -> str:
+        """Return how the shift ended; "" if it goes on."""
+        present = any(each.token for each in (*fleet.arms, *fleet.auctioneers))
+        self._seen |= present
+        self._gone_s = math.inf if present or not self._seen else min(self._gone_s, real_s)
+        total, open_jobs = sum(fleet.counts.values()), sum(fleet.counts.get(state, 0) for state in OPEN)
+        if real_s >= self._gone_s + GONE_S and total and not open_jobs:
+            counts = {state.replace("_", " "): fleet.counts.get(state, 0) for state in SETTLED[1:]}
+            rest = [f"{count} {state}" for state, count in counts.items() if count]
+            finished = f"{fleet.counts.get('finished', 0)} of {total} jobs finished"
+            self.sentence = f"The shift has ended: {', '.join([finished, *rest])}."
+        return self.sentence
+
+
+def draw(listener: FleetListener, news: deque[str], ended: Callable[[FleetSnapshot], bool]) -> None:
+    """Draw a screen that fills the terminal, again and again until the end."""
     with Live(console=out_console, screen=True, auto_refresh=False) as live:
-        while not stopped():
+        while not ended(fleet := listener.view.snapshot(time.monotonic(), jobs=0)):
             listener.serve(time.monotonic() + FRAME_S)
-            fleet = listener.view.snapshot(time.monotonic(), jobs=0)
             live.update(screen(fleet, list(news), out_console.height), refresh=True)
 
 
-def print_lines(listener: FleetListener, news: deque[str], stopped: Callable[[], bool]) -> None:
-    """Print news as they come, and a line about every arm from time to time, until stopped."""
+def print_lines(listener: FleetListener, news: deque[str], ended: Callable[[FleetSnapshot], bool]) -> None:
+    """Print news as they come, and a line about every arm from time to time, until the end."""
     due_s = time.monotonic() + SNAPSHOT_S
-    while not stopped():
+    while not ended(fleet := listener.view.snapshot(time.monotonic(), jobs=0)):
         listener.serve(time.monotonic() + FRAME_S)
         while news:
             typer.echo(news.popleft())
         if time.monotonic() >= due_s:
             due_s = time.monotonic() + LINE_S
-            fleet = listener.view.snapshot(time.monotonic(), jobs=0)
             for arm in fleet.arms:
                 typer.echo(arm_line(arm))
             typer.echo(jobs_line(fleet).plain)

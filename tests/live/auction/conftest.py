@@ -23,9 +23,10 @@ from fleet.bus.protocol.auction import (
     Receipt,
     Report,
 )
+from fleet.bus.protocol.history import History, HistoryRequest
 from fleet.bus.protocol.messages import State
-from fleet.live.auction.ledger import AuctionRecord
 from fleet.live.auction.node import AuctionNode
+from fleet.live.auction.records import AuctionRecord
 from fleet.live.auction.round import Assignment
 from fleet.live.journal import Journal
 
@@ -42,13 +43,19 @@ class Arm:
 
     def __init__(self, link, name):
         self.link, self.name = link, name
-        self.done, self.awards = [], []
+        self.done, self.awards, self.commits = [], [], True
         self._numbers = count()
         self._current, self._answers, self._published_s, self._asked = None, {}, 0.0, False
         fleet = link.fleet
         link.reply_to(keys.of_arm(fleet, name, "quote"), QuoteRequest, self.quote)
         link.reply_to(keys.of_arm(fleet, name, "award"), Award, self.answer_award)
+        link.reply_to(keys.of_arm(fleet, name, "history"), HistoryRequest, self.history)
         link.declare_token(keys.of_arm(fleet, name, "alive"))
+
+    def history(self, request):
+        finished = tuple(award.job for award in self.awards if award.job.name in self.done)
+        current = () if self._current is None or self._current.job.name in self.done else (self._current,)
+        return History(self.name, self.awards[-1].epoch if self.awards else "", finished, current)
 
     def quote(self, request):
         estimates = tuple(JobEstimate(job.name, (PlanQuote(finish_in_s=1.0),)) for job in request.jobs)
@@ -68,7 +75,7 @@ class Arm:
             self._published_s = time.monotonic()
             state = State(self.name, next(self._numbers), 0.0, "idle", (30.0,), 30.0)
             self.link.publish(keys.of_arm(self.link.fleet, self.name, "state"), state)
-            if self._current is not None and not self._asked:
+            if self._current is not None and not self._asked and self.commits:
                 entry = LeaseEntry(self._current.award, self._current.job.name, 0, "finishing")
                 self._query("lease", LeaseRequest(self.name, (entry,)), Lease, self.apply_lease)
 

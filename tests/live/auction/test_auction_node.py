@@ -21,7 +21,7 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.messages import encode
 from fleet.errors import JournalFull
-from fleet.live import journal
+from fleet.live import journal, journal_upkeep
 from fleet.live.auction.job_rules import status_reply
 from fleet.live.journal import Journal
 
@@ -118,7 +118,7 @@ def test_the_journal_is_compacted_at_the_start_and_when_it_has_grown(bus, monkey
     again = bus.auctioneer()
     assert [type(record).__name__ for record in again.journal.records()] == ["LedgerSnapshot", "Started"]
     assert bus.states(again) == ["finished"]
-    monkeypatch.setattr(journal, "TICK_S", 0.01)
+    monkeypatch.setattr(journal_upkeep, "TICK_S", 0.01)
     monkeypatch.setattr(journal, "COMPACT_BYTES", 1)
     before = again.journal.path.stat().st_size
     bus.kill(again)
@@ -140,6 +140,7 @@ def test_a_journal_that_cannot_be_compacted_is_continued(bus, monkeypatch, caplo
     assert [type(record).__name__ for record in again.journal.records()] == [
         "LedgerSnapshot",
         "Started",
+        "EpochBegun",
         "JobsAccepted",
         "Started",
     ]

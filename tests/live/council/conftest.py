@@ -18,8 +18,9 @@ from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
 from fleet.live.arm.journal_records import ArmHistory
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.round import Timing
-from fleet.live.consensus.granter import Granter, Register
+from fleet.live.consensus.granter import Granter
 from fleet.live.consensus.participant import Membership, Participant
+from fleet.live.consensus.register import Register
 from fleet.live.space import no_conflicts
 from tests.live.disk import Crash, Disk
 

@@ -1,6 +1,8 @@
 """Arms without an auctioneer and without message loss: they agree on the allocation, and know when all is done."""
 
 import random
+import re
+from contextlib import nullcontext
 
 import pytest
 from hypothesis import given, settings
@@ -8,6 +10,9 @@ from hypothesis import strategies as st
 
 from agents.registry import RULES
 from fleet.bus.protocol.auction import JobSpec
+from fleet.bus.protocol.history import History
+from fleet.errors import BusError
+from fleet.live.consensus.node import check_journals
 
 ARM_POLICIES = [name for name, rule in RULES.items() if rule.scope == "arm"]
 
@@ -91,3 +96,22 @@ def test_an_isolated_arm_does_not_report_that_all_jobs_are_settled(council):
     isolated = fleet.arms[min(fleet.cut)]
     assert isolated.participant.open_jobs(isolated.real_s) == []
     assert not isolated.participant.all_settled(isolated.real_s)
+
+
+@pytest.mark.parametrize(
+    ("boot", "epoch", "peer", "reason"),
+    [
+        (1, "", History("b"), ""),  # nobody has begun
+        (1, "", History("b", "x", claims={"b": 1000000003}), ""),  # the arm is new in a fleet that has
+        (2, "x", History("b", "x", claims={"a": 1000000003}), ""),  # it was restarted
+        (2, "", History("b", "", claims={"a": 1000000003}), ""),  # neither has heard of epochs
+        (1, "", History("b", "x", claims={"a": 1000000003}), "'b' knows claims of 'a' that its journals do not"),
+        (2, "", History("b", "x", claims={"a": 1000000003}), "'b' knows claims of 'a' that its journals do not"),
+        (2, "x", History("b", "x", claims={"a": 2000000001}), "'b' knows claims of 'a' that its journals do not"),
+        (2, "y", History("b", "x"), "The journals of 'a' are of the epoch 'y', those of 'b' of 'x'"),
+    ],
+)
+def test_an_arm_with_other_journals_than_its_peers_know_does_not_start(boot, epoch, peer, reason):
+    own = History("a", "z", claims={"a": 9000000000})  # its own reply says nothing
+    with pytest.raises(BusError, match=re.escape(reason)) if reason else nullcontext():
+        check_journals("a", boot, epoch, [own, peer])

@@ -6,7 +6,8 @@ from fleet.bus.protocol.auction import JobEstimate, JobSpec, PlanQuote
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimEntry, JobOutcome
 from fleet.errors import Refused
 from fleet.live.auction.round import Timing
-from fleet.live.consensus.granter import Granter, Register
+from fleet.live.consensus.granter import Granter
+from fleet.live.consensus.register import Register
 
 TIMING = Timing(lease_s=3.0, margin_s=0.05)
 ROSTER = ("a", "b", "c")

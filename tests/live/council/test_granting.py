@@ -9,7 +9,8 @@ from fleet.live.arm.award_executor import AwardExecutor
 from fleet.live.arm.journal_records import ArmHistory
 from fleet.live.auction.round import Timing
 from fleet.live.consensus.claimant import Claimant
-from fleet.live.consensus.granter import Granter, Register
+from fleet.live.consensus.granter import Granter
+from fleet.live.consensus.register import Register
 from tests.live.disk import Disk
 
 TIMING = Timing(lease_s=3.0, margin_s=0.05)
