@@ -148,9 +148,7 @@ def load_of(arms: int, sites: int, *, state_hz: float, asked: int, costs: Costs 
     for _ in range(200):  # fixed point: a longer round collects more jobs
         round_jobs = max(1, min(limits.max_jobs, round(jobs * round_s)))
         replies = min(arms, per_job * round_jobs)
-        work_s = (
-            replies * costs.request_s + per_job * round_jobs * costs.estimate_s + round_jobs * costs.award_s
-        )
+        work_s = replies * costs.request_s + per_job * round_jobs * costs.estimate_s + round_jobs * costs.award_s
         round_s = max(0.05, work_s)
     rounds = jobs / round_jobs
     replies = min(arms, per_job * round_jobs)
@@ -281,9 +279,7 @@ def shifts(library: Library, seeds: Sequence[int], asked: int | None, by: str) -
         while not over:
             mask, actions = obs["action_mask"], np.full((1, len(env.agents)), WAIT)
             if mask[0, :, 1:-1].any():
-                known = {
-                    arm: env.layout.read(obs["observation"][0, a], mask[0, a]) for a, arm in enumerate(env.agents)
-                }
+                known = {arm: env.layout.read(obs["observation"][0, a], mask[0, a]) for a, arm in enumerate(env.agents)}
                 actions[0] = actions_of(env.agents, policy.act(known))
             obs, _, ended, cut, _ = env.step(actions)
             over = bool((ended | cut)[0])
@@ -298,8 +294,12 @@ def print_asked(arms: int, seeds: int, difficulty: DifficultyName, arrivals: flo
     """Print the table of value against the number of arms that are asked."""
     library, rng = large_cell(arms, difficulty, arrivals), np.random.default_rng(np.random.SeedSequence(0))
     full = np.array(list(shifts(library, range(seeds), None, "coolest")))
-    print(f"{arms} arms, {arrivals:g} × arrivals, {seeds} shifts, {difficulty}; asked: arms for each job; loss of value with 95 % interval")
-    print(f"{'asked':>14}{'quotes/job':>12}{'finished':>10}{'value':>9}{'loss %':>9}{'interval':>18}{'faults':>8}{'hot min':>9}")
+    print(
+        f"{arms} arms, {arrivals:g} × arrivals, {seeds} shifts, {difficulty}; asked: arms for each job; loss of value with 95 % interval"
+    )
+    print(
+        f"{'asked':>14}{'quotes/job':>12}{'finished':>10}{'value':>9}{'loss %':>9}{'interval':>18}{'faults':>8}{'hot min':>9}"
+    )
 
     def line(name: str, rows: Array) -> None:
         loss = 100.0 * (full[:, 0] - rows[:, 0]) / full[:, 0]

@@ -8,8 +8,7 @@ import ipaddress
 import json
 import logging
 import re
-from collections.abc import Mapping, Sequence
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
 import zenoh
