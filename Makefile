@@ -13,7 +13,7 @@ PINNED := $(sort $(basename $(notdir $(wildcard constraints/*.txt))))
 ADAPTERS := $(filter-out bench,$(PINNED))
 ADAPTER_TESTS := $(ADAPTERS:%=test-adapter-%)
 
-.PHONY: demo test test-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos soak clean install
+.PHONY: demo test test-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos soak fuzz clean install
 
 demo: $(STAMP)
 	@$(BIN)/thermofleet demo --out $(OUT)/demo
@@ -55,6 +55,15 @@ chaos: $(STAMP)
 # A week of work, a million jobs, through one auctioneer: about 20 minutes.
 soak: $(STAMP)
 	@$(BIN)/python benchmarks/soak.py --jobs 1000000
+
+# Coverage-guided fuzzing of every parser. `make fuzz INPUTS=10000000` takes longer, `TARGETS=journal` one parser.
+INPUTS ?= 1000000
+fuzz: $(VENV)/.atheris
+	@$(BIN)/python benchmarks/fuzz --inputs $(INPUTS) $(TARGETS)
+
+$(VENV)/.atheris: $(STAMP)
+	@$(PIP) atheris==3.0.0
+	@touch $@
 
 bench: $(STAMP)
 	@for b in benchmarks/bench_*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done

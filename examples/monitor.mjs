@@ -44,6 +44,12 @@ function apply(topic, { name, message }) {
   }
 }
 
+// Escape control characters and direction marks: names come from others.
+function visible(_key, value) {
+  if (typeof value !== "string") return value;
+  return value.replace(/[\p{C}\p{Zl}\p{Zp}]/gu, (char) => `\\u{${char.codePointAt(0).toString(16)}}`);
+}
+
 // Parse a block of the stream: lines are "field: value"; a line that begins with ":" is a keep-alive.
 function parse(block) {
   const fields = {};
@@ -53,7 +59,7 @@ function parse(block) {
   }
   if (fields.id) last = fields.id;
   if (fields.event === "gap") console.log("some events were missed: the connection was lost for too long");
-  else if (fields.data) apply(fields.event, JSON.parse(fields.data));
+  else if (fields.data) apply(fields.event, JSON.parse(fields.data, visible));
 }
 
 async function read(signal) {

@@ -1,5 +1,6 @@
-"""Exceptions that callers may want to catch, checks of numbers, and hints for unknown names."""
+"""Exceptions that callers may want to catch, checks of numbers and names, and hints for unknown names."""
 
+import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -121,3 +122,44 @@ def nearest(name: str, allowed: Iterable[str]) -> str:
     close = get_close_matches(name, names, n=1)
     hint = f"; did you mean '{close[0]}'?" if close else "."
     return f"{hint} Allowed: {', '.join(names)}."
+
+
+MAX_NAME = 128
+"""Characters; a file name with it and an ending has at most 255 bytes."""
+NAME_RULE = f"1 to {MAX_NAME} printable characters without / \\ [ ], and no dot or space at the start"
+_FORBIDDEN = frozenset("/\\[]")
+"""The one rule for names of fleets, arms, auctioneers, jobs and places."""
+
+
+def is_name(text: str) -> bool:
+    """Whether a text follows the rule for names, `NAME_RULE`: it is one file name, and is shown as it is written."""
+    return 0 < len(text) <= MAX_NAME and text[0] not in ". " and text.isprintable() and _FORBIDDEN.isdisjoint(text)
+
+
+def check_names(owner: object, *fields: str) -> None:
+    """Check that these fields, or all elements of a tuple, are names.
+
+    Raises:
+        ValueError: names the field, the value and the rule.
+    """
+    for field in fields:
+        given = getattr(owner, field)
+        for name in given if isinstance(given, tuple) else (given,):
+            if not is_name(name):
+                raise ValueError(f"{type(owner).__name__}.{field} must have {NAME_RULE} (got '{printable(name)}').")
+
+
+def printable(text: str, longest: int = 4 * MAX_NAME) -> str:
+    """A name or sentence from outside as one short line of a message; escaped as by `visible`."""
+    return visible(text[:longest]) + ("…" if len(text) > longest else "")
+
+
+def visible(text: str, keep: str = "") -> str:
+    """Text as a terminal or a page may show it: control characters and direction marks as JSON escapes them.
+
+    Args:
+        keep: Characters that stay as they are, for example line breaks.
+    """
+    if text.isprintable():
+        return text
+    return "".join(char if char.isprintable() or char in keep else json.dumps(char)[1:-1] for char in text)

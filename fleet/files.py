@@ -6,17 +6,52 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from fleet.errors import FleetError
+
 
 def cache_folder() -> Path:
-    """Folder of plans and twins: $THERMOFLEET_CACHE, else thermofleet in $XDG_CACHE_HOME or ~/.cache."""
+    """Folder of plans and twins: $THERMOFLEET_CACHE, else thermofleet in $XDG_CACHE_HOME or ~/.cache.
+
+    Raises:
+        FleetError: as `private_folder`.
+    """
     own = os.environ.get("THERMOFLEET_CACHE")
-    return Path(own) if own else user_cache_folder()
+    return private_folder(Path(own)) if own else user_cache_folder()
 
 
 def user_cache_folder() -> Path:
-    """Folder of compiled code, shared by all studies: thermofleet in $XDG_CACHE_HOME or ~/.cache."""
+    """Folder of compiled code, shared by all studies: thermofleet in $XDG_CACHE_HOME or ~/.cache.
+
+    Raises:
+        FleetError: as `private_folder`.
+    """
     base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "thermofleet"
+    return private_folder((Path(base) if base else Path.home() / ".cache") / "thermofleet")
+
+
+def private_folder(path: Path) -> Path:
+    """Make a folder that only its owner can use (mode 700), and return it: who writes to a cache runs code.
+
+    Raises:
+        FleetError: it belongs to another user, or cannot be made.
+    """
+    try:
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise FleetError(
+            f"Cannot keep plans and twins in '{path}': {error.strerror}. Set THERMOFLEET_CACHE and XDG_CACHE_HOME to "
+            "folders that you may write to."
+        ) from error
+    status = path.stat()
+    if os.name == "posix":
+        if status.st_uid != os.geteuid():
+            raise FleetError(
+                f"The cache '{path}' belongs to another user, who could run code as you. Set THERMOFLEET_CACHE and "
+                "XDG_CACHE_HOME to folders of your own."
+            )
+        if status.st_mode & 0o077:
+            path.chmod(0o700)
+    return path
 
 
 @contextmanager

@@ -21,6 +21,8 @@ MOST_PAYLOAD_M = 0.1
 """Largest radius of such a ball."""
 LEAST_FIXTURE_M, MOST_FIXTURE_M = 0.001, 10.0
 """Smallest and largest length of a fixture."""
+LONGEST_GRASP_S = 180.0
+"""Largest `dwell_s` of a pick_place or sort, whose standstills are planned sample by sample."""
 LONGEST_JOB_S = 7 * 24 * 3600.0
 """Longest planned duration of a job."""
 
@@ -57,7 +59,7 @@ class Bounds(NamedTuple):
 BOUNDS: Mapping[str, Bounds] = {
     "payload_kg": Bounds(0.0, 10.0, "kg"),
     "force_n": Bounds(0.0, 200.0, "N"),
-    "dwell_s": Bounds(0.02, 3600.0, "s"),  # one sample of a plan; every motion is stored sample by sample
+    "dwell_s": Bounds(0.02, 3600.0, "s"),  # from one sample of a plan; see also `check_dwell`
     "repetitions": Bounds(1, 100_000),
     "release_s": Bounds(0.0, 1e9, "s"),
     "due_s": Bounds(0.0, 1e9, "s"),
@@ -91,6 +93,19 @@ def check_places(owner: object, kind: str, names: Sequence[str]) -> None:
     if len(names) != 1 + two or len(set(names)) != len(names):
         wanted = "two different places, from and to," if two else "one place"
         raise ValueError(f"{type(owner).__name__}.places must be {wanted} for a {kind} (got {', '.join(names)}).")
+
+
+def check_dwell(owner: object, kind: str, dwell_s: float) -> None:
+    """Check that a work does not open or close the hand for too long.
+
+    Raises:
+        ValueError: names the number and what is allowed.
+    """
+    if kind in ("pick_place", "sort") and dwell_s > LONGEST_GRASP_S:
+        raise ValueError(
+            f"{type(owner).__name__}.dwell_s of a {kind} must be at most {LONGEST_GRASP_S:g} s, the time to open or "
+            f"close the hand (got {dwell_s:g} s). To wait with a payload use a hold."
+        )
 
 
 def check_duration(owner: object, dwell_s: float, repetitions: int) -> None:
@@ -179,6 +194,7 @@ class Work:
             raise ValueError(f"Work.kind '{self.kind}' is unknown. Allowed: {', '.join(KINDS)}.")
         check_places(self, self.kind, [place.name for place in self.places])
         check_bounds(self, "payload_kg", "force_n", "dwell_s")
+        check_dwell(self, self.kind, self.dwell_s)
         if self.force_n and self.kind != "press":
             raise ValueError(f"Only a press has a contact force; this is a {self.kind} with {self.force_n} N.")
 

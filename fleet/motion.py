@@ -79,8 +79,24 @@ class Drive:
     """Mean friction heat, W, [..., joint]."""
 
 
+def distinct(profile: Array) -> Array:
+    """Return the first sample of a standstill that is stored once, whatever its duration; other profiles unchanged."""
+    return profile[:1] if len(profile) and profile.strides[0] == 0 else profile
+
+
+def stored_once(phase: Phase) -> Phase:
+    """Return the same phase; if all its samples are equal, with one of them stored."""
+    profile, payload_kg = phase.profile, phase.payload_kg
+    if len(profile) < 2 or (profile != profile[0]).any() or (payload_kg != payload_kg[0]).any():
+        return phase
+    return Phase(
+        np.broadcast_to(profile[0].copy(), profile.shape), np.broadcast_to(payload_kg[0].copy(), payload_kg.shape)
+    )
+
+
 def drive(profile: Array, motors: Motors) -> Drive:
     """Mean heat drive of a profile [time, channel, joint] for the motors of one arm; zeros for no samples."""
+    profile = distinct(profile)
     if len(profile) == 0:
         joints = profile.shape[-1]
         return Drive(np.zeros(joints), np.zeros(joints))

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import lru_cache
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -63,8 +64,17 @@ def _nominal() -> tuple[Motors, ThermalModel, Array]:
     return motors, thermal, thermal.steady(drive_heat(np.full(NODES, AMBIENT_C), none, none, motors), AMBIENT_C)
 
 
-@lru_cache(maxsize=4096)
-def _loads(variants: tuple[Plan, ...]) -> Drive:
+_DRIVES: WeakKeyDictionary[Plan, Drive] = WeakKeyDictionary()
+
+
+def nominal_drive(plan: Plan) -> Drive:
+    """Mean drive of each phase in the motors of a nominal arm, [phase, joint]; computed once while the plan exists."""
+    if plan not in _DRIVES:
+        _DRIVES[plan] = drives([phase.profile for phase in plan.phases], _nominal()[0])
+    return _DRIVES[plan]
+
+
+def _loads(variants: Sequence[Plan]) -> Drive:
     """Mean drives of the phases, [plan, phase, joint]."""
-    each = [drives([phase.profile for phase in plan.phases], _nominal()[0]) for plan in variants]
+    each = [nominal_drive(plan) for plan in variants]
     return Drive(np.stack([one.current_sq for one in each]), np.stack([one.friction_w for one in each]))

@@ -11,10 +11,12 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 import msgspec
 
-from fleet.errors import ScenarioError, nearest
+from fleet.errors import ScenarioError, nearest, printable
 from scenarios.schema import Scenario
 from scenarios.schema_errors import check_finite, plain_kind, readable_error
 
+MOST_BYTES = 10_000_000
+"""Of a scenario file."""
 MOST_JOBS = 100_000
 """Largest number of expected jobs in a shift: a mistyped gap would give billions."""
 APART_M = 0.2
@@ -36,18 +38,35 @@ def load(name_or_path: str | Path) -> Scenario:
     known = library()
     path = known.get(str(name_or_path), Path(name_or_path))
     try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        if path.stat().st_size > MOST_BYTES:
+            raise ScenarioError(f"{path.name}: a scenario has at most {MOST_BYTES} bytes (got {path.stat().st_size}).")
+        content = path.read_bytes()
     except (FileNotFoundError, NotADirectoryError, IsADirectoryError) as error:
         if path.suffix == ".toml":
             raise ScenarioError(f"There is no scenario file '{path}'.") from error
         raise ScenarioError(f"No scenario '{name_or_path}'{nearest(str(name_or_path), known)}") from error
     except OSError as error:
         raise ScenarioError(f"Cannot read '{path}': {error.strerror}.") from error
-    except tomllib.TOMLDecodeError as error:
-        raise ScenarioError(f"{path.name}: not valid TOML: {error}.") from error
-    except UnicodeDecodeError as error:
-        raise ScenarioError(f"{path.name}: not a UTF-8 text file.") from error
-    return parse_scenario({"name": path.stem, **raw}, path)
+    return parse_toml(content, path)
+
+
+def parse_toml(content: bytes, path: Path) -> Scenario:
+    """The scenario in the content of a file; `path` names it in errors and locates the files it refers to.
+
+    Raises:
+        ScenarioError: as `load`.
+    """
+    try:
+        try:
+            raw = tomllib.loads(content.decode("utf-8-sig"))
+        except UnicodeDecodeError as error:
+            raise ScenarioError(f"{path.name}: not a UTF-8 text file.") from error
+        except ValueError as error:  # also an integer with too many digits
+            reason = str(error).partition(";")[0]
+            raise ScenarioError(f"{path.name}: not valid TOML: {printable(reason)}.") from error
+        return parse_scenario({"name": path.stem, **raw}, path)
+    except RecursionError as error:
+        raise ScenarioError(f"{path.name}: its tables are nested too deeply; a scenario needs 4 levels.") from error
 
 
 def parse_scenario(raw: Mapping[str, object], path: Path) -> Scenario:

@@ -9,8 +9,8 @@ import numpy as np
 from fleet.arrivals import Arrivals, Batch, Poisson, Trace
 from fleet.engine.reward import RewardWeights
 from fleet.env.validation import Decisions
-from fleet.errors import FleetError, check_between, check_nonnegative, check_positive, nearest
-from fleet.job import BOUNDS, DWELL_S, Fixture, Kind, Place, check_bounds, check_duration, check_places
+from fleet.errors import MAX_NAME, FleetError, check_between, check_names, check_nonnegative, check_positive, nearest
+from fleet.job import BOUNDS, DWELL_S, Fixture, Kind, Place, check_bounds, check_duration, check_dwell, check_places
 from fleet.robot import Cooling, Mount, Robot, ThermalLimits
 
 MOST_SAMPLES = 1_000_000
@@ -21,6 +21,8 @@ MOST_FIXTURES = 64
 MOST_EXPLORATION = 10_000
 MOST_SPREAD = 10.0
 MOST_WEIGHT = 1e9
+_NUMBER = 8
+"""Characters that the name of a job may have after that of its stream."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,8 +128,6 @@ class JobStream:
     """Streams whose job of the same number must finish first."""
 
     def __post_init__(self) -> None:
-        if not self.name:
-            raise ValueError("JobStream.name must not be empty")
         if not self.payload_kg:
             raise ValueError("JobStream.payload_kg must not be an empty list")
         check_places(self, self.kind, self.places)
@@ -135,6 +135,7 @@ class JobStream:
         low, high = self.repetitions
         if low > high:
             raise ValueError(f"JobStream.repetitions must be [fewest, most] (got {low}, {high})")
+        check_dwell(self, self.kind, self.dwell_s)
         check_duration(self, self.dwell_s, high)
         if self.force_n and self.kind != "press":
             raise ValueError(f"JobStream.force_n: only a press has a contact force (got {self.force_n} N)")
@@ -290,16 +291,15 @@ class Scenario:
                 f"Scenario.jobs: horizon_s plus the longest due_s must be at most {BOUNDS['due_s'].high:.15g} s "
                 f"(got {latest_s:.15g})"
             )
-        if not self.name.strip() or self.name[0] == "." or any(c in "/\\" or not c.isprintable() for c in self.name):
-            raise ValueError(
-                f"Scenario.name must be non-empty, without a leading dot and without slashes (got '{self.name}')"
-            )
-
-        named = (("arms", self.arms), ("places", self.places), ("fixtures", self.fixtures), ("jobs", self.jobs))
-        for what, those in named:
-            for each in those:
-                if "[" in each.name or "]" in each.name:
-                    raise ValueError(f"Scenario.{what}: a name must not contain [ or ] (got '{each.name}')")
+        check_names(self, "name")
+        for each in (*self.arms, *self.places, *self.fixtures, *self.jobs):
+            check_names(each, "name")
+        for stream in self.jobs:
+            if len(stream.name) > MAX_NAME - _NUMBER:
+                raise ValueError(
+                    f"JobStream.name must have at most {MAX_NAME - _NUMBER} characters, as its jobs have a number "
+                    f"after it (got {len(stream.name)})"
+                )
 
     @property
     def ticks(self) -> int:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.difficulty import KNOWN, Difficulty, Forecast, known_temperatures, stack_forecasts
+from fleet.difficulty import KNOWN, Difficulty, Forecast, heat_weights, known_temperatures, stack_forecasts
 
 CURVE = np.array([[-4.0, 0.05], [0.0, 0.2], [0.0, 0.4], [3.0, 1.0]])
 
@@ -20,6 +20,13 @@ risks = st.builds(
     st.booleans(),
 )
 temps = st.integers(0, 10_000).map(lambda seed: np.random.default_rng(seed).uniform(10.0, 80.0, KNOWN))
+
+
+def test_a_joint_counts_by_its_share_in_the_heat() -> None:
+    d = np.array([0.9, 0.5, 0.0])
+    assert Difficulty(d).total == pytest.approx(1.4)  # the paper's sum
+    assert Difficulty(d, weight=heat_weights(np.full(3, 4.0))).total == pytest.approx(1.4)  # equal torque: the same
+    assert Difficulty(d, weight=heat_weights(np.array([0.0, 9.0, 3.0]))).total == pytest.approx(3 * 0.75 * 0.5)
 
 
 def test_the_worst_piece_decides_through_the_logistic_function() -> None:

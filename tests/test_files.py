@@ -2,7 +2,8 @@
 
 import pytest
 
-from fleet.files import atomic_path, cache_folder, user_cache_folder
+from fleet.errors import FleetError
+from fleet.files import atomic_path, cache_folder, private_folder, user_cache_folder
 
 
 def test_a_file_is_replaced_when_the_block_ends(tmp_path):
@@ -37,3 +38,12 @@ def test_cache_folders_follow_the_environment(tmp_path, monkeypatch):
     monkeypatch.setenv("THERMOFLEET_CACHE", str(tmp_path / "own"))
     assert cache_folder() == tmp_path / "own"
     assert user_cache_folder() == tmp_path / "thermofleet"
+
+
+def test_a_cache_is_private_to_its_owner(tmp_path, monkeypatch):
+    (tmp_path / "open").mkdir(mode=0o777)
+    for name in ("new/deep", "open"):
+        assert private_folder(tmp_path / name).stat().st_mode & 0o777 == 0o700
+    monkeypatch.setattr("os.geteuid", lambda: 12345)
+    with pytest.raises(FleetError, match="belongs to another user, who could run code as you"):
+        private_folder(tmp_path / "open")

@@ -38,7 +38,7 @@ def read_card(path: Path, kind: type[Card], *, format_: int, what: str) -> Card:
         return msgspec.json.decode(text, type=kind)
     except FileNotFoundError:
         raise CheckpointError(f"No {what} in {path.parent}: {path.name} is missing.") from None
-    except msgspec.DecodeError as error:  # not JSON, or (ValidationError) JSON of another shape
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:  # not JSON, or of another shape
         raise CheckpointError(f"{path}: {error}") from error
 
 

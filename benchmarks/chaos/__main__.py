@@ -29,6 +29,7 @@ from fleet_under_test import CannotInject, Fault
 from malformed import malformed, replayed_awards
 from namespaces import unavailable_reason
 from partition import partition
+from poison import poison
 from processes import (
     full_disk,
     full_disks,
@@ -57,6 +58,7 @@ FAULTS = {
     "full-log-disk": Fault(full_log_disk),
     "full-disks": Fault(full_disks),
     "malformed": Fault(malformed),
+    "poison": Fault(poison),
     "replayed-awards": Fault(replayed_awards),
     "trespass": Fault(trespass, tls=True),
     "partition": Fault(partition, cut=True),
@@ -65,6 +67,7 @@ FAULTS = {
     "alone-stop-arm": Fault(stop_arm, no_auctioneer=True),
     "alone-kill-router": Fault(kill_router, no_auctioneer=True),
     "alone-malformed": Fault(malformed, no_auctioneer=True),
+    "alone-poison": Fault(poison, no_auctioneer=True),
     "alone-cut-one": Fault(cut_off_one, no_auctioneer=True, cut=True, cut_arms=1),
     "alone-halves": Fault(cut_off_half, no_auctioneer=True, cut=True),
 }

@@ -71,17 +71,26 @@ class Journal(Generic[Record]):
         torn: Bytes of an unfinished last line that were removed on opening.
     """
 
-    def __init__(self, path: Path, kind: type[Record] | UnionType, *, sync: Callable[[int], None] = os.fsync) -> None:
+    def __init__(
+        self,
+        path: Path,
+        kind: type[Record] | UnionType,
+        *,
+        sync: Callable[[int], None] = os.fsync,
+        put_aside: Callable[[bytes, str], None] | None = None,
+    ) -> None:
         """Prepare a journal of records of one `msgspec.Struct`, or of a union of tagged ones.
 
         Args:
             sync: Writes an open file through to the disk.
+            put_aside: Gets each undamaged record that is none of this version, with the reason, and `records` leaves it
+                out; None: the journal refuses to open.
         """
         self.path = path
         self.torn = 0
         self._decoder = msgspec.json.Decoder(cast(type[list[Record]], list[kind]))
         self._encoder = msgspec.json.Encoder()
-        self._sync = sync
+        self._sync, self._put_aside = sync, put_aside
         self._file = self._lock = -1
         self._end = self._compacted = 0
         self._broken = ""
@@ -101,7 +110,7 @@ class Journal(Generic[Record]):
             self._file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
             if fresh:
                 self._sync_folder()
-            self._end = sum(len(line) for line, _ in self._lines())
+            self._end = sum(len(line) for line, _ in self._lines(_ignore if self._put_aside else None))
             self.torn = os.fstat(self._file).st_size - self._end
             if self.torn:
                 _LOG.warning("%s: removed an unfinished last line (%d bytes).", self.path, self.torn)
@@ -135,7 +144,7 @@ class Journal(Generic[Record]):
         Raises:
             JournalError: the file was damaged while it was open.
         """
-        for _, records in self._lines():
+        for _, records in self._lines(self._put_aside):
             yield from records
 
     def append(self, *records: Record) -> None:
@@ -224,15 +233,15 @@ class Journal(Generic[Record]):
         body = self._encoder.encode(records)
         return b"".join((_HEAD, b"%08x" % zlib.crc32(body), _MIDDLE, body, _TAIL))
 
-    def _lines(self) -> Iterator[tuple[bytes, list[Record]]]:
+    def _lines(self, put_aside: Callable[[bytes, str], None] | None) -> Iterator[tuple[bytes, list[Record]]]:
         """Yield every complete line with its records."""
         with open(os.dup(self._opened()), "rb") as file:
             file.seek(0)
             for number, line in enumerate(file, start=1):
                 if line.endswith(b"\n"):
-                    yield line, self._decode(line, number)
+                    yield line, self._decode(line, number, put_aside)
 
-    def _decode(self, line: bytes, number: int) -> list[Record]:
+    def _decode(self, line: bytes, number: int, put_aside: Callable[[bytes, str], None] | None) -> list[Record]:
         body = line[_START : -len(_TAIL)]
         complete = line.startswith(_HEAD) and line[_CRC_END:_START] == _MIDDLE and line.endswith(_TAIL)
         if not complete or line[len(_HEAD) : _CRC_END] != b"%08x" % zlib.crc32(body):
@@ -241,10 +250,26 @@ class Journal(Generic[Record]):
             )
         try:
             return self._decoder.decode(body)
-        except msgspec.DecodeError as error:
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+            if put_aside is not None and (records := self._some_of(body, put_aside)) is not None:
+                return records
             raise JournalError(
                 f"{self.path}, line {number}: not a record of this version ({error}). {_REMEDY}"
             ) from error
+
+    def _some_of(self, body: bytes, put_aside: Callable[[bytes, str], None]) -> list[Record] | None:
+        """Decode records one by one; None if it is no list."""
+        try:
+            raws = msgspec.json.decode(body, type=list[msgspec.Raw])
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+            return None
+        records: list[Record] = []
+        for raw in raws:
+            try:
+                records += self._decoder.decode(b"[" + bytes(raw) + b"]")
+            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+                put_aside(bytes(raw), str(error))
+        return records
 
     def _write(self, file: int, line: bytes) -> None:
         """Write a line through to the disk."""
@@ -282,3 +307,7 @@ class Journal(Generic[Record]):
             self._sync(folder)
         finally:
             os.close(folder)
+
+
+def _ignore(record: bytes, reason: str) -> None:
+    """Leave a record out."""

@@ -14,7 +14,7 @@ import numpy as np
 from fleet.errors import InfeasibleJob
 from fleet.files import atomic_path
 from fleet.job import Fixture, Work
-from fleet.motion import RATE_HZ, Phase, Plan
+from fleet.motion import RATE_HZ, Phase, Plan, distinct, stored_once
 from fleet.physics.gen3 import ELBOW_ANGLES_DEG, GRAVITY_M_S2, gen3_xml
 from fleet.planning.task_phases import GRASP_S
 from fleet.robot import GEN3, RATING, Robot
@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 
 PLANNER_VERSION = 3
 """Increment it whenever the plans of the same work change."""
+MAX_SAMPLES = 1_000_000
+"""Of one phase in a file; a longer one is damage."""
 
 
 class CachedPlanner:
@@ -146,13 +148,28 @@ def _write(path: Path, arrays: Mapping[str, Array]) -> None:
 def _pack(plans: tuple[Plan, ...] | InfeasibleJob) -> dict[str, Array]:
     if isinstance(plans, InfeasibleJob):
         return {"infeasible": np.array([plans.place, plans.reason, "too heavy" if plans.too_heavy else ""])}
-    phases = [phase for plan in plans for phase in plan.phases]
+    stored = [[distinct(phase.profile) for phase in plan.phases] for plan in plans]
+    counts = [[len(part) for part in parts] for parts in stored]
+    loads = [
+        phase.payload_kg[: len(part)]
+        for p, s in zip(plans, stored, strict=True)
+        for phase, part in zip(p.phases, s, strict=True)
+    ]
     return {
-        "profile": np.concatenate([phase.profile for phase in phases]),
-        "payload_kg": np.concatenate([phase.payload_kg for phase in phases]),
+        "profile": np.concatenate([part for parts in stored for part in parts]),
+        "payload_kg": np.concatenate(loads),
         "lengths": np.array([[len(phase.profile) for phase in plan.phases] for plan in plans]),
+        "stored": np.array(counts),
         "variants": np.array([(plan.elbow, plan.speed) for plan in plans]),
     }
+
+
+def _phase(length: int, profile: Array, payload_kg: Array) -> Phase:
+    """The phase of stored samples: all of them, or the one that all are equal to."""
+    if len(profile) < length:
+        profile = np.broadcast_to(profile[0], (length, *profile.shape[1:]))
+        payload_kg = np.broadcast_to(payload_kg[0], (length,))
+    return stored_once(Phase(profile, payload_kg))
 
 
 def _unpack(arrays: Mapping[str, Array], arm: str, work: Work) -> tuple[Plan, ...] | InfeasibleJob:
@@ -161,10 +178,14 @@ def _unpack(arrays: Mapping[str, Array], arm: str, work: Work) -> tuple[Plan, ..
         place, reason, load = arrays["infeasible"].tolist()
         return InfeasibleJob(arm, place, reason, too_heavy=bool(load))
     profile, lengths, variants = arrays["profile"], arrays["lengths"], arrays["variants"]
-    if lengths.sum() != len(profile) or len(lengths) != len(variants):
-        raise ValueError(f"its {len(lengths)} plans have {lengths.sum()} samples in all, but {len(profile)} are stored")
-    ends = np.cumsum(lengths.ravel())[:-1]
-    phases = iter(map(Phase, np.split(profile, ends), np.split(arrays["payload_kg"], ends)))
+    stored = arrays.get("stored", lengths)
+    if stored.sum() != len(profile) or len(lengths) != len(variants) or stored.shape != lengths.shape:
+        raise ValueError(f"its {len(lengths)} plans have {stored.sum()} samples in all, but {len(profile)} are stored")
+    if not ((stored == lengths) | (stored == 1)).all() or lengths.max() > MAX_SAMPLES:
+        raise ValueError("the stored samples do not fit the lengths of the phases")
+    ends = np.cumsum(stored.ravel())[:-1]
+    parts = zip(lengths.ravel(), np.split(profile, ends), np.split(arrays["payload_kg"], ends), strict=True)
+    phases = iter([_phase(int(length), *part) for length, *part in parts])
     return tuple(
         Plan(arm, work, int(elbow), float(speed), next(phases), next(phases), next(phases)) for elbow, speed in variants
     )

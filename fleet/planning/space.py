@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fleet.job import Work
-from fleet.motion import Plan
+from fleet.motion import Plan, distinct
 from fleet.physics.gen3 import gen3_xml
 from fleet.planning.plan_cache import cached_arrays
 from fleet.robot import Robot
@@ -194,7 +194,7 @@ class _Paths:
 
 def _stops(plan: Plan) -> Array:
     """Postures at which the arm stops along a plan, float32 [stop, joint]; joint paths between them are straight."""
-    profiles = [phase.profile for phase in plan.phases]
+    profiles = [distinct(phase.profile) for phase in plan.phases]
     stops = np.concatenate([profile[(profile[:, 1] == 0).all(axis=1), 0] for profile in profiles])
     return stops[np.append(True, (np.diff(stops, axis=0) != 0).any(axis=1))]
 

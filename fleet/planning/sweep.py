@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from fleet.job import payload_radius_m
-from fleet.motion import Plan
+from fleet.motion import Plan, distinct
 from fleet.physics.models import ArmModel, links_of
 
 Array = np.ndarray
@@ -112,7 +112,7 @@ class Capsules:
         Args:
             payload_kg: Payload; default: that of the plan.
         """
-        q = np.concatenate([phase.profile[:, 0] for phase in plan.phases]).astype(float)
+        q = np.concatenate([distinct(phase.profile)[:, 0] for phase in plan.phases]).astype(float)
         travelled = np.concatenate([[0.0], np.abs(np.diff(q, axis=0)).max(axis=1).cumsum()])
         # Takes the last sample before each step, so no joint moves more than a step plus one sample between postures.
         wanted = np.arange(0.0, travelled[-1] + STEP_RAD, STEP_RAD)

@@ -1,7 +1,7 @@
 """Jerk-limited motion from rest to rest, sampled at RATE_HZ, and the torque that it needs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import ruckig
@@ -68,8 +68,9 @@ def move(start: Array, end: Array, speed: float) -> Motion:
 
 def rest(q: Array, seconds: float) -> Motion:
     """Standstill at `q`, to the nearest whole number of samples."""
-    still = np.zeros((round(seconds * RATE_HZ), JOINTS))
-    return Motion(still + q, still, still)
+    shape = (round(seconds * RATE_HZ), JOINTS)  # stored once, however long
+    still = np.broadcast_to(0.0, shape)
+    return Motion(np.broadcast_to(q, shape), still, still)
 
 
 def straight_line(start: Array, end: Array, step_rad: float) -> Array:
@@ -84,6 +85,14 @@ def build_phase(arm: ArmModel, parts: Sequence[LoadedMotion]) -> Phase:
     Raises:
         InfeasibleJob: a limit of the arm is exceeded; names the place and the load.
     """
+    if len(parts) == 1 and len(parts[0].motion) > 1 and not parts[0].motion.qd.any():
+        first = Motion(*(array[:1] for array in vars(parts[0].motion).values()))
+        one = build_phase(arm, [replace(parts[0], motion=first)])
+        count = len(parts[0].motion)
+        return Phase(
+            np.broadcast_to(one.profile[0], (count, *one.profile.shape[1:])),
+            np.broadcast_to(one.payload_kg[0], (count,)),
+        )
     lengths = [len(part.motion) for part in parts]
     none = np.empty((0, JOINTS))
     q, qd, qdd = (np.concatenate([none, *(getattr(part.motion, n) for part in parts)]) for n in ("q", "qd", "qdd"))

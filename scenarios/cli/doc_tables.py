@@ -126,9 +126,13 @@ def _type(kind: Schema) -> str:
     limits = [
         f"{sign} {kind[name]:g}"
         for name, sign in (("minimum", "≥"), ("exclusiveMinimum", ">"), ("maximum", "≤"))
-        if name in kind
+        if name in kind and kind[name] not in _COMMON
     ]
     return f"{kind['type']}{' ' if limits else ''}{', '.join(limits)}"
+
+
+_COMMON = (messages.LEAST, messages.MOST, messages.MOST_COUNT)
+"""Bounds of numbers that are only in the table of limits."""
 
 
 def _span(kind: Schema, low: str, high: str) -> str:
@@ -193,6 +197,7 @@ def _limit_table() -> str:
         (f"{MOST_JOBS}", "jobs in one message; a `Status` lists open jobs before closed ones"),
         (f"{MAX_OPEN_JOBS:,}", "open jobs of one auctioneer"),
         (f"{longest}", "characters of a job's name"),
+        (f"{messages.MOST:g}", f"any other number, positive or negative; {messages.MOST_COUNT:g} if it is whole"),
     ]
     return table(("limit", "applies to"), rows)
 

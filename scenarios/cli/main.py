@@ -14,9 +14,9 @@ from typing import Annotated, Any, NamedTuple
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from fleet.errors import FleetError, JournalFull, NoRouter
+from fleet.errors import FleetError, JournalFull, NoRouter, visible
 from fleet.live.supervisor import SUPERVISED, WAITS
-from scenarios.cli.terminal import INTERRUPTED, Interrupted, err_console, say
+from scenarios.cli.terminal import INTERRUPTED, Interrupted, echo, err_console, say
 from scenarios.extras import missing_extra
 
 USAGE = 2
@@ -118,7 +118,7 @@ def _print_version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
-        typer.echo(f"thermofleet {version('thermofleet')}")
+        echo(f"thermofleet {version('thermofleet')}")
         raise typer.Exit
 
 
@@ -160,9 +160,19 @@ def main(argv: Sequence[str] | None = None) -> None:
     sys.exit(code or 0)
 
 
+class VisibleFormatter(logging.Formatter):
+    """Formatter that escapes control characters and direction marks."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the record as text."""
+        return visible(super().format(record), "\n")
+
+
 def _log_warnings() -> None:
     if not err_console.is_terminal:  # a file, in which every line is one message
-        logging.basicConfig(level=logging.WARNING, format="%(levelname)-8s %(name)s: %(message)s")
+        plain = logging.StreamHandler()
+        plain.setFormatter(VisibleFormatter("%(levelname)-8s %(name)s: %(message)s"))
+        logging.basicConfig(level=logging.WARNING, handlers=[plain])
         return
     from rich.logging import RichHandler
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 
 from agents.registry import names_of
-from fleet.errors import FleetError, LogError
+from fleet.errors import NAME_RULE, FleetError, LogError, is_name, printable
 
 if TYPE_CHECKING:  # slow to import
     from fleet.bus.exchange.channel import Channel, Partition
@@ -15,8 +15,6 @@ if TYPE_CHECKING:  # slow to import
 
 Number = TypeVar("Number", int, float, None)
 MAX_SEED = 2**32 - 1
-MAX_NAME = 128
-"""Characters; a file name with it and an ending has at most 255 bytes."""
 
 
 def number(text: str, low: float, high: float, *names: str, above: bool = False, **more: Any) -> Any:
@@ -41,14 +39,11 @@ def check_name(option: typer.CallbackParam, value: str) -> str:
     Its default needs no check: "" for none.
 
     Raises:
-        FleetError: it is empty or too long, or has a slash or characters that cannot be printed.
+        FleetError: it does not follow the rule for names.
     """
-    valid = 0 < len(value) <= MAX_NAME and "/" not in value and value.isprintable()
-    if not valid and value != option.default:
+    if value != option.default and not is_name(value):
         name = option.opts[0] if option.param_type_name == "option" else option.opts[0].upper()
-        raise FleetError(
-            f"{name} must have 1 to {MAX_NAME} printable characters and no '/' (got {value[:MAX_NAME]!r})."
-        )
+        raise FleetError(f"{name} must have {NAME_RULE} (got '{printable(value)}').")
     return value
 
 

@@ -9,6 +9,7 @@ import typer
 from fleet.errors import FleetError
 from fleet.robot import ThermalLimits
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, check_name, number, the_fleet
+from scenarios.cli.terminal import echo
 from scenarios.extras import require_extra
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ def bridge_command(
     limits = limits_of(warning_c, error_c)
     with until_stopped() as stop, BusClient(endpoint, the_fleet(fleet, endpoint)) as link, node:
         bridge = Bridge(link, node, limits=limits, humble=humble)
-        typer.echo(f"ready ros2 bridge {where} {os.getpid()}")
+        echo(f"ready ros2 bridge {where} {os.getpid()}")
         while not stop.is_set():
             bridge.serve(time.monotonic() + TURN_S)
         stop.leave("The bridge was interrupted.")
@@ -92,7 +93,7 @@ def listen_command(
         limits = limits_of(warning_c, max(warning_c + 1.0, DEFAULTS.error_c))
         readings, topics = ArmReadings(names, hardware), (topic, temperatures)
         follower = Follower(link, node, arm, readings, topics, clock, limits=limits, rate_hz=rate_hz)
-        typer.echo(f"ready {arm} {topic} {os.getpid()}")
+        echo(f"ready {arm} {topic} {os.getpid()}")
         while not stop.is_set():
             follower.serve(time.monotonic() + TURN_S)
         stop.leave(f"Stopped listening to {topic}.")

@@ -9,6 +9,7 @@ from fleet.bus.protocol.registry import CHANNEL
 from fleet.errors import FleetError
 from scenarios.cli.options import check_name, number
 from scenarios.cli.signals import until_stopped
+from scenarios.cli.terminal import echo
 from scenarios.load import load
 
 PORT = 7447
@@ -45,7 +46,7 @@ def router_command(
     limits = Limits(state_hz=state_hz or None)
     router = Router(port, host=host, tls=Tls(tls, name) if tls else None, limits=limits, connect=connect or ())
     with until_stopped() as stop, router:
-        typer.echo(router.endpoint)  # flushed: a supervisor reads this line
+        echo(router.endpoint)  # flushed: a supervisor reads this line
         stop.wait()
         stop.leave("The router was interrupted; its clients keep trying to reconnect.")
 

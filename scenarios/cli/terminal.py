@@ -1,19 +1,41 @@
 """Output of every command: sentences, tables, JSON and a progress bar."""
 
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import typer
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
 from rich.table import Table
+from rich.text import Text
 
-from fleet.errors import FleetError
+from fleet.errors import FleetError, visible
 from fleet.files import cache_folder
 from scenarios.progress import COUNTED, Progress
 
-out_console = Console()
-err_console = Console(stderr=True)
+
+class SafeConsole(Console):
+    """Console that escapes control characters and direction marks in all texts, so none can change the terminal."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """Return segments whose text is visible; control segments are rich's own."""
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else Segment(visible(segment.text, "\n"), segment.style)
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Return visible text, so that its width is known (Any: options of rich, passed on)."""
+        return super().render_str(visible(text, "\n"), **options)
+
+
+def echo(text: str, *, nl: bool = True) -> None:
+    """Print text on standard output, with control characters and direction marks escaped."""
+    typer.echo(visible(text, "\n"), nl=nl)
+
+
+out_console = SafeConsole()
+err_console = SafeConsole(stderr=True)
 
 LONG_STAGES = {
     "training": "Training the twins that are not in the cache: up to a minute per arm and core, full size minutes …",
@@ -68,7 +90,7 @@ def print_json(value: object) -> None:
     """Print a value on standard output as JSON."""
     import msgspec
 
-    typer.echo(msgspec.json.format(msgspec.json.encode(value), indent=1).decode())
+    echo(msgspec.json.format(msgspec.json.encode(value), indent=1).decode())
 
 
 def plain_table(*heads: str, numbers: bool = True, title: str | None = None, caption: str | None = None) -> Table:

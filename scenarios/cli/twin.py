@@ -11,7 +11,7 @@ from rich.table import Table
 
 from fleet.errors import FleetError
 from scenarios.cli import options
-from scenarios.cli.terminal import out_console, plain_table, print_json, progress_bar, say
+from scenarios.cli.terminal import echo, out_console, plain_table, print_json, progress_bar, say
 from scenarios.cli.twin_motion import export_command, generate_command, identify_command, recover_command
 from scenarios.load import load
 from scenarios.schema_errors import choose
@@ -130,7 +130,7 @@ def score_command(
         rows = [row for recording in recordings for row in window_rows(twin, recording)]
     shown = render(rows, format_, caption=f"twin of {twin.arm}, version {twin.version}, data {twin.data_hash}")
     if isinstance(shown, str):
-        typer.echo(shown, nl=False)
+        echo(shown, nl=False)
     else:
         out_console.print(shown)
 
@@ -256,7 +256,7 @@ def report_command(
             title = f"The twin of {of_scenario.arms[index].name} in {of_scenario.name}"
         card = write(sections, folder, title=title, lead=("Every section gives a result and the method.",))
     if as_json:
-        typer.echo((out / "report.json").read_text(encoding="utf-8"), nl=False)
+        echo((out / "report.json").read_text(encoding="utf-8"), nl=False)
     else:
         say(f"Open {out / 'report.html'} in a browser.", out_console)
     if card["failed"]:

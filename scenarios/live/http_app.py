@@ -5,7 +5,6 @@ event loop only. Errors are problem details (RFC 9457).
 """
 
 import asyncio
-import hmac
 import secrets
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
@@ -19,29 +18,23 @@ from starlette.middleware import Middleware
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import Message, Receive, Scope, Send
 
 from fleet.bus.protocol.auction import JobSpec, QuoteRequest, StatusRequest, Submission
 from fleet.bus.protocol.messages import MalformedMessage, decode, encode
 from fleet.live.monitor.async_bridge import AsyncBridge, NoReply
 from fleet.live.monitor.event_feed import Entry, EventFeed, ReaderBuffer
+from scenarios.live.http_access import AccessCheck, Bodies, Problem, Role, check_role, problem_response
 
 MAX_BYTES = 60_000
 """Of a body: what the router passes, less the overhead of a message."""
 MAX_READERS, MAX_REQUESTS = 64, 16
 BODY_S, STUCK_S, HEARTBEAT_S = 10.0, 10.0, 15.0
 """Real seconds: for a body to arrive; for a reader to take what was sent; between two heartbeats."""
-LOCAL = ("127.0.0.1", "localhost", "[::1]")
 Body = TypeVar("Body", bound=msgspec.Struct)
 Reply = TypeVar("Reply")
-
-
-class Problem(Exception):
-    """An HTTP error with a sentence that says what is wrong."""
-
-    def __init__(self, status: HTTPStatus, detail: str) -> None:
-        super().__init__(detail)
-        self.status, self.detail = status, detail
+Endpoint = Callable[[Request], Awaitable[Response]]
+NO_TOKENS: Mapping[str, Role] = {}
 
 
 class AskBody(msgspec.Struct, frozen=True):
@@ -81,14 +74,14 @@ def application(
     bridge: AsyncBridge,
     readers: Readers,
     *,
-    token: str = "",
+    tokens: Mapping[str, Role] = NO_TOKENS,
     heartbeat_s: float = HEARTBEAT_S,
     stuck_s: float = STUCK_S,
     body_s: float = BODY_S,
 ) -> Starlette:
-    """Make the application; with a token every request must show it, without one only local requests are served."""
+    """Make the application; with tokens every request must show one, without any only local requests are served."""
     boot = secrets.token_hex(4)  # event numbers are valid for one start of the gateway
-    slots = asyncio.Semaphore(MAX_REQUESTS)
+    slots, bodies = asyncio.Semaphore(MAX_REQUESTS), Bodies(body_s)
 
     async def limited(request: Callable[[], Awaitable[Reply]]) -> Reply:
         if slots.locked():
@@ -100,7 +93,7 @@ def application(
         return json_response(await bridge.snapshot())
 
     async def post_jobs(request: Request) -> Response:
-        submission = await read_body(request, Submission, body_s)
+        submission = await read_body(request, Submission, bodies)
         return json_response(await limited(lambda: bridge.submit(submission)))
 
     async def get_jobs(request: Request) -> Response:
@@ -108,7 +101,7 @@ def application(
         return json_response(await limited(lambda: bridge.status(StatusRequest(names))))
 
     async def post_ask(request: Request) -> Response:
-        ask = await read_body(request, AskBody, body_s)
+        ask = await read_body(request, AskBody, bodies)
         try:
             quote_request = decode(QuoteRequest, encode(QuoteRequest("http", ask.jobs, dry_run=True)))
         except MalformedMessage as error:
@@ -122,44 +115,21 @@ def application(
         last_event = request.headers.get("last-event-id", "")
         return EventStream(bridge.feed, readers, boot, last_event, heartbeat_s, stuck_s)
 
-    routes = [
-        Route("/v4/fleet", fleet),
-        Route("/v4/events", events),
-        Route("/v4/jobs", get_jobs),
-        Route("/v4/jobs", post_jobs, methods=["POST"]),
-        Route("/v4/ask", post_ask, methods=["POST"]),
+    async def contents(request: Request) -> Response:
+        entries = [{"method": m, "path": p, "role": role, "what": what} for m, p, role, _, what in table]
+        return json_response({"gateway": "thermofleet", "role": request.scope["role"], "requests": entries})
+
+    table: list[tuple[str, str, Role, Endpoint, str]] = [
+        ("GET", "/", "monitor", contents, "This list."),
+        ("GET", "/v4/fleet", "monitor", fleet, "State of every arm, jobs and messages, as `thermofleet watch --json`."),
+        ("GET", "/v4/events", "monitor", events, "Every message as server-sent events."),
+        ("GET", "/v4/jobs", "monitor", get_jobs, "Status of the jobs ?job=NAME, or of all."),
+        ("POST", "/v4/jobs", "submitter", post_jobs, "Submit jobs: a Submission."),
+        ("POST", "/v4/ask", "submitter", post_ask, 'Quotes without submitting: {"jobs": […]}.'),
     ]
+    routes = [Route(path, _checked(role, handle), methods=[method]) for method, path, role, handle, _ in table]
     handlers = dict.fromkeys((Problem, NoReply, HTTPException, Exception), error_response)
-    return Starlette(routes=routes, exception_handlers=handlers, middleware=[Middleware(AccessCheck, token=token)])
-
-
-class AccessCheck:
-    """Passes requests that show the token; without a token, requests to this machine's local names.
-
-    The name is checked since a page of another site must not reach the gateway under a name of its own.
-    """
-
-    def __init__(self, app: ASGIApp, token: str) -> None:
-        self.app, self.token = app, token.encode()
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Refuse the request or pass it on."""
-        refusal = self.refusal(dict(scope["headers"])) if scope["type"] == "http" else None
-        await (refusal or self.app)(scope, receive, send)
-
-    def refusal(self, headers: dict[bytes, bytes]) -> Response | None:
-        """Error response, None if the request may pass."""
-        if not self.token:
-            host = headers.get(b"host", b"").decode("latin-1")
-            name = host if host.endswith("]") else host.rpartition(":")[0] or host
-            if name in LOCAL:
-                return None
-            return problem_response(HTTPStatus.MISDIRECTED_REQUEST, f"This gateway is {LOCAL[0]}, not '{name}'.")
-        shown = headers.get(b"authorization", b"")
-        if shown[:7].lower() == b"bearer " and hmac.compare_digest(shown[7:], self.token):
-            return None
-        detail = "This gateway needs its token: Authorization: Bearer …."
-        return problem_response(HTTPStatus.UNAUTHORIZED, detail, {"WWW-Authenticate": "Bearer"})
+    return Starlette(routes=routes, exception_handlers=handlers, middleware=[Middleware(AccessCheck, tokens=tokens)])
 
 
 class EventStream(StreamingResponse):
@@ -211,7 +181,17 @@ class EventStream(StreamingResponse):
         return f"id: {self._boot}-{entry.number}\nevent: {entry.topic}\ndata: {data}\n\n"
 
 
-async def read_body(request: Request, kind: type[Body], body_s: float) -> Body:
+def _checked(role: Role, handle: Endpoint) -> Endpoint:
+    """The handler of a request that needs a role."""
+
+    async def check(request: Request) -> Response:
+        check_role(request, role)
+        return await handle(request)
+
+    return check
+
+
+async def read_body(request: Request, kind: type[Body], bodies: Bodies) -> Body:
     """Read the message that is the body of a request.
 
     Raises:
@@ -223,7 +203,7 @@ async def read_body(request: Request, kind: type[Body], body_s: float) -> Body:
         raise Problem(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, detail)
     parts: list[bytes] = []
     try:
-        async with asyncio.timeout(body_s):
+        async with bodies.reading():
             async for part in request.stream():
                 parts.append(part)
                 if sum(map(len, parts)) > MAX_BYTES:
@@ -231,7 +211,7 @@ async def read_body(request: Request, kind: type[Body], body_s: float) -> Body:
                     raise Problem(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, detail)
         return decode(kind, b"".join(parts))
     except TimeoutError as error:
-        raise Problem(HTTPStatus.REQUEST_TIMEOUT, f"The body did not arrive within {body_s:g} s.") from error
+        raise Problem(HTTPStatus.REQUEST_TIMEOUT, f"The body did not arrive within {bodies.body_s:g} s.") from error
     except ClientDisconnect as error:
         raise Problem(HTTPStatus.BAD_REQUEST, "The body is incomplete.") from error
     except MalformedMessage as error:
@@ -254,9 +234,3 @@ def error_response(_: Request, error: Exception) -> Response:
             return problem_response(HTTPStatus(error.status_code), str(error.detail), error.headers)
         case _:
             return problem_response(HTTPStatus.INTERNAL_SERVER_ERROR, "The gateway failed; the reason is in its log.")
-
-
-def problem_response(status: HTTPStatus, detail: str, headers: Mapping[str, str] | None = None) -> Response:
-    """Problem details, RFC 9457."""
-    fields = {"type": "about:blank", "title": status.phrase, "status": status.value, "detail": detail}
-    return Response(msgspec.json.encode(fields), status.value, headers, media_type="application/problem+json")

@@ -6,6 +6,7 @@ from typing import Any, TypeVar  # Any: values of Plotly's schema
 
 import numpy as np
 
+from fleet.errors import visible
 from fleet.events import Event
 from scenarios.report.schedule import Assignment, Outage, Schedule
 
@@ -55,7 +56,7 @@ def stream_of(job: str) -> str:
 
 def plain(text: str) -> str:
     """Text escaped for Plotly, which interprets some HTML."""
-    return html.escape(text, quote=False)
+    return html.escape(visible(text), quote=False)
 
 
 def clock(time_s: float) -> str:

@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any  # values of JSON
 
+from fleet.errors import visible
+
 PNG_HEAD = b"\x89PNG\r\n\x1a\n"
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data: blob:; form-action 'none'; base-uri 'none'"
 """The browser itself prevents every request."""
@@ -178,7 +180,7 @@ def table(
 
 def escape(text: str) -> str:
     """Text as HTML that shows it unchanged."""
-    return html.escape(text)
+    return html.escape(visible(text, "\n"))
 
 
 def _section(section: Section) -> list[str]:

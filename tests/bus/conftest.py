@@ -15,7 +15,7 @@ from fleet.bus.security.access_control import of_arms
 from fleet.bus.security.keyring import make
 from fleet.bus.security.tls import Tls
 
-ARMS = ("arm_0", "arm_1", "arm 2/*@")
+ARMS = ("arm_0", "arm_1", "arm 2+*@")
 PATIENT_S = 20.0
 Connect = Callable[[str], zenoh.Session]
 

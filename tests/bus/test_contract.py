@@ -175,7 +175,10 @@ def test_asyncapi_has_every_key_and_no_loose_end():
 
 @pytest.mark.parametrize(
     ("nodes", "role"),
-    [(("arm/node", "arm/auctioneer_client", "consensus/node"), "arm"), (("auction/node",), "auction")],
+    [
+        (("arm/node", "arm/publications", "arm/auctioneer_client", "consensus/node"), "arm"),
+        (("auction/node",), "auction"),
+    ],
 )
 def test_the_participants_publish_and_answer_as_the_contract_says(nodes, role):
     """Read from their source: `link.publisher(keys.of_…(…, "topic"), Kind)` and `link.reply_to(…)`."""

@@ -9,11 +9,10 @@ from hypothesis import strategies as st
 
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.keys import ASKED, NAMELESS, TOPICS, Key
+from fleet.errors import is_name
 
-names = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=30)
-wild = st.sampled_from(
-    ["*", "**", "@", "@v1", "a/b", "/", "a b", "$*", "?", "#", "%", "%2F", "ä", "机", ".", "..", "x//y"]
-)
+names = st.text(st.characters(exclude_categories=["Cs", "Cc", "Cf"]), min_size=1, max_size=30).filter(is_name)
+wild = st.sampled_from(["*", "**", "@", "@v1", "a b", "$*", "?", "#", "%", "%2F", "ä", "机", "a.b", "a.."])
 concrete = st.one_of(
     st.sampled_from([(role, topic) for role, topics in TOPICS.items() for topic in topics]).flatmap(
         lambda place: st.builds(
@@ -64,16 +63,16 @@ def test_all_of_one_is_what_it_says_and_no_word_of_another(one, other):
     ("built", "written"),
     [
         (keys.of_arm("f", "arm_0", "state"), "thermofleet/v4/f/arm/arm_0/state"),
-        (keys.of_arm("hall 2", "a/b", "alive"), "thermofleet/v4/hall%202/arm/a%2Fb/alive"),
+        (keys.of_arm("hall 2", "a+b", "alive"), "thermofleet/v4/hall%202/arm/a%2Bb/alive"),
         (keys.of_every_arm("x", "difficulty"), "thermofleet/v4/x/arm/*/difficulty"),
         (keys.of_auction("f", "@boss", "announce"), "thermofleet/v4/f/auction/%40boss/announce"),
         (keys.of_jobs("f", "submit"), "thermofleet/v4/f/jobs/submit"),
         (keys.of_clock("f"), "thermofleet/v4/f/clock/now"),
         (keys.of_every_auction("f", "result"), "thermofleet/v4/f/auction/*/result"),
-        (keys.asked_by("f", "a", "lease", "arm 1/b"), "thermofleet/v4/f/auction/a/lease/arm%201%2Fb"),
+        (keys.asked_by("f", "a", "lease", "arm 1&b"), "thermofleet/v4/f/auction/a/lease/arm%201%26b"),
         (keys.asked_by_every_arm("f", "x", "report"), "thermofleet/v4/f/auction/x/report/*"),
         (keys.asked_of_all("f", "report", "x"), "thermofleet/v4/f/auction/*/report/x"),
-        (keys.asked_by("f", "a", "claim", "arm 1/b"), "thermofleet/v4/f/arm/a/claim/arm%201%2Fb"),
+        (keys.asked_by("f", "a", "claim", "arm 1&b"), "thermofleet/v4/f/arm/a/claim/arm%201%26b"),
         (keys.asked_by_every_arm("f", "x", "claim"), "thermofleet/v4/f/arm/x/claim/*"),
         (keys.asked_of_all("f", "claim", "x"), "thermofleet/v4/f/arm/*/claim/x"),
     ],
@@ -142,7 +141,7 @@ def test_who_asks_as_nobody_is_not_answered(asked):
 def test_only_what_an_arm_asks_as_itself_ends_in_a_name():
     with pytest.raises(ValueError, match=r"Keys of 'result' do not end in a querier's name \(got 'x'\)"):
         str(Key("f", "auction", "a", "result", "x"))
-    with pytest.raises(ValueError, match="must not be empty"):
+    with pytest.raises(ValueError, match="must have 1 to 128"):
         str(Key("f", "auction", "a", "lease"))
 
 
@@ -155,7 +154,7 @@ def test_any_text_is_parsed_or_refused(text):
     assert str(key) == text
 
 
-@pytest.mark.parametrize("name", ["", "\ud800"])
+@pytest.mark.parametrize("name", ["", "\ud800", "a/b", "..", "a\u202eb", "a\nb", "x" * 129])
 def test_names_that_cannot_be_written_are_refused(name):
     with pytest.raises(ValueError, match="name"):
         keys.of_arm("f", name, "state")
@@ -164,7 +163,7 @@ def test_names_that_cannot_be_written_are_refused(name):
 
 
 def test_a_key_that_was_read_before_is_not_taken_apart_again_unless_it_is_very_long():
-    short, long = (keys.of_arm("f", name, "state") for name in ("arm_0", "a" * 300))
+    short, long = (keys.of_arm("f", name, "state") for name in ("arm_0", "机" * 100))
     assert keys.parse(short) is keys.parse(short)
     assert keys.parse(long) == keys.parse(long)
     assert keys.parse(long) is not keys.parse(long)

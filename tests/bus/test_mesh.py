@@ -23,6 +23,8 @@ from fleet.bus.security.tls import Tls
 from fleet.errors import BusError
 
 PATIENCE_S, POLL_S = 20.0, 0.02
+ROUTES_S = 0.5
+"""Zenoh calculates its routes 0.1 s after a new link."""
 ARMS = tuple(f"arm_{number}" for number in range(4))
 FAR = Participant("router_b", "router")
 
@@ -121,6 +123,7 @@ def test_missed_messages_are_fetched_when_a_router_is_back(place):
 
         state(0)
         wait_for(lambda: ticks == [0] and tokens == [("arm_0", True)])
+        time.sleep(ROUTES_S)
         port = int(far.endpoint.rsplit(":", 1)[1])
         far.close()
         for tick in (1, 2, 3):
@@ -161,7 +164,7 @@ def test_the_rate_limit_counts_each_arm_and_not_the_link(place):
         listener = monitor[0].declare_subscriber(
             keys.of_every_arm("f", "state"), lambda sample: heard.append(str(sample.key_expr))
         )
-        time.sleep(0.5)  # until the far router knows the subscriber
+        time.sleep(ROUTES_S)
         for _ in range(each):
             for name, arm in zip(ARMS, arms, strict=True):
                 arm.put(keys.of_arm("f", name, "state"), b"x")

@@ -15,7 +15,7 @@ from fleet.bus.security.access_control import ROLES, Participant, access_control
 from fleet.errors import BusError
 
 DOCS = (Path(__file__).parents[2] / "docs" / "security.md").read_text(encoding="utf-8")
-ARMS = ("arm_0", "arm_1", "arm 2/*@", "arm_10")
+ARMS = ("arm_0", "arm_1", "arm 2+*@", "arm_10")
 EVERY_KEY = [
     str(keys.Key("f", role, name, topic, asker))
     for role, topics in TOPICS.items()

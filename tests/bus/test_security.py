@@ -32,7 +32,7 @@ from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, GrantedE
 from fleet.bus.protocol.messages import encode, encoding
 from fleet.bus.security.tls import Tls
 
-ARMS = ("arm_0", "arm_1", "arm 2/*@")
+ARMS = ("arm_0", "arm_1", "arm 2+*@")
 PATIENT_S = 20.0
 HERE = "thermofleet/v4/f"
 Connect = Callable[[str], zenoh.Session]

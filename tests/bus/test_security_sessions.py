@@ -17,7 +17,7 @@ from fleet.bus.security.certificates import issue
 from fleet.bus.security.keyring import add, make
 from fleet.bus.security.tls import Tls
 
-ARMS = ("arm_0", "arm_1", "arm 2/*@")
+ARMS = ("arm_0", "arm_1", "arm 2+*@")
 PATIENT_S = 20.0
 HERE = "thermofleet/v4/f"
 

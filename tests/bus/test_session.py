@@ -21,7 +21,7 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import DifficultyScores, Info, State, check_name, decode, encode, encoding
 from fleet.errors import BusError
 
-ARMS = ("arm_0", "arm_1", "arm 2/*@")
+ARMS = ("arm_0", "arm_1", "arm 2+*@")
 ROOT = Path(__file__).parents[2]
 PATIENT_S = 30.0
 

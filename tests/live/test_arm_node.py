@@ -29,9 +29,11 @@ from fleet.bus.protocol.messages import DifficultyScores, Info, State
 from fleet.errors import InfeasibleJob
 from fleet.job import Place
 from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
+from fleet.live.arm.config import ArmConfig
 from fleet.live.arm.estimator import NOT_PLANNED, Estimator, NominalPeaks
 from fleet.live.arm.journal_records import ArmHistory, ArmRecord
-from fleet.live.arm.node import PLANNING_S, ArmConfig, ArmNode
+from fleet.live.arm.node import ArmNode
+from fleet.live.arm.planning import PLANNING_S
 from fleet.live.arm.replay_body import ReplayBody, SensorLog
 from fleet.live.arm.simulated_body import SimulatedBody
 from fleet.live.clock import FleetClock

@@ -32,7 +32,7 @@ CRATE_JSON = {"name": "crate 1", "kind": "hold", "places": ["rack"]}
 
 
 class StandIn:
-    """A fleet of one arm `a/1` and an auctioneer, on a thread of its own."""
+    """A fleet of one arm `a+1` and an auctioneer, on a thread of its own."""
 
     def __init__(self, endpoint):
         self.link, self.stop, self.asked = BusClient(endpoint, "f"), threading.Event(), []
@@ -40,9 +40,9 @@ class StandIn:
 
     def __enter__(self):
         link = self.link.open()
-        link.reply_to(keys.of_arm("f", "a/1", "quote"), bus.QuoteRequest, self.quote)
-        link.declare_token(keys.of_arm("f", "a/1", "alive"))
-        self.event = link.publisher(keys.of_arm("f", "a/1", "event"), bus.ArmEvent)
+        link.reply_to(keys.of_arm("f", "a+1", "quote"), bus.QuoteRequest, self.quote)
+        link.declare_token(keys.of_arm("f", "a+1", "alive"))
+        self.event = link.publisher(keys.of_arm("f", "a+1", "event"), bus.ArmEvent)
         link.reply_to(keys.of_jobs("f", "submit"), bus.Submission, self.submit)
         link.reply_to(keys.of_jobs("f", "status"), bus.StatusRequest, self.status)
         self.thread.start()
@@ -60,7 +60,7 @@ class StandIn:
     def quote(self, request):
         assert request.dry_run
         offers = tuple(bus.JobEstimate(job.name, (bus.PlanQuote(difficulty=0.25),)) for job in request.jobs)
-        return bus.Quote("a/1", request.auction, "", 3.0, "t", 1.0, "idle", 20.0, 1, offers)
+        return bus.Quote("a+1", request.auction, "", 3.0, "t", 1.0, "idle", 20.0, 1, offers)
 
     def submit(self, word):
         if word.by == "disk full":
@@ -71,16 +71,16 @@ class StandIn:
     def status(self, word):
         return bus.Status("au", 9.0, (bus.JobStatus("crate 1", "waiting"),))
 
-    def state(self, tick, arm="a/1"):
+    def state(self, tick, arm="a+1"):
         word = State(arm=arm, tick=tick, time_s=float(tick), mode="idle", temp_c=(30.0, 41.5), headroom_k=18.5)
         self.link.publish(keys.of_arm("f", arm, "state"), word)
 
     def difficulty(self):
-        word = DifficultyScores("a/1", 1, 1.0, "t", ("crate 1",), (0.5,), (None,))
-        self.link.publish(keys.of_arm("f", "a/1", "difficulty"), word)
+        word = DifficultyScores("a+1", 1, 1.0, "t", ("crate 1",), (0.5,), (None,))
+        self.link.publish(keys.of_arm("f", "a+1", "difficulty"), word)
 
     def happens(self, number, reason=""):
-        self.event(bus.ArmEvent(arm="a/1", number=number, time_s=1.0, kind="warning", joint=2, reason=reason))
+        self.event(bus.ArmEvent(arm="a+1", number=number, time_s=1.0, kind="warning", joint=2, reason=reason))
 
 
 class Served:
@@ -199,7 +199,7 @@ def test_the_fleet_is_shown_with_ages(gateway, arm):
     told = until(fleet, lambda: arm.state(3))
     assert told["fleet"] == "f"
     (seen,) = told["arms"]
-    assert (seen["arm"], seen["hottest_c"], seen["joint"], seen["headroom_k"]) == ("a/1", 41.5, 2, 18.5)
+    assert (seen["arm"], seen["hottest_c"], seen["joint"], seen["headroom_k"]) == ("a+1", 41.5, 2, 18.5)
     assert 0 <= seen["state_age_s"] < 3.0
     assert told["counts"] == {"waiting": 1}
 
@@ -266,7 +266,7 @@ def test_without_an_auctioneer_the_gateway_says_so():
 
 def test_only_requests_with_the_token_are_served(router):
     token = "sixteen-or-more-characters"
-    with Served(router, token=token) as served:
+    with Served(router, tokens={token: "operator"}) as served:
         for wrong in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": f"Basic {token}"},
                       {"Authorization": f"Bearer {token}x"}, {"Authorization": f"Bearer {token[:-1]}"}):  # fmt: skip
             status, kind, _ = served.ask("GET", "/v4/fleet", headers=wrong)
@@ -275,6 +275,58 @@ def test_only_requests_with_the_token_are_served(router):
             assert " 401 " in file.readline()
         status, _, _ = served.ask("GET", "/v4/fleet", headers={"Authorization": f"bearer {token}", "Host": "any"})
         assert status == 200
+
+
+def test_a_token_may_do_what_its_role_may(router, arm):
+    watcher, sender = "watcher-watcher-watcher", "sender-sender-sender"
+    with Served(router, tokens={watcher: "monitor", sender: "submitter"}) as served:
+
+        def ask(token, method, path, body=None):
+            return served.ask(method, path, body, {"Authorization": f"Bearer {token}"})
+
+        assert ask(watcher, "GET", "/v4/jobs")[0] == 200
+        status, _, told = ask(watcher, "POST", "/v4/jobs", {"jobs": [CRATE_JSON]})
+        assert (status, told["detail"]) == (403, "This token has the role monitor; this request needs submitter.")
+        assert ask(sender, "POST", "/v4/jobs", {"jobs": [CRATE_JSON]})[0] == 200
+
+
+def test_the_first_page_lists_all_requests(gateway):
+    status, _, told = gateway.ask("GET", "/")
+    assert (status, told["role"]) == (200, "operator")
+    offered = {(entry["method"], entry["path"]) for entry in told["requests"]}
+    assert {("GET", "/v4/fleet"), ("POST", "/v4/jobs")} <= offered
+    for method, path in offered - {("GET", "/v4/events")}:
+        assert gateway.ask(method, path, {} if method == "POST" else None)[0] in (200, 422)
+
+
+@pytest.mark.parametrize(
+    "begun",
+    [
+        "POST /v4/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n{",
+        "POST /v4/jobs HTTP/1.1\r\nHost: loc",
+        "",
+    ],
+    ids=["bodies", "headers", "connections"],
+)
+def test_300_unfinished_requests_hold_nobody_up(router, arm, begun):
+    with Served(router) as served, ExitStack() as lines:
+        for _ in range(300):
+            line = lines.enter_context(socket.create_connection(("127.0.0.1", served.port)))
+            line.sendall(begun.encode())
+        time.sleep(2.5)  # the rate of one address is limited, too
+        start_s = time.monotonic()
+        assert served.ask("GET", "/v4/fleet")[0] == 200
+        assert served.ask("POST", "/v4/jobs", {"jobs": [CRATE_JSON]})[0] == 200
+        assert time.monotonic() - start_s < 3.0
+
+
+def test_requests_beyond_the_rate_are_refused_until_a_pause(router):
+    with Served(router) as served:
+        answers = [served.ask("GET", "/")[0] for _ in range(400)]
+        assert answers[:100] == [200] * 100
+        assert 429 in answers
+        time.sleep(0.5)
+        assert served.ask("GET", "/")[0] == 200
 
 
 def test_no_other_origin_is_ever_allowed(gateway):
@@ -290,8 +342,8 @@ def test_the_stream_has_all_messages(gateway, arm):
         arm.difficulty()
         arm.happens(0)
         found = events(file, lambda found: {"state", "difficulty", "event"} <= {name for _, name, _ in found})
-    assert of("presence", found)[0]["message"] == {"role": "arm", "name": "a/1", "there": True}
-    assert of("state", found)[0]["name"] == "a/1"
+    assert of("presence", found)[0]["message"] == {"role": "arm", "name": "a+1", "there": True}
+    assert of("state", found)[0]["name"] == "a+1"
     assert of("state", found)[0]["message"]["temp_c"] == [30.0, 41.5]
     assert of("event", found)[0]["message"]["kind"] == "warning"
     numbers = [int(number.partition("-")[2]) for number, _, _ in found]
@@ -396,6 +448,6 @@ def test_the_monitor_in_javascript_shows_the_fleet(router, arm, tmp_path):
             node.wait(timeout=PATIENCE_S)
     told = log.read_text(encoding="utf-8")
     assert node.returncode == 0
-    assert re.search(r"a/1 .*idle.*41\.5.*2 .*18\.5", told)
+    assert re.search(r"a\+1 .*idle.*41\.5.*2 .*18\.5", told)
     assert "warning" in told
     assert "crate 1 0.50" in told

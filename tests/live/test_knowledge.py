@@ -18,9 +18,10 @@ from fleet.difficulty import KNOWN, Difficulty, Forecast
 from fleet.env.allocation_v1 import Episode, parallel_env
 from fleet.errors import InfeasibleJob
 from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
+from fleet.live.arm.config import ArmConfig
 from fleet.live.arm.estimator import Estimator, NominalPeaks
 from fleet.live.arm.journal_records import ArmHistory
-from fleet.live.arm.node import ArmConfig, ArmNode
+from fleet.live.arm.node import ArmNode
 from fleet.live.arm.simulated_body import SimulatedBody
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.knowledge import LiveFleet

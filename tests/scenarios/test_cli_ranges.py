@@ -6,8 +6,8 @@ from typing import Annotated, get_args, get_origin, get_type_hints
 import pytest
 import typer
 
+from fleet.errors import MAX_NAME
 from scenarios.cli.main import COMMANDS, target_of
-from scenarios.cli.options import MAX_NAME
 
 HUGE = "9" * 30
 WRONG = {int: (HUGE, f"-{HUGE}"), float: (HUGE, f"-{HUGE}", "nan", "inf", "-inf")}

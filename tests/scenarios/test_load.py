@@ -88,7 +88,8 @@ WRONG = [
     (put("slots", 0), "heat.toml: slots must be between 1 and 256 (got 0)."),
     (
         put("name", "../up"),
-        "heat.toml: name must be non-empty, without a leading dot and without slashes (got '../up').",
+        "heat.toml: name must have 1 to 128 printable characters without / \\ [ ], and no dot or space at the start "
+        "(got '../up').",
     ),
     (
         put("places", 0, "position_m", [0.0, math.nan, 0.0]),

@@ -13,6 +13,7 @@ class Plain:
     """Stands in for the learned twin, which P by `rc` does not need: every plan is equally difficult."""
 
     version = "plain"
+    joint_weight = None
 
     def features(self, plans, repetitions) -> Features:
         return Features(np.full((len(plans), 7, PARTS), 0.1))

@@ -1,6 +1,6 @@
 """What a long command says where there is no terminal to draw a bar on, and when it is interrupted."""
 
-from scenarios.cli.terminal import LONG_STAGES, Interrupted, progress_bar
+from scenarios.cli.terminal import LONG_STAGES, Interrupted, SafeConsole, echo, plain_table, progress_bar
 
 
 def interrupted(stage: str, **bar: str) -> str:
@@ -46,3 +46,13 @@ def test_an_interruption_says_what_is_kept_and_where(monkeypatch, tmp_path):
 
 def test_an_interruption_that_keeps_nothing_does_not_promise_it():
     assert interrupted("learning the log", kept="") == "Interrupted while learning the log: nothing was written."
+
+
+def test_text_from_others_cannot_move_the_cursor_or_reorder_a_line(capsys):
+    odd = "a\x1b[2Jb\u202ec\x9bd"
+    table = plain_table("name")
+    table.add_row(odd)
+    SafeConsole(width=200).print(table)
+    echo(odd)
+    for line in capsys.readouterr().out.splitlines()[1:]:
+        assert line.strip() == r"a\u001b[2Jb\u202ec\u009bd"

@@ -10,6 +10,8 @@ import pytest
 
 from scenarios.cli.main import main
 from scenarios.report.page import Section
+from twin.vae.checkpoint import load
+from twin.vae.measures import TAU
 from twin.vae.model import TwinConfig
 
 TINY = ("--hidden", 8, "--epochs", 10, "--max-windows", 150, "--restarts", 1, "--allow-collapse")
@@ -126,7 +128,11 @@ def test_the_twin_of_one_arm_of_a_scenario_scores_its_jobs(thermofleet, small_to
     assert all(0 <= row["d"] < 7 and row["why"] for row in rows)
     calibrated_on = json.loads((out / "twins.json").read_text(encoding="utf-8"))["twins"][0]["calibrated_on"]
     assert all((row["p_value"] is None) == (calibrated_on == 0) for row in rows)
-    assert all(row["d"] == pytest.approx(sum(row[f"d_{j}"] for j in range(1, 8))) for row in rows)
+    scaler = load(out / "right.twin").scaler
+    torque_sq = scaler.mean[:, TAU] ** 2 + scaler.std[:, TAU] ** 2
+    weight = 7 * torque_sq / torque_sq.sum()
+    for row in rows:
+        assert row["d"] == pytest.approx(sum(weight[j] * row[f"d_{j + 1}"] for j in range(7)))
 
 
 @pytest.mark.parametrize(

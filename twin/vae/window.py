@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet.motion import CHANNELS, RATE_HZ, Plan
+from fleet.motion import CHANNELS, RATE_HZ, Plan, distinct
 from twin.logs.recording import CONTINUOUS
 from twin.vae.model import TwinConfig
 
@@ -143,12 +143,18 @@ def cut_phases(plans: Sequence[Plan], config: TwinConfig) -> JobWindows:
     parts, weights, owners = [], [], []
     for plan in plans:
         for name, phase in zip(PHASES, plan.phases, strict=True):
-            profile = check_profile(phase.profile, f"{name.capitalize()} of arm '{plan.arm}'")
+            profile = check_profile(_one_window(phase.profile, config), f"{name.capitalize()} of arm '{plan.arm}'")
             samples = resample(profile, RATE_HZ, config.rate_hz)
             parts.append(cut(samples, config.window, config.score_stride))
             weights.append(cover(len(samples), config.window, config.score_stride))
             owners.append(np.full(len(parts[-1]), len(owners)))
     return JobWindows(np.concatenate(parts), np.concatenate(weights), np.concatenate(owners), len(owners))
+
+
+def _one_window(profile: Array, config: TwinConfig) -> Array:
+    """The samples of one window of a standstill that is stored once: all its windows are equal."""
+    count = int(np.ceil(config.window * RATE_HZ / config.rate_hz))
+    return profile[:count] if len(distinct(profile)) < len(profile) else profile
 
 
 def cut_jobs(plans: Sequence[Plan], repetitions: Sequence[int], config: TwinConfig) -> JobWindows:

@@ -101,6 +101,12 @@ def reachable(endpoint: str, tls: Tls | None = None) -> str:
     return endpoint
 
 
+def reached_at(host: str) -> str:
+    """Address, as in an endpoint, at which this machine reaches a router that listens on `host`."""
+    bare = host.strip("[]")
+    return _ANY_ADDRESS.get(bare, f"[{bare}]" if ":" in bare else bare)
+
+
 def connect(endpoint: str, timeout_s: float, stopped: Callable[[], bool] | None) -> zenoh.Session:
     """A client session on the router at `endpoint`: once there is one, if `stopped` is given, instead of `timeout_s`.
 
@@ -180,7 +186,7 @@ class Router:
         """
         if not 0 <= port <= 65535:
             raise ValueError(f"A port is 0..65535 (got {port}).")
-        self._host = f"[{host}]" if ":" in host and not host.startswith("[") else host
+        self._host = f"[{host.strip('[]')}]" if ":" in host else host
         self._port = port
         self._tls = tls
         self._limits = limits or Limits()
@@ -296,8 +302,7 @@ class Router:
             locators = json.loads(reply.ok.payload.to_bytes())["locators"]
             ports = {locator.rsplit(":", 1)[1] for locator in locators}
             if len(ports) == 1:
-                host = _ANY_ADDRESS.get(self._host.strip("[]"), self._host)
-                return f"{self._listen[:3]}/{host}:{ports.pop()}"
+                return f"{self._listen[:3]}/{reached_at(self._host)}:{ports.pop()}"
         raise BusError("The router opened, but its port is unknown.")
 
 

@@ -18,54 +18,23 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from fleet.bus.protocol.messages import Count, Name, Share, finite
-from fleet.job import BOUNDS, DWELL_S, Kind, check_bounds, check_duration, check_places
+from fleet.bus.protocol.job_spec import JobSpec
+from fleet.bus.protocol.messages import Count, Name, Number, Share, finite
 from fleet.telemetry import Mode
 
-Positive = Annotated[float, msgspec.Meta(gt=0)]
+LeaseTime = Annotated[float, msgspec.Meta(gt=0, le=3600)]
+MIN_SPEED, MAX_SPEED = 0.001, 10_000.0
+"""Of a fleet, in fleet seconds per real second."""
 LEASE_S = 6.0
 """Real seconds that an arm may work on a job without renewing its lease."""
+NOT_PLANNED = "not planned yet; ask again"
+"""Reason of an estimate that the arm will have soon."""
 MOST_PLANS = 8
 """Of one arm for one job."""
 MOST_QUOTED = 64
 """Jobs in one quote, so that it does not exceed the router's size limit."""
 MOST_JOBS = 128
 """In one message; more are sent as several messages, so that none exceeds the router's size limit."""
-
-
-def _bounds(name: str) -> msgspec.Meta:
-    """Bounds of a number in the JSON schema; `JobSpec` itself checks them, as its error also names the value."""
-    return msgspec.Meta(extra_json_schema={"minimum": BOUNDS[name].low, "maximum": BOUNDS[name].high})
-
-
-class JobSpec(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A job on the bus; fields as in `fleet.job.Work` and `fleet.job.Job`."""
-
-    name: Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
-    """Unique in the fleet; a second job with this name is the same job."""
-    kind: Kind
-    places: Annotated[tuple[Name, ...], msgspec.Meta(min_length=1, max_length=2)]
-    """Places of the cell: from and to for pick_place and sort; one for hold and press."""
-    repetitions: Annotated[int, _bounds("repetitions")] = 1
-    payload_kg: Annotated[float, _bounds("payload_kg")] = 0.0
-    dwell_s: Annotated[float, _bounds("dwell_s")] = DWELL_S
-    force_n: Annotated[float, _bounds("force_n")] = 0.0
-    release_s: Annotated[float, _bounds("release_s")] = 0.0
-    """Earliest start."""
-    due_s: Annotated[float, _bounds("due_s")] | None = None
-    """Due date; null for none."""
-    value: Annotated[float, _bounds("value")] = 1.0
-    after: tuple[Name, ...] = ()
-    """Jobs that must be finished before."""
-    expires: bool = False
-    """The due date is hard: the job is given up if it still waits then."""
-
-    def __post_init__(self) -> None:
-        check_places(self, self.kind, self.places)
-        check_bounds(self, "repetitions", "payload_kg", "dwell_s", "force_n", "release_s", "due_s", "value")
-        check_duration(self, self.dwell_s, self.repetitions)
-        if self.due_s is not None and self.due_s < self.release_s:
-            raise ValueError(f"JobSpec.due_s must be >= release_s = {self.release_s:g} (got {self.due_s:g}).")
 
 
 Jobs = Annotated[tuple[JobSpec, ...], msgspec.Meta(min_length=1, max_length=MOST_JOBS)]
@@ -115,19 +84,19 @@ class PlanQuote(msgspec.Struct, frozen=True, omit_defaults=True):
 
     plan: Count = 0
     """Number of the plan: an `Award` names it. Different for each plan of a job."""
-    peak_c: float | None = None
+    peak_c: Number | None = None
     """Predicted temperature of the hottest motor during the job."""
-    gained_k: float | None = None
+    gained_k: Number | None = None
     """`peak_c` above the hottest motor now."""
     p_saturation: Share | None = None
     """Probability that a motor passes the warning limit, starting from the present temperatures."""
-    joint_difficulty: tuple[float, ...] | None = None
+    joint_difficulty: tuple[Number, ...] | None = None
     """d_k, [joint]."""
-    difficulty: float | None = None
+    difficulty: Number | None = None
     """d = Σ_k w_k d_k, with the weights of the arm's twin (`fleet.difficulty`)."""
-    duration_s: float | None = None
+    duration_s: Number | None = None
     """Duration of the job alone."""
-    finish_in_s: float | None = None
+    finish_in_s: Number | None = None
     """Time until it would be finished, including the arm's current jobs."""
     space: Name | None = None
     """Name of the space of its plan, from home to home; null for unknown: anywhere within reach."""
@@ -175,13 +144,13 @@ class Quote(msgspec.Struct, frozen=True):
     auction: Name
     quote: str
     """Name of this quote, which this arm never uses again, not even after a restart; "" for a dry run."""
-    valid_s: float
+    valid_s: Number
     """Real seconds during which the arm accepts an award that refers to it, counted by the arm."""
     twin: str
     """Version of the twin that scored."""
-    time_s: float
+    time_s: Number
     mode: Mode
-    headroom_k: float
+    headroom_k: Number
     capacity: Count
     """How many more jobs the arm would accept now."""
     estimates: tuple[JobEstimate, ...]
@@ -210,7 +179,7 @@ class Award(msgspec.Struct, frozen=True):
     job: JobSpec
     cycles: Count = 0
     """Cycles of the job that others have done already."""
-    lease_s: Positive = LEASE_S
+    lease_s: LeaseTime = LEASE_S
     """Real seconds that the arm may work on it without renewing the lease, counted from its quote."""
     plan: Count = 0
     """Number of the quoted plan by which to do it."""
@@ -250,7 +219,7 @@ class Lease(msgspec.Struct, frozen=True):
     """Reply to a `LeaseRequest`."""
 
     auctioneer: Name
-    lease_s: Positive
+    lease_s: LeaseTime
     """Real seconds, counted by the arm from the moment it sent the request."""
     granted: tuple[str, ...]
     """Awards whose lease is renewed."""
@@ -270,7 +239,7 @@ class Report(msgspec.Struct, frozen=True):
     outcome: Literal["finished", "returned"]
     cycles: Count
     """Done so far, including those of others."""
-    time_s: float
+    time_s: Number
     """When it was finished or returned."""
     reason: str = ""
     unsure: bool = False
@@ -307,7 +276,7 @@ class JobStatus(msgspec.Struct, frozen=True):
     arm: str = ""
     award: str = ""
     cycles: Count = 0
-    finished_s: float | None = None
+    finished_s: Number | None = None
     reason: str = ""
 
 
@@ -322,7 +291,7 @@ class Status(msgspec.Struct, frozen=True):
     """Reply to a `StatusRequest`; unknown names are left out."""
 
     auctioneer: Name
-    time_s: float
+    time_s: Number
     jobs: tuple[JobStatus, ...]
     space: dict[Name, tuple[Name, ...]] = {}
     """Names of the spaces that are closed to others, by the arm that takes them or may take them; "*" is all space
@@ -336,7 +305,7 @@ class Announcement(msgspec.Struct, frozen=True):
 
     auctioneer: Name
     auction: Name
-    time_s: float
+    time_s: Number
     jobs: tuple[str, ...]
 
 
@@ -346,13 +315,13 @@ class Result(msgspec.Struct, frozen=True):
     auctioneer: Name
     number: Count
     """Counts the results of this auctioneer, across restarts."""
-    time_s: float
+    time_s: Number
     status: JobStatus
     auction: str = ""
-    difficulty: float | None = None
+    difficulty: Number | None = None
     """Quoted by the arm, as are the next two."""
-    p_saturation: float | None = None
-    peak_c: float | None = None
+    p_saturation: Number | None = None
+    peak_c: Number | None = None
 
 
 class ArmEvent(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -361,11 +330,11 @@ class ArmEvent(msgspec.Struct, frozen=True, omit_defaults=True):
     arm: Name
     number: Count
     """Counts the events of this arm; unique, with a gap after a restart."""
-    time_s: float
+    time_s: Number
     kind: Name
     job: str = ""
-    joint: Annotated[int, msgspec.Meta(ge=0)] = 0
-    value: float | None = None
+    joint: Annotated[int, msgspec.Meta(ge=0, le=64)] = 0
+    value: Number | None = None
     reason: str = ""
 
 
@@ -376,9 +345,9 @@ class ClockRequest(msgspec.Struct, frozen=True):
 class Clock(msgspec.Struct, frozen=True):
     """Reply to a `ClockRequest`."""
 
-    time_s: float
+    time_s: Number
     """Fleet time of the reply."""
-    speed: Positive
+    speed: Annotated[float, msgspec.Meta(ge=MIN_SPEED, le=MAX_SPEED)]
     """Fleet seconds per real second."""
     epoch: str = ""
     """Name of the journal that the fleet continues; another one if that was lost, or a new shift began."""

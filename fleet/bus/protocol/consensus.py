@@ -17,8 +17,8 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from fleet.bus.protocol.auction import MOST_JOBS, Count, JobEstimate, JobSpec, Positive
-from fleet.bus.protocol.messages import Name, finite
+from fleet.bus.protocol.auction import MOST_JOBS, Count, JobEstimate, JobSpec, LeaseTime
+from fleet.bus.protocol.messages import Name, Number, finite
 
 
 class Bid(msgspec.Struct, frozen=True):
@@ -27,7 +27,7 @@ class Bid(msgspec.Struct, frozen=True):
     arm: Name
     number: Count
     """Counts the bids of this arm; unique, with a gap after a restart."""
-    time_s: float
+    time_s: Number
     """Fleet time of this arm; the latest time of any arm is that of the fleet."""
     capacity: Count
     """How many more jobs it would accept now."""
@@ -83,7 +83,7 @@ class JobOutcome(msgspec.Struct, frozen=True):
     """unfinished: the arm crashed after it got permission to commit, and no arm does the job again; given_up: arms
     faulted in it too often; returned: the job is open again."""
     cycles: Count
-    time_s: float
+    time_s: Number
     reason: str = ""
     faults: Faults = {}
 
@@ -133,7 +133,7 @@ class ClaimReply(msgspec.Struct, frozen=True):
     arm: Name
     number: Count
     """Number of the claim that this answers."""
-    lease_s: Positive
+    lease_s: LeaseTime
     """Real seconds, counted by the claimer from the moment it sent the claim."""
     granted: tuple[GrantedEntry, ...] = ()
     denied: tuple[DeniedEntry, ...] = ()

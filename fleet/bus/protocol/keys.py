@@ -13,6 +13,8 @@ from functools import lru_cache
 from typing import Literal, get_args
 from urllib.parse import quote, unquote
 
+from fleet.errors import NAME_RULE, is_name, printable
+
 Role = Literal["arm", "auction", "jobs", "clock"]
 ArmTopic = Literal["alive", "state", "info", "difficulty", "event", "bid", "quote", "award", "history"]
 AuctionTopic = Literal["alive", "announce", "result"]
@@ -210,11 +212,8 @@ def chunk(name: str) -> str:
     """The name as one chunk of a key.
 
     Raises:
-        ValueError: empty, or no valid Unicode.
+        ValueError: it does not follow the rule for names.
     """
-    if not name:
-        raise ValueError("A name in a key must not be empty.")
-    try:
-        return quote(name, safe="")
-    except UnicodeEncodeError as error:
-        raise ValueError(f"The name {name!r} is no valid Unicode text.") from error
+    if not is_name(name):
+        raise ValueError(f"A name in a key must have {NAME_RULE} (got '{printable(name)}').")
+    return quote(name, safe="")

@@ -15,8 +15,11 @@ from fleet.errors import BusError
 from fleet.telemetry import Mode
 
 VERSION = 4
-Name = Annotated[str, msgspec.Meta(min_length=1)]
-Count = Annotated[int, msgspec.Meta(ge=0)]
+Name = Annotated[str, msgspec.Meta(min_length=1, max_length=512)]
+LEAST, MOST, MOST_COUNT = -1e12, 1e12, 10**15
+Count = Annotated[int, msgspec.Meta(ge=0, le=MOST_COUNT)]
+Number = Annotated[float, msgspec.Meta(ge=LEAST, le=MOST)]
+"""Any quantity without bounds of its own: no sum or product of a few of them overflows."""
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Celsius = Annotated[float, msgspec.Meta(ge=-273.15, le=1000)]
 
@@ -31,17 +34,17 @@ class State(msgspec.Struct, frozen=True, omit_defaults=True):
     arm: Name
     tick: Count
     """Counts the states of this arm; in a simulated shift, state and difficulty of one step have the same tick."""
-    time_s: float
+    time_s: Number
     mode: Mode
-    temp_c: tuple[float, ...]
+    temp_c: tuple[Number, ...]
     """Measured motor temperatures, [joint]."""
-    headroom_k: float
+    headroom_k: Number
     """Warning limit minus hottest motor."""
     job: str = ""
     """The current job; "" for none."""
     space: str = ""
     """Name of the space that the arm takes while it is away from home; "" at home, or if the arm does not say."""
-    busy_s: float = 0.0
+    busy_s: Number = 0.0
     """Time until it is home with its current job done."""
     housing_c: tuple[Celsius, ...] = ()
     """Its estimate of the housing temperatures, which have no sensor, [joint]."""
@@ -55,13 +58,13 @@ class State(msgspec.Struct, frozen=True, omit_defaults=True):
     """Predicted temperature of the hottest motor in the rest of the current job."""
     job_p_saturation: Share | None = None
     """Probability that a motor passes the warning limit in the rest of the current job."""
-    q: tuple[float, ...] = ()
+    q: tuple[Number, ...] = ()
     """rad, [joint]."""
-    qd: tuple[float, ...] = ()
+    qd: tuple[Number, ...] = ()
     """rad/s, [joint]."""
-    tau: tuple[float, ...] = ()
+    tau: tuple[Number, ...] = ()
     """N·m at the joint output, [joint]."""
-    current_a: tuple[float, ...] = ()
+    current_a: tuple[Number, ...] = ()
     """[joint]."""
 
     def __post_init__(self) -> None:
@@ -82,16 +85,16 @@ class DifficultyScores(msgspec.Struct, frozen=True):
     arm: Name
     tick: Count
     """Counts the scores of this arm; in a simulated shift, state and difficulty of one step have the same tick."""
-    time_s: float
+    time_s: Number
     twin: str
     """Version of the twin that scored."""
     jobs: tuple[Name, ...]
     """Names of the open jobs, each once; the columns of the lists below."""
-    difficulty: tuple[float | None, ...]
+    difficulty: tuple[Number | None, ...]
     """d, [job]; null where the arm has no score or cannot do the job."""
-    p_saturation: tuple[float | None, ...]
+    p_saturation: tuple[Number | None, ...]
     """Probability that a motor passes the warning limit, [job]; null where unknown."""
-    peak_c: tuple[float | None, ...] = ()
+    peak_c: tuple[Number | None, ...] = ()
     """Predicted temperature of the hottest motor during the job, [job]; null where unknown; empty if none is known."""
 
     def __post_init__(self) -> None:
@@ -111,7 +114,7 @@ class Info(msgspec.Struct, frozen=True):
     """Constants of an arm: published at its start, and again when they change."""
 
     arm: Name
-    joints: Annotated[int, msgspec.Meta(ge=1)]
+    joints: Annotated[int, msgspec.Meta(ge=1, le=64)]
     twin: str
     """Version of its twin."""
 

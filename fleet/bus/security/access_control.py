@@ -119,17 +119,13 @@ def read_roster(folder: Path) -> Roster:
         ) from error
     except OSError as error:
         raise BusError(f"Cannot read '{path}': {error.strerror}.") from error
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise BusError(f"'{path}' is not a roster: {error}.") from error
 
 
 def file_of(name: str) -> str:
-    """File name of a participant, without the ending: its name as in keys, with a first dot encoded, too.
-
-    `urllib.parse.unquote` is the inverse.
-    """
-    encoded = keys.chunk(name)
-    return f"%2E{encoded[1:]}" if encoded.startswith(".") else encoded
+    """File name of a participant, without the ending: its name as in keys; `urllib.parse.unquote` is the inverse."""
+    return keys.chunk(name)
 
 
 @dataclass(frozen=True)

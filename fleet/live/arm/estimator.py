@@ -4,33 +4,35 @@ Inputs are planned motions, the difficulty model, measured motor temperatures an
 arm; not the true parameters of its body.
 """
 
+import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import repeat
 from typing import NamedTuple
 
 import numpy as np
 
-from fleet.bus.protocol.auction import JobEstimate, JobSpec, PlanQuote
+from fleet.bus.protocol.auction import NOT_PLANNED, JobEstimate, JobSpec, PlanQuote
 from fleet.difficulty import Difficulty, DifficultyModel
-from fleet.errors import InfeasibleJob
+from fleet.errors import InfeasibleJob, printable
 from fleet.job import LONGEST_JOB_S, Job, Place, Work
-from fleet.motion import Drive, Plan, drives
+from fleet.motion import Drive, Plan, distinct
 from fleet.motor import gen3_motors
-from fleet.offered_plans import offered_plans
+from fleet.offered_plans import nominal_drive, offered_plans
 from fleet.planning.space import plan_key, space_name
 from fleet.robot import JOINTS
 from fleet.thermal import NODES, WINDING, gen3_network, temperature_steps, thermal_model
 
 Array = np.ndarray
+_LOG = logging.getLogger(__name__)
 
-MAX_WORKS, MAX_SCORES = 512, 4096
-"""Works whose plans are kept, and jobs whose plans are kept."""
+MAX_WORKS, MAX_SCORES, MAX_BYTES = 512, 1024, 24_000_000
+"""Of works that were not known at the start: how many are kept, jobs whose scores are kept, and size of the plans."""
+MAX_REASON = 300
+"""Characters of an error in a reason."""
 STEPS = 24
 """Time steps of a job when its temperatures are predicted."""
 NO_CYCLES: Mapping[str, int] = {}
-NOT_PLANNED = "not planned yet; ask again"
 
 
 class NominalPeaks:
@@ -38,7 +40,6 @@ class NominalPeaks:
 
     def __init__(self) -> None:
         self._motors, self._thermal = gen3_motors(), thermal_model(gen3_network())
-        self._drive = lru_cache(MAX_SCORES)(self._mean_drive)
 
     def peaks_c(self, plans: Sequence[Plan], repetitions: Sequence[int], known_c: Array) -> Array:
         """Hottest motor during each plan, °C, [plan], in `STEPS` steps of constant heat each.
@@ -50,7 +51,7 @@ class NominalPeaks:
             return np.zeros(0)
         jobs = list(zip(plans, repetitions, strict=True))
         shares = [plan.weights(times) for plan, times in jobs]
-        loads = [self._drive(plan) for plan in plans]
+        loads = [nominal_drive(plan) for plan in plans]
         mean = Drive(
             np.stack([share @ load.current_sq for share, load in zip(shares, loads, strict=True)]),
             np.stack([share @ load.friction_w for share, load in zip(shares, loads, strict=True)]),
@@ -64,10 +65,6 @@ class NominalPeaks:
             ambient_c=float(known_c[NODES]),
         )
         return np.max([step[:, WINDING].max(axis=1) for step in steps], axis=0)
-
-    def _mean_drive(self, plan: Plan) -> Drive:
-        """Mean drive of each phase, [phase, joint]."""
-        return drives([phase.profile for phase in plan.phases], self._motors)
 
 
 class ScoredPlan(NamedTuple):
@@ -106,14 +103,18 @@ class Estimator:
     ) -> None:
         self.model = model
         self._plan, self._places, self._peaks = plan, places, peaks
-        self._variants = lru_cache(MAX_WORKS)(self._variants_or_reason)
+        self._known: dict[Work, tuple[Plan, ...] | NoPlan] = {}
+        self._requested: dict[Work, tuple[Plan, ...] | NoPlan] = {}
+        """Variants of the works known at the start, and of others, oldest first."""
+        self._bytes = 0
+        """Size of the plans of requested works."""
         self._offers: dict[tuple[Work, int, int], Offers] = {}
         """By work, number of repetitions and how many of them are done."""
 
     def plan_ahead(self, works: Iterable[Work]) -> None:
-        """Plan some works before they are requested."""
+        """Plan some works before they are requested; they are never dropped."""
         for work in works:
-            self._variants(work)
+            self._known[work] = self._variants_or_reason(work)
 
     def is_prepared(self, job: JobSpec, done: int = 0) -> bool:
         """Whether an estimate of the job needs neither planning nor scoring.
@@ -124,14 +125,36 @@ class Estimator:
         return self._offers_or_reason(job, done) != NoPlan(NOT_PLANNED)
 
     def prepare(self, job: JobSpec, done: int = 0) -> None:
-        """Plan and score the job, maybe slowly; never raises. Arguments as in `is_prepared`."""
-        if self.is_prepared(job, done):
-            return
-        work = self._work(job)
-        assert isinstance(work, Work)
-        if len(self._offers) >= MAX_SCORES:
-            del self._offers[next(iter(self._offers))]
-        self._offers[work, job.repetitions, done] = self._scored_or_reason(work, job.repetitions, done)
+        """Plan and score the job, maybe slowly; never raises. Arguments as in `is_prepared`.
+
+        An error is a reason why there is no plan.
+        """
+        for cycles in {0, done}:
+            if not self.is_prepared(job, cycles):
+                work = self._work(job)
+                assert isinstance(work, Work)
+                try:
+                    offers = self._scored_or_reason(work, job.repetitions, cycles)
+                except Exception as error:  # whatever it is, the arm goes on
+                    offers = failed(job, error)
+                while len(self._offers) >= MAX_SCORES:
+                    del self._offers[next(iter(self._offers))]
+                self._offers[work, job.repetitions, cycles] = offers
+
+    def _variants(self, work: Work) -> tuple[Plan, ...] | NoPlan:
+        """Variants of a work, kept within `MAX_WORKS` and `MAX_BYTES`."""
+        for kept in (self._known, self._requested):
+            if work in kept:
+                return kept[work]
+        variants = self._variants_or_reason(work)
+        self._requested[work] = variants
+        self._bytes += _size(variants)
+        while self._requested and (len(self._requested) > MAX_WORKS or self._bytes > MAX_BYTES):
+            oldest = next(iter(self._requested))
+            self._bytes -= _size(self._requested.pop(oldest))
+            for key in [key for key in self._offers if key[0] == oldest]:
+                del self._offers[key]
+        return variants
 
     def _scored_or_reason(self, work: Work, repetitions: int, done: int) -> Offers:
         variants = self._variants(work)
@@ -143,11 +166,15 @@ class Estimator:
             return NoPlan(f"{days}: use fewer repetitions")
         return tuple(ScoredPlan(plan, self.model.score(plan, _left(repetitions, done))) for plan in offered)
 
-    def job(self, job: JobSpec) -> Job | None:
-        """Return the job with its work; None if it is not possible in this cell."""
+    def job(self, job: JobSpec) -> Job:
+        """Return the job with its work.
+
+        Raises:
+            ValueError: it is not possible in this cell.
+        """
         work = self._work(job)
         if isinstance(work, NoPlan):
-            return None
+            raise ValueError(work.reason)
         return Job(
             name=job.name,
             work=work,
@@ -160,26 +187,35 @@ class Estimator:
         )
 
     def plans(self, job: JobSpec) -> tuple[ScoredPlan, ...]:
-        """Return the plans on offer for the job, planned if needed, the fastest first; none if the arm cannot do it."""
-        self.prepare(job)
+        """Return the plans on offer for a prepared job, the fastest first; none if the arm cannot do it."""
         offers = self._offers_or_reason(job)
         return () if isinstance(offers, NoPlan) else offers
 
     def space_of(self, job: JobSpec, plan: int) -> str | None:
-        """Return the name of the space that the arm takes by a plan on offer; None if there is no such plan."""
+        """Return the name of the space that the arm takes by a plan on offer; None if no such plan is prepared."""
         offers = self.plans(job)
         return space_name(plan_key(offers[plan].plan)) if plan < len(offers) else None
 
     def estimate(
         self, jobs: Sequence[JobSpec], known_c: Array, busy_s: float, cycles: Mapping[str, int] = NO_CYCLES
     ) -> tuple[JobEstimate, ...]:
-        """Estimate the cycles of each job that are not done, from what is planned already.
+        """Estimate the cycles of each job that are not done, from what is planned already; an error is a reason.
 
         Args:
             known_c: Measured motor temperatures, estimated housing temperatures and ambient temperature, [KNOWN].
             busy_s: Seconds until the arm is free; inf if unknown.
             cycles: Cycles that are done, by job; 0 if not named.
         """
+        try:
+            return self._estimate(jobs, known_c, busy_s, cycles)
+        except Exception as error:
+            if len(jobs) == 1:
+                return (JobEstimate(job=jobs[0].name, reason=failed(jobs[0], error).reason),)
+            return tuple(each for job in jobs for each in self.estimate([job], known_c, busy_s, cycles))
+
+    def _estimate(
+        self, jobs: Sequence[JobSpec], known_c: Array, busy_s: float, cycles: Mapping[str, int]
+    ) -> tuple[JobEstimate, ...]:
         offers = [(job, self._offers_or_reason(job, cycles.get(job.name, 0))) for job in jobs]
         left = [_left(job.repetitions, cycles.get(job.name, 0)) for job in jobs]
         pairs = [
@@ -229,6 +265,18 @@ class Estimator:
             return self._plan(work)
         except InfeasibleJob as infeasible:
             return NoPlan(f"at '{infeasible.place}': {infeasible.reason}", infeasible.too_heavy)
+
+
+def failed(job: JobSpec, error: Exception) -> NoPlan:
+    """Log an unexpected error, and return it as the reason why there is no plan."""
+    _LOG.warning("'%s' could not be quoted.", printable(job.name), exc_info=error)
+    return NoPlan(f"it could not be planned: {type(error).__name__}: {error}"[:MAX_REASON])
+
+
+def _size(variants: tuple[Plan, ...] | NoPlan) -> int:
+    """Bytes of the samples that are stored."""
+    plans = () if isinstance(variants, NoPlan) else variants
+    return sum(distinct(phase.profile).nbytes for plan in plans for phase in plan.phases)
 
 
 def _left(repetitions: int, done: int) -> int:

@@ -1,64 +1,40 @@
 """An arm on the bus: publishes its state, quotes jobs, accepts awards and executes them in fleet time.
 
-One thread runs it. Planning a new motion takes some 50 ms, which must not delay its state messages: a reply plans for
-at most `PLANNING_S`, publishes the state between two plans, and calls the remaining jobs `NOT_PLANNED`; these are
-planned later, one motion per step, so that the next request finds them planned.
+One thread runs it, and another one plans (`fleet.live.arm.planning`), as a new motion takes 50 ms and more. A reply
+waits for plans for at most `PLANNING_S`, publishes the state meanwhile, and calls the remaining jobs `NOT_PLANNED`; the
+next request finds them planned.
 """
 
 import math
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import Ack, ArmEvent, Award, JobEstimate, JobSpec, Quote, QuoteRequest
-from fleet.bus.protocol.messages import DifficultyScores, Info, State
-from fleet.bus.protocol.registry import STATE_HZ
+from fleet.bus.protocol.auction import Ack, Award, JobEstimate, JobSpec, Quote, QuoteRequest
+from fleet.bus.protocol.messages import State
 from fleet.difficulty import known_temperatures
-from fleet.errors import Refused
+from fleet.errors import Refused, printable
 from fleet.events import Event
 from fleet.live.arm.auctioneer_client import AuctioneerClient, RateLimitedWarnings, WorkSource
 from fleet.live.arm.award_executor import AwardExecutor
 from fleet.live.arm.body import Body
+from fleet.live.arm.config import ArmConfig
 from fleet.live.arm.estimator import NO_CYCLES, Estimator, ScoredPlan
 from fleet.live.arm.journal_records import ActiveAward
+from fleet.live.arm.planning import PlanningThread
+from fleet.live.arm.publications import Publications
 from fleet.live.clock import FleetClock, next_due_s
 from fleet.live.space import ANYWHERE
 from fleet.planning.space import plan_key, space_name
 
 Array = np.ndarray
 
-PLANNING_S = 0.3
-"""Real seconds that one reply may spend on planning."""
-MAX_UNPLANNED = 256
-"""Jobs that wait to be planned."""
 WRITE_RETRY_S = 1.0
 """Real seconds between two attempts to write records for which the disk had no space."""
-EVENTS_PER_BOOT = 1_000_000_000
-"""The number of an event is the boot number times this, plus a count."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ArmConfig:
-    """How an arm takes part in the fleet."""
-
-    warning_c: float
-    """Motor temperature above which it accepts no work."""
-    rate_hz: float = STATE_HZ
-    """State messages per real second."""
-    boot: int = 1
-    """Number of this start."""
-    ambient_c: Callable[[float], float] = lambda time_s: 25.0
-    """Measured ambient temperature of the cell by fleet time."""
-    takes_jobs: bool = True
-
-    def __post_init__(self) -> None:
-        if not 0 < self.rate_hz <= 1000:
-            raise ValueError(f"ArmConfig.rate_hz must be > 0 and <= 1000 (got {self.rate_hz:g}).")
 
 
 class ArmNode:
@@ -87,10 +63,10 @@ class ArmNode:
         self._name = executor.arm
         self._body_award = ""
         """Award that the body works on."""
-        self._unplanned: deque[tuple[JobSpec, int]] = deque(maxlen=MAX_UNPLANNED)
-        """Jobs, and how many of their cycles are done."""
+        self._planning = PlanningThread(estimator)
+        self._plans: dict[str, ScoredPlan] = {}
+        """Plan of each active award: it stays even if the estimator drops it."""
         self._reading = body.read_sensors()
-        self._tick = self._events = 0
         self._state_due_s = self._retry_s = -math.inf
         """Real seconds at which the next state message and the next attempt to write are due."""
         self._warn = RateLimitedWarnings(self._name)
@@ -99,10 +75,8 @@ class ArmNode:
 
     def serve(self, until_s: float) -> None:
         """Handle messages and run the arm until `time.monotonic()` is `until_s`, or slightly less."""
-        self.link.serve(-math.inf if self._unplanned else min(until_s, self._state_due_s, self.work_source.wake_s))
+        self.link.serve(min(until_s, self._state_due_s, self.work_source.wake_s))
         self._step()
-        if self._unplanned:
-            self._estimator.prepare(*self._unplanned.popleft())
 
     def retire(self, until_s: float) -> None:
         """Return all awards, and report them until they are acknowledged or `time.monotonic()` is `until_s`."""
@@ -115,11 +89,8 @@ class ArmNode:
 
     def _declare(self) -> None:
         link, fleet, name = self.link, self.link.fleet, self._name
-        self._publish_state = link.publisher(keys.of_arm(fleet, name, "state"), State)
-        self._publish_difficulty = link.publisher(keys.of_arm(fleet, name, "difficulty"), DifficultyScores)
-        self._publish_event = link.publisher(keys.of_arm(fleet, name, "event"), ArmEvent)
-        self._publish_info = link.publisher(keys.of_arm(fleet, name, "info"), Info)  # holds the last one
-        self._publish_info(Info(name, len(self._reading.temp_c), self._estimator.model.version))
+        self._publish = Publications(link, name, self._config.boot)
+        self._publish.info(len(self._reading.temp_c), self._estimator.model.version)
         link.reply_to(keys.of_arm(fleet, name, "quote"), QuoteRequest, self._quote)
         link.reply_to(keys.of_arm(fleet, name, "award"), Award, self._award)
         link.declare_token(keys.of_arm(fleet, name, "alive"))
@@ -129,7 +100,7 @@ class ArmNode:
         jobs = {job.name: job for job in request.jobs}
         if len(jobs) != len(request.jobs):
             raise Refused("The request names a job twice.")
-        estimates, name = self.estimate(request.jobs, request.cycles), ""
+        estimates, name = self.estimate(request.jobs, request.cycles, dry_run=request.dry_run), ""
         real_s = time.monotonic()
         if not request.dry_run:
             offers = {estimate.job: (jobs[estimate.job], len(estimate.plans)) for estimate in estimates}
@@ -156,7 +127,10 @@ class ArmNode:
         return () if plan is None else (space_name(plan_key(plan)),)
 
     def space_of(self, job: JobSpec, plan: int) -> str | None:
-        """Return the name of the space that the arm takes for a job by a plan; None if it has no such plan."""
+        """Return the name of the space that the arm takes for a job by a plan; None if it has no such plan now."""
+        for active in self.executor.active:
+            if (active.award.job, active.award.plan) == (job, plan):
+                return space_name(plan_key(self._scored(active.award).plan))
         return self._estimator.space_of(job, plan)
 
     def _possible_space(self) -> tuple[str, ...]:
@@ -165,22 +139,19 @@ class ArmNode:
         jobs = {self.space_of(award.job, award.plan) or ANYWHERE for award in awards}
         return tuple(sorted(jobs.union(self.space)))
 
-    def estimate(self, jobs: tuple[JobSpec, ...], cycles: Mapping[str, int] = NO_CYCLES) -> tuple[JobEstimate, ...]:
+    def estimate(
+        self, jobs: tuple[JobSpec, ...], cycles: Mapping[str, int] = NO_CYCLES, *, dry_run: bool = False
+    ) -> tuple[JobEstimate, ...]:
         """Estimate what jobs would cost the arm now; those that cannot be planned in time are called `NOT_PLANNED`.
 
         Args:
             cycles: Cycles that are done, by job; 0 if not named.
+            dry_run: Whether they may be planned after the jobs of others.
         """
-        until_s = time.monotonic() + PLANNING_S
-        for job in jobs:
-            done = cycles.get(job.name, 0)
-            if self._estimator.is_prepared(job, done):
-                continue
-            if time.monotonic() < until_s:
-                self._estimator.prepare(job, done)
-                self._step()
-            else:
-                self._unplanned.append((job, done))
+        begun = [(job, cycles.get(job.name, 0)) for job in jobs]
+        missing = [each for each in begun if not self._estimator.is_prepared(*each)]
+        if missing:
+            self._planning.plan(missing, self._step, dry_run=dry_run)
         return self._estimator.estimate(jobs, self._known_c(), self._busy_s(), cycles)
 
     @property
@@ -192,19 +163,7 @@ class ArmNode:
 
     def publish_difficulty(self, estimates: tuple[JobEstimate, ...], real_s: float) -> None:
         """Publish how difficult jobs are for the arm, by the plan with the least difficulty."""
-        plans = [estimate.least for estimate in estimates]
-        self._publish_difficulty(
-            DifficultyScores(
-                arm=self._name,
-                tick=self._tick,
-                time_s=self.clock.now_s(real_s),
-                twin=self._estimator.model.version,
-                jobs=tuple(estimate.job for estimate in estimates),
-                difficulty=tuple(plan.difficulty for plan in plans),
-                p_saturation=tuple(plan.p_saturation for plan in plans),
-                peak_c=tuple(plan.peak_c for plan in plans),
-            )
-        )
+        self._publish.difficulty(estimates, self._estimator.model.version, self.clock.now_s(real_s))
 
     def _award(self, award: Award) -> Ack:
         if self.work_source.objection:
@@ -213,12 +172,17 @@ class ArmNode:
 
     def answer_award(self, award: Award, real_s: float) -> Ack:
         """Accept or refuse an award."""
-        before = len(self.executor.active)
-        ack = self.executor.answer_award(award, real_s, self.unfit())
-        if ack.accepted and len(self.executor.active) > before:
+        before = {active.award.award for active in self.executor.active}
+        plans = self._estimator.plans(award.job)
+        unplanned = "" if award.plan < len(plans) else "its plan is not kept any more: request another quote"
+        ack = self.executor.answer_award(award, real_s, self.unfit() or unplanned)
+        active = {active.award.award for active in self.executor.active}
+        if award.award in active - before:
+            self._plans = {name: plan for name, plan in self._plans.items() if name in active}
+            self._plans[award.award] = plans[award.plan]
             difficulty = self._scored(award).difficulty
             score = math.nan if difficulty is None else difficulty.total
-            self._report_event(Event(time_s=self._body.time_s, kind="award", job=award.job.name, value=score))
+            self._publish.event(Event(time_s=self._body.time_s, kind="award", job=award.job.name, value=score))
         return ack
 
     def unfit(self) -> str:
@@ -276,14 +240,17 @@ class ArmNode:
             self._body_award = ""
         if current is None or not self._body.is_free:
             return
-        job = self._estimator.job(current.award.job)
-        assert job is not None
-        self._body.start(job, self._scored(current.award).plan, current.cycles)
-        self._body_award = name
+        try:
+            self._body.start(self._estimator.job(current.award.job), self._scored(current.award).plan, current.cycles)
+        except ValueError as error:
+            self._warn("start", f"returns '{printable(current.job)}', which it cannot start: {error}")
+            self.executor.return_all(self._body.time_s, time.monotonic(), f"it cannot be started: {error}")
+        else:
+            self._body_award = name
 
     def _scored(self, award: Award) -> ScoredPlan:
-        """Return the plan of an award; one without a quoted plan is refused."""
-        return self._estimator.plans(award.job)[award.plan]
+        """Return the plan of an active award."""
+        return self._plans[award.award]
 
     def _advance(self, until_s: float, current: ActiveAward | None, leased_s: float, real_s: float) -> None:
         if current is not None and self._body_award == current.award.award:
@@ -324,7 +291,7 @@ class ArmNode:
             self.executor.record_progress(int(event.value), math.inf)
             self.executor.return_all(event.time_s, real_s, f"the arm faulted; {event.reason}", faulted=True)
             self._reading = self._body.read_sensors()  # the next estimates take the fault into account
-        self._report_event(event)
+        self._publish.event(event)
 
     def _busy_s(self) -> float:
         """Fleet seconds until the arm has finished all its jobs."""
@@ -342,11 +309,10 @@ class ArmNode:
 
     def _send_state(self) -> None:
         self._reading = self._body.read_sensors()
-        self._tick += 1
-        self._publish_state(
+        self._publish.state(
             State(
                 arm=self._name,
-                tick=self._tick,
+                tick=self._publish.next_tick(),
                 time_s=self._body.time_s,
                 headroom_k=self._headroom_k,
                 job="" if self._current is None else self._current.job,
@@ -372,21 +338,6 @@ class ArmNode:
             "job_peak_c": None if score is None else score.peak_at(known_c, left_s),
             "job_p_saturation": None if score is None else score.p_at(known_c, left_s),
         }
-
-    def _report_event(self, event: Event) -> None:
-        self._events += 1
-        self._publish_event(
-            ArmEvent(
-                arm=self._name,
-                number=self._config.boot * EVENTS_PER_BOOT + self._events,
-                time_s=event.time_s,
-                kind=event.kind,
-                job=event.job,
-                joint=event.joint,
-                value=event.value if math.isfinite(event.value) else None,
-                reason=event.reason,
-            )
-        )
 
     def set_clock(self, clock: FleetClock, *, jump: bool = False) -> None:
         """Use another clock; with `jump` it reads another time now, and the body is set to that time."""

@@ -26,9 +26,10 @@ from fleet.job import Work
 from fleet.live.arm.auctioneer_client import AuctioneerClient, WorkSource
 from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
 from fleet.live.arm.body import Body
+from fleet.live.arm.config import ArmConfig
 from fleet.live.arm.estimator import Estimator, NominalPeaks
-from fleet.live.arm.journal_records import ArmHistory, ArmRecord
-from fleet.live.arm.node import ArmConfig, ArmNode
+from fleet.live.arm.journal_records import ArmHistory, ArmRecord, put_aside
+from fleet.live.arm.node import ArmNode
 from fleet.live.arm.replay_body import ReplayBody, SensorLog
 from fleet.live.clock import FleetClock
 from fleet.live.journal import Journal
@@ -37,6 +38,7 @@ from fleet.motion import Plan
 from scenarios.cli.live.journals import folder_of, refuse_other_way
 from scenarios.cli.live.options import (
     MAX_SPEED,
+    MIN_SPEED,
     JobsOption,
     JournalOption,
     ModelOption,
@@ -46,7 +48,7 @@ from scenarios.cli.live.options import (
 )
 from scenarios.cli.options import ENDPOINT, EndpointOption, RiskOption, ScenarioArg, check_name, number
 from scenarios.cli.signals import until_stopped
-from scenarios.cli.terminal import progress_bar
+from scenarios.cli.terminal import echo, progress_bar
 from scenarios.load import load
 from scenarios.policy_loader import scope_of
 from scenarios.progress import Progress
@@ -71,7 +73,7 @@ def arm_command(
     risk: RiskOption = "rc",
     speed: Annotated[
         float | None,
-        number("Fleet seconds per real second. Default: the auctioneer's, else 1.", 0, MAX_SPEED, above=True),
+        number("Fleet seconds per real second. Default: the auctioneer's, else 1.", MIN_SPEED, MAX_SPEED),
     ] = None,
     rate_hz: RateOption = STATE_HZ,
     capacity: Annotated[int, number("Maximum concurrent jobs.", 1, 256)] = 1,
@@ -104,7 +106,9 @@ def arm_command(
     with (
         until_stopped() as stop,
         BusClient(endpoint, fleet, stopped=stop.is_set) as link,
-        Journal[ArmRecord](folder / f"{name}.journal", ArmRecord) as book,
+        Journal[ArmRecord](
+            folder / f"{name}.journal", ArmRecord, put_aside=put_aside(folder / f"{name}.aside", name)
+        ) as book,
         ExitStack() as resources,
     ):
         wait_for_name(link, name)
@@ -116,7 +120,7 @@ def arm_command(
         node = make_node(
             link, book, arm, chosen, speed=speed, rate_hz=rate_hz, capacity=capacity, work_source=work_source
         )
-        typer.echo(f"ready {name} {endpoint} {os.getpid()}")
+        echo(f"ready {name} {endpoint} {os.getpid()}")
         if policy and consensus.serve_until_done(node, stop):
             return
         while not stop.is_set():

@@ -1,5 +1,6 @@
 """`thermofleet ask`: request quotes of all arms without submitting anything."""
 
+import time
 from collections.abc import Mapping, Sequence
 from typing import Annotated
 
@@ -8,16 +9,25 @@ import typer
 from rich.table import Table
 
 from fleet.bus.client.client import BusClient
+from fleet.bus.client.replies import Replies
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import MOST_QUOTED, JobEstimate, JobSpec, PlanQuote, Quote, QuoteRequest
+from fleet.bus.protocol.auction import (
+    MOST_QUOTED,
+    NOT_PLANNED,
+    JobEstimate,
+    JobSpec,
+    PlanQuote,
+    Quote,
+    QuoteRequest,
+)
 from fleet.errors import BusError, FleetError
 from fleet.job import BOUNDS, DWELL_S
 from scenarios.cli.live.submit import JOBS_HELP, explain, read_jobs
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, number, the_fleet
-from scenarios.cli.terminal import out_console, say
+from scenarios.cli.terminal import echo, out_console, say
 
-REPLY_S = 5.0
-"""Real seconds to wait for arms: planning a new motion takes a while."""
+REPLY_S, PAUSE_S = 5.0, 0.2
+"""Real seconds to wait for arms, as planning a new motion takes a while; and before a request is repeated."""
 _RANGES = {name: (bounds.low, bounds.high) for name, bounds in BOUNDS.items()}
 
 
@@ -55,13 +65,16 @@ def ask_command(
         raise FleetError(f"A request can name at most {MOST_QUOTED} jobs (got {len(jobs)}).")
     with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
         request = QuoteRequest("dry run", tuple(jobs), dry_run=True)
-        answers = link.query_and_wait(keys.of_every_arm(link.fleet, "quote"), request, Quote, timeout_s=timeout)
+        answers, until_s = query(link, request, timeout), time.monotonic() + timeout
+        while _is_unplanned(answers) and time.monotonic() < until_s:
+            link.serve(time.monotonic() + PAUSE_S)
+            answers = query(link, request, timeout)
         name = link.fleet
     quotes = {quote.arm: quote for quote in sorted(answers.messages.values(), key=lambda quote: quote.arm)}
     if not quotes and not answers.refused:
         raise BusError(f"No arm of fleet '{name}' replied. Is `thermofleet arm` running?")
     if as_json:
-        typer.echo(msgspec.json.format(msgspec.json.encode(list(quotes.values())), indent=1).decode())
+        echo(msgspec.json.format(msgspec.json.encode(list(quotes.values())), indent=1).decode())
     else:
         out_console.print(quote_table(jobs, quotes))
     for reason in answers.refused.values():
@@ -69,6 +82,17 @@ def ask_command(
     feasible = {estimate.job for quote in quotes.values() for estimate in quote.estimates if estimate.feasible}
     if not feasible.issuperset(job.name for job in jobs):
         raise typer.Exit(1)
+
+
+def query(link: BusClient, request: QuoteRequest, timeout_s: float) -> Replies[Quote]:
+    """Request the quotes of every arm."""
+    return link.query_and_wait(keys.of_every_arm(link.fleet, "quote"), request, Quote, timeout_s=timeout_s)
+
+
+def _is_unplanned(answers: Replies[Quote]) -> bool:
+    """Whether an arm is still planning a job."""
+    estimates = (estimate for quote in answers.messages.values() for estimate in quote.estimates)
+    return any(estimate.reason == NOT_PLANNED for estimate in estimates)
 
 
 def one_job(

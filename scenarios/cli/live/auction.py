@@ -30,7 +30,7 @@ from scenarios.cli.live.options import (
 )
 from scenarios.cli.options import ENDPOINT, EndpointOption, PolicyOption, ScenarioArg, check_name
 from scenarios.cli.signals import Stop, until_stopped
-from scenarios.cli.terminal import progress_bar
+from scenarios.cli.terminal import echo, progress_bar
 from scenarios.job_stream import draw_jobs
 from scenarios.live.allocation import central_allocation
 from scenarios.live.space import cell_space
@@ -89,7 +89,7 @@ def auction_command(
         )
         for sentence in other_versions(endpoint, fleet):
             log.error("Refused: %s", sentence)
-        typer.echo(f"ready {name} {endpoint} {os.getpid()}")
+        echo(f"ready {name} {endpoint} {os.getpid()}")
         ledger = node.auctioneer.ledger
         if ledger.jobs:
             so_far = summary(node.auctioneer.status(), node.time_s, ledger.left).partition("\n")[0]
@@ -101,7 +101,7 @@ def auction_command(
         else:
             while not stop.is_set():
                 node.serve(time.monotonic() + TURN_S)
-        typer.echo(summary(node.auctioneer.status(), node.time_s, ledger.left))
+        echo(summary(node.auctioneer.status(), node.time_s, ledger.left))
         stop.leave(f"Interrupted at {node.time_s:.0f} s; the journal is {book.path}, and the same command continues.")
 
 

@@ -10,6 +10,7 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.operator import Cleared, ClearRequest
 from fleet.errors import BusError, FleetError
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, check_name, the_fleet
+from scenarios.cli.terminal import echo
 
 MOST_CHARACTERS = 128
 """Longest name of a person."""
@@ -45,7 +46,7 @@ def clear_command(
             f"Neither an auctioneer nor an arm of fleet '{name}' replied within {REPLY_S:g} s. With TLS, use a "
             "certificate of the role operator."
         )
-    typer.echo(f"{arm}: its space is free until the arm reports its space again.")
+    echo(f"{arm}: its space is free until the arm reports its space again.")
 
 
 def _user() -> str:

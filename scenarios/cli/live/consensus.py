@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-import typer
 
 from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
@@ -18,6 +17,7 @@ from fleet.live.consensus.records import GrantRecord
 from fleet.live.journal import Journal
 from scenarios.cli.live.auction import own_jobs, summary
 from scenarios.cli.signals import Stop
+from scenarios.cli.terminal import echo
 from scenarios.live.allocation import live_fleet
 from scenarios.live.space import cell_space
 from scenarios.policy_loader import arm_policy_of
@@ -80,8 +80,8 @@ def serve_until_done(node: ArmNode, stop: Stop) -> bool:
         node.serve(time.monotonic() + TURN_S)
     if stop.is_set():
         return False
-    typer.echo(summary(source.statuses(), node.clock.now_s(time.monotonic())))
-    typer.echo(f"This is the view of one arm, after {source.participant.rounds} rounds of allocation.")
+    echo(summary(source.statuses(), node.clock.now_s(time.monotonic())))
+    echo(f"This is the view of one arm, after {source.participant.rounds} rounds of allocation.")
     until_s = time.monotonic() + FAREWELL_S
     while not stop.is_set() and time.monotonic() < until_s:
         node.serve(min(until_s, time.monotonic() + TURN_S))

@@ -20,7 +20,7 @@ from fleet.live.monitor.health import ClockProbe, HealthReport, check_health
 from fleet.live.monitor.listener import FleetListener
 from fleet.live.monitor.snapshot import FleetSnapshot
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, number
-from scenarios.cli.terminal import out_console, say
+from scenarios.cli.terminal import echo, out_console, say
 from scenarios.live.watch_screen import arm_table, format_time, jobs_line, space_line
 from scenarios.load import load
 
@@ -62,7 +62,7 @@ def doctor_command(
     snapshot, report = examine(endpoint, fleet or fleets[0], seconds, auctioneer=auctioneer, expected=expected)
     if as_json:
         fields = {"healthy": report.healthy, **msgspec.to_builtins(report)}
-        typer.echo(msgspec.json.format(msgspec.json.encode(fields)).decode())
+        echo(msgspec.json.format(msgspec.json.encode(fields)).decode())
     else:
         show(endpoint, snapshot, report)
         if fleets and fleet and fleet not in fleets:

@@ -6,23 +6,28 @@ import logging
 import os
 import signal
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated
 
 import typer
 import uvicorn
 from starlette.applications import Starlette
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from fleet.bus.client.client import BusClient
 from fleet.errors import FleetError
 from fleet.live.monitor.async_bridge import AsyncBridge
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, number, the_fleet
-from scenarios.cli.terminal import Interrupted
+from scenarios.cli.terminal import Interrupted, echo
+from scenarios.live.http_access import MIN_TOKEN, ROLES, Role, check_token, read_tokens
 from scenarios.live.http_app import STUCK_S, Readers, application
 
 TOKEN = "THERMOFLEET_TOKEN"
-MIN_TOKEN = 16
+MAX_CONNECTIONS, MAX_WAITING, HEADER_S = 1000, 128, 5.0
+"""Connections at a time; those that have sent no complete request yet, of which one more ends the oldest; and real
+seconds after which such a connection ends."""
 _LOG = logging.getLogger(__name__)
 
 
@@ -34,31 +39,45 @@ def gateway_command(
     token: Annotated[
         str,
         typer.Option(
-            envvar=TOKEN, help="Bearer token of requests. Prefer the variable: other users can read command lines."
+            envvar=TOKEN,
+            help="Bearer token for all requests. Prefer the variable: other users can read command lines.",
         ),
     ] = "",
+    tokens: Annotated[
+        Path | None,
+        typer.Option(
+            help=f"File with ROLE TOKEN in each line, readable by you alone. Roles: {', '.join(ROLES)}; each may do "
+            "what the ones before it may."
+        ),
+    ] = None,
 ) -> None:
     """Serve the fleet over HTTP until Ctrl-C or SIGTERM."""
-    check(host, token)
-    if asyncio.run(serve(endpoint, the_fleet(fleet, endpoint), host, port, token)) == signal.SIGINT:
+    roles = read_tokens(tokens) if tokens else {}
+    if token:
+        roles[check_token(token)] = "operator"
+    check(host, endpoint, bool(roles))
+    if asyncio.run(serve(endpoint, the_fleet(fleet, endpoint), host, port, roles)) == signal.SIGINT:
         raise Interrupted("The gateway was interrupted.")
 
 
-def check(host: str, token: str) -> None:
-    """Refuse an address that others can reach without a token.
+def check(host: str, endpoint: str, has_tokens: bool) -> None:
+    """Refuse to pass on requests without a token of those that could not send them to the router themselves.
 
     Raises:
         FleetError: an option is wrong or missing.
     """
-    if token and (len(token) < MIN_TOKEN or not token.isascii() or not token.isprintable()):
-        raise FleetError(f"A token needs {MIN_TOKEN} or more printable ASCII characters (got {len(token)}).")
     try:
         local = ipaddress.ip_address(host).is_loopback
     except ValueError as error:
         raise FleetError(f"--host must be an IP address, as 127.0.0.1 or ::1 (got '{host}').") from error
+    if not has_tokens and endpoint.startswith("tls/"):
+        raise FleetError(
+            f"The router needs certificates, and without a token every user of this machine could use yours. Set "
+            f"{TOKEN} (or --token) to {MIN_TOKEN} or more random characters, or give --tokens."
+        )
     if local:
         return
-    if not token:
+    if not has_tokens:
         raise FleetError(
             f"--host {host} is reachable from other machines, which could submit jobs. Set {TOKEN} (or --token) to "
             f"{MIN_TOKEN} or more random characters, or use 127.0.0.1."
@@ -91,11 +110,12 @@ class Server(uvicorn.Server):
     def __init__(self, app: Starlette, readers: Readers) -> None:
         config = uvicorn.Config(
             app,
+            http=_protocol(),
             log_config=None,
             access_log=False,
             server_header=False,
             lifespan="off",
-            limit_concurrency=256,
+            limit_concurrency=MAX_CONNECTIONS,
             timeout_keep_alive=5,
             timeout_graceful_shutdown=2,
         )
@@ -113,12 +133,41 @@ class Server(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-async def serve(endpoint: str, fleet: str, host: str, port: int, token: str) -> int:
+def _protocol() -> type[H11Protocol]:
+    """HTTP of one server, which does not let connections wait without a complete request."""
+    waiting: dict[H11Protocol, Callable[[], None]] = {}
+
+    class Protocol(H11Protocol):
+        def connection_made(self, transport: asyncio.Transport) -> None:
+            super().connection_made(transport)
+            waiting[self] = self._end_waiting
+            if len(waiting) > MAX_WAITING:
+                next(iter(waiting.values()))()
+            self.loop.call_later(HEADER_S, self._end_waiting)
+
+        def handle_events(self) -> None:
+            super().handle_events()
+            if self.cycle is not None:
+                waiting.pop(self, None)
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            waiting.pop(self, None)
+            super().connection_lost(exc)
+
+        def _end_waiting(self) -> None:
+            if self in waiting:
+                del waiting[self]
+                self.transport.close()
+
+    return Protocol
+
+
+async def serve(endpoint: str, fleet: str, host: str, port: int, tokens: Mapping[str, Role]) -> int:
     """Serve until a signal arrives; return its number."""
     readers, received = Readers(), [0]
     with listen(host, port, STUCK_S) as bound, BusClient(endpoint, fleet) as link:
         async with AsyncBridge(link, readers.put) as bridge:
-            server = Server(application(bridge, readers, token=token), readers)
+            server = Server(application(bridge, readers, tokens=tokens), readers)
 
             def stop(number: int) -> None:
                 received[0], server.should_exit = number, True
@@ -127,6 +176,6 @@ async def serve(endpoint: str, fleet: str, host: str, port: int, token: str) -> 
                 asyncio.get_running_loop().add_signal_handler(number, stop, number)
             address, bound_port, *_ = bound.getsockname()
             shown = f"[{address}]" if ":" in address else address
-            typer.echo(f"ready gateway http://{shown}:{bound_port}/v4 {os.getpid()}")
+            echo(f"ready gateway http://{shown}:{bound_port}/v4 {os.getpid()}")
             await server.serve(sockets=[bound])
     return received[0]

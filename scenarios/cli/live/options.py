@@ -5,10 +5,10 @@ from typing import Annotated, Literal
 
 import typer
 
+from fleet.bus.protocol.auction import MAX_SPEED, MIN_SPEED
 from scenarios.cli.options import MAX_SEED, check_name, number
 
-MAX_SPEED = 10_000.0
-SpeedOption = Annotated[float, number("Fleet seconds per real second.", 0, MAX_SPEED, above=True)]
+SpeedOption = Annotated[float, number("Fleet seconds per real second.", MIN_SPEED, MAX_SPEED)]
 RateOption = Annotated[float, number("State messages per real second.", 0, 100, above=True)]
 SeedOption = Annotated[int, number("Random seed of the scenario's jobs, the sensor noise and the policy.", 0, MAX_SEED)]
 ModelOption = Annotated[Literal["twin", "blind"], typer.Option(help="Difficulty model.")]

@@ -18,7 +18,7 @@ from fleet.errors import FleetError
 from scenarios.cli.live.options import MAX_SPEED
 from scenarios.cli.options import ENDPOINT, EndpointOption, check_name, number
 from scenarios.cli.signals import until_stopped
-from scenarios.cli.terminal import out_console, say
+from scenarios.cli.terminal import echo, out_console, say
 from scenarios.live.recorder import Recorder
 from scenarios.live.replayer import Replay
 
@@ -77,7 +77,7 @@ def record_command(
 ) -> None:
     """Record what arms and auctioneer publish, as Parquet parts that are readable at once."""
     with until_stopped() as stop, BusClient(endpoint, fleet, backlog=BACKLOG, stopped=stop.is_set) as link:
-        typer.echo(f"ready record {endpoint}")
+        echo(f"ready record {endpoint}")
         recorder = record(link, out, rotate_s=rotate, stopped=stop.is_set)
     missed = sum(count.missed for count in recorder.counts.values())
     kept = sum(count.kept for count in recorder.counts.values())
@@ -96,7 +96,7 @@ def replay_command(
     if not len(replay):
         raise FleetError(f"'{path}' holds no messages yet; parts are written every --rotate seconds and at the end.")
     with until_stopped() as stop, BusClient(endpoint, fleet or replay.fleet) as link:
-        typer.echo(f"ready replay {endpoint}")
+        echo(f"ready replay {endpoint}")
         count = replay.play(link, speed=speed, stopped=stop.is_set)
     say(f"Published {count} of {len(replay)} messages.", out_console)
     stop.leave("The replay was interrupted.")

@@ -28,6 +28,7 @@ from fleet.job import BOUNDS, KINDS
 from fleet.live.monitor.snapshot import describe_status
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
 from scenarios.cli.signals import Stop, until_stopped
+from scenarios.cli.terminal import echo
 
 REPLY_S, ATTEMPTS = 5.0, 3
 """Real seconds to wait for a reply, and number of attempts: a job that is submitted twice is one job."""
@@ -58,7 +59,7 @@ def submit_command(
         admissions = [admission for batch in batches(jobs) for admission in submit(link, batch, by)]
         for admission in admissions:
             decision = "accepted" if admission.accepted else "refused"
-            typer.echo(f"{admission.job}: {decision}{f': {admission.reason}' if admission.reason else ''}")
+            echo(f"{admission.job}: {decision}{f': {admission.reason}' if admission.reason else ''}")
         accepted = [admission.job for admission in admissions if admission.accepted]
         unfinished = follow(link, accepted, stop) if wait and accepted else []
         stop.leave("Stopped following; the auctioneer has the jobs.")
@@ -90,7 +91,7 @@ def read_jobs(file: str) -> list[JobSpec]:
 def _decode(raw: bytes, kind: type[Decoded], where: str) -> Decoded:
     try:
         return msgspec.json.decode(raw, type=kind)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise FleetError(f"{where}: {explain(error)}") from error
 
 
@@ -156,7 +157,7 @@ def follow(link: BusClient, names: Sequence[str], stop: Stop) -> list[str]:
             heard_s = time.monotonic()
             if states.get(status.job) != status.state:
                 states[status.job] = status.state
-                typer.echo(describe_status(status))
+                echo(describe_status(status))
         if all(states.get(name) in SETTLED for name in names):
             break
         if time.monotonic() > heard_s + PATIENCE_S:

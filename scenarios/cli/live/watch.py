@@ -19,7 +19,7 @@ from fleet.live.monitor.listener import FleetListener
 from fleet.live.monitor.snapshot import FleetSnapshot, describe_event, describe_status
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
 from scenarios.cli.signals import Stop, until_stopped
-from scenarios.cli.terminal import err_console, out_console, say
+from scenarios.cli.terminal import echo, err_console, out_console, say
 from scenarios.live.watch_screen import arm_line, format_time, jobs_line, screen, space_line
 
 WAIT_S, GONE_S = 0.5, 3.0
@@ -50,7 +50,7 @@ def watch_command(
         listener = FleetListener(link, on_message=on_message, on_presence=on_presence)
         if as_json:
             listener.serve(time.monotonic() + SNAPSHOT_S)
-            typer.echo(msgspec.json.encode(listener.view.snapshot(time.monotonic())).decode())
+            echo(msgspec.json.encode(listener.view.snapshot(time.monotonic())).decode())
         else:
             end = ShiftEnd()
             (draw if out_console.is_terminal else print_lines)(
@@ -124,13 +124,13 @@ def print_lines(listener: FleetListener, news: deque[str], ended: Callable[[Flee
     while not ended(fleet := listener.view.snapshot(time.monotonic(), jobs=0)):
         listener.serve(time.monotonic() + FRAME_S)
         while news:
-            typer.echo(news.popleft())
+            echo(news.popleft())
         if time.monotonic() >= due_s:
             due_s = time.monotonic() + LINE_S
             for arm in fleet.arms:
-                typer.echo(arm_line(arm))
-            typer.echo(jobs_line(fleet).plain)
-            typer.echo(space_line(fleet).plain)
+                echo(arm_line(arm))
+            echo(jobs_line(fleet).plain)
+            echo(space_line(fleet).plain)
 
 
 def describe(name: str, message: msgspec.Struct) -> str:

@@ -17,9 +17,10 @@ from fleet.bus.protocol.auction import Ack, ArmEvent, Award, JobSpec, Status, St
 from fleet.errors import BusError
 from fleet.job import Place
 from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
+from fleet.live.arm.config import ArmConfig
 from fleet.live.arm.estimator import Estimator, NominalPeaks
 from fleet.live.arm.journal_records import ArmHistory, ArmRecord, Closed
-from fleet.live.arm.node import ArmConfig, ArmNode
+from fleet.live.arm.node import ArmNode
 from fleet.live.arm.simulated_body import SimulatedBody
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.round import Timing

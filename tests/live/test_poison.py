@@ -1,0 +1,278 @@
+"""Odd numbers in any field of any message to an arm or an auctioneer: all go on, quickly, in little memory."""
+
+import gc
+import json
+import time
+import zlib
+from collections import defaultdict
+from contextlib import ExitStack, suppress
+from copy import deepcopy
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from fleet.bus.client.client import AnotherReplies
+from fleet.bus.client.replies import Replies
+from fleet.bus.protocol.auction import (
+    Ack,
+    Award,
+    Clock,
+    ClockRequest,
+    JobSpec,
+    Lease,
+    LeaseEntry,
+    LeaseRequest,
+    Quote,
+    QuoteRequest,
+    Receipt,
+    Report,
+    StatusRequest,
+    Submission,
+)
+from fleet.bus.protocol.examples import EXAMPLES
+from fleet.bus.protocol.messages import MalformedMessage, State, decode, encode
+from fleet.bus.protocol.operator import ClearRequest
+from fleet.errors import Refused
+from fleet.job import Place
+from fleet.live.arm.award_executor import AwardExecutor
+from fleet.live.arm.config import ArmConfig
+from fleet.live.arm.estimator import MAX_BYTES, Estimator, NominalPeaks, _size
+from fleet.live.arm.journal_records import ArmHistory, ArmRecord, AwardAccepted, put_aside
+from fleet.live.arm.node import ArmNode
+from fleet.live.arm.simulated_body import SimulatedBody
+from fleet.live.auction.ledger import AuctionRecord
+from fleet.live.auction.node import AuctionNode
+from fleet.live.auction.round import Assignment
+from fleet.live.clock import FleetClock
+from fleet.live.journal import Journal
+from fleet.motion import Plan
+from fleet.planning.planner import Planner
+from fleet.robot import ThermalLimits
+
+SILENT_S, GROWN_BYTES = 1.0, 50_000_000
+JOB = JobSpec(name="j", kind="hold", places=("bench",), repetitions=3, dwell_s=1.0)
+PLACES = {name: Place(name=name, position_m=(0.45, y, 0.25)) for name, y in (("bench", 0.0), ("rack", 0.15))}
+ODD = st.one_of(
+    st.floats(),
+    st.integers(-(10**400), 10**400),
+    st.sampled_from(
+        [0, -1, 1, 2, 1800.0, 3600.0, 60_000, 1e12, 1e200, 1e308, -1e308, 5e-324, 2**53, 2**64, True, None]
+    ),
+    st.sampled_from(["", "x", "\u202e", "a\0b", "x" * 9000, [], {}, [[]] * 9, [1e308] * 7]),
+)
+
+
+class Wire:
+    """The bus of one participant without a network; messages to it are given as bytes."""
+
+    fleet = "f"
+
+    def __init__(self, other=None):
+        self.handlers, self.peers = {}, [other] if other else []
+        self.replies = defaultdict(list)
+        """Bodies that the next queries for a kind of reply get."""
+        self.sent = []
+
+    def publisher(self, key, kind):
+        return lambda message: self.sent.append(encode(message)[:0])
+
+    def publish(self, key, message):
+        encode(message)
+
+    def reply_to(self, key, kind, handle):
+        self.handlers[kind] = handle
+
+    def subscribe(self, expression, kind, handle, **options):
+        self.handlers[kind] = lambda message: handle(getattr(message, "arm", "arm_0"), message)
+
+    def watch_tokens(self, expression, handle):
+        if "/arm/" in expression:
+            handle("arm_0", True)
+
+    def declare_token(self, key):
+        pass
+
+    def tokens(self, expression, *, timeout_s):
+        return frozenset()
+
+    def query(self, key, request, kind, done, *, timeout_s, each=lambda reply: None):
+        replies = Replies()
+        for body in self.replies.pop(kind, []):
+            with suppress(MalformedMessage):
+                message = decode(kind, body)
+                replies.messages[key] = message
+                each(message)
+        encode(request)
+        done(replies)
+
+    def query_and_wait(self, key, request, kind, *, timeout_s):
+        return Replies()
+
+    def serve(self, until_s=0.0):
+        return 0
+
+    def take(self, kind, body):
+        """Handle a request or a publication as the client does."""
+        with suppress(Refused, AnotherReplies, MalformedMessage):
+            reply = self.handlers[kind](decode(kind, body))
+            if reply is not None:
+                encode(reply)
+                return reply
+        return None
+
+
+@pytest.fixture(scope="module")
+def participants(tmp_path_factory, small):
+    folder = tmp_path_factory.mktemp("poison")
+    own = small.arm(0, [small.work("bench")])
+    planner = Planner(own.robot, elbows=1)
+    with ExitStack() as stack:
+        book = stack.enter_context(Journal(folder / "arm_0", ArmRecord, sync=lambda file: None))
+        history = ArmHistory().after_restart("arm_0", 0.0)
+        estimator = Estimator(own.model, planner.plan, PLACES, NominalPeaks())
+        body = SimulatedBody(
+            own, ThermalLimits(), lambda _: 25.0, dt_s=3.0, rng=np.random.default_rng(0), time_s=0.0, max_dt_s=30.0
+        )
+        executor = AwardExecutor("arm_0", book.append, history, nonce="n")
+        clock = FleetClock(1.0, time.monotonic())
+        arm = ArmNode(Wire(), body, executor, estimator, clock, ArmConfig(warning_c=60.0))
+        ledger = stack.enter_context(Journal(folder / "auctioneer", AuctionRecord, sync=lambda file: None))
+        auction = AuctionNode(
+            Wire(),
+            "x",
+            ledger,
+            allocate=lambda bidding: dict(
+                zip((job.name for job in bidding.jobs), map(Assignment, sorted(bidding.quotes)), strict=False)
+            ),
+            speed=1.0,
+            arms=("arm_0",),
+        )
+        arm.estimate((JOB,))
+        yield arm, auction
+
+
+def odd(draw, message):
+    """The message as JSON with odd values in one to three places."""
+    content = json.loads(encode(message))
+    for _ in range(draw(st.integers(1, 3))):
+        inner = content
+        while True:
+            places = list(inner) if isinstance(inner, dict) else list(range(len(inner)))
+            if not places:
+                break
+            place = draw(st.sampled_from(places))
+            if isinstance(inner[place], dict | list) and inner[place] and draw(st.booleans()):
+                inner = inner[place]
+                continue
+            inner[place] = deepcopy(draw(ODD))
+            break
+    return json.dumps(content).encode()
+
+
+def resident() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+
+
+@settings(max_examples=400, deadline=None, suppress_health_check=list(HealthCheck))
+@given(st.data())
+def test_no_message_stops_an_arm_or_an_auctioneer(participants, data):
+    arm, auction = participants
+    arm_wire, auction_wire = arm.link, auction._link
+    quote = arm_wire.handlers[QuoteRequest](QuoteRequest("r", (JOB,)))
+    award = Award("w", "r", "x", quote.quote, JOB, lease_s=2.0)
+    entry = LeaseEntry("w", "j", 1, "working")
+    to_arm = {QuoteRequest: QuoteRequest("r", (JOB,), cycles={"j": 1}), Award: award}
+    to_auction = {
+        Submission: Submission((JOB,)),
+        StatusRequest: StatusRequest(("j",)),
+        ClearRequest: ClearRequest("arm_0"),
+        LeaseRequest: LeaseRequest("arm_0", (entry,)),
+        Report: Report("arm_0", "w", "j", "returned", 1, 0.0),
+        State: msgspec.structs.replace(EXAMPLES[State], arm="arm_0"),
+        ClockRequest: ClockRequest(),
+    }
+    kind = data.draw(st.sampled_from([*to_arm, *to_auction]), label="kind")
+    for answer, message in (
+        (Clock, Clock(1.0, 1.0)),
+        (Lease, Lease("x", 2.0, ("w",), ())),
+        (Receipt, Receipt("x", "w")),
+    ):
+        arm_wire.replies[answer] = [odd(data.draw, message)] if data.draw(st.booleans()) else [encode(message)]
+    for answer, message in ((Quote, quote), (Ack, Ack("arm_0", "w", True))):
+        auction_wire.replies[answer] = [odd(data.draw, message)] if data.draw(st.booleans()) else [encode(message)]
+    arm.work_source._clock._asked_s = -np.inf  # ask for the time now
+    start_s = time.monotonic()
+    message = (to_arm | to_auction)[kind]
+    body = odd(data.draw, message) if msgspec.to_builtins(message) else b"[]"
+    (arm_wire if kind in to_arm else auction_wire).take(kind, body)
+    arm.serve(-np.inf)
+    auction.serve(-np.inf)
+    assert time.monotonic() - start_s < SILENT_S
+    gc.collect()
+    if not hasattr(arm, "first_bytes"):
+        arm.first_bytes = resident()
+    assert resident() - arm.first_bytes < GROWN_BYTES
+
+
+@pytest.mark.parametrize("dwell_s", [60_000, 200_000, 1e12, 1e308])
+def test_a_dwell_time_in_milliseconds_is_refused_by_its_field(dwell_s):
+    body = json.dumps({"auction": "r", "dry_run": True, "jobs": [json.loads(encode(JOB)) | {"dwell_s": dwell_s}]})
+    with pytest.raises(MalformedMessage, match=r"dwell_s must be between 0.02 and 3600 s \(got"):
+        decode(QuoteRequest, body.encode())
+
+
+def test_a_long_hold_costs_no_more_than_a_short_one_and_has_its_peak(participants):
+    """Second method: repetitions of a short hold that are as long together."""
+    arm, _ = participants
+    estimator: Estimator = arm._estimator
+    long, short = JobSpec("l", "hold", ("bench",), dwell_s=3600.0), JobSpec("s", "hold", ("bench",), 3600, dwell_s=1.0)
+    for job in (long, short):
+        estimator.prepare(job)
+    one, many = (estimate.plans[0] for estimate in estimator.estimate([long, short], arm._known_c(), 0.0))
+    assert one.duration_s == pytest.approx(many.duration_s)
+    assert one.peak_c == pytest.approx(many.peak_c, abs=1e-6)
+    assert one.joint_difficulty == pytest.approx(many.joint_difficulty)
+    plans: tuple[Plan, ...] = estimator._variants(estimator._work(long))
+    assert _size(plans) < 2e6
+
+
+def test_plans_of_any_number_of_works_take_bounded_memory(participants):
+    arm, _ = participants
+    estimator = arm._estimator
+    for i in range(40):
+        estimator.prepare(JobSpec(f"p{i}", "pick_place", ("bench", "rack"), dwell_s=60.0, payload_kg=0.01 * i))
+    assert sum(map(_size, estimator._requested.values())) <= MAX_BYTES
+    assert len(estimator._requested) > 3
+
+
+def test_an_error_in_a_quote_is_its_reason(participants, small):
+    own = small.arm(0, [small.work("bench")])
+
+    def fail(work):
+        raise MemoryError("no room")
+
+    estimator = Estimator(own.model, fail, PLACES, NominalPeaks())
+    estimator.prepare(JOB)
+    (estimate,) = estimator.estimate([JOB], np.full(15, 30.0), 0.0)
+    assert not estimate.feasible
+    assert "MemoryError: no room" in estimate.reason
+
+
+def test_a_poisonous_award_in_a_journal_is_put_aside_and_the_rest_is_reported(tmp_path):
+    """A journal of an earlier version, which had no bounds."""
+    good = AwardAccepted(Award("good", "r", "x", "q", JOB))
+    poison = json.loads(encode(AwardAccepted(Award("poison", "r", "x", "q", JOB))))
+    poison["award"]["job"]["dwell_s"] = 60_000
+    records = json.dumps([{"type": "started", "boot": 3}, poison, json.loads(encode(good))]).encode()
+    path, aside = tmp_path / "a.journal", tmp_path / "a.aside"
+    path.write_bytes(b'{"crc":"%08x","records":%s}\n' % (zlib.crc32(records), records))
+    for _ in range(2):
+        with Journal(path, ArmRecord, put_aside=put_aside(aside, "a")) as book:
+            history = ArmHistory().replay(book.records()).after_restart("a", 0.0)
+            book.rewrite(*history.compact())
+    assert set(history.reports) == {"good"}
+    assert [json.loads(line)["award"]["award"] for line in aside.read_text().splitlines()] == ["poison"]
