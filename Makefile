@@ -13,7 +13,7 @@ PINNED := $(sort $(basename $(notdir $(wildcard constraints/*.txt))))
 ADAPTERS := $(filter-out bench,$(PINNED))
 ADAPTER_TESTS := $(ADAPTERS:%=test-adapter-%)
 
-.PHONY: demo test test-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos soak fuzz clean install
+.PHONY: demo test test-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos mesh soak fuzz clean install
 
 demo: $(STAMP)
 	@$(BIN)/thermofleet demo --out $(OUT)/demo
@@ -51,6 +51,10 @@ lint: $(STAMP)
 
 chaos: $(STAMP)
 	@$(BIN)/python benchmarks/chaos
+
+# 256 arms behind two linked routers: kill either, cut the link.
+mesh: $(STAMP)
+	@$(BIN)/python benchmarks/chaos/mesh.py --speed 20
 
 # A week of work, a million jobs, through one auctioneer: about 20 minutes.
 soak: $(STAMP)

@@ -22,7 +22,7 @@ from fleet.bus.security.certificates import issue
 from fleet.bus.security.tls import Tls, identified
 from fleet.live.arm.journal_records import ArmRecord, Closed
 from fleet.live.journal import Journal
-from scenarios.cli.live.up import free_port, chosen_arms, parts_of
+from scenarios.cli.live.up import chosen_arms, free_port, parts_of
 from scenarios.cli.main import main
 
 ROOT = Path(__file__).parents[2]

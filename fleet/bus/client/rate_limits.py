@@ -14,8 +14,8 @@ class Limits:
     message_bytes: int = 65_536
     """Largest payload with its attachment, of a publication, a request or a reply."""
     state_hz: float | None = None
-    """Telemetry messages a second, real time, of each session, or with TLS of each arm; None for any number. A steady stream needs a limit of
-    twice its rate, as Zenoh limits the gap between two messages, which varies."""
+    """Telemetry messages a second, real time, of each session, or with TLS of each arm; None for any number. A steady
+    stream needs a limit of twice its rate, as Zenoh limits the gap between two messages, which varies."""
 
     def __post_init__(self) -> None:
         if self.message_bytes < 1:

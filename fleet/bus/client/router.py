@@ -197,8 +197,8 @@ class Router:
             raise BusError(f"'{host}' is no address to listen on, as 127.0.0.1 or 0.0.0.0.")
         if connect and tls is None:
             raise BusError(
-                f"A link to another router ({connect[0]}) needs TLS: routers recognise each other by certificates. Start "
-                "both with --tls."
+                f"A link to another router ({connect[0]}) needs TLS: routers recognise each other by certificates. "
+                "Start both with --tls."
             )
         self._connect = [reachable(endpoint, tls) for endpoint in connect]
         self._session: zenoh.Session | None = None

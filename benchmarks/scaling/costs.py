@@ -1,9 +1,9 @@
 """CPU-seconds per message of a router and of the auctioneer's client, over mutual TLS on loopback.
 
-    python benchmarks/scaling_costs.py [--states 20000] [--arms 64]
+    python benchmarks/scaling/costs.py [--states 20000] [--arms 64]
 
 Router, arms (one process) and client are separate processes, so the CPU time of each is its own; the time of day is
-not used, so a busy machine changes little. `benchmarks/scaling.py` calculates with these costs.
+not used, so a busy machine changes little. `load.py` calculates with these costs.
 """
 
 import argparse
@@ -15,7 +15,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from scaling import JOINTS, estimate_of, job_of, quote_of, state_of
+from load import JOINTS, estimate_of, job_of, quote_of, state_of
 
 from fleet.bus.client.client import BusClient
 from fleet.bus.client.router import Router
