@@ -5,6 +5,7 @@ import time
 from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
 
+import msgspec
 import pytest
 import zenoh
 from cryptography import x509
@@ -193,6 +194,35 @@ def test_a_link_needs_tls_and_a_certificate_that_may_connect(place, tmp_path, mo
     Router(tls=Tls(older, "router")).open().close()  # it may still listen
     with pytest.raises(BusError, match=r"permits listening only.*thermofleet keys .* --add router:router --overwrite"):
         Router(tls=Tls(older, "router"), connect=["tls/127.0.0.1:7447"]).open()
+
+
+def test_a_router_in_no_roster_has_no_rights(place, tmp_path):
+    """Nor has one with the name of the router itself: only other routers are linked."""
+    rogue = tmp_path / "rogue"
+    rogue.mkdir()
+    for name in ("ca.pem", "ca.key"):
+        (rogue / name).write_bytes((place / name).read_bytes())
+    roster = of_arms("f", ARMS, [Participant("router_c", "router")])
+    for name in ("router_c", "router"):
+        issue(rogue, Participant(name, "router"), days=20)
+    (rogue / "roster.json").write_bytes(msgspec.json.encode(roster))
+    with Router(tls=Tls(place, "router")) as near:
+        heard = queue.Queue()
+        session = open_client(near.endpoint, timeout_s=PATIENCE_S, tls=Tls(place, "monitor"))
+        listener = session.declare_subscriber(keys.of_every_arm("f", "state"), lambda sample: heard.put(sample.payload))
+        for name in ("router_c", "router"):
+            with (
+                Router(tls=Tls(rogue, name), connect=[near.endpoint]) as far,
+                open_client(far.endpoint, timeout_s=PATIENCE_S, tls=Tls(place, "arm_0")) as arm,
+            ):
+                wait_until(lambda: near.linked() == 1)
+                time.sleep(ROUTES_S)
+                arm.put(keys.of_arm("f", "arm_0", "state"), b"x")
+                time.sleep(ROUTES_S)
+            wait_until(lambda: near.linked() == 0)
+        assert heard.empty()
+        listener.undeclare()
+        session.close()
 
 
 def test_only_routers_have_certificates_for_both_ends(place):

@@ -290,7 +290,7 @@ class Router:
             if self._connect:
                 link["tls"] |= self._tls.link(serves=False)
             roster = read_roster(self._tls.folder)
-            own["access_control"] = access_control(roster)
+            own["access_control"] = access_control(roster, self._tls.name)
             own |= self._limits.settings(roster)
         return _config(own, link)
 
