@@ -13,7 +13,8 @@ PINNED := $(sort $(basename $(notdir $(wildcard constraints/*.txt))))
 ADAPTERS := $(filter-out bench,$(PINNED))
 ADAPTER_TESTS := $(ADAPTERS:%=test-adapter-%)
 
-.PHONY: demo test test-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos mesh soak fuzz clean install
+.PHONY: demo test test-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos mesh simulate soak \
+	fuzz clean install
 
 demo: $(STAMP)
 	@$(BIN)/thermofleet demo --out $(OUT)/demo
@@ -56,6 +57,12 @@ chaos: $(STAMP)
 mesh: $(STAMP)
 	@$(BIN)/python benchmarks/chaos/mesh.py --speed 20
 
+# Whole fleets in one process under faults, seed after seed until one breaks a rule or Ctrl-C. SEEDS=n or HOURS=n
+# bounds it, FIRST=n is the first seed, SEED=n prints the trace of one, MUTATIONS=all breaks rules on purpose.
+simulate: $(STAMP)
+	@$(BIN)/python benchmarks/simulation $(if $(SEED),--seed $(SEED)) $(if $(SEEDS),--seeds $(SEEDS)) \
+	  $(if $(HOURS),--hours $(HOURS)) $(if $(FIRST),--first $(FIRST)) $(if $(MUTATIONS),--mutations $(MUTATIONS))
+
 # A week of work, a million jobs, through one auctioneer: about 20 minutes.
 soak: $(STAMP)
 	@$(BIN)/python benchmarks/soak.py --jobs 1000000
@@ -74,6 +81,8 @@ bench: $(STAMP)
 
 EXTRA := [cli]
 .venv-adapters/bench/.installed: EXTRA := [cli,learn]
+.venv-adapters/ros2/.installed: EXTRA := [bus,ros2]
+.venv-adapters/vda5050/.installed: EXTRA := [bus,vda5050]
 bench-env: .venv-adapters/bench/.installed
 	@.venv-adapters/bench/bin/python benchmarks/env.py
 

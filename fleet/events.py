@@ -29,6 +29,9 @@ arm returned its job after a cycle; expire: due date passed before an arm began 
 cleared; moved: a person moved the faulted arm home; contact: a link or payload of an arm is inside another arm, the
 floor or a fixture (the plant `mujoco` looks for it)."""
 
+EVENTS_PER_BOOT = 1_000_000_000
+"""On the bus, the number of an arm's event is its boot number times this, plus a count from 1."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Event:

@@ -15,6 +15,7 @@ EXTRAS = {
     "meshes": ("mujoco_menagerie",),
     "onnx": ("onnx", "onnxruntime"),
     "ros2": ("rosbags",),
+    "vda5050": ("paho",),
 }
 """Top-level modules of the libraries of each extra."""
 

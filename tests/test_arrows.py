@@ -19,6 +19,8 @@ NOUNS_OF_LAWS = ("robot", "job", "errors", "jit")
 
 SIM_LIBRARIES = ("mujoco", "mink", "ruckig")
 TRAINERS = ("agilerl", "benchmarl", "ray", "sb3_contrib", "stable_baselines3", "tianshou")
+NEIGHBOURS = {"rosbags": "fleet.ros2.cdr", "rclpy": "fleet.ros2.job_action", "paho": "fleet.vda5050.mqtt"}
+"""Libraries of other systems, each in one module."""
 TENSORS = ("torch", "torchrl", "tensordict")
 HEAVY = ("torch", "mujoco", "zenoh")
 
@@ -76,6 +78,7 @@ BELOW = {
     "fleet.env": ("fleet.engine", *IN_MEMORY),
     "fleet.live": ("fleet.bus", "fleet.engine", "fleet.planning", "fleet.physics"),
     "fleet.ros2": ("fleet.bus", "fleet.live"),
+    "fleet.vda5050": ("fleet.bus", "fleet.live"),
 }
 """Which folders of fleet a folder of fleet may import, besides itself and the nouns."""
 
@@ -108,8 +111,8 @@ def library_allowed(importer: str, library: str) -> bool:
             "fleet.bus.client.client",
             "fleet.ros2.node",
         )
-    if library == "rosbags":
-        return importer == "fleet.ros2.cdr"
+    if library in NEIGHBOURS:
+        return importer == NEIGHBOURS[library]
     if library in TRAINERS:
         return below(importer, "fleet.env.adapters")
     if library in TENSORS:
@@ -164,6 +167,7 @@ def test_the_wrong_way_is_seen(importer, imported):
         ("agents.rules", "torch"),
         ("fleet.env.x", "mink"),
         ("fleet.ros2.node", "rosbags"),
+        ("fleet.vda5050.station", "paho"),
         ("fleet.env.allocation_v1", "ray"),
         ("agents.learned.train", "stable_baselines3"),
         ("fleet.env.vector", "torch"),

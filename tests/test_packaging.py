@@ -40,20 +40,24 @@ def pinned_in(file: str) -> dict[str, str]:
 
 
 APART = sorted(path.stem for path in (ROOT / "constraints").glob("*.txt"))
-"""What has an environment and pins of its own: trainers of reinforcement learning, and peers to measure beside."""
+"""What has an environment and pins of its own: trainers of reinforcement learning, peers to measure beside, and
+neighbours to talk to."""
+NEIGHBOURS = ("ros2", "vda5050")
+"""Their extras are installed with everything else; what the test talks to (ROS 2, a broker) is apart."""
+ALONE = [name for name in APART if name not in NEIGHBOURS]
 EXTRAS = {
     extra: [each for each in wanted if not each.startswith("thermofleet[")]
     for extra, wanted in PROJECT["optional-dependencies"].items()
 }
 """What each extra adds itself, without the extras that it includes."""
-SHARED = [*PROJECT["dependencies"], *(each for extra in EXTRAS if extra not in APART for each in EXTRAS[extra])]
+SHARED = [*PROJECT["dependencies"], *(each for extra in EXTRAS if extra not in ALONE for each in EXTRAS[extra])]
 
 
 @pytest.mark.parametrize(
     ("requirement", "file"),
     [
         *((requirement, "constraints.txt") for requirement in SHARED),
-        *((each, f"constraints/{extra}.txt") for extra in EXTRAS if extra in APART for each in EXTRAS[extra]),
+        *((each, f"constraints/{extra}.txt") for extra in EXTRAS if extra in ALONE for each in EXTRAS[extra]),
     ],
 )
 def test_every_direct_dependency_is_pinned_within_its_range(requirement, file):
@@ -78,7 +82,7 @@ def test_a_missing_library_is_told_with_the_extra_that_has_it(extra):
 
 
 def test_every_extra_that_is_no_trainer_is_told_of():
-    assert set(extras.EXTRAS) == {name for name in EXTRAS if name not in (*APART, "all", "dev")}
+    assert set(extras.EXTRAS) == {name for name in EXTRAS if name not in (*ALONE, "all", "dev")}
 
 
 WITHOUT_EXTRAS = f"""
@@ -107,7 +111,7 @@ def test_who_lives_apart_pins_what_it_brings_and_what_it_wants_otherwise(name):
 def test_every_test_of_a_trainer_has_its_adapter():
     trainers = {path.stem.removeprefix("test_") for path in (ROOT / "tests" / "adapters").glob("test_*.py")}
     assert trainers >= {"agilerl", "benchmarl", "rllib", "tianshou"}
-    assert trainers <= {path.stem for path in (ROOT / "fleet" / "env" / "adapters").glob("*.py")}
+    assert trainers - {*NEIGHBOURS} <= {path.stem for path in (ROOT / "fleet" / "env" / "adapters").glob("*.py")}
 
 
 def written_by_hand() -> list[Path]:

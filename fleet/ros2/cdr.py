@@ -17,6 +17,8 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 MAX_ITEMS = 4096
 """Largest length of a list in a message that is read."""
+SPARE_BYTES, _SPARE_STEP = 16, 4
+"""Bytes that may follow a message; rosbags ignores up to 3 of them."""
 _NS = 1_000_000_000
 _SECONDS = range(-(2**31), 2**31)
 
@@ -97,8 +99,18 @@ def read_diagnostics(payload: bytes) -> tuple[Diagnostic, ...]:
 
 
 def _read(payload: bytes, kind: str) -> Any:  # rosbags makes its classes at run time
+    """Decode a message; up to `SPARE_BYTES` may follow it, as after `rclpy.serialization.serialize_message`.
+
+    That function returns its whole buffer. Fast DDS sizes it with padding before the elements of empty lists, and
+    fills no padding: the bytes there are whatever was in memory.
+    """
     try:
-        return _STORE.deserialize_cdr(payload, kind)
+        for spare in range(0, SPARE_BYTES + 1, _SPARE_STEP):
+            try:
+                return _STORE.deserialize_cdr(payload[: len(payload) - spare], kind)
+            except SerdeError as error:
+                if spare == SPARE_BYTES or "size mismatch" not in str(error):
+                    raise
     except SerdeError as error:
         raise MalformedMessage(f"Not a {kind}: {error}") from error
 

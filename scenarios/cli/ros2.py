@@ -99,6 +99,34 @@ def listen_command(
         stop.leave(f"Stopped listening to {topic}.")
 
 
+@ros2_app.command("jobs")
+def jobs_command(
+    endpoint: EndpointOption = ENDPOINT,
+    fleet: FleetOption = "",
+    domain: DomainOption = 0,
+) -> None:
+    """Serve the action thermofleet_msgs/action/DoJob: a goal is a job. Needs rclpy, with any middleware."""
+    from fleet.bus.client.client import BusClient
+    from scenarios.cli.signals import until_stopped
+
+    try:
+        from fleet.ros2.job_action import JobAction
+    except ModuleNotFoundError as error:
+        raise FleetError(
+            f"This needs the Python module '{error.name}' of ROS 2: build fleet/ros2/thermofleet_msgs in a workspace, "
+            "source its setup file, and use the Python of that ROS 2 (docs/ros2.md)."
+        ) from error
+    with (
+        until_stopped() as stop,
+        BusClient(endpoint, the_fleet(fleet, endpoint)) as link,
+        JobAction(link, domain=domain) as jobs,
+    ):
+        typer.echo(f"ready {jobs.name} {os.getpid()}")
+        while not stop.is_set():
+            jobs.serve(time.monotonic() + TURN_S)
+        stop.leave("The action server was stopped; submitted jobs go on.")
+
+
 def ros2_router(router: str, endpoint: str) -> str:
     """Endpoint of the router of ROS 2: the given one, or the fleet's, but not with TLS, which excludes ROS 2."""
     if not router and endpoint.startswith("tls/"):

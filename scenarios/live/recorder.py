@@ -1,103 +1,73 @@
-"""Record the messages of arms and auctioneers in Parquet parts, readable while the recording continues.
+"""Record the messages of arms and auctioneers: on disk within seconds, each once, and gaps known.
 
-`recording.json` describes the recording; `telemetry-000001.parquet`, `events-…` and `results-…` are its parts, each
-written atomically. Columns are the fields of the messages `State`, `ArmEvent` and `Result`. Every message is kept once
-and in order, by the number that its sender gives it: repeated ones, which caches send after a reconnection, are
-dropped, and missing ones are counted.
+A message goes to the append-only journal first (`save`), later to Parquet parts (`write`). The card names the last
+complete part, so a crash at any moment loses no row and doubles none. Every sender numbers its messages: repeated ones
+are dropped, missing ones are sought in the caches of the publishers (`scenarios.live.gap_fetcher`), and those that
+cannot be had become a row of `gaps`.
 """
 
-import math
+import logging
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, cast
 
 import msgspec
-import pyarrow as pa
 import pyarrow.parquet as pq
-from msgspec import inspect, structs
+from msgspec import structs
 
-from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
-from fleet.bus.protocol.messages import State
-from fleet.errors import FleetError
+from fleet.errors import FleetError, JournalError
+from fleet.events import EVENTS_PER_BOOT
 from fleet.files import atomic_path
-from fleet.robot import JOINTS
+from fleet.live.journal import Journal
+from scenarios.live.recording import (
+    CARD,
+    JOURNAL,
+    KINDS,
+    RECORDING_FORMAT,
+    Card,
+    Count,
+    Gap,
+    Heard,
+    HeardEvent,
+    HeardState,
+    Kind,
+    Message,
+    PartOpened,
+    Record,
+    part_file,
+    read_card,
+    records_of,
+    to_record,
+    to_row,
+    to_table,
+)
 
-Message = State | ArmEvent | Result
-Kind = Literal["telemetry", "events", "results"]
-KINDS: tuple[Kind, ...] = ("telemetry", "events", "results")
-RECORDING_FORMAT = 4
-CARD = "recording.json"
-SENSORS = ("q", "qd", "tau", "current_a", "temp_c", "housing_c")
-MAX_ROWS = 200_000
-"""Kept in memory; with more, a part is written before it is due."""
-_COLUMNS = {inspect.IntType: pa.int64(), inspect.FloatType: pa.float64()}
-_NUMBERS: dict[Kind, str] = {"telemetry": "tick", "events": "number", "results": "number"}
-_LABELS: dict[Kind, str] = {"telemetry": "state", "events": "events", "results": "results"}
+_LOG = logging.getLogger(__name__)
 
-
-def _columns(message: type[msgspec.Struct]) -> dict[str, pa.DataType]:
-    """Column types of the plain fields of a message, nested messages left out."""
-    info = inspect.type_info(message)
-    assert isinstance(info, inspect.StructType)
-    columns: dict[str, pa.DataType] = {}
-    for each in info.fields:
-        kinds = each.type.types if isinstance(each.type, inspect.UnionType) else (each.type,)
-        kind = next(kind for kind in kinds if not isinstance(kind, inspect.NoneType))
-        if not isinstance(kind, inspect.StructType):
-            columns[each.name] = _COLUMNS.get(type(kind), pa.string())
-    return columns
-
-
-_STATE = _columns(State)
-"""Columns of a state; those of `SENSORS` have one for each joint."""
-SCHEMAS: dict[Kind, pa.Schema] = {
-    "telemetry": pa.schema(
-        {"time_s": pa.float64(), **{name: kind for name, kind in _STATE.items() if name not in SENSORS}}
-        | {f"{name}_{joint + 1}": pa.float32() for name in SENSORS for joint in range(JOINTS)}
-    ),
-    "events": pa.schema({"time_s": pa.float64(), **_columns(ArmEvent), "joint": pa.int8()}),
-    "results": pa.schema({"time_s": pa.float64(), **_columns(Result), **_columns(JobStatus)}),
-}
+MAX_ROWS = 50_000
+"""Rows in memory at which a part is written before it is due."""
+MAX_WAITING = 4 * MAX_ROWS
+"""Rows in memory while the disk takes none; further messages are not taken, and sought when it does."""
 
 
-@dataclass(eq=False)
-class Count:
-    """Number of messages of one sender."""
-
-    kept: int = 0
-    twice: int = 0
-    missed: int = 0
-    """Numbers that were skipped: not received, or sent before the recording had joined."""
-    last: int = -1
-    time_s: float = -math.inf
-    """Fleet time of the last message."""
-
-
-class Card(msgspec.Struct, frozen=True):
-    """Content of `recording.json`."""
-
-    format: int
-    status: str
-    fleet: str
-    parts: dict[Kind, int]
-    """Number of parts."""
-    speakers: dict[str, Count]
-
-
-@dataclass(eq=False)
 class Recorder:
-    """Keeps every message once, and writes them in parts.
+    """Keeps every message once. `open` starts or continues a recording; call `save` often and `write` sometimes.
 
-    Start one by `open`; an interrupted recording in the same folder is continued with its next part.
+    Attributes:
+        counts: Messages by sender: `state of arm_0`.
+        sought: Gaps that may still be filled.
+        parts: Number of the last complete part.
     """
 
-    folder: Path
-    fleet: str
-    parts: dict[Kind, int]
-    counts: dict[str, Count]
-    _rows: dict[Kind, list[dict[str, object]]] = field(default_factory=lambda: {kind: [] for kind in KINDS})
+    def __init__(self, folder: Path, fleet: str, card: Card | None) -> None:
+        self.folder, self.fleet = folder, fleet
+        self.counts: dict[str, Count] = {} if card is None else card.speakers
+        self.sought: list[Gap] = [] if card is None else list(card.sought)
+        self.parts = 0 if card is None else card.parts
+        self._saved: list[Heard | Gap] = []
+        self._unsaved: list[Heard | Gap] = []
+        self._journal: Journal[Record] = Journal(folder / JOURNAL, Record)
 
     @classmethod
     def open(cls, folder: Path, fleet: str) -> "Recorder":
@@ -111,129 +81,154 @@ class Recorder:
             raise FleetError(f"'{folder}' holds other files; --out needs a new folder or an earlier recording.")
         if card is not None and card.fleet != fleet:
             raise FleetError(f"'{folder}' is a recording of fleet '{card.fleet}', not of '{fleet}'.")
-        parts: dict[Kind, int] = {kind: len(part_files(folder, kind)) for kind in KINDS}
-        recorder = cls(folder, fleet, parts, {} if card is None else card.speakers)
+        recorder = cls(folder, fleet, card)
         recorder._write_card("recording")
+        recorder._continue_journal()
         return recorder
+
+    def close(self) -> None:
+        """Release the journal; rows that were not saved are lost."""
+        self._journal.close()
 
     @property
     def waiting(self) -> int:
-        """Number of rows that are not on disk yet."""
-        return sum(map(len, self._rows.values()))
+        """Number of rows that are in no part yet."""
+        return len(self._saved) + len(self._unsaved)
 
     def add(self, sender: str, message: Message) -> None:
-        """Keep a message, unless it was kept before."""
-        kind, row = _row(message)
-        if self._is_new(f"{_LABELS[kind]} of {sender}", getattr(message, _NUMBERS[kind]), message.time_s):
-            self._rows[kind].append(row)
-            if self.waiting >= MAX_ROWS:
-                self.write()
+        """Keep a message, unless it was kept before or memory is full."""
+        if self.waiting < MAX_WAITING:
+            record = to_record(message)
+            if self._take(record):
+                self._unsaved.append(record)
 
-    def write(self, *, status: str = "recording") -> None:
-        """Write waiting rows as new parts, and the card.
+    def give_up(self, gap: Gap, reason: str) -> None:
+        """Stop seeking the messages of a gap: it becomes a row."""
+        if gap in self.sought:
+            self.sought.remove(gap)
+            self._unsaved.append(structs.replace(gap, reason=reason))
+
+    def save(self) -> None:
+        """Write rows through to the journal on the disk.
 
         Raises:
             FleetError: the disk refuses; no row is lost, and the next call tries again.
         """
-        for kind, rows in self._rows.items():
-            if not rows:
-                continue
-            table = pa.Table.from_pylist(rows, schema=SCHEMAS[kind])
-            number = self.parts[kind] + 1
-            with self._draft(f"{kind}-{number:06d}.parquet") as draft:
-                pq.write_table(table, draft)
-            self.parts[kind] = number
-            rows.clear()
-        self._write_card(status)
+        if not self._unsaved:
+            return
+        try:
+            self._journal.append(*self._unsaved)
+        except JournalError as error:
+            raise FleetError(str(error)) from error
+        self._saved += self._unsaved
+        self._unsaved.clear()
 
-    def _is_new(self, sender: str, number: int, time_s: float) -> bool:
+    def write(self, *, status: str = "recording") -> None:
+        """Write all rows as a new part, and the card; a status other than `recording` ends the recording.
+
+        Raises:
+            FleetError: the disk refuses; no row is lost, and the next call tries again.
+        """
+        if ends := status != "recording":
+            for gap in list(self.sought):
+                self.give_up(gap, "the recording ended while they were sought")
+        rows: dict[Kind, list[dict[str, object]]] = {kind: [] for kind in KINDS}
+        for record in (*self._saved, *self._unsaved):
+            kind, row = to_row(record)
+            rows[kind].append(row)
+        for kind in KINDS:
+            if rows[kind]:
+                with self._draft(part_file(self.folder, kind, self.parts + 1)) as draft:
+                    pq.write_table(to_table(kind, rows[kind]), draft)
+        written = self.parts + bool(self.waiting)
+        self._write_card(status, written)
+        self.parts = written
+        self._saved.clear()
+        self._unsaved.clear()
+        try:  # a crash before this leaves a journal of a complete part, which is ignored
+            self._journal.close()
+            if ends:
+                for path in (self._journal.path, self._journal.path.with_name(f"{JOURNAL}.lock")):
+                    path.unlink(missing_ok=True)
+            else:
+                self._journal.open()
+                self._journal.rewrite(PartOpened(self.parts + 1))
+        except (JournalError, OSError) as error:
+            raise FleetError(f"{error}") from error
+
+    # Inside
+
+    def _continue_journal(self) -> None:
+        """Take back the rows of the journal, which a crash has left there; a damaged one is put aside."""
+        try:
+            self._journal.open()
+        except JournalError as error:
+            aside = self._journal.path.with_name(f"damaged-after-{self.parts:06d}.journal")
+            self._journal.path.replace(aside)
+            _LOG.error("%s Put aside as '%s'.", error, aside.name)
+            self._journal.open()
+            time_s = max((count.time_s for count in self.counts.values()), default=0.0)
+            self._unsaved.append(Gap("all", 0, 0, time_s, time_s, f"the journal was damaged: {aside.name}"))
+        records = records_of(self._journal, self.parts + 1)
+        for record in records:
+            if isinstance(record, Gap):
+                self.sought = [gap for gap in self.sought if structs.replace(gap, reason=record.reason) != record]
+            else:
+                self._take(record)
+        self._saved = records
+        if not records:
+            self._journal.rewrite(PartOpened(self.parts + 1))
+
+    def _take(self, record: Heard) -> bool:
+        """Count a message; return whether it is new."""
+        message = record.message
+        if isinstance(record, HeardState):
+            sender, number, first = f"state of {record.message.arm}", record.message.tick, 1
+        elif isinstance(record, HeardEvent):
+            sender, number = f"events of {record.message.arm}", record.message.number
+            first = number // EVENTS_PER_BOOT * EVENTS_PER_BOOT + 1
+        else:
+            sender, number, first = f"results of {record.message.auctioneer}", record.message.number, 0
         count = self.counts.setdefault(sender, Count())
-        if number <= count.last and time_s <= count.time_s:
-            count.twice += 1
-            return False
-        if number > count.last and count.kept:  # a restarted sender counts from zero again
-            count.missed += number - count.last - 1
+        if number <= count.last and message.time_s <= count.time_s:
+            return self._fill(sender, count, number, message.time_s)
+        if count.kept:
+            expected = first if number <= count.last or first > count.last else count.last + 1  # first: it restarted
+            if expected < number:
+                self.sought.append(Gap(sender, expected, number - 1, count.time_s, message.time_s))
+                count.missed += number - expected
         count.kept += 1
-        count.last, count.time_s = number, time_s
+        count.last, count.time_s = number, message.time_s
         return True
 
-    def _write_card(self, status: str) -> None:
+    def _fill(self, sender: str, count: Count, number: int, time_s: float) -> bool:
+        """Whether a late message belongs to a gap, which then shrinks or splits."""
+        for gap in self.sought:
+            if gap.sender == sender and gap.first <= number <= gap.last and gap.after_s <= time_s <= gap.time_s:
+                self.sought.remove(gap)
+                if gap.first < number:
+                    self.sought.append(structs.replace(gap, last=number - 1, time_s=time_s))
+                if number < gap.last:
+                    self.sought.append(structs.replace(gap, first=number + 1, after_s=time_s))
+                count.kept, count.missed = count.kept + 1, count.missed - 1
+                return True
+        count.twice += 1
+        return False
+
+    def _write_card(self, status: str, parts: int | None = None) -> None:
         senders = {name: count for name, count in sorted(self.counts.items()) if count.kept}
-        card = Card(RECORDING_FORMAT, status, self.fleet, self.parts, senders)
-        with self._draft(CARD) as draft:
+        number = self.parts if parts is None else parts
+        card = Card(RECORDING_FORMAT, status, self.fleet, number, senders, tuple(self.sought))
+        with self._draft(self.folder / CARD) as draft:
             draft.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=1) + b"\n")
 
     @contextmanager
-    def _draft(self, name: str) -> Iterator[Path]:
+    def _draft(self, path: Path) -> Iterator[Path]:
+        """A draft of a file, on disk before it takes its name."""
         try:
-            with atomic_path(self.folder / name) as draft:
+            with atomic_path(path) as draft:
                 yield draft
+                with draft.open("rb") as file:
+                    os.fsync(file.fileno())
         except OSError as error:
-            raise FleetError(f"Cannot write '{self.folder / name}': {error.strerror or error}.") from error
-
-
-def _row(message: Message) -> tuple[Kind, dict[str, object]]:
-    """Kind and columns of a message."""
-    if isinstance(message, ArmEvent):
-        return "events", structs.asdict(message)
-    if isinstance(message, Result):
-        fields = structs.asdict(message)
-        return "results", fields | structs.asdict(fields.pop("status"))
-    row: dict[str, object] = {name: getattr(message, name) for name in _STATE if name not in SENSORS}
-    for name in SENSORS:
-        row |= {f"{name}_{joint + 1}": value for joint, value in enumerate(getattr(message, name)[:JOINTS])}
-    return "telemetry", row
-
-
-def read_card(folder: Path) -> Card:
-    """Read the description of a recording.
-
-    Raises:
-        FleetError: it is no recording, or of another format.
-    """
-    try:
-        card = msgspec.json.decode((folder / CARD).read_bytes(), type=Card)
-    except (OSError, msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise FleetError(f"'{folder}' is no recording of the bus: {CARD} is missing or damaged.") from error
-    if card.format != RECORDING_FORMAT:
-        raise FleetError(
-            f"'{folder}' is a recording of format {card.format}, of an earlier bus (and allocation_v0); this "
-            f"version reads {RECORDING_FORMAT}. Record it again."
-        )
-    return card
-
-
-def part_files(folder: Path, kind: Kind) -> list[Path]:
-    """Paths of the parts of a kind, in order; each is complete."""
-    return sorted(folder.glob(f"{kind}-*.parquet"))
-
-
-def read_parts(folder: Path, kind: Kind) -> pa.Table:
-    """Read all parts of a kind that are on disk now, in order of time."""
-    tables = [pq.read_table(path, schema=SCHEMAS[kind]) for path in part_files(folder, kind)]
-    table = pa.concat_tables(tables) if tables else SCHEMAS[kind].empty_table()
-    return table.sort_by([("time_s", "ascending"), (_NUMBERS[kind], "ascending")])
-
-
-def states(table: pa.Table, *, warning_c: float = 60.0) -> Iterator[State]:
-    """Yield telemetry of a recording or a run as messages; sensors that were not recorded are left out.
-
-    Args:
-        warning_c: Warning limit of the headroom, where no headroom was recorded.
-    """
-    ticks: dict[str, int] = {}
-    for batch in table.to_batches(max_chunksize=10_000):
-        for row in batch.to_pylist():
-            arm = row["arm"]
-            ticks[arm] = tick = row.get("tick", ticks.get(arm, -1) + 1)
-            sensors = {name: _joints(row, name) for name in SENSORS}
-            temps_c = sensors["temp_c"]
-            headroom_k = row.get("headroom_k", warning_c - max(temps_c) if temps_c else 0.0)
-            fields = {name: row[name] for name in _STATE if row.get(name) is not None}
-            yield msgspec.convert(fields | {"tick": tick, "headroom_k": headroom_k} | sensors, State)
-
-
-def _joints(row: dict[str, float | None], name: str) -> tuple[float, ...]:
-    """Values of a sensor, [joint]; empty if one is missing."""
-    values = [row.get(f"{name}_{joint + 1}") for joint in range(JOINTS)]
-    return () if None in values else cast(tuple[float, ...], tuple(values))
+            raise FleetError(f"Cannot write '{path}': {error.strerror or error}.") from error

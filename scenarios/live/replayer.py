@@ -15,7 +15,7 @@ from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
 from fleet.errors import FleetError
-from scenarios.live.recorder import CARD, KINDS, Message, read_card, read_parts, states
+from scenarios.live.recording import CARD, MESSAGES, Message, read_card, read_parts, states
 from scenarios.run.run_folder import check_format
 
 TURN_S, TOKENS_S = 0.2, 2.0
@@ -44,7 +44,7 @@ class Replay:
             FleetError: it is neither.
         """
         if (folder / CARD).exists():
-            return cls(read_card(folder).fleet, *(read_parts(folder, kind) for kind in KINDS))
+            return cls(read_card(folder).fleet, *(read_parts(folder, kind) for kind in MESSAGES))
         try:
             run = json.loads((folder / "run.json").read_text(encoding="utf-8"))
             scenario = run["scenario"]

@@ -125,7 +125,7 @@ def _assignment_text(a: Assignment) -> str:
         end = f"finished at {clock(a.finished_s or 0.0)}, {end}"
     elif a.outcome == "returned":
         kept = "" if a.cycles_kept is None else f", {a.cycles_kept} cycles kept"
-        end = f"returned to the queue after a fault{kept}"
+        end = f"returned to the queue{' after a fault' if a.faulted else ''}{kept}"
     else:
         end = "still running at the end"
     scores = [a.prediction] if a.prediction else []

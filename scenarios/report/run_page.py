@@ -54,7 +54,7 @@ def report_html(
         _provenance(run),
     ]
     scenario = run.get("scenario", {}).get("name", "unnamed scenario")
-    title = f"{scenario} · {run.get('policy', 'unknown policy')} · seed {run.get('seed', '?')}"
+    title = f"{scenario} · {run.get('policy', 'unknown policy')}" + (f" · seed {run['seed']}" if "seed" in run else "")
     return html_page(title, body, figure=drawing)
 
 

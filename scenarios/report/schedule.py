@@ -1,8 +1,9 @@
 """Schedule of a shift, derived from its events: assignments and outages of each arm."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
+from math import isfinite
 from typing import Literal
 
 from fleet.errors import nearest
@@ -29,10 +30,13 @@ class Assignment:
     finished_s: float | None = None
     """End of the last cycle; None if it was not reached."""
     outcome: Outcome
-    """finished: all cycles done, even if the arm was not home yet; returned: a fault put the job back in the queue;
+    """finished: all cycles done, even if the arm was not home yet; returned: it is back in the queue, after a fault or
+    because a live arm had to return it;
     given_up: the job faulted too often."""
     late_s: float | None = None
     """Tardiness of a finished job; 0 if on time."""
+    faulted: bool = True
+    """Of a returned or given-up job: a fault was the reason."""
     cycles_kept: int | None = None
     """Cycles of a returned or given-up job that this arm has done and that count."""
     difficulty: float = float("nan")
@@ -116,6 +120,11 @@ def _assignments(arm: str, log: Sequence[Event], horizon_s: float) -> list[Assig
             outcome = "given_up" if after and after.kind == "give_up" else "returned"
             out.append(_assignment(award, finish, event.time_s, outcome, after))
             award, stopped = None, True
+        elif (
+            event.kind == "return" and award is not None and award.job == event.job
+        ):  # in a live fleet, without a fault
+            out.append(replace(_assignment(award, finish, event.time_s, "returned", event), faulted=False))
+            award = None
     if award is not None:
         out.append(_assignment(award, finish, max(horizon_s, award.time_s), "running"))
     return out
@@ -132,7 +141,7 @@ def _assignment(
         finished_s=finish.time_s if finish else None,
         outcome="finished" if finish else outcome,
         late_s=finish.value if finish else None,
-        cycles_kept=round(returned.value) if returned and not finish else None,
+        cycles_kept=round(returned.value) if returned and not finish and isfinite(returned.value) else None,
         difficulty=award.value,
         prediction=award.reason,
     )

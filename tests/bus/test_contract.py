@@ -153,6 +153,10 @@ def test_fields_are_described_by_the_text_under_them():
 def test_asyncapi_has_every_key_and_no_loose_end():
     document = asyncapi()
     assert [channel["address"] for channel in document["channels"].values()] == [c.address for c in CHANNELS]
+    for action in ("send", "receive"):  # both sides of every key with messages
+        done = [each["channel"]["$ref"] for each in document["operations"].values() if each["action"] == action]
+        assert done == [f"#/channels/{c.name}" for c in CHANNELS if c.message is not None]
+    assert "security" in document["servers"]["routerTls"]
 
     def references(value):
         if isinstance(value, dict):

@@ -18,6 +18,7 @@ from fleet.ros2.cdr import (
     DIAGNOSTICS,
     JOINT_STATE,
     MAX_ITEMS,
+    SPARE_BYTES,
     read_diagnostics,
     read_joints,
     type_hash,
@@ -191,3 +192,12 @@ def test_a_list_that_is_too_long_is_refused(count):
     else:
         with pytest.raises(MalformedMessage, match="Not a sensor_msgs/msg/JointState"):
             read_joints(payload)
+
+
+def test_a_few_bytes_may_follow_a_message():
+    """As after `serialize_message` of rclpy, which returns its whole buffer."""
+    payload = write_joints(Joints(1.0, ("a", "b"), (0.5, 1.5)))
+    for spare in range(SPARE_BYTES + 1):
+        assert read_joints(payload + b"\x7f" * spare).q == (0.5, 1.5)
+    with pytest.raises(MalformedMessage, match="size mismatch"):
+        read_joints(payload + b"\x7f" * (SPARE_BYTES + 4))

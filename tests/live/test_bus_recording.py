@@ -3,6 +3,7 @@
 import threading
 import time
 from contextlib import ExitStack
+from functools import partial
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -17,7 +18,8 @@ from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
 from fleet.bus.protocol.messages import State
 from fleet.errors import FleetError
 from scenarios.cli.live.record import lock_folder, record
-from scenarios.live.recorder import CARD, Recorder, part_files, read_card, read_parts, states
+from scenarios.live.recorder import Recorder
+from scenarios.live.recording import CARD, JOURNAL, part_files, read_card, read_parts, states
 from scenarios.live.replayer import Replay
 
 PATIENCE_S = 20.0
@@ -65,18 +67,69 @@ def test_recorded_messages_are_read_back(tmp_path):
 
 
 @settings(max_examples=50, deadline=None)
-@given(st.lists(st.integers(0, 30), min_size=1, max_size=60))
-def test_every_message_is_kept_once_and_gaps_are_counted(tmp_path_factory, ticks):
-    recorder = Recorder.open(tmp_path_factory.mktemp("r"), "f")
-    kept = []
-    for tick in ticks:  # a word is new if it is later than all before
-        if not kept or tick > kept[-1]:
-            kept.append(tick)
+@given(
+    st.lists(st.tuples(st.integers(0, 30), st.sampled_from(["", "save", "write", "crash"])), min_size=1, max_size=60)
+)
+def test_every_message_is_kept_once_and_gaps_are_known(tmp_path_factory, steps):
+    """Whatever the order of messages, and wherever the recorder crashes after a save."""
+    folder = tmp_path_factory.mktemp("r")
+    recorder = Recorder.open(folder, "f")
+    first, kept = steps[0][0], set()
+    for tick, then in steps:
         recorder.add("a", state("a", tick))
+        if tick >= first:  # what was sent before it joined is unknown to it
+            kept.add(tick)
+        if then == "write":
+            recorder.write()
+        elif then:
+            recorder.save()
+        if then == "crash":
+            recorder.close()
+            recorder = Recorder.open(folder, "f")
+    recorder.save()
+    assert read_parts(folder, "telemetry")["tick"].to_pylist() == sorted(kept)
+    sought = {tick for gap in recorder.sought for tick in range(gap.first, gap.last + 1)}
+    assert sought == set(range(first, max(kept) + 1)) - kept
     count = recorder.counts["state of a"]
-    assert count.kept == len(kept)
-    assert count.twice == len(ticks) - len(kept)
-    assert count.missed == kept[-1] - kept[0] + 1 - len(kept)
+    assert (count.kept, count.missed) == (len(kept), len(sought))
+    recorder.write(status="finished")
+    gaps = read_parts(folder, "gaps").to_pylist()
+    assert {tick for gap in gaps for tick in range(gap["first"], gap["last"] + 1)} == sought
+    assert all("the recording ended" in gap["reason"] for gap in gaps)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_a_torn_journal_loses_only_what_was_not_saved(tmp_path_factory, data):
+    folder = tmp_path_factory.mktemp("r")
+    recorder = Recorder.open(folder, "f")
+    sizes = []
+    for tick in range(4):
+        recorder.add("a", state("a", tick))
+        recorder.save()
+        sizes.append((folder / JOURNAL).stat().st_size)
+    recorder.close()
+    size = data.draw(st.integers(0, sizes[-1]))
+    (folder / JOURNAL).write_bytes((folder / JOURNAL).read_bytes()[:size])
+    again = Recorder.open(folder, "f")
+    again.write()
+    expected = [tick for tick, end in enumerate(sizes) if end <= size]
+    assert read_parts(folder, "telemetry")["tick"].to_pylist() == expected
+
+
+def test_a_damaged_journal_is_put_aside_and_the_recording_says_so(tmp_path):
+    recorder = Recorder.open(tmp_path, "f")
+    for tick in range(2):
+        recorder.add("a", state("a", tick))
+        recorder.save()
+    recorder.close()
+    damaged = (tmp_path / JOURNAL).read_bytes().replace(b'"tick":0', b'"tick":7')
+    (tmp_path / JOURNAL).write_bytes(damaged)
+    again = Recorder.open(tmp_path, "f")
+    again.write()
+    (gap,) = read_parts(tmp_path, "gaps").to_pylist()
+    assert "the journal was damaged: damaged-after-000000.journal" in gap["reason"]
+    assert (tmp_path / "damaged-after-000000.journal").read_bytes() == damaged
 
 
 def test_messages_of_a_restarted_arm_are_kept(tmp_path):
@@ -91,7 +144,8 @@ def test_a_recording_is_readable_meanwhile_and_can_be_continued(tmp_path):
     first.add("a", state("a", 0))
     first.write()
     assert read_parts(tmp_path, "telemetry").num_rows == 1
-    first.add("a", state("a", 1))  # never written: the process died
+    first.add("a", state("a", 1))  # never saved: the process died
+    first.close()
     again = Recorder.open(tmp_path, "f")
     again.add("a", state("a", 0))  # from a cache
     again.add("a", state("a", 1))
@@ -144,7 +198,8 @@ class Recording:
 
     def _run(self, endpoint, folder):
         with BusClient(endpoint, "f") as link:
-            self.recorder = record(link, folder, rotate_s=0.2, stopped=self._stop.is_set)
+            connect = partial(BusClient, endpoint, "f", timeout_s=0.5)
+            self.recorder = record(link, folder, rotate_s=2.0, stopped=self._stop.is_set, connect=connect)
 
     def __enter__(self):
         self._thread.start()
@@ -155,8 +210,8 @@ class Recording:
         self._thread.join(PATIENCE_S)
 
 
-def wait_for(condition, link=None):
-    deadline_s = time.monotonic() + PATIENCE_S
+def wait_for(condition, link=None, patience_s=PATIENCE_S):
+    deadline_s = time.monotonic() + patience_s
     while not condition():
         assert time.monotonic() < deadline_s, "waited in vain"
         if link is not None:
@@ -166,7 +221,7 @@ def wait_for(condition, link=None):
 
 
 def rows(folder, kind="telemetry"):
-    return read_parts(folder, kind).num_rows if folder.exists() else 0
+    return read_parts(folder, kind).num_rows if (folder / CARD).exists() else 0
 
 
 def test_no_message_is_lost_when_the_router_restarts(tmp_path):
@@ -196,6 +251,26 @@ def test_no_message_is_lost_when_the_router_restarts(tmp_path):
             recording.__exit__()
     assert read_parts(tmp_path, "telemetry")["tick"].to_pylist() == list(range(said))
     assert recording.recorder.counts["state of a"].missed == 0
+
+
+def test_gaps_are_fetched_from_the_publishers_cache_or_become_rows(tmp_path):
+    """A publisher sends numbers 0 and 3 live; its cache has 1, and nobody has 2."""
+    with Router() as router, BusClient(router.endpoint, "f") as boss, Recording(router.endpoint, tmp_path) as recording:
+        wait_for(lambda: (tmp_path / CARD).exists())
+        live = [keys.of_auction("f", "boss", "result"), Result]
+        boss.publish(*live[:1], result(0))
+        wait_for(lambda: rows(tmp_path, "results") == 1)
+        boss.publish(*live[:1], result(3))
+        wait_for(lambda: rows(tmp_path, "results") == 2)
+        with BusClient(router.endpoint, "f") as again:
+            again.publisher(*live)(result(1))
+            wait_for(lambda: rows(tmp_path, "results") == 3)
+            wait_for(lambda: rows(tmp_path, "gaps") == 1, patience_s=40.0)
+    assert read_parts(tmp_path, "results")["number"].to_pylist() == [0, 1, 3]
+    (gap,) = read_parts(tmp_path, "gaps").to_pylist()
+    assert (gap["sender"], gap["first"], gap["last"]) == ("results of boss", 2, 2)
+    assert "not in the cache of its publisher" in gap["reason"]
+    assert recording.recorder.counts["results of boss"].missed == 1
 
 
 def test_a_replay_publishes_the_same_messages_and_refuses_names_of_present_arms(tmp_path):

@@ -51,7 +51,7 @@ def test_help_imports_no_large_library():
 @pytest.mark.parametrize(
     ("words", "completions"),
     [
-        ("thermofleet re", ["record", "replay"]),
+        ("thermofleet re", ["record", "replay", "report"]),
         ("thermofleet run --pl", ["--plant"]),
         ("thermofleet twin re", ["recover", "reliability", "report"]),
     ],

@@ -73,6 +73,7 @@ def test_an_arm_is_published_in_ros_and_followed_again():
         (["listen", "/joint_states"], "has no motor temperatures"),
         (["listen", "/j", "--temperatures", "/d", "--joints", "a,a"], "different names"),
         (["listen", "/j", "--temperatures", "/d", "--rate-hz", "0"], "--rate-hz must be"),
+        (["jobs"], "needs the Python module 'rclpy' of ROS 2"),
         (["bridge", "--domain", "233"], "--domain must be 0 to 232"),
         (["bridge", "--fleet", "f", "--warning-c", "80"], "--warning-c must be less than --error-c"),
         (["bridge", "--endpoint", "tls/127.0.0.1:7447#keys/arm_0"], "name the router of ROS 2 with --router"),

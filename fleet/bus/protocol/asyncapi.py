@@ -35,11 +35,25 @@ def asyncapi() -> Schema:
                 "protocol": "zenoh",
                 "description": "The router of the fleet; everybody else is a client of it.",
                 "x-zenoh": {"mode": "client", "connect": "tcp/127.0.0.1:7447", "scouting": False},
-            }
+            },
+            "routerTls": {
+                "host": "HOST:7447",
+                "protocol": "zenoh",
+                "description": "The same with mutual TLS, required beyond loopback. See docs/security.md.",
+                "security": [{"$ref": "#/components/securitySchemes/certificate"}],
+                "x-zenoh": {"mode": "client", "connect": "tls/HOST:7447", "scouting": False},
+            },
         },
         "channels": {channel.name: _channel(channel) for channel in CHANNELS},
         "operations": {name: operation for channel in CHANNELS for name, operation in _operations(channel).items()},
         "components": {
+            "securitySchemes": {
+                "certificate": {
+                    "type": "X509",
+                    "description": "A certificate of the fleet's own authority; its common name, as `arm:arm_0`, is "
+                    "the role and the name of the participant. The router permits the keys of that role only.",
+                }
+            },
             "messages": {kind.__name__: _message(kind) for kind in EXAMPLES},
             "schemas": schemas("#/components/schemas/{name}"),
         },
@@ -67,23 +81,25 @@ def _channel(channel: Channel) -> Schema:
 
 
 def _operations(channel: Channel) -> Schema:
-    """What can be done at a key: a publication, or a query and its reply."""
+    """What can be done at a key, from both sides: publish and subscribe, or query and answer."""
     if channel.message is None:
         return {}
-    operation = {
-        "action": "send",
+    sends, receives = ("query", "answer") if channel.reply else ("publish", "subscribe")
+    operation: Schema = {
         "channel": {"$ref": f"#/channels/{channel.name}"},
         "summary": first_line(channel.message),
         "messages": [_in(channel, channel.message)],
-        "x-zenoh": {"by": channel.receiver if channel.reply else channel.sender},
     }
-    if channel.reply is None:
-        return {f"publish_{channel.name}": operation}
-    reply = {
-        "channel": {"$ref": f"#/channels/{channel.name}"},
-        "messages": [_in(channel, kind) for kind in channel.messages[1:]],
+    if channel.reply is not None:
+        operation["reply"] = {
+            "channel": {"$ref": f"#/channels/{channel.name}"},
+            "messages": [_in(channel, kind) for kind in channel.messages[1:]],
+        }
+    by = (channel.receiver, channel.sender) if channel.reply else (channel.sender, channel.receiver)
+    return {
+        f"{verb}_{channel.name}": {"action": action, **operation, "x-zenoh": {"by": who}}
+        for verb, action, who in zip((sends, receives), ("send", "receive"), by, strict=True)
     }
-    return {f"query_{channel.name}": {**operation, "reply": reply}}
 
 
 def _in(channel: Channel, kind: MessageType) -> dict[str, str]:

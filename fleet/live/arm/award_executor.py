@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from fleet.bus.protocol.auction import Ack, Award, JobSpec, Lease, LeaseEntry, LeaseRequest, Receipt, Report
-from fleet.errors import JournalError
+from fleet.errors import JournalFull
 from fleet.live.arm.journal_records import (
     ActiveAward,
     ArmHistory,
@@ -107,7 +107,8 @@ class AwardExecutor:
         """Start.
 
         Args:
-            keep: Writes records and returns when they are on disk; if it raises a JournalError, none is.
+            keep: Writes records and returns when they are on disk; if it raises JournalFull, none is. After another
+                JournalError the process must end: only a restart can read what is on disk.
             history: As `ArmHistory.after_restart` returns it, and on disk.
             nonce: Different at every start, so that names of quotes stay unique even if the disk was wiped.
         """
@@ -191,7 +192,7 @@ class AwardExecutor:
             records.insert(0, Released(earlier.award.award, earlier.job, self.arm))
         try:
             self._keep(*records)
-        except JournalError as error:
+        except JournalFull as error:
             return self._ack(award, f"my journal cannot be written: {error}")
         if earlier is not None:
             del self._active[earlier.award.award]
@@ -393,7 +394,7 @@ class AwardExecutor:
         """Write records; return whether they are on disk."""
         try:
             self._keep(*records)
-        except JournalError as error:
+        except JournalFull as error:
             _LOG.warning("%d record(s) of '%s' could not be written: %s", len(records), self.arm, error)
             return False
         return True

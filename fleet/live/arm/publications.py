@@ -6,10 +6,7 @@ from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, JobEstimate
 from fleet.bus.protocol.messages import DifficultyScores, Info, State
-from fleet.events import Event
-
-EVENTS_PER_BOOT = 1_000_000_000
-"""The number of an event is the boot number times this, plus a count."""
+from fleet.events import EVENTS_PER_BOOT, Event
 
 
 class Publications:

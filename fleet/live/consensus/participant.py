@@ -199,7 +199,7 @@ class Participant:
         settled = self.granter.register.settled
         expired = {name for name in late if name not in settled and not self.granter.is_granted(name, real_s)}
         causes = self.granter.register.given_up | expired
-        return dict.fromkeys(expired, EXPIRED) | lost_jobs(jobs.values(), causes)
+        return dict.fromkeys(expired, EXPIRED) | (lost_jobs(jobs.values(), causes) if causes else {})
 
     def all_settled(self, real_s: float) -> bool:
         """Return whether every present arm, a majority at least, knows that every job is settled."""

@@ -1,10 +1,11 @@
-"""`thermofleet record` and `thermofleet replay`: from the bus to Parquet, and from Parquet to the bus."""
+"""`thermofleet record`, `replay` and `report`: from the bus to Parquet, back to the bus, and to a page."""
 
 import fcntl
+import logging
 import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -15,32 +16,59 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, Result
 from fleet.bus.protocol.messages import State
 from fleet.errors import FleetError
+from fleet.files import atomic_path
 from scenarios.cli.live.options import MAX_SPEED
 from scenarios.cli.options import ENDPOINT, EndpointOption, check_name, number
 from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import echo, out_console, say
-from scenarios.live.recorder import Recorder
+from scenarios.live.gap_fetcher import GapFetcher
+from scenarios.live.recorder import MAX_ROWS, Recorder
 from scenarios.live.replayer import Replay
+from scenarios.result_folder import disk_errors
 
 BACKLOG = 200_000
 """Messages that may wait: joining a fleet of a hundred arms brings a hundred thousand at once."""
-TURN_S = 0.5
-"""Real seconds between two checks whether to stop."""
+TURN_S, BATCH = 0.5, 1000
+"""Real seconds, and messages, after which received messages are written to the disk."""
+RETRY_S = 5.0
+"""Real seconds until the next attempt to write a part to a disk that refused."""
+CONNECT_S = 0.5
+"""Real seconds that the router has to accept the session that fetches missed messages."""
+
+_LOG = logging.getLogger(__name__)
 
 
-def record(link: BusClient, folder: Path, *, rotate_s: float, stopped: Callable[[], bool]) -> Recorder:
-    """Record until stopped; return the recorder, everything written."""
-    with lock_folder(folder):
-        recorder = Recorder.open(folder, link.fleet)
+def record(
+    link: BusClient, folder: Path, *, rotate_s: float, stopped: Callable[[], bool], connect: Callable[[], BusClient]
+) -> Recorder:
+    """Record until stopped; return the recorder, everything written.
+
+    Args:
+        rotate_s: Real seconds between two Parquet parts; rows are in the journal before.
+        connect: Makes another client of the fleet, which fetches missed messages.
+
+    Raises:
+        FleetError: the disk refuses at the beginning or at the end; in between it is tried again.
+    """
+    with lock_folder(folder), closing(Recorder.open(folder, link.fleet)) as recorder:
         link.subscribe(keys.of_every_arm(link.fleet, "state"), State, recorder.add, history=True)
         link.subscribe(keys.of_every_arm(link.fleet, "event"), ArmEvent, recorder.add, history=True)
         link.subscribe(keys.of_every_auction(link.fleet, "result"), Result, recorder.add, history=True)
-        due_s = time.monotonic() + rotate_s
-        while not stopped():
-            link.serve(min(due_s, time.monotonic() + TURN_S))
-            if time.monotonic() >= due_s:
-                recorder.write()
-                due_s = time.monotonic() + rotate_s
+        due_s, failure = time.monotonic() + rotate_s, ""
+        with closing(GapFetcher(recorder, connect)) as fetcher:
+            while not stopped():
+                link.serve(time.monotonic() + TURN_S, at_least=BATCH)
+                fetcher.step(real_s := time.monotonic())
+                try:
+                    if real_s >= due_s or (recorder.waiting >= MAX_ROWS and not failure):
+                        due_s = real_s + rotate_s
+                        recorder.write()
+                    recorder.save()
+                    failure = ""
+                except FleetError as error:
+                    if not failure:
+                        _LOG.error("Not recorded yet: %s", error)
+                    failure, due_s = str(error), min(due_s, real_s + RETRY_S)
         link.serve()
         recorder.write(status="finished")
     return recorder
@@ -73,12 +101,18 @@ def record_command(
     ],
     out: Annotated[Path, typer.Option(help="Folder of the recording; an interrupted one is continued.")],
     endpoint: EndpointOption = ENDPOINT,
-    rotate: Annotated[float, number("Real seconds between two parts.", 0.1, 86_400)] = 60.0,
+    rotate: Annotated[
+        float, number("Real seconds between two parts; a message is on disk within a second.", 0.1, 86_400)
+    ] = 60.0,
 ) -> None:
-    """Record what arms and auctioneer publish, as Parquet parts that are readable at once."""
+    """Record what arms and auctioneer publish: a journal, then Parquet parts; readable at once."""
     with until_stopped() as stop, BusClient(endpoint, fleet, backlog=BACKLOG, stopped=stop.is_set) as link:
         echo(f"ready record {endpoint}")
-        recorder = record(link, out, rotate_s=rotate, stopped=stop.is_set)
+
+        def connect() -> BusClient:
+            return BusClient(endpoint, fleet, timeout_s=CONNECT_S, backlog=BACKLOG)
+
+        recorder = record(link, out, rotate_s=rotate, stopped=stop.is_set, connect=connect)
     missed = sum(count.missed for count in recorder.counts.values())
     kept = sum(count.kept for count in recorder.counts.values())
     say(f"Recorded {kept} messages in {out}, {missed} missed.", out_console)
@@ -94,9 +128,23 @@ def replay_command(
     """Publish a run or a recording on the bus, in real time or at --speed."""
     replay = Replay.of(path)
     if not len(replay):
-        raise FleetError(f"'{path}' holds no messages yet; parts are written every --rotate seconds and at the end.")
+        raise FleetError(f"'{path}' holds no messages.")
     with until_stopped() as stop, BusClient(endpoint, fleet or replay.fleet) as link:
         echo(f"ready replay {endpoint}")
         count = replay.play(link, speed=speed, stopped=stop.is_set)
     say(f"Published {count} of {len(replay)} messages.", out_console)
     stop.leave("The replay was interrupted.")
+
+
+def report_command(
+    recording: Annotated[Path, typer.Argument(help="Folder of a recording, finished or not.")],
+    out: Annotated[Path | None, typer.Option(help="The HTML file. Default: report.html beside the recording.")] = None,
+) -> None:
+    """Write the report of a live recording, as `run` writes one of a simulated shift."""
+    from scenarios.live.recording_report import recording_html
+
+    path = out or recording.parent / "report.html"
+    html = recording_html(recording)
+    with disk_errors(path), atomic_path(path) as draft:
+        draft.write_text(html, encoding="utf-8")
+    say(f"Open {path} in a browser.", out_console)

@@ -1,0 +1,1 @@
+"""VDA 5050: a fleet as one stationary vehicle, for plant masters that speak MQTT."""

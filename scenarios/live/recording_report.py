@@ -1,0 +1,234 @@
+"""The report of a live recording: the page that a run has, from what was recorded of arms and auctioneer.
+
+A live log has what a simulated one has not: awards that queue, jobs that are returned without a fault, arms that crash
+and messages that are lost. `order_events` turns it into a sequence that a schedule can have.
+"""
+
+import math
+from collections import defaultdict, deque
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any  # values of the report
+
+import numpy as np
+import pyarrow as pa
+
+from fleet.errors import FleetError
+from fleet.events import EVENT_KINDS, Event
+from fleet.robot import JOINTS, ThermalLimits
+from fleet.telemetry import FAULTED, MODES, WORKING, Telemetry
+from scenarios.live.recording import SENSORS, read_card, read_parts
+from scenarios.report.run_page import report_html
+from scenarios.report.schedule import SAME_MOMENT_DIGITS
+
+Array = np.ndarray
+
+MOST_SAMPLES = 20_000
+"""Samples of telemetry in a report, in time."""
+ABSENT_SAMPLES = 30
+"""Without a state for this many typical intervals, an arm has no temperature in the report."""
+_ENDED = ("waiting", "given_up", "unfinished")
+"""States of a job in which the arm that had it has it no more."""
+
+
+def recording_html(folder: Path, limits: ThermalLimits | None = None) -> str:
+    """The report of a recording, which may still grow, as one HTML page.
+
+    Raises:
+        FleetError: it is no recording, or has no states of arms yet.
+    """
+    limits, card = limits or ThermalLimits(), read_card(folder)
+    table, results = read_parts(folder, "telemetry"), read_parts(folder, "results")
+    arms = sorted(set(table["arm"].to_pylist()))
+    if not arms:
+        raise FleetError(f"'{folder}' holds no state of an arm yet; record longer.")
+    events = order_events(_arm_events(read_parts(folder, "events")), _returns(results))
+    events = [event for event in events if event.arm in arms]
+    telemetry = telemetry_of(table, arms)
+    run = {
+        "status": {"recording": "interrupted"}.get(card.status, card.status),
+        "scenario": {"name": card.fleet},
+        "policy": "live recording",
+        "metrics": _metrics(telemetry, events, results, arms, limits),
+        "messages": {
+            sender: f"{count.kept} recorded, {count.missed} missing" for sender, count in card.speakers.items()
+        },
+        "missing": _missing(read_parts(folder, "gaps")),
+    }
+    return report_html(run, telemetry, events, arms, warning_c=limits.warning_c, error_c=limits.error_c)
+
+
+def order_events(events: Iterable[Event], returns: Iterable[Event]) -> list[Event]:
+    """Events of arms that contradict each other nowhere, by arm and time.
+
+    An award to a busy arm begins when the arm is free. A job that the arm neither finished nor lost by a fault ends
+    with a `return`: where the auctioneer took it back, or where the arm went on with another one.
+
+    Args:
+        events: As the arms reported them, in any order; some may be missing.
+        returns: A `return` for every job that the auctioneer took back from its arm.
+    """
+    own: dict[str, list[Event]] = defaultdict(list)
+    for event in (*events, *returns):
+        own[event.arm].append(event)
+    return [event for arm in sorted(own) for event in _order_of_arm(own[arm])]
+
+
+_ORDER = {kind: place for place, kind in enumerate(("recover", "finish", "home", "award", "fault", "return"))}
+
+
+def _order_of_arm(log: list[Event]) -> list[Event]:
+    out: list[Event] = []
+    job, finished, faulted = "", False, False
+    queue: deque[Event] = deque()
+    last = (-math.inf, 0)
+
+    def emit(event: Event) -> None:
+        """Append an event; in its turn, should it be of the same moment as the one before."""
+        nonlocal last
+        time_s, place = round(event.time_s, SAME_MOMENT_DIGITS), _ORDER[event.kind]
+        if (time_s, place) < last:
+            time_s = last[0] + 2 * 10**-SAME_MOMENT_DIGITS
+            event = replace(event, time_s=time_s)
+        last = (time_s, place)
+        out.append(event)
+
+    def begin(time_s: float) -> None:
+        nonlocal job, finished
+        job, finished = "", False
+        if queue:
+            award = queue.popleft()
+            emit(replace(award, time_s=max(time_s, award.time_s)))
+            job = award.job
+
+    def end(event: Event) -> None:
+        """End the current job without a fault."""
+        kind = "home" if finished else "return"
+        emit(replace(event, kind=kind, job=job))
+        begin(event.time_s)
+
+    for event in sorted(log, key=lambda e: (round(e.time_s, SAME_MOMENT_DIGITS), _ORDER.get(e.kind, len(_ORDER)))):
+        waiting = {award.job for award in queue}
+        match event.kind:
+            case "award":
+                if event.job not in waiting and (event.job != job or finished):
+                    queue.append(event)
+                    if not job and not faulted:
+                        begin(event.time_s)
+            case "finish":
+                while event.job != job and event.job in waiting and job:
+                    end(replace(event, value=float("nan"), reason="the arm went on with another job"))
+                if event.job == job and not finished:
+                    emit(event)
+                    finished = True
+            case "home":
+                if finished and not faulted:
+                    end(event)
+            case "fault" if not faulted:
+                emit(event)
+                job, finished, faulted = "", False, True
+                queue.clear()
+            case "recover" if faulted:
+                emit(event)
+                faulted = False
+                begin(event.time_s)
+            case "return":
+                if event.job == job and not finished:
+                    end(event)
+                elif event.job in waiting:
+                    queue = deque(award for award in queue if award.job != event.job)
+                elif faulted:
+                    emit(event)
+            case "fault" | "recover":
+                pass
+            case _:
+                out.append(event)
+    return out
+
+
+def _arm_events(table: pa.Table) -> list[Event]:
+    rows = (row for row in table.to_pylist() if row["kind"] in EVENT_KINDS)
+    names = ("time_s", "kind", "arm", "job", "joint", "reason")
+    return [
+        Event(**{name: row[name] for name in names}, value=float("nan") if row["value"] is None else row["value"])
+        for row in rows
+    ]
+
+
+def _returns(results: pa.Table) -> list[Event]:
+    """A `return` for each job that an arm had and has no more, though it did not finish it."""
+    out: list[Event] = []
+    holder: dict[str, str] = {}
+    for row in results.to_pylist():
+        if row["state"] in _ENDED and (arm := holder.pop(row["job"], "")):
+            reason = row["reason"] or "the arm returned the job, or lost its lease"
+            out.append(
+                Event(time_s=row["time_s"], kind="return", arm=arm, job=row["job"], value=row["cycles"], reason=reason)
+            )
+        elif row["state"] == "awarded":
+            holder[row["job"]] = row["arm"]
+        elif row["state"] == "finished":
+            holder.pop(row["job"], None)
+    return out
+
+
+def telemetry_of(table: pa.Table, arms: list[str]) -> Telemetry:
+    """Telemetry of a recording on common times: at each, the last reading of every arm, or NaN if it was absent."""
+    all_s = table["time_s"].to_numpy()
+    names = np.array(table["arm"].to_pylist())
+    own_s = [all_s[names == arm] for arm in arms]
+    steps = np.concatenate([np.diff(times) for times in own_s if len(times) > 1] or [np.ones(1)])
+    step_s = max(float(np.median(steps)), float(all_s[-1] - all_s[0]) / MOST_SAMPLES, 1e-3)
+    time_s = np.arange(all_s[0], all_s[-1] + step_s, step_s)
+    modes = np.array([MODES.index(mode) for mode in table["mode"].to_pylist()])
+    readings = {
+        name: np.stack([table[f"{name}_{j + 1}"].to_numpy(zero_copy_only=False) for j in range(JOINTS)], axis=-1)
+        for name in SENSORS
+        if name != "housing_c"
+    }
+    shape = (len(time_s), len(arms), JOINTS)
+    out = {name: np.full(shape, np.nan, np.float32) for name in readings}
+    mode = np.zeros(shape[:2], int)
+    for a, arm in enumerate(arms):
+        rows, times = np.flatnonzero(names == arm), own_s[a]
+        last = np.searchsorted(times, time_s, side="right") - 1
+        fresh = (last >= 0) & (time_s - times[last] <= ABSENT_SAMPLES * step_s)
+        mode[fresh, a] = modes[rows[last[fresh]]]
+        for name, values in readings.items():
+            out[name][fresh, a] = values[rows[last[fresh]]]
+    return Telemetry(time_s=time_s, mode=mode, **out)
+
+
+def _metrics(
+    telemetry: Telemetry, events: list[Event], results: pa.Table, arms: list[str], limits: ThermalLimits
+) -> dict[str, Any]:
+    """Key figures, named as in a run; what only the simulator knows is left out."""
+    late_s = [event.value for event in events if event.kind == "finish"]
+    states = {row["job"]: row["state"] for row in results.to_pylist()}
+    jobs = set(states) | {event.job for event in events if event.job}
+    step_s = float(telemetry.time_s[1] - telemetry.time_s[0]) if len(telemetry.time_s) > 1 else 0.0
+    span_h = float(telemetry.time_s[-1] - telemetry.time_s[0]) / 3600.0
+    seen = np.asarray(np.isfinite(telemetry.temp_c).any(axis=2))
+    finished = max(len(late_s), sum(state == "finished" for state in states.values()))
+    hot = (np.nan_to_num(telemetry.temp_c, nan=-np.inf) > limits.warning_c).any(axis=2)
+    peaks = {arm: float(np.nanmax(telemetry.temp_c[:, a])) for a, arm in enumerate(arms) if seen[:, a].any()}
+    return {
+        "jobs": len(jobs),
+        "finished": finished,
+        "on_time": sum(not late for late in late_s),
+        "tardiness_min": float(np.nansum(late_s)) / 60.0,
+        "faults": sum(event.kind == "fault" for event in events),
+        "given_up": sum(state == "given_up" for state in states.values()),
+        "unfinished": sum(state == "unfinished" for state in states.values()),
+        "above_warning_min": float(hot.sum()) * step_s / 60.0,
+        "availability": float(1.0 - (telemetry.mode[seen] == FAULTED).mean()) if seen.any() else None,
+        "utilisation": float((telemetry.mode[seen] == WORKING).mean()) if seen.any() else None,
+        "jobs_per_hour": finished / span_h if span_h else None,
+        "peak_c": peaks,
+    }
+
+
+def _missing(gaps: pa.Table) -> Mapping[str, str]:
+    rows = gaps.to_pylist()
+    return {f"{row['sender']}, numbers {row['first']} to {row['last']}": row["reason"] for row in rows} or {"": "none"}

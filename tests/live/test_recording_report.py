@@ -1,0 +1,125 @@
+"""The report of a live recording: equal to that of a run where both know the same, and never impossible."""
+
+import re
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
+from fleet.bus.protocol.messages import State
+from fleet.errors import FleetError
+from fleet.events import Event
+from scenarios.cli.main import main
+from scenarios.live.recorder import Recorder
+from scenarios.live.recording import read_parts
+from scenarios.live.recording_report import order_events, recording_html, telemetry_of
+from scenarios.report.run_page import report_html
+from scenarios.report.schedule import schedule
+
+ARMS = ("arm_0", "arm_1")
+
+
+def figure_of(html):
+    """The traces of the page's figure."""
+    return re.findall(r'"type":"bar".*?"hovertemplate"', html)
+
+
+LOG = (
+    Event(time_s=0.0, kind="award", arm="arm_0", job="a-1", value=0.4),
+    Event(time_s=0.0, kind="award", arm="arm_1", job="b-1", value=0.2),
+    Event(time_s=30.0, kind="finish", arm="arm_1", job="b-1", value=12.0),
+    Event(time_s=31.0, kind="home", arm="arm_1", job="b-1"),
+    Event(time_s=40.0, kind="warning", arm="arm_0", job="a-1", joint=2, reason="motor 2 passed 60 °C"),
+    Event(time_s=50.0, kind="fault", arm="arm_0", job="a-1", joint=2, reason="motor 2 passed 75 °C"),
+    Event(time_s=50.0, kind="return", arm="arm_0", job="a-1", value=3.0, reason="3 of 9 cycles kept"),
+    Event(time_s=90.0, kind="recover", arm="arm_0", reason="cool again"),
+    Event(time_s=95.0, kind="award", arm="arm_1", job="a-1", value=0.3),
+)
+
+
+def record(folder, events, samples=100):
+    """A recording of these events, and of one state a second per arm."""
+    folder.mkdir()
+    recorder = Recorder.open(folder, "shop")
+    for tick in range(samples):
+        for arm in ARMS:
+            temps = tuple((np.linspace(30.0, 40.0, 7) + tick / 8).tolist())
+            recorder.add(arm, State(arm=arm, tick=tick, time_s=float(tick), mode="idle", temp_c=temps, headroom_k=1.0))
+    for number, event in enumerate(events, start=1):
+        value = event.value if np.isfinite(event.value) else None
+        fields = {name: getattr(event, name) for name in ("arm", "time_s", "kind", "job", "joint", "reason")}
+        recorder.add(event.arm, ArmEvent(number=number, value=value, **fields))
+    return recorder
+
+
+def test_the_work_and_events_of_a_recording_are_those_of_a_run(tmp_path):
+    """Second method: the page of the same events, written as that of a run."""
+    record(tmp_path / "r", LOG).write(status="finished")
+    live = recording_html(tmp_path / "r")
+    telemetry = telemetry_of(read_parts(tmp_path / "r", "telemetry"), list(ARMS))
+    assert telemetry.temp_c[:, 0, 0].tolist() == pytest.approx([30.0 + tick / 8 for tick in range(100)])
+    run = {"status": "finished", "scenario": {"name": "shop"}, "policy": "p", "seed": 1}
+    page = report_html(run, telemetry, LOG, ARMS, warning_c=60.0, error_c=75.0)
+    bars = figure_of(live)
+    assert bars == figure_of(page)
+    assert len(bars) >= 2
+    rows = r"<tr class=.*?</tr>|<td>.*?</td>"
+    assert re.findall(rows, live.split("<h2>Events")[1].split("<details")[0]) == re.findall(
+        rows, page.split("<h2>Events")[1].split("<details")[0]
+    )
+
+
+def test_a_report_names_missing_messages_and_returned_jobs(tmp_path):
+    recorder = record(tmp_path / "r", LOG[:2])
+    for number, status in enumerate(
+        (("b-1", "awarded", "arm_1"), ("b-1", "waiting", ""), ("b-1", "finished", "arm_0"))
+    ):
+        job, state, arm = status
+        told = JobStatus(job=job, state=state, arm=arm, cycles=2)
+        recorder.add("boss", Result(auctioneer="boss", number=2 * number, time_s=20.0 + number, status=told))
+    recorder.write(status="finished")
+    html = recording_html(tmp_path / "r")
+    assert "returned to the queue, 2 cycles kept" in html
+    assert "results of boss, numbers 1 to 1" in html
+    assert "3 recorded, 2 missing" in html
+
+
+kinds = st.sampled_from(["award", "finish", "home", "fault", "recover", "return", "warning", "moved"])
+events = st.builds(
+    Event,
+    time_s=st.integers(0, 20).map(float),
+    kind=kinds,
+    arm=st.sampled_from(ARMS),
+    job=st.sampled_from(["a", "b", "c"]),
+    value=st.sampled_from([0.0, 2.0, float("nan")]),
+)
+
+
+@settings(max_examples=500, deadline=None)
+@given(st.lists(events, max_size=30), st.lists(events.map(lambda event: replace(event, kind="return")), max_size=6))
+def test_whatever_was_lost_there_is_a_schedule(log, returns):
+    plan = schedule(order_events(log, returns), ARMS, 20.0)
+    for arm in ARMS:
+        own = [each for each in plan.assignments if each.arm == arm]
+        assert all(one.end_s <= two.start_s for one, two in pairwise(own))
+
+
+def test_a_possible_log_is_left_as_it_is():
+    assert schedule(order_events(LOG, ()), ARMS, 100.0) == schedule(LOG, ARMS, 100.0)
+
+
+def test_the_command_writes_the_page_beside_the_recording(tmp_path, capsys):
+    recorder = record(tmp_path / "r", LOG)
+    recorder.save()  # still going on
+    with pytest.raises(SystemExit) as code:
+        main(["report", str(tmp_path / "r")])
+    assert code.value.code == 0
+    assert "live recording" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    (tmp_path / "empty").mkdir()
+    Recorder.open(tmp_path / "empty", "f")
+    with pytest.raises(FleetError, match="no state of an arm"):
+        recording_html(tmp_path / "empty")
