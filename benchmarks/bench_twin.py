@@ -22,8 +22,9 @@ import torch
 from torch import Tensor
 
 from fleet.motion import RATE_HZ
+from twin.vae.config import TwinConfig
 from twin.vae.inference import reconstruct
-from twin.vae.model import LstmVae, TwinConfig, build
+from twin.vae.model import LstmVae, build, weights_of
 from twin.vae.onnx import export_onnx
 from twin.vae.train import Run, train
 from twin.vae.twin import Fit, Twin
@@ -91,7 +92,7 @@ def untrained(config: TwinConfig) -> Twin:
     """A twin with random weights, which cost as much as trained ones."""
     scaler = Scaler(np.zeros(JOINTS), np.zeros((JOINTS, 3)), np.ones((JOINTS, 3)), np.zeros(JOINTS, dtype=bool))
     count, channels = config.networks(JOINTS), config.channels(JOINTS)
-    nets = [build(config, seed, channels=channels) for seed in range(count)]
+    nets = [weights_of(build(config, seed, channels=channels)) for seed in range(count)]
     fit = Fit(elbo=0.0, kl=1.0, active_units=1, mean_squared_error=1.0, restart=0)
     return Twin(config, scaler, nets, arm="bench", data_hash="", seed="0", fits=[fit] * count)
 
@@ -130,9 +131,12 @@ def scoring(config: TwinConfig, name: str, windows: int, runs: int) -> None:
         for x in np.moveaxis(z.reshape(*z.shape[:2], len(twin.nets), -1), 2, 0)
     ]
 
+    channels = config.channels(JOINTS)
+    nets = [build(config, seed, channels=channels).eval() for seed in range(len(twin.nets))]
+
     def plain() -> None:
         with torch.inference_mode():
-            for net, x in zip(twin.nets, parts, strict=True):
+            for net, x in zip(nets, parts, strict=True):
                 plain_forward(net, x)
 
     calls: dict[str, Callable[[], object]] = {

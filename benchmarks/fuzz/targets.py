@@ -217,7 +217,7 @@ def checkpoint(data: bytes) -> None:
 def twin_files() -> tuple[bytes, bytes]:
     """Card and weights of a small twin."""
     from twin.vae import checkpoint as vae
-    from twin.vae.model import TwinConfig
+    from twin.vae.config import TwinConfig
     from twin.vae.train import train
 
     rng = np.random.default_rng(0)

@@ -18,7 +18,7 @@ from scenarios.schema_errors import choose
 
 if TYPE_CHECKING:  # slow to import
     from scenarios.studies.shift_reliability import Awards
-    from twin.vae.model import TwinConfig
+    from twin.vae.config import TwinConfig
 
 twin_app = typer.Typer(
     help="Train, score and use the digital twin of an arm: an LSTM variational autoencoder of its cool motion.",
@@ -270,7 +270,7 @@ def config_of(size: str, given: dict[str, Any], *, of_log: bool = False) -> "Twi
     from dataclasses import replace
 
     from scenarios.prepare.twin_folder import LOG_RATE_HZ
-    from twin.vae.model import TwinConfig
+    from twin.vae.config import TwinConfig
 
     base = TwinConfig.quick() if size == "quick" else TwinConfig()
     # A window smaller than the usual stride would leave gaps between windows.

@@ -20,8 +20,8 @@ from scenarios.prepare.planned_arm import ArmHardware, PlannedArm
 from scenarios.progress import Progress
 from scenarios.schema import Scenario, TwinSpec
 from twin.vae.checkpoint import load, save
-from twin.vae.model import TwinConfig
-from twin.vae.train import train, training_key
+from twin.vae.config import TwinConfig
+from twin.vae.training_key import training_key
 from twin.vae.twin import Twin
 
 Array = np.ndarray
@@ -91,6 +91,8 @@ def train_twin(
         progress: Called with the fraction of the training that is done.
     """
     trained_on = [*records(own), *exploration_records(scenario, arm)]
+    from twin.vae.train import train  # imports torch, which scoring does not need
+
     twin = train(trained_on, config, seed, arm=arm.hardware.robot.name, progress=progress)
     held_out = _cool_exploration(scenario, arm, HELD_OUT)
     if len(held_out) < FEWEST_HELD_OUT:
@@ -140,6 +142,8 @@ def train_or_load(
     """The twin of these records: from the folder while its inputs are unchanged, else trained and kept there."""
 
     def make(home: Path, _report: Callable[[float], None]) -> None:
+        from twin.vae.train import train  # imports torch
+
         save(train(records, config, seed, arm=arm), home)
 
     home = folder / "twins" / training_key(records, config, seed)

@@ -22,7 +22,7 @@ from twin.logs.recording import Recording
 from twin.training_data import cool_stretches
 from twin.vae.checkpoint import CARD as TWIN_CARD
 from twin.vae.checkpoint import load, save
-from twin.vae.model import TwinConfig
+from twin.vae.config import TwinConfig
 from twin.vae.train import train
 from twin.vae.twin import Twin, net_names
 

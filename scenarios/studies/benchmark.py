@@ -25,8 +25,8 @@ from twin.baselines.reconstruction import (
 )
 from twin.baselines.torque import torque_over_continuous, torque_over_known
 from twin.thermal.thermal_twin import RcTwin
+from twin.vae.config import TwinConfig
 from twin.vae.measures import Calibration, Features
-from twin.vae.model import TwinConfig
 from twin.vae.twin import Twin
 from twin.vae.window import check_jobs
 

@@ -11,7 +11,7 @@ import numpy as np
 from joblib import Parallel, cpu_count, delayed
 
 from scenarios.progress import Progress, quiet
-from twin.vae.model import TwinConfig
+from twin.vae.config import TwinConfig
 from twin.vae.train import train
 from twin.vae.window import windows_of
 

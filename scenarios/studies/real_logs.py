@@ -16,7 +16,7 @@ from scenarios.studies.ranking import CARRIER
 from twin.logs.recording import Recording
 from twin.logs.resampling import Stretch, stretches
 from twin.training_data import cool_stretches
-from twin.vae.model import TwinConfig
+from twin.vae.config import TwinConfig
 from twin.vae.twin import Twin
 from twin.vae.window import cut, starts
 

@@ -25,8 +25,8 @@ from twin.saturation.fit import Experience, fit_saturation
 from twin.saturation.model import EVIDENCE, METHODS
 from twin.saturation.reliability import Reliability, brier, reliability
 from twin.thermal.thermal_twin import RcTwin
+from twin.vae.config import TwinConfig
 from twin.vae.measures import score_of
-from twin.vae.model import TwinConfig
 from twin.vae.twin import Twin
 
 Array = np.ndarray

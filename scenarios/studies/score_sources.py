@@ -26,7 +26,7 @@ from scenarios.schema import Scenario
 from twin.baselines.reconstruction import untrained_config
 from twin.baselines.torque import TorqueRms, torque_over_known
 from twin.thermal.calibrated import CalibratedTwin
-from twin.vae.model import TwinConfig
+from twin.vae.config import TwinConfig
 
 Array = np.ndarray
 

@@ -22,7 +22,7 @@ from fleet.thermal import ThermalModel, ThermalSpread, gen3_network, spread_moto
 from scenarios.prepare.cool_motion import cold_peaks, records
 from scenarios.prepare.planned_arm import ArmHardware
 from scenarios.prepare.train_twins import train_or_load
-from twin.vae.model import TwinConfig
+from twin.vae.config import TwinConfig
 from twin.vae.twin import Twin
 
 Array = np.ndarray

@@ -16,7 +16,7 @@ from scenarios.cli.main import main
 from scenarios.motion.perform import bare_arm
 from scenarios.prepare.cool_motion import records
 from scenarios.prepare.oracle import peaks
-from twin.vae.model import TwinConfig
+from twin.vae.config import TwinConfig
 from twin.vae.train import train
 
 SMALL = """

@@ -11,7 +11,7 @@ from scenarios.studies.ranking import QUESTIONS, side_by_side
 from scenarios.studies.self_training import GENERATED, OWN, PRIOR, autonomy, generated_plans, prior_records, remaining
 from scenarios.studies.setup import Bench, make_study
 from twin.baselines.reconstruction import untrained_config
-from twin.vae.model import TwinConfig
+from twin.vae.config import TwinConfig
 
 TINY = replace(untrained_config(TwinConfig()), hidden=4, max_windows=64)
 SEED = np.random.SeedSequence(1)

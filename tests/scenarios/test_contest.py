@@ -23,7 +23,7 @@ from scenarios.studies.ranking import CARRIER, MEASURES, verdicts
 from scenarios.studies.setup import Bench, make_study
 from twin.baselines.reconstruction import ModelScorer, untrained_config
 from twin.thermal.thermal_twin import RcTwin
-from twin.vae.model import TwinConfig
+from twin.vae.config import TwinConfig
 
 SEED = np.random.SeedSequence(1)
 TINY = replace(untrained_config(TwinConfig()), hidden=4, max_windows=64)

@@ -11,8 +11,8 @@ from fleet.robot import JOINTS, Robot
 from fleet.thermal import gen3_network
 from scenarios.studies.exploration import SCORES, coverage
 from scenarios.studies.setup import Bench, Sample, Study
+from twin.vae.config import TwinConfig
 from twin.vae.measures import PARTS, Features
-from twin.vae.model import TwinConfig
 
 SEEDS = [np.random.SeedSequence(seed) for seed in (5, 6)]
 HORIZON_S = 95.0

@@ -17,7 +17,7 @@ from scenarios.prepare import model_cache
 from scenarios.prepare import train_twins as rehearse
 from scenarios.prepare.cool_motion import records, require_cool_plans
 from scenarios.prepare.planned_arm import ArmHardware, PlannedArm
-from twin.vae.model import TwinConfig
+from twin.vae.config import TwinConfig
 from twin.vae.train import train
 
 TINY = TwinConfig(max_windows=64, epochs=2, restarts=1, hidden=4, allow_collapse=True)

@@ -11,7 +11,7 @@ from scenarios.studies.benchmark import jobs_of
 from scenarios.studies.setup import Bench, make_study
 from scenarios.studies.transfer import INPUTS, REGRESSORS, compare, fit, job_inputs, moments, over_time, transfer
 from twin.baselines.reconstruction import untrained_config
-from twin.vae.model import TwinConfig
+from twin.vae.config import TwinConfig
 from twin.vae.window import cut_jobs
 
 TINY = replace(untrained_config(TwinConfig()), hidden=4, max_windows=64)

@@ -11,8 +11,8 @@ import pytest
 from scenarios.cli.main import main
 from scenarios.report.page import Section
 from twin.vae.checkpoint import load
+from twin.vae.config import TwinConfig
 from twin.vae.measures import TAU
-from twin.vae.model import TwinConfig
 
 TINY = ("--hidden", 8, "--epochs", 10, "--max-windows", 150, "--restarts", 1, "--allow-collapse")
 RATE_HZ = 2.0

@@ -19,7 +19,7 @@ from scenarios.studies.report.claims import claims
 from scenarios.studies.report.figures import picture, sheet
 from scenarios.studies.report.paper_chapters import active_units
 from scenarios.studies.report.section_cache import Chapter, SectionCache, basis, compute_sections
-from twin.vae.model import TwinConfig
+from twin.vae.config import TwinConfig
 
 
 def dots(alt="Three dots."):

@@ -13,7 +13,7 @@ from scenarios.prepare.train_twins import train_twin, train_twins
 from scenarios.prepare.twin_folder import quality, train_arms
 from scenarios.progress import quiet
 from scenarios.schema import Scenario
-from twin.vae.model import TwinConfig
+from twin.vae.config import TwinConfig
 from twin.vae.twin import Twin
 
 TINY = TwinConfig(max_windows=64, epochs=2, restarts=1, hidden=4, allow_collapse=True)

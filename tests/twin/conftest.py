@@ -7,7 +7,7 @@ import pytest
 
 from fleet.job import Place, Work
 from fleet.motion import RATE_HZ, Phase, Plan
-from twin.vae.model import TwinConfig
+from twin.vae.config import TwinConfig
 from twin.vae.train import train
 from twin.vae.twin import Twin
 

@@ -23,7 +23,7 @@ from twin.baselines.detectors import (
 )
 from twin.baselines.reconstruction import ModelScorer, collapsed_config, cool_windows, pca, untrained_config
 from twin.baselines.torque import TorqueRms, continuous_torque, torque_over_continuous, torque_over_known
-from twin.vae.model import TwinConfig
+from twin.vae.config import TwinConfig
 from twin.vae.train import train
 from twin.vae.window import cut_jobs
 

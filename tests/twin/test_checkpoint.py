@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.numpy import load_file, save_file
 
 from fleet.errors import CheckpointError
 from twin.vae.checkpoint import CARD, WEIGHTS, load, save
@@ -80,15 +80,15 @@ def test_a_missing_tensor_is_named(folder):
     tensors = load_file(folder / WEIGHTS)
     del tensors["joint_3.mu.weight"]
     save_file(tensors, folder / WEIGHTS)
-    with pytest.raises(CheckpointError, match=r'Missing key.*"joint_3\.mu\.weight"'):
+    with pytest.raises(CheckpointError, match=r"missing tensor 'joint_3\.mu\.weight'"):
         load(folder)
 
 
 def test_a_tensor_of_another_shape_is_named(folder):
     tensors = load_file(folder / WEIGHTS)
-    tensors["joint_3.mu.weight"] = tensors["joint_3.mu.weight"][:1].clone()
+    tensors["joint_3.mu.weight"] = tensors["joint_3.mu.weight"][:1].copy()
     save_file(tensors, folder / WEIGHTS)
-    with pytest.raises(CheckpointError, match=r"size mismatch for joint_3\.mu\.weight"):
+    with pytest.raises(CheckpointError, match=r"'joint_3\.mu\.weight' is float32 \[1, 16\], not float32 \[2, 16\]"):
         load(folder)
 
 
@@ -106,12 +106,12 @@ def test_a_changed_weight_is_noticed(folder):
         (lambda card: card["mean"][2].__setitem__(1, 0.5), "changed since it was saved"),
         (lambda card: card.update(arm="arm_9"), "changed since it was saved"),
         (lambda card: card["config"].update(score_stride=25), "changed since it was saved"),
-        (lambda card: card["config"].update(hidden=8), "size mismatch for joint_1"),
+        (lambda card: card["config"].update(hidden=8), "not float32"),
         (lambda card: card["config"].update(hidden=-8), "hidden must be >= 1"),
         (lambda card: card["std"].pop(), "must each have 7 joints"),
         (lambda card: card["fits"].pop(), r"needs 7 network\(s\) and fits \(got 7 and 6\)"),
-        (lambda card: card["config"].update(scope="arm"), "Missing key"),
-        (lambda card: card["config"].update(kind="ae"), "Unexpected key"),
+        (lambda card: card["config"].update(scope="arm"), "missing tensor"),
+        (lambda card: card["config"].update(kind="ae"), "unknown tensors"),
         (lambda card: card["std"][0].pop(), "Expected `array` of length 3"),
         (lambda card: card.pop("seed"), "seed"),
         (lambda card: card.update(more=1), "more"),

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from fleet.motion import RATE_HZ, Phase
 from fleet.robot import GEN3
+from twin.vae.config import TwinConfig
 from twin.vae.generate import STRIDE, rest_to_rest, time_spline, vary
-from twin.vae.model import TwinConfig
 
 LIMITS = [np.array(limit) for limit in (GEN3.velocity, GEN3.acceleration, GEN3.jerk)]
 PEAKS = (15 / 8, 10 / np.sqrt(3), 60.0)

@@ -2,8 +2,9 @@ import numpy as np
 import torch
 from torch.distributions import Independent, Normal, kl_divergence
 
+from twin.vae.config import TwinConfig
 from twin.vae.loss import active_units, collapsed, kl, negative_elbo, reconstruction
-from twin.vae.model import TwinConfig, build
+from twin.vae.model import build
 
 DRAW = torch.Generator().manual_seed(0)
 

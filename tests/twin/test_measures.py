@@ -203,7 +203,7 @@ def test_a_calibration_is_kept_in_the_checkpoint_and_in_the_version(twin, known,
 
 
 def test_a_checkpoint_with_and_without_calibration_cannot_be_mixed(twin, known, tmp_path):
-    for model, claims, words in ((twin, True, "missing tensor 'calibration"), (known, False, "Unexpected key")):
+    for model, claims, words in ((twin, True, "missing tensor 'calibration"), (known, False, "unknown tensors")):
         folder = tmp_path / str(claims)
         save(model, folder)
         card = json.loads((folder / CARD).read_text())

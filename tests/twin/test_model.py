@@ -1,7 +1,8 @@
 import pytest
 import torch
 
-from twin.vae.model import LOGVAR_RANGE, TwinConfig, build, one_thread
+from twin.vae.config import LOGVAR_RANGE, TwinConfig
+from twin.vae.model import build, one_thread
 
 
 @pytest.mark.parametrize("latent", [1, 2, 5])

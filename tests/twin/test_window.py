@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from twin.vae.model import TwinConfig
+from twin.vae.config import TwinConfig
 from twin.vae.window import STD_FLOOR, Scaler, cover, cut, resample, starts, windows_of
 
 lengths = st.integers(1, 300)

@@ -13,7 +13,7 @@ from sklearn.decomposition import PCA
 
 from fleet.difficulty import DifficultyModel, difficulty_of_error
 from fleet.motion import CHANNELS, Plan
-from twin.vae.model import TwinConfig
+from twin.vae.config import TwinConfig
 from twin.vae.window import Scaler, check_jobs, cut_jobs, draw_windows, windows_of
 
 Array = np.ndarray

@@ -5,19 +5,20 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
-from torch import nn
+from safetensors.numpy import load_file, save_file
 
 from fleet.errors import CheckpointError
 from fleet.files import atomic_path
 from fleet.robot import JOINTS
 from twin.json_file import check_version, read_card, write_card
+from twin.vae.config import TwinConfig
+from twin.vae.inference import shapes
 from twin.vae.measures import Calibration, Features
-from twin.vae.model import TwinConfig, build
 from twin.vae.twin import Fit, Twin, net_names
 from twin.vae.window import Scaler
+
+Array = np.ndarray
 
 FORMAT = 3
 WEIGHTS = "weights.safetensors"
@@ -51,7 +52,7 @@ def save(twin: Twin, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     tensors = twin.tensors()
     if twin.calibration is not None:
-        tensors[REFERENCE] = torch.from_numpy(np.array(twin.calibration.reference.packed, dtype=float))
+        tensors[REFERENCE] = np.array(twin.calibration.reference.packed, dtype=float)
     with atomic_path(folder / WEIGHTS) as draft:
         save_file(tensors, draft)
     shared = {name: getattr(twin, name) for name in _SHARED}
@@ -73,19 +74,31 @@ def load(folder: Path, *, joints: int = JOINTS) -> Twin:
     scaler = Scaler(*(np.array(getattr(card, field.name)) for field in fields(Scaler)))
     if {len(part) for part in (scaler.mean, scaler.std, scaler.still)} != {joints}:
         raise CheckpointError(f"{folder / CARD}: mean, std and still must each have {joints} joints.")
-    channels = card.config.channels(joints)
-    nets = {name: build(card.config, seed=0, channels=channels) for name in net_names(card.config, joints)}
+    wanted = shapes(card.config, card.config.channels(joints))
     try:
         tensors = load_file(folder / WEIGHTS)
-        calibration = Calibration(Features(tensors.pop(REFERENCE).numpy())) if card.calibrated else None
-        nn.ModuleDict(nets).load_state_dict(tensors)
+        calibration = Calibration(Features(tensors.pop(REFERENCE))) if card.calibrated else None
+        nets = [
+            {name: _tensor(tensors, f"{net}.{name}", shape) for name, shape in wanted.items()}
+            for net in net_names(card.config, joints)
+        ]
+        if tensors:
+            raise ValueError(f"unknown tensors {', '.join(sorted(tensors))}")
         shared = {name: getattr(card, name) for name in _SHARED}
-        twin = Twin(scaler=scaler, nets=tuple(nets.values()), calibration=calibration, **shared)
+        twin = Twin(scaler=scaler, nets=tuple(nets), calibration=calibration, **shared)
     except FileNotFoundError:
         raise CheckpointError(f"No twin in {folder}: {WEIGHTS} is missing.") from None
     except KeyError as error:
         raise CheckpointError(f"{folder / WEIGHTS}: missing tensor {error}.") from error
-    except (SafetensorError, RuntimeError, ValueError) as error:
+    except (SafetensorError, ValueError) as error:
         raise CheckpointError(f"{folder / WEIGHTS} does not fit {CARD}: {' '.join(str(error).split())}") from error
     check_version(folder, card.version, twin.version)
     return twin
+
+
+def _tensor(tensors: dict[str, Array], name: str, shape: tuple[int, ...]) -> Array:
+    """Take a tensor out; raises KeyError or ValueError."""
+    tensor = tensors.pop(name)
+    if tensor.shape != shape or tensor.dtype != np.float32:
+        raise ValueError(f"'{name}' is {tensor.dtype} {list(tensor.shape)}, not float32 {list(shape)}")
+    return tensor

@@ -1,52 +1,133 @@
-"""The trained networks of one arm as one module on windows of all joints, and functions of NumPy arrays."""
+"""The trained networks of one arm on windows of all joints, in NumPy: scoring needs no torch.
 
-from collections.abc import Callable, Sequence
+All networks run together, one matrix product per layer and time step. Weights have the names and the order of gates
+(input, forget, cell, output) of torch.nn.LSTM and torch.nn.Linear in `twin.vae.model.LstmVae`.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
-import torch
-from torch import Tensor, nn
 
 from fleet.motion import CHANNELS
-from twin.vae.model import LstmVae, one_thread
+from twin.vae.config import LOGVAR_RANGE, TwinConfig
 
 Array = np.ndarray
+Weights = Mapping[str, Array]
+"""Parameters of one network by name, such as `encoder.weight_ih_l0`, float32."""
 
-_CHUNK = 512
+_CHUNK = 64
 """Windows per pass: keeps the activations in cache."""
 
 
-class Networks(nn.Module):
-    """Networks that each read their share of an arm's channels, in z-scores; deterministic."""
+def shapes(config: TwinConfig, channels: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of the parameters of one network."""
+    hidden, latent = config.hidden, config.latent
+    found: dict[str, tuple[int, ...]] = {}
+    for lstm, size in (("encoder", channels), ("decoder", hidden)):
+        for layer in range(config.layers):
+            found[f"{lstm}.weight_ih_l{layer}"] = 4 * hidden, hidden if layer else size
+            found[f"{lstm}.weight_hh_l{layer}"] = 4 * hidden, hidden
+            found[f"{lstm}.bias_ih_l{layer}"] = found[f"{lstm}.bias_hh_l{layer}"] = (4 * hidden,)
+    linear = {
+        "summary": (hidden, hidden),
+        "mu": (latent, hidden),
+        "expand": (hidden, latent),
+        "out": (channels, hidden),
+    }
+    if config.kind == "vae":
+        linear["logvar"] = latent, hidden
+    for name, (rows, columns) in linear.items():
+        found[f"{name}.weight"], found[f"{name}.bias"] = (rows, columns), (rows,)
+    return found
 
-    def __init__(self, nets: Sequence[LstmVae]) -> None:
-        super().__init__()
-        self.nets = tuple(net.eval().requires_grad_(False) for net in nets)
 
-    def encode(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Posterior mean and log variance, [batch, net, latent], of windows [batch, time, joint, channel]."""
-        parts = z.flatten(2).chunk(len(self.nets), dim=2)
-        posteriors = [net.encode(part) for net, part in zip(self.nets, parts, strict=True)]
-        return torch.stack([mu for mu, _ in posteriors], dim=1), torch.stack([var for _, var in posteriors], dim=1)
+class Networks:
+    """Networks that each read their share of an arm's channels, in z-scores; deterministic.
 
-    def decode(self, latent: Tensor, steps: int) -> Tensor:
+    Args:
+        nets: Parameters of each network; all have the same shapes.
+    """
+
+    def __init__(self, nets: Sequence[Weights]) -> None:
+        self._nets, self.count = nets, len(nets)
+        self.encoder, self.decoder = self._lstm("encoder"), self._lstm("decoder")
+        self.summary, self.mu, self.expand, self.out = map(self._linear, ("summary", "mu", "expand", "out"))
+        self.logvar = self._linear("logvar") if "logvar.weight" in nets[0] else None
+
+    def encode(self, z: Array) -> tuple[Array, Array]:
+        """Posterior mean and standard deviation, [batch, net, latent], of windows [batch, time, joint, channel]."""
+        parts = z.reshape(*z.shape[:2], self.count, -1).transpose(1, 2, 0, 3)
+        hidden = np.ascontiguousarray(parts)  # [time, net, batch, channel]
+        for layer in self.encoder:
+            hidden = np.stack(list(layer(hidden)))
+        summary = np.tanh(_affine(hidden[-1], self.summary))
+        mu = _affine(summary, self.mu)
+        if self.logvar is None:
+            sigma = np.zeros_like(mu)
+        else:
+            sigma = np.exp(0.5 * np.clip(_affine(summary, self.logvar), *LOGVAR_RANGE))
+        return mu.swapaxes(0, 1), sigma.swapaxes(0, 1)
+
+    def decode(self, latent: Array, steps: int) -> Array:
         """Windows decoded from latents [batch, net, latent], [batch, time, joint, channel]."""
-        parts = [net.decode(latent[:, n], steps) for n, net in enumerate(self.nets)]
-        return torch.cat(parts, dim=2).unflatten(2, (-1, len(CHANNELS)))
+        first = np.tanh(_affine(latent.swapaxes(0, 1), self.expand))
+        hidden = np.broadcast_to(first, (steps, *first.shape))
+        for layer in self.decoder:
+            hidden = np.stack(list(layer(hidden)))
+        z = np.matmul(hidden, self.out[0]) + self.out[1]  # [time, net, batch, channel]
+        return z.transpose(2, 0, 1, 3).reshape(z.shape[2], steps, -1, len(CHANNELS))
 
-    def forward(self, z: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-        """Windows decoded from their posterior means, [batch, time, joint, channel], and the means."""
-        mu = self.encode(z)[0]
-        return self.decode(mu, steps), mu
+    def _linear(self, name: str) -> tuple[Array, Array]:
+        """Weight [net, in, out] and bias [net, 1, out]."""
+        weight = np.stack([net[f"{name}.weight"].T for net in self._nets])
+        return weight, np.stack([net[f"{name}.bias"][None] for net in self._nets])
+
+    def _lstm(self, name: str) -> "list[_Layer]":
+        layers = sum(key.startswith(f"{name}.weight_hh_l") for key in self._nets[0])
+        return [_Layer(self._nets, name, layer) for layer in range(layers)]
+
+
+class _Layer:
+    """One layer of an LSTM, for all networks.
+
+    The weights of the three gates that are logistic functions are halved, σ(x) = (1 + tanh(x / 2)) / 2, so that one
+    tanh serves all four.
+    """
+
+    def __init__(self, nets: Sequence[Weights], name: str, layer: int) -> None:
+        hidden = nets[0][f"{name}.weight_hh_l{layer}"].shape[1]
+        half = np.repeat(np.array([0.5, 0.5, 1.0, 0.5], np.float32), hidden)
+
+        def stacked(kind: str) -> Array:
+            return np.stack([(net[f"{name}.{kind}_l{layer}"].T * half) for net in nets])
+
+        self._input, self._recurrent = stacked("weight_ih"), stacked("weight_hh")  # [net, in, 4 hidden]
+        self._bias = (stacked("bias_ih") + stacked("bias_hh"))[:, None]
+        self._hidden = hidden
+
+    def __call__(self, inputs: Array) -> Iterator[Array]:
+        """Hidden states [net, batch, hidden] of each step of the inputs [time, net, batch, in]."""
+        constant = inputs.strides[0] == 0
+        driven = np.matmul(inputs[:1] if constant else inputs, self._input) + self._bias
+        size, shape = self._hidden, (*inputs.shape[1:3], self._hidden)
+        state, cell = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        for step in range(len(inputs)):
+            gates = np.matmul(state, self._recurrent)
+            gates += driven[0 if constant else step]
+            np.tanh(gates, out=gates)
+            enter, keep, new, leave = (gates[..., n * size : (n + 1) * size] for n in range(4))
+            cell = 0.5 * ((1.0 + keep) * cell + (1.0 + enter) * new)
+            state = 0.5 * (1.0 + leave) * np.tanh(cell)
+            yield state
+
+
+def _affine(x: Array, linear: tuple[Array, Array]) -> Array:
+    return np.matmul(x, linear[0]) + linear[1]
 
 
 def posterior(networks: Networks, z: Array) -> tuple[Array, Array]:
     """Mean and standard deviation of the latent of windows [batch, time, joint, channel], [batch, net, latent]."""
-
-    def of(part: Tensor) -> tuple[Tensor, ...]:
-        mu, logvar = networks.encode(part)
-        return mu, torch.exp(0.5 * logvar)
-
-    mu, sigma = _in_chunks(of, z)
+    mu, sigma = _in_chunks(networks.encode, z)
     return mu, sigma
 
 
@@ -57,11 +138,10 @@ def decode(networks: Networks, latent: Array, steps: int) -> Array:
 
 def reconstruct(networks: Networks, z: Array) -> Array:
     """Windows [batch, time, joint, channel] decoded from the means of their posteriors, float32."""
-    return _in_chunks(lambda part: networks(part, z.shape[1]), z)[0]
+    return _in_chunks(lambda part: (networks.decode(networks.encode(part)[0], z.shape[1]),), z)[0]
 
 
-def _in_chunks(function: Callable[[Tensor], tuple[Tensor, ...]], values: Array) -> list[Array]:
-    """The results of a function of a batch, computed chunk by chunk on one thread."""
-    with one_thread(), torch.inference_mode():
-        parts = [function(part) for part in torch.from_numpy(values).split(_CHUNK)]
-        return [torch.cat(result).numpy() for result in zip(*parts, strict=True)]
+def _in_chunks(function: Callable[[Array], tuple[Array, ...]], values: Array) -> list[Array]:
+    """The results of a function of a batch, computed chunk by chunk."""
+    parts = [function(values[first : first + _CHUNK]) for first in range(0, max(len(values), 1), _CHUNK)]
+    return [np.concatenate(result) for result in zip(*parts, strict=True)]

@@ -16,6 +16,8 @@ from fleet.errors import FleetError
 from fleet.files import atomic_path
 from fleet.motion import CHANNELS
 from twin.logs.recording import CONTINUOUS
+from twin.vae.inference import Weights
+from twin.vae.model import LstmVae, build
 from twin.vae.twin import Twin
 from twin.vae.window import Q
 
@@ -76,12 +78,19 @@ def export_onnx(twin: Twin, path: Path) -> Path:
     return file
 
 
+def _network(twin: Twin, weights: Weights) -> LstmVae:
+    """A network of a twin for torch."""
+    net = build(twin.config, seed=0, channels=twin.config.channels(twin.joints))
+    net.load_state_dict({name: torch.from_numpy(values) for name, values in weights.items()})
+    return net.eval().requires_grad_(False)
+
+
 class _OnnxTwin(nn.Module):
     """Windows in SI units to reconstruction, errors and latent means, as `Twin` computes them."""
 
     def __init__(self, twin: Twin) -> None:
         super().__init__()
-        self.networks, self.steps = twin.networks, twin.config.window
+        self.nets, self.steps = tuple(_network(twin, net) for net in twin.nets), twin.config.window
         turns = np.zeros((twin.joints, len(CHANNELS)))
         turns[[j for j in CONTINUOUS if j < twin.joints], Q] = 2 * np.pi
         home = np.zeros_like(turns)
@@ -94,5 +103,10 @@ class _OnnxTwin(nn.Module):
         turn, home, mean, std = (self.get_buffer(name) for name in ("turn", "home", "mean", "std"))
         away = (windows.mean(dim=1, keepdim=True) - home) / (2 * torch.pi)
         z = ((windows - turn * torch.round(away) - mean) / std).float()
-        z_hat, mu = self.networks(z, self.steps)
+        means, parts = list[Tensor](), list[Tensor]()
+        for net, part in zip(self.nets, z.flatten(2).chunk(len(self.nets), dim=2), strict=True):
+            mu = net.encode(part)[0]
+            means.append(mu)
+            parts.append(net.decode(mu, self.steps))
+        z_hat, mu = torch.cat(parts, dim=2).unflatten(2, (-1, len(CHANNELS))), torch.stack(means, dim=1)
         return z_hat.double() * std + mean, (z - z_hat).abs().mean(dim=1), mu

@@ -6,27 +6,24 @@ two cost 1.6 trainings. A shorter trial ranks them worse: of four pairs of train
 gave the same winner over five trainings of joint 2.
 """
 
-import hashlib
 import math
 from collections.abc import Callable, Sequence
 from itertools import count
 
-import msgspec
 import numpy as np
 import torch
 from torch import Tensor
 
 from fleet.errors import FleetError
 from fleet.seeding import child
+from twin.vae.config import TwinConfig
 from twin.vae.loss import active_units, collapsed, kl, negative_elbo
-from twin.vae.model import LstmVae, TwinConfig, build, one_thread
+from twin.vae.model import LstmVae, build, one_thread, weights_of
+from twin.vae.training_key import hash_records, seed_text
 from twin.vae.twin import Fit, Twin, net_names
 from twin.vae.window import Scaler, draw_windows, windows_of
 
 Array = np.ndarray
-
-RECIPE = 2
-"""Increase it when the same records, configuration and seed give other weights."""
 
 
 class CollapsedPosterior(FleetError):
@@ -35,26 +32,6 @@ class CollapsedPosterior(FleetError):
 
 class Diverged(FleetError):
     """No training of a network ended with finite weights."""
-
-
-def hash_records(records: Sequence[Array]) -> str:
-    """Hash of the training data."""
-    digest = hashlib.sha256()
-    for record in records:
-        digest.update(f"{record.dtype}{record.shape}".encode())
-        digest.update(np.ascontiguousarray(record).tobytes())
-    return digest.hexdigest()[:32]
-
-
-def training_key(records: Sequence[Array], config: TwinConfig, seed: np.random.SeedSequence) -> str:
-    """Cache key of a training: equal keys mean equal weights."""
-    parts = [str(RECIPE), hash_records(records), msgspec.json.encode(config).decode(), seed_text(seed)]
-    return hashlib.sha256("|".join(parts).encode()).hexdigest()[:32]
-
-
-def seed_text(seed: np.random.SeedSequence) -> str:
-    """A seed as text, `entropy/spawn.key`."""
-    return f"{seed.entropy}/{'.'.join(map(str, seed.spawn_key))}"
 
 
 def train(
@@ -113,7 +90,7 @@ def train(
                     "active latent unit(s). Lower beta, train longer (epochs, max_windows), or set allow_collapse to "
                     "keep it as a baseline."
                 )
-            nets.append(net)
+            nets.append(weights_of(net))
             fits.append(fit)
     data = hash_records(records) if data_hash is None else data_hash
     return Twin(config, scaler, nets, arm=arm, data_hash=data, seed=seed_text(seed), fits=tuple(fits))

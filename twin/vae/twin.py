@@ -2,19 +2,18 @@
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, fields, replace
 from functools import cached_property
 
 import msgspec
 import numpy as np
-import torch
 
 from fleet.difficulty import Difficulty, heat_weights
 from fleet.motion import CHANNELS, Plan
 from twin.plan_cache import PlanCache
 from twin.vae import inference
+from twin.vae.config import TwinConfig
 from twin.vae.measures import PARTS, TAU, Calibration, Features, Measures, measures_of
-from twin.vae.model import LstmVae, TwinConfig
 from twin.vae.window import PHASES, Scaler, check_jobs, cut_phases
 
 Array = np.ndarray
@@ -51,8 +50,8 @@ class Twin:
 
     config: TwinConfig
     scaler: Scaler
-    nets: Sequence[LstmVae]
-    """The networks, one per joint or one for the arm."""
+    nets: Sequence[inference.Weights]
+    """Weights of the networks, one per joint or one for the arm."""
     _: KW_ONLY
     arm: str
     data_hash: str
@@ -76,6 +75,9 @@ class Twin:
             joints = self.calibration.reference.packed.shape[1]
             raise ValueError(f"The calibration is for {joints} joints, the twin has {self.joints}.")
 
+    def __getstate__(self) -> dict[str, object]:
+        return {each.name: getattr(self, each.name) for each in fields(self)}  # without cached properties
+
     @property
     def joints(self) -> int:
         """Number of joints."""
@@ -88,7 +90,7 @@ class Twin:
 
     @cached_property
     def networks(self) -> inference.Networks:
-        """The networks as one module."""
+        """The networks as one."""
         return inference.Networks(self.nets)
 
     @property
@@ -103,19 +105,19 @@ class Twin:
         for values in vars(self.scaler).values():
             digest.update(np.ascontiguousarray(values).tobytes())
         for name, tensor in sorted(self.tensors().items()):
-            digest.update(f"{name}{tuple(tensor.shape)}".encode())
-            digest.update(tensor.numpy().tobytes())
+            digest.update(f"{name}{tensor.shape}".encode())
+            digest.update(tensor.tobytes())
         if self.calibration is not None:
             digest.update(np.ascontiguousarray(self.calibration.reference.packed, dtype=float).tobytes())
         return digest.hexdigest()[:16]
 
-    def tensors(self) -> dict[str, torch.Tensor]:
+    def tensors(self) -> dict[str, Array]:
         """All weights by name, such as `joint_1.encoder.weight_ih_l0` or `arm.encoder.weight_ih_l0`."""
         names = net_names(self.config, self.joints)
         return {
-            f"{net_name}.{name}": tensor.contiguous()
+            f"{net_name}.{name}": np.ascontiguousarray(tensor)
             for net_name, net in zip(names, self.nets, strict=True)
-            for name, tensor in net.state_dict().items()
+            for name, tensor in net.items()
         }
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty:

@@ -11,7 +11,7 @@ import numpy as np
 
 from fleet.motion import CHANNELS, RATE_HZ, Plan, distinct
 from twin.logs.recording import CONTINUOUS
-from twin.vae.model import TwinConfig
+from twin.vae.config import TwinConfig
 
 Array = np.ndarray
 

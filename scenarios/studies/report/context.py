@@ -16,7 +16,7 @@ from scenarios.studies.epochs import EPOCHS
 from scenarios.studies.ranking import CARRIER, Jobs
 from scenarios.studies.setup import Bench, Study, make_study
 from scenarios.studies.transfer import LABELS
-from twin.vae.model import TwinConfig
+from twin.vae.config import TwinConfig
 from twin.vae.twin import Twin
 from twin.vae.window import cut_jobs
 

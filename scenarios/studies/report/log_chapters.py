@@ -33,7 +33,7 @@ from scenarios.studies.report.paper_chapters import (
     reconstruction_section,
 )
 from twin.logs.recording import Recording
-from twin.vae.model import TwinConfig
+from twin.vae.config import TwinConfig
 
 Array = np.ndarray
 
