@@ -13,7 +13,7 @@ PINNED := $(sort $(basename $(notdir $(wildcard constraints/*.txt))))
 ADAPTERS := $(filter-out bench,$(PINNED))
 ADAPTER_TESTS := $(ADAPTERS:%=test-adapter-%)
 
-.PHONY: demo test test-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos simulate soak \
+.PHONY: demo test test-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos mesh simulate soak \
 	fuzz clean install
 
 demo: $(STAMP)
@@ -52,6 +52,10 @@ lint: $(STAMP)
 
 chaos: $(STAMP)
 	@$(BIN)/python benchmarks/chaos
+
+# 256 arms behind two linked routers: kill either, cut the link.
+mesh: $(STAMP)
+	@$(BIN)/python benchmarks/chaos/mesh.py --speed 20
 
 # Whole fleets in one process under faults, seed after seed until one breaks a rule or Ctrl-C. SEEDS=n or HOURS=n
 # bounds it, FIRST=n is the first seed, SEED=n prints the trace of one, MUTATIONS=all breaks rules on purpose.

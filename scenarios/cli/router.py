@@ -25,6 +25,10 @@ def router_command(
     name: Annotated[
         str, typer.Option(help="--tls: participant whose certificate the router presents.", callback=check_name)
     ] = "router",
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(help="--tls: another router of the fleet, tls/HOST:PORT, to link with; may be given repeatedly."),
+    ] = None,
     scenario: Annotated[
         str | None, typer.Option(help="--tls: refuse to start unless every arm of this scenario has a certificate.")
     ] = None,
@@ -40,7 +44,8 @@ def router_command(
     if scenario is not None:
         check_roster(tls, scenario)
     limits = Limits(state_hz=state_hz or None)
-    with until_stopped() as stop, Router(port, host=host, tls=Tls(tls, name) if tls else None, limits=limits) as router:
+    router = Router(port, host=host, tls=Tls(tls, name) if tls else None, limits=limits, connect=connect or ())
+    with until_stopped() as stop, router:
         echo(router.endpoint)  # flushed: a supervisor reads this line
         stop.wait()
         stop.leave("The router was interrupted; its clients keep trying to reconnect.")

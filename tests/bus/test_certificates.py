@@ -49,7 +49,10 @@ def test_openssl_finds_each_certificate_good_for_its_own_end_alone(folder, file)
     own, other = ("sslserver", "sslclient") if file == "router" else ("sslclient", "sslserver")
     verify = ("verify", "-x509_strict", "-CAfile", folder / "ca.pem", "-purpose")
     assert openssl(*verify, own, path) == f"{path}: OK\n"
-    assert "unsuitable certificate purpose" in openssl(*verify, other, path)
+    if file == "router":  # it opens links to other routers
+        assert openssl(*verify, other, path) == f"{path}: OK\n"
+    else:
+        assert "unsuitable certificate purpose" in openssl(*verify, other, path)
     text = text_of(path)
     role = "arm" if file.startswith("arm") else file
     assert f"Subject: CN={role}:{file},O=thermofleet" in text

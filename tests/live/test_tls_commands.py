@@ -39,7 +39,7 @@ from fleet.errors import BusError
 from scenarios.cli.main import app
 
 PATIENCE_S = 30.0
-ARM = "arm 1/b"
+ARM = "arm 1+b"
 EXTRA = Participant("gateway", "submitter")
 COMMANDS = {
     "watch": ["watch", "--json"],

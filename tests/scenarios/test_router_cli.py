@@ -22,7 +22,7 @@ from fleet.bus.security.certificates import issue
 from fleet.bus.security.tls import Tls, identified
 from fleet.live.arm.journal_records import ArmRecord, Closed
 from fleet.live.journal import Journal
-from scenarios.cli.live.up import free_port, parts_of
+from scenarios.cli.live.up import chosen_arms, free_port, parts_of
 from scenarios.cli.main import main
 
 ROOT = Path(__file__).parents[2]
@@ -161,6 +161,36 @@ def test_up_gives_every_process_its_own_certificate(folder):
     for tls in who:
         assert tls[1] is not None
         tls[1].check(serves=False)
+
+
+def test_a_part_of_a_fleet_connects_to_a_router_elsewhere(folder):
+    options = {"port": 7447, "fleet": "quickstart", "folder": Path("run"), "speed": 60.0, "seed": 0, "jobs": "none"}
+    options |= {"policy": "matching", "difficulty": "blind", "tls": folder}
+    names = chosen_arms("arm_3, arm_1", ("arm_0", "arm_1", "arm_2", "arm_3"))
+    assert names == ("arm_1", "arm_3")
+    _, arms, *_ = parts_of("quickstart", names, at="tls/cell-1:7447", **options)
+    ends = [identified(part.argv[part.argv.index("--endpoint") + 1]) for part in arms]
+    assert ends == [("tls/cell-1:7447", Tls(folder, name)) for name in names]
+    router, *_ = parts_of("quickstart", names, host="0.0.0.0", **options)
+    assert router.argv[router.argv.index("--host") + 1] == "0.0.0.0"
+    assert router.ready == "tls/127.0.0.1:7447"
+    assert parts_of("quickstart", names, host="fd00::1", **options)[0].ready == "tls/[fd00::1]:7447"
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("--arms", "arm_7"), "the scenario has no arm 'arm_7'"),
+        (("--router", "tls/cell-1:7447"), "name the arms to start here: --arms"),
+        (("--arms", "arm_0", "--router", "tls/cell-1:7447"), "needs a certificate"),
+        (("--arms", "arm_0", "--router", "tcp/10.0.0.1:7447"), "is not on loopback"),
+        (("--host", "0.0.0.0"), "needs --tls"),
+    ],
+)
+def test_wrong_options_for_several_machines_are_one_sentence(capsys, tmp_path, words, complaint):
+    code, _, err = call(capsys, "up", "quickstart", "--out", tmp_path / "run", *words)
+    assert code == 2
+    assert complaint in " ".join(err.split())
 
 
 @pytest.mark.parametrize(

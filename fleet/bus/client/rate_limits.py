@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fleet.bus.protocol import keys
+from fleet.bus.security.access_control import Roster
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -13,8 +14,8 @@ class Limits:
     message_bytes: int = 65_536
     """Largest payload with its attachment, of a publication, a request or a reply."""
     state_hz: float | None = None
-    """Telemetry messages a second, real time, of each session; None for any number. A steady stream needs a limit of
-    twice its rate, as Zenoh limits the gap between two messages, which varies."""
+    """Telemetry messages a second, real time, of each session, or with TLS of each arm; None for any number. A steady
+    stream needs a limit of twice its rate, as Zenoh limits the gap between two messages, which varies."""
 
     def __post_init__(self) -> None:
         if self.message_bytes < 1:
@@ -22,8 +23,13 @@ class Limits:
         if self.state_hz is not None and not 0 < self.state_hz < 1e6:
             raise ValueError(f"Limits.state_hz must be > 0, or None (got {self.state_hz}).")
 
-    def settings(self) -> dict[str, Any]:
-        """Settings for Zenoh's configuration."""
+    def settings(self, roster: Roster | None = None) -> dict[str, Any]:
+        """Settings for Zenoh's configuration.
+
+        Args:
+            roster: Participants, if each is held to its own keys. The rate is then limited by key: one session, that of
+                a linked router, may carry the telemetry of many arms.
+        """
         size = {
             "flows": ["ingress"],
             "messages": ["put", "delete", "query", "reply"],
@@ -32,10 +38,15 @@ class Limits:
         }
         if self.state_hz is None:
             return {"low_pass_filter": [size]}
+        limited = (
+            [keys.STATES]
+            if roster is None
+            else [keys.of_arm(roster.fleet, arm, "state") for arm in roster.of_role("arm")]
+        )
         rate = {
             "flows": ["ingress"],
             "messages": ["put", "delete"],
-            "rules": [{"key_expr": keys.STATES, "freq": self.state_hz}],
+            "rules": [{"key_expr": key, "freq": self.state_hz} for key in limited],
         }
         return {"low_pass_filter": [size], "downsampling": [rate]}
 

@@ -8,7 +8,7 @@ import ipaddress
 import json
 import logging
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
 import zenoh
@@ -41,6 +41,7 @@ _ACCEPTING: Mapping[str, Any] = {
     # A closing session waits this long for a connection to a stopped router.
     "open_timeout": 3000,
 }
+_RETRY: Mapping[str, Any] = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
 _SENDING: Mapping[str, Any] = {
     "lease": round(1000 * SESSION_LEASE_S),
     "queue": {
@@ -100,6 +101,12 @@ def reachable(endpoint: str, tls: Tls | None = None) -> str:
     return endpoint
 
 
+def reached_at(host: str) -> str:
+    """Address, as in an endpoint, at which this machine reaches a router that listens on `host`."""
+    bare = host.strip("[]")
+    return _ANY_ADDRESS.get(bare, f"[{bare}]" if ":" in bare else bare)
+
+
 def connect(endpoint: str, timeout_s: float, stopped: Callable[[], bool] | None) -> zenoh.Session:
     """A client session on the router at `endpoint`: once there is one, if `stopped` is given, instead of `timeout_s`.
 
@@ -135,7 +142,7 @@ def open_client(endpoint: str, *, timeout_s: float, tls: Tls | None = None) -> z
     connect = {
         "endpoints": [reachable(endpoint, tls)],
         "timeout_ms": max(1, round(1000 * timeout_s)),
-        "retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
+        "retry": _RETRY,
     }
     link = {"tx": _SENDING}
     if tls is not None:
@@ -152,11 +159,18 @@ def open_client(endpoint: str, *, timeout_s: float, tls: Tls | None = None) -> z
 class Router:
     """A router in this process, for the sessions of one fleet.
 
-    `with Router() as router:` listens on a free port of 127.0.0.1 until the end of the block.
+    `with Router() as router:` listens on a free port of 127.0.0.1 until the end of the block. Linked routers (Zenoh's
+    router mode) forward messages between their sessions; each enforces the access control for its own ones.
     """
 
     def __init__(
-        self, port: int = 0, *, host: str = "127.0.0.1", tls: Tls | None = None, limits: Limits | None = None
+        self,
+        port: int = 0,
+        *,
+        host: str = "127.0.0.1",
+        tls: Tls | None = None,
+        limits: Limits | None = None,
+        connect: Sequence[str] = (),
     ) -> None:
         """Prepare a router.
 
@@ -164,13 +178,15 @@ class Router:
             port: TCP port; 0 lets the system choose a free one.
             host: Address to listen on; without TLS one of loopback.
             tls: The router's certificate; the roster of its folder sets the access control. None for plain TCP.
+            connect: Endpoints of other routers of the fleet, `tls/HOST:PORT`. A link that is not there, or is lost, is
+                tried again every second at most.
 
         Raises:
-            BusError: plain TCP beyond loopback.
+            BusError: plain TCP beyond loopback, a link without TLS, or no endpoint of TLS.
         """
         if not 0 <= port <= 65535:
             raise ValueError(f"A port is 0..65535 (got {port}).")
-        self._host = f"[{host}]" if ":" in host and not host.startswith("[") else host
+        self._host = f"[{host.strip('[]')}]" if ":" in host else host
         self._port = port
         self._tls = tls
         self._limits = limits or Limits()
@@ -179,6 +195,12 @@ class Router:
             loopback(self._listen)
         elif _ENDPOINT.fullmatch(self._listen) is None:
             raise BusError(f"'{host}' is no address to listen on, as 127.0.0.1 or 0.0.0.0.")
+        if connect and tls is None:
+            raise BusError(
+                f"A link to another router ({connect[0]}) needs TLS: routers recognise each other by certificates. "
+                "Start both with --tls."
+            )
+        self._connect = [reachable(endpoint, tls) for endpoint in connect]
         self._session: zenoh.Session | None = None
         self._endpoint: str | None = None
 
@@ -227,6 +249,10 @@ class Router:
             return self
         raise problem
 
+    def linked(self) -> int:
+        """Number of other routers that it has a link to now."""
+        return 0 if self._session is None else len(self._session.info.routers_zid())
+
     def close(self) -> None:
         """Stop listening and close all connections; may be called twice.
 
@@ -251,15 +277,21 @@ class Router:
         own = {
             "mode": "router",
             "listen": {"endpoints": [self._listen]},
+            # Without end and without failure: the other router may start later.
+            "connect": {"endpoints": self._connect, "timeout_ms": -1, "exit_on_failure": False, "retry": _RETRY},
             # The admin space holds the port that the system chose.
             "adminspace": {"enabled": True, "permissions": {"read": True, "write": False}},
             **self._limits.settings(),
         }
         link = {"tx": _SENDING, "rx": {"max_message_size": self._limits.assembled_bytes}}
         if self._tls is not None:
-            self._tls.check(serves=True)
+            self._tls.check(serves=True, links=bool(self._connect))
             link["tls"] = self._tls.link(serves=True)
-            own["access_control"] = access_control(read_roster(self._tls.folder))
+            if self._connect:
+                link["tls"] |= self._tls.link(serves=False)
+            roster = read_roster(self._tls.folder)
+            own["access_control"] = access_control(roster, self._tls.name)
+            own |= self._limits.settings(roster)
         return _config(own, link)
 
     def _where(self, session: zenoh.Session) -> str:
@@ -270,8 +302,7 @@ class Router:
             locators = json.loads(reply.ok.payload.to_bytes())["locators"]
             ports = {locator.rsplit(":", 1)[1] for locator in locators}
             if len(ports) == 1:
-                host = _ANY_ADDRESS.get(self._host.strip("[]"), self._host)
-                return f"{self._listen[:3]}/{host}:{ports.pop()}"
+                return f"{self._listen[:3]}/{reached_at(self._host)}:{ports.pop()}"
         raise BusError("The router opened, but its port is unknown.")
 
 

@@ -175,8 +175,11 @@ def rights_by_role(fleet: str, name: str) -> dict[Role, Rights]:
     return {role: rights(fleet, Participant(name, role)) for role in get_args(Role)}
 
 
-def access_control(roster: Roster) -> dict[str, Any]:
+def access_control(roster: Roster, router: str = "router") -> dict[str, Any]:
     """The rules of a roster for Zenoh's configuration; everything that they do not allow is denied.
+
+    Args:
+        router: Name of the router that enforces them; other routers of the roster may link with it.
 
     ingress is what a participant sends to the router, egress what the router sends to it. A rule allows a message when
     a key expression of the rule includes the whole key expression of the message: `arm/*/state` is in no arm's rule.
@@ -190,6 +193,13 @@ def access_control(roster: Roster) -> dict[str, Any]:
     ]
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
+    others = [one.common_name for one in roster.participants if one.role == "router" and one.name != router]
+    if others:  # what another router forwards has passed the rules of that router
+        messages = sorted({*_RECEIVE, *_SUBSCRIBE})
+        links = [_rule(f"link {flow}", flow, messages, everything) for flow in ("ingress", "egress")]
+        rules += links
+        policies.append({"subjects": ["routers"], "rules": [rule["id"] for rule in links]})
+        subjects.append({"id": "routers", "cert_common_names": others})
     for participant in roster.participants:
         if participant.role == "router":
             continue

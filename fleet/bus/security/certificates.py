@@ -1,7 +1,8 @@
 """Certificates of a fleet: its authority, and one certificate for each participant.
 
-ECDSA over P-256, X.509 v3 (RFC 5280). The common name identifies the participant. The router's certificate is valid
-only for listening and every other one only for connecting, so no participant can act as the router.
+ECDSA over P-256, X.509 v3 (RFC 5280). The common name identifies the participant. The certificate of a router is
+valid for listening and for links to other routers, every other one only for connecting, so no participant can act as
+the router.
 """
 
 import ipaddress
@@ -28,6 +29,7 @@ LONGEST_DAYS = 3650
 """Lifetime of a certificate authority; every certificate that it signs expires by then."""
 SKEW = timedelta(minutes=5)
 """Certificates are valid from this long before their issue, as the clocks of machines differ."""
+_CONNECT = ExtendedKeyUsageOID.CLIENT_AUTH
 HERE = ("localhost", "127.0.0.1", "::1")
 _HOST_NAME = re.compile(r"(?=.{1,253}$)[A-Za-z0-9_]([A-Za-z0-9_.-]*[A-Za-z0-9_])?", re.ASCII)
 _OWNER_ONLY, _ALL_READ = 0o600, 0o644
@@ -72,13 +74,13 @@ def issue(
     key = ec.generate_private_key(ec.SECP256R1())
     expires = min(now + timedelta(days=days), authority.not_valid_after_utc)
     is_router = participant.role == "router"
-    purpose = ExtendedKeyUsageOID.SERVER_AUTH if is_router else ExtendedKeyUsageOID.CLIENT_AUTH
+    purposes = [_CONNECT] if not is_router else [ExtendedKeyUsageOID.SERVER_AUTH, _CONNECT]
     authority_key = authority.extensions.get_extension_for_class(x509.SubjectKeyIdentifier).value
     certificate = (
         _builder(_name(participant.common_name), authority.subject, key.public_key(), now - SKEW, expires)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(_usage("digital_signature"), critical=True)
-        .add_extension(x509.ExtendedKeyUsage([purpose]), critical=False)
+        .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_subject_key_identifier(authority_key), critical=False)
     )
     if is_router:
@@ -144,6 +146,11 @@ def common_name(certificate: x509.Certificate) -> str:
     """Common name of a certificate, as `arm:arm_0`; "" for none."""
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(names[0].value) if names else ""
+
+
+def may_connect(certificate: x509.Certificate) -> bool:
+    """Whether a certificate is valid for the end of a connection that opens it."""
+    return _CONNECT in certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
 
 
 def format_time(moment: datetime) -> str:

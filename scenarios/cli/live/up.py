@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from fleet.bus.security.tls import Tls
-from fleet.errors import FleetError
+from fleet.errors import FleetError, nearest
 from fleet.live.supervisor import Part, Supervisor
 from scenarios.cli.live.journals import folder_of, refuse_other_way
 from scenarios.cli.live.options import (
@@ -47,6 +47,8 @@ def parts_of(
     seed: int,
     tls: Path | None = None,
     new_epoch: bool = False,
+    host: str = "",
+    at: str = "",
 ) -> tuple[Part, list[Part], Part, Part | None]:
     """Router, arms, recorder and auctioneer of a fleet, as `Supervisor` starts them.
 
@@ -55,11 +57,16 @@ def parts_of(
         names: Names of the arms.
         folder: Folder of journals, recording and logs.
         tls: Folder with a certificate of every participant; None for plain TCP.
+        host: Address on which the router listens; "" for loopback only.
+        at: Endpoint of the router, if it is not the one returned.
 
     Returns:
         The auctioneer is None with a policy of scope `arm`.
     """
-    address = f"{'tls' if tls else 'tcp'}/127.0.0.1:{port}"
+    from fleet.bus.client.router import reached_at
+
+    own = f"{'tls' if tls else 'tcp'}/{reached_at(host or '127.0.0.1')}:{port}"
+    address = at or own
 
     def part(name: str, command: str, *options: str, user: str, rank: int, essential: bool = False) -> Part:
         endpoint = address if tls is None else Tls(tls, user).endpoint(address)
@@ -71,7 +78,8 @@ def parts_of(
     without_auctioneer, ends = scope_of(policy) == "arm", jobs == "scenario"
     options = (*shared, "--difficulty", difficulty, "--risk", risk, *(allocation if without_auctioneer else ()))
     secure = () if tls is None else ("--tls", str(tls), "--scenario", scenario)
-    router = Part(name="router", argv=(*PROGRAM, "router", "--port", str(port), *secure), ready=address)
+    listen = ("--port", str(port), *(("--host", host) if host else ()))
+    router = Part(name="router", argv=(*PROGRAM, "router", *listen, *secure), ready=own)
     arms = [
         part(f"arm-{name}", "arm", scenario, name, *options, user=name, rank=2, essential=without_auctioneer and ends)
         for name in names
@@ -107,11 +115,24 @@ def up_command(
         typer.Option(help="Folder that thermofleet keys wrote for this scenario: mutual TLS and access control."),
     ] = None,
     new_epoch: NewEpochOption = False,
+    arms: Annotated[
+        str, typer.Option(help="Start only these arms here, comma-separated; the others run on other machines.")
+    ] = "",
+    router: Annotated[
+        str,
+        typer.Option(
+            help="--arms: endpoint of a running router, as tls/HOST:PORT. Only the arms are started; router, recorder "
+            "and auctioneer run elsewhere."
+        ),
+    ] = "",
+    host: Annotated[
+        str, typer.Option(help="--tls: address on which the router listens, as 0.0.0.0. Default: loopback only.")
+    ] = "",
 ) -> None:
     """Start a whole fleet, each participant as its own process, and keep it running until its jobs are done.
 
     A process that exits is restarted with back-off; Ctrl-C stops all in order. The same command with the same --out
-    continues from the journals.
+    continues from the journals. With --arms it starts a part of the fleet.
     """
     from scenarios.prepare.fleet import RiskName, prepare
 
@@ -119,16 +140,17 @@ def up_command(
     fleet, folder = folder_of(out, fleet, chosen)
     if tls is not None and fleet != chosen.name:
         raise FleetError(f"The keys of --tls are for the fleet of their scenario; leave --fleet out (got '{fleet}').")
-    names = tuple(arm.name for arm in chosen.arms)
+    names = chosen_arms(arms, tuple(arm.name for arm in chosen.arms))
+    _check_place(arms, router, host, names[0], tls)
     if tls is not None:
         check_roster(tls, scenario)
     refuse_other_way(folder / "journals", names, alone=scope_of(policy) == "arm")
     with progress_bar() as progress:  # once, so that no arm has to plan or train by itself
         prepare(chosen, difficulty=difficulty, risk=choose("risk", risk, RiskName), progress=progress)
-    router, arms, record, auction = parts_of(
+    own_router, parts, record, auction = parts_of(
         scenario,
         names,
-        port=port or free_port(PORT if port is None else 0),
+        port=PORT if router else port or free_port(PORT if port is None else 0),
         fleet=fleet,
         folder=folder,
         speed=speed,
@@ -139,20 +161,24 @@ def up_command(
         seed=seed,
         tls=tls,
         new_epoch=new_epoch,
+        host=host,
+        at=router,
     )
-    count = f"{len(arms)} arms, which allocate the jobs" if auction is None else f"{len(arms)} arms and the auctioneer"
-    say(f"Starting the router, the recorder, {count} …", err_console)
+    at, count = router or own_router.ready, f"{len(parts)} arm{'s' * (len(parts) > 1)}"
+    central = f"{count}, which allocate the jobs" if auction is None else f"{count} and the auctioneer"
+    say(f"Starting {count if router else f'the router, the recorder, {central}'} …", err_console)
     with until_stopped() as stop, Supervisor(folder / "logs") as supervisor:
-        supervisor.start(router, ready_s=START_S)
+        if not router:
+            supervisor.start(own_router, ready_s=START_S)
         # The auctioneer starts last: its clock runs from its start, and the arms must be ready by then.
-        for together in ((record, *arms), () if auction is None else (auction,)):
+        for together in (parts,) if router else ((record, *parts), () if auction is None else (auction,)):
             for part in together:
                 supervisor.start(part)
             for part in together:
                 supervisor.await_ready(part.name, START_S, stop.is_set)
-        watch = Tls(tls, "monitor").endpoint(router.ready) if tls else router.ready
+        watch = Tls(tls, "monitor").endpoint(at) if tls else at
         say(
-            f"{fleet} is up: {len(arms)} arms at {router.ready}, {speed:g} times as fast as real time; logs in "
+            f"{fleet} is up: {count} at {at}, {speed:g} times as fast as real time; logs in "
             f"{supervisor.folder}. To watch it: thermofleet watch --endpoint {watch}",
             out_console,
         )
@@ -164,8 +190,39 @@ def up_command(
         restarts = ", ".join(f"{name} {count} time(s)" for name, count in supervisor.restarts().items() if count)
     if restarts:
         say(f"Restarted: {restarts}", out_console)
-    say(f"Recorded in {folder / 'recording'}.", out_console)
+    if not router:
+        say(f"Recorded in {folder / 'recording'}.", out_console)
     stop.leave(f"The fleet was stopped; journals, recording and logs are in {folder}; the same command continues.")
+
+
+def chosen_arms(text: str, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Arms of a comma-separated list, in the order of the scenario; all if it is empty.
+
+    Raises:
+        FleetError: the scenario has no such arm.
+    """
+    wanted = [name.strip() for name in text.split(",")] if text else list(names)
+    if unknown := [name for name in wanted if name not in names]:
+        raise FleetError(f"--arms: the scenario has no arm '{unknown[0]}'{nearest(unknown[0], names)}")
+    return tuple(name for name in names if name in wanted)
+
+
+def _check_place(arms: str, router: str, host: str, name: str, tls: Path | None) -> None:
+    """Check the options for a fleet on several machines.
+
+    Raises:
+        FleetError: two options contradict each other, or the endpoint of the router may not be used.
+    """
+    from fleet.bus.client.router import reachable
+
+    if router and not arms:
+        raise FleetError("--router is for a part of a fleet; name the arms to start here: --arms NAME,NAME.")
+    if router and host:
+        raise FleetError("--host is for a router that is started here; with --router leave it out.")
+    if router:
+        reachable(router, None if tls is None else Tls(tls, name))
+    if host and tls is None:
+        raise FleetError(f"--host {host} needs --tls: plain TCP does not authenticate, so it is limited to loopback.")
 
 
 def free_port(wanted: int = 0) -> int:

@@ -1,0 +1,197 @@
+"""Many arms behind two linked routers: kill either router, cut the link, count lost jobs and jobs done twice.
+
+    python benchmarks/chaos/mesh.py [--arms 256] [--jobs 512] [--speed 120] [--keep DIR] [--no-namespaces]
+
+Host a has a router, the auctioneer and half of the arms, host b a router that is linked to the first, and the other
+arms. As root, host b is a network namespace and the link a virtual cable; otherwise the link passes a proxy. During the
+work router b is killed, the link is cut for 12 s (longer than a lease) and healed, and router a is killed; the
+supervisor starts routers again. TLS, access control and journals are on. A job that was done twice is found in the
+journals of the arms. Exit code 1: a job was lost or done twice, or a process exited that was not killed.
+"""
+
+import argparse
+import logging
+import math
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+from fleet_under_test import Fleet, Outcome
+from mesh_parts import FLEET, SCENARIO, job_of, names_of
+from namespaces import Namespaces, unavailable_reason
+from partition import CUT_S, Proxy
+
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.router import open_client
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import SETTLED, JobStatus, Status, StatusRequest, Submission, SubmissionReply
+from fleet.bus.security.access_control import Participant, of_arms
+from fleet.bus.security.certificates import HERE
+from fleet.bus.security.keyring import make
+from fleet.bus.security.tls import Tls
+from fleet.live.supervisor import Backoff, Part, Supervisor
+from scenarios.cli.live.up import PROGRAM, free_port
+from scenarios.load import load
+from scenarios.prepare.fleet import prepare
+
+PARTS = Path(__file__).with_name("mesh_parts.py")
+START_S, BACK_S, LATE_REPORTS_S, AT_ONCE = 300.0, 120.0, 20.0, 64
+FAR = "router_b"
+
+
+def mesh(folder: Path, *, arms: int, jobs: int, speed: float, namespaces: bool, settle_s: float = 900.0) -> Outcome:
+    """Run the campaign once.
+
+    Raises:
+        RuntimeError: the fleet did not start, or did not accept the jobs.
+    """
+    names, port_a, port_b = names_of(arms), free_port(), free_port()
+    with ExitStack() as stack:
+        cable = stack.enter_context(Namespaces(["b"], port_a) if namespaces else Proxy(port_a))
+        hosts = tuple(cable.hosts.values()) if isinstance(cable, Namespaces) else ()
+        place, at_a, at_b = folder / "keys", f"tls/127.0.0.1:{port_a}", f"tls/127.0.0.1:{port_b}"
+        make(place, of_arms(FLEET, names, [Participant(FAR, "router")]), days=30, hosts=(*HERE, *hosts))
+        beyond = ("--host", "0.0.0.0") if hosts else ()
+        router = (*PROGRAM, "router", "--tls", str(place))
+        near = Part(name="router", argv=(*router, "--port", str(port_a), *beyond), ready=at_a)
+        link = ("--port", str(port_b), "--name", FAR, "--connect", at_a)
+        far = cable.through(Part(name=FAR, argv=(*router, *link), ready=at_b), "b")
+
+        def part(name: str, what: str, address: str, rank: int) -> Part:
+            words = (what, address, str(place), str(folder / "journals"), str(arms), f"{speed:g}")
+            return Part(name=name, argv=(sys.executable, str(PARTS), *words), rank=rank)
+
+        halves = [",".join(str(number) for number in range(first, arms, 2)) for first in (0, 1)]
+        others = [
+            part("auction", "auction", at_a, 3),
+            part("arms-a", halves[0], at_a, 2),
+            cable.through(part("arms-b", halves[1], at_b, 2), "b"),
+        ]
+        supervisor = stack.enter_context(Supervisor(folder / "logs", backoff=Backoff(first_s=0.2)))
+        supervisor.start(near, ready_s=START_S)
+        supervisor.start(far, ready_s=START_S)
+        for one in others:
+            supervisor.start(one)
+        for one in others:
+            supervisor.await_ready(one.name, START_S)
+        endpoint = Tls(place, "submitter").endpoint(at_a)
+        client = stack.enter_context(BusClient(endpoint, FLEET))
+        session = stack.enter_context(open_client(endpoint, timeout_s=5.0))
+        fleet = Fleet(supervisor, client, at_a, session, folder, names, keys=place)
+        fleet.listen()
+        if math.isinf(fleet.wait_until(lambda: _all_present(fleet), START_S)):
+            raise RuntimeError(f"Only {len(fleet.states)} of {arms} arms are on the bus.")
+        accepted = tuple(job_of(number, arms) for number in range(jobs))
+        _submit(client, accepted)
+        wanted, began_s = [job.name for job in accepted], time.monotonic()
+        fleet.wait_until(lambda: _count(fleet, wanted, ("finished",)) >= max(1, jobs // 8), settle_s)
+        for what, inject in (("router b killed", _kill_far), ("link cut", _cut), ("router a killed", _kill_near)):
+            done, before_s = _count(fleet, wanted, SETTLED), time.monotonic()
+            inject(fleet, cable)
+            back_s = fleet.wait_until(lambda: _all_present(fleet), BACK_S)
+            took_s = time.monotonic() - before_s
+            fleet.note(
+                f"{what} after {done} jobs: all arms present {took_s if math.isfinite(back_s) else back_s:.1f} s later"
+            )
+        settled_s = fleet.wait_until(lambda: _count(fleet, wanted, SETTLED) == jobs, settle_s)
+        fleet.wait_until(lambda: _count(fleet, wanted, ("finished",)) == jobs, LATE_REPORTS_S)
+        outcome = _outcome(fleet, wanted)
+        outcome.by, outcome.took_s = cable.by, time.monotonic() - began_s if math.isfinite(settled_s) else math.inf
+    return outcome
+
+
+def _submit(client: BusClient, jobs: Sequence) -> None:
+    for first in range(0, len(jobs), AT_ONCE):
+        some = tuple(jobs[first : first + AT_ONCE])
+        replies = client.query_and_wait(
+            keys.of_jobs(FLEET, "submit"), Submission(some), SubmissionReply, timeout_s=20.0
+        )
+        admitted = [job for reply in replies.messages.values() for job in reply.jobs if job.accepted]
+        if len(admitted) != len(some):
+            raise RuntimeError(f"Only {len(admitted)} of {len(some)} jobs were accepted: {replies.refused}")
+
+
+def _kill_far(fleet: Fleet, _: Proxy | Namespaces) -> None:
+    fleet.send_signal(FAR)
+    fleet.wait_until(lambda: any(map(fleet.is_absent, fleet.arms[1::2])), 10.0)
+
+
+def _cut(fleet: Fleet, cable: Proxy | Namespaces) -> None:
+    cable.cut()
+    fleet.wait_until(lambda: False, CUT_S)
+    if not all(map(fleet.is_absent, fleet.arms[1::2])):
+        fleet.violations.append("arms behind the cut link seemed present")
+    cable.heal()
+
+
+def _kill_near(fleet: Fleet, _: Proxy | Namespaces) -> None:
+    fleet.send_signal("router")
+    fleet.wait_until(lambda: any(map(fleet.is_absent, fleet.arms)), 10.0)
+
+
+def _all_present(fleet: Fleet) -> bool:
+    fleet.client.serve(time.monotonic() + 0.2)
+    return len(fleet.states) == len(fleet.arms) and not any(map(fleet.is_absent, fleet.arms))
+
+
+def _statuses(fleet: Fleet, wanted: Sequence[str]) -> dict[str, JobStatus]:
+    statuses: dict[str, JobStatus] = {}
+    for first in range(0, len(wanted), AT_ONCE):
+        request = StatusRequest(tuple(wanted[first : first + AT_ONCE]))
+        replies = fleet.client.query_and_wait(keys.of_jobs(FLEET, "status"), request, Status, timeout_s=5.0)
+        statuses |= {job.job: job for reply in replies.messages.values() for job in reply.jobs}
+    return statuses
+
+
+def _count(fleet: Fleet, wanted: Sequence[str], states: Sequence[str]) -> int:
+    fleet.client.serve(time.monotonic() + 1.0, at_least=10_000)
+    return sum(job.state in states for job in _statuses(fleet, wanted).values())
+
+
+def _outcome(fleet: Fleet, wanted: Sequence[str]) -> Outcome:
+    status, done, restarts = _statuses(fleet, wanted), fleet.count_finished(), fleet.supervisor.restarts()
+    settled = {name for name, job in status.items() if job.state in SETTLED}
+    return Outcome(
+        finished=sum(job.state == "finished" for job in status.values()),
+        unfinished=sum(job.state in ("unfinished", "given_up") for job in status.values()),
+        lost=tuple(sorted(set(wanted) - settled)),
+        twice=tuple(sorted(name for name, times in done.items() if times > 1)),
+        exited=tuple(sorted(name for name, count in restarts.items() if count > fleet.killed[name])),
+        violations=tuple(fleet.violations),
+        notes=tuple(fleet.notes),
+    )
+
+
+def main() -> None:
+    """Run the campaign and print its outcome."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--arms", type=int, default=256)
+    parser.add_argument("--jobs", type=int, default=512)
+    parser.add_argument("--speed", type=float, default=120.0, help="fleet seconds per real second")
+    parser.add_argument("--keep", type=Path, help="folder for journals and logs; default: temporary")
+    parser.add_argument("--no-namespaces", action="store_true", help="cut the link by a proxy, also as root")
+    given = parser.parse_args()
+    logging.basicConfig(level=logging.ERROR)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # remove the namespaces: they outlive the process
+    reason = "--no-namespaces" if given.no_namespaces else unavailable_reason()
+    prepare(load(SCENARIO), difficulty="blind")  # fills the cache
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = given.keep or Path(temporary)
+        amount = {"arms": given.arms, "jobs": given.jobs, "speed": given.speed}
+        outcome = mesh(folder / "mesh", **amount, namespaces=not reason)
+    print(f"{given.arms} arms, two routers, link by {outcome.by}{f' ({reason})' if reason else ''}")
+    print(
+        f"{given.jobs} jobs: {outcome.finished} finished, {outcome.unfinished} unfinished, {len(outcome.lost)} lost, "
+        f"{len(outcome.twice)} twice; exited: {', '.join(outcome.exited) or 'none'}; {outcome.took_s:.0f} s"
+    )
+    for line in (*outcome.notes, *outcome.violations, *outcome.lost[:8], *outcome.twice[:8]):
+        print("  " + line)
+    sys.exit(0 if outcome.good else 1)
+
+
+if __name__ == "__main__":
+    main()

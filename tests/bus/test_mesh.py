@@ -1,0 +1,235 @@
+"""Two linked routers: what holds behind one holds across both."""
+
+import queue
+import time
+from contextlib import ExitStack
+from datetime import UTC, datetime, timedelta
+
+import msgspec
+import pytest
+import zenoh
+from cryptography import x509
+from cryptography.x509.oid import ExtendedKeyUsageOID
+
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.rate_limits import Limits
+from fleet.bus.client.router import Router, open_client
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.messages import State
+from fleet.bus.security import certificates
+from fleet.bus.security.access_control import Participant, of_arms
+from fleet.bus.security.certificates import issue
+from fleet.bus.security.keyring import make
+from fleet.bus.security.tls import Tls
+from fleet.errors import BusError
+
+PATIENCE_S, POLL_S = 20.0, 0.02
+ROUTES_S = 0.5
+"""Zenoh calculates its routes 0.1 s after a new link."""
+ARMS = tuple(f"arm_{number}" for number in range(4))
+FAR = Participant("router_b", "router")
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    place = tmp_path_factory.mktemp("keys") / "f"
+    make(place, of_arms("f", ARMS, [FAR]), days=30)
+    return place
+
+
+@pytest.fixture
+def mesh(place):
+    """Two routers, and sessions of participants on either."""
+    with (
+        Router(tls=Tls(place, "router")) as near,
+        Router(tls=Tls(place, FAR.name), connect=[near.endpoint]) as far,
+        ExitStack() as stack,
+    ):
+        wait_until(lambda: near.linked() == far.linked() == 1)
+
+        def session(router, name):
+            return stack.enter_context(open_client(router.endpoint, timeout_s=PATIENCE_S, tls=Tls(place, name)))
+
+        yield near, far, session
+
+
+def wait_until(condition, patience_s=PATIENCE_S):
+    deadline_s = time.monotonic() + patience_s
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(POLL_S)
+
+
+def ask(session, key, timeout_s=PATIENCE_S):
+    every = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
+    return [str(reply.ok.key_expr) for reply in session.get(key, payload=b"?", timeout=timeout_s, **every) if reply.ok]
+
+
+def test_permissions_hold_across_linked_routers(mesh):
+    near, far, session = mesh
+    arm, other, auctioneer, monitor = (
+        session(router, name)
+        for router, name in ((far, "arm_0"), (near, "arm_1"), (near, "auctioneer"), (near, "monitor"))
+    )
+    states, tokens = queue.Queue(), queue.Queue()
+    listeners = [
+        monitor.declare_subscriber(keys.all_of_fleet("f"), lambda sample: states.put(str(sample.key_expr))),
+        monitor.liveliness().declare_subscriber(
+            keys.of_every_arm("f", "alive"), lambda sample: tokens.put(str(sample.key_expr)), history=True
+        ),
+    ]
+    quotes = {one: keys.of_arm("f", one, "quote") for one in ("arm_0", "arm_1")}
+    entities = [
+        arm.declare_queryable(quotes["arm_0"], lambda query: query.reply(quotes["arm_0"], b"own"), complete=True),
+        arm.declare_queryable(quotes["arm_1"], lambda query: query.reply(quotes["arm_1"], b"fake"), complete=True),
+        other.declare_queryable(quotes["arm_1"], lambda query: query.reply(quotes["arm_1"], b"own"), complete=True),
+        arm.liveliness().declare_token(keys.of_arm("f", "arm_1", "alive")),
+        arm.liveliness().declare_token(keys.of_arm("f", "arm_0", "alive")),
+    ]
+    assert tokens.get(timeout=PATIENCE_S) == keys.of_arm("f", "arm_0", "alive")
+    wait_until(lambda: len(ask(auctioneer, keys.of_every_arm("f", "quote"))) == 2)
+    assert sorted(ask(auctioneer, keys.of_every_arm("f", "quote"))) == sorted(quotes.values())
+    assert ask(monitor, keys.of_every_arm("f", "quote"), 0.5) == []  # its role may not
+    for key in ("arm/arm_1/state", "auction/auctioneer/result", "arm/arm_0/state"):
+        arm.put(f"{keys.all_of_fleet('f').removesuffix('/**')}/{key}", b"x")
+    assert states.get(timeout=PATIENCE_S) == keys.of_arm("f", "arm_0", "state")
+    assert states.empty()
+    assert tokens.empty()
+    for entity in (*listeners, *entities):
+        entity.undeclare()
+
+
+def test_missed_messages_are_fetched_when_a_router_is_back(place):
+    with Router(tls=Tls(place, "router")) as near, ExitStack() as stack:
+        far = Router(tls=Tls(place, FAR.name), connect=[near.endpoint]).open()
+        arm = stack.enter_context(BusClient(Tls(place, "arm_0").endpoint(far.endpoint), "f"))
+        monitor = stack.enter_context(BusClient(Tls(place, "monitor").endpoint(near.endpoint), "f"))
+        ticks, tokens = [], []
+        monitor.subscribe(
+            keys.of_every_arm("f", "state"), State, lambda _, state: ticks.append(state.tick), history=True
+        )
+        monitor.watch_tokens(keys.of_every_arm("f", "alive"), lambda name, there: tokens.append((name, there)))
+        publish = arm.publisher(keys.of_arm("f", "arm_0", "state"), State)
+        arm.declare_token(keys.of_arm("f", "arm_0", "alive"))
+
+        def state(tick):
+            publish(State("arm_0", tick, float(tick), "idle", (30.0,) * 7, 30.0))
+
+        def wait_for(condition):
+            def serve_and_check():
+                monitor.serve(time.monotonic() + POLL_S)
+                return condition()
+
+            wait_until(serve_and_check)
+
+        state(0)
+        wait_for(lambda: ticks == [0] and tokens == [("arm_0", True)])
+        time.sleep(ROUTES_S)
+        port = int(far.endpoint.rsplit(":", 1)[1])
+        far.close()
+        for tick in (1, 2, 3):
+            state(tick)
+        wait_for(lambda: tokens[-1] == ("arm_0", False))
+        with Router(port, tls=Tls(place, FAR.name), connect=[near.endpoint]):
+            wait_for(lambda: tokens[-1] == ("arm_0", True))
+            last = 3
+
+            def publish_and_check():  # a message that is lost while the link is new is fetched with a later one
+                nonlocal last
+                last += 1
+                state(last)
+                monitor.serve(time.monotonic() + 0.2)
+                return ticks[-1] >= 4
+
+            wait_until(publish_and_check)
+            assert ticks == list(range(len(ticks)))
+
+
+def test_the_rate_limit_counts_each_arm_and_not_the_link(place):
+    """Four arms of 25 messages a second are as many as one arm may send; behind a link they are one session."""
+    limits, each = Limits(state_hz=50.0), 20
+    with (
+        Router(tls=Tls(place, "router"), limits=limits) as near,
+        Router(tls=Tls(place, FAR.name), connect=[near.endpoint], limits=limits) as far,
+        ExitStack() as stack,
+    ):
+        wait_until(lambda: near.linked() == far.linked() == 1)
+        arms, monitor = (
+            [
+                stack.enter_context(open_client(router.endpoint, timeout_s=PATIENCE_S, tls=Tls(place, name)))
+                for name in names
+            ]
+            for router, names in ((far, ARMS), (near, ["monitor"]))
+        )
+        heard = []
+        listener = monitor[0].declare_subscriber(
+            keys.of_every_arm("f", "state"), lambda sample: heard.append(str(sample.key_expr))
+        )
+        time.sleep(ROUTES_S)
+        for _ in range(each):
+            for name, arm in zip(ARMS, arms, strict=True):
+                arm.put(keys.of_arm("f", name, "state"), b"x")
+            time.sleep(0.04)
+        wait_until(lambda: len(heard) >= 0.8 * each * len(ARMS))
+        del heard[:]
+        for _ in range(200):
+            arms[0].put(keys.of_arm("f", "arm_0", "state"), b"x")
+        time.sleep(0.5)
+        assert 1 <= len(heard) < 50
+        listener.undeclare()
+
+
+def test_a_link_needs_tls_and_a_certificate_that_may_connect(place, tmp_path, monkeypatch):
+    with pytest.raises(BusError, match="needs TLS: routers recognise each other"):
+        Router(connect=["tcp/127.0.0.1:7447"])
+    with pytest.raises(BusError, match=r"no endpoint for the certificate of 'router'. Expected tls/"):
+        Router(tls=Tls(place, "router"), connect=["tcp/127.0.0.1:7447"])
+    monkeypatch.setattr(certificates, "_CONNECT", ExtendedKeyUsageOID.SERVER_AUTH)  # as earlier versions did
+    older = tmp_path / "older"
+    older.mkdir()
+    for name in ("ca.pem", "ca.key", "roster.json"):
+        (older / name).write_bytes((place / name).read_bytes())
+    issue(older, Participant("router", "router"), days=20, now=datetime.now(UTC) - timedelta(days=1))
+    monkeypatch.undo()
+    Router(tls=Tls(older, "router")).open().close()  # it may still listen
+    with pytest.raises(BusError, match=r"permits listening only.*thermofleet keys .* --add router:router --overwrite"):
+        Router(tls=Tls(older, "router"), connect=["tls/127.0.0.1:7447"]).open()
+
+
+def test_a_router_in_no_roster_has_no_rights(place, tmp_path):
+    """Nor has one with the name of the router itself: only other routers are linked."""
+    rogue = tmp_path / "rogue"
+    rogue.mkdir()
+    for name in ("ca.pem", "ca.key"):
+        (rogue / name).write_bytes((place / name).read_bytes())
+    roster = of_arms("f", ARMS, [Participant("router_c", "router")])
+    for name in ("router_c", "router"):
+        issue(rogue, Participant(name, "router"), days=20)
+    (rogue / "roster.json").write_bytes(msgspec.json.encode(roster))
+    with Router(tls=Tls(place, "router")) as near:
+        heard = queue.Queue()
+        session = open_client(near.endpoint, timeout_s=PATIENCE_S, tls=Tls(place, "monitor"))
+        listener = session.declare_subscriber(keys.of_every_arm("f", "state"), lambda sample: heard.put(sample.payload))
+        for name in ("router_c", "router"):
+            with (
+                Router(tls=Tls(rogue, name), connect=[near.endpoint]) as far,
+                open_client(far.endpoint, timeout_s=PATIENCE_S, tls=Tls(place, "arm_0")) as arm,
+            ):
+                wait_until(lambda: near.linked() == 1)
+                time.sleep(ROUTES_S)
+                arm.put(keys.of_arm("f", "arm_0", "state"), b"x")
+                time.sleep(ROUTES_S)
+            wait_until(lambda: near.linked() == 0)
+        assert heard.empty()
+        listener.undeclare()
+        session.close()
+
+
+def test_only_routers_have_certificates_for_both_ends(place):
+    def purposes(name):
+        certificate = x509.load_pem_x509_certificate((place / f"{name}.pem").read_bytes())
+        return set(certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value)
+
+    both = {ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH}
+    assert purposes("router") == purposes(FAR.name) == both
+    assert all(purposes(name) == {ExtendedKeyUsageOID.CLIENT_AUTH} for name in (*ARMS, "auctioneer", "operator"))
