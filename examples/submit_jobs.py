@@ -19,7 +19,7 @@ MAX_JOBS = 100
 """Jobs in one message; the limits of the bus are 128 jobs and 64 KiB."""
 WAIT_S = 10.0
 """Longest wait for an auctioneer, or for arms that allocate jobs without one."""
-ENDED = ("finished", "unfinished", "given_up")
+ENDED = ("finished", "unfinished", "given_up", "cancelled")
 """States of jobs that no arm will work on any more."""
 JOBS = [
     {"name": "outside 1", "kind": "hold", "places": ["fixture"], "payload_kg": 1.0, "dwell_s": 5.0},
@@ -90,19 +90,23 @@ def query(session, key, name, request):
     return messages
 
 
-def main(port, fleet, jobs, seconds=600.0):
-    """Submit jobs and wait for their results; return whether all are finished."""
+def connect(port):
+    """Open a session at the router on this port; it ends with a `with` block."""
     config = {
         "mode": "client",
         "connect": {"endpoints": [f"tcp/127.0.0.1:{port}"], "timeout_ms": 10_000},
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
     }
-    root = f"thermofleet/v4/{quote(fleet, safe='')}"
     try:
-        opened = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+        return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
     except zenoh.ZError:
         sys.exit(f"No router at port {port}.")
-    with opened as session:
+
+
+def main(port, fleet, jobs, seconds=600.0):
+    """Submit jobs and wait for their results; return whether all are finished."""
+    root = f"thermofleet/v4/{quote(fleet, safe='')}"
+    with connect(port) as session:
         end_s, pause = time.monotonic() + WAIT_S, queue.SimpleQueue()
         while not query(session, f"{root}/clock/now", "ClockRequest", {}):  # the participant that accepts jobs replies
             if time.monotonic() > end_s:

@@ -6,7 +6,19 @@ from participants import CLIENT
 from world import Process
 
 from fleet.bus.protocol import keys
-from fleet.bus.protocol.operator import Cleared, ClearRequest
+from fleet.bus.protocol.operator import (
+    ALL_ARMS,
+    Action,
+    Cancel,
+    Change,
+    Cleared,
+    ClearRequest,
+    Controlled,
+    ControlRequest,
+    Pause,
+    Resume,
+    Settle,
+)
 
 if TYPE_CHECKING:
     from shift import Shift
@@ -195,6 +207,37 @@ def clear(shift: "Shift", arm: str) -> None:
     link.query(keys.of_jobs("f", "clear"), ClearRequest(arm, "a person"), Cleared, lambda _: None, timeout_s=2.0)
 
 
+def steer(shift: "Shift") -> None:
+    """Have a person cancel, settle or change a job, or pause arms; a person knows what was done."""
+    if shift.alone or not shift.submitter.accepted:
+        return
+    job, arm = shift.rng.choice(list(shift.submitter.accepted)), shift.rng.choice([ALL_ARMS, *shift.arms])
+    actions: list[Action] = [Cancel(job), Change(job, value=shift.rng.random()), Pause(arm), Resume()]
+    if shift.finished.get(job):
+        actions.append(Settle(job, "done"))
+    elif not shift.begun.get(job):
+        actions.append(Settle(job, "redo"))
+    request(shift, shift.rng.choice(actions))
+
+
+def request(shift: "Shift", action: Action) -> None:
+    """Send a request of a person, again until there is a reply or the fleet is healed."""
+    if isinstance(action, Cancel):
+        shift.cancelled.add(action.job)
+    message = ControlRequest(str(shift.world.now_s), action, "a person")
+    shift.world.log("person", f"requests {action}")
+    link: Any = shift.world.processes[CLIENT].client
+
+    def send() -> None:
+        link.query(keys.of_jobs("f", "control"), message, Controlled, done, timeout_s=2.0)
+
+    def done(replies: Any) -> None:
+        if not (replies.messages or any(replies.refused.values()) or shift.healed):
+            send()
+
+    send()
+
+
 def kill_supervisor(shift: "Shift") -> None:
     """Kill the supervisor, and with it all processes."""
     if shift.rng.random() < 0.3:
@@ -204,7 +247,7 @@ def kill_supervisor(shift: "Shift") -> None:
 FAULTS = (
     *(kill, kill_at_work, lose_power, crash_at_write, crash_at_write, fill_disk, break_disk, stop, stop_at_work, cut),
     *(cut_off_at_work, cut_off_at_work, lose_router, lose_messages, lose_messages, overheat, break_machine, move_home),
-    *(kill_supervisor, fill_log_disk, lose_rack, swizzle),
+    *(kill_supervisor, fill_log_disk, lose_rack, swizzle, steer, steer),
 )
 
 

@@ -10,11 +10,12 @@ from random import Random
 from typing import Any
 
 from bus import Bus
-from faults import FAULTS, heal
+from faults import FAULTS, heal, request
 from participants import AUCTIONEER, CLIENT, ArmProcess, Submitter, Watch, auctioneer_process, simulated_system
 from world import Process, Violation, World
 
-from fleet.bus.protocol.auction import JobSpec
+from fleet.bus.protocol.auction import ABANDONED, SETTLED, JobSpec
+from fleet.bus.protocol.operator import Resume
 from fleet.job import reason_to_give_up
 from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.round import Assignment, Timing
@@ -97,6 +98,8 @@ class Shift:
         self.away: dict[str, str] = {}
         self.faults: dict[str, list[str]] = {}
         self.unsure: set[str] = set()
+        self.cancelled: set[str] = set()
+        """Jobs that a person has asked to cancel."""
         self.work_s = 0.0
         self.healed = False
         self.jobs: list[JobSpec] = []
@@ -266,14 +269,15 @@ class Shift:
             what += [f"'{name}' has '{active.job}'" for active in executor.active]
             what += [f"'{name}' has a report" for _ in range(executor.has_pending_reports)]
         for name, job in self.submitter.accepted.items():
-            if states.get(name) not in ("finished", "unfinished", "given_up") and not self._stuck(job, states):
+            if states.get(name) not in SETTLED and not self._stuck(job, states):
                 what.append(f"'{name}' is {states.get(name, 'unknown')}")
         return what
 
     def _stuck(self, job: JobSpec, states: Mapping[str, str]) -> bool:
         """Whether a job waits for one that stays unfinished."""
         return any(
-            states.get(before) in ("unfinished", "given_up") or self._stuck(self.submitter.accepted[before], states)
+            states.get(before) in ("unfinished", "given_up", "cancelled")
+            or self._stuck(self.submitter.accepted[before], states)
             for before in job.after
             if before in self.submitter.accepted
         )
@@ -283,6 +287,8 @@ class Shift:
         while self._open():
             if self.world.now_s > deadline_s:
                 raise Violation(f"No end after {self.world.now_s:.0f} s: {'; '.join(self._open()[:4])}.")
+            if not self.alone and (node := self.node(AUCTIONEER)) is not None and node.auctioneer.ledger.paused:
+                request(self, Resume())
             self.world.run(self.world.now_s + CHECK_S)
         self.unsure |= {job for builder in self.builders.values() for job in builder.unsure}
         states = self.statuses()
@@ -294,6 +300,10 @@ class Shift:
                 raise Violation(f"'{name}' was done, and is called {state}.")
             if state == "unfinished" and name not in self.unsure:
                 raise Violation(f"'{name}' is unfinished, and no arm stopped in its last cycle.")
-            lost = any(states.get(before) == "given_up" for before in job.after)
-            if state == "given_up" and not (lost or job.expires or reason_to_give_up(self.faults.get(name, ()))):
+            if state == "cancelled" and name not in self.cancelled:
+                raise Violation(f"'{name}' is cancelled, and nobody asked for it.")
+            lost = any(states.get(before) in ABANDONED for before in job.after)
+            if state == "given_up" and not (
+                lost or name in self.cancelled or job.expires or reason_to_give_up(self.faults.get(name, ()))
+            ):
                 raise Violation(f"'{name}' is given up without a reason.")

@@ -2,8 +2,10 @@
 
 import logging
 import math
+import secrets
 import time
 from collections.abc import Callable
+from functools import partial
 
 from fleet.bus.client.client import BusClient
 from fleet.bus.client.replies import Replies
@@ -18,6 +20,7 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
+from fleet.bus.protocol.operator import Action, Cancel, Controlled, ControlRequest, Pause, Resume
 
 _LOG = logging.getLogger(__name__)
 
@@ -42,6 +45,8 @@ class JobClient:
         self.statuses: dict[str, JobStatus] = {}
         self._link, self._by, self._on_change = link, by, on_change
         self._unsubmitted: dict[str, JobSpec] = {}
+        self._requests: dict[str, ControlRequest] = {}
+        """Requests without a reply, by name."""
         self._due_s = -math.inf
         link.subscribe(keys.of_every_auction(link.fleet, "result"), Result, lambda _, result: self._set(result.status))
 
@@ -51,18 +56,29 @@ class JobClient:
         self.statuses.setdefault(spec.name, JobStatus(spec.name, "waiting"))
         self._due_s = -math.inf
 
-    def cancel(self, _job: str) -> str:
+    def cancel(self, job: str) -> str:
         """Ask the fleet to cancel a job; return why that is impossible, or "". The job then ends as any other."""
-        return "This version of the bus has no message that cancels a job."
+        if job not in self.statuses:
+            return f"There is no job '{job}'."
+        self._request(Cancel(job))
+        return ""
 
-    def pause(self, _paused: bool) -> str:
+    def pause(self, paused: bool) -> str:
         """Ask the fleet to begin no further cycle, or to go on; return why that is impossible, or ""."""
-        return "This version of the bus has no message that pauses a fleet."
+        later = {name: r for name, r in self._requests.items() if not isinstance(r.action, Pause | Resume)}
+        self._requests = later
+        self._request(Pause() if paused else Resume())
+        return ""
 
     def forget(self, job: str) -> None:
         """Follow a job no longer."""
         self.statuses.pop(job, None)
         self._unsubmitted.pop(job, None)
+
+    def _request(self, action: Action) -> None:
+        request = ControlRequest(secrets.token_hex(8), action, self._by)
+        self._requests[request.request] = request
+        self._due_s = -math.inf
 
     def step(self) -> None:
         """Send requests that are due."""
@@ -74,6 +90,10 @@ class JobClient:
             key = keys.of_jobs(self._link.fleet, "submit")
             self._link.query(key, request, SubmissionReply, self._apply_admission, timeout_s=REPLY_S)
         known = self._unsubmitted
+        for request in self._requests.values():
+            if not (isinstance(request.action, Cancel) and request.action.job in known):
+                key, done = keys.of_jobs(self._link.fleet, "control"), partial(self._apply_control, request)
+                self._link.query(key, request, Controlled, done, timeout_s=REPLY_S)
         open_jobs = [job for job, status in self.statuses.items() if job not in known and status.state not in SETTLED]
         if open_jobs:
             request = StatusRequest(tuple(open_jobs[:MOST_FOLLOWED]))
@@ -86,6 +106,13 @@ class JobClient:
                 self._set(JobStatus(admission.job, "given_up", reason=f"not accepted: {admission.reason}"))
         for reason in filter(None, replies.refused.values()):
             _LOG.warning("Not submitted yet: %s", reason)
+
+    def _apply_control(self, request: ControlRequest, replies: Replies[Controlled]) -> None:
+        refusals = list(filter(None, replies.refused.values()))
+        if replies.messages or refusals:
+            self._requests.pop(request.request, None)
+        for reason in refusals:
+            _LOG.warning("Refused: %s", reason)
 
     def _apply_statuses(self, replies: Replies[Status]) -> None:
         for status in (each for reply in replies.messages.values() for each in reply.jobs):

@@ -21,7 +21,9 @@ from starlette.routing import Route
 from starlette.types import Message, Receive, Scope, Send
 
 from fleet.bus.protocol.auction import JobSpec, QuoteRequest, StatusRequest, Submission
+from fleet.bus.protocol.cell import Cell, CellRequest
 from fleet.bus.protocol.messages import MalformedMessage, decode, encode
+from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest
 from fleet.live.monitor.async_bridge import AsyncBridge, NoReply
 from fleet.live.monitor.event_feed import Entry, EventFeed, ReaderBuffer
 from scenarios.live.http_access import AccessCheck, Bodies, Problem, Role, check_role, problem_response
@@ -100,6 +102,17 @@ def application(
         names = tuple(request.query_params.getlist("job"))
         return json_response(await limited(lambda: bridge.status(StatusRequest(names))))
 
+    async def post_control(request: Request) -> Response:
+        control = await read_body(request, ControlRequest, bodies)
+        return json_response(await limited(lambda: bridge.request("control", control, Controlled)))
+
+    async def post_clear(request: Request) -> Response:
+        clear = await read_body(request, ClearRequest, bodies)
+        return json_response(await limited(lambda: bridge.request("clear", clear, Cleared)))
+
+    async def get_cell(request: Request) -> Response:
+        return json_response(await limited(lambda: bridge.request("cell", CellRequest(), Cell)))
+
     async def post_ask(request: Request) -> Response:
         ask = await read_body(request, AskBody, bodies)
         try:
@@ -125,6 +138,9 @@ def application(
         ("GET", "/v4/events", "monitor", events, "Every message as server-sent events."),
         ("GET", "/v4/jobs", "monitor", get_jobs, "Status of the jobs ?job=NAME, or of all."),
         ("POST", "/v4/jobs", "submitter", post_jobs, "Submit jobs: a Submission."),
+        ("GET", "/v4/cell", "monitor", get_cell, "Places, arms, kinds of jobs and limits: all that a job may name."),
+        ("POST", "/v4/control", "operator", post_control, "Cancel, settle, change, pause, resume: a ControlRequest."),
+        ("POST", "/v4/clear", "operator", post_clear, "Free the space of an absent arm: a ClearRequest."),
         ("POST", "/v4/ask", "submitter", post_ask, 'Quotes without submitting: {"jobs": […]}.'),
     ]
     routes = [Route(path, _checked(role, handle), methods=[method]) for method, path, role, handle, _ in table]

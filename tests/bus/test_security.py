@@ -190,11 +190,14 @@ def test_nobody_pretends_that_another_is_there(side, connect, fake):
 ASKERS = {
     keys.of_arm("f", "arm_0", "quote"): {"auctioneer", "submitter", "operator"},
     keys.of_arm("f", "arm_0", "award"): {"auctioneer"},
+    keys.of_arm("f", "arm_0", "reset"): {"operator"},
     keys.asked_by("f", "auctioneer", "lease", "arm_0"): {"arm_0"},
     keys.asked_by("f", "auctioneer", "report", "arm_1"): {"arm_1"},
     keys.asked_by("f", "arm_0", "claim", "arm_1"): {"arm_1"},
     keys.of_jobs("f", "submit"): {"submitter", "operator"},
     keys.of_jobs("f", "clear"): {"operator"},
+    keys.of_jobs("f", "cell"): {"submitter", "operator", "monitor", "recorder"},
+    keys.of_jobs("f", "control"): {"operator"},
     keys.of_jobs("f", "status"): {"submitter", "operator", "monitor", "recorder", "auctioneer"},
     keys.of_clock("f"): {"arm_0", "arm_1", "submitter", "operator", "monitor", "recorder", "auctioneer"},
 }

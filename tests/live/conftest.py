@@ -31,7 +31,7 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
-from fleet.bus.protocol.operator import ClearRequest
+from fleet.bus.protocol.operator import Cancel, ClearRequest, Controlled, ControlRequest, Settle
 from fleet.errors import JournalFull, Refused
 from fleet.live.auction.auctioneer import Auctioneer
 from fleet.live.auction.leases import SendAward
@@ -241,6 +241,11 @@ class ModelFleet:
         self.accepted: dict[str, JobSpec] = {}
         self.unsure_jobs: set[str] = set()
         """Jobs that an arm returned without knowing whether the last cycle was done."""
+        self.requests: list[ControlRequest] = []
+        self.answered: set[str] = set()
+        """Names of the requests that were carried out and answered."""
+        self.cancelled: set[str] = set()
+        """Jobs whose cancellation was answered, and that no person has had redone since."""
         self.boots = 0
         self.full = self.kill_next = False
         self.auctioneer: Auctioneer = self.restart()
@@ -308,6 +313,22 @@ class ModelFleet:
                     assert self.results.setdefault(result.number, result) == result, "two results of one number"
                 case Announcement():
                     pass
+        return answer
+
+    def control(self, request: ControlRequest) -> Controlled | None:
+        """Request what a person may; return the answer, None if there is none or it is refused."""
+        self.requests.append(request)
+        try:
+            answer = self.attempt(lambda: self.auctioneer.control(request, self.true_s))
+        except Refused:
+            return None
+        if not isinstance(answer, Controlled):
+            return None
+        if request.request in self.answered:
+            assert not answer.changed, "carried out twice"
+        self.answered.add(request.request)
+        if answer.changed and isinstance(request.action, Cancel | Settle):
+            (self.cancelled.add if isinstance(request.action, Cancel) else self.cancelled.discard)(request.action.job)
         return answer
 
     def submit(self, *jobs: JobSpec) -> None:
@@ -416,12 +437,20 @@ class ModelFleet:
         assert self.accepted.keys() <= statuses.keys(), "a job is lost"
         for status in statuses.values():
             assert status.state != "finished" or status.job in finished, "reported finished, but not done"
+            assert status.state != "cancelled" or status.job not in self.at_work(), "cancelled, but an arm may work"
 
     def check_settled(self) -> None:
         """Check after a run without faults: every job is done, or its arm crashed in the last cycle."""
         ledger = self.auctioneer.ledger
         states = {status.job: status.state for status in self.auctioneer.status()}
         for job, state in states.items():
+            if state == "given_up":
+                assert any(states[before] in ("cancelled", "given_up") for before in ledger.jobs[job].spec.after), job
+                continue
+            if state == "cancelled" or job in self.cancelled:
+                assert any(getattr(r.action, "job", "") == job for r in self.requests), "nobody cancelled it"
+                assert state != "waiting", f"'{job}' waits after its cancellation"
+                continue
             blocked = any(states[before] != "finished" for before in ledger.jobs[job].spec.after)
             expected = "unfinished" if job in self.unsure_jobs else "waiting" if blocked else "finished"
             assert state == expected or (job in self.unsure_jobs and state == "finished"), f"'{job}' is {state}"

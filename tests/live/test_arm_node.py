@@ -26,12 +26,13 @@ from fleet.bus.protocol.auction import (
     Report,
 )
 from fleet.bus.protocol.messages import DifficultyScores, Info, State
+from fleet.bus.protocol.operator import ResetReply, ResetRequest
 from fleet.errors import InfeasibleJob
 from fleet.job import Place
 from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
 from fleet.live.arm.config import ArmConfig
 from fleet.live.arm.estimator import NOT_PLANNED, Estimator, NominalPeaks
-from fleet.live.arm.journal_records import ArmHistory, ArmRecord
+from fleet.live.arm.journal_records import ArmHistory, ArmRecord, FaultCleared
 from fleet.live.arm.node import ArmNode
 from fleet.live.arm.planning import PLANNING_S
 from fleet.live.arm.replay_body import ReplayBody, SensorLog
@@ -39,6 +40,7 @@ from fleet.live.arm.simulated_body import SimulatedBody
 from fleet.live.clock import FleetClock
 from fleet.live.journal import Journal
 from fleet.robot import ThermalLimits
+from fleet.thermal import WINDING
 
 PATIENCE_S = 15.0
 LIMITS = ThermalLimits()
@@ -271,6 +273,24 @@ def test_a_faulted_arm_returns_its_job_with_the_cycles(bus):
     assert report.cycles == (fault.time_s - began_s - 3.0) // 10.0
     assert "faulted" in report.reason
     assert bus.ask(line, "quote", request(), Quote).capacity == 0
+
+
+def test_a_person_clears_the_fault_of_an_arm_and_journal_and_event_name_the_person(bus):
+    auctioneer, line, events = Auctioneer(bus.link()), bus.link(), []
+    line.subscribe(keys.of_every_arm("f", "event"), ArmEvent, lambda _, e: events.append(e), history=True)
+    limits = ThermalLimits(warning_c=33.0, error_c=34.0, restart_c=30.0, clear_s=1e5)
+    arm = bus.arm(limits=limits, warning_c=1000.0, speed=600.0, warm=False)
+    assert not bus.ask(line, "reset", ResetRequest("ann"), ResetReply).changed
+    long = JobSpec(name="j", kind="hold", places=("bench",), repetitions=5000)
+    quote = bus.ask(line, "quote", request(long), Quote)
+    assert bus.ask(line, "award", award(quote.quote, long), Ack).accepted
+    bus.serve(lambda: auctioneer.reports)
+    bus.serve(lambda: arm.body.truth.temp_c[0, 0, WINDING].max() < 29.0)
+    assert bus.ask(line, "reset", ResetRequest("ann"), ResetReply).changed
+    bus.serve(lambda: any(e.kind == "recover" for e in events))
+    assert next(e for e in events if e.kind == "recover").reason == "cleared by 'ann'"
+    assert not bus.ask(line, "reset", ResetRequest("ann"), ResetReply).changed
+    assert [record.by for record in arm.book.records() if isinstance(record, FaultCleared)] == ["ann"]
 
 
 def test_a_hot_arm_quotes_but_accepts_no_award(bus):

@@ -7,6 +7,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fleet.bus.protocol.auction import JobSpec
+from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Pause, Resume, Settle
 from fleet.live.space import ANYWHERE
 
 
@@ -111,13 +112,36 @@ def stop_on_the_way(fleet, rng: random.Random) -> None:
         fleet.check()
 
 
+def steer(fleet, rng: random.Random) -> None:
+    """A person requests something, or a request comes again: late, and often after a restart."""
+    for _ in range(rng.randrange(1, 5)):
+        again = [r for r in fleet.requests if r.request in fleet.answered or not isinstance(r.action, Settle)]
+        if again and rng.random() < 0.3:
+            fleet.control(rng.choice(again))
+            continue
+        job, arm = rng.choice(list(fleet.auctioneer.ledger.jobs) or ["job 0"]), rng.choice(["*", "arm_0", "arm_1"])
+        done = any(job in each.done for each in fleet.arms.values())  # a person has looked
+        action = rng.choice(
+            [
+                Cancel(job),
+                Settle(job, "done" if done else "redo"),
+                Change(job, value=rng.random()),
+                Pause(arm),
+                Resume(),
+            ]
+        )
+        fleet.control(ControlRequest(str(len(fleet.requests)), action, "a person"))
+        fleet.run_without_faults(0.1, 0.1)
+        fleet.check()
+
+
 def no_faults(fleet, rng: random.Random) -> None:
     fleet.run_without_faults(rng.choice([0.25, 0.5, 1.0, 2.0]))
 
 
 ACTIONS = (
     *(lossy_network, submit, wait, cut_off, stop_on_the_way, kill_arm, give_back),
-    *(clear, clear_one_that_lives_on, kill_auctioneer, fill_disk, no_faults),
+    *(steer, steer, clear, clear_one_that_lives_on, kill_auctioneer, fill_disk, no_faults),
 )
 rates = st.tuples(*[st.floats(1 - 1e-3, 1 + 1e-3)] * 4)
 
@@ -150,6 +174,8 @@ def test_no_job_is_done_twice_or_lost_and_all_are_done_after_the_faults(live, ra
     for action in actions:
         action(fleet, rng)
         fleet.check()
+    fleet.full = fleet.kill_next = False
+    fleet.control(ControlRequest("the last", Resume(), "a person"))
     for _ in range(60):
         fleet.run_without_faults(2.0)
         fleet.check()

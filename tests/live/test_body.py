@@ -229,6 +229,26 @@ def test_a_faulted_body_is_not_free(small):
         body.start(job, plan, 0)
 
 
+def test_a_person_clears_a_fault_once_the_arm_is_cool_and_it_goes_home(small):
+    arm, job, plan = one_job(small, repetitions=5000, payload=small.HOT)
+    body = body_of(arm)
+    body.start(job, plan, 0)
+    body.allow_cycles(5000)
+    while body.truth.mode[0, 0] != FAULTED:
+        body.advance(body.time_s + DT_S)
+    assert f"a fault can be cleared below {LIMITS.restart_c:g} °C" in body.clear_fault()
+    while body.truth.temp_c[0, 0, WINDING].max() >= LIMITS.restart_c:
+        body.advance(body.time_s + DT_S)
+    assert body.read_sensors().mode == "faulted", "it waits for a person"
+    cool_s = body.time_s
+    assert not body.clear_fault()
+    events = body.advance(cool_s + DT_S)
+    assert [(event.kind, event.time_s) for event in events] == [("recover", cool_s)]
+    body.advance(body.time_s + 120.0)
+    assert body.is_free
+    assert body.away is None
+
+
 def test_sensors_read_the_motion(small):
     arm, job, plan = one_job(small, payload=small.WARM)
     body = body_of(arm, dt_s=1.0, warm=True)

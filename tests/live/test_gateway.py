@@ -21,7 +21,10 @@ from fleet.bus.client.client import BusClient, Refused
 from fleet.bus.client.router import Router
 from fleet.bus.protocol import auction as bus
 from fleet.bus.protocol import keys
+from fleet.bus.protocol.cell import Cell, CellRequest
+from fleet.bus.protocol.examples import EXAMPLES
 from fleet.bus.protocol.messages import DifficultyScores, State
+from fleet.bus.protocol.operator import Cancel, Controlled, ControlRequest
 from fleet.live.monitor.async_bridge import AsyncBridge
 from scenarios.cli.live.gateway import Server, listen
 from scenarios.live.http_app import MAX_BYTES, Readers, application
@@ -45,6 +48,8 @@ class StandIn:
         self.event = link.publisher(keys.of_arm("f", "a+1", "event"), bus.ArmEvent)
         link.reply_to(keys.of_jobs("f", "submit"), bus.Submission, self.submit)
         link.reply_to(keys.of_jobs("f", "status"), bus.StatusRequest, self.status)
+        link.reply_to(keys.of_jobs("f", "cell"), CellRequest, lambda _: EXAMPLES[Cell])
+        link.reply_to(keys.of_jobs("f", "control"), ControlRequest, self.control)
         self.thread.start()
         return self
 
@@ -67,6 +72,10 @@ class StandIn:
             raise Refused("The journal has no room.")
         self.asked.append(word)
         return bus.SubmissionReply("au", tuple(bus.Admission(job.name, True) for job in word.jobs))
+
+    def control(self, request):
+        self.asked.append(request)
+        return Controlled("au", request.request, changed=True)
 
     def status(self, word):
         return bus.Status("au", 9.0, (bus.JobStatus("crate 1", "waiting"),))
@@ -288,6 +297,16 @@ def test_a_token_may_do_what_its_role_may(router, arm):
         status, _, told = ask(watcher, "POST", "/v4/jobs", {"jobs": [CRATE_JSON]})
         assert (status, told["detail"]) == (403, "This token has the role monitor; this request needs submitter.")
         assert ask(sender, "POST", "/v4/jobs", {"jobs": [CRATE_JSON]})[0] == 200
+        status, _, told = ask(sender, "POST", "/v4/control", {"request": "1", "action": {"action": "pause"}})
+        assert (status, told["detail"]) == (403, "This token has the role submitter; this request needs operator.")
+
+
+def test_an_operator_cancels_over_http(gateway, arm):
+    cancel = {"request": "1", "action": {"action": "cancel", "job": "crate 1"}, "by": "ann"}
+    status, _, told = gateway.ask("POST", "/v4/control", cancel)
+    assert (status, told["changed"]) == (200, True)
+    assert arm.asked[-1] == ControlRequest("1", Cancel("crate 1"), "ann")
+    assert gateway.ask("POST", "/v4/control", {"request": "1", "action": {"action": "fly"}})[0] == 422
 
 
 def test_the_first_page_lists_all_requests(gateway):

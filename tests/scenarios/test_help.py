@@ -51,7 +51,7 @@ def test_help_imports_no_large_library():
 @pytest.mark.parametrize(
     ("words", "completions"),
     [
-        ("thermofleet re", ["record", "replay", "report"]),
+        ("thermofleet re", ["record", "replay", "report", "reset", "resume"]),
         ("thermofleet run --pl", ["--plant"]),
         ("thermofleet twin re", ["recover", "reliability", "report"]),
     ],

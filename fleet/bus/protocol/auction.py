@@ -260,12 +260,14 @@ class Receipt(msgspec.Struct, frozen=True):
     award: Name
 
 
-JobState = Literal["waiting", "awarded", "finishing", "finished", "unfinished", "given_up"]
+JobState = Literal["waiting", "awarded", "finishing", "finished", "unfinished", "given_up", "cancelled"]
 """waiting: for its release, its predecessors or an arm; finishing: in its last cycle; unfinished: the arm had
 permission to commit and is silent since, or the shift ended before the job was done; given_up: arms faulted in it too
-often, or in a job that it waits for."""
-SETTLED: tuple[JobState, ...] = ("finished", "unfinished", "given_up")
-"""States that need nothing more; only a late report that the job is finished may change the other two."""
+often, or in a job that it waits for; cancelled: by a `ControlRequest`."""
+ABANDONED: tuple[JobState, ...] = ("given_up", "cancelled")
+SETTLED: tuple[JobState, ...] = ("finished", "unfinished", *ABANDONED)
+"""States that need nothing more; only a late report that the job is finished, or a `ControlRequest`, may change those
+other than finished."""
 
 
 class JobStatus(msgspec.Struct, frozen=True):
@@ -276,8 +278,13 @@ class JobStatus(msgspec.Struct, frozen=True):
     arm: str = ""
     award: str = ""
     cycles: Count = 0
+    """Done, of `repetitions`."""
     finished_s: Number | None = None
     reason: str = ""
+    repetitions: Count = 0
+    """Cycles of the job; 0 for unknown."""
+    finish_s: Number | None = None
+    """Predicted fleet time at which it is finished and its arm at home; null for unknown, or if no arm is at work."""
 
 
 class StatusRequest(msgspec.Struct, frozen=True):
@@ -298,6 +305,8 @@ class Status(msgspec.Struct, frozen=True):
     within its reach."""
     epoch: str = ""
     """As in `Clock`."""
+    paused: dict[Name, str] = {}
+    """Who paused an arm, by arm; "*" for all arms."""
 
 
 class Announcement(msgspec.Struct, frozen=True):
@@ -322,6 +331,8 @@ class Result(msgspec.Struct, frozen=True):
     """Quoted by the arm, as are the next two."""
     p_saturation: Number | None = None
     peak_c: Number | None = None
+    by: str = ""
+    """Who asked for the change, by a `Submission` or a `ControlRequest`."""
 
 
 class ArmEvent(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -29,10 +29,20 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
+from fleet.bus.protocol.cell import Cell, CellArm, CellKind, CellPlace, CellRequest, Limit, PlannedWork
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimEntry, ClaimReply, DeniedEntry, GrantedEntry, JobOutcome
 from fleet.bus.protocol.history import History, HistoryRequest
 from fleet.bus.protocol.messages import DifficultyScores, Info, Refusal, State
-from fleet.bus.protocol.operator import Cleared, ClearRequest
+from fleet.bus.protocol.operator import (
+    Cancel,
+    Cleared,
+    ClearRequest,
+    Controlled,
+    ControlRequest,
+    Operation,
+    ResetReply,
+    ResetRequest,
+)
 
 CRATE = JobSpec(
     name="crate_1",
@@ -59,7 +69,32 @@ _FASTEST = PlanQuote(
 )
 _COOLEST = PlanQuote(plan=1, peak_c=48.25, gained_k=5.25, p_saturation=0.01, duration_s=252.0, finish_in_s=280.5)
 _OFFER = JobEstimate(job="crate_1", plans=(_FASTEST, _COOLEST))
-_DONE = JobStatus(job="crate_1", state="finished", arm=_ARM, award=_AWARD, cycles=20, finished_s=842.5)
+_DONE = JobStatus(job="crate_1", state="finished", arm=_ARM, award=_AWARD, cycles=20, finished_s=842.5, repetitions=20)
+_CELL = Cell(
+    auctioneer=_AUCTIONEER,
+    scenario="packing",
+    places=(
+        CellPlace("conveyor", (0.4, 0.2, 0.1), (180.0, 0.0, 0.0), 0.08),
+        CellPlace("pallet", (0.4, -0.2, 0.1), (180.0, 0.0, 0.0), 0.08),
+    ),
+    arms=(
+        CellArm(
+            _ARM,
+            (0.0, 0.0, 0.0),
+            (0.0, 0.0, 0.0),
+            payload_kg=3.1,
+            payload_outstretched_kg=0.2,
+            reach_m=0.902,
+            works=(PlannedWork("pick_place", CRATE.places, 1.5, plans=4, cycle_s=9.6),),
+        ),
+    ),
+    kinds=(CellKind("pick_place", 2, "Take the payload from the first place to the second."),),
+    limits={"payload_kg": Limit(0.0, 10.0, "kg")},
+    warning_c=60.0,
+    error_c=75.0,
+    jobs_in_message=128,
+)
+_CANCEL = ControlRequest(request="5f0c2b1e", action=Cancel(job="crate_1"), by="shop floor")
 
 _ALL: tuple[msgspec.Struct, ...] = (
     State(
@@ -163,6 +198,19 @@ _ALL: tuple[msgspec.Struct, ...] = (
     Status(auctioneer=_AUCTIONEER, time_s=900.0, jobs=(_DONE,), space={"arm_2": ("5d1c0f7e92ab3486",)}, epoch=_EPOCH),
     ClearRequest(arm="arm_2", by="shop floor"),
     Cleared(auctioneer=_AUCTIONEER, arm="arm_2"),
+    ResetRequest(by="shop floor"),
+    ResetReply(arm=_ARM, changed=True),
+    _CANCEL,
+    Controlled(
+        auctioneer=_AUCTIONEER,
+        request=_CANCEL.request,
+        changed=True,
+        note="The arm ends the cycle in progress and returns it.",
+        job=JobStatus(job="crate_1", state="awarded", arm=_ARM, award=_AWARD, cycles=3, repetitions=20, finish_s=842.0),
+    ),
+    Operation(auctioneer=_AUCTIONEER, time_s=650.0, request=_CANCEL),
+    CellRequest(),
+    _CELL,
     ClockRequest(),
     Clock(time_s=600.0, speed=60.0, epoch=_EPOCH),
 )

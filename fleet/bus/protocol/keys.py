@@ -16,10 +16,10 @@ from urllib.parse import quote, unquote
 from fleet.errors import NAME_RULE, is_name, printable
 
 Role = Literal["arm", "auction", "jobs", "clock"]
-ArmTopic = Literal["alive", "state", "info", "difficulty", "event", "bid", "quote", "award", "history"]
-AuctionTopic = Literal["alive", "announce", "result"]
+ArmTopic = Literal["alive", "state", "info", "difficulty", "event", "bid", "quote", "award", "history", "reset"]
+AuctionTopic = Literal["alive", "announce", "result", "operation"]
 AskedTopic = Literal["lease", "report", "claim"]
-JobsTopic = Literal["submit", "status", "clear"]
+JobsTopic = Literal["submit", "status", "clear", "control", "cell"]
 
 PREFIX = "thermofleet/v4"
 STATES = f"{PREFIX}/*/arm/*/state"

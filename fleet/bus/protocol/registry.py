@@ -10,7 +10,7 @@ from typing import Literal
 
 import msgspec
 
-from fleet.bus.protocol import auction, consensus, history, keys, messages, operator
+from fleet.bus.protocol import auction, cell, consensus, history, keys, messages, operator
 from fleet.bus.protocol.keys import Role
 
 MessageType = type[msgspec.Struct]
@@ -96,16 +96,20 @@ CHANNELS: tuple[Channel, ...] = (
     ),
     Channel("arm", "award", "query", auction.Award, auction.Ack, receiver="auctioneer"),
     Channel("arm", "history", "query", history.HistoryRequest, history.History, receiver="auctioneer, or arm"),
+    Channel("arm", "reset", "query", operator.ResetRequest, operator.ResetReply, receiver="operator"),
     Channel("arm", "bid", "publish", consensus.Bid, receiver="arm", history=1, rate_hz=1.0),
     Channel("arm", "claim", "query", consensus.Claim, consensus.ClaimReply, receiver="arm", lease_s=auction.LEASE_S),
     Channel("auction", "alive", "token", lease_s=SESSION_LEASE_S),
     Channel("auction", "announce", "publish", auction.Announcement, history=HISTORY),
     Channel("auction", "result", "publish", auction.Result, history=HISTORY),
+    Channel("auction", "operation", "publish", operator.Operation, history=HISTORY),
     Channel("auction", "lease", "query", auction.LeaseRequest, auction.Lease, receiver="arm", lease_s=auction.LEASE_S),
     Channel("auction", "report", "query", auction.Report, auction.Receipt, receiver="arm"),
     Channel("jobs", "submit", "query", auction.Submission, auction.SubmissionReply),
     Channel("jobs", "status", "query", auction.StatusRequest, auction.Status),
     Channel("jobs", "clear", "query", operator.ClearRequest, operator.Cleared, receiver="operator"),
+    Channel("jobs", "control", "query", operator.ControlRequest, operator.Controlled, receiver="operator"),
+    Channel("jobs", "cell", "query", cell.CellRequest, cell.Cell),
     Channel("clock", "now", "query", auction.ClockRequest, auction.Clock),
 )
 CHANNEL: Mapping[tuple[str, str], Channel] = {(channel.role, channel.topic): channel for channel in CHANNELS}

@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from fleet.bus.protocol import auction, consensus, keys, messages
+from fleet.bus.protocol import auction, cell, consensus, history, keys, messages, operator
 from fleet.bus.protocol.registry import MESSAGES, MessageType
 from fleet.job import Job, Work
 
@@ -79,7 +79,7 @@ def _structs() -> Mapping[str, MessageType]:
     """Every struct that occurs in the schemas, by name."""
     return {
         name: value
-        for module in (messages, auction, consensus)
+        for module in (messages, auction, cell, consensus, history, operator)
         for name, value in vars(module).items()
         if isinstance(value, type) and issubclass(value, msgspec.Struct)
     }

@@ -143,7 +143,7 @@ def rights(fleet: str, participant: Participant, *, by_consensus: bool = False) 
     Args:
         by_consensus: The fleet has no auctioneer, so its arms reply to outsiders.
     """
-    time, status = keys.of_clock(fleet), keys.of_jobs(fleet, "status")
+    time, status, cell = keys.of_clock(fleet), keys.of_jobs(fleet, "status"), keys.of_jobs(fleet, "cell")
     quotes, awards = keys.of_every_arm(fleet, "quote"), keys.of_every_arm(fleet, "award")
     history = keys.of_every_arm(fleet, "history")
     if participant.role == "arm":
@@ -161,10 +161,12 @@ def rights(fleet: str, participant: Participant, *, by_consensus: bool = False) 
             queries=(quotes, awards, history, time, status),
         )
     if participant.role in ("submitter", "operator"):
-        clear = (keys.of_jobs(fleet, "clear"),) if participant.role == "operator" else ()
-        return Rights(queries=(keys.of_jobs(fleet, "submit"), *clear, status, quotes, time))
+        reset = keys.of_every_arm(fleet, "reset")
+        steer = (keys.of_jobs(fleet, "clear"), keys.of_jobs(fleet, "control"), reset)
+        operator = steer if participant.role == "operator" else ()
+        return Rights(queries=(keys.of_jobs(fleet, "submit"), *operator, status, cell, quotes, time))
     if participant.role in ("monitor", "recorder"):
-        return Rights(queries=(status, time))
+        return Rights(queries=(status, cell, time))
     return Rights()
 
 

@@ -292,7 +292,7 @@ class AwardExecutor:
         report = Report(self.arm, name, active.job, outcome, active.cycles, time_s, reason, faulted=faulted)
         del self._active[name]
         self._reports[name] = _PendingReport(active.award.auctioneer, report, now_s)
-        self._write(closed(report))
+        self.write(closed(report))
 
     # Leases
 
@@ -373,14 +373,14 @@ class AwardExecutor:
         pending = self._reports.get(receipt.award)
         if pending is not None and pending.auctioneer == receipt.auctioneer:
             del self._reports[receipt.award]
-            self._write(ReportReceived(receipt.award))
+            self.write(ReportReceived(receipt.award))
 
     # The disk
 
     def _unwritten_reports(self) -> set[str]:
         return {record.award for record in self.unwritten if isinstance(record, Closed)}
 
-    def _write(self, record: ArmRecord) -> None:
+    def write(self, record: ArmRecord) -> None:
         """Write what has already happened; without space on the disk, later."""
         self.unwritten.append(record)
         self.retry_writes()

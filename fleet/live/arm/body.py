@@ -79,6 +79,10 @@ class Body(Protocol):
         """Limit the cycles of the current job that may be begun, including those done; one in progress is finished."""
         ...
 
+    def clear_fault(self) -> str:
+        """Clear a fault at once, if it may be; return why it may not, or ""."""
+        ...
+
     def release(self) -> None:
         """Finish the cycle, return home, release the job."""
         ...

@@ -40,6 +40,13 @@ class ReportReceived(msgspec.Struct, frozen=True, tag="report_received"):
     award: Name
 
 
+class FaultCleared(msgspec.Struct, frozen=True, tag="fault_cleared"):
+    """A person has cleared a fault of the arm."""
+
+    by: str
+    time_s: float
+
+
 class PastAward(msgspec.Struct, frozen=True, tag="past_award"):
     """An award that was accepted and closed: only its answer is kept."""
 
@@ -55,7 +62,16 @@ class JobsFinished(msgspec.Struct, frozen=True, tag="jobs_finished"):
 
 
 ArmRecord = (
-    JobsFinished | Started | AwardAccepted | Progress | CommitPermitted | Closed | Released | ReportReceived | PastAward
+    JobsFinished
+    | Started
+    | AwardAccepted
+    | Progress
+    | CommitPermitted
+    | Closed
+    | Released
+    | ReportReceived
+    | PastAward
+    | FaultCleared
 )
 
 
@@ -135,6 +151,8 @@ class ArmHistory(JournalState[ArmRecord]):
                 self.epoch = epoch or self.epoch
                 for job in jobs:
                     self._finish(job)
+            case FaultCleared():
+                pass
 
     def _finish(self, job: JobSpec) -> None:
         self.finished.pop(job.name, None)

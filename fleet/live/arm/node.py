@@ -16,6 +16,7 @@ from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Ack, Award, JobEstimate, JobSpec, Quote, QuoteRequest
 from fleet.bus.protocol.messages import State
+from fleet.bus.protocol.operator import ResetReply, ResetRequest
 from fleet.difficulty import known_temperatures
 from fleet.errors import Refused, printable
 from fleet.events import Event
@@ -24,7 +25,7 @@ from fleet.live.arm.award_executor import AwardExecutor
 from fleet.live.arm.body import Body
 from fleet.live.arm.config import ArmConfig
 from fleet.live.arm.estimator import NO_CYCLES, Estimator, ScoredPlan
-from fleet.live.arm.journal_records import ActiveAward
+from fleet.live.arm.journal_records import ActiveAward, FaultCleared
 from fleet.live.arm.planning import PlanningThread
 from fleet.live.arm.publications import Publications
 from fleet.live.clock import FleetClock, next_due_s
@@ -63,6 +64,8 @@ class ArmNode:
         self._name = executor.arm
         self._body_award = ""
         """Award that the body works on."""
+        self._cleared_by: str | None = None
+        """The person who has cleared the present fault."""
         self._planning = PlanningThread(estimator)
         self._plans: dict[str, ScoredPlan] = {}
         """Plan of each active award: it stays even if the estimator drops it."""
@@ -93,6 +96,7 @@ class ArmNode:
         self._publish.info(len(self._reading.temp_c), self._estimator.model.version)
         link.reply_to(keys.of_arm(fleet, name, "quote"), QuoteRequest, self._quote)
         link.reply_to(keys.of_arm(fleet, name, "award"), Award, self._award)
+        link.reply_to(keys.of_arm(fleet, name, "reset"), ResetRequest, self._reset)
         link.declare_token(keys.of_arm(fleet, name, "alive"))
         self._step()
 
@@ -119,6 +123,16 @@ class ArmNode:
             estimates=estimates,
             space=self._possible_space(),
         )
+
+    def _reset(self, request: ResetRequest) -> ResetReply:
+        self._reading = self._body.read_sensors()
+        if self._reading.mode != "faulted":
+            return ResetReply(self._name, changed=False)
+        if reason := self._body.clear_fault():
+            raise Refused(f"The fault of '{self._name}' is not cleared: {reason}.")
+        self.executor.write(FaultCleared(request.by, self._body.time_s))
+        self._cleared_by = request.by
+        return ResetReply(self._name, changed=True)
 
     @property
     def space(self) -> tuple[str, ...]:
@@ -223,8 +237,9 @@ class ArmNode:
         """Advance the body to the present, as far as leases allow."""
         now_s, current = self.clock.now_s(real_s), self._current
         self._assign(current)
-        if current is not None and current.lease_end_s < real_s:
-            # Work done within the lease counts, even if this process was stopped since.
+        if current is not None and self.clock.real_s <= current.lease_end_s < real_s:
+            # Work done within the lease counts, even if this process was stopped since. A clock that was set later does
+            # not know the fleet time of the end of the lease: it returns a later one.
             lease_end_s = math.nextafter(current.lease_end_s, -math.inf)
             self._advance(self.clock.now_s(lease_end_s), current, lease_end_s, real_s)
             current = self._current
@@ -291,6 +306,8 @@ class ArmNode:
             self.executor.record_progress(int(event.value), math.inf)
             self.executor.return_all(event.time_s, real_s, f"the arm faulted; {event.reason}", faulted=True)
             self._reading = self._body.read_sensors()  # the next estimates take the fault into account
+        elif event.kind == "recover" and self._cleared_by is not None:
+            event, self._cleared_by = replace(event, reason=f"cleared by '{self._cleared_by}'"), None
         self._publish.event(event)
 
     def _busy_s(self) -> float:

@@ -83,6 +83,9 @@ class ReplayBody:
         self._start_s += time_s - self._now_s
         self._now_s = time_s
 
+    def clear_fault(self) -> str:
+        return "a recorded arm has no faults"
+
     def set_step(self, dt_s: float) -> None:
         pass  # samples are read at any time
 

@@ -192,6 +192,13 @@ class SimulatedBody:
             if not self._working:
                 self._task = None
 
+    def clear_fault(self) -> str:
+        hottest_c = float(self._state.temp_c[0, 0, WINDING].max())
+        if hottest_c >= self._limits.restart_c:
+            return f"a motor has {hottest_c:.1f} °C; a fault can be cleared below {self._limits.restart_c:g} °C"
+        self._state = self._state._replace(clear_at_s=np.full((1, 1), float(self._state.tick[0]) * self._dt_s))
+        return ""
+
     def set_time(self, time_s: float) -> None:
         self._start_s += time_s - self.time_s
 

@@ -34,11 +34,12 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.history import History
 from fleet.bus.protocol.messages import State
-from fleet.bus.protocol.operator import Cleared, ClearRequest
+from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
 from fleet.errors import Refused
+from fleet.live.auction.control import ALREADY_DONE, job_of, next_step, objection
 from fleet.live.auction.leases import CountedLease, adopted, send_again, unanswered
 from fleet.live.auction.ledger import Ledger
-from fleet.live.auction.records import AuctionRecord, ContactLost, ContactRegained, ShiftEnded
+from fleet.live.auction.records import AuctionRecord, ContactLost, ContactRegained, Operated, ShiftEnded
 from fleet.live.auction.round import MAX_REASON, Allocate, Timing
 from fleet.live.auction.rounds import SCAN_S, Rounds
 from fleet.live.auction.space_rules import cleared_space, retaken_space
@@ -205,6 +206,25 @@ class Auctioneer:
             self.rounds.retry_now()
         return Cleared(self.name, request.arm)
 
+    def control(self, request: ControlRequest, time_s: float) -> Controlled:
+        """Carry out a request of a person, once; it is on disk when this returns.
+
+        Raises:
+            Refused: it is not possible now.
+        """
+        ledger, job = self.ledger, job_of(request)
+        known = request.request in ledger.requests
+        note = ALREADY_DONE if known else objection(ledger, request, self.rounds.states.keys() | self.rounds.present)
+        if not known:
+            self._writer.record(Operated(request, time_s))
+            self.out.append(Operation(self.name, time_s, request))
+            _LOG.warning("'%s' requested: %s", request.by, request.action)
+            self.rounds.retry_now()
+        changed = not (known or note)
+        status = next(iter(self.status((job,))), None) if job else None
+        note = note or next_step(ledger, request)
+        return Controlled(self.name, request.request, changed, note, status, dict(ledger.paused))
+
     def set_present(self, present: frozenset[str]) -> None:
         """Set which arms are present."""
         if present - self.rounds.present:
@@ -240,13 +260,15 @@ class Auctioneer:
         lease = self._writer.leases.get(status.award)
         cycles = status.cycles if lease is None else max(status.cycles, lease.cycles)
         note = self.rounds.note(status.job) if status.state == "waiting" else ""
-        return replace(status, cycles=cycles, reason=status.reason or note)
+        state = self.rounds.states.get(status.arm) if status.state in ("awarded", "finishing") else None
+        finish_s = state.time_s + state.busy_s if state is not None and state.job == status.job else None
+        return replace(status, cycles=cycles, reason=status.reason or note, finish_s=finish_s)
 
     def _is_leased(self, entry: LeaseEntry, arm: str) -> bool:
         award = self.ledger.open.get(entry.award)
         if award is None or (award.record.arm, award.record.job) != (arm, entry.job):
             return False
-        return award.may_commit or not self.ledger.ended
+        return self.ledger.may_begin(entry.award)
 
     def _permit_commits(self, leased: dict[str, LeaseEntry], time_s: float) -> bool:
         """Record permissions to commit, and contact with silent arms; return whether that is on disk."""

@@ -7,10 +7,12 @@ from collections.abc import Callable, Collection, Container, Iterable, Mapping, 
 from itertools import accumulate
 
 import networkx as nx
+from msgspec import UNSET
 from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import MOST_JOBS, SETTLED, Admission, JobSpec, JobStatus, Status
 from fleet.bus.protocol.messages import encode
+from fleet.bus.protocol.operator import Change as ChangeJob
 from fleet.live.auction.past_jobs import PastJobs
 
 MAX_OPEN_JOBS = 10_000
@@ -18,6 +20,9 @@ MAX_OPEN_JOBS = 10_000
 MAX_BYTES = 60_000
 """Size of the statuses in one reply: a router may drop larger messages."""
 SHIFT_ENDED = "The shift ended before it was done."
+
+
+NOT_PAUSED: Mapping[str, str] = {}
 
 
 def reason_for_silence(arm: str) -> str:
@@ -87,6 +92,21 @@ EXPIRED = "expired: its due date passed before an arm had begun it."
 def is_late(job: JobSpec, time_s: float) -> bool:
     """Return whether a job that still waits has expired at a fleet time."""
     return job.expires and job.due_s is not None and job.due_s < time_s
+
+
+def changed_spec(job: JobSpec, change: ChangeJob) -> JobSpec:
+    """Return a job with the due date and value that a person has requested.
+
+    Raises:
+        ValueError: they are not possible for this job.
+    """
+    given = {"due_s": change.due_s, "value": change.value}
+    return replace(job, **{name: value for name, value in given.items() if value is not UNSET})
+
+
+def is_same_work(one: JobSpec, other: JobSpec) -> bool:
+    """Return whether two jobs differ at most in due date and value, which a person may change."""
+    return replace(one, due_s=None, value=1.0) == replace(other, due_s=None, value=1.0)
 
 
 def lost_jobs(jobs: Collection[JobSpec], given_up: Container[str]) -> dict[str, str]:
@@ -163,7 +183,12 @@ def ready_jobs(
 
 
 def status_reply(
-    name: str, time_s: float, statuses: Iterable[JobStatus], taken: Mapping[str, Iterable[str]], epoch: str = ""
+    name: str,
+    time_s: float,
+    statuses: Iterable[JobStatus],
+    taken: Mapping[str, Iterable[str]],
+    epoch: str = "",
+    paused: Mapping[str, str] = NOT_PAUSED,
 ) -> Status:
     """Return the reply to a status request.
 
@@ -174,7 +199,7 @@ def status_reply(
         taken: Names of the spaces that each arm may take.
     """
     kept, space = list(statuses), {arm: tuple(sorted(names)) for arm, names in sorted(taken.items()) if names}
-    reply = Status(name, time_s, (), space, epoch)
+    reply = Status(name, time_s, (), space, epoch, dict(paused))
     if len(kept) > MOST_JOBS:
         kept = sorted(kept, key=lambda status: status.state in SETTLED)[:MOST_JOBS]
     sizes = accumulate((len(encode(status)) + 1 for status in kept), initial=len(encode(reply)))

@@ -4,8 +4,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from fleet.bus.protocol.auction import Award
+from fleet.bus.protocol.auction import Award, JobSpec
 from fleet.bus.protocol.history import History
+from fleet.live.auction.job_rules import is_same_work
 from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.records import AuctionRecord, Awarded, HistoryAdopted
 from fleet.live.auction.round import Assignment, Bidding, Timing
@@ -70,10 +71,14 @@ def adopted(ledger: Ledger, history: History, name: str, time_s: float) -> list[
     """
     records: list[AuctionRecord] = []
     waiting = {job: entry.spec for job, entry in ledger.waiting.items()}
+
+    def is_waiting(job: JobSpec) -> bool:
+        return job.name in waiting and is_same_work(waiting[job.name], job)
+
     unknown = tuple(
         job
         for job in history.finished
-        if waiting.get(job.name) == job or (job.name not in ledger.jobs and job.name not in ledger.past)
+        if is_waiting(job) or (job.name not in ledger.jobs and job.name not in ledger.past)
     )
     if unknown:
         records.append(HistoryAdopted(history.arm, unknown, time_s))
@@ -81,7 +86,7 @@ def adopted(ledger: Ledger, history: History, name: str, time_s: float) -> list[
     for award in history.awards:
         job = award.job
         fresh = job.name not in ledger.jobs and job.name not in ledger.past and job.name not in done
-        if award.auctioneer != name or award.award in ledger.awards or not (fresh or waiting.get(job.name) == job):
+        if award.auctioneer != name or award.award in ledger.awards or not (fresh or is_waiting(job)):
             continue
         if fresh:
             records.append(JobsAccepted((job,), f"adopted from {history.arm}", time_s))

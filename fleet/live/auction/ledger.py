@@ -9,9 +9,11 @@ from dataclasses import dataclass
 
 from msgspec.structs import asdict, replace
 
-from fleet.bus.protocol.auction import JobState
+from fleet.bus.protocol.auction import ABANDONED, SETTLED, JobState
+from fleet.bus.protocol.operator import ALL_ARMS, Cancel, ControlRequest, Pause, Resume, Settle
+from fleet.bus.protocol.operator import Change as ChangeJob
 from fleet.job import reason_to_give_up
-from fleet.live.auction.job_rules import EXPIRED, SHIFT_ENDED, lost_jobs, reason_for_silence
+from fleet.live.auction.job_rules import EXPIRED, SHIFT_ENDED, changed_spec, lost_jobs, reason_for_silence
 from fleet.live.auction.ledger_view import MAX_RECENT, LedgerView
 from fleet.live.auction.past_jobs import PastJobs
 from fleet.live.auction.records import (
@@ -25,6 +27,7 @@ from fleet.live.auction.records import (
     HistoryAdopted,
     JobEntry,
     LedgerSnapshot,
+    Operated,
     ShiftEnded,
 )
 from fleet.live.journal import TimedState
@@ -42,6 +45,8 @@ from fleet.live.space import ANYWHERE
 
 MAX_SETTLED = 2_000
 """Finished and given-up jobs whose status is kept; older ones leave the ledger, and only `PastJobs` knows them."""
+MAX_REQUESTS = 1_024
+"""Requests of people whose names are kept."""
 MAX_AWARDS = 16
 """Closed awards of one job on which a report is still expected."""
 
@@ -74,6 +79,8 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
             open=tuple(self.open),
             recent=tuple(self.recent),
             space={arm: tuple(sorted(spaces)) for arm, spaces in self.space.items()},
+            paused=dict(self.paused),
+            requests=tuple(self.requests),
         )
         return (snapshot,)
 
@@ -123,17 +130,33 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
                 self.epoch, self.succeeds = record.epoch, record.succeeds
             case HistoryAdopted():
                 changed = self._adopt(record)
+            case Operated():
+                changed = self._operate(record.request, record.time_s)
             case LedgerSnapshot():
                 self._restore(record)
             case Started() | ClockTick():
                 pass
         self.time_s = max(self.time_s, record.time_s)
-        changes = [self._change(entry, record.time_s) for entry in changed]
+        by = self._person(record)
+        changes = [self._change(entry, record.time_s, by) for entry in changed]
         while len(self.settled) > MAX_SETTLED:
             self._leave(next(iter(self.settled)))
         return changes
 
     # Inside
+
+    def _person(self, record: AuctionRecord) -> str:
+        """Return who asked for what a record changes; "" if nobody."""
+        match record:
+            case JobsAccepted():
+                return record.by
+            case Operated():
+                return record.request.by
+            case Closed() if (award := self.awards.get(record.award)) is not None:
+                entry = self.jobs[award.record.job]
+                return entry.changed_by if entry.state == "cancelled" else ""
+            case _:
+                return ""
 
     def _move(self, entry: JobEntry, state: JobState, reason: str = "") -> None:
         """Change the state of a job."""
@@ -143,7 +166,7 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
         entry.state, entry.reason = state, reason
         if state == "waiting":
             self.waiting[name] = entry
-        elif state in ("finished", "given_up"):
+        elif state in ("finished", *ABANDONED):
             self.settled[name] = None
 
     def _adopt(self, record: HistoryAdopted) -> list[JobEntry]:
@@ -161,7 +184,7 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
         """Forget a settled job, except for its name and outcome."""
         entry = self.jobs.pop(name)
         del self.settled[name]
-        self.past.add(entry.spec, finished=entry.state == "finished")
+        self.past.add(entry.original, finished=entry.state == "finished")
         self.left[entry.state] = self.left.get(entry.state, 0) + 1
         for award in self._awards_of.pop(name, ()):
             del self.awards[award]
@@ -192,13 +215,13 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
         if record.outcome == "finished":
             if entry.award in self.open:  # a later award of the same job has no purpose any more
                 self._end(self.open[entry.award])
-            given_up = entry.state == "given_up"
+            given_up = entry.state in ABANDONED
             entry.award, entry.finished_s = record.award, record.time_s
             self._move(entry, "finished")
             return [entry, *(self._follow_given_up() if given_up else ())]
         if entry.award != record.award:  # the job was awarded again since
             return self._give_up(entry)
-        if record.unsure or self.ended:
+        if record.unsure or (self.ended and not entry.cancelled):
             self._move(entry, "unfinished", record.reason or "It is unknown whether its last cycle was done.")
             return [entry]
         self._move(entry, "waiting", record.reason)
@@ -208,20 +231,68 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
         return self._give_up(entry) or [entry]
 
     def _give_up(self, entry: JobEntry) -> list[JobEntry]:
-        """Give a waiting job up if arms have faulted in it too often; return what has changed."""
+        """Give a waiting job up if it is cancelled, or arms have faulted in it too often; return what has changed."""
+        if entry.state == "waiting" and entry.cancelled:
+            return self._cancel(entry)
         reason = reason_to_give_up(entry.faults)
         if entry.state != "waiting" or not reason:
             return []
         self._move(entry, "given_up", reason)
         return [entry, *self._follow_given_up()]
 
+    def _cancel(self, entry: JobEntry) -> list[JobEntry]:
+        self._move(entry, "cancelled", f"Cancelled by '{entry.changed_by}'.")
+        return [entry, *self._follow_given_up()]
+
+    def _operate(self, request: ControlRequest, time_s: float) -> list[JobEntry]:
+        """Carry out a request of a person, which `fleet.live.auction.control` has checked; return what has changed."""
+        self.requests[request.request] = None
+        while len(self.requests) > MAX_REQUESTS:
+            del self.requests[next(iter(self.requests))]
+        match request.action:
+            case Pause(arm):
+                self.paused[arm] = request.by
+            case Resume(arm):
+                self.paused = {} if arm == ALL_ARMS else {a: by for a, by in self.paused.items() if a != arm}
+            case Cancel(name) | Settle(name) | ChangeJob(name):
+                if (entry := self.jobs.get(name)) is not None:
+                    return self._operate_job(entry, request, time_s)
+        return []
+
+    def _operate_job(self, entry: JobEntry, request: ControlRequest, time_s: float) -> list[JobEntry]:
+        action, before = request.action, entry.state
+        if isinstance(action, Cancel) and before not in ("finished", "unfinished", "cancelled"):
+            entry.cancelled, entry.changed_by = True, request.by
+            if before in ("waiting", "given_up"):
+                return self._cancel(entry)
+            self._move(entry, before, f"Cancelled by '{request.by}'; its arm ends the cycle in progress.")
+            return [entry]
+        if isinstance(action, Settle) and before == "unfinished":
+            entry.cancelled, entry.changed_by = False, request.by
+            if action.outcome == "done":
+                if entry.award in self.open:
+                    self._end(self.open[entry.award])
+                entry.cycles, entry.finished_s = entry.spec.repetitions, time_s
+                self._move(entry, "finished", f"Settled as done by '{request.by}'.")
+                return [entry, *self._follow_given_up()]
+            entry.award = ""  # a late report on it that is unsure is settled, too
+            entry.cycles = min(entry.cycles, entry.spec.repetitions - 1)
+            self._move(entry, "waiting", f"To be redone, by '{request.by}'.")
+            return self._give_up(entry) or [entry]
+        if isinstance(action, ChangeJob) and before not in SETTLED:
+            changed = changed_spec(entry.spec, action)
+            if changed != entry.spec:
+                entry.submitted, entry.spec, entry.changed_by = entry.original, changed, request.by
+                return [entry]
+        return []
+
     def _follow_given_up(self) -> list[JobEntry]:
         """Give up jobs that wait for one that is given up; return what has changed.
 
         They wait again if that one was finished after all.
         """
-        given_up = [self.jobs[name] for name in self.settled if self.jobs[name].state == "given_up"]
-        causes = {entry.spec.name for entry in given_up if entry.expired or reason_to_give_up(entry.faults)}
+        given_up = [self.jobs[name] for name in self.settled if self.jobs[name].state in ABANDONED]
+        causes = {e.spec.name for e in given_up if e.cancelled or e.expired or reason_to_give_up(e.faults)}
         open_jobs = [*self.waiting.values(), *(entry for entry in given_up if entry.spec.name not in causes)]
         causes |= {name for entry in open_jobs for name in entry.spec.after if self.past.is_given_up(name)}
         lost = lost_jobs([entry.spec for entry in open_jobs], causes) if causes else {}
@@ -248,7 +319,7 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
         self.jobs = {entry.spec.name: replace(entry) for entry in snapshot.jobs}
         self.waiting = {name: entry for name, entry in self.jobs.items() if entry.state == "waiting"}
         self.settled = dict.fromkeys(snapshot.settled)
-        self.settled |= {name: None for name, e in self.jobs.items() if e.state in ("finished", "given_up")}
+        self.settled |= {name: None for name, e in self.jobs.items() if e.state in ("finished", *ABANDONED)}
         self.past, self.left, self.epoch = PastJobs(snapshot.past, self.past.limit), dict(snapshot.left), snapshot.epoch
         self.succeeds = snapshot.succeeds
         self.awards = {award.record.award: replace(award) for award in snapshot.awards}
@@ -258,6 +329,7 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
         self.open = {name: self.awards[name] for name in snapshot.open}
         self.recent = deque(snapshot.recent, maxlen=MAX_RECENT)
         self.space |= {arm: frozenset(spaces) for arm, spaces in snapshot.space.items()}
+        self.paused, self.requests = dict(snapshot.paused), dict.fromkeys(snapshot.requests)
 
     def _may_count(self, award: AwardState) -> bool:
         """Whether a report on a closed award could change the state of its job."""
@@ -266,8 +338,8 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
     def _entry(self, award: str) -> JobEntry:
         return self.jobs[self.awards[award].record.job]
 
-    def _change(self, entry: JobEntry, time_s: float) -> Change:
-        change = Change(self.number, time_s, self.status_of(entry))
+    def _change(self, entry: JobEntry, time_s: float, by: str) -> Change:
+        change = Change(self.number, time_s, self.status_of(entry), by=by)
         if entry.award:
             award = asdict(self.awards[entry.award].record)
             change = replace(

@@ -4,7 +4,8 @@ from collections import deque
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from fleet.bus.protocol.auction import SETTLED, Admission, JobSpec, JobState, JobStatus
+from fleet.bus.protocol.auction import ABANDONED, SETTLED, Admission, JobSpec, JobState, JobStatus
+from fleet.bus.protocol.operator import ALL_ARMS
 from fleet.live.auction.job_rules import admit, is_late, job_order, ready_jobs
 from fleet.live.auction.past_jobs import PastJobs
 from fleet.live.auction.records import AwardState, Change, Expired, JobEntry
@@ -50,11 +51,16 @@ class LedgerView:
     """Names of the spaces that an arm may take besides those of its open awards, by arm: closed awards leave theirs
     here until the arm says that it is at home."""
 
+    paused: dict[str, str] = field(default_factory=dict[str, str])
+    """Who paused an arm, by arm; "*" for all arms."""
+    requests: dict[str, None] = field(default_factory=dict[str, None])
+    """Names of the last requests of people that were carried out, oldest first."""
+
     def admit(self, jobs: Sequence[JobSpec]) -> tuple[Admission, ...]:
         """Return which submitted jobs can be accepted; changes nothing."""
         named = {name for job in jobs for name in (job.name, *job.after) if name in self.jobs}
-        known = {name: self.jobs[name].spec for name in named}
-        given_up = {name for name in named if self.jobs[name].state == "given_up"}
+        known = {name: self.jobs[name].original for name in named}
+        given_up = {name for name in named if self.jobs[name].state in ABANDONED}
         given_up |= {name for job in jobs for name in job.after if self.past.is_given_up(name)}
         count = len(self.jobs) - len(self.settled)
         return admit(jobs, known, places=self.places, count=count, ended=self.ended, given_up=given_up, past=self.past)
@@ -81,6 +87,16 @@ class LedgerView:
         """Return the waiting jobs whose hard due date has passed."""
         entries = () if self.ended else self.waiting.values()
         return [Expired(entry.spec.name, time_s) for entry in entries if is_late(entry.spec, time_s)]
+
+    def is_paused(self, arm: str) -> bool:
+        """Return whether an arm gets no jobs."""
+        return arm in self.paused or ALL_ARMS in self.paused
+
+    def may_begin(self, award: str) -> bool:
+        """Return whether cycles of an open award may be begun under a lease."""
+        state = self.open[award]
+        cancelled = self.jobs[state.record.job].cancelled
+        return state.may_commit or not (self.ended or cancelled or self.is_paused(state.record.arm))
 
     def busy_stations(self) -> frozenset[str]:
         """Return the stations at which an arm may be at work; a silent arm does not block its station."""
@@ -123,4 +139,5 @@ class LedgerView:
         )
         award = entry.award if assigned else ""
         arm = self.awards[award].record.arm if award else ""
-        return JobStatus(entry.spec.name, entry.state, arm, award, entry.cycles, entry.finished_s, entry.reason)
+        done = (entry.cycles, entry.finished_s, entry.reason, entry.spec.repetitions)
+        return JobStatus(entry.spec.name, entry.state, arm, award, *done)

@@ -28,8 +28,9 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
+from fleet.bus.protocol.cell import Cell, CellRequest
 from fleet.bus.protocol.messages import State
-from fleet.bus.protocol.operator import Cleared, ClearRequest
+from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
 from fleet.bus.protocol.registry import SESSION_LEASE_S
 from fleet.errors import BusError, JournalFull, Refused
 from fleet.live.auction.auctioneer import Auctioneer
@@ -81,6 +82,7 @@ class AuctionNode:
         arms: tuple[str, ...] = (),
         excludes: Excludes = no_conflicts,
         new_epoch: bool = False,
+        cell: Cell | None = None,
     ) -> None:
         """Continue from a journal.
 
@@ -91,6 +93,7 @@ class AuctionNode:
             places: Names of the cell's places; None allows any name.
             arms: Arms of the cell; each may be anywhere until it is heard.
             excludes: Which plans of two arms exclude each other.
+            cell: Reply to requests for the cell; None refuses them.
             new_epoch: Begin with an empty journal even if arms know an older one.
 
         Raises:
@@ -99,6 +102,7 @@ class AuctionNode:
         """
         self._link, self._name, self.journal = link, name, journal
         self._timing = timing or Timing()
+        self._cell = cell
         self._check_no_auctioneer()
         ledger = Ledger(places, arms).replay(journal.records())
         if not (ledger.epoch or new_epoch):
@@ -189,10 +193,13 @@ class AuctionNode:
         link, fleet, name, auctioneer = self._link, self._link.fleet, self._name, self.auctioneer
         self._announce = link.publisher(keys.of_auction(fleet, name, "announce"), Announcement)
         self._result = link.publisher(keys.of_auction(fleet, name, "result"), Result)
+        self._operation = link.publisher(keys.of_auction(fleet, name, "operation"), Operation)
         renew_leases, apply_report = self._logged(auctioneer.renew_leases), self._logged(auctioneer.apply_report)
         link.reply_to(keys.of_jobs(fleet, "submit"), Submission, self._logged(self._submit))
         link.reply_to(keys.of_jobs(fleet, "status"), StatusRequest, self._status)
         link.reply_to(keys.of_jobs(fleet, "clear"), ClearRequest, self._logged(self._clear))
+        link.reply_to(keys.of_jobs(fleet, "cell"), CellRequest, self._describe_cell)
+        link.reply_to(keys.of_jobs(fleet, "control"), ControlRequest, self._logged(self._control))
         link.reply_to(keys.asked_by_every_arm(fleet, name, "lease"), LeaseRequest, renew_leases)
         link.reply_to(keys.asked_by_every_arm(fleet, name, "report"), Report, apply_report)
         link.reply_to(keys.of_clock(fleet), ClockRequest, lambda _: Clock(self.time_s, self._clock.speed, self.epoch))
@@ -225,10 +232,21 @@ class AuctionNode:
             raise Refused(f"{self._name_rivals()}: no space is cleared until one is stopped.")
         return self.auctioneer.clear(request, self.present, time_s)
 
+    def _control(self, request: ControlRequest, real_s: float, time_s: float) -> Controlled:
+        if self.rivals:
+            raise Refused(f"{self._name_rivals()}: nothing is changed until one is stopped.")
+        return self.auctioneer.control(request, time_s)
+
+    def _describe_cell(self, _: CellRequest) -> Cell:
+        if self._cell is None:
+            raise Refused("This auctioneer knows no cell.")
+        return self._cell
+
     def _status(self, request: StatusRequest) -> Status:
         auctioneer = self.auctioneer
         taken = auctioneer.ledger.taken_space()
-        return status_reply(self._name, self.time_s, auctioneer.status(request.jobs), taken, self.epoch)
+        paused = auctioneer.ledger.paused
+        return status_reply(self._name, self.time_s, auctioneer.status(request.jobs), taken, self.epoch, paused)
 
     def _apply_state(self, arm: str, state: State) -> None:
         self._state_s[arm] = time.monotonic()
@@ -321,6 +339,8 @@ class AuctionNode:
                     self._announce(announcement)
                 case Result() as result:
                     self._result(result)
+                case Operation() as operation:
+                    self._operation(operation)
 
     def _end_quotes(self, auction: str, replies: Replies[Quote]) -> None:
         for reason in filter(None, replies.refused.values()):

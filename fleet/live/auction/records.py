@@ -3,6 +3,7 @@
 import msgspec
 
 from fleet.bus.protocol.auction import JobSpec, JobState, JobStatus
+from fleet.bus.protocol.operator import ControlRequest
 from fleet.live.journal_records import (
     ClockTick,
     Closed,
@@ -71,6 +72,13 @@ class ShiftEnded(msgspec.Struct, frozen=True, tag="shift_ended"):
     time_s: float
 
 
+class Operated(msgspec.Struct, frozen=True, tag="operated"):
+    """A request of a person is carried out; what changes follows from the state."""
+
+    request: ControlRequest
+    time_s: float
+
+
 class Change(msgspec.Struct, frozen=True):
     """A job's state has changed; fields as in `fleet.bus.protocol.auction.Result`."""
 
@@ -81,6 +89,7 @@ class Change(msgspec.Struct, frozen=True):
     difficulty: float | None = None
     p_saturation: float | None = None
     peak_c: float | None = None
+    by: str = ""
 
 
 class JobEntry(msgspec.Struct):
@@ -102,6 +111,17 @@ class JobEntry(msgspec.Struct):
     """The arm of each fault in this job."""
     expired: bool = False
     """It waited when its hard due date passed."""
+    cancelled: bool = False
+    """A person has cancelled it: it never waits again, unless a person has it redone."""
+    changed_by: str = ""
+    """The person whose request changed it last."""
+    submitted: JobSpec | None = None
+    """As it was submitted, if a person has changed it since."""
+
+    @property
+    def original(self) -> JobSpec:
+        """The job as it was submitted."""
+        return self.submitted or self.spec
 
 
 class AwardState(msgspec.Struct):
@@ -134,9 +154,11 @@ class LedgerSnapshot(msgspec.Struct, frozen=True, tag="ledger_snapshot"):
     left: dict[JobState, int] = {}
     epoch: str = ""
     succeeds: bool = False
+    paused: dict[str, str] = {}
+    requests: tuple[str, ...] = ()
 
 
 AwardRecord = Awarded | CommitPermitted | ContactLost | ContactRegained | Closed
-JobRecord = JobsAccepted | Expired | HistoryAdopted
+JobRecord = JobsAccepted | Expired | HistoryAdopted | Operated
 SpaceRecord = SpaceTaken | SpaceCleared
 AuctionRecord = Started | EpochBegun | ClockTick | JobRecord | AwardRecord | SpaceRecord | ShiftEnded | LedgerSnapshot

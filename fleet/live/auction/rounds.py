@@ -86,10 +86,11 @@ class Rounds:
 
     def _begin(self, real_s: float, time_s: float) -> None:
         waiting = unanswered(self._writer.leases)
-        bidders = self.present - {message.arm for _, message in waiting}
+        ledger = self._writer.ledger
+        able = {arm for arm in self.present if not ledger.is_paused(arm)}
+        bidders = frozenset(able - {message.arm for _, message in waiting})
         if not bidders or any(real_s < lease.sent_s + self._timing.window_s for lease, _ in waiting):
             return
-        ledger = self._writer.ledger
         self._later_s = {job: at_s for job, at_s in self._later_s.items() if at_s > real_s}
         self._notes = {job: note for job, note in self._notes.items() if job in ledger.waiting}
         jobs = tuple(ledger.ready(time_s, self._timing.max_jobs, excluded=self._later_s))
@@ -109,9 +110,9 @@ class Rounds:
             self.delay(real_s, (job.name for job in closing.jobs))
             return
         entries = [self._writer.ledger.jobs[job.name] for job in closing.jobs]
-        entries = [entry for entry in entries if entry.state == "waiting"]
+        entries = [e for e, job in zip(entries, closing.jobs, strict=True) if e.state == "waiting" and e.spec == job]
         jobs = tuple(entry.spec for entry in entries)
-        quotes = {arm: quote for arm, quote in closing.quotes.items() if arm in closing.asked & self.present}
+        quotes = {arm: quote for arm, quote in closing.quotes.items() if self._may_work(arm, closing)}
         bidding = Bidding(
             closing.auction,
             time_s,
@@ -139,6 +140,9 @@ class Rounds:
             if not bidding.quotes:  # no arm has capacity for any job
                 self._scan_s = real_s + self._pause_s
             self.delay(real_s, (job.name for job in closing.jobs))
+
+    def _may_work(self, arm: str, closing: Round) -> bool:
+        return arm in closing.asked & self.present and not self._writer.ledger.is_paused(arm)
 
     def _award(self, bidding: Bidding, allocation: dict[str, Assignment], real_s: float, time_s: float) -> None:
         self._writer.record(*(records := new_awards(self._writer.ledger, bidding, allocation, time_s)))

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from msgspec.structs import asdict
 
 from fleet.bus.protocol.auction import Announcement, QuoteRequest, Result
+from fleet.bus.protocol.operator import Operation
 from fleet.errors import JournalFull
 from fleet.live.auction.leases import CountedLease, SendAward
 from fleet.live.auction.ledger import Ledger
@@ -14,7 +15,7 @@ from fleet.live.auction.records import AuctionRecord, Change
 
 _LOG = logging.getLogger(__name__)
 
-Out = QuoteRequest | SendAward | Announcement | Result
+Out = QuoteRequest | SendAward | Announcement | Result | Operation
 
 
 class LedgerWriter:

@@ -10,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Iterable
 from random import Random
+from typing import NoReturn
 
 from msgspec.structs import replace
 
@@ -27,10 +28,11 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
+from fleet.bus.protocol.cell import CellRequest
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply
 from fleet.bus.protocol.history import History, HistoryRequest
 from fleet.bus.protocol.messages import State
-from fleet.bus.protocol.operator import Cleared, ClearRequest
+from fleet.bus.protocol.operator import Cleared, ClearRequest, ControlRequest
 from fleet.errors import BusError, Refused
 from fleet.live.arm.auctioneer_client import RateLimitedWarnings
 from fleet.live.arm.node import ArmNode
@@ -214,6 +216,8 @@ class ConsensusNode:
         link.reply_to(keys.of_jobs(fleet, "submit"), Submission, self._submit)
         link.reply_to(keys.of_jobs(fleet, "status"), StatusRequest, self._status)
         link.reply_to(keys.of_jobs(fleet, "clear"), ClearRequest, self._clear)
+        link.reply_to(keys.of_jobs(fleet, "control"), ControlRequest, self._refuse)
+        link.reply_to(keys.of_jobs(fleet, "cell"), CellRequest, self._refuse)
         link.reply_to(keys.of_clock(fleet), ClockRequest, self._clock)
         link.subscribe(keys.of_every_arm(fleet, "bid"), Bid, self._apply_bid, history=True)
         link.subscribe(keys.of_every_arm(fleet, "state"), State, self.participant.states.__setitem__)
@@ -291,6 +295,10 @@ class ConsensusNode:
         finally:
             self._check_first()
         return Cleared(self._name, request.arm)
+
+    def _refuse(self, _: ControlRequest | CellRequest) -> NoReturn:
+        self._check_first()
+        raise Refused("Only a fleet with an auctioneer replies to this; these arms allocate the jobs themselves.")
 
     def _clock(self, _: ClockRequest) -> Clock:
         self._check_first()

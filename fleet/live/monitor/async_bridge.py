@@ -76,6 +76,10 @@ class AsyncBridge:
         """Request the status of jobs. Raises NoReply if no auctioneer replied, or it refused."""
         return await self._ask_auctioneer(keys.of_jobs(self._link.fleet, "status"), request, Status)
 
+    async def request(self, topic: keys.JobsTopic, request: msgspec.Struct, kind: type[Reply]) -> Reply:
+        """Send another request to the auctioneer. Raises NoReply if it did not reply, or refused."""
+        return await self._ask_auctioneer(keys.of_jobs(self._link.fleet, topic), request, kind)
+
     async def quotes(self, request: QuoteRequest) -> Quotes:
         """Request quotes of every arm. Raises NoReply if the gateway's certificate does not permit it."""
         answers = await self._ask(keys.of_every_arm(self._link.fleet, "quote"), request, Quote, QUOTE_S)

@@ -33,6 +33,7 @@ from scenarios.cli.signals import Stop, until_stopped
 from scenarios.cli.terminal import echo, progress_bar
 from scenarios.job_stream import draw_jobs
 from scenarios.live.allocation import central_allocation
+from scenarios.live.cell import cell_message
 from scenarios.live.space import cell_space
 from scenarios.load import load
 from scenarios.schema import Scenario
@@ -67,7 +68,7 @@ def auction_command(
     fleet, folder = folder_of(journal, fleet, chosen)
     refuse_other_way(folder, (arm.name for arm in chosen.arms), alone=False)
     with progress_bar() as progress:
-        excludes = cell_space(chosen, progress=progress)
+        excludes, cell = cell_space(chosen, progress=progress), cell_message(chosen, name, progress=progress)
     with (
         until_stopped() as stop,
         BusClient(endpoint, fleet, stopped=stop.is_set) as link,
@@ -86,6 +87,7 @@ def auction_command(
             arms=tuple(arm.name for arm in chosen.arms),
             excludes=excludes,
             new_epoch=new_epoch,
+            cell=cell,
         )
         for sentence in other_versions(endpoint, fleet):
             log.error("Refused: %s", sentence)

@@ -31,10 +31,9 @@ def clear_command(
     at home. The request is refused for an arm that is present, because its own
     quotes report its space.
     """
-    if len(by) > MOST_CHARACTERS:
-        raise FleetError(f"--by must have at most {MOST_CHARACTERS} characters (got {len(by)}).")
+    check_person(by)
     with BusClient(endpoint, the_fleet(fleet, endpoint)) as link:
-        request = ClearRequest(arm, by or _user())
+        request = ClearRequest(arm, by or user_name())
         replies = link.query_and_wait(keys.of_jobs(link.fleet, "clear"), request, Cleared, timeout_s=REPLY_S)
         name = link.fleet
     reasons = [reason for reason in replies.refused.values() if reason]
@@ -49,7 +48,17 @@ def clear_command(
     echo(f"{arm}: its space is free until the arm reports its space again.")
 
 
-def _user() -> str:
+def check_person(by: str) -> None:
+    """Check the name of the person who requests something.
+
+    Raises:
+        FleetError: it is too long.
+    """
+    if len(by) > MOST_CHARACTERS:
+        raise FleetError(f"--by must have at most {MOST_CHARACTERS} characters (got {len(by)}).")
+
+
+def user_name() -> str:
     """Name of the user of this process; "" if it has none."""
     try:
         return getpass.getuser()

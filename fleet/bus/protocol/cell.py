@@ -1,0 +1,93 @@
+"""Messages that describe a cell: all that an outsider needs to write a job."""
+
+from typing import Annotated
+
+import msgspec
+
+from fleet.bus.protocol.messages import Count, Name, Number
+from fleet.job import Kind
+
+Point = Annotated[tuple[Number, ...], msgspec.Meta(min_length=3, max_length=3)]
+
+
+class CellRequest(msgspec.Struct, frozen=True):
+    """Request to `jobs/cell`: the places, arms and limits of the cell."""
+
+
+class CellPlace(msgspec.Struct, frozen=True):
+    """A place that a job may name; one arm at a time works there."""
+
+    name: Name
+    position_m: Point
+    """Tool point in the world, m."""
+    tool_deg: Point
+    """Roll, pitch, yaw of the tool frame about the fixed world axes, deg; its z axis points out of the hand."""
+    retreat_m: Number
+    """Distance that the hand retracts along its own z axis before it moves on."""
+
+
+class CellKind(msgspec.Struct, frozen=True):
+    """A kind of job."""
+
+    kind: Kind
+    places: Count
+    """How many places a job of this kind names: 2 are from and to."""
+    meaning: str
+    """What an arm does in a cycle."""
+
+
+class Limit(msgspec.Struct, frozen=True):
+    """Smallest and largest value of a field of `JobSpec`, both allowed."""
+
+    low: Number
+    high: Number
+    unit: str = ""
+
+
+class PlannedWork(msgspec.Struct, frozen=True):
+    """Work for which an arm has plans; other work is planned when it is asked for."""
+
+    kind: Kind
+    places: tuple[Name, ...]
+    payload_kg: Number
+    plans: Count
+    """How many. Work that the arm cannot do is left out."""
+    cycle_s: Number | None = None
+    """Duration of a cycle by the fastest plan."""
+
+
+class CellArm(msgspec.Struct, frozen=True):
+    """An arm of the cell."""
+
+    name: Name
+    position_m: Point
+    """Base in the world, m."""
+    tilt_deg: Point
+    """Roll, pitch, yaw of the base, deg."""
+    payload_kg: Number
+    """Largest payload within half its reach, for as long as it likes: the rating less the gripper, or a lower limit of
+    its own."""
+    payload_outstretched_kg: Number
+    """The same at its full reach."""
+    reach_m: Number
+    """From joint 2 to the tool point."""
+    works: tuple[PlannedWork, ...] = ()
+    """Work of the scenario; empty if the message would be too large. A dry run (`arm/*/quote`) answers for any job."""
+
+
+class Cell(msgspec.Struct, frozen=True):
+    """Reply to a `CellRequest`."""
+
+    auctioneer: Name
+    scenario: str
+    places: tuple[CellPlace, ...]
+    arms: tuple[CellArm, ...]
+    kinds: tuple[CellKind, ...]
+    limits: dict[Name, Limit]
+    """By field of `JobSpec`."""
+    warning_c: Number
+    """Motor temperature of zero headroom, °C."""
+    error_c: Number
+    """Motor temperature at which an arm faults, °C."""
+    jobs_in_message: Annotated[int, msgspec.Meta(ge=1)]
+    """Most jobs in one `Submission`."""

@@ -1,0 +1,96 @@
+"""Requests of people who steer a fleet: which are possible, and what happens next; the ledger carries them out."""
+
+from collections.abc import Set
+
+from fleet.bus.protocol.auction import SETTLED
+from fleet.bus.protocol.operator import ALL_ARMS, Cancel, Change, ControlRequest, Pause, Resume, Settle
+from fleet.errors import Refused
+from fleet.live.auction.job_rules import changed_spec
+from fleet.live.auction.ledger import Ledger
+
+ALREADY_DONE = "This request was carried out before."
+NO_CHANGE = "Nothing changed: it is so already."
+
+
+def job_of(request: ControlRequest) -> str:
+    """Return the name of the job of a request; "" if it is for arms."""
+    return "" if isinstance(request.action, Pause | Resume) else request.action.job
+
+
+def objection(ledger: Ledger, request: ControlRequest, heard: Set[str]) -> str:
+    """Return why a request changes nothing; "" if it changes something.
+
+    Args:
+        heard: Arms that are present or were heard.
+
+    Raises:
+        Refused: it is not possible now.
+    """
+    match request.action:
+        case Pause(arm):
+            _check_arm(ledger, arm, heard)
+            return NO_CHANGE if arm in ledger.paused else ""
+        case Resume(arm):
+            _check_arm(ledger, arm, heard)
+            if arm != ALL_ARMS and ALL_ARMS in ledger.paused:
+                raise Refused("All arms are paused. Resume all; then pause those that must stay paused.")
+            paused = ledger.paused if arm == ALL_ARMS else arm in ledger.paused
+            return "" if paused else NO_CHANGE
+        case Cancel() | Settle() | Change() as action:
+            return _objection_to_job(ledger, action)
+
+
+def _check_arm(ledger: Ledger, arm: str, heard: Set[str]) -> None:
+    known = heard | ledger.space.keys()
+    if arm != ALL_ARMS and arm not in known:
+        raise Refused(f"There is no arm '{arm}'. Arms: {', '.join(sorted(known)) or 'none'}; '*' for all.")
+
+
+def _objection_to_job(ledger: Ledger, action: Cancel | Settle | Change) -> str:
+    entry = ledger.jobs.get(action.job)
+    if entry is None:
+        if action.job in ledger.past:
+            return "It was settled long ago."
+        raise Refused(f"There is no job '{action.job}'.")
+    state = entry.state
+    match action:
+        case Cancel():
+            if state == "unfinished":
+                raise Refused(f"'{action.job}' is unfinished: settle it as done, or redo it and then cancel it.")
+            return f"It is {state}." if state == "finished" or entry.cancelled else ""
+        case Settle(_, outcome):
+            if state != "unfinished":
+                if state in ("finished", "waiting") and (state == "finished") == (outcome == "done"):
+                    return NO_CHANGE
+                raise Refused(f"'{action.job}' is {state}; only an unfinished job can be settled.")
+            if outcome == "redo" and ledger.ended:
+                raise Refused("The shift is over: nothing is redone.")
+            if outcome == "redo" and entry.award in ledger.open:
+                arm = ledger.open[entry.award].record.arm
+                raise Refused(
+                    f"'{arm}' may still do the last cycle of '{action.job}'. Stop it and free its space "
+                    f"(jobs/clear, or thermofleet clear {arm}) first."
+                )
+            return ""
+        case Change():
+            if state in SETTLED:
+                raise Refused(f"'{action.job}' is {state}; only a job that is not settled can be changed.")
+            try:
+                changed = changed_spec(entry.spec, action)
+            except ValueError as error:
+                raise Refused(str(error)) from error
+            return NO_CHANGE if changed == entry.spec else ""
+
+
+def next_step(ledger: Ledger, request: ControlRequest) -> str:
+    """Return what happens next; "" if nothing does."""
+    match request.action:
+        case Pause(arm):
+            awards = [a for a in ledger.open.values() if arm in (ALL_ARMS, a.record.arm)]
+            return f"{len(awards)} job(s) end or go back after the cycle in progress." if awards else ""
+        case Cancel(job) if (entry := ledger.jobs.get(job)) is not None and entry.award in ledger.open:
+            if ledger.open[entry.award].may_commit:
+                return "It is in its last cycle: it is cancelled only if the arm returns it."
+            return "The arm ends the cycle in progress and returns it."
+        case _:
+            return ""

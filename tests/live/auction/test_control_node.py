@@ -1,0 +1,65 @@
+"""Each request of people over a real router, and who may send it."""
+
+import pytest
+
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import Result, Status, StatusRequest, Submission
+from fleet.bus.protocol.messages import decode, encode
+from fleet.bus.protocol.operator import Cancel, Change, Controlled, ControlRequest, Operation, Pause, Resume, Settle
+
+
+def control(bus, name, action):
+    """Return the reply to a request and the reason of a refusal."""
+    replies = bus.ask(keys.of_jobs("f", "control"), ControlRequest(name, action, "ann"), Controlled)
+    return next(iter(replies.messages.values()), None), next(iter(replies.refused.values()), "")
+
+
+def test_every_request_is_answered_published_and_kept_over_a_restart(bus):
+    node, arm = bus.auctioneer(), bus.arm("arm_0")
+    operations, results = [], []
+    watcher = bus.link()
+    watcher.subscribe(keys.of_every_auction("f", "operation"), Operation, lambda _, each: operations.append(each))
+    watcher.subscribe(keys.of_every_auction("f", "result"), Result, lambda _, each: results.append(each))
+    arm.commits = False
+    bus.until(lambda: node.present)
+    assert control(bus, "1", Pause())[0].paused == {"*": "ann"}
+    node.submit(Submission((*bus.jobs("a"), *bus.jobs("b", place="bin")), "bob"))
+    reply, _ = control(bus, "2", Cancel("a"))
+    assert (reply.changed, reply.job.state) == (True, "cancelled")
+    reply, _ = control(bus, "3", Change("b", due_s=900.0, value=2.0))
+    assert (reply.changed, reply.job.state) == (True, "waiting")
+    bus.kill(node)
+    node = bus.auctioneer()
+    assert node.auctioneer.ledger.jobs["b"].spec.due_s == 900.0
+    assert not control(bus, "2", Cancel("a"))[0].changed
+    bus.serve_for(1.0)
+    assert bus.states(node) == ["cancelled", "waiting"]
+    assert control(bus, "4", Resume("*"))[0].paused == {}
+    bus.until(lambda: bus.states(node) == ["cancelled", "awarded"])
+    assert control(bus, "5", Settle("b", "done")) == (None, "'b' is awarded; only an unfinished job can be settled.")
+    assert control(bus, "6", Cancel("unknown")) == (None, "There is no job 'unknown'.")
+    bus.until(lambda: len(operations) >= 4)
+    assert [each.request.request for each in operations] == ["1", "2", "3", "4"]
+    assert {each.request.by for each in operations} == {"ann"}
+    assert {each.by for each in results if each.status.state == "cancelled"} == {"ann"}
+    (status,) = bus.ask(keys.of_jobs("f", "status"), StatusRequest(), Status).messages.values()
+    assert [job.repetitions for job in status.jobs] == [1, 1]
+
+
+def test_an_unfinished_job_is_settled(bus):
+    node, arm = bus.auctioneer(), bus.arm("arm_0")
+    node.submit(Submission(bus.jobs("a")))
+    arm.apply_lease = lambda _: None  # it may commit, and says nothing more
+    bus.until(lambda: bus.states(node) == ["finishing"])
+    node.end()
+    assert bus.states(node) == ["unfinished"]
+    assert "over" in control(bus, "1", Settle("a", "redo"))[1]
+    assert control(bus, "2", Settle("a", "done"))[0].job.state == "finished"
+    bus.kill(node)
+    assert bus.states(bus.auctioneer()) == ["finished"]
+
+
+@pytest.mark.parametrize("action", [Cancel("a"), Settle("a", "redo"), Change("a", due_s=None), Pause(), Resume("x")])
+def test_every_action_travels_as_json(action):
+    request = ControlRequest("1", action)
+    assert decode(ControlRequest, encode(request)) == request
