@@ -167,14 +167,14 @@ def test_own_arm_keeps_the_rules_towards_a_strict_auctioneer(bus):
     scores, told = [], []
     auctioneer.subscribe(keys.of_every_arm("f", "difficulty"), DifficultyScores, lambda _, word: scores.append(word))
     auctioneer.watch_tokens(keys.of_every_arm("f", "alive"), lambda arm, there: told.append((arm, there)))
-    command = [sys.executable, "-u", str(ROOT / "examples" / "own_arm.py"), str(port), "f", "arm 1/b"]
+    command = [sys.executable, "-u", str(ROOT / "examples" / "own_arm.py"), str(port), "f", "arm 1+b"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
-        serve(lambda: ("arm 1/b", True) in told and states, auctioneer)
+        serve(lambda: ("arm 1+b", True) in told and states, auctioneer)
         assert states[0].time_s >= 5000.0
 
         def question(key, word, kind):
-            return only(auctioneer.query_and_wait(keys.of_arm("f", "arm 1/b", key), word, kind, timeout_s=PATIENCE_S))
+            return only(auctioneer.query_and_wait(keys.of_arm("f", "arm 1+b", key), word, kind, timeout_s=PATIENCE_S))
 
         dry = question("quote", QuoteRequest(auction="r", jobs=(JOB,), dry_run=True), Quote)
         assert dry.quote == ""
@@ -202,7 +202,7 @@ def test_own_arm_keeps_the_rules_towards_a_strict_auctioneer(bus):
     finally:
         process.kill()
         process.communicate(timeout=PATIENCE_S)
-    serve(lambda: ("arm 1/b", False) in told, auctioneer)
+    serve(lambda: ("arm 1+b", False) in told, auctioneer)
     assert auctioneer.malformed == 0
 
 

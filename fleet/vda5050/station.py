@@ -179,7 +179,7 @@ def jobs_of(order: Order) -> tuple[JobSpec, ...]:
         hard = action.blocking_type == "HARD"
         after = (beside or barrier) if hard else barrier
         fields: dict[str, Any] = {each.key: each.value for each in action.action_parameters if each.key in _FIELDS}
-        fields |= {"name": f"{order.order_id}/{action.action_id}", "kind": action.action_type, "after": after}
+        fields |= {"name": f"{order.order_id}:{action.action_id}", "kind": action.action_type, "after": after}
         try:
             specs.append(msgspec.convert(fields, JobSpec))
         except msgspec.ValidationError as error:

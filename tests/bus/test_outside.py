@@ -168,7 +168,9 @@ REQUESTS = {
     "QuoteRequest": {"jobs": [JOB], "dry_run": True},
     "Claim": {"arm": "spare", "number": 1, "entries": [], "outcomes": [], "jobs": [], "space": []},
     "ClearRequest": {"arm": "spare"},
-    "ControlRequest": {"request": "extra", "action": {"action": "cancel", "job": "extra"}},
+    "CellRequest": {},
+    "ResetRequest": {},
+    "ControlRequest": {"request": "extra", "action": {"action": "resume"}},
 }
 
 
@@ -244,6 +246,8 @@ def test_a_live_fleet_is_as_the_contract_says(folder, port):
                 outsider.request("clock_now", "ClockRequest")
                 outsider.request("arm_quote", "QuoteRequest", arm="*")
                 outsider.request("jobs_control", "ControlRequest")
+                outsider.request("jobs_cell", "CellRequest")
+                outsider.request("arm_reset", "ResetRequest", arm="*")
     assert not outsider.missing(channels), (folder / "up.log").read_text()
     assert not any(outsider.seen[name] for name in CONSENSUS)
 

@@ -381,7 +381,7 @@ def test_the_journal_of_an_arm_stays_short_while_it_is_written(tmp_path, monkeyp
 
 
 def test_a_history_of_long_names_fits_into_one_message():
-    jobs = tuple(JobSpec(name=f"{number:0128d}", kind="hold", places=("p" * 900,)) for number in range(256))
+    jobs = tuple(JobSpec(name=f"{number:0128d}", kind="hold", places=("p" * 128,)) for number in range(256))
     history = ArmHistory().replay([JobsFinished(jobs, "x")])
     message = history.message("a")
     assert 0 < len(message.finished) < 256

@@ -129,7 +129,7 @@ def test_keys_for_humble_have_no_hash(make):
 
 
 def test_invalid_names_are_changed_and_stay_unique(make):
-    domain = make(fleet="7 shops/ä")
+    domain = make(fleet="7 shops ä")
     one, other = state(arm="arm-0"), state(arm="arm 0", time_s=99.0)
     domain.until(under("0/n7_shops/arm_0/joint_states/"), one)
     domain.until(under(DIAGNOSTICS_KEY), other, one)
@@ -144,7 +144,7 @@ def test_invalid_names_are_changed_and_stay_unique(make):
 def test_arms_that_cannot_be_published_do_not_affect_the_others(make, monkeypatch):
     monkeypatch.setattr(ros2_bridge, "MAX_ARMS", 2)
     domain = make()
-    said = [state(arm="late", time_s=1e300), *(state(arm=f"arm_{number}") for number in range(5))]
+    said = [state(arm="late", time_s=1e11), *(state(arm=f"arm_{number}") for number in range(5))]
     domain.until(lambda sample: "/arm_1/" in str(sample.key_expr), *said)
     assert domain.bridge.arms == ("arm_0", "arm_1")
     assert "A ROS 2 time is" in domain.bridge.skipped["late"]

@@ -41,10 +41,11 @@ from scenarios.cli.main import app
 PATIENCE_S = 30.0
 ARM = "arm 1+b"
 EXTRA = Participant("gateway", "submitter")
+TOKEN = "a token of this test"
 COMMANDS = {
     "watch": ["watch", "--json"],
     "doctor": ["doctor", "--seconds", "1"],
-    "gateway": ["gateway", "--port", "0"],
+    "gateway": ["gateway", "--port", "0", "--token", TOKEN],
 }
 
 
@@ -127,7 +128,8 @@ def gateway(fleet, name):
 def asked(port, method, path, body=None):
     line = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
     try:
-        line.request(method, path, json.dumps(body), {"Content-Type": "application/json"})
+        headers = {"Content-Type": "application/json", "Authorization": f"Bearer {TOKEN}"}
+        line.request(method, path, json.dumps(body), headers)
         answer = line.getresponse()
         return answer.status, json.loads(answer.read())
     finally:

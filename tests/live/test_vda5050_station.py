@@ -72,7 +72,7 @@ def test_hard_actions_are_alone_and_others_are_together(blocking):
     master.order(actions=[action(str(i), each) for i, each in enumerate(blocking)])
     waits: dict[int, set[int]] = {}
     for i in range(len(blocking)):
-        own = {int(name.rpartition("/")[2]) for name in master.fleet.jobs[f"o1/{i}"].after}
+        own = {int(name.rpartition(":")[2]) for name in master.fleet.jobs[f"o1:{i}"].after}
         waits[i] = own.union(*(waits[each] for each in own))
     for later in range(len(blocking)):
         for earlier in range(later):
@@ -84,19 +84,19 @@ def test_hard_actions_are_alone_and_others_are_together(blocking):
 def test_an_order_becomes_jobs_and_their_states_become_those_of_its_actions():
     master = Master()
     master.order(actions=[action("a"), action("b", kind="pick_place", places=["x", "y"], repetitions=3)])
-    spec = master.fleet.jobs["o1/b"]
+    spec = master.fleet.jobs["o1:b"]
     assert (spec.kind, spec.places, spec.repetitions, spec.dwell_s) == ("pick_place", ("x", "y"), 3, 5.0)
     assert master.told() == {"a": "WAITING", "b": "WAITING"}
-    master.end("o1/a", "awarded", arm="arm_0", cycles=0)
-    master.end("o1/b", "awarded", arm="arm_1", cycles=2)
+    master.end("o1:a", "awarded", arm="arm_0", cycles=0)
+    master.end("o1:b", "awarded", arm="arm_1", cycles=2)
     assert master.told() == {"a": "INITIALIZING", "b": "RUNNING"}
     master.order("o2", actions=[action("c")])
     assert master.errors() == ["orderError"]
-    master.end("o1/a")
-    master.end("o1/b", "unfinished", reason="the shift ended")
+    master.end("o1:a")
+    master.end("o1:b", "unfinished", reason="the shift ended")
     assert master.told() == {"a": "FINISHED", "b": "FAILED"}
     master.order("o2", actions=[action("c")])
-    assert (master.errors(), list(master.fleet.jobs)) == ([], ["o2/c"])
+    assert (master.errors(), list(master.fleet.jobs)) == ([], ["o2:c"])
     master.order("o2", actions=[action("c")])  # sent again
     assert master.errors() == []
     master.order("o2", actions=[action("c"), action("d")], update=1)
@@ -144,9 +144,9 @@ def test_cancel_and_pause_are_passed_on_and_end_when_the_fleet_says_so():
     assert master.station.paused
     master.instant("cancelOrder")
     assert master.told()["cancelOrder"] == "RUNNING"
-    master.end("o1/a", "given_up", reason="cancelled")
+    master.end("o1:a", "given_up", reason="cancelled")
     assert master.told()["cancelOrder"] == "RUNNING"
-    master.end("o1/b")
+    master.end("o1:b")
     assert master.told() == {"a": "FAILED", "b": "FINISHED", "cancelOrder": "FINISHED", "startPause": "FINISHED"}
     master.instant("fly")
     assert (master.told()["fly"], master.errors()) == ("FAILED", ["unsupportedAction"])
