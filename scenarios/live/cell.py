@@ -61,4 +61,4 @@ def _arm(robot: Robot, works: tuple[PlannedWork, ...]) -> CellArm:
 def _work(work: Work, plans: tuple[Plan, ...]) -> PlannedWork:
     places = tuple(place.name for place in work.places)
     cycle_s = min((plan.cycle.duration_s for plan in plans), default=None)
-    return PlannedWork(work.kind, places, work.payload_kg, len(plans), cycle_s)
+    return PlannedWork(work.kind, places, work.payload_kg, len(plans), cycle_s, work.dwell_s, work.force_n)

@@ -53,7 +53,10 @@ class PlannedWork(msgspec.Struct, frozen=True):
     plans: Count
     """How many. Work that the arm cannot do is left out."""
     cycle_s: Number | None = None
-    """Duration of a cycle by the fastest plan."""
+    """Duration of a cycle by the fastest plan, with this `dwell_s`."""
+    dwell_s: Number = 0.0
+    force_n: Number = 0.0
+    """As in `JobSpec`; other values are other work."""
 
 
 class CellArm(msgspec.Struct, frozen=True):

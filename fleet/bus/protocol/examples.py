@@ -85,7 +85,7 @@ _CELL = Cell(
             payload_kg=3.1,
             payload_outstretched_kg=0.2,
             reach_m=0.902,
-            works=(PlannedWork("pick_place", CRATE.places, 1.5, plans=4, cycle_s=9.6),),
+            works=(PlannedWork("pick_place", CRATE.places, 1.5, plans=4, cycle_s=9.6, dwell_s=0.5),),
         ),
     ),
     kinds=(CellKind("pick_place", 2, "Take the payload from the first place to the second."),),
