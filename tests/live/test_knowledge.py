@@ -125,7 +125,7 @@ class LiveShift:
         )
         config = ExecutorConfig(valid_s=HOUR_S)
         executor = AwardExecutor(name, lambda *_: None, ArmHistory(), nonce="n", config=config)
-        clock = SimpleNamespace(speed=1e3, now_s=lambda _: self.time_s)
+        clock = SimpleNamespace(speed=1e3, real_s=0.0, now_s=lambda _: self.time_s)
         return ArmNode(
             self.wires[name],
             body,

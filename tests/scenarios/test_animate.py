@@ -1,7 +1,6 @@
 """The film of a shift: as many frames as asked for, as long as asked for, and of the shift that `run` records."""
 
 import json
-import os
 import signal
 from pathlib import Path
 
@@ -157,7 +156,7 @@ class PressingCtrlC:
     def act(self, observations):
         self._left -= 1
         if not self._left:
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
         return dict.fromkeys(observations, 0)
 
 
