@@ -1,7 +1,10 @@
 """The film of a shift: as many frames as asked for, as long as asked for, and of the shift that `run` records."""
 
 import json
-import signal
+import os
+import subprocess
+import sys
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -144,27 +147,25 @@ def test_a_long_shift_gets_about_as_many_frames_as_a_film_has(thermofleet, small
     assert out.stat().st_size < 2e6
 
 
-class PressingCtrlC:
-    """Waits, until somebody presses Ctrl-C."""
+def test_ctrl_c_leaves_nothing(small_toml, tmp_path, plans):
+    """In a process of its own, where nothing but the command has set what Ctrl-C does."""
+    program = textwrap.dedent("""
+        import signal, sys
+        import scenarios.policy_loader
+        from scenarios.cli.main import main
 
-    def __init__(self) -> None:
-        self._left = 4
+        class PressingCtrlC:
+            def reset(self, rng): pass
+            def act(self, observations): signal.raise_signal(signal.SIGINT)
 
-    def reset(self, rng):
-        pass
-
-    def act(self, observations):
-        self._left -= 1
-        if not self._left:
-            signal.raise_signal(signal.SIGINT)
-        return dict.fromkeys(observations, 0)
-
-
-def test_ctrl_c_leaves_nothing(thermofleet, small_toml, tmp_path, monkeypatch):
-    monkeypatch.setattr("scenarios.policy_loader.policy_of", lambda name: PressingCtrlC())
-    said = thermofleet("animate", small_toml, *QUICK, "--out", tmp_path / "film.gif")
-    assert said.code == 130
-    assert said.err.startswith("Interrupted while working: nothing was written.")
+        scenarios.policy_loader.policy_of = lambda name: PressingCtrlC()
+        main(sys.argv[1:])
+    """)
+    command = [sys.executable, "-c", program, "animate", small_toml, *QUICK, "--out", tmp_path / "film.gif"]
+    env = {**os.environ, "THERMOFLEET_CACHE": str(plans)}
+    said = subprocess.run(command, env=env, capture_output=True, text=True, timeout=60, check=False)
+    assert said.returncode == 130
+    assert "Interrupted while working: nothing was written." in said.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["heat.toml"]
 
 
