@@ -163,7 +163,7 @@ def test_ctrl_c_leaves_nothing(small_toml, tmp_path, plans):
     """)
     command = [sys.executable, "-c", program, "animate", small_toml, *QUICK, "--out", tmp_path / "film.gif"]
     env = {**os.environ, "THERMOFLEET_CACHE": str(plans)}
-    said = subprocess.run(command, env=env, capture_output=True, text=True, timeout=60, check=False)
+    said = subprocess.run(command, env=env, capture_output=True, text=True, timeout=240, check=False)
     assert said.returncode == 130
     assert "Interrupted while working: nothing was written." in said.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["heat.toml"]

@@ -111,6 +111,6 @@ def test_a_killed_run_leaves_only_a_folder_with_a_dot(small_toml, tmp_path, plan
     where = tmp_path / "runs"
     command = [sys.executable, "-c", program, "run", str(small_toml), *QUICK, "--out", str(where / "run")]
     env = {**os.environ, "THERMOFLEET_CACHE": str(plans)}
-    killed = subprocess.run(command, env=env, capture_output=True, timeout=60, check=False)
+    killed = subprocess.run(command, env=env, capture_output=True, timeout=240, check=False)
     assert killed.returncode == -signal.SIGKILL
     assert all(p.name.startswith(".run.") for p in where.iterdir())
