@@ -135,7 +135,7 @@ def _arms(
         raise ScenarioError("\n".join(problems))
     arms = [_blind_arm(arm, asked, folder) for arm in planned]
     if difficulty == "twin":
-        from scenarios.prepare.calibrate_twins import calibrate_twins  # both import torch
+        from scenarios.prepare.calibrate_twins import calibrate_twins  # both need the extra `twin`
         from scenarios.prepare.train_twins import train_twins
 
         if every_work:

@@ -137,13 +137,11 @@ class _Torque:
     torque: TorqueRms
     risk: DifficultyModel
     version: str = "torque"
-    weighted: bool = False
-    """By the mean squared torque of the training motion, as d of the twin."""
 
     def score(self, plan: Plan, repetitions: int) -> Difficulty | None:
         per_joint = difficulty_of_error(self.torque.scores([plan], [repetitions]).per_joint[0])
         score = self.risk.score(plan, repetitions)
-        weight = heat_weights(self.torque.nominal_nm**2) if self.weighted else None
+        weight = heat_weights(self.torque.nominal_nm**2)
         return Difficulty(np.minimum(per_joint, BELOW_ONE), risk=score and score.risk, weight=weight)
 
 
@@ -186,15 +184,14 @@ def _vae(drawn: DrawnFleet, training: int, *, trained: bool) -> Fleet:
     return drawn.scored([_WithoutPeak(model) for model in drawn.calibrated(training, "excess", trained=trained)])
 
 
-def _unweighted(drawn: DrawnFleet, training: int) -> Fleet:
-    return drawn.scored([_Unweighted(arm.model) for arm in _vae(drawn, training, trained=True).arms])
+def _unweighted(drawn: DrawnFleet, fleet: Fleet) -> Fleet:
+    return drawn.scored([_Unweighted(arm.model) for arm in fleet.arms])
 
 
-def _torque(drawn: DrawnFleet, *, weighted: bool) -> Fleet:
+def _torque(drawn: DrawnFleet) -> Fleet:
     twins = drawn.calibrated(0, "torque")
     rules = [torque_over_known(_training_records(drawn.scenario, arm)) for arm in drawn.planned]
-    models = zip(rules, twins, strict=True)
-    return drawn.scored([_Torque(rule, twin, weighted=weighted) for rule, twin in models])
+    return drawn.scored([_Torque(rule, twin) for rule, twin in zip(rules, twins, strict=True)])
 
 
 def _training_records(scenario: Scenario, arm: PlannedArm) -> list[Array]:
@@ -218,9 +215,12 @@ def _random(drawn: DrawnFleet, training: int) -> Fleet:
 SOURCES: dict[str, Source] = {
     "trained": Source("trained VAE", lambda drawn, training: _vae(drawn, training, trained=True)),
     "untrained": Source("untrained VAE", lambda drawn, training: _vae(drawn, training, trained=False)),
-    "unweighted": Source("trained VAE, unweighted", _unweighted),
-    "torque": Source("RMS torque", lambda drawn, _: _torque(drawn, weighted=False), trained=False),
-    "weighted-torque": Source("RMS torque, weighted", lambda drawn, _: _torque(drawn, weighted=True), trained=False),
+    "unweighted": Source(
+        "trained VAE, unweighted",
+        lambda drawn, training: _unweighted(drawn, _vae(drawn, training, trained=True)),
+    ),
+    "torque": Source("RMS torque", lambda drawn, _: _unweighted(drawn, _torque(drawn)), trained=False),
+    "weighted-torque": Source("RMS torque, weighted", lambda drawn, _: _torque(drawn), trained=False),
     "rc-nominal": Source("nominal rc", lambda drawn, _: _network(drawn, "rc-nominal"), trained=False),
     "rc": Source("identified rc", lambda drawn, _: _network(drawn, "rc"), trained=False),
     "random": Source("random", _random),

@@ -4,7 +4,7 @@ All networks run together, one matrix product per layer and time step. Weights h
 (input, forget, cell, output) of torch.nn.LSTM and torch.nn.Linear in `twin.vae.model.LstmVae`.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -59,7 +59,7 @@ class Networks:
         parts = z.reshape(*z.shape[:2], self.count, -1).transpose(1, 2, 0, 3)
         hidden = np.ascontiguousarray(parts)  # [time, net, batch, channel]
         for layer in self.encoder:
-            hidden = np.stack(list(layer(hidden)))
+            hidden = layer(hidden)
         summary = np.tanh(_affine(hidden[-1], self.summary))
         mu = _affine(summary, self.mu)
         if self.logvar is None:
@@ -73,7 +73,7 @@ class Networks:
         first = np.tanh(_affine(latent.swapaxes(0, 1), self.expand))
         hidden = np.broadcast_to(first, (steps, *first.shape))
         for layer in self.decoder:
-            hidden = np.stack(list(layer(hidden)))
+            hidden = layer(hidden)
         z = np.matmul(hidden, self.out[0]) + self.out[1]  # [time, net, batch, channel]
         return z.transpose(2, 0, 1, 3).reshape(z.shape[2], steps, -1, len(CHANNELS))
 
@@ -105,20 +105,21 @@ class _Layer:
         self._bias = (stacked("bias_ih") + stacked("bias_hh"))[:, None]
         self._hidden = hidden
 
-    def __call__(self, inputs: Array) -> Iterator[Array]:
-        """Hidden states [net, batch, hidden] of each step of the inputs [time, net, batch, in]."""
+    def __call__(self, inputs: Array) -> Array:
+        """Hidden states [time, net, batch, hidden] after each step of the inputs [time, net, batch, in]."""
         constant = inputs.strides[0] == 0
         driven = np.matmul(inputs[:1] if constant else inputs, self._input) + self._bias
-        size, shape = self._hidden, (*inputs.shape[1:3], self._hidden)
-        state, cell = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        size = self._hidden
+        states = np.empty((*inputs.shape[:3], size), np.float32)
+        state, cell = np.zeros_like(states[0]), np.zeros_like(states[0])
         for step in range(len(inputs)):
             gates = np.matmul(state, self._recurrent)
             gates += driven[0 if constant else step]
             np.tanh(gates, out=gates)
             enter, keep, new, leave = (gates[..., n * size : (n + 1) * size] for n in range(4))
             cell = 0.5 * ((1.0 + keep) * cell + (1.0 + enter) * new)
-            state = 0.5 * (1.0 + leave) * np.tanh(cell)
-            yield state
+            states[step] = state = 0.5 * (1.0 + leave) * np.tanh(cell)
+        return states
 
 
 def _affine(x: Array, linear: tuple[Array, Array]) -> Array:

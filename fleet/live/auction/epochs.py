@@ -52,13 +52,13 @@ def _describe(history: History) -> str:
 
 
 class EpochCheck:
-    """Which arms have told their history, and whether it is one of this auctioneer's journal."""
+    """Which arms have sent their history, and whether it is one of this auctioneer's journal."""
 
     def __init__(self, link: BusClient, auctioneer: Auctioneer) -> None:
         """Start; no arm is admitted yet."""
         self._link, self._auctioneer = link, auctioneer
         self._asked_s: dict[str, float] = {}
-        """Real second of the last request to each arm that has not told its history."""
+        """Real second of the last request to each arm that has not sent its history."""
         self._admitted: set[str] = set()
         self._foreign: dict[str, str] = {}
         """Why an arm gets no work, by arm."""
