@@ -22,7 +22,7 @@ import mujoco.viewer
 import numpy as np
 import pyarrow.parquet as pq
 
-from fleet.env.render.picture import heat_colour
+from fleet.env.render.heat import heat_colour
 from fleet.errors import FleetError
 from fleet.physics.models import build_cell
 from fleet.robot import JOINTS

@@ -9,7 +9,7 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 from scipy.spatial import KDTree
 
-from fleet.env.render import picture
+from fleet.env.render import heat, picture
 
 Array = np.ndarray
 
@@ -49,9 +49,9 @@ def _palette() -> tuple[Array, Array]:
     """Colours uint8 [256, 3] of every picture, and the index of the nearest one by the high bits of a colour."""
     named = (*picture.PLATES, picture.GROUND, picture.LINE, picture.WORK, picture.FAULT, picture.INK, picture.FAINT)
     flat = np.array([to_rgb(colour) for colour in (*named, "#8a8a8a", "#e6e6e6")])
-    heat = picture.heat_colour(np.linspace(0.0, picture.BEYOND_K + 41.0, 120), 40.0, 41.0)
+    scale = heat.heat_colour(np.linspace(0.0, heat.BEYOND_K + 41.0, 120), 40.0, 41.0)
     edges = [flat + (flat[3] - flat) * share for share in np.linspace(0.0, 1.0, 9)[1:-1]]
-    colours = np.rint(255 * np.concatenate([flat, *edges, heat, 0.6 * heat[::3]])).astype(np.uint8)
+    colours = np.rint(255 * np.concatenate([flat, *edges, scale, 0.6 * scale[::3]])).astype(np.uint8)
     cells = np.indices((1 << BITS,) * 3).reshape(3, -1).T * (256 >> BITS) + (128 >> BITS)
     nearest = np.asarray(KDTree(colours).query(cells)[1], dtype=np.uint8)
     nearest[_cell(colours[: len(flat)])] = np.arange(len(flat))  # large areas keep their colour exactly

@@ -5,9 +5,13 @@ import html
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
+from importlib.resources import files
 from typing import Any  # values of JSON
 
 from fleet.errors import visible
+from scenarios.view.playback import compressed
+from scenarios.view.three import three_js
 
 PNG_HEAD = b"\x89PNG\r\n\x1a\n"
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data: blob:; form-action 'none'; base-uri 'none'"
@@ -20,45 +24,6 @@ _PLOTLY_OPTIONS = {
     "showSendToCloud": False,
     "plotlyServerURL": "",
 }
-_STYLE = """
-:root { color-scheme: light; }
-body { margin: 0 auto; max-width: 1320px; padding: 20px 28px 48px; color: #222; background: #fff;
-  font: 14px/1.45 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
-body.narrow { max-width: 1080px; font-size: 15px; }
-h1 { font-size: 23px; margin: 0 0 4px; overflow-wrap: anywhere; }
-h2 { font-size: 17px; margin: 28px 0 8px; }
-section h2 { margin-top: 38px; border-top: 1px solid #e2e2e2; padding-top: 18px; }
-p { margin: 4px 0; max-width: 90ch; overflow-wrap: anywhere; }
-.faint { color: #666; font-size: 13px; }
-.status { display: inline-block; margin: 8px 0; padding: 2px 10px; border-radius: 4px; font-weight: 600; }
-.good { background: #e8f3ea; color: #1c6b32; }
-.bad { background: #fbe5e5; color: #a31515; }
-.figures { display: grid; grid-template-columns: repeat(6, 1fr); gap: 8px; margin: 18px 0 10px; }
-@media (max-width: 900px) { .figures { grid-template-columns: repeat(3, 1fr); } }
-.figures div { border: 1px solid #e2e2e2; border-radius: 6px; padding: 7px 10px; }
-.figures div.bad { background: none; }
-.figures dt { color: #666; font-size: 12px; }
-.figures dd { margin: 0; font-size: 18px; font-weight: 600; font-variant-numeric: tabular-nums; }
-.figures small { font-size: 12px; font-weight: 400; color: #666; }
-figure { margin: 14px 0; }
-figure img { max-width: 100%; height: auto; border: 1px solid #eee; border-radius: 4px; }
-table { border-collapse: collapse; font-size: 13px; margin: 8px 0; }
-caption { text-align: left; color: #444; padding: 4px 0; }
-th, td { text-align: left; padding: 3px 14px 3px 0; border-bottom: 1px solid #eee; vertical-align: top;
-  overflow-wrap: anywhere; font-variant-numeric: tabular-nums; }
-table.numbers th:not(:first-child), table.numbers td:not(:first-child) { text-align: right; }
-table.events { width: 100%; }
-th { color: #555; font-weight: 600; }
-#lost:not(:checked) ~ div tr.lost { display: none; }
-tr.fault td, tr.contact td { color: #b51d1d; font-weight: 600; }
-tr.warning td { color: #8a5600; }
-.wide { overflow-x: auto; }
-nav a { margin-right: 14px; white-space: nowrap; }
-details { margin: 8px 0; }
-summary { cursor: pointer; color: #444; }
-"""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Picture:
     """One PNG of a section."""
@@ -107,6 +72,18 @@ class Section:
     """Why there is no result; None for a complete section."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Replay:
+    """A shift to be played in 3-D."""
+
+    model: Mapping[str, Any]
+    """`scenarios.view.cell_model.cell_model`."""
+    playback: str
+    """`scenarios.view.playback.packed`."""
+    unit_s: float
+    """Unit of the figure's time axis."""
+
+
 def sections_page(title: str, lead: Sequence[str], sections: Sequence[Section]) -> str:
     """A report in sections, as HTML text; the same input gives the same text."""
     failed = [section for section in sections if section.failed]
@@ -119,32 +96,95 @@ def sections_page(title: str, lead: Sequence[str], sections: Sequence[Section]) 
     return html_page(title, body, narrow=True)
 
 
-def html_page(title: str, body: Iterable[str], *, figure: Mapping[str, Any] | None = None, narrow: bool = False) -> str:
+def html_page(
+    title: str,
+    body: Iterable[str],
+    *,
+    figure: Mapping[str, Any] | None = None,
+    replay: Replay | None = None,
+    narrow: bool = False,
+) -> str:
     """A whole page.
 
     Args:
         body: HTML elements below the heading.
         figure: Data and layout of a Plotly figure; drawn into `figure_place()`.
+        replay: A shift in 3-D; played in `replay_place()`.
         narrow: For text; the default width is for figures over a shift.
     """
-    policy, head, end = _POLICY, "", ""
-    if figure is not None:
-        from plotly.offline import get_plotlyjs
-
-        policy = f"script-src 'unsafe-inline'; {_POLICY}"
-        # "<" escaped, so that no name can end the script element.
-        values = json.dumps(figure, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-        options = json.dumps(_PLOTLY_OPTIONS, separators=(",", ":"))
-        head = f"<script>{get_plotlyjs()}</script>\n"
-        end = f'<script>const drawn={values};Plotly.newPlot("figure",drawn.data,drawn.layout,{options});</script>\n'
+    parts = [*(_figure_parts(figure) if figure is not None else ()), *(_replay_parts(replay) if replay else ())]
+    scripts = "\n".join(parts)
+    if parts:
+        start = "start().catch((error)=>{document.title+=' (incomplete)';console.error(error);});"
+        code = [_source(name) for name in ("unpack.js", *(("cell.js", "replay.js") if replay else ()))]
+        scripts += f"\n<script>{''.join(code)}\n{_start(figure is not None, replay)}\n{start}</script>\n"
+    policy = f"script-src 'unsafe-inline'; {_POLICY}" if parts else _POLICY
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{_STYLE}</style>\n{head}</head>\n"
+        f"<title>{escape(title)}</title>\n<style>{_source('page.css')}</style>\n</head>\n"
         f"<body class='{'narrow' if narrow else 'wide-figures'}'>\n<h1>{escape(title)}</h1>\n"
         + "\n".join(body)
-        + f"\n{end}</body>\n</html>\n"
+        + f"\n{scripts}</body>\n</html>\n"
+    )
+
+
+def _figure_parts(figure: Mapping[str, Any]) -> list[str]:
+    from plotly.offline import get_plotlyjs
+
+    return [_data("plotly", compressed(get_plotlyjs())), _data("drawn", _json(figure))]
+
+
+def _replay_parts(replay: Replay) -> list[str]:
+    return [
+        _data("three", compressed(three_js())),
+        _data("cell-model", _json(replay.model)),
+        _data("playback", replay.playback),
+    ]
+
+
+def _start(figure: bool, replay: Replay | None) -> str:
+    """The function that begins a page, after everything that it needs."""
+    draw = play = ""
+    if figure:
+        draw = (
+            'await runLibrary("plotly");const drawn=JSON.parse(document.getElementById("drawn").textContent);'
+            f'await Plotly.newPlot("figure",drawn.data,drawn.layout,{json.dumps(_PLOTLY_OPTIONS)});'
+        )
+    if replay:
+        place = 'document.getElementById("figure")' if figure else "null"
+        play = f'await runLibrary("three");await startReplay({place},{replay.unit_s});'
+    return f"async function start(){{{draw}{play}}}"
+
+
+
+def _data(key: str, text: str) -> str:
+    """An element that holds text for a script and is not run."""
+    return f'<script type="text/plain" id="{key}">{text}</script>'
+
+
+def _json(value: object) -> str:
+    """JSON with "<" escaped, so that no name can end the element that holds it."""
+    return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+
+
+@cache
+def _source(name: str) -> str:
+    """A file of `static`."""
+    return files("scenarios.report").joinpath("static", name).read_text(encoding="utf-8")
+
+
+def replay_place() -> str:
+    """The element in which a shift is played."""
+    speeds = "".join(f'<option value="{s}"{" selected" if s == 60 else ""}>{s} ×</option>' for s in (1, 10, 60, 240))
+    return (
+        '<section class="replay" aria-label="The shift in three dimensions"><div id="cell"></div>'
+        '<pre id="now" aria-live="off"></pre><div class="controls">'
+        '<button id="play" type="button" aria-label="play">▶</button>'
+        '<input id="time" type="range" min="0" max="1" value="0" aria-label="time of the shift">'
+        f'<output id="clock">0:00:00</output><select id="speed" aria-label="speed">{speeds}</select>'
+        '</div></section>'
     )
 
 

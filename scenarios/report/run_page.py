@@ -8,10 +8,12 @@ from typing import Any  # values of run.json
 from fleet.events import Event
 from fleet.telemetry import Telemetry
 from scenarios.report.gantt import clock
-from scenarios.report.page import escape, figure_place, html_page, paragraph, table
+from scenarios.report.page import Replay, escape, figure_place, html_page, paragraph, replay_place, table
 from scenarios.report.schedule import schedule
-from scenarios.report.timeline import figure
+from scenarios.report.timeline import figure, time_unit
+from scenarios.view.playback import packed, payloads
 
+NO_PAYLOADS: Mapping[str, float] = {}
 ROWS = 300
 """Most rows of the event table."""
 
@@ -27,6 +29,8 @@ def report_html(
     *,
     warning_c: float,
     error_c: float,
+    model: Mapping[str, Any] | None = None,
+    payload_of: Mapping[str, float] = NO_PAYLOADS,
 ) -> str:
     """The report of a run as one HTML page; the same input gives the same text.
 
@@ -35,6 +39,8 @@ def report_html(
         telemetry: Arms in the order of `arms`; may be empty.
         events: Event log of the run, in any order.
         warning_c, error_c: Limits of the motor temperature.
+        model: `scenarios.view.cell_model.cell_model` with the same arms; without it nothing is shown in 3-D.
+        payload_of: Payload of each job, kg.
 
     Raises:
         ValueError: the telemetry has another number of arms, or the events contradict each other.
@@ -46,16 +52,22 @@ def report_html(
     reached_s = max(last, default=float(run.get("scenario", {}).get("horizon_s", 0.0)))
     plan = schedule(events, arms, reached_s)
     drawing = figure(plan, telemetry, events, arms, warning_c=warning_c, error_c=error_c)
+    replay = None
+    if model is not None and len(telemetry.time_s):
+        spans = [(a.arm, a.start_s, a.finished_s or a.end_s, payload_of.get(a.job, 0.0)) for a in plan.assignments]
+        playback = packed(telemetry, payloads(telemetry, arms, spans))
+        replay = Replay(model=model, playback=playback, unit_s=time_unit(plan.horizon_s)[1])
     body = [
         *_head(run, arms, reached_s),
         _key_figures(run.get("metrics") or {}),
+        *([replay_place()] if replay else []),
         figure_place(),
         *_event_table(events),
         _provenance(run),
     ]
     scenario = run.get("scenario", {}).get("name", "unnamed scenario")
     title = f"{scenario} · {run.get('policy', 'unknown policy')}" + (f" · seed {run['seed']}" if "seed" in run else "")
-    return html_page(title, body, figure=drawing)
+    return html_page(title, body, figure=drawing, replay=replay)
 
 
 def _head(run: Mapping[str, Any], arms: Sequence[str], reached_s: float) -> list[str]:

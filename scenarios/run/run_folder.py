@@ -1,7 +1,8 @@
 """The files of a recorded run."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,11 @@ from fleet.robot import JOINTS
 from fleet.telemetry import MODES, Telemetry
 from scenarios.report.run_page import report_html
 from scenarios.result_folder import ResultKind, disk_errors
+from scenarios.run.records import JobRecord, Offer
 from scenarios.run.shift import RUN_FORMAT, RunResult, summary
+from scenarios.view.cell_model import cell_model
 
-FILES = ("run.json", "telemetry.parquet", "events.parquet", "report.html")
+FILES = ("run.json", "telemetry.parquet", "events.parquet", "jobs.parquet", "offers.parquet", "report.html")
 RUN = ResultKind(name="run", card="run.json", files=FILES)
 
 
@@ -33,11 +36,22 @@ def write(result: RunResult, folder: Path) -> None:
     with disk_errors(folder):
         (folder / "run.json").write_text(json.dumps(run, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         pq.write_table(event_table(result.events), folder / "events.parquet")
+        pq.write_table(record_table(JobRecord, result.jobs), folder / "jobs.parquet")
+        pq.write_table(record_table(Offer, result.offers), folder / "offers.parquet")
         if result.telemetry is None:
             return
         pq.write_table(telemetry_table(result.telemetry, arms), folder / "telemetry.parquet")
-        limits = {"warning_c": result.scenario.limits.warning_c, "error_c": result.scenario.limits.error_c}
-        html = report_html(run, result.telemetry, result.events, arms, **limits)
+        scenario, limits = result.scenario, result.scenario.limits
+        html = report_html(
+            run,
+            result.telemetry,
+            result.events,
+            arms,
+            warning_c=limits.warning_c,
+            error_c=limits.error_c,
+            model=cell_model([a.robot() for a in scenario.arms], scenario.places, scenario.fixtures, limits=limits),
+            payload_of={job.job: job.payload_kg for job in result.jobs},
+        )
         (folder / "report.html").write_text(html, encoding="utf-8")
 
 
@@ -95,3 +109,10 @@ def event_table(events: tuple[Event, ...]) -> pa.Table:
         "reason": text,
     }
     return pa.table({name: pa.array([getattr(e, name) for e in events], kind) for name, kind in types.items()})
+
+
+def record_table(kind: type, records: Sequence[object]) -> pa.Table:
+    """One row per record: the fields of a dataclass of text, numbers and booleans."""
+    types = {"str": pa.string(), "bool": pa.bool_(), "int": pa.int64(), "float": pa.float64(), "float | None": pa.float64()}
+    names = {field.name: types[getattr(field.type, "__name__", str(field.type))] for field in fields(kind)}
+    return pa.table({name: pa.array([getattr(r, name) for r in records], kind) for name, kind in names.items()})

@@ -23,9 +23,10 @@ from scenarios.progress import Progress, quiet
 from scenarios.run.metrics import Metrics
 from scenarios.run.outcome import metrics_of
 from scenarios.run.provenance import provenance
+from scenarios.run.records import JobRecord, Offer, job_records, offers_of
 from scenarios.schema import Scenario
 
-RUN_FORMAT = 5
+RUN_FORMAT = 6
 """Raised when run.json or the columns of the recordings change."""
 _LIBRARIES = ("thermofleet", "numpy", "mujoco", "torch", "pettingzoo", "eclipse-zenoh", "pyarrow")
 
@@ -54,6 +55,9 @@ class RunResult:
     telemetry: Telemetry | None
     """None if the shift was interrupted before its first step."""
     events: tuple[Event, ...]
+    jobs: tuple[JobRecord, ...]
+    offers: tuple[Offer, ...]
+    """Of all arms, at every award."""
     twins: dict[str, dict[str, Any]]
     """`provenance` of each arm's difficulty model."""
     finished: bool
@@ -90,6 +94,7 @@ def run(
         watch=recorder,
     )
     finished, reward = False, 0.0
+    offers: list[Offer] = []
     try:
         if recorder is not None:
             recorder.env = env
@@ -98,6 +103,9 @@ def run(
             seen, count = env.knowledge(), len(env.events)
             actions = policy.act(seen)
             _, rewards, _, _, _ = env.step(actions)
+            awards = [event for event in env.events[count:] if event.kind == "award"]
+            for award in awards if record else ():
+                offers += offers_of(award, seen, actions, env.world.plans_per_job)
             env.events[count:] = [_with_prediction(event, seen, actions) for event in env.events[count:]]
             reward += next(iter(rewards.values()))
             progress("working", env.tick / env.world.ticks)
@@ -112,6 +120,8 @@ def run(
         metrics=metrics_of(world, state, events, env.messages, finds_contacts=not env.episode.plant.follows_plans),
         telemetry=recorder.telemetry() if recorder is not None else None,
         events=events,
+        jobs=job_records(world, state),
+        offers=tuple(offers),
         twins={arm.robot.name: provenance(arm.model) for arm in fleet.arms},
         finished=finished,
         time_s=float(state.tick[0] * world.dt_s),

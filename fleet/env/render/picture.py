@@ -9,7 +9,6 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection, LineCollection, PathCollection
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
 from matplotlib.path import Path
@@ -17,6 +16,7 @@ from matplotlib.transforms import IdentityTransform
 from numpy.typing import ArrayLike
 
 from fleet.env.render.floor_plan import NORMAL, FloorPlan, Pixel, floor_plan, shortened, text_path, text_width
+from fleet.env.render.heat import heat_colour, heat_marks
 from fleet.env.render.scene import MountKind, QueuedJob, Scene
 from fleet.telemetry import FAULTED, WORKING
 
@@ -26,27 +26,10 @@ INK, FAINT, LINE, PAPER, GROUND, BOX = "#222222", "#666666", "#c9c9c9", "#ffffff
 WORK, FAULT = "#4477aa", "#cc2222"
 PLATES = ("#ffffff", "#dfe9f3", "#f9d9d9")
 """Background of an idle, a working and a faulted arm."""
-HEAT = ("#cbe2f4", "#efd382", "#e08a00", FAULT, "#4d0a2a")
-"""Cool, halfway to the warning limit, warning, error, beyond; ever darker. Warning and error as in the run report."""
-COOL_C, BEYOND_K = 20.0, 10.0
-"""The colour scale begins at `COOL_C` and ends `BEYOND_K` above the error limit."""
 MOUNTS: dict[MountKind, str] = {"floor": "■", "wall": "▬", "ceiling": "○", "tilted": "◆"}
 """Symbol of what an arm is fixed to."""
 MOST_MARKS = 12
 """With more arms, the queue counts those that can take a job instead of marking each."""
-
-
-def heat_marks(warning_c: float, error_c: float) -> Array:
-    """Temperatures of the colours in `HEAT`, °C, rising."""
-    cool_c = min(COOL_C, warning_c - COOL_C)
-    return np.array([cool_c, (cool_c + warning_c) / 2, warning_c, error_c, error_c + BEYOND_K])
-
-
-def heat_colour(temp_c: Array, warning_c: float, error_c: float) -> Array:
-    """RGB from 0 to 1, [..., 3], of motor temperatures [...], °C; constant outside the scale."""
-    marks = heat_marks(warning_c, error_c)
-    rgb = np.array([to_rgb(colour) for colour in HEAT])
-    return np.stack([np.interp(temp_c, marks, rgb[:, i]) for i in range(3)], axis=-1)
 
 
 class Picture:

@@ -1,0 +1,247 @@
+// The cell in three dimensions: draws what scenarios/view/cell_model.py describes, with three.js.
+// One instanced mesh per shape of a link, with one instance per arm: the number of draws does not grow with the fleet.
+"use strict";
+
+function makeCell(place, model) {
+  const arms = model.arms.length, turning = model.links.filter((link) => link.turns).length;
+  const scene = new THREE.Scene(), renderer = new THREE.WebGLRenderer({ antialias: true, preserveDrawingBuffer: true });
+  const camera = new THREE.PerspectiveCamera(40, 1, 0.05, 200);
+  camera.up.set(0, 0, 1);
+  place.append(renderer.domElement);
+  renderer.outputEncoding = THREE.sRGBEncoding;
+  const dark = matchMedia("(prefers-color-scheme: dark)");
+  const ground = () => { scene.background = new THREE.Color(dark.matches ? "#16181b" : "#f3f4f5"); changed = true; };
+  scene.add(new THREE.HemisphereLight("#ffffff", "#9a9a9a", 0.85));
+  const sun = new THREE.DirectionalLight("#ffffff", 0.5);
+  sun.position.set(2, -3, 6);
+  scene.add(sun);
+
+  const vector = (values) => new THREE.Vector3(...values);
+  const pose = (what, scale) => new THREE.Matrix4().compose(
+    vector(what.position), new THREE.Quaternion(what.quaternion[1], what.quaternion[2], what.quaternion[3],
+      what.quaternion[0]), scale || new THREE.Vector3(1, 1, 1));
+  const material = (colour) => new THREE.MeshLambertMaterial({ color: colour });
+  const colourOf = (rgb) => new THREE.Color(...rgb).convertSRGBToLinear();
+
+  function geometry(shape) {
+    const [a, b, c] = shape.size;
+    switch (shape.kind) {
+      case "sphere": return new THREE.SphereGeometry(a, 20, 14);
+      case "capsule": return new THREE.CapsuleGeometry(a, 2 * b, 6, 14).rotateX(Math.PI / 2);
+      case "cylinder": return new THREE.CylinderGeometry(a, a, 2 * b, 20).rotateX(Math.PI / 2);
+      default: return new THREE.BoxGeometry(2 * a, 2 * b, 2 * c);
+    }
+  }
+
+  function instanced(shape, colour) {
+    const mesh = new THREE.InstancedMesh(shape, material(colour), arms);
+    mesh.frustumCulled = false;
+    scene.add(mesh);
+    return mesh;
+  }
+
+  const links = model.links.map((link) => ({
+    parent: link.parent, turns: link.turns, local: pose(link),
+    shapes: link.shapes.map((shape) => ({ local: pose(shape), mesh: instanced(geometry(shape), colourOf(shape.colour)) })),
+    motor: link.turns ? instanced(new THREE.SphereGeometry(1, 18, 12), "#ffffff") : null,
+  }));
+  const hand = pose(model.hand), load = instanced(new THREE.SphereGeometry(1, 18, 12), colourOf([0.36, 0.52, 0.7]));
+  const mounts = model.arms.map((arm) => pose(arm));
+
+  const box = new THREE.Box3();
+  for (const arm of model.arms) box.expandByPoint(vector(arm.position));
+  for (const one of model.places) {
+    box.expandByPoint(vector(one.position));
+    const mark = new THREE.Mesh(new THREE.OctahedronGeometry(0.03), material("#7a5ba6"));
+    mark.applyMatrix4(pose(one));
+    scene.add(mark);
+  }
+  for (const one of model.fixtures) {
+    const block = new THREE.Mesh(new THREE.BoxGeometry(...one.size), material("#8c8069"));
+    block.applyMatrix4(pose(one));
+    box.expandByPoint(vector(one.position));
+    scene.add(block);
+  }
+  const across = Math.max(1, ...box.getSize(new THREE.Vector3()).toArray());
+  const floor = new THREE.GridHelper(Math.ceil(across + 3), Math.ceil(across + 3) * 2, "#9aa0a6", "#c3c7cb");
+  floor.rotation.x = Math.PI / 2;
+  const centre = box.getCenter(new THREE.Vector3());
+  floor.position.set(centre.x, centre.y, Math.min(0, box.min.z) - 0.002);
+  scene.add(floor);
+
+  function label(text) {
+    const canvas = document.createElement("canvas"), pen = canvas.getContext("2d"), font = "600 40px system-ui, sans-serif";
+    pen.font = font;
+    canvas.width = Math.min(600, pen.measureText(text).width + 24);
+    canvas.height = 56;
+    pen.font = font;
+    pen.fillStyle = "rgba(255,255,255,.82)";
+    pen.fillRect(0, 0, canvas.width, canvas.height);
+    pen.fillStyle = "#222";
+    pen.fillText(text, 12, 42, canvas.width - 24);
+    const sprite = new THREE.Sprite(new THREE.SpriteMaterial({ map: new THREE.CanvasTexture(canvas), depthTest: false }));
+    sprite.scale.set((0.09 * canvas.width) / canvas.height, 0.09, 1);
+    return sprite;
+  }
+  const named = arms <= 40;
+  if (named) model.arms.forEach((arm) => {
+    const sprite = label(arm.name);
+    sprite.position.copy(vector(arm.position)).add(new THREE.Vector3(0, 0, -0.08).applyMatrix4(
+      new THREE.Matrix4().extractRotation(pose(arm))));
+    scene.add(sprite);
+  });
+
+  // Colours between the marks of the scale.
+  const marks = model.heat.marks_c, scale = model.heat.colours.map((colour) => new THREE.Color(colour));
+  function heatColour(tempC) {
+    let i = 1;
+    while (i < marks.length - 1 && tempC > marks[i]) i++;
+    const share = Math.min(1, Math.max(0, (tempC - marks[i - 1]) / (marks[i] - marks[i - 1])));
+    return new THREE.Color().lerpColors(scale[i - 1], scale[i], share).convertSRGBToLinear();
+  }
+  // A hotter motor is also larger, for people who see no colours.
+  const radius = (tempC) => 0.052 + 0.022 * Math.min(1, Math.max(0, (tempC - marks[0]) / (model.heat.error_c - marks[0])));
+
+  const radii = new Float32Array(arms * turning).fill(radius(marks[0]));
+  const work = new THREE.Matrix4(), turn = new THREE.Matrix4();
+  let changed = true;
+
+  // Angles of an arm's joints, rad.
+  function setPose(arm, q, loadM) {
+    const at = [];
+    let joint = 0;
+    for (const link of links) {
+      const here = new THREE.Matrix4().multiplyMatrices(link.parent < 0 ? mounts[arm] : at[link.parent], link.local);
+      if (link.turns) {
+        here.multiply(turn.makeRotationZ(q[joint]));
+        const size = radii[arm * turning + joint++];
+        link.motor.setMatrixAt(arm, work.copy(here).scale(new THREE.Vector3(size, size, size)));
+        link.motor.instanceMatrix.needsUpdate = true;
+      }
+      at.push(here);
+      for (const shape of link.shapes) {
+        shape.mesh.setMatrixAt(arm, work.multiplyMatrices(here, shape.local));
+        shape.mesh.instanceMatrix.needsUpdate = true;
+      }
+    }
+    const held = Math.max(loadM || 0, 1e-6);
+    work.multiplyMatrices(at[at.length - 1], hand).multiply(turn.makeTranslation(0, 0, held));
+    load.setMatrixAt(arm, work.scale(new THREE.Vector3(held, held, held)));
+    load.instanceMatrix.needsUpdate = true;
+    changed = true;
+  }
+
+  // Temperatures of an arm's motors, °C; shown with the next pose.
+  function setHeat(arm, tempC) {
+    let joint = 0;
+    for (const link of links) if (link.turns) {
+      radii[arm * turning + joint] = radius(tempC[joint]);
+      link.motor.setColorAt(arm, heatColour(tempC[joint++]));
+      link.motor.instanceColor.needsUpdate = true;
+    }
+  }
+
+  // 0 idle, 1 working, 2 faulted, -1 absent: a faulted arm is red, an absent one dark.
+  const shades = { "-1": [0.35, 0.35, 0.37], 0: [1, 1, 1], 1: [1, 1, 1], 2: [1, 0.45, 0.42] };
+  function setMode(arm, mode) {
+    const colour = colourOf(shades[mode] || shades[0]);
+    for (const link of links) for (const shape of link.shapes) {
+      shape.mesh.setColorAt(arm, colour);
+      shape.mesh.instanceColor.needsUpdate = true;
+    }
+  }
+
+  // The camera goes round a target: drag to turn, shift-drag or two fingers to move, wheel or pinch to zoom.
+  const target = centre.clone().add(new THREE.Vector3(0, 0, 0.35));
+  const start = { azimuth: -0.9, height: 0.5, distance: 1.5 + 1.25 * across };
+  let view = { ...start }, fingers = new Map(), spread = 0;
+  function look() {
+    const { azimuth, height, distance } = view;
+    camera.position.set(Math.cos(azimuth) * Math.cos(height), Math.sin(azimuth) * Math.cos(height), Math.sin(height))
+      .multiplyScalar(distance).add(target);
+    camera.lookAt(target);
+    changed = true;
+  }
+  function rotate(dx, dy) {
+    view.azimuth -= dx * 0.008;
+    view.height = Math.min(1.5, Math.max(-0.2, view.height + dy * 0.008));
+    look();
+  }
+  function move(dx, dy) {
+    const side = new THREE.Vector3().setFromMatrixColumn(camera.matrix, 0);
+    const up = new THREE.Vector3().setFromMatrixColumn(camera.matrix, 1);
+    target.addScaledVector(side, (-dx * view.distance) / 700).addScaledVector(up, (dy * view.distance) / 700);
+    look();
+  }
+  function zoom(factor) {
+    view.distance = Math.min(60, Math.max(0.4, view.distance * factor));
+    look();
+  }
+  const canvas = renderer.domElement;
+  canvas.tabIndex = 0;
+  canvas.setAttribute("role", "img");
+  canvas.setAttribute("aria-label", "The cell in three dimensions. Arrow keys turn the view, plus and minus zoom, 0 resets it.");
+  canvas.style.touchAction = "none";
+  canvas.addEventListener("pointerdown", (event) => {
+    canvas.setPointerCapture(event.pointerId);
+    fingers.set(event.pointerId, event);
+    spread = 0;
+  });
+  canvas.addEventListener("pointermove", (event) => {
+    const last = fingers.get(event.pointerId);
+    if (!last) return;
+    const [dx, dy] = [event.clientX - last.clientX, event.clientY - last.clientY];
+    fingers.set(event.pointerId, event);
+    if (fingers.size === 2) {
+      const [one, other] = [...fingers.values()], now = Math.hypot(one.clientX - other.clientX, one.clientY - other.clientY);
+      if (spread) zoom(spread / now);
+      spread = now;
+      move(dx / 2, dy / 2);
+    } else if (event.shiftKey || event.buttons === 4) move(dx, dy);
+    else rotate(dx, dy);
+  });
+  for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, (event) => fingers.delete(event.pointerId));
+  canvas.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    zoom(Math.exp(event.deltaY * 0.001));
+  }, { passive: false });
+  canvas.addEventListener("keydown", (event) => {
+    const turns = { ArrowLeft: [-20, 0], ArrowRight: [20, 0], ArrowUp: [0, 20], ArrowDown: [0, -20] }[event.key];
+    if (turns) rotate(...turns);
+    else if (event.key === "+" || event.key === "=") zoom(0.9);
+    else if (event.key === "-") zoom(1.1);
+    else if (event.key === "0") { view = { ...start }; look(); }
+    else return;
+    event.preventDefault();
+    event.stopPropagation();
+  });
+  new ResizeObserver(() => {
+    const [width, height] = [place.clientWidth || 300, place.clientHeight || 300];
+    renderer.setPixelRatio(Math.min(2, devicePixelRatio));
+    renderer.setSize(width, height);
+    camera.aspect = width / height;
+    camera.updateProjectionMatrix();
+    changed = true;
+  }).observe(place);
+  dark.addEventListener("change", ground);
+  ground();
+  look();
+  for (let arm = 0; arm < arms; arm++) {
+    setMode(arm, 0);
+    setHeat(arm, new Float32Array(turning).fill(marks[0]));
+    setPose(arm, new Float32Array(turning), 0);
+  }
+
+  // Draw, if anything has changed.
+  function draw() {
+    if (changed) renderer.render(scene, camera);
+    changed = false;
+  }
+  // Look at an arm from its own front.
+  function focus(arm) {
+    target.copy(vector(model.arms[arm].position)).add(new THREE.Vector3(0, 0, 0.3));
+    view.distance = 2.4;
+    look();
+  }
+  return { setPose, setHeat, setMode, focus, draw, heatColour };
+}

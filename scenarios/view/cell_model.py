@@ -1,0 +1,97 @@
+"""The cell in three dimensions, as plain values that every way to show it shares."""
+
+# MuJoCo is compiled and ships no type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from collections.abc import Sequence
+from typing import Any  # plain values of JSON
+
+import mujoco
+import numpy as np
+
+from fleet.env.render.heat import HEAT, heat_marks
+from fleet.job import MOST_PAYLOAD_M, PAYLOAD_KG_PER_M3, Fixture, Place
+from fleet.physics.models import build_cell
+from fleet.robot import Mount, Robot, ThermalLimits, rotation
+
+SHAPES = {
+    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
+    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
+    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
+    mujoco.mjtGeom.mjGEOM_BOX: "box",
+}
+"""Shapes of links; sizes are MuJoCo's: radius, half length along z, or half lengths along x, y and z."""
+DIGITS = 5
+
+
+def cell_model(
+    robots: Sequence[Robot],
+    places: Sequence[Place] = (),
+    fixtures: Sequence[Fixture] = (),
+    *,
+    limits: ThermalLimits,
+) -> dict[str, Any]:
+    """Arms, places, fixtures and the colour scale of the motors.
+
+    Returns:
+        `links`: the bodies of one arm in the order of the chain, each with the index of its parent (-1 for the
+        mount), its pose in the parent's frame, whether it turns about its z axis (joints in the order of the links),
+        and its shapes. `hand`: pose of the flange in the last link's frame. `arms`, `places`, `fixtures`: names and
+        poses in the world. Positions and sizes are in m, quaternions w, x, y, z.
+    """
+    model = build_cell([Robot(name="arm", mount=Mount())])
+    first, payload = model.body("arm/base").id, model.body("arm/payload").id
+    links: list[dict[str, Any]] = []
+    for body in range(first, model.nbody):
+        shapes = [_shape(model, g) for g in range(model.ngeom) if model.geom_bodyid[g] == body]
+        if body == payload or (not shapes and not model.body_jntnum[body]):
+            continue
+        links.append(
+            {
+                "parent": int(model.body_parentid[body]) - first if body > first else -1,
+                "position": _rounded(model.body_pos[body]),
+                "quaternion": _rounded(model.body_quat[body]),
+                "turns": bool(model.body_jntnum[body]),
+                "shapes": shapes,
+            }
+        )
+    hand = {"position": _rounded(model.body_pos[payload]), "quaternion": _rounded(model.body_quat[payload])}
+    return {
+        "links": links,
+        "hand": hand,
+        "arms": [
+            {"name": robot.name, **_pose(robot.mount.position_m, robot.mount.rotation())} for robot in robots
+        ],
+        "places": [{"name": place.name, **_pose(place.position_m, rotation(place.tool_deg))} for place in places],
+        "fixtures": [
+            {"name": box.name, "size": list(box.size_m), **_pose(box.position_m, rotation(box.tilt_deg))}
+            for box in fixtures
+        ],
+        "load": {"most_m": MOST_PAYLOAD_M, "kg_per_m3": PAYLOAD_KG_PER_M3},
+        "heat": {
+            "colours": list(HEAT),
+            "marks_c": _rounded(heat_marks(limits.warning_c, limits.error_c)),
+            "warning_c": limits.warning_c,
+            "error_c": limits.error_c,
+        },
+    }
+
+
+def _shape(model: mujoco.MjModel, geom: int) -> dict[str, Any]:
+    return {
+        "kind": SHAPES[mujoco.mjtGeom(model.geom_type[geom])],
+        "size": _rounded(model.geom_size[geom]),
+        "position": _rounded(model.geom_pos[geom]),
+        "quaternion": _rounded(model.geom_quat[geom]),
+        "colour": _rounded(model.geom_rgba[geom][:3]),
+    }
+
+
+def _pose(position_m: Sequence[float], matrix: np.ndarray) -> dict[str, Any]:
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(matrix).ravel())
+    return {"position": _rounded(position_m), "quaternion": _rounded(quaternion)}
+
+
+def _rounded(values: Sequence[float] | np.ndarray) -> list[float]:
+    return [round(float(value), DIGITS) for value in values]

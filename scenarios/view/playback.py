@@ -1,0 +1,91 @@
+"""The movement and the temperatures of a shift, packed for a page."""
+
+import base64
+import gzip
+import json
+from collections.abc import Sequence
+from typing import Any  # plain values of JSON
+
+import numpy as np
+
+from fleet.telemetry import Telemetry
+
+Array = np.ndarray
+
+MOST_VALUES = 3_000_000
+"""Joint angles in a page; longer shifts of larger fleets keep fewer moments."""
+HEAT_STEP_S = 10.0
+"""Motors take minutes to heat up; temperatures keep one moment in this time."""
+ANGLE_RAD, HEAT_C, LOAD_KG = 1e-3, 0.1, 0.01
+"""Resolution."""
+
+
+def packed(telemetry: Telemetry, payload_kg: Array | None = None) -> str:
+    """Angles, temperatures, modes and payloads of a shift as text: base64 of a gzip stream.
+
+    The stream is a line of JSON that lists the arrays (name, shape, scale, first moment and step in s), then their
+    values: 16-bit little-endian integers, [arm, joint, moment] or [arm, moment], each but the first as the
+    difference to its predecessor along the moments, modulo 2^16.
+
+    Args:
+        telemetry: At least one sample, equally spaced in time. An arm that is absent (NaN) keeps its last values, and
+            its mode is -1.
+        payload_kg: [sample, arm]; no payloads by default.
+    """
+    samples, arms = telemetry.mode.shape
+    time_s = telemetry.time_s
+    step_s = float(np.median(np.diff(time_s))) if samples > 1 else 1.0
+    dense = max(1, -(-telemetry.q.size // MOST_VALUES))
+    sparse = max(1, round(HEAT_STEP_S / step_s))
+    absent = ~np.isfinite(telemetry.q).all(axis=2)
+    mode = np.where(absent, -1, telemetry.mode)
+    load = np.zeros((samples, arms)) if payload_kg is None else payload_kg
+    arrays = [
+        ("q", telemetry.q, ANGLE_RAD, dense),
+        ("temp_c", telemetry.temp_c, HEAT_C, sparse),
+        ("mode", mode, 1.0, dense),
+        ("payload_kg", load, LOAD_KG, dense),
+    ]
+    listed: list[dict[str, Any]] = []
+    body = b""
+    for name, values, scale, stride in arrays:
+        kept = np.moveaxis(np.round(_held(values[::stride]) / scale).astype(np.int64), 0, -1)
+        first, step = float(time_s[0]), stride * step_s
+        listed.append({"name": name, "shape": kept.shape, "scale": scale, "first_s": first, "step_s": step})
+        body += np.diff(kept, axis=-1, prepend=0).astype("<i2").tobytes()
+    head = json.dumps(listed, separators=(",", ":")).encode()
+    return compressed(head + b"\n" + body)
+
+
+def compressed(content: bytes | str) -> str:
+    """Bytes or text as base64 of a gzip stream; the same content gives the same text."""
+    raw = content.encode() if isinstance(content, str) else content
+    return base64.b64encode(gzip.compress(raw, 9, mtime=0)).decode("ascii")
+
+
+def payloads(
+    telemetry: Telemetry, arms: Sequence[str], spans: Sequence[tuple[str, float, float, float]]
+) -> Array:
+    """Payloads in the hands, kg, [sample, arm].
+
+    Args:
+        spans: Arm, begin and end in s, and payload in kg, of each job at work.
+    """
+    load = np.zeros(telemetry.mode.shape)
+    for arm, begin_s, end_s, payload_kg in spans:
+        rows = slice(*np.searchsorted(telemetry.time_s, (begin_s, end_s)))
+        load[rows, list(arms).index(arm)] = payload_kg
+    return load
+
+
+def _held(values: Array) -> Array:
+    """Values along the first axis, NaN replaced by the last value before it, or the first after it."""
+    values = np.array(values, dtype=float)
+    if np.isfinite(values).all():
+        return values
+    flat = values.reshape(len(values), -1)
+    for column in flat.T:
+        known = np.flatnonzero(np.isfinite(column))
+        last = np.searchsorted(known, np.arange(len(column)), side="right") - 1
+        column[:] = column[known[np.maximum(last, 0)]] if len(known) else 0.0
+    return flat.reshape(values.shape)
