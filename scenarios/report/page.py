@@ -24,6 +24,8 @@ _PLOTLY_OPTIONS = {
     "showSendToCloud": False,
     "plotlyServerURL": "",
 }
+
+
 @dataclass(frozen=True, kw_only=True)
 class Picture:
     """One PNG of a section."""
@@ -77,7 +79,7 @@ class Replay:
     """A shift to be played in 3-D."""
 
     model: Mapping[str, Any]
-    """`scenarios.view.cell_model.cell_model`."""
+    """`fleet.physics.cell_model.cell_model`."""
     playback: str
     """`scenarios.view.playback.packed`."""
     unit_s: float
@@ -158,7 +160,6 @@ def _start(figure: bool, replay: Replay | None) -> str:
     return f"async function start(){{{draw}{play}}}"
 
 
-
 def _data(key: str, text: str) -> str:
     """An element that holds text for a script and is not run."""
     return f'<script type="text/plain" id="{key}">{text}</script>'
@@ -184,7 +185,7 @@ def replay_place() -> str:
         '<button id="play" type="button" aria-label="play">▶</button>'
         '<input id="time" type="range" min="0" max="1" value="0" aria-label="time of the shift">'
         f'<output id="clock">0:00:00</output><select id="speed" aria-label="speed">{speeds}</select>'
-        '</div></section>'
+        "</div></section>"
     )
 
 
@@ -199,19 +200,35 @@ def paragraph(text: str, style: str = "") -> str:
     return f'<p class="{style}">{escape(text)}</p>' if style else f"<p>{escape(text)}</p>"
 
 
+@dataclass(frozen=True)
+class Moment:
+    """A time of the shift, and the arm to look at."""
+
+    time_s: float
+    arm: str = ""
+
+
 def table(
-    head: Sequence[str], rows: Iterable[Sequence[str]], *, caption: str = "", style: str = "", kinds: Sequence[str] = ()
+    head: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    *,
+    caption: str = "",
+    style: str = "",
+    kinds: Sequence[str] = (),
+    moments: Sequence[Moment] = (),
 ) -> str:
     """A table of plain text.
 
     Args:
         kinds: A class of the style sheet for each row; none by default.
+        moments: Of each row; a click on a row goes there in the page's replay.
     """
-    classes = [f' class="{escape(kind)}"' for kind in kinds]
-    lines = [
-        f"<tr{classes[i] if classes else ''}>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>"
-        for i, row in enumerate(rows)
-    ]
+    lines = []
+    for i, row in enumerate(rows):
+        marks = f' class="{escape(kinds[i])}"' if kinds else ""
+        if moments:
+            marks += f' data-time="{moments[i].time_s:g}" data-arm="{escape(moments[i].arm)}" tabindex="0"'
+        lines.append(f"<tr{marks}>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>")
     above = f"<caption>{escape(caption)}</caption>" if caption else ""
     if head:
         above += f"<thead><tr>{''.join(f'<th>{escape(cell)}</th>' for cell in head)}</tr></thead>"

@@ -5,17 +5,24 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any  # values of run.json
 
+from fleet.env.render.heat import heat_scale
 from fleet.events import Event
 from fleet.telemetry import Telemetry
+from scenarios.report.choices import choices
 from scenarios.report.gantt import clock
-from scenarios.report.page import Replay, escape, figure_place, html_page, paragraph, replay_place, table
+from scenarios.report.page import Moment, Replay, escape, figure_place, html_page, paragraph, replay_place, table
 from scenarios.report.schedule import schedule
 from scenarios.report.timeline import figure, time_unit
+from scenarios.report.verdict import Verdict, duration, verdict
+from scenarios.shift_records import Offer
 from scenarios.view.playback import packed, payloads
 
 NO_PAYLOADS: Mapping[str, float] = {}
 ROWS = 300
 """Most rows of the event table."""
+
+BEFORE_S = 5.0
+"""A click on an event goes to this time before it."""
 
 NOTABLE = ("fault", "contact", "recover", "return", "warning", "torque_warning", "lost")
 """Event kinds of the event table, most important first; the least important are dropped first."""
@@ -31,6 +38,7 @@ def report_html(
     error_c: float,
     model: Mapping[str, Any] | None = None,
     payload_of: Mapping[str, float] = NO_PAYLOADS,
+    offers: Sequence[Offer] = (),
 ) -> str:
     """The report of a run as one HTML page; the same input gives the same text.
 
@@ -39,8 +47,9 @@ def report_html(
         telemetry: Arms in the order of `arms`; may be empty.
         events: Event log of the run, in any order.
         warning_c, error_c: Limits of the motor temperature.
-        model: `scenarios.view.cell_model.cell_model` with the same arms; without it nothing is shown in 3-D.
+        model: `fleet.physics.cell_model.cell_model` with the same arms; without it nothing is shown in 3-D.
         payload_of: Payload of each job, kg.
+        offers: What each arm knew at each award.
 
     Raises:
         ValueError: the telemetry has another number of arms, or the events contradict each other.
@@ -56,13 +65,15 @@ def report_html(
     if model is not None and len(telemetry.time_s):
         spans = [(a.arm, a.start_s, a.finished_s or a.end_s, payload_of.get(a.job, 0.0)) for a in plan.assignments]
         playback = packed(telemetry, payloads(telemetry, arms, spans))
-        replay = Replay(model=model, playback=playback, unit_s=time_unit(plan.horizon_s)[1])
+        shown = {**model, "heat": heat_scale(warning_c, error_c)}
+        replay = Replay(model=shown, playback=playback, unit_s=time_unit(plan.horizon_s)[1])
     body = [
-        *_head(run, arms, reached_s),
+        *_head(run, arms, verdict(run, events, plan, offers)),
         _key_figures(run.get("metrics") or {}),
         *([replay_place()] if replay else []),
         figure_place(),
         *_event_table(events),
+        *choices(offers, arms),
         _provenance(run),
     ]
     scenario = run.get("scenario", {}).get("name", "unnamed scenario")
@@ -70,20 +81,20 @@ def report_html(
     return html_page(title, body, figure=drawing, replay=replay)
 
 
-def _head(run: Mapping[str, Any], arms: Sequence[str], reached_s: float) -> list[str]:
+def _head(run: Mapping[str, Any], arms: Sequence[str], told: Verdict) -> list[str]:
     scenario = run.get("scenario", {})
     horizon_s = scenario.get("horizon_s")
-    length = f"{_duration(horizon_s)} shift" if horizon_s is not None else "Shift"
+    length = f"{duration(horizon_s)} shift" if horizon_s is not None else "Shift"
     how = [f"{length} of {len(arms)} arm{'s' if len(arms) != 1 else ''}"]
     how += [f"{name} {run[name]}" for name in ("plant", "bus", "difficulty") if run.get(name) is not None]
-    status = str(run.get("status", "unknown"))
-    summary = {
-        "finished": "Finished",
-        "interrupted": f"Interrupted after {_duration(reached_s)}: everything here covers that part only",
-    }.get(status, f"Status: {status}")
-    lines = [paragraph(str(scenario["description"]))] if scenario.get("description") else []
-    look = "status good" if status == "finished" else "status bad"
-    return [*lines, paragraph(" · ".join(how), "faint"), paragraph(summary, look)]
+    lines = [paragraph(str(scenario["description"]), "faint")] if scenario.get("description") else []
+    badge = paragraph(told.badge, "status good" if told.good else "status bad")
+    return [
+        badge,
+        *(paragraph(sentence, "verdict") for sentence in told.sentences),
+        *lines,
+        paragraph(" · ".join(how), "faint"),
+    ]
 
 
 KEY_FIGURES = (
@@ -144,7 +155,16 @@ def _event_table(events: Sequence[Event]) -> list[str]:
     listed.sort(key=lambda e: (e.time_s, e.arm, NOTABLE.index(e.kind)))
     rows = [(clock(e.time_s), _label(e.kind), e.arm, e.job, e.reason) for e in listed]
     head = ("time", "event", "arm", "job", "reason")
-    return [*lines, table(head, rows, style="events", kinds=[e.kind for e in listed])]
+    return [
+        *lines,
+        table(
+            head,
+            rows,
+            style="events",
+            kinds=[e.kind for e in listed],
+            moments=[Moment(max(0.0, e.time_s - BEFORE_S), e.arm) for e in listed],
+        ),
+    ]
 
 
 def _label(kind: str) -> str:
@@ -174,11 +194,3 @@ def _plain(value: object) -> str:
     if isinstance(value, list | tuple) and any(isinstance(inner, Mapping | list | tuple) for inner in value):
         return f"list of {len(value)}"
     return ", ".join(map(_plain, value)) if isinstance(value, list | tuple) else str(value)
-
-
-def _duration(time_s: float) -> str:
-    """3 h, 54 min, 1 h 30 min, 20 s."""
-    hours, minutes = divmod(round(time_s / 60), 60)
-    if time_s < 60:
-        return f"{time_s:.0f} s"
-    return " ".join(f"{n} {unit}" for n, unit in ((hours, "h"), (minutes, "min")) if n)

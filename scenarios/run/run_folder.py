@@ -13,13 +13,13 @@ import pyarrow.parquet as pq
 from fleet.env.allocation_v1 import VERSION
 from fleet.errors import FleetError
 from fleet.events import Event
+from fleet.physics.cell_model import cell_model
 from fleet.robot import JOINTS
 from fleet.telemetry import MODES, Telemetry
 from scenarios.report.run_page import report_html
 from scenarios.result_folder import ResultKind, disk_errors
-from scenarios.run.records import JobRecord, Offer
 from scenarios.run.shift import RUN_FORMAT, RunResult, summary
-from scenarios.view.cell_model import cell_model
+from scenarios.shift_records import JobRecord, Offer
 
 FILES = ("run.json", "telemetry.parquet", "events.parquet", "jobs.parquet", "offers.parquet", "report.html")
 RUN = ResultKind(name="run", card="run.json", files=FILES)
@@ -49,8 +49,9 @@ def write(result: RunResult, folder: Path) -> None:
             arms,
             warning_c=limits.warning_c,
             error_c=limits.error_c,
-            model=cell_model([a.robot() for a in scenario.arms], scenario.places, scenario.fixtures, limits=limits),
+            model=cell_model([a.robot() for a in scenario.arms], scenario.places, scenario.fixtures),
             payload_of={job.job: job.payload_kg for job in result.jobs},
+            offers=result.offers,
         )
         (folder / "report.html").write_text(html, encoding="utf-8")
 
@@ -113,6 +114,12 @@ def event_table(events: tuple[Event, ...]) -> pa.Table:
 
 def record_table(kind: type, records: Sequence[object]) -> pa.Table:
     """One row per record: the fields of a dataclass of text, numbers and booleans."""
-    types = {"str": pa.string(), "bool": pa.bool_(), "int": pa.int64(), "float": pa.float64(), "float | None": pa.float64()}
+    types = {
+        "str": pa.string(),
+        "bool": pa.bool_(),
+        "int": pa.int64(),
+        "float": pa.float64(),
+        "float | None": pa.float64(),
+    }
     names = {field.name: types[getattr(field.type, "__name__", str(field.type))] for field in fields(kind)}
     return pa.table({name: pa.array([getattr(r, name) for r in records], kind) for name, kind in names.items()})

@@ -23,8 +23,8 @@ from scenarios.progress import Progress, quiet
 from scenarios.run.metrics import Metrics
 from scenarios.run.outcome import metrics_of
 from scenarios.run.provenance import provenance
-from scenarios.run.records import JobRecord, Offer, job_records, offers_of
 from scenarios.schema import Scenario
+from scenarios.shift_records import JobRecord, Offer, job_records, offers_of
 
 RUN_FORMAT = 6
 """Raised when run.json or the columns of the recordings change."""

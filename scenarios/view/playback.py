@@ -63,9 +63,7 @@ def compressed(content: bytes | str) -> str:
     return base64.b64encode(gzip.compress(raw, 9, mtime=0)).decode("ascii")
 
 
-def payloads(
-    telemetry: Telemetry, arms: Sequence[str], spans: Sequence[tuple[str, float, float, float]]
-) -> Array:
+def payloads(telemetry: Telemetry, arms: Sequence[str], spans: Sequence[tuple[str, float, float, float]]) -> Array:
     """Payloads in the hands, kg, [sample, arm].
 
     Args:

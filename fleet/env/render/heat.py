@@ -1,10 +1,12 @@
 """The colour scale of motor temperatures, shared by every picture and page."""
 
+from typing import Any  # plain values of JSON
+
 import numpy as np
 
 Array = np.ndarray
 
-HEAT = ("#bfe5b0", "#efd382", "#e08a00", "#cc2222", "#4d0a2a")
+HEAT = ("#aef2a6", "#ecd070", "#e08a00", "#cc2222", "#4d0a2a")
 """Cool, halfway to the warning limit, warning, error, beyond: green to red, and ever darker, so that they can be told
 apart without colour vision."""
 COOL_C, BEYOND_K = 20.0, 10.0
@@ -22,3 +24,9 @@ def heat_colour(temp_c: Array, warning_c: float, error_c: float) -> Array:
     marks = heat_marks(warning_c, error_c)
     rgb = np.array([[int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)] for colour in HEAT])
     return np.stack([np.interp(temp_c, marks, rgb[:, i]) for i in range(3)], axis=-1)
+
+
+def heat_scale(warning_c: float, error_c: float) -> dict[str, Any]:
+    """The scale as plain values, for a page."""
+    marks = [round(float(mark), 2) for mark in heat_marks(warning_c, error_c)]
+    return {"colours": list(HEAT), "marks_c": marks, "warning_c": warning_c, "error_c": error_c}

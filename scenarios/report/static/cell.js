@@ -4,7 +4,7 @@
 
 function makeCell(place, model) {
   const arms = model.arms.length, turning = model.links.filter((link) => link.turns).length;
-  const scene = new THREE.Scene(), renderer = new THREE.WebGLRenderer({ antialias: true, preserveDrawingBuffer: true });
+  const scene = new THREE.Scene(), renderer = new THREE.WebGLRenderer({ antialias: true });
   const camera = new THREE.PerspectiveCamera(40, 1, 0.05, 200);
   camera.up.set(0, 0, 1);
   place.append(renderer.domElement);
@@ -153,7 +153,7 @@ function makeCell(place, model) {
 
   // The camera goes round a target: drag to turn, shift-drag or two fingers to move, wheel or pinch to zoom.
   const target = centre.clone().add(new THREE.Vector3(0, 0, 0.35));
-  const start = { azimuth: -0.9, height: 0.5, distance: 1.5 + 1.25 * across };
+  const start = { azimuth: -0.9, height: 0.62, distance: 1.2 + 1.05 * across };
   let view = { ...start }, fingers = new Map(), spread = 0;
   function look() {
     const { azimuth, height, distance } = view;

@@ -106,19 +106,22 @@ async function startReplay(figure, unitS) {
     return (t) => {
       const { xaxis, _size } = element._fullLayout, px = xaxis.l2p(t / unitS);
       line.hidden = px < 0 || px > xaxis._length;
-      Object.assign(line.style, { left: `${_size.l + px}px`, top: `${_size.t}px`, height: `${_size.h}px` });
+      Object.assign(line.style, { transform: `translateX(${_size.l + px}px)`, top: `${_size.t}px`, height: `${_size.h}px` });
     };
   }
   play.addEventListener("click", toggle);
   slider.addEventListener("input", () => show(Number(slider.value)));
-  document.addEventListener("click", (event) => {
+  // A row of a table with a moment goes there, by click or Enter.
+  function goTo(event) {
     const row = event.target.closest("[data-time]");
-    if (!row) return;
+    if (!row || (event.type === "keydown" && event.key !== "Enter")) return;
     const arm = model.arms.findIndex((one) => one.name === row.dataset.arm);
     show(Number(row.dataset.time));
     if (cell && arm >= 0) cell.focus(arm);
     place.scrollIntoView({ block: "center", behavior: "smooth" });
-  });
+  }
+  document.addEventListener("click", goTo);
+  document.addEventListener("keydown", goTo);
   document.addEventListener("keydown", (event) => {
     if (event.target.closest("input, select, button, canvas, a, summary")) return;
     if (event.key === " ") toggle();

@@ -9,10 +9,9 @@ from typing import Any  # plain values of JSON
 import mujoco
 import numpy as np
 
-from fleet.env.render.heat import HEAT, heat_marks
 from fleet.job import MOST_PAYLOAD_M, PAYLOAD_KG_PER_M3, Fixture, Place
 from fleet.physics.models import build_cell
-from fleet.robot import Mount, Robot, ThermalLimits, rotation
+from fleet.robot import Mount, Robot, rotation
 
 SHAPES = {
     mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
@@ -28,10 +27,8 @@ def cell_model(
     robots: Sequence[Robot],
     places: Sequence[Place] = (),
     fixtures: Sequence[Fixture] = (),
-    *,
-    limits: ThermalLimits,
 ) -> dict[str, Any]:
-    """Arms, places, fixtures and the colour scale of the motors.
+    """Arms, places and fixtures, with the movement of the links.
 
     Returns:
         `links`: the bodies of one arm in the order of the chain, each with the index of its parent (-1 for the
@@ -59,21 +56,13 @@ def cell_model(
     return {
         "links": links,
         "hand": hand,
-        "arms": [
-            {"name": robot.name, **_pose(robot.mount.position_m, robot.mount.rotation())} for robot in robots
-        ],
+        "arms": [{"name": robot.name, **_pose(robot.mount.position_m, robot.mount.rotation())} for robot in robots],
         "places": [{"name": place.name, **_pose(place.position_m, rotation(place.tool_deg))} for place in places],
         "fixtures": [
             {"name": box.name, "size": list(box.size_m), **_pose(box.position_m, rotation(box.tilt_deg))}
             for box in fixtures
         ],
         "load": {"most_m": MOST_PAYLOAD_M, "kg_per_m3": PAYLOAD_KG_PER_M3},
-        "heat": {
-            "colours": list(HEAT),
-            "marks_c": _rounded(heat_marks(limits.warning_c, limits.error_c)),
-            "warning_c": limits.warning_c,
-            "error_c": limits.error_c,
-        },
     }
 
 
