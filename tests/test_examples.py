@@ -71,20 +71,6 @@ def test_own_policy_is_compared_beside_the_rules() -> None:
     assert "Careful" in done.stdout
 
 
-def test_the_player_shows_recorded_postures_and_heat(tmp_path) -> None:
-    options = ["--policy", "round_robin", "--seed", "11", "--difficulty", "blind", "--bus", "memory"]
-    subprocess.run([*COMMAND, "run", "quickstart", *options, "--out", tmp_path / "run"], check=True, timeout=120)
-    player = example("view_run").Player(tmp_path / "run")
-    hottest = int(player.temp_c.max(axis=1).argmax())
-    player.show(float(player.time_s[hottest]))
-    assert player.data.qpos == pytest.approx(player.q[hottest])
-    colours = player.model.site_rgba[player.motors]
-    red, hot = colours[:, 0] - colours[:, 1], player.temp_c[hottest]
-    assert red[hot.argmax()] > red[hot.argmin()]
-    player.show(float(player.time_s[hottest : hottest + 2].mean()))
-    assert player.data.qpos == pytest.approx(player.q[hottest : hottest + 2].mean(axis=0))
-
-
 def test_monitor_hears_every_arm_from_another_process(tmp_path) -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

@@ -1,7 +1,6 @@
 """The report: one file that shows what happened, fetches nothing, and cannot be broken by a name."""
 
 import base64
-import base64
 import copy
 import gzip
 import json

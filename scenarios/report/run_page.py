@@ -63,8 +63,7 @@ def report_html(
     drawing = figure(plan, telemetry, events, arms, warning_c=warning_c, error_c=error_c)
     replay = None
     if model is not None and len(telemetry.time_s):
-        spans = [(a.arm, a.start_s, a.finished_s or a.end_s, payload_of.get(a.job, 0.0)) for a in plan.assignments]
-        playback = packed(telemetry, payloads(telemetry, arms, spans))
+        playback = packed(telemetry, payloads(telemetry, plan, arms, payload_of))
         shown = {**model, "heat": heat_scale(warning_c, error_c)}
         replay = Replay(model=shown, playback=playback, unit_s=time_unit(plan.horizon_s)[1])
     body = [

@@ -3,12 +3,13 @@
 import base64
 import gzip
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any  # plain values of JSON
 
 import numpy as np
 
 from fleet.telemetry import Telemetry
+from scenarios.report.schedule import Schedule
 
 Array = np.ndarray
 
@@ -63,17 +64,18 @@ def compressed(content: bytes | str) -> str:
     return base64.b64encode(gzip.compress(raw, 9, mtime=0)).decode("ascii")
 
 
-def payloads(telemetry: Telemetry, arms: Sequence[str], spans: Sequence[tuple[str, float, float, float]]) -> Array:
+def payloads(telemetry: Telemetry, plan: Schedule, arms: Sequence[str], payload_of: Mapping[str, float]) -> Array:
     """Payloads in the hands, kg, [sample, arm].
 
     Args:
-        spans: Arm, begin and end in s, and payload in kg, of each job at work.
+        plan: Which arm worked on what.
+        payload_of: Payload of each job, kg; none for others.
     """
-    load = np.zeros(telemetry.mode.shape)
-    for arm, begin_s, end_s, payload_kg in spans:
-        rows = slice(*np.searchsorted(telemetry.time_s, (begin_s, end_s)))
-        load[rows, list(arms).index(arm)] = payload_kg
-    return load
+    load_kg = np.zeros(telemetry.mode.shape)
+    for work in plan.assignments:
+        rows = slice(*np.searchsorted(telemetry.time_s, (work.start_s, work.finished_s or work.end_s)))
+        load_kg[rows, arms.index(work.arm)] = payload_of.get(work.job, 0.0)
+    return load_kg
 
 
 def _held(values: Array) -> Array:

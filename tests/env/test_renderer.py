@@ -23,7 +23,7 @@ def test_without_a_display_it_warns_once_and_continues(monkeypatch, caplog) -> N
         assert window.show(BLACK + 255) is False
     assert len(caplog.messages) == 1
     assert "render_mode='rgb_array'" in caplog.messages[0]
-    assert "thermofleet animate" in caplog.messages[0]
+    assert "thermofleet film" in caplog.messages[0]
     window.close()
     pickle.loads(pickle.dumps(window))
 

@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 DPI = 100
 NO_WINDOW = (
     "There is no display to show the fleet on (%s). Use render_mode='rgb_array' for the frames, or "
-    "`thermofleet animate SCENARIO` for a GIF."
+    "`thermofleet run SCENARIO` and `thermofleet film RUN` for a film."
 )
 
 

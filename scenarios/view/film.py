@@ -1,0 +1,219 @@
+"""Films of a recorded shift: MuJoCo's renderer without a display, and ffmpeg's encoders through PyAV."""
+
+# MuJoCo is compiled and ships no type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+import mujoco
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from fleet.env.render.heat import heat_colour, heat_marks
+from fleet.errors import FleetError, visible
+from fleet.physics.cell_player import CellPlayer
+from fleet.telemetry import FAULTED, MODES
+from scenarios.report.gantt import clock
+from scenarios.report.schedule import schedule
+from scenarios.run.stored_run import StoredRun
+from scenarios.view.playback import payloads
+
+Array = np.ndarray
+
+NO_OPENGL = (
+    "No OpenGL without a display could be had ({error}). Install EGL or OSMesa (on Debian: libegl1 and "
+    "libgl1-mesa-dri, or libosmesa6), or choose one with MUJOCO_GL=egl or MUJOCO_GL=osmesa."
+)
+INK, PAPER, FAULT = (34, 34, 34), (250, 250, 248), (204, 34, 34)
+CODECS = {"mp4": "libx264", "webm": "libvpx"}
+OPTIONS = {"libx264": {"preset": "veryfast", "crf": "27"}, "libvpx": {"deadline": "realtime", "cpu-used": "8"}}
+MOST_LINES = 8
+"""Arms whose hottest motor is written in the picture."""
+TEXT_PX, LINE_PX = 16, 21
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shot:
+    """What to film and how."""
+
+    speed: float = 120.0
+    """Shift seconds per second of the film."""
+    fps: int = 30
+    width: int = 1280
+    height: int = 720
+    begin_s: float = 0.0
+    end_s: float = float("inf")
+    meshes: bool = False
+
+
+def times(run: StoredRun, shot: Shot) -> Array:
+    """Times of the frames, s.
+
+    Raises:
+        FleetError: the run has no readings between `begin_s` and `end_s`.
+    """
+    time_s = run.telemetry.time_s
+    begin_s, end_s = max(shot.begin_s, float(time_s[0])), min(shot.end_s, float(time_s[-1]))
+    if not begin_s <= end_s:
+        raise FleetError(
+            f"The run has readings from {time_s[0]:g} to {time_s[-1]:g} s (got {shot.begin_s:g} to {shot.end_s:g} s)."
+        )
+    return np.arange(begin_s, end_s + 1e-9, shot.speed / shot.fps)
+
+
+class Film:
+    """A recorded shift in a MuJoCo model of its cell.
+
+    Raises:
+        FleetError: the meshes are not available.
+    """
+
+    def __init__(self, run: StoredRun, *, meshes: bool = False) -> None:
+        scenario, readings = run.scenario, run.telemetry
+        robots = [arm.robot() for arm in scenario.arms]
+        self.player = CellPlayer(robots, scenario.places, scenario.fixtures, limits=scenario.limits, meshes=meshes)
+        self.mounts_m = np.array([robot.mount.position_m for robot in robots])
+        plan = schedule(run.events, run.arms, float(readings.time_s[-1]))
+        self._load_kg = payloads(readings, plan, run.arms, {job.job: job.payload_kg for job in run.jobs})
+        self._readings = readings
+
+    def show(self, time_s: float) -> tuple[Array, Array]:
+        """Put the cell into its state at a time; returns the temperatures [arm, joint] and the modes [arm]."""
+        readings = self._readings
+        row = int(
+            np.clip(
+                np.searchsorted(readings.time_s, time_s), min(1, len(readings.time_s) - 1), len(readings.time_s) - 1
+            )
+        )
+        before = max(row - 1, 0)
+        length_s = readings.time_s[row] - readings.time_s[before]
+        share = np.clip((time_s - readings.time_s[before]) / length_s, 0.0, 1.0) if length_s else 1.0
+        q, temp_c = ((1 - share) * v[before] + share * v[row] for v in (readings.q, readings.temp_c))
+        self.player.show(q, temp_c, self._load_kg[row])
+        return temp_c, readings.mode[row]
+
+
+def frames(run: StoredRun, shot: Shot, at_s: Array) -> Iterator[Array]:
+    """Pictures of a shift, uint8 [height, width, 3].
+
+    Raises:
+        FleetError: OpenGL or the meshes are not available.
+    """
+    film, overlay = Film(run, meshes=shot.meshes), Overlay(run, shot)
+    model = film.player.model
+    model.vis.global_.offwidth, model.vis.global_.offheight = shot.width, shot.height
+    model.vis.quality.offsamples = 0
+    try:
+        renderer = mujoco.Renderer(model, shot.height, shot.width)
+    except Exception as error:  # each OpenGL backend has errors of its own
+        raise FleetError(NO_OPENGL.format(error=error or type(error).__name__)) from error
+    camera = camera_on(film.mounts_m)
+    with renderer:
+        for time_s in at_s:
+            temp_c, mode = film.show(time_s)
+            renderer.update_scene(film.player.data, camera)
+            for slow in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+                renderer.scene.flags[slow] = 0
+            yield overlay.draw(renderer.render(), float(time_s), temp_c, mode)
+
+
+def camera_on(mounts_m: Array) -> mujoco.MjvCamera:
+    """A camera that sees a whole cell; mounts [arm, 3]."""
+    camera = mujoco.MjvCamera()
+    across = max(1.0, *np.ptp(mounts_m, axis=0))
+    camera.lookat[:] = (mounts_m.min(axis=0) + mounts_m.max(axis=0)) / 2 + (0.0, 0.0, 0.35)
+    camera.distance, camera.azimuth, camera.elevation = 1.2 + 1.05 * across, 128.0, -36.0
+    return camera
+
+
+class Overlay:
+    """Clock, hottest motors and colour scale, written into a picture."""
+
+    def __init__(self, run: StoredRun, shot: Shot) -> None:
+        self._arms, self._limits = [visible(arm) for arm in run.arms], run.scenario.limits
+        self._font, self._small = _font(TEXT_PX), _font(12)
+        card = run.card
+        self._title = visible(f"{run.scenario.name} · {card['policy']} · seed {card['seed']} · {shot.speed:g} ×")
+        self._scale = self._colour_scale(min(320, shot.width - 24))
+
+    def draw(self, picture: Array, time_s: float, temp_c: Array, mode: Array) -> Array:
+        """The picture with its text; modes [arm] index `fleet.telemetry.MODES`."""
+        image = Image.fromarray(picture)
+        pen = ImageDraw.Draw(image)
+        hottest = temp_c.max(axis=1)
+        lines = [(f"{clock(time_s)}  {self._title}", INK)]
+        for arm in np.argsort(-hottest)[:MOST_LINES]:
+            text = (
+                f"{self._arms[arm]}: {MODES[mode[arm]]}, joint {int(temp_c[arm].argmax()) + 1} at {hottest[arm]:.1f} °C"
+            )
+            lines.append((text, FAULT if mode[arm] == FAULTED else INK))
+        width = max(pen.textlength(text, font=self._font) for text, _ in lines)
+        pen.rectangle((6, 4, width + 18, 10 + len(lines) * LINE_PX), fill=PAPER)
+        for number, (text, colour) in enumerate(lines):
+            pen.text((12, 8 + number * LINE_PX), text, font=self._font, fill=colour)
+        image.paste(self._scale, (12, image.height - self._scale.height - 12))
+        return np.asarray(image)
+
+    def _colour_scale(self, width: int) -> Image.Image:
+        warning_c, error_c = self._limits.warning_c, self._limits.error_c
+        marks = heat_marks(warning_c, error_c)
+        image = Image.new("RGB", (width, 44), PAPER)
+        colours = heat_colour(np.linspace(marks[0], marks[-1], width - 16), warning_c, error_c)
+        bar = np.rint(255 * np.tile(colours, (14, 1, 1))).astype(np.uint8)
+        image.paste(Image.fromarray(bar), (8, 6))
+        pen = ImageDraw.Draw(image)
+        for mark, word in ((marks[0], f"{marks[0]:g} °C"), (warning_c, f"{warning_c:g}"), (error_c, f"{error_c:g}")):
+            x = 8 + (width - 16) * (mark - marks[0]) / (marks[-1] - marks[0])
+            pen.line((x, 4, x, 22), fill=INK)
+            pen.text((max(2, x - (0 if mark == marks[0] else 8)), 24), word, font=self._small, fill=INK)
+        return image
+
+
+def _font(size_px: int) -> ImageFont.FreeTypeFont:
+    """DejaVu Sans as it comes with matplotlib: Pillow's own font lacks signs like ×."""
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")), size_px)
+
+
+def write_film(path: Path, kind: str, pictures: Iterator[Array], shot: Shot) -> int:
+    """Write pictures as mp4 (H.264), webm (VP8) or gif, and return their number.
+
+    Raises:
+        FleetError: PyAV is not installed.
+    """
+    if kind == "gif":
+        return _write_gif(path, pictures, shot.fps)
+    try:
+        import av
+    except ModuleNotFoundError as error:
+        raise FleetError(
+            "Films as MP4 or WebM need PyAV: pip install 'thermofleet[film]'. A GIF needs nothing."
+        ) from error
+    codec = CODECS[kind]
+    count = 0
+    with av.open(str(path), "w", format=kind) as container:
+        stream = container.add_stream(codec, rate=shot.fps, options=OPTIONS[codec])
+        stream.width, stream.height, stream.pix_fmt = shot.width, shot.height, "yuv420p"
+        if codec == "libvpx":
+            stream.bit_rate = 1_500_000
+        for picture in pictures:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+            count += 1
+        container.mux(stream.encode())
+    return count
+
+
+def _write_gif(path: Path, pictures: Iterator[Array], fps: int) -> int:
+    """All frames share the palette of the first and a hot one, so that colours do not flicker."""
+    images = []
+    palette: Image.Image | None = None
+    for picture in pictures:
+        image = Image.fromarray(picture)
+        if palette is None:
+            palette = image.quantize(256)
+        images.append(image.quantize(palette=palette, dither=Image.Dither.NONE))
+    first, *rest = images
+    first.save(path, "GIF", save_all=True, append_images=rest, duration=round(1000 / fps), loop=0, optimize=True)
+    return len(images)

@@ -1,0 +1,74 @@
+"""A run read from its folder, and what a page gets of it."""
+
+import base64
+import gzip
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleet.errors import FleetError
+from fleet.telemetry import Telemetry
+from scenarios.run.run_folder import telemetry_table
+from scenarios.run.stored_run import read_run
+from scenarios.view.playback import packed
+
+
+def unpacked(text: str) -> dict[str, tuple[dict, np.ndarray]]:
+    """Every array of a playback with its entry in the list, decoded as its docstring says."""
+    raw = gzip.decompress(base64.b64decode(text))
+    head, _, body = raw.partition(b"\n")
+    out, at = {}, 0
+    for entry in json.loads(head):
+        count = int(np.prod(entry["shape"]))
+        steps = np.frombuffer(body, "<i2", count, at).reshape(entry["shape"]).astype(np.int64)
+        at += 2 * count
+        out[entry["name"]] = entry, np.cumsum(steps, axis=-1).astype(np.int16) * entry["scale"]
+    assert at == len(body)
+    return out
+
+
+def test_the_readings_are_those_of_the_file(run_folder: Path) -> None:
+    run = read_run(run_folder)
+    again = telemetry_table(run.telemetry, list(run.arms))
+    import pyarrow.parquet as pq
+
+    assert again.drop_columns(["arm", "mode"]).equals(
+        pq.read_table(run_folder / "telemetry.parquet").drop_columns(["arm", "mode"])
+    )
+    assert {job.job for job in run.jobs} >= {event.job for event in run.events if event.job}
+    awards = [event for event in run.events if event.kind == "award"]
+    assert len(run.offers) == len(awards) * len(run.arms)
+    assert [(o.time_s, o.job, o.arm) for o in run.offers if o.awarded] == [(e.time_s, e.job, e.arm) for e in awards]
+
+
+def test_a_page_gets_the_shift_within_its_resolution(run_folder: Path) -> None:
+    readings = read_run(run_folder).telemetry
+    arrays = unpacked(packed(readings))
+    entry, q = arrays["q"]
+    stride = round(entry["step_s"] / float(readings.time_s[1] - readings.time_s[0]))
+    np.testing.assert_allclose(np.moveaxis(q, -1, 0), readings.q[::stride], atol=0.51e-3)
+    entry, temp_c = arrays["temp_c"]
+    stride = round(entry["step_s"] / float(readings.time_s[1] - readings.time_s[0]))
+    np.testing.assert_allclose(np.moveaxis(temp_c, -1, 0), readings.temp_c[::stride], atol=0.051)
+
+
+def test_an_absent_arm_keeps_its_last_posture() -> None:
+    q = np.tile(np.arange(6.0)[:, None, None], (1, 2, 7))
+    q[2:4, 1] = q[0, 0] = np.nan
+    still = np.zeros_like(q)
+    readings = Telemetry(np.arange(6.0), np.ones((6, 2), int), q, still, still, still, still)
+    arrays = unpacked(packed(readings))
+    np.testing.assert_allclose(arrays["q"][1][1, 0], [0, 1, 1, 1, 4, 5])
+    np.testing.assert_allclose(arrays["q"][1][0, 0], [1, 1, 2, 3, 4, 5])
+    assert arrays["mode"][1].tolist() == [[-1, 1, 1, 1, 1, 1], [1, 1, -1, -1, 1, 1]]
+
+
+@pytest.mark.parametrize("damage", ["jobs.parquet", "telemetry.parquet", "run.json"])
+def test_a_damaged_run_is_refused_in_words(run_folder: Path, tmp_path: Path, damage: str) -> None:
+    copied = shutil.copytree(run_folder, tmp_path / "run")
+    (copied / damage).write_bytes(b"PAR1 cut short")
+    with pytest.raises(FleetError, match="no complete folder of `thermofleet run`"):
+        read_run(copied)
