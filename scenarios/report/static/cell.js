@@ -2,9 +2,16 @@
 // One instanced mesh per shape of a link, with one instance per arm: the number of draws does not grow with the fleet.
 "use strict";
 
+// Whether WebGL has no graphics card: smooth edges would then cost more time than all else.
+function drawnBySoftware() {
+  const gl = document.createElement("canvas").getContext("webgl");
+  const info = gl && gl.getExtension("WEBGL_debug_renderer_info");
+  return Boolean(info) && /swiftshader|llvmpipe|software/i.test(gl.getParameter(info.UNMASKED_RENDERER_WEBGL));
+}
+
 function makeCell(place, model) {
   const arms = model.arms.length, turning = model.links.filter((link) => link.turns).length;
-  const scene = new THREE.Scene(), renderer = new THREE.WebGLRenderer({ antialias: true });
+  const scene = new THREE.Scene(), renderer = new THREE.WebGLRenderer({ antialias: !drawnBySoftware() });
   const camera = new THREE.PerspectiveCamera(40, 1, 0.05, 200);
   camera.up.set(0, 0, 1);
   place.append(renderer.domElement);
@@ -26,9 +33,9 @@ function makeCell(place, model) {
   function geometry(shape) {
     const [a, b, c] = shape.size;
     switch (shape.kind) {
-      case "sphere": return new THREE.SphereGeometry(a, 20, 14);
-      case "capsule": return new THREE.CapsuleGeometry(a, 2 * b, 6, 14).rotateX(Math.PI / 2);
-      case "cylinder": return new THREE.CylinderGeometry(a, a, 2 * b, 20).rotateX(Math.PI / 2);
+      case "sphere": return new THREE.SphereGeometry(a, 14, 9);
+      case "capsule": return new THREE.CapsuleGeometry(a, 2 * b, 3, 12).rotateX(Math.PI / 2);
+      case "cylinder": return new THREE.CylinderGeometry(a, a, 2 * b, 14).rotateX(Math.PI / 2);
       default: return new THREE.BoxGeometry(2 * a, 2 * b, 2 * c);
     }
   }
@@ -43,9 +50,9 @@ function makeCell(place, model) {
   const links = model.links.map((link) => ({
     parent: link.parent, turns: link.turns, local: pose(link),
     shapes: link.shapes.map((shape) => ({ local: pose(shape), mesh: instanced(geometry(shape), colourOf(shape.colour)) })),
-    motor: link.turns ? instanced(new THREE.SphereGeometry(1, 18, 12), "#ffffff") : null,
+    motor: link.turns ? instanced(new THREE.SphereGeometry(1, 14, 9), "#ffffff") : null,
   }));
-  const hand = pose(model.hand), load = instanced(new THREE.SphereGeometry(1, 18, 12), colourOf([0.36, 0.52, 0.7]));
+  const hand = pose(model.hand), load = instanced(new THREE.SphereGeometry(1, 14, 9), colourOf([0.36, 0.52, 0.7]));
   const mounts = model.arms.map((arm) => pose(arm));
 
   const box = new THREE.Box3();
