@@ -20,14 +20,20 @@ async function drawFigure(options) {
   // The layout leaves room for a legend of a wide page; on a narrow one the figure begins lower.
   const room = drawn.layout.margin.t;
   let last = 0;
-  element.on("plotly_afterplot", () => {
+  async function fit() {
     const legend = element.querySelector(".legend");
     if (!legend || element.clientWidth === last) return;
     last = element.clientWidth;
+    const narrow = last < 600; // the time axis of the work has the title of the one below
     const needed = legend.getBoundingClientRect().height + 50;
     const margin = Math.max(room, Math.ceil(needed));
-    if (Math.abs(margin - element.layout.margin.t) > 4)
-      Plotly.relayout(element, { "margin.t": margin, height: drawn.layout.height + margin - room });
-  });
+    if (narrow || Math.abs(margin - element.layout.margin.t) > 4)
+      await Plotly.relayout(element, {
+        "margin.t": margin, height: drawn.layout.height + margin - room,
+        "legend2.font.size": narrow ? 9 : 12, "xaxis.title.text": narrow ? "" : drawn.layout.xaxis2.title.text,
+      });
+  }
+  await fit();
+  element.on("plotly_afterplot", fit);
   return element;
 }
