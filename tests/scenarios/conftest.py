@@ -1,13 +1,18 @@
 """A small cell whose plans are made once for all tests here, and the command line called in place."""
 
+import os
+import signal
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 
+from agents.registry import make_policy
 from fleet.motor import gen3_motors
 from fleet.planning.random_motions import random_jobs
 from fleet.robot import Robot
@@ -120,3 +125,30 @@ def thermofleet(
         return Said(left.value.code, said.out, said.err)
 
     return call
+
+
+class PressingCtrlC:
+    """Round robin, until somebody presses Ctrl-C at a certain step."""
+
+    def __init__(self, step: int, times: int) -> None:
+        self._policy, self._left, self._times = make_policy("round_robin"), step, times
+
+    def reset(self, rng):
+        self._policy.reset(rng)
+
+    def act(self, observations):
+        self._left -= 1
+        if self._left == 0:
+            for _ in range(self._times):
+                os.kill(os.getpid(), signal.SIGINT)
+        return self._policy.act(observations)
+
+
+@pytest.fixture
+def press_ctrl_c() -> Callable[..., AbstractContextManager[object]]:
+    """A function that has the shifts within a block interrupted at their fourth step."""
+
+    def press(times: int = 1) -> AbstractContextManager[object]:
+        return patch("scenarios.policy_loader.policy_of", lambda name: PressingCtrlC(step=4, times=times))
+
+    return press
