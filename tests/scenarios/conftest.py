@@ -2,17 +2,18 @@
 
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
+from typing import NamedTuple
 from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 from agents.registry import make_policy
+from fleet.bus.client.router import Router
 from fleet.motor import gen3_motors
 from fleet.planning.random_motions import random_jobs
 from fleet.robot import Robot
@@ -70,8 +71,7 @@ speeds = [1.0]
 """
 
 
-@dataclass(frozen=True)
-class Said:
+class Said(NamedTuple):
     """What one call of the command line said."""
 
     code: int
@@ -108,6 +108,13 @@ def small_toml(tmp_path: Path) -> Path:
     path = tmp_path / "heat.toml"
     path.write_text(SMALL, encoding="utf-8")
     return path
+
+
+@pytest.fixture
+def endpoint() -> Iterator[str]:
+    """A router."""
+    with Router() as router:
+        yield router.endpoint
 
 
 @pytest.fixture
