@@ -41,7 +41,7 @@ from fleet.job import Place
 from fleet.live.arm.award_executor import AwardExecutor
 from fleet.live.arm.config import ArmConfig
 from fleet.live.arm.estimator import MAX_BYTES, Estimator, NominalPeaks, _size
-from fleet.live.arm.journal_records import ArmHistory, ArmRecord, AwardAccepted, put_aside
+from fleet.live.arm.journal_records import ArmHistory, ArmRecord, AwardAccepted
 from fleet.live.arm.node import ArmNode
 from fleet.live.arm.simulated_body import SimulatedBody
 from fleet.live.auction.ledger import AuctionRecord
@@ -49,6 +49,7 @@ from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.round import Assignment
 from fleet.live.clock import FleetClock
 from fleet.live.journal import Journal
+from fleet.live.journal_upkeep import put_aside
 from fleet.motion import Plan
 from fleet.planning.planner import Planner
 from fleet.robot import ThermalLimits

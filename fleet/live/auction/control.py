@@ -51,6 +51,10 @@ def _objection_to_job(ledger: Ledger, action: Cancel | Settle | Change) -> str:
     if entry is None:
         if action.job in ledger.past:
             return "It was settled long ago."
+        if action.job in ledger.aside:
+            if isinstance(action, Settle):
+                return ""
+            raise Refused(f"'{action.job}' is put aside, and its description is lost: settle it as done or redo.")
         raise Refused(f"There is no job '{action.job}'.")
     state = entry.state
     match action:

@@ -44,6 +44,10 @@ class PastJobs(Container[str]):
         """Add a job that is finished, or given up; the oldest one is dropped if there are too many."""
         self._put(_hash(job.name.encode()), _spec_hash(job) | finished)
 
+    def add_name(self, name: str, *, finished: bool) -> None:
+        """Add a job of which only the name is known."""
+        self._put(_hash(name.encode()), int(finished))
+
     def __contains__(self, name: object) -> bool:
         return isinstance(name, str) and _hash(name.encode()) in self._jobs
 
