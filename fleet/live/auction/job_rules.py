@@ -186,6 +186,13 @@ def ready_jobs(
     return ready
 
 
+def with_terms(status: JobStatus, job: JobSpec | None) -> JobStatus:
+    """Return a status with what the job itself says, if that is known."""
+    if job is None:
+        return status
+    return replace(status, repetitions=job.repetitions, due_s=job.due_s, value=job.value)
+
+
 def status_reply(
     name: str,
     time_s: float,

@@ -113,6 +113,8 @@ class Ledger(LedgerState):
                 changed = [entry]
             case CommitPermitted() | ContactLost() | ContactRegained():
                 award, entry = self.awards[record.award], self._entry(record.award)
+                if not isinstance(record, ContactRegained):
+                    _count(entry, record.cycles)
                 award.may_commit, award.silent = True, isinstance(record, ContactLost)
                 silence = reason_for_silence(award.record.arm) if award.silent else ""
                 self._move(entry, "unfinished" if award.silent else "finishing", silence)
@@ -132,13 +134,14 @@ class Ledger(LedgerState):
                 self.ended = True
                 changed = [self.jobs[name] for name in self.unsettled()]
                 for entry in changed:
+                    _count(entry, record.cycles.get(entry.award, 0))
                     self._move(entry, "unfinished", entry.reason or SHIFT_ENDED)
             case EpochBegun():
                 self.epoch, self.succeeds = record.epoch, record.succeeds
             case HistoryAdopted():
                 changed = self._adopt(record)
             case Operated():
-                changed = self._operate(record.request, record.time_s)
+                changed = self._operate(record)
             case JobsPutAside():
                 self._put_aside(record.jobs)
             case Checked():
@@ -167,7 +170,7 @@ class Ledger(LedgerState):
                 return record.request.by
             case Closed() if (award := self.awards.get(record.award)) is not None:
                 entry = self.jobs[award.record.job]
-                return entry.changed_by if entry.state == "cancelled" else ""
+                return entry.changed_by if entry.state == "cancelled" else self._pauser(entry, record) or ""
             case _:
                 return ""
 
@@ -178,7 +181,8 @@ class Ledger(LedgerState):
                 self.past.add(job, finished=True)
         entries = [self.waiting[job.name] for job in record.finished if job.name in self.waiting]
         for entry in entries:
-            entry.cycles, entry.finished_s, entry.award = entry.spec.repetitions, record.time_s, ""
+            entry.cycles, entry.finished_s = entry.spec.repetitions, record.time_s
+            entry.award, entry.arm = "", record.arm
             self._move(entry, "finished", f"'{record.arm}' had finished it; the journal did not know it.")
         return entries
 
@@ -226,7 +230,8 @@ class Ledger(LedgerState):
         if record.unsure or (self.ended and not entry.cancelled):
             self._move(entry, "unfinished", record.reason or "It is unknown whether its last cycle was done.")
             return [entry]
-        self._move(entry, "waiting", record.reason)
+        pauser = self._pauser(entry, record)
+        self._move(entry, "waiting", record.reason if pauser is None else f"Its arm was paused by '{pauser}'.")
         if record.outcome == "returned" and reopened:
             entry.returns, entry.returned_s = entry.returns + 1, record.time_s
         entry.cycles = min(entry.cycles, entry.spec.repetitions - 1)  # the last cycle is never assumed done
@@ -246,8 +251,16 @@ class Ledger(LedgerState):
         self._move(entry, "cancelled", f"Cancelled by '{entry.changed_by}'.")
         return [entry, *self._follow_given_up()]
 
-    def _operate(self, request: ControlRequest, time_s: float) -> list[JobEntry]:
+    def _pauser(self, entry: JobEntry, record: Closed) -> str | None:
+        """Return who paused the arm that has returned a job; None if it has another reason to."""
+        award = self.awards[record.award]
+        if record.faulted or entry.state not in ("awarded", "finishing", "waiting") or entry.award != record.award:
+            return None
+        return None if award.may_commit or record.outcome == "refused" else self.pauser_of(award.record.arm)
+
+    def _operate(self, record: Operated) -> list[JobEntry]:
         """Carry out a request of a person, which `fleet.live.auction.control` has checked; return what has changed."""
+        request, time_s = record.request, record.time_s
         self.requests[request.request] = None
         while len(self.requests) > MAX_REQUESTS:
             del self.requests[next(iter(self.requests))]
@@ -262,6 +275,7 @@ class Ledger(LedgerState):
                     self.past.add_name(name, finished=True)
             case Cancel(name) | Settle(name) | ChangeJob(name):
                 if (entry := self.jobs.get(name)) is not None:
+                    _count(entry, record.cycles)
                     return self._operate_job(entry, request, time_s)
         return []
 
@@ -281,6 +295,7 @@ class Ledger(LedgerState):
                 entry.cycles, entry.finished_s = entry.spec.repetitions, time_s
                 self._move(entry, "finished", f"Settled as done by '{request.by}'.")
                 return [entry, *self._follow_given_up()]
+            entry.arm = self.status_of(entry).arm
             entry.award = ""  # a late report on it that is unsure is settled, too
             entry.cycles = min(entry.cycles, entry.spec.repetitions - 1)
             self._move(entry, "waiting", f"To be redone, by '{request.by}'.")
@@ -330,3 +345,8 @@ class Ledger(LedgerState):
         self.number += 1
         self.recent.append(change)
         return change
+
+
+def _count(entry: JobEntry, cycles: int) -> None:
+    """Count the cycles of a job that an arm has reported; the last one counts when the job is finished."""
+    entry.cycles = max(entry.cycles, min(cycles, entry.spec.repetitions - 1))

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from fleet.bus.protocol.auction import ABANDONED, SETTLED, Admission, JobSpec, JobState, JobStatus
 from fleet.bus.protocol.operator import ALL_ARMS
-from fleet.live.auction.job_rules import admit, is_late, job_order, ready_jobs
+from fleet.live.auction.job_rules import admit, is_late, job_order, ready_jobs, with_terms
 from fleet.live.auction.past_jobs import PastJobs
 from fleet.live.auction.records import AwardState, Change, Expired, JobEntry
 
@@ -115,6 +115,10 @@ class LedgerView:
         """Return whether an arm gets no jobs."""
         return arm in self.paused or ALL_ARMS in self.paused
 
+    def pauser_of(self, arm: str) -> str | None:
+        """Return who paused an arm; None if it is not paused."""
+        return self.paused.get(arm, self.paused.get(ALL_ARMS))
+
     def may_begin(self, award: str) -> bool:
         """Return whether cycles of an open award may be begun under a lease."""
         state = self.open[award]
@@ -167,7 +171,7 @@ class LedgerView:
         assigned = entry.state in ("awarded", "finishing", "finished") or (
             entry.state == "unfinished" and entry.award in self.open
         )
-        award = entry.award if assigned else ""
-        arm = self.awards[award].record.arm if award else ""
-        done = (entry.cycles, entry.finished_s, entry.reason, entry.spec.repetitions)
-        return JobStatus(entry.spec.name, entry.state, arm, award, *done)
+        last, spec = self.awards.get(entry.award), entry.spec
+        arm, award = entry.arm if last is None else last.record.arm, entry.award if assigned else ""
+        done = (entry.cycles, entry.finished_s, entry.reason)
+        return with_terms(JobStatus(spec.name, entry.state, arm, award, *done), spec)

@@ -5,6 +5,7 @@ from typing import cast
 import msgspec
 
 from fleet.bus.protocol.auction import JobSpec, JobState, JobStatus
+from fleet.bus.protocol.messages import Count
 from fleet.bus.protocol.operator import ControlRequest
 from fleet.errors import JournalError
 from fleet.live.journal import PutAside, Salvage
@@ -57,6 +58,8 @@ class ContactLost(msgspec.Struct, frozen=True, tag="contact_lost"):
 
     award: str
     time_s: float
+    cycles: Count = 0
+    """Last reported progress."""
 
 
 class ContactRegained(msgspec.Struct, frozen=True, tag="contact_regained"):
@@ -77,6 +80,8 @@ class ShiftEnded(msgspec.Struct, frozen=True, tag="shift_ended"):
     """The fleet's shift is over; open jobs stay unfinished."""
 
     time_s: float
+    cycles: dict[str, Count] = {}
+    """Last reported progress, by open award."""
 
 
 class Operated(msgspec.Struct, frozen=True, tag="operated"):
@@ -84,6 +89,8 @@ class Operated(msgspec.Struct, frozen=True, tag="operated"):
 
     request: ControlRequest
     time_s: float
+    cycles: Count = 0
+    """Last reported progress of its job."""
 
 
 class Change(msgspec.Struct, frozen=True):
@@ -124,6 +131,8 @@ class JobEntry(msgspec.Struct):
     """The person whose request changed it last."""
     submitted: JobSpec | None = None
     """As it was submitted, if a person has changed it since."""
+    arm: str = ""
+    """The arm that had it last, if `award` does not say."""
     aside: str = ""
     """Why it is put aside; "" if it is not. It stays unfinished until an arm reports it finished, or a person settles
     it."""

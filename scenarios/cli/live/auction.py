@@ -174,6 +174,6 @@ def summary(statuses: Sequence[JobStatus], time_s: float, left: Mapping[JobState
     finished, total = len(statuses) - len(others) + left.get("finished", 0), len(statuses) + sum(left.values())
     lines = [f"{time_s:.0f} s: {finished} of {total} jobs finished."]
     for job in others:
-        arm, reason = f" at {job.arm}" if job.arm else "", f", {job.reason}" if job.reason else ""
+        arm, reason = f" (arm: {job.arm})" if job.arm else "", f", {job.reason}" if job.reason else ""
         lines.append(f"  {job.job}: {job.state}{arm}{reason}")
     return "\n".join(lines)
