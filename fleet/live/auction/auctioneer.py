@@ -36,7 +36,7 @@ from fleet.bus.protocol.history import History
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
 from fleet.errors import Refused
-from fleet.live.auction.control import ALREADY_DONE, job_of, next_step, objection
+from fleet.live.auction.control import ALREADY_DONE, job_of, next_step, objection, was_carried_out
 from fleet.live.auction.leases import CountedLease, adopted, send_again, unanswered
 from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.records import AuctionRecord, ContactLost, ContactRegained, Operated, ShiftEnded
@@ -214,7 +214,7 @@ class Auctioneer:
             Refused: it is not possible now.
         """
         ledger, job = self.ledger, job_of(request)
-        known = request.request in ledger.requests
+        known = was_carried_out(ledger, request)
         note = ALREADY_DONE if known else objection(ledger, request, self.rounds.states.keys() | self.rounds.present)
         if not known:
             entry = ledger.jobs.get(job)

@@ -18,6 +18,7 @@ from fleet.bus.protocol.operator import Change as ChangeJob
 from fleet.job import reason_to_give_up
 from fleet.live.auction.job_rules import EXPIRED, SHIFT_ENDED, changed_spec, lost_jobs, reason_for_silence
 from fleet.live.auction.ledger_state import LedgerState, doubt
+from fleet.live.auction.past_jobs import content_hash
 from fleet.live.auction.records import (
     AuctionRecord,
     Awarded,
@@ -261,7 +262,7 @@ class Ledger(LedgerState):
     def _operate(self, record: Operated) -> list[JobEntry]:
         """Carry out a request of a person, which `fleet.live.auction.control` has checked; return what has changed."""
         request, time_s = record.request, record.time_s
-        self.requests[request.request] = None
+        self.requests[request.request] = content_hash(request)
         while len(self.requests) > MAX_REQUESTS:
             del self.requests[next(iter(self.requests))]
         match request.action:

@@ -69,7 +69,7 @@ class LedgerState(LedgerView, TimedState[AuctionRecord]):
             recent=tuple(self.recent),
             space={arm: tuple(sorted(spaces)) for arm, spaces in self.space.items()},
             paused=dict(self.paused),
-            requests=tuple(self.requests),
+            requests=dict(self.requests),
             aside=dict(self.aside),
             checks=self.checks,
         )
@@ -127,7 +127,9 @@ class LedgerState(LedgerView, TimedState[AuctionRecord]):
         self.open = {name: self.awards[name] for name in snapshot.open if name in self.awards}
         self.recent = deque(snapshot.recent, maxlen=MAX_RECENT)
         self.space |= {arm: frozenset(spaces) for arm, spaces in snapshot.space.items()}
-        self.paused, self.requests = dict(snapshot.paused), dict.fromkeys(snapshot.requests)
+        requests = snapshot.requests
+        self.requests = dict(requests) if isinstance(requests, dict) else dict.fromkeys(requests, 0)
+        self.paused = dict(snapshot.paused)
         self.aside, self._unnoted = dict(snapshot.aside), False
         self.unchecked.clear()
         if broken := broken_parts(snapshot):

@@ -58,8 +58,8 @@ class LedgerView:
 
     paused: dict[str, str] = field(default_factory=dict[str, str])
     """Who paused an arm, by arm; "*" for all arms."""
-    requests: dict[str, None] = field(default_factory=dict[str, None])
-    """Names of the last requests of people that were carried out, oldest first."""
+    requests: dict[str, int] = field(default_factory=dict[str, int])
+    """Hashes of the last requests of people that were carried out, by name, oldest first; 0 for unknown."""
 
     aside: dict[str, str] = field(default_factory=dict[str, str])
     """Why jobs are put aside of which only the name is known, by name."""

@@ -194,7 +194,8 @@ class LedgerSnapshot(msgspec.Struct, frozen=True, tag="ledger_snapshot"):
     epoch: str = ""
     succeeds: bool = False
     paused: dict[str, str] = {}
-    requests: tuple[str, ...] = ()
+    requests: dict[str, int] | tuple[str, ...] = ()
+    """As in `Ledger`; earlier versions kept the names alone."""
     aside: dict[str, str] = {}
     checks: int = 0
 
