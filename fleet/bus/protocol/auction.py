@@ -344,17 +344,23 @@ class Result(msgspec.Struct, frozen=True):
 
 
 class ArmEvent(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Published under `arm/{arm}/event`: something happened to an arm; kinds as in `fleet.events`."""
+    """Published under `arm/{arm}/event`: something happened to an arm."""
 
     arm: Name
     number: Count
     """Counts the events of this arm; unique, with a gap after a restart."""
     time_s: Number
+    """Exact fleet time of the event."""
     kind: Name
+    """One of those below; skip others."""
     job: str = ""
+    """Its job; "" for none."""
     joint: Annotated[int, msgspec.Meta(ge=0, le=64)] = 0
+    """Motor, from 1; 0 for none."""
     value: Number | None = None
+    """Quantity of the kind; null or left out for none."""
     reason: str = ""
+    """Why, in words."""
 
 
 class ClockRequest(msgspec.Struct, frozen=True):
