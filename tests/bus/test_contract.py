@@ -149,7 +149,7 @@ def test_a_whole_number_written_with_a_point_is_the_one_known_difference():
 def test_fields_are_described_by_the_text_under_them():
     assert descriptions(messages.State)["tau"] == "N·m at the joint output, [joint]."
     assert descriptions(JobSpec)["payload_kg"].startswith("Carried from grasp to release")
-    assert descriptions(JobSpec)["release_s"] == "Earliest start."
+    assert descriptions(JobSpec)["release_s"] == "Earliest start, fleet time."
 
 
 def test_asyncapi_has_every_key_and_no_loose_end():
