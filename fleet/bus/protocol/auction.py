@@ -333,6 +333,8 @@ class Result(msgspec.Struct, frozen=True):
     peak_c: Number | None = None
     by: str = ""
     """Who asked for the change, by a `Submission` or a `ControlRequest`."""
+    epoch: str = ""
+    """As in `Clock`: `number` begins again with another epoch."""
 
 
 class ArmEvent(msgspec.Struct, frozen=True, omit_defaults=True):

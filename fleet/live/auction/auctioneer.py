@@ -34,7 +34,7 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.history import History
 from fleet.bus.protocol.messages import State
-from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
+from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest
 from fleet.errors import Refused
 from fleet.live.auction.control import ALREADY_DONE, job_of, next_step, objection
 from fleet.live.auction.leases import CountedLease, adopted, send_again, unanswered
@@ -217,7 +217,6 @@ class Auctioneer:
         note = ALREADY_DONE if known else objection(ledger, request, self.rounds.states.keys() | self.rounds.present)
         if not known:
             self._writer.record(Operated(request, time_s))
-            self.out.append(Operation(self.name, time_s, request))
             _LOG.warning("'%s' requested: %s", request.by, request.action)
             self.rounds.retry_now()
         changed = not (known or note)

@@ -81,6 +81,8 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
             space={arm: tuple(sorted(spaces)) for arm, spaces in self.space.items()},
             paused=dict(self.paused),
             requests=tuple(self.requests),
+            operated=self.operated,
+            operations=tuple(self.operations),
         )
         return (snapshot,)
 
@@ -131,6 +133,8 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
             case HistoryAdopted():
                 changed = self._adopt(record)
             case Operated():
+                self.operated += 1
+                self.operations.append(record)
                 changed = self._operate(record.request, record.time_s)
             case LedgerSnapshot():
                 self._restore(record)
@@ -330,6 +334,7 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
         self.recent = deque(snapshot.recent, maxlen=MAX_RECENT)
         self.space |= {arm: frozenset(spaces) for arm, spaces in snapshot.space.items()}
         self.paused, self.requests = dict(snapshot.paused), dict.fromkeys(snapshot.requests)
+        self.operated, self.operations = snapshot.operated, deque(snapshot.operations, maxlen=MAX_RECENT)
 
     def _may_count(self, award: AwardState) -> bool:
         """Whether a report on a closed award could change the state of its job."""

@@ -156,6 +156,8 @@ class LedgerSnapshot(msgspec.Struct, frozen=True, tag="ledger_snapshot"):
     succeeds: bool = False
     paused: dict[str, str] = {}
     requests: tuple[str, ...] = ()
+    operated: int = 0
+    operations: tuple[Operated, ...] = ()
 
 
 AwardRecord = Awarded | CommitPermitted | ContactLost | ContactRegained | Closed
