@@ -65,24 +65,24 @@ class Series:
     first: int
     """Least number since the last start of the sender."""
     continues: bool
-    """Whether the numbers go on when the sender starts again; its times are in no order then."""
+    """Whether the numbers of an epoch go on when the sender starts again; its times are in no order then."""
     whole: bool = True
     """Whether what was sent before the recording began belongs to it, as far as it is cached."""
 
     @property
     def name(self) -> str:
-        """Name of the series."""
-        return f"{self.sender}, epoch {self.epoch}" if self.epoch else self.sender
+        """Name of the series; the numbers of an arm have no epoch, as it learns the epoch after its start."""
+        return f"{self.sender}, epoch {self.epoch}" if self.epoch and self.continues else self.sender
 
 
 def series_of(message: Message) -> Series:
     """Return the series that a message belongs to."""
     match message:
         case State():
-            return Series(f"state of {message.arm}", message.tick, "", 1, False, whole=False)
+            return Series(f"state of {message.arm}", message.tick, message.epoch, 1, False, whole=False)
         case ArmEvent(number=number):
             first = number // EVENTS_PER_BOOT * EVENTS_PER_BOOT + 1
-            return Series(f"events of {message.arm}", number, "", first, False)
+            return Series(f"events of {message.arm}", number, message.epoch, first, False)
         case Result():
             return Series(f"results of {message.auctioneer}", message.number, message.epoch, 0, True)
         case Operation():
@@ -224,14 +224,17 @@ class Recorder:
         series = series_of(record.message)
         number, time_s = series.number, record.message.time_s
         count = self.counts.setdefault(series.name, Count())
-        if number <= count.last and (series.continues or time_s <= count.time_s):
+        begins = bool(series.epoch) and series.epoch not in count.epochs
+        restarted = not series.continues and number <= count.last and (begins or time_s > count.time_s)
+        if number <= count.last and not restarted:
             return self._fill(series, count, time_s)
-        restarted = number <= count.last or series.first > count.last
-        expected = series.first if restarted else count.last + 1
+        if begins:
+            count.epochs += (series.epoch,)
+        expected = series.first if restarted or series.first > count.last else count.last + 1
         if not count.kept:  # what was sent before: as much of it as the sender may have cached
             expected = max(series.first, number - HISTORY) if series.whole else number
         if expected < number:
-            after_s = max(count.time_s, 0.0)
+            after_s = 0.0 if begins else max(count.time_s, 0.0)
             gap = Gap(series.sender, expected, number - 1, after_s, time_s, epoch=series.epoch)
             self.sought.append(gap)
             count.missed += number - expected
@@ -243,7 +246,8 @@ class Recorder:
         """Whether a late message belongs to a gap, which then shrinks or splits."""
         number = series.number
         for gap in self.sought:
-            own = (gap.sender, gap.epoch) == (series.sender, series.epoch) and gap.first <= number <= gap.last
+            own = gap.sender == series.sender and gap.first <= number <= gap.last
+            own &= gap.epoch == series.epoch or (not series.continues and "" in (gap.epoch, series.epoch))
             if own and (series.continues or gap.after_s <= time_s <= gap.time_s):
                 self.sought.remove(gap)
                 if gap.first < number:

@@ -100,6 +100,8 @@ class Count:
     last: int = -1
     time_s: float = -math.inf
     """Fleet time of the last message."""
+    epochs: tuple[str, ...] = ()
+    """In which the sender gave its numbers."""
 
 
 class Card(msgspec.Struct, frozen=True):

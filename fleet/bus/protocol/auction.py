@@ -349,6 +349,8 @@ class ArmEvent(msgspec.Struct, frozen=True, omit_defaults=True):
     joint: Annotated[int, msgspec.Meta(ge=0, le=64)] = 0
     value: Number | None = None
     reason: str = ""
+    epoch: str = ""
+    """As in `Clock`, of its time; "" for unknown."""
 
 
 class ClockRequest(msgspec.Struct, frozen=True):
