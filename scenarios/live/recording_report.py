@@ -259,6 +259,10 @@ def _submitters(results: pa.Table) -> Mapping[str, int]:
 def _describe_request(row: Mapping[str, Any]) -> tuple[str, ...]:
     """Time, action, what it concerns, and who asked."""
     action = json.loads(row["content"])["action"]
-    details = (f"{key.removesuffix('_s')} {action[key]}" for key in ("outcome", "due_s", "value") if key in action)
+    details = (
+        f"{key.removesuffix('_s')} {action[key]}".removeprefix("outcome ")
+        for key in ("outcome", "due_s", "value")
+        if key in action
+    )
     concerns = row["job"] or ("all arms" if row["arm"] == ALL_ARMS else row["arm"])
     return clock(row["time_s"]), " ".join((row["action"], *details)), concerns, row["by"]
