@@ -6,12 +6,13 @@ from dataclasses import dataclass, field
 
 from fleet.bus.protocol.auction import ABANDONED, SETTLED, Admission, JobSpec, JobState, JobStatus
 from fleet.bus.protocol.operator import ALL_ARMS
+from fleet.bus.protocol.registry import HISTORY
 from fleet.live.auction.job_rules import admit, is_late, job_order, ready_jobs
 from fleet.live.auction.past_jobs import PastJobs
 from fleet.live.auction.records import AwardState, Change, Expired, JobEntry, Operated
 
-MAX_RECENT = 64
-"""Latest changes and requests, published again after a restart for those who missed them."""
+MAX_RECENT = HISTORY
+"""Latest changes and requests, published again after a restart for those who missed them: as many as were cached."""
 
 
 @dataclass
