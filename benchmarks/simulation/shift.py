@@ -2,8 +2,8 @@
 
 The rules: the last cycle of a job is done at most once; no two arms have one job; no two arms are away from home on
 plans that exclude each other; an accepted job stays known; after the faults every job is finished, given up for the
-reasons that the product names, or unfinished because an arm stopped in its last cycle; every wait ends; the recording
-has every result once (`recording`).
+reasons that the product names, or unfinished because an arm stopped in its last cycle; every wait ends; requests of
+people have their effect (`steering`); the recording has every result once (`recording`).
 """
 
 from collections.abc import Mapping
@@ -14,6 +14,7 @@ from bus import Bus
 from faults import FAULTS, heal, request
 from participants import AUCTIONEER, CLIENT, ArmProcess, Submitter, Watch, auctioneer_process, simulated_system
 from recording import RECORDER, Sent, recorder_process
+from steering import check_steering
 from world import Process, Violation, World
 
 from fleet.bus.protocol.auction import ABANDONED, SETTLED, JobSpec
@@ -314,6 +315,9 @@ class Shift:
                 lost or name in self.cancelled or job.expires or reason_to_give_up(self.faults.get(name, ()))
             ):
                 raise Violation(f"'{name}' is given up without a reason.")
+
+        if not self.alone:
+            check_steering(self.sent, states, self.node(AUCTIONEER).auctioneer.ledger.jobs)
 
     def _end_recording(self) -> None:
         process, deadline_s = self.world.processes[RECORDER], self.world.now_s + RECORD_S
