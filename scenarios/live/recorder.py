@@ -268,11 +268,19 @@ class Recorder:
 
     @contextmanager
     def _draft(self, path: Path) -> Iterator[Path]:
-        """A draft of a file, on disk before it takes its name."""
+        """A draft of a file, on disk before it takes its name; and the name is on disk when the block ends.
+
+        So no later file, which relies on this one, is there without it after a loss of power.
+        """
         try:
             with atomic_path(path) as draft:
                 yield draft
                 with draft.open("rb") as file:
                     os.fsync(file.fileno())
+            folder = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
         except OSError as error:
             raise FleetError(f"Cannot write '{path}': {error.strerror or error}.") from error
