@@ -15,6 +15,7 @@ from typing import Any
 from bus import SimulatedClient
 from disk import Disk, DiskCalls, DiskPath
 from machine import Deeds, SimulatedArm, SimulatedEstimator
+from recording import simulated_files
 from world import Process, World
 
 from fleet.bus.protocol import keys
@@ -271,7 +272,7 @@ def simulated_system(world: World) -> Iterator[None]:
     replace(arm_module, "plan_key", lambda plan: plan.space)
     replace(arm_module, "space_name", str)
     try:
-        with world.installed():
+        with world.installed(), simulated_files(disk):
             yield
     finally:
         for module, name, value in reversed(replaced):

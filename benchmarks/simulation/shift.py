@@ -2,7 +2,8 @@
 
 The rules: the last cycle of a job is done at most once; no two arms have one job; no two arms are away from home on
 plans that exclude each other; an accepted job stays known; after the faults every job is finished, given up for the
-reasons that the product names, or unfinished because an arm stopped in its last cycle; every wait ends.
+reasons that the product names, or unfinished because an arm stopped in its last cycle; every wait ends; requests of
+people have their effect (`steering`); the recording has every result once (`recording`).
 """
 
 from collections.abc import Mapping
@@ -12,6 +13,8 @@ from typing import Any
 from bus import Bus
 from faults import FAULTS, heal, request
 from participants import AUCTIONEER, CLIENT, ArmProcess, Submitter, Watch, auctioneer_process, simulated_system
+from recording import RECORDER, Sent, recorder_process
+from steering import check_steering
 from world import Process, Violation, World
 
 from fleet.bus.protocol.auction import ABANDONED, SETTLED, JobSpec
@@ -32,6 +35,8 @@ MOST_JOBS = 60
 """In one shift, about."""
 CHECK_S = 2.0
 """True seconds between two checks whether all is settled."""
+RECORD_S = 120.0
+"""True seconds after the last result in which the recorder has it."""
 SETTLE_S = 240.0
 """True seconds after the faults in which all jobs must be settled, besides the time that they take."""
 
@@ -116,6 +121,8 @@ class Shift:
         if not self.alone:
             build = auctioneer_process(self.arms, self.speed, first_come, timing, self.excludes)
             Process(world, AUCTIONEER, build)
+        self.sent = Sent(world.bus)
+        Process(world, RECORDER, recorder_process(rng.choice([5.0, 20.0, 60.0])))
         self.names = tuple(world.processes)
         Process(world, CLIENT, Submitter)
         world.after_run, world.after_exit = self._after_run, self._after_exit
@@ -142,6 +149,7 @@ class Shift:
             world.run(self.faulty_s)
             heal(self)
             self._settle()
+            self._end_recording()
 
     @property
     def submitter(self) -> Submitter:
@@ -307,3 +315,15 @@ class Shift:
                 lost or name in self.cancelled or job.expires or reason_to_give_up(self.faults.get(name, ()))
             ):
                 raise Violation(f"'{name}' is given up without a reason.")
+
+        if not self.alone:
+            check_steering(self.sent, states, self.node(AUCTIONEER).auctioneer.ledger.jobs)
+
+    def _end_recording(self) -> None:
+        process, deadline_s = self.world.processes[RECORDER], self.world.now_s + RECORD_S
+        while missing := self.sent.missing(self.node(RECORDER)):
+            if self.world.now_s > deadline_s:
+                raise Violation(f"The recorder has not: {'; '.join(missing[:4])}.")
+            self.world.run(self.world.now_s + CHECK_S)
+        process._call(self.node(RECORDER).end)
+        self.sent.check(process)

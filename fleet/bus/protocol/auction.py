@@ -341,6 +341,8 @@ class Result(msgspec.Struct, frozen=True):
     peak_c: Number | None = None
     by: str = ""
     """Who asked for the change, by a `Submission` or a `ControlRequest`, also who paused the arm that stopped."""
+    epoch: str = ""
+    """As in `Clock`: `number` begins again with another epoch."""
 
 
 class ArmEvent(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -361,6 +363,8 @@ class ArmEvent(msgspec.Struct, frozen=True, omit_defaults=True):
     """Quantity of the kind; null or left out for none."""
     reason: str = ""
     """Why, in words."""
+    epoch: str = ""
+    """As in `Clock`, of its time; "" for unknown."""
 
 
 class ClockRequest(msgspec.Struct, frozen=True):

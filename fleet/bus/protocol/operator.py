@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from fleet.bus.protocol.auction import JobStatus
-from fleet.bus.protocol.messages import Name, Number
+from fleet.bus.protocol.messages import Count, Name, Number
 
 JobName = Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
 
@@ -128,3 +128,7 @@ class Operation(msgspec.Struct, frozen=True):
     auctioneer: Name
     time_s: Number
     request: ControlRequest
+    number: Count = 0
+    """Counts the requests that this auctioneer has carried out, across restarts."""
+    epoch: str = ""
+    """As in `Clock`: `number` begins again with another epoch."""

@@ -34,7 +34,7 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.history import History
 from fleet.bus.protocol.messages import State
-from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
+from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest
 from fleet.errors import Refused
 from fleet.live.auction.control import ALREADY_DONE, job_of, next_step, objection, was_carried_out
 from fleet.live.auction.leases import CountedLease, adopted, send_again, unanswered
@@ -220,7 +220,6 @@ class Auctioneer:
             entry = ledger.jobs.get(job)
             lease = None if entry is None else self._writer.leases.get(entry.award)
             self._writer.record(Operated(request, time_s, 0 if lease is None else lease.cycles))
-            self.out.append(Operation(self.name, time_s, request))
             _LOG.warning("'%s' requested: %s", request.by, request.action)
             self.rounds.retry_now()
         changed = not (known or note)

@@ -142,6 +142,8 @@ class Ledger(LedgerState):
             case HistoryAdopted():
                 changed = self._adopt(record)
             case Operated():
+                self.operated += 1
+                self.operations.append(record)
                 changed = self._operate(record)
             case JobsPutAside():
                 self._put_aside(record.jobs)

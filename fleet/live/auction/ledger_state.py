@@ -72,6 +72,8 @@ class LedgerState(LedgerView, TimedState[AuctionRecord]):
             requests=dict(self.requests),
             aside=dict(self.aside),
             checks=self.checks,
+            operated=self.operated,
+            operations=tuple(self.operations),
         )
         return (snapshot,)
 
@@ -130,6 +132,7 @@ class LedgerState(LedgerView, TimedState[AuctionRecord]):
         requests = snapshot.requests
         self.requests = dict(requests) if isinstance(requests, dict) else dict.fromkeys(requests, 0)
         self.paused = dict(snapshot.paused)
+        self.operated, self.operations = snapshot.operated, deque(snapshot.operations, maxlen=MAX_RECENT)
         self.aside, self._unnoted = dict(snapshot.aside), False
         self.unchecked.clear()
         if broken := broken_parts(snapshot):

@@ -6,12 +6,13 @@ from dataclasses import dataclass, field
 
 from fleet.bus.protocol.auction import ABANDONED, SETTLED, Admission, JobSpec, JobState, JobStatus
 from fleet.bus.protocol.operator import ALL_ARMS
+from fleet.bus.protocol.registry import HISTORY
 from fleet.live.auction.job_rules import admit, is_late, job_order, ready_jobs, with_terms
 from fleet.live.auction.past_jobs import PastJobs
-from fleet.live.auction.records import AwardState, Change, Expired, JobEntry
+from fleet.live.auction.records import AwardState, Change, Expired, JobEntry, Operated
 
-MAX_RECENT = 64
-"""Latest changes, published again after a restart for those who missed them."""
+MAX_RECENT = HISTORY
+"""Latest changes and requests, published again after a restart for those who missed them: as many as were cached."""
 
 
 def reason_of_aside(reason: str) -> str:
@@ -48,6 +49,10 @@ class LedgerView:
     """Of the next change."""
     ended: bool = False
     recent: deque[Change] = field(default_factory=lambda: deque(maxlen=MAX_RECENT))
+    operated: int = 0
+    """Number of the next request of a person."""
+    operations: deque[Operated] = field(default_factory=lambda: deque(maxlen=MAX_RECENT))
+    """The latest ones that were carried out."""
     open: dict[str, AwardState] = field(default_factory=dict[str, AwardState])
     """Awards that are not closed, by name."""
     _awards_of: dict[str, list[str]] = field(default_factory=dict[str, list[str]], repr=False, compare=False)

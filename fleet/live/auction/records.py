@@ -198,6 +198,8 @@ class LedgerSnapshot(msgspec.Struct, frozen=True, tag="ledger_snapshot"):
     """As in `Ledger`; earlier versions kept the names alone."""
     aside: dict[str, str] = {}
     checks: int = 0
+    operated: int = 0
+    operations: tuple[Operated, ...] = ()
 
 
 AwardRecord = Awarded | CommitPermitted | ContactLost | ContactRegained | Closed

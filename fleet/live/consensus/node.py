@@ -207,7 +207,7 @@ class ConsensusNode:
 
     def _set_time(self, time_s: float, real_s: float) -> None:
         self._begun = True
-        self._arm.set_clock(FleetClock(self._speed, real_s, time_s), jump=True)
+        self._arm.set_clock(FleetClock(self._speed, real_s, time_s, epoch=self._epoch), jump=True)
 
     def _declare(self) -> None:
         link, fleet, name = self._link, self._link.fleet, self._name

@@ -309,5 +309,5 @@ def fleet_clock(link: BusClient, speed: float | None) -> FleetClock:
     for reply in answers.messages.values():
         if speed is not None and speed != reply.speed:
             log.warning("The fleet's speed is %g, not %g.", reply.speed, speed)
-        return FleetClock(reply.speed).set_to(asked_s, answered_s, reply.time_s)
+        return FleetClock(reply.speed, epoch=reply.epoch).set_to(asked_s, answered_s, reply.time_s)
     return FleetClock(speed or 1.0, answered_s)
