@@ -4,7 +4,7 @@ A record is on disk before it is applied, so a replay gives the same ledger, wit
 ends of leases are not recorded: after a restart every open award counts as leased from then on.
 """
 
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass
 
 from msgspec.structs import asdict, replace
@@ -94,8 +94,9 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
                 for entry in changed:
                     self.jobs[entry.spec.name] = entry
                     self._move(entry, "waiting")
+                self._awaited.update(before for entry in changed for before in entry.spec.after)
                 if any(entry.spec.after for entry in changed):
-                    self._follow_given_up()
+                    self._apply_given_up()
             case Awarded():
                 entry = self.jobs[record.job]
                 self._forget_awards(entry)
@@ -116,7 +117,7 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
                 entry = self.jobs[record.job]
                 entry.expired = True
                 self._move(entry, "given_up", EXPIRED)
-                changed = [entry, *self._follow_given_up()]
+                changed = [entry, *self._follow_given_up(entry)]
             case SpaceTaken():
                 self.space[record.arm] = frozenset(record.space)
             case SpaceCleared():
@@ -184,6 +185,10 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
         """Forget a settled job, except for its name and outcome."""
         entry = self.jobs.pop(name)
         del self.settled[name]
+        for before in entry.spec.after:
+            self._awaited[before] -= 1
+            if not self._awaited[before]:
+                del self._awaited[before]
         self.past.add(entry.original, finished=entry.state == "finished")
         self.left[entry.state] = self.left.get(entry.state, 0) + 1
         for award in self._awards_of.pop(name, ()):
@@ -218,7 +223,7 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
             given_up = entry.state in ABANDONED
             entry.award, entry.finished_s = record.award, record.time_s
             self._move(entry, "finished")
-            return [entry, *(self._follow_given_up() if given_up else ())]
+            return [entry, *(self._follow_given_up(entry) if given_up else ())]
         if entry.award != record.award:  # the job was awarded again since
             return self._give_up(entry)
         if record.unsure or (self.ended and not entry.cancelled):
@@ -238,11 +243,11 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
         if entry.state != "waiting" or not reason:
             return []
         self._move(entry, "given_up", reason)
-        return [entry, *self._follow_given_up()]
+        return [entry, *self._follow_given_up(entry)]
 
     def _cancel(self, entry: JobEntry) -> list[JobEntry]:
         self._move(entry, "cancelled", f"Cancelled by '{entry.changed_by}'.")
-        return [entry, *self._follow_given_up()]
+        return [entry, *self._follow_given_up(entry)]
 
     def _operate(self, request: ControlRequest, time_s: float) -> list[JobEntry]:
         """Carry out a request of a person, which `fleet.live.auction.control` has checked; return what has changed."""
@@ -274,7 +279,7 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
                     self._end(self.open[entry.award])
                 entry.cycles, entry.finished_s = entry.spec.repetitions, time_s
                 self._move(entry, "finished", f"Settled as done by '{request.by}'.")
-                return [entry, *self._follow_given_up()]
+                return [entry, *self._follow_given_up(entry)]
             entry.award = ""  # a late report on it that is unsure is settled, too
             entry.cycles = min(entry.cycles, entry.spec.repetitions - 1)
             self._move(entry, "waiting", f"To be redone, by '{request.by}'.")
@@ -286,7 +291,11 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
                 return [entry]
         return []
 
-    def _follow_given_up(self) -> list[JobEntry]:
+    def _follow_given_up(self, entry: JobEntry) -> list[JobEntry]:
+        """Apply a change of this job to jobs that wait for it; return what has changed."""
+        return self._apply_given_up() if entry.spec.name in self._awaited else []
+
+    def _apply_given_up(self) -> list[JobEntry]:
         """Give up jobs that wait for one that is given up; return what has changed.
 
         They wait again if that one was finished after all.
@@ -318,6 +327,7 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
         self.number, self.ended = snapshot.number, snapshot.ended
         self.jobs = {entry.spec.name: replace(entry) for entry in snapshot.jobs}
         self.waiting = {name: entry for name, entry in self.jobs.items() if entry.state == "waiting"}
+        self._awaited = Counter(before for entry in self.jobs.values() for before in entry.spec.after)
         self.settled = dict.fromkeys(snapshot.settled)
         self.settled |= {name: None for name, e in self.jobs.items() if e.state in ("finished", *ABANDONED)}
         self.past, self.left, self.epoch = PastJobs(snapshot.past, self.past.limit), dict(snapshot.left), snapshot.epoch
