@@ -82,7 +82,7 @@ def clock_jump(fleet: Fleet) -> float:
     """Let the wall clocks of the participants jump one after the other, then all back."""
     clocks = fleet.clocks
     assert isinstance(clocks, WallClocks)
-    arm = fleet.working_arm() or fleet.arms[0]
+    arm = fleet.victim()
     other = next(name for name in fleet.arms if name != arm)
     jumps = {
         f"arm-{arm}": HOUR_S,

@@ -451,6 +451,27 @@ def test_the_command_exits_on_a_signal_even_while_a_reader_is_connected(router, 
         assert "Traceback" not in started.stderr.read()
 
 
+def test_the_command_waits_for_a_router():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    with Router(port):
+        pass  # now the port is free, and was a router's
+    command = [sys.executable, "-u", "-c", "from scenarios.cli.main import main; main()", "gateway", "--fleet", "f"]
+    command += ["--endpoint", f"tcp/127.0.0.1:{port}", "--port", "0"]
+    started = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        assert "Waiting for a router." in started.stderr.readline()
+        assert started.poll() is None
+        with Router(port):
+            assert started.stdout.readline().startswith("ready gateway http://127.0.0.1:")
+            started.terminate()
+            assert started.wait(PATIENCE_S) == 0
+    finally:
+        started.kill()
+        started.communicate(timeout=PATIENCE_S)
+
+
 @pytest.mark.skipif(shutil.which("node") is None, reason="no Node")
 def test_the_monitor_in_javascript_shows_the_fleet(router, arm, tmp_path):
     log = tmp_path / "log"  # a pipe that nobody reads would stop it
