@@ -119,7 +119,7 @@ class Figures:
     """Accepted jobs that the auctioneer does not know."""
     twice: tuple[str, ...] = ()
     unreported: tuple[str, ...] = ()
-    """Accepted jobs without an end, or whose end is not in the recording."""
+    """Accepted jobs without an end, or whose end is not in the recording, and no row says that it is missing."""
     violations: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     took_s: float = math.nan
@@ -239,14 +239,17 @@ def run(seed: int, folder: Path, *, minutes: float, speed: float, clocks: bool) 
         ]
         if math.isinf(ended_s):
             fleet.note(f"jobs were open {TIMEOUT_S:g} s after the last fault")
-    recorded = _recorded(folder / "recording")
-    states = feeder.states
+    (recorded, named), states = _recorded(folder / "recording"), feeder.states
     figures.states = Counter(str(state) for state in states.values())
     figures.lost = tuple(sorted(name for name, state in states.items() if state is None))
     figures.twice = tuple(sorted(name for name, times in done.items() if times > 1))
-    figures.unreported = tuple(
-        sorted(name for name, state in states.items() if state not in SETTLED or recorded.get(name) != state)
-    )
+    ended = {name: state for name, state in states.items() if state in SETTLED}
+    missing = {name for name, state in ended.items() if recorded.get(name) != state}
+    if named and missing:
+        fleet.note(
+            f"the recording has a row for each result that it misses, as the end of {', '.join(sorted(missing))}"
+        )
+    figures.unreported = tuple(sorted((states.keys() - ended.keys()) | (set() if named else missing)))
     by_nobody = sorted(name for name, state in states.items() if state == "finished" and not done[name])
     fleet.violations += [f"{name} is called finished, and no arm has finished it" for name in by_nobody]
     figures.violations, figures.notes = tuple(fleet.violations), tuple(fleet.notes)
@@ -267,7 +270,12 @@ def _inject(fleet: Fleet, step: Step, inject: Inject, at_s: float) -> Injected:
     return Injected(step, at_s, next_s - ended_s, recovered_s)
 
 
-def _recorded(folder: Path) -> dict[str, str]:
-    """Last recorded state of each job."""
-    table = read_parts(folder, "results").sort_by("number")
-    return dict(zip(table["job"].to_pylist(), table["state"].to_pylist(), strict=True))
+def _recorded(folder: Path) -> tuple[dict[str, str], bool]:
+    """Last recorded state of each job, and whether results are missing and a row of the recording names each one."""
+    table, gaps = read_parts(folder, "results").sort_by("number"), read_parts(folder, "gaps").to_pylist()
+    numbers = set(table["number"].to_pylist())
+    missing = set(range(max(numbers, default=0))) - numbers
+    gaps = [gap for gap in gaps if gap["sender"].startswith("results of")]
+    named = {number for number in missing if any(gap["first"] <= number <= gap["last"] for gap in gaps)}
+    states = dict(zip(table["job"].to_pylist(), table["state"].to_pylist(), strict=True))
+    return states, bool(missing) and named == missing
