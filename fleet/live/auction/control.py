@@ -7,9 +7,25 @@ from fleet.bus.protocol.operator import ALL_ARMS, Cancel, Change, ControlRequest
 from fleet.errors import Refused
 from fleet.live.auction.job_rules import changed_spec
 from fleet.live.auction.ledger import Ledger
+from fleet.live.auction.past_jobs import content_hash
 
 ALREADY_DONE = "This request was carried out before."
 NO_CHANGE = "Nothing changed: it is so already."
+
+
+def was_carried_out(ledger: Ledger, request: ControlRequest) -> bool:
+    """Return whether this request was carried out before.
+
+    Raises:
+        Refused: another request of this name was.
+    """
+    before = ledger.requests.get(request.request)
+    if before not in (None, 0, content_hash(request)):
+        raise Refused(
+            f"Another request of the name '{request.request}' was carried out before, so this one is not "
+            f"({request.action}). Give each request a name of its own, for example a UUID."
+        )
+    return before is not None
 
 
 def job_of(request: ControlRequest) -> str:
@@ -51,6 +67,10 @@ def _objection_to_job(ledger: Ledger, action: Cancel | Settle | Change) -> str:
     if entry is None:
         if action.job in ledger.past:
             return "It was settled long ago."
+        if action.job in ledger.aside:
+            if isinstance(action, Settle):
+                return ""
+            raise Refused(f"'{action.job}' is put aside, and its description is lost: settle it as done or redo.")
         raise Refused(f"There is no job '{action.job}'.")
     state = entry.state
     match action:

@@ -9,6 +9,8 @@ from collections.abc import Container, Iterator
 from hashlib import blake2b
 from struct import iter_unpack, pack
 
+from msgspec import Struct
+
 from fleet.bus.protocol.auction import JobSpec
 from fleet.bus.protocol.messages import encode
 
@@ -20,9 +22,14 @@ def _hash(content: bytes) -> int:
     return int.from_bytes(blake2b(content, digest_size=8).digest(), "little")
 
 
+def content_hash(message: Struct) -> int:
+    """Return a hash of the content of a message."""
+    return _hash(encode(message))
+
+
 def _spec_hash(job: JobSpec) -> int:
     """Hash of a job without the lowest bit, which says whether it was finished."""
-    return _hash(encode(job)) & ~1
+    return content_hash(job) & ~1
 
 
 class PastJobs(Container[str]):
@@ -43,6 +50,10 @@ class PastJobs(Container[str]):
     def add(self, job: JobSpec, *, finished: bool) -> None:
         """Add a job that is finished, or given up; the oldest one is dropped if there are too many."""
         self._put(_hash(job.name.encode()), _spec_hash(job) | finished)
+
+    def add_name(self, name: str, *, finished: bool) -> None:
+        """Add a job of which only the name is known."""
+        self._put(_hash(name.encode()), int(finished))
 
     def __contains__(self, name: object) -> bool:
         return isinstance(name, str) and _hash(name.encode()) in self._jobs

@@ -25,7 +25,7 @@ from fleet.bus.protocol.auction import JobSpec, JobStatus, Quote
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply
 from fleet.bus.protocol.messages import State
 from fleet.live.arm.node import ArmNode
-from fleet.live.auction.job_rules import EXPIRED, SHIFT_ENDED, is_late, job_order, lost_jobs, ready_jobs
+from fleet.live.auction.job_rules import EXPIRED, SHIFT_ENDED, is_late, job_order, lost_jobs, ready_jobs, with_terms
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.round import Bidding, Choice, Timing, resolve_claims
 from fleet.live.consensus.claimant import NUMBERS_PER_BOOT, Claimant
@@ -214,7 +214,7 @@ class Participant:
         jobs = self.jobs | {job.name: job for job in later}
         lost = self._given_up(jobs, real_s)
         names = dict.fromkeys([*jobs, *self.granter.register.settled])
-        statuses = [self.granter.status(name, real_s) for name in names]
+        statuses = [with_terms(self.granter.status(name, real_s), jobs.get(name)) for name in names]
         statuses = [
             replace(status, state="given_up", reason=lost[status.job])
             if status.state == "waiting" and status.job in lost
