@@ -102,8 +102,9 @@ class Ledger(LedgerState):
                 for entry in changed:
                     self.jobs[entry.spec.name] = entry
                     self._move(entry, "waiting")
+                self._awaited.update(before for entry in changed for before in entry.spec.after)
                 if any(entry.spec.after for entry in changed):
-                    self._follow_given_up()
+                    self._apply_given_up()
             case Awarded():
                 entry = self.jobs[record.job]
                 self._forget_awards(entry)
@@ -126,7 +127,7 @@ class Ledger(LedgerState):
                 entry = self.jobs[record.job]
                 entry.expired = True
                 self._move(entry, "given_up", EXPIRED)
-                changed = [entry, *self._follow_given_up()]
+                changed = [entry, *self._follow_given_up(entry)]
             case SpaceTaken():
                 self.space[record.arm] = frozenset(record.space)
             case SpaceCleared():
@@ -193,6 +194,10 @@ class Ledger(LedgerState):
         """Forget a settled job, except for its name and outcome."""
         entry = self.jobs.pop(name)
         del self.settled[name]
+        for before in entry.spec.after:
+            self._awaited[before] -= 1
+            if not self._awaited[before]:
+                del self._awaited[before]
         self.past.add(entry.original, finished=entry.state == "finished")
         self.left[entry.state] = self.left.get(entry.state, 0) + 1
         for award in self._awards_of.pop(name, ()):
@@ -227,7 +232,7 @@ class Ledger(LedgerState):
             given_up = entry.state in ABANDONED
             entry.award, entry.finished_s = record.award, record.time_s
             self._move(entry, "finished")
-            return [entry, *(self._follow_given_up() if given_up else ())]
+            return [entry, *(self._follow_given_up(entry) if given_up else ())]
         if entry.award != record.award:  # the job was awarded again since
             return self._give_up(entry)
         if record.unsure or (self.ended and not entry.cancelled):
@@ -248,11 +253,11 @@ class Ledger(LedgerState):
         if entry.state != "waiting" or not reason:
             return []
         self._move(entry, "given_up", reason)
-        return [entry, *self._follow_given_up()]
+        return [entry, *self._follow_given_up(entry)]
 
     def _cancel(self, entry: JobEntry) -> list[JobEntry]:
         self._move(entry, "cancelled", f"Cancelled by '{entry.changed_by}'.")
-        return [entry, *self._follow_given_up()]
+        return [entry, *self._follow_given_up(entry)]
 
     def _pauser(self, entry: JobEntry, record: Closed) -> str | None:
         """Return who paused the arm that has returned a job; None if it has another reason to."""
@@ -297,7 +302,7 @@ class Ledger(LedgerState):
                     self._end(self.open[entry.award])
                 entry.cycles, entry.finished_s = entry.spec.repetitions, time_s
                 self._move(entry, "finished", f"Settled as done by '{request.by}'.")
-                return [entry, *self._follow_given_up()]
+                return [entry, *self._follow_given_up(entry)]
             entry.arm = self.status_of(entry).arm
             entry.award = ""  # a late report on it that is unsure is settled, too
             entry.cycles = min(entry.cycles, entry.spec.repetitions - 1)
@@ -310,7 +315,11 @@ class Ledger(LedgerState):
                 return [entry]
         return []
 
-    def _follow_given_up(self) -> list[JobEntry]:
+    def _follow_given_up(self, entry: JobEntry) -> list[JobEntry]:
+        """Apply a change of this job to jobs that wait for it; return what has changed."""
+        return self._apply_given_up() if entry.spec.name in self._awaited else []
+
+    def _apply_given_up(self) -> list[JobEntry]:
         """Give up jobs that wait for one that is given up; return what has changed.
 
         They wait again if that one was finished after all.

@@ -5,7 +5,7 @@ contradicts is put aside with its jobs, which no arm does until a person has set
 begins with what the line before has changed (`Checked`), so a missing record is noticed, too.
 """
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -123,6 +123,7 @@ class LedgerState(LedgerView, TimedState[AuctionRecord]):
         self.succeeds = snapshot.succeeds
         jobs = self.jobs
         self.awards = {a.record.award: replace(a) for a in snapshot.awards if a.record.job in jobs}
+        self._awaited = Counter(before for entry in self.jobs.values() for before in entry.spec.after)
         self._awards_of = {}
         for name, award in self.awards.items():
             self._awards_of.setdefault(award.record.job, []).append(name)

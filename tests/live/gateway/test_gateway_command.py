@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from fleet.bus.client.router import Router
 from tests.waiting import PATIENCE_S, wait_until
 
 ROOT = Path(__file__).parents[3]
@@ -43,6 +45,27 @@ def test_the_command_exits_on_a_signal_even_while_a_reader_is_connected(router, 
         assert started.wait(PATIENCE_S) == code
         line.close()
         assert "Traceback" not in started.stderr.read()
+
+
+def test_the_command_waits_for_a_router():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    with Router(port):
+        pass  # now the port is free, and was a router's
+    command = [sys.executable, "-u", "-c", "from scenarios.cli.main import main; main()", "gateway", "--fleet", "f"]
+    command += ["--endpoint", f"tcp/127.0.0.1:{port}", "--port", "0"]
+    started = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        assert "Waiting for a router." in started.stderr.readline()
+        assert started.poll() is None
+        with Router(port):
+            assert started.stdout.readline().startswith("ready gateway http://127.0.0.1:")
+            started.terminate()
+            assert started.wait(PATIENCE_S) == 0
+    finally:
+        started.kill()
+        started.communicate(timeout=PATIENCE_S)
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="no Node")
