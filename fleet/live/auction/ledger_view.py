@@ -92,6 +92,10 @@ class LedgerView:
         """Return whether an arm gets no jobs."""
         return arm in self.paused or ALL_ARMS in self.paused
 
+    def at_work(self) -> Mapping[str, tuple[str, bool]]:
+        """Return the arm with an open award of a job, and whether it has permission to commit, by job."""
+        return {award.record.job: (award.record.arm, award.may_commit) for award in self.open.values()}
+
     def may_begin(self, award: str) -> bool:
         """Return whether cycles of an open award may be begun under a lease."""
         state = self.open[award]

@@ -16,13 +16,14 @@ MAX_PAST = 100_000
 """Jobs whose names are known after they have left the ledger."""
 
 
-def _hash(content: bytes) -> int:
+def hash_of(content: bytes) -> int:
+    """Return 64 bits, the same in every process."""
     return int.from_bytes(blake2b(content, digest_size=8).digest(), "little")
 
 
 def _spec_hash(job: JobSpec) -> int:
     """Hash of a job without the lowest bit, which says whether it was finished."""
-    return _hash(encode(job)) & ~1
+    return hash_of(encode(job)) & ~1
 
 
 class PastJobs(Container[str]):
@@ -42,10 +43,10 @@ class PastJobs(Container[str]):
 
     def add(self, job: JobSpec, *, finished: bool) -> None:
         """Add a job that is finished, or given up; the oldest one is dropped if there are too many."""
-        self._put(_hash(job.name.encode()), _spec_hash(job) | finished)
+        self._put(hash_of(job.name.encode()), _spec_hash(job) | finished)
 
     def __contains__(self, name: object) -> bool:
-        return isinstance(name, str) and _hash(name.encode()) in self._jobs
+        return isinstance(name, str) and hash_of(name.encode()) in self._jobs
 
     def __len__(self) -> int:
         return len(self._jobs)
@@ -57,15 +58,15 @@ class PastJobs(Container[str]):
 
     def is_same(self, job: JobSpec) -> bool:
         """Return whether a job of this name is known, and is this one."""
-        return self._jobs.get(_hash(job.name.encode()), -1) & ~1 == _spec_hash(job)
+        return self._jobs.get(hash_of(job.name.encode()), -1) & ~1 == _spec_hash(job)
 
     def is_finished(self, name: str) -> bool:
         """Return whether a job of this name is known, and was finished."""
-        return bool(self._jobs.get(_hash(name.encode()), 0) & 1)
+        return bool(self._jobs.get(hash_of(name.encode()), 0) & 1)
 
     def is_given_up(self, name: str) -> bool:
         """Return whether a job of this name is known, and was given up."""
-        return not self._jobs.get(_hash(name.encode()), 1) & 1
+        return not self._jobs.get(hash_of(name.encode()), 1) & 1
 
     def packed(self) -> bytes:
         """Return all jobs, oldest first."""

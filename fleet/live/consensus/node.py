@@ -4,13 +4,13 @@ The fleet's time is the latest that any arm keeps: an arm that receives a later 
 all arms of the roster are present, or a majority has waited long enough for the others.
 """
 
+import logging
 import math
 import secrets
 import time
 from collections import deque
 from collections.abc import Iterable
 from random import Random
-from typing import NoReturn
 
 from msgspec.structs import replace
 
@@ -18,6 +18,7 @@ from fleet.bus.client.client import AnotherReplies
 from fleet.bus.client.replies import Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
+    ABANDONED,
     Clock,
     ClockRequest,
     JobStatus,
@@ -28,11 +29,11 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
-from fleet.bus.protocol.cell import CellRequest
+from fleet.bus.protocol.cell import Cell, CellRequest
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply
 from fleet.bus.protocol.history import History, HistoryRequest
 from fleet.bus.protocol.messages import State
-from fleet.bus.protocol.operator import Cleared, ClearRequest, ControlRequest
+from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
 from fleet.errors import BusError, Refused
 from fleet.live.arm.auctioneer_client import RateLimitedWarnings
 from fleet.live.arm.node import ArmNode
@@ -46,6 +47,8 @@ from fleet.live.consensus.records import GrantRecord
 from fleet.live.consensus.register import Register
 from fleet.live.journal import Journal
 from fleet.live.journal_upkeep import TimeRecorder
+
+_LOG = logging.getLogger(__name__)
 
 LISTEN_S = 0.5
 """Real seconds that an arm listens before it starts the fleet's time."""
@@ -212,12 +215,13 @@ class ConsensusNode:
     def _declare(self) -> None:
         link, fleet, name = self._link, self._link.fleet, self._name
         self._publish_bid = link.publisher(keys.of_arm(fleet, name, "bid"), Bid)
+        self._publish_operation = link.publisher(keys.of_arm(fleet, name, "operation"), Operation)
         link.reply_to(keys.asked_by_every_arm(fleet, name, "claim"), Claim, self._answer_claim)
         link.reply_to(keys.of_jobs(fleet, "submit"), Submission, self._submit)
         link.reply_to(keys.of_jobs(fleet, "status"), StatusRequest, self._status)
         link.reply_to(keys.of_jobs(fleet, "clear"), ClearRequest, self._clear)
-        link.reply_to(keys.of_jobs(fleet, "control"), ControlRequest, self._refuse)
-        link.reply_to(keys.of_jobs(fleet, "cell"), CellRequest, self._refuse)
+        link.reply_to(keys.of_jobs(fleet, "control"), ControlRequest, self._control)
+        link.reply_to(keys.of_jobs(fleet, "cell"), CellRequest, self._describe_cell)
         link.reply_to(keys.of_clock(fleet), ClockRequest, self._clock)
         link.subscribe(keys.of_every_arm(fleet, "bid"), Bid, self._apply_bid, history=True)
         link.subscribe(keys.of_every_arm(fleet, "state"), State, self.participant.states.__setitem__)
@@ -271,9 +275,9 @@ class ConsensusNode:
             raise AnotherReplies
 
     def _submit(self, submission: Submission) -> SubmissionReply:
-        known = {job.name: job for _, job in self._stream} | self.participant.jobs
+        known = {job.name: job for _, job in self._stream} | self.participant.submitted
         ended = self.participant.ended
-        given_up = {status.job for status in self.statuses() if status.state == "given_up"}
+        given_up = {status.job for status in self.statuses() if status.state in ABANDONED}
         admissions = admit(submission.jobs, known, places=self._membership.places, ended=ended, given_up=given_up)
         accepted = tuple(job for job, reply in zip(submission.jobs, admissions, strict=True) if reply.accepted)
         self.participant.granter.add_jobs(tuple(job for job in accepted if job.name not in known), submission.by)
@@ -285,7 +289,8 @@ class ConsensusNode:
         self._check_first()
         statuses = [status for status in self.statuses() if not request.jobs or status.job in request.jobs]
         time_s, register = self._arm.clock.now_s(time.monotonic()), self.participant.granter.register
-        return status_reply(self._name, time_s, statuses, register.space, self._epoch)
+        paused = register.operations.paused
+        return status_reply(self._name, time_s, statuses, register.space, self._epoch, paused)
 
     def _clear(self, request: ClearRequest) -> Cleared:
         real_s = time.monotonic()
@@ -296,9 +301,19 @@ class ConsensusNode:
             self._check_first()
         return Cleared(self._name, request.arm)
 
-    def _refuse(self, _: ControlRequest | CellRequest) -> NoReturn:
+    def _control(self, request: ControlRequest) -> Controlled:
         self._check_first()
-        raise Refused("Only a fleet with an auctioneer replies to this; these arms allocate the jobs themselves.")
+        real_s = time.monotonic()
+        later = (job for _, job in self._stream)
+        reply = self.participant.control(request, real_s, self._arm.clock.now_s(real_s), later)
+        _LOG.warning("'%s' requested: %s", request.by, request.action)
+        return reply
+
+    def _describe_cell(self, _: CellRequest) -> Cell:
+        self._check_first()
+        if self._membership.cell is None:
+            raise Refused("This arm knows no cell.")
+        return self._membership.cell
 
     def _clock(self, _: ClockRequest) -> Clock:
         self._check_first()
@@ -318,6 +333,8 @@ class ConsensusNode:
                         for each in bid.estimates
                     )
                     self._publish_bid(replace(bid, estimates=estimates))
+                case Operation() as operation:
+                    self._publish_operation(operation)
                 case Claim() as claim:
                     self._query_claim(claim)
 

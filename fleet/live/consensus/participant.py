@@ -13,6 +13,7 @@ Safety rests on step 4 alone (`fleet.live.consensus.granter`). Steps 1 to 3 only
 job: where messages are lost two arms may claim one, and the one without a majority waits and tries again.
 """
 
+import logging
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
@@ -22,17 +23,25 @@ from random import Random
 from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import JobSpec, JobStatus, Quote
+from fleet.bus.protocol.cell import Cell
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply
-from fleet.bus.protocol.messages import State
+from fleet.bus.protocol.messages import MOST_COUNT, State
+from fleet.bus.protocol.operator import Controlled, ControlRequest, Operation, Settle
+from fleet.errors import JournalFull
 from fleet.live.arm.node import ArmNode
+from fleet.live.auction.control import ALREADY_DONE, job_of, next_step, objection
 from fleet.live.auction.job_rules import EXPIRED, SHIFT_ENDED, is_late, job_order, lost_jobs, ready_jobs
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.round import Bidding, Choice, Timing, resolve_claims
 from fleet.live.consensus.claimant import NUMBERS_PER_BOOT, Claimant
+from fleet.live.consensus.control import KnownFleet, KnownJob
 from fleet.live.consensus.granter import Granter
+from fleet.live.consensus.register import Register
 from fleet.live.monitor.snapshot import FRESH_S
 from fleet.live.space import Excludes, no_conflicts
 from fleet.observation import Observation
+
+_LOG = logging.getLogger(__name__)
 
 QUIET_S = 0.05
 """Real seconds without a new bid or choice, after which all arms most likely have the same bids."""
@@ -64,6 +73,8 @@ class Membership:
     """Fleet time at which the shift is over."""
     excludes: Excludes = no_conflicts
     """Which plans of two arms exclude each other."""
+    cell: Cell | None = None
+    """Reply to requests for the cell, in the name of this arm; None refuses them."""
     timing: Timing = field(default_factory=Timing)
 
 
@@ -71,11 +82,12 @@ class Participant:
     """One arm among its peers, from one start of its process to the next.
 
     Attributes:
-        jobs: All jobs that it knows, by release and name.
+        submitted: All jobs that it knows as they were submitted, by release and name.
+        jobs: The same jobs with the changes that people have requested.
         claimant: Its claims.
         granter: Its grants.
         states: The last state of each arm; the driver puts them in.
-        out: Bids and claims to send, oldest first; the driver takes them out.
+        out: Bids, claims and requests of people that were carried out; the driver sends them.
         ended: The shift is over: it accepts no more jobs.
         rounds: Number of choices of its policy.
         changed_s: Real second of the last change of a bid or choice.
@@ -91,9 +103,10 @@ class Participant:
         self.name, self.executor, self.granter = arm.executor.arm, arm.executor, granter
         self._timing = membership.timing
         self.claimant = Claimant(arm.executor, granter, arm.answer_award, arm.space_of, boot=boot, timing=self._timing)
+        self.submitted: dict[str, JobSpec] = {}
         self.jobs: dict[str, JobSpec] = {}
         self.states: dict[str, State] = {}
-        self.out: deque[Bid | Claim] = deque()
+        self.out: deque[Bid | Claim | Operation] = deque()
         self.ended, self.rounds = False, 0
         self._arm, self._fleet, self._policy = arm, membership.fleet, membership.choose
         self._excludes = membership.excludes
@@ -119,9 +132,14 @@ class Participant:
 
     def add_jobs(self, jobs: Iterable[JobSpec]) -> None:
         """Add jobs that it does not know yet."""
-        new = {job.name: job for job in jobs if job.name not in self.jobs}
+        new = {job.name: job for job in jobs if job.name not in self.submitted}
         if new:
-            self.jobs = {job.name: job for job in sorted((self.jobs | new).values(), key=job_order)}
+            self.submitted = {job.name: job for job in sorted((self.submitted | new).values(), key=job_order)}
+            self._apply_changes()
+
+    def _apply_changes(self) -> None:
+        """Have the jobs follow what people have requested."""
+        self.jobs = {name: self.granter.register.operations.changed(job) for name, job in self.submitted.items()}
 
     def set_present(self, present: frozenset[str]) -> None:
         """Set which arms are present."""
@@ -146,18 +164,22 @@ class Participant:
         for job in bid.open_jobs:
             if job in register.settled:
                 self.claimant.send_outcome(register.settled[job])
-        if bid.closed_count >= register.closed_count:
+        if bid.closed_count >= register.closed_count and bid.digest == _digest(register):
             self._behind_s.pop(bid.arm, None)
         elif real_s >= self._behind_s.setdefault(bid.arm, real_s) + 2 * BID_S:
             outcomes = list(register.settled.values())
-            for _ in range(min(MAX_OPEN_JOBS, len(outcomes))):
-                self._corrected = (self._corrected + 1) % len(outcomes)
-                self.claimant.send_outcome(outcomes[self._corrected])
+            operations = register.operations.all
+            for _ in range(MAX_OPEN_JOBS):
+                self._corrected += 1
+                if outcomes:
+                    self.claimant.send_outcome(outcomes[self._corrected % len(outcomes)])
+                if operations:
+                    self.claimant.send_operation(operations[self._corrected % len(operations)])
         full = len(bid.open_jobs) == MAX_OPEN_JOBS and bid.open_jobs[-1] in self.jobs
         last = job_order(self.jobs[bid.open_jobs[-1]]) if full else (math.inf, "")
         for job in self.open_jobs(real_s) if register.jobs else []:
             if job in register.jobs and job not in bid.open_jobs and job_order(self.jobs[job]) < last:
-                self.claimant.send_job(self.jobs[job])
+                self.claimant.send_job(register.jobs[job])
 
     def answer_claim(self, claim: Claim, real_s: float) -> ClaimReply:
         """Return the reply to a peer's claim.
@@ -165,15 +187,59 @@ class Participant:
         Raises:
             Refused: as `Granter.answer_claim`.
         """
-        reply = self.granter.answer_claim(claim, real_s)
-        self.add_jobs(claim.jobs)
-        return reply
+        before = self.granter.register.operations.digest
+        try:
+            return self.granter.answer_claim(claim, real_s)
+        finally:
+            self.add_jobs(job for job in claim.jobs if job.name in self.granter.register.jobs)
+            if self.granter.register.operations.digest != before:
+                self._apply_changes()
+
+    def control(
+        self, request: ControlRequest, real_s: float, time_s: float, later: Iterable[JobSpec] = ()
+    ) -> Controlled:
+        """Carry out a request of a person, once; it is on disk when this returns, and the peers get it.
+
+        Args:
+            later: Jobs that are not offered yet.
+
+        Raises:
+            Refused: it is not possible now.
+        """
+        granter, operations, job = self.granter, self.granter.register.operations, job_of(request)
+        self.add_jobs(each for each in later if each.name == job)
+        fleet = KnownFleet(granter.register, self._steered(job, real_s), (), self.ended)
+        known = request.request in operations.names
+        note = ALREADY_DONE if known else objection(fleet, request, granter.roster)
+        if not known:
+            operation = fleet.operation(self.name, request, time_s)
+            granter.operate(operation)
+            if isinstance(request.action, Settle) and request.action.outcome == "done" and not note:
+                self.claimant.send_outcome(granter.settle(operation, fleet.jobs[job].award))
+            granter.abandon(real_s)
+            self._apply_changes()
+            self.claimant.send_operation(operation)
+            self.out.append(operation)
+        status = next(iter(self._steered(job, real_s).values()), None)
+        changed, note = not (known or note), note or next_step(fleet, request)
+        return Controlled(self.name, request.request, changed, note, status and status.status, operations.paused)
+
+    def _steered(self, job: str, real_s: float) -> dict[str, KnownJob]:
+        """Return what is known of a job; nothing of an unknown one."""
+        register = self.granter.register
+        spec = self.jobs.get(job)
+        status = next((each for each in self.status((), real_s) if each.job == job), None)
+        if spec is None or status is None:
+            return {}
+        grant, cancelled = register.grants.get(job), register.operations.cancelled(job) is not None
+        return {job: KnownJob(spec, status, cancelled, status.award or ("" if grant is None else grant.award))}
 
     # Time
 
     def tick(self, real_s: float, time_s: float) -> None:
         """Do what is due."""
         self._time_s = time_s
+        self._obey(real_s)
         for job in self.claimant.rejected:
             self._lost = True
             self._pause(job, real_s)
@@ -186,11 +252,23 @@ class Participant:
         if claim := self.claimant.claim(self._present, self._arm.space, real_s):
             self.out.append(claim)
 
+    def _obey(self, real_s: float) -> None:
+        """Stop what people have stopped, as far as it is not in its last cycle."""
+        operations = self.granter.register.operations
+        if not operations.latest:
+            return
+        paused, cancelled = operations.is_paused(self.name), operations.all_cancelled
+        self.claimant.revoke(lambda job: paused or job in cancelled, real_s)
+        try:
+            self.granter.abandon(real_s)
+        except JournalFull as error:
+            _LOG.error("Cancelled jobs are not recorded: %s", error)
+
     def open_jobs(self, real_s: float) -> list[str]:
         """Return the jobs that can still be done, without those of absent arms that had permission to commit."""
         register = self.granter.register
         gone = {job for job in self.granter.out_of_contact(real_s) if register.grants[job].arm not in self._present}
-        gone.update(register.settled, self._given_up(self.jobs, real_s))
+        gone.update(register.settled, register.operations.all_cancelled, self._given_up(self.jobs, real_s))
         return [job for job in self.jobs if job not in gone]
 
     def _given_up(self, jobs: Mapping[str, JobSpec], real_s: float) -> dict[str, str]:
@@ -232,11 +310,12 @@ class Participant:
 
     def _ready(self, real_s: float, time_s: float) -> list[JobSpec]:
         """Return the jobs that wait for an arm, as they queue, without recently rejected ones."""
-        settled = self.granter.register.settled
+        settled, cancelled = self.granter.register.settled, self.granter.register.operations.all_cancelled
         free = (
             job
             for name, job in self.jobs.items()
             if name not in settled
+            and name not in cancelled
             and not self.granter.is_granted(name, real_s)
             and not is_late(job, time_s)
             and self._later_s.get(name, -math.inf) <= real_s
@@ -250,14 +329,15 @@ class Participant:
 
     def _bid(self, real_s: float, time_s: float) -> None:
         """Publish a bid when its content has changed, and every `BID_S`."""
-        capacity = 0 if self.ended or self._arm.unfit() else max(0, self.claimant.capacity)
+        paused = self.granter.register.operations.is_paused(self.name)
+        capacity = 0 if self.ended or paused or self._arm.unfit() else max(0, self.claimant.capacity)
         ready = [] if self.ended else self._ready(real_s, time_s)
         names = [job.name for job in ready]
         if self._choice.job not in names or self.claimant.pending:
             self._choice = NO_CHOICE
         open_jobs = self.open_jobs(real_s)
         register, busy = self.granter.register, self.granter.busy_stations(real_s)
-        content = (capacity, names, len(open_jobs), self._choice, busy, dict(register.space))
+        content = (capacity, names, len(open_jobs), self._choice, busy, dict(register.space), _digest(register))
         if content == self._last_bid and real_s < self._bid_s + BID_S:
             return
         self._new_bids |= content != self._last_bid
@@ -275,6 +355,7 @@ class Participant:
             choice=self._choice.job,
             choice_plan=self._choice.plan,
             epoch=register.epoch,
+            digest=_digest(register),
         )
         self.apply_bid(bid, real_s)
         self.out.append(bid)
@@ -344,6 +425,10 @@ class Participant:
         count = self._pauses[job] = self._pauses.get(job, 0) + 1
         pause_s = min(longest_s, first_s * 2.0 ** min(count - 1, 10))
         self._later_s[job] = real_s + pause_s * self._rng.uniform(0.2, 1.0)
+
+
+def _digest(register: Register) -> int:
+    return register.operations.digest % MOST_COUNT
 
 
 def _offered(bid: Bid) -> tuple[bool, frozenset[str]]:

@@ -4,6 +4,7 @@ import msgspec
 
 from fleet.bus.protocol.auction import Count, Name
 from fleet.bus.protocol.consensus import Faults, JobOutcome
+from fleet.bus.protocol.operator import Operation
 from fleet.live.journal_records import ClockTick, EpochBegun, JobsAccepted, Progress, Released, SpaceCleared, SpaceTaken
 
 
@@ -49,6 +50,18 @@ class ClaimNumbered(msgspec.Struct, frozen=True, tag="claim_numbered"):
     number: Count
 
 
+class Requested(msgspec.Struct, frozen=True, tag="requested"):
+    """A request of a person is carried out, here or by a peer."""
+
+    operation: Operation
+
+
+class RequestsKnown(msgspec.Struct, frozen=True, tag="requests_known"):
+    """Requests of people that were carried out, by name."""
+
+    names: tuple[str, ...]
+
+
 GrantRecord = (
     JobGranted
     | Released
@@ -59,6 +72,8 @@ GrantRecord = (
     | ClockTick
     | ClaimNumbered
     | Progress
+    | Requested
+    | RequestsKnown
     | SpaceTaken
     | SpaceCleared
     | EpochBegun

@@ -2,15 +2,28 @@
 
 from dataclasses import dataclass, field
 
-from fleet.bus.protocol.auction import JobSpec
-from fleet.bus.protocol.consensus import (
-    Faults,
-    JobOutcome,
+from fleet.bus.protocol.auction import ABANDONED, JobSpec
+from fleet.bus.protocol.consensus import Faults, JobOutcome
+from fleet.bus.protocol.operator import Operation
+from fleet.live.auction.control import job_of
+from fleet.live.consensus.operations import Operations
+from fleet.live.consensus.records import (
+    ClaimNumbered,
+    Faulted,
+    GrantRecord,
+    JobGranted,
+    JobReturned,
+    JobSettled,
+    Requested,
+    RequestsKnown,
 )
-from fleet.live.consensus.records import ClaimNumbered, Faulted, GrantRecord, JobGranted, JobReturned, JobSettled
 from fleet.live.journal import TimedState
 from fleet.live.journal_records import ClockTick, EpochBegun, JobsAccepted, Progress, Released, SpaceCleared, SpaceTaken
 from fleet.live.space import ANYWHERE
+
+
+RANKS = ("returned", "given_up", "cancelled", "unfinished", "finished")
+"""Outcomes of a job: the later ones count more."""
 
 
 @dataclass(eq=False)
@@ -34,7 +47,7 @@ class Register(TimedState[GrantRecord]):
     grants: dict[str, Grant] = field(default_factory=dict[str, Grant])
     """By job."""
     settled: dict[str, JobOutcome] = field(default_factory=dict[str, JobOutcome])
-    """By job; finished, unfinished for good, or given up."""
+    """By job; finished, unfinished, given up or cancelled."""
     faults: dict[str, Faults] = field(default_factory=dict[str, Faults])
     """Faults of arms, by job."""
     returned_s: dict[str, float] = field(default_factory=dict[str, float])
@@ -50,6 +63,8 @@ class Register(TimedState[GrantRecord]):
     """Name that all arms give to this shift; "" before they have begun."""
     space: dict[str, frozenset[str]] = field(default_factory=dict[str, frozenset[str]])
     """Names of the spaces that an arm may take, by arm."""
+    operations: Operations = field(default_factory=Operations)
+    """Requests of people."""
 
     def apply(self, record: GrantRecord) -> None:
         """Apply a record that is on disk."""
@@ -71,10 +86,11 @@ class Register(TimedState[GrantRecord]):
                 self._add_faults(outcome.job, outcome.faults)
                 if outcome.outcome == "returned":
                     self._return(outcome.job, outcome.time_s)
-                else:
+                elif self.is_news(outcome):
                     self.settled[outcome.job] = outcome
-                    self.grants.pop(outcome.job, None)
                     self.returned_s.pop(outcome.job, None)
+                    if outcome.outcome not in ABANDONED:  # an arm may still be in a cycle of an abandoned job
+                        self.grants.pop(outcome.job, None)
             case Faulted(job, faults):
                 self._add_faults(job, faults)
             case JobReturned(job, time_s):
@@ -96,6 +112,11 @@ class Register(TimedState[GrantRecord]):
                 self.space[arm] = frozenset()
                 for grant in self.grants.values():
                     grant.revoked |= grant.arm == arm
+                self._drop_redone()
+            case Requested(operation):
+                self._operate(operation)
+            case RequestsKnown(names):
+                self.operations.add_names(names)
 
     def compact(self) -> tuple[GrantRecord, ...]:
         """Return the fewest records that give the same register."""
@@ -112,23 +133,47 @@ class Register(TimedState[GrantRecord]):
         records += [Faulted(job, faults) for job, faults in self.faults.items() if job not in self.settled]
         records += [JobReturned(job, time_s) for job, time_s in self.returned_s.items()]
         records += [JobSettled(outcome) for outcome in self.settled.values()]
+        records += [RequestsKnown(tuple(self.operations.names))] if self.operations.names else []
+        records += map(Requested, self.operations.all)
         known = {arm: names for arm, names in self.space.items() if ANYWHERE not in names}
         records += [SpaceTaken(arm, tuple(sorted(names))) for arm, names in known.items()]
         return tuple(records)
 
     @property
     def given_up(self) -> frozenset[str]:
-        """Jobs in which arms have faulted too often."""
-        return frozenset(job for job, outcome in self.settled.items() if outcome.outcome == "given_up")
+        """Jobs in which arms have faulted too often, and cancelled ones."""
+        return frozenset(job for job, outcome in self.settled.items() if outcome.outcome in ABANDONED)
 
     @property
     def closed_count(self) -> int:
-        """Number of outcomes that nothing changes; a job that is given up may be finished after all."""
+        """Number of outcomes that nothing changes; one that is given up may be finished after all."""
         return len(self.settled) - len(self.given_up)
+
+    def is_news(self, outcome: JobOutcome) -> bool:
+        """Return whether the outcome of a job counts more than what is known of the job."""
+        known = self.settled.get(outcome.job)
+        if outcome.outcome == "unfinished" and outcome.award in self.operations.redone(outcome.job):
+            return False
+        return known is None or RANKS.index(outcome.outcome) > RANKS.index(known.outcome)
 
     def knows(self, job: str, faults: Faults) -> bool:
         """Return whether these faults in a job are known."""
         return faults.keys() <= self.faults.get(job, {}).keys()
+
+    def _operate(self, operation: Operation) -> None:
+        self.operations.add(operation)
+        self.time_s = max(self.time_s, operation.time_s)
+        job = job_of(operation.request)
+        known, redone = self.settled.get(job), self.operations.redone(job)
+        if known is not None and known.outcome == "unfinished" and known.award in redone:
+            del self.settled[job]
+        self._drop_redone()
+
+    def _drop_redone(self) -> None:
+        """Drop the grants of cleared arms for jobs whose last cycle a person has called not done."""
+        for job, grant in list(self.grants.items()):
+            if grant.revoked and grant.award in self.operations.redone(job):
+                del self.grants[job]
 
     def _add_faults(self, job: str, faults: Faults) -> None:
         if faults:

@@ -19,6 +19,7 @@ from scenarios.cli.live.auction import own_jobs, summary
 from scenarios.cli.signals import Stop
 from scenarios.cli.terminal import echo
 from scenarios.live.allocation import live_fleet
+from scenarios.live.cell import cell_message
 from scenarios.live.space import cell_space
 from scenarios.policy_loader import arm_policy_of
 from scenarios.schema import Scenario
@@ -47,6 +48,7 @@ def membership_of(scenario: Scenario, name: str, policy: str, *, jobs: str, seed
         stream=tuple(own_jobs(scenario, seed)) if stream else (),
         horizon_s=scenario.horizon_s if stream else float("inf"),
         excludes=cell_space(scenario),
+        cell=cell_message(scenario, name),
     )
 
 
