@@ -251,7 +251,8 @@ class Granter:
         register = self.register
         outcomes: list[GrantRecord] = []
         for job, operation in register.operations.all_cancelled.items():
-            if job not in register.settled and not self.is_granted(job, real_s):
+            known = register.settled.get(job)
+            if (known is None or known.outcome == "given_up") and not self.is_granted(job, real_s):
                 award, arm, cycles = operation.request.request, operation.auctioneer, register.cycles.get(job, 0)
                 reason = _cancelled_by(operation)
                 outcomes.append(JobSettled(JobOutcome(job, award, arm, "cancelled", cycles, operation.time_s, reason)))
@@ -277,6 +278,8 @@ class Granter:
         """Return why a job cannot be granted now, or ""."""
         if entry.job in self.register.settled:
             return f"'{entry.job}' is settled"
+        if entry.award in self.register.operations.redone(entry.job):
+            return f"a person has '{entry.job}' done again"
         grant = self.register.grants.get(entry.job)
         same = grant is not None and (grant.arm, grant.award) == (arm, entry.award)
         if grant is not None and same and grant.revoked:

@@ -160,7 +160,7 @@ class ConsensusNode:
         real_s = time.monotonic()
         if math.isinf(self._membership.horizon_s):
             return False
-        if self.participant.ended:
+        if self.participant.known.ended:
             own = self.participant.executor.active or self.participant.executor.has_pending_reports
             others = any(status.state == "finishing" for status in self.statuses())
             return not (own or others) or real_s >= self._ended_s + LAST_S
@@ -179,7 +179,7 @@ class ConsensusNode:
         if self._begun:
             while self._stream and self._stream[0][0] <= time_s:
                 self.participant.add_jobs([self._stream.popleft()[1]])
-            if time_s >= self._membership.horizon_s and not self.participant.ended:
+            if time_s >= self._membership.horizon_s and not self.participant.known.ended:
                 self._end(real_s, time_s)
             self.participant.set_present(frozenset(self._tokens))
             self.participant.tick(real_s, time_s)
@@ -203,7 +203,7 @@ class ConsensusNode:
 
     def _end(self, real_s: float, time_s: float) -> None:
         """End the shift; only a last cycle continues."""
-        self.participant.ended, self._ended_s = True, real_s
+        self.participant.known.ended, self._ended_s = True, real_s
         executor = self.participant.executor
         if executor.active and not executor.active[0].may_commit:
             executor.return_all(time_s, real_s, "the shift is over")
@@ -275,8 +275,8 @@ class ConsensusNode:
             raise AnotherReplies
 
     def _submit(self, submission: Submission) -> SubmissionReply:
-        known = {job.name: job for _, job in self._stream} | self.participant.submitted
-        ended = self.participant.ended
+        known = {job.name: job for _, job in self._stream} | self.participant.known.submitted
+        ended = self.participant.known.ended
         given_up = {status.job for status in self.statuses() if status.state in ABANDONED}
         admissions = admit(submission.jobs, known, places=self._membership.places, ended=ended, given_up=given_up)
         accepted = tuple(job for job, reply in zip(submission.jobs, admissions, strict=True) if reply.accepted)

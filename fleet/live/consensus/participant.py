@@ -16,11 +16,9 @@ job: where messages are lost two arms may claim one, and the one without a major
 import logging
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from random import Random
-
-from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import JobSpec, JobStatus, Quote
 from fleet.bus.protocol.cell import Cell
@@ -30,12 +28,13 @@ from fleet.bus.protocol.operator import Controlled, ControlRequest, Operation, S
 from fleet.errors import JournalFull
 from fleet.live.arm.node import ArmNode
 from fleet.live.auction.control import ALREADY_DONE, job_of, next_step, objection
-from fleet.live.auction.job_rules import EXPIRED, SHIFT_ENDED, is_late, job_order, lost_jobs, ready_jobs
+from fleet.live.auction.job_rules import job_order
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.round import Bidding, Choice, Timing, resolve_claims
 from fleet.live.consensus.claimant import NUMBERS_PER_BOOT, Claimant
-from fleet.live.consensus.control import KnownFleet, KnownJob
+from fleet.live.consensus.control import KnownFleet
 from fleet.live.consensus.granter import Granter
+from fleet.live.consensus.known_jobs import KnownJobs
 from fleet.live.consensus.register import Register
 from fleet.live.monitor.snapshot import FRESH_S
 from fleet.live.space import Excludes, no_conflicts
@@ -82,13 +81,11 @@ class Participant:
     """One arm among its peers, from one start of its process to the next.
 
     Attributes:
-        submitted: All jobs that it knows as they were submitted, by release and name.
-        jobs: The same jobs with the changes that people have requested.
+        known: All jobs that it knows.
         claimant: Its claims.
         granter: Its grants.
         states: The last state of each arm; the driver puts them in.
         out: Bids, claims and requests of people that were carried out; the driver sends them.
-        ended: The shift is over: it accepts no more jobs.
         rounds: Number of choices of its policy.
         changed_s: Real second of the last change of a bid or choice.
     """
@@ -103,11 +100,10 @@ class Participant:
         self.name, self.executor, self.granter = arm.executor.arm, arm.executor, granter
         self._timing = membership.timing
         self.claimant = Claimant(arm.executor, granter, arm.answer_award, arm.space_of, boot=boot, timing=self._timing)
-        self.submitted: dict[str, JobSpec] = {}
-        self.jobs: dict[str, JobSpec] = {}
+        self.known = KnownJobs(granter)
         self.states: dict[str, State] = {}
         self.out: deque[Bid | Claim | Operation] = deque()
-        self.ended, self.rounds = False, 0
+        self.rounds = 0
         self._arm, self._fleet, self._policy = arm, membership.fleet, membership.choose
         self._excludes = membership.excludes
         self._slots, self._rng = min(membership.slots, MAX_OPEN_JOBS), rng
@@ -132,14 +128,7 @@ class Participant:
 
     def add_jobs(self, jobs: Iterable[JobSpec]) -> None:
         """Add jobs that it does not know yet."""
-        new = {job.name: job for job in jobs if job.name not in self.submitted}
-        if new:
-            self.submitted = {job.name: job for job in sorted((self.submitted | new).values(), key=job_order)}
-            self._apply_changes()
-
-    def _apply_changes(self) -> None:
-        """Have the jobs follow what people have requested."""
-        self.jobs = {name: self.granter.register.operations.changed(job) for name, job in self.submitted.items()}
+        self.known.add(jobs)
 
     def set_present(self, present: frozenset[str]) -> None:
         """Set which arms are present."""
@@ -175,10 +164,10 @@ class Participant:
                     self.claimant.send_outcome(outcomes[self._corrected % len(outcomes)])
                 if operations:
                     self.claimant.send_operation(operations[self._corrected % len(operations)])
-        full = len(bid.open_jobs) == MAX_OPEN_JOBS and bid.open_jobs[-1] in self.jobs
-        last = job_order(self.jobs[bid.open_jobs[-1]]) if full else (math.inf, "")
+        full = len(bid.open_jobs) == MAX_OPEN_JOBS and bid.open_jobs[-1] in self.known.current
+        last = job_order(self.known.current[bid.open_jobs[-1]]) if full else (math.inf, "")
         for job in self.open_jobs(real_s) if register.jobs else []:
-            if job in register.jobs and job not in bid.open_jobs and job_order(self.jobs[job]) < last:
+            if job in register.jobs and job not in bid.open_jobs and job_order(self.known.current[job]) < last:
                 self.claimant.send_job(register.jobs[job])
 
     def answer_claim(self, claim: Claim, real_s: float) -> ClaimReply:
@@ -193,7 +182,7 @@ class Participant:
         finally:
             self.add_jobs(job for job in claim.jobs if job.name in self.granter.register.jobs)
             if self.granter.register.operations.digest != before:
-                self._apply_changes()
+                self.known.apply_changes()
 
     def control(
         self, request: ControlRequest, real_s: float, time_s: float, later: Iterable[JobSpec] = ()
@@ -208,7 +197,7 @@ class Participant:
         """
         granter, operations, job = self.granter, self.granter.register.operations, job_of(request)
         self.add_jobs(each for each in later if each.name == job)
-        fleet = KnownFleet(granter.register, self._steered(job, real_s), (), self.ended)
+        fleet = KnownFleet(granter.register, self.known.steered(job, self.states, real_s, time_s), (), self.known.ended)
         known = request.request in operations.names
         note = ALREADY_DONE if known else objection(fleet, request, granter.roster)
         if not known:
@@ -217,22 +206,12 @@ class Participant:
             if isinstance(request.action, Settle) and request.action.outcome == "done" and not note:
                 self.claimant.send_outcome(granter.settle(operation, fleet.jobs[job].award))
             granter.abandon(real_s)
-            self._apply_changes()
+            self.known.apply_changes()
             self.claimant.send_operation(operation)
             self.out.append(operation)
-        status = next(iter(self._steered(job, real_s).values()), None)
+        status = next(iter(self.known.steered(job, self.states, real_s, time_s).values()), None)
         changed, note = not (known or note), note or next_step(fleet, request)
         return Controlled(self.name, request.request, changed, note, status and status.status, operations.paused)
-
-    def _steered(self, job: str, real_s: float) -> dict[str, KnownJob]:
-        """Return what is known of a job; nothing of an unknown one."""
-        register = self.granter.register
-        spec = self.jobs.get(job)
-        status = next((each for each in self.status((), real_s) if each.job == job), None)
-        if spec is None or status is None:
-            return {}
-        grant, cancelled = register.grants.get(job), register.operations.cancelled(job) is not None
-        return {job: KnownJob(spec, status, cancelled, status.award or ("" if grant is None else grant.award))}
 
     # Time
 
@@ -265,19 +244,12 @@ class Participant:
             _LOG.error("Cancelled jobs are not recorded: %s", error)
 
     def open_jobs(self, real_s: float) -> list[str]:
-        """Return the jobs that can still be done, without those of absent arms that had permission to commit."""
-        register = self.granter.register
-        gone = {job for job in self.granter.out_of_contact(real_s) if register.grants[job].arm not in self._present}
-        gone.update(register.settled, register.operations.all_cancelled, self._given_up(self.jobs, real_s))
-        return [job for job in self.jobs if job not in gone]
+        """Return the jobs that can still be done."""
+        return self.known.open(self._present, real_s, self._time_s)
 
-    def _given_up(self, jobs: Mapping[str, JobSpec], real_s: float) -> dict[str, str]:
-        """Return why jobs are given up in which no arm has faulted too often: they expired, or wait for one that is."""
-        late = (job.name for job in jobs.values() if is_late(job, self._time_s))
-        settled = self.granter.register.settled
-        expired = {name for name in late if name not in settled and not self.granter.is_granted(name, real_s)}
-        causes = self.granter.register.given_up | expired
-        return dict.fromkeys(expired, EXPIRED) | (lost_jobs(jobs.values(), causes) if causes else {})
+    def status(self, later: Iterable[JobSpec], real_s: float) -> list[JobStatus]:
+        """Return the status of all known jobs, and of `later` ones that are not offered yet."""
+        return self.known.status(later, self.states, real_s, self._time_s)
 
     def all_settled(self, real_s: float) -> bool:
         """Return whether every present arm, a majority at least, knows that every job is settled."""
@@ -287,51 +259,13 @@ class Participant:
         known = all(bid is not None and bid[0].open_count == 0 and real_s < bid[1] + FRESH_S for bid in others)
         return known and not (self.open_jobs(real_s) or self.executor.has_pending_reports or self.executor.active)
 
-    def status(self, later: Iterable[JobSpec], real_s: float) -> list[JobStatus]:
-        """Return the status of all known jobs, and of `later` ones that are not offered yet."""
-        jobs = self.jobs | {job.name: job for job in later}
-        lost = self._given_up(jobs, real_s)
-        names = dict.fromkeys([*jobs, *self.granter.register.settled])
-        statuses = [self.granter.status(name, real_s) for name in names]
-        statuses = [
-            replace(status, state="given_up", reason=lost[status.job])
-            if status.state == "waiting" and status.job in lost
-            else status
-            for status in statuses
-        ]
-        if not self.ended:
-            return statuses
-        return [
-            replace(status, state="unfinished", reason=SHIFT_ENDED) if status.state == "waiting" else status
-            for status in statuses
-        ]
-
     # Bids and choices
-
-    def _ready(self, real_s: float, time_s: float) -> list[JobSpec]:
-        """Return the jobs that wait for an arm, as they queue, without recently rejected ones."""
-        settled, cancelled = self.granter.register.settled, self.granter.register.operations.all_cancelled
-        free = (
-            job
-            for name, job in self.jobs.items()
-            if name not in settled
-            and name not in cancelled
-            and not self.granter.is_granted(name, real_s)
-            and not is_late(job, time_s)
-            and self._later_s.get(name, -math.inf) <= real_s
-        )
-
-        def finished(name: str) -> bool:
-            return name in settled and settled[name].outcome == "finished"
-
-        busy, returned_s = self.granter.busy_stations(real_s), self.granter.register.returned_s
-        return ready_jobs(free, time_s, self._slots, busy, finished, returned_s)
 
     def _bid(self, real_s: float, time_s: float) -> None:
         """Publish a bid when its content has changed, and every `BID_S`."""
         paused = self.granter.register.operations.is_paused(self.name)
-        capacity = 0 if self.ended or paused or self._arm.unfit() else max(0, self.claimant.capacity)
-        ready = [] if self.ended else self._ready(real_s, time_s)
+        capacity = 0 if self.known.ended or paused or self._arm.unfit() else max(0, self.claimant.capacity)
+        ready = [] if self.known.ended else self.known.ready(real_s, time_s, self._slots, self._later_s)
         names = [job.name for job in ready]
         if self._choice.job not in names or self.claimant.pending:
             self._choice = NO_CHOICE
@@ -395,7 +329,7 @@ class Participant:
         bidding = self._bidding(bids, [choice.job for choice in choices.values()], real_s)
         (job, plan), self._choice = self._choice, NO_CHOICE
         if resolve_claims(bidding, choices, self._fleet.arms).get(job) == (self.name, plan):
-            self.claimant.request(self.jobs[job], plan, real_s)
+            self.claimant.request(self.known.current[job], plan, real_s)
         else:
             self._lost = True
 
@@ -409,7 +343,7 @@ class Participant:
         return Bidding(
             auction="consensus",
             time_s=max(bid.time_s for bid in bids.values()),
-            jobs=tuple(self.jobs[name] for name in dict.fromkeys(names) if name in self.jobs),
+            jobs=tuple(self.known.current[name] for name in dict.fromkeys(names) if name in self.known.current),
             quotes={arm: quote for arm, quote in quotes.items() if quote.capacity and quote.estimates},
             full={arm: quote for arm, quote in quotes.items() if not (quote.capacity and quote.estimates)},
             states=self.states,

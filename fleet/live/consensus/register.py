@@ -21,7 +21,6 @@ from fleet.live.journal import TimedState
 from fleet.live.journal_records import ClockTick, EpochBegun, JobsAccepted, Progress, Released, SpaceCleared, SpaceTaken
 from fleet.live.space import ANYWHERE
 
-
 RANKS = ("returned", "given_up", "cancelled", "unfinished", "finished")
 """Outcomes of a job: the later ones count more."""
 
