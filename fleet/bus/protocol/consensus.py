@@ -36,9 +36,6 @@ class Bid(msgspec.Struct, frozen=True):
     """Estimates of jobs that wait for an arm, to this arm's knowledge."""
     open_count: Count
     """Number of jobs without an outcome, as far as this arm knows."""
-    closed_count: Count = 0
-    """Number of jobs that this arm knows to be finished or unfinished. A peer with a higher count sends the missing
-    outcomes."""
     open_jobs: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
     """The first jobs without an outcome, by release and name. A peer that knows an outcome, or a missing job, sends
     it."""
@@ -49,7 +46,7 @@ class Bid(msgspec.Struct, frozen=True):
     epoch: str = ""
     """Name of the shift, as in `Clock`; an arm that has none takes that of the first bid."""
     digest: Count = 0
-    """Of the requests of people that this arm knows. A peer with another digest sends those that it knows."""
+    """Of the outcomes of jobs and requests of people that this arm knows. A peer with another digest sends its own."""
 
     def __post_init__(self) -> None:
         finite("Bid", "time_s", (self.time_s,))

@@ -41,9 +41,14 @@ class PastJobs(Container[str]):
         for name, value in iter_unpack("<QQ", packed):
             self._put(name, value)
 
-    def add(self, job: JobSpec, *, finished: bool) -> None:
-        """Add a job that is finished, or given up; the oldest one is dropped if there are too many."""
-        self._put(hash_of(job.name.encode()), _spec_hash(job) | finished)
+    def add(self, job: JobSpec | str, *, finished: bool) -> None:
+        """Add a job that is finished, or given up; the oldest one is dropped if there are too many.
+
+        Args:
+            job: A job, or the name of one of unknown content, which is the same as any other of that name.
+        """
+        name, content = (job, 0) if isinstance(job, str) else (job.name, _spec_hash(job))
+        self._put(hash_of(name.encode()), content | finished)
 
     def __contains__(self, name: object) -> bool:
         return isinstance(name, str) and hash_of(name.encode()) in self._jobs
@@ -58,7 +63,7 @@ class PastJobs(Container[str]):
 
     def is_same(self, job: JobSpec) -> bool:
         """Return whether a job of this name is known, and is this one."""
-        return self._jobs.get(hash_of(job.name.encode()), -1) & ~1 == _spec_hash(job)
+        return self._jobs.get(hash_of(job.name.encode()), -1) & ~1 in (0, _spec_hash(job))
 
     def is_finished(self, name: str) -> bool:
         """Return whether a job of this name is known, and was finished."""

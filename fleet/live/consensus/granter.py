@@ -15,7 +15,7 @@ are on disk, and are applied only then. The rules that make it safe (`fleet.bus.
 - After a crash every grant counts as leased from the restart.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 from fleet.bus.protocol.auction import JobSpec, JobStatus
 from fleet.bus.protocol.consensus import (
@@ -31,7 +31,8 @@ from fleet.bus.protocol.operator import Operation
 from fleet.errors import JournalFull, Refused
 from fleet.job import reason_to_give_up
 from fleet.live.auction.control import job_of
-from fleet.live.auction.job_rules import reason_for_silence
+from fleet.live.auction.job_rules import MAX_OPEN_JOBS, reason_for_silence
+from fleet.live.auction.ledger import MAX_SETTLED
 from fleet.live.auction.round import Timing
 from fleet.live.consensus.operations import is_for
 from fleet.live.consensus.records import Faulted, GrantRecord, JobGranted, JobSettled, Requested
@@ -97,7 +98,7 @@ class Granter:
         for entry in claim.entries:
             reason = self._objection(claim.arm, entry, real_s) or self._grant(claim, entry, real_s)
             if reason:
-                denied.append(DeniedEntry(entry.award, reason, register.settled.get(entry.job)))
+                denied.append(DeniedEntry(entry.award, reason, register.settled.known(entry.job, self.arm)))
             else:
                 may_commit = register.grants[entry.job].may_commit
                 cycles, faults = register.cycles.get(entry.job, 0), register.faults.get(entry.job, {})
@@ -142,7 +143,8 @@ class Granter:
         """
         operations = self.register.operations
         known = operation.request.request in operations.names
-        if is_for(operation, self.roster) and not (known and not operations.is_new(operation)):
+        past = job_of(operation.request) in self.register.past
+        if not past and is_for(operation, self.roster) and not (known and not operations.is_new(operation)):
             self._record([Requested(operation)])
 
     def settle(self, operation: Operation, award: str) -> JobOutcome:
@@ -157,6 +159,15 @@ class Granter:
         outcome = JobOutcome(job, award, operation.auctioneer, "finished", cycles, operation.time_s, reason)
         self._record([JobSettled(outcome)])
         return outcome
+
+    def give_up(self, lost: Mapping[str, str], time_s: float) -> None:
+        """Record jobs as given up for these reasons, so that they can leave.
+
+        Raises:
+            JournalError: they are not on disk, and nothing has changed.
+        """
+        outcomes = (JobOutcome(job, "?", self.arm, "given_up", 0, time_s, reason) for job, reason in lost.items())
+        self._record([JobSettled(outcome) for outcome in outcomes])
 
     def abandon(self, real_s: float) -> None:
         """Record the outcomes of jobs that no arm has, and that are cancelled or in which arms have faulted too often.
@@ -181,7 +192,9 @@ class Granter:
         Raises:
             JournalError: none is on disk.
         """
-        new = tuple(job for job in jobs if job.name not in self.register.jobs)
+        register = self.register
+        new = tuple(job for job in jobs if job.name not in register.jobs and job.name not in register.past)
+        new = new[: max(0, MAX_OPEN_JOBS + MAX_SETTLED - len(register.jobs))]
         self._record([JobsAccepted(new, by)] if new else [])
 
     def begin_epoch(self, epoch: str) -> None:
@@ -276,7 +289,7 @@ class Granter:
 
     def _objection(self, arm: str, entry: ClaimEntry, real_s: float) -> str:
         """Return why a job cannot be granted now, or ""."""
-        if entry.job in self.register.settled:
+        if self.register.is_settled(entry.job):
             return f"'{entry.job}' is settled"
         if entry.award in self.register.operations.redone(entry.job):
             return f"a person has '{entry.job}' done again"

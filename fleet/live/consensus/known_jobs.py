@@ -7,6 +7,7 @@ from msgspec.structs import replace
 from fleet.bus.protocol.auction import JobSpec, JobStatus
 from fleet.bus.protocol.messages import State
 from fleet.live.auction.job_rules import EXPIRED, SHIFT_ENDED, is_late, job_order, lost_jobs, ready_jobs
+from fleet.live.auction.ledger import MAX_SETTLED
 from fleet.live.consensus.control import KnownJob
 from fleet.live.consensus.granter import Granter
 
@@ -29,10 +30,25 @@ class KnownJobs:
 
     def add(self, jobs: Iterable[JobSpec]) -> None:
         """Add jobs that are not known yet."""
-        new = {job.name: job for job in jobs if job.name not in self.submitted}
+        new = {job.name: job for job in jobs if job.name not in self.submitted and job.name not in self._register.past}
         if new:
             self.submitted = {job.name: job for job in sorted((self.submitted | new).values(), key=job_order)}
             self.apply_changes()
+
+    def forget(self, real_s: float, time_s: float) -> None:
+        """Drop the jobs that have left, and have those leave that are given up without a fault, if there are many.
+
+        Raises:
+            JournalError: they are not on disk, and stay.
+        """
+        if len(self.current) > 2 * MAX_SETTLED:
+            waiting = {name: job for name, job in self.current.items() if name not in self._register.settled}
+            lost = self._lost(waiting, real_s, time_s)
+            if len(lost) > MAX_SETTLED:
+                self._granter.give_up(dict(list(lost.items())[: len(lost) - MAX_SETTLED]), time_s)
+        for name in self._register.take_gone():
+            self.submitted.pop(name, None)
+            self.current.pop(name, None)
 
     def apply_changes(self) -> None:
         """Have the jobs follow what people have requested."""
@@ -61,11 +77,8 @@ class KnownJobs:
             and not is_late(job, time_s)
             and paused_until_s.get(name, real_s) <= real_s
         )
-
-        def finished(name: str) -> bool:
-            return name in settled and settled[name].outcome == "finished"
-
-        return ready_jobs(free, time_s, limit, self._granter.busy_stations(real_s), finished, self._register.returned_s)
+        finished, busy = self._register.is_finished, self._granter.busy_stations(real_s)
+        return ready_jobs(free, time_s, limit, busy, finished, self._register.returned_s)
 
     def status(
         self, later: Iterable[JobSpec], states: Mapping[str, State], real_s: float, time_s: float
@@ -102,5 +115,6 @@ class KnownJobs:
         late = (job.name for job in jobs.values() if is_late(job, time_s))
         settled = self._register.settled
         expired = {name for name in late if name not in settled and not self._granter.is_granted(name, real_s)}
-        causes = self._register.given_up | expired
+        past = {name for job in jobs.values() for name in job.after if self._register.past.is_given_up(name)}
+        causes = self._register.given_up | expired | past
         return dict.fromkeys(expired, EXPIRED) | (lost_jobs(jobs.values(), causes) if causes else {})

@@ -277,8 +277,13 @@ class ConsensusNode:
     def _submit(self, submission: Submission) -> SubmissionReply:
         known = {job.name: job for _, job in self._stream} | self.participant.known.submitted
         ended = self.participant.known.ended
+        past = self.participant.granter.register.past
         given_up = {status.job for status in self.statuses() if status.state in ABANDONED}
-        admissions = admit(submission.jobs, known, places=self._membership.places, ended=ended, given_up=given_up)
+        given_up |= {name for job in submission.jobs for name in job.after if past.is_given_up(name)}
+        count, places = len(self.participant.open_jobs(time.monotonic())), self._membership.places
+        admissions = admit(
+            submission.jobs, known, places=places, count=count, ended=ended, given_up=given_up, past=past
+        )
         accepted = tuple(job for job, reply in zip(submission.jobs, admissions, strict=True) if reply.accepted)
         self.participant.granter.add_jobs(tuple(job for job in accepted if job.name not in known), submission.by)
         self.participant.add_jobs(accepted)

@@ -23,7 +23,7 @@ from random import Random
 from fleet.bus.protocol.auction import JobSpec, JobStatus, Quote
 from fleet.bus.protocol.cell import Cell
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply
-from fleet.bus.protocol.messages import MOST_COUNT, State
+from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Controlled, ControlRequest, Operation, Settle
 from fleet.errors import JournalFull
 from fleet.live.arm.node import ArmNode
@@ -35,7 +35,6 @@ from fleet.live.consensus.claimant import NUMBERS_PER_BOOT, Claimant
 from fleet.live.consensus.control import KnownFleet
 from fleet.live.consensus.granter import Granter
 from fleet.live.consensus.known_jobs import KnownJobs
-from fleet.live.consensus.register import Register
 from fleet.live.monitor.snapshot import FRESH_S
 from fleet.live.space import Excludes, no_conflicts
 from fleet.observation import Observation
@@ -47,6 +46,8 @@ QUIET_S = 0.05
 BID_S = 1.0
 """Real seconds between two bids in which only the costs differ."""
 NO_CHOICE = Choice("")
+MAX_PAUSES = 4096
+"""Jobs whose pauses are known, besides those of which one lasts."""
 MAX_OPEN_JOBS = 32
 """Jobs in one bid."""
 
@@ -151,9 +152,9 @@ class Participant:
         """Send a peer outcomes of jobs that it takes for open, and jobs that it does not know."""
         register = self.granter.register
         for job in bid.open_jobs:
-            if job in register.settled:
-                self.claimant.send_outcome(register.settled[job])
-        if bid.closed_count >= register.closed_count and bid.digest == _digest(register):
+            if (outcome := register.settled.known(job, self.name)) is not None:
+                self.claimant.send_outcome(outcome)
+        if bid.digest == register.digest:
             self._behind_s.pop(bid.arm, None)
         elif real_s >= self._behind_s.setdefault(bid.arm, real_s) + 2 * BID_S:
             outcomes = list(register.settled.values())
@@ -197,7 +198,12 @@ class Participant:
         """
         granter, operations, job = self.granter, self.granter.register.operations, job_of(request)
         self.add_jobs(each for each in later if each.name == job)
-        fleet = KnownFleet(granter.register, self.known.steered(job, self.states, real_s, time_s), (), self.known.ended)
+        fleet = KnownFleet(
+            granter.register,
+            self.known.steered(job, self.states, real_s, time_s),
+            granter.register.past,
+            self.known.ended,
+        )
         known = request.request in operations.names
         note = ALREADY_DONE if known else objection(fleet, request, granter.roster)
         if not known:
@@ -232,8 +238,12 @@ class Participant:
             self.out.append(claim)
 
     def _obey(self, real_s: float) -> None:
-        """Stop what people have stopped, as far as it is not in its last cycle."""
+        """Stop what people have stopped, as far as it is not in its last cycle, and forget jobs of long ago."""
         operations = self.granter.register.operations
+        try:
+            self.known.forget(real_s, self._time_s)
+        except JournalFull as error:
+            _LOG.error("Jobs that are given up are not recorded: %s", error)
         if not operations.latest:
             return
         paused, cancelled = operations.is_paused(self.name), operations.all_cancelled
@@ -271,7 +281,7 @@ class Participant:
             self._choice = NO_CHOICE
         open_jobs = self.open_jobs(real_s)
         register, busy = self.granter.register, self.granter.busy_stations(real_s)
-        content = (capacity, names, len(open_jobs), self._choice, busy, dict(register.space), _digest(register))
+        content = (capacity, names, len(open_jobs), self._choice, busy, dict(register.space), register.digest)
         if content == self._last_bid and real_s < self._bid_s + BID_S:
             return
         self._new_bids |= content != self._last_bid
@@ -284,12 +294,11 @@ class Participant:
             capacity=capacity,
             estimates=self._arm.estimate(tuple(ready), register.cycles) if ready else (),
             open_count=len(open_jobs),
-            closed_count=register.closed_count,
             open_jobs=tuple(open_jobs[:MAX_OPEN_JOBS]),
             choice=self._choice.job,
             choice_plan=self._choice.plan,
             epoch=register.epoch,
-            digest=_digest(register),
+            digest=register.digest,
         )
         self.apply_bid(bid, real_s)
         self.out.append(bid)
@@ -358,11 +367,10 @@ class Participant:
         first_s, longest_s = self._timing.pause_s
         count = self._pauses[job] = self._pauses.get(job, 0) + 1
         pause_s = min(longest_s, first_s * 2.0 ** min(count - 1, 10))
+        if len(self._later_s) > MAX_PAUSES:
+            self._later_s = {name: until_s for name, until_s in self._later_s.items() if until_s > real_s}
+            self._pauses = {name: count for name, count in self._pauses.items() if name in self._later_s}
         self._later_s[job] = real_s + pause_s * self._rng.uniform(0.2, 1.0)
-
-
-def _digest(register: Register) -> int:
-    return register.operations.digest % MOST_COUNT
 
 
 def _offered(bid: Bid) -> tuple[bool, frozenset[str]]:

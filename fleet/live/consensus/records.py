@@ -2,7 +2,7 @@
 
 import msgspec
 
-from fleet.bus.protocol.auction import Count, Name
+from fleet.bus.protocol.auction import Count, JobState, Name
 from fleet.bus.protocol.consensus import Faults, JobOutcome
 from fleet.bus.protocol.operator import Operation
 from fleet.live.journal_records import ClockTick, EpochBegun, JobsAccepted, Progress, Released, SpaceCleared, SpaceTaken
@@ -62,8 +62,16 @@ class RequestsKnown(msgspec.Struct, frozen=True, tag="requests_known"):
     names: tuple[str, ...]
 
 
+class PastKnown(msgspec.Struct, frozen=True, tag="past_known"):
+    """Settled jobs that have left, as `PastJobs.packed`, and how many have left, by state."""
+
+    packed: bytes
+    left: dict[JobState, int]
+
+
 GrantRecord = (
-    JobGranted
+    PastKnown
+    | JobGranted
     | Released
     | JobSettled
     | Faulted

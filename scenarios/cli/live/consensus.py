@@ -82,7 +82,8 @@ def serve_until_done(node: ArmNode, stop: Stop) -> bool:
         node.serve(time.monotonic() + TURN_S)
     if stop.is_set():
         return False
-    echo(summary(source.statuses(), node.clock.now_s(time.monotonic())))
+    left = source.participant.granter.register.settled.left
+    echo(summary(source.statuses(), node.clock.now_s(time.monotonic()), left))
     echo(f"This is the view of one arm, after {source.participant.rounds} rounds of allocation.")
     until_s = time.monotonic() + FAREWELL_S
     while not stop.is_set() and time.monotonic() < until_s:

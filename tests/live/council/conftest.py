@@ -21,7 +21,8 @@ from fleet.live.auction.knowledge import LiveFleet
 from fleet.live.auction.round import Timing
 from fleet.live.consensus.granter import Granter
 from fleet.live.consensus.participant import Membership, Participant
-from fleet.live.consensus.register import RANKS, Register
+from fleet.live.consensus.register import Register
+from fleet.live.consensus.settled_jobs import RANKS
 from fleet.live.space import no_conflicts
 from tests.live.disk import Crash, Disk
 
@@ -314,11 +315,14 @@ class Fleet:
             self.run(0.1)
         return None
 
-    def settled(self) -> dict[str, str]:
-        """Return the outcomes that the arms know; the ones that count most."""
+    def settled(self, names=()) -> dict[str, str]:
+        """Return the outcomes that the arms know, of these jobs or of all that have not left: those that count most."""
         outcomes: dict[str, str] = {}
         for arm in self.arms.values():
-            for job, outcome in arm.participant.granter.register.settled.items():
+            settled = arm.participant.granter.register.settled
+            for job in names or settled:
+                if (outcome := settled.known(job, arm.name)) is None:
+                    continue
                 if RANKS.index(outcome.outcome) > RANKS.index(outcomes.setdefault(job, outcome.outcome)):
                     outcomes[job] = outcome.outcome
         return outcomes
