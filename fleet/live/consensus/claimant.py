@@ -110,6 +110,10 @@ class Claimant:
         """Version of the last claim to which each arm has replied."""
         self._version, self._due, self._claimed_s = 1, True, -math.inf
 
+    def count_after(self, number: int) -> None:
+        """Number the next claims as those of the start after the one with this number."""
+        self._number = max(self._number, (number // NUMBERS_PER_BOOT + 1) * NUMBERS_PER_BOOT)
+
     @property
     def capacity(self) -> int:
         """How many more jobs it may request."""

@@ -197,6 +197,17 @@ class Granter:
         new = new[: max(0, MAX_OPEN_JOBS + MAX_SETTLED - len(register.jobs))]
         self._record([JobsAccepted(new, by)] if new else [])
 
+    def adopt(self, records: list[GrantRecord], real_s: float) -> None:
+        """Record what other arms have done and have; what they have counts as leased from now.
+
+        Raises:
+            JournalError: nothing is on disk.
+        """
+        self._record(records)
+        for record in records:
+            if isinstance(record, JobGranted):
+                self.register.grants[record.job].until_s = real_s + self._timing.counted_lease_s
+
     def begin_epoch(self, epoch: str) -> None:
         """Record the name of the shift.
 

@@ -9,7 +9,6 @@ import math
 import secrets
 import time
 from collections import deque
-from collections.abc import Iterable
 from random import Random
 
 from msgspec.structs import replace
@@ -37,10 +36,11 @@ from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, Contr
 from fleet.errors import BusError, Refused
 from fleet.live.arm.auctioneer_client import RateLimitedWarnings
 from fleet.live.arm.node import ArmNode
-from fleet.live.auction.epochs import ask_arms
+from fleet.live.auction.epochs import REPLY_S, ask_arms
 from fleet.live.auction.job_rules import admit, status_reply
 from fleet.live.clock import FleetClock
 from fleet.live.consensus.claimant import NUMBERS_PER_BOOT
+from fleet.live.consensus.epochs import adopted, check_journals, first_number, history_of
 from fleet.live.consensus.granter import Granter
 from fleet.live.consensus.participant import QUIET_S, Membership, Participant
 from fleet.live.consensus.records import GrantRecord
@@ -60,26 +60,6 @@ NOT_YET_S = 1e9
 """Real seconds until the fleet's time would begin if no arm started it: never."""
 
 
-def check_journals(arm: str, boot: int, epoch: str, histories: Iterable[History]) -> None:
-    """Check that the journals of an arm are those that its peers know.
-
-    Raises:
-        BusError: they are lost, older copies, or of another epoch: jobs might be done twice.
-    """
-    for peer in (history for history in histories if history.arm != arm):
-        claimed = peer.claims.get(arm, -1)
-        if claimed >= boot * NUMBERS_PER_BOOT or (claimed >= 0 and peer.epoch and not epoch):
-            reason = f"'{peer.arm}' knows claims of '{arm}' that its journals do not: they are lost, or older copies"
-        elif "" not in (epoch, peer.epoch) and epoch != peer.epoch:
-            reason = f"The journals of '{arm}' are of the epoch '{epoch}', those of '{peer.arm}' of '{peer.epoch}'"
-        else:
-            continue
-        raise BusError(
-            f"{reason}. Jobs could be done twice. Bring the journals back, or stop all arms and start them with new "
-            "journals."
-        )
-
-
 class ConsensusNode:
     """Work source of an arm that allocates jobs together with its peers.
 
@@ -97,11 +77,13 @@ class ConsensusNode:
         journal: Journal[GrantRecord],
         *,
         boot: int,
+        new_epoch: bool = False,
     ) -> None:
         """Join; the arm's client and the journal are open.
 
         Args:
             boot: Number of this start of the arm.
+            new_epoch: Begin even if peers know claims of this arm that its journals do not.
 
         Raises:
             BusError: peers know another epoch, or claims of this arm after those in its journals.
@@ -114,6 +96,8 @@ class ConsensusNode:
         roster = membership.fleet.arms
         timing, excludes = membership.timing, membership.excludes
         granter = Granter(self._name, roster, register, journal.append, real_s=real_s, timing=timing, excludes=excludes)
+        self._first_number, self._new_epoch = first_number(self._name, boot, register), new_epoch
+        boot = self._first_number // NUMBERS_PER_BOOT
         self.participant = Participant(arm, granter, membership, boot=boot, rng=Random(f"{self._name} {boot}"))
         self.participant.add_jobs(register.jobs.values())
         self._stream = deque(membership.stream)
@@ -127,7 +111,11 @@ class ConsensusNode:
         arm.set_clock(FleetClock(self._speed, real_s + NOT_YET_S))
         link, fleet, name = self._link, self._link.fleet, self._name
         link.reply_to(keys.of_arm(fleet, name, "history"), HistoryRequest, self._history)
-        check_journals(name, boot, register.epoch, ask_arms(link))  # before it grants anything
+        self._joined = False
+        """Its peers were asked, when there were any, whether its journals are those that they know."""
+        self._asked_s = -math.inf
+        self._failure: BusError | None = None
+        self._join(ask_arms(link))  # before it grants anything
         self._declare()
 
     # For the arm
@@ -172,7 +160,42 @@ class ConsensusNode:
 
     # Inside
 
+    def _join(self, histories: tuple[History, ...]) -> None:
+        """Check what the peers know, and adopt what this arm has lost.
+
+        Raises:
+            BusError: jobs might be done twice.
+        """
+        granter, number = self.participant.granter, self._first_number
+        check_journals(self._name, number, self._epoch, histories, new_epoch=self._new_epoch)
+        known = max((history.claims.get(self._name, -1) for history in histories), default=-1)
+        if known >= number or (known >= 0 and not self._epoch):
+            _LOG.warning("Arm '%s' adopts what %d arm(s) have done and have.", self._name, len(histories))
+            granter.adopt(adopted(self._name, granter.register, histories), time.monotonic())
+            self.participant.count_after(known)
+
+    def _ask_peers(self, real_s: float) -> None:
+        """Ask all peers what they know, before this arm takes or names an epoch."""
+        if real_s < self._asked_s + REPLY_S:
+            return
+        self._asked_s = real_s
+
+        def done(replies: Replies[History]) -> None:
+            try:
+                self._join(tuple(replies.messages.values()))
+                self._joined = True
+            except Refused as error:
+                self._warn("journal", f"cannot record what its peers know: {error}")
+            except BusError as error:
+                self._failure = error
+
+        self._link.query(
+            keys.of_every_arm(self._link.fleet, "history"), HistoryRequest(), History, done, timeout_s=REPLY_S
+        )
+
     def _step(self, real_s: float) -> None:
+        if self._failure is not None:
+            raise self._failure
         time_s = self._arm.clock.now_s(real_s)
         if not self._begun:
             self._begin(real_s)
@@ -196,6 +219,9 @@ class ConsensusNode:
             self._since_s = real_s
         elif real_s - self._since_s >= (LISTEN_S if present == len(roster) else PATIENCE_S):
             first = self._name == min(self._tokens & roster | {self._name})
+            if not (self._epoch or self._joined):
+                self._ask_peers(real_s)
+                return
             if not (self._epoch or first):  # the first by name names the epoch; its bid begins the fleet's time here
                 return
             if self._take_epoch(self._epoch or secrets.token_hex(4)):
@@ -231,6 +257,9 @@ class ConsensusNode:
         real_s = time.monotonic()
         if arm == self._name or arm not in self.participant.granter.roster:
             return
+        if bid.epoch and not (self._epoch or self._joined):
+            self._ask_peers(real_s)
+            return
         if not self._take_epoch(bid.epoch) and not self._begun:
             return
         if not self._begun or bid.time_s > self._arm.clock.now_s(real_s):
@@ -253,13 +282,13 @@ class ConsensusNode:
         return epoch in ("", self._epoch)
 
     def _history(self, _: HistoryRequest) -> History:
-        return History(self._name, self._epoch, claims=dict(self.participant.granter.register.numbers))
+        return history_of(self._name, self.participant.granter.register, self.participant.known.submitted)
 
     def _apply_token(self, arm: str, present: bool) -> None:
         (self._tokens.add if present else self._tokens.discard)(arm)
 
     def _answer_claim(self, claim: Claim) -> ClaimReply:
-        if claim.arm == self._name:
+        if claim.arm == self._name or not self._begun:
             raise AnotherReplies
         return self.participant.answer_claim(claim, time.monotonic())
 

@@ -131,6 +131,11 @@ class Participant:
         """Add jobs that it does not know yet."""
         self.known.add(jobs)
 
+    def count_after(self, number: int) -> None:
+        """Number the next claims and bids as those of the start after the one with this number."""
+        self.claimant.count_after(number)
+        self._number = max(self._number, (number // NUMBERS_PER_BOOT + 1) * NUMBERS_PER_BOOT)
+
     def set_present(self, present: frozenset[str]) -> None:
         """Set which arms are present."""
         self._present = present & self.granter.roster

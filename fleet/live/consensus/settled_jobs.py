@@ -49,7 +49,7 @@ class SettledJobs(Mapping[str, JobOutcome]):
         return job in self._outcomes
 
     def is_news(self, outcome: JobOutcome) -> bool:
-        """Return whether an outcome counts more than the known one: by its kind, then the earlier one."""
+        """Return whether an outcome counts more than the known one: by its kind, then the later one."""
         known = self._outcomes.get(outcome.job)
         if known is None and outcome.job in self.past:
             return outcome.outcome == "finished" and self.past.is_given_up(outcome.job)
@@ -108,7 +108,7 @@ def is_abandoned(outcome: JobOutcome) -> bool:
 
 
 def _weight(outcome: JobOutcome) -> tuple[int, float]:
-    return RANKS.index(outcome.outcome), -outcome.time_s
+    return RANKS.index(outcome.outcome), outcome.time_s
 
 
 def _hash(outcome: JobOutcome) -> int:

@@ -64,14 +64,16 @@ def refuse_auctioneer(link: BusClient) -> None:
 
 
 @contextmanager
-def work_source(path: Path, membership: Membership) -> Iterator[Callable[[ArmNode, int], ConsensusNode]]:
+def work_source(
+    path: Path, membership: Membership, *, new_epoch: bool = False
+) -> Iterator[Callable[[ArmNode, int], ConsensusNode]]:
     """Factory of an arm's work source, from the arm and its boot number; the journal of its grants is open meanwhile.
 
     Raises:
         FleetError: the journal cannot be used.
     """
     with Journal[GrantRecord](path, GrantRecord) as book:
-        yield lambda arm, boot: ConsensusNode(arm, membership, book, boot=boot)
+        yield lambda arm, boot: ConsensusNode(arm, membership, book, boot=boot, new_epoch=new_epoch)
 
 
 def serve_until_done(node: ArmNode, stop: Stop) -> bool:

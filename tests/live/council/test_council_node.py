@@ -64,7 +64,11 @@ def bus(tmp_path, small):
         operations: list[Operation] = []
         outsider.subscribe(keys.of_every_arm("f", "operation"), Operation, lambda _, each: operations.append(each))
 
-        def arm(name, **membership):
+        def lose_journals(name):
+            for kind in ("journal", "grants"):
+                (tmp_path / f"{name}.{kind}").unlink()
+
+        def arm(name, *, new_epoch=False, **membership):
             own = small.arm(ROSTER.index(name), [small.work(place) for place in PLACES])
             plans = {(work.kind, work.places[0].name): plans for work, plans in own.plans.items()}
             book = stack.enter_context(Journal(tmp_path / f"{name}.journal", ArmRecord))
@@ -83,7 +87,7 @@ def bus(tmp_path, small):
                 Estimator(own.model, lambda work: plans[work.kind, work.places[0].name], PLACES, NominalPeaks()),
                 FleetClock(SPEED, time.monotonic()),
                 ArmConfig(warning_c=60.0, rate_hz=20.0, boot=history.boot),
-                partial(ConsensusNode, membership=member, journal=grants, boot=history.boot),
+                partial(ConsensusNode, membership=member, journal=grants, boot=history.boot, new_epoch=new_epoch),
             )
             arms[name] = SimpleNamespace(node=node, link=link, book=book, grants=grants, work_source=node.work_source)
             return arms[name]
@@ -141,6 +145,7 @@ def bus(tmp_path, small):
             submit=submit,
             statuses=statuses,
             kill=kill,
+            lose_journals=lose_journals,
             finished=finished,
             operations=operations,
             done_by_journals=done_by_journals,
@@ -251,6 +256,39 @@ def test_a_restarted_arm_receives_missed_jobs_and_outcomes(bus):
     assert bus.serve(lambda: settled(bus, "b"))
     back = bus.arm("arm_2").work_source.participant
     assert bus.serve(lambda: "b" in back.granter.register.settled and "c" in back.known.current)
+
+
+def test_an_arm_that_lost_its_journals_does_not_join_unless_a_person_requests_it(bus):
+    for name in ROSTER:
+        bus.arm(name)
+    bus.submit(hold("a"), hold("b", "rack"), hold("long", "shelf", repetitions=2000))
+    assert bus.serve(lambda: settled(bus, "a", "b"))
+    assert bus.serve(lambda: any(one.node.executor.active for one in bus.arms.values()))
+    lost = next(name for name, one in bus.arms.items() if not one.node.executor.active)
+    bus.kill(lost)
+    bus.lose_journals(lost)
+    for name in ROSTER:
+        if name != lost:
+            bus.kill(name)
+    back = bus.arm(lost)  # before the others: it takes part only when it knows what they know
+    for name in ROSTER:
+        if name != lost:
+            bus.arm(name)
+    with pytest.raises(BusError, match=r"knows claims of 'arm_\d'.*2 finished job\(s\).*--new-epoch"):
+        bus.serve(lambda: back.work_source._begun)
+    bus.kill(lost)
+    bus.lose_journals(lost)
+    back = bus.arm(lost, new_epoch=True)
+    register = back.work_source.participant.granter.register
+    assert bus.serve(lambda: back.work_source._begun)
+    assert {"a", "b"} <= register.settled.keys()
+    bus.submit(hold("a"), hold("c"))
+    assert bus.serve(lambda: settled(bus, "c"))
+    bus.kill(lost)
+    bus.arm(lost)  # the same journals again
+    bus.submit(hold("d", "rack"))
+    assert bus.serve(lambda: settled(bus, "d"))
+    assert bus.finished == Counter("abcd")
 
 
 def test_arms_do_not_start_where_an_auctioneer_is_present(bus, token_reaches):
