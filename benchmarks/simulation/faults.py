@@ -209,7 +209,7 @@ def clear(shift: "Shift", arm: str) -> None:
 
 def steer(shift: "Shift") -> None:
     """Have a person cancel, settle or change a job, or pause arms; a person knows what was done."""
-    if shift.alone or not shift.submitter.accepted:
+    if not shift.submitter.accepted:
         return
     job, arm = shift.rng.choice(list(shift.submitter.accepted)), shift.rng.choice([ALL_ARMS, *shift.arms])
     actions: list[Action] = [Cancel(job), Change(job, value=shift.rng.random()), Pause(arm), Resume()]
