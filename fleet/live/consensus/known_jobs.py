@@ -115,6 +115,7 @@ class KnownJobs:
         late = (job.name for job in jobs.values() if is_late(job, time_s))
         settled = self._register.settled
         expired = {name for name in late if name not in settled and not self._granter.is_granted(name, real_s)}
-        past = {name for job in jobs.values() for name in job.after if self._register.past.is_given_up(name)}
+        before = {name for job in jobs.values() for name in job.after if name not in jobs}
+        past = {name for name in before if self._register.past.is_given_up(name)}
         causes = self._register.given_up | expired | past
         return dict.fromkeys(expired, EXPIRED) | (lost_jobs(jobs.values(), causes) if causes else {})
