@@ -105,6 +105,15 @@ def check_overwrite(out: Path, overwrite: bool, what: str = "exists") -> None:
         raise FleetError(f"'{out}' {what}; give another --out, or --overwrite to replace it.")
 
 
+def check_file(out: Path, ending: str, overwrite: bool) -> None:
+    """Raise a FleetError unless `out` has the ending, as `.gif`, is no folder, and is free or may be replaced."""
+    if out.suffix.lower() != ending:
+        raise FleetError(f"--out must end in {ending} (got '{out}').")
+    if out.is_dir():
+        raise FleetError(f"Cannot write to '{out}': it is a folder.")
+    check_overwrite(out, overwrite)
+
+
 def _status(card: Path) -> str | None:
     """The status on a card; None if there is no card or it is not one of ours."""
     try:

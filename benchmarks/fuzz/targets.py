@@ -140,7 +140,7 @@ def journal(data: bytes) -> None:
     path = written("journal", content)
     with (
         suppress(FleetError),
-        Journal(path, kind, sync=lambda file: None, put_aside=lambda record, reason: None) as book,
+        Journal(path, kind, sync=lambda file: None, put_aside=lambda record, reason: ()) as book,
     ):
         records = list(book.records())
         if kind is ArmRecord:

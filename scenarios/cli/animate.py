@@ -17,7 +17,7 @@ from scenarios.cli.terminal import out_console, progress_bar, say
 from scenarios.load import load
 from scenarios.policy_loader import label, policy_at, policy_of
 from scenarios.progress import Progress
-from scenarios.result_folder import check_overwrite, disk_errors
+from scenarios.result_folder import check_file, disk_errors
 from scenarios.schema_errors import choose
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def animate_command(
     stride = _stride(chosen.ticks, every, pixels, seconds)
     policy_of(policy)
     where = out or Path("runs") / f"{chosen.name}-{label(policy)}-{seed}.gif"
-    check_out(where, overwrite=overwrite)
+    check_file(where, ".gif", overwrite)
     from scenarios.report.gif import write_gif
 
     with disk_errors(where):
@@ -65,15 +65,6 @@ def animate_command(
         frames = _frames(chosen, policy, seed, (difficulty, risk), stride, pixels, progress)
         images, length_s = write_gif(file, frames, seconds)
     say(f"Drew {images} frames, {length_s:.1f} s, {where.stat().st_size / 1e6:.1f} MB: {where}.", out_console)
-
-
-def check_out(out: Path, *, overwrite: bool) -> None:
-    """Raise a FleetError unless `out` ends in .gif, is no folder, and is free or may be replaced."""
-    if out.suffix.lower() != ".gif":
-        raise FleetError(f"--out must end in .gif (got '{out}').")
-    if out.is_dir():
-        raise FleetError(f"Cannot write to '{out}': it is a folder.")
-    check_overwrite(out, overwrite)
 
 
 def _size(asked: str) -> "Pixel":

@@ -31,7 +31,7 @@ KINDS: tuple[Kind, ...] = (*MESSAGES, "gaps")
 RECORDING_FORMAT = 5
 CARD, JOURNAL = "recording.json", "open.journal"
 SENSORS = ("q", "qd", "tau", "current_a", "temp_c", "housing_c")
-_COLUMNS = {inspect.IntType: pa.int64(), inspect.FloatType: pa.float64()}
+_COLUMNS = {inspect.IntType: pa.int64(), inspect.FloatType: pa.float64(), inspect.BoolType: pa.bool_()}
 _SORTED_BY: dict[Kind, str] = {"telemetry": "tick", "events": "number", "results": "number", "gaps": "first"}
 _READS = 5
 """Attempts to read a recording between two commits of its recorder."""

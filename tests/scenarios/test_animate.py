@@ -1,10 +1,6 @@
 """The film of a shift: as many frames as asked for, as long as asked for, and of the shift that `run` records."""
 
 import json
-import os
-import subprocess
-import sys
-import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -147,25 +143,11 @@ def test_a_long_shift_gets_about_as_many_frames_as_a_film_has(thermofleet, small
     assert out.stat().st_size < 2e6
 
 
-def test_ctrl_c_leaves_nothing(small_toml, tmp_path, plans):
-    """In a process of its own, where nothing but the command has set what Ctrl-C does."""
-    program = textwrap.dedent("""
-        import signal, sys
-        import scenarios.policy_loader
-        from scenarios.cli.main import main
-
-        class PressingCtrlC:
-            def reset(self, rng): pass
-            def act(self, observations): signal.raise_signal(signal.SIGINT)
-
-        scenarios.policy_loader.policy_of = lambda name: PressingCtrlC()
-        main(sys.argv[1:])
-    """)
-    command = [sys.executable, "-c", program, "animate", small_toml, *QUICK, "--out", tmp_path / "film.gif"]
-    env = {**os.environ, "THERMOFLEET_CACHE": str(plans)}
-    said = subprocess.run(command, env=env, capture_output=True, text=True, timeout=240, check=False)
-    assert said.returncode == 130
-    assert "Interrupted while working: nothing was written." in said.stderr
+def test_ctrl_c_leaves_nothing(thermofleet, small_toml, tmp_path, press_ctrl_c):
+    with press_ctrl_c():
+        said = thermofleet("animate", small_toml, *QUICK, "--out", tmp_path / "film.gif")
+    assert said.code == 130
+    assert said.err.startswith("Interrupted while working: nothing was written.")
     assert [path.name for path in tmp_path.iterdir()] == ["heat.toml"]
 
 

@@ -83,7 +83,8 @@ class ControlRequest(msgspec.Struct, frozen=True):
     """Request to `jobs/control`: change what the fleet does. One that was carried out is not carried out again."""
 
     request: Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
-    """Unique name of this request, for example a UUID; the last 1024 are known, also after a restart."""
+    """Unique name of this request, for example a UUID; the last 1024 are known, also after a restart. The same request
+    again is answered and not carried out; another one of its name is refused."""
     action: Action
     by: Person = ""
     """Who requests it, for journal, events and status."""

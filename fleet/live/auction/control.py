@@ -7,6 +7,7 @@ from fleet.bus.protocol.auction import SETTLED, JobSpec, JobState
 from fleet.bus.protocol.operator import ALL_ARMS, Cancel, Change, ControlRequest, Pause, Resume, Settle
 from fleet.errors import Refused
 from fleet.live.auction.job_rules import changed_spec
+from fleet.live.auction.past_jobs import content_hash
 
 ALREADY_DONE = "This request was carried out before."
 NO_CHANGE = "Nothing changed: it is so already."
@@ -35,11 +36,30 @@ class SteeredFleet(Protocol):
     @property
     def space(self) -> Mapping[str, frozenset[str]]: ...
     @property
+    def aside(self) -> Container[str]: ...
+    @property
+    def requests(self) -> Mapping[str, int]: ...
+    @property
     def ended(self) -> bool: ...
 
     def at_work(self) -> Mapping[str, tuple[str, bool]]:
         """Return the arm that has a job, and whether it has permission to commit, by job."""
         ...
+
+
+def was_carried_out(fleet: SteeredFleet, request: ControlRequest) -> bool:
+    """Return whether this request was carried out before.
+
+    Raises:
+        Refused: another request of this name was.
+    """
+    before = fleet.requests.get(request.request)
+    if before not in (None, 0, content_hash(request)):
+        raise Refused(
+            f"Another request of the name '{request.request}' was carried out before, so this one is not "
+            f"({request.action}). Give each request a name of its own, for example a UUID."
+        )
+    return before is not None
 
 
 def job_of(request: ControlRequest) -> str:
@@ -81,6 +101,10 @@ def _objection_to_job(fleet: SteeredFleet, action: Cancel | Settle | Change) -> 
     if entry is None:
         if action.job in fleet.past:
             return "It was settled long ago."
+        if action.job in fleet.aside:
+            if isinstance(action, Settle):
+                return ""
+            raise Refused(f"'{action.job}' is put aside, and its description is lost: settle it as done or redo.")
         raise Refused(f"There is no job '{action.job}'.")
     state = entry.state
     match action:

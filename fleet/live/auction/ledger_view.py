@@ -6,12 +6,17 @@ from dataclasses import dataclass, field
 
 from fleet.bus.protocol.auction import ABANDONED, SETTLED, Admission, JobSpec, JobState, JobStatus
 from fleet.bus.protocol.operator import ALL_ARMS
-from fleet.live.auction.job_rules import admit, is_late, job_order, ready_jobs
+from fleet.live.auction.job_rules import admit, is_late, job_order, ready_jobs, with_terms
 from fleet.live.auction.past_jobs import PastJobs
 from fleet.live.auction.records import AwardState, Change, Expired, JobEntry
 
 MAX_RECENT = 64
 """Latest changes, published again after a restart for those who missed them."""
+
+
+def reason_of_aside(reason: str) -> str:
+    """Return why a job is unfinished that is put aside."""
+    return f"Put aside, because the journal is wrong about it: {reason}. Settle it as done or redo."
 
 
 @dataclass
@@ -53,8 +58,15 @@ class LedgerView:
 
     paused: dict[str, str] = field(default_factory=dict[str, str])
     """Who paused an arm, by arm; "*" for all arms."""
-    requests: dict[str, None] = field(default_factory=dict[str, None])
-    """Names of the last requests of people that were carried out, oldest first."""
+    requests: dict[str, int] = field(default_factory=dict[str, int])
+    """Hashes of the last requests of people that were carried out, by name, oldest first; 0 for unknown."""
+
+    aside: dict[str, str] = field(default_factory=dict[str, str])
+    """Why jobs are put aside of which only the name is known, by name."""
+    checks: int = 0
+    """Number of the last `Checked` record."""
+    unchecked: set[str] = field(default_factory=set[str], repr=False, compare=False)
+    """Names of the jobs that have changed since."""
 
     def admit(self, jobs: Sequence[JobSpec]) -> tuple[Admission, ...]:
         """Return which submitted jobs can be accepted; changes nothing."""
@@ -63,7 +75,16 @@ class LedgerView:
         given_up = {name for name in named if self.jobs[name].state in ABANDONED}
         given_up |= {name for job in jobs for name in job.after if self.past.is_given_up(name)}
         count = len(self.jobs) - len(self.settled)
-        return admit(jobs, known, places=self.places, count=count, ended=self.ended, given_up=given_up, past=self.past)
+        return admit(
+            jobs,
+            known,
+            places=self.places,
+            count=count,
+            ended=self.ended,
+            given_up=given_up,
+            past=self.past,
+            aside=self.aside,
+        )
 
     def ready(self, time_s: float, limit: int, *, excluded: Container[str] = ()) -> list[JobSpec]:
         """Return the jobs that wait for an arm, as `ready_jobs` does."""
@@ -81,7 +102,9 @@ class LedgerView:
         given up do not wait.
         """
         entry = self.jobs.get(name)
-        return not self.past.is_given_up(name) if entry is None else entry.state == "finished"
+        if entry is None:
+            return name not in self.aside and not self.past.is_given_up(name)
+        return entry.state == "finished"
 
     def expired(self, time_s: float) -> list[Expired]:
         """Return the waiting jobs whose hard due date has passed."""
@@ -95,6 +118,10 @@ class LedgerView:
     def at_work(self) -> Mapping[str, tuple[str, bool]]:
         """Return the arm with an open award of a job, and whether it has permission to commit, by job."""
         return {award.record.job: (award.record.arm, award.may_commit) for award in self.open.values()}
+
+    def pauser_of(self, arm: str) -> str | None:
+        """Return who paused an arm; None if it is not paused."""
+        return self.paused.get(arm, self.paused.get(ALL_ARMS))
 
     def may_begin(self, award: str) -> bool:
         """Return whether cycles of an open award may be begun under a lease."""
@@ -133,15 +160,22 @@ class LedgerView:
 
     def status(self, names: Iterable[str] = ()) -> list[JobStatus]:
         """Return the status of these jobs, without unknown ones; of all jobs if none is named."""
-        wanted = dict.fromkeys(names) or sorted(self.jobs, key=lambda name: job_order(self.jobs[name].spec))
-        return [self.status_of(self.jobs[name]) for name in wanted if name in self.jobs]
+        in_order = [*sorted(self.jobs, key=lambda name: job_order(self.jobs[name].spec)), *self.aside]
+        wanted = dict.fromkeys(names) or in_order
+        return [
+            self.status_of(self.jobs[name])
+            if name in self.jobs
+            else JobStatus(name, "unfinished", reason=reason_of_aside(self.aside[name]))
+            for name in wanted
+            if name in self.jobs or name in self.aside
+        ]
 
     def status_of(self, entry: JobEntry) -> JobStatus:
         """Return the status of a job."""
         assigned = entry.state in ("awarded", "finishing", "finished") or (
             entry.state == "unfinished" and entry.award in self.open
         )
-        award = entry.award if assigned else ""
-        arm = self.awards[award].record.arm if award else ""
-        done = (entry.cycles, entry.finished_s, entry.reason, entry.spec.repetitions)
-        return JobStatus(entry.spec.name, entry.state, arm, award, *done)
+        last, spec = self.awards.get(entry.award), entry.spec
+        arm, award = entry.arm if last is None else last.record.arm, entry.award if assigned else ""
+        done = (entry.cycles, entry.finished_s, entry.reason)
+        return with_terms(JobStatus(spec.name, entry.state, arm, award, *done), spec)

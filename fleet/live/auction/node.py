@@ -104,7 +104,7 @@ class AuctionNode:
         self._timing = timing or Timing()
         self._cell = cell
         self._check_no_auctioneer()
-        ledger = Ledger(places, arms).replay(journal.records())
+        ledger = Ledger(places, arms).replay(journal.records(), journal.put_aside)
         if not (ledger.epoch or new_epoch):
             check_begin(link.fleet, ask_arms(link))
         real_s = time.monotonic()

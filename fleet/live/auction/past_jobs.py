@@ -9,6 +9,8 @@ from collections.abc import Container, Iterator
 from hashlib import blake2b
 from struct import iter_unpack, pack
 
+from msgspec import Struct
+
 from fleet.bus.protocol.auction import JobSpec
 from fleet.bus.protocol.messages import encode
 
@@ -21,9 +23,14 @@ def hash_of(content: bytes) -> int:
     return int.from_bytes(blake2b(content, digest_size=8).digest(), "little")
 
 
+def content_hash(message: Struct) -> int:
+    """Return a hash of the content of a message."""
+    return hash_of(encode(message))
+
+
 def _spec_hash(job: JobSpec) -> int:
     """Hash of a job without the lowest bit, which says whether it was finished."""
-    return hash_of(encode(job)) & ~1
+    return content_hash(job) & ~1
 
 
 class PastJobs(Container[str]):
@@ -49,6 +56,10 @@ class PastJobs(Container[str]):
         """
         name, content = (job, 0) if isinstance(job, str) else (job.name, _spec_hash(job))
         self._put(hash_of(name.encode()), content | finished)
+
+    def add_name(self, name: str, *, finished: bool) -> None:
+        """Add a job of which only the name is known."""
+        self._put(hash_of(name.encode()), int(finished))
 
     def __contains__(self, name: object) -> bool:
         return isinstance(name, str) and hash_of(name.encode()) in self._jobs

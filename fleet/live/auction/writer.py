@@ -48,6 +48,7 @@ class LedgerWriter:
         """
         if not records:
             return
+        records = (*self.ledger.checks_due(), *records)
         self._keep(*records)
         for record in records:
             self.out.extend(map(self._result, self.ledger.apply(record)))

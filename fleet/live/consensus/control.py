@@ -44,6 +44,16 @@ class KnownFleet:
         """Names of the spaces that an arm may take, by arm."""
         return self.register.space
 
+    @property
+    def aside(self) -> Container[str]:
+        """Jobs whose record cannot be read: none."""
+        return ()
+
+    @property
+    def requests(self) -> Mapping[str, int]:
+        """Names of the last requests; their content is not kept."""
+        return dict.fromkeys(self.register.operations.names, 0)
+
     def at_work(self) -> Mapping[str, tuple[str, bool]]:
         """Return the arm that has a job, and whether it has permission to commit, by job."""
         grants = self.register.grants.items()

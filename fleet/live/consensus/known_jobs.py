@@ -6,7 +6,7 @@ from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import JobSpec, JobStatus
 from fleet.bus.protocol.messages import State
-from fleet.live.auction.job_rules import EXPIRED, SHIFT_ENDED, is_late, job_order, lost_jobs, ready_jobs
+from fleet.live.auction.job_rules import EXPIRED, SHIFT_ENDED, is_late, job_order, lost_jobs, ready_jobs, with_terms
 from fleet.live.auction.ledger import MAX_SETTLED
 from fleet.live.consensus.control import KnownJob
 from fleet.live.consensus.granter import Granter
@@ -108,7 +108,7 @@ class KnownJobs:
             status = replace(status, state="unfinished", reason=SHIFT_ENDED)
         state = states.get(status.arm) if status.state in ("awarded", "finishing") else None
         finish_s = state.time_s + state.busy_s if state is not None and state.job == name else None
-        return replace(status, repetitions=0 if job is None else job.repetitions, finish_s=finish_s)
+        return replace(with_terms(status, job), finish_s=finish_s)
 
     def _lost(self, jobs: Mapping[str, JobSpec], real_s: float, time_s: float) -> dict[str, str]:
         """Return why jobs are given up in which no arm has faulted too often: they expired, or wait for one that is."""

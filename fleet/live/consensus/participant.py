@@ -27,7 +27,7 @@ from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Controlled, ControlRequest, Operation, Settle
 from fleet.errors import JournalFull
 from fleet.live.arm.node import ArmNode
-from fleet.live.auction.control import ALREADY_DONE, job_of, next_step, objection
+from fleet.live.auction.control import ALREADY_DONE, job_of, next_step, objection, was_carried_out
 from fleet.live.auction.job_rules import job_order
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.round import Bidding, Choice, Timing, resolve_claims
@@ -209,7 +209,7 @@ class Participant:
             granter.register.past,
             self.known.ended,
         )
-        known = request.request in operations.names
+        known = was_carried_out(fleet, request)
         note = ALREADY_DONE if known else objection(fleet, request, granter.roster)
         if not known:
             operation = fleet.operation(self.name, request, time_s)

@@ -28,12 +28,12 @@ from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
 from fleet.live.arm.body import Body
 from fleet.live.arm.config import ArmConfig
 from fleet.live.arm.estimator import Estimator, NominalPeaks
-from fleet.live.arm.journal_records import ArmHistory, ArmRecord, put_aside
+from fleet.live.arm.journal_records import ArmHistory, ArmRecord
 from fleet.live.arm.node import ArmNode
 from fleet.live.arm.replay_body import ReplayBody, SensorLog
 from fleet.live.clock import FleetClock
 from fleet.live.journal import Journal
-from fleet.live.journal_upkeep import CompactingJournal
+from fleet.live.journal_upkeep import CompactingJournal, put_aside
 from fleet.motion import Plan
 from scenarios.cli.live.journals import folder_of, refuse_other_way
 from scenarios.cli.live.options import (
@@ -107,12 +107,13 @@ def arm_command(
     with progress_bar() as progress:
         simulated = partial(simulated_arm, chosen, name, difficulty, seed, progress, risk=risk)
         arm = replayed_arm(name, file) if file else simulated()
+    # An award that is put aside is not executed again: its lease expires at the auctioneer, which awards the job anew
+    # or, if it had permitted the last cycle, calls it unfinished.
+    aside = put_aside(folder / f"{name}.aside", name)
     with (
         until_stopped() as stop,
         BusClient(endpoint, fleet, stopped=stop.is_set) as link,
-        Journal[ArmRecord](
-            folder / f"{name}.journal", ArmRecord, put_aside=put_aside(folder / f"{name}.aside", name)
-        ) as book,
+        Journal[ArmRecord](folder / f"{name}.journal", ArmRecord, put_aside=aside) as book,
         ExitStack() as resources,
     ):
         wait_for_name(link, name)
@@ -298,7 +299,7 @@ def make_node(
 
 def restart_history(book: Journal[ArmRecord], name: str, time_s: float) -> ArmHistory:
     """History of the arm at this start, written to its journal."""
-    before = ArmHistory().replay(book.records())
+    before = ArmHistory().replay(book.records(), book.put_aside)
     for active in before.active.values():
         log.warning("'%s' was unfinished at the last exit of the arm: returned.", active.job)
     history = before.after_restart(name, time_s)
