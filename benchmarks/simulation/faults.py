@@ -209,7 +209,7 @@ def clear(shift: "Shift", arm: str) -> None:
 
 def steer(shift: "Shift") -> None:
     """Have a person cancel, settle or change a job, or pause arms; a person knows what was done."""
-    if shift.alone or not shift.submitter.accepted:
+    if not shift.submitter.accepted:
         return
     node: Any = shift.node(AUCTIONEER)
     entries = {} if node is None else node.auctioneer.ledger.jobs

@@ -260,9 +260,13 @@ class Shift:
             return states | {each.job: each.state for each in auctioneer.status()}
         states = {}
         for name in self.arms:
-            for each in self.node(name).work_source.statuses():
-                if states.setdefault(each.job, each.state) in ("waiting", "given_up", "unfinished"):
-                    states[each.job] = each.state
+            known = {each.job: each.state for each in self.node(name).work_source.statuses()}
+            past = self.node(name).work_source.participant.granter.register.past
+            left = [job for job in self.submitter.accepted if job in past and job not in known]
+            known |= {job: "finished" if past.is_finished(job) else "given_up" for job in left}
+            for job, state in known.items():
+                if states.setdefault(job, state) in ("waiting", "unfinished", *ABANDONED):
+                    states[job] = state
         return states
 
     def _open(self) -> list[str]:
@@ -290,12 +294,18 @@ class Shift:
             if before in self.submitter.accepted
         )
 
+    def _is_paused(self) -> bool:
+        if not self.alone:
+            return (node := self.node(AUCTIONEER)) is not None and bool(node.auctioneer.ledger.paused)
+        nodes = (node for name in self.arms if (node := self.node(name)) is not None)
+        return any(node.work_source.participant.granter.register.operations.paused for node in nodes)
+
     def _settle(self) -> None:
         deadline_s = self.world.now_s + SETTLE_S + 3.0 * self.work_s
         while self._open():
             if self.world.now_s > deadline_s:
                 raise Violation(f"No end after {self.world.now_s:.0f} s: {'; '.join(self._open()[:4])}.")
-            if not self.alone and (node := self.node(AUCTIONEER)) is not None and node.auctioneer.ledger.paused:
+            if self._is_paused():
                 request(self, Resume())
             self.world.run(self.world.now_s + CHECK_S)
         self.unsure |= {job for builder in self.builders.values() for job in builder.unsure}

@@ -122,6 +122,10 @@ class LedgerView:
         """Return whether an arm gets no jobs."""
         return arm in self.paused or ALL_ARMS in self.paused
 
+    def at_work(self) -> Mapping[str, tuple[str, bool]]:
+        """Return the arm with an open award of a job, and whether it has permission to commit, by job."""
+        return {award.record.job: (award.record.arm, award.may_commit) for award in self.open.values()}
+
     def pauser_of(self, arm: str) -> str | None:
         """Return who paused an arm; None if it is not paused."""
         return self.paused.get(arm, self.paused.get(ALL_ARMS))

@@ -42,6 +42,7 @@ from scenarios.cli.live.options import (
     JobsOption,
     JournalOption,
     ModelOption,
+    NewEpochOption,
     RateOption,
     ScenarioFleetOption,
     SeedOption,
@@ -89,6 +90,7 @@ def arm_command(
     jobs: JobsOption = "scenario",
     endpoint: EndpointOption = ENDPOINT,
     fleet: ScenarioFleetOption = "",
+    new_epoch: NewEpochOption = False,
 ) -> None:
     """Run one arm of a fleet: publish its state, quote and execute jobs, and report, until Ctrl-C or SIGTERM."""
     from scenarios.cli.live import consensus
@@ -98,8 +100,10 @@ def arm_command(
         given = f"{source} {file or ''}".strip()
         raise FleetError(f"--source must be sim, or log with a FILE after the arm's name (got {given}).")
     _check_policy(policy, file)
+    if new_epoch and not policy:
+        raise FleetError("--new-epoch is for an arm with --policy, or for thermofleet auction: leave it out.")
     fleet, folder = folder_of(journal, fleet, chosen)
-    refuse_other_way(folder, (name,), alone=bool(policy))
+    refuse_other_way(folder, (name,), alone=bool(policy), new_epoch=new_epoch)
     with progress_bar() as progress:
         simulated = partial(simulated_arm, chosen, name, difficulty, seed, progress, risk=risk)
         arm = replayed_arm(name, file) if file else simulated()
@@ -117,7 +121,9 @@ def arm_command(
         if policy:
             consensus.refuse_auctioneer(link)
             membership = consensus.membership_of(chosen, name, policy, jobs=jobs, seed=seed)
-            work_source = resources.enter_context(consensus.work_source(folder / f"{name}.grants", membership))
+            work_source = resources.enter_context(
+                consensus.work_source(folder / f"{name}.grants", membership, new_epoch=new_epoch)
+            )
         node = make_node(
             link, book, arm, chosen, speed=speed, rate_hz=rate_hz, capacity=capacity, work_source=work_source
         )
