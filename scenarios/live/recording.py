@@ -32,7 +32,12 @@ KINDS: tuple[Kind, ...] = (*MESSAGES, "gaps")
 RECORDING_FORMAT = 6
 CARD, JOURNAL = "recording.json", "open.journal"
 SENSORS = ("q", "qd", "tau", "current_a", "temp_c", "housing_c")
-_COLUMNS = {inspect.IntType: pa.int64(), inspect.FloatType: pa.float64(), inspect.BoolType: pa.bool_()}
+_COLUMNS = {
+    inspect.IntType: pa.int64(),
+    inspect.FloatType: pa.float64(),
+    inspect.BoolType: pa.bool_(),
+    inspect.VarTupleType: pa.list_(pa.string()),
+}
 _SORTED_BY: dict[Kind, str] = {"telemetry": "tick", "gaps": "first"}
 """Besides the time; `number` for the other kinds."""
 _READS = 5
