@@ -88,6 +88,10 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
     """The most recently changed last."""
     space: dict[str, tuple[str, ...]] = {}
     """Names of the spaces that are closed to others, by arm, as the last status reply has them."""
+    paused: dict[str, str] = {}
+    """Who paused an arm, by arm, as the last status reply has it; "*" for all arms."""
+    speed: float | None = None
+    """Fleet seconds per real second."""
 
 
 @dataclass
@@ -128,6 +132,7 @@ class FleetView:
     _arms: "Recent[str, _Arm]" = field(default_factory=lambda: Recent(MAX_NAMES))
     _auctioneers: "Recent[str, _Auctioneer]" = field(default_factory=lambda: Recent(MAX_NAMES))
     _space: dict[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
+    _paused: dict[str, str] = field(default_factory=dict[str, str])
     _jobs: "Recent[str, _Job]" = field(default_factory=lambda: Recent(MAX_JOBS))
 
     def set_token(self, role: Role, name: str, present: bool) -> bool:
@@ -153,7 +158,8 @@ class FleetView:
                 self._jobs.clear()
             for job in self._jobs.values():
                 job.number = 0
-        auctioneer.heard_s, auctioneer.time_s, self._space = now_s, reply.time_s, dict(reply.space)
+        auctioneer.heard_s, auctioneer.time_s = now_s, reply.time_s
+        self._space, self._paused = dict(reply.space), dict(reply.paused)
         for status in reply.jobs:
             self._set_status(status, now_s)
 
@@ -183,6 +189,8 @@ class FleetView:
             counts=dict(Counter(status.state for status in statuses)),
             jobs=tuple(statuses[-jobs:]) if jobs > 0 else (),
             space=self._space,
+            paused=self._paused,
+            speed=self.speed,
         )
 
     def _arm(self, name: str) -> _Arm:

@@ -1,4 +1,4 @@
-"""`thermofleet gateway`: the bus over HTTP and server-sent events, for clients without Zenoh."""
+"""`thermofleet gateway` and `dashboard`: the bus over HTTP and server-sent events, and a page for browsers."""
 
 import asyncio
 import ipaddress
@@ -9,7 +9,7 @@ import socket
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 import uvicorn
@@ -17,46 +17,92 @@ from starlette.applications import Starlette
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from fleet.bus.client.client import BusClient
+from fleet.env.render.heat import heat_scale
 from fleet.errors import FleetError
 from fleet.live.monitor.async_bridge import AsyncBridge
+from fleet.live.supervisor import exit_with_supervisor
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, number, the_fleet
 from scenarios.cli.terminal import Interrupted, echo
 from scenarios.live.http_access import MIN_TOKEN, ROLES, Role, check_token, read_tokens
 from scenarios.live.http_app import STUCK_S, Readers, application
+from scenarios.live.http_page import LivePage
+from scenarios.load import load
+from scenarios.schema import Scenario
 
 TOKEN = "THERMOFLEET_TOKEN"
+PORT = 8080
 MAX_CONNECTIONS, MAX_WAITING, HEADER_S = 1000, 128, 5.0
 """Connections at a time; those that have sent no complete request yet, of which one more ends the oldest; and real
 seconds after which such a connection ends."""
 _LOG = logging.getLogger(__name__)
+PortOption = Annotated[int, number("TCP port of the gateway; 0 takes a free one.", 0, 65535)]
+HostOption = Annotated[str, typer.Option(help="Listening address; beyond loopback only with a token.")]
+TokenOption = Annotated[
+    str,
+    typer.Option(
+        envvar=TOKEN, help="Bearer token for all requests. Prefer the variable: other users can read command lines."
+    ),
+]
+TokensOption = Annotated[
+    Path | None,
+    typer.Option(
+        help=f"File with ROLE TOKEN in each line, readable by you alone. Roles: {', '.join(ROLES)}; each may do "
+        "what the ones before it may."
+    ),
+]
 
 
 def gateway_command(
     endpoint: EndpointOption = ENDPOINT,
     fleet: FleetOption = "",
-    port: Annotated[int, number("TCP port of the gateway; 0 takes a free one.", 0, 65535)] = 8080,
-    host: Annotated[str, typer.Option(help="Listening address; beyond loopback only with a token.")] = "127.0.0.1",
-    token: Annotated[
-        str,
-        typer.Option(
-            envvar=TOKEN,
-            help="Bearer token for all requests. Prefer the variable: other users can read command lines.",
-        ),
-    ] = "",
-    tokens: Annotated[
-        Path | None,
-        typer.Option(
-            help=f"File with ROLE TOKEN in each line, readable by you alone. Roles: {', '.join(ROLES)}; each may do "
-            "what the ones before it may."
-        ),
-    ] = None,
+    port: PortOption = PORT,
+    host: HostOption = "127.0.0.1",
+    token: TokenOption = "",
+    tokens: TokensOption = None,
 ) -> None:
     """Serve the fleet over HTTP until Ctrl-C or SIGTERM."""
+    run(endpoint, fleet, port, host, token, tokens)
+
+
+def dashboard_command(
+    scenario: Annotated[
+        str,
+        typer.Argument(help="Scenario of the cell, to draw its fixtures too. Default: as the auctioneer describes it."),
+    ] = "",
+    endpoint: EndpointOption = ENDPOINT,
+    fleet: FleetOption = "",
+    port: PortOption = PORT,
+    host: HostOption = "127.0.0.1",
+    token: TokenOption = "",
+    tokens: TokensOption = None,
+) -> None:
+    """Serve a live page for browsers, until Ctrl-C or SIGTERM.
+
+    It is a gateway with a page: arms in 3-D, temperatures, jobs, offers,
+    alerts, and what the role of a token may request.
+    """
+    run(endpoint, fleet, port, host, token, tokens, LivePage(scene_of(load(scenario)) if scenario else None))
+
+
+def scene_of(scenario: Scenario) -> dict[str, Any]:  # values of JSON
+    """The cell of a scenario as the page draws it."""
+    from fleet.physics.cell_model import cell_model  # loads MuJoCo
+
+    limits, robots = scenario.limits, [arm.robot() for arm in scenario.arms]
+    heat = heat_scale(limits.warning_c, limits.error_c)
+    return {**cell_model(robots, scenario.places, scenario.fixtures), "heat": heat}
+
+
+def run(
+    endpoint: str, fleet: str, port: int, host: str, token: str, tokens: Path | None, page: LivePage | None = None
+) -> None:
+    """Serve until a signal arrives; the arguments are the options of the commands."""
+    exit_with_supervisor()
     roles = read_tokens(tokens) if tokens else {}
     if token:
         roles[check_token(token)] = "operator"
     check(host, endpoint, bool(roles))
-    if asyncio.run(serve(endpoint, the_fleet(fleet, endpoint), host, port, roles)) == signal.SIGINT:
+    if asyncio.run(serve(endpoint, the_fleet(fleet, endpoint), host, port, roles, page)) == signal.SIGINT:
         raise Interrupted("The gateway was interrupted.")
 
 
@@ -162,12 +208,14 @@ def _protocol() -> type[H11Protocol]:
     return Protocol
 
 
-async def serve(endpoint: str, fleet: str, host: str, port: int, tokens: Mapping[str, Role]) -> int:
+async def serve(
+    endpoint: str, fleet: str, host: str, port: int, tokens: Mapping[str, Role], page: LivePage | None = None
+) -> int:
     """Serve until a signal arrives; return its number."""
     readers, received = Readers(), [0]
     with listen(host, port, STUCK_S) as bound, BusClient(endpoint, fleet) as link:
         async with AsyncBridge(link, readers.put) as bridge:
-            server = Server(application(bridge, readers, tokens=tokens), readers)
+            server = Server(application(bridge, readers, tokens=tokens, page=page), readers)
 
             def stop(number: int) -> None:
                 received[0], server.should_exit = number, True
@@ -176,6 +224,7 @@ async def serve(endpoint: str, fleet: str, host: str, port: int, tokens: Mapping
                 asyncio.get_running_loop().add_signal_handler(number, stop, number)
             address, bound_port, *_ = bound.getsockname()
             shown = f"[{address}]" if ":" in address else address
-            echo(f"ready gateway http://{shown}:{bound_port}/v4 {os.getpid()}")
+            kind, path = ("gateway", "/v4") if page is None else ("page", "/")
+            echo(f"ready {kind} http://{shown}:{bound_port}{path} {os.getpid()}")
             await server.serve(sockets=[bound])
     return received[0]
