@@ -1,6 +1,7 @@
 """The live page: its files, as browsers load them, and the cell in three dimensions as it draws it.
 
-Nobody needs a token for the files, which say nothing about a fleet; the page asks for one and sends it with each request.
+Nobody needs a token for the files, which say nothing about a fleet; the page asks for one and sends it with each
+request.
 """
 
 import asyncio
@@ -14,7 +15,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.types import Scope
 
-from fleet.bus.protocol.cell import Cell
+from fleet.bus.protocol.cell import Cell, Point
 from fleet.env.render.heat import heat_scale
 from fleet.job import Place
 from fleet.live.monitor.async_bridge import NoReply
@@ -41,7 +42,8 @@ class LivePage:
 
     def __init__(self, model: Mapping[str, Any] | None = None) -> None:
         """Prepare; without a model the cell is drawn as the auctioneer describes it, without fixtures."""
-        self._model, self._cell, self._given = model, None, model is not None
+        self._given, self._model = model is not None, model
+        self._cell: Cell | None = None
 
     async def scene(self, ask_cell: Callable[[], Awaitable[Cell]]) -> Mapping[str, Any]:
         """The cell in three dimensions; raises NoReply if nobody describes it, or with wrong numbers."""
@@ -87,9 +89,17 @@ def is_public(scope: Scope) -> bool:
 def _model_of(cell: Cell) -> Mapping[str, Any]:
     from fleet.physics.cell_model import cell_model  # loads MuJoCo
 
-    robots = [Robot(name=arm.name, mount=Mount(position_m=arm.position_m, tilt_deg=arm.tilt_deg)) for arm in cell.arms]
+    robots = [
+        Robot(name=arm.name, mount=Mount(position_m=_xyz(arm.position_m), tilt_deg=_xyz(arm.tilt_deg)))
+        for arm in cell.arms
+    ]
     places = [
-        Place(name=place.name, position_m=place.position_m, tool_deg=place.tool_deg, retreat_m=place.retreat_m)
+        Place(name=place.name, position_m=_xyz(place.position_m), tool_deg=_xyz(place.tool_deg))
         for place in cell.places
     ]
     return {**cell_model(robots, places), "heat": heat_scale(cell.warning_c, cell.error_c)}
+
+
+def _xyz(point: Point) -> tuple[float, float, float]:
+    x, y, z = point
+    return x, y, z

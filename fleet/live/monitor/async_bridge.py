@@ -80,9 +80,7 @@ class AsyncBridge:
         """Send another request to the auctioneer. Raises NoReply if it did not reply, or refused."""
         return await self._ask_auctioneer(keys.of_jobs(self._link.fleet, topic), request, kind)
 
-    async def request_of_arm(
-        self, arm: str, topic: keys.ArmTopic, request: msgspec.Struct, kind: type[Reply]
-    ) -> Reply:
+    async def request_of_arm(self, arm: str, topic: keys.ArmTopic, request: msgspec.Struct, kind: type[Reply]) -> Reply:
         """Send a request to an arm. Raises NoReply if it did not reply, or refused."""
         return _only(await self._ask(keys.of_arm(self._link.fleet, arm, topic), request, kind, REPLY_S), f"arm '{arm}'")
 

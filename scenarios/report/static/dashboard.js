@@ -4,7 +4,7 @@
 const FRESH_S = 3, DRAW_MS = 60, TABLES_MS = 250, POLL_MS = 2000, MOST_JOBS = 300, MOST_ROWS = 60, MOST_NOTES = 300, MOST_AWARDS = 20;
 const MODES = { idle: "○ idle", working: "▶ working", faulted: "✖ faulted" };
 const STATES = {
-  waiting: "… waiting", awarded: "▶ awarded", finishing: "▶▌finishing", finished: "✔ finished", unfinished: "? unfinished",
+  waiting: "… waiting", awarded: "▶ awarded", finishing: "▶ finishing", finished: "✔ finished", unfinished: "? unfinished",
   given_up: "✖ given up", cancelled: "⊘ cancelled",
 };
 
@@ -205,7 +205,7 @@ function startPage() {
     }
     const pause = fleet.paused["*"] !== undefined ? "*" : fleet.paused[arm.name] !== undefined ? arm.name : "";
     const word = here ? MODES[state.mode] : "◌ absent";
-    setText(mode, pause ? `${word}, ⏸ paused` : word);
+    setText(mode, pause ? `${word}, ❚❚ paused` : word);
     setClass(row, here ? state.mode : "absent");
     const temps = state ? state.temp_c : [], tempC = Math.max(...temps), of = state && fleet.jobs.get(state.job);
     const [bar, text] = hot.children;
@@ -227,7 +227,7 @@ function startPage() {
     const wanted = [];
     if (actions.may("operator")) {
       if (pause !== "*") wanted.push(pause ? { text: "▶ Resume", label: `Resume ${arm.name}`, act: () => actions.resume(arm.name) }
-        : { text: "⏸ Pause", label: `Pause ${arm.name}`, act: () => actions.pause(arm.name) });
+        : { text: "❚❚ Pause", label: `Pause ${arm.name}`, act: () => actions.pause(arm.name) });
       if (here && state.mode === "faulted") wanted.push({ text: "Reset", label: `Reset ${arm.name}`, act: () => actions.reset(arm.name) });
       if (!arm.token) wanted.push({ text: "Free its space", label: `Free the space of ${arm.name}`, act: () => actions.clear(arm.name) });
     }
@@ -280,7 +280,7 @@ function startPage() {
     if (unfinished) add(`unfinished/${unfinished}`, "warning", `${unfinished} job(s) unfinished: look at the cell, then settle each as done or redo.`);
     if (fleet.counts.given_up) add(`given/${fleet.counts.given_up}`, "warning", `${fleet.counts.given_up} job(s) given up.`);
     if (!list.length) add("none", "none", connected ? "None." : "Unknown while the gateway does not answer.");
-    const words = { fault: "✖ Fault: ", warning: "▲ Warning: ", pause: "⏸ ", none: "" }, place = element("alert-list");
+    const words = { fault: "✖ Fault: ", warning: "▲ Warning: ", pause: "❚❚ ", none: "" }, place = element("alert-list");
     const known = new Map([...place.children].map((item) => [item.dataset.key, item]));
     for (const [key, item] of known) if (!list.some(([one]) => one === key)) item.remove();
     for (const [key, kind, text] of list) if (!known.has(key)) place.append(make("li", { class: kind, "data-key": key }, make("b", {}, words[kind]), visible(text)));
