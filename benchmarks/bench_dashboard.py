@@ -18,6 +18,7 @@ import tempfile
 import threading
 import time
 import urllib.request
+from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -173,7 +174,7 @@ def measure(address: str, server: int, options: argparse.Namespace) -> dict[str,
     return rates(readers, server, options.seconds, lambda: pause.wait(options.seconds))
 
 
-def rates(readers: list[Reader], server: int, seconds: float, wait) -> dict[str, float]:  # noqa: ANN001
+def rates(readers: list[Reader], server: int, seconds: float, wait: Callable[[], object]) -> dict[str, float]:
     """Figures of the server while `wait` runs."""
     counts, octets = [reader.count for reader in readers], sum(reader.octets for reader in readers)
     start_s, start_core_s = time.monotonic(), core_s(server)
