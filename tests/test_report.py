@@ -272,12 +272,22 @@ def test_a_short_spike_of_a_long_shift_is_drawn() -> None:
     assert x[y.argmax()] == pytest.approx(readings.time_s[12_345] / 3600)
 
 
-def test_a_large_fleet_gets_fewer_points_per_motor() -> None:
+def test_a_large_fleet_gets_a_heat_map_and_lanes_of_its_hottest_arms() -> None:
     arms = tuple(f"arm_{i}" for i in range(64))
-    shown = figure(schedule((), arms, 7200.0), telemetry(7200, 64), (), arms, warning_c=60.0, error_c=75.0)
-    points = [len(base64.b64decode(t["x"]["bdata"])) // 4 for t in shown["data"] if t["type"] == "scatter"]
-    assert len(points) == 64 * 7
-    assert sum(points) <= 250_000
+    readings = telemetry(7200, 64)
+    readings.temp_c[:] = np.minimum(readings.temp_c, 79.0)
+    readings.temp_c[3000, 41, 5] = 88.0
+    shown = figure(schedule((), arms, 7200.0), readings, (), arms, warning_c=60.0, error_c=75.0)
+    lines = [t for t in shown["data"] if t["type"] == "scatter"]
+    assert len(lines) == 5 * 7
+    assert "arm_41 joint 1" in lines[0]["hovertemplate"]
+    (heat,) = [t for t in shown["data"] if t["type"] == "heatmap"]
+    rows, columns = map(int, heat["z"]["shape"].split(","))
+    cells = np.frombuffer(base64.b64decode(heat["z"]["bdata"]), np.uint8).reshape(rows, columns)
+    assert rows == len(arms)
+    assert np.unravel_index(cells.argmax(), cells.shape)[0] == 41
+    assert 20.0 + cells.max() / 2 == pytest.approx(85.0, abs=3.1)  # the scale ends 10 K above the limit
+    go.Figure(shown)
 
 
 @pytest.mark.parametrize(("job", "stream"), [("sort_parts-001", "sort_parts"), ("a-b-2", "a-b"), ("lonely", "lonely")])

@@ -45,7 +45,7 @@ def choices(offers: Sequence[Offer], arms: Sequence[str]) -> list[str]:
     return [
         f"<details><summary>Why each arm got its job: the offers behind {len(awards)} awards</summary>",
         paragraph(NOTE + (left if len(awards) > MOST_AWARDS else ""), "faint"),
-        table(head, rows, moments=moments),
+        table(head, rows, moments=moments, key="choices"),
         "</details>",
     ]
 

@@ -118,7 +118,7 @@ def html_page(
     scripts = "\n".join(parts)
     if parts:
         start = "start().catch((error)=>{document.title+=' (incomplete)';console.error(error);});"
-        code = [_source(name) for name in ("unpack.js", *(("cell.js", "replay.js") if replay else ()))]
+        code = [_source(name) for name in ("unpack.js", "figure.js", *(("cell.js", "replay.js") if replay else ()))]
         scripts += f"\n<script>{''.join(code)}\n{_start(figure is not None, replay)}\n{start}</script>\n"
     policy = f"script-src 'unsafe-inline'; {_POLICY}" if parts else _POLICY
     return (
@@ -148,15 +148,8 @@ def _replay_parts(replay: Replay) -> list[str]:
 
 def _start(figure: bool, replay: Replay | None) -> str:
     """The function that begins a page, after everything that it needs."""
-    draw = play = ""
-    if figure:
-        draw = (
-            'await runLibrary("plotly");const drawn=JSON.parse(document.getElementById("drawn").textContent);'
-            f'await Plotly.newPlot("figure",drawn.data,drawn.layout,{json.dumps(_PLOTLY_OPTIONS)});'
-        )
-    if replay:
-        place = 'document.getElementById("figure")' if figure else "null"
-        play = f'await runLibrary("three");await startReplay({place},{replay.unit_s});'
+    draw = f"const figure=await drawFigure({json.dumps(_PLOTLY_OPTIONS)});" if figure else "const figure=null;"
+    play = f'await runLibrary("three");await startReplay(figure,{replay.unit_s});' if replay else ""
     return f"async function start(){{{draw}{play}}}"
 
 
@@ -185,6 +178,7 @@ def replay_place() -> str:
         '<button id="play" type="button" aria-label="play">▶</button>'
         '<input id="time" type="range" min="0" max="1" value="0" aria-label="time of the shift">'
         f'<output id="clock">0:00:00</output><select id="speed" aria-label="speed">{speeds}</select>'
+        '<select id="arm" aria-label="arm to look at"><option value="-1">all arms</option></select>'
         "</div></section>"
     )
 
@@ -216,12 +210,14 @@ def table(
     style: str = "",
     kinds: Sequence[str] = (),
     moments: Sequence[Moment] = (),
+    key: str = "",
 ) -> str:
     """A table of plain text.
 
     Args:
         kinds: A class of the style sheet for each row; none by default.
         moments: Of each row; a click on a row goes there in the page's replay.
+        key: With one, a field above the table filters its rows.
     """
     lines = []
     for i, row in enumerate(rows):
@@ -232,7 +228,13 @@ def table(
     above = f"<caption>{escape(caption)}</caption>" if caption else ""
     if head:
         above += f"<thead><tr>{''.join(f'<th>{escape(cell)}</th>' for cell in head)}</tr></thead>"
-    return f'<div class="wide"><table class="{style}">{above}<tbody>{"".join(lines)}</tbody></table></div>'
+    field = (
+        f'<input class="filter" data-table="{key}" placeholder="filter: arm, job, …" aria-label="filter rows">'
+        if key
+        else ""
+    )
+    mark = f' id="{key}"' if key else ""
+    return f'{field}<div class="wide"><table{mark} class="{style}">{above}<tbody>{"".join(lines)}</tbody></table></div>'
 
 
 def escape(text: str) -> str:

@@ -160,6 +160,7 @@ def _event_table(events: Sequence[Event]) -> list[str]:
             head,
             rows,
             style="events",
+            key="events",
             kinds=[e.kind for e in listed],
             moments=[Moment(max(0.0, e.time_s - BEFORE_S), e.arm) for e in listed],
         ),

@@ -9,6 +9,7 @@ from typing import Any  # values of Plotly's schema
 
 import numpy as np
 
+from fleet.env.render.heat import HEAT, heat_marks
 from fleet.events import Event
 from fleet.robot import JOINTS
 from fleet.telemetry import Telemetry
@@ -21,6 +22,10 @@ POINTS_PER_TRACE = 2000
 POINTS_IN_ALL = 250_000
 """Browsers are slow above this; large fleets get fewer points per trace."""
 FEWEST_POINTS = 200
+MOST_LANES, HOTTEST = 16, 5
+"""Fleets of more arms than `MOST_LANES` get a heat map, and lanes of their `HOTTEST` arms."""
+HEAT_BINS = 1440
+"""Columns of the heat map."""
 
 GRID, FRAME = "#e6e6e6", "#bbbbbb"
 JOINT_COLOURS = ("#332288", "#cc6677", "#117733", "#88ccee", "#aa4499", "#999933", "#44aa99")
@@ -31,7 +36,8 @@ NARROW_PX = 860
 LEGEND_ROW_PX = 20.0
 NAME_PX = 20.0
 """Height of the name of an arm above its lane."""
-GAP_PX = 150.0
+MAP_GAP_PX = 90.0
+GAP_PX = 172.0
 """Height between the two blocks, for an axis, a title and a legend."""
 BETWEEN_LANES_PX = 28.0
 
@@ -74,34 +80,95 @@ def figure(
     """
     unit, unit_s = time_unit(plan.horizon_s)
     bars = gantt(plan, events, arms, unit_s)
+    lanes = lanes_of(telemetry, len(arms))
+    overview = len(lanes) < len(arms)
     time = AXIS | {
         "range": [0, max(plan.horizon_s / unit_s, 1e-3)],
         "title": {"text": f"time ({unit})", "standoff": 6},
         "domain": [0, 1],
     }
     limits = (("error", error_c, FAULT, "bottom", "solid"), ("warning", warning_c, WARNING, "top", "dash"))
-    layout = LAYOUT | _blocks(arms, _legend_height(bars))
+    layout = LAYOUT | _blocks(arms, lanes, _legend_height(bars))
     layout["xaxis"] = time | {"anchor": "y"}
-    layout["xaxis2"] = time | {"anchor": f"y{len(arms) + 1}", "matches": "x"}
+    layout["xaxis2"] = time | {"anchor": f"y{len(lanes) + 1}", "matches": "x"}
     temperature = AXIS | {
         "range": _temperature_range(telemetry.temp_c, warning_c, error_c),
         "title": {"text": "°C", "standoff": 8},
         "anchor": "x2",
         "nticks": 6,
     }
-    for a in range(len(arms)):
-        layout[f"yaxis{a + 2}"] = temperature | layout[f"yaxis{a + 2}"] | ({"matches": "y2"} if a else {})
-        layout["annotations"] += [_limit_label(a, *limit[:4]) for limit in limits]
+    for lane in range(len(lanes)):
+        layout[f"yaxis{lane + 2}"] = temperature | layout[f"yaxis{lane + 2}"] | ({"matches": "y2"} if lane else {})
+        layout["annotations"] += [_limit_label(lane, *limit[:4]) for limit in limits]
     layout["shapes"] = [
         *(
             {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "yref": f"y{a + 2}", "y0": limit, "y1": limit}
             | {"line": {"color": colour, "width": 1, "dash": dash}}
-            for a in range(len(arms))
+            for a in range(len(lanes))
             for _, limit, colour, _, dash in reversed(limits)
         ),
-        *_outages(plan, arms, unit_s),
+        *_outages(plan, [arms[a] for a in lanes], unit_s),
     ]
-    return {"data": [*bars, *_temperatures(telemetry, arms, unit, unit_s)], "layout": layout}
+    data = [*bars, *_temperatures(telemetry, arms, lanes, unit, unit_s)]
+    if overview:
+        number = len(lanes) + 2
+        layout["xaxis3"] = time | {"anchor": f"y{number}", "matches": "x"}
+        # The page may show any other arm in the last lane.
+        title = next(
+            i for i, note in enumerate(layout["annotations"]) if note["text"] == f"<b>{plain(arms[lanes[-1]])}</b>"
+        )
+        layout["meta"] = {"lane_traces": list(range(len(data) - JOINTS, len(data))), "lane_title": title}
+        data.append(heat_map(telemetry, arms, number, unit, unit_s, warning_c=warning_c, error_c=error_c))
+    return {"data": data, "layout": layout}
+
+
+def lanes_of(telemetry: Telemetry, arms: int) -> list[int]:
+    """Indices of the arms with a lane of temperatures: all of a small fleet, the hottest of a large one."""
+    if arms <= MOST_LANES:
+        return list(range(arms))
+    peak_c = np.nan_to_num(telemetry.temp_c, nan=-np.inf).max(axis=(0, 2), initial=-np.inf)
+    return np.argsort(-peak_c, kind="stable")[:HOTTEST].tolist()
+
+
+def heat_map(
+    telemetry: Telemetry, arms: Sequence[str], axis: int, unit: str, unit_s: float, *, warning_c: float, error_c: float
+) -> Trace:
+    """The hottest motor of each arm over time, one row per arm; y axis `axis`, x axis 3."""
+    samples = len(telemetry.time_s)
+    edges = np.unique(np.linspace(0, samples, min(samples, HEAT_BINS) + 1).astype(int))[:-1]
+    hottest = np.nan_to_num(telemetry.temp_c, nan=-np.inf).max(axis=2)
+    peak_c = np.maximum.reduceat(hottest, edges, axis=0).T if samples else np.zeros((len(arms), 0))
+    marks = heat_marks(warning_c, error_c)
+    low, high = float(marks[0]), float(marks[-1])
+    kelvin = np.clip(np.round((peak_c - low) * 2), 0, 255).astype(np.uint8)
+    shares = (marks - low) / (high - low)
+    names = [plain(arm) for arm in arms]
+    return {
+        "type": "heatmap",
+        "z": {
+            "dtype": "u1",
+            "bdata": base64.b64encode(kelvin.tobytes()).decode(),
+            "shape": f"{len(arms)},{len(edges)}",
+        },
+        "x": _packed(telemetry.time_s[edges] / unit_s),
+        "y": list(range(len(arms))),
+        "xaxis": "x3",
+        "yaxis": f"y{axis}",
+        "zmin": 0,
+        "zmax": 2 * (high - low),
+        "colorscale": [[float(share), colour] for share, colour in zip(shares, HEAT, strict=True)],
+        "colorbar": {
+            "title": {"text": "°C"},
+            "tickvals": [0, 2 * (warning_c - low), 2 * (error_c - low)],
+            "ticktext": [f"{low:g}", f"{warning_c:g}", f"{error_c:g}"],
+            "thickness": 12,
+            "len": 0.2,
+            "yanchor": "top",
+        },
+        "customdata": names,
+        "hovertemplate": f"%{{y}}<br>%{{x:.2f}} {unit}<extra></extra>",
+        "showlegend": False,
+    }
 
 
 def time_unit(horizon_s: float) -> tuple[str, float]:
@@ -109,11 +176,15 @@ def time_unit(horizon_s: float) -> tuple[str, float]:
     return ("min", 60.0) if horizon_s <= 3 * 3600 else ("h", 3600.0)
 
 
-def _blocks(arms: Sequence[str], legend_px: float) -> dict[str, Any]:
-    """Heights, titles and legends of the Gantt chart and of a lane of temperatures for each arm."""
-    gantt_px = max(90.0, len(arms) * (40.0 if len(arms) <= 8 else 26.0))
-    lane_px = 120.0 if len(arms) <= 8 else 84.0
-    tops = [gantt_px + GAP_PX + a * (lane_px + BETWEEN_LANES_PX) for a in range(len(arms))]
+def _blocks(arms: Sequence[str], lanes: Sequence[int], legend_px: float) -> dict[str, Any]:
+    """Heights, titles and legends of the Gantt chart, of the heat map of a large fleet, and of the lanes."""
+    overview = len(lanes) < len(arms)
+    gantt_px = max(90.0, len(arms) * (40.0 if len(arms) <= 8 else 26.0 if not overview else 12.0))
+    lane_px = 120.0 if len(lanes) <= 8 else 84.0
+    map_px = len(arms) * 8.0 if overview else 0.0
+    map_top = gantt_px + MAP_GAP_PX
+    first = map_top + map_px if overview else gantt_px
+    tops = [first + GAP_PX + a * (lane_px + BETWEEN_LANES_PX) for a in range(len(lanes))]
     total_px = tops[-1] + lane_px
 
     def paper(from_top_px: float) -> float:
@@ -133,19 +204,40 @@ def _blocks(arms: Sequence[str], legend_px: float) -> dict[str, Any]:
         "fixedrange": True,
         "automargin": True,
     }
+    small: dict[str, Any] = {"tickfont": {"size": 8}} if overview else {}
+    heat: dict[str, Any] = {}
+    if overview:
+        place = {"domain": [paper(map_top + map_px), paper(map_top)], "anchor": "x3"}
+        every = slice(None, None, -(-len(arms) // 50))
+        marks = {
+            "tickvals": rows["tickvals"][every],
+            "ticktext": rows["ticktext"][every],
+            "range": [len(arms) - 0.5, -0.5],
+        }
+        heat = {f"yaxis{len(lanes) + 2}": AXIS | rows | small | place | marks}
     return {
         "height": round(total_px + legend_px + 44.0 + MARGIN["b"]),
         "margin": MARGIN | {"t": round(legend_px + 44.0)},
-        "yaxis": AXIS | rows,
+        "yaxis": AXIS | rows | small,
+        **heat,
         **{f"yaxis{a + 2}": {"domain": [max(0.0, paper(y + lane_px)), paper(y)]} for a, y in enumerate(tops)},
-        "legend": LEGEND | {"y": paper(-6.0), "itemclick": "toggle"},
-        "legend2": LEGEND | {"y": paper(tops[0] - NAME_PX - 6.0), "itemdoubleclick": "toggleothers"},
+        "legend": LEGEND | {"y": paper(-6.0), "itemclick": "toggle", "title": _heading("Work of each arm")},
+        "legend2": LEGEND
+        | {
+            "y": paper(tops[0] - NAME_PX - 6.0),
+            "itemdoubleclick": "toggleothers",
+            "title": _heading(f"Motor temperatures{' of the hottest arms' if overview else ''}"),
+        },
         "annotations": [
-            title("Work of each arm", -legend_px - 14.0),
-            title("Motor temperatures", tops[0] - NAME_PX - 34.0),
-            *(title(plain(arm), y - 2.0, size=12) for arm, y in zip(arms, tops, strict=True)),
+            *([title("Hottest motor of each arm", map_top - 8.0)] if overview else []),
+            *(title(plain(arms[a]), y - 2.0, size=12) for a, y in zip(lanes, tops, strict=True)),
         ],
     }
+
+
+def _heading(text: str) -> dict[str, Any]:
+    """Title of a legend, above its entries; so the two cannot overlap."""
+    return {"text": f"<b>{text}</b>", "side": "top", "font": {"size": 15}}
 
 
 def _legend_height(bars: Sequence[Trace]) -> float:
@@ -179,9 +271,11 @@ def _limit_label(arm: int, name: str, limit: float, colour: str, anchor: str) ->
 
 
 def _outages(plan: Schedule, arms: Sequence[str], unit_s: float) -> list[dict[str, Any]]:
-    """Faults as vertical lines and outages as shade in the lane of their arm."""
+    """Faults as vertical lines and outages as shade in the lane of their arm; arms without a lane are left out."""
     shapes = []
     for o in plan.outages:
+        if o.arm not in arms:
+            continue
         lane = {"xref": "x2", "yref": f"y{arms.index(o.arm) + 2} domain", "y0": 0, "y1": 1}
         start, end = round(o.start_s / unit_s, 5), round(o.end_s / unit_s, 5)
         shapes += [
@@ -191,10 +285,13 @@ def _outages(plan: Schedule, arms: Sequence[str], unit_s: float) -> list[dict[st
     return shapes
 
 
-def _temperatures(telemetry: Telemetry, arms: Sequence[str], unit: str, unit_s: float) -> list[Trace]:
-    points = int(np.clip(POINTS_IN_ALL // max(1, JOINTS * len(arms)), FEWEST_POINTS, POINTS_PER_TRACE))
+def _temperatures(
+    telemetry: Telemetry, arms: Sequence[str], lanes: Sequence[int], unit: str, unit_s: float
+) -> list[Trace]:
+    points = int(np.clip(POINTS_IN_ALL // max(1, JOINTS * len(lanes)), FEWEST_POINTS, POINTS_PER_TRACE))
     traces = []
-    for a, arm in enumerate(arms):
+    for lane, a in enumerate(lanes):
+        arm = arms[a]
         for j, colour in enumerate(JOINT_COLOURS):
             value, name = telemetry.temp_c[:, a, j], f"joint {j + 1}"
             kept = decimate(value, points)
@@ -205,11 +302,11 @@ def _temperatures(telemetry: Telemetry, arms: Sequence[str], unit: str, unit_s: 
                     "name": name,
                     "legendgroup": name,
                     "legend": "legend2",
-                    "showlegend": a == 0,
+                    "showlegend": lane == 0,
                     "x": _packed(telemetry.time_s[kept] / unit_s),
                     "y": _packed(value[kept]),
                     "xaxis": "x2",
-                    "yaxis": f"y{a + 2}",
+                    "yaxis": f"y{lane + 2}",
                     "line": {"color": colour, "width": 1.3},
                     "hovertemplate": f"{plain(arm)} {name}<br>%{{y:.1f}} °C at %{{x:.2f}} {unit}<extra></extra>",
                 }

@@ -11,6 +11,8 @@ from scenarios.shift_records import Offer
 
 MOST_FAULTS = 3
 """Faults with a sentence of their own."""
+MOST_ARMS = 6
+"""Arms that are named in one sentence."""
 CLEARLY = 0.1
 """P(saturation) of another offer counts as lower if it is less by this."""
 
@@ -39,7 +41,8 @@ def verdict(run: Mapping[str, Any], events: Sequence[Event], plan: Schedule, off
     for fault in faults[:MOST_FAULTS]:
         sentences += [_fault(fault, plan), *_other_choice(fault, plan, offers)]
     if len(faults) > MOST_FAULTS:
-        arms = ", ".join(sorted({fault.arm for fault in faults}))
+        of = sorted({fault.arm for fault in faults})
+        arms = ", ".join(of[:MOST_ARMS]) + (f" and {len(of) - MOST_ARMS} more" if len(of) > MOST_ARMS else "")
         sentences.append(f"{len(faults)} faults in all, of {arms}: see the events below.")
     elif not faults:
         sentences.append("No motor reached its limit.")

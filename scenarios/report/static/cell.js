@@ -244,10 +244,11 @@ function makeCell(place, model) {
     if (changed) renderer.render(scene, camera);
     changed = false;
   }
-  // Look at an arm from its own front.
+  // Look at an arm; at the whole cell for -1.
   function focus(arm) {
-    target.copy(vector(model.arms[arm].position)).add(new THREE.Vector3(0, 0, 0.3));
-    view.distance = 2.4;
+    const at = arm < 0 ? centre : vector(model.arms[arm].position);
+    target.copy(at).add(new THREE.Vector3(0, 0, 0.35));
+    view.distance = arm < 0 ? start.distance : Math.min(2.6, start.distance);
     look();
   }
   return { setPose, setHeat, setMode, focus, draw, heatColour };

@@ -36,7 +36,7 @@ async function startReplay(figure, unitS) {
   const data = await readPlayback("playback");
   const joints = data.q.rows / model.arms.length, endS = data.q.first_s + (data.q.moments - 1) * data.q.step_s;
   const play = document.getElementById("play"), slider = document.getElementById("time"), speed = document.getElementById("speed");
-  const clock = document.getElementById("clock"), now = document.getElementById("now");
+  const clock = document.getElementById("clock"), now = document.getElementById("now"), chooser = document.getElementById("arm");
   let cell;
   try {
     cell = makeCell(place, model);
@@ -109,6 +109,25 @@ async function startReplay(figure, unitS) {
       Object.assign(line.style, { transform: `translateX(${_size.l + px}px)`, top: `${_size.t}px`, height: `${_size.h}px` });
     };
   }
+  // Looks at one arm, and shows its temperatures in the last lane of a large fleet; -1: the whole cell.
+  function choose(arm) {
+    chooser.value = arm;
+    if (cell) cell.focus(arm);
+    const lane = figure && figure.layout.meta;
+    if (!lane || arm < 0) return;
+    const { moments, first_s, step_s } = data.temp_c, xs = Array.from({ length: moments }, (_, i) => (first_s + i * step_s) / unitS);
+    const ys = Array.from({ length: joints }, (_, j) => xs.map((_, i) => data.temp_c.values[(arm * joints + j) * moments + i] * data.temp_c.scale));
+    Plotly.restyle(figure, { x: ys.map(() => xs), y: ys }, lane.lane_traces);
+    const name = document.createElement("b");
+    name.textContent = model.arms[arm].name;
+    Plotly.relayout(figure, { [`annotations[${lane.lane_title}].text`]: name.outerHTML });
+  }
+  model.arms.forEach((arm, i) => chooser.append(new Option(arm.name, i)));
+  chooser.addEventListener("change", () => choose(Number(chooser.value)));
+  if (figure) figure.on("plotly_click", (event) => {
+    const point = event.points[0];
+    if (point.data.type === "heatmap") choose(point.y);
+  });
   play.addEventListener("click", toggle);
   slider.addEventListener("input", () => show(Number(slider.value)));
   // A row of a table with a moment goes there, by click or Enter.
@@ -117,9 +136,14 @@ async function startReplay(figure, unitS) {
     if (!row || (event.type === "keydown" && event.key !== "Enter")) return;
     const arm = model.arms.findIndex((one) => one.name === row.dataset.arm);
     show(Number(row.dataset.time));
-    if (cell && arm >= 0) cell.focus(arm);
+    if (arm >= 0) choose(arm);
     place.scrollIntoView({ block: "center", behavior: "smooth" });
   }
+  for (const filter of document.querySelectorAll("input.filter")) filter.addEventListener("input", () => {
+    const words = filter.value.toLowerCase().split(/\s+/);
+    for (const row of document.getElementById(filter.dataset.table).querySelectorAll("tbody tr"))
+      row.hidden = !words.every((word) => row.textContent.toLowerCase().includes(word));
+  });
   document.addEventListener("click", goTo);
   document.addEventListener("keydown", goTo);
   document.addEventListener("keydown", (event) => {

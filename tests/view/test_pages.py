@@ -1,0 +1,143 @@
+"""The pages in a browser: Chromium, as Debian packages it, with WebGL in software."""
+
+import io
+import shutil
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import Browser, Page, sync_playwright
+
+from scenarios.run.stored_run import read_run
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")
+COLOURS = """element => {
+  let behind = element;
+  while (behind && getComputedStyle(behind).backgroundColor === "rgba(0, 0, 0, 0)") behind = behind.parentElement;
+  const style = getComputedStyle(element);
+  const ink = element instanceof SVGElement ? style.fill : style.color;
+  return [ink, behind ? getComputedStyle(behind).backgroundColor : "rgb(255, 255, 255)"];
+}"""
+"""Colour of the words of an element, and of what is behind them."""
+FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def page(browser: Browser, run_folder: Path) -> Iterator[Page]:
+    """The report of the shared run; nothing may be requested, and nothing may fail."""
+    page, said = browser.new_page(viewport={"width": 1200, "height": 900}), []
+    page.on("console", lambda message: said.append(message.text) if message.type in ("error", "warning") else None)
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("request", lambda request: said.append(request.url) if not request.url.startswith("file:") else None)
+    page.goto((run_folder / "report.html").as_uri())
+    page.wait_for_selector("body[data-ready]", timeout=60_000)
+    yield page
+    page.close()
+    assert [line for line in said if "GL Driver Message" not in line] == []
+
+
+def canvas(page: Page) -> np.ndarray:
+    """What the cell's canvas shows, uint8 [y, x, 3]."""
+    page.wait_for_timeout(200)  # two frames or more
+    picture = Image.open(io.BytesIO(page.locator("#cell canvas").screenshot()))
+    return np.asarray(picture.convert("RGB")).astype(int)
+
+
+def test_the_cell_is_drawn_and_moves_with_the_clock(page: Page, run_folder: Path) -> None:
+    run = read_run(run_folder)
+    before = canvas(page)
+    assert len(np.unique(before.reshape(-1, 3), axis=0)) > 50
+    work = next(event.time_s for event in run.events if event.kind == "finish")
+    page.locator("#time").fill(str(round(work - 20)))
+    page.locator("#time").dispatch_event("input")
+    after = canvas(page)
+    assert (np.abs(after - before).max(axis=2) > 60).sum() > 200
+    minutes, seconds = divmod(round(work - 20), 60)
+    assert page.locator("#clock").inner_text() == f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"
+
+
+def test_the_cursor_of_the_figure_and_the_clock_are_one(page: Page) -> None:
+    figure = page.locator("#figure .draglayer .nsewdrag").first
+    figure.scroll_into_view_if_needed()
+    box = figure.bounding_box()
+    assert box is not None
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    hours, minutes, seconds = map(int, page.locator("#clock").inner_text().split(":"))
+    assert 3600 * hours + 60 * minutes + seconds == pytest.approx(3600, abs=30)  # the middle of two hours
+    cursor = page.locator("#figure .cursor").bounding_box()
+    assert cursor is not None
+    assert cursor["x"] == pytest.approx(box["x"] + box["width"] / 2, abs=3)
+
+
+def test_a_click_on_an_event_goes_there(page: Page, run_folder: Path) -> None:
+    row = page.locator("#events tbody tr:not(.lost)").first
+    at_s, arm = float(row.get_attribute("data-time") or "nan"), row.get_attribute("data-arm")
+    assert (at_s + 5, arm) in [(pytest.approx(event.time_s), event.arm) for event in read_run(run_folder).events]
+    row.click()
+    assert float(page.locator("#time").input_value()) == pytest.approx(at_s, abs=0.5)
+    assert page.locator("#arm option:checked").inner_text() == arm
+    page.locator("input.filter[data-table=events]").fill("no such words")
+    assert page.locator("#events tbody tr:visible").count() == 0
+
+
+def test_the_keyboard_plays_and_turns(page: Page) -> None:
+    page.locator("#speed").select_option("240")
+    page.locator("body").press("Space")
+    assert page.locator("#play").get_attribute("aria-label") == "pause"
+    page.locator("#clock:not(:text('0:00:01'))").wait_for()
+    page.locator("body").press("Space")
+    assert float(page.locator("#time").input_value()) > 2
+    still = canvas(page)
+    page.locator("#cell canvas").press("ArrowRight")
+    assert (np.abs(canvas(page) - still).max(axis=2) > 60).sum() > 200
+
+
+@pytest.mark.parametrize("width", [390, 500])
+def test_a_narrow_page_overprints_nothing(page: Page, width: int) -> None:
+    page.set_viewport_size({"width": width, "height": 850})
+    page.reload()
+    page.wait_for_selector("body[data-ready]", timeout=60_000)
+    page.wait_for_timeout(500)
+    boxes = [
+        page.locator(f"#figure .{name}").first.bounding_box() for name in ("legend", "xaxislayer-above", "legend2")
+    ]
+    assert all(boxes)
+    for above, below in pairwise(boxes):
+        assert above is not None
+        assert below is not None
+        assert above["y"] + above["height"] <= below["y"] + 1
+    overflow = page.locator("html").evaluate("e => e.scrollWidth - e.clientWidth")
+    assert overflow <= 0
+
+
+def luminance(rgb: np.ndarray) -> np.ndarray:
+    """Relative luminance of colours uint8 [..., 3] (WCAG 2)."""
+    linear = np.where(rgb / 255 <= 0.04045, rgb / 255 / 12.92, ((rgb / 255 + 0.055) / 1.055) ** 2.4)
+    return linear @ (0.2126, 0.7152, 0.0722)
+
+
+def test_words_have_contrast_in_light_and_dark(browser: Browser, run_folder: Path) -> None:
+    for scheme in ("light", "dark"):
+        page = browser.new_page(color_scheme=scheme)  # pyright: ignore[reportArgumentType]
+        page.goto((run_folder / "report.html").as_uri())
+        page.wait_for_selector("body[data-ready]", timeout=60_000)
+        for selector in ("h1", ".verdict", ".faint", ".status", "#events td", "#figure .ytick text"):
+            colours = page.locator(selector).first.evaluate(COLOURS)
+            ink, paper = (
+                luminance(np.array([int(x) for x in c[c.index("(") + 1 :].rstrip(")").split(",")[:3]])) for c in colours
+            )
+            bright, dim = max(ink, paper), min(ink, paper)
+            assert (bright + 0.05) / (dim + 0.05) >= 4.5, (scheme, selector, colours)
+        page.close()
