@@ -146,11 +146,9 @@ class MovingFleet:
         scores = {"difficulty": 0.2, "p_saturation": 0.01, "peak_c": 41.0} if status.state == "awarded" else {}
         self.results(bus.Result("auctioneer", self.number, self.now(), status, by=by, **scores))
 
-    def happens(self, arm, kind, **fields):
-        self.number += 1
-        self.link.post(
-            lambda: self.events[arm](bus.ArmEvent(arm=arm, number=self.number, time_s=self.now(), kind=kind, **fields))
-        )
+    def post(self, call):
+        """Have the fleet's own thread call."""
+        self.link.post(call)
 
     # Requests
 

@@ -14,7 +14,7 @@ function startPage() {
   const actions = makeActions(gateway, fleet);
   const offers = new Map(), awards = [], noted = new Set();
   const counted = { updates: 0, states: 0 };
-  let view = null, index = new Map(), heat = null, changed = new Set(), modelText = "", lastDraw = 0, lastTables = 0, connected = false, dirty = true;
+  let view = null, index = new Map(), heat = null, changed = new Set(), modelText = "", lastDraw = 0, lastTables = 0, looked = "", connected = false, dirty = true;
 
   const armOf = (name) => {
     if (!fleet.arms.has(name)) fleet.arms.set(name, { name, token: false, state: null, atMs: -Infinity, difficultyMs: null });
@@ -197,7 +197,8 @@ function startPage() {
     if (!name.firstChild) {
       const button = make("button", { type: "button", class: "plain", title: "Look at this arm" }, visible(arm.name));
       button.addEventListener("click", () => {
-        if (view && index.has(arm.name)) view.focus(index.get(arm.name));
+        looked = looked === arm.name ? "" : arm.name; // a second click shows the whole cell again
+        if (view && index.has(arm.name)) view.focus(looked ? index.get(arm.name) : -1);
         element("cell").scrollIntoView({ block: "nearest" });
       });
       name.append(button);
