@@ -90,14 +90,17 @@ def _model_of(cell: Cell) -> Mapping[str, Any]:
     from fleet.physics.cell_model import cell_model  # loads MuJoCo
 
     robots = [
-        Robot(name=arm.name, mount=Mount(position_m=_xyz(arm.position_m), tilt_deg=_xyz(arm.tilt_deg)))
-        for arm in cell.arms
+        Robot(name=f"arm_{i}", mount=Mount(position_m=_xyz(arm.position_m), tilt_deg=_xyz(arm.tilt_deg)))
+        for i, arm in enumerate(cell.arms)
     ]
     places = [
         Place(name=place.name, position_m=_xyz(place.position_m), tool_deg=_xyz(place.tool_deg))
         for place in cell.places
     ]
-    return {**cell_model(robots, places), "heat": heat_scale(cell.warning_c, cell.error_c)}
+    model = cell_model(robots, places)
+    for shown, arm in zip(model["arms"], cell.arms, strict=True):
+        shown["name"] = arm.name  # any name of the bus, not only one of a scenario
+    return {**model, "heat": heat_scale(cell.warning_c, cell.error_c)}
 
 
 def _xyz(point: Point) -> tuple[float, float, float]:

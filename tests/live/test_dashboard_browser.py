@@ -206,7 +206,7 @@ def test_a_phone_shows_all_of_it(served, fleet, open_page, scheme):
 def test_hostile_names_stay_text(router, open_page):
     with MovingFleet(router, (EVIL_ARM,), fleet="f") as fleet, Served(router, page=LivePage()) as served:
         page = open_page(served)
-        page.evaluate("window.boom = () => { document.title = 'boom'; document.body.dataset.boom = 'yes'; }")
+        page.evaluate("() => { window.boom = () => { document.body.dataset.boom = 'yes'; }; }")
         fleet.post(lambda: fleet.set(EVIL_TEXT, EVIL_TEXT, state="waiting", reason=EVIL_TEXT))
         fleet.paused[EVIL_ARM] = EVIL_TEXT
         for place in ("#journal", "#jobs", "#alert-list"):
@@ -244,7 +244,7 @@ def test_a_page_asks_for_a_token_and_allows_what_its_role_may(router, fleet, ope
 
 def test_the_page_connects_again_to_a_gateway_and_a_router_that_return(browser, open_page):
     with Router() as router:
-        port, endpoint = router.port, router.endpoint
+        endpoint, port = router.endpoint, int(router.endpoint.rpartition(":")[2])
         with MovingFleet(endpoint, ("arm_0",), fleet="f") as fleet:
             with Served(endpoint, page=LivePage()) as served:
                 page = open_page(served, errors=True)  # Chromium logs every refused connection

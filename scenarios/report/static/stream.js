@@ -77,6 +77,10 @@ function makeGateway() {
       const response = await fetch("/v4/events", {
         cache: "no-store", signal: stop.signal, headers: headers({ Accept: "text/event-stream", ...(last && { "Last-Event-ID": last }) }),
       });
+      if (response.status === 401) {
+        clearTimeout(timer);
+        await request("/"); // asks for a token
+      }
       if (!response.ok) throw new Error(`The gateway answered ${response.status}.`);
       await onOpen();
       const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
