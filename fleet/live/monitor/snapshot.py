@@ -16,6 +16,7 @@ import msgspec
 from fleet.bus.protocol import auction
 from fleet.bus.protocol.auction import Announcement, ArmEvent, JobStatus, Result, Status
 from fleet.bus.protocol.messages import DifficultyScores, Info, State, encode
+from fleet.bus.protocol.operator import ALL_ARMS, ControlRequest, Operation, Pause, Resume
 from fleet.live.monitor.recent import Recent
 from fleet.telemetry import Mode
 
@@ -147,6 +148,9 @@ class FleetView:
             self._auctioneer(name).heard_s = now_s
             if isinstance(message, Result):
                 self._set_status(message.status, now_s, message.number)
+        elif isinstance(message, Operation):
+            if message.time_s >= self._auctioneer(name).time_s:
+                self._pause(message.request)
         elif isinstance(message, State | DifficultyScores | Info | ArmEvent):
             self._arm(name).messages[type(message)] = message, now_s
 
@@ -189,9 +193,20 @@ class FleetView:
             counts=dict(Counter(status.state for status in statuses)),
             jobs=tuple(statuses[-jobs:]) if jobs > 0 else (),
             space=self._space,
-            paused=self._paused,
+            paused=dict(self._paused),
             speed=self.speed,
         )
+
+    def _pause(self, request: ControlRequest) -> None:
+        """Apply a pause or its end, which the next status reply confirms."""
+        match request.action:
+            case Pause(arm):
+                self._paused[arm] = request.by
+            case Resume(arm):
+                kept = {} if arm == ALL_ARMS else {name: by for name, by in self._paused.items() if name != arm}
+                self._paused = kept
+            case _:
+                pass
 
     def _arm(self, name: str) -> _Arm:
         arm = self._arms[name] = self._arms.get(name) or _Arm()

@@ -5,11 +5,15 @@ const ROLES = ["monitor", "submitter", "operator"];
 
 function makeActions(gateway, fleet) {
   const may = (role) => ROLES.indexOf(fleet.role) >= ROLES.indexOf(role);
+  const maySteer = () => may("operator") && fleet.auctioneers.some((each) => each.token); // arms alone take no such requests
   const by = element("by");
   by.value = sessionStorage.getItem("by") || "";
 
+  let hide = 0;
   function answer(text, failed) {
     const place = element("answer");
+    clearTimeout(hide);
+    if (!failed) hide = setTimeout(() => { place.hidden = true; }, 20000);
     place.hidden = false;
     setClass(place, failed ? "status bad" : "status good");
     setText(place, `${failed ? "✖" : "✔"} ${text}`);
@@ -173,11 +177,11 @@ function makeActions(gateway, fleet) {
       const rows = quotes.map((quote) => ({ arm: quote.arm, estimate: quote.estimates[0] })).sort((a, b) => a.arm < b.arm ? -1 : 1);
       const lines = rows.flatMap(({ arm, estimate: { plans, reason } }) => (plans || []).length ? plans.map((plan) => [arm,
         figure(plan.peak_c, 1, " °C"), figure(plan.p_saturation, 2), figure(plan.difficulty, 2), plan.finish_in_s == null ? "—" : clock(plan.finish_in_s)])
-        : [[arm, reason || "cannot do it", "", "", ""]]);
+        : [[arm, reason || "cannot do it"]]);
       const head = ["Arm", "Predicted peak", "P", "d", "Finished in"];
       place.replaceChildren(lines.length ? make("table", { class: "numbers" }, make("caption", {}, "Quotes, for this job alone; nothing is submitted."),
         make("thead", {}, make("tr", {}, ...head.map((text) => make("th", { scope: "col" }, text)))),
-        make("tbody", {}, ...lines.map((line) => make("tr", {}, ...line.map((text) => make("td", {}, visible(text))))))) : "No arm has quoted.",
+        make("tbody", {}, ...lines.map((line) => make("tr", {}, ...line.map((text) => make("td", line.length === 2 && text === line[1] ? { colspan: 4, class: "words" } : {}, visible(text))))))) : "No arm has quoted.",
         ...refused.filter(Boolean).map((reason) => make("p", {}, visible(reason))));
     } catch (error) {
       place.textContent = visible(error.message);
@@ -194,9 +198,9 @@ function makeActions(gateway, fleet) {
   // Allow what the role allows.
   function allow() {
     for (const button of document.querySelectorAll("[data-role]")) {
-      button.disabled = !may(button.dataset.role) || (button.form && button.form.id === "submit" && !fleet.cell);
-      button.title = may(button.dataset.role) ? "" : `Needs the role ${button.dataset.role}; this page has ${fleet.role}.`;
+      button.disabled = button.dataset.role === "operator" ? !maySteer() : !may(button.dataset.role) || !fleet.cell;
+      button.title = may(button.dataset.role) ? "" : `This needs the role ${button.dataset.role} (this page has ${fleet.role}).`;
     }
   }
-  return { may, allow, offer, cancel, settle, change, pause, resume, reset, clear };
+  return { may, maySteer, allow, offer, cancel, settle, change, pause, resume, reset, clear };
 }

@@ -90,7 +90,7 @@ function startPage() {
       }
     },
     event(name, event) {
-      const value = event.value === undefined || event.value === null ? "" : event.value.toFixed(1);
+      const value = event.value === undefined || event.value === null ? "" : `${event.kind === "award" ? "d " : ""}${event.value.toFixed(1)}`;
       const what = [event.kind.replace("_", " "), event.joint ? `joint ${event.joint}` : "", value, event.job && `(${event.job})`, event.reason].filter(Boolean).join(" ");
       note(`event/${name}/${event.number}`, event.time_s, name, what, ["fault", "contact", "warning"].includes(event.kind) ? event.kind : "");
     },
@@ -108,7 +108,7 @@ function startPage() {
         if (arm.token !== there) note(`presence/${name}/${performance.now()}`, null, name, there ? "joined" : "left");
         arm.token = there;
         changed.add(name);
-      } else poll();
+      } else if (there && connected) setTimeout(() => load().catch(() => {}), POLL_MS); // it needs a moment
     },
     gap: () => note(`gap/${performance.now()}`, null, "gateway", "some events were missed"),
   };
@@ -122,20 +122,21 @@ function startPage() {
   async function load() {
     fleet.role = (await gateway.request("/")).role;
     await poll();
-    try {
+    let missing = "There is no auctioneer. To submit a job use thermofleet submit.";
+    if (fleet.auctioneers.some((each) => each.token)) try {
       fleet.cell = await gateway.request("/v4/cell");
       actions.offer(fleet.cell);
-      element("no-cell").hidden = true;
+      missing = "";
     } catch (error) {
-      element("no-cell").hidden = false;
-      setText(element("no-cell"), `The form needs a description of the cell. ${error.message}`);
+      missing = error.message;
     }
+    element("no-cell").hidden = !missing;
+    setText(element("no-cell"), `The auctioneer describes the cell for this form. ${missing}`);
     try {
       await draw(await gateway.request("/v4/scene"));
     } catch (error) {
       if (!view) setText(element("cell"), `The cell cannot be drawn. ${error.message}`);
     }
-    actions.allow();
   }
 
   async function draw(model) {
@@ -227,7 +228,7 @@ function startPage() {
     setText(messages, `state ${age(ageOf(arm))}, scores ${scores}`);
     const wanted = [];
     if (actions.may("operator")) {
-      if (pause !== "*") wanted.push(pause ? { text: "▶ Resume", label: `Resume ${arm.name}`, act: () => actions.resume(arm.name) }
+      if (pause !== "*" && actions.maySteer()) wanted.push(pause ? { text: "▶ Resume", label: `Resume ${arm.name}`, act: () => actions.resume(arm.name) }
         : { text: "❚❚ Pause", label: `Pause ${arm.name}`, act: () => actions.pause(arm.name) });
       if (here && state.mode === "faulted") wanted.push({ text: "Reset", label: `Reset ${arm.name}`, act: () => actions.reset(arm.name) });
       if (!arm.token) wanted.push({ text: "Free its space", label: `Free the space of ${arm.name}`, act: () => actions.clear(arm.name) });
@@ -244,7 +245,7 @@ function startPage() {
     setText(cycles, status.repetitions ? `${status.cycles} of ${status.repetitions}` : String(status.cycles));
     setText(finish, status.finish_s == null ? "—" : `at ${clock(status.finish_s)}, in ${clock(status.finish_s - fleetTime())}`);
     const button = (text, act) => ({ text, label: `${text} ${status.job}`, act });
-    setButtons(requests, !actions.may("operator") ? [] : status.state === "unfinished"
+    setButtons(requests, !actions.maySteer() ? [] : status.state === "unfinished"
       ? [button("Done", () => actions.settle(status.job, "done")), button("Redo", () => actions.settle(status.job, "redo"))]
       : [button("Cancel", () => actions.cancel(status.job)), button("Change", () => actions.change(status.job))]);
   }
@@ -307,6 +308,7 @@ function startPage() {
       ...awards.map((award) => [award.key, { job: award.job, state: `✔ to ${award.arm}`, winner: award.arm, scores: award.offers }]),
     ], fillOffer);
     alerts();
+    actions.allow();
   }
 
   function frame(ms) {
