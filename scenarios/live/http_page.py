@@ -20,7 +20,7 @@ from fleet.env.render.heat import heat_scale
 from fleet.job import Place
 from fleet.live.monitor.async_bridge import NoReply
 from fleet.robot import Mount, Robot
-from scenarios.view.three import three_js
+from scenarios.report.three import three_js
 
 PAGE = "dashboard.html"
 FILES = ("page.css", "dashboard.css", "cell.js", "stream.js", "tables.js", "actions.js", "dashboard.js")

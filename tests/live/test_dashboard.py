@@ -1,5 +1,6 @@
 """The live page without a browser: what is served to whom, and under which policy."""
 
+import asyncio
 import gzip
 import http.client
 import json
@@ -8,9 +9,13 @@ import re
 import pytest
 
 from fleet.bus.client.router import Router
-from fleet.bus.protocol.operator import ResetRequest
+from fleet.bus.protocol.auction import Status
+from fleet.bus.protocol.operator import ControlRequest, Operation, Pause, ResetRequest, Resume
+from fleet.live.monitor.snapshot import FleetView
+from scenarios.cli.live.gateway import scene_of
 from scenarios.cli.live.up import page_of
 from scenarios.live.http_page import FILES, PAGE, LivePage
+from scenarios.load import load
 from tests.live.moving_fleet import MovingFleet
 from tests.live.test_gateway import PATIENCE_S, Served, until
 
@@ -115,6 +120,33 @@ def test_the_scene_is_the_cell_that_the_auctioneer_describes(served, fleet):
     assert [place["name"] for place in scene["places"]] == [place.name for place in cell.places]
     assert (scene["heat"]["warning_c"], scene["heat"]["error_c"]) == (cell.warning_c, cell.error_c)
     assert sum(link["turns"] for link in scene["links"]) == 7
+
+
+def test_a_scenario_is_drawn_without_an_auctioneer():
+    scenario = load("heat_wave")
+
+    async def nobody():
+        raise AssertionError("asked for the cell")
+
+    scene = asyncio.run(LivePage(scene_of(scenario)).scene(nobody))
+    assert [box["name"] for box in scene["fixtures"]] == [fixture.name for fixture in scenario.fixtures]
+    assert len(scene["arms"]) == len(scenario.arms)
+
+
+def test_a_pause_is_seen_when_it_is_requested_and_not_when_it_is_history():
+    view = FleetView("f")
+
+    def paused(action, time_s, by="ann"):
+        view.update("au", Operation("au", time_s, ControlRequest("1", action, by)), 0.0)
+        return view.snapshot(0.0).paused
+
+    assert paused(Pause("a"), 1.0) == {"a": "ann"}
+    assert paused(Pause("*"), 2.0, "bob") == {"a": "ann", "*": "bob"}
+    view.update_jobs(Status("au", 5.0, (), paused={"c": "eve"}), 0.0)
+    assert paused(Pause("b"), 4.0) == {"c": "eve"}  # the reply is newer
+    assert paused(Resume("c"), 6.0) == {}
+    assert paused(Pause("b"), 7.0) == {"b": "ann"}
+    assert paused(Resume("*"), 8.0) == {}
 
 
 def test_a_fault_is_reset_over_http(served, fleet):

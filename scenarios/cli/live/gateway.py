@@ -27,6 +27,7 @@ from scenarios.live.http_access import MIN_TOKEN, ROLES, Role, check_token, read
 from scenarios.live.http_app import STUCK_S, Readers, application
 from scenarios.live.http_page import LivePage
 from scenarios.load import load
+from scenarios.report.three import three_js
 from scenarios.schema import Scenario
 
 TOKEN = "THERMOFLEET_TOKEN"
@@ -81,6 +82,7 @@ def dashboard_command(
     It is a gateway with a page: arms in 3-D, temperatures, jobs, offers,
     alerts, and what the role of a token may request.
     """
+    three_js()  # if it is missing, say so at once
     run(endpoint, fleet, port, host, token, tokens, LivePage(scene_of(load(scenario)) if scenario else None))
 
 

@@ -224,6 +224,7 @@ def _check_page(tls: Path | None) -> None:
         FleetError: a token or a certificate is missing.
     """
     require_extra("gateway")
+    require_extra("report")
     from scenarios.cli.live.gateway import TOKEN
 
     if tls is not None and not os.environ.get(TOKEN):

@@ -109,7 +109,8 @@ function makeGateway() {
         }, onMessage);
         onLost("The gateway has closed the stream");
       } catch (error) {
-        onLost(error.name === "AbortError" ? "The gateway is silent" : "The gateway does not answer");
+        onLost(error.name === "AbortError" ? "The gateway is silent" : error instanceof TypeError ? "The gateway does not answer"
+          : error.message.replace(/\.$/, ""));
       }
       await new Promise((resolve) => setTimeout(resolve, Math.min(5000, 500 * 2 ** attempt)));
     }
