@@ -10,8 +10,10 @@ import pytest
 from PIL import Image
 from playwright.sync_api import expect, sync_playwright
 
+from fleet.bus.client.client import BusClient
 from fleet.bus.client.router import Router
-from fleet.bus.protocol.operator import Cancel, Pause, ResetRequest
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.operator import Cancel, Change, ClearRequest, Pause, ResetRequest, Settle
 from scenarios.live.http_page import LivePage
 from tests.live.moving_fleet import MovingFleet
 from tests.live.test_gateway import Served, until
@@ -149,6 +151,31 @@ def test_a_job_is_cancelled_and_the_fleet_paused_with_the_name_of_the_person(ser
     page.get_by_role("button", name="Resume all arms").click()
     confirm(page)
     expect(page.locator("#alert-list")).not_to_contain_text("paused")
+
+
+def test_a_job_is_changed_and_settled_and_the_space_of_an_absent_arm_freed(served, fleet, router, open_page):
+    with BusClient(router, "f") as other:  # an arm that leaves
+        other.declare_token(keys.of_arm("f", "gone", "alive"))
+        until(lambda: any(arm["arm"] == "gone" for arm in served.ask("GET", "/v4/fleet")[2]["arms"]))
+    fleet.paused["*"] = "ann"
+    for name, state in (("late", "waiting"), ("lost", "unfinished")):
+        fleet.post(lambda name=name, state=state: fleet.set(name, state=state, repetitions=3, cycles=2))
+    page = open_page(served)
+    page.get_by_role("button", name="Change late").click()
+    page.locator("#new-value").fill("7")
+    confirm(page)
+    answer(page).to_contain_text("late: waiting")
+    assert fleet.requests[-1].action == Change("late", value=7.0)
+    expect(page.locator("#alert-list")).to_contain_text("1 job(s) unfinished")
+    page.get_by_role("button", name="Done lost").click()
+    confirm(page)
+    answer(page).to_contain_text("lost: finished")
+    assert fleet.requests[-1].action == Settle("lost", "done")
+    expect(page.locator("#alert-list")).to_contain_text("Absent: gone")
+    page.get_by_role("button", name="Free the space of gone").click()
+    confirm(page)
+    answer(page).to_contain_text("gone: its space is free")
+    assert fleet.requests[-1] == ClearRequest("gone", "ann")
 
 
 def test_a_fault_is_told_in_words_and_reset(served, fleet, open_page):

@@ -1,7 +1,7 @@
 // The live page: the fleet as its messages show it.
 "use strict";
 
-const FRESH_S = 3, DRAW_MS = 60, TABLES_MS = 250, POLL_MS = 2000, MOST_JOBS = 300, MOST_ROWS = 60, MOST_NOTES = 300, MOST_AWARDS = 20;
+const FRESH_S = 3, DRAW_MS = 60, TABLES_MS = 500, POLL_MS = 2000, MOST_JOBS = 300, MOST_ROWS = 60, MOST_NOTES = 300, MOST_AWARDS = 20;
 const MODES = { idle: "○ idle", working: "▶ working", faulted: "✖ faulted" };
 const STATES = {
   waiting: "… waiting", awarded: "▶ awarded", finishing: "▶ finishing", finished: "✔ finished", unfinished: "? unfinished",
@@ -16,6 +16,7 @@ function startPage() {
   const counted = { updates: 0, states: 0 };
   let view = null, index = new Map(), heat = null, changed = new Set(), modelText = "", lastDraw = 0, lastTables = 0, looked = "", connected = false, dirty = true;
 
+  const byName = (a, b) => a.name.localeCompare(b.name, "en", { numeric: true });
   const armOf = (name) => {
     if (!fleet.arms.has(name)) fleet.arms.set(name, { name, token: false, state: null, atMs: -Infinity, difficultyMs: null });
     return fleet.arms.get(name);
@@ -264,18 +265,19 @@ function startPage() {
     setText(row.cells[2], text.join(";  ") || (winner ? `✔ ${winner}` : "none"));
   }
 
+  const some = (names) => names.slice(0, 20).join(", ") + (names.length > 20 ? ` and ${names.length - 20} more` : "");
   function alerts() {
-    const list = [], all = [...fleet.arms.values()];
+    const list = [], all = [...fleet.arms.values()].sort(byName);
     const add = (key, kind, text) => list.push([key, kind, text]);
     if (connected && !all.some((arm) => arm.token) && !fleet.auctioneers.some((each) => each.token)) {
       add("nobody", "fault", "No arm and no auctioneer is present: the router or the fleet may be down. This page waits for them.");
     } else {
       const absent = all.filter((arm) => !isPresent(arm)).map((arm) => arm.name), faulted = all.filter((arm) => isPresent(arm) && arm.state.mode === "faulted");
       for (const arm of faulted) add(`faulted/${arm.name}`, "fault", `${arm.name} is faulted.`);
-      if (absent.length) add(`absent/${absent}`, "fault", `Absent: ${absent.slice(0, 20).join(", ")}${absent.length > 20 ? ` and ${absent.length - 20} more` : ""}.`);
-      for (const arm of all) if (heat && isPresent(arm) && Math.max(...arm.state.temp_c) >= heat.warning_c) {
-        add(`warm/${arm.name}`, "warning", `${arm.name}: joint ${arm.state.temp_c.indexOf(Math.max(...arm.state.temp_c)) + 1} is above the warning limit.`);
-      }
+      if (absent.length) add(`absent/${absent}`, "fault", `Absent: ${some(absent)}.`);
+      const warm = all.filter((arm) => heat && isPresent(arm) && Math.max(...arm.state.temp_c) >= heat.warning_c)
+        .map((arm) => `${arm.name} (joint ${arm.state.temp_c.indexOf(Math.max(...arm.state.temp_c)) + 1})`);
+      if (warm.length) add(`warm/${warm}`, "warning", `Above the warning limit: ${some(warm)}.`);
     }
     for (const [arm, by] of Object.entries(fleet.paused)) add(`paused/${arm}/${by}`, "pause", `${arm === "*" ? "All arms are" : `${arm} is`} paused${by ? ` by ${by}` : ""}.`);
     const unfinished = [...fleet.jobs.values()].filter(({ state }) => state === "unfinished").length;
@@ -291,7 +293,7 @@ function startPage() {
   function drawTables() {
     setText(element("fleet"), fleet.name || "Fleet");
     document.title = `${visible(fleet.name)} live`;
-    const all = [...fleet.arms.values()].sort((a, b) => a.name < b.name ? -1 : 1), here = all.filter(isPresent).length;
+    const all = [...fleet.arms.values()].sort(byName), here = all.filter(isPresent).length;
     const speed = fleet.speed && fleet.speed !== 1 ? `, ${Number(fleet.speed.toPrecision(3))} times as fast as real time` : "";
     const auctioneers = fleet.auctioneers.filter((each) => each.token).map((each) => each.auctioneer).join(", ");
     setText(element("summary"), `Fleet time ${clock(fleetTime())}${speed}. ${here} of ${all.length} arms present. ${auctioneers ? `Auctioneer: ${auctioneers}` : "No auctioneer"}. Your role: ${fleet.role}.`);
