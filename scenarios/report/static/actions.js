@@ -5,7 +5,6 @@ const ROLES = ["monitor", "submitter", "operator"];
 
 function makeActions(gateway, fleet) {
   const may = (role) => ROLES.indexOf(fleet.role) >= ROLES.indexOf(role);
-  const maySteer = () => may("operator") && fleet.auctioneers.some((each) => each.token); // arms alone take no such requests
   const by = element("by");
   by.value = sessionStorage.getItem("by") || "";
 
@@ -198,9 +197,9 @@ function makeActions(gateway, fleet) {
   // Allow what the role allows.
   function allow() {
     for (const button of document.querySelectorAll("[data-role]")) {
-      button.disabled = button.dataset.role === "operator" ? !maySteer() : !may(button.dataset.role) || !fleet.cell;
+      button.disabled = !may(button.dataset.role) || (button.dataset.role === "submitter" && !fleet.cell);
       button.title = may(button.dataset.role) ? "" : `This needs the role ${button.dataset.role} (this page has ${fleet.role}).`;
     }
   }
-  return { may, maySteer, allow, offer, cancel, settle, change, pause, resume, reset, clear };
+  return { may, allow, offer, cancel, settle, change, pause, resume, reset, clear };
 }

@@ -123,16 +123,15 @@ function startPage() {
   async function load() {
     fleet.role = (await gateway.request("/")).role;
     await poll();
-    let missing = "There is no auctioneer. To submit a job use thermofleet submit.";
-    if (fleet.auctioneers.some((each) => each.token)) try {
+    let missing = "";
+    try {
       fleet.cell = await gateway.request("/v4/cell");
       actions.offer(fleet.cell);
-      missing = "";
     } catch (error) {
-      missing = error.message;
+      missing = `The form needs a description of the cell. ${error.message}`;
     }
     element("no-cell").hidden = !missing;
-    setText(element("no-cell"), `The auctioneer describes the cell for this form. ${missing}`);
+    setText(element("no-cell"), missing);
     try {
       await draw(await gateway.request("/v4/scene"));
     } catch (error) {
@@ -229,7 +228,7 @@ function startPage() {
     setText(messages, `state ${age(ageOf(arm))}, scores ${scores}`);
     const wanted = [];
     if (actions.may("operator")) {
-      if (pause !== "*" && actions.maySteer()) wanted.push(pause ? { text: "▶ Resume", label: `Resume ${arm.name}`, act: () => actions.resume(arm.name) }
+      if (pause !== "*") wanted.push(pause ? { text: "▶ Resume", label: `Resume ${arm.name}`, act: () => actions.resume(arm.name) }
         : { text: "❚❚ Pause", label: `Pause ${arm.name}`, act: () => actions.pause(arm.name) });
       if (here && state.mode === "faulted") wanted.push({ text: "Reset", label: `Reset ${arm.name}`, act: () => actions.reset(arm.name) });
       if (!arm.token) wanted.push({ text: "Free its space", label: `Free the space of ${arm.name}`, act: () => actions.clear(arm.name) });
@@ -240,13 +239,15 @@ function startPage() {
   function fillJob(row, status) {
     const [job, state, arm, cycles, finish, requests] = row.cells;
     setText(job, status.job);
-    setText(state, `${STATES[status.state] || status.state}${status.reason ? `: ${status.reason}` : ""}`);
+    setText(state, `${STATES[status.state] || status.state}${status.not_planned ? ", not planned yet" : ""}${status.reason ? `: ${status.reason}` : ""}`);
     setClass(row, status.state);
     setText(arm, status.arm || "—");
     setText(cycles, status.repetitions ? `${status.cycles} of ${status.repetitions}` : String(status.cycles));
-    setText(finish, status.finish_s == null ? "—" : `at ${clock(status.finish_s)}, in ${clock(status.finish_s - fleetTime())}`);
+    const late = status.due_s != null && (status.finish_s ?? fleetTime()) > status.due_s ? " (late)" : "";
+    setText(finish, [status.finish_s == null ? "" : `at ${clock(status.finish_s)}, in ${clock(status.finish_s - fleetTime())}`,
+      status.due_s == null ? "" : `due ${clock(status.due_s)}${late}`].filter(Boolean).join("; ") || "—");
     const button = (text, act) => ({ text, label: `${text} ${status.job}`, act });
-    setButtons(requests, !actions.maySteer() ? [] : status.state === "unfinished"
+    setButtons(requests, !actions.may("operator") ? [] : status.state === "unfinished"
       ? [button("Done", () => actions.settle(status.job, "done")), button("Redo", () => actions.settle(status.job, "redo"))]
       : [button("Cancel", () => actions.cancel(status.job)), button("Change", () => actions.change(status.job))]);
   }

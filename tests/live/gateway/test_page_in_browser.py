@@ -15,8 +15,8 @@ from fleet.bus.client.router import Router
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.operator import Cancel, Change, ClearRequest, Pause, ResetRequest, Settle
 from scenarios.live.http_page import LivePage
-from tests.live.moving_fleet import MovingFleet
-from tests.live.test_gateway import Served, until
+from tests.live.gateway.moving_fleet import MovingFleet, until
+from tests.live.gateway.served import Served
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")

@@ -25,7 +25,17 @@ from fleet.bus.protocol.operator import (
 from fleet.job import BOUNDS
 
 WARNING_C, ERROR_C = 60.0, 75.0
+PATIENCE_S = 60.0
 PLACES = ("conveyor", "pallet", "clamp")
+
+
+def until(condition):
+    """The first true value of a condition that other threads bring about."""
+    deadline_s, pause = time.monotonic() + PATIENCE_S, threading.Event()
+    while not (value := condition()):
+        assert time.monotonic() < deadline_s, "waited in vain"
+        pause.wait(0.02)
+    return value
 
 
 class MovingFleet:

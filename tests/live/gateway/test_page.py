@@ -16,8 +16,8 @@ from scenarios.cli.live.gateway import scene_of
 from scenarios.cli.live.up import page_of
 from scenarios.live.http_page import FILES, PAGE, LivePage
 from scenarios.load import load
-from tests.live.moving_fleet import MovingFleet
-from tests.live.test_gateway import PATIENCE_S, Served, until
+from tests.live.gateway.moving_fleet import MovingFleet, until
+from tests.live.gateway.served import PATIENCE_S, Served
 
 BROWSER = {"Accept": "text/html,application/xhtml+xml,application/xml;q=0.9,*/*;q=0.8"}
 WATCHER, BOSS = "watcher-watcher-watcher", "operator-operator-operator"
