@@ -66,6 +66,7 @@ COMMANDS = {
     "reset": LazyCommand(_LIVE, "live.control:reset_command", "Clear the fault of an arm."),
     "watch": LazyCommand(_LIVE, "live.watch:watch_command", "Watch a fleet in the terminal."),
     "doctor": LazyCommand(_LIVE, "live.doctor:doctor_command", "Check the health of a fleet."),
+    "dashboard": LazyCommand(_LIVE, "live.gateway:dashboard_command", "Show a fleet live on a page."),
     "gateway": LazyCommand(_LIVE, "live.gateway:gateway_command", "Serve a fleet over HTTP."),
     "record": LazyCommand(_LIVE, "live.record:record_command", "Record a fleet to Parquet."),
     "replay": LazyCommand(_LIVE, "live.record:replay_command", "Replay a run or a recording on the bus."),

@@ -3,7 +3,7 @@
 import asyncio
 import hmac
 import math
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from http import HTTPStatus
 from pathlib import Path
@@ -77,11 +77,14 @@ def read_tokens(path: Path) -> dict[str, Role]:
 class AccessCheck:
     """Passes requests that show a token, at a limited rate; without tokens, requests to this machine's local names.
 
-    The name is checked since a page of another site must not reach the gateway under a name of its own.
+    The name is checked since a page of another site must not reach the gateway under a name of its own. A request that
+    is `public` needs no token.
     """
 
-    def __init__(self, app: ASGIApp, tokens: Mapping[str, Role]) -> None:
-        self.app, self.tokens = app, {token.encode(): role for token, role in tokens.items()}
+    def __init__(
+        self, app: ASGIApp, tokens: Mapping[str, Role], public: Callable[[Scope], bool] = lambda scope: False
+    ) -> None:
+        self.app, self.tokens, self.public = app, {token.encode(): role for token, role in tokens.items()}, public
         self._senders: dict[bytes, tuple[float, float]] = {}
         """Requests that each may still send, and the loop's time at which that was counted."""
 
@@ -90,11 +93,11 @@ class AccessCheck:
         refusal = None
         if scope["type"] == "http":
             headers = dict(scope["headers"])
-            refusal = self.refusal(headers)
+            refusal = None if self.tokens and self.public(scope) else self.refusal(headers)
             if refusal is None:
                 shown = headers.get(b"authorization", b"")[7:]
-                scope["role"] = self.tokens.get(shown, "operator")
-                sender = shown if self.tokens else str((scope.get("client") or ("",))[0]).encode()
+                scope["role"] = self.tokens.get(shown, "monitor" if self.tokens else "operator")
+                sender = shown if shown in self.tokens else str((scope.get("client") or ("",))[0]).encode()
                 refusal = self._too_fast(sender)
         await (refusal or self.app)(scope, receive, send)
 

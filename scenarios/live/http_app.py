@@ -23,10 +23,21 @@ from starlette.types import Message, Receive, Scope, Send
 from fleet.bus.protocol.auction import JobSpec, QuoteRequest, StatusRequest, Submission
 from fleet.bus.protocol.cell import Cell, CellRequest
 from fleet.bus.protocol.messages import MalformedMessage, decode, encode
-from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest
+from fleet.bus.protocol.operator import (
+    Cleared,
+    ClearRequest,
+    Controlled,
+    ControlRequest,
+    Person,
+    ResetReply,
+    ResetRequest,
+)
+from fleet.errors import NAME_RULE, is_name
 from fleet.live.monitor.async_bridge import AsyncBridge, NoReply
 from fleet.live.monitor.event_feed import Entry, EventFeed, ReaderBuffer
+from fleet.live.monitor.snapshot import MAX_JOBS
 from scenarios.live.http_access import AccessCheck, Bodies, Problem, Role, check_role, problem_response
+from scenarios.live.http_page import FILES, LivePage, is_public, wants_page
 
 MAX_BYTES = 60_000
 """Of a body: what the router passes, less the overhead of a message."""
@@ -43,6 +54,14 @@ class AskBody(msgspec.Struct, frozen=True):
     """Body of /v4/ask: jobs to be quoted, not done."""
 
     jobs: tuple[JobSpec, ...]
+
+
+class ResetBody(msgspec.Struct, frozen=True):
+    """Body of /v4/reset: clear the fault of an arm."""
+
+    arm: str
+    by: Person = ""
+    """Who requests it."""
 
 
 @dataclass(eq=False)
@@ -80,10 +99,15 @@ def application(
     heartbeat_s: float = HEARTBEAT_S,
     stuck_s: float = STUCK_S,
     body_s: float = BODY_S,
+    page: LivePage | None = None,
 ) -> Starlette:
-    """Make the application; with tokens every request must show one, without any only local requests are served."""
+    """Make the application; with tokens every request must show one, without any only local requests are served.
+
+    Args:
+        page: Shown to browsers at `/`; None for none.
+    """
     boot = secrets.token_hex(4)  # event numbers are valid for one start of the gateway
-    slots, bodies = asyncio.Semaphore(MAX_REQUESTS), Bodies(body_s)
+    slots, bodies, shown = asyncio.Semaphore(MAX_REQUESTS), Bodies(body_s), page or LivePage()
 
     async def limited(request: Callable[[], Awaitable[Reply]]) -> Reply:
         if slots.locked():
@@ -92,7 +116,9 @@ def application(
             return await request()
 
     async def fleet(request: Request) -> Response:
-        return json_response(await bridge.snapshot())
+        text = request.query_params.get("jobs", "")
+        jobs = int(text) if text.isdecimal() and len(text) < 5 else MAX_JOBS
+        return json_response(await bridge.snapshot(jobs))
 
     async def post_jobs(request: Request) -> Response:
         submission = await read_body(request, Submission, bodies)
@@ -110,8 +136,22 @@ def application(
         clear = await read_body(request, ClearRequest, bodies)
         return json_response(await limited(lambda: bridge.request("clear", clear, Cleared)))
 
+    async def post_reset(request: Request) -> Response:
+        body = await read_body(request, ResetBody, bodies)
+        if not is_name(body.arm):
+            raise Problem(HTTPStatus.UNPROCESSABLE_ENTITY, f"The name of an arm must have {NAME_RULE}.")
+        return json_response(
+            await limited(lambda: bridge.request_of_arm(body.arm, "reset", ResetRequest(body.by), ResetReply))
+        )
+
+    async def ask_cell() -> Cell:
+        return await limited(lambda: bridge.request("cell", CellRequest(), Cell))
+
     async def get_cell(request: Request) -> Response:
-        return json_response(await limited(lambda: bridge.request("cell", CellRequest(), Cell)))
+        return json_response(await ask_cell())
+
+    async def get_scene(request: Request) -> Response:
+        return json_response(await shown.scene(ask_cell))
 
     async def post_ask(request: Request) -> Response:
         ask = await read_body(request, AskBody, bodies)
@@ -129,6 +169,8 @@ def application(
         return EventStream(bridge.feed, readers, boot, last_event, heartbeat_s, stuck_s)
 
     async def contents(request: Request) -> Response:
+        if page is not None and wants_page(request.scope):
+            return page.response()
         entries = [{"method": m, "path": p, "role": role, "what": what} for m, p, role, _, what in table]
         return json_response({"gateway": "thermofleet", "role": request.scope["role"], "requests": entries})
 
@@ -139,13 +181,18 @@ def application(
         ("GET", "/v4/jobs", "monitor", get_jobs, "Status of the jobs ?job=NAME, or of all."),
         ("POST", "/v4/jobs", "submitter", post_jobs, "Submit jobs: a Submission."),
         ("GET", "/v4/cell", "monitor", get_cell, "Places, arms, kinds of jobs and limits: all that a job may name."),
+        ("GET", "/v4/scene", "monitor", get_scene, "Arms, places and colours in three dimensions, as the page draws."),
         ("POST", "/v4/control", "operator", post_control, "Cancel, settle, change, pause, resume: a ControlRequest."),
         ("POST", "/v4/clear", "operator", post_clear, "Free the space of an absent arm: a ClearRequest."),
+        ("POST", "/v4/reset", "operator", post_reset, 'Clear the fault of an arm: {"arm": …, "by": …}.'),
         ("POST", "/v4/ask", "submitter", post_ask, 'Quotes without submitting: {"jobs": […]}.'),
     ]
     routes = [Route(path, _checked(role, handle), methods=[method]) for method, path, role, handle, _ in table]
+    if page is not None:
+        routes += [Route(f"/page/{name}", page.file, methods=["GET"]) for name in (*FILES, "three.js")]
     handlers = dict.fromkeys((Problem, NoReply, HTTPException, Exception), error_response)
-    return Starlette(routes=routes, exception_handlers=handlers, middleware=[Middleware(AccessCheck, tokens=tokens)])
+    access = Middleware(AccessCheck, tokens=tokens, **({"public": is_public} if page is not None else {}))
+    return Starlette(routes=routes, exception_handlers=handlers, middleware=[access])
 
 
 class EventStream(StreamingResponse):

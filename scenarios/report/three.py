@@ -2,8 +2,8 @@
 
 import re
 from functools import cache
-from importlib.resources import files
-from io import BytesIO
+from importlib.util import find_spec
+from pathlib import Path
 from zipfile import ZipFile
 
 from fleet.errors import FleetError
@@ -20,8 +20,11 @@ def three_js() -> str:
         FleetError: trimesh is not installed, or is a version that does not carry three.js.
     """
     try:
-        packed = files("trimesh").joinpath("resources/templates/viewer.zip").read_bytes()
-        page = ZipFile(BytesIO(packed)).read("viewer.html.template").decode()
+        package = find_spec("trimesh")  # not imported, which would take 50 MB
+        if package is None or package.origin is None:
+            raise ModuleNotFoundError("it is not installed")
+        with ZipFile(Path(package.origin).parent / "resources/templates/viewer.zip") as packed:
+            page = packed.read("viewer.html.template").decode()
     except (ModuleNotFoundError, FileNotFoundError, KeyError) as error:
         raise FleetError(f"Pages in 3-D need trimesh: pip install 'thermofleet[report]' ({error}).") from error
     found = _LIBRARY.search(page)

@@ -17,7 +17,7 @@ from fleet.bus.protocol.messages import encode
 from fleet.errors import BusError
 from fleet.live.monitor.event_feed import Entry, EventFeed
 from fleet.live.monitor.listener import FleetListener
-from fleet.live.monitor.snapshot import FleetSnapshot, Role
+from fleet.live.monitor.snapshot import MAX_JOBS, FleetSnapshot, Role
 
 _LOG = logging.getLogger(__name__)
 
@@ -64,9 +64,9 @@ class AsyncBridge:
         self._stop.set()
         await asyncio.to_thread(self._thread.join)
 
-    async def snapshot(self) -> FleetSnapshot:
-        """Return the fleet as it is now."""
-        return await self._on_bus(lambda done: done(self._listener.view.snapshot(time.monotonic())))
+    async def snapshot(self, jobs: int = MAX_JOBS) -> FleetSnapshot:
+        """Return the fleet as it is now, with at most `jobs` of the jobs that changed last."""
+        return await self._on_bus(lambda done: done(self._listener.view.snapshot(time.monotonic(), jobs)))
 
     async def submit(self, submission: Submission) -> SubmissionReply:
         """Submit jobs. Raises NoReply if no auctioneer replied, or it refused."""
@@ -80,18 +80,17 @@ class AsyncBridge:
         """Send another request to the auctioneer. Raises NoReply if it did not reply, or refused."""
         return await self._ask_auctioneer(keys.of_jobs(self._link.fleet, topic), request, kind)
 
+    async def request_of_arm(self, arm: str, topic: keys.ArmTopic, request: msgspec.Struct, kind: type[Reply]) -> Reply:
+        """Send a request to an arm. Raises NoReply if it did not reply, or refused."""
+        return _only(await self._ask(keys.of_arm(self._link.fleet, arm, topic), request, kind, REPLY_S), f"arm '{arm}'")
+
     async def quotes(self, request: QuoteRequest) -> Quotes:
         """Request quotes of every arm. Raises NoReply if the gateway's certificate does not permit it."""
         answers = await self._ask(keys.of_every_arm(self._link.fleet, "quote"), request, Quote, QUOTE_S)
         return Quotes(tuple(answers.messages.values()), tuple(answers.refused.values()))
 
     async def _ask_auctioneer(self, key: str, request: msgspec.Struct, kind: type[Reply]) -> Reply:
-        answers = await self._ask(key, request, kind, REPLY_S)
-        for reply in answers.messages.values():
-            return reply
-        for reason in answers.refused.values():
-            raise NoReply(f"The auctioneer refused: {reason}" if reason else "The auctioneer did not reply in time.")
-        raise NoReply("There is no auctioneer in this fleet.")
+        return _only(await self._ask(key, request, kind, REPLY_S), "auctioneer")
 
     async def _ask(self, key: str, request: msgspec.Struct, kind: type[Reply], timeout_s: float) -> Replies[Reply]:
         def ask(done: Callable[[Replies[Reply] | BusError], None]) -> None:
@@ -138,3 +137,12 @@ class AsyncBridge:
             self._loop.call_soon_threadsafe(call)
         except RuntimeError:
             _LOG.debug("The event loop has ended.")
+
+
+def _only(answers: Replies[Reply], who: str) -> Reply:
+    """Return the first reply. Raises NoReply if there is none."""
+    for reply in answers.messages.values():
+        return reply
+    for reason in answers.refused.values():
+        raise NoReply(f"The {who} refused: {reason}" if reason else f"The {who} did not reply in time.")
+    raise NoReply(f"There is no {who} in this fleet.")

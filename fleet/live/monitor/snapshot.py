@@ -16,6 +16,7 @@ import msgspec
 from fleet.bus.protocol import auction
 from fleet.bus.protocol.auction import Announcement, ArmEvent, JobStatus, Result, Status
 from fleet.bus.protocol.messages import DifficultyScores, Info, State, encode
+from fleet.bus.protocol.operator import ALL_ARMS, ControlRequest, Operation, Pause, Resume
 from fleet.live.monitor.recent import Recent
 from fleet.telemetry import Mode
 
@@ -88,6 +89,10 @@ class FleetSnapshot(msgspec.Struct, frozen=True):
     """The most recently changed last."""
     space: dict[str, tuple[str, ...]] = {}
     """Names of the spaces that are closed to others, by arm, as the last status reply has them."""
+    paused: dict[str, str] = {}
+    """Who paused an arm, by arm, as the last status reply has it; "*" for all arms."""
+    speed: float | None = None
+    """Fleet seconds per real second."""
 
 
 @dataclass
@@ -128,6 +133,7 @@ class FleetView:
     _arms: "Recent[str, _Arm]" = field(default_factory=lambda: Recent(MAX_NAMES))
     _auctioneers: "Recent[str, _Auctioneer]" = field(default_factory=lambda: Recent(MAX_NAMES))
     _space: dict[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
+    _paused: dict[str, str] = field(default_factory=dict[str, str])
     _jobs: "Recent[str, _Job]" = field(default_factory=lambda: Recent(MAX_JOBS))
 
     def set_token(self, role: Role, name: str, present: bool) -> bool:
@@ -142,6 +148,9 @@ class FleetView:
             self._auctioneer(name).heard_s = now_s
             if isinstance(message, Result):
                 self._set_status(message.status, now_s, message.number)
+        elif isinstance(message, Operation):
+            if message.time_s >= max((known.time_s for known in self._auctioneers.values()), default=-math.inf):
+                self._pause(message.request)
         elif isinstance(message, State | DifficultyScores | Info | ArmEvent):
             self._arm(name).messages[type(message)] = message, now_s
 
@@ -153,7 +162,8 @@ class FleetView:
                 self._jobs.clear()
             for job in self._jobs.values():
                 job.number = 0
-        auctioneer.heard_s, auctioneer.time_s, self._space = now_s, reply.time_s, dict(reply.space)
+        auctioneer.heard_s, auctioneer.time_s = now_s, reply.time_s
+        self._space, self._paused = dict(reply.space), dict(reply.paused)
         for status in reply.jobs:
             self._set_status(status, now_s)
 
@@ -183,7 +193,20 @@ class FleetView:
             counts=dict(Counter(status.state for status in statuses)),
             jobs=tuple(statuses[-jobs:]) if jobs > 0 else (),
             space=self._space,
+            paused=dict(self._paused),
+            speed=self.speed,
         )
+
+    def _pause(self, request: ControlRequest) -> None:
+        """Apply a pause or its end, which the next status reply confirms."""
+        match request.action:
+            case Pause(arm):
+                self._paused[arm] = request.by
+            case Resume(arm):
+                kept = {} if arm == ALL_ARMS else {name: by for name, by in self._paused.items() if name != arm}
+                self._paused = kept
+            case _:
+                pass
 
     def _arm(self, name: str) -> _Arm:
         arm = self._arms[name] = self._arms.get(name) or _Arm()

@@ -1,4 +1,4 @@
-"""`thermofleet gateway`: the bus over HTTP and server-sent events, for clients without Zenoh."""
+"""`thermofleet gateway` and `dashboard`: the bus over HTTP and server-sent events, and a page for browsers."""
 
 import asyncio
 import ipaddress
@@ -9,7 +9,7 @@ import socket
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 import uvicorn
@@ -17,6 +17,7 @@ from starlette.applications import Starlette
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from fleet.bus.client.client import BusClient
+from fleet.env.render.heat import heat_scale
 from fleet.errors import FleetError
 from fleet.live.monitor.async_bridge import AsyncBridge
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, number, the_fleet
@@ -24,35 +25,80 @@ from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import Interrupted, echo
 from scenarios.live.http_access import MIN_TOKEN, ROLES, Role, check_token, read_tokens
 from scenarios.live.http_app import STUCK_S, Readers, application
+from scenarios.live.http_page import LivePage
+from scenarios.load import load
+from scenarios.report.three import three_js
+from scenarios.schema import Scenario
 
 TOKEN = "THERMOFLEET_TOKEN"
+PORT = 8080
 MAX_CONNECTIONS, MAX_WAITING, HEADER_S = 1000, 128, 5.0
 """Connections at a time; those that have sent no complete request yet, of which one more ends the oldest; and real
 seconds after which such a connection ends."""
 _LOG = logging.getLogger(__name__)
+PortOption = Annotated[int, number("TCP port of the gateway; 0 takes a free one.", 0, 65535)]
+HostOption = Annotated[str, typer.Option(help="Listening address; beyond loopback only with a token.")]
+TokenOption = Annotated[
+    str,
+    typer.Option(
+        envvar=TOKEN, help="Bearer token for all requests. Prefer the variable: other users can read command lines."
+    ),
+]
+TokensOption = Annotated[
+    Path | None,
+    typer.Option(
+        help=f"File with ROLE TOKEN in each line, readable by you alone. Roles: {', '.join(ROLES)}; each may do "
+        "what the ones before it may."
+    ),
+]
 
 
 def gateway_command(
     endpoint: EndpointOption = ENDPOINT,
     fleet: FleetOption = "",
-    port: Annotated[int, number("TCP port of the gateway; 0 takes a free one.", 0, 65535)] = 8080,
-    host: Annotated[str, typer.Option(help="Listening address; beyond loopback only with a token.")] = "127.0.0.1",
-    token: Annotated[
-        str,
-        typer.Option(
-            envvar=TOKEN,
-            help="Bearer token for all requests. Prefer the variable: other users can read command lines.",
-        ),
-    ] = "",
-    tokens: Annotated[
-        Path | None,
-        typer.Option(
-            help=f"File with ROLE TOKEN in each line, readable by you alone. Roles: {', '.join(ROLES)}; each may do "
-            "what the ones before it may."
-        ),
-    ] = None,
+    port: PortOption = PORT,
+    host: HostOption = "127.0.0.1",
+    token: TokenOption = "",
+    tokens: TokensOption = None,
 ) -> None:
     """Serve the fleet over HTTP until Ctrl-C or SIGTERM."""
+    run(endpoint, fleet, port, host, token, tokens)
+
+
+def dashboard_command(
+    scenario: Annotated[
+        str,
+        typer.Argument(help="Scenario of the cell, to draw its fixtures too. Default: as the auctioneer describes it."),
+    ] = "",
+    endpoint: EndpointOption = ENDPOINT,
+    fleet: FleetOption = "",
+    port: PortOption = PORT,
+    host: HostOption = "127.0.0.1",
+    token: TokenOption = "",
+    tokens: TokensOption = None,
+) -> None:
+    """Serve a live page for browsers, until Ctrl-C or SIGTERM.
+
+    It is a gateway with a page: arms in 3-D, temperatures, jobs, offers,
+    alerts, and what the role of a token may request.
+    """
+    three_js()  # if it is missing, say so at once
+    run(endpoint, fleet, port, host, token, tokens, LivePage(scene_of(load(scenario)) if scenario else None))
+
+
+def scene_of(scenario: Scenario) -> dict[str, Any]:  # values of JSON
+    """The cell of a scenario as the page draws it."""
+    from fleet.physics.cell_model import cell_model  # loads MuJoCo
+
+    limits, robots = scenario.limits, [arm.robot() for arm in scenario.arms]
+    heat = heat_scale(limits.warning_c, limits.error_c)
+    return {**cell_model(robots, scenario.places, scenario.fixtures), "heat": heat}
+
+
+def run(
+    endpoint: str, fleet: str, port: int, host: str, token: str, tokens: Path | None, page: LivePage | None = None
+) -> None:
+    """Serve until a signal arrives; the arguments are the options of the commands."""
     roles = read_tokens(tokens) if tokens else {}
     if token:
         roles[check_token(token)] = "operator"
@@ -62,7 +108,7 @@ def gateway_command(
         with until_stopped() as stop:
             link = BusClient(endpoint, name, stopped=stop.is_set).open()
         with link:
-            number = asyncio.run(serve(link, bound, roles))
+            number = asyncio.run(serve(link, bound, roles, page))
     if number == signal.SIGINT:
         raise Interrupted("The gateway was interrupted.")
 
@@ -169,11 +215,11 @@ def _protocol() -> type[H11Protocol]:
     return Protocol
 
 
-async def serve(link: BusClient, bound: socket.socket, tokens: Mapping[str, Role]) -> int:
+async def serve(link: BusClient, bound: socket.socket, tokens: Mapping[str, Role], page: LivePage | None = None) -> int:
     """Serve until a signal arrives; return its number."""
     readers, received = Readers(), [0]
     async with AsyncBridge(link, readers.put) as bridge:
-        server = Server(application(bridge, readers, tokens=tokens), readers)
+        server = Server(application(bridge, readers, tokens=tokens, page=page), readers)
 
         def stop(number: int) -> None:
             received[0], server.should_exit = number, True
@@ -182,6 +228,7 @@ async def serve(link: BusClient, bound: socket.socket, tokens: Mapping[str, Role
             asyncio.get_running_loop().add_signal_handler(number, stop, number)
         address, bound_port, *_ = bound.getsockname()
         shown = f"[{address}]" if ":" in address else address
-        echo(f"ready gateway http://{shown}:{bound_port}/v4 {os.getpid()}")
+        kind, path = ("gateway", "/v4") if page is None else ("page", "/")
+        echo(f"ready {kind} http://{shown}:{bound_port}{path} {os.getpid()}")
         await server.serve(sockets=[bound])
     return received[0]

@@ -1,5 +1,6 @@
 """`thermofleet up`: run a whole fleet, each participant as its own process: router, arms, recorder and auctioneer."""
 
+import os
 import socket
 import sys
 from pathlib import Path
@@ -23,12 +24,14 @@ from scenarios.cli.options import PolicyOption, RiskOption, ScenarioArg, number
 from scenarios.cli.router import PORT, check_roster
 from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import err_console, out_console, progress_bar, say
+from scenarios.extras import require_extra
 from scenarios.load import load
 from scenarios.policy_loader import scope_of
 from scenarios.schema_errors import choose
 
 START_S = 60.0
 """Real seconds until a participant must be ready: an arm loads its twin."""
+PAGE_PORT, PAGE_READY = 8080, "ready page "
 PROGRAM = (sys.executable, "-c", "from scenarios.cli.main import main; main()")
 
 
@@ -129,6 +132,10 @@ def up_command(
     host: Annotated[
         str, typer.Option(help="--tls: address on which the router listens, as 0.0.0.0. Default: loopback only.")
     ] = "",
+    page: Annotated[
+        bool,
+        typer.Option("--page", help=f"Also serve a live page (thermofleet dashboard), on port {PAGE_PORT} if free."),
+    ] = False,
 ) -> None:
     """Start a whole fleet, each participant as its own process, and keep it running until its jobs are done.
 
@@ -143,6 +150,8 @@ def up_command(
         raise FleetError(f"The keys of --tls are for the fleet of their scenario; leave --fleet out (got '{fleet}').")
     names = chosen_arms(arms, tuple(arm.name for arm in chosen.arms))
     _check_place(arms, router, host, names[0], tls)
+    if page:
+        _check_page(tls)
     if tls is not None:
         check_roster(tls, scenario)
     refuse_other_way(folder / "journals", names, alone=scope_of(policy) == "arm", new_epoch=new_epoch)
@@ -165,6 +174,7 @@ def up_command(
         host=host,
         at=router,
     )
+    shown = page_of(scenario, fleet, router or own_router.ready, tls) if page else None
     at, count = router or own_router.ready, f"{len(parts)} arm{'s' * (len(parts) > 1)}"
     central = f"{count}, which allocate the jobs" if auction is None else f"{count} and the auctioneer"
     say(f"Starting {count if router else f'the router, the recorder, {central}'} …", err_console)
@@ -177,12 +187,16 @@ def up_command(
                 supervisor.start(part)
             for part in together:
                 supervisor.await_ready(part.name, START_S, stop.is_set)
+        if shown is not None:
+            supervisor.start(shown, ready_s=START_S)
         watch = Tls(tls, "monitor").endpoint(at) if tls else at
         say(
             f"{fleet} is up: {count} at {at}, {speed:g} times as fast as real time; logs in "
             f"{supervisor.folder}. To watch it: thermofleet watch --endpoint {watch}",
             out_console,
         )
+        if shown is not None:
+            say(f"Page: {shown.ready.removeprefix(PAGE_READY)}", out_console)
         if ended := supervisor.run(stop.is_set):
             for line in supervisor.log_since_ready(ended).splitlines():
                 say(line, out_console)
@@ -194,6 +208,30 @@ def up_command(
     if not router:
         say(f"Recorded in {folder / 'recording'}.", out_console)
     stop.leave(f"The fleet was stopped; journals, recording and logs are in {folder}; the same command continues.")
+
+
+def page_of(scenario: str, fleet: str, at: str, tls: Path | None) -> Part:
+    """The live page of a fleet, on a port that is free now; it keeps the port when it is restarted."""
+    endpoint, port = at if tls is None else Tls(tls, "operator").endpoint(at), free_port(PAGE_PORT)
+    argv = (*PROGRAM, "dashboard", scenario, "--endpoint", endpoint, "--fleet", fleet, "--port", str(port))
+    return Part(name="page", argv=argv, rank=1, ready=f"{PAGE_READY}http://127.0.0.1:{port}/")
+
+
+def _check_page(tls: Path | None) -> None:
+    """Check that the page can be served.
+
+    Raises:
+        MissingExtra: a library is missing.
+        FleetError: a token or a certificate is missing.
+    """
+    require_extra("gateway")
+    require_extra("report")
+    from scenarios.cli.live.gateway import TOKEN
+
+    if tls is not None and not os.environ.get(TOKEN):
+        raise FleetError(f"With --tls the page needs a token: set {TOKEN} to 16 or more random characters.")
+    if tls is not None and not (tls / "operator.pem").is_file():
+        raise FleetError(f"The page needs a certificate: thermofleet keys {tls} --add operator:operator")
 
 
 def chosen_arms(text: str, names: tuple[str, ...]) -> tuple[str, ...]:

@@ -17,7 +17,11 @@ function makeCell(place, model) {
   place.append(renderer.domElement);
   renderer.outputEncoding = THREE.sRGBEncoding;
   const dark = matchMedia("(prefers-color-scheme: dark)");
-  const ground = () => { scene.background = new THREE.Color(dark.matches ? "#16181b" : "#f3f4f5"); changed = true; };
+  const ground = () => {
+    scene.background = new THREE.Color(dark.matches ? "#16181b" : "#f3f4f5");
+    floor.material.opacity = dark.matches ? 0.3 : 1;
+    changed = true;
+  };
   scene.add(new THREE.HemisphereLight("#ffffff", "#9a9a9a", 0.85));
   const sun = new THREE.DirectionalLight("#ffffff", 0.5);
   sun.position.set(2, -3, 6);
@@ -72,6 +76,7 @@ function makeCell(place, model) {
   const across = Math.max(1, ...box.getSize(new THREE.Vector3()).toArray());
   const floor = new THREE.GridHelper(Math.ceil(across + 3), Math.ceil(across + 3) * 2, "#9aa0a6", "#c3c7cb");
   floor.rotation.x = Math.PI / 2;
+  floor.material.transparent = true;
   const centre = box.getCenter(new THREE.Vector3());
   floor.position.set(centre.x, centre.y, Math.min(0, box.min.z) - 0.002);
   scene.add(floor);
@@ -160,12 +165,12 @@ function makeCell(place, model) {
 
   // The camera goes round a target: drag to turn, shift-drag or two fingers to move, wheel or pinch to zoom.
   const target = centre.clone().add(new THREE.Vector3(0, 0, 0.35));
-  const start = { azimuth: -0.9, height: 0.62, distance: 1.2 + 1.05 * across };
+  const start = { azimuth: -0.9, height: 0.62, distance: 1.5 + 1.35 * across };
   let view = { ...start }, fingers = new Map(), spread = 0;
   function look() {
     const { azimuth, height, distance } = view;
     camera.position.set(Math.cos(azimuth) * Math.cos(height), Math.sin(azimuth) * Math.cos(height), Math.sin(height))
-      .multiplyScalar(distance).add(target);
+      .multiplyScalar(distance * Math.max(1, 1.3 / camera.aspect)).add(target); // farther away on a narrow screen
     camera.lookAt(target);
     changed = true;
   }
@@ -228,7 +233,7 @@ function makeCell(place, model) {
     renderer.setSize(width, height);
     camera.aspect = width / height;
     camera.updateProjectionMatrix();
-    changed = true;
+    look();
   }).observe(place);
   dark.addEventListener("change", ground);
   ground();

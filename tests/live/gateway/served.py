@@ -82,16 +82,17 @@ class StandIn:
 
 
 class Served:
-    """A gateway in this process, on a free port."""
+    """A gateway in this process, on a free port or the one given."""
 
-    def __init__(self, endpoint, **options):
+    def __init__(self, endpoint, port=0, **options):
+        self.port = port
         self.endpoint, self.options, self.readers = endpoint, options, Readers()
         self.started = threading.Event()
         self.thread = threading.Thread(target=lambda: asyncio.run(self.run()))
 
     async def run(self):
         stuck_s = self.options.get("stuck_s", 10.0)
-        with listen("127.0.0.1", 0, stuck_s) as bound, BusClient(self.endpoint, "f") as link:
+        with listen("127.0.0.1", self.port, stuck_s) as bound, BusClient(self.endpoint, "f") as link:
             async with AsyncBridge(link, self.readers.put) as self.gateway:
                 self.server = Server(application(self.gateway, self.readers, **self.options), self.readers)
                 self.port = bound.getsockname()[1]

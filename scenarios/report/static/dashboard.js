@@ -1,0 +1,356 @@
+// The live page: the fleet as its messages show it.
+"use strict";
+
+const FRESH_S = 3, DRAW_MS = 60, TABLES_MS = 500, POLL_MS = 2000, MOST_JOBS = 300, MOST_ROWS = 60, MOST_NOTES = 300, MOST_AWARDS = 20;
+const MODES = { idle: "○ idle", working: "▶ working", faulted: "✖ faulted" };
+const STATES = {
+  waiting: "… waiting", awarded: "▶ awarded", finishing: "▶ finishing", finished: "✔ finished", unfinished: "? unfinished",
+  given_up: "✖ given up", cancelled: "⊘ cancelled",
+};
+
+function startPage() {
+  const gateway = makeGateway();
+  const fleet = { role: "monitor", cell: null, name: "", paused: {}, speed: null, arms: new Map(), jobs: new Map(), auctioneers: [], counts: {}, refresh: poll, now: fleetTime };
+  const actions = makeActions(gateway, fleet);
+  const offers = new Map(), awards = [], noted = new Set();
+  const counted = { updates: 0, states: 0 };
+  let view = null, index = new Map(), heat = null, changed = new Set(), modelText = "", lastDraw = 0, lastTables = 0, looked = "", connected = false, dirty = true;
+
+  const byName = (a, b) => a.name.localeCompare(b.name, "en", { numeric: true });
+  const armOf = (name) => {
+    if (!fleet.arms.has(name)) fleet.arms.set(name, { name, token: false, state: null, atMs: -Infinity, difficultyMs: null });
+    return fleet.arms.get(name);
+  };
+  const ageOf = (arm) => arm.state ? (performance.now() - arm.atMs) / 1000 : null;
+  const isPresent = (arm) => arm.token && arm.state !== null && ageOf(arm) <= FRESH_S;
+  function fleetTime() {
+    const times = [...fleet.arms.values()].filter(isPresent).map((arm) => arm.state.time_s);
+    return times.length ? Math.max(...times) : 0;
+  }
+
+  // Messages
+
+  function note(key, timeS, who, what, kind) {
+    if (noted.has(key)) return;
+    noted.add(key);
+    if (noted.size > 4 * MOST_NOTES) noted.delete(noted.values().next().value);
+    const row = make("tr", kind ? { class: kind } : {}, ...[timeS === null ? "—" : clock(timeS), who, what].map((text) => make("td", {}, visible(text))));
+    const body = element("journal").tBodies[0];
+    body.prepend(row);
+    if (body.rows.length > MOST_NOTES) body.lastElementChild.remove();
+  }
+
+  function setJob(status, result) {
+    const before = fleet.jobs.get(status.job);
+    fleet.jobs.set(status.job, status);
+    if (fleet.jobs.size > 4 * MOST_JOBS) fleet.jobs.delete(fleet.jobs.keys().next().value);
+    if (status.state === "awarded" && status.arm && (!before || before.arm !== status.arm || before.state !== "awarded")) {
+      const all = new Map(offers.get(status.job));
+      if (result && result.peak_c !== undefined) all.set(status.arm, { peak: result.peak_c, p: result.p_saturation, d: result.difficulty });
+      if (all.size || result) {
+        awards.unshift({ key: `${status.job}/${status.award}/${status.arm}`, job: status.job, arm: status.arm, offers: all });
+        awards.splice(MOST_AWARDS);
+      }
+    }
+  }
+
+  function offer(job, arm, score) {
+    if (!offers.has(job)) offers.set(job, new Map());
+    offers.get(job).set(arm, score);
+    if (offers.size > MOST_JOBS) offers.delete(offers.keys().next().value);
+  }
+
+  function describe({ action, job, arm, outcome, due_s: due, value }) {
+    const whom = arm === undefined || arm === "*" ? "all arms" : arm;
+    switch (action) {
+      case "pause": case "resume": return `asked to ${action} ${whom}`;
+      case "settle": return `settled ${job} as ${outcome}`;
+      case "change": return `changed ${job}:${due === undefined ? "" : due === null ? " no due date" : ` due at ${clock(due)}`}${value === undefined ? "" : ` value ${value}`}`;
+      default: return `asked to ${action} ${job}`;
+    }
+  }
+
+  const apply = {
+    state(name, state) {
+      const arm = armOf(name);
+      if (arm.state && arm.state.mode !== state.mode) arm.changed = true;
+      arm.state = state;
+      arm.atMs = performance.now();
+      changed.add(name);
+      counted.states++;
+    },
+    difficulty(name, scores) {
+      armOf(name).difficultyMs = performance.now();
+      for (const [job, of] of offers) if (!scores.jobs.includes(job)) of.delete(name);
+      scores.jobs.forEach((job, i) => offer(job, name, { peak: (scores.peak_c || [])[i], p: scores.p_saturation[i], d: scores.difficulty[i] }));
+    },
+    bid(name, bid) {
+      for (const { job, plans } of bid.estimates) {
+        const best = (plans || []).reduce((a, b) => !a || (b.difficulty ?? Infinity) < (a.difficulty ?? Infinity) ? b : a, null);
+        if (best) offer(job, name, { peak: best.peak_c, p: best.p_saturation, d: best.difficulty });
+      }
+    },
+    event(name, event) {
+      const value = event.value === undefined || event.value === null ? "" : `${event.kind === "award" ? "d " : ""}${event.value.toFixed(1)}`;
+      const what = [event.kind.replace("_", " "), event.joint ? `joint ${event.joint}` : "", value, event.job && `(${event.job})`, event.reason].filter(Boolean).join(" ");
+      note(`event/${name}/${event.number}`, event.time_s, name, what, ["fault", "contact", "warning"].includes(event.kind) ? event.kind : "");
+    },
+    result(name, result) {
+      const { status } = result, arm = status.arm ? ` ${status.state === "awarded" ? "to" : "by"} ${status.arm}` : "";
+      setJob(status, result);
+      note(`result/${name}/${result.number}/${result.time_s}`, result.time_s, result.by || name, `${status.job}: ${status.state.replace("_", " ")}${arm}${status.reason ? `: ${status.reason}` : ""}`);
+    },
+    operation(name, { time_s: timeS, request }) {
+      note(`operation/${request.request}`, timeS, request.by || "no name given", describe(request.action), "operation");
+    },
+    presence(_, { role, name, there }) {
+      if (role === "arm") {
+        const arm = armOf(name);
+        if (arm.token !== there) note(`presence/${name}/${performance.now()}`, null, name, there ? "joined" : "left");
+        arm.token = there;
+        changed.add(name);
+      } else if (there && connected) setTimeout(() => load().catch(() => {}), POLL_MS); // it needs a moment
+    },
+    gap: () => note(`gap/${performance.now()}`, null, "gateway", "some events were missed"),
+  };
+  function onMessage(topic, data) {
+    if (apply[topic]) apply[topic](data.name, data.message);
+    dirty = true;
+  }
+
+  // Requests
+
+  async function load() {
+    fleet.role = (await gateway.request("/")).role;
+    await poll();
+    let missing = "";
+    try {
+      fleet.cell = await gateway.request("/v4/cell");
+      actions.offer(fleet.cell);
+    } catch (error) {
+      missing = `The form needs a description of the cell. ${error.message}`;
+    }
+    element("no-cell").hidden = !missing;
+    setText(element("no-cell"), missing);
+    try {
+      await draw(await gateway.request("/v4/scene"));
+    } catch (error) {
+      if (!view) setText(element("cell"), `The cell cannot be drawn. ${error.message}`);
+    }
+  }
+
+  async function draw(model) {
+    const text = JSON.stringify(model);
+    if (text === modelText) return;
+    if (view) location.reload(); // another cell
+    modelText = text;
+    index = new Map(model.arms.map((arm, i) => [arm.name, i]));
+    heat = model.heat;
+    element("cell").textContent = "";
+    try {
+      view = makeCell(element("cell"), { ...model, arms: model.arms.map((arm) => ({ ...arm, name: visible(arm.name) })) });
+    } catch {
+      setText(element("cell"), "This browser cannot draw in 3-D (WebGL is missing). The tables show the same fleet.");
+    }
+    setText(element("scale"), `Motors: small and light green below ${heat.marks_c[0]} °C, orange from ${heat.warning_c} °C (warning), dark red and large from ${heat.error_c} °C (fault). A red arm is faulted, a grey one absent.`);
+    for (const name of fleet.arms.keys()) changed.add(name);
+  }
+
+  async function poll() {
+    const snapshot = await gateway.request(`/v4/fleet?jobs=${MOST_JOBS}`);
+    const nowMs = performance.now();
+    Object.assign(fleet, { name: snapshot.fleet, counts: snapshot.counts, paused: snapshot.paused, speed: snapshot.speed, auctioneers: snapshot.auctioneers });
+    for (const one of snapshot.arms) {
+      const arm = armOf(one.arm);
+      arm.token = one.token;
+      if (one.state_age_s !== null) arm.atMs = Math.max(arm.atMs, nowMs - 1000 * one.state_age_s);
+      arm.difficultyMs = one.difficulty_age_s === null ? null : nowMs - 1000 * one.difficulty_age_s;
+    }
+    const named = new Set(snapshot.jobs.map(({ job }) => job));
+    for (const job of [...fleet.jobs.keys()]) if (!named.has(job)) fleet.jobs.delete(job);
+    for (const status of snapshot.jobs) setJob(status);
+    dirty = true;
+  }
+
+  // Pictures and tables
+
+  const arms = makeTable(element("arms"), 8), jobs = makeTable(element("jobs"), 6), settled = makeTable(element("settled"), 5);
+  const offered = makeTable(element("offers"), 3), present = new Map();
+
+  function drawCell() {
+    if (!view || !changed.size) return;
+    for (const name of changed) {
+      const arm = fleet.arms.get(name), i = index.get(name);
+      if (i === undefined || !arm || !arm.state) continue;
+      const mode = isPresent(arm) ? Math.max(0, ["idle", "working", "faulted"].indexOf(arm.state.mode)) : -1;
+      if (present.get(name) !== mode) view.setMode(i, mode);
+      present.set(name, mode);
+      if (arm.state.temp_c.length === 7) view.setHeat(i, arm.state.temp_c);
+      if ((arm.state.q || []).length === 7) view.setPose(i, arm.state.q, 0);
+    }
+    changed.clear();
+    view.draw();
+    counted.updates++;
+  }
+
+  function fillArm(row, arm) {
+    const [name, mode, hot, job, cycles, predicted, messages, requests] = row.cells, { state } = arm, here = isPresent(arm);
+    if (!name.firstChild) {
+      const button = make("button", { type: "button", class: "plain", title: "Look at this arm" }, visible(arm.name));
+      button.addEventListener("click", () => {
+        looked = looked === arm.name ? "" : arm.name; // a second click shows the whole cell again
+        if (view && index.has(arm.name)) view.focus(looked ? index.get(arm.name) : -1);
+        element("cell").scrollIntoView({ block: "nearest" });
+      });
+      name.append(button);
+      hot.append(make("span", { class: "bar", "aria-hidden": "true" }, make("i")), make("span"));
+    }
+    const pause = fleet.paused["*"] !== undefined ? "*" : fleet.paused[arm.name] !== undefined ? arm.name : "";
+    const word = here ? MODES[state.mode] : "◌ absent";
+    setText(mode, pause ? `${word}, ❚❚ paused` : word);
+    setClass(row, here ? state.mode : "absent");
+    const temps = state ? state.temp_c : [], tempC = Math.max(...temps), of = state && fleet.jobs.get(state.job);
+    const [bar, text] = hot.children;
+    if (temps.length) {
+      const warning = heat ? tempC >= heat.error_c ? " above the limit" : tempC >= heat.warning_c ? " warm" : "" : "";
+      setText(text, `${tempC.toFixed(1)} °C, joint ${temps.indexOf(tempC) + 1}${warning}`);
+      const share = heat ? (tempC - heat.marks_c[0]) / (heat.error_c - heat.marks_c[0]) : tempC / 80;
+      bar.firstChild.style.width = `${Math.round(100 * Math.min(1, Math.max(0, share)))}%`;
+      if (view) bar.firstChild.style.background = `#${view.heatColour(tempC).convertLinearToSRGB().getHexString()}`;
+    } else setText(text, "—");
+    setText(job, (state && state.job) || "—");
+    setText(cycles, of && of.repetitions ? `${of.cycles} of ${of.repetitions}` : state && state.job_cycles_left ? `${state.job_cycles_left} left` : "—");
+    const finish = of && of.finish_s != null ? `done in ${clock(of.finish_s - fleetTime())}` : "";
+    const peak = state && state.job_peak_c != null ? `peak ${state.job_peak_c.toFixed(1)} °C` : "";
+    const chance = state && state.job_p_saturation != null ? `P ${state.job_p_saturation.toFixed(2)}` : "";
+    setText(predicted, [finish, peak, chance].filter(Boolean).join(", ") || "—");
+    const scores = arm.difficultyMs === null ? "—" : age((performance.now() - arm.difficultyMs) / 1000);
+    setText(messages, `state ${age(ageOf(arm))}, scores ${scores}`);
+    const wanted = [];
+    if (actions.may("operator")) {
+      if (pause !== "*") wanted.push(pause ? { text: "▶ Resume", label: `Resume ${arm.name}`, act: () => actions.resume(arm.name) }
+        : { text: "❚❚ Pause", label: `Pause ${arm.name}`, act: () => actions.pause(arm.name) });
+      if (here && state.mode === "faulted") wanted.push({ text: "Reset", label: `Reset ${arm.name}`, act: () => actions.reset(arm.name) });
+      if (!arm.token) wanted.push({ text: "Free its space", label: `Free the space of ${arm.name}`, act: () => actions.clear(arm.name) });
+    }
+    setButtons(requests, wanted);
+  }
+
+  function fillJob(row, status) {
+    const [job, state, arm, cycles, finish, requests] = row.cells;
+    setText(job, status.job);
+    setText(state, `${STATES[status.state] || status.state}${status.not_planned ? ", not planned yet" : ""}${status.reason ? `: ${status.reason}` : ""}`);
+    setClass(row, status.state);
+    setText(arm, status.arm || "—");
+    setText(cycles, status.repetitions ? `${status.cycles} of ${status.repetitions}` : String(status.cycles));
+    const late = status.due_s != null && (status.finish_s ?? fleetTime()) > status.due_s ? " (late)" : "";
+    setText(finish, [status.finish_s == null ? "" : `at ${clock(status.finish_s)}, in ${clock(status.finish_s - fleetTime())}`,
+      status.due_s == null ? "" : `due ${clock(status.due_s)}${late}`].filter(Boolean).join("; ") || "—");
+    const button = (text, act) => ({ text, label: `${text} ${status.job}`, act });
+    setButtons(requests, !actions.may("operator") ? [] : status.state === "unfinished"
+      ? [button("Done", () => actions.settle(status.job, "done")), button("Redo", () => actions.settle(status.job, "redo"))]
+      : [button("Cancel", () => actions.cancel(status.job)), button("Change", () => actions.change(status.job))]);
+  }
+
+  function fillSettled(row, status) {
+    [status.job, STATES[status.state] || status.state, status.arm || "—", clock(status.finished_s), status.reason || ""].forEach((text, i) => setText(row.cells[i], text));
+  }
+
+  function fillOffer(row, { job, state, winner, scores }) {
+    setText(row.cells[0], job);
+    setText(row.cells[1], state);
+    const listed = [...scores].filter(([, { peak, p, d }]) => (peak ?? p ?? d) != null).sort(([a, x], [b, y]) => (x.peak ?? 1e9) - (y.peak ?? 1e9) || (x.d ?? 1e9) - (y.d ?? 1e9) || (a < b ? -1 : 1));
+    const shown = listed.filter(([arm], i) => i < 6 || arm === winner);
+    const text = shown.map(([arm, { peak, p, d }]) => `${arm === winner ? "✔ " : ""}${arm} ${figure(peak, 1, " °C")}, P ${figure(p, 2)}, d ${figure(d, 2)}`);
+    if (shown.length < listed.length) text.push(`and ${listed.length - shown.length} more`);
+    setText(row.cells[2], text.join(";  ") || (winner ? `✔ ${winner}` : "none"));
+  }
+
+  const some = (names) => names.slice(0, 20).join(", ") + (names.length > 20 ? ` and ${names.length - 20} more` : "");
+  function alerts() {
+    const list = [], all = [...fleet.arms.values()].sort(byName);
+    const add = (key, kind, text) => list.push([key, kind, text]);
+    if (connected && !all.some((arm) => arm.token) && !fleet.auctioneers.some((each) => each.token)) {
+      add("nobody", "fault", "No arm and no auctioneer is present: the router or the fleet may be down. This page waits for them.");
+    } else {
+      const absent = all.filter((arm) => !isPresent(arm)).map((arm) => arm.name), faulted = all.filter((arm) => isPresent(arm) && arm.state.mode === "faulted");
+      for (const arm of faulted) add(`faulted/${arm.name}`, "fault", `${arm.name} is faulted.`);
+      if (absent.length) add(`absent/${absent}`, "fault", `Absent: ${some(absent)}.`);
+      const warm = all.filter((arm) => heat && isPresent(arm) && Math.max(...arm.state.temp_c) >= heat.warning_c)
+        .map((arm) => `${arm.name} (joint ${arm.state.temp_c.indexOf(Math.max(...arm.state.temp_c)) + 1})`);
+      if (warm.length) add(`warm/${warm}`, "warning", `Above the warning limit: ${some(warm)}.`);
+    }
+    for (const [arm, by] of Object.entries(fleet.paused)) add(`paused/${arm}/${by}`, "pause", `${arm === "*" ? "All arms are" : `${arm} is`} paused${by ? ` by ${by}` : ""}.`);
+    const unfinished = [...fleet.jobs.values()].filter(({ state }) => state === "unfinished").length;
+    if (unfinished) add(`unfinished/${unfinished}`, "warning", `${unfinished} job(s) unfinished: look at the cell, then settle each as done or redo.`);
+    if (fleet.counts.given_up) add(`given/${fleet.counts.given_up}`, "warning", `${fleet.counts.given_up} job(s) given up.`);
+    if (!list.length) add("none", "none", connected ? "None." : "Unknown while the gateway does not answer.");
+    const words = { fault: "✖ Fault: ", warning: "▲ Warning: ", pause: "❚❚ ", none: "" }, place = element("alert-list");
+    const known = new Map([...place.children].map((item) => [item.dataset.key, item]));
+    for (const [key, item] of known) if (!list.some(([one]) => one === key)) item.remove();
+    for (const [key, kind, text] of list) if (!known.has(key)) place.append(make("li", { class: kind, "data-key": key }, make("b", {}, words[kind]), visible(text)));
+  }
+
+  function drawTables() {
+    setText(element("fleet"), fleet.name || "Fleet");
+    document.title = `${visible(fleet.name)} live`;
+    const all = [...fleet.arms.values()].sort(byName), here = all.filter(isPresent).length;
+    const speed = fleet.speed && fleet.speed !== 1 ? `, ${Number(fleet.speed.toPrecision(3))} times as fast as real time` : "";
+    const auctioneers = fleet.auctioneers.filter((each) => each.token).map((each) => each.auctioneer).join(", ");
+    setText(element("summary"), `Fleet time ${clock(fleetTime())}${speed}. ${here} of ${all.length} arms present. ${auctioneers ? `Auctioneer: ${auctioneers}` : "No auctioneer"}. Your role: ${fleet.role}.`);
+    arms.update(all.map((arm) => [arm.name, arm]), fillArm);
+    const listed = [...fleet.jobs.values()], rank = { unfinished: 0, finishing: 1, awarded: 2, waiting: 3 };
+    const open = listed.filter(({ state }) => state in rank).sort((a, b) => rank[a.state] - rank[b.state]);
+    jobs.update(open.slice(0, MOST_ROWS).map((status) => [status.job, status]), fillJob);
+    const counts = Object.entries(fleet.counts).map(([state, count]) => `${count} ${state.replace("_", " ")}`).join(", ");
+    setText(element("counts"), `${counts || "No jobs"}.${open.length > MOST_ROWS ? ` The first ${MOST_ROWS} of ${open.length} open jobs are listed.` : ""}`);
+    if (element("settled-part").open) settled.update(listed.filter(({ state }) => !(state in rank)).reverse().slice(0, MOST_ROWS).map((status) => [status.job, status]), fillSettled);
+    const waiting = open.filter(({ job, state }) => state === "waiting" && (offers.get(job) || new Map()).size).slice(0, MOST_AWARDS);
+    offered.update([
+      ...waiting.map(({ job }) => [`waiting/${job}`, { job, state: "… waiting", winner: "", scores: offers.get(job) }]),
+      ...awards.map((award) => [award.key, { job: award.job, state: `✔ to ${award.arm}`, winner: award.arm, scores: award.offers }]),
+    ], fillOffer);
+    alerts();
+    actions.allow();
+  }
+
+  function frame(ms) {
+    if (ms - lastDraw >= DRAW_MS) {
+      lastDraw = ms;
+      drawCell();
+    }
+    if (dirty && ms - lastTables >= TABLES_MS) {
+      lastTables = ms;
+      drawTables();
+    }
+    if (view) view.draw();
+    requestAnimationFrame(frame);
+  }
+  function say(text, style) {
+    setText(element("link"), text);
+    setClass(element("link"), `status ${style}`);
+  }
+  gateway.follow({
+    onMessage,
+    async onOpen() {
+      connected = true;
+      await load();
+      say("● Connected", "good");
+      document.body.dataset.ready = "live";
+    },
+    onLost(reason) {
+      connected = false;
+      dirty = true;
+      say(`✖ ${reason}. What is shown may be old. Connecting again …`, "bad");
+    },
+  });
+  setInterval(() => {
+    dirty = true; // ages
+    for (const arm of fleet.arms.values()) if (isPresent(arm) !== (present.get(arm.name) !== -1)) changed.add(arm.name);
+    if (connected) poll().catch(() => {});
+  }, POLL_MS);
+  requestAnimationFrame(frame);
+  window.dashboard = counted;
+}
+
+startPage();

@@ -1,0 +1,216 @@
+"""A fleet that moves, warms and does the jobs it gets, on a thread: what a live page is tested with."""
+
+import math
+import threading
+import time
+
+from fleet.bus.client.client import BusClient, Refused
+from fleet.bus.protocol import auction as bus
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.cell import Cell, CellArm, CellKind, CellPlace, CellRequest, Limit, PlannedWork
+from fleet.bus.protocol.messages import DifficultyScores, State
+from fleet.bus.protocol.operator import (
+    Cancel,
+    Change,
+    Cleared,
+    ClearRequest,
+    Controlled,
+    ControlRequest,
+    Operation,
+    Pause,
+    ResetReply,
+    ResetRequest,
+    Settle,
+)
+from fleet.job import BOUNDS
+
+WARNING_C, ERROR_C = 60.0, 75.0
+PATIENCE_S = 60.0
+PLACES = ("conveyor", "pallet", "clamp")
+
+
+def until(condition):
+    """The first true value of a condition that other threads bring about."""
+    deadline_s, pause = time.monotonic() + PATIENCE_S, threading.Event()
+    while not (value := condition()):
+        assert time.monotonic() < deadline_s, "waited in vain"
+        pause.wait(0.02)
+    return value
+
+
+class MovingFleet:
+    """`with MovingFleet(endpoint, ("arm_0", "arm_1")) as fleet:` publishes until the end of the block.
+
+    Attributes:
+        requests: Every request of a person, in order.
+        temp_c: Temperature of joint 2, by arm.
+        mode: Mode of each arm.
+        jobs: Status of every job by name.
+    """
+
+    def __init__(self, endpoint, arms=("arm_0", "arm_1", "arm_2", "arm_3"), fleet="cell", rate_hz=10.0, cycle_s=0.3):
+        self.link, self.fleet, self.arms, self.rate_hz = BusClient(endpoint, fleet), fleet, arms, rate_hz
+        self.requests, self.jobs, self.paused = [], {}, {}
+        self.temp_c = {arm: 35.0 + 6.0 * i for i, arm in enumerate(arms)}
+        self.mode = dict.fromkeys(arms, "idle")
+        self.work = {}  # job by arm, and the real second at which its next cycle ends
+        self.cycle_s, self.number, self.tick = cycle_s, 0, 0
+        self.stop, self.thread = threading.Event(), threading.Thread(target=self.serve)
+
+    def __enter__(self):
+        link, fleet = self.link.open(), self.fleet
+        self.start_s = time.monotonic()
+        self.states = {arm: link.publisher(keys.of_arm(fleet, arm, "state"), State) for arm in self.arms}
+        self.scores = {
+            arm: link.publisher(keys.of_arm(fleet, arm, "difficulty"), DifficultyScores) for arm in self.arms
+        }
+        self.events = {arm: link.publisher(keys.of_arm(fleet, arm, "event"), bus.ArmEvent) for arm in self.arms}
+        self.results = link.publisher(keys.of_auction(fleet, "auctioneer", "result"), bus.Result)
+        self.operations = link.publisher(keys.of_auction(fleet, "auctioneer", "operation"), Operation)
+        for arm in self.arms:
+            link.declare_token(keys.of_arm(fleet, arm, "alive"))
+            link.reply_to(keys.of_arm(fleet, arm, "quote"), bus.QuoteRequest, lambda r, arm=arm: self.quote(arm, r))
+            link.reply_to(keys.of_arm(fleet, arm, "reset"), ResetRequest, lambda r, arm=arm: self.reset(arm, r))
+        link.declare_token(keys.of_auction(fleet, "auctioneer", "alive"))
+        link.reply_to(keys.of_jobs(fleet, "submit"), bus.Submission, self.submit)
+        link.reply_to(keys.of_jobs(fleet, "status"), bus.StatusRequest, self.status)
+        link.reply_to(keys.of_jobs(fleet, "control"), ControlRequest, self.control)
+        link.reply_to(keys.of_jobs(fleet, "clear"), ClearRequest, self.clear)
+        link.reply_to(keys.of_jobs(fleet, "cell"), CellRequest, lambda _: self.cell())
+        link.reply_to(keys.of_clock(fleet), bus.ClockRequest, lambda _: bus.Clock(self.now(), 1.0))
+        self.thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self.stop.set()
+        self.thread.join()
+        self.link.close()
+
+    def now(self):
+        return time.monotonic() - self.start_s
+
+    def serve(self):
+        while not self.stop.is_set():
+            until_s = time.monotonic() + 1.0 / self.rate_hz
+            self.move()
+            while time.monotonic() < until_s:
+                self.link.serve(until_s)
+
+    def move(self):
+        """Publish where every arm is, and get on with the jobs."""
+        self.tick += 1
+        now_s = self.now()
+        for i, arm in enumerate(self.arms):
+            job = self.work.get(arm, ("", 0.0))[0]
+            swing = math.sin(now_s + i)
+            q = (swing, 0.4 + 0.3 * swing, 3.1, -2.0 + 0.4 * swing, 0.0, 0.9, 1.57)
+            temp_c = (30.0, self.temp_c[arm], 31.0, 33.0, 29.0, 28.0, 27.0)
+            status = self.jobs.get(job)
+            left = {} if status is None else {"job_peak_c": self.temp_c[arm] + 3.0, "job_p_saturation": 0.05}
+            self.states[arm](
+                State(arm=arm, tick=self.tick, time_s=now_s, mode=self.mode[arm], temp_c=temp_c, job=job, q=q,
+                      headroom_k=WARNING_C - self.temp_c[arm], qd=(0.1,) * 7, tau=(1.0,) * 7, current_a=(0.2,) * 7,
+                      housing_c=(25.0,) * 7, ambient_c=22.0, **left)
+            )  # fmt: skip
+        if self.tick % 5 == 1:
+            self.score()
+        self.progress()
+
+    def score(self):
+        names = tuple(name for name, status in self.jobs.items() if status.state == "waiting")
+        for i, arm in enumerate(self.arms):
+            peaks = tuple(self.temp_c[arm] + 4.0 + i for _ in names)
+            d, p = tuple(0.2 + 0.1 * i for _ in names), tuple(0.01 * (i + 1) for _ in names)
+            self.scores[arm](DifficultyScores(arm, self.tick, self.now(), "twin", names, d, p, peaks))
+
+    def progress(self):
+        real_s = time.monotonic()
+        for arm, (job, due_s) in list(self.work.items()):
+            status = self.jobs[job]
+            if status.state == "cancelled" or arm in self.paused:
+                self.end(arm)
+            elif real_s >= due_s:
+                cycles, total = status.cycles + 1, status.repetitions
+                self.work[arm] = job, real_s + self.cycle_s
+                if cycles == total:
+                    self.set(job, state="finished", arm=arm, cycles=cycles, repetitions=total, finished_s=self.now())
+                    self.end(arm)
+                else:
+                    self.jobs[job] = bus.JobStatus(
+                        job, "awarded", arm, "a", cycles, repetitions=total, finish_s=self.now() + total - cycles
+                    )
+        free = [a for a in self.arms if a not in self.work and self.mode[a] == "idle" and a not in self.paused]
+        waiting = [name for name, status in self.jobs.items() if status.state == "waiting"]
+        for arm, job in zip(free if "*" not in self.paused else (), waiting, strict=False):
+            if self.tick % 10 == 0:  # after some scores
+                self.mode[arm], self.work[arm] = "working", (job, real_s + self.cycle_s)
+                self.set(job, state="awarded", arm=arm, award="a", repetitions=self.jobs[job].repetitions, cycles=0)
+
+    def end(self, arm):
+        del self.work[arm]
+        self.mode[arm] = "idle"
+
+    def set(self, job, by="", **fields):
+        self.jobs[job] = status = bus.JobStatus(job, **fields)
+        self.number += 1
+        scores = {"difficulty": 0.2, "p_saturation": 0.01, "peak_c": 41.0} if status.state == "awarded" else {}
+        self.results(bus.Result("auctioneer", self.number, self.now(), status, by=by, **scores))
+
+    def post(self, call):
+        """Have the fleet's own thread call."""
+        self.link.post(call)
+
+    # Requests
+
+    def cell(self):
+        work = PlannedWork("pick_place", ("conveyor", "pallet"), 1.5, 2, 9.6, 0.5)
+        places = tuple(CellPlace(name, (0.4, 0.3 * i, 0.2), (180.0, 0.0, 0.0), 0.08) for i, name in enumerate(PLACES))
+        arms = tuple(
+            CellArm(arm, (1.6 * (i % 4), 1.6 * (i // 4), 0.0), (0.0, 0.0, 0.0), 3.0, 0.5, 0.902, (work,))
+            for i, arm in enumerate(self.arms)
+        )
+        kinds = (CellKind("pick_place", 2, "Take the payload to the second place."), CellKind("hold", 1, "Hold it."))
+        fields = ("payload_kg", "force_n", "dwell_s", "repetitions", "due_s", "value")
+        limits = {name: Limit(*BOUNDS[name]) for name in fields}
+        return Cell("auctioneer", "packing", places, arms, kinds, limits, WARNING_C, ERROR_C, 128)
+
+    def quote(self, arm, request):
+        i = self.arms.index(arm)
+        plan = bus.PlanQuote(peak_c=self.temp_c[arm] + 4, p_saturation=0.01, difficulty=0.2 + i, finish_in_s=30.0)
+        offers = tuple(bus.JobEstimate(job.name, (plan,)) for job in request.jobs)
+        return bus.Quote(arm, request.auction, "", 3.0, "t", self.now(), self.mode[arm], 20.0, 1, offers)
+
+    def submit(self, request):
+        self.requests.append(request)
+        for job in request.jobs:
+            self.set(job.name, request.by, state="waiting", repetitions=job.repetitions)
+        return bus.SubmissionReply("auctioneer", tuple(bus.Admission(job.name, True) for job in request.jobs))
+
+    def status(self, request):
+        return bus.Status("auctioneer", self.now(), tuple(self.jobs.values())[-100:], paused=self.paused)
+
+    def control(self, request):
+        self.requests.append(request)
+        action, status = request.action, None
+        if isinstance(action, Cancel | Settle | Change):
+            if action.job not in self.jobs:
+                raise Refused(f"There is no job '{action.job}'.")
+            status = self.jobs[action.job]
+            state = {Cancel: "cancelled", Settle: "finished", Change: status.state}[type(action)]
+            self.set(action.job, request.by, state=state, repetitions=status.repetitions, cycles=status.cycles)
+            status = self.jobs[action.job]
+        elif isinstance(action, Pause):
+            self.paused[action.arm] = request.by
+        else:
+            self.paused.pop(action.arm, None)
+        self.operations(Operation("auctioneer", self.now(), request))
+        return Controlled("auctioneer", request.request, True, "It is so.", status, dict(self.paused))
+
+    def clear(self, request):
+        self.requests.append(request)
+        return Cleared("auctioneer", request.arm)
+
+    def reset(self, arm, request):
+        self.requests.append(request)
+        changed, self.mode[arm] = self.mode[arm] == "faulted", "idle"
+        return ResetReply(arm, changed)
