@@ -99,10 +99,10 @@ def check_free(out: Path, kind: ResultKind, *, overwrite: bool) -> None:
         check_overwrite(out, overwrite, f"holds a finished {kind.name}")
 
 
-def check_overwrite(out: Path, overwrite: bool, what: str = "exists") -> None:
-    """Raise a FleetError if `out` exists and must not be replaced."""
+def check_overwrite(out: Path, overwrite: bool, what: str = "exists", option: str = "--out") -> None:
+    """Raise a FleetError if `out`, the value of an option, exists and must not be replaced."""
     if out.exists() and not overwrite:
-        raise FleetError(f"'{out}' {what}; give another --out, or --overwrite to replace it.")
+        raise FleetError(f"'{out}' {what}; give another {option}, or --overwrite to replace it.")
 
 
 def _status(card: Path) -> str | None:

@@ -19,6 +19,12 @@ MOTOR_M, HOT_MOTOR_M = 0.052, 0.074
 """Radius of the sphere of a cool motor and of one at the error limit: a hotter motor is also larger."""
 
 
+def motor_radius_m(temp_c: Array, error_c: float) -> Array:
+    """Radius of the sphere of a motor at a temperature in °C, m."""
+    heat = np.clip((temp_c - 20.0) / (error_c - 20.0), 0.0, 1.0)
+    return MOTOR_M + heat * (HOT_MOTOR_M - MOTOR_M)
+
+
 class CellPlayer:
     """The model of a cell, `model`, and its state, `data`.
 
@@ -49,8 +55,7 @@ class CellPlayer:
         """Take postures [arm, joint] in rad, temperatures [arm, joint] in °C and payloads [arm] in kg."""
         self.data.qpos[:] = q.ravel()
         warning_c, error_c = self._limits.warning_c, self._limits.error_c
-        heat = np.clip((temp_c.ravel() - 20.0) / (error_c - 20.0), 0.0, 1.0)
         self.model.site_rgba[self._motors, :3] = heat_colour(temp_c.ravel(), warning_c, error_c)
-        self.model.site_size[self._motors, 0] = MOTOR_M + heat * (HOT_MOTOR_M - MOTOR_M)
+        self.model.site_size[self._motors, 0] = motor_radius_m(temp_c.ravel(), error_c)
         set_payload_balls(self.model, self._payloads, payload_kg)
         mujoco.mj_forward(self.model, self.data)
