@@ -11,11 +11,11 @@ from fleet.telemetry import Telemetry
 from scenarios.report.choices import choices
 from scenarios.report.gantt import clock
 from scenarios.report.page import Moment, Replay, escape, figure_place, html_page, paragraph, replay_place, table
+from scenarios.report.playback import packed, payloads
 from scenarios.report.schedule import schedule
 from scenarios.report.timeline import figure, time_unit
 from scenarios.report.verdict import Verdict, duration, verdict
 from scenarios.shift_records import Offer
-from scenarios.view.playback import packed, payloads
 
 NO_PAYLOADS: Mapping[str, float] = {}
 ROWS = 300

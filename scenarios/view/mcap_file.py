@@ -30,7 +30,7 @@ from fleet.ros2.conversion import Joints, diagnostics_of, joint_names
 from fleet.ros2.topics import plain_name
 from fleet.telemetry import MODES
 from scenarios.progress import Progress, quiet
-from scenarios.view.moments import Moments, ahead
+from scenarios.view.moments import Moments, ahead, motor_spheres
 
 Array = np.ndarray
 
@@ -175,7 +175,7 @@ class _File:
         fleet = moments.run.scenario.name
         for done, sample in enumerate(moments.heats.tolist()):
             time_s, temp_c = float(heat_s[done]), readings.temp_c[sample].astype(float)
-            colours, radii = moments.motors(temp_c)
+            colours, radii = motor_spheres(temp_c, moments.limits)
             now = stamp(time_s)
             statuses: list[Any] = []
             for arm, name in enumerate(self.arms):

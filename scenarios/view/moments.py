@@ -8,21 +8,33 @@ from typing import Any  # plain values of a cell model
 
 import numpy as np
 
-from fleet.env.render.heat import heat_colour
+from fleet.env.render.heat import heat_colour, heat_marks
 from fleet.events import Event
 from fleet.job import payload_radius_m
 from fleet.physics.cell_model import cell_model
-from fleet.physics.cell_player import motor_radius_m
+from fleet.robot import ThermalLimits
+from scenarios.report.playback import HEAT_STEP_S, payloads
 from scenarios.report.schedule import Schedule, schedule
 from scenarios.run.stored_run import StoredRun
 from scenarios.shift_records import Offer
-from scenarios.view.playback import HEAT_STEP_S, payloads
 
 Array = np.ndarray
 
 MOST_POSES, MOST_HEATS = 250_000, 40_000
 """Postures and sets of temperatures of one arm in a file; longer shifts of larger fleets keep fewer moments by default,
 so that a file stays below 100 MB."""
+
+
+MOTOR_M, HOT_MOTOR_M = 0.052, 0.074
+"""Radius of the sphere of a cool motor and of one at the error limit: a hotter motor is also larger."""
+
+
+def motor_spheres(temp_c: Array, limits: ThermalLimits) -> tuple[Array, Array]:
+    """Colours (RGB from 0 to 1, [..., 3]) and radii (m, [...]) of motors at temperatures in °C, [...]."""
+    coolest_c = heat_marks(limits.warning_c, limits.error_c)[0]
+    heat = np.clip((temp_c - coolest_c) / (limits.error_c - coolest_c), 0.0, 1.0)
+    colours = heat_colour(temp_c, limits.warning_c, limits.error_c)
+    return colours, MOTOR_M + heat * (HOT_MOTOR_M - MOTOR_M)
 
 
 @dataclass(frozen=True)
@@ -75,12 +87,6 @@ class Moments:
         cos, sin = np.cos(half), np.sin(half)
         w, x, y, z = fixed.T
         return np.stack([w * cos - z * sin, x * cos + y * sin, y * cos - x * sin, z * cos + w * sin], axis=-1)
-
-    def motors(self, temp_c: Array) -> tuple[Array, Array]:
-        """Colours (RGB from 0 to 1, [..., 3]) and radii (m, [...]) of motors at temperatures in °C, [...]."""
-        limits = self.limits
-        colours = heat_colour(temp_c, limits.warning_c, limits.error_c)
-        return colours, motor_radius_m(temp_c, limits.error_c)
 
     @cached_property
     def plan(self) -> Schedule:

@@ -12,7 +12,7 @@ from fleet.env.render.heat import heat_colour
 from fleet.robot import JOINTS
 from fleet.telemetry import MODES
 from scenarios.progress import Progress, quiet
-from scenarios.view.moments import Moments, ahead
+from scenarios.view.moments import Moments, ahead, motor_spheres
 
 Array = np.ndarray
 
@@ -147,7 +147,7 @@ class _File:
         q = readings.q[moments.poses, index]
         turned = moments.link_quaternions(q)[..., [1, 2, 3, 0]].astype(np.float32)  # Rerun: x, y, z, w
         temp_c = readings.temp_c[moments.heats, index].astype(float)
-        colours, radii = moments.motors(temp_c)
+        colours, radii = motor_spheres(temp_c, moments.limits)
         rgb = np.rint(255 * colours).astype(np.uint8)
         joints = iter(range(JOINTS))
         for i, (link, path) in enumerate(zip(links, paths, strict=True)):

@@ -22,8 +22,8 @@ from fleet.bus.protocol.messages import MalformedMessage
 from fleet.bus.protocol.registry import CHANNELS, MESSAGES, channel_of
 from fleet.bus.protocol.schemas import descriptions, schema_document
 from scenarios.cli.contract import documents
-from scenarios.cli.doc_tables import fill_tables
 from scenarios.cli.main import app
+from scenarios.doc_tables import fill_tables
 
 ROOT = Path(__file__).parents[2]
 DOCUMENT = schema_document()
