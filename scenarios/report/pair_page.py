@@ -47,18 +47,18 @@ class Side:
 def pair_page(title: str, description: str, sides: tuple[Side, Side]) -> str:
     """The page; it links the two reports. The same input gives the same text."""
     columns = [
-        f"<section>{_head(side)}{key_figures(side.run.get('metrics') or {})}"
-        f'<p><a href="{escape(quote(side.report))}">Open its report</a>: 3-D, temperatures, awards.</p>'
-        f"{''.join(paragraph(line, 'faint') for line in other_choices(side, other))}</section>"
+        f"<section>{_head(side, other)}{key_figures(side.run.get('metrics') or {})}"
+        f'<p><a href="{escape(quote(side.report))}">Open its report</a>: 3-D, temperatures, awards.</p></section>'
         for side, other in (sides, sides[::-1])
     ]
     return html_page(title, [paragraph(description, "faint"), f'<div class="pair">{"".join(columns)}</div>'])
 
 
-def _head(side: Side) -> str:
+def _head(side: Side, other: Side) -> str:
     told = side.verdict
     badge = paragraph(told.badge, "status good" if told.good else "status bad")
-    return f"<h2>{escape(side.name)}</h2>{badge}{''.join(paragraph(line, 'verdict') for line in told.sentences)}"
+    lines = [*told.sentences, *other_choices(side, other)]
+    return f"<h2>{escape(side.name)}</h2>{badge}{''.join(paragraph(line, 'verdict') for line in lines)}"
 
 
 def other_choices(side: Side, other: Side) -> list[str]:
@@ -72,5 +72,6 @@ def other_choices(side: Side, other: Side) -> list[str]:
             after = f", after {len(faults)} fault{'s' * (len(faults) > 1)}" if faults else " without a fault"
             lines.append(f"Under {other.name}, {finish.arm} finished {job} at {clock(finish.time_s)}{after}.")
         else:
-            lines.append(f"Under {other.name}, {job} was not finished.")
+            began = any(event.kind == "award" for event in own)
+            lines.append(f"Under {other.name}, {job} was not {'finished' if began else 'begun'}.")
     return lines
