@@ -13,7 +13,7 @@ from fleet.files import atomic_path
 from scenarios.cli.options import number
 from scenarios.cli.terminal import out_console, progress_bar, say
 from scenarios.extras import require_extra
-from scenarios.result_folder import check_overwrite, disk_errors
+from scenarios.result_folder import check_file, disk_errors
 
 NO_DISPLAY = (
     "MuJoCo's viewer needs a display, and there is none (DISPLAY and WAYLAND_DISPLAY are not set). Use "
@@ -89,9 +89,7 @@ def _write_files(what: str, rerun: Path | None, mcap: Path | None, every_s: floa
     for name, (path, ending) in wanted.items():
         if path is None:
             continue
-        if path.suffix.lower() != ending or path.is_dir():
-            raise FleetError(f"--{name} must be a file that ends in {ending} (got '{path}').")
-        check_overwrite(path, overwrite, option=f"--{name}")
+        check_file(path, (ending,), overwrite, f"--{name}")
         for extra in (name, *(("ros2",) if name == "mcap" else ())):
             require_extra(extra)
     if not (Path(what) / "run.json").exists():

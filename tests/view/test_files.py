@@ -169,7 +169,7 @@ def test_a_rerun_file_has_the_shift_and_a_layout(run_folder: Path, run: StoredRu
 @pytest.mark.parametrize(
     ("options", "needed"),
     [
-        (["--mcap", "shift.bag"], "--mcap must be a file that ends in .mcap (got 'shift.bag')"),
+        (["--mcap", "shift.bag"], "--mcap must end in .mcap (got 'shift.bag')"),
         (["--mcap", "there.mcap"], "'there.mcap' exists; give another --mcap"),
         (["--every", "5"], "--every is for --rerun and --mcap"),
     ],
