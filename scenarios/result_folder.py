@@ -106,7 +106,7 @@ def check_overwrite(out: Path, overwrite: bool, what: str = "exists", option: st
 
 
 def check_file(out: Path, endings: Sequence[str], overwrite: bool, option: str = "--out") -> None:
-    """Raise a FleetError unless `out`, the value of an option, ends as asked, for example in `.gif`, is no folder, and may be written."""
+    """Raise a FleetError unless `out`, the value of an option, ends as asked, is no folder, and may be written."""
     if out.suffix.lower() not in endings:
         raise FleetError(f"{option} must end in {', '.join(endings)} (got '{out}').")
     if out.is_dir():

@@ -41,7 +41,8 @@ def definition(kind: str) -> str:
 def message(kind: str, **fields: Any) -> Any:  # rosbags makes its classes at run time
     """A message with some fields; the others are zero or empty."""
     filled: dict[str, Any] = {}
-    for name, (node, of) in _STORE.fielddefs[kind][1]:
+    fields_of: Any = _STORE.fielddefs[kind][1]  # nested tuples of several forms
+    for name, (node, of) in fields_of:
         if name in fields:
             filled[name] = fields[name]
         elif node == Nodetype.NAME:
