@@ -7,7 +7,7 @@ and messages that are lost. `order_events` turns it into a sequence that a sched
 import json
 import math
 from collections import Counter, defaultdict, deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any  # values of the report
