@@ -13,8 +13,10 @@ EXTRAS = {
     "film": ("av",),
     "gateway": ("starlette", "uvicorn"),
     "learn": ("tensordict", "torchrl"),
+    "mcap": ("mcap",),
     "meshes": ("mujoco_menagerie",),
     "onnx": ("onnx", "onnxruntime"),
+    "rerun": ("rerun",),
     "ros2": ("rosbags",),
     "vda5050": ("paho",),
 }

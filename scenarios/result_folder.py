@@ -99,19 +99,19 @@ def check_free(out: Path, kind: ResultKind, *, overwrite: bool) -> None:
         check_overwrite(out, overwrite, f"holds a finished {kind.name}")
 
 
-def check_overwrite(out: Path, overwrite: bool, what: str = "exists") -> None:
-    """Raise a FleetError if `out` exists and must not be replaced."""
+def check_overwrite(out: Path, overwrite: bool, what: str = "exists", option: str = "--out") -> None:
+    """Raise a FleetError if `out`, the value of an option, exists and must not be replaced."""
     if out.exists() and not overwrite:
-        raise FleetError(f"'{out}' {what}; give another --out, or --overwrite to replace it.")
+        raise FleetError(f"'{out}' {what}; give another {option}, or --overwrite to replace it.")
 
 
-def check_file(out: Path, endings: Sequence[str], overwrite: bool) -> None:
-    """Raise a FleetError unless `out` ends as asked, for example in `.gif`, is no folder, and may be written."""
+def check_file(out: Path, endings: Sequence[str], overwrite: bool, option: str = "--out") -> None:
+    """Raise a FleetError unless `out`, the value of an option, ends as asked, is no folder, and may be written."""
     if out.suffix.lower() not in endings:
-        raise FleetError(f"--out must end in {', '.join(endings)} (got '{out}').")
+        raise FleetError(f"{option} must end in {', '.join(endings)} (got '{out}').")
     if out.is_dir():
         raise FleetError(f"Cannot write to '{out}': it is a folder.")
-    check_overwrite(out, overwrite)
+    check_overwrite(out, overwrite, option=option)
 
 
 def _status(card: Path) -> str | None:

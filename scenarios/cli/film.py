@@ -12,6 +12,7 @@ from fleet.errors import FleetError
 from fleet.files import atomic_path
 from scenarios.cli.options import number
 from scenarios.cli.terminal import out_console, progress_bar, say
+from scenarios.progress import Count
 from scenarios.result_folder import check_file, disk_errors
 
 ENDINGS = (".mp4", ".webm", ".gif")
@@ -64,7 +65,7 @@ def film_command(
 
         def counted():
             for number, picture in enumerate(frames(stored, shot, at_s), 1):
-                progress("filming", number / len(at_s))
+                progress("filming", Count(number, len(at_s)))
                 yield picture
 
         with atomic_path(out) as file:

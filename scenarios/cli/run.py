@@ -18,17 +18,20 @@ from scenarios.cli.terminal import INTERRUPTED, Interrupted, out_console, plain_
 from scenarios.load import load
 from scenarios.policy_loader import label, policy_of
 from scenarios.progress import Progress
-from scenarios.result_folder import check_free, new_folder
+from scenarios.result_folder import check_free, disk_errors, new_folder
 from scenarios.run.metrics import Metrics
 from scenarios.schema import Scenario
 from scenarios.schema_errors import choose
 
 if TYPE_CHECKING:  # slow to import
+    from fleet.events import Event
     from scenarios.prepare.fleet import Fleet
     from scenarios.run.shift import RunResult, RunSpec
 
 DEMO_POLICY = "wsept"
 """The policy that the demo compares with `round_robin`."""
+PAIR = "index.html"
+"""The page of the demo."""
 
 
 def run_command(
@@ -106,12 +109,17 @@ def run_command(
 
 
 def demo_command(
-    out: Annotated[Path, typer.Option(help="Folder of the two recordings.")] = Path("out/demo"),
+    out: Annotated[Path, typer.Option(help="Folder of the two recordings and of the page that compares them.")] = Path(
+        "out/demo"
+    ),
     seed: options.SeedOption = 19,
 ) -> None:
     """Run the quickstart shift under two policies, side by side."""
+    from scenarios.report.pair_page import Side, pair_page
+    from scenarios.run.shift import summary
+
     chosen = load("quickstart")
-    results: dict[str, Metrics] = {}
+    results: dict[str, RunResult] = {}
     fleet = None
     with progress_bar() as progress:
         for policy in ("round_robin", DEMO_POLICY):
@@ -119,10 +127,32 @@ def demo_command(
             fleet, result = _run_into(chosen, spec, out / policy, True, progress, fleet=fleet)
             if not result.finished:
                 raise Interrupted(f"Interrupted while working; recordings are in {out}.")
-            results[policy] = result.metrics
+            results[policy] = result
+    first, second = (
+        Side(
+            run=summary(result),
+            events=result.events,
+            arms=[arm.name for arm in chosen.arms],
+            time_s=result.time_s,
+            report=f"{policy}/report.html",
+            offers=result.offers,
+        )
+        for policy, result in results.items()
+    )
+    with disk_errors(out):
+        page = pair_page(f"{chosen.name} · seed {seed} · two policies", chosen.description, (first, second))
+        (out / PAIR).write_text(page, encoding="utf-8")
     say(f"{chosen.name}, seed {seed}: {chosen.description}", out_console)
-    out_console.print(metrics_table(results))
-    say(f"Open {out / DEMO_POLICY / 'report.html'} in a browser to see what happened.", out_console)
+    out_console.print(metrics_table({policy: result.metrics for policy, result in results.items()}))
+    for side in sorted((first, second), key=lambda side: -len(side.faults)):
+        count = len(side.faults)
+        how = f"{count} fault{'s' * (count > 1)}, of {_named(side.faults)}" if count else "no fault"
+        say(f"{side.name}: {how}. {out / side.report}", out_console)
+    say(f"Open {out / PAIR} in a browser to see both side by side.", out_console)
+
+
+def _named(faults: "list[Event]") -> str:
+    return ", ".join(dict.fromkeys(f"{fault.arm} (motor {fault.joint})" for fault in faults))
 
 
 def _spec(policy: str, seed: int, plant: str, bus: str, difficulty: str, risk: str, channel: Channel) -> "RunSpec":

@@ -1,6 +1,8 @@
 """Output of every command: sentences, tables, JSON and a progress bar."""
 
 import textwrap
+import threading
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -13,7 +15,7 @@ from rich.text import Text
 
 from fleet.errors import FleetError, visible
 from fleet.files import cache_folder
-from scenarios.progress import COUNTED, Progress
+from scenarios.progress import COUNTED, Progress, StageClock, brief
 
 
 class SafeConsole(Console):
@@ -37,13 +39,8 @@ def echo(text: str, *, nl: bool = True) -> None:
 out_console = SafeConsole()
 err_console = SafeConsole(stderr=True)
 
-LONG_STAGES = {
-    "training": "Training the twins that are not in the cache: up to a minute per arm and core, full size minutes …",
-    "learning the log": "Training the twin of the log: up to a minute, several minutes at full size …",
-    "teaching": "Training the networks that the report compares and the cache lacks: the longest part …",
-    "comparing": "Comparing the policies …",
-}
-"""Lines printed for long stages when there is no terminal to draw a bar on."""
+EVERY_S, AFTER_S = 30.0, 2.0
+"""Without a terminal: time between two lines of one stage, and time that a stage must last to have a line."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""
 
@@ -53,8 +50,12 @@ class Interrupted(FleetError):
 
 
 @contextmanager
-def progress_bar(*, kept: str = "Plans and twins already made are") -> Iterator[Progress]:
-    """Show a bar on standard error that names the stage; without a terminal, one line for each long stage.
+def progress_bar(
+    *, kept: str = "Plans and twins already made are", every_s: float = EVERY_S, after_s: float = AFTER_S
+) -> Iterator[Progress]:
+    """Show a bar on standard error: what is going on, count and time left. Without a terminal, print lines.
+
+    Lines are printed when a stage begins that lasts longer than `after_s`, and every `every_s` in it.
 
     Args:
         kept: What an interruption leaves in the cache, as the beginning of a sentence; empty for nothing.
@@ -62,28 +63,86 @@ def progress_bar(*, kept: str = "Plans and twins already made are") -> Iterator[
     Raises:
         Interrupted: Ctrl-C.
     """
-    from rich.progress import BarColumn, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bar
-
-    is_terminal = err_console.is_terminal
-    name = TextColumn("{task.description:<9}")
-    columns = (SpinnerColumn(), name, BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
-    with Bar(*columns, console=err_console, transient=True, disable=not is_terminal) as bar:
-        task = bar.add_task("starting", total=1.0)
-
-        def report(stage: str, fraction: float) -> None:
-            if not is_terminal and stage != bar.tasks[0].description:
-                if stage.startswith(COUNTED):
-                    say(f"{stage[0].upper()}{stage[1:]}")
-                elif fraction < 1.0 and stage in LONG_STAGES:
-                    say(LONG_STAGES[stage])
-            bar.update(task, description=stage, completed=fraction)
-
+    shown = _Bar() if err_console.is_terminal else _Lines(every_s, after_s)
+    with shown:
         try:
-            yield report
+            yield shown.report
         except KeyboardInterrupt:
             rest = f" {kept} kept in {cache_folder()}, and the same command continues from there." if kept else ""
-            raise Interrupted(f"Interrupted while {bar.tasks[0].description}: nothing was written.{rest}") from None
+            stage = shown.clock.stage or "starting"
+            raise Interrupted(f"Interrupted while {stage}: nothing was written.{rest}") from None
+
+
+class _Bar:
+    """A bar on the terminal."""
+
+    def __init__(self) -> None:
+        from rich.progress import BarColumn, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import Progress as Bar
+
+        self.clock = StageClock()
+        text, left = TextColumn("{task.description}"), TextColumn("{task.fields[left]}")
+        columns = (SpinnerColumn(), text, BarColumn(bar_width=18), TaskProgressColumn(), TimeElapsedColumn(), left)
+        self._bar = Bar(*columns, console=err_console, transient=True)
+        self._task = self._bar.add_task("Starting", total=1.0, left="")
+
+    def __enter__(self) -> None:
+        self._bar.start()
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def report(self, stage: str, fraction: float) -> None:
+        """Show a report."""
+        now_s = time.monotonic()
+        if self.clock.update(stage, fraction, now_s):
+            self._bar.reset(self._task, total=1.0)
+        left_s = self.clock.left_s(now_s)
+        left = "" if left_s is None else f"{brief(left_s)} left"
+        self._bar.update(self._task, description=self.clock.label, completed=float(fraction), left=left)
+
+
+class _Lines:
+    """Lines on standard error, printed by a thread: a long step reports nothing meanwhile."""
+
+    def __init__(self, every_s: float, after_s: float) -> None:
+        self.clock = StageClock()
+        self._every_s, self._after_s = every_s, after_s
+        self._due_s, self._begun = float("inf"), False
+        self._changed, self._ended = threading.Condition(), False
+        self._thread = threading.Thread(target=self._print, name="progress", daemon=True)
+
+    def __enter__(self) -> None:
+        self._thread.start()
+
+    def __exit__(self, *_: object) -> None:
+        with self._changed:
+            self._ended = True
+            self._changed.notify()
+        self._thread.join()
+
+    def report(self, stage: str, fraction: float) -> None:
+        """Take a report."""
+        with self._changed:
+            now_s = time.monotonic()
+            if self.clock.update(stage, fraction, now_s):
+                self._begun = stage.startswith(COUNTED)
+                if self._begun:
+                    say(self.clock.first_line().removesuffix(" …"))
+                self._due_s = now_s + (self._every_s if self._begun else self._after_s)
+                self._changed.notify()
+
+    def _print(self) -> None:
+        with self._changed:
+            while not self._ended:
+                now_s = time.monotonic()
+                if now_s < self._due_s:
+                    self._changed.wait(None if self._due_s == float("inf") else self._due_s - now_s)
+                    continue
+                if self.clock.fraction < 1.0:
+                    say(self.clock.line(now_s) if self._begun else self.clock.first_line())
+                    self._begun = True
+                self._due_s = now_s + self._every_s
 
 
 def print_json(value: object) -> None:

@@ -1,4 +1,4 @@
-"""`thermofleet view`: a shift or a cell in MuJoCo's own viewer."""
+"""`thermofleet view`: a shift or a cell in MuJoCo's own viewer, or as a file of other viewers."""
 
 import os
 import sys
@@ -9,12 +9,15 @@ from typing import Annotated
 import typer
 
 from fleet.errors import FleetError
+from fleet.files import atomic_path
 from scenarios.cli.options import number
-from scenarios.cli.terminal import out_console, say
+from scenarios.cli.terminal import out_console, progress_bar, say
+from scenarios.extras import require_extra
+from scenarios.result_folder import check_file, disk_errors
 
 NO_DISPLAY = (
     "MuJoCo's viewer needs a display, and there is none (DISPLAY and WAYLAND_DISPLAY are not set). Use "
-    "`thermofleet film RUN`, or open the run's report.html."
+    "`thermofleet film RUN`, `--rerun` or `--mcap`, or open the run's report.html."
 )
 
 
@@ -23,8 +26,33 @@ def view_command(
     speed: Annotated[float, number("Shift seconds per second.", 0.1, 3600)] = 30.0,
     begin: Annotated[float, number("First second of the shift.", 0, 1e9)] = 0.0,
     meshes: Annotated[bool, typer.Option("--meshes", help="Kinova's shells; needs the extra `meshes`.")] = False,
+    rerun: Annotated[
+        Path | None, typer.Option(help="Write the run as this file (.rrd) instead, for Rerun; needs the extra `rerun`.")
+    ] = None,
+    mcap: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write the run as this file (.mcap) instead, in messages of ROS 2, for Foxglove, RViz or PlotJuggler; "
+            "needs the extra `mcap`."
+        ),
+    ] = None,
+    every: Annotated[
+        float | None,
+        number(
+            "Time between two postures in these files, s. Default: as recorded, up to 250,000 postures.", 0.01, 3600
+        ),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it exists.")] = False,
 ) -> None:
-    """Play a recorded shift in MuJoCo's viewer, or show the cell of a scenario; close its window to end."""
+    """Play a recorded shift in MuJoCo's viewer, or show the cell of a scenario; close its window to end.
+
+    With --rerun or --mcap the shift is written as a file instead, without a display.
+    """
+    if rerun is not None or mcap is not None:
+        _write_files(what, rerun, mcap, every, overwrite)
+        return
+    if every is not None:
+        raise FleetError("--every is for --rerun and --mcap.")
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise FleetError(NO_DISPLAY)
     import numpy as np
@@ -54,3 +82,35 @@ def view_command(
 
     say(f"Showing '{what}'; close the window to end.", out_console)
     player.open_viewer(update)
+
+
+def _write_files(what: str, rerun: Path | None, mcap: Path | None, every_s: float | None, overwrite: bool) -> None:
+    wanted = {"rerun": (rerun, ".rrd"), "mcap": (mcap, ".mcap")}
+    for name, (path, ending) in wanted.items():
+        if path is None:
+            continue
+        check_file(path, (ending,), overwrite, f"--{name}")
+        for extra in (name, *(("ros2",) if name == "mcap" else ())):
+            require_extra(extra)
+    if not (Path(what) / "run.json").exists():
+        raise FleetError(f"--rerun and --mcap need the folder of a `thermofleet run` (got '{what}').")
+    from scenarios.run.stored_run import read_run
+    from scenarios.view.moments import Moments
+
+    moments = Moments(read_run(Path(what)), every_s)
+    for name, (path, _) in wanted.items():
+        if path is None:
+            continue
+        with progress_bar(kept="") as progress, disk_errors(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_path(path) as file:
+                if name == "rerun":
+                    from scenarios.view.rerun_file import write_rerun
+
+                    write_rerun(file, moments, progress)
+                else:
+                    from scenarios.view.mcap_file import write_mcap
+
+                    write_mcap(file, moments, progress)
+        hint = f"rerun {path}" if name == "rerun" else "open it in Foxglove, or: ros2 bag play " + str(path)
+        say(f"Wrote {len(moments.poses)} moments, {path.stat().st_size / 1e6:.1f} MB: {path} ({hint}).", out_console)

@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 from joblib import Parallel, cpu_count, delayed
 
 from fleet.errors import CheckpointError
-from scenarios.progress import Progress, quiet
+from scenarios.progress import Count, Progress, quiet
 
 log = logging.getLogger(__name__)
 
@@ -32,10 +32,10 @@ def load_or_make(models: Sequence[CachedModel[Model]], stage: str, progress: Pro
     """Every model: from its folder if it is there and intact, else made now, several at a time."""
     loaded = [_load_intact(model) for model in models]
     missing = [i for i, model in enumerate(loaded) if model is None]
-    progress(stage, 1.0 - len(missing) / len(models))
+    progress(stage, Count(len(models) - len(missing), len(models)))
 
     def report(made: float) -> None:
-        progress(stage, 1.0 - (len(missing) - made) / len(models))
+        progress(stage, Count(len(models) - len(missing) + made, len(models)))
 
     reasons: list[str | None] = []
     if len(missing) == 1:  # in this process, which can report progress within one model

@@ -16,7 +16,7 @@ from fleet.planning.plan_cache import CachedPlanner
 from fleet.planning.space import conflicts_with_homes
 from fleet.robot import Robot
 from fleet.thermal import ThermalModel, ThermalSpread, gen3_network, spread_motors, thermal_model
-from scenarios.progress import Progress
+from scenarios.progress import Count, Progress
 from scenarios.schema import Scenario
 
 log = logging.getLogger(__name__)
@@ -125,7 +125,7 @@ def plan_arms(
         infeasible: list[InfeasibleJob] = []
         too_heavy: set[Work] = set()
         for i, work in enumerate(works):
-            progress("planning", (done + i / len(works)) / len(indices))
+            progress("planning", Count(done + i / len(works), len(indices)))
             try:
                 plans[work] = planner.plan(work)
             except InfeasibleJob as error:

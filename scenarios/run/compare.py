@@ -19,7 +19,7 @@ from fleet.errors import FleetError
 from fleet.files import cache_folder
 from scenarios.policy_loader import label, policy_of, scope_of
 from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, RiskName, prepare
-from scenarios.progress import Progress, quiet
+from scenarios.progress import Count, Progress, quiet
 from scenarios.run.evaluate import FIGURES, Outcome, outcomes
 from scenarios.schema import Scenario
 
@@ -121,7 +121,7 @@ def compare(
     results = _run_parts(fleet, (difficulty, risk), channel, folder, parts, workers)
     for n, ((policy, _), result) in enumerate(zip(parts, results, strict=True)):
         by_policy[policy] += result
-        progress("comparing", (n + 1) / len(parts))
+        progress("comparing", Count((n + 1) * len(seeds) * len(policies) // len(parts), len(seeds) * len(policies)))
     rng = np.random.default_rng(np.random.SeedSequence(0))
     figures = {
         p: {name: _figure(name, rows, by_policy[baseline], rng) for name in FIGURES} for p, rows in by_policy.items()

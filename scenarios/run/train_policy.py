@@ -21,7 +21,7 @@ from fleet.files import atomic_path
 from scenarios.fault_price import weights_of
 from scenarios.policy_loader import policy_of
 from scenarios.prepare.fleet import RISK, DifficultyName, RiskName, prepare
-from scenarios.progress import Progress, quiet
+from scenarios.progress import Count, Progress, quiet
 from scenarios.run.batch import library_of
 from scenarios.run.shift import scenario_hash
 from scenarios.schema import Scenario
@@ -172,7 +172,7 @@ def _demonstrations(env: BatchEnv, rule: str, progress: Progress) -> Iterator[tu
         policy.reset(np.random.default_rng(child))
     obs, _ = env.reset()
     for number in range(DEMONSTRATIONS):
-        progress(f"imitating {rule}", number / DEMONSTRATIONS)
+        progress(f"imitating {rule}", Count(number, DEMONSTRATIONS))
         rows: list[tuple[Array, Array, Array]] = []
         for _ in range(STEPS):
             actions = np.array([_actions_of(policy, env, obs, e) for e, policy in enumerate(policies)])

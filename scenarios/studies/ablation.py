@@ -25,7 +25,7 @@ from scipy import stats
 from fleet.errors import FleetError, nearest
 from fleet.files import atomic_path, cache_folder
 from scenarios.policy_loader import label, policy_of
-from scenarios.progress import COUNTED, Progress, quiet
+from scenarios.progress import COUNTED, Count, Progress, quiet
 from scenarios.result_folder import disk_errors
 from scenarios.run.evaluate import outcomes
 from scenarios.run.shift import scenario_hash
@@ -127,7 +127,7 @@ def ablate(scenario: Scenario, plan: AblationPlan, out: Path, *, progress: Progr
         if not missing:
             continue
         policy, source = plan.parts(name)
-        progress(f"{COUNTED}fleet {fleet + 1}, training {training + 1}: {plan.label(name)}", n / len(draws))
+        progress(f"{COUNTED}fleet {fleet + 1}, training {training + 1}: {plan.label(name)}", Count(n, len(draws)))
         if drawn is None or drawn_index != fleet:
             spread = replace(scenario.spread, seed=scenario.spread.seed + fleet)
             drawn, drawn_index = DrawnFleet(replace(scenario, spread=spread), cache_folder(), quiet), fleet

@@ -17,11 +17,10 @@ from scenarios.report.gantt import clock
 from scenarios.report.playback import payloads
 from scenarios.report.schedule import schedule
 from scenarios.run.stored_run import StoredRun
+from scenarios.view.moments import motor_spheres
 
 Array = np.ndarray
 
-MOTOR_M, HOT_MOTOR_M = 0.052, 0.074
-"""Radius of the sphere of a cool motor and of one at the error limit: a hotter motor is also larger."""
 INK, PAPER, FAULT = (34, 34, 34), (250, 250, 248), (204, 34, 34)
 CODECS = {"mp4": "libx264", "webm": "libvpx"}
 OPTIONS = {"libx264": {"preset": "veryfast", "crf": "27"}, "libvpx": {"deadline": "realtime", "cpu-used": "8"}}
@@ -61,10 +60,7 @@ def times(run: StoredRun, shot: Shot) -> Array:
 
 def show_heat(player: CellPlayer, q: Array, temp_c: Array, payload_kg: Array, limits: ThermalLimits) -> None:
     """Put a cell into postures [arm, joint] in rad, with motors coloured by temperatures [arm, joint] in °C."""
-    rgb = heat_colour(temp_c, limits.warning_c, limits.error_c)
-    coolest_c = heat_marks(limits.warning_c, limits.error_c)[0]
-    share = np.clip((temp_c - coolest_c) / (limits.error_c - coolest_c), 0.0, 1.0)
-    player.show(q, rgb, MOTOR_M + share * (HOT_MOTOR_M - MOTOR_M), payload_kg)
+    player.show(q, *motor_spheres(temp_c, limits), payload_kg)
 
 
 class Film:

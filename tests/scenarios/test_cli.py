@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -133,4 +134,8 @@ def test_the_demo_sets_two_policies_side_by_side(thermofleet, tmp_path, monkeypa
         told = run_json(tmp_path / "demo" / policy)
         assert (told["policy"], told["status"], told["scenario"]["name"]) == (policy, "finished", "quickstart")
         assert f"{told['metrics']['energy_wh']:.0f}" in said.out
-    assert str(tmp_path / "demo" / "wsept" / "report.html") in said.out
+        assert str(tmp_path / "demo" / policy / "report.html") in said.out
+    page = (tmp_path / "demo" / "index.html").read_text(encoding="utf-8")
+    for link in re.findall(r'href="([^"]+)"', page):
+        assert (tmp_path / "demo" / link).is_file()
+    assert page.count("<section>") == page.count("href=") == 2

@@ -1,6 +1,13 @@
 """What a long command says where there is no terminal to draw a bar on, and when it is interrupted."""
 
-from scenarios.cli.terminal import LONG_STAGES, Interrupted, SafeConsole, echo, plain_table, progress_bar
+import threading
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from scenarios.cli.terminal import Interrupted, SafeConsole, echo, plain_table, progress_bar
+from scenarios.progress import HINTS, Count, StageClock
 
 
 def interrupted(stage: str, **bar: str) -> str:
@@ -13,27 +20,43 @@ def interrupted(stage: str, **bar: str) -> str:
         return str(error)
 
 
-def test_without_a_terminal_every_long_stage_and_every_section_is_a_line_of_its_own(capsys):
-    with progress_bar() as progress:
-        progress("planning", 0.5)
-        progress("training", 0.0)
-        progress("training", 0.5)
+def test_without_a_terminal_a_long_stage_says_what_goes_on_how_many_and_how_long(capsys):
+    """The lines come while a step reports nothing, as one that trains for a quarter of an hour."""
+    silent = threading.Event()
+    with progress_bar(after_s=0.05, every_s=0.1) as progress:
+        progress("planning", 0.5)  # over at once: no line
+        progress("training", Count(1, 4))
+        silent.wait(0.5)
         progress("computing section 1 of 2: Latent map", 0.0)
-        progress("drawing jobs", 0.0)
-        progress("computing sections, 2 of 2 done: Epochs", 1.0)
+        progress("computing section 2 of 2: Epochs", 0.5)
+        progress("filming", 1.0)
+        silent.wait(0.2)
     said = capsys.readouterr()
+    first, *again, one, two = said.err.splitlines()
     assert said.out == ""
-    assert said.err.splitlines() == [
-        LONG_STAGES["training"],
-        "Computing section 1 of 2: Latent map",
-        "Computing sections, 2 of 2 done: Epochs",
-    ]
+    assert first == f"Training the twins 1/4 ({HINTS['training']}) …"
+    assert 2 <= len(again) <= 6
+    assert set(again) <= {f"Training the twins 1/4: 25%, for {seconds} s." for seconds in (0, 1)}
+    assert (one, two) == ("Computing section 1 of 2: Latent map", "Computing section 2 of 2: Epochs")
 
 
-def test_what_comes_from_the_cache_is_not_announced(capsys):
-    with progress_bar() as progress:
-        progress("training", 1.0)
-    assert capsys.readouterr().err == ""
+@given(
+    first=st.floats(0, 0.5), pace=st.floats(1e-4, 0.01), spent_s=st.floats(10, 40), began_s=st.floats(0, 1e6)
+)  # fmt: skip
+def test_at_a_constant_pace_the_time_left_is_exact(first, pace, spent_s, began_s):
+    clock = StageClock()
+    assert clock.update("comparing", first, began_s)
+    assert clock.left_s(began_s) is None
+    now = first + pace * spent_s
+    assert not clock.update("comparing", now, began_s + spent_s)
+    assert clock.left_s(began_s + spent_s) == pytest.approx((1.0 - now) / pace, rel=1e-3)
+
+
+def test_a_stage_whose_name_counts_is_one_stage():
+    clock = StageClock()
+    assert [clock.update(f"iteration {n}, best {n / 7:.1f}", n / 9, n) for n in range(3)] == [True, False, False]
+    assert clock.line(2.0) == "Iteration 2, best 0.3: 22%, for 2 s."
+    assert clock.line(8.0) == "Iteration 2, best 0.3: 22%, about 28 s left."
 
 
 def test_an_interruption_says_what_is_kept_and_where(monkeypatch, tmp_path):

@@ -95,9 +95,7 @@ def test_ctrl_c_while_learning_a_log_promises_nothing(thermofleet, logs, tmp_pat
     monkeypatch.setattr("scenarios.prepare.twin_folder.train", interrupted)
     said = thermofleet("twin", "train", "--log", logs / "cool", *TINY, "--out", tmp_path / "twins")
     assert said.code == 130
-    first, *_, last = said.err.splitlines()
-    assert first.startswith("Training the twin of the log: ")
-    assert last == "Interrupted while learning the log: nothing was written."
+    assert said.err.splitlines()[-1] == "Interrupted while learning the log: nothing was written."
     assert not (tmp_path / "twins").exists()
 
 

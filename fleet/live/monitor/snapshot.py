@@ -53,7 +53,11 @@ class ArmSnapshot(msgspec.Struct, frozen=True):
     joint: int | None = None
     """The hottest motor, 1..7."""
     headroom_k: float | None = None
+    temp_c: tuple[float, ...] = ()
+    """[joint]."""
     job: str = ""
+    busy_s: float = 0.0
+    """Fleet seconds until it is home with its current job done."""
     away: bool = False
     """It says that it is away from home."""
     scores: dict[str, JobScore] = {}
@@ -272,7 +276,9 @@ def _arm_snapshot(name: str, arm: _Arm, now_s: float, speed: float | None, ended
         hottest_c=hottest_c,
         joint=None if hottest_c is None else temps_c.index(hottest_c) + 1,
         headroom_k=state.headroom_k if state else None,
+        temp_c=temps_c,
         job=state.job if state else "",
+        busy_s=state.busy_s if state else 0.0,
         away=bool(state and state.space),
         scores={job: score for job, score in by_job if job not in ended},
         joints=info.joints if info else None,

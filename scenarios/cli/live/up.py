@@ -192,7 +192,7 @@ def up_command(
         watch = Tls(tls, "monitor").endpoint(at) if tls else at
         say(
             f"{fleet} is up: {count} at {at}, {speed:g} times as fast as real time; logs in "
-            f"{supervisor.folder}. To watch it: thermofleet watch --endpoint {watch}",
+            f"{supervisor.folder}. To watch it: thermofleet watch --scenario {scenario} --endpoint {watch}",
             out_console,
         )
         if shown is not None:

@@ -1,10 +1,13 @@
 """`thermofleet watch`: show a fleet live on the terminal."""
 
 import math
+import os
+import select
+import sys
 import time
 from collections import deque
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Annotated
 
 import msgspec
@@ -16,11 +19,21 @@ from fleet.bus.client.discover import fleets_at
 from fleet.bus.protocol.auction import SETTLED, ArmEvent, JobState, Result
 from fleet.errors import NoRouter
 from fleet.live.monitor.listener import FleetListener
-from fleet.live.monitor.snapshot import FleetSnapshot, describe_event, describe_status
+from fleet.live.monitor.snapshot import FleetSnapshot, describe_status
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, the_fleet
 from scenarios.cli.signals import Stop, until_stopped
 from scenarios.cli.terminal import echo, err_console, out_console, say
-from scenarios.live.watch_screen import arm_line, format_time, jobs_line, screen, space_line
+from scenarios.live.watch_screen import (
+    JobBars,
+    arm_line,
+    format_time,
+    jobs_line,
+    plain_event,
+    screen,
+    space_line,
+    time_line,
+)
+from scenarios.load import load
 
 WAIT_S, GONE_S = 0.5, 3.0
 """Real seconds: between two looks for a fleet; without any participant, after which a settled shift has ended."""
@@ -33,8 +46,13 @@ def watch_command(
     endpoint: EndpointOption = ENDPOINT,
     fleet: FleetOption = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print one snapshot as JSON.")] = False,
+    joints: Annotated[bool, typer.Option("--joints", help="Show every motor; the key j changes that.")] = False,
+    scenario: Annotated[
+        str, typer.Option(help="Scenario of the fleet, to show what is left of the shift; the bus does not tell.")
+    ] = "",
 ) -> None:
     """Watch a fleet until it has ended, or Ctrl-C: temperatures, difficulty, jobs, and the age of every message."""
+    end_s = load(scenario).horizon_s if scenario else None
     news: deque[str] = deque(maxlen=100)
 
     def on_message(_: str, name: str, message: msgspec.Struct) -> None:
@@ -53,9 +71,14 @@ def watch_command(
             echo(msgspec.json.encode(listener.view.snapshot(time.monotonic())).decode())
         else:
             end = ShiftEnd()
-            (draw if out_console.is_terminal else print_lines)(
-                listener, news, lambda fleet: stop.is_set() or bool(end.check(fleet, time.monotonic()))
-            )
+
+            def ended(fleet: FleetSnapshot) -> bool:
+                return stop.is_set() or bool(end.check(fleet, time.monotonic()))
+
+            if out_console.is_terminal:
+                draw(listener, news, ended, joints=joints, end_s=end_s)
+            else:
+                print_lines(listener, news, ended, joints=joints, end_s=end_s)
             if end.sentence:
                 say(end.sentence, out_console)
         stop.leave("Stopped watching.")
@@ -110,15 +133,65 @@ class ShiftEnd:
         return self.sentence
 
 
-def draw(listener: FleetListener, news: deque[str], ended: Callable[[FleetSnapshot], bool]) -> None:
-    """Draw a screen that fills the terminal, again and again until the end."""
-    with Live(console=out_console, screen=True, auto_refresh=False) as live:
+def draw(
+    listener: FleetListener,
+    news: deque[str],
+    ended: Callable[[FleetSnapshot], bool],
+    *,
+    joints: bool,
+    end_s: float | None,
+) -> None:
+    """Draw a screen that fills the terminal, again and again until the end or the key q."""
+    bars = JobBars()
+    with pressed_keys() as pressed, Live(console=out_console, screen=True, auto_refresh=False) as live:
         while not ended(fleet := listener.view.snapshot(time.monotonic(), jobs=0)):
             listener.serve(time.monotonic() + FRAME_S)
-            live.update(screen(fleet, list(news), out_console.height), refresh=True)
+            keys = pressed()
+            if "q" in keys:
+                break
+            joints ^= keys.count("j") % 2 == 1
+            size = out_console.size
+            how = {"width": size.width, "joints": joints, "done": bars.update(fleet), "end_s": end_s}
+            live.update(screen(fleet, list(news), size.height, **how), refresh=True)
 
 
-def print_lines(listener: FleetListener, news: deque[str], ended: Callable[[FleetSnapshot], bool]) -> None:
+@contextmanager
+def pressed_keys() -> Iterator[Callable[[], str]]:
+    """A function that returns the keys pressed since it was last called, in lower case; none without a terminal."""
+    try:
+        import termios
+        import tty
+
+    except ModuleNotFoundError:  # Windows
+        yield lambda: ""
+        return
+    try:
+        before = termios.tcgetattr(sys.stdin.fileno())
+    except (OSError, ValueError, termios.error):  # no terminal, or closed
+        yield lambda: ""
+        return
+
+    def pressed() -> str:
+        keys = ""
+        while select.select([sys.stdin], [], [], 0.0)[0] and (more := os.read(sys.stdin.fileno(), 64)):
+            keys += more.decode("ascii", "ignore").lower()
+        return keys
+
+    try:
+        tty.setcbreak(sys.stdin.fileno())
+        yield pressed
+    finally:
+        termios.tcsetattr(sys.stdin.fileno(), termios.TCSADRAIN, before)
+
+
+def print_lines(
+    listener: FleetListener,
+    news: deque[str],
+    ended: Callable[[FleetSnapshot], bool],
+    *,
+    joints: bool,
+    end_s: float | None,
+) -> None:
     """Print news as they come, and a line about every arm from time to time, until the end."""
     due_s = time.monotonic() + SNAPSHOT_S
     while not ended(fleet := listener.view.snapshot(time.monotonic(), jobs=0)):
@@ -128,15 +201,17 @@ def print_lines(listener: FleetListener, news: deque[str], ended: Callable[[Flee
         if time.monotonic() >= due_s:
             due_s = time.monotonic() + LINE_S
             for arm in fleet.arms:
-                echo(arm_line(arm))
+                echo(arm_line(arm, joints=joints))
             echo(jobs_line(fleet).plain)
             echo(space_line(fleet).plain)
+            if end_s is not None:
+                echo(time_line(fleet, end_s).plain)
 
 
 def describe(name: str, message: msgspec.Struct) -> str:
     """Line about an event or a result; "" for other messages."""
     if isinstance(message, ArmEvent):
-        return f"{format_time(message.time_s)}  {name}: {describe_event(message)}"
+        return f"{format_time(message.time_s)}  {name} {plain_event(message)}"
     if isinstance(message, Result):
         return f"{format_time(message.time_s)}  job {describe_status(message.status)}"
     return ""

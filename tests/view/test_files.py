@@ -1,0 +1,185 @@
+"""Recorded shifts as files of other viewers, opened by the readers of those, and compared with the telemetry."""
+
+from collections import defaultdict
+from importlib.util import find_spec
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from fleet.ros2.cdr import read, read_diagnostics, read_joints
+from fleet.telemetry import MODES
+from scenarios.cli.main import main
+from scenarios.run.stored_run import StoredRun, read_run
+from scenarios.view.film import Film
+from scenarios.view.moments import Moments
+
+EVERY_S = 20
+
+
+def written(run_folder: Path, path: Path) -> Path:
+    with pytest.raises(SystemExit) as ended:
+        main(["view", str(run_folder), f"--{ {'.rrd': 'rerun'}.get(path.suffix, 'mcap') }", str(path), "--every", "20"])
+    assert ended.value.code in (0, None)
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(run_folder: Path) -> StoredRun:
+    return read_run(run_folder)
+
+
+def hottest_moment(run: StoredRun) -> tuple[int, float]:
+    """A kept sample at which an arm works and is hot, and its time."""
+    kept = Moments(run, EVERY_S).heats
+    sample = int(kept[run.telemetry.temp_c[kept].max(axis=(1, 2)).argmax()])
+    return sample, float(run.telemetry.time_s[sample])
+
+
+def positions_in_mujoco(run: StoredRun, time_s: float) -> np.ndarray:
+    """Motors in the world as MuJoCo has them, [arm, joint, 3]."""
+    film = Film(run)
+    film.show(time_s)
+    data, model = film.player.data, film.player.model
+    return np.array([[data.site_xpos[model.site(f"{arm}/motor_{j + 1}").id] for j in range(7)] for arm in run.arms])
+
+
+def along(parents: dict[str, str], poses: dict[str, tuple[list[float], list[float]]], frame: str) -> np.ndarray:
+    """Origin of a frame in the world; poses are positions and quaternions w, x, y, z."""
+    point = np.zeros(3)
+    while frame in parents:
+        position, quaternion = poses[frame]
+        turned = np.empty(3)
+        mujoco.mju_rotVecQuat(turned, point, np.array(quaternion))
+        point, frame = turned + position, parents[frame]
+    return point
+
+
+def test_an_mcap_file_has_the_shift_in_messages_of_ros_2(run_folder: Path, run: StoredRun, tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+
+    path = written(run_folder, tmp_path / "shift.mcap")
+    messages: dict[str, list[tuple[float, object]]] = defaultdict(list)
+    with path.open("rb") as stream:
+        for schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
+            assert (schema.encoding, channel.message_encoding) == ("ros2msg", "cdr")
+            content = message.data if channel.topic.endswith("joint_states") else read(message.data, schema.name)
+            if channel.topic == "/diagnostics":
+                content = read_diagnostics(message.data)
+            messages[channel.topic].append((message.log_time / 1e9, content))
+    readings, moments = run.telemetry, Moments(run, EVERY_S)
+    for index, arm in enumerate(run.arms):
+        joints = [read_joints(payload) for _, payload in messages[f"/quickstart/{arm}/joint_states"]]
+        assert np.array([each.q for each in joints]) == pytest.approx(readings.q[moments.poses, index])
+        assert np.array([each.tau for each in joints]) == pytest.approx(readings.tau[moments.poses, index])
+        for joint in range(7):
+            heat = messages[f"/quickstart/{arm}/joint_{joint + 1}/temperature"]
+            assert [time_s for time_s, _ in heat] == pytest.approx(readings.time_s[moments.heats])
+            assert [each.temperature for _, each in heat] == pytest.approx(readings.temp_c[moments.heats, index, joint])
+    sample, time_s = hottest_moment(run)
+    parents, poses = {}, {}
+    for topic in ("/tf_static", "/tf"):
+        last = [content for at_s, content in messages[topic] if at_s <= time_s][-1]
+        for each in last.transforms:
+            move, turn = each.transform.translation, each.transform.rotation
+            parents[each.child_frame_id] = each.header.frame_id
+            poses[each.child_frame_id] = ([move.x, move.y, move.z], [turn.w, turn.x, turn.y, turn.z])
+    expected = positions_in_mujoco(run, time_s)
+    spheres = next(content for at_s, content in messages["/motors"] if at_s == time_s).markers
+    found = np.array([along(parents, poses, sphere.header.frame_id) for sphere in spheres])
+    assert found == pytest.approx(expected.reshape(-1, 3), abs=1e-4)
+    hottest, coolest = readings.temp_c[sample].argmax(), readings.temp_c[sample].argmin()
+    assert spheres[hottest].scale.x > spheres[coolest].scale.x
+    assert spheres[hottest].color.r - spheres[hottest].color.g > spheres[coolest].color.r - spheres[coolest].color.g
+    statuses = {each.hardware: each for each in dict(messages["/diagnostics"])[time_s]}
+    for index, arm in enumerate(run.arms):
+        assert dict(statuses[f"quickstart/{arm}"].values)["mode"] == MODES[readings.mode[sample, index]]
+    log = [(at_s, line.name, line.msg) for at_s, line in messages["/rosout"]]
+    for kind in ("award", "fault"):
+        assert [(at_s, arm) for at_s, arm, text in log if text.startswith(kind)] == [
+            (pytest.approx(event.time_s), event.arm) for event in run.events if event.kind == kind
+        ]
+    awards = sum(event.kind == "award" for event in run.events)
+    assert sum(text.startswith("offers for ") for *_, text in log) == awards > 0
+    assert [each.temperature for _, each in messages["/limits/error"]] == [run.scenario.limits.error_c] * 2
+
+
+@pytest.mark.skipif(find_spec("rerun") is None, reason="needs the extra `rerun` (170 MB)")
+def test_a_rerun_file_has_the_shift_and_a_layout(run_folder: Path, run: StoredRun, tmp_path: Path) -> None:
+    from rerun.chunk import RrdReader
+
+    reader = RrdReader(written(run_folder, tmp_path / "shift.rrd"))
+    tables: dict[str, list] = defaultdict(list)
+    for chunk in reader.stream().to_chunks():
+        tables[chunk.entity_path].append(chunk.to_record_batch())
+
+    def column(entity: str, name: str) -> tuple[np.ndarray, list]:
+        """Times in s and values of a component."""
+        times, values = [], []
+        for batch in tables[entity]:
+            if (
+                field := next((f for f in batch.schema.names if f.endswith(name)), None)
+            ) and "shift" in batch.schema.names:
+                times += (batch.column("shift").to_numpy().astype(int) / 1e9).tolist()
+                values += batch.column(field).to_pylist()
+        order = np.argsort(times, kind="stable")
+        return np.array(times)[order], [values[i] for i in order]
+
+    readings, moments = run.telemetry, Moments(run, EVERY_S)
+    for index, arm in enumerate(run.arms):
+        for entity, name, rows in (("temperature", "temp_c", moments.heats), ("angle", "q", moments.poses)):
+            times, values = column(f"/{entity}/{arm}", "Scalars:scalars")
+            assert times == pytest.approx(readings.time_s[rows])
+            assert np.array(values) == pytest.approx(getattr(readings, name)[rows, index])
+        times, states = column(f"/mode/{arm}", "StateChange:state")
+        shown = np.searchsorted(times, readings.time_s + 1e-6, side="right") - 1
+        assert [states[i][0] for i in shown] == [MODES[mode] for mode in readings.mode[:, index]]
+    _, time_s = hottest_moment(run)
+    expected = positions_in_mujoco(run, time_s)
+    model = moments.model
+    for index, arm in enumerate(run.arms):
+        mount, path = model["arms"][index], f"/cell/{arm}"
+        parents, poses = {path: "/cell"}, {path: (mount["position"], mount["quaternion"])}
+        joint = 0
+        for i, link in enumerate(model["links"]):
+            parent, path = path, f"{path}/link_{i}"
+            parents[path] = parent
+            poses[path] = (link["position"], link["quaternion"])
+            if link["turns"]:
+                times, moves = column(path, "Transform3D:translation")
+                _, turns = column(path, "Transform3D:quaternion")
+                row = int(np.flatnonzero(np.isclose(times, time_s))[0])
+                x, y, z, w = turns[row][0]
+                poses[path] = (moves[row][0], [w, x, y, z])
+                assert along(parents, poses, path) == pytest.approx(expected[index, joint], abs=1e-4)
+                joint += 1
+    faults = [event.time_s for event in run.events if event.kind == "fault"]
+    logged = [
+        t
+        for arm in run.arms
+        for t, (text,) in zip(*column(f"/events/{arm}", "TextLog:text"), strict=True)
+        if text.startswith("fault")
+    ]
+    assert sorted(logged) == pytest.approx(faults)
+    assert faults
+    assert len(reader.blueprints()) == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "needed"),
+    [
+        (["--mcap", "shift.bag"], "--mcap must end in .mcap (got 'shift.bag')"),
+        (["--mcap", "there.mcap"], "'there.mcap' exists; give another --mcap"),
+        (["--every", "5"], "--every is for --rerun and --mcap"),
+    ],
+)
+def test_a_file_that_cannot_be_is_refused(
+    run_folder: Path, tmp_path: Path, monkeypatch, capsys, options, needed
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there.mcap").touch()
+    with pytest.raises(SystemExit) as ended:
+        main(["view", str(run_folder), *options])
+    assert ended.value.code == 2
+    assert needed in " ".join(capsys.readouterr().err.split())
