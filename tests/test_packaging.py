@@ -97,7 +97,7 @@ def test_nothing_is_pinned_that_is_not_asked_for():
     assert set(pinned_in("constraints.txt")) == {name_of(requirement) for requirement in SHARED}
 
 
-OTHERWISE = {"agilerl": {"tensordict"}, "benchmarl": {"tensordict", "torchrl"}, "rllib": {"gymnasium"}}
+OTHERWISE = {"agilerl": {"tensordict"}, "benchmarl": {"av", "tensordict", "torchrl"}, "rllib": {"gymnasium"}}
 """What it wants in another version than everybody else."""
 
 

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,10 +40,9 @@ def write(result: RunResult, folder: Path) -> None:
         pq.write_table(record_table(Offer, result.offers), folder / "offers.parquet")
         if result.telemetry is None:
             return
-        pq.write_table(
-            telemetry_table(result.telemetry, [arm.name for arm in result.scenario.arms]), folder / "telemetry.parquet"
-        )
-        html = run_html(run, result.scenario, result.telemetry, result.events, result.jobs, result.offers)
+        arms, telemetry = [arm.name for arm in result.scenario.arms], _as_kept(result.telemetry)
+        pq.write_table(telemetry_table(telemetry, arms), folder / "telemetry.parquet")
+        html = run_html(run, result.scenario, telemetry, result.events, result.jobs, result.offers)
         (folder / "report.html").write_text(html, encoding="utf-8")
 
 
@@ -72,6 +71,11 @@ def run_html(
         payload_of={job.job: job.payload_kg for job in jobs},
         offers=offers,
     )
+
+
+def _as_kept(telemetry: Telemetry) -> Telemetry:
+    """The readings in the precision of the file."""
+    return replace(telemetry, **{name: getattr(telemetry, name).astype(np.float32) for name in UNITS})
 
 
 def check_format(run: Mapping[str, Any], folder: Path) -> None:
