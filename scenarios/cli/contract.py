@@ -1,4 +1,4 @@
-"""`thermofleet contract`: schemas and AsyncAPI document of the bus, and the tables of docs/bus.md and docs/env.md."""
+"""`thermofleet contract`: schemas and AsyncAPI document of the bus, and the tables of bus.md, env.md and cli.md."""
 
 import json
 from pathlib import Path
@@ -9,7 +9,7 @@ import typer
 from fleet.errors import FleetError
 from scenarios.cli.terminal import out_console, say
 
-PAGES = ("bus.md", "env.md")
+PAGES = ("bus.md", "cli.md", "env.md")
 """Pages with generated tables."""
 
 
@@ -17,7 +17,7 @@ def contract_command(
     out: Annotated[Path, typer.Option(help="Folder for the documents.")] = Path("docs/contract"),
     check: Annotated[bool, typer.Option("--check", help="Only check whether the documents are current.")] = False,
 ) -> None:
-    """Write JSON schemas and AsyncAPI 3 document of all bus messages, and the tables of bus.md and env.md."""
+    """Write JSON schemas and AsyncAPI 3 document of all bus messages, and the tables of bus.md, cli.md and env.md."""
     made = documents(out)
     stale = [path for path, text in made.items() if not path.is_file() or path.read_text(encoding="utf-8") != text]
     if check:

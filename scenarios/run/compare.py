@@ -76,9 +76,9 @@ class Comparison:
     seeds: tuple[int, ...]
     baseline: str
     figures: dict[str, dict[str, Figure]]
-    """[policy][figure]."""
+    """By policy and name of the figure."""
     scopes: dict[str, str]
-    """[policy]: central or arm, see `agents.policy`."""
+    """By policy: central or arm, see `agents.policy`."""
     channel: dict[str, Any]
     """`Channel.described`."""
     channel_text: str
