@@ -68,7 +68,7 @@ def report_html(
         replay = Replay(model=shown, playback=playback, unit_s=time_unit(plan.horizon_s)[1])
     body = [
         *_head(run, arms, verdict(run, events, plan, offers)),
-        _key_figures(run.get("metrics") or {}),
+        key_figures(run.get("metrics") or {}),
         *([replay_place()] if replay else []),
         figure_place(),
         *_event_table(events),
@@ -114,7 +114,7 @@ KEY_FIGURES = (
 """Label, metric, format, unit, and the metric it is a part of."""
 
 
-def _key_figures(metrics: Mapping[str, Any]) -> str:
+def key_figures(metrics: Mapping[str, Any]) -> str:
     """The most important metrics as a row of tiles; metrics without a number are left out."""
     values = {k: float(v) for k, v in metrics.items() if isinstance(v, int | float) and math.isfinite(v)}
     peaks = {k: v for k, v in (metrics.get("peak_c") or {}).items() if v is not None and math.isfinite(v)}

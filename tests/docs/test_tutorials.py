@@ -1,7 +1,7 @@
 """Every tutorial runs as its page says: commands, files and programs in order, with the outputs that it shows.
 
-A block of `sh` is run in a shell, one of `python` by Python; with a title it is a file instead. A block of `text` is the
-output of the block before it, where … stands for anything. After `<!-- background -->` a command runs on.
+A block of `sh` is run in a shell, one of `python` by Python; with a title it is a file instead. A block of `text` is
+the output of the block before it, where … stands for anything. After `<!-- background -->` a command runs on.
 """
 
 import os
