@@ -14,9 +14,9 @@ from playwright.sync_api import sync_playwright
 
 ROOT = Path(__file__).parents[1]
 PICTURES = ROOT / "docs" / "pictures"
-FILM_RUN = ("heat_wave", "--policy", "round_robin", "--difficulty", "oracle", "--seed", "3")
+FILM_RUN = ("quickstart", "--policy", "round_robin", "--difficulty", "oracle", "--seed", "19")
 FILM = ("--size", "640x360", "--speed", "240", "--fps", "8", "--overwrite")
-REPORT_RUN = ("active_waiting", "--policy", "round_robin", "--seed", "1")
+REPORT_RUN = ("active_waiting", "--policy", "round_robin", "--difficulty", "oracle", "--seed", "1")
 GRAPHICS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 
