@@ -50,8 +50,9 @@ lint: $(STAMP)
 	@$(BIN)/ruff check .
 	@$(BIN)/pyright
 
+# MINUTES=10 SEED=1: random kills and many faults on one fleet instead, in an order that the seed determines.
 chaos: $(STAMP)
-	@$(BIN)/python benchmarks/chaos
+	@$(BIN)/python benchmarks/chaos $(if $(MINUTES),--minutes $(MINUTES)) $(if $(SEED),--seed $(SEED))
 
 # 256 arms behind two linked routers: kill either, cut the link.
 mesh: $(STAMP)

@@ -18,11 +18,13 @@ import statistics
 import subprocess
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
+from fleet.engine.tables import Tables
 from fleet.env.buffers import keep_pages
 from fleet.env.random_actions import random_legal
 from fleet.env.vector import BatchEnv, Library
@@ -71,23 +73,22 @@ def single(difficulty: DifficultyName) -> float:
 def library(difficulty: DifficultyName, arms: int = 4, peers: int | None = None) -> Library:
     """Return quickstart with its four arms repeated, and arrival rates multiplied accordingly.
 
+    The axis of the arms in each table is the one that is shorter for a fleet of three.
+
     Args:
         peers: Number of peers in the vector of each arm; default: all others.
     """
-    times = arms // 4
-    fleet = [prepare(load("quickstart"), difficulty=difficulty)]
-    one = library_of(fleet, Randomisation(arrivals=(times, times)))
-    per_arm = (
-        "thermal_step", "to_ambient", "root_capacity", "rates", "modes", "sensor_noise_k", "copper_w_per_a2", "idle_w",
-        "rest_current_sq", "rest_friction_w", "start_c", "work",
-    )  # fmt: skip
-    tables = one.tables._replace(
-        ambient_c=np.tile(one.tables.ambient_c, (1, 1, times)),
-        feasible=np.tile(one.tables.feasible, (1, 1, times)),
-        **{name: np.concatenate([getattr(one.tables, name)] * times, axis=1) for name in per_arm},
-    )
+    scenario = load("quickstart")
+    times = arms // len(scenario.arms)
+    one = library_of([prepare(scenario, difficulty=difficulty)], Randomisation(arrivals=(times, times)))
+    fewer = library_of([prepare(replace(scenario, arms=scenario.arms[:-1]), difficulty="blind")])
+    repeated = {}
+    for name, table, shorter in zip(Tables._fields, one.tables, fewer.tables, strict=True):
+        axes = list(zip(np.shape(table), np.shape(shorter), strict=True))
+        if (pair := (len(scenario.arms), len(scenario.arms) - 1)) in axes:
+            repeated[name] = np.concatenate([table] * times, axis=axes.index(pair))
     near = None if peers is None else tuple(tuple((a - p - 1) % arms for p in range(peers)) for a in range(arms))
-    return Library(tuple(f"arm_{a}" for a in range(arms)), one.slots, tables, one.draw, near)
+    return Library(tuple(f"arm_{a}" for a in range(arms)), one.slots, one.tables._replace(**repeated), one.draw, near)
 
 
 def batch(difficulty: DifficultyName, envs: int, arms: int = 4, peers: int | None = None) -> float:

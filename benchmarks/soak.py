@@ -228,14 +228,20 @@ def plot(samples: list[Sample], path: Path) -> None:
     figure.savefig(path, dpi=120)
 
 
+def read_options(description: str | None, *, jobs: int, arms: int) -> argparse.Namespace:
+    """Return the options of the command line, and make the folder of results."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--jobs", type=int, default=jobs)
+    parser.add_argument("--arms", type=int, default=arms)
+    parser.add_argument("--out", type=Path, default=Path("runs/soak"))
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    return options
+
+
 def main() -> None:
     """Run the week, write the figures and check the goals."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--jobs", type=int, default=100_000)
-    parser.add_argument("--arms", type=int, default=16)
-    parser.add_argument("--out", type=Path, default=Path("runs/soak"))
-    arguments = parser.parse_args()
-    arguments.out.mkdir(parents=True, exist_ok=True)
+    arguments = read_options(__doc__, jobs=100_000, arms=16)
     with tempfile.TemporaryDirectory(dir=arguments.out) as folder:
         samples, missing = soak(Path(folder) / "auctioneer.journal", arguments.jobs, arguments.arms)
         took_s = restart_s(Path(folder))

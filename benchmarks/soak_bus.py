@@ -6,7 +6,6 @@ The auctioneer and model arms, which finish a job at once, run in one process, e
 submits ten jobs whenever fewer than 200 wait. Writes soak_bus.json. For a week of work see soak.py.
 """
 
-import argparse
 import json
 import sys
 import tempfile
@@ -16,7 +15,7 @@ from itertools import count
 from pathlib import Path
 
 import numpy as np
-from soak import BACKLOG, BATCH, PLAN, first_come, rss_mb
+from soak import BACKLOG, BATCH, PLAN, first_come, read_options, rss_mb
 
 from fleet.bus.client.client import BusClient
 from fleet.bus.client.replies import Replies
@@ -116,12 +115,7 @@ class Submitter(threading.Thread):
 
 def main() -> None:
     """Run all jobs and write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--jobs", type=int, default=5000)
-    parser.add_argument("--arms", type=int, default=4)
-    parser.add_argument("--out", type=Path, default=Path("runs/soak"))
-    arguments = parser.parse_args()
-    arguments.out.mkdir(parents=True, exist_ok=True)
+    arguments = read_options(__doc__, jobs=5000, arms=4)
     with (
         tempfile.TemporaryDirectory(dir=arguments.out) as folder,
         Router() as router,

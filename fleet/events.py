@@ -1,7 +1,7 @@
 """Events of an episode: awards, completions, warnings, faults and recoveries."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 EventKind = Literal[
     "release",
@@ -22,12 +22,38 @@ EventKind = Literal[
     "contact",
 ]
 EVENT_KINDS: tuple[str, ...] = get_args(EventKind)
-"""release: job may be claimed; award: claim won; lost: claim lost; illegal: claim not allowed, counted as a wait;
-torque_warning: the awarded plan exceeds the torque warning; finish: last cycle done; home: arm free again;
-warning, fault: motor limit passed; return: job back in the queue; give_up: job that faulted too often; give_back: an
-arm returned its job after a cycle; expire: due date passed before an arm began the job; recover: fault
-cleared; moved: a person moved the faulted arm home; contact: a link or payload of an arm is inside another arm, the
-floor or a fixture (the plant `mujoco` looks for it)."""
+
+
+class Meaning(NamedTuple):
+    """Meaning of a kind of event."""
+
+    text: str
+    value: str = ""
+    """What `value` is; "" for nothing."""
+    live: bool = False
+    """A live arm reports it; the others are events of simulated shifts alone."""
+
+
+MEANINGS: dict[EventKind, Meaning] = {
+    "release": Meaning("The job may be claimed."),
+    "award": Meaning("The arm got the job.", "difficulty of the job for the arm", live=True),
+    "lost": Meaning("The arm claimed the job, and another arm got it."),
+    "illegal": Meaning("The claim was not allowed, and counts as a wait."),
+    "torque_warning": Meaning("The plan of the job exceeds the torque warning of `joint`.", "torque, N·m", live=True),
+    "finish": Meaning("The last cycle of the job is done.", "lateness, s; 0 if on time", live=True),
+    "home": Meaning("The arm is at home and free again.", live=True),
+    "warning": Meaning("The motor of `joint` passed its warning limit.", "temperature, °C", live=True),
+    "fault": Meaning("The motor of `joint` passed its fault limit: the arm stopped.", "temperature, °C", live=True),
+    "return": Meaning("After a fault the job is open again.", "cycles that are kept", live=True),
+    "give_up": Meaning("Arms faulted in the job too often: it is given up."),
+    "give_back": Meaning("The arm returned its job after a cycle.", "cycles that are kept"),
+    "expire": Meaning("The due date passed before an arm began the job: it is given up."),
+    "recover": Meaning("The fault is cleared.", live=True),
+    "moved": Meaning("A person moved the faulted arm home.", live=True),
+    "contact": Meaning(
+        "A link or payload of the arm is inside another arm, the floor or a fixture (plant `mujoco`).", "depth, mm"
+    ),
+}
 
 EVENTS_PER_BOOT = 1_000_000_000
 """On the bus, the number of an arm's event is its boot number times this, plus a count from 1."""
@@ -45,7 +71,6 @@ class Event:
     joint: int = 0
     """Motor 1..7; 0 if the event has none."""
     value: float = float("nan")
-    """Quantity of the kind: temperature °C, torque N·m, difficulty of an award, cycles kept of a return or a
-    give_back, depth of a contact in mm."""
+    """Quantity of the kind, as in `MEANINGS`; NaN for none."""
     reason: str = ""
     """Why, in words; of an award in a simulated shift, the predicted peak temperature and P(saturation)."""

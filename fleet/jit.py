@@ -83,10 +83,7 @@ def kernel(function: Callable[..., Any]) -> Kernel:
 
 def compiled_sources() -> tuple[Path, ...]:
     """Files whose functions are compiled, or whose constants are compiled into functions."""
-    names = (
-        *("jit", "arrivals", "seeding", "motor", "difficulty", "robot", "telemetry", "thermal", "observation", "job"),
-        *("planning/clearance", "planning/sweep"),
-    )
+    names = ("jit", "arrivals", "seeding", "motor", "difficulty", "robot", "telemetry", "thermal", "observation", "job")
     return (*(_PACKAGE / f"{name}.py" for name in names), *sorted((_PACKAGE / "engine").glob("*.py")))
 
 

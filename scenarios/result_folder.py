@@ -4,7 +4,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -103,6 +103,15 @@ def check_overwrite(out: Path, overwrite: bool, what: str = "exists") -> None:
     """Raise a FleetError if `out` exists and must not be replaced."""
     if out.exists() and not overwrite:
         raise FleetError(f"'{out}' {what}; give another --out, or --overwrite to replace it.")
+
+
+def check_file(out: Path, endings: Sequence[str], overwrite: bool) -> None:
+    """Raise a FleetError unless `out` ends as asked, for example in `.gif`, is no folder, and may be written."""
+    if out.suffix.lower() not in endings:
+        raise FleetError(f"--out must end in {', '.join(endings)} (got '{out}').")
+    if out.is_dir():
+        raise FleetError(f"Cannot write to '{out}': it is a folder.")
+    check_overwrite(out, overwrite)
 
 
 def _status(card: Path) -> str | None:

@@ -1,9 +1,10 @@
 """Small worlds in which every figure is known beforehand: constant torques, whole seconds, no MuJoCo and no twin."""
 
 import os
+import signal
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
@@ -33,6 +34,18 @@ settings.register_profile("thermofleet", deadline=None)
 settings.register_profile("ci", deadline=None, derandomize=True, print_blob=True)
 settings.register_profile("storm", deadline=None, derandomize=False, print_blob=True, max_examples=1000)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE") or ("ci" if os.environ.get("CI") else "thermofleet"))
+
+# A shell starts background jobs with Ctrl-C ignored, and their child processes inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(autouse=True)
+def signal_handlers_are_restored() -> Iterator[None]:
+    """Fail the test that leaves another handler of Ctrl-C or SIGTERM to the tests after it."""
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    yield
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
 
 LIGHT, WARM, HOT = 0.0, 4.0, 8.0
 """Payloads, kg: cool for ever; past 60 °C within the hour; past 75 °C within minutes."""

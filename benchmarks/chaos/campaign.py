@@ -2,7 +2,8 @@
 
 import math
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from fleet.bus.security.access_control import Participant, of_arms
 from fleet.bus.security.certificates import HERE
 from fleet.bus.security.keyring import make
 from fleet.bus.security.tls import Tls
-from fleet.live.supervisor import Backoff, Supervisor
+from fleet.live.supervisor import Supervisor
 from scenarios.cli.live.up import free_port, parts_of
 from scenarios.load import load
 
@@ -32,8 +33,9 @@ ROGUE = "rogue"
 """An arm with a certificate that is not in the scenario."""
 
 
-def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float, namespaces: bool) -> Outcome:
-    """Run one fault on a new fleet.
+@contextmanager
+def start_fleet(fault: Fault, folder: Path, *, speed: float, namespaces: bool = False) -> Iterator[Fleet]:
+    """Start the fleet that a fault needs, and wait until all participants are on the bus.
 
     Args:
         namespaces: Partition by network namespaces, with certificates, instead of by a proxy.
@@ -69,7 +71,6 @@ def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float, namespaces:
         )
         if isinstance(cut, Namespaces):
             router = replace(router, argv=(*router.argv, "--host", "0.0.0.0"))
-        work = tuple(_job(number) for number in range(jobs))
         clocks = WallClocks(folder / "clocks") if fault.clocks else None
         if cut is not None:
             arm_parts[-len(cut_arms) :] = map(cut.through, arm_parts[-len(cut_arms) :], cut_arms)
@@ -77,7 +78,7 @@ def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float, namespaces:
         if clocks is not None:
             router = replace(router, env=clocks.env("router"))
             parts = [replace(part, env=clocks.env(part.name)) for part in parts]
-        supervisor = stack.enter_context(Supervisor(folder / "logs", backoff=Backoff(first_s=0.2)))
+        supervisor = stack.enter_context(Supervisor(folder / "logs"))
         supervisor.start(router, ready_s=START_S)
         for part in parts:
             supervisor.start(part)
@@ -87,6 +88,7 @@ def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float, namespaces:
         client = stack.enter_context(BusClient(endpoint, SCENARIO))
         session = stack.enter_context(open_client(endpoint, timeout_s=5.0))
         fleet = Fleet(supervisor, client, router.ready, session, folder, arms, keys=place, cut=cut, clocks=clocks)
+        stack.callback(fleet.journals.close)
         fleet.cut_arms = cut_arms
         fleet.listen()
         if math.isinf(
@@ -98,6 +100,13 @@ def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float, namespaces:
                 fleet.client.query_and_wait(keys.of_clock(SCENARIO), ClockRequest(), Clock, timeout_s=2.0).messages
             )
         )
+        yield fleet
+
+
+def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float, namespaces: bool) -> Outcome:
+    """Run one fault on a new fleet; arguments and errors as for `start_fleet`."""
+    with start_fleet(fault, folder, speed=speed, namespaces=namespaces) as fleet:
+        client, work = fleet.client, tuple(map(short_job, range(jobs)))
         replies = client.query_and_wait(
             keys.of_jobs(SCENARIO, "submit"), Submission(work), SubmissionReply, timeout_s=10.0
         )
@@ -107,21 +116,21 @@ def campaign(fault: Fault, folder: Path, *, jobs: int, speed: float, namespaces:
         fleet.wait_until(lambda: fleet.working_arm() is not None and _finished(fleet) >= 2)
         injected_s = time.monotonic()
         detected_s = fault.inject(fleet)
-        well_s = fleet.wait_until(lambda: _is_healthy(fleet))
+        well_s = fleet.wait_until(lambda: is_healthy(fleet))
         recovered_s = time.monotonic() - injected_s if math.isfinite(well_s) else math.inf
         settled_s = fleet.wait_until(lambda: _all_settled(fleet, accepted))
         ended_s = time.monotonic()
         fleet.wait_until(lambda: not _any_unfinished(fleet), LATE_REPORTS_S)
         outcome = _outcome(fleet, accepted)
-        outcome.by = "" if cut is None else cut.by
+        outcome.by = getattr(fleet.cut, "by", "")
         outcome.detected_s, outcome.recovered_s = detected_s, recovered_s
         outcome.took_s = ended_s - injected_s if math.isfinite(settled_s) else math.inf
     return outcome
 
 
-def _job(number: int) -> JobSpec:
+def short_job(number: int) -> JobSpec:
     """Return a job of a few minutes whose plans are cached, at one of three stations in turn."""
-    name, repetitions = f"job {number:03d}", 4 + number % 3
+    name, repetitions = f"job {number:04d}", 4 + number % 3
     if number % 3 == 0:
         return JobSpec(name=name, kind="sort", places=("belt", "bin"), payload_kg=0.1, repetitions=repetitions)
     if number % 3 == 1:
@@ -134,7 +143,7 @@ def _finished(fleet: Fleet) -> int:
     return sum(job.state == "finished" for job in fleet.status().values())
 
 
-def _is_healthy(fleet: Fleet) -> bool:
+def is_healthy(fleet: Fleet) -> bool:
     """Whether all participants are present and publish, killed ones too, and the auctioneer replies."""
     fleet.client.serve(time.monotonic() + 0.05)
     there = all(fleet.supervisor.ready(name) for name in fleet.supervisor.restarts())

@@ -3,7 +3,6 @@
 import math
 import os
 import signal
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -12,13 +11,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import zenoh
+from journal_files import JournalFiles
 
 from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobStatus, Result, Status, StatusRequest
 from fleet.bus.protocol.messages import State
-from fleet.live.arm.journal_records import ArmRecord, Closed
-from fleet.live.journal import Journal
 from fleet.live.supervisor import Supervisor
 
 TIMEOUT_S = 150.0
@@ -81,6 +79,16 @@ class Fleet:
     states: dict[str, tuple[float, State]] = field(default_factory=dict)
     """By arm: real time of the last state, and the state."""
     results: list[tuple[float, JobStatus]] = field(default_factory=list)
+    each_step: Callable[[], None] = lambda: None
+    """Called at every step, as to submit jobs."""
+    target: str = ""
+    """The arm that a fault hits; "" for any that works."""
+    ended_s: float = -math.inf
+    """Real time of the last kill, and of the last end of a fault that lasts."""
+
+    def __post_init__(self) -> None:
+        self.journals = JournalFiles(self.folder / "journals")
+        self._last_result = -1
 
     def listen(self) -> None:
         """Subscribe to tokens, states and results."""
@@ -99,15 +107,30 @@ class Fleet:
         while time.monotonic() - began_s < timeout_s:
             if condition():
                 return time.monotonic() - began_s
-            self.supervisor.poll()
-            self.client.serve(time.monotonic() + 0.02)
+            self.step(0.02)
         return math.inf
+
+    def step(self, wait_s: float = 0.0) -> None:
+        """Restart exited processes, and wait for messages and handle them."""
+        self.supervisor.poll()
+        self.client.serve(time.monotonic() + wait_s)
+        self.journals.follow()
+        self.each_step()
+
+    def end_fault(self) -> None:
+        """Note that the cause of a fault has ended now."""
+        self.ended_s = time.monotonic()
+
+    def victim(self) -> str:
+        """Return the arm that a fault hits."""
+        return self.target or self.working_arm() or self.arms[0]
 
     def send_signal(self, name: str, number: int = signal.SIGKILL) -> None:
         """Send a signal to a participant."""
         pid = self.supervisor.pid(name)
         if pid is not None:
             os.kill(pid, number)
+            self.end_fault()
             if number == signal.SIGKILL:
                 self.killed[name] += 1
 
@@ -130,20 +153,8 @@ class Fleet:
         return {job.job: job for word in answers.messages.values() for job in word.jobs}
 
     def count_finished(self) -> Counter[str]:
-        """Count how often each job was finished, by the journals of the arms."""
-        done: Counter[str] = Counter()
-        for path in sorted((self.folder / "journals").glob("*.journal")):
-            if path.stem == "auctioneer":
-                continue
-            copy = Path(tempfile.mkdtemp()) / path.name  # the arm has locked its own
-            copy.write_bytes(path.read_bytes())
-            with Journal[ArmRecord](copy, ArmRecord) as journal:
-                done.update(
-                    record.job
-                    for record in journal.records()
-                    if isinstance(record, Closed) and record.outcome == "finished"
-                )
-        return done
+        """Count how often each job was finished, by the journals of the arms since their first start."""
+        return self.journals.count_finished()
 
     def _token(self, arm: str, there: bool) -> None:
         (self.tokens.add if there else self.tokens.discard)(arm)
@@ -152,7 +163,9 @@ class Fleet:
         self.states[arm] = time.monotonic(), word
 
     def _result(self, _auctioneer: str, word: Result) -> None:
-        self.results.append((time.monotonic(), word.status))
+        if word.number > self._last_result:  # an auctioneer repeats its last results when it starts
+            self._last_result = word.number
+            self.results.append((time.monotonic(), word.status))
 
 
 Inject = Callable[[Fleet], float]

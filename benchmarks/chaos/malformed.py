@@ -52,14 +52,13 @@ def malformed(fleet: Fleet) -> float:
         else:
             session.put(key, body, encoding=kind)
         if number % 500 == 0:
-            fleet.supervisor.poll()
-            fleet.client.serve()
+            fleet.step()
     return math.nan
 
 
 def replayed_awards(fleet: Fleet) -> float:
     """Send the awards of an arm again, 50 times."""
-    arm = fleet.arms[0]
+    arm = fleet.target or fleet.arms[0]
     for award in awards_of(fleet, arm) * 50:
         fleet.session.get(
             keys.of_arm(fleet.client.fleet, arm, "award"),
@@ -68,8 +67,7 @@ def replayed_awards(fleet: Fleet) -> float:
             encoding=encoding(Award),
             timeout=2.0,
         )
-        fleet.supervisor.poll()
-        fleet.client.serve()
+        fleet.step()
     return math.nan
 
 

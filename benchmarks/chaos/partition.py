@@ -118,6 +118,7 @@ def partition(fleet: Fleet) -> float:
     cut, cut_arms, seen_s = cut_at_work(fleet)
     fleet.wait_until(lambda: False, CUT_S)
     cut.heal()
+    fleet.end_fault()
     healed_s = fleet.wait_until(lambda: not any(map(fleet.is_absent, cut_arms)), 30.0)
     how = "each in a network namespace, link down" if cut.by == "netns" else "behind a proxy"
     cut_s = CUT_S + min(seen_s, 10.0)

@@ -77,8 +77,7 @@ def _listen(fleet: Fleet, for_s: float, silent_s: dict[str, float]) -> None:
     """Receive states for a time, and note how long each arm is silent."""
     until_s = time.monotonic() + for_s
     while True:
-        fleet.supervisor.poll()
-        fleet.client.serve(min(until_s, time.monotonic() + 0.05))
+        fleet.step(max(0.0, min(until_s - time.monotonic(), 0.05)))
         now_s = time.monotonic()
         for arm in silent_s:
             silent_s[arm] = max(silent_s[arm], now_s - fleet.states[arm][0])

@@ -16,20 +16,20 @@ from fleet_under_test import Fleet
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import JobSpec, Submission, SubmissionReply
 
-DISK_S, ANSWER_S = 10.0, 3.0
-"""Real seconds: of a full disk; in which a submission must be answered once the router is back."""
+DISK_S, ANSWER_S, STOP_S = 10.0, 3.0, 4.0
+"""Real seconds: of a full disk; in which a submission must be answered once the router is back; of a stop."""
 
 
 def kill_arm(fleet: Fleet) -> float:
     """SIGKILL an arm during a job."""
-    arm = fleet.working_arm() or fleet.arms[0]
+    arm = fleet.victim()
     fleet.send_signal(f"arm-{arm}")
     return fleet.wait_until(lambda: fleet.is_absent(arm), 10.0)
 
 
 def stop_arm(fleet: Fleet) -> float:
     """SIGSTOP an arm during a job, for longer than its lease, then SIGCONT."""
-    arm = fleet.working_arm() or fleet.arms[0]
+    arm = fleet.victim()
     fleet.send_signal(f"arm-{arm}", signal.SIGSTOP)
     seen_s = fleet.wait_until(lambda: fleet.is_absent(arm), 10.0)
     fleet.wait_until(lambda: False, 12.0)
@@ -49,6 +49,20 @@ def kill_router(fleet: Fleet) -> float:
     """SIGKILL the router."""
     fleet.send_signal("router")
     return fleet.wait_until(lambda: not fleet.tokens, 10.0)
+
+
+def kill_recorder(fleet: Fleet) -> float:
+    """SIGKILL the recorder."""
+    fleet.send_signal("record")
+    return math.nan
+
+
+def stop_auctioneer(fleet: Fleet) -> float:
+    """SIGSTOP the auctioneer for a time shorter than a lease, then SIGCONT."""
+    fleet.send_signal(fleet.auction, signal.SIGSTOP)
+    fleet.wait_until(lambda: False, STOP_S)
+    fleet.send_signal(fleet.auction, signal.SIGCONT)
+    return math.nan
 
 
 def stuck_subscriber(fleet: Fleet) -> float:
@@ -76,9 +90,10 @@ def stuck_subscriber(fleet: Fleet) -> float:
 
 def full_disk(fleet: Fleet) -> float:
     """Leave no space for the journals of an arm and of the auctioneer for ten seconds."""
-    arm = fleet.working_arm() or fleet.arms[0]
+    arm = fleet.victim()
     with _without_space(_pids(fleet, f"arm-{arm}", fleet.auction)):
         fleet.wait_until(lambda: False, DISK_S)
+    fleet.end_fault()
     return math.nan
 
 

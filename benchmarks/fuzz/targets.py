@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -140,7 +140,7 @@ def journal(data: bytes) -> None:
     path = written("journal", content)
     with (
         suppress(FleetError),
-        Journal(path, kind, sync=lambda file: None, put_aside=lambda record, reason: None) as book,
+        Journal[Any](path, kind, sync=lambda file: None, put_aside=lambda record, reason: ()) as book,
     ):
         records = list(book.records())
         if kind is ArmRecord:

@@ -15,7 +15,9 @@ import sys
 import time
 from dataclasses import dataclass
 
-from mutations import MUTATIONS, applied
+import mutations  # noqa: F401 -- adds its mutations, as the next one does
+import steering_mutations  # noqa: F401
+from mutation import MUTATIONS, applied
 from shift import Shift
 from world import Violation
 

@@ -1,8 +1,8 @@
 """A simulated bus: the calls of `fleet.bus.client.client.BusClient` on a `World`.
 
 Messages are passed as objects; some are encoded and decoded on their way, as a check of the contract. A subscriber with
-history gets what its publisher has cached, in order and once, as soon as both reach each other. Everything else may be
-lost, late, doubled or out of order.
+history gets what its publisher has cached, in order and once, as soon as both reach each other, but for `MISSED`.
+Everything else may be lost, late, doubled or out of order.
 """
 
 import math
@@ -18,10 +18,12 @@ from fleet.bus.client.replies import AnotherReplies, Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.messages import decode_as, encode, encoding
 from fleet.bus.protocol.registry import channel_for
-from fleet.errors import Refused
+from fleet.errors import BusError, Refused
 
 ENCODED = 0.02
 """Share of messages that are encoded and decoded on their way."""
+MISSED = 0.3
+"""Share of lost messages that a subscriber with history never gets: it asks a cache once for what it misses."""
 
 Handle = Callable[..., Any]
 
@@ -39,10 +41,12 @@ class Bus:
     def __init__(self, world: World) -> None:
         self.world = world
         self.clients: dict[str, SimulatedClient] = {}
+        self.on_publish: Handle = lambda published, message: None
 
     def drop(self, process: Process) -> None:
         """Forget an ended process."""
-        self.clients.pop(process.name, None)
+        for name in (process.name, f"{process.name}+"):
+            self.clients.pop(name, None)
         self.update_tokens()
 
     def update_tokens(self) -> None:
@@ -83,6 +87,7 @@ class Published:
         """Publish a message."""
         self.count += 1
         self.cache.append((self.count, message))
+        self.client.bus.on_publish(self, message)
         world, process = self.client.world, self.client.process
         for subscription in self.client.subscriptions_of(self.key):
             if subscription.history:
@@ -110,7 +115,10 @@ class Subscription:
         world, process, own = self.client.world, source.client.process, self.client.process
         if not (source.client.open_ and self.client.open_):
             return
-        if not world.reach(process, own) or process.hung or world.rng.random() < world.loss:
+        lost = world.rng.random() < world.loss
+        if not world.reach(process, own) or process.hung or lost:
+            if lost and source.channel.history > 1 and world.rng.random() < MISSED:
+                self._last[source] = source.count
             self.fetch_soon(source, source.channel.heartbeat_s * (1.0 + world.rng.random()))
             return
         last = self._last.get(source, 0)
@@ -123,9 +131,9 @@ class Subscription:
 
 
 class SimulatedClient:
-    """A participant's connection, as `BusClient`."""
+    """A participant's connection, as `BusClient`; a `further` one is opened and closed while it works."""
 
-    def __init__(self, process: Process, fleet: str = "f") -> None:
+    def __init__(self, process: Process, fleet: str = "f", *, further: bool = False) -> None:
         self.process, self.world, self.fleet = process, process.world, fleet
         self.bus: Bus = process.world.bus
         self.malformed = self.overrun = 0
@@ -136,29 +144,47 @@ class SimulatedClient:
         self.queryables: list[tuple[str, Handle]] = []
         self.subscriptions: list[Subscription] = []
         self.publishers: list[Published] = []
-        self._boot = process.boot
-        process.client = self
-        self.bus.clients[process.name] = self
+        self._boot, self._further, self._batch_s = process.boot, further, math.inf
+        if not further:
+            process.client = self
+            self.bus.clients[process.name] = self
 
     @property
     def open_(self) -> bool:
-        return self.process.up and self.process.boot == self._boot
+        own = self.bus.clients.get(f"{self.process.name}+") is self if self._further else True
+        return self.process.up and self.process.boot == self._boot and own
 
     def open(self) -> "SimulatedClient":
+        """Connect a further client; `BusError` without a router."""
+        if self.process.group:
+            raise BusError("no router")
+        self.bus.clients[f"{self.process.name}+"] = self
         return self
 
     def close(self) -> None:
-        """Do nothing: the end of the process closes it."""
+        """Close a further client; the others end with their process."""
+        if self._further and self.open_:
+            del self.bus.clients[f"{self.process.name}+"]
 
     # Handling
 
     def serve(self, until_s: float = -math.inf, *, at_least: int = 1) -> int:
         """Handle what has arrived; without anything, wait once per turn of the process."""
+        if at_least > 1:
+            return self._serve_batch(until_s, at_least)
         handled = self.handle_all()
         if not handled and not self.elapsed and until_s > self.process.real_s:
             raise Sleep(until_s)
         self.elapsed = False
         return handled
+
+    def _serve_batch(self, until_s: float, at_least: int) -> int:
+        """Wait until there are as many messages, or until that time."""
+        self._batch_s = min(self._batch_s, until_s)
+        if len(self.process.inbox) < at_least and self.process.real_s < self._batch_s:
+            raise Sleep(self._batch_s)
+        self._batch_s = math.inf
+        return self.handle_all()
 
     def handle_all(self) -> int:
         handled = 0

@@ -42,7 +42,7 @@ class Disk:
     def __init__(self, rng: Random) -> None:
         self.full = False
         self.broken = self.crash_in = 0
-        self.power = False
+        self.power = self._crashed = False
         self._rng = rng
         self.names: dict[str, File] = {}
         self._durable: dict[str, File] = {}
@@ -58,8 +58,11 @@ class Disk:
         """Lose what a killed process, or a machine without power, loses."""
         if not power:
             return
-        if self._rng.random() < 0.5:
-            self.names = dict(self._durable)
+        for name in sorted(self.names.keys() | self._durable.keys()):  # each change of a name that no fsync has kept
+            if self.names.get(name) is not self._durable.get(name) and self._rng.random() < 0.5:
+                self.names.pop(name, None)
+                if name in self._durable:
+                    self.names[name] = self._durable[name]
         for file in self.names.values():
             kept = self._rng.randint(file.synced, max(file.synced, len(file.data)))
             del file.data[kept:]
@@ -68,7 +71,7 @@ class Disk:
         """Close what an ended process had open."""
         self._open.clear()
         self._locked.clear()
-        self.crash_in = 0
+        self.crash_in, self._crashed = 0, False
 
     # Calls of `os`
 
@@ -143,10 +146,15 @@ class Disk:
         self._before("rename")
         self.names[name] = self.names.pop(draft)
 
+    def unlink(self, name: str) -> None:
+        if not self._crashed:  # a killed process cleans nothing up
+            self.names.pop(name, None)
+
     def _before(self, call: str) -> None:
         if self.crash_in:
             self.crash_in -= 1
             if not self.crash_in:
+                self._crashed = True
                 raise Crash(call, power=self.power)
 
 
@@ -179,10 +187,24 @@ class DiskPath:
         self.disk.replace(self.name, other.name)
 
     def unlink(self, *, missing_ok: bool = False) -> None:
-        self.disk.names.pop(self.name, None)
+        self.disk.unlink(self.name)
+
+    def iterdir(self) -> list["DiskPath"]:
+        return [DiskPath(self.disk, name) for name in self.disk.names]
+
+    def read_bytes(self) -> bytes:
+        if not self.exists():
+            raise FileNotFoundError(errno.ENOENT, "No such file", self.name)
+        return bytes(self.disk.names[self.name].data)
+
+    def write_bytes(self, content: bytes) -> None:
+        handle, rest = self.disk.open(self, os.O_TRUNC), memoryview(content)
+        while rest:
+            rest = rest[self.disk.write(handle, rest) :]
+        self.disk.close(handle)
 
     def open(self, mode: str, **options: Any) -> "_Log":
-        return _Log(self.disk)
+        return _Reader(self.disk, self.disk.open(self, 0)) if mode == "rb" else _Log(self.disk)
 
 
 class _Log:
@@ -207,6 +229,20 @@ class _Log:
 
     def __exit__(self, *exc: object) -> None:
         self.close()
+
+
+class _Reader(_Log):
+    """A file that is open for `fsync`."""
+
+    def __init__(self, disk: Disk, handle: int) -> None:
+        super().__init__(disk)
+        self._handle = handle
+
+    def fileno(self) -> int:
+        return self._handle
+
+    def close(self) -> None:
+        self._disk.close(self._handle)
 
 
 class DiskCalls:

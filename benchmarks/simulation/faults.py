@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from participants import CLIENT
+from participants import AUCTIONEER, CLIENT
 from world import Process
 
 from fleet.bus.protocol import keys
@@ -209,9 +209,13 @@ def clear(shift: "Shift", arm: str) -> None:
 
 def steer(shift: "Shift") -> None:
     """Have a person cancel, settle or change a job, or pause arms; a person knows what was done."""
-    if shift.alone or not shift.submitter.accepted:
+    if not shift.submitter.accepted:
         return
-    job, arm = shift.rng.choice(list(shift.submitter.accepted)), shift.rng.choice([ALL_ARMS, *shift.arms])
+    node: Any = shift.node(AUCTIONEER)
+    entries = {} if node is None else node.auctioneer.ledger.jobs
+    unfinished = [name for name, entry in entries.items() if entry.state == "unfinished"]  # a person sees them
+    job = shift.rng.choice(unfinished or list(shift.submitter.accepted))
+    arm = shift.rng.choice([ALL_ARMS, *shift.arms])
     actions: list[Action] = [Cancel(job), Change(job, value=shift.rng.random()), Pause(arm), Resume()]
     if shift.finished.get(job):
         actions.append(Settle(job, "done"))
@@ -221,7 +225,7 @@ def steer(shift: "Shift") -> None:
 
 
 def request(shift: "Shift", action: Action) -> None:
-    """Send a request of a person, again until there is a reply or the fleet is healed."""
+    """Send a request of a person, again until there is a reply or the fleet is healed; and sometimes once more."""
     if isinstance(action, Cancel):
         shift.cancelled.add(action.job)
     message = ControlRequest(str(shift.world.now_s), action, "a person")
@@ -236,6 +240,8 @@ def request(shift: "Shift", action: Action) -> None:
             send()
 
     send()
+    if not shift.healed and shift.rng.random() < 0.3:
+        shift.world.after(shift.rng.uniform(0.0, 30.0), send)
 
 
 def kill_supervisor(shift: "Shift") -> None:

@@ -1,14 +1,10 @@
-"""Rules of the product, each broken on purpose by a patch of the running process.
-
-A patch replaces methods of the product's classes until the end of its `with` block. The simulation must find each one.
-"""
+"""Rules of auction, consensus, arms and journals, each broken on purpose."""
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any
 
 from msgspec.structs import replace as changed
+from mutation import add_mutation, unwritten
 
 from fleet.errors import JournalError
 from fleet.live import journal as journal_module
@@ -27,53 +23,6 @@ from fleet.live.consensus.records import JobGranted
 from fleet.live.journal import Journal
 from fleet.live.journal_records import Closed, CommitPermitted, JobsAccepted
 from fleet.live.supervisor import Supervisor
-
-Patch = tuple[Any, str, Callable[[Any], Any]]
-"""Where, the name, and what makes the replacement of what was there."""
-
-
-class Mutation(NamedTuple):
-    """A broken rule."""
-
-    rule: str
-    patches: tuple[Patch, ...]
-    alone: bool | None = None
-    """Whether it concerns fleets without an auctioneer; None: all fleets."""
-
-
-MUTATIONS: dict[str, Mutation] = {}
-"""By name."""
-
-
-def _mutation(name: str, rule: str, *patches: Patch, alone: bool | None = None) -> None:
-    MUTATIONS[name] = Mutation(rule, patches, alone)
-
-
-@contextmanager
-def applied(name: str) -> Iterator[None]:
-    """Break one rule until the end of the block; "" breaks none."""
-    before: list[tuple[Any, str, Any]] = []
-    try:
-        for owner, attribute, make in MUTATIONS[name].patches if name else ():
-            original = vars(owner)[attribute]
-            before.append((owner, attribute, original))
-            setattr(owner, attribute, make(original))
-        yield
-    finally:
-        for owner, attribute, original in reversed(before):
-            setattr(owner, attribute, original)
-
-
-def _unwritten(kind: type) -> Callable[[Any], Any]:
-    """Journal whose records of one kind are not written."""
-
-    def make(append: Any) -> Any:
-        def patched(self: Any, *records: Any) -> None:
-            append(self, *(record for record in records if not isinstance(record, kind)))
-
-        return patched
-
-    return make
 
 
 def _forgetful(start: Any) -> Any:
@@ -159,11 +108,11 @@ def _ends_free(end: Any) -> Any:
 def _reads_torn_lines(lines: Any) -> Any:
     """Take an unfinished last line for a record."""
 
-    def patched(self: Any) -> Any:
-        size = sum(len(line) for line, _ in lines(self))
+    def patched(self: Any, put_aside: Any) -> Any:
+        size = sum(len(line) for line, _ in lines(self, None))
         if size < journal_module.os.fstat(self._file).st_size:
             raise JournalError("damaged")
-        yield from lines(self)
+        yield from lines(self, put_aside)
 
     return patched
 
@@ -172,45 +121,45 @@ def _nobody_in_the_way(original: Any) -> Any:
     return lambda arm, space, taken, excludes: ()
 
 
-_mutation(
-    "award-unwritten", "an award is on disk before it is sent", (Journal, "append", _unwritten(Awarded)), alone=False
+add_mutation(
+    "award-unwritten", "an award is on disk before it is sent", (Journal, "append", unwritten(Awarded)), alone=False
 )
-_mutation(
+add_mutation(
     "commit-unwritten",
     "permission to commit is on disk before it is given",
-    (Journal, "append", _unwritten(CommitPermitted)),
+    (Journal, "append", unwritten(CommitPermitted)),
 )
-_mutation("accept-unwritten", "an arm accepts an award on disk", (Journal, "append", _unwritten(AwardAccepted)))
-_mutation("submission-unwritten", "an accepted job is on disk", (Journal, "append", _unwritten(JobsAccepted)))
-_mutation(
-    "grant-unwritten", "a grant is on disk before the reply", (Journal, "append", _unwritten(JobGranted)), alone=True
+add_mutation("accept-unwritten", "an arm accepts an award on disk", (Journal, "append", unwritten(AwardAccepted)))
+add_mutation("submission-unwritten", "an accepted job is on disk", (Journal, "append", unwritten(JobsAccepted)))
+add_mutation(
+    "grant-unwritten", "a grant is on disk before the reply", (Journal, "append", unwritten(JobGranted)), alone=True
 )
-_mutation(
+add_mutation(
     "end-unwritten",
     "the end of a job is on disk before its report and receipt",
-    (Journal, "append", _unwritten(Closed)),
+    (Journal, "append", unwritten(Closed)),
 )
-_mutation(
+add_mutation(
     "no-fsync",
     "a record is written through",
     (Journal, "__init__", lambda start: lambda self, *a, **k: start(self, *a, **{**k, "sync": lambda file: None})),
 )
-_mutation("torn-line-read", "an unfinished last line is removed", (Journal, "_lines", _reads_torn_lines))
-_mutation(
+add_mutation("torn-line-read", "an unfinished last line is removed", (Journal, "_lines", _reads_torn_lines))
+add_mutation(
     "lease-forgotten",
     "after a restart open awards count as leased",
     (LedgerWriter, "__init__", _forgetful),
     alone=False,
 )
-_mutation(
+add_mutation(
     "grant-forgotten", "after a restart grants count as leased", (Granter, "__init__", _forgetful_granter), alone=True
 )
-_mutation(
+add_mutation(
     "lease-too-short",
     "the granting side counts leases longer",
     (Timing, "counted_lease_s", lambda _: property(lambda self: 0.5 * self.lease_s)),
 )
-_mutation(
+add_mutation(
     "lease-ignored",
     "an arm begins cycles under a lease only",
     (
@@ -219,7 +168,7 @@ _mutation(
         lambda _: lambda self, now_s: self._current.award.job.repetitions - (not self._current.may_commit),
     ),
 )
-_mutation(
+add_mutation(
     "commit-ignored",
     "the last cycle needs permission to commit",
     (AwardExecutor, "allowed_cycles", lambda _: lambda self, now_s: self._current.award.job.repetitions),
@@ -231,57 +180,59 @@ _mutation(
         ),
     ),
 )
-_mutation(
+add_mutation(
     "commit-taken-back",
     "after permission to commit a job goes to no other arm",
     (Auctioneer, "_expire", _expires_all),
     alone=False,
 )
-_mutation(
+add_mutation(
     "duplicate-accepted",
     "a repeated award gets the same answer",
     (AwardExecutor, "answer_award", _duplicate),
     alone=False,
 )
-_mutation(
+add_mutation(
     "past-forgotten",
     "the name of a settled job is not used again",
     (PastJobs, "__contains__", lambda _: lambda self, name: False),
     alone=False,
 )
-_mutation("report-dropped", "a report is repeated until its receipt", (AwardExecutor, "due_reports", _dropped))
-_mutation("receipt-first", "a report is on disk before its receipt", (Auctioneer, "apply_report", _silent), alone=False)
-_mutation("crash-is-sure", "after a crash in the last cycle nobody repeats it", (ArmHistory, "after_restart", _sure))
-_mutation(
+add_mutation("report-dropped", "a report is repeated until its receipt", (AwardExecutor, "due_reports", _dropped))
+add_mutation(
+    "receipt-first", "a report is on disk before its receipt", (Auctioneer, "apply_report", _silent), alone=False
+)
+add_mutation("crash-is-sure", "after a crash in the last cycle nobody repeats it", (ArmHistory, "after_restart", _sure))
+add_mutation(
     "space-ignored",
     "plans that exclude each other are not awarded at a time",
     *((module, "arms_in_the_way", _nobody_in_the_way) for module in (round_module,)),
     alone=False,
 )
-_mutation(
+add_mutation(
     "space-freed-early",
     "closed awards keep their space until the arm is at home",
     (Ledger, "_end", _ends_free),
     alone=False,
 )
-_mutation(
+add_mutation(
     "claim-space-ignored",
     "an arm grants one of two plans that exclude each other",
     (Granter, "in_the_way", lambda _: lambda self, arm, space: ()),
     alone=True,
 )
-_mutation(
+add_mutation(
     "minority",
     "a claim needs a majority",
     (Claimant, "__init__", lambda start: lambda self, *a, **k: (start(self, *a, **k), setattr(self, "majority", 1))[0]),
     alone=True,
 )
-_mutation(
+add_mutation(
     "no-restart",
     "the supervisor starts ended processes again",
     (Supervisor, "_handle_exit", lambda _: lambda self, running: False),
 )
-_mutation(
+add_mutation(
     "no-backstop",
     "an unanswered award is sent again, or expires",
     (Auctioneer, "_expire", lambda _: lambda self, real_s, time_s: None),

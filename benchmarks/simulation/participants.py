@@ -15,6 +15,7 @@ from typing import Any
 from bus import SimulatedClient
 from disk import Disk, DiskCalls, DiskPath
 from machine import Deeds, SimulatedArm, SimulatedEstimator
+from recording import simulated_files
 from world import Process, World
 
 from fleet.bus.protocol import keys
@@ -31,6 +32,7 @@ from fleet.live.auction import ledger as ledger_module
 from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.records import AuctionRecord
 from fleet.live.auction.round import Allocate, Timing
+from fleet.live.consensus import settled_jobs
 from fleet.live.consensus.node import ConsensusNode
 from fleet.live.consensus.participant import Membership
 from fleet.live.consensus.records import GrantRecord
@@ -268,10 +270,11 @@ def simulated_system(world: World) -> Iterator[None]:
     replace(supervisor_module, "threading", SimpleNamespace(Thread=Thread, Event=threading.Event))
     replace(journal_module, "COMPACT_BYTES", 5_000)  # so that both happen in a short shift
     replace(ledger_module, "MAX_SETTLED", 5)
+    replace(settled_jobs, "MAX_SETTLED", 5)
     replace(arm_module, "plan_key", lambda plan: plan.space)
     replace(arm_module, "space_name", str)
     try:
-        with world.installed():
+        with world.installed(), simulated_files(disk):
             yield
     finally:
         for module, name, value in reversed(replaced):

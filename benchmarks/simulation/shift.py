@@ -2,7 +2,8 @@
 
 The rules: the last cycle of a job is done at most once; no two arms have one job; no two arms are away from home on
 plans that exclude each other; an accepted job stays known; after the faults every job is finished, given up for the
-reasons that the product names, or unfinished because an arm stopped in its last cycle; every wait ends.
+reasons that the product names, or unfinished because an arm stopped in its last cycle; every wait ends; requests of
+people have their effect (`steering`); the recording has every result once (`recording`).
 """
 
 from collections.abc import Mapping
@@ -12,6 +13,8 @@ from typing import Any
 from bus import Bus
 from faults import FAULTS, heal, request
 from participants import AUCTIONEER, CLIENT, ArmProcess, Submitter, Watch, auctioneer_process, simulated_system
+from recording import RECORDER, Sent, recorder_process
+from steering import check_steering
 from world import Process, Violation, World
 
 from fleet.bus.protocol.auction import ABANDONED, SETTLED, JobSpec
@@ -32,6 +35,8 @@ MOST_JOBS = 60
 """In one shift, about."""
 CHECK_S = 2.0
 """True seconds between two checks whether all is settled."""
+RECORD_S = 120.0
+"""True seconds after the last result in which the recorder has it."""
 SETTLE_S = 240.0
 """True seconds after the faults in which all jobs must be settled, besides the time that they take."""
 
@@ -116,6 +121,8 @@ class Shift:
         if not self.alone:
             build = auctioneer_process(self.arms, self.speed, first_come, timing, self.excludes)
             Process(world, AUCTIONEER, build)
+        self.sent = Sent(world.bus)
+        Process(world, RECORDER, recorder_process(rng.choice([5.0, 20.0, 60.0])))
         self.names = tuple(world.processes)
         Process(world, CLIENT, Submitter)
         world.after_run, world.after_exit = self._after_run, self._after_exit
@@ -142,6 +149,7 @@ class Shift:
             world.run(self.faulty_s)
             heal(self)
             self._settle()
+            self._end_recording()
 
     @property
     def submitter(self) -> Submitter:
@@ -252,9 +260,13 @@ class Shift:
             return states | {each.job: each.state for each in auctioneer.status()}
         states = {}
         for name in self.arms:
-            for each in self.node(name).work_source.statuses():
-                if states.setdefault(each.job, each.state) in ("waiting", "given_up", "unfinished"):
-                    states[each.job] = each.state
+            known = {each.job: each.state for each in self.node(name).work_source.statuses()}
+            past = self.node(name).work_source.participant.granter.register.past
+            left = [job for job in self.submitter.accepted if job in past and job not in known]
+            known |= {job: "finished" if past.is_finished(job) else "given_up" for job in left}
+            for job, state in known.items():
+                if states.setdefault(job, state) in ("waiting", "unfinished", *ABANDONED):
+                    states[job] = state
         return states
 
     def _open(self) -> list[str]:
@@ -282,12 +294,18 @@ class Shift:
             if before in self.submitter.accepted
         )
 
+    def _is_paused(self) -> bool:
+        if not self.alone:
+            return (node := self.node(AUCTIONEER)) is not None and bool(node.auctioneer.ledger.paused)
+        nodes = (node for name in self.arms if (node := self.node(name)) is not None)
+        return any(node.work_source.participant.granter.register.operations.paused for node in nodes)
+
     def _settle(self) -> None:
         deadline_s = self.world.now_s + SETTLE_S + 3.0 * self.work_s
         while self._open():
             if self.world.now_s > deadline_s:
                 raise Violation(f"No end after {self.world.now_s:.0f} s: {'; '.join(self._open()[:4])}.")
-            if not self.alone and (node := self.node(AUCTIONEER)) is not None and node.auctioneer.ledger.paused:
+            if self._is_paused():
                 request(self, Resume())
             self.world.run(self.world.now_s + CHECK_S)
         self.unsure |= {job for builder in self.builders.values() for job in builder.unsure}
@@ -307,3 +325,15 @@ class Shift:
                 lost or name in self.cancelled or job.expires or reason_to_give_up(self.faults.get(name, ()))
             ):
                 raise Violation(f"'{name}' is given up without a reason.")
+
+        if not self.alone:
+            check_steering(self.sent, states, self.node(AUCTIONEER).auctioneer.ledger.jobs)
+
+    def _end_recording(self) -> None:
+        process, deadline_s = self.world.processes[RECORDER], self.world.now_s + RECORD_S
+        while missing := self.sent.missing(self.node(RECORDER)):
+            if self.world.now_s > deadline_s:
+                raise Violation(f"The recorder has not: {'; '.join(missing[:4])}.")
+            self.world.run(self.world.now_s + CHECK_S)
+        process._call(self.node(RECORDER).end)
+        self.sent.check(process)

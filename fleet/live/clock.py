@@ -6,7 +6,7 @@ Cristian's algorithm: its reading is taken as the time halfway between request a
 of the time between them. (Cristian 1989, Distributed Computing 3, 146-158.)
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite
 from typing import Self
 
@@ -29,10 +29,12 @@ class FleetClock:
     """Fleet time at `real_s`."""
     offset_s: float = 0.0
     """Fleet seconds to be gained from `real_s` on (negative: to be lost)."""
+    epoch: str = ""
+    """As in `fleet.bus.protocol.auction.Clock`; "" for unknown."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not isfinite(value):
+            if name != "epoch" and not isfinite(value):
                 raise ValueError(f"FleetClock.{name} must be finite (got {value}).")
         if self.speed <= 0:
             raise ValueError(f"FleetClock.speed must be > 0 (got {self.speed:g}).")
@@ -55,11 +57,13 @@ class FleetClock:
             A clock that is off by at most `speed · (answered_s − asked_s) / 2` once the offset is removed.
         """
         now_s = self.now_s(answered_s)
-        return type(self)(self.speed, answered_s, now_s, self._reading_s(asked_s, answered_s, time_s) - now_s)
+        offset_s = self._reading_s(asked_s, answered_s, time_s) - now_s
+        return replace(self, real_s=answered_s, zero_s=now_s, offset_s=offset_s)
 
     def set_to(self, asked_s: float, answered_s: float, time_s: float) -> Self:
         """Return a clock that reads the other clock's time at once, for use before the first reading."""
-        return type(self)(self.speed, answered_s, self._reading_s(asked_s, answered_s, time_s))
+        zero_s = self._reading_s(asked_s, answered_s, time_s)
+        return replace(self, real_s=answered_s, zero_s=zero_s, offset_s=0.0)
 
     def _reading_s(self, asked_s: float, answered_s: float, time_s: float) -> float:
         """Reading of the other clock at `answered_s`."""

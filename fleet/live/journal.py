@@ -11,7 +11,7 @@ import logging
 import os
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from types import UnionType
 from typing import Generic, Self, TypeVar, cast
@@ -27,6 +27,10 @@ COMPACT_FACTOR, COMPACT_BYTES = 4, 1_000_000
 """A journal needs compaction once it has grown by this factor since the last one, and to this size."""
 
 Record = TypeVar("Record", bound=msgspec.Struct)
+PutAside = Callable[[bytes, str], object]
+"""Keeps a record that is not applied, with the reason."""
+Salvage = Callable[[bytes, str], Sequence[Record]]
+"""Keeps a record that cannot be read, with the reason, and returns what replaces it."""
 
 _REMEDY = (
     "Bring back a copy. Without its journal a participant has forgotten jobs, and may do them twice: see Epochs in "
@@ -49,10 +53,19 @@ class JournalState(ABC, Generic[Record]):
     def compact(self) -> tuple[Record, ...]:
         """Return the fewest records that give the same state."""
 
-    def replay(self, records: Iterable[Record]) -> Self:
-        """Apply records, oldest first, and return the state."""
+    def replay(self, records: Iterable[Record], put_aside: PutAside | None = None) -> Self:
+        """Apply records, oldest first, and return the state.
+
+        Args:
+            put_aside: Gets each record that cannot be applied, with the reason; None: it is an error.
+        """
         for record in records:
-            self.apply(record)
+            try:
+                self.apply(record)
+            except (KeyError, ValueError, msgspec.ValidationError) as error:
+                if put_aside is None:
+                    raise
+                put_aside(msgspec.json.encode(record), str(error))
         return self
 
 
@@ -62,6 +75,10 @@ class TimedState(JournalState[Record]):
     time_s: float
     """Latest time of all records."""
 
+    def checks_due(self) -> tuple[Record, ...]:
+        """Return records to write before the next ones, by which a replay can check those before."""
+        return ()
+
 
 class Journal(Generic[Record]):
     """`with Journal(path, Opened | Closed) as journal:` keeps the file open, for this process alone.
@@ -69,6 +86,7 @@ class Journal(Generic[Record]):
     Attributes:
         path: The file.
         torn: Bytes of an unfinished last line that were removed on opening.
+        put_aside: Gets records that are not applied.
     """
 
     def __init__(
@@ -77,20 +95,20 @@ class Journal(Generic[Record]):
         kind: type[Record] | UnionType,
         *,
         sync: Callable[[int], None] = os.fsync,
-        put_aside: Callable[[bytes, str], None] | None = None,
+        put_aside: Salvage[Record] | None = None,
     ) -> None:
         """Prepare a journal of records of one `msgspec.Struct`, or of a union of tagged ones.
 
         Args:
             sync: Writes an open file through to the disk.
-            put_aside: Gets each undamaged record that is none of this version, with the reason, and `records` leaves it
-                out; None: the journal refuses to open.
+            put_aside: Gets each undamaged record that is none of this version, with the reason; `records` has what it
+                returns instead. None: the journal refuses to open.
         """
         self.path = path
         self.torn = 0
         self._decoder = msgspec.json.Decoder(cast(type[list[Record]], list[kind]))
         self._encoder = msgspec.json.Encoder()
-        self._sync, self._put_aside = sync, put_aside
+        self._sync, self.put_aside = sync, put_aside
         self._file = self._lock = -1
         self._end = self._compacted = 0
         self._broken = ""
@@ -110,7 +128,7 @@ class Journal(Generic[Record]):
             self._file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
             if fresh:
                 self._sync_folder()
-            self._end = sum(len(line) for line, _ in self._lines(_ignore if self._put_aside else None))
+            self._end = sum(len(line) for line, _ in self._lines(_ignore if self.put_aside else None))
             self.torn = os.fstat(self._file).st_size - self._end
             if self.torn:
                 _LOG.warning("%s: removed an unfinished last line (%d bytes).", self.path, self.torn)
@@ -144,7 +162,7 @@ class Journal(Generic[Record]):
         Raises:
             JournalError: the file was damaged while it was open.
         """
-        for _, records in self._lines(self._put_aside):
+        for _, records in self._lines(self.put_aside):
             yield from records
 
     def append(self, *records: Record) -> None:
@@ -233,7 +251,7 @@ class Journal(Generic[Record]):
         body = self._encoder.encode(records)
         return b"".join((_HEAD, b"%08x" % zlib.crc32(body), _MIDDLE, body, _TAIL))
 
-    def _lines(self, put_aside: Callable[[bytes, str], None] | None) -> Iterator[tuple[bytes, list[Record]]]:
+    def _lines(self, put_aside: Salvage[Record] | None) -> Iterator[tuple[bytes, list[Record]]]:
         """Yield every complete line with its records."""
         with open(os.dup(self._opened()), "rb") as file:
             file.seek(0)
@@ -241,7 +259,7 @@ class Journal(Generic[Record]):
                 if line.endswith(b"\n"):
                     yield line, self._decode(line, number, put_aside)
 
-    def _decode(self, line: bytes, number: int, put_aside: Callable[[bytes, str], None] | None) -> list[Record]:
+    def _decode(self, line: bytes, number: int, put_aside: Salvage[Record] | None) -> list[Record]:
         body = line[_START : -len(_TAIL)]
         complete = line.startswith(_HEAD) and line[_CRC_END:_START] == _MIDDLE and line.endswith(_TAIL)
         if not complete or line[len(_HEAD) : _CRC_END] != b"%08x" % zlib.crc32(body):
@@ -257,7 +275,7 @@ class Journal(Generic[Record]):
                 f"{self.path}, line {number}: not a record of this version ({error}). {_REMEDY}"
             ) from error
 
-    def _some_of(self, body: bytes, put_aside: Callable[[bytes, str], None]) -> list[Record] | None:
+    def _some_of(self, body: bytes, put_aside: Salvage[Record]) -> list[Record] | None:
         """Decode records one by one; None if it is no list."""
         try:
             raws = msgspec.json.decode(body, type=list[msgspec.Raw])
@@ -268,7 +286,7 @@ class Journal(Generic[Record]):
             try:
                 records += self._decoder.decode(b"[" + bytes(raw) + b"]")
             except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-                put_aside(bytes(raw), str(error))
+                records += put_aside(bytes(raw), str(error))
         return records
 
     def _write(self, file: int, line: bytes) -> None:
@@ -309,5 +327,6 @@ class Journal(Generic[Record]):
             os.close(folder)
 
 
-def _ignore(record: bytes, reason: str) -> None:
+def _ignore(record: bytes, reason: str) -> tuple[()]:
     """Leave a record out."""
+    return ()

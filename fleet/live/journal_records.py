@@ -55,6 +55,8 @@ class CommitPermitted(msgspec.Struct, frozen=True, tag="commit_permitted"):
 
     award: Name
     time_s: float = 0.0
+    cycles: Count = 0
+    """Done then, where an auctioneer writes it."""
 
 
 class Released(msgspec.Struct, frozen=True, tag="released"):

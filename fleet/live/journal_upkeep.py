@@ -1,9 +1,12 @@
 """Journals that stay short while they are written, and fleet time in them."""
 
 import logging
+import os
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Generic
 
-from fleet.errors import JournalError, JournalFull
+from fleet.errors import JournalError, JournalFull, printable
 from fleet.live.journal import Journal, JournalState, Record, TimedState
 from fleet.live.journal_records import ClockTick
 
@@ -11,6 +14,31 @@ _LOG = logging.getLogger(__name__)
 
 TICK_S = 2.0
 """Real seconds between two records of the fleet's time."""
+
+
+def put_aside(path: Path, name: str) -> Callable[[bytes, str], tuple[()]]:
+    """Return what to do with a record of a journal that is not applied: append it to a file, and report it.
+
+    Args:
+        path: The file.
+        name: Of the arm or auctioneer.
+    """
+
+    def put(record: bytes, reason: str) -> tuple[()]:
+        begin = printable(record[:200].decode(errors="replace"))
+        _LOG.error("'%s': put a journal record aside in '%s': %s. It begins %s.", name, path, reason, begin)
+        try:
+            with path.open("ab") as file:
+                file.write(record + b"\n")
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise JournalError(
+                f"A record cannot be put aside in '{path}': {error.strerror}. Make room there."
+            ) from error
+        return ()
+
+    return put
 
 
 class CompactingJournal(Generic[Record]):
@@ -57,11 +85,13 @@ class TimeRecorder:
         if real_s < self._recorded_s + TICK_S:
             return
         self._recorded_s = real_s
+        records = (*self._state.checks_due(), ClockTick(time_s))
         try:
-            self._journal.append(ClockTick(time_s))
+            self._journal.append(*records)
         except JournalFull as error:
             _LOG.error("Could not record the fleet's time: %s", error)
         else:
-            self._state.apply(ClockTick(time_s))
+            for record in records:
+                self._state.apply(record)
         if self._journal.needs_compaction:
             self._journal.compact(*self._state.compact())

@@ -33,8 +33,8 @@ class Backoff:
 
     first_s: float = 0.5
     factor: float = 2.0
-    max_s: float = 4.0
-    stable_s: float = 30.0
+    max_s: float = 2.0
+    stable_s: float = 10.0
     """A process that ran longer than this starts with the first delay again."""
 
     def wait_s(self, failures: int) -> float:

@@ -8,10 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet.jit import jit_inline, kernel
 from fleet.planning.sweep import LEAF, Sweep
 
 Array = np.ndarray
+
+CHUNK = 512
+"""Pairs of nodes that are looked at together."""
 
 
 @dataclass(frozen=True)
@@ -38,84 +40,69 @@ def conflict(one: Sweep, other: Sweep, margin_m: float) -> bool:
 
 
 def _search(one: Sweep, other: Sweep, cutoff_m: float, enough_m: float) -> tuple[float, int, int]:
-    return search.chosen()(
-        one.ends_m, one.radius_m, one.boxes_m, other.ends_m, other.radius_m, other.boxes_m, cutoff_m, enough_m
-    )
-
-
-@kernel
-def search(
-    ends_a: Array, radius_a: Array, boxes_a: Array, ends_b: Array, radius_b: Array, boxes_b: Array,
-    cutoff_m: float, enough_m: float,
-) -> tuple[float, int, int]:  # fmt: skip
     """Smallest distance below the cutoff, and the indices of its two capsules (−1 for none).
 
+    The search takes up to `CHUNK` pairs of nodes at a time, the last ones first, so that memory stays bounded.
+
     Args:
-        ends_a, radius_a, boxes_a: As in `Sweep`; `…_b` are those of the other sweep.
-        enough_m: The search ends at the first distance below this.
+        enough_m: The search ends when it has found a distance below this.
     """
     best, at_a, at_b = cutoff_m, -1, -1
-    leaves_a, leaves_b = boxes_a.shape[1] // 2, boxes_b.shape[1] // 2
-    stack = np.empty((128, 2), np.int64)
-    for i in range(len(radius_a)):
-        for j in range(len(radius_b)):
-            both_m = radius_a[i] + radius_b[j]
-            used = 1
-            stack[0, 0], stack[0, 1] = 1, 1
-            while used > 0:
-                used -= 1
-                a, b = stack[used, 0], stack[used, 1]
-                if box_distance(boxes_a[i, a], boxes_b[j, b]) >= best:
-                    continue
-                if a < leaves_a and (b >= leaves_b or a <= b):
-                    stack[used, 0], stack[used, 1] = 2 * a, b
-                    stack[used + 1, 0], stack[used + 1, 1] = 2 * a + 1, b
-                    used += 2
-                elif b < leaves_b:
-                    stack[used, 0], stack[used, 1] = a, 2 * b
-                    stack[used + 1, 0], stack[used + 1, 1] = a, 2 * b + 1
-                    used += 2
-                else:
-                    first_a, first_b = (a - leaves_a) * LEAF, (b - leaves_b) * LEAF
-                    for p in range(first_a, min(first_a + LEAF, ends_a.shape[1])):
-                        for q in range(first_b, min(first_b + LEAF, ends_b.shape[1])):
-                            apart_m = segment_distance(ends_a[i, p], ends_b[j, q]) - both_m
-                            if apart_m < best:
-                                best, at_a, at_b = apart_m, i, j
-                                if best < enough_m:
-                                    return best, at_a, at_b
+    leaves_a, leaves_b = one.boxes_m.shape[1] // 2, other.boxes_m.shape[1] // 2
+    i, j = np.divmod(np.arange(len(one.radius_m) * len(other.radius_m)), len(other.radius_m))
+    stack = [np.stack([i, np.ones_like(i), j, np.ones_like(j)], axis=1)]  # [pair, (capsule, node, capsule, node)]
+    while stack:
+        pairs = stack.pop()
+        if len(pairs) > CHUNK:
+            stack.append(pairs[:-CHUNK])
+            pairs = pairs[-CHUNK:]
+        i, a, j, b = pairs.T
+        pairs = pairs[_box_distance(one.boxes_m[i, a], other.boxes_m[j, b]) < best]
+        i, a, j, b = pairs.T
+        at_leaf = (a >= leaves_a) & (b >= leaves_b)
+        split_a = (a < leaves_a) & ((b >= leaves_b) | (a <= b))
+        children = np.repeat(pairs[~at_leaf], 2, axis=0)
+        rows, column = np.arange(len(children)), np.repeat(np.where(split_a, 1, 3)[~at_leaf], 2)
+        children[rows, column] = 2 * children[rows, column] + rows % 2
+        if len(children):
+            stack.append(children)
+        i, a, j, b = pairs[at_leaf].T
+        if len(i):
+            ends_a, ends_b = _leaf_ends(one, i, a - leaves_a), _leaf_ends(other, j, b - leaves_b)
+            apart_m = segment_distance(ends_a[:, :, None], ends_b[:, None]).min(axis=(1, 2))
+            apart_m -= one.radius_m[i] + other.radius_m[j]
+            closest = int(apart_m.argmin())
+            if apart_m[closest] < best:
+                best, at_a, at_b = float(apart_m[closest]), int(i[closest]), int(j[closest])
+                if best < enough_m:
+                    break
     return best, at_a, at_b
 
 
-@jit_inline
-def box_distance(a: Array, b: Array) -> float:
-    """Distance of two boxes [(low, high), 3], m; −inf if they touch."""
-    square = 0.0
-    for k in range(3):
-        gap = max(a[0, k] - b[1, k], b[0, k] - a[1, k])
-        if gap > 0.0:
-            square += gap * gap
-    return np.sqrt(square) if square > 0.0 else -np.inf
+def _leaf_ends(sweep: Sweep, capsule: Array, leaf: Array) -> Array:
+    """Ends of the axes of each capsule at the postures of a leaf, [pair, posture, end, 3]; the last leaf is padded."""
+    postures = np.minimum(leaf[:, None] * LEAF + np.arange(LEAF), sweep.ends_m.shape[1] - 1)
+    return sweep.ends_m[capsule[:, None], postures].astype(float)
 
 
-@jit_inline
-def segment_distance(a: Array, b: Array) -> float:
-    """Distance of two segments [end, 3], m."""
-    aa = bb = ab = ar = br = 0.0
-    for k in range(3):
-        u, v, r = float(a[1, k] - a[0, k]), float(b[1, k] - b[0, k]), float(a[0, k] - b[0, k])
-        aa, bb, ab, ar, br = aa + u * u, bb + v * v, ab + u * v, ar + u * r, br + v * r
-    s = t = 0.0  # nearest point on each segment, 0 to 1
+def _box_distance(a: Array, b: Array) -> Array:
+    """Distance of boxes [pair, (low, high), 3], m, [pair]; −inf for boxes that touch."""
+    gap_m = np.maximum(np.maximum(a[:, 0] - b[:, 1], b[:, 0] - a[:, 1]), 0.0)
+    return np.where(gap_m.any(axis=1), np.linalg.norm(gap_m, axis=1), -np.inf)
+
+
+def segment_distance(a: Array, b: Array) -> Array:
+    """Distance of segments [..., end, 3], m."""
+    u, v, r = a[..., 1, :] - a[..., 0, :], b[..., 1, :] - b[..., 0, :], a[..., 0, :] - b[..., 0, :]
+    aa, bb, ab, ar, br = ((x * y).sum(axis=-1) for x, y in ((u, u), (v, v), (u, v), (u, r), (v, r)))
     determinant = aa * bb - ab * ab
-    if determinant > 1e-12:
-        s = min(max((ab * br - ar * bb) / determinant, 0.0), 1.0)
-    if bb > 1e-12:
-        t = (ab * s + br) / bb
-    if t < 0.0 or t > 1.0 or bb <= 1e-12:
-        t = min(max(t, 0.0), 1.0)
-        s = min(max((ab * t - ar) / aa, 0.0), 1.0) if aa > 1e-12 else 0.0
-    square = 0.0
-    for k in range(3):
-        gap = (a[0, k] - b[0, k]) + s * (a[1, k] - a[0, k]) - t * (b[1, k] - b[0, k])
-        square += gap * gap
-    return np.sqrt(square)
+    is_point_a, is_point_b = aa <= 1e-12, bb <= 1e-12
+    # Nearest point on each segment, 0 to 1.
+    skew = determinant > 1e-12
+    s = np.where(skew, np.clip((ab * br - ar * bb) / np.where(skew, determinant, 1.0), 0.0, 1.0), 0.0)
+    t = np.where(is_point_b, 0.0, (ab * s + br) / np.where(is_point_b, 1.0, bb))
+    at_end = (t < 0.0) | (t > 1.0) | is_point_b
+    t = np.clip(t, 0.0, 1.0)
+    nearest = np.where(is_point_a, 0.0, np.clip((ab * t - ar) / np.where(is_point_a, 1.0, aa), 0.0, 1.0))
+    s = np.where(at_end, nearest, s)
+    return np.linalg.norm(r + s[..., None] * u - t[..., None] * v, axis=-1)

@@ -3,8 +3,10 @@
 import hashlib
 import json
 import logging
+import os
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -28,6 +30,8 @@ log = logging.getLogger(__name__)
 
 PLANNER_VERSION = 3
 """Increment it whenever the plans of the same work change."""
+MAX_CACHE_BYTES = 2_000_000_000
+"""Of all files in a folder; after a new one the least recently used ones are removed."""
 MAX_SAMPLES = 1_000_000
 """Of one phase in a file; a longer one is damage."""
 
@@ -131,7 +135,10 @@ def _read(path: Path, unpack: Callable[[Mapping[str, Array]], T]) -> T | None:
     """The content of a file; None if there is no file, or if it is damaged."""
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            return unpack(arrays)
+            content = unpack(arrays)
+        with suppress(OSError):
+            os.utime(path)  # the time of its last use
+        return content
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
@@ -143,6 +150,24 @@ def _write(path: Path, arrays: Mapping[str, Array]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as draft, draft.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
+    _remove_oldest(path.parent)
+
+
+def _remove_oldest(folder: Path) -> None:
+    """Remove the least recently used files of a folder that has grown too large; others may do so meanwhile."""
+    files: list[tuple[float, int, str]] = []
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            with suppress(FileNotFoundError):
+                if entry.name.endswith(".npz"):
+                    files.append((entry.stat().st_mtime, entry.stat().st_size, entry.path))
+    total = sum(size for _, size, _ in files)
+    for _, size, path in sorted(files)[:-1]:
+        if total <= MAX_CACHE_BYTES:
+            break
+        with suppress(OSError):
+            os.unlink(path)
+        total -= size
 
 
 def _pack(plans: tuple[Plan, ...] | InfeasibleJob) -> dict[str, Array]:

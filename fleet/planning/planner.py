@@ -14,6 +14,7 @@ from fleet.physics.models import ArmModel
 from fleet.planning.collision import CollisionChecker
 from fleet.planning.kinematics import InverseKinematics, Pose, Unreachable
 from fleet.planning.task_phases import Segment, Stop, TaskPhases, task_phases
+from fleet.planning.time_limit import check_time
 from fleet.planning.trajectory import LoadedMotion, build_phase, move, rest
 from fleet.robot import Robot, rotation
 
@@ -59,6 +60,7 @@ class Planner:
         """All variants: elbow postures in order of duration, each from the highest speed down.
 
         Raises:
+            PlanningTimeout: the `fleet.planning.time_limit` of this thread has passed.
             InfeasibleJob: no variant is within reach, joint stops and torque limits and free of collision; reports
                 the variant that came furthest.
         """
@@ -68,6 +70,7 @@ class Planner:
         for elbow_deg in ELBOW_ANGLES_DEG:
             if len(variants) == self.elbows:
                 break
+            check_time()
             postures: dict[Stop, Array] = {}
             try:
                 self._solve(phases, elbow_deg, postures)
@@ -83,6 +86,7 @@ class Planner:
                 continue
             plans = []
             for speed in self.speeds:
+                check_time()
                 try:
                     plans.append(self._plan(work, phases, postures, speed))
                 except InfeasibleJob as failure:
@@ -99,6 +103,7 @@ class Planner:
     def _solve(self, phases: TaskPhases, elbow_deg: float, postures: dict[Stop, Array]) -> None:
         """Put the joint positions of each stop, with this elbow angle, into `postures`."""
         for stop, previous in phases.previous_stops().items():
+            check_time()
             near = self.robot.home_q() if previous is None else postures[previous]
             try:
                 postures[stop] = self._inverse.solve(_pose(stop), elbow_deg, near)
@@ -113,6 +118,7 @@ class Planner:
 
     def _check_collisions(self, phases: TaskPhases, postures: dict[Stop, Array], payload_kg: float) -> None:
         for ends, carries in phases.paths().items():
+            check_time()
             start, end = (self.robot.home_q() if stop is None else postures[stop] for stop in ends)
             if collision := self._collisions.on_path(start, end, payload_kg if carries else 0.0):
                 stop = ends[1] or ends[0]
@@ -122,6 +128,7 @@ class Planner:
     def _plan(self, work: Work, phases: TaskPhases, postures: dict[Stop, Array], speed: float) -> Plan:
         here, built = self.robot.home_q(), []
         for segments in phases:
+            check_time()
             parts = []
             for segment in segments:
                 start, here = here, self.robot.home_q() if segment.to is None else postures[segment.to]

@@ -20,6 +20,7 @@ from fleet.job import Work
 from fleet.motion import Plan, distinct
 from fleet.physics.gen3 import gen3_xml
 from fleet.planning.plan_cache import cached_arrays
+from fleet.planning.time_limit import check_time
 from fleet.robot import Robot
 
 if TYPE_CHECKING:  # both load MuJoCo
@@ -119,7 +120,10 @@ def conflicts_with_homes(
 
     def compute() -> dict[str, Array]:
         homes = [(other.name, _home(other)) for other in near]
-        reasons = [_home_reason(paths.sweep(*load), homes, margin_m) for load in paths.loads]
+        reasons: list[str] = []
+        for load in paths.loads:
+            check_time()
+            reasons.append(_home_reason(paths.sweep(*load), homes, margin_m))
         return {"reasons": np.array(reasons, dtype=str)}
 
     if not near or not paths.loads:

@@ -11,7 +11,7 @@ from typing import Any, Self
 
 import zenoh
 
-from fleet.bus.client.router import open_client
+from fleet.bus.client.router import connect
 from fleet.errors import BusError
 from fleet.ros2.topics import Topic, attachment, gid, node_token, plain_name, publisher_token
 
@@ -41,6 +41,7 @@ class Node:
 
     Args:
         endpoint: The router, which has `timeout_s` to reply.
+        stopped: Wait for a router until this is true, instead of `timeout_s`.
         name: Characters that ROS 2 does not allow in it become `_`.
         now_ns: Wall clock for the time stamps of messages, ns since 1970.
     """
@@ -52,10 +53,11 @@ class Node:
         *,
         domain: int = 0,
         timeout_s: float = 5.0,
+        stopped: Callable[[], bool] | None = None,
         now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         self.name, self.domain = plain_name(name), domain
-        self._endpoint, self._timeout_s, self._now_ns = endpoint, timeout_s, now_ns
+        self._endpoint, self._timeout_s, self._stopped, self._now_ns = endpoint, timeout_s, stopped, now_ns
         self._session: zenoh.Session | None = None
         self._entities = 0
         self._resources = ExitStack()
@@ -69,7 +71,7 @@ class Node:
             BusError: no router replied.
         """
         if self._session is None:
-            self._session = open_client(self._endpoint, timeout_s=self._timeout_s)
+            self._session = connect(self._endpoint, self._timeout_s, self._stopped)
             self._resources.callback(self._session.close)
             token = self._session.liveliness().declare_token(
                 node_token(self.domain, str(self._session.zid()), self.name)

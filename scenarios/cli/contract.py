@@ -35,7 +35,7 @@ def documents(out: Path) -> dict[Path, str]:
     """Text of every document by path, including the pages that are in the folder above."""
     from fleet.bus.protocol.asyncapi import asyncapi
     from fleet.bus.protocol.schemas import schema_document
-    from scenarios.cli.doc_tables import fill_tables
+    from scenarios.doc_tables import fill_tables
 
     made = {out / "schemas.json": _json(schema_document()), out / "asyncapi.json": _json(asyncapi())}
     for page in (out.parent / name for name in PAGES):

@@ -12,7 +12,7 @@ from fleet.errors import FleetError
 from fleet.files import atomic_path
 from scenarios.cli.options import number
 from scenarios.cli.terminal import out_console, progress_bar, say
-from scenarios.result_folder import check_overwrite, disk_errors
+from scenarios.result_folder import check_file, disk_errors
 
 ENDINGS = (".mp4", ".webm", ".gif")
 SMALLEST, LARGEST = 160, 3840
@@ -35,11 +35,7 @@ def film_command(
 ) -> None:
     """Film a recorded shift: the arms move, their motors coloured by temperature."""
     suffix = out.suffix.lower()
-    if suffix not in ENDINGS:
-        raise FleetError(f"--out must end in {', '.join(ENDINGS)} (got '{out}').")
-    if out.is_dir():
-        raise FleetError(f"Cannot write to '{out}': it is a folder.")
-    check_overwrite(out, overwrite)
+    check_file(out, ENDINGS, overwrite)
     width, height = _size(size)
     if sys.platform.startswith("linux"):  # MuJoCo chooses its OpenGL when it is loaded, and the default needs a display
         os.environ.setdefault("MUJOCO_GL", "egl")

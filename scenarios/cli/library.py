@@ -6,12 +6,11 @@ from typing import Annotated
 
 import typer
 
-from fleet.errors import FleetError
 from fleet.files import atomic_path
 from scenarios.cli.options import JsonOption, OverwriteOption, ScenarioArg
 from scenarios.cli.terminal import out_console, plain_table, print_json, progress_bar, say
 from scenarios.load import library, load
-from scenarios.result_folder import check_overwrite, disk_errors
+from scenarios.result_folder import check_file, disk_errors
 
 
 def list_command(as_json: JsonOption = False) -> None:
@@ -60,11 +59,7 @@ def layout_command(
 
     chosen = load(scenario)
     if out is not None:
-        if out.suffix.lower() != ".png":
-            raise FleetError(f"--out must end in .png (got '{out}').")
-        if out.is_dir():
-            raise FleetError(f"Cannot write to '{out}': it is a folder.")
-        check_overwrite(out, overwrite)
+        check_file(out, (".png",), overwrite)
     with progress_bar() as progress:
         report = layout_report(chosen, progress)
     if as_json:

@@ -2,6 +2,7 @@
 
 import os
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -43,13 +44,16 @@ def bridge_command(
 ) -> None:
     """Publish every arm of a fleet as JointState and DiagnosticArray, until Ctrl-C or SIGTERM."""
     where = ros2_router(router, endpoint)
-    node = node_at(where, "thermofleet", domain)
     from fleet.bus.client.client import BusClient
     from fleet.ros2.bridge import Bridge
     from scenarios.cli.signals import until_stopped
 
     limits = limits_of(warning_c, error_c)
-    with until_stopped() as stop, BusClient(endpoint, the_fleet(fleet, endpoint)) as link, node:
+    with (
+        until_stopped() as stop,
+        node_at(where, "thermofleet", domain, stop.is_set) as node,
+        BusClient(endpoint, the_fleet(fleet, endpoint), stopped=stop.is_set) as link,
+    ):
         bridge = Bridge(link, node, limits=limits, humble=humble)
         echo(f"ready ros2 bridge {where} {os.getpid()}")
         while not stop.is_set():
@@ -82,13 +86,16 @@ def listen_command(
             "has them with --temperatures. docs/ros2.md describes its content."
         )
     names, where = names_of(joints), ros2_router(router, endpoint)
-    node = node_at(where, f"thermofleet_{arm}", domain)
     from fleet.bus.client.client import BusClient
     from fleet.live.clock import FleetClock
     from fleet.ros2.follower import ArmReadings, Follower
     from scenarios.cli.signals import until_stopped
 
-    with until_stopped() as stop, BusClient(endpoint, the_fleet(fleet, endpoint)) as link, node:
+    with (
+        until_stopped() as stop,
+        node_at(where, f"thermofleet_{arm}", domain, stop.is_set) as node,
+        BusClient(endpoint, the_fleet(fleet, endpoint), stopped=stop.is_set) as link,
+    ):
         clock = FleetClock(1.0, time.monotonic())
         limits = limits_of(warning_c, max(warning_c + 1.0, DEFAULTS.error_c))
         readings, topics = ArmReadings(names, hardware), (topic, temperatures)
@@ -118,7 +125,7 @@ def jobs_command(
         ) from error
     with (
         until_stopped() as stop,
-        BusClient(endpoint, the_fleet(fleet, endpoint)) as link,
+        BusClient(endpoint, the_fleet(fleet, endpoint), stopped=stop.is_set) as link,
         JobAction(link, domain=domain) as jobs,
     ):
         typer.echo(f"ready {jobs.name} {os.getpid()}")
@@ -137,15 +144,15 @@ def ros2_router(router: str, endpoint: str) -> str:
     return router or endpoint
 
 
-def node_at(router: str, name: str, domain: int) -> "Node":
-    """A ROS 2 node, not yet open, after a check of the domain and of the installed extra."""
+def node_at(router: str, name: str, domain: int, stopped: Callable[[], bool]) -> "Node":
+    """A ROS 2 node, not yet open, which waits for a router; after a check of the domain and of the installed extra."""
     require_extra("ros2")
     from fleet.ros2.node import Node
     from fleet.ros2.topics import DOMAINS
 
     if domain not in DOMAINS:
         raise FleetError(f"--domain must be 0 to {DOMAINS[-1]} (got {domain}).")
-    return Node(router, name, domain=domain)
+    return Node(router, name, domain=domain, stopped=stopped)
 
 
 def names_of(joints: str) -> tuple[str, ...]:

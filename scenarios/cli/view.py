@@ -1,11 +1,7 @@
 """`thermofleet view`: a shift or a cell in MuJoCo's own viewer."""
 
-# MuJoCo is compiled and ships no type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 import os
 import sys
-import threading
 import time
 from pathlib import Path
 from typing import Annotated
@@ -16,7 +12,6 @@ from fleet.errors import FleetError
 from scenarios.cli.options import number
 from scenarios.cli.terminal import out_console, say
 
-FRAME_S = 1 / 30
 NO_DISPLAY = (
     "MuJoCo's viewer needs a display, and there is none (DISPLAY and WAYLAND_DISPLAY are not set). Use "
     "`thermofleet film RUN`, or open the run's report.html."
@@ -32,32 +27,30 @@ def view_command(
     """Play a recorded shift in MuJoCo's viewer, or show the cell of a scenario; close its window to end."""
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise FleetError(NO_DISPLAY)
-    import mujoco.viewer
     import numpy as np
 
     from fleet.physics.cell_player import CellPlayer
     from scenarios.load import load
     from scenarios.run.stored_run import read_run
-    from scenarios.view.film import Film
+    from scenarios.view.film import Film, show_heat
 
-    pause = threading.Event()
     if (Path(what) / "run.json").exists():
         run = read_run(Path(what))
-        film = Film(run, meshes=meshes)
-        player, last_s = film.player, float(run.telemetry.time_s[-1])
+        film, last_s, began_s = Film(run, meshes=meshes), float(run.telemetry.time_s[-1]), time.monotonic()
+        player = film.player
+
+        def update() -> object:
+            return film.show(min(begin + speed * (time.monotonic() - began_s), last_s))
+
     else:
-        scenario, film, last_s = load(what), None, 0.0
+        scenario = load(what)
         robots = [arm.robot() for arm in scenario.arms]
-        player = CellPlayer(robots, scenario.places, scenario.fixtures, limits=scenario.limits, meshes=meshes)
+        player = CellPlayer(robots, scenario.places, scenario.fixtures, meshes=meshes)
         home = np.array([robot.home_q for robot in robots])
-        player.show(home, np.full(home.shape, 20.0), np.zeros(len(robots)))
+        ambient_c = np.full(home.shape, 20.0)
+
+        def update() -> object:
+            return show_heat(player, home, ambient_c, np.zeros(len(robots)), scenario.limits)
+
     say(f"Showing '{what}'; close the window to end.", out_console)
-    with mujoco.viewer.launch_passive(player.model, player.data) as viewer:
-        began_s = time.monotonic()
-        while viewer.is_running():
-            at_s = begin + speed * (time.monotonic() - began_s)
-            if film is not None:
-                with viewer.lock():
-                    film.show(min(at_s, last_s))
-            viewer.sync()
-            pause.wait(FRAME_S)
+    player.open_viewer(update)

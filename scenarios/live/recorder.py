@@ -10,12 +10,17 @@ import logging
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
 import pyarrow.parquet as pq
 from msgspec import structs
 
+from fleet.bus.protocol.auction import ArmEvent, Result
+from fleet.bus.protocol.messages import State
+from fleet.bus.protocol.operator import Operation
+from fleet.bus.protocol.registry import HISTORY
 from fleet.errors import FleetError, JournalError
 from fleet.events import EVENTS_PER_BOOT
 from fleet.files import atomic_path
@@ -29,8 +34,6 @@ from scenarios.live.recording import (
     Count,
     Gap,
     Heard,
-    HeardEvent,
-    HeardState,
     Kind,
     Message,
     PartOpened,
@@ -51,11 +54,46 @@ MAX_WAITING = 4 * MAX_ROWS
 """Rows in memory while the disk takes none; further messages are not taken, and sought when it does."""
 
 
+@dataclass(frozen=True)
+class Series:
+    """The place of a message among those that its sender numbers."""
+
+    sender: str
+    """As in the card: `state of arm_0`."""
+    number: int
+    epoch: str
+    first: int
+    """Least number since the last start of the sender."""
+    continues: bool
+    """Whether the numbers of an epoch go on when the sender starts again; its times are in no order then."""
+    whole: bool = True
+    """Whether what was sent before the recording began belongs to it, as far as it is cached."""
+
+    @property
+    def name(self) -> str:
+        """Name of the series; the numbers of an arm have no epoch, as it learns the epoch after its start."""
+        return f"{self.sender}, epoch {self.epoch}" if self.epoch and self.continues else self.sender
+
+
+def series_of(message: Message) -> Series:
+    """Return the series that a message belongs to."""
+    match message:
+        case State():
+            return Series(f"state of {message.arm}", message.tick, message.epoch, 1, False, whole=False)
+        case ArmEvent(number=number):
+            first = number // EVENTS_PER_BOOT * EVENTS_PER_BOOT + 1
+            return Series(f"events of {message.arm}", number, message.epoch, first, False)
+        case Result():
+            return Series(f"results of {message.auctioneer}", message.number, message.epoch, 0, True)
+        case Operation():
+            return Series(f"operations of {message.auctioneer}", message.number, message.epoch, 0, True)
+
+
 class Recorder:
     """Keeps every message once. `open` starts or continues a recording; call `save` often and `write` sometimes.
 
     Attributes:
-        counts: Messages by sender: `state of arm_0`.
+        counts: Messages by series: `state of arm_0`.
         sought: Gaps that may still be filled.
         parts: Number of the last complete part.
     """
@@ -163,6 +201,8 @@ class Recorder:
         try:
             self._journal.open()
         except JournalError as error:
+            if isinstance(error.__cause__, OSError):  # not damaged: the disk refuses, or another process has it
+                raise FleetError(str(error)) from error
             aside = self._journal.path.with_name(f"damaged-after-{self.parts:06d}.journal")
             self._journal.path.replace(aside)
             _LOG.error("%s Put aside as '%s'.", error, aside.name)
@@ -181,30 +221,34 @@ class Recorder:
 
     def _take(self, record: Heard) -> bool:
         """Count a message; return whether it is new."""
-        message = record.message
-        if isinstance(record, HeardState):
-            sender, number, first = f"state of {record.message.arm}", record.message.tick, 1
-        elif isinstance(record, HeardEvent):
-            sender, number = f"events of {record.message.arm}", record.message.number
-            first = number // EVENTS_PER_BOOT * EVENTS_PER_BOOT + 1
-        else:
-            sender, number, first = f"results of {record.message.auctioneer}", record.message.number, 0
-        count = self.counts.setdefault(sender, Count())
-        if number <= count.last and message.time_s <= count.time_s:
-            return self._fill(sender, count, number, message.time_s)
-        if count.kept:
-            expected = first if number <= count.last or first > count.last else count.last + 1  # first: it restarted
-            if expected < number:
-                self.sought.append(Gap(sender, expected, number - 1, count.time_s, message.time_s))
-                count.missed += number - expected
+        series = series_of(record.message)
+        number, time_s = series.number, record.message.time_s
+        count = self.counts.setdefault(series.name, Count())
+        begins = bool(series.epoch) and series.epoch not in count.epochs
+        restarted = not series.continues and number <= count.last and (begins or time_s > count.time_s)
+        if number <= count.last and not restarted:
+            return self._fill(series, count, time_s)
+        if begins:
+            count.epochs += (series.epoch,)
+        expected = series.first if restarted or series.first > count.last else count.last + 1
+        if not count.kept:  # what was sent before: as much of it as the sender may have cached
+            expected = max(series.first, number - HISTORY) if series.whole else number
+        if expected < number:
+            after_s = 0.0 if begins else max(count.time_s, 0.0)
+            gap = Gap(series.sender, expected, number - 1, after_s, time_s, epoch=series.epoch)
+            self.sought.append(gap)
+            count.missed += number - expected
         count.kept += 1
-        count.last, count.time_s = number, message.time_s
+        count.last, count.time_s = number, time_s
         return True
 
-    def _fill(self, sender: str, count: Count, number: int, time_s: float) -> bool:
+    def _fill(self, series: Series, count: Count, time_s: float) -> bool:
         """Whether a late message belongs to a gap, which then shrinks or splits."""
+        number = series.number
         for gap in self.sought:
-            if gap.sender == sender and gap.first <= number <= gap.last and gap.after_s <= time_s <= gap.time_s:
+            own = gap.sender == series.sender and gap.first <= number <= gap.last
+            own &= gap.epoch == series.epoch or (not series.continues and "" in (gap.epoch, series.epoch))
+            if own and (series.continues or gap.after_s <= time_s <= gap.time_s):
                 self.sought.remove(gap)
                 if gap.first < number:
                     self.sought.append(structs.replace(gap, last=number - 1, time_s=time_s))
@@ -224,11 +268,19 @@ class Recorder:
 
     @contextmanager
     def _draft(self, path: Path) -> Iterator[Path]:
-        """A draft of a file, on disk before it takes its name."""
+        """A draft of a file, on disk before it takes its name; and the name is on disk when the block ends.
+
+        So no later file, which relies on this one, is there without it after a loss of power.
+        """
         try:
             with atomic_path(path) as draft:
                 yield draft
                 with draft.open("rb") as file:
                     os.fsync(file.fileno())
+            folder = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
         except OSError as error:
             raise FleetError(f"Cannot write '{path}': {error.strerror or error}.") from error

@@ -1,8 +1,8 @@
 """Format of a recording of the bus, and how it is read, also while it grows.
 
-`recording.json` describes the recording. `telemetry-000001.parquet`, `events-…`, `results-…` and `gaps-…` are its
-parts; columns are the fields of the messages `State`, `ArmEvent` and `Result`. What is not in a part yet is in
-`open.journal`. A row of `gaps` says which messages of a sender are missing, and why.
+`recording.json` describes the recording. `telemetry-000001.parquet`, `events-…`, `results-…`, `operations-…` and
+`gaps-…` are its parts; columns are fields of the messages `State`, `ArmEvent`, `Result` and `Operation`. What is not in
+a part yet is in `open.journal`. A row of `gaps` says which messages of a sender are missing, and why.
 """
 
 import math
@@ -20,19 +20,26 @@ from msgspec import inspect, structs
 
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
 from fleet.bus.protocol.messages import State
+from fleet.bus.protocol.operator import ControlRequest, Operation
 from fleet.errors import FleetError
 from fleet.live.journal import Journal
 from fleet.robot import JOINTS
 
-Message = State | ArmEvent | Result
-Kind = Literal["telemetry", "events", "results", "gaps"]
-MESSAGES: tuple[Kind, ...] = ("telemetry", "events", "results")
+Message = State | ArmEvent | Result | Operation
+Kind = Literal["telemetry", "events", "results", "operations", "gaps"]
+MESSAGES: tuple[Kind, ...] = ("telemetry", "events", "results", "operations")
 KINDS: tuple[Kind, ...] = (*MESSAGES, "gaps")
-RECORDING_FORMAT = 5
+RECORDING_FORMAT = 6
 CARD, JOURNAL = "recording.json", "open.journal"
 SENSORS = ("q", "qd", "tau", "current_a", "temp_c", "housing_c")
-_COLUMNS = {inspect.IntType: pa.int64(), inspect.FloatType: pa.float64()}
-_SORTED_BY: dict[Kind, str] = {"telemetry": "tick", "events": "number", "results": "number", "gaps": "first"}
+_COLUMNS = {
+    inspect.IntType: pa.int64(),
+    inspect.FloatType: pa.float64(),
+    inspect.BoolType: pa.bool_(),
+    inspect.VarTupleType: pa.list_(pa.string()),
+}
+_SORTED_BY: dict[Kind, str] = {"telemetry": "tick", "gaps": "first"}
+"""Besides the time; `number` for the other kinds."""
 _READS = 5
 """Attempts to read a recording between two commits of its recorder."""
 
@@ -49,6 +56,8 @@ class Gap(msgspec.Struct, frozen=True, tag="gap"):
     time_s: float
     reason: str = ""
     """Why they cannot be had; "" while they are sought."""
+    epoch: str = ""
+    """In which the numbers were given; "" for unknown."""
 
 
 class HeardState(msgspec.Struct, frozen=True, tag="telemetry"):
@@ -69,13 +78,19 @@ class HeardResult(msgspec.Struct, frozen=True, tag="results"):
     message: Result
 
 
+class HeardOperation(msgspec.Struct, frozen=True, tag="operations"):
+    """A message in the journal."""
+
+    message: Operation
+
+
 class PartOpened(msgspec.Struct, frozen=True, tag="part"):
     """First record of the journal: what follows becomes the part of this number."""
 
     number: int
 
 
-Heard = HeardState | HeardEvent | HeardResult
+Heard = HeardState | HeardEvent | HeardResult | HeardOperation
 Record = Heard | Gap | PartOpened
 
 
@@ -90,6 +105,8 @@ class Count:
     last: int = -1
     time_s: float = -math.inf
     """Fleet time of the last message."""
+    epochs: tuple[str, ...] = ()
+    """In which the sender gave its numbers."""
 
 
 class Card(msgspec.Struct, frozen=True):
@@ -127,15 +144,25 @@ SCHEMAS: dict[Kind, pa.Schema] = {
     ),
     "events": pa.schema({"time_s": pa.float64(), **_columns(ArmEvent), "joint": pa.int8()}),
     "results": pa.schema({"time_s": pa.float64(), **_columns(Result), **_columns(JobStatus)}),
+    "operations": pa.schema(
+        {"time_s": pa.float64(), **_columns(Operation), **_columns(ControlRequest)}
+        | {name: pa.string() for name in ("action", "job", "arm", "content")}
+    ),
     "gaps": pa.schema({"time_s": pa.float64(), **_columns(Gap)}),
 }
 
 
 def to_record(message: Message) -> Heard:
     """Wrap a message for the journal."""
-    if isinstance(message, State):
-        return HeardState(message)
-    return HeardEvent(message) if isinstance(message, ArmEvent) else HeardResult(message)
+    match message:
+        case State():
+            return HeardState(message)
+        case ArmEvent():
+            return HeardEvent(message)
+        case Result():
+            return HeardResult(message)
+        case Operation():
+            return HeardOperation(message)
 
 
 def to_row(record: Heard | Gap) -> tuple[Kind, dict[str, object]]:
@@ -148,6 +175,12 @@ def to_row(record: Heard | Gap) -> tuple[Kind, dict[str, object]]:
         case HeardResult(message):
             fields = structs.asdict(message)
             return "results", fields | structs.asdict(fields.pop("status"))
+        case HeardOperation(message):
+            request = message.request
+            action = cast(dict[str, object], msgspec.to_builtins(request.action))
+            fields = structs.asdict(message) | {name: action.get(name, "") for name in ("action", "job", "arm")}
+            fields |= {"request": request.request, "by": request.by, "content": msgspec.json.encode(request).decode()}
+            return "operations", fields
         case HeardState(message):
             row: dict[str, object] = {name: getattr(message, name) for name in _STATE if name not in SENSORS}
             for name in SENSORS:
@@ -204,7 +237,7 @@ def read_parts(folder: Path, kind: Kind) -> pa.Table:
         if read_card(folder).parts == parts:
             break
     table = pa.concat_tables([*tables, to_table(kind, rows)])
-    return table.sort_by([("time_s", "ascending"), (_SORTED_BY[kind], "ascending")])
+    return table.sort_by([("time_s", "ascending"), (_SORTED_BY.get(kind, "number"), "ascending")])
 
 
 def _open_records(folder: Path, number: int) -> list[Heard | Gap]:

@@ -4,23 +4,29 @@ A live log has what a simulated one has not: awards that queue, jobs that are re
 and messages that are lost. `order_events` turns it into a sequence that a schedule can have.
 """
 
+import json
 import math
-from collections import defaultdict, deque
-from collections.abc import Iterable, Mapping
+from collections import Counter, defaultdict, deque
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any  # values of the report
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
+from fleet.bus.protocol.operator import ALL_ARMS
 from fleet.errors import FleetError
 from fleet.events import EVENT_KINDS, Event
+from fleet.physics.cell_model import cell_model
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import FAULTED, MODES, WORKING, Telemetry
-from scenarios.live.recording import SENSORS, read_card, read_parts
+from scenarios.live.recording import MESSAGES, SENSORS, read_card, read_parts
+from scenarios.report.gantt import clock
 from scenarios.report.run_page import report_html
 from scenarios.report.schedule import SAME_MOMENT_DIGITS
+from scenarios.schema import Scenario
 
 Array = np.ndarray
 
@@ -28,22 +34,26 @@ MOST_SAMPLES = 20_000
 """Samples of telemetry in a report, in time."""
 ABSENT_SAMPLES = 30
 """Without a state for this many typical intervals, an arm has no temperature in the report."""
-_ENDED = ("waiting", "given_up", "unfinished")
+_ENDED = ("waiting", "given_up", "unfinished", "cancelled")
 """States of a job in which the arm that had it has it no more."""
 
 
-def recording_html(folder: Path, limits: ThermalLimits | None = None) -> str:
+def recording_html(folder: Path, scenario: Scenario | None = None) -> str:
     """The report of a recording, which may still grow, as one HTML page.
 
+    Args:
+        scenario: Gives the limits and the cell of the fleet; without it nothing is shown in 3-D.
+
     Raises:
-        FleetError: it is no recording, or has no states of arms yet.
+        FleetError: it is no recording, has no states of arms yet, or has arms that the scenario does not have.
     """
-    limits, card = limits or ThermalLimits(), read_card(folder)
-    table, results = read_parts(folder, "telemetry"), read_parts(folder, "results")
+    limits, card = scenario.limits if scenario else ThermalLimits(), read_card(folder)
+    epochs = dict.fromkeys(epoch for count in card.speakers.values() for epoch in count.epochs)
+    table, log, results, operations = (_of_epoch(read_parts(folder, kind), [*epochs]) for kind in MESSAGES)
     arms = sorted(set(table["arm"].to_pylist()))
     if not arms:
         raise FleetError(f"'{folder}' holds no state of an arm yet; record longer.")
-    events = order_events(_arm_events(read_parts(folder, "events")), _returns(results))
+    events = order_events(_arm_events(log), _returns(results))
     events = [event for event in events if event.arm in arms]
     telemetry = telemetry_of(table, arms)
     run = {
@@ -55,8 +65,23 @@ def recording_html(folder: Path, limits: ThermalLimits | None = None) -> str:
             sender: f"{count.kept} recorded, {count.missed} missing" for sender, count in card.speakers.items()
         },
         "missing": _missing(read_parts(folder, "gaps")),
+        "jobs submitted by": _submitters(results),
+        "requests": [_describe_request(row) for row in operations.to_pylist()],
     }
-    return report_html(run, telemetry, events, arms, warning_c=limits.warning_c, error_c=limits.error_c)
+    if len(epochs) > 1:
+        run["epochs"] = f"{len(epochs)} are recorded here; this page shows the last one, {[*epochs][-1]}"
+    model = None if scenario is None else _model(scenario, arms)
+    return report_html(run, telemetry, events, arms, warning_c=limits.warning_c, error_c=limits.error_c, model=model)
+
+
+def _model(scenario: Scenario, arms: Sequence[str]) -> dict[str, Any]:
+    robots = {arm.name: arm.robot() for arm in scenario.arms}
+    if missing := [arm for arm in arms if arm not in robots]:
+        raise FleetError(
+            f"The recording has the arm '{missing[0]}', and scenario '{scenario.name}' has only {', '.join(robots)}; "
+            "give the scenario that the fleet was started with."
+        )
+    return cell_model([robots[arm] for arm in arms], scenario.places, scenario.fixtures)
 
 
 def order_events(events: Iterable[Event], returns: Iterable[Event]) -> list[Event]:
@@ -232,3 +257,28 @@ def _metrics(
 def _missing(gaps: pa.Table) -> Mapping[str, str]:
     rows = gaps.to_pylist()
     return {f"{row['sender']}, numbers {row['first']} to {row['last']}": row["reason"] for row in rows} or {"": "none"}
+
+
+def _of_epoch(table: pa.Table, epochs: list[str]) -> pa.Table:
+    """Rows of the last of several epochs, each of which begins its time again."""
+    if len(epochs) < 2:
+        return table
+    return table.filter(pc.field("epoch").isin(["", epochs[-1]]))  # "": before an arm knew it
+
+
+def _submitters(results: pa.Table) -> Mapping[str, int]:
+    """Number of jobs by who submitted them; "nobody named" for none."""
+    first = {row["job"]: row["by"] for row in reversed(results.to_pylist()) if row["state"] == "waiting"}
+    return Counter(by or "nobody named" for by in first.values())
+
+
+def _describe_request(row: Mapping[str, Any]) -> tuple[str, ...]:
+    """Time, action, what it concerns, and who asked."""
+    action = json.loads(row["content"])["action"]
+    details = (
+        f"{key.removesuffix('_s')} {action[key]}".removeprefix("outcome ")
+        for key in ("outcome", "due_s", "value")
+        if key in action
+    )
+    concerns = row["job"] or ("all arms" if row["arm"] == ALL_ARMS else row["arm"])
+    return clock(row["time_s"]), " ".join((row["action"], *details)), concerns, row["by"]

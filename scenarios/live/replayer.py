@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
+from fleet.bus.protocol.operator import ControlRequest, Operation
 from fleet.errors import FleetError
 from scenarios.live.recording import CARD, MESSAGES, Message, read_card, read_parts, states
 from scenarios.run.run_folder import check_format
@@ -30,11 +31,12 @@ class Replay:
     telemetry: pa.Table
     events: pa.Table
     results: pa.Table
+    operations: pa.Table
     warning_c: float = 60.0
     """Warning limit of the headroom, where no headroom was recorded."""
 
     def __len__(self) -> int:
-        return self.telemetry.num_rows + self.events.num_rows + self.results.num_rows
+        return sum(table.num_rows for table in (self.telemetry, self.events, self.results, self.operations))
 
     @classmethod
     def of(cls, folder: Path) -> "Replay":
@@ -54,6 +56,7 @@ class Replay:
                 telemetry=pq.read_table(folder / "telemetry.parquet"),
                 events=pq.read_table(folder / "events.parquet"),
                 results=pa.table({}),
+                operations=pa.table({}),
                 warning_c=scenario["limits"]["warning_c"],
             )
         except (OSError, ValueError, KeyError, TypeError, pa.ArrowInvalid) as error:
@@ -73,6 +76,7 @@ class Replay:
             states(self.telemetry, warning_c=self.warning_c),
             _events(self.events),
             _results(self.results),
+            _operations(self.operations),
         ]
         return merge(*streams, key=lambda message: message.time_s)
 
@@ -103,8 +107,8 @@ class Replay:
 
 
 def _key(fleet: str, message: Message) -> str:
-    if isinstance(message, Result):
-        return keys.of_auction(fleet, message.auctioneer, "result")
+    if isinstance(message, Result | Operation):
+        return keys.of_auction(fleet, message.auctioneer, "result" if isinstance(message, Result) else "operation")
     return keys.of_arm(fleet, message.arm, "event" if isinstance(message, ArmEvent) else "state")
 
 
@@ -122,6 +126,12 @@ def _events(table: pa.Table) -> Iterator[ArmEvent]:
 def _results(table: pa.Table) -> Iterator[Result]:
     for row in table.to_pylist():
         yield msgspec.convert({**row, "status": {name: row[name] for name in JobStatus.__struct_fields__}}, Result)
+
+
+def _operations(table: pa.Table) -> Iterator[Operation]:
+    for row in table.to_pylist():
+        request = msgspec.json.decode(row["content"], type=ControlRequest)
+        yield Operation(row["auctioneer"], row["time_s"], request, row["number"], row["epoch"])
 
 
 def _refuse_present(link: BusClient, arms: list[str]) -> None:

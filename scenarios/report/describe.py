@@ -10,6 +10,7 @@ from rich.text import Text
 from scenarios.fault_price import fault_price
 from scenarios.prepare.fleet import ShiftFactory, prepare
 from scenarios.progress import Progress, quiet
+from scenarios.report.layout_tables import text_table
 from scenarios.report.load_factor import load_factor
 from scenarios.schema import ArmSpec, JobStream, Scenario
 
@@ -62,7 +63,7 @@ def _arms(scenario: Scenario) -> Table:
         ("wear", lambda a: f"{a.wear:g}"),
     ]
     shown = [(name, text) for name, text in columns if any(text(a) != text(usual) for a in scenario.arms)]
-    table = _table("arms", "position, m", "tilt, deg", *(name for name, _ in shown))
+    table = text_table("arms", "position, m", "tilt, deg", *(name for name, _ in shown))
     for a in scenario.arms:
         where = ", ".join(f"{v:g}" for v in a.position_m)
         tilt = ", ".join(f"{v:g}" for v in a.tilt_deg)
@@ -72,7 +73,7 @@ def _arms(scenario: Scenario) -> Table:
 
 def _jobs(scenario: Scenario) -> Table:
     """One row per stream, as sentences that fit any terminal."""
-    table = _table("jobs", "")
+    table = text_table("jobs", "")
     for s in scenario.jobs:
         table.add_row(s.name, f"{_work(s)}\nworth {s.value:g}, due after {s.due_s / 60:g} min; {_arrivals(s)}")
     return table
@@ -106,10 +107,3 @@ def _arrivals(stream: JobStream) -> str:
             return f"{spec.count} at {spec.start_s:g} s{again}{after}"
         case "trace":
             return f"a trace of {len(spec.times_s or ())}{after}"
-
-
-def _table(*columns: str) -> Table:
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for column in columns:
-        table.add_column(column, overflow="fold")
-    return table

@@ -14,15 +14,15 @@ def layout_tables(scenario: Scenario, report: LayoutReport) -> list[Table | Text
     """Reach matrix, reasons, exclusions, and the most arms at work at once."""
     arms = [arm.name for arm in scenario.arms]
     reach = {(entry.place, entry.arm): entry for entry in report.reach}
-    matrix = _table("place", *arms)
+    matrix = text_table("place", *arms)
     for place in scenario.places:
         matrix.add_row(place.name, *(_payload(reach[place.name, arm].payload_kg) for arm in arms))
-    reasons = _table("cannot do", "reason")
+    reasons = text_table("cannot do", "reason")
     for entry in report.reach:
         if entry.reason:
             reasons.add_row(f"{entry.arm} at {entry.place}", entry.reason)
     shared = [pair for pair in report.exclusions if not pair.same_place]
-    pairs = _table("job", "excludes", "share of plans")
+    pairs = text_table("job", "excludes", "share of plans")
     for pair in shared[:WORST]:
         one, other = (f"{job}, {arm}" for job, arm in zip(pair.jobs, pair.arms, strict=True))
         pairs.add_row(one, other, f"{pair.share:.0%}")
@@ -54,7 +54,8 @@ def _payload(payload_kg: float | None) -> str:
     return "–" if payload_kg is None else f"{payload_kg:g}"
 
 
-def _table(*columns: str) -> Table:
+def text_table(*columns: str) -> Table:
+    """An empty table without lines, whose cells are folded."""
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in columns:
         table.add_column(column, overflow="fold")

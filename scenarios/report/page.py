@@ -10,8 +10,8 @@ from importlib.resources import files
 from typing import Any  # values of JSON
 
 from fleet.errors import visible
-from scenarios.view.playback import compressed
-from scenarios.view.three import three_js
+from scenarios.report.playback import compressed
+from scenarios.report.three import three_js
 
 PNG_HEAD = b"\x89PNG\r\n\x1a\n"
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data: blob:; form-action 'none'; base-uri 'none'"
@@ -81,7 +81,7 @@ class Replay:
     model: Mapping[str, Any]
     """`fleet.physics.cell_model.cell_model`."""
     playback: str
-    """`scenarios.view.playback.packed`."""
+    """`scenarios.report.playback.packed`."""
     unit_s: float
     """Unit of the figure's time axis."""
 

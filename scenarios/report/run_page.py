@@ -11,11 +11,11 @@ from fleet.telemetry import Telemetry
 from scenarios.report.choices import choices
 from scenarios.report.gantt import clock
 from scenarios.report.page import Moment, Replay, escape, figure_place, html_page, paragraph, replay_place, table
+from scenarios.report.playback import packed, payloads
 from scenarios.report.schedule import schedule
 from scenarios.report.timeline import figure, time_unit
 from scenarios.report.verdict import Verdict, duration, verdict
 from scenarios.shift_records import Offer
-from scenarios.view.playback import packed, payloads
 
 NO_PAYLOADS: Mapping[str, float] = {}
 ROWS = 300
@@ -73,6 +73,7 @@ def report_html(
         figure_place(),
         *_event_table(events),
         *choices(offers, arms),
+        *_request_table(run.get("requests") or ()),
         _provenance(run),
     ]
     scenario = run.get("scenario", {}).get("name", "unnamed scenario")
@@ -167,6 +168,17 @@ def _event_table(events: Sequence[Event]) -> list[str]:
     ]
 
 
+def _request_table(requests: Sequence[Sequence[str]]) -> list[str]:
+    """What people asked of a live fleet, if anything."""
+    if not requests:
+        return []
+    rows = [tuple(request) for request in requests[-ROWS:]]
+    lines = ["<h2>Requests of people</h2>"]
+    if len(rows) < len(requests):
+        lines.append(paragraph(f"The last {len(rows)} of {len(requests)}.", "faint"))
+    return [*lines, table(("time", "request", "job or arm", "by"), rows)]
+
+
 def _label(kind: str) -> str:
     return {"lost": "claim lost", "return": "job returned", "recover": "recovered"}.get(kind, kind.replace("_", " "))
 
@@ -179,7 +191,7 @@ def _provenance(run: Mapping[str, Any]) -> str:
     """Everything else in `run.json`, folded away."""
     rows = []
     scenario = {f"scenario {k}": v for k, v in run.get("scenario", {}).items() if k not in ("name", "description")}
-    rest = {k: v for k, v in run.items() if k not in ("scenario", "status", "policy", "seed")}
+    rest = {k: v for k, v in run.items() if k not in ("scenario", "status", "policy", "seed", "requests")}
     for key, value in (rest | scenario).items():
         parts = value.items() if isinstance(value, Mapping) else [("", value)]
         rows += [(f"{key} {part}".strip(), _plain(inner)) for part, inner in parts]

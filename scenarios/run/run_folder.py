@@ -19,6 +19,7 @@ from fleet.telemetry import MODES, Telemetry
 from scenarios.report.run_page import report_html
 from scenarios.result_folder import ResultKind, disk_errors
 from scenarios.run.shift import RUN_FORMAT, RunResult, summary
+from scenarios.schema import Scenario
 from scenarios.shift_records import JobRecord, Offer
 
 FILES = ("run.json", "telemetry.parquet", "events.parquet", "jobs.parquet", "offers.parquet", "report.html")
@@ -32,7 +33,6 @@ def write(result: RunResult, folder: Path) -> None:
         FleetError: the folder cannot be written.
     """
     run = summary(result)
-    arms = [arm.name for arm in result.scenario.arms]
     with disk_errors(folder):
         (folder / "run.json").write_text(json.dumps(run, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         pq.write_table(event_table(result.events), folder / "events.parquet")
@@ -40,20 +40,38 @@ def write(result: RunResult, folder: Path) -> None:
         pq.write_table(record_table(Offer, result.offers), folder / "offers.parquet")
         if result.telemetry is None:
             return
-        pq.write_table(telemetry_table(result.telemetry, arms), folder / "telemetry.parquet")
-        scenario, limits = result.scenario, result.scenario.limits
-        html = report_html(
-            run,
-            result.telemetry,
-            result.events,
-            arms,
-            warning_c=limits.warning_c,
-            error_c=limits.error_c,
-            model=cell_model([a.robot() for a in scenario.arms], scenario.places, scenario.fixtures),
-            payload_of={job.job: job.payload_kg for job in result.jobs},
-            offers=result.offers,
+        pq.write_table(
+            telemetry_table(result.telemetry, [arm.name for arm in result.scenario.arms]), folder / "telemetry.parquet"
         )
+        html = run_html(run, result.scenario, result.telemetry, result.events, result.jobs, result.offers)
         (folder / "report.html").write_text(html, encoding="utf-8")
+
+
+def run_html(
+    card: Mapping[str, Any],
+    scenario: Scenario,
+    telemetry: Telemetry,
+    events: Sequence[Event],
+    jobs: Sequence[JobRecord],
+    offers: Sequence[Offer],
+) -> str:
+    """The report of a run as one HTML page.
+
+    Args:
+        card: Content of run.json.
+    """
+    robots, limits = [arm.robot() for arm in scenario.arms], scenario.limits
+    return report_html(
+        card,
+        telemetry,
+        events,
+        [robot.name for robot in robots],
+        warning_c=limits.warning_c,
+        error_c=limits.error_c,
+        model=cell_model(robots, scenario.places, scenario.fixtures),
+        payload_of={job.job: job.payload_kg for job in jobs},
+        offers=offers,
+    )
 
 
 def check_format(run: Mapping[str, Any], folder: Path) -> None:

@@ -1,32 +1,27 @@
 """Films of a recorded shift: MuJoCo's renderer without a display, and ffmpeg's encoders through PyAV."""
 
-# MuJoCo is compiled and ships no type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib
-import mujoco
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from fleet.env.render.heat import heat_colour, heat_marks
 from fleet.errors import FleetError, visible
-from fleet.physics.cell_player import CellPlayer
+from fleet.physics.cell_player import CellCamera, CellPlayer
+from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, MODES
 from scenarios.report.gantt import clock
+from scenarios.report.playback import payloads
 from scenarios.report.schedule import schedule
 from scenarios.run.stored_run import StoredRun
-from scenarios.view.playback import payloads
 
 Array = np.ndarray
 
-NO_OPENGL = (
-    "No OpenGL without a display could be had ({error}). Install EGL or OSMesa (on Debian: libegl1 and "
-    "libgl1-mesa-dri, or libosmesa6), or choose one with MUJOCO_GL=egl or MUJOCO_GL=osmesa."
-)
+MOTOR_M, HOT_MOTOR_M = 0.052, 0.074
+"""Radius of the sphere of a cool motor and of one at the error limit: a hotter motor is also larger."""
 INK, PAPER, FAULT = (34, 34, 34), (250, 250, 248), (204, 34, 34)
 CODECS = {"mp4": "libx264", "webm": "libvpx"}
 OPTIONS = {"libx264": {"preset": "veryfast", "crf": "27"}, "libvpx": {"deadline": "realtime", "cpu-used": "8"}}
@@ -64,6 +59,14 @@ def times(run: StoredRun, shot: Shot) -> Array:
     return np.arange(begin_s, end_s + 1e-9, shot.speed / shot.fps)
 
 
+def show_heat(player: CellPlayer, q: Array, temp_c: Array, payload_kg: Array, limits: ThermalLimits) -> None:
+    """Put a cell into postures [arm, joint] in rad, with motors coloured by temperatures [arm, joint] in °C."""
+    rgb = heat_colour(temp_c, limits.warning_c, limits.error_c)
+    coolest_c = heat_marks(limits.warning_c, limits.error_c)[0]
+    share = np.clip((temp_c - coolest_c) / (limits.error_c - coolest_c), 0.0, 1.0)
+    player.show(q, rgb, MOTOR_M + share * (HOT_MOTOR_M - MOTOR_M), payload_kg)
+
+
 class Film:
     """A recorded shift in a MuJoCo model of its cell.
 
@@ -74,8 +77,8 @@ class Film:
     def __init__(self, run: StoredRun, *, meshes: bool = False) -> None:
         scenario, readings = run.scenario, run.telemetry
         robots = [arm.robot() for arm in scenario.arms]
-        self.player = CellPlayer(robots, scenario.places, scenario.fixtures, limits=scenario.limits, meshes=meshes)
-        self.mounts_m = np.array([robot.mount.position_m for robot in robots])
+        self.player = CellPlayer(robots, scenario.places, scenario.fixtures, meshes=meshes)
+        self._limits = scenario.limits
         plan = schedule(run.events, run.arms, float(readings.time_s[-1]))
         self._load_kg = payloads(readings, plan, run.arms, {job.job: job.payload_kg for job in run.jobs})
         self._readings = readings
@@ -92,7 +95,7 @@ class Film:
         length_s = readings.time_s[row] - readings.time_s[before]
         share = np.clip((time_s - readings.time_s[before]) / length_s, 0.0, 1.0) if length_s else 1.0
         q, temp_c = ((1 - share) * v[before] + share * v[row] for v in (readings.q, readings.temp_c))
-        self.player.show(q, temp_c, self._load_kg[row])
+        show_heat(self.player, q, temp_c, self._load_kg[row], self._limits)
         return temp_c, readings.mode[row]
 
 
@@ -103,30 +106,10 @@ def frames(run: StoredRun, shot: Shot, at_s: Array) -> Iterator[Array]:
         FleetError: OpenGL or the meshes are not available.
     """
     film, overlay = Film(run, meshes=shot.meshes), Overlay(run, shot)
-    model = film.player.model
-    model.vis.global_.offwidth, model.vis.global_.offheight = shot.width, shot.height
-    model.vis.quality.offsamples = 0
-    try:
-        renderer = mujoco.Renderer(model, shot.height, shot.width)
-    except Exception as error:  # each OpenGL backend has errors of its own
-        raise FleetError(NO_OPENGL.format(error=error or type(error).__name__)) from error
-    camera = camera_on(film.mounts_m)
-    with renderer:
+    with CellCamera(film.player, shot.width, shot.height) as camera:
         for time_s in at_s:
             temp_c, mode = film.show(time_s)
-            renderer.update_scene(film.player.data, camera)
-            for slow in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
-                renderer.scene.flags[slow] = 0
-            yield overlay.draw(renderer.render(), float(time_s), temp_c, mode)
-
-
-def camera_on(mounts_m: Array) -> mujoco.MjvCamera:
-    """A camera that sees a whole cell; mounts [arm, 3]."""
-    camera = mujoco.MjvCamera()
-    across = max(1.0, *np.ptp(mounts_m, axis=0))
-    camera.lookat[:] = (mounts_m.min(axis=0) + mounts_m.max(axis=0)) / 2 + (0.0, 0.0, 0.35)
-    camera.distance, camera.azimuth, camera.elevation = 1.2 + 1.05 * across, 128.0, -36.0
-    return camera
+            yield overlay.draw(camera.picture(), float(time_s), temp_c, mode)
 
 
 class Overlay:
@@ -195,6 +178,7 @@ def write_film(path: Path, kind: str, pictures: Iterator[Array], shot: Shot) -> 
     count = 0
     with av.open(str(path), "w", format=kind) as container:
         stream = container.add_stream(codec, rate=shot.fps, options=OPTIONS[codec])
+        assert isinstance(stream, av.VideoStream)  # what the codecs above make
         stream.width, stream.height, stream.pix_fmt = shot.width, shot.height, "yuv420p"
         if codec == "libvpx":
             stream.bit_rate = 1_500_000

@@ -21,9 +21,11 @@ from fleet.bus.protocol.examples import EXAMPLES
 from fleet.bus.protocol.messages import MalformedMessage
 from fleet.bus.protocol.registry import CHANNELS, MESSAGES, channel_of
 from fleet.bus.protocol.schemas import descriptions, schema_document
+from fleet.events import EVENT_KINDS, MEANINGS
+from fleet.live.arm.simulated_body import _REPORTED
 from scenarios.cli.contract import documents
-from scenarios.cli.doc_tables import fill_tables
 from scenarios.cli.main import app
+from scenarios.doc_tables import fill_tables
 
 ROOT = Path(__file__).parents[2]
 DOCUMENT = schema_document()
@@ -147,7 +149,7 @@ def test_a_whole_number_written_with_a_point_is_the_one_known_difference():
 def test_fields_are_described_by_the_text_under_them():
     assert descriptions(messages.State)["tau"] == "N·m at the joint output, [joint]."
     assert descriptions(JobSpec)["payload_kg"].startswith("Carried from grasp to release")
-    assert descriptions(JobSpec)["release_s"] == "Earliest start."
+    assert descriptions(JobSpec)["release_s"] == "Earliest start, fleet time."
 
 
 def test_asyncapi_has_every_key_and_no_loose_end():
@@ -248,3 +250,24 @@ def test_stale_documents_are_named_and_made_anew(tmp_path):
     assert page.endswith("<!-- end -->\nz\n")
     assert fill_tables(page) == page
     assert CliRunner().invoke(app, ["contract", "--check", "--out", str(out)]).exit_code == 0
+
+
+def test_every_kind_of_event_has_a_meaning_and_live_ones_are_those_that_arms_report():
+    live = {kind for kind, meaning in MEANINGS.items() if meaning.live}
+    assert tuple(MEANINGS) == EVENT_KINDS
+    assert live == {*_REPORTED, "award", "finish", "return"}
+    page = Path("docs/bus.md").read_text(encoding="utf-8")
+    assert all(f"| `{kind}` | {meaning.text} | {meaning.value} |" in page for kind, meaning in MEANINGS.items())
+
+
+def test_the_table_of_a_job_has_the_unit_of_every_bounded_field():
+    page = Path("docs/bus.md").read_text(encoding="utf-8")
+    rows = [line.split(" | ") for line in page.partition("### JobSpec")[2].partition("### ")[0].splitlines()]
+    units = {row[0].strip("| `"): row[2] for row in rows if len(row) == 5}
+    assert {name: units[name].strip() for name in ("payload_kg", "force_n", "dwell_s", "due_s", "value")} == {
+        "payload_kg": "kg",
+        "force_n": "N",
+        "dwell_s": "s",
+        "due_s": "s",
+        "value": "",
+    }

@@ -14,6 +14,7 @@ from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Admission, ArmEvent, Clock, ClockRequest, JobSpec, Submission, SubmissionReply
 from fleet.bus.protocol.messages import Refusal, encoding
 from fleet.errors import BusError
+from tests.waiting import serve_until
 
 PATIENCE_S = 10.0
 
@@ -26,22 +27,13 @@ def bus():
         yield lambda **options: stack.enter_context(BusClient(router.endpoint, "f", **options))
 
 
-def serve(condition, *links):
-    """Serve all links until the condition holds."""
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline_s, "waited in vain"
-        for link in links:
-            link.serve(time.monotonic() + 0.02)
-
-
 def meet(*links):
     """What each has declared is known to all: a token is declared last, and seen after the rest."""
     seen = [set() for _ in links]
     for number, (link, names) in enumerate(zip(links, seen, strict=True)):
         link.declare_token(keys.of_arm("f", f"guest_{number}", "alive"))
         link.watch_tokens(keys.of_every_arm("f", "alive"), lambda arm, _, names=names: names.add(arm))
-    serve(lambda: all(len(names) >= len(links) for names in seen), *links)
+    serve_until(lambda: all(len(names) >= len(links) for names in seen), *links)
 
 
 def raw(link):
@@ -55,7 +47,7 @@ def test_an_answer_reaches_the_one_who_asked(bus):
     meet(asker, teller)
     got = []
     asker.query(keys.of_clock("f"), ClockRequest(), Clock, got.append, timeout_s=5.0)
-    serve(lambda: got, asker, teller)
+    serve_until(lambda: got, asker, teller)
     assert list(got[0].messages.values()) == [Clock(time_s=12.5, speed=60.0)]
     assert not got[0].refused
     assert got[0].took_s < PATIENCE_S
@@ -78,7 +70,7 @@ def test_a_refusal_is_told_in_words(bus):
     meet(asker, teller)
     got = []
     asker.query(keys.of_clock("f"), ClockRequest(), Clock, got.append, timeout_s=5.0)
-    serve(lambda: got, asker, teller)
+    serve_until(lambda: got, asker, teller)
     assert got[0].refused == {keys.of_clock("f"): "No clock here."}
 
 
@@ -95,7 +87,7 @@ def test_two_that_ask_each_other_do_not_block(bus):
     one.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=1.0, speed=1.0))
     meet(one, other)
     one.query(keys.of_jobs("f", "submit"), Submission((job,)), SubmissionReply, got.append, timeout_s=5.0)
-    serve(lambda: len(got) == 2, one, other)
+    serve_until(lambda: len(got) == 2, one, other)
     assert all(len(answers.messages) == 1 for answers in got)
 
 
@@ -114,7 +106,7 @@ def test_a_malformed_question_is_answered_with_what_is_wrong(bus, payload, said,
     meet(asker, teller)
     replies = []
     raw(asker).get(keys.of_clock("f"), replies.append, payload=payload, encoding=said, timeout=5.0)
-    serve(lambda: replies, teller)
+    serve_until(lambda: replies, teller)
     assert str(replies[0].ok.encoding) == encoding(Refusal)
     assert complaint in json.loads(replies[0].ok.payload.to_bytes())["reason"]
     assert teller.malformed == 1
@@ -129,7 +121,7 @@ def test_a_late_joiner_hears_the_last_words(bus):
     late.subscribe(
         keys.of_every_arm("f", "event"), ArmEvent, lambda arm, word: heard.append((arm, word.number)), history=True
     )
-    serve(lambda: len(heard) == 3, late)
+    serve_until(lambda: len(heard) == 3, late)
     assert heard == [("arm_0", 0), ("arm_0", 1), ("arm_0", 2)]
 
 
@@ -142,7 +134,7 @@ def test_words_that_speak_for_another_are_left_out(bus):
     stranger.publish(keys.of_arm("f", "arm_0", "event"), lie)
     raw(stranger).put("thermofleet/v4/f/arm/*/event", json.dumps({"arm": "arm_0"}), encoding=encoding(ArmEvent))
     stranger.publish(keys.of_arm("f", "arm_2", "event"), truth)
-    serve(lambda: heard, listener)
+    serve_until(lambda: heard, listener)
     assert heard == ["arm_2"]
     assert listener.malformed == 2
 
@@ -152,9 +144,9 @@ def test_who_comes_and_goes_is_seen(bus):
     watcher.watch_tokens(keys.of_every_arm("f", "alive"), lambda arm, there: seen.append((arm, there)))
     arm = bus()
     arm.declare_token(keys.of_arm("f", "arm_0", "alive"))
-    serve(lambda: ("arm_0", True) in seen, watcher)
+    serve_until(lambda: ("arm_0", True) in seen, watcher)
     arm.close()
-    serve(lambda: ("arm_0", False) in seen, watcher)
+    serve_until(lambda: ("arm_0", False) in seen, watcher)
     assert seen.index(("arm_0", True)) < seen.index(("arm_0", False))
 
 

@@ -30,7 +30,7 @@ PUBLISHED = {name for name, (_, how) in CHANNELS.items() if how["pattern"] == "p
 QUERIED = {name for name, (_, how) in CHANNELS.items() if how["pattern"] == "query"}
 ARM = {"arm_alive", "arm_state", "arm_info", "arm_difficulty"}
 """What a simulated shift has."""
-CONSENSUS = {"arm_bid", "arm_claim"}
+CONSENSUS = {"arm_bid", "arm_claim", "arm_operation"}
 PATIENCE_S = 240.0
 COMMAND = [sys.executable, "-c", "from scenarios.cli.main import main; main()"]
 REPEATED = 2
@@ -257,6 +257,7 @@ def test_a_fleet_without_an_auctioneer_is_as_the_contract_says(folder, port):
     at = ("--endpoint", f"tcp/127.0.0.1:{port}", "--difficulty", "blind", "--speed", 20, "--policy", "consensus")
     here = ("--jobs", "none", "--journal", folder / "journals")
     channels = {*ARM, "arm_event", "arm_quote", *CONSENSUS, "jobs_submit", "jobs_status", "clock_now"}
+    channels |= {"jobs_control", "jobs_cell"}
     with ExitStack() as stack:
         stack.enter_context(started(folder, "router", "--port", port))
         outsider = stack.enter_context(outside(port, "cell"))
@@ -272,6 +273,8 @@ def test_a_fleet_without_an_auctioneer_is_as_the_contract_says(folder, port):
                 outsider.request("jobs_submit", "Submission")
                 outsider.request("jobs_status", "StatusRequest")
                 outsider.request("clock_now", "ClockRequest")
+                outsider.request("jobs_control", "ControlRequest")
+                outsider.request("jobs_cell", "CellRequest")
                 outsider.request("arm_quote", "QuoteRequest", arm="*")
                 outsider.request("arm_claim", "Claim", arm="*", peer="spare")
         token.undeclare()

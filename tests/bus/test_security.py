@@ -8,7 +8,6 @@ an open router, where every trespass gets through.
 import itertools
 import queue
 import threading
-import time
 from collections.abc import Callable
 
 import pytest
@@ -31,6 +30,7 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, GrantedEntry
 from fleet.bus.protocol.messages import encode, encoding
 from fleet.bus.security.tls import Tls
+from tests.waiting import serve_until
 
 ARMS = ("arm_0", "arm_1", "arm 2+*@")
 PATIENT_S = 20.0
@@ -250,7 +250,7 @@ def test_an_error_of_zenohs_is_lost_under_a_wildcard_and_a_refusal_is_not(router
         for where in (key, everywhere):
             got: list[Replies[Ack]] = []
             asks.query(where, award, Ack, got.append, timeout_s=PATIENT_S)
-            serve(lambda got=got: bool(got), answers, asks)
+            serve_until(lambda got=got: bool(got), answers, asks)
             assert got[0].refused == {key: "too warm"}
 
 
@@ -258,15 +258,6 @@ def raw(link: BusClient) -> zenoh.Session:
     """The session beneath."""
     assert link._session is not None
     return link._session
-
-
-def serve(condition: Callable[[], bool], *links: BusClient) -> None:
-    """Serve all until the condition holds."""
-    deadline_s = time.monotonic() + PATIENT_S
-    while not condition():
-        assert time.monotonic() < deadline_s, "waited in vain"
-        for link in links:
-            link.serve(time.monotonic() + 0.02)
 
 
 @pytest.mark.parametrize("topic", keys.ASKED)
@@ -304,7 +295,7 @@ def test_an_arm_neither_renews_nor_reports_nor_claims_for_another(router, side, 
                 key, handler, payload=encode(word), encoding=encoding(type(word)), target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE, timeout=PATIENT_S,
             )  # fmt: skip
-            serve(over.is_set, auctioneer)
+            serve_until(over.is_set, auctioneer)
             return [str(reply.ok.encoding).split(".")[1] for reply in got]
 
         def ask_as(asker: str, arm: str) -> list[str]:

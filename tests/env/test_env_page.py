@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 from fleet.engine.reward import TERMS
 from fleet.observation import FIELDS, Layout
 from scenarios import make_batch, make_env
-from scenarios.cli.doc_tables import fill_tables
 from scenarios.cli.main import app
+from scenarios.doc_tables import fill_tables
 from scenarios.load import override
 from scenarios.schema import RewardSpec
 

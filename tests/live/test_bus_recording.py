@@ -10,12 +10,14 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from fleet.bus.client.client import BusClient
 from fleet.bus.client.router import Router
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
 from fleet.bus.protocol.messages import State
+from fleet.bus.protocol.operator import Cancel, ControlRequest, Operation
 from fleet.errors import FleetError
 from scenarios.cli.live.record import lock_folder, record
 from scenarios.live.recorder import Recorder
@@ -49,6 +51,11 @@ def result(number):
     return Result(auctioneer="boss", number=number, time_s=number / 2, status=status, difficulty=0.5)
 
 
+def operation(number):
+    request = ControlRequest(f"request {number}", Cancel(f"job {number}"), "ann")
+    return Operation("boss", number / 2, request, number)
+
+
 def test_recorded_messages_are_read_back(tmp_path):
     recorder = Recorder.open(tmp_path, "f")
     said = [state(arm, tick) for tick in range(5) for arm in ("a", "b")]
@@ -57,12 +64,14 @@ def test_recorded_messages_are_read_back(tmp_path):
     for number in range(3):
         recorder.add("a", event("a", number))
         recorder.add("boss", result(number))
+        recorder.add("boss", operation(number))
     recorder.write(status="finished")
     read = list(states(read_parts(tmp_path, "telemetry")))
     assert sorted(read, key=lambda w: (w.tick, w.arm)) == sorted(said, key=lambda w: (w.tick, w.arm))
     told = Replay.of(tmp_path)
     assert [w for w in told.messages() if isinstance(w, ArmEvent)] == [event("a", n) for n in range(3)]
     assert [w for w in told.messages() if isinstance(w, Result)] == [result(n) for n in range(3)]
+    assert [w for w in told.messages() if isinstance(w, Operation)] == [operation(n) for n in range(3)]
     assert read_card(tmp_path).status == "finished"
 
 
@@ -137,6 +146,56 @@ def test_messages_of_a_restarted_arm_are_kept(tmp_path):
     for word in (state("a", 7, 70.0), state("a", 0, 80.0), state("a", 1, 81.0), state("a", 0, 80.0)):
         recorder.add("a", word)
     assert (recorder.counts["state of a"].kept, recorder.counts["state of a"].missed) == (3, 0)
+
+
+def test_a_new_epoch_in_the_same_folder_is_no_repetition(tmp_path):
+    """A second shift begins its numbers and its time again; caches repeat messages of both."""
+    recorder = Recorder.open(tmp_path, "f")
+    sent = [
+        replace(message, epoch=epoch)
+        for epoch in ("one", "two")
+        for number in range(1, 6)
+        for message in (state("a", number), event("a", number + 10**9), result(number - 1), operation(number - 1))
+    ]
+    for message in (*sent, *sent[-12:]):
+        recorder.add("", message)
+    recorder.save()
+    recorder.close()
+    again = Recorder.open(tmp_path, "f")
+    for message in sent[-12:]:
+        again.add("", message)
+    again.write(status="finished")
+    read = list(Replay.of(tmp_path).messages())
+    assert sorted(map(repr, read)) == sorted(map(repr, sent))
+    assert read_parts(tmp_path, "gaps").num_rows == 0
+
+
+def test_a_result_of_an_earlier_time_is_no_restart(tmp_path):
+    """An auctioneer numbers a late report after results of later times, and repeats all after a restart."""
+    recorder = Recorder.open(tmp_path, "f")
+    sent = [replace(result(number), time_s=time_s) for number, time_s in enumerate((10.0, 30.0, 20.0, 40.0))]
+    for message in (*sent[:3], *sent, sent[1]):
+        recorder.add("boss", message)
+    recorder.write(status="finished")
+    assert read_parts(tmp_path, "results")["number"].to_pylist() == [0, 2, 1, 3]
+    assert read_parts(tmp_path, "gaps").num_rows == 0
+
+
+def test_a_full_disk_at_the_start_puts_no_journal_aside(tmp_path, monkeypatch):
+    recorder = Recorder.open(tmp_path, "f")
+    recorder.add("a", state("a", 0))
+    recorder.save()
+    recorder.close()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as broken:
+        broken.setattr("fleet.live.journal.os.open", full)
+        with pytest.raises(FleetError, match="No space left on device"):
+            Recorder.open(tmp_path, "f")
+    Recorder.open(tmp_path, "f").write()
+    assert read_parts(tmp_path, "telemetry").num_rows == 1
 
 
 def test_a_recording_is_readable_meanwhile_and_can_be_continued(tmp_path):

@@ -5,9 +5,16 @@ import re
 import shutil
 import subprocess
 import sys
+from importlib import import_module
+from itertools import islice
 from pathlib import Path
 
 import pytest
+
+from fleet.bus.protocol.auction import Award, JobSpec
+from fleet.live.arm.journal_records import ArmHistory, ArmRecord, AwardAccepted
+from fleet.live.journal import Journal
+from fleet.live.journal_records import Closed
 
 CAMPAIGN = Path(__file__).parents[2] / "benchmarks" / "chaos"
 
@@ -21,6 +28,44 @@ def strike(*faults, jobs, env=None):
         check=False,
         env=env,
     )
+
+
+@pytest.fixture
+def chaos(monkeypatch):
+    """The modules of the campaign."""
+    monkeypatch.syspath_prepend(str(CAMPAIGN))
+    return import_module
+
+
+def test_a_seed_repeats_its_faults_and_12_faults_occur(chaos):
+    schedule, others = chaos("random_faults").schedule, chaos("random_faults").OTHERS
+
+    def faults(seed):
+        return list(islice(schedule(seed, ("a", "b")), 60))
+
+    assert faults(1) == faults(1) != faults(2)
+    assert len(others) >= 12
+    assert others.keys() <= {step.fault for step in faults(1)}
+
+
+def test_jobs_are_counted_that_a_journal_has_left_out(chaos, tmp_path):
+    def close(journal, award, job):
+        journal.append(
+            AwardAccepted(Award(award, "r", "auctioneer", "q", JobSpec(job, "hold", ("x",)))),
+            Closed(award, "finished", 1, 0.0, job=job, arm="a"),
+        )
+
+    files = chaos("journal_files").JournalFiles(tmp_path)
+    with Journal[ArmRecord](tmp_path / "a.journal", ArmRecord) as journal:
+        close(journal, "1", "j")
+        files.follow()
+        journal.rewrite(*ArmHistory().replay(journal.records()).compact())  # as at a start: the report is repeated
+        files.follow()
+        journal.rewrite()
+        close(journal, "2", "j")
+        close(journal, "3", "k")
+        assert files.count_finished() == {"j": 2, "k": 1}
+    files.close()
 
 
 def test_a_fleet_survives_a_kill_of_its_auctioneer():

@@ -143,3 +143,19 @@ def test_due_date_and_value_change_and_the_job_stays_the_same_to_its_submitter(f
     assert fleet.auctioneer.ledger.expired(91.0)
     ask(fleet, Change("a", due_s=None))
     assert not fleet.auctioneer.ledger.expired(math.inf)
+
+
+@pytest.mark.parametrize("restarts", [0, 1, 2])
+def test_the_name_of_a_request_stands_for_one_request(fleet, restarts):
+    """Also after restarts from records and from a snapshot."""
+    fleet.submit(job("a", release_s=1e6), job("b", release_s=1e6))
+    ask(fleet, Cancel("a"), "one")
+    for _ in range(restarts):
+        fleet.auctioneer = fleet.restart()
+    same = ask(fleet, Cancel("a"), "one")
+    assert (same.changed, same.note, same.job.state) == (False, "This request was carried out before.", "cancelled")
+    for other in (Cancel("b"), Change("a", value=2.0), Pause()):
+        with pytest.raises(Refused, match="Another request of the name 'one'"):
+            ask(fleet, other, "one")
+    assert (status(fleet, "b").state, fleet.auctioneer.ledger.paused) == ("waiting", {})
+    assert ask(fleet, Cancel("b"), "two").changed

@@ -1,5 +1,7 @@
 """A job in which arms fault too often is given up: by an auctioneer, and by arms that allocate without one."""
 
+import time
+
 import msgspec
 import pytest
 from hypothesis import given, settings
@@ -11,7 +13,7 @@ from fleet.job import reason_to_give_up
 from fleet.live.arm.award_executor import AwardExecutor
 from fleet.live.arm.journal_records import ArmHistory
 from fleet.live.auction.auctioneer import Auctioneer
-from fleet.live.auction.ledger import Ledger
+from fleet.live.auction.ledger import MAX_SETTLED, Ledger
 from fleet.live.auction.records import AuctionRecord, Awarded
 from fleet.live.consensus.granter import Granter
 from fleet.live.consensus.records import GrantRecord
@@ -65,7 +67,7 @@ def test_the_auctioneer_gives_a_job_up_at_that_fault_and_no_other_event(attempts
         assert status.state == ("given_up" if too_often(faults) else "waiting")
         if too_often(faults):
             assert status.reason == reason_to_give_up(faults)
-            assert (status.arm, status.award) == ("", "")
+            assert (status.arm, status.award) == (attempts[len(written) // 2 - 1][0], "")
             assert not ledger.unsettled()
             (successor,) = ledger.status(["k"])
             assert (successor.state, successor.reason) == ("given_up", LOST)
@@ -241,3 +243,13 @@ def test_a_job_that_still_waits_at_its_hard_due_date_is_given_up_with_its_succes
     assert told["soft"] == ("finished", "")
     assert told["late"] == ("given_up", "expired: its due date passed before an arm had begun it.")
     assert told["z"] == ("given_up", "Given up, because it waits for 'late', which is given up.")
+
+
+def test_many_jobs_that_expire_together_do_not_keep_the_auctioneer_busy():
+    """The ledger looked at all jobs for each one: these took 10 s of CPU time, now 0.1 s."""
+    jobs = tuple(JobSpec(f"j{number}", "hold", ("x",), due_s=1.0, expires=True) for number in range(8000))
+    book = Ledger().replay([JobsAccepted(jobs, "test", 0.0)])
+    start_s = time.process_time()
+    book.replay(book.expired(2.0))
+    assert time.process_time() - start_s < 2.0
+    assert (len(book.jobs), book.unsettled()) == (MAX_SETTLED, [])

@@ -2,6 +2,7 @@
 
 import gc
 import json
+import threading
 import time
 import zlib
 from collections import defaultdict
@@ -41,16 +42,19 @@ from fleet.job import Place
 from fleet.live.arm.award_executor import AwardExecutor
 from fleet.live.arm.config import ArmConfig
 from fleet.live.arm.estimator import MAX_BYTES, Estimator, NominalPeaks, _size
-from fleet.live.arm.journal_records import ArmHistory, ArmRecord, AwardAccepted, put_aside
+from fleet.live.arm.journal_records import ArmHistory, ArmRecord, AwardAccepted
 from fleet.live.arm.node import ArmNode
+from fleet.live.arm.planning import PlanningThread
 from fleet.live.arm.simulated_body import SimulatedBody
 from fleet.live.auction.ledger import AuctionRecord
 from fleet.live.auction.node import AuctionNode
 from fleet.live.auction.round import Assignment
 from fleet.live.clock import FleetClock
 from fleet.live.journal import Journal
+from fleet.live.journal_upkeep import put_aside
 from fleet.motion import Plan
 from fleet.planning.planner import Planner
+from fleet.planning.time_limit import check_time
 from fleet.robot import ThermalLimits
 
 SILENT_S, GROWN_BYTES = 1.0, 50_000_000
@@ -260,6 +264,31 @@ def test_an_error_in_a_quote_is_its_reason(participants, small):
     (estimate,) = estimator.estimate([JOB], np.full(15, 30.0), 0.0)
     assert not estimate.feasible
     assert "MemoryError: no room" in estimate.reason
+
+
+def test_a_plan_that_takes_too_long_is_the_reason_and_the_next_job_is_quoted(small, monkeypatch):
+    """A planner that never ends of itself; an arm's messages are served meanwhile, and the next plan is whole."""
+    own = small.arm(0, [small.work("bench")])
+    planner, never = Planner(own.robot, elbows=1), threading.Event()
+
+    def plan(work):
+        while work.payload_kg == 0.25:
+            check_time()
+            never.wait(0.01)
+        return planner.plan(work)
+
+    monkeypatch.setattr("fleet.live.arm.estimator.PLAN_S", 1.0)
+    estimator = Estimator(own.model, plan, PLACES, NominalPeaks())
+    thread, steps = PlanningThread(estimator), []
+    endless, good = msgspec.structs.replace(JOB, name="endless", payload_kg=0.25), JOB
+    until_s = time.monotonic() + 30.0
+    while not all(estimator.is_prepared(job) for job in (endless, good)) and time.monotonic() < until_s:
+        thread.plan([(endless, 0), (good, 0)], lambda: steps.append(time.monotonic()))
+        never.wait(0.01)
+    slow, quick = estimator.estimate([endless, good], np.full(15, 30.0), 0.0)
+    assert (slow.feasible, quick.feasible) == (False, True)
+    assert "planning took more than 1 s" in slow.reason
+    assert len(steps) > 2
 
 
 def test_a_poisonous_award_in_a_journal_is_put_aside_and_the_rest_is_reported(tmp_path):

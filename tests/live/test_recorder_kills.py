@@ -28,7 +28,7 @@ endpoint, journal, start_s = sys.argv[1], Path(sys.argv[2]), float(sys.argv[3])
 known = [json.loads(line) for line in journal.read_text().splitlines()] if journal.exists() else []
 with BusClient(endpoint, "f", timeout_s=60.0) as link, journal.open("a") as file:
     say = link.publisher(keys.of_auction("f", "boss", "result"), Result)
-    for number, time_s in known[-64:]:  # as our auctioneer after a restart
+    for number, time_s in known[-1024:]:  # as our auctioneer after a restart
         say(result(number, time_s))
     for number in range(len(known), 10**6):
         time_s = time.monotonic() - start_s

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
 from fleet.bus.protocol.messages import State
+from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Operation, Pause, Settle
 from fleet.errors import FleetError
 from fleet.events import Event
 from scenarios.cli.main import main
@@ -86,6 +87,36 @@ def test_a_report_names_missing_messages_and_returned_jobs(tmp_path):
     assert "returned to the queue, 2 cycles kept" in html
     assert "results of boss, numbers 1 to 1" in html
     assert "3 recorded, 2 missing" in html
+
+
+def test_a_report_names_who_asked_for_what(tmp_path):
+    recorder = record(tmp_path / "r", LOG[:1])
+    recorder.add("boss", Result("boss", 0, 0.0, JobStatus("a-1", "waiting"), by="bob"))
+    actions = (Change("a-1", due_s=900.0), Cancel("b-1"), Pause(), Settle("c-1", "redo"))
+    for number, action in enumerate(actions):
+        recorder.add("boss", Operation("boss", 60.0 * number, ControlRequest(str(number), action, "<ann>"), number))
+    recorder.write(status="finished")
+    html = recording_html(tmp_path / "r")
+    rows = re.findall(r"<tr>(.*?)</tr>", html.split("Requests of people</h2>")[1].split("</table>")[0])
+    assert [re.findall(r"<td>(.*?)</td>", row) for row in rows[1:]] == [
+        ["0:00:00", "change due 900.0", "a-1", "&lt;ann&gt;"],
+        ["0:01:00", "cancel", "b-1", "&lt;ann&gt;"],
+        ["0:02:00", "pause", "all arms", "&lt;ann&gt;"],
+        ["0:03:00", "settle redo", "c-1", "&lt;ann&gt;"],
+    ]
+    assert "<td>jobs submitted by bob</td><td>1</td>" in html
+
+
+def test_the_report_of_two_epochs_shows_the_last_one(tmp_path):
+    recorder = record(tmp_path / "r", ())
+    for epoch, time_s in (("one", 0.0), ("two", 5.0)):
+        for number, job in enumerate(("x", "y") if epoch == "one" else ("z",)):
+            status = JobStatus(job, "finished", arm="arm_0")
+            recorder.add("boss", Result("boss", number, time_s, status, epoch=epoch))
+    recorder.write(status="finished")
+    html = recording_html(tmp_path / "r")
+    assert "this page shows the last one, two" in html
+    assert "<dt>jobs finished</dt><dd>1<small> of 1</small>" in html
 
 
 kinds = st.sampled_from(["award", "finish", "home", "fault", "recover", "return", "warning", "moved"])

@@ -34,7 +34,9 @@ def test_a_seed_repeats_the_same_events_in_every_process():
     assert digests[0] == digests[1]
 
 
-@pytest.mark.parametrize("mutation", ["submission-unwritten", "commit-ignored", "space-ignored"])
+@pytest.mark.parametrize(
+    "mutation", ["submission-unwritten", "commit-ignored", "space-ignored", "repeats-recorded", "pause-ignored"]
+)
 def test_a_rule_that_is_broken_on_purpose_is_found(mutation):
     told = simulate("--mutations", mutation)
     assert told.returncode == 0, told.stdout + told.stderr

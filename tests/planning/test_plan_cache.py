@@ -1,6 +1,8 @@
 """Cached plans: equal to computed ones, one file per question, damaged files replaced."""
 
 import logging
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +13,7 @@ from fleet.job import KINDS, Fixture, Place, Work
 from fleet.motion import Plan
 from fleet.planning.plan_cache import CachedPlanner
 from fleet.planning.planner import Planner
+from fleet.planning.time_limit import PlanningTimeout, time_limit
 from fleet.robot import Mount, Robot
 
 ROBOT = Robot(name="floor")
@@ -99,3 +102,63 @@ def test_an_infeasible_job_is_cached_too(tmp_path, no_planning):
     with pytest.raises(InfeasibleJob) as second:
         planner.plan(heavy)
     assert str(second.value) == str(first.value)
+
+
+def test_the_least_recently_used_plans_leave_a_full_cache(tmp_path, monkeypatch):
+    """Four works in a cache with room for three: the one that was neither made nor read last is planned anew."""
+    planned = []
+    plan = Planner.plan
+    monkeypatch.setattr(Planner, "plan", lambda self, work: (planned.append(work), plan(self, work))[1])
+
+    def use(payload_kg: float) -> None:
+        planner = CachedPlanner(ROBOT, elbows=1, speeds=(1.0,), cache_dir=tmp_path)
+        before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*.npz")}
+        planner.plan(replace(WORKS["hold"], payload_kg=payload_kg))
+        for path, at_ns in before.items():  # every use is a second after the one before
+            if path.exists() and path.stat().st_mtime_ns == at_ns:
+                os.utime(path, ns=(at_ns, at_ns - 10**9))
+
+    use(1.0)
+    size = sum(path.stat().st_size for path in tmp_path.iterdir())
+    monkeypatch.setattr("fleet.planning.plan_cache.MAX_CACHE_BYTES", int(3.5 * size))
+    for payload_kg in (1.1, 1.2, 1.0, 1.3):
+        use(payload_kg)
+        assert sum(path.stat().st_size for path in tmp_path.glob("*.npz")) <= 3.5 * size
+    planned.clear()
+    for payload_kg in (1.0, 1.2, 1.3, 1.1):
+        use(payload_kg)
+    assert [work.payload_kg for work in planned] == [1.1]
+
+
+def test_a_plan_that_takes_too_long_is_given_up_in_its_own_thread_alone(tmp_path):
+    """No file is written for it; another thread has no limit meanwhile; without a limit it is planned."""
+    planner = CachedPlanner(ROBOT, elbows=2, cache_dir=tmp_path / "a")
+    other = CachedPlanner(ROBOT, elbows=1, cache_dir=tmp_path / "b")
+    with ThreadPoolExecutor(1) as pool, time_limit(0.0):
+        with pytest.raises(PlanningTimeout, match="more than 0 s"):
+            planner.plan(WORKS["pick_place"])
+        assert pool.submit(other.plan, WORKS["hold"]).result(60.0)
+    assert not list(tmp_path.glob("a/*.npz"))
+    assert planner.plan(WORKS["pick_place"])
+
+
+def test_the_time_is_checked_in_every_part_of_a_plan(monkeypatch):
+    """Wherever the time ends, planning ends at the next check."""
+    clock, pieces = [0.0], []
+
+    def tick() -> float:
+        clock[0] += 1.0
+        return clock[0]
+
+    monkeypatch.setattr("fleet.planning.time_limit.monotonic", tick)
+    planner = Planner(ROBOT, elbows=2)
+    with time_limit(1e6):
+        planner.plan(WORKS["pick_place"])
+    checks = int(clock[0]) - 1
+    assert checks > 20
+    for end in range(0, checks - 1, 5):
+        clock[0] = 0.0
+        with time_limit(float(end)), pytest.raises(PlanningTimeout):
+            planner.plan(WORKS["pick_place"])
+        pieces.append(clock[0])
+    assert pieces == [end + 2.0 for end in range(0, checks - 1, 5)]

@@ -1,13 +1,19 @@
 """A small cell whose plans are made once for all tests here, and the command line called in place."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import os
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from types import SimpleNamespace
+from typing import NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 
+from agents.registry import make_policy
+from fleet.bus.client.router import Router
 from fleet.motor import gen3_motors
 from fleet.planning.random_motions import random_jobs
 from fleet.robot import Robot
@@ -65,8 +71,7 @@ speeds = [1.0]
 """
 
 
-@dataclass(frozen=True)
-class Said:
+class Said(NamedTuple):
     """What one call of the command line said."""
 
     code: int
@@ -106,6 +111,13 @@ def small_toml(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
+def endpoint() -> Iterator[str]:
+    """A router."""
+    with Router() as router:
+        yield router.endpoint
+
+
+@pytest.fixture
 def thermofleet(
     plans: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Callable[..., Said]:
@@ -120,3 +132,30 @@ def thermofleet(
         return Said(left.value.code, said.out, said.err)
 
     return call
+
+
+class PressingCtrlC:
+    """Round robin, until somebody presses Ctrl-C at a certain step."""
+
+    def __init__(self, step: int, times: int) -> None:
+        self._policy, self._left, self._times = make_policy("round_robin"), step, times
+
+    def reset(self, rng):
+        self._policy.reset(rng)
+
+    def act(self, observations):
+        self._left -= 1
+        if self._left == 0:
+            for _ in range(self._times):
+                os.kill(os.getpid(), signal.SIGINT)
+        return self._policy.act(observations)
+
+
+@pytest.fixture
+def press_ctrl_c() -> Callable[..., AbstractContextManager[object]]:
+    """A function that has the shifts within a block interrupted at their fourth step."""
+
+    def press(times: int = 1) -> AbstractContextManager[object]:
+        return patch("scenarios.policy_loader.policy_of", lambda name: PressingCtrlC(step=4, times=times))
+
+    return press

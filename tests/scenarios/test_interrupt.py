@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.registry import make_policy
 from scenarios.run.run_folder import FILES
 
 QUICK = ("--difficulty", "blind", "--bus", "memory", "--policy", "round_robin")
@@ -20,29 +19,11 @@ def run_json(folder: Path) -> dict:
     return json.loads((folder / "run.json").read_text(encoding="utf-8"))
 
 
-class PressingCtrlC:
-    """Round robin, until somebody presses Ctrl-C at a certain step."""
-
-    def __init__(self, step: int, times: int) -> None:
-        self._policy, self._left, self._times = make_policy("round_robin"), step, times
-
-    def reset(self, rng):
-        self._policy.reset(rng)
-
-    def act(self, observations):
-        self._left -= 1
-        if self._left == 0:
-            for _ in range(self._times):
-                os.kill(os.getpid(), signal.SIGINT)
-        return self._policy.act(observations)
-
-
 def test_ctrl_c_while_working_keeps_what_was_done_and_the_same_command_replaces_it(
-    thermofleet, small_toml, tmp_path, monkeypatch
+    thermofleet, small_toml, tmp_path, press_ctrl_c
 ):
     out = tmp_path / "run"
-    with monkeypatch.context() as patched:
-        patched.setattr("scenarios.policy_loader.policy_of", lambda name: PressingCtrlC(step=4, times=1))
+    with press_ctrl_c():
         said = thermofleet("run", small_toml, *QUICK, "--out", out)
     assert said.code == 130
     assert "Interrupted after 40 s of 180 s: the shift until then is kept in " in said.err
@@ -54,9 +35,9 @@ def test_ctrl_c_while_working_keeps_what_was_done_and_the_same_command_replaces_
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
 
 
-def test_a_second_ctrl_c_leaves_nothing(thermofleet, small_toml, tmp_path, monkeypatch):
-    monkeypatch.setattr("scenarios.policy_loader.policy_of", lambda name: PressingCtrlC(step=4, times=2))
-    said = thermofleet("run", small_toml, *QUICK, "--out", tmp_path / "run")
+def test_a_second_ctrl_c_leaves_nothing(thermofleet, small_toml, tmp_path, press_ctrl_c):
+    with press_ctrl_c(times=2):
+        said = thermofleet("run", small_toml, *QUICK, "--out", tmp_path / "run")
     assert said.code == 130
     assert "Interrupted while working: nothing was written." in said.err
     assert [p.name for p in tmp_path.iterdir()] == ["heat.toml"]

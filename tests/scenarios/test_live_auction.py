@@ -1,105 +1,32 @@
-"""`thermofleet auction`, `submit` and `ask`, and their parts."""
+"""`thermofleet auction` and its parts."""
 
 import json
 import signal
 import subprocess
 import sys
-import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from fleet.bus.client.client import BusClient
-from fleet.bus.client.router import Router
-from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
     Admission,
-    JobEstimate,
     JobSpec,
-    JobStatus,
-    PlanQuote,
-    Quote,
-    QuoteRequest,
-    Status,
-    StatusRequest,
     Submission,
     SubmissionReply,
 )
-from fleet.errors import FleetError
 from fleet.job import Job, Place, Work
 from scenarios.cli.live import auction as live_auction
 from scenarios.cli.live.auction import job_spec, own_jobs
 from scenarios.cli.live.journals import refuse_other_way
-from scenarios.cli.live.submit import batches, read_jobs
-from scenarios.cli.main import main
 from scenarios.load import load
 from scenarios.prepare.fleet import make_env
 
 ROOT = Path(__file__).parents[2]
 PATIENT_S = 20.0
 HOLD = {"name": "a", "kind": "hold", "places": ["rack"], "repetitions": 2}
-
-
-def call(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
-    """Exit code, and what was said on both outputs."""
-    with pytest.raises(SystemExit) as left:
-        main([str(word) for word in words])
-    said = capsys.readouterr()
-    assert isinstance(left.value.code, int)
-    return left.value.code, said.out, said.err
-
-
-def test_jobs_are_read_from_lines_or_a_list(tmp_path):
-    other = {**HOLD, "name": "b"}
-    lines, listed = tmp_path / "jobs.jsonl", tmp_path / "jobs.json"
-    lines.write_text(f"{json.dumps(HOLD)}\n\n{json.dumps(other)}\n", encoding="utf-8")
-    listed.write_text(json.dumps([HOLD, other], indent=1), encoding="utf-8")
-    assert [word.name for word in read_jobs(str(lines))] == ["a", "b"]
-    assert read_jobs(str(lines)) == read_jobs(str(listed))
-
-
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    [
-        (f"{json.dumps(HOLD)}\n{{}}", "line 2: Object missing required field `name`."),
-        (json.dumps(HOLD | {"repetitions": 0}), "line 1: JobSpec.repetitions must be between 1 and 100000 (got 0)."),
-        (
-            json.dumps([HOLD, HOLD | {"kind": "dance"}]),
-            "No kind of job 'dance'. Allowed: hold, pick_place, press, sort (at [1].kind).",
-        ),
-        (json.dumps(HOLD | {"places": ["a", "b"]}), "line 1: JobSpec.places must be one place for a hold (got a, b)."),
-        ("{", "line 1: Input data was truncated."),
-        ("\n", "contains no jobs."),
-        ("[]", "contains no jobs."),
-        ("\xff", "line 1: "),
-    ],
-)
-def test_an_invalid_job_is_reported_with_its_line(tmp_path, text, complaint):
-    file = tmp_path / "jobs"
-    file.write_bytes(text.encode("latin-1"))
-    with pytest.raises(FleetError) as refusal:
-        read_jobs(str(file))
-    assert str(refusal.value).startswith(f"{file}")
-    assert complaint in str(refusal.value)
-
-
-def test_jobs_in_several_messages_follow_those_they_wait_for():
-    words = [JobSpec(f"j{i:03d}", "hold", ("x",), after=(f"j{i + 1:03d}",) if i < 199 else ()) for i in range(200)]
-    handed_in = list(batches(words))
-    assert [len(part) for part in handed_in] == [64, 64, 64, 8]
-    assert [word.name for part in handed_in for word in part] == [word.name for word in reversed(words)]
-    ring = [JobSpec("a", "hold", ("x",), after=("b",)), JobSpec("b", "hold", ("x",), after=("a",))]
-    assert list(batches(ring)) == [tuple(ring)]
-
-
-def test_a_missing_file_is_one_sentence(capsys):
-    code, _, err = call(capsys, "submit", "no-such-file", "--fleet", "f")
-    assert code == 2
-    assert "Cannot read 'no-such-file': No such file or directory." in err
 
 
 def test_the_stream_is_the_one_of_a_run(small_toml, plans):
@@ -211,8 +138,8 @@ def test_a_job_message_has_all_fields():
         (("arm", "quickstart", "arm_0", "--jobs", "all"), "'all' is not one of 'scenario', 'none'"),
     ],
 )
-def test_an_invalid_policy_is_one_sentence(capsys, words, complaint):
-    code, _, err = call(capsys, *words)
+def test_an_invalid_policy_is_one_sentence(thermofleet, words, complaint):
+    code, _, err = thermofleet(*words)
     assert code == 2
     assert complaint in " ".join(err.split())
 
@@ -235,13 +162,13 @@ def test_an_invalid_policy_is_one_sentence(capsys, words, complaint):
         ),
     ],
 )
-def test_a_shift_is_not_continued_with_the_other_kind_of_allocation(capsys, tmp_path, words, files, complaint):
+def test_a_shift_is_not_continued_with_the_other_kind_of_allocation(thermofleet, tmp_path, words, files, complaint):
     """Who goes on from the journals of the other way does not know what is done, and would have it done again."""
     folder = tmp_path / "journals" if words[0] == "up" else tmp_path
     folder.mkdir(exist_ok=True)
     for file in files:
         (folder / file).write_text("{}\n")
-    code, _, err = call(capsys, *words, tmp_path)
+    code, _, err = thermofleet(*words, tmp_path)
     assert code == 2
     assert complaint in " ".join(err.split())
 
@@ -273,32 +200,26 @@ def auctioneer(endpoint: str, folder: Path, *words: object) -> Iterator[subproce
             process.kill()
 
 
-@pytest.fixture
-def endpoint() -> Iterator[str]:
-    with Router() as router:
-        yield router.endpoint
-
-
-def test_submitted_jobs_survive_a_kill(endpoint, tmp_path, capsys):
+def test_submitted_jobs_survive_a_kill(endpoint, tmp_path, thermofleet):
     file = tmp_path / "jobs.jsonl"
     file.write_text("\n".join(json.dumps(HOLD | {"name": n, "places": [p]}) for n, p in (("a", "belt"), ("b", "moon"))))
     at = ("--endpoint", endpoint, "--fleet", "quickstart")
     with auctioneer(endpoint, tmp_path, "quickstart", "--jobs", "none") as process:
-        code, out, _ = call(capsys, "submit", file, *at)
+        code, out, _ = thermofleet("submit", file, *at)
         assert code == 1
         assert out.startswith("a: accepted\nb: refused: No place 'moon' in this cell. Places: ")
-        code, _, err = call(capsys, "auction", "quickstart", "--endpoint", endpoint, "--journal", tmp_path / "other")
+        code, _, err = thermofleet("auction", "quickstart", "--endpoint", endpoint, "--journal", tmp_path / "other")
         assert code == 2
         assert "Fleet 'quickstart' has an auctioneer 'auctioneer' already: its token is present." in err
         other = ("--name", "other", "--journal", tmp_path / "other")
-        code, _, err = call(capsys, "auction", "quickstart", "--endpoint", endpoint, *other)
+        code, _, err = thermofleet("auction", "quickstart", "--endpoint", endpoint, *other)
         assert code == 2
         assert "Fleet 'quickstart' has an auctioneer already: 'auctioneer'." in err
         process.send_signal(signal.SIGKILL)
         process.wait(PATIENT_S)
     with auctioneer(endpoint, tmp_path, "quickstart", "--jobs", "none") as process:
         file.write_text(json.dumps(HOLD | {"places": ["belt"]}))
-        assert call(capsys, "submit", file, *at)[:2] == (0, "a: accepted\n")
+        assert thermofleet("submit", file, *at)[:2] == (0, "a: accepted\n")
         process.send_signal(signal.SIGTERM)
         out, err = process.communicate(timeout=PATIENT_S)
         assert process.returncode == 0
@@ -314,97 +235,3 @@ def test_the_end_of_a_shift_lists_unfinished_jobs(endpoint, tmp_path):
         out, _ = process.communicate(timeout=PATIENT_S)
     assert process.returncode == 0
     assert "unfinished, The shift ended before it was done." in out
-
-
-def test_a_missing_auctioneer_is_one_sentence(endpoint, tmp_path, capsys):
-    file = tmp_path / "jobs"
-    file.write_text(json.dumps(HOLD))
-    code, _, err = call(capsys, "submit", file, "--endpoint", endpoint, "--fleet", "f")
-    assert code == 2
-    assert "No auctioneer of fleet 'f' replied" in err
-
-
-@contextmanager
-def served(endpoint: str, declare: Callable[[BusClient], None]) -> Iterator[None]:
-    """A participant of fleet f on a thread of its own."""
-    stop = threading.Event()
-    with BusClient(endpoint, "f") as link:
-        declare(link)
-
-        def serve() -> None:
-            while not stop.is_set():
-                link.serve(time.monotonic() + 0.05)
-
-        thread = threading.Thread(target=serve)
-        thread.start()
-        try:
-            yield
-        finally:
-            stop.set()
-            thread.join(PATIENT_S)
-
-
-@contextmanager
-def arm(endpoint: str, *, feasible: bool = True) -> Iterator[list[QuoteRequest]]:
-    """An arm that only quotes; gives what it was asked."""
-    asked: list[QuoteRequest] = []
-
-    def answer(request: QuoteRequest) -> Quote:
-        asked.append(request)
-        fastest = PlanQuote(0, 52.34, 12.34, 0.125, (0.5,) * 7, 3.5, 100.0, 160.0)
-        offers = (JobEstimate(request.jobs[0].name, (fastest, PlanQuote(1, 49.5)) if feasible else ()),)
-        return Quote("arm_0", request.auction, "", 5.0, "t", 0.0, "idle", 20.0, 1, offers)
-
-    with served(endpoint, lambda link: link.reply_to(keys.of_arm("f", "arm_0", "quote"), QuoteRequest, answer)):
-        yield asked
-
-
-@pytest.mark.parametrize(("end", "code"), [("finished", 0), ("unfinished", 1)])
-def test_jobs_can_be_followed_to_their_end(endpoint, tmp_path, capsys, end, code):
-    states = iter([JobStatus("a", "waiting"), JobStatus("a", "awarded", "arm_0"), JobStatus("a", end, "arm_0")])
-
-    def declare(link: BusClient) -> None:
-        taken = SubmissionReply("auctioneer", (Admission("a", True),))
-        link.reply_to(keys.of_jobs("f", "submit"), Submission, lambda _: taken)
-        link.reply_to(keys.of_jobs("f", "status"), StatusRequest, lambda _: Status("auctioneer", 0.0, (next(states),)))
-
-    file = tmp_path / "jobs"
-    file.write_text(json.dumps(HOLD))
-    with served(endpoint, declare):
-        said = call(capsys, "submit", file, "--wait", "--endpoint", endpoint, "--fleet", "f")
-    assert said[:2] == (code, f"a: accepted\na: waiting\na: awarded to arm_0\na: {end} by arm_0\n")
-
-
-def test_ask_shows_the_cost_of_a_job_for_each_arm(endpoint, capsys):
-    job = ("--kind", "hold", "--place", "rack", "--payload", "2")
-    with arm(endpoint) as asked:
-        code, out, _ = call(capsys, "ask", *job, "--endpoint", endpoint, "--fleet", "f")
-        assert code == 0
-        assert "hold  arm_0     0     52.3     +12.3  0.12  3.50         100          160" in out
-        assert "1     49.5         –     –     –           –            –" in out
-        code, out, _ = call(capsys, "ask", *job, "--endpoint", endpoint, "--fleet", "f", "--json")
-        assert json.loads(out)[0]["estimates"][0]["plans"][0]["difficulty"] == 3.5
-    assert [request.dry_run for request in asked] == [True, True]
-    assert asked[0].jobs[0].payload_kg == 2.0
-
-
-def test_ask_exits_with_1_where_no_arm_can_do_a_job(endpoint, capsys):
-    with arm(endpoint, feasible=False):
-        at = ("--endpoint", endpoint, "--fleet", "f")
-        code, out, _ = call(capsys, "ask", "--kind", "hold", "--place", "rack", *at)
-        assert (code, "arm_0" in out) == (1, True)
-        assert call(capsys, "ask", "--kind", "hold", "--place", "rack", "--json", *at)[0] == 1
-
-
-def test_ask_reports_missing_arguments(endpoint, capsys):
-    at = ("--endpoint", endpoint, "--fleet", "f")
-    assert "either a FILE of jobs or one job" in call(capsys, "ask", *at)[2]
-    assert r"must be UTF-8 text (got '\udcff')" in call(capsys, "ask", "--kind", "\udcff", *at)[2]
-    heavy = call(capsys, "ask", "--kind", "hold", "--place", "rack", "--payload", "11", *at)
-    assert "--payload must be 0 to 10 (got 11)" in heavy[2]
-    told = call(capsys, "ask", "--kind", "pick_and_place", *at)[2]
-    told_kinds = "did you mean 'pick_place'? Allowed: hold, pick_place, press, sort (at kind)."
-    assert f"Invalid job: No kind of job 'pick_and_place'; {told_kinds}" in " ".join(told.split())
-    code, _, err = call(capsys, "ask", "--kind", "hold", "--place", "rack", *at)
-    assert code == 2
-    assert "No arm of fleet 'f' replied" in err

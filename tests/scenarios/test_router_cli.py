@@ -23,19 +23,9 @@ from fleet.bus.security.tls import Tls, identified
 from fleet.live.arm.journal_records import ArmRecord, Closed
 from fleet.live.journal import Journal
 from scenarios.cli.live.up import chosen_arms, free_port, parts_of
-from scenarios.cli.main import main
 
 ROOT = Path(__file__).parents[2]
 PATIENT_S = 20.0
-
-
-def call(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
-    """Exit code, and what was said on both outputs."""
-    with pytest.raises(SystemExit) as left:
-        main([str(word) for word in words])
-    said = capsys.readouterr()
-    assert isinstance(left.value.code, int)
-    return left.value.code, said.out, said.err
 
 
 @contextmanager
@@ -51,9 +41,9 @@ def started(*words: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+def folder(tmp_path: Path, thermofleet: pytest.CaptureFixture[str]) -> Path:
     place = tmp_path / "keys"
-    assert call(capsys, "keys", place, "quickstart", "--extra", "gateway:submitter")[0] == 0
+    assert thermofleet("keys", place, "quickstart", "--extra", "gateway:submitter")[0] == 0
     return place
 
 
@@ -95,10 +85,10 @@ def test_a_router_with_tls_enforces_access_and_the_state_rate(folder):
         assert process.wait(PATIENT_S) == 0
 
 
-def test_a_port_in_use_is_one_sentence(capsys):
+def test_a_port_in_use_is_one_sentence(thermofleet):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        code, out, err = call(capsys, "router", "--port", port)
+        code, out, err = thermofleet("router", "--port", port)
     assert (code, out) == (2, "")
     assert f"could not listen on port {port} of 127.0.0.1; is it in use?" in err
 
@@ -115,24 +105,24 @@ def test_a_port_in_use_is_one_sentence(capsys):
         (("--tls", "{keys}", "--name", "arm_0"), "a router needs that of a router"),
     ],
 )
-def test_an_error_of_the_router_command_is_one_sentence(capsys, folder, words, complaint):
-    code, out, err = call(capsys, "router", *(word.format(keys=folder) for word in words))
+def test_an_error_of_the_router_command_is_one_sentence(thermofleet, folder, words, complaint):
+    code, out, err = thermofleet("router", *(word.format(keys=folder) for word in words))
     assert (code, out) == (2, "")
     assert complaint in " ".join(err.split())
     assert "Traceback" not in err
 
 
-def test_an_arm_without_a_certificate_is_named_before_the_router_starts(capsys, folder):
+def test_an_arm_without_a_certificate_is_named_before_the_router_starts(thermofleet, folder):
     told = json.loads((folder / "roster.json").read_text())
     told["participants"] = [one for one in told["participants"] if one["name"] != "arm_1"]
     (folder / "roster.json").write_text(json.dumps(told))
-    code, _, err = call(capsys, "router", "--tls", folder, "--scenario", "quickstart")
+    code, _, err = thermofleet("router", "--tls", folder, "--scenario", "quickstart")
     assert code == 2
     assert "--add arm_1:arm." in " ".join(err.split())
 
 
-def test_keys_are_made_shown_and_extended(capsys, folder):
-    code, out, err = call(capsys, "keys", folder, "--json")
+def test_keys_are_made_shown_and_extended(thermofleet, folder):
+    code, out, err = thermofleet("keys", folder, "--json")
     assert (code, err) == (0, "")
     told = json.loads(out)
     assert told["fleet"] == "quickstart"
@@ -142,8 +132,8 @@ def test_keys_are_made_shown_and_extended(capsys, folder):
         **{f"arm_{i}": "arm" for i in range(4)},
         "gateway": "submitter",
     }
-    assert call(capsys, "keys", folder, "--add", "a:b:monitor", "--days", 5)[0] == 0
-    code, out, _ = call(capsys, "keys", folder)
+    assert thermofleet("keys", folder, "--add", "a:b:monitor", "--days", 5)[0] == 0
+    code, out, _ = thermofleet("keys", folder)
     assert "a:b" in out
     assert "expired" not in out
     assert "(authority)" in out
@@ -187,8 +177,8 @@ def test_a_part_of_a_fleet_connects_to_a_router_elsewhere(folder):
         (("--host", "0.0.0.0"), "needs --tls"),
     ],
 )
-def test_wrong_options_for_several_machines_are_one_sentence(capsys, tmp_path, words, complaint):
-    code, _, err = call(capsys, "up", "quickstart", "--out", tmp_path / "run", *words)
+def test_wrong_options_for_several_machines_are_one_sentence(thermofleet, tmp_path, words, complaint):
+    code, _, err = thermofleet("up", "quickstart", "--out", tmp_path / "run", *words)
     assert code == 2
     assert complaint in " ".join(err.split())
 
@@ -211,9 +201,9 @@ def test_wrong_options_for_several_machines_are_one_sentence(capsys, tmp_path, w
         (("nowhere",), "No scenario 'nowhere'"),
     ],
 )
-def test_an_error_of_the_keys_command_is_one_sentence(capsys, folder, words, complaint):
+def test_an_error_of_the_keys_command_is_one_sentence(thermofleet, folder, words, complaint):
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    code, out, err = call(capsys, "keys", folder, *words)
+    code, out, err = thermofleet("keys", folder, *words)
     assert (code, out) == (2, "")
     assert complaint in " ".join(err.split())
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
@@ -229,10 +219,10 @@ def reports(folder):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("policy", ["matching", "consensus"])
-def test_a_whole_fleet_works_with_tls_and_access_control(capsys, small_toml, plans, tmp_path, policy):
+def test_a_whole_fleet_works_with_tls_and_access_control(thermofleet, small_toml, plans, tmp_path, policy):
     """Processes of their own for router, arms, auctioneer and recorder: what they need of each other is allowed."""
     place, out = tmp_path / "keys", tmp_path / "live"
-    assert call(capsys, "keys", place, small_toml, *(["--no-auctioneer"] if policy == "consensus" else []))[0] == 0
+    assert thermofleet("keys", place, small_toml, *(["--no-auctioneer"] if policy == "consensus" else []))[0] == 0
     words = ("up", small_toml, "--tls", place, "--speed", 20, "--difficulty", "blind", "--out", out, "--policy", policy)
     done = subprocess.run(
         [sys.executable, "-c", "from scenarios.cli.main import main; main()", *map(str, words)],
@@ -258,12 +248,12 @@ def test_a_whole_fleet_works_with_tls_and_access_control(capsys, small_toml, pla
     assert not [name for name, said in logs.items() if "Traceback" in said or "No router answered" in said]
 
 
-def test_the_list_of_keys_shows_which_are_invalid_now(tmp_path, capsys):
+def test_the_list_of_keys_shows_which_are_invalid_now(tmp_path, thermofleet):
     place, now = tmp_path / "keys", datetime.now(UTC)
-    assert call(capsys, "keys", place, "quickstart")[0] == 0
+    assert thermofleet("keys", place, "quickstart")[0] == 0
     issue(place, Participant("arm_0", "arm"), days=1, now=now - timedelta(days=3))
     issue(place, Participant("arm_1", "arm"), days=1, now=now + timedelta(days=3))
-    rows = dict(line.split(maxsplit=1) for line in call(capsys, "keys", place)[1].splitlines()[2:])
+    rows = dict(line.split(maxsplit=1) for line in thermofleet("keys", place)[1].splitlines()[2:])
     assert rows["arm_0"].rstrip().endswith(f"{now - timedelta(days=2):%Y-%m-%d %H:%M} UTC, expired")
     assert rows["arm_1"].rstrip().endswith(f"{now + timedelta(days=4):%Y-%m-%d %H:%M} UTC, not yet valid")
     assert rows["arm_2"].rstrip().endswith("UTC")

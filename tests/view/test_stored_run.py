@@ -7,13 +7,15 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from fleet.errors import FleetError
 from fleet.telemetry import Telemetry
+from scenarios.cli.main import main
+from scenarios.report.playback import packed
 from scenarios.run.run_folder import telemetry_table
 from scenarios.run.stored_run import read_run
-from scenarios.view.playback import packed
 
 
 def unpacked(text: str) -> dict[str, tuple[dict, np.ndarray]]:
@@ -33,8 +35,6 @@ def unpacked(text: str) -> dict[str, tuple[dict, np.ndarray]]:
 def test_the_readings_are_those_of_the_file(run_folder: Path) -> None:
     run = read_run(run_folder)
     again = telemetry_table(run.telemetry, list(run.arms))
-    import pyarrow.parquet as pq
-
     assert again.drop_columns(["arm", "mode"]).equals(
         pq.read_table(run_folder / "telemetry.parquet").drop_columns(["arm", "mode"])
     )
@@ -72,3 +72,10 @@ def test_a_damaged_run_is_refused_in_words(run_folder: Path, tmp_path: Path, dam
     (copied / damage).write_bytes(b"PAR1 cut short")
     with pytest.raises(FleetError, match="no complete folder of `thermofleet run`"):
         read_run(copied)
+
+
+def test_the_report_written_anew_is_the_same(run_folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["report", str(run_folder), "--out", str(tmp_path / "again.html")])
+    assert ended.value.code in (0, None)
+    assert (tmp_path / "again.html").read_bytes() == (run_folder / "report.html").read_bytes()

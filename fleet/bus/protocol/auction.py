@@ -276,15 +276,23 @@ class JobStatus(msgspec.Struct, frozen=True):
     job: Name
     state: JobState
     arm: str = ""
+    """The arm that has it, or had it last; "" if none had."""
     award: str = ""
+    """The award by which that arm has it, or finished it; "" if it has it no more."""
     cycles: Count = 0
-    """Done, of `repetitions`."""
+    """Done, of `repetitions`, as far as arms have reported; a status and a `Result` count the same."""
     finished_s: Number | None = None
     reason: str = ""
     repetitions: Count = 0
     """Cycles of the job; 0 for unknown."""
     finish_s: Number | None = None
     """Predicted fleet time at which it is finished and its arm at home; null for unknown, or if no arm is at work."""
+    due_s: Number | None = None
+    """Due date; null for none. A `Change` changes it."""
+    value: Number | None = None
+    """As in `JobSpec`; null for unknown. A `Change` changes it."""
+    not_planned: bool = False
+    """It waits, and is not planned yet: no arm has a plan for it, and it is unknown whether one can do it."""
 
 
 class StatusRequest(msgspec.Struct, frozen=True):
@@ -332,21 +340,31 @@ class Result(msgspec.Struct, frozen=True):
     p_saturation: Number | None = None
     peak_c: Number | None = None
     by: str = ""
-    """Who asked for the change, by a `Submission` or a `ControlRequest`."""
+    """Who asked for the change, by a `Submission` or a `ControlRequest`, also who paused the arm that stopped."""
+    epoch: str = ""
+    """As in `Clock`: `number` begins again with another epoch."""
 
 
 class ArmEvent(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Published under `arm/{arm}/event`: something happened to an arm; kinds as in `fleet.events`."""
+    """Published under `arm/{arm}/event`: something happened to an arm."""
 
     arm: Name
     number: Count
     """Counts the events of this arm; unique, with a gap after a restart."""
     time_s: Number
+    """Exact fleet time of the event."""
     kind: Name
+    """One of those below; skip others."""
     job: str = ""
+    """Its job; "" for none."""
     joint: Annotated[int, msgspec.Meta(ge=0, le=64)] = 0
+    """Motor, from 1; 0 for none."""
     value: Number | None = None
+    """Quantity of the kind; null or left out for none."""
     reason: str = ""
+    """Why, in words."""
+    epoch: str = ""
+    """As in `Clock`, of its time; "" for unknown."""
 
 
 class ClockRequest(msgspec.Struct, frozen=True):

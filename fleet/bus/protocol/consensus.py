@@ -19,6 +19,7 @@ import msgspec
 
 from fleet.bus.protocol.auction import MOST_JOBS, Count, JobEstimate, JobSpec, LeaseTime
 from fleet.bus.protocol.messages import Name, Number, finite
+from fleet.bus.protocol.operator import Operation
 
 
 class Bid(msgspec.Struct, frozen=True):
@@ -35,9 +36,6 @@ class Bid(msgspec.Struct, frozen=True):
     """Estimates of jobs that wait for an arm, to this arm's knowledge."""
     open_count: Count
     """Number of jobs without an outcome, as far as this arm knows."""
-    closed_count: Count = 0
-    """Number of jobs that this arm knows to be finished or unfinished. A peer with a higher count sends the missing
-    outcomes."""
     open_jobs: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
     """The first jobs without an outcome, by release and name. A peer that knows an outcome, or a missing job, sends
     it."""
@@ -47,6 +45,8 @@ class Bid(msgspec.Struct, frozen=True):
     """Number of the plan that it chose."""
     epoch: str = ""
     """Name of the shift, as in `Clock`; an arm that has none takes that of the first bid."""
+    digest: Count = 0
+    """Of the outcomes of jobs and requests of people that this arm knows. A peer with another digest sends its own."""
 
     def __post_init__(self) -> None:
         finite("Bid", "time_s", (self.time_s,))
@@ -79,9 +79,9 @@ class JobOutcome(msgspec.Struct, frozen=True):
     award: Name
     arm: Name
     """The arm that had the job."""
-    outcome: Literal["finished", "unfinished", "given_up", "returned"]
+    outcome: Literal["finished", "unfinished", "given_up", "cancelled", "returned"]
     """unfinished: the arm crashed after it got permission to commit, and no arm does the job again; given_up: arms
-    faulted in it too often; returned: the job is open again."""
+    faulted in it too often; cancelled: by a person; returned: the job is open again."""
     cycles: Count
     time_s: Number
     reason: str = ""
@@ -102,6 +102,9 @@ class Claim(msgspec.Struct, frozen=True):
     outcomes: Annotated[tuple[JobOutcome, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
     jobs: Annotated[tuple[JobSpec, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
     """Jobs that outsiders submitted and that a peer does not seem to know."""
+    operations: Annotated[tuple[Operation, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
+    """Requests of people that a peer does not seem to know. For each thing that a request sets, the latest counts: by
+    `time_s`, then by name."""
     space: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST_JOBS)] | None = None
     """Names of the spaces that the arm takes now; empty at home. All other space that was granted to it before and is
     not of its entries is free. null if the arm does not say: it may be anywhere within reach."""

@@ -5,6 +5,7 @@ from typing import Annotated
 import msgspec
 
 from fleet.bus.protocol.auction import MOST_JOBS, Award, JobSpec
+from fleet.bus.protocol.consensus import JobOutcome
 from fleet.bus.protocol.messages import Count, Name
 
 MOST_FINISHED = 256
@@ -29,3 +30,5 @@ class History(msgspec.Struct, frozen=True):
     """Awards among these with permission to commit."""
     claims: Annotated[dict[Name, Count], msgspec.Meta(max_length=MOST_JOBS)] = {}
     """Number of the last claim of each arm, where arms allocate jobs without an auctioneer."""
+    committed: Annotated[tuple[JobOutcome, ...], msgspec.Meta(max_length=MOST_JOBS)] = ()
+    """Likewise: jobs of arms with permission to commit, which are unfinished if their arms have lost their journals."""

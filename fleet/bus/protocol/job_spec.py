@@ -20,17 +20,20 @@ class JobSpec(msgspec.Struct, frozen=True, omit_defaults=True):
     name: Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
     """Unique in the fleet; a second job with this name is the same job."""
     kind: Kind
+    """What an arm does in a cycle, as in [CellKind](#cellkind)."""
     places: Annotated[tuple[Name, ...], msgspec.Meta(min_length=1, max_length=2)]
     """Places of the cell: from and to for pick_place and sort; one for hold and press."""
     repetitions: Annotated[int, _bounds("repetitions")] = 1
+    """Cycles of the job."""
     payload_kg: Annotated[float, _bounds("payload_kg")] = 0.0
     dwell_s: Annotated[float, _bounds("dwell_s")] = DWELL_S
     force_n: Annotated[float, _bounds("force_n")] = 0.0
     release_s: Annotated[float, _bounds("release_s")] = 0.0
-    """Earliest start."""
+    """Earliest start, fleet time."""
     due_s: Annotated[float, _bounds("due_s")] | None = None
-    """Due date; null for none."""
+    """Due date, fleet time, not before `release_s`; null for none."""
     value: Annotated[float, _bounds("value")] = 1.0
+    """What finishing it is worth, in any unit that all jobs share."""
     after: tuple[Name, ...] = ()
     """Jobs that must be finished before."""
     expires: bool = False

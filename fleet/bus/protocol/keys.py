@@ -16,7 +16,9 @@ from urllib.parse import quote, unquote
 from fleet.errors import NAME_RULE, is_name, printable
 
 Role = Literal["arm", "auction", "jobs", "clock"]
-ArmTopic = Literal["alive", "state", "info", "difficulty", "event", "bid", "quote", "award", "history", "reset"]
+ArmTopic = Literal[
+    "alive", "state", "info", "difficulty", "event", "bid", "quote", "award", "history", "reset", "operation"
+]
 AuctionTopic = Literal["alive", "announce", "result", "operation"]
 AskedTopic = Literal["lease", "report", "claim"]
 JobsTopic = Literal["submit", "status", "clear", "control", "cell"]

@@ -66,6 +66,8 @@ class State(msgspec.Struct, frozen=True, omit_defaults=True):
     """N·m at the joint output, [joint]."""
     current_a: tuple[Number, ...] = ()
     """[joint]."""
+    epoch: str = ""
+    """As in `Clock`, of its time; "" for unknown."""
 
     def __post_init__(self) -> None:
         for name in ("time_s", "headroom_k", "busy_s", "ambient_c", "job_value", "job_peak_c", "job_p_saturation"):

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from fleet.bus.protocol.auction import JobStatus
-from fleet.bus.protocol.messages import Name, Number
+from fleet.bus.protocol.messages import Count, Name, Number, finite
 
 JobName = Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
 
@@ -83,7 +83,8 @@ class ControlRequest(msgspec.Struct, frozen=True):
     """Request to `jobs/control`: change what the fleet does. One that was carried out is not carried out again."""
 
     request: Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
-    """Unique name of this request, for example a UUID; the last 1024 are known, also after a restart."""
+    """Unique name of this request, for example a UUID; the last 1024 are known, also after a restart. The same request
+    again is answered and not carried out; another one of its name is refused."""
     action: Action
     by: Person = ""
     """Who requests it, for journal, events and status."""
@@ -122,8 +123,19 @@ class ResetReply(msgspec.Struct, frozen=True):
 
 
 class Operation(msgspec.Struct, frozen=True):
-    """Published under `auction/{auctioneer}/operation`: a request of a person was carried out."""
+    """Published under `auction/{auctioneer}/operation`, without an auctioneer under `arm/{arm}/operation`: a request of
+    a person was carried out."""
 
     auctioneer: Name
+    """Or the arm that replied, without an auctioneer."""
     time_s: Number
     request: ControlRequest
+    number: Count = 0
+    """Counts the requests that this auctioneer has carried out, across restarts."""
+    epoch: str = ""
+    """As in `Clock`: `number` begins again with another epoch."""
+    awards: Annotated[tuple[Name, ...], msgspec.Meta(max_length=16)] = ()
+    """With `redo`, without an auctioneer: the awards of the job whose last cycle was not done."""
+
+    def __post_init__(self) -> None:
+        finite("Operation", "time_s", (self.time_s,))

@@ -99,6 +99,7 @@ CHANNELS: tuple[Channel, ...] = (
     Channel("arm", "reset", "query", operator.ResetRequest, operator.ResetReply, receiver="operator"),
     Channel("arm", "bid", "publish", consensus.Bid, receiver="arm", history=1, rate_hz=1.0),
     Channel("arm", "claim", "query", consensus.Claim, consensus.ClaimReply, receiver="arm", lease_s=auction.LEASE_S),
+    Channel("arm", "operation", "publish", operator.Operation, history=HISTORY),
     Channel("auction", "alive", "token", lease_s=SESSION_LEASE_S),
     Channel("auction", "announce", "publish", auction.Announcement, history=HISTORY),
     Channel("auction", "result", "publish", auction.Result, history=HISTORY),

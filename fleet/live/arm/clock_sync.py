@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from fleet.bus.client.client import BusClient
 from fleet.bus.client.replies import Replies
@@ -56,6 +57,7 @@ class ClockSync:
         clock = self._clock()
         if reply.speed != clock.speed:
             clock = FleetClock(reply.speed, answered_s, clock.now_s(answered_s))
+        clock = replace(clock, epoch=reply.epoch)
         set_to, jump = (clock.slewed_to, False) if self._is_set else (clock.set_to, True)
         self._is_set = True
         self._set_clock(set_to(asked_s, answered_s, reply.time_s), jump)

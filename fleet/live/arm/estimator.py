@@ -20,6 +20,7 @@ from fleet.motion import Drive, Plan, distinct
 from fleet.motor import gen3_motors
 from fleet.offered_plans import nominal_drive, offered_plans
 from fleet.planning.space import plan_key, space_name
+from fleet.planning.time_limit import check_time, time_limit
 from fleet.robot import JOINTS
 from fleet.thermal import NODES, WINDING, gen3_network, temperature_steps, thermal_model
 
@@ -28,6 +29,8 @@ _LOG = logging.getLogger(__name__)
 
 MAX_WORKS, MAX_SCORES, MAX_BYTES = 512, 1024, 24_000_000
 """Of works that were not known at the start: how many are kept, jobs whose scores are kept, and size of the plans."""
+PLAN_S = 20.0
+"""Real seconds that planning and scoring of one job may take; a usual one takes 0.05 to 0.5."""
 MAX_REASON = 300
 """Characters of an error in a reason."""
 STEPS = 24
@@ -134,7 +137,8 @@ class Estimator:
                 work = self._work(job)
                 assert isinstance(work, Work)
                 try:
-                    offers = self._scored_or_reason(work, job.repetitions, cycles)
+                    with time_limit(PLAN_S):
+                        offers = self._scored_or_reason(work, job.repetitions, cycles)
                 except Exception as error:  # whatever it is, the arm goes on
                     offers = failed(job, error)
                 while len(self._offers) >= MAX_SCORES:
@@ -164,7 +168,11 @@ class Estimator:
         if (takes_s := offered[0].duration_s(repetitions)) > LONGEST_JOB_S:
             days = f"it would take {takes_s / 86400:.1f} days; at most {LONGEST_JOB_S / 86400:g} are allowed"
             return NoPlan(f"{days}: use fewer repetitions")
-        return tuple(ScoredPlan(plan, self.model.score(plan, _left(repetitions, done))) for plan in offered)
+        scored: list[ScoredPlan] = []
+        for plan in offered:
+            check_time()
+            scored.append(ScoredPlan(plan, self.model.score(plan, _left(repetitions, done))))
+        return tuple(scored)
 
     def job(self, job: JobSpec) -> Job:
         """Return the job with its work.

@@ -5,11 +5,9 @@ the process dies are returned at the next start: the arm is at home again, and o
 was permitted to commit, the last cycle may have been done or not, and the report says so.
 """
 
-import logging
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import msgspec
 from msgspec.structs import replace
@@ -17,11 +15,9 @@ from msgspec.structs import replace
 from fleet.bus.protocol.auction import MOST_JOBS, Award, JobSpec, Name, Report
 from fleet.bus.protocol.history import MOST_FINISHED, History
 from fleet.bus.protocol.messages import encode
-from fleet.errors import printable
 from fleet.live.journal import JournalState
 from fleet.live.journal_records import Closed, CommitPermitted, Progress, Released, Started
 
-_LOG = logging.getLogger(__name__)
 MAX_BYTES = 60_000
 """Size of a history: a router may drop larger messages."""
 MAX_PAST_AWARDS = 256
@@ -137,8 +133,9 @@ class ArmHistory(JournalState[ArmRecord]):
                     self.active[name].may_commit = True
             case Closed(name):
                 if name in self.active:
+                    report = report_of(record)
                     award = self.active.pop(name).award
-                    self.reports[name] = award, report_of(record)
+                    self.reports[name] = award, report
                     if record.outcome == "finished":
                         self._finish(award.job)
             case Released(name):
@@ -195,27 +192,6 @@ class ArmHistory(JournalState[ArmRecord]):
                 break
             finished.append(job)
         return replace(history, finished=tuple(reversed(finished)))
-
-
-def put_aside(path: Path, arm: str) -> Callable[[bytes, str], None]:
-    """Return what to do with a record of an arm's journal that cannot be read: append it to a file, and report it.
-
-    An award that is put aside is not executed again. Its lease expires at the auctioneer, which awards the job anew or,
-    if it had permitted the last cycle, calls it unfinished.
-    """
-
-    def put(record: bytes, reason: str) -> None:
-        _LOG.error(
-            "Arm '%s': put a journal record aside in '%s': %s. The record begins %s.",
-            *(arm, path, reason, printable(record[:200].decode(errors="replace"))),
-        )
-        try:
-            with path.open("ab") as file:
-                file.write(record + b"\n")
-        except OSError as error:
-            _LOG.error("The record could not be written to '%s': %s.", path, error.strerror)
-
-    return put
 
 
 def bounded(accepted: dict[str, str], needed: Iterable[str]) -> dict[str, str]:

@@ -196,7 +196,8 @@ class ArmNode:
             self._plans[award.award] = plans[award.plan]
             difficulty = self._scored(award).difficulty
             score = math.nan if difficulty is None else difficulty.total
-            self._publish.event(Event(time_s=self._body.time_s, kind="award", job=award.job.name, value=score))
+            event = Event(time_s=self._body.time_s, kind="award", job=award.job.name, value=score)
+            self._publish.event(event, self.clock.epoch)
         return ack
 
     def unfit(self) -> str:
@@ -308,7 +309,7 @@ class ArmNode:
             self._reading = self._body.read_sensors()  # the next estimates take the fault into account
         elif event.kind == "recover" and self._cleared_by is not None:
             event, self._cleared_by = replace(event, reason=f"cleared by '{self._cleared_by}'"), None
-        self._publish.event(event)
+        self._publish.event(event, self.clock.epoch)
 
     def _busy_s(self) -> float:
         """Fleet seconds until the arm has finished all its jobs."""
@@ -334,6 +335,7 @@ class ArmNode:
                 headroom_k=self._headroom_k,
                 job="" if self._current is None else self._current.job,
                 space="".join(self.space),
+                epoch=self.clock.epoch,
                 busy_s=busy_s if math.isfinite(busy_s := self._busy_s()) else 0.0,
                 housing_c=tuple(self._body.housing_c.tolist()),
                 ambient_c=self._ambient_c,

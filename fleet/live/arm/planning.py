@@ -22,8 +22,8 @@ Key = tuple[JobSpec, int]
 class PlanningThread:
     """Plans and scores jobs, those of an auction before those of dry runs.
 
-    Nothing can interrupt a plan, but its size is bounded: `fleet.job.BOUNDS` and `check_dwell` limit the samples, and
-    `Estimator` the memory of what it keeps. Only this thread calls `Estimator.prepare`.
+    A plan has bounded size and time: `fleet.job.BOUNDS` and `check_dwell` limit the samples, `Estimator` the time and
+    the memory of what it keeps. Only this thread calls `Estimator.prepare`.
     """
 
     def __init__(self, estimator: Estimator) -> None:

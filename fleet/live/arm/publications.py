@@ -54,8 +54,8 @@ class Publications:
             )
         )
 
-    def event(self, event: Event) -> None:
-        """Publish an event."""
+    def event(self, event: Event, epoch: str) -> None:
+        """Publish an event of an epoch of the fleet."""
         self._events += 1
         self._publish_event(
             ArmEvent(
@@ -67,5 +67,6 @@ class Publications:
                 joint=event.joint,
                 value=event.value if math.isfinite(event.value) else None,
                 reason=event.reason,
+                epoch=epoch,
             )
         )

@@ -34,9 +34,9 @@ from fleet.bus.protocol.auction import (
 )
 from fleet.bus.protocol.history import History
 from fleet.bus.protocol.messages import State
-from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
+from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest
 from fleet.errors import Refused
-from fleet.live.auction.control import ALREADY_DONE, job_of, next_step, objection
+from fleet.live.auction.control import ALREADY_DONE, job_of, next_step, objection, was_carried_out
 from fleet.live.auction.leases import CountedLease, adopted, send_again, unanswered
 from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.records import AuctionRecord, ContactLost, ContactRegained, Operated, ShiftEnded
@@ -104,12 +104,13 @@ class Auctioneer:
         leased = {entry.award: entry for entry in request.entries if self._is_leased(entry, request.arm)}
         revoked = tuple(entry.award for entry in request.entries if entry.award not in leased)
         self._take_space(request.arm, self.ledger.space_of(revoked, request.arm))
-        if not self._permit_commits(leased, time_s):
-            leased = {award: entry for award, entry in leased.items() if not self.ledger.open[award].silent}
         for award, entry in leased.items():
             lease = self._writer.leases[award]
             lease.unanswered, lease.cycles = None, max(entry.cycles, lease.cycles)
-            lease.until_s = real_s + self._timing.counted_lease_s
+        if not self._permit_commits(leased, time_s):
+            leased = {award: entry for award, entry in leased.items() if not self.ledger.open[award].silent}
+        for award in leased:
+            self._writer.leases[award].until_s = real_s + self._timing.counted_lease_s
         return Lease(
             auctioneer=self.name,
             lease_s=self._timing.lease_s,
@@ -213,11 +214,12 @@ class Auctioneer:
             Refused: it is not possible now.
         """
         ledger, job = self.ledger, job_of(request)
-        known = request.request in ledger.requests
+        known = was_carried_out(ledger, request)
         note = ALREADY_DONE if known else objection(ledger, request, self.rounds.states.keys() | self.rounds.present)
         if not known:
-            self._writer.record(Operated(request, time_s))
-            self.out.append(Operation(self.name, time_s, request))
+            entry = ledger.jobs.get(job)
+            lease = None if entry is None else self._writer.leases.get(entry.award)
+            self._writer.record(Operated(request, time_s, 0 if lease is None else lease.cycles))
             _LOG.warning("'%s' requested: %s", request.by, request.action)
             self.rounds.retry_now()
         changed = not (known or note)
@@ -244,7 +246,7 @@ class Auctioneer:
         """End the shift: nothing more is offered, and open jobs are reported unfinished."""
         if not self.ledger.ended:
             self.rounds.open = None
-            self._writer.record(ShiftEnded(time_s))
+            self._writer.record(ShiftEnded(time_s, {name: lease.cycles for name, lease in self._writer.leases.items()}))
 
     def finishing(self) -> bool:
         """Return whether a present arm may be in the last cycle of a job."""
@@ -259,10 +261,13 @@ class Auctioneer:
     def _with_progress(self, status: JobStatus) -> JobStatus:
         lease = self._writer.leases.get(status.award)
         cycles = status.cycles if lease is None else max(status.cycles, lease.cycles)
-        note = self.rounds.note(status.job) if status.state == "waiting" else ""
+        waits = status.state == "waiting"
+        note = self.rounds.note(status.job) if waits else ""
+        planned = not waits or self.rounds.is_planned(status.job)
         state = self.rounds.states.get(status.arm) if status.state in ("awarded", "finishing") else None
         finish_s = state.time_s + state.busy_s if state is not None and state.job == status.job else None
-        return replace(status, cycles=cycles, reason=status.reason or note, finish_s=finish_s)
+        reason = status.reason or note
+        return replace(status, cycles=cycles, reason=reason, finish_s=finish_s, not_planned=not planned)
 
     def _is_leased(self, entry: LeaseEntry, arm: str) -> bool:
         award = self.ledger.open.get(entry.award)
@@ -276,7 +281,7 @@ class Auctioneer:
         for name, entry in leased.items():
             award = self.ledger.open[name]
             if entry.phase == "finishing" and not award.may_commit:
-                records.append(CommitPermitted(name, time_s))
+                records.append(CommitPermitted(name, time_s, entry.cycles))
             elif award.silent and not self.ledger.ended:
                 records.append(ContactRegained(name, time_s))
         return self._writer.try_to_record("No permission to commit is given", *records)
@@ -297,6 +302,6 @@ class Auctioneer:
                     return
                 self.rounds.retry_now()
             elif not award.silent and not self.ledger.ended:
-                if not self._writer.try_to_record(vain, ContactLost(name, time_s)):
+                if not self._writer.try_to_record(vain, ContactLost(name, time_s, lease.cycles)):
                     return
                 lease.until_s = math.inf

@@ -42,10 +42,11 @@ def check_begin(fleet: str, histories: Iterable[History]) -> None:
     """
     for history in histories:
         if history.epoch:
-            raise BusError(f"The journal is empty, but fleet '{fleet}' has worked: {_describe(history)}. {REMEDY}")
+            raise BusError(f"The journal is empty, but fleet '{fleet}' has worked: {describe(history)}. {REMEDY}")
 
 
-def _describe(history: History) -> str:
+def describe(history: History) -> str:
+    """Return what an arm knows, in words."""
     names = [job.name for job in history.finished[-MAX_NAMED:]]
     done = f"{len(history.finished)} finished job(s), the last ones {', '.join(names)}" if names else "no finished job"
     return f"'{history.arm}' knows the epoch '{history.epoch}', {done}, and has {len(history.awards)} job(s)"
@@ -104,7 +105,7 @@ class EpochCheck:
         ledger = self._auctioneer.ledger
         if history.epoch not in ("", ledger.epoch) and not ledger.succeeds:
             self._foreign[history.arm] = (
-                f"No jobs are accepted: the journal has the epoch '{ledger.epoch}', but {_describe(history)}. {REMEDY}"
+                f"No jobs are accepted: the journal has the epoch '{ledger.epoch}', but {describe(history)}. {REMEDY}"
             )
             _LOG.error("%s", self._foreign[history.arm])
             return False

@@ -22,7 +22,7 @@ MAX_BYTES = 60_000
 SHIFT_ENDED = "The shift ended before it was done."
 
 
-NOT_PAUSED: Mapping[str, str] = {}
+NONE: Mapping[str, str] = {}
 
 
 def reason_for_silence(arm: str) -> str:
@@ -40,6 +40,7 @@ def admit(
     ended: bool = False,
     given_up: Container[str] = (),
     past: PastJobs | None = None,
+    aside: Mapping[str, str] = NONE,
 ) -> tuple[Admission, ...]:
     """Return which jobs of one submission can be accepted; they may name one another as predecessors in any order.
 
@@ -51,6 +52,7 @@ def admit(
         ended: Whether the shift is over.
         given_up: Known jobs that are given up: a job that waits for one is accepted, and given up too.
         past: Jobs that were settled long ago; they are known, too.
+        aside: Why jobs are put aside of which only the name is known: none of that name is accepted.
     """
     past = past or PastJobs()
     count = len(known) if count is None else count
@@ -65,6 +67,8 @@ def admit(
             continue
         elif same_name is not None or job.name in past:
             rejected[index] = f"Another job has the name '{job.name}'; names must be unique."
+        elif job.name in aside:
+            rejected[index] = f"A job '{job.name}' is put aside, and may have been done: settle it first."
         elif unknown:
             rejected[index] = f"No place '{unknown[0]}' in this cell. Places: {', '.join(sorted(places or ()))}."
         elif count + len(new) >= limit:
@@ -182,13 +186,20 @@ def ready_jobs(
     return ready
 
 
+def with_terms(status: JobStatus, job: JobSpec | None) -> JobStatus:
+    """Return a status with what the job itself says, if that is known."""
+    if job is None:
+        return status
+    return replace(status, repetitions=job.repetitions, due_s=job.due_s, value=job.value)
+
+
 def status_reply(
     name: str,
     time_s: float,
     statuses: Iterable[JobStatus],
     taken: Mapping[str, Iterable[str]],
     epoch: str = "",
-    paused: Mapping[str, str] = NOT_PAUSED,
+    paused: Mapping[str, str] = NONE,
 ) -> Status:
     """Return the reply to a status request.
 

@@ -4,33 +4,38 @@ A record is on disk before it is applied, so a replay gives the same ledger, wit
 ends of leases are not recorded: after a restart every open award counts as leased from then on.
 """
 
-from collections import deque
+import logging
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Self
 
 from msgspec.structs import asdict, replace
 
-from fleet.bus.protocol.auction import ABANDONED, SETTLED, JobState
+from fleet.bus.protocol.auction import ABANDONED, SETTLED, JobStatus
+from fleet.bus.protocol.messages import encode
 from fleet.bus.protocol.operator import ALL_ARMS, Cancel, ControlRequest, Pause, Resume, Settle
 from fleet.bus.protocol.operator import Change as ChangeJob
 from fleet.job import reason_to_give_up
 from fleet.live.auction.job_rules import EXPIRED, SHIFT_ENDED, changed_spec, lost_jobs, reason_for_silence
-from fleet.live.auction.ledger_view import MAX_RECENT, LedgerView
-from fleet.live.auction.past_jobs import PastJobs
+from fleet.live.auction.ledger_state import LedgerState, doubt
+from fleet.live.auction.past_jobs import content_hash
 from fleet.live.auction.records import (
     AuctionRecord,
     Awarded,
     AwardState,
     Change,
+    Checked,
     ContactLost,
     ContactRegained,
     Expired,
     HistoryAdopted,
     JobEntry,
+    JobsPutAside,
     LedgerSnapshot,
     Operated,
     ShiftEnded,
 )
-from fleet.live.journal import TimedState
+from fleet.live.journal import PutAside
 from fleet.live.journal_records import (
     ClockTick,
     Closed,
@@ -41,61 +46,65 @@ from fleet.live.journal_records import (
     SpaceTaken,
     Started,
 )
-from fleet.live.space import ANYWHERE
+
+_LOG = logging.getLogger(__name__)
 
 MAX_SETTLED = 2_000
 """Finished and given-up jobs whose status is kept; older ones leave the ledger, and only `PastJobs` knows them."""
 MAX_REQUESTS = 1_024
 """Requests of people whose names are kept."""
+NUMBERS_SKIPPED = 1_000
+"""Numbers of results that are left out after a journal that was wrong, so that none is used twice."""
 MAX_AWARDS = 16
 """Closed awards of one job on which a report is still expected."""
 
 
 @dataclass
-class Ledger(LedgerView, TimedState[AuctionRecord]):
+class Ledger(LedgerState):
     """Jobs and awards; only `apply` changes it."""
 
-    def __post_init__(self) -> None:
-        self.space |= {arm: frozenset([ANYWHERE]) for arm in self.arms}
+    def replay(self, records: Iterable[AuctionRecord], put_aside: PutAside | None = None) -> Self:
+        """Apply records, oldest first, and return the ledger.
 
-    def compact(self) -> tuple[LedgerSnapshot]:
-        """Return one record that gives the same ledger, without awards on which a report would change nothing."""
-        kept = [
-            award
-            for name, award in self.awards.items()
-            if name in self.open or self._entry(name).award == name or self._may_count(award)
-        ]
-        snapshot = LedgerSnapshot(
-            time_s=self.time_s,
-            number=self.number,
-            ended=self.ended,
-            jobs=tuple(map(replace, self.jobs.values())),
-            settled=tuple(self.settled),
-            past=self.past.packed(),
-            left=dict(self.left),
-            epoch=self.epoch,
-            succeeds=self.succeeds,
-            awards=tuple(map(replace, kept)),
-            open=tuple(self.open),
-            recent=tuple(self.recent),
-            space={arm: tuple(sorted(spaces)) for arm, spaces in self.space.items()},
-            paused=dict(self.paused),
-            requests=tuple(self.requests),
-        )
-        return (snapshot,)
+        Records that contradict those before are not applied, and their jobs are put aside.
+
+        Args:
+            put_aside: Gets each of these records, with the reason; None: it is logged.
+        """
+        before, doubts = set(self._aside_jobs()), 0
+        for record in records:
+            if (found := doubt(self, record)) is None:
+                self.apply(record)
+                continue
+            doubts += 1
+            _LOG.error("A record of the journal is wrong, %s: %s", found.reason, record)
+            if put_aside is not None:
+                put_aside(encode(record), found.reason)
+            self._put_aside(dict.fromkeys(found.jobs, found.reason))
+            if isinstance(record, Checked):
+                self._apply_check(record)
+        aside = [name for name in self._aside_jobs() if name not in before]
+        if doubts or aside:  # the numbers of the last changes are uncertain
+            self.recent.clear()
+            self.number += NUMBERS_SKIPPED
+        for name in aside:
+            self._change(self.status((name,))[0], self.time_s, "", self.jobs.get(name))
+        return self
 
     def apply(self, record: AuctionRecord) -> list[Change]:
         """Apply a record that is on disk, and return the changes of job states."""
         changed: list[JobEntry] = []
         match record:
             case JobsAccepted():
-                new = (job for job in record.jobs if job.name not in self.jobs and job.name not in self.past)
+                known = (self.jobs, self.past, self.aside)
+                new = (job for job in record.jobs if not any(job.name in names for names in known))
                 changed = [JobEntry(job, record.by) for job in new]
                 for entry in changed:
                     self.jobs[entry.spec.name] = entry
                     self._move(entry, "waiting")
+                self._awaited.update(before for entry in changed for before in entry.spec.after)
                 if any(entry.spec.after for entry in changed):
-                    self._follow_given_up()
+                    self._apply_given_up()
             case Awarded():
                 entry = self.jobs[record.job]
                 self._forget_awards(entry)
@@ -106,6 +115,8 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
                 changed = [entry]
             case CommitPermitted() | ContactLost() | ContactRegained():
                 award, entry = self.awards[record.award], self._entry(record.award)
+                if not isinstance(record, ContactRegained):
+                    _count(entry, record.cycles)
                 award.may_commit, award.silent = True, isinstance(record, ContactLost)
                 silence = reason_for_silence(award.record.arm) if award.silent else ""
                 self._move(entry, "unfinished" if award.silent else "finishing", silence)
@@ -116,7 +127,7 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
                 entry = self.jobs[record.job]
                 entry.expired = True
                 self._move(entry, "given_up", EXPIRED)
-                changed = [entry, *self._follow_given_up()]
+                changed = [entry, *self._follow_given_up(entry)]
             case SpaceTaken():
                 self.space[record.arm] = frozenset(record.space)
             case SpaceCleared():
@@ -125,20 +136,29 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
                 self.ended = True
                 changed = [self.jobs[name] for name in self.unsettled()]
                 for entry in changed:
+                    _count(entry, record.cycles.get(entry.award, 0))
                     self._move(entry, "unfinished", entry.reason or SHIFT_ENDED)
             case EpochBegun():
                 self.epoch, self.succeeds = record.epoch, record.succeeds
             case HistoryAdopted():
                 changed = self._adopt(record)
             case Operated():
-                changed = self._operate(record.request, record.time_s)
+                self.operated += 1
+                self.operations.append(record)
+                changed = self._operate(record)
+            case JobsPutAside():
+                self._put_aside(record.jobs)
+            case Checked():
+                self._apply_check(record)
             case LedgerSnapshot():
                 self._restore(record)
             case Started() | ClockTick():
                 pass
         self.time_s = max(self.time_s, record.time_s)
+        self.unchecked.update(entry.spec.name for entry in changed)
+        self._unnoted |= bool(changed) or isinstance(record, Operated | ShiftEnded)
         by = self._person(record)
-        changes = [self._change(entry, record.time_s, by) for entry in changed]
+        changes = [self._change(self.status_of(entry), record.time_s, by, entry) for entry in changed]
         while len(self.settled) > MAX_SETTLED:
             self._leave(next(iter(self.settled)))
         return changes
@@ -154,20 +174,9 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
                 return record.request.by
             case Closed() if (award := self.awards.get(record.award)) is not None:
                 entry = self.jobs[award.record.job]
-                return entry.changed_by if entry.state == "cancelled" else ""
+                return entry.changed_by if entry.state == "cancelled" else self._pauser(entry, record) or ""
             case _:
                 return ""
-
-    def _move(self, entry: JobEntry, state: JobState, reason: str = "") -> None:
-        """Change the state of a job."""
-        name = entry.spec.name
-        for index in (self.waiting, self.settled):
-            index.pop(name, None)
-        entry.state, entry.reason = state, reason
-        if state == "waiting":
-            self.waiting[name] = entry
-        elif state in ("finished", *ABANDONED):
-            self.settled[name] = None
 
     def _adopt(self, record: HistoryAdopted) -> list[JobEntry]:
         """Apply what an arm has finished; return the waiting jobs that need no arm any more."""
@@ -176,7 +185,8 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
                 self.past.add(job, finished=True)
         entries = [self.waiting[job.name] for job in record.finished if job.name in self.waiting]
         for entry in entries:
-            entry.cycles, entry.finished_s, entry.award = entry.spec.repetitions, record.time_s, ""
+            entry.cycles, entry.finished_s = entry.spec.repetitions, record.time_s
+            entry.award, entry.arm = "", record.arm
             self._move(entry, "finished", f"'{record.arm}' had finished it; the journal did not know it.")
         return entries
 
@@ -184,6 +194,10 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
         """Forget a settled job, except for its name and outcome."""
         entry = self.jobs.pop(name)
         del self.settled[name]
+        for before in entry.spec.after:
+            self._awaited[before] -= 1
+            if not self._awaited[before]:
+                del self._awaited[before]
         self.past.add(entry.original, finished=entry.state == "finished")
         self.left[entry.state] = self.left.get(entry.state, 0) + 1
         for award in self._awards_of.pop(name, ()):
@@ -218,13 +232,14 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
             given_up = entry.state in ABANDONED
             entry.award, entry.finished_s = record.award, record.time_s
             self._move(entry, "finished")
-            return [entry, *(self._follow_given_up() if given_up else ())]
+            return [entry, *(self._follow_given_up(entry) if given_up else ())]
         if entry.award != record.award:  # the job was awarded again since
             return self._give_up(entry)
         if record.unsure or (self.ended and not entry.cancelled):
             self._move(entry, "unfinished", record.reason or "It is unknown whether its last cycle was done.")
             return [entry]
-        self._move(entry, "waiting", record.reason)
+        pauser = self._pauser(entry, record)
+        self._move(entry, "waiting", record.reason if pauser is None else f"Its arm was paused by '{pauser}'.")
         if record.outcome == "returned" and reopened:
             entry.returns, entry.returned_s = entry.returns + 1, record.time_s
         entry.cycles = min(entry.cycles, entry.spec.repetitions - 1)  # the last cycle is never assumed done
@@ -238,15 +253,23 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
         if entry.state != "waiting" or not reason:
             return []
         self._move(entry, "given_up", reason)
-        return [entry, *self._follow_given_up()]
+        return [entry, *self._follow_given_up(entry)]
 
     def _cancel(self, entry: JobEntry) -> list[JobEntry]:
         self._move(entry, "cancelled", f"Cancelled by '{entry.changed_by}'.")
-        return [entry, *self._follow_given_up()]
+        return [entry, *self._follow_given_up(entry)]
 
-    def _operate(self, request: ControlRequest, time_s: float) -> list[JobEntry]:
+    def _pauser(self, entry: JobEntry, record: Closed) -> str | None:
+        """Return who paused the arm that has returned a job; None if it has another reason to."""
+        award = self.awards[record.award]
+        if record.faulted or entry.state not in ("awarded", "finishing", "waiting") or entry.award != record.award:
+            return None
+        return None if award.may_commit or record.outcome == "refused" else self.pauser_of(award.record.arm)
+
+    def _operate(self, record: Operated) -> list[JobEntry]:
         """Carry out a request of a person, which `fleet.live.auction.control` has checked; return what has changed."""
-        self.requests[request.request] = None
+        request, time_s = record.request, record.time_s
+        self.requests[request.request] = content_hash(request)
         while len(self.requests) > MAX_REQUESTS:
             del self.requests[next(iter(self.requests))]
         match request.action:
@@ -254,8 +277,13 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
                 self.paused[arm] = request.by
             case Resume(arm):
                 self.paused = {} if arm == ALL_ARMS else {a: by for a, by in self.paused.items() if a != arm}
+            case Settle(name, outcome) if name in self.aside:
+                del self.aside[name]
+                if outcome == "done":
+                    self.past.add_name(name, finished=True)
             case Cancel(name) | Settle(name) | ChangeJob(name):
                 if (entry := self.jobs.get(name)) is not None:
+                    _count(entry, record.cycles)
                     return self._operate_job(entry, request, time_s)
         return []
 
@@ -268,13 +296,14 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
             self._move(entry, before, f"Cancelled by '{request.by}'; its arm ends the cycle in progress.")
             return [entry]
         if isinstance(action, Settle) and before == "unfinished":
-            entry.cancelled, entry.changed_by = False, request.by
+            entry.cancelled, entry.changed_by, entry.aside = False, request.by, ""
             if action.outcome == "done":
                 if entry.award in self.open:
                     self._end(self.open[entry.award])
                 entry.cycles, entry.finished_s = entry.spec.repetitions, time_s
                 self._move(entry, "finished", f"Settled as done by '{request.by}'.")
-                return [entry, *self._follow_given_up()]
+                return [entry, *self._follow_given_up(entry)]
+            entry.arm = self.status_of(entry).arm
             entry.award = ""  # a late report on it that is unsure is settled, too
             entry.cycles = min(entry.cycles, entry.spec.repetitions - 1)
             self._move(entry, "waiting", f"To be redone, by '{request.by}'.")
@@ -286,7 +315,11 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
                 return [entry]
         return []
 
-    def _follow_given_up(self) -> list[JobEntry]:
+    def _follow_given_up(self, entry: JobEntry) -> list[JobEntry]:
+        """Apply a change of this job to jobs that wait for it; return what has changed."""
+        return self._apply_given_up() if entry.spec.name in self._awaited else []
+
+    def _apply_given_up(self) -> list[JobEntry]:
         """Give up jobs that wait for one that is given up; return what has changed.
 
         They wait again if that one was finished after all.
@@ -314,33 +347,9 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
             arm = award.record.arm
             self.space[arm] = self.space.get(arm, frozenset()) | {award.record.space}
 
-    def _restore(self, snapshot: LedgerSnapshot) -> None:
-        self.number, self.ended = snapshot.number, snapshot.ended
-        self.jobs = {entry.spec.name: replace(entry) for entry in snapshot.jobs}
-        self.waiting = {name: entry for name, entry in self.jobs.items() if entry.state == "waiting"}
-        self.settled = dict.fromkeys(snapshot.settled)
-        self.settled |= {name: None for name, e in self.jobs.items() if e.state in ("finished", *ABANDONED)}
-        self.past, self.left, self.epoch = PastJobs(snapshot.past, self.past.limit), dict(snapshot.left), snapshot.epoch
-        self.succeeds = snapshot.succeeds
-        self.awards = {award.record.award: replace(award) for award in snapshot.awards}
-        self._awards_of = {}
-        for name, award in self.awards.items():
-            self._awards_of.setdefault(award.record.job, []).append(name)
-        self.open = {name: self.awards[name] for name in snapshot.open}
-        self.recent = deque(snapshot.recent, maxlen=MAX_RECENT)
-        self.space |= {arm: frozenset(spaces) for arm, spaces in snapshot.space.items()}
-        self.paused, self.requests = dict(snapshot.paused), dict.fromkeys(snapshot.requests)
-
-    def _may_count(self, award: AwardState) -> bool:
-        """Whether a report on a closed award could change the state of its job."""
-        return award.outcome != "refused" and self.jobs[award.record.job].state != "finished"
-
-    def _entry(self, award: str) -> JobEntry:
-        return self.jobs[self.awards[award].record.job]
-
-    def _change(self, entry: JobEntry, time_s: float, by: str) -> Change:
-        change = Change(self.number, time_s, self.status_of(entry), by=by)
-        if entry.award:
+    def _change(self, status: JobStatus, time_s: float, by: str, entry: JobEntry | None) -> Change:
+        change = Change(self.number, time_s, status, by=by)
+        if entry is not None and entry.award in self.awards:
             award = asdict(self.awards[entry.award].record)
             change = replace(
                 change, **{name: award[name] for name in ("auction", "difficulty", "p_saturation", "peak_c")}
@@ -348,3 +357,8 @@ class Ledger(LedgerView, TimedState[AuctionRecord]):
         self.number += 1
         self.recent.append(change)
         return change
+
+
+def _count(entry: JobEntry, cycles: int) -> None:
+    """Count the cycles of a job that an arm has reported; the last one counts when the job is finished."""
+    entry.cycles = max(entry.cycles, min(cycles, entry.spec.repetitions - 1))

@@ -1,17 +1,23 @@
 """Jobs and awards of an auctioneer, and what can be asked about them; `fleet.live.auction.ledger` changes them."""
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from fleet.bus.protocol.auction import ABANDONED, SETTLED, Admission, JobSpec, JobState, JobStatus
 from fleet.bus.protocol.operator import ALL_ARMS
-from fleet.live.auction.job_rules import admit, is_late, job_order, ready_jobs
+from fleet.bus.protocol.registry import HISTORY
+from fleet.live.auction.job_rules import admit, is_late, job_order, ready_jobs, with_terms
 from fleet.live.auction.past_jobs import PastJobs
-from fleet.live.auction.records import AwardState, Change, Expired, JobEntry
+from fleet.live.auction.records import AwardState, Change, Expired, JobEntry, Operated
 
-MAX_RECENT = 64
-"""Latest changes, published again after a restart for those who missed them."""
+MAX_RECENT = HISTORY
+"""Latest changes and requests, published again after a restart for those who missed them: as many as were cached."""
+
+
+def reason_of_aside(reason: str) -> str:
+    """Return why a job is unfinished that is put aside."""
+    return f"Put aside, because the journal is wrong about it: {reason}. Settle it as done or redo."
 
 
 @dataclass
@@ -43,18 +49,31 @@ class LedgerView:
     """Of the next change."""
     ended: bool = False
     recent: deque[Change] = field(default_factory=lambda: deque(maxlen=MAX_RECENT))
+    operated: int = 0
+    """Number of the next request of a person."""
+    operations: deque[Operated] = field(default_factory=lambda: deque(maxlen=MAX_RECENT))
+    """The latest ones that were carried out."""
     open: dict[str, AwardState] = field(default_factory=dict[str, AwardState])
     """Awards that are not closed, by name."""
     _awards_of: dict[str, list[str]] = field(default_factory=dict[str, list[str]], repr=False, compare=False)
     """Names of the awards of each job."""
+    _awaited: Counter[str] = field(default_factory=Counter[str], repr=False, compare=False)
+    """How many jobs wait for each job, settled ones included."""
     space: dict[str, frozenset[str]] = field(default_factory=dict[str, frozenset[str]])
     """Names of the spaces that an arm may take besides those of its open awards, by arm: closed awards leave theirs
     here until the arm says that it is at home."""
 
     paused: dict[str, str] = field(default_factory=dict[str, str])
     """Who paused an arm, by arm; "*" for all arms."""
-    requests: dict[str, None] = field(default_factory=dict[str, None])
-    """Names of the last requests of people that were carried out, oldest first."""
+    requests: dict[str, int] = field(default_factory=dict[str, int])
+    """Hashes of the last requests of people that were carried out, by name, oldest first; 0 for unknown."""
+
+    aside: dict[str, str] = field(default_factory=dict[str, str])
+    """Why jobs are put aside of which only the name is known, by name."""
+    checks: int = 0
+    """Number of the last `Checked` record."""
+    unchecked: set[str] = field(default_factory=set[str], repr=False, compare=False)
+    """Names of the jobs that have changed since."""
 
     def admit(self, jobs: Sequence[JobSpec]) -> tuple[Admission, ...]:
         """Return which submitted jobs can be accepted; changes nothing."""
@@ -63,7 +82,16 @@ class LedgerView:
         given_up = {name for name in named if self.jobs[name].state in ABANDONED}
         given_up |= {name for job in jobs for name in job.after if self.past.is_given_up(name)}
         count = len(self.jobs) - len(self.settled)
-        return admit(jobs, known, places=self.places, count=count, ended=self.ended, given_up=given_up, past=self.past)
+        return admit(
+            jobs,
+            known,
+            places=self.places,
+            count=count,
+            ended=self.ended,
+            given_up=given_up,
+            past=self.past,
+            aside=self.aside,
+        )
 
     def ready(self, time_s: float, limit: int, *, excluded: Container[str] = ()) -> list[JobSpec]:
         """Return the jobs that wait for an arm, as `ready_jobs` does."""
@@ -81,7 +109,9 @@ class LedgerView:
         given up do not wait.
         """
         entry = self.jobs.get(name)
-        return not self.past.is_given_up(name) if entry is None else entry.state == "finished"
+        if entry is None:
+            return name not in self.aside and not self.past.is_given_up(name)
+        return entry.state == "finished"
 
     def expired(self, time_s: float) -> list[Expired]:
         """Return the waiting jobs whose hard due date has passed."""
@@ -91,6 +121,14 @@ class LedgerView:
     def is_paused(self, arm: str) -> bool:
         """Return whether an arm gets no jobs."""
         return arm in self.paused or ALL_ARMS in self.paused
+
+    def at_work(self) -> Mapping[str, tuple[str, bool]]:
+        """Return the arm with an open award of a job, and whether it has permission to commit, by job."""
+        return {award.record.job: (award.record.arm, award.may_commit) for award in self.open.values()}
+
+    def pauser_of(self, arm: str) -> str | None:
+        """Return who paused an arm; None if it is not paused."""
+        return self.paused.get(arm, self.paused.get(ALL_ARMS))
 
     def may_begin(self, award: str) -> bool:
         """Return whether cycles of an open award may be begun under a lease."""
@@ -129,15 +167,22 @@ class LedgerView:
 
     def status(self, names: Iterable[str] = ()) -> list[JobStatus]:
         """Return the status of these jobs, without unknown ones; of all jobs if none is named."""
-        wanted = dict.fromkeys(names) or sorted(self.jobs, key=lambda name: job_order(self.jobs[name].spec))
-        return [self.status_of(self.jobs[name]) for name in wanted if name in self.jobs]
+        in_order = [*sorted(self.jobs, key=lambda name: job_order(self.jobs[name].spec)), *self.aside]
+        wanted = dict.fromkeys(names) or in_order
+        return [
+            self.status_of(self.jobs[name])
+            if name in self.jobs
+            else JobStatus(name, "unfinished", reason=reason_of_aside(self.aside[name]))
+            for name in wanted
+            if name in self.jobs or name in self.aside
+        ]
 
     def status_of(self, entry: JobEntry) -> JobStatus:
         """Return the status of a job."""
         assigned = entry.state in ("awarded", "finishing", "finished") or (
             entry.state == "unfinished" and entry.award in self.open
         )
-        award = entry.award if assigned else ""
-        arm = self.awards[award].record.arm if award else ""
-        done = (entry.cycles, entry.finished_s, entry.reason, entry.spec.repetitions)
-        return JobStatus(entry.spec.name, entry.state, arm, award, *done)
+        last, spec = self.awards.get(entry.award), entry.spec
+        arm, award = entry.arm if last is None else last.record.arm, entry.award if assigned else ""
+        done = (entry.cycles, entry.finished_s, entry.reason)
+        return with_terms(JobStatus(spec.name, entry.state, arm, award, *done), spec)

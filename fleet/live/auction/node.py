@@ -104,7 +104,7 @@ class AuctionNode:
         self._timing = timing or Timing()
         self._cell = cell
         self._check_no_auctioneer()
-        ledger = Ledger(places, arms).replay(journal.records())
+        ledger = Ledger(places, arms).replay(journal.records(), journal.put_aside)
         if not (ledger.epoch or new_epoch):
             check_begin(link.fleet, ask_arms(link))
         real_s = time.monotonic()
@@ -250,7 +250,9 @@ class AuctionNode:
 
     def _apply_state(self, arm: str, state: State) -> None:
         self._state_s[arm] = time.monotonic()
-        self.auctioneer.apply_state(arm, state)
+        # An arm outside the cell may be anywhere: without a token it would stop all others, and nobody could ask it.
+        if arm in self._tokens or arm in self.auctioneer.ledger.arms:
+            self.auctioneer.apply_state(arm, state)
 
     def _apply_token(self, arm: str, present: bool) -> None:
         (self._tokens.add if present else self._tokens.discard)(arm)

@@ -9,6 +9,8 @@ from collections.abc import Container, Iterator
 from hashlib import blake2b
 from struct import iter_unpack, pack
 
+from msgspec import Struct
+
 from fleet.bus.protocol.auction import JobSpec
 from fleet.bus.protocol.messages import encode
 
@@ -16,13 +18,19 @@ MAX_PAST = 100_000
 """Jobs whose names are known after they have left the ledger."""
 
 
-def _hash(content: bytes) -> int:
+def hash_of(content: bytes) -> int:
+    """Return 64 bits, the same in every process."""
     return int.from_bytes(blake2b(content, digest_size=8).digest(), "little")
+
+
+def content_hash(message: Struct) -> int:
+    """Return a hash of the content of a message."""
+    return hash_of(encode(message))
 
 
 def _spec_hash(job: JobSpec) -> int:
     """Hash of a job without the lowest bit, which says whether it was finished."""
-    return _hash(encode(job)) & ~1
+    return content_hash(job) & ~1
 
 
 class PastJobs(Container[str]):
@@ -40,12 +48,21 @@ class PastJobs(Container[str]):
         for name, value in iter_unpack("<QQ", packed):
             self._put(name, value)
 
-    def add(self, job: JobSpec, *, finished: bool) -> None:
-        """Add a job that is finished, or given up; the oldest one is dropped if there are too many."""
-        self._put(_hash(job.name.encode()), _spec_hash(job) | finished)
+    def add(self, job: JobSpec | str, *, finished: bool) -> None:
+        """Add a job that is finished, or given up; the oldest one is dropped if there are too many.
+
+        Args:
+            job: A job, or the name of one of unknown content, which is the same as any other of that name.
+        """
+        name, content = (job, 0) if isinstance(job, str) else (job.name, _spec_hash(job))
+        self._put(hash_of(name.encode()), content | finished)
+
+    def add_name(self, name: str, *, finished: bool) -> None:
+        """Add a job of which only the name is known."""
+        self._put(hash_of(name.encode()), int(finished))
 
     def __contains__(self, name: object) -> bool:
-        return isinstance(name, str) and _hash(name.encode()) in self._jobs
+        return isinstance(name, str) and hash_of(name.encode()) in self._jobs
 
     def __len__(self) -> int:
         return len(self._jobs)
@@ -57,15 +74,15 @@ class PastJobs(Container[str]):
 
     def is_same(self, job: JobSpec) -> bool:
         """Return whether a job of this name is known, and is this one."""
-        return self._jobs.get(_hash(job.name.encode()), -1) & ~1 == _spec_hash(job)
+        return self._jobs.get(hash_of(job.name.encode()), -1) & ~1 in (0, _spec_hash(job))
 
     def is_finished(self, name: str) -> bool:
         """Return whether a job of this name is known, and was finished."""
-        return bool(self._jobs.get(_hash(name.encode()), 0) & 1)
+        return bool(self._jobs.get(hash_of(name.encode()), 0) & 1)
 
     def is_given_up(self, name: str) -> bool:
         """Return whether a job of this name is known, and was given up."""
-        return not self._jobs.get(_hash(name.encode()), 1) & 1
+        return not self._jobs.get(hash_of(name.encode()), 1) & 1
 
     def packed(self) -> bytes:
         """Return all jobs, oldest first."""

@@ -1,9 +1,14 @@
 """Journal records of an auctioneer, and the entries of its ledger, which a snapshot of the ledger holds as records."""
 
+from typing import cast
+
 import msgspec
 
 from fleet.bus.protocol.auction import JobSpec, JobState, JobStatus
+from fleet.bus.protocol.messages import Count
 from fleet.bus.protocol.operator import ControlRequest
+from fleet.errors import JournalError
+from fleet.live.journal import PutAside, Salvage
 from fleet.live.journal_records import (
     ClockTick,
     Closed,
@@ -15,6 +20,9 @@ from fleet.live.journal_records import (
     Started,
 )
 from fleet.live.space import ANYWHERE
+
+MAX_REASON = 300
+"""Characters of the reason for which a job is put aside."""
 
 
 class HistoryAdopted(msgspec.Struct, frozen=True, tag="history_adopted"):
@@ -50,6 +58,8 @@ class ContactLost(msgspec.Struct, frozen=True, tag="contact_lost"):
 
     award: str
     time_s: float
+    cycles: Count = 0
+    """Last reported progress."""
 
 
 class ContactRegained(msgspec.Struct, frozen=True, tag="contact_regained"):
@@ -70,6 +80,8 @@ class ShiftEnded(msgspec.Struct, frozen=True, tag="shift_ended"):
     """The fleet's shift is over; open jobs stay unfinished."""
 
     time_s: float
+    cycles: dict[str, Count] = {}
+    """Last reported progress, by open award."""
 
 
 class Operated(msgspec.Struct, frozen=True, tag="operated"):
@@ -77,6 +89,8 @@ class Operated(msgspec.Struct, frozen=True, tag="operated"):
 
     request: ControlRequest
     time_s: float
+    cycles: Count = 0
+    """Last reported progress of its job."""
 
 
 class Change(msgspec.Struct, frozen=True):
@@ -117,11 +131,36 @@ class JobEntry(msgspec.Struct):
     """The person whose request changed it last."""
     submitted: JobSpec | None = None
     """As it was submitted, if a person has changed it since."""
+    arm: str = ""
+    """The arm that had it last, if `award` does not say."""
+    aside: str = ""
+    """Why it is put aside; "" if it is not. It stays unfinished until an arm reports it finished, or a person settles
+    it."""
 
     @property
     def original(self) -> JobSpec:
         """The job as it was submitted."""
         return self.submitted or self.spec
+
+
+class Checked(msgspec.Struct, frozen=True, tag="checked"):
+    """What the records since the last one of these have changed, so that a wrong or missing one is noticed."""
+
+    number: int
+    """Counts them, from 1."""
+    changes: int
+    """Number of the next change."""
+    jobs: dict[str, int]
+    """Checksum of the state of each job that has changed."""
+    time_s: float
+    paused: dict[str, str] = {}
+
+
+class JobsPutAside(msgspec.Struct, frozen=True, tag="jobs_put_aside"):
+    """Jobs whose records cannot be read, with the reason."""
+
+    jobs: dict[str, str]
+    time_s: float = 0.0
 
 
 class AwardState(msgspec.Struct):
@@ -155,10 +194,91 @@ class LedgerSnapshot(msgspec.Struct, frozen=True, tag="ledger_snapshot"):
     epoch: str = ""
     succeeds: bool = False
     paused: dict[str, str] = {}
-    requests: tuple[str, ...] = ()
+    requests: dict[str, int] | tuple[str, ...] = ()
+    """As in `Ledger`; earlier versions kept the names alone."""
+    aside: dict[str, str] = {}
+    checks: int = 0
+    operated: int = 0
+    operations: tuple[Operated, ...] = ()
 
 
 AwardRecord = Awarded | CommitPermitted | ContactLost | ContactRegained | Closed
-JobRecord = JobsAccepted | Expired | HistoryAdopted | Operated
+JobRecord = JobsAccepted | JobsPutAside | Expired | HistoryAdopted | Operated
 SpaceRecord = SpaceTaken | SpaceCleared
-AuctionRecord = Started | EpochBegun | ClockTick | JobRecord | AwardRecord | SpaceRecord | ShiftEnded | LedgerSnapshot
+AuctionRecord = (
+    Started | EpochBegun | ClockTick | Checked | JobRecord | AwardRecord | SpaceRecord | ShiftEnded | LedgerSnapshot
+)
+
+
+def job_of(award: str) -> str:
+    """Return the job in the name of an award, as `leases.new_awards` makes it: ROUND:JOB; "" if there is none."""
+    return award.partition(":")[2]
+
+
+# Records that cannot be read
+
+
+def salvage(put_aside: PutAside) -> Salvage[AuctionRecord]:
+    """Return what to do with a record that cannot be read: put it aside, and go on with its other jobs."""
+
+    def put(record: bytes, reason: str) -> list[AuctionRecord]:
+        put_aside(record, reason)
+        return rest_of(record, reason)
+
+    return put
+
+
+def rest_of(raw: bytes, reason: str) -> list[AuctionRecord]:
+    """Return what can be kept of a record that is none of this version: its other jobs, and whom it concerns.
+
+    Raises:
+        JournalError: it is the record of all jobs, and cannot be read at all.
+    """
+    try:
+        content = msgspec.json.decode(raw)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return []
+    if not isinstance(content, dict):
+        return []
+    fields, bad = cast(dict[str, object], content), set[str]()
+    snapshot = fields.get("type") == "ledger_snapshot"
+    parts = {"jobs": JobEntry if snapshot else JobSpec, "finished": JobSpec, "awards": AwardState, "recent": Change}
+    for key, kind in parts.items():
+        if isinstance(items := fields.get(key), list):
+            kept: list[object] = []
+            for item in cast(list[object], items):
+                if _is_readable(item, kind):
+                    kept.append(item)
+                elif kind is not Change:  # of the last messages none is needed
+                    bad.add(_job_in(item))
+            fields[key] = kept
+    rest: list[AuctionRecord] = []
+    try:
+        rest.append(msgspec.convert(fields, AuctionRecord, str_keys=True))
+    except msgspec.ValidationError as error:
+        if snapshot:
+            raise JournalError(f"The journal's record of all jobs cannot be read: {error}.") from error
+        bad.add(_job_in(fields))
+    bad.discard("")
+    return [*rest, JobsPutAside(dict.fromkeys(sorted(bad), reason[:MAX_REASON]))] if bad else rest
+
+
+def _is_readable(item: object, kind: type[msgspec.Struct]) -> bool:
+    try:
+        msgspec.convert(item, kind)
+    except msgspec.ValidationError:
+        return False
+    return True
+
+
+def _job_in(item: object) -> str:
+    """Return the name of the job that a part of a record is about; "" if there is none."""
+    if not isinstance(item, dict):
+        return ""
+    fields = cast(dict[str, object], item)
+    for key in ("name", "job"):
+        if isinstance(name := fields.get(key), str):
+            return name
+    if isinstance(award := fields.get("award"), str) and job_of(award):
+        return job_of(award)
+    return next(filter(None, (_job_in(fields.get(key)) for key in ("spec", "record", "request", "action"))), "")

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
-from fleet.bus.protocol.auction import LEASE_S, JobSpec, PlanQuote, Quote
+from fleet.bus.protocol.auction import LEASE_S, NOT_PLANNED, JobSpec, PlanQuote, Quote
 from fleet.bus.protocol.messages import State
 from fleet.live.clock import CLOCK_DRIFT
 from fleet.live.space import ANYWHERE, Excludes, arms_in_the_way, no_conflicts
@@ -190,8 +190,15 @@ def infeasible_jobs(quotes: Mapping[str, Quote]) -> dict[str, str]:
     return {
         job: f"No arm can do it: {'; '.join(f'{arm}: {reason}' for arm, reason in by_arm.items())}."[:MAX_REASON]
         for job, by_arm in reasons.items()
-        if len(by_arm) == len(quotes)
+        if len(by_arm) == len(quotes) and NOT_PLANNED not in by_arm.values()
     }
+
+
+def planned_jobs(quotes: Mapping[str, Quote]) -> set[str]:
+    """Return the jobs for which an arm quotes a plan, and those for which every arm says that it has none."""
+    offers = [offer for quote in quotes.values() for offer in quote.estimates]
+    open_jobs = {offer.job for offer in offers if offer.reason == NOT_PLANNED}
+    return {offer.job for offer in offers if offer.feasible or offer.job not in open_jobs}
 
 
 @dataclass(eq=False)

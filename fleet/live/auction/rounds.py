@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 from fleet.bus.protocol.auction import Announcement, Award, QuoteRequest
 from fleet.bus.protocol.messages import State
+from fleet.bus.protocol.operator import ALL_ARMS
 from fleet.errors import JournalFull
 from fleet.live.auction.leases import CountedLease, SendAward, new_awards, unanswered
 from fleet.live.auction.round import (
@@ -16,6 +17,7 @@ from fleet.live.auction.round import (
     Timing,
     drop_invalid,
     infeasible_jobs,
+    planned_jobs,
 )
 from fleet.live.auction.space_rules import stated_spaces, waits_for_space
 from fleet.live.auction.writer import LedgerWriter
@@ -51,6 +53,8 @@ class Rounds:
         """Real second from which a job may be offered again."""
         self._notes: dict[str, str] = {}
         """Why no arm can do a job."""
+        self._planned: set[str] = set()
+        """Waiting jobs for which arms have plans, or have said that there is none."""
         self._scan_s = -math.inf
         self._pause_s = timing.pause_s[0]
 
@@ -68,8 +72,14 @@ class Rounds:
         self._scan_s = -math.inf
 
     def note(self, job: str) -> str:
-        """Return why no arm can do a job; "" if an arm may."""
+        """Return why no arm begins a job; "" if an arm may."""
+        if (pauser := self._writer.ledger.paused.get(ALL_ARMS)) is not None:
+            return f"All arms are paused by '{pauser}'."
         return self._notes.get(job, "")
+
+    def is_planned(self, job: str) -> bool:
+        """Return whether an arm has a plan for a waiting job, or all have said that there is none."""
+        return job in self._planned
 
     def retry_now(self) -> None:
         """Offer delayed jobs again at once: something has changed."""
@@ -93,6 +103,7 @@ class Rounds:
             return
         self._later_s = {job: at_s for job, at_s in self._later_s.items() if at_s > real_s}
         self._notes = {job: note for job, note in self._notes.items() if job in ledger.waiting}
+        self._planned &= ledger.waiting.keys()
         jobs = tuple(ledger.ready(time_s, self._timing.max_jobs, excluded=self._later_s))
         busy = ledger.busy_stations()
         if not any(busy.isdisjoint(job.places) for job in jobs):
@@ -127,6 +138,7 @@ class Rounds:
         )
         for job in closing.jobs if quotes else ():
             self._notes.pop(job.name, None)
+        self._planned |= planned_jobs(quotes)
         self._notes |= infeasible_jobs(quotes) | waits_for_space(bidding)
         allocation = drop_invalid(bidding, self.allocate(bidding)) if bidding.quotes and jobs else {}
         try:

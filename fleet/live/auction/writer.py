@@ -11,7 +11,7 @@ from fleet.bus.protocol.operator import Operation
 from fleet.errors import JournalFull
 from fleet.live.auction.leases import CountedLease, SendAward
 from fleet.live.auction.ledger import Ledger
-from fleet.live.auction.records import AuctionRecord, Change
+from fleet.live.auction.records import AuctionRecord, Change, Operated
 
 _LOG = logging.getLogger(__name__)
 
@@ -39,6 +39,8 @@ class LedgerWriter:
         self.leases = {award: CountedLease(counted_until_s) for award in ledger.open}
         self._name, self._keep = name, keep
         self.out: deque[Out] = deque(self._result(change) for change in ledger.recent)
+        first = ledger.operated - len(ledger.operations)
+        self.out.extend(self._operation(record, first + place) for place, record in enumerate(ledger.operations))
 
     def record(self, *records: AuctionRecord) -> None:
         """Write records, then apply them.
@@ -48,9 +50,12 @@ class LedgerWriter:
         """
         if not records:
             return
+        records = (*self.ledger.checks_due(), *records)
         self._keep(*records)
         for record in records:
             self.out.extend(map(self._result, self.ledger.apply(record)))
+            if isinstance(record, Operated):
+                self.out.append(self._operation(record, self.ledger.operated - 1))
         for award in self.leases.keys() - self.ledger.open.keys():
             del self.leases[award]
 
@@ -64,4 +69,7 @@ class LedgerWriter:
         return True
 
     def _result(self, change: Change) -> Result:
-        return Result(self._name, **asdict(change))
+        return Result(self._name, epoch=self.ledger.epoch, **asdict(change))
+
+    def _operation(self, record: Operated, number: int) -> Operation:
+        return Operation(self._name, record.time_s, record.request, number, self.ledger.epoch)

@@ -15,6 +15,7 @@ from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import MOST_JOBS, Ack, Award, JobSpec, Lease, Receipt, Report
 from fleet.bus.protocol.consensus import Claim, ClaimEntry, ClaimReply, Faults, JobOutcome
+from fleet.bus.protocol.operator import Operation
 from fleet.errors import JournalError, Refused
 from fleet.job import reason_to_give_up
 from fleet.live.arm.award_executor import AwardExecutor
@@ -102,11 +103,16 @@ class Claimant:
         """Entries of the last claim, by award: a job is claimed until its report is on disk."""
         self._corrections: dict[str, JobOutcome] = {}
         self._new_jobs: dict[str, JobSpec] = {}
+        self._operations: dict[str, Operation] = {}
         self._sent: dict[int, tuple[Claim, float, int]] = {}
         """Claims by number, each with its real second and version."""
         self._answered: dict[str, int] = {}
         """Version of the last claim to which each arm has replied."""
         self._version, self._due, self._claimed_s = 1, True, -math.inf
+
+    def count_after(self, number: int) -> None:
+        """Number the next claims as those of the start after the one with this number."""
+        self._number = max(self._number, (number // NUMBERS_PER_BOOT + 1) * NUMBERS_PER_BOOT)
 
     @property
     def capacity(self) -> int:
@@ -132,6 +138,20 @@ class Claimant:
         self._new_jobs[job.name] = job
         self._due = True
 
+    def send_operation(self, operation: Operation) -> None:
+        """Send a request of a person with the next claim: a peer seems to miss it."""
+        self._operations[operation.request.request] = operation
+        self._due = True
+
+    def revoke(self, is_stopped: Callable[[str], bool], real_s: float) -> None:
+        """Withdraw requests for jobs, and have the arm return those whose last cycle is not permitted."""
+        for award, pending in list(self.pending.items()):
+            if is_stopped(pending.job.name):
+                self._reject(award)
+        going_on = (active for active in self.executor.active if not (active.may_commit or active.revoked))
+        if awards := tuple(active.award.award for active in going_on if is_stopped(active.job)):
+            self.executor.apply_lease(Lease(self.arm, self._timing.lease_s, (), awards), real_s)
+
     def claim_soon(self) -> None:
         """Claim with the next tick: a lease, a permission to commit or a receipt is due."""
         self._due = True
@@ -153,7 +173,8 @@ class Claimant:
         corrections = list(self._corrections.values())[: min(MAX_CORRECTIONS, MOST_JOBS - len(outcomes))]
         self._number += 1
         jobs = tuple(self._new_jobs.values())[:MAX_CORRECTIONS]
-        claim = Claim(self.arm, self._number, tuple(entries), (*outcomes, *corrections), jobs, space)
+        operations = tuple(self._operations.values())[:MAX_CORRECTIONS]
+        claim = Claim(self.arm, self._number, tuple(entries), (*outcomes, *corrections), jobs, operations, space)
         self._claimed_s, self._due = real_s, False
         try:
             own_reply = self.granter.answer_claim(claim, real_s)
@@ -162,6 +183,7 @@ class Claimant:
             return None
         self._corrections.clear()
         self._new_jobs.clear()
+        self._operations.clear()
         self._sent = {number: sent for number, sent in self._sent.items() if number > claim.number - MAX_CLAIMS}
         self._sent[claim.number] = claim, real_s, self._version
         self.apply_reply(own_reply, real_s)

@@ -11,10 +11,11 @@ are on disk, and are applied only then. The rules that make it safe (`fleet.bus.
 - Of two plans that exclude each other one is granted. Its arm takes the space until a later claim of the arm says that
   it does not take it any more, or a person frees it. An arm without a claim may be anywhere.
 - Whoever frees the space of an arm also revokes its grants: the arm gets no lease on them any more, and returns them.
+- A person's cancellation ends the leases of a job, except for an arm with permission to commit.
 - After a crash every grant counts as leased from the restart.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 from fleet.bus.protocol.auction import JobSpec, JobStatus
 from fleet.bus.protocol.consensus import (
@@ -26,11 +27,15 @@ from fleet.bus.protocol.consensus import (
     GrantedEntry,
     JobOutcome,
 )
+from fleet.bus.protocol.operator import Operation
 from fleet.errors import JournalFull, Refused
 from fleet.job import reason_to_give_up
-from fleet.live.auction.job_rules import reason_for_silence
+from fleet.live.auction.control import job_of
+from fleet.live.auction.job_rules import MAX_OPEN_JOBS, reason_for_silence
+from fleet.live.auction.ledger import MAX_SETTLED
 from fleet.live.auction.round import Timing
-from fleet.live.consensus.records import Faulted, GrantRecord, JobGranted, JobSettled
+from fleet.live.consensus.operations import is_for
+from fleet.live.consensus.records import Faulted, GrantRecord, JobGranted, JobSettled, Requested
 from fleet.live.consensus.register import Register
 from fleet.live.journal_records import EpochBegun, JobsAccepted, Released, SpaceCleared, SpaceTaken
 from fleet.live.space import ANYWHERE, Excludes, arms_in_the_way, no_conflicts
@@ -83,7 +88,9 @@ class Granter:
         self.add_jobs(claim.jobs)
         self._record([JobSettled(outcome) for outcome in claim.outcomes if self._is_new(outcome)])
         self._record(self._released(claim))
-        self._record(self._given_up(real_s))
+        for operation in claim.operations:
+            self.operate(operation)
+        self.abandon(real_s)
         self._set_space(claim)
         register.numbers[claim.arm] = claim.number
         granted: list[GrantedEntry] = []
@@ -91,7 +98,7 @@ class Granter:
         for entry in claim.entries:
             reason = self._objection(claim.arm, entry, real_s) or self._grant(claim, entry, real_s)
             if reason:
-                denied.append(DeniedEntry(entry.award, reason, register.settled.get(entry.job)))
+                denied.append(DeniedEntry(entry.award, reason, register.settled.known(entry.job, self.arm)))
             else:
                 may_commit = register.grants[entry.job].may_commit
                 cycles, faults = register.cycles.get(entry.job, 0), register.faults.get(entry.job, {})
@@ -128,6 +135,48 @@ class Granter:
         if self._is_new(outcome):
             self._record([JobSettled(outcome)])
 
+    def operate(self, operation: Operation) -> None:
+        """Record a request of a person, which was carried out by this arm or a peer.
+
+        Raises:
+            JournalError: it is not on disk, and nothing has changed.
+        """
+        operations = self.register.operations
+        known = operation.request.request in operations.names
+        past = job_of(operation.request) in self.register.past
+        if not past and is_for(operation, self.roster) and not (known and not operations.is_new(operation)):
+            self._record([Requested(operation)])
+
+    def settle(self, operation: Operation, award: str) -> JobOutcome:
+        """Record that a person calls a job done, and return its outcome.
+
+        Raises:
+            JournalError: it is not on disk, and nothing has changed.
+        """
+        job, by = job_of(operation.request), operation.request.by
+        award, cycles = award or operation.request.request, self.register.cycles.get(job, 0)
+        reason = f"Settled as done by '{by}'."
+        outcome = JobOutcome(job, award, operation.auctioneer, "finished", cycles, operation.time_s, reason)
+        self._record([JobSettled(outcome)])
+        return outcome
+
+    def give_up(self, lost: Mapping[str, str], time_s: float) -> None:
+        """Record jobs as given up for these reasons, so that they can leave.
+
+        Raises:
+            JournalError: they are not on disk, and nothing has changed.
+        """
+        outcomes = (JobOutcome(job, "?", self.arm, "given_up", 0, time_s, reason) for job, reason in lost.items())
+        self._record([JobSettled(outcome) for outcome in outcomes])
+
+    def abandon(self, real_s: float) -> None:
+        """Record the outcomes of jobs that no arm has, and that are cancelled or in which arms have faulted too often.
+
+        Raises:
+            JournalError: they are not on disk, and nothing has changed.
+        """
+        self._record([*self._given_up(real_s), *self._cancelled(real_s)])
+
     def add_faults(self, job: str, faults: Faults) -> None:
         """Record faults in a job that a peer knows.
 
@@ -143,8 +192,21 @@ class Granter:
         Raises:
             JournalError: none is on disk.
         """
-        new = tuple(job for job in jobs if job.name not in self.register.jobs)
+        register = self.register
+        new = tuple(job for job in jobs if job.name not in register.jobs and job.name not in register.past)
+        new = new[: max(0, MAX_OPEN_JOBS + MAX_SETTLED - len(register.jobs))]
         self._record([JobsAccepted(new, by)] if new else [])
+
+    def adopt(self, records: list[GrantRecord], real_s: float) -> None:
+        """Record what other arms have done and have; what they have counts as leased from now.
+
+        Raises:
+            JournalError: nothing is on disk.
+        """
+        self._record(records)
+        for record in records:
+            if isinstance(record, JobGranted):
+                self.register.grants[record.job].until_s = real_s + self._timing.counted_lease_s
 
     def begin_epoch(self, epoch: str) -> None:
         """Record the name of the shift.
@@ -174,16 +236,19 @@ class Granter:
         outcome, grant = self.register.settled.get(job), self.register.grants.get(job)
         cycles = self.register.cycles.get(job, 0)
         if outcome is not None and outcome.outcome == "finished":
-            return JobStatus(job, "finished", outcome.arm, outcome.award, cycles, outcome.time_s)
-        if outcome is not None and outcome.outcome == "given_up":
-            return JobStatus(job, "given_up", cycles=cycles, reason=outcome.reason)
+            return JobStatus(job, "finished", outcome.arm, outcome.award, cycles, outcome.time_s, outcome.reason)
+        if outcome is not None and (outcome.outcome == "given_up" or outcome.outcome == "cancelled"):
+            return JobStatus(job, outcome.outcome, cycles=cycles, reason=outcome.reason)
         if outcome is not None:
             return JobStatus(job, "unfinished", outcome.arm, outcome.award, cycles, None, outcome.reason)
         if grant is None or not self.is_granted(job, real_s):
             return JobStatus(job, "waiting", cycles=cycles)
         if grant.may_commit and real_s >= grant.until_s:
             return JobStatus(job, "unfinished", grant.arm, grant.award, cycles, None, reason_for_silence(grant.arm))
-        return JobStatus(job, "finishing" if grant.may_commit else "awarded", grant.arm, grant.award, cycles)
+        cancel = self.register.operations.cancelled(job)
+        reason = "" if cancel is None else f"{_cancelled_by(cancel)[:-1]}; its arm ends the cycle in progress."
+        state = "finishing" if grant.may_commit else "awarded"
+        return JobStatus(job, state, grant.arm, grant.award, cycles, None, reason)
 
     # Inside
 
@@ -191,8 +256,7 @@ class Granter:
         if outcome.outcome == "returned":
             more = outcome.cycles > self.register.cycles.get(outcome.job, 0)
             return more or not self.register.knows(outcome.job, outcome.faults)
-        known = self.register.settled.get(outcome.job)
-        return known is None or (known.outcome, outcome.outcome) == ("given_up", "finished")
+        return self.register.is_news(outcome)
 
     def _given_up(self, real_s: float) -> list[GrantRecord]:
         """Outcomes of jobs that no arm has, and in which arms have faulted too often."""
@@ -204,6 +268,18 @@ class Granter:
                 award, cycles = max(faults), register.cycles.get(job, 0)
                 outcome = JobOutcome(job, award, faults[award], "given_up", cycles, register.time_s, reason)
                 outcomes.append(JobSettled(outcome))
+        return outcomes
+
+    def _cancelled(self, real_s: float) -> list[GrantRecord]:
+        """Outcomes of cancelled jobs that no arm has."""
+        register = self.register
+        outcomes: list[GrantRecord] = []
+        for job, operation in register.operations.all_cancelled.items():
+            known = register.settled.get(job)
+            if (known is None or known.outcome == "given_up") and not self.is_granted(job, real_s):
+                award, arm, cycles = operation.request.request, operation.auctioneer, register.cycles.get(job, 0)
+                reason = _cancelled_by(operation)
+                outcomes.append(JobSettled(JobOutcome(job, award, arm, "cancelled", cycles, operation.time_s, reason)))
         return outcomes
 
     def _released(self, claim: Claim) -> list[GrantRecord]:
@@ -224,12 +300,17 @@ class Granter:
 
     def _objection(self, arm: str, entry: ClaimEntry, real_s: float) -> str:
         """Return why a job cannot be granted now, or ""."""
-        if entry.job in self.register.settled:
+        if self.register.is_settled(entry.job):
             return f"'{entry.job}' is settled"
+        if entry.award in self.register.operations.redone(entry.job):
+            return f"a person has '{entry.job}' done again"
         grant = self.register.grants.get(entry.job)
         same = grant is not None and (grant.arm, grant.award) == (arm, entry.award)
         if grant is not None and same and grant.revoked:
             return f"the space of '{arm}' was cleared"
+        cancel = self.register.operations.cancelled(entry.job)
+        if cancel is not None and not (grant is not None and same and grant.may_commit):
+            return _cancelled_by(cancel)
         has_space = same and (entry.space or ANYWHERE) in self.register.space[arm]
         if not has_space and (in_way := self.in_the_way(arm, entry.space)):
             return f"'{in_way[0]}' is in the way"
@@ -268,3 +349,7 @@ class Granter:
             self._keep(*records)
         for record in records:
             self.register.apply(record)
+
+
+def _cancelled_by(operation: Operation) -> str:
+    return f"Cancelled by '{operation.request.by}'."

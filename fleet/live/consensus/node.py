@@ -4,13 +4,12 @@ The fleet's time is the latest that any arm keeps: an arm that receives a later 
 all arms of the roster are present, or a majority has waited long enough for the others.
 """
 
+import logging
 import math
 import secrets
 import time
 from collections import deque
-from collections.abc import Iterable
 from random import Random
-from typing import NoReturn
 
 from msgspec.structs import replace
 
@@ -18,6 +17,7 @@ from fleet.bus.client.client import AnotherReplies
 from fleet.bus.client.replies import Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import (
+    ABANDONED,
     Clock,
     ClockRequest,
     JobStatus,
@@ -28,24 +28,27 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
-from fleet.bus.protocol.cell import CellRequest
+from fleet.bus.protocol.cell import Cell, CellRequest
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply
 from fleet.bus.protocol.history import History, HistoryRequest
 from fleet.bus.protocol.messages import State
-from fleet.bus.protocol.operator import Cleared, ClearRequest, ControlRequest
+from fleet.bus.protocol.operator import Cleared, ClearRequest, Controlled, ControlRequest, Operation
 from fleet.errors import BusError, Refused
 from fleet.live.arm.auctioneer_client import RateLimitedWarnings
 from fleet.live.arm.node import ArmNode
-from fleet.live.auction.epochs import ask_arms
+from fleet.live.auction.epochs import REPLY_S, ask_arms
 from fleet.live.auction.job_rules import admit, status_reply
 from fleet.live.clock import FleetClock
 from fleet.live.consensus.claimant import NUMBERS_PER_BOOT
+from fleet.live.consensus.epochs import adopted, check_journals, first_number, history_of
 from fleet.live.consensus.granter import Granter
 from fleet.live.consensus.participant import QUIET_S, Membership, Participant
 from fleet.live.consensus.records import GrantRecord
 from fleet.live.consensus.register import Register
 from fleet.live.journal import Journal
 from fleet.live.journal_upkeep import TimeRecorder
+
+_LOG = logging.getLogger(__name__)
 
 LISTEN_S = 0.5
 """Real seconds that an arm listens before it starts the fleet's time."""
@@ -55,26 +58,6 @@ LAST_S = 10.0
 """Real seconds after the end of the shift that an arm waits at most for last cycles, its own and its peers'."""
 NOT_YET_S = 1e9
 """Real seconds until the fleet's time would begin if no arm started it: never."""
-
-
-def check_journals(arm: str, boot: int, epoch: str, histories: Iterable[History]) -> None:
-    """Check that the journals of an arm are those that its peers know.
-
-    Raises:
-        BusError: they are lost, older copies, or of another epoch: jobs might be done twice.
-    """
-    for peer in (history for history in histories if history.arm != arm):
-        claimed = peer.claims.get(arm, -1)
-        if claimed >= boot * NUMBERS_PER_BOOT or (claimed >= 0 and peer.epoch and not epoch):
-            reason = f"'{peer.arm}' knows claims of '{arm}' that its journals do not: they are lost, or older copies"
-        elif "" not in (epoch, peer.epoch) and epoch != peer.epoch:
-            reason = f"The journals of '{arm}' are of the epoch '{epoch}', those of '{peer.arm}' of '{peer.epoch}'"
-        else:
-            continue
-        raise BusError(
-            f"{reason}. Jobs could be done twice. Bring the journals back, or stop all arms and start them with new "
-            "journals."
-        )
 
 
 class ConsensusNode:
@@ -94,11 +77,13 @@ class ConsensusNode:
         journal: Journal[GrantRecord],
         *,
         boot: int,
+        new_epoch: bool = False,
     ) -> None:
         """Join; the arm's client and the journal are open.
 
         Args:
             boot: Number of this start of the arm.
+            new_epoch: Begin even if peers know claims of this arm that its journals do not.
 
         Raises:
             BusError: peers know another epoch, or claims of this arm after those in its journals.
@@ -111,6 +96,8 @@ class ConsensusNode:
         roster = membership.fleet.arms
         timing, excludes = membership.timing, membership.excludes
         granter = Granter(self._name, roster, register, journal.append, real_s=real_s, timing=timing, excludes=excludes)
+        self._first_number, self._new_epoch = first_number(self._name, boot, register), new_epoch
+        boot = self._first_number // NUMBERS_PER_BOOT
         self.participant = Participant(arm, granter, membership, boot=boot, rng=Random(f"{self._name} {boot}"))
         self.participant.add_jobs(register.jobs.values())
         self._stream = deque(membership.stream)
@@ -124,7 +111,11 @@ class ConsensusNode:
         arm.set_clock(FleetClock(self._speed, real_s + NOT_YET_S))
         link, fleet, name = self._link, self._link.fleet, self._name
         link.reply_to(keys.of_arm(fleet, name, "history"), HistoryRequest, self._history)
-        check_journals(name, boot, register.epoch, ask_arms(link))  # before it grants anything
+        self._joined = False
+        """Its peers were asked, when there were any, whether its journals are those that they know."""
+        self._asked_s = -math.inf
+        self._failure: BusError | None = None
+        self._join(ask_arms(link))  # before it grants anything
         self._declare()
 
     # For the arm
@@ -157,7 +148,7 @@ class ConsensusNode:
         real_s = time.monotonic()
         if math.isinf(self._membership.horizon_s):
             return False
-        if self.participant.ended:
+        if self.participant.known.ended:
             own = self.participant.executor.active or self.participant.executor.has_pending_reports
             others = any(status.state == "finishing" for status in self.statuses())
             return not (own or others) or real_s >= self._ended_s + LAST_S
@@ -169,14 +160,49 @@ class ConsensusNode:
 
     # Inside
 
+    def _join(self, histories: tuple[History, ...]) -> None:
+        """Check what the peers know, and adopt what this arm has lost.
+
+        Raises:
+            BusError: jobs might be done twice.
+        """
+        granter, number = self.participant.granter, self._first_number
+        check_journals(self._name, number, self._epoch, histories, new_epoch=self._new_epoch)
+        known = max((history.claims.get(self._name, -1) for history in histories), default=-1)
+        if known >= number or (known >= 0 and not self._epoch):
+            _LOG.warning("Arm '%s' adopts what %d arm(s) have done and have.", self._name, len(histories))
+            granter.adopt(adopted(self._name, granter.register, histories), time.monotonic())
+            self.participant.count_after(known)
+
+    def _ask_peers(self, real_s: float) -> None:
+        """Ask all peers what they know, before this arm takes or names an epoch."""
+        if real_s < self._asked_s + REPLY_S:
+            return
+        self._asked_s = real_s
+
+        def done(replies: Replies[History]) -> None:
+            try:
+                self._join(tuple(replies.messages.values()))
+                self._joined = True
+            except Refused as error:
+                self._warn("journal", f"cannot record what its peers know: {error}")
+            except BusError as error:
+                self._failure = error
+
+        self._link.query(
+            keys.of_every_arm(self._link.fleet, "history"), HistoryRequest(), History, done, timeout_s=REPLY_S
+        )
+
     def _step(self, real_s: float) -> None:
+        if self._failure is not None:
+            raise self._failure
         time_s = self._arm.clock.now_s(real_s)
         if not self._begun:
             self._begin(real_s)
         if self._begun:
             while self._stream and self._stream[0][0] <= time_s:
                 self.participant.add_jobs([self._stream.popleft()[1]])
-            if time_s >= self._membership.horizon_s and not self.participant.ended:
+            if time_s >= self._membership.horizon_s and not self.participant.known.ended:
                 self._end(real_s, time_s)
             self.participant.set_present(frozenset(self._tokens))
             self.participant.tick(real_s, time_s)
@@ -193,6 +219,9 @@ class ConsensusNode:
             self._since_s = real_s
         elif real_s - self._since_s >= (LISTEN_S if present == len(roster) else PATIENCE_S):
             first = self._name == min(self._tokens & roster | {self._name})
+            if not (self._epoch or self._joined):
+                self._ask_peers(real_s)
+                return
             if not (self._epoch or first):  # the first by name names the epoch; its bid begins the fleet's time here
                 return
             if self._take_epoch(self._epoch or secrets.token_hex(4)):
@@ -200,24 +229,25 @@ class ConsensusNode:
 
     def _end(self, real_s: float, time_s: float) -> None:
         """End the shift; only a last cycle continues."""
-        self.participant.ended, self._ended_s = True, real_s
+        self.participant.known.ended, self._ended_s = True, real_s
         executor = self.participant.executor
         if executor.active and not executor.active[0].may_commit:
             executor.return_all(time_s, real_s, "the shift is over")
 
     def _set_time(self, time_s: float, real_s: float) -> None:
         self._begun = True
-        self._arm.set_clock(FleetClock(self._speed, real_s, time_s), jump=True)
+        self._arm.set_clock(FleetClock(self._speed, real_s, time_s, epoch=self._epoch), jump=True)
 
     def _declare(self) -> None:
         link, fleet, name = self._link, self._link.fleet, self._name
         self._publish_bid = link.publisher(keys.of_arm(fleet, name, "bid"), Bid)
+        self._publish_operation = link.publisher(keys.of_arm(fleet, name, "operation"), Operation)
         link.reply_to(keys.asked_by_every_arm(fleet, name, "claim"), Claim, self._answer_claim)
         link.reply_to(keys.of_jobs(fleet, "submit"), Submission, self._submit)
         link.reply_to(keys.of_jobs(fleet, "status"), StatusRequest, self._status)
         link.reply_to(keys.of_jobs(fleet, "clear"), ClearRequest, self._clear)
-        link.reply_to(keys.of_jobs(fleet, "control"), ControlRequest, self._refuse)
-        link.reply_to(keys.of_jobs(fleet, "cell"), CellRequest, self._refuse)
+        link.reply_to(keys.of_jobs(fleet, "control"), ControlRequest, self._control)
+        link.reply_to(keys.of_jobs(fleet, "cell"), CellRequest, self._describe_cell)
         link.reply_to(keys.of_clock(fleet), ClockRequest, self._clock)
         link.subscribe(keys.of_every_arm(fleet, "bid"), Bid, self._apply_bid, history=True)
         link.subscribe(keys.of_every_arm(fleet, "state"), State, self.participant.states.__setitem__)
@@ -226,6 +256,9 @@ class ConsensusNode:
     def _apply_bid(self, arm: str, bid: Bid) -> None:
         real_s = time.monotonic()
         if arm == self._name or arm not in self.participant.granter.roster:
+            return
+        if bid.epoch and not (self._epoch or self._joined):
+            self._ask_peers(real_s)
             return
         if not self._take_epoch(bid.epoch) and not self._begun:
             return
@@ -249,13 +282,13 @@ class ConsensusNode:
         return epoch in ("", self._epoch)
 
     def _history(self, _: HistoryRequest) -> History:
-        return History(self._name, self._epoch, claims=dict(self.participant.granter.register.numbers))
+        return history_of(self._name, self.participant.granter.register, self.participant.known.submitted)
 
     def _apply_token(self, arm: str, present: bool) -> None:
         (self._tokens.add if present else self._tokens.discard)(arm)
 
     def _answer_claim(self, claim: Claim) -> ClaimReply:
-        if claim.arm == self._name:
+        if claim.arm == self._name or not self._begun:
             raise AnotherReplies
         return self.participant.answer_claim(claim, time.monotonic())
 
@@ -271,10 +304,15 @@ class ConsensusNode:
             raise AnotherReplies
 
     def _submit(self, submission: Submission) -> SubmissionReply:
-        known = {job.name: job for _, job in self._stream} | self.participant.jobs
-        ended = self.participant.ended
-        given_up = {status.job for status in self.statuses() if status.state == "given_up"}
-        admissions = admit(submission.jobs, known, places=self._membership.places, ended=ended, given_up=given_up)
+        known = {job.name: job for _, job in self._stream} | self.participant.known.submitted
+        ended = self.participant.known.ended
+        past = self.participant.granter.register.past
+        given_up = {status.job for status in self.statuses() if status.state in ABANDONED}
+        given_up |= {name for job in submission.jobs for name in job.after if past.is_given_up(name)}
+        count, places = len(self.participant.open_jobs(time.monotonic())), self._membership.places
+        admissions = admit(
+            submission.jobs, known, places=places, count=count, ended=ended, given_up=given_up, past=past
+        )
         accepted = tuple(job for job, reply in zip(submission.jobs, admissions, strict=True) if reply.accepted)
         self.participant.granter.add_jobs(tuple(job for job in accepted if job.name not in known), submission.by)
         self.participant.add_jobs(accepted)
@@ -285,7 +323,8 @@ class ConsensusNode:
         self._check_first()
         statuses = [status for status in self.statuses() if not request.jobs or status.job in request.jobs]
         time_s, register = self._arm.clock.now_s(time.monotonic()), self.participant.granter.register
-        return status_reply(self._name, time_s, statuses, register.space, self._epoch)
+        paused = register.operations.paused
+        return status_reply(self._name, time_s, statuses, register.space, self._epoch, paused)
 
     def _clear(self, request: ClearRequest) -> Cleared:
         real_s = time.monotonic()
@@ -296,9 +335,19 @@ class ConsensusNode:
             self._check_first()
         return Cleared(self._name, request.arm)
 
-    def _refuse(self, _: ControlRequest | CellRequest) -> NoReturn:
+    def _control(self, request: ControlRequest) -> Controlled:
         self._check_first()
-        raise Refused("Only a fleet with an auctioneer replies to this; these arms allocate the jobs themselves.")
+        real_s = time.monotonic()
+        later = (job for _, job in self._stream)
+        reply = self.participant.control(request, real_s, self._arm.clock.now_s(real_s), later)
+        _LOG.warning("'%s' requested: %s", request.by, request.action)
+        return reply
+
+    def _describe_cell(self, _: CellRequest) -> Cell:
+        self._check_first()
+        if self._membership.cell is None:
+            raise Refused("This arm knows no cell.")
+        return self._membership.cell
 
     def _clock(self, _: ClockRequest) -> Clock:
         self._check_first()
@@ -318,6 +367,8 @@ class ConsensusNode:
                         for each in bid.estimates
                     )
                     self._publish_bid(replace(bid, estimates=estimates))
+                case Operation() as operation:
+                    self._publish_operation(operation)
                 case Claim() as claim:
                     self._query_claim(claim)
 

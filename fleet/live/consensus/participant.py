@@ -13,32 +13,41 @@ Safety rests on step 4 alone (`fleet.live.consensus.granter`). Steps 1 to 3 only
 job: where messages are lost two arms may claim one, and the one without a majority waits and tries again.
 """
 
+import logging
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from random import Random
 
-from msgspec.structs import replace
-
 from fleet.bus.protocol.auction import JobSpec, JobStatus, Quote
+from fleet.bus.protocol.cell import Cell
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimReply
 from fleet.bus.protocol.messages import State
+from fleet.bus.protocol.operator import Controlled, ControlRequest, Operation, Settle
+from fleet.errors import JournalFull
 from fleet.live.arm.node import ArmNode
-from fleet.live.auction.job_rules import EXPIRED, SHIFT_ENDED, is_late, job_order, lost_jobs, ready_jobs
+from fleet.live.auction.control import ALREADY_DONE, job_of, next_step, objection, was_carried_out
+from fleet.live.auction.job_rules import job_order
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
 from fleet.live.auction.round import Bidding, Choice, Timing, resolve_claims
 from fleet.live.consensus.claimant import NUMBERS_PER_BOOT, Claimant
+from fleet.live.consensus.control import KnownFleet
 from fleet.live.consensus.granter import Granter
+from fleet.live.consensus.known_jobs import KnownJobs
 from fleet.live.monitor.snapshot import FRESH_S
 from fleet.live.space import Excludes, no_conflicts
 from fleet.observation import Observation
+
+_LOG = logging.getLogger(__name__)
 
 QUIET_S = 0.05
 """Real seconds without a new bid or choice, after which all arms most likely have the same bids."""
 BID_S = 1.0
 """Real seconds between two bids in which only the costs differ."""
 NO_CHOICE = Choice("")
+MAX_PAUSES = 4096
+"""Jobs whose pauses are known, besides those of which one lasts."""
 MAX_OPEN_JOBS = 32
 """Jobs in one bid."""
 
@@ -64,6 +73,8 @@ class Membership:
     """Fleet time at which the shift is over."""
     excludes: Excludes = no_conflicts
     """Which plans of two arms exclude each other."""
+    cell: Cell | None = None
+    """Reply to requests for the cell, in the name of this arm; None refuses them."""
     timing: Timing = field(default_factory=Timing)
 
 
@@ -71,12 +82,11 @@ class Participant:
     """One arm among its peers, from one start of its process to the next.
 
     Attributes:
-        jobs: All jobs that it knows, by release and name.
+        known: All jobs that it knows.
         claimant: Its claims.
         granter: Its grants.
         states: The last state of each arm; the driver puts them in.
-        out: Bids and claims to send, oldest first; the driver takes them out.
-        ended: The shift is over: it accepts no more jobs.
+        out: Bids, claims and requests of people that were carried out; the driver sends them.
         rounds: Number of choices of its policy.
         changed_s: Real second of the last change of a bid or choice.
     """
@@ -91,10 +101,10 @@ class Participant:
         self.name, self.executor, self.granter = arm.executor.arm, arm.executor, granter
         self._timing = membership.timing
         self.claimant = Claimant(arm.executor, granter, arm.answer_award, arm.space_of, boot=boot, timing=self._timing)
-        self.jobs: dict[str, JobSpec] = {}
+        self.known = KnownJobs(granter)
         self.states: dict[str, State] = {}
-        self.out: deque[Bid | Claim] = deque()
-        self.ended, self.rounds = False, 0
+        self.out: deque[Bid | Claim | Operation] = deque()
+        self.rounds = 0
         self._arm, self._fleet, self._policy = arm, membership.fleet, membership.choose
         self._excludes = membership.excludes
         self._slots, self._rng = min(membership.slots, MAX_OPEN_JOBS), rng
@@ -119,9 +129,12 @@ class Participant:
 
     def add_jobs(self, jobs: Iterable[JobSpec]) -> None:
         """Add jobs that it does not know yet."""
-        new = {job.name: job for job in jobs if job.name not in self.jobs}
-        if new:
-            self.jobs = {job.name: job for job in sorted((self.jobs | new).values(), key=job_order)}
+        self.known.add(jobs)
+
+    def count_after(self, number: int) -> None:
+        """Number the next claims and bids as those of the start after the one with this number."""
+        self.claimant.count_after(number)
+        self._number = max(self._number, (number // NUMBERS_PER_BOOT + 1) * NUMBERS_PER_BOOT)
 
     def set_present(self, present: frozenset[str]) -> None:
         """Set which arms are present."""
@@ -144,20 +157,24 @@ class Participant:
         """Send a peer outcomes of jobs that it takes for open, and jobs that it does not know."""
         register = self.granter.register
         for job in bid.open_jobs:
-            if job in register.settled:
-                self.claimant.send_outcome(register.settled[job])
-        if bid.closed_count >= register.closed_count:
+            if (outcome := register.settled.known(job, self.name)) is not None:
+                self.claimant.send_outcome(outcome)
+        if bid.digest == register.digest:
             self._behind_s.pop(bid.arm, None)
         elif real_s >= self._behind_s.setdefault(bid.arm, real_s) + 2 * BID_S:
             outcomes = list(register.settled.values())
-            for _ in range(min(MAX_OPEN_JOBS, len(outcomes))):
-                self._corrected = (self._corrected + 1) % len(outcomes)
-                self.claimant.send_outcome(outcomes[self._corrected])
-        full = len(bid.open_jobs) == MAX_OPEN_JOBS and bid.open_jobs[-1] in self.jobs
-        last = job_order(self.jobs[bid.open_jobs[-1]]) if full else (math.inf, "")
+            operations = register.operations.all
+            for _ in range(MAX_OPEN_JOBS):
+                self._corrected += 1
+                if outcomes:
+                    self.claimant.send_outcome(outcomes[self._corrected % len(outcomes)])
+                if operations:
+                    self.claimant.send_operation(operations[self._corrected % len(operations)])
+        full = len(bid.open_jobs) == MAX_OPEN_JOBS and bid.open_jobs[-1] in self.known.current
+        last = job_order(self.known.current[bid.open_jobs[-1]]) if full else (math.inf, "")
         for job in self.open_jobs(real_s) if register.jobs else []:
-            if job in register.jobs and job not in bid.open_jobs and job_order(self.jobs[job]) < last:
-                self.claimant.send_job(self.jobs[job])
+            if job in register.jobs and job not in bid.open_jobs and job_order(self.known.current[job]) < last:
+                self.claimant.send_job(register.jobs[job])
 
     def answer_claim(self, claim: Claim, real_s: float) -> ClaimReply:
         """Return the reply to a peer's claim.
@@ -165,15 +182,54 @@ class Participant:
         Raises:
             Refused: as `Granter.answer_claim`.
         """
-        reply = self.granter.answer_claim(claim, real_s)
-        self.add_jobs(claim.jobs)
-        return reply
+        before = self.granter.register.operations.digest
+        try:
+            return self.granter.answer_claim(claim, real_s)
+        finally:
+            self.add_jobs(job for job in claim.jobs if job.name in self.granter.register.jobs)
+            if self.granter.register.operations.digest != before:
+                self.known.apply_changes()
+
+    def control(
+        self, request: ControlRequest, real_s: float, time_s: float, later: Iterable[JobSpec] = ()
+    ) -> Controlled:
+        """Carry out a request of a person, once; it is on disk when this returns, and the peers get it.
+
+        Args:
+            later: Jobs that are not offered yet.
+
+        Raises:
+            Refused: it is not possible now.
+        """
+        granter, operations, job = self.granter, self.granter.register.operations, job_of(request)
+        self.add_jobs(each for each in later if each.name == job)
+        fleet = KnownFleet(
+            granter.register,
+            self.known.steered(job, self.states, real_s, time_s),
+            granter.register.past,
+            self.known.ended,
+        )
+        known = was_carried_out(fleet, request)
+        note = ALREADY_DONE if known else objection(fleet, request, granter.roster)
+        if not known:
+            operation = fleet.operation(self.name, request, time_s)
+            granter.operate(operation)
+            if isinstance(request.action, Settle) and request.action.outcome == "done" and not note:
+                self.claimant.send_outcome(granter.settle(operation, fleet.jobs[job].award))
+            granter.abandon(real_s)
+            self.known.apply_changes()
+            self.claimant.send_operation(operation)
+            self.out.append(operation)
+        status = next(iter(self.known.steered(job, self.states, real_s, time_s).values()), None)
+        changed, note = not (known or note), note or next_step(fleet, request)
+        return Controlled(self.name, request.request, changed, note, status and status.status, operations.paused)
 
     # Time
 
     def tick(self, real_s: float, time_s: float) -> None:
         """Do what is due."""
         self._time_s = time_s
+        self._obey(real_s)
         for job in self.claimant.rejected:
             self._lost = True
             self._pause(job, real_s)
@@ -186,20 +242,29 @@ class Participant:
         if claim := self.claimant.claim(self._present, self._arm.space, real_s):
             self.out.append(claim)
 
-    def open_jobs(self, real_s: float) -> list[str]:
-        """Return the jobs that can still be done, without those of absent arms that had permission to commit."""
-        register = self.granter.register
-        gone = {job for job in self.granter.out_of_contact(real_s) if register.grants[job].arm not in self._present}
-        gone.update(register.settled, self._given_up(self.jobs, real_s))
-        return [job for job in self.jobs if job not in gone]
+    def _obey(self, real_s: float) -> None:
+        """Stop what people have stopped, as far as it is not in its last cycle, and forget jobs of long ago."""
+        operations = self.granter.register.operations
+        try:
+            self.known.forget(real_s, self._time_s)
+        except JournalFull as error:
+            _LOG.error("Jobs that are given up are not recorded: %s", error)
+        if not operations.latest:
+            return
+        paused, cancelled = operations.is_paused(self.name), operations.all_cancelled
+        self.claimant.revoke(lambda job: paused or job in cancelled, real_s)
+        try:
+            self.granter.abandon(real_s)
+        except JournalFull as error:
+            _LOG.error("Cancelled jobs are not recorded: %s", error)
 
-    def _given_up(self, jobs: Mapping[str, JobSpec], real_s: float) -> dict[str, str]:
-        """Return why jobs are given up in which no arm has faulted too often: they expired, or wait for one that is."""
-        late = (job.name for job in jobs.values() if is_late(job, self._time_s))
-        settled = self.granter.register.settled
-        expired = {name for name in late if name not in settled and not self.granter.is_granted(name, real_s)}
-        causes = self.granter.register.given_up | expired
-        return dict.fromkeys(expired, EXPIRED) | (lost_jobs(jobs.values(), causes) if causes else {})
+    def open_jobs(self, real_s: float) -> list[str]:
+        """Return the jobs that can still be done."""
+        return self.known.open(self._present, real_s, self._time_s)
+
+    def status(self, later: Iterable[JobSpec], real_s: float) -> list[JobStatus]:
+        """Return the status of all known jobs, and of `later` ones that are not offered yet."""
+        return self.known.status(later, self.states, real_s, self._time_s)
 
     def all_settled(self, real_s: float) -> bool:
         """Return whether every present arm, a majority at least, knows that every job is settled."""
@@ -209,55 +274,19 @@ class Participant:
         known = all(bid is not None and bid[0].open_count == 0 and real_s < bid[1] + FRESH_S for bid in others)
         return known and not (self.open_jobs(real_s) or self.executor.has_pending_reports or self.executor.active)
 
-    def status(self, later: Iterable[JobSpec], real_s: float) -> list[JobStatus]:
-        """Return the status of all known jobs, and of `later` ones that are not offered yet."""
-        jobs = self.jobs | {job.name: job for job in later}
-        lost = self._given_up(jobs, real_s)
-        names = dict.fromkeys([*jobs, *self.granter.register.settled])
-        statuses = [self.granter.status(name, real_s) for name in names]
-        statuses = [
-            replace(status, state="given_up", reason=lost[status.job])
-            if status.state == "waiting" and status.job in lost
-            else status
-            for status in statuses
-        ]
-        if not self.ended:
-            return statuses
-        return [
-            replace(status, state="unfinished", reason=SHIFT_ENDED) if status.state == "waiting" else status
-            for status in statuses
-        ]
-
     # Bids and choices
-
-    def _ready(self, real_s: float, time_s: float) -> list[JobSpec]:
-        """Return the jobs that wait for an arm, as they queue, without recently rejected ones."""
-        settled = self.granter.register.settled
-        free = (
-            job
-            for name, job in self.jobs.items()
-            if name not in settled
-            and not self.granter.is_granted(name, real_s)
-            and not is_late(job, time_s)
-            and self._later_s.get(name, -math.inf) <= real_s
-        )
-
-        def finished(name: str) -> bool:
-            return name in settled and settled[name].outcome == "finished"
-
-        busy, returned_s = self.granter.busy_stations(real_s), self.granter.register.returned_s
-        return ready_jobs(free, time_s, self._slots, busy, finished, returned_s)
 
     def _bid(self, real_s: float, time_s: float) -> None:
         """Publish a bid when its content has changed, and every `BID_S`."""
-        capacity = 0 if self.ended or self._arm.unfit() else max(0, self.claimant.capacity)
-        ready = [] if self.ended else self._ready(real_s, time_s)
+        paused = self.granter.register.operations.is_paused(self.name)
+        capacity = 0 if self.known.ended or paused or self._arm.unfit() else max(0, self.claimant.capacity)
+        ready = [] if self.known.ended else self.known.ready(real_s, time_s, self._slots, self._later_s)
         names = [job.name for job in ready]
         if self._choice.job not in names or self.claimant.pending:
             self._choice = NO_CHOICE
         open_jobs = self.open_jobs(real_s)
         register, busy = self.granter.register, self.granter.busy_stations(real_s)
-        content = (capacity, names, len(open_jobs), self._choice, busy, dict(register.space))
+        content = (capacity, names, len(open_jobs), self._choice, busy, dict(register.space), register.digest)
         if content == self._last_bid and real_s < self._bid_s + BID_S:
             return
         self._new_bids |= content != self._last_bid
@@ -270,11 +299,11 @@ class Participant:
             capacity=capacity,
             estimates=self._arm.estimate(tuple(ready), register.cycles) if ready else (),
             open_count=len(open_jobs),
-            closed_count=register.closed_count,
             open_jobs=tuple(open_jobs[:MAX_OPEN_JOBS]),
             choice=self._choice.job,
             choice_plan=self._choice.plan,
             epoch=register.epoch,
+            digest=register.digest,
         )
         self.apply_bid(bid, real_s)
         self.out.append(bid)
@@ -314,7 +343,7 @@ class Participant:
         bidding = self._bidding(bids, [choice.job for choice in choices.values()], real_s)
         (job, plan), self._choice = self._choice, NO_CHOICE
         if resolve_claims(bidding, choices, self._fleet.arms).get(job) == (self.name, plan):
-            self.claimant.request(self.jobs[job], plan, real_s)
+            self.claimant.request(self.known.current[job], plan, real_s)
         else:
             self._lost = True
 
@@ -328,7 +357,7 @@ class Participant:
         return Bidding(
             auction="consensus",
             time_s=max(bid.time_s for bid in bids.values()),
-            jobs=tuple(self.jobs[name] for name in dict.fromkeys(names) if name in self.jobs),
+            jobs=tuple(self.known.current[name] for name in dict.fromkeys(names) if name in self.known.current),
             quotes={arm: quote for arm, quote in quotes.items() if quote.capacity and quote.estimates},
             full={arm: quote for arm, quote in quotes.items() if not (quote.capacity and quote.estimates)},
             states=self.states,
@@ -343,6 +372,9 @@ class Participant:
         first_s, longest_s = self._timing.pause_s
         count = self._pauses[job] = self._pauses.get(job, 0) + 1
         pause_s = min(longest_s, first_s * 2.0 ** min(count - 1, 10))
+        if len(self._later_s) > MAX_PAUSES:
+            self._later_s = {name: until_s for name, until_s in self._later_s.items() if until_s > real_s}
+            self._pauses = {name: count for name, count in self._pauses.items() if name in self._later_s}
         self._later_s[job] = real_s + pause_s * self._rng.uniform(0.2, 1.0)
 
 

@@ -2,8 +2,9 @@
 
 import msgspec
 
-from fleet.bus.protocol.auction import Count, Name
+from fleet.bus.protocol.auction import Count, JobState, Name
 from fleet.bus.protocol.consensus import Faults, JobOutcome
+from fleet.bus.protocol.operator import Operation
 from fleet.live.journal_records import ClockTick, EpochBegun, JobsAccepted, Progress, Released, SpaceCleared, SpaceTaken
 
 
@@ -49,8 +50,28 @@ class ClaimNumbered(msgspec.Struct, frozen=True, tag="claim_numbered"):
     number: Count
 
 
+class Requested(msgspec.Struct, frozen=True, tag="requested"):
+    """A request of a person is carried out, here or by a peer."""
+
+    operation: Operation
+
+
+class RequestsKnown(msgspec.Struct, frozen=True, tag="requests_known"):
+    """Requests of people that were carried out, by name."""
+
+    names: tuple[str, ...]
+
+
+class PastKnown(msgspec.Struct, frozen=True, tag="past_known"):
+    """Settled jobs that have left, as `PastJobs.packed`, and how many have left, by state."""
+
+    packed: bytes
+    left: dict[JobState, int]
+
+
 GrantRecord = (
-    JobGranted
+    PastKnown
+    | JobGranted
     | Released
     | JobSettled
     | Faulted
@@ -59,6 +80,8 @@ GrantRecord = (
     | ClockTick
     | ClaimNumbered
     | Progress
+    | Requested
+    | RequestsKnown
     | SpaceTaken
     | SpaceCleared
     | EpochBegun

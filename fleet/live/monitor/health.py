@@ -99,7 +99,9 @@ def check_health(
             Finding("warning", f"{overrun} message(s) dropped: they arrived faster than they were processed.")
         )
     if unfinished := fleet.counts.get("unfinished", 0):
-        findings.append(Finding("warning", f"{unfinished} job(s) are unfinished: they may have been done or not."))
+        findings.append(
+            Finding("warning", f"{unfinished} job(s) are unfinished, maybe done or not: their status names the reason.")
+        )
     if given_up := fleet.counts.get("given_up", 0):
         findings.append(Finding("warning", f"{given_up} job(s) are given up; their status names the reason."))
     findings += [Finding("fault", sentence) for sentence in other_versions]

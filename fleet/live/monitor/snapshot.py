@@ -218,7 +218,8 @@ def describe_event(event: ArmEvent) -> str:
 
 def describe_status(status: JobStatus) -> str:
     """Short text of a job's status, for example `crate_1: finished by arm_0 at 842 s`."""
-    arm = f" {'to' if status.state == 'awarded' else 'by'} {status.arm}" if status.arm else ""
+    link = {"awarded": "to", "finishing": "by", "finished": "by"}.get(status.state, "last at")
+    arm = f" {link} {status.arm}" if status.arm else ""
     end = "" if status.finished_s is None else f" at {status.finished_s:.0f} s"
     return f"{status.job}: {status.state}{arm}{end}{f': {status.reason}' if status.reason else ''}"
 

@@ -28,12 +28,12 @@ from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
 from fleet.live.arm.body import Body
 from fleet.live.arm.config import ArmConfig
 from fleet.live.arm.estimator import Estimator, NominalPeaks
-from fleet.live.arm.journal_records import ArmHistory, ArmRecord, put_aside
+from fleet.live.arm.journal_records import ArmHistory, ArmRecord
 from fleet.live.arm.node import ArmNode
 from fleet.live.arm.replay_body import ReplayBody, SensorLog
 from fleet.live.clock import FleetClock
 from fleet.live.journal import Journal
-from fleet.live.journal_upkeep import CompactingJournal
+from fleet.live.journal_upkeep import CompactingJournal, put_aside
 from fleet.motion import Plan
 from scenarios.cli.live.journals import folder_of, refuse_other_way
 from scenarios.cli.live.options import (
@@ -42,6 +42,7 @@ from scenarios.cli.live.options import (
     JobsOption,
     JournalOption,
     ModelOption,
+    NewEpochOption,
     RateOption,
     ScenarioFleetOption,
     SeedOption,
@@ -89,6 +90,7 @@ def arm_command(
     jobs: JobsOption = "scenario",
     endpoint: EndpointOption = ENDPOINT,
     fleet: ScenarioFleetOption = "",
+    new_epoch: NewEpochOption = False,
 ) -> None:
     """Run one arm of a fleet: publish its state, quote and execute jobs, and report, until Ctrl-C or SIGTERM."""
     from scenarios.cli.live import consensus
@@ -98,17 +100,20 @@ def arm_command(
         given = f"{source} {file or ''}".strip()
         raise FleetError(f"--source must be sim, or log with a FILE after the arm's name (got {given}).")
     _check_policy(policy, file)
+    if new_epoch and not policy:
+        raise FleetError("--new-epoch is for an arm with --policy, or for thermofleet auction: leave it out.")
     fleet, folder = folder_of(journal, fleet, chosen)
-    refuse_other_way(folder, (name,), alone=bool(policy))
+    refuse_other_way(folder, (name,), alone=bool(policy), new_epoch=new_epoch)
     with progress_bar() as progress:
         simulated = partial(simulated_arm, chosen, name, difficulty, seed, progress, risk=risk)
         arm = replayed_arm(name, file) if file else simulated()
+    # An award that is put aside is not executed again: its lease expires at the auctioneer, which awards the job anew
+    # or, if it had permitted the last cycle, calls it unfinished.
+    aside = put_aside(folder / f"{name}.aside", name)
     with (
         until_stopped() as stop,
         BusClient(endpoint, fleet, stopped=stop.is_set) as link,
-        Journal[ArmRecord](
-            folder / f"{name}.journal", ArmRecord, put_aside=put_aside(folder / f"{name}.aside", name)
-        ) as book,
+        Journal[ArmRecord](folder / f"{name}.journal", ArmRecord, put_aside=aside) as book,
         ExitStack() as resources,
     ):
         wait_for_name(link, name)
@@ -116,7 +121,9 @@ def arm_command(
         if policy:
             consensus.refuse_auctioneer(link)
             membership = consensus.membership_of(chosen, name, policy, jobs=jobs, seed=seed)
-            work_source = resources.enter_context(consensus.work_source(folder / f"{name}.grants", membership))
+            work_source = resources.enter_context(
+                consensus.work_source(folder / f"{name}.grants", membership, new_epoch=new_epoch)
+            )
         node = make_node(
             link, book, arm, chosen, speed=speed, rate_hz=rate_hz, capacity=capacity, work_source=work_source
         )
@@ -292,7 +299,7 @@ def make_node(
 
 def restart_history(book: Journal[ArmRecord], name: str, time_s: float) -> ArmHistory:
     """History of the arm at this start, written to its journal."""
-    before = ArmHistory().replay(book.records())
+    before = ArmHistory().replay(book.records(), book.put_aside)
     for active in before.active.values():
         log.warning("'%s' was unfinished at the last exit of the arm: returned.", active.job)
     history = before.after_restart(name, time_s)
@@ -308,5 +315,5 @@ def fleet_clock(link: BusClient, speed: float | None) -> FleetClock:
     for reply in answers.messages.values():
         if speed is not None and speed != reply.speed:
             log.warning("The fleet's speed is %g, not %g.", reply.speed, speed)
-        return FleetClock(reply.speed).set_to(asked_s, answered_s, reply.time_s)
+        return FleetClock(reply.speed, epoch=reply.epoch).set_to(asked_s, answered_s, reply.time_s)
     return FleetClock(speed or 1.0, answered_s)

@@ -16,9 +16,10 @@ from fleet.bus.protocol.auction import JobSpec, JobState, JobStatus, Submission
 from fleet.errors import Refused
 from fleet.job import Job
 from fleet.live.auction.node import AuctionNode
-from fleet.live.auction.records import AuctionRecord
+from fleet.live.auction.records import AuctionRecord, salvage
 from fleet.live.auction.round import Timing
 from fleet.live.journal import Journal
+from fleet.live.journal_upkeep import put_aside
 from scenarios.cli.live.journals import folder_of, refuse_other_way
 from scenarios.cli.live.options import (
     JobsOption,
@@ -69,10 +70,11 @@ def auction_command(
     refuse_other_way(folder, (arm.name for arm in chosen.arms), alone=False)
     with progress_bar() as progress:
         excludes, cell = cell_space(chosen, progress=progress), cell_message(chosen, name, progress=progress)
+    aside = salvage(put_aside(folder / f"{name}.aside", name))
     with (
         until_stopped() as stop,
         BusClient(endpoint, fleet, stopped=stop.is_set) as link,
-        Journal[AuctionRecord](folder / f"{name}.journal", AuctionRecord) as book,
+        Journal[AuctionRecord](folder / f"{name}.journal", AuctionRecord, put_aside=aside) as book,
     ):
         places = frozenset(place.name for place in chosen.places)
         timing = Timing(max_jobs=chosen.slots)
@@ -172,6 +174,6 @@ def summary(statuses: Sequence[JobStatus], time_s: float, left: Mapping[JobState
     finished, total = len(statuses) - len(others) + left.get("finished", 0), len(statuses) + sum(left.values())
     lines = [f"{time_s:.0f} s: {finished} of {total} jobs finished."]
     for job in others:
-        arm, reason = f" at {job.arm}" if job.arm else "", f", {job.reason}" if job.reason else ""
+        arm, reason = f" (arm: {job.arm})" if job.arm else "", f", {job.reason}" if job.reason else ""
         lines.append(f"  {job.job}: {job.state}{arm}{reason}")
     return "\n".join(lines)

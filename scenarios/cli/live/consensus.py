@@ -19,6 +19,7 @@ from scenarios.cli.live.auction import own_jobs, summary
 from scenarios.cli.signals import Stop
 from scenarios.cli.terminal import echo
 from scenarios.live.allocation import live_fleet
+from scenarios.live.cell import cell_message
 from scenarios.live.space import cell_space
 from scenarios.policy_loader import arm_policy_of
 from scenarios.schema import Scenario
@@ -47,6 +48,7 @@ def membership_of(scenario: Scenario, name: str, policy: str, *, jobs: str, seed
         stream=tuple(own_jobs(scenario, seed)) if stream else (),
         horizon_s=scenario.horizon_s if stream else float("inf"),
         excludes=cell_space(scenario),
+        cell=cell_message(scenario, name),
     )
 
 
@@ -62,14 +64,16 @@ def refuse_auctioneer(link: BusClient) -> None:
 
 
 @contextmanager
-def work_source(path: Path, membership: Membership) -> Iterator[Callable[[ArmNode, int], ConsensusNode]]:
+def work_source(
+    path: Path, membership: Membership, *, new_epoch: bool = False
+) -> Iterator[Callable[[ArmNode, int], ConsensusNode]]:
     """Factory of an arm's work source, from the arm and its boot number; the journal of its grants is open meanwhile.
 
     Raises:
         FleetError: the journal cannot be used.
     """
     with Journal[GrantRecord](path, GrantRecord) as book:
-        yield lambda arm, boot: ConsensusNode(arm, membership, book, boot=boot)
+        yield lambda arm, boot: ConsensusNode(arm, membership, book, boot=boot, new_epoch=new_epoch)
 
 
 def serve_until_done(node: ArmNode, stop: Stop) -> bool:
@@ -80,7 +84,8 @@ def serve_until_done(node: ArmNode, stop: Stop) -> bool:
         node.serve(time.monotonic() + TURN_S)
     if stop.is_set():
         return False
-    echo(summary(source.statuses(), node.clock.now_s(time.monotonic())))
+    left = source.participant.granter.register.settled.left
+    echo(summary(source.statuses(), node.clock.now_s(time.monotonic()), left))
     echo(f"This is the view of one arm, after {source.participant.rounds} rounds of allocation.")
     until_s = time.monotonic() + FAREWELL_S
     while not stop.is_set() and time.monotonic() < until_s:

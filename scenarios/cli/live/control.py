@@ -141,8 +141,8 @@ def _request(link: BusClient, control: ControlRequest) -> Controlled:
         for reason in filter(None, replies.refused.values()):
             raise BusError(reason)
     raise BusError(
-        f"No auctioneer of fleet '{link.fleet}' replied within {ATTEMPTS * REPLY_S:g} s. With TLS, use a certificate "
-        "of the role operator."
+        f"Neither an auctioneer nor an arm of fleet '{link.fleet}' replied within {ATTEMPTS * REPLY_S:g} s. With TLS, "
+        "use a certificate of the role operator."
     )
 
 

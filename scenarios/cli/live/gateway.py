@@ -20,6 +20,7 @@ from fleet.bus.client.client import BusClient
 from fleet.errors import FleetError
 from fleet.live.monitor.async_bridge import AsyncBridge
 from scenarios.cli.options import ENDPOINT, EndpointOption, FleetOption, number, the_fleet
+from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import Interrupted, echo
 from scenarios.live.http_access import MIN_TOKEN, ROLES, Role, check_token, read_tokens
 from scenarios.live.http_app import STUCK_S, Readers, application
@@ -56,7 +57,13 @@ def gateway_command(
     if token:
         roles[check_token(token)] = "operator"
     check(host, endpoint, bool(roles))
-    if asyncio.run(serve(endpoint, the_fleet(fleet, endpoint), host, port, roles)) == signal.SIGINT:
+    name = the_fleet(fleet, endpoint)
+    with listen(host, port, STUCK_S) as bound:
+        with until_stopped() as stop:
+            link = BusClient(endpoint, name, stopped=stop.is_set).open()
+        with link:
+            number = asyncio.run(serve(link, bound, roles))
+    if number == signal.SIGINT:
         raise Interrupted("The gateway was interrupted.")
 
 
@@ -162,20 +169,19 @@ def _protocol() -> type[H11Protocol]:
     return Protocol
 
 
-async def serve(endpoint: str, fleet: str, host: str, port: int, tokens: Mapping[str, Role]) -> int:
+async def serve(link: BusClient, bound: socket.socket, tokens: Mapping[str, Role]) -> int:
     """Serve until a signal arrives; return its number."""
     readers, received = Readers(), [0]
-    with listen(host, port, STUCK_S) as bound, BusClient(endpoint, fleet) as link:
-        async with AsyncBridge(link, readers.put) as bridge:
-            server = Server(application(bridge, readers, tokens=tokens), readers)
+    async with AsyncBridge(link, readers.put) as bridge:
+        server = Server(application(bridge, readers, tokens=tokens), readers)
 
-            def stop(number: int) -> None:
-                received[0], server.should_exit = number, True
+        def stop(number: int) -> None:
+            received[0], server.should_exit = number, True
 
-            for number in (signal.SIGINT, signal.SIGTERM):
-                asyncio.get_running_loop().add_signal_handler(number, stop, number)
-            address, bound_port, *_ = bound.getsockname()
-            shown = f"[{address}]" if ":" in address else address
-            echo(f"ready gateway http://{shown}:{bound_port}/v4 {os.getpid()}")
-            await server.serve(sockets=[bound])
+        for number in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().add_signal_handler(number, stop, number)
+        address, bound_port, *_ = bound.getsockname()
+        shown = f"[{address}]" if ":" in address else address
+        echo(f"ready gateway http://{shown}:{bound_port}/v4 {os.getpid()}")
+        await server.serve(sockets=[bound])
     return received[0]

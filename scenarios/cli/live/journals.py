@@ -23,11 +23,12 @@ def folder_of(folder: Path | None, fleet: str, scenario: Scenario) -> tuple[str,
     return name, where
 
 
-def refuse_other_way(folder: Path, arms: Iterable[str], *, alone: bool) -> None:
+def refuse_other_way(folder: Path, arms: Iterable[str], *, alone: bool, new_epoch: bool = False) -> None:
     """Check that journals in a folder are not of a shift with the other kind of allocation: jobs would be done twice.
 
     Args:
         alone: Whether the arms allocate jobs without an auctioneer.
+        new_epoch: Whether an arm may begin without its grants.
 
     Raises:
         FleetError: a journal is of the other kind.
@@ -35,10 +36,10 @@ def refuse_other_way(folder: Path, arms: Iterable[str], *, alone: bool) -> None:
     remedy = "Use the --policy that the shift was started with, or another folder for a new shift."
     for arm in arms:
         grants, journal = folder / f"{arm}.grants", folder / f"{arm}.journal"
-        if alone and not grants.exists() and journal.exists() and journal.stat().st_size:
+        if alone and not (new_epoch or grants.exists()) and journal.exists() and journal.stat().st_size:
             raise FleetError(
                 f"'{journal}' has no '{grants.name}' in its folder: the shift had an auctioneer, or the grants are "
-                f"lost, and jobs would be done twice. {remedy}"
+                f"lost, and jobs would be done twice. {remedy} If the grants are lost: --new-epoch."
             )
         if not alone and grants.exists() and grants.stat().st_size:
             raise FleetError(

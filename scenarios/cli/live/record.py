@@ -1,9 +1,7 @@
 """`thermofleet record`, `replay` and `report`: from the bus to Parquet, back to the bus, and to a page."""
 
 import fcntl
-import logging
 import os
-import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -12,30 +10,21 @@ from typing import Annotated
 import typer
 
 from fleet.bus.client.client import BusClient
-from fleet.bus.protocol import keys
-from fleet.bus.protocol.auction import ArmEvent, Result
-from fleet.bus.protocol.messages import State
 from fleet.errors import FleetError
 from fleet.files import atomic_path
 from scenarios.cli.live.options import MAX_SPEED
 from scenarios.cli.options import ENDPOINT, EndpointOption, check_name, number
 from scenarios.cli.signals import until_stopped
 from scenarios.cli.terminal import echo, out_console, say
-from scenarios.live.gap_fetcher import GapFetcher
-from scenarios.live.recorder import MAX_ROWS, Recorder
+from scenarios.live.recorder import Recorder
+from scenarios.live.recorder_node import RecorderNode
 from scenarios.live.replayer import Replay
 from scenarios.result_folder import disk_errors
 
 BACKLOG = 200_000
 """Messages that may wait: joining a fleet of a hundred arms brings a hundred thousand at once."""
-TURN_S, BATCH = 0.5, 1000
-"""Real seconds, and messages, after which received messages are written to the disk."""
-RETRY_S = 5.0
-"""Real seconds until the next attempt to write a part to a disk that refused."""
 CONNECT_S = 0.5
 """Real seconds that the router has to accept the session that fetches missed messages."""
-
-_LOG = logging.getLogger(__name__)
 
 
 def record(
@@ -50,27 +39,14 @@ def record(
     Raises:
         FleetError: the disk refuses at the beginning or at the end; in between it is tried again.
     """
-    with lock_folder(folder), closing(Recorder.open(folder, link.fleet)) as recorder:
-        link.subscribe(keys.of_every_arm(link.fleet, "state"), State, recorder.add, history=True)
-        link.subscribe(keys.of_every_arm(link.fleet, "event"), ArmEvent, recorder.add, history=True)
-        link.subscribe(keys.of_every_auction(link.fleet, "result"), Result, recorder.add, history=True)
-        due_s, failure = time.monotonic() + rotate_s, ""
-        with closing(GapFetcher(recorder, connect)) as fetcher:
-            while not stopped():
-                link.serve(time.monotonic() + TURN_S, at_least=BATCH)
-                fetcher.step(real_s := time.monotonic())
-                try:
-                    if real_s >= due_s or (recorder.waiting >= MAX_ROWS and not failure):
-                        due_s = real_s + rotate_s
-                        recorder.write()
-                    recorder.save()
-                    failure = ""
-                except FleetError as error:
-                    if not failure:
-                        _LOG.error("Not recorded yet: %s", error)
-                    failure, due_s = str(error), min(due_s, real_s + RETRY_S)
-        link.serve()
-        recorder.write(status="finished")
+    with (
+        lock_folder(folder),
+        closing(Recorder.open(folder, link.fleet)) as recorder,
+        closing(RecorderNode(link, recorder, connect, rotate_s=rotate_s)) as node,
+    ):
+        while not stopped():
+            node.serve()
+        node.end()
     return recorder
 
 
@@ -137,14 +113,26 @@ def replay_command(
 
 
 def report_command(
-    recording: Annotated[Path, typer.Argument(help="Folder of a recording, finished or not.")],
-    out: Annotated[Path | None, typer.Option(help="The HTML file. Default: report.html beside the recording.")] = None,
+    folder: Annotated[Path, typer.Argument(help="Folder of `thermofleet run`, or of a recording, finished or not.")],
+    out: Annotated[
+        Path | None, typer.Option(help="The HTML file. Default: in the folder of a run, beside that of a recording.")
+    ] = None,
+    scenario: Annotated[
+        str | None, typer.Option(help="Of a recording: the scenario of the fleet, to show its cell in 3-D.")
+    ] = None,
 ) -> None:
-    """Write the report of a live recording, as `run` writes one of a simulated shift."""
+    """Write the report of a live recording, as `run` writes one of a simulated shift, or that of a run anew."""
     from scenarios.live.recording_report import recording_html
+    from scenarios.load import load
+    from scenarios.run.run_folder import run_html
+    from scenarios.run.stored_run import read_run
 
-    path = out or recording.parent / "report.html"
-    html = recording_html(recording)
+    if (folder / "run.json").exists():
+        path, run = out or folder / "report.html", read_run(folder)
+        html = run_html(run.card, run.scenario, run.telemetry, run.events, run.jobs, run.offers)
+    else:
+        path = out or folder.parent / "report.html"
+        html = recording_html(folder, None if scenario is None else load(scenario))
     with disk_errors(path), atomic_path(path) as draft:
         draft.write_text(html, encoding="utf-8")
     say(f"Open {path} in a browser.", out_console)

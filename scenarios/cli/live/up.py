@@ -76,7 +76,9 @@ def parts_of(
     shared = ("--fleet", fleet, "--speed", f"{speed:g}", "--journal", str(folder / "journals"), "--seed", str(seed))
     allocation = ("--policy", policy, "--jobs", jobs)
     without_auctioneer, ends = scope_of(policy) == "arm", jobs == "scenario"
-    options = (*shared, "--difficulty", difficulty, "--risk", risk, *(allocation if without_auctioneer else ()))
+    begins = ("--new-epoch",) if new_epoch else ()
+    alone = (*allocation, *begins) if without_auctioneer else ()
+    options = (*shared, "--difficulty", difficulty, "--risk", risk, *alone)
     secure = () if tls is None else ("--tls", str(tls), "--scenario", scenario)
     listen = ("--port", str(port), *(("--host", host) if host else ()))
     router = Part(name="router", argv=(*PROGRAM, "router", *listen, *secure), ready=own)
@@ -87,7 +89,6 @@ def parts_of(
     record = part("record", "record", fleet, "--out", str(folder / "recording"), user="recorder", rank=1)
     if without_auctioneer:
         return router, arms, record, None
-    begins = ("--new-epoch",) if new_epoch else ()
     auction = part(
         "auction", "auction", scenario, *shared, *allocation, *begins, user="auctioneer", rank=3, essential=ends
     )
@@ -144,7 +145,7 @@ def up_command(
     _check_place(arms, router, host, names[0], tls)
     if tls is not None:
         check_roster(tls, scenario)
-    refuse_other_way(folder / "journals", names, alone=scope_of(policy) == "arm")
+    refuse_other_way(folder / "journals", names, alone=scope_of(policy) == "arm", new_epoch=new_epoch)
     with progress_bar() as progress:  # once, so that no arm has to plan or train by itself
         prepare(chosen, difficulty=difficulty, risk=choose("risk", risk, RiskName), progress=progress)
     own_router, parts, record, auction = parts_of(

@@ -32,7 +32,7 @@ def vda5050_command(
     name = the_fleet(fleet, endpoint)
     with (
         until_stopped() as stop,
-        BusClient(endpoint, name) as link,
+        BusClient(endpoint, name, stopped=stop.is_set) as link,
         StationLink(
             link,
             broker,

@@ -26,9 +26,10 @@ from fleet.bus.protocol.auction import (
 from fleet.bus.protocol.history import History, HistoryRequest
 from fleet.bus.protocol.messages import State
 from fleet.live.auction.node import AuctionNode
-from fleet.live.auction.records import AuctionRecord
+from fleet.live.auction.records import AuctionRecord, salvage
 from fleet.live.auction.round import Assignment
 from fleet.live.journal import Journal
+from fleet.live.journal_upkeep import put_aside
 
 PATIENCE_S = 15.0
 
@@ -119,6 +120,7 @@ class Bus:
         with ExitStack() as resources:
             link = resources.enter_context(BusClient(self.endpoint, "f"))
             path = self.folder / folder / name
+            extra["put_aside"] = salvage(put_aside(path.with_suffix(".aside"), name))
             journal = resources.enter_context(Journal[AuctionRecord](path, AuctionRecord, **extra))
             node = AuctionNode(link, name, journal, **{"allocate": first_come, "speed": 60.0, **options})
             node.resources = self.stack.enter_context(resources.pop_all())

@@ -19,7 +19,7 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
-from fleet.bus.protocol.messages import encode
+from fleet.bus.protocol.messages import State, encode
 from fleet.errors import JournalFull
 from fleet.live import journal, journal_upkeep
 from fleet.live.auction.job_rules import status_reply
@@ -172,3 +172,18 @@ def test_an_arm_of_an_older_version_is_named_with_its_version(bus):
         (sentence,) = other_versions(bus.endpoint, "f")
         token.undeclare()
     assert sentence.startswith("'arm 1' uses version v2 of the bus, and this program v4")
+
+
+def test_a_state_without_a_token_takes_no_space_unless_the_arm_is_of_the_cell(bus):
+    """Any process could stop the fleet: an arm outside the cell may be anywhere, and would be in everybody's way."""
+    node = bus.auctioneer(arms=("arm_0",), excludes=lambda *_: True)
+    outsider = bus.link()
+    said = State("nobody", 1, 0.0, "working", (30.0,), 30.0, space="s")
+    for _ in range(3):
+        outsider.publish(keys.of_arm("f", "nobody", "state"), said)
+        bus.serve_for(0.1)
+    assert "nobody" not in node.auctioneer.ledger.taken_space()
+    outsider.declare_token(keys.of_arm("f", "nobody", "alive"))
+    bus.until(lambda: "nobody" in node._tokens)
+    outsider.publish(keys.of_arm("f", "nobody", "state"), said)
+    bus.until(lambda: "nobody" in node.auctioneer.ledger.taken_space())

@@ -13,6 +13,7 @@ import pytest
 
 from agents.consensus import Consensus
 from fleet.bus.protocol.auction import JobEstimate, JobSpec, PlanQuote
+from fleet.bus.protocol.operator import ControlRequest, Operation
 from fleet.errors import JournalFull, Refused
 from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
 from fleet.live.arm.journal_records import ArmHistory
@@ -21,6 +22,7 @@ from fleet.live.auction.round import Timing
 from fleet.live.consensus.granter import Granter
 from fleet.live.consensus.participant import Membership, Participant
 from fleet.live.consensus.register import Register
+from fleet.live.consensus.settled_jobs import RANKS
 from fleet.live.space import no_conflicts
 from tests.live.disk import Crash, Disk
 
@@ -124,7 +126,11 @@ class Arm:
         self.participant.set_present(self.fleet.alive_for(self.name))
         self.participant.tick(self.real_s, self.fleet.true_s)
         while self.participant.out:
-            self.fleet.send(self.name, self.participant.out.popleft())
+            message = self.participant.out.popleft()
+            if isinstance(message, Operation):
+                self.fleet.operations.append(message)
+            else:
+                self.fleet.send(self.name, message)
 
     def _work(self) -> None:
         """Work, and go home when there is nothing to do; a hot arm stands where it stopped."""
@@ -203,6 +209,10 @@ class Fleet:
         self.unsure_jobs: set[str] = set()
         self.faults: dict[str, list[str]] = {}
         """Arm of each fault, by job."""
+        self.cancelled: set[str] = set()
+        """Jobs that a person has asked to cancel."""
+        self.operations: list[Operation] = []
+        """Requests of people that were published."""
         self.arms = {name: Arm(self, name, rate) for name, rate in zip(self.names, rates, strict=True)}
 
     def offer(self, arm: str, job: JobSpec) -> JobEstimate:
@@ -260,6 +270,13 @@ class Fleet:
         if self.reach(one, other):
             call()
 
+    def control(self, action, name: str, arm: str = ""):
+        """Return the reply of an arm, by default the first one, to the request of a person; a refusal is raised."""
+        one, replies = self.arms[arm or self.names[0]], []
+        request = ControlRequest(name, action, "ann")
+        one.run_until_crash(lambda: replies.append(one.participant.control(request, one.real_s, self.true_s)))
+        return replies[0] if replies else None
+
     def run(self, seconds: float, step_s: float = 0.1, stopped: str = "") -> None:
         """Run without message loss; one arm may be stopped."""
         for _ in range(round(seconds / step_s)):
@@ -298,14 +315,16 @@ class Fleet:
             self.run(0.1)
         return None
 
-    def settled(self) -> dict[str, str]:
-        """Return the outcomes that the arms know; they never differ, but a job that is given up may be finished yet."""
+    def settled(self, names=()) -> dict[str, str]:
+        """Return the outcomes that the arms know, of these jobs or of all that have not left: those that count most."""
         outcomes: dict[str, str] = {}
         for arm in self.arms.values():
-            for job, outcome in arm.participant.granter.register.settled.items():
-                if outcomes.setdefault(job, outcome.outcome) == "given_up":
+            settled = arm.participant.granter.register.settled
+            for job in names or settled:
+                if (outcome := settled.known(job, arm.name)) is None:
+                    continue
+                if RANKS.index(outcome.outcome) > RANKS.index(outcomes.setdefault(job, outcome.outcome)):
                     outcomes[job] = outcome.outcome
-                assert outcome.outcome in ("given_up", outcomes[job]), job
         return outcomes
 
 

@@ -8,12 +8,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from agents.consensus import Consensus
 from fleet.bus.client.client import BusClient
 from fleet.bus.client.router import Router
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Ack, ArmEvent, Award, JobSpec, Status, StatusRequest, Submission, SubmissionReply
+from fleet.bus.protocol.cell import Cell, CellRequest
+from fleet.bus.protocol.examples import EXAMPLES
+from fleet.bus.protocol.operator import Cancel, Controlled, ControlRequest, Operation, Pause
 from fleet.errors import BusError
 from fleet.job import Place
 from fleet.live.arm.award_executor import AwardExecutor, ExecutorConfig
@@ -57,7 +61,14 @@ def bus(tmp_path, small):
             lambda _, event: finished.update([event.job] if event.kind == "finish" else []),
         )
 
-        def arm(name, **membership):
+        operations: list[Operation] = []
+        outsider.subscribe(keys.of_every_arm("f", "operation"), Operation, lambda _, each: operations.append(each))
+
+        def lose_journals(name):
+            for kind in ("journal", "grants"):
+                (tmp_path / f"{name}.{kind}").unlink()
+
+        def arm(name, *, new_epoch=False, **membership):
             own = small.arm(ROSTER.index(name), [small.work(place) for place in PLACES])
             plans = {(work.kind, work.places[0].name): plans for work, plans in own.plans.items()}
             book = stack.enter_context(Journal(tmp_path / f"{name}.journal", ArmRecord))
@@ -76,7 +87,7 @@ def bus(tmp_path, small):
                 Estimator(own.model, lambda work: plans[work.kind, work.places[0].name], PLACES, NominalPeaks()),
                 FleetClock(SPEED, time.monotonic()),
                 ArmConfig(warning_c=60.0, rate_hz=20.0, boot=history.boot),
-                partial(ConsensusNode, membership=member, journal=grants, boot=history.boot),
+                partial(ConsensusNode, membership=member, journal=grants, boot=history.boot, new_epoch=new_epoch),
             )
             arms[name] = SimpleNamespace(node=node, link=link, book=book, grants=grants, work_source=node.work_source)
             return arms[name]
@@ -134,7 +145,9 @@ def bus(tmp_path, small):
             submit=submit,
             statuses=statuses,
             kill=kill,
+            lose_journals=lose_journals,
             finished=finished,
+            operations=operations,
             done_by_journals=done_by_journals,
         )
 
@@ -158,6 +171,32 @@ def test_submitted_jobs_are_allocated_to_several_arms_and_done_once(bus):
     assert not bus.submit(hold("a", "rack")).jobs[0].accepted, "names are unique"
     assert not bus.submit(hold("z", after=("nothing",))).jobs[0].accepted
     assert bus.submit(hold("a")).jobs[0].accepted, "an identical job is accepted again"
+
+
+def test_people_steer_arms_and_ask_for_the_cell(bus):
+    cell = EXAMPLES[Cell]
+    for name in ROSTER:
+        bus.arm(name, cell=replace(cell, auctioneer=name))
+    assert bus.ask(keys.of_jobs("f", "cell"), CellRequest(), Cell).places == cell.places
+    bus.submit(hold("long", repetitions=10_000), hold("later", "rack", release_s=1e6))
+    assert bus.serve(lambda: bus.statuses()["long"].cycles > 2)
+    assert bus.statuses()["long"].repetitions == 10_000
+
+    def control(name, action):
+        return bus.ask(keys.of_jobs("f", "control"), ControlRequest(name, action, "ann"), Controlled)
+
+    assert control("1", Cancel("later")).job.state == "cancelled"
+    assert control("2", Cancel("long")).changed
+    assert bus.serve(lambda: bus.statuses()["long"].state == "cancelled")
+    assert not control("2", Cancel("long")).changed
+    assert "no job 'x'" in control("3", Cancel("x"))
+    assert control("4", Pause()).paused == {"*": "ann"}
+    assert bus.serve(lambda: sorted(each.request.request for each in bus.operations) == ["1", "2", "4"])
+    assert {each.request.by for each in bus.operations} == {"ann"}
+    bus.kill("arm_0")  # the one that replied
+    assert bus.ask(keys.of_jobs("f", "status"), StatusRequest(), Status).paused == {"*": "ann"}
+    states = {name: each.state for name, each in bus.statuses().items()}
+    assert states == {"long": "cancelled", "later": "cancelled"}
 
 
 def test_all_jobs_of_a_common_stream_are_done(bus):
@@ -216,7 +255,40 @@ def test_a_restarted_arm_receives_missed_jobs_and_outcomes(bus):
     bus.submit(hold("b"), hold("c", "rack", release_s=1e6))
     assert bus.serve(lambda: settled(bus, "b"))
     back = bus.arm("arm_2").work_source.participant
-    assert bus.serve(lambda: "b" in back.granter.register.settled and "c" in back.jobs)
+    assert bus.serve(lambda: "b" in back.granter.register.settled and "c" in back.known.current)
+
+
+def test_an_arm_that_lost_its_journals_does_not_join_unless_a_person_requests_it(bus):
+    for name in ROSTER:
+        bus.arm(name)
+    bus.submit(hold("a"), hold("b", "rack"), hold("long", "shelf", repetitions=2000))
+    assert bus.serve(lambda: settled(bus, "a", "b"))
+    assert bus.serve(lambda: any(one.node.executor.active for one in bus.arms.values()))
+    lost = next(name for name, one in bus.arms.items() if not one.node.executor.active)
+    bus.kill(lost)
+    bus.lose_journals(lost)
+    for name in ROSTER:
+        if name != lost:
+            bus.kill(name)
+    back = bus.arm(lost)  # before the others: it takes part only when it knows what they know
+    for name in ROSTER:
+        if name != lost:
+            bus.arm(name)
+    with pytest.raises(BusError, match=r"knows claims of 'arm_\d'.*2 finished job\(s\).*--new-epoch"):
+        bus.serve(lambda: back.work_source._begun)
+    bus.kill(lost)
+    bus.lose_journals(lost)
+    back = bus.arm(lost, new_epoch=True)
+    register = back.work_source.participant.granter.register
+    assert bus.serve(lambda: back.work_source._begun)
+    assert {"a", "b"} <= register.settled.keys()
+    bus.submit(hold("a"), hold("c"))
+    assert bus.serve(lambda: settled(bus, "c"))
+    bus.kill(lost)
+    bus.arm(lost)  # the same journals again
+    bus.submit(hold("d", "rack"))
+    assert bus.serve(lambda: settled(bus, "d"))
+    assert bus.finished == Counter("abcd")
 
 
 def test_arms_do_not_start_where_an_auctioneer_is_present(bus, token_reaches):

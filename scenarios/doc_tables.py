@@ -8,12 +8,14 @@ from typing import Any
 
 from fleet.bus.client.rate_limits import Limits
 from fleet.bus.protocol import messages
-from fleet.bus.protocol.auction import MOST_JOBS
+from fleet.bus.protocol.auction import MOST_JOBS, ArmEvent
 from fleet.bus.protocol.examples import EXAMPLES
 from fleet.bus.protocol.registry import CHANNEL, CHANNELS, PATTERNS, SESSION_LEASE_S, Channel, MessageType
 from fleet.bus.protocol.schemas import Schema, descriptions, schemas
 from fleet.engine.reward import RewardWeights
 from fleet.errors import FleetError
+from fleet.events import MEANINGS
+from fleet.job import BOUNDS, LONGEST_GRASP_S, LONGEST_JOB_S
 from fleet.live.arm.award_executor import COMMIT_RETRY_S, RENEWALS, REPORT_RETRY_S, ExecutorConfig
 from fleet.live.auction.job_rules import MAX_OPEN_JOBS
 from fleet.live.auction.round import Timing
@@ -87,13 +89,22 @@ def _message(name: str, part: Schema, message: MessageType | None) -> str:
         for field, kind in part["properties"].items():
             default = f"`{json.dumps(kind['default'])}`" if "default" in kind else ""
             if_absent = "required" if field in required else default
-            rows.append((f"`{field}`", _type(kind), if_absent, kind.get("description", "")))
-        parts.append(table(("field", "type", "default", "meaning"), rows))
+            unit = (BOUNDS[field].unit if field in BOUNDS else "",) if name == "JobSpec" else ()
+            rows.append((f"`{field}`", _type(kind), *unit, if_absent, kind.get("description", "")))
+        unit = ("unit",) if name == "JobSpec" else ()
+        parts.append(table(("field", "type and bounds" if unit else "type", *unit, "default", "meaning"), rows))
     else:
         parts.append("No fields: the payload is `{}`.")
+    if message is ArmEvent:
+        parts += ["Kinds; those that no live arm reports come from simulated shifts (`run --listen`):", _event_table()]
     if message is not None:
         parts.append(f"```json\n{messages.encode(EXAMPLES[message]).decode()}\n```")
     return "\n\n".join(parts)
+
+
+def _event_table() -> str:
+    rows = [(f"`{kind}`", each.text, each.value, "yes" if each.live else "") for kind, each in MEANINGS.items()]
+    return table(("kind", "meaning", "`value`", "live arm"), rows)
 
 
 def _short(channel: Channel) -> str:
@@ -199,6 +210,8 @@ def _limit_table() -> str:
         (f"{MOST_JOBS}", "jobs in one message; a `Status` lists open jobs before closed ones"),
         (f"{MAX_OPEN_JOBS:,}", "open jobs of one auctioneer"),
         (f"{longest}", "characters of a job's name"),
+        (f"{LONGEST_GRASP_S:g} s", "`dwell_s` of a pick_place or sort"),
+        (f"{LONGEST_JOB_S:g} s", "`repetitions` times `dwell_s`, and the whole duration of a job"),
         (f"{messages.MOST:g}", f"any other number, positive or negative; {messages.MOST_COUNT:g} if it is whole"),
     ]
     return table(("limit", "applies to"), rows)

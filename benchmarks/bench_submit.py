@@ -1,0 +1,124 @@
+"""Submissions of one job each, at a constant rate, to an auctioneer with its journal on the disk.
+
+    python benchmarks/bench_submit.py [--rate 1000] [--seconds 30] [--sessions 4] [--out DIR]
+
+Router and auctioneer are processes of their own. The submitter does not wait for replies, so a slow reply delays no
+later submission. No arm is present, and every job expires `EXPIRES_S` after its submission: it is accepted, written
+through to the disk, given up and forgotten, and never are more than 10,000 jobs open. Prints how many submissions were
+answered and accepted, and the time to the reply. Exit code 1: one was not answered or not accepted, or the rate was not
+reached.
+"""
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.replies import Replies
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import Clock, ClockRequest, JobSpec, Submission, SubmissionReply
+from fleet.live.supervisor import Supervisor
+from scenarios.cli.live.up import free_port, parts_of
+from scenarios.load import load
+from scenarios.prepare.fleet import prepare
+
+SCENARIO, START_S, REPLY_S, EXPIRES_S = "quickstart", 60.0, 5.0, 2.0
+"""Real seconds: to start a process, to wait for a reply, and until a job expires."""
+
+
+class Submitters:
+    """Sends submissions over some sessions, and collects what became of them."""
+
+    def __init__(self, links: list[BusClient], clock: Clock) -> None:
+        self._links, self._clock, self._clock_s = links, clock, time.monotonic()
+        self._key = keys.of_jobs(links[0].fleet, "submit")
+        self.took_s: list[float] = []
+        """Real seconds from each answered submission to its reply."""
+        self.accepted = self.sent = self.ended = 0
+
+    def send(self) -> None:
+        """Submit the next job."""
+        now_s = time.monotonic()
+        due_s = self._clock.time_s + (now_s - self._clock_s + EXPIRES_S) * self._clock.speed
+        job = JobSpec(f"job {self.sent:07d}", "hold", ("clamp",), payload_kg=3.0, due_s=due_s, expires=True)
+        link, done = self._links[self.sent % len(self._links)], partial(self._reply, now_s)
+        link.query(self._key, Submission((job,), "rate"), SubmissionReply, done, timeout_s=REPLY_S)
+        self.sent += 1
+
+    def serve(self) -> None:
+        """Handle the replies that are there."""
+        for link in self._links:
+            link.serve()
+
+    def _reply(self, sent_s: float, replies: Replies[SubmissionReply]) -> None:
+        self.ended += 1
+        for reply in replies.messages.values():
+            self.took_s.append(time.monotonic() - sent_s)
+            self.accepted += sum(job.accepted for job in reply.jobs)
+
+
+def main() -> None:
+    """Submit, and print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rate", type=float, default=1000.0, help="submissions a second")
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--sessions", type=int, default=4)
+    parser.add_argument("--out", type=Path, help="folder for journal and logs; default: temporary")
+    arguments = parser.parse_args()
+    prepare(load(SCENARIO), difficulty="blind")
+    with ExitStack() as stack:
+        folder = arguments.out or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        router, _, _, auction = parts_of(
+            SCENARIO,
+            tuple(arm.name for arm in load(SCENARIO).arms),
+            port=free_port(),
+            fleet=SCENARIO,
+            folder=folder,
+            speed=1.0,
+            policy="quickest_matching",
+            difficulty="blind",
+            jobs="none",
+            seed=0,
+        )
+        assert auction is not None
+        supervisor = stack.enter_context(Supervisor(folder / "logs"))
+        supervisor.start(router, ready_s=START_S)
+        supervisor.start(auction, ready_s=START_S)
+        links = [stack.enter_context(BusClient(router.ready, SCENARIO)) for _ in range(arguments.sessions)]
+        clocks = links[0].query_and_wait(keys.of_clock(SCENARIO), ClockRequest(), Clock, timeout_s=REPLY_S)
+        submitters = Submitters(links, *clocks.messages.values())
+        took_s = run(submitters, arguments.rate, arguments.seconds)
+    wanted, per_s = round(arguments.rate * arguments.seconds), submitters.sent / took_s
+    answered, (p50_s, p99_s) = len(submitters.took_s), np.quantile(submitters.took_s or [np.nan], [0.5, 0.99])
+    print(
+        f"{submitters.sent} submissions in {took_s:.1f} s, {per_s:.0f} a second: {answered} answered, "
+        f"{submitters.accepted} accepted; reply p50 {p50_s * 1e3:.1f} ms, p99 {p99_s * 1e3:.1f} ms, longest "
+        f"{max(submitters.took_s, default=np.nan) * 1e3:.0f} ms; load of the machine {os.getloadavg()[0]:.1f}"
+    )
+    sys.exit(not (submitters.accepted == answered == wanted and per_s > 0.99 * arguments.rate))
+
+
+def run(submitters: Submitters, rate: float, seconds: float) -> float:
+    """Submit at a constant rate; return the real seconds until the last was sent, and wait for all replies."""
+    wanted, start_s = round(rate * seconds), time.monotonic()
+    while submitters.sent < wanted:
+        while submitters.sent < min(wanted, (time.monotonic() - start_s) * rate):
+            submitters.send()
+        submitters.serve()
+        time.sleep(0.001)
+    sent_s = time.monotonic() - start_s
+    while submitters.ended < wanted and time.monotonic() < start_s + sent_s + REPLY_S + 1.0:
+        submitters.serve()
+        time.sleep(0.001)
+    return sent_s
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,73 @@
+"""The recorder on the bus: receives what arms and auctioneers publish, and writes it in turns."""
+
+import logging
+import math
+import time
+from collections.abc import Callable
+
+from fleet.bus.client.client import BusClient
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import ArmEvent, Result
+from fleet.bus.protocol.messages import State
+from fleet.bus.protocol.operator import Operation
+from fleet.errors import FleetError
+from scenarios.live.gap_fetcher import GapFetcher
+from scenarios.live.recorder import MAX_ROWS, Recorder
+
+TURN_S, BATCH = 0.5, 1000
+"""Real seconds, and messages, after which received messages are written to the disk."""
+RETRY_S = 5.0
+"""Real seconds until the next attempt to write a part to a disk that refused."""
+
+_LOG = logging.getLogger(__name__)
+
+
+class RecorderNode:
+    """Records what a fleet publishes: call `serve` until the end, then `end`."""
+
+    def __init__(
+        self, link: BusClient, recorder: Recorder, connect: Callable[[], BusClient], *, rotate_s: float
+    ) -> None:
+        """Subscribe.
+
+        Args:
+            link: Open client of the bus.
+            connect: Makes another client of the fleet, not open yet, which fetches missed messages.
+            rotate_s: Real seconds between two Parquet parts; rows are in the journal before.
+        """
+        self._link, self.recorder, self._rotate_s = link, recorder, rotate_s
+        self._fetcher = GapFetcher(recorder, connect)
+        self._due_s, self._failure = time.monotonic() + rotate_s, ""
+        link.subscribe(keys.of_every_arm(link.fleet, "state"), State, recorder.add, history=True)
+        link.subscribe(keys.of_every_arm(link.fleet, "event"), ArmEvent, recorder.add, history=True)
+        link.subscribe(keys.of_every_auction(link.fleet, "result"), Result, recorder.add, history=True)
+        link.subscribe(keys.of_every_auction(link.fleet, "operation"), Operation, recorder.add, history=True)
+
+    def serve(self, until_s: float = math.inf) -> None:
+        """Handle messages for a turn, and do what is due; a disk that refuses is tried again later."""
+        self._link.serve(min(until_s, time.monotonic() + TURN_S), at_least=BATCH)
+        self._fetcher.step(real_s := time.monotonic())
+        try:
+            if real_s >= self._due_s or (self.recorder.waiting >= MAX_ROWS and not self._failure):
+                self._due_s = real_s + self._rotate_s
+                self.recorder.write()
+            self.recorder.save()
+            self._failure = ""
+        except FleetError as error:
+            if not self._failure:
+                _LOG.error("Not recorded yet: %s", error)
+            self._failure, self._due_s = str(error), min(self._due_s, real_s + RETRY_S)
+
+    def end(self) -> None:
+        """Write everything that has arrived, and end the recording.
+
+        Raises:
+            FleetError: the disk refuses.
+        """
+        self.close()
+        self._link.serve()
+        self.recorder.write(status="finished")
+
+    def close(self) -> None:
+        """Close the client that fetches."""
+        self._fetcher.close()

@@ -1,0 +1,33 @@
+"""Shifts played with given actions."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from fleet.engine.shift import Stepped, step
+from fleet.engine.state import World, initial
+from fleet.events import Event
+
+DT_S = 10.0
+
+
+def play(world, plant, actions, log=None, state=None) -> list[Stepped]:
+    """Play a shift with actions [tick][arm] for all envs; afterwards all arms wait."""
+    state = initial(world) if state is None else state
+    steps = []
+    for tick in range(world.ticks):
+        chosen = np.zeros((world.envs, len(world.arms)), dtype=int)
+        if tick < len(actions):
+            chosen[:] = actions[tick]
+        steps.append(step(world, state, chosen, plant, log))
+        state = steps[-1].state
+    return steps
+
+
+def with_random_difficulty(world: World, rng: np.random.Generator) -> World:
+    """Return the world with other difficulties, which decide between claims."""
+    return replace(world, offers=replace(world.offers, difficulty=rng.random(world.offers.difficulty.shape)))
+
+
+def times(log: list[Event], kind: str) -> list[float]:
+    return [e.time_s for e in log if e.kind == kind]

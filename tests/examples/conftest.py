@@ -1,0 +1,22 @@
+"""A cache of its own for every example, and a router."""
+
+from contextlib import ExitStack
+
+import pytest
+
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.router import Router
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("THERMOFLEET_CACHE", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def bus():
+    """The port of a router, and what makes lines to it."""
+    with ExitStack() as stack:
+        router = stack.enter_context(Router())
+        port = int(router.endpoint.rsplit(":", 1)[1])
+        yield port, lambda: stack.enter_context(BusClient(router.endpoint, "f"))

@@ -1,0 +1,53 @@
+"""Examples that need no fleet, or only watch one, run as their first lines say."""
+
+import importlib.util
+import re
+import subprocess
+import sys
+from types import ModuleType
+
+from scenarios.cli.live.up import free_port
+from tests.examples.programs import COMMAND, ROOT, program, started
+from tests.waiting import PATIENCE_S
+
+
+def example(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_own_policy_finishes_a_shift(capsys) -> None:
+    example("own_policy").main(horizon_s=1800, difficulty="oracle")
+    told = capsys.readouterr().out
+    for name in ("LeastDifficulty", "Careful"):
+        assert re.search(rf"{name}: reward -?[\d.]+, jobs \d+, peaks arm_0 [\d.]+ °C", told)
+
+
+def test_own_policy_is_compared_beside_the_rules() -> None:
+    own = f"{ROOT / 'examples' / 'own_policy.py'}:Careful"
+    options = ["--policies", f"least_difficulty,{own}", "--baseline", "least_difficulty", "--seeds", "2"]
+    command = [*COMMAND, "compare", "quickstart", *options, "--difficulty", "oracle"]
+    done = subprocess.run(command, timeout=120, capture_output=True, text=True, check=True)
+    assert "Careful" in done.stdout
+
+
+def test_monitor_hears_every_arm_from_another_process(tmp_path) -> None:
+    port = free_port()
+    with started(program("monitor", port)) as monitor:
+        options = ["--difficulty", "blind", "--listen", str(port), "--out", str(tmp_path / "run"), "--seed", "1"]
+        subprocess.run([*COMMAND, "run", "quickstart", *options], check=True, timeout=120, capture_output=True)
+        told, _ = monitor.communicate(timeout=PATIENCE_S)
+        assert monitor.returncode == 0
+    assert all(f"arm_{i}" in told for i in range(4))
+    assert "hottest motor" in told
+
+
+def test_every_example_for_outsiders_imports_nothing_of_ours():
+    for name in ("monitor", "submit_jobs", "own_arm", "own_allocator"):
+        source = (ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8")
+        imported = set(re.findall(r"^(?:import|from) (\w+)", source, re.MULTILINE))
+        assert imported - set(sys.stdlib_module_names) == {"zenoh"}

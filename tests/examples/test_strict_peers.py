@@ -1,0 +1,184 @@
+"""The example of an arm and that of an allocator keep the rules of the bus."""
+
+import json
+import subprocess
+from contextlib import ExitStack
+
+import pytest
+
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.router import Router
+from fleet.bus.protocol import keys
+from fleet.bus.protocol.auction import (
+    Ack,
+    Award,
+    Clock,
+    ClockRequest,
+    JobEstimate,
+    JobSpec,
+    Lease,
+    LeaseEntry,
+    LeaseRequest,
+    PlanQuote,
+    Quote,
+    QuoteRequest,
+    Receipt,
+    Report,
+    Result,
+    Status,
+    StatusRequest,
+)
+from fleet.bus.protocol.messages import DifficultyScores, State
+from tests.examples.programs import program, running, started
+from tests.waiting import PATIENCE_S, serve_until
+
+JOB = JobSpec(name="crate 1", kind="hold", places=("rack",), repetitions=3, payload_kg=1.0)
+
+
+def only(answers):
+    """The one answer to a question."""
+    assert not answers.refused
+    (word,) = answers.messages.values()
+    return word
+
+
+def test_own_arm_keeps_the_rules_towards_a_strict_auctioneer(bus):
+    port, link = bus
+    auctioneer, leave, asked, reports, states = link(), [], [], [], []
+
+    def lease(request):
+        asked.append(request)
+        held = tuple(hold.award for hold in request.entries)
+        return Lease(auctioneer="a", lease_s=6.0, granted=held, revoked=(), may_commit=held if leave else ())
+
+    def report(word):
+        reports.append(word)
+        return Receipt(auctioneer="a", award=word.award)
+
+    auctioneer.reply_to(keys.asked_by_every_arm("f", "a", "lease"), LeaseRequest, lease)
+    auctioneer.reply_to(keys.asked_by_every_arm("f", "a", "report"), Report, report)
+    auctioneer.reply_to(keys.of_clock("f"), ClockRequest, lambda _: Clock(time_s=5000.0, speed=60.0))
+    auctioneer.subscribe(keys.of_every_arm("f", "state"), State, lambda _, word: states.append(word))
+    scores, told = [], []
+    auctioneer.subscribe(keys.of_every_arm("f", "difficulty"), DifficultyScores, lambda _, word: scores.append(word))
+    auctioneer.watch_tokens(keys.of_every_arm("f", "alive"), lambda arm, there: told.append((arm, there)))
+    with started(program("own_arm", port, "f", "arm 1+b")):
+        serve_until(lambda: ("arm 1+b", True) in told and states, auctioneer)
+        assert states[0].time_s >= 5000.0
+
+        def question(key, word, kind):
+            return only(auctioneer.query_and_wait(keys.of_arm("f", "arm 1+b", key), word, kind, timeout_s=PATIENCE_S))
+
+        dry = question("quote", QuoteRequest(auction="r", jobs=(JOB,), dry_run=True), Quote)
+        assert dry.quote == ""
+        quote = question("quote", QuoteRequest(auction="r", jobs=(JOB,)), Quote)
+        assert quote.estimates[0].feasible
+        serve_until(lambda: scores, auctioneer)
+        assert scores[0].difficulty == (quote.estimates[0].plans[0].difficulty,)
+        award = Award(award="r-crate", auction="r", auctioneer="a", quote=quote.quote, job=JOB)
+        first, again = (question("award", award, Ack) for _ in range(2))
+        assert first == again
+        assert first.accepted
+        second = Award(award="r-other", auction="r", auctioneer="a", quote=quote.quote, job=JOB)
+        assert not question("award", second, Ack).accepted
+        unheard = Award(award="r-unheard", auction="r", auctioneer="a", quote="never made", job=JOB)
+        assert not question("award", unheard, Ack).accepted
+
+        serve_until(lambda: any(hold.phase == "finishing" for request in asked for hold in request.entries), auctioneer)
+        asked.clear()
+        serve_until(lambda: asked, auctioneer)  # it waits at its last cycle until it may begin it
+        assert asked[0].entries[0].cycles == JOB.repetitions - 1
+        assert not reports
+        leave.append(True)
+        serve_until(lambda: reports, auctioneer)
+        assert (reports[0].outcome, reports[0].cycles, reports[0].job) == ("finished", 3, "crate 1")
+    serve_until(lambda: ("arm 1+b", False) in told, auctioneer)
+    assert auctioneer.malformed == 0
+
+
+def test_own_allocator_keeps_the_rules_towards_a_strict_arm(bus):
+    port, link = bus
+    arm, awards, results = link(), [], []
+    leases, receipts = [], []
+
+    def offer(job):
+        return JobEstimate(job.name, (PlanQuote(difficulty=0.5),))
+
+    def quote(request):
+        return Quote(
+            arm="x", auction=request.auction, quote=f"x-{request.auction}", valid_s=3.0, twin="t", time_s=1.0,
+            mode="idle", headroom_k=20.0, capacity=0 if awards else 1, estimates=tuple(map(offer, request.jobs)),
+        )  # fmt: skip
+
+    def take(award):
+        awards.append(award)
+        return Ack(arm="x", award=award.award, accepted=True)
+
+    arm.reply_to(keys.of_arm("f", "x", "quote"), QuoteRequest, quote)
+    arm.reply_to(keys.of_arm("f", "x", "award"), Award, take)
+    arm.subscribe(keys.of_every_auction("f", "result"), Result, lambda _, word: results.append(word.status.state))
+    with running("own_allocator", port, "f"), started(program("submit_jobs", port, "f")):
+        serve_until(lambda: awards, arm)
+
+        def hold(phase, cycles):
+            holds = (LeaseEntry(award=awards[0].award, job=awards[0].job.name, cycles=cycles, phase=phase),)
+            key = keys.asked_by("f", "own", "lease", "x")
+            request = LeaseRequest(arm="x", entries=holds)
+            arm.query(key, request, Lease, lambda answers: leases.append(only(answers)), timeout_s=PATIENCE_S)
+            serve_until(lambda: leases, arm)
+            return leases.pop()
+
+        assert awards[0].award not in hold("working", 0).may_commit
+        assert awards[0].award in hold("finishing", 0).may_commit
+        word = Report(arm="x", award=awards[0].award, job=awards[0].job.name, outcome="finished", cycles=1, time_s=3.0)
+        for _ in range(2):
+            key = keys.asked_by("f", "own", "report", "x")
+            arm.query(key, word, Receipt, lambda answers: receipts.append(only(answers)), timeout_s=PATIENCE_S)
+        serve_until(lambda: len(receipts) == 2 and "finished" in results, arm)
+        assert receipts[0] == receipts[1]
+        assert awards[0].award in hold("working", 0).revoked
+        status = only(arm.query_and_wait(keys.of_jobs("f", "status"), StatusRequest(), Status, timeout_s=PATIENCE_S))
+        assert {word.job: word.state for word in status.jobs}[awards[0].job.name] == "finished"
+    assert arm.malformed == 0
+
+
+def test_own_allocator_does_not_begin_beside_arms_that_share_jobs_out(bus):
+    """They show no auctioneer's token: one of them answers for all."""
+    port, link = bus
+    arm = link()
+    arm.reply_to(keys.of_jobs("f", "status"), StatusRequest, lambda _: Status(auctioneer="x", time_s=1.0, jobs=()))
+    with started(program("own_allocator", port, "f"), stderr=subprocess.PIPE) as process:
+        serve_until(lambda: process.poll() is not None, arm)
+        assert process.returncode == 1
+        assert "jobs/status already" in process.stderr.read()
+    assert arm.malformed == 0
+
+
+@pytest.mark.parametrize("kinds", [("own_arm", "quote"), ("own_arm", "award"), ("own_allocator", "lease")])
+@pytest.mark.parametrize(
+    ("payload", "said"),
+    [(b"{", None), (b"[]", None), (b"{}", None), (b"\xff", None), (b"{}", "text/plain"), (b'{"jobs": 3}', None)],
+)
+def test_an_example_survives_rubbish_and_says_what_is_wrong(rubbish_at, kinds, payload, said):
+    assert "Malformed" in rubbish_at(*kinds, payload, said)
+
+
+@pytest.fixture(scope="module")
+def rubbish_at():
+    """Asks an example at a key for an answer to rubbish; each runs once for all questions."""
+    words = {"quote": "QuoteRequest", "award": "Award", "lease": "LeaseRequest"}
+    with ExitStack() as stack:
+        router = stack.enter_context(Router())
+        port = int(router.endpoint.rsplit(":", 1)[1])
+        line = stack.enter_context(BusClient(router.endpoint, "f"))
+        stack.enter_context(running("own_arm", port, "f", "x"))
+        stack.enter_context(running("own_allocator", port, "f"))
+
+        def ask(example, topic, payload, said):
+            key = keys.of_arm("f", "x", topic) if example == "own_arm" else keys.asked_by("f", "own", topic, "x")
+            encoding = said or f"application/json;thermofleet.{words[topic]}.v4"
+            (reply,) = list(line._session.get(key, payload=payload, encoding=encoding, timeout=PATIENCE_S))
+            assert str(reply.ok.encoding) == "application/json;thermofleet.Refusal.v4"
+            return json.loads(reply.ok.payload.to_string())["reason"]
+
+        yield ask

@@ -1,0 +1,189 @@
+"""Requests of people to arms without an auctioneer: what each does in each state of a job, also after restarts."""
+
+import pytest
+
+from fleet.bus.protocol.auction import JobSpec
+from fleet.bus.protocol.operator import Cancel, Change, Pause, Resume, Settle
+from fleet.errors import Refused
+
+
+def job(name: str, repetitions: int = 100, **more) -> JobSpec:
+    return JobSpec(name=name, kind="hold", places=(f"place of {name}",), repetitions=repetitions, **more)
+
+
+def states(fleet, name: str) -> set[str]:
+    """State of a job, as each arm knows it."""
+    return {
+        status.state
+        for arm in fleet.arms.values()
+        for status in arm.participant.status([], arm.real_s)
+        if status.job == name
+    }
+
+
+def run_until(fleet, condition, stopped: str = "", patience_s: float = 40.0) -> None:
+    for _ in range(round(patience_s / 0.1)):
+        if condition():
+            return
+        fleet.run(0.1, stopped=stopped)
+    raise AssertionError("the condition was never met")
+
+
+def holder(fleet, name: str):
+    """Name of the arm that has a job; "" for none."""
+    has = (arm.name for arm in fleet.arms.values() for active in arm.executor.active if active.job == name)
+    return next(has, "")
+
+
+def silent(fleet, name: str = "a") -> str:
+    """Run until an arm has permission to commit, then isolate it until the others call the job unfinished."""
+    run_until(fleet, lambda: any(arm.cycle_ends_s is not None for arm in fleet.arms.values()))
+    one = holder(fleet, name)
+    fleet.cut = {one}
+    others = [arm for arm in fleet.arms.values() if arm.name != one]
+    run_until(
+        fleet,
+        lambda: all(s.state == "unfinished" for a in others for s in a.participant.status([], a.real_s)),
+        stopped=one,
+    )
+    return one
+
+
+def test_a_waiting_job_is_cancelled_at_all_arms_and_its_followers_are_given_up(council):
+    fleet = council.Fleet([1.0] * 3, [job("a", release_s=1e6), job("b", after=("a",))])
+    reply = fleet.control(Cancel("a"), "one")
+    assert (reply.changed, reply.job.state, reply.job.reason) == (True, "cancelled", "Cancelled by 'ann'.")
+    assert not fleet.control(Cancel("a"), "one").changed
+    fleet.run(1.0)
+    assert (states(fleet, "a"), states(fleet, "b")) == ({"cancelled"}, {"given_up"})
+    assert [operation.request.by for operation in fleet.operations] == ["ann"]
+    for arm in fleet.arms.values():
+        arm.start()
+    assert states(fleet, "a") == {"cancelled"}
+    assert not fleet.control(Cancel("a"), "one").changed
+    with pytest.raises(Refused, match="no job 'x'"):
+        fleet.control(Cancel("x"), "two")
+
+
+def test_a_job_at_work_is_cancelled_after_the_cycle_in_progress_and_never_done(council):
+    fleet = council.Fleet([1.0] * 3, [job("a")])
+    run_until(fleet, lambda: any(a.cycles > 3 for arm in fleet.arms.values() for a in arm.executor.active))
+    other = next(name for name in fleet.names if name != holder(fleet, "a"))
+    reply = fleet.control(Cancel("a"), "one", other)
+    assert (reply.changed, reply.job.state, reply.job.repetitions) == (True, "awarded", 100)
+    assert "ends the cycle" in reply.note
+    run_until(fleet, lambda: states(fleet, "a") == {"cancelled"}, patience_s=5.0)
+    assert not any(arm.executor.active or arm.executor.has_pending_reports for arm in fleet.arms.values())
+    fleet.run(5.0)
+    assert "a" not in fleet.last_cycles
+
+
+def test_a_job_in_its_last_cycle_is_finished_in_spite_of_a_cancellation(council):
+    fleet = council.Fleet([1.0] * 3, [job("a", 1)])
+    run_until(fleet, lambda: bool(fleet.last_cycles))
+    assert "last cycle" in fleet.control(Cancel("a"), "one").note
+    run_until(fleet, lambda: states(fleet, "a") == {"finished"})
+
+
+def test_an_arm_that_is_cut_off_carries_a_cancellation_out_when_it_is_heard_again(council):
+    fleet = council.Fleet([1.0] * 3, [job("a")])
+    run_until(fleet, lambda: bool(holder(fleet, "a")))
+    one = holder(fleet, "a")
+    fleet.cut = {one}
+    fleet.control(Cancel("a"), "one", next(name for name in fleet.names if name != one))
+    run_until(fleet, lambda: "cancelled" in states(fleet, "a"), stopped=one)
+    fleet.cut = set()
+    run_until(fleet, lambda: states(fleet, "a") == {"cancelled"})
+    run_until(fleet, lambda: not fleet.arms[one].executor.active)
+    assert "a" not in fleet.last_cycles
+
+
+def test_an_unfinished_job_is_settled_as_done_and_stays_so(council):
+    fleet = council.Fleet([1.0] * 3, [job("a", 1)])
+    one = silent(fleet)
+    first = next(name for name in fleet.names if name != one)
+    with pytest.raises(Refused, match="settle it"):
+        fleet.control(Cancel("a"), "x", first)
+    assert fleet.control(Settle("a", "done"), "y", first).job.state == "finished"
+    assert not fleet.control(Settle("a", "done"), "z", first).changed
+    fleet.cut = set()
+    run_until(fleet, lambda: states(fleet, "a") == {"finished"})
+    fleet.run(3.0)
+    assert fleet.last_cycles == {"a": 1}
+
+
+def test_an_unfinished_job_is_redone_only_after_its_arm_was_stopped_and_cleared(council):
+    fleet = council.Fleet([1.0] * 3, [job("a", 1)])
+    one = silent(fleet)
+    first = next(name for name in fleet.names if name != one)
+    with pytest.raises(Refused, match=f"'{one}' may still do the last cycle"):
+        fleet.control(Settle("a", "redo"), "x", first)
+    fleet.arms[one].break_off()
+    fleet.arms[one].crash()  # it is unsure, and will report that
+    for name in fleet.names:
+        if name != one:
+            fleet.arms[name].clear(one)
+    assert fleet.control(Settle("a", "redo"), "y", first).job.state == "waiting"
+    run_until(fleet, lambda: "finished" in states(fleet, "a"), stopped=one)
+    fleet.cut = set()
+    run_until(fleet, lambda: states(fleet, "a") == {"finished"})
+    assert fleet.last_cycles == {"a": 1}
+
+
+def test_a_late_unsure_report_does_not_stop_a_job_that_is_redone(council):
+    fleet = council.Fleet([1.0] * 3, [job("a", 1, release_s=0.0)])
+    one = silent(fleet)
+    others = [name for name in fleet.names if name != one]
+    for name in others:
+        fleet.arms[name].clear(one)
+        fleet.arms[name].hot = True  # nobody can redo it yet
+    fleet.control(Settle("a", "redo"), "y", others[0])
+    fleet.arms[one].break_off()
+    fleet.arms[one].crash()
+    fleet.arms[one].hot = True
+    fleet.cut = set()
+    fleet.run(5.0)
+    assert states(fleet, "a") == {"waiting"}
+    for arm in fleet.arms.values():
+        arm.start()
+        arm.hot = False
+    run_until(fleet, lambda: states(fleet, "a") == {"finished"})
+
+
+def test_a_paused_arm_gives_its_job_back_and_gets_none_until_it_is_resumed(council):
+    fleet = council.Fleet([1.0] * 3, [job("a", 400)])
+    run_until(fleet, lambda: bool(holder(fleet, "a")))
+    one = holder(fleet, "a")
+    other = next(name for name in fleet.names if name != one)
+    assert fleet.control(Pause(one), "1", other).paused == {one: "ann"}
+    run_until(fleet, lambda: holder(fleet, "a") not in ("", one))
+    assert fleet.control(Pause(), "2").paused == {one: "ann", "*": "ann"}
+    with pytest.raises(Refused, match="All arms are paused"):
+        fleet.control(Resume(one), "3")
+    for arm in fleet.arms.values():
+        arm.start()
+    run_until(fleet, lambda: not holder(fleet, "a"))
+    fleet.run(3.0)
+    assert states(fleet, "a") == {"waiting"}
+    assert fleet.control(Resume(), "4").paused == {}
+    run_until(fleet, lambda: bool(holder(fleet, "a")))
+    with pytest.raises(Refused, match="no arm 'x'"):
+        fleet.control(Pause("x"), "5")
+
+
+def test_due_date_and_value_change_at_all_arms_and_the_latest_counts(council):
+    fleet = council.Fleet([1.0] * 3, [job("a", release_s=1e6, due_s=2e6, expires=True)])
+    fleet.cut = {fleet.names[0]}
+    fleet.control(Change("a", value=2.0), "1", fleet.names[0])
+    fleet.true_s += 1.0
+    fleet.control(Change("a", value=3.0), "2", fleet.names[1])
+    fleet.control(Change("a", due_s=3e6), "3", fleet.names[2])
+    with pytest.raises(Refused, match="due_s must be >= release_s"):
+        fleet.control(Change("a", due_s=5.0), "4")
+    fleet.cut = set()
+    fleet.run(6.0)
+    for arm in fleet.arms.values():
+        arm.start()
+        spec = arm.participant.known.current["a"]
+        assert (spec.due_s, spec.value) == (3e6, 3.0)
+        assert arm.participant.known.submitted["a"].value == 1.0

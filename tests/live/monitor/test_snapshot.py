@@ -1,0 +1,121 @@
+"""View of a fleet, from its messages, in bounded memory."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet.bus.protocol.auction import JobStatus, Status
+from fleet.bus.protocol.messages import DifficultyScores
+from fleet.live.monitor import snapshot as snapshot_module
+from fleet.live.monitor.snapshot import FRESH_S, FleetView, JobScore
+from tests.live.monitor.messages import result, stands, state
+
+
+@given(token=st.booleans(), age_s=st.floats(0.0, 10.0), spoke=st.booleans())
+def test_present_is_token_and_fresh_state(token, age_s, spoke):
+    seen = FleetView("f")
+    seen.set_token("arm", "a", token)
+    if spoke:
+        seen.update("a", state(), 100.0)
+    (arm,) = seen.snapshot(100.0 + age_s).arms
+    assert arm.present == (token and spoke and (100.0 + age_s) - 100.0 <= FRESH_S)
+    assert arm.state_age_s == (pytest.approx(age_s, abs=1e-9) if spoke else None)
+
+
+def test_the_hottest_motor_is_named_by_its_joint():
+    seen = FleetView("f")
+    seen.update("a", state(), 0.0)
+    (arm,) = seen.snapshot(0.0).arms
+    assert (arm.hottest_c, arm.joint) == (52.5, 2)
+
+
+def scores(time_s, **difficulty):
+    jobs, values = tuple(difficulty), tuple(difficulty.values())
+    return DifficultyScores("a", 1, time_s, "v", jobs, values, (None,) * len(jobs))
+
+
+@pytest.mark.parametrize(("speed", "age_s"), [(None, 2.0), (10.0, 7.0), (1.0, 61.0)])
+def test_scores_from_a_cache_are_as_old_as_the_arm_made_them(speed, age_s):
+    """Made at 40 s of fleet time, they arrive at 10 s; the state of 100 s arrives at 11 s; now it is 12 s."""
+    seen = FleetView("f", speed=speed)
+    seen.update("a", scores(40.0, x=0.5), 10.0)
+    seen.update("a", state(time_s=100.0), 11.0)
+    assert seen.snapshot(12.0).arms[0].difficulty_age_s == pytest.approx(age_s)
+
+
+def test_scores_of_jobs_that_have_ended_are_not_shown():
+    seen = FleetView("f")
+    seen.update("a", scores(1.0, x=0.5, y=None, z=0.2), 0.0)
+    seen.update_jobs(stands(1.0, "x"), 0.0)
+    assert seen.snapshot(0.0).arms[0].scores == {"y": JobScore(), "z": JobScore(difficulty=0.2)}
+
+
+def test_a_token_change_is_reported_once():
+    seen = FleetView("f")
+    assert [seen.set_token("arm", "a", there) for there in (True, True, False, False, True)] == [
+        True,
+        False,
+        True,
+        False,
+        True,
+    ]
+
+
+def test_jobs_unknown_to_the_auctioneer_are_dropped():
+    seen = FleetView("f")
+    for number, job in enumerate("ab"):
+        seen.update("au", result(40 + number, job, "finished"), 0.0)
+    seen.update("au", result(1, "new"), 2.0)  # said after the question was
+    seen.update_jobs(stands(5.0, "b", state="waiting"), 3.0)
+    seen.forget_other_jobs([stands(5.0, "b", state="waiting")], 1.0)
+    assert {job.job: job.state for job in seen.snapshot(3.0).jobs} == {"b": "waiting", "new": "awarded"}
+    seen.forget_other_jobs([], 9.0)  # nobody answered
+    assert seen.snapshot(9.0).counts == {"waiting": 1, "awarded": 1}
+
+
+def test_a_restarted_fleet_counts_its_results_anew():
+    seen = FleetView("f")
+    seen.update("au", result(40, "a", "finished"), 0.0)
+    seen.update_jobs(stands(900.0, "a"), 1.0)
+    seen.update_jobs(stands(3.0, "a", state="waiting"), 2.0)
+    seen.update("au", result(0, "a", "awarded"), 3.0)
+    assert seen.snapshot(3.0).counts == {"awarded": 1}
+
+
+@pytest.mark.parametrize(("jobs", "letters"), [(128, 1), (20, 2000)])
+def test_an_incomplete_status_reply_drops_no_job(jobs, letters):
+    names = [f"{number:03d}{'x' * letters}" for number in range(jobs)]
+    seen = FleetView("f")
+    seen.update("au", result(0, "old", "finished"), 0.0)
+    full = stands(5.0, *names)
+    seen.update_jobs(full, 2.0)
+    seen.forget_other_jobs([full], 1.0)
+    assert sum(seen.snapshot(2.0).counts.values()) == jobs + 1
+    seen.update_jobs(stands(1.0, *names), 3.0)  # but time that ran back does
+    assert sum(seen.snapshot(3.0).counts.values()) == jobs
+
+
+def test_an_older_result_changes_nothing():
+    seen = FleetView("f")
+    for word in (result(2, to="finished"), result(1, to="awarded")):
+        seen.update("au", word, 0.0)
+    assert seen.snapshot(0.0).counts == {"finished": 1}
+
+
+def test_the_auctioneers_status_adds_jobs_without_a_result():
+    seen = FleetView("f")
+    seen.update_jobs(Status("au", 1.0, (JobStatus("x", "waiting"), JobStatus("y", "finished"))), 0.0)
+    assert seen.snapshot(4.0).counts == {"waiting": 1, "finished": 1}
+    assert seen.snapshot(4.0).auctioneers[0].heard_age_s == 4.0
+
+
+def test_too_many_names_drop_the_oldest(monkeypatch):
+    monkeypatch.setattr(snapshot_module, "MAX_NAMES", 3)
+    monkeypatch.setattr(snapshot_module, "MAX_JOBS", 3)
+    seen = FleetView("f")
+    for number in range(10):
+        seen.update(f"a{number}", state(f"a{number}"), 0.0)
+        seen.update("au", result(number, f"j{number}"), 0.0)
+    now = seen.snapshot(0.0)
+    assert [arm.arm for arm in now.arms] == ["a7", "a8", "a9"]
+    assert [job.job for job in now.jobs] == ["j7", "j8", "j9"]

@@ -1,0 +1,168 @@
+"""The `watch` screen and command."""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+from io import StringIO
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+from rich.console import Console
+
+from fleet.bus.client.client import BusClient
+from fleet.bus.client.router import Router
+from fleet.bus.protocol import keys
+from fleet.live.monitor.snapshot import ArmSnapshot, FleetSnapshot, JobScore
+from scenarios.cli.live.up import free_port
+from scenarios.cli.live.watch import GONE_S, ShiftEnd
+from scenarios.live.watch_screen import arm_line, format_age, format_scores, format_time, screen
+from tests.waiting import PATIENCE_S
+
+
+def shown(now, width=80, height=24, events=()):
+    console = Console(file=StringIO(), width=width, height=height, force_terminal=False)
+    console.print(screen(now, list(events), height))
+    return console.file.getvalue()
+
+
+def fleet_of(arms):
+    return FleetSnapshot("f", tuple(arms), (), {"waiting": 2, "finished": 1}, ())
+
+
+SCORES = {"x": JobScore(52.0, 0.02), "y": JobScore(), "z": JobScore(41.0, 0.25, 0.5)}
+
+
+def arm_now(name="a", **change):
+    known = {
+        "token": True, "present": True, "mode": "working", "time_s": 3661.0, "hottest_c": 52.5, "joint": 2,
+        "headroom_k": 7.5, "job": "crate 1", "scores": SCORES, "state_age_s": 0.1,
+    }  # fmt: skip
+    return ArmSnapshot(arm=name, **{**known, **change})
+
+
+def test_the_screen_shows_the_fleet():
+    told = shown(fleet_of([arm_now()]), width=160, events=["a came"])
+    jobs = r"z 41 °C, P 0\.25 \(d 0\.50\); x 52 °C, P 0\.02 \(d —\); y — °C, P — \(d —\)"
+    assert re.search(rf"a +working +52\.5 J2 +7\.5 +crate 1 +{jobs} +0\.1 s +— +yes", told)
+    assert "1:01:01" in told
+    assert "1 of 1 arms present" in told
+    assert "jobs: 2 waiting, 1 finished" in told
+    assert "a came" in told
+
+
+@given(arms=st.integers(0, 40), width=st.integers(60, 200), height=st.integers(8, 50), events=st.integers(0, 20))
+def test_the_screen_fits_the_terminal(arms, width, height, events):
+    names = [arm_now(f"arm_{number}", headroom_k=float(number), job="j" * 60) for number in range(arms)]
+    told = shown(fleet_of(names), width, height, ["an event " * 20] * events).splitlines()
+    assert len(told) <= max(height, 4 + min(events, 6) + 2)
+    assert max(map(len, told)) <= width
+
+
+def test_a_small_screen_shows_the_arms_with_least_headroom():
+    names = [arm_now(f"arm_{number}", headroom_k=float(number)) for number in range(30)]
+    told = shown(fleet_of(names), height=12)
+    assert "arm_0 " in told
+    assert "arm_29" not in told
+    assert "more with more headroom" in told
+
+
+def test_an_empty_fleet_is_shown_as_empty():
+    told = shown(FleetSnapshot("f", (), (), {}, ()))
+    assert "no auctioneer" in told
+    assert "jobs: none" in told
+
+
+def test_ages_and_times_are_short():
+    assert [format_age(value) for value in (None, -0.1, 0.04, 9.94, 12.4, 130.0)] == [
+        "—",
+        "0.0 s",
+        "0.0 s",
+        "9.9 s",
+        "12 s",
+        "2 min",
+    ]
+    assert [format_time(value) for value in (0.0, 59.9, 3600.0, 86461.0)] == [
+        "0:00:00",
+        "0:00:59",
+        "1:00:00",
+        "24:01:01",
+    ]
+    assert format_scores(SimpleNamespace(scores={})) == ""
+    assert "headroom 7.5 K  job crate 1" in arm_line(arm_now())
+    assert "no token" in arm_line(arm_now(token=False))
+
+
+def command(*arguments):
+    return [sys.executable, "-u", "-c", "from scenarios.cli.main import main; main()", "watch", *arguments]
+
+
+def test_without_a_terminal_lines_are_printed_until_stopped(fleet):
+    for number, code in ((signal.SIGTERM, 0), (signal.SIGINT, 130)):
+        process = subprocess.Popen(
+            command("--endpoint", fleet.endpoint), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        )
+        try:
+            assert process.stdout.readline() == "a joined\n"
+            fleet.say()
+            while "52.5 °C J2" not in (told := process.stdout.readline()):
+                assert told
+            assert "j — °C, P — (d 0.50)" in told
+            process.send_signal(number)
+            assert process.wait(PATIENCE_S) == code
+        finally:
+            process.kill()
+            process.communicate(timeout=PATIENCE_S)
+
+
+def test_a_snapshot_is_json(fleet):
+    done = subprocess.run(
+        command("--endpoint", fleet.endpoint, "--json"), capture_output=True, text=True, timeout=60, check=True
+    )
+    told = json.loads(done.stdout)
+    assert told["fleet"] == "f"
+    assert [(arm["arm"], arm["token"], arm["present"]) for arm in told["arms"]] == [("a", True, False)]
+
+
+def test_the_end_of_a_shift_is_told_when_all_have_left():
+    end = ShiftEnd()
+    arm = ArmSnapshot("a", token=True, present=True)
+    at_work = FleetSnapshot("f", (arm,), (), {"finished": 3, "awarded": 1}, ())
+    left = replace(at_work, arms=(replace(arm, token=False),))
+    settled = replace(left, counts={"finished": 3, "given_up": 1})
+    assert end.check(settled, 0.0) == ""  # nobody has been seen
+    assert [end.check(fleet, 1.0) for fleet in (at_work, left)] == ["", ""]
+    assert end.check(left, 99.0) == end.check(at_work, 99.5) == end.check(settled, 100.0) == ""
+    assert end.check(settled, 100.0 + GONE_S) == "The shift has ended: 3 of 4 jobs finished, 1 given up."
+
+
+def test_watch_waits_for_a_router_and_a_fleet():
+    port = free_port()
+    with subprocess.Popen(command("--endpoint", f"tcp/127.0.0.1:{port}"), stdout=subprocess.PIPE, text=True) as process:
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(2.0)
+        with Router(port) as router, BusClient(router.endpoint, "f") as link:
+            link.declare_token(keys.of_arm("f", "arm_0", "alive"))
+            assert "arm_0" in process.stdout.readline()
+            process.terminate()
+            process.communicate(timeout=PATIENCE_S)
+
+
+@pytest.mark.parametrize("fleets", [(), ("f", "g")])
+def test_an_ambiguous_fleet_is_an_error(fleets, token_reaches):
+    with Router() as router:
+        links = [BusClient(router.endpoint, name).open() for name in fleets]
+        for link in links:
+            link.declare_token(keys.of_arm(link.fleet, "a", "alive"))
+            token_reaches(links[0], keys.of_arm(link.fleet, "a", "alive"))
+        done = subprocess.run(
+            command("--endpoint", router.endpoint, "--json"), capture_output=True, text=True, timeout=60
+        )
+        for link in links:
+            link.close()
+    assert done.returncode == 2
+    assert ("several fleets" if fleets else "no fleet") in done.stderr.replace("\n", " ")

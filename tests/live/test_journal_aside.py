@@ -1,0 +1,247 @@
+"""Journals of an auctioneer with one wrong record: it goes on, and what it cannot rely on is put aside and reported."""
+
+import json
+import random
+import zlib
+from contextlib import suppress
+from copy import deepcopy
+from functools import cache
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet.bus.protocol.auction import Award, JobSpec
+from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Pause, Resume, Settle
+from fleet.errors import JournalError, Refused
+from fleet.live.arm.journal_records import ArmHistory, ArmRecord, AwardAccepted, ReportReceived
+from fleet.live.auction.control import objection
+from fleet.live.auction.ledger import Ledger
+from fleet.live.auction.records import AuctionRecord, Awarded, Operated, salvage
+from fleet.live.journal import Journal
+from fleet.live.journal_records import ClockTick, Closed, CommitPermitted, JobsAccepted, Progress, Started
+from fleet.live.journal_upkeep import put_aside
+
+KINDS = ("deleted", "doubled", "repeated at the end", "changed")
+
+
+def spec(name: str, *after: str, repetitions: int = 3) -> JobSpec:
+    terms = {"repetitions": repetitions, "value": 2.0, "due_s": 900.0}
+    return JobSpec(name=name, kind="hold", places=(f"place of {name}",), after=after, **terms)
+
+
+@pytest.fixture(scope="module")
+def worked(live):
+    """Return fleets that have worked, by seed: their journals are real, and none is compacted but once."""
+
+    @cache
+    def work(seed: int):
+        rng = random.Random(seed)
+        fleet = live.Fleet([live.Arm("arm_0"), live.Arm("arm_1")])
+        fleet.submit(*(spec(f"j{i}", repetitions=rng.randint(1, 4)) for i in range(3)))
+        fleet.submit(spec("next", "j0"), spec("long", repetitions=1000))
+        for step in range(14):
+            fleet.run_without_faults(rng.uniform(0.1, 1.0), absent=rng.choice(["", "", "arm_0", "arm_1"]))
+            action = rng.choice([None, Cancel("j1"), Pause("arm_0"), Resume(), Change("j2", value=5.0), Cancel("long")])
+            if action is not None:
+                fleet.control(ControlRequest(f"r{step}", action, "ann"))
+            if rng.random() < 0.2:
+                name = rng.choice(["arm_0", "arm_1"])
+                fleet.arms[name].crash(fleet.true_s)
+            if step in (4, 5) and seed % 2:
+                fleet.auctioneer = fleet.restart()
+            if step == 7:
+                fleet.submit(spec("late"))
+        fleet.keep(*fleet.auctioneer.ledger.checks_due(), ClockTick(fleet.true_s))
+        return fleet
+
+    return work
+
+
+def altered(record, rng: random.Random, kind=AuctionRecord):
+    """Return the record with one field changed to another value that can be read."""
+    content = json.loads(msgspec.json.encode(record))
+    places = []
+
+    def visit(part, path):
+        for key, value in part.items() if isinstance(part, dict) else enumerate(part):
+            if isinstance(value, dict | list):
+                visit(value, [*path, key])
+            elif key not in ("type", "action", "time_s", "by"):
+                places.append([*path, key])
+
+    visit(content, [])
+    rng.shuffle(places)
+    for path in places:
+        part = content
+        for key in path[:-1]:
+            part = part[key]
+        before = part[path[-1]]
+        others = {bool: [not before], str: ["j2", "arm_1", "x:j0", "finished"], int: [7, 0], float: [3.0]}
+        for value in others.get(type(before), [0]):
+            part[path[-1]] = value
+            try:
+                other = msgspec.convert(content, kind)
+            except msgspec.ValidationError:
+                continue
+            if other != record:
+                return other
+        part[path[-1]] = before
+    return None
+
+
+def wrong_journal(records, kind: str, index: int, rng: random.Random, record_kind=AuctionRecord):
+    records, record = list(records), records[index]
+    if kind == "deleted":
+        del records[index]
+    elif kind == "doubled":
+        records.insert(index, record)
+    elif kind == "repeated at the end":
+        records.append(record)
+    else:
+        other = altered(record, rng, record_kind)
+        if other is None:
+            return None
+        records[index] = other
+    return records
+
+
+def names_in(*records) -> set[str]:
+    """Names of the jobs that records are about, with the jobs that wait for them."""
+    text = b"".join(map(msgspec.json.encode, records)).decode()
+    named = {name for name in ("j0", "j1", "j2", "next", "long", "late", "a", "b") if f'{name}"' in text}
+    return named | ({"next"} if "j0" in named else set())
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.integers(0, 5), st.sampled_from(KINDS), st.integers(0, 10_000), st.randoms(use_true_random=False))
+def test_one_wrong_record_leaves_other_jobs_as_they_are_and_no_job_is_done_twice(worked, seed, kind, index, rng):
+    fleet = worked(seed)
+    whole = Ledger(arms=tuple(fleet.arms)).replay(fleet.journal)
+    index = 1 + index % (len(fleet.journal) - 1)  # without the snapshot, which is the whole journal
+    journal = wrong_journal(fleet.journal, kind, index, rng)
+    if journal is None:
+        return
+    kept: list[bytes] = []
+    ledger = Ledger(arms=tuple(fleet.arms)).replay(journal, lambda record, reason: kept.append(record))
+    before, after = ({each.job: each for each in book.status()} for book in (whole, ledger))
+    touched = names_in(fleet.journal[index], journal[min(index, len(journal) - 1)])
+    aside = {name for name, status in after.items() if status.reason.startswith("Put aside")}
+    for name, status in before.items():
+        assert name in after, f"'{name}' is lost without a report"
+        if name not in touched:
+            assert after[name].state == status.state, f"'{name}' was not touched"
+        assert after[name].state == status.state or name in aside, f"'{name}' is wrong without a report"
+    assert not aside or kept
+    for name in aside:
+        assert after[name].state == "unfinished"
+        assert name not in {job.name for job in ledger.ready(1e6, 99)}
+    again = Ledger(arms=tuple(fleet.arms)).replay(ledger.compact())
+    assert again.status() == ledger.status(), "it is the same after the next start"
+
+    fleet = deepcopy(fleet)
+    fleet.journal = journal
+    if kind == "changed":  # a result may repeat the field that was changed
+        fleet.results.clear()
+    fleet.auctioneer = fleet.restart()
+    answer = fleet.answer
+
+    def answer_or_refuse(message):
+        with suppress(Refused):
+            return answer(message)
+
+    fleet.answer = answer_or_refuse
+    fleet.run_without_faults(8.0)
+    done = [job for arm in fleet.arms.values() for job in arm.done]
+    assert len(done) == len(set(done)), f"done twice: {done}"
+
+
+def journal_of(path, records: list[dict]):
+    """Write records with a right checksum, as another version may have written them; return the journal."""
+    body = json.dumps(records).encode()
+    path.write_bytes(b'{"crc":"%08x","records":%s}\n' % (zlib.crc32(body), body))
+    return Journal[AuctionRecord](path, AuctionRecord, put_aside=salvage(put_aside(path.with_suffix(".aside"), "au")))
+
+
+def as_json(record) -> dict:
+    return json.loads(msgspec.json.encode(record))
+
+
+@pytest.mark.parametrize("in_snapshot", [False, True])
+def test_a_job_that_cannot_be_read_is_put_aside_alone_and_settled_by_a_person(tmp_path, in_snapshot):
+    """`dwell_s` in milliseconds, from a version that had no bounds; an award of it follows."""
+    jobs = JobsAccepted((spec("good"), spec("poison"), spec("after", "poison")))
+    record = as_json(Ledger().replay([jobs]).compact()[0] if in_snapshot else jobs)
+    poison = record["jobs"][1]["spec"] if in_snapshot else record["jobs"][1]
+    poison["dwell_s"] = 60_000
+    awarded = as_json(Awarded("r:poison", "r", "poison", "arm_0", "q", 0, 1.0))
+    path = tmp_path / "au.journal"
+    with journal_of(path, [record, awarded]) as book:
+        ledger = Ledger().replay(book.records(), book.put_aside)
+        book.compact(*ledger.compact())
+    assert "60000" in path.with_suffix(".aside").read_text()
+    with Journal[AuctionRecord](path, AuctionRecord) as book:
+        ledger = Ledger().replay(book.records())
+    states = {each.job: each for each in ledger.status()}
+    assert {name: each.state for name, each in states.items()} == {
+        "good": "waiting",
+        "after": "waiting",
+        "poison": "unfinished",
+    }
+    assert "dwell_s" in states["poison"].reason
+    assert [job.name for job in ledger.ready(1.0, 9)] == ["good"]
+    refused = ledger.admit([spec("poison")])[0]
+    assert (refused.accepted, "settle it first" in refused.reason) == (False, True)
+    with pytest.raises(Refused, match="put aside"):
+        objection(ledger, ControlRequest("1", Cancel("poison")), frozenset())
+    done, redo = (Ledger().replay(ledger.compact()) for _ in range(2))
+    done.apply(Operated(ControlRequest("1", Settle("poison", "done")), 2.0))
+    assert [job.name for job in done.ready(1.0, 9)] == ["after", "good"]
+    redo.apply(Operated(ControlRequest("1", Settle("poison", "redo")), 2.0))
+    assert redo.admit([spec("poison")])[0].accepted
+
+
+def test_a_job_put_aside_by_contradiction_waits_again_after_it_was_settled():
+    twice = [Awarded(f"r{i}:a", f"r{i}", "a", "arm_0", "q", 0, 1.0) for i in range(2)]
+    ledger = Ledger().replay([JobsAccepted((spec("a"), spec("b"))), *twice])
+    assert [(each.job, each.state) for each in ledger.status()] == [("a", "unfinished"), ("b", "waiting")]
+    with pytest.raises(Refused, match="may still do the last cycle"):
+        objection(ledger, ControlRequest("1", Settle("a", "redo")), frozenset())
+    ledger.apply(Closed("r0:a", "returned", 1, 2.0))
+    assert ledger.status(["a"])[0].state == "unfinished"
+    ledger.apply(Operated(ControlRequest("1", Settle("a", "redo")), 3.0))
+    assert ledger.status(["a"])[0].state == "waiting"
+
+
+def test_a_damaged_line_in_the_middle_is_not_taken_for_a_wrong_job(tmp_path):
+    with journal_of(tmp_path / "au.journal", [as_json(JobsAccepted((spec("a"),)))]) as book:
+        book.append(ClockTick(1.0))
+        book.append(ClockTick(2.0))
+    content = book.path.read_bytes().replace(b'"time_s":1.0', b'"time_s":1.5')
+    book.path.write_bytes(content)
+    with pytest.raises(JournalError, match="line 2: damaged"):
+        book.open()
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.integers(0, 3), st.sampled_from(KINDS), st.integers(0, 10_000), st.randoms(use_true_random=False))
+def test_one_wrong_record_in_the_journal_of_an_arm_does_not_stop_it(boots, kind, index, rng):
+    award = Award("r:a", "r", "au", "q", spec("a"))
+    other = Award("r:b", "r", "au", "q", spec("b"))
+    records = [
+        Started(boot=boots),
+        AwardAccepted(award),
+        Progress("a", 1),
+        CommitPermitted("r:a"),
+        AwardAccepted(other),
+    ]
+    records += [Closed("r:a", "finished", 3, 2.0, job="a", arm="arm_0"), ReportReceived("r:a"), Progress("b", 2)]
+    journal = wrong_journal(records, kind, index % len(records), rng, ArmRecord)
+    if journal is None:
+        return
+    kept: list[str] = []
+    history = ArmHistory().replay(journal, lambda record, reason: kept.append(reason)).after_restart("arm_0", 3.0)
+    assert ArmHistory().replay(history.compact()).boot == history.boot
+    if not names_in(records[index % len(records)]) & {"b"} and "r:b" in history.reports:
+        assert history.reports["r:b"][1].outcome == "returned"
