@@ -65,7 +65,7 @@ def _output(output: dict[str, Any]) -> str:
         encoded = base64.b64encode(base64.b64decode("".join(data["image/png"]))).decode()
         return f'<img alt="Output of the cell above" src="data:image/png;base64,{encoded}">'
     if "text/html" in data:
-        return "<div>" + re.sub(r"\s*\n\s*", " ", "".join(data["text/html"])) + "</div>"
+        return '<div style="overflow-x: auto">' + re.sub(r"\s*\n\s*", " ", "".join(data["text/html"])) + "</div>"
     return "```text\n" + "".join(data.get("text/plain", output.get("text", ""))) + "\n```"
 
 

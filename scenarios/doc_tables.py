@@ -1,10 +1,10 @@
-"""Tables for docs/bus.md, env.md and cli.md, from the same source as the schemas, environment and command line."""
+"""Tables for docs/bus.md and docs/env.md, from the same source as the schemas and the environment."""
 
 import json
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import prod
-from typing import Any
+from types import MappingProxyType
 
 from fleet.bus.client.rate_limits import Limits
 from fleet.bus.protocol import messages
@@ -22,23 +22,31 @@ from fleet.live.auction.round import Timing
 from fleet.live.clock import CLOCK_DRIFT
 from fleet.live.monitor.snapshot import FRESH_S
 from fleet.observation import FIELDS, Layout
-from scenarios.cli.main import COMMANDS, load_command
 from scenarios.schema import RewardSpec
 
 _PART = re.compile(r"(<!-- made by thermofleet contract: (?P<name>\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
-def fill_tables(page: str) -> str:
+Tables = Mapping[str, Callable[[], str]]
+"""Text of each table by the name in its mark."""
+
+
+def fill_tables(page: str, more: Tables = MappingProxyType({})) -> str:
     """Replace every marked part of a page.
+
+    Args:
+        more: Tables that are not made here.
 
     Raises:
         FleetError: a mark names an unknown table.
     """
 
+    tables = {**_TABLES, **more}
+
     def fill(match: re.Match[str]) -> str:
-        if match["name"] not in _TABLES:
-            raise FleetError(f"Unknown table '{match['name']}' in the page. Allowed: {', '.join(_TABLES)}.")
-        return f"{match[1]}\n{_TABLES[match['name']]()}\n\n{match[3]}"
+        if match["name"] not in tables:
+            raise FleetError(f"Unknown table '{match['name']}' in the page. Allowed: {', '.join(tables)}.")
+        return f"{match[1]}\n{tables[match['name']]()}\n\n{match[3]}"
 
     return _PART.sub(fill, page)
 
@@ -251,39 +259,7 @@ def _number(value: float) -> str:
     return f"{value:.15g}".replace("-", "−")
 
 
-def _command_tables() -> str:
-    """Each command by group, with its text, arguments and options."""
-    panels = dict.fromkeys(entry.panel for entry in COMMANDS.values())
-    groups = {panel: [name for name, entry in COMMANDS.items() if entry.panel == panel] for panel in panels}
-    return "\n\n".join(
-        f"## {panel}\n\n" + "\n\n".join(_command(f"thermofleet {name}", load_command(name)) for name in names)
-        for panel, names in groups.items()
-    )
-
-
-def _command(name: str, command: Any) -> str:
-    """Any: typer keeps the class of commands private."""
-    context = command.make_context(name, [], resilient_parsing=True)
-    usage = " ".join((name, *command.collect_usage_pieces(context)))
-    parts = [f"### {name}", _plain(command.help or ""), f"```\n{usage}\n```"]
-    shown = [option.get_help_record(context) for option in command.get_params(context)]
-    rows = [
-        (f"`{names}`".replace("|", "\\|"), _plain(text)) for names, text in filter(None, shown) if names != "--help"
-    ]
-    if rows:
-        parts.append(table(("argument or option", "meaning"), rows))
-    parts += [_command(f"{name} {part}", command.commands[part]) for part in getattr(command, "commands", ())]
-    return "\n\n".join(parts)
-
-
-def _plain(text: str) -> str:
-    """Text of the command line as Markdown, with no sign that ends a cell or begins markup."""
-    spaced = re.sub(r" {2,}", " ", text)
-    return re.sub(r"(`[^`]*`)|([|*<])", lambda match: match[1] or f"\\{match[2]}", spaced)
-
-
 _TABLES: dict[str, Callable[[], str]] = {
-    "commands": _command_tables,
     "keys": _key_table,
     "patterns": lambda: table(("pattern", "meaning"), PATTERNS.items()),
     "transport": _transport_table,
