@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import nbformat
-from jupyter_client.manager import AsyncKernelManager
 from nbclient import NotebookClient
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
@@ -18,8 +17,7 @@ def execute(path: Path, folder: Path) -> nbformat.NotebookNode:
         CellExecutionError: a cell fails.
     """
     notebook = nbformat.read(path, as_version=4)
-    kernel = AsyncKernelManager(transport="ipc")
-    NotebookClient(notebook, km=kernel, timeout=LIMIT_S, resources={"metadata": {"path": str(folder)}}).execute()
+    NotebookClient(notebook, timeout=LIMIT_S, resources={"metadata": {"path": str(folder)}}).execute()
     for cell in notebook.cells:
         cell.metadata.pop("execution", None)  # times of the run
         if cell.cell_type == "code":
