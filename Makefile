@@ -14,7 +14,7 @@ ADAPTERS := $(filter-out bench,$(PINNED))
 ADAPTER_TESTS := $(ADAPTERS:%=test-adapter-%)
 
 .PHONY: demo test test-slow storm test-adapter test-adapters $(ADAPTER_TESTS) coverage lint bench bench-env chaos mesh simulate soak \
-	fuzz clean install
+	fuzz docs pictures clean install
 
 demo: $(STAMP)
 	@$(BIN)/thermofleet demo --out $(OUT)/demo
@@ -76,6 +76,16 @@ fuzz: $(VENV)/.atheris
 $(VENV)/.atheris: $(STAMP)
 	@$(PIP) atheris==3.0.0
 	@touch $@
+
+# The documentation as a site, with its links and anchors checked.
+docs: $(STAMP)
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict --site-dir $(abspath $(OUT))/site
+	@echo "Open $(OUT)/site/index.html in a browser."
+
+# Every picture of README and docs, and the outputs of the notebooks, made anew. Needs OpenGL (EGL) and Chromium.
+pictures: $(STAMP)
+	@$(BIN)/python docs/make_pictures.py
+	@$(BIN)/python docs/notebooks.py
 
 bench: $(STAMP)
 	@for b in benchmarks/bench_*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done

@@ -2,8 +2,9 @@
 
 import json
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import prod
+from types import MappingProxyType
 
 from fleet.bus.client.rate_limits import Limits
 from fleet.bus.protocol import messages
@@ -26,17 +27,26 @@ from scenarios.schema import RewardSpec
 _PART = re.compile(r"(<!-- made by thermofleet contract: (?P<name>\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
-def fill_tables(page: str) -> str:
+Tables = Mapping[str, Callable[[], str]]
+"""Text of each table by the name in its mark."""
+
+
+def fill_tables(page: str, more: Tables = MappingProxyType({})) -> str:
     """Replace every marked part of a page.
+
+    Args:
+        more: Tables that are not made here.
 
     Raises:
         FleetError: a mark names an unknown table.
     """
 
+    tables = {**_TABLES, **more}
+
     def fill(match: re.Match[str]) -> str:
-        if match["name"] not in _TABLES:
-            raise FleetError(f"Unknown table '{match['name']}' in the page. Allowed: {', '.join(_TABLES)}.")
-        return f"{match[1]}\n{_TABLES[match['name']]()}\n\n{match[3]}"
+        if match["name"] not in tables:
+            raise FleetError(f"Unknown table '{match['name']}' in the page. Allowed: {', '.join(tables)}.")
+        return f"{match[1]}\n{tables[match['name']]()}\n\n{match[3]}"
 
     return _PART.sub(fill, page)
 

@@ -6,8 +6,19 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
-TOP_FOLDERS = ("fleet", "twin", "agents", "scenarios", "tests", "benchmarks", "examples", "docs", "constraints")
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
+TOP_FOLDERS = (
+    "fleet",
+    "twin",
+    "agents",
+    "scenarios",
+    "tests",
+    "benchmarks",
+    "examples",
+    "docs",
+    "notebooks",
+    "constraints",
+)
 
 
 def anchors(page: Path) -> set[str]:

@@ -82,7 +82,7 @@ def test_a_missing_library_is_told_with_the_extra_that_has_it(extra):
 
 
 def test_every_extra_that_is_no_trainer_is_told_of():
-    assert set(extras.EXTRAS) == {name for name in EXTRAS if name not in (*ALONE, "all", "dev")}
+    assert set(extras.EXTRAS) == {name for name in EXTRAS if name not in (*ALONE, "all", "dev", "docs")}
 
 
 WITHOUT_EXTRAS = f"""

@@ -1,15 +1,16 @@
-"""`thermofleet contract`: schemas and AsyncAPI document of the bus, and the tables of docs/bus.md and docs/env.md."""
+"""`thermofleet contract`: schemas and AsyncAPI document of the bus, and the tables of bus.md, env.md and cli.md."""
 
 import json
+import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from fleet.errors import FleetError
 from scenarios.cli.terminal import out_console, say
 
-PAGES = ("bus.md", "env.md")
+PAGES = ("bus.md", "cli.md", "env.md")
 """Pages with generated tables."""
 
 
@@ -17,7 +18,7 @@ def contract_command(
     out: Annotated[Path, typer.Option(help="Folder for the documents.")] = Path("docs/contract"),
     check: Annotated[bool, typer.Option("--check", help="Only check whether the documents are current.")] = False,
 ) -> None:
-    """Write JSON schemas and AsyncAPI 3 document of all bus messages, and the tables of bus.md and env.md."""
+    """Write JSON schemas and AsyncAPI 3 document of all bus messages, and the tables of bus.md, cli.md and env.md."""
     made = documents(out)
     stale = [path for path, text in made.items() if not path.is_file() or path.read_text(encoding="utf-8") != text]
     if check:
@@ -40,8 +41,43 @@ def documents(out: Path) -> dict[Path, str]:
     made = {out / "schemas.json": _json(schema_document()), out / "asyncapi.json": _json(asyncapi())}
     for page in (out.parent / name for name in PAGES):
         if page.is_file():
-            made[page] = fill_tables(page.read_text(encoding="utf-8"))
+            made[page] = fill_tables(page.read_text(encoding="utf-8"), {"commands": _command_tables})
     return made
+
+
+def _command_tables() -> str:
+    """Each command by group, with its text, arguments and options."""
+    from scenarios.cli.main import COMMANDS, load_command
+
+    panels = dict.fromkeys(entry.panel for entry in COMMANDS.values())
+    groups = {panel: [name for name, entry in COMMANDS.items() if entry.panel == panel] for panel in panels}
+    return "\n\n".join(
+        f"## {panel}\n\n" + "\n\n".join(_command(f"thermofleet {name}", load_command(name)) for name in names)
+        for panel, names in groups.items()
+    )
+
+
+def _command(name: str, command: Any) -> str:
+    """Any: typer keeps the class of commands private."""
+    from scenarios.doc_tables import table
+
+    context = command.make_context(name, [], resilient_parsing=True)
+    usage = " ".join((name, *command.collect_usage_pieces(context)))
+    parts = [f"### {name}", _plain(command.help or ""), f"```\n{usage}\n```"]
+    shown = [option.get_help_record(context) for option in command.get_params(context)]
+    rows = [
+        (f"`{names}`".replace("|", "\\|"), _plain(text)) for names, text in filter(None, shown) if names != "--help"
+    ]
+    if rows:
+        parts.append(table(("argument or option", "meaning"), rows))
+    parts += [_command(f"{name} {part}", command.commands[part]) for part in getattr(command, "commands", ())]
+    return "\n\n".join(parts)
+
+
+def _plain(text: str) -> str:
+    """Text of the command line as Markdown, with no sign that ends a cell or begins markup."""
+    spaced = re.sub(r" {2,}", " ", text)
+    return re.sub(r"(`[^`]*`)|([|*<])", lambda match: match[1] or f"\\{match[2]}", spaced)
 
 
 def _json(document: object) -> str:

@@ -20,6 +20,7 @@ from fleet.files import cache_folder
 from scenarios.policy_loader import label, policy_of, scope_of
 from scenarios.prepare.fleet import RISK, DifficultyName, Fleet, RiskName, prepare
 from scenarios.progress import Count, Progress, quiet
+from scenarios.report.page import table
 from scenarios.run.evaluate import FIGURES, Outcome, outcomes
 from scenarios.schema import Scenario
 
@@ -76,12 +77,23 @@ class Comparison:
     seeds: tuple[int, ...]
     baseline: str
     figures: dict[str, dict[str, Figure]]
-    """[policy][figure]."""
+    """By policy and name of the figure."""
     scopes: dict[str, str]
-    """[policy]: central or arm, see `agents.policy`."""
+    """By policy: central or arm, see `agents.policy`."""
     channel: dict[str, Any]
     """`Channel.described`."""
     channel_text: str
+
+    def _repr_html_(self) -> str:
+        head = ("policy", *(HEADINGS[name] for name in FIGURES))
+        rows = [[label(policy), *map(self._cell, figures.values())] for policy, figures in self.figures.items()]
+        what = f"mean (difference to {label(self.baseline)}; * its 95 % interval excludes 0)"
+        return table(head, rows, caption=f"{self.scenario}, {len(self.seeds)} seeds: {what}")
+
+    @staticmethod
+    def _cell(figure: Figure) -> str:
+        difference = f" ({figure.difference:+.3g}{'*' * figure.excludes_zero})" if figure.difference else ""
+        return f"{figure.mean:.4g}{difference}"
 
 
 def compare(

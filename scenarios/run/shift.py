@@ -66,6 +66,11 @@ class RunResult:
     """Simulated time at the end."""
     total_reward: float
 
+    def _repr_html_(self) -> str:
+        from scenarios.report.notebook import run_html
+
+        return run_html(summary(self), self.events, self.offers)
+
 
 def run(
     fleet: Fleet,

@@ -15,6 +15,7 @@ from fleet.errors import FleetError
 from fleet.events import Event
 from fleet.robot import JOINTS
 from fleet.telemetry import MODES, Telemetry
+from scenarios.report.notebook import run_html
 from scenarios.run.run_folder import UNITS, check_format
 from scenarios.schema import Scenario
 from scenarios.shift_records import JobRecord, Offer
@@ -36,6 +37,9 @@ class StoredRun:
     def arms(self) -> tuple[str, ...]:
         """Names of the arms."""
         return tuple(arm.name for arm in self.scenario.arms)
+
+    def _repr_html_(self) -> str:
+        return run_html(self.card, self.events, self.offers)
 
 
 def read_run(folder: Path) -> StoredRun:

@@ -1,0 +1,61 @@
+"""Make every picture of README and docs anew: python docs/make_pictures.py.
+
+The film needs OpenGL without a display (EGL), the screenshots need Chromium. `$CHROMIUM` names another executable.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from playwright.sync_api import sync_playwright
+
+ROOT = Path(__file__).parents[1]
+PICTURES = ROOT / "docs" / "pictures"
+FILM_RUN = ("quickstart", "--policy", "round_robin", "--difficulty", "oracle", "--seed", "19")
+FILM = ("--size", "640x360", "--speed", "240", "--fps", "8", "--overwrite")
+REPORT_RUN = ("active_waiting", "--policy", "round_robin", "--difficulty", "oracle", "--seed", "1")
+GRAPHICS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+
+
+def thermofleet(*words: str) -> None:
+    """Run a command of thermofleet.
+
+    Raises:
+        CalledProcessError: it fails.
+    """
+    subprocess.run([sys.executable, "-m", "scenarios", *words], check=True, cwd=ROOT)
+
+
+def screenshot(page: Path, picture: Path) -> None:
+    """A picture of the first screen of a report."""
+    chromium = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
+    if chromium is None:
+        sys.exit(
+            "There is no Chromium here, which makes the screenshots. Install it, or name one: CHROMIUM=/path/to/it"
+        )
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=list(GRAPHICS))
+        view = browser.new_page(viewport={"width": 1280, "height": 1500})
+        view.goto(page.as_uri())
+        view.wait_for_selector("body[data-ready]")
+        view.screenshot(path=picture)
+        browser.close()
+
+
+def main() -> None:
+    """Make the pictures; prints the size of each."""
+    with TemporaryDirectory() as folder:
+        film, report = str(Path(folder) / "film"), str(Path(folder) / "report")
+        thermofleet("run", *FILM_RUN, "--out", film)
+        thermofleet("film", film, "--out", str(PICTURES / "shift.gif"), *FILM)
+        thermofleet("run", *REPORT_RUN, "--out", report)
+        screenshot(Path(report) / "report.html", PICTURES / "report.png")
+    for picture in sorted(PICTURES.iterdir()):
+        print(f"{picture.relative_to(ROOT)}: {picture.stat().st_size / 1e6:.2f} MB")
+
+
+if __name__ == "__main__":
+    main()
