@@ -32,6 +32,11 @@ def reason_for_silence(arm: str) -> str:
     return f"'{arm}' was about to finish it and has not renewed its lease since."
 
 
+def reason_to_follow(before: str) -> str:
+    """Return why a job is given up that waits for one that is."""
+    return f"Given up, because it waits for '{before}', which is given up."
+
+
 def admit(
     jobs: Sequence[JobSpec],
     known: Mapping[str, JobSpec],
@@ -135,7 +140,7 @@ def lost_jobs(jobs: Collection[JobSpec], given_up: Container[str]) -> dict[str, 
     for before in lost:  # grows meanwhile
         for name in waiting.get(before, ()):
             if name not in reasons and name not in given_up:
-                reasons[name] = f"Given up, because it waits for '{before}', which is given up."
+                reasons[name] = reason_to_follow(before)
                 lost.append(name)
     return reasons
 
