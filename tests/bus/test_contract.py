@@ -233,6 +233,7 @@ def test_the_committed_documents_are_current():
         ROOT / "docs" / "contract" / "schemas.json",
         ROOT / "docs" / "contract" / "asyncapi.json",
         ROOT / "docs" / "bus.md",
+        ROOT / "docs" / "cli.md",
         ROOT / "docs" / "env.md",
     }
 
