@@ -41,6 +41,7 @@ async function startReplay(figure, unitS) {
   try {
     cell = makeCell(place, model);
   } catch (error) {
+    place.className = "absent";
     place.textContent = "This browser cannot draw in 3-D (WebGL is missing). The figures below show the same shift.";
   }
   let timeS = data.q.first_s, playing = false, last = 0, shown = null, moveCursor = null;
