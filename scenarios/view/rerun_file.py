@@ -1,5 +1,8 @@
 """A recorded shift as a file of the Rerun viewer (`rerun FILE.rrd`), written by its SDK, with a layout."""
 
+# The extra `rerun` is too large for `dev`, so that its types are unknown to most.
+# pyright: reportMissingImports=false
+
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any  # archetypes of Rerun
