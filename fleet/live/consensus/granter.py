@@ -310,6 +310,8 @@ class Granter:
             return f"the space of '{arm}' was cleared"
         cancel = self.register.operations.cancelled(entry.job)
         if cancel is not None and not (grant is not None and same and grant.may_commit):
+            if grant is not None and same:  # its arm ends the cycle in progress, which may take longer than a lease
+                grant.until_s = real_s + self._timing.counted_lease_s
             return _cancelled_by(cancel)
         has_space = same and (entry.space or ANYWHERE) in self.register.space[arm]
         if not has_space and (in_way := self.in_the_way(arm, entry.space)):

@@ -78,6 +78,26 @@ def test_a_job_at_work_is_cancelled_after_the_cycle_in_progress_and_never_done(c
     assert "a" not in fleet.last_cycles
 
 
+@pytest.mark.parametrize("cancels", [True, False])
+def test_the_cycle_in_progress_counts_when_a_job_is_stopped(council, cancels):
+    fleet = council.Fleet([1.0] * 3, [job("a", 3)])
+    fleet.cycle_s = 8.0  # longer than a lease
+    run_until(fleet, lambda: any(arm.cycle_ends_s is not None for arm in fleet.arms.values()))
+    one = holder(fleet, "a")
+    fleet.control(Cancel("a") if cancels else Pause(), "one", next(name for name in fleet.names if name != one))
+    fleet.run(6.0)
+    assert states(fleet, "a") == {"awarded"}
+    run_until(fleet, lambda: states(fleet, "a") == {"cancelled" if cancels else "waiting"})
+    fleet.run(1.0)
+    assert {s.cycles for arm in fleet.arms.values() for s in arm.participant.status([], arm.real_s)} == {1}
+    if not cancels:
+        fleet.cycle_s = 0.2
+        fleet.control(Resume(), "two")
+        run_until(fleet, lambda: states(fleet, "a") == {"finished"})
+        assert fleet.cycles_done == 3
+    assert fleet.last_cycles == ({} if cancels else {"a": 1})
+
+
 def test_a_job_in_its_last_cycle_is_finished_in_spite_of_a_cancellation(council):
     fleet = council.Fleet([1.0] * 3, [job("a", 1)])
     run_until(fleet, lambda: bool(fleet.last_cycles))
@@ -163,7 +183,7 @@ def test_a_paused_arm_gives_its_job_back_and_gets_none_until_it_is_resumed(counc
     for arm in fleet.arms.values():
         arm.start()
     run_until(fleet, lambda: not holder(fleet, "a"))
-    fleet.run(3.0)
+    fleet.run(5.0)
     assert states(fleet, "a") == {"waiting"}
     assert fleet.control(Resume(), "4").paused == {}
     run_until(fleet, lambda: bool(holder(fleet, "a")))
