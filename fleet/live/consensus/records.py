@@ -41,6 +41,8 @@ class JobReturned(msgspec.Struct, frozen=True, tag="job_returned"):
 
     job: Name
     time_s: float
+    arm: Name | None = None
+    """None in the journals of earlier versions."""
 
 
 class ClaimNumbered(msgspec.Struct, frozen=True, tag="claim_numbered"):

@@ -60,6 +60,8 @@ class Register(TimedState[GrantRecord]):
     """Fleet time at which an arm last returned a job, by job."""
     cycles: dict[str, int] = field(default_factory=dict[str, int])
     """Cycles known to be done, by job."""
+    last_arm: dict[str, str] = field(default_factory=dict[str, str])
+    """The arm that has a job, or had it last, by job."""
     numbers: dict[str, int] = field(default_factory=dict[str, int])
     """Number of the last claim, by arm."""
     jobs: dict[str, JobSpec] = field(default_factory=dict[str, JobSpec])
@@ -80,6 +82,7 @@ class Register(TimedState[GrantRecord]):
             case JobGranted():
                 self._count(record.job, record.cycles)
                 self._number(record.arm, record.number)
+                self._note_arm(record.job, record.arm)
                 self.grants[record.job] = Grant(
                     record.arm, record.award, record.places, record.may_commit, record.revoked
                 )
@@ -94,6 +97,7 @@ class Register(TimedState[GrantRecord]):
                 self._add_faults(outcome.job, outcome.faults)
                 if outcome.outcome == "returned":
                     self._return(outcome.job, outcome.time_s)
+                    self._note_arm(outcome.job, outcome.arm)
                 elif self.is_news(outcome):
                     self.settled.put(outcome, self.jobs)
                     self.returned_s.pop(outcome.job, None)
@@ -102,8 +106,9 @@ class Register(TimedState[GrantRecord]):
                 self._forget()
             case Faulted(job, faults):
                 self._add_faults(job, faults)
-            case JobReturned(job, time_s):
+            case JobReturned(job, time_s, arm):
                 self._return(job, time_s)
+                self._note_arm(job, arm)
             case JobsAccepted(jobs):
                 self.jobs |= {job.name: job for job in jobs if job.name not in self.past}
             case PastKnown(packed, left):
@@ -143,7 +148,7 @@ class Register(TimedState[GrantRecord]):
                 JobGranted(grant.arm, number, grant.award, job, grant.places, cycles, grant.may_commit, grant.revoked)
             )
         records += [Faulted(job, faults) for job, faults in self.faults.items() if job not in self.settled]
-        records += [JobReturned(job, time_s) for job, time_s in self.returned_s.items()]
+        records += [JobReturned(job, time_s, self.last_arm.get(job)) for job, time_s in self.returned_s.items()]
         records += [JobSettled(outcome) for outcome in self.settled.values()]
         records += [RequestsKnown(tuple(self.operations.names))] if self.operations.names else []
         records += map(Requested, self.operations.all)
@@ -186,7 +191,7 @@ class Register(TimedState[GrantRecord]):
     def _forget(self) -> None:
         """Forget what is known of jobs that have left."""
         for job in self.settled.gone[self._forgotten :]:
-            for notes in (self.jobs, self.cycles, self.faults, self.returned_s):
+            for notes in (self.jobs, self.cycles, self.faults, self.returned_s, self.last_arm):
                 notes.pop(job, None)
             self.operations.forget(job)
         self._forgotten = len(self.settled.gone)
@@ -225,6 +230,11 @@ class Register(TimedState[GrantRecord]):
         if job not in self.past:
             self.cycles[job] = max(cycles, self.cycles.get(job, 0))
             _bound(self.cycles)
+
+    def _note_arm(self, job: str, arm: str | None) -> None:
+        if arm is not None and job not in self.past:
+            self.last_arm[job] = arm
+            _bound(self.last_arm)
 
     def _number(self, arm: str, number: int) -> None:
         self.numbers[arm] = max(number, self.numbers.get(arm, -1))
