@@ -124,7 +124,7 @@ class ResetReply(msgspec.Struct, frozen=True):
 
 class Operation(msgspec.Struct, frozen=True):
     """Published under `auction/{auctioneer}/operation`, without an auctioneer under `arm/{arm}/operation`: a request of
-    a person was carried out."""
+    a person was carried out, also one that changed nothing; not the same request again."""
 
     auctioneer: Name
     """Or the arm that replied, without an auctioneer."""
