@@ -227,17 +227,26 @@ def read_parts(folder: Path, kind: Kind) -> pa.Table:
     """Read everything of a kind that is on disk now, in order of time.
 
     Raises:
-        FleetError: it is no recording, or its journal is damaged.
+        FleetError: it is no recording, or its journal or a part is damaged.
     """
     rows, tables = list[dict[str, object]](), list[pa.Table]()
     for _ in range(_READS):
         parts = read_card(folder).parts
         rows = [row for own, row in map(to_row, _open_records(folder, parts + 1)) if own == kind]
-        tables = [pq.read_table(path, schema=SCHEMAS[kind]) for path in part_files(folder, kind)]
+        tables = [_read_part(path, kind) for path in part_files(folder, kind)]
         if read_card(folder).parts == parts:
             break
     table = pa.concat_tables([*tables, to_table(kind, rows)])
     return table.sort_by([("time_s", "ascending"), (_SORTED_BY.get(kind, "number"), "ascending")])
+
+
+def _read_part(path: Path, kind: Kind) -> pa.Table:
+    try:
+        return pq.read_table(path, schema=SCHEMAS[kind])
+    except (OSError, pa.ArrowException) as error:
+        raise FleetError(
+            f"Cannot read '{path}': {error} Restore the file, or move it away to read the recording without it."
+        ) from error
 
 
 def _open_records(folder: Path, number: int) -> list[Heard | Gap]:

@@ -154,3 +154,11 @@ def test_the_command_writes_the_page_beside_the_recording(tmp_path, capsys):
     Recorder.open(tmp_path / "empty", "f")
     with pytest.raises(FleetError, match="no state of an arm"):
         recording_html(tmp_path / "empty")
+
+
+def test_a_part_that_was_cut_is_named(tmp_path):
+    record(tmp_path / "r", LOG).write()
+    part = next((tmp_path / "r").glob("events-*.parquet"))
+    part.write_bytes(part.read_bytes()[:50])
+    with pytest.raises(FleetError, match=re.escape(str(part))):
+        recording_html(tmp_path / "r")

@@ -19,7 +19,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from fleet.bus.protocol.job_spec import JobSpec
-from fleet.bus.protocol.messages import Count, Name, Number, Share, finite
+from fleet.bus.protocol.messages import Count, Name, Number, Person, Share, finite
 from fleet.telemetry import Mode
 
 LeaseTime = Annotated[float, msgspec.Meta(gt=0, le=3600)]
@@ -44,7 +44,7 @@ class Submission(msgspec.Struct, frozen=True):
     """Request to `jobs/submit`: add jobs. The same job submitted twice is one job."""
 
     jobs: Jobs
-    by: str = ""
+    by: Person = ""
     """Who submits, for the records."""
 
 

@@ -16,6 +16,8 @@ from fleet.telemetry import Mode
 
 VERSION = 4
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=512)]
+Person = Annotated[str, msgspec.Meta(max_length=128)]
+"""Who requests something."""
 LEAST, MOST, MOST_COUNT = -1e12, 1e12, 10**15
 Count = Annotated[int, msgspec.Meta(ge=0, le=MOST_COUNT)]
 Number = Annotated[float, msgspec.Meta(ge=LEAST, le=MOST)]

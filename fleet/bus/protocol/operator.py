@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from fleet.bus.protocol.auction import JobStatus
-from fleet.bus.protocol.messages import Count, Name, Number, finite
+from fleet.bus.protocol.messages import Count, Name, Number, Person, finite
 
 JobName = Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
 
@@ -18,7 +18,7 @@ class ClearRequest(msgspec.Struct, frozen=True):
     """
 
     arm: Name
-    by: str = ""
+    by: Person = ""
     """Who requests it, for the records."""
 
 
@@ -29,7 +29,6 @@ class Cleared(msgspec.Struct, frozen=True):
     arm: Name
 
 
-Person = Annotated[str, msgspec.Meta(max_length=128)]
 ALL_ARMS = "*"
 """Instead of the name of an arm."""
 

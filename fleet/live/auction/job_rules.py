@@ -19,6 +19,8 @@ MAX_OPEN_JOBS = 10_000
 """Jobs of one auctioneer that are neither finished nor given up; more are refused."""
 MAX_BYTES = 60_000
 """Size of the statuses in one reply: a router may drop larger messages."""
+REASON_LENGTHS = (300, 80, 0)
+"""Characters of a reason in a reply to a submission: the first of these with which the reply fits into one message."""
 SHIFT_ENDED = "The shift ended before it was done."
 
 
@@ -28,6 +30,11 @@ NONE: Mapping[str, str] = {}
 def reason_for_silence(arm: str) -> str:
     """Return why a job is unfinished whose arm stopped renewing its lease after permission to commit."""
     return f"'{arm}' was about to finish it and has not renewed its lease since."
+
+
+def reason_to_follow(before: str) -> str:
+    """Return why a job is given up that waits for one that is."""
+    return f"Given up, because it waits for '{before}', which is given up."
 
 
 def admit(
@@ -79,10 +86,19 @@ def admit(
     reasons = [rejected.get(index) or never.get(job.name, "") for index, job in enumerate(jobs)]
     notes = lost_jobs(new.values(), given_up)
     notes |= {job.name: _past_note(job.name, past) for job in jobs if job.name in past}
-    return tuple(
-        Admission(job.name, not reason, reason or notes.get(job.name, ""))
-        for job, reason in zip(jobs, reasons, strict=True)
-    )
+    replies = [
+        Admission(job.name, not why, why or notes.get(job.name, "")) for job, why in zip(jobs, reasons, strict=True)
+    ]
+    return _in_one_message(replies)
+
+
+def _in_one_message(replies: Sequence[Admission]) -> tuple[Admission, ...]:
+    """Return the replies with their reasons as short as one message needs: a router may drop a larger one."""
+    for length in REASON_LENGTHS:
+        replies = [replace(reply, reason=reply.reason[:length]) for reply in replies]
+        if sum(len(encode(reply)) + 1 for reply in replies) <= MAX_BYTES:
+            break
+    return tuple(replies)
 
 
 def _past_note(name: str, past: PastJobs) -> str:
@@ -115,15 +131,17 @@ def is_same_work(one: JobSpec, other: JobSpec) -> bool:
 
 def lost_jobs(jobs: Collection[JobSpec], given_up: Container[str]) -> dict[str, str]:
     """Return why jobs are given up that wait for one that is, directly or not, by name."""
+    waiting: dict[str, list[str]] = {}
+    for job in jobs:
+        for before in job.after:
+            waiting.setdefault(before, []).append(job.name)
     reasons: dict[str, str] = {}
-    before = -1
-    while len(reasons) > before:
-        before = len(reasons)
-        for job in jobs:
-            if job.name not in reasons and job.name not in given_up:
-                lost = next((name for name in job.after if name in given_up or name in reasons), None)
-                if lost is not None:
-                    reasons[job.name] = f"Given up, because it waits for '{lost}', which is given up."
+    lost = [before for before in waiting if before in given_up]
+    for before in lost:  # grows meanwhile
+        for name in waiting.get(before, ()):
+            if name not in reasons and name not in given_up:
+                reasons[name] = reason_to_follow(before)
+                lost.append(name)
     return reasons
 
 

@@ -16,7 +16,14 @@ from fleet.bus.protocol.messages import encode
 from fleet.bus.protocol.operator import ALL_ARMS, Cancel, ControlRequest, Pause, Resume, Settle
 from fleet.bus.protocol.operator import Change as ChangeJob
 from fleet.job import reason_to_give_up
-from fleet.live.auction.job_rules import EXPIRED, SHIFT_ENDED, changed_spec, lost_jobs, reason_for_silence
+from fleet.live.auction.job_rules import (
+    EXPIRED,
+    SHIFT_ENDED,
+    changed_spec,
+    lost_jobs,
+    reason_for_silence,
+    reason_to_follow,
+)
 from fleet.live.auction.ledger_state import LedgerState, doubt
 from fleet.live.auction.past_jobs import content_hash
 from fleet.live.auction.records import (
@@ -102,7 +109,7 @@ class Ledger(LedgerState):
                 for entry in changed:
                     self.jobs[entry.spec.name] = entry
                     self._move(entry, "waiting")
-                self._awaited.update(before for entry in changed for before in entry.spec.after)
+                self._note_followers(changed)
                 if any(entry.spec.after for entry in changed):
                     self._apply_given_up()
             case Awarded():
@@ -195,9 +202,10 @@ class Ledger(LedgerState):
         entry = self.jobs.pop(name)
         del self.settled[name]
         for before in entry.spec.after:
-            self._awaited[before] -= 1
-            if not self._awaited[before]:
-                del self._awaited[before]
+            if (followers := self._awaited.get(before)) is not None:
+                followers.pop(name, None)
+                if not followers:
+                    del self._awaited[before]
         self.past.add(entry.original, finished=entry.state == "finished")
         self.left[entry.state] = self.left.get(entry.state, 0) + 1
         for award in self._awards_of.pop(name, ()):
@@ -317,7 +325,18 @@ class Ledger(LedgerState):
 
     def _follow_given_up(self, entry: JobEntry) -> list[JobEntry]:
         """Apply a change of this job to jobs that wait for it; return what has changed."""
-        return self._apply_given_up() if entry.spec.name in self._awaited else []
+        if entry.spec.name not in self._awaited:
+            return []
+        if entry.state not in ABANDONED:
+            return self._apply_given_up()
+        changed, lost = list[JobEntry](), [entry.spec.name]
+        for before in lost:  # grows meanwhile
+            for name in self._awaited.get(before, ()):
+                if (follower := self.waiting.get(name)) is not None:
+                    self._move(follower, "given_up", reason_to_follow(before))
+                    changed.append(follower)
+                    lost.append(name)
+        return changed
 
     def _apply_given_up(self) -> list[JobEntry]:
         """Give up jobs that wait for one that is given up; return what has changed.

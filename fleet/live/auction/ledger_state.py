@@ -5,8 +5,8 @@ contradicts is put aside with its jobs, which no arm does until a person has set
 begins with what the line before has changed (`Checked`), so a missing record is noticed, too.
 """
 
-from collections import Counter, deque
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 from zlib import crc32
@@ -123,7 +123,8 @@ class LedgerState(LedgerView, TimedState[AuctionRecord]):
         self.succeeds = snapshot.succeeds
         jobs = self.jobs
         self.awards = {a.record.award: replace(a) for a in snapshot.awards if a.record.job in jobs}
-        self._awaited = Counter(before for entry in self.jobs.values() for before in entry.spec.after)
+        self._awaited = {}
+        self._note_followers(self.jobs.values())
         self._awards_of = {}
         for name, award in self.awards.items():
             self._awards_of.setdefault(award.record.job, []).append(name)
@@ -141,6 +142,12 @@ class LedgerState(LedgerView, TimedState[AuctionRecord]):
                 if self.jobs[name].award not in self.awards:
                     self.jobs[name].award = ""
             self._put_aside(broken)
+
+    def _note_followers(self, entries: Iterable[JobEntry]) -> None:
+        """Note which jobs these wait for."""
+        for entry in entries:
+            for before in entry.spec.after:
+                self._awaited.setdefault(before, {})[entry.spec.name] = None
 
     def _move(self, entry: JobEntry, state: JobState, reason: str = "") -> None:
         """Change the state of a job."""

@@ -1,6 +1,6 @@
 """Jobs and awards of an auctioneer, and what can be asked about them; `fleet.live.auction.ledger` changes them."""
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -57,8 +57,8 @@ class LedgerView:
     """Awards that are not closed, by name."""
     _awards_of: dict[str, list[str]] = field(default_factory=dict[str, list[str]], repr=False, compare=False)
     """Names of the awards of each job."""
-    _awaited: Counter[str] = field(default_factory=Counter[str], repr=False, compare=False)
-    """How many jobs wait for each job, settled ones included."""
+    _awaited: dict[str, dict[str, None]] = field(default_factory=dict[str, dict[str, None]], repr=False, compare=False)
+    """Names of the jobs that wait for each job, settled ones included, in the order of their submission."""
     space: dict[str, frozenset[str]] = field(default_factory=dict[str, frozenset[str]])
     """Names of the spaces that an arm may take besides those of its open awards, by arm: closed awards leave theirs
     here until the arm says that it is at home."""

@@ -249,9 +249,9 @@ class AuctionNode:
         return status_reply(self._name, self.time_s, auctioneer.status(request.jobs), taken, self.epoch, paused)
 
     def _apply_state(self, arm: str, state: State) -> None:
-        self._state_s[arm] = time.monotonic()
         # An arm outside the cell may be anywhere: without a token it would stop all others, and nobody could ask it.
         if arm in self._tokens or arm in self.auctioneer.ledger.arms:
+            self._state_s[arm] = time.monotonic()
             self.auctioneer.apply_state(arm, state)
 
     def _apply_token(self, arm: str, present: bool) -> None:
