@@ -180,7 +180,7 @@ class Recorder:
                 with self._draft(part_file(self.folder, kind, self.parts + 1)) as draft:
                     pq.write_table(to_table(kind, rows[kind]), draft, write_page_checksum=True)
         written = self.parts + bool(self.waiting)
-        counted = {kind: self._rows.get(kind, 0) + len(rows[kind]) for kind in KINDS}
+        counted: dict[Kind, int] = {kind: self._rows.get(kind, 0) + len(rows[kind]) for kind in KINDS}
         self._write_card(status, written, counted)
         self.parts, self._rows = written, counted
         self._saved.clear()
