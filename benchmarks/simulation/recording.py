@@ -51,9 +51,9 @@ def recorder_process(rotate_s: float) -> Callable[[Process], RecorderNode]:
 def simulated_files(disk: Callable[[], Any]) -> Iterator[None]:
     """Have the recorder use the disk of the running process."""
 
-    def write_table(table: Any, path: Any) -> None:
+    def write_table(table: Any, path: Any, **options: Any) -> None:
         content = io.BytesIO()
-        pq.write_table(table, content)
+        pq.write_table(table, content, **options)
         path.write_bytes(content.getvalue())
 
     module: Any = recorder_module

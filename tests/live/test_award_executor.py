@@ -388,7 +388,7 @@ def test_a_journal_on_disk_restores_the_history(tmp_path):
 def test_a_first_start_is_the_first_boot():
     assert ArmHistory().after_restart("a", 0.0).boot == 1
     history = ArmHistory().replay([Started(boot=4)]).after_restart("a", 0.0)
-    assert history.compact() == (Started(boot=5),)
+    assert history.compact() == (Started("a", boot=5),)
 
 
 @pytest.mark.parametrize(

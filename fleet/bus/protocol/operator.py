@@ -64,14 +64,14 @@ class Pause(msgspec.Struct, frozen=True, tag_field="action", tag="pause"):
     """Give an arm no more jobs. Its job goes back after the cycle in progress, and to another arm; a last cycle that
     was permitted is finished."""
 
-    arm: str = ALL_ARMS
+    arm: Name = ALL_ARMS
     """"*" for all arms, also those that join later."""
 
 
 class Resume(msgspec.Struct, frozen=True, tag_field="action", tag="resume"):
     """End a pause."""
 
-    arm: str = ALL_ARMS
+    arm: Name = ALL_ARMS
     """"*" ends all pauses."""
 
 

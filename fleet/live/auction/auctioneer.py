@@ -218,7 +218,7 @@ class Auctioneer:
         """
         ledger, job = self.ledger, job_of(request)
         known = was_carried_out(ledger, request)
-        note = ALREADY_DONE if known else objection(ledger, request, self.rounds.states.keys() | self.rounds.present)
+        note = ALREADY_DONE if known else objection(ledger, request, self.rounds.present.union(ledger.arms))
         if not known:
             entry = ledger.jobs.get(job)
             lease = None if entry is None else self._writer.leases.get(entry.award)

@@ -24,7 +24,16 @@ from fleet.live.consensus.records import (
 )
 from fleet.live.consensus.settled_jobs import SettledJobs, is_abandoned
 from fleet.live.journal import TimedState
-from fleet.live.journal_records import ClockTick, EpochBegun, JobsAccepted, Progress, Released, SpaceCleared, SpaceTaken
+from fleet.live.journal_records import (
+    ClockTick,
+    EpochBegun,
+    JobsAccepted,
+    Progress,
+    Released,
+    SpaceCleared,
+    SpaceTaken,
+    Started,
+)
 from fleet.live.space import ANYWHERE
 
 MAX_NOTES = 4 * MAX_OPEN_JOBS
@@ -73,12 +82,16 @@ class Register(TimedState[GrantRecord]):
     """Names of the spaces that an arm may take, by arm."""
     operations: Operations = field(default_factory=Operations)
     """Requests of people."""
+    name: str = ""
+    """Of the arm; "" in a journal of an earlier version."""
     _forgotten: int = 0
     """How many of the jobs that have left are forgotten."""
 
     def apply(self, record: GrantRecord) -> None:
         """Apply a record that is on disk."""
         match record:
+            case Started(name):
+                self.name = name or self.name
             case JobGranted():
                 self._count(record.job, record.cycles)
                 self._number(record.arm, record.number)
@@ -136,7 +149,7 @@ class Register(TimedState[GrantRecord]):
 
     def compact(self) -> tuple[GrantRecord, ...]:
         """Return the fewest records that give the same register."""
-        records: list[GrantRecord] = [ClockTick(self.time_s)]
+        records: list[GrantRecord] = [ClockTick(self.time_s), *([Started(self.name)] if self.name else [])]
         records += [PastKnown(self.past.packed(), self.settled.left)] if len(self.past) else []
         records += [EpochBegun(self.epoch)] if self.epoch else []
         records += [ClaimNumbered(arm, number) for arm, number in self.numbers.items()]
