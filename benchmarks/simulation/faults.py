@@ -211,7 +211,7 @@ def steer(shift: "Shift") -> None:
     """Have a person cancel, settle or change a job, or pause arms; a person knows what was done."""
     if not shift.submitter.accepted:
         return
-    node: Any = shift.node(AUCTIONEER)
+    node: Any = shift.node(AUCTIONEER) if AUCTIONEER in shift.names else None
     entries = {} if node is None else node.auctioneer.ledger.jobs
     unfinished = [name for name, entry in entries.items() if entry.state == "unfinished"]  # a person sees them
     job = shift.rng.choice(unfinished or list(shift.submitter.accepted))

@@ -20,6 +20,7 @@ from bus import Bus, Published, SimulatedClient
 from disk import DiskCalls
 from world import Process, Violation
 
+from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, Result
 from fleet.bus.protocol.operator import Operation
 from fleet.events import EVENTS_PER_BOOT
@@ -50,9 +51,9 @@ def recorder_process(rotate_s: float) -> Callable[[Process], RecorderNode]:
 def simulated_files(disk: Callable[[], Any]) -> Iterator[None]:
     """Have the recorder use the disk of the running process."""
 
-    def write_table(table: Any, path: Any) -> None:
+    def write_table(table: Any, path: Any, **options: Any) -> None:
         content = io.BytesIO()
-        pq.write_table(table, content)
+        pq.write_table(table, content, **options)
         path.write_bytes(content.getvalue())
 
     module: Any = recorder_module
@@ -74,6 +75,8 @@ class Sent:
         bus.on_publish = self._add
 
     def _add(self, published: Published, message: msgspec.Struct) -> None:
+        if isinstance(message, Operation) and keys.parse(published.key).role == "arm":
+            return  # not recorded, and not counted
         if isinstance(message, Result | Operation):
             kind: Kind = "results" if isinstance(message, Result) else "operations"
             key: tuple[Kind, str, int] = kind, message.auctioneer, message.number

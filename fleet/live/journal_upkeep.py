@@ -2,13 +2,13 @@
 
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Generic
 
 from fleet.errors import JournalError, JournalFull, printable
 from fleet.live.journal import Journal, JournalState, Record, TimedState
-from fleet.live.journal_records import ClockTick
+from fleet.live.journal_records import ClockTick, Started
 
 _LOG = logging.getLogger(__name__)
 
@@ -39,6 +39,21 @@ def put_aside(path: Path, name: str) -> Callable[[bytes, str], tuple[()]]:
         return ()
 
     return put
+
+
+def own_records(journal: Journal[Record], name: str) -> Iterator[Record]:
+    """Yield the records of the journal of an arm or auctioneer, oldest first.
+
+    Raises:
+        JournalError: it is of another one, or damaged. Journals of earlier versions may name none.
+    """
+    for record in journal.records():
+        if isinstance(record, Started) and record.name not in ("", name):
+            raise JournalError(
+                f"Journal '{journal.path}' is of '{printable(record.name)}'; '{name}' needs its own. If journals were "
+                f"swapped or copied, bring that of '{name}' back. See Epochs in docs/bus.md before you move one away."
+            )
+        yield record
 
 
 class CompactingJournal(Generic[Record]):

@@ -1,9 +1,12 @@
-"""A limit on the time that one plan may take, checked between the pieces of the work; each thread has its own."""
+"""A limit on the time that one plan may take, checked between the pieces of the work; each thread has its own.
+
+It counts processor time of the thread: a process that was stopped, or had to wait for others, loses none of it.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from time import monotonic
+from time import thread_time
 
 
 class PlanningTimeout(Exception):
@@ -11,13 +14,13 @@ class PlanningTimeout(Exception):
 
 
 _limit: ContextVar[tuple[float, float] | None] = ContextVar("planning_limit", default=None)
-"""Length, s, and real second of the end."""
+"""Length, s, and end in processor time of the thread, s."""
 
 
 @contextmanager
 def time_limit(limit_s: float) -> Iterator[None]:
-    """Have `check_time` raise in this thread once the block has taken this long, real seconds."""
-    token = _limit.set((limit_s, monotonic() + limit_s))
+    """Have `check_time` raise in this thread once the block has taken this long, seconds of processor time."""
+    token = _limit.set((limit_s, thread_time() + limit_s))
     try:
         yield
     finally:
@@ -30,5 +33,5 @@ def check_time() -> None:
     Raises:
         PlanningTimeout: the limit has passed.
     """
-    if (limit := _limit.get()) is not None and monotonic() > limit[1]:
-        raise PlanningTimeout(f"planning took more than {limit[0]:g} s")
+    if (limit := _limit.get()) is not None and thread_time() > limit[1]:
+        raise PlanningTimeout(f"planning took more than {limit[0]:g} s of processor time")

@@ -103,6 +103,7 @@ class Recorder:
         self.counts: dict[str, Count] = {} if card is None else card.speakers
         self.sought: list[Gap] = [] if card is None else list(card.sought)
         self.parts = 0 if card is None else card.parts
+        self._rows: dict[Kind, int] = {} if card is None else card.rows
         self._saved: list[Heard | Gap] = []
         self._unsaved: list[Heard | Gap] = []
         self._journal: Journal[Record] = Journal(folder / JOURNAL, Record)
@@ -120,7 +121,7 @@ class Recorder:
         if card is not None and card.fleet != fleet:
             raise FleetError(f"'{folder}' is a recording of fleet '{card.fleet}', not of '{fleet}'.")
         recorder = cls(folder, fleet, card)
-        recorder._write_card("recording")
+        recorder._write_card("recording", recorder.parts, recorder._rows)
         recorder._continue_journal()
         return recorder
 
@@ -177,10 +178,11 @@ class Recorder:
         for kind in KINDS:
             if rows[kind]:
                 with self._draft(part_file(self.folder, kind, self.parts + 1)) as draft:
-                    pq.write_table(to_table(kind, rows[kind]), draft)
+                    pq.write_table(to_table(kind, rows[kind]), draft, write_page_checksum=True)
         written = self.parts + bool(self.waiting)
-        self._write_card(status, written)
-        self.parts = written
+        counted: dict[Kind, int] = {kind: self._rows.get(kind, 0) + len(rows[kind]) for kind in KINDS}
+        self._write_card(status, written, counted)
+        self.parts, self._rows = written, counted
         self._saved.clear()
         self._unsaved.clear()
         try:  # a crash before this leaves a journal of a complete part, which is ignored
@@ -259,10 +261,9 @@ class Recorder:
         count.twice += 1
         return False
 
-    def _write_card(self, status: str, parts: int | None = None) -> None:
+    def _write_card(self, status: str, parts: int, rows: dict[Kind, int]) -> None:
         senders = {name: count for name, count in sorted(self.counts.items()) if count.kept}
-        number = self.parts if parts is None else parts
-        card = Card(RECORDING_FORMAT, status, self.fleet, number, senders, tuple(self.sought))
+        card = Card(RECORDING_FORMAT, status, self.fleet, parts, senders, tuple(self.sought), rows)
         with self._draft(self.folder / CARD) as draft:
             draft.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=1) + b"\n")
 

@@ -120,6 +120,8 @@ class Card(msgspec.Struct, frozen=True):
     speakers: dict[str, Count]
     sought: tuple[Gap, ...] = ()
     """Missing messages that may still be had."""
+    rows: dict[Kind, int] = {}
+    """Number of rows in all parts, by kind; none in recordings of earlier versions."""
 
 
 def _columns(message: type[msgspec.Struct]) -> dict[str, pa.DataType]:
@@ -240,9 +242,20 @@ def read_parts(folder: Path, kind: Kind) -> pa.Table:
     return table.sort_by([("time_s", "ascending"), (_SORTED_BY.get(kind, "number"), "ascending")])
 
 
+def lost_rows(folder: Path) -> dict[Kind, int]:
+    """Number of rows of parts that were removed since they were written, by kind; `read_parts` finds damaged ones.
+
+    Raises:
+        FleetError: it is no recording.
+    """
+    rows = read_card(folder).rows
+    there = {kind: sum(pq.read_metadata(path).num_rows for path in part_files(folder, kind)) for kind in rows}
+    return {kind: number - there[kind] for kind, number in rows.items() if number > there[kind]}
+
+
 def _read_part(path: Path, kind: Kind) -> pa.Table:
     try:
-        return pq.read_table(path, schema=SCHEMAS[kind])
+        return pq.read_table(path, schema=SCHEMAS[kind], page_checksum_verification=True)
     except (OSError, pa.ArrowException) as error:
         raise FleetError(
             f"Cannot read '{path}': {error} Restore the file, or move it away to read the recording without it."

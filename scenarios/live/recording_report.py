@@ -22,7 +22,7 @@ from fleet.events import EVENT_KINDS, Event
 from fleet.physics.cell_model import cell_model
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import FAULTED, MODES, WORKING, Telemetry
-from scenarios.live.recording import MESSAGES, SENSORS, read_card, read_parts
+from scenarios.live.recording import MESSAGES, SENSORS, Kind, lost_rows, read_card, read_parts
 from scenarios.report.gantt import clock
 from scenarios.report.run_page import report_html
 from scenarios.report.schedule import SAME_MOMENT_DIGITS
@@ -64,7 +64,7 @@ def recording_html(folder: Path, scenario: Scenario | None = None) -> str:
         "messages": {
             sender: f"{count.kept} recorded, {count.missed} missing" for sender, count in card.speakers.items()
         },
-        "missing": _missing(read_parts(folder, "gaps")),
+        "missing": _missing(read_parts(folder, "gaps"), lost_rows(folder)),
         "jobs submitted by": _submitters(results),
         "requests": [_describe_request(row) for row in operations.to_pylist()],
     }
@@ -254,9 +254,11 @@ def _metrics(
     }
 
 
-def _missing(gaps: pa.Table) -> Mapping[str, str]:
+def _missing(gaps: pa.Table, lost: Mapping[Kind, int]) -> Mapping[str, str]:
     rows = gaps.to_pylist()
-    return {f"{row['sender']}, numbers {row['first']} to {row['last']}": row["reason"] for row in rows} or {"": "none"}
+    missing = {f"{row['sender']}, numbers {row['first']} to {row['last']}": row["reason"] for row in rows}
+    missing |= {f"{number} rows of {kind}": "parts of the recording were removed" for kind, number in lost.items()}
+    return missing or {"": "none"}
 
 
 def _of_epoch(table: pa.Table, epochs: list[str]) -> pa.Table:

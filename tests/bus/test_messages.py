@@ -18,6 +18,7 @@ from fleet.bus.protocol.messages import (
     encoding,
     schema,
 )
+from fleet.bus.protocol.operator import ControlRequest
 from fleet.errors import BusError
 
 numbers = st.floats(-1e12, 1e12)
@@ -152,3 +153,11 @@ def test_an_integer_is_a_number():
 def test_a_schema_has_a_version():
     assert schema(Info) == "thermofleet.Info.v4"
     assert encoding(State) == "application/json;thermofleet.State.v4"
+
+
+@pytest.mark.parametrize("action", ["pause", "resume"])
+@pytest.mark.parametrize("arm", ["", "x" * 513])
+def test_the_arm_of_a_pause_has_the_bounds_of_a_name(action, arm):
+    request = {"request": "1", "action": {"action": action, "arm": arm}}
+    with pytest.raises(MalformedMessage, match="length"):
+        decode(ControlRequest, json.dumps(request).encode())

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from fleet.bus.client.client import BusClient
 from fleet.bus.client.router import Router
@@ -54,6 +55,7 @@ class Auctioneer:
 
     def __init__(self, link):
         self.link, self.grants, self.leases, self.reports, self.words = link, True, [], [], []
+        self.revokes = False
         link.reply_to(keys.asked_by_every_arm("f", "x", "lease"), LeaseRequest, self.lease)
         link.reply_to(keys.asked_by_every_arm("f", "x", "report"), Report, self.report)
 
@@ -61,7 +63,7 @@ class Auctioneer:
         self.leases.append(request)
         names = tuple(h.award for h in request.entries) if self.grants else ()
         leave = tuple(h.award for h in request.entries if self.grants and h.phase == "finishing")
-        return Lease("x", 2.0, names, (), leave)
+        return Lease("x", 2.0, () if self.revokes else names, names if self.revokes else (), leave)
 
     def report(self, report):
         self.reports.append(report)
@@ -222,6 +224,28 @@ def test_without_permission_no_job_is_finished_and_without_a_lease_work_stops(bu
     auctioneer.grants = True
     bus.serve(lambda: auctioneer.reports)
     assert auctioneer.reports[0].outcome == "finished"
+
+
+def test_the_cycle_in_progress_counts_when_the_award_is_revoked_and_the_arm_is_at_home_then(bus):
+    auctioneer, line = Auctioneer(bus.link()), bus.link()
+    arm = bus.arm(speed=5.0)  # a cycle of 11 s takes more than three lease requests
+    job = replace(JOB, repetitions=100)
+    quote = bus.ask(line, "quote", request(job), Quote)
+    assert bus.ask(line, "award", award(quote.quote, job), Ack).accepted
+    (active,) = arm.node.executor.active
+    begun_s = arm.body.time_s
+    bus.serve(lambda: arm.body.time_s > begun_s + 3.0)
+    auctioneer.revokes = True
+    bus.serve(lambda: active.revoked)
+    assert arm.body.cycles == 0
+    assert not auctioneer.reports
+    assert arm.body.away is not None
+    bus.serve(lambda: auctioneer.reports)
+    (report,) = auctioneer.reports
+    assert (report.outcome, report.cycles, report.unsure) == ("returned", 1, False)
+    assert arm.body.away is None
+    assert arm.node.unfit() == ""
+    assert [r.cycles for _, r in ArmHistory().replay(arm.book.records()).reports.values()] in ([1], [])
 
 
 def test_after_a_crash_the_job_is_returned_and_the_arm_works_again(bus):

@@ -14,6 +14,7 @@ from fleet.bus.protocol.auction import (
     Report,
     Submission,
 )
+from fleet.bus.protocol.operator import Cancel, ControlRequest, Pause
 from fleet.errors import JournalFull, Refused
 from fleet.live.auction.round import Assignment
 
@@ -207,6 +208,42 @@ def test_a_late_lease_request_renews_an_award_that_is_still_open(fleet_of, live)
     fleet.true_s += 2 * live.TIMING.lease_s
     fleet.auctioneer.tick(fleet.real_s, fleet.true_s)
     assert fleet.auctioneer.renew_leases(request, fleet.real_s, fleet.true_s).revoked == (award,)
+
+
+@pytest.mark.parametrize("action", [Cancel("a"), Pause("arm_0")])
+def test_a_stopped_job_stays_with_an_arm_that_ends_a_long_cycle_and_the_cycle_counts(fleet_of, live, action):
+    fleet = fleet_of(1)
+    bid(fleet, hold("a", repetitions=3))
+    fleet.deliver_all()
+    arm = fleet.arms["arm_0"]
+    (award,) = arm.current
+    fleet.auctioneer.control(ControlRequest("one", action, "ann"), fleet.true_s)
+    for _ in range(10):  # a cycle of five leases
+        fleet.true_s += live.TIMING.lease_s / 2
+        fleet.auctioneer.tick(fleet.real_s, fleet.true_s)
+        lease = fleet.auctioneer.renew_leases(arm.request(), fleet.real_s, fleet.true_s)
+        assert (lease.granted, lease.revoked) == ((), (award,))
+        (status,) = fleet.auctioneer.status()
+        assert (status.state, status.cycles) == ("awarded", 0)
+    report = Report("arm_0", award, "a", "returned", 1, fleet.true_s, "the award was revoked")
+    for _ in range(2):
+        fleet.auctioneer.apply_report(report, fleet.real_s, fleet.true_s)
+        (status,) = fleet.auctioneer.status()
+        assert (status.state, status.arm, status.cycles) == (
+            "cancelled" if isinstance(action, Cancel) else "waiting",
+            "arm_0",
+            1,
+        )
+
+
+def test_a_stopped_job_of_a_silent_arm_is_taken_back_after_the_lease(fleet_of, live):
+    fleet = fleet_of(1)
+    bid(fleet, hold("a", repetitions=3))
+    fleet.deliver_all()
+    fleet.auctioneer.control(ControlRequest("one", Cancel("a"), "ann"), fleet.true_s)
+    fleet.true_s += 2 * live.TIMING.lease_s
+    fleet.auctioneer.tick(fleet.real_s, fleet.true_s)
+    assert fleet.auctioneer.status()[0].state == "cancelled"
 
 
 def test_the_status_of_an_infeasible_job_gives_the_reason(fleet_of):

@@ -185,7 +185,7 @@ def test_the_last_cycle_needs_permission_which_is_on_disk_and_a_lease():
     disk.full = False
     executor.apply_lease(leave, 1.0)
     assert (executor.allowed_cycles(5.9), executor.allowed_cycles(6.0)) == (3, 2)
-    executor.return_expired(0.0, 1000.0)
+    executor.return_ended(0.0, 1000.0, at_home=True)
     assert ArmHistory().replay(disk.records).active[award.award].may_commit
     executor.apply_lease(leave, 1000.0)
     assert executor.allowed_cycles(1001.0) == 3
@@ -200,32 +200,42 @@ def test_after_permission_to_commit_a_revoked_award_is_reported_from_home(in_las
     executor.apply_lease(Lease("x", 4.0, (), (award.award,)), 2.0)
     executor.apply_lease(Lease("x", 4.0, (award.award,), (), (award.award,)), 1.5)  # it was late
     assert executor.allowed_cycles(2.0) == 2
-    executor.return_revoked(9.0, 3.0, at_home=False)
+    executor.return_ended(9.0, 3.0, at_home=False)
     assert executor.active
     if in_last_cycle:
         executor.finish(10.0, 4.0)
     else:
-        executor.return_revoked(10.0, 4.0, at_home=True)
+        executor.return_ended(10.0, 4.0, at_home=True)
     ((_, report),) = executor.due_reports(4.0)
     assert (report.cycles, report.unsure, report.outcome == "finished") == (2 + in_last_cycle, False, in_last_cycle)
 
 
-def test_a_revoked_award_is_returned():
+def test_a_revoked_award_is_returned_at_home_with_the_cycle_that_was_in_progress():
     executor, disk = shop()
     award = taken(executor)
     executor.apply_lease(Lease("x", 4.0, (), (award.award,)), 2.0)
     assert executor.allowed_cycles(2.0) == 0
-    executor.return_revoked(1.0, 2.0, at_home=False)
-    assert [report.outcome for _, report in executor.due_reports(2.0)] == ["returned"]
-    assert not ArmHistory().replay(disk.records).active
+    executor.return_ended(1.0, 1000.0, at_home=False)  # a cycle may be longer than any lease
+    assert executor.active
+    assert not executor.due_reports(1000.0)
+    executor.record_progress(1, 5.0)
+    assert executor.allowed_cycles(2.0) == 1
+    executor.return_ended(9.0, 1000.5, at_home=True)
+    ((_, report),) = executor.due_reports(1000.5)
+    assert (report.outcome, report.cycles, report.time_s) == ("returned", 1, 9.0)
+    history = ArmHistory().replay(disk.records)
+    assert not history.active
+    assert [on_disk.cycles for _, on_disk in history.reports.values()] == [1]
 
 
 def test_a_job_without_a_lease_for_long_is_returned():
     executor, _ = shop(return_after_s=20.0)
     taken(executor)
-    executor.return_expired(1.0, 25.9)
+    executor.return_ended(1.0, 25.9, at_home=True)
     assert executor.active
-    executor.return_expired(2.0, 26.0)
+    executor.return_ended(1.5, 26.0, at_home=False)
+    assert executor.active, "a cycle is in progress"
+    executor.return_ended(2.0, 26.0, at_home=True)
     ((_, report),) = executor.due_reports(26.0)
     assert (report.outcome, report.time_s, report.reason) == ("returned", 2.0, "no lease for 20 s")
 
@@ -378,7 +388,7 @@ def test_a_journal_on_disk_restores_the_history(tmp_path):
 def test_a_first_start_is_the_first_boot():
     assert ArmHistory().after_restart("a", 0.0).boot == 1
     history = ArmHistory().replay([Started(boot=4)]).after_restart("a", 0.0)
-    assert history.compact() == (Started(boot=5),)
+    assert history.compact() == (Started("a", boot=5),)
 
 
 @pytest.mark.parametrize(

@@ -221,7 +221,7 @@ def test_a_full_disk_loses_nothing(tmp_path, monkeypatch):
     recorder = Recorder.open(tmp_path, "f")
     recorder.add("a", state("a", 0))
 
-    def full(*_):
+    def full(*_, **__):
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as broken:

@@ -5,6 +5,7 @@ import math
 import pytest
 
 from fleet.bus.protocol.auction import JobSpec
+from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Pause, Resume, Settle
 from fleet.errors import Refused
 
@@ -159,3 +160,14 @@ def test_the_name_of_a_request_stands_for_one_request(fleet, restarts):
             ask(fleet, other, "one")
     assert (status(fleet, "b").state, fleet.auctioneer.ledger.paused) == ("waiting", {})
     assert ask(fleet, Cancel("b"), "two").changed
+
+
+def test_a_refusal_names_the_arms_that_are_present_or_of_the_cell(fleet):
+    """A state under any name comes in over plain TCP, and stays known when its sender has gone."""
+    fleet.run_without_faults(0.1)
+    fleet.auctioneer.apply_state("ghost", State("ghost", 1, 0.0, "idle", (30.0,), 50.0))
+    with pytest.raises(Refused, match=r"no arm 'x'\. Arms: arm_0, arm_1;"):
+        ask(fleet, Pause("x"))
+    ask(fleet, Pause("arm_0"))
+    fleet.auctioneer.set_present(frozenset(["arm_1"]))
+    assert ask(fleet, Resume("arm_0")).paused == {}

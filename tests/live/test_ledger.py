@@ -278,7 +278,7 @@ def test_a_late_report_changes_the_same_after_compaction(steps, data):
 def test_a_ledger_and_its_snapshot_share_no_objects():
     book = ledger(spec("a"))
     book.apply(award("a"))
-    (record,) = book.compact()
+    record = book.compact()[0]
     short = Ledger().replay([record])
     book.apply(CommitPermitted("0:a", 2.0))
     assert not record.awards[0].may_commit

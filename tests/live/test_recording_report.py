@@ -5,6 +5,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -162,3 +163,29 @@ def test_a_part_that_was_cut_is_named(tmp_path):
     part.write_bytes(part.read_bytes()[:50])
     with pytest.raises(FleetError, match=re.escape(str(part))):
         recording_html(tmp_path / "r")
+
+
+def test_a_changed_byte_in_a_part_is_an_error_that_names_it(tmp_path):
+    """Without a checksum the other word would be read."""
+    record(tmp_path / "r", LOG).write()
+    part = next((tmp_path / "r").glob("events-*.parquet"))
+    content = part.read_bytes()
+    assert b"cool again" in content
+    part.write_bytes(content.replace(b"cool again", b"cold again", 1))
+    with pytest.raises(FleetError, match=re.escape(str(part))):
+        recording_html(tmp_path / "r")
+
+
+def test_the_rows_of_a_removed_part_are_counted_as_missing(tmp_path):
+    """Also in a recording that goes on in another process."""
+    first = record(tmp_path / "r", LOG)
+    first.write()
+    first.close()
+    again = Recorder.open(tmp_path / "r", "shop")
+    again.add("boss", Result("boss", 0, 0.0, JobStatus("x", "waiting")))
+    again.write(status="finished")
+    assert "parts of the recording were removed" not in recording_html(tmp_path / "r")
+    part = next((tmp_path / "r").glob("events-*.parquet"))
+    number = pq.read_metadata(part).num_rows
+    part.unlink()
+    assert re.search(f"{number} rows of events.*parts of the recording were removed", recording_html(tmp_path / "r"))

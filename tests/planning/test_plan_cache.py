@@ -2,6 +2,8 @@
 
 import logging
 import os
+import threading
+from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -13,7 +15,7 @@ from fleet.job import KINDS, Fixture, Place, Work
 from fleet.motion import Plan
 from fleet.planning.plan_cache import CachedPlanner
 from fleet.planning.planner import Planner
-from fleet.planning.time_limit import PlanningTimeout, time_limit
+from fleet.planning.time_limit import PlanningTimeout, check_time, time_limit
 from fleet.robot import Mount, Robot
 
 ROBOT = Robot(name="floor")
@@ -142,6 +144,15 @@ def test_a_plan_that_takes_too_long_is_given_up_in_its_own_thread_alone(tmp_path
     assert planner.plan(WORKS["pick_place"])
 
 
+def test_only_processor_time_counts():
+    """A process that was stopped, or had no processor, goes on planning."""
+    with time_limit(0.05):
+        threading.Event().wait(0.3)
+        check_time()
+        with pytest.raises(PlanningTimeout):
+            deque(iter(check_time, True), maxlen=0)  # without end
+
+
 def test_the_time_is_checked_in_every_part_of_a_plan(monkeypatch):
     """Wherever the time ends, planning ends at the next check."""
     clock, pieces = [0.0], []
@@ -150,7 +161,7 @@ def test_the_time_is_checked_in_every_part_of_a_plan(monkeypatch):
         clock[0] += 1.0
         return clock[0]
 
-    monkeypatch.setattr("fleet.planning.time_limit.monotonic", tick)
+    monkeypatch.setattr("fleet.planning.time_limit.thread_time", tick)
     planner = Planner(ROBOT, elbows=2)
     with time_limit(1e6):
         planner.plan(WORKS["pick_place"])

@@ -95,9 +95,9 @@ class PlanQuote(msgspec.Struct, frozen=True, omit_defaults=True):
     difficulty: Number | None = None
     """d = Σ_k w_k d_k, with the weights of the arm's twin (`fleet.difficulty`)."""
     duration_s: Number | None = None
-    """Duration of the job alone."""
+    """Duration of the job alone, from home to home."""
     finish_in_s: Number | None = None
-    """Time until it would be finished, including the arm's current jobs."""
+    """Time until its last cycle would be done, after the arm's current jobs; without the way home."""
     space: Name | None = None
     """Name of the space of its plan, from home to home; null for unknown: anywhere within reach."""
 
@@ -286,13 +286,15 @@ class JobStatus(msgspec.Struct, frozen=True):
     repetitions: Count = 0
     """Cycles of the job; 0 for unknown."""
     finish_s: Number | None = None
-    """Predicted fleet time at which it is finished and its arm at home; null for unknown, or if no arm is at work."""
+    """Predicted fleet time at which it is finished and its arm at home; null for unknown, or if no arm is at work. Only
+    `jobs/status` has it: it is null in a `Result`."""
     due_s: Number | None = None
     """Due date; null for none. A `Change` changes it."""
     value: Number | None = None
     """As in `JobSpec`; null for unknown. A `Change` changes it."""
     not_planned: bool = False
-    """It waits, and is not planned yet: no arm has a plan for it, and it is unknown whether one can do it."""
+    """It waits, and is not planned yet: no arm has a plan for it, and it is unknown whether one can do it. Only
+    `jobs/status` has it: it is false in a `Result`."""
 
 
 class StatusRequest(msgspec.Struct, frozen=True):

@@ -45,7 +45,8 @@ class Limit(msgspec.Struct, frozen=True):
 
 
 class PlannedWork(msgspec.Struct, frozen=True):
-    """Work for which an arm has plans; other work is planned when it is asked for."""
+    """Work for which an arm has plans. With another payload, dwell or force it is other work, which is planned when it
+    is asked for."""
 
     kind: Kind
     places: tuple[Name, ...]
@@ -56,7 +57,7 @@ class PlannedWork(msgspec.Struct, frozen=True):
     """Duration of a cycle by the fastest plan, with this `dwell_s`."""
     dwell_s: Number = 0.0
     force_n: Number = 0.0
-    """As in `JobSpec`; other values are other work."""
+    """As in `JobSpec`, and `dwell_s` too."""
 
 
 class CellArm(msgspec.Struct, frozen=True):

@@ -64,14 +64,14 @@ class Pause(msgspec.Struct, frozen=True, tag_field="action", tag="pause"):
     """Give an arm no more jobs. Its job goes back after the cycle in progress, and to another arm; a last cycle that
     was permitted is finished."""
 
-    arm: str = ALL_ARMS
+    arm: Name = ALL_ARMS
     """"*" for all arms, also those that join later."""
 
 
 class Resume(msgspec.Struct, frozen=True, tag_field="action", tag="resume"):
     """End a pause."""
 
-    arm: str = ALL_ARMS
+    arm: Name = ALL_ARMS
     """"*" ends all pauses."""
 
 
@@ -123,7 +123,7 @@ class ResetReply(msgspec.Struct, frozen=True):
 
 class Operation(msgspec.Struct, frozen=True):
     """Published under `auction/{auctioneer}/operation`, without an auctioneer under `arm/{arm}/operation`: a request of
-    a person was carried out."""
+    a person was carried out, also one that changed nothing; not the same request again."""
 
     auctioneer: Name
     """Or the arm that replied, without an auctioneer."""

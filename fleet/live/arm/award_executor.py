@@ -266,17 +266,14 @@ class AwardExecutor:
         for number, active in enumerate(self.active):
             self._close(active, "returned", time_s, now_s, reason, faulted=faulted and number == 0)
 
-    def return_revoked(self, time_s: float, now_s: float, *, at_home: bool) -> None:
-        """Return the revoked awards; one with permission to commit at home only: there no last cycle is in progress."""
+    def return_ended(self, time_s: float, now_s: float, *, at_home: bool) -> None:
+        """Return awards that are revoked, or without a lease for `return_after_s`; the current one from home only."""
         for active in self.active:
-            if active.revoked and (at_home or not active.may_commit):
-                self._close(active, "returned", time_s, now_s, "the award was revoked")
-
-    def return_expired(self, time_s: float, now_s: float) -> None:
-        """Return the awards whose lease expired more than `return_after_s` ago."""
-        for active in self.active:
-            if not active.may_commit and now_s > active.lease_end_s + self.config.return_after_s:
-                self._close(active, "returned", time_s, now_s, f"no lease for {now_s - active.lease_end_s:.0f} s")
+            unleased_s = now_s - active.lease_end_s
+            expired = not active.may_commit and unleased_s > self.config.return_after_s
+            if (active.revoked or expired) and (at_home or active is not self._current):
+                reason = "the award was revoked" if active.revoked else f"no lease for {unleased_s:.0f} s"
+                self._close(active, "returned", time_s, now_s, reason)
 
     def _close(
         self,
@@ -304,7 +301,8 @@ class AwardExecutor:
         for auctioneer in auctioneers:
             mine = [active for active in self.active if active.award.auctioneer == auctioneer]
             renew_s = self._asked_s.get(auctioneer, -math.inf) + min(active.lease_s for active in mine) / RENEWALS
-            waiting = [active for active in mine if self._phase(active) == "finishing" and not active.may_commit]
+            waiting = [active for active in mine if self._phase(active) == "finishing"]
+            waiting = [active for active in waiting if not (active.may_commit or active.revoked)]
             if now_s < renew_s and all(now_s < active.commit_asked_s + COMMIT_RETRY_S for active in waiting):
                 continue
             self._asked_s[auctioneer] = now_s

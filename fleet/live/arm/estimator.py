@@ -30,7 +30,7 @@ _LOG = logging.getLogger(__name__)
 MAX_WORKS, MAX_SCORES, MAX_BYTES = 512, 1024, 24_000_000
 """Of works that were not known at the start: how many are kept, jobs whose scores are kept, and size of the plans."""
 PLAN_S = 20.0
-"""Real seconds that planning and scoring of one job may take; a usual one takes 0.05 to 0.5."""
+"""Seconds of processor time that planning and scoring of one job may take; a usual one takes 0.05 to 0.5."""
 MAX_REASON = 300
 """Characters of an error in a reason."""
 STEPS = 24

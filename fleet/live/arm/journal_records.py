@@ -114,12 +114,14 @@ class ArmHistory(JournalState[ArmRecord]):
     """Of the last accepted award that has one."""
     finished: dict[str, JobSpec] = field(default_factory=dict[str, JobSpec])
     """The last jobs that the arm finished, oldest first."""
+    name: str = ""
+    """Of the arm; "" in a journal of an earlier version."""
 
     def apply(self, record: ArmRecord) -> None:
         """Change the history as the record says."""
         match record:
-            case Started():
-                self.boot = record.boot
+            case Started(name):
+                self.name, self.boot = name or self.name, record.boot
             case AwardAccepted(award):
                 self.active[award.award] = ActiveAward(award, award.cycles, cycles_on_disk=award.cycles)
                 self.accepted[award.award] = award.job.name
@@ -160,7 +162,7 @@ class ArmHistory(JournalState[ArmRecord]):
     def compact(self) -> tuple[ArmRecord, ...]:
         """Return the fewest records that give the same history, without closed awards of long ago."""
         self.accepted = bounded(self.accepted, [*self.reports, *self.active])
-        records: list[ArmRecord] = [Started(boot=self.boot)]
+        records: list[ArmRecord] = [Started(self.name, boot=self.boot)]
         records += [JobsFinished(tuple(self.finished.values()), self.epoch)] if self.epoch or self.finished else []
         records += [PastAward(name, job) for name, job in self.accepted.items()]
         for award, report in self.reports.values():
@@ -178,7 +180,7 @@ class ArmHistory(JournalState[ArmRecord]):
             report = Report(arm, name, active.job, "returned", active.cycles, time_s, reason, unsure=active.may_commit)
             reports[name] = active.award, report
         accepted = bounded(self.accepted, reports)
-        return ArmHistory(self.boot + 1, {}, reports, accepted, self.epoch, dict(self.finished))
+        return ArmHistory(self.boot + 1, {}, reports, accepted, self.epoch, dict(self.finished), arm)
 
     def message(self, arm: str) -> History:
         """Return what the arm has done and has, as much as fits into one message."""

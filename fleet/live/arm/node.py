@@ -220,7 +220,7 @@ class ArmNode:
             self._retry_s = real_s + WRITE_RETRY_S
             self.executor.retry_writes()
         self._advance_body(real_s)
-        self.executor.return_expired(self._body.time_s, real_s)
+        self.executor.return_ended(self._body.time_s, real_s, at_home=self._body.away is None)
         for auctioneer, request in self.executor.lease_requests(real_s):
             self.work_source.request_leases(auctioneer, request, real_s)
         for auctioneer, report in self.executor.due_reports(real_s):
@@ -279,7 +279,6 @@ class ArmNode:
         if self._reading.mode == "faulted" and self.executor.active:
             self.executor.return_all(self._body.time_s, real_s, "the arm is faulted")
             self._body_award = ""
-        self.executor.return_revoked(self._body.time_s, real_s, at_home=self._body.away is None)
         if current := self._current:
             at_work = self._body_award == current.award.award and self._body.job
             cycles = self._body.cycles if at_work else current.cycles

@@ -101,12 +101,15 @@ class Auctioneer:
 
         An arm that asks after the end of its lease, but before its award was closed, keeps it: no other arm has it.
         """
-        leased = {entry.award: entry for entry in request.entries if self._is_leased(entry, request.arm)}
+        its = {entry.award: entry for entry in request.entries if self._is_open(entry, request.arm)}
+        leased = {award: entry for award, entry in its.items() if self.ledger.may_begin(award)}
         revoked = tuple(entry.award for entry in request.entries if entry.award not in leased)
         self._take_space(request.arm, self.ledger.space_of(revoked, request.arm))
-        for award, entry in leased.items():
+        for award, entry in its.items():
             lease = self._writer.leases[award]
             lease.unanswered, lease.cycles = None, max(entry.cycles, lease.cycles)
+            if award not in leased:  # its arm ends the cycle in progress, which may take longer than a lease
+                lease.until_s = real_s + self._timing.counted_lease_s
         if not self._permit_commits(leased, time_s):
             leased = {award: entry for award, entry in leased.items() if not self.ledger.open[award].silent}
         for award in leased:
@@ -215,7 +218,7 @@ class Auctioneer:
         """
         ledger, job = self.ledger, job_of(request)
         known = was_carried_out(ledger, request)
-        note = ALREADY_DONE if known else objection(ledger, request, self.rounds.states.keys() | self.rounds.present)
+        note = ALREADY_DONE if known else objection(ledger, request, self.rounds.present.union(ledger.arms))
         if not known:
             entry = ledger.jobs.get(job)
             lease = None if entry is None else self._writer.leases.get(entry.award)
@@ -269,11 +272,9 @@ class Auctioneer:
         reason = status.reason or note
         return replace(status, cycles=cycles, reason=reason, finish_s=finish_s, not_planned=not planned)
 
-    def _is_leased(self, entry: LeaseEntry, arm: str) -> bool:
+    def _is_open(self, entry: LeaseEntry, arm: str) -> bool:
         award = self.ledger.open.get(entry.award)
-        if award is None or (award.record.arm, award.record.job) != (arm, entry.job):
-            return False
-        return self.ledger.may_begin(entry.award)
+        return award is not None and (award.record.arm, award.record.job) == (arm, entry.job)
 
     def _permit_commits(self, leased: dict[str, LeaseEntry], time_s: float) -> bool:
         """Record permissions to commit, and contact with silent arms; return whether that is on disk."""

@@ -67,21 +67,21 @@ def job_of(request: ControlRequest) -> str:
     return "" if isinstance(request.action, Pause | Resume) else request.action.job
 
 
-def objection(fleet: SteeredFleet, request: ControlRequest, heard: Set[str]) -> str:
+def objection(fleet: SteeredFleet, request: ControlRequest, arms: Set[str]) -> str:
     """Return why a request changes nothing; "" if it changes something.
 
     Args:
-        heard: Arms that are present or were heard.
+        arms: Those that are present, and those of the cell.
 
     Raises:
         Refused: it is not possible now.
     """
     match request.action:
         case Pause(arm):
-            _check_arm(fleet, arm, heard)
+            _check_arm(fleet, arm, arms)
             return NO_CHANGE if arm in fleet.paused else ""
         case Resume(arm):
-            _check_arm(fleet, arm, heard)
+            _check_arm(fleet, arm, arms)
             if arm != ALL_ARMS and ALL_ARMS in fleet.paused:
                 raise Refused("All arms are paused. Resume all; then pause those that must stay paused.")
             paused = fleet.paused if arm == ALL_ARMS else arm in fleet.paused
@@ -90,10 +90,9 @@ def objection(fleet: SteeredFleet, request: ControlRequest, heard: Set[str]) -> 
             return _objection_to_job(fleet, action)
 
 
-def _check_arm(fleet: SteeredFleet, arm: str, heard: Set[str]) -> None:
-    known = heard | fleet.space.keys()
-    if arm != ALL_ARMS and arm not in known:
-        raise Refused(f"There is no arm '{arm}'. Arms: {', '.join(sorted(known)) or 'none'}; '*' for all.")
+def _check_arm(fleet: SteeredFleet, arm: str, arms: Set[str]) -> None:
+    if arm != ALL_ARMS and not any(arm in names for names in (arms, fleet.space, fleet.paused)):
+        raise Refused(f"There is no arm '{arm}'. Arms: {', '.join(sorted(arms)) or 'none'}; '*' for all.")
 
 
 def _objection_to_job(fleet: SteeredFleet, action: Cancel | Settle | Change) -> str:

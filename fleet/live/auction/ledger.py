@@ -159,7 +159,9 @@ class Ledger(LedgerState):
                 self._apply_check(record)
             case LedgerSnapshot():
                 self._restore(record)
-            case Started() | ClockTick():
+            case Started(name):
+                self.name = name or self.name
+            case ClockTick():
                 pass
         self.time_s = max(self.time_s, record.time_s)
         self.unchecked.update(entry.spec.name for entry in changed)

@@ -33,7 +33,7 @@ from fleet.live.auction.records import (
     job_of,
 )
 from fleet.live.journal import TimedState
-from fleet.live.journal_records import Closed, CommitPermitted
+from fleet.live.journal_records import Closed, CommitPermitted, Started
 from fleet.live.space import ANYWHERE
 
 
@@ -41,14 +41,16 @@ from fleet.live.space import ANYWHERE
 class LedgerState(LedgerView, TimedState[AuctionRecord]):
     """Jobs and awards that can be written as one record, and restored."""
 
+    name: str = field(default="", compare=False)
+    """Of the auctioneer; "" in a journal of an earlier version."""
     _unnoted: bool = field(default=False, repr=False, compare=False)
     """Something has changed since the last `Checked`."""
 
     def __post_init__(self) -> None:
         self.space |= {arm: frozenset([ANYWHERE]) for arm in self.arms}
 
-    def compact(self) -> tuple[LedgerSnapshot]:
-        """Return one record that gives the same ledger, without awards on which a report would change nothing."""
+    def compact(self) -> tuple[LedgerSnapshot, Started]:
+        """Return the records that give the same ledger, without awards on which a report would change nothing."""
         kept = [
             award
             for name, award in self.awards.items()
@@ -75,7 +77,7 @@ class LedgerState(LedgerView, TimedState[AuctionRecord]):
             operated=self.operated,
             operations=tuple(self.operations),
         )
-        return (snapshot,)
+        return snapshot, Started(self.name, self.time_s)
 
     def checks_due(self) -> tuple[Checked, ...]:
         """Return what to write before the next records, so that a replay notices if those before are wrong."""

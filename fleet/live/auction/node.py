@@ -44,7 +44,7 @@ from fleet.live.auction.rounds import SCAN_S
 from fleet.live.clock import FleetClock
 from fleet.live.journal import Journal
 from fleet.live.journal_records import EpochBegun, Started
-from fleet.live.journal_upkeep import TimeRecorder
+from fleet.live.journal_upkeep import TimeRecorder, own_records
 from fleet.live.monitor.snapshot import FRESH_S
 from fleet.live.space import Excludes, no_conflicts
 
@@ -98,21 +98,22 @@ class AuctionNode:
 
         Raises:
             BusError: the fleet has an auctioneer already, or the journal is empty and arms know an older one.
-            JournalError: the journal is damaged, or has no space.
+            JournalError: the journal is damaged, of another auctioneer, or has no space.
         """
         self._link, self._name, self.journal = link, name, journal
         self._timing = timing or Timing()
         self._cell = cell
         self._check_no_auctioneer()
-        ledger = Ledger(places, arms).replay(journal.records(), journal.put_aside)
+        ledger = Ledger(places, arms).replay(own_records(journal, name), journal.put_aside)
         if not (ledger.epoch or new_epoch):
             check_begin(link.fleet, ask_arms(link))
         real_s = time.monotonic()
         self._recorder = TimeRecorder(journal, ledger, real_s)
         start_s = self._recorder.start_s(speed)
         self._clock = FleetClock(speed, real_s, start_s)
-        begun = () if ledger.epoch else (EpochBegun(secrets.token_hex(4), start_s, succeeds=new_epoch),)
-        journal.append(Started(name, start_s), *begun)
+        epoch = () if ledger.epoch else (EpochBegun(secrets.token_hex(4), start_s, succeeds=new_epoch),)
+        begun = (Started(name, start_s), *epoch)
+        journal.append(*begun)
         ledger.replay(begun)
         self.auctioneer = Auctioneer(
             name,

@@ -180,6 +180,11 @@ def _without_conflicts(bidding: Bidding, pairs: Iterable[tuple[str, Assignment]]
     return kept
 
 
+def no_arm_can(reasons: Mapping[str, str]) -> str:
+    """Return the reason of a job that no arm can do, from the reasons of the arms."""
+    return f"No arm can do it: {'; '.join(f'{arm}: {reason}' for arm, reason in sorted(reasons.items()))}."[:MAX_REASON]
+
+
 def infeasible_jobs(quotes: Mapping[str, Quote]) -> dict[str, str]:
     """Return the jobs that every arm with a quote calls infeasible, with the reasons of the arms."""
     reasons: dict[str, dict[str, str]] = {}
@@ -188,7 +193,7 @@ def infeasible_jobs(quotes: Mapping[str, Quote]) -> dict[str, str]:
             if not offer.feasible:
                 reasons.setdefault(offer.job, {})[arm] = offer.reason or "infeasible"
     return {
-        job: f"No arm can do it: {'; '.join(f'{arm}: {reason}' for arm, reason in by_arm.items())}."[:MAX_REASON]
+        job: no_arm_can(by_arm)
         for job, by_arm in reasons.items()
         if len(by_arm) == len(quotes) and NOT_PLANNED not in by_arm.values()
     }

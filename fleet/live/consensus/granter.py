@@ -147,16 +147,16 @@ class Granter:
         if not past and is_for(operation, self.roster) and not (known and not operations.is_new(operation)):
             self._record([Requested(operation)])
 
-    def settle(self, operation: Operation, award: str) -> JobOutcome:
-        """Record that a person calls a job done, and return its outcome.
+    def settle(self, operation: Operation, award: str, cycles: int) -> JobOutcome:
+        """Record that a person calls a job of so many cycles done, and return its outcome.
 
         Raises:
             JournalError: it is not on disk, and nothing has changed.
         """
         job, by = job_of(operation.request), operation.request.by
-        award, cycles = award or operation.request.request, self.register.cycles.get(job, 0)
+        award, arm = award or operation.request.request, self.register.last_arm.get(job, operation.auctioneer)
         reason = f"Settled as done by '{by}'."
-        outcome = JobOutcome(job, award, operation.auctioneer, "finished", cycles, operation.time_s, reason)
+        outcome = JobOutcome(job, award, arm, "finished", cycles, operation.time_s, reason)
         self._record([JobSettled(outcome)])
         return outcome
 
@@ -234,15 +234,15 @@ class Granter:
     def status(self, job: str, real_s: float) -> JobStatus:
         """Return the status of a job, as far as this arm knows from its grants and from received outcomes."""
         outcome, grant = self.register.settled.get(job), self.register.grants.get(job)
-        cycles = self.register.cycles.get(job, 0)
+        cycles, last = self.register.cycles.get(job, 0), self.register.last_arm.get(job, "")
         if outcome is not None and outcome.outcome == "finished":
             return JobStatus(job, "finished", outcome.arm, outcome.award, cycles, outcome.time_s, outcome.reason)
         if outcome is not None and (outcome.outcome == "given_up" or outcome.outcome == "cancelled"):
-            return JobStatus(job, outcome.outcome, cycles=cycles, reason=outcome.reason)
+            return JobStatus(job, outcome.outcome, last, cycles=cycles, reason=outcome.reason)
         if outcome is not None:
             return JobStatus(job, "unfinished", outcome.arm, outcome.award, cycles, None, outcome.reason)
         if grant is None or not self.is_granted(job, real_s):
-            return JobStatus(job, "waiting", cycles=cycles)
+            return JobStatus(job, "waiting", last, cycles=cycles, reason=self._why_again(job, last))
         if grant.may_commit and real_s >= grant.until_s:
             return JobStatus(job, "unfinished", grant.arm, grant.award, cycles, None, reason_for_silence(grant.arm))
         cancel = self.register.operations.cancelled(job)
@@ -251,6 +251,14 @@ class Granter:
         return JobStatus(job, state, grant.arm, grant.award, cycles, None, reason)
 
     # Inside
+
+    def _why_again(self, job: str, arm: str) -> str:
+        """Return the request of a person by which a job waits again; "" if there is none."""
+        operations = self.register.operations
+        if arm and (pauser := operations.paused.get(arm)) is not None:
+            return f"Its arm was paused by '{pauser}'."
+        redo = operations.latest.get(("redo", job))
+        return "" if redo is None else f"To be redone, by '{redo.request.by}'."
 
     def _is_new(self, outcome: JobOutcome) -> bool:
         if outcome.outcome == "returned":
@@ -310,6 +318,8 @@ class Granter:
             return f"the space of '{arm}' was cleared"
         cancel = self.register.operations.cancelled(entry.job)
         if cancel is not None and not (grant is not None and same and grant.may_commit):
+            if grant is not None and same:  # its arm ends the cycle in progress, which may take longer than a lease
+                grant.until_s = real_s + self._timing.counted_lease_s
             return _cancelled_by(cancel)
         has_space = same and (entry.space or ANYWHERE) in self.register.space[arm]
         if not has_space and (in_way := self.in_the_way(arm, entry.space)):

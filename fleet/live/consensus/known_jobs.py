@@ -4,12 +4,16 @@ from collections.abc import Iterable, Mapping, Set
 
 from msgspec.structs import replace
 
-from fleet.bus.protocol.auction import JobSpec, JobStatus
+from fleet.bus.protocol.auction import NOT_PLANNED, JobSpec, JobStatus
+from fleet.bus.protocol.consensus import Bid
 from fleet.bus.protocol.messages import State
+from fleet.bus.protocol.operator import ALL_ARMS
 from fleet.live.auction.job_rules import EXPIRED, SHIFT_ENDED, is_late, job_order, lost_jobs, ready_jobs, with_terms
 from fleet.live.auction.ledger import MAX_SETTLED
+from fleet.live.auction.round import no_arm_can
 from fleet.live.consensus.control import KnownJob
 from fleet.live.consensus.granter import Granter
+from fleet.live.consensus.register import MAX_NOTES
 
 
 class KnownJobs:
@@ -27,6 +31,8 @@ class KnownJobs:
         self.current: dict[str, JobSpec] = {}
         self.ended = False
         self._granter, self._register = granter, granter.register
+        self._refusals: dict[str, dict[str, str]] = {}
+        """Why arms cannot do a job, by arm, by job."""
 
     def add(self, jobs: Iterable[JobSpec]) -> None:
         """Add jobs that are not known yet."""
@@ -49,6 +55,23 @@ class KnownJobs:
         for name in self._register.take_gone():
             self.submitted.pop(name, None)
             self.current.pop(name, None)
+
+    def note_offers(self, bid: Bid) -> None:
+        """Note which jobs the arm of a bid cannot do."""
+        for offer in bid.estimates:
+            by_arm = self._refusals.setdefault(offer.job, {})
+            by_arm[bid.arm] = "" if offer.feasible else offer.reason or "infeasible"
+        while len(self._refusals) > MAX_NOTES:
+            del self._refusals[next(iter(self._refusals))]
+
+    def _refusal(self, job: str, present: Set[str]) -> str:
+        """Return why no present arm can do a job, or none works; "" if one can, or it is unknown."""
+        if (pauser := self._register.operations.paused.get(ALL_ARMS)) is not None:
+            return f"All arms are paused by '{pauser}'."
+        reasons = self._refusals.get(job, {})
+        if not reasons or present - reasons.keys() or not all(reasons.values()) or NOT_PLANNED in reasons.values():
+            return ""
+        return no_arm_can(reasons)
 
     def apply_changes(self) -> None:
         """Have the jobs follow what people have requested."""
@@ -81,13 +104,22 @@ class KnownJobs:
         return ready_jobs(free, time_s, limit, busy, finished, self._register.returned_s)
 
     def status(
-        self, later: Iterable[JobSpec], states: Mapping[str, State], real_s: float, time_s: float
+        self,
+        later: Iterable[JobSpec],
+        states: Mapping[str, State],
+        real_s: float,
+        time_s: float,
+        present: Set[str] = frozenset(),
     ) -> list[JobStatus]:
         """Return the status of all known jobs, and of `later` ones that are not offered yet."""
         jobs = self.current | {job.name: job for job in later}
         lost = self._lost(jobs, real_s, time_s)
         names = dict.fromkeys([*jobs, *self._register.settled])
-        return [self._status(name, jobs.get(name), lost, states, real_s) for name in names]
+        found = [self._status(name, jobs.get(name), lost, states, real_s) for name in names]
+        return [
+            replace(each, reason=each.reason or self._refusal(each.job, present)) if each.state == "waiting" else each
+            for each in found
+        ]
 
     def steered(self, name: str, states: Mapping[str, State], real_s: float, time_s: float) -> dict[str, KnownJob]:
         """Return what is known of one job, by its name; nothing of an unknown one."""

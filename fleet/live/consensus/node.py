@@ -9,6 +9,7 @@ import math
 import secrets
 import time
 from collections import deque
+from itertools import chain
 from random import Random
 
 from msgspec.structs import replace
@@ -46,7 +47,8 @@ from fleet.live.consensus.participant import QUIET_S, Membership, Participant
 from fleet.live.consensus.records import GrantRecord
 from fleet.live.consensus.register import Register
 from fleet.live.journal import Journal
-from fleet.live.journal_upkeep import TimeRecorder
+from fleet.live.journal_records import Started
+from fleet.live.journal_upkeep import TimeRecorder, own_records
 
 _LOG = logging.getLogger(__name__)
 
@@ -87,10 +89,11 @@ class ConsensusNode:
 
         Raises:
             BusError: peers know another epoch, or claims of this arm after those in its journals.
+            JournalError: the journal is of another arm.
         """
         self._arm, self._link, self._membership = arm, arm.link, membership
         self._name, self._speed = arm.executor.arm, arm.clock.speed
-        register = Register().replay(journal.records())
+        register = Register().replay(chain(own_records(journal, self._name), [Started(self._name)]))
         real_s = time.monotonic()
         self._recorder = TimeRecorder(journal, register, real_s)
         roster = membership.fleet.arms

@@ -146,6 +146,7 @@ class Participant:
         if bid.arm not in self.granter.roster or (before is not None and bid.number < before[0].number):
             return
         self._bids[bid.arm] = bid, real_s
+        self.known.note_offers(bid)
         if before is None or _offered(before[0]) != _offered(bid):
             self.changed_s, self._new_bids = real_s, True
         elif (before[0].choice, before[0].choice_plan) != (bid.choice, bid.choice_plan):
@@ -215,7 +216,8 @@ class Participant:
             operation = fleet.operation(self.name, request, time_s)
             granter.operate(operation)
             if isinstance(request.action, Settle) and request.action.outcome == "done" and not note:
-                self.claimant.send_outcome(granter.settle(operation, fleet.jobs[job].award))
+                settled = fleet.jobs[job]
+                self.claimant.send_outcome(granter.settle(operation, settled.award, settled.spec.repetitions))
             granter.abandon(real_s)
             self.known.apply_changes()
             self.claimant.send_operation(operation)
@@ -264,7 +266,7 @@ class Participant:
 
     def status(self, later: Iterable[JobSpec], real_s: float) -> list[JobStatus]:
         """Return the status of all known jobs, and of `later` ones that are not offered yet."""
-        return self.known.status(later, self.states, real_s, self._time_s)
+        return self.known.status(later, self.states, real_s, self._time_s, self._present)
 
     def all_settled(self, real_s: float) -> bool:
         """Return whether every present arm, a majority at least, knows that every job is settled."""
@@ -320,8 +322,7 @@ class Participant:
         early = self._present - bids.keys() or real_s < self.changed_s + QUIET_S
         if early and real_s < self._bid_s + self._timing.window_s:
             return
-        self._new_bids, self._chosen_s = False, real_s
-        self.rounds += 1
+        self._new_bids, self._chosen_s, self.rounds = False, real_s, self.rounds + 1
         bidding = self._bidding(bids, [offer.job for offer in own.estimates], real_s)
         observations = observe(bidding, self._fleet, last={self.name: -1} if self._lost else {})
         action = self._policy(observations[self.name], self._fleet.arms.index(self.name))

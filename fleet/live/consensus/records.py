@@ -5,7 +5,16 @@ import msgspec
 from fleet.bus.protocol.auction import Count, JobState, Name
 from fleet.bus.protocol.consensus import Faults, JobOutcome
 from fleet.bus.protocol.operator import Operation
-from fleet.live.journal_records import ClockTick, EpochBegun, JobsAccepted, Progress, Released, SpaceCleared, SpaceTaken
+from fleet.live.journal_records import (
+    ClockTick,
+    EpochBegun,
+    JobsAccepted,
+    Progress,
+    Released,
+    SpaceCleared,
+    SpaceTaken,
+    Started,
+)
 
 
 class JobGranted(msgspec.Struct, frozen=True, tag="job_granted"):
@@ -41,6 +50,8 @@ class JobReturned(msgspec.Struct, frozen=True, tag="job_returned"):
 
     job: Name
     time_s: float
+    arm: Name | None = None
+    """None in the journals of earlier versions."""
 
 
 class ClaimNumbered(msgspec.Struct, frozen=True, tag="claim_numbered"):
@@ -70,7 +81,8 @@ class PastKnown(msgspec.Struct, frozen=True, tag="past_known"):
 
 
 GrantRecord = (
-    PastKnown
+    Started
+    | PastKnown
     | JobGranted
     | Released
     | JobSettled

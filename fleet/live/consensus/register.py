@@ -24,7 +24,16 @@ from fleet.live.consensus.records import (
 )
 from fleet.live.consensus.settled_jobs import SettledJobs, is_abandoned
 from fleet.live.journal import TimedState
-from fleet.live.journal_records import ClockTick, EpochBegun, JobsAccepted, Progress, Released, SpaceCleared, SpaceTaken
+from fleet.live.journal_records import (
+    ClockTick,
+    EpochBegun,
+    JobsAccepted,
+    Progress,
+    Released,
+    SpaceCleared,
+    SpaceTaken,
+    Started,
+)
 from fleet.live.space import ANYWHERE
 
 MAX_NOTES = 4 * MAX_OPEN_JOBS
@@ -60,6 +69,8 @@ class Register(TimedState[GrantRecord]):
     """Fleet time at which an arm last returned a job, by job."""
     cycles: dict[str, int] = field(default_factory=dict[str, int])
     """Cycles known to be done, by job."""
+    last_arm: dict[str, str] = field(default_factory=dict[str, str])
+    """The arm that has a job, or had it last, by job."""
     numbers: dict[str, int] = field(default_factory=dict[str, int])
     """Number of the last claim, by arm."""
     jobs: dict[str, JobSpec] = field(default_factory=dict[str, JobSpec])
@@ -71,15 +82,20 @@ class Register(TimedState[GrantRecord]):
     """Names of the spaces that an arm may take, by arm."""
     operations: Operations = field(default_factory=Operations)
     """Requests of people."""
+    name: str = ""
+    """Of the arm; "" in a journal of an earlier version."""
     _forgotten: int = 0
     """How many of the jobs that have left are forgotten."""
 
     def apply(self, record: GrantRecord) -> None:
         """Apply a record that is on disk."""
         match record:
+            case Started(name):
+                self.name = name or self.name
             case JobGranted():
                 self._count(record.job, record.cycles)
                 self._number(record.arm, record.number)
+                self._note_arm(record.job, record.arm)
                 self.grants[record.job] = Grant(
                     record.arm, record.award, record.places, record.may_commit, record.revoked
                 )
@@ -94,6 +110,7 @@ class Register(TimedState[GrantRecord]):
                 self._add_faults(outcome.job, outcome.faults)
                 if outcome.outcome == "returned":
                     self._return(outcome.job, outcome.time_s)
+                    self._note_arm(outcome.job, outcome.arm)
                 elif self.is_news(outcome):
                     self.settled.put(outcome, self.jobs)
                     self.returned_s.pop(outcome.job, None)
@@ -102,8 +119,9 @@ class Register(TimedState[GrantRecord]):
                 self._forget()
             case Faulted(job, faults):
                 self._add_faults(job, faults)
-            case JobReturned(job, time_s):
+            case JobReturned(job, time_s, arm):
                 self._return(job, time_s)
+                self._note_arm(job, arm)
             case JobsAccepted(jobs):
                 self.jobs |= {job.name: job for job in jobs if job.name not in self.past}
             case PastKnown(packed, left):
@@ -131,7 +149,7 @@ class Register(TimedState[GrantRecord]):
 
     def compact(self) -> tuple[GrantRecord, ...]:
         """Return the fewest records that give the same register."""
-        records: list[GrantRecord] = [ClockTick(self.time_s)]
+        records: list[GrantRecord] = [ClockTick(self.time_s), *([Started(self.name)] if self.name else [])]
         records += [PastKnown(self.past.packed(), self.settled.left)] if len(self.past) else []
         records += [EpochBegun(self.epoch)] if self.epoch else []
         records += [ClaimNumbered(arm, number) for arm, number in self.numbers.items()]
@@ -143,7 +161,7 @@ class Register(TimedState[GrantRecord]):
                 JobGranted(grant.arm, number, grant.award, job, grant.places, cycles, grant.may_commit, grant.revoked)
             )
         records += [Faulted(job, faults) for job, faults in self.faults.items() if job not in self.settled]
-        records += [JobReturned(job, time_s) for job, time_s in self.returned_s.items()]
+        records += [JobReturned(job, time_s, self.last_arm.get(job)) for job, time_s in self.returned_s.items()]
         records += [JobSettled(outcome) for outcome in self.settled.values()]
         records += [RequestsKnown(tuple(self.operations.names))] if self.operations.names else []
         records += map(Requested, self.operations.all)
@@ -186,7 +204,7 @@ class Register(TimedState[GrantRecord]):
     def _forget(self) -> None:
         """Forget what is known of jobs that have left."""
         for job in self.settled.gone[self._forgotten :]:
-            for notes in (self.jobs, self.cycles, self.faults, self.returned_s):
+            for notes in (self.jobs, self.cycles, self.faults, self.returned_s, self.last_arm):
                 notes.pop(job, None)
             self.operations.forget(job)
         self._forgotten = len(self.settled.gone)
@@ -225,6 +243,11 @@ class Register(TimedState[GrantRecord]):
         if job not in self.past:
             self.cycles[job] = max(cycles, self.cycles.get(job, 0))
             _bound(self.cycles)
+
+    def _note_arm(self, job: str, arm: str | None) -> None:
+        if arm is not None and job not in self.past:
+            self.last_arm[job] = arm
+            _bound(self.last_arm)
 
     def _number(self, arm: str, number: int) -> None:
         self.numbers[arm] = max(number, self.numbers.get(arm, -1))

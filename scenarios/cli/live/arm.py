@@ -33,7 +33,7 @@ from fleet.live.arm.node import ArmNode
 from fleet.live.arm.replay_body import ReplayBody, SensorLog
 from fleet.live.clock import FleetClock
 from fleet.live.journal import Journal
-from fleet.live.journal_upkeep import CompactingJournal, put_aside
+from fleet.live.journal_upkeep import CompactingJournal, own_records, put_aside
 from fleet.motion import Plan
 from scenarios.cli.live.journals import folder_of, refuse_other_way
 from scenarios.cli.live.options import (
@@ -299,7 +299,7 @@ def make_node(
 
 def restart_history(book: Journal[ArmRecord], name: str, time_s: float) -> ArmHistory:
     """History of the arm at this start, written to its journal."""
-    before = ArmHistory().replay(book.records(), book.put_aside)
+    before = ArmHistory().replay(own_records(book, name), book.put_aside)
     for active in before.active.values():
         log.warning("'%s' was unfinished at the last exit of the arm: returned.", active.job)
     history = before.after_restart(name, time_s)

@@ -119,8 +119,7 @@ class Arm:
     def _step(self) -> None:
         self.executor.retry_writes()
         self._work()
-        self.executor.return_revoked(0.0, self.real_s, at_home=not self.out)
-        self.executor.return_expired(0.0, self.real_s)
+        self.executor.return_ended(0.0, self.real_s, at_home=not self.out)
         if self.executor.lease_requests(self.real_s) or self.executor.due_reports(self.real_s):
             self.participant.claimant.claim_soon()
         self.participant.set_present(self.fleet.alive_for(self.name))
@@ -155,18 +154,19 @@ class Arm:
         first = self.executor.active[0]
         name, repetitions = first.award.job.name, first.award.job.repetitions
         if self.cycle_ends_s is None and self.executor.allowed_cycles(self.real_s) > first.cycles:
-            self.cycle_ends_s = name, self.real_s + CYCLE_S
+            self.cycle_ends_s = name, self.real_s + self.fleet.cycle_s
             if first.cycles + 1 == repetitions:
                 self.fleet.last_cycle(name)
         elif self.cycle_ends_s is not None and self.cycle_ends_s[0] != name:
             self.cycle_ends_s = None
         elif self.cycle_ends_s is not None and self.real_s >= self.cycle_ends_s[1]:
             self.cycle_ends_s = None
+            self.fleet.cycles_done += 1
             if first.cycles + 1 == repetitions:
                 self.executor.finish(self.fleet.true_s, self.real_s)
                 return
             self.executor.record_progress(first.cycles + 1, 0.0)
-        self.executor.record_progress(first.cycles, (repetitions - 1 - first.cycles) * CYCLE_S)
+        self.executor.record_progress(first.cycles, (repetitions - 1 - first.cycles) * self.fleet.cycle_s)
 
     def break_off(self) -> None:
         """Stop during a cycle, which then does not count."""
@@ -205,6 +205,7 @@ class Fleet:
         self.packets: list = []
         self.old: list = []
         self.cut: set[str] = set()
+        self.cycle_s, self.cycles_done = CYCLE_S, 0
         self.last_cycles: dict[str, int] = {}
         self.unsure_jobs: set[str] = set()
         self.faults: dict[str, list[str]] = {}

@@ -2,7 +2,7 @@
 
 import pytest
 
-from fleet.bus.protocol.auction import JobSpec
+from fleet.bus.protocol.auction import JobEstimate, JobSpec
 from fleet.bus.protocol.operator import Cancel, Change, Pause, Resume, Settle
 from fleet.errors import Refused
 
@@ -76,6 +76,26 @@ def test_a_job_at_work_is_cancelled_after_the_cycle_in_progress_and_never_done(c
     assert not any(arm.executor.active or arm.executor.has_pending_reports for arm in fleet.arms.values())
     fleet.run(5.0)
     assert "a" not in fleet.last_cycles
+
+
+@pytest.mark.parametrize("cancels", [True, False])
+def test_the_cycle_in_progress_counts_when_a_job_is_stopped(council, cancels):
+    fleet = council.Fleet([1.0] * 3, [job("a", 3)])
+    fleet.cycle_s = 8.0  # longer than a lease
+    run_until(fleet, lambda: any(arm.cycle_ends_s is not None for arm in fleet.arms.values()))
+    one = holder(fleet, "a")
+    fleet.control(Cancel("a") if cancels else Pause(), "one", next(name for name in fleet.names if name != one))
+    fleet.run(6.0)
+    assert states(fleet, "a") == {"awarded"}
+    run_until(fleet, lambda: states(fleet, "a") == {"cancelled" if cancels else "waiting"})
+    fleet.run(1.0)
+    assert {s.cycles for arm in fleet.arms.values() for s in arm.participant.status([], arm.real_s)} == {1}
+    if not cancels:
+        fleet.cycle_s = 0.2
+        fleet.control(Resume(), "two")
+        run_until(fleet, lambda: states(fleet, "a") == {"finished"})
+        assert fleet.cycles_done == 3
+    assert fleet.last_cycles == ({} if cancels else {"a": 1})
 
 
 def test_a_job_in_its_last_cycle_is_finished_in_spite_of_a_cancellation(council):
@@ -163,7 +183,7 @@ def test_a_paused_arm_gives_its_job_back_and_gets_none_until_it_is_resumed(counc
     for arm in fleet.arms.values():
         arm.start()
     run_until(fleet, lambda: not holder(fleet, "a"))
-    fleet.run(3.0)
+    fleet.run(5.0)
     assert states(fleet, "a") == {"waiting"}
     assert fleet.control(Resume(), "4").paused == {}
     run_until(fleet, lambda: bool(holder(fleet, "a")))
@@ -187,3 +207,40 @@ def test_due_date_and_value_change_at_all_arms_and_the_latest_counts(council):
         spec = arm.participant.known.current["a"]
         assert (spec.due_s, spec.value) == (3e6, 3.0)
         assert arm.participant.known.submitted["a"].value == 1.0
+
+
+def test_a_status_names_the_last_arm_and_why_a_job_waits(council):
+    fleet = council.Fleet([1.0] * 3, [job("a", 1)])
+    one = silent(fleet)
+    first = next(name for name in fleet.names if name != one)
+    done = fleet.control(Settle("a", "done"), "1", first).job
+    assert (done.state, done.arm, done.cycles) == ("finished", one, 1)
+
+    fleet = council.Fleet([1.0] * 3, [job("a")])
+    run_until(fleet, lambda: bool(holder(fleet, "a")))
+    one = holder(fleet, "a")
+    fleet.control(Pause(one), "1")
+    run_until(fleet, lambda: holder(fleet, "a") not in ("", one))
+    one = holder(fleet, "a")
+    for name in fleet.names:
+        fleet.control(Pause(name), f"pause {name}")
+    run_until(fleet, lambda: states(fleet, "a") == {"waiting"})
+    for restarted in (False, True):
+        for arm in fleet.arms.values():
+            if restarted:
+                arm.start()
+            (status,) = arm.participant.status([], arm.real_s)
+            assert (status.arm, status.reason) == (one, "Its arm was paused by 'ann'.")
+    fleet.control(Cancel("a"), "cancel")
+    fleet.run(5.0)
+    assert states(fleet, "a") == {"cancelled"}
+    assert {s.arm for arm in fleet.arms.values() for s in arm.participant.status([], arm.real_s)} == {one}
+
+
+def test_a_status_says_why_no_arm_can_do_a_job(council):
+    fleet = council.Fleet([1.0] * 3, [job("a")])
+    fleet.offer = lambda arm, job: JobEstimate(job.name, reason=f"too far for {arm}")
+    fleet.run(3.0)
+    expected = "No arm can do it: arm_0: too far for arm_0; arm_1: too far for arm_1; arm_2: too far for arm_2."
+    reasons = [s.reason for arm in fleet.arms.values() for s in arm.participant.status([], arm.real_s)]
+    assert reasons == [expected] * 3
