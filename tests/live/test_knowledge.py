@@ -125,7 +125,7 @@ class LiveShift:
         )
         config = ExecutorConfig(valid_s=HOUR_S)
         executor = AwardExecutor(name, lambda *_: None, ArmHistory(), nonce="n", config=config)
-        clock = SimpleNamespace(speed=1e3, real_s=0.0, now_s=lambda _: self.time_s)
+        clock = SimpleNamespace(speed=1e3, real_s=0.0, epoch="e", now_s=lambda _: self.time_s)
         return ArmNode(
             self.wires[name],
             body,
@@ -205,7 +205,7 @@ def fill(register: Register, ledger: Ledger, states: dict[str, State]) -> None:
             register.returned_s[name] = entry.returned_s
             register.faults[name] = {str(number): arm for number, arm in enumerate(entry.faults)}
         if entry.state in ("finished", "given_up"):
-            register.settled[name] = JobOutcome(name, "a", NAMES[0], entry.state, entry.cycles, 0.0)
+            register.settled.put(JobOutcome(name, "a", NAMES[0], entry.state, entry.cycles, 0.0), register.jobs)
         elif entry.state in ("awarded", "finishing"):
             arm = ledger.open[entry.award].record.arm
             register.grants[name] = Grant(arm, entry.award, entry.spec.places, until_s=np.inf)

@@ -122,20 +122,20 @@ def arm(endpoint: str, *, feasible: bool = True) -> Iterator[list[QuoteRequest]]
         yield asked
 
 
-@pytest.mark.parametrize(("end", "code"), [("finished", 0), ("unfinished", 1)])
-def test_jobs_can_be_followed_to_their_end(endpoint, tmp_path, thermofleet, end, code):
+@pytest.mark.parametrize(("end", "link", "code"), [("finished", "by", 0), ("unfinished", "last at", 1)])
+def test_jobs_can_be_followed_to_their_end(endpoint, tmp_path, thermofleet, end, link, code):
     states = iter([JobStatus("a", "waiting"), JobStatus("a", "awarded", "arm_0"), JobStatus("a", end, "arm_0")])
 
-    def declare(link: BusClient) -> None:
+    def declare(bus: BusClient) -> None:
         taken = SubmissionReply("auctioneer", (Admission("a", True),))
-        link.reply_to(keys.of_jobs("f", "submit"), Submission, lambda _: taken)
-        link.reply_to(keys.of_jobs("f", "status"), StatusRequest, lambda _: Status("auctioneer", 0.0, (next(states),)))
+        bus.reply_to(keys.of_jobs("f", "submit"), Submission, lambda _: taken)
+        bus.reply_to(keys.of_jobs("f", "status"), StatusRequest, lambda _: Status("auctioneer", 0.0, (next(states),)))
 
     file = tmp_path / "jobs"
     file.write_text(json.dumps(HOLD))
     with served(endpoint, declare):
         said = thermofleet("submit", file, "--wait", "--endpoint", endpoint, "--fleet", "f")
-    assert said[:2] == (code, f"a: accepted\na: waiting\na: awarded to arm_0\na: {end} by arm_0\n")
+    assert said[:2] == (code, f"a: accepted\na: waiting\na: awarded to arm_0\na: {end} {link} arm_0\n")
 
 
 def test_ask_shows_the_cost_of_a_job_for_each_arm(endpoint, thermofleet):
