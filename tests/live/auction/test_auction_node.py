@@ -25,6 +25,9 @@ from fleet.live import journal, journal_upkeep
 from fleet.live.auction.job_rules import status_reply
 from fleet.live.journal import Journal
 
+TWICE = ("Started", "Started")
+"""Of the owner, which compaction keeps, and of the start."""
+
 
 def test_jobs_are_accepted_awarded_and_finished(bus):
     node = bus.auctioneer(places=frozenset({"rack", "bin"}))
@@ -116,7 +119,7 @@ def test_the_journal_is_compacted_at_the_start_and_when_it_has_grown(bus, monkey
     bus.until(lambda: bus.states(first) == ["finished"])
     bus.kill(first)
     again = bus.auctioneer()
-    assert [type(record).__name__ for record in again.journal.records()] == ["LedgerSnapshot", "Started"]
+    assert [type(record).__name__ for record in again.journal.records()] == ["LedgerSnapshot", *TWICE]
     assert bus.states(again) == ["finished"]
     monkeypatch.setattr(journal_upkeep, "TICK_S", 0.01)
     monkeypatch.setattr(journal, "COMPACT_BYTES", 1)
@@ -139,7 +142,7 @@ def test_a_journal_that_cannot_be_compacted_is_continued(bus, monkeypatch, caplo
     assert "is not compacted: no room" in caplog.text
     assert [type(record).__name__ for record in again.journal.records()] == [
         "LedgerSnapshot",
-        "Started",
+        *TWICE,
         "EpochBegun",
         "JobsAccepted",
         "Started",
