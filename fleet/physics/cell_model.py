@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from fleet.job import MOST_PAYLOAD_M, PAYLOAD_KG_PER_M3, Fixture, Place
-from fleet.physics.models import build_cell
+from fleet.physics.models import build_cell, quaternion
 from fleet.robot import Mount, Robot, rotation
 
 SHAPES = {
@@ -77,9 +77,7 @@ def _shape(model: mujoco.MjModel, geom: int) -> dict[str, Any]:
 
 
 def _pose(position_m: Sequence[float], matrix: np.ndarray) -> dict[str, Any]:
-    quaternion = np.empty(4)
-    mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(matrix).ravel())
-    return {"position": _rounded(position_m), "quaternion": _rounded(quaternion)}
+    return {"position": _rounded(position_m), "quaternion": _rounded(quaternion(matrix))}
 
 
 def _rounded(values: Sequence[float] | np.ndarray) -> list[float]:

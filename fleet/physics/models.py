@@ -65,13 +65,13 @@ def build_cell(
         spec.geom("floor").contype = spec.geom("floor").conaffinity = 0
     world.add_light(name="sun", pos=(0.0, 0.0, 4.0), dir=(0.0, 0.0, -1.0), type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     for robot in robots:
-        mount = world.add_frame(pos=robot.mount.position_m, quat=_quat(robot.mount.rotation()))
+        mount = world.add_frame(pos=robot.mount.position_m, quat=quaternion(robot.mount.rotation()))
         spec.attach(_arm_spec(robot, meshes=meshes), prefix=f"{robot.name}/", frame=mount)
     for place in places:
         world.add_site(
             name=f"station/{place.name}",
             pos=place.position_m,
-            quat=_quat(rotation(place.tool_deg)),
+            quat=quaternion(rotation(place.tool_deg)),
             size=(0.015, 0.015, 0.015),
             rgba=(0.95, 0.55, 0.10, 1.0),
         )
@@ -80,7 +80,7 @@ def build_cell(
             name=f"fixture/{fixture.name}",
             type=mujoco.mjtGeom.mjGEOM_BOX,
             pos=fixture.position_m,
-            quat=_quat(rotation(fixture.tilt_deg)),
+            quat=quaternion(rotation(fixture.tilt_deg)),
             size=[length / 2 for length in fixture.size_m],
             rgba=(0.55, 0.50, 0.43, 1.0),
         )
@@ -229,7 +229,8 @@ def _arm_spec(robot: Robot, *, meshes: bool) -> mujoco.MjSpec:
     return spec
 
 
-def _quat(matrix: Array) -> Array:
+def quaternion(matrix: Array) -> Array:
+    """Rotation matrix [3, 3] as a unit quaternion w, x, y, z."""
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, np.ascontiguousarray(matrix).ravel())
     return quat

@@ -7,6 +7,7 @@ from scenarios.report.gantt import clock
 from scenarios.report.page import Moment, paragraph, table
 from scenarios.shift_records import Offer
 
+CANNOT = "cannot do it"
 MOST_AWARDS = 300
 MOST_ARMS = 8
 """With more arms, the columns are the best other offers instead of the arms."""
@@ -50,12 +51,17 @@ def choices(offers: Sequence[Offer], arms: Sequence[str]) -> list[str]:
     ]
 
 
-def _cell(offer: Offer) -> str:
-    if not offer.feasible or offer.p_saturation is None:
-        return "cannot do it"
-    parts = [f"P {offer.p_saturation:.2f}"]
+def scores(offer: Offer) -> list[str]:
+    """P(saturation), predicted peak and difficulty of an offer, as far as they are known."""
+    parts = [f"P {offer.p_saturation:.2f}"] if offer.p_saturation is not None else []
     parts += [f"{offer.peak_c:.0f} °C"] if offer.peak_c is not None else []
     parts += [f"d {offer.difficulty:.2f}"] if offer.difficulty is not None else []
-    parts += [f"{(offer.duration_s or 0.0) / 60:.0f} min"]
+    return parts
+
+
+def _cell(offer: Offer) -> str:
+    if not offer.feasible or offer.p_saturation is None:
+        return CANNOT
+    parts = [*scores(offer), f"{(offer.duration_s or 0.0) / 60:.0f} min"]
     barred = "" if offer.free else f" ({offer.state if offer.state != 'idle' else 'place or space taken'})"
     return ", ".join(parts) + barred

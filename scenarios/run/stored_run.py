@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any  # values of run.json
 
@@ -16,6 +17,8 @@ from fleet.events import Event
 from fleet.robot import JOINTS
 from fleet.telemetry import MODES, Telemetry
 from scenarios.report.notebook import run_html
+from scenarios.report.playback import payloads
+from scenarios.report.schedule import Schedule, schedule
 from scenarios.run.run_folder import UNITS, check_format
 from scenarios.schema import Scenario
 from scenarios.shift_records import JobRecord, Offer
@@ -37,6 +40,16 @@ class StoredRun:
     def arms(self) -> tuple[str, ...]:
         """Names of the arms."""
         return tuple(arm.name for arm in self.scenario.arms)
+
+    @cached_property
+    def plan(self) -> Schedule:
+        """Which arm worked on what."""
+        return schedule(self.events, self.arms, float(self.telemetry.time_s[-1]))
+
+    @cached_property
+    def load_kg(self) -> np.ndarray:
+        """Payload in each hand, kg, [sample, arm]."""
+        return payloads(self.telemetry, self.plan, self.arms, {job.job: job.payload_kg for job in self.jobs})
 
     def _repr_html_(self) -> str:
         return run_html(self.card, self.events, self.offers)

@@ -14,8 +14,6 @@ from fleet.physics.cell_player import CellCamera, CellPlayer
 from fleet.robot import ThermalLimits
 from fleet.telemetry import FAULTED, MODES
 from scenarios.report.gantt import clock
-from scenarios.report.playback import payloads
-from scenarios.report.schedule import schedule
 from scenarios.run.stored_run import StoredRun
 from scenarios.view.moments import motor_spheres
 
@@ -71,13 +69,11 @@ class Film:
     """
 
     def __init__(self, run: StoredRun, *, meshes: bool = False) -> None:
-        scenario, readings = run.scenario, run.telemetry
+        scenario = run.scenario
         robots = [arm.robot() for arm in scenario.arms]
         self.player = CellPlayer(robots, scenario.places, scenario.fixtures, meshes=meshes)
         self._limits = scenario.limits
-        plan = schedule(run.events, run.arms, float(readings.time_s[-1]))
-        self._load_kg = payloads(readings, plan, run.arms, {job.job: job.payload_kg for job in run.jobs})
-        self._readings = readings
+        self._load_kg, self._readings = run.load_kg, run.telemetry
 
     def show(self, time_s: float) -> tuple[Array, Array]:
         """Put the cell into its state at a time; returns the temperatures [arm, joint] and the modes [arm]."""

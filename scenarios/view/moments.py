@@ -13,8 +13,8 @@ from fleet.events import Event
 from fleet.job import payload_radius_m
 from fleet.physics.cell_model import cell_model
 from fleet.robot import ThermalLimits
-from scenarios.report.playback import HEAT_STEP_S, payloads
-from scenarios.report.schedule import Schedule, schedule
+from scenarios.report.choices import CANNOT, scores
+from scenarios.report.playback import HEAT_STEP_S
 from scenarios.run.stored_run import StoredRun
 from scenarios.shift_records import Offer
 
@@ -89,22 +89,16 @@ class Moments:
         return np.stack([w * cos - z * sin, x * cos + y * sin, y * cos - x * sin, z * cos + w * sin], axis=-1)
 
     @cached_property
-    def plan(self) -> Schedule:
-        """Which arm worked on what."""
-        return schedule(self.run.events, self.run.arms, float(self.run.telemetry.time_s[-1]))
-
-    @cached_property
     def payload_m(self) -> Array:
         """Radius of the ball in each hand, m, [sample, arm]; 0 without a payload."""
-        weights = {job.job: job.payload_kg for job in self.run.jobs}
-        load_kg = payloads(self.run.telemetry, self.plan, self.run.arms, weights)
+        load_kg = self.run.load_kg
         sizes = {kg: payload_radius_m(kg) for kg in np.unique(load_kg).tolist()}
         return np.vectorize(sizes.__getitem__, otypes=[float])(load_kg)
 
     def jobs(self, arm: str, time_s: Array) -> list[str]:
         """Job of an arm at each time; "" for none."""
         names = [""] * len(time_s)
-        for work in self.plan.assignments:
+        for work in self.run.plan.assignments:
             if work.arm == arm:
                 begin, end = np.searchsorted(time_s, (work.start_s, work.end_s))
                 names[begin:end] = [work.job] * (end - begin)
@@ -138,9 +132,7 @@ def offers_text(offers: Sequence[Offer]) -> str:
     """What each arm knew of a job, the winner first."""
     parts: list[str] = []
     for offer in sorted(offers, key=lambda o: (not o.awarded, o.arm)):
-        known = [f"P {offer.p_saturation:.2f}"] if offer.p_saturation is not None else ["cannot do it"]
-        known += [f"{offer.peak_c:.0f} °C"] if offer.peak_c is not None else []
-        known += [f"d {offer.difficulty:.2f}"] if offer.difficulty is not None else []
+        known = scores(offer) if offer.p_saturation is not None else [CANNOT]
         known += [offer.state] if not offer.free and offer.feasible else []
         parts.append(f"{offer.arm} ({', '.join(known)})")
     return "; ".join(parts)

@@ -290,7 +290,7 @@ class Ledger(LedgerState):
             case Settle(name, outcome) if name in self.aside:
                 del self.aside[name]
                 if outcome == "done":
-                    self.past.add_name(name, finished=True)
+                    self.past.add(name, finished=True)
             case Cancel(name) | Settle(name) | ChangeJob(name):
                 if (entry := self.jobs.get(name)) is not None:
                     _count(entry, record.cycles)

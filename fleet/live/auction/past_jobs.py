@@ -57,10 +57,6 @@ class PastJobs(Container[str]):
         name, content = (job, 0) if isinstance(job, str) else (job.name, _spec_hash(job))
         self._put(hash_of(name.encode()), content | finished)
 
-    def add_name(self, name: str, *, finished: bool) -> None:
-        """Add a job of which only the name is known."""
-        self._put(hash_of(name.encode()), int(finished))
-
     def __contains__(self, name: object) -> bool:
         return isinstance(name, str) and hash_of(name.encode()) in self._jobs
 
