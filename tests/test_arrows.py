@@ -32,7 +32,8 @@ def name_of(path: Path) -> str:
 
 
 MODULES = {name_of(path) for path in SOURCES}
-NOUNS = {name_of(path) for path in SOURCES if path.parent == Path("fleet") and path.name != "__init__.py"}
+NOUN_FOLDERS = (Path("fleet"), Path("fleet/heat"))
+NOUNS = {name_of(path) for path in SOURCES if path.parent in NOUN_FOLDERS and path.name != "__init__.py"}
 LARGEST_FOLDER = 16
 """Most files in a folder, without `__init__.py`."""
 LONGEST_FILE = 400
@@ -71,6 +72,7 @@ def below(name: str, *parents: str) -> bool:
 
 IN_MEMORY = tuple(f"fleet.bus.exchange.{name}" for name in ("protocol", "memory"))
 BELOW = {
+    "fleet.heat": (),
     "fleet.planning": ("fleet.physics",),
     "fleet.physics": ("fleet.planning", "fleet.engine"),
     "fleet.engine": IN_MEMORY,
