@@ -19,7 +19,42 @@ POSTURES: dict[str, tuple[float, ...]] = {
 }
 """Named joint positions, rad. home, retract and vertical are Kinova's keyframes."""
 
-Cooling = Literal["still_air", "forced_air", "liquid", "immersion", "vacuum"]
+Cooling = Literal["still_air", "heat_sink", "heat_spreader", "forced_air", "liquid", "immersion", "vacuum"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoolingStrategy:
+    """How a way of cooling changes the thermal network of every joint, relative to still air."""
+
+    ambient_factor: float = 1.0
+    """Factor on the conductance from housing to ambient."""
+    capacity_factor: float = 1.0
+    """Factor on the heat capacity of the housing."""
+    neighbour_w_per_k: float = 0.0
+    """Conductance added between the housings of neighbouring joints."""
+    winding_ratio: float = 0.0
+    """Whole conductance from winding to ambient as a multiple of that with `liquid`, where the medium reaches the
+    winding; 0: it does not, and all heat passes the housing."""
+
+
+COOLING: dict[Cooling, CoolingStrategy] = {
+    "still_air": CoolingStrategy(),
+    "heat_sink": CoolingStrategy(ambient_factor=1.8, capacity_factor=1.35),
+    "heat_spreader": CoolingStrategy(neighbour_w_per_k=0.2, capacity_factor=1.1),
+    "forced_air": CoolingStrategy(ambient_factor=2.5),
+    "liquid": CoolingStrategy(ambient_factor=6.0),
+    "immersion": CoolingStrategy(ambient_factor=6.0, winding_ratio=3.7),
+    "vacuum": CoolingStrategy(ambient_factor=0.5),
+}
+"""The cooling strategies. Engineering values, not measured on a Gen3; docs/concepts/cooling.md has their sources.
+
+Still air at the surface of a link carries about 5 W/m²K by convection and 5.5 by radiation (4·ε·σ·T³, ε ≈ 0.9,
+T ≈ 305 K), so vacuum keeps about half. A heat sink of finned aluminium, 0.3 kg at a large joint, triples the surface for
+convection at 90 % fin efficiency and leaves radiation. A heat spreader is a copper strip of 1 mm × 100 mm over 0.2 m
+from each housing to the next. Forced air and liquid are the lower ends of the film coefficients in Incropera & DeWitt,
+table 1.1, limited by conduction through the shell; their ratio fits the motor of Zhu et al. (`fleet.heat.cooled_motor`).
+Immersion is that motor's: the liquid reaches the winding, and the whole conductance is 3.7 times that with liquid.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,27 +15,13 @@ import numpy as np
 from fleet.errors import check_nonnegative
 from fleet.motion import Drive
 from fleet.motor import Motors, copper_loss, magnet_factor, thermal_data
-from fleet.robot import JOINTS, Cooling
+from fleet.robot import COOLING, JOINTS, Cooling
 
 Array = np.ndarray
 
 NODES = 2 * JOINTS
 WINDING = slice(0, JOINTS)
 HOUSING = slice(JOINTS, NODES)
-
-AMBIENT_FACTOR: dict[Cooling, float] = {
-    "still_air": 1.0,
-    "forced_air": 2.5,
-    "liquid": 6.0,
-    "immersion": 10.0,
-    "vacuum": 0.5,
-}
-"""Conductance from housing to ambient relative to still air, by cooling strategy.
-
-Still air at the surface of a link carries about 5 W/m²K by convection and 5.5 by radiation (4·ε·σ·T³, ε ≈ 0.9,
-T ≈ 305 K), so vacuum keeps about half. The others are the lower ends of the film coefficients in Incropera &
-DeWitt, table 1.1, limited by conduction through the shell. Engineering values, not measured on a Gen3.
-"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,27 +64,38 @@ def gen3_network(
     """Thermal network of one Gen3: nodes with `capacity_j_per_k`, edges with `conductance_w_per_k`.
 
     Args:
-        cooling: Scales every edge to ambient by `AMBIENT_FACTOR`.
-        cooling_factor: A further scale of the same edges (dust, a blocked fan).
+        cooling: Its `CoolingStrategy` changes edges and capacities.
+        cooling_factor: Scales every edge to ambient (dust, a blocked fan).
         spread: Random differences from the nominal arm, drawn from `rng`.
     """
-    if cooling not in AMBIENT_FACTOR:
-        raise ValueError(f"Unknown cooling '{cooling}'. Allowed: {', '.join(AMBIENT_FACTOR)}.")
-    data = thermal_data()
+    if cooling not in COOLING:
+        raise ValueError(f"Unknown cooling '{cooling}'. Allowed: {', '.join(COOLING)}.")
+    data, strategy = thermal_data(), COOLING[cooling]
     draw = _factors(spread, rng)
     graph: nx.Graph[str] = nx.Graph()
     graph.add_node("ambient")
     for j in range(JOINTS):
+        shell = data["housing_j_per_k"][j] * draw["capacity"][1, j] * strategy.capacity_factor
         graph.add_node(winding(j), capacity_j_per_k=data["winding_j_per_k"][j] * draw["capacity"][0, j])
-        graph.add_node(housing(j), capacity_j_per_k=data["housing_j_per_k"][j] * draw["capacity"][1, j])
-        resistance = data["winding_housing_k_per_w"][j] * draw["winding_housing"][0, j]
-        graph.add_edge(winding(j), housing(j), conductance_w_per_k=1.0 / resistance)
+        graph.add_node(housing(j), capacity_j_per_k=shell)
+        inner = 1.0 / (data["winding_housing_k_per_w"][j] * draw["winding_housing"][0, j])
         to_air = data["housing_ambient_k_per_w"][j] * draw["housing_ambient"][0, j]
-        scale = AMBIENT_FACTOR[cooling] * cooling_factor
+        graph.add_edge(winding(j), housing(j), conductance_w_per_k=inner)
+        scale = strategy.ambient_factor * cooling_factor
         graph.add_edge(housing(j), "ambient", conductance_w_per_k=scale / to_air)
+        if strategy.winding_ratio:
+            liquid = in_series(inner, COOLING["liquid"].ambient_factor / to_air)
+            direct = strategy.winding_ratio * liquid - in_series(inner, strategy.ambient_factor / to_air)
+            graph.add_edge(winding(j), "ambient", conductance_w_per_k=direct * cooling_factor)
         if j:
-            graph.add_edge(housing(j - 1), housing(j), conductance_w_per_k=data["neighbour_w_per_k"])
+            between = data["neighbour_w_per_k"] + strategy.neighbour_w_per_k
+            graph.add_edge(housing(j - 1), housing(j), conductance_w_per_k=between)
     return graph
+
+
+def in_series(one: float, other: float) -> float:
+    """Conductance of two conductances in series, W/K."""
+    return one * other / (one + other)
 
 
 def spread_motors(motors: Motors, spread: ThermalSpread, rng: np.random.Generator) -> Motors:
@@ -186,9 +183,14 @@ def thermal_model(network: "nx.Graph[str]") -> ThermalModel:
     capacity = np.array([network.nodes[name]["capacity_j_per_k"] for name in names], dtype=float)
     conductance = nx.to_numpy_array(network, nodelist=[*names, "ambient"], weight="conductance_w_per_k")
     laplacian = np.diag(conductance[:NODES].sum(axis=1)) - conductance[:NODES, :NODES]
+    return modal_model(capacity, laplacian, conductance[:NODES, NODES])
+
+
+def modal_model(capacity: Array, laplacian: Array, to_ambient: Array) -> ThermalModel:
+    """The model of a network given by its matrices, see `ThermalModel`."""
     root = np.sqrt(capacity)
-    rates, modes = np.linalg.eigh(laplacian / np.outer(root, root))
-    return ThermalModel(capacity, laplacian, conductance[:NODES, NODES], rates, modes)
+    rates, modes = np.linalg.eigh(laplacian / (root[..., :, None] * root[..., None, :]))
+    return ThermalModel(capacity, laplacian, to_ambient, rates, modes)
 
 
 def _check(network: "nx.Graph[str]", names: list[str]) -> None:

@@ -2,15 +2,16 @@
 
 from itertools import pairwise
 
+import networkx as nx
 import numpy as np
 import pytest
 
 from fleet.motor import Motors, gen3_motors
-from fleet.robot import JOINTS, Cooling
+from fleet.robot import COOLING, JOINTS, Cooling
 from fleet.thermal import (
-    AMBIENT_FACTOR,
     HOUSING,
     NODES,
+    WINDING,
     ThermalModel,
     ThermalSpread,
     gen3_network,
@@ -25,14 +26,40 @@ from fleet.thermal import (
 MODEL = thermal_model(gen3_network())
 MOTORS = gen3_motors()
 REST = np.zeros(JOINTS)
+LABEL = "conductance_w_per_k"
 
 
 def test_better_cooling_is_cooler():
-    order: list[Cooling] = ["vacuum", "still_air", "forced_air", "liquid", "immersion"]
-    assert set(order) == set(AMBIENT_FACTOR)
+    order: list[Cooling] = ["vacuum", "still_air", "heat_sink", "forced_air", "liquid", "immersion"]
+    assert set(order) | {"heat_spreader"} == set(COOLING)
     heat_w = node_heat(np.full(JOINTS, 8.0), MOTORS.idle_w)
     ends = [thermal_model(gen3_network(cooling=name)).steady(heat_w, 25.0) for name in order]
     assert all(np.all(worse > better) for worse, better in pairwise(ends))
+
+
+def test_immersion_conducts_3_7_times_what_liquid_does():
+    """Zhu et al., measured from the winding. Without neighbours a joint is two conductances, so rise = heat / G."""
+    spread = ThermalSpread.gen3()
+    rises = []
+    for name in ("liquid", "immersion"):
+        network = gen3_network(cooling=name, spread=spread, rng=np.random.default_rng(3))
+        nx.set_edge_attributes(network, {(housing(j - 1), housing(j)): {LABEL: 0.0} for j in range(1, JOINTS)})
+        rises.append(thermal_model(network).steady(node_heat(np.full(JOINTS, 5.0), REST), 0.0)[WINDING])
+    np.testing.assert_allclose(rises[0] / rises[1], 3.7)
+    nominal = thermal_model(gen3_network(cooling="liquid")).laplacian
+    assert nominal[0, 0] == pytest.approx(1 / 2.5)  # with liquid at the shell the winding touches the housing only
+
+
+def test_a_heat_spreader_moves_heat_and_a_heat_sink_delays_it():
+    only_second = node_heat(np.eye(JOINTS)[1] * 10.0, REST)
+    plain, spread = (thermal_model(gen3_network(cooling=name)) for name in ("still_air", "heat_spreader"))
+    before, after = plain.steady(only_second, 0.0), spread.steady(only_second, 0.0)
+    assert after[WINDING][1] < before[WINDING][1]
+    assert np.all(np.delete(after[WINDING], 1) > np.delete(before[WINDING], 1))
+    for model, end in ((plain, before), (spread, after)):
+        assert model.to_ambient @ end == pytest.approx(10.0)  # all heat leaves through the shells
+    sink = thermal_model(gen3_network(cooling="heat_sink"))
+    np.testing.assert_allclose(sink.capacity[HOUSING] / plain.capacity[HOUSING], 1.35)
 
 
 def test_dust_is_hotter_and_no_cooling_at_all_is_refused():

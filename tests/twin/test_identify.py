@@ -286,9 +286,11 @@ def test_a_round_trip_keeps_every_number_and_a_change_is_noticed(rng, tmp_path):
         load(tmp_path)
 
 
-def test_an_arm_with_values_of_its_own_gives_them_back(rng):
+@pytest.mark.parametrize("cooling", ["still_air", "immersion"])
+def test_an_arm_with_values_of_its_own_gives_them_back(rng, cooling):
     spread = ThermalSpread.gen3()
-    body = HeatModel(spread_motors(gen3_motors(), spread, rng), gen3_network(spread=spread, rng=rng))
+    network = gen3_network(cooling=cooling, spread=spread, rng=rng)
+    body = HeatModel(spread_motors(gen3_motors(), spread, rng), network)
     layout = ParameterVector(body, tuple(PRIOR_SD))
     again, batch = layout.heat_model(layout.mean), layout.models(layout.mean[None])
     np.testing.assert_allclose(batch.laplacian[0], body.thermal().laplacian, atol=1e-12)

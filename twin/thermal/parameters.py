@@ -8,7 +8,7 @@ import numpy as np
 
 from fleet.motor import Motors
 from fleet.robot import JOINTS
-from fleet.thermal import HOUSING, NODES, WINDING, ThermalModel, housing, thermal_model, winding
+from fleet.thermal import HOUSING, NODES, WINDING, ThermalModel, housing, modal_model, thermal_model, winding
 
 Array = np.ndarray
 
@@ -141,9 +141,16 @@ class ParameterVector:
         conductance = np.concatenate([1.0 / values["winding_housing_k_per_w"], to_air, between], axis=-1)
         laplacian = np.einsum("...e,en,em->...nm", conductance, _INCIDENCE, _INCIDENCE)
         capacity = np.concatenate([values["winding_j_per_k"], values["housing_j_per_k"]], axis=-1)
-        root = np.sqrt(capacity)
-        rates, modes = np.linalg.eigh(laplacian / (root[..., :, None] * root[..., None, :]))
-        return ThermalModel(capacity, laplacian, np.concatenate([np.zeros_like(to_air), to_air], -1), rates, modes)
+        direct = np.array([self._direct(j) for j in range(JOINTS)])
+        laplacian[..., range(JOINTS), range(JOINTS)] += direct
+        to_ambient = np.concatenate([np.broadcast_to(direct, to_air.shape), to_air], axis=-1)
+        return modal_model(capacity, laplacian, to_ambient)
+
+    def _direct(self, joint: int) -> float:
+        """Conductance from a winding to ambient, which no parameter changes; 0 unless the arm is immersed."""
+        edge = (winding(joint), "ambient")
+        network = self.nominal.network
+        return float(network.edges[edge]["conductance_w_per_k"]) if network.has_edge(*edge) else 0.0
 
 
 _ROWS = np.eye(NODES)
