@@ -1,8 +1,9 @@
 """The motor of Zhu et al. under four ways of cooling, as a two-node network fitted to their published numbers.
 
 C_w Tw' = P (1 + a_cu (Tw − T0)) − G_i (Tw − Th) − G_d (Tw − T0);  C_h Th' = G_i (Tw − Th) − G_o (Th − T0).
-The numbers fix ratios only: every conductance and the heat are relative to the winding's capacity C_w. Constant current,
-coolant and start at T0 = 26 °C. Numbers: tables 1 and 2 of E. Guiffo Kaigom, arXiv 2509.12740, after Zhu et al. 2021.
+The numbers fix ratios only: every conductance and the heat are relative to the winding's capacity C_w. The current is
+constant; coolant and start are at T0 = 26 °C. Numbers: tables 1 and 2 of E. Guiffo Kaigom, arXiv 2509.12740, after
+Zhu et al.
 """
 
 from dataclasses import dataclass, fields
