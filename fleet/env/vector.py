@@ -116,6 +116,12 @@ class BatchEnv:
         self._check_begun("looking at its state")
         return self._engine.state.copy()
 
+    @property
+    def temp_c(self) -> Array:
+        """True temperatures, °C, [env, arm, node], a view that the next step overwrites (not for policies)."""
+        self._check_begun("looking at its temperatures")
+        return self._engine.state.temp_c
+
     def reset(
         self, seed: int | Sequence[int] | None = None, *, rows: Array | Sequence[int] | None = None
     ) -> tuple[Obs, dict[str, Any]]:

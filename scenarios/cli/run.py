@@ -229,6 +229,8 @@ def metrics_table(results: dict[str, Metrics]) -> Table:
         ("min above warning", lambda m: f"{m.above_warning_min:.1f}"),
         ("availability", lambda m: f"{m.availability:.1%}"),
         ("energy, Wh", lambda m: f"{m.energy_wh:.0f}"),
+        ("insulation life used, ppb", lambda m: f"{max(m.insulation_ppb.values()):.1f}"),
+        ("tool drift, mm", lambda m: f"{max(m.tool_drift_mm.values()):.2f}"),
     ]
     if any(m.contacts for m in results.values()):
         rows.append(("contacts", lambda m: "-" if m.contacts is None else str(m.contacts)))

@@ -110,6 +110,8 @@ KEY_FIGURES = (
     ("availability", "availability", ".1%", "", ""),
     ("utilisation", "utilisation", ".1%", "", ""),
     ("energy to heat", "energy_wh", ",.0f", " Wh", ""),
+    ("tool drift", "most_drift_mm", ".2f", " mm", ""),
+    ("insulation used", "most_insulation_ppb", ",.3g", " ppb", ""),
     ("lost claims", "lost_claims", ",.0f", "", ""),
 )
 """Label, metric, format, unit, and the metric it is a part of."""
@@ -122,6 +124,9 @@ def key_figures(metrics: Mapping[str, Any]) -> str:
     hottest = max(peaks, key=lambda arm: peaks[arm], default="")
     if hottest:
         values["hottest_c"] = peaks[hottest]
+    for name, own in (("most_drift_mm", "tool_drift_mm"), ("most_insulation_ppb", "insulation_ppb")):
+        if metrics.get(own):
+            values[name] = max(metrics[own].values())
     tiles = []
     for label, name, form, unit, whole in KEY_FIGURES:
         if name in values and (name != "contacts" or values[name] > 0):

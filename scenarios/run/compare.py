@@ -38,8 +38,12 @@ HEADINGS = {
     "above_warning_min": "min above warning",
     "peak_c": "hottest motor, °C",
     "availability": "availability, 0–1",
+    "insulation_ppb": "insulation, ppb",
+    "tool_drift_mm": "tool drift, mm",
 }
 """Headings of the figures in the table, with units."""
+LEAST_DIGITS = {"availability": 3, "tool_drift_mm": 2}
+"""Decimals of a figure; 1 for others."""
 MORE_DIGITS = 3
 RESAMPLES = 2000
 TOGETHER = 16
@@ -208,7 +212,7 @@ def comparison_table(result: Comparison) -> Group:
         table.add_row(f"  {label(policy)}", scope)
     for name in FIGURES:
         table.add_row(f"[bold]{HEADINGS[name]}[/bold]")
-        digits = _digits([figures[name] for figures in result.figures.values()], 3 if name == "availability" else 1)
+        digits = _digits([figures[name] for figures in result.figures.values()], LEAST_DIGITS.get(name, 1))
         for policy, figures in result.figures.items():
             f = figures[name]
             mean, low, high = (f"{value:z.{digits}f}" for value in (f.mean, f.low, f.high))

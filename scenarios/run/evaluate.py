@@ -15,6 +15,7 @@ from scenarios.fault_price import weights_of
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.fleet import Fleet
 from scenarios.run.batch import library_of
+from scenarios.run.heat_use import HeatUse
 from scenarios.run.outcome import common_figures
 
 Array = np.ndarray
@@ -34,6 +35,10 @@ class Outcome:
     peak_c: float
     """Temperature of the hottest motor of the fleet."""
     availability: float
+    insulation_ppb: float
+    """Billionths of the rated life that the most aged winding of the fleet used."""
+    tool_drift_mm: float
+    """Of the arm whose tool point drifted most."""
 
 
 FIGURES = tuple(field.name for field in fields(Outcome))
@@ -57,9 +62,9 @@ def outcomes(fleet: Fleet, policy: str, seeds: Sequence[int], channel: Channel =
         weights=weights,
         autoreset=False,
         exchanges=exchanges,
-        decisions="events" if only_when_asked and exchanges is None else "interval",
     )
     obs, _ = env.reset()
+    heat = HeatUse(env.temp_c)
     reward, running = np.zeros(len(seeds)), np.ones(len(seeds), dtype=bool)
     results: dict[int, Outcome] = {}
     while running.any():
@@ -71,6 +76,7 @@ def outcomes(fleet: Fleet, policy: str, seeds: Sequence[int], channel: Channel =
             actions[e] = actions_of(env.agents, policies[e].act(known))
         obs, earned, finished, cut, _ = env.step(actions)
         reward += earned
+        heat.add(env.temp_c, library.tables.dt_s)
         over = finished | cut
         if not over.any():
             continue
@@ -82,6 +88,8 @@ def outcomes(fleet: Fleet, policy: str, seeds: Sequence[int], channel: Channel =
                 **common_figures(state, e, value, shift.due_s, dt_s),
                 reward=float(reward[e]),
                 peak_c=float(state.peak_c[e].max()),
+                insulation_ppb=float(heat.insulation_ppb[e].max()),
+                tool_drift_mm=float(heat.tool_drift_mm[e].max()),
             )
         running &= ~over
         if running.any():

@@ -45,6 +45,11 @@ class Metrics:
     """Energy turned to heat in the motors of all arms."""
     heat_gini: float
     """Gini coefficient of the arms' shares of that heat: 0 all equal, near 1 one arm has all."""
+    insulation_ppb: dict[str, float]
+    """Of each arm: billionths of the rated life that its most aged winding used; see `fleet.heat.insulation`."""
+    tool_drift_mm: dict[str, float]
+    """Of each arm: the most that heat moved its tool point since the beginning of the shift, if it is stretched; see
+    `fleet.heat.tool_drift`."""
     messages: int
     """Messages delivered to a peer."""
     lost_claims: int

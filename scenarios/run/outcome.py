@@ -8,17 +8,25 @@ import numpy as np
 
 from fleet.engine.state import DONE, EXPIRED, GIVEN_UP, State, World
 from fleet.events import Event
+from scenarios.run.heat_use import HeatUse
 from scenarios.run.metrics import Metrics, gini
 
 Array = np.ndarray
 
 
 def metrics_of(
-    world: World, state: State, events: Sequence[Event], messages: int, *, finds_contacts: bool = False
+    world: World,
+    state: State,
+    heat: HeatUse,
+    events: Sequence[Event],
+    messages: int,
+    *,
+    finds_contacts: bool = False,
 ) -> Metrics:
     """Metrics of env 0 at the time of `state`.
 
     Args:
+        heat: Of the whole shift, [arm].
         finds_contacts: Whether the plant looks for contacts.
     """
     time_s = float(state.tick[0] * world.dt_s)
@@ -48,6 +56,8 @@ def metrics_of(
         utilisation=float(state.busy_s[0].sum() / (time_s * len(world.arms))) if time_s else 0.0,
         energy_wh=float(state.energy_j[0].sum() / 3600.0),
         heat_gini=gini(state.energy_j[0]),
+        insulation_ppb=dict(zip(world.arms, heat.insulation_ppb.tolist(), strict=True)),
+        tool_drift_mm=dict(zip(world.arms, heat.tool_drift_mm.tolist(), strict=True)),
         messages=messages,
         contacts=sum(event.kind == "contact" for event in events) if finds_contacts else None,
         lost_claims=sum(event.kind == "lost" for event in events),

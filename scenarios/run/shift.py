@@ -20,6 +20,7 @@ from fleet.telemetry import Telemetry, join
 from scenarios.policy_loader import policy_at
 from scenarios.prepare.fleet import RISK, BusName, DifficultyName, Fleet, PlantName, RiskName, env_of
 from scenarios.progress import Progress, quiet
+from scenarios.run.heat_use import HeatUse
 from scenarios.run.metrics import Metrics
 from scenarios.run.outcome import metrics_of
 from scenarios.run.provenance import provenance
@@ -88,7 +89,7 @@ def run(
         endpoint: Zenoh router on loopback, for other listeners; by default the fleet has its own.
     """
     policy = policy_at(spec.policy, spec.seed)
-    recorder = _Recorder(fleet.scenario) if record else None
+    recorder = _Recorder(fleet.scenario, record)
     env = env_of(
         fleet,
         plant=spec.plant,
@@ -101,8 +102,7 @@ def run(
     finished, reward = False, 0.0
     offers: list[Offer] = []
     try:
-        if recorder is not None:
-            recorder.env = env
+        recorder.env = env
         env.reset(seed=spec.seed)
         while env.agents and not stopped():
             seen, count = env.knowledge(), len(env.events)
@@ -122,8 +122,15 @@ def run(
     return RunResult(
         spec=spec,
         scenario=fleet.scenario,
-        metrics=metrics_of(world, state, events, env.messages, finds_contacts=not env.episode.plant.follows_plans),
-        telemetry=recorder.telemetry() if recorder is not None else None,
+        metrics=metrics_of(
+            world,
+            state,
+            recorder.heat or HeatUse(world.start_c),
+            events,
+            env.messages,
+            finds_contacts=not env.episode.plant.follows_plans,
+        ),
+        telemetry=recorder.telemetry(),
         events=events,
         jobs=job_records(world, state),
         offers=tuple(offers),
@@ -148,23 +155,31 @@ class _Recorder:
 
     Args:
         env: The environment of the shift; set before its reset.
+        reads: Whether to read the sensors.
     """
 
     env: AllocationEnv
+    heat: HeatUse | None = None
+    """None before the first step."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: Scenario, reads: bool) -> None:
         every_s, dt_s = scenario.telemetry_interval_s, scenario.decision_interval_s
+        self._dt_s, self._reads = dt_s, reads
         self._offsets_s = np.arange(1, int(np.floor(dt_s / every_s + 1e-9)) + 1) * every_s
         self._records: list[StepRecord] = []
         self._parts: list[Telemetry] = []
 
     def __call__(self, record: StepRecord) -> None:
+        self.heat = self.heat or HeatUse(record.start_c[0])
+        self.heat.add(record.end_c[0], self._dt_s)
+        if not self._reads:
+            return
         self._records.append(record)
         if len(self._records) == self.env.episode.plant.most_steps:
             self._read()
 
     def telemetry(self) -> Telemetry | None:
-        """All readings; None before the first step."""
+        """All readings; None before the first step, or without reading."""
         if self._records:
             self._read()
         return join(self._parts) if self._parts else None

@@ -1,0 +1,95 @@
+"""Insulation ageing and drift of the tool point: closed forms, bounds, and the geometry of MuJoCo."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from fleet.heat.insulation import CLASSES, GEN3_INSULATION, Insulation, arrhenius_rate, life_used, montsinger_rate
+from fleet.heat.tool_drift import (
+    ALUMINIUM_PER_K,
+    GEN3_SEGMENTS_M,
+    SEGMENTS,
+    drift_m,
+    most_drift_m,
+    segment_temperatures,
+)
+from fleet.physics.cell_model import cell_model
+from fleet.physics.models import ArmModel
+from fleet.robot import JOINTS, Mount, Robot
+
+ARM = Robot(name="arm", mount=Mount())
+
+
+@pytest.mark.parametrize("insulation", CLASSES.values(), ids=CLASSES)
+def test_a_winding_at_the_temperature_of_its_class_lasts_its_rated_life(insulation) -> None:
+    for law in (arrhenius_rate, montsinger_rate):
+        rate = law(insulation.rated_c, insulation)
+        assert life_used(rate, rate, 3600.0 * insulation.rated_life_h, insulation) == pytest.approx(1.0)
+        assert law(insulation.rated_c + insulation.halving_k, insulation) == pytest.approx(2.0)
+
+
+def test_the_activation_energy_is_in_the_range_of_insulating_materials() -> None:
+    """0.8 to 1.3 eV for enamels and resins (Dakin 1948 gives 1.0 eV for class A)."""
+    assert all(0.8 < insulation.activation_ev < 1.4 for insulation in CLASSES.values())
+    assert GEN3_INSULATION.activation_ev == pytest.approx(1.12, abs=0.01)
+
+
+def test_far_below_the_class_arrhenius_gives_the_slower_ageing() -> None:
+    """Its halving interval is about E⁻¹ k T² ln 2: 6 K at 60 °C instead of 10 K."""
+    cool_c = np.linspace(20.0, 150.0, 14)
+    assert (arrhenius_rate(cool_c) < montsinger_rate(cool_c)).all()
+    kelvin = 333.15
+    interval_k = np.log(2) * kelvin**2 / GEN3_INSULATION.activation_k
+    assert arrhenius_rate(60.0 + interval_k) / arrhenius_rate(60.0) == pytest.approx(2.0, rel=0.02)
+
+
+def test_an_exponential_rise_of_the_rate_is_integrated_to_the_closed_form() -> None:
+    """Montsinger's rate along a linear rise of 1 K/min from 60 to 120 °C: ∫ 2^((T − T₀)/10) dt."""
+    time_s = np.arange(0.0, 3601.0, 10.0)
+    rate = montsinger_rate(60.0 + time_s / 60.0)
+    used = sum(life_used(one, two, 10.0) for one, two in pairwise(rate))
+    exact_s = 600.0 / np.log(2) * (rate[-1] - rate[0])
+    assert used * 3600.0 * GEN3_INSULATION.rated_life_h == pytest.approx(exact_s, rel=1e-4)
+
+
+@pytest.mark.parametrize("wrong", [{"rated_c": 500.0}, {"rated_life_h": 0.0}, {"halving_k": -1.0}])
+def test_an_insulation_that_cannot_be_is_refused(wrong) -> None:
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        Insulation(**wrong)
+
+
+def anchors_m(arm: ArmModel, q: np.ndarray) -> np.ndarray:
+    """Base, joints 1..7 and flange in the world, from MuJoCo, m, [point, 3]."""
+    arm.tool_pose(q)  # puts the model into this posture
+    flange = arm.data.body("arm/payload").xpos
+    return np.vstack([np.zeros(3), [arm.data.body(arm.model.jnt_bodyid[j]).xpos for j in range(JOINTS)], flange]).copy()
+
+
+def test_the_segments_have_the_lengths_of_the_model() -> None:
+    model = cell_model([ARM])
+    offsets = [link["position"] for link in model["links"] if link["turns"]] + [model["hand"]["position"]]
+    assert np.linalg.norm(offsets, axis=1) == pytest.approx(GEN3_SEGMENTS_M, abs=1e-5)
+
+
+def test_the_drift_is_that_of_a_model_with_longer_links() -> None:
+    """Second method: MuJoCo with the position of every body scaled by its expansion; the bound holds in any posture."""
+    rng = np.random.default_rng(3)
+    cold, warm = ArmModel(ARM), ArmModel(ARM)
+    rise_k = rng.uniform(0.0, 40.0, SEGMENTS)
+    bodies = [*warm.model.jnt_bodyid, warm.model.body("arm/payload").id]
+    for body, rise in zip(bodies, rise_k, strict=True):
+        warm.model.body_pos[body] *= 1.0 + ALUMINIUM_PER_K * rise
+    for q in rng.uniform(-np.pi, np.pi, (20, JOINTS)):
+        before = anchors_m(cold, q)
+        moved = anchors_m(warm, q)[-1] - before[-1]
+        assert drift_m(np.diff(before, axis=0), rise_k) == pytest.approx(moved, abs=1e-9)
+        assert np.linalg.norm(moved) <= most_drift_m(rise_k) + 1e-9
+    stretched = anchors_m(warm, np.zeros(JOINTS))[-1] - anchors_m(cold, np.zeros(JOINTS))[-1]
+    assert np.linalg.norm(stretched) == pytest.approx(most_drift_m(rise_k), rel=0.01)
+
+
+def test_a_uniformly_warm_arm_grows_like_a_rod() -> None:
+    segments_c = segment_temperatures(np.full((5, JOINTS), 45.0))
+    assert segments_c.shape == (5, SEGMENTS)
+    assert most_drift_m(segments_c - 25.0) == pytest.approx(23.6e-6 * 20.0 * sum(GEN3_SEGMENTS_M))
