@@ -10,6 +10,7 @@ from fleet.arrivals import Arrivals, Batch, Poisson, Trace
 from fleet.engine.reward import RewardWeights
 from fleet.env.validation import Decisions
 from fleet.errors import MAX_NAME, FleetError, check_between, check_names, check_nonnegative, check_positive, nearest
+from fleet.heat.touch import LONGEST_CONTACT_S, SHORTEST_CONTACT_S, burn_threshold_c
 from fleet.job import BOUNDS, DWELL_S, Fixture, Kind, Place, check_bounds, check_duration, check_dwell, check_places
 from fleet.robot import Cooling, Mount, Robot, ThermalLimits
 
@@ -162,6 +163,22 @@ class Ambient:
 
 
 @dataclass(frozen=True, kw_only=True)
+class People:
+    """People who may touch the arms during the shift."""
+
+    contact_s: float = 1.0
+    """Longest time for which they do: 1 s by mistake, minutes where they guide an arm or lean on it."""
+
+    def __post_init__(self) -> None:
+        check_between(self, SHORTEST_CONTACT_S, LONGEST_CONTACT_S, "contact_s")
+
+    @property
+    def burn_c(self) -> float:
+        """Temperature of uncoated metal from which such a contact may burn."""
+        return burn_threshold_c(self.contact_s)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Planning:
     """Which plans each arm makes for a work."""
 
@@ -255,6 +272,7 @@ class Scenario:
     telemetry_interval_s: float = 1.0
     ambient: Ambient = field(default_factory=Ambient)
     limits: ThermalLimits = field(default_factory=ThermalLimits)
+    people: People = field(default_factory=People)
     reward: RewardSpec = field(default_factory=RewardSpec)
     planning: Planning = field(default_factory=Planning)
     twin: TwinSpec = field(default_factory=TwinSpec)

@@ -107,6 +107,7 @@ KEY_FIGURES = (
     ("contacts", "contacts", ",.0f", "", ""),
     ("above warning", "above_warning_min", ",.1f", " min", ""),
     ("hottest motor", "hottest_c", ".1f", " °C", ""),
+    ("too hot to touch", "hot_surface_min", ",.1f", " min", ""),
     ("availability", "availability", ".1%", "", ""),
     ("utilisation", "utilisation", ".1%", "", ""),
     ("energy to heat", "energy_wh", ",.0f", " Wh", ""),

@@ -39,6 +39,7 @@ class Outcome:
     """Billionths of the rated life that the most aged winding of the fleet used."""
     tool_drift_mm: float
     """Of the arm whose tool point drifted most."""
+    hot_surface_min: float
 
 
 FIGURES = tuple(field.name for field in fields(Outcome))
@@ -64,7 +65,7 @@ def outcomes(fleet: Fleet, policy: str, seeds: Sequence[int], channel: Channel =
         exchanges=exchanges,
     )
     obs, _ = env.reset()
-    heat = HeatUse(env.temp_c)
+    heat = HeatUse(env.temp_c, fleet.scenario.people.burn_c)
     reward, running = np.zeros(len(seeds)), np.ones(len(seeds), dtype=bool)
     results: dict[int, Outcome] = {}
     while running.any():
@@ -90,6 +91,7 @@ def outcomes(fleet: Fleet, policy: str, seeds: Sequence[int], channel: Channel =
                 peak_c=float(state.peak_c[e].max()),
                 insulation_ppb=float(heat.insulation_ppb[e].max()),
                 tool_drift_mm=float(heat.tool_drift_mm[e].max()),
+                hot_surface_min=float(heat.hot_surface_min[e].sum()),
             )
         running &= ~over
         if running.any():

@@ -50,6 +50,10 @@ class Metrics:
     tool_drift_mm: dict[str, float]
     """Of each arm: the most that heat moved its tool point since the beginning of the shift, if it is stretched; see
     `fleet.heat.tool_drift`."""
+    hot_surface_min: float
+    """Sum over arms of the time with a surface above the burn threshold of the scenario's `people.contact_s`."""
+    surface_c: dict[str, float]
+    """Hottest surface of each arm that can be touched; see `fleet.heat.touch`."""
     messages: int
     """Messages delivered to a peer."""
     lost_claims: int

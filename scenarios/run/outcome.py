@@ -58,6 +58,8 @@ def metrics_of(
         heat_gini=gini(state.energy_j[0]),
         insulation_ppb=dict(zip(world.arms, heat.insulation_ppb.tolist(), strict=True)),
         tool_drift_mm=dict(zip(world.arms, heat.tool_drift_mm.tolist(), strict=True)),
+        hot_surface_min=float(heat.hot_surface_min.sum()),
+        surface_c=dict(zip(world.arms, heat.surface_c.tolist(), strict=True)),
         messages=messages,
         contacts=sum(event.kind == "contact" for event in events) if finds_contacts else None,
         lost_claims=sum(event.kind == "lost" for event in events),

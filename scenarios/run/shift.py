@@ -125,7 +125,7 @@ def run(
         metrics=metrics_of(
             world,
             state,
-            recorder.heat or HeatUse(world.start_c),
+            recorder.heat or HeatUse(world.start_c, fleet.scenario.people.burn_c),
             events,
             env.messages,
             finds_contacts=not env.episode.plant.follows_plans,
@@ -164,13 +164,13 @@ class _Recorder:
 
     def __init__(self, scenario: Scenario, reads: bool) -> None:
         every_s, dt_s = scenario.telemetry_interval_s, scenario.decision_interval_s
-        self._dt_s, self._reads = dt_s, reads
+        self._dt_s, self._reads, self._burn_c = dt_s, reads, scenario.people.burn_c
         self._offsets_s = np.arange(1, int(np.floor(dt_s / every_s + 1e-9)) + 1) * every_s
         self._records: list[StepRecord] = []
         self._parts: list[Telemetry] = []
 
     def __call__(self, record: StepRecord) -> None:
-        self.heat = self.heat or HeatUse(record.start_c[0])
+        self.heat = self.heat or HeatUse(record.start_c[0], self._burn_c)
         self.heat.add(record.end_c[0], self._dt_s)
         if not self._reads:
             return

@@ -89,6 +89,7 @@ def one_by_one(fleet: Fleet, policy: str, seeds, channel: Channel = PERFECT) -> 
                 reward=result.total_reward, value=m.value, finished=m.finished, on_time=m.on_time, faults=m.faults,
                 above_warning_min=m.above_warning_min, peak_c=max(m.peak_c.values()), availability=m.availability,
                 insulation_ppb=max(m.insulation_ppb.values()), tool_drift_mm=max(m.tool_drift_mm.values()),
+                hot_surface_min=m.hot_surface_min,
             )
         )  # fmt: skip
     return found
@@ -166,7 +167,7 @@ def test_actions_that_cannot_be_are_refused_with_the_same_message(hot, kind, sai
 def test_the_figures_are_those_of_an_outcome_in_their_order() -> None:
     assert FIGURES == (
         "reward", "value", "finished", "on_time", "faults", "above_warning_min", "peak_c", "availability",
-        "insulation_ppb", "tool_drift_mm",
+        "insulation_ppb", "tool_drift_mm", "hot_surface_min",
     )  # fmt: skip
 
 
