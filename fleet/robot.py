@@ -126,6 +126,8 @@ class ThermalLimits:
     Source: Kinova Gen3 user guide, safety thresholds of the motor temperature.
     """
 
+    lower_c: float = 0.0
+    """A shift must not begin with a motor below this."""
     warning_c: float = 60.0
     error_c: float = 75.0
     restart_c: float = 50.0
@@ -138,12 +140,12 @@ class ThermalLimits:
     """Switch the drives off while faulted: no idle heat, so the arm cools to ambient temperature."""
 
     def __post_init__(self) -> None:
-        if not self.restart_c < self.warning_c < self.error_c:
+        if not self.lower_c < self.restart_c < self.warning_c < self.error_c:
             raise ValueError(
-                "ThermalLimits need restart_c < warning_c < error_c "
-                f"(got {self.restart_c}, {self.warning_c}, {self.error_c})."
+                "ThermalLimits need lower_c < restart_c < warning_c < error_c "
+                f"(got {self.lower_c}, {self.restart_c}, {self.warning_c}, {self.error_c})."
             )
-        check_between(self, LEAST_LIMIT_C, MOST_LIMIT_C, "restart_c", "error_c")
+        check_between(self, LEAST_LIMIT_C, MOST_LIMIT_C, "lower_c", "error_c")
         check_between(self, 0.0, LONGEST_S, "clear_s", "move_home_s")
 
 

@@ -50,6 +50,9 @@ COMMANDS = {
     "view": LazyCommand(_LOOK, "view:view_command", "Play a shift in MuJoCo's viewer."),
     "compare": LazyCommand(_POLICIES, "compare:compare_command", "Compare policies on the same seeds."),
     "ablate": LazyCommand(_POLICIES, "compare:ablate_command", "Compare sources of scores under one policy."),
+    "cooling": LazyCommand(
+        _POLICIES, "heat.cooling:cooling_command", "Compare ways of cooling motor, joint and fleet."
+    ),
     "train": LazyCommand(_POLICIES, "train:train_command", "Train a policy by reinforcement learning."),
     "up": LazyCommand(_LIVE, "live.up:up_command", "Start a whole fleet, one process per participant."),
     "router": LazyCommand(_LIVE, "router:router_command", "Run the Zenoh router of a fleet."),

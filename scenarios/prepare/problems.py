@@ -9,6 +9,7 @@ from fleet.difficulty import Blind
 from fleet.engine.world import Arm, warm_start
 from fleet.planning.plan_cache import rest_torque
 from fleet.planning.space import collisions_of_homes
+from fleet.thermal import WINDING
 from scenarios.job_stream import works_of
 from scenarios.prepare.planned_arm import PlannedArm, air_offsets, homes_in_fixtures
 from scenarios.schema import Scenario
@@ -36,10 +37,7 @@ def problems_of(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) ->
         f"{file}: {sentence}; move the arm or the fixture, or give the arm another `home`."
         for sentence in homes_in_fixtures(scenario)
     ]
-    problems += [
-        f'{file}: {sentence}; give it more cooling or cooler air, or begin with start = "cold".'
-        for sentence in _overheated_at_home(scenario, arms, folder)
-    ]
+    problems += [f"{file}: {sentence}." for sentence in _outside_limits_at_home(scenario, arms, folder)]
     infeasible = [error for arm in arms for error in arm.infeasible]
     for i, stream in enumerate(scenario.jobs if arms else ()):
         here = [error for error in infeasible if error.place in stream.places]
@@ -58,16 +56,27 @@ def problems_of(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) ->
     return problems
 
 
-def _overheated_at_home(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) -> list[str]:
-    """A sentence for each arm that never settles at home, though the shift begins with settled arms."""
+def _outside_limits_at_home(scenario: Scenario, arms: Sequence[PlannedArm], folder: Path) -> list[str]:
+    """A sentence for each arm that begins too cold, or that never settles at home though the shift begins settled."""
     cell_c, offsets_k = float(scenario.ambient.at(np.zeros(1))[0]), air_offsets(scenario)
-    found = []
-    for arm in arms if scenario.start == "idle_warm" else ():
-        robot, motors, thermal = arm.hardware
-        rest_tau = rest_torque(robot, folder / "plans")
-        still = Arm(robot=robot, motors=motors, thermal=thermal, rest_tau=rest_tau, model=Blind(), plans={})
-        try:
-            warm_start(still, cell_c + float(offsets_k[arm.index]))
-        except ValueError as error:
-            found.append(f"arms[{arm.index}]: {str(error).rstrip('.')}")
+    lower_c, found = scenario.limits.lower_c, []
+    for arm in arms:
+        ambient_c = coldest_c = cell_c + float(offsets_k[arm.index])
+        if scenario.start == "idle_warm":
+            robot, motors, thermal = arm.hardware
+            rest_tau = rest_torque(robot, folder / "plans")
+            still = Arm(robot=robot, motors=motors, thermal=thermal, rest_tau=rest_tau, model=Blind(), plans={})
+            try:
+                coldest_c = float(warm_start(still, ambient_c)[WINDING].min())
+            except ValueError as error:
+                reason = str(error).rstrip(".")
+                advice = 'give it more cooling or cooler air, or begin with start = "cold"'
+                found.append(f"arms[{arm.index}]: {reason}; {advice}")
+        if coldest_c < lower_c:
+            advice = "give it warmer air" + (', or begin with start = "idle_warm"' if scenario.start == "cold" else "")
+            name = scenario.arms[arm.index].name
+            found.append(
+                f"arms[{arm.index}]: a motor of '{name}' begins at {coldest_c:.1f} °C, below limits.lower_c "
+                f"({lower_c:g} °C); {advice}"
+            )
     return found

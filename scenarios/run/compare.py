@@ -141,7 +141,7 @@ def compare(
         progress("comparing", Count((n + 1) * len(seeds) * len(policies) // len(parts), len(seeds) * len(policies)))
     rng = np.random.default_rng(np.random.SeedSequence(0))
     figures = {
-        p: {name: _figure(name, rows, by_policy[baseline], rng) for name in FIGURES} for p, rows in by_policy.items()
+        p: {name: figure_of(name, rows, by_policy[baseline], rng) for name in FIGURES} for p, rows in by_policy.items()
     }
     scopes = {policy: scope_of(policy) for policy in policies}
     return Comparison(scenario.name, tuple(seeds), baseline, figures, scopes, channel.described(), channel.text)
@@ -174,7 +174,12 @@ def _run_in_worker(
     return outcomes(_fleet(scenario, models, folder), policy, seeds, channel)
 
 
-def _figure(name: str, rows: Sequence[Outcome], base: Sequence[Outcome], rng: np.random.Generator) -> Figure:
+def figure_of(name: str, rows: Sequence[Outcome], base: Sequence[Outcome], rng: np.random.Generator) -> Figure:
+    """One figure over seeds: mean, and paired difference to the rows of a baseline.
+
+    Args:
+        rows, base: On the same seeds, in the same order.
+    """
     values = np.array([getattr(each, name) for each in rows], dtype=float)
     paired = values - np.array([getattr(each, name) for each in base], dtype=float)
     mean, iqm = float(values.mean()), float(trim_mean(values, 0.25))

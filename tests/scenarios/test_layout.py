@@ -14,6 +14,7 @@ from scenarios.job_stream import all_works
 from scenarios.load import library, load, parse_scenario
 from scenarios.prepare.fleet import prepare, prepare_arm
 from scenarios.report.layout import layout_report
+from scenarios.schema import Ambient
 
 
 @pytest.fixture
@@ -171,3 +172,12 @@ def test_an_arm_that_never_settles_at_home_is_a_problem_of_the_cell(cache):
     (problem,) = layout_report(unventilated).problems
     assert problem.startswith("cell.toml: arms[0]: Arm 'west' has no steady state when idle at home")
     assert layout_report(replace(unventilated, start="cold")).problems == ()
+
+
+def test_a_shift_that_begins_below_the_lower_limit_is_a_problem_of_the_cell(cache):
+    cold = replace(cell(*APART, places={"left": (-0.9, 0.3, 0.25)}), ambient=Ambient(points=((0.0, -5.0),)))
+    first, second = layout_report(replace(cold, start="cold")).problems
+    assert first.startswith("cell.toml: arms[0]: a motor of 'west' begins at -")
+    assert "°C, below limits.lower_c (0 °C); give it warmer air, or begin with" in first
+    assert second.startswith("cell.toml: arms[1]")
+    assert layout_report(cold).problems == ()  # powered for hours, its idle heat keeps every motor above 0 °C

@@ -131,7 +131,10 @@ WRONG = [
     ),
     (put("jobs", 1, "arrivals", "count", 3), "arrivals of kind 'poisson' take no 'count'; they take every_s, start_s,"),
     (put("jobs", 0, "arrivals", {"kind": "trace"}), "arrivals of kind 'trace' need either 'times_s' or 'file'."),
-    (put("limits", "warning_c", 90), "heat.toml: limits need restart_c < warning_c < error_c (got 50.0, 90.0, 75.0)."),
+    (
+        put("limits", "warning_c", 90),
+        "heat.toml: limits need lower_c < restart_c < warning_c < error_c (got 0.0, 50.0, 90.0, 75.0).",
+    ),
     (put("limits", "error_c", 1e308), "heat.toml: limits.error_c must be between -60 and 1000 (got 1e+308)."),
     (put("limits", "clear_s", 1e308), "heat.toml: limits.clear_s must be between 0 and 604800 (got 1e+308)."),
     (put("spread", "scale", 1e308), "heat.toml: spread.scale must be between 0 and 10 (got 1e+308)."),
