@@ -29,12 +29,14 @@ def describe(scenario: Scenario, progress: Progress = quiet) -> list[Table | Tex
     regimes = [f.regime for f in factors]
     points = [f"{c:g} °C at {t / 3600:g} h" for t, c in scenario.ambient.points]
     ambient = ", ".join(points) if len(points) > 1 else f"{scenario.ambient.at(np.zeros(1))[0]:g} °C"
+    people = scenario.people
     head = (
         f"{scenario.name}: {scenario.description}\n{scenario.horizon_s / 3600:g} h, a decision every "
         f"{scenario.decision_interval_s:g} s, {scenario.slots} slots, ambient {ambient}\n"
         f"thermal load factor {thermal:.2f} for the best assignment, {blind:.2f} for an equal split, "
         f"time load {time:.2f} (mean of {SEEDS} seeds): {max(set(regimes), key=regimes.count)}\n"
-        f"{_fault_cost(scenario)}"
+        f"{_fault_cost(scenario)}\n"
+        f"people touch an arm for up to {people.contact_s:g} s: surfaces burn from {people.burn_c:g} °C"
     )
     refused = list(dict.fromkeys(map(str, fleet.infeasible)))
     more = [f"… and {len(refused) - MOST_REASONS} more."] if len(refused) > MOST_REASONS else []

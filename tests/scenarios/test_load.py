@@ -136,6 +136,7 @@ WRONG = [
         "heat.toml: limits need lower_c < restart_c < warning_c < error_c (got 0.0, 50.0, 90.0, 75.0).",
     ),
     (put("limits", "error_c", 1e308), "heat.toml: limits.error_c must be between -60 and 1000 (got 1e+308)."),
+    (put("people", {"contact_s": 0.5}), "heat.toml: people.contact_s must be between 1 and 28800 (got 0.5)."),
     (put("limits", "clear_s", 1e308), "heat.toml: limits.clear_s must be between 0 and 604800 (got 1e+308)."),
     (put("spread", "scale", 1e308), "heat.toml: spread.scale must be between 0 and 10 (got 1e+308)."),
     (put("arms", 0, "tilt_deg", [0, 0, 1e9]), "arms[0].tilt_deg must be between -360 and 360 (got [0.0, 0.0, 1"),
