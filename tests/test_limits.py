@@ -1,6 +1,5 @@
 """The limits of motor and core: a core of known resistance beside the simulated steady state of its joint."""
 
-import networkx as nx
 import numpy as np
 import pytest
 
@@ -18,9 +17,8 @@ def test_the_limits_are_those_of_the_user_guide():
 @pytest.mark.parametrize("joint", range(JOINTS))
 def test_a_core_of_the_allowed_resistance_warns_just_as_its_motor_reaches_the_error_limit(joint):
     network = gen3_network()
-    nx.set_edge_attributes(
-        network, {(housing(j - 1), housing(j)): {"conductance_w_per_k": 0.0} for j in range(1, JOINTS)}
-    )
+    for j in range(1, JOINTS):
+        network.edges[housing(j - 1), housing(j)]["conductance_w_per_k"] = 0.0
     model, idle_w = thermal_model(network), np.array(thermal_data()["idle_w"])
     per_watt = model.steady(node_heat(np.ones(JOINTS), np.zeros(JOINTS)), 0.0)[WINDING][joint]
     idle_c = model.steady(node_heat(np.zeros(JOINTS), idle_w), 36.0)[WINDING][joint]

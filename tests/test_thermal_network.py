@@ -2,7 +2,6 @@
 
 from itertools import pairwise
 
-import networkx as nx
 import numpy as np
 import pytest
 
@@ -26,7 +25,6 @@ from fleet.thermal import (
 MODEL = thermal_model(gen3_network())
 MOTORS = gen3_motors()
 REST = np.zeros(JOINTS)
-LABEL = "conductance_w_per_k"
 
 
 def test_better_cooling_is_cooler():
@@ -43,7 +41,8 @@ def test_immersion_conducts_3_7_times_what_liquid_does():
     rises = []
     for name in ("liquid", "immersion"):
         network = gen3_network(cooling=name, spread=spread, rng=np.random.default_rng(3))
-        nx.set_edge_attributes(network, {(housing(j - 1), housing(j)): {LABEL: 0.0} for j in range(1, JOINTS)})
+        for j in range(1, JOINTS):
+            network.edges[housing(j - 1), housing(j)]["conductance_w_per_k"] = 0.0
         rises.append(thermal_model(network).steady(node_heat(np.full(JOINTS, 5.0), REST), 0.0)[WINDING])
     np.testing.assert_allclose(rises[0] / rises[1], 3.7)
     nominal = thermal_model(gen3_network(cooling="liquid")).laplacian
