@@ -40,7 +40,7 @@ HEADINGS = {
     "availability": "availability, 0–1",
     "insulation_ppb": "insulation, ppb",
     "tool_drift_mm": "tool drift, mm",
-    "hot_surface_min": "min with a hot surface",
+    "hot_surface_min": "min hot surface",
 }
 """Headings of the figures in the table, with units."""
 LEAST_DIGITS = {"availability": 3, "tool_drift_mm": 2}
