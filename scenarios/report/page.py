@@ -147,10 +147,11 @@ def _replay_parts(replay: Replay) -> list[str]:
 
 
 def _start(figure: bool, replay: Replay | None) -> str:
-    """The function that begins a page, after everything that it needs."""
-    draw = f"const figure=await drawFigure({json.dumps(_PLOTLY_OPTIONS)});" if figure else "const figure=null;"
-    play = f'await runLibrary("three");await startReplay(figure,{replay.unit_s});' if replay else ""
-    return f"async function start(){{{draw}{play}}}"
+    """The function that begins a page; the replay comes first, since a figure takes longer."""
+    play = f'await runLibrary("three");const shift=await startReplay({replay.unit_s});' if replay else ""
+    draw = f"const figure=await drawFigure({json.dumps(_PLOTLY_OPTIONS)});" if figure else ""
+    join = "shift.attach(figure);" if replay and figure else ""
+    return f'async function start(){{{play}{draw}{join}document.body.dataset.ready="all";}}'
 
 
 def _data(key: str, text: str) -> str:

@@ -30,7 +30,8 @@ function stateAt(array, row, timeS) {
   return array.values[row * array.moments + i] * array.scale;
 }
 
-async function startReplay(figure, unitS) {
+// Plays the shift; a figure that is drawn later gets its cursor by `attach`.
+async function startReplay(unitS) {
   const place = document.getElementById("cell");
   const model = JSON.parse(document.getElementById("cell-model").textContent);
   const data = await readPlayback("playback");
@@ -44,7 +45,7 @@ async function startReplay(figure, unitS) {
     place.className = "absent";
     place.textContent = "This browser cannot draw in 3-D (WebGL is missing). The figures below show the same shift.";
   }
-  let timeS = data.q.first_s, playing = false, last = 0, shown = null, moveCursor = null;
+  let timeS = data.q.first_s, playing = false, last = 0, shown = null, figure = null, moveCursor = null;
   slider.min = data.q.first_s;
   slider.max = endS;
   slider.step = "any";
@@ -125,10 +126,6 @@ async function startReplay(figure, unitS) {
   }
   model.arms.forEach((arm, i) => chooser.append(new Option(arm.name, i)));
   chooser.addEventListener("change", () => choose(Number(chooser.value)));
-  if (figure) figure.on("plotly_click", (event) => {
-    const point = event.points[0];
-    if (point.data.type === "heatmap") choose(point.y);
-  });
   play.addEventListener("click", toggle);
   slider.addEventListener("input", () => show(Number(slider.value)));
   // A row of a table with a moment goes there, by click or Enter.
@@ -155,9 +152,19 @@ async function startReplay(figure, unitS) {
     else return;
     event.preventDefault();
   });
-  if (figure) moveCursor = addCursor(figure);
+  function attach(element) {
+    figure = element;
+    figure.on("plotly_click", (event) => {
+      const point = event.points[0];
+      if (point.data.type === "heatmap") choose(point.y);
+    });
+    moveCursor = addCursor(figure);
+    choose(Number(chooser.value));
+    moveCursor(timeS);
+  }
   show(timeS);
   requestAnimationFrame(frame);
   window.replay = { show, time: () => timeS };
-  document.body.dataset.ready = "replay";
+  performance.mark("playable");
+  return { attach };
 }
