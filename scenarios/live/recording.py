@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from msgspec import inspect, structs
 
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
+from fleet.bus.protocol.cell import Cell
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import ControlRequest, Operation
 from fleet.errors import FleetError
@@ -122,6 +123,8 @@ class Card(msgspec.Struct, frozen=True):
     """Missing messages that may still be had."""
     rows: dict[Kind, int] = {}
     """Number of rows in all parts, by kind; none in recordings of earlier versions."""
+    cell: Cell | None = None
+    """As an auctioneer described it, without the work of the arms; None while none has."""
 
 
 def _columns(message: type[msgspec.Struct]) -> dict[str, pa.DataType]:

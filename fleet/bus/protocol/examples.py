@@ -29,7 +29,7 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
-from fleet.bus.protocol.cell import Cell, CellArm, CellKind, CellPlace, CellRequest, Limit, PlannedWork
+from fleet.bus.protocol.cell import Cell, CellArm, CellFixture, CellKind, CellPlace, CellRequest, Limit, PlannedWork
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimEntry, ClaimReply, DeniedEntry, GrantedEntry, JobOutcome
 from fleet.bus.protocol.history import History, HistoryRequest
 from fleet.bus.protocol.messages import DifficultyScores, Info, Refusal, State
@@ -93,6 +93,7 @@ _CELL = Cell(
     warning_c=60.0,
     error_c=75.0,
     jobs_in_message=128,
+    fixtures=(CellFixture("table", (0.4, 0.0, -0.05), (0.6, 0.9, 0.1), (0.0, 0.0, 0.0)),),
 )
 _CANCEL = ControlRequest(request="5f0c2b1e", action=Cancel(job="crate_1"), by="shop floor")
 

@@ -118,7 +118,7 @@ def report_command(
         Path | None, typer.Option(help="The HTML file. Default: in the folder of a run, beside that of a recording.")
     ] = None,
     scenario: Annotated[
-        str | None, typer.Option(help="Of a recording: the scenario of the fleet, to show its cell in 3-D.")
+        str | None, typer.Option(help="Of a recording: the scenario of the fleet, if no auctioneer described its cell.")
     ] = None,
 ) -> None:
     """Write the report of a live recording, as `run` writes one of a simulated shift, or that of a run anew."""
