@@ -148,7 +148,9 @@ SCHEMAS: dict[Kind, pa.Schema] = {
         | {f"{name}_{joint + 1}": pa.float32() for name in SENSORS for joint in range(JOINTS)}
     ),
     "events": pa.schema({"time_s": pa.float64(), **_columns(ArmEvent), "joint": pa.int8()}),
-    "results": pa.schema({"time_s": pa.float64(), **_columns(Result), **_columns(JobStatus)}),
+    "results": pa.schema(
+        {"time_s": pa.float64(), **_columns(Result), **_columns(JobStatus), "offers": pa.string()}  # JSON
+    ),
     "operations": pa.schema(
         {"time_s": pa.float64(), **_columns(Operation), **_columns(ControlRequest)}
         | {name: pa.string() for name in ("action", "job", "arm", "content")}
@@ -179,6 +181,7 @@ def to_row(record: Heard | Gap) -> tuple[Kind, dict[str, object]]:
             return "events", structs.asdict(message)
         case HeardResult(message):
             fields = structs.asdict(message)
+            fields["offers"] = msgspec.json.encode(message.offers).decode() if message.offers else ""
             return "results", fields | structs.asdict(fields.pop("status"))
         case HeardOperation(message):
             request = message.request

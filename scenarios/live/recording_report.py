@@ -7,16 +7,18 @@ and messages that are lost. `order_events` turns it into a sequence that a sched
 import json
 import math
 from collections import Counter, defaultdict, deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any  # values of the report
 
+import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from fleet.bus.protocol.auction import ArmOffer, PlanQuote
 from fleet.bus.protocol.cell import Cell
 from fleet.bus.protocol.operator import ALL_ARMS
 from fleet.errors import FleetError
@@ -30,6 +32,7 @@ from scenarios.report.gantt import clock
 from scenarios.report.run_page import report_html
 from scenarios.report.schedule import SAME_MOMENT_DIGITS
 from scenarios.schema import Scenario
+from scenarios.shift_records import Offer
 
 Array = np.ndarray
 
@@ -75,7 +78,16 @@ def recording_html(folder: Path, scenario: Scenario | None = None) -> str:
     }
     if len(epochs) > 1:
         run["epochs"] = f"{len(epochs)} are recorded here; this page shows the last one, {[*epochs][-1]}"
-    return report_html(run, telemetry, events, arms, warning_c=warning_c, error_c=error_c, model=model)
+    return report_html(
+        run,
+        telemetry,
+        events,
+        arms,
+        warning_c=warning_c,
+        error_c=error_c,
+        model=model,
+        offers=[offer for row in results.to_pylist() for offer in _offers(row)],
+    )
 
 
 def _cell(
@@ -242,6 +254,25 @@ def telemetry_of(table: pa.Table, arms: list[str]) -> Telemetry:
         for name, values in readings.items():
             out[name][fresh, a] = values[rows[last[fresh]]]
     return Telemetry(time_s=time_s, mode=mode, **out)
+
+
+def _offers(row: Mapping[str, Any]) -> Iterator[Offer]:
+    """What the arms offered for a job that was awarded, from a row of the results."""
+    for offer in msgspec.json.decode(row["offers"] or "[]", type=tuple[ArmOffer, ...]):
+        plan = offer.plan or PlanQuote()
+        yield Offer(
+            time_s=row["time_s"],
+            job=row["job"],
+            arm=offer.arm,
+            awarded=offer.arm == row["arm"],
+            state=offer.mode,
+            feasible=offer.plan is not None,
+            free=offer.free,
+            difficulty=plan.difficulty,
+            peak_c=plan.peak_c,
+            p_saturation=plan.p_saturation,
+            duration_s=plan.duration_s,
+        )
 
 
 def _metrics(

@@ -23,6 +23,7 @@ from scenarios.cli.main import main
 from scenarios.live.recorder import Recorder
 from scenarios.live.recording import read_parts
 from scenarios.live.recording_report import order_events, recording_html, telemetry_of
+from scenarios.live.replayer import Replay
 from scenarios.report.run_page import report_html
 from scenarios.report.schedule import schedule
 
@@ -159,6 +160,23 @@ def test_the_command_writes_the_page_beside_the_recording(tmp_path, capsys):
     Recorder.open(tmp_path / "empty", "f")
     with pytest.raises(FleetError, match="no state of an arm"):
         recording_html(tmp_path / "empty")
+
+
+def test_the_offers_behind_an_award_are_kept_listed_and_replayed(tmp_path):
+    recorder, result = record(tmp_path / "r", LOG), EXAMPLES[Result]
+    for name, place in (("a-1", 0), ("b-1", 1)):
+        status = structs.replace(result.status, job=name, arm=ARMS[place])
+        offers = tuple(structs.replace(offer, arm=arm) for offer, arm in zip(result.offers, ARMS, strict=False))
+        offers = offers if place == 0 else (offers[1], structs.replace(offers[0], plan=None))
+        recorder.add("boss", structs.replace(result, auctioneer="boss", number=place, status=status, offers=offers))
+    recorder.write()
+    html = recording_html(tmp_path / "r")
+    assert "the offers behind 2 awards" in html
+    assert "<td>a-1</td><td>arm_0</td><td>P 0.04, 52 °C, d 0.53, 4 min</td>" in html
+    assert "<td>b-1</td><td>arm_1</td><td>cannot do it</td>" in html
+    replayed = [message for message in Replay.of(tmp_path / "r").messages() if isinstance(message, Result)]
+    assert [len(message.offers) for message in replayed] == [2, 2]
+    assert replayed[0].offers[0].plan == result.offers[0].plan
 
 
 def test_the_cell_of_a_recording_is_shown_in_three_dimensions(tmp_path):

@@ -46,6 +46,8 @@ function startPage() {
     if (fleet.jobs.size > 4 * MOST_JOBS) fleet.jobs.delete(fleet.jobs.keys().next().value);
     if (status.state === "awarded" && status.arm && (!before || before.arm !== status.arm || before.state !== "awarded")) {
       const all = new Map(offers.get(status.job));
+      for (const { arm, plan } of (result && result.offers) || [])
+        if (plan) all.set(arm, { peak: plan.peak_c, p: plan.p_saturation, d: plan.difficulty });
       if (result && result.peak_c !== undefined) all.set(status.arm, { peak: result.peak_c, p: result.p_saturation, d: result.difficulty });
       if (all.size || result) {
         awards.unshift({ key: `${status.job}/${status.award}/${status.arm}`, job: status.job, arm: status.arm, offers: all });
