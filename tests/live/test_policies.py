@@ -278,7 +278,7 @@ def test_the_offers_behind_an_award_are_the_winner_then_the_others_best_first() 
     assert all(o.plan is None or (o.plan.joint_difficulty, o.plan.space) == (None, None) for o in offers)
     many = {f"a{n:03d}": quote(f"a{n:03d}", costs(n / 300)) for n in range(256)}
     kept = offers_of(Bidding("r", 0.0, jobs, many), "j", Assignment("a200"))
-    assert [o.arm for o in kept] == ["a200", *(f"a{n:03d}" for n in range(15))]
+    assert [o.arm for o in kept] == ["a200", *(f"a{n:03d}" for n in range(7))]
 
 
 def test_an_illegal_action_is_logged_and_waits(caplog) -> None:

@@ -29,11 +29,10 @@ LEASE_S = 6.0
 """Real seconds that an arm may work on a job without renewing its lease."""
 NOT_PLANNED = "not planned yet; ask again"
 """Reason of an estimate that the arm will have soon."""
-MOST_PLANS, MOST_OFFERS = 8, 16
+MOST_PLANS, MOST_OFFERS = 8, 8
 """Plans of one arm for one job; offers in a `Result`."""
 MOST_QUOTED, MOST_JOBS = 64, 128
 """Jobs in one quote and in one message, so that none exceeds the router's size limit; more take several messages."""
-
 Jobs = Annotated[tuple[JobSpec, ...], msgspec.Meta(min_length=1, max_length=MOST_JOBS)]
 
 
@@ -333,8 +332,10 @@ class ArmOffer(msgspec.Struct, frozen=True, omit_defaults=True):
     free: bool
     """Whether the arm could have taken it: it had capacity, and the places and the space of a plan were free."""
     plan: PlanQuote | None = None
-    """Of the arm that got the job the awarded plan, of others the one with the least difficulty, both without
-    `joint_difficulty` and `space`; null if the arm cannot do the job."""
+    """The awarded plan, of other arms that with the least difficulty; null without one. Not with all its fields."""
+
+
+Offers = Annotated[tuple[ArmOffer, ...], msgspec.Meta(max_length=MOST_OFFERS)]
 
 
 class Result(msgspec.Struct, frozen=True):
@@ -354,9 +355,8 @@ class Result(msgspec.Struct, frozen=True):
     """Who asked for the change, by a `Submission` or a `ControlRequest`, also who paused the arm that stopped."""
     epoch: str = ""
     """As in `Clock`: `number` begins again with another epoch."""
-    offers: Annotated[tuple[ArmOffer, ...], msgspec.Meta(max_length=MOST_OFFERS)] = ()
-    """Behind an award, that of the arm which got the job first, then the best others. Empty for other states, and after
-    a restart of the auctioneer."""
+    offers: Offers = ()
+    """Behind an award, that of the arm which got the job first, then the best others; empty for other states."""
 
 
 class ArmEvent(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -17,7 +17,6 @@ from fleet.live.auction.round import (
     Timing,
     drop_invalid,
     infeasible_jobs,
-    offers_of,
     planned_jobs,
 )
 from fleet.live.auction.space_rules import stated_spaces, waits_for_space
@@ -158,8 +157,7 @@ class Rounds:
         return arm in closing.asked & self.present and not self._writer.ledger.is_paused(arm)
 
     def _award(self, bidding: Bidding, allocation: dict[str, Assignment], real_s: float, time_s: float) -> None:
-        offers = {job: offers_of(bidding, job, assignment) for job, assignment in allocation.items()}
-        self._writer.record(*(records := new_awards(self._writer.ledger, bidding, allocation, time_s)), offers=offers)
+        self._writer.record(*(records := new_awards(self._writer.ledger, bidding, allocation, time_s)))
         for record in records:
             self._notes.pop(record.job, None)
             spec = self._writer.ledger.jobs[record.job].spec

@@ -2,11 +2,11 @@
 
 import logging
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 from msgspec.structs import asdict
 
-from fleet.bus.protocol.auction import Announcement, ArmOffer, QuoteRequest, Result
+from fleet.bus.protocol.auction import Announcement, QuoteRequest, Result
 from fleet.bus.protocol.operator import Operation
 from fleet.errors import JournalFull
 from fleet.live.auction.leases import CountedLease, SendAward
@@ -15,8 +15,6 @@ from fleet.live.auction.records import AuctionRecord, Change, Operated
 
 _LOG = logging.getLogger(__name__)
 
-Offers = Mapping[str, tuple[ArmOffer, ...]]
-NO_OFFERS: Offers = {}
 Out = QuoteRequest | SendAward | Announcement | Result | Operation
 
 
@@ -44,11 +42,8 @@ class LedgerWriter:
         first = ledger.operated - len(ledger.operations)
         self.out.extend(self._operation(record, first + place) for place, record in enumerate(ledger.operations))
 
-    def record(self, *records: AuctionRecord, offers: Offers = NO_OFFERS) -> None:
+    def record(self, *records: AuctionRecord) -> None:
         """Write records, then apply them.
-
-        Args:
-            offers: Behind each award among the records, by job.
 
         Raises:
             JournalError: nothing was written, and nothing has changed.
@@ -58,9 +53,7 @@ class LedgerWriter:
         records = (*self.ledger.checks_due(), *records)
         self._keep(*records)
         for record in records:
-            for change in self.ledger.apply(record):
-                behind = offers.get(change.status.job, ()) if change.status.state == "awarded" else ()
-                self.out.append(self._result(change, behind))
+            self.out.extend(map(self._result, self.ledger.apply(record)))
             if isinstance(record, Operated):
                 self.out.append(self._operation(record, self.ledger.operated - 1))
         for award in self.leases.keys() - self.ledger.open.keys():
@@ -75,8 +68,8 @@ class LedgerWriter:
             return False
         return True
 
-    def _result(self, change: Change, offers: tuple[ArmOffer, ...] = ()) -> Result:
-        return Result(self._name, epoch=self.ledger.epoch, offers=offers, **asdict(change))
+    def _result(self, change: Change) -> Result:
+        return Result(self._name, epoch=self.ledger.epoch, **asdict(change))
 
     def _operation(self, record: Operated, number: int) -> Operation:
         return Operation(self._name, record.time_s, record.request, number, self.ledger.epoch)
