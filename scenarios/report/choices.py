@@ -12,8 +12,8 @@ MOST_AWARDS = 300
 MOST_ARMS = 8
 """With more arms, the columns are the best other offers instead of the arms."""
 NOTE = (
-    "P is the probability that a motor reaches its limit, then the predicted peak, the difficulty d and the time "
-    "needed. In brackets: why the arm could not have taken the job then."
+    "Of each arm: P(saturation), the probability that a motor passes its warning limit; the predicted peak; the "
+    "difficulty d; the duration of the job. In brackets: why the arm could not take the job then."
 )
 
 
