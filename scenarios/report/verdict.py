@@ -10,7 +10,7 @@ from scenarios.report.gantt import clock
 from scenarios.report.schedule import Assignment, Outage, Schedule
 from scenarios.shift_records import Offer
 
-MOST_FAULTS = 3
+MOST_FAULTS = 2
 """Faults with a sentence of their own."""
 MOST_ARMS = 6
 """Arms that are named in one sentence."""
@@ -96,14 +96,14 @@ def _fault(fault: Event, plan: Schedule) -> str:
     at = f" during {fault.job}" if fault.job else ""
     why = fault.reason or f"motor {fault.joint} reached its limit"
     why = why.replace(f"motor {fault.joint} ", f"the motor of joint {fault.joint} ", 1)
-    return f"{clock(fault.time_s)}: {fault.arm} stopped{at}: {why}. {_outage(outage)}."
+    return f"{clock(fault.time_s)}: {fault.arm} stopped{at}, {_outage(outage)}: {why}."
 
 
 def _outage(outage: Outage | None) -> str:
     if outage is None:
-        return "The arm recovered at once"
+        return "and recovered at once"
     length = duration(outage.end_s - outage.start_s)
-    return f"The arm was out for {length}" if outage.recovered else f"The arm was out for the remaining {length}"
+    return f"out for {length}" if outage.recovered else f"out for the remaining {length}"
 
 
 def _cause(fault: Event, plan: Schedule, offers: Sequence[Offer]) -> Iterable[str]:
@@ -117,10 +117,10 @@ def _cause(fault: Event, plan: Schedule, offers: Sequence[Offer]) -> Iterable[st
     if own is None or own.peak_c is None or own.p_saturation is None:
         return
     begin_s = _begin(award, work)
-    pause = f"{fault.arm} had worked without a pause since {clock(begin_s)}; " if begin_s < award.start_s else ""
+    pause = f"at work without a pause since {clock(begin_s)}; " if begin_s < award.start_s else ""
     yield (
-        f"Why: {pause}when {'it' if pause else fault.arm} got the job, at {clock(award.start_s)}, its predicted peak "
-        f"was {own.peak_c:.0f} °C and P(saturation) {own.p_saturation:.2f}."
+        f"Why: {pause}at the award, {clock(award.start_s)}, predicted peak {own.peak_c:.0f} °C and P(saturation) "
+        f"{own.p_saturation:.2f}."
     )
     yield _avoidable(fault, own, offered, plan)
 
