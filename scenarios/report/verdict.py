@@ -17,6 +17,8 @@ MOST_ARMS = 6
 MARGIN_K = 3.0
 """Another arm would have avoided a fault if its predicted peak was this much below the limit and below the peak of the
 arm that faulted."""
+WEIGHS_PEAK = "wsept"
+"""The built-in policy that weighs the predicted peak against the value of a job."""
 PAUSE_S = 60.0
 """Two jobs of an arm count as one stretch of work if less time lies between them."""
 
@@ -50,6 +52,8 @@ def verdict(run: Mapping[str, Any], events: Sequence[Event], plan: Schedule, off
         sentences.append(f"{len(faults)} faults in all, of {arms}: see the events below.")
     elif not faults:
         sentences.append(_hottest(metrics))
+    if run.get("policy") != WEIGHS_PEAK:
+        sentences += _foreseen(faults, plan, offers)
     if contacts:
         sentences.append(f"Arms touched something {_times(contacts)}: see the events below.")
     status = str(run.get("status", "unknown"))
@@ -106,23 +110,49 @@ def _outage(outage: Outage | None) -> str:
     return f"out for {length}" if outage.recovered else f"out for the remaining {length}"
 
 
+def _award(fault: Event, plan: Schedule) -> Assignment | None:
+    """The work in which an arm faulted."""
+    same = (a for a in plan.assignments if (a.arm, a.job) == (fault.arm, fault.job))
+    return next((a for a in same if a.start_s <= fault.time_s <= a.end_s), None)
+
+
+def _own_offer(award: Assignment, offers: Sequence[Offer]) -> Offer | None:
+    """The offer that got the job; None if its scores are unknown."""
+    own = next((o for o in offers if o.awarded and o.job == award.job and o.time_s == award.start_s), None)
+    return own if own is not None and own.peak_c is not None and own.p_saturation is not None else None
+
+
+def _foreseen(faults: Sequence[Event], plan: Schedule, offers: Sequence[Offer]) -> Iterable[str]:
+    """How many faults were predicted, and what kind of policy avoids them."""
+    awards = [(fault, _award(fault, plan)) for fault in faults]
+    own = [(fault, _own_offer(award, offers)) for fault, award in awards if award is not None]
+    count = sum(offer is not None and (offer.peak_c or 0.0) >= _limit_c(fault) for fault, offer in own)
+    if count:
+        which = "The fault was" if len(faults) == 1 else f"{count} of {len(faults)} faults were"
+        yield f"{which} predicted: a policy that weighs the predicted peak, such as {WEIGHS_PEAK}, avoids such awards."
+
+
+def _limit_c(fault: Event) -> float:
+    return fault.value if math.isfinite(fault.value) else math.inf
+
+
 def _cause(fault: Event, plan: Schedule, offers: Sequence[Offer]) -> Iterable[str]:
     """Why an arm faulted, as far as its award tells, and what would have avoided it."""
-    work = [a for a in plan.assignments if a.arm == fault.arm and a.start_s <= fault.time_s]
-    award = next((a for a in work if a.job == fault.job and fault.time_s <= a.end_s), None)
+    award = _award(fault, plan)
     if award is None:
         return
-    offered = [o for o in offers if o.job == fault.job and o.time_s == award.start_s]
-    own = next((o for o in offered if o.awarded), None)
-    if own is None or own.peak_c is None or own.p_saturation is None:
-        return
-    begin_s = _begin(award, work)
+    begin_s = _begin(award, [a for a in plan.assignments if a.arm == fault.arm and a.start_s <= fault.time_s])
     pause = f"at work without a pause since {clock(begin_s)}; " if begin_s < award.start_s else ""
+    own = _own_offer(award, offers)
+    if own is None:
+        if pause:
+            yield f"Why: {pause}no prediction was recorded."
+        return
     yield (
         f"Why: {pause}at the award, {clock(award.start_s)}, predicted peak {own.peak_c:.0f} °C and P(saturation) "
         f"{own.p_saturation:.2f}."
     )
-    yield _avoidable(fault, own, offered, plan)
+    yield _avoidable(fault, own, [o for o in offers if o.job == award.job and o.time_s == award.start_s], plan)
 
 
 def _begin(award: Assignment, work: Sequence[Assignment]) -> float:
@@ -137,7 +167,7 @@ def _begin(award: Assignment, work: Sequence[Assignment]) -> float:
 def _avoidable(fault: Event, own: Offer, offered: Sequence[Offer], plan: Schedule) -> str:
     """What would have avoided a fault, by the predictions at the award of its job."""
     own_c = own.peak_c or math.inf
-    limit_c = fault.value if math.isfinite(fault.value) else math.inf
+    limit_c = _limit_c(fault)
     most_c = min(own_c, limit_c) - MARGIN_K
     cooler = [o for o in offered if not o.awarded and o.feasible and o.peak_c is not None and o.peak_c <= most_c]
     free = [o for o in cooler if o.free]
@@ -147,7 +177,7 @@ def _avoidable(fault: Event, own: Offer, offered: Sequence[Offer], plan: Schedul
         return f"{choice}: it was free." if best.free else f"{choice}, {_occupied(best, plan)}."
     others = "no other arm could do the job" + (" cooler" if any(o.feasible and not o.awarded for o in offered) else "")
     if own_c < limit_c:
-        return f"Not foreseen: the prediction was below the limit, and {others}."
+        return f"Not predicted: the predicted peak was below the limit, and {others}."
     return f"Avoidable only by letting the job wait until {fault.arm} had cooled: {others}."
 
 

@@ -39,9 +39,11 @@ def sentences(*offers, events=EVENTS, end=60):
 
 
 def test_a_fault_is_told_with_its_arm_joint_time_and_cause():
-    fault, why, _ = sentences(offer("hot", 78.2), offer("cool", 50.0))
+    fault, why, _, remedy = sentences(offer("hot", 78.2), offer("cool", 50.0))
     assert fault == "0:30:00: hot stopped during hold-2, out for 20 min: the motor of joint 2 passed 75 °C."
     assert why.startswith("Why: at work without a pause since 0:00:00; at the award, 0:20:30, predicted peak 78 °C ")
+    assert remedy.startswith("The fault was predicted")
+    assert len(sentences(offer("hot", 74.0), offer("cool", 50.0))) == 3
 
 
 @pytest.mark.parametrize(
@@ -55,18 +57,18 @@ def test_a_fault_is_told_with_its_arm_joint_time_and_cause():
     ],
 )  # fmt: skip
 def test_the_choice_that_would_have_avoided_a_fault(own_c, other, end, told):
-    assert sentences(offer("hot", own_c), offer("cool", **other), end=end)[-1].endswith(told)
+    assert sentences(offer("hot", own_c), offer("cool", **other), end=end)[2].endswith(told)
 
 
 @pytest.mark.parametrize(("end", "told"), [(60, "once it was free, at 0:55:00."), (55, "which was busy to the end.")])
 def test_a_cooler_arm_at_work_is_named_with_the_end_of_its_job(end, told):
     events = (EVENTS[0], event(10, "award", "cool", "sort-1"), *EVENTS[1:4], *EVENTS[5:])
     busy = offer("cool", 50.0, free=False, state="working")
-    assert sentences(offer("hot", 78.0), busy, events=events, end=end)[-1].endswith(told)
+    assert sentences(offer("hot", 78.0), busy, events=events, end=end)[2].endswith(told)
 
 
-def test_nothing_is_said_about_a_choice_that_was_not_recorded():
-    assert len(sentences()) == 1
+def test_without_offers_only_the_work_before_a_fault_is_told():
+    assert sentences()[1:] == ("Why: at work without a pause since 0:00:00; no prediction was recorded.",)
 
 
 def test_the_hottest_motor_of_a_shift_without_a_fault():
