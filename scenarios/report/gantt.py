@@ -33,6 +33,8 @@ def gantt(plan: Schedule, events: Sequence[Event], arms: Sequence[str], unit_s: 
     if plan.outages:
         look = {"color": FAULT, "opacity": 0.8, "line": {"width": 0}, "pattern": HATCH | {"shape": "x"}}
         traces.append(_bars("out after a fault", plan.outages, _outage_text, arms, unit_s, look))
+    if not traces:  # without a trace Plotly draws no rows
+        traces.append(BAR | {"name": "no job was begun", "x": [None], "y": [None], "marker": {"color": "#888888"}})
     for kind, symbol, colour in MARKS:  # above the bars of their arm
         own = [e for e in events if e.kind == kind and e.arm in arms]
         if own:

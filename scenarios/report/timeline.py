@@ -29,12 +29,12 @@ HEAT_BINS = 1440
 
 GRID, FRAME = "#e6e6e6", "#bbbbbb"
 JOINT_LINES = (
-    ("#4a6fd0", "solid"),
+    ("#4a6fd0", "longdashdot"),
     ("#cc6677", "solid"),
     ("#228a44", "dash"),
     ("#2f8fb5", "dot"),
-    ("#b554a8", "dash"),
-    ("#8a8a2a", "dot"),
+    ("#b554a8", "longdash"),
+    ("#8a8a2a", "1px,5px"),
     ("#2f9488", "dashdot"),
 )
 """Colour and dash of each joint. Each colour has a contrast above 3 on light and dark pages; the dashes tell apart what
