@@ -20,7 +20,7 @@ BAR_HEIGHT = 0.62
 """In rows."""
 LATE = {"color": INK, "width": 1.6}
 HATCH = {"fillmode": "overlay", "fgcolor": "white", "fgopacity": 1.0, "size": 7, "solidity": 0.35}
-ARM_NAME, STREAM_NAME = 18, 30
+ARM_NAME, STREAM_NAME = 16, 30
 """Most characters of a name beside an axis and in a legend, which take their place from the figure."""
 UNFINISHED = 0.55
 """Opacity of work that was returned or is still running."""
@@ -34,7 +34,10 @@ def gantt(plan: Schedule, events: Sequence[Event], arms: Sequence[str], unit_s: 
         look = {"color": FAULT, "opacity": 0.8, "line": {"width": 0}, "pattern": HATCH | {"shape": "x"}}
         traces.append(_bars("out after a fault", plan.outages, _outage_text, arms, unit_s, look))
     if not traces:  # without a trace Plotly draws no rows
-        traces.append(BAR | {"name": "no job was begun", "x": [None], "y": [None], "marker": {"color": "#888888"}})
+        traces.append(
+            BAR
+            | {"name": "no job was begun", "showlegend": True, "x": [None], "y": [None], "marker": {"color": "#888888"}}
+        )
     for kind, symbol, colour in MARKS:  # above the bars of their arm
         own = [e for e in events if e.kind == kind and e.arm in arms]
         if own:

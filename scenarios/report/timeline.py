@@ -46,7 +46,7 @@ NARROW_PX = 860
 LEGEND_ROW_PX = 20.0
 NAME_PX = 20.0
 """Height of the name of an arm above its lane."""
-MAP_GAP_PX = 90.0
+MAP_GAP_PX, MAP_ROW_PX = 90.0, 8.0
 GAP_PX = 172.0
 """Height between the two blocks, for an axis, a title and a legend."""
 BETWEEN_LANES_PX = 28.0
@@ -126,7 +126,8 @@ def figure(
         # The page may show any other arm in the last lane.
         title = len(lanes)  # annotations: the title of the heat map, then those of the lanes
         layout["meta"] = {"lane_traces": list(range(len(data) - JOINTS, len(data))), "lane_title": title}
-        data.append(heat_map(telemetry, arms, number, unit, unit_s, warning_c=warning_c, error_c=error_c))
+        heat = heat_map(telemetry, arms, number, unit, unit_s, warning_c=warning_c, error_c=error_c)
+        data.append(heat | {"colorbar": heat["colorbar"] | {"y": layout[f"yaxis{number}"]["domain"][1]}})
     return {"data": data, "layout": layout}
 
 
@@ -170,7 +171,8 @@ def heat_map(
             "tickvals": [0, 2 * (warning_c - low), 2 * (error_c - low)],
             "ticktext": [f"{low:g}", f"{warning_c:g}", f"{error_c:g}"],
             "thickness": 12,
-            "len": 0.2,
+            "lenmode": "pixels",
+            "len": min(200, MAP_ROW_PX * len(arms)),
             "yanchor": "top",
         },
         "customdata": names,
@@ -189,7 +191,7 @@ def _blocks(arms: Sequence[str], lanes: Sequence[int], legend_px: float) -> dict
     overview = len(lanes) < len(arms)
     gantt_px = max(90.0, len(arms) * (40.0 if len(arms) <= 8 else 26.0 if not overview else 12.0))
     lane_px = 120.0 if len(lanes) <= 8 else 84.0
-    map_px = len(arms) * 8.0 if overview else 0.0
+    map_px = len(arms) * MAP_ROW_PX if overview else 0.0
     map_top = gantt_px + MAP_GAP_PX
     first = map_top + map_px if overview else gantt_px
     tops = [first + GAP_PX + a * (lane_px + BETWEEN_LANES_PX) for a in range(len(lanes))]
