@@ -57,7 +57,7 @@ def write_rerun(path: Path, moments: Moments, progress: Progress = quiet) -> Non
         recording.flush()
         recording.disconnect()
     except RuntimeError as error:  # its writer has ended, for want of space as a rule, and says no more
-        raise OSError(f"{error}; is the disk full?") from error
+        raise OSError(f"{error} (the disk may be full)") from error
 
 
 def layout(moments: Moments) -> rrb.Blueprint:
