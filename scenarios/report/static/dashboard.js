@@ -207,7 +207,7 @@ function startPage() {
       name.append(button);
       hot.append(make("span", { class: "bar", "aria-hidden": "true" }, make("i")), make("span"));
     }
-    const pause = fleet.paused["*"] !== undefined ? "*" : fleet.paused[arm.name] !== undefined ? arm.name : "";
+    const pause = ["*", arm.name].find((one) => Object.hasOwn(fleet.paused, one)) || "";
     const word = here ? MODES[state.mode] : "◌ absent";
     setText(mode, pause ? `${word}, ❚❚ paused` : word);
     setClass(row, here ? state.mode : "absent");
@@ -317,6 +317,7 @@ function startPage() {
   }
 
   function frame(ms) {
+    requestAnimationFrame(frame); // first: an error in a picture does not end all later ones
     if (ms - lastDraw >= DRAW_MS) {
       lastDraw = ms;
       drawCell();
@@ -326,7 +327,6 @@ function startPage() {
       drawTables();
     }
     if (view) view.draw();
-    requestAnimationFrame(frame);
   }
   function say(text, style) {
     setText(element("link"), text);
