@@ -30,6 +30,8 @@ class Verdict:
     badge: str
     good: bool
     sentences: tuple[str, ...]
+    faults: Mapping[str, Event]
+    """That some of the sentences are about."""
 
 
 def verdict(run: Mapping[str, Any], events: Sequence[Event], plan: Schedule, offers: Sequence[Offer] = ()) -> Verdict:
@@ -43,9 +45,10 @@ def verdict(run: Mapping[str, Any], events: Sequence[Event], plan: Schedule, off
     metrics = run.get("metrics") or {}
     faults = [event for event in events if event.kind == "fault"]
     contacts = sum(event.kind == "contact" for event in events)
+    about = {_fault(fault, plan): fault for fault in faults[:MOST_FAULTS]}
     sentences = [*_jobs(metrics)]
-    for fault in faults[:MOST_FAULTS]:
-        sentences += [_fault(fault, plan), *_cause(fault, plan, offers)]
+    for sentence, fault in about.items():
+        sentences += [sentence, *_cause(fault, plan, offers)]
     if len(faults) > MOST_FAULTS:
         of = sorted({fault.arm for fault in faults})
         arms = ", ".join(of[:MOST_ARMS]) + (f" and {len(of) - MOST_ARMS} more" if len(of) > MOST_ARMS else "")
@@ -65,7 +68,8 @@ def verdict(run: Mapping[str, Any], events: Sequence[Event], plan: Schedule, off
         badge = "Contact"
     else:
         badge = "No fault" if status == "finished" else f"Status: {status}"
-    return Verdict(badge=badge, good=status == "finished" and not faults and not contacts, sentences=tuple(sentences))
+    good = status == "finished" and not faults and not contacts
+    return Verdict(badge=badge, good=good, sentences=tuple(sentences), faults=about)
 
 
 def duration(time_s: float) -> str:

@@ -225,6 +225,7 @@ function makeCell(place, model) {
   });
   for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, (event) => fingers.delete(event.pointerId));
   canvas.addEventListener("wheel", (event) => {
+    if (document.activeElement !== canvas && !event.ctrlKey) return; // before a click on the cell the wheel moves the page
     event.preventDefault();
     zoom(Math.exp(event.deltaY * 0.001));
   }, { passive: false });

@@ -75,7 +75,7 @@ async function startReplay(unitS) {
     }
     shown = lines.map((line) => line.mode);
     now.textContent = lines.sort((a, b) => b.tempC - a.tempC).slice(0, 8).map(({ arm, mode, hottest, tempC }) =>
-      `${model.arms[arm].name}: ${words[mode] || "absent"}, joint ${hottest} at ${tempC.toFixed(1)} °C`
+      words[mode] === undefined ? `${model.arms[arm].name}: absent` : `${model.arms[arm].name}: ${words[mode]}, joint ${hottest} at ${tempC.toFixed(1)} °C`
       + (tempC >= model.heat.error_c ? " (above the limit)" : tempC >= model.heat.warning_c ? " (warm)" : "")).join("\n");
     if (moveCursor) moveCursor(timeS);
   }
@@ -128,7 +128,7 @@ async function startReplay(unitS) {
   chooser.addEventListener("change", () => choose(Number(chooser.value)));
   play.addEventListener("click", toggle);
   slider.addEventListener("input", () => show(Number(slider.value)));
-  // A row of a table with a moment goes there, by click or Enter.
+  // An element with a moment goes there, by click or Enter.
   function goTo(event) {
     const row = event.target.closest("[data-time]");
     if (!row || (event.type === "keydown" && event.key !== "Enter")) return;
@@ -137,11 +137,7 @@ async function startReplay(unitS) {
     if (arm >= 0) choose(arm);
     place.scrollIntoView({ block: "center", behavior: "smooth" });
   }
-  for (const filter of document.querySelectorAll("input.filter")) filter.addEventListener("input", () => {
-    const words = filter.value.toLowerCase().split(/\s+/);
-    for (const row of document.getElementById(filter.dataset.table).querySelectorAll("tbody tr"))
-      row.hidden = !words.every((word) => row.textContent.toLowerCase().includes(word));
-  });
+  for (const one of document.querySelectorAll("[data-time]")) one.tabIndex = 0;
   document.addEventListener("click", goTo);
   document.addEventListener("keydown", goTo);
   document.addEventListener("keydown", (event) => {
@@ -159,7 +155,7 @@ async function startReplay(unitS) {
       if (point.data.type === "heatmap") choose(point.y);
     });
     moveCursor = addCursor(figure);
-    choose(Number(chooser.value));
+    if (chooser.value >= 0) choose(Number(chooser.value));
     moveCursor(timeS);
   }
   show(timeS);
