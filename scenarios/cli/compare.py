@@ -115,7 +115,7 @@ def ablate_command(
     chosen = load(scenario)
     given = {} if scores is None else {"scores": tuple(name.strip() for name in scores.split(","))}
     plan = AblationPlan(policy=policy, fleets=fleets, trainings=trainings, seeds=seeds, first_seed=first_seed, **given)
-    folder = out or Path(f"runs/ablate-{chosen.name}-{label(policy)}")
+    folder = out or Path(f"runs/ablate-{chosen.name}-{label(policy).replace(':', '-')}")
     with progress_bar(kept="Finished shifts, plans and twins are") as progress:
         result = ablate(chosen, plan, folder, progress=progress)
     if as_json:
