@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from agents.registry import RULES
+from agents.registry import RULES, WRAPPERS_HELP
 from scenarios.cli import options
 from scenarios.cli.terminal import out_console, print_json, progress_bar, say
 from scenarios.load import load
@@ -17,8 +17,8 @@ def compare_command(
     policies: Annotated[
         str,
         typer.Option(
-            help="Policies, separated by commas: names, FILE.py:CLASS, or folders of `thermofleet train`; default: "
-            f"{', '.join(RULES)}.",
+            help="Policies, separated by commas: names, FILE.py:CLASS, or folders of `thermofleet train`; "
+            f"{WRAPPERS_HELP}. Default: {', '.join(RULES)}.",
             show_default=False,
         ),
     ] = ",".join(RULES),
