@@ -116,13 +116,20 @@ def test_a_folder_without_a_run_is_said(tmp_path: Path, monkeypatch) -> None:
 
 def test_a_recording_has_what_arms_published_and_says_what_is_missing(tmp_path: Path) -> None:
     recorder = Recorder.open(tmp_path, "f")
-    for number, (kind, reason) in enumerate((("award", "plan 1, twin d:0123"), ("warning", "hot"), ("finish", ""))):
+    log = (
+        ("award", ", twin old"),
+        ("return", ""),
+        ("award", "plan 1, twin d:0123"),
+        ("warning", "hot"),
+        ("finish", ""),
+    )
+    for number, (kind, reason) in enumerate(log):
         recorder.add("a", ArmEvent(arm="a", number=number, time_s=10.0 * number, kind=kind, job="j", reason=reason))
     recorder.write(status="finished")
     recorder.close()
     thread = thread_of(tmp_path, "warning")
     assert thread.award is not None
-    assert (thread.award.time_s, thread.twin) == (0.0, {"arm": "a", "version": "d:0123"})
-    assert [event.kind for event in thread.history] == ["award", "warning", "finish"]
+    assert (thread.award.time_s, thread.twin) == (20.0, {"arm": "a", "version": "d:0123"})
+    assert [event.kind for event in thread.history] == [kind for kind, _ in log]
     assert (thread.job, thread.code["hash"]) == ({"job": "j"}, NOT_RECORDED)
     assert json.dumps(thread.as_json(), allow_nan=False)
