@@ -1,5 +1,6 @@
 """`thermofleet trace`: one event, and everything that led to it, on one screen."""
 
+import re
 from bisect import bisect
 from collections.abc import Mapping
 from pathlib import Path
@@ -74,7 +75,7 @@ def thread_screen(thread: Thread) -> Group:
     if thread.award is not None:
         award = thread.award
         row("award", f"{clock(award.time_s)} to {award.arm}", *_number("d", award.value), award.reason)
-        row("plan", *_plan(thread.offers))
+        row("plan", *_plan(thread.offers, award))
     shown = sorted(thread.offers, key=lambda o: (not o.awarded, not o.free, o.arm))
     for i, offer in enumerate(shown[:MOST_OFFERS]):
         row("" if i else "offers", *_offer(offer))
@@ -120,12 +121,14 @@ def _number(name: str, value: float) -> list[str]:
     return [f"{name} {value:.2f}"] if value == value else []
 
 
-def _plan(offers: tuple[Offer, ...]) -> list[str]:
+def _plan(offers: tuple[Offer, ...], award: Event) -> list[str]:
     chosen = next((offer for offer in offers if offer.awarded), None)
-    if chosen is None or chosen.plan is None:
-        return [NOT_RECORDED]
-    which = f"plan {chosen.plan}, the {'coolest' if chosen.plan else 'fastest'} that was offered"
-    return [which, f"{chosen.duration_s:.0f} s" if chosen.duration_s is not None else ""]
+    duration = f"{chosen.duration_s:.0f} s" if chosen is not None and chosen.duration_s is not None else ""
+    stated = re.match(r"plan (\d+), twin ", award.reason)  # by a live arm
+    number = int(stated[1]) if stated else None if chosen is None else chosen.plan
+    if number is None:
+        return [NOT_RECORDED, duration]
+    return [f"plan {number}, the {'coolest' if number else 'fastest'} that was offered", duration]
 
 
 def _offer(offer: Offer) -> list[str]:

@@ -8,6 +8,7 @@ from typing import Any  # values of run.json
 from fleet.errors import FleetError, nearest
 from fleet.events import EVENT_KINDS, Event
 from scenarios.live.recording import CARD, read_card, read_parts
+from scenarios.live.recording_report import offers_of
 from scenarios.run.stored_run import StoredRun, read_run
 from scenarios.shift_records import JobRecord, Offer
 
@@ -61,7 +62,8 @@ class _Log:
     job: Callable[[str], Mapping[str, Any]]
     holder: Callable[[Event], str]
     """Job that the arm of an event without a job worked on; "" for none."""
-    offers: Sequence[Offer]
+    offers: Callable[[Event], Sequence[Offer]]
+    """Of all arms, at an award."""
     twins: Mapping[str, Mapping[str, Any]]
     configuration: Mapping[str, Any]
     code: Mapping[str, Any]
@@ -88,7 +90,7 @@ def thread_of(folder: Path, asked: str) -> Thread:
     job = event.job or log.holder(event)
     history = tuple(e for e in log.events if job and e.job == job)
     award = _award_of(history, event)
-    offers = () if award is None else tuple(o for o in log.offers if (o.time_s, o.job) == (award.time_s, job))
+    offers = () if award is None else tuple(log.offers(award))
     arm = event.arm or (award.arm if award else "")
     return Thread(
         folder=str(folder),
@@ -163,7 +165,7 @@ def _of_run(run: StoredRun) -> _Log:
         events=run.events,
         job=lambda name: asdict(records[name]) if name in records else {},
         holder=holder,
-        offers=run.offers,
+        offers=lambda award: [o for o in run.offers if (o.time_s, o.job) == (award.time_s, award.job)],
         twins=card["twins"],
         configuration=configuration,
         code={"hash": card.get("code_hash", NOT_RECORDED)} | card["versions"],
@@ -184,6 +186,12 @@ def _of_recording(folder: Path) -> _Log:
         own = {key: last[name][key] for key in shown} if name in last else {"job": name}
         return own | ({key: awarded[-1][key] for key in quoted} if awarded else {})
 
+    def offers(award: Event) -> list[Offer]:
+        """Those of the award to the arm that is the next one in time: auctioneer and arm have clocks of their own."""
+        own = [row for row in results if (row["job"], row["arm"]) == (award.job, award.arm) and row["offers"]]
+        row = min(own, key=lambda row: abs(row["time_s"] - award.time_s), default=None)
+        return [] if row is None else list(offers_of(row))
+
     def holder(event: Event) -> str:
         before = (row for row in reversed(busy) if row["arm"] == event.arm and row["time_s"] <= event.time_s)
         return next((row["job"] for row in before), "")
@@ -192,7 +200,7 @@ def _of_recording(folder: Path) -> _Log:
         events=events,
         job=job,
         holder=holder,
-        offers=(),
+        offers=offers,
         twins={},
         configuration={"fleet": card.fleet, "status": card.status, "recording format": card.format},
         code={"hash": NOT_RECORDED},

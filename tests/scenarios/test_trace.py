@@ -6,7 +6,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from fleet.bus.protocol.auction import ArmEvent
+from fleet.bus.protocol.auction import ArmEvent, ArmOffer, JobStatus, PlanQuote, Result
 from fleet.errors import FleetError
 from fleet.events import Event
 from scenarios.cli.main import main
@@ -125,11 +125,20 @@ def test_a_recording_has_what_arms_published_and_says_what_is_missing(tmp_path: 
     )
     for number, (kind, reason) in enumerate(log):
         recorder.add("a", ArmEvent(arm="a", number=number, time_s=10.0 * number, kind=kind, job="j", reason=reason))
+    status = JobStatus(job="j", state="awarded", arm="a", value=2.0)
+    for number, time_s in enumerate((1.0, 21.0)):
+        quoted = PlanQuote(difficulty=time_s, p_saturation=0.1, duration_s=60.0)
+        offers = (ArmOffer("a", "idle", True, quoted), ArmOffer("b", "working", False))
+        recorder.add("boss", Result(auctioneer="boss", number=number, time_s=time_s, status=status, offers=offers))
     recorder.write(status="finished")
     recorder.close()
     thread = thread_of(tmp_path, "warning")
     assert thread.award is not None
     assert (thread.award.time_s, thread.twin) == (20.0, {"arm": "a", "version": "d:0123"})
     assert [event.kind for event in thread.history] == [kind for kind, _ in log]
-    assert (thread.job, thread.code["hash"]) == ({"job": "j"}, NOT_RECORDED)
+    assert [(o.arm, o.awarded, o.feasible, o.difficulty) for o in thread.offers] == [
+        ("a", True, True, 21.0),
+        ("b", False, False, None),
+    ]
+    assert (thread.job["value"], thread.code["hash"]) == (2.0, NOT_RECORDED)
     assert json.dumps(thread.as_json(), allow_nan=False)
