@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from agents.assignment import Matching, QuickestMatching, QuickestSsi, Ssi
 from agents.consensus import Consensus
+from agents.heat_guards import FuzzySpeed, Guard, TorqueLimiter
 from agents.heat_rules import Thermometer, Wsept
 from agents.policy import ArmPolicy, Policy, for_all_arms
 from agents.rules import CoolestFirst, LeastDifficulty, RandomLegal, RoundRobin, Wspt, WsptCool
@@ -46,12 +47,29 @@ RULES: dict[str, Rule] = {
 """The policies, simple ones first."""
 
 
+@dataclass(frozen=True)
+class Wrapper:
+    """A guard that comes with the project; `NAME:POLICY` wraps any policy in it."""
+
+    kind: type[Guard]
+    effect: str
+    """What it does, for a table."""
+    source: str
+
+
+WRAPPERS: dict[str, Wrapper] = {
+    "limited": Wrapper(TorqueLimiter, "torque limit that falls with the temperature", "Singh et al. 2021"),
+    "fuzzy": Wrapper(FuzzySpeed, "speed by fuzzy rules about temperature and its tendency", "Afaq et al."),
+}
+
+
 def names_of(scope: str) -> str:
     """The policies of a scope, separated by commas."""
     return ", ".join(name for name, rule in RULES.items() if rule.scope == scope)
 
 
-NAMES_HELP = f"{', '.join(RULES)}, your own as FILE.py:CLASS, or a folder of `thermofleet train`."
+WRAPPERS_HELP = " or ".join(f"{name}:POLICY" for name in WRAPPERS) + " limits one by temperature"
+NAMES_HELP = f"{', '.join(RULES)}, your own as FILE.py:CLASS, or a folder of `thermofleet train`; {WRAPPERS_HELP}."
 """Allowed names of a policy, for `--help`."""
 
 

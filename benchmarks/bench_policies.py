@@ -23,7 +23,7 @@ from typing import NamedTuple, get_args
 import numpy as np
 import pyarrow.parquet as pq
 
-from agents.registry import RULES
+from agents.registry import RULES, WRAPPERS
 from fleet.env.validation import Decisions
 from scenarios.load import library, load
 from scenarios.policy_loader import label, policy_at, scope_of
@@ -54,9 +54,11 @@ def live(scenario: str, policy: str, seed: int, speed: float, shift_s: float) ->
 
 
 def listed() -> str:
-    """Print the built-in policies as a Markdown table."""
+    """Return the built-in policies and wrappers as two Markdown tables."""
     rows = [f"| `{name}` | {rule.scope} | {rule.cost} | {rule.source} |" for name, rule in RULES.items()]
-    return "\n".join(["| policy | scope | minimises | source |", "|---|---|---|---|", *rows])
+    policies = ["| policy | scope | minimises | source |", "|---|---|---|---|", *rows]
+    wraps = [f"| `{name}:POLICY` | {wrapper.effect} | {wrapper.source} |" for name, wrapper in WRAPPERS.items()]
+    return "\n".join([*policies, "", "| wrapper | effect | source |", "|---|---|---|", *wraps])
 
 
 class Steps(NamedTuple):

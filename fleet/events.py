@@ -73,4 +73,5 @@ class Event:
     value: float = float("nan")
     """Quantity of the kind, as in `MEANINGS`; NaN for none."""
     reason: str = ""
-    """Why, in words; of an award in a simulated shift, the predicted peak temperature and P(saturation)."""
+    """Why, in words; of an award in a simulated shift, the predicted peak temperature and P(saturation), and live, the
+    number of the plan and the version of the twin."""

@@ -1,5 +1,5 @@
-"""Policies by name: one of `agents.registry`, a class of your own as `FILE.py:CLASS` or `MODULE:CLASS`, or the folder
-of a trained one."""
+"""Policies by name: one of `agents.registry`, a class of your own as `FILE.py:CLASS` or `MODULE:CLASS`, the folder of a
+trained one, or any of these in a wrapper, as `WRAPPER:POLICY`."""
 
 import importlib
 import importlib.util
@@ -12,8 +12,9 @@ from types import ModuleType
 
 import numpy as np
 
+from agents.heat_guards import guarded
 from agents.policy import SCOPES, ArmPolicy, Policy, for_all_arms
-from agents.registry import RULES, rule_of
+from agents.registry import RULES, WRAPPERS, Wrapper, rule_of
 from fleet.errors import FleetError, nearest
 from fleet.seeding import child
 
@@ -50,6 +51,8 @@ def scope_of(name: str) -> str:
     Raises:
         FleetError: as `policy_of`.
     """
+    if wrapped := _wrapped(name):
+        return scope_of(wrapped[1])
     return "arm" if _is_folder(name) else _class_of(name).scope
 
 
@@ -65,10 +68,18 @@ def policy_at(name: str, seed: int) -> Policy:
 
 
 def label(name: str) -> str:
-    """What a table calls a policy: the rule, the class, or the last folder."""
+    """What a table calls a policy: the rule, the class, or the last folder, after its wrapper."""
+    if wrapped := _wrapped(name):
+        return f"{name.partition(':')[0]}:{label(wrapped[1])}"
     if _is_folder(name):
         return Path(os.path.abspath(name)).name
     return name.rpartition(":")[2]
+
+
+def _wrapped(name: str) -> tuple[Wrapper, str] | None:
+    """A wrapper, and the name of the policy in it; None if there is no wrapper."""
+    wrapper, colon, policy = name.partition(":")
+    return (WRAPPERS[wrapper], policy) if colon and wrapper in WRAPPERS else None
 
 
 def _is_folder(name: str) -> bool:
@@ -76,6 +87,9 @@ def _is_folder(name: str) -> bool:
 
 
 def _maker(name: str) -> Callable[[], Policy] | Callable[[], ArmPolicy]:
+    if wrapped := _wrapped(name):
+        wrapper, inner = wrapped[0], _maker(wrapped[1])
+        return lambda: guarded(wrapper.kind, inner())  # pyright: ignore[reportReturnType]  # as the policy in it
     if _is_folder(name):
         from agents.learned.policy import load_policy  # loads torch
 

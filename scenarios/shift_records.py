@@ -50,6 +50,8 @@ class Offer:
     """P(saturation) of that plan; None without a plan."""
     duration_s: float | None
     """Time for the rest of the job by that plan; None without a plan."""
+    plan: int | None = None
+    """Number of that plan: 0 is the fastest, 1 the coolest; None without a plan, and in runs of earlier versions."""
 
 
 def job_records(world: World, state: State) -> tuple[JobRecord, ...]:
@@ -97,4 +99,5 @@ def offers_of(event: Event, seen: Mapping[str, Observation], actions: Mapping[st
             peak_c=peak_c if able and peak_c else None,
             p_saturation=float(own.p_saturation[best]) if able else None,
             duration_s=float(own.duration_s[best]) if able else None,
+            plan=best % plans if able else None,
         )

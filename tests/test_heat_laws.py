@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.integrate import simpson
 
 from fleet.heat.insulation import CLASSES, GEN3_INSULATION, Insulation, arrhenius_rate, life_used, montsinger_rate
 from fleet.heat.tool_drift import (
@@ -17,6 +18,8 @@ from fleet.heat.tool_drift import (
 from fleet.physics.cell_model import cell_model
 from fleet.physics.models import ArmModel
 from fleet.robot import JOINTS, Mount, Robot
+from fleet.thermal import HOUSING, NODES, WINDING
+from scenarios.run.heat_use import HeatUse
 
 ARM = Robot(name="arm", mount=Mount())
 
@@ -93,3 +96,23 @@ def test_a_uniformly_warm_arm_grows_like_a_rod() -> None:
     segments_c = segment_temperatures(np.full((5, JOINTS), 45.0))
     assert segments_c.shape == (5, SEGMENTS)
     assert most_drift_m(segments_c - 25.0) == pytest.approx(23.6e-6 * 20.0 * sum(GEN3_SEGMENTS_M))
+
+
+def test_a_segment_has_the_mean_temperature_of_its_ends() -> None:
+    segments_c = segment_temperatures(np.arange(20.0, 90.0, 10.0))
+    assert segments_c.tolist() == [20.0, 25.0, 35.0, 45.0, 55.0, 65.0, 75.0, 80.0]
+
+
+def test_the_heat_of_a_shift_is_that_of_its_most_aged_winding_and_of_the_largest_drift() -> None:
+    """An arm that warms up and cools down again along a line; the integral by a second method, Simpson's rule."""
+    shape, steps, dt_s = np.array([1.0, 0.5]), 360, 10.0
+    course = 30.0 * np.interp(np.arange(steps + 1), (0, steps // 2, steps), (0.0, 1.0, 0.0))
+    temp_c = np.empty((steps + 1, 2, NODES))  # two arms, the second one half as warm
+    temp_c[..., WINDING] = 40.0 + 1.5 * course[:, None, None] * shape[:, None] * np.linspace(0.2, 1.0, JOINTS)
+    temp_c[..., HOUSING] = 40.0 + course[:, None, None] * shape[:, None]
+    heat = HeatUse(temp_c[0])
+    for after_c in temp_c[1:]:
+        heat.add(after_c, dt_s)
+    used_h = simpson(arrhenius_rate(temp_c[..., JOINTS - 1]), dx=dt_s, axis=0) / 3600.0
+    assert heat.insulation_ppb == pytest.approx(1e9 * used_h / GEN3_INSULATION.rated_life_h, rel=1e-3)
+    assert heat.tool_drift_mm == pytest.approx(1e3 * 23.6e-6 * 30.0 * shape * sum(GEN3_SEGMENTS_M))

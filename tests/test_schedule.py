@@ -11,6 +11,7 @@ from scenarios.report.schedule import schedule
 
 ARMS = ("arm_0", "arm_1")
 HORIZON_S = 1000.0
+ENDINGS = ("home", "fault", "late fault", "idle fault", "give back", "back fault")
 
 gaps = st.integers(min_value=1, max_value=40).map(lambda n: n * 0.5)
 
@@ -22,7 +23,7 @@ def logs(draw: st.DrawFn) -> tuple[list[Event], dict[str, int]]:
     told = {"finished": 0, "returned": 0, "running": 0, "outages": 0, "open": 0}
     for a, arm in enumerate(ARMS):
         now, job = 0.0, 0
-        for ending in draw(st.lists(st.sampled_from(["home", "fault", "late fault", "idle fault"]), max_size=8)):
+        for ending in draw(st.lists(st.sampled_from(ENDINGS), max_size=8)):
             now += draw(st.just(0.0) | gaps)
             name = f"work-{a}{job:03d}"
             if ending != "idle fault":
@@ -31,9 +32,13 @@ def logs(draw: st.DrawFn) -> tuple[list[Event], dict[str, int]]:
             if ending in ("home", "late fault"):
                 now += draw(gaps)
                 events.append(Event(time_s=now, kind="finish", arm=arm, job=name, value=0.0))
+            elif ending in ("give back", "back fault"):
+                now += draw(gaps)
+                events.append(Event(time_s=now, kind="give_back", arm=arm, job=name, value=3.0))
+                told["returned"] += 1
             now += draw(gaps)
             told["finished"] += ending in ("home", "late fault")
-            if ending == "home":
+            if ending in ("home", "give back"):
                 events.append(Event(time_s=now, kind="home", arm=arm, job=name))
                 continue
             held = "" if ending == "idle fault" else name

@@ -75,7 +75,7 @@ def montsinger_rate(winding_c: Array | float, insulation: Insulation = GEN3_INSU
 
 
 def life_used(
-    before: Array | float, after: Array | float, dt_s: float, insulation: Insulation = GEN3_INSULATION
+    before: Array | float, after: Array | float, dt_s: Array | float, insulation: Insulation = GEN3_INSULATION
 ) -> Array:
     """Share of the rated life that windings use in a time, by the trapezoidal rule, [...].
 

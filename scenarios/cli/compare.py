@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from agents.registry import RULES
+from agents.registry import RULES, WRAPPERS_HELP
 from scenarios.cli import options
 from scenarios.cli.terminal import out_console, print_json, progress_bar, say
 from scenarios.load import load
@@ -17,8 +17,8 @@ def compare_command(
     policies: Annotated[
         str,
         typer.Option(
-            help="Policies, separated by commas: names, FILE.py:CLASS, or folders of `thermofleet train`; default: "
-            f"{', '.join(RULES)}.",
+            help="Policies, separated by commas: names, FILE.py:CLASS, or folders of `thermofleet train`; "
+            f"{WRAPPERS_HELP}. Default: {', '.join(RULES)}.",
             show_default=False,
         ),
     ] = ",".join(RULES),
@@ -115,7 +115,7 @@ def ablate_command(
     chosen = load(scenario)
     given = {} if scores is None else {"scores": tuple(name.strip() for name in scores.split(","))}
     plan = AblationPlan(policy=policy, fleets=fleets, trainings=trainings, seeds=seeds, first_seed=first_seed, **given)
-    folder = out or Path(f"runs/ablate-{chosen.name}-{label(policy)}")
+    folder = out or Path(f"runs/ablate-{chosen.name}-{label(policy).replace(':', '-')}")
     with progress_bar(kept="Finished shifts, plans and twins are") as progress:
         result = ablate(chosen, plan, folder, progress=progress)
     if as_json:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from agents.registry import names_of
+from agents.registry import WRAPPERS_HELP, names_of
 from fleet.errors import NAME_RULE, FleetError, LogError, is_name, printable
 
 if TYPE_CHECKING:  # slow to import
@@ -105,7 +105,7 @@ PolicyOption = Annotated[
     typer.Option(
         help=f"Allocation policy. Run by the auctioneer: {names_of('central')}. Run by each arm, without an "
         f"auctioneer: {names_of('arm')}, or a folder of `thermofleet train`. Your own as FILE.py:CLASS, run "
-        "according to its scope."
+        f"according to its scope. {WRAPPERS_HELP}."
     ),
 ]
 FleetOption = Annotated[

@@ -80,7 +80,7 @@ def run_command(
     spec = _spec(policy, seed, plant, bus, difficulty, risk, channel)
     if listen and bus == "memory":
         raise FleetError(f"--listen needs --bus zenoh (got {listen} and {bus}).")
-    where = out or Path("runs") / f"{chosen.name}-{label(policy)}-{seed}"
+    where = out or Path("runs") / f"{chosen.name}-{label(policy).replace(':', '-')}-{seed}"
     check_free(where, RUN, overwrite=overwrite)
     with ExitStack() as open_until_end:
         endpoint = None

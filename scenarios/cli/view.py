@@ -36,6 +36,13 @@ def view_command(
             "needs the extra `mcap`."
         ),
     ] = None,
+    gltf: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write the run as this file (.glb) instead, for viewers of augmented reality and of the web; --speed "
+            "is that of its animation."
+        ),
+    ] = None,
     every: Annotated[
         float | None,
         number(
@@ -46,13 +53,13 @@ def view_command(
 ) -> None:
     """Play a recorded shift in MuJoCo's viewer, or show the cell of a scenario; close its window to end.
 
-    With --rerun or --mcap the shift is written as a file instead, without a display.
+    With --rerun, --mcap or --gltf the shift is written as a file instead, without a display.
     """
-    if rerun is not None or mcap is not None:
-        _write_files(what, rerun, mcap, every, overwrite)
+    if rerun is not None or mcap is not None or gltf is not None:
+        _write_files(what, rerun, mcap, gltf, every, speed, overwrite)
         return
     if every is not None:
-        raise FleetError("--every is for --rerun and --mcap.")
+        raise FleetError("--every is for --rerun, --mcap and --gltf.")
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise FleetError(NO_DISPLAY)
     import numpy as np
@@ -84,23 +91,29 @@ def view_command(
     player.open_viewer(update)
 
 
-def _write_files(what: str, rerun: Path | None, mcap: Path | None, every_s: float | None, overwrite: bool) -> None:
-    wanted = {"rerun": (rerun, ".rrd"), "mcap": (mcap, ".mcap")}
-    for name, (path, ending) in wanted.items():
-        if path is None:
-            continue
+def _write_files(
+    what: str,
+    rerun: Path | None,
+    mcap: Path | None,
+    gltf: Path | None,
+    every_s: float | None,
+    speed: float,
+    overwrite: bool,
+) -> None:
+    wanted = [("rerun", rerun, ".rrd"), ("mcap", mcap, ".mcap"), ("gltf", gltf, ".glb")]
+    files = {name: (path, ending) for name, path, ending in wanted if path is not None}
+    extras = {"rerun": ("rerun",), "mcap": ("mcap", "ros2"), "gltf": ("report",)}
+    for name, (path, ending) in files.items():
         check_file(path, (ending,), overwrite, f"--{name}")
-        for extra in (name, *(("ros2",) if name == "mcap" else ())):
+        for extra in extras[name]:
             require_extra(extra)
     if not (Path(what) / "run.json").exists():
-        raise FleetError(f"--rerun and --mcap need the folder of a `thermofleet run` (got '{what}').")
+        raise FleetError(f"--rerun, --mcap and --gltf need the folder of a `thermofleet run` (got '{what}').")
     from scenarios.run.stored_run import read_run
     from scenarios.view.moments import Moments
 
     moments = Moments(read_run(Path(what)), every_s)
-    for name, (path, _) in wanted.items():
-        if path is None:
-            continue
+    for name, (path, _) in files.items():
         with progress_bar(kept="") as progress, disk_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_path(path) as file:
@@ -108,9 +121,18 @@ def _write_files(what: str, rerun: Path | None, mcap: Path | None, every_s: floa
                     from scenarios.view.rerun_file import write_rerun
 
                     write_rerun(file, moments, progress)
-                else:
+                elif name == "mcap":
                     from scenarios.view.mcap_file import write_mcap
 
                     write_mcap(file, moments, progress)
-        hint = f"rerun {path}" if name == "rerun" else "open it in Foxglove, or: ros2 bag play " + str(path)
-        say(f"Wrote {len(moments.poses)} moments, {path.stat().st_size / 1e6:.1f} MB: {path} ({hint}).", out_console)
+                else:
+                    from scenarios.view.gltf_file import write_gltf
+
+                    write_gltf(file, moments, speed, progress)
+        hints = {
+            "rerun": f"rerun {path}",
+            "mcap": f"open it in Foxglove, or: ros2 bag play {path}",
+            "gltf": f"{speed:g} × real time; open it in Blender or a web viewer",
+        }
+        size = f"{path.stat().st_size / 1e6:.1f} MB"
+        say(f"Wrote {len(moments.poses)} moments, {size}: {path} ({hints[name]}).", out_console)

@@ -23,6 +23,8 @@ from fleet.bus.protocol.cell import Cell
 from fleet.bus.protocol.operator import ALL_ARMS
 from fleet.errors import FleetError
 from fleet.events import EVENT_KINDS, Event
+from fleet.heat.insulation import arrhenius_rate, life_used
+from fleet.heat.tool_drift import most_drift_m, segment_temperatures
 from fleet.physics.cell_model import cell_model
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import FAULTED, MODES, WORKING, Telemetry
@@ -68,7 +70,7 @@ def recording_html(folder: Path, scenario: Scenario | None = None) -> str:
         "status": {"recording": "interrupted"}.get(card.status, card.status),
         "scenario": {"name": card.fleet},
         "policy": "live recording",
-        "metrics": _metrics(telemetry, events, results, arms, warning_c),
+        "metrics": _metrics(telemetry, events, results, arms, warning_c) | heat_use(table, arms),
         "messages": {
             sender: f"{count.kept} recorded, {count.missed} missing" for sender, count in card.speakers.items()
         },
@@ -86,7 +88,7 @@ def recording_html(folder: Path, scenario: Scenario | None = None) -> str:
         warning_c=warning_c,
         error_c=error_c,
         model=model,
-        offers=[offer for row in results.to_pylist() for offer in _offers(row)],
+        offers=[offer for row in results.to_pylist() for offer in offers_of(row)],
     )
 
 
@@ -256,7 +258,7 @@ def telemetry_of(table: pa.Table, arms: list[str]) -> Telemetry:
     return Telemetry(time_s=time_s, mode=mode, **out)
 
 
-def _offers(row: Mapping[str, Any]) -> Iterator[Offer]:
+def offers_of(row: Mapping[str, Any]) -> Iterator[Offer]:
     """What the arms offered for a job that was awarded, from a row of the results."""
     for offer in msgspec.json.decode(row["offers"] or "[]", type=tuple[ArmOffer, ...]):
         plan = offer.plan or PlanQuote()
@@ -302,6 +304,31 @@ def _metrics(
         "jobs_per_hour": finished / span_h if span_h else None,
         "peak_c": peaks,
     }
+
+
+def heat_use(table: pa.Table, arms: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Insulation life that was used, and drift of the tool points, of each arm whose temperatures were recorded.
+
+    As in the metrics of a run, but from measured winding temperatures and the arms' own estimates of their housings.
+    The tool points are calibrated at the first state.
+    """
+    names = np.array(table["arm"].to_pylist())
+    used: dict[str, float] = {}
+    drift: dict[str, float] = {}
+    for arm in arms:
+        rows = table.filter(pa.array(names == arm))
+        winding_c, housing_c = (
+            np.stack([rows[f"{name}_{j + 1}"].to_numpy(zero_copy_only=False) for j in range(JOINTS)], axis=-1)
+            for name in ("temp_c", "housing_c")
+        )
+        measured, estimated = (np.isfinite(values).all(axis=1) for values in (winding_c, housing_c))
+        if measured.sum() > 1:
+            time_s, rate = rows["time_s"].to_numpy()[measured], arrhenius_rate(winding_c[measured])
+            used[arm] = 1e9 * float(life_used(rate[:-1], rate[1:], np.diff(time_s)[:, None]).sum(axis=0).max())
+        if estimated.any():
+            segments_c = segment_temperatures(housing_c[estimated])
+            drift[arm] = 1e3 * float(most_drift_m(segments_c - segments_c[0]).max())
+    return {"insulation_ppb": used, "tool_drift_mm": drift}
 
 
 def _missing(gaps: pa.Table, lost: Mapping[Kind, int]) -> Mapping[str, str]:

@@ -11,7 +11,7 @@ from fleet.events import Event
 
 Outcome = Literal["finished", "returned", "given_up", "running"]
 
-_ORDER = ("recover", "finish", "home", "award", "fault", "return", "give_up")
+_ORDER = ("recover", "finish", "give_back", "home", "award", "fault", "return", "give_up")
 """The event kinds that determine a schedule, in the order in which they can occur at the same time."""
 
 SAME_MOMENT_DIGITS = 6
@@ -30,8 +30,8 @@ class Assignment:
     finished_s: float | None = None
     """End of the last cycle; None if it was not reached."""
     outcome: Outcome
-    """finished: all cycles done, even if the arm was not home yet; returned: it is back in the queue, after a fault or
-    because a live arm had to return it;
+    """finished: all cycles done, even if the arm was not home yet; returned: it is back in the queue, after a fault,
+    because the policy gave it back, or because a live arm had to return it;
     given_up: the job faulted too often."""
     late_s: float | None = None
     """Tardiness of a finished job; 0 if on time."""
@@ -100,23 +100,30 @@ def _assignments(arm: str, log: Sequence[Event], horizon_s: float) -> list[Assig
     out: list[Assignment] = []
     award: Event | None = None
     finish: Event | None = None
+    given_back: Event | None = None
     stopped = False  # by a fault, away from home
     for i, event in enumerate(log):
         if event.kind == "award":
             if award is not None:
                 raise ValueError(f"{_at(event)}: '{arm}' is awarded '{event.job}' while at '{award.job}'.")
-            award, finish, stopped = event, None, False
+            award, finish, given_back, stopped = event, None, None, False
         elif event.kind == "finish":
             if award is None or award.job != event.job:
                 raise ValueError(f"{_at(event)}: '{arm}' finishes '{event.job}', which it was not awarded.")
             finish = event
+        elif event.kind == "give_back" and award is not None and award.job == event.job:
+            given_back = event
+        elif event.kind == "home" and not stopped and award is not None and given_back is not None:
+            out.append(replace(_assignment(award, None, event.time_s, "returned", given_back), faulted=False))
+            award = None
         elif event.kind == "home" and not stopped:
             if award is None or finish is None:
                 raise ValueError(f"{_at(event)}: '{arm}' is home from '{event.job}', which it did not finish.")
             out.append(_assignment(award, finish, event.time_s, "finished"))
             award = None
         elif event.kind == "fault" and award is not None:
-            after = next((e for e in log[i + 1 :] if e.kind in ("return", "give_up") and e.job == award.job), None)
+            ends = (e for e in log[i + 1 :] if e.kind in ("return", "give_up") and e.job == award.job)
+            after = given_back or next(ends, None)
             outcome = "given_up" if after and after.kind == "give_up" else "returned"
             out.append(_assignment(award, finish, event.time_s, outcome, after))
             award, stopped = None, True

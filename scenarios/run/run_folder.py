@@ -146,6 +146,7 @@ def record_table(kind: type, records: Sequence[object]) -> pa.Table:
         "str": pa.string(),
         "bool": pa.bool_(),
         "int": pa.int64(),
+        "int | None": pa.int64(),
         "float": pa.float64(),
         "float | None": pa.float64(),
     }

@@ -23,12 +23,12 @@ from scenarios.progress import Progress, quiet
 from scenarios.run.heat_use import HeatUse
 from scenarios.run.metrics import Metrics
 from scenarios.run.outcome import metrics_of
-from scenarios.run.provenance import provenance
+from scenarios.run.provenance import code_hash, provenance
 from scenarios.schema import Scenario
 from scenarios.shift_records import JobRecord, Offer, job_records, offers_of
 
 RUN_FORMAT = 6
-"""Raised when run.json or the columns of the recordings change."""
+"""Raised when run.json or the columns of the recordings change so that an earlier version cannot be read."""
 _LIBRARIES = ("thermofleet", "numpy", "mujoco", "torch", "pettingzoo", "eclipse-zenoh", "pyarrow")
 
 
@@ -211,6 +211,7 @@ def summary(result: RunResult) -> dict[str, Any]:
         "channel": result.spec.channel.described(),
         "twins": result.twins,
         "versions": {"python": platform.python_version()} | {name: version(name) for name in _LIBRARIES},
+        "code_hash": code_hash(),
         "reward": result.total_reward,
         "metrics": asdict(result.metrics),
     }

@@ -22,7 +22,7 @@ from fleet.events import Event
 from scenarios.cli.main import main
 from scenarios.live.recorder import Recorder
 from scenarios.live.recording import read_parts
-from scenarios.live.recording_report import order_events, recording_html, telemetry_of
+from scenarios.live.recording_report import heat_use, order_events, recording_html, telemetry_of
 from scenarios.live.replayer import Replay
 from scenarios.report.run_page import report_html
 from scenarios.report.schedule import schedule
@@ -78,6 +78,29 @@ def test_the_work_and_events_of_a_recording_are_those_of_a_run(tmp_path):
     assert re.findall(rows, live.split("<h2>Events")[1].split("<details")[0]) == re.findall(
         rows, page.split("<h2>Events")[1].split("<details")[0]
     )
+
+
+def test_the_heat_of_a_recording_has_the_closed_forms_of_its_laws(tmp_path):
+    """An hour at the temperature of the insulation class uses 1/20,000 of its life; the links warm by 20 K."""
+    recorder = Recorder.open(tmp_path, "shop")
+    for tick in range(61):
+        housing = (25.0 + 20.0 * tick / 60.0,) * 7
+        state = State(
+            arm="hot",
+            tick=tick,
+            time_s=60.0 * tick,
+            mode="idle",
+            temp_c=(155.0,) * 7,
+            headroom_k=1.0,
+            housing_c=housing,
+        )
+        recorder.add("hot", state)
+        recorder.add("bare", State(arm="bare", tick=tick, time_s=60.0 * tick, mode="idle", temp_c=(), headroom_k=1.0))
+    recorder.write(status="finished")
+    recorder.close()
+    found = heat_use(read_parts(tmp_path, "telemetry"), ["hot", "bare"])
+    assert found["insulation_ppb"] == {"hot": pytest.approx(1e9 / 20_000.0)}
+    assert found["tool_drift_mm"] == {"hot": pytest.approx(1e3 * 23.6e-6 * 20.0 * 1.1878, rel=1e-3)}
 
 
 def test_a_report_names_missing_messages_and_returned_jobs(tmp_path):

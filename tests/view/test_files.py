@@ -171,7 +171,7 @@ def test_a_rerun_file_has_the_shift_and_a_layout(run_folder: Path, run: StoredRu
     [
         (["--mcap", "shift.bag"], "--mcap must end in .mcap (got 'shift.bag')"),
         (["--mcap", "there.mcap"], "'there.mcap' exists; give another --mcap"),
-        (["--every", "5"], "--every is for --rerun and --mcap"),
+        (["--every", "5"], "--every is for --rerun, --mcap and --gltf"),
     ],
 )
 def test_a_file_that_cannot_be_is_refused(

@@ -196,7 +196,8 @@ class ArmNode:
             self._plans[award.award] = plans[award.plan]
             difficulty = self._scored(award).difficulty
             score = math.nan if difficulty is None else difficulty.total
-            event = Event(time_s=self._body.time_s, kind="award", job=award.job.name, value=score)
+            reason = f"plan {award.plan}, twin {self._estimator.model.version}"
+            event = Event(time_s=self._body.time_s, kind="award", job=award.job.name, value=score, reason=reason)
             self._publish.event(event, self.clock.epoch)
         return ack
 

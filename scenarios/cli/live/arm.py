@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 import numpy as np
 import typer
 
-from agents.registry import names_of
+from agents.registry import WRAPPERS_HELP, names_of
 from fleet.bus.client.client import BusClient
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import Clock, ClockRequest
@@ -84,7 +84,7 @@ def arm_command(
         str,
         typer.Option(
             help=f"Allocate jobs without an auctioneer, by a policy of scope arm: {names_of('arm')}, your own as "
-            "FILE.py:CLASS, or a folder of `thermofleet train`. Default: an auctioneer awards them."
+            f"FILE.py:CLASS, or a folder of `thermofleet train`; {WRAPPERS_HELP}. Default: an auctioneer awards them."
         ),
     ] = "",
     jobs: JobsOption = "scenario",

@@ -1,0 +1,187 @@
+"""Reactive control of heat as a wrapper round any policy: a torque limiter and a fuzzy speed control.
+
+Both react to measured temperatures, and need neither a twin nor a thermal model. On a real arm they act on torque and
+speed within a motion. An allocation policy has no such command, so they act by what the environment allows: they close
+claims, leave only the cooler of the two plans of a job, and give the current job back after its cycle. The wrapped
+policy chooses among the claims that are left.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import ClassVar, Protocol
+
+import numpy as np
+
+from agents.policy import WAIT, ArmPolicy, Policy, per_option, plans_of
+from fleet.observation import Observation
+from fleet.robot import RATING, ThermalLimits
+
+Array = np.ndarray
+
+ERROR_ABOVE_WARNING_K = ThermalLimits.error_c - ThermalLimits.warning_c
+
+
+class Guard(Protocol):
+    """What the temperatures of an arm allow."""
+
+    def claims(self, seen: Observation) -> Array:
+        """Claims that it allows, of those that are legal, bool [option]."""
+        ...
+
+    def gives_back(self, seen: Observation, payload_kg: float) -> bool:
+        """Whether the arm must give back the job with this payload."""
+        ...
+
+
+class TorqueLimiter:
+    """Torque limit that falls with the temperature: 1 up to `full_k` below the warning limit, 0 at the error limit.
+
+    The torque of a job is that of joint 2 of a stretched arm with its payload, relative to that with the rated payload.
+    An arm claims a job only below the limit, and gives its job back above.
+
+    Source: thermal derating of the joint torque limit, as in the motor protection of Singh et al. (2021).
+    """
+
+    full_k: ClassVar = 10.0
+    arm_kg: ClassVar = 2.65
+    """Payload whose torque at joint 2 of the stretched Gen3 equals that of the arm itself: 23.5 N·m of 8.85 N·m/kg."""
+
+    def limit(self, headroom_k: float) -> float:
+        """Torque limit as a share of the rated torque, for a headroom to the warning limit in K."""
+        return float(np.clip((headroom_k + ERROR_ABOVE_WARNING_K) / (self.full_k + ERROR_ABOVE_WARNING_K), 0.0, 1.0))
+
+    def torque(self, payload_kg: Array | float) -> Array:
+        """Torque with a payload, as a share of the rated torque."""
+        rated_kg = self.arm_kg + RATING.mid_range_kg
+        return np.minimum((self.arm_kg + np.asarray(payload_kg)) / rated_kg, 1.0)
+
+    def claims(self, seen: Observation) -> Array:
+        """Claims of jobs whose torque is below the limit, bool [option]."""
+        return per_option(seen, self.torque(seen.payload_kg)) <= self.limit(float(seen.headroom_k))
+
+    def gives_back(self, seen: Observation, payload_kg: float) -> bool:
+        """Whether the torque of the job is above the limit."""
+        return bool(self.torque(payload_kg) > self.limit(float(seen.headroom_k)))
+
+
+class FuzzySpeed:
+    """Speed from fuzzy rules about the temperature and its tendency.
+
+    Inputs: headroom to the warning limit (cool, warm, hot), and the excess of a winding over its housing (steady,
+    rising), which is proportional to the heat that flows into the housing. The speed is the mean of the rules' values,
+    weighted by their truth (Takagi & Sugeno, IEEE Trans. SMC 15, 1985). At less than `fast` an arm takes the cooler of
+    two plans, at less than `slow` it claims nothing, at less than `stop` it gives its job back.
+
+    Source: fuzzy control of the speed by the motor temperature, as in Afaq et al.
+    """
+
+    warm_k, cool_k = 10.0, 20.0
+    """Headroom at which an arm is just warm, and just cool; it is hot at 0."""
+    steady_k, rising_k = 2.0, 10.0
+    rules: ClassVar = {"cool": (1.0, 1.0), "warm": (0.8, 0.5), "hot": (0.3, 0.0)}
+    """Speeds of a steady and of a rising temperature."""
+    fast, slow, stop = 0.75, 0.4, 0.15
+
+    def speed(self, headroom_k: float, excess_k: float) -> float:
+        """Speed as a share of the full speed."""
+        warm = np.interp(headroom_k, (0.0, self.warm_k, self.cool_k), (0.0, 1.0, 0.0))
+        truth = {
+            "cool": np.interp(headroom_k, (self.warm_k, self.cool_k), (0.0, 1.0)),
+            "warm": warm,
+            "hot": np.interp(headroom_k, (0.0, self.warm_k), (1.0, 0.0)),
+        }
+        rising = np.interp(excess_k, (self.steady_k, self.rising_k), (0.0, 1.0))
+        return float(sum(t * np.dot((1.0 - rising, rising), self.rules[name]) for name, t in truth.items()))
+
+    def _speed_of(self, seen: Observation) -> float:
+        return self.speed(float(seen.headroom_k), float((seen.temp_c - seen.housing_c).max()))
+
+    def claims(self, seen: Observation) -> Array:
+        """All claims of a fast arm, the cooler plans of a slower one, none of a slow one, bool [option]."""
+        speed, plans = self._speed_of(seen), plans_of(seen)
+        allowed = seen.action_mask[1:-1].astype(bool).reshape(-1, plans)
+        if speed < self.slow:
+            allowed[:] = False
+        elif speed < self.fast:
+            allowed[:, :-1] &= ~allowed[:, -1:]
+        return allowed.ravel()
+
+    def gives_back(self, seen: Observation, payload_kg: float) -> bool:
+        """Whether the speed is less than `stop`."""
+        return self._speed_of(seen) < self.stop
+
+
+class _GuardOfArm:
+    """A guard of one arm, with the payload of its present job."""
+
+    def __init__(self, guard: Guard) -> None:
+        self._guard, self._claimed_kg = guard, 0.0
+
+    def narrow(self, seen: Observation) -> Observation:
+        """The observation with the claims that the guard allows."""
+        mask = seen.action_mask
+        if not mask[1:-1].any():
+            return seen
+        narrower = mask.copy()
+        narrower[1:-1] &= self._guard.claims(seen)
+        return replace(seen, action_mask=narrower)
+
+    def decide(self, seen: Observation, action: int) -> int:
+        """The action of the wrapped policy, or that which gives the job back."""
+        last = len(seen.action_mask) - 1
+        if 0 < action < last:
+            self._claimed_kg = float(seen.payload_kg[(action - 1) // plans_of(seen)])
+        elif seen.action_mask[last] and self._guard.gives_back(seen, self._claimed_kg):
+            return last
+        return action
+
+
+class GuardedArm:
+    """An arm policy whose claims pass a guard."""
+
+    def __init__(self, guard: Callable[[], Guard], policy: ArmPolicy) -> None:
+        self.scope = policy.scope
+        self._make_guard, self._policy = guard, policy
+        self._guard = _GuardOfArm(guard())
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Begin a shift."""
+        self._guard = _GuardOfArm(self._make_guard())
+        self._policy.reset(rng)
+
+    def choose(self, observation: Observation, place: int) -> int:
+        """The choice of the policy among the claims that the guard allows."""
+        narrowed = self._guard.narrow(observation)
+        return self._guard.decide(observation, self._policy.choose(narrowed, place))
+
+
+class GuardedFleet:
+    """A policy for all arms, with a guard for each of them."""
+
+    def __init__(self, guard: Callable[[], Guard], policy: Policy) -> None:
+        self.scope = policy.scope
+        self._make_guard, self._policy = guard, policy
+        self._guards: dict[str, _GuardOfArm] = {}
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Begin a shift."""
+        self._guards = {}
+        self._policy.reset(rng)
+
+    def act(self, observations: Mapping[str, Observation]) -> dict[str, int]:
+        """The actions of the policy among the claims that the guards allow."""
+        for arm in observations:
+            self._guards.setdefault(arm, _GuardOfArm(self._make_guard()))
+        actions = self._policy.act({arm: self._guards[arm].narrow(seen) for arm, seen in observations.items()})
+        return {arm: self._guards[arm].decide(seen, actions.get(arm, WAIT)) for arm, seen in observations.items()}
+
+    def choose(self, observation: Observation, place: int) -> int:
+        """The choice of one arm, of a policy of scope arm."""
+        return self.act({"": observation})[""]
+
+
+def guarded(guard: Callable[[], Guard], policy: Policy | ArmPolicy) -> Policy | ArmPolicy:
+    """A policy, for one arm or for all, whose claims pass a guard."""
+    if hasattr(policy, "act"):
+        return GuardedFleet(guard, policy)  # pyright: ignore  # hasattr does not narrow the type
+    return GuardedArm(guard, policy)  # pyright: ignore

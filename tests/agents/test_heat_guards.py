@@ -1,0 +1,161 @@
+"""Guards round any policy: closed forms of their laws, and what they forbid in a shift."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from agents.heat_guards import FuzzySpeed, GuardedArm, GuardedFleet, TorqueLimiter
+from agents.policy import WAIT, for_all_arms
+from agents.registry import RULES, WRAPPERS
+from fleet.env.allocation_v1 import parallel_env
+from fleet.errors import FleetError
+from fleet.observation import Layout, Observation
+from fleet.physics.models import ArmModel
+from fleet.robot import POSTURES, RATING, Mount, Robot
+from scenarios.policy_loader import arm_policy_of, label, policy_of, scope_of
+
+WARNING_C = 60.0
+
+
+def seen(temp_c: float, payload_kg=(0.5, 3.5), *, excess_k: float = 0.0, idle: bool = True) -> Observation:
+    """What an arm knows with two plans for each job; at work it may only give its job back."""
+    slots = len(payload_kg)
+    layout = Layout(1, slots, plans=2)
+    options = np.full(2 * slots, idle)
+    mask = np.concatenate([[1], options, [not idle]]).astype(np.int8)
+    blank = layout.read(np.zeros(layout.size, np.float32), mask)
+    return replace(
+        blank,
+        idle=np.array(float(idle)),
+        temp_c=np.full(7, temp_c),
+        housing_c=np.full(7, temp_c - excess_k),
+        headroom_k=np.array(WARNING_C - temp_c),
+        payload_kg=np.array(payload_kg),
+        value=np.ones(slots),
+        duration_s=np.tile([100.0, 150.0], slots),
+    )
+
+
+def test_the_limiter_knows_the_weight_of_the_arm() -> None:
+    """Torque of joint 2 of the stretched arm, from MuJoCo: it is linear in the payload, with this offset."""
+    arm, q = ArmModel(Robot(name="arm", mount=Mount())), np.array(POSTURES["outstretched"])
+    empty, full = (abs(arm.gravity_torque(q, kg)[1]) for kg in (0.0, RATING.mid_range_kg))
+    assert float(TorqueLimiter().torque(0.0)) == pytest.approx(empty / full, abs=0.005)
+    assert float(TorqueLimiter().torque(RATING.mid_range_kg)) == 1.0
+
+
+@pytest.mark.parametrize(("temp_c", "limit"), [(20.0, 1.0), (50.0, 1.0), (60.0, 0.6), (75.0, 0.0), (90.0, 0.0)])
+def test_the_torque_limit_falls_linearly_from_below_the_warning_to_the_error_limit(temp_c, limit) -> None:
+    assert TorqueLimiter().limit(WARNING_C - temp_c) == pytest.approx(limit)
+
+
+def test_a_warm_arm_claims_light_jobs_only_and_puts_a_heavy_one_down() -> None:
+    guard = TorqueLimiter()
+    assert guard.claims(seen(40.0)).tolist() == [True] * 4
+    assert guard.claims(seen(58.0)).tolist() == [True, True, False, False]
+    assert guard.claims(seen(70.0)).tolist() == [False] * 4
+    assert [guard.gives_back(seen(58.0), kg) for kg in (0.5, 3.5)] == [False, True]
+
+
+temperatures = st.floats(-20.0, 40.0)
+excesses = st.floats(0.0, 20.0)
+
+
+@given(temperatures, temperatures, excesses, excesses)
+def test_the_fuzzy_speed_is_a_share_and_never_rises_with_heat(headroom_k, other_k, excess_k, more_k) -> None:
+    speed = FuzzySpeed().speed
+    assert 0.0 <= speed(headroom_k, excess_k) <= 1.0
+    low, high = sorted((headroom_k, other_k))
+    assert speed(low, excess_k) <= speed(high, excess_k) + 1e-12
+    assert speed(headroom_k, excess_k + more_k) <= speed(headroom_k, excess_k) + 1e-12
+
+
+def test_a_single_true_rule_gives_its_speed() -> None:
+    for headroom_k, name in ((25.0, "cool"), (10.0, "warm"), (-5.0, "hot")):
+        assert [FuzzySpeed().speed(headroom_k, e) for e in (0.0, 15.0)] == list(FuzzySpeed.rules[name])
+    assert FuzzySpeed().speed(15.0, 0.0) == pytest.approx((1.0 + 0.8) / 2)
+
+
+def test_a_warm_arm_takes_the_cooler_plans_and_a_hot_one_stops() -> None:
+    guard = FuzzySpeed()
+    assert guard.claims(seen(35.0)).tolist() == [True] * 4
+    assert guard.claims(seen(50.0, excess_k=9.0)).tolist() == [False, True, False, True]
+    assert guard.claims(seen(60.0)).tolist() == [False] * 4
+    single = seen(50.0, excess_k=9.0)
+    single.action_mask[2] = 0  # the first job has one plan
+    assert guard.claims(single).tolist() == [True, False, False, True]
+    assert [guard.gives_back(seen(62.0, excess_k=e), 1.0) for e in (0.0, 10.0)] == [False, True]
+
+
+def test_the_job_that_is_given_back_is_the_one_that_was_claimed() -> None:
+    """With the heavy job the limit is reached at 50 °C, with the light one above 60 °C."""
+
+    class Slot:
+        scope = "arm"
+
+        def __init__(self, slot: int) -> None:
+            self.slot = slot
+
+        def reset(self, rng) -> None:
+            """Nothing to reset."""
+
+        def choose(self, observation, place) -> int:
+            return 1 + 2 * self.slot if observation.action_mask[1 + 2 * self.slot] else WAIT
+
+    for slot, given_back in ((0, WAIT), (1, 5)):
+        policy = GuardedArm(TorqueLimiter, Slot(slot))  # pyright: ignore[reportArgumentType]
+        assert policy.choose(seen(40.0), 0) == 1 + 2 * slot
+        assert policy.choose(seen(58.0, idle=False), 0) == given_back
+
+
+@pytest.mark.parametrize("wrapper", WRAPPERS)
+@pytest.mark.parametrize("name", RULES)
+def test_every_rule_in_a_wrapper_keeps_its_scope_and_is_legal_all_shift(small, wrapper, name) -> None:
+    full = f"{wrapper}:{name}"
+    policy = policy_of(full)
+    assert scope_of(full) == scope_of(name) == policy.scope
+    assert label(full) == full
+    env = parallel_env(small.Shifts(arms=2, jobs=8, ticks=100, ambient_c=38.0))
+    env.reset(seed=1)
+    policy.reset(np.random.default_rng(1))
+    while env.agents:
+        env.step(policy.act(env.knowledge()))
+    assert env.truth.illegal.sum() == 0
+
+
+def test_a_wrapped_arm_policy_can_be_had_alone_and_wrappers_nest() -> None:
+    assert isinstance(arm_policy_of("limited:least_difficulty"), GuardedArm)
+    assert isinstance(policy_of("fuzzy:limited:wsept"), GuardedFleet)
+    assert label("fuzzy:limited:agents.rules:Wspt") == "fuzzy:limited:Wspt"
+    with pytest.raises(FleetError, match="'limited:wsept' is a central policy"):
+        arm_policy_of("limited:wsept")
+    with pytest.raises(FleetError, match="did you mean 'wsept'"):
+        policy_of("limited:wsep")
+
+
+def test_a_guard_that_allows_all_changes_nothing(small) -> None:
+    class Open:
+        def claims(self, seen):
+            return np.ones(len(seen.action_mask) - 2, dtype=bool)
+
+        def gives_back(self, seen, payload_kg):
+            return False
+
+    env = parallel_env(small.Shifts(arms=3, jobs=12))
+    for name in ("wspt", "least_difficulty", "random"):
+        bare = policy_of(name)
+        if scope_of(name) == "central":
+            wrapped = GuardedFleet(Open, policy_of(name))
+        else:
+            wrapped = for_all_arms(lambda name=name: GuardedArm(Open, arm_policy_of(name)))  # pyright: ignore
+        env.reset(seed=4)
+        for policy in (bare, wrapped):
+            policy.reset(np.random.default_rng(4))
+        while env.agents:
+            known = env.knowledge()
+            actions = bare.act(known)
+            assert wrapped.act(known) == actions
+            env.step(actions)

@@ -1,0 +1,237 @@
+"""A recorded shift as glTF, read back by a reader of its own and by three.js, and compared with MuJoCo."""
+
+import base64
+import io
+import json
+import re
+import struct
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+from zipfile import ZipFile
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from scenarios.cli.main import main
+from scenarios.run.stored_run import StoredRun, read_run
+from scenarios.view.film import Film
+from scenarios.view.gltf_file import LONGEST_TURN_RAD, SAME_RAD, Z_UP, divided, keys_of
+from scenarios.view.moments import motor_spheres
+from tests.view.test_pages import CHROMIUM, browser  # noqa: F401  # a fixture
+
+SPEED = 60.0
+NEAR_M = 1e-4
+
+
+@pytest.fixture(scope="module")
+def run(run_folder: Path) -> StoredRun:
+    return read_run(run_folder)
+
+
+@pytest.fixture(scope="module")
+def file(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("gltf") / "shift.glb"
+    with pytest.raises(SystemExit) as ended:
+        main(["view", str(run_folder), "--gltf", str(path), "--speed", str(SPEED)])
+    assert ended.value.code in (0, None)
+    return path
+
+
+class Reader:
+    """Nodes of a GLB file at a time of its animation, from the specification alone."""
+
+    def __init__(self, path: Path) -> None:
+        raw = path.read_bytes()
+        magic, version, length = struct.unpack_from("<4sII", raw)
+        assert (magic, version, length) == (b"glTF", 2, len(raw))
+        size, kind = struct.unpack_from("<I4s", raw, 12)
+        assert (size % 4, kind) == (0, b"JSON")
+        self.json: dict[str, Any] = json.loads(raw[20 : 20 + size])
+        (held, kind), self._bin = struct.unpack_from("<I4s", raw, 20 + size), raw[28 + size :]
+        assert (held, kind) == (len(self._bin), b"BIN\0")
+        assert self.json["buffers"] == [{"byteLength": held}]
+        self.parent = {c: i for i, node in enumerate(self.json["nodes"]) for c in node.get("children", ())}
+        self.index = {node["name"]: i for i, node in enumerate(self.json["nodes"])}
+
+    def array(self, accessor: int) -> np.ndarray:
+        about = self.json["accessors"][accessor]
+        view = self.json["bufferViews"][about["bufferView"]]
+        columns = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[about["type"]]
+        kind = {5126: "<f4", 5123: "<u2"}[about["componentType"]]
+        flat = np.frombuffer(self._bin, kind, about["count"] * columns, view["byteOffset"])
+        return flat.reshape(-1, columns)[:, 0] if columns == 1 else flat.reshape(-1, columns)
+
+    def at(self, time_s: float) -> list[dict[str, np.ndarray]]:
+        """Translation, rotation (x, y, z, w) and scale of each node."""
+        unit = {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1]}
+        nodes = [{k: np.array(node.get(k, v), float) for k, v in unit.items()} for node in self.json["nodes"]]
+        (animation,) = self.json["animations"]
+        for channel in animation["channels"]:
+            sampler = animation["samplers"][channel["sampler"]]
+            times, values = self.array(sampler["input"]), self.array(sampler["output"])
+            assert (np.diff(times) > 0).all()
+            after = int(np.clip(np.searchsorted(times, time_s, side="right"), 1, len(times)))
+            before = values[after - 1].astype(float)
+            if sampler["interpolation"] == "LINEAR" and after < len(times):
+                share = np.clip((time_s - times[after - 1]) / (times[after] - times[after - 1]), 0.0, 1.0)
+                before = slerp(before, values[after].astype(float), float(share))
+            nodes[channel["target"]["node"]][channel["target"]["path"]] = before
+        return nodes
+
+    def place(self, nodes: list[dict[str, np.ndarray]], name: str) -> np.ndarray:
+        """Origin of a node in the coordinates of the cell."""
+        point, i = np.zeros(3), self.index[name]
+        while i in self.parent:
+            x, y, z, w = nodes[i]["rotation"]
+            turned = np.empty(3)
+            mujoco.mju_rotVecQuat(turned, point * nodes[i]["scale"], np.array([w, x, y, z]))  # pyright: ignore[reportAttributeAccessIssue]
+            point, i = turned + nodes[i]["translation"], self.parent[i]
+        assert nodes[i]["rotation"] == pytest.approx(Z_UP)
+        return point
+
+
+def slerp(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
+    dot = float(a @ b)
+    b, dot = (b, dot) if dot >= 0 else (-b, -dot)
+    angle = np.arccos(min(dot, 1.0))
+    if angle < 1e-6:
+        return a + share * (b - a)
+    return (np.sin((1 - share) * angle) * a + np.sin(share * angle) * b) / np.sin(angle)
+
+
+def motors_in_mujoco(run: StoredRun, time_s: float) -> np.ndarray:
+    """Motors in the world, [arm, joint, 3]."""
+    film = Film(run)
+    film.show(time_s)
+    data, model = film.player.data, film.player.model
+    return np.array([[data.site_xpos[model.site(f"{arm}/motor_{j + 1}").id] for j in range(7)] for arm in run.arms])
+
+
+def moments_of(run: StoredRun, count: int) -> np.ndarray:
+    """Times at which some arm moves, s."""
+    moving = np.abs(run.telemetry.qd).max(axis=(1, 2)) > 0.2
+    return np.random.default_rng(5).choice(run.telemetry.time_s[moving], count, replace=False)
+
+
+def test_the_motors_are_where_mujoco_has_them(file: Path, run: StoredRun) -> None:
+    reader, begin_s = Reader(file), float(run.telemetry.time_s[0])
+    for time_s in moments_of(run, 12):
+        nodes = reader.at((time_s - begin_s) / SPEED)
+        found = np.array([[reader.place(nodes, f"{arm}/link_{j + 1}") for j in range(7)] for arm in run.arms])
+        assert np.abs(found - motors_in_mujoco(run, float(time_s))).max() < NEAR_M
+
+
+def test_each_motor_shows_one_sphere_of_the_colour_of_its_temperature(file: Path, run: StoredRun) -> None:
+    reader, readings = Reader(file), run.telemetry
+    hottest = readings.temp_c.max(axis=(1, 2)).argmax()
+    for sample in (0, hottest // 10 * 10, len(readings.time_s) // 20 * 10):
+        nodes = reader.at((readings.time_s[sample] - readings.time_s[0]) / SPEED + 1e-9)
+        for a, arm in enumerate(run.arms):
+            for joint in range(7):
+                start = f"{arm}/motor_{joint + 1}/"
+                shown = [n for n in reader.index if n.startswith(start) and nodes[reader.index[n]]["scale"].any()]
+                assert len(shown) == 1
+                band_c = float(shown[0].removeprefix(start))
+                temp_c = np.clip(readings.temp_c[sample, a, joint], 17.6, 87.4)
+                assert abs(band_c - temp_c) <= 2.5 + 1e-6
+                node = reader.json["nodes"][reader.index[shown[0]]]
+                primitive = reader.json["meshes"][node["mesh"]]["primitives"][0]
+                colour = reader.json["materials"][primitive["material"]]["pbrMetallicRoughness"]["baseColorFactor"][:3]
+                rgb, radius_m = motor_spheres(np.array(band_c), run.scenario.limits)
+                assert np.power(colour, 1 / 2.2) == pytest.approx(rgb, abs=0.03)  # sRGB is nearly a power of 2.2
+                assert nodes[reader.index[shown[0]]]["scale"] == pytest.approx([float(radius_m)] * 3)
+
+
+def test_trimesh_reads_the_shapes(file: Path, run: StoredRun) -> None:
+    import trimesh
+
+    scene = trimesh.load_scene(file)
+    assert np.isfinite(scene.bounds).all()
+    assert scene.extents.max() < 5.0
+    assert all(f"{arm}/link_7" in scene.graph.nodes for arm in run.arms)
+    assert all(mesh.is_winding_consistent for mesh in scene.geometry.values())
+
+
+angles = st.lists(st.floats(-1.5, 1.5), min_size=2, max_size=60).map(lambda steps: np.cumsum(steps))
+
+
+@given(angles)
+def test_left_out_angles_are_those_that_interpolation_gives(angle_rad: np.ndarray) -> None:
+    time_s = np.arange(len(angle_rad)) * 0.5
+    kept = keys_of(time_s, angle_rad)
+    assert (kept[0], kept[-1]) == (0, len(angle_rad) - 1)
+    assert np.abs(np.interp(time_s, time_s[kept], angle_rad[kept]) - angle_rad).max() <= SAME_RAD + 1e-9
+    assert np.abs(np.diff(angle_rad[kept])).max() <= LONGEST_TURN_RAD
+
+
+def test_a_resting_joint_has_two_keys_and_a_long_turn_goes_the_right_way() -> None:
+    time_s = np.arange(100.0)
+    assert keys_of(time_s, np.full(100, 0.3)).tolist() == [0, 99]
+    finer_s, angle_rad = divided(np.array([0.0, 1.0, 2.0]), np.array([0.0, 5.0, 5.0]))
+    assert np.abs(np.diff(angle_rad)).max() <= LONGEST_TURN_RAD
+    assert angle_rad == pytest.approx(np.interp(finer_s, [0.0, 1.0, 2.0], [0.0, 5.0, 5.0]))
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")
+def test_three_js_plays_it_as_mujoco_has_it(browser, file: Path, run: StoredRun, tmp_path: Path) -> None:  # noqa: F811
+    """The loader and the mixer of three.js, which trimesh carries for its own viewer."""
+    package = find_spec("trimesh")
+    assert package is not None
+    assert package.origin is not None
+    with ZipFile(Path(package.origin).parent / "resources/templates/viewer.zip") as packed:
+        template = packed.read("viewer.html.template").decode()
+    (library,) = re.findall(r"<script>(.*)</script>", template, re.S)
+    page, html = browser.new_page(viewport={"width": 900, "height": 600}), tmp_path / "play.html"
+    scripts = f"<script>{library.removesuffix('init();')}</script><script>{PLAYER}</script>"
+    html.write_text(f"<meta charset='utf-8'><body style='margin:0'>{scripts}", encoding="utf-8")
+    page.goto(html.as_uri())
+    page.evaluate("text => begin(text)", base64.b64encode(file.read_bytes()).decode())
+    times_s = moments_of(run, 4)
+    names = [f"{arm}/link_{j + 1}" for arm in run.arms for j in range(7)]
+    for time_s in times_s.tolist():
+        played_s = (time_s - float(run.telemetry.time_s[0])) / SPEED
+        shown = page.evaluate("([time_s, names]) => show(time_s, names)", [played_s, names])
+        x, y, z = np.array(shown).reshape(len(run.arms), 7, 3).transpose(2, 0, 1)
+        found = np.stack([x, -z, y], axis=-1)  # back to z up
+        assert np.abs(found - motors_in_mujoco(run, time_s)).max() < NEAR_M
+    picture = np.asarray(Image.open(io.BytesIO(page.locator("canvas").screenshot())).convert("RGB"))
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100  # shaded links and coloured spheres
+    assert (np.abs(picture.astype(int) - BACKGROUND).max(axis=-1) > 8).mean() > 0.02
+    page.close()
+
+
+PLAYER = """
+{
+let gltf, mixer, renderer, camera, scene;
+window.begin = async text => {
+  const raw = Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer;
+  gltf = await new Promise((done, failed) => new THREE.GLTFLoader().parse(raw, "", done, failed));
+  scene = new THREE.Scene();
+  scene.background = new THREE.Color(0xf4f4f0);
+  scene.add(gltf.scene, new THREE.HemisphereLight(0xffffff, 0x888888, 1.2));
+  mixer = new THREE.AnimationMixer(gltf.scene);
+  mixer.clipAction(gltf.animations[0]).play();
+  camera = new THREE.PerspectiveCamera(45, 1.5, 0.01, 50);
+  camera.position.set(2.2, 1.8, 2.2);
+  camera.lookAt(0, 0.5, 0);
+  renderer = new THREE.WebGLRenderer({preserveDrawingBuffer: true});
+  renderer.outputEncoding = THREE.sRGBEncoding;
+  renderer.setSize(900, 600);
+  document.body.appendChild(renderer.domElement);
+};
+window.show = (time_s, names) => {
+  mixer.setTime(time_s);
+  gltf.scene.updateMatrixWorld(true);
+  renderer.render(scene, camera);
+  const byName = {};
+  gltf.scene.traverse(node => { byName[node.userData.name || node.name] = node; });
+  return names.map(name => new THREE.Vector3().setFromMatrixPosition(byName[name].matrixWorld).toArray());
+};
+}
+"""
+BACKGROUND = (0xF4, 0xF4, 0xF0)
