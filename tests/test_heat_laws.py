@@ -110,7 +110,7 @@ def test_the_heat_of_a_shift_is_that_of_its_most_aged_winding_and_of_the_largest
     temp_c = np.empty((steps + 1, 2, NODES))  # two arms, the second one half as warm
     temp_c[..., WINDING] = 40.0 + 1.5 * course[:, None, None] * shape[:, None] * np.linspace(0.2, 1.0, JOINTS)
     temp_c[..., HOUSING] = 40.0 + course[:, None, None] * shape[:, None]
-    heat = HeatUse(temp_c[0])
+    heat = HeatUse(temp_c[0], burn_c=65.0)
     for after_c in temp_c[1:]:
         heat.add(after_c, dt_s)
     used_h = simpson(arrhenius_rate(temp_c[..., JOINTS - 1]), dx=dt_s, axis=0) / 3600.0

@@ -69,6 +69,6 @@ def seconds_above(before_c: Array, after_c: Array, limit_c: float, dt_s: float) 
         dt_s: Its length, s; short against the time constant of a housing, which is above half an hour.
     """
     low, high = np.minimum(before_c, after_c), np.maximum(before_c, after_c)
-    steady = (high > limit_c).astype(float)
+    steady = np.array(high > limit_c, dtype=float)
     share = np.divide(high - limit_c, high - low, out=steady, where=high > low)
     return dt_s * np.clip(share, 0.0, 1.0)
