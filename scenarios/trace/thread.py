@@ -127,9 +127,10 @@ def rows_of(events: Sequence[Event], asked: str) -> list[int]:
     elif kind not in EVENT_KINDS:
         close = get_close_matches(asked, [*EVENT_KINDS, *jobs], n=1)
         kinds = ", ".join(dict.fromkeys(event.kind for event in events))
+        hint = f"; did you mean '{close[0]}'?" if close else "."
         raise FleetError(
-            f"No row, kind of event or job '{asked}'{f'; did you mean {close[0]!r}?' if close else '.'} Kinds that were "
-            f"recorded: {kinds}. Rows are 0 to {len(events) - 1}."
+            f"No row, kind of event or job '{asked}'{hint} Kinds that were recorded: {kinds}. Rows: 0 to "
+            f"{len(events) - 1}."
         )
     rows = [i for i, e in enumerate(events) if e.kind == kind and name in ("", e.arm, e.job)]
     if rows:
