@@ -131,8 +131,8 @@ def _module(where: str, name: str) -> ModuleType:
         try:
             return importlib.import_module(where)
         except ImportError as error:
-            rules = ", ".join(RULES)
-            raise FleetError(f"Policy '{name}': cannot import '{where}' ({error}). Rules: {rules}.") from error
+            known = f"Rules: {', '.join(RULES)}. Wrappers: {', '.join(WRAPPERS)}."
+            raise FleetError(f"Policy '{name}': cannot import '{where}' ({error}). {known}") from error
     path = Path(where)
     spec = importlib.util.spec_from_file_location(f"own_policy_{path.stem}", path)
     if spec is None or spec.loader is None or not path.is_file():

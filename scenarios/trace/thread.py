@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any  # values of run.json
 
@@ -124,8 +125,13 @@ def rows_of(events: Sequence[Event], asked: str) -> list[int]:
     if not at and asked in jobs:
         kind, name = "award", asked
     elif kind not in EVENT_KINDS:
-        allowed = nearest(asked, [*EVENT_KINDS, *jobs])
-        raise FleetError(f"No event, kind of event or job '{asked}'{allowed}")
+        close = get_close_matches(asked, [*EVENT_KINDS, *jobs], n=1)
+        kinds = ", ".join(dict.fromkeys(event.kind for event in events))
+        hint = f"; did you mean '{close[0]}'?" if close else "."
+        raise FleetError(
+            f"No row, kind of event or job '{asked}'{hint} Kinds that were recorded: {kinds}. Rows: 0 to "
+            f"{len(events) - 1}."
+        )
     rows = [i for i, e in enumerate(events) if e.kind == kind and name in ("", e.arm, e.job)]
     if rows:
         return rows
