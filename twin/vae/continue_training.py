@@ -1,4 +1,4 @@
-"""Train the networks of one twin further on the motion of another arm."""
+"""Train the networks of one twin further, on other motion: of the same arm later, or of another arm."""
 
 from collections.abc import Sequence
 
@@ -7,10 +7,10 @@ import torch
 
 from fleet.seeding import child
 from twin.vae.config import TwinConfig
-from twin.vae.loss import active_units, kl, negative_elbo
-from twin.vae.model import LstmVae, build, one_thread, weights_of
+from twin.vae.model import one_thread
+from twin.vae.run import Run
 from twin.vae.training_key import hash_records, seed_text
-from twin.vae.twin import Fit, Twin
+from twin.vae.twin import Twin
 from twin.vae.window import Scaler, draw_windows, windows_of
 
 Array = np.ndarray
@@ -20,23 +20,17 @@ SHAPE = ("scope", "kind", "latent", "hidden", "layers", "window", "rate_hz")
 
 
 def continue_training(
-    start: Twin,
-    records: Sequence[Array],
-    config: TwinConfig,
-    seed: np.random.SeedSequence,
-    *,
-    arm: str,
-    scaler: Scaler | None = None,
+    start: Twin, records: Sequence[Array], config: TwinConfig, seed: np.random.SeedSequence, *, arm: str
 ) -> Twin:
-    """A twin of `arm` whose networks start from the weights of another twin, instead of random ones.
+    """A twin of `arm` whose networks start from the weights of another twin; its z-scores are those of the records.
 
-    Uses one thread and no global random state. There are no restarts, since the weights are given.
+    It uses one thread and no global random state. There are no restarts, since the weights are given, and the twin is
+    not calibrated.
 
     Args:
         start: The first twin; it is unchanged.
         records: Cool motion of the arm, profiles [time, 3, joint] at `config.record_hz`.
-        config: Epochs, batch, learning rate and β of the further training.
-        scaler: z-scores; default: fitted on the records.
+        config: Epochs, batch and learning rate of the further training.
 
     Raises:
         ValueError: records as in `twin.vae.train.train`, another number of joints, or a configuration with networks
@@ -48,44 +42,16 @@ def continue_training(
     if windows.shape[2] != start.joints:
         raise ValueError(f"The first twin has {start.joints} joints, the records have {windows.shape[2]}.")
     windows = draw_windows(windows, config.max_windows, child(seed, 0))
-    scaler = scaler or Scaler.fit(windows)
-    z = torch.from_numpy(scaler.to_z(windows)).flatten(2).chunk(len(start.nets), dim=2)
-    noise = torch.from_numpy((np.array(config.noise) / scaler.std).astype(np.float32)).reshape(len(start.nets), -1)
-    nets, fits = [], []
+    scaler, count = Scaler.fit(windows), len(start.nets)
+    noise = torch.from_numpy((np.array(config.noise) / scaler.std).astype(np.float32)).reshape(count, -1)
+    parts = torch.from_numpy(scaler.to_z(windows)).flatten(2).chunk(count, dim=2)
+    seeds = [int(child(seed, 1, n).generate_state(1)[0]) for n in range(count)]
     with one_thread():
-        for n, (weights, x) in enumerate(zip(start.nets, z, strict=True)):
-            net = build(config, 0, channels=x.shape[-1])
-            net.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in weights.items()})
-            draw = torch.Generator().manual_seed(int(child(seed, 1, n).generate_state(1)[0]))
-            fits.append(_train(net, x.contiguous(), noise[n], config, draw))
-            nets.append(weights_of(net))
-    return Twin(
-        config, scaler, nets, arm=arm, data_hash=hash_records(records), seed=seed_text(seed), fits=tuple(fits)
-    )
-
-
-def _train(net: LstmVae, x: torch.Tensor, noise: torch.Tensor, config: TwinConfig, draw: torch.Generator) -> Fit:
-    optimizer = torch.optim.Adam(net.parameters(), lr=config.learning_rate, fused=True)
-    steps = max(config.epochs * -(-len(x) // config.batch), 2)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.learning_rate, total_steps=steps)
-    beta = config.beta if config.kind == "vae" else 0.0
-    for _ in range(config.epochs):
-        for index in torch.randperm(len(x), generator=draw).split(config.batch):
-            batch = x[index] + noise * torch.randn(x[index].shape, generator=draw)
-            optimizer.zero_grad()
-            eps = torch.randn(len(batch), config.latent, generator=draw)
-            x_hat, mu, logvar = net(batch, eps)
-            negative_elbo(batch, x_hat, mu, logvar, beta).backward()
-            torch.nn.utils.clip_grad_norm_(net.parameters(), config.clip)
-            optimizer.step()
-            schedule.step()
-    with torch.inference_mode():
-        mu, logvar = net.encode(x)
-        mean_hat = net.decode(mu, x.shape[1])
-        return Fit(
-            elbo=-float(negative_elbo(x, mean_hat, mu, logvar, beta)),
-            kl=float(kl(mu, logvar).mean()) if beta else 0.0,
-            active_units=active_units(mu),
-            mean_squared_error=float((x - mean_hat).square().mean()),
-            restart=0,
-        )
+        run = Run([part.permute(1, 2, 0).contiguous() for part in parts], noise, config, seeds)
+        with torch.no_grad():
+            for name, weight in run.nets.weights.items():
+                weight.copy_(torch.from_numpy(np.stack([net[name] for net in start.nets])))
+        run.train(config.epochs)
+        fits = run.fits([0] * count, [()] * count)
+    nets = [run.nets.weights_of(n) for n in range(count)]
+    return Twin(config, scaler, nets, arm=arm, data_hash=hash_records(records), seed=seed_text(seed), fits=tuple(fits))
