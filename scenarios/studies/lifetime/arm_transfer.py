@@ -6,7 +6,7 @@ judged on other cool jobs of the second arm. Torque is computed from the motor c
 """
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -47,15 +47,17 @@ SHORT = TwinConfig(
 class TransferSize:
     """Numbers of jobs and training steps."""
 
-    jobs: tuple[int, ...] = (2, 5, 10, 20, 40)
+    jobs: tuple[int, ...] = (5, 10, 20, 40)
     """Jobs of the second arm, ascending; the last one is the reference."""
-    source_jobs: int = 120
+    source_jobs: int = 160
+    """Cool jobs of the first arm."""
+    source_steps: int = 1500
     held_out: int = 60
     test: int = 200
     """Jobs of the natural mix, for AUROC."""
-    steps: int = 300
-    """Of a training from nothing; the twin of the first arm gets twice as many."""
-    further_steps: int = 75
+    steps: int = 600
+    """Of a training from nothing."""
+    further_steps: int = 100
     further_rate: float = 1e-3
     """Peak learning rate of the further training."""
     config: TwinConfig = field(default_factory=lambda: replace(SHORT, hidden=32, rate_hz=12.5, window=50, stride=10))
@@ -64,7 +66,14 @@ class TransferSize:
     def quick(cls) -> "TransferSize":
         """Smaller networks and fewer jobs, about a tenth of the time."""
         return cls(
-            jobs=(5, 10, 20, 40), source_jobs=60, held_out=40, test=80, steps=200, further_steps=50, config=SHORT
+            jobs=(5, 10, 40),
+            source_jobs=120,
+            source_steps=1000,
+            held_out=40,
+            test=60,
+            steps=300,
+            further_steps=75,
+            config=SHORT,
         )
 
 
@@ -143,7 +152,7 @@ def arm_transfer(
         root = np.random.SeedSequence(seed)
         first = make_study(child(root, 0), train=size.source_jobs, reference=0, test=0, novel=0, robot=SUBJECT)
         own = records(sensed(first.train.plans, first.motors))
-        source = train(own, with_steps(size.config, own, 2 * size.steps), child(root, 1), arm="first")
+        source = train(own, with_steps(size.config, own, size.source_steps), child(root, 1), arm="first")
         for i, (name, robot) in enumerate(targets.items()):
             progress("transfer", len(cells) / (len(seeds) * len(targets)))
             study = make_study(
@@ -162,30 +171,58 @@ def with_steps(config: TwinConfig, parts: Sequence[Array], steps: int) -> TwinCo
 def _cell(name: str, seed: int, study: Study, source: Twin, size: TransferSize, random: np.random.SeedSequence) -> Cell:
     cool, config = sensed(study.train.plans, study.motors), size.config
     held_out = windows_of(records(sensed(study.reference.plans, study.motors)), config)
-    common = Scaler.fit(windows_of(records(cool), config))
     test = jobs_of(study.test, study.horizon_s)
     test_plans = sensed(test.plans, study.motors)
     critical = test.peak_c[:, CARRIER] >= study.warning_c
 
-    def judged(start: str, jobs: int, twin: Twin, cpu_s: float, steps: int) -> Trained:
+    def auroc(twin: Twin) -> float:
+        if critical.all() or not critical.any():
+            return float("nan")
         d = twin.features(test_plans, test.repetitions).difficulty[:, CARRIER]
-        mixed = critical.any() and not critical.all()
-        auroc = float(roc_auc_score(critical, d)) if mixed else float("nan")
-        return Trained(start, jobs, steps, cpu_s, error_of(twin, held_out, common), auroc)
+        return float(roc_auc_score(critical, d))
 
+    parts = {n: records(cool[:n]) for n in size.jobs}
+    return compare_starts(name, seed, source, parts, held_out, size, random, auroc)
+
+
+def compare_starts(
+    name: str,
+    seed: int,
+    source: Twin,
+    parts: Mapping[int, Sequence[Array]],
+    held_out: Array,
+    size: TransferSize,
+    random: np.random.SeedSequence,
+    auroc: Callable[[Twin], float],
+) -> Cell:
+    """Twins of a second arm by `STARTS` and number of jobs.
+
+    Args:
+        source: Twin of the first arm.
+        parts: Records of the second arm by number of jobs, ascending.
+        held_out: Windows of other cool motion of the second arm, SI units.
+        auroc: Of d of joint 2 by a twin.
+    """
+    config = source.config
+    common = Scaler.fit(windows_of(parts[max(parts)], config))
     rows = []
-    for n in size.jobs:
-        parts = records(cool[:n])
+    for n, some in parts.items():
+
+        def judged(start: str, twin: Twin, steps: int, began_s: float, n: int = n) -> Trained:
+            cpu_s = time.process_time() - began_s
+            return Trained(start, n, steps, cpu_s, error_of(twin, held_out, common), auroc(twin))
+
         began_s = time.process_time()
-        twin = train(parts, with_steps(config, parts, size.steps), child(random, n), arm=study.robot.name)
-        rows.append(judged(NOTHING, n, twin, time.process_time() - began_s, size.steps))
-        scaler = Scaler.fit(windows_of(parts, config))
-        rows.append(judged(RESCALED, n, replace(source, scaler=scaler), 0.0, 0))
-        further = replace(with_steps(config, parts, size.further_steps), learning_rate=size.further_rate)
+        twin = train(some, with_steps(config, some, size.steps), child(random, n), arm=source.arm)
+        rows.append(judged(NOTHING, twin, size.steps, began_s))
         began_s = time.process_time()
-        twin = continue_training(source, parts, further, child(random, n), arm=study.robot.name)
-        rows.append(judged(FURTHER, n, twin, time.process_time() - began_s, size.further_steps))
-    minutes = tuple(sum(map(len, records(cool[:n]))) / config.record_hz / 60.0 for n in size.jobs)
+        rescaled = replace(source, scaler=Scaler.fit(windows_of(some, config)))
+        rows.append(judged(RESCALED, rescaled, 0, began_s))
+        began_s = time.process_time()
+        further = replace(with_steps(config, some, size.further_steps), learning_rate=size.further_rate)
+        twin = continue_training(source, some, further, child(random, n), arm=source.arm)
+        rows.append(judged(FURTHER, twin, size.further_steps, began_s))
+    minutes = tuple(sum(map(len, some)) / config.record_hz / 60.0 for some in parts.values())
     return Cell(name, seed, minutes, error_of(source, held_out, common), tuple(rows))
 
 

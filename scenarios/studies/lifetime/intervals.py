@@ -38,12 +38,12 @@ def study_result(name: str, seeds: Sequence[int], size: Any, rows: Sequence[Any]
 
 
 def write_result(result: object, file: Path) -> None:
-    """Write a result as JSON.
+    """Write a result as JSON; numbers that are not finite become null.
 
     Raises:
         FleetError: the file cannot be written.
     """
-    text = json.dumps(msgspec.to_builtins(result), indent=1, allow_nan=True)
+    text = json.dumps(msgspec.json.decode(msgspec.json.encode(result)), indent=1, allow_nan=False)
     with disk_errors(file):
         file.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(file) as draft:
