@@ -117,7 +117,7 @@ def test_worn_jobs_are_hotter_and_their_targets_belong_to_them(study):
 
 
 def test_a_cusum_alarms_after_a_step_and_starts_anew():
-    reference = [-1.0, 1.0] * 5
+    reference = [1.0, -1.0] * 5
     step = 1.5 * float(np.std(reference, ddof=1))  # the sum grows by 1.5 - 0.5 a day
     watch = Cusum(reference=10, slack=0.5, threshold=5.25)
     assert not any(watch.add(value) for value in reference * 3)

@@ -89,8 +89,8 @@ class DriftSize:
 
     @classmethod
     def quick(cls) -> "DriftSize":
-        """Fewer jobs and training steps."""
-        return cls(jobs=4, train=40, pool=40, steps=200, further_steps=50)
+        """Fewer jobs, training steps and planned retrainings."""
+        return cls(jobs=4, period=28, train=40, pool=40, steps=200, further_steps=50)
 
 
 @dataclass(frozen=True)
