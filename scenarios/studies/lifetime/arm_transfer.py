@@ -41,6 +41,8 @@ SHORT = TwinConfig(
     allow_collapse=True,
 )  # fmt: skip
 """Half the hidden units and half the sample rate of a usual twin: an eighth of its time."""
+BETTER = replace(SHORT, learning_rate=6e-3, restarts=2)
+"""The same with the better of two starts: a latent of two numbers has local minima."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,11 +58,11 @@ class TransferSize:
     test: int = 200
     """Jobs of the natural mix, for AUROC."""
     steps: int = 600
-    """Of a training from nothing."""
+    """Of a training from nothing; the better of two starts counts there and for the first arm."""
     further_steps: int = 100
     further_rate: float = 1e-3
     """Peak learning rate of the further training."""
-    config: TwinConfig = field(default_factory=lambda: replace(SHORT, hidden=32, rate_hz=12.5, window=50, stride=10))
+    config: TwinConfig = field(default_factory=lambda: TwinConfig(batch=32, max_windows=100_000, allow_collapse=True))
 
     @classmethod
     def quick(cls) -> "TransferSize":
@@ -69,11 +71,11 @@ class TransferSize:
             jobs=(5, 10, 40),
             source_jobs=120,
             source_steps=1000,
-            held_out=40,
-            test=60,
+            held_out=30,
+            test=40,
             steps=300,
             further_steps=75,
-            config=SHORT,
+            config=BETTER,
         )
 
 

@@ -6,7 +6,7 @@ many noisy copies of its jobs, random light motions with predicted peaks, or mea
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import islice
 
 import numpy as np
@@ -53,7 +53,7 @@ class AugmentationSize:
     s: float = 1.0
     """Perturbation of generated motion, posterior standard deviations."""
     steps: int = 300
-    config: TwinConfig = field(default_factory=lambda: replace(SHORT, hidden=32, rate_hz=12.5, window=50, stride=10))
+    config: TwinConfig = field(default_factory=lambda: TwinConfig(batch=32, max_windows=100_000, allow_collapse=True))
 
     @classmethod
     def quick(cls) -> "AugmentationSize":

@@ -17,7 +17,7 @@ from fleet.seeding import child
 from scenarios.prepare.cool_motion import cold_peaks, records
 from scenarios.progress import Progress, quiet
 from scenarios.studies.benchmark import jobs_of
-from scenarios.studies.lifetime.arm_transfer import SHORT, with_steps
+from scenarios.studies.lifetime.arm_transfer import BETTER, with_steps
 from scenarios.studies.lifetime.sensed_torque import sensed
 from scenarios.studies.ranking import Jobs
 from scenarios.studies.setup import Study, make_study
@@ -44,12 +44,12 @@ class FeatureSize:
     train: int = 120
     """Cool jobs that train the twin."""
     steps: int = 600
-    config: TwinConfig = field(default_factory=lambda: replace(SHORT, hidden=32, rate_hz=12.5, window=50, stride=10))
+    config: TwinConfig = field(default_factory=lambda: TwinConfig(batch=32, max_windows=100_000, allow_collapse=True))
 
     @classmethod
     def quick(cls) -> "FeatureSize":
         """Smaller networks and half the jobs."""
-        return cls(labels=(50, 200), train=80, steps=400, config=SHORT)
+        return cls(labels=(50, 200), train=80, steps=400, config=BETTER)
 
 
 @dataclass(frozen=True)
