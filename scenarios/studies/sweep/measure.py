@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 from scipy.stats import t as student
 
+from scenarios.prepare.cool_motion import records
 from scenarios.progress import Count, Progress, quiet
 from scenarios.studies.benchmark import jobs_of
 from scenarios.studies.detection_metrics import detection
@@ -16,7 +17,7 @@ from scenarios.studies.ranking import RANKING, Jobs
 from scenarios.studies.setup import Study
 from scenarios.studies.sweep.configurations import Configuration
 from scenarios.studies.sweep.rows import Row, Rows
-from scenarios.studies.sweep.subjects import Subject
+from scenarios.studies.sweep.subjects import Subject, carrier_of
 from twin.vae.config import TwinConfig
 from twin.vae.train import Motion, train_all
 from twin.vae.training_key import RECIPE
@@ -61,7 +62,11 @@ def sweep(
         twins = train_all(motions, configuration.config)
         cpu_s = (time.process_time() - start_s) / len(twins)
         for (key, subject), twin in zip(missing.items(), twins, strict=True):
-            row: Row = {"configuration": name, "subject": subject.name, **measures(twin, studies[subject.name])}
+            row: Row = {
+                "configuration": name,
+                "subject": subject.name,
+                **measures(twin, subject, studies[subject.name]),
+            }
             rows.append(key, row | {"epochs": configuration.config.epochs, "cpu_s": round(cpu_s, 2)})
     progress("sweeping", 1.0)
     return [rows.by_key[key] for key in wanted]
@@ -69,30 +74,26 @@ def sweep(
 
 def key_of(name: str, config: TwinConfig, subject: Subject) -> str:
     """Key of a row: equal keys mean equal results."""
-    basis = [RECIPE, msgspec.to_builtins(config), asdict(subject.sizes)]
+    basis = [RECIPE, msgspec.to_builtins(config), asdict(subject.sizes), subject.carrier_only]
     return f"{name}/{subject.name}/{hashlib.sha256(msgspec.json.encode(basis)).hexdigest()[:12]}"
 
 
 def _motion(subject: Subject, study: Study, configuration: Configuration) -> Motion:
     source = study if configuration.data == "cool" else subject.any_motion()
-    return Motion(arm=subject.name, records=source.train.records(), seed=subject.entropy)
+    plans = subject.seen(source.train.plans, carrier_of(study))
+    return Motion(arm=subject.name, records=records(plans), seed=subject.entropy)
 
 
-def carrier_of(study: Study) -> int:
-    """The joint that overheats in most test jobs, 0 … 6: joint 2 of a standing arm, joint 1 of one on a wall."""
-    return int((study.test.peak_c >= study.warning_c).sum(axis=0).argmax())
-
-
-def measures(twin: Twin, study: Study) -> Row:
+def measures(twin: Twin, subject: Subject, study: Study) -> Row:
     """How the twin's scores rank the test jobs: [label][score][measure]; and how the training went, carrier first."""
     carrier = carrier_of(study)
     test, reference = jobs_of(study.test, study.horizon_s), jobs_of(study.reference, study.horizon_s)
-    of_test, of_reference = (_scores(twin, jobs, carrier) for jobs in (test, reference))
+    of_test, of_reference = (_scores(twin, subject, jobs, carrier) for jobs in (test, reference))
     own, hottest = test.peak_c[:, carrier], test.peak_c.max(axis=1)
     row: Row = {"carrier": carrier + 1}
     for label in LABELS:
         row[label] = {}
-        for score in SCORES:
+        for score in of_test:
             peak_c = own if score == "carrier" else hottest
             limit_c = study.cool_c if label == "hot_40" else study.warning_c
             kept = (peak_c < study.cool_c) | (peak_c >= study.warning_c) if label == "no_band" else peak_c == peak_c
@@ -111,8 +112,11 @@ def measures(twin: Twin, study: Study) -> Row:
     return row
 
 
-def _scores(twin: Twin, jobs: Jobs, carrier: int) -> dict[str, Array]:
-    features = twin.features(jobs.plans, jobs.repetitions)
+def _scores(twin: Twin, subject: Subject, jobs: Jobs, carrier: int) -> dict[str, Array]:
+    """By the names of `SCORES`."""
+    features = twin.features(subject.seen(jobs.plans, carrier), jobs.repetitions)
+    if subject.carrier_only:
+        return {"carrier": features.difficulty[:, carrier]}
     means = 1.0 - np.exp(-features.errors.mean(axis=-1))
     d = features.difficulty
     values = d[:, carrier], d @ twin.joint_weight, d.sum(axis=1), means.sum(axis=1)

@@ -2,10 +2,11 @@
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fleet.motion import Plan
 from scenarios.schema import Scenario
 from scenarios.studies.setup import Study, make_study
 
@@ -30,6 +31,9 @@ class Subject:
     index: int
     seed: int
     sizes: Sizes
+    carrier_only: bool = False
+    """Whether twins have networks of the joints up to the carrying one only: much faster, but with d of that one
+    alone."""
 
     @property
     def name(self) -> str:
@@ -49,16 +53,36 @@ class Subject:
         robot = self.scenario.arms[self.index].robot()
         return make_study(self.entropy, robot=robot, **settings)  # pyright: ignore[reportArgumentType]
 
+    def seen(self, plans: Sequence[Plan], carrier: int) -> tuple[Plan, ...]:
+        """The plans as the twin sees them, with all joints or those up to the carrying one."""
+        return tuple(first_joints(plan, carrier + 1) for plan in plans) if self.carrier_only else tuple(plans)
+
     def any_motion(self) -> Study:
         """The same arm with training jobs of any heat, and no other jobs."""
         return self.study(cool_c=EVERYTHING_C, reference=0, test=0)
 
 
+def carrier_of(study: Study) -> int:
+    """The joint that overheats in most test jobs, 0 … 6: joint 2 of a standing arm, joint 1 of one on a wall."""
+    return int((study.test.peak_c >= study.warning_c).sum(axis=0).argmax())
+
+
+def first_joints(plan: Plan, joints: int) -> Plan:
+    """The same plan, of the first joints of the arm."""
+    cut = [replace(phase, profile=phase.profile[:, :, :joints]) for phase in plan.phases]
+    return replace(plan, approach=cut[0], cycle=cut[1], retreat=cut[2])
+
+
 def subjects_of(
-    scenarios: Sequence[Scenario], *, arms: Sequence[int], seeds: Sequence[int], sizes: Sizes
+    scenarios: Sequence[Scenario],
+    *,
+    arms: Sequence[int],
+    seeds: Sequence[int],
+    sizes: Sizes,
+    carrier_only: bool = False,
 ) -> Iterator[Subject]:
     """The arms at these places of every scenario, under every seed."""
     for scenario in scenarios:
         for index in arms:
             if index < len(scenario.arms):
-                yield from (Subject(scenario, index, seed, sizes) for seed in seeds)
+                yield from (Subject(scenario, index, seed, sizes, carrier_only) for seed in seeds)

@@ -61,7 +61,7 @@ class Line:
         return [
             self.configuration.group,
             self.configuration.label,
-            *map(str, self.measures.values()),
+            *(str(self.measures.get(column, "–")) for column in COLUMNS),
             f"{units:.1f}",
             f"{nats:.2f}",
             f"{epochs:.0f}",
@@ -86,6 +86,8 @@ def _line(name: str, configuration: Configuration, rows: Mapping[str, Row], ours
     shared = [] if name == OURS else [subject for subject in rows if subject in ours]
     measures: dict[str, Cell] = {}
     for column, path in COLUMNS.items():
+        if any(path[1] not in row[path[0]] for row in rows.values()):
+            continue  # of the carrying joint only
         mean, half = interval([_at(row, path) for row in rows.values()])
         leads = [_at(rows[subject], path) - _at(ours[subject], path) for subject in shared]
         measures[column] = Cell(mean, half, *interval(leads)) if leads else Cell(mean, half)
