@@ -63,7 +63,7 @@ def forward(gates: Array, driven: Array, before: Array, after: Array, states: Ar
         gates: Products of the recurrent weights; overwritten by the values of the gates, [net, 4 m].
         driven: Bias and input that do not change with time, added to them, [net, 4 m].
         before: Cells before the step, [net, m].
-        after: Cells after it, [net, m]; may be the same array.
+        after: Cells after it, [net, m]; another array, or the compiler does not vectorise.
         states: Hidden states after it, [net, skip + m]; the first `skip` numbers of each network are left alone.
         order: The networks, 0 … net − 1. Read from an array so that the compiler does not test all networks at once
             for overlap, which would fail and stop it from vectorising.

@@ -92,12 +92,13 @@ class Networks:
             states = np.zeros((steps + 1, self.count, size + hidden, batch), np.float32)
             if size:
                 states[:-1, :, :size] = x
-            gates, cells = np.empty_like(driven, order="C"), np.zeros((self.count, hidden * batch), np.float32)
+            gates, cells = np.empty_like(driven, order="C"), np.zeros((2, self.count, hidden * batch), np.float32)
             flat, flat_driven = (np.ascontiguousarray(each).reshape(self.count, -1) for each in (gates, driven))
             for step in range(steps):
                 np.matmul(weight, states[step], out=gates)
                 after = states[step + 1].reshape(self.count, -1)
-                self._advance(flat, flat_driven, cells, cells, after, size * batch, self._order)
+                before, now = cells[step % 2], cells[(step + 1) % 2]
+                self._advance(flat, flat_driven, before, now, after, size * batch, self._order)
             x = states[1:, :, size:]
         return x
 
