@@ -17,7 +17,7 @@ from fleet.seeding import child
 from scenarios.prepare.cool_motion import cold_peaks, records
 from scenarios.progress import Progress, quiet
 from scenarios.studies.benchmark import jobs_of
-from scenarios.studies.lifetime.arm_transfer import BETTER, with_steps
+from scenarios.studies.lifetime.arm_transfer import SHORT, with_steps
 from scenarios.studies.lifetime.sensed_torque import sensed
 from scenarios.studies.ranking import Jobs
 from scenarios.studies.setup import Study, make_study
@@ -49,7 +49,7 @@ class FeatureSize:
     @classmethod
     def quick(cls) -> "FeatureSize":
         """Smaller networks and half the jobs."""
-        return cls(labels=(50, 200), train=80, steps=400, config=BETTER)
+        return cls(labels=(50, 200), train=80, steps=400, config=SHORT)
 
 
 @dataclass(frozen=True)
