@@ -1,6 +1,7 @@
 """Cost of a twin: a training step, the training of seven joints, and scoring, beside plain `nn.LSTM` and a lower bound.
 
-    python benchmarks/bench_twin.py [--full] [--arms 100]
+    python benchmarks/bench_twin.py [--full]
+    python benchmarks/bench_twin.py --arms 100
 
 CPU time on one core, medians; ours and the others alternate. Plain is a bare `nn.LSTM` autoencoder: encoder, linear
 layers, decoder, loss and backward pass, or the forward pass alone. The lower bound ("floor") is the matrix
@@ -227,6 +228,9 @@ def main() -> None:
     parser.add_argument("--arms", type=int, default=0, help="train and score with the twins of so many arms")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    if arguments.arms > 1:
+        fleet(arguments.arms)
+        return
     default, arm = TwinConfig(), TwinConfig(scope="arm", hidden=64, latent=8)
     beside = "".join(f"{f'{count} nets':>9}" for count in BESIDE)
     print(f"{'ms per step and network':<26}{beside}{'plain':>9}{'floor':>9}{'ratio':>8}")
@@ -238,8 +242,6 @@ def main() -> None:
     scoring(default, "1 real plan, 9 windows", 9, 100)
     scoring(default, "1 000 jobs of 4 windows", 4000, 3)
     scoring(arm, "whole arm, 1 000 jobs of 4 windows", 4000, 3)
-    if arguments.arms > 1:
-        fleet(arguments.arms)
     if arguments.full:
         rng = np.random.default_rng(0)
         records = [smooth(rng, 12.0) for _ in range(250)]

@@ -1,6 +1,7 @@
 """The sweep of configurations: resumable rows, and what the table says of them."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -45,6 +46,18 @@ def test_a_stopped_sweep_goes_on_where_it_was(subjects, tmp_path, monkeypatch):
 
 
 train_all = measure.train_all
+
+
+def test_networks_up_to_the_carrier_only(subjects, tmp_path):
+    """Joint 2 of a standing arm carries, so two networks are trained, and d of that joint is all there is."""
+    alone = replace(subjects[0], carrier_only=True)
+    (row,) = measure.sweep([alone], {OURS: TWO[OURS]}, Rows(tmp_path / "rows.jsonl"))
+    assert row["carrier"] == 2
+    assert len(row["kl"]) == 1 + 2
+    assert [list(row[label]) for label in measure.LABELS] == [["carrier"]] * 3
+    (line,) = lines_of([row], TWO)
+    assert line.cells()[7:10] == ["–"] * 3
+    assert measure.key_of(OURS, TWO[OURS].config, alone) != measure.key_of(OURS, TWO[OURS].config, subjects[0])
 
 
 def test_a_file_of_something_else_is_refused(tmp_path):

@@ -13,7 +13,7 @@ from fleet.errors import FleetError
 from scenarios.cli import options
 from scenarios.cli.studies.sweep import parsimony_command, sweep_command
 from scenarios.cli.terminal import echo, out_console, plain_table, print_json, progress_bar, say
-from scenarios.cli.twin_motion import export_command, generate_command, identify_command, recover_command
+from scenarios.cli.twin.motion import export_command, generate_command, identify_command, recover_command
 from scenarios.load import load
 from scenarios.schema_errors import choose
 
