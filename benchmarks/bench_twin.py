@@ -1,11 +1,14 @@
 """Cost of a twin: a training step, the training of seven joints, and scoring, beside plain `nn.LSTM` and a lower bound.
 
     python benchmarks/bench_twin.py [--full]
+    python benchmarks/bench_twin.py --arms 100
 
 CPU time on one core, medians; ours and the others alternate. Plain is a bare `nn.LSTM` autoencoder: encoder, linear
 layers, decoder, loss and backward pass, or the forward pass alone. The lower bound ("floor") is the matrix
 multiplications of the same passes, as `torch.mm` of their shapes. Training is extrapolated from its steps; --full runs
 it on random smooth motion. A job of the target has four windows; a real plan has the median number of the quickstart's.
+--arms trains that many twins of the quick size side by side in two processes, and has them score 1 000 jobs each;
+beside it a training of one twin network after network with `nn.LSTM` (peer), extrapolated.
 """
 
 import os
@@ -14,24 +17,33 @@ os.environ["OMP_NUM_THREADS"] = "1"
 
 import argparse
 import statistics
+import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
+from joblib import Parallel, delayed
 from torch import Tensor
 
 from fleet.motion import RATE_HZ
+from twin.vae.checkpoint import save
 from twin.vae.config import TwinConfig
 from twin.vae.inference import reconstruct
 from twin.vae.model import LstmVae, build, weights_of
 from twin.vae.onnx import export_onnx
-from twin.vae.train import Run, train
+from twin.vae.run import Run
+from twin.vae.train import SIDE_BY_SIDE, Motion, train, train_all
 from twin.vae.twin import Fit, Twin
-from twin.vae.window import Scaler
+from twin.vae.window import Scaler, cut, resample
 
 JOINTS = 7
 RUNS = 15
+BESIDE = (1, 7, SIDE_BY_SIDE, 28)
+"""Numbers of networks trained side by side."""
+JOBS = 1000
 
 
 def seconds(call: Callable[[], object]) -> float:
@@ -101,25 +113,29 @@ def training(config: TwinConfig, name: str) -> None:
     """Duration of a training step beside plain, and of a whole training."""
     channels, nets = config.channels(JOINTS), config.networks(JOINTS)
     x = torch.randn(config.batch, config.window, channels)
-    run = Run(x, torch.zeros(channels), TwinConfig(**{**vars(config), "epochs": 10_000}), seed=0)
     net = build(config, 0, channels=channels)
     optimizer = torch.optim.Adam(net.parameters(), lr=1e-3, fused=True)
-    epochs = iter(range(1, 10_000))
-    took = in_turns(
-        {
-            "ours": lambda: run.train(next(epochs)),
-            "plain": lambda: plain_step(net, x, optimizer),
-            "floor": floor(config, config.batch, 3, 1),
-        },
-        RUNS,
-    )
+    calls: dict[str, Callable[[], object]] = {
+        "plain": lambda: plain_step(net, x, optimizer),
+        "floor": floor(config, config.batch, 3, 1),
+    }
+    for count in BESIDE:
+        calls[str(count)] = _epochs_of(count, config, channels)
+    took = in_turns(calls, RUNS)
+    ours = {count: took[str(count)] / count for count in BESIDE}
     steps = nets * -(-config.max_windows // config.batch)
     trial = round(config.trial * config.epochs) if config.restarts > 1 else 0
-    whole_s = took["ours"] * steps * (config.epochs + trial * (config.restarts - 1))
-    print(
-        f"{name:<26}{1e3 * took['ours']:>9.1f}{1e3 * took['plain']:>9.1f}{1e3 * took['floor']:>9.1f}"
-        f"{took['ours'] / took['plain']:>8.2f}   all joints, restarts included: {whole_s:.0f} s"
-    )
+    whole_s = ours[SIDE_BY_SIDE] * steps * (config.epochs + trial * (config.restarts - 1))
+    cells = "".join(f"{1e3 * each:>9.1f}" for each in (*ours.values(), took["plain"], took["floor"]))
+    print(f"{name:<26}{cells}{ours[SIDE_BY_SIDE] / took['plain']:>8.2f}   all joints and restarts: {whole_s:.0f} s")
+
+
+def _epochs_of(count: int, config: TwinConfig, channels: int) -> Callable[[], object]:
+    """A training step of some networks side by side: an epoch of one batch."""
+    windows = [torch.randn(config.window, channels, config.batch) for _ in range(count)]
+    endless = replace(config, epochs=10_000)
+    run, epochs = Run(windows, torch.zeros(count, channels), endless, range(count)), iter(range(1, 10_000))
+    return lambda: run.train(next(epochs))
 
 
 def scoring(config: TwinConfig, name: str, windows: int, runs: int) -> None:
@@ -156,9 +172,6 @@ def _onnx(twin: Twin, z: np.ndarray) -> dict[str, Callable[[], object]]:
         import onnxruntime
     except ImportError:
         return {}
-    import tempfile
-    from pathlib import Path
-
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     with tempfile.TemporaryDirectory() as folder:
@@ -168,14 +181,59 @@ def _onnx(twin: Twin, z: np.ndarray) -> dict[str, Callable[[], object]]:
     return {"onnx": lambda: session.run(["errors"], feed)}
 
 
+def some_arms(first: int, count: int) -> tuple[float, float, int]:
+    """Train twins and have each score 1 000 jobs of its own; CPU time of both, s, and the bytes of a saved twin."""
+    torch.set_num_threads(1)
+    config = TwinConfig.quick()
+    motions, windows = [], []
+    for arm in range(first, first + count):
+        rng = np.random.default_rng(arm)
+        records = [smooth(rng, 12.0) for _ in range(90)]
+        motions.append(Motion(arm=f"arm_{arm}", records=records, seed=np.random.SeedSequence(arm)))
+        windows.append(np.concatenate([cut(resample(r, RATE_HZ, config.rate_hz), config.window, 50) for r in records]))
+    train_all(motions[:1], replace(config, epochs=1, allow_collapse=True))  # loads compiled code
+    twins: list[Twin] = []
+    training_s = seconds(lambda: twins.extend(train_all(motions, config)))
+    scoring_s = 0.0
+    for twin, own in zip(twins, windows, strict=True):
+        drawn = own[np.random.default_rng(0).integers(0, len(own), 4 * JOBS)]
+        scoring_s += seconds(lambda twin=twin, drawn=drawn: twin.window_features(drawn))
+    with tempfile.TemporaryDirectory() as folder:
+        save(twins[0], Path(folder))
+        size = sum(file.stat().st_size for file in Path(folder).iterdir())
+    return training_s, scoring_s, size
+
+
+def fleet(arms: int) -> None:
+    """Twins of many arms in two processes, beside networks trained one after another."""
+    config, shares = TwinConfig.quick(), [(0, arms // 2), (arms // 2, arms - arms // 2)]
+    start_s = time.perf_counter()
+    parts = list(Parallel(n_jobs=2)(delayed(some_arms)(*share) for share in shares))
+    wall_s = time.perf_counter() - start_s
+    training_s, scoring_s, sizes = zip(*parts, strict=True)
+    x, net = torch.randn(config.batch, config.window, 3), build(config, 0)
+    optimizer = torch.optim.Adam(net.parameters(), lr=1e-3, fused=True)
+    plain_s = in_turns({"plain": lambda: plain_step(net, x, optimizer)}, RUNS)["plain"]
+    steps = arms * JOINTS * config.epochs * -(-config.max_windows // config.batch)
+    print(f"\n{arms} twins of the quick size, two processes; everything took {wall_s:.0f} s")
+    print(f"{'training, CPU s':<34}{sum(training_s):>9.0f}   one after another: {plain_s * steps:.0f}")
+    print(f"{'scoring 1 000 jobs each, CPU s':<34}{sum(scoring_s):>9.1f}")
+    print(f"{'a twin on disk, kB':<34}{max(sizes) / 1e3:>9.0f}")
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--full", action="store_true", help="train seven joints at the default configuration")
+    parser.add_argument("--arms", type=int, default=0, help="train and score with the twins of so many arms")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    if arguments.arms > 1:
+        fleet(arguments.arms)
+        return
     default, arm = TwinConfig(), TwinConfig(scope="arm", hidden=64, latent=8)
-    print(f"{'training step, batch 128':<26}{'ours ms':>9}{'plain':>9}{'floor':>9}{'ratio':>8}")
+    beside = "".join(f"{f'{count} nets':>9}" for count in BESIDE)
+    print(f"{'ms per step and network':<26}{beside}{'plain':>9}{'floor':>9}{'ratio':>8}")
     training(default, "one joint of seven")
     training(arm, "whole arm")
     columns = ("features", "networks", "plain", "floor", "onnx")

@@ -38,6 +38,12 @@ def jit(function: Function) -> Function:
     return function
 
 
+def fused(function: Function) -> Function:
+    """Let the compiler fuse products with sums: faster, and rounded otherwise than uncompiled. Innermost decorator."""
+    vars(function)["options"] = {"fastmath": {"contract"}}
+    return function
+
+
 @jit_inline
 def nonnegative(index: Any) -> Any:  # any integer type
     """Return the same index; the compiler then omits the check for negative indices."""
@@ -104,7 +110,8 @@ def compile_cached(function: Callable[..., Any]) -> Callable[..., Any]:
     from numba.extending import register_jitable
 
     while _inlined:
-        register_jitable(forceinline=True, **_OPTIONS)(_inlined.pop())
+        inlined = _inlined.pop()
+        register_jitable(forceinline=True, **_options_of(inlined))(inlined)
     while _called:
         register_jitable(**_OPTIONS)(_called.pop())
     options: Any = config  # numba sets its options by name
@@ -114,6 +121,10 @@ def compile_cached(function: Callable[..., Any]) -> Callable[..., Any]:
         folder.mkdir(parents=True, exist_ok=True)
     before, options.CACHE_DIR = options.CACHE_DIR, str(folder)
     try:
-        return njit(function, cache=True, nogil=True, **_OPTIONS)
+        return njit(function, cache=True, nogil=True, **_options_of(function))
     finally:
         options.CACHE_DIR = before
+
+
+def _options_of(function: Callable[..., Any]) -> dict[str, Any]:
+    return _OPTIONS | vars(function).get("options", {})

@@ -1,6 +1,6 @@
-"""Transfer: a twin's latent as input of a small regressor of the temperature rise, against plain features.
+"""Transfer: a twin's latent as input of small regressors, against plain features.
 
-The twin was trained without labels; the regressor gets a few jobs with their true temperature rise.
+The twin was trained without labels; a regressor gets a few jobs with their true temperature rise, payload or friction.
 """
 
 import warnings

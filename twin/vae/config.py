@@ -12,6 +12,11 @@ The second also learns which postures and loads go together, and trains faster."
 Kind = Literal["vae", "ae"]
 """Variational, or a plain autoencoder without KL, latent noise and posterior."""
 
+Loss = Literal["sum", "mean"]
+"""Squared error of a window summed over time and channel, as in the ELBO, or its mean, which the KL outweighs."""
+Optimizer = Literal["adam", "sgd"]
+"""Adam with a one-cycle schedule, or plain stochastic gradient descent at a constant learning rate."""
+
 LOGVAR_RANGE = (-8.0, 4.0)
 """Bounds of the posterior's log variance."""
 
@@ -40,10 +45,12 @@ class TwinConfig:
     """Most training windows, drawn at random; 14 batches."""
     beta: float = 1.0
     """Weight of the KL term."""
+    loss: Loss = "sum"
+    optimizer: Optimizer = "adam"
     epochs: int = 60
     batch: int = 128
     learning_rate: float = 3e-3
-    """Peak of the one-cycle schedule."""
+    """Peak of the one-cycle schedule; with `sgd` the constant rate."""
     clip: float = 1.0
     """Largest gradient norm."""
     restarts: int = 2
@@ -57,7 +64,8 @@ class TwinConfig:
     """Keep a twin with a collapsed posterior, as a baseline, instead of raising CollapsedPosterior."""
 
     def __post_init__(self) -> None:
-        for name, allowed in (("scope", get_args(Scope)), ("kind", get_args(Kind))):
+        choices = {"scope": Scope, "kind": Kind, "loss": Loss, "optimizer": Optimizer}
+        for name, allowed in ((name, get_args(literal)) for name, literal in choices.items()):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"TwinConfig.{name} must be one of {allowed} (got {getattr(self, name)!r}).")
         whole = ("latent", "hidden", "layers", "stride", "score_stride", "max_windows", "epochs", "batch", "restarts")

@@ -1,6 +1,7 @@
 """The trained networks of one arm on windows of all joints, in NumPy: scoring needs no torch.
 
-All networks run together, one matrix product per layer and time step. Weights have the names and the order of gates
+All networks run together: a matrix product and `twin.vae.cell.forward` per layer and time step, with the batch last as
+there. Weights have the names and the order of gates
 (input, forget, cell, output) of torch.nn.LSTM and torch.nn.Linear in `twin.vae.model.LstmVae`.
 """
 
@@ -9,13 +10,16 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from fleet.motion import CHANNELS
+from twin.vae import cell
 from twin.vae.config import LOGVAR_RANGE, TwinConfig
 
 Array = np.ndarray
+Linear = tuple[Array, Array]
+"""Weights and biases of all networks."""
 Weights = Mapping[str, Array]
 """Parameters of one network by name, such as `encoder.weight_ih_l0`, float32."""
 
-_CHUNK = 64
+_CHUNK = 128
 """Windows per pass: keeps the activations in cache."""
 
 
@@ -50,80 +54,76 @@ class Networks:
 
     def __init__(self, nets: Sequence[Weights]) -> None:
         self._nets, self.count = nets, len(nets)
+        self._advance, self._order = cell.forward.chosen(), np.arange(len(nets))
         self.encoder, self.decoder = self._lstm("encoder"), self._lstm("decoder")
         self.summary, self.mu, self.expand, self.out = map(self._linear, ("summary", "mu", "expand", "out"))
         self.logvar = self._linear("logvar") if "logvar.weight" in nets[0] else None
 
     def encode(self, z: Array) -> tuple[Array, Array]:
         """Posterior mean and standard deviation, [batch, net, latent], of windows [batch, time, joint, channel]."""
-        parts = z.reshape(*z.shape[:2], self.count, -1).transpose(1, 2, 0, 3)
-        hidden = np.ascontiguousarray(parts)  # [time, net, batch, channel]
-        for layer in self.encoder:
-            hidden = layer(hidden)
-        summary = np.tanh(_affine(hidden[-1], self.summary))
+        parts = z.reshape(*z.shape[:2], self.count, -1).transpose(1, 2, 3, 0)  # [time, net, channel, batch]
+        summary = np.tanh(_affine(self._unroll(self.encoder, parts, z.shape[1])[-1], self.summary))
         mu = _affine(summary, self.mu)
         if self.logvar is None:
             sigma = np.zeros_like(mu)
         else:
             sigma = np.exp(0.5 * np.clip(_affine(summary, self.logvar), *LOGVAR_RANGE))
-        return mu.swapaxes(0, 1), sigma.swapaxes(0, 1)
+        return mu.transpose(2, 0, 1), sigma.transpose(2, 0, 1)
 
     def decode(self, latent: Array, steps: int) -> Array:
         """Windows decoded from latents [batch, net, latent], [batch, time, joint, channel]."""
-        first = np.tanh(_affine(latent.swapaxes(0, 1), self.expand))
-        hidden = np.broadcast_to(first, (steps, *first.shape))
-        for layer in self.decoder:
-            hidden = layer(hidden)
-        z = np.matmul(hidden, self.out[0]) + self.out[1]  # [time, net, batch, channel]
-        return z.transpose(2, 0, 1, 3).reshape(z.shape[2], steps, -1, len(CHANNELS))
+        first = np.tanh(_affine(latent.transpose(1, 2, 0), self.expand))
+        z = _affine(self._unroll(self.decoder, first, steps), self.out)  # [time, net, channel, batch]
+        return z.transpose(3, 0, 1, 2).reshape(z.shape[3], steps, -1, len(CHANNELS))
 
-    def _linear(self, name: str) -> tuple[Array, Array]:
-        """Weight [net, in, out] and bias [net, 1, out]."""
-        weight = np.stack([net[f"{name}.weight"].T for net in self._nets])
-        return weight, np.stack([net[f"{name}.bias"][None] for net in self._nets])
+    def _unroll(self, layers: Sequence[Linear], x: Array, steps: int) -> Array:
+        """Hidden states of the highest layer, [time, net, hidden, batch].
 
-    def _lstm(self, name: str) -> "list[_Layer]":
+        Args:
+            layers: Weight [net, 4 hidden, input + hidden] and bias [net, 4 hidden, 1] of each layer.
+            x: Inputs [time, net, size, batch], or [net, size, batch] at every step.
+        """
+        for weight, bias in layers:
+            hidden, batch = bias.shape[1] // 4, x.shape[-1]
+            size = weight.shape[2] - hidden
+            driven = np.broadcast_to(bias, (self.count, 4 * hidden, batch))
+            if x.ndim == 3:
+                driven, weight, size = driven + np.matmul(weight[:, :, :size], x), weight[:, :, size:], 0
+            states = np.zeros((steps + 1, self.count, size + hidden, batch), np.float32)
+            if size:
+                states[:-1, :, :size] = x
+            gates, cells = np.empty_like(driven, order="C"), np.zeros((2, self.count, hidden * batch), np.float32)
+            flat, flat_driven = (np.ascontiguousarray(each).reshape(self.count, -1) for each in (gates, driven))
+            for step in range(steps):
+                np.matmul(weight, states[step], out=gates)
+                after = states[step + 1].reshape(self.count, -1)
+                before, now = cells[step % 2], cells[(step + 1) % 2]
+                self._advance(flat, flat_driven, before, now, after, size * batch, self._order)
+            x = states[1:, :, size:]
+        return x
+
+    def _linear(self, name: str) -> Linear:
+        """Weight [net, out, in] and bias [net, out, 1]."""
+        weight = np.stack([net[f"{name}.weight"] for net in self._nets])
+        return weight, np.stack([net[f"{name}.bias"][:, None] for net in self._nets])
+
+    def _lstm(self, name: str) -> list[Linear]:
         layers = sum(key.startswith(f"{name}.weight_hh_l") for key in self._nets[0])
-        return [_Layer(self._nets, name, layer) for layer in range(layers)]
+
+        def stacked(kind: str, layer: int) -> Array:
+            return np.stack([net[f"{name}.{kind}_l{layer}"] for net in self._nets])
+
+        return [
+            (
+                np.concatenate([stacked("weight_ih", n), stacked("weight_hh", n)], axis=2),
+                (stacked("bias_ih", n) + stacked("bias_hh", n))[:, :, None],
+            )
+            for n in range(layers)
+        ]
 
 
-class _Layer:
-    """One layer of an LSTM, for all networks.
-
-    The weights of the three gates that are logistic functions are halved, σ(x) = (1 + tanh(x / 2)) / 2, so that one
-    tanh serves all four.
-    """
-
-    def __init__(self, nets: Sequence[Weights], name: str, layer: int) -> None:
-        hidden = nets[0][f"{name}.weight_hh_l{layer}"].shape[1]
-        half = np.repeat(np.array([0.5, 0.5, 1.0, 0.5], np.float32), hidden)
-
-        def stacked(kind: str) -> Array:
-            return np.stack([(net[f"{name}.{kind}_l{layer}"].T * half) for net in nets])
-
-        self._input, self._recurrent = stacked("weight_ih"), stacked("weight_hh")  # [net, in, 4 hidden]
-        self._bias = (stacked("bias_ih") + stacked("bias_hh"))[:, None]
-        self._hidden = hidden
-
-    def __call__(self, inputs: Array) -> Array:
-        """Hidden states [time, net, batch, hidden] after each step of the inputs [time, net, batch, in]."""
-        constant = inputs.strides[0] == 0
-        driven = np.matmul(inputs[:1] if constant else inputs, self._input) + self._bias
-        size = self._hidden
-        states = np.empty((*inputs.shape[:3], size), np.float32)
-        state, cell = np.zeros_like(states[0]), np.zeros_like(states[0])
-        for step in range(len(inputs)):
-            gates = np.matmul(state, self._recurrent)
-            gates += driven[0 if constant else step]
-            np.tanh(gates, out=gates)
-            enter, keep, new, leave = (gates[..., n * size : (n + 1) * size] for n in range(4))
-            cell = 0.5 * ((1.0 + keep) * cell + (1.0 + enter) * new)
-            states[step] = state = 0.5 * (1.0 + leave) * np.tanh(cell)
-        return states
-
-
-def _affine(x: Array, linear: tuple[Array, Array]) -> Array:
-    return np.matmul(x, linear[0]) + linear[1]
+def _affine(x: Array, linear: Linear) -> Array:
+    return np.matmul(linear[0], x) + linear[1]
 
 
 def posterior(networks: Networks, z: Array) -> tuple[Array, Array]:

@@ -212,13 +212,18 @@ class Twin:
     def _window_features(self, z: Array, weights: Array) -> Array:
         """Packed features of windows in z-scores, summed over time with weights [batch, time], [batch, joint, part]."""
         z_hat = inference.reconstruct(self.networks, z)
-        std, offset = self.scaler.std[:, TAU], self.scaler.mean[:, TAU] / self.scaler.std[:, TAU]
+        std = self.scaler.std[:, TAU]
+        offset = (self.scaler.mean[:, TAU] / std).astype(np.float32)
         size, size_hat = np.abs(z[..., TAU] + offset), np.abs(z_hat[..., TAU] + offset)
-        packed = np.empty((len(z), self.joints, PARTS))
-        packed[..., : len(CHANNELS)] = np.einsum("bt,btjc->bjc", weights, np.abs(z - z_hat))
-        packed[..., -3] = np.einsum("bt,btj->bj", weights, np.maximum(size - size_hat, 0.0))
-        packed[..., -2] = np.einsum("bt,btj->bj", weights, np.maximum(size**2 - size_hat**2, 0.0)) * std**2
-        packed[..., -1] = np.einsum("bt,btj->bj", weights, size**2) * std**2
+        parts = np.empty((PARTS, *size.shape), np.float32)  # [part, batch, time, joint]
+        for channel in range(len(CHANNELS)):
+            np.abs(z[..., channel] - z_hat[..., channel], out=parts[channel])
+        np.maximum(size - size_hat, 0.0, out=parts[-3])
+        np.square(size, out=parts[-1])
+        np.maximum(parts[-1] - np.square(size_hat), 0.0, out=parts[-2])
+        means = np.matmul(weights[:, None].astype(np.float32), parts)[:, :, 0]  # [part, batch, joint]
+        packed = means.transpose(1, 2, 0).astype(float)
+        packed[..., -2:] *= std[:, None] ** 2
         return packed
 
 

@@ -11,8 +11,9 @@ from rich.table import Table
 
 from fleet.errors import FleetError
 from scenarios.cli import options
+from scenarios.cli.studies.sweep import parsimony_command, sweep_command
 from scenarios.cli.terminal import echo, out_console, plain_table, print_json, progress_bar, say
-from scenarios.cli.twin_motion import export_command, generate_command, identify_command, recover_command
+from scenarios.cli.twin.motion import export_command, generate_command, identify_command, recover_command
 from scenarios.load import load
 from scenarios.schema_errors import choose
 
@@ -139,6 +140,8 @@ twin_app.command("identify")(identify_command)
 twin_app.command("generate")(generate_command)
 twin_app.command("recover")(recover_command)
 twin_app.command("export")(export_command)
+twin_app.command("sweep")(sweep_command)
+twin_app.command("parsimony")(parsimony_command)
 
 
 @twin_app.command("reliability")

@@ -1,0 +1,136 @@
+"""`thermofleet twin sweep` and `parsimony`: what the choices of a twin and the amount of its data change."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from fleet.errors import FleetError, nearest
+from scenarios.cli import options
+from scenarios.cli.terminal import echo, out_console, plain_table, print_json, progress_bar
+from scenarios.load import load
+from scenarios.schema_errors import choose
+
+if TYPE_CHECKING:  # slow to import
+    from scenarios.studies.sweep.subjects import Subject
+
+SCENARIOS = "quickstart,active_waiting,heat_wave"
+ScenariosOption = Annotated[str, typer.Option(help="Scenarios whose arms are studied, separated by commas.")]
+ArmsOption = Annotated[str, typer.Option(help="Places of the studied arms in each scenario, from 0.")]
+SeedsOption = Annotated[int, options.number("Number of seeds: bodies, jobs and trainings of each arm.", 1, 100)]
+TestOption = Annotated[int, options.number("Test jobs of each arm.", 50, 100_000)]
+CarrierOption = Annotated[
+    bool,
+    typer.Option("--carrier-only", help="Train networks up to the carrying joint only: faster, d of it alone."),
+]
+FormatOption = Annotated[str, typer.Option("--format", help="table, markdown or json.")]
+
+
+def sweep_command(
+    out: Annotated[Path, typer.Option(help="File of the rows; finished ones are not computed again.")] = Path(
+        "runs/twin_sweep.jsonl"
+    ),
+    scenarios: ScenariosOption = SCENARIOS,
+    arms: ArmsOption = "0,2",
+    seeds: SeedsOption = 1,
+    test: TestOption = 600,
+    carrier_only: CarrierOption = False,
+    only: Annotated[str | None, typer.Option(help="Configurations, separated by commas; default: all.")] = None,
+    format_: FormatOption = "table",
+) -> None:
+    """Train twins under many configurations, the paper's own among them, and compare how d ranks jobs.
+
+    A configuration is trained on all arms side by side: half a minute of one core
+    for each arm. Every row is kept as soon as it is known; the same command
+    continues after an interruption, and prints the table once all rows are there.
+    """
+    choose("format", format_, Literal["table", "markdown", "json"])
+    from scenarios.studies.sweep.configurations import CONFIGURATIONS
+    from scenarios.studies.sweep.measure import sweep
+    from scenarios.studies.sweep.rows import Rows
+    from scenarios.studies.sweep.table import HEADS, lines_of
+
+    names = list(CONFIGURATIONS) if only is None else [name.strip() for name in only.split(",")]
+    for name in names:
+        if name not in CONFIGURATIONS:
+            raise FleetError(f"No configuration '{name}'{nearest(name, CONFIGURATIONS)}")
+    chosen = {name: CONFIGURATIONS[name] for name in names}
+    subjects = subjects_from(scenarios, arms, seeds, test, carrier_only=carrier_only)
+    rows = Rows(out)
+    with progress_bar(kept="Finished rows are") as progress:
+        wanted = sweep(subjects, chosen, rows, progress=progress)
+    if format_ == "json":
+        print_json(wanted)
+        return
+    cells = [line.cells() for line in lines_of(wanted, chosen)]
+    caption = "in brackets: paired difference to ours, ± half its 95 % interval over the arms; * if it excludes zero"
+    show(HEADS, cells, format_, title=f"d of the carrying joint on {len(subjects)} arms", caption=caption)
+
+
+def places(text: str) -> list[int]:
+    """Places of arms from `0,2`.
+
+    Raises:
+        FleetError: not whole numbers from zero.
+    """
+    try:
+        found = [int(part) for part in text.split(",")]
+    except ValueError:
+        found = [-1]
+    if min(found) < 0:
+        raise FleetError(f"--arms must be whole numbers from 0, separated by commas (got '{text}').")
+    return found
+
+
+def parsimony_command(
+    out: Annotated[Path, typer.Option(help="File of the rows; finished ones are not computed again.")] = Path(
+        "runs/twin_parsimony.jsonl"
+    ),
+    scenarios: ScenariosOption = SCENARIOS,
+    arms: ArmsOption = "0,2",
+    seeds: SeedsOption = 1,
+    test: TestOption = 600,
+    format_: FormatOption = "table",
+) -> None:
+    """Compare twins and temperature regressors trained on more and more jobs: how much data each needs.
+
+    The regressor is an LSTM on torques, trained on the temperatures of the same
+    jobs, or of as many jobs of any heat. A minute of one core for each arm; the
+    same command continues after an interruption.
+    """
+    choose("format", format_, Literal["table", "markdown", "json"])
+    from scenarios.studies.sweep.parsimony import HEADS, parsimony, summary
+    from scenarios.studies.sweep.rows import Rows
+
+    subjects = subjects_from(scenarios, arms, seeds, test, carrier_only=True)
+    with progress_bar(kept="Finished rows are") as progress:
+        rows = parsimony(subjects, Rows(out), progress=progress)
+    if format_ == "json":
+        print_json(rows)
+        return
+    show(HEADS, summary(rows), format_, title=f"Quality by amount of training data, {len(subjects)} arms")
+
+
+def subjects_from(scenarios: str, arms: str, seeds: int, test: int, *, carrier_only: bool = False) -> "list[Subject]":
+    """The subjects that the options name."""
+    from scenarios.studies.sweep.subjects import Sizes, subjects_of
+
+    chosen = [load(name.strip()) for name in scenarios.split(",")]
+    numbers = range(1, seeds + 1)
+    return list(
+        subjects_of(chosen, arms=places(arms), seeds=numbers, sizes=Sizes(test=test), carrier_only=carrier_only)
+    )
+
+
+def show(heads: Sequence[str], rows: Sequence[Sequence[str]], format_: str, *, title: str, caption: str = "") -> None:
+    """Print rows as a table, or in Markdown."""
+    from scenarios.studies.sweep.table import markdown
+
+    if format_ == "markdown":
+        echo(markdown(heads, rows), nl=False)
+        return
+    table = plain_table(*heads, title=title, caption=caption or None)
+    for row in rows:
+        table.add_row(*row)
+    out_console.print(table)

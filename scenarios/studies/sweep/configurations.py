@@ -1,0 +1,70 @@
+"""Configurations that a sweep compares: one choice of the twin changed at a time, and the paper's own choices."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal  # Any: values of fields of TwinConfig
+
+from twin.vae.config import TwinConfig
+
+BASE = replace(TwinConfig.quick(), allow_collapse=True)
+"""What every row changes in one point: the size that the scenarios of the library use. A collapse is a result too."""
+OURS = "ours"
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """One row of the sweep."""
+
+    group: str
+    """What is varied."""
+    label: str
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    """Fields of `BASE` with other values."""
+    data: Literal["cool", "any"] = "cool"
+    """Training motion: cool over the whole horizon, or any motion, as if chosen by the temperature of the moment: all
+    work begins cool."""
+
+    @property
+    def config(self) -> TwinConfig:
+        """The configuration; strides no longer than the window."""
+        window = self.changes.get("window", BASE.window)
+        base = replace(BASE, stride=min(BASE.stride, window), score_stride=min(BASE.score_stride, window))
+        return replace(base, **self.changes)
+
+
+SGD = {"optimizer": "sgd", "learning_rate": 0.1, "epochs": 60}
+"""Three times the steps: SGD needs them."""
+PAPER = {**SGD, "loss": "mean", "layers": 2, "noise": (0.0, 0.0, 0.0)}
+CONFIGURATIONS: Mapping[str, Configuration] = {
+    OURS: Configuration("ours", "quick: β 1, 4 s, latent 2, one layer, Adam 0.005, 20 epochs"),
+    "paper": Configuration("paper", "all of the paper's choices below", PAPER, data="any"),
+    "paper_cool": Configuration("paper", "the same, trained on motion that is cool by the whole horizon", PAPER),
+    "paper_sum": Configuration("paper", "the same with the summed loss", {**PAPER, "loss": "sum"}),
+    "mean": Configuration("paper, one at a time", "mean loss", {"loss": "mean"}),
+    "sgd": Configuration("paper, one at a time", "SGD 0.1, 60 epochs", SGD),
+    "moment": Configuration("paper, one at a time", "cool by the temperature of the moment", data="any"),
+    "layers_2": Configuration("paper, one at a time", "two LSTM layers", {"layers": 2}),
+    "no_noise": Configuration("paper, one at a time", "no sensor noise", {"noise": (0.0, 0.0, 0.0)}),
+    "window_1s": Configuration("window", "1 s", {"window": 12}),
+    "window_2s": Configuration("window", "2 s", {"window": 25}),
+    "window_8s": Configuration("window", "8 s", {"window": 100}),
+    "beta_0.25": Configuration("β", "0.25", {"beta": 0.25}),
+    "beta_4": Configuration("β", "4", {"beta": 4.0}),
+    "beta_16": Configuration("β", "16", {"beta": 16.0}),
+    "latent_1": Configuration("latent", "1", {"latent": 1}),
+    "latent_4": Configuration("latent", "4", {"latent": 4}),
+    "latent_8": Configuration("latent", "8", {"latent": 8}),
+    "rate_0.001": Configuration("learning rate", "0.001", {"learning_rate": 1e-3}),
+    "rate_0.01": Configuration("learning rate", "0.01", {"learning_rate": 1e-2}),
+    "epochs_60": Configuration("training", "60 epochs, rate 0.003", {"epochs": 60, "learning_rate": 3e-3}),
+    "untrained": Configuration("training", "untrained", {"epochs": 1, "learning_rate": 1e-9}),
+    "restarts_2": Configuration("training", "two restarts", {"restarts": 2}),
+    "epochs_180": Configuration("training", "180 epochs", {"epochs": 180}),
+    "best_2s": Configuration("together", "2 s, latent 4, 60 epochs", {"window": 25, "latent": 4, "epochs": 60}),
+    "best_1s": Configuration("together", "1 s, latent 4, 60 epochs", {"window": 12, "latent": 4, "epochs": 60}),
+    "hidden_16": Configuration("hidden units", "16", {"hidden": 16}),
+    "hidden_64": Configuration("hidden units", "64", {"hidden": 64}),
+    "whole_arm": Configuration("scope", "one network", {"scope": "arm", "hidden": 64, "latent": 8}),
+    "ae": Configuration("scope", "autoencoder", {"kind": "ae"}),
+}
+"""By the key of their rows, the most informative first."""

@@ -1,0 +1,113 @@
+"""The rows of a sweep as one table: means over the subjects, and paired differences to our configuration."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+
+import numpy as np
+
+from scenarios.studies.sweep.configurations import OURS, Configuration
+from scenarios.studies.sweep.measure import interval
+from scenarios.studies.sweep.rows import Row
+
+COLUMNS: Mapping[str, tuple[str, ...]] = {
+    "AUROC": ("hot_60", "carrier", "auroc"),
+    "AUPRC": ("hot_60", "carrier", "auprc"),
+    "Spearman": ("hot_60", "carrier", "spearman"),
+    "AUROC, hot from 40 °C": ("hot_40", "carrier", "auroc"),
+    "AUROC, 40–60 °C left out": ("no_band", "carrier", "auroc"),
+    "any joint, Σ w d": ("hot_60", "weighted", "auroc"),
+    "any joint, Σ d": ("hot_60", "sum", "auroc"),
+    "Σ d of means": ("hot_60", "sum_of_means", "auroc"),
+}
+"""Path in a row of each measure that is compared with ours; the first five are of d of the carrying joint."""
+PLAIN = ("active units", "KL, nat", "epochs", "CPU s")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A measure of one configuration."""
+
+    mean: float
+    half: float
+    """Half the width of its 95 % interval over the subjects."""
+    lead: float | None = None
+    """Mean difference to our configuration on the same subjects; None for ours."""
+    lead_half: float = 0.0
+
+    def __str__(self) -> str:
+        if self.lead is None:
+            return f"{_short(self.mean)} ± {_short(self.half)}"
+        clear = "*" if abs(self.lead) > self.lead_half > 0 else ""
+        sign = "−" if self.lead < 0 else "+"
+        return f"{_short(self.mean)} ({sign}{_short(abs(self.lead))} ± {_short(self.lead_half)}{clear})"
+
+
+@dataclass(frozen=True)
+class Line:
+    """One configuration."""
+
+    name: str
+    configuration: Configuration
+    subjects: int
+    measures: Mapping[str, Cell]
+    """By the names of `COLUMNS`."""
+    plain: Mapping[str, float]
+    """Means, by the names of `PLAIN`."""
+
+    def cells(self) -> list[str]:
+        """The line as text: group, configuration, measures, plain numbers and the number of subjects."""
+        units, nats, epochs, cpu_s = (self.plain[name] for name in PLAIN)
+        return [
+            self.configuration.group,
+            self.configuration.label,
+            *(str(self.measures.get(column, "–")) for column in COLUMNS),
+            f"{units:.1f}",
+            f"{nats:.2f}",
+            f"{epochs:.0f}",
+            f"{cpu_s:.0f}",
+            str(self.subjects),
+        ]
+
+
+HEADS = ("group", "configuration", *COLUMNS, *PLAIN, "arms")
+
+
+def lines_of(rows: Iterable[Row], configurations: Mapping[str, Configuration]) -> list[Line]:
+    """A line for each configuration that has rows, in the order of the configurations."""
+    by_name: dict[str, dict[str, Row]] = {}
+    for row in rows:
+        by_name.setdefault(row["configuration"], {})[row["subject"]] = row
+    ours = by_name.get(OURS, {})
+    return [_line(name, configurations[name], by_name[name], ours) for name in configurations if name in by_name]
+
+
+def _line(name: str, configuration: Configuration, rows: Mapping[str, Row], ours: Mapping[str, Row]) -> Line:
+    shared = [] if name == OURS else [subject for subject in rows if subject in ours]
+    measures: dict[str, Cell] = {}
+    for column, path in COLUMNS.items():
+        if any(path[1] not in row[path[0]] for row in rows.values()):
+            continue  # of the carrying joint only
+        mean, half = interval([_at(row, path) for row in rows.values()])
+        leads = [_at(rows[subject], path) - _at(ours[subject], path) for subject in shared]
+        measures[column] = Cell(mean, half, *interval(leads)) if leads else Cell(mean, half)
+    columns = {
+        "active units": [row["active_units"][0] for row in rows.values()],
+        "KL, nat": [row["kl"][0] for row in rows.values()],
+        "epochs": [row["epochs"] for row in rows.values()],
+        "CPU s": [row["cpu_s"] for row in rows.values()],
+    }
+    return Line(name, configuration, len(rows), measures, {key: float(np.mean(v)) for key, v in columns.items()})
+
+
+def _at(row: Row, path: Sequence[str]) -> float:
+    return float(reduce(lambda part, key: part[key], path, row))  # pyright: ignore[reportArgumentType]
+
+
+def _short(value: float) -> str:
+    return f"{value:.3f}".removeprefix("0")
+
+
+def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    return "\n".join(["| " + " | ".join(row) + " |" for row in (heads, ["---"] * len(heads), *rows)]) + "\n"
