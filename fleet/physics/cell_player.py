@@ -91,7 +91,11 @@ class CellPlayer:
         import mujoco.viewer
 
         pause = threading.Event()
-        with mujoco.viewer.launch_passive(self.model, self.data) as viewer:
+        with mujoco.viewer.launch_passive(self.model, self.data, show_left_ui=False, show_right_ui=False) as viewer:
+            low, high = self._mounts_m.min(axis=0), self._mounts_m.max(axis=0)
+            viewer.cam.azimuth, viewer.cam.elevation = AZIMUTH_DEG, ELEVATION_DEG
+            viewer.cam.lookat[:] = (low + high) / 2 + (0.0, 0.0, ROOM_M)
+            viewer.cam.distance = 2.0 + float(np.ptp(self._mounts_m, axis=0).max())
             while viewer.is_running():
                 with viewer.lock():
                     update()
