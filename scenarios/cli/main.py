@@ -74,7 +74,7 @@ COMMANDS = {
     "ros2": LazyCommand(_LIVE, "ros2:ros2_app", "Connect a fleet and ROS 2."),
     "vda5050": LazyCommand(_LIVE, "live.vda5050:vda5050_command", "Take orders by VDA 5050 over MQTT."),
     "keys": LazyCommand(_LIVE, "keys:keys_command", "Make and show TLS keys and certificates."),
-    "twin": LazyCommand(_TWIN, "twin:twin_app", "Train, score and use the digital twin of an arm."),
+    "twin": LazyCommand(_TWIN, "twin.group:twin_app", "Train, score and use the digital twin of an arm."),
     "hold": LazyCommand(_TWIN, "scenarios.motion.hold:hold_command", "Compute how long an arm can hold a payload."),
     "contract": LazyCommand(_TOOLS, "contract:contract_command", "Generate the bus schemas and the tables in docs."),
 }

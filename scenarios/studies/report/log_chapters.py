@@ -184,7 +184,12 @@ def log_difficulty_chapter(book: Logbook) -> Section:
 
 
 def _score_name(key: str) -> str:
-    names = {"d": "d of joint 2", "rms_torque": "RMS torque"}
+    names = {
+        "d": "d of joint 2",
+        "load": "torque above the reconstruction",
+        "latent": "latent distance",
+        "rms_torque": "RMS torque",
+    }
     return names.get(key) or f"error of {CHANNEL_NAMES[CHANNELS.index(key)]}"
 
 

@@ -1,0 +1,1 @@
+"""The `twin` commands: train, score, judge and use the digital twin of an arm."""
