@@ -13,7 +13,7 @@ from fleet.errors import FleetError
 from scenarios.cli import options
 from scenarios.cli.terminal import echo, out_console, plain_table, print_json, progress_bar, say
 from scenarios.cli.twin.motion import export_command, generate_command, identify_command, recover_command
-from scenarios.cli.twin.verdict import readings_command, verdict_command
+from scenarios.cli.twin.verdict import questions_command, readings_command, sides_command, verdict_command
 from scenarios.load import load
 from scenarios.schema_errors import choose
 
@@ -145,6 +145,8 @@ twin_app.command("recover")(recover_command)
 twin_app.command("export")(export_command)
 twin_app.command("verdict")(verdict_command)
 twin_app.command("readings")(readings_command)
+twin_app.command("sides")(sides_command)
+twin_app.command("questions")(questions_command)
 
 
 @twin_app.command("reliability")

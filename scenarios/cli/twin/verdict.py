@@ -1,4 +1,4 @@
-"""`thermofleet twin verdict` and `twin readings`."""
+"""`thermofleet twin verdict`, `twin readings`, `twin sides` and `twin questions`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -139,6 +139,91 @@ def readings_command(
     ):
         out_console.print(readings_table(card, question, title))
     say(f"Written to {out}.", out_console)
+
+
+def sides_command(
+    scenario: options.ScenarioArg,
+    arm: Annotated[str | None, typer.Option("--arm", help="Arm of the scenario; default: the first.")] = None,
+    count: Annotated[int, options.number("Motions from each side.", 2, 10_000)] = 40,
+    strength: Annotated[
+        float, options.number("Perturbation in posterior standard deviations; 0 reconstructs.", 0, 100, "--s")
+    ] = 1.0,
+    seed: Annotated[int, options.number("Random seed.", 0, options.MAX_SEED)] = 1,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Generate motion from the hot and from the cool side of the latent space, and tell how much of it gets hot.
+
+    The arm gets random jobs with true outcomes and a twin trained on its cool
+    ones, as in `twin readings`. Takes some minutes.
+    """
+    from dataclasses import asdict
+
+    import numpy as np
+
+    from fleet.files import cache_folder
+    from scenarios.prepare.train_twins import train_or_load
+    from scenarios.studies.setup import make_study
+    from scenarios.studies.verdict.readings import SIZES
+    from scenarios.studies.verdict.sides import COMMON_KG, sides
+    from twin.vae.config import TwinConfig
+
+    chosen = load(scenario)
+    index = 0 if arm is None else chosen.index_of(arm)
+    draw = np.random.SeedSequence([seed, index + 1])
+    with progress_bar() as progress:
+        progress("drawing jobs", 0.0)
+        make: Any = make_study  # sizes by name
+        study = make(draw, **SIZES, robot=chosen.arms[index].robot())
+        config = TwinConfig.quick()
+        twin = train_or_load(study.train.records(), config, draw, arm="arm", folder=cache_folder())
+        result = sides(study, twin, count=count, s=strength, seed=seed, progress=progress)
+    if as_json:
+        print_json({"scenario": chosen.name, "arm": chosen.arms[index].name, "seed": seed, **asdict(result)})
+        return
+    title = f"Motion generated from each side of the latent space: {chosen.arms[index].name} of {chosen.name}"
+    caption = f"Shares with 95 % intervals; warm: above {study.cool_c:g} °C, critical: {study.warning_c:g} °C or more"
+    table = plain_table("payload", "side", "motions", "warm", "critical", "median °C", title=title, caption=caption)
+    for name, by_side in (("as the source", result.own), (f"{COMMON_KG:g} kg for all", result.common)):
+        for side, share in by_side.items():
+            shares = interval_text(*share.warm), interval_text(*share.critical)
+            table.add_row(name, side, str(share.motions), *shares, f"{share.peak_c:.1f}")
+    out_console.print(table)
+
+
+def questions_command(
+    log: Annotated[Path, typer.Option("--log", help="A folder of logs of one arm, with motor temperatures.")],
+    seeds: Annotated[int, options.number("Number of seeds, from 0.", 1, 100)] = 3,
+    skip_damaged: options.DamagedOption = False,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Tell on which questions about an arm's heat d of joint 2 is ahead of RMS torque, cross-validated by file.
+
+    A twin for each fold and seed: some minutes.
+    """
+    from dataclasses import asdict
+
+    from fleet.files import cache_folder
+    from scenarios.studies.verdict.log_questions import answers, judged_windows
+
+    recordings = options.recordings_of(log, skip_damaged)
+    found = {}
+    with progress_bar() as progress:
+        for seed in range(seeds):
+            windows = judged_windows(recordings, seed, folder=cache_folder(), progress=progress)
+            found[seed] = answers(windows)
+    if as_json:
+        print_json({str(s): {q: asdict(answer) for q, answer in by.items()} for s, by in found.items()})
+        return
+    caption = "[95 % interval, bootstrap over files]; lead: AUROC minus that of RMS torque"
+    for question, first in found[0].items():
+        title = f"{question}: {first.events} of {first.windows} windows, in {first.files_with} of {first.files} files"
+        table = plain_table("seed", "score", "AUROC", "lead", title=title, caption=caption)
+        for seed, by_question in found.items():
+            answer = by_question[question]
+            for name, auroc in answer.auroc.items():
+                lead = interval_text(*answer.lead[name]) if name in answer.lead else ""
+                table.add_row(str(seed), name, interval_text(*auroc), lead)
+        out_console.print(table)
 
 
 def readings_table(card: dict[str, Any], question: str, title: str) -> Table:  # JSON

@@ -105,12 +105,14 @@ def study_arms(
     config: TwinConfig,
     folder: Path,
     sizes: Mapping[str, int] = SIZES,
+    make: Callable[..., Study] = make_study,
     progress: Progress = quiet,
 ) -> dict[str, Any]:
     """Judge every reading on every arm under every seed; finished ones are taken from `out`, which is kept up to date.
 
     Args:
         folder: Cache of trained twins.
+        make: Makes the study of an arm; sizes as in `make_study`.
 
     Returns:
         The content of `out`: for each arm and seed what it measured.
@@ -131,7 +133,7 @@ def study_arms(
         seed, number = seeds[done // len(units)], done % len(units)
         scenario, arm = units[number]
         draw = np.random.SeedSequence([seed, number + 1])
-        study = make_study(draw, **sizes, robot=scenario.arms[arm].robot())
+        study = make(draw, **sizes, robot=scenario.arms[arm].robot())
         twin = train_or_load(study.train.records(), config, draw, arm="arm", folder=folder)
         card["arms"][name] = judge_arm(study, twin)
         with atomic_path(out) as draft:
