@@ -7,6 +7,7 @@ motion would score as difficult. `scenarios/studies/exploration.py` measures the
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -159,4 +160,5 @@ def train_or_load(
         save(train(records, config, seed, arm=arm), home)
 
     home = folder / "twins" / training_key(records, config, seed)
-    return load_or_make([CachedModel(home, load, make)], "training")[0]
+    of_same_joints = partial(load, joints=records[0].shape[-1])
+    return load_or_make([CachedModel(home, of_same_joints, make)], "training")[0]

@@ -157,7 +157,9 @@ def render(rows: Sequence[Row], how: str, *, caption: str) -> str | Table:
     table = Table(box=None, pad_edge=False, caption=caption, caption_justify="left")
     for head in (head for head in heads if head not in OMITTED):
         text = isinstance(rows[0][head], str)
-        table.add_column(SHORT.get(head, head), justify="left" if text else "right", no_wrap=not text)
+        table.add_column(
+            SHORT.get(head, head), justify="left" if text else "right", no_wrap=not text or head == "verdict"
+        )
     for row in rows:
         table.add_row(*(_cell(value) for head, value in row.items() if head not in OMITTED))
     return table

@@ -5,7 +5,7 @@ intervals are bootstraps over files.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from fleet.errors import FleetError
 from scenarios.progress import Count, Progress, quiet
 from scenarios.studies.ranking import CARRIER
 from scenarios.studies.real_logs import CONFIG, HOT_C, LogStudy, recording_peaks, study_of
-from twin.logs.recording import Recording
+from twin.logs.recording import READINGS, Recording
 from twin.vae.config import TwinConfig
 
 Array = np.ndarray
@@ -79,6 +79,7 @@ def judged_windows(
     Raises:
         FleetError: fewer cool files than folds.
     """
+    recordings = [_up_to_carrier(recording) for recording in recordings]
     rng, peaks = np.random.default_rng(seed), recording_peaks(recordings)
     cool = [r.name for r in recordings if peaks[r.name] < HOT_C]
     hot = [r.name for r in recordings if peaks[r.name] >= HOT_C]
@@ -99,6 +100,13 @@ def judged_windows(
         parts.append({"file": study.file, "fold": np.full(len(study.file), fold), **moments, **own})
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return Windows(scores={name: joined.pop(name) for name in SCORES}, **joined)
+
+
+def _up_to_carrier(recording: Recording) -> Recording:
+    """The recording of joints 1 and 2 alone: each joint has a network of its own, and only joint 2 is judged."""
+    kept = {name: getattr(recording, name) for name in READINGS}
+    some = {name: None if values is None else values[:, : CARRIER + 1] for name, values in kept.items()}
+    return replace(recording, **some)
 
 
 @dataclass(frozen=True, kw_only=True)
