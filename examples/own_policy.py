@@ -28,7 +28,7 @@ class Careful:
         self._rule.reset(rng)
 
     def choose(self, observation, place):
-        """Return WAIT, or k to claim the job in slot k; fleet/observation.py defines the observation.
+        """Return WAIT, or 1 + k to claim option k; fleet/observation.py defines the observation.
 
         `place` is the arm's index in the fleet.
         """

@@ -34,7 +34,7 @@ def test_each_side_says_what_happened_and_what_became_of_the_job_on_the_other():
     burned, spared = re.findall(r"<section>(.*?)</section>", page, re.S)
     assert "<h2>round_robin</h2>" in burned
     assert "status bad" in burned
-    assert "arm_a stopped with crate: motor 2 passed 75 °C" in burned
+    assert "arm_a stopped during crate, out for 13 min: the motor of joint 2 passed 75 °C" in burned
     assert "Under wsept, arm_b finished crate at 0:05:00 without a fault." in burned
     assert 'href="round_robin/report.html"' in burned
     assert "status good" in spared

@@ -212,7 +212,7 @@ def test_a_run_without_figures_readings_or_events_still_has_a_report() -> None:
     run = {"status": "interrupted", "metrics": {"value": None, "availability": float("nan"), "peak_c": {}}}
     text = page(run, (), readings=telemetry(0))
     assert "unnamed scenario" in text
-    assert "No motor reached its limit" in text
+    assert "No motor reached its fault limit" in text
     assert "nan%" not in text
     go.Figure(drawn(text))
 
@@ -250,15 +250,29 @@ def test_telemetry_of_another_fleet_is_refused() -> None:
 
 
 @given(
-    arrays(np.float64, st.integers(1, 400), elements=st.floats(-50, 150)),
-    st.integers(4, 60),
+    arrays(np.float64, st.integers(1, 400), elements=st.floats(-50, 150) | st.just(np.nan)),
+    st.integers(5, 60),
 )
-def test_decimation_keeps_both_extremes_the_ends_and_the_limit(value: np.ndarray, limit: int) -> None:
+def test_decimation_keeps_both_extremes_the_ends_a_gap_and_the_limit(value: np.ndarray, limit: int) -> None:
     kept = decimate(value, limit)
     assert len(kept) <= max(limit, 0)
     assert (np.diff(kept) > 0).all()
     assert (kept[0], kept[-1]) == (0, len(value) - 1)
-    assert (value[kept].min(), value[kept].max()) == (value.min(), value.max())
+    assert np.isnan(value[kept]).any() == np.isnan(value).any()
+    if np.isfinite(value).any():
+        assert (np.nanmin(value[kept]), np.nanmax(value[kept])) == (np.nanmin(value), np.nanmax(value))
+
+
+def test_a_long_name_leaves_room_for_the_figure_and_is_no_template() -> None:
+    arms = ("left_" + "W" * 120 + "_1", "%{meta.lane_title}")
+    events = (Event(time_s=0.0, kind="award", arm=arms[0], job="q" * 120 + "-001"),)
+    shown = drawn(page(events=events, arms=arms))
+    assert max(map(len, shown["layout"]["yaxis"]["ticktext"])) < 30
+    assert shown["layout"]["yaxis"]["ticktext"][0].startswith("left_WW")
+    assert shown["layout"]["yaxis"]["ticktext"][0].endswith("WW_1")
+    assert max(len(trace.get("name", "")) for trace in shown["data"]) <= 30
+    assert any("q" * 120 in str(trace.get("customdata")) for trace in shown["data"])
+    assert "%{meta" not in json.dumps(shown)
 
 
 def test_a_short_spike_of_a_long_shift_is_drawn() -> None:

@@ -152,11 +152,21 @@ def print_json(value: object) -> None:
     echo(msgspec.json.format(msgspec.json.encode(value), indent=1).decode())
 
 
+MOST_LABEL = 40
+"""Characters of a row's label, so that a long name of an arm leaves room for the figures."""
+
+
 def plain_table(*heads: str, numbers: bool = True, title: str | None = None, caption: str | None = None) -> Table:
     """An empty table without lines; with `numbers` all columns but the first are aligned to the right."""
     table = Table(box=None, pad_edge=False, title=title, caption=caption, title_justify="left", caption_justify="left")
     for column, head in enumerate(heads):
-        table.add_column(head, justify="right" if numbers and column else "left", no_wrap=numbers and not column)
+        named = numbers and not column
+        table.add_column(
+            head,
+            justify="right" if numbers and column else "left",
+            no_wrap=named,
+            max_width=MOST_LABEL if named else None,
+        )
     return table
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from fleet.bus.protocol.auction import MOST_JOBS
-from fleet.bus.protocol.cell import Cell, CellArm, CellKind, CellPlace, Limit, PlannedWork
+from fleet.bus.protocol.cell import Cell, CellArm, CellFixture, CellKind, CellPlace, Limit, PlannedWork
 from fleet.bus.protocol.messages import encode
 from fleet.files import cache_folder
 from fleet.job import BOUNDS, Work
@@ -45,6 +45,7 @@ def cell_message(scenario: Scenario, auctioneer: str, *, cache: Path | None = No
         warning_c=scenario.limits.warning_c,
         error_c=scenario.limits.error_c,
         jobs_in_message=MOST_JOBS,
+        fixtures=tuple(CellFixture(f.name, f.position_m, f.size_m, f.tilt_deg) for f in scenario.fixtures),
     )
     if len(encode(cell)) > MAX_BYTES:
         cell = replace(cell, arms=tuple(replace(arm, works=()) for arm in cell.arms))

@@ -15,11 +15,9 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.types import Scope
 
-from fleet.bus.protocol.cell import Cell, Point
+from fleet.bus.protocol.cell import Cell
 from fleet.env.render.heat import heat_scale
-from fleet.job import Place
 from fleet.live.monitor.async_bridge import NoReply
-from fleet.robot import Mount, Robot
 from scenarios.report.three import three_js
 
 PAGE = "dashboard.html"
@@ -41,7 +39,7 @@ class LivePage:
     """The page of a gateway."""
 
     def __init__(self, model: Mapping[str, Any] | None = None) -> None:
-        """Prepare; without a model the cell is drawn as the auctioneer describes it, without fixtures."""
+        """Prepare; without a model the cell is drawn as the auctioneer describes it."""
         self._given, self._model = model is not None, model
         self._cell: Cell | None = None
 
@@ -87,22 +85,6 @@ def is_public(scope: Scope) -> bool:
 
 
 def _model_of(cell: Cell) -> Mapping[str, Any]:
-    from fleet.physics.cell_model import cell_model  # loads MuJoCo
+    from scenarios.live.described_cell import described_model  # loads MuJoCo
 
-    robots = [
-        Robot(name=f"arm_{i}", mount=Mount(position_m=_xyz(arm.position_m), tilt_deg=_xyz(arm.tilt_deg)))
-        for i, arm in enumerate(cell.arms)
-    ]
-    places = [
-        Place(name=place.name, position_m=_xyz(place.position_m), tool_deg=_xyz(place.tool_deg))
-        for place in cell.places
-    ]
-    model = cell_model(robots, places)
-    for shown, arm in zip(model["arms"], cell.arms, strict=True):
-        shown["name"] = arm.name  # any name of the bus, not only one of a scenario
-    return {**model, "heat": heat_scale(cell.warning_c, cell.error_c)}
-
-
-def _xyz(point: Point) -> tuple[float, float, float]:
-    x, y, z = point
-    return x, y, z
+    return {**described_model(cell, [arm.name for arm in cell.arms]), "heat": heat_scale(cell.warning_c, cell.error_c)}

@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 from msgspec import structs
 
 from fleet.bus.protocol.auction import ArmEvent, Result
+from fleet.bus.protocol.cell import Cell
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Operation
 from fleet.bus.protocol.registry import HISTORY
@@ -96,6 +97,7 @@ class Recorder:
         counts: Messages by series: `state of arm_0`.
         sought: Gaps that may still be filled.
         parts: Number of the last complete part.
+        cell: Description of the cell, for the card.
     """
 
     def __init__(self, folder: Path, fleet: str, card: Card | None) -> None:
@@ -104,6 +106,7 @@ class Recorder:
         self.sought: list[Gap] = [] if card is None else list(card.sought)
         self.parts = 0 if card is None else card.parts
         self._rows: dict[Kind, int] = {} if card is None else card.rows
+        self.cell: Cell | None = None if card is None else card.cell
         self._saved: list[Heard | Gap] = []
         self._unsaved: list[Heard | Gap] = []
         self._journal: Journal[Record] = Journal(folder / JOURNAL, Record)
@@ -263,7 +266,7 @@ class Recorder:
 
     def _write_card(self, status: str, parts: int, rows: dict[Kind, int]) -> None:
         senders = {name: count for name, count in sorted(self.counts.items()) if count.kept}
-        card = Card(RECORDING_FORMAT, status, self.fleet, parts, senders, tuple(self.sought), rows)
+        card = Card(RECORDING_FORMAT, status, self.fleet, parts, senders, tuple(self.sought), rows, self.cell)
         with self._draft(self.folder / CARD) as draft:
             draft.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=1) + b"\n")
 

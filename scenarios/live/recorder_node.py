@@ -4,18 +4,25 @@ import logging
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
+
+from msgspec import structs
 
 from fleet.bus.client.client import BusClient
+from fleet.bus.client.replies import Replies
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, Result
+from fleet.bus.protocol.cell import Cell, CellRequest
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Operation
-from fleet.errors import FleetError
+from fleet.errors import BusError, FleetError
 from scenarios.live.gap_fetcher import GapFetcher
 from scenarios.live.recorder import MAX_ROWS, Recorder
 
 TURN_S, BATCH = 0.5, 1000
 """Real seconds, and messages, after which received messages are written to the disk."""
+CELL_S, CELL_REPLY_S = 30.0, 5.0
+"""Real seconds between two questions about the cell, until one is answered; in which a reply counts."""
 RETRY_S = 5.0
 """Real seconds until the next attempt to write a part to a disk that refused."""
 
@@ -38,6 +45,7 @@ class RecorderNode:
         self._link, self.recorder, self._rotate_s = link, recorder, rotate_s
         self._fetcher = GapFetcher(recorder, connect)
         self._due_s, self._failure = time.monotonic() + rotate_s, ""
+        self._ask_cell_s = -math.inf
         link.subscribe(keys.of_every_arm(link.fleet, "state"), State, recorder.add, history=True)
         link.subscribe(keys.of_every_arm(link.fleet, "event"), ArmEvent, recorder.add, history=True)
         link.subscribe(keys.of_every_auction(link.fleet, "result"), Result, recorder.add, history=True)
@@ -47,6 +55,11 @@ class RecorderNode:
         """Handle messages for a turn, and do what is due; a disk that refuses is tried again later."""
         self._link.serve(min(until_s, time.monotonic() + TURN_S), at_least=BATCH)
         self._fetcher.step(real_s := time.monotonic())
+        if self.recorder.cell is None and real_s >= self._ask_cell_s:
+            self._ask_cell_s = real_s + CELL_S
+            key = keys.of_jobs(self._link.fleet, "cell")
+            with suppress(BusError):  # also with a certificate that does not allow it, the rest is recorded
+                self._link.query(key, CellRequest(), Cell, self._keep_cell, timeout_s=CELL_REPLY_S)
         try:
             if real_s >= self._due_s or (self.recorder.waiting >= MAX_ROWS and not self._failure):
                 self._due_s = real_s + self._rotate_s
@@ -57,6 +70,13 @@ class RecorderNode:
             if not self._failure:
                 _LOG.error("Not recorded yet: %s", error)
             self._failure, self._due_s = str(error), min(self._due_s, real_s + RETRY_S)
+
+    def _keep_cell(self, replies: Replies[Cell]) -> None:
+        """Keep the description of the cell without the work of its arms; the next part puts it on the disk."""
+        for cell in replies.messages.values():
+            self.recorder.cell = structs.replace(cell, arms=tuple(structs.replace(arm, works=()) for arm in cell.arms))
+            self._due_s = -math.inf
+            return
 
     def end(self) -> None:
         """Write everything that has arrived, and end the recording.

@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from msgspec import inspect, structs
 
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
+from fleet.bus.protocol.cell import Cell
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import ControlRequest, Operation
 from fleet.errors import FleetError
@@ -122,6 +123,8 @@ class Card(msgspec.Struct, frozen=True):
     """Missing messages that may still be had."""
     rows: dict[Kind, int] = {}
     """Number of rows in all parts, by kind; none in recordings of earlier versions."""
+    cell: Cell | None = None
+    """As an auctioneer described it, without the work of the arms; None while none has."""
 
 
 def _columns(message: type[msgspec.Struct]) -> dict[str, pa.DataType]:
@@ -145,7 +148,9 @@ SCHEMAS: dict[Kind, pa.Schema] = {
         | {f"{name}_{joint + 1}": pa.float32() for name in SENSORS for joint in range(JOINTS)}
     ),
     "events": pa.schema({"time_s": pa.float64(), **_columns(ArmEvent), "joint": pa.int8()}),
-    "results": pa.schema({"time_s": pa.float64(), **_columns(Result), **_columns(JobStatus)}),
+    "results": pa.schema(
+        {"time_s": pa.float64(), **_columns(Result), **_columns(JobStatus), "offers": pa.string()}  # JSON
+    ),
     "operations": pa.schema(
         {"time_s": pa.float64(), **_columns(Operation), **_columns(ControlRequest)}
         | {name: pa.string() for name in ("action", "job", "arm", "content")}
@@ -176,6 +181,7 @@ def to_row(record: Heard | Gap) -> tuple[Kind, dict[str, object]]:
             return "events", structs.asdict(message)
         case HeardResult(message):
             fields = structs.asdict(message)
+            fields["offers"] = msgspec.json.encode(message.offers).decode() if message.offers else ""
             return "results", fields | structs.asdict(fields.pop("status"))
         case HeardOperation(message):
             request = message.request

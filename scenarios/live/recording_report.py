@@ -7,26 +7,32 @@ and messages that are lost. `order_events` turns it into a sequence that a sched
 import json
 import math
 from collections import Counter, defaultdict, deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any  # values of the report
 
+import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from fleet.bus.protocol.auction import ArmOffer, PlanQuote
+from fleet.bus.protocol.cell import Cell
 from fleet.bus.protocol.operator import ALL_ARMS
 from fleet.errors import FleetError
 from fleet.events import EVENT_KINDS, Event
 from fleet.physics.cell_model import cell_model
 from fleet.robot import JOINTS, ThermalLimits
 from fleet.telemetry import FAULTED, MODES, WORKING, Telemetry
+from scenarios.live.described_cell import described_model
 from scenarios.live.recording import MESSAGES, SENSORS, Kind, lost_rows, read_card, read_parts
 from scenarios.report.gantt import clock
 from scenarios.report.run_page import report_html
 from scenarios.report.schedule import SAME_MOMENT_DIGITS
 from scenarios.schema import Scenario
+from scenarios.shift_records import Offer
 
 Array = np.ndarray
 
@@ -42,17 +48,19 @@ def recording_html(folder: Path, scenario: Scenario | None = None) -> str:
     """The report of a recording, which may still grow, as one HTML page.
 
     Args:
-        scenario: Gives the limits and the cell of the fleet; without it nothing is shown in 3-D.
+        scenario: Gives the limits and the cell of the fleet; by default they are those that the recording has from
+            the auctioneer. With neither, nothing is shown in 3-D.
 
     Raises:
         FleetError: it is no recording, has no states of arms yet, or has arms that the scenario does not have.
     """
-    limits, card = scenario.limits if scenario else ThermalLimits(), read_card(folder)
+    card = read_card(folder)
     epochs = dict.fromkeys(epoch for count in card.speakers.values() for epoch in count.epochs)
     table, log, results, operations = (_of_epoch(read_parts(folder, kind), [*epochs]) for kind in MESSAGES)
     arms = sorted(set(table["arm"].to_pylist()))
     if not arms:
         raise FleetError(f"'{folder}' holds no state of an arm yet; record longer.")
+    warning_c, error_c, model = _cell(scenario, card.cell, arms)
     events = order_events(_arm_events(log), _returns(results))
     events = [event for event in events if event.arm in arms]
     telemetry = telemetry_of(table, arms)
@@ -60,7 +68,7 @@ def recording_html(folder: Path, scenario: Scenario | None = None) -> str:
         "status": {"recording": "interrupted"}.get(card.status, card.status),
         "scenario": {"name": card.fleet},
         "policy": "live recording",
-        "metrics": _metrics(telemetry, events, results, arms, limits),
+        "metrics": _metrics(telemetry, events, results, arms, warning_c),
         "messages": {
             sender: f"{count.kept} recorded, {count.missed} missing" for sender, count in card.speakers.items()
         },
@@ -70,8 +78,31 @@ def recording_html(folder: Path, scenario: Scenario | None = None) -> str:
     }
     if len(epochs) > 1:
         run["epochs"] = f"{len(epochs)} are recorded here; this page shows the last one, {[*epochs][-1]}"
-    model = None if scenario is None else _model(scenario, arms)
-    return report_html(run, telemetry, events, arms, warning_c=limits.warning_c, error_c=limits.error_c, model=model)
+    return report_html(
+        run,
+        telemetry,
+        events,
+        arms,
+        warning_c=warning_c,
+        error_c=error_c,
+        model=model,
+        offers=[offer for row in results.to_pylist() for offer in _offers(row)],
+    )
+
+
+def _cell(
+    scenario: Scenario | None, described: Cell | None, arms: Sequence[str]
+) -> tuple[float, float, dict[str, Any] | None]:
+    """Temperatures of warning and fault, and the cell in three dimensions."""
+    if scenario is not None:
+        return scenario.limits.warning_c, scenario.limits.error_c, _model(scenario, arms)
+    limits, model = ThermalLimits(), None
+    if described is not None:
+        with suppress(ValueError):  # of numbers that no cell has, or of arms that joined later
+            restart_c = min(limits.restart_c, described.warning_c - 1.0)
+            limits = ThermalLimits(warning_c=described.warning_c, error_c=described.error_c, restart_c=restart_c)
+            model = described_model(described, arms)
+    return limits.warning_c, limits.error_c, model
 
 
 def _model(scenario: Scenario, arms: Sequence[str]) -> dict[str, Any]:
@@ -225,8 +256,27 @@ def telemetry_of(table: pa.Table, arms: list[str]) -> Telemetry:
     return Telemetry(time_s=time_s, mode=mode, **out)
 
 
+def _offers(row: Mapping[str, Any]) -> Iterator[Offer]:
+    """What the arms offered for a job that was awarded, from a row of the results."""
+    for offer in msgspec.json.decode(row["offers"] or "[]", type=tuple[ArmOffer, ...]):
+        plan = offer.plan or PlanQuote()
+        yield Offer(
+            time_s=row["time_s"],
+            job=row["job"],
+            arm=offer.arm,
+            awarded=offer.arm == row["arm"],
+            state=offer.mode,
+            feasible=offer.plan is not None,
+            free=offer.free,
+            difficulty=plan.difficulty,
+            peak_c=plan.peak_c,
+            p_saturation=plan.p_saturation,
+            duration_s=plan.duration_s,
+        )
+
+
 def _metrics(
-    telemetry: Telemetry, events: list[Event], results: pa.Table, arms: list[str], limits: ThermalLimits
+    telemetry: Telemetry, events: list[Event], results: pa.Table, arms: list[str], warning_c: float
 ) -> dict[str, Any]:
     """Key figures, named as in a run; what only the simulator knows is left out."""
     late_s = [event.value for event in events if event.kind == "finish"]
@@ -236,7 +286,7 @@ def _metrics(
     span_h = float(telemetry.time_s[-1] - telemetry.time_s[0]) / 3600.0
     seen = np.asarray(np.isfinite(telemetry.temp_c).any(axis=2))
     finished = max(len(late_s), sum(state == "finished" for state in states.values()))
-    hot = (np.nan_to_num(telemetry.temp_c, nan=-np.inf) > limits.warning_c).any(axis=2)
+    hot = (np.nan_to_num(telemetry.temp_c, nan=-np.inf) > warning_c).any(axis=2)
     peaks = {arm: float(np.nanmax(telemetry.temp_c[:, a])) for a, arm in enumerate(arms) if seen[:, a].any()}
     return {
         "jobs": len(jobs),

@@ -125,7 +125,8 @@ def _events(table: pa.Table) -> Iterator[ArmEvent]:
 
 def _results(table: pa.Table) -> Iterator[Result]:
     for row in table.to_pylist():
-        yield msgspec.convert({**row, "status": {name: row[name] for name in JobStatus.__struct_fields__}}, Result)
+        status = {name: row[name] for name in JobStatus.__struct_fields__}
+        yield msgspec.convert({**row, "status": status, "offers": json.loads(row["offers"] or "[]")}, Result)
 
 
 def _operations(table: pa.Table) -> Iterator[Operation]:

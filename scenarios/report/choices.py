@@ -12,8 +12,8 @@ MOST_AWARDS = 300
 MOST_ARMS = 8
 """With more arms, the columns are the best other offers instead of the arms."""
 NOTE = (
-    "P is the probability that a motor reaches its limit, then the predicted peak, the difficulty d and the time "
-    "needed. In brackets: why the arm could not have taken the job then."
+    "Of each arm: P(saturation), the probability that a motor passes its warning limit; the predicted peak; the "
+    "difficulty d; the duration of the job. In brackets: why the arm could not take the job then."
 )
 
 
@@ -60,7 +60,7 @@ def scores(offer: Offer) -> list[str]:
 
 
 def _cell(offer: Offer) -> str:
-    if not offer.feasible or offer.p_saturation is None:
+    if not offer.feasible:
         return CANNOT
     parts = [*scores(offer), f"{(offer.duration_s or 0.0) / 60:.0f} min"]
     barred = "" if offer.free else f" ({offer.state if offer.state != 'idle' else 'place or space taken'})"

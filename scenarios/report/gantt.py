@@ -20,6 +20,8 @@ BAR_HEIGHT = 0.62
 """In rows."""
 LATE = {"color": INK, "width": 1.6}
 HATCH = {"fillmode": "overlay", "fgcolor": "white", "fgopacity": 1.0, "size": 7, "solidity": 0.35}
+ARM_NAME, STREAM_NAME = 16, 30
+"""Most characters of a name beside an axis and in a legend, which take their place from the figure."""
 UNFINISHED = 0.55
 """Opacity of work that was returned or is still running."""
 MARKS = (("fault", "x", FAULT), ("warning", "triangle-up", WARNING))
@@ -29,8 +31,13 @@ def gantt(plan: Schedule, events: Sequence[Event], arms: Sequence[str], unit_s: 
     """All traces; the row of an arm is its index, times are in units of `unit_s`."""
     traces = _work_bars(plan, events, arms, unit_s)
     if plan.outages:
-        look = {"color": FAULT, "opacity": 0.8, "line": {"width": 0}}
+        look = {"color": FAULT, "opacity": 0.8, "line": {"width": 0}, "pattern": HATCH | {"shape": "x"}}
         traces.append(_bars("out after a fault", plan.outages, _outage_text, arms, unit_s, look))
+    if not traces:  # without a trace Plotly draws no rows
+        traces.append(
+            BAR
+            | {"name": "no job was begun", "showlegend": True, "x": [None], "y": [None], "marker": {"color": "#888888"}}
+        )
     for kind, symbol, colour in MARKS:  # above the bars of their arm
         own = [e for e in events if e.kind == kind and e.arm in arms]
         if own:
@@ -54,9 +61,12 @@ def stream_of(job: str) -> str:
     return job.rpartition("-")[0] or job
 
 
-def plain(text: str) -> str:
-    """Text escaped for Plotly, which interprets some HTML."""
-    return html.escape(visible(text), quote=False)
+def plain(text: str, most: int | None = None) -> str:
+    """Text escaped for Plotly, which interprets some HTML and `%{…}`; with `most`, its start and end are kept."""
+    shown = visible(text)
+    if most is not None and len(shown) > most:
+        shown = f"{shown[: most - most // 2 - 1]}…{shown[-(most // 2) :]}"
+    return html.escape(shown, quote=False).replace("%{", "%&#123;")
 
 
 def clock(time_s: float) -> str:
@@ -85,18 +95,27 @@ def _work_bars(plan: Schedule, events: Sequence[Event], arms: Sequence[str], uni
                 "color": [LATE["color"] if a.late_s else "white" for a in own],
                 "width": [LATE["width"] if a.late_s else 0.6 for a in own],
             },
-            "pattern": HATCH | {"shape": ["/" if a.outcome == "returned" else "" for a in own]},
+            "pattern": HATCH | {"shape": [_shape(a) for a in own]},
         }
-        traces.append(_bars(plain(stream), own, _assignment_text, arms, unit_s, look))
+        traces.append(_bars(plain(stream, STREAM_NAME), own, _assignment_text, arms, unit_s, look))
     outcomes = {a.outcome for a in plan.assignments}
     samples = (
-        ("late", any(a.late_s for a in plan.assignments), {"color": "white", "line": LATE}),
+        (
+            "late",
+            any(a.late_s for a in plan.assignments),
+            {"color": "#888888", "line": LATE, "pattern": HATCH | {"shape": "."}},
+        ),
         ("returned", "returned" in outcomes, {"color": "#888888", "pattern": HATCH | {"shape": "/"}}),
         ("still running", "running" in outcomes, {"color": "#888888", "opacity": UNFINISHED}),
     )
     return traces + [
         BAR | {"name": name, "x": [None], "y": [None], "marker": look} for name, used, look in samples if used
     ]
+
+
+def _shape(a: Assignment) -> str:
+    """Pattern of a bar, for people who see no colours and for dark pages, which show no dark outline."""
+    return "/" if a.outcome == "returned" else "." if a.late_s else ""
 
 
 def _bars(

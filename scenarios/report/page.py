@@ -147,10 +147,11 @@ def _replay_parts(replay: Replay) -> list[str]:
 
 
 def _start(figure: bool, replay: Replay | None) -> str:
-    """The function that begins a page, after everything that it needs."""
-    draw = f"const figure=await drawFigure({json.dumps(_PLOTLY_OPTIONS)});" if figure else "const figure=null;"
-    play = f'await runLibrary("three");await startReplay(figure,{replay.unit_s});' if replay else ""
-    return f"async function start(){{{draw}{play}}}"
+    """The function that begins a page; the replay comes first, since a figure takes longer."""
+    play = f'await runLibrary("three");const shift=await startReplay({replay.unit_s});' if replay else ""
+    draw = f"const figure=await drawFigure({json.dumps(_PLOTLY_OPTIONS)});" if figure else ""
+    join = "shift.attach(figure);" if replay and figure else ""
+    return f'async function start(){{startFilters();{play}{draw}{join}document.body.dataset.ready="all";}}'
 
 
 def _data(key: str, text: str) -> str:
@@ -189,17 +190,23 @@ def figure_place() -> str:
     return f'<div id="figure"></div>\n<noscript>{paragraph(notice)}</noscript>'
 
 
-def paragraph(text: str, style: str = "") -> str:
-    """A paragraph of plain text; `style` is a class of the page's style sheet."""
-    return f'<p class="{style}">{escape(text)}</p>' if style else f"<p>{escape(text)}</p>"
-
-
 @dataclass(frozen=True)
 class Moment:
-    """A time of the shift, and the arm to look at."""
+    """A time of the shift, and the arm to look at; a click on an element with a moment goes there in the replay."""
 
     time_s: float
     arm: str = ""
+
+    @property
+    def marks(self) -> str:
+        """Attributes of the element."""
+        return f' data-time="{self.time_s:g}" data-arm="{escape(self.arm)}"'
+
+
+def paragraph(text: str, style: str = "", moment: Moment | None = None) -> str:
+    """A paragraph of plain text; `style` is a class of the page's style sheet."""
+    marks = (f' class="{style}"' if style else "") + (moment.marks if moment else "")
+    return f"<p{marks}>{escape(text)}</p>"
 
 
 def table(
@@ -216,14 +223,14 @@ def table(
 
     Args:
         kinds: A class of the style sheet for each row; none by default.
-        moments: Of each row; a click on a row goes there in the page's replay.
+        moments: Of each row.
         key: With one, a field above the table filters its rows.
     """
     lines = []
     for i, row in enumerate(rows):
         marks = f' class="{escape(kinds[i])}"' if kinds else ""
         if moments:
-            marks += f' data-time="{moments[i].time_s:g}" data-arm="{escape(moments[i].arm)}" tabindex="0"'
+            marks += moments[i].marks
         lines.append(f"<tr{marks}>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>")
     above = f"<caption>{escape(caption)}</caption>" if caption else ""
     if head:

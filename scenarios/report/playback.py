@@ -50,7 +50,8 @@ def packed(telemetry: Telemetry, payload_kg: Array | None = None) -> str:
     listed: list[dict[str, Any]] = []
     body = b""
     for name, values, scale, stride in arrays:
-        kept = np.moveaxis(np.round(_held(values[::stride]) / scale).astype(np.int64), 0, -1)
+        steps = np.clip(np.round(_held(values[::stride]) / scale), -(2**15), 2**15 - 1)
+        kept = np.moveaxis(steps.astype(np.int64), 0, -1)
         first, step = float(time_s[0]), stride * step_s
         listed.append({"name": name, "shape": kept.shape, "scale": scale, "first_s": first, "step_s": step})
         body += np.diff(kept, axis=-1, prepend=0).astype("<i2").tobytes()

@@ -88,10 +88,11 @@ def _head(run: Mapping[str, Any], arms: Sequence[str], told: Verdict) -> list[st
     how = [f"{length} of {len(arms)} arm{'s' if len(arms) != 1 else ''}"]
     how += [f"{name} {run[name]}" for name in ("plant", "bus", "difficulty") if run.get(name) is not None]
     lines = [paragraph(str(scenario["description"]), "faint")] if scenario.get("description") else []
-    badge = paragraph(told.badge, "status good" if told.good else "status bad")
+    moments = {sentence: _before(fault) for sentence, fault in told.faults.items()}
+    first = next(iter(moments.values()), None)
     return [
-        badge,
-        *(paragraph(sentence, "verdict") for sentence in told.sentences),
+        paragraph(told.badge, "status good" if told.good else "status bad", first),
+        *(paragraph(sentence, "verdict", moments.get(sentence)) for sentence in told.sentences),
         *lines,
         paragraph(" · ".join(how), "faint"),
     ]
@@ -110,7 +111,7 @@ KEY_FIGURES = (
     ("availability", "availability", ".1%", "", ""),
     ("utilisation", "utilisation", ".1%", "", ""),
     ("energy to heat", "energy_wh", ",.0f", " Wh", ""),
-    ("lost claims", "lost_claims", ",.0f", "", ""),
+    ("claims lost to another arm", "lost_claims", ",.0f", "", ""),
 )
 """Label, metric, format, unit, and the metric it is a part of."""
 
@@ -163,9 +164,13 @@ def _event_table(events: Sequence[Event]) -> list[str]:
             style="events",
             key="events",
             kinds=[e.kind for e in listed],
-            moments=[Moment(max(0.0, e.time_s - BEFORE_S), e.arm) for e in listed],
+            moments=[_before(event) for event in listed],
         ),
     ]
+
+
+def _before(event: Event) -> Moment:
+    return Moment(max(0.0, event.time_s - BEFORE_S), event.arm)
 
 
 def _request_table(requests: Sequence[Sequence[str]]) -> list[str]:

@@ -13,7 +13,7 @@ from fleet.env.render.heat import HEAT, heat_marks
 from fleet.events import Event
 from fleet.robot import JOINTS
 from fleet.telemetry import Telemetry
-from scenarios.report.gantt import FAULT, INK, WARNING, Trace, gantt, plain
+from scenarios.report.gantt import ARM_NAME, FAULT, INK, STREAM_NAME, WARNING, Trace, gantt, plain
 from scenarios.report.schedule import Schedule
 
 Array = np.ndarray
@@ -28,7 +28,17 @@ HEAT_BINS = 1440
 """Columns of the heat map."""
 
 GRID, FRAME = "#e6e6e6", "#bbbbbb"
-JOINT_COLOURS = ("#332288", "#cc6677", "#117733", "#88ccee", "#aa4499", "#999933", "#44aa99")
+JOINT_LINES = (
+    ("#4a6fd0", "longdashdot"),
+    ("#cc6677", "solid"),
+    ("#228a44", "dash"),
+    ("#2f8fb5", "dot"),
+    ("#b554a8", "longdash"),
+    ("#8a8a2a", "1px,5px"),
+    ("#2f9488", "dashdot"),
+)
+"""Colour and dash of each joint. Each colour has a contrast above 3 on light and dark pages; the dashes tell apart what
+looks alike to people who see few colours."""
 
 MARGIN = {"l": 90, "r": 84, "b": 52}
 NARROW_PX = 860
@@ -36,7 +46,7 @@ NARROW_PX = 860
 LEGEND_ROW_PX = 20.0
 NAME_PX = 20.0
 """Height of the name of an arm above its lane."""
-MAP_GAP_PX = 90.0
+MAP_GAP_PX, MAP_ROW_PX = 90.0, 8.0
 GAP_PX = 172.0
 """Height between the two blocks, for an axis, a title and a legend."""
 BETWEEN_LANES_PX = 28.0
@@ -87,7 +97,7 @@ def figure(
         "title": {"text": f"time ({unit})", "standoff": 6},
         "domain": [0, 1],
     }
-    limits = (("error", error_c, FAULT, "bottom", "solid"), ("warning", warning_c, WARNING, "top", "dash"))
+    limits = (("error", error_c, FAULT, "bottom", "solid"), ("warning", warning_c, WARNING, "top", "longdash"))
     layout = LAYOUT | _blocks(arms, lanes, _legend_height(bars))
     layout["xaxis"] = time | {"anchor": "y"}
     layout["xaxis2"] = time | {"anchor": f"y{len(lanes) + 1}", "matches": "x"}
@@ -99,7 +109,7 @@ def figure(
     }
     for lane in range(len(lanes)):
         layout[f"yaxis{lane + 2}"] = temperature | layout[f"yaxis{lane + 2}"] | ({"matches": "y2"} if lane else {})
-        layout["annotations"] += [_limit_label(lane, *limit[:4]) for limit in limits]
+        layout["annotations"] += [_limit_label(lane, name, limit_c, anchor) for name, limit_c, _, anchor, _ in limits]
     layout["shapes"] = [
         *(
             {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "yref": f"y{a + 2}", "y0": limit, "y1": limit}
@@ -114,11 +124,10 @@ def figure(
         number = len(lanes) + 2
         layout["xaxis3"] = time | {"anchor": f"y{number}", "matches": "x"}
         # The page may show any other arm in the last lane.
-        title = next(
-            i for i, note in enumerate(layout["annotations"]) if note["text"] == f"<b>{plain(arms[lanes[-1]])}</b>"
-        )
+        title = len(lanes)  # annotations: the title of the heat map, then those of the lanes
         layout["meta"] = {"lane_traces": list(range(len(data) - JOINTS, len(data))), "lane_title": title}
-        data.append(heat_map(telemetry, arms, number, unit, unit_s, warning_c=warning_c, error_c=error_c))
+        heat = heat_map(telemetry, arms, number, unit, unit_s, warning_c=warning_c, error_c=error_c)
+        data.append(heat | {"colorbar": heat["colorbar"] | {"y": layout[f"yaxis{number}"]["domain"][1]}})
     return {"data": data, "layout": layout}
 
 
@@ -162,7 +171,8 @@ def heat_map(
             "tickvals": [0, 2 * (warning_c - low), 2 * (error_c - low)],
             "ticktext": [f"{low:g}", f"{warning_c:g}", f"{error_c:g}"],
             "thickness": 12,
-            "len": 0.2,
+            "lenmode": "pixels",
+            "len": min(200, MAP_ROW_PX * len(arms)),
             "yanchor": "top",
         },
         "customdata": names,
@@ -181,7 +191,7 @@ def _blocks(arms: Sequence[str], lanes: Sequence[int], legend_px: float) -> dict
     overview = len(lanes) < len(arms)
     gantt_px = max(90.0, len(arms) * (40.0 if len(arms) <= 8 else 26.0 if not overview else 12.0))
     lane_px = 120.0 if len(lanes) <= 8 else 84.0
-    map_px = len(arms) * 8.0 if overview else 0.0
+    map_px = len(arms) * MAP_ROW_PX if overview else 0.0
     map_top = gantt_px + MAP_GAP_PX
     first = map_top + map_px if overview else gantt_px
     tops = [first + GAP_PX + a * (lane_px + BETWEEN_LANES_PX) for a in range(len(lanes))]
@@ -199,7 +209,7 @@ def _blocks(arms: Sequence[str], lanes: Sequence[int], legend_px: float) -> dict
         "domain": [paper(gantt_px), 1.0],
         "range": [len(arms) - 0.4, -0.65],
         "tickvals": list(range(len(arms))),
-        "ticktext": [plain(arm) for arm in arms],
+        "ticktext": [plain(arm, ARM_NAME) for arm in arms],
         "showgrid": False,
         "fixedrange": True,
         "automargin": True,
@@ -230,7 +240,7 @@ def _blocks(arms: Sequence[str], lanes: Sequence[int], legend_px: float) -> dict
         },
         "annotations": [
             *([title("Hottest motor of each arm", map_top - 8.0)] if overview else []),
-            *(title(plain(arms[a]), y - 2.0, size=12) for a, y in zip(lanes, tops, strict=True)),
+            *(title(plain(arms[a], STREAM_NAME), y - 2.0, size=12) for a, y in zip(lanes, tops, strict=True)),
         ],
     }
 
@@ -256,7 +266,7 @@ def _temperature_range(temp_c: Array, warning_c: float, error_c: float) -> list[
     return [low - room, high + room]
 
 
-def _limit_label(arm: int, name: str, limit: float, colour: str, anchor: str) -> dict[str, Any]:
+def _limit_label(arm: int, name: str, limit: float, anchor: str) -> dict[str, Any]:
     """Name of a limit at the right of an arm's lane."""
     return TEXT | {
         "text": f"{name} {limit:g} °C",
@@ -266,7 +276,7 @@ def _limit_label(arm: int, name: str, limit: float, colour: str, anchor: str) ->
         "yref": f"y{arm + 2}",
         "yanchor": anchor,
         "yshift": -5 if anchor == "bottom" else 5,
-        "font": {"size": 10, "color": colour},
+        "font": {"size": 10},
     }
 
 
@@ -292,7 +302,7 @@ def _temperatures(
     traces = []
     for lane, a in enumerate(lanes):
         arm = arms[a]
-        for j, colour in enumerate(JOINT_COLOURS):
+        for j, (colour, dash) in enumerate(JOINT_LINES):
             value, name = telemetry.temp_c[:, a, j], f"joint {j + 1}"
             kept = decimate(value, points)
             traces.append(
@@ -307,7 +317,7 @@ def _temperatures(
                     "y": _packed(value[kept]),
                     "xaxis": "x2",
                     "yaxis": f"y{lane + 2}",
-                    "line": {"color": colour, "width": 1.3},
+                    "line": {"color": colour, "width": 1.5, "dash": dash},
                     "hovertemplate": f"{plain(arm)} {name}<br>%{{y:.1f}} °C at %{{x:.2f}} {unit}<extra></extra>",
                 }
             )
@@ -315,24 +325,25 @@ def _temperatures(
 
 
 def decimate(value: Array, limit: int) -> Array:
-    """Samples that keep the look of a long line: lowest and highest of each bin.
+    """Samples that keep the look of a long line: lowest and highest of each bin, and its gap if it has one.
 
     Args:
-        value: [sample].
-        limit: Most samples to keep, at least 4.
+        value: [sample]; NaN is a gap.
+        limit: Most samples to keep, at least 5.
 
     Returns:
         Indices in order, with the first, the last and both extremes among them, int [kept <= limit].
     """
-    if limit < 4:
-        raise ValueError(f"limit must be >= 4 (got {limit}).")
+    if limit < 5:
+        raise ValueError(f"limit must be >= 5 (got {limit}).")
     if len(value) <= limit:
         return np.arange(len(value))
-    edges = np.linspace(0, len(value), (limit - 2) // 2 + 1).astype(int)
+    gap = np.isnan(value)
+    picks = [np.where(gap, np.inf, value), np.where(gap, np.inf, -value), *([~gap] if gap.any() else [])]
+    edges = np.linspace(0, len(value), (limit - 2) // len(picks) + 1).astype(int)
     keep = [0, len(value) - 1]
     for low, high in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        piece = value[low:high]
-        keep += [low + int(piece.argmin()), low + int(piece.argmax())]
+        keep += [low + int(pick[low:high].argmin()) for pick in picks]
     return np.unique(keep)
 
 

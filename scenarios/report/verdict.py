@@ -1,20 +1,26 @@
 """What happened in a shift, in words."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any  # values of run.json
 
 from fleet.events import Event
 from scenarios.report.gantt import clock
-from scenarios.report.schedule import Outage, Schedule
+from scenarios.report.schedule import Assignment, Outage, Schedule
 from scenarios.shift_records import Offer
 
-MOST_FAULTS = 3
+MOST_FAULTS = 2
 """Faults with a sentence of their own."""
 MOST_ARMS = 6
 """Arms that are named in one sentence."""
-CLEARLY = 0.1
-"""P(saturation) of another offer counts as lower if it is less by this."""
+MARGIN_K = 3.0
+"""Another arm would have avoided a fault if its predicted peak was this much below the limit and below the peak of the
+arm that faulted."""
+WEIGHS_PEAK = "wsept"
+"""The built-in policy that weighs the predicted peak against the value of a job."""
+PAUSE_S = 60.0
+"""Two jobs of an arm count as one stretch of work if less time lies between them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,6 +30,8 @@ class Verdict:
     badge: str
     good: bool
     sentences: tuple[str, ...]
+    faults: Mapping[str, Event]
+    """That some of the sentences are about."""
 
 
 def verdict(run: Mapping[str, Any], events: Sequence[Event], plan: Schedule, offers: Sequence[Offer] = ()) -> Verdict:
@@ -37,15 +45,18 @@ def verdict(run: Mapping[str, Any], events: Sequence[Event], plan: Schedule, off
     metrics = run.get("metrics") or {}
     faults = [event for event in events if event.kind == "fault"]
     contacts = sum(event.kind == "contact" for event in events)
+    about = {_fault(fault, plan): fault for fault in faults[:MOST_FAULTS]}
     sentences = [*_jobs(metrics)]
-    for fault in faults[:MOST_FAULTS]:
-        sentences += [_fault(fault, plan), *_other_choice(fault, plan, offers)]
+    for sentence, fault in about.items():
+        sentences += [sentence, *_cause(fault, plan, offers)]
     if len(faults) > MOST_FAULTS:
         of = sorted({fault.arm for fault in faults})
         arms = ", ".join(of[:MOST_ARMS]) + (f" and {len(of) - MOST_ARMS} more" if len(of) > MOST_ARMS else "")
         sentences.append(f"{len(faults)} faults in all, of {arms}: see the events below.")
     elif not faults:
-        sentences.append("No motor reached its limit.")
+        sentences.append(_hottest(metrics))
+    if run.get("policy") != WEIGHS_PEAK:
+        sentences += _foreseen(faults, plan, offers)
     if contacts:
         sentences.append(f"Arms touched something {_times(contacts)}: see the events below.")
     status = str(run.get("status", "unknown"))
@@ -57,7 +68,8 @@ def verdict(run: Mapping[str, Any], events: Sequence[Event], plan: Schedule, off
         badge = "Contact"
     else:
         badge = "No fault" if status == "finished" else f"Status: {status}"
-    return Verdict(badge=badge, good=status == "finished" and not faults and not contacts, sentences=tuple(sentences))
+    good = status == "finished" and not faults and not contacts
+    return Verdict(badge=badge, good=good, sentences=tuple(sentences), faults=about)
 
 
 def duration(time_s: float) -> str:
@@ -79,49 +91,120 @@ def _jobs(metrics: Mapping[str, Any]) -> Iterable[str]:
     yield f"{finished}{of} jobs finished{late}."
 
 
+def _hottest(metrics: Mapping[str, Any]) -> str:
+    peaks_c = {arm: c for arm, c in (metrics.get("peak_c") or {}).items() if c is not None and math.isfinite(c)}
+    if not peaks_c:
+        return "No motor reached its fault limit."
+    arm = max(peaks_c, key=lambda arm: peaks_c[arm])
+    return f"No motor reached its fault limit; the hottest, in {arm}, reached {peaks_c[arm]:.0f} °C."
+
+
 def _fault(fault: Event, plan: Schedule) -> str:
     outage = next((o for o in plan.outages if o.arm == fault.arm and o.start_s == fault.time_s), None)
-    at = f" with {fault.job}" if fault.job else ""
+    at = f" during {fault.job}" if fault.job else ""
     why = fault.reason or f"motor {fault.joint} reached its limit"
-    return f"{clock(fault.time_s)}: {fault.arm} stopped{at}: {why}; {_lost(outage)}."
+    why = why.replace(f"motor {fault.joint} ", f"the motor of joint {fault.joint} ", 1)
+    return f"{clock(fault.time_s)}: {fault.arm} stopped{at}, {_outage(outage)}: {why}."
 
 
-def _lost(outage: Outage | None) -> str:
+def _outage(outage: Outage | None) -> str:
     if outage is None:
-        return "it recovered at once"
+        return "and recovered at once"
     length = duration(outage.end_s - outage.start_s)
-    return f"it was lost for {length}" if outage.recovered else f"it was lost for the remaining {length}"
+    return f"out for {length}" if outage.recovered else f"out for the remaining {length}"
 
 
-def _other_choice(fault: Event, plan: Schedule, offers: Sequence[Offer]) -> Iterable[str]:
-    """What was known when the job of a fault was awarded, and whether another arm had less to fear."""
-    award = next(
-        (
-            a
-            for a in plan.assignments
-            if (a.arm, a.job) == (fault.arm, fault.job) and a.start_s <= fault.time_s <= a.end_s
-        ),
-        None,
-    )
+def _award(fault: Event, plan: Schedule) -> Assignment | None:
+    """The work in which an arm faulted."""
+    same = (a for a in plan.assignments if (a.arm, a.job) == (fault.arm, fault.job))
+    return next((a for a in same if a.start_s <= fault.time_s <= a.end_s), None)
+
+
+def _behind(award: Assignment, offers: Sequence[Offer]) -> list[Offer]:
+    """The offers behind an award; in a live fleet they are a little older than its start."""
+    earlier = [offer for offer in offers if offer.job == award.job and offer.time_s <= award.start_s]
+    last_s = max((offer.time_s for offer in earlier), default=0.0)
+    return [offer for offer in earlier if offer.time_s == last_s]
+
+
+def _own_offer(award: Assignment, offers: Sequence[Offer]) -> Offer | None:
+    """The offer that got the job; None if its scores are unknown."""
+    own = next((o for o in _behind(award, offers) if o.awarded), None)
+    return own if own is not None and own.peak_c is not None and own.p_saturation is not None else None
+
+
+def _foreseen(faults: Sequence[Event], plan: Schedule, offers: Sequence[Offer]) -> Iterable[str]:
+    """How many faults were predicted, and what kind of policy avoids them."""
+    awards = [(fault, _award(fault, plan)) for fault in faults]
+    own = [(fault, _own_offer(award, offers)) for fault, award in awards if award is not None]
+    count = sum(offer is not None and (offer.peak_c or 0.0) >= _limit_c(fault) for fault, offer in own)
+    if count:
+        which = "The fault was" if len(faults) == 1 else f"{count} of {len(faults)} faults were"
+        yield f"{which} predicted: a policy that weighs the predicted peak, such as {WEIGHS_PEAK}, avoids such awards."
+
+
+def _limit_c(fault: Event) -> float:
+    return fault.value if math.isfinite(fault.value) else math.inf
+
+
+def _cause(fault: Event, plan: Schedule, offers: Sequence[Offer]) -> Iterable[str]:
+    """Why an arm faulted, as far as its award tells, and what would have avoided it."""
+    award = _award(fault, plan)
     if award is None:
         return
-    known = [o for o in offers if o.job == fault.job and o.time_s == award.start_s]
-    own = next((o for o in known if o.awarded), None)
-    if own is None or own.peak_c is None or own.p_saturation is None:
+    begin_s = _begin(award, [a for a in plan.assignments if a.arm == fault.arm and a.start_s <= fault.time_s])
+    pause = f"at work without a pause since {clock(begin_s)}; " if begin_s < award.start_s else ""
+    own = _own_offer(award, offers)
+    if own is None:
+        if pause:
+            yield f"Why: {pause}no prediction was recorded."
         return
-    told = f"At its award, {clock(award.start_s)}, the predicted peak was {own.peak_c:.0f} °C, P(saturation) "
-    told += f"{own.p_saturation:.2f}"
-    better = [
-        o for o in known if o.free and o.p_saturation is not None and o.p_saturation <= own.p_saturation - CLEARLY
-    ]
-    if better:
-        best = min(better, key=lambda o: o.p_saturation or 0.0)
-        peak = f"{best.peak_c:.0f} °C, " if best.peak_c is not None else ""
-        yield f"{told}; {best.arm} was free, with {peak}P {best.p_saturation:.2f}."
-    elif any(o.free and not o.awarded for o in known):
-        yield f"{told}; no free arm was clearly better."
-    else:
-        yield f"{told}; no other arm was free for it."
+    yield (
+        f"Why: {pause}at the award, {clock(award.start_s)}, predicted peak {own.peak_c:.0f} °C and P(saturation) "
+        f"{own.p_saturation:.2f}."
+    )
+    yield _avoidable(fault, own, _behind(award, offers), plan)
+
+
+def _begin(award: Assignment, work: Sequence[Assignment]) -> float:
+    """Begin of the work of an arm that led to an award without a pause."""
+    begin_s = award.start_s
+    for a in sorted(work, key=lambda a: a.start_s, reverse=True):
+        if a.start_s < begin_s <= a.end_s + PAUSE_S:
+            begin_s = a.start_s
+    return begin_s
+
+
+def _avoidable(fault: Event, own: Offer, offered: Sequence[Offer], plan: Schedule) -> str:
+    """What would have avoided a fault, by the predictions at the award of its job."""
+    own_c = own.peak_c or math.inf
+    limit_c = _limit_c(fault)
+    most_c = min(own_c, limit_c) - MARGIN_K
+    cooler = [o for o in offered if not o.awarded and o.feasible and o.peak_c is not None and o.peak_c <= most_c]
+    free = [o for o in cooler if o.free]
+    if cooler:
+        best = min(free or cooler, key=lambda o: o.peak_c or 0.0)
+        choice = f"Avoidable by giving the job to {best.arm}, predicted peak {best.peak_c:.0f} °C"
+        return f"{choice}: it was free." if best.free else f"{choice}, {_occupied(best, plan)}."
+    others = "no other arm could do the job" + (" cooler" if any(o.feasible and not o.awarded for o in offered) else "")
+    if own_c < limit_c:
+        return f"Not predicted: the predicted peak was below the limit, and {others}."
+    return f"Avoidable only by letting the job wait until {fault.arm} had cooled: {others}."
+
+
+def _occupied(offer: Offer, plan: Schedule) -> str:
+    """Until when an arm could not have taken a job, or why."""
+    if offer.state == "faulted":
+        return "which was out after a fault"
+    current = next(
+        (a for a in plan.assignments if a.arm == offer.arm and a.start_s <= offer.time_s < a.end_s),
+        None,
+    )
+    if current is None:
+        return "but its place or space was taken"
+    if current.end_s >= plan.horizon_s:
+        return "which was busy to the end"
+    return f"once it was free, at {clock(current.end_s)}"
 
 
 def _times(count: int) -> str:

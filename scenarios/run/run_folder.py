@@ -53,11 +53,17 @@ def run_html(
     events: Sequence[Event],
     jobs: Sequence[JobRecord],
     offers: Sequence[Offer],
+    *,
+    meshes: bool = False,
 ) -> str:
     """The report of a run as one HTML page.
 
     Args:
         card: Content of run.json.
+        meshes: Show Kinova's shells instead of primitives.
+
+    Raises:
+        FleetError: the meshes are not available.
     """
     robots, limits = [arm.robot() for arm in scenario.arms], scenario.limits
     return report_html(
@@ -67,7 +73,7 @@ def run_html(
         [robot.name for robot in robots],
         warning_c=limits.warning_c,
         error_c=limits.error_c,
-        model=cell_model(robots, scenario.places, scenario.fixtures),
+        model=cell_model(robots, scenario.places, scenario.fixtures, meshes=meshes),
         payload_of={job.job: job.payload_kg for job in jobs},
         offers=offers,
     )

@@ -66,7 +66,7 @@ def read_run(folder: Path) -> StoredRun:
         check_format(card, folder)
         scenario = msgspec.convert(card["scenario"], Scenario)
         tables = {name: pq.read_table(folder / f"{name}.parquet") for name in ("telemetry", "events", "jobs", "offers")}
-        return StoredRun(
+        stored = StoredRun(
             card,
             scenario,
             _telemetry(tables["telemetry"], len(scenario.arms)),
@@ -74,6 +74,10 @@ def read_run(folder: Path) -> StoredRun:
             tuple(JobRecord(**row) for row in tables["jobs"].to_pylist()),
             tuple(Offer(**row) for row in tables["offers"].to_pylist()),
         )
+        if not len(stored.telemetry.time_s):
+            raise ValueError("telemetry.parquet has no rows")
+        _ = stored.plan  # raises for events that contradict each other or the fleet
+        return stored
     except (OSError, ValueError, KeyError, TypeError, pa.ArrowInvalid) as error:
         raise FleetError(
             f"'{folder}' is no complete folder of `thermofleet run` ({type(error).__name__}: {error})."

@@ -24,7 +24,12 @@ CODECS = {"mp4": "libx264", "webm": "libvpx"}
 OPTIONS = {"libx264": {"preset": "veryfast", "crf": "27"}, "libvpx": {"deadline": "realtime", "cpu-used": "8"}}
 MOST_LINES = 8
 """Arms whose hottest motor is written in the picture."""
-TEXT_PX, LINE_PX = 16, 21
+MOST_NAMES, NAMES_FROM_PX = 24, 400
+"""In a larger fleet, or a smaller picture, the names of the arms would cover it."""
+TEXT_PX, SMALLEST_PX = 16, 11
+"""Height of text in a picture of 1280 x 720 px, and in the smallest ones."""
+POSTURES = 64
+"""Postures of the film that the camera must hold."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,6 +95,11 @@ class Film:
         show_heat(self.player, q, temp_c, self._load_kg[row], self._limits)
         return temp_c, readings.mode[row]
 
+    def postures(self, at_s: Array) -> Array:
+        """Postures of the span of some times, [sample, arm, joint] in rad; at most `POSTURES`."""
+        first, last = np.searchsorted(self._readings.time_s, (at_s[0], at_s[-1])).clip(0, len(self._readings.q) - 1)
+        return self._readings.q[np.unique(np.linspace(first, last, POSTURES).astype(int))]
+
 
 def frames(run: StoredRun, shot: Shot, at_s: Array) -> Iterator[Array]:
     """Pictures of a shift, uint8 [height, width, 3].
@@ -98,52 +108,79 @@ def frames(run: StoredRun, shot: Shot, at_s: Array) -> Iterator[Array]:
         FleetError: OpenGL or the meshes are not available.
     """
     film, overlay = Film(run, meshes=shot.meshes), Overlay(run, shot)
-    with CellCamera(film.player, shot.width, shot.height) as camera:
+    seen = film.player.extent(film.postures(at_s))
+    free = {"top": overlay.top_px / shot.height, "bottom": overlay.bottom_px / shot.height}
+    with CellCamera(film.player, shot.width, shot.height, seen, **free) as camera:
+        labels = camera.pixels(film.player.labels_m)
         for time_s in at_s:
             temp_c, mode = film.show(time_s)
-            yield overlay.draw(camera.picture(), float(time_s), temp_c, mode)
+            yield overlay.draw(camera.picture(), float(time_s), temp_c, mode, labels)
 
 
 class Overlay:
-    """Clock, hottest motors and colour scale, written into a picture."""
+    """Clock, hottest motors, names of the arms and colour scale, written into a picture."""
 
     def __init__(self, run: StoredRun, shot: Shot) -> None:
         self._arms, self._limits = [visible(arm) for arm in run.arms], run.scenario.limits
-        self._font, self._small = _font(TEXT_PX), _font(12)
+        text_px = max(SMALLEST_PX, round(TEXT_PX * min(shot.width / 1280, shot.height / 720)))
+        self._font, self._small = _font(text_px), _font(max(SMALLEST_PX, round(0.75 * text_px)))
+        self._line_px, self._edge_px = round(1.3 * text_px), max(6, text_px // 2)
+        self._lines = min(MOST_LINES, len(self._arms), max(0, round(0.3 * shot.height / self._line_px) - 1))
         card = run.card
         self._title = visible(f"{run.scenario.name} · {card['policy']} · seed {card['seed']} · {shot.speed:g} ×")
-        self._scale = self._colour_scale(min(320, shot.width - 24))
+        self._scale = self._colour_scale(min(20 * text_px, shot.width - 24))
+        self.top_px = 2 * self._edge_px + (1 + self._lines) * self._line_px
+        """Height of the text above the picture of the cell."""
+        self.bottom_px = self._scale.height + 12
+        """Height of the colour scale below it."""
 
-    def draw(self, picture: Array, time_s: float, temp_c: Array, mode: Array) -> Array:
-        """The picture with its text; modes [arm] index `fleet.telemetry.MODES`."""
+    def draw(self, picture: Array, time_s: float, temp_c: Array, mode: Array, labels: Array) -> Array:
+        """The picture with its text; modes [arm] index `fleet.telemetry.MODES`, names are at `labels` [arm, 2], px."""
         image = Image.fromarray(picture)
         pen = ImageDraw.Draw(image)
+        if len(self._arms) <= MOST_NAMES and min(image.size) >= NAMES_FROM_PX:
+            for arm, faulted, (x, y) in zip(self._arms, mode == FAULTED, labels, strict=True):
+                name = self._fitting(f"{'✖ ' if faulted else ''}{arm}", image.width // 4, self._small)
+                width = pen.textlength(name, font=self._small)
+                x = float(np.clip(x - width / 2, 4, max(4, image.width - width - 4)))
+                half = self._small.size / 2 + 3
+                pen.rectangle((x - 4, y - half, x + width + 4, y + half), fill=FAULT if faulted else PAPER)
+                pen.text((x, y - half + 1), name, font=self._small, fill=PAPER if faulted else INK)
         hottest = temp_c.max(axis=1)
         lines = [(f"{clock(time_s)}  {self._title}", INK)]
-        for arm in np.argsort(-hottest)[:MOST_LINES]:
-            text = (
-                f"{self._arms[arm]}: {MODES[mode[arm]]}, joint {int(temp_c[arm].argmax()) + 1} at {hottest[arm]:.1f} °C"
-            )
-            lines.append((text, FAULT if mode[arm] == FAULTED else INK))
+        for arm in np.argsort(-hottest)[: self._lines]:
+            heat = f"{MODES[mode[arm]]}, joint {int(temp_c[arm].argmax()) + 1} at {hottest[arm]:.1f} °C"
+            name = self._fitting(self._arms[arm], image.width - pen.textlength(f": {heat}", font=self._font) - 24)
+            lines.append((f"{name}: {heat}", FAULT if mode[arm] == FAULTED else INK))
+        lines = [(self._fitting(text, image.width - 24), colour) for text, colour in lines]
         width = max(pen.textlength(text, font=self._font) for text, _ in lines)
-        pen.rectangle((6, 4, width + 18, 10 + len(lines) * LINE_PX), fill=PAPER)
+        pen.rectangle((6, 4, width + 18, self.top_px - self._edge_px + 2), fill=PAPER)
         for number, (text, colour) in enumerate(lines):
-            pen.text((12, 8 + number * LINE_PX), text, font=self._font, fill=colour)
-        image.paste(self._scale, (12, image.height - self._scale.height - 12))
+            pen.text((12, 6 + number * self._line_px), text, font=self._font, fill=colour)
+        image.paste(self._scale, (12, image.height - self._scale.height - 6))
         return np.asarray(image)
+
+    def _fitting(self, text: str, width_px: float, font: ImageFont.FreeTypeFont | None = None) -> str:
+        """Text of at most this width, with … where its end is cut off."""
+        font = font or self._font
+        if font.getlength(text) <= width_px:
+            return text
+        while text and font.getlength(f"{text}…") > width_px:
+            text = text[:-1]
+        return f"{text}…"
 
     def _colour_scale(self, width: int) -> Image.Image:
         warning_c, error_c = self._limits.warning_c, self._limits.error_c
-        marks = heat_marks(warning_c, error_c)
-        image = Image.new("RGB", (width, 44), PAPER)
+        marks, text_px = heat_marks(warning_c, error_c), self._small.size
+        image = Image.new("RGB", (width, round(2.2 * text_px + 14)), PAPER)
         colours = heat_colour(np.linspace(marks[0], marks[-1], width - 16), warning_c, error_c)
-        bar = np.rint(255 * np.tile(colours, (14, 1, 1))).astype(np.uint8)
+        bar = np.rint(255 * np.tile(colours, (round(text_px), 1, 1))).astype(np.uint8)
         image.paste(Image.fromarray(bar), (8, 6))
         pen = ImageDraw.Draw(image)
         for mark, word in ((marks[0], f"{marks[0]:g} °C"), (warning_c, f"{warning_c:g}"), (error_c, f"{error_c:g}")):
             x = 8 + (width - 16) * (mark - marks[0]) / (marks[-1] - marks[0])
-            pen.line((x, 4, x, 22), fill=INK)
-            pen.text((max(2, x - (0 if mark == marks[0] else 8)), 24), word, font=self._small, fill=INK)
+            pen.line((x, 4, x, text_px + 8), fill=INK)
+            pen.text((max(2, x - (0 if mark == marks[0] else 8)), text_px + 9), word, font=self._small, fill=INK)
         return image
 
 

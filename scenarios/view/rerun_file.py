@@ -53,8 +53,11 @@ def write_rerun(path: Path, moments: Moments, progress: Progress = quiet) -> Non
         file.write_arm(index, arm)
     progress("writing events", 1.0)
     file.write_log()
-    recording.flush()
-    recording.disconnect()
+    try:
+        recording.flush()
+        recording.disconnect()
+    except RuntimeError as error:  # its writer has ended, for want of space as a rule, and says no more
+        raise OSError(f"{error} (the disk may be full)") from error
 
 
 def layout(moments: Moments) -> rrb.Blueprint:

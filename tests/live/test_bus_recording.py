@@ -16,6 +16,8 @@ from fleet.bus.client.client import BusClient
 from fleet.bus.client.router import Router
 from fleet.bus.protocol import keys
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
+from fleet.bus.protocol.cell import Cell, CellRequest
+from fleet.bus.protocol.examples import EXAMPLES
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cancel, ControlRequest, Operation
 from fleet.errors import FleetError
@@ -330,6 +332,24 @@ def test_gaps_are_fetched_from_the_publishers_cache_or_become_rows(tmp_path):
     assert (gap["sender"], gap["first"], gap["last"]) == ("results of boss", 2, 2)
     assert "not in the cache of its publisher" in gap["reason"]
     assert recording.recorder.counts["results of boss"].missed == 1
+
+
+def test_the_cell_of_the_auctioneer_is_kept_and_asked_for_once(tmp_path):
+    cell, asked = EXAMPLES[Cell], []
+
+    def describe(request):
+        asked.append(request)
+        return cell
+
+    with Router() as router, BusClient(router.endpoint, "f") as boss:
+        boss.reply_to(keys.of_jobs("f", "cell"), CellRequest, describe)
+        for _ in range(2):  # the second continues the recording
+            with Recording(router.endpoint, tmp_path):
+                wait_for(lambda: (tmp_path / CARD).exists() and read_card(tmp_path).cell, boss)
+    kept = read_card(tmp_path).cell
+    assert len(asked) == 1
+    assert (kept.places, kept.fixtures, kept.warning_c) == (cell.places, cell.fixtures, cell.warning_c)
+    assert [(arm.name, arm.position_m, arm.works) for arm in kept.arms] == [("arm_0", (0.0, 0.0, 0.0), ())]
 
 
 def test_a_replay_publishes_the_same_messages_and_refuses_names_of_present_arms(tmp_path):

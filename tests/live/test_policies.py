@@ -15,7 +15,7 @@ from fleet.bus.protocol.auction import JobSpec, PlanQuote, Quote
 from fleet.bus.protocol.messages import State
 from fleet.env.allocation_v1 import parallel_env
 from fleet.live.auction.knowledge import LiveFleet, claimed_jobs, observe
-from fleet.live.auction.round import Assignment, Bidding, Choice, resolve_claims
+from fleet.live.auction.round import Assignment, Bidding, Choice, offers_of, resolve_claims
 from fleet.observation import FIELDS, LONG_S, Observation
 from fleet.offered_plans import PLANS
 from scenarios.live.allocation import CentralAllocation
@@ -251,6 +251,34 @@ def test_the_difficulty_of_the_claimed_plan_counts() -> None:
     bidding = Bidding("r", 0.0, jobs, quotes)
     for plan, winner in ((0, Assignment("b")), (1, Assignment("a", 1)), (2, Assignment("b"))):
         assert resolve_claims(bidding, {"a": Choice("j", plan), "b": Choice("j")}, ("a", "b")) == {"j": winner}
+
+
+def test_the_offers_behind_an_award_are_the_winner_then_the_others_best_first() -> None:
+    jobs = (JobSpec("j", "hold", ("x",)), JobSpec("k", "hold", ("y",)))
+    joints = (0.1,) * 7
+
+    def costs(*ps):
+        return Estimate(
+            "j",
+            tuple(
+                PlanQuote(n, p_saturation=p, difficulty=p, joint_difficulty=joints, space="s") for n, p in enumerate(ps)
+            ),
+        )
+
+    quotes = {arm: quote(arm, estimate) for arm, estimate in (
+        ("cannot", Estimate("j", (), "out of reach")), ("hot", costs(0.9)),
+            ("cool", costs(0.3, 0.1)), ("winner", costs(0.2, 0.4)),
+    )}  # fmt: skip
+    bidding = Bidding("r", 0.0, jobs, quotes, {"full": quote("full", costs(0.0), capacity=0)})
+    offers = offers_of(bidding, "j", Assignment("winner", 1))
+    assert [(o.arm, o.free, o.plan and o.plan.p_saturation) for o in offers] == [
+        ("winner", True, 0.4), ("cool", True, 0.1), ("hot", True, 0.9), ("full", False, 0.0),
+        ("cannot", False, None),
+    ]  # fmt: skip
+    assert all(o.plan is None or (o.plan.joint_difficulty, o.plan.space) == (None, None) for o in offers)
+    many = {f"a{n:03d}": quote(f"a{n:03d}", costs(n / 300)) for n in range(256)}
+    kept = offers_of(Bidding("r", 0.0, jobs, many), "j", Assignment("a200"))
+    assert [o.arm for o in kept] == ["a200", *(f"a{n:03d}" for n in range(7))]
 
 
 def test_an_illegal_action_is_logged_and_waits(caplog) -> None:

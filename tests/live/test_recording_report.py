@@ -1,5 +1,6 @@
 """The report of a live recording: equal to that of a run where both know the same, and never impossible."""
 
+import json
 import re
 from dataclasses import replace
 from itertools import pairwise
@@ -9,8 +10,11 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec import structs
 
 from fleet.bus.protocol.auction import ArmEvent, JobStatus, Result
+from fleet.bus.protocol.cell import Cell
+from fleet.bus.protocol.examples import EXAMPLES
 from fleet.bus.protocol.messages import State
 from fleet.bus.protocol.operator import Cancel, Change, ControlRequest, Operation, Pause, Settle
 from fleet.errors import FleetError
@@ -19,6 +23,7 @@ from scenarios.cli.main import main
 from scenarios.live.recorder import Recorder
 from scenarios.live.recording import read_parts
 from scenarios.live.recording_report import order_events, recording_html, telemetry_of
+from scenarios.live.replayer import Replay
 from scenarios.report.run_page import report_html
 from scenarios.report.schedule import schedule
 
@@ -155,6 +160,46 @@ def test_the_command_writes_the_page_beside_the_recording(tmp_path, capsys):
     Recorder.open(tmp_path / "empty", "f")
     with pytest.raises(FleetError, match="no state of an arm"):
         recording_html(tmp_path / "empty")
+
+
+def test_the_offers_behind_an_award_are_kept_listed_and_replayed(tmp_path):
+    recorder, result = record(tmp_path / "r", LOG), EXAMPLES[Result]
+    for name, place in (("a-1", 0), ("b-1", 1)):
+        status = structs.replace(result.status, job=name, arm=ARMS[place])
+        offers = tuple(structs.replace(offer, arm=arm) for offer, arm in zip(result.offers, ARMS, strict=False))
+        offers = offers if place == 0 else (offers[1], structs.replace(offers[0], plan=None))
+        recorder.add("boss", structs.replace(result, auctioneer="boss", number=place, status=status, offers=offers))
+    recorder.write()
+    html = recording_html(tmp_path / "r")
+    assert "the offers behind 2 awards" in html
+    assert "<td>a-1</td><td>arm_0</td><td>P 0.04, 52 °C, d 0.53, 4 min</td>" in html
+    assert "<td>b-1</td><td>arm_1</td><td>cannot do it</td>" in html
+    replayed = [message for message in Replay.of(tmp_path / "r").messages() if isinstance(message, Result)]
+    assert [len(message.offers) for message in replayed] == [2, 2]
+    assert replayed[0].offers[0].plan == result.offers[0].plan
+
+
+def test_the_cell_of_a_recording_is_shown_in_three_dimensions(tmp_path):
+    """As the auctioneer described it; not for an arm that it does not know, nor with limits that cannot be."""
+    recorder = record(tmp_path / "r", LOG)
+    cell = EXAMPLES[Cell]
+    mounts = tuple(structs.replace(cell.arms[0], name=arm, position_m=(0.0, i, 0.0)) for i, arm in enumerate(ARMS))
+    for described, shown in (
+        (structs.replace(cell, arms=mounts, warning_c=51.0), True),
+        (structs.replace(cell, arms=mounts[:1]), False),
+        (structs.replace(cell, arms=mounts, warning_c=90.0), False),
+    ):
+        recorder.cell = described
+        recorder.write()
+        html = recording_html(tmp_path / "r")
+        assert ('id="cell-model"' in html) is shown
+        if shown:
+            model = json.loads(re.search(r'id="cell-model">(.*?)</script>', html)[1])
+            assert [(arm["name"], arm["position"]) for arm in model["arms"]] == [
+                (arm, [0.0, float(i), 0.0]) for i, arm in enumerate(ARMS)
+            ]
+            assert [box["name"] for box in model["fixtures"]] == ["table"]
+            assert model["heat"]["warning_c"] == 51.0
 
 
 def test_a_part_that_was_cut_is_named(tmp_path):

@@ -1,5 +1,6 @@
 """The arm's model against Kinova's numbers, against MuJoCo's forward dynamics, and against energy."""
 
+import base64
 import importlib.util
 import struct
 import sys
@@ -14,6 +15,7 @@ from hypothesis.extra.numpy import arrays
 
 from fleet.errors import FleetError
 from fleet.job import Place
+from fleet.physics.cell_model import cell_model
 from fleet.physics.meshes import MESH_OF_GEOM
 from fleet.physics.models import ArmModel, build_cell
 from fleet.robot import GEN3, POSTURES, Mount, Robot, rotation
@@ -214,6 +216,27 @@ def test_meshes_change_the_looks_and_nothing_else(monkeypatch, tmp_path):
     assert (dressed.geom_type == mujoco.mjtGeom.mjGEOM_MESH).sum() == 2 * len(MESH_OF_GEOM)
     np.testing.assert_array_equal(dressed.body_mass, plain.body_mass)
     np.testing.assert_array_equal(dressed.body_inertia, plain.body_inertia)
+
+
+def test_a_page_gets_the_surfaces_of_the_meshes(monkeypatch, tmp_path):
+    """Second method: MuJoCo's own position of a corner of the tetrahedron, from the file."""
+    (tmp_path / "assets").mkdir()
+    for mesh in MESH_OF_GEOM.values():
+        (tmp_path / "assets" / f"{mesh}.stl").write_bytes(_tetrahedron_stl())
+    _pretend_menagerie(monkeypatch, tmp_path)
+    shown, plain = (cell_model([Robot(name="a")], meshes=meshes) for meshes in (True, False))
+    assert not plain["meshes"]
+    assert {shape["kind"] for link in shown["links"] for shape in link["shapes"]} == {"mesh"}
+    shape = shown["links"][0]["shapes"][0]
+    mesh = shown["meshes"][shape["mesh"]]
+    points = np.frombuffer(base64.b64decode(mesh["points"]), "<i2").reshape(-1, 3) * mesh["unit_m"]
+    triangles = np.frombuffer(base64.b64decode(mesh["triangles"]), "<u4")
+    turned = np.empty(9)
+    mujoco.mju_quat2Mat(turned, np.array(shape["quaternion"]))
+    corners = points @ turned.reshape(3, 3).T + shape["position"]
+    expected = [(0, 0, 0), (0.1, 0, 0), (0, 0.1, 0), (0, 0, 0.1)]
+    assert np.abs(corners[:, None] - np.array(expected)).max(-1).min(0).max() < 2e-5
+    assert (len(points), len(triangles)) == (4, 12)
 
 
 def test_missing_mesh_files_are_named(monkeypatch, tmp_path):

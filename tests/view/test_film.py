@@ -43,6 +43,40 @@ def test_the_cell_takes_the_recorded_postures_and_heat(run_folder: Path) -> None
     assert data.qpos == pytest.approx(readings.q[hottest : hottest + 2].mean(axis=0).ravel())
 
 
+SEEN = """
+import sys, numpy as np
+from pathlib import Path
+from fleet.physics.cell_player import CellCamera
+from scenarios.run.stored_run import read_run
+from scenarios.view.film import Film
+run = read_run(Path(sys.argv[1]))
+film, t = Film(run), run.telemetry
+row, arm, joint = np.unravel_index(t.temp_c.argmax(), t.temp_c.shape)
+points = film.player.extent(film.postures(t.time_s))
+film.show(float(t.time_s[row]))
+motors = film.player.data.site_xpos[[film.player.model.site(f"{run.arms[arm]}/motor_{j + 1}").id for j in range(7)]]
+with CellCamera(film.player, 640, 360, points, top=0.2, bottom=0.1) as camera:
+    picture, places, (x, y) = camera.picture(), camera.pixels(points), camera.pixels(motors)[joint]
+red, green, _ = picture[round(y), round(x)].astype(int)
+print(*places.min(axis=0), *places.max(axis=0), red - green, picture.max(axis=2).min())
+"""
+
+
+@pytest.mark.skipif(not has_egl(), reason="this machine has no EGL")
+def test_the_camera_holds_every_posture_and_sees_no_edge_of_the_floor(run_folder: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", SEEN, str(run_folder)],
+        capture_output=True, text=True, timeout=120, env=os.environ | {"MUJOCO_GL": "egl"},
+    )  # fmt: skip
+    left, upper, right, lower, redness, darkest = map(float, done.stdout.split())
+    assert min(left, 640 - right) > 0
+    assert upper > 0.2 * 360
+    assert lower < 0.9 * 360
+    assert min(left, 640 - right) < 40 or min(upper - 72, 324 - lower) < 40  # and it is no farther than it must be
+    assert redness > 80  # the hottest motor is where `pixels` says
+    assert darkest > 10
+
+
 @pytest.mark.parametrize(("begin_s", "end_s"), [(-5.0, 1e9), (600.0, 700.0)])
 def test_the_pictures_follow_the_clock(run_folder: Path, begin_s: float, end_s: float) -> None:
     run = read_run(run_folder)

@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -72,6 +73,18 @@ def test_a_damaged_run_is_refused_in_words(run_folder: Path, tmp_path: Path, dam
     (copied / damage).write_bytes(b"PAR1 cut short")
     with pytest.raises(FleetError, match="no complete folder of `thermofleet run`"):
         read_run(copied)
+
+
+def test_a_run_without_readings_or_with_events_of_another_fleet_is_refused(run_folder: Path, tmp_path: Path) -> None:
+    telemetry, events = (pq.read_table(run_folder / f"{name}.parquet") for name in ("telemetry", "events"))
+    ghosts = pa.array(["ghost"] * events.num_rows)
+    damaged = {"telemetry": telemetry.slice(0, 0), "events": events.set_column(2, "arm", ghosts)}
+    assert events.schema.names[2] == "arm"
+    for name, table in damaged.items():
+        copied = shutil.copytree(run_folder, tmp_path / name)
+        pq.write_table(table, copied / f"{name}.parquet")
+        with pytest.raises(FleetError, match="has no rows" if name == "telemetry" else "No arm 'ghost'"):
+            read_run(copied)
 
 
 def test_the_report_written_anew_is_the_same(run_folder: Path, tmp_path: Path) -> None:

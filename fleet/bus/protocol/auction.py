@@ -29,14 +29,10 @@ LEASE_S = 6.0
 """Real seconds that an arm may work on a job without renewing its lease."""
 NOT_PLANNED = "not planned yet; ask again"
 """Reason of an estimate that the arm will have soon."""
-MOST_PLANS = 8
-"""Of one arm for one job."""
-MOST_QUOTED = 64
-"""Jobs in one quote, so that it does not exceed the router's size limit."""
-MOST_JOBS = 128
-"""In one message; more are sent as several messages, so that none exceeds the router's size limit."""
-
-
+MOST_PLANS, MOST_OFFERS = 8, 8
+"""Plans of one arm for one job; offers in a `Result`."""
+MOST_QUOTED, MOST_JOBS = 64, 128
+"""Jobs in one quote and in one message, so that none exceeds the router's size limit; more take several messages."""
 Jobs = Annotated[tuple[JobSpec, ...], msgspec.Meta(min_length=1, max_length=MOST_JOBS)]
 
 
@@ -328,6 +324,20 @@ class Announcement(msgspec.Struct, frozen=True):
     jobs: tuple[str, ...]
 
 
+class ArmOffer(msgspec.Struct, frozen=True, omit_defaults=True):
+    """What an arm offered for a job in the round in which the job was awarded."""
+
+    arm: Name
+    mode: Mode
+    free: bool
+    """Whether the arm could have taken it: it had capacity, and the places and the space of a plan were free."""
+    plan: PlanQuote | None = None
+    """The awarded plan, of other arms that with the least difficulty; null without one. Not with all its fields."""
+
+
+Offers = Annotated[tuple[ArmOffer, ...], msgspec.Meta(max_length=MOST_OFFERS)]
+
+
 class Result(msgspec.Struct, frozen=True):
     """Published under `auction/{auctioneer}/result`: the state of a job has changed."""
 
@@ -345,6 +355,8 @@ class Result(msgspec.Struct, frozen=True):
     """Who asked for the change, by a `Submission` or a `ControlRequest`, also who paused the arm that stopped."""
     epoch: str = ""
     """As in `Clock`: `number` begins again with another epoch."""
+    offers: Offers = ()
+    """Behind an award, that of the arm which got the job first, then the best others; empty for other states."""
 
 
 class ArmEvent(msgspec.Struct, frozen=True, omit_defaults=True):

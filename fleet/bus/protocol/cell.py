@@ -26,6 +26,18 @@ class CellPlace(msgspec.Struct, frozen=True):
     """Distance that the hand retracts along its own z axis before it moves on."""
 
 
+class CellFixture(msgspec.Struct, frozen=True):
+    """A box that stands in the cell; no arm may touch it."""
+
+    name: Name
+    position_m: Point
+    """Its centre in the world, m."""
+    size_m: Point
+    """Full edge lengths along its own axes, m."""
+    tilt_deg: Point
+    """Roll, pitch, yaw of the box, deg."""
+
+
 class CellKind(msgspec.Struct, frozen=True):
     """A kind of job."""
 
@@ -95,3 +107,4 @@ class Cell(msgspec.Struct, frozen=True):
     """Motor temperature at which an arm faults, °C."""
     jobs_in_message: Annotated[int, msgspec.Meta(ge=1)]
     """Most jobs in one `Submission`."""
+    fixtures: tuple[CellFixture, ...] = ()

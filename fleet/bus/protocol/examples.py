@@ -9,6 +9,7 @@ from fleet.bus.protocol.auction import (
     Admission,
     Announcement,
     ArmEvent,
+    ArmOffer,
     Award,
     Clock,
     ClockRequest,
@@ -29,7 +30,7 @@ from fleet.bus.protocol.auction import (
     Submission,
     SubmissionReply,
 )
-from fleet.bus.protocol.cell import Cell, CellArm, CellKind, CellPlace, CellRequest, Limit, PlannedWork
+from fleet.bus.protocol.cell import Cell, CellArm, CellFixture, CellKind, CellPlace, CellRequest, Limit, PlannedWork
 from fleet.bus.protocol.consensus import Bid, Claim, ClaimEntry, ClaimReply, DeniedEntry, GrantedEntry, JobOutcome
 from fleet.bus.protocol.history import History, HistoryRequest
 from fleet.bus.protocol.messages import DifficultyScores, Info, Refusal, State
@@ -93,6 +94,7 @@ _CELL = Cell(
     warning_c=60.0,
     error_c=75.0,
     jobs_in_message=128,
+    fixtures=(CellFixture("table", (0.4, 0.0, -0.05), (0.6, 0.9, 0.1), (0.0, 0.0, 0.0)),),
 )
 _CANCEL = ControlRequest(request="5f0c2b1e", action=Cancel(job="crate_1"), by="shop floor")
 
@@ -180,12 +182,17 @@ _ALL: tuple[msgspec.Struct, ...] = (
     Announcement(auctioneer=_AUCTIONEER, auction=_ROUND, time_s=601.9, jobs=("crate_1",)),
     Result(
         auctioneer=_AUCTIONEER,
-        number=33,
-        time_s=842.6,
-        status=_DONE,
+        number=32,
+        time_s=602.4,
+        status=JobStatus(job="crate_1", state="awarded", arm=_ARM, award=_AWARD, repetitions=20),
         auction=_ROUND,
         difficulty=0.53,
         p_saturation=0.04,
+        peak_c=51.5,
+        offers=(
+            ArmOffer(_ARM, "idle", True, PlanQuote(peak_c=51.5, p_saturation=0.04, difficulty=0.53, duration_s=212.0)),
+            ArmOffer("arm_1", "working", False, PlanQuote(peak_c=63.0, p_saturation=0.71, difficulty=0.9)),
+        ),
     ),
     LeaseRequest(arm=_ARM, entries=(LeaseEntry(award=_AWARD, job="crate_1", cycles=19, phase="finishing"),)),
     Lease(auctioneer=_AUCTIONEER, lease_s=6.0, granted=(_AWARD,), revoked=(), may_commit=(_AWARD,)),

@@ -9,7 +9,7 @@ from fleet.bus.protocol.history import History
 from fleet.live.auction.job_rules import is_same_work
 from fleet.live.auction.ledger import Ledger
 from fleet.live.auction.records import AuctionRecord, Awarded, HistoryAdopted
-from fleet.live.auction.round import Assignment, Bidding, Timing
+from fleet.live.auction.round import Assignment, Bidding, Timing, offers_of
 from fleet.live.journal_records import CommitPermitted, JobsAccepted
 from fleet.live.space import ANYWHERE
 
@@ -59,7 +59,8 @@ def new_awards(ledger: Ledger, bidding: Bidding, allocation: Mapping[str, Assign
         assert offer is not None, "drop_invalid keeps jobs with a bid"
         names = (f"{bidding.auction}:{job}", bidding.auction, job, arm, bidding.quotes[arm].quote)
         heat = (offer.difficulty, offer.p_saturation, offer.peak_c)
-        records.append(Awarded(*names, ledger.jobs[job].cycles, time_s, *heat, offer.space or ANYWHERE, plan))
+        terms = (ledger.jobs[job].cycles, time_s, *heat, offer.space or ANYWHERE, plan)
+        records.append(Awarded(*names, *terms, offers_of(bidding, job, Assignment(arm, plan))))
     return records
 
 

@@ -11,7 +11,7 @@ from typing import Self
 
 from msgspec.structs import asdict, replace
 
-from fleet.bus.protocol.auction import ABANDONED, SETTLED, JobStatus
+from fleet.bus.protocol.auction import ABANDONED, SETTLED, JobStatus, Offers
 from fleet.bus.protocol.messages import encode
 from fleet.bus.protocol.operator import ALL_ARMS, Cancel, ControlRequest, Pause, Resume, Settle
 from fleet.bus.protocol.operator import Change as ChangeJob
@@ -115,7 +115,7 @@ class Ledger(LedgerState):
             case Awarded():
                 entry = self.jobs[record.job]
                 self._forget_awards(entry)
-                self.awards[record.award] = self.open[record.award] = AwardState(record)
+                self.awards[record.award] = self.open[record.award] = AwardState(replace(record, offers=()))
                 self._awards_of.setdefault(record.job, []).append(record.award)
                 entry.award = record.award
                 self._move(entry, "awarded")
@@ -167,7 +167,8 @@ class Ledger(LedgerState):
         self.unchecked.update(entry.spec.name for entry in changed)
         self._unnoted |= bool(changed) or isinstance(record, Operated | ShiftEnded)
         by = self._person(record)
-        changes = [self._change(self.status_of(entry), record.time_s, by, entry) for entry in changed]
+        offers = record.offers if isinstance(record, Awarded) else ()
+        changes = [self._change(self.status_of(entry), record.time_s, by, entry, offers) for entry in changed]
         while len(self.settled) > MAX_SETTLED:
             self._leave(next(iter(self.settled)))
         return changes
@@ -368,8 +369,8 @@ class Ledger(LedgerState):
             arm = award.record.arm
             self.space[arm] = self.space.get(arm, frozenset()) | {award.record.space}
 
-    def _change(self, status: JobStatus, time_s: float, by: str, entry: JobEntry | None) -> Change:
-        change = Change(self.number, time_s, status, by=by)
+    def _change(self, status: JobStatus, time_s: float, by: str, entry: JobEntry | None, offers: Offers = ()) -> Change:
+        change = Change(self.number, time_s, status, by=by, offers=offers)
         if entry is not None and entry.award in self.awards:
             award = asdict(self.awards[entry.award].record)
             change = replace(

@@ -4,7 +4,7 @@ from typing import cast
 
 import msgspec
 
-from fleet.bus.protocol.auction import JobSpec, JobState, JobStatus
+from fleet.bus.protocol.auction import JobSpec, JobState, JobStatus, Offers
 from fleet.bus.protocol.messages import Count
 from fleet.bus.protocol.operator import ControlRequest
 from fleet.errors import JournalError
@@ -51,6 +51,8 @@ class Awarded(msgspec.Struct, frozen=True, tag="awarded"):
     """Name of the space of its plan."""
     plan: int = 0
     """Number of the plan in the quote."""
+    offers: Offers = ()
+    """Behind the award. The ledger keeps them with its last changes only."""
 
 
 class ContactLost(msgspec.Struct, frozen=True, tag="contact_lost"):
@@ -104,6 +106,7 @@ class Change(msgspec.Struct, frozen=True):
     p_saturation: float | None = None
     peak_c: float | None = None
     by: str = ""
+    offers: Offers = ()
 
 
 class JobEntry(msgspec.Struct):

@@ -7,7 +7,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
-from fleet.bus.protocol.auction import LEASE_S, NOT_PLANNED, JobSpec, PlanQuote, Quote
+from msgspec.structs import replace
+
+from fleet.bus.protocol.auction import LEASE_S, MOST_OFFERS, NOT_PLANNED, ArmOffer, JobSpec, PlanQuote, Quote
 from fleet.bus.protocol.messages import State
 from fleet.live.clock import CLOCK_DRIFT
 from fleet.live.space import ANYWHERE, Excludes, arms_in_the_way, no_conflicts
@@ -144,6 +146,25 @@ def resolve_claims(bidding: Bidding, claims: Mapping[str, Choice], order: Sequen
             difficulty = math.inf if offer.difficulty is None else offer.difficulty
             ranked.append((difficulty, order.index(arm), job, Assignment(arm, plan)))
     return _without_conflicts(bidding, [(job, assignment) for _, _, job, assignment in sorted(ranked)])
+
+
+def offers_of(bidding: Bidding, job: str, awarded: Assignment) -> tuple[ArmOffer, ...]:
+    """Return what the arms offered for an awarded job: first the arm that gets it, then the others, best first."""
+    offers: list[ArmOffer] = []
+    for quote in (*bidding.quotes.values(), *bidding.full.values()):
+        estimate = next((each for each in quote.estimates if each.job == job), None)
+        plan = None if estimate is None or not estimate.feasible else estimate.least
+        if quote.arm == awarded.arm:
+            plan = bidding.offer(awarded.arm, job, awarded.plan)
+        shown = None if plan is None else replace(plan, joint_difficulty=None, space=None)
+        offers.append(ArmOffer(quote.arm, quote.mode, bool(bidding.plans(quote.arm, job)), shown))
+
+    def rank(offer: ArmOffer) -> tuple[bool, bool, float, float]:
+        cost = offer.plan or PlanQuote()
+        p, d = (math.inf if value is None else value for value in (cost.p_saturation, cost.difficulty))
+        return offer.arm != awarded.arm, not offer.free, p, d
+
+    return tuple(sorted(offers, key=rank)[:MOST_OFFERS])
 
 
 def drop_invalid(bidding: Bidding, allocation: Mapping[str, Assignment]) -> dict[str, Assignment]:

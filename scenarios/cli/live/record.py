@@ -118,8 +118,11 @@ def report_command(
         Path | None, typer.Option(help="The HTML file. Default: in the folder of a run, beside that of a recording.")
     ] = None,
     scenario: Annotated[
-        str | None, typer.Option(help="Of a recording: the scenario of the fleet, to show its cell in 3-D.")
+        str | None, typer.Option(help="Of a recording: the scenario of the fleet, if no auctioneer described its cell.")
     ] = None,
+    meshes: Annotated[
+        bool, typer.Option("--meshes", help="Of a run: Kinova's shells; needs the extra `meshes`.")
+    ] = False,
 ) -> None:
     """Write the report of a live recording, as `run` writes one of a simulated shift, or that of a run anew."""
     from scenarios.live.recording_report import recording_html
@@ -129,7 +132,7 @@ def report_command(
 
     if (folder / "run.json").exists():
         path, run = out or folder / "report.html", read_run(folder)
-        html = run_html(run.card, run.scenario, run.telemetry, run.events, run.jobs, run.offers)
+        html = run_html(run.card, run.scenario, run.telemetry, run.events, run.jobs, run.offers, meshes=meshes)
     else:
         path = out or folder.parent / "report.html"
         html = recording_html(folder, None if scenario is None else load(scenario))

@@ -1,4 +1,4 @@
-// The cell in three dimensions: draws what scenarios/view/cell_model.py describes, with three.js.
+// The cell in three dimensions: draws what fleet/physics/cell_model.py describes, with three.js.
 // One instanced mesh per shape of a link, with one instance per arm: the number of draws does not grow with the fleet.
 "use strict";
 
@@ -34,7 +34,18 @@ function makeCell(place, model) {
   const material = (colour) => new THREE.MeshLambertMaterial({ color: colour });
   const colourOf = (rgb) => new THREE.Color(...rgb).convertSRGBToLinear();
 
+  const decoded = (text, Kind) => new Kind(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
+  const surfaces = model.meshes.map((mesh) => {
+    const surface = new THREE.BufferGeometry();
+    surface.setAttribute("position", new THREE.BufferAttribute(
+      Float32Array.from(decoded(mesh.points, Int16Array), (value) => value * mesh.unit_m), 3));
+    surface.setIndex(new THREE.BufferAttribute(decoded(mesh.triangles, Uint32Array), 1));
+    surface.computeVertexNormals();
+    return surface;
+  });
+
   function geometry(shape) {
+    if (shape.kind === "mesh") return surfaces[shape.mesh];
     const [a, b, c] = shape.size;
     switch (shape.kind) {
       case "sphere": return new THREE.SphereGeometry(a, 14, 9);
@@ -214,6 +225,7 @@ function makeCell(place, model) {
   });
   for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, (event) => fingers.delete(event.pointerId));
   canvas.addEventListener("wheel", (event) => {
+    if (document.activeElement !== canvas && !event.ctrlKey) return; // before a click on the cell the wheel moves the page
     event.preventDefault();
     zoom(Math.exp(event.deltaY * 0.001));
   }, { passive: false });

@@ -46,6 +46,8 @@ function startPage() {
     if (fleet.jobs.size > 4 * MOST_JOBS) fleet.jobs.delete(fleet.jobs.keys().next().value);
     if (status.state === "awarded" && status.arm && (!before || before.arm !== status.arm || before.state !== "awarded")) {
       const all = new Map(offers.get(status.job));
+      for (const { arm, plan } of (result && result.offers) || [])
+        if (plan) all.set(arm, { peak: plan.peak_c, p: plan.p_saturation, d: plan.difficulty });
       if (result && result.peak_c !== undefined) all.set(status.arm, { peak: result.peak_c, p: result.p_saturation, d: result.difficulty });
       if (all.size || result) {
         awards.unshift({ key: `${status.job}/${status.award}/${status.arm}`, job: status.job, arm: status.arm, offers: all });
@@ -205,7 +207,7 @@ function startPage() {
       name.append(button);
       hot.append(make("span", { class: "bar", "aria-hidden": "true" }, make("i")), make("span"));
     }
-    const pause = fleet.paused["*"] !== undefined ? "*" : fleet.paused[arm.name] !== undefined ? arm.name : "";
+    const pause = ["*", arm.name].find((one) => Object.hasOwn(fleet.paused, one)) || "";
     const word = here ? MODES[state.mode] : "◌ absent";
     setText(mode, pause ? `${word}, ❚❚ paused` : word);
     setClass(row, here ? state.mode : "absent");
@@ -315,6 +317,7 @@ function startPage() {
   }
 
   function frame(ms) {
+    requestAnimationFrame(frame); // first: an error in a picture does not end all later ones
     if (ms - lastDraw >= DRAW_MS) {
       lastDraw = ms;
       drawCell();
@@ -324,7 +327,6 @@ function startPage() {
       drawTables();
     }
     if (view) view.draw();
-    requestAnimationFrame(frame);
   }
   function say(text, style) {
     setText(element("link"), text);

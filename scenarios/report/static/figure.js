@@ -1,5 +1,14 @@
-// Draws the page's Plotly figure in the colours of the page, with room for its legends at any width.
+// Filters of tables; and draws the page's Plotly figure in the colours of the page, with room for its legends at any width.
 "use strict";
+
+// Fields that show only the rows of their table that have all the words.
+function startFilters() {
+  for (const filter of document.querySelectorAll("input.filter")) filter.addEventListener("input", () => {
+    const words = filter.value.toLowerCase().split(/\s+/);
+    for (const row of document.getElementById(filter.dataset.table).querySelectorAll("tbody tr"))
+      row.hidden = !words.every((word) => row.textContent.toLowerCase().includes(word));
+  });
+}
 
 async function drawFigure(options) {
   await runLibrary("plotly");

@@ -30,7 +30,8 @@ function stateAt(array, row, timeS) {
   return array.values[row * array.moments + i] * array.scale;
 }
 
-async function startReplay(figure, unitS) {
+// Plays the shift; a figure that is drawn later gets its cursor by `attach`.
+async function startReplay(unitS) {
   const place = document.getElementById("cell");
   const model = JSON.parse(document.getElementById("cell-model").textContent);
   const data = await readPlayback("playback");
@@ -44,7 +45,7 @@ async function startReplay(figure, unitS) {
     place.className = "absent";
     place.textContent = "This browser cannot draw in 3-D (WebGL is missing). The figures below show the same shift.";
   }
-  let timeS = data.q.first_s, playing = false, last = 0, shown = null, moveCursor = null;
+  let timeS = data.q.first_s, playing = false, last = 0, shown = null, figure = null, moveCursor = null;
   slider.min = data.q.first_s;
   slider.max = endS;
   slider.step = "any";
@@ -74,7 +75,7 @@ async function startReplay(figure, unitS) {
     }
     shown = lines.map((line) => line.mode);
     now.textContent = lines.sort((a, b) => b.tempC - a.tempC).slice(0, 8).map(({ arm, mode, hottest, tempC }) =>
-      `${model.arms[arm].name}: ${words[mode] || "absent"}, joint ${hottest} at ${tempC.toFixed(1)} °C`
+      words[mode] === undefined ? `${model.arms[arm].name}: absent` : `${model.arms[arm].name}: ${words[mode]}, joint ${hottest} at ${tempC.toFixed(1)} °C`
       + (tempC >= model.heat.error_c ? " (above the limit)" : tempC >= model.heat.warning_c ? " (warm)" : "")).join("\n");
     if (moveCursor) moveCursor(timeS);
   }
@@ -125,13 +126,9 @@ async function startReplay(figure, unitS) {
   }
   model.arms.forEach((arm, i) => chooser.append(new Option(arm.name, i)));
   chooser.addEventListener("change", () => choose(Number(chooser.value)));
-  if (figure) figure.on("plotly_click", (event) => {
-    const point = event.points[0];
-    if (point.data.type === "heatmap") choose(point.y);
-  });
   play.addEventListener("click", toggle);
   slider.addEventListener("input", () => show(Number(slider.value)));
-  // A row of a table with a moment goes there, by click or Enter.
+  // An element with a moment goes there, by click or Enter.
   function goTo(event) {
     const row = event.target.closest("[data-time]");
     if (!row || (event.type === "keydown" && event.key !== "Enter")) return;
@@ -140,11 +137,7 @@ async function startReplay(figure, unitS) {
     if (arm >= 0) choose(arm);
     place.scrollIntoView({ block: "center", behavior: "smooth" });
   }
-  for (const filter of document.querySelectorAll("input.filter")) filter.addEventListener("input", () => {
-    const words = filter.value.toLowerCase().split(/\s+/);
-    for (const row of document.getElementById(filter.dataset.table).querySelectorAll("tbody tr"))
-      row.hidden = !words.every((word) => row.textContent.toLowerCase().includes(word));
-  });
+  for (const one of document.querySelectorAll("[data-time]")) one.tabIndex = 0;
   document.addEventListener("click", goTo);
   document.addEventListener("keydown", goTo);
   document.addEventListener("keydown", (event) => {
@@ -155,9 +148,19 @@ async function startReplay(figure, unitS) {
     else return;
     event.preventDefault();
   });
-  if (figure) moveCursor = addCursor(figure);
+  function attach(element) {
+    figure = element;
+    figure.on("plotly_click", (event) => {
+      const point = event.points[0];
+      if (point.data.type === "heatmap") choose(point.y);
+    });
+    moveCursor = addCursor(figure);
+    if (chooser.value >= 0) choose(Number(chooser.value));
+    moveCursor(timeS);
+  }
   show(timeS);
   requestAnimationFrame(frame);
   window.replay = { show, time: () => timeS };
-  document.body.dataset.ready = "replay";
+  performance.mark("playable");
+  return { attach };
 }

@@ -60,6 +60,7 @@ def test_a_late_subscriber_gets_the_last_results(bus):
     bus.until(lambda: len(results) == 4 and rounds)
     assert [result.status.state for result in results] == ["waiting", "awarded", "finishing", "finished"]
     assert [result.number for result in results] == [0, 1, 2, 3]
+    assert [[offer.arm for offer in result.offers] for result in results] == [[], ["arm_0"], [], []]
     assert rounds[0].jobs == ("a",)
 
 

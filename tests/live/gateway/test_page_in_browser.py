@@ -247,6 +247,36 @@ def test_hostile_names_stay_text(router, open_page):
         assert page.evaluate("document.body.dataset.boom") is None
 
 
+def test_long_names_and_names_of_javascript_s_own_leave_the_page_as_it_is(router, open_page):
+    names = ("constructor", "__proto__", "W" * 120)
+    with MovingFleet(router, names, fleet="f") as fleet, Served(router, page=LivePage()) as served:
+        page = open_page(served)
+        fleet.post(lambda: fleet.set("q" * 120, arm="W" * 120, state="awarded"))
+        expect(page.locator("#offers")).to_contain_text("W" * 120)
+        expect(page.locator("#arms tbody tr")).to_have_count(3)
+        expect(page.locator("#arms")).not_to_contain_text("paused")
+        assert page.evaluate("document.documentElement.scrollWidth") <= 1300
+        for cell in page.locator("#arms td, #jobs td, #journal td").all():
+            assert cell.bounding_box()["width"] >= 50
+        page.get_by_role("button", name="Pause __proto__").click()
+        confirm(page)
+        answer(page).to_contain_text("Paused: __proto__.")
+        expect(page.locator("#arms tr", has_text="__proto__")).to_contain_text("paused")
+
+
+def test_without_webgl_the_tables_and_requests_still_work(browser, served, fleet):
+    flat = browser.browser_type.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-3d-apis"])
+    page = flat.new_page()
+    page.goto(f"http://127.0.0.1:{served.port}/")
+    page.wait_for_selector("body[data-ready]", timeout=PATIENCE_MS)
+    expect(page.locator("#cell")).to_contain_text("cannot draw in 3-D")
+    expect(page.locator("#arms tbody tr").nth(1)).to_contain_text("41.0 °C, joint 2")
+    page.get_by_role("button", name="Pause arm_0").click()
+    confirm(page)
+    answer(page).to_contain_text("Paused: arm_0.")
+    flat.close()
+
+
 def test_a_page_asks_for_a_token_and_allows_what_its_role_may(router, fleet, open_page):
     with Served(router, page=LivePage(), tokens={WATCHER: "monitor", BOSS: "operator"}) as served:
         page = open_page(served, errors=True, wait=False)  # Chromium logs every 401
