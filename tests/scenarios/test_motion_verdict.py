@@ -142,7 +142,7 @@ def test_readings_rank_more_error_higher_and_tell_jobs_apart() -> None:
     more = less.copy()
     more[..., :PARTS] *= 1.7
     weight = rng.dirichlet(np.ones(7)) * 7
-    for name, reading in (TOTALS | JOINTS).items():
+    for name, reading in {**TOTALS, **JOINTS}.items():
         low, high = (reading(Errors(Features(packed), calibration, weight)) for packed in (less, more))
         assert np.all(high >= low), name
         if not name.startswith("latent"):

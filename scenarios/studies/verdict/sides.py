@@ -1,8 +1,8 @@
 """Motion sampled from the hot side of a twin's latent space is hot in the simulator: its share, against the cool side.
 
 The side of a job is told by its latents alone: a linear discriminant of their means over the job, fitted on one half of
-the test jobs. New motion is decoded from perturbed latents of the other half, its torque comes from inverse dynamics,
-and MuJoCo performs it with the payload of the job. Generated with one payload for all, the sides differ by motion only.
+the test jobs. New motion is decoded from perturbed latents of the other half, its torque comes from MuJoCo's inverse
+dynamics, and the true motors of the arm are heated with it. With one payload for all, the sides differ by motion only.
 """
 
 from collections.abc import Sequence
@@ -15,9 +15,7 @@ from sklearn.covariance import LedoitWolf
 from fleet.errors import FleetError
 from fleet.motion import Plan
 from fleet.physics.models import ArmModel
-from fleet.thermal import NODES
 from scenarios.motion.generate import Rejected, planned
-from scenarios.motion.perform import bare_arm, perform
 from scenarios.prepare.cool_motion import cold_peaks
 from scenarios.progress import Count, Progress, quiet
 from scenarios.studies.benchmark import jobs_of
@@ -39,7 +37,7 @@ class Share:
 
     motions: int
     rejected: int
-    """Beyond joint or torque limits, or a servo at its largest torque."""
+    """Beyond joint or torque limits."""
     warm: tuple[float, float, float]
     """Share in which a motor passes the cool limit when the motion repeats over the horizon."""
     critical: tuple[float, float, float]
@@ -57,9 +55,9 @@ class Sides:
     source_critical: dict[str, float]
     """Share of them that are critical."""
     own: dict[str, Share]
-    """Performed in MuJoCo with the payload of the source, by side."""
+    """With the payload of the source, by side."""
     common: dict[str, Share]
-    """With `COMMON_KG` for all, torque by inverse dynamics, by side."""
+    """With `COMMON_KG` for all, by side."""
 
 
 def sides(
@@ -77,6 +75,7 @@ def sides(
     chosen = {"hot": rest[score[rest] > 0], "cool": rest[score[rest] <= 0]}
     if not all(map(len, chosen.values())):
         raise FleetError("All test jobs lie on one side of the latent space; take another arm or more test jobs.")
+    model = ArmModel(study.robot)
     result: dict[str, dict[str, Share]] = {"own": {}, "common": {}}
     for number, (side, index) in enumerate(chosen.items()):
         rng = np.random.default_rng([seed, number])
@@ -90,7 +89,7 @@ def sides(
             made = vary(twin, source, s, rng)
             for name, plans in motions.items():
                 try:
-                    plans.append(_realised(study, made, source, performed=name == "own"))
+                    plans.append(_realised(model, made, source, COMMON_KG if name == "common" else None))
                 except Rejected:
                     rejected[name] += 1
         for name, plans in motions.items():
@@ -121,17 +120,12 @@ def hot_side(study: Study, twin: Twin) -> tuple[Array, Array, Array]:
     return (latent - (cool + hot) / 2) @ np.linalg.solve(within.covariance_, hot - cool), critical, rest
 
 
-def _realised(study: Study, made: Variation, source: Plan, *, performed: bool) -> Plan:
-    """The plan of a variation, as MuJoCo performs it or with the common payload; raises Rejected."""
-    if not performed:
-        phases = tuple(replace(part, payload_kg=np.full(len(part.payload_kg), COMMON_KG)) for part in made.phases)
-        return planned(replace(made, phases=phases), source, ArmModel(study.robot))
-    plan = planned(made, source, ArmModel(study.robot))
-    arm = bare_arm(study.robot, study.motors, study.thermal)
-    done = perform(arm, plan, start_c=np.full(NODES, study.ambient_c), ambient_c=study.ambient_c)
-    if done.clipped:
-        raise Rejected("torque clip")
-    return done.as_plan()
+def _realised(model: ArmModel, made: Variation, source: Plan, payload_kg: float | None) -> Plan:
+    """The plan of a variation, with another payload if one is given; raises Rejected."""
+    if payload_kg is not None:
+        phases = tuple(replace(part, payload_kg=np.full(len(part.payload_kg), payload_kg)) for part in made.phases)
+        made = replace(made, phases=phases)
+    return planned(made, source, model)
 
 
 def _share(study: Study, plans: Sequence[Plan], rejected: int) -> Share:
